@@ -1,1 +1,4 @@
-//! x
+//! A fleet for interactive robot simulations in the browser.
+
+pub mod session;
+pub mod shared;

@@ -1,0 +1,213 @@
+//! The session server's configuration, `config/session/NAME.json`.
+
+use std::time::Duration;
+
+use serde::{Deserialize, Serialize};
+
+use crate::shared::address::PublicAddress;
+use crate::shared::config::{Configuration, ExpandedPath, Unfit, optional_port, percent, seconds, whole};
+
+/// Every key of the session server. The original's keys keep their meaning.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(rename_all = "camelCase")]
+pub struct SessionConfig {
+    /// Fully qualified domain name of the session server. Default: `localhost`, with a warning.
+    #[serde(default)]
+    pub server: String,
+    /// Whether URLs begin with `https` and `wss`. Default: true.
+    #[serde(default = "yes")]
+    pub ssl: bool,
+    /// Local port; 0 takes any free one.
+    #[serde(deserialize_with = "whole::<0, 65535, _, _>")]
+    pub port: u16,
+    /// Local address to listen on. Default: all of them.
+    #[serde(default = "everywhere")]
+    pub bind: String,
+    /// Whether a web server in front rewrites ports in URLs: HOST/PORT, not HOST:PORT. Default: true.
+    #[serde(default = "yes")]
+    pub port_rewrite: bool,
+    /// The simulation servers, as HOST:PORT or HOST/PORT.
+    pub simulation_servers: Vec<PublicAddress>,
+    /// Mail address that receives notifications.
+    #[serde(default)]
+    pub administrator: Option<String>,
+    /// SMTP host.
+    #[serde(default)]
+    pub mail_server: Option<String>,
+    /// SMTP port: 25, 587 or 465 by convention. Default: 25, with a password 587.
+    #[serde(default, deserialize_with = "optional_port")]
+    pub mail_server_port: Option<u16>,
+    /// Mail address that notifications come from.
+    #[serde(default)]
+    pub mail_sender: Option<String>,
+    /// User name for SMTP. Default: `mailSender`.
+    #[serde(default)]
+    pub mail_sender_user: Option<String>,
+    /// Password for SMTP: with it the connection is always encrypted.
+    #[serde(default)]
+    pub mail_sender_password: Option<Secret>,
+    /// Folder of `session/output.log`. Default: `log`.
+    #[serde(default = "log_folder")]
+    pub log_dir: ExpandedPath,
+    /// Log to standard output. Default: false.
+    #[serde(default)]
+    pub debug: bool,
+    /// A simulation server with this load (percent) or more takes no client. Default: 95.
+    #[serde(default = "threshold", deserialize_with = "percent")]
+    pub load_threshold: f64,
+    /// Seconds between two looks at each simulation server. Default: 1.
+    #[serde(default = "one_second", with = "seconds")]
+    pub load_refresh: Duration,
+    /// What a client is expected to cost a simulation server (percent of load) until its reports teach better.
+    /// Default: 2.
+    #[serde(default = "client_cost", deserialize_with = "percent")]
+    pub client_cost: f64,
+    /// How many client WebSockets may be open in all. Default: 20000.
+    #[serde(default = "many_clients", deserialize_with = "whole::<1, 1_000_000, _, _>")]
+    pub max_clients: usize,
+    /// Every other duration.
+    #[serde(default)]
+    pub timing: Timing,
+}
+
+/// Durations, in seconds.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(rename_all = "camelCase", default, deny_unknown_fields)]
+pub struct Timing {
+    /// How long a simulation server may take to answer. Default: 3.
+    #[serde(with = "seconds")]
+    pub answer: Duration,
+    /// Between two pings of a client. Default: 20.
+    #[serde(with = "seconds")]
+    pub ping: Duration,
+    /// A client that is silent for so long is gone. Default: 60.
+    #[serde(with = "seconds")]
+    pub silence: Duration,
+    /// How long a placement counts whose client never came. Default: 15.
+    #[serde(with = "seconds")]
+    pub placement: Duration,
+    /// How long notices are gathered before one mail tells them all. Default: 10.
+    #[serde(with = "seconds")]
+    pub gather: Duration,
+    /// Least time between two mails about one flapping simulation server. Default: 600.
+    #[serde(with = "seconds")]
+    pub flapping: Duration,
+    /// The first wait before a failed mail is tried again; it doubles each time. Default: 10.
+    #[serde(with = "seconds")]
+    pub mail_retry: Duration,
+    /// After so long a failing mail is given up. Default: 3600.
+    #[serde(with = "seconds")]
+    pub mail_patience: Duration,
+    /// How long an SMTP server may take for one mail. Default: 30.
+    #[serde(with = "seconds")]
+    pub mail_answer: Duration,
+    /// How long open connections may take to end when the server stops. Default: 4.
+    #[serde(with = "seconds")]
+    pub stop: Duration,
+}
+
+impl Default for Timing {
+    fn default() -> Self {
+        Self {
+            answer: Duration::from_secs(3),
+            ping: Duration::from_secs(20),
+            silence: Duration::from_secs(60),
+            placement: Duration::from_secs(15),
+            gather: Duration::from_secs(10),
+            flapping: Duration::from_secs(600),
+            mail_retry: Duration::from_secs(10),
+            mail_patience: Duration::from_secs(3600),
+            mail_answer: Duration::from_secs(30),
+            stop: Duration::from_secs(4),
+        }
+    }
+}
+
+/// A text that is never shown.
+#[derive(Clone, Deserialize)]
+pub struct Secret(String);
+
+impl Secret {
+    /// The text, for the one who needs it.
+    #[must_use]
+    pub fn reveal(&self) -> &str {
+        &self.0
+    }
+}
+
+impl std::fmt::Debug for Secret {
+    fn fmt(&self, out: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        out.write_str("********")
+    }
+}
+
+impl Serialize for Secret {
+    fn serialize<S: serde::Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.serialize_str("********")
+    }
+}
+
+impl SessionConfig {
+    /// Where this server is reached from outside.
+    #[must_use]
+    pub fn address(&self) -> PublicAddress {
+        PublicAddress::new(&self.server, self.port, self.port_rewrite)
+    }
+}
+
+impl Configuration for SessionConfig {
+    const ALIASES: &'static [&'static str] = &[];
+
+    fn complete(&mut self) -> Result<Vec<String>, Unfit> {
+        let mut warnings = Vec::new();
+        if self.server.is_empty() {
+            warnings.push("server is not set: URLs will name localhost".to_owned());
+            self.server = "localhost".to_owned();
+        }
+        let mut seen = std::collections::HashSet::new();
+        for address in &self.simulation_servers {
+            if !seen.insert(address) {
+                let problem = format!("{address} is listed twice; each simulation server is listed once");
+                return Err(Unfit { key: "simulationServers", problem });
+            }
+        }
+        if self.timing.silence <= self.timing.ping {
+            let problem = format!("{} s is not more than timing.ping", self.timing.silence.as_secs_f64());
+            return Err(Unfit { key: "timing.silence", problem });
+        }
+        if self.administrator.is_some() && self.mail_server.is_none() {
+            warnings.push("mailServer is not set: notifications are off".to_owned());
+        } else if self.administrator.is_some() && self.mail_sender.is_none() {
+            warnings.push("mailSender is not set: notifications are off".to_owned());
+        }
+        Ok(warnings)
+    }
+}
+
+fn yes() -> bool {
+    true
+}
+
+fn everywhere() -> String {
+    "0.0.0.0".to_owned()
+}
+
+fn log_folder() -> ExpandedPath {
+    ExpandedPath::plain("log")
+}
+
+fn threshold() -> f64 {
+    95.0
+}
+
+fn one_second() -> Duration {
+    Duration::from_secs(1)
+}
+
+fn client_cost() -> f64 {
+    2.0
+}
+
+fn many_clients() -> usize {
+    20_000
+}

@@ -1,0 +1,109 @@
+//! Where a server is reached from outside: `HOST:PORT`, or `HOST/PORT` behind a web server that rewrites ports.
+
+use std::fmt;
+use std::str::FromStr;
+
+use serde::{Deserialize, Serialize};
+
+/// A server's public address.
+///
+/// With port rewrite (a web server on port 443 forwards `https://HOST/PORT/...` to that local port) the port is the
+/// first segment of the path: `HOST/PORT`. Without, it is the plain `HOST:PORT`.
+#[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(try_from = "String", into = "String")]
+pub struct PublicAddress {
+    host: String,
+    port: u16,
+    rewritten: bool,
+}
+
+/// A text that is no public address.
+#[derive(Debug, thiserror::Error)]
+#[error("{found:?} is no address; allowed is HOST:PORT, or HOST/PORT where a web server rewrites ports")]
+pub struct NoAddress {
+    found: String,
+}
+
+impl PublicAddress {
+    /// The address of `port` on `host`; `rewritten` tells whether a web server in front rewrites ports.
+    #[must_use]
+    pub fn new(host: &str, port: u16, rewritten: bool) -> Self {
+        Self { host: host.to_owned(), port, rewritten }
+    }
+
+    /// The WebSocket URL, without a slash at its end: `ws://HOST:PORT` or `wss://HOST/PORT`.
+    #[must_use]
+    pub fn websocket_url(&self, ssl: bool) -> String {
+        format!("{}://{self}", if ssl { "wss" } else { "ws" })
+    }
+
+    /// The HTTP URL, without a slash at its end: `http://HOST:PORT` or `https://HOST/PORT`.
+    #[must_use]
+    pub fn http_url(&self, ssl: bool) -> String {
+        format!("{}://{self}", if ssl { "https" } else { "http" })
+    }
+}
+
+impl fmt::Display for PublicAddress {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(out, "{}{}{}", self.host, if self.rewritten { '/' } else { ':' }, self.port)
+    }
+}
+
+impl From<PublicAddress> for String {
+    fn from(address: PublicAddress) -> Self {
+        address.to_string()
+    }
+}
+
+impl TryFrom<String> for PublicAddress {
+    type Error = NoAddress;
+
+    fn try_from(text: String) -> Result<Self, NoAddress> {
+        text.parse()
+    }
+}
+
+impl FromStr for PublicAddress {
+    type Err = NoAddress;
+
+    fn from_str(text: &str) -> Result<Self, NoAddress> {
+        let no_address = || NoAddress { found: text.to_owned() };
+        let (host, port, rewritten) = match text.split_once('/') {
+            Some((host, port)) => (host, port, true),
+            None => text.rsplit_once(':').map(|(host, port)| (host, port, false)).ok_or_else(no_address)?,
+        };
+        url::Host::parse(host).map_err(|_| no_address())?;
+        let port = port.parse().ok().filter(|port| *port > 0).ok_or_else(no_address)?;
+        Ok(Self { host: host.to_owned(), port, rewritten })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn both_forms_are_read_and_written_as_they_were() {
+        for text in ["localhost:2000", "cyberbotics1.epfl.ch/2000", "[::1]:2000", "10.0.0.7/65535"] {
+            assert_eq!(text.parse::<PublicAddress>().unwrap().to_string(), text);
+        }
+    }
+
+    #[test]
+    fn the_scheme_follows_ssl() {
+        let address: PublicAddress = "host/2000".parse().unwrap();
+        assert_eq!(address.websocket_url(true), "wss://host/2000");
+        assert_eq!(address.http_url(false), "http://host/2000");
+    }
+
+    #[test]
+    fn anything_else_is_refused_by_name() {
+        for text in
+            ["", "host", "host:", "host:0", "host:65536", "host/2000/x", "http://host:1", "a b:1", ":2000", "h:-1"]
+        {
+            let error = text.parse::<PublicAddress>().unwrap_err().to_string();
+            assert!(error.contains(&format!("{text:?}")), "{error}");
+        }
+    }
+}

@@ -1,0 +1,72 @@
+//! How busy a machine is.
+
+use std::fmt;
+
+use serde::{Deserialize, Serialize};
+
+/// A machine's load in percent: finite and not negative. It may pass 100.
+#[derive(Debug, Clone, Copy, PartialEq, PartialOrd, Serialize, Deserialize)]
+#[serde(try_from = "f64", into = "f64")]
+pub struct Load(f64);
+
+/// A number that is no load.
+#[derive(Debug, PartialEq, thiserror::Error)]
+#[error("{0} is no load; a load is a finite number of percent that is not negative")]
+pub struct NoLoad(String);
+
+impl Load {
+    /// No load at all.
+    pub const ZERO: Self = Self(0.0);
+    /// A machine that takes nobody any more.
+    pub const FULL: Self = Self(100.0);
+
+    /// The load as a number of percent.
+    #[must_use]
+    pub fn percent(self) -> f64 {
+        self.0
+    }
+
+    /// Reads the body of a `/load` answer: a plain decimal number.
+    ///
+    /// # Errors
+    /// When the body is anything else.
+    pub fn parse(body: &[u8]) -> Result<Self, NoLoad> {
+        let text = String::from_utf8_lossy(body);
+        let number: f64 = text.trim().parse().map_err(|_| NoLoad(format!("{:?}", text.trim())))?;
+        Self::try_from(number)
+    }
+}
+
+impl TryFrom<f64> for Load {
+    type Error = NoLoad;
+
+    fn try_from(number: f64) -> Result<Self, NoLoad> {
+        if number.is_finite() && number >= 0.0 { Ok(Self(number)) } else { Err(NoLoad(number.to_string())) }
+    }
+}
+
+impl From<Load> for f64 {
+    fn from(load: Load) -> Self {
+        load.0
+    }
+}
+
+impl fmt::Display for Load {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        fmt::Display::fmt(&self.0, out)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_load_is_a_finite_number_that_is_not_negative() {
+        assert_eq!(Load::parse(b" 12.5\n").map(Load::percent), Ok(12.5));
+        assert_eq!(Load::parse(b"0").map(Load::percent), Ok(0.0));
+        for odd in ["", "NaN", "inf", "-1", "12%", "<html>", "\u{ff}", "1e999"] {
+            assert!(Load::parse(odd.as_bytes()).is_err(), "{odd:?} was taken for a load");
+        }
+    }
+}

@@ -1,0 +1,309 @@
+//! The URL of a world in a git repository, as a web client types it.
+
+use std::fmt;
+
+use percent_encoding::percent_decode_str;
+
+/// A world's place: a repository on a forge, and the path of a world file below a reference of it.
+///
+/// The reference may hold slashes (`feature/arm`), so the URL alone doesn't tell where it ends;
+/// [`ProjectUrl::candidates`] gives the possible readings, and the repository decides.
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+pub struct ProjectUrl {
+    host: String,
+    /// Every path segment, percent-decoded.
+    segments: Vec<String>,
+    /// How many of the segments name the repository.
+    repository: usize,
+    /// How many segments come before the reference.
+    reference: usize,
+    /// What kind of reference the URL says it is; GitHub and GitLab don't say.
+    kind: RefKind,
+}
+
+/// What a URL says of its reference.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum RefKind {
+    /// A branch, a tag or a commit.
+    Any,
+    /// A branch (Gitea: `src/branch/NAME`).
+    Branch,
+    /// A tag (Gitea: `src/tag/NAME`).
+    Tag,
+    /// A commit (Gitea: `src/commit/HASH`).
+    Commit,
+}
+
+/// One way to read a world's URL.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Reading {
+    /// Branch, tag or commit.
+    pub reference: String,
+    /// The project's folder inside the repository; empty for its root.
+    pub folder: String,
+}
+
+/// Why a text is no world's URL. Its words are for the web client.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error(
+    "Wrong Webots simulation URL: {problem}. Allowed is https://github.com/USER/REPOSITORY/blob/REFERENCE/PATH/worlds/NAME.wbt."
+)]
+pub struct NoProject {
+    problem: String,
+}
+
+fn no_project(problem: impl Into<String>) -> NoProject {
+    NoProject { problem: problem.into() }
+}
+
+/// The longest URL that is read.
+const LONGEST: usize = 2000;
+
+impl ProjectUrl {
+    /// Reads a world's URL in the form of GitHub, GitLab (`/-/blob/`) or Gitea (`/src/branch/`).
+    ///
+    /// # Errors
+    /// When it is not `https`, names a user or a query, holds `.`, `..` or empty segments, encoded slashes or control
+    /// characters, or does not end in `/worlds/NAME.wbt`.
+    pub fn parse(text: &str) -> Result<Self, NoProject> {
+        let (host, segments) = split_url(text)?;
+        let (repository, reference, kind) = split_repository(&segments)?;
+        let inside = segments.get(reference..).unwrap_or_default();
+        let world = match inside {
+            [.., folder, world] if folder == "worlds" => world,
+            _ => return Err(no_project("it does not end in /worlds/NAME.wbt")),
+        };
+        let is_world =
+            world.len() > 4 && world.get(world.len() - 4..).is_some_and(|end| end.eq_ignore_ascii_case(".wbt"));
+        if !is_world {
+            return Err(no_project(format!("{world:?} is no world file")));
+        }
+        if inside.len() < 3 {
+            return Err(no_project("it names no branch or tag"));
+        }
+        if inside.iter().any(|segment| segment.eq_ignore_ascii_case(".git")) {
+            return Err(no_project("a folder is called .git"));
+        }
+        Ok(Self { host, segments, repository, reference, kind })
+    }
+
+    /// The forge, in small letters, with its port where that is not 443.
+    #[must_use]
+    pub fn host(&self) -> &str {
+        &self.host
+    }
+
+    /// All path segments of the URL, percent-decoded.
+    #[must_use]
+    pub fn segments(&self) -> &[String] {
+        &self.segments
+    }
+
+    /// The path segments that name the repository, such as user and name.
+    #[must_use]
+    pub fn repository_segments(&self) -> &[String] {
+        self.segments.get(..self.repository).unwrap_or_default()
+    }
+
+    /// The repository's URL, such as `https://github.com/lab/arm`.
+    #[must_use]
+    pub fn repository(&self) -> String {
+        format!("https://{}/{}", self.host, self.repository_segments().join("/"))
+    }
+
+    /// What the URL says of its reference.
+    #[must_use]
+    pub fn kind(&self) -> RefKind {
+        self.kind
+    }
+
+    /// The world file's name, such as `arena.wbt`.
+    #[must_use]
+    pub fn world(&self) -> &str {
+        self.segments.last().map_or("", String::as_str)
+    }
+
+    /// The possible readings, that with the shortest reference first.
+    #[must_use]
+    pub fn candidates(&self) -> Vec<Reading> {
+        let inside = self.segments.get(self.reference..).unwrap_or_default();
+        let before_worlds = inside.len().saturating_sub(2);
+        (1..=before_worlds)
+            .filter_map(|length| {
+                let reference = inside.get(..length)?.join("/");
+                let folder = inside.get(length..before_worlds)?.join("/");
+                Some(Reading { reference, folder })
+            })
+            .collect()
+    }
+}
+
+impl fmt::Display for ProjectUrl {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(out, "https://{}/{}", self.host, self.segments.join("/"))
+    }
+}
+
+/// Splits an `https` URL into its host and its percent-decoded path segments, and refuses every trick.
+///
+/// # Errors
+/// See [`ProjectUrl::parse`].
+pub(super) fn split_url(text: &str) -> Result<(String, Vec<String>), NoProject> {
+    if text.len() > LONGEST {
+        return Err(no_project(format!("it is longer than {LONGEST} bytes")));
+    }
+    if text.chars().any(|letter| letter.is_control() || letter == '\\') {
+        return Err(no_project("it holds a backslash or a control character"));
+    }
+    let Some(rest) = text.get(..8).filter(|scheme| scheme.eq_ignore_ascii_case("https://")).and_then(|_| text.get(8..))
+    else {
+        return Err(no_project("it does not begin with https://"));
+    };
+    let (authority, path) = rest.split_once('/').unwrap_or((rest, ""));
+    if path.contains(['?', '#']) {
+        return Err(no_project("it holds ? or #"));
+    }
+    let host = parse_host(authority)?;
+    if path.is_empty() {
+        return Ok((host, Vec::new()));
+    }
+    let segments = path.split('/').map(decode_segment).collect::<Result<_, _>>()?;
+    Ok((host, segments))
+}
+
+fn parse_host(authority: &str) -> Result<String, NoProject> {
+    if authority.contains('@') {
+        return Err(no_project("it names a user"));
+    }
+    let parsed = url::Url::parse(&format!("https://{authority}/"))
+        .map_err(|error| no_project(format!("its host {authority:?} can't be read ({error})")))?;
+    let host = parsed.host_str().unwrap_or_default().to_owned();
+    Ok(parsed.port().map_or(host.clone(), |port| format!("{host}:{port}")))
+}
+
+fn decode_segment(raw: &str) -> Result<String, NoProject> {
+    let segment = percent_decode_str(raw)
+        .decode_utf8()
+        .map_err(|_| no_project(format!("{raw:?} is no UTF-8 text")))?
+        .into_owned();
+    if segment.is_empty() || segment == "." || segment == ".." {
+        return Err(no_project("its path holds an empty segment, . or .."));
+    }
+    if segment.chars().any(|letter| letter.is_control() || letter == '/' || letter == '\\') {
+        return Err(no_project(format!("{raw:?} holds an encoded slash or control character")));
+    }
+    Ok(segment)
+}
+
+/// Finds where the repository ends and where the reference begins.
+fn split_repository(segments: &[String]) -> Result<(usize, usize, RefKind), NoProject> {
+    let words: Vec<&str> = segments.iter().map(String::as_str).collect();
+    if let Some(dash) = words.iter().position(|word| *word == "-")
+        && dash >= 2
+        && matches!(words.get(dash + 1), Some(&("blob" | "tree")))
+    {
+        return Ok((dash, dash + 2, RefKind::Any));
+    }
+    match words.as_slice() {
+        [_, _, "blob" | "tree", ..] => Ok((2, 3, RefKind::Any)),
+        [_, _, "src", "branch", ..] => Ok((2, 4, RefKind::Branch)),
+        [_, _, "src", "tag", ..] => Ok((2, 4, RefKind::Tag)),
+        [_, _, "src", "commit", ..] => Ok((2, 4, RefKind::Commit)),
+        [_, _, other, ..] => {
+            Err(no_project(format!("blob or tree is missing after the repository, {other:?} stands there")))
+        }
+        _ => Err(no_project("it names no repository")),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    #[test]
+    fn the_url_forms_of_the_forges_are_read() {
+        let table = [
+            ("https://github.com/u/r/blob/main/worlds/a.wbt", "https://github.com/u/r", "main", ""),
+            ("https://GitHub.com/u/r/tree/v1.0/p/q/worlds/a.wbt", "https://github.com/u/r", "v1.0", "p/q"),
+            (
+                "https://github.com:443/u/r/blob/my%20tag/p%2B/worlds/a%20b.wbt",
+                "https://github.com/u/r",
+                "my tag",
+                "p+",
+            ),
+            ("https://gitlab.lab.org/g/s/r/-/blob/main/p/worlds/a.wbt", "https://gitlab.lab.org/g/s/r", "main", "p"),
+            ("https://git.lab:3000/u/r/src/branch/main/p/worlds/a.wbt", "https://git.lab:3000/u/r", "main", "p"),
+            ("https://git.lab/u/r/src/tag/v1/worlds/a.WBT", "https://git.lab/u/r", "v1", ""),
+        ];
+        for (text, repository, reference, folder) in table {
+            let url = ProjectUrl::parse(text).unwrap_or_else(|error| panic!("{text}: {error}"));
+            assert_eq!(url.repository(), repository, "{text}");
+            assert!(
+                url.candidates().contains(&Reading { reference: reference.to_owned(), folder: folder.to_owned() }),
+                "{text}: {:?}",
+                url.candidates()
+            );
+        }
+    }
+
+    #[test]
+    fn a_reference_with_slashes_has_several_readings() {
+        let url = ProjectUrl::parse("https://github.com/u/r/blob/feature/arm/lab/worlds/a.wbt").unwrap();
+        let readings: Vec<_> =
+            url.candidates().into_iter().map(|reading| (reading.reference, reading.folder)).collect();
+        let expected = [("feature", "arm/lab"), ("feature/arm", "lab"), ("feature/arm/lab", "")];
+        assert_eq!(readings, expected.map(|(reference, folder)| (reference.to_owned(), folder.to_owned())));
+    }
+
+    #[test]
+    fn tricks_are_refused() {
+        for text in [
+            "",
+            "http://github.com/u/r/blob/main/worlds/a.wbt",
+            "file:///etc/passwd",
+            "ext::sh -c id",
+            "https://github.com/u/r",
+            "https://github.com/u/r/blob/worlds/a.wbt",
+            "https://github.com/u/r/blob/main/a.wbt",
+            "https://github.com/u/r/blob/main/worlds/.wbt",
+            "https://github.com/u/r/blob/main/worlds/a.txt",
+            "https://github.com/u/r/wiki/main/worlds/a.wbt",
+            "https://github.com/u/r/blob/../worlds/a.wbt",
+            "https://github.com/u/r/blob/%2e%2e/worlds/a.wbt",
+            "https://github.com/u//r/blob/main/worlds/a.wbt",
+            "https://github.com/u/r/blob/main/p%2f..%2fq/worlds/a.wbt",
+            "https://github.com/u/r/blob/main/p%5cq/worlds/a.wbt",
+            "https://github.com/u/r/blob/main/.git/worlds/a.wbt",
+            "https://me@github.com/u/r/blob/main/worlds/a.wbt",
+            "https://github.com@evil.org/u/r/blob/main/worlds/a.wbt",
+            "https://github.com\\@evil.org/u/r/blob/main/worlds/a.wbt",
+            "https://github.com/u/r/blob/main/worlds/a.wbt?x=.wbt",
+            "https://github.com/u/r/blob/main/worlds/a.wbt#.wbt",
+            "https://github.com/u/r/blob/ma\nin/worlds/a.wbt",
+            "https://github.com/u/r/blob/ma%00in/worlds/a.wbt",
+            "https:///u/r/blob/main/worlds/a.wbt",
+        ] {
+            assert!(ProjectUrl::parse(text).is_err(), "{text:?} was taken for a world");
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn reading_any_text_never_panics(text in "\\PC*", path in "[a-z%2./-]{0,60}") {
+            let any = ProjectUrl::parse(&text);
+            let likely = ProjectUrl::parse(&format!("https://github.com/{path}/worlds/a.wbt"));
+            prop_assert!(any.is_err() || !text.is_empty());
+            drop(likely);
+        }
+
+        #[test]
+        fn no_segment_of_a_url_leaves_its_folder(path in "([a-z]{1,3}|%2e|\\.|%2f|/|\\.\\.){1,30}") {
+            if let Ok(url) = ProjectUrl::parse(&format!("https://github.com/u/r/blob/{path}/worlds/a.wbt")) {
+                for segment in url.segments() {
+                    prop_assert!(!segment.contains('/') && segment != ".." && segment != "." && !segment.is_empty());
+                }
+            }
+        }
+    }
+}
