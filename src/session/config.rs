@@ -62,7 +62,7 @@ pub struct SessionConfig {
     /// Default: 2.
     #[serde(default = "client_cost", deserialize_with = "percent")]
     pub client_cost: f64,
-    /// How many client WebSockets may be open in all. Default: 20000.
+    /// How many client `WebSockets` may be open in all. Default: 20000.
     #[serde(default = "many_clients", deserialize_with = "whole::<1, 1_000_000, _, _>")]
     pub max_clients: usize,
     /// Every other duration.
@@ -111,12 +111,12 @@ impl Default for Timing {
         Self {
             answer: Duration::from_secs(3),
             ping: Duration::from_secs(20),
-            silence: Duration::from_secs(60),
+            silence: Duration::from_mins(1),
             placement: Duration::from_secs(15),
             gather: Duration::from_secs(10),
-            flapping: Duration::from_secs(600),
+            flapping: Duration::from_mins(10),
             mail_retry: Duration::from_secs(10),
-            mail_patience: Duration::from_secs(3600),
+            mail_patience: Duration::from_hours(1),
             mail_answer: Duration::from_secs(30),
             stop: Duration::from_secs(4),
         }
