@@ -5,7 +5,7 @@ use std::time::Duration;
 use serde::{Deserialize, Serialize};
 
 use crate::shared::address::PublicAddress;
-use crate::shared::config::{Configuration, ExpandedPath, Unfit, optional_port, percent, seconds, whole};
+use crate::shared::config::{Configuration, ExpandedPath, Secret, Unfit, optional_port, percent, seconds, whole};
 
 /// Every key of the session server. The original's keys keep their meaning.
 #[derive(Debug, Clone, Serialize, Deserialize)]
@@ -123,30 +123,6 @@ impl Default for Timing {
     }
 }
 
-/// A text that is never shown.
-#[derive(Clone, Deserialize)]
-pub struct Secret(String);
-
-impl Secret {
-    /// The text, for the one who needs it.
-    #[must_use]
-    pub fn reveal(&self) -> &str {
-        &self.0
-    }
-}
-
-impl std::fmt::Debug for Secret {
-    fn fmt(&self, out: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        out.write_str("********")
-    }
-}
-
-impl Serialize for Secret {
-    fn serialize<S: serde::Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        serializer.serialize_str("********")
-    }
-}
-
 impl SessionConfig {
     /// Where this server is reached from outside.
     #[must_use]
@@ -162,7 +138,7 @@ impl Configuration for SessionConfig {
         let mut warnings = Vec::new();
         if self.server.is_empty() {
             warnings.push("server is not set: URLs will name localhost".to_owned());
-            self.server = "localhost".to_owned();
+            "localhost".clone_into(&mut self.server);
         }
         let mut seen = std::collections::HashSet::new();
         for address in &self.simulation_servers {

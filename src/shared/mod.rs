@@ -1,10 +1,16 @@
 //! What both servers stand on. Knows neither of them.
 
 pub mod address;
+pub mod admission;
+pub mod auth;
 pub mod config;
+pub mod liveness;
 pub mod load;
 pub mod logging;
+pub mod metrics;
+pub mod permanent;
 pub mod project_url;
 pub mod repositories;
 pub mod shutdown;
+pub mod start;
 pub mod status;

@@ -45,3 +45,20 @@ impl Signals {
         }
     }
 }
+
+/// What a server is doing, as everybody in it can see from a watch channel.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Phase {
+    /// It takes clients.
+    Open,
+    /// It keeps the clients that it has, and takes no others.
+    Draining,
+    /// It ends: clients are told to go.
+    Closing,
+}
+
+/// Waits until a server is closing.
+pub async fn closing(mut phase: tokio::sync::watch::Receiver<Phase>) {
+    // A sender that is gone means the same.
+    phase.wait_for(|phase| *phase == Phase::Closing).await.ok();
+}

@@ -1,0 +1,104 @@
+//! Whether a world may run here, now. Pure.
+
+use super::load::Load;
+use super::project_url::ProjectUrl;
+use super::repositories::{UrlPrefix, any_covers};
+
+/// The rules of a server.
+#[derive(Debug, Clone)]
+pub struct Rules {
+    /// Whose worlds run at any load.
+    pub allowed: Vec<UrlPrefix>,
+    /// Whose worlds never run.
+    pub blocked: Vec<UrlPrefix>,
+    /// Whether worlds of others can be shut into containers.
+    pub docker: bool,
+    /// The highest load, in percent, at which worlds of others run; 0: never.
+    pub share_idle_time: f64,
+}
+
+/// Why a world may not run. Its words are for the client.
+#[derive(Debug, PartialEq, thiserror::Error)]
+pub enum Refusal {
+    /// On the list of the blocked.
+    #[error("Cannot run simulation from blocked repository: {0}")]
+    Blocked(String),
+    /// Not allowed, and no way to run it safely.
+    #[error(
+        "{0} is not one of the repositories that this simulation server allows, and it runs no others, for Docker is not enabled"
+    )]
+    NotAllowed(String),
+    /// Not allowed, and the server shares nothing.
+    #[error("This simulation server is not configured to share idle time: it does not allow {0}")]
+    NotShared(String),
+    /// Not allowed while the server is busy.
+    #[error(
+        "Cannot share idle time when current load is above threshold: {load:.0} % are more than {threshold} %. Try again later"
+    )]
+    Busy {
+        /// Percent.
+        load: f64,
+        /// Percent.
+        threshold: f64,
+    },
+}
+
+impl Rules {
+    /// Whether a world may run at this load. A blocked repository never may; the original asks that only of worlds
+    /// that are not allowed.
+    ///
+    /// # Errors
+    /// Why it may not.
+    pub fn admit(&self, world: &ProjectUrl, load: Load) -> Result<(), Refusal> {
+        if any_covers(&self.blocked, world) {
+            return Err(Refusal::Blocked(world.repository()));
+        }
+        if any_covers(&self.allowed, world) {
+            return Ok(());
+        }
+        if !self.docker {
+            return Err(Refusal::NotAllowed(world.repository()));
+        }
+        if self.share_idle_time <= 0.0 {
+            return Err(Refusal::NotShared(world.repository()));
+        }
+        if load.percent() > self.share_idle_time {
+            return Err(Refusal::Busy { load: load.percent(), threshold: self.share_idle_time });
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_world_runs_by_its_repository_and_the_load() {
+        let prefixes =
+            |texts: &[&str]| texts.iter().map(|text| UrlPrefix::try_from((*text).to_owned()).unwrap()).collect();
+        let rules = |docker, share_idle_time| Rules {
+            allowed: prefixes(&["https://github.com/lab"]),
+            blocked: prefixes(&["https://github.com/lab/secret", "https://github.com/Evil"]),
+            docker,
+            share_idle_time,
+        };
+        let table = [
+            ("lab/arm", true, 50.0, 99.0, "", "allowed at any load"),
+            ("LAB/arm", false, 0.0, 0.0, "", "forges don't tell cases apart"),
+            ("lab/secret", true, 50.0, 0.0, "blocked", "blocked even where allowed"),
+            ("evil/x", true, 50.0, 0.0, "blocked", "no way around by small letters"),
+            ("lab-evil/arm", false, 50.0, 0.0, "Docker", "a like beginning is no prefix"),
+            ("other/x", false, 50.0, 0.0, "Docker", "others need a container"),
+            ("other/x", true, 0.0, 0.0, "not configured to share", "nothing is shared"),
+            ("other/x", true, 50.0, 50.0, "", "idle enough"),
+            ("other/x", true, 50.0, 50.1, "above threshold", "too busy"),
+        ];
+        for (repository, docker, share, load, words, why) in table {
+            let world = ProjectUrl::parse(&format!("https://github.com/{repository}/blob/main/worlds/a.wbt")).unwrap();
+            let verdict = rules(docker, share).admit(&world, Load::try_from(load).unwrap());
+            let text = verdict.map_or_else(|refusal| refusal.to_string(), |()| String::new());
+            assert!(if words.is_empty() { text.is_empty() } else { text.contains(words) }, "{why}: {text:?}");
+        }
+    }
+}

@@ -1,0 +1,80 @@
+//! Counters and gauges in Prometheus' text format.
+
+use prometheus::{Encoder, GaugeVec, IntCounterVec, Opts, Registry, TextEncoder};
+
+/// The metrics of one server.
+///
+/// Counters live as long as the server; gauges are set from its state whenever somebody asks.
+#[derive(Debug, Clone)]
+pub struct Metrics {
+    counters: Registry,
+}
+
+/// The media type of [`Metrics::render`].
+pub const CONTENT_TYPE: &str = prometheus::TEXT_FORMAT;
+
+/// A gauge with its help text and its values, each with the values of its labels.
+#[derive(Debug)]
+pub struct Gauge<'text> {
+    /// The metric's name.
+    pub name: &'text str,
+    /// What it means, with its unit.
+    pub help: &'text str,
+    /// The names of its labels.
+    pub labels: &'text [&'text str],
+    /// The values.
+    pub values: Vec<(Vec<String>, f64)>,
+}
+
+impl<'text> Gauge<'text> {
+    /// A gauge without labels.
+    #[must_use]
+    pub fn plain(name: &'text str, help: &'text str, value: f64) -> Self {
+        Self { name, help, labels: &[], values: vec![(Vec::new(), value)] }
+    }
+}
+
+impl Metrics {
+    /// Metrics without counters.
+    #[must_use]
+    pub fn new() -> Self {
+        Self { counters: Registry::new() }
+    }
+
+    /// Adds a counter with one label.
+    ///
+    /// # Errors
+    /// When its name is no name, or is there already.
+    pub fn counter(&self, name: &str, help: &str, label: &str) -> Result<IntCounterVec, prometheus::Error> {
+        let counter = IntCounterVec::new(Opts::new(name, help), &[label])?;
+        self.counters.register(Box::new(counter.clone()))?;
+        Ok(counter)
+    }
+
+    /// Writes the counters and these gauges.
+    ///
+    /// # Errors
+    /// When a gauge's name or labels are no names.
+    pub fn render(&self, gauges: &[Gauge<'_>]) -> Result<Vec<u8>, prometheus::Error> {
+        let registry = Registry::new();
+        for gauge in gauges {
+            let family = GaugeVec::new(Opts::new(gauge.name, gauge.help), gauge.labels)?;
+            for (labels, value) in &gauge.values {
+                let labels: Vec<&str> = labels.iter().map(String::as_str).collect();
+                family.get_metric_with_label_values(&labels)?.set(*value);
+            }
+            registry.register(Box::new(family))?;
+        }
+        let mut families = self.counters.gather();
+        families.extend(registry.gather());
+        let mut text = Vec::new();
+        TextEncoder::new().encode(&families, &mut text)?;
+        Ok(text)
+    }
+}
+
+impl Default for Metrics {
+    fn default() -> Self {
+        Self::new()
+    }
+}

@@ -1,0 +1,66 @@
+//! How a program starts: configuration, log, then the server, and an exit code.
+
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+
+use super::config::{self, Configuration, Loaded};
+use super::logging::{self, LogTarget};
+
+/// The server failed at run time: a port that is taken, an actor that is gone.
+pub const FAILED: u8 = 1;
+/// The configuration can't be used.
+pub const WRONG_CONFIGURATION: u8 = 2;
+
+/// Reads a configuration, or says in one line why it can't be used.
+///
+/// # Errors
+/// The exit code.
+pub fn read<C: Configuration>(file: &Path) -> Result<Loaded<C>, ExitCode> {
+    config::load(file).map_err(|error| {
+        eprintln!("error: {error}");
+        ExitCode::from(WRONG_CONFIGURATION)
+    })
+}
+
+/// Prints the effective configuration, and warnings to the error output.
+#[must_use]
+pub fn check<C: Configuration>(loaded: &Loaded<C>) -> ExitCode {
+    for warning in &loaded.warnings {
+        eprintln!("warning: {warning}");
+    }
+    match serde_json::to_string_pretty(&loaded.config) {
+        Ok(text) => {
+            println!("{text}");
+            ExitCode::SUCCESS
+        }
+        Err(error) => {
+            eprintln!("error: {error}");
+            ExitCode::from(WRONG_CONFIGURATION)
+        }
+    }
+}
+
+/// Starts the log and runs a server to its end.
+pub fn serve<E: std::error::Error>(
+    log: &PathBuf,
+    debug: bool,
+    warnings: &[String],
+    server: impl Future<Output = Result<(), E>>,
+) -> ExitCode {
+    let target = if debug { LogTarget::Stdout } else { LogTarget::File(log) };
+    if let Err(error) = logging::start(target) {
+        eprintln!("error: the log {} can't be written: {error}", log.display());
+        return ExitCode::from(FAILED);
+    }
+    for warning in warnings {
+        log::warn!("{warning}");
+    }
+    match actix_rt::System::new().block_on(server) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            log::error!("{error}");
+            eprintln!("error: {error}");
+            ExitCode::from(FAILED)
+        }
+    }
+}

@@ -1,0 +1,64 @@
+//! Actor: tells other services, at start, that this server is there.
+//!
+//! One for the whole server. It posts the form of the original to each address in `notify`, up to six times, and holds
+//! up nothing. It ends when all are told or given up.
+
+use std::time::Duration;
+
+use actix::prelude::*;
+use futures_util::future::join_all;
+
+use super::config::SimulationConfig;
+
+/// How often each address is tried.
+const TRIES: u32 = 6;
+/// How long an address may take to answer.
+const ANSWER: Duration = Duration::from_secs(10);
+
+/// The actor.
+pub struct Announcer {
+    addresses: Vec<String>,
+    form: Vec<(&'static str, String)>,
+    pause: Duration,
+}
+
+impl Announcer {
+    /// Prepares the announcements of a server.
+    #[must_use]
+    pub fn new(config: &SimulationConfig) -> Self {
+        let allowed: Vec<&str> = config.allowed_repositories.iter().map(|prefix| prefix.as_str()).collect();
+        let form = vec![
+            ("url", config.address(config.port).http_url(config.ssl)),
+            ("shareIdleTime", config.share_idle_time.to_string()),
+            ("allowedRepositories", allowed.join(",")),
+        ];
+        Self { addresses: config.notify.clone(), form, pause: config.timing.announce }
+    }
+}
+
+async fn announce(address: String, form: Vec<(&'static str, String)>, pause: Duration) {
+    let client = awc::Client::builder().timeout(ANSWER).finish();
+    for attempt in 1..=TRIES {
+        let problem = match client.post(&address).send_form(&form).await {
+            Ok(answer) if answer.status().is_success() => {
+                log::info!("announced to {address}");
+                return;
+            }
+            Ok(answer) => format!("it answered {}", answer.status()),
+            Err(error) => error.to_string(),
+        };
+        log::warn!("can't announce to {address} ({attempt} of {TRIES}): {problem}");
+        actix_rt::time::sleep(pause).await;
+    }
+    log::error!("gave up announcing to {address}");
+}
+
+impl Actor for Announcer {
+    type Context = Context<Self>;
+
+    fn started(&mut self, ctx: &mut Self::Context) {
+        let (form, pause) = (self.form.clone(), self.pause);
+        let announcements = self.addresses.drain(..).map(|address| announce(address, form.clone(), pause));
+        join_all(announcements.collect::<Vec<_>>()).into_actor(self).map(|_, _, ctx| ctx.stop()).spawn(ctx);
+    }
+}

@@ -1,0 +1,245 @@
+//! The simulation server as a whole: what it is made of, how it starts, and how it ends.
+
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use actix::prelude::*;
+use actix_web::dev::ServerHandle;
+use actix_web::{App, HttpServer, web};
+use tokio::sync::{Semaphore, watch};
+
+use super::announcer::Announcer;
+use super::checkout::{Checkouts, Limits};
+use super::config::SimulationConfig;
+use super::git::Git;
+use super::instance_dir::{RunDir, Swept};
+use super::load_monitor::{LoadMonitor, Readings};
+use super::places::{Census, Places};
+use super::repository_cache::RepositoryCache;
+use super::routes;
+use crate::shared::admission::Rules;
+use crate::shared::load::Load;
+use crate::shared::metrics::Metrics;
+use crate::shared::permanent;
+use crate::shared::shutdown::{Phase, Request, Signals};
+
+/// What routes and web clients share.
+pub struct Server {
+    /// The effective configuration.
+    pub config: Arc<SimulationConfig>,
+    /// Whose worlds run here.
+    pub rules: Rules,
+    /// Lends places.
+    pub places: Addr<Places>,
+    /// The machine's load.
+    pub readings: watch::Receiver<Arc<Readings>>,
+    /// Checks worlds out.
+    pub checkouts: Arc<Checkouts>,
+    /// Folders of simulations.
+    pub run: Arc<RunDir>,
+    /// Whether clients are taken.
+    pub phase: watch::Receiver<Phase>,
+    /// Where drains are asked for.
+    pub requests: tokio::sync::mpsc::Sender<Request>,
+    /// Where Webots' actors live.
+    pub main_thread: ArbiterHandle,
+    /// Counts connections.
+    pub connections: Arc<Semaphore>,
+    /// What is counted.
+    pub metrics: Metrics,
+    /// Clients that asked for a simulation, by what came of it.
+    pub starts: prometheus::IntCounterVec,
+    /// When the server was started.
+    pub started: Instant,
+}
+
+/// Why the server can't go on.
+#[derive(Debug, thiserror::Error)]
+pub enum AppError {
+    /// The port is taken, or may not be used.
+    #[error("can't listen on {address}: {source}")]
+    Bind {
+        /// Host and port.
+        address: String,
+        /// What the system says.
+        source: std::io::Error,
+    },
+    /// The cache folder can't be used.
+    #[error("the folder {} (cacheDir) can't be used: {source}", folder.display())]
+    Cache {
+        /// The folder.
+        folder: PathBuf,
+        /// What the system says.
+        source: std::io::Error,
+    },
+    /// Something else in the system.
+    #[error(transparent)]
+    System(#[from] std::io::Error),
+    /// A name of a metric is wrong.
+    #[error(transparent)]
+    Metrics(#[from] prometheus::Error),
+    /// A fault in this program.
+    #[error("{0}")]
+    Gone(String),
+}
+
+/// Between two looks whether all simulations have ended.
+const LOOK: Duration = Duration::from_millis(50);
+
+impl Server {
+    /// The load that is told: of a machine that drains, 100.
+    #[must_use]
+    pub fn load(&self) -> Load {
+        if self.is_draining() { Load::FULL } else { self.readings.borrow().load.unwrap_or(Load::ZERO) }
+    }
+
+    /// Whether no new clients are taken.
+    #[must_use]
+    pub fn is_draining(&self) -> bool {
+        *self.phase.borrow() != Phase::Open
+    }
+
+    /// The program that is started for each client.
+    ///
+    /// # Errors
+    /// Where it was looked for, and how to set it, in words for the client.
+    pub fn webots_program(&self) -> Result<PathBuf, String> {
+        let how = "Its administrator can set webotsHome in the server's configuration, or the environment variable \
+                   WEBOTS_HOME";
+        let Some(program) = self.config.webots_program() else {
+            return Err(format!("This simulation server does not know where Webots is installed. {how}."));
+        };
+        let program = std::path::absolute(&program).unwrap_or(program);
+        if program.is_file() {
+            Ok(program)
+        } else {
+            Err(format!("This simulation server has no Webots at {}. {how}.", program.display()))
+        }
+    }
+}
+
+/// Runs the server until it is asked to stop.
+///
+/// # Errors
+/// When it can't start, or an actor that must live is gone.
+pub async fn run(config: SimulationConfig) -> Result<(), AppError> {
+    let mut signals = Signals::catch()?;
+    let (phase_sender, phase) = watch::channel(Phase::Open);
+    let (requests, mut asked) = tokio::sync::mpsc::channel(4);
+    let socket = bind(&config)?;
+    let server = Arc::new(assemble(config, phase, requests)?);
+    let shared = web::Data::from(Arc::clone(&server));
+    let http = HttpServer::new(move || App::new().app_data(shared.clone()).configure(routes::configure))
+        .disable_signals()
+        .shutdown_timeout(1)
+        .listen(socket)?
+        .run();
+    let handle = http.handle();
+    let serving = actix_rt::spawn(http);
+    tell_start(&server.config);
+    let places = server.places.clone();
+    let lost = permanent::gone("Places", places.clone());
+    let mut lost = std::pin::pin!(lost);
+    loop {
+        let request = tokio::select! {
+            request = signals.next() => request,
+            Some(request) = asked.recv() => request,
+            () = drained(&server) => Request::Stop,
+            name = &mut lost => return Err(AppError::Gone(name)),
+        };
+        match request {
+            Request::Stop => break,
+            Request::Drain => {
+                log::info!("draining: no new clients, the server ends when the last has gone");
+                phase_sender.send_replace(Phase::Draining);
+            }
+            Request::Reload => log::info!("SIGHUP changes nothing here: the configuration is read at start"),
+        }
+    }
+    log::info!("stopping");
+    phase_sender.send_replace(Phase::Closing);
+    actix_rt::time::timeout(server.config.timing.stop, empty(&places)).await.ok();
+    stop(&handle).await;
+    drop(serving);
+    log::info!("stopped");
+    Ok(())
+}
+
+fn bind(config: &SimulationConfig) -> Result<std::net::TcpListener, AppError> {
+    let address = format!("{}:{}", config.bind, config.port);
+    std::net::TcpListener::bind(&address).map_err(|source| AppError::Bind { address, source })
+}
+
+/// Makes everything that the server is made of, and starts its actors.
+fn assemble(
+    config: SimulationConfig,
+    phase: watch::Receiver<Phase>,
+    requests: tokio::sync::mpsc::Sender<Request>,
+) -> Result<Server, AppError> {
+    let folder = config.cache_dir.0.clone();
+    let cache_fault = |source| AppError::Cache { folder: folder.clone(), source };
+    let (run, swept) = RunDir::open(&folder).map_err(cache_fault)?;
+    if swept != Swept::default() {
+        log::warn!("removed what {} earlier runs had left, {} processes among it", swept.runs, swept.processes);
+    }
+    let git = Git::new(run.path()).map_err(cache_fault)?;
+    let cache = RepositoryCache::open(&folder, config.cache_size << 20).map_err(cache_fault)?;
+    let limits = Limits { time: config.timing.checkout, size: config.project_size << 20 };
+    let runtime = tokio::runtime::Handle::current();
+    let checkouts = Checkouts::new(git, cache, config.git_mirrors.clone(), limits, runtime);
+    let places = Places::new(config.streaming_ports(), config.waiting_line).start();
+    let csv = config.monitor_log_enabled.then(|| config.log_dir.0.join("simulation/monitor.csv"));
+    let (load_monitor, readings) = LoadMonitor::new(places.clone(), run.path(), csv);
+    load_monitor.start();
+    if !config.notify.is_empty() {
+        Announcer::new(&config).start();
+    }
+    let metrics = Metrics::new();
+    let starts = metrics.counter("simulation_starts_total", "Clients that asked for a simulation", "outcome")?;
+    let rules = Rules {
+        allowed: config.allowed_repositories.clone(),
+        blocked: config.blocked_repositories.clone(),
+        docker: config.docker,
+        share_idle_time: config.share_idle_time,
+    };
+    Ok(Server {
+        rules,
+        places,
+        readings,
+        checkouts: Arc::new(checkouts),
+        run: Arc::new(run),
+        phase,
+        requests,
+        main_thread: Arbiter::current(),
+        connections: Arc::new(Semaphore::new(config.max_clients)),
+        metrics,
+        starts,
+        started: Instant::now(),
+        config: Arc::new(config),
+    })
+}
+
+fn tell_start(config: &SimulationConfig) {
+    let address = config.address(config.port).http_url(config.ssl);
+    log::info!("simulation server {} listens on port {}: {address}", env!("CARGO_PKG_VERSION"), config.port);
+    println!("simulation server: {address}/monitor (local port {})", config.port);
+}
+
+/// Waits until the server is draining and its last client has gone.
+async fn drained(server: &Server) {
+    let mut phase = server.phase.clone();
+    phase.wait_for(|phase| *phase == Phase::Draining).await.ok();
+    empty(&server.places).await;
+}
+
+/// Waits until no simulation is left, nor anybody who waits for one.
+async fn empty(places: &Addr<Places>) {
+    while places.send(Census).await.is_ok_and(|census| !census.simulations.is_empty()) {
+        actix_rt::time::sleep(LOOK).await;
+    }
+}
+
+async fn stop(http: &ServerHandle) {
+    http.stop(true).await;
+}

@@ -1,0 +1,302 @@
+//! Actor: lends places to simulations, keeps the waiting line, and knows who is here.
+//!
+//! One for the whole server, created at start; it never ends. A place is a streaming port. Whoever wants one gets a
+//! [`Ticket`] at once and then hears how many are ahead, until a port is granted. Dropping the ticket leaves the line
+//! or frees the port, so that it can't be forgotten in any state or by any panic.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::net::{Ipv4Addr, TcpListener};
+use std::ops::RangeInclusive;
+use std::path::PathBuf;
+use std::time::{Duration, SystemTime};
+
+use actix::prelude::*;
+use serde::Serialize;
+
+use crate::shared::status::Instances;
+
+/// Asks for a place.
+#[derive(Message)]
+#[rtype(result = "Result<Ticket, Refused>")]
+pub struct Ask {
+    /// Who wants to know when there is one.
+    pub client: Recipient<PlaceEvent>,
+    /// The world's URL, to show who is here.
+    pub world: String,
+}
+
+/// No place is given.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum Refused {
+    /// Everything is taken, the waiting line too.
+    #[error(
+        "All {places} places of this simulation server are taken, and {waiting} clients are waiting already. Try again later"
+    )]
+    Full {
+        /// Places in all.
+        places: usize,
+        /// Length of the waiting line.
+        waiting: usize,
+    },
+}
+
+/// What the one who asked hears.
+#[derive(Message, Debug, Clone, Copy, PartialEq, Eq)]
+#[rtype(result = "()")]
+pub enum PlaceEvent {
+    /// So many clients are ahead in the waiting line.
+    Ahead(usize),
+    /// This port may be used as long as the ticket lives.
+    Granted(u16),
+}
+
+/// A place, or a place in the line for one. Dropping it gives it back.
+#[derive(Debug)]
+pub struct Ticket {
+    id: u64,
+    places: Addr<Places>,
+}
+
+/// Tells what a simulation is doing, to show it.
+#[derive(Message)]
+#[rtype(result = "()")]
+pub struct Update {
+    id: u64,
+    change: Change,
+}
+
+/// What has changed in a simulation.
+#[derive(Debug)]
+pub enum Change {
+    /// It is in another state.
+    Stage(Stage),
+    /// Its world was made for this version of Webots.
+    Version(String),
+    /// It streams on this port, and its output is kept in this file.
+    Launched {
+        /// The port that was granted.
+        port: u16,
+        /// The file.
+        log: PathBuf,
+    },
+    /// It streams on this port.
+    Port(u16),
+}
+
+/// The states of a simulation as they are shown.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Stage {
+    /// In the waiting line.
+    Queued,
+    /// Its project is checked out.
+    CheckingOut,
+    /// Webots is starting.
+    Launching,
+    /// Webots runs, the simulation is paused.
+    Idle,
+    /// The simulation runs.
+    Running,
+    /// Webots is ending.
+    Stopping,
+}
+
+/// Asks who is here.
+#[derive(Message)]
+#[rtype(result = "Everybody")]
+pub struct Census;
+
+/// Who is here.
+#[derive(Debug, Clone, Default, MessageResponse)]
+pub struct Everybody {
+    /// How many, by state.
+    pub instances: Instances,
+    /// Each simulation, the oldest first.
+    pub simulations: Vec<Simulation>,
+}
+
+/// One simulation as it is shown.
+#[derive(Debug, Clone, Serialize)]
+#[serde(rename_all = "camelCase")]
+pub struct Simulation {
+    /// The world's URL.
+    pub world: String,
+    /// Its state.
+    pub stage: Stage,
+    /// When its client asked for it, in seconds since 1970.
+    pub since: u64,
+    /// The streaming port, once there is one.
+    pub port: Option<u16>,
+    /// The version of Webots that the world was made for.
+    pub version: Option<String>,
+    /// The file that its output is kept in.
+    pub log: Option<PathBuf>,
+}
+
+#[derive(Message)]
+#[rtype(result = "()")]
+struct Leave(u64);
+
+/// The actor.
+pub struct Places {
+    ports: RangeInclusive<u16>,
+    longest_line: usize,
+    last: u64,
+    present: BTreeMap<u64, Present>,
+    line: VecDeque<Waiting>,
+}
+
+struct Present {
+    /// The port that is lent, which is not always the one that Webots took.
+    lent: Option<u16>,
+    shown: Simulation,
+}
+
+struct Waiting {
+    id: u64,
+    client: Recipient<PlaceEvent>,
+    told: Option<usize>,
+}
+
+/// Between two looks for a port that somebody outside of this server has taken.
+const LOOK_AGAIN: Duration = Duration::from_secs(1);
+
+impl Places {
+    /// Lends these ports; `longest_line` clients may wait.
+    #[must_use]
+    pub fn new(ports: RangeInclusive<u16>, longest_line: usize) -> Self {
+        Self { ports, longest_line, last: 0, present: BTreeMap::new(), line: VecDeque::new() }
+    }
+
+    /// Gives free places to those who wait, and tells the others how many are ahead.
+    fn serve(&mut self) {
+        while !self.line.is_empty()
+            && let Some(port) = self.free_port()
+            && let Some(first) = self.line.pop_front()
+        {
+            // Whoever is gone by now drops the ticket too.
+            if first.client.try_send(PlaceEvent::Granted(port)).is_ok()
+                && let Some(present) = self.present.get_mut(&first.id)
+            {
+                present.lent = Some(port);
+                present.shown.port = Some(port);
+                present.shown.stage = Stage::CheckingOut;
+            }
+        }
+        for (ahead, waiting) in self.line.iter_mut().enumerate() {
+            if waiting.told != Some(ahead) && waiting.client.try_send(PlaceEvent::Ahead(ahead)).is_ok() {
+                waiting.told = Some(ahead);
+            }
+        }
+    }
+
+    /// The lowest port that is neither lent nor used by anybody else.
+    fn free_port(&self) -> Option<u16> {
+        let taken = |port: u16| self.present.values().any(|one| one.lent == Some(port) || one.shown.port == Some(port));
+        self.ports
+            .clone()
+            .filter(|port| !taken(*port))
+            .find(|port| TcpListener::bind((Ipv4Addr::UNSPECIFIED, *port)).is_ok())
+    }
+
+    fn instances(&self) -> Instances {
+        let count = |stages: &[Stage]| {
+            let matching = self.present.values().filter(|one| stages.contains(&one.shown.stage)).count();
+            u32::try_from(matching).unwrap_or(u32::MAX)
+        };
+        Instances {
+            queued: count(&[Stage::Queued]),
+            starting: count(&[Stage::CheckingOut, Stage::Launching]),
+            idle: count(&[Stage::Idle, Stage::Stopping]),
+            running: count(&[Stage::Running]),
+            places: u32::try_from(self.ports.len()).unwrap_or(u32::MAX),
+            arrivals: self.last,
+        }
+    }
+}
+
+impl Actor for Places {
+    type Context = Context<Self>;
+
+    fn started(&mut self, ctx: &mut Self::Context) {
+        ctx.run_interval(LOOK_AGAIN, |places, _| places.serve());
+    }
+}
+
+impl Handler<Ask> for Places {
+    type Result = Result<Ticket, Refused>;
+
+    fn handle(&mut self, ask: Ask, ctx: &mut Self::Context) -> Self::Result {
+        self.last += 1;
+        let free = self.line.is_empty() && self.free_port().is_some();
+        if !free && self.line.len() >= self.longest_line {
+            return Err(Refused::Full { places: self.ports.len(), waiting: self.line.len() });
+        }
+        let id = self.last;
+        let shown = Simulation {
+            world: ask.world,
+            stage: Stage::Queued,
+            since: SystemTime::UNIX_EPOCH.elapsed().map_or(0, |age| age.as_secs()),
+            port: None,
+            version: None,
+            log: None,
+        };
+        self.present.insert(id, Present { lent: None, shown });
+        self.line.push_back(Waiting { id, client: ask.client, told: None });
+        self.serve();
+        Ok(Ticket { id, places: ctx.address() })
+    }
+}
+
+impl Handler<Leave> for Places {
+    type Result = ();
+
+    fn handle(&mut self, Leave(id): Leave, _: &mut Self::Context) {
+        self.present.remove(&id);
+        self.line.retain(|waiting| waiting.id != id);
+        self.serve();
+    }
+}
+
+impl Handler<Update> for Places {
+    type Result = ();
+
+    fn handle(&mut self, Update { id, change }: Update, _: &mut Self::Context) {
+        let Some(Present { shown, .. }) = self.present.get_mut(&id) else {
+            return;
+        };
+        match change {
+            Change::Stage(stage) => shown.stage = stage,
+            Change::Version(version) => shown.version = Some(version),
+            Change::Port(port) => shown.port = Some(port),
+            Change::Launched { port, log } => {
+                shown.port = Some(port);
+                shown.log = Some(log);
+                shown.stage = Stage::Launching;
+            }
+        }
+    }
+}
+
+impl Handler<Census> for Places {
+    type Result = Everybody;
+
+    fn handle(&mut self, _: Census, _: &mut Self::Context) -> Everybody {
+        let simulations = self.present.values().map(|one| one.shown.clone()).collect();
+        Everybody { instances: self.instances(), simulations }
+    }
+}
+
+impl Ticket {
+    /// Tells what the simulation is doing.
+    pub fn update(&self, change: Change) {
+        // The actor lives as long as the server; without it there is nothing to show.
+        self.places.do_send(Update { id: self.id, change });
+    }
+}
+
+impl Drop for Ticket {
+    fn drop(&mut self) {
+        self.places.do_send(Leave(self.id));
+    }
+}

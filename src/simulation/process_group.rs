@@ -1,0 +1,127 @@
+//! A program that the server has started, with all that it starts: dropping it ends them.
+
+use std::ffi::OsString;
+use std::fmt;
+use std::future::Future;
+use std::io::{PipeWriter, Write};
+use std::os::unix::process::ExitStatusExt;
+use std::path::PathBuf;
+use std::process::{ExitStatus, Stdio};
+use std::time::Duration;
+
+use super::guardian::NOT_STARTED;
+use super::process_tree;
+
+/// What to start, and how it ends.
+#[derive(Debug)]
+pub struct Plan {
+    /// The program and its arguments; no shell ever sees them.
+    pub command: Vec<OsString>,
+    /// Variables that are added to the server's own environment.
+    pub environment: Vec<(OsString, OsString)>,
+    /// Working folder; the server's own where absent.
+    pub folder: Option<PathBuf>,
+    /// By which every process of the tree is known, and what a later server sweeps.
+    pub mark: PathBuf,
+    /// Folder that is removed with the tree.
+    pub remove: Option<PathBuf>,
+    /// Time between SIGTERM and SIGKILL.
+    pub grace: Duration,
+}
+
+/// A guard for a running program and all its descendants.
+///
+/// Dropping it closes the guardian's lifeline (see [`super::guardian`]): everything is killed at once, also when the
+/// drop comes from a panic, and also when the server itself is killed.
+#[derive(Debug)]
+pub struct ProcessGroup {
+    lifeline: PipeWriter,
+    guardian: i32,
+}
+
+/// How a program ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Ending {
+    /// With this exit code.
+    Code(u8),
+    /// By this signal.
+    Signal(u8),
+    /// It could not be started.
+    NotStarted,
+}
+
+impl ProcessGroup {
+    /// Starts a program; the future ends when nothing of its tree is left.
+    ///
+    /// # Errors
+    /// When the system can start no more processes.
+    pub fn start(
+        plan: &Plan,
+        output: Stdio,
+        errors: Stdio,
+    ) -> std::io::Result<(Self, impl Future<Output = Ending> + Send + 'static)> {
+        let (reader, lifeline) = std::io::pipe()?;
+        let mut command = tokio::process::Command::new("/proc/self/exe");
+        command.arg0("simulation-server").arg("guard");
+        command.args(["--grace", &plan.grace.as_millis().to_string()]);
+        if let Some(folder) = &plan.remove {
+            command.arg("--remove").arg(folder);
+        }
+        command.arg("--").args(&plan.command);
+        command.envs(plan.environment.iter().map(|(name, value)| (name, value))).env(process_tree::MARK, &plan.mark);
+        if let Some(folder) = &plan.folder {
+            command.current_dir(folder);
+        }
+        let mut child = command.stdin(reader).stdout(output).stderr(errors).process_group(0).spawn()?;
+        let guardian = child.id().and_then(|id| i32::try_from(id).ok()).unwrap_or_default();
+        let mark = plan.mark.clone();
+        let ended = async move {
+            match child.wait().await {
+                Ok(status) if status.signal().is_none() => Ending::of_guardian(status),
+                // Somebody has killed the guardian: what it guarded is found by its mark.
+                _ => {
+                    log::error!("the guardian {guardian} was killed, its processes are ended by their mark");
+                    actix_rt::task::spawn_blocking(move || process_tree::kill_marked(&mark)).await.ok();
+                    Ending::Signal(9)
+                }
+            }
+        };
+        Ok((Self { lifeline, guardian }, ended))
+    }
+
+    /// The process from which the whole tree descends.
+    #[must_use]
+    pub fn guardian(&self) -> i32 {
+        self.guardian
+    }
+
+    /// Asks for an orderly end: SIGTERM, the grace time, SIGKILL.
+    pub fn ask_to_end(&mut self) {
+        // A guardian that no longer reads has nothing left to end.
+        self.lifeline.write_all(b".").ok();
+    }
+}
+
+impl Ending {
+    fn of_guardian(status: ExitStatus) -> Self {
+        match u8::try_from(status.code().unwrap_or_default()).unwrap_or_default() {
+            NOT_STARTED => Self::NotStarted,
+            code if code > 128 => Self::Signal(code - 128),
+            code => Self::Code(code),
+        }
+    }
+}
+
+impl fmt::Display for Ending {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Code(0) => out.write_str("ended"),
+            Self::Code(code) => write!(out, "ended with exit code {code}"),
+            Self::NotStarted => out.write_str("could not be started"),
+            Self::Signal(number) => match nix::sys::signal::Signal::try_from(i32::from(*number)) {
+                Ok(signal) => write!(out, "was ended by the signal {signal}"),
+                Err(_) => write!(out, "was ended by signal {number}"),
+            },
+        }
+    }
+}

@@ -1,0 +1,146 @@
+//! Who descends from a process, which ports its tree listens on, and how a whole tree is ended. Linux: `/proc`.
+
+use std::collections::HashSet;
+use std::ops::RangeInclusive;
+use std::path::Path;
+
+use nix::sys::signal::{Signal, kill};
+use nix::unistd::Pid;
+use procfs::net::TcpState;
+use procfs::process::{FDTarget, Process, all_processes};
+
+/// The environment variable by which every process of an instance is known: its value is the instance's folder.
+/// Children inherit it, so that even those are found that left their process group and lost their parent.
+pub const MARK: &str = "WEBOTS_FLEET_INSTANCE";
+
+/// All descendants of a process that exist at this moment, without itself.
+#[must_use]
+pub fn descendants(root: i32) -> Vec<i32> {
+    let mut found = Vec::new();
+    let mut open = vec![root];
+    while let Some(pid) = open.pop() {
+        for child in children(pid) {
+            found.push(child);
+            open.push(child);
+        }
+    }
+    found
+}
+
+/// A process that has ended has no children; that is no fault.
+fn children(pid: i32) -> Vec<i32> {
+    let Ok(tasks) = Process::new(pid).and_then(|process| process.tasks()) else {
+        return Vec::new();
+    };
+    let of_task = |task: procfs::process::Task| task.children().unwrap_or_default();
+    tasks.flatten().flat_map(of_task).filter_map(|child| i32::try_from(child).ok()).collect()
+}
+
+/// Ends all descendants of a process. They are stopped first, so that none can fork its way out, then killed.
+pub fn kill_descendants(root: i32) {
+    let mut known = HashSet::new();
+    loop {
+        let fresh: Vec<i32> = descendants(root).into_iter().filter(|pid| known.insert(*pid)).collect();
+        if fresh.is_empty() {
+            break;
+        }
+        signal_each(&fresh, Signal::SIGSTOP);
+    }
+    signal_each(known.iter(), Signal::SIGKILL);
+}
+
+/// Ends every process that carries the mark of an instance below `folder`, in whatever tree it is now.
+///
+/// Gives back how many there were.
+#[must_use]
+pub fn kill_marked(folder: &Path) -> usize {
+    let marked = |process: &Process| {
+        process.environ().is_ok_and(|environment| {
+            environment.get(std::ffi::OsStr::new(MARK)).is_some_and(|value| Path::new(value).starts_with(folder))
+        })
+    };
+    let Ok(processes) = all_processes() else {
+        return 0;
+    };
+    let pids: Vec<i32> = processes.flatten().filter(marked).map(|process| process.pid()).collect();
+    signal_each(&pids, Signal::SIGKILL);
+    pids.len()
+}
+
+fn signal_each<'pid>(pids: impl IntoIterator<Item = &'pid i32>, signal: Signal) {
+    for pid in pids {
+        // The only fault is that the process has ended, which is what is wanted.
+        kill(Pid::from_raw(*pid), signal).ok();
+    }
+}
+
+/// The sockets that listen on ports of a range, as (port, inode).
+#[must_use]
+pub fn listeners(ports: &RangeInclusive<u16>) -> Vec<(u16, u64)> {
+    let four = procfs::net::tcp().unwrap_or_default();
+    let six = procfs::net::tcp6().unwrap_or_default();
+    let listening = four.into_iter().chain(six).filter(|entry| entry.state == TcpState::Listen);
+    listening.map(|entry| (entry.local_address.port(), entry.inode)).filter(|(port, _)| ports.contains(port)).collect()
+}
+
+/// The lowest port of a range on which a descendant of `root` listens; a listener of somebody else never counts.
+#[must_use]
+pub fn listening_port(root: i32, ports: &RangeInclusive<u16>) -> Option<u16> {
+    let mut listeners = listeners(ports);
+    if listeners.is_empty() {
+        return None;
+    }
+    listeners.sort_unstable();
+    let ours: HashSet<u64> = descendants(root).into_iter().flat_map(sockets).collect();
+    listeners.into_iter().find(|(_, inode)| ours.contains(inode)).map(|(port, _)| port)
+}
+
+/// The inodes of a process's sockets.
+fn sockets(pid: i32) -> Vec<u64> {
+    let Ok(files) = Process::new(pid).and_then(|process| process.fd()) else {
+        return Vec::new();
+    };
+    let socket = |file: procfs::process::FDInfo| match file.target {
+        FDTarget::Socket(inode) => Some(inode),
+        _ => None,
+    };
+    files.flatten().filter_map(socket).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::process::{Command, Stdio};
+
+    #[test]
+    fn grandchildren_are_found_and_ended() {
+        let mut shell = Command::new("sh").args(["-c", "sleep 100 & sleep 100 & echo ready; wait"]);
+        let mut shell = shell.stdout(Stdio::piped()).spawn().unwrap();
+        let mut line = String::new();
+        std::io::BufRead::read_line(&mut std::io::BufReader::new(shell.stdout.take().unwrap()), &mut line).unwrap();
+        let pid = i32::try_from(shell.id()).unwrap();
+        assert_eq!(descendants(pid).len(), 2);
+        kill_descendants(pid);
+        assert!(shell.wait().is_ok());
+        assert_eq!(descendants(pid), []);
+    }
+
+    #[test]
+    fn a_listener_of_somebody_else_does_not_count() {
+        let socket = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+        let port = socket.local_addr().unwrap().port();
+        let sleeper = Command::new("sleep").arg("100").spawn().unwrap();
+        let sleeper = Ended(sleeper);
+        assert_eq!(listeners(&(port..=port)).len(), 1);
+        assert_eq!(listening_port(i32::try_from(sleeper.0.id()).unwrap(), &(port..=port)), None);
+    }
+
+    struct Ended(std::process::Child);
+
+    impl Drop for Ended {
+        fn drop(&mut self) {
+            self.0.kill().ok();
+            self.0.wait().ok();
+        }
+    }
+}

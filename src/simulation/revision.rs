@@ -1,0 +1,205 @@
+//! Which commit a world's URL means, and what lies in it: arguments for git and the reading of its answers. Pure.
+
+use std::collections::HashSet;
+use std::ffi::OsString;
+use std::path::Path;
+
+use crate::shared::project_url::{ProjectUrl, Reading, RefKind};
+
+/// One commit that a world's URL may mean.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Revision {
+    /// The object that git names: a commit, or the tag that stands for one.
+    pub commit: String,
+    /// Branch, tag or commit, as the URL has it.
+    pub name: String,
+    /// What is asked for on the remote.
+    remote_name: String,
+    /// The project's folder; empty for the root.
+    pub folder: String,
+}
+
+/// How many readings of a URL are looked for: no real branch has more slashes in its name.
+const MOST_READINGS: usize = 12;
+
+/// The commit that a URL names by its full hash: then nobody need be asked what it is.
+#[must_use]
+pub fn commit_of(world: &ProjectUrl) -> Option<Revision> {
+    let Reading { reference, folder } = world.candidates().into_iter().next()?;
+    let is_hash = [40, 64].contains(&reference.len()) && reference.bytes().all(|byte| byte.is_ascii_hexdigit());
+    let kind = matches!(world.kind(), RefKind::Any | RefKind::Commit);
+    let commit = reference.to_ascii_lowercase();
+    (is_hash && kind).then(|| Revision { remote_name: commit.clone(), name: reference, commit, folder })
+}
+
+/// Asks the remote for all branches and tags that a URL may mean.
+#[must_use]
+pub fn search_arguments(world: &ProjectUrl, location: &str) -> Vec<OsString> {
+    let names = world.candidates().into_iter().take(MOST_READINGS).flat_map(|reading| full_names(world, &reading));
+    let fixed = ["ls-remote", "--quiet", "--", location].map(OsString::from);
+    fixed.into_iter().chain(names.map(OsString::from)).collect()
+}
+
+fn full_names(world: &ProjectUrl, reading: &Reading) -> Vec<String> {
+    let branch = format!("refs/heads/{}", reading.reference);
+    let tag = format!("refs/tags/{}", reading.reference);
+    match world.kind() {
+        RefKind::Any => vec![branch, tag],
+        RefKind::Branch => vec![branch],
+        RefKind::Tag => vec![tag],
+        RefKind::Commit => Vec::new(),
+    }
+}
+
+/// What the remote has of what was asked for: the longest names first, branches before tags.
+#[must_use]
+pub fn found(world: &ProjectUrl, answer: &str) -> Vec<Revision> {
+    let known: Vec<(&str, &str)> = answer.lines().filter_map(|line| line.split_once('\t')).collect();
+    let readings = world.candidates().into_iter().take(MOST_READINGS).rev();
+    readings
+        .flat_map(|reading| full_names(world, &reading).into_iter().map(move |name| (name, reading.clone())))
+        .filter_map(|(name, reading)| {
+            let (commit, _) = known.iter().find(|(_, known)| *known == name)?;
+            let is_hash = commit.len() >= 40 && commit.bytes().all(|byte| byte.is_ascii_hexdigit());
+            is_hash.then(|| Revision {
+                commit: (*commit).to_owned(),
+                name: reading.reference,
+                remote_name: name,
+                folder: reading.folder,
+            })
+        })
+        .collect()
+}
+
+impl Revision {
+    /// Whether the URL names a commit, not a branch or tag.
+    #[must_use]
+    pub fn is_commit(&self) -> bool {
+        self.remote_name == self.commit
+    }
+
+    /// Fetches this commit alone.
+    #[must_use]
+    pub fn fetch_arguments(&self, location: &str) -> Vec<OsString> {
+        let refspec = format!("+{}:refs/fleet/{}", self.remote_name, self.commit);
+        let options = ["fetch", "--depth=1", "--no-tags", "--no-write-fetch-head", "--progress", "--"];
+        options.into_iter().map(OsString::from).chain([location.into(), refspec.into()]).collect()
+    }
+
+    /// Lists the files of the project.
+    #[must_use]
+    pub fn list_arguments(&self, reference: &str) -> Vec<OsString> {
+        let fixed = ["ls-tree", "-r", "-l", "-z", "--full-tree", reference].map(OsString::from);
+        let folder = (!self.folder.is_empty()).then(|| OsString::from(format!("{}/", self.folder)));
+        fixed.into_iter().chain(folder).collect()
+    }
+
+    /// Where the world lies in the repository.
+    #[must_use]
+    pub fn world_path(&self, world: &ProjectUrl) -> String {
+        let slash = if self.folder.is_empty() { "" } else { "/" };
+        format!("{}{slash}worlds/{}", self.folder, world.world())
+    }
+}
+
+/// The files of a project as the commit has them.
+#[derive(Debug, Default, PartialEq, Eq)]
+pub struct Listing {
+    /// Of all files, in bytes.
+    pub size: u64,
+    paths: HashSet<Vec<u8>>,
+}
+
+impl Listing {
+    /// Reads the answer of `git ls-tree -r -l -z`.
+    #[must_use]
+    pub fn parse(answer: &[u8]) -> Self {
+        let mut listing = Self::default();
+        for entry in answer.split(|byte| *byte == 0) {
+            let Some(tab) = entry.iter().position(|byte| *byte == b'\t') else {
+                continue;
+            };
+            let (about, path) = entry.split_at(tab);
+            let size = about.rsplit(|byte| *byte == b' ').next().and_then(|size| str::from_utf8(size).ok());
+            listing.size = listing.size.saturating_add(size.and_then(|size| size.parse().ok()).unwrap_or(0));
+            listing.paths.insert(path.get(1..).unwrap_or_default().to_vec());
+        }
+        listing
+    }
+
+    /// Whether a file is there.
+    #[must_use]
+    pub fn has(&self, path: &str) -> bool {
+        self.paths.contains(path.as_bytes())
+    }
+}
+
+/// How many files below a folder are pointers into Git LFS, in place of what they stand for. Reads from disk.
+#[must_use]
+pub fn unresolved_lfs(folder: &Path) -> usize {
+    let mut count = 0;
+    let mut open = vec![folder.to_owned()];
+    while let Some(folder) = open.pop() {
+        for entry in std::fs::read_dir(folder).into_iter().flatten().flatten() {
+            match entry.metadata() {
+                Ok(about) if about.is_dir() => open.push(entry.path()),
+                Ok(about) if about.is_file() && about.len() < 1024 => {
+                    let text = std::fs::read(entry.path()).unwrap_or_default();
+                    count += usize::from(text.starts_with(b"version https://git-lfs.github.com/spec/"));
+                }
+                _ => {}
+            }
+        }
+    }
+    count
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const A: &str = "aaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaa";
+    const B: &str = "bbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbb";
+
+    fn world(path: &str) -> ProjectUrl {
+        ProjectUrl::parse(&format!("https://github.com/u/r/{path}")).unwrap()
+    }
+
+    #[test]
+    fn a_branch_with_slashes_is_found_and_preferred_to_a_shorter_tag() {
+        let url = world("blob/feature/arm/lab/worlds/a.wbt");
+        let answer =
+            format!("{A}\trefs/tags/feature\n{B}\trefs/heads/feature/arm\n{B}\trefs/heads/x/refs/heads/feature\n");
+        let found: Vec<_> = found(&url, &answer).into_iter().map(|one| (one.commit, one.name, one.folder)).collect();
+        let expected = [(B, "feature/arm", "lab"), (A, "feature", "arm/lab")];
+        assert_eq!(
+            found,
+            expected.map(|(commit, name, folder)| (commit.to_owned(), name.to_owned(), folder.to_owned()))
+        );
+    }
+
+    #[test]
+    fn a_full_hash_is_a_commit() {
+        let commit = commit_of(&world(&format!("tree/{A}/p/worlds/a.wbt"))).unwrap();
+        assert!(commit.is_commit());
+        assert_eq!(commit.world_path(&world("blob/x/worlds/a.wbt")), "p/worlds/a.wbt");
+        assert_eq!(commit_of(&world("blob/aaaaaaa/worlds/a.wbt")), None, "short hashes are not unique");
+        assert_eq!(commit_of(&world(&format!("src/branch/{A}/worlds/a.wbt"))), None, "it says that it is a branch");
+    }
+
+    #[test]
+    fn an_answer_that_is_no_hash_is_never_used() {
+        let url = world("blob/main/worlds/a.wbt");
+        assert_eq!(found(&url, "--upload-pack=evil\trefs/heads/main\n"), []);
+        assert_eq!(found(&url, "nonsense"), []);
+    }
+
+    #[test]
+    fn a_listing_knows_sizes_and_paths() {
+        let answer = b"100644 blob aaa      12\tp/worlds/a b.wbt\x00120000 blob bbb       3\tp/link\x00160000 commit ccc -\tp/module\x00";
+        let listing = Listing::parse(answer);
+        assert_eq!(listing.size, 15);
+        assert!(listing.has("p/worlds/a b.wbt") && !listing.has("p/worlds"));
+        assert_eq!(Listing::parse(b""), Listing::default());
+    }
+}

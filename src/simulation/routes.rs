@@ -1,0 +1,133 @@
+//! The simulation server's public paths: each reads the request, asks for what it needs, and maps the answer.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use actix_web::http::header;
+use actix_web::middleware::DefaultHeaders;
+use actix_web::{HttpRequest, HttpResponse, web};
+use actix_web_actors::ws::WsResponseBuilder;
+use askama::Template;
+
+use super::app::Server;
+use super::places::{Census, Everybody};
+use super::status::{self, Page, StatusPage};
+use super::web_client::WebClient;
+use crate::shared::auth::is_authorised;
+use crate::shared::metrics::CONTENT_TYPE;
+use crate::shared::shutdown::Request;
+
+/// How long an actor may take to answer a page.
+const PATIENCE: Duration = Duration::from_secs(2);
+/// The largest message of a client, in bytes.
+const LARGEST_MESSAGE: usize = 8 * 1024;
+
+/// Adds all paths to an app.
+pub fn configure(app: &mut web::ServiceConfig) {
+    let cors = DefaultHeaders::new()
+        .add((header::ACCESS_CONTROL_ALLOW_ORIGIN, "*"))
+        .add((header::ACCESS_CONTROL_ALLOW_HEADERS, "x-requested-with"))
+        .add((header::ACCESS_CONTROL_ALLOW_METHODS, "POST, GET, OPTIONS"))
+        .add((header::CACHE_CONTROL, "no-store"));
+    app.service(
+        web::scope("")
+            .wrap(cors)
+            .route("/client", web::get().to(client))
+            .route("/load", web::get().to(load))
+            .route("/monitor", web::get().to(monitor))
+            .route("/status", web::get().to(status_json))
+            .route("/metrics", web::get().to(metrics))
+            .route("/health", web::get().to(health))
+            .route("/drain", web::post().to(drain))
+            .route("/{path:.*}", web::method(actix_web::http::Method::OPTIONS).to(HttpResponse::NoContent))
+            .default_service(web::to(nothing_here)),
+    );
+}
+
+async fn client(request: HttpRequest, stream: web::Payload, server: web::Data<Server>) -> HttpResponse {
+    if let Some(refusal) = refuse_origin(&request, &server) {
+        return refusal;
+    }
+    let Ok(permit) = Arc::clone(&server.connections).try_acquire_owned() else {
+        return HttpResponse::ServiceUnavailable().body("Error: too many connections.");
+    };
+    let peer = request.peer_addr().map(|address| address.ip());
+    let actor = WebClient::new(Arc::clone(&server), peer, permit);
+    WsResponseBuilder::new(actor, &request, stream).frame_size(LARGEST_MESSAGE).start().unwrap_or_else(|error| {
+        let problem = format!("Error: this is a WebSocket: {error}.");
+        HttpResponse::build(error.as_response_error().status_code()).body(problem)
+    })
+}
+
+/// A page of another origin may use visitors' browsers to start simulations, unless origins are listed.
+fn refuse_origin(request: &HttpRequest, server: &Server) -> Option<HttpResponse> {
+    let allowed = &server.config.allowed_origins;
+    let origin = request.headers().get(header::ORIGIN)?.to_str().unwrap_or_default();
+    if allowed.is_empty() || allowed.iter().any(|one| one.eq_ignore_ascii_case(origin)) {
+        return None;
+    }
+    Some(HttpResponse::Forbidden().body("Error: this page is not one of those that may start simulations here."))
+}
+
+async fn load(server: web::Data<Server>) -> HttpResponse {
+    HttpResponse::Ok().content_type("text/plain").body(server.load().to_string())
+}
+
+async fn everybody(server: &Server) -> Option<Everybody> {
+    let census = server.places.send(Census);
+    actix_rt::time::timeout(PATIENCE, census).await.ok().and_then(Result::ok)
+}
+
+async fn status_json(server: web::Data<Server>) -> HttpResponse {
+    match everybody(&server).await {
+        Some(everybody) => HttpResponse::Ok().json(StatusPage::new(&server, everybody)),
+        None => too_busy(),
+    }
+}
+
+async fn metrics(server: web::Data<Server>) -> HttpResponse {
+    let Some(everybody) = everybody(&server).await else {
+        return too_busy();
+    };
+    match server.metrics.render(&status::gauges(&server, &everybody)) {
+        Ok(text) => HttpResponse::Ok().content_type(CONTENT_TYPE).body(text),
+        Err(error) => HttpResponse::InternalServerError().body(format!("Error: {error}.")),
+    }
+}
+
+async fn monitor(server: web::Data<Server>) -> HttpResponse {
+    let Some(everybody) = everybody(&server).await else {
+        return too_busy();
+    };
+    match Page::new(&server, everybody).render() {
+        Ok(page) => HttpResponse::Ok().content_type("text/html; charset=utf-8").body(page),
+        Err(error) => HttpResponse::InternalServerError().body(format!("Error: {error}.")),
+    }
+}
+
+async fn health() -> HttpResponse {
+    HttpResponse::Ok().content_type("text/plain").body("ok")
+}
+
+async fn drain(request: HttpRequest, server: web::Data<Server>) -> HttpResponse {
+    let Some(password) = &server.config.admin_password else {
+        return HttpResponse::Forbidden().body("Error: actions are off; adminPassword is not set.");
+    };
+    if !is_authorised(&request, password) {
+        return HttpResponse::Unauthorized()
+            .insert_header((header::WWW_AUTHENTICATE, "Basic realm=\"simulation server\""))
+            .body("Error: a password is needed.");
+    }
+    match server.requests.try_send(Request::Drain) {
+        Ok(()) => HttpResponse::Accepted().body("draining"),
+        Err(error) => HttpResponse::ServiceUnavailable().body(format!("Error: {error}.")),
+    }
+}
+
+async fn nothing_here() -> HttpResponse {
+    HttpResponse::NotFound().body("Error: there is nothing here. Try /monitor, /status, /load, /metrics or /health.")
+}
+
+fn too_busy() -> HttpResponse {
+    HttpResponse::ServiceUnavailable().body("Error: the server is too busy to tell.")
+}

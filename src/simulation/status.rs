@@ -1,0 +1,129 @@
+//! What the simulation server tells of itself: `/status`, `/monitor` and `/metrics`.
+
+use std::path::Path;
+
+use askama::Template;
+use serde::Serialize;
+
+use super::app::Server;
+use super::places::{Everybody, Simulation};
+use super::sensors::{Gpu, Host, Machine};
+use crate::shared::metrics::Gauge;
+use crate::shared::status::Dispatch;
+
+/// The page `/status`.
+#[derive(Debug, Serialize)]
+#[serde(rename_all = "camelCase")]
+pub struct StatusPage {
+    /// What decides where clients go.
+    #[serde(flatten)]
+    pub dispatch: Dispatch,
+    /// In seconds.
+    pub uptime: u64,
+    /// What the machine is.
+    pub host: Host,
+    /// What the machine is doing.
+    pub machine: Machine,
+    /// What its GPUs are doing.
+    pub gpus: Vec<Gpu>,
+    /// Each simulation.
+    pub simulations: Vec<Simulation>,
+}
+
+impl StatusPage {
+    /// The state of the server at this moment.
+    #[must_use]
+    pub fn new(server: &Server, everybody: Everybody) -> Self {
+        let readings = server.readings.borrow().clone();
+        let rules = &server.rules;
+        let dispatch = Dispatch {
+            load: server.load(),
+            version: env!("CARGO_PKG_VERSION").to_owned(),
+            instances: Some(everybody.instances),
+            allowed_repositories: rules.allowed.clone(),
+            blocked_repositories: rules.blocked.clone(),
+            share_idle_time: rules.share_idle_time,
+            docker: Some(rules.docker),
+            draining: server.is_draining(),
+        };
+        Self {
+            dispatch,
+            uptime: server.started.elapsed().as_secs(),
+            host: readings.host.clone(),
+            machine: readings.machine,
+            gpus: readings.gpus.clone(),
+            simulations: everybody.simulations,
+        }
+    }
+}
+
+/// The page `/monitor`.
+#[derive(Template)]
+#[template(path = "simulation_monitor.html")]
+pub struct Page<'server> {
+    title: &'server str,
+    description: &'server str,
+    status: StatusPage,
+}
+
+impl<'server> Page<'server> {
+    /// The state of the server at this moment.
+    #[must_use]
+    pub fn new(server: &'server Server, everybody: Everybody) -> Self {
+        Self {
+            title: server.config.title.as_deref().unwrap_or("Webots simulation server"),
+            description: server.config.description.as_deref().unwrap_or_default(),
+            status: StatusPage::new(server, everybody),
+        }
+    }
+
+    fn log(path: Option<&Path>) -> String {
+        path.map(|path| path.display().to_string()).unwrap_or_default()
+    }
+}
+
+/// The gauges of `/metrics`.
+#[must_use]
+pub fn gauges<'text>(server: &Server, everybody: &Everybody) -> Vec<Gauge<'text>> {
+    let readings = server.readings.borrow();
+    let instances = everybody.instances;
+    let machine = readings.machine;
+    let by_state = [
+        ("queued", instances.queued),
+        ("starting", instances.starting),
+        ("idle", instances.idle),
+        ("running", instances.running),
+    ];
+    let gpu = |value: fn(&Gpu) -> f64| {
+        let numbered = readings.gpus.iter().enumerate();
+        numbered.map(|(index, gpu)| (vec![index.to_string(), gpu.name.clone()], value(gpu))).collect()
+    };
+    let draining = f64::from(u8::from(server.is_draining()));
+    vec![
+        Gauge::plain("simulation_load_percent", "Load as /load tells it", server.load().percent()),
+        Gauge::plain("simulation_draining", "1 while no new clients are taken", draining),
+        Gauge::plain("simulation_places", "Simulations that fit", f64::from(instances.places)),
+        Gauge {
+            name: "simulation_instances",
+            help: "Simulations by state",
+            labels: &["state"],
+            values: by_state.iter().map(|(state, count)| (vec![(*state).to_owned()], f64::from(*count))).collect(),
+        },
+        Gauge::plain("machine_cpu_percent", "CPU in use", machine.cpu),
+        Gauge::plain("machine_memory_percent", "Memory in use", machine.memory),
+        Gauge::plain("machine_swap_percent", "Swap in use", machine.swap),
+        Gauge::plain("machine_disk_percent", "Disk in use where the cache is", machine.disk),
+        Gauge {
+            name: "machine_gpu_compute_percent",
+            help: "GPU: time in which a kernel ran",
+            labels: &["gpu", "name"],
+            values: gpu(|gpu| gpu.compute),
+        },
+        Gauge {
+            name: "machine_gpu_memory_percent",
+            help: "GPU: memory in use",
+            labels: &["gpu", "name"],
+            values: gpu(|gpu| gpu.memory),
+        },
+    ]
+}

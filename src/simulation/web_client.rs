@@ -1,0 +1,322 @@
+//! Actor: one WebSocket on `/client`. Its life is the life of one simulation, as one state machine.
+//!
+//! Created by the route for each connection; ends with it. The connection is the lease: whatever this actor holds in
+//! any state (a place in the line, a checkout under way, a running Webots) is given back when it is dropped.
+
+use std::net::IpAddr;
+use std::sync::Arc;
+
+use actix::prelude::*;
+use actix_web_actors::ws::{self, CloseCode, CloseReason, Message, ProtocolError, WebsocketContext};
+use tokio::sync::OwnedSemaphorePermit;
+
+use super::app::Server;
+use super::checkout::{CheckoutError, Project};
+use super::places::{Ask, Change, PlaceEvent, Ticket};
+use super::protocol::{self, Mode, Request};
+use super::webots::{End, Exit, Orders, RestoreController, Webots, WebotsEvent};
+use crate::shared::liveness::Liveness;
+use crate::shared::project_url::ProjectUrl;
+use crate::shared::shutdown::{Phase, closing};
+
+/// The actor.
+pub struct WebClient {
+    server: Arc<Server>,
+    peer: Option<IpAddr>,
+    stage: Stage,
+    liveness: Liveness,
+    restoring: bool,
+    _permit: OwnedSemaphorePermit,
+}
+
+/// The life of a simulation.
+enum Stage {
+    /// Nothing was asked for yet.
+    Connected,
+    /// A place was asked for; it may be granted before the ticket for it is here.
+    Asking { wanted: Wanted, granted: Option<u16> },
+    /// In the waiting line.
+    Waiting { wanted: Wanted, ticket: Ticket },
+    /// The project is being checked out; the job ends with the actor.
+    CheckingOut { mode: Mode, place: (Ticket, u16) },
+    /// Webots was started.
+    Launched(Lease),
+    /// The client was told the end.
+    Over,
+}
+
+struct Wanted {
+    world: ProjectUrl,
+    mode: Mode,
+}
+
+/// A running Webots: dropping it asks Webots to end.
+struct Lease(Addr<Webots>);
+
+impl Drop for Lease {
+    fn drop(&mut self) {
+        self.0.do_send(End);
+    }
+}
+
+/// Progress of a checkout.
+#[derive(Message)]
+#[rtype(result = "()")]
+struct Progress(String);
+
+type Context = WebsocketContext<WebClient>;
+
+impl WebClient {
+    /// A client that has just connected; `permit` counts it.
+    #[must_use]
+    pub fn new(server: Arc<Server>, peer: Option<IpAddr>, permit: OwnedSemaphorePermit) -> Self {
+        let stage = Stage::Connected;
+        Self { server, peer, stage, liveness: Liveness::new(), restoring: false, _permit: permit }
+    }
+
+    fn name(&self) -> String {
+        self.peer.map_or_else(|| "client".to_owned(), |peer| format!("client {peer}"))
+    }
+
+    /// Tells a failure, and closes the connection.
+    fn fail(&mut self, why: &str, ctx: &mut Context) {
+        log::info!("{}: {why}", self.name());
+        self.finish(&protocol::error(why), CloseCode::Normal, ctx);
+    }
+
+    fn finish(&mut self, last_words: &str, code: CloseCode, ctx: &mut Context) {
+        self.stage = Stage::Over;
+        ctx.text(last_words.to_owned());
+        ctx.close(Some(CloseReason { code, description: None }));
+        ctx.stop();
+    }
+
+    fn understand(&mut self, text: &str, ctx: &mut Context) {
+        match Request::parse(text) {
+            Ok(Request::Start { url, mode }) => self.start(&url, mode, ctx),
+            Ok(Request::ResetController(file)) => self.reset_controller(file, ctx),
+            Err(wrong) => self.fail(&wrong.to_string(), ctx),
+        }
+    }
+
+    fn start(&mut self, url: &str, mode: Mode, ctx: &mut Context) {
+        if !matches!(self.stage, Stage::Connected) {
+            log::warn!("{}: asks for a second simulation on one connection; ignored", self.name());
+            return;
+        }
+        let admitted = ProjectUrl::parse(url).map_err(|wrong| wrong.to_string()).and_then(|world| {
+            let load = self.server.load();
+            let phase = *self.server.phase.borrow();
+            if phase != Phase::Open {
+                return Err("This simulation server is about to end, and takes no new clients".to_owned());
+            }
+            self.server.rules.admit(&world, load).map_err(|refusal| refusal.to_string())?;
+            Ok(world)
+        });
+        let world = match admitted {
+            Ok(world) => world,
+            Err(why) => return self.fail(&why, ctx),
+        };
+        log::info!("{}: asks for {world}", self.name());
+        let ask = Ask { client: ctx.address().recipient(), world: world.to_string() };
+        self.stage = Stage::Asking { wanted: Wanted { world, mode }, granted: None };
+        let asked = self.server.places.send(ask).into_actor(self);
+        asked
+            .map(|answer, this, ctx| match answer {
+                Ok(Ok(ticket)) => this.ticket_came(ticket, ctx),
+                Ok(Err(refused)) => this.fail(&refused.to_string(), ctx),
+                Err(error) => this.fail(&format!("This simulation server can't lend a place: {error}"), ctx),
+            })
+            .spawn(ctx);
+    }
+
+    fn ticket_came(&mut self, ticket: Ticket, ctx: &mut Context) {
+        match std::mem::replace(&mut self.stage, Stage::Over) {
+            Stage::Asking { wanted, granted: Some(port) } => self.check_out(wanted, ticket, port, ctx),
+            Stage::Asking { wanted, granted: None } => self.stage = Stage::Waiting { wanted, ticket },
+            other => self.stage = other,
+        }
+    }
+
+    fn check_out(&mut self, Wanted { world, mode }: Wanted, ticket: Ticket, port: u16, ctx: &mut Context) {
+        let instance = match self.server.run.instance() {
+            Ok(instance) => instance,
+            Err(error) => return self.fail(&format!("This simulation server has no room for a project: {error}"), ctx),
+        };
+        self.stage = Stage::CheckingOut { mode, place: (ticket, port) };
+        let me = ctx.address();
+        // A step that is told while the mailbox is full is one step less on the screen.
+        let progress = move |text: String| drop(me.try_send(Progress(text)));
+        let job = self.server.checkouts.start(world, instance, progress);
+        job.into_actor(self)
+            .map(|result, this, ctx| match result {
+                Ok(Ok(project)) => this.launch(project, ctx),
+                Ok(Err(error)) => this.fail(&error.to_string(), ctx),
+                Err(error) => this.fail(&format!("The checkout broke off: {error}"), ctx),
+            })
+            .spawn(ctx);
+    }
+
+    fn launch(&mut self, project: Project, ctx: &mut Context) {
+        let (mode, place) = match std::mem::replace(&mut self.stage, Stage::Over) {
+            Stage::CheckingOut { mode, place } => (mode, place),
+            other => return self.stage = other,
+        };
+        let program = match self.server.webots_program() {
+            Ok(program) => program,
+            Err(why) => return self.fail(&why, ctx),
+        };
+        log::info!("{}: {} is for Webots {}", self.name(), project.world.path.display(), project.world.version);
+        place.0.update(Change::Version(project.world.version.clone()));
+        for warning in &project.warnings {
+            ctx.text(protocol::loading(warning));
+        }
+        ctx.text(protocol::loading("webots is starting"));
+        let orders = Orders {
+            config: Arc::clone(&self.server.config),
+            program,
+            checkouts: Arc::clone(&self.server.checkouts),
+            project,
+            mode,
+            place,
+            events: ctx.address().recipient(),
+        };
+        let webots = Webots::start_in_arbiter(&self.server.main_thread, |_| Webots::new(orders));
+        self.stage = Stage::Launched(Lease(webots));
+        ctx.text(protocol::shutdown_timeout(self.server.config.timeout));
+    }
+
+    fn reset_controller(&mut self, file: String, ctx: &mut Context) {
+        let Stage::Launched(Lease(webots)) = &self.stage else {
+            return self.fail("A controller can be reset only while a simulation runs", ctx);
+        };
+        if std::mem::replace(&mut self.restoring, true) {
+            log::warn!("{}: asks to reset a controller while another is being reset; ignored", self.name());
+            return;
+        }
+        let restored = webots.send(RestoreController(file.clone())).into_actor(self);
+        restored
+            .map(move |answer, this, ctx| {
+                this.restoring = false;
+                match answer {
+                    Ok(Ok(())) => ctx.text(protocol::reset_controller(&file)),
+                    Ok(Err(error)) => this.warn(&error, ctx),
+                    Err(error) => log::warn!("{}: no controller was reset: {error}", this.name()),
+                }
+            })
+            .spawn(ctx);
+    }
+
+    /// Tells a failure that does not end the simulation.
+    fn warn(&self, error: &CheckoutError, ctx: &mut Context) {
+        log::warn!("{}: {error}", self.name());
+        ctx.text(protocol::error(&error.to_string()));
+    }
+
+    fn exited(&mut self, Exit { clean, why }: &Exit, ctx: &mut Context) {
+        let words = if *clean { protocol::loading(why) } else { protocol::error(why) };
+        self.finish(&words, CloseCode::Normal, ctx);
+    }
+
+    fn ping(&mut self, ctx: &mut Context) {
+        if self.liveness.is_gone(self.server.config.timing.silence) {
+            log::info!("{}: silent for too long", self.name());
+            ctx.stop();
+        } else {
+            ctx.ping(b"");
+        }
+    }
+}
+
+impl Actor for WebClient {
+    type Context = Context;
+
+    fn started(&mut self, ctx: &mut Self::Context) {
+        log::info!("{}: connected", self.name());
+        ctx.run_interval(self.server.config.timing.ping, Self::ping);
+        closing(self.server.phase.clone())
+            .into_actor(self)
+            .map(|(), this, ctx| {
+                this.finish(&protocol::error("This simulation server is stopping"), CloseCode::Away, ctx);
+            })
+            .spawn(ctx);
+    }
+
+    fn stopped(&mut self, _: &mut Self::Context) {
+        log::info!("{}: gone", self.name());
+    }
+}
+
+impl StreamHandler<Result<Message, ProtocolError>> for WebClient {
+    fn handle(&mut self, message: Result<Message, ProtocolError>, ctx: &mut Self::Context) {
+        self.liveness.heard();
+        match message {
+            Ok(Message::Text(text)) if self.liveness.may_answer() => self.understand(&text, ctx),
+            Ok(Message::Ping(data)) if self.liveness.may_answer() => ctx.pong(&data),
+            Ok(Message::Pong(_)) => self.liveness.pong(),
+            Ok(Message::Close(reason)) => {
+                ctx.close(reason);
+                ctx.stop();
+            }
+            Ok(Message::Nop) => {}
+            Ok(Message::Text(_) | Message::Ping(_)) => {
+                log::warn!("{}: asks without reading the answers", self.name());
+                ctx.close(Some(CloseCode::Policy.into()));
+                ctx.stop();
+            }
+            Ok(Message::Binary(_) | Message::Continuation(_)) => {
+                self.fail("Wrong message: allowed are short texts", ctx)
+            }
+            Err(error) => {
+                log::info!("{}: {error}", self.name());
+                ctx.close(Some(ws::CloseCode::Protocol.into()));
+                ctx.stop();
+            }
+        }
+    }
+}
+
+impl Handler<PlaceEvent> for WebClient {
+    type Result = ();
+
+    fn handle(&mut self, event: PlaceEvent, ctx: &mut Self::Context) {
+        match (event, std::mem::replace(&mut self.stage, Stage::Over)) {
+            (PlaceEvent::Granted(port), Stage::Waiting { wanted, ticket }) => self.check_out(wanted, ticket, port, ctx),
+            (PlaceEvent::Granted(port), Stage::Asking { wanted, .. }) => {
+                self.stage = Stage::Asking { wanted, granted: Some(port) };
+            }
+            (PlaceEvent::Ahead(ahead), stage @ (Stage::Waiting { .. } | Stage::Asking { .. })) => {
+                self.stage = stage;
+                ctx.text(protocol::queue(ahead));
+            }
+            (_, stage) => self.stage = stage,
+        }
+    }
+}
+
+impl Handler<Progress> for WebClient {
+    type Result = ();
+
+    fn handle(&mut self, Progress(text): Progress, ctx: &mut Self::Context) {
+        if matches!(self.stage, Stage::CheckingOut { .. }) {
+            ctx.text(protocol::loading(&text));
+        }
+    }
+}
+
+impl Handler<WebotsEvent> for WebClient {
+    type Result = ();
+
+    fn handle(&mut self, event: WebotsEvent, ctx: &mut Self::Context) {
+        match event {
+            WebotsEvent::Listening(port) => {
+                ctx.text(protocol::webots(&self.server.config.address(port), self.server.config.ssl));
+            }
+            WebotsEvent::Heartbeat => ctx.text(protocol::HEARTBEAT),
+            WebotsEvent::Hanging(seconds) => {
+                ctx.text(protocol::loading(&format!("Webots has given no sign of life for {seconds} seconds")));
+            }
+            WebotsEvent::Exited(exit) => self.exited(&exit, ctx),
+        }
+    }
+}

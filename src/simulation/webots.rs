@@ -1,0 +1,301 @@
+//! Actor: one running Webots. Owns its process group, its folder and its place; ends with all three.
+//!
+//! Created by a web client once its project is checked out. It starts Webots, finds the port on which it listens,
+//! watches its signs of life and the time limit, and tells its client with [`WebotsEvent`]s. It ends when nothing of
+//! Webots' process tree is left, and is never restarted.
+
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use actix::prelude::*;
+
+use super::checkout::{CheckoutError, Checkouts, Project};
+use super::command::Launch;
+use super::config::SimulationConfig;
+use super::output::{self, Sign, Tail};
+use super::places::{Change, Stage, Ticket};
+use super::process_group::{Ending, Plan, ProcessGroup};
+use super::process_tree;
+use super::protocol::Mode;
+
+/// Asks Webots to end.
+#[derive(Message)]
+#[rtype(result = "()")]
+pub struct End;
+
+/// Asks for the original state of a file below the project's `controllers` folder.
+#[derive(Message)]
+#[rtype(result = "Result<(), CheckoutError>")]
+pub struct RestoreController(pub String);
+
+/// What a client hears of its Webots.
+#[derive(Message, Debug, Clone, PartialEq, Eq)]
+#[rtype(result = "()")]
+pub enum WebotsEvent {
+    /// It listens on this port.
+    Listening(u16),
+    /// It lives.
+    Heartbeat,
+    /// It has given no sign of life for so many seconds.
+    Hanging(u64),
+    /// It has ended, and why.
+    Exited(Exit),
+}
+
+/// Why a Webots has ended.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Exit {
+    /// Whether it ended by itself and in order.
+    pub clean: bool,
+    /// In words, for the client.
+    pub why: String,
+}
+
+/// What a Webots is started with.
+pub struct Orders {
+    /// The server's configuration.
+    pub config: Arc<SimulationConfig>,
+    /// The program to start.
+    pub program: PathBuf,
+    /// Where controllers are restored from.
+    pub checkouts: Arc<Checkouts>,
+    /// What was checked out.
+    pub project: Project,
+    /// How it is shown.
+    pub mode: Mode,
+    /// The place, and its port.
+    pub place: (Ticket, u16),
+    /// Who hears of it.
+    pub events: Recipient<WebotsEvent>,
+}
+
+/// The actor.
+pub struct Webots {
+    config: Arc<SimulationConfig>,
+    program: PathBuf,
+    checkouts: Arc<Checkouts>,
+    project: Arc<Project>,
+    mode: Mode,
+    port: u16,
+    ticket: Ticket,
+    events: Recipient<WebotsEvent>,
+    group: Option<ProcessGroup>,
+    tail: Tail,
+    listening: bool,
+    last_sign: Instant,
+    hanging: bool,
+    /// Why it was asked to end, if it was.
+    asked: Option<String>,
+}
+
+/// So many heartbeats may be missed before Webots counts as hanging.
+const MISSED_HEARTBEATS: u32 = 6;
+/// If its port is taken, Webots silently takes one of so many that follow.
+const NEXT_PORTS: u16 = 10;
+/// Between two looks whether Webots listens, at first.
+const FIRST_LOOK: Duration = Duration::from_millis(10);
+/// Between two looks whether Webots listens, at most.
+const SLOWEST_LOOK: Duration = Duration::from_millis(200);
+
+impl Webots {
+    /// Prepares a Webots; it starts with the actor.
+    #[must_use]
+    pub fn new(orders: Orders) -> Self {
+        let Orders { config, program, checkouts, project, mode, place: (ticket, port), events } = orders;
+        Self {
+            config,
+            program,
+            checkouts,
+            project: Arc::new(project),
+            mode,
+            port,
+            ticket,
+            events,
+            group: None,
+            tail: Tail::default(),
+            listening: false,
+            last_sign: Instant::now(),
+            hanging: false,
+            asked: None,
+        }
+    }
+
+    fn launch(&mut self, ctx: &mut Context<Self>) -> std::io::Result<()> {
+        let log = self.config.log_dir.0.join("simulation/instances").join(format!("{}.log", self.port));
+        let (reader, output) = std::io::pipe()?;
+        self.tail = output::follow(reader, &log, ctx.address())?;
+        let errors = output.try_clone()?;
+        let (group, ended) = ProcessGroup::start(&self.plan(), output.into(), errors.into())?;
+        log::info!(
+            "port {}: started {} for {} (guardian {})",
+            self.port,
+            self.program.display(),
+            self.project.world.path.display(),
+            group.guardian()
+        );
+        self.ticket.update(Change::Launched { port: self.port, log });
+        self.group = Some(group);
+        ended.into_actor(self).map(|ending, this, ctx| this.exited(ending, ctx)).spawn(ctx);
+        self.look_for_port(FIRST_LOOK, ctx);
+        ctx.run_interval(self.config.timing.heartbeat, Self::check_signs);
+        let limit = self.config.timing.launch;
+        ctx.run_later(limit, move |this, _| {
+            if !this.listening {
+                this.end(&format!("Webots did not become ready within {} seconds", limit.as_secs()));
+            }
+        });
+        let limit = self.config.timeout;
+        ctx.run_later(Duration::from_secs(limit), move |this, _| {
+            this.end(&format!("The time limit of {limit} seconds was reached"));
+        });
+        Ok(())
+    }
+
+    fn plan(&self) -> Plan {
+        let launch = Launch {
+            program: &self.program,
+            mode: self.mode,
+            port: self.port,
+            heartbeat: self.config.timing.heartbeat,
+            world: &self.project.world.path,
+            xvfb: self.config.xvfb,
+        };
+        let display = self.config.display.clone();
+        let display = display.or_else(|| std::env::var_os("DISPLAY").is_none().then(|| ":0".to_owned()));
+        Plan {
+            command: launch.arguments(),
+            environment: display.into_iter().map(|display| ("DISPLAY".into(), display.into())).collect(),
+            folder: Some(self.project.folder().to_owned()),
+            mark: self.project.instance.path().to_owned(),
+            remove: Some(self.project.instance.path().to_owned()),
+            grace: self.config.timing.grace,
+        }
+    }
+
+    /// Looks whether a process of this instance listens on a port that Webots may have taken.
+    fn look_for_port(&self, pause: Duration, ctx: &mut Context<Self>) {
+        let Some(root) = self.group.as_ref().map(ProcessGroup::guardian) else {
+            return;
+        };
+        let ports = self.port..=self.port.saturating_add(NEXT_PORTS);
+        let look = async move {
+            actix_rt::time::sleep(pause).await;
+            actix_rt::task::spawn_blocking(move || process_tree::listening_port(root, &ports)).await.unwrap_or_default()
+        };
+        look.into_actor(self)
+            .map(move |port, this, ctx| match port {
+                Some(port) => this.ready(port),
+                None => this.look_for_port((pause * 3 / 2).min(SLOWEST_LOOK), ctx),
+            })
+            .spawn(ctx);
+    }
+
+    fn ready(&mut self, port: u16) {
+        let allowed = self.config.streaming_ports();
+        if !allowed.contains(&port) {
+            let (first, last) = (allowed.start(), allowed.end());
+            return self
+                .end(&format!("Webots listens on port {port}, outside of this server's ports {first} to {last}"));
+        }
+        if port != self.port {
+            log::warn!("port {}: it was taken, Webots listens on {port}", self.port);
+        }
+        log::info!("port {port}: ready");
+        self.listening = true;
+        self.ticket.update(Change::Port(port));
+        self.ticket.update(Change::Stage(Stage::Idle));
+        self.tell(WebotsEvent::Listening(port));
+    }
+
+    fn check_signs(&mut self, _: &mut Context<Self>) {
+        let silence = self.last_sign.elapsed();
+        let hangs_after = self.config.timing.heartbeat * MISSED_HEARTBEATS;
+        if silence > hangs_after + self.config.hang_limit {
+            self.end(&format!("Webots gave no sign of life for {} seconds", silence.as_secs()));
+        } else if silence > hangs_after && !self.hanging {
+            self.hanging = true;
+            log::warn!("port {}: no sign of life for {} s", self.port, silence.as_secs());
+            self.tell(WebotsEvent::Hanging(silence.as_secs()));
+        }
+    }
+
+    /// Asks for an orderly end. The first reason is the one that is told.
+    fn end(&mut self, why: &str) {
+        if self.asked.is_none() {
+            log::info!("port {}: ending: {why}", self.port);
+            self.asked = Some(why.to_owned());
+            self.ticket.update(Change::Stage(Stage::Stopping));
+            if let Some(group) = &mut self.group {
+                group.ask_to_end();
+            }
+        }
+    }
+
+    fn exited(&mut self, ending: Ending, ctx: &mut Context<Self>) {
+        log::info!("port {}: Webots {ending}", self.port);
+        let exit = match self.asked.take() {
+            Some(why) => Exit { clean: false, why: self.with_last_lines(&why) },
+            None if ending == Ending::Code(0) => Exit { clean: true, why: "Webots has ended".to_owned() },
+            None => Exit { clean: false, why: self.with_last_lines(&format!("Webots {ending}")) },
+        };
+        self.tell(WebotsEvent::Exited(exit));
+        ctx.stop();
+    }
+
+    /// What a user needs to understand an end: the last of what was printed.
+    fn with_last_lines(&self, why: &str) -> String {
+        let lines = self.tail.lines();
+        if lines.is_empty() { format!("{why}.") } else { format!("{why}. Its last output: {}", lines.join(" | ")) }
+    }
+
+    fn tell(&self, event: WebotsEvent) {
+        if let Err(lost) = self.events.try_send(event) {
+            log::debug!("port {}: the client is gone: {lost}", self.port);
+        }
+    }
+}
+
+impl Actor for Webots {
+    type Context = Context<Self>;
+
+    fn started(&mut self, ctx: &mut Self::Context) {
+        if let Err(error) = self.launch(ctx) {
+            log::error!("port {}: Webots can't be started: {error}", self.port);
+            self.tell(WebotsEvent::Exited(Exit { clean: false, why: format!("Webots can't be started: {error}") }));
+            ctx.stop();
+        }
+    }
+}
+
+impl Handler<Sign> for Webots {
+    type Result = ();
+
+    fn handle(&mut self, sign: Sign, _: &mut Self::Context) {
+        self.last_sign = Instant::now();
+        self.hanging = false;
+        match sign {
+            Sign::Heartbeat if self.listening => self.tell(WebotsEvent::Heartbeat),
+            Sign::Paused if self.asked.is_none() => self.ticket.update(Change::Stage(Stage::Idle)),
+            Sign::Running if self.asked.is_none() => self.ticket.update(Change::Stage(Stage::Running)),
+            Sign::Heartbeat | Sign::Paused | Sign::Running => {}
+        }
+    }
+}
+
+impl Handler<RestoreController> for Webots {
+    type Result = ResponseFuture<Result<(), CheckoutError>>;
+
+    fn handle(&mut self, RestoreController(file): RestoreController, _: &mut Self::Context) -> Self::Result {
+        let (checkouts, project) = (Arc::clone(&self.checkouts), Arc::clone(&self.project));
+        Box::pin(async move { checkouts.restore_controller(&project, &file).await })
+    }
+}
+
+impl Handler<End> for Webots {
+    type Result = ();
+
+    fn handle(&mut self, _: End, _: &mut Self::Context) {
+        self.end("Its client has gone");
+    }
+}
