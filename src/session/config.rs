@@ -35,9 +35,12 @@ pub struct SessionConfig {
     /// SMTP host.
     #[serde(default)]
     pub mail_server: Option<String>,
-    /// SMTP port; 465 is encrypted from the first byte. Default: 25, with a password 587.
+    /// SMTP port. Default: 25, with a password 587.
     #[serde(default, deserialize_with = "optional_port")]
     pub mail_server_port: Option<u16>,
+    /// Whether the SMTP server encrypts from the first byte, without STARTTLS. Default: true for port 465, else false.
+    #[serde(default)]
+    pub mail_server_implicit_tls: Option<bool>,
     /// Mail address that notifications come from.
     #[serde(default, deserialize_with = "mail_address::optional")]
     pub mail_sender: Option<MailAddress>,

@@ -114,7 +114,6 @@ impl Letterhead {
             .from(self.from.mailbox().clone())
             .to(self.to.mailbox().clone())
             .subject(subject)
-            // A mail that is sent twice because the first answer got lost has the same ID: most programs show it once.
             .message_id(None)
             .header(AutoSubmitted)
             .multipart(MultiPart::alternative_plain_html(text, html))
@@ -186,13 +185,10 @@ fn shown(text: &str) -> String {
     short
 }
 
-/// `2026-03-01 14:05:09+01:00`, in the time zone of the machine.
+/// `2026-03-01 14:05:09 UTC`, the clock of the log.
 fn time(at: SystemTime) -> String {
-    let Ok(time) = jiff::Timestamp::try_from(at) else {
-        return "at an unknown time".to_owned();
-    };
-    let zone = jiff::tz::TimeZone::try_system().unwrap_or(jiff::tz::TimeZone::UTC);
-    time.to_zoned(zone).strftime("%Y-%m-%d %H:%M:%S%:z").to_string()
+    jiff::Timestamp::try_from(at)
+        .map_or_else(|_| "unknown".to_owned(), |time| time.strftime("%Y-%m-%d %H:%M:%S UTC").to_string())
 }
 
 #[cfg(test)]
@@ -223,5 +219,11 @@ mod tests {
         assert_eq!(shown("a\r\nBcc: x\u{7}\u{85}y"), "a  Bcc: x  y");
         let long = shown(&"\u{e9}".repeat(600));
         assert_eq!((long.chars().count(), long.ends_with("\u{e9}...")), (503, true));
+    }
+
+    #[test]
+    fn the_time_is_that_of_the_log() {
+        let at = SystemTime::UNIX_EPOCH + std::time::Duration::from_secs(1_772_373_909);
+        assert_eq!(time(at), "2026-03-01 14:05:09 UTC");
     }
 }

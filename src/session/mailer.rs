@@ -130,40 +130,40 @@ impl Mailer {
 
     /// Notes how a try went.
     fn settle(&mut self, batch: Batch, sent: Result<String, MailError>) {
-        let count = batch.entries().count();
-        match sent {
+        let told = in_words(batch.entries());
+        let error = match sent {
             Ok(answer) => {
-                log::info!("mail with {count} notices sent by {}: {answer}", self.relay.name());
-                self.outbox.succeeded();
+                log::info!("mail sent by {} ({told}): {answer}", self.relay.name());
+                return self.outbox.succeeded();
             }
-            Err(error) => {
-                let failure = if error.is_lasting() { Failure::Lasting } else { Failure::Passing };
-                let now = Instant::now();
-                let given_up = self.outbox.failed(batch, failure, now);
-                if given_up.len() < count
-                    && let Some(next) = self.outbox.due(now)
-                {
-                    let wait = next.saturating_duration_since(now).as_secs_f64();
-                    log::warn!("mail with {count} notices not sent, next try in {wait:.0} s: {error}");
-                }
-                if !given_up.is_empty() {
-                    self.log_lost(&given_up, &error);
-                }
-            }
+            Err(error) => error,
+        };
+        let failure = if error.is_lasting() { Failure::Lasting } else { Failure::Passing };
+        let now = Instant::now();
+        let count = batch.entries().count();
+        let lost = self.outbox.failed(batch, failure, now);
+        if !lost.is_empty() {
+            let patience = self.pace.persistence.patience.as_secs_f64();
+            log::error!("mail given up after {patience} s ({}): {error}", in_words(lost.iter()));
+        }
+        if lost.len() < count
+            && let Some(next) = self.outbox.due(now)
+        {
+            let wait = next.saturating_duration_since(now).as_secs_f64();
+            log::warn!("mail not sent, next try in {wait:.0} s ({told}): {error}");
         }
     }
+}
 
-    fn log_lost(&self, lost: &[Entry], error: &MailError) {
-        let words: Vec<String> = lost
-            .iter()
-            .take(10)
-            .map(|entry| format!("{} {}", entry.notice.server, entry.notice.event.words()))
-            .collect();
-        let more = if lost.len() > words.len() { ", ..." } else { "" };
-        let patience = self.pace.persistence.patience.as_secs_f64();
-        let count = lost.len();
-        log::error!("{count} notices given up after {patience} s ({}{more}): {error}", words.join(", "));
+/// The first few entries, for a log line.
+fn in_words<'entries>(entries: impl Iterator<Item = &'entries Entry>) -> String {
+    let mut entries = entries.map(|entry| format!("{} {}", entry.notice.server, entry.notice.event.words()));
+    let words = entries.by_ref().take(3).collect::<Vec<_>>().join(", ");
+    let more = entries.count();
+    if more > 0 {
+        return format!("{words} and {more} more");
     }
+    words
 }
 
 impl Actor for Mailer {

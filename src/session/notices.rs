@@ -205,11 +205,13 @@ mod tests {
 
     use Event::{AvailableAgain, MaximumLoad, NotResponding, WorkingAgain};
 
-    /// Plays notices (second, port, event) with a gathering of 10 s and a flapping limit of 600 s; gives back the
-    /// mails as (second, [(port, event, held back)]).
-    fn play(notices: &[(u64, u16, Event)]) -> Vec<(u64, Vec<(u16, Event, usize)>)> {
+    /// When (second), and what (port, event, held back).
+    type Mail = (u64, Vec<(u16, Event, usize)>);
+
+    /// Plays notices (second, port, event) with a gathering of 10 s and a flapping limit of 600 s.
+    fn play(notices: &[(u64, u16, Event)]) -> Vec<Mail> {
         let start = Instant::now();
-        let mut state = Notices::new(Duration::from_secs(10), Duration::from_secs(600));
+        let mut state = Notices::new(Duration::from_secs(10), Duration::from_mins(10));
         let mut mails = Vec::new();
         for second in 0..5_000 {
             let now = start + Duration::from_secs(second);

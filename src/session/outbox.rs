@@ -147,7 +147,7 @@ mod tests {
     }
 
     fn outbox(most: usize) -> Outbox {
-        let (retry, patience) = (Duration::from_secs(10), Duration::from_secs(3_600));
+        let (retry, patience) = (Duration::from_secs(10), Duration::from_hours(1));
         Outbox::new(Persistence { retry, patience, most })
     }
 

@@ -1,7 +1,7 @@
 //! Hands mails to the SMTP server, and says in plain words why one did not get there.
 //!
-//! With a password the connection is encrypted before anything else: from its first byte on port 465, by STARTTLS on
-//! any other. Who is trusted is read from the system for each mail, or from the file that `SSL_CERT_FILE` names.
+//! With a password the connection is encrypted before anything else: from its first byte where the server does so, else
+//! by STARTTLS. Who is trusted is read from the system for each mail, or from the file that `SSL_CERT_FILE` names.
 
 use std::error::Error as _;
 use std::time::Duration;
@@ -16,8 +16,8 @@ use super::config::{Secret, SessionConfig};
 use super::letter::{Letter, Unwritable};
 use crate::shared::logging::one_line;
 
-/// The port whose connections are encrypted from their first byte.
-const IMPLICIT_TLS: u16 = 465;
+/// The port whose connections are usually encrypted from their first byte.
+const IMPLICIT_TLS_PORT: u16 = 465;
 const DEFAULT_PORT: u16 = 25;
 const DEFAULT_PORT_WITH_PASSWORD: u16 = 587;
 
@@ -119,6 +119,7 @@ impl MailError {
 pub struct Relay {
     host: String,
     port: u16,
+    implicit_tls: bool,
     login: Option<(String, Secret)>,
     patience: Duration,
 }
@@ -142,13 +143,14 @@ impl Relay {
             });
         let usual = if login.is_some() { DEFAULT_PORT_WITH_PASSWORD } else { DEFAULT_PORT };
         let port = config.mail_server_port.unwrap_or(usual);
-        Ok(Self { host, port, login, patience: config.timing.mail_answer })
+        let implicit_tls = config.mail_server_implicit_tls.unwrap_or(port == IMPLICIT_TLS_PORT);
+        Ok(Self { host, port, implicit_tls, login, patience: config.timing.mail_answer })
     }
 
     /// How the connection is, in a word: `encrypted` or `not encrypted`.
     #[must_use]
     pub fn privacy(&self) -> &'static str {
-        if self.login.is_some() || self.port == IMPLICIT_TLS { "encrypted" } else { "not encrypted" }
+        if self.login.is_some() || self.implicit_tls { "encrypted" } else { "not encrypted" }
     }
 
     /// `HOST:PORT`.
@@ -179,7 +181,7 @@ impl Relay {
             .map_err(|error| MailError::Unresolved { server: self.name(), reason: one_line(&error.to_string()) })?
             .collect();
         let me = ClientId::default();
-        let implicit = if self.port == IMPLICIT_TLS { Some(self.trust().await?) } else { None };
+        let implicit = if self.implicit_tls { Some(self.trust().await?) } else { None };
         let mut line = AsyncSmtpConnection::connect_tokio1(addresses.as_slice(), None, &me, implicit, None)
             .await
             .map_err(|error| self.no_connection(&error))?;
@@ -282,4 +284,29 @@ fn tls_fault(error: &lettre::transport::smtp::Error) -> Option<&rustls::Error> {
         cause = error.source();
     }
     None
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn port_and_encryption_follow_from_the_password() {
+        for (keys, port, implicit_tls, privacy) in [
+            (r#""mailSenderUser": "fleet""#, 25, false, "not encrypted"),
+            (r#""mailSenderPassword": """#, 25, false, "not encrypted"),
+            (r#""mailSenderPassword": "x""#, 587, false, "encrypted"),
+            (r#""mailSenderPassword": "x", "mailServerPort": 25"#, 25, false, "encrypted"),
+            (r#""mailSenderPassword": "x", "mailServerPort": 465"#, 465, true, "encrypted"),
+            (r#""mailServerPort": 465"#, 465, true, "encrypted"),
+            (r#""mailServerPort": 2465, "mailServerImplicitTls": true"#, 2465, true, "encrypted"),
+        ] {
+            let json = format!(
+                r#"{{"port": 1999, "simulationServers": [], "administrator": "a@example.org", "mailServer": "smtp",
+                     "mailSender": "b@example.org", {keys}}}"#
+            );
+            let relay = Relay::new(&serde_json::from_str(&json).unwrap()).unwrap();
+            assert_eq!((relay.port, relay.implicit_tls, relay.privacy()), (port, implicit_tls, privacy), "{keys}");
+        }
+    }
 }
