@@ -4,6 +4,7 @@ use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
+use super::mail_address::{self, MailAddress};
 use crate::shared::address::PublicAddress;
 use crate::shared::config::{Configuration, ExpandedPath, Secret, Unfit, optional_port, percent, seconds, whole};
 
@@ -29,17 +30,20 @@ pub struct SessionConfig {
     /// The simulation servers, as HOST:PORT or HOST/PORT.
     pub simulation_servers: Vec<PublicAddress>,
     /// Mail address that receives notifications.
-    #[serde(default)]
-    pub administrator: Option<String>,
+    #[serde(default, deserialize_with = "mail_address::optional")]
+    pub administrator: Option<MailAddress>,
     /// SMTP host.
     #[serde(default)]
     pub mail_server: Option<String>,
-    /// SMTP port: 25, 587 or 465 by convention. Default: 25, with a password 587.
+    /// SMTP port. Default: 25, with a password 587.
     #[serde(default, deserialize_with = "optional_port")]
     pub mail_server_port: Option<u16>,
-    /// Mail address that notifications come from.
+    /// Whether the SMTP server encrypts from the first byte, without STARTTLS. Default: true for port 465, else false.
     #[serde(default)]
-    pub mail_sender: Option<String>,
+    pub mail_server_implicit_tls: Option<bool>,
+    /// Mail address that notifications come from.
+    #[serde(default, deserialize_with = "mail_address::optional")]
+    pub mail_sender: Option<MailAddress>,
     /// User name for SMTP. Default: `mailSender`.
     #[serde(default)]
     pub mail_sender_user: Option<String>,
@@ -150,6 +154,12 @@ impl Configuration for SessionConfig {
         if self.timing.silence <= self.timing.ping {
             let problem = format!("{} s is not more than timing.ping", self.timing.silence.as_secs_f64());
             return Err(Unfit { key: "timing.silence", problem });
+        }
+        self.mail_server = self.mail_server.take().filter(|host| !host.is_empty());
+        if let Some(host) = self.mail_server.as_deref().filter(|host| !mail_address::is_host(host)) {
+            let problem =
+                format!("{host:?} is no host; allowed is a name or an IP address (mailServerPort has the port)");
+            return Err(Unfit { key: "mailServer", problem });
         }
         if self.administrator.is_some() && self.mail_server.is_none() {
             warnings.push("mailServer is not set: notifications are off".to_owned());

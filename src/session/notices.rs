@@ -1,0 +1,310 @@
+//! Decides which notice is mailed when: gathering, and the limit for flapping servers. Pure; time is passed in.
+//!
+//! A simulation server has two topics: whether it responds, and whether its load leaves room. For each topic:
+//!
+//! 1. The first notice waits for `gather`, so that servers that fail together are one mail.
+//! 2. For `flapping` after a mail, notices are held back and counted; what is left then is one entry with the newest
+//!    notice and the count.
+//! 3. One failure and its end are no flapping: an end that has lasted for a tenth of `flapping` is told at once, if
+//!    nothing else was held back.
+
+use std::collections::HashMap;
+use std::time::{Duration, Instant, SystemTime};
+
+use actix::Message;
+
+use crate::shared::address::PublicAddress;
+use crate::shared::load::Load;
+
+/// Something the administrator should know of a simulation server.
+#[derive(Message, Debug, Clone, PartialEq)]
+#[rtype(result = "()")]
+pub struct Notice {
+    /// The simulation server.
+    pub server: PublicAddress,
+    /// What happened.
+    pub event: Event,
+    /// Its load, where one is known.
+    pub load: Option<Load>,
+    /// The last error, where there was one. It may hold anything.
+    pub error: Option<String>,
+    /// When it happened.
+    pub at: SystemTime,
+}
+
+/// What can happen to a simulation server. The order is that of the lines in a mail.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum Event {
+    /// It gives no usable answer.
+    NotResponding,
+    /// It gives good answers again.
+    WorkingAgain,
+    /// Its load reached the threshold.
+    MaximumLoad,
+    /// Its load is below the threshold again.
+    AvailableAgain,
+}
+
+/// The two things that mails are about.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum Topic {
+    /// Whether a server responds.
+    Life,
+    /// Whether a server has room.
+    Room,
+}
+
+impl Event {
+    /// In words, to follow 'simulation server' or 'simulation servers'.
+    #[must_use]
+    pub fn words(self) -> &'static str {
+        match self {
+            Self::NotResponding => "not responding",
+            Self::WorkingAgain => "working again",
+            Self::MaximumLoad => "reached maximum load",
+            Self::AvailableAgain => "available again",
+        }
+    }
+
+    /// What it is about.
+    #[must_use]
+    pub fn topic(self) -> Topic {
+        match self {
+            Self::NotResponding | Self::WorkingAgain => Topic::Life,
+            Self::MaximumLoad | Self::AvailableAgain => Topic::Room,
+        }
+    }
+
+    fn ends_trouble(self) -> bool {
+        matches!(self, Self::WorkingAgain | Self::AvailableAgain)
+    }
+}
+
+/// One entry of a mail: the newest notice of a server and topic, and how many it stands for.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Entry {
+    /// The newest notice; its error is the last one known.
+    pub notice: Notice,
+    /// How many earlier notices were held back.
+    pub held_back: usize,
+}
+
+impl Entry {
+    /// Whether both are about the same topic of the same server.
+    #[must_use]
+    pub fn goes_with(&self, other: &Self) -> bool {
+        self.notice.event.topic() == other.notice.event.topic() && self.notice.server == other.notice.server
+    }
+
+    /// Takes in a newer entry that goes with this one.
+    pub fn renew(&mut self, newer: Self) {
+        let error = self.notice.error.take();
+        self.notice = newer.notice;
+        self.notice.error = self.notice.error.take().or(error);
+        self.held_back += newer.held_back + 1;
+    }
+}
+
+/// What happened since the last mail, and what was mailed lately.
+#[derive(Debug)]
+pub struct Notices {
+    gather: Duration,
+    flapping: Duration,
+    topics: HashMap<(PublicAddress, Topic), State>,
+}
+
+#[derive(Debug)]
+struct State {
+    pending: Option<Pending>,
+    quiet: Option<Quiet>,
+}
+
+#[derive(Debug)]
+struct Pending {
+    entry: Entry,
+    first: Instant,
+    newest: Instant,
+}
+
+/// The time after a mail.
+#[derive(Debug)]
+struct Quiet {
+    end: Instant,
+    /// Whether the mail before it came after a time without any.
+    fresh: bool,
+}
+
+impl Notices {
+    /// Nothing happened yet.
+    #[must_use]
+    pub fn new(gather: Duration, flapping: Duration) -> Self {
+        Self { gather, flapping, topics: HashMap::new() }
+    }
+
+    /// Takes in a notice.
+    pub fn add(&mut self, notice: Notice, now: Instant) {
+        let key = (notice.server.clone(), notice.event.topic());
+        let entry = Entry { notice, held_back: 0 };
+        let state = self.topics.entry(key).or_insert(State { pending: None, quiet: None });
+        if let Some(pending) = &mut state.pending {
+            pending.entry.renew(entry);
+            pending.newest = now;
+        } else {
+            state.quiet.take_if(|quiet| quiet.end <= now);
+            state.pending = Some(Pending { entry, first: now, newest: now });
+        }
+    }
+
+    /// When there will be something to mail, if nothing else happens.
+    #[must_use]
+    pub fn due(&self) -> Option<Instant> {
+        self.topics.values().filter_map(|state| self.ready(state)).min()
+    }
+
+    /// What is to be mailed now; it counts as mailed from now on.
+    pub fn take(&mut self, now: Instant) -> Vec<Entry> {
+        self.topics.retain(|_, state| state.pending.is_some() || state.quiet.as_ref().is_some_and(|q| q.end > now));
+        if self.due().is_none_or(|due| due > now) {
+            return Vec::new();
+        }
+        let (gather, flapping) = (self.gather, self.flapping);
+        let mut mailed = Vec::new();
+        for state in self.topics.values_mut() {
+            // A mail that goes anyway takes along what nothing but the gathering holds up.
+            let ready = ready(state, gather, flapping).is_some_and(|ready| state.quiet.is_none() || ready <= now);
+            if let Some(pending) = state.pending.take_if(|_| ready) {
+                let fresh = state.quiet.is_none();
+                state.quiet = Some(Quiet { end: now + flapping, fresh });
+                mailed.push(pending.entry);
+            }
+        }
+        mailed
+    }
+
+    fn ready(&self, state: &State) -> Option<Instant> {
+        ready(state, self.gather, self.flapping)
+    }
+}
+
+/// When the pending entry may be mailed.
+fn ready(state: &State, gather: Duration, flapping: Duration) -> Option<Instant> {
+    let pending = state.pending.as_ref()?;
+    let Some(quiet) = &state.quiet else {
+        return Some(pending.first + gather);
+    };
+    if quiet.fresh && pending.entry.held_back == 0 && pending.entry.notice.event.ends_trouble() {
+        Some(quiet.end.min(pending.newest + gather.max(flapping / 10)))
+    } else {
+        Some(quiet.end)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    use Event::{AvailableAgain, MaximumLoad, NotResponding, WorkingAgain};
+
+    /// When (second), and what (port, event, held back).
+    type Mail = (u64, Vec<(u16, Event, usize)>);
+
+    /// Plays notices (second, port, event) with a gathering of 10 s and a flapping limit of 600 s.
+    fn play(notices: &[(u64, u16, Event)]) -> Vec<Mail> {
+        let start = Instant::now();
+        let mut state = Notices::new(Duration::from_secs(10), Duration::from_mins(10));
+        let mut mails = Vec::new();
+        for second in 0..5_000 {
+            let now = start + Duration::from_secs(second);
+            for (_, port, event) in notices.iter().filter(|(when, ..)| *when == second) {
+                let server = PublicAddress::new("host", *port, false);
+                let notice = Notice { server, event: *event, load: None, error: None, at: SystemTime::UNIX_EPOCH };
+                state.add(notice, now);
+            }
+            let mut mail: Vec<_> = state
+                .take(now)
+                .into_iter()
+                .map(|entry| {
+                    let server = entry.notice.server.to_string();
+                    (server.rsplit_once(':').unwrap().1.parse().unwrap(), entry.notice.event, entry.held_back)
+                })
+                .collect();
+            mail.sort_unstable();
+            if !mail.is_empty() {
+                mails.push((second, mail));
+            }
+        }
+        assert!(state.topics.is_empty(), "something is kept for good: {state:?}");
+        mails
+    }
+
+    #[test]
+    fn servers_that_fail_together_are_one_mail() {
+        let notices = [(0, 1, NotResponding), (3, 2, NotResponding), (9, 3, MaximumLoad), (11, 4, NotResponding)];
+        let first = vec![(1, NotResponding, 0), (2, NotResponding, 0), (3, MaximumLoad, 0)];
+        assert_eq!(play(&notices), [(10, first), (21, vec![(4, NotResponding, 0)])]);
+    }
+
+    #[test]
+    fn a_failure_and_its_end_are_two_mails_in_good_time() {
+        let mails = play(&[(0, 1, NotResponding), (100, 1, WorkingAgain)]);
+        assert_eq!(mails, [(10, vec![(1, NotResponding, 0)]), (160, vec![(1, WorkingAgain, 0)])]);
+        let mails = play(&[(0, 1, MaximumLoad), (590, 1, AvailableAgain)]);
+        assert_eq!(mails, [(10, vec![(1, MaximumLoad, 0)]), (610, vec![(1, AvailableAgain, 0)])]);
+    }
+
+    #[test]
+    fn a_flapping_server_is_one_mail_in_ten_minutes_with_a_count() {
+        let turns = |step: u64, until: u64| -> Vec<_> {
+            (0..until / step)
+                .map(|turn| (turn * step, 1, if turn % 2 == 0 { NotResponding } else { WorkingAgain }))
+                .collect()
+        };
+        let entry = |event, held_back| vec![(1, event, held_back)];
+        let each_second = play(&turns(1, 1_000));
+        assert_eq!(each_second.iter().map(|(when, _)| *when).collect::<Vec<_>>(), [10, 610, 1_210]);
+        assert_eq!(each_second[0].1, entry(NotResponding, 10));
+        assert_eq!(each_second[1].1, entry(NotResponding, 599));
+        assert_eq!(each_second[2].1, entry(WorkingAgain, 388));
+        let each_half_minute = play(&turns(30, 600));
+        assert_eq!(each_half_minute, [(10, entry(NotResponding, 0)), (610, entry(WorkingAgain, 18))]);
+    }
+
+    #[test]
+    fn a_second_failure_soon_after_the_first_waits() {
+        let notices = [(0, 1, NotResponding), (100, 1, WorkingAgain), (200, 1, NotResponding)];
+        let mails: Vec<_> = play(&notices).into_iter().map(|(when, entries)| (when, entries[0].1)).collect();
+        assert_eq!(mails, [(10, NotResponding), (160, WorkingAgain), (760, NotResponding)]);
+    }
+
+    #[test]
+    fn a_failure_is_told_though_the_same_server_was_at_maximum_load_before() {
+        let mails = play(&[(0, 1, MaximumLoad), (60, 1, NotResponding)]);
+        assert_eq!(mails, [(10, vec![(1, MaximumLoad, 0)]), (70, vec![(1, NotResponding, 0)])]);
+    }
+
+    #[test]
+    fn one_flapping_server_does_not_hold_up_the_others() {
+        let notices = [(0, 1, NotResponding), (20, 1, WorkingAgain), (21, 1, NotResponding), (30, 2, NotResponding)];
+        let expected =
+            [(10, vec![(1, NotResponding, 0)]), (40, vec![(2, NotResponding, 0)]), (610, vec![(1, NotResponding, 1)])];
+        assert_eq!(play(&notices), expected);
+    }
+
+    #[test]
+    fn the_last_error_outlives_the_recovery() {
+        let notice = |event, error: Option<&str>| Entry {
+            notice: Notice {
+                server: PublicAddress::new("host", 1, false),
+                event,
+                load: None,
+                error: error.map(str::to_owned),
+                at: SystemTime::UNIX_EPOCH,
+            },
+            held_back: 0,
+        };
+        let mut entry = notice(NotResponding, Some("connection refused"));
+        entry.renew(notice(WorkingAgain, None));
+        assert_eq!(entry.notice.error.as_deref(), Some("connection refused"));
+        assert_eq!((entry.notice.event, entry.held_back), (WorkingAgain, 1));
+    }
+}

@@ -1,0 +1,13 @@
+#!/bin/sh
+# Makes the Python environment that tests use as a counterpart (a real SMTP server), unless it is there:
+# target/test-venv. Prints the path of its interpreter.
+set -eu
+cd "$(dirname "$0")/.."
+venv=target/test-venv
+if ! cmp -s tests/requirements.txt "$venv/requirements.txt"; then
+    rm -rf "$venv"
+    python3 -m venv "$venv"
+    "$venv/bin/pip" install --quiet --disable-pip-version-check --requirement tests/requirements.txt >&2
+    cp tests/requirements.txt "$venv/requirements.txt"
+fi
+echo "$PWD/$venv/bin/python"
