@@ -12,8 +12,9 @@ use lettre::transport::smtp::commands::{Data, Mail, Rcpt};
 use lettre::transport::smtp::extension::ClientId;
 use tokio::time::{Instant, timeout_at};
 
-use super::config::{Secret, SessionConfig};
+use super::config::SessionConfig;
 use super::letter::{Letter, Unwritable};
+use crate::shared::config::Secret;
 use crate::shared::logging::one_line;
 
 /// The port whose connections are usually encrypted from their first byte.

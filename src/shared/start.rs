@@ -1,6 +1,6 @@
 //! How a program starts: configuration, log, then the server, and an exit code.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::process::ExitCode;
 
 use super::config::{self, Configuration, Loaded};
@@ -42,7 +42,7 @@ pub fn check<C: Configuration>(loaded: &Loaded<C>) -> ExitCode {
 
 /// Starts the log and runs a server to its end.
 pub fn serve<E: std::error::Error>(
-    log: &PathBuf,
+    log: &Path,
     debug: bool,
     warnings: &[String],
     server: impl Future<Output = Result<(), E>>,

@@ -122,7 +122,7 @@ mod tests {
         assert_eq!(descendants(pid).len(), 2);
         kill_descendants(pid);
         assert!(shell.wait().is_ok());
-        assert_eq!(descendants(pid), []);
+        assert!(descendants(pid).is_empty());
     }
 
     #[test]

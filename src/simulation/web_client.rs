@@ -265,7 +265,7 @@ impl StreamHandler<Result<Message, ProtocolError>> for WebClient {
                 ctx.stop();
             }
             Ok(Message::Binary(_) | Message::Continuation(_)) => {
-                self.fail("Wrong message: allowed are short texts", ctx)
+                self.fail("Wrong message: allowed are short texts", ctx);
             }
             Err(error) => {
                 log::info!("{}: {error}", self.name());
