@@ -114,8 +114,8 @@ mod tests {
 
     #[test]
     fn grandchildren_are_found_and_ended() {
-        let mut shell = Command::new("sh").args(["-c", "sleep 100 & sleep 100 & echo ready; wait"]);
-        let mut shell = shell.stdout(Stdio::piped()).spawn().unwrap();
+        let script = "sleep 100 & sleep 100 & echo ready; wait";
+        let mut shell = Command::new("sh").args(["-c", script]).stdout(Stdio::piped()).spawn().unwrap();
         let mut line = String::new();
         std::io::BufRead::read_line(&mut std::io::BufReader::new(shell.stdout.take().unwrap()), &mut line).unwrap();
         let pid = i32::try_from(shell.id()).unwrap();
