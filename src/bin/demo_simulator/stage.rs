@@ -15,6 +15,8 @@ pub(crate) struct Stage {
     /// None while it is being loaded.
     world: Option<World>,
     names: Names,
+    /// Who wanted to watch while there was nothing to see.
+    newcomers: Vec<ClientId>,
     /// The world's time.
     pub(crate) clock: Clock,
     /// Everybody who is connected.
@@ -27,6 +29,7 @@ impl Stage {
         Self {
             world: None,
             names: Names::default(),
+            newcomers: Vec::new(),
             clock: Clock::new(mode, NO_WORLD_STEP),
             audience: Audience::default(),
         }
@@ -58,22 +61,21 @@ impl Stage {
         for id in self.audience.watchers() {
             self.show_world(id);
         }
+        for id in std::mem::take(&mut self.newcomers) {
+            self.tell_state(id);
+        }
     }
 
     /// Lets a client watch.
     pub(crate) fn admit(&mut self, id: ClientId) {
         self.audience.watch(id);
         if self.world.is_none() {
+            self.newcomers.push(id);
             self.audience.tell(id, reading());
             return;
         }
         self.show_world(id);
-        let state = match self.clock.mode() {
-            Mode::Pause => protocol::paused(self.clock.now()),
-            Mode::RealTime => protocol::REAL_TIME.to_owned(),
-            Mode::Fast => protocol::FAST.to_owned(),
-        };
-        self.audience.tell(id, state);
+        self.tell_state(id);
     }
 
     /// Makes one step, whatever the mode.
@@ -114,6 +116,15 @@ impl Stage {
         let time = self.clock.now();
         let everything = || protocol::update(&world.scene.everything(time));
         self.audience.catch_up(everything);
+    }
+
+    fn tell_state(&mut self, id: ClientId) {
+        let state = match self.clock.mode() {
+            Mode::Pause => protocol::paused(self.clock.now()),
+            Mode::RealTime => protocol::REAL_TIME.to_owned(),
+            Mode::Fast => protocol::FAST.to_owned(),
+        };
+        self.audience.tell(id, state);
     }
 
     fn show_world(&mut self, id: ClientId) {

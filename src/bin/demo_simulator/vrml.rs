@@ -371,7 +371,7 @@ mod tests {
                 "Group()",
             ),
             (
-                "Solid { children [ Shape { geometry Box { size 1 2 3 } } Odd { a [ { ] } ] } Pose {} ] }",
+                "Solid { children [ Shape { geometry Box { size 1 2 3 } } Odd { a [ { ] } } Pose {} ] }",
                 "Solid(Shape(Box())Pose())",
             ),
             (
