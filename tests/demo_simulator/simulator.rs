@@ -162,10 +162,7 @@ fn read_lines(
     tokio::spawn(async move {
         let mut lines = BufReader::new(stream).lines();
         while let Ok(Some(line)) = lines.next_line().await {
-            printed
-                .lock()
-                .unwrap()
-                .push_str(&format!("{prefix}{line}\n"));
+            printed.lock().unwrap().extend([prefix, &line, "\n"]);
             if let Some(sender) = &sender {
                 drop(sender.send(line));
             }

@@ -13,9 +13,10 @@ async fn a_broken_world_is_replaced_by_an_empty_one_and_only_stderr_tells() {
     let deep = format!("{HEADER}{}", "Group { children ".repeat(100_000));
     let wild = format!("{HEADER}\u{0} }}}} ]] \"\\");
     let huge = format!("{HEADER}{}", " ".repeat(9 * 1024 * 1024));
-    let doubling: String = (1..50)
+    let doubling: Vec<String> = (1..50)
         .map(|i| format!("DEF N{i} Group {{ children [ USE N{0} USE N{0} ] }}", i - 1))
         .collect();
+    let doubling = doubling.concat();
     let exploding = format!("{HEADER}DEF N0 Group {{ }}{doubling}");
     for text in [
         no_header,

@@ -104,8 +104,8 @@ fn turn_about_z([w, x, y, z]: [f64; 4], angle: f64) -> [f64; 4] {
         cos * z + sin * w,
     ];
     // of the two ways to write a rotation, the one with the smaller angle
-    let sign = if turned[0] < 0.0 { -1.0 } else { 1.0 };
-    let [w, x, y, z] = turned.map(|part| part * sign);
+    let side = if turned[0] < 0.0 { -1.0 } else { 1.0 };
+    let [w, x, y, z] = turned.map(|part| part * side);
     let length = (x * x + y * y + z * z).sqrt();
     if length < 1e-9 {
         return [0.0, 0.0, 1.0, 0.0];
@@ -166,7 +166,7 @@ mod tests {
 
     #[test]
     fn after_a_round_a_robot_is_back() {
-        for index in 0..RADII.len() {
+        for (index, radius) in RADII.into_iter().enumerate() {
             let path = Path::new(
                 Pose {
                     translation: [0.5, -1.0, 0.1],
@@ -174,7 +174,7 @@ mod tests {
                 },
                 index,
             );
-            let round = std::f64::consts::TAU * RADII[index].abs() / SPEED * 1000.0;
+            let round = std::f64::consts::TAU * radius.abs() / SPEED * 1000.0;
             let pose = path.pose_at(round);
             assert!(!pose.differs(&path.pose_at(0.0)), "{pose:?}");
             assert!(pose.differs(&path.pose_at(round / 2.0)));

@@ -305,9 +305,10 @@ mod tests {
 
     #[test]
     fn a_world_that_multiplies_by_use_is_refused() {
-        let doubling: String = (1..60)
+        let doubling: Vec<String> = (1..60)
             .map(|i| format!("DEF N{i} Group{{children[USE N{0} USE N{0}]}}\n", i - 1))
             .collect();
+        let doubling = doubling.concat();
         let nodes = parse(&format!("DEF N0 Box{{}}\n{doubling}")).unwrap();
         assert!(matches!(Scene::new(&nodes), Err(SceneError::TooManyNodes)));
     }

@@ -462,9 +462,10 @@ mod tests {
             SyntaxError::TooDeep { line: 1 }
         );
 
-        let chain: String = (1..DEEPEST + 9)
+        let chain: Vec<String> = (1..DEEPEST + 9)
             .map(|i| format!("DEF N{i} Group{{children USE N{}}}\n", i - 1))
             .collect();
+        let chain = chain.concat();
         assert_eq!(
             parse(&format!("DEF N0 Box{{}}\n{chain}")).unwrap_err(),
             SyntaxError::TooDeep { line: DEEPEST + 1 }
