@@ -85,3 +85,45 @@ async fn the_demo_worlds_have_robots_that_move() {
         assert!(!simulator.printed().contains("stderr"));
     }
 }
+
+#[tokio::test]
+async fn each_node_becomes_an_element_with_its_number() {
+    let text = r#"#VRML_SIM R2025a utf8
+        EXTERNPROTO "https://example.org/Floor.proto"
+        Floor { size 3 3 appearance Parquetry { type "}" } }  # a comment }
+        WorldInfo { title "<a> & \"b\"" basicTimeStep 16 }
+        Viewpoint { position -4 0 2 near 0.1 }
+        Solid {
+          name "it's"
+          translation 0 0 .5
+          children Shape {
+            castShadows TRUE
+            appearance PBRAppearance { baseColor 1 0 0 baseColorMap ImageTexture { url "a.png" } }
+            geometry Box { size 1, 2, 3 }
+          }
+          boundingObject Box { }
+        }
+        DEF PAIR Group { children [ Pose { } Group { } ] }
+        USE PAIR
+    "#;
+    let project = project(&[("a.wbt", text)]);
+    let simulator = Start::paused(&project.path().join("worlds/a.wbt"))
+        .playing()
+        .await;
+    let mut viewer = simulator.viewer().await;
+    viewer.say("w3d").await;
+    viewer.hears(&["world:"]).await;
+    assert_eq!(
+        viewer.hear().await,
+        concat!(
+            r#"model:<?xml version="1.0" encoding="UTF-8"?><X3D><head><meta name="generator" content="Webots"/>"#,
+            r#"<meta name="version" content="R2025a"/></head><Scene>"#,
+            r#"<WorldInfo id="n1" title="&lt;a&gt; &amp; &quot;b&quot;" basicTimeStep="16"/>"#,
+            r#"<Viewpoint id="n2" position="-4 0 2" zNear="0.1"/>"#,
+            r#"<Solid id="n3" name="it&apos;s" translation="0 0 0.5"><Shape id="n4" castShadows="true">"#,
+            r#"<PBRAppearance id="n5" baseColor="1 0 0"/><Box id="n6" size="1 2 3"/></Shape></Solid>"#,
+            r#"<Group id="n7"><Pose id="n8"/><Group id="n9"/></Group>"#,
+            r#"<Group id="n10"><Pose id="n11"/><Group id="n12"/></Group></Scene></X3D>"#,
+        )
+    );
+}

@@ -19,6 +19,7 @@ mod files;
 mod kinds;
 mod lexer;
 mod motion;
+mod node;
 mod port;
 mod protocol;
 mod run;

@@ -7,8 +7,9 @@ use std::rc::Rc;
 
 use thiserror::Error;
 
-use crate::kinds::{self, Kind};
+use crate::kinds;
 use crate::lexer::{Lexer, Token};
+use crate::node::{Node, Value};
 
 /// Nodes in nodes, counted through `USE`.
 const DEEPEST: usize = 64;
@@ -16,29 +17,6 @@ const DEEPEST: usize = 64;
 const MOST_NODES: usize = 100_000;
 /// Numbers kept of one field: no field that is passed on has more.
 const MOST_NUMBERS: usize = 16;
-
-/// A node of a known kind.
-#[derive(Debug)]
-pub(crate) struct Node {
-    /// What it is.
-    pub(crate) kind: &'static Kind,
-    fields: Vec<(String, Value)>,
-    /// How many nodes lie within each other here, itself included.
-    height: usize,
-}
-
-/// The value of a field.
-#[derive(Debug)]
-pub(crate) enum Value {
-    /// One or more numbers.
-    Numbers(Vec<f64>),
-    /// A string, or the first of a list.
-    Text(String),
-    /// `TRUE` or `FALSE`.
-    Flag(bool),
-    /// Nodes of known kinds; also `NULL`, the empty list, and what has been skipped.
-    Nodes(Vec<Rc<Node>>),
-}
 
 /// Why a world file cannot be parsed.
 #[derive(Debug, Error, PartialEq)]
@@ -65,32 +43,6 @@ pub(crate) enum SyntaxError {
         /// The line, from 1.
         line: usize,
     },
-}
-
-impl Node {
-    /// The value of the field called `name`, if it is given.
-    pub(crate) fn field(&self, name: &str) -> Option<&Value> {
-        self.fields
-            .iter()
-            .find(|(field, _)| field == name)
-            .map(|(_, value)| value)
-    }
-
-    /// The nodes in the field called `name`; none if it holds something else.
-    pub(crate) fn nodes(&self, name: &str) -> &[Rc<Node>] {
-        match self.field(name) {
-            Some(Value::Nodes(nodes)) => nodes,
-            _ => &[],
-        }
-    }
-
-    /// The numbers in the field called `name`, if it holds exactly that many.
-    pub(crate) fn numbers<const N: usize>(&self, name: &str) -> Option<[f64; N]> {
-        match self.field(name) {
-            Some(Value::Numbers(numbers)) => numbers.as_slice().try_into().ok(),
-            _ => None,
-        }
-    }
 }
 
 /// Parses the nodes at the top level of a world file, whose header has been read before.
@@ -128,7 +80,7 @@ impl<'a> Parser<'a> {
                 let name = self.word("a name after USE")?;
                 let node = self.named.get(name).cloned();
                 match node {
-                    Some(node) if node.height > room => Err(SyntaxError::TooDeep {
+                    Some(node) if node.height() > room => Err(SyntaxError::TooDeep {
                         line: self.lexer.line(),
                     }),
                     node => Ok(node),
@@ -159,14 +111,12 @@ impl<'a> Parser<'a> {
                 line: self.lexer.line(),
             });
         }
-        let room = room.checked_sub(1).ok_or(SyntaxError::TooDeep {
-            line: self.lexer.line(),
-        })?;
-        let mut node = Node {
-            kind,
-            fields: Vec::new(),
-            height: 1,
+        let Some(room) = room.checked_sub(1) else {
+            return Err(SyntaxError::TooDeep {
+                line: self.lexer.line(),
+            });
         };
+        let mut node = Node::new(kind);
         loop {
             match self.lexer.next() {
                 Some(Token::CloseBrace) => return Ok(Some(Rc::new(node))),
@@ -186,11 +136,7 @@ impl<'a> Parser<'a> {
             return self.skip_value();
         }
         let value = self.value(room)?;
-        if let Value::Nodes(children) = &value {
-            let tallest = children.iter().map(|child| child.height).max().unwrap_or(0);
-            node.height = node.height.max(tallest + 1);
-        }
-        node.fields.push((field.to_owned(), value));
+        node.set(field, value);
         Ok(())
     }
 

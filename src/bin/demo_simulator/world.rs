@@ -9,8 +9,9 @@ use std::rc::Rc;
 use thiserror::Error;
 
 use crate::kinds;
+use crate::node::Node;
 use crate::scene::{Scene, SceneError};
-use crate::vrml::{self, Node, SyntaxError};
+use crate::vrml::{self, SyntaxError};
 
 /// What is shown when a world file makes no sense, so that viewers see something.
 const EMPTY_WORLD: &str =
@@ -220,7 +221,27 @@ fn is_header(line: &str) -> bool {
 
 #[cfg(test)]
 mod tests {
+    use proptest::prelude::*;
+
     use super::*;
+
+    proptest! {
+        #[test]
+        fn no_world_file_makes_the_loader_panic(
+            words in prop::collection::vec(
+                prop::sample::select(vec![
+                    "WorldInfo", "Robot", "Solid", "Shape", "Box", "DEF", "USE", "A", "B", "{", "}", "{}", "[", "]",
+                    "children", "geometry", "size", "name", "\"<&>\"", "translation", "rotation", "basicTimeStep",
+                    "FPS", "1", "0", "-1e308", "1e-300", "TRUE", "NULL",
+                ]),
+                0..40,
+            )
+        ) {
+            if let Ok(mut world) = World::parse(&format!("#VRML_SIM R2025a utf8\n{}", words.join(" "))) {
+                drop(world.scene.changes(1e9));
+            }
+        }
+    }
 
     #[test]
     fn the_header_is_checked() {
