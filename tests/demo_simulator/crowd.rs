@@ -6,6 +6,7 @@ use tokio_tungstenite::tungstenite::Message;
 use tokio_tungstenite::tungstenite::protocol::frame::coding::CloseCode;
 
 use crate::simulator::{DEADLINE, SMALL_WORLD, Start, project};
+use crate::viewer::time_of;
 
 #[tokio::test]
 async fn many_viewers_see_the_same() {
@@ -51,6 +52,35 @@ async fn a_viewer_that_does_not_read_is_dropped_and_the_others_go_on() {
         .expect("the connection was not broken in time");
     other.say("pause").await;
     other.hears(&["paused by client"]).await;
+}
+
+#[tokio::test]
+async fn a_viewer_that_reads_too_slowly_misses_updates_but_sees_the_last() {
+    let robots = "Robot { name \"one of a great many robots\" }\n".repeat(3000);
+    let project = project(&[("a.wbt", &format!("{SMALL_WORLD}{robots}"))]);
+    let world = project.path().join("worlds/a.wbt");
+    let simulator = Start::paused(&world).playing().await;
+    let mut slow = simulator.spectator().await;
+    let mut other = simulator.spectator().await;
+    other.say("real-time:-1").await;
+    other.hears(&["real-time"]).await;
+    let mut received = Vec::new();
+    while received.len() < 60 {
+        received.push(other.hear().await);
+    }
+    other.say("pause").await;
+    received.extend(other.hears_after_updates("paused by client").await);
+    slow.say("pause").await;
+    let seen = slow.hears_after_updates("paused by client").await;
+    assert!(
+        seen.len() < received.len(),
+        "{} of {}",
+        seen.len(),
+        received.len()
+    );
+    let [seen, received] = [seen, received].map(|updates| updates.last().unwrap().clone());
+    assert!((time_of(&seen) - time_of(&received)).abs() < 1.0);
+    assert_eq!(seen.matches("\"id\"").count(), 3001);
 }
 
 #[tokio::test]
