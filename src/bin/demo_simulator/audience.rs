@@ -1,0 +1,129 @@
+//! Everybody who is connected, and what each may be sent: owned by the simulation. Keeps what waits for
+//! a peer that reads slowly, or not at all, within bounds.
+
+use std::collections::BTreeMap;
+
+use actix_web_actors::ws::CloseCode;
+use bytestring::ByteString;
+
+use crate::client::{ClientId, Outbox};
+
+/// With so many bytes waiting a client gets no more pose updates, until it has caught up.
+const SLOW: usize = 64 * 1024;
+/// With so many bytes waiting a client is hopeless.
+const HOPELESS: usize = 4 * 1024 * 1024;
+
+/// Everybody who is connected.
+#[derive(Default)]
+pub(crate) struct Audience {
+    seats: BTreeMap<ClientId, Seat>,
+}
+
+struct Seat {
+    outbox: Outbox,
+    /// Whether it has asked to see the scene.
+    watching: bool,
+    /// Whether it missed an update, so that the next one must name everything.
+    missed: bool,
+}
+
+impl Audience {
+    /// Someone connected.
+    pub(crate) fn join(&mut self, id: ClientId, outbox: Outbox) {
+        self.seats.insert(
+            id,
+            Seat {
+                outbox,
+                watching: false,
+                missed: false,
+            },
+        );
+    }
+
+    /// Someone is gone.
+    pub(crate) fn leave(&mut self, id: ClientId) {
+        self.seats.remove(&id);
+    }
+
+    /// Someone wants to see the scene from now on.
+    pub(crate) fn watch(&mut self, id: ClientId) {
+        if let Some(seat) = self.seats.get_mut(&id) {
+            seat.watching = true;
+        }
+    }
+
+    /// Those who see the scene.
+    pub(crate) fn watchers(&self) -> Vec<ClientId> {
+        self.seats
+            .iter()
+            .filter(|(_, seat)| seat.watching)
+            .map(|(id, _)| *id)
+            .collect()
+    }
+
+    /// Whether nobody sees the scene.
+    pub(crate) fn is_blind(&self) -> bool {
+        !self.seats.values().any(|seat| seat.watching)
+    }
+
+    /// Sends a text to one.
+    pub(crate) fn tell(&mut self, id: ClientId, text: impl Into<ByteString>) {
+        if let Some(seat) = self.seats.get(&id)
+            && !seat.send(text.into())
+        {
+            self.seats.remove(&id);
+        }
+    }
+
+    /// Sends a text to all who see the scene.
+    pub(crate) fn tell_watchers(&mut self, text: impl Into<ByteString>) {
+        let text = text.into();
+        self.seats
+            .retain(|_, seat| !seat.watching || seat.send(text.clone()));
+    }
+
+    /// Sends an update to all who see the scene and read fast enough; `everything` makes the one for
+    /// those who missed some before.
+    pub(crate) fn show(
+        &mut self,
+        changes: impl Into<ByteString>,
+        mut everything: impl FnMut() -> String,
+    ) {
+        let changes = changes.into();
+        for seat in self.seats.values_mut().filter(|seat| seat.watching) {
+            if seat.outbox.waiting() > SLOW {
+                seat.missed = true;
+            } else if std::mem::take(&mut seat.missed) {
+                seat.outbox.send(everything().into());
+            } else {
+                seat.outbox.send(changes.clone());
+            }
+        }
+    }
+
+    /// Sends everything to those who missed an update, since time stops and no other will come.
+    pub(crate) fn catch_up(&mut self, mut everything: impl FnMut() -> String) {
+        self.seats
+            .retain(|_, seat| !std::mem::take(&mut seat.missed) || seat.send(everything().into()));
+    }
+
+    /// Says goodbye to everybody.
+    pub(crate) fn close(&mut self) {
+        for seat in std::mem::take(&mut self.seats).into_values() {
+            seat.outbox.close(CloseCode::Away);
+        }
+    }
+}
+
+impl Seat {
+    /// Sends a text that must arrive. To a hopeless client it cannot: then the connection is broken, and
+    /// false is returned.
+    fn send(&self, text: ByteString) -> bool {
+        if self.outbox.waiting() > HOPELESS {
+            self.outbox.hang_up();
+            return false;
+        }
+        self.outbox.send(text);
+        true
+    }
+}

@@ -1,0 +1,198 @@
+//! Simulation time: how far it runs in a stretch of wall time, and when it pauses by itself. Pure;
+//! owned by the simulation, which feeds it the wall time.
+
+use std::time::Duration;
+
+/// How many times faster than real time `fast` is. Webots would run as fast as it can; a scene
+/// this small needs a limit, so that many demo simulators can share a machine.
+const FAST_SPEED: f64 = 16.0;
+/// Wall time beyond this is forgotten: a process that was stopped for a while does not catch up.
+const LONGEST_STRETCH: Duration = Duration::from_secs(1);
+
+/// Whether and how time runs.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Mode {
+    /// Time stands still.
+    Pause,
+    /// One second of simulation per second.
+    RealTime,
+    /// Faster than real time.
+    Fast,
+}
+
+/// What became of a stretch of wall time.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Progress {
+    /// Not enough of it for a step.
+    Nothing,
+    /// Simulation time moved.
+    Moved,
+    /// Simulation time moved up to the timeout, and is now paused.
+    TimedOut,
+}
+
+/// The simulation's time.
+#[derive(Debug)]
+pub(crate) struct Clock {
+    mode: Mode,
+    /// Length of a step, in milliseconds.
+    step: f64,
+    /// Simulation time, in milliseconds.
+    now: f64,
+    /// Simulation time at which to pause; infinite for never.
+    pause_at: f64,
+    /// Simulation time that is due but makes no whole step yet, in milliseconds.
+    due: f64,
+}
+
+impl Clock {
+    /// A clock at time 0, whose steps are `step` milliseconds long.
+    pub(crate) fn new(mode: Mode, step: f64) -> Self {
+        Self {
+            mode,
+            step,
+            now: 0.0,
+            pause_at: f64::INFINITY,
+            due: 0.0,
+        }
+    }
+
+    /// Simulation time, in milliseconds.
+    pub(crate) fn now(&self) -> f64 {
+        self.now
+    }
+
+    /// Whether and how time runs.
+    pub(crate) fn mode(&self) -> Mode {
+        self.mode
+    }
+
+    /// Changes the mode and nothing else.
+    pub(crate) fn set_mode(&mut self, mode: Mode) {
+        self.mode = mode;
+        self.due = 0.0;
+    }
+
+    /// Pauses once `timeout` milliseconds of simulation time have passed.
+    pub(crate) fn set_timeout(&mut self, timeout: f64) {
+        self.pause_at = self.now + timeout;
+    }
+
+    /// Back to time 0, in the same mode and without a timeout.
+    pub(crate) fn reset(&mut self) {
+        *self = Self::new(self.mode, self.step);
+    }
+
+    /// A clock at time 0 for another world, in the same mode and with the same time left.
+    pub(crate) fn restart(&mut self, step: f64) {
+        let left = (self.pause_at - self.now).max(0.0);
+        *self = Self {
+            pause_at: left,
+            ..Self::new(self.mode, step)
+        };
+    }
+
+    /// One step, whatever the mode.
+    pub(crate) fn step(&mut self) {
+        self.now += self.step;
+    }
+
+    /// Lets `elapsed` wall time pass.
+    pub(crate) fn advance(&mut self, elapsed: Duration) -> Progress {
+        let speed = match self.mode {
+            Mode::Pause => return Progress::Nothing,
+            Mode::RealTime => 1.0,
+            Mode::Fast => FAST_SPEED,
+        };
+        self.due += elapsed.min(LONGEST_STRETCH).as_secs_f64() * 1000.0 * speed;
+        // rounded, so that a timer that fires a little early does not skip a frame
+        let steps = (self.due / self.step).round();
+        if steps < 1.0 {
+            return Progress::Nothing;
+        }
+        self.due -= steps * self.step;
+        let left = ((self.pause_at - self.now) / self.step).ceil().max(1.0);
+        if steps < left {
+            self.now += steps * self.step;
+            return Progress::Moved;
+        }
+        self.now += left * self.step;
+        self.pause_at = f64::INFINITY;
+        self.set_mode(Mode::Pause);
+        Progress::TimedOut
+    }
+}
+
+#[cfg(test)]
+#[expect(clippy::float_cmp, reason = "whole numbers of milliseconds are exact")]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn real_time_makes_whole_steps_and_keeps_the_rest() {
+        let mut clock = Clock::new(Mode::RealTime, 32.0);
+        assert_eq!(clock.advance(Duration::from_millis(10)), Progress::Nothing);
+        assert_eq!(clock.advance(Duration::from_millis(10)), Progress::Moved);
+        assert_eq!(clock.now(), 32.0);
+        for _ in 0..98 {
+            clock.advance(Duration::from_millis(10));
+        }
+        assert_eq!(clock.now(), 992.0, "1000 ms of wall time");
+    }
+
+    #[test]
+    fn fast_is_faster_by_a_fixed_factor() {
+        let mut clock = Clock::new(Mode::Fast, 10.0);
+        clock.advance(Duration::from_millis(100));
+        assert_eq!(clock.now(), 1600.0);
+    }
+
+    #[test]
+    fn a_paused_clock_stands_still_but_can_step() {
+        let mut clock = Clock::new(Mode::Pause, 8.0);
+        assert_eq!(clock.advance(Duration::from_secs(1)), Progress::Nothing);
+        clock.step();
+        assert_eq!(clock.now(), 8.0);
+    }
+
+    #[test]
+    fn the_timeout_pauses_at_the_first_step_that_reaches_it() {
+        for (timeout, expected) in [(0.0, 32.0), (32.0, 32.0), (33.0, 64.0), (100.0, 128.0)] {
+            let mut clock = Clock::new(Mode::Fast, 32.0);
+            clock.set_timeout(timeout);
+            assert_eq!(
+                clock.advance(Duration::from_millis(100)),
+                Progress::TimedOut,
+                "{timeout}"
+            );
+            assert_eq!(
+                (clock.now(), clock.mode()),
+                (expected, Mode::Pause),
+                "{timeout}"
+            );
+            clock.set_mode(Mode::Fast);
+            assert_eq!(
+                clock.advance(Duration::from_millis(100)),
+                Progress::Moved,
+                "it pauses only once"
+            );
+        }
+    }
+
+    #[test]
+    fn a_process_that_was_stopped_for_long_does_not_catch_up() {
+        let mut clock = Clock::new(Mode::RealTime, 10.0);
+        clock.advance(Duration::from_hours(1));
+        assert_eq!(clock.now(), 1000.0);
+    }
+
+    #[test]
+    fn reset_goes_back_to_zero_in_the_same_mode_without_a_timeout() {
+        let mut clock = Clock::new(Mode::RealTime, 10.0);
+        clock.set_timeout(50.0);
+        clock.advance(Duration::from_millis(20));
+        clock.reset();
+        assert_eq!((clock.now(), clock.mode()), (0.0, Mode::RealTime));
+        assert_eq!(clock.advance(Duration::from_millis(500)), Progress::Moved);
+    }
+}

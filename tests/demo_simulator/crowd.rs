@@ -1,0 +1,121 @@
+//! Many clients, and those that do not behave.
+
+use futures_util::{SinkExt as _, StreamExt as _};
+use tokio::time::timeout;
+use tokio_tungstenite::tungstenite::Message;
+use tokio_tungstenite::tungstenite::protocol::frame::coding::CloseCode;
+
+use crate::simulator::{DEADLINE, SMALL_WORLD, Start, project};
+use crate::viewer::time_of;
+
+#[tokio::test]
+async fn many_viewers_see_the_same() {
+    let project = project(&[("a.wbt", SMALL_WORLD)]);
+    let simulator = Start::paused(&project.path().join("worlds/a.wbt"))
+        .playing()
+        .await;
+    let mut viewers = Vec::new();
+    for _ in 0..50 {
+        viewers.push(simulator.spectator().await);
+    }
+    viewers[0].say("step").await;
+    for viewer in &mut viewers {
+        viewer.hears(&["application/json:{\"time\":10,"]).await;
+    }
+}
+
+#[tokio::test]
+async fn a_viewer_that_does_not_read_is_dropped_and_the_others_go_on() {
+    let robots = "Robot { name \"one of a great many robots\" }\n".repeat(5000);
+    let project = project(&[("a.wbt", &format!("{SMALL_WORLD}{robots}"))]);
+    let simulator = Start::paused(&project.path().join("worlds/a.wbt"))
+        .playing()
+        .await;
+    let mut deaf = simulator.spectator().await;
+    let mut other = simulator.spectator().await;
+    for _ in 0..40 {
+        other.say("reset").await;
+        while other.hear().await != "reset finished" {}
+    }
+    // what was sent before can still be read, then the connection breaks without a goodbye
+    let rest = async {
+        while let Some(message) = deaf.socket.next().await {
+            match message {
+                Ok(Message::Text(_)) => (),
+                Ok(other) => panic!("expected the connection to break, got {other:?}"),
+                Err(_) => break,
+            }
+        }
+    };
+    timeout(DEADLINE, rest)
+        .await
+        .expect("the connection was not broken in time");
+    other.say("pause").await;
+    other.hears(&["paused by client"]).await;
+}
+
+#[tokio::test]
+async fn a_viewer_that_reads_too_slowly_misses_updates_but_sees_the_last() {
+    let robots = "Robot { name \"one of a great many robots\" }\n".repeat(3000);
+    let project = project(&[("a.wbt", &format!("{SMALL_WORLD}{robots}"))]);
+    let world = project.path().join("worlds/a.wbt");
+    let simulator = Start::paused(&world).playing().await;
+    let mut slow = simulator.spectator().await;
+    let mut other = simulator.spectator().await;
+    other.say("real-time:-1").await;
+    other.hears(&["real-time"]).await;
+    let mut received = Vec::new();
+    while received.len() < 60 {
+        received.push(other.hear().await);
+    }
+    other.say("pause").await;
+    received.extend(other.hears_after_updates("paused by client").await);
+    slow.say("pause").await;
+    let seen = slow.hears_after_updates("paused by client").await;
+    assert!(
+        seen.len() < received.len(),
+        "{} of {}",
+        seen.len(),
+        received.len()
+    );
+    let [seen, received] = [seen, received].map(|updates| updates.last().unwrap().clone());
+    assert!((time_of(&seen) - time_of(&received)).abs() < 1.0);
+    assert_eq!(seen.matches("\"id\"").count(), 3001);
+}
+
+#[tokio::test]
+async fn a_viewer_that_says_goodbye_is_answered() {
+    let project = project(&[("a.wbt", SMALL_WORLD)]);
+    let simulator = Start::paused(&project.path().join("worlds/a.wbt"))
+        .playing()
+        .await;
+    let mut viewer = simulator.spectator().await;
+    viewer.socket.close(None).await.unwrap();
+    assert!(matches!(
+        timeout(DEADLINE, viewer.socket.next()).await,
+        Ok(Some(Ok(Message::Close(_))) | None)
+    ));
+    simulator.spectator().await;
+}
+
+#[tokio::test]
+async fn a_viewer_that_sends_bytes_is_sent_away() {
+    let project = project(&[("a.wbt", SMALL_WORLD)]);
+    let simulator = Start::paused(&project.path().join("worlds/a.wbt"))
+        .playing()
+        .await;
+    let mut viewer = simulator.spectator().await;
+    viewer
+        .socket
+        .send(Message::binary(vec![1, 2, 3]))
+        .await
+        .unwrap();
+    viewer.is_closed(CloseCode::Unsupported).await;
+    let mut viewer = simulator.spectator().await;
+    viewer
+        .socket
+        .send(Message::text("x".repeat(100_000)))
+        .await
+        .unwrap();
+    viewer.is_closed(CloseCode::Protocol).await;
+}
