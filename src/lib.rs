@@ -1,1 +1,3 @@
-//! x
+//! Session server and simulation server for interactive Webots simulations in the browser.
+
+pub mod session;
