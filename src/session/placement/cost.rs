@@ -1,21 +1,25 @@
-//! What one client costs one server, learned from its reports.
+//! What one client costs a server, learned from the reports.
 //!
-//! A least squares fit of `load = base + cost * clients` in which old reports fade and which starts from a guess, so that
-//! it answers sensibly from the first report on: the guess holds until there is something to learn from, a server that is
-//! watched while its clients come and go gives the cost, and one whose number of clients never changes still tells that
-//! cost and base explain its load together.
+//! Each server has a least squares fit of `load = base + cost * clients` ([`Cost`]), in which old reports fade and which
+//! starts from a guess. Clients differ, so a server that has seen few knows little; the fleet ([`Common`]) tells how much
+//! the servers differ at all, and by that each server's own estimate is drawn towards what all have in common: servers that
+//! look alike are taken as alike, and a new one starts from what the others have learned.
 
 use std::time::Duration;
 
-/// How long a report is remembered: its weight falls to 1/e in that time.
+/// How long a report is remembered: its weight falls to 1/e in that time, of which only the time with clients counts.
 const MEMORY: Duration = Duration::from_mins(10);
 /// The most time that one report stands for, so that a gap between reports does not make the next one weigh too much.
 const LONGEST_STEP: Duration = Duration::from_secs(10);
-/// An idle server's load is expected to be 0; that expectation weighs as much as so many seconds of reports.
+/// An idle server's load is expected to be 0; that weighs as much as so many seconds of reports.
 const BASE_TRUST: f64 = 2.0;
-/// The guessed cost weighs as much as so many seconds of watching a server with one client, if the guess is 1 %; a
-/// greater guess is less certain, and its weight falls with its square.
-const COST_TRUST: f64 = 45.0;
+/// An idle server's load is remembered for so many seconds.
+const IDLE_MEMORY: f64 = 60.0;
+/// How far a load lies from what the fit says, as a variance in percent squared, for one second of reports: 2 % for five
+/// seconds, since so many make one mean.
+const NOISE: f64 = 2.0 * 2.0 * 5.0;
+/// How far clients differ: the variance of one client's cost, relative to the square of the mean cost.
+const VARIETY: f64 = 0.16;
 /// From this load on a report only says 'at least so much', because the machine has no more to give.
 pub(super) const FULL: f64 = 99.0;
 /// The lowest cost that is believed, in percent: clients that do nothing yet may start to.
@@ -23,7 +27,20 @@ const LOWEST: f64 = 0.1;
 /// The highest cost that is believed, in percent.
 const HIGHEST: f64 = 50.0;
 
-/// The fit for one server: the weighted sums of the samples seen, and what follows from them.
+/// A believable cost, whatever the number.
+fn believable(cost: f64) -> f64 {
+    // `clamp` would let NaN through; `max` does not.
+    cost.max(LOWEST).min(HIGHEST)
+}
+
+/// What one server says about its cost: the logarithm, and how sure it is (one over the variance of that logarithm).
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Estimate {
+    log: f64,
+    precision: f64,
+}
+
+/// The fit for one server: the weighted sums of the samples seen with clients, and what follows from them.
 #[derive(Debug, Clone)]
 pub(super) struct Cost {
     guess: f64,
@@ -32,15 +49,20 @@ pub(super) struct Cost {
     clients_squared: f64,
     load: f64,
     clients_by_load: f64,
+    /// The load without clients, and how many seconds it was seen.
+    idle_load: f64,
+    idle_weight: f64,
+    /// How many clients the fit rests on.
+    seen: f64,
     base: f64,
-    percent: f64,
+    cost: f64,
+    precision: f64,
 }
 
 impl Cost {
     /// Nothing learned yet: a client costs `guess` percent.
     pub(super) fn new(guess: f64) -> Self {
-        // `clamp` would let NaN through; `max` does not.
-        let guess = guess.max(LOWEST).min(HIGHEST);
+        let guess = believable(guess);
         Self {
             guess,
             weight: 0.0,
@@ -48,51 +70,128 @@ impl Cost {
             clients_squared: 0.0,
             load: 0.0,
             clients_by_load: 0.0,
+            idle_load: 0.0,
+            idle_weight: BASE_TRUST,
+            seen: 0.0,
             base: 0.0,
-            percent: guess,
+            cost: guess,
+            precision: 0.0,
         }
     }
 
-    /// What one more client is expected to add to the load, in percent: always positive and finite.
-    pub(super) fn percent(&self) -> f64 {
-        self.percent
+    /// This server's own estimate.
+    pub(super) fn estimate(&self) -> Estimate {
+        Estimate {
+            log: self.cost.ln(),
+            precision: self.precision,
+        }
+    }
+
+    /// So many clients were seen for the first time.
+    pub(super) fn meet(&mut self, clients: f64) {
+        self.seen += clients;
     }
 
     /// Learns that the server had this `load` while it held so many `clients`. `elapsed` is the time since the report
     /// before, and `trust` (0 to 1) tells how well the number of clients is known.
     pub(super) fn learn(&mut self, clients: f64, load: f64, elapsed: Duration, trust: f64) {
-        let fade = (-elapsed.as_secs_f64() / MEMORY.as_secs_f64()).exp();
+        let seconds = elapsed.min(LONGEST_STEP).as_secs_f64();
         let load = load.min(100.0);
         // A full machine can teach that its clients cost more than was thought, but not that they cost less.
-        let says_nothing = load >= FULL && self.base + self.percent * clients >= load;
-        let weight = if says_nothing {
-            0.0
+        let says_nothing = load >= FULL && self.base + self.cost * clients >= load;
+        if says_nothing || seconds == 0.0 {
+            return;
+        }
+        if clients < 0.5 {
+            let weight = (self.idle_weight + seconds).min(IDLE_MEMORY);
+            self.idle_load += (load - self.idle_load) * seconds / weight;
+            self.idle_weight = weight;
         } else {
-            trust * elapsed.min(LONGEST_STEP).as_secs_f64()
-        };
-        self.weight = self.weight * fade + weight;
-        self.clients = self.clients * fade + weight * clients;
-        self.clients_squared = self.clients_squared * fade + weight * clients * clients;
-        self.load = self.load * fade + weight * load;
-        self.clients_by_load = self.clients_by_load * fade + weight * clients * load;
+            let fade = (-seconds / MEMORY.as_secs_f64()).exp();
+            let weight = trust * seconds;
+            self.weight = self.weight * fade + weight;
+            self.clients = self.clients * fade + weight * clients;
+            self.clients_squared = self.clients_squared * fade + weight * clients * clients;
+            self.load = self.load * fade + weight * load;
+            self.clients_by_load = self.clients_by_load * fade + weight * clients * load;
+            self.seen *= fade;
+        }
         self.fit();
     }
 
     fn fit(&mut self) {
-        let trust = COST_TRUST / (self.guess * self.guess);
-        let weight = self.weight + BASE_TRUST;
+        let trust = NOISE / (self.guess * self.guess);
+        let weight = self.weight + self.idle_weight;
+        let load = self.load + self.idle_weight * self.idle_load;
         let squares = self.clients_squared + trust;
         let products = self.clients_by_load + trust * self.guess;
-        // Positive, because weight * squares >= clients * clients holds already without the two trusts.
+        // Positive, because weight * squares >= clients * clients holds already without what is added to the two.
         let determinant = weight * squares - self.clients * self.clients;
-        let base = (self.load * squares - self.clients * products) / determinant;
-        let cost = if base < 0.0 {
-            // No machine is less than idle: the best fit that has no base.
-            products / squares
+        let base = (load * squares - self.clients * products) / determinant;
+        // No machine is less than idle: if the best fit says so, then the best one that has no base.
+        let (cost, variance) = if base < 0.0 {
+            (products / squares, NOISE / squares)
         } else {
-            (weight * products - self.clients * self.load) / determinant
+            let cost = (weight * products - self.clients * load) / determinant;
+            (cost, NOISE * weight / determinant)
         };
         self.base = base.max(0.0);
-        self.percent = cost.max(LOWEST).min(HIGHEST);
+        self.cost = believable(cost);
+        let relative = variance / (self.cost * self.cost);
+        // seen / (seen * relative + VARIETY) is 1 / (relative + VARIETY / seen), and 0 where none was seen.
+        self.precision = self.seen / (self.seen * relative + VARIETY);
+    }
+}
+
+/// What the servers of a fleet have in common: sums over their estimates, from which follow the mean and how far servers
+/// really differ from it, beyond the doubt in their estimates (DerSimonian and Laird's estimator).
+#[derive(Debug, Clone)]
+pub(super) struct Common {
+    servers: f64,
+    precision: f64,
+    precision_squared: f64,
+    log: f64,
+    log_squared: f64,
+}
+
+impl Common {
+    /// A fleet without servers.
+    pub(super) fn new() -> Self {
+        Self { servers: 0.0, precision: 0.0, precision_squared: 0.0, log: 0.0, log_squared: 0.0 }
+    }
+
+    /// Replaces what a server said before by what it says now.
+    pub(super) fn replace(&mut self, old: Estimate, new: Estimate) {
+        for (sign, estimate) in [(-1.0, old), (1.0, new)] {
+            let Estimate { log, precision } = estimate;
+            self.servers += if precision > 0.0 { sign } else { 0.0 };
+            self.precision += sign * precision;
+            self.precision_squared += sign * precision * precision;
+            self.log += sign * precision * log;
+            self.log_squared += sign * precision * log * log;
+        }
+    }
+
+    /// What a client costs a server that estimates so, in percent: always positive and finite. `guess` is what a client
+    /// is expected to cost when nothing is known.
+    pub(super) fn cost(&self, own: Estimate, guess: f64) -> f64 {
+        // The guess counts as one more server, which is in doubt by a factor of e.
+        let mean = (self.log + believable(guess).ln()) / (self.precision + 1.0);
+        let spread = self.spread();
+        let own_share = own.precision * spread;
+        believable(((own.log * own_share + mean) / (own_share + 1.0)).exp())
+    }
+
+    /// The variance of the logarithm of the cost between servers.
+    fn spread(&self) -> f64 {
+        if self.servers < 2.0 || self.precision <= 0.0 {
+            return 0.0;
+        }
+        let scatter = self.log_squared - self.log * self.log / self.precision;
+        let scale = self.precision - self.precision_squared / self.precision;
+        if scale <= 0.0 {
+            return 0.0;
+        }
+        ((scatter - (self.servers - 1.0)) / scale).max(0.0)
     }
 }

@@ -1,5 +1,6 @@
 //! The servers of the fleet, and the choice between them.
 
+use super::cost::{Common, Estimate};
 use super::server::{Report, Server};
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
@@ -49,6 +50,7 @@ impl Default for Policy {
 pub struct Fleet<Id> {
     policy: Policy,
     servers: BTreeMap<Id, Server>,
+    common: Common,
     turns: u64,
 }
 
@@ -59,6 +61,7 @@ impl<Id: Clone + Ord> Fleet<Id> {
         Self {
             policy,
             servers: BTreeMap::new(),
+            common: Common::new(),
             turns: 0,
         }
     }
@@ -76,13 +79,18 @@ impl<Id: Clone + Ord> Fleet<Id> {
 
     /// Removes a server and all that was known of it.
     pub fn remove(&mut self, id: &Id) {
-        self.servers.remove(id);
+        if let Some(server) = self.servers.remove(id) {
+            self.common.replace(server.estimate(), Estimate::default());
+        }
     }
 
     /// A server answered at `now`. Says nothing of a server that is not in the fleet.
     pub fn report(&mut self, id: &Id, now: Instant, report: Report) {
         if let Some(server) = self.servers.get_mut(id) {
+            let before = server.estimate();
             server.report(now, report, &self.policy);
+            self.common.replace(before, server.estimate());
+            server.adopt_cost(&self.common, &self.policy);
         }
     }
 

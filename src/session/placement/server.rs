@@ -1,6 +1,6 @@
 //! What is known of one simulation server: its last report, and what has been sent to it since.
 
-use super::cost::{Cost, FULL};
+use super::cost::{Common, Cost, Estimate, FULL};
 use super::fleet::Policy;
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
@@ -60,7 +60,9 @@ pub(super) struct Server {
     settling: VecDeque<Change>,
     /// The sum of what `settling` hid from the last report.
     unseen: f64,
-    cost: Cost,
+    fit: Cost,
+    /// What a client is expected to add to the load, in percent.
+    cost: f64,
     /// When this server had its last turn, as a number that grows with each placement of the fleet.
     pub(super) turn: u64,
 }
@@ -74,7 +76,8 @@ impl Server {
             in_flight: VecDeque::new(),
             settling: VecDeque::new(),
             unseen: 0.0,
-            cost: Cost::new(policy.initial_cost),
+            fit: Cost::new(policy.initial_cost),
+            cost: policy.initial_cost,
             turn,
         }
     }
@@ -97,7 +100,7 @@ impl Server {
             let shown = (present - self.unseen).max(0.0);
             let trust = if self.unseen > 0.0 { shown / present.max(1.0) } else { 1.0 };
             let elapsed = now.saturating_duration_since(before);
-            self.cost.learn(shown, report.load, elapsed, trust * trust);
+            self.fit.learn(shown, report.load, elapsed, trust * trust);
         }
         self.last = Some((now, report));
         self.up = true;
@@ -142,7 +145,7 @@ impl Server {
         let unseen = if load < FULL { self.unseen } else { self.unseen.max(0.0) };
         #[expect(clippy::cast_precision_loss, reason = "nobody sends 2^52 clients to a server")]
         let ahead = unseen + in_flight as f64;
-        (load + self.cost.percent() * ahead).max(0.0)
+        (load + self.cost * ahead).max(0.0)
     }
 
     /// How many placements are on their way: made, their client not seen yet and not given up.
@@ -163,7 +166,17 @@ impl Server {
 
     /// What one more client is expected to add to the load, in percent.
     pub(super) fn learned_cost(&self) -> f64 {
-        self.cost.percent()
+        self.cost
+    }
+
+    /// This server's own estimate of what a client costs it.
+    pub(super) fn estimate(&self) -> Estimate {
+        self.fit.estimate()
+    }
+
+    /// Takes over what the fleet makes of that estimate.
+    pub(super) fn adopt_cost(&mut self, common: &Common, policy: &Policy) {
+        self.cost = common.cost(self.fit.estimate(), policy.initial_cost);
     }
 
     fn forget_missing(&mut self, now: Instant, policy: &Policy) {
@@ -184,6 +197,7 @@ impl Server {
             // The first report, or a server that began anew: its load has nothing of the past in it. Placements in flight
             // may still come.
             self.settling.clear();
+            self.fit.meet(f64::from(new.present));
             return;
         };
         let came = usize::try_from(new.arrivals - old.arrivals).unwrap_or(usize::MAX);
@@ -193,7 +207,9 @@ impl Server {
         let first = self.in_flight.len() - came;
         self.settling.extend(self.in_flight.drain(first..).map(|at| Change { at, clients: 1.0 }));
         // Those who left, less those who came without having been sent; some time since the last report.
-        let others = f64::from(new.present) - f64::from(old.present) - f64::from(u32::try_from(came).unwrap_or(u32::MAX));
+        let came = f64::from(u32::try_from(came).unwrap_or(u32::MAX));
+        let others = f64::from(new.present) - f64::from(old.present) - came;
+        self.fit.meet(came + others.max(0.0));
         if others != 0.0 {
             let at = before + now.saturating_duration_since(before) / 2;
             self.settling.push_back(Change { at, clients: others });
