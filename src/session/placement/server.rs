@@ -127,7 +127,7 @@ impl Server {
             instances.accepting && taken < instances.places as usize
         });
         let load = self.load_ahead(report.load, in_flight);
-        (has_place && load < policy.threshold).then_some(load)
+        (has_place && load < policy.threshold.min(100.0 - self.cost)).then_some(load)
     }
 
     /// The last report's load, in percent, if the server is up.
