@@ -54,9 +54,10 @@ pub(super) struct Cost {
     idle_weight: f64,
     /// How many clients the fit rests on.
     seen: f64,
+    lowest_base: f64,
     base: f64,
     cost: f64,
-    precision: f64,
+    variance: f64,
 }
 
 impl Cost {
@@ -73,18 +74,27 @@ impl Cost {
             idle_load: 0.0,
             idle_weight: BASE_TRUST,
             seen: 0.0,
+            lowest_base: 0.0,
             base: 0.0,
             cost: guess,
-            precision: 0.0,
+            variance: guess * guess,
         }
     }
 
-    /// This server's own estimate.
-    pub(super) fn estimate(&self) -> Estimate {
+    /// This server's own estimate. `believed` is what its clients have been taken to cost until now, in percent: an
+    /// estimate is not surer for being high.
+    pub(super) fn estimate(&self, believed: f64) -> Estimate {
+        let relative = self.variance / (believed * believed);
         Estimate {
             log: self.cost.ln(),
-            precision: self.precision,
+            // This is 1 / (relative + VARIETY / seen), and 0 where none was seen.
+            precision: self.seen / (self.seen * relative + VARIETY),
         }
+    }
+
+    pub(super) fn learn_change(&mut self, clients: f64, load: f64, elapsed: Duration) {
+        self.lowest_base = f64::NEG_INFINITY;
+        self.learn(clients, load, elapsed, 0.25);
     }
 
     /// So many clients were seen for the first time.
@@ -129,17 +139,15 @@ impl Cost {
         let determinant = weight * squares - self.clients * self.clients;
         let base = (load * squares - self.clients * products) / determinant;
         // No machine is less than idle: if the best fit says so, then the best one that has no base.
-        let (cost, variance) = if base < 0.0 {
+        let (cost, variance) = if base < self.lowest_base {
             (products / squares, NOISE / squares)
         } else {
             let cost = (weight * products - self.clients * load) / determinant;
             (cost, NOISE * weight / determinant)
         };
-        self.base = base.max(0.0);
+        self.base = base.max(self.lowest_base);
         self.cost = believable(cost);
-        let relative = variance / (self.cost * self.cost);
-        // seen / (seen * relative + VARIETY) is 1 / (relative + VARIETY / seen), and 0 where none was seen.
-        self.precision = self.seen / (self.seen * relative + VARIETY);
+        self.variance = variance;
     }
 }
 

@@ -87,10 +87,7 @@ impl<Id: Clone + Ord> Fleet<Id> {
     /// A server answered at `now`. Says nothing of a server that is not in the fleet.
     pub fn report(&mut self, id: &Id, now: Instant, report: Report) {
         if let Some(server) = self.servers.get_mut(id) {
-            let before = server.estimate();
-            server.report(now, report, &self.policy);
-            self.common.replace(before, server.estimate());
-            server.adopt_cost(&self.common, &self.policy);
+            server.report(now, report, &self.policy, &mut self.common);
         }
     }
 

@@ -63,6 +63,9 @@ pub(super) struct Server {
     fit: Cost,
     /// What a client is expected to add to the load, in percent.
     cost: f64,
+    estimate: Estimate,
+    sent: f64,
+    anchor: Option<(Instant, f64, f64)>,
     /// When this server had its last turn, as a number that grows with each placement of the fleet.
     pub(super) turn: u64,
 }
@@ -78,12 +81,15 @@ impl Server {
             unseen: 0.0,
             fit: Cost::new(policy.initial_cost),
             cost: policy.initial_cost,
+            estimate: Estimate::default(),
+            sent: 0.0,
+            anchor: None,
             turn,
         }
     }
 
     /// Takes in a report that came at `now`; one that is older than the last is passed over.
-    pub(super) fn report(&mut self, now: Instant, report: Report, policy: &Policy) {
+    pub(super) fn report(&mut self, now: Instant, report: Report, policy: &Policy, common: &mut Common) {
         if !report.load.is_finite() || report.load < 0.0 {
             self.lose();
             return;
@@ -102,8 +108,23 @@ impl Server {
             let elapsed = now.saturating_duration_since(before);
             self.fit.learn(shown, report.load, elapsed, trust * trust);
         }
+        if report.instances.is_none() {
+            let shown = self.sent - self.unseen;
+            match self.anchor {
+                None => self.anchor = Some((now, shown, report.load)),
+                Some((at, before, load)) if now.saturating_duration_since(at) >= MEAN_WINDOW => {
+                    if load < FULL && report.load < FULL {
+                        self.fit.meet((shown - before).max(0.0));
+                        self.fit.learn_change(shown - before, report.load - load, now.saturating_duration_since(at));
+                    }
+                    self.anchor = Some((now, shown, report.load));
+                }
+                _ => {}
+            }
+        }
         self.last = Some((now, report));
         self.up = true;
+        self.share_cost(common, policy);
     }
 
     /// The server does not answer.
@@ -115,6 +136,7 @@ impl Server {
     pub(super) fn place(&mut self, now: Instant, turn: u64, policy: &Policy) {
         self.forget_missing(now, policy);
         self.in_flight.push_back(now);
+        self.sent += 1.0;
         self.turn = turn;
     }
 
@@ -169,14 +191,17 @@ impl Server {
         self.cost
     }
 
-    /// This server's own estimate of what a client costs it.
+    /// What this server says about the cost of a client.
     pub(super) fn estimate(&self) -> Estimate {
-        self.fit.estimate()
+        self.estimate
     }
 
-    /// Takes over what the fleet makes of that estimate.
-    pub(super) fn adopt_cost(&mut self, common: &Common, policy: &Policy) {
-        self.cost = common.cost(self.fit.estimate(), policy.initial_cost);
+    /// Tells the fleet what has been learned here, and takes over what it makes of that.
+    fn share_cost(&mut self, common: &mut Common, policy: &Policy) {
+        let estimate = self.fit.estimate(self.cost);
+        common.replace(self.estimate, estimate);
+        self.estimate = estimate;
+        self.cost = common.cost(estimate, policy.initial_cost);
     }
 
     fn forget_missing(&mut self, now: Instant, policy: &Policy) {
