@@ -120,11 +120,18 @@ impl Dispatcher for Rival {
             return None;
         }
         Some(match self.rule {
-            Rule::LeastReported => *self.open.iter().min_by(|a, b| self.loads[**a].total_cmp(&self.loads[**b]))?,
+            Rule::LeastReported => *self
+                .open
+                .iter()
+                .min_by(|a, b| self.loads[**a].total_cmp(&self.loads[**b]))?,
             Rule::Random => self.any(),
             Rule::TwoChoices => {
                 let (one, other) = (self.any(), self.any());
-                if self.loads[other] < self.loads[one] { other } else { one }
+                if self.loads[other] < self.loads[one] {
+                    other
+                } else {
+                    one
+                }
             }
             Rule::RoundRobin => {
                 let next = self.open.partition_point(|server| *server <= self.last);

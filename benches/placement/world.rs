@@ -36,6 +36,16 @@ pub(crate) enum Arrivals {
     Crowd,
 }
 
+impl Arrivals {
+    pub(crate) const ALL: [Self; 5] = [
+        Self::Steady,
+        Self::Moment,
+        Self::Minute,
+        Self::TooMany,
+        Self::Crowd,
+    ];
+}
+
 /// How the machines differ.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Sizes {
@@ -110,14 +120,23 @@ impl Machine {
     }
 
     fn sample(&mut self, now: f64, noise: f64) {
-        while self.starting.front().is_some_and(|(since, _)| now - since >= RAMP) {
+        while self
+            .starting
+            .front()
+            .is_some_and(|(since, _)| now - since >= RAMP)
+        {
             self.starting.pop_front();
         }
-        let not_yet: f64 = self.starting.iter().map(|(since, cost)| cost * (1.0 - (now - since) / RAMP)).sum();
+        let not_yet: f64 = self
+            .starting
+            .iter()
+            .map(|(since, cost)| cost * (1.0 - (now - since) / RAMP))
+            .sum();
         if self.samples.len() == 5 {
             self.samples.pop_front();
         }
-        self.samples.push_back((self.demand - not_yet + noise).clamp(0.0, 100.0));
+        self.samples
+            .push_back((self.demand - not_yet + noise).clamp(0.0, 100.0));
     }
 
     fn sight(&self) -> Sight {
@@ -163,8 +182,12 @@ pub(crate) fn run(scenario: &Scenario, seed: u64, dispatcher: &mut impl Dispatch
     let mut highest = 0.0_f64;
     loop {
         let next_report = scenario.refresh * (asked + 1) as f64 / machines.len() as f64;
-        let request = clients.get(next_client).map_or(f64::INFINITY, |client| client.at);
-        let event = events.peek().map_or(f64::INFINITY, |Reverse((at, ..))| *at as f64 / 1e6);
+        let request = clients
+            .get(next_client)
+            .map_or(f64::INFINITY, |client| client.at);
+        let event = events
+            .peek()
+            .map_or(f64::INFINITY, |Reverse((at, ..))| *at as f64 / 1e6);
         let now = next_report.min(request).min(event).min(next_sample);
         if now > HORIZON {
             break;
@@ -173,7 +196,12 @@ pub(crate) fn run(scenario: &Scenario, seed: u64, dispatcher: &mut impl Dispatch
             let Some(Reverse((_, step, client, server))) = events.pop() else {
                 break;
             };
-            let (Client { weight, session, .. }, machine): (&Client, &mut Machine) = (&clients[client], &mut machines[server]);
+            let (
+                Client {
+                    weight, session, ..
+                },
+                machine,
+            ): (&Client, &mut Machine) = (&clients[client], &mut machines[server]);
             let cost = weight * machine.client_cost;
             if step == Step::Comes {
                 machine.change(now, cost);
@@ -181,7 +209,12 @@ pub(crate) fn run(scenario: &Scenario, seed: u64, dispatcher: &mut impl Dispatch
                 machine.arrivals += 1;
                 machine.starting.push_back((now, cost));
                 highest = highest.max(machine.demand);
-                events.push(Reverse((micros(now + session), Step::Leaves, client, server)));
+                events.push(Reverse((
+                    micros(now + session),
+                    Step::Leaves,
+                    client,
+                    server,
+                )));
             } else {
                 machine.change(now, -cost);
                 machine.present -= 1;
@@ -199,7 +232,12 @@ pub(crate) fn run(scenario: &Scenario, seed: u64, dispatcher: &mut impl Dispatch
             let client = &clients[next_client];
             match dispatcher.place(now) {
                 Some(server) if client.comes => {
-                    events.push(Reverse((micros(now + client.travel), Step::Comes, next_client, server)));
+                    events.push(Reverse((
+                        micros(now + client.travel),
+                        Step::Comes,
+                        next_client,
+                        server,
+                    )));
                 }
                 Some(_) => {}
                 None => refused += 1,
@@ -241,7 +279,10 @@ fn machines(scenario: &Scenario, random: &mut StdRng) -> Vec<Machine> {
 }
 
 fn clients(scenario: &Scenario, machines: &[Machine], random: &mut StdRng) -> Vec<Client> {
-    let capacity: f64 = machines.iter().map(|machine| (THRESHOLD - machine.base) / machine.client_cost).sum();
+    let capacity: f64 = machines
+        .iter()
+        .map(|machine| (THRESHOLD - machine.base) / machine.client_cost)
+        .sum();
     let class = if scenario.servers <= 5 { 200.0 } else { 1000.0 };
     // How much of the fleet the steady stream fills, how many come besides, and in how many seconds.
     let (steady, besides, within) = match scenario.arrivals {
@@ -251,7 +292,9 @@ fn clients(scenario: &Scenario, machines: &[Machine], random: &mut StdRng) -> Ve
         Arrivals::TooMany => (1.3, 0.0, 0.0),
         Arrivals::Crowd => (0.5, 1.5 * capacity, 0.0),
     };
-    let mut times: Vec<f64> = (0..besides as usize).map(|_| BURST_AT + within * random.random::<f64>()).collect();
+    let mut times: Vec<f64> = (0..besides as usize)
+        .map(|_| BURST_AT + within * random.random::<f64>())
+        .collect();
     let rate = steady * capacity / MEAN_SESSION;
     let mut at = exponential(random) / rate;
     while at < HORIZON {
@@ -259,7 +302,10 @@ fn clients(scenario: &Scenario, machines: &[Machine], random: &mut StdRng) -> Ve
         at += exponential(random) / rate;
     }
     times.sort_by(f64::total_cmp);
-    times.into_iter().map(|at| client(scenario, at, random)).collect()
+    times
+        .into_iter()
+        .map(|at| client(scenario, at, random))
+        .collect()
 }
 
 fn client(scenario: &Scenario, at: f64, random: &mut StdRng) -> Client {

@@ -4,8 +4,12 @@
 //! starts from a guess. Clients differ, so a server that has seen few knows little; the fleet ([`Common`]) tells how much
 //! the servers differ at all, and by that each server's own estimate is drawn towards what all have in common: servers that
 //! look alike are taken as alike, and a new one starts from what the others have learned.
+//!
+//! A server that reports only its load does not tell how many clients it has. There the fit is of the steps between
+//! reports: how the load changed while so many clients that were sent there began to show. Who left is not known and makes
+//! such an estimate less sure.
 
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 /// How long a report is remembered: its weight falls to 1/e in that time, of which only the time with clients counts.
 const MEMORY: Duration = Duration::from_mins(10);
@@ -20,10 +24,16 @@ const IDLE_MEMORY: f64 = 60.0;
 const NOISE: f64 = 2.0 * 2.0 * 5.0;
 /// How far clients differ: the variance of one client's cost, relative to the square of the mean cost.
 const VARIETY: f64 = 0.16;
+/// The least time that is a step for the fit of steps: the mean load of five seconds is another one then.
+const STEP: Duration = Duration::from_secs(5);
+/// How much a step tells, compared with a report of a server that tells how many clients it has.
+const STEP_TRUST: f64 = 0.15;
+/// How much a client tells of its cost in the fit of steps, compared with one that is known to be there.
+const STEP_CLIENT: f64 = 0.25;
 /// From this load on a report only says 'at least so much', because the machine has no more to give.
 pub(super) const FULL: f64 = 99.0;
 /// The lowest cost that is believed, in percent: clients that do nothing yet may start to.
-const LOWEST: f64 = 0.1;
+const LOWEST: f64 = 0.25;
 /// The highest cost that is believed, in percent.
 const HIGHEST: f64 = 50.0;
 
@@ -54,7 +64,10 @@ pub(super) struct Cost {
     idle_weight: f64,
     /// How many clients the fit rests on.
     seen: f64,
+    /// No machine is less than idle; but a load may well sink from step to step.
     lowest_base: f64,
+    /// Where the last step ended: when, how many clients had shown until then, and the load.
+    step: Option<(Instant, f64, f64)>,
     base: f64,
     cost: f64,
     variance: f64,
@@ -75,6 +88,7 @@ impl Cost {
             idle_weight: BASE_TRUST,
             seen: 0.0,
             lowest_base: 0.0,
+            step: None,
             base: 0.0,
             cost: guess,
             variance: guess * guess,
@@ -90,11 +104,6 @@ impl Cost {
             // This is 1 / (relative + VARIETY / seen), and 0 where none was seen.
             precision: self.seen / (self.seen * relative + VARIETY),
         }
-    }
-
-    pub(super) fn learn_change(&mut self, clients: f64, load: f64, elapsed: Duration) {
-        self.lowest_base = f64::NEG_INFINITY;
-        self.learn(clients, load, elapsed, 0.25);
     }
 
     /// So many clients were seen for the first time.
@@ -129,6 +138,25 @@ impl Cost {
         self.fit();
     }
 
+    /// Learns from a server that tells its load only: of all clients that were ever sent there, `shown` are expected to be
+    /// in this load.
+    pub(super) fn learn_step(&mut self, now: Instant, shown: f64, load: f64) {
+        self.lowest_base = f64::NEG_INFINITY;
+        if let Some((begin, shown_before, load_before)) = self.step {
+            let elapsed = now.saturating_duration_since(begin);
+            if elapsed < STEP {
+                return;
+            }
+            // What a full machine reports is no measure of anything.
+            if load_before < FULL && load < FULL {
+                let clients = (shown - shown_before).max(0.0);
+                self.meet(STEP_CLIENT * clients);
+                self.learn(clients, load - load_before, elapsed, STEP_TRUST);
+            }
+        }
+        self.step = Some((now, shown, load));
+    }
+
     fn fit(&mut self) {
         let trust = NOISE / (self.guess * self.guess);
         let weight = self.weight + self.idle_weight;
@@ -138,7 +166,7 @@ impl Cost {
         // Positive, because weight * squares >= clients * clients holds already without what is added to the two.
         let determinant = weight * squares - self.clients * self.clients;
         let base = (load * squares - self.clients * products) / determinant;
-        // No machine is less than idle: if the best fit says so, then the best one that has no base.
+        // If the base of the best fit is impossible, then the best fit that has none.
         let (cost, variance) = if base < self.lowest_base {
             (products / squares, NOISE / squares)
         } else {
@@ -165,7 +193,13 @@ pub(super) struct Common {
 impl Common {
     /// A fleet without servers.
     pub(super) fn new() -> Self {
-        Self { servers: 0.0, precision: 0.0, precision_squared: 0.0, log: 0.0, log_squared: 0.0 }
+        Self {
+            servers: 0.0,
+            precision: 0.0,
+            precision_squared: 0.0,
+            log: 0.0,
+            log_squared: 0.0,
+        }
     }
 
     /// Replaces what a server said before by what it says now.

@@ -74,7 +74,9 @@ impl<Id: Clone + Ord> Fleet<Id> {
     /// Adds a server, which is down until its first report. One that is there already stays as it is.
     pub fn add(&mut self, id: Id) {
         self.turns += 1;
-        self.servers.entry(id).or_insert_with(|| Server::new(&self.policy, self.turns));
+        self.servers
+            .entry(id)
+            .or_insert_with(|| Server::new(&self.policy, self.turns));
     }
 
     /// Removes a server and all that was known of it.
@@ -105,7 +107,9 @@ impl<Id: Clone + Ord> Fleet<Id> {
         let mut best: Option<(f64, &Id, &mut Server)> = None;
         for (id, server) in &mut self.servers {
             if let Some(load) = server.effective_load_if_room(now, policy)
-                && best.as_ref().is_none_or(|(least, _, first)| (load, server.turn) < (*least, first.turn))
+                && best
+                    .as_ref()
+                    .is_none_or(|(least, _, first)| (load, server.turn) < (*least, first.turn))
                 && eligible(id)
             {
                 best = Some((load, id, server));
@@ -120,13 +124,18 @@ impl<Id: Clone + Ord> Fleet<Id> {
     /// Whether some server can take a client.
     #[must_use]
     pub fn available(&self, now: Instant) -> bool {
-        self.servers.values().any(|server| server.effective_load_if_room(now, &self.policy).is_some())
+        self.servers
+            .values()
+            .any(|server| server.effective_load_if_room(now, &self.policy).is_some())
     }
 
     /// When placements are given up next: the one moment at which availability can change without a call to this fleet.
     #[must_use]
     pub fn next_change(&self, now: Instant) -> Option<Instant> {
-        self.servers.values().filter_map(|server| server.next_expiry(now, &self.policy)).min()
+        self.servers
+            .values()
+            .filter_map(|server| server.next_expiry(now, &self.policy))
+            .min()
     }
 
     /// The load that a server will have once all that was sent to it shows, in percent; `None` if it is down.
@@ -138,7 +147,9 @@ impl<Id: Clone + Ord> Fleet<Id> {
     /// How many clients have been sent to a server and not been seen there yet.
     #[must_use]
     pub fn in_flight(&self, id: &Id, now: Instant) -> usize {
-        self.servers.get(id).map_or(0, |server| server.in_flight(now, &self.policy))
+        self.servers
+            .get(id)
+            .map_or(0, |server| server.in_flight(now, &self.policy))
     }
 
     /// What a client is expected to cost a server, in percent; `None` if the fleet does not have that server.
