@@ -30,6 +30,9 @@ const STEP: Duration = Duration::from_secs(5);
 const STEP_TRUST: f64 = 0.15;
 /// How much a client tells of its cost in the fit of steps, compared with one that is known to be there.
 const STEP_CLIENT: f64 = 0.25;
+/// Steps are not believed if they say that a client costs less than this share of the guess: their errors are great, and
+/// a server that is thought too able is sent too many.
+const STEP_LOWEST: f64 = 0.5;
 /// From this load on a report only says 'at least so much', because the machine has no more to give.
 pub(super) const FULL: f64 = 99.0;
 /// The lowest cost that is believed, in percent: clients that do nothing yet may start to.
@@ -64,8 +67,8 @@ pub(super) struct Cost {
     idle_weight: f64,
     /// How many clients the fit rests on.
     seen: f64,
-    /// No machine is less than idle; but a load may well sink from step to step.
-    lowest_base: f64,
+    /// Whether the samples are steps between reports.
+    of_steps: bool,
     /// Where the last step ended: when, how many clients had shown until then, and the load.
     step: Option<(Instant, f64, f64)>,
     base: f64,
@@ -87,7 +90,7 @@ impl Cost {
             idle_load: 0.0,
             idle_weight: BASE_TRUST,
             seen: 0.0,
-            lowest_base: 0.0,
+            of_steps: false,
             step: None,
             base: 0.0,
             cost: guess,
@@ -141,7 +144,7 @@ impl Cost {
     /// Learns from a server that tells its load only: of all clients that were ever sent there, `shown` are expected to be
     /// in this load.
     pub(super) fn learn_step(&mut self, now: Instant, shown: f64, load: f64) {
-        self.lowest_base = f64::NEG_INFINITY;
+        self.of_steps = true;
         if let Some((begin, shown_before, load_before)) = self.step {
             let elapsed = now.saturating_duration_since(begin);
             if elapsed < STEP {
@@ -166,15 +169,19 @@ impl Cost {
         // Positive, because weight * squares >= clients * clients holds already without what is added to the two.
         let determinant = weight * squares - self.clients * self.clients;
         let base = (load * squares - self.clients * products) / determinant;
-        // If the base of the best fit is impossible, then the best fit that has none.
-        let (cost, variance) = if base < self.lowest_base {
-            (products / squares, NOISE / squares)
+        // No machine is less than idle, though its load may well sink from step to step: if the best fit says so, then
+        // the best one that has no base.
+        let (base, cost, variance) = if base < 0.0 && !self.of_steps {
+            (0.0, products / squares, NOISE / squares)
         } else {
             let cost = (weight * products - self.clients * load) / determinant;
-            (cost, NOISE * weight / determinant)
+            (base, cost, NOISE * weight / determinant)
         };
-        self.base = base.max(self.lowest_base);
+        self.base = base;
         self.cost = believable(cost);
+        if self.of_steps {
+            self.cost = self.cost.max(self.guess * STEP_LOWEST);
+        }
         self.variance = variance;
     }
 }
