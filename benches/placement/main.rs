@@ -14,16 +14,17 @@
 
 mod compare;
 mod dispatch;
+mod scenario;
 mod world;
 
 use compare::{
     HIGHEST_TIE, OVERLOAD_TIE, POLICIES, REFUSED_TIE, Row, better_rivals, compare, scenarios,
 };
+use scenario::{Arrivals, Outcome, Scenario, Sizes};
 use std::hint::black_box;
 use std::process::ExitCode;
 use std::time::{Duration, Instant};
 use webots_fleet::session::placement::{Fleet, Instances, Policy, Report};
-use world::{Arrivals, Outcome, Scenario, Sizes};
 
 fn main() -> ExitCode {
     let begin = Instant::now();

@@ -42,8 +42,11 @@ const HIGHEST: f64 = 50.0;
 
 /// A believable cost, whatever the number.
 fn believable(cost: f64) -> f64 {
-    // `clamp` would let NaN through; `max` does not.
-    cost.max(LOWEST).min(HIGHEST)
+    if cost.is_nan() {
+        HIGHEST
+    } else {
+        cost.clamp(LOWEST, HIGHEST)
+    }
 }
 
 /// What one server says about its cost: the logarithm, and how sure it is (one over the variance of that logarithm).
@@ -72,7 +75,7 @@ pub(super) struct Cost {
     /// Where the last step ended: when, how many clients had shown until then, and the load.
     step: Option<(Instant, f64, f64)>,
     base: f64,
-    cost: f64,
+    slope: f64,
     variance: f64,
 }
 
@@ -93,7 +96,7 @@ impl Cost {
             of_steps: false,
             step: None,
             base: 0.0,
-            cost: guess,
+            slope: guess,
             variance: guess * guess,
         }
     }
@@ -103,7 +106,7 @@ impl Cost {
     pub(super) fn estimate(&self, believed: f64) -> Estimate {
         let relative = self.variance / (believed * believed);
         Estimate {
-            log: self.cost.ln(),
+            log: self.slope.ln(),
             // This is 1 / (relative + VARIETY / seen), and 0 where none was seen.
             precision: self.seen / (self.seen * relative + VARIETY),
         }
@@ -120,7 +123,7 @@ impl Cost {
         let seconds = elapsed.min(LONGEST_STEP).as_secs_f64();
         let load = load.min(100.0);
         // A full machine can teach that its clients cost more than was thought, but not that they cost less.
-        let says_nothing = load >= FULL && self.base + self.cost * clients >= load;
+        let says_nothing = load >= FULL && self.base + self.slope * clients >= load;
         if says_nothing || seconds == 0.0 {
             return;
         }
@@ -178,16 +181,16 @@ impl Cost {
             (base, cost, NOISE * weight / determinant)
         };
         self.base = base;
-        self.cost = believable(cost);
+        self.slope = believable(cost);
         if self.of_steps {
-            self.cost = self.cost.max(self.guess * STEP_LOWEST);
+            self.slope = self.slope.max(self.guess * STEP_LOWEST);
         }
         self.variance = variance;
     }
 }
 
 /// What the servers of a fleet have in common: sums over their estimates, from which follow the mean and how far servers
-/// really differ from it, beyond the doubt in their estimates (DerSimonian and Laird's estimator).
+/// really differ from it, beyond the doubt in their estimates.
 #[derive(Debug, Clone)]
 pub(super) struct Common {
     servers: f64,
@@ -236,6 +239,7 @@ impl Common {
         if self.servers < 2.0 || self.precision <= 0.0 {
             return 0.0;
         }
+        // The estimator of DerSimonian and Laird (1986), who compare clinical trials as we compare servers.
         let scatter = self.log_squared - self.log * self.log / self.precision;
         let scale = self.precision - self.precision_squared / self.precision;
         if scale <= 0.0 {
