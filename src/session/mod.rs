@@ -7,3 +7,4 @@ pub mod mailer;
 pub mod notices;
 pub mod outbox;
 pub mod smtp;
+pub mod placement;

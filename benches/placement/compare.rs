@@ -1,0 +1,110 @@
+//! Which scenarios are run, and who wins.
+
+use crate::dispatch::{Own, Rival, Rule};
+use crate::scenario::{Arrivals, Outcome, Scenario, Sessions, Sizes};
+use crate::world::run;
+
+/// The policies in the order of an outcome's row. The first is the one that has to win.
+pub(crate) const POLICIES: [&str; 6] = [
+    "ours",
+    "ours, load only",
+    "least reported",
+    "random",
+    "two choices",
+    "round robin",
+];
+/// The first rival in a row: what stands before it is the project's own.
+const FIRST_RIVAL: usize = 2;
+/// Highest loads that differ by no more are tied: two clients, in percent.
+pub(crate) const HIGHEST_TIE: f64 = 4.0;
+/// Overload shares that differ by no more are tied, in percent.
+pub(crate) const OVERLOAD_TIE: f64 = 0.25;
+/// Refused shares that differ by no more are tied, in percent.
+pub(crate) const REFUSED_TIE: f64 = 1.0;
+
+/// What each policy made of a scenario, as means over the seeds.
+pub(crate) type Row = [Outcome; POLICIES.len()];
+
+/// All scenarios of fleets of these sizes at these refresh intervals.
+pub(crate) fn scenarios(fleets: &[usize], refreshes: &[f64]) -> Vec<Scenario> {
+    let mut all = Vec::new();
+    for &servers in fleets {
+        for sizes in [Sizes::Equal, Sizes::Mixed] {
+            for arrivals in Arrivals::ALL {
+                for sessions in [Sessions::Exponential, Sessions::Heavy] {
+                    for &refresh in refreshes {
+                        all.push(Scenario {
+                            arrivals,
+                            refresh,
+                            servers,
+                            sizes,
+                            sessions,
+                        });
+                    }
+                }
+            }
+        }
+    }
+    all
+}
+
+/// Runs every policy on a scenario; a small fleet is left more to chance and needs more seeds.
+pub(crate) fn compare(scenario: &Scenario) -> Row {
+    let seeds = match scenario.servers {
+        ..50 => 4,
+        50..500 => 2,
+        _ => 1,
+    };
+    let mut row = Row::default();
+    for seed in 1..=seeds {
+        let servers = scenario.servers;
+        let rival = |rule| run(scenario, seed, &mut Rival::new(servers, rule, seed));
+        let outcomes = [
+            run(scenario, seed, &mut Own::new(servers, true)),
+            run(scenario, seed, &mut Own::new(servers, false)),
+            rival(Rule::LeastReported),
+            rival(Rule::Random),
+            rival(Rule::TwoChoices),
+            rival(Rule::RoundRobin),
+        ];
+        for (mean, outcome) in row.iter_mut().zip(outcomes) {
+            mean.highest += outcome.highest / seeds as f64;
+            mean.overload += outcome.overload / seeds as f64;
+            mean.refused += outcome.refused / seeds as f64;
+        }
+    }
+    row
+}
+
+/// The rivals that are better than the policy at this place of the row, and in what.
+///
+/// A rival is not better for loading its servers less if it refused more clients for that, nor for refusing fewer clients
+/// if it overloaded its servers with them.
+pub(crate) fn better_rivals(row: &Row, policy: usize) -> Vec<String> {
+    let own = row[policy];
+    let mut better = Vec::new();
+    for (name, rival) in POLICIES.iter().zip(row).skip(FIRST_RIVAL) {
+        let refuses_more = rival.refused > own.refused + REFUSED_TIE;
+        let loads_more = rival.highest > own.highest + HIGHEST_TIE
+            || rival.overload > own.overload + OVERLOAD_TIE;
+        if own.highest > rival.highest + HIGHEST_TIE && !refuses_more {
+            better.push(format!(
+                "{name}: highest load {:.0} < {:.0}",
+                rival.highest, own.highest
+            ));
+        }
+        if own.overload > rival.overload + OVERLOAD_TIE && !refuses_more {
+            better.push(format!(
+                "{name}: overload {:.2} < {:.2}",
+                rival.overload, own.overload
+            ));
+        }
+        if own.refused > rival.refused + REFUSED_TIE && !loads_more {
+            better.push(format!(
+                "{name}: refused {:.1} < {:.1}",
+                rival.refused, own.refused
+            ));
+        }
+    }
+    better
+}

@@ -1,0 +1,143 @@
+//! The policies that are compared: the project's own, and those of others, which see the same reports.
+
+use crate::world::THRESHOLD;
+use rand::rngs::StdRng;
+use rand::{RngExt, SeedableRng};
+use std::time::{Duration, Instant};
+use webots_fleet::session::placement::{Fleet, Instances, Policy, Report};
+
+/// What a server reports.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Sight {
+    pub(crate) load: f64,
+    pub(crate) present: u32,
+    pub(crate) arrivals: u64,
+}
+
+/// A policy at work.
+pub(crate) trait Dispatcher {
+    /// A report of a server has come; `now` is in seconds.
+    fn report(&mut self, server: usize, now: f64, sight: Sight);
+    /// Chooses a server for a client, or refuses it.
+    fn place(&mut self, now: f64) -> Option<usize>;
+}
+
+/// The project's own policy: the real code, on a clock that starts at some moment.
+pub(crate) struct Own {
+    fleet: Fleet<usize>,
+    start: Instant,
+    /// Whether the servers tell of their instances, or of their load only.
+    instances: bool,
+}
+
+impl Own {
+    pub(crate) fn new(servers: usize, instances: bool) -> Self {
+        let mut fleet = Fleet::new(Policy::default());
+        (0..servers).for_each(|server| fleet.add(server));
+        Self {
+            fleet,
+            start: Instant::now(),
+            instances,
+        }
+    }
+
+    fn at(&self, now: f64) -> Instant {
+        self.start + Duration::from_secs_f64(now)
+    }
+}
+
+impl Dispatcher for Own {
+    fn report(&mut self, server: usize, now: f64, sight: Sight) {
+        let instances = Instances {
+            present: sight.present,
+            places: 100_000,
+            arrivals: sight.arrivals,
+            accepting: true,
+        };
+        let report = Report {
+            load: sight.load,
+            instances: self.instances.then_some(instances),
+        };
+        self.fleet.report(&server, self.at(now), report);
+    }
+
+    fn place(&mut self, now: f64) -> Option<usize> {
+        self.fleet.place(self.at(now), |_| true)
+    }
+}
+
+/// How a rival chooses among the servers whose last report is under the threshold.
+#[derive(Debug, Clone, Copy)]
+pub(crate) enum Rule {
+    /// The least reported load, the first of equal ones: what the Python original does.
+    LeastReported,
+    /// Any.
+    Random,
+    /// The lesser loaded of any two.
+    TwoChoices,
+    /// Each in turn.
+    RoundRobin,
+}
+
+/// A policy that goes by the last reports alone.
+pub(crate) struct Rival {
+    rule: Rule,
+    loads: Vec<f64>,
+    /// The servers under the threshold.
+    open: Vec<usize>,
+    last: usize,
+    random: StdRng,
+}
+
+impl Rival {
+    pub(crate) fn new(servers: usize, rule: Rule, seed: u64) -> Self {
+        Self {
+            rule,
+            loads: vec![f64::INFINITY; servers],
+            open: Vec::new(),
+            last: 0,
+            random: StdRng::seed_from_u64(seed),
+        }
+    }
+
+    fn any(&mut self) -> usize {
+        self.open[self.random.random_range(0..self.open.len())]
+    }
+}
+
+impl Dispatcher for Rival {
+    fn report(&mut self, server: usize, _now: f64, sight: Sight) {
+        self.loads[server] = sight.load;
+        match (self.open.binary_search(&server), sight.load < THRESHOLD) {
+            (Ok(at), false) => drop(self.open.remove(at)),
+            (Err(at), true) => self.open.insert(at, server),
+            _ => {}
+        }
+    }
+
+    fn place(&mut self, _now: f64) -> Option<usize> {
+        if self.open.is_empty() {
+            return None;
+        }
+        Some(match self.rule {
+            Rule::LeastReported => *self
+                .open
+                .iter()
+                .min_by(|a, b| self.loads[**a].total_cmp(&self.loads[**b]))?,
+            Rule::Random => self.any(),
+            Rule::TwoChoices => {
+                let (one, other) = (self.any(), self.any());
+                if self.loads[other] < self.loads[one] {
+                    other
+                } else {
+                    one
+                }
+            }
+            Rule::RoundRobin => {
+                let next = self.open.partition_point(|server| *server <= self.last);
+                self.last = self.open[next % self.open.len()];
+                self.last
+            }
+        })
+    }
+}

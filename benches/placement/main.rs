@@ -1,0 +1,219 @@
+//! Compares the placement policy with others in a simulated fleet.
+//!
+//! `cargo bench --bench placement` runs all scenarios, prints what came of each, and fails if a rival is better anywhere;
+//! `-- --quick` runs a few in a second or two.
+
+#![expect(
+    clippy::cast_possible_truncation,
+    clippy::cast_precision_loss,
+    clippy::cast_sign_loss,
+    clippy::float_cmp,
+    clippy::indexing_slicing,
+    reason = "a simulation counts in small numbers, compares times with themselves, and may end at once if it is wrong"
+)]
+
+mod compare;
+mod dispatch;
+mod scenario;
+mod world;
+
+use compare::{
+    HIGHEST_TIE, OVERLOAD_TIE, POLICIES, REFUSED_TIE, Row, better_rivals, compare, scenarios,
+};
+use scenario::{Arrivals, Outcome, Scenario, Sizes};
+use std::hint::black_box;
+use std::process::ExitCode;
+use std::time::{Duration, Instant};
+use webots_fleet::session::placement::{Fleet, Instances, Policy, Report};
+
+fn main() -> ExitCode {
+    let begin = Instant::now();
+    // `cargo test --all-targets` runs this program too, without the argument that `cargo bench` adds.
+    let quick = std::env::args().any(|argument| argument == "--quick")
+        || !std::env::args().any(|argument| argument == "--bench");
+    let scenarios = if quick {
+        scenarios(&[5], &[1.0, 10.0])
+    } else {
+        scenarios(&[5, 50, 500], &[0.1, 1.0, 3.0, 10.0])
+    };
+    let rows = compare_all(&scenarios);
+    println!(
+        "Each cell: highest load that clients asked of a server (%), share of the servers' time over 100 % (%), refused clients (%).\n"
+    );
+    println!(
+        "{:42}{}",
+        "servers, sizes, arrivals, sessions, refresh",
+        POLICIES.map(|name| format!(" | {name:>16}")).concat()
+    );
+    for (scenario, row) in scenarios.iter().zip(&rows) {
+        let Scenario {
+            arrivals,
+            refresh,
+            servers,
+            sizes,
+            sessions,
+        } = scenario;
+        let name = format!("{servers:>3} {sizes:?} {arrivals:?} {sessions:?} {refresh} s");
+        println!(
+            "{name:42}{}",
+            row.map(|cell| format!(
+                " | {:6.0} {:5.2} {:4.1}",
+                cell.highest, cell.overload, cell.refused
+            ))
+            .concat()
+        );
+    }
+    summary(&scenarios, &rows);
+    speed();
+    let lost = verdict(&scenarios, &rows);
+    println!(
+        "\n{} scenarios in {:.0} s",
+        scenarios.len(),
+        begin.elapsed().as_secs_f64()
+    );
+    if lost == 0 {
+        ExitCode::SUCCESS
+    } else {
+        ExitCode::FAILURE
+    }
+}
+
+/// Spreads the scenarios over the cores; each is the same wherever it runs.
+fn compare_all(scenarios: &[Scenario]) -> Vec<Row> {
+    let threads = std::thread::available_parallelism().map_or(1, usize::from);
+    let mut rows = vec![Row::default(); scenarios.len()];
+    std::thread::scope(|scope| {
+        let workers: Vec<_> = (0..threads)
+            .map(|first| {
+                scope.spawn(move || {
+                    let mine = scenarios.iter().enumerate().skip(first).step_by(threads);
+                    mine.map(|(i, scenario)| (i, compare(scenario)))
+                        .collect::<Vec<_>>()
+                })
+            })
+            .collect();
+        for worker in workers {
+            for (i, row) in worker.join().into_iter().flatten() {
+                rows[i] = row;
+            }
+        }
+    });
+    rows
+}
+
+/// The table of the documentation: for each kind of arrivals, sizes and refresh the worst highest load and the mean shares.
+fn summary(scenarios: &[Scenario], rows: &[Row]) {
+    println!("\nWorst highest load, and mean shares of overload and refusal, in %:\n");
+    println!("| arrivals | machines | {} |", POLICIES.join(" | "));
+    println!("|---|---|{}", "---|".repeat(POLICIES.len()));
+    for arrivals in Arrivals::ALL {
+        for sizes in [Sizes::Equal, Sizes::Mixed] {
+            let chosen = select(scenarios, rows, |scenario| {
+                scenario.arrivals == arrivals && scenario.sizes == sizes
+            });
+            println!("| {arrivals:?} | {sizes:?} | {} |", cells(&chosen));
+        }
+    }
+    println!(
+        "\n| refresh | {} |\n|---|{}",
+        POLICIES.join(" | "),
+        "---|".repeat(POLICIES.len())
+    );
+    for refresh in [0.1, 1.0, 3.0, 10.0] {
+        let chosen = select(scenarios, rows, |scenario| scenario.refresh == refresh);
+        if !chosen.is_empty() {
+            println!("| {refresh} s | {} |", cells(&chosen));
+        }
+    }
+}
+
+fn select<'a>(
+    scenarios: &[Scenario],
+    rows: &'a [Row],
+    wanted: impl Fn(&Scenario) -> bool,
+) -> Vec<&'a Row> {
+    scenarios
+        .iter()
+        .zip(rows)
+        .filter(|(scenario, _)| wanted(scenario))
+        .map(|(_, row)| row)
+        .collect()
+}
+
+fn cells(rows: &[&Row]) -> String {
+    let cell = |policy: usize| {
+        let all = || rows.iter().map(|row| row[policy]);
+        let worst = all().map(|outcome| outcome.highest).fold(0.0, f64::max);
+        let mean = |part: fn(&Outcome) -> f64| {
+            all().map(|outcome| part(&outcome)).sum::<f64>() / rows.len() as f64
+        };
+        format!(
+            "{worst:.0} / {:.2} / {:.1}",
+            mean(|outcome| outcome.overload),
+            mean(|outcome| outcome.refused)
+        )
+    };
+    (0..POLICIES.len())
+        .map(cell)
+        .collect::<Vec<_>>()
+        .join(" | ")
+}
+
+/// How long one placement and one report take among 1,000 servers.
+fn speed() {
+    const SERVERS: u32 = 1000;
+    const ROUNDS: u32 = 2000;
+    let start = Instant::now();
+    let mut fleet = Fleet::new(Policy::default());
+    (0..SERVERS).for_each(|id| fleet.add(id));
+    let report = |round: u32| Report {
+        load: 30.0,
+        instances: Some(Instances {
+            present: 10,
+            places: 100,
+            arrivals: 10 + u64::from(round),
+            accepting: true,
+        }),
+    };
+    (0..SERVERS).for_each(|id| fleet.report(&id, start, report(0)));
+    let begin = Instant::now();
+    for _ in 0..ROUNDS {
+        black_box(fleet.place(start, |_| true));
+    }
+    let place = begin.elapsed() / ROUNDS;
+    let begin = Instant::now();
+    for id in 0..SERVERS {
+        fleet.report(&id, start + Duration::from_secs(1), report(2));
+    }
+    println!(
+        "\n1,000 servers: a placement takes {place:?}, a report {:?}",
+        begin.elapsed() / SERVERS
+    );
+}
+
+/// Says where rivals are better, and gives back in how many scenarios one is better than the policy for servers that tell
+/// of their instances.
+fn verdict(scenarios: &[Scenario], rows: &[Row]) -> usize {
+    println!(
+        "\nTied means within {HIGHEST_TIE} % of highest load, {OVERLOAD_TIE} % of overload share, {REFUSED_TIE} % of refusals."
+    );
+    let lost = |policy: usize| {
+        let mut lost = 0;
+        for (scenario, row) in scenarios.iter().zip(rows) {
+            let better = better_rivals(row, policy);
+            if !better.is_empty() {
+                println!("{:?}: {}", scenario, better.join("; "));
+                lost += 1;
+            }
+        }
+        println!(
+            "{}: best or tied in {} of {} scenarios",
+            POLICIES[policy],
+            scenarios.len() - lost,
+            scenarios.len()
+        );
+        lost
+    };
+    lost(1);
+    lost(0)
+}

@@ -1,0 +1,198 @@
+//! A fleet of machines, the clients that want to use it, and a clock that runs as fast as it can.
+
+use crate::dispatch::{Dispatcher, Sight};
+use crate::scenario::{Client, HORIZON, Outcome, Scenario, Sizes, clients};
+use rand::rngs::StdRng;
+use rand::{RngExt, SeedableRng};
+use std::cmp::Reverse;
+use std::collections::{BinaryHeap, VecDeque};
+
+/// What a client costs on the middle one of machines, in percent.
+const UNIT_COST: f64 = 2.0;
+/// Seconds until a new simulation needs all that it is going to need.
+const RAMP: f64 = 3.0;
+/// The load at which a server's own rule stops taking clients, in percent.
+pub(crate) const THRESHOLD: f64 = 95.0;
+
+/// One machine.
+struct Machine {
+    base: f64,
+    client_cost: f64,
+    demand: f64,
+    demand_since: f64,
+    overload: f64,
+    present: u32,
+    arrivals: u64,
+    /// Who is still starting: since when, and the cost.
+    starting: VecDeque<(f64, f64)>,
+    samples: VecDeque<f64>,
+}
+
+impl Machine {
+    fn change(&mut self, now: f64, by: f64) {
+        if self.demand > 100.0 {
+            self.overload += now - self.demand_since;
+        }
+        self.demand_since = now;
+        self.demand += by;
+    }
+
+    fn sample(&mut self, now: f64, noise: f64) {
+        while self
+            .starting
+            .front()
+            .is_some_and(|(since, _)| now - since >= RAMP)
+        {
+            self.starting.pop_front();
+        }
+        let not_yet: f64 = self
+            .starting
+            .iter()
+            .map(|(since, cost)| cost * (1.0 - (now - since) / RAMP))
+            .sum();
+        if self.samples.len() == 5 {
+            self.samples.pop_front();
+        }
+        self.samples
+            .push_back((self.demand - not_yet + noise).clamp(0.0, 100.0));
+    }
+
+    fn sight(&self) -> Sight {
+        Sight {
+            load: self.samples.iter().sum::<f64>() / self.samples.len() as f64,
+            present: self.present,
+            arrivals: self.arrivals,
+        }
+    }
+}
+
+/// What happens to a client after it has been placed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+enum Step {
+    Comes,
+    Leaves,
+}
+
+/// Microseconds, so that events have an order.
+fn micros(seconds: f64) -> u64 {
+    (seconds * 1e6) as u64
+}
+
+/// Runs a scenario against a policy.
+pub(crate) fn run(scenario: &Scenario, seed: u64, dispatcher: &mut impl Dispatcher) -> Outcome {
+    let mut random = StdRng::seed_from_u64(seed);
+    let mut machines = machines(scenario, &mut random);
+    let room = |machine: &Machine| (THRESHOLD - machine.base) / machine.client_cost;
+    let clients = clients(scenario, machines.iter().map(room).sum(), &mut random);
+    // The servers are asked in turn, each once per refresh.
+    let mut asked = 0_usize;
+    let mut order: Vec<usize> = (0..machines.len()).collect();
+    for i in (1..order.len()).rev() {
+        order.swap(i, random.random_range(0..=i));
+    }
+    for (id, machine) in machines.iter_mut().enumerate() {
+        machine.sample(0.0, 0.0);
+        dispatcher.report(id, 0.0, machine.sight());
+    }
+    let mut events: BinaryHeap<Reverse<(u64, Step, usize, usize)>> = BinaryHeap::new();
+    let mut next_client = 0;
+    let mut next_sample = 1.0;
+    let mut refused = 0_u32;
+    let mut highest = 0.0_f64;
+    loop {
+        let next_report = scenario.refresh * (asked + 1) as f64 / machines.len() as f64;
+        let request = clients
+            .get(next_client)
+            .map_or(f64::INFINITY, |client| client.at);
+        let event = events
+            .peek()
+            .map_or(f64::INFINITY, |Reverse((at, ..))| *at as f64 / 1e6);
+        let now = next_report.min(request).min(event).min(next_sample);
+        if now > HORIZON {
+            break;
+        }
+        if now == event {
+            let Some(Reverse((_, step, client, server))) = events.pop() else {
+                break;
+            };
+            let (
+                Client {
+                    weight, session, ..
+                },
+                machine,
+            ): (&Client, &mut Machine) = (&clients[client], &mut machines[server]);
+            let cost = weight * machine.client_cost;
+            if step == Step::Comes {
+                machine.change(now, cost);
+                machine.present += 1;
+                machine.arrivals += 1;
+                machine.starting.push_back((now, cost));
+                highest = highest.max(machine.demand);
+                events.push(Reverse((
+                    micros(now + session),
+                    Step::Leaves,
+                    client,
+                    server,
+                )));
+            } else {
+                machine.change(now, -cost);
+                machine.present -= 1;
+            }
+        } else if now == next_sample {
+            for machine in &mut machines {
+                machine.sample(now, random.random_range(-1.5..1.5));
+            }
+            next_sample += 1.0;
+        } else if now == next_report {
+            let server = order[asked % order.len()];
+            dispatcher.report(server, now, machines[server].sight());
+            asked += 1;
+        } else {
+            let client = &clients[next_client];
+            match dispatcher.place(now) {
+                Some(server) if client.comes => {
+                    events.push(Reverse((
+                        micros(now + client.travel),
+                        Step::Comes,
+                        next_client,
+                        server,
+                    )));
+                }
+                Some(_) => {}
+                None => refused += 1,
+            }
+            next_client += 1;
+        }
+    }
+    for machine in &mut machines {
+        machine.change(HORIZON, 0.0);
+    }
+    let overload: f64 = machines.iter().map(|machine| machine.overload).sum();
+    Outcome {
+        highest,
+        overload: 100.0 * overload / (HORIZON * machines.len() as f64),
+        refused: 100.0 * f64::from(refused) / clients.len() as f64,
+    }
+}
+
+fn machines(scenario: &Scenario, random: &mut StdRng) -> Vec<Machine> {
+    (0..scenario.servers)
+        .map(|i| {
+            let base = random.random_range(1.0..5.0);
+            Machine {
+                base,
+                client_cost: match scenario.sizes {
+                    Sizes::Equal => UNIT_COST,
+                    Sizes::Mixed => UNIT_COST * [0.5, 0.75, 1.0, 2.0, 4.0][i % 5],
+                },
+                demand: base,
+                demand_since: 0.0,
+                overload: 0.0,
+                present: 0,
+                arrivals: 0,
+                starting: VecDeque::new(),
+                samples: VecDeque::new(),
+            }
+        })
+        .collect()
+}

@@ -1,0 +1,31 @@
+//! A small part of what `cargo bench --bench placement` measures, so that a change that spoils the policy fails the tests.
+
+#![expect(
+    clippy::cast_possible_truncation,
+    clippy::cast_precision_loss,
+    clippy::cast_sign_loss,
+    clippy::float_cmp,
+    clippy::indexing_slicing,
+    reason = "the simulation is shared with the benchmark, which says why"
+)]
+
+#[path = "../benches/placement/compare.rs"]
+mod compare;
+#[path = "../benches/placement/dispatch.rs"]
+mod dispatch;
+#[path = "../benches/placement/scenario.rs"]
+mod scenario;
+#[path = "../benches/placement/world.rs"]
+mod world;
+
+#[test]
+fn no_rival_is_better_in_a_small_fleet() {
+    for scenario in compare::scenarios(&[5], &[1.0, 10.0]) {
+        let row = compare::compare(&scenario);
+        assert_eq!(
+            compare::better_rivals(&row, 0),
+            Vec::<String>::new(),
+            "{scenario:?}"
+        );
+    }
+}
