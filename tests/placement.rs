@@ -20,7 +20,7 @@ mod world;
 
 #[test]
 fn no_rival_is_better_in_a_small_fleet() {
-    for scenario in compare::scenarios(&[5], &[1.0, 10.0]) {
+    for scenario in compare::scenarios(&[5], &[3.0]) {
         let row = compare::compare(&scenario);
         assert_eq!(
             compare::better_rivals(&row, 0),

@@ -51,8 +51,8 @@ pub(crate) fn scenarios(fleets: &[usize], refreshes: &[f64]) -> Vec<Scenario> {
 /// Runs every policy on a scenario; a small fleet is left more to chance and needs more seeds.
 pub(crate) fn compare(scenario: &Scenario) -> Row {
     let seeds = match scenario.servers {
-        ..50 => 4,
-        50..500 => 2,
+        ..50 => 20,
+        50..500 => 4,
         _ => 1,
     };
     let mut row = Row::default();

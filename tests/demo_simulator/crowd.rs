@@ -25,6 +25,23 @@ async fn many_viewers_see_the_same() {
 }
 
 #[tokio::test]
+async fn a_large_world_is_shown_whole() {
+    let solids = "Solid { name \"one of a great many solids\" }\n".repeat(40_000);
+    let project = project(&[("a.wbt", &format!("{SMALL_WORLD}{solids}"))]);
+    let world = project.path().join("worlds/a.wbt");
+    let simulator = Start::paused(&world).playing().await;
+    let mut viewer = simulator.spectator().await;
+    viewer.say("step").await;
+    viewer
+        .hears(&["application/json:", "paused by client"])
+        .await;
+    viewer.say("reload").await;
+    viewer.hears(&["delete world", "loading:"]).await;
+    viewer.hears(&["loading:", "loading:", "world:"]).await;
+    assert_eq!(viewer.hear().await.matches("<Solid ").count(), 40_001);
+}
+
+#[tokio::test]
 async fn a_viewer_that_does_not_read_is_dropped_and_the_others_go_on() {
     let robots = "Robot { name \"one of a great many robots\" }\n".repeat(5000);
     let project = project(&[("a.wbt", &format!("{SMALL_WORLD}{robots}"))]);
@@ -52,6 +69,30 @@ async fn a_viewer_that_does_not_read_is_dropped_and_the_others_go_on() {
         .expect("the connection was not broken in time");
     other.say("pause").await;
     other.hears(&["paused by client"]).await;
+}
+
+#[tokio::test]
+async fn a_viewer_that_never_stops_talking_is_sent_away() {
+    // each reset takes a while, as there is much to put back
+    let robots = "Robot { name \"one of a great many robots\" }\n".repeat(3000);
+    let project = project(&[("a.wbt", &format!("{SMALL_WORLD}{robots}"))]);
+    let world = project.path().join("worlds/a.wbt");
+    let simulator = Start::paused(&world).playing().await;
+    let (mut talking, mut hearing) = simulator.viewer().await.socket.split();
+    let talk = async { while talking.send(Message::text("reset")).await.is_ok() {} };
+    let hear = async {
+        match hearing.next().await {
+            Some(Ok(Message::Close(Some(frame)))) => assert_eq!(frame.code, CloseCode::Policy),
+            // the rest of its flood may break the connection before the goodbye is read
+            Some(Err(_)) => (),
+            other => panic!("expected to be sent away, got {other:?}"),
+        }
+    };
+    let both = async { tokio::join!(talk, hear) };
+    timeout(DEADLINE, both)
+        .await
+        .expect("was not sent away in time");
+    simulator.spectator().await;
 }
 
 #[tokio::test]

@@ -10,13 +10,15 @@ use crate::client::{ClientId, Outbox};
 
 /// With so many bytes waiting a client gets no more pose updates, until it has caught up.
 const SLOW: usize = 64 * 1024;
-/// With so many bytes waiting a client is hopeless.
-const HOPELESS: usize = 4 * 1024 * 1024;
+/// With so many bytes waiting, beyond what it takes to show the world twice, a client is hopeless.
+const HOPELESS: usize = 1024 * 1024;
 
 /// Everybody who is connected.
 #[derive(Default)]
 pub(crate) struct Audience {
     seats: BTreeMap<ClientId, Seat>,
+    /// What it takes to show the world, in bytes.
+    scene_size: usize,
 }
 
 struct Seat {
@@ -38,6 +40,11 @@ impl Audience {
                 missed: false,
             },
         );
+    }
+
+    /// Another world will be shown, which takes so many bytes.
+    pub(crate) fn expect_scene_of(&mut self, bytes: usize) {
+        self.scene_size = bytes;
     }
 
     /// Someone is gone.
@@ -68,8 +75,9 @@ impl Audience {
 
     /// Sends a text to one.
     pub(crate) fn tell(&mut self, id: ClientId, text: impl Into<ByteString>) {
+        let patience = self.patience();
         if let Some(seat) = self.seats.get(&id)
-            && !seat.send(text.into())
+            && !seat.send(text.into(), patience)
         {
             self.seats.remove(&id);
         }
@@ -78,8 +86,9 @@ impl Audience {
     /// Sends a text to all who see the scene.
     pub(crate) fn tell_watchers(&mut self, text: impl Into<ByteString>) {
         let text = text.into();
+        let patience = self.patience();
         self.seats
-            .retain(|_, seat| !seat.watching || seat.send(text.clone()));
+            .retain(|_, seat| !seat.watching || seat.send(text.clone(), patience));
     }
 
     /// Sends an update to all who see the scene and read fast enough; `everything` makes the one for
@@ -103,8 +112,10 @@ impl Audience {
 
     /// Sends everything to those who missed an update, since time stops and no other will come.
     pub(crate) fn catch_up(&mut self, mut everything: impl FnMut() -> String) {
-        self.seats
-            .retain(|_, seat| !std::mem::take(&mut seat.missed) || seat.send(everything().into()));
+        let patience = self.patience();
+        self.seats.retain(|_, seat| {
+            !std::mem::take(&mut seat.missed) || seat.send(everything().into(), patience)
+        });
     }
 
     /// Says goodbye to everybody.
@@ -113,13 +124,17 @@ impl Audience {
             seat.outbox.close(CloseCode::Away);
         }
     }
+
+    fn patience(&self) -> usize {
+        HOPELESS + 2 * self.scene_size
+    }
 }
 
 impl Seat {
-    /// Sends a text that must arrive. To a hopeless client it cannot: then the connection is broken, and
-    /// false is returned.
-    fn send(&self, text: ByteString) -> bool {
-        if self.outbox.waiting() > HOPELESS {
+    /// Sends a text that must arrive. To a client with more than `patience` bytes waiting it cannot: then
+    /// the connection is broken, and false is returned.
+    fn send(&self, text: ByteString, patience: usize) -> bool {
+        if self.outbox.waiting() > patience {
             self.outbox.hang_up();
             return false;
         }

@@ -1,19 +1,22 @@
-//! The actor of one WebSocket. Created for each connection; passes what its peer says to the simulation
-//! as events, one at a time, and writes out what the simulation puts in its `Outbox`.
+//! The actor of one WebSocket. Created for each connection; passes what its peer says to the simulation as
+//! events, and writes out what the simulation puts in its `Outbox`.
 //!
-//! Nothing piles up: the next text of the peer waits until the simulation has handled the last, and an
-//! actor whose peer does not read is not run at all, so the simulation sees its outbox fill up.
+//! Nothing piles up: a peer that talks faster than the simulation listens is sent away, and an actor whose
+//! peer does not read is not run at all, so the simulation sees its outbox fill up. (To make the actor wait
+//! until the simulation has listened would not do: what the peer says then piles up below the actor.)
 
 use std::net::{Shutdown, TcpStream};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 
 use actix::{
-    Actor, ActorContext as _, ActorFutureExt as _, AsyncContext as _, ContextFutureSpawner as _,
-    Handler, Message, Recipient, StreamHandler, WrapFuture as _,
+    Actor, ActorContext as _, AsyncContext as _, Handler, Message, Recipient, StreamHandler,
 };
 use actix_web_actors::ws;
 use bytestring::ByteString;
+
+/// Texts of a peer that the simulation has not heard yet, at most.
+const MOST_UNHEARD: usize = 256;
 
 /// Tells connections apart.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -34,10 +37,13 @@ pub(crate) enum Event {
     /// It was opened; here is how to write to it.
     Joined(ClientId, Outbox),
     /// Its peer said something.
-    Said(ClientId, ByteString),
+    Said(ClientId, ByteString, Unheard),
     /// It is closed.
     Left(ClientId),
 }
+
+/// Counts a text as not heard yet, until it is dropped.
+pub(crate) struct Unheard(Arc<AtomicUsize>);
 
 /// The way to a client's peer.
 #[derive(Clone)]
@@ -51,11 +57,11 @@ pub(crate) struct Outbox {
 impl Outbox {
     /// Queues a text, however much waits already.
     pub(crate) fn send(&self, text: ByteString) {
-        self.waiting.fetch_add(text.len(), Ordering::Relaxed);
+        self.waiting.fetch_add(cost(&text), Ordering::Relaxed);
         self.client.do_send(Outgoing::Text(text));
     }
 
-    /// How many bytes wait for the peer to read.
+    /// How many bytes of memory hold what waits for the peer to read.
     pub(crate) fn waiting(&self) -> usize {
         self.waiting.load(Ordering::Relaxed)
     }
@@ -73,10 +79,29 @@ impl Outbox {
     }
 }
 
+impl Unheard {
+    fn new(count: &Arc<AtomicUsize>) -> Self {
+        count.fetch_add(1, Ordering::Relaxed);
+        Self(Arc::clone(count))
+    }
+}
+
+impl Drop for Unheard {
+    fn drop(&mut self) {
+        self.0.fetch_sub(1, Ordering::Relaxed);
+    }
+}
+
+/// A queued text takes about this much memory, even a short one.
+fn cost(text: &ByteString) -> usize {
+    text.len() + 128
+}
+
 /// The actor of one WebSocket.
 pub(crate) struct Client {
     id: ClientId,
     simulation: Recipient<Event>,
+    unheard: Arc<AtomicUsize>,
     waiting: Arc<AtomicUsize>,
     connection: Arc<TcpStream>,
 }
@@ -89,9 +114,19 @@ impl Client {
         Self {
             id,
             simulation,
+            unheard: Arc::default(),
             waiting: Arc::default(),
             connection,
         }
+    }
+
+    fn pass_on(&self, text: ByteString, ctx: &mut ws::WebsocketContext<Self>) {
+        if self.unheard.load(Ordering::Relaxed) >= MOST_UNHEARD {
+            Self::end(ctx, Some(ws::CloseCode::Policy.into()));
+            return;
+        }
+        let unheard = Unheard::new(&self.unheard);
+        self.simulation.do_send(Event::Said(self.id, text, unheard));
     }
 
     fn end(ctx: &mut ws::WebsocketContext<Self>, reason: Option<ws::CloseReason>) {
@@ -120,11 +155,7 @@ impl Actor for Client {
 impl StreamHandler<Result<ws::Message, ws::ProtocolError>> for Client {
     fn handle(&mut self, message: Result<ws::Message, ws::ProtocolError>, ctx: &mut Self::Context) {
         match message {
-            Ok(ws::Message::Text(text)) => {
-                let told = self.simulation.send(Event::Said(self.id, text));
-                // waiting for the answer is what slows down a peer that says too much
-                told.into_actor(self).map(|_, _, _| ()).wait(ctx);
-            }
+            Ok(ws::Message::Text(text)) => self.pass_on(text, ctx),
             Ok(ws::Message::Ping(data)) => ctx.pong(&data),
             Ok(ws::Message::Pong(_) | ws::Message::Nop) => (),
             Ok(ws::Message::Close(reason)) => Self::end(ctx, reason),
@@ -142,7 +173,7 @@ impl Handler<Outgoing> for Client {
     fn handle(&mut self, message: Outgoing, ctx: &mut Self::Context) {
         match message {
             Outgoing::Text(text) => {
-                self.waiting.fetch_sub(text.len(), Ordering::Relaxed);
+                self.waiting.fetch_sub(cost(&text), Ordering::Relaxed);
                 ctx.text(text);
             }
             Outgoing::Close(code) => Self::end(ctx, Some(code.into())),

@@ -73,12 +73,10 @@ impl Handler<Event> for Simulation {
         match event {
             Event::Joined(id, outbox) => self.stage.audience.join(id, outbox),
             Event::Left(id) => self.stage.audience.leave(id),
-            // like Webots without `--stream`: the client is left waiting
-            Event::Said(..) if !self.stream => (),
-            Event::Said(id, text) => match Command::parse(&text) {
-                Some(command) => self.obey(command, id, ctx),
-                None => self.complain_about(&text),
-            },
+            Event::Said(id, text, unheard) => {
+                self.hear(id, &text, ctx);
+                drop(unheard);
+            }
         }
     }
 }
@@ -93,6 +91,15 @@ impl Handler<CloseAll> for Simulation {
 
 /// What clients ask for.
 impl Simulation {
+    fn hear(&mut self, id: ClientId, text: &str, ctx: &mut Context<Self>) {
+        match Command::parse(text) {
+            // like Webots without `--stream`: the client is left waiting
+            _ if !self.stream => (),
+            Some(command) => self.obey(command, id, ctx),
+            None => self.complain_about(text),
+        }
+    }
+
     fn obey(&mut self, command: Command, id: ClientId, ctx: &mut Context<Self>) {
         match command {
             Command::Watch { broadcast } => {

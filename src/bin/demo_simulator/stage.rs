@@ -51,8 +51,10 @@ impl Stage {
     }
 
     /// A world has been loaded: plays it from time 0, in the same mode.
-    pub(crate) fn open(&mut self, world: World, names: Names) {
+    pub(crate) fn open(&mut self, mut world: World, names: Names) {
         self.clock.restart(world.time_step);
+        let size = world.scene.model.len() + world.scene.everything(0.0).len();
+        self.audience.expect_scene_of(size);
         self.world = Some(world);
         self.names = names;
         for status in ["Parsing world", "Finalizing nodes"] {

@@ -41,7 +41,7 @@ const LOWEST: f64 = 0.25;
 const HIGHEST: f64 = 50.0;
 
 /// A believable cost, whatever the number.
-fn believable(cost: f64) -> f64 {
+pub(super) fn believable(cost: f64) -> f64 {
     if cost.is_nan() {
         HIGHEST
     } else {

@@ -503,6 +503,19 @@ mod tests {
     }
 
     #[test]
+    fn an_absurd_policy_does_no_harm() {
+        for initial_cost in [0.0, -3.0, f64::NAN, f64::INFINITY] {
+            let start = Instant::now();
+            let mut fleet = Fleet::new(policy(initial_cost));
+            for id in 0..3 {
+                fleet.add(id);
+                teach(&mut fleet, id, start, 2.0, 10);
+            }
+            assert_near(fleet.learned_cost(&0), 2.0, 0.4);
+        }
+    }
+
+    #[test]
     fn a_full_machine_does_not_teach_that_clients_are_cheap() {
         let start = Instant::now();
         let mut fleet = fleet_of_one(start, full_report(100.0, 20, 20));

@@ -1,6 +1,6 @@
 //! What is known of one simulation server: its last report, and what has been sent to it since.
 
-use super::cost::{Common, Cost, Estimate, FULL};
+use super::cost::{Common, Cost, Estimate, FULL, believable};
 use super::fleet::Policy;
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
@@ -85,7 +85,7 @@ impl Server {
             settling: VecDeque::new(),
             unseen: 0.0,
             fit: Cost::new(policy.initial_cost),
-            cost: policy.initial_cost,
+            cost: believable(policy.initial_cost),
             estimate: Estimate::default(),
             sent: 0.0,
             turn,
