@@ -5,14 +5,8 @@ use crate::scenario::{Arrivals, Outcome, Scenario, Sessions, Sizes};
 use crate::world::run;
 
 /// The policies in the order of an outcome's row. The first is the one that has to win.
-pub(crate) const POLICIES: [&str; 6] = [
-    "ours",
-    "ours, load only",
-    "least reported",
-    "random",
-    "two choices",
-    "round robin",
-];
+pub(crate) const POLICIES: [&str; 6] =
+    ["ours", "ours, load only", "least reported", "random", "two choices", "round robin"];
 /// The first rival in a row: what stands before it is the project's own.
 const FIRST_RIVAL: usize = 2;
 /// Highest loads that differ by no more are tied: two clients, in percent.
@@ -33,13 +27,7 @@ pub(crate) fn scenarios(fleets: &[usize], refreshes: &[f64]) -> Vec<Scenario> {
             for arrivals in Arrivals::ALL {
                 for sessions in [Sessions::Exponential, Sessions::Heavy] {
                     for &refresh in refreshes {
-                        all.push(Scenario {
-                            arrivals,
-                            refresh,
-                            servers,
-                            sizes,
-                            sessions,
-                        });
+                        all.push(Scenario { arrivals, refresh, servers, sizes, sessions });
                     }
                 }
             }
@@ -85,25 +73,15 @@ pub(crate) fn better_rivals(row: &Row, policy: usize) -> Vec<String> {
     let mut better = Vec::new();
     for (name, rival) in POLICIES.iter().zip(row).skip(FIRST_RIVAL) {
         let refuses_more = rival.refused > own.refused + REFUSED_TIE;
-        let loads_more = rival.highest > own.highest + HIGHEST_TIE
-            || rival.overload > own.overload + OVERLOAD_TIE;
+        let loads_more = rival.highest > own.highest + HIGHEST_TIE || rival.overload > own.overload + OVERLOAD_TIE;
         if own.highest > rival.highest + HIGHEST_TIE && !refuses_more {
-            better.push(format!(
-                "{name}: highest load {:.0} < {:.0}",
-                rival.highest, own.highest
-            ));
+            better.push(format!("{name}: highest load {:.0} < {:.0}", rival.highest, own.highest));
         }
         if own.overload > rival.overload + OVERLOAD_TIE && !refuses_more {
-            better.push(format!(
-                "{name}: overload {:.2} < {:.2}",
-                rival.overload, own.overload
-            ));
+            better.push(format!("{name}: overload {:.2} < {:.2}", rival.overload, own.overload));
         }
         if own.refused > rival.refused + REFUSED_TIE && !loads_more {
-            better.push(format!(
-                "{name}: refused {:.1} < {:.1}",
-                rival.refused, own.refused
-            ));
+            better.push(format!("{name}: refused {:.1} < {:.1}", rival.refused, own.refused));
         }
     }
     better

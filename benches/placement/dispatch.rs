@@ -34,11 +34,7 @@ impl Own {
     pub(crate) fn new(servers: usize, instances: bool) -> Self {
         let mut fleet = Fleet::new(Policy::default());
         (0..servers).for_each(|server| fleet.add(server));
-        Self {
-            fleet,
-            start: Instant::now(),
-            instances,
-        }
+        Self { fleet, start: Instant::now(), instances }
     }
 
     fn at(&self, now: f64) -> Instant {
@@ -48,16 +44,9 @@ impl Own {
 
 impl Dispatcher for Own {
     fn report(&mut self, server: usize, now: f64, sight: Sight) {
-        let instances = Instances {
-            present: sight.present,
-            places: 100_000,
-            arrivals: sight.arrivals,
-            accepting: true,
-        };
-        let report = Report {
-            load: sight.load,
-            instances: self.instances.then_some(instances),
-        };
+        let instances =
+            Instances { present: sight.present, places: 100_000, arrivals: sight.arrivals, accepting: true };
+        let report = Report { load: sight.load, instances: self.instances.then_some(instances) };
         self.fleet.report(&server, self.at(now), report);
     }
 
@@ -120,18 +109,11 @@ impl Dispatcher for Rival {
             return None;
         }
         Some(match self.rule {
-            Rule::LeastReported => *self
-                .open
-                .iter()
-                .min_by(|a, b| self.loads[**a].total_cmp(&self.loads[**b]))?,
+            Rule::LeastReported => *self.open.iter().min_by(|a, b| self.loads[**a].total_cmp(&self.loads[**b]))?,
             Rule::Random => self.any(),
             Rule::TwoChoices => {
                 let (one, other) = (self.any(), self.any());
-                if self.loads[other] < self.loads[one] {
-                    other
-                } else {
-                    one
-                }
+                if self.loads[other] < self.loads[one] { other } else { one }
             }
             Rule::RoundRobin => {
                 let next = self.open.partition_point(|server| *server <= self.last);

@@ -17,9 +17,7 @@ mod dispatch;
 mod scenario;
 mod world;
 
-use compare::{
-    HIGHEST_TIE, OVERLOAD_TIE, POLICIES, REFUSED_TIE, Row, better_rivals, compare, scenarios,
-};
+use compare::{HIGHEST_TIE, OVERLOAD_TIE, POLICIES, REFUSED_TIE, Row, better_rivals, compare, scenarios};
 use scenario::{Arrivals, Outcome, Scenario, Sizes};
 use std::hint::black_box;
 use std::process::ExitCode;
@@ -31,11 +29,8 @@ fn main() -> ExitCode {
     // `cargo test --all-targets` runs this program too, without the argument that `cargo bench` adds.
     let quick = std::env::args().any(|argument| argument == "--quick")
         || !std::env::args().any(|argument| argument == "--bench");
-    let scenarios = if quick {
-        scenarios(&[5], &[1.0, 10.0])
-    } else {
-        scenarios(&[5, 50, 500], &[0.1, 1.0, 3.0, 10.0])
-    };
+    let scenarios =
+        if quick { scenarios(&[5], &[1.0, 10.0]) } else { scenarios(&[5, 50, 500], &[0.1, 1.0, 3.0, 10.0]) };
     let rows = compare_all(&scenarios);
     println!(
         "Each cell: highest load that clients asked of a server (%), share of the servers' time over 100 % (%), refused clients (%).\n"
@@ -46,36 +41,18 @@ fn main() -> ExitCode {
         POLICIES.map(|name| format!(" | {name:>16}")).concat()
     );
     for (scenario, row) in scenarios.iter().zip(&rows) {
-        let Scenario {
-            arrivals,
-            refresh,
-            servers,
-            sizes,
-            sessions,
-        } = scenario;
+        let Scenario { arrivals, refresh, servers, sizes, sessions } = scenario;
         let name = format!("{servers:>3} {sizes:?} {arrivals:?} {sessions:?} {refresh} s");
         println!(
             "{name:42}{}",
-            row.map(|cell| format!(
-                " | {:6.0} {:5.2} {:4.1}",
-                cell.highest, cell.overload, cell.refused
-            ))
-            .concat()
+            row.map(|cell| format!(" | {:6.0} {:5.2} {:4.1}", cell.highest, cell.overload, cell.refused)).concat()
         );
     }
     summary(&scenarios, &rows);
     speed();
     let lost = verdict(&scenarios, &rows);
-    println!(
-        "\n{} scenarios in {:.0} s",
-        scenarios.len(),
-        begin.elapsed().as_secs_f64()
-    );
-    if lost == 0 {
-        ExitCode::SUCCESS
-    } else {
-        ExitCode::FAILURE
-    }
+    println!("\n{} scenarios in {:.0} s", scenarios.len(), begin.elapsed().as_secs_f64());
+    if lost == 0 { ExitCode::SUCCESS } else { ExitCode::FAILURE }
 }
 
 /// Spreads the scenarios over the cores; each is the same wherever it runs.
@@ -87,8 +64,7 @@ fn compare_all(scenarios: &[Scenario]) -> Vec<Row> {
             .map(|first| {
                 scope.spawn(move || {
                     let mine = scenarios.iter().enumerate().skip(first).step_by(threads);
-                    mine.map(|(i, scenario)| (i, compare(scenario)))
-                        .collect::<Vec<_>>()
+                    mine.map(|(i, scenario)| (i, compare(scenario))).collect::<Vec<_>>()
                 })
             })
             .collect();
@@ -108,17 +84,11 @@ fn summary(scenarios: &[Scenario], rows: &[Row]) {
     println!("|---|---|{}", "---|".repeat(POLICIES.len()));
     for arrivals in Arrivals::ALL {
         for sizes in [Sizes::Equal, Sizes::Mixed] {
-            let chosen = select(scenarios, rows, |scenario| {
-                scenario.arrivals == arrivals && scenario.sizes == sizes
-            });
+            let chosen = select(scenarios, rows, |scenario| scenario.arrivals == arrivals && scenario.sizes == sizes);
             println!("| {arrivals:?} | {sizes:?} | {} |", cells(&chosen));
         }
     }
-    println!(
-        "\n| refresh | {} |\n|---|{}",
-        POLICIES.join(" | "),
-        "---|".repeat(POLICIES.len())
-    );
+    println!("\n| refresh | {} |\n|---|{}", POLICIES.join(" | "), "---|".repeat(POLICIES.len()));
     for refresh in [0.1, 1.0, 3.0, 10.0] {
         let chosen = select(scenarios, rows, |scenario| scenario.refresh == refresh);
         if !chosen.is_empty() {
@@ -127,36 +97,18 @@ fn summary(scenarios: &[Scenario], rows: &[Row]) {
     }
 }
 
-fn select<'a>(
-    scenarios: &[Scenario],
-    rows: &'a [Row],
-    wanted: impl Fn(&Scenario) -> bool,
-) -> Vec<&'a Row> {
-    scenarios
-        .iter()
-        .zip(rows)
-        .filter(|(scenario, _)| wanted(scenario))
-        .map(|(_, row)| row)
-        .collect()
+fn select<'a>(scenarios: &[Scenario], rows: &'a [Row], wanted: impl Fn(&Scenario) -> bool) -> Vec<&'a Row> {
+    scenarios.iter().zip(rows).filter(|(scenario, _)| wanted(scenario)).map(|(_, row)| row).collect()
 }
 
 fn cells(rows: &[&Row]) -> String {
     let cell = |policy: usize| {
         let all = || rows.iter().map(|row| row[policy]);
         let worst = all().map(|outcome| outcome.highest).fold(0.0, f64::max);
-        let mean = |part: fn(&Outcome) -> f64| {
-            all().map(|outcome| part(&outcome)).sum::<f64>() / rows.len() as f64
-        };
-        format!(
-            "{worst:.0} / {:.2} / {:.1}",
-            mean(|outcome| outcome.overload),
-            mean(|outcome| outcome.refused)
-        )
+        let mean = |part: fn(&Outcome) -> f64| all().map(|outcome| part(&outcome)).sum::<f64>() / rows.len() as f64;
+        format!("{worst:.0} / {:.2} / {:.1}", mean(|outcome| outcome.overload), mean(|outcome| outcome.refused))
     };
-    (0..POLICIES.len())
-        .map(cell)
-        .collect::<Vec<_>>()
-        .join(" | ")
+    (0..POLICIES.len()).map(cell).collect::<Vec<_>>().join(" | ")
 }
 
 /// How long one placement and one report take among 1,000 servers.
@@ -168,12 +120,7 @@ fn speed() {
     (0..SERVERS).for_each(|id| fleet.add(id));
     let report = |round: u32| Report {
         load: 30.0,
-        instances: Some(Instances {
-            present: 10,
-            places: 100,
-            arrivals: 10 + u64::from(round),
-            accepting: true,
-        }),
+        instances: Some(Instances { present: 10, places: 100, arrivals: 10 + u64::from(round), accepting: true }),
     };
     (0..SERVERS).for_each(|id| fleet.report(&id, start, report(0)));
     let begin = Instant::now();
@@ -185,10 +132,7 @@ fn speed() {
     for id in 0..SERVERS {
         fleet.report(&id, start + Duration::from_secs(1), report(2));
     }
-    println!(
-        "\n1,000 servers: a placement takes {place:?}, a report {:?}",
-        begin.elapsed() / SERVERS
-    );
+    println!("\n1,000 servers: a placement takes {place:?}, a report {:?}", begin.elapsed() / SERVERS);
 }
 
 /// Says where rivals are better, and gives back in how many scenarios one is better than the policy for servers that tell
@@ -206,12 +150,7 @@ fn verdict(scenarios: &[Scenario], rows: &[Row]) -> usize {
                 lost += 1;
             }
         }
-        println!(
-            "{}: best or tied in {} of {} scenarios",
-            POLICIES[policy],
-            scenarios.len() - lost,
-            scenarios.len()
-        );
+        println!("{}: best or tied in {} of {} scenarios", POLICIES[policy], scenarios.len() - lost, scenarios.len());
         lost
     };
     lost(1);

@@ -28,13 +28,7 @@ pub(crate) enum Arrivals {
 }
 
 impl Arrivals {
-    pub(crate) const ALL: [Self; 5] = [
-        Self::Steady,
-        Self::Moment,
-        Self::Minute,
-        Self::TooMany,
-        Self::Crowd,
-    ];
+    pub(crate) const ALL: [Self; 5] = [Self::Steady, Self::Moment, Self::Minute, Self::TooMany, Self::Crowd];
 }
 
 /// How the machines differ.
@@ -98,9 +92,7 @@ pub(crate) fn clients(scenario: &Scenario, capacity: f64, random: &mut StdRng) -
         Arrivals::TooMany => (1.3, 0.0, 0.0),
         Arrivals::Crowd => (0.5, 1.5 * capacity, 0.0),
     };
-    let mut times: Vec<f64> = (0..besides as usize)
-        .map(|_| BURST_AT + within * random.random::<f64>())
-        .collect();
+    let mut times: Vec<f64> = (0..besides as usize).map(|_| BURST_AT + within * random.random::<f64>()).collect();
     let rate = steady * capacity / MEAN_SESSION;
     let mut at = exponential(random) / rate;
     while at < HORIZON {
@@ -108,10 +100,7 @@ pub(crate) fn clients(scenario: &Scenario, capacity: f64, random: &mut StdRng) -
         at += exponential(random) / rate;
     }
     times.sort_by(f64::total_cmp);
-    times
-        .into_iter()
-        .map(|at| client(scenario, at, random))
-        .collect()
+    times.into_iter().map(|at| client(scenario, at, random)).collect()
 }
 
 fn client(scenario: &Scenario, at: f64, random: &mut StdRng) -> Client {

@@ -38,23 +38,14 @@ impl Machine {
     }
 
     fn sample(&mut self, now: f64, noise: f64) {
-        while self
-            .starting
-            .front()
-            .is_some_and(|(since, _)| now - since >= RAMP)
-        {
+        while self.starting.front().is_some_and(|(since, _)| now - since >= RAMP) {
             self.starting.pop_front();
         }
-        let not_yet: f64 = self
-            .starting
-            .iter()
-            .map(|(since, cost)| cost * (1.0 - (now - since) / RAMP))
-            .sum();
+        let not_yet: f64 = self.starting.iter().map(|(since, cost)| cost * (1.0 - (now - since) / RAMP)).sum();
         if self.samples.len() == 5 {
             self.samples.pop_front();
         }
-        self.samples
-            .push_back((self.demand - not_yet + noise).clamp(0.0, 100.0));
+        self.samples.push_back((self.demand - not_yet + noise).clamp(0.0, 100.0));
     }
 
     fn sight(&self) -> Sight {
@@ -101,12 +92,8 @@ pub(crate) fn run(scenario: &Scenario, seed: u64, dispatcher: &mut impl Dispatch
     let mut highest = 0.0_f64;
     loop {
         let next_report = scenario.refresh * (asked + 1) as f64 / machines.len() as f64;
-        let request = clients
-            .get(next_client)
-            .map_or(f64::INFINITY, |client| client.at);
-        let event = events
-            .peek()
-            .map_or(f64::INFINITY, |Reverse((at, ..))| *at as f64 / 1e6);
+        let request = clients.get(next_client).map_or(f64::INFINITY, |client| client.at);
+        let event = events.peek().map_or(f64::INFINITY, |Reverse((at, ..))| *at as f64 / 1e6);
         let now = next_report.min(request).min(event).min(next_sample);
         if now > HORIZON {
             break;
@@ -115,12 +102,8 @@ pub(crate) fn run(scenario: &Scenario, seed: u64, dispatcher: &mut impl Dispatch
             let Some(Reverse((_, step, client, server))) = events.pop() else {
                 break;
             };
-            let (
-                Client {
-                    weight, session, ..
-                },
-                machine,
-            ): (&Client, &mut Machine) = (&clients[client], &mut machines[server]);
+            let (Client { weight, session, .. }, machine): (&Client, &mut Machine) =
+                (&clients[client], &mut machines[server]);
             let cost = weight * machine.client_cost;
             if step == Step::Comes {
                 machine.change(now, cost);
@@ -128,12 +111,7 @@ pub(crate) fn run(scenario: &Scenario, seed: u64, dispatcher: &mut impl Dispatch
                 machine.arrivals += 1;
                 machine.starting.push_back((now, cost));
                 highest = highest.max(machine.demand);
-                events.push(Reverse((
-                    micros(now + session),
-                    Step::Leaves,
-                    client,
-                    server,
-                )));
+                events.push(Reverse((micros(now + session), Step::Leaves, client, server)));
             } else {
                 machine.change(now, -cost);
                 machine.present -= 1;
@@ -151,12 +129,7 @@ pub(crate) fn run(scenario: &Scenario, seed: u64, dispatcher: &mut impl Dispatch
             let client = &clients[next_client];
             match dispatcher.place(now) {
                 Some(server) if client.comes => {
-                    events.push(Reverse((
-                        micros(now + client.travel),
-                        Step::Comes,
-                        next_client,
-                        server,
-                    )));
+                    events.push(Reverse((micros(now + client.travel), Step::Comes, next_client, server)));
                 }
                 Some(_) => {}
                 None => refused += 1,

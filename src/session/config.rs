@@ -29,6 +29,9 @@ pub struct SessionConfig {
     pub port_rewrite: bool,
     /// The simulation servers, as HOST:PORT or HOST/PORT.
     pub simulation_servers: Vec<PublicAddress>,
+    /// Those of the simulation servers that get no new clients, while they are still watched. Default: none.
+    #[serde(default)]
+    pub drained_servers: Vec<PublicAddress>,
     /// Mail address that receives notifications.
     #[serde(default, deserialize_with = "mail_address::optional")]
     pub administrator: Option<MailAddress>,
@@ -150,6 +153,10 @@ impl Configuration for SessionConfig {
                 let problem = format!("{address} is listed twice; each simulation server is listed once");
                 return Err(Unfit { key: "simulationServers", problem });
             }
+        }
+        if let Some(address) = self.drained_servers.iter().find(|address| !seen.contains(address)) {
+            let problem = format!("{address} is not one of simulationServers");
+            return Err(Unfit { key: "drainedServers", problem });
         }
         if self.timing.silence <= self.timing.ping {
             let problem = format!("{} s is not more than timing.ping", self.timing.silence.as_secs_f64());

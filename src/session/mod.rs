@@ -1,10 +1,17 @@
 //! The session server: the one door to a fleet of simulation servers.
 
+pub mod app;
 pub mod config;
+pub mod fleet_status;
 pub mod letter;
 pub mod mail_address;
 pub mod mailer;
 pub mod notices;
 pub mod outbox;
-pub mod smtp;
 pub mod placement;
+pub mod registry;
+pub mod routes;
+pub mod server_monitor;
+pub mod smtp;
+pub mod status;
+pub mod web_client;

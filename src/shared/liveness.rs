@@ -4,12 +4,13 @@ use std::time::{Duration, Instant};
 
 /// Watches one WebSocket connection.
 ///
-/// A peer that is silent for too long is gone: a half-open connection never says so by itself (RFC 6455, section
-/// 5.5.2, has pings for this). A peer that asks without reading the answers would make them pile up here: between two
-/// signs of life it may ask only so often.
+/// A half-open connection never says that it is one; RFC 6455, section 5.5.2, has pings for this. Each ping carries a
+/// number that can't be guessed, and only its return counts: a peer that sends without reading is as good as gone,
+/// and would make answers pile up here. Between two pings it may therefore ask only so often.
 #[derive(Debug)]
 pub struct Liveness {
-    heard: Instant,
+    alive: Instant,
+    asked: [u8; 8],
     answers: u32,
 }
 
@@ -20,18 +21,21 @@ impl Liveness {
     /// A connection that was just opened.
     #[must_use]
     pub fn new() -> Self {
-        Self { heard: Instant::now(), answers: 0 }
+        Self { alive: Instant::now(), asked: rand::random(), answers: 0 }
     }
 
-    /// Something came from the peer.
-    pub fn heard(&mut self) {
-        self.heard = Instant::now();
+    /// The content of the next ping.
+    pub fn ping(&mut self) -> [u8; 8] {
+        self.asked = rand::random();
+        self.asked
     }
 
-    /// The peer has answered a ping: it reads what it is sent.
-    pub fn pong(&mut self) {
-        self.heard();
-        self.answers = 0;
+    /// A pong came from the peer.
+    pub fn pong(&mut self, content: &[u8]) {
+        if content == self.asked {
+            self.alive = Instant::now();
+            self.answers = 0;
+        }
     }
 
     /// Counts an answer; false when the peer has asked for too many without reading.
@@ -41,15 +45,31 @@ impl Liveness {
         self.answers <= ANSWERS
     }
 
-    /// Whether the peer has been silent for longer than this.
+    /// Whether the peer has not answered a ping for longer than this.
     #[must_use]
     pub fn is_gone(&self, silence: Duration) -> bool {
-        self.heard.elapsed() > silence
+        self.alive.elapsed() > silence
     }
 }
 
 impl Default for Liveness {
     fn default() -> Self {
         Self::new()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_the_right_pong_is_a_sign_of_life() {
+        let mut liveness = Liveness::new();
+        while liveness.may_answer() {}
+        liveness.pong(b"");
+        assert!(!liveness.may_answer(), "a pong that nobody asked for proves nothing");
+        let ping = liveness.ping();
+        liveness.pong(&ping);
+        assert!(liveness.may_answer());
     }
 }

@@ -2,8 +2,10 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::admission::Rules;
 use super::load::Load;
-use super::repositories::UrlPrefix;
+use super::project_url::ProjectUrl;
+use super::repositories::{UrlPrefix, any_covers};
 
 /// The part of a simulation server's `/status` that decides where clients go.
 ///
@@ -60,5 +62,86 @@ impl Instances {
     #[must_use]
     pub fn present(&self) -> u32 {
         self.queued + self.starting + self.idle + self.running
+    }
+}
+
+impl Dispatch {
+    /// What is known of a server that tells its load alone.
+    #[must_use]
+    pub fn load_only(load: Load) -> Self {
+        Self {
+            load,
+            version: String::new(),
+            instances: None,
+            allowed_repositories: Vec::new(),
+            blocked_repositories: Vec::new(),
+            share_idle_time: 0.0,
+            docker: None,
+            draining: false,
+        }
+    }
+
+    /// Whether the server will run this world, by what it says of itself.
+    ///
+    /// A server that doesn't say whether it has docker is another's: it is taken to run every world that it does not
+    /// rule out, as the original's session server takes it.
+    #[must_use]
+    pub fn accepts(&self, world: &ProjectUrl) -> bool {
+        let Some(docker) = self.docker else {
+            let blocked = any_covers(&self.blocked_repositories, world);
+            let open = self.allowed_repositories.is_empty() || self.share_idle_time > 0.0;
+            return !blocked && (open || any_covers(&self.allowed_repositories, world));
+        };
+        let rules = Rules {
+            allowed: self.allowed_repositories.clone(),
+            blocked: self.blocked_repositories.clone(),
+            docker,
+            share_idle_time: self.share_idle_time,
+        };
+        rules.admit(world, self.load).is_ok()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_server_is_sent_only_worlds_that_it_will_run() {
+        let lab = ProjectUrl::parse("https://github.com/lab/arm/blob/main/worlds/a.wbt").unwrap();
+        let other = ProjectUrl::parse("https://github.com/other/arm/blob/main/worlds/a.wbt").unwrap();
+        let table = [
+            (r#"{"load": 1}"#, true, true, "it says nothing"),
+            (
+                r#"{"load": 1, "allowedRepositories": ["https://github.com/lab"]}"#,
+                true,
+                false,
+                "Python, shares nothing",
+            ),
+            (
+                r#"{"load": 1, "allowedRepositories": ["https://github.com/lab"], "shareIdleTime": 50}"#,
+                true,
+                true,
+                "Python",
+            ),
+            (r#"{"load": 1, "docker": false}"#, false, false, "ours, allows nobody"),
+            (r#"{"load": 1, "docker": false, "allowedRepositories": ["https://github.com/lab"]}"#, true, false, "ours"),
+            (
+                r#"{"load": 60, "docker": true, "shareIdleTime": 50, "allowedRepositories": ["https://github.com/lab"]}"#,
+                true,
+                false,
+                "busy",
+            ),
+            (
+                r#"{"load": 40, "docker": true, "shareIdleTime": 50, "blockedRepositories": ["https://github.com/lab"]}"#,
+                false,
+                true,
+                "blocked",
+            ),
+        ];
+        for (text, runs_lab, runs_other, why) in table {
+            let status: Dispatch = serde_json::from_str(text).unwrap();
+            assert_eq!((status.accepts(&lab), status.accepts(&other)), (runs_lab, runs_other), "{why}");
+        }
     }
 }

@@ -26,7 +26,8 @@ impl Announcer {
     /// Prepares the announcements of a server.
     #[must_use]
     pub fn new(config: &SimulationConfig) -> Self {
-        let allowed: Vec<&str> = config.allowed_repositories.iter().map(super::super::shared::repositories::UrlPrefix::as_str).collect();
+        let allowed: Vec<&str> =
+            config.allowed_repositories.iter().map(super::super::shared::repositories::UrlPrefix::as_str).collect();
         let form = vec![
             ("url", config.address(config.port).http_url(config.ssl)),
             ("shareIdleTime", config.share_idle_time.to_string()),

@@ -9,7 +9,7 @@ use std::collections::HashMap;
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use futures_util::FutureExt;
 use futures_util::future::{BoxFuture, Shared, WeakShared};
@@ -132,6 +132,9 @@ struct Fetch {
     result: WeakShared<BoxFuture<'static, Result<Arc<Fetched>, CheckoutError>>>,
 }
 
+/// Progress is told so often at most: nobody reads faster.
+const BETWEEN_NEWS: Duration = Duration::from_millis(100);
+
 type SharedFetch = Shared<BoxFuture<'static, Result<Arc<Fetched>, CheckoutError>>>;
 
 impl Checkouts {
@@ -188,10 +191,17 @@ impl Checkouts {
         progress: &(impl Fn(String) + Send + Sync),
     ) -> Result<Arc<Fetched>, CheckoutError> {
         let (mut result, mut news) = self.join_or_start(world);
+        let mut told: Option<Instant> = None;
         loop {
             tokio::select! {
                 fetched = &mut result => return fetched,
-                Ok(()) = news.changed() => progress(news.borrow_and_update().clone()),
+                Ok(()) = news.changed() => {
+                    let step = news.borrow_and_update().clone();
+                    if told.is_none_or(|told| told.elapsed() >= BETWEEN_NEWS) {
+                        told = Some(Instant::now());
+                        progress(step);
+                    }
+                }
             }
         }
     }
@@ -279,7 +289,8 @@ impl Checkouts {
         let call = self.call(remote, repository.path(), revision.fetch_arguments(&remote.location));
         let tell = |line: &str| {
             if line.contains('%') {
-                progress.send_replace(format!("fetching {}: {line}", world.repository()));
+                let step = line.trim_start_matches("remote: ");
+                progress.send_replace(format!("fetching {}: {step}", world.repository()));
             }
         };
         let mut fetch = std::pin::pin!(self.git.run(call, tell));

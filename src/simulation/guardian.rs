@@ -72,9 +72,6 @@ pub fn guard(orders: &Orders) -> u8 {
 
 fn run(orders: &Orders) -> Result<u8, String> {
     let (program, arguments) = orders.command.split_first().ok_or("no program is named")?;
-    // It is the server who decides when the program ends. The program itself starts with no signal blocked.
-    let deaf_to: SigSet = [Signal::SIGINT, Signal::SIGTERM, Signal::SIGHUP].into_iter().collect();
-    deaf_to.thread_block().map_err(|error| format!("can't block signals: {error}"))?;
     prctl::set_child_subreaper(true).map_err(|error| format!("can't adopt orphans: {error}"))?;
     let child = Command::new(program)
         .args(arguments)
@@ -82,6 +79,9 @@ fn run(orders: &Orders) -> Result<u8, String> {
         .process_group(0)
         .spawn()
         .map_err(|error| format!("{} can't be started: {error}", program.display()))?;
+    // It is the server who decides when the program ends. The program itself has inherited no blocked signal.
+    let deaf_to: SigSet = [Signal::SIGINT, Signal::SIGTERM, Signal::SIGHUP].into_iter().collect();
+    deaf_to.thread_block().map_err(|error| format!("can't block signals: {error}"))?;
     let group = Pid::from_raw(i32::try_from(child.id()).map_err(|error| error.to_string())?);
     let (sender, events) = channel();
     let lifeline = sender.clone();

@@ -21,7 +21,8 @@ pub struct RepositoryCache {
 pub struct InUse {
     path: PathBuf,
     fetch_lock: PathBuf,
-    _lock: File,
+    #[expect(dead_code, reason = "it is held, not read")]
+    lock: File,
 }
 
 /// The right to add to a cached repository.
@@ -54,7 +55,7 @@ impl RepositoryCache {
         wait(|| lock.try_lock_shared()).await?;
         lock.set_modified(SystemTime::now())?;
         let fetch_lock = self.folder.join(format!("{name}.fetch"));
-        Ok(InUse { path: self.folder.join(&name), fetch_lock, _lock: lock })
+        Ok(InUse { path: self.folder.join(&name), fetch_lock, lock })
     }
 
     /// Removes the repositories that were not used for longest, until all fit into the budget. Those in use stay.
@@ -177,6 +178,12 @@ fn size_of(folder: &Path) -> u64 {
 mod tests {
     use super::*;
 
+    fn age_of(cache: &RepositoryCache, name: &str, seconds: u64) {
+        let lock = cache.folder.join(format!("{}.use", file_name(name)));
+        let file = File::options().append(true).open(lock).unwrap();
+        file.set_modified(SystemTime::now() - Duration::from_secs(seconds)).unwrap();
+    }
+
     #[actix_rt::test]
     async fn the_least_recently_used_goes_first_and_one_in_use_stays() {
         let folder = tempfile::tempdir().unwrap();
@@ -185,10 +192,10 @@ mod tests {
             let taken = cache.take(name).await.unwrap();
             std::fs::create_dir(taken.path()).unwrap();
             std::fs::write(taken.path().join("pack"), [0; 100]).unwrap();
-            taken._lock.set_modified(SystemTime::now() - Duration::from_secs(age)).unwrap();
+            age_of(&cache, name, age);
         }
-        let used = cache.take("in use").await.unwrap();
-        used._lock.set_modified(SystemTime::UNIX_EPOCH).unwrap();
+        let _used = cache.take("in use").await.unwrap();
+        age_of(&cache, "in use", 30);
         assert_eq!(cache.shrink(), 1);
         let exists = |name| cache.folder.join(file_name(name)).exists();
         assert!(exists("in use") && !exists("old") && exists("new"));

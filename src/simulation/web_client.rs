@@ -223,7 +223,7 @@ impl WebClient {
             log::info!("{}: silent for too long", self.name());
             ctx.stop();
         } else {
-            ctx.ping(b"");
+            ctx.ping(&self.liveness.ping());
         }
     }
 }
@@ -249,11 +249,10 @@ impl Actor for WebClient {
 
 impl StreamHandler<Result<Message, ProtocolError>> for WebClient {
     fn handle(&mut self, message: Result<Message, ProtocolError>, ctx: &mut Self::Context) {
-        self.liveness.heard();
         match message {
             Ok(Message::Text(text)) if self.liveness.may_answer() => self.understand(&text, ctx),
             Ok(Message::Ping(data)) if self.liveness.may_answer() => ctx.pong(&data),
-            Ok(Message::Pong(_)) => self.liveness.pong(),
+            Ok(Message::Pong(content)) => self.liveness.pong(&content),
             Ok(Message::Close(reason)) => {
                 ctx.close(reason);
                 ctx.stop();

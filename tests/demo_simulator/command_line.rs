@@ -15,9 +15,7 @@ async fn a_bad_option_ends_it_with_a_message_and_1() {
         let mut simulator = Start::with(&arguments).spawn();
         assert_eq!(simulator.end().await.code(), Some(1), "{arguments:?}");
         simulator.has_printed("stderr: webots: ").await;
-        simulator
-            .has_printed("stderr: Try 'webots --help' for more information.")
-            .await;
+        simulator.has_printed("stderr: Try 'webots --help' for more information.").await;
     }
 }
 
@@ -45,6 +43,5 @@ async fn warnings_are_printed_only_with_stderr() {
     quiet.prints(&["."]).await;
     assert!(!quiet.printed().contains("WARNING"));
     let loud = start().argument("--stderr").listening().await;
-    loud.has_printed("stderr: WARNING: Streaming should be used with --batch.")
-        .await;
+    loud.has_printed("stderr: WARNING: Streaming should be used with --batch.").await;
 }

@@ -11,9 +11,7 @@ use crate::viewer::time_of;
 #[tokio::test]
 async fn many_viewers_see_the_same() {
     let project = project(&[("a.wbt", SMALL_WORLD)]);
-    let simulator = Start::paused(&project.path().join("worlds/a.wbt"))
-        .playing()
-        .await;
+    let simulator = Start::paused(&project.path().join("worlds/a.wbt")).playing().await;
     let mut viewers = Vec::new();
     for _ in 0..50 {
         viewers.push(simulator.spectator().await);
@@ -32,9 +30,7 @@ async fn a_large_world_is_shown_whole() {
     let simulator = Start::paused(&world).playing().await;
     let mut viewer = simulator.spectator().await;
     viewer.say("step").await;
-    viewer
-        .hears(&["application/json:", "paused by client"])
-        .await;
+    viewer.hears(&["application/json:", "paused by client"]).await;
     viewer.say("reload").await;
     viewer.hears(&["delete world", "loading:"]).await;
     viewer.hears(&["loading:", "loading:", "world:"]).await;
@@ -45,9 +41,7 @@ async fn a_large_world_is_shown_whole() {
 async fn a_viewer_that_does_not_read_is_dropped_and_the_others_go_on() {
     let robots = "Robot { name \"one of a great many robots\" }\n".repeat(5000);
     let project = project(&[("a.wbt", &format!("{SMALL_WORLD}{robots}"))]);
-    let simulator = Start::paused(&project.path().join("worlds/a.wbt"))
-        .playing()
-        .await;
+    let simulator = Start::paused(&project.path().join("worlds/a.wbt")).playing().await;
     let mut deaf = simulator.spectator().await;
     let mut other = simulator.spectator().await;
     for _ in 0..40 {
@@ -64,9 +58,7 @@ async fn a_viewer_that_does_not_read_is_dropped_and_the_others_go_on() {
             }
         }
     };
-    timeout(DEADLINE, rest)
-        .await
-        .expect("the connection was not broken in time");
+    timeout(DEADLINE, rest).await.expect("the connection was not broken in time");
     other.say("pause").await;
     other.hears(&["paused by client"]).await;
 }
@@ -89,9 +81,7 @@ async fn a_viewer_that_never_stops_talking_is_sent_away() {
         }
     };
     let both = async { tokio::join!(talk, hear) };
-    timeout(DEADLINE, both)
-        .await
-        .expect("was not sent away in time");
+    timeout(DEADLINE, both).await.expect("was not sent away in time");
     simulator.spectator().await;
 }
 
@@ -113,12 +103,7 @@ async fn a_viewer_that_reads_too_slowly_misses_updates_but_sees_the_last() {
     received.extend(other.hears_after_updates("paused by client").await);
     slow.say("pause").await;
     let seen = slow.hears_after_updates("paused by client").await;
-    assert!(
-        seen.len() < received.len(),
-        "{} of {}",
-        seen.len(),
-        received.len()
-    );
+    assert!(seen.len() < received.len(), "{} of {}", seen.len(), received.len());
     let [seen, received] = [seen, received].map(|updates| updates.last().unwrap().clone());
     assert!((time_of(&seen) - time_of(&received)).abs() < 1.0);
     assert_eq!(seen.matches("\"id\"").count(), 3001);
@@ -127,36 +112,21 @@ async fn a_viewer_that_reads_too_slowly_misses_updates_but_sees_the_last() {
 #[tokio::test]
 async fn a_viewer_that_says_goodbye_is_answered() {
     let project = project(&[("a.wbt", SMALL_WORLD)]);
-    let simulator = Start::paused(&project.path().join("worlds/a.wbt"))
-        .playing()
-        .await;
+    let simulator = Start::paused(&project.path().join("worlds/a.wbt")).playing().await;
     let mut viewer = simulator.spectator().await;
     viewer.socket.close(None).await.unwrap();
-    assert!(matches!(
-        timeout(DEADLINE, viewer.socket.next()).await,
-        Ok(Some(Ok(Message::Close(_))) | None)
-    ));
+    assert!(matches!(timeout(DEADLINE, viewer.socket.next()).await, Ok(Some(Ok(Message::Close(_))) | None)));
     simulator.spectator().await;
 }
 
 #[tokio::test]
 async fn a_viewer_that_sends_bytes_is_sent_away() {
     let project = project(&[("a.wbt", SMALL_WORLD)]);
-    let simulator = Start::paused(&project.path().join("worlds/a.wbt"))
-        .playing()
-        .await;
+    let simulator = Start::paused(&project.path().join("worlds/a.wbt")).playing().await;
     let mut viewer = simulator.spectator().await;
-    viewer
-        .socket
-        .send(Message::binary(vec![1, 2, 3]))
-        .await
-        .unwrap();
+    viewer.socket.send(Message::binary(vec![1, 2, 3])).await.unwrap();
     viewer.is_closed(CloseCode::Unsupported).await;
     let mut viewer = simulator.spectator().await;
-    viewer
-        .socket
-        .send(Message::text("x".repeat(100_000)))
-        .await
-        .unwrap();
+    viewer.socket.send(Message::text("x".repeat(100_000))).await.unwrap();
     viewer.is_closed(CloseCode::Protocol).await;
 }

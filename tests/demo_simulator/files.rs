@@ -10,9 +10,7 @@ async fn started() -> (tempfile::TempDir, Simulator) {
     fs::create_dir(project.path().join("worlds/textures")).unwrap();
     fs::write(project.path().join("worlds/textures/wood.png"), "a picture").unwrap();
     fs::write(project.path().join("index.html"), "<p>hello").unwrap();
-    let simulator = Start::paused(&project.path().join("worlds/a.wbt"))
-        .playing()
-        .await;
+    let simulator = Start::paused(&project.path().join("worlds/a.wbt")).playing().await;
     (project, simulator)
 }
 
@@ -29,16 +27,8 @@ async fn files_of_the_project_are_given_to_pages_of_any_origin_and_may_be_cached
     ] {
         assert!(head.contains(header), "{head}");
     }
-    let tag = head
-        .lines()
-        .find_map(|line| line.strip_prefix("etag: "))
-        .expect(&head);
-    let (status, _, body) = simulator
-        .get(
-            "/worlds/textures/wood.png",
-            &format!("If-None-Match: {tag}\r\n"),
-        )
-        .await;
+    let tag = head.lines().find_map(|line| line.strip_prefix("etag: ")).expect(&head);
+    let (status, _, body) = simulator.get("/worlds/textures/wood.png", &format!("If-None-Match: {tag}\r\n")).await;
     assert_eq!((status, body.as_str()), (304, ""));
     assert_eq!(simulator.get("/index.html", "").await.2, "<p>hello");
 }
@@ -48,11 +38,7 @@ async fn anything_else_is_not_found() {
     let (project, simulator) = started().await;
     let outside = tempfile::tempdir().unwrap();
     fs::write(outside.path().join("secret.png"), "secret").unwrap();
-    symlink(
-        outside.path().join("secret.png"),
-        project.path().join("leak.png"),
-    )
-    .unwrap();
+    symlink(outside.path().join("secret.png"), project.path().join("leak.png")).unwrap();
     symlink(outside.path(), project.path().join("leak")).unwrap();
     let name = outside.path().file_name().unwrap().to_str().unwrap();
     for path in [
@@ -72,10 +58,7 @@ async fn anything_else_is_not_found() {
     ] {
         let (status, head, body) = simulator.get(path, "").await;
         assert_eq!(status, 404, "{path}");
-        assert!(
-            head.contains("content-type: text/html") && body.contains("404 Not Found"),
-            "{path}: {head} {body}"
-        );
+        assert!(head.contains("content-type: text/html") && body.contains("404 Not Found"), "{path}: {head} {body}");
     }
 }
 

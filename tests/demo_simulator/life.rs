@@ -29,11 +29,7 @@ async fn without_stdout_only_status_lines_are_printed() {
     let start = Start::with(&["--batch", "--stream", "--heartbeat=20", "--port=21234"]);
     let mut simulator = start.world(&project.path().join("worlds/a.wbt")).spawn();
     simulator.prints(&[".", "."]).await;
-    assert!(
-        !simulator
-            .printed()
-            .contains(|character| character != '.' && character != '\n')
-    );
+    assert!(!simulator.printed().contains(|character| character != '.' && character != '\n'));
 }
 
 #[tokio::test]
@@ -41,42 +37,22 @@ async fn a_client_that_comes_before_the_world_is_told_so_and_then_shown_it() {
     let project = project(&[]);
     let world = project.path().join("worlds/slow.wbt");
     mkfifo(&world, Mode::S_IRWXU).unwrap();
-    let mut simulator = Start::paused(&world)
-        .argument("--heartbeat=10")
-        .listening()
-        .await;
+    let mut simulator = Start::paused(&world).argument("--heartbeat=10").listening().await;
     let mut viewer = simulator.viewer().await;
     viewer.say("w3d").await;
     viewer.hears(&["loading:Reading world file :0"]).await;
     simulator.prints(&[".", "."]).await;
     tokio::fs::write(&world, SMALL_WORLD).await.unwrap();
-    viewer
-        .hears(&["loading:Parsing world:100", "loading:Finalizing nodes:100"])
-        .await;
-    viewer
-        .hears(&[
-            "world:worlds/slow.wbt:",
-            "model:",
-            "application/json:",
-            "scene load completed",
-            "pause: 0",
-        ])
-        .await;
+    viewer.hears(&["loading:Parsing world:100", "loading:Finalizing nodes:100"]).await;
+    viewer.hears(&["world:worlds/slow.wbt:", "model:", "application/json:", "scene load completed", "pause: 0"]).await;
     viewer.hears_nothing().await;
 }
 
 #[tokio::test]
 async fn a_signal_ends_it_with_0_and_clients_are_told() {
     let project = project(&[("a.wbt", SMALL_WORLD)]);
-    for signal in [
-        Signal::SIGTERM,
-        Signal::SIGINT,
-        Signal::SIGHUP,
-        Signal::SIGQUIT,
-    ] {
-        let mut simulator = Start::paused(&project.path().join("worlds/a.wbt"))
-            .listening()
-            .await;
+    for signal in [Signal::SIGTERM, Signal::SIGINT, Signal::SIGHUP, Signal::SIGQUIT] {
+        let mut simulator = Start::paused(&project.path().join("worlds/a.wbt")).listening().await;
         let mut viewer = simulator.spectator().await;
         simulator.signal(signal);
         viewer.is_closed(CloseCode::Away).await;
@@ -100,44 +76,25 @@ async fn a_taken_port_is_passed_over_silently() {
     let world = project.path().join("worlds/a.wbt");
     let address = own_address();
     let first = Start::paused(&world).on(address).listening().await;
-    let mut second = Start::paused(&world)
-        .on(address)
-        .argument("--heartbeat=1")
-        .listening()
-        .await;
-    let third = Start::paused(&world)
-        .on(address)
-        .argument("--stderr")
-        .listening()
-        .await;
-    assert_eq!(
-        [&first, &second, &third].map(|simulator| simulator.address.port()),
-        [PORT, PORT + 1, PORT + 2]
-    );
+    let mut second = Start::paused(&world).on(address).argument("--heartbeat=1").listening().await;
+    let third = Start::paused(&world).on(address).argument("--stderr").listening().await;
+    assert_eq!([&first, &second, &third].map(|simulator| simulator.address.port()), [PORT, PORT + 1, PORT + 2]);
     for simulator in [&first, &second, &third] {
         simulator.spectator().await;
     }
     second.prints(&["."]).await;
     assert!(!second.printed().contains("stderr"));
-    third
-        .has_printed("stderr: WARNING: Could not listen to port")
-        .await;
+    third.has_printed("stderr: WARNING: Could not listen to port").await;
 }
 
 #[tokio::test]
 async fn with_eleven_ports_taken_it_gives_up() {
     let project = project(&[("a.wbt", SMALL_WORLD)]);
     let address = own_address();
-    let listeners: Vec<_> = (PORT..=PORT + 10)
-        .map(|port| TcpListener::bind((address, port)).unwrap())
-        .collect();
-    let mut simulator = Start::paused(&project.path().join("worlds/a.wbt"))
-        .on(address)
-        .spawn();
+    let listeners: Vec<_> = (PORT..=PORT + 10).map(|port| TcpListener::bind((address, port)).unwrap()).collect();
+    let mut simulator = Start::paused(&project.path().join("worlds/a.wbt")).on(address).spawn();
     assert_eq!(simulator.end().await.code(), Some(1));
-    simulator
-        .has_printed("stderr: webots: failed to open TCP server in the port range [21234-21244]")
-        .await;
+    simulator.has_printed("stderr: webots: failed to open TCP server in the port range [21234-21244]").await;
     drop(listeners);
 }
 
@@ -147,8 +104,6 @@ async fn a_world_that_cannot_be_read_ends_it_with_a_failure() {
     for name in ["missing.wbt", "notes.txt"] {
         let mut simulator = Start::paused(&project.path().join("worlds").join(name)).spawn();
         assert_eq!(simulator.end().await.code(), Some(1), "{name}");
-        simulator
-            .has_printed("stderr: webots: could not open file: '")
-            .await;
+        simulator.has_printed("stderr: webots: could not open file: '").await;
     }
 }

@@ -9,9 +9,7 @@ use std::time::Duration;
 
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
-use tokio::io::{
-    AsyncBufReadExt as _, AsyncRead, AsyncReadExt as _, AsyncWriteExt as _, BufReader,
-};
+use tokio::io::{AsyncBufReadExt as _, AsyncRead, AsyncReadExt as _, AsyncWriteExt as _, BufReader};
 use tokio::net::TcpStream;
 use tokio::process::{Child, Command};
 use tokio::sync::mpsc;
@@ -66,11 +64,7 @@ pub(crate) fn project(worlds: &[(&str, &str)]) -> tempfile::TempDir {
 impl Start {
     /// A simulator that is started with these arguments and no others.
     pub(crate) fn with(arguments: &[&str]) -> Self {
-        Self {
-            arguments: arguments.iter().map(ToString::to_string).collect(),
-            address: own_address(),
-            world: None,
-        }
+        Self { arguments: arguments.iter().map(ToString::to_string).collect(), address: own_address(), world: None }
     }
 
     /// A paused streaming simulator of a world, which also prints its remarks.
@@ -112,36 +106,17 @@ impl Start {
             .unwrap();
         let printed = Arc::new(Mutex::new(String::new()));
         let (sender, out) = mpsc::unbounded_channel();
-        read_lines(
-            child.stdout.take().unwrap(),
-            "",
-            Arc::clone(&printed),
-            Some(sender),
-        );
-        read_lines(
-            child.stderr.take().unwrap(),
-            "stderr: ",
-            Arc::clone(&printed),
-            None,
-        );
-        Simulator {
-            child,
-            address: SocketAddrV4::new(self.address, PORT).into(),
-            out,
-            printed,
-        }
+        read_lines(child.stdout.take().unwrap(), "", Arc::clone(&printed), Some(sender));
+        read_lines(child.stderr.take().unwrap(), "stderr: ", Arc::clone(&printed), None);
+        Simulator { child, address: SocketAddrV4::new(self.address, PORT).into(), out, printed }
     }
 
     /// Starts it and waits until it listens, on whichever port it says.
     pub(crate) async fn listening(self) -> Simulator {
         let mut simulator = self.spawn();
         let line = simulator.line().await;
-        let port = line
-            .strip_prefix("INFO: Streaming server listening on port ")
-            .expect(&line);
-        simulator
-            .address
-            .set_port(port.trim_end_matches('.').parse().unwrap());
+        let port = line.strip_prefix("INFO: Streaming server listening on port ").expect(&line);
+        simulator.address.set_port(port.trim_end_matches('.').parse().unwrap());
         simulator
     }
 
@@ -173,9 +148,7 @@ fn read_lines(
 impl Simulator {
     /// The next line on its standard output.
     pub(crate) async fn line(&mut self) -> String {
-        let line = timeout(DEADLINE, self.out.recv())
-            .await
-            .expect("no line in time");
+        let line = timeout(DEADLINE, self.out.recv()).await.expect("no line in time");
         line.expect("the standard output has ended")
     }
 
@@ -208,15 +181,8 @@ impl Simulator {
 
     /// Waits until it has ended and all it printed has been read.
     pub(crate) async fn end(&mut self) -> ExitStatus {
-        let status = timeout(DEADLINE, self.child.wait())
-            .await
-            .expect("did not end in time")
-            .unwrap();
-        while timeout(DEADLINE, self.out.recv())
-            .await
-            .expect("the output did not end")
-            .is_some()
-        {}
+        let status = timeout(DEADLINE, self.child.wait()).await.expect("did not end in time").unwrap();
+        while timeout(DEADLINE, self.out.recv()).await.expect("the output did not end").is_some() {}
         status
     }
 
@@ -236,14 +202,10 @@ impl Simulator {
     /// Sends a request line for a path just as it is; the status, the headers in lower case, and the body.
     pub(crate) async fn get(&self, path: &str, header: &str) -> (u16, String, String) {
         let mut stream = TcpStream::connect(self.address).await.unwrap();
-        let request =
-            format!("GET {path} HTTP/1.1\r\nHost: test\r\nConnection: close\r\n{header}\r\n");
+        let request = format!("GET {path} HTTP/1.1\r\nHost: test\r\nConnection: close\r\n{header}\r\n");
         stream.write_all(request.as_bytes()).await.unwrap();
         let mut answer = String::new();
-        timeout(DEADLINE, stream.read_to_string(&mut answer))
-            .await
-            .expect("no answer in time")
-            .unwrap();
+        timeout(DEADLINE, stream.read_to_string(&mut answer)).await.expect("no answer in time").unwrap();
         let (head, body) = answer.split_once("\r\n\r\n").unwrap();
         let status = head.split(' ').nth(1).unwrap().parse().unwrap();
         (status, head.to_ascii_lowercase(), body.to_owned())
@@ -253,11 +215,7 @@ impl Simulator {
 impl Drop for Simulator {
     fn drop(&mut self) {
         if std::thread::panicking() {
-            eprintln!(
-                "--- the simulator at {} printed:\n{}---",
-                self.address,
-                self.printed()
-            );
+            eprintln!("--- the simulator at {} printed:\n{}---", self.address, self.printed());
         }
     }
 }

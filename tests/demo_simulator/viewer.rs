@@ -19,9 +19,7 @@ pub(crate) struct Viewer {
 impl Viewer {
     pub(crate) async fn connect(address: SocketAddr) -> Self {
         let stream = TcpStream::connect(address).await.unwrap();
-        let (socket, _) = client_async(format!("ws://{address}/"), stream)
-            .await
-            .unwrap();
+        let (socket, _) = client_async(format!("ws://{address}/"), stream).await.unwrap();
         Self { socket }
     }
 
@@ -31,10 +29,7 @@ impl Viewer {
 
     /// The next text.
     pub(crate) async fn hear(&mut self) -> String {
-        match timeout(DEADLINE, self.socket.next())
-            .await
-            .expect("heard nothing in time")
-        {
+        match timeout(DEADLINE, self.socket.next()).await.expect("heard nothing in time") {
             Some(Ok(Message::Text(text))) => text.to_string(),
             other => panic!("expected a text, got {other:?}"),
         }
@@ -44,22 +39,14 @@ impl Viewer {
     pub(crate) async fn hears(&mut self, starts: &[&str]) {
         for start in starts {
             let text = self.hear().await;
-            assert!(
-                text.starts_with(start),
-                "expected {start:?}, heard {text:?}"
-            );
+            assert!(text.starts_with(start), "expected {start:?}, heard {text:?}");
         }
     }
 
     /// The scene must come, perhaps after some progress; then the state, which is returned.
     pub(crate) async fn hears_scene(&mut self) -> String {
         while !self.hear_world().await.starts_with("world:") {}
-        self.hears(&[
-            "model:<?xml",
-            "application/json:{\"time\":",
-            "scene load completed",
-        ])
-        .await;
+        self.hears(&["model:<?xml", "application/json:{\"time\":", "scene load completed"]).await;
         self.hear().await
     }
 
@@ -78,24 +65,15 @@ impl Viewer {
             if heard == text {
                 return updates;
             }
-            assert!(
-                heard.starts_with("application/json:"),
-                "expected {text:?}, heard {heard:?}"
-            );
+            assert!(heard.starts_with("application/json:"), "expected {text:?}, heard {heard:?}");
             updates.push(heard);
         }
     }
 
     /// Makes sure that nothing is on its way: the answer to a ping comes next.
     pub(crate) async fn hears_nothing(&mut self) {
-        self.socket
-            .send(Message::Ping(b"anything?".to_vec().into()))
-            .await
-            .unwrap();
-        match timeout(DEADLINE, self.socket.next())
-            .await
-            .expect("no pong in time")
-        {
+        self.socket.send(Message::Ping(b"anything?".to_vec().into())).await.unwrap();
+        match timeout(DEADLINE, self.socket.next()).await.expect("no pong in time") {
             Some(Ok(Message::Pong(data))) => assert_eq!(data.as_ref(), b"anything?"),
             other => panic!("expected nothing, got {other:?}"),
         }
@@ -103,10 +81,7 @@ impl Viewer {
 
     /// The connection must be closed by the simulator, with this code.
     pub(crate) async fn is_closed(&mut self, code: CloseCode) {
-        match timeout(DEADLINE, self.socket.next())
-            .await
-            .expect("not closed in time")
-        {
+        match timeout(DEADLINE, self.socket.next()).await.expect("not closed in time") {
             Some(Ok(Message::Close(Some(frame)))) => assert_eq!(frame.code, code),
             other => panic!("expected a close frame, got {other:?}"),
         }

@@ -11,9 +11,7 @@ async fn started_with(arguments: &[&str]) -> (tempfile::TempDir, Simulator) {
     let other = SMALL_WORLD.replace("mover", "other mover");
     let project = project(&[("a.wbt", SMALL_WORLD), ("b.wbt", &other)]);
     let start = Start::paused(&project.path().join("worlds/a.wbt"));
-    let start = arguments
-        .iter()
-        .fold(start, |start, argument| start.argument(argument));
+    let start = arguments.iter().fold(start, |start, argument| start.argument(argument));
     (project, start.playing().await)
 }
 
@@ -24,19 +22,10 @@ async fn nothing_is_said_before_the_first_message_and_then_the_whole_scene() {
         let mut viewer = simulator.viewer().await;
         viewer.hears_nothing().await;
         viewer.say(first).await;
-        assert_eq!(
-            viewer.hear().await,
-            "world:worlds/a.wbt:worlds/a.wbt;worlds/b.wbt"
-        );
+        assert_eq!(viewer.hear().await, "world:worlds/a.wbt:worlds/a.wbt;worlds/b.wbt");
         let model = viewer.hear().await;
-        assert!(
-            model.starts_with("model:<?xml version=\"1.0\" encoding=\"UTF-8\"?><X3D>"),
-            "{model}"
-        );
-        assert!(
-            model.contains(r#"<Robot id="n6" name="mover" translation="1 2 0"/>"#),
-            "{model}"
-        );
+        assert!(model.starts_with("model:<?xml version=\"1.0\" encoding=\"UTF-8\"?><X3D>"), "{model}");
+        assert!(model.contains(r#"<Robot id="n6" name="mover" translation="1 2 0"/>"#), "{model}");
         assert_eq!(
             viewer.hear().await,
             r#"application/json:{"time":0,"updates":[{"id":6,"translation":"1 2 0","rotation":"0 0 1 0"}]}"#
@@ -64,9 +53,7 @@ async fn a_step_moves_time_for_all_and_is_answered_to_the_one_who_asked() {
         one.say("step").await;
         let update = one.hear().await;
         assert!(
-            update.starts_with(&format!(
-                "application/json:{{\"time\":{time},\"updates\":[{{\"id\":6,"
-            )),
+            update.starts_with(&format!("application/json:{{\"time\":{time},\"updates\":[{{\"id\":6,")),
             "{update}"
         );
         one.hears(&["paused by client"]).await;
@@ -82,28 +69,14 @@ async fn real_time_and_fast_run_until_paused_and_later_viewers_hear_which() {
         let (_project, mut simulator) = paused().await;
         let mut viewer = simulator.spectator().await;
         viewer.say(&format!("{mode}:-1")).await;
-        viewer
-            .hears(&[
-                mode,
-                "application/json:",
-                "application/json:",
-                "application/json:",
-            ])
-            .await;
+        viewer.hears(&[mode, "application/json:", "application/json:", "application/json:"]).await;
         let mut late = simulator.viewer().await;
         late.say("w3d;broadcast").await;
         assert_eq!(late.hears_scene().await, mode);
         viewer.say("pause").await;
-        let times: Vec<f64> = viewer
-            .hears_after_updates("paused by client")
-            .await
-            .iter()
-            .map(|text| time_of(text))
-            .collect();
-        assert!(
-            times.is_sorted_by(|earlier, later| earlier < later),
-            "{times:?}"
-        );
+        let times: Vec<f64> =
+            viewer.hears_after_updates("paused by client").await.iter().map(|text| time_of(text)).collect();
+        assert!(times.is_sorted_by(|earlier, later| earlier < later), "{times:?}");
         viewer.hears_nothing().await;
         simulator.prints(&[mode, "pause"]).await;
     }
@@ -113,19 +86,11 @@ async fn real_time_and_fast_run_until_paused_and_later_viewers_hear_which() {
 async fn a_run_with_a_timeout_pauses_by_itself_and_tells_all() {
     let (_project, mut simulator) = paused().await;
     let (mut one, mut other) = (simulator.spectator().await, simulator.spectator().await);
-    for (command, mode, state) in [
-        ("real-time:95", "real-time", "pause: 100"),
-        ("fast:500", "fast", "pause: 600"),
-    ] {
+    for (command, mode, state) in [("real-time:95", "real-time", "pause: 100"), ("fast:500", "fast", "pause: 600")] {
         one.say(command).await;
         one.hears(&[mode]).await;
         let updates = one.hears_after_updates(state).await;
-        assert_eq!(
-            updates
-                .last()
-                .map(|update| format!("pause: {}", time_of(update))),
-            Some(state.to_owned())
-        );
+        assert_eq!(updates.last().map(|update| format!("pause: {}", time_of(update))), Some(state.to_owned()));
         other.hears_after_updates(state).await;
         simulator.prints(&[mode, "pause"]).await;
     }
@@ -151,9 +116,7 @@ async fn a_timeout_changes_when_a_run_pauses() {
 async fn a_viewer_that_does_not_only_look_on_pauses_a_simulation_that_runs_by_itself() {
     let (_project, mut simulator) = started_with(&["--mode=realtime"]).await;
     let mut spectator = simulator.spectator().await;
-    spectator
-        .hears(&["application/json:", "application/json:"])
-        .await;
+    spectator.hears(&["application/json:", "application/json:"]).await;
     let mut viewer = simulator.viewer().await;
     viewer.say("w3d").await;
     simulator.prints(&["pause"]).await;
@@ -166,8 +129,7 @@ async fn a_reset_goes_back_to_the_start_for_all() {
     let (_project, mut simulator) = paused().await;
     let (mut one, mut other) = (simulator.spectator().await, simulator.spectator().await);
     one.say("step").await;
-    one.hears(&["application/json:{\"time\":10,", "paused by client"])
-        .await;
+    one.hears(&["application/json:{\"time\":10,", "paused by client"]).await;
     other.hears(&["application/json:{\"time\":10,"]).await;
     one.say("reset").await;
     for viewer in [&mut one, &mut other] {
@@ -192,9 +154,7 @@ async fn a_reset_forgets_the_timeout_and_keeps_the_mode() {
     viewer.hears(&["real-time", "application/json:"]).await;
     viewer.say("reset").await;
     while viewer.hear().await != "reset finished" {}
-    viewer
-        .hears(&["application/json:", "application/json:"])
-        .await;
+    viewer.hears(&["application/json:", "application/json:"]).await;
 }
 
 #[tokio::test]
@@ -214,21 +174,12 @@ async fn reload_and_load_show_a_world_again_without_the_state() {
     ] {
         one.say(command).await;
         for viewer in [&mut one, &mut other] {
-            viewer
-                .hears(&["delete world", "loading:Reading world file :0"])
-                .await;
-            viewer
-                .hears(&["loading:Parsing world:100", "loading:Finalizing nodes:100"])
-                .await;
+            viewer.hears(&["delete world", "loading:Reading world file :0"]).await;
+            viewer.hears(&["loading:Parsing world:100", "loading:Finalizing nodes:100"]).await;
             viewer.hears(&[&format!("world:{world}:")]).await;
             let model = viewer.hear().await;
-            assert!(
-                model.contains(&format!("name=\"{robot}\"")),
-                "{command}: {model}"
-            );
-            viewer
-                .hears(&["application/json:{\"time\":0,", "scene load completed"])
-                .await;
+            assert!(model.contains(&format!("name=\"{robot}\"")), "{command}: {model}");
+            viewer.hears(&["application/json:{\"time\":0,", "scene load completed"]).await;
             viewer.hears_nothing().await;
         }
     }
@@ -243,20 +194,13 @@ async fn what_makes_no_sense_is_ignored_and_logged() {
         ("dance", "Unsupported message: \"dance\"."),
         ("real-time:soon", "Unsupported message: \"real-time:soon\"."),
         ("load:missing.wbt", "there is no world \"missing.wbt\"."),
-        (
-            "load:../../etc/passwd",
-            "there is no world \"../../etc/passwd\".",
-        ),
+        ("load:../../etc/passwd", "there is no world \"../../etc/passwd\"."),
         ("mjpeg: 800x600", "this simulator renders no pictures."),
     ] {
         viewer.say(text).await;
-        simulator
-            .has_printed(&format!("stderr: ERROR: Streaming server: {complaint}"))
-            .await;
+        simulator.has_printed(&format!("stderr: ERROR: Streaming server: {complaint}")).await;
     }
-    viewer
-        .say("robot:{\"name\":\"mover\",\"message\":\"hello\"}")
-        .await;
+    viewer.say("robot:{\"name\":\"mover\",\"message\":\"hello\"}").await;
     viewer.say("pause").await;
     viewer.hears(&["paused by client"]).await;
     simulator.prints(&["pause"]).await;
@@ -267,10 +211,7 @@ async fn what_makes_no_sense_is_ignored_and_logged() {
 async fn without_stream_clients_are_accepted_and_ignored() {
     let project = project(&[("a.wbt", SMALL_WORLD)]);
     let start = Start::with(&["--batch", "--mode=pause", "--stdout", "--port=21234"]);
-    let simulator = start
-        .world(&project.path().join("worlds/a.wbt"))
-        .listening()
-        .await;
+    let simulator = start.world(&project.path().join("worlds/a.wbt")).listening().await;
     let mut viewer = simulator.viewer().await;
     viewer.say("w3d").await;
     viewer.say("pause").await;

@@ -13,26 +13,14 @@ async fn a_broken_world_is_replaced_by_an_empty_one_and_only_stderr_tells() {
     let deep = format!("{HEADER}{}", "Group { children ".repeat(100_000));
     let wild = format!("{HEADER}\u{0} }}}} ]] \"\\");
     let huge = format!("{HEADER}{}", " ".repeat(9 * 1024 * 1024));
-    let doubling: Vec<String> = (1..50)
-        .map(|i| format!("DEF N{i} Group {{ children [ USE N{0} USE N{0} ] }}", i - 1))
-        .collect();
+    let doubling: Vec<String> =
+        (1..50).map(|i| format!("DEF N{i} Group {{ children [ USE N{0} USE N{0} ] }}", i - 1)).collect();
     let doubling = doubling.concat();
     let exploding = format!("{HEADER}DEF N0 Group {{ }}{doubling}");
-    for text in [
-        no_header,
-        unclosed,
-        deep,
-        wild,
-        huge,
-        exploding,
-        String::new(),
-    ] {
+    for text in [no_header, unclosed, deep, wild, huge, exploding, String::new()] {
         let project = project(&[("a.wbt", &text)]);
         let world = project.path().join("worlds/a.wbt");
-        let mut quiet = Start::paused(&world)
-            .argument("--heartbeat=1")
-            .listening()
-            .await;
+        let mut quiet = Start::paused(&world).argument("--heartbeat=1").listening().await;
         let mut viewer = quiet.viewer().await;
         viewer.say("w3d").await;
         let model = loop {
@@ -41,10 +29,7 @@ async fn a_broken_world_is_replaced_by_an_empty_one_and_only_stderr_tells() {
                 break heard;
             }
         };
-        assert!(
-            model.contains("<Viewpoint") && !model.contains("<Solid"),
-            "{model}"
-        );
+        assert!(model.contains("<Viewpoint") && !model.contains("<Solid"), "{model}");
         quiet.prints(&["."]).await;
         assert!(!quiet.printed().contains("stderr"));
         let loud = Start::paused(&world).argument("--stderr").listening().await;
@@ -55,31 +40,20 @@ async fn a_broken_world_is_replaced_by_an_empty_one_and_only_stderr_tells() {
 #[tokio::test]
 async fn the_demo_worlds_have_robots_that_move() {
     for (name, robots) in [("playground.wbt", 3), ("carousel.wbt", 4)] {
-        let world = Path::new(env!("CARGO_MANIFEST_DIR"))
-            .join("config/demo/worlds")
-            .join(name);
+        let world = Path::new(env!("CARGO_MANIFEST_DIR")).join("config/demo/worlds").join(name);
         let simulator = Start::paused(&world).argument("--stderr").playing().await;
         let mut viewer = simulator.viewer().await;
         viewer.say("w3d").await;
         let worlds = viewer.hear().await;
-        assert_eq!(
-            worlds,
-            format!("world:worlds/{name}:worlds/carousel.wbt;worlds/playground.wbt")
-        );
+        assert_eq!(worlds, format!("world:worlds/{name}:worlds/carousel.wbt;worlds/playground.wbt"));
         let model = viewer.hear().await;
         assert_eq!(model.matches("<Robot ").count(), robots);
         assert!(model.contains("<Background ") && model.contains("<DirectionalLight "));
-        viewer
-            .hears(&["application/json:", "scene load completed", "pause: 0"])
-            .await;
+        viewer.hears(&["application/json:", "scene load completed", "pause: 0"]).await;
         for _ in 0..2 {
             viewer.say("step").await;
             let update = viewer.hear().await;
-            assert_eq!(
-                update.matches("\"translation\"").count(),
-                robots,
-                "{update}"
-            );
+            assert_eq!(update.matches("\"translation\"").count(), robots, "{update}");
             viewer.hears(&["paused by client"]).await;
         }
         assert!(!simulator.printed().contains("stderr"));
@@ -107,9 +81,7 @@ async fn each_node_becomes_an_element_with_its_number() {
         USE PAIR
     "#;
     let project = project(&[("a.wbt", text)]);
-    let simulator = Start::paused(&project.path().join("worlds/a.wbt"))
-        .playing()
-        .await;
+    let simulator = Start::paused(&project.path().join("worlds/a.wbt")).playing().await;
     let mut viewer = simulator.viewer().await;
     viewer.say("w3d").await;
     viewer.hears(&["world:"]).await;

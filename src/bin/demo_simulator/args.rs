@@ -27,10 +27,7 @@ pub(crate) enum Request {
 
 /// How to run a simulation.
 #[derive(Debug, PartialEq)]
-#[expect(
-    clippy::struct_excessive_bools,
-    reason = "each is an independent switch of the command line"
-)]
+#[expect(clippy::struct_excessive_bools, reason = "each is an independent switch of the command line")]
 pub(crate) struct Options {
     /// The world file.
     pub(crate) world: PathBuf,
@@ -146,10 +143,7 @@ impl Options {
 }
 
 fn invalid(option: &'static str, value: &str) -> ArgsError {
-    ArgsError::InvalidValue {
-        option,
-        value: value.to_owned(),
-    }
+    ArgsError::InvalidValue { option, value: value.to_owned() }
 }
 
 #[cfg(test)]
@@ -199,43 +193,16 @@ mod tests {
     #[test]
     fn bad_options_are_refused_with_the_reason() {
         for (line, message) in [
-            (
-                "--nonsense w.wbt",
-                "invalid option '--nonsense': unknown or malformed.",
-            ),
-            (
-                "--batch=yes w.wbt",
-                "invalid option '--batch=yes': unknown or malformed.",
-            ),
-            (
-                "--port w.wbt",
-                "invalid option '--port': unknown or malformed.",
-            ),
+            ("--nonsense w.wbt", "invalid option '--nonsense': unknown or malformed."),
+            ("--batch=yes w.wbt", "invalid option '--batch=yes': unknown or malformed."),
+            ("--port w.wbt", "invalid option '--port': unknown or malformed."),
             ("--port=0 w.wbt", "invalid value \"0\" to '--port' option."),
-            (
-                "--port=65536 w.wbt",
-                "invalid value \"65536\" to '--port' option.",
-            ),
-            (
-                "--stream=foo w.wbt",
-                "invalid value \"foo\" to '--stream' option.",
-            ),
-            (
-                "--mode=slow w.wbt",
-                "invalid value \"slow\" to '--mode' option.",
-            ),
-            (
-                "--heartbeat=0 w.wbt",
-                "invalid value \"0\" to '--heartbeat' option.",
-            ),
-            (
-                "--heartbeat=-5 w.wbt",
-                "invalid value \"-5\" to '--heartbeat' option.",
-            ),
-            (
-                "a.wbt b.wbt",
-                "unexpected argument 'b.wbt' after the world file.",
-            ),
+            ("--port=65536 w.wbt", "invalid value \"65536\" to '--port' option."),
+            ("--stream=foo w.wbt", "invalid value \"foo\" to '--stream' option."),
+            ("--mode=slow w.wbt", "invalid value \"slow\" to '--mode' option."),
+            ("--heartbeat=0 w.wbt", "invalid value \"0\" to '--heartbeat' option."),
+            ("--heartbeat=-5 w.wbt", "invalid value \"-5\" to '--heartbeat' option."),
+            ("a.wbt b.wbt", "unexpected argument 'b.wbt' after the world file."),
             ("--batch", "a world file is needed."),
         ] {
             assert_eq!(parse_line(line).unwrap_err().to_string(), message, "{line}");

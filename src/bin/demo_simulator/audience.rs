@@ -32,14 +32,7 @@ struct Seat {
 impl Audience {
     /// Someone connected.
     pub(crate) fn join(&mut self, id: ClientId, outbox: Outbox) {
-        self.seats.insert(
-            id,
-            Seat {
-                outbox,
-                watching: false,
-                missed: false,
-            },
-        );
+        self.seats.insert(id, Seat { outbox, watching: false, missed: false });
     }
 
     /// Another world will be shown, which takes so many bytes.
@@ -61,11 +54,7 @@ impl Audience {
 
     /// Those who see the scene.
     pub(crate) fn watchers(&self) -> Vec<ClientId> {
-        self.seats
-            .iter()
-            .filter(|(_, seat)| seat.watching)
-            .map(|(id, _)| *id)
-            .collect()
+        self.seats.iter().filter(|(_, seat)| seat.watching).map(|(id, _)| *id).collect()
     }
 
     /// Whether nobody sees the scene.
@@ -87,17 +76,12 @@ impl Audience {
     pub(crate) fn tell_watchers(&mut self, text: impl Into<ByteString>) {
         let text = text.into();
         let patience = self.patience();
-        self.seats
-            .retain(|_, seat| !seat.watching || seat.send(text.clone(), patience));
+        self.seats.retain(|_, seat| !seat.watching || seat.send(text.clone(), patience));
     }
 
     /// Sends an update to all who see the scene and read fast enough; `everything` makes the one for
     /// those who missed some before.
-    pub(crate) fn show(
-        &mut self,
-        changes: impl Into<ByteString>,
-        mut everything: impl FnMut() -> String,
-    ) {
+    pub(crate) fn show(&mut self, changes: impl Into<ByteString>, mut everything: impl FnMut() -> String) {
         let changes = changes.into();
         for seat in self.seats.values_mut().filter(|seat| seat.watching) {
             if seat.outbox.waiting() > SLOW {
@@ -113,9 +97,7 @@ impl Audience {
     /// Sends everything to those who missed an update, since time stops and no other will come.
     pub(crate) fn catch_up(&mut self, mut everything: impl FnMut() -> String) {
         let patience = self.patience();
-        self.seats.retain(|_, seat| {
-            !std::mem::take(&mut seat.missed) || seat.send(everything().into(), patience)
-        });
+        self.seats.retain(|_, seat| !std::mem::take(&mut seat.missed) || seat.send(everything().into(), patience));
     }
 
     /// Says goodbye to everybody.

@@ -9,9 +9,7 @@ use std::net::{Shutdown, TcpStream};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 
-use actix::{
-    Actor, ActorContext as _, AsyncContext as _, Handler, Message, Recipient, StreamHandler,
-};
+use actix::{Actor, ActorContext as _, AsyncContext as _, Handler, Message, Recipient, StreamHandler};
 use actix_web_actors::ws;
 use bytestring::ByteString;
 
@@ -111,13 +109,7 @@ impl Client {
     pub(crate) fn new(simulation: Recipient<Event>, connection: Arc<TcpStream>) -> Self {
         static NEXT_ID: AtomicU64 = AtomicU64::new(1);
         let id = ClientId(NEXT_ID.fetch_add(1, Ordering::Relaxed));
-        Self {
-            id,
-            simulation,
-            unheard: Arc::default(),
-            waiting: Arc::default(),
-            connection,
-        }
+        Self { id, simulation, unheard: Arc::default(), waiting: Arc::default(), connection }
     }
 
     fn pass_on(&self, text: ByteString, ctx: &mut ws::WebsocketContext<Self>) {

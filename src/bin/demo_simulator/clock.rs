@@ -48,13 +48,7 @@ pub(crate) struct Clock {
 impl Clock {
     /// A clock at time 0, whose steps are `step` milliseconds long.
     pub(crate) fn new(mode: Mode, step: f64) -> Self {
-        Self {
-            mode,
-            step,
-            now: 0.0,
-            pause_at: f64::INFINITY,
-            due: 0.0,
-        }
+        Self { mode, step, now: 0.0, pause_at: f64::INFINITY, due: 0.0 }
     }
 
     /// Simulation time, in milliseconds.
@@ -86,10 +80,7 @@ impl Clock {
     /// A clock at time 0 for another world, in the same mode and with the same time left.
     pub(crate) fn restart(&mut self, step: f64) {
         let left = (self.pause_at - self.now).max(0.0);
-        *self = Self {
-            pause_at: left,
-            ..Self::new(self.mode, step)
-        };
+        *self = Self { pause_at: left, ..Self::new(self.mode, step) };
     }
 
     /// One step, whatever the mode.
@@ -160,22 +151,10 @@ mod tests {
         for (timeout, expected) in [(0.0, 32.0), (32.0, 32.0), (33.0, 64.0), (100.0, 128.0)] {
             let mut clock = Clock::new(Mode::Fast, 32.0);
             clock.set_timeout(timeout);
-            assert_eq!(
-                clock.advance(Duration::from_millis(100)),
-                Progress::TimedOut,
-                "{timeout}"
-            );
-            assert_eq!(
-                (clock.now(), clock.mode()),
-                (expected, Mode::Pause),
-                "{timeout}"
-            );
+            assert_eq!(clock.advance(Duration::from_millis(100)), Progress::TimedOut, "{timeout}");
+            assert_eq!((clock.now(), clock.mode()), (expected, Mode::Pause), "{timeout}");
             clock.set_mode(Mode::Fast);
-            assert_eq!(
-                clock.advance(Duration::from_millis(100)),
-                Progress::Moved,
-                "it pauses only once"
-            );
+            assert_eq!(clock.advance(Duration::from_millis(100)), Progress::Moved, "it pauses only once");
         }
     }
 

@@ -20,9 +20,7 @@ use percent_encoding::percent_decode_str;
 use crate::client::{Client, Event};
 
 /// The extensions of the files that are given away: what a viewer needs to draw and to explain a scene.
-const EXTENSIONS: [&str; 11] = [
-    "png", "jpg", "jpeg", "ico", "html", "css", "js", "dae", "obj", "mtl", "stl",
-];
+const EXTENSIONS: [&str; 11] = ["png", "jpg", "jpeg", "ico", "html", "css", "js", "dae", "obj", "mtl", "stl"];
 const NOT_FOUND: &str = include_str!("../../../templates/demo/not_found.html");
 
 /// The folder of which files are given away, with its links resolved.
@@ -36,23 +34,14 @@ struct Connection(Arc<TcpStream>);
 impl ProjectFolder {
     /// Gives away files of `folder`; none if there is no such folder.
     pub(crate) fn new(folder: &Path) -> Self {
-        Self(
-            folder
-                .canonicalize()
-                .unwrap_or_else(|_| PathBuf::from("/dev/null")),
-        )
+        Self(folder.canonicalize().unwrap_or_else(|_| PathBuf::from("/dev/null")))
     }
 
     /// The file that a request's path asks for, if it may be given away.
     fn file(&self, path: &str) -> Option<PathBuf> {
-        let path = percent_decode_str(path.trim_start_matches('/'))
-            .decode_utf8()
-            .ok()?;
+        let path = percent_decode_str(path.trim_start_matches('/')).decode_utf8().ok()?;
         let path = Path::new(path.as_ref());
-        if !path
-            .components()
-            .all(|part| matches!(part, Component::Normal(_)))
-        {
+        if !path.components().all(|part| matches!(part, Component::Normal(_))) {
             return None;
         }
         // once the links are resolved nothing of the request is left to trick with
@@ -65,9 +54,7 @@ impl ProjectFolder {
 
 /// Keeps a second handle to each connection, by which it can be broken.
 pub(crate) fn remember_connection(io: &dyn Any, data: &mut Extensions) {
-    let handle = io
-        .downcast_ref::<net::TcpStream>()
-        .and_then(|stream| stream.as_fd().try_clone_to_owned().ok());
+    let handle = io.downcast_ref::<net::TcpStream>().and_then(|stream| stream.as_fd().try_clone_to_owned().ok());
     if let Some(handle) = handle {
         data.insert(Connection(Arc::new(handle.into())));
     }
@@ -75,8 +62,7 @@ pub(crate) fn remember_connection(io: &dyn Any, data: &mut Extensions) {
 
 /// Adds the simulator's paths to an application.
 pub(crate) fn configure(app: &mut web::ServiceConfig) {
-    app.route("/", web::get().to(open_client))
-        .default_service(web::get().to(send_file));
+    app.route("/", web::get().to(open_client)).default_service(web::get().to(send_file));
 }
 
 async fn open_client(
@@ -85,9 +71,7 @@ async fn open_client(
     simulation: web::Data<Recipient<Event>>,
 ) -> Result<HttpResponse, Error> {
     let Some(Connection(connection)) = request.conn_data::<Connection>().cloned() else {
-        return Err(ErrorInternalServerError(
-            "the connection has no second handle",
-        ));
+        return Err(ErrorInternalServerError("the connection has no second handle"));
     };
     let simulation = simulation.get_ref().clone();
     ws::start(Client::new(simulation, connection), &request, body)
@@ -95,31 +79,17 @@ async fn open_client(
 
 async fn send_file(request: HttpRequest, project: web::Data<ProjectFolder>) -> HttpResponse {
     let path = request.path().to_owned();
-    let found = web::block(move || {
-        project
-            .file(&path)
-            .and_then(|path| NamedFile::open(path).ok())
-    })
-    .await;
+    let found = web::block(move || project.file(&path).and_then(|path| NamedFile::open(path).ok())).await;
     let Ok(Some(file)) = found else {
         return HttpResponse::NotFound()
             .insert_header((header::ACCESS_CONTROL_ALLOW_ORIGIN, "*"))
             .content_type("text/html; charset=utf-8")
             .body(NOT_FOUND);
     };
-    let mut response = file
-        .use_last_modified(false)
-        .disable_content_disposition()
-        .into_response(&request);
+    let mut response = file.use_last_modified(false).disable_content_disposition().into_response(&request);
     let headers = response.headers_mut();
-    headers.insert(
-        header::ACCESS_CONTROL_ALLOW_ORIGIN,
-        header::HeaderValue::from_static("*"),
-    );
-    headers.insert(
-        header::CACHE_CONTROL,
-        header::HeaderValue::from_static("public, max-age=3600"),
-    );
+    headers.insert(header::ACCESS_CONTROL_ALLOW_ORIGIN, header::HeaderValue::from_static("*"));
+    headers.insert(header::CACHE_CONTROL, header::HeaderValue::from_static("public, max-age=3600"));
     response
 }
 
@@ -135,13 +105,7 @@ mod tests {
         let outside = tempfile::tempdir().unwrap();
         let project = outside.path().join("project");
         fs::create_dir_all(project.join("worlds/textures")).unwrap();
-        for file in [
-            "worlds/a.wbt",
-            "worlds/textures/a b.PNG",
-            "index.html",
-            "../secret.png",
-            "x.py",
-        ] {
+        for file in ["worlds/a.wbt", "worlds/textures/a b.PNG", "index.html", "../secret.png", "x.py"] {
             fs::write(project.join(file), "").unwrap();
         }
         symlink("../secret.png", project.join("leak.png")).unwrap();

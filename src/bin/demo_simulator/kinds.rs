@@ -15,39 +15,20 @@ pub(crate) struct Kind {
 }
 
 const fn leaf(name: &'static str, attributes: &'static [(&'static str, &'static str)]) -> Kind {
-    Kind {
-        name,
-        attributes,
-        children: &[],
-        placed: false,
-    }
+    Kind { name, attributes, children: &[], placed: false }
 }
 
 const fn parent(name: &'static str, children: &'static [&'static str]) -> Kind {
-    Kind {
-        name,
-        attributes: &[],
-        children,
-        placed: false,
-    }
+    Kind { name, attributes: &[], children, placed: false }
 }
 
 const fn placed(name: &'static str) -> Kind {
-    Kind {
-        name,
-        attributes: PLACE,
-        children: CHILDREN,
-        placed: true,
-    }
+    Kind { name, attributes: PLACE, children: CHILDREN, placed: true }
 }
 
 const CHILDREN: &[&str] = &["children"];
-const PLACE: &[(&str, &str)] = &[
-    ("name", "name"),
-    ("translation", "translation"),
-    ("rotation", "rotation"),
-    ("scale", "scale"),
-];
+const PLACE: &[(&str, &str)] =
+    &[("name", "name"), ("translation", "translation"), ("rotation", "rotation"), ("scale", "scale")];
 
 const KINDS: &[Kind] = &[
     leaf(
@@ -71,10 +52,7 @@ const KINDS: &[Kind] = &[
             ("followSmoothness", "followSmoothness"),
         ],
     ),
-    leaf(
-        "Background",
-        &[("skyColor", "skyColor"), ("luminosity", "luminosity")],
-    ),
+    leaf("Background", &[("skyColor", "skyColor"), ("luminosity", "luminosity")]),
     leaf(
         "DirectionalLight",
         &[
@@ -134,34 +112,15 @@ const KINDS: &[Kind] = &[
         ],
     ),
     leaf("Box", &[("size", "size")]),
-    leaf(
-        "Sphere",
-        &[
-            ("radius", "radius"),
-            ("subdivision", "subdivision"),
-            ("ico", "ico"),
-        ],
-    ),
+    leaf("Sphere", &[("radius", "radius"), ("subdivision", "subdivision"), ("ico", "ico")]),
     leaf("Cylinder", ROUND),
-    leaf(
-        "Cone",
-        &[
-            ("bottomRadius", "bottomRadius"),
-            ("height", "height"),
-            ("subdivision", "subdivision"),
-        ],
-    ),
+    leaf("Cone", &[("bottomRadius", "bottomRadius"), ("height", "height"), ("subdivision", "subdivision")]),
     leaf("Capsule", ROUND),
     leaf("Plane", &[("size", "size")]),
 ];
 
-const ROUND: &[(&str, &str)] = &[
-    ("radius", "radius"),
-    ("height", "height"),
-    ("subdivision", "subdivision"),
-    ("top", "top"),
-    ("bottom", "bottom"),
-];
+const ROUND: &[(&str, &str)] =
+    &[("radius", "radius"), ("height", "height"), ("subdivision", "subdivision"), ("top", "top"), ("bottom", "bottom")];
 
 /// The kind whose nodes drive around.
 pub(crate) const ROBOT: &str = "Robot";

@@ -29,10 +29,7 @@ pub(crate) struct Lexer<'a> {
 impl<'a> Lexer<'a> {
     /// Starts at the beginning of `source`.
     pub(crate) fn new(source: &'a str) -> Self {
-        Self {
-            source,
-            rest: source,
-        }
+        Self { source, rest: source }
     }
 
     /// The number of the line that has been reached, from 1.
@@ -120,34 +117,16 @@ mod tests {
             ("# only a comment", vec![]),
             (
                 "Box{size 1 2,3}",
-                vec![
-                    Word("Box"),
-                    OpenBrace,
-                    Word("size"),
-                    Word("1"),
-                    Word("2"),
-                    Word("3"),
-                    CloseBrace,
-                ],
+                vec![Word("Box"), OpenBrace, Word("size"), Word("1"), Word("2"), Word("3"), CloseBrace],
             ),
-            (
-                "[a]#x {\nb",
-                vec![OpenBracket, Word("a"), CloseBracket, Word("b")],
-            ),
-            (
-                r#"name"a } # \" b""#,
-                vec![Word("name"), Text(r#"a } # \" b"#)],
-            ),
+            ("[a]#x {\nb", vec![OpenBracket, Word("a"), CloseBracket, Word("b")]),
+            (r#"name"a } # \" b""#, vec![Word("name"), Text(r#"a } # \" b"#)]),
             (r#""\\"x"#, vec![Text(r"\\"), Word("x")]),
             ("\"never", vec![Token::Unterminated]),
             ("\"never\\", vec![Token::Unterminated]),
             ("é{\"ü\"", vec![Word("é"), OpenBrace, Text("ü")]),
         ] {
-            assert_eq!(
-                Lexer::new(source).collect::<Vec<_>>(),
-                expected,
-                "{source:?}"
-            );
+            assert_eq!(Lexer::new(source).collect::<Vec<_>>(), expected, "{source:?}");
         }
     }
 

@@ -78,7 +78,5 @@ fn main() {
 fn system_info() -> String {
     let cores = thread::available_parallelism().map_or(1, std::num::NonZero::get);
     let (system, processor) = (env::consts::OS, env::consts::ARCH);
-    format!(
-        "System: {system}\nProcessor: {processor}\nNumber of cores: {cores}\nOpenGL: none (demo simulator)"
-    )
+    format!("System: {system}\nProcessor: {processor}\nNumber of cores: {cores}\nOpenGL: none (demo simulator)")
 }

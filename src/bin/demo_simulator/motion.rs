@@ -26,10 +26,7 @@ pub(crate) struct PoseText {
 
 impl Default for Pose {
     fn default() -> Self {
-        Self {
-            translation: [0.0; 3],
-            rotation: [0.0, 0.0, 1.0, 0.0],
-        }
+        Self { translation: [0.0; 3], rotation: [0.0, 0.0, 1.0, 0.0] }
     }
 }
 
@@ -43,10 +40,7 @@ impl Pose {
 
     /// The numbers as text, rounded to 0.0001.
     pub(crate) fn to_text(self) -> PoseText {
-        PoseText {
-            translation: join_rounded(&self.translation),
-            rotation: join_rounded(&self.rotation),
-        }
+        PoseText { translation: join_rounded(&self.translation), rotation: join_rounded(&self.rotation) }
     }
 }
 
@@ -97,12 +91,7 @@ fn quaternion([x, y, z, angle]: [f64; 4]) -> [f64; 4] {
 /// The rotation that first does `quaternion`, then turns by `angle` about the vertical axis.
 fn turn_about_z([w, x, y, z]: [f64; 4], angle: f64) -> [f64; 4] {
     let (sin, cos) = (angle / 2.0).sin_cos();
-    let turned = [
-        cos * w - sin * z,
-        cos * x - sin * y,
-        cos * y + sin * x,
-        cos * z + sin * w,
-    ];
+    let turned = [cos * w - sin * z, cos * x - sin * y, cos * y + sin * x, cos * z + sin * w];
     // of the two ways to write a rotation, the one with the smaller angle
     let side = if turned[0] < 0.0 { -1.0 } else { 1.0 };
     let [w, x, y, z] = turned.map(|part| part * side);
@@ -115,10 +104,7 @@ fn turn_about_z([w, x, y, z]: [f64; 4], angle: f64) -> [f64; 4] {
 
 fn join_rounded(numbers: &[f64]) -> String {
     // the zero added turns -0 into 0
-    let texts: Vec<String> = numbers
-        .iter()
-        .map(|number| ((number * 1e4).round() / 1e4 + 0.0).to_string())
-        .collect();
+    let texts: Vec<String> = numbers.iter().map(|number| ((number * 1e4).round() / 1e4 + 0.0).to_string()).collect();
     texts.join(" ")
 }
 
@@ -132,10 +118,7 @@ mod tests {
 
     #[test]
     fn a_robot_starts_exactly_where_the_world_puts_it() {
-        let start = Pose {
-            translation: [1.0, 2.0, 3.0],
-            rotation: [0.2, 0.9, 0.1, 2.0],
-        };
+        let start = Pose { translation: [1.0, 2.0, 3.0], rotation: [0.2, 0.9, 0.1, 2.0] };
         assert_eq!(Path::new(start, 0).pose_at(0.0), start);
     }
 
@@ -147,13 +130,7 @@ mod tests {
             ([0.0, 0.0, -1.0, 1.0], [1_f64.cos(), -1_f64.sin()]),
             ([0.0, 0.0, 0.0, 1.0], [1.0, 0.0]),
         ] {
-            let path = Path::new(
-                Pose {
-                    rotation,
-                    ..Pose::default()
-                },
-                0,
-            );
+            let path = Path::new(Pose { rotation, ..Pose::default() }, 0);
             let [x, y, z] = path.pose_at(1.0).translation;
             let moved = SPEED / 1000.0;
             assert!(
@@ -167,13 +144,7 @@ mod tests {
     #[test]
     fn after_a_round_a_robot_is_back() {
         for (index, radius) in RADII.into_iter().enumerate() {
-            let path = Path::new(
-                Pose {
-                    translation: [0.5, -1.0, 0.1],
-                    rotation: [0.0, 0.0, 1.0, 0.7],
-                },
-                index,
-            );
+            let path = Path::new(Pose { translation: [0.5, -1.0, 0.1], rotation: [0.0, 0.0, 1.0, 0.7] }, index);
             let round = std::f64::consts::TAU * radius.abs() / SPEED * 1000.0;
             let pose = path.pose_at(round);
             assert!(!pose.differs(&path.pose_at(0.0)), "{pose:?}");
@@ -191,27 +162,15 @@ mod tests {
 
     #[test]
     fn numbers_are_rounded_and_zero_has_no_sign() {
-        let pose = Pose {
-            translation: [1.0, -0.000_01, 0.123_456],
-            rotation: [0.0, 0.0, 1.0, 3.0],
-        };
+        let pose = Pose { translation: [1.0, -0.000_01, 0.123_456], rotation: [0.0, 0.0, 1.0, 3.0] };
         let text = pose.to_text();
-        assert_eq!(
-            (text.translation.as_str(), text.rotation.as_str()),
-            ("1 0 0.1235", "0 0 1 3")
-        );
+        assert_eq!((text.translation.as_str(), text.rotation.as_str()), ("1 0 0.1235", "0 0 1 3"));
     }
 
     #[test]
     fn poses_differ_from_a_thousandth_on() {
         let pose = Pose::default();
-        assert!(!pose.differs(&Pose {
-            translation: [0.0009, 0.0, 0.0],
-            ..pose
-        }));
-        assert!(pose.differs(&Pose {
-            rotation: [0.0, 0.0, 1.0, -0.0011],
-            ..pose
-        }));
+        assert!(!pose.differs(&Pose { translation: [0.0009, 0.0, 0.0], ..pose }));
+        assert!(pose.differs(&Pose { rotation: [0.0, 0.0, 1.0, -0.0011], ..pose }));
     }
 }

@@ -29,11 +29,7 @@ pub(crate) enum Value {
 impl Node {
     /// A node without any fields.
     pub(crate) fn new(kind: &'static Kind) -> Self {
-        Self {
-            kind,
-            fields: Vec::new(),
-            height: 1,
-        }
+        Self { kind, fields: Vec::new(), height: 1 }
     }
 
     /// How many nodes lie within each other here, itself included.
@@ -54,10 +50,7 @@ impl Node {
 
     /// The value of the field called `name`, if it is given.
     pub(crate) fn field(&self, name: &str) -> Option<&Value> {
-        self.fields
-            .iter()
-            .find(|(field, _)| field == name)
-            .map(|(_, value)| value)
+        self.fields.iter().find(|(field, _)| field == name).map(|(_, value)| value)
     }
 
     /// The nodes in the field called `name`; none if it holds something else.

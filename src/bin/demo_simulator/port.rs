@@ -40,9 +40,7 @@ pub(crate) fn listen(first: u16, console: Console) -> Result<TcpListener, BindEr
         match TcpListener::bind(SocketAddr::new(address, port)) {
             Ok(listener) => {
                 if port != first {
-                    console.warning(format_args!(
-                        "Could not listen to port {first}. Using port {port} instead."
-                    ));
+                    console.warning(format_args!("Could not listen to port {first}. Using port {port} instead."));
                 }
                 console.info(format_args!("Streaming server listening on port {port}."));
                 return Ok(listener);
@@ -50,11 +48,7 @@ pub(crate) fn listen(first: u16, console: Console) -> Result<TcpListener, BindEr
             Err(error) => source = error,
         }
     }
-    Err(BindError::NoPort {
-        first,
-        last,
-        source,
-    })
+    Err(BindError::NoPort { first, last, source })
 }
 
 fn bind_address() -> Result<IpAddr, BindError> {

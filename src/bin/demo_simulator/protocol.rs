@@ -51,9 +51,9 @@ impl Command {
             "step" => Self::Step,
             "reset" => Self::Reset,
             "reload" | "revert" => Self::Reload,
-            _ if text.starts_with("x3d") || text.starts_with("w3d") => Self::Watch {
-                broadcast: text.ends_with(";broadcast"),
-            },
+            _ if text.starts_with("x3d") || text.starts_with("w3d") => {
+                Self::Watch { broadcast: text.ends_with(";broadcast") }
+            }
             _ => match text.split_once(':')? {
                 ("real-time", timeout) => Self::RealTime(parse_timeout(timeout)?),
                 ("fast", timeout) => Self::Fast(parse_timeout(timeout)?),
@@ -72,11 +72,7 @@ impl Command {
 fn parse_timeout(text: &str) -> Option<f64> {
     let timeout: f64 = text.trim().parse().ok()?;
     let is_number = timeout.is_finite();
-    is_number.then_some(if timeout < 0.0 {
-        f64::INFINITY
-    } else {
-        timeout
-    })
+    is_number.then_some(if timeout < 0.0 { f64::INFINITY } else { timeout })
 }
 
 /// Answers `pause` and `step`.
@@ -145,10 +141,7 @@ mod tests {
             ("reload", Some(Command::Reload)),
             ("revert", Some(Command::Reload)),
             ("load:b.wbt", Some(Command::Load("b.wbt".to_owned()))),
-            (
-                "robot:{\"name\":\"a\",\"message\":\"b\"}",
-                Some(Command::Robot),
-            ),
+            ("robot:{\"name\":\"a\",\"message\":\"b\"}", Some(Command::Robot)),
             ("run", None),
             ("", None),
         ] {
@@ -159,14 +152,8 @@ mod tests {
     #[test]
     fn what_the_simulator_says_is_byte_for_byte_what_viewers_expect() {
         let [a, b] = ["worlds/a.wbt", "worlds/b.wbt"].map(str::to_owned);
-        let names = Names {
-            current: a.clone(),
-            all: vec![a, b],
-        };
-        assert_eq!(
-            world(&names),
-            "world:worlds/a.wbt:worlds/a.wbt;worlds/b.wbt"
-        );
+        let names = Names { current: a.clone(), all: vec![a, b] };
+        assert_eq!(world(&names), "world:worlds/a.wbt:worlds/a.wbt;worlds/b.wbt");
         assert_eq!(paused(1024.0), "pause: 1024");
         assert_eq!(loading("Parsing world", 100), "loading:Parsing world:100");
         assert_eq!(update("{}"), "application/json:{}");

@@ -35,10 +35,7 @@ pub(crate) fn run(options: &Options) -> ! {
 }
 
 async fn simulate(options: &Options) -> Result<i32, Box<dyn std::error::Error>> {
-    let console = Console {
-        stdout: options.stdout,
-        stderr: options.stderr,
-    };
+    let console = Console { stdout: options.stdout, stderr: options.stderr };
     let told_to_end = signals()?;
     let listener = port::listen(options.port, console)?;
     warn_of(options, console);
@@ -105,18 +102,11 @@ async fn beat(period: Duration) {
     }
 }
 
-fn serve(
-    listener: TcpListener,
-    simulation: Recipient<Event>,
-    project: ProjectFolder,
-) -> std::io::Result<Server> {
+fn serve(listener: TcpListener, simulation: Recipient<Event>, project: ProjectFolder) -> std::io::Result<Server> {
     let simulation = web::Data::new(simulation);
     let project = web::Data::new(project);
     let server = HttpServer::new(move || {
-        App::new()
-            .app_data(simulation.clone())
-            .app_data(project.clone())
-            .configure(files::configure)
+        App::new().app_data(simulation.clone()).app_data(project.clone()).configure(files::configure)
     });
     Ok(server
         .on_connect(files::remember_connection)

@@ -69,19 +69,10 @@ struct Update {
 impl Scene {
     /// The scene made of the nodes at the top level of a world.
     pub(crate) fn new(nodes: &[Rc<Node>]) -> Result<Self, SceneError> {
-        let mut author = Author {
-            writer: Writer::new(Vec::new()),
-            last_id: 0,
-            placed: Vec::new(),
-            movers: Vec::new(),
-        };
+        let mut author = Author { writer: Writer::new(Vec::new()), last_id: 0, placed: Vec::new(), movers: Vec::new() };
         author.document(nodes)?;
         let model = String::from_utf8(author.writer.into_inner()).map_err(io::Error::other)?;
-        Ok(Self {
-            model,
-            placed: author.placed,
-            movers: author.movers,
-        })
+        Ok(Self { model, placed: author.placed, movers: author.movers })
     }
 
     /// The update that names every node that moves, as JSON.
@@ -108,18 +99,12 @@ impl Scene {
 }
 
 fn update(id: u32, pose: Pose) -> Update {
-    Update {
-        id,
-        pose: pose.to_text(),
-    }
+    Update { id, pose: pose.to_text() }
 }
 
 fn frame(time: f64, updates: Vec<Update>) -> String {
     // by way of text, so that a whole number of milliseconds has no decimal point, as in Webots
-    let time = time
-        .to_string()
-        .parse()
-        .unwrap_or_else(|_| serde_json::Number::from(0));
+    let time = time.to_string().parse().unwrap_or_else(|_| serde_json::Number::from(0));
     serde_json::to_string(&Frame { time, updates }).unwrap_or_default()
 }
 
@@ -132,13 +117,11 @@ struct Author {
 
 impl Author {
     fn document(&mut self, nodes: &[Rc<Node>]) -> Result<(), SceneError> {
-        self.writer
-            .write_event(Event::Decl(BytesDecl::new("1.0", Some("UTF-8"), None)))?;
+        self.writer.write_event(Event::Decl(BytesDecl::new("1.0", Some("UTF-8"), None)))?;
         self.start(BytesStart::new("X3D"))?;
         self.start(BytesStart::new("head"))?;
         for (name, content) in [("generator", "Webots"), ("version", "R2025a")] {
-            let tag =
-                BytesStart::new("meta").with_attributes([("name", name), ("content", content)]);
+            let tag = BytesStart::new("meta").with_attributes([("name", name), ("content", content)]);
             self.writer.write_event(Event::Empty(tag))?;
         }
         self.end("head")?;
@@ -165,19 +148,10 @@ impl Author {
         }
         if node.kind.name == kinds::ROBOT {
             let start = start_pose(node);
-            self.movers.push(Mover {
-                id,
-                path: Path::new(start, self.movers.len()),
-                shown: start,
-            });
+            self.movers.push(Mover { id, path: Path::new(start, self.movers.len()), shown: start });
         }
         let tag = tag(node, id);
-        let mut children = node
-            .kind
-            .children
-            .iter()
-            .flat_map(|field| node.nodes(field))
-            .peekable();
+        let mut children = node.kind.children.iter().flat_map(|field| node.nodes(field)).peekable();
         if children.peek().is_none() {
             return Ok(self.writer.write_event(Event::Empty(tag))?);
         }
@@ -210,18 +184,8 @@ fn tag(node: &Node, id: u32) -> BytesStart<'static> {
 
 fn attribute_text(value: &Value) -> Option<String> {
     match value {
-        Value::Numbers(numbers) => Some(
-            numbers
-                .iter()
-                .map(f64::to_string)
-                .collect::<Vec<_>>()
-                .join(" "),
-        ),
-        Value::Text(text) => Some(
-            text.chars()
-                .filter(|character| is_in_xml(*character))
-                .collect(),
-        ),
+        Value::Numbers(numbers) => Some(numbers.iter().map(f64::to_string).collect::<Vec<_>>().join(" ")),
+        Value::Text(text) => Some(text.chars().filter(|character| is_in_xml(*character)).collect()),
         Value::Flag(flag) => Some(flag.to_string()),
         Value::Nodes(_) => None,
     }
@@ -259,23 +223,15 @@ mod tests {
         );
         assert_eq!(scene.changes(0.0), r#"{"time":0}"#, "nothing changed yet");
         let update = scene.changes(32.0);
-        assert!(
-            update.starts_with(r#"{"time":32,"updates":[{"id":2,"#),
-            "{update}"
-        );
+        assert!(update.starts_with(r#"{"time":32,"updates":[{"id":2,"#), "{update}");
         assert_eq!(scene.changes(32.0), r#"{"time":32}"#);
-        assert_eq!(
-            scene.everything(32.0),
-            update,
-            "the same time gives the same poses"
-        );
+        assert_eq!(scene.everything(32.0), update, "the same time gives the same poses");
     }
 
     #[test]
     fn a_world_that_multiplies_by_use_is_refused() {
-        let doubling: Vec<String> = (1..60)
-            .map(|i| format!("DEF N{i} Group{{children[USE N{0} USE N{0}]}}\n", i - 1))
-            .collect();
+        let doubling: Vec<String> =
+            (1..60).map(|i| format!("DEF N{i} Group{{children[USE N{0} USE N{0}]}}\n", i - 1)).collect();
         let doubling = doubling.concat();
         let nodes = parse(&format!("DEF N0 Box{{}}\n{doubling}")).unwrap();
         assert!(matches!(Scene::new(&nodes), Err(SceneError::TooManyNodes)));

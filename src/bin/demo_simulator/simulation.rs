@@ -4,10 +4,7 @@
 
 use std::time::{Duration, Instant};
 
-use actix::{
-    Actor, ActorFutureExt as _, AsyncContext as _, Context, Handler, Message, SpawnHandle,
-    WrapFuture as _,
-};
+use actix::{Actor, ActorFutureExt as _, AsyncContext as _, Context, Handler, Message, SpawnHandle, WrapFuture as _};
 use tokio::sync::oneshot;
 use tokio::task::spawn_blocking;
 

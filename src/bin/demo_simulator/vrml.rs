@@ -47,11 +47,7 @@ pub(crate) enum SyntaxError {
 
 /// Parses the nodes at the top level of a world file, whose header has been read before.
 pub(crate) fn parse(source: &str) -> Result<Vec<Rc<Node>>, SyntaxError> {
-    let mut parser = Parser {
-        lexer: Lexer::new(source),
-        named: HashMap::new(),
-        nodes: 0,
-    };
+    let mut parser = Parser { lexer: Lexer::new(source), named: HashMap::new(), nodes: 0 };
     let mut top = Vec::new();
     while let Some(token) = parser.lexer.next() {
         match token {
@@ -80,9 +76,7 @@ impl<'a> Parser<'a> {
                 let name = self.word("a name after USE")?;
                 let node = self.named.get(name).cloned();
                 match node {
-                    Some(node) if node.height() > room => Err(SyntaxError::TooDeep {
-                        line: self.lexer.line(),
-                    }),
+                    Some(node) if node.height() > room => Err(SyntaxError::TooDeep { line: self.lexer.line() }),
                     node => Ok(node),
                 }
             }
@@ -107,14 +101,10 @@ impl<'a> Parser<'a> {
         };
         self.nodes += 1;
         if self.nodes > MOST_NODES {
-            return Err(SyntaxError::TooMany {
-                line: self.lexer.line(),
-            });
+            return Err(SyntaxError::TooMany { line: self.lexer.line() });
         }
         let Some(room) = room.checked_sub(1) else {
-            return Err(SyntaxError::TooDeep {
-                line: self.lexer.line(),
-            });
+            return Err(SyntaxError::TooDeep { line: self.lexer.line() });
         };
         let mut node = Node::new(kind);
         loop {
@@ -255,21 +245,14 @@ impl<'a> Parser<'a> {
             Some(Token::Unterminated) => "a string without an end".to_owned(),
             None => "the end of the file".to_owned(),
         };
-        SyntaxError::Unexpected {
-            line: self.lexer.line(),
-            expected,
-            found,
-        }
+        SyntaxError::Unexpected { line: self.lexer.line(), expected, found }
     }
 }
 
 fn number(word: &str) -> Option<f64> {
     // Rust would also read `inf` and `NaN`, which are names here
-    let is_number =
-        word.starts_with(|first: char| first.is_ascii_digit() || matches!(first, '-' | '+' | '.'));
-    word.parse()
-        .ok()
-        .filter(|number: &f64| is_number && number.is_finite())
+    let is_number = word.starts_with(|first: char| first.is_ascii_digit() || matches!(first, '-' | '+' | '.'));
+    word.parse().ok().filter(|number: &f64| is_number && number.is_finite())
 }
 
 fn unescape(text: &str) -> String {
@@ -292,12 +275,7 @@ mod tests {
 
     fn outline(nodes: &[Rc<Node>]) -> String {
         let one = |node: &Rc<Node>| {
-            let inner: String = node
-                .kind
-                .children
-                .iter()
-                .map(|field| outline(node.nodes(field)))
-                .collect();
+            let inner: String = node.kind.children.iter().map(|field| outline(node.nodes(field))).collect();
             format!("{}({inner})", node.kind.name)
         };
         nodes.iter().map(one).collect()
@@ -308,31 +286,16 @@ mod tests {
         for (source, expected) in [
             ("", ""),
             ("WorldInfo { } Viewpoint {}", "WorldInfo()Viewpoint()"),
-            (
-                "EXTERNPROTO \"a.proto\" IMPORTABLE EXTERNPROTO \"b.proto\" Group {}",
-                "Group()",
-            ),
-            (
-                "Floor { size 1 2 appearance Parquetry { type \"}\" # }\n } } Group {}",
-                "Group()",
-            ),
+            ("EXTERNPROTO \"a.proto\" IMPORTABLE EXTERNPROTO \"b.proto\" Group {}", "Group()"),
+            ("Floor { size 1 2 appearance Parquetry { type \"}\" # }\n } } Group {}", "Group()"),
             (
                 "Solid { children [ Shape { geometry Box { size 1 2 3 } } Odd { a [ { ] } } Pose {} ] }",
                 "Solid(Shape(Box())Pose())",
             ),
-            (
-                "Solid { boundingObject Box { } physics DEF P Physics { } children Pose { } }",
-                "Solid(Pose())",
-            ),
-            (
-                "DEF A Group { children DEF B Pose { } } USE B USE A",
-                "Group(Pose())Pose()Group(Pose())",
-            ),
+            ("Solid { boundingObject Box { } physics DEF P Physics { } children Pose { } }", "Solid(Pose())"),
+            ("DEF A Group { children DEF B Pose { } } USE B USE A", "Group(Pose())Pose()Group(Pose())"),
             ("USE NOBODY Group { children USE NOBODY }", "Group()"),
-            (
-                "Robot { hidden position_0_0 1.5 children [] name \"a\" supervisor TRUE window NULL }",
-                "Robot()",
-            ),
+            ("Robot { hidden position_0_0 1.5 children [] name \"a\" supervisor TRUE window NULL }", "Robot()"),
             (
                 "Shape { appearance Appearance { material Material { diffuseColor 1 0 0 } } }",
                 "Shape(Appearance(Material()))",
@@ -344,9 +307,8 @@ mod tests {
 
     #[test]
     fn fields_keep_their_values() {
-        let nodes = parse(
-            r#"Robot { name "a \"b\" \\" translation 1 -2.5 +3e-1 rotation [0, 0 1 .5] } WorldInfo { FPS 30 }"#,
-        );
+        let nodes =
+            parse(r#"Robot { name "a \"b\" \\" translation 1 -2.5 +3e-1 rotation [0, 0 1 .5] } WorldInfo { FPS 30 }"#);
         let nodes = nodes.unwrap();
         assert!(matches!(nodes[0].field("name"), Some(Value::Text(name)) if name == r#"a "b" \"#));
         assert_eq!(nodes[0].numbers("translation"), Some([1.0, -2.5, 0.3]));
@@ -359,30 +321,15 @@ mod tests {
     fn broken_worlds_are_refused_with_the_line() {
         for (source, message) in [
             ("}", "line 1: expected a node, found }"),
-            (
-                "Solid {\n\n",
-                "line 3: expected a field or }, found the end of the file",
-            ),
+            ("Solid {\n\n", "line 3: expected a field or }, found the end of the file"),
             ("Solid {\nname }", "line 2: expected a value, found }"),
-            (
-                "Solid {\nname \"x }",
-                "line 2: expected a value, found a string without an end",
-            ),
+            ("Solid {\nname \"x }", "line 2: expected a value, found a string without an end"),
             ("Solid\nSolid", "line 2: expected {, found \"Solid\""),
-            (
-                "Odd { { }",
-                "line 1: expected } or ], found the end of the file",
-            ),
-            (
-                "Solid { children [ [ ] ] }",
-                "line 1: expected an item or ], found [",
-            ),
+            ("Odd { { }", "line 1: expected } or ], found the end of the file"),
+            ("Solid { children [ [ ] ] }", "line 1: expected an item or ], found ["),
             ("Box { size inf 0 0 }", "line 1: expected {, found \"0\""),
             ("Box { size 1e999 0 0 }", "line 1: expected {, found \"0\""),
-            (
-                "DEF",
-                "line 1: expected a name after DEF, found the end of the file",
-            ),
+            ("DEF", "line 1: expected a name after DEF, found the end of the file"),
             ("EXTERNPROTO x", "line 1: expected a string, found \"x\""),
         ] {
             assert_eq!(parse(source).unwrap_err().to_string(), message, "{source}");
@@ -391,31 +338,15 @@ mod tests {
 
     #[test]
     fn nesting_is_limited_by_braces_and_by_use() {
-        let nested = |depth| {
-            format!(
-                "{}{}",
-                "Group{children ".repeat(depth) + "Box{}",
-                "}".repeat(depth)
-            )
-        };
+        let nested = |depth| format!("{}{}", "Group{children ".repeat(depth) + "Box{}", "}".repeat(depth));
         assert!(parse(&nested(DEEPEST - 1)).is_ok());
-        assert_eq!(
-            parse(&nested(DEEPEST)).unwrap_err(),
-            SyntaxError::TooDeep { line: 1 }
-        );
-        assert_eq!(
-            parse(&nested(1_000_000)).unwrap_err(),
-            SyntaxError::TooDeep { line: 1 }
-        );
+        assert_eq!(parse(&nested(DEEPEST)).unwrap_err(), SyntaxError::TooDeep { line: 1 });
+        assert_eq!(parse(&nested(1_000_000)).unwrap_err(), SyntaxError::TooDeep { line: 1 });
 
-        let chain: Vec<String> = (1..DEEPEST + 9)
-            .map(|i| format!("DEF N{i} Group{{children USE N{}}}\n", i - 1))
-            .collect();
+        let chain: Vec<String> =
+            (1..DEEPEST + 9).map(|i| format!("DEF N{i} Group{{children USE N{}}}\n", i - 1)).collect();
         let chain = chain.concat();
-        assert_eq!(
-            parse(&format!("DEF N0 Box{{}}\n{chain}")).unwrap_err(),
-            SyntaxError::TooDeep { line: DEEPEST + 1 }
-        );
+        assert_eq!(parse(&format!("DEF N0 Box{{}}\n{chain}")).unwrap_err(), SyntaxError::TooDeep { line: DEEPEST + 1 });
     }
 
     #[test]
@@ -426,10 +357,7 @@ mod tests {
 
     #[test]
     fn the_number_of_nodes_is_limited() {
-        assert_eq!(
-            parse(&"Box{}".repeat(MOST_NODES + 1)).unwrap_err(),
-            SyntaxError::TooMany { line: 1 }
-        );
+        assert_eq!(parse(&"Box{}".repeat(MOST_NODES + 1)).unwrap_err(), SyntaxError::TooMany { line: 1 });
     }
 
     proptest! {

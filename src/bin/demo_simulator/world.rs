@@ -14,8 +14,7 @@ use crate::scene::{Scene, SceneError};
 use crate::vrml::{self, SyntaxError};
 
 /// What is shown when a world file makes no sense, so that viewers see something.
-const EMPTY_WORLD: &str =
-    "#VRML_SIM R2025a utf8\nWorldInfo { } Viewpoint { orientation 0 1 0 0.8 position -10 0 10 }";
+const EMPTY_WORLD: &str = "#VRML_SIM R2025a utf8\nWorldInfo { } Viewpoint { orientation 0 1 0 0.8 position -10 0 10 }";
 /// Size of a world file, in bytes.
 const LARGEST_FILE: u64 = 8 * 1024 * 1024;
 const DEFAULT_TIME_STEP: f64 = 32.0;
@@ -92,10 +91,7 @@ impl WorldFile {
             Some(project) if folder.ends_with("worlds") => project,
             _ => folder,
         };
-        Self {
-            project: project.to_owned(),
-            path,
-        }
+        Self { project: project.to_owned(), path }
     }
 
     /// Where the file is.
@@ -111,58 +107,35 @@ impl WorldFile {
     /// The world beside this one whose file is called as the last part of `name`, if there is one.
     pub(crate) fn sibling(&self, name: &str) -> Option<Self> {
         let path = self.path.with_file_name(Path::new(name).file_name()?);
-        (is_world(&path) && path.exists()).then(|| Self {
-            path,
-            project: self.project.clone(),
-        })
+        (is_world(&path) && path.exists()).then(|| Self { path, project: self.project.clone() })
     }
 
     /// Reads the file; blocks.
     pub(crate) fn load(&self) -> Loaded {
-        Loaded {
-            names: self.names(),
-            world: self.read().and_then(|source| World::parse(&source)),
-        }
+        Loaded { names: self.names(), world: self.read().and_then(|source| World::parse(&source)) }
     }
 
     fn names(&self) -> Names {
-        let folder = self
-            .path
-            .parent()
-            .and_then(|folder| fs::read_dir(folder).ok());
+        let folder = self.path.parent().and_then(|folder| fs::read_dir(folder).ok());
         let entries = folder.into_iter().flatten().flatten();
-        let paths = entries
-            .map(|entry| entry.path())
-            .filter(|path| is_world(path));
+        let paths = entries.map(|entry| entry.path()).filter(|path| is_world(path));
         let mut all: Vec<String> = paths.map(|path| self.name(&path)).collect();
         all.sort();
-        Names {
-            current: self.name(&self.path),
-            all,
-        }
+        Names { current: self.name(&self.path), all }
     }
 
     fn name(&self, path: &Path) -> String {
-        path.strip_prefix(&self.project)
-            .unwrap_or(path)
-            .display()
-            .to_string()
+        path.strip_prefix(&self.project).unwrap_or(path).display().to_string()
     }
 
     fn read(&self) -> Result<String, WorldError> {
-        let unreadable = |source| WorldError::Unreadable {
-            path: self.path.clone(),
-            source,
-        };
+        let unreadable = |source| WorldError::Unreadable { path: self.path.clone(), source };
         if !is_world(&self.path) {
             return Err(unreadable(io::Error::other("not a .wbt file")));
         }
         let mut bytes = Vec::new();
         let file = File::open(&self.path).map_err(unreadable)?;
-        let length = file
-            .take(LARGEST_FILE + 1)
-            .read_to_end(&mut bytes)
-            .map_err(unreadable)?;
+        let length = file.take(LARGEST_FILE + 1).read_to_end(&mut bytes).map_err(unreadable)?;
         if u64::try_from(length).is_ok_and(|length| length > LARGEST_FILE) {
             return Err(WorldError::TooLarge);
         }
@@ -179,15 +152,9 @@ impl World {
         }
         let mut nodes = vrml::parse(source)?; // to which the header is a comment
         if !nodes.iter().any(|node| node.kind.name == kinds::VIEWPOINT) {
-            nodes.extend(
-                vrml::parse(EMPTY_WORLD)?
-                    .into_iter()
-                    .filter(|node| node.kind.name == kinds::VIEWPOINT),
-            );
+            nodes.extend(vrml::parse(EMPTY_WORLD)?.into_iter().filter(|node| node.kind.name == kinds::VIEWPOINT));
         }
-        let info = nodes
-            .iter()
-            .find(|node| node.kind.name == kinds::WORLD_INFO);
+        let info = nodes.iter().find(|node| node.kind.name == kinds::WORLD_INFO);
         Ok(Self {
             time_step: setting(info, "basicTimeStep", DEFAULT_TIME_STEP).clamp(0.1, 10_000.0),
             fps: setting(info, "FPS", DEFAULT_FPS).clamp(1.0, 240.0),
@@ -202,21 +169,17 @@ impl World {
 }
 
 fn setting(info: Option<&Rc<Node>>, field: &str, default: f64) -> f64 {
-    info.and_then(|info| info.numbers(field))
-        .map_or(default, |[value]: [f64; 1]| value)
+    info.and_then(|info| info.numbers(field)).map_or(default, |[value]: [f64; 1]| value)
 }
 
 fn is_world(path: &Path) -> bool {
-    path.extension()
-        .is_some_and(|extension| extension.eq_ignore_ascii_case("wbt"))
+    path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("wbt"))
 }
 
 fn is_header(line: &str) -> bool {
     let mut words = line.split_whitespace();
     let release = |word: &str| word.starts_with(['R', 'V']) && word.len() > 1;
-    words.next() == Some("#VRML_SIM")
-        && words.next().is_some_and(release)
-        && words.next() == Some("utf8")
+    words.next() == Some("#VRML_SIM") && words.next().is_some_and(release) && words.next() == Some("utf8")
 }
 
 #[cfg(test)]
@@ -266,12 +229,8 @@ mod tests {
             ("basicTimeStep 0 FPS 0", 0.1, 1.0),
             ("basicTimeStep -5 FPS 1e9", 0.1, 240.0),
         ] {
-            let world =
-                World::parse(&format!("#VRML_SIM R2025a utf8\nWorldInfo {{ {fields} }}")).unwrap();
-            assert!(
-                (world.time_step - time_step).abs() < 1e-9 && (world.fps - fps).abs() < 1e-9,
-                "{fields}"
-            );
+            let world = World::parse(&format!("#VRML_SIM R2025a utf8\nWorldInfo {{ {fields} }}")).unwrap();
+            assert!((world.time_step - time_step).abs() < 1e-9 && (world.fps - fps).abs() < 1e-9, "{fields}");
         }
     }
 
@@ -293,15 +252,9 @@ mod tests {
     #[test]
     fn the_project_is_the_folder_that_holds_worlds() {
         let file = WorldFile::new(Path::new("/p/worlds/a.wbt"));
-        assert_eq!(
-            (file.project(), file.names().current.as_str()),
-            (Path::new("/p"), "worlds/a.wbt")
-        );
+        assert_eq!((file.project(), file.names().current.as_str()), (Path::new("/p"), "worlds/a.wbt"));
         let file = WorldFile::new(Path::new("/home/me/a.wbt"));
-        assert_eq!(
-            (file.project(), file.names().current.as_str()),
-            (Path::new("/home/me"), "a.wbt")
-        );
+        assert_eq!((file.project(), file.names().current.as_str()), (Path::new("/home/me"), "a.wbt"));
     }
 
     #[test]

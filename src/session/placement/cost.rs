@@ -42,11 +42,7 @@ const HIGHEST: f64 = 50.0;
 
 /// A believable cost, whatever the number.
 pub(super) fn believable(cost: f64) -> f64 {
-    if cost.is_nan() {
-        HIGHEST
-    } else {
-        cost.clamp(LOWEST, HIGHEST)
-    }
+    if cost.is_nan() { HIGHEST } else { cost.clamp(LOWEST, HIGHEST) }
 }
 
 /// What one server says about its cost: the logarithm, and how sure it is (one over the variance of that logarithm).
@@ -203,13 +199,7 @@ pub(super) struct Common {
 impl Common {
     /// A fleet without servers.
     pub(super) fn new() -> Self {
-        Self {
-            servers: 0.0,
-            precision: 0.0,
-            precision_squared: 0.0,
-            log: 0.0,
-            log_squared: 0.0,
-        }
+        Self { servers: 0.0, precision: 0.0, precision_squared: 0.0, log: 0.0, log_squared: 0.0 }
     }
 
     /// Replaces what a server said before by what it says now.

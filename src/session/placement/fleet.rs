@@ -21,12 +21,7 @@ pub struct Policy {
 
 impl Default for Policy {
     fn default() -> Self {
-        Self {
-            threshold: 95.0,
-            initial_cost: 2.0,
-            patience: Duration::from_secs(15),
-            settling: Duration::from_secs(8),
-        }
+        Self { threshold: 95.0, initial_cost: 2.0, patience: Duration::from_secs(15), settling: Duration::from_secs(8) }
     }
 }
 
@@ -58,12 +53,7 @@ impl<Id: Clone + Ord> Fleet<Id> {
     /// A fleet without servers.
     #[must_use]
     pub fn new(policy: Policy) -> Self {
-        Self {
-            policy,
-            servers: BTreeMap::new(),
-            common: Common::new(),
-            turns: 0,
-        }
+        Self { policy, servers: BTreeMap::new(), common: Common::new(), turns: 0 }
     }
 
     /// Changes the policy for all that follows. What servers have learned by the `initial_cost` until now stays.
@@ -74,9 +64,7 @@ impl<Id: Clone + Ord> Fleet<Id> {
     /// Adds a server, which is down until its first report. One that is there already stays as it is.
     pub fn add(&mut self, id: Id) {
         self.turns += 1;
-        self.servers
-            .entry(id)
-            .or_insert_with(|| Server::new(&self.policy, self.turns));
+        self.servers.entry(id).or_insert_with(|| Server::new(&self.policy, self.turns));
     }
 
     /// Removes a server and all that was known of it.
@@ -107,9 +95,7 @@ impl<Id: Clone + Ord> Fleet<Id> {
         let mut best: Option<(f64, &Id, &mut Server)> = None;
         for (id, server) in &mut self.servers {
             if let Some(load) = server.effective_load_if_room(now, policy)
-                && best
-                    .as_ref()
-                    .is_none_or(|(least, _, first)| (load, server.turn) < (*least, first.turn))
+                && best.as_ref().is_none_or(|(least, _, first)| (load, server.turn) < (*least, first.turn))
                 && eligible(id)
             {
                 best = Some((load, id, server));
@@ -124,18 +110,13 @@ impl<Id: Clone + Ord> Fleet<Id> {
     /// Whether some server can take a client.
     #[must_use]
     pub fn available(&self, now: Instant) -> bool {
-        self.servers
-            .values()
-            .any(|server| server.effective_load_if_room(now, &self.policy).is_some())
+        self.servers.values().any(|server| server.effective_load_if_room(now, &self.policy).is_some())
     }
 
     /// When placements are given up next: the one moment at which availability can change without a call to this fleet.
     #[must_use]
     pub fn next_change(&self, now: Instant) -> Option<Instant> {
-        self.servers
-            .values()
-            .filter_map(|server| server.next_expiry(now, &self.policy))
-            .min()
+        self.servers.values().filter_map(|server| server.next_expiry(now, &self.policy)).min()
     }
 
     /// The load that a server will have once all that was sent to it shows, in percent; `None` if it is down.
@@ -147,9 +128,7 @@ impl<Id: Clone + Ord> Fleet<Id> {
     /// How many clients have been sent to a server and not been seen there yet.
     #[must_use]
     pub fn in_flight(&self, id: &Id, now: Instant) -> usize {
-        self.servers
-            .get(id)
-            .map_or(0, |server| server.in_flight(now, &self.policy))
+        self.servers.get(id).map_or(0, |server| server.in_flight(now, &self.policy))
     }
 
     /// What a client is expected to cost a server, in percent; `None` if the fleet does not have that server.
@@ -178,30 +157,16 @@ mod tests {
     use proptest::prelude::*;
 
     fn policy(initial_cost: f64) -> Policy {
-        Policy {
-            initial_cost,
-            ..Policy::default()
-        }
+        Policy { initial_cost, ..Policy::default() }
     }
 
     fn load_only(load: f64) -> Report {
-        Report {
-            load,
-            instances: None,
-        }
+        Report { load, instances: None }
     }
 
     fn full_report(load: f64, present: u32, arrivals: u64) -> Report {
-        let instances = Instances {
-            present,
-            places: 1000,
-            arrivals,
-            accepting: true,
-        };
-        Report {
-            load,
-            instances: Some(instances),
-        }
+        let instances = Instances { present, places: 1000, arrivals, accepting: true };
+        Report { load, instances: Some(instances) }
     }
 
     fn seconds(seconds: f64) -> Duration {
@@ -216,10 +181,7 @@ mod tests {
     }
 
     fn assert_near(value: Option<f64>, expected: f64, tolerance: f64) {
-        assert!(
-            value.is_some_and(|value| (value - expected).abs() <= tolerance),
-            "{value:?} is not {expected}"
-        );
+        assert!(value.is_some_and(|value| (value - expected).abs() <= tolerance), "{value:?} is not {expected}");
     }
 
     #[test]
@@ -229,27 +191,18 @@ mod tests {
         assert!(!fleet.available(now));
         fleet.add("a");
         assert!(!fleet.available(now));
-        assert_eq!(
-            (fleet.place(now, |_| true), fleet.mean_load()),
-            (None, None)
-        );
+        assert_eq!((fleet.place(now, |_| true), fleet.mean_load()), (None, None));
         fleet.report(&"a", now, load_only(20.0));
         assert!(fleet.available(now));
         assert_eq!(fleet.place(now, |_| true), Some("a"));
         fleet.lose(&"a");
         assert!(!fleet.available(now));
-        assert_eq!(
-            (fleet.effective_load(&"a", now), fleet.mean_load()),
-            (None, None)
-        );
+        assert_eq!((fleet.effective_load(&"a", now), fleet.mean_load()), (None, None));
         fleet.report(&"a", now, load_only(20.0));
         assert!(fleet.available(now));
         assert_eq!(fleet.mean_load(), Some(20.0));
         fleet.remove(&"a");
-        assert_eq!(
-            (fleet.available(now), fleet.learned_cost(&"a")),
-            (false, None)
-        );
+        assert_eq!((fleet.available(now), fleet.learned_cost(&"a")), (false, None));
         fleet.report(&"unknown", now, load_only(20.0));
         assert!(!fleet.available(now));
     }
@@ -268,26 +221,14 @@ mod tests {
 
     #[test]
     fn a_report_decides_whether_a_server_takes_clients() {
-        let instances = |present, places, accepting| {
-            Some(Instances {
-                present,
-                places,
-                arrivals: 7,
-                accepting,
-            })
-        };
+        let instances = |present, places, accepting| Some(Instances { present, places, arrivals: 7, accepting });
         for (why, load, instances, available) in [
             ("idle", 0.0, instances(0, 10, true), true),
             ("under the threshold", 94.9, instances(5, 10, true), true),
             ("at the threshold", 95.0, instances(5, 10, true), false),
             ("drained", 0.0, instances(0, 10, false), false),
             ("no place left", 10.0, instances(10, 10, true), false),
-            (
-                "more clients than places",
-                10.0,
-                instances(12, 10, true),
-                false,
-            ),
+            ("more clients than places", 10.0, instances(12, 10, true), false),
             ("no places at all", 0.0, instances(0, 0, true), false),
             ("not a number", f64::NAN, instances(0, 10, true), false),
             ("infinite", f64::INFINITY, None, false),
@@ -305,21 +246,12 @@ mod tests {
     fn placements_in_flight_use_up_places_and_load() {
         let now = Instant::now();
         let mut report = full_report(0.0, 8, 8);
-        report.instances = report.instances.map(|instances| Instances {
-            places: 10,
-            ..instances
-        });
+        report.instances = report.instances.map(|instances| Instances { places: 10, ..instances });
         let mut fleet = fleet_of_one(now, report);
-        assert_eq!(
-            [(); 3].map(|()| fleet.place(now, |_| true)),
-            [Some(0), Some(0), None]
-        );
+        assert_eq!([(); 3].map(|()| fleet.place(now, |_| true)), [Some(0), Some(0), None]);
 
         let mut fleet = fleet_of_one(now, load_only(90.0));
-        assert_eq!(
-            [(); 4].map(|()| fleet.place(now, |_| true)),
-            [Some(0), Some(0), Some(0), None]
-        );
+        assert_eq!([(); 4].map(|()| fleet.place(now, |_| true)), [Some(0), Some(0), Some(0), None]);
         assert_eq!(fleet.effective_load(&0, now), Some(96.0));
     }
 
@@ -343,15 +275,9 @@ mod tests {
         fleet.place(now + seconds(1.0), |_| true);
         assert_eq!(fleet.in_flight(&0, now + seconds(14.9)), 2);
         assert!(!fleet.available(now + seconds(1.0)));
-        assert_eq!(
-            fleet.next_change(now + seconds(1.0)),
-            Some(now + seconds(15.0))
-        );
+        assert_eq!(fleet.next_change(now + seconds(1.0)), Some(now + seconds(15.0)));
         assert_eq!(fleet.in_flight(&0, now + seconds(15.0)), 1);
-        assert_eq!(
-            fleet.next_change(now + seconds(15.0)),
-            Some(now + seconds(16.0))
-        );
+        assert_eq!(fleet.next_change(now + seconds(15.0)), Some(now + seconds(16.0)));
         assert_eq!(fleet.in_flight(&0, now + seconds(16.0)), 0);
         assert!(fleet.available(now + seconds(16.0)));
         assert_eq!(fleet.next_change(now + seconds(16.0)), None);
@@ -364,11 +290,7 @@ mod tests {
         fleet.place(now, |_| true);
         for second in 1..=20_u32 {
             fleet.place(now + seconds(f64::from(second) - 0.5), |_| true);
-            fleet.report(
-                &0,
-                now + seconds(f64::from(second)),
-                full_report(10.0, second, second.into()),
-            );
+            fleet.report(&0, now + seconds(f64::from(second)), full_report(10.0, second, second.into()));
         }
         assert_eq!(fleet.in_flight(&0, now + seconds(20.0)), 0);
     }
@@ -378,10 +300,7 @@ mod tests {
         let now = Instant::now();
         let mut fleet = fleet_of_one(now, full_report(10.0, 5, 5));
         fleet.place(now, |_| true);
-        assert_eq!(
-            (fleet.effective_load(&0, now), fleet.in_flight(&0, now)),
-            (Some(12.0), 1)
-        );
+        assert_eq!((fleet.effective_load(&0, now), fleet.in_flight(&0, now)), (Some(12.0), 1));
         for (after, load, expected) in [(1.0, 10.0, 11.75), (4.0, 11.0, 12.0), (8.0, 12.0, 12.0)] {
             let later = now + seconds(after);
             fleet.report(&0, later, full_report(load, 6, 6));
@@ -397,11 +316,7 @@ mod tests {
         fleet.place(now, |_| true);
         for (after, expected) in [(0.0, 12.0), (4.0, 11.0), (8.0, 10.0)] {
             fleet.report(&0, now + seconds(after), load_only(10.0));
-            assert_near(
-                fleet.effective_load(&0, now + seconds(after)),
-                expected,
-                0.1,
-            );
+            assert_near(fleet.effective_load(&0, now + seconds(after)), expected, 0.1);
         }
     }
 
@@ -454,21 +369,13 @@ mod tests {
         for second in 0..600_u32 {
             // Each client stays long enough for the mean load to show it.
             let step = second / 20;
-            let present = if (step / most).is_multiple_of(2) {
-                step % most
-            } else {
-                most - step % most
-            };
+            let present = if (step / most).is_multiple_of(2) { step % most } else { most - step % most };
             if second.is_multiple_of(20) {
                 arrivals += 1;
             }
             let noise = if second.is_multiple_of(2) { 1.0 } else { -1.0 };
             let load = (5.0 + cost * f64::from(present) + noise).min(100.0);
-            fleet.report(
-                &id,
-                start + seconds(f64::from(second)),
-                full_report(load, present, arrivals),
-            );
+            fleet.report(&id, start + seconds(f64::from(second)), full_report(load, present, arrivals));
         }
     }
 
@@ -522,11 +429,7 @@ mod tests {
         let mut last = start;
         for second in 1..300_u32 {
             last = start + seconds(f64::from(second));
-            fleet.report(
-                &0,
-                last,
-                full_report(100.0, 20 + second, u64::from(20 + second)),
-            );
+            fleet.report(&0, last, full_report(100.0, 20 + second, u64::from(20 + second)));
         }
         assert!(fleet.learned_cost(&0).is_some_and(|cost| cost >= 2.0));
         assert!(!fleet.available(last));

@@ -40,11 +40,7 @@ struct Change {
 impl Change {
     /// The clients of this change that a mean load taken at `now` does not show.
     fn unseen(&self, now: Instant, settling: Duration) -> f64 {
-        let span = if self.clients > 0.0 {
-            settling
-        } else {
-            MEAN_WINDOW
-        };
+        let span = if self.clients > 0.0 { settling } else { MEAN_WINDOW };
         let age = now.saturating_duration_since(self.at);
         if age >= span {
             return 0.0;
@@ -93,13 +89,7 @@ impl Server {
     }
 
     /// Takes in a report that came at `now`; one that is older than the last is passed over.
-    pub(super) fn report(
-        &mut self,
-        now: Instant,
-        report: Report,
-        policy: &Policy,
-        common: &mut Common,
-    ) {
+    pub(super) fn report(&mut self, now: Instant, report: Report, policy: &Policy, common: &mut Common) {
         if !report.load.is_finite() || report.load < 0.0 {
             self.lose();
             return;
@@ -109,13 +99,8 @@ impl Server {
         }
         self.forget_missing(now, policy);
         self.note_changes(now, report.instances);
-        self.settling
-            .retain(|change| change.unseen(now, policy.settling) != 0.0);
-        self.unseen = self
-            .settling
-            .iter()
-            .map(|change| change.unseen(now, policy.settling))
-            .sum();
+        self.settling.retain(|change| change.unseen(now, policy.settling) != 0.0);
+        self.unseen = self.settling.iter().map(|change| change.unseen(now, policy.settling)).sum();
         self.learn(now, report);
         self.last = Some((now, report));
         self.up = true;
@@ -155,21 +140,13 @@ impl Server {
 
     /// The load that is to be expected once all that was sent here shows, in percent, if the server is up.
     pub(super) fn effective_load(&self, now: Instant, policy: &Policy) -> Option<f64> {
-        self.load()
-            .map(|load| self.load_ahead(load, self.in_flight(now, policy)))
+        self.load().map(|load| self.load_ahead(load, self.in_flight(now, policy)))
     }
 
     fn load_ahead(&self, load: f64, in_flight: usize) -> f64 {
         // How far a full machine is over is not known, so those who left may not have made it less than full.
-        let unseen = if load < FULL {
-            self.unseen
-        } else {
-            self.unseen.max(0.0)
-        };
-        #[expect(
-            clippy::cast_precision_loss,
-            reason = "nobody sends 2^52 clients to a server"
-        )]
+        let unseen = if load < FULL { self.unseen } else { self.unseen.max(0.0) };
+        #[expect(clippy::cast_precision_loss, reason = "nobody sends 2^52 clients to a server")]
         let ahead = unseen + in_flight as f64;
         (load + self.cost * ahead).max(0.0)
     }
@@ -187,9 +164,7 @@ impl Server {
     /// When the next placement is given up, if none of their clients comes before.
     pub(super) fn next_expiry(&self, now: Instant, policy: &Policy) -> Option<Instant> {
         let first = self.in_flight.len() - self.in_flight(now, policy);
-        self.in_flight
-            .get(first)
-            .and_then(|placed| placed.checked_add(policy.patience))
+        self.in_flight.get(first).and_then(|placed| placed.checked_add(policy.patience))
     }
 
     /// What one more client is expected to add to the load, in percent.
@@ -219,25 +194,15 @@ impl Server {
             self.fit = Cost::new(self.cost);
         }
         let Some(instances) = report.instances else {
-            self.fit
-                .learn_step(now, self.sent - self.unseen, report.load);
+            self.fit.learn_step(now, self.sent - self.unseen, report.load);
             return;
         };
         // Those who wait for a place cost nothing yet.
         let present = f64::from(instances.present.min(instances.places));
         let shown = (present - self.unseen).max(0.0);
         // While many are starting, it is not well known how much of them the load shows.
-        let trust = if shown < present {
-            shown / present
-        } else {
-            1.0
-        };
-        self.fit.learn(
-            shown,
-            report.load,
-            now.saturating_duration_since(before),
-            trust * trust,
-        );
+        let trust = if shown < present { shown / present } else { 1.0 };
+        self.fit.learn(shown, report.load, now.saturating_duration_since(before), trust * trust);
     }
 
     fn forget_missing(&mut self, now: Instant, policy: &Policy) {
@@ -250,16 +215,10 @@ impl Server {
     fn note_changes(&mut self, now: Instant, new: Option<Instances>) {
         let Some(new) = new else {
             // A load alone does not tell who came: every placement is taken to have come as it was made.
-            self.settling.extend(
-                self.in_flight
-                    .drain(..)
-                    .map(|at| Change { at, clients: 1.0 }),
-            );
+            self.settling.extend(self.in_flight.drain(..).map(|at| Change { at, clients: 1.0 }));
             return;
         };
-        let old = self
-            .last
-            .and_then(|(at, report)| report.instances.map(|old| (at, old)));
+        let old = self.last.and_then(|(at, report)| report.instances.map(|old| (at, old)));
         let Some((before, old)) = old.filter(|(_, old)| old.arrivals <= new.arrivals) else {
             // The first report, or a server that began anew: its load has nothing of the past in it. Placements in flight
             // may still come.
@@ -272,21 +231,14 @@ impl Server {
         // The latest placements are taken to be those that came. Nothing tells clients apart; were the oldest taken, then
         // a client that never comes would stay in flight as long as others follow it.
         let first = self.in_flight.len() - came;
-        self.settling.extend(
-            self.in_flight
-                .drain(first..)
-                .map(|at| Change { at, clients: 1.0 }),
-        );
+        self.settling.extend(self.in_flight.drain(first..).map(|at| Change { at, clients: 1.0 }));
         // Those who left, less those who came without having been sent; some time since the last report.
         let came = f64::from(u32::try_from(came).unwrap_or(u32::MAX));
         let others = f64::from(new.present) - f64::from(old.present) - came;
         self.fit.meet(came + others.max(0.0));
         if others != 0.0 {
             let at = before + now.saturating_duration_since(before) / 2;
-            self.settling.push_back(Change {
-                at,
-                clients: others,
-            });
+            self.settling.push_back(Change { at, clients: others });
         }
     }
 }

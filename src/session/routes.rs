@@ -1,0 +1,174 @@
+//! The session server's public paths: each reads the request, asks the registry, and maps the answer.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use actix::prelude::*;
+use actix_web::http::{Method, StatusCode, header};
+use actix_web::middleware::DefaultHeaders;
+use actix_web::{HttpRequest, HttpResponse, web};
+use actix_web_actors::ws::WsResponseBuilder;
+use askama::Template;
+use rand::RngExt;
+
+use super::app::Server;
+use super::fleet_status::{FleetStatus, told_mean};
+use super::registry::{GetStatus, IsAvailable, NoServer, Pick, Registry};
+use super::status::{self, Page, StatusPage};
+use super::web_client::WebClient;
+use crate::shared::metrics::CONTENT_TYPE;
+
+/// How long the registry may take to answer.
+const PATIENCE: Duration = Duration::from_secs(2);
+/// The largest message of a client, in bytes.
+const LARGEST_MESSAGE: usize = 8 * 1024;
+/// After how many seconds a client that was refused may come back: drawn at random, so that a class that was refused
+/// together does not come back together.
+const COME_BACK: std::ops::RangeInclusive<u32> = 2..=6;
+
+/// Adds all paths to an app.
+pub fn configure(app: &mut web::ServiceConfig) {
+    let cors = DefaultHeaders::new()
+        .add((header::ACCESS_CONTROL_ALLOW_ORIGIN, "*"))
+        .add((header::ACCESS_CONTROL_ALLOW_HEADERS, "x-requested-with"))
+        .add((header::ACCESS_CONTROL_ALLOW_METHODS, "POST, GET, OPTIONS"))
+        .add((header::CACHE_CONTROL, "no-store"));
+    app.service(
+        web::scope("")
+            .wrap(cors)
+            .route("/", web::get().to(root))
+            .route("/request", web::get().to(availability))
+            .route("/session", web::get().to(session))
+            .route("/load", web::get().to(load))
+            .route("/monitor", web::get().to(monitor))
+            .route("/status", web::get().to(status_json))
+            .route("/metrics", web::get().to(metrics))
+            .route("/health", web::get().to(health))
+            .route("/{path:.*}", web::method(Method::OPTIONS).to(HttpResponse::NoContent))
+            .default_service(web::to(nothing_here)),
+    );
+}
+
+/// Asks the registry; nothing when it is too busy to answer.
+async fn ask<M>(server: &Server, message: M) -> Option<M::Result>
+where
+    M: Message<Result: Send> + Send + 'static,
+    Registry: Handler<M>,
+{
+    let answer = server.registry.send(message);
+    actix_rt::time::timeout(PATIENCE, answer).await.ok().and_then(Result::ok)
+}
+
+fn wants_websocket(request: &HttpRequest) -> bool {
+    let upgrade = request.headers().get(header::UPGRADE).and_then(|value| value.to_str().ok());
+    upgrade.is_some_and(|value| value.eq_ignore_ascii_case("websocket"))
+}
+
+async fn root(request: HttpRequest, stream: web::Payload, server: web::Data<Server>) -> HttpResponse {
+    if wants_websocket(&request) { websocket(&request, stream, &server) } else { availability(server).await }
+}
+
+async fn session(request: HttpRequest, stream: web::Payload, server: web::Data<Server>) -> HttpResponse {
+    if wants_websocket(&request) {
+        return websocket(&request, stream, &server);
+    }
+    let answer = server.pick(Pick::parse(wanted_world(request.query_string()))).await;
+    let status = match answer.refusal {
+        None => StatusCode::OK,
+        Some(NoServer::Unavailable) => StatusCode::SERVICE_UNAVAILABLE,
+        Some(NoServer::NotAccepted(_)) => StatusCode::FORBIDDEN,
+        Some(NoServer::NoWorld(_)) => StatusCode::BAD_REQUEST,
+    };
+    let mut response = HttpResponse::build(status);
+    if status == StatusCode::SERVICE_UNAVAILABLE {
+        response.insert_header((header::RETRY_AFTER, rand::rng().random_range(COME_BACK)));
+    }
+    response.content_type("text/plain; charset=utf-8").body(answer.text)
+}
+
+/// The world of a query. `webots.js` does not percent-encode it, so that it is all that follows `url=`: a plus sign
+/// or an ampersand may be part of it.
+fn wanted_world(query: &str) -> Option<&str> {
+    let begin = query.strip_prefix("url=").or_else(|| query.split_once("&url=").map(|(_, world)| world));
+    begin.filter(|world| !world.is_empty())
+}
+
+fn websocket(request: &HttpRequest, stream: web::Payload, server: &web::Data<Server>) -> HttpResponse {
+    let Ok(permit) = Arc::clone(&server.connections).try_acquire_owned() else {
+        return HttpResponse::ServiceUnavailable().body("Error: too many connections.");
+    };
+    let peer = request.peer_addr().map(|address| address.ip());
+    let actor = WebClient::new(Arc::clone(server), peer, permit);
+    WsResponseBuilder::new(actor, request, stream).frame_size(LARGEST_MESSAGE).start().unwrap_or_else(|error| {
+        let problem = format!("Error: this is a WebSocket: {error}.");
+        HttpResponse::build(error.as_response_error().status_code()).body(problem)
+    })
+}
+
+async fn availability(server: web::Data<Server>) -> HttpResponse {
+    let available = ask(&server, IsAvailable).await.unwrap_or(false);
+    HttpResponse::Ok().content_type("text/plain").body(if available { "1" } else { "0" })
+}
+
+async fn load(server: web::Data<Server>) -> HttpResponse {
+    let mean = ask(&server, GetStatus).await.and_then(|status| status.mean_load);
+    HttpResponse::Ok().content_type("text/plain").body(told_mean(mean).to_string())
+}
+
+async fn with_status(server: &Server, answer: impl FnOnce(&FleetStatus) -> HttpResponse) -> HttpResponse {
+    match ask(server, GetStatus).await {
+        Some(status) => answer(&status),
+        None => HttpResponse::ServiceUnavailable().body("Error: the server is too busy to tell."),
+    }
+}
+
+async fn status_json(server: web::Data<Server>) -> HttpResponse {
+    with_status(&server, |status| HttpResponse::Ok().json(StatusPage::new(&server, status))).await
+}
+
+async fn monitor(server: web::Data<Server>) -> HttpResponse {
+    with_status(&server, |status| match Page::new(&server, status).render() {
+        Ok(page) => HttpResponse::Ok().content_type("text/html; charset=utf-8").body(page),
+        Err(error) => HttpResponse::InternalServerError().body(format!("Error: {error}.")),
+    })
+    .await
+}
+
+async fn metrics(server: web::Data<Server>) -> HttpResponse {
+    with_status(&server, |status| match server.metrics.render(&status::gauges(status)) {
+        Ok(text) => HttpResponse::Ok().content_type(CONTENT_TYPE).body(text),
+        Err(error) => HttpResponse::InternalServerError().body(format!("Error: {error}.")),
+    })
+    .await
+}
+
+async fn health() -> HttpResponse {
+    HttpResponse::Ok().content_type("text/plain").body("ok")
+}
+
+async fn nothing_here() -> HttpResponse {
+    HttpResponse::NotFound()
+        .body("Error: there is nothing here. Try /session, /monitor, /status, /load, /metrics or /health.")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_world_is_all_that_follows_url() {
+        let table = [
+            ("", None),
+            ("url=", None),
+            ("mode=x3d", None),
+            (
+                "url=https://github.com/u/c++/blob/a&b/worlds/x.wbt",
+                Some("https://github.com/u/c++/blob/a&b/worlds/x.wbt"),
+            ),
+            ("mode=x3d&url=https://x", Some("https://x")),
+        ];
+        for (query, world) in table {
+            assert_eq!(wanted_world(query), world, "{query:?}");
+        }
+    }
+}

@@ -1,0 +1,198 @@
+//! Actor: watches one simulation server.
+//!
+//! Created by the registry for each address in `simulationServers`. Every [`Watch::refresh`] it asks the server for its
+//! state, with one request in flight at most, and tells the registry what came: it judges nothing itself. It ends when
+//! the registry says so; after a panic the registry makes a new one.
+//!
+//! It asks for `/status`; a server that has no such page is asked for `/load`, as the original is. Nothing that comes is
+//! trusted: the whole exchange has one time limit, an answer has a largest size, and a load must be one.
+
+use std::fmt;
+use std::time::{Duration, Instant};
+
+use actix::prelude::*;
+
+use crate::shared::address::PublicAddress;
+use crate::shared::load::Load;
+use crate::shared::status::Dispatch;
+
+/// What was learned about a simulation server.
+#[derive(Message, Debug)]
+#[rtype(result = "()")]
+pub struct Reported {
+    /// The server.
+    pub server: PublicAddress,
+    /// How long it took to answer, or until that was given up.
+    pub latency: Duration,
+    /// What it said of itself, or why it can't be counted on.
+    pub answer: Result<Dispatch, Unreachable>,
+}
+
+/// Why a simulation server gave no usable answer.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Unreachable {
+    /// No connection, or one that broke.
+    Refused(String),
+    /// No whole answer in time.
+    TimedOut(Duration),
+    /// An answer that makes no sense.
+    BadAnswer(String),
+}
+
+/// How often and how patiently a server is asked.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Watch {
+    /// Between two looks.
+    pub refresh: Duration,
+    /// How long an answer may take.
+    pub patience: Duration,
+    /// Whether the fleet is behind https.
+    pub ssl: bool,
+}
+
+/// Asks a monitor to end: its server is no longer one of the fleet.
+#[derive(Message)]
+#[rtype(result = "()")]
+pub struct Forget;
+
+/// The actor.
+pub struct ServerMonitor {
+    server: PublicAddress,
+    watch: Watch,
+    client: awc::Client,
+    reports: Recipient<Reported>,
+    asking: bool,
+    /// Until when a server that has no `/status` is asked for `/load` alone.
+    load_only_until: Option<Instant>,
+}
+
+/// The largest answer that is read, in bytes.
+const LARGEST_ANSWER: usize = 1024 * 1024;
+/// For how long a server is taken to have no `/status`.
+const LOAD_ONLY: Duration = Duration::from_mins(1);
+
+/// What was understood of an answer.
+enum Answer {
+    Status(Dispatch),
+    /// There is no `/status`, but a `/load`.
+    Load(Load),
+}
+
+impl ServerMonitor {
+    /// A monitor of one server. `client` is shared by all: it keeps the connections.
+    #[must_use]
+    pub fn new(server: PublicAddress, watch: Watch, client: awc::Client, reports: Recipient<Reported>) -> Self {
+        Self { server, watch, client, reports, asking: false, load_only_until: None }
+    }
+
+    fn ask(&mut self, ctx: &mut Context<Self>) {
+        if std::mem::replace(&mut self.asking, true) {
+            return;
+        }
+        let (client, url, patience) = (self.client.clone(), self.server.http_url(self.watch.ssl), self.watch.patience);
+        let load_only = self.load_only_until.is_some_and(|end| Instant::now() < end);
+        let begun = Instant::now();
+        let exchange = async move {
+            let answer = actix_rt::time::timeout(patience, exchange(&client, &url, load_only)).await;
+            answer.unwrap_or(Err(Unreachable::TimedOut(patience)))
+        };
+        exchange.into_actor(self).map(move |answer, monitor, _| monitor.came(answer, begun.elapsed())).spawn(ctx);
+    }
+
+    fn came(&mut self, answer: Result<Answer, Unreachable>, latency: Duration) {
+        self.asking = false;
+        let answer = answer.map(|answer| match answer {
+            Answer::Status(dispatch) => dispatch,
+            Answer::Load(load) => {
+                if self.load_only_until.is_none_or(|end| Instant::now() >= end) {
+                    self.load_only_until = Some(Instant::now() + LOAD_ONLY);
+                }
+                Dispatch::load_only(load)
+            }
+        });
+        let report = Reported { server: self.server.clone(), latency, answer };
+        if let Err(lost) = self.reports.try_send(report) {
+            log::warn!("a report of {} is lost: {lost}", self.server);
+        }
+    }
+}
+
+impl Actor for ServerMonitor {
+    type Context = Context<Self>;
+
+    fn started(&mut self, ctx: &mut Self::Context) {
+        self.ask(ctx);
+        ctx.run_interval(self.watch.refresh, Self::ask);
+    }
+}
+
+impl Handler<Forget> for ServerMonitor {
+    type Result = ();
+
+    fn handle(&mut self, _: Forget, ctx: &mut Self::Context) {
+        ctx.stop();
+    }
+}
+
+impl fmt::Display for Unreachable {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Refused(why) => write!(out, "no connection: {why}"),
+            Self::TimedOut(limit) => write!(out, "no answer within {} s", limit.as_secs_f64()),
+            Self::BadAnswer(what) => write!(out, "an answer that makes no sense: {what}"),
+        }
+    }
+}
+
+async fn exchange(client: &awc::Client, url: &str, load_only: bool) -> Result<Answer, Unreachable> {
+    if !load_only && let Some(body) = get(client, &format!("{url}/status")).await? {
+        return parse_status(&body).map(Answer::Status);
+    }
+    let body = get(client, &format!("{url}/load")).await?;
+    let body = body.ok_or_else(|| Unreachable::BadAnswer("it has neither /status nor /load".to_owned()))?;
+    Load::parse(&body).map(Answer::Load).map_err(|error| Unreachable::BadAnswer(shortened(&error.to_string())))
+}
+
+/// The body of a page; nothing where the server says that there is none.
+async fn get(client: &awc::Client, url: &str) -> Result<Option<actix_web::web::Bytes>, Unreachable> {
+    let mut answer = client.get(url).send().await.map_err(|error| Unreachable::Refused(error.to_string()))?;
+    let status = answer.status();
+    if status == awc::http::StatusCode::NOT_FOUND {
+        return Ok(None);
+    }
+    if !status.is_success() {
+        return Err(Unreachable::BadAnswer(format!("status {status}")));
+    }
+    let body = answer.body().limit(LARGEST_ANSWER).await;
+    body.map(Some).map_err(|error| Unreachable::BadAnswer(error.to_string()))
+}
+
+/// Some servers of the Python family have a `/status` with less in it; a page that is no status at all counts as none.
+fn parse_status(body: &[u8]) -> Result<Dispatch, Unreachable> {
+    serde_json::from_slice(body).map_err(|error| {
+        let text = String::from_utf8_lossy(body.get(..body.len().min(40)).unwrap_or_default()).into_owned();
+        Unreachable::BadAnswer(format!("{error} in {text:?}"))
+    })
+}
+
+/// Words that may hold what somebody else wrote are kept short.
+fn shortened(text: &str) -> String {
+    text.chars().take(120).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_status_needs_a_load_that_is_one() {
+        let status =
+            parse_status(br#"{"load": 12.5, "allowedRepositories": ["https://github.com/lab"], "new": 1}"#).unwrap();
+        assert!((status.load.percent() - 12.5).abs() < f64::EPSILON);
+        assert_eq!(status.allowed_repositories.len(), 1);
+        for odd in ["", "{}", "[]", "12", r#"{"load": -1}"#, r#"{"load": "1"}"#, r#"{"load": null}"#, "<html>", "\u{0}"]
+        {
+            assert!(matches!(parse_status(odd.as_bytes()), Err(Unreachable::BadAnswer(_))), "{odd:?}");
+        }
+    }
+}

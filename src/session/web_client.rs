@@ -1,0 +1,146 @@
+//! Actor: one web client's WebSocket. Tells it whether a simulation server can take a client, and which.
+//!
+//! Created by the route for each connection; ends with it. It subscribes to the registry's changes, and never tells
+//! the same value twice. A text from the client asks for a simulation server.
+
+use std::net::IpAddr;
+use std::sync::Arc;
+
+use actix::prelude::*;
+use actix_web_actors::ws::{CloseCode, CloseReason, Message, ProtocolError, WebsocketContext};
+use serde::Deserialize;
+use tokio::sync::OwnedSemaphorePermit;
+
+use super::app::Server;
+use super::registry::{Availability, Pick, Subscribe, Subscription};
+use crate::shared::liveness::Liveness;
+use crate::shared::shutdown::closing;
+
+/// The actor.
+pub struct WebClient {
+    server: Arc<Server>,
+    peer: Option<IpAddr>,
+    liveness: Liveness,
+    told: Option<bool>,
+    subscription: Option<Subscription>,
+    _permit: OwnedSemaphorePermit,
+}
+
+type Context = WebsocketContext<WebClient>;
+
+impl WebClient {
+    /// A client that has just connected; `permit` counts it.
+    #[must_use]
+    pub fn new(server: Arc<Server>, peer: Option<IpAddr>, permit: OwnedSemaphorePermit) -> Self {
+        Self { server, peer, liveness: Liveness::new(), told: None, subscription: None, _permit: permit }
+    }
+
+    fn close(code: CloseCode, ctx: &mut Context) {
+        ctx.close(Some(CloseReason { code, description: None }));
+        ctx.stop();
+    }
+
+    fn ping(&mut self, ctx: &mut Context) {
+        if self.liveness.is_gone(self.server.timing.silence) {
+            log::debug!("client {:?}: silent for too long", self.peer);
+            ctx.stop();
+        } else {
+            ctx.ping(&self.liveness.ping());
+        }
+    }
+
+    fn pick(&self, text: &str, ctx: &mut Context) {
+        let server = Arc::clone(&self.server);
+        let wanted = wanted_world(text);
+        let picked = async move { server.pick(Pick::parse(wanted.as_deref())).await };
+        picked.into_actor(self).map(|answer, _, ctx| ctx.text(answer.text)).spawn(ctx);
+    }
+}
+
+/// The world that a message names: a URL, `{"url": ...}`, or nothing in particular.
+fn wanted_world(text: &str) -> Option<String> {
+    #[derive(Deserialize)]
+    struct Wanted {
+        url: String,
+    }
+    let text = text.trim();
+    if let Ok(Wanted { url }) = serde_json::from_str(text) {
+        return Some(url);
+    }
+    text.contains("://").then(|| text.to_owned())
+}
+
+impl Actor for WebClient {
+    type Context = Context;
+
+    fn started(&mut self, ctx: &mut Self::Context) {
+        ctx.run_interval(self.server.timing.ping, Self::ping);
+        let subscribed = self.server.registry.send(Subscribe(ctx.address().recipient())).into_actor(self);
+        subscribed
+            .map(|answer, client, ctx| match answer {
+                Ok(subscription) => client.subscription = Some(subscription),
+                Err(error) => {
+                    log::error!("a client can't be told of changes: {error}");
+                    Self::close(CloseCode::Error, ctx);
+                }
+            })
+            .spawn(ctx);
+        let ending = closing(self.server.phase.clone()).into_actor(self);
+        ending.map(|(), _, ctx| Self::close(CloseCode::Away, ctx)).spawn(ctx);
+    }
+}
+
+impl Handler<Availability> for WebClient {
+    type Result = ();
+
+    fn handle(&mut self, Availability(available): Availability, ctx: &mut Self::Context) {
+        if self.told.replace(available) != Some(available) {
+            ctx.text(if available { "1" } else { "0" });
+        }
+    }
+}
+
+impl StreamHandler<Result<Message, ProtocolError>> for WebClient {
+    fn handle(&mut self, message: Result<Message, ProtocolError>, ctx: &mut Self::Context) {
+        match message {
+            Ok(Message::Text(text)) if self.liveness.may_answer() => self.pick(&text, ctx),
+            Ok(Message::Ping(data)) if self.liveness.may_answer() => ctx.pong(&data),
+            Ok(Message::Pong(content)) => self.liveness.pong(&content),
+            Ok(Message::Close(reason)) => {
+                ctx.close(reason);
+                ctx.stop();
+            }
+            Ok(Message::Nop) => {}
+            Ok(Message::Text(_) | Message::Ping(_)) => {
+                log::warn!("client {:?}: asks without reading the answers", self.peer);
+                Self::close(CloseCode::Policy, ctx);
+            }
+            Ok(Message::Binary(_) | Message::Continuation(_)) => Self::close(CloseCode::Unsupported, ctx),
+            Err(error) => {
+                log::debug!("client {:?}: {error}", self.peer);
+                Self::close(CloseCode::Protocol, ctx);
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_message_may_name_a_world() {
+        let world = "https://github.com/u/r/blob/main/worlds/a.wbt";
+        let table = [
+            ("", None),
+            ("please", None),
+            (r#"{"other": 1}"#, None),
+            (world, Some(world)),
+            (&format!(r#"{{"url": "{world}"}}"#), Some(world)),
+            ("http://no.world", Some("http://no.world")),
+        ];
+        for (text, expected) in table {
+            assert_eq!(wanted_world(text).as_deref(), expected, "{text:?}");
+        }
+    }
+}

@@ -1,0 +1,30 @@
+//! What web clients get at the door.
+
+use crate::support::client::Client;
+use crate::support::git::{Forge, world};
+use crate::support::http;
+use crate::support::program::{session_server, simulation_server};
+use crate::support::until;
+use crate::support::webots::Webots;
+
+#[actix_rt::test]
+async fn a_client_is_led_to_the_simulation_server_that_is_there() {
+    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
+    let simulation = simulation_server(&webots.path(), forge.path(), 9).start().await;
+    let session = session_server(&[simulation.address()]).start().await;
+    let mut client = Client::connect(&session.websocket("/session")).await;
+    client.until("1").await;
+    let address = format!("ws://{}", simulation.address());
+    assert_eq!(http::get(&session.url("/request")).await.text(), "1");
+    assert_eq!(http::get(&session.url("/session")).await.text(), address);
+    let url = world("lab/arm", "main", "worlds/a.wbt");
+    assert_eq!(http::get(&session.url(&format!("/session?url={url}"))).await.text(), address);
+    client.send(&url).await;
+    assert_eq!(client.until("ws").await, address);
+    drop(simulation);
+    client.until("0").await;
+    until("the door is closed", async || http::get(&session.url("/request")).await.text() == "0").await;
+    let answer = http::get(&session.url("/session")).await;
+    assert_eq!(answer.text(), "Error: no simulation server available at the moment.");
+    assert_eq!(answer.status, 503);
+}

@@ -1,0 +1,16 @@
+//! The session server, seen from outside: the built program, real sockets, stand-ins for simulation servers.
+
+#![allow(
+    missing_docs,
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::panic,
+    clippy::indexing_slicing,
+    reason = "tests fail by panics"
+)]
+#![allow(clippy::pedantic, reason = "tests are read one by one")]
+
+#[path = "../support/mod.rs"]
+mod support;
+
+mod door;

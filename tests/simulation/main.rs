@@ -1,0 +1,16 @@
+//! The simulation server, seen from outside: the built program, real git, real processes, a stand-in for Webots.
+
+#![allow(
+    missing_docs,
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::panic,
+    clippy::indexing_slicing,
+    reason = "tests fail by panics"
+)]
+#![allow(clippy::pedantic, reason = "tests are read one by one")]
+
+#[path = "../support/mod.rs"]
+mod support;
+
+mod life;

@@ -1,0 +1,97 @@
+//! A web client: a WebSocket on which texts are awaited with a deadline.
+
+use std::time::Duration;
+
+use futures_util::{SinkExt, StreamExt};
+use tokio::net::TcpStream;
+use tokio_tungstenite::tungstenite::Message;
+use tokio_tungstenite::tungstenite::protocol::CloseFrame;
+use tokio_tungstenite::{MaybeTlsStream, WebSocketStream};
+
+use super::SOON;
+
+/// A WebSocket, and all texts that came on it.
+pub struct Client {
+    socket: WebSocketStream<MaybeTlsStream<TcpStream>>,
+    /// Every text that came.
+    pub heard: Vec<String>,
+}
+
+/// Something that came on a WebSocket.
+#[derive(Debug)]
+pub enum Heard {
+    Text(String),
+    Closed(Option<CloseFrame>),
+}
+
+impl Client {
+    /// Connects.
+    pub async fn connect(url: &str) -> Self {
+        let (socket, _) = tokio_tungstenite::connect_async(url).await.unwrap_or_else(|error| panic!("{url}: {error}"));
+        Self { socket, heard: Vec::new() }
+    }
+
+    /// Connects to a simulation server and asks for a world.
+    pub async fn start(server: &super::program::Server, world: &str) -> Self {
+        let mut client = Self::connect(&server.websocket("/client")).await;
+        client.send(&serde_json::json!({"start": {"url": world}}).to_string()).await;
+        client
+    }
+
+    /// Sends a text.
+    pub async fn send(&mut self, text: &str) {
+        self.socket.send(Message::text(text)).await.unwrap();
+    }
+
+    /// The next text, or the end.
+    pub async fn next(&mut self) -> Heard {
+        match actix_rt::time::timeout(SOON, self.read()).await {
+            Ok(heard) => heard,
+            Err(_) => panic!("nothing more came after {:#?}", self.heard),
+        }
+    }
+
+    async fn read(&mut self) -> Heard {
+        loop {
+            match self.socket.next().await {
+                Some(Ok(Message::Text(text))) => {
+                    self.heard.push(text.to_string());
+                    return Heard::Text(text.to_string());
+                }
+                Some(Ok(Message::Close(frame))) => return Heard::Closed(frame),
+                Some(Ok(_)) => {}
+                Some(Err(_)) | None => return Heard::Closed(None),
+            }
+        }
+    }
+
+    /// The next text that begins with this; what comes before it is passed over.
+    pub async fn until(&mut self, beginning: &str) -> String {
+        loop {
+            match self.next().await {
+                Heard::Text(text) if text.starts_with(beginning) => return text,
+                Heard::Text(_) => {}
+                Heard::Closed(frame) => panic!("closed ({frame:?}) before {beginning:?}; heard {:#?}", self.heard),
+            }
+        }
+    }
+
+    /// The close code that ends the connection; `None` where it just broke.
+    pub async fn closed(&mut self) -> Option<u16> {
+        loop {
+            if let Heard::Closed(frame) = self.next().await {
+                return frame.map(|frame| frame.code.into());
+            }
+        }
+    }
+
+    /// Whether nothing comes for so long.
+    pub async fn is_silent(&mut self, time: Duration) -> bool {
+        actix_rt::time::timeout(time, self.read()).await.is_err()
+    }
+
+    /// Leaves in order.
+    pub async fn leave(mut self) {
+        self.socket.close(None).await.ok();
+    }
+}

@@ -1,0 +1,88 @@
+//! Real git repositories in a folder of the test, as a forge would have them.
+
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+/// A folder of bare repositories: `repositories/lab/arm` is what `https://github.com/lab/arm` is mirrored to.
+pub struct Forge {
+    folder: tempfile::TempDir,
+}
+
+/// A world that the demo simulator can show.
+pub const WORLD: &str = "#VRML_SIM R2025a utf8\nWorldInfo { title \"Test\" basicTimeStep 32 }\nViewpoint { position -4 0 2 }\n\
+                         Robot { name \"one\" translation 0 0 0.1 children [ Shape { geometry Box { size 0.1 0.1 0.1 } } ] }\n";
+
+impl Forge {
+    pub fn new() -> Self {
+        Self { folder: tempfile::tempdir().unwrap() }
+    }
+
+    /// A forge with `lab/arm`, whose branch `main` has `worlds/a.wbt` and a controller.
+    pub fn with_arm() -> Self {
+        let forge = Self::new();
+        forge.commit("lab/arm", "main", &[("worlds/a.wbt", WORLD), ("controllers/c/c.py", "print('original')\n")]);
+        forge
+    }
+
+    pub fn path(&self) -> &Path {
+        self.folder.path()
+    }
+
+    /// Adds these files to a branch, which is made if need be; gives back the commit's hash.
+    pub fn commit(&self, repository: &str, branch: &str, files: &[(&str, &str)]) -> String {
+        let work = self.work_tree(repository, branch);
+        for (path, text) in files {
+            let path = work.join(path);
+            std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+            std::fs::write(path, text).unwrap();
+        }
+        self.commit_work_tree(repository, branch)
+    }
+
+    /// A checkout of a branch, to change at will before [`Forge::commit_work_tree`].
+    pub fn work_tree(&self, repository: &str, branch: &str) -> PathBuf {
+        let work = self.folder.path().join(".work").join(repository);
+        let bare = self.folder.path().join(repository);
+        if !bare.exists() {
+            std::fs::create_dir_all(&bare).unwrap();
+            git(&bare, &["init", "--quiet", "--bare", "--initial-branch=main"]);
+            std::fs::create_dir_all(&work).unwrap();
+            git(&work, &["init", "--quiet", "--initial-branch", branch]);
+            git(&work, &["remote", "add", "origin", bare.to_str().unwrap()]);
+        } else if git(&work, &["branch", "--show-current"]).trim() != branch {
+            let known = git(&work, &["branch", "--list", branch]);
+            let make: &[&str] = if known.trim().is_empty() { &["-b"] } else { &[] };
+            git(&work, &[&["checkout", "--quiet"], make, &[branch]].concat());
+        }
+        work
+    }
+
+    /// Commits and pushes whatever the checkout holds.
+    pub fn commit_work_tree(&self, repository: &str, branch: &str) -> String {
+        let work = self.folder.path().join(".work").join(repository);
+        git(&work, &["add", "--all"]);
+        git(&work, &["commit", "--quiet", "--allow-empty", "--message", "test"]);
+        git(&work, &["push", "--quiet", "--force", "origin", &format!("{branch}:refs/heads/{branch}")]);
+        git(&work, &["rev-parse", "HEAD"]).trim().to_owned()
+    }
+
+    /// Tags what a branch has.
+    pub fn tag(&self, repository: &str, name: &str) {
+        let work = self.folder.path().join(".work").join(repository);
+        git(&work, &["tag", "--annotate", "--message", "test", name]);
+        git(&work, &["push", "--quiet", "origin", &format!("refs/tags/{name}")]);
+    }
+}
+
+/// The URL of a world.
+pub fn world(repository: &str, reference: &str, path: &str) -> String {
+    format!("https://github.com/{repository}/blob/{reference}/{path}")
+}
+
+/// Runs git in a folder; gives back what it prints.
+pub fn git(folder: &Path, arguments: &[&str]) -> String {
+    let fixed = ["-c", "user.name=Test", "-c", "user.email=test@localhost", "-c", "commit.gpgSign=false"];
+    let output = Command::new("git").current_dir(folder).args(fixed).args(arguments).output().unwrap();
+    assert!(output.status.success(), "git {arguments:?}: {}", String::from_utf8_lossy(&output.stderr));
+    String::from_utf8(output.stdout).unwrap()
+}

@@ -1,0 +1,48 @@
+//! HTTP requests with a deadline.
+
+use actix_web::web::Bytes;
+use awc::http::StatusCode;
+use awc::http::header::HeaderMap;
+
+use super::SOON;
+
+/// An answer as a whole.
+#[derive(Debug)]
+pub struct Answer {
+    pub status: StatusCode,
+    pub headers: HeaderMap,
+    pub body: Bytes,
+}
+
+impl Answer {
+    pub fn text(&self) -> String {
+        String::from_utf8_lossy(&self.body).into_owned()
+    }
+
+    pub fn json(&self) -> serde_json::Value {
+        serde_json::from_slice(&self.body).unwrap_or_else(|error| panic!("{error}: {}", self.text()))
+    }
+
+    pub fn header(&self, name: &str) -> Option<&str> {
+        self.headers.get(name).and_then(|value| value.to_str().ok())
+    }
+}
+
+/// Asks for a page.
+pub async fn get(url: &str) -> Answer {
+    try_get(url).await.unwrap_or_else(|error| panic!("{url}: {error}"))
+}
+
+/// Asks for a page of a server that may not be there.
+pub async fn try_get(url: &str) -> Result<Answer, String> {
+    let mut answer = awc::Client::builder()
+        .timeout(SOON)
+        .disable_redirects()
+        .finish()
+        .get(url)
+        .send()
+        .await
+        .map_err(|error| error.to_string())?;
+    let body = answer.body().limit(64 << 20).await.map_err(|error| error.to_string())?;
+    Ok(Answer { status: answer.status(), headers: answer.headers().clone(), body })
+}

@@ -1,0 +1,26 @@
+//! What the black-box tests stand on: the built programs on free ports, git repositories, clients, deadlines.
+//!
+//! Everything that a test starts ends with it, and a test that fails prints the logs of what it had started.
+
+#![allow(dead_code, reason = "each test crate uses its own part of this")]
+
+pub mod client;
+pub mod git;
+pub mod http;
+pub mod ports;
+pub mod program;
+pub mod webots;
+
+use std::time::{Duration, Instant};
+
+/// How long anything may take that should happen soon. Far more than it needs: the machine may be busy.
+pub const SOON: Duration = Duration::from_secs(20);
+
+/// Waits until a condition holds, and says what was waited for when it never does.
+pub async fn until(what: &str, mut condition: impl AsyncFnMut() -> bool) {
+    let deadline = Instant::now() + SOON;
+    while !condition().await {
+        assert!(Instant::now() < deadline, "waited in vain until {what}");
+        actix_rt::time::sleep(Duration::from_millis(10)).await;
+    }
+}

@@ -1,0 +1,25 @@
+//! Blocks of free ports. Simulation servers need ports in a row, and test each for being free on all addresses.
+
+use std::net::{Ipv4Addr, TcpListener};
+use std::sync::atomic::{AtomicU16, Ordering};
+
+/// Below the ports that the system gives to outgoing connections.
+const FIRST: u16 = 10_000;
+const LAST: u16 = 32_000;
+
+static NEXT: AtomicU16 = AtomicU16::new(0);
+
+/// The first of `count` free ports in a row, which no other test of this process is given.
+pub fn block(count: u16) -> u16 {
+    // Other test processes begin elsewhere.
+    let start = u16::try_from(std::process::id() % 200).unwrap() * 100;
+    for _ in 0..1000 {
+        let offset = start.wrapping_add(NEXT.fetch_add(count, Ordering::Relaxed)) % (LAST - FIRST - count);
+        let first = FIRST + offset;
+        let free = |port| TcpListener::bind((Ipv4Addr::UNSPECIFIED, port)).is_ok();
+        if (first..first + count).all(free) {
+            return first;
+        }
+    }
+    panic!("no {count} free ports in a row");
+}

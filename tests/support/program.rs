@@ -1,0 +1,179 @@
+//! The built programs as child processes.
+
+use std::fs::File;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::time::Instant;
+
+use nix::sys::signal::{Signal, kill};
+use nix::unistd::Pid;
+use serde_json::Value;
+
+use super::{SOON, http, ports};
+
+/// A server that was started for one test. It is killed with the test, and its log is printed if the test fails.
+pub struct Server {
+    child: Child,
+    /// Where its configuration, log and cache are.
+    pub folder: PathBuf,
+    /// Its port on the loopback.
+    pub port: u16,
+    name: &'static str,
+    _temporary: Option<tempfile::TempDir>,
+}
+
+/// A server before it is started.
+pub struct Builder {
+    program: &'static str,
+    name: &'static str,
+    config: Value,
+    port: u16,
+    environment: Vec<(String, String)>,
+    folder: Option<PathBuf>,
+}
+
+/// A session server that watches these simulation servers (`HOST:PORT`).
+pub fn session_server(simulation_servers: &[String]) -> Builder {
+    let port = ports::block(1);
+    let config = serde_json::json!({
+        "server": "localhost", "ssl": false, "portRewrite": false, "bind": "127.0.0.1", "port": port, "debug": true,
+        "simulationServers": simulation_servers, "loadRefresh": 0.1,
+    });
+    Builder::new(env!("CARGO_BIN_EXE_session-server"), "session-server", config, port)
+}
+
+/// A simulation server with so many places, which starts this program as Webots and allows worlds of
+/// `https://github.com/lab`, taken from the folder `repositories`.
+pub fn simulation_server(webots: &Path, repositories: &Path, places: u16) -> Builder {
+    // Webots may take one of the ten ports that follow its own.
+    let port = ports::block(places + 12);
+    let config = serde_json::json!({
+        "server": "localhost", "ssl": false, "portRewrite": false, "bind": "127.0.0.1", "port": port, "debug": true,
+        "webots": webots, "maxConnections": places, "allowedRepositories": ["https://github.com/lab"],
+        "gitMirrors": {"https://github.com/": format!("file:{}", repositories.display())},
+    });
+    Builder::new(env!("CARGO_BIN_EXE_simulation-server"), "simulation-server", config, port)
+        .env("DEMO_SIMULATOR_BIND", "127.0.0.1")
+}
+
+impl Builder {
+    fn new(program: &'static str, name: &'static str, config: Value, port: u16) -> Self {
+        Self { program, name, config, port, environment: Vec::new(), folder: None }
+    }
+
+    /// Sets a key of the configuration; `a.b` is a key of a part.
+    pub fn set(mut self, key: &str, value: impl Into<Value>) -> Self {
+        let pointer = key.split('.').fold(&mut self.config, |place, part| &mut place[part]);
+        *pointer = value.into();
+        self
+    }
+
+    /// Sets a variable of the environment.
+    pub fn env(mut self, name: &str, value: &str) -> Self {
+        self.environment.push((name.to_owned(), value.to_owned()));
+        self
+    }
+
+    /// Uses a folder that outlives the server, to start another one in it.
+    pub fn folder(mut self, folder: &Path) -> Self {
+        self.folder = Some(folder.to_owned());
+        self
+    }
+
+    /// Writes the configuration and starts the program, without waiting for it.
+    pub fn spawn(mut self) -> Server {
+        let temporary = self.folder.is_none().then(|| tempfile::tempdir().unwrap());
+        let folder = self.folder.take().unwrap_or_else(|| temporary.as_ref().unwrap().path().to_owned());
+        for (key, name) in [("logDir", "log"), ("cacheDir", "cache")] {
+            if self.config.get(key).is_none() && (key == "logDir" || self.name == "simulation-server") {
+                self.config[key] = folder.join(name).to_str().unwrap().into();
+            }
+        }
+        let file = folder.join("config.json");
+        std::fs::write(&file, serde_json::to_string_pretty(&self.config).unwrap()).unwrap();
+        let log = File::options().create(true).append(true).open(folder.join("output.txt")).unwrap();
+        let child = Command::new(self.program)
+            .arg(&file)
+            .envs(self.environment)
+            .stdin(Stdio::null())
+            .stdout(log.try_clone().unwrap())
+            .stderr(log)
+            .spawn()
+            .unwrap();
+        Server { child, folder, port: self.port, name: self.name, _temporary: temporary }
+    }
+
+    /// Starts the program and waits until it answers.
+    pub async fn start(self) -> Server {
+        let mut server = self.spawn();
+        let deadline = Instant::now() + SOON;
+        while http::try_get(&server.url("/health")).await.is_err() {
+            assert!(server.child.try_wait().unwrap().is_none(), "{} has ended", server.name);
+            assert!(Instant::now() < deadline, "{} does not answer", server.name);
+            actix_rt::time::sleep(std::time::Duration::from_millis(5)).await;
+        }
+        server
+    }
+}
+
+impl Server {
+    /// `HOST:PORT`.
+    pub fn address(&self) -> String {
+        format!("127.0.0.1:{}", self.port)
+    }
+
+    /// The URL of a path.
+    pub fn url(&self, path: &str) -> String {
+        format!("http://{}{path}", self.address())
+    }
+
+    /// The WebSocket URL of a path.
+    pub fn websocket(&self, path: &str) -> String {
+        format!("ws://{}{path}", self.address())
+    }
+
+    /// The process id.
+    pub fn pid(&self) -> i32 {
+        i32::try_from(self.child.id()).unwrap()
+    }
+
+    /// Sends a signal to the server itself.
+    pub fn signal(&self, signal: Signal) {
+        kill(Pid::from_raw(self.pid()), signal).unwrap();
+    }
+
+    /// Waits until the server has ended by itself; gives back its exit code.
+    pub async fn ended(&mut self) -> Option<i32> {
+        let deadline = Instant::now() + SOON;
+        loop {
+            if let Some(status) = self.child.try_wait().unwrap() {
+                return status.code();
+            }
+            assert!(Instant::now() < deadline, "{} does not end", self.name);
+            actix_rt::time::sleep(std::time::Duration::from_millis(5)).await;
+        }
+    }
+
+    /// What the server has printed until now.
+    pub fn log(&self) -> String {
+        std::fs::read_to_string(self.folder.join("output.txt")).unwrap_or_default()
+    }
+
+    /// Writes another configuration into the server's file, for SIGHUP.
+    pub fn rewrite_config(&self, change: impl FnOnce(&mut Value)) {
+        let file = self.folder.join("config.json");
+        let mut config: Value = serde_json::from_str(&std::fs::read_to_string(&file).unwrap()).unwrap();
+        change(&mut config);
+        std::fs::write(&file, config.to_string()).unwrap();
+    }
+}
+
+impl Drop for Server {
+    fn drop(&mut self) {
+        self.child.kill().ok();
+        self.child.wait().ok();
+        if std::thread::panicking() {
+            eprintln!("--- {} on port {} ---\n{}---", self.name, self.port, self.log());
+        }
+    }
+}

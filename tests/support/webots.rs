@@ -1,0 +1,46 @@
+//! Stand-ins for Webots: the demo simulator behind a launcher, as the real one is, and scripts that misbehave.
+
+use std::os::unix::fs::PermissionsExt;
+use std::path::{Path, PathBuf};
+
+/// A folder with an executable script called `webots`.
+pub struct Webots {
+    folder: tempfile::TempDir,
+}
+
+impl Webots {
+    /// A script with this text below `#!/usr/bin/env bash`.
+    pub fn script(text: &str) -> Self {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("webots");
+        std::fs::write(&path, format!("#!/usr/bin/env bash\n{text}\n")).unwrap();
+        std::fs::set_permissions(&path, std::fs::Permissions::from_mode(0o755)).unwrap();
+        Self { folder }
+    }
+
+    /// The launcher of the real Webots: it starts the simulator as its child, hands SIGTERM on, and waits.
+    pub fn launcher() -> Self {
+        Self::script(&format!(
+            "trap 'kill -TERM $child' TERM INT\n{} \"$@\" &\nchild=$!\nwait $child\ncode=$?\ntrap - TERM INT\nwait $child 2>/dev/null\nexit $code",
+            env!("CARGO_BIN_EXE_demo-simulator")
+        ))
+    }
+
+    pub fn path(&self) -> PathBuf {
+        self.folder.path().join("webots")
+    }
+}
+
+/// The processes that carry the mark of an instance of a server whose cache is in this folder: pid and command line.
+pub fn instances_below(folder: &Path) -> Vec<(i32, String)> {
+    let folder = folder.canonicalize().unwrap();
+    let mark = std::ffi::OsStr::new("WEBOTS_FLEET_INSTANCE");
+    let processes = procfs::process::all_processes().unwrap().flatten();
+    processes
+        .filter(|process| {
+            let environment = process.environ().unwrap_or_default();
+            environment.get(mark).is_some_and(|value| Path::new(value).starts_with(&folder))
+        })
+        .map(|process| (process.pid(), process.cmdline().unwrap_or_default().join(" ")))
+        .collect()
+}
