@@ -48,10 +48,10 @@ names() {
     done | sort -u
 }
 
-# Whether a process is there. One that has ended and was not waited for has no command line.
+# Whether a process is there; one that has ended and was not waited for does not count.
 alive() { # PID
-    local arguments
-    { mapfile -d '' -t arguments <"/proc/$1/cmdline"; } 2>/dev/null && ((${#arguments[@]} > 0))
+    local stat
+    { read -r stat <"/proc/$1/stat"; } 2>/dev/null && [[ ${stat##*) } != [ZX]* ]]
 }
 
 # The process of a server that runs. A process id in a file says little: it may be another's by now.
@@ -65,12 +65,22 @@ pid_of() { # KIND NAME
     say "$pid"
 }
 
-# The names of which a server runs.
-running_names() {
+# The names that were started and not stopped.
+started_names() {
     local file name
     for file in log/*.pid; do
         name=${file#log/} name=${name%.pid}
-        if pid_of "${name##*.}" "${name%.*}" >/dev/null; then say "${name%.*}"; fi
+        [[ ! -f $file ]] || say "${name%.*}"
+    done | sort -u
+}
+
+# The names of which a server runs.
+running_names() {
+    local name kind
+    for name in $(started_names); do
+        for kind in "${KINDS[@]}"; do
+            if pid_of "$kind" "$name" >/dev/null; then say "$name"; fi
+        done
     done | sort -u
 }
 
@@ -315,6 +325,8 @@ main() {
     local names
     if (($# == 2)); then
         names=("$2")
+    elif [[ $1 == stop ]]; then
+        mapfile -t names < <(started_names)
     else
         mapfile -t names < <(running_names)
     fi
