@@ -1,11 +1,14 @@
 //! The demo, as the README has a newcomer try it.
 
-use nix::sys::signal::{Signal, kill};
+use std::process::Stdio;
+
+use nix::sys::signal::{Signal, kill, killpg};
 use nix::unistd::Pid;
+use tokio::io::AsyncBufReadExt;
 
 use crate::copy::{Project, nothing_is_left, processes_in, run};
 use crate::support::client::Client;
-use crate::support::{http, until};
+use crate::support::{SOON, http, until};
 
 const WORLD: &str = "https://github.com/webots-fleet/demo/blob/main/worlds/playground.wbt";
 
@@ -138,21 +141,32 @@ async fn a_restart_shows_what_was_changed_in_the_demos_project() {
 async fn the_client_of_the_readme_works() {
     let project = Project::copy();
     project.done(&["start", "demo"]).await;
-    let script = r#"timeout 20 "$0" "$1" "$2" | head -n "$3""#;
-    let talk = async |port: u16, path: &str, message: &str, lines: &str| {
-        let output = tokio::process::Command::new("bash")
-            .args(["-c", script])
-            .arg(project.path("tests/websocket.sh"))
-            .args([&format!("ws://localhost:{port}{path}"), message, lines])
-            .stdin(std::process::Stdio::null())
-            .output();
-        String::from_utf8(output.await.unwrap().stdout).unwrap()
+    let talk = async |port: u16, path: &str, message: &str, lines: usize| {
+        let mut child = tokio::process::Command::new(project.path("tests/websocket.sh"))
+            .args([&format!("ws://localhost:{port}{path}"), message])
+            .stdin(Stdio::null())
+            .stdout(Stdio::piped())
+            .process_group(0)
+            .spawn()
+            .unwrap();
+        let group = Pid::from_raw(child.id().unwrap().try_into().unwrap());
+        let mut reader = tokio::io::BufReader::new(child.stdout.take().unwrap()).lines();
+        let mut heard = Vec::new();
+        while heard.len() < lines {
+            let line = actix_rt::time::timeout(SOON, reader.next_line()).await;
+            let Ok(Ok(Some(line))) = line else { panic!("only {heard:?} came") };
+            heard.push(line);
+        }
+        // As Ctrl-C does.
+        killpg(group, Signal::SIGINT).unwrap();
+        actix_rt::time::timeout(SOON, child.wait()).await.unwrap().unwrap();
+        heard
     };
-    let answer = talk(project.session, "/session", WORLD, "2").await;
-    assert_eq!(answer, format!("1\nws://localhost:{}\n", project.simulation));
+    let answer = talk(project.session, "/session", WORLD, 2).await;
+    assert_eq!(answer, ["1".to_owned(), format!("ws://localhost:{}", project.simulation)]);
     let start = serde_json::json!({"start": {"url": WORLD}}).to_string();
-    let answer = talk(project.simulation, "/client", &start, "6").await;
-    assert!(answer.ends_with(&format!("webots:ws://localhost:{}\n", project.simulation + 1)), "{answer}");
+    let answer = talk(project.simulation, "/client", &start, 6).await;
+    assert_eq!(answer[5], format!("webots:ws://localhost:{}", project.simulation + 1), "{answer:?}");
 }
 
 #[actix_rt::test]
