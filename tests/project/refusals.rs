@@ -29,7 +29,8 @@ async fn a_name_that_is_not_configured_is_refused_with_those_that_are() {
 #[actix_rt::test]
 async fn what_runs_already_is_not_started_twice() {
     let project = Project::copy();
-    let (one, other) = futures_util::join!(project.server_sh(&["start", "demo"]), project.server_sh(&["start", "demo"]));
+    let (one, other) =
+        futures_util::join!(project.server_sh(&["start", "demo"]), project.server_sh(&["start", "demo"]));
     let (lost, won) = if one.code == Some(0) { (other, one) } else { (one, other) };
     assert_eq!((won.code, lost.code), (Some(0), Some(1)), "{won:#?} {lost:#?}");
     assert!(lost.errors.contains("already runs"), "{lost:#?}");
