@@ -72,6 +72,8 @@ pub enum AppError {
 
 /// How long the registry may take to pick a server.
 const PATIENCE: Duration = Duration::from_secs(2);
+/// What can come of a request: each is counted from the start.
+const OUTCOMES: [&str; 4] = ["placed", "unavailable", "not_accepted", "wrong_url"];
 
 impl Server {
     /// Asks for a simulation server, and puts the answer in the words of the protocol.
@@ -148,6 +150,9 @@ fn assemble(config: SessionConfig, phase: watch::Receiver<Phase>) -> Result<Serv
     let metrics = Metrics::new();
     let latencies = metrics.histogram("session_report_seconds", "Time in which simulation servers answer")?;
     let picks = metrics.counter("session_requests_total", "Requests for a simulation server", "outcome")?;
+    for outcome in OUTCOMES {
+        picks.with_label_values(&[outcome]).reset();
+    }
     let notices = mailer::start(&config).map(Addr::recipient);
     let (timing, ssl) = (config.timing.clone(), config.ssl);
     let connections = Arc::new(Semaphore::new(config.max_clients));
