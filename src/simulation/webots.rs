@@ -64,6 +64,8 @@ pub struct Webots {
     group: Option<ProcessGroup>,
     tail: Tail,
     listening: bool,
+    /// Whether the simulation is not paused.
+    runs: bool,
     last_sign: Instant,
     hanging: bool,
     /// Why it was asked to end, if it was.
@@ -96,6 +98,7 @@ impl Webots {
             group: None,
             tail: Tail::default(),
             listening: false,
+            runs: false,
             last_sign: Instant::now(),
             hanging: false,
             asked: None,
@@ -184,8 +187,15 @@ impl Webots {
         log::info!("port {port}: ready");
         self.listening = true;
         self.ticket.update(Change::Port(port));
-        self.ticket.update(Change::Stage(Stage::Idle));
+        self.show_pace();
         self.tell(WebotsEvent::Listening(port));
+    }
+
+    /// Shows whether the simulation runs; a Webots that is starting or ending is shown as that.
+    fn show_pace(&self) {
+        if self.listening && self.asked.is_none() {
+            self.ticket.update(Change::Stage(if self.runs { Stage::Running } else { Stage::Idle }));
+        }
     }
 
     fn check_signs(&mut self, _: &mut Context<Self>) {
@@ -269,9 +279,11 @@ impl Handler<Sign> for Webots {
         self.hanging = false;
         match sign {
             Sign::Heartbeat if self.listening => self.tell(WebotsEvent::Heartbeat),
-            Sign::Paused if self.asked.is_none() => self.ticket.update(Change::Stage(Stage::Idle)),
-            Sign::Running if self.asked.is_none() => self.ticket.update(Change::Stage(Stage::Running)),
-            Sign::Heartbeat | Sign::Paused | Sign::Running => {}
+            Sign::Heartbeat => {}
+            Sign::Paused | Sign::Running => {
+                self.runs = sign == Sign::Running;
+                self.show_pace();
+            }
         }
     }
 }
