@@ -101,6 +101,8 @@ impl WebClient {
                 return Err("This simulation server is about to end, and takes no new clients".to_owned());
             }
             self.server.rules.admit(&world, load).map_err(|refusal| refusal.to_string())?;
+            // Nobody has to wait for a checkout only to learn that there is nothing to start.
+            self.server.webots_program()?;
             Ok(world)
         });
         let world = match admitted {
