@@ -24,4 +24,5 @@ mod protocol;
 mod readings;
 mod ready;
 mod scene;
+mod soak;
 mod stopping;
