@@ -136,6 +136,7 @@ mod tests {
     use super::super::server::Instances;
     use super::*;
     use proptest::prelude::*;
+    use std::time::Duration;
 
     fn policy(initial_cost: f64) -> Policy {
         Policy { initial_cost, ..Policy::default() }
