@@ -65,7 +65,7 @@ fn arrival(stream: &TcpStream, value: u8) -> Duration {
 /// When the registry decided the last change, as its log says, to the millisecond.
 fn decision(server: &Server) -> Duration {
     let log = server.log();
-    let line = log.lines().rfind(|line| line.contains("clients are told")).expect("a decision");
+    let line = log.lines().rfind(|line| line.contains("simulation server is available")).expect("a decision");
     let at: SystemTime = line[..24].parse::<jiff::Timestamp>().expect("a time").into();
     at.duration_since(SystemTime::UNIX_EPOCH).expect("it is later than 1970")
 }
@@ -79,9 +79,9 @@ pub(crate) fn measure(verdict: &mut Verdict) {
     for change in 0..CHANGES {
         // The only simulation server has a load of 5 %.
         let (threshold, value) = if change % 2 == 0 { (4, b'0') } else { (95, b'1') };
-        let decisions = server.log().matches("clients are told").count();
+        let decisions = server.log().matches("simulation server is available").count();
         server.reread(threshold);
-        server.wait_until(|server| server.log().matches("clients are told").count() > decisions);
+        server.wait_until(|server| server.log().matches("simulation server is available").count() > decisions);
         std::thread::sleep(PAUSE);
         let arrivals: Vec<Duration> = clients.iter().map(|client| arrival(client, value)).collect();
         let decided = decision(&server);
