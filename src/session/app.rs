@@ -8,6 +8,7 @@ use actix::prelude::*;
 use actix_web::{App, HttpServer, web};
 use tokio::sync::{Semaphore, watch};
 
+use super::audience::Audience;
 use super::config::SessionConfig;
 use super::mailer;
 use super::registry::{Reconfigure, Registry};
@@ -58,12 +59,13 @@ pub async fn run(mut config: SessionConfig, file: PathBuf) -> Result<(), AppErro
     let told = config.address().http_url(config.ssl);
     let server = Arc::new(assemble(config, phase)?);
     let shared = web::Data::from(Arc::clone(&server));
-    let http = HttpServer::new(move || App::new().app_data(shared.clone()).configure(routes::configure))
-        .disable_signals()
-        .shutdown_timeout(stop.as_secs())
-        .backlog(4096)
-        .listen(socket)?
-        .run();
+    // This is called in each thread that serves connections.
+    let app = move || {
+        let audience = Audience::new(Arc::clone(&shared)).start();
+        App::new().app_data(shared.clone()).app_data(web::Data::new(audience)).configure(routes::configure)
+    };
+    let http =
+        HttpServer::new(app).disable_signals().shutdown_timeout(stop.as_secs()).backlog(4096).listen(socket)?.run();
     let handle = http.handle();
     let serving = actix_rt::spawn(http);
     log::info!("session server {} listens on port {port}: {told}", env!("CARGO_PKG_VERSION"));
@@ -99,10 +101,11 @@ fn assemble(config: SessionConfig, phase: watch::Receiver<Phase>) -> Result<Serv
     }
     let notices = mailer::start(&config).map(Addr::recipient);
     let (timing, ssl) = (config.timing.clone(), config.ssl);
-    let connections = Arc::new(Semaphore::new(config.max_clients));
+    let max_clients = config.max_clients;
+    let connections = Arc::new(Semaphore::new(max_clients));
     let registry = Registry::new(Arc::new(config), notices, latencies).start();
     let (started, started_at) = (Instant::now(), SystemTime::now());
-    Ok(Server { registry, timing, ssl, phase, connections, metrics, picks, started, started_at })
+    Ok(Server { registry, timing, ssl, phase, connections, max_clients, metrics, picks, started, started_at })
 }
 
 /// Reads the configuration again. One that can't be used changes nothing.

@@ -24,6 +24,8 @@ pub struct Server {
     pub phase: watch::Receiver<Phase>,
     /// Counts WebSockets.
     pub connections: Arc<Semaphore>,
+    /// How many WebSockets may be open.
+    pub max_clients: usize,
     /// What is counted.
     pub metrics: Metrics,
     /// Requests for a simulation server, by what came of them.
@@ -46,6 +48,12 @@ pub struct Answer {
 const PATIENCE: Duration = Duration::from_secs(2);
 
 impl Server {
+    /// How many web clients are connected.
+    #[must_use]
+    pub fn clients(&self) -> usize {
+        self.max_clients.saturating_sub(self.connections.available_permits())
+    }
+
     /// Asks for a simulation server, and puts the answer in the words of the protocol.
     pub async fn pick(&self, wanted: Result<Pick, NoServer>) -> Answer {
         let picked = match wanted {
