@@ -10,7 +10,8 @@ use tokio::sync::{Semaphore, watch};
 
 use super::config::{SessionConfig, Timing};
 use super::mailer;
-use super::registry::{NoServer, Pick, Reconfigure, Registry};
+use super::pick::{NoServer, Pick};
+use super::registry::{Reconfigure, Registry};
 use super::routes;
 use crate::shared::config;
 use crate::shared::metrics::Metrics;
@@ -100,12 +101,13 @@ impl Server {
 ///
 /// # Errors
 /// When it can't start, or an actor that must live is gone.
-pub async fn run(config: SessionConfig, file: PathBuf) -> Result<(), AppError> {
+pub async fn run(mut config: SessionConfig, file: PathBuf) -> Result<(), AppError> {
     let mut signals = Signals::catch()?;
     let (phase_sender, phase) = watch::channel(Phase::Open);
     let address = format!("{}:{}", config.bind, config.port);
     let socket = std::net::TcpListener::bind(&address).map_err(|source| AppError::Bind { address, source })?;
     let port = socket.local_addr()?.port();
+    config.port = port;
     let stop = config.timing.stop;
     let told = config.address().http_url(config.ssl);
     let server = Arc::new(assemble(config, phase)?);

@@ -1,6 +1,7 @@
 //! The session server: the one door to a fleet of simulation servers.
 
 pub mod app;
+pub mod changes;
 pub mod config;
 pub mod fleet_status;
 pub mod letter;
@@ -8,10 +9,13 @@ pub mod mail_address;
 pub mod mailer;
 pub mod notices;
 pub mod outbox;
+pub mod pick;
 pub mod placement;
 pub mod registry;
 pub mod routes;
 pub mod server_monitor;
 pub mod smtp;
 pub mod status;
+pub mod subscribers;
+pub mod watched;
 pub mod web_client;

@@ -13,7 +13,8 @@ use rand::RngExt;
 
 use super::app::Server;
 use super::fleet_status::{FleetStatus, told_mean};
-use super::registry::{GetStatus, IsAvailable, NoServer, Pick, Registry};
+use super::pick::{NoServer, Pick};
+use super::registry::{GetStatus, IsAvailable, Registry};
 use super::status::{self, Page, StatusPage};
 use super::web_client::WebClient;
 use crate::shared::metrics::CONTENT_TYPE;
