@@ -6,7 +6,7 @@ use std::time::{Duration, Instant, SystemTime};
 
 use actix::prelude::*;
 use actix_web::{App, HttpServer, web};
-use tokio::sync::{Semaphore, watch};
+use tokio::sync::watch;
 
 use super::config::{SessionConfig, Timing};
 use super::mailer;
@@ -15,7 +15,9 @@ use super::registry::{Reconfigure, Registry};
 use super::routes;
 use crate::shared::config;
 use crate::shared::metrics::Metrics;
+use crate::shared::peer::TrustedProxies;
 use crate::shared::permanent;
+use crate::shared::seats::Seats;
 use crate::shared::shutdown::{Phase, Request, Signals};
 
 /// What routes and web clients share.
@@ -29,7 +31,9 @@ pub struct Server {
     /// Whether clients are taken.
     pub phase: watch::Receiver<Phase>,
     /// Counts WebSockets.
-    pub connections: Arc<Semaphore>,
+    pub seats: Seats,
+    /// Whose word on clients' addresses is taken.
+    pub trusted_proxies: TrustedProxies,
     /// What is counted.
     pub metrics: Metrics,
     /// Requests for a simulation server, by what came of them.
@@ -150,10 +154,11 @@ fn assemble(config: SessionConfig, phase: watch::Receiver<Phase>) -> Result<Serv
     let picks = metrics.counter("session_requests_total", "Requests for a simulation server", "outcome")?;
     let notices = mailer::start(&config).map(Addr::recipient);
     let (timing, ssl) = (config.timing.clone(), config.ssl);
-    let connections = Arc::new(Semaphore::new(config.max_clients));
+    let seats = Seats::new(config.max_clients, config.max_clients_per_address);
+    let trusted_proxies = config.trusted_proxies.clone();
     let registry = Registry::new(Arc::new(config), notices, latencies).start();
     let (started, started_at) = (Instant::now(), SystemTime::now());
-    Ok(Server { registry, timing, ssl, phase, connections, metrics, picks, started, started_at })
+    Ok(Server { registry, timing, ssl, phase, seats, trusted_proxies, metrics, picks, started, started_at })
 }
 
 /// Reads the configuration again. One that can't be used changes nothing.

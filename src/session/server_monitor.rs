@@ -17,6 +17,7 @@ use awc::error::SendRequestError;
 use crate::shared::address::PublicAddress;
 use crate::shared::load::Load;
 use crate::shared::status::Dispatch;
+use crate::shared::tls;
 
 /// What was learned about a simulation server.
 #[derive(Message, Debug)]
@@ -92,7 +93,10 @@ enum Answer {
 pub fn client(refresh: Duration) -> awc::Client {
     let idle = (refresh * 3).max(Duration::from_secs(15));
     // The default limit of the pool is 100 connections. A look as a whole has a time limit, its parts have none.
-    let connector = awc::Connector::new().limit(0).conn_keep_alive(idle).timeout(NEVER);
+    let mut connector = awc::Connector::new().limit(0).conn_keep_alive(idle).timeout(NEVER);
+    if let Some(config) = tls::client_config() {
+        connector = connector.rustls_0_23(config);
+    }
     awc::Client::builder().connector(connector).disable_timeout().disable_redirects().finish()
 }
 
@@ -207,7 +211,7 @@ async fn get(client: &awc::Client, url: &str) -> Result<Option<actix_web::web::B
         Err(broken) if !matches!(broken, SendRequestError::Connect(_)) => client.get(url).send().await,
         answer => answer,
     }
-    .map_err(|error| Unreachable::Refused(shortened(&error.to_string())))?;
+    .map_err(|error| Unreachable::Refused(tls::reason(&error).unwrap_or_else(|| shortened(&error.to_string()))))?;
     let status = answer.status();
     if status == awc::http::StatusCode::NOT_FOUND {
         return Ok(None);

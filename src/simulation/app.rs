@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use actix::prelude::*;
 use actix_web::dev::ServerHandle;
 use actix_web::{App, HttpServer, web};
-use tokio::sync::{Semaphore, watch};
+use tokio::sync::watch;
 
 use super::announcer::Announcer;
 use super::checkout::Checkouts;
@@ -25,6 +25,7 @@ use crate::shared::admission::Rules;
 use crate::shared::load::Load;
 use crate::shared::metrics::Metrics;
 use crate::shared::permanent;
+use crate::shared::seats::Seats;
 use crate::shared::shutdown::{Phase, Request, Signals};
 
 /// What routes and web clients share.
@@ -50,7 +51,7 @@ pub struct Server {
     /// Where Webots' actors live.
     pub main_thread: ArbiterHandle,
     /// Counts connections.
-    pub connections: Arc<Semaphore>,
+    pub seats: Seats,
     /// What is counted.
     pub metrics: Metrics,
     /// Clients that asked for a simulation, by what came of it.
@@ -226,7 +227,7 @@ fn assemble(
         phase,
         requests,
         main_thread: Arbiter::current(),
-        connections: Arc::new(Semaphore::new(config.max_clients)),
+        seats: Seats::new(config.max_clients, config.max_clients_per_address),
         metrics,
         starts,
         started: Instant::now(),
