@@ -140,7 +140,7 @@ mod tests {
 
     use actix_web::http::header::{HeaderName, HeaderValue};
 
-    fn resolve(trusted: &[&str], connected: &str, headers: &[(&'static str, &str)]) -> Peer {
+    fn resolve(trusted: &[&str], connected: &str, headers: Headers<'_>) -> Peer {
         let trusted: Vec<String> = trusted.iter().map(|&text| text.to_owned()).collect();
         let mut map = HeaderMap::new();
         for (name, value) in headers {
@@ -149,10 +149,12 @@ mod tests {
         TrustedProxies::try_from(trusted).unwrap().resolve(connected.parse().unwrap(), &map)
     }
 
+    type Headers<'a> = &'a [(&'static str, &'a str)];
+
     #[test]
     fn the_client_is_who_the_nearest_trusted_proxy_saw() {
         let (common, standard) = ("x-forwarded-for", "forwarded");
-        let table: &[(&str, &[(&str, &str)], &str, &str)] = &[
+        let table: &[(&str, Headers<'_>, &str, &str)] = &[
             ("203.0.113.9", &[(common, "1.1.1.1")], "203.0.113.9", "a stranger's word on itself"),
             ("127.0.0.1", &[(common, "203.0.113.9")], "203.0.113.9", "one proxy"),
             ("127.0.0.1", &[(common, "1.1.1.1, 203.0.113.9")], "203.0.113.9", "the client wrote one itself"),

@@ -56,14 +56,16 @@ fn mistrust(problem: &CertificateError) -> String {
             "it comes from an authority that is not known here (update-ca-certificates and SSL_CERT_FILE make one known)"
                 .to_owned()
         }
-        CertificateError::ExpiredContext { not_after, .. } => format!("it expired {}", date(not_after.as_secs())),
+        CertificateError::ExpiredContext { not_after, .. } => format!("it expired on {}", date(not_after.as_secs())),
         CertificateError::NotValidYetContext { not_before, .. } => {
             format!("it is valid only from {}", date(not_before.as_secs()))
         }
         CertificateError::NotValidForNameContext { expected, presented } => {
-            let names: String = presented.join(", ").chars().filter(|letter| !letter.is_control()).take(200).collect();
+            let names: Vec<&str> = presented.iter().map(|name| bare(name)).collect();
+            let names: String = names.join(", ").chars().filter(|letter| !letter.is_control()).take(200).collect();
             format!("it is for {names}, not for {}", expected.to_str())
         }
+        CertificateError::BadSignature => "the authority that it names has not signed it".to_owned(),
         CertificateError::Revoked => "it was revoked".to_owned(),
         other if format!("{other:?}").contains("CaUsedAsEndEntity") => {
             "it is that of an authority (CA:TRUE), where one of a server is needed".to_owned()
@@ -72,7 +74,13 @@ fn mistrust(problem: &CertificateError) -> String {
     }
 }
 
+/// A name as rustls tells it, `DnsName("lab.org")`, without its kind.
+fn bare(name: &str) -> &str {
+    let inner = name.split_once('(').and_then(|(_, rest)| rest.strip_suffix(')'));
+    inner.map_or(name, |inner| inner.trim_matches('"'))
+}
+
 fn date(seconds: u64) -> String {
     let time = i64::try_from(seconds).ok().and_then(|seconds| jiff::Timestamp::from_second(seconds).ok());
-    time.map_or_else(|| "at a time that is none".to_owned(), |time| format!("on {time:.0}"))
+    time.map_or_else(|| "a day that is none".to_owned(), |time| format!("{time:.0}"))
 }
