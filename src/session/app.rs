@@ -2,55 +2,22 @@
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::time::{Duration, Instant, SystemTime};
+use std::time::{Instant, SystemTime};
 
 use actix::prelude::*;
 use actix_web::{App, HttpServer, web};
 use tokio::sync::watch;
 
-use super::config::{SessionConfig, Timing};
+use super::config::SessionConfig;
 use super::mailer;
-use super::pick::{NoServer, Pick};
 use super::registry::{Reconfigure, Registry};
 use super::routes;
+use super::server::Server;
 use crate::shared::config;
 use crate::shared::metrics::Metrics;
-use crate::shared::peer::TrustedProxies;
 use crate::shared::permanent;
 use crate::shared::seats::Seats;
 use crate::shared::shutdown::{Phase, Request, Signals};
-
-/// What routes and web clients share.
-pub struct Server {
-    /// Owns the fleet's state.
-    pub registry: Addr<Registry>,
-    /// Durations.
-    pub timing: Timing,
-    /// Whether URLs begin with `wss`.
-    pub ssl: bool,
-    /// Whether clients are taken.
-    pub phase: watch::Receiver<Phase>,
-    /// Counts WebSockets.
-    pub seats: Seats,
-    /// Whose word on clients' addresses is taken.
-    pub trusted_proxies: TrustedProxies,
-    /// What is counted.
-    pub metrics: Metrics,
-    /// Requests for a simulation server, by what came of them.
-    pub picks: prometheus::IntCounterVec,
-    /// When the server was started.
-    pub started: Instant,
-    /// The same, as a time of day.
-    pub started_at: SystemTime,
-}
-
-/// The answer to a request for a simulation server.
-pub struct Answer {
-    /// A URL, or `Error: ...`.
-    pub text: String,
-    /// Why there is no URL.
-    pub refusal: Option<NoServer>,
-}
 
 /// Why the server can't go on.
 #[derive(Debug, thiserror::Error)]
@@ -74,32 +41,8 @@ pub enum AppError {
     Gone(String),
 }
 
-/// How long the registry may take to pick a server.
-const PATIENCE: Duration = Duration::from_secs(2);
-
-impl Server {
-    /// Asks for a simulation server, and puts the answer in the words of the protocol.
-    pub async fn pick(&self, wanted: Result<Pick, NoServer>) -> Answer {
-        let picked = match wanted {
-            Ok(pick) => {
-                let picked = actix_rt::time::timeout(PATIENCE, self.registry.send(pick)).await;
-                picked.ok().and_then(Result::ok).unwrap_or(Err(NoServer::Unavailable))
-            }
-            Err(wrong) => Err(wrong),
-        };
-        let outcome = match &picked {
-            Ok(_) => "placed",
-            Err(NoServer::Unavailable) => "unavailable",
-            Err(NoServer::NotAccepted(_)) => "not_accepted",
-            Err(NoServer::NoWorld(_)) => "wrong_url",
-        };
-        self.picks.with_label_values(&[outcome]).inc();
-        match picked {
-            Ok(address) => Answer { text: address.websocket_url(self.ssl), refusal: None },
-            Err(refusal) => Answer { text: refusal.to_string(), refusal: Some(refusal) },
-        }
-    }
-}
+/// What can come of a request: each is counted from the start.
+const OUTCOMES: [&str; 4] = ["placed", "unavailable", "not_accepted", "wrong_url"];
 
 /// Runs the server until it is asked to stop. `file` is read again on SIGHUP.
 ///
@@ -152,6 +95,9 @@ fn assemble(config: SessionConfig, phase: watch::Receiver<Phase>) -> Result<Serv
     let metrics = Metrics::new();
     let latencies = metrics.histogram("session_report_seconds", "Time in which simulation servers answer")?;
     let picks = metrics.counter("session_requests_total", "Requests for a simulation server", "outcome")?;
+    for outcome in OUTCOMES {
+        picks.with_label_values(&[outcome]).reset();
+    }
     let notices = mailer::start(&config).map(Addr::recipient);
     let (timing, ssl) = (config.timing.clone(), config.ssl);
     let seats = Seats::new(config.max_clients, config.max_clients_per_address);

@@ -11,10 +11,10 @@ use actix_web_actors::ws::WsResponseBuilder;
 use askama::Template;
 use rand::RngExt;
 
-use super::app::Server;
 use super::fleet_status::{FleetStatus, told_mean};
 use super::pick::{NoServer, Pick};
 use super::registry::{GetStatus, IsAvailable, Registry};
+use super::server::Server;
 use super::status::{self, Page, StatusPage};
 use super::web_client::WebClient;
 use crate::shared::metrics::CONTENT_TYPE;

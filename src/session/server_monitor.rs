@@ -12,7 +12,7 @@ use std::fmt;
 use std::time::{Duration, Instant};
 
 use actix::prelude::*;
-use awc::error::SendRequestError;
+use awc::error::{ConnectError, SendRequestError};
 
 use crate::shared::address::PublicAddress;
 use crate::shared::load::Load;
@@ -208,10 +208,10 @@ async fn exchange(client: &awc::Client, url: &str, load_only: bool) -> Result<An
 async fn get(client: &awc::Client, url: &str) -> Result<Option<actix_web::web::Bytes>, Unreachable> {
     let answer = match client.get(url).send().await {
         // A connection that was kept may have ended just now: that says nothing of the server.
-        Err(broken) if !matches!(broken, SendRequestError::Connect(_)) => client.get(url).send().await,
+        Err(error) if is_broken(&error) => client.get(url).send().await,
         answer => answer,
     }
-    .map_err(|error| Unreachable::Refused(tls::reason(&error).unwrap_or_else(|| shortened(&error.to_string()))))?;
+    .map_err(no_answer)?;
     let status = answer.status();
     if status == awc::http::StatusCode::NOT_FOUND {
         return Ok(None);
@@ -221,6 +221,18 @@ async fn get(client: &awc::Client, url: &str) -> Result<Option<actix_web::web::B
     }
     let body = answer.timeout(NEVER).body().limit(LARGEST_ANSWER).await;
     body.map(Some).map_err(|error| Unreachable::BadAnswer(shortened(&error.to_string())))
+}
+
+/// Whether a connection ended, as opposed to one that could not be made.
+fn is_broken(error: &SendRequestError) -> bool {
+    !matches!(error, SendRequestError::Connect(reason) if !matches!(reason, ConnectError::Disconnected))
+}
+
+fn no_answer(error: SendRequestError) -> Unreachable {
+    Unreachable::Refused(match error {
+        SendRequestError::Connect(ConnectError::Disconnected) => "it was closed without an answer".to_owned(),
+        error => tls::reason(&error).unwrap_or_else(|| shortened(&error.to_string())),
+    })
 }
 
 /// Some servers of the Python family have a `/status` with less in it; a page that is no status at all counts as none.

@@ -9,9 +9,9 @@ use actix::prelude::*;
 use actix_web_actors::ws::{CloseCode, CloseReason, Message, ProtocolError, WebsocketContext};
 use serde::Deserialize;
 
-use super::app::Server;
 use super::pick::Pick;
 use super::registry::{Subscribe, Subscription};
+use super::server::Server;
 use super::subscribers::Availability;
 use crate::shared::liveness::Liveness;
 use crate::shared::peer::Peer;

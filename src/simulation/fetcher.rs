@@ -89,16 +89,18 @@ impl Fetcher {
         progress: &(impl Fn(String) + Send + Sync),
     ) -> Result<Arc<Fetched>, CheckoutError> {
         let (mut result, mut news) = self.join_or_start(world);
-        let mut told: Option<Instant> = None;
+        let mut told = Instant::now().checked_sub(BETWEEN_NEWS).unwrap_or_else(Instant::now);
         loop {
+            let step = async {
+                // What comes too soon waits, and only the newest of it is told.
+                actix_rt::time::sleep_until((told + BETWEEN_NEWS).into()).await;
+                news.changed().await.map(|()| news.borrow_and_update().clone())
+            };
             tokio::select! {
                 fetched = &mut result => return fetched,
-                Ok(()) = news.changed() => {
-                    let step = news.borrow_and_update().clone();
-                    if told.is_none_or(|told| told.elapsed() >= BETWEEN_NEWS) {
-                        told = Some(Instant::now());
-                        progress(step);
-                    }
+                Ok(step) = step => {
+                    told = Instant::now();
+                    progress(step);
                 }
             }
         }

@@ -9,9 +9,9 @@ use actix_web::{HttpRequest, HttpResponse, web};
 use actix_web_actors::ws::WsResponseBuilder;
 use askama::Template;
 
-use super::app::Server;
 use super::census::Everybody;
 use super::places::Census;
+use super::server::Server;
 use super::status::{self, Page, StatusPage};
 use super::web_client::WebClient;
 use crate::shared::auth::is_authorised;

@@ -5,9 +5,9 @@ use std::path::Path;
 use askama::Template;
 use serde::Serialize;
 
-use super::app::Server;
 use super::census::{Everybody, Simulation};
 use super::sensors::{Gpu, Host, Machine};
+use super::server::Server;
 use crate::shared::metrics::Gauge;
 use crate::shared::status::Dispatch;
 

@@ -8,7 +8,6 @@ use std::sync::Arc;
 use actix::prelude::*;
 use actix_web_actors::ws::{self, CloseCode, CloseReason, Message, ProtocolError, WebsocketContext};
 
-use super::app::Server;
 use super::census::Change;
 use super::checkout::Project;
 use super::checkout_error::CheckoutError;
@@ -16,6 +15,7 @@ use super::lease::{Lease, Stage, Wanted};
 use super::outcome::{Outcome, Pending};
 use super::places::{Ask, PlaceEvent, Ticket};
 use super::protocol::{self, Mode, Request};
+use super::server::Server;
 use super::webots::{Orders, RestoreController, Webots};
 use super::webots_event::{Exit, WebotsEvent};
 use crate::shared::liveness::Liveness;
@@ -101,6 +101,8 @@ impl WebClient {
                 return Err("This simulation server is about to end, and takes no new clients".to_owned());
             }
             self.server.rules.admit(&world, load).map_err(|refusal| refusal.to_string())?;
+            // Nobody has to wait for a checkout only to learn that there is nothing to start.
+            self.server.webots_program()?;
             Ok(world)
         });
         let world = match admitted {

@@ -76,6 +76,8 @@ pub struct Webots {
 const MISSED_HEARTBEATS: u32 = 6;
 /// If its port is taken, Webots silently takes one of so many that follow.
 const NEXT_PORTS: u16 = 10;
+/// How long the rest of an output may take to be read.
+const LAST_WORDS: Duration = Duration::from_secs(1);
 /// Between two looks whether Webots listens, at first.
 const FIRST_LOOK: Duration = Duration::from_millis(10);
 /// Between two looks whether Webots listens, at most.
@@ -108,7 +110,8 @@ impl Webots {
     fn launch(&mut self, ctx: &mut Context<Self>) -> std::io::Result<()> {
         let log = self.config.log_dir.0.join("simulation/instances").join(format!("{}.log", self.port));
         let (reader, output) = std::io::pipe()?;
-        self.tail = output::follow(reader, &log, ctx.address())?;
+        let (tail, all_read) = output::follow(reader, &log, ctx.address())?;
+        self.tail = tail;
         let errors = output.try_clone()?;
         let (group, ended) = ProcessGroup::start(&self.plan(), output.into(), errors.into())?;
         log::info!(
@@ -120,6 +123,12 @@ impl Webots {
         );
         self.ticket.update(Change::Launched { port: self.port, log });
         self.group = Some(group);
+        let ended = async move {
+            let ending = ended.await;
+            // What was printed last tells why. A process that nobody can end may keep the pipe open.
+            actix_rt::time::timeout(LAST_WORDS, all_read).await.ok();
+            ending
+        };
         ended.into_actor(self).map(|ending, this, ctx| this.ended(ending, ctx)).spawn(ctx);
         self.look_for_port(FIRST_LOOK, ctx);
         ctx.run_interval(self.config.timing.heartbeat, Self::check_signs);
