@@ -64,7 +64,7 @@ impl WebServer {
         let program = self.program();
         assert!(
             Path::new(program).exists(),
-            "this test needs Debian's web servers, and {program} is missing: apt install apache2 nginx"
+            "this test needs Debian's web servers, and {program} is missing: apt install apache2-bin nginx"
         );
         let conf = self.folder.path().join("main.conf");
         let output = std::fs::File::options().create(true).append(true).open(self.error_log()).unwrap();
