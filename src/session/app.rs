@@ -6,7 +6,7 @@ use std::time::{Instant, SystemTime};
 
 use actix::prelude::*;
 use actix_web::{App, HttpServer, web};
-use tokio::sync::{Semaphore, watch};
+use tokio::sync::watch;
 
 use super::audience::Audience;
 use super::config::SessionConfig;
@@ -17,6 +17,7 @@ use super::server::Server;
 use crate::shared::config;
 use crate::shared::metrics::Metrics;
 use crate::shared::permanent;
+use crate::shared::seats::Seats;
 use crate::shared::shutdown::{Phase, Request, Signals};
 
 /// Why the server can't go on.
@@ -101,11 +102,11 @@ fn assemble(config: SessionConfig, phase: watch::Receiver<Phase>) -> Result<Serv
     }
     let notices = mailer::start(&config).map(Addr::recipient);
     let (timing, ssl) = (config.timing.clone(), config.ssl);
-    let max_clients = config.max_clients;
-    let connections = Arc::new(Semaphore::new(max_clients));
+    let seats = Seats::new(config.max_clients, config.max_clients_per_address);
+    let trusted_proxies = config.trusted_proxies.clone();
     let registry = Registry::new(Arc::new(config), notices, latencies).start();
     let (started, started_at) = (Instant::now(), SystemTime::now());
-    Ok(Server { registry, timing, ssl, phase, connections, max_clients, metrics, picks, started, started_at })
+    Ok(Server { registry, timing, ssl, phase, seats, trusted_proxies, metrics, picks, started, started_at })
 }
 
 /// Reads the configuration again. One that can't be used changes nothing.

@@ -111,11 +111,12 @@ fn websocket(
     server: &web::Data<Server>,
     audience: &Addr<Audience>,
 ) -> HttpResponse {
-    let Ok(permit) = Arc::clone(&server.connections).try_acquire_owned() else {
-        return HttpResponse::ServiceUnavailable().body("Error: too many connections.");
+    let peer = server.trusted_proxies.peer(request);
+    let seat = match server.seats.take(peer) {
+        Ok(seat) => seat,
+        Err(crowded) => return crowded.answer(),
     };
-    let peer = request.peer_addr().map(|address| address.ip());
-    let actor = WebClient::new(Arc::clone(server), audience.clone(), peer, permit);
+    let actor = WebClient::new(Arc::clone(server), audience.clone(), peer, seat);
     WsResponseBuilder::new(actor, request, stream).frame_size(LARGEST_MESSAGE).start().unwrap_or_else(|error| {
         let problem = format!("Error: this is a WebSocket: {error}.");
         HttpResponse::build(error.as_response_error().status_code()).body(problem)

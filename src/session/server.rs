@@ -1,15 +1,16 @@
 //! What the routes, the pages and the web clients of a session server share. Made by `app`.
 
-use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
 use actix::prelude::*;
-use tokio::sync::{Semaphore, watch};
+use tokio::sync::watch;
 
 use super::config::Timing;
 use super::pick::{NoServer, Pick};
 use super::registry::Registry;
 use crate::shared::metrics::Metrics;
+use crate::shared::peer::TrustedProxies;
+use crate::shared::seats::Seats;
 use crate::shared::shutdown::Phase;
 
 /// What routes and web clients share.
@@ -23,9 +24,9 @@ pub struct Server {
     /// Whether clients are taken.
     pub phase: watch::Receiver<Phase>,
     /// Counts WebSockets.
-    pub connections: Arc<Semaphore>,
-    /// How many WebSockets may be open.
-    pub max_clients: usize,
+    pub seats: Seats,
+    /// Whose word on clients' addresses is taken.
+    pub trusted_proxies: TrustedProxies,
     /// What is counted.
     pub metrics: Metrics,
     /// Requests for a simulation server, by what came of them.
@@ -51,7 +52,7 @@ impl Server {
     /// How many web clients are connected.
     #[must_use]
     pub fn clients(&self) -> usize {
-        self.max_clients.saturating_sub(self.connections.available_permits())
+        self.seats.taken()
     }
 
     /// Asks for a simulation server, and puts the answer in the words of the protocol.

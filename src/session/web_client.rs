@@ -3,43 +3,38 @@
 //! Created by the route for each connection; ends with it. It joins the audience of its thread, and never tells the
 //! same value twice. A text from the client asks for a simulation server.
 
-use std::net::IpAddr;
 use std::sync::Arc;
 
 use actix::prelude::*;
 use actix_web_actors::ws::{CloseCode, CloseReason, Message, ProtocolError, WebsocketContext};
 use serde::Deserialize;
-use tokio::sync::OwnedSemaphorePermit;
 
-use super::audience::{Audience, Join, Seat};
+use super::audience::{Audience, Join, Membership};
 use super::pick::Pick;
 use super::server::Server;
 use super::subscribers::News;
 use crate::shared::liveness::Liveness;
+use crate::shared::peer::Peer;
+use crate::shared::seats::Seat;
 
 /// The actor.
 pub struct WebClient {
     server: Arc<Server>,
-    peer: Option<IpAddr>,
+    peer: Peer,
     liveness: Liveness,
     told: Option<bool>,
     audience: Addr<Audience>,
-    seat: Option<Seat>,
-    _permit: OwnedSemaphorePermit,
+    membership: Option<Membership>,
+    _seat: Seat,
 }
 
 type Context = WebsocketContext<WebClient>;
 
 impl WebClient {
-    /// A client that has just connected; `permit` counts it.
+    /// A client that has just connected; `seat` counts it.
     #[must_use]
-    pub fn new(
-        server: Arc<Server>,
-        audience: Addr<Audience>,
-        peer: Option<IpAddr>,
-        permit: OwnedSemaphorePermit,
-    ) -> Self {
-        Self { server, peer, liveness: Liveness::new(), told: None, audience, seat: None, _permit: permit }
+    pub fn new(server: Arc<Server>, audience: Addr<Audience>, peer: Peer, seat: Seat) -> Self {
+        Self { server, peer, liveness: Liveness::new(), told: None, audience, membership: None, _seat: seat }
     }
 
     fn close(code: CloseCode, ctx: &mut Context) {
@@ -49,7 +44,7 @@ impl WebClient {
 
     fn ping(&mut self, ctx: &mut Context) {
         if self.liveness.is_gone(self.server.timing.silence) {
-            log::debug!("client {:?}: silent for too long", self.peer);
+            log::debug!("client {}: silent for too long", self.peer);
             ctx.stop();
         } else {
             ctx.ping(&self.liveness.ping());
@@ -85,7 +80,7 @@ impl Actor for WebClient {
         let subscribed = self.audience.send(Join(ctx.address().recipient())).into_actor(self);
         subscribed
             .map(|answer, client, ctx| match answer {
-                Ok(seat) => client.seat = Some(seat),
+                Ok(membership) => client.membership = Some(membership),
                 Err(error) => {
                     log::error!("a client can't be told of changes: {error}");
                     Self::close(CloseCode::Error, ctx);
@@ -121,12 +116,12 @@ impl StreamHandler<Result<Message, ProtocolError>> for WebClient {
             }
             Ok(Message::Nop) => {}
             Ok(Message::Text(_) | Message::Ping(_)) => {
-                log::warn!("client {:?}: asks without reading the answers", self.peer);
+                log::warn!("client {}: asks without reading the answers", self.peer);
                 Self::close(CloseCode::Policy, ctx);
             }
             Ok(Message::Binary(_) | Message::Continuation(_)) => Self::close(CloseCode::Unsupported, ctx),
             Err(error) => {
-                log::debug!("client {:?}: {error}", self.peer);
+                log::debug!("client {}: {error}", self.peer);
                 Self::close(CloseCode::Protocol, ctx);
             }
         }

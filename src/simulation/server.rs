@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use actix::prelude::*;
-use tokio::sync::{Semaphore, watch};
+use tokio::sync::watch;
 
 use super::checkout::Checkouts;
 use super::command::is_in_path;
@@ -16,6 +16,7 @@ use super::places::Places;
 use crate::shared::admission::Rules;
 use crate::shared::load::Load;
 use crate::shared::metrics::Metrics;
+use crate::shared::seats::Seats;
 use crate::shared::shutdown::{Phase, Request};
 
 /// What routes and web clients share.
@@ -41,7 +42,7 @@ pub struct Server {
     /// Where Webots' actors live.
     pub main_thread: ArbiterHandle,
     /// Counts connections.
-    pub connections: Arc<Semaphore>,
+    pub seats: Seats,
     /// What is counted.
     pub metrics: Metrics,
     /// Clients that asked for a simulation, by what came of it.
