@@ -8,11 +8,12 @@ use actix::prelude::*;
 use actix_web::{App, HttpServer, web};
 use tokio::sync::{Semaphore, watch};
 
-use super::config::{SessionConfig, Timing};
+use super::config::{Example, SessionConfig, Timing};
 use super::mailer;
 use super::registry::{NoServer, Pick, Reconfigure, Registry};
 use super::routes;
 use crate::shared::config;
+use crate::shared::live::Live;
 use crate::shared::metrics::Metrics;
 use crate::shared::permanent;
 use crate::shared::shutdown::{Phase, Request, Signals};
@@ -33,6 +34,12 @@ pub struct Server {
     pub metrics: Metrics,
     /// Requests for a simulation server, by what came of them.
     pub picks: prometheus::IntCounterVec,
+    /// Monitor pages that are open.
+    pub live: Live,
+    /// Worlds to try in the viewer.
+    pub examples: Vec<Example>,
+    /// Where Webots' own viewer comes from.
+    pub viewer_script: Option<url::Url>,
     /// When the server was started.
     pub started: Instant,
     /// The same, as a time of day.
@@ -149,9 +156,23 @@ fn assemble(config: SessionConfig, phase: watch::Receiver<Phase>) -> Result<Serv
     let notices = mailer::start(&config).map(Addr::recipient);
     let (timing, ssl) = (config.timing.clone(), config.ssl);
     let connections = Arc::new(Semaphore::new(config.max_clients));
+    let (examples, viewer_script) = (config.examples.clone(), config.viewer_script.clone());
     let registry = Registry::new(Arc::new(config), notices, latencies).start();
     let (started, started_at) = (Instant::now(), SystemTime::now());
-    Ok(Server { registry, timing, ssl, phase, connections, metrics, picks, started, started_at })
+    Ok(Server {
+        registry,
+        timing,
+        ssl,
+        phase,
+        connections,
+        metrics,
+        picks,
+        live: Live::new(),
+        examples,
+        viewer_script,
+        started,
+        started_at,
+    })
 }
 
 /// Reads the configuration again. One that can't be used changes nothing.

@@ -8,6 +8,8 @@ pub mod mail_address;
 pub mod mailer;
 pub mod notices;
 pub mod outbox;
+pub mod page_routes;
+pub mod pages;
 pub mod placement;
 pub mod registry;
 pub mod routes;

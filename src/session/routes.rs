@@ -8,13 +8,13 @@ use actix_web::http::{Method, StatusCode, header};
 use actix_web::middleware::DefaultHeaders;
 use actix_web::{HttpRequest, HttpResponse, web};
 use actix_web_actors::ws::WsResponseBuilder;
-use askama::Template;
 use rand::RngExt;
 
 use super::app::Server;
 use super::fleet_status::{FleetStatus, told_mean};
+use super::page_routes;
 use super::registry::{GetStatus, IsAvailable, NoServer, Pick, Registry};
-use super::status::{self, Page, StatusPage};
+use super::status::{self, StatusPage};
 use super::web_client::WebClient;
 use crate::shared::metrics::CONTENT_TYPE;
 
@@ -40,7 +40,7 @@ pub fn configure(app: &mut web::ServiceConfig) {
             .route("/request", web::get().to(availability))
             .route("/session", web::get().to(session))
             .route("/load", web::get().to(load))
-            .route("/monitor", web::get().to(monitor))
+            .configure(page_routes::configure)
             .route("/status", web::get().to(status_json))
             .route("/metrics", web::get().to(metrics))
             .route("/health", web::get().to(health))
@@ -50,7 +50,7 @@ pub fn configure(app: &mut web::ServiceConfig) {
 }
 
 /// Asks the registry; nothing when it is too busy to answer.
-async fn ask<M>(server: &Server, message: M) -> Option<M::Result>
+pub(super) async fn ask<M>(server: &Server, message: M) -> Option<M::Result>
 where
     M: Message<Result: Send> + Send + 'static,
     Registry: Handler<M>,
@@ -115,7 +115,7 @@ async fn load(server: web::Data<Server>) -> HttpResponse {
     HttpResponse::Ok().content_type("text/plain").body(told_mean(mean).to_string())
 }
 
-async fn with_status(server: &Server, answer: impl FnOnce(&FleetStatus) -> HttpResponse) -> HttpResponse {
+pub(super) async fn with_status(server: &Server, answer: impl FnOnce(&FleetStatus) -> HttpResponse) -> HttpResponse {
     match ask(server, GetStatus).await {
         Some(status) => answer(&status),
         None => HttpResponse::ServiceUnavailable().body("Error: the server is too busy to tell."),
@@ -124,14 +124,6 @@ async fn with_status(server: &Server, answer: impl FnOnce(&FleetStatus) -> HttpR
 
 async fn status_json(server: web::Data<Server>) -> HttpResponse {
     with_status(&server, |status| HttpResponse::Ok().json(StatusPage::new(&server, status))).await
-}
-
-async fn monitor(server: web::Data<Server>) -> HttpResponse {
-    with_status(&server, |status| match Page::new(&server, status).render() {
-        Ok(page) => HttpResponse::Ok().content_type("text/html; charset=utf-8").body(page),
-        Err(error) => HttpResponse::InternalServerError().body(format!("Error: {error}.")),
-    })
-    .await
 }
 
 async fn metrics(server: web::Data<Server>) -> HttpResponse {
@@ -148,7 +140,7 @@ async fn health() -> HttpResponse {
 
 async fn nothing_here() -> HttpResponse {
     HttpResponse::NotFound()
-        .body("Error: there is nothing here. Try /session, /monitor, /status, /load, /metrics or /health.")
+        .body("Error: there is nothing here. Try /session, /monitor, /viewer, /status, /load, /metrics or /health.")
 }
 
 #[cfg(test)]
