@@ -6,7 +6,9 @@ use serde::{Deserialize, Serialize};
 
 use super::mail_address::{self, MailAddress};
 use crate::shared::address::PublicAddress;
-use crate::shared::config::{Configuration, ExpandedPath, Secret, Unfit, one_or_many, optional_port, percent, seconds, whole};
+use crate::shared::config::{
+    Configuration, ExpandedPath, Secret, Unfit, one_or_many, optional_port, percent, seconds, whole,
+};
 
 /// Every key of the session server. The original's keys keep their meaning.
 #[derive(Debug, Clone, Serialize, Deserialize)]

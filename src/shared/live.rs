@@ -253,7 +253,10 @@ mod tests {
     fn only_what_has_changed_is_sent() {
         let before = view("one", &[("a", "1"), ("b", "2")]);
         assert_eq!(event(&before, &before.clone()), "");
-        assert_eq!(event(&before, &view("two", &[("a", "1"), ("b", "2")])), "data: {\"parts\":{\"glance\":\"two\"}}\n\n");
+        assert_eq!(
+            event(&before, &view("two", &[("a", "1"), ("b", "2")])),
+            "data: {\"parts\":{\"glance\":\"two\"}}\n\n"
+        );
         assert_eq!(
             event(&before, &view("one", &[("a", "1"), ("b", "3")])),
             "data: {\"tables\":{\"servers\":{\"rows\":{\"b\":\"3\"}}}}\n\n"

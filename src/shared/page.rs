@@ -110,6 +110,22 @@ pub fn fleet_sources<'address>(addresses: impl Iterator<Item = &'address PublicA
     hosts.iter().flat_map(|host| [format!("{http}://{host}"), format!("{websocket}://{host}")]).collect()
 }
 
+/// How a bar of so many percent is coloured.
+#[must_use]
+pub fn heat(percent: &f64) -> &'static str {
+    match *percent {
+        ..70.0 => "cool",
+        70.0..95.0 => "warm",
+        _ => "hot",
+    }
+}
+
+/// How long a bar of so many percent is.
+#[must_use]
+pub fn width(percent: &f64) -> String {
+    format!("{:.1}", percent.clamp(0.0, 100.0))
+}
+
 /// Sends a page.
 #[must_use]
 pub fn html(page: Result<String, askama::Error>, policy: &Policy) -> HttpResponse {

@@ -18,7 +18,9 @@ use super::load_monitor::{LoadMonitor, Readings};
 use super::places::{Census, Places};
 use super::repository_cache::RepositoryCache;
 use super::routes;
+use super::usage::UsageMonitor;
 use crate::shared::admission::Rules;
+use crate::shared::live::Live;
 use crate::shared::load::Load;
 use crate::shared::metrics::Metrics;
 use crate::shared::permanent;
@@ -50,6 +52,10 @@ pub struct Server {
     pub metrics: Metrics,
     /// Clients that asked for a simulation, by what came of it.
     pub starts: prometheus::IntCounterVec,
+    /// Monitor pages that are open.
+    pub live: Live,
+    /// What simulations take of the machine.
+    pub usage: UsageMonitor,
     /// When the server was started.
     pub started: Instant,
 }
@@ -215,6 +221,8 @@ fn assemble(
         connections: Arc::new(Semaphore::new(config.max_clients)),
         metrics,
         starts,
+        live: Live::new(),
+        usage: UsageMonitor::default(),
         started: Instant::now(),
         config: Arc::new(config),
     })

@@ -74,6 +74,8 @@ pub enum Change {
     Version(String),
     /// It streams on this port, and its output is kept in this file.
     Launched {
+        /// The process from which all of it descends.
+        pid: i32,
         /// The port that was granted.
         port: u16,
         /// The file.
@@ -119,12 +121,18 @@ pub struct Everybody {
 #[derive(Debug, Clone, Serialize)]
 #[serde(rename_all = "camelCase")]
 pub struct Simulation {
+    /// Its number.
+    pub id: u64,
     /// The world's URL.
     pub world: String,
     /// Its state.
     pub stage: Stage,
     /// When its client asked for it, in seconds since 1970.
     pub since: u64,
+    /// When it was launched, in seconds since 1970; from then on its time is limited.
+    pub launched: Option<u64>,
+    /// The process from which all of it descends, once it is launched.
+    pub pid: Option<i32>,
     /// The streaming port, once there is one.
     pub port: Option<u16>,
     /// The version of Webots that the world was made for.
@@ -215,6 +223,11 @@ impl Places {
     }
 }
 
+/// Seconds since 1970.
+fn now() -> u64 {
+    SystemTime::UNIX_EPOCH.elapsed().map_or(0, |age| age.as_secs())
+}
+
 impl Actor for Places {
     type Context = Context<Self>;
 
@@ -234,9 +247,12 @@ impl Handler<Ask> for Places {
         }
         let id = self.last;
         let shown = Simulation {
+            id,
             world: ask.world,
             stage: Stage::Queued,
-            since: SystemTime::UNIX_EPOCH.elapsed().map_or(0, |age| age.as_secs()),
+            since: now(),
+            launched: None,
+            pid: None,
             port: None,
             version: None,
             log: None,
@@ -269,7 +285,9 @@ impl Handler<Update> for Places {
             Change::Stage(stage) => shown.stage = stage,
             Change::Version(version) => shown.version = Some(version),
             Change::Port(port) => shown.port = Some(port),
-            Change::Launched { port, log } => {
+            Change::Launched { pid, port, log } => {
+                shown.launched = Some(now());
+                shown.pid = Some(pid);
                 shown.port = Some(port);
                 shown.log = Some(log);
                 shown.stage = Stage::Launching;

@@ -134,7 +134,7 @@ impl Webots {
             self.project.world.path.display(),
             group.guardian()
         );
-        self.ticket.update(Change::Launched { port: self.port, log });
+        self.ticket.update(Change::Launched { pid: group.guardian(), port: self.port, log });
         self.group = Some(group);
         ended.into_actor(self).map(|ending, this, ctx| this.exited(ending, ctx)).spawn(ctx);
         self.look_for_port(FIRST_LOOK, ctx);
