@@ -1,4 +1,56 @@
-//! A fleet for interactive robot simulations in the browser.
+//! A fleet for interactive robot simulations in the browser: a session server and simulation servers.
+//!
+//! This page is the map. Imports point down only: `bin` -> `app` -> `routes` -> actors -> pure files and guards ->
+//! [`shared`]. [`session`] and [`simulation`] never see each other. A child never names its parent: it is given a
+//! `Recipient` of its events, which are defined in the child's file.
+//!
+//! # Who talks to whom
+//!
+//! ```text
+//! session server
+//!
+//!   routes ----------- Pick, GetStatus ------------> Registry --- Notice --> Mailer --> SMTP
+//!     | one per WebSocket                             ^    | one per simulation server
+//!   WebClient -- Subscribe, Pick --------------------'     |
+//!     ^--------- Availability (changes only) ----------'   v
+//!                                                     ServerMonitor -- GET /status, /load --> simulation server
+//!                                                          '-- Reported --> Registry
+//!
+//! simulation server
+//!
+//!   routes --- Census --> Places <-- Census -- LoadMonitor --> monitor.csv
+//!     | one per WebSocket  ^  |                     '-- Readings (watch channel) --> routes
+//!   WebClient -- Ask -----'   |
+//!     ^  ^------- PlaceEvent -'
+//!     |  |--- checkout (a task on the main thread, shared by all who want the same world) --> git
+//!     |  '--- starts ---> Webots (one per simulation) --> guardian process --> Webots' process tree
+//!     '------ WebotsEvent ---'
+//! ```
+//!
+//! The [`session::registry`] alone decides availability: it hears of every report and of every pick.
+//! A [`simulation::webots`] owns its process group, its folder and its place through guards, so that leaving in any
+//! state, even by a panic, frees all three. Whatever the simulation server starts runs below a
+//! [`simulation::guardian`], which ends it when the server is gone in whatever way.
+//!
+//! # What ends, and what is started again
+//!
+//! | actor | ends by itself | after a panic |
+//! |---|---|---|
+//! | Registry, Places, `LoadMonitor` | never | the server logs it and ends with exit code 1: the service manager starts it again |
+//! | `ServerMonitor` | when its server leaves the configuration | the registry makes a new one |
+//! | Mailer | never | it is off until the server is started again; the loss of each notice is logged |
+//! | Announcer | when all are told or given up | it is not started again: announcing is a courtesy |
+//! | `WebClient` | with its connection | its connection closes; what it leased is freed |
+//! | Webots | with its process tree; it is never restarted, its client is told | its process tree is killed at once, its folder removed, its place freed |
+//!
+//! # Facts about actix 0.13 that this rests on
+//!
+//! 1. A `Supervisor` restarts an actor that has stopped with the same value: resetting it is its own job.
+//! 2. After a panic in a handler the actor is dropped, not restarted, and every later message fails as 'closed'.
+//! 3. When the system ends, an actor is dropped without `stopped`. Only `Drop` is sure to run.
+//! 4. tokio's `kill_on_drop` reaches the direct child only; Webots' launcher has a child of its own.
+//! 5. An actor whose WebSocket's peer does not read is not polled once the buffers are full: whoever must be closed
+//!    for that reason has to be closed before, see [`shared::liveness`].
 
 pub mod session;
 pub mod shared;

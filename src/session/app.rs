@@ -10,7 +10,8 @@ use tokio::sync::{Semaphore, watch};
 
 use super::config::{Example, SessionConfig, Timing};
 use super::mailer;
-use super::registry::{NoServer, Pick, Reconfigure, Registry};
+use super::pick::{NoServer, Pick};
+use super::registry::{Reconfigure, Registry};
 use super::routes;
 use crate::shared::config;
 use crate::shared::live::Live;
@@ -78,6 +79,8 @@ pub enum AppError {
 
 /// How long the registry may take to pick a server.
 const PATIENCE: Duration = Duration::from_secs(2);
+/// What can come of a request: each is counted from the start.
+const OUTCOMES: [&str; 4] = ["placed", "unavailable", "not_accepted", "wrong_url"];
 
 impl Server {
     /// Asks for a simulation server, and puts the answer in the words of the protocol.
@@ -107,12 +110,13 @@ impl Server {
 ///
 /// # Errors
 /// When it can't start, or an actor that must live is gone.
-pub async fn run(config: SessionConfig, file: PathBuf) -> Result<(), AppError> {
+pub async fn run(mut config: SessionConfig, file: PathBuf) -> Result<(), AppError> {
     let mut signals = Signals::catch()?;
     let (phase_sender, phase) = watch::channel(Phase::Open);
     let address = format!("{}:{}", config.bind, config.port);
     let socket = std::net::TcpListener::bind(&address).map_err(|source| AppError::Bind { address, source })?;
     let port = socket.local_addr()?.port();
+    config.port = port;
     let stop = config.timing.stop;
     let told = config.address().http_url(config.ssl);
     let server = Arc::new(assemble(config, phase)?);
@@ -153,6 +157,9 @@ fn assemble(config: SessionConfig, phase: watch::Receiver<Phase>) -> Result<Serv
     let metrics = Metrics::new();
     let latencies = metrics.histogram("session_report_seconds", "Time in which simulation servers answer")?;
     let picks = metrics.counter("session_requests_total", "Requests for a simulation server", "outcome")?;
+    for outcome in OUTCOMES {
+        picks.with_label_values(&[outcome]).reset();
+    }
     let notices = mailer::start(&config).map(Addr::recipient);
     let (timing, ssl) = (config.timing.clone(), config.ssl);
     let connections = Arc::new(Semaphore::new(config.max_clients));

@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use super::mail_address::{self, MailAddress};
 use crate::shared::address::PublicAddress;
 use crate::shared::config::{
-    Configuration, ExpandedPath, Secret, Unfit, one_or_many, optional_port, percent, seconds, whole,
+    Configuration, ExpandedPath, Secret, Unfit, one_or_many, optional_port, percent, seconds, threshold, whole,
 };
 
 /// Every key of the session server. The original's keys keep their meaning.
@@ -61,8 +61,9 @@ pub struct SessionConfig {
     /// Log to standard output. Default: false.
     #[serde(default)]
     pub debug: bool,
-    /// A simulation server with this load (percent) or more takes no client. Default: 95.
-    #[serde(default = "threshold", deserialize_with = "percent")]
+    /// A simulation server with this load (percent) or more takes no client; above 100 the load closes no server.
+    /// Default: 95.
+    #[serde(default = "usual_threshold", deserialize_with = "threshold")]
     pub load_threshold: f64,
     /// Seconds between two looks at each simulation server. Default: 1.
     #[serde(default = "one_second", with = "seconds")]
@@ -228,7 +229,7 @@ fn log_folder() -> ExpandedPath {
     ExpandedPath::plain("log")
 }
 
-fn threshold() -> f64 {
+fn usual_threshold() -> f64 {
     95.0
 }
 

@@ -1,6 +1,8 @@
 //! The session server: the one door to a fleet of simulation servers.
 
 pub mod app;
+pub mod asking;
+pub mod changes;
 pub mod config;
 pub mod fleet_status;
 pub mod letter;
@@ -10,10 +12,13 @@ pub mod notices;
 pub mod outbox;
 pub mod page_routes;
 pub mod pages;
+pub mod pick;
 pub mod placement;
 pub mod registry;
 pub mod routes;
 pub mod server_monitor;
 pub mod smtp;
 pub mod status;
+pub mod subscribers;
+pub mod watched;
 pub mod web_client;

@@ -1,9 +1,7 @@
 //! The session server's public paths: each reads the request, asks the registry, and maps the answer.
 
 use std::sync::Arc;
-use std::time::Duration;
 
-use actix::prelude::*;
 use actix_web::http::{Method, StatusCode, header};
 use actix_web::middleware::DefaultHeaders;
 use actix_web::{HttpRequest, HttpResponse, web};
@@ -11,15 +9,15 @@ use actix_web_actors::ws::WsResponseBuilder;
 use rand::RngExt;
 
 use super::app::Server;
-use super::fleet_status::{FleetStatus, told_mean};
+use super::asking::{ask, with_status};
+use super::fleet_status::told_mean;
 use super::page_routes;
-use super::registry::{GetStatus, IsAvailable, NoServer, Pick, Registry};
+use super::pick::{NoServer, Pick};
+use super::registry::{GetStatus, IsAvailable};
 use super::status::{self, StatusPage};
 use super::web_client::WebClient;
 use crate::shared::metrics::CONTENT_TYPE;
 
-/// How long the registry may take to answer.
-const PATIENCE: Duration = Duration::from_secs(2);
 /// The largest message of a client, in bytes.
 const LARGEST_MESSAGE: usize = 8 * 1024;
 /// After how many seconds a client that was refused may come back: drawn at random, so that a class that was refused
@@ -47,16 +45,6 @@ pub fn configure(app: &mut web::ServiceConfig) {
             .route("/{path:.*}", web::method(Method::OPTIONS).to(HttpResponse::NoContent))
             .default_service(web::to(nothing_here)),
     );
-}
-
-/// Asks the registry; nothing when it is too busy to answer.
-pub(super) async fn ask<M>(server: &Server, message: M) -> Option<M::Result>
-where
-    M: Message<Result: Send> + Send + 'static,
-    Registry: Handler<M>,
-{
-    let answer = server.registry.send(message);
-    actix_rt::time::timeout(PATIENCE, answer).await.ok().and_then(Result::ok)
 }
 
 fn wants_websocket(request: &HttpRequest) -> bool {
@@ -113,13 +101,6 @@ async fn availability(server: web::Data<Server>) -> HttpResponse {
 async fn load(server: web::Data<Server>) -> HttpResponse {
     let mean = ask(&server, GetStatus).await.and_then(|status| status.mean_load);
     HttpResponse::Ok().content_type("text/plain").body(told_mean(mean).to_string())
-}
-
-pub(super) async fn with_status(server: &Server, answer: impl FnOnce(&FleetStatus) -> HttpResponse) -> HttpResponse {
-    match ask(server, GetStatus).await {
-        Some(status) => answer(&status),
-        None => HttpResponse::ServiceUnavailable().body("Error: the server is too busy to tell."),
-    }
 }
 
 async fn status_json(server: web::Data<Server>) -> HttpResponse {

@@ -12,7 +12,9 @@ use serde::Deserialize;
 use tokio::sync::OwnedSemaphorePermit;
 
 use super::app::Server;
-use super::registry::{Availability, Pick, Subscribe, Subscription};
+use super::pick::Pick;
+use super::registry::{Subscribe, Subscription};
+use super::subscribers::Availability;
 use crate::shared::liveness::Liveness;
 use crate::shared::shutdown::closing;
 

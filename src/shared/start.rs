@@ -52,6 +52,8 @@ pub fn serve<E: std::error::Error>(
         eprintln!("error: the log {} can't be written: {error}", log.display());
         return ExitCode::from(FAILED);
     }
+    // A panic is a fault in this program; without this it would be told to a terminal that nobody looks at.
+    std::panic::set_hook(Box::new(|panic| log::error!("{panic}")));
     for warning in warnings {
         log::warn!("{warning}");
     }

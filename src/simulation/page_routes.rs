@@ -1,19 +1,19 @@
 //! The paths of the simulation server's page, with what it loads and listens to, and of Webots' own viewer.
 
 use std::io::{Read, Seek, SeekFrom};
-use std::path::{Component, Path, PathBuf};
+use std::path::Path;
 
 use actix_files::NamedFile;
 use actix_web::http::header::{self, HeaderValue};
 use actix_web::{HttpRequest, HttpResponse, web};
-use percent_encoding::percent_decode_str;
 use serde::Deserialize;
 
 use super::app::Server;
+use super::asking::{everybody, locked, too_busy};
+use super::census::Everybody;
 use super::pages;
-use super::places::Everybody;
-use super::routes::{everybody, locked, too_busy};
 use super::usage::Usages;
+use super::webots_viewer;
 use crate::asset;
 use crate::shared::assets::{self, Asset};
 use crate::shared::auth::is_authorised;
@@ -24,10 +24,6 @@ const ASSETS: &[Asset] =
     &[asset!("charts.css"), asset!("charts.js"), asset!("chart.js"), asset!("simulation_monitor.js")];
 /// How much of an output's end is shown, in bytes.
 const LARGEST_TAIL: u64 = 32 * 1024;
-/// Where Webots keeps its own viewer, below its folder.
-const WWI: &str = "resources/web/wwi";
-/// The viewer itself, as `/status` names it.
-pub const VIEWER: &str = "wwi/WebotsView.js";
 
 /// Adds the paths to an app.
 pub fn configure(app: &mut web::ServiceConfig) {
@@ -115,19 +111,11 @@ fn tail(path: &Path) -> std::io::Result<String> {
     Ok(whole.to_owned())
 }
 
-/// The folder of Webots' own viewer, if Webots is installed here.
-#[must_use]
-pub fn viewer_folder(server: &Server) -> Option<PathBuf> {
-    let home = &server.config.webots_home.as_ref()?.0;
-    let places = [home.join(WWI), home.join("Contents").join(WWI)];
-    places.into_iter().find(|folder| folder.join("WebotsView.js").is_file())
-}
-
 /// A file of Webots' own viewer.
 async fn wwi(request: HttpRequest, server: web::Data<Server>) -> HttpResponse {
     let path = request.match_info().query("path").to_owned();
     let file = web::block(move || {
-        let file = file_below(&viewer_folder(&server)?, &path)?;
+        let file = webots_viewer::file_below(&webots_viewer::folder(&server.config)?, &path)?;
         NamedFile::open(file).ok()
     });
     let Ok(Some(file)) = file.await else {
@@ -139,50 +127,10 @@ async fn wwi(request: HttpRequest, server: web::Data<Server>) -> HttpResponse {
     response
 }
 
-/// A file of a folder, unless the path or a link leads out of it.
-fn file_below(folder: &Path, path: &str) -> Option<PathBuf> {
-    let path = percent_decode_str(path).decode_utf8().ok()?;
-    let path = Path::new(path.as_ref());
-    if !path.components().all(|part| matches!(part, Component::Normal(_))) {
-        return None;
-    }
-    let folder = folder.canonicalize().ok()?;
-    let file = folder.join(path).canonicalize().ok()?;
-    (file.starts_with(&folder) && file.is_file()).then_some(file)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
     use std::fs;
-
-    #[test]
-    fn nothing_outside_of_the_viewers_folder_is_sent() {
-        let home = tempfile::tempdir().unwrap();
-        let folder = home.path().join("wwi");
-        fs::create_dir_all(folder.join("css")).unwrap();
-        for file in ["WebotsView.js", "css/wwi.css", "../secret.js"] {
-            fs::write(folder.join(file), "").unwrap();
-        }
-        std::os::unix::fs::symlink("../secret.js", folder.join("link.js")).unwrap();
-        let table = [
-            ("WebotsView.js", true),
-            ("css/wwi.css", true),
-            ("css%2Fwwi.css", true),
-            ("css", false),
-            ("", false),
-            ("../secret.js", false),
-            ("%2e%2e/secret.js", false),
-            ("css/../../secret.js", false),
-            ("/etc/passwd", false),
-            ("link.js", false),
-            ("WebotsView.js%00", false),
-            ("%ff", false),
-        ];
-        for (path, found) in table {
-            assert_eq!(file_below(&folder, path).is_some(), found, "{path:?}");
-        }
-    }
 
     #[test]
     fn only_the_end_of_an_output_is_read() {

@@ -5,13 +5,13 @@ use std::time::{Duration, SystemTime};
 use askama::Template;
 
 use super::app::Server;
+use super::census::{Everybody, Simulation, Stage};
 use super::load_monitor::{Readings, Sample};
-use super::places::{Everybody, Simulation, Stage};
 use super::sensors::{self, Gpu, Host, Machine};
 use super::usage::{Usage, Usages};
 use crate::shared::live::{Row, View};
 use crate::shared::repositories::UrlPrefix;
-use crate::shared::timestamp::timestamp;
+use crate::shared::timestamp::{seconds_since_1970, timestamp};
 
 /// The whole page `/monitor`.
 #[derive(Template)]
@@ -168,7 +168,7 @@ impl<'one> SimulationRow<'one> {
     fn new(one: &'one Simulation, usage: Option<Usage>, limit: u64) -> Self {
         let (stage, class) = words(one.stage);
         let ends = one.launched.map_or(0, |launched| launched + limit);
-        let now = SystemTime::UNIX_EPOCH.elapsed().map_or(0, |age| age.as_secs());
+        let now = seconds_since_1970();
         let path = one.world.split_once("://").map_or(one.world.as_str(), |(_, path)| path);
         let (repository, file) =
             path.split_once("/blob/").or_else(|| path.split_once("/tree/")).unwrap_or((path, path));

@@ -7,13 +7,13 @@
 use std::collections::{BTreeMap, VecDeque};
 use std::net::{Ipv4Addr, TcpListener};
 use std::ops::RangeInclusive;
-use std::path::PathBuf;
-use std::time::{Duration, SystemTime};
+use std::time::Duration;
 
 use actix::prelude::*;
-use serde::Serialize;
 
+use super::census::{Change, Everybody, Simulation, Stage};
 use crate::shared::status::Instances;
+use crate::shared::timestamp::seconds_since_1970;
 
 /// Asks for a place.
 #[derive(Message)]
@@ -65,81 +65,10 @@ pub struct Update {
     change: Change,
 }
 
-/// What has changed in a simulation.
-#[derive(Debug)]
-pub enum Change {
-    /// It is in another state.
-    Stage(Stage),
-    /// Its world was made for this version of Webots.
-    Version(String),
-    /// It streams on this port, and its output is kept in this file.
-    Launched {
-        /// The process from which all of it descends.
-        pid: i32,
-        /// The port that was granted.
-        port: u16,
-        /// The file.
-        log: PathBuf,
-    },
-    /// It streams on this port.
-    Port(u16),
-}
-
-/// The states of a simulation as they are shown.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Stage {
-    /// In the waiting line.
-    Queued,
-    /// Its project is checked out.
-    CheckingOut,
-    /// Webots is starting.
-    Launching,
-    /// Webots runs, the simulation is paused.
-    Idle,
-    /// The simulation runs.
-    Running,
-    /// Webots is ending.
-    Stopping,
-}
-
 /// Asks who is here.
 #[derive(Message)]
 #[rtype(result = "Everybody")]
 pub struct Census;
-
-/// Who is here.
-#[derive(Debug, Clone, Default, MessageResponse)]
-pub struct Everybody {
-    /// How many, by state.
-    pub instances: Instances,
-    /// Each simulation, the oldest first.
-    pub simulations: Vec<Simulation>,
-}
-
-/// One simulation as it is shown.
-#[derive(Debug, Clone, Serialize)]
-#[serde(rename_all = "camelCase")]
-pub struct Simulation {
-    /// Its number.
-    pub id: u64,
-    /// The world's URL.
-    pub world: String,
-    /// Its state.
-    pub stage: Stage,
-    /// When its client asked for it, in seconds since 1970.
-    pub since: u64,
-    /// When it was launched, in seconds since 1970; from then on its time is limited.
-    pub launched: Option<u64>,
-    /// The process from which all of it descends, once it is launched.
-    pub pid: Option<i32>,
-    /// The streaming port, once there is one.
-    pub port: Option<u16>,
-    /// The version of Webots that the world was made for.
-    pub version: Option<String>,
-    /// The file that its output is kept in.
-    pub log: Option<PathBuf>,
-}
 
 #[derive(Message)]
 #[rtype(result = "()")]
@@ -182,19 +111,29 @@ impl Places {
             && let Some(port) = self.free_port()
             && let Some(first) = self.line.pop_front()
         {
-            // Whoever is gone by now drops the ticket too.
-            if first.client.try_send(PlaceEvent::Granted(port)).is_ok()
-                && let Some(present) = self.present.get_mut(&first.id)
-            {
-                present.lent = Some(port);
-                present.shown.port = Some(port);
-                present.shown.stage = Stage::CheckingOut;
+            match first.client.try_send(PlaceEvent::Granted(port)) {
+                Ok(()) => self.lend(first.id, port),
+                // It is told at the next look, and nobody passes it.
+                Err(SendError::Full(_)) => {
+                    self.line.push_front(first);
+                    break;
+                }
+                // It is gone, and drops its ticket too.
+                Err(SendError::Closed(_)) => {}
             }
         }
         for (ahead, waiting) in self.line.iter_mut().enumerate() {
             if waiting.told != Some(ahead) && waiting.client.try_send(PlaceEvent::Ahead(ahead)).is_ok() {
                 waiting.told = Some(ahead);
             }
+        }
+    }
+
+    fn lend(&mut self, id: u64, port: u16) {
+        if let Some(present) = self.present.get_mut(&id) {
+            present.lent = Some(port);
+            present.shown.port = Some(port);
+            present.shown.stage = Stage::CheckingOut;
         }
     }
 
@@ -223,11 +162,6 @@ impl Places {
     }
 }
 
-/// Seconds since 1970.
-fn now() -> u64 {
-    SystemTime::UNIX_EPOCH.elapsed().map_or(0, |age| age.as_secs())
-}
-
 impl Actor for Places {
     type Context = Context<Self>;
 
@@ -250,7 +184,7 @@ impl Handler<Ask> for Places {
             id,
             world: ask.world,
             stage: Stage::Queued,
-            since: now(),
+            since: seconds_since_1970(),
             launched: None,
             pid: None,
             port: None,
@@ -281,18 +215,7 @@ impl Handler<Update> for Places {
         let Some(Present { shown, .. }) = self.present.get_mut(&id) else {
             return;
         };
-        match change {
-            Change::Stage(stage) => shown.stage = stage,
-            Change::Version(version) => shown.version = Some(version),
-            Change::Port(port) => shown.port = Some(port),
-            Change::Launched { pid, port, log } => {
-                shown.launched = Some(now());
-                shown.pid = Some(pid);
-                shown.port = Some(port);
-                shown.log = Some(log);
-                shown.stage = Stage::Launching;
-            }
-        }
+        shown.apply(change);
     }
 }
 

@@ -1,7 +1,6 @@
 //! The simulation server's public paths: each reads the request, asks for what it needs, and maps the answer.
 
 use std::sync::Arc;
-use std::time::Duration;
 
 use actix_web::http::header;
 use actix_web::middleware::DefaultHeaders;
@@ -9,16 +8,14 @@ use actix_web::{HttpRequest, HttpResponse, web};
 use actix_web_actors::ws::WsResponseBuilder;
 
 use super::app::Server;
+use super::asking::{everybody, locked, too_busy};
 use super::page_routes;
-use super::places::{Census, Everybody};
 use super::status::{self, StatusPage};
 use super::web_client::WebClient;
 use crate::shared::auth::is_authorised;
 use crate::shared::metrics::CONTENT_TYPE;
 use crate::shared::shutdown::Request;
 
-/// How long an actor may take to answer a page.
-const PATIENCE: Duration = Duration::from_secs(2);
 /// The largest message of a client, in bytes.
 const LARGEST_MESSAGE: usize = 8 * 1024;
 
@@ -73,11 +70,6 @@ async fn load(server: web::Data<Server>) -> HttpResponse {
     HttpResponse::Ok().content_type("text/plain").body(server.load().to_string())
 }
 
-pub(super) async fn everybody(server: &Server) -> Option<Everybody> {
-    let census = server.places.send(Census);
-    actix_rt::time::timeout(PATIENCE, census).await.ok().and_then(Result::ok)
-}
-
 async fn status_json(server: web::Data<Server>) -> HttpResponse {
     match everybody(&server).await {
         Some(everybody) => HttpResponse::Ok().json(StatusPage::new(&server, everybody)),
@@ -112,16 +104,6 @@ async fn drain(request: HttpRequest, server: web::Data<Server>) -> HttpResponse 
     }
 }
 
-pub(super) fn locked() -> HttpResponse {
-    HttpResponse::Unauthorized()
-        .insert_header((header::WWW_AUTHENTICATE, "Basic realm=\"simulation server\""))
-        .body("Error: a password is needed.")
-}
-
 async fn nothing_here() -> HttpResponse {
     HttpResponse::NotFound().body("Error: there is nothing here. Try /monitor, /status, /load, /metrics or /health.")
-}
-
-pub(super) fn too_busy() -> HttpResponse {
-    HttpResponse::ServiceUnavailable().body("Error: the server is too busy to tell.")
 }

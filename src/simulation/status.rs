@@ -3,9 +3,9 @@
 use serde::Serialize;
 
 use super::app::Server;
-use super::page_routes;
-use super::places::{Everybody, Simulation};
+use super::census::{Everybody, Simulation};
 use super::sensors::{Gpu, Host, Machine};
+use super::webots_viewer;
 use crate::shared::metrics::Gauge;
 use crate::shared::status::Dispatch;
 
@@ -53,7 +53,7 @@ impl StatusPage {
             host: readings.host.clone(),
             machine: readings.machine,
             gpus: readings.gpus.clone(),
-            viewer: page_routes::viewer_folder(server).map(|_| page_routes::VIEWER),
+            viewer: webots_viewer::folder(&server.config).map(|_| webots_viewer::PATH),
             simulations: everybody.simulations,
         }
     }

@@ -10,14 +10,19 @@ use std::time::{Duration, Instant};
 
 use actix::prelude::*;
 
-use super::checkout::{CheckoutError, Checkouts, Project};
+use super::census::{Change, Stage};
+use super::checkout::{Checkouts, Project};
+use super::checkout_error::CheckoutError;
 use super::command::Launch;
 use super::config::SimulationConfig;
+use super::display;
 use super::output::{self, Sign, Tail};
-use super::places::{Change, Stage, Ticket};
+use super::places::Ticket;
 use super::process_group::{Ending, Plan, ProcessGroup};
 use super::process_tree;
 use super::protocol::Mode;
+use super::webots_event::{Exit, LastWord, WebotsEvent};
+use crate::shared::timestamp::seconds_since_1970;
 
 /// Asks Webots to end.
 #[derive(Message)]
@@ -28,29 +33,6 @@ pub struct End;
 #[derive(Message)]
 #[rtype(result = "Result<(), CheckoutError>")]
 pub struct RestoreController(pub String);
-
-/// What a client hears of its Webots.
-#[derive(Message, Debug, Clone, PartialEq, Eq)]
-#[rtype(result = "()")]
-pub enum WebotsEvent {
-    /// It listens on this port.
-    Listening(u16),
-    /// It lives.
-    Heartbeat,
-    /// It has given no sign of life for so many seconds.
-    Hanging(u64),
-    /// It has ended, and why.
-    Exited(Exit),
-}
-
-/// Why a Webots has ended.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Exit {
-    /// Whether it ended by itself and in order.
-    pub clean: bool,
-    /// In words, for the client.
-    pub why: String,
-}
 
 /// What a Webots is started with.
 pub struct Orders {
@@ -79,10 +61,12 @@ pub struct Webots {
     mode: Mode,
     port: u16,
     ticket: Ticket,
-    events: Recipient<WebotsEvent>,
+    events: LastWord,
     group: Option<ProcessGroup>,
     tail: Tail,
     listening: bool,
+    /// Whether the simulation is not paused.
+    runs: bool,
     last_sign: Instant,
     hanging: bool,
     /// Why it was asked to end, if it was.
@@ -93,6 +77,8 @@ pub struct Webots {
 const MISSED_HEARTBEATS: u32 = 6;
 /// If its port is taken, Webots silently takes one of so many that follow.
 const NEXT_PORTS: u16 = 10;
+/// How long the rest of an output may take to be read.
+const LAST_WORDS: Duration = Duration::from_secs(1);
 /// Between two looks whether Webots listens, at first.
 const FIRST_LOOK: Duration = Duration::from_millis(10);
 /// Between two looks whether Webots listens, at most.
@@ -111,10 +97,11 @@ impl Webots {
             mode,
             port,
             ticket,
-            events,
+            events: LastWord::new(events),
             group: None,
             tail: Tail::default(),
             listening: false,
+            runs: false,
             last_sign: Instant::now(),
             hanging: false,
             asked: None,
@@ -124,7 +111,8 @@ impl Webots {
     fn launch(&mut self, ctx: &mut Context<Self>) -> std::io::Result<()> {
         let log = self.config.log_dir.0.join("simulation/instances").join(format!("{}.log", self.port));
         let (reader, output) = std::io::pipe()?;
-        self.tail = output::follow(reader, &log, ctx.address())?;
+        let (tail, all_read) = output::follow(reader, &log, ctx.address())?;
+        self.tail = tail;
         let errors = output.try_clone()?;
         let (group, ended) = ProcessGroup::start(&self.plan(), output.into(), errors.into())?;
         log::info!(
@@ -134,9 +122,16 @@ impl Webots {
             self.project.world.path.display(),
             group.guardian()
         );
-        self.ticket.update(Change::Launched { pid: group.guardian(), port: self.port, log });
+        let (at, pid) = (seconds_since_1970(), group.guardian());
+        self.ticket.update(Change::Launched { at, pid, port: self.port, log });
         self.group = Some(group);
-        ended.into_actor(self).map(|ending, this, ctx| this.exited(ending, ctx)).spawn(ctx);
+        let ended = async move {
+            let ending = ended.await;
+            // What was printed last tells why. A process that nobody can end may keep the pipe open.
+            actix_rt::time::timeout(LAST_WORDS, all_read).await.ok();
+            ending
+        };
+        ended.into_actor(self).map(|ending, this, ctx| this.ended(ending, ctx)).spawn(ctx);
         self.look_for_port(FIRST_LOOK, ctx);
         ctx.run_interval(self.config.timing.heartbeat, Self::check_signs);
         let limit = self.config.timing.launch;
@@ -161,11 +156,10 @@ impl Webots {
             world: &self.project.world.path,
             xvfb: self.config.xvfb,
         };
-        let display = self.config.display.clone();
-        let display = display.or_else(|| std::env::var_os("DISPLAY").is_none().then(|| ":0".to_owned()));
+        let display = display::effective(self.config.display.as_deref());
         Plan {
             command: launch.arguments(),
-            environment: display.into_iter().map(|display| ("DISPLAY".into(), display.into())).collect(),
+            environment: vec![("DISPLAY".into(), display.into())],
             folder: Some(self.project.folder().to_owned()),
             mark: self.project.instance.path().to_owned(),
             remove: Some(self.project.instance.path().to_owned()),
@@ -204,8 +198,15 @@ impl Webots {
         log::info!("port {port}: ready");
         self.listening = true;
         self.ticket.update(Change::Port(port));
-        self.ticket.update(Change::Stage(Stage::Idle));
+        self.show_pace();
         self.tell(WebotsEvent::Listening(port));
+    }
+
+    /// Shows whether the simulation runs; a Webots that is starting or ending is shown as that.
+    fn show_pace(&self) {
+        if self.listening && self.asked.is_none() {
+            self.ticket.update(Change::Stage(if self.runs { Stage::Running } else { Stage::Idle }));
+        }
     }
 
     fn check_signs(&mut self, _: &mut Context<Self>) {
@@ -232,13 +233,28 @@ impl Webots {
         }
     }
 
-    fn exited(&mut self, ending: Ending, ctx: &mut Context<Self>) {
+    fn ended(&mut self, ending: Ending, ctx: &mut Context<Self>) {
         log::info!("port {}: Webots {ending}", self.port);
         let exit = match self.asked.take() {
             Some(why) => Exit { clean: false, why: self.with_last_lines(&why) },
             None if ending == Ending::Code(0) => Exit { clean: true, why: "Webots has ended".to_owned() },
             None => Exit { clean: false, why: self.with_last_lines(&format!("Webots {ending}")) },
         };
+        if exit.clean || self.listening || self.config.xvfb {
+            return self.exited(exit, ctx);
+        }
+        let display = display::effective(self.config.display.as_deref());
+        let look =
+            actix_rt::task::spawn_blocking(move || (!display::answers(&display)).then(|| display::hint(&display)));
+        look.into_actor(self)
+            .map(move |hint, this, ctx| {
+                let hint = hint.ok().flatten().map(|hint| format!(" Note: {hint}.")).unwrap_or_default();
+                this.exited(Exit { clean: false, why: exit.why.clone() + &hint }, ctx);
+            })
+            .spawn(ctx);
+    }
+
+    fn exited(&mut self, exit: Exit, ctx: &mut Context<Self>) {
         self.tell(WebotsEvent::Exited(exit));
         ctx.stop();
     }
@@ -249,10 +265,8 @@ impl Webots {
         if lines.is_empty() { format!("{why}.") } else { format!("{why}. Its last output: {}", lines.join(" | ")) }
     }
 
-    fn tell(&self, event: WebotsEvent) {
-        if let Err(lost) = self.events.try_send(event) {
-            log::debug!("port {}: the client is gone: {lost}", self.port);
-        }
+    fn tell(&mut self, event: WebotsEvent) {
+        self.events.tell(event);
     }
 }
 
@@ -276,9 +290,11 @@ impl Handler<Sign> for Webots {
         self.hanging = false;
         match sign {
             Sign::Heartbeat if self.listening => self.tell(WebotsEvent::Heartbeat),
-            Sign::Paused if self.asked.is_none() => self.ticket.update(Change::Stage(Stage::Idle)),
-            Sign::Running if self.asked.is_none() => self.ticket.update(Change::Stage(Stage::Running)),
-            Sign::Heartbeat | Sign::Paused | Sign::Running => {}
+            Sign::Heartbeat => {}
+            Sign::Paused | Sign::Running => {
+                self.runs = sign == Sign::Running;
+                self.show_pace();
+            }
         }
     }
 }

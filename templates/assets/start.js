@@ -66,14 +66,14 @@ export class Simulation extends EventTarget {
       const clients = ahead === 1 ? 'one client is' : `${ahead} clients are`;
       this.#step('place', 'doing', ahead === 0 ? 'you are next' : `${clients} ahead of you`);
     } else if (text.startsWith('shutdownTimeout:')) {
-      this.#step('place', 'done', '');
+      this.#step('place', 'done', 'taken');
       this.#step('checkout', 'done', '');
       this.#tell('left', Number(rest('shutdownTimeout:')));
     }
   }
 
   #loading(text) {
-    this.#step('place', 'done', '');
+    this.#step('place', 'done', 'taken');
     if (this.#launched)
       this.#step('simulation', 'doing', text);
     else if (CHECKOUT_IS_OVER.test(text)) {

@@ -120,7 +120,8 @@ class Fleet:
             self.session = self._start("session-server", "session", {
                 "port": free_ports(1),
                 "simulationServers": [self.simulation.address, self.other.address],
-                "loadRefresh": 0.2, "loadThreshold": 100,
+                # Whatever else keeps this machine busy is no concern of the tests.
+                "loadRefresh": 0.2, "loadThreshold": 1000,
                 "examples": [
                     {"title": "Playground", "url": WORLD.format("playground")},
                     {"title": "Carousel", "url": WORLD.format("carousel")},

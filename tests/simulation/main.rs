@@ -14,4 +14,7 @@
 #[path = "../support/mod.rs"]
 mod support;
 
+mod checkout;
+mod git_wrapper;
 mod life;
+mod scene;
