@@ -59,8 +59,9 @@ export class Chart {
     this.#moment = html('p', { className: 'moment', textContent: 'now' });
     this.#root.append(this.#axes, this.#lines, this.#cross);
     const unit = group.unit ? ` (${group.unit})` : '';
+    const title = html('h3', {}, group.title, html('span', { textContent: unit }));
     this.#root.setAttribute('aria-label', `${group.title}${unit} over the last ten minutes; the arrow keys read values`);
-    const head = html('figcaption', {}, html('h3', { textContent: group.title }), this.#moment);
+    const head = html('figcaption', {}, title, this.#moment);
     root.append(html('figure', {}, head, html('div', { className: 'plot' }, this.#root), legend));
     this.#root.addEventListener('pointermove', (event) => pointed(this.#timeAt(event)));
     this.#root.addEventListener('pointerleave', () => pointed());

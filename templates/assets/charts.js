@@ -9,7 +9,7 @@ const GROUPS = [
     series: [['CPU load', 3], ['CPU memory', 4], ['GPU load compute', 5], ['GPU load memory', 6], ['GPU memory', 7], ['Swap', 8], ['Disk', 9]],
   },
   { title: 'Simulations', unit: '', whole: true, least: 4, series: [['Webots running', 1], ['Webots idle', 2]] },
-  { title: 'Network', unit: 'MB/s', least: 0.01, series: [['Network sent', 10], ['Network received', 11]] },
+  { title: 'Network', unit: 'MB/s', least: 0.1, series: [['Network sent', 10], ['Network received', 11]] },
 ];
 const KEPT = 600;
 const STORE = 'hidden-series';
