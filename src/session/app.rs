@@ -2,58 +2,22 @@
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::time::{Duration, Instant, SystemTime};
+use std::time::{Instant, SystemTime};
 
 use actix::prelude::*;
 use actix_web::{App, HttpServer, web};
 use tokio::sync::{Semaphore, watch};
 
-use super::config::{Example, SessionConfig, Timing};
+use super::config::SessionConfig;
 use super::mailer;
-use super::pick::{NoServer, Pick};
 use super::registry::{Reconfigure, Registry};
 use super::routes;
+use super::server::Server;
 use crate::shared::config;
 use crate::shared::live::Live;
 use crate::shared::metrics::Metrics;
 use crate::shared::permanent;
 use crate::shared::shutdown::{Phase, Request, Signals};
-
-/// What routes and web clients share.
-pub struct Server {
-    /// Owns the fleet's state.
-    pub registry: Addr<Registry>,
-    /// Durations.
-    pub timing: Timing,
-    /// Whether URLs begin with `wss`.
-    pub ssl: bool,
-    /// Whether clients are taken.
-    pub phase: watch::Receiver<Phase>,
-    /// Counts WebSockets.
-    pub connections: Arc<Semaphore>,
-    /// What is counted.
-    pub metrics: Metrics,
-    /// Requests for a simulation server, by what came of them.
-    pub picks: prometheus::IntCounterVec,
-    /// Monitor pages that are open.
-    pub live: Live,
-    /// Worlds to try in the viewer.
-    pub examples: Vec<Example>,
-    /// Where Webots' own viewer comes from.
-    pub viewer_script: Option<url::Url>,
-    /// When the server was started.
-    pub started: Instant,
-    /// The same, as a time of day.
-    pub started_at: SystemTime,
-}
-
-/// The answer to a request for a simulation server.
-pub struct Answer {
-    /// A URL, or `Error: ...`.
-    pub text: String,
-    /// Why there is no URL.
-    pub refusal: Option<NoServer>,
-}
 
 /// Why the server can't go on.
 #[derive(Debug, thiserror::Error)]
@@ -77,34 +41,8 @@ pub enum AppError {
     Gone(String),
 }
 
-/// How long the registry may take to pick a server.
-const PATIENCE: Duration = Duration::from_secs(2);
 /// What can come of a request: each is counted from the start.
 const OUTCOMES: [&str; 4] = ["placed", "unavailable", "not_accepted", "wrong_url"];
-
-impl Server {
-    /// Asks for a simulation server, and puts the answer in the words of the protocol.
-    pub async fn pick(&self, wanted: Result<Pick, NoServer>) -> Answer {
-        let picked = match wanted {
-            Ok(pick) => {
-                let picked = actix_rt::time::timeout(PATIENCE, self.registry.send(pick)).await;
-                picked.ok().and_then(Result::ok).unwrap_or(Err(NoServer::Unavailable))
-            }
-            Err(wrong) => Err(wrong),
-        };
-        let outcome = match &picked {
-            Ok(_) => "placed",
-            Err(NoServer::Unavailable) => "unavailable",
-            Err(NoServer::NotAccepted(_)) => "not_accepted",
-            Err(NoServer::NoWorld(_)) => "wrong_url",
-        };
-        self.picks.with_label_values(&[outcome]).inc();
-        match picked {
-            Ok(address) => Answer { text: address.websocket_url(self.ssl), refusal: None },
-            Err(refusal) => Answer { text: refusal.to_string(), refusal: Some(refusal) },
-        }
-    }
-}
 
 /// Runs the server until it is asked to stop. `file` is read again on SIGHUP.
 ///

@@ -5,9 +5,9 @@ use std::time::Duration;
 use actix::prelude::*;
 use actix_web::HttpResponse;
 
-use super::app::Server;
 use super::fleet_status::FleetStatus;
 use super::registry::{GetStatus, Registry};
+use super::server::Server;
 
 /// How long the registry may take to answer.
 const PATIENCE: Duration = Duration::from_secs(2);

@@ -16,6 +16,7 @@ pub mod pick;
 pub mod placement;
 pub mod registry;
 pub mod routes;
+pub mod server;
 pub mod server_monitor;
 pub mod smtp;
 pub mod status;

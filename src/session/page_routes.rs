@@ -3,11 +3,11 @@
 use actix_web::{HttpRequest, HttpResponse, web};
 use askama::Template;
 
-use super::app::Server;
 use super::asking::{ask, with_status};
 use super::fleet_status::FleetStatus;
 use super::pages::{self, Viewer, WebotsViewer};
 use super::registry::GetStatus;
+use super::server::Server;
 use crate::asset;
 use crate::shared::assets::{self, Asset};
 use crate::shared::page::{Policy, fleet_sources, html};

@@ -8,12 +8,12 @@ use actix_web::{HttpRequest, HttpResponse, web};
 use actix_web_actors::ws::WsResponseBuilder;
 use rand::RngExt;
 
-use super::app::Server;
 use super::asking::{ask, with_status};
 use super::fleet_status::told_mean;
 use super::page_routes;
 use super::pick::{NoServer, Pick};
 use super::registry::{GetStatus, IsAvailable};
+use super::server::Server;
 use super::status::{self, StatusPage};
 use super::web_client::WebClient;
 use crate::shared::metrics::CONTENT_TYPE;

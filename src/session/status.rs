@@ -4,8 +4,8 @@ use std::time::Duration;
 
 use serde::Serialize;
 
-use super::app::Server;
 use super::fleet_status::{FleetStatus, ServerStatus, State, told_mean};
+use super::server::Server;
 use crate::shared::load::Load;
 use crate::shared::metrics::Gauge;
 use crate::shared::status::Instances;

@@ -11,9 +11,9 @@ use actix_web_actors::ws::{CloseCode, CloseReason, Message, ProtocolError, Webso
 use serde::Deserialize;
 use tokio::sync::OwnedSemaphorePermit;
 
-use super::app::Server;
 use super::pick::Pick;
 use super::registry::{Subscribe, Subscription};
+use super::server::Server;
 use super::subscribers::Availability;
 use crate::shared::liveness::Liveness;
 use crate::shared::shutdown::closing;

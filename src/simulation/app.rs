@@ -11,59 +11,22 @@ use tokio::sync::{Semaphore, watch};
 
 use super::announcer::Announcer;
 use super::checkout::Checkouts;
-use super::command::is_in_path;
 use super::config::SimulationConfig;
 use super::fetcher::{Fetcher, Limits};
 use super::git::Git;
 use super::instance_dir::{RunDir, Swept};
-use super::load_monitor::{LoadMonitor, Readings};
+use super::load_monitor::LoadMonitor;
 use super::outcome;
 use super::places::{Census, Places};
 use super::repository_cache::RepositoryCache;
 use super::routes;
+use super::server::Server;
 use super::usage::UsageMonitor;
 use crate::shared::admission::Rules;
 use crate::shared::live::Live;
-use crate::shared::load::Load;
 use crate::shared::metrics::Metrics;
 use crate::shared::permanent;
 use crate::shared::shutdown::{Phase, Request, Signals};
-
-/// What routes and web clients share.
-pub struct Server {
-    /// The effective configuration.
-    pub config: Arc<SimulationConfig>,
-    /// Whose worlds run here.
-    pub rules: Rules,
-    /// Lends places.
-    pub places: Addr<Places>,
-    /// Reads the machine.
-    pub load_monitor: Addr<LoadMonitor>,
-    /// The machine's load.
-    pub readings: watch::Receiver<Arc<Readings>>,
-    /// Checks worlds out.
-    pub checkouts: Arc<Checkouts>,
-    /// Folders of simulations.
-    pub run: Arc<RunDir>,
-    /// Whether clients are taken.
-    pub phase: watch::Receiver<Phase>,
-    /// Where drains are asked for.
-    pub requests: tokio::sync::mpsc::Sender<Request>,
-    /// Where Webots' actors live.
-    pub main_thread: ArbiterHandle,
-    /// Counts connections.
-    pub connections: Arc<Semaphore>,
-    /// What is counted.
-    pub metrics: Metrics,
-    /// Clients that asked for a simulation, by what came of it.
-    pub starts: prometheus::IntCounterVec,
-    /// Monitor pages that are open.
-    pub live: Live,
-    /// What simulations take of the machine.
-    pub usage: UsageMonitor,
-    /// When the server was started.
-    pub started: Instant,
-}
 
 /// Why the server can't go on.
 #[derive(Debug, thiserror::Error)]
@@ -97,43 +60,6 @@ pub enum AppError {
 
 /// Between two looks whether all simulations have ended.
 const LOOK: Duration = Duration::from_millis(50);
-
-impl Server {
-    /// The load that is told: of a machine that drains, 100.
-    #[must_use]
-    pub fn load(&self) -> Load {
-        if self.is_draining() { Load::FULL } else { self.readings.borrow().load.unwrap_or(Load::ZERO) }
-    }
-
-    /// Whether no new clients are taken.
-    #[must_use]
-    pub fn is_draining(&self) -> bool {
-        *self.phase.borrow() != Phase::Open
-    }
-
-    /// The program that is started for each client.
-    ///
-    /// # Errors
-    /// What is missing, and how to set it, in words for the client.
-    pub fn webots_program(&self) -> Result<PathBuf, String> {
-        if self.config.xvfb && !is_in_path("xvfb-run") {
-            return Err("This simulation server gives each Webots a display of its own (xvfb), but has no xvfb-run. \
-                        Its administrator can install it, or set xvfb: false and display"
-                .to_owned());
-        }
-        let how = "Its administrator can set webotsHome in the server's configuration, or the environment variable \
-                   WEBOTS_HOME";
-        let Some(program) = self.config.webots_program() else {
-            return Err(format!("This simulation server does not know where Webots is installed. {how}."));
-        };
-        let program = std::path::absolute(&program).unwrap_or(program);
-        if program.is_file() {
-            Ok(program)
-        } else {
-            Err(format!("This simulation server has no Webots at {}. {how}.", program.display()))
-        }
-    }
-}
 
 /// Runs the server until it is asked to stop.
 ///

@@ -5,9 +5,9 @@ use std::time::Duration;
 use actix_web::HttpResponse;
 use actix_web::http::header;
 
-use super::app::Server;
 use super::census::Everybody;
 use super::places::Census;
+use super::server::Server;
 
 /// How long an actor may take to answer a page.
 const PATIENCE: Duration = Duration::from_secs(2);

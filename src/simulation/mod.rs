@@ -29,6 +29,7 @@ pub mod repository_cache;
 pub mod revision;
 pub mod routes;
 pub mod sensors;
+pub mod server;
 pub mod status;
 pub mod usage;
 pub mod web_client;

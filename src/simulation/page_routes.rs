@@ -8,10 +8,10 @@ use actix_web::http::header::{self, HeaderValue};
 use actix_web::{HttpRequest, HttpResponse, web};
 use serde::Deserialize;
 
-use super::app::Server;
 use super::asking::{everybody, locked, too_busy};
 use super::census::Everybody;
 use super::pages;
+use super::server::Server;
 use super::usage::Usages;
 use super::webots_viewer;
 use crate::asset;

@@ -4,10 +4,10 @@ use std::time::{Duration, SystemTime};
 
 use askama::Template;
 
-use super::app::Server;
 use super::census::{Everybody, Simulation, Stage};
 use super::load_monitor::{Readings, Sample};
 use super::sensors::{self, Gpu, Host, Machine};
+use super::server::Server;
 use super::usage::{Usage, Usages};
 use crate::shared::live::{Row, View};
 use crate::shared::repositories::UrlPrefix;

@@ -7,9 +7,9 @@ use actix_web::middleware::DefaultHeaders;
 use actix_web::{HttpRequest, HttpResponse, web};
 use actix_web_actors::ws::WsResponseBuilder;
 
-use super::app::Server;
 use super::asking::{everybody, locked, too_busy};
 use super::page_routes;
+use super::server::Server;
 use super::status::{self, StatusPage};
 use super::web_client::WebClient;
 use crate::shared::auth::is_authorised;

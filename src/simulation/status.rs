@@ -2,9 +2,9 @@
 
 use serde::Serialize;
 
-use super::app::Server;
 use super::census::{Everybody, Simulation};
 use super::sensors::{Gpu, Host, Machine};
+use super::server::Server;
 use super::webots_viewer;
 use crate::shared::metrics::Gauge;
 use crate::shared::status::Dispatch;

@@ -10,7 +10,6 @@ use actix::prelude::*;
 use actix_web_actors::ws::{self, CloseCode, CloseReason, Message, ProtocolError, WebsocketContext};
 use tokio::sync::OwnedSemaphorePermit;
 
-use super::app::Server;
 use super::census::Change;
 use super::checkout::Project;
 use super::checkout_error::CheckoutError;
@@ -18,6 +17,7 @@ use super::lease::{Lease, Stage, Wanted};
 use super::outcome::{Outcome, Pending};
 use super::places::{Ask, PlaceEvent, Ticket};
 use super::protocol::{self, Mode, Request};
+use super::server::Server;
 use super::webots::{Orders, RestoreController, Webots};
 use super::webots_event::{Exit, WebotsEvent};
 use crate::shared::liveness::Liveness;

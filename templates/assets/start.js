@@ -9,10 +9,13 @@ export function advice(text) {
     [/not one of the repositories|no simulation server accepts|blocked repository|does not allow/i,
       'Only worlds of allowed repositories run here: the monitor page of each simulation server lists them.'],
     [/idle time/i, 'Worlds of others run here only while the servers have little to do. Try again later.'],
-    [/URL|blob|worlds folder|\.wbt/, 'Copy the address of the world’s page on its forge, such as https://github.com/USER/REPOSITORY/blob/main/worlds/NAME.wbt.'],
-    [/Webots is installed|has no Webots/, 'The administrator of this simulation server has to set where Webots is.'],
+    [/wrong .*URL|\bno URL\b/i, 'Copy the address of the world’s page on its forge, such as https://github.com/USER/REPOSITORY/blob/main/worlds/NAME.wbt.'],
+    [/does not exist|not public|has no |no branch|not found|no such/i,
+      'Look whether the repository, the branch and the file exist, and whether everybody may read them.'],
+    [/larger than|longer than/i, 'Try a smaller project, or ask the administrator for a higher limit.'],
+    [/Webots is installed|no Webots at/, 'The administrator of this simulation server has to set where Webots is.'],
     [/time limit/i, 'Connect again for another simulation.'],
-    [/clon|fetch|branch|tag|repository/i, 'Look whether the repository, the branch and the file exist, and whether everybody may read them.'],
+    [/places .* are taken/i, 'Connect again in a few minutes.'],
   ];
   const found = table.find(([pattern]) => pattern.test(text));
   return found ? found[1] : 'Connect again. If that fails too, tell the administrator what is written here.';

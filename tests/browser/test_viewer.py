@@ -81,7 +81,7 @@ class Viewing(BrowserTest):
         table = [
             ("https://github.com/stranger/worlds/blob/main/worlds/a.wbt", "no simulation server accepts", "monitor page"),
             ("https://github.com/demo/worlds/blob/main/a.wbt", "worlds", "Copy the address"),
-            (WORLD.format("missing"), "missing", "Look whether"),
+            (WORLD.format("missing"), "missing.wbt", "Look whether"),
             ("https://github.com/demo/nothing/blob/main/worlds/a.wbt", "nothing", "Look whether"),
         ]
         page = self.open(self.fleet.session.url("viewer"))

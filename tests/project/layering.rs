@@ -7,20 +7,21 @@ use crate::source::{Source, sources};
 /// Without inline tests.
 const LONGEST_FILE: usize = 300;
 
-fn is_actor(source: &Source) -> bool {
-    source.shipped.contains("impl Actor for")
+/// An actor, or what holds addresses of actors.
+fn is_about_actors(source: &Source) -> bool {
+    source.shipped.contains("impl Actor for") || source.shipped.contains("Addr<")
 }
 
-/// The floor that a module is on: it may name what is on its own floor or below. A room's `server` and `status` hold
-/// addresses of actors, and are named by actors and routes.
+/// The floor that a module is on: it may name what is on its own floor or below. The pages of `status` are made of what
+/// actors tell.
 fn floor(source: &Source) -> usize {
     let module = source.module().unwrap_or_default();
     match module.split_once("::") {
         Some(("shared", _)) => 0,
         Some((_, "app")) => 4,
         Some((_, "routes" | "page_routes")) => 3,
-        Some((_, "server" | "status" | "pages" | "asking")) => 2,
-        _ if is_actor(source) => 2,
+        Some((_, "status" | "pages" | "asking")) => 2,
+        _ if is_about_actors(source) => 2,
         _ => 1,
     }
 }

@@ -1,29 +1,10 @@
 //! The servers of the fleet, and the choice between them.
 
 use super::cost::{Common, Estimate};
+use super::policy::Policy;
 use super::server::{Report, Server};
 use std::collections::BTreeMap;
-use std::time::{Duration, Instant};
-
-/// What the owner of a fleet can set.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Policy {
-    /// A server takes clients while its effective load is under this, in percent. Default: 95.
-    pub threshold: f64,
-    /// What a client is expected to cost until a server's reports teach better, in percent. Default: 2.
-    pub initial_cost: f64,
-    /// How long a placement counts whose client does not come. Default: 15 seconds.
-    pub patience: Duration,
-    /// How long it takes until a client that came shows fully in the reported load, which is a mean of five seconds, and a
-    /// simulation needs a while to start. Default: 8 seconds.
-    pub settling: Duration,
-}
-
-impl Default for Policy {
-    fn default() -> Self {
-        Self { threshold: 95.0, initial_cost: 2.0, patience: Duration::from_secs(15), settling: Duration::from_secs(8) }
-    }
-}
+use std::time::Instant;
 
 /// The simulation servers, what is known of each, and the choice between them. `Id` is whatever the owner knows a server
 /// by.
@@ -155,6 +136,7 @@ mod tests {
     use super::super::server::Instances;
     use super::*;
     use proptest::prelude::*;
+    use std::time::Duration;
 
     fn policy(initial_cost: f64) -> Policy {
         Policy { initial_cost, ..Policy::default() }

@@ -1,7 +1,7 @@
 //! What is known of one simulation server: its last report, and what has been sent to it since.
 
 use super::cost::{Common, Cost, Estimate, FULL, believable};
-use super::fleet::Policy;
+use super::policy::Policy;
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 
