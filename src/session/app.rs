@@ -15,6 +15,7 @@ use super::registry::{Reconfigure, Registry};
 use super::routes;
 use super::server::Server;
 use crate::shared::config;
+use crate::shared::live::Live;
 use crate::shared::metrics::Metrics;
 use crate::shared::permanent;
 use crate::shared::seats::Seats;
@@ -104,9 +105,24 @@ fn assemble(config: SessionConfig, phase: watch::Receiver<Phase>) -> Result<Serv
     let (timing, ssl) = (config.timing.clone(), config.ssl);
     let seats = Seats::new(config.max_clients, config.max_clients_per_address);
     let trusted_proxies = config.trusted_proxies.clone();
+    let (examples, viewer_script) = (config.examples.clone(), config.viewer_script.clone());
     let registry = Registry::new(Arc::new(config), notices, latencies).start();
     let (started, started_at) = (Instant::now(), SystemTime::now());
-    Ok(Server { registry, timing, ssl, phase, seats, trusted_proxies, metrics, picks, started, started_at })
+    Ok(Server {
+        registry,
+        timing,
+        ssl,
+        phase,
+        seats,
+        trusted_proxies,
+        metrics,
+        picks,
+        live: Live::new(),
+        examples,
+        viewer_script,
+        started,
+        started_at,
+    })
 }
 
 /// Reads the configuration again. One that can't be used changes nothing.

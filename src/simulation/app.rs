@@ -21,7 +21,9 @@ use super::places::{Census, Places};
 use super::repository_cache::RepositoryCache;
 use super::routes;
 use super::server::Server;
+use super::usage::UsageMonitor;
 use crate::shared::admission::Rules;
+use crate::shared::live::Live;
 use crate::shared::metrics::Metrics;
 use crate::shared::permanent;
 use crate::shared::seats::Seats;
@@ -160,6 +162,8 @@ fn assemble(
         seats: Seats::new(config.max_clients, config.max_clients_per_address),
         metrics,
         starts,
+        live: Live::new(),
+        usage: UsageMonitor::default(),
         started: Instant::now(),
         config: Arc::new(config),
     })

@@ -13,7 +13,9 @@ use super::config::SimulationConfig;
 use super::instance_dir::RunDir;
 use super::load_monitor::{LoadMonitor, Readings};
 use super::places::Places;
+use super::usage::UsageMonitor;
 use crate::shared::admission::Rules;
+use crate::shared::live::Live;
 use crate::shared::load::Load;
 use crate::shared::metrics::Metrics;
 use crate::shared::seats::Seats;
@@ -47,6 +49,10 @@ pub struct Server {
     pub metrics: Metrics,
     /// Clients that asked for a simulation, by what came of it.
     pub starts: prometheus::IntCounterVec,
+    /// Monitor pages that are open.
+    pub live: Live,
+    /// What simulations take of the machine.
+    pub usage: UsageMonitor,
     /// When the server was started.
     pub started: Instant,
 }
