@@ -10,11 +10,14 @@ use actix_web::{App, HttpServer, web};
 use tokio::sync::{Semaphore, watch};
 
 use super::announcer::Announcer;
-use super::checkout::{Checkouts, Limits};
+use super::checkout::Checkouts;
+use super::command::is_in_path;
 use super::config::SimulationConfig;
+use super::fetcher::{Fetcher, Limits};
 use super::git::Git;
 use super::instance_dir::{RunDir, Swept};
 use super::load_monitor::{LoadMonitor, Readings};
+use super::outcome;
 use super::places::{Census, Places};
 use super::repository_cache::RepositoryCache;
 use super::routes;
@@ -32,6 +35,8 @@ pub struct Server {
     pub rules: Rules,
     /// Lends places.
     pub places: Addr<Places>,
+    /// Reads the machine.
+    pub load_monitor: Addr<LoadMonitor>,
     /// The machine's load.
     pub readings: watch::Receiver<Arc<Readings>>,
     /// Checks worlds out.
@@ -103,8 +108,13 @@ impl Server {
     /// The program that is started for each client.
     ///
     /// # Errors
-    /// Where it was looked for, and how to set it, in words for the client.
+    /// What is missing, and how to set it, in words for the client.
     pub fn webots_program(&self) -> Result<PathBuf, String> {
+        if self.config.xvfb && !is_in_path("xvfb-run") {
+            return Err("This simulation server gives each Webots a display of its own (xvfb), but has no xvfb-run. \
+                        Its administrator can install it, or set xvfb: false and display"
+                .to_owned());
+        }
         let how = "Its administrator can set webotsHome in the server's configuration, or the environment variable \
                    WEBOTS_HOME";
         let Some(program) = self.config.webots_program() else {
@@ -139,14 +149,15 @@ pub async fn run(config: SimulationConfig) -> Result<(), AppError> {
     let serving = actix_rt::spawn(http);
     tell_start(&server.config);
     let places = server.places.clone();
-    let lost = permanent::gone("Places", places.clone());
-    let mut lost = std::pin::pin!(lost);
+    let mut no_places = std::pin::pin!(permanent::gone("Places", places.clone()));
+    let mut no_readings = std::pin::pin!(permanent::gone("LoadMonitor", server.load_monitor.clone()));
     loop {
         let request = tokio::select! {
             request = signals.next() => request,
             Some(request) = asked.recv() => request,
             () = drained(&server) => Request::Stop,
-            name = &mut lost => return Err(AppError::Gone(name)),
+            fault = &mut no_places => return Err(AppError::Gone(fault)),
+            fault = &mut no_readings => return Err(AppError::Gone(fault)),
         };
         match request {
             Request::Stop => break,
@@ -162,6 +173,7 @@ pub async fn run(config: SimulationConfig) -> Result<(), AppError> {
     actix_rt::time::timeout(server.config.timing.stop, empty(&places)).await.ok();
     stop(&handle).await;
     drop(serving);
+    server.run.remove();
     log::info!("stopped");
     Ok(())
 }
@@ -187,16 +199,17 @@ fn assemble(
     let cache = RepositoryCache::open(&folder, config.cache_size << 20).map_err(cache_fault)?;
     let limits = Limits { time: config.timing.checkout, size: config.project_size << 20 };
     let runtime = tokio::runtime::Handle::current();
-    let checkouts = Checkouts::new(git, cache, config.git_mirrors.clone(), limits, runtime);
+    let fetcher = Fetcher::new(git, cache, config.git_mirrors.clone(), limits, runtime.clone());
+    let checkouts = Checkouts::new(fetcher, limits, runtime);
     let places = Places::new(config.streaming_ports(), config.waiting_line).start();
     let csv = config.monitor_log_enabled.then(|| config.log_dir.0.join("simulation/monitor.csv"));
     let (load_monitor, readings) = LoadMonitor::new(places.clone(), run.path(), csv);
-    load_monitor.start();
+    let load_monitor = load_monitor.start();
     if !config.notify.is_empty() {
         Announcer::new(&config).start();
     }
     let metrics = Metrics::new();
-    let starts = metrics.counter("simulation_starts_total", "Clients that asked for a simulation", "outcome")?;
+    let starts = outcome::counter(&metrics)?;
     let rules = Rules {
         allowed: config.allowed_repositories.clone(),
         blocked: config.blocked_repositories.clone(),
@@ -206,6 +219,7 @@ fn assemble(
     Ok(Server {
         rules,
         places,
+        load_monitor,
         readings,
         checkouts: Arc::new(checkouts),
         run: Arc::new(run),

@@ -1,4 +1,4 @@
-//! The command line of Webots. Pure.
+//! The command line of Webots.
 
 use std::ffi::OsString;
 use std::path::Path;
@@ -46,6 +46,13 @@ impl Launch<'_> {
         arguments.push(self.world.into());
         arguments
     }
+}
+
+/// Whether a program is found where the system looks for programs.
+#[must_use]
+pub fn is_in_path(program: &str) -> bool {
+    let folders = std::env::var_os("PATH").unwrap_or_default();
+    std::env::split_paths(&folders).any(|folder| folder.join(program).is_file())
 }
 
 #[cfg(test)]

@@ -87,13 +87,22 @@ fn run(orders: &Orders) -> Result<u8, String> {
     let lifeline = sender.clone();
     std::thread::spawn(move || watch_lifeline(&lifeline));
     std::thread::spawn(move || reap(group, &sender));
-    let code = supervise(&events, group, Duration::from_millis(orders.grace));
-    end_tree(&events);
+    let (code, rest) = supervise(&events, group, Duration::from_millis(orders.grace));
+    if rest == Rest::Unknown {
+        end_tree(&events);
+    }
     Ok(code)
 }
 
+/// What is left of a tree.
+#[derive(PartialEq, Eq)]
+enum Rest {
+    Nothing,
+    Unknown,
+}
+
 /// Waits for the end of the program, or for what ends it. Gives back the exit code.
-fn supervise(events: &Receiver<Event>, group: Pid, grace: Duration) -> u8 {
+fn supervise(events: &Receiver<Event>, group: Pid, grace: Duration) -> (u8, Rest) {
     let mut deadline: Option<Instant> = None;
     let mut code = 128 + 9;
     loop {
@@ -107,12 +116,14 @@ fn supervise(events: &Receiver<Event>, group: Pid, grace: Duration) -> u8 {
             Ok(Event::Ended(ended)) => {
                 code = ended;
                 if deadline.is_none() {
-                    return code;
+                    return (code, Rest::Unknown);
                 }
             }
             Ok(Event::Stop) => {}
             Err(RecvTimeoutError::Timeout) if deadline.is_none() => {}
-            Ok(Event::Lost | Event::Empty) | Err(_) => return code,
+            // It is told once only: who waited for it again would wait in vain.
+            Ok(Event::Empty) => return (code, Rest::Nothing),
+            Ok(Event::Lost) | Err(_) => return (code, Rest::Unknown),
         }
     }
 }

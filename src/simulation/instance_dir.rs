@@ -65,9 +65,16 @@ impl RunDir {
     }
 }
 
+impl RunDir {
+    /// Removes the folder with everything inside. Whoever still uses it does so in vain.
+    pub fn remove(&self) {
+        remove(&self.folder);
+    }
+}
+
 impl Drop for RunDir {
     fn drop(&mut self) {
-        remove(&self.folder);
+        self.remove();
     }
 }
 

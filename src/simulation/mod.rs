@@ -2,14 +2,21 @@
 
 pub mod announcer;
 pub mod app;
+pub mod census;
 pub mod checkout;
+pub mod checkout_error;
 pub mod command;
 pub mod config;
+pub mod display;
+pub mod fetcher;
 pub mod git;
 pub mod guardian;
 pub mod instance_dir;
+pub mod large_files;
+pub mod lease;
 pub mod load_monitor;
 pub mod mirrors;
+pub mod outcome;
 pub mod output;
 pub mod places;
 pub mod process_group;
@@ -22,4 +29,5 @@ pub mod sensors;
 pub mod status;
 pub mod web_client;
 pub mod webots;
+pub mod webots_event;
 pub mod world_file;

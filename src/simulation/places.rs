@@ -7,12 +7,11 @@
 use std::collections::{BTreeMap, VecDeque};
 use std::net::{Ipv4Addr, TcpListener};
 use std::ops::RangeInclusive;
-use std::path::PathBuf;
 use std::time::{Duration, SystemTime};
 
 use actix::prelude::*;
-use serde::Serialize;
 
+use super::census::{Change, Everybody, Simulation, Stage};
 use crate::shared::status::Instances;
 
 /// Asks for a place.
@@ -65,73 +64,10 @@ pub struct Update {
     change: Change,
 }
 
-/// What has changed in a simulation.
-#[derive(Debug)]
-pub enum Change {
-    /// It is in another state.
-    Stage(Stage),
-    /// Its world was made for this version of Webots.
-    Version(String),
-    /// It streams on this port, and its output is kept in this file.
-    Launched {
-        /// The port that was granted.
-        port: u16,
-        /// The file.
-        log: PathBuf,
-    },
-    /// It streams on this port.
-    Port(u16),
-}
-
-/// The states of a simulation as they are shown.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Stage {
-    /// In the waiting line.
-    Queued,
-    /// Its project is checked out.
-    CheckingOut,
-    /// Webots is starting.
-    Launching,
-    /// Webots runs, the simulation is paused.
-    Idle,
-    /// The simulation runs.
-    Running,
-    /// Webots is ending.
-    Stopping,
-}
-
 /// Asks who is here.
 #[derive(Message)]
 #[rtype(result = "Everybody")]
 pub struct Census;
-
-/// Who is here.
-#[derive(Debug, Clone, Default, MessageResponse)]
-pub struct Everybody {
-    /// How many, by state.
-    pub instances: Instances,
-    /// Each simulation, the oldest first.
-    pub simulations: Vec<Simulation>,
-}
-
-/// One simulation as it is shown.
-#[derive(Debug, Clone, Serialize)]
-#[serde(rename_all = "camelCase")]
-pub struct Simulation {
-    /// The world's URL.
-    pub world: String,
-    /// Its state.
-    pub stage: Stage,
-    /// When its client asked for it, in seconds since 1970.
-    pub since: u64,
-    /// The streaming port, once there is one.
-    pub port: Option<u16>,
-    /// The version of Webots that the world was made for.
-    pub version: Option<String>,
-    /// The file that its output is kept in.
-    pub log: Option<PathBuf>,
-}
 
 #[derive(Message)]
 #[rtype(result = "()")]
@@ -174,19 +110,29 @@ impl Places {
             && let Some(port) = self.free_port()
             && let Some(first) = self.line.pop_front()
         {
-            // Whoever is gone by now drops the ticket too.
-            if first.client.try_send(PlaceEvent::Granted(port)).is_ok()
-                && let Some(present) = self.present.get_mut(&first.id)
-            {
-                present.lent = Some(port);
-                present.shown.port = Some(port);
-                present.shown.stage = Stage::CheckingOut;
+            match first.client.try_send(PlaceEvent::Granted(port)) {
+                Ok(()) => self.lend(first.id, port),
+                // It is told at the next look, and nobody passes it.
+                Err(SendError::Full(_)) => {
+                    self.line.push_front(first);
+                    break;
+                }
+                // It is gone, and drops its ticket too.
+                Err(SendError::Closed(_)) => {}
             }
         }
         for (ahead, waiting) in self.line.iter_mut().enumerate() {
             if waiting.told != Some(ahead) && waiting.client.try_send(PlaceEvent::Ahead(ahead)).is_ok() {
                 waiting.told = Some(ahead);
             }
+        }
+    }
+
+    fn lend(&mut self, id: u64, port: u16) {
+        if let Some(present) = self.present.get_mut(&id) {
+            present.lent = Some(port);
+            present.shown.port = Some(port);
+            present.shown.stage = Stage::CheckingOut;
         }
     }
 
@@ -265,16 +211,7 @@ impl Handler<Update> for Places {
         let Some(Present { shown, .. }) = self.present.get_mut(&id) else {
             return;
         };
-        match change {
-            Change::Stage(stage) => shown.stage = stage,
-            Change::Version(version) => shown.version = Some(version),
-            Change::Port(port) => shown.port = Some(port),
-            Change::Launched { port, log } => {
-                shown.port = Some(port);
-                shown.log = Some(log);
-                shown.stage = Stage::Launching;
-            }
-        }
+        shown.apply(change);
     }
 }
 

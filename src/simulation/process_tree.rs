@@ -3,6 +3,7 @@
 use std::collections::HashSet;
 use std::ops::RangeInclusive;
 use std::path::Path;
+use std::time::Duration;
 
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
@@ -51,20 +52,36 @@ pub fn kill_descendants(root: i32) {
 
 /// Ends every process that carries the mark of an instance below `folder`, in whatever tree it is now.
 ///
-/// Gives back how many there were.
+/// It looks again until none is left, for one of them may have forked meanwhile. Gives back how many there were.
 #[must_use]
 pub fn kill_marked(folder: &Path) -> usize {
-    let marked = |process: &Process| {
+    let mut known = HashSet::new();
+    for _ in 0..MOST_LOOKS {
+        let found = marked(folder);
+        if found.is_empty() {
+            break;
+        }
+        signal_each(&found, Signal::SIGKILL);
+        known.extend(found);
+        std::thread::sleep(BETWEEN_LOOKS);
+    }
+    known.len()
+}
+
+/// How often marked processes are looked for.
+const MOST_LOOKS: usize = 200;
+/// Between two looks: killed processes need a moment to vanish.
+const BETWEEN_LOOKS: Duration = Duration::from_millis(5);
+
+fn marked(folder: &Path) -> Vec<i32> {
+    let carries_mark = |process: &Process| {
+        // A process that has ended, and is not yet buried, has no environment.
         process.environ().is_ok_and(|environment| {
             environment.get(std::ffi::OsStr::new(MARK)).is_some_and(|value| Path::new(value).starts_with(folder))
         })
     };
-    let Ok(processes) = all_processes() else {
-        return 0;
-    };
-    let pids: Vec<i32> = processes.flatten().filter(marked).map(|process| process.pid()).collect();
-    signal_each(&pids, Signal::SIGKILL);
-    pids.len()
+    let processes = all_processes().into_iter().flatten().flatten();
+    processes.filter(carries_mark).map(|process| process.pid()).collect()
 }
 
 fn signal_each<'pid>(pids: impl IntoIterator<Item = &'pid i32>, signal: Signal) {

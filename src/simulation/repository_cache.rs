@@ -105,7 +105,7 @@ impl InUse {
     pub async fn fetching(&self) -> io::Result<Fetching> {
         let lock = File::options().create(true).append(true).open(&self.fetch_lock)?;
         wait(|| lock.try_lock()).await?;
-        for broken in self.incoming() {
+        for broken in self.incoming().chain(self.locks()) {
             std::fs::remove_file(broken).ok();
         }
         Ok(Fetching { _lock: lock })
@@ -121,6 +121,19 @@ impl InUse {
     fn incoming(&self) -> impl Iterator<Item = PathBuf> {
         let entries = std::fs::read_dir(self.path.join("objects/pack")).into_iter().flatten().flatten();
         entries.filter(|entry| entry.file_name().as_encoded_bytes().starts_with(b"tmp_")).map(|entry| entry.path())
+    }
+
+    /// Locks that git leaves behind when it is killed: each would make every later fetch fail.
+    fn locks(&self) -> impl Iterator<Item = PathBuf> {
+        let folders = [self.path.clone(), self.path.join("refs/fleet")];
+        let entries = folders.into_iter().flat_map(|folder| std::fs::read_dir(folder).into_iter().flatten().flatten());
+        entries.map(|entry| entry.path()).filter(|path| path.extension().is_some_and(|extension| extension == "lock"))
+    }
+
+    /// Whether the bare repository is there.
+    #[must_use]
+    pub fn is_made(&self) -> bool {
+        self.path.join("HEAD").is_file()
     }
 
     /// Whether a commit was fetched, with all that belongs to it.

@@ -2,7 +2,6 @@
 
 use std::collections::HashSet;
 use std::ffi::OsString;
-use std::path::Path;
 
 use crate::shared::project_url::{ProjectUrl, Reading, RefKind};
 
@@ -132,26 +131,6 @@ impl Listing {
     pub fn has(&self, path: &str) -> bool {
         self.paths.contains(path.as_bytes())
     }
-}
-
-/// How many files below a folder are pointers into Git LFS, in place of what they stand for. Reads from disk.
-#[must_use]
-pub fn unresolved_lfs(folder: &Path) -> usize {
-    let mut count = 0;
-    let mut open = vec![folder.to_owned()];
-    while let Some(folder) = open.pop() {
-        for entry in std::fs::read_dir(folder).into_iter().flatten().flatten() {
-            match entry.metadata() {
-                Ok(about) if about.is_dir() => open.push(entry.path()),
-                Ok(about) if about.is_file() && about.len() < 1024 => {
-                    let text = std::fs::read(entry.path()).unwrap_or_default();
-                    count += usize::from(text.starts_with(b"version https://git-lfs.github.com/spec/"));
-                }
-                _ => {}
-            }
-        }
-    }
-    count
 }
 
 #[cfg(test)]

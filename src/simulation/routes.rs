@@ -10,7 +10,8 @@ use actix_web_actors::ws::WsResponseBuilder;
 use askama::Template;
 
 use super::app::Server;
-use super::places::{Census, Everybody};
+use super::census::Everybody;
+use super::places::Census;
 use super::status::{self, Page, StatusPage};
 use super::web_client::WebClient;
 use crate::shared::auth::is_authorised;

@@ -6,7 +6,7 @@ use askama::Template;
 use serde::Serialize;
 
 use super::app::Server;
-use super::places::{Everybody, Simulation};
+use super::census::{Everybody, Simulation};
 use super::sensors::{Gpu, Host, Machine};
 use crate::shared::metrics::Gauge;
 use crate::shared::status::Dispatch;

@@ -11,10 +11,15 @@ use actix_web_actors::ws::{self, CloseCode, CloseReason, Message, ProtocolError,
 use tokio::sync::OwnedSemaphorePermit;
 
 use super::app::Server;
-use super::checkout::{CheckoutError, Project};
-use super::places::{Ask, Change, PlaceEvent, Ticket};
+use super::census::Change;
+use super::checkout::Project;
+use super::checkout_error::CheckoutError;
+use super::lease::{Lease, Stage, Wanted};
+use super::outcome::{Outcome, Pending};
+use super::places::{Ask, PlaceEvent, Ticket};
 use super::protocol::{self, Mode, Request};
-use super::webots::{End, Exit, Orders, RestoreController, Webots, WebotsEvent};
+use super::webots::{Orders, RestoreController, Webots};
+use super::webots_event::{Exit, WebotsEvent};
 use crate::shared::liveness::Liveness;
 use crate::shared::project_url::ProjectUrl;
 use crate::shared::shutdown::{Phase, closing};
@@ -26,37 +31,9 @@ pub struct WebClient {
     stage: Stage,
     liveness: Liveness,
     restoring: bool,
+    /// Set from the wish for a simulation on.
+    start: Option<Pending>,
     _permit: OwnedSemaphorePermit,
-}
-
-/// The life of a simulation.
-enum Stage {
-    /// Nothing was asked for yet.
-    Connected,
-    /// A place was asked for; it may be granted before the ticket for it is here.
-    Asking { wanted: Wanted, granted: Option<u16> },
-    /// In the waiting line.
-    Waiting { wanted: Wanted, ticket: Ticket },
-    /// The project is being checked out; the job ends with the actor.
-    CheckingOut { mode: Mode, place: (Ticket, u16) },
-    /// Webots was started.
-    Launched(Lease),
-    /// The client was told the end.
-    Over,
-}
-
-struct Wanted {
-    world: ProjectUrl,
-    mode: Mode,
-}
-
-/// A running Webots: dropping it asks Webots to end.
-struct Lease(Addr<Webots>);
-
-impl Drop for Lease {
-    fn drop(&mut self) {
-        self.0.do_send(End);
-    }
 }
 
 /// Progress of a checkout.
@@ -71,7 +48,7 @@ impl WebClient {
     #[must_use]
     pub fn new(server: Arc<Server>, peer: Option<IpAddr>, permit: OwnedSemaphorePermit) -> Self {
         let stage = Stage::Connected;
-        Self { server, peer, stage, liveness: Liveness::new(), restoring: false, _permit: permit }
+        Self { server, peer, stage, liveness: Liveness::new(), restoring: false, start: None, _permit: permit }
     }
 
     fn name(&self) -> String {
@@ -82,6 +59,18 @@ impl WebClient {
     fn fail(&mut self, why: &str, ctx: &mut Context) {
         log::info!("{}: {why}", self.name());
         self.finish(&protocol::error(why), CloseCode::Normal, ctx);
+    }
+
+    /// The start that was asked for has failed.
+    fn fail_start(&mut self, outcome: Outcome, why: &str, ctx: &mut Context) {
+        self.comes_to(outcome);
+        self.fail(why, ctx);
+    }
+
+    fn comes_to(&mut self, outcome: Outcome) {
+        if let Some(start) = &mut self.start {
+            start.is(outcome);
+        }
     }
 
     fn finish(&mut self, last_words: &str, code: CloseCode, ctx: &mut Context) {
@@ -104,6 +93,7 @@ impl WebClient {
             log::warn!("{}: asks for a second simulation on one connection; ignored", self.name());
             return;
         }
+        self.start = Some(Pending::new(&self.server.starts));
         let admitted = ProjectUrl::parse(url).map_err(|wrong| wrong.to_string()).and_then(|world| {
             let load = self.server.load();
             let phase = *self.server.phase.borrow();
@@ -115,7 +105,7 @@ impl WebClient {
         });
         let world = match admitted {
             Ok(world) => world,
-            Err(why) => return self.fail(&why, ctx),
+            Err(why) => return self.fail_start(Outcome::Refused, &why, ctx),
         };
         log::info!("{}: asks for {world}", self.name());
         let ask = Ask { client: ctx.address().recipient(), world: world.to_string() };
@@ -124,7 +114,7 @@ impl WebClient {
         asked
             .map(|answer, this, ctx| match answer {
                 Ok(Ok(ticket)) => this.ticket_came(ticket, ctx),
-                Ok(Err(refused)) => this.fail(&refused.to_string(), ctx),
+                Ok(Err(refused)) => this.fail_start(Outcome::Full, &refused.to_string(), ctx),
                 Err(error) => this.fail(&format!("This simulation server can't lend a place: {error}"), ctx),
             })
             .spawn(ctx);
@@ -141,7 +131,10 @@ impl WebClient {
     fn check_out(&mut self, Wanted { world, mode }: Wanted, ticket: Ticket, port: u16, ctx: &mut Context) {
         let instance = match self.server.run.instance() {
             Ok(instance) => instance,
-            Err(error) => return self.fail(&format!("This simulation server has no room for a project: {error}"), ctx),
+            Err(error) => {
+                let why = format!("This simulation server has no room for a project: {error}");
+                return self.fail_start(Outcome::NoCheckout, &why, ctx);
+            }
         };
         self.stage = Stage::CheckingOut { mode, place: (ticket, port) };
         let me = ctx.address();
@@ -151,8 +144,8 @@ impl WebClient {
         job.into_actor(self)
             .map(|result, this, ctx| match result {
                 Ok(Ok(project)) => this.launch(project, ctx),
-                Ok(Err(error)) => this.fail(&error.to_string(), ctx),
-                Err(error) => this.fail(&format!("The checkout broke off: {error}"), ctx),
+                Ok(Err(error)) => this.fail_start(Outcome::NoCheckout, &error.to_string(), ctx),
+                Err(error) => this.fail_start(Outcome::NoCheckout, &format!("The checkout broke off: {error}"), ctx),
             })
             .spawn(ctx);
     }
@@ -164,7 +157,7 @@ impl WebClient {
         };
         let program = match self.server.webots_program() {
             Ok(program) => program,
-            Err(why) => return self.fail(&why, ctx),
+            Err(why) => return self.fail_start(Outcome::NoWebots, &why, ctx),
         };
         log::info!("{}: {} is for Webots {}", self.name(), project.world.path.display(), project.world.version);
         place.0.update(Change::Version(project.world.version.clone()));
@@ -215,6 +208,7 @@ impl WebClient {
 
     fn exited(&mut self, Exit { clean, why }: &Exit, ctx: &mut Context) {
         let words = if *clean { protocol::loading(why) } else { protocol::error(why) };
+        self.comes_to(Outcome::NoWebots);
         self.finish(&words, CloseCode::Normal, ctx);
     }
 
@@ -237,6 +231,7 @@ impl Actor for WebClient {
         closing(self.server.phase.clone())
             .into_actor(self)
             .map(|(), this, ctx| {
+                this.comes_to(Outcome::Stopped);
                 this.finish(&protocol::error("This simulation server is stopping"), CloseCode::Away, ctx);
             })
             .spawn(ctx);
@@ -309,6 +304,7 @@ impl Handler<WebotsEvent> for WebClient {
     fn handle(&mut self, event: WebotsEvent, ctx: &mut Self::Context) {
         match event {
             WebotsEvent::Listening(port) => {
+                self.comes_to(Outcome::Ready);
                 ctx.text(protocol::webots(&self.server.config.address(port), self.server.config.ssl));
             }
             WebotsEvent::Heartbeat => ctx.text(protocol::HEARTBEAT),

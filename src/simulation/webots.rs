@@ -10,14 +10,18 @@ use std::time::{Duration, Instant};
 
 use actix::prelude::*;
 
-use super::checkout::{CheckoutError, Checkouts, Project};
+use super::census::{Change, Stage};
+use super::checkout::{Checkouts, Project};
+use super::checkout_error::CheckoutError;
 use super::command::Launch;
 use super::config::SimulationConfig;
+use super::display;
 use super::output::{self, Sign, Tail};
-use super::places::{Change, Stage, Ticket};
+use super::places::Ticket;
 use super::process_group::{Ending, Plan, ProcessGroup};
 use super::process_tree;
 use super::protocol::Mode;
+use super::webots_event::{Exit, LastWord, WebotsEvent};
 
 /// Asks Webots to end.
 #[derive(Message)]
@@ -28,29 +32,6 @@ pub struct End;
 #[derive(Message)]
 #[rtype(result = "Result<(), CheckoutError>")]
 pub struct RestoreController(pub String);
-
-/// What a client hears of its Webots.
-#[derive(Message, Debug, Clone, PartialEq, Eq)]
-#[rtype(result = "()")]
-pub enum WebotsEvent {
-    /// It listens on this port.
-    Listening(u16),
-    /// It lives.
-    Heartbeat,
-    /// It has given no sign of life for so many seconds.
-    Hanging(u64),
-    /// It has ended, and why.
-    Exited(Exit),
-}
-
-/// Why a Webots has ended.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Exit {
-    /// Whether it ended by itself and in order.
-    pub clean: bool,
-    /// In words, for the client.
-    pub why: String,
-}
 
 /// What a Webots is started with.
 pub struct Orders {
@@ -79,10 +60,12 @@ pub struct Webots {
     mode: Mode,
     port: u16,
     ticket: Ticket,
-    events: Recipient<WebotsEvent>,
+    events: LastWord,
     group: Option<ProcessGroup>,
     tail: Tail,
     listening: bool,
+    /// Whether the simulation is not paused.
+    runs: bool,
     last_sign: Instant,
     hanging: bool,
     /// Why it was asked to end, if it was.
@@ -111,10 +94,11 @@ impl Webots {
             mode,
             port,
             ticket,
-            events,
+            events: LastWord::new(events),
             group: None,
             tail: Tail::default(),
             listening: false,
+            runs: false,
             last_sign: Instant::now(),
             hanging: false,
             asked: None,
@@ -136,7 +120,7 @@ impl Webots {
         );
         self.ticket.update(Change::Launched { port: self.port, log });
         self.group = Some(group);
-        ended.into_actor(self).map(|ending, this, ctx| this.exited(ending, ctx)).spawn(ctx);
+        ended.into_actor(self).map(|ending, this, ctx| this.ended(ending, ctx)).spawn(ctx);
         self.look_for_port(FIRST_LOOK, ctx);
         ctx.run_interval(self.config.timing.heartbeat, Self::check_signs);
         let limit = self.config.timing.launch;
@@ -161,11 +145,10 @@ impl Webots {
             world: &self.project.world.path,
             xvfb: self.config.xvfb,
         };
-        let display = self.config.display.clone();
-        let display = display.or_else(|| std::env::var_os("DISPLAY").is_none().then(|| ":0".to_owned()));
+        let display = display::effective(self.config.display.as_deref());
         Plan {
             command: launch.arguments(),
-            environment: display.into_iter().map(|display| ("DISPLAY".into(), display.into())).collect(),
+            environment: vec![("DISPLAY".into(), display.into())],
             folder: Some(self.project.folder().to_owned()),
             mark: self.project.instance.path().to_owned(),
             remove: Some(self.project.instance.path().to_owned()),
@@ -204,8 +187,15 @@ impl Webots {
         log::info!("port {port}: ready");
         self.listening = true;
         self.ticket.update(Change::Port(port));
-        self.ticket.update(Change::Stage(Stage::Idle));
+        self.show_pace();
         self.tell(WebotsEvent::Listening(port));
+    }
+
+    /// Shows whether the simulation runs; a Webots that is starting or ending is shown as that.
+    fn show_pace(&self) {
+        if self.listening && self.asked.is_none() {
+            self.ticket.update(Change::Stage(if self.runs { Stage::Running } else { Stage::Idle }));
+        }
     }
 
     fn check_signs(&mut self, _: &mut Context<Self>) {
@@ -232,13 +222,28 @@ impl Webots {
         }
     }
 
-    fn exited(&mut self, ending: Ending, ctx: &mut Context<Self>) {
+    fn ended(&mut self, ending: Ending, ctx: &mut Context<Self>) {
         log::info!("port {}: Webots {ending}", self.port);
         let exit = match self.asked.take() {
             Some(why) => Exit { clean: false, why: self.with_last_lines(&why) },
             None if ending == Ending::Code(0) => Exit { clean: true, why: "Webots has ended".to_owned() },
             None => Exit { clean: false, why: self.with_last_lines(&format!("Webots {ending}")) },
         };
+        if exit.clean || self.listening || self.config.xvfb {
+            return self.exited(exit, ctx);
+        }
+        let display = display::effective(self.config.display.as_deref());
+        let look =
+            actix_rt::task::spawn_blocking(move || (!display::answers(&display)).then(|| display::hint(&display)));
+        look.into_actor(self)
+            .map(move |hint, this, ctx| {
+                let hint = hint.ok().flatten().map(|hint| format!(" Note: {hint}.")).unwrap_or_default();
+                this.exited(Exit { clean: false, why: exit.why.clone() + &hint }, ctx);
+            })
+            .spawn(ctx);
+    }
+
+    fn exited(&mut self, exit: Exit, ctx: &mut Context<Self>) {
         self.tell(WebotsEvent::Exited(exit));
         ctx.stop();
     }
@@ -249,10 +254,8 @@ impl Webots {
         if lines.is_empty() { format!("{why}.") } else { format!("{why}. Its last output: {}", lines.join(" | ")) }
     }
 
-    fn tell(&self, event: WebotsEvent) {
-        if let Err(lost) = self.events.try_send(event) {
-            log::debug!("port {}: the client is gone: {lost}", self.port);
-        }
+    fn tell(&mut self, event: WebotsEvent) {
+        self.events.tell(event);
     }
 }
 
@@ -276,9 +279,11 @@ impl Handler<Sign> for Webots {
         self.hanging = false;
         match sign {
             Sign::Heartbeat if self.listening => self.tell(WebotsEvent::Heartbeat),
-            Sign::Paused if self.asked.is_none() => self.ticket.update(Change::Stage(Stage::Idle)),
-            Sign::Running if self.asked.is_none() => self.ticket.update(Change::Stage(Stage::Running)),
-            Sign::Heartbeat | Sign::Paused | Sign::Running => {}
+            Sign::Heartbeat => {}
+            Sign::Paused | Sign::Running => {
+                self.runs = sign == Sign::Running;
+                self.show_pace();
+            }
         }
     }
 }

@@ -1,16 +1,29 @@
-//! The life of a simulation, from the first message to the last trace.
+//! Leaving a simulation in every state and for every reason: nothing of it is left.
 
+use std::time::{Duration, Instant};
+
+use nix::sys::signal::{Signal, kill};
+use nix::unistd::Pid;
+
+use crate::scene::{ALL, DEMO, Scene, State, arm, instance_folders, nothing_left, stages};
 use crate::support::client::Client;
-use crate::support::git::{Forge, world};
-use crate::support::program::simulation_server;
+use crate::support::git::Forge;
+use crate::support::program::{Builder, simulation_server};
 use crate::support::until;
 use crate::support::webots::{Webots, instances_below};
+
+fn quick(builder: Builder) -> Builder {
+    builder.set("timing.grace", 0.3).set("timing.heartbeat", 0.2)
+}
+
+const WITH_CLIENT: [State; 6] =
+    [State::Connected, State::Waiting, State::CheckingOut, State::Launching, State::Idle, State::Running];
 
 #[actix_rt::test]
 async fn a_simulation_runs_from_the_first_message_to_the_last_trace() {
     let (forge, webots) = (Forge::with_arm(), Webots::launcher());
     let server = simulation_server(&webots.path(), forge.path(), 2).start().await;
-    let mut client = Client::start(&server, &world("lab/arm", "main", "worlds/a.wbt")).await;
+    let mut client = Client::start(&server, &arm()).await;
     assert_eq!(client.until("shutdownTimeout").await, "shutdownTimeout: 7200");
     let url = client.until("webots:").await;
     assert_eq!(url, format!("webots:ws://localhost:{}", server.port + 1));
@@ -18,11 +31,142 @@ async fn a_simulation_runs_from_the_first_message_to_the_last_trace() {
     viewer.send("x3d").await;
     viewer.until("scene load completed").await;
     assert!(instances_below(&server.folder).len() >= 3, "guardian, launcher and simulator");
+    let left = Instant::now();
     client.leave().await;
-    until("nothing of the simulation is left", async || {
-        let runs = std::fs::read_dir(server.folder.join("cache/runs")).unwrap();
-        let folders = runs.flat_map(|run| std::fs::read_dir(run.unwrap().path()).unwrap()).count();
-        instances_below(&server.folder).is_empty() && folders == 2
-    })
-    .await;
+    nothing_left(&server, 2).await;
+    assert!(left.elapsed() < Duration::from_secs(5), "the grace time was waited for in vain");
+}
+
+#[actix_rt::test]
+async fn a_client_that_closes_leaves_nothing_in_any_state() {
+    for state in WITH_CLIENT {
+        let mut scene = Scene::new(state, quick).await;
+        scene.client.take().unwrap().leave().await;
+        if let Some(other) = scene.other.take() {
+            until("the line is empty", async || stages(&scene.server).await == ["idle"]).await;
+            other.leave().await;
+        }
+        nothing_left(&scene.server, 1).await;
+    }
+}
+
+#[actix_rt::test]
+async fn a_connection_that_breaks_leaves_nothing_in_any_state() {
+    for state in WITH_CLIENT {
+        let mut scene = Scene::new(state, quick).await;
+        // Dropped without a word.
+        drop((scene.client.take(), scene.other.take()));
+        nothing_left(&scene.server, 1).await;
+    }
+}
+
+#[actix_rt::test]
+async fn a_half_open_connection_is_found_by_ping_in_any_state() {
+    for state in WITH_CLIENT {
+        // A client that is not polled answers no pings, and its connection stays open.
+        let change = |builder| quick(builder).set("timing.ping", 0.1).set("timing.silence", 1.5);
+        let scene = Scene::new(state, change).await;
+        if state == State::Connected {
+            until("it is sent away", async || scene.server.log().contains("silent for too long")).await;
+        }
+        nothing_left(&scene.server, 1).await;
+    }
+}
+
+#[actix_rt::test]
+async fn a_simulator_that_ignores_sigterm_and_hides_ends_after_the_grace_time() {
+    // The script ignores SIGTERM, and has a child in a session of its own.
+    let scene = Scene::new(State::Stopping, |builder| quick(builder).set("timing.grace", 1.0)).await;
+    assert!(instances_below(&scene.server.folder).iter().any(|one| one.1 == "sleep 1000"));
+    nothing_left(&scene.server, 1).await;
+}
+
+#[actix_rt::test]
+async fn a_server_that_stops_tells_its_clients_and_leaves_nothing_in_any_state() {
+    for state in ALL {
+        let mut scene = Scene::new(state, |builder| quick(builder).set("timing.grace", 1.0)).await;
+        let asked = Instant::now();
+        scene.server.signal(Signal::SIGTERM);
+        for client in [&mut scene.client, &mut scene.other].into_iter().flatten() {
+            assert_eq!(client.until("loading: Error:").await, "loading: Error: This simulation server is stopping");
+            assert_eq!(client.closed().await, Some(1001), "{state:?}");
+        }
+        assert_eq!(scene.server.ended().await, Some(0), "{state:?}");
+        assert!(asked.elapsed() < Duration::from_secs(10), "{state:?}");
+        assert_eq!(instances_below(scene.folder.path()), [], "{state:?}");
+        let runs = std::fs::read_dir(scene.folder.path().join("cache/runs")).unwrap().count();
+        assert_eq!(runs, 0, "{state:?}: the folder of the run is left");
+    }
+}
+
+#[actix_rt::test]
+async fn a_server_that_is_killed_leaves_nothing_in_any_state() {
+    for state in ALL {
+        let mut scene = Scene::new(state, quick).await;
+        scene.server.signal(Signal::SIGKILL);
+        scene.server.ended().await;
+        until("all processes are gone", async || instances_below(scene.folder.path()).is_empty()).await;
+        if !matches!(state, State::Connected | State::CheckingOut) {
+            until("its folder is gone", async || instance_folders(scene.folder.path()).is_empty()).await;
+        }
+    }
+}
+
+#[actix_rt::test]
+async fn what_a_killed_server_has_left_is_removed_at_the_next_start() {
+    let mut scene = Scene::new(State::CheckingOut, quick).await;
+    scene.server.signal(Signal::SIGKILL);
+    scene.server.ended().await;
+    assert_eq!(instance_folders(scene.folder.path()).len(), 1);
+    // A process that even left the guardian's tree is known by its mark.
+    let mark = instance_folders(scene.folder.path()).remove(0).canonicalize().unwrap();
+    let mut orphan = std::process::Command::new("sleep").arg("1000").env("WEBOTS_FLEET_INSTANCE", mark).spawn().unwrap();
+    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
+    let next = simulation_server(&webots.path(), forge.path(), 1).folder(scene.folder.path()).start().await;
+    assert!(!orphan.wait().unwrap().success(), "it was killed");
+    assert_eq!(instance_folders(scene.folder.path()).len(), 0);
+    assert!(next.log().contains("removed what 1 earlier runs had left, 1 processes among it"), "{}", next.log());
+}
+
+#[actix_rt::test]
+async fn a_guardian_that_is_killed_takes_its_tree_along_and_the_client_is_told() {
+    for state in [State::Launching, State::Idle, State::Running, State::Stopping] {
+        let mut scene = Scene::new(state, |builder| quick(builder).set("timing.grace", 4.0)).await;
+        let guardian = |one: &&(i32, String)| one.1.contains("guard") && one.1.contains("--remove");
+        let guardian = instances_below(scene.folder.path()).iter().find(guardian).unwrap().0;
+        kill(Pid::from_raw(guardian), Signal::SIGKILL).unwrap();
+        if let Some(client) = &mut scene.client {
+            let told = client.until("loading: Error:").await;
+            assert!(told.contains("Webots was ended by the signal SIGKILL"), "{told}");
+            assert_eq!(client.closed().await, Some(1000));
+        }
+        nothing_left(&scene.server, 1).await;
+    }
+}
+
+#[actix_rt::test]
+async fn a_client_is_told_how_webots_ended() {
+    let table = [
+        ("exit 0", "loading: Webots has ended"),
+        ("echo 'no licence' >&2; exit 3", "loading: Error: Webots ended with exit code 3. Its last output: no licence"),
+        ("kill -SEGV $$", "loading: Error: Webots was ended by the signal SIGSEGV"),
+    ];
+    let forge = Forge::with_arm();
+    for (end, words) in table {
+        // It ends while it is launching, or when it was ready.
+        for start in [String::new(), format!("{DEMO} \"$@\" &\nsleep 0.5; echo pause")] {
+            let webots = Webots::script(&format!("{start}\n{end}"));
+            let server = quick(simulation_server(&webots.path(), forge.path(), 1)).start().await;
+            let mut client = Client::start(&server, &arm()).await;
+            client.until("shutdownTimeout").await;
+            client.until("loading: ").await;
+            if client.heard.last().unwrap() == "loading: webots is starting" {
+                client.until("loading: ").await;
+            }
+            let told = client.heard.last().unwrap();
+            assert!(told.starts_with(words), "{told}");
+            assert_eq!(client.closed().await, Some(1000));
+            nothing_left(&server, 1).await;
+        }
+    }
 }

@@ -1,0 +1,87 @@
+//! Who is here, and what each simulation is doing: what is shown of it.
+
+use std::path::PathBuf;
+
+use actix::prelude::*;
+use serde::Serialize;
+
+use crate::shared::status::Instances;
+
+/// What has changed in a simulation.
+#[derive(Debug)]
+pub enum Change {
+    /// It is in another state.
+    Stage(Stage),
+    /// Its world was made for this version of Webots.
+    Version(String),
+    /// It streams on this port, and its output is kept in this file.
+    Launched {
+        /// The port that was granted.
+        port: u16,
+        /// The file.
+        log: PathBuf,
+    },
+    /// It streams on this port.
+    Port(u16),
+}
+
+/// The states of a simulation as they are shown.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Stage {
+    /// In the waiting line.
+    Queued,
+    /// Its project is checked out.
+    CheckingOut,
+    /// Webots is starting.
+    Launching,
+    /// Webots runs, the simulation is paused.
+    Idle,
+    /// The simulation runs.
+    Running,
+    /// Webots is ending.
+    Stopping,
+}
+
+/// Who is here.
+#[derive(Debug, Clone, Default, MessageResponse)]
+pub struct Everybody {
+    /// How many, by state.
+    pub instances: Instances,
+    /// Each simulation, the oldest first.
+    pub simulations: Vec<Simulation>,
+}
+
+/// One simulation as it is shown.
+#[derive(Debug, Clone, Serialize)]
+#[serde(rename_all = "camelCase")]
+pub struct Simulation {
+    /// The world's URL.
+    pub world: String,
+    /// Its state.
+    pub stage: Stage,
+    /// When its client asked for it, in seconds since 1970.
+    pub since: u64,
+    /// The streaming port, once there is one.
+    pub port: Option<u16>,
+    /// The version of Webots that the world was made for.
+    pub version: Option<String>,
+    /// The file that its output is kept in.
+    pub log: Option<PathBuf>,
+}
+
+impl Simulation {
+    /// Notes what has changed.
+    pub fn apply(&mut self, change: Change) {
+        match change {
+            Change::Stage(stage) => self.stage = stage,
+            Change::Version(version) => self.version = Some(version),
+            Change::Port(port) => self.port = Some(port),
+            Change::Launched { port, log } => {
+                self.port = Some(port);
+                self.log = Some(log);
+                self.stage = Stage::Launching;
+            }
+        }
+    }
+}
