@@ -8,6 +8,7 @@ pub mod liveness;
 pub mod load;
 pub mod logging;
 pub mod metrics;
+pub mod notify;
 pub mod permanent;
 pub mod project_url;
 pub mod repositories;
