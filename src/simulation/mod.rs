@@ -19,6 +19,7 @@ pub mod mirrors;
 pub mod outcome;
 pub mod output;
 pub mod places;
+pub mod preflight;
 pub mod process_group;
 pub mod process_tree;
 pub mod protocol;

@@ -120,7 +120,8 @@ async fn what_a_killed_server_has_left_is_removed_at_the_next_start() {
     assert_eq!(instance_folders(scene.folder.path()).len(), 1);
     // A process that even left the guardian's tree is known by its mark.
     let mark = instance_folders(scene.folder.path()).remove(0).canonicalize().unwrap();
-    let mut orphan = std::process::Command::new("sleep").arg("1000").env("WEBOTS_FLEET_INSTANCE", mark).spawn().unwrap();
+    let mut orphan =
+        std::process::Command::new("sleep").arg("1000").env("WEBOTS_FLEET_INSTANCE", mark).spawn().unwrap();
     let (forge, webots) = (Forge::with_arm(), Webots::launcher());
     let next = simulation_server(&webots.path(), forge.path(), 1).folder(scene.folder.path()).start().await;
     assert!(!orphan.wait().unwrap().success(), "it was killed");

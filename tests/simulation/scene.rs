@@ -56,7 +56,9 @@ impl Scene {
         let webots = Webots::script(&match state {
             State::Launching => "sleep 1000 & sleep 1000".to_owned(),
             State::Running => format!("{DEMO} \"$@\" & echo real-time; wait"),
-            State::Stopping => format!("trap '' TERM\n(setsid sleep 1000) &\n{DEMO} \"$@\" &\nwhile true; do wait; sleep 0.1; done"),
+            State::Stopping => {
+                format!("trap '' TERM\n(setsid sleep 1000) &\n{DEMO} \"$@\" &\nwhile true; do wait; sleep 0.1; done")
+            }
             _ => format!("{DEMO} \"$@\" & wait"),
         });
         let mut builder = simulation_server(&webots.path(), forge.path(), 1).folder(folder.path());
