@@ -11,12 +11,13 @@ use tokio::sync::watch;
 use super::audience::Audience;
 use super::config::SessionConfig;
 use super::mailer;
-use super::registry::{Reconfigure, Registry};
+use super::registry::{IsAvailable, Reconfigure, Registry};
 use super::routes;
 use super::server::Server;
 use crate::shared::config;
 use crate::shared::live::Live;
 use crate::shared::metrics::Metrics;
+use crate::shared::notify;
 use crate::shared::permanent;
 use crate::shared::seats::Seats;
 use crate::shared::shutdown::{Phase, Request, Signals};
@@ -72,6 +73,10 @@ pub async fn run(mut config: SessionConfig, file: PathBuf) -> Result<(), AppErro
     let serving = actix_rt::spawn(http);
     log::info!("session server {} listens on port {port}: {told}", env!("CARGO_PKG_VERSION"));
     println!("session server: {told}/monitor (local port {port})");
+    let listening = format!("listens on port {port}");
+    notify::ready(&listening);
+    let registry = server.registry.clone();
+    actix_rt::spawn(notify::feed_watchdog(async move || registry.send(IsAvailable).await.is_ok()));
     let mut lost = std::pin::pin!(permanent::gone("Registry", server.registry.clone()));
     loop {
         let request = tokio::select! {
@@ -80,11 +85,16 @@ pub async fn run(mut config: SessionConfig, file: PathBuf) -> Result<(), AppErro
         };
         match request {
             Request::Stop => break,
-            Request::Reload => reload(&file, &server.registry),
+            Request::Reload => {
+                notify::reloading();
+                reload(&file, &server.registry);
+                notify::ready(&listening);
+            }
             Request::Drain => log::info!("SIGUSR1 changes nothing here: simulation servers are drained"),
         }
     }
     log::info!("stopping");
+    notify::stopping();
     phase_sender.send_replace(Phase::Closing);
     // A connection that doesn't end in time is cut.
     actix_rt::time::timeout(stop, handle.stop(true)).await.ok();

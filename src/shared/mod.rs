@@ -10,6 +10,7 @@ pub mod liveness;
 pub mod load;
 pub mod logging;
 pub mod metrics;
+pub mod notify;
 pub mod page;
 pub mod peer;
 pub mod permanent;

@@ -22,6 +22,7 @@ pub mod output;
 pub mod page_routes;
 pub mod pages;
 pub mod places;
+pub mod preflight;
 pub mod process_group;
 pub mod process_tree;
 pub mod protocol;

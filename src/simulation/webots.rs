@@ -244,8 +244,7 @@ impl Webots {
             return self.exited(exit, ctx);
         }
         let display = display::effective(self.config.display.as_deref());
-        let look =
-            actix_rt::task::spawn_blocking(move || (!display::answers(&display)).then(|| display::hint(&display)));
+        let look = actix_rt::task::spawn_blocking(move || display::look(&display).err());
         look.into_actor(self)
             .map(move |hint, this, ctx| {
                 let hint = hint.ok().flatten().map(|hint| format!(" Note: {hint}.")).unwrap_or_default();
