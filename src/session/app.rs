@@ -6,6 +6,7 @@ use std::time::{Instant, SystemTime};
 
 use actix::prelude::*;
 use actix_web::{App, HttpServer, web};
+use nix::sys::resource::{Resource, getrlimit, setrlimit};
 use tokio::sync::watch;
 
 use super::audience::Audience;
@@ -53,6 +54,7 @@ const OUTCOMES: [&str; 4] = ["placed", "unavailable", "not_accepted", "wrong_url
 /// When it can't start, or an actor that must live is gone.
 pub async fn run(mut config: SessionConfig, file: PathBuf) -> Result<(), AppError> {
     let mut signals = Signals::catch()?;
+    allow_open_files();
     let (phase_sender, phase) = watch::channel(Phase::Open);
     let address = format!("{}:{}", config.bind, config.port);
     let socket = std::net::TcpListener::bind(&address).map_err(|source| AppError::Bind { address, source })?;
@@ -101,6 +103,16 @@ pub async fn run(mut config: SessionConfig, file: PathBuf) -> Result<(), AppErro
     drop(serving);
     log::info!("stopped");
     Ok(())
+}
+
+/// Lets the server open as many files as the system allows it: each client is one, and the usual limit is 1,024.
+fn allow_open_files() {
+    let raised = getrlimit(Resource::RLIMIT_NOFILE)
+        .and_then(|(_, most)| setrlimit(Resource::RLIMIT_NOFILE, most, most).map(|()| most));
+    match raised {
+        Ok(most) => log::debug!("{most} files may be open"),
+        Err(error) => log::warn!("the limit of open files can't be raised: {error}"),
+    }
 }
 
 /// Makes everything that the server is made of, and starts its actors.
