@@ -25,6 +25,7 @@ use crate::shared::admission::Rules;
 use crate::shared::load::Load;
 use crate::shared::metrics::Metrics;
 use crate::shared::permanent;
+use crate::shared::project_url::ProjectUrl;
 use crate::shared::shutdown::{Phase, Request, Signals};
 
 /// What routes and web clients share.
@@ -103,6 +104,19 @@ impl Server {
     #[must_use]
     pub fn is_draining(&self) -> bool {
         *self.phase.borrow() != Phase::Open
+    }
+
+    /// Whether a world may run here, now.
+    ///
+    /// # Errors
+    /// Why not, in words for the client.
+    pub fn admit(&self, url: &str) -> Result<ProjectUrl, String> {
+        let world = ProjectUrl::parse(url).map_err(|wrong| wrong.to_string())?;
+        if self.is_draining() {
+            return Err("This simulation server is about to end, and takes no new clients".to_owned());
+        }
+        self.rules.admit(&world, self.load()).map_err(|refusal| refusal.to_string())?;
+        Ok(world)
     }
 
     /// The program that is started for each client.
