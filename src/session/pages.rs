@@ -169,6 +169,7 @@ impl<'server> ServerRow<'server> {
     }
 
     /// By which rows are sorted.
+    #[expect(clippy::ref_option, reason = "templates hand references over")]
     fn value(number: &Option<f64>) -> f64 {
         number.map_or(-1.0, |number| (number * 10.0).round() / 10.0)
     }

@@ -17,6 +17,7 @@ pub mod large_files;
 pub mod lease;
 pub mod load_monitor;
 pub mod mirrors;
+pub mod orders;
 pub mod outcome;
 pub mod output;
 pub mod page_routes;

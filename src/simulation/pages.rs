@@ -153,12 +153,14 @@ impl<'readings> Glance<'readings> {
         }
     }
 
+    #[expect(clippy::trivially_copy_pass_by_ref, reason = "templates hand references over")]
     fn bytes(count: &u64) -> String {
         bytes(*count)
     }
 }
 
 impl Monitor<'_> {
+    #[expect(clippy::trivially_copy_pass_by_ref, reason = "templates hand references over")]
     fn bytes(count: &u64) -> String {
         bytes(*count)
     }
