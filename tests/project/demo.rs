@@ -48,8 +48,9 @@ async fn the_demo_runs_from_its_start_to_its_stop() {
         assert!(told.contains(&part), "{part} is missing: {told}");
     }
 
+    project.available().await;
     let mut visitor = Client::connect(&format!("ws://localhost:{session}/session")).await;
-    assert_eq!(visitor.until("").await, "1");
+    visitor.until("1").await;
     let chosen = http::get(&project.session_url(&format!("/session?url={WORLD}"))).await.text();
     assert_eq!(chosen, format!("ws://localhost:{simulation}"));
     for path in ["/monitor", "/status", "/load", "/metrics", "/health", "/request"] {
@@ -162,6 +163,7 @@ async fn the_client_of_the_readme_works() {
         actix_rt::time::timeout(SOON, child.wait()).await.unwrap().unwrap();
         heard
     };
+    project.available().await;
     let answer = talk(project.session, "/session", WORLD, 2).await;
     assert_eq!(answer, ["1".to_owned(), format!("ws://localhost:{}", project.simulation)]);
     let start = serde_json::json!({"start": {"url": WORLD}}).to_string();
