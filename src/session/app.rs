@@ -6,16 +6,19 @@ use std::time::{Instant, SystemTime};
 
 use actix::prelude::*;
 use actix_web::{App, HttpServer, web};
-use tokio::sync::{Semaphore, watch};
+use tokio::sync::watch;
 
+use super::audience::Audience;
 use super::config::SessionConfig;
 use super::mailer;
 use super::registry::{Reconfigure, Registry};
 use super::routes;
 use super::server::Server;
 use crate::shared::config;
+use crate::shared::live::Live;
 use crate::shared::metrics::Metrics;
 use crate::shared::permanent;
+use crate::shared::seats::Seats;
 use crate::shared::shutdown::{Phase, Request, Signals};
 
 /// Why the server can't go on.
@@ -58,12 +61,13 @@ pub async fn run(mut config: SessionConfig, file: PathBuf) -> Result<(), AppErro
     let told = config.address().http_url(config.ssl);
     let server = Arc::new(assemble(config, phase)?);
     let shared = web::Data::from(Arc::clone(&server));
-    let http = HttpServer::new(move || App::new().app_data(shared.clone()).configure(routes::configure))
-        .disable_signals()
-        .shutdown_timeout(stop.as_secs())
-        .backlog(4096)
-        .listen(socket)?
-        .run();
+    // This is called in each thread that serves connections.
+    let app = move || {
+        let audience = Audience::new(Arc::clone(&shared)).start();
+        App::new().app_data(shared.clone()).app_data(web::Data::new(audience)).configure(routes::configure)
+    };
+    let http =
+        HttpServer::new(app).disable_signals().shutdown_timeout(stop.as_secs()).backlog(4096).listen(socket)?.run();
     let handle = http.handle();
     let serving = actix_rt::spawn(http);
     log::info!("session server {} listens on port {port}: {told}", env!("CARGO_PKG_VERSION"));
@@ -99,10 +103,26 @@ fn assemble(config: SessionConfig, phase: watch::Receiver<Phase>) -> Result<Serv
     }
     let notices = mailer::start(&config).map(Addr::recipient);
     let (timing, ssl) = (config.timing.clone(), config.ssl);
-    let connections = Arc::new(Semaphore::new(config.max_clients));
+    let seats = Seats::new(config.max_clients, config.max_clients_per_address);
+    let trusted_proxies = config.trusted_proxies.clone();
+    let (examples, viewer_script) = (config.examples.clone(), config.viewer_script.clone());
     let registry = Registry::new(Arc::new(config), notices, latencies).start();
     let (started, started_at) = (Instant::now(), SystemTime::now());
-    Ok(Server { registry, timing, ssl, phase, connections, metrics, picks, started, started_at })
+    Ok(Server {
+        registry,
+        timing,
+        ssl,
+        phase,
+        seats,
+        trusted_proxies,
+        metrics,
+        picks,
+        live: Live::new(),
+        examples,
+        viewer_script,
+        started,
+        started_at,
+    })
 }
 
 /// Reads the configuration again. One that can't be used changes nothing.

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use actix::prelude::*;
 use actix_web::dev::ServerHandle;
 use actix_web::{App, HttpServer, web};
-use tokio::sync::{Semaphore, watch};
+use tokio::sync::watch;
 
 use super::announcer::Announcer;
 use super::checkout::Checkouts;
@@ -21,9 +21,12 @@ use super::places::{Census, Places};
 use super::repository_cache::RepositoryCache;
 use super::routes;
 use super::server::Server;
+use super::usage::UsageMonitor;
 use crate::shared::admission::Rules;
+use crate::shared::live::Live;
 use crate::shared::metrics::Metrics;
 use crate::shared::permanent;
+use crate::shared::seats::Seats;
 use crate::shared::shutdown::{Phase, Request, Signals};
 
 /// Why the server can't go on.
@@ -156,9 +159,11 @@ fn assemble(
         phase,
         requests,
         main_thread: Arbiter::current(),
-        connections: Arc::new(Semaphore::new(config.max_clients)),
+        seats: Seats::new(config.max_clients, config.max_clients_per_address),
         metrics,
         starts,
+        live: Live::new(),
+        usage: UsageMonitor::default(),
         started: Instant::now(),
         config: Arc::new(config),
     })

@@ -61,6 +61,8 @@ pub fn settings(remote: &Remote) -> Vec<OsString> {
     };
     let settings = [
         format!("lfs.url={url}"),
+        // For a folder, git-lfs looks here.
+        format!("remote.origin.url={url}"),
         "filter.lfs.process=git-lfs filter-process".to_owned(),
         "filter.lfs.smudge=git-lfs smudge -- %f".to_owned(),
         "filter.lfs.clean=git-lfs clean -- %f".to_owned(),

@@ -2,6 +2,7 @@
 
 pub mod announcer;
 pub mod app;
+pub mod asking;
 pub mod census;
 pub mod checkout;
 pub mod checkout_error;
@@ -18,6 +19,8 @@ pub mod load_monitor;
 pub mod mirrors;
 pub mod outcome;
 pub mod output;
+pub mod page_routes;
+pub mod pages;
 pub mod places;
 pub mod process_group;
 pub mod process_tree;
@@ -28,7 +31,9 @@ pub mod routes;
 pub mod sensors;
 pub mod server;
 pub mod status;
+pub mod usage;
 pub mod web_client;
 pub mod webots;
 pub mod webots_event;
+pub mod webots_viewer;
 pub mod world_file;

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use actix::prelude::*;
-use tokio::sync::{Semaphore, watch};
+use tokio::sync::watch;
 
 use super::checkout::Checkouts;
 use super::command::is_in_path;
@@ -13,9 +13,12 @@ use super::config::SimulationConfig;
 use super::instance_dir::RunDir;
 use super::load_monitor::{LoadMonitor, Readings};
 use super::places::Places;
+use super::usage::UsageMonitor;
 use crate::shared::admission::Rules;
+use crate::shared::live::Live;
 use crate::shared::load::Load;
 use crate::shared::metrics::Metrics;
+use crate::shared::seats::Seats;
 use crate::shared::shutdown::{Phase, Request};
 
 /// What routes and web clients share.
@@ -41,11 +44,15 @@ pub struct Server {
     /// Where Webots' actors live.
     pub main_thread: ArbiterHandle,
     /// Counts connections.
-    pub connections: Arc<Semaphore>,
+    pub seats: Seats,
     /// What is counted.
     pub metrics: Metrics,
     /// Clients that asked for a simulation, by what came of it.
     pub starts: prometheus::IntCounterVec,
+    /// Monitor pages that are open.
+    pub live: Live,
+    /// What simulations take of the machine.
+    pub usage: UsageMonitor,
     /// When the server was started.
     pub started: Instant,
 }

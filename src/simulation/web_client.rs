@@ -3,12 +3,10 @@
 //! Created by the route for each connection; ends with it. The connection is the lease: whatever this actor holds in
 //! any state (a place in the line, a checkout under way, a running Webots) is given back when it is dropped.
 
-use std::net::IpAddr;
 use std::sync::Arc;
 
 use actix::prelude::*;
 use actix_web_actors::ws::{self, CloseCode, CloseReason, Message, ProtocolError, WebsocketContext};
-use tokio::sync::OwnedSemaphorePermit;
 
 use super::census::Change;
 use super::checkout::Project;
@@ -21,19 +19,21 @@ use super::server::Server;
 use super::webots::{Orders, RestoreController, Webots};
 use super::webots_event::{Exit, WebotsEvent};
 use crate::shared::liveness::Liveness;
+use crate::shared::peer::Peer;
 use crate::shared::project_url::ProjectUrl;
+use crate::shared::seats::Seat;
 use crate::shared::shutdown::{Phase, closing};
 
 /// The actor.
 pub struct WebClient {
     server: Arc<Server>,
-    peer: Option<IpAddr>,
+    peer: Peer,
     stage: Stage,
     liveness: Liveness,
     restoring: bool,
     /// Set from the wish for a simulation on.
     start: Option<Pending>,
-    _permit: OwnedSemaphorePermit,
+    _seat: Seat,
 }
 
 /// Progress of a checkout.
@@ -44,15 +44,15 @@ struct Progress(String);
 type Context = WebsocketContext<WebClient>;
 
 impl WebClient {
-    /// A client that has just connected; `permit` counts it.
+    /// A client that has just connected; `seat` counts it.
     #[must_use]
-    pub fn new(server: Arc<Server>, peer: Option<IpAddr>, permit: OwnedSemaphorePermit) -> Self {
+    pub fn new(server: Arc<Server>, peer: Peer, seat: Seat) -> Self {
         let stage = Stage::Connected;
-        Self { server, peer, stage, liveness: Liveness::new(), restoring: false, start: None, _permit: permit }
+        Self { server, peer, stage, liveness: Liveness::new(), restoring: false, start: None, _seat: seat }
     }
 
     fn name(&self) -> String {
-        self.peer.map_or_else(|| "client".to_owned(), |peer| format!("client {peer}"))
+        format!("client {}", self.peer)
     }
 
     /// Tells a failure, and closes the connection.

@@ -22,6 +22,7 @@ use super::process_group::{Ending, Plan, ProcessGroup};
 use super::process_tree;
 use super::protocol::Mode;
 use super::webots_event::{Exit, LastWord, WebotsEvent};
+use crate::shared::timestamp::seconds_since_1970;
 
 /// Asks Webots to end.
 #[derive(Message)]
@@ -121,7 +122,8 @@ impl Webots {
             self.project.world.path.display(),
             group.guardian()
         );
-        self.ticket.update(Change::Launched { port: self.port, log });
+        let (at, pid) = (seconds_since_1970(), group.guardian());
+        self.ticket.update(Change::Launched { at, pid, port: self.port, log });
         self.group = Some(group);
         let ended = async move {
             let ending = ended.await;
