@@ -14,9 +14,9 @@ use super::registry::{Reconfigure, Registry};
 use super::routes;
 use super::server::Server;
 use crate::shared::config;
+use crate::shared::connections::Connections;
 use crate::shared::metrics::Metrics;
 use crate::shared::permanent;
-use crate::shared::seats::Seats;
 use crate::shared::shutdown::{Phase, Request, Signals};
 
 /// Why the server can't go on.
@@ -100,11 +100,11 @@ fn assemble(config: SessionConfig, phase: watch::Receiver<Phase>) -> Result<Serv
     }
     let notices = mailer::start(&config).map(Addr::recipient);
     let (timing, ssl) = (config.timing.clone(), config.ssl);
-    let seats = Seats::new(config.max_clients, config.max_clients_per_address);
+    let connections = Connections::new(config.max_clients, config.max_clients_per_address);
     let trusted_proxies = config.trusted_proxies.clone();
     let registry = Registry::new(Arc::new(config), notices, latencies).start();
     let (started, started_at) = (Instant::now(), SystemTime::now());
-    Ok(Server { registry, timing, ssl, phase, seats, trusted_proxies, metrics, picks, started, started_at })
+    Ok(Server { registry, timing, ssl, phase, connections, trusted_proxies, metrics, picks, started, started_at })
 }
 
 /// Reads the configuration again. One that can't be used changes nothing.

@@ -8,9 +8,9 @@ use tokio::sync::watch;
 use super::config::Timing;
 use super::pick::{NoServer, Pick};
 use super::registry::Registry;
+use crate::shared::connections::Connections;
 use crate::shared::metrics::Metrics;
 use crate::shared::peer::TrustedProxies;
-use crate::shared::seats::Seats;
 use crate::shared::shutdown::Phase;
 
 /// What routes and web clients share.
@@ -24,7 +24,7 @@ pub struct Server {
     /// Whether clients are taken.
     pub phase: watch::Receiver<Phase>,
     /// Counts WebSockets.
-    pub seats: Seats,
+    pub connections: Connections,
     /// Whose word on clients' addresses is taken.
     pub trusted_proxies: TrustedProxies,
     /// What is counted.

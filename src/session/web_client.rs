@@ -13,9 +13,9 @@ use super::pick::Pick;
 use super::registry::{Subscribe, Subscription};
 use super::server::Server;
 use super::subscribers::Availability;
+use crate::shared::connections::Connection;
 use crate::shared::liveness::Liveness;
 use crate::shared::peer::Peer;
-use crate::shared::seats::Seat;
 use crate::shared::shutdown::closing;
 
 /// The actor.
@@ -25,16 +25,16 @@ pub struct WebClient {
     liveness: Liveness,
     told: Option<bool>,
     subscription: Option<Subscription>,
-    _seat: Seat,
+    _connection: Connection,
 }
 
 type Context = WebsocketContext<WebClient>;
 
 impl WebClient {
-    /// A client that has just connected; `seat` counts it.
+    /// A client that has just connected; `connection` counts it.
     #[must_use]
-    pub fn new(server: Arc<Server>, peer: Peer, seat: Seat) -> Self {
-        Self { server, peer, liveness: Liveness::new(), told: None, subscription: None, _seat: seat }
+    pub fn new(server: Arc<Server>, peer: Peer, connection: Connection) -> Self {
+        Self { server, peer, liveness: Liveness::new(), told: None, subscription: None, _connection: connection }
     }
 
     fn close(code: CloseCode, ctx: &mut Context) {

@@ -22,9 +22,9 @@ use super::repository_cache::RepositoryCache;
 use super::routes;
 use super::server::Server;
 use crate::shared::admission::Rules;
+use crate::shared::connections::Connections;
 use crate::shared::metrics::Metrics;
 use crate::shared::permanent;
-use crate::shared::seats::Seats;
 use crate::shared::shutdown::{Phase, Request, Signals};
 
 /// Why the server can't go on.
@@ -157,7 +157,7 @@ fn assemble(
         phase,
         requests,
         main_thread: Arbiter::current(),
-        seats: Seats::new(config.max_clients, config.max_clients_per_address),
+        connections: Connections::new(config.max_clients, config.max_clients_per_address),
         metrics,
         starts,
         started: Instant::now(),

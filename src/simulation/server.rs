@@ -14,9 +14,9 @@ use super::instance_dir::RunDir;
 use super::load_monitor::{LoadMonitor, Readings};
 use super::places::Places;
 use crate::shared::admission::Rules;
+use crate::shared::connections::Connections;
 use crate::shared::load::Load;
 use crate::shared::metrics::Metrics;
-use crate::shared::seats::Seats;
 use crate::shared::shutdown::{Phase, Request};
 
 /// What routes and web clients share.
@@ -42,7 +42,7 @@ pub struct Server {
     /// Where Webots' actors live.
     pub main_thread: ArbiterHandle,
     /// Counts connections.
-    pub seats: Seats,
+    pub connections: Connections,
     /// What is counted.
     pub metrics: Metrics,
     /// Clients that asked for a simulation, by what came of it.

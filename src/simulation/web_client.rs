@@ -18,10 +18,10 @@ use super::protocol::{self, Mode, Request};
 use super::server::Server;
 use super::webots::{Orders, RestoreController, Webots};
 use super::webots_event::{Exit, WebotsEvent};
+use crate::shared::connections::Connection;
 use crate::shared::liveness::Liveness;
 use crate::shared::peer::Peer;
 use crate::shared::project_url::ProjectUrl;
-use crate::shared::seats::Seat;
 use crate::shared::shutdown::{Phase, closing};
 
 /// The actor.
@@ -33,7 +33,7 @@ pub struct WebClient {
     restoring: bool,
     /// Set from the wish for a simulation on.
     start: Option<Pending>,
-    _seat: Seat,
+    _connection: Connection,
 }
 
 /// Progress of a checkout.
@@ -44,11 +44,11 @@ struct Progress(String);
 type Context = WebsocketContext<WebClient>;
 
 impl WebClient {
-    /// A client that has just connected; `seat` counts it.
+    /// A client that has just connected; `connection` counts it.
     #[must_use]
-    pub fn new(server: Arc<Server>, peer: Peer, seat: Seat) -> Self {
+    pub fn new(server: Arc<Server>, peer: Peer, connection: Connection) -> Self {
         let stage = Stage::Connected;
-        Self { server, peer, stage, liveness: Liveness::new(), restoring: false, start: None, _seat: seat }
+        Self { server, peer, stage, liveness: Liveness::new(), restoring: false, start: None, _connection: connection }
     }
 
     fn name(&self) -> String {
