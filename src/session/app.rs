@@ -8,6 +8,7 @@ use actix::prelude::*;
 use actix_web::{App, HttpServer, web};
 use tokio::sync::watch;
 
+use super::audience::Audience;
 use super::config::SessionConfig;
 use super::mailer;
 use super::registry::{Reconfigure, Registry};
@@ -59,12 +60,13 @@ pub async fn run(mut config: SessionConfig, file: PathBuf) -> Result<(), AppErro
     let told = config.address().http_url(config.ssl);
     let server = Arc::new(assemble(config, phase)?);
     let shared = web::Data::from(Arc::clone(&server));
-    let http = HttpServer::new(move || App::new().app_data(shared.clone()).configure(routes::configure))
-        .disable_signals()
-        .shutdown_timeout(stop.as_secs())
-        .backlog(4096)
-        .listen(socket)?
-        .run();
+    // This is called in each thread that serves connections.
+    let app = move || {
+        let audience = Audience::new(Arc::clone(&shared)).start();
+        App::new().app_data(shared.clone()).app_data(web::Data::new(audience)).configure(routes::configure)
+    };
+    let http =
+        HttpServer::new(app).disable_signals().shutdown_timeout(stop.as_secs()).backlog(4096).listen(socket)?.run();
     let handle = http.handle();
     let serving = actix_rt::spawn(http);
     log::info!("session server {} listens on port {port}: {told}", env!("CARGO_PKG_VERSION"));

@@ -1,6 +1,7 @@
 //! The session server: the one door to a fleet of simulation servers.
 
 pub mod app;
+pub mod audience;
 pub mod changes;
 pub mod config;
 pub mod fleet_status;

@@ -11,6 +11,7 @@ use actix_web_actors::ws::WsResponseBuilder;
 use askama::Template;
 use rand::RngExt;
 
+use super::audience::Audience;
 use super::fleet_status::{FleetStatus, told_mean};
 use super::pick::{NoServer, Pick};
 use super::registry::{GetStatus, IsAvailable, Registry};
@@ -65,13 +66,23 @@ fn wants_websocket(request: &HttpRequest) -> bool {
     upgrade.is_some_and(|value| value.eq_ignore_ascii_case("websocket"))
 }
 
-async fn root(request: HttpRequest, stream: web::Payload, server: web::Data<Server>) -> HttpResponse {
-    if wants_websocket(&request) { websocket(&request, stream, &server) } else { availability(server).await }
+async fn root(
+    request: HttpRequest,
+    stream: web::Payload,
+    server: web::Data<Server>,
+    audience: web::Data<Addr<Audience>>,
+) -> HttpResponse {
+    if wants_websocket(&request) { websocket(&request, stream, &server, &audience) } else { availability(server).await }
 }
 
-async fn session(request: HttpRequest, stream: web::Payload, server: web::Data<Server>) -> HttpResponse {
+async fn session(
+    request: HttpRequest,
+    stream: web::Payload,
+    server: web::Data<Server>,
+    audience: web::Data<Addr<Audience>>,
+) -> HttpResponse {
     if wants_websocket(&request) {
-        return websocket(&request, stream, &server);
+        return websocket(&request, stream, &server, &audience);
     }
     let answer = server.pick(Pick::parse(wanted_world(request.query_string()))).await;
     let status = match answer.refusal {
@@ -94,13 +105,18 @@ fn wanted_world(query: &str) -> Option<&str> {
     begin.filter(|world| !world.is_empty())
 }
 
-fn websocket(request: &HttpRequest, stream: web::Payload, server: &web::Data<Server>) -> HttpResponse {
+fn websocket(
+    request: &HttpRequest,
+    stream: web::Payload,
+    server: &web::Data<Server>,
+    audience: &Addr<Audience>,
+) -> HttpResponse {
     let peer = server.trusted_proxies.peer(request);
-    let connection = match server.connections.take(peer) {
+    let connection = match server.connections.admit(peer) {
         Ok(connection) => connection,
         Err(crowded) => return crowded.answer(),
     };
-    let actor = WebClient::new(Arc::clone(server), peer, connection);
+    let actor = WebClient::new(Arc::clone(server), audience.clone(), peer, connection);
     WsResponseBuilder::new(actor, request, stream).frame_size(LARGEST_MESSAGE).start().unwrap_or_else(|error| {
         let problem = format!("Error: this is a WebSocket: {error}.");
         HttpResponse::build(error.as_response_error().status_code()).body(problem)
@@ -137,7 +153,7 @@ async fn monitor(server: web::Data<Server>) -> HttpResponse {
 }
 
 async fn metrics(server: web::Data<Server>) -> HttpResponse {
-    with_status(&server, |status| match server.metrics.render(&status::gauges(status)) {
+    with_status(&server, |status| match server.metrics.render(&status::gauges(server.clients(), status)) {
         Ok(text) => HttpResponse::Ok().content_type(CONTENT_TYPE).body(text),
         Err(error) => HttpResponse::InternalServerError().body(format!("Error: {error}.")),
     })

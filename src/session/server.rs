@@ -49,6 +49,12 @@ pub struct Answer {
 const PATIENCE: Duration = Duration::from_secs(2);
 
 impl Server {
+    /// How many web clients are connected.
+    #[must_use]
+    pub fn clients(&self) -> usize {
+        self.connections.count()
+    }
+
     /// Asks for a simulation server, and puts the answer in the words of the protocol.
     pub async fn pick(&self, wanted: Result<Pick, NoServer>) -> Answer {
         let picked = match wanted {

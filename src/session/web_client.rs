@@ -1,7 +1,7 @@
 //! Actor: one web client's WebSocket. Tells it whether a simulation server can take a client, and which.
 //!
-//! Created by the route for each connection; ends with it. It subscribes to the registry's changes, and never tells
-//! the same value twice. A text from the client asks for a simulation server.
+//! Created by the route for each connection; ends with it. It joins the audience of its thread, and never tells the
+//! same value twice. A text from the client asks for a simulation server.
 
 use std::sync::Arc;
 
@@ -9,14 +9,13 @@ use actix::prelude::*;
 use actix_web_actors::ws::{CloseCode, CloseReason, Message, ProtocolError, WebsocketContext};
 use serde::Deserialize;
 
+use super::audience::{Audience, Join, Seat};
 use super::pick::Pick;
-use super::registry::{Subscribe, Subscription};
 use super::server::Server;
-use super::subscribers::Availability;
+use super::subscribers::News;
 use crate::shared::connections::Connection;
 use crate::shared::liveness::Liveness;
 use crate::shared::peer::Peer;
-use crate::shared::shutdown::closing;
 
 /// The actor.
 pub struct WebClient {
@@ -24,7 +23,8 @@ pub struct WebClient {
     peer: Peer,
     liveness: Liveness,
     told: Option<bool>,
-    subscription: Option<Subscription>,
+    audience: Addr<Audience>,
+    seat: Option<Seat>,
     _connection: Connection,
 }
 
@@ -33,8 +33,8 @@ type Context = WebsocketContext<WebClient>;
 impl WebClient {
     /// A client that has just connected; `connection` counts it.
     #[must_use]
-    pub fn new(server: Arc<Server>, peer: Peer, connection: Connection) -> Self {
-        Self { server, peer, liveness: Liveness::new(), told: None, subscription: None, _connection: connection }
+    pub fn new(server: Arc<Server>, audience: Addr<Audience>, peer: Peer, connection: Connection) -> Self {
+        Self { server, peer, liveness: Liveness::new(), told: None, audience, seat: None, _connection: connection }
     }
 
     fn close(code: CloseCode, ctx: &mut Context) {
@@ -77,27 +77,29 @@ impl Actor for WebClient {
 
     fn started(&mut self, ctx: &mut Self::Context) {
         ctx.run_interval(self.server.timing.ping, Self::ping);
-        let subscribed = self.server.registry.send(Subscribe(ctx.address().recipient())).into_actor(self);
+        let subscribed = self.audience.send(Join(ctx.address().recipient())).into_actor(self);
         subscribed
             .map(|answer, client, ctx| match answer {
-                Ok(subscription) => client.subscription = Some(subscription),
+                Ok(seat) => client.seat = Some(seat),
                 Err(error) => {
                     log::error!("a client can't be told of changes: {error}");
                     Self::close(CloseCode::Error, ctx);
                 }
             })
             .spawn(ctx);
-        let ending = closing(self.server.phase.clone()).into_actor(self);
-        ending.map(|(), _, ctx| Self::close(CloseCode::Away, ctx)).spawn(ctx);
     }
 }
 
-impl Handler<Availability> for WebClient {
+impl Handler<News> for WebClient {
     type Result = ();
 
-    fn handle(&mut self, Availability(available): Availability, ctx: &mut Self::Context) {
-        if self.told.replace(available) != Some(available) {
-            ctx.text(if available { "1" } else { "0" });
+    fn handle(&mut self, news: News, ctx: &mut Self::Context) {
+        match news {
+            News::Closing => Self::close(CloseCode::Away, ctx),
+            News::Availability(available) if self.told.replace(available) != Some(available) => {
+                ctx.text(if available { "1" } else { "0" });
+            }
+            News::Availability(_) => {}
         }
     }
 }

@@ -50,7 +50,7 @@ async fn client(request: HttpRequest, stream: web::Payload, server: web::Data<Se
         return refusal;
     }
     let peer = server.config.trusted_proxies.peer(&request);
-    let connection = match server.connections.take(peer) {
+    let connection = match server.connections.admit(peer) {
         Ok(connection) => connection,
         Err(crowded) => return crowded.answer(),
     };
