@@ -49,7 +49,9 @@ struct ServerRow<'server> {
     rank: u8,
     error: Option<&'server str>,
     load: Option<f64>,
+    load_value: f64,
     effective: Option<f64>,
+    effective_value: f64,
     instances: Option<Instances>,
     repositories: Vec<&'server str>,
     whose: &'static str,
@@ -145,6 +147,7 @@ impl Glance {
 impl<'server> ServerRow<'server> {
     fn new(server: &'server ServerStatus, ssl: bool) -> Self {
         let report = server.report.as_ref().filter(|_| server.state != State::Down);
+        let load = report.map(|report| report.load.percent());
         let repositories = report.map(|report| report.allowed_repositories.as_slice()).unwrap_or_default();
         let whose = match report {
             None => "–",
@@ -156,8 +159,10 @@ impl<'server> ServerRow<'server> {
             monitor: format!("{}/monitor", server.address.http_url(ssl)),
             rank: rank(server.state),
             error: server.error.as_deref().filter(|_| server.state == State::Down),
-            load: report.map(|report| report.load.percent()),
+            load,
+            load_value: sort_value(load),
             effective: server.effective_load,
+            effective_value: sort_value(server.effective_load),
             instances: known_instances(server),
             repositories: repositories.iter().map(|prefix| without_scheme(prefix.as_str())).collect(),
             whose,
@@ -166,12 +171,6 @@ impl<'server> ServerRow<'server> {
             latency_value: server.latency.unwrap_or_default().as_micros(),
             since: timestamp(server.since),
         }
-    }
-
-    /// By which rows are sorted.
-    #[expect(clippy::ref_option, reason = "templates hand references over")]
-    fn value(number: &Option<f64>) -> f64 {
-        number.map_or(-1.0, |number| (number * 10.0).round() / 10.0)
     }
 }
 
@@ -207,4 +206,9 @@ fn milliseconds(time: Duration) -> String {
         millis @ 1..1000 => format!("{millis} ms"),
         _ => format!("{:.1} s", time.as_secs_f64()),
     }
+}
+
+/// By which rows are sorted: what is not known comes first.
+fn sort_value(number: Option<f64>) -> f64 {
+    number.map_or(-1.0, |number| (number * 10.0).round() / 10.0)
 }

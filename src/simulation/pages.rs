@@ -24,7 +24,7 @@ struct Monitor<'server> {
     glance: &'server str,
     rows: &'server [Row],
     host: &'server Host,
-    gpus: &'server [Gpu],
+    gpus: Vec<(&'server Gpu, String)>,
     memory: String,
     swap: String,
     allowed: &'server [UrlPrefix],
@@ -43,7 +43,7 @@ struct Glance<'readings> {
     maker: &'static str,
     machine: Machine,
     memory: String,
-    gpus: &'readings [Gpu],
+    gpus: Vec<(&'readings Gpu, String)>,
     running: u32,
     idle: u32,
     starting: u32,
@@ -104,7 +104,7 @@ pub fn monitor(server: &Server, everybody: &Everybody, usages: &Usages) -> Resul
         glance: view.parts.get("glance").map(String::as_str).unwrap_or_default(),
         rows: view.tables.get("simulations").map(Vec::as_slice).unwrap_or_default(),
         host: &readings.host,
-        gpus: &readings.gpus,
+        gpus: with_sizes(&readings.gpus),
         memory: bytes(readings.host.memory),
         swap: bytes(readings.host.swap),
         allowed: &server.rules.allowed,
@@ -143,7 +143,7 @@ impl<'readings> Glance<'readings> {
             maker: sensors::busiest(&readings.machine, &readings.gpus),
             machine: readings.machine,
             memory: bytes(readings.host.memory),
-            gpus: &readings.gpus,
+            gpus: with_sizes(&readings.gpus),
             running: instances.running,
             idle: instances.idle,
             starting: instances.starting,
@@ -152,18 +152,11 @@ impl<'readings> Glance<'readings> {
             places: instances.places,
         }
     }
-
-    #[expect(clippy::trivially_copy_pass_by_ref, reason = "templates hand references over")]
-    fn bytes(count: &u64) -> String {
-        bytes(*count)
-    }
 }
 
-impl Monitor<'_> {
-    #[expect(clippy::trivially_copy_pass_by_ref, reason = "templates hand references over")]
-    fn bytes(count: &u64) -> String {
-        bytes(*count)
-    }
+/// Each GPU with the size of its memory in words.
+fn with_sizes(gpus: &[Gpu]) -> Vec<(&Gpu, String)> {
+    gpus.iter().map(|gpu| (gpu, bytes(gpu.memory_total))).collect()
 }
 
 impl<'one> SimulationRow<'one> {
