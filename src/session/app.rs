@@ -16,11 +16,11 @@ use super::registry::{IsAvailable, Reconfigure, Registry};
 use super::routes;
 use super::server::Server;
 use crate::shared::config;
+use crate::shared::connections::Connections;
 use crate::shared::live::Live;
 use crate::shared::metrics::Metrics;
 use crate::shared::notify;
 use crate::shared::permanent;
-use crate::shared::seats::Seats;
 use crate::shared::shutdown::{Phase, Request, Signals};
 
 /// Why the server can't go on.
@@ -125,7 +125,7 @@ fn assemble(config: SessionConfig, phase: watch::Receiver<Phase>) -> Result<Serv
     }
     let notices = mailer::start(&config).map(Addr::recipient);
     let (timing, ssl) = (config.timing.clone(), config.ssl);
-    let seats = Seats::new(config.max_clients, config.max_clients_per_address);
+    let connections = Connections::new(config.max_clients, config.max_clients_per_address);
     let trusted_proxies = config.trusted_proxies.clone();
     let (examples, viewer_script) = (config.examples.clone(), config.viewer_script.clone());
     let registry = Registry::new(Arc::new(config), notices, latencies).start();
@@ -135,7 +135,7 @@ fn assemble(config: SessionConfig, phase: watch::Receiver<Phase>) -> Result<Serv
         timing,
         ssl,
         phase,
-        seats,
+        connections,
         trusted_proxies,
         metrics,
         picks,

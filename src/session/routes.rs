@@ -100,11 +100,11 @@ fn websocket(
     audience: &Addr<Audience>,
 ) -> HttpResponse {
     let peer = server.trusted_proxies.peer(request);
-    let seat = match server.seats.take(peer) {
-        Ok(seat) => seat,
+    let connection = match server.connections.admit(peer) {
+        Ok(connection) => connection,
         Err(crowded) => return crowded.answer(),
     };
-    let actor = WebClient::new(Arc::clone(server), audience.clone(), peer, seat);
+    let actor = WebClient::new(Arc::clone(server), audience.clone(), peer, connection);
     WsResponseBuilder::new(actor, request, stream).frame_size(LARGEST_MESSAGE).start().unwrap_or_else(|error| {
         let problem = format!("Error: this is a WebSocket: {error}.");
         HttpResponse::build(error.as_response_error().status_code()).body(problem)

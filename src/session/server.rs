@@ -8,10 +8,10 @@ use tokio::sync::watch;
 use super::config::{Example, Timing};
 use super::pick::{NoServer, Pick};
 use super::registry::Registry;
+use crate::shared::connections::Connections;
 use crate::shared::live::Live;
 use crate::shared::metrics::Metrics;
 use crate::shared::peer::TrustedProxies;
-use crate::shared::seats::Seats;
 use crate::shared::shutdown::Phase;
 
 /// What routes and web clients share.
@@ -25,7 +25,7 @@ pub struct Server {
     /// Whether clients are taken.
     pub phase: watch::Receiver<Phase>,
     /// Counts WebSockets.
-    pub seats: Seats,
+    pub connections: Connections,
     /// Whose word on clients' addresses is taken.
     pub trusted_proxies: TrustedProxies,
     /// What is counted.
@@ -59,7 +59,7 @@ impl Server {
     /// How many web clients are connected.
     #[must_use]
     pub fn clients(&self) -> usize {
-        self.seats.taken()
+        self.connections.count()
     }
 
     /// Asks for a simulation server, and puts the answer in the words of the protocol.

@@ -13,9 +13,9 @@ use super::audience::{Audience, Join, Membership};
 use super::pick::Pick;
 use super::server::Server;
 use super::subscribers::News;
+use crate::shared::connections::Connection;
 use crate::shared::liveness::Liveness;
 use crate::shared::peer::Peer;
-use crate::shared::seats::Seat;
 
 /// The actor.
 pub struct WebClient {
@@ -25,16 +25,24 @@ pub struct WebClient {
     told: Option<bool>,
     audience: Addr<Audience>,
     membership: Option<Membership>,
-    _seat: Seat,
+    _connection: Connection,
 }
 
 type Context = WebsocketContext<WebClient>;
 
 impl WebClient {
-    /// A client that has just connected; `seat` counts it.
+    /// A client that has just connected; `connection` counts it.
     #[must_use]
-    pub fn new(server: Arc<Server>, audience: Addr<Audience>, peer: Peer, seat: Seat) -> Self {
-        Self { server, peer, liveness: Liveness::new(), told: None, audience, membership: None, _seat: seat }
+    pub fn new(server: Arc<Server>, audience: Addr<Audience>, peer: Peer, connection: Connection) -> Self {
+        Self {
+            server,
+            peer,
+            liveness: Liveness::new(),
+            told: None,
+            audience,
+            membership: None,
+            _connection: connection,
+        }
     }
 
     fn close(code: CloseCode, ctx: &mut Context) {

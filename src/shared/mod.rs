@@ -5,6 +5,7 @@ pub mod admission;
 pub mod assets;
 pub mod auth;
 pub mod config;
+pub mod connections;
 pub mod live;
 pub mod liveness;
 pub mod load;
@@ -16,7 +17,7 @@ pub mod peer;
 pub mod permanent;
 pub mod project_url;
 pub mod repositories;
-pub mod seats;
+
 pub mod shutdown;
 pub mod start;
 pub mod status;

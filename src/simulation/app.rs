@@ -23,11 +23,11 @@ use super::routes;
 use super::server::Server;
 use super::usage::UsageMonitor;
 use crate::shared::admission::Rules;
+use crate::shared::connections::Connections;
 use crate::shared::live::Live;
 use crate::shared::metrics::Metrics;
 use crate::shared::notify;
 use crate::shared::permanent;
-use crate::shared::seats::Seats;
 use crate::shared::shutdown::{Phase, Request, Signals};
 
 /// Why the server can't go on.
@@ -164,7 +164,7 @@ fn assemble(
         phase,
         requests,
         main_thread: Arbiter::current(),
-        seats: Seats::new(config.max_clients, config.max_clients_per_address),
+        connections: Connections::new(config.max_clients, config.max_clients_per_address),
         metrics,
         starts,
         live: Live::new(),

@@ -46,11 +46,11 @@ async fn client(request: HttpRequest, stream: web::Payload, server: web::Data<Se
         return refusal;
     }
     let peer = server.config.trusted_proxies.peer(&request);
-    let seat = match server.seats.take(peer) {
-        Ok(seat) => seat,
+    let connection = match server.connections.admit(peer) {
+        Ok(connection) => connection,
         Err(crowded) => return crowded.answer(),
     };
-    let actor = WebClient::new(Arc::clone(&server), peer, seat);
+    let actor = WebClient::new(Arc::clone(&server), peer, connection);
     WsResponseBuilder::new(actor, &request, stream).frame_size(LARGEST_MESSAGE).start().unwrap_or_else(|error| {
         let problem = format!("Error: this is a WebSocket: {error}.");
         HttpResponse::build(error.as_response_error().status_code()).body(problem)

@@ -15,11 +15,11 @@ use super::load_monitor::{LoadMonitor, Readings};
 use super::places::Places;
 use super::usage::UsageMonitor;
 use crate::shared::admission::Rules;
+use crate::shared::connections::Connections;
 use crate::shared::live::Live;
 use crate::shared::load::Load;
 use crate::shared::metrics::Metrics;
 use crate::shared::project_url::ProjectUrl;
-use crate::shared::seats::Seats;
 use crate::shared::shutdown::{Phase, Request};
 
 /// What routes and web clients share.
@@ -45,7 +45,7 @@ pub struct Server {
     /// Where Webots' actors live.
     pub main_thread: ArbiterHandle,
     /// Counts connections.
-    pub seats: Seats,
+    pub connections: Connections,
     /// What is counted.
     pub metrics: Metrics,
     /// Clients that asked for a simulation, by what came of it.

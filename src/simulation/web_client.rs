@@ -18,9 +18,9 @@ use super::protocol::{self, Mode, Request};
 use super::server::Server;
 use super::webots::{RestoreController, Webots};
 use super::webots_event::{Exit, WebotsEvent};
+use crate::shared::connections::Connection;
 use crate::shared::liveness::Liveness;
 use crate::shared::peer::Peer;
-use crate::shared::seats::Seat;
 use crate::shared::shutdown::closing;
 
 /// The actor.
@@ -32,15 +32,15 @@ pub struct WebClient {
     restoring: bool,
     /// Set from the wish for a simulation on.
     start: Pending,
-    _seat: Seat,
+    _connection: Connection,
 }
 
 type Context = WebsocketContext<WebClient>;
 
 impl WebClient {
-    /// A client that has just connected; `seat` counts it.
+    /// A client that has just connected; `connection` counts it.
     #[must_use]
-    pub fn new(server: Arc<Server>, peer: Peer, seat: Seat) -> Self {
+    pub fn new(server: Arc<Server>, peer: Peer, connection: Connection) -> Self {
         let stage = Stage::Connected;
         Self {
             server,
@@ -49,7 +49,7 @@ impl WebClient {
             liveness: Liveness::new(),
             restoring: false,
             start: Pending::default(),
-            _seat: seat,
+            _connection: connection,
         }
     }
 

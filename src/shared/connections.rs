@@ -11,16 +11,16 @@ use super::peer::Peer;
 
 /// Counts open connections.
 #[derive(Debug)]
-pub struct Seats {
+pub struct Connections {
     all: Arc<Semaphore>,
-    count: usize,
+    most: usize,
     per_address: usize,
     taken: Arc<Mutex<HashMap<IpAddr, usize>>>,
 }
 
 /// One connection. Dropping it makes room for another.
 #[derive(Debug)]
-pub struct Seat {
+pub struct Connection {
     _permit: OwnedSemaphorePermit,
     _place: Option<Place>,
 }
@@ -32,7 +32,7 @@ struct Place {
     taken: Arc<Mutex<HashMap<IpAddr, usize>>>,
 }
 
-/// Why there is no seat. The words are for the client.
+/// Why a connection is refused. The words are for the client.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum Crowded {
     /// The server is full.
@@ -43,30 +43,30 @@ pub enum Crowded {
     FromThere,
 }
 
-impl Seats {
+impl Connections {
     /// So many in all, and so many per address.
     #[must_use]
-    pub fn new(all: usize, per_address: usize) -> Self {
-        Self { all: Arc::new(Semaphore::new(all)), count: all, per_address, taken: Arc::default() }
+    pub fn new(most: usize, per_address: usize) -> Self {
+        Self { all: Arc::new(Semaphore::new(most)), most, per_address, taken: Arc::default() }
     }
 
-    /// How many connections are open.
+    /// How many there are.
     #[must_use]
-    pub fn taken(&self) -> usize {
-        self.count.saturating_sub(self.all.available_permits())
+    pub fn count(&self) -> usize {
+        self.most.saturating_sub(self.all.available_permits())
     }
 
-    /// Takes a seat. A proxy that says nothing of its clients stands for many: it is counted among all alone.
+    /// Admits a connection. A proxy that says nothing of its clients stands for many: it is counted among all alone.
     ///
     /// # Errors
     /// When there are too many connections.
-    pub fn take(&self, peer: Peer) -> Result<Seat, Crowded> {
+    pub fn admit(&self, peer: Peer) -> Result<Connection, Crowded> {
         let permit = Arc::clone(&self.all).try_acquire_owned().map_err(|_| Crowded::Everywhere)?;
         let place = match peer {
             Peer::Client(address) => Some(self.place(household(address))?),
             Peer::Proxy(_) | Peer::Unknown => None,
         };
-        Ok(Seat { _permit: permit, _place: place })
+        Ok(Connection { _permit: permit, _place: place })
     }
 
     fn place(&self, address: IpAddr) -> Result<Place, Crowded> {
@@ -93,7 +93,7 @@ impl Drop for Place {
 }
 
 impl Crowded {
-    /// The answer to a client that finds no seat.
+    /// The answer to a client that is refused.
     #[must_use]
     pub fn answer(self) -> HttpResponse {
         match self {
@@ -126,25 +126,26 @@ mod tests {
 
     #[test]
     fn seats_are_counted_in_all_and_per_address() {
-        let seats = Seats::new(4, 2);
-        let first = seats.take(client("203.0.113.9")).unwrap();
-        let _second = seats.take(client("203.0.113.9")).unwrap();
-        assert_eq!(seats.take(client("203.0.113.9")).unwrap_err(), Crowded::FromThere);
-        let _other = seats.take(client("203.0.113.10")).unwrap();
+        let connections = Connections::new(4, 2);
+        let first = connections.admit(client("203.0.113.9")).unwrap();
+        let _second = connections.admit(client("203.0.113.9")).unwrap();
+        assert_eq!(connections.admit(client("203.0.113.9")).unwrap_err(), Crowded::FromThere);
+        let _other = connections.admit(client("203.0.113.10")).unwrap();
+        assert_eq!(connections.count(), 3);
         drop(first);
-        let _again = seats.take(client("203.0.113.9")).unwrap();
-        let _proxy = seats.take(Peer::Proxy("127.0.0.1".parse().unwrap())).unwrap();
-        assert_eq!(seats.take(client("203.0.113.11")).unwrap_err(), Crowded::Everywhere);
+        let _again = connections.admit(client("203.0.113.9")).unwrap();
+        let _proxy = connections.admit(Peer::Proxy("127.0.0.1".parse().unwrap())).unwrap();
+        assert_eq!(connections.admit(client("203.0.113.11")).unwrap_err(), Crowded::Everywhere);
     }
 
     #[test]
     fn nothing_is_kept_of_those_who_have_left() {
-        let seats = Seats::new(9, 1);
-        let seat = seats.take(client("2001:db8::1")).unwrap();
-        assert_eq!(seats.take(client("2001:db8::2")).unwrap_err(), Crowded::FromThere, "the same household");
-        let _neighbour = seats.take(client("2001:db8:0:1::1")).unwrap();
-        assert_eq!(lock(&seats.taken).len(), 2);
-        drop(seat);
-        assert_eq!(lock(&seats.taken).len(), 1);
+        let connections = Connections::new(9, 1);
+        let connection = connections.admit(client("2001:db8::1")).unwrap();
+        assert_eq!(connections.admit(client("2001:db8::2")).unwrap_err(), Crowded::FromThere, "the same household");
+        let _neighbour = connections.admit(client("2001:db8:0:1::1")).unwrap();
+        assert_eq!(lock(&connections.taken).len(), 2);
+        drop(connection);
+        assert_eq!(lock(&connections.taken).len(), 1);
     }
 }
