@@ -75,7 +75,8 @@ impl WebServer {
             Kind::Apache => command.arg("-f").arg(&conf).arg("-DFOREGROUND"),
             Kind::Nginx => command.arg("-c").arg(&conf).arg("-e").arg(self.error_log()),
         };
-        let child = command.stdin(Stdio::null()).stdout(output.try_clone().unwrap()).stderr(output).spawn().unwrap();
+        let child = command.stdin(Stdio::null()).stdout(output.try_clone().unwrap()).stderr(output).spawn();
+        let child = child.expect("this test needs setpriv: apt install util-linux");
         self.child = Some(child);
         let deadline = Instant::now() + SOON;
         while std::net::TcpStream::connect(("127.0.0.1", self.port)).is_err() {
