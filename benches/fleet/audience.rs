@@ -27,11 +27,11 @@ const TEXT: [u8; 2] = [0x81, 1];
 fn connect(port: u16) -> TcpStream {
     let mut stream = TcpStream::connect(("127.0.0.1", port)).expect("a client connects");
     stream.write_all(HANDSHAKE).expect("a client asks");
-    let (mut heard, mut part) = (Vec::new(), [0; 512]);
+    let (mut heard, mut piece) = (Vec::new(), [0; 512]);
     while !tells(&heard, b'1') {
-        let length = stream.read(&mut part).expect("a client hears");
+        let length = stream.read(&mut piece).expect("a client hears");
         assert!(length > 0, "a client was sent away");
-        heard.extend_from_slice(&part[..length]);
+        heard.extend_from_slice(&piece[..length]);
     }
     setsockopt(&stream, sockopt::ReceiveTimestampns, &true).expect("the system notes times");
     stream
@@ -66,7 +66,8 @@ fn arrival(stream: &TcpStream, value: u8) -> Duration {
 fn decision(server: &Server) -> Duration {
     let log = server.log();
     let line = log.lines().rfind(|line| line.contains("simulation server is available")).expect("a decision");
-    let at: SystemTime = line[..24].parse::<jiff::Timestamp>().expect("a time").into();
+    let at = line.split(' ').next().expect("a line begins with its time");
+    let at: SystemTime = at.parse::<jiff::Timestamp>().expect("a time").into();
     at.duration_since(SystemTime::UNIX_EPOCH).expect("it is later than 1970")
 }
 

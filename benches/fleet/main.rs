@@ -14,7 +14,6 @@
     clippy::cast_sign_loss,
     clippy::expect_used,
     clippy::indexing_slicing,
-    clippy::panic,
     reason = "a measurement that can't go on ends"
 )]
 

@@ -48,7 +48,7 @@ impl Server {
 
     /// Waits until something holds.
     pub(crate) fn wait_until(&self, condition: impl Fn(&Self) -> bool) {
-        let deadline = Instant::now() + Duration::from_secs(60);
+        let deadline = Instant::now() + Duration::from_mins(1);
         while !condition(self) {
             assert!(Instant::now() < deadline, "waited in vain for the session server; its log:\n{}", self.log());
             std::thread::sleep(Duration::from_millis(20));

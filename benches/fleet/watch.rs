@@ -18,7 +18,7 @@ fn needs(servers: usize) -> (f64, f64) {
     std::thread::sleep(TIME);
     let (elapsed, after) = (begin.elapsed(), server.processor_time());
     let percent = |used: Duration| 100.0 * used.as_secs_f64() / elapsed.as_secs_f64();
-    (percent(after.0 - before.0), percent(after.1 - before.1))
+    (percent(after.0.saturating_sub(before.0)), percent(after.1.saturating_sub(before.1)))
 }
 
 /// The same number of exchanges per second without a server: one thread that asks stand-ins by plain blocking calls.

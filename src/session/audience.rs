@@ -16,12 +16,12 @@ use crate::shared::shutdown::closing;
 
 /// Asks to be told the news, now and whenever there are others.
 #[derive(Message)]
-#[rtype(result = "Seat")]
+#[rtype(result = "Membership")]
 pub struct Join(pub Recipient<News>);
 
 /// A place in the audience. Dropping it gives it up.
 #[derive(Debug)]
-pub struct Seat {
+pub struct Membership {
     id: u64,
     audience: Addr<Audience>,
 }
@@ -87,7 +87,7 @@ impl Handler<Join> for Audience {
 
     fn handle(&mut self, Join(client): Join, ctx: &mut Self::Context) -> Self::Result {
         let id = self.clients.add(client, self.news);
-        MessageResult(Seat { id, audience: ctx.address() })
+        MessageResult(Membership { id, audience: ctx.address() })
     }
 }
 
@@ -99,7 +99,7 @@ impl Handler<Leave> for Audience {
     }
 }
 
-impl Drop for Seat {
+impl Drop for Membership {
     fn drop(&mut self) {
         self.audience.do_send(Leave(self.id));
     }

@@ -1,6 +1,7 @@
 //! The session server: the one door to a fleet of simulation servers.
 
 pub mod app;
+pub mod asking;
 pub mod audience;
 pub mod changes;
 pub mod config;
@@ -10,6 +11,8 @@ pub mod mail_address;
 pub mod mailer;
 pub mod notices;
 pub mod outbox;
+pub mod page_routes;
+pub mod pages;
 pub mod pick;
 pub mod placement;
 pub mod registry;

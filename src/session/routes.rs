@@ -1,27 +1,25 @@
 //! The session server's public paths: each reads the request, asks the registry, and maps the answer.
 
 use std::sync::Arc;
-use std::time::Duration;
 
-use actix::prelude::*;
+use actix::Addr;
 use actix_web::http::{Method, StatusCode, header};
 use actix_web::middleware::DefaultHeaders;
 use actix_web::{HttpRequest, HttpResponse, web};
 use actix_web_actors::ws::WsResponseBuilder;
-use askama::Template;
 use rand::RngExt;
 
+use super::asking::{ask, with_status};
 use super::audience::Audience;
-use super::fleet_status::{FleetStatus, told_mean};
+use super::fleet_status::told_mean;
+use super::page_routes;
 use super::pick::{NoServer, Pick};
-use super::registry::{GetStatus, IsAvailable, Registry};
+use super::registry::{GetStatus, IsAvailable};
 use super::server::Server;
-use super::status::{self, Page, StatusPage};
+use super::status::{self, StatusPage};
 use super::web_client::WebClient;
 use crate::shared::metrics::CONTENT_TYPE;
 
-/// How long the registry may take to answer.
-const PATIENCE: Duration = Duration::from_secs(2);
 /// The largest message of a client, in bytes.
 const LARGEST_MESSAGE: usize = 8 * 1024;
 /// After how many seconds a client that was refused may come back: drawn at random, so that a class that was refused
@@ -42,23 +40,13 @@ pub fn configure(app: &mut web::ServiceConfig) {
             .route("/request", web::get().to(availability))
             .route("/session", web::get().to(session))
             .route("/load", web::get().to(load))
-            .route("/monitor", web::get().to(monitor))
+            .configure(page_routes::configure)
             .route("/status", web::get().to(status_json))
             .route("/metrics", web::get().to(metrics))
             .route("/health", web::get().to(health))
             .route("/{path:.*}", web::method(Method::OPTIONS).to(HttpResponse::NoContent))
             .default_service(web::to(nothing_here)),
     );
-}
-
-/// Asks the registry; nothing when it is too busy to answer.
-async fn ask<M>(server: &Server, message: M) -> Option<M::Result>
-where
-    M: Message<Result: Send> + Send + 'static,
-    Registry: Handler<M>,
-{
-    let answer = server.registry.send(message);
-    actix_rt::time::timeout(PATIENCE, answer).await.ok().and_then(Result::ok)
 }
 
 fn wants_websocket(request: &HttpRequest) -> bool {
@@ -133,23 +121,8 @@ async fn load(server: web::Data<Server>) -> HttpResponse {
     HttpResponse::Ok().content_type("text/plain").body(told_mean(mean).to_string())
 }
 
-async fn with_status(server: &Server, answer: impl FnOnce(&FleetStatus) -> HttpResponse) -> HttpResponse {
-    match ask(server, GetStatus).await {
-        Some(status) => answer(&status),
-        None => HttpResponse::ServiceUnavailable().body("Error: the server is too busy to tell."),
-    }
-}
-
 async fn status_json(server: web::Data<Server>) -> HttpResponse {
     with_status(&server, |status| HttpResponse::Ok().json(StatusPage::new(&server, status))).await
-}
-
-async fn monitor(server: web::Data<Server>) -> HttpResponse {
-    with_status(&server, |status| match Page::new(&server, status).render() {
-        Ok(page) => HttpResponse::Ok().content_type("text/html; charset=utf-8").body(page),
-        Err(error) => HttpResponse::InternalServerError().body(format!("Error: {error}.")),
-    })
-    .await
 }
 
 async fn metrics(server: web::Data<Server>) -> HttpResponse {
@@ -166,7 +139,7 @@ async fn health() -> HttpResponse {
 
 async fn nothing_here() -> HttpResponse {
     HttpResponse::NotFound()
-        .body("Error: there is nothing here. Try /session, /monitor, /status, /load, /metrics or /health.")
+        .body("Error: there is nothing here. Try /session, /monitor, /viewer, /status, /load, /metrics or /health.")
 }
 
 #[cfg(test)]

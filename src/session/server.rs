@@ -5,10 +5,11 @@ use std::time::{Duration, Instant, SystemTime};
 use actix::prelude::*;
 use tokio::sync::watch;
 
-use super::config::Timing;
+use super::config::{Example, Timing};
 use super::pick::{NoServer, Pick};
 use super::registry::Registry;
 use crate::shared::connections::Connections;
+use crate::shared::live::Live;
 use crate::shared::metrics::Metrics;
 use crate::shared::peer::TrustedProxies;
 use crate::shared::shutdown::Phase;
@@ -31,6 +32,12 @@ pub struct Server {
     pub metrics: Metrics,
     /// Requests for a simulation server, by what came of them.
     pub picks: prometheus::IntCounterVec,
+    /// Monitor pages that are open.
+    pub live: Live,
+    /// Worlds to try in the viewer.
+    pub examples: Vec<Example>,
+    /// Where Webots' own viewer comes from.
+    pub viewer_script: Option<url::Url>,
     /// When the server was started.
     pub started: Instant,
     /// The same, as a time of day.

@@ -9,7 +9,7 @@ use actix::prelude::*;
 use actix_web_actors::ws::{CloseCode, CloseReason, Message, ProtocolError, WebsocketContext};
 use serde::Deserialize;
 
-use super::audience::{Audience, Join, Seat};
+use super::audience::{Audience, Join, Membership};
 use super::pick::Pick;
 use super::server::Server;
 use super::subscribers::News;
@@ -24,7 +24,7 @@ pub struct WebClient {
     liveness: Liveness,
     told: Option<bool>,
     audience: Addr<Audience>,
-    seat: Option<Seat>,
+    membership: Option<Membership>,
     _connection: Connection,
 }
 
@@ -34,7 +34,15 @@ impl WebClient {
     /// A client that has just connected; `connection` counts it.
     #[must_use]
     pub fn new(server: Arc<Server>, audience: Addr<Audience>, peer: Peer, connection: Connection) -> Self {
-        Self { server, peer, liveness: Liveness::new(), told: None, audience, seat: None, _connection: connection }
+        Self {
+            server,
+            peer,
+            liveness: Liveness::new(),
+            told: None,
+            audience,
+            membership: None,
+            _connection: connection,
+        }
     }
 
     fn close(code: CloseCode, ctx: &mut Context) {
@@ -80,7 +88,7 @@ impl Actor for WebClient {
         let subscribed = self.audience.send(Join(ctx.address().recipient())).into_actor(self);
         subscribed
             .map(|answer, client, ctx| match answer {
-                Ok(seat) => client.seat = Some(seat),
+                Ok(membership) => client.membership = Some(membership),
                 Err(error) => {
                     log::error!("a client can't be told of changes: {error}");
                     Self::close(CloseCode::Error, ctx);

@@ -32,6 +32,18 @@ impl PublicAddress {
         Self { host: host.to_owned(), port, rewritten }
     }
 
+    /// The host alone.
+    #[must_use]
+    pub fn host(&self) -> &str {
+        &self.host
+    }
+
+    /// Whether a web server in front rewrites ports.
+    #[must_use]
+    pub fn is_rewritten(&self) -> bool {
+        self.rewritten
+    }
+
     /// The WebSocket URL, without a slash at its end: `ws://HOST:PORT` or `wss://HOST/PORT`.
     #[must_use]
     pub fn websocket_url(&self, ssl: bool) -> String {

@@ -1,25 +1,21 @@
 //! The simulation server's public paths: each reads the request, asks for what it needs, and maps the answer.
 
 use std::sync::Arc;
-use std::time::Duration;
 
 use actix_web::http::header;
 use actix_web::middleware::DefaultHeaders;
 use actix_web::{HttpRequest, HttpResponse, web};
 use actix_web_actors::ws::WsResponseBuilder;
-use askama::Template;
 
-use super::census::Everybody;
-use super::places::Census;
+use super::asking::{everybody, locked, too_busy};
+use super::page_routes;
 use super::server::Server;
-use super::status::{self, Page, StatusPage};
+use super::status::{self, StatusPage};
 use super::web_client::WebClient;
 use crate::shared::auth::is_authorised;
 use crate::shared::metrics::CONTENT_TYPE;
 use crate::shared::shutdown::Request;
 
-/// How long an actor may take to answer a page.
-const PATIENCE: Duration = Duration::from_secs(2);
 /// The largest message of a client, in bytes.
 const LARGEST_MESSAGE: usize = 8 * 1024;
 
@@ -35,7 +31,7 @@ pub fn configure(app: &mut web::ServiceConfig) {
             .wrap(cors)
             .route("/client", web::get().to(client))
             .route("/load", web::get().to(load))
-            .route("/monitor", web::get().to(monitor))
+            .configure(page_routes::configure)
             .route("/status", web::get().to(status_json))
             .route("/metrics", web::get().to(metrics))
             .route("/health", web::get().to(health))
@@ -75,11 +71,6 @@ async fn load(server: web::Data<Server>) -> HttpResponse {
     HttpResponse::Ok().content_type("text/plain").body(server.load().to_string())
 }
 
-async fn everybody(server: &Server) -> Option<Everybody> {
-    let census = server.places.send(Census);
-    actix_rt::time::timeout(PATIENCE, census).await.ok().and_then(Result::ok)
-}
-
 async fn status_json(server: web::Data<Server>) -> HttpResponse {
     match everybody(&server).await {
         Some(everybody) => HttpResponse::Ok().json(StatusPage::new(&server, everybody)),
@@ -97,16 +88,6 @@ async fn metrics(server: web::Data<Server>) -> HttpResponse {
     }
 }
 
-async fn monitor(server: web::Data<Server>) -> HttpResponse {
-    let Some(everybody) = everybody(&server).await else {
-        return too_busy();
-    };
-    match Page::new(&server, everybody).render() {
-        Ok(page) => HttpResponse::Ok().content_type("text/html; charset=utf-8").body(page),
-        Err(error) => HttpResponse::InternalServerError().body(format!("Error: {error}.")),
-    }
-}
-
 async fn health() -> HttpResponse {
     HttpResponse::Ok().content_type("text/plain").body("ok")
 }
@@ -116,9 +97,7 @@ async fn drain(request: HttpRequest, server: web::Data<Server>) -> HttpResponse 
         return HttpResponse::Forbidden().body("Error: actions are off; adminPassword is not set.");
     };
     if !is_authorised(&request, password) {
-        return HttpResponse::Unauthorized()
-            .insert_header((header::WWW_AUTHENTICATE, "Basic realm=\"simulation server\""))
-            .body("Error: a password is needed.");
+        return locked();
     }
     match server.requests.try_send(Request::Drain) {
         Ok(()) => HttpResponse::Accepted().body("draining"),
@@ -128,8 +107,4 @@ async fn drain(request: HttpRequest, server: web::Data<Server>) -> HttpResponse 
 
 async fn nothing_here() -> HttpResponse {
     HttpResponse::NotFound().body("Error: there is nothing here. Try /monitor, /status, /load, /metrics or /health.")
-}
-
-fn too_busy() -> HttpResponse {
-    HttpResponse::ServiceUnavailable().body("Error: the server is too busy to tell.")
 }

@@ -13,10 +13,13 @@ use super::config::SimulationConfig;
 use super::instance_dir::RunDir;
 use super::load_monitor::{LoadMonitor, Readings};
 use super::places::Places;
+use super::usage::UsageMonitor;
 use crate::shared::admission::Rules;
 use crate::shared::connections::Connections;
+use crate::shared::live::Live;
 use crate::shared::load::Load;
 use crate::shared::metrics::Metrics;
+use crate::shared::project_url::ProjectUrl;
 use crate::shared::shutdown::{Phase, Request};
 
 /// What routes and web clients share.
@@ -47,6 +50,10 @@ pub struct Server {
     pub metrics: Metrics,
     /// Clients that asked for a simulation, by what came of it.
     pub starts: prometheus::IntCounterVec,
+    /// Monitor pages that are open.
+    pub live: Live,
+    /// What simulations take of the machine.
+    pub usage: UsageMonitor,
     /// When the server was started.
     pub started: Instant,
 }
@@ -62,6 +69,20 @@ impl Server {
     #[must_use]
     pub fn is_draining(&self) -> bool {
         *self.phase.borrow() != Phase::Open
+    }
+
+    /// Whether a world may run here, now. Nobody has to wait for a checkout only to learn that there is no Webots.
+    ///
+    /// # Errors
+    /// Why not, in words for the client.
+    pub fn admit(&self, url: &str) -> Result<ProjectUrl, String> {
+        let world = ProjectUrl::parse(url).map_err(|wrong| wrong.to_string())?;
+        if self.is_draining() {
+            return Err("This simulation server is about to end, and takes no new clients".to_owned());
+        }
+        self.rules.admit(&world, self.load()).map_err(|refusal| refusal.to_string())?;
+        self.webots_program()?;
+        Ok(world)
     }
 
     /// The program that is started for each client.

@@ -19,8 +19,8 @@ fn floor(source: &Source) -> usize {
     match module.split_once("::") {
         Some(("shared", _)) => 0,
         Some((_, "app")) => 4,
-        Some((_, "routes")) => 3,
-        Some((_, "status")) => 2,
+        Some((_, "routes" | "page_routes")) => 3,
+        Some((_, "status" | "pages" | "asking")) => 2,
         _ if is_about_actors(source) => 2,
         _ => 1,
     }
