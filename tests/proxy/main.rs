@@ -24,5 +24,6 @@ mod web_server;
 mod addresses;
 mod connections;
 mod exposure;
+mod pages;
 mod trust;
 mod whole_way;
