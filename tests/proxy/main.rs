@@ -26,4 +26,5 @@ mod connections;
 mod exposure;
 mod pages;
 mod trust;
+mod visitor;
 mod whole_way;

@@ -45,8 +45,9 @@ async fn pages_are_complete_and_live(rules: Rules) {
         has_all_that_it_loads(browser, &rules.session_path(fleet.session.port, page)).await;
     }
     has_all_that_it_loads(browser, &machine("/monitor")).await;
-    is_told_what_happens(browser, &machine("/events")).await;
-    is_told_what_happens(browser, &rules.session_path(fleet.session.port, "/events")).await;
+    let door = rules.session_path(fleet.session.port, "/events");
+    let here = machine("/events");
+    futures_util::join!(is_told_what_happens(browser, &here), is_told_what_happens(browser, &door));
 }
 
 #[actix_rt::test]
