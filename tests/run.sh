@@ -12,9 +12,9 @@ command -v cargo >/dev/null || {
 # Debian has web servers where only root looks for programs.
 PATH=$PATH:/usr/sbin
 # The C compiler links the programs; python3 and openssl make counterparts for mail and TLS; xvfb gives a display; the
-# fleet is tested behind both web servers.
+# fleet is tested behind both web servers, by a real browser too.
 tests/install.sh cc=gcc,libc6-dev git=git flock=util-linux openssl=openssl python3=python3 python3-venv=python3-venv \
-    xvfb-run=xvfb,xauth apache2=apache2-bin nginx=nginx setpriv=util-linux
+    xvfb-run=xvfb,xauth apache2=apache2-bin nginx=nginx setpriv=util-linux chromium=chromium
 tests/python.sh >/dev/null
 
 start=$SECONDS
