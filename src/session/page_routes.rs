@@ -65,13 +65,14 @@ async fn viewer(request: HttpRequest, server: web::Data<Server>) -> HttpResponse
     .await
 }
 
-/// Webots' own viewer is a program of somebody else: it gets a page without anything of ours in it.
+/// Webots' own viewer is a program of somebody else, and a link to this page can name another that lies on a host of the
+/// fleet: it gets a page without anything of ours in it, whose scripts count as those of no server.
 async fn webots_viewer(server: web::Data<Server>) -> HttpResponse {
     with_status(&server, |status| {
         let mut sources = fleet(&server, status);
         sources.extend(server.viewer_script.as_ref().map(|script| script.origin().ascii_serialization()));
         let page = WebotsViewer { version: env!("CARGO_PKG_VERSION") };
-        html(page.render(), &Policy::own().run(&sources).any_picture().framed())
+        html(page.render(), &Policy::own().run(&sources).any_picture().framed().foreign())
     })
     .await
 }

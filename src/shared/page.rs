@@ -14,6 +14,7 @@ pub struct Policy {
     connections: Vec<String>,
     frames: bool,
     framed: bool,
+    foreign: bool,
 }
 
 /// A policy that names more hosts than this would be too long for a header.
@@ -24,7 +25,15 @@ impl Policy {
     #[must_use]
     pub fn own() -> Self {
         let own = || vec!["'self'".to_owned()];
-        Self { scripts: own(), styles: own(), pictures: own(), connections: own(), frames: false, framed: false }
+        Self {
+            scripts: own(),
+            styles: own(),
+            pictures: own(),
+            connections: own(),
+            frames: false,
+            framed: false,
+            foreign: false,
+        }
     }
 
     /// Lets a page open WebSockets to the server that it comes from: older browsers don't take them for its own.
@@ -77,19 +86,27 @@ impl Policy {
         self
     }
 
+    /// Makes a page a stranger to its own server: its scripts get no passwords, and nothing that is kept for others.
+    #[must_use]
+    pub fn foreign(mut self) -> Self {
+        self.foreign = true;
+        self
+    }
+
     /// The header's value.
     #[must_use]
     pub fn text(&self) -> String {
         let own_or_none = |allowed| if allowed { "'self'" } else { "'none'" };
         format!(
             "default-src 'none'; script-src {}; style-src {}; img-src {}; connect-src {}; frame-src {}; \
-             frame-ancestors {}; base-uri 'none'; form-action 'self'",
+             frame-ancestors {}; base-uri 'none'; form-action 'self'{}",
             self.scripts.join(" "),
             self.styles.join(" "),
             self.pictures.join(" "),
             self.connections.join(" "),
             own_or_none(self.frames),
             own_or_none(self.framed),
+            if self.foreign { "; sandbox allow-scripts allow-modals allow-pointer-lock" } else { "" },
         )
     }
 }

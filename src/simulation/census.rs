@@ -24,6 +24,8 @@ pub enum Change {
         port: u16,
         /// The file.
         log: PathBuf,
+        /// How long the file was before: what earlier simulations on this port have printed.
+        begin: u64,
     },
     /// It streams on this port.
     Port(u16),
@@ -78,6 +80,9 @@ pub struct Simulation {
     pub version: Option<String>,
     /// The file that its output is kept in.
     pub log: Option<PathBuf>,
+    /// Where in that file its output begins.
+    #[serde(skip)]
+    pub log_begin: u64,
 }
 
 impl Simulation {
@@ -87,7 +92,8 @@ impl Simulation {
             Change::Stage(stage) => self.stage = stage,
             Change::Version(version) => self.version = Some(version),
             Change::Port(port) => self.port = Some(port),
-            Change::Launched { at, pid, port, log } => {
+            Change::Launched { at, pid, port, log, begin } => {
+                self.log_begin = begin;
                 self.launched = Some(at);
                 self.pid = Some(pid);
                 self.port = Some(port);

@@ -86,11 +86,12 @@ async fn output(request: HttpRequest, which: web::Query<Which>, server: web::Dat
     let Some(everybody) = everybody(&server).await else {
         return too_busy();
     };
-    let log = everybody.simulations.into_iter().find(|one| one.id == which.id).and_then(|one| one.log);
-    let Some(log) = log else {
+    let one = everybody.simulations.into_iter().find(|one| one.id == which.id);
+    let log = one.and_then(|one| Some((one.log?, one.log_begin)));
+    let Some((log, begin)) = log else {
         return HttpResponse::NotFound().body("Error: this simulation has ended.");
     };
-    let tail = web::block(move || tail(&log)).await.map(Result::unwrap_or_default);
+    let tail = web::block(move || tail(&log, begin)).await.map(Result::unwrap_or_default);
     HttpResponse::Ok()
         .insert_header((header::X_CONTENT_TYPE_OPTIONS, "nosniff"))
         .insert_header((header::CONTENT_SECURITY_POLICY, "default-src 'none'; frame-ancestors 'none'"))
@@ -98,16 +99,18 @@ async fn output(request: HttpRequest, which: web::Query<Which>, server: web::Dat
         .body(tail.unwrap_or_default())
 }
 
-/// The last whole lines of a file.
-fn tail(path: &Path) -> std::io::Result<String> {
+/// The last whole lines of a file, none that lie before `begin`: those are of somebody else. A file that was put aside
+/// since then begins anew.
+fn tail(path: &Path, begin: u64) -> std::io::Result<String> {
     let mut file = std::fs::File::open(path)?;
     let size = file.metadata()?.len();
-    let skipped = size.saturating_sub(LARGEST_TAIL);
+    let begin = if begin > size { 0 } else { begin };
+    let skipped = size.saturating_sub(LARGEST_TAIL).max(begin);
     file.seek(SeekFrom::Start(skipped))?;
     let mut bytes = Vec::new();
     file.take(LARGEST_TAIL).read_to_end(&mut bytes)?;
     let text = String::from_utf8_lossy(&bytes);
-    let whole = if skipped > 0 { text.split_once('\n').map_or("", |(_, rest)| rest) } else { &text };
+    let whole = if skipped > begin { text.split_once('\n').map_or("", |(_, rest)| rest) } else { &text };
     Ok(whole.to_owned())
 }
 
@@ -137,9 +140,11 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("1.log");
         fs::write(&path, "a short one\n").unwrap();
-        assert_eq!(tail(&path).unwrap(), "a short one\n");
+        assert_eq!(tail(&path, 0).unwrap(), "a short one\n");
+        assert_eq!(tail(&path, 2).unwrap(), "short one\n");
+        assert_eq!(tail(&path, 100).unwrap(), "a short one\n");
         fs::write(&path, "a line of the flood\n".repeat(10_000)).unwrap();
-        let end = tail(&path).unwrap();
+        let end = tail(&path, 7).unwrap();
         assert!(end.len() as u64 <= LARGEST_TAIL && end.starts_with("a line"), "{}", end.len());
     }
 }

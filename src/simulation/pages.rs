@@ -247,6 +247,7 @@ mod tests {
             port: Some(2001),
             version: None,
             log: None,
+            log_begin: 0,
         };
         let html = SimulationRow::new(&one, None, 7200).render().unwrap();
         assert!(!html.contains("<script>") && !html.contains("<b>"), "{html}");

@@ -190,6 +190,7 @@ impl Handler<Ask> for Places {
             port: None,
             version: None,
             log: None,
+            log_begin: 0,
         };
         self.present.insert(id, Present { lent: None, shown });
         self.line.push_back(Waiting { id, client: ask.client, told: None });

@@ -76,6 +76,7 @@ impl Webots {
 
     fn launch(&mut self, ctx: &mut Context<Self>) -> std::io::Result<()> {
         let log = self.orders.config.log_dir.0.join("simulation/instances").join(format!("{}.log", self.port));
+        let begin = std::fs::metadata(&log).map_or(0, |file| file.len());
         let (reader, output) = std::io::pipe()?;
         let (tail, all_read) = output::follow(reader, &log, ctx.address())?;
         self.tail = tail;
@@ -89,7 +90,7 @@ impl Webots {
             group.guardian()
         );
         let (at, pid) = (seconds_since_1970(), group.guardian());
-        self.orders.place.0.update(Change::Launched { at, pid, port: self.port, log });
+        self.orders.place.0.update(Change::Launched { at, pid, port: self.port, log, begin });
         self.group = Some(group);
         let ended = async move {
             let ending = ended.await;

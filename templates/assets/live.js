@@ -7,6 +7,7 @@ import { showTimes } from './times.js';
 const listeners = [];
 const lamp = document.getElementById('live');
 const cells = new WeakMap();
+let source;
 
 /** Calls a function with the numbers of each event that has some; `fresh` tells that events may have been missed. */
 export function onSample(listener) {
@@ -134,20 +135,32 @@ function take(event) {
     listeners.forEach((listener) => listener(sample.map(Number), Boolean(version)));
 }
 
+/** A tab that nobody sees doesn't listen: browsers allow few connections to one server. */
 function listen() {
-  const events = new EventSource('events');
-  events.addEventListener('open', () => say('Live', false));
-  events.addEventListener('message', take);
-  events.addEventListener('error', () => {
+  if (document.hidden || source)
+    return;
+  source = new EventSource('events');
+  source.addEventListener('open', () => say('Live', false));
+  source.addEventListener('message', take);
+  source.addEventListener('error', () => {
     const since = new Date().toLocaleTimeString();
     if (!lamp.classList.contains('lost'))
       say(`No connection since ${since}: what you see is old. Trying again …`, true);
-    if (events.readyState === EventSource.CLOSED)
+    if (source?.readyState === EventSource.CLOSED) {
+      rest();
       setTimeout(listen, 3000);
+    }
   });
-  addEventListener('pagehide', () => events.close(), { once: true });
+}
+
+function rest() {
+  source?.close();
+  source = undefined;
 }
 
 document.querySelectorAll('table:has(th[data-sort])').forEach(makeSortable);
 showTimes(document);
+document.addEventListener('visibilitychange', () => (document.hidden ? rest() : listen()));
+addEventListener('pagehide', rest);
+addEventListener('pageshow', listen);
 listen();

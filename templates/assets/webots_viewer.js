@@ -21,6 +21,20 @@ function redirected(node) {
   return node;
 }
 
+/** This page keeps nothing: a component that wants to keep something may think that it does. */
+function forgetful() {
+  const kept = new Map();
+  return {
+    getItem: (key) => kept.get(String(key)) ?? null,
+    setItem: (key, value) => kept.set(String(key), String(value)),
+    removeItem: (key) => kept.delete(String(key)),
+    clear: () => kept.clear(),
+  };
+}
+
+for (const name of ['localStorage', 'sessionStorage'])
+  Object.defineProperty(window, name, { value: forgetful() });
+
 window.Module = [];
 window.Module.locateFile = (path, prefix) => (path.endsWith('.data') ? base : prefix) + path;
 

@@ -22,7 +22,8 @@ class WebotsView extends HTMLElement {
     document.head.appendChild(script);
   }
   connect(server) {
-    this.textContent = `${greeting} ${server} ${Module.locateFile('wren.data', '')} ${window.ran}`;
+    localStorage.setItem('theme', 'dark');
+    this.textContent = `${greeting} ${server} ${Module.locateFile('wren.data', '')} ${window.ran} ${window.origin}`;
   }
 }
 customElements.define('webots-view', WebotsView);
@@ -49,7 +50,7 @@ class WebotsViewer(BrowserTest):
         page.tab.get_by_role("button", name="Connect", exact=True).click()
         view = page.tab.frame_locator("#stage iframe").locator("webots-view")
         expect(view).to_contain_text("connected to ws://127.0.0.1:")
-        expect(view).to_contain_text("/wwi/wren.data undefined")
+        expect(view).to_contain_text("/wwi/wren.data undefined null")
         expect(view).to_have_css("font-size", "20px")
 
     def test_a_scene_of_the_demonstration_is_shown_by_the_small_viewer(self):
