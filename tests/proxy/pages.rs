@@ -31,7 +31,7 @@ async fn is_told_what_happens(browser: &Browser, path: &str) {
         browser.begin(&format!("https://{}{path}", browser.host), &[("Accept", "text/event-stream")]).await;
     assert_eq!(events.status(), 200, "{path}");
     let begun = std::time::Instant::now();
-    while begun.elapsed() < IDLE * 2 {
+    while begun.elapsed() < IDLE * 3 / 2 {
         let event = actix_rt::time::timeout(SOON, events.next()).await.expect("nothing is told");
         event.unwrap_or_else(|| panic!("{path}: the end")).unwrap();
     }
