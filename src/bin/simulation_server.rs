@@ -40,7 +40,9 @@ fn main() -> ExitCode {
     };
     if arguments.check {
         let code = start::check(&loaded);
-        preflight::look(&loaded.config).iter().for_each(|finding| eprintln!("{finding}"));
+        for finding in preflight::look(&loaded.config) {
+            eprintln!("{finding}");
+        }
         return code;
     }
     let log = loaded.config.log_dir.0.join("simulation/output.log");

@@ -6,7 +6,10 @@ use serde::{Deserialize, Serialize};
 
 use super::mail_address::{self, MailAddress};
 use crate::shared::address::PublicAddress;
-use crate::shared::config::{Configuration, ExpandedPath, Secret, Unfit, optional_port, percent, seconds, whole};
+use crate::shared::config::{
+    Configuration, ExpandedPath, Secret, Unfit, one_or_many, optional_port, percent, seconds, threshold, whole,
+};
+use crate::shared::peer::TrustedProxies;
 
 /// Every key of the session server. The original's keys keep their meaning.
 #[derive(Debug, Clone, Serialize, Deserialize)]
@@ -59,8 +62,9 @@ pub struct SessionConfig {
     /// Log to standard output. Default: false.
     #[serde(default)]
     pub debug: bool,
-    /// A simulation server with this load (percent) or more takes no client. Default: 95.
-    #[serde(default = "threshold", deserialize_with = "percent")]
+    /// A simulation server with this load (percent) or more takes no client; above 100 the load closes no server.
+    /// Default: 95.
+    #[serde(default = "usual_threshold", deserialize_with = "threshold")]
     pub load_threshold: f64,
     /// Seconds between two looks at each simulation server. Default: 1.
     #[serde(default = "one_second", with = "seconds")]
@@ -72,9 +76,49 @@ pub struct SessionConfig {
     /// How many client `WebSockets` may be open in all. Default: 20000.
     #[serde(default = "many_clients", deserialize_with = "whole::<1, 1_000_000, _, _>")]
     pub max_clients: usize,
+    /// How many of them one client address may have. Default: 1000, for a class sits behind one address.
+    #[serde(default = "a_class", deserialize_with = "whole::<1, 1_000_000, _, _>")]
+    pub max_clients_per_address: usize,
+    /// Web servers, as addresses or networks, whose `X-Forwarded-For` or `Forwarded` tells their clients' addresses.
+    /// Default: `["127.0.0.0/8", "::1/128"]`.
+    #[serde(default)]
+    pub trusted_proxies: TrustedProxies,
+    /// Worlds that the page `/viewer` offers: URLs, or `{"title": ..., "url": ...}`. Default: none.
+    #[serde(default, deserialize_with = "one_or_many")]
+    pub examples: Vec<Example>,
+    /// Address of Webots' own viewer (`WebotsView.js`), for simulation servers that don't have it. Default: none.
+    #[serde(default)]
+    pub viewer_script: Option<url::Url>,
     /// Every other duration.
     #[serde(default)]
     pub timing: Timing,
+}
+
+/// A world to try.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(from = "WireExample")]
+pub struct Example {
+    /// What it is called; the URL where nothing was said.
+    pub title: String,
+    /// The world's URL.
+    pub url: String,
+}
+
+#[derive(Deserialize)]
+#[serde(untagged)]
+enum WireExample {
+    Url(String),
+    Titled { title: Option<String>, url: String },
+}
+
+impl From<WireExample> for Example {
+    fn from(wire: WireExample) -> Self {
+        let (title, url) = match wire {
+            WireExample::Url(url) => (None, url),
+            WireExample::Titled { title, url } => (title, url),
+        };
+        Self { title: title.unwrap_or_else(|| url.clone()), url }
+    }
 }
 
 /// Durations, in seconds.
@@ -162,6 +206,10 @@ impl Configuration for SessionConfig {
             let problem = format!("{} s is not more than timing.ping", self.timing.silence.as_secs_f64());
             return Err(Unfit { key: "timing.silence", problem });
         }
+        if let Some(script) = self.viewer_script.as_ref().filter(|script| !script.has_host()) {
+            let problem = format!("{script} has no host; allowed are http and https URLs");
+            return Err(Unfit { key: "viewerScript", problem });
+        }
         self.mail_server = self.mail_server.take().filter(|host| !host.is_empty());
         if let Some(host) = self.mail_server.as_deref().filter(|host| !mail_address::is_host(host)) {
             let problem =
@@ -189,7 +237,7 @@ fn log_folder() -> ExpandedPath {
     ExpandedPath::plain("log")
 }
 
-fn threshold() -> f64 {
+fn usual_threshold() -> f64 {
     95.0
 }
 
@@ -199,6 +247,10 @@ fn one_second() -> Duration {
 
 fn client_cost() -> f64 {
     2.0
+}
+
+fn a_class() -> usize {
+    1000
 }
 
 fn many_clients() -> usize {

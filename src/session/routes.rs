@@ -1,25 +1,25 @@
 //! The session server's public paths: each reads the request, asks the registry, and maps the answer.
 
 use std::sync::Arc;
-use std::time::Duration;
 
-use actix::prelude::*;
+use actix::Addr;
 use actix_web::http::{Method, StatusCode, header};
 use actix_web::middleware::DefaultHeaders;
 use actix_web::{HttpRequest, HttpResponse, web};
 use actix_web_actors::ws::WsResponseBuilder;
-use askama::Template;
 use rand::RngExt;
 
-use super::app::Server;
-use super::fleet_status::{FleetStatus, told_mean};
-use super::registry::{GetStatus, IsAvailable, NoServer, Pick, Registry};
-use super::status::{self, Page, StatusPage};
+use super::asking::{ask, with_status};
+use super::audience::Audience;
+use super::fleet_status::told_mean;
+use super::page_routes;
+use super::pick::{NoServer, Pick};
+use super::registry::{GetStatus, IsAvailable};
+use super::server::Server;
+use super::status::{self, StatusPage};
 use super::web_client::WebClient;
 use crate::shared::metrics::CONTENT_TYPE;
 
-/// How long the registry may take to answer.
-const PATIENCE: Duration = Duration::from_secs(2);
 /// The largest message of a client, in bytes.
 const LARGEST_MESSAGE: usize = 8 * 1024;
 /// After how many seconds a client that was refused may come back: drawn at random, so that a class that was refused
@@ -40,7 +40,7 @@ pub fn configure(app: &mut web::ServiceConfig) {
             .route("/request", web::get().to(availability))
             .route("/session", web::get().to(session))
             .route("/load", web::get().to(load))
-            .route("/monitor", web::get().to(monitor))
+            .configure(page_routes::configure)
             .route("/status", web::get().to(status_json))
             .route("/metrics", web::get().to(metrics))
             .route("/health", web::get().to(health))
@@ -49,28 +49,28 @@ pub fn configure(app: &mut web::ServiceConfig) {
     );
 }
 
-/// Asks the registry; nothing when it is too busy to answer.
-async fn ask<M>(server: &Server, message: M) -> Option<M::Result>
-where
-    M: Message<Result: Send> + Send + 'static,
-    Registry: Handler<M>,
-{
-    let answer = server.registry.send(message);
-    actix_rt::time::timeout(PATIENCE, answer).await.ok().and_then(Result::ok)
-}
-
 fn wants_websocket(request: &HttpRequest) -> bool {
     let upgrade = request.headers().get(header::UPGRADE).and_then(|value| value.to_str().ok());
     upgrade.is_some_and(|value| value.eq_ignore_ascii_case("websocket"))
 }
 
-async fn root(request: HttpRequest, stream: web::Payload, server: web::Data<Server>) -> HttpResponse {
-    if wants_websocket(&request) { websocket(&request, stream, &server) } else { availability(server).await }
+async fn root(
+    request: HttpRequest,
+    stream: web::Payload,
+    server: web::Data<Server>,
+    audience: web::Data<Addr<Audience>>,
+) -> HttpResponse {
+    if wants_websocket(&request) { websocket(&request, stream, &server, &audience) } else { availability(server).await }
 }
 
-async fn session(request: HttpRequest, stream: web::Payload, server: web::Data<Server>) -> HttpResponse {
+async fn session(
+    request: HttpRequest,
+    stream: web::Payload,
+    server: web::Data<Server>,
+    audience: web::Data<Addr<Audience>>,
+) -> HttpResponse {
     if wants_websocket(&request) {
-        return websocket(&request, stream, &server);
+        return websocket(&request, stream, &server, &audience);
     }
     let answer = server.pick(Pick::parse(wanted_world(request.query_string()))).await;
     let status = match answer.refusal {
@@ -93,12 +93,18 @@ fn wanted_world(query: &str) -> Option<&str> {
     begin.filter(|world| !world.is_empty())
 }
 
-fn websocket(request: &HttpRequest, stream: web::Payload, server: &web::Data<Server>) -> HttpResponse {
-    let Ok(permit) = Arc::clone(&server.connections).try_acquire_owned() else {
-        return HttpResponse::ServiceUnavailable().body("Error: too many connections.");
+fn websocket(
+    request: &HttpRequest,
+    stream: web::Payload,
+    server: &web::Data<Server>,
+    audience: &Addr<Audience>,
+) -> HttpResponse {
+    let peer = server.trusted_proxies.peer(request);
+    let connection = match server.connections.admit(peer) {
+        Ok(connection) => connection,
+        Err(crowded) => return crowded.answer(),
     };
-    let peer = request.peer_addr().map(|address| address.ip());
-    let actor = WebClient::new(Arc::clone(server), peer, permit);
+    let actor = WebClient::new(Arc::clone(server), audience.clone(), peer, connection);
     WsResponseBuilder::new(actor, request, stream).frame_size(LARGEST_MESSAGE).start().unwrap_or_else(|error| {
         let problem = format!("Error: this is a WebSocket: {error}.");
         HttpResponse::build(error.as_response_error().status_code()).body(problem)
@@ -115,27 +121,12 @@ async fn load(server: web::Data<Server>) -> HttpResponse {
     HttpResponse::Ok().content_type("text/plain").body(told_mean(mean).to_string())
 }
 
-async fn with_status(server: &Server, answer: impl FnOnce(&FleetStatus) -> HttpResponse) -> HttpResponse {
-    match ask(server, GetStatus).await {
-        Some(status) => answer(&status),
-        None => HttpResponse::ServiceUnavailable().body("Error: the server is too busy to tell."),
-    }
-}
-
 async fn status_json(server: web::Data<Server>) -> HttpResponse {
     with_status(&server, |status| HttpResponse::Ok().json(StatusPage::new(&server, status))).await
 }
 
-async fn monitor(server: web::Data<Server>) -> HttpResponse {
-    with_status(&server, |status| match Page::new(&server, status).render() {
-        Ok(page) => HttpResponse::Ok().content_type("text/html; charset=utf-8").body(page),
-        Err(error) => HttpResponse::InternalServerError().body(format!("Error: {error}.")),
-    })
-    .await
-}
-
 async fn metrics(server: web::Data<Server>) -> HttpResponse {
-    with_status(&server, |status| match server.metrics.render(&status::gauges(status)) {
+    with_status(&server, |status| match server.metrics.render(&status::gauges(server.clients(), status)) {
         Ok(text) => HttpResponse::Ok().content_type(CONTENT_TYPE).body(text),
         Err(error) => HttpResponse::InternalServerError().body(format!("Error: {error}.")),
     })
@@ -148,7 +139,7 @@ async fn health() -> HttpResponse {
 
 async fn nothing_here() -> HttpResponse {
     HttpResponse::NotFound()
-        .body("Error: there is nothing here. Try /session, /monitor, /status, /load, /metrics or /health.")
+        .body("Error: there is nothing here. Try /session, /monitor, /viewer, /status, /load, /metrics or /health.")
 }
 
 #[cfg(test)]

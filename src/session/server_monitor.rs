@@ -1,8 +1,9 @@
 //! Actor: watches one simulation server.
 //!
 //! Created by the registry for each address in `simulationServers`. Every [`Watch::refresh`] it asks the server for its
-//! state, with one request in flight at most, and tells the registry what came: it judges nothing itself. It ends when
-//! the registry says so; after a panic the registry makes a new one.
+//! state, with one request in flight at most, and tells the registry what came: it judges nothing itself. It asks again
+//! only when the registry has taken that in, so that no report is lost and none piles up. It ends when the registry says
+//! so; after a panic the registry makes a new one.
 //!
 //! It asks for `/status`; a server that has no such page is asked for `/load`, as the original is. Nothing that comes is
 //! trusted: the whole exchange has one time limit, an answer has a largest size, and a load must be one.
@@ -11,10 +12,12 @@ use std::fmt;
 use std::time::{Duration, Instant};
 
 use actix::prelude::*;
+use awc::error::{ConnectError, SendRequestError};
 
 use crate::shared::address::PublicAddress;
 use crate::shared::load::Load;
 use crate::shared::status::Dispatch;
+use crate::shared::tls;
 
 /// What was learned about a simulation server.
 #[derive(Message, Debug)]
@@ -39,8 +42,9 @@ pub enum Unreachable {
     BadAnswer(String),
 }
 
-/// How often and how patiently a server is asked.
-#[derive(Debug, Clone, Copy, PartialEq)]
+/// How often and how patiently a server is asked. As a message it changes a monitor's ways.
+#[derive(Message, Debug, Clone, Copy, PartialEq)]
+#[rtype(result = "()")]
 pub struct Watch {
     /// Between two looks.
     pub refresh: Duration,
@@ -62,12 +66,18 @@ pub struct ServerMonitor {
     client: awc::Client,
     reports: Recipient<Reported>,
     asking: bool,
+    /// The next look, or all that follow.
+    looks: SpawnHandle,
     /// Until when a server that has no `/status` is asked for `/load` alone.
     load_only_until: Option<Instant>,
 }
 
 /// The largest answer that is read, in bytes.
 const LARGEST_ANSWER: usize = 1024 * 1024;
+/// A load beyond this is none, in percent.
+const LARGEST_LOAD: f64 = 1000.0;
+/// Longer than any time limit of a look.
+const NEVER: Duration = Duration::from_hours(24);
 /// For how long a server is taken to have no `/status`.
 const LOAD_ONLY: Duration = Duration::from_mins(1);
 
@@ -78,11 +88,36 @@ enum Answer {
     Load(Load),
 }
 
+/// What all monitors ask with: it keeps one connection to each simulation server.
+#[must_use]
+pub fn client(refresh: Duration) -> awc::Client {
+    let idle = (refresh * 3).max(Duration::from_secs(15));
+    // The default limit of the pool is 100 connections. A look as a whole has a time limit, its parts have none.
+    let mut connector = awc::Connector::new().limit(0).conn_keep_alive(idle).timeout(NEVER);
+    if let Some(config) = tls::client_config() {
+        connector = connector.rustls_0_23(config);
+    }
+    awc::Client::builder().connector(connector).disable_timeout().disable_redirects().finish()
+}
+
 impl ServerMonitor {
     /// A monitor of one server. `client` is shared by all: it keeps the connections.
     #[must_use]
     pub fn new(server: PublicAddress, watch: Watch, client: awc::Client, reports: Recipient<Reported>) -> Self {
-        Self { server, watch, client, reports, asking: false, load_only_until: None }
+        let looks = SpawnHandle::default();
+        Self { server, watch, client, reports, asking: false, looks, load_only_until: None }
+    }
+
+    /// Asks now, and then at regular times that are not those of the other monitors: were the whole fleet asked in the
+    /// same moment, the door would wait meanwhile.
+    fn begin(&mut self, ctx: &mut Context<Self>) {
+        ctx.cancel_future(self.looks);
+        self.ask(ctx);
+        let first = self.watch.refresh.mul_f64(rand::random());
+        self.looks = ctx.run_later(first, |monitor, ctx| {
+            monitor.ask(ctx);
+            monitor.looks = ctx.run_interval(monitor.watch.refresh, Self::ask);
+        });
     }
 
     fn ask(&mut self, ctx: &mut Context<Self>) {
@@ -94,14 +129,25 @@ impl ServerMonitor {
         let begun = Instant::now();
         let exchange = async move {
             let answer = actix_rt::time::timeout(patience, exchange(&client, &url, load_only)).await;
-            answer.unwrap_or(Err(Unreachable::TimedOut(patience)))
+            (answer.unwrap_or(Err(Unreachable::TimedOut(patience))), begun.elapsed())
         };
-        exchange.into_actor(self).map(move |answer, monitor, _| monitor.came(answer, begun.elapsed())).spawn(ctx);
+        let told = exchange.into_actor(self).then(|(answer, latency), monitor, _| {
+            let answer = answer.map(|answer| monitor.understood(answer));
+            let report = Reported { server: monitor.server.clone(), latency, answer };
+            monitor.reports.send(report).into_actor(monitor)
+        });
+        told.map(|taken, monitor, ctx| {
+            monitor.asking = false;
+            // Without a registry there is nothing to do.
+            if taken.is_err() {
+                ctx.stop();
+            }
+        })
+        .spawn(ctx);
     }
 
-    fn came(&mut self, answer: Result<Answer, Unreachable>, latency: Duration) {
-        self.asking = false;
-        let answer = answer.map(|answer| match answer {
+    fn understood(&mut self, answer: Answer) -> Dispatch {
+        match answer {
             Answer::Status(dispatch) => dispatch,
             Answer::Load(load) => {
                 if self.load_only_until.is_none_or(|end| Instant::now() >= end) {
@@ -109,10 +155,6 @@ impl ServerMonitor {
                 }
                 Dispatch::load_only(load)
             }
-        });
-        let report = Reported { server: self.server.clone(), latency, answer };
-        if let Err(lost) = self.reports.try_send(report) {
-            log::warn!("a report of {} is lost: {lost}", self.server);
         }
     }
 }
@@ -121,8 +163,16 @@ impl Actor for ServerMonitor {
     type Context = Context<Self>;
 
     fn started(&mut self, ctx: &mut Self::Context) {
-        self.ask(ctx);
-        ctx.run_interval(self.watch.refresh, Self::ask);
+        self.begin(ctx);
+    }
+}
+
+impl Handler<Watch> for ServerMonitor {
+    type Result = ();
+
+    fn handle(&mut self, watch: Watch, ctx: &mut Self::Context) {
+        self.watch = watch;
+        self.begin(ctx);
     }
 }
 
@@ -150,12 +200,18 @@ async fn exchange(client: &awc::Client, url: &str, load_only: bool) -> Result<An
     }
     let body = get(client, &format!("{url}/load")).await?;
     let body = body.ok_or_else(|| Unreachable::BadAnswer("it has neither /status nor /load".to_owned()))?;
-    Load::parse(&body).map(Answer::Load).map_err(|error| Unreachable::BadAnswer(shortened(&error.to_string())))
+    let load = Load::parse(&body).map_err(|error| Unreachable::BadAnswer(shortened(&error.to_string())))?;
+    plausible(load).map(Answer::Load)
 }
 
 /// The body of a page; nothing where the server says that there is none.
 async fn get(client: &awc::Client, url: &str) -> Result<Option<actix_web::web::Bytes>, Unreachable> {
-    let mut answer = client.get(url).send().await.map_err(|error| Unreachable::Refused(error.to_string()))?;
+    let answer = match client.get(url).send().await {
+        // A connection that was kept may have ended just now: that says nothing of the server.
+        Err(error) if is_broken(&error) => client.get(url).send().await,
+        answer => answer,
+    }
+    .map_err(no_answer)?;
     let status = answer.status();
     if status == awc::http::StatusCode::NOT_FOUND {
         return Ok(None);
@@ -163,16 +219,35 @@ async fn get(client: &awc::Client, url: &str) -> Result<Option<actix_web::web::B
     if !status.is_success() {
         return Err(Unreachable::BadAnswer(format!("status {status}")));
     }
-    let body = answer.body().limit(LARGEST_ANSWER).await;
-    body.map(Some).map_err(|error| Unreachable::BadAnswer(error.to_string()))
+    let body = answer.timeout(NEVER).body().limit(LARGEST_ANSWER).await;
+    body.map(Some).map_err(|error| Unreachable::BadAnswer(shortened(&error.to_string())))
+}
+
+/// Whether a connection ended, as opposed to one that could not be made.
+fn is_broken(error: &SendRequestError) -> bool {
+    !matches!(error, SendRequestError::Connect(reason) if !matches!(reason, ConnectError::Disconnected))
+}
+
+fn no_answer(error: SendRequestError) -> Unreachable {
+    Unreachable::Refused(match error {
+        SendRequestError::Connect(ConnectError::Disconnected) => "it was closed without an answer".to_owned(),
+        error => tls::reason(&error).unwrap_or_else(|| shortened(&error.to_string())),
+    })
 }
 
 /// Some servers of the Python family have a `/status` with less in it; a page that is no status at all counts as none.
 fn parse_status(body: &[u8]) -> Result<Dispatch, Unreachable> {
-    serde_json::from_slice(body).map_err(|error| {
+    let dispatch: Dispatch = serde_json::from_slice(body).map_err(|error| {
         let text = String::from_utf8_lossy(body.get(..body.len().min(40)).unwrap_or_default()).into_owned();
-        Unreachable::BadAnswer(format!("{error} in {text:?}"))
-    })
+        Unreachable::BadAnswer(shortened(&format!("{error} in {text:?}")))
+    })?;
+    plausible(dispatch.load)?;
+    Ok(dispatch)
+}
+
+fn plausible(load: Load) -> Result<Load, Unreachable> {
+    let is_none = load.percent() > LARGEST_LOAD;
+    if is_none { Err(Unreachable::BadAnswer(shortened(&format!("a load of {load} %")))) } else { Ok(load) }
 }
 
 /// Words that may hold what somebody else wrote are kept short.
@@ -190,8 +265,18 @@ mod tests {
             parse_status(br#"{"load": 12.5, "allowedRepositories": ["https://github.com/lab"], "new": 1}"#).unwrap();
         assert!((status.load.percent() - 12.5).abs() < f64::EPSILON);
         assert_eq!(status.allowed_repositories.len(), 1);
-        for odd in ["", "{}", "[]", "12", r#"{"load": -1}"#, r#"{"load": "1"}"#, r#"{"load": null}"#, "<html>", "\u{0}"]
-        {
+        for odd in [
+            "",
+            "{}",
+            "[]",
+            "12",
+            r#"{"load": -1}"#,
+            r#"{"load": "1"}"#,
+            r#"{"load": null}"#,
+            r#"{"load": 1e308}"#,
+            "<html>",
+            "\u{0}",
+        ] {
             assert!(matches!(parse_status(odd.as_bytes()), Err(Unreachable::BadAnswer(_))), "{odd:?}");
         }
     }

@@ -1,15 +1,15 @@
-//! What the session server tells of its fleet: `/status`, `/monitor` and `/metrics`.
+//! What the session server tells programs of its fleet: `/status` and `/metrics`.
 
-use std::time::{Duration, SystemTime};
+use std::time::Duration;
 
-use askama::Template;
 use serde::Serialize;
 
-use super::app::Server;
 use super::fleet_status::{FleetStatus, ServerStatus, State, told_mean};
+use super::server::Server;
 use crate::shared::load::Load;
 use crate::shared::metrics::Gauge;
 use crate::shared::status::Instances;
+use crate::shared::timestamp::timestamp;
 
 /// The page `/status`.
 #[derive(Debug, Serialize)]
@@ -60,7 +60,7 @@ impl StatusPage {
     #[must_use]
     pub fn new(server: &Server, status: &FleetStatus) -> Self {
         let changes = status.changes.iter().map(|change| ChangePage {
-            at: time(change.at),
+            at: timestamp(change.at),
             server: change.server.to_string(),
             state: change.state.word(),
             why: change.why.clone(),
@@ -69,7 +69,7 @@ impl StatusPage {
             version: env!("CARGO_PKG_VERSION"),
             uptime: server.started.elapsed().as_secs(),
             available: status.available,
-            clients: status.clients,
+            clients: server.clients(),
             load: status.mean_load,
             servers: status.servers.iter().map(|one| ServerPage::new(one, server.ssl)).collect(),
             changes: changes.collect(),
@@ -86,7 +86,7 @@ impl ServerPage {
             address: server.address.to_string(),
             monitor: format!("{}/monitor", server.address.http_url(ssl)),
             state: server.state.word(),
-            since: time(server.since),
+            since: timestamp(server.since),
             load: known.map(|report| report.load),
             effective_load: server.effective_load,
             in_flight: server.in_flight,
@@ -101,42 +101,9 @@ impl ServerPage {
     }
 }
 
-/// The page `/monitor`.
-#[derive(Template)]
-#[template(path = "session_monitor.html")]
-pub struct Page {
-    status: StatusPage,
-    started: String,
-    mean_load: String,
-}
-
-impl Page {
-    /// The state of the fleet.
-    #[must_use]
-    pub fn new(server: &Server, status: &FleetStatus) -> Self {
-        let mean_load = match status.mean_load {
-            Some(mean) => format!("{mean:.1} %"),
-            None => "not known".to_owned(),
-        };
-        Self { status: StatusPage::new(server, status), started: time(server.started_at), mean_load }
-    }
-
-    fn percent(number: Option<f64>) -> String {
-        number.map(|number| format!("{number:.1} %")).unwrap_or_default()
-    }
-
-    fn milliseconds(seconds: Option<f64>) -> String {
-        seconds.map(|seconds| format!("{:.1} ms", 1000.0 * seconds)).unwrap_or_default()
-    }
-}
-
-fn time(time: SystemTime) -> String {
-    jiff::Timestamp::try_from(time).map(|time| format!("{time:.0}")).unwrap_or_default()
-}
-
 /// The gauges of `/metrics`.
 #[must_use]
-pub fn gauges<'text>(status: &FleetStatus) -> Vec<Gauge<'text>> {
+pub fn gauges<'text>(clients: usize, status: &FleetStatus) -> Vec<Gauge<'text>> {
     let of_each = |value: &dyn Fn(&ServerStatus) -> Option<f64>| {
         let servers = status.servers.iter();
         servers.filter_map(|server| Some((vec![server.address.to_string()], value(server)?))).collect()
@@ -150,7 +117,7 @@ pub fn gauges<'text>(status: &FleetStatus) -> Vec<Gauge<'text>> {
             "1 while some simulation server can take a client",
             f64::from(u8::from(status.available)),
         ),
-        Gauge::plain("session_clients", "Web clients connected", number(status.clients)),
+        Gauge::plain("session_clients", "Web clients connected", number(clients)),
         Gauge::plain(
             "session_load_percent",
             "Mean load of the servers that answer, -1 where none does",

@@ -221,6 +221,14 @@ pub fn percent<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f64, D::Err
     deserializer.deserialize_any(Between { least: 0.0, most: 100.0, what: "a number of percent" })
 }
 
+/// Reads a percentage that may pass 100, which nothing that is measured does.
+///
+/// # Errors
+/// When the value is something else.
+pub fn threshold<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f64, D::Error> {
+    deserializer.deserialize_any(Between { least: 0.0, most: 1000.0, what: "a number of percent" })
+}
+
 /// A duration, written as a number of seconds.
 pub mod seconds {
     use super::{Between, Deserializer, Duration, Serializer};

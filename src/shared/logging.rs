@@ -27,9 +27,12 @@ pub enum LogTarget<'path> {
 /// # Errors
 /// When the file's folder can't be made or written.
 pub fn start(target: LogTarget<'_>) -> std::io::Result<()> {
+    // The decoder logs each malformed message as an error, and who sends them decides how many there are.
     let default_level = match target {
-        LogTarget::Stdout => "debug,actix_http=info,actix_server=info,mio=info,rustls=info,h2=info",
-        LogTarget::File(_) => "info,actix_server=warn",
+        LogTarget::Stdout => {
+            "debug,actix_http=info,actix_http::h1::decoder=off,actix_server=info,mio=info,rustls=info,h2=info"
+        }
+        LogTarget::File(_) => "info,actix_http::h1::decoder=off,actix_server=warn",
     };
     let mut builder = Builder::from_env(Env::default().default_filter_or(default_level));
     builder.target(match target {

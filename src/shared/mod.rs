@@ -2,16 +2,24 @@
 
 pub mod address;
 pub mod admission;
+pub mod assets;
 pub mod auth;
 pub mod config;
+pub mod connections;
+pub mod live;
 pub mod liveness;
 pub mod load;
 pub mod logging;
 pub mod metrics;
 pub mod notify;
+pub mod page;
+pub mod peer;
 pub mod permanent;
 pub mod project_url;
 pub mod repositories;
+
 pub mod shutdown;
 pub mod start;
 pub mod status;
+pub mod timestamp;
+pub mod tls;

@@ -7,58 +7,28 @@ use std::time::{Duration, Instant};
 use actix::prelude::*;
 use actix_web::dev::ServerHandle;
 use actix_web::{App, HttpServer, web};
-use tokio::sync::{Semaphore, watch};
+use tokio::sync::watch;
 
 use super::announcer::Announcer;
 use super::checkout::Checkouts;
-use super::command::is_in_path;
 use super::config::SimulationConfig;
 use super::fetcher::{Fetcher, Limits};
 use super::git::Git;
 use super::instance_dir::{RunDir, Swept};
-use super::load_monitor::{LoadMonitor, Readings};
+use super::load_monitor::LoadMonitor;
 use super::outcome;
 use super::places::{Census, Places};
 use super::repository_cache::RepositoryCache;
 use super::routes;
+use super::server::Server;
+use super::usage::UsageMonitor;
 use crate::shared::admission::Rules;
-use crate::shared::load::Load;
+use crate::shared::connections::Connections;
+use crate::shared::live::Live;
 use crate::shared::metrics::Metrics;
 use crate::shared::notify;
 use crate::shared::permanent;
 use crate::shared::shutdown::{Phase, Request, Signals};
-
-/// What routes and web clients share.
-pub struct Server {
-    /// The effective configuration.
-    pub config: Arc<SimulationConfig>,
-    /// Whose worlds run here.
-    pub rules: Rules,
-    /// Lends places.
-    pub places: Addr<Places>,
-    /// Reads the machine.
-    pub load_monitor: Addr<LoadMonitor>,
-    /// The machine's load.
-    pub readings: watch::Receiver<Arc<Readings>>,
-    /// Checks worlds out.
-    pub checkouts: Arc<Checkouts>,
-    /// Folders of simulations.
-    pub run: Arc<RunDir>,
-    /// Whether clients are taken.
-    pub phase: watch::Receiver<Phase>,
-    /// Where drains are asked for.
-    pub requests: tokio::sync::mpsc::Sender<Request>,
-    /// Where Webots' actors live.
-    pub main_thread: ArbiterHandle,
-    /// Counts connections.
-    pub connections: Arc<Semaphore>,
-    /// What is counted.
-    pub metrics: Metrics,
-    /// Clients that asked for a simulation, by what came of it.
-    pub starts: prometheus::IntCounterVec,
-    /// When the server was started.
-    pub started: Instant,
-}
 
 /// Why the server can't go on.
 #[derive(Debug, thiserror::Error)]
@@ -92,43 +62,6 @@ pub enum AppError {
 
 /// Between two looks whether all simulations have ended.
 const LOOK: Duration = Duration::from_millis(50);
-
-impl Server {
-    /// The load that is told: of a machine that drains, 100.
-    #[must_use]
-    pub fn load(&self) -> Load {
-        if self.is_draining() { Load::FULL } else { self.readings.borrow().load.unwrap_or(Load::ZERO) }
-    }
-
-    /// Whether no new clients are taken.
-    #[must_use]
-    pub fn is_draining(&self) -> bool {
-        *self.phase.borrow() != Phase::Open
-    }
-
-    /// The program that is started for each client.
-    ///
-    /// # Errors
-    /// What is missing, and how to set it, in words for the client.
-    pub fn webots_program(&self) -> Result<PathBuf, String> {
-        if self.config.xvfb && !is_in_path("xvfb-run") {
-            return Err("This simulation server gives each Webots a display of its own (xvfb), but has no xvfb-run. \
-                        Its administrator can install it, or set xvfb: false and display"
-                .to_owned());
-        }
-        let how = "Its administrator can set webotsHome in the server's configuration, or the environment variable \
-                   WEBOTS_HOME";
-        let Some(program) = self.config.webots_program() else {
-            return Err(format!("This simulation server does not know where Webots is installed. {how}."));
-        };
-        let program = std::path::absolute(&program).unwrap_or(program);
-        if program.is_file() {
-            Ok(program)
-        } else {
-            Err(format!("This simulation server has no Webots at {}. {how}.", program.display()))
-        }
-    }
-}
 
 /// Runs the server until it is asked to stop.
 ///
@@ -231,9 +164,11 @@ fn assemble(
         phase,
         requests,
         main_thread: Arbiter::current(),
-        connections: Arc::new(Semaphore::new(config.max_clients)),
+        connections: Connections::new(config.max_clients, config.max_clients_per_address),
         metrics,
         starts,
+        live: Live::new(),
+        usage: UsageMonitor::default(),
         started: Instant::now(),
         config: Arc::new(config),
     })

@@ -16,10 +16,16 @@ pub enum Change {
     Version(String),
     /// It streams on this port, and its output is kept in this file.
     Launched {
+        /// When, in seconds since 1970.
+        at: u64,
+        /// The process from which all of it descends.
+        pid: i32,
         /// The port that was granted.
         port: u16,
         /// The file.
         log: PathBuf,
+        /// How long the file was before: what earlier simulations on this port have printed.
+        begin: u64,
     },
     /// It streams on this port.
     Port(u16),
@@ -56,18 +62,27 @@ pub struct Everybody {
 #[derive(Debug, Clone, Serialize)]
 #[serde(rename_all = "camelCase")]
 pub struct Simulation {
+    /// Its number.
+    pub id: u64,
     /// The world's URL.
     pub world: String,
     /// Its state.
     pub stage: Stage,
     /// When its client asked for it, in seconds since 1970.
     pub since: u64,
+    /// When it was launched, in seconds since 1970; from then on its time is limited.
+    pub launched: Option<u64>,
+    /// The process from which all of it descends, once it is launched.
+    pub pid: Option<i32>,
     /// The streaming port, once there is one.
     pub port: Option<u16>,
     /// The version of Webots that the world was made for.
     pub version: Option<String>,
     /// The file that its output is kept in.
     pub log: Option<PathBuf>,
+    /// Where in that file its output begins.
+    #[serde(skip)]
+    pub log_begin: u64,
 }
 
 impl Simulation {
@@ -77,7 +92,10 @@ impl Simulation {
             Change::Stage(stage) => self.stage = stage,
             Change::Version(version) => self.version = Some(version),
             Change::Port(port) => self.port = Some(port),
-            Change::Launched { port, log } => {
+            Change::Launched { at, pid, port, log, begin } => {
+                self.log_begin = begin;
+                self.launched = Some(at);
+                self.pid = Some(pid);
                 self.port = Some(port);
                 self.log = Some(log);
                 self.stage = Stage::Launching;

@@ -89,16 +89,18 @@ impl Fetcher {
         progress: &(impl Fn(String) + Send + Sync),
     ) -> Result<Arc<Fetched>, CheckoutError> {
         let (mut result, mut news) = self.join_or_start(world);
-        let mut told: Option<Instant> = None;
+        let mut told = Instant::now().checked_sub(BETWEEN_NEWS).unwrap_or_else(Instant::now);
         loop {
+            let step = async {
+                // What comes too soon waits, and only the newest of it is told.
+                actix_rt::time::sleep_until((told + BETWEEN_NEWS).into()).await;
+                news.changed().await.map(|()| news.borrow_and_update().clone())
+            };
             tokio::select! {
                 fetched = &mut result => return fetched,
-                Ok(()) = news.changed() => {
-                    let step = news.borrow_and_update().clone();
-                    if told.is_none_or(|told| told.elapsed() >= BETWEEN_NEWS) {
-                        told = Some(Instant::now());
-                        progress(step);
-                    }
+                Ok(step) = step => {
+                    told = Instant::now();
+                    progress(step);
                 }
             }
         }
@@ -157,7 +159,8 @@ impl Fetcher {
             if !repository.has(&reference) {
                 self.download(world, remote, repository, &revision, progress).await?;
             }
-            let call = call(remote, repository.path(), revision.list_arguments(&reference));
+            let mut call = call(remote, repository.path(), revision.list_arguments(&reference));
+            call.is_alone = true;
             let listing = self.git.run(call, |_| ()).await.map_err(|source| damaged(world, source))?;
             let listing = revision::Listing::parse(&listing);
             if listing.size > self.limits.size {
@@ -250,7 +253,7 @@ impl Fetcher {
     /// Whether git finds everything in order in a cached repository. It reads all of it: for use after a failure.
     async fn is_sound(&self, repository: &Path) -> bool {
         let arguments = ["fsck", "--full", "--no-dangling", "--no-progress"].map(OsString::from).to_vec();
-        let call = Call { repository, arguments, protocol: "https", environment: Vec::new() };
+        let call = Call { repository, arguments, protocol: "https", is_alone: false, environment: Vec::new() };
         self.git.run(call, |_| ()).await.is_ok()
     }
 
@@ -281,5 +284,5 @@ impl Fetcher {
 /// A git command on a cached repository.
 #[must_use]
 pub fn call<'call>(remote: &Remote, repository: &'call Path, arguments: Vec<OsString>) -> Call<'call> {
-    Call { repository, arguments, protocol: remote.protocol, environment: Vec::new() }
+    Call { repository, arguments, protocol: remote.protocol, is_alone: false, environment: Vec::new() }
 }

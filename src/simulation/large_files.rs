@@ -56,11 +56,12 @@ pub fn settings(remote: &Remote) -> Vec<OsString> {
     let location = &remote.location;
     let url = match remote.protocol {
         "file" => format!("file://{location}"),
-        _ if location.ends_with(".git") => format!("{location}/info/lfs"),
-        _ => format!("{}.git/info/lfs", location.trim_end_matches('/')),
+        _ => format!("{}.git/info/lfs", location.trim_end_matches('/').trim_end_matches(".git")),
     };
     let settings = [
         format!("lfs.url={url}"),
+        // For a folder, git-lfs looks here.
+        format!("remote.origin.url={url}"),
         "filter.lfs.process=git-lfs filter-process".to_owned(),
         "filter.lfs.smudge=git-lfs smudge -- %f".to_owned(),
         "filter.lfs.clean=git-lfs clean -- %f".to_owned(),

@@ -158,11 +158,14 @@ fn mean(values: impl Iterator<Item = f64>) -> Option<Load> {
 }
 
 fn append(path: &Path, sample: &Sample, first: bool, put_aside: bool) -> std::io::Result<()> {
+    if let Some(folder) = path.parent() {
+        std::fs::create_dir_all(folder)?;
+    }
     if put_aside {
         std::fs::rename(path, path.with_extension("csv.1"))?;
     }
     let mut file = std::fs::File::options().create(true).append(!first).write(true).truncate(first).open(path)?;
-    if first {
+    if file.metadata()?.len() == 0 {
         writeln!(file, "{CSV_HEADER}")?;
     }
     let Sample { timestamp, running, idle, machine, gpu_compute, gpu_memory_traffic, gpu_memory, .. } = sample;
@@ -186,13 +189,20 @@ impl Actor for LoadMonitor {
             }
             Err(error) => log::error!("the machine can't be read: {error}"),
         }
-        let gpus = ctx.address().recipient();
-        // Opening the driver may take its time too.
-        drop(actix_rt::task::spawn_blocking(move || match GpuSensor::open() {
-            Ok(sensor) => read_each_period(gpus, move || GpusRead(sensor.read())),
-            Err(error) => log::info!("no NVIDIA GPU is read: {error}"),
-        }));
+        read_gpus(ctx.address().recipient());
         ctx.run_interval(PERIOD, Self::sample);
+    }
+}
+
+/// Opens the driver and reads the GPUs. Both may hang, which must not hold up even the end of the program: the thread
+/// is none of the runtime's.
+fn read_gpus(actor: Recipient<GpusRead>) {
+    let opening = std::thread::Builder::new().name("gpus".to_owned()).spawn(move || match GpuSensor::open() {
+        Ok(sensor) => read_each_period(actor, move || GpusRead(sensor.read())),
+        Err(error) => log::info!("no NVIDIA GPU is read: {error}"),
+    });
+    if let Err(error) = opening {
+        log::error!("no thread can be started to read the GPUs: {error}");
     }
 }
 

@@ -11,6 +11,7 @@ use std::time::Duration;
 
 use actix::dev::ToEnvelope;
 use actix::prelude::*;
+use tokio::sync::oneshot;
 
 use crate::shared::logging::{one_line, rotated};
 
@@ -67,17 +68,19 @@ impl Tail {
 /// How many older files are kept beside the newest.
 const OLD_FILES: usize = 1;
 
-/// Reads an output until its end: signs go to `signs`, other lines to the file at `log` and to the tail.
+/// Reads an output until its end: signs go to `signs`, other lines to the file at `log` and to the tail. The receiver
+/// that is given back with the tail hears when the end was reached.
 ///
 /// # Errors
 /// When the file or the thread can't be made.
-pub fn follow<A>(output: PipeReader, log: &Path, signs: Addr<A>) -> std::io::Result<Tail>
+pub fn follow<A>(output: PipeReader, log: &Path, signs: Addr<A>) -> std::io::Result<(Tail, oneshot::Receiver<()>)>
 where
     A: Actor<Context: ToEnvelope<A, Sign>> + Handler<Sign>,
 {
     let tail = Tail::default();
     let kept = tail.clone();
     let mut file = rotated(log, OLD_FILES)?;
+    let (end, ended) = oneshot::channel();
     std::thread::Builder::new().name("output".to_owned()).spawn(move || {
         let mut reader = BufReader::with_capacity(64 * 1024, output);
         while let Some(line) = next_line(&mut reader) {
@@ -89,8 +92,10 @@ where
                 kept.push(line);
             }
         }
+        // Nobody may wait for it.
+        end.send(()).ok();
     })?;
-    Ok(tail)
+    Ok((tail, ended))
 }
 
 /// Hands a sign over. An actor that can't keep up makes the simulator wait, not the mailbox grow.

@@ -7,12 +7,13 @@
 use std::collections::{BTreeMap, VecDeque};
 use std::net::{Ipv4Addr, TcpListener};
 use std::ops::RangeInclusive;
-use std::time::{Duration, SystemTime};
+use std::time::Duration;
 
 use actix::prelude::*;
 
 use super::census::{Change, Everybody, Simulation, Stage};
 use crate::shared::status::Instances;
+use crate::shared::timestamp::seconds_since_1970;
 
 /// Asks for a place.
 #[derive(Message)]
@@ -180,12 +181,16 @@ impl Handler<Ask> for Places {
         }
         let id = self.last;
         let shown = Simulation {
+            id,
             world: ask.world,
             stage: Stage::Queued,
-            since: SystemTime::UNIX_EPOCH.elapsed().map_or(0, |age| age.as_secs()),
+            since: seconds_since_1970(),
+            launched: None,
+            pid: None,
             port: None,
             version: None,
             log: None,
+            log_begin: 0,
         };
         self.present.insert(id, Present { lent: None, shown });
         self.line.push_back(Waiting { id, client: ask.client, told: None });

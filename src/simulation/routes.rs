@@ -1,25 +1,21 @@
 //! The simulation server's public paths: each reads the request, asks for what it needs, and maps the answer.
 
 use std::sync::Arc;
-use std::time::Duration;
 
 use actix_web::http::header;
 use actix_web::middleware::DefaultHeaders;
 use actix_web::{HttpRequest, HttpResponse, web};
 use actix_web_actors::ws::WsResponseBuilder;
-use askama::Template;
 
-use super::app::Server;
-use super::census::Everybody;
-use super::places::Census;
-use super::status::{self, Page, StatusPage};
+use super::asking::{everybody, locked, too_busy};
+use super::page_routes;
+use super::server::Server;
+use super::status::{self, StatusPage};
 use super::web_client::WebClient;
 use crate::shared::auth::is_authorised;
 use crate::shared::metrics::CONTENT_TYPE;
 use crate::shared::shutdown::Request;
 
-/// How long an actor may take to answer a page.
-const PATIENCE: Duration = Duration::from_secs(2);
 /// The largest message of a client, in bytes.
 const LARGEST_MESSAGE: usize = 8 * 1024;
 
@@ -35,7 +31,7 @@ pub fn configure(app: &mut web::ServiceConfig) {
             .wrap(cors)
             .route("/client", web::get().to(client))
             .route("/load", web::get().to(load))
-            .route("/monitor", web::get().to(monitor))
+            .configure(page_routes::configure)
             .route("/status", web::get().to(status_json))
             .route("/metrics", web::get().to(metrics))
             .route("/health", web::get().to(health))
@@ -49,11 +45,12 @@ async fn client(request: HttpRequest, stream: web::Payload, server: web::Data<Se
     if let Some(refusal) = refuse_origin(&request, &server) {
         return refusal;
     }
-    let Ok(permit) = Arc::clone(&server.connections).try_acquire_owned() else {
-        return HttpResponse::ServiceUnavailable().body("Error: too many connections.");
+    let peer = server.config.trusted_proxies.peer(&request);
+    let connection = match server.connections.admit(peer) {
+        Ok(connection) => connection,
+        Err(crowded) => return crowded.answer(),
     };
-    let peer = request.peer_addr().map(|address| address.ip());
-    let actor = WebClient::new(Arc::clone(&server), peer, permit);
+    let actor = WebClient::new(Arc::clone(&server), peer, connection);
     WsResponseBuilder::new(actor, &request, stream).frame_size(LARGEST_MESSAGE).start().unwrap_or_else(|error| {
         let problem = format!("Error: this is a WebSocket: {error}.");
         HttpResponse::build(error.as_response_error().status_code()).body(problem)
@@ -74,11 +71,6 @@ async fn load(server: web::Data<Server>) -> HttpResponse {
     HttpResponse::Ok().content_type("text/plain").body(server.load().to_string())
 }
 
-async fn everybody(server: &Server) -> Option<Everybody> {
-    let census = server.places.send(Census);
-    actix_rt::time::timeout(PATIENCE, census).await.ok().and_then(Result::ok)
-}
-
 async fn status_json(server: web::Data<Server>) -> HttpResponse {
     match everybody(&server).await {
         Some(everybody) => HttpResponse::Ok().json(StatusPage::new(&server, everybody)),
@@ -96,16 +88,6 @@ async fn metrics(server: web::Data<Server>) -> HttpResponse {
     }
 }
 
-async fn monitor(server: web::Data<Server>) -> HttpResponse {
-    let Some(everybody) = everybody(&server).await else {
-        return too_busy();
-    };
-    match Page::new(&server, everybody).render() {
-        Ok(page) => HttpResponse::Ok().content_type("text/html; charset=utf-8").body(page),
-        Err(error) => HttpResponse::InternalServerError().body(format!("Error: {error}.")),
-    }
-}
-
 async fn health() -> HttpResponse {
     HttpResponse::Ok().content_type("text/plain").body("ok")
 }
@@ -115,9 +97,7 @@ async fn drain(request: HttpRequest, server: web::Data<Server>) -> HttpResponse 
         return HttpResponse::Forbidden().body("Error: actions are off; adminPassword is not set.");
     };
     if !is_authorised(&request, password) {
-        return HttpResponse::Unauthorized()
-            .insert_header((header::WWW_AUTHENTICATE, "Basic realm=\"simulation server\""))
-            .body("Error: a password is needed.");
+        return locked();
     }
     match server.requests.try_send(Request::Drain) {
         Ok(()) => HttpResponse::Accepted().body("draining"),
@@ -127,8 +107,4 @@ async fn drain(request: HttpRequest, server: web::Data<Server>) -> HttpResponse 
 
 async fn nothing_here() -> HttpResponse {
     HttpResponse::NotFound().body("Error: there is nothing here. Try /monitor, /status, /load, /metrics or /health.")
-}
-
-fn too_busy() -> HttpResponse {
-    HttpResponse::ServiceUnavailable().body("Error: the server is too busy to tell.")
 }

@@ -53,6 +53,22 @@ pub fn load(machine: &Machine, gpus: &[Gpu]) -> Load {
     Load::try_from(least.unwrap_or_else(|| with(0.0, 0.0))).unwrap_or(Load::ZERO)
 }
 
+/// Which gauge makes the load, in words.
+#[must_use]
+pub fn busiest(machine: &Machine, gpus: &[Gpu]) -> &'static str {
+    let total = load(machine, gpus).percent();
+    let close = |value: f64| (value - total).abs() < 1e-9;
+    if close(machine.cpu) {
+        "the CPU"
+    } else if gpus.iter().any(|gpu| close(gpu.compute)) {
+        "the GPU"
+    } else if gpus.is_empty() {
+        "a third of memory and swap"
+    } else {
+        "a third of memory, swap and GPU memory"
+    }
+}
+
 /// What the machine is, which does not change.
 #[derive(Debug, Clone, Default, Serialize)]
 #[serde(rename_all = "camelCase")]

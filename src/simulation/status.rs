@@ -1,13 +1,11 @@
-//! What the simulation server tells of itself: `/status`, `/monitor` and `/metrics`.
+//! What the simulation server tells programs of itself: `/status` and `/metrics`.
 
-use std::path::Path;
-
-use askama::Template;
 use serde::Serialize;
 
-use super::app::Server;
 use super::census::{Everybody, Simulation};
 use super::sensors::{Gpu, Host, Machine};
+use super::server::Server;
+use super::webots_viewer;
 use crate::shared::metrics::Gauge;
 use crate::shared::status::Dispatch;
 
@@ -26,6 +24,9 @@ pub struct StatusPage {
     pub machine: Machine,
     /// What its GPUs are doing.
     pub gpus: Vec<Gpu>,
+    /// Where Webots' own viewer can be had from this server.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub viewer: Option<&'static str>,
     /// Each simulation.
     pub simulations: Vec<Simulation>,
 }
@@ -52,33 +53,9 @@ impl StatusPage {
             host: readings.host.clone(),
             machine: readings.machine,
             gpus: readings.gpus.clone(),
+            viewer: webots_viewer::folder(&server.config).map(|_| webots_viewer::PATH),
             simulations: everybody.simulations,
         }
-    }
-}
-
-/// The page `/monitor`.
-#[derive(Template)]
-#[template(path = "simulation_monitor.html")]
-pub struct Page<'server> {
-    title: &'server str,
-    description: &'server str,
-    status: StatusPage,
-}
-
-impl<'server> Page<'server> {
-    /// The state of the server at this moment.
-    #[must_use]
-    pub fn new(server: &'server Server, everybody: Everybody) -> Self {
-        Self {
-            title: server.config.title.as_deref().unwrap_or("Webots simulation server"),
-            description: server.config.description.as_deref().unwrap_or_default(),
-            status: StatusPage::new(server, everybody),
-        }
-    }
-
-    fn log(path: Option<&Path>) -> String {
-        path.map(|path| path.display().to_string()).unwrap_or_default()
     }
 }
 

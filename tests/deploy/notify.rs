@@ -51,7 +51,7 @@ async fn a_session_server_tells_when_it_is_ready_reloads_and_stops() {
     assert_eq!(http::try_get(&server.url("/health")).await.unwrap().status, 200, "at once");
     server.signal(Signal::SIGHUP);
     let reloading = manager.expect("RELOADING=1\nMONOTONIC_USEC=");
-    assert!(reloading.lines().nth(1).unwrap()["MONOTONIC_USEC=".len()..].parse::<u64>().unwrap() > 0);
+    assert!(reloading.lines().nth(1).unwrap().strip_prefix("MONOTONIC_USEC=").unwrap().parse::<u64>().unwrap() > 0);
     manager.expect("READY=1\n");
     server.signal(Signal::SIGTERM);
     manager.expect("STOPPING=1\n");

@@ -14,5 +14,15 @@
 #[path = "../support/mod.rs"]
 mod support;
 
+mod admission;
+mod checkout;
+mod git_wrapper;
 mod life;
+mod output;
+mod places;
+mod protocol;
+mod readings;
+mod ready;
 mod scene;
+mod soak;
+mod stopping;

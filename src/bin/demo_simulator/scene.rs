@@ -120,7 +120,7 @@ impl Author {
         self.writer.write_event(Event::Decl(BytesDecl::new("1.0", Some("UTF-8"), None)))?;
         self.start(BytesStart::new("X3D"))?;
         self.start(BytesStart::new("head"))?;
-        for (name, content) in [("generator", "Webots"), ("version", "R2025a")] {
+        for (name, content) in [("generator", "Webots"), ("version", "R2025a"), ("simulator", "demo")] {
             let tag = BytesStart::new("meta").with_attributes([("name", name), ("content", content)]);
             self.writer.write_event(Event::Empty(tag))?;
         }

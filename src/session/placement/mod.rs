@@ -4,7 +4,8 @@
 //! server that looked best a moment ago. The [`Fleet`] therefore counts each of its own placements as load at once, for as
 //! long as the reports cannot show it, at the cost per client that it has learned from that server's reports.
 //!
-//! - `fleet`: the servers, and the choice between them;
+//! - `fleet`: the servers, and the choice between them; `policy`: what its owner can set;
+//! - `order`: the servers by their effective load, so that a large fleet is as fast as a small one;
 //! - `server`: what is known of one server;
 //! - `cost`: how the cost of a client is learned.
 //!
@@ -13,7 +14,10 @@
 
 mod cost;
 mod fleet;
+mod order;
+mod policy;
 mod server;
 
-pub use fleet::{Fleet, Policy};
+pub use fleet::Fleet;
+pub use policy::Policy;
 pub use server::{Instances, Report};

@@ -1,7 +1,7 @@
 //! What is known of one simulation server: its last report, and what has been sent to it since.
 
 use super::cost::{Common, Cost, Estimate, FULL, believable};
-use super::fleet::Policy;
+use super::policy::Policy;
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 
@@ -130,7 +130,9 @@ impl Server {
         });
         let load = self.load_ahead(report.load, in_flight);
         // A client that costs much is turned away earlier, because it would take more than the machine has.
-        (has_place && load < policy.threshold.min(100.0 - self.cost)).then_some(load)
+        // A threshold that no load reaches says that the load is to close no server.
+        let limit = if policy.threshold > 100.0 { policy.threshold } else { policy.threshold.min(100.0 - self.cost) };
+        (has_place && load < limit).then_some(load)
     }
 
     /// The last report's load, in percent, if the server is up.

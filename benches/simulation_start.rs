@@ -1,0 +1,95 @@
+//! What a cached start costs over the git commands that it runs.
+//!
+//! `cargo bench --bench simulation_start [-- --starts N]`
+
+#![allow(
+    missing_docs,
+    unreachable_pub,
+    clippy::pedantic,
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::panic,
+    clippy::indexing_slicing,
+    reason = "a measurement that fails ends with a panic"
+)]
+
+#[path = "../tests/support/mod.rs"]
+mod support;
+
+use std::path::Path;
+use std::process::{Command, Stdio};
+use std::time::{Duration, Instant};
+
+use support::client::Client;
+use support::git::{Forge, world};
+use support::program::simulation_server;
+use support::webots::Webots;
+
+fn main() {
+    let arguments: Vec<String> = std::env::args().collect();
+    let starts =
+        arguments.iter().position(|one| one == "--starts").map_or(100, |at| arguments[at + 1].parse().unwrap());
+    actix_rt::System::new().block_on(measure(starts));
+}
+
+async fn measure(starts: usize) {
+    let forge = Forge::with_arm();
+    // Never launched: the program is not there.
+    let webots = Webots::script("exit 0");
+    let server = simulation_server(&webots.path(), forge.path(), 4).start().await;
+    let url = world("lab/arm", "main", "worlds/a.wbt");
+    let (mut ours, mut plain) = (Vec::new(), Vec::new());
+    checkout(&server, &url).await;
+    for _ in 0..starts {
+        ours.push(checkout(&server, &url).await);
+        plain.push(commands(&server.folder.join("cache/git"), &forge.path().join("lab/arm")));
+    }
+    let (ours, plain) = (median(ours), median(plain));
+    println!("cached start, from the wish to the end of the checkout: {ours:.1?} (median of {starts})");
+    println!("the same three git commands by themselves:              {plain:.1?}");
+    let over = ours.saturating_sub(plain);
+    println!("over them: {over:.1?}, {:.2} times", ours.as_secs_f64() / plain.as_secs_f64());
+    assert!(over < Duration::from_millis(10), "a cached start costs more than 10 ms over its git commands");
+}
+
+async fn checkout(server: &support::program::Server, url: &str) -> Duration {
+    let mut client = Client::connect(&server.websocket("/client")).await;
+    let begin = Instant::now();
+    client.send(&serde_json::json!({"start": {"url": url}}).to_string()).await;
+    client.until("loading: checkout done").await;
+    let time = begin.elapsed();
+    client.closed().await;
+    time
+}
+
+fn commands(cache: &Path, remote: &Path) -> Duration {
+    let entries = std::fs::read_dir(cache).unwrap().flatten().map(|entry| entry.path());
+    let repository = entries.into_iter().find(|path| path.is_dir()).unwrap();
+    let fleet = std::fs::read_dir(repository.join("refs/fleet")).unwrap().flatten().next().unwrap();
+    let reference = format!("refs/fleet/{}", fleet.file_name().to_str().unwrap());
+    let folder = tempfile::tempdir().unwrap();
+    let run = |arguments: &[&str]| {
+        let status = Command::new("git")
+            .arg("--git-dir")
+            .arg(&repository)
+            .args(arguments)
+            .env("GIT_INDEX_FILE", folder.path().join("index"))
+            .env("GIT_CONFIG_GLOBAL", "/dev/null")
+            .stdout(Stdio::null())
+            .stderr(Stdio::null())
+            .status();
+        assert!(status.unwrap().success(), "{arguments:?}");
+    };
+    std::fs::create_dir(folder.path().join("project")).unwrap();
+    let tree = format!("--work-tree={}", folder.path().join("project").display());
+    let begin = Instant::now();
+    run(&["ls-remote", "--quiet", "--", remote.to_str().unwrap(), "refs/heads/main", "refs/tags/main"]);
+    run(&["ls-tree", "-r", "-l", "-z", "--full-tree", &reference]);
+    run(&[&tree, "checkout", "--force", "--progress", &reference, "--", "."]);
+    begin.elapsed()
+}
+
+fn median(mut times: Vec<Duration>) -> Duration {
+    times.sort();
+    times[times.len() / 2]
+}

@@ -1,0 +1,39 @@
+//! What a client asks the registry for, and how it is told that there is none.
+
+use actix::prelude::*;
+
+use crate::shared::address::PublicAddress;
+use crate::shared::project_url::{NoProject, ProjectUrl};
+
+/// Asks for a simulation server: the least loaded that will run this world.
+#[derive(Message, Debug)]
+#[rtype(result = "Result<PublicAddress, NoServer>")]
+pub struct Pick {
+    /// The world, where one is named.
+    pub world: Option<ProjectUrl>,
+}
+
+/// No simulation server is given. The words are those of the protocol.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum NoServer {
+    /// None has room.
+    #[error("Error: no simulation server available at the moment.")]
+    Unavailable,
+    /// None runs worlds of this repository.
+    #[error("Error: no simulation server accepts {0}.")]
+    NotAccepted(String),
+    /// The world's URL is none.
+    #[error("Error: {0}")]
+    NoWorld(NoProject),
+}
+
+impl Pick {
+    /// Reads what a client wants: nothing in particular, or a world.
+    ///
+    /// # Errors
+    /// When the URL is none.
+    pub fn parse(world: Option<&str>) -> Result<Self, NoServer> {
+        let world = world.filter(|text| !text.is_empty()).map(ProjectUrl::parse).transpose();
+        world.map(|world| Self { world }).map_err(NoServer::NoWorld)
+    }
+}

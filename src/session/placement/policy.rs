@@ -1,0 +1,23 @@
+//! What can be set about placement.
+
+use std::time::Duration;
+
+/// What the owner of a fleet can set.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Policy {
+    /// A server takes clients while its effective load is under this, in percent. Default: 95.
+    pub threshold: f64,
+    /// What a client is expected to cost until a server's reports teach better, in percent. Default: 2.
+    pub initial_cost: f64,
+    /// How long a placement counts whose client does not come. Default: 15 seconds.
+    pub patience: Duration,
+    /// How long it takes until a client that came shows fully in the reported load, which is a mean of five seconds, and a
+    /// simulation needs a while to start. Default: 8 seconds.
+    pub settling: Duration,
+}
+
+impl Default for Policy {
+    fn default() -> Self {
+        Self { threshold: 95.0, initial_cost: 2.0, patience: Duration::from_secs(15), settling: Duration::from_secs(8) }
+    }
+}

@@ -1,0 +1,198 @@
+//! What the registry knows of one simulation server, and what a change of it means. Part of the registry.
+
+use std::time::{Duration, Instant, SystemTime};
+
+use super::fleet_status::State;
+use super::notices::Event;
+use super::placement;
+use super::server_monitor::Unreachable;
+use crate::shared::load::Load;
+use crate::shared::status::Dispatch;
+
+/// One simulation server.
+#[derive(Debug)]
+pub struct Watched {
+    /// Whether the configuration has it drained.
+    pub drained: bool,
+    /// Its state.
+    pub state: State,
+    /// Since when.
+    pub since: SystemTime,
+    /// What it said last; kept when it is down.
+    pub report: Option<Dispatch>,
+    /// Why it gave no usable answer, if it did not.
+    pub error: Option<Unreachable>,
+    /// How long it took to answer.
+    pub latency: Option<Duration>,
+    /// When it last gave a good answer.
+    pub answered: Option<Instant>,
+    /// Whether the administrator was told that it is full, and not yet that it has room again.
+    full_told: bool,
+}
+
+/// A server has changed its state.
+#[derive(Debug, PartialEq)]
+pub struct Change {
+    /// Its new state.
+    pub state: State,
+    /// When.
+    pub at: SystemTime,
+    /// Why, in words.
+    pub why: String,
+    /// What the administrator is told of it.
+    pub events: Vec<Event>,
+}
+
+impl Watched {
+    /// A server that was not heard of yet.
+    #[must_use]
+    pub fn new(drained: bool) -> Self {
+        Self {
+            drained,
+            state: State::Unknown,
+            since: SystemTime::now(),
+            report: None,
+            error: None,
+            latency: None,
+            answered: None,
+            full_told: false,
+        }
+    }
+
+    /// Takes in a good answer that came at this time.
+    pub fn said(&mut self, report: Dispatch, at: Instant, threshold: f64) -> Option<Change> {
+        let (state, why) = self.judge(&report, threshold);
+        self.report = Some(report);
+        self.error = None;
+        self.answered = Some(at);
+        self.enter(state, why)
+    }
+
+    /// Takes in that there is no good answer.
+    pub fn failed(&mut self, error: Unreachable) -> Option<Change> {
+        let why = error.to_string();
+        self.error = Some(error);
+        self.enter(State::Down, || why)
+    }
+
+    /// The last report, if it still holds.
+    #[must_use]
+    pub fn current(&self) -> Option<&Dispatch> {
+        self.report.as_ref().filter(|_| self.state != State::Down)
+    }
+
+    /// The last report in the terms of the placement policy; nothing for a server that must not get clients and has
+    /// no other way to say so.
+    #[must_use]
+    pub fn for_placement(&self) -> Option<placement::Report> {
+        let report = self.current()?;
+        let accepting = self.state != State::Draining;
+        let instances = report.instances.map(|instances| placement::Instances {
+            present: instances.present(),
+            places: instances.places,
+            arrivals: instances.arrivals,
+            accepting,
+        });
+        (accepting || instances.is_some()).then(|| placement::Report { load: report.load.percent(), instances })
+    }
+
+    /// The load for a notice.
+    #[must_use]
+    pub fn load(&self) -> Option<Load> {
+        self.current().map(|report| report.load)
+    }
+
+    fn judge(&self, report: &Dispatch, threshold: f64) -> (State, impl FnOnce() -> String + use<>) {
+        let load = report.load.percent();
+        let no_place = report.instances.filter(|instances| instances.present() >= instances.places);
+        let state = if self.drained || report.draining {
+            State::Draining
+        } else if load >= threshold || no_place.is_some() {
+            State::Full
+        } else {
+            State::Up
+        };
+        let reason = match (state, no_place) {
+            (State::Draining, _) if self.drained => " (drained by drainedServers)".to_owned(),
+            (State::Draining, _) => " (it drains itself)".to_owned(),
+            (State::Full, Some(full)) => format!(", {} clients in {} places", full.present(), full.places),
+            _ => String::new(),
+        };
+        (state, move || format!("load {load:.1} %{reason}"))
+    }
+
+    fn enter(&mut self, state: State, why: impl FnOnce() -> String) -> Option<Change> {
+        let before = std::mem::replace(&mut self.state, state);
+        if before == state {
+            return None;
+        }
+        self.since = SystemTime::now();
+        Some(Change { state, at: self.since, why: why(), events: self.events(before) })
+    }
+
+    /// The four events of the original. A server that was full, then down, then up is told of as working again and as
+    /// available again.
+    fn events(&mut self, before: State) -> Vec<Event> {
+        let mut events = Vec::new();
+        match (before, self.state) {
+            (_, State::Down) => events.push(Event::NotResponding),
+            (State::Down, _) => events.push(Event::WorkingAgain),
+            _ => {}
+        }
+        if self.state == State::Full && !std::mem::replace(&mut self.full_told, true) {
+            events.push(Event::MaximumLoad);
+        } else if self.state == State::Up && std::mem::replace(&mut self.full_told, false) {
+            events.push(Event::AvailableAgain);
+        }
+        events
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn report(load: f64) -> Dispatch {
+        Dispatch::load_only(Load::try_from(load).unwrap())
+    }
+
+    /// The events of each step: a load, or nothing for a failure.
+    fn events(steps: &[Option<f64>]) -> Vec<Vec<Event>> {
+        let mut watched = Watched::new(false);
+        let change = |step: &Option<f64>| match step {
+            Some(load) => watched.said(report(*load), Instant::now(), 95.0),
+            None => watched.failed(Unreachable::Refused(String::new())),
+        };
+        steps.iter().map(change).map(|change| change.map(|change| change.events).unwrap_or_default()).collect()
+    }
+
+    #[test]
+    fn the_administrator_hears_of_four_events() {
+        use Event::{AvailableAgain, MaximumLoad, NotResponding, WorkingAgain};
+        assert_eq!(events(&[Some(1.0), Some(2.0)]), [vec![], vec![]], "a server that is well is no news");
+        assert_eq!(events(&[None, None, Some(1.0)]), [vec![NotResponding], vec![], vec![WorkingAgain]]);
+        assert_eq!(events(&[Some(95.0), Some(99.0), Some(94.9)]), [vec![MaximumLoad], vec![], vec![AvailableAgain]]);
+        assert_eq!(events(&[None, Some(96.0)]), [vec![NotResponding], vec![WorkingAgain, MaximumLoad]]);
+        assert_eq!(
+            events(&[Some(96.0), None, Some(96.0), None, Some(1.0)]),
+            [
+                vec![MaximumLoad],
+                vec![NotResponding],
+                vec![WorkingAgain],
+                vec![NotResponding],
+                vec![WorkingAgain, AvailableAgain]
+            ]
+        );
+    }
+
+    #[test]
+    fn a_drained_server_is_for_nobody_whether_it_counts_or_not() {
+        let mut watched = Watched::new(true);
+        let change = watched.said(report(1.0), Instant::now(), 95.0).unwrap();
+        assert_eq!((change.state, change.why.as_str()), (State::Draining, "load 1.0 % (drained by drainedServers)"));
+        assert_eq!(watched.for_placement(), None);
+        watched.drained = false;
+        watched.said(report(1.0), Instant::now(), 95.0);
+        assert!(watched.for_placement().is_some());
+    }
+}

@@ -1,0 +1,33 @@
+//! Asking who is here on behalf of a request, and answers that several paths give.
+
+use std::time::Duration;
+
+use actix_web::HttpResponse;
+use actix_web::http::header;
+
+use super::census::Everybody;
+use super::places::Census;
+use super::server::Server;
+
+/// How long an actor may take to answer a page.
+const PATIENCE: Duration = Duration::from_secs(2);
+
+/// Who is here; nothing when the actor that knows is too busy to answer.
+pub async fn everybody(server: &Server) -> Option<Everybody> {
+    let census = server.places.send(Census);
+    actix_rt::time::timeout(PATIENCE, census).await.ok().and_then(Result::ok)
+}
+
+/// The answer when nobody tells.
+#[must_use]
+pub fn too_busy() -> HttpResponse {
+    HttpResponse::ServiceUnavailable().body("Error: the server is too busy to tell.")
+}
+
+/// The answer to a request without the administrator's password.
+#[must_use]
+pub fn locked() -> HttpResponse {
+    HttpResponse::Unauthorized()
+        .insert_header((header::WWW_AUTHENTICATE, "Basic realm=\"simulation server\""))
+        .body("Error: a password is needed.")
+}

@@ -1,0 +1,123 @@
+//! What each simulation takes of the machine: CPU and memory of its process tree. Linux: `/proc`.
+//!
+//! One pass over all processes serves all simulations, at most once in [`AGE`], and only when somebody looks.
+
+use std::collections::{BTreeMap, HashMap};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::{Duration, Instant};
+
+use procfs::process::{Stat, all_processes};
+
+/// What a process tree takes.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct Usage {
+    /// Percent of one core, the mean since the reading before; nothing at the first.
+    pub cpu: Option<f64>,
+    /// Resident memory, in bytes; what processes share counts for each.
+    pub memory: u64,
+}
+
+/// Readings of process trees, by the process that each descends from.
+pub type Usages = BTreeMap<i32, Usage>;
+
+/// Reads process trees for whoever looks.
+#[derive(Debug, Clone, Default)]
+pub struct UsageMonitor(Arc<Mutex<Readings>>);
+
+#[derive(Debug, Default)]
+struct Readings {
+    read: Option<Instant>,
+    ticks: HashMap<i32, u64>,
+    usages: Usages,
+}
+
+/// A reading that is younger is not made anew.
+const AGE: Duration = Duration::from_millis(1800);
+
+impl UsageMonitor {
+    /// The usage of each of these trees, never much older than two seconds.
+    pub async fn read(&self, roots: Vec<i32>) -> Usages {
+        if roots.is_empty() {
+            return Usages::new();
+        }
+        let readings = Arc::clone(&self.0);
+        let read = actix_rt::task::spawn_blocking(move || {
+            let mut readings = readings.lock().unwrap_or_else(PoisonError::into_inner);
+            readings.renew(&roots);
+            readings.usages.clone()
+        });
+        read.await.unwrap_or_default()
+    }
+}
+
+impl Readings {
+    fn renew(&mut self, roots: &[i32]) {
+        let passed = self.read.map(|read| read.elapsed());
+        let known = roots.iter().all(|root| self.usages.contains_key(root));
+        if known && passed.is_some_and(|passed| passed < AGE) {
+            return;
+        }
+        self.read = Some(Instant::now());
+        let processes = processes();
+        let before = std::mem::take(&mut self.ticks);
+        self.usages.clear();
+        for root in roots {
+            let (ticks, pages) = tree_sum(*root, &processes);
+            let gone = before.get(root).zip(passed).filter(|(_, passed)| !passed.is_zero());
+            let cpu = gone.map(|(before, passed)| cpu_percent(ticks.saturating_sub(*before), passed));
+            self.ticks.insert(*root, ticks);
+            self.usages.insert(*root, Usage { cpu, memory: pages * procfs::page_size() });
+        }
+    }
+}
+
+/// All processes by their parents.
+fn processes() -> HashMap<i32, Vec<Stat>> {
+    let mut by_parent: HashMap<i32, Vec<Stat>> = HashMap::new();
+    let all = all_processes().into_iter().flatten().flatten();
+    for stat in all.filter_map(|process| process.stat().ok()) {
+        by_parent.entry(stat.ppid).or_default().push(stat);
+    }
+    by_parent
+}
+
+/// CPU ticks and pages of memory of all that descends from a process.
+fn tree_sum(root: i32, by_parent: &HashMap<i32, Vec<Stat>>) -> (u64, u64) {
+    let (mut ticks, mut pages) = (0, 0);
+    let mut open = vec![root];
+    while let Some(pid) = open.pop() {
+        for child in by_parent.get(&pid).into_iter().flatten() {
+            ticks += child.utime + child.stime;
+            pages += child.rss;
+            open.push(child.pid);
+        }
+    }
+    (ticks, pages)
+}
+
+#[expect(clippy::cast_precision_loss, reason = "a percentage needs no more digits than f64 has")]
+fn cpu_percent(ticks: u64, passed: Duration) -> f64 {
+    100.0 * ticks as f64 / procfs::ticks_per_second() as f64 / passed.as_secs_f64()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[actix_rt::test]
+    async fn a_busy_child_is_seen() {
+        let mut child = std::process::Command::new("sh").args(["-c", "while :; do :; done"]).spawn().unwrap();
+        let me = i32::try_from(std::process::id()).unwrap();
+        let monitor = UsageMonitor::default();
+        let first = monitor.read(vec![me]).await;
+        assert_eq!(first[&me].cpu, None, "nothing to compare with");
+        assert!(first[&me].memory > 10_000);
+        let deadline = Instant::now() + Duration::from_secs(20);
+        while monitor.read(vec![me]).await[&me].cpu.is_none_or(|cpu| cpu < 5.0) {
+            assert!(Instant::now() < deadline, "it takes nothing");
+            actix_rt::time::sleep(Duration::from_millis(100)).await;
+        }
+        child.kill().unwrap();
+        child.wait().unwrap();
+    }
+}

@@ -1,0 +1,185 @@
+// One line chart as SVG: axes with units, a legend of switches, and the values under the pointer.
+
+import { timeOfDay } from './times.js';
+
+const SPAN = 600;
+const BOX = { left: 46, right: 10, top: 10, bottom: 24, height: 220 };
+const TICKS = [600, 480, 360, 240, 120, 0];
+
+function svg(name, attributes = {}, text = '') {
+  const element = document.createElementNS('http://www.w3.org/2000/svg', name);
+  for (const [key, value] of Object.entries(attributes))
+    element.setAttribute(key, value);
+  element.textContent = text;
+  return element;
+}
+
+function html(name, properties, ...children) {
+  const element = Object.assign(document.createElement(name), properties);
+  element.append(...children);
+  return element;
+}
+
+/** The least round number that is not below another: 1, 2 or 5 times a power of ten. */
+function roundUp(number) {
+  const power = 10 ** Math.floor(Math.log10(number));
+  return power * [1, 2, 5, 10].find((factor) => factor * power >= number * 0.9999);
+}
+
+export class Chart {
+  #group;
+  #hidden;
+  #root = svg('svg', { tabindex: 0, role: 'img', preserveAspectRatio: 'none' });
+  #axes = svg('g', { class: 'axes' });
+  #lines = svg('g', { class: 'lines' });
+  #cross = svg('line', { class: 'cross', visibility: 'hidden' });
+  #values = [];
+  #moment;
+  #samples = [];
+  /** The time that is pointed at; the newest where nothing is. */
+  #pointed;
+
+  constructor(root, group, hidden, switched, pointed) {
+    this.#group = group;
+    this.#hidden = hidden;
+    const legend = html('ul', { className: 'legend' });
+    group.series.forEach(([name], index) => {
+      const value = html('b', { textContent: '–' });
+      const box = html('input', { type: 'checkbox', checked: !hidden.has(name) });
+      const swatch = svg('svg', { class: `swatch s${index}`, viewBox: '0 0 20 8', 'aria-hidden': 'true' });
+      swatch.append(svg('line', { x1: 0, x2: 20, y1: 4, y2: 4 }));
+      box.addEventListener('change', () => {
+        hidden[box.checked ? 'delete' : 'add'](name);
+        switched();
+      });
+      legend.append(html('li', {}, html('label', {}, box, swatch, html('span', { textContent: name }), value)));
+      this.#values.push(value);
+      this.#lines.append(svg('polyline', { class: `s${index}` }));
+    });
+    this.#moment = html('p', { className: 'moment', textContent: 'now' });
+    this.#root.append(this.#axes, this.#lines, this.#cross);
+    const unit = group.unit ? ` (${group.unit})` : '';
+    const title = html('h3', {}, group.title, html('span', { textContent: unit }));
+    this.#root.setAttribute('aria-label', `${group.title}${unit} over the last ten minutes; the arrow keys read values`);
+    const head = html('figcaption', {}, title, this.#moment);
+    root.append(html('figure', {}, head, html('div', { className: 'plot' }, this.#root), legend));
+    this.#root.addEventListener('pointermove', (event) => pointed(this.#timeAt(event)));
+    this.#root.addEventListener('pointerleave', () => pointed());
+    this.#root.addEventListener('blur', () => pointed());
+    this.#root.addEventListener('keydown', (event) => this.#key(event, pointed));
+    new ResizeObserver(() => this.draw(this.#samples)).observe(this.#root);
+  }
+
+  get #width() {
+    return Math.max(160, this.#root.clientWidth);
+  }
+
+  get #end() {
+    return this.#samples.at(-1)?.[0] ?? Date.now() / 1000;
+  }
+
+  #x(time) {
+    const { left, right } = BOX;
+    return left + (this.#width - left - right) * (1 - (this.#end - time) / SPAN);
+  }
+
+  #timeAt(event) {
+    const { left, right } = BOX;
+    const part = (event.clientX - this.#root.getBoundingClientRect().left - left) / (this.#width - left - right);
+    return this.#end - SPAN * (1 - part);
+  }
+
+  #key(event, pointed) {
+    const steps = { ArrowLeft: -5, ArrowRight: 5, Home: -SPAN, End: SPAN };
+    if (!steps[event.key])
+      return;
+    event.preventDefault();
+    const first = this.#samples[0]?.[0] ?? 0;
+    pointed(Math.max(first, Math.min(this.#end, (this.#pointed ?? this.#end) + steps[event.key])));
+  }
+
+  #top() {
+    const { most, least = 1, whole, series } = this.#group;
+    if (most)
+      return most;
+    const shown = series.filter(([name]) => !this.#hidden.has(name));
+    const highest = Math.max(least, ...this.#samples.flatMap((sample) => shown.map(([, column]) => sample[column])));
+    return whole ? 4 * Math.ceil(highest / 4) : roundUp(highest);
+  }
+
+  /** Draws samples: a time and then the columns. */
+  draw(samples) {
+    this.#samples = samples;
+    const { height, left, right, top, bottom } = BOX;
+    const [width, most] = [this.#width, this.#top()];
+    const y = (value) => top + (height - top - bottom) * (1 - Math.min(value, most) / most);
+    this.#root.setAttribute('viewBox', `0 0 ${width} ${height}`);
+    this.#drawAxes(width, most, y);
+    this.#group.series.forEach(([name, column], index) => {
+      const line = this.#lines.children[index];
+      const points = this.#hidden.has(name) ? [] : samples.map((sample) => `${this.#x(sample[0]).toFixed(1)},${y(sample[column]).toFixed(1)}`);
+      line.setAttribute('points', points.join(' '));
+    });
+    this.#cross.setAttribute('y1', top);
+    this.#cross.setAttribute('y2', height - bottom);
+    this.#area = [left, width - right];
+    this.point(this.#pointed);
+  }
+
+  #area = [0, 0];
+
+  #drawAxes(width, most, y) {
+    const { left, right, height, bottom } = BOX;
+    const parts = [];
+    for (let step = 0; step <= 4; ++step) {
+      const value = most * step / 4;
+      parts.push(svg('line', { class: step === 0 ? 'base' : 'grid', x1: left, x2: width - right, y1: y(value), y2: y(value) }));
+      parts.push(svg('text', { x: left - 6, y: y(value) + 4, 'text-anchor': 'end' }, this.#written(value)));
+    }
+    const ticks = width < 420 ? TICKS.filter((_, index) => index !== 1 && index !== 3 && index !== 4) : TICKS;
+    for (const ago of ticks) {
+      const x = this.#x(this.#end - ago);
+      const anchor = ago === 0 ? 'end' : ago === SPAN ? 'start' : 'middle';
+      parts.push(svg('line', { class: 'tick', x1: x, x2: x, y1: height - bottom, y2: height - bottom + 4 }));
+      parts.push(svg('text', { x, y: height - 6, 'text-anchor': anchor }, ago === 0 ? 'now' : `−${ago / 60} min`));
+    }
+    this.#axes.replaceChildren(...parts);
+  }
+
+  /** A number on the axis, with the unit where it fits. */
+  #written(value) {
+    const { unit, most } = this.#group;
+    const digits = value === 0 || value >= 10 || Number.isInteger(value) ? 0 : value >= 1 ? 1 : value >= 0.01 ? 2 : 4;
+    const text = value.toFixed(digits).replace(/(\.\d*?)0+$/, '$1').replace(/\.$/, '');
+    return most && unit === '%' ? `${text} %` : text;
+  }
+
+  /** Shows the values of a time, or the newest. */
+  point(time) {
+    const found = time === undefined ? undefined : this.#nearest(time);
+    const sample = found ?? this.#samples.at(-1);
+    this.#pointed = found?.[0];
+    this.#moment.textContent = found ? `at ${timeOfDay(found[0])}` : 'now';
+    this.#cross.setAttribute('visibility', found ? 'visible' : 'hidden');
+    if (!sample)
+      return;
+    const x = this.#x(sample[0]);
+    this.#cross.setAttribute('x1', x);
+    this.#cross.setAttribute('x2', x);
+    const { unit, whole, series } = this.#group;
+    series.forEach(([, column], index) => {
+      const value = sample[column];
+      const text = whole ? String(value) : unit === '%' ? value.toFixed(1) : value.toFixed(value < 1 ? 3 : 2);
+      this.#values[index].textContent = `${text} ${unit}`.trim();
+    });
+  }
+
+  #nearest(time) {
+    let best;
+    for (const sample of this.#samples) {
+      if (!best || Math.abs(sample[0] - time) < Math.abs(best[0] - time))
+        best = sample;
+    }
+    return best;
+  }
+}

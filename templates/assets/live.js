@@ -1,0 +1,166 @@
+// Keeps a monitor page true: takes the server's events and puts what has changed into the page.
+// An event names parts (the contents of elements) and tables (rows by their keys); all of it is HTML that the server
+// has made from the same templates as the page, so that nothing is written twice.
+
+import { showTimes } from './times.js';
+
+const listeners = [];
+const lamp = document.getElementById('live');
+const cells = new WeakMap();
+let source;
+
+/** Calls a function with the numbers of each event that has some; `fresh` tells that events may have been missed. */
+export function onSample(listener) {
+  listeners.push(listener);
+}
+
+function say(text, lost) {
+  lamp.textContent = text;
+  lamp.classList.toggle('lost', lost);
+}
+
+/** The rows of HTML cells; a template understands them outside of a table. */
+function parsed(html) {
+  const template = document.createElement('template');
+  template.innerHTML = `<table><tbody><tr>${html}</tr></tbody></table>`;
+  return template.content.querySelector('tr');
+}
+
+/** Replaces only those cells that differ, so that a focused link stays focused and an opened list open. */
+function fill(row, html) {
+  const fresh = [...parsed(html).children];
+  const texts = fresh.map((cell) => cell.outerHTML);
+  const known = cells.get(row);
+  cells.set(row, texts);
+  fresh.forEach((cell, index) => {
+    if (known && known[index] === texts[index])
+      return;
+    const old = row.children[index];
+    showTimes(cell);
+    if (old)
+      old.replaceWith(cell);
+    else
+      row.append(cell);
+  });
+}
+
+function changeTable(body, { order, rows }) {
+  const present = new Map([...body.rows].map((row) => [row.dataset.key, row]));
+  for (const [key, html] of Object.entries(rows)) {
+    if (!present.has(key)) {
+      const row = document.createElement('tr');
+      row.setAttribute('role', 'row');
+      row.dataset.key = key;
+      present.set(key, row);
+    }
+    fill(present.get(key), html);
+  }
+  if (order) {
+    const listed = new Set(order);
+    for (const [key, row] of present) {
+      if (!listed.has(key))
+        row.remove();
+    }
+    order.forEach((key, place) => { present.get(key).dataset.place = place; });
+    for (const key of order) {
+      if (!present.get(key).isConnected)
+        body.append(present.get(key));
+    }
+  }
+  sort(body);
+}
+
+function cellValue(row, column, kind) {
+  const value = row.children[column]?.dataset.value ?? '';
+  return kind === 'number' ? Number(value) : value;
+}
+
+/** Sorts the rows as the headline says; rows are moved only where they are not in place already. */
+function sort(body) {
+  const heads = [...body.closest('table').tHead.rows[0].cells];
+  const column = heads.findIndex((head) => head.hasAttribute('aria-sort'));
+  const rows = [...body.rows];
+  const wanted = [...rows].sort((one, other) => Number(one.dataset.place) - Number(other.dataset.place));
+  if (column >= 0) {
+    const kind = heads[column].dataset.sort;
+    const sign = heads[column].getAttribute('aria-sort') === 'descending' ? -1 : 1;
+    wanted.sort((one, other) => {
+      const [a, b] = [cellValue(one, column, kind), cellValue(other, column, kind)];
+      const order = kind === 'number' ? a - b : a.localeCompare(b, undefined, { numeric: true });
+      return sign * order;
+    });
+  }
+  wanted.forEach((row, place) => {
+    if (body.rows[place] !== row)
+      body.insertBefore(row, body.rows[place] ?? null);
+  });
+}
+
+function makeSortable(table) {
+  [...table.tBodies[0].rows].forEach((row, place) => {
+    row.dataset.place = place;
+    cells.set(row, [...row.children].map((cell) => cell.outerHTML));
+  });
+  for (const head of table.tHead.rows[0].cells) {
+    if (!head.dataset.sort)
+      continue;
+    const button = document.createElement('button');
+    button.type = 'button';
+    button.textContent = head.textContent;
+    button.addEventListener('click', () => {
+      const turn = head.getAttribute('aria-sort') === 'ascending' ? 'descending' : 'ascending';
+      for (const other of table.tHead.rows[0].cells)
+        other.removeAttribute('aria-sort');
+      head.setAttribute('aria-sort', turn);
+      sort(table.tBodies[0]);
+    });
+    head.replaceChildren(button);
+  }
+}
+
+function take(event) {
+  const { version, parts = {}, tables = {}, sample } = JSON.parse(event.data);
+  if (version && version !== document.documentElement.dataset.version) {
+    location.reload();
+    return;
+  }
+  for (const [id, html] of Object.entries(parts)) {
+    const part = document.getElementById(id);
+    part.innerHTML = html;
+    showTimes(part);
+  }
+  for (const [id, change] of Object.entries(tables))
+    changeTable(document.getElementById(id), change);
+  if (sample)
+    listeners.forEach((listener) => listener(sample.map(Number), Boolean(version)));
+}
+
+/** A tab that nobody sees doesn't listen: browsers allow few connections to one server. */
+function listen() {
+  if (document.hidden || source)
+    return;
+  source = new EventSource('events');
+  source.addEventListener('open', () => say('Live', false));
+  source.addEventListener('message', take);
+  source.addEventListener('error', () => {
+    const since = new Date().toLocaleTimeString();
+    if (!lamp.classList.contains('lost'))
+      say(`No connection since ${since}: what you see is old. Trying again …`, true);
+    if (source?.readyState === EventSource.CLOSED) {
+      rest();
+      setTimeout(listen, 3000);
+    }
+  });
+}
+
+function rest() {
+  source?.close();
+  source = undefined;
+}
+
+document.querySelectorAll('table:has(th[data-sort])').forEach(makeSortable);
+showTimes(document);
+document.addEventListener('visibilitychange', () => (document.hidden ? rest() : listen()));
+addEventListener('pagehide', rest);
+addEventListener('pageshow', listen);
+listen();

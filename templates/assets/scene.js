@@ -1,0 +1,102 @@
+// A scene as a simulator tells it: the nodes of its model, and where they are now.
+
+import { identity, pose, times } from './matrix.js';
+import { shape } from './shapes.js';
+
+const PLACED = new Set(['Pose', 'Transform', 'Solid', 'Robot']);
+const numbers = (text, standard) => (text ? text.trim().split(/[\s,]+/).map(Number) : standard);
+
+export class Scene {
+  /** What is drawn: {mesh, colour, glow, opacity, matrix}. */
+  shapes = [];
+  title = '';
+  sky = [0.6, 0.75, 0.9];
+  light = { direction: [0.4, 0.3, -1], colour: [1, 1, 1] };
+  viewpoint = { position: [-5, 0, 3], orientation: [0, 1, 0, 0.5], angle: Math.PI / 4 };
+  #nodes = new Map();
+  #root = { children: [], shapes: [] };
+
+  /** Reads a model; an exception tells that it is none. */
+  constructor(xml) {
+    const document = new DOMParser().parseFromString(xml, 'text/xml');
+    const scene = document.querySelector('Scene');
+    if (!scene || document.querySelector('parsererror'))
+      throw new Error('the simulator has sent a scene that can’t be read');
+    this.#settings(scene);
+    for (const element of scene.children)
+      this.#read(element, this.#root);
+    this.place();
+  }
+
+  #settings(scene) {
+    this.title = scene.querySelector('WorldInfo')?.getAttribute('title') ?? '';
+    this.sky = numbers(scene.querySelector('Background')?.getAttribute('skyColor'), this.sky).slice(0, 3);
+    const light = scene.querySelector('DirectionalLight');
+    this.light.direction = numbers(light?.getAttribute('direction'), this.light.direction);
+    this.light.colour = numbers(light?.getAttribute('color'), this.light.colour);
+    const view = scene.querySelector('Viewpoint');
+    this.viewpoint.position = numbers(view?.getAttribute('position'), this.viewpoint.position);
+    this.viewpoint.orientation = numbers(view?.getAttribute('orientation'), this.viewpoint.orientation);
+    this.viewpoint.angle = Number(view?.getAttribute('fieldOfView') ?? this.viewpoint.angle);
+  }
+
+  #read(element, parent) {
+    if (element.getAttribute('role') === 'boundingObject')
+      return;
+    if (element.tagName === 'Shape') {
+      this.#readShape(element, parent);
+      return;
+    }
+    let node = parent;
+    if (PLACED.has(element.tagName)) {
+      node = {
+        translation: numbers(element.getAttribute('translation'), [0, 0, 0]),
+        rotation: numbers(element.getAttribute('rotation'), [0, 0, 1, 0]),
+        scale: numbers(element.getAttribute('scale'), [1, 1, 1]),
+        children: [],
+        shapes: [],
+      };
+      this.#nodes.set(Number(element.id.slice(1)), node);
+      parent.children.push(node);
+    }
+    for (const child of element.children)
+      this.#read(child, node);
+  }
+
+  #readShape(element, node) {
+    const mesh = [...element.children].map(shape).find((found) => found);
+    if (!mesh)
+      return;
+    const look = element.querySelector('PBRAppearance, Material');
+    const colour = look?.getAttribute('baseColor') ?? look?.getAttribute('diffuseColor');
+    const drawn = {
+      mesh,
+      colour: numbers(colour, look ? [1, 1, 1] : [0.8, 0.8, 0.8]),
+      glow: numbers(look?.getAttribute('emissiveColor'), [0, 0, 0]),
+      opacity: 1 - Number(look?.getAttribute('transparency') ?? 0),
+      matrix: identity(),
+    };
+    node.shapes.push(drawn);
+    this.shapes.push(drawn);
+  }
+
+  /** Takes an update: poses of nodes by their numbers. */
+  update({ updates = [] }) {
+    for (const { id, translation, rotation } of updates) {
+      const node = this.#nodes.get(id);
+      if (!node)
+        continue;
+      node.translation = numbers(translation, node.translation);
+      node.rotation = numbers(rotation, node.rotation);
+    }
+    this.place();
+  }
+
+  /** Computes where each shape is. */
+  place(node = this.#root, matrix = identity()) {
+    for (const drawn of node.shapes)
+      drawn.matrix = matrix;
+    for (const child of node.children)
+      this.place(child, times(matrix, pose(child.translation, child.rotation, child.scale)));
+  }
+}

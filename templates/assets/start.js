@@ -1,0 +1,108 @@
+// The way from a world's URL to a running simulation: the simulation server's WebSocket, whose life is the lease.
+
+const CHECKOUT_IS_OVER = /^webots\b/i;
+
+/** What somebody can do about a failure, in words. */
+export function advice(text) {
+  const table = [
+    [/no simulation server available/i, 'All simulation servers are busy or do not answer. Connect again when the light above is on.'],
+    [/not one of the repositories|no simulation server accepts|blocked repository|does not allow/i,
+      'Only worlds of allowed repositories run here: the monitor page of each simulation server lists them.'],
+    [/idle time/i, 'Worlds of others run here only while the servers have little to do. Try again later.'],
+    [/wrong .*URL|\bno URL\b/i, 'Copy the address of the world’s page on its forge, such as https://github.com/USER/REPOSITORY/blob/main/worlds/NAME.wbt.'],
+    [/does not exist|not public|has no |no branch|not found|no such/i,
+      'Look whether the repository, the branch and the file exist, and whether everybody may read them.'],
+    [/larger than|longer than/i, 'Try a smaller project, or ask the administrator for a higher limit.'],
+    [/Webots is installed|no Webots at/, 'The administrator of this simulation server has to set where Webots is.'],
+    [/time limit/i, 'Connect again for another simulation.'],
+    [/places .* are taken/i, 'Connect again in a few minutes.'],
+  ];
+  const found = table.find(([pattern]) => pattern.test(text));
+  return found ? found[1] : 'Connect again. If that fails too, tell the administrator what is written here.';
+}
+
+/**
+ * One simulation. Events: `step` ({step, state, text}), `left` (seconds until it is closed), `ready` (the simulator's
+ * address), `failed` (text), `over` (text).
+ */
+export class Simulation extends EventTarget {
+  #socket;
+  #launched = false;
+  #ended = false;
+
+  /** Asks a simulation server (a WebSocket address) for a world. */
+  constructor(server, world) {
+    super();
+    this.#step('server', 'doing', `connecting to ${server}`);
+    this.#socket = new WebSocket(`${server}/client`);
+    this.#socket.addEventListener('open', () => {
+      this.#step('server', 'done', server);
+      this.#step('place', 'doing', 'asking for one');
+      this.#socket.send(JSON.stringify({ start: { url: world } }));
+    });
+    this.#socket.addEventListener('message', ({ data }) => this.#understand(data));
+    this.#socket.addEventListener('close', () => this.#closed());
+  }
+
+  #tell(kind, detail) {
+    this.dispatchEvent(new CustomEvent(kind, { detail }));
+  }
+
+  #step(step, state, text) {
+    this.#tell('step', { step, state, text });
+  }
+
+  #understand(text) {
+    const rest = (prefix) => text.slice(prefix.length).trim();
+    if (text.startsWith('webots:')) {
+      this.#launched = true;
+      this.#step('launch', 'done', 'the simulator is ready');
+      this.#tell('ready', rest('webots:'));
+    } else if (text.startsWith('loading: Error:'))
+      this.#fail(rest('loading: Error:'));
+    else if (text.startsWith('error:'))
+      this.#fail(rest('error:'));
+    else if (text.startsWith('loading:'))
+      this.#loading(rest('loading:'));
+    else if (text.startsWith('queue:')) {
+      const ahead = Number(rest('queue:'));
+      const clients = ahead === 1 ? 'one client is' : `${ahead} clients are`;
+      this.#step('place', 'doing', ahead === 0 ? 'you are next' : `${clients} ahead of you`);
+    } else if (text.startsWith('shutdownTimeout:')) {
+      this.#step('place', 'done', 'taken');
+      this.#step('checkout', 'done', '');
+      this.#tell('left', Number(rest('shutdownTimeout:')));
+    }
+  }
+
+  #loading(text) {
+    this.#step('place', 'done', 'taken');
+    if (this.#launched)
+      this.#step('simulation', 'doing', text);
+    else if (CHECKOUT_IS_OVER.test(text)) {
+      this.#step('checkout', 'done', '');
+      this.#step('launch', 'doing', text);
+    } else
+      this.#step('checkout', 'doing', text);
+  }
+
+  #fail(text) {
+    this.#ended = true;
+    this.#tell('failed', text);
+  }
+
+  #closed() {
+    if (this.#ended)
+      return;
+    this.#ended = true;
+    this.#tell('failed', this.#launched
+      ? 'The connection to the simulation server broke: the simulation has ended.'
+      : 'The simulation server could not be reached, or has closed the connection.');
+  }
+
+  /** Leaves: the simulation ends. */
+  close() {
+    this.#ended = true;
+    this.#socket.close(1000);
+  }
+}

@@ -1,0 +1,218 @@
+// The viewer page: the availability light, the form, the steps, and the simulation.
+
+import { Simulation, advice } from './start.js';
+import { SmallViewer } from './small_viewer.js';
+import { isDemonstration } from './stream.js';
+import { duration } from './times.js';
+
+const find = (id) => document.getElementById(id);
+const form = find('start');
+let simulation;
+let viewer;
+let countdown;
+let wanted;
+
+/* the light */
+
+let door;
+
+function openDoor() {
+  const url = new URL('session', location.href);
+  url.protocol = url.protocol === 'https:' ? 'wss:' : 'ws:';
+  door = new WebSocket(url);
+  door.addEventListener('message', ({ data }) => hear(data));
+  door.addEventListener('close', () => {
+    light('', 'No connection', 'to the session server. Trying again …');
+    if (wanted)
+      failed('The session server could not be reached.');
+    setTimeout(openDoor, 2000);
+  });
+}
+
+function light(state, word, text) {
+  find('light').classList.remove('on', 'off');
+  if (state)
+    find('light').classList.add(state);
+  find('light-word').textContent = word;
+  find('light-text').textContent = text;
+}
+
+function hear(text) {
+  if (text === '1')
+    light('on', 'Available', 'A simulation server can take you.');
+  else if (text === '0')
+    light('off', 'Not available', 'All simulation servers are busy or do not answer.');
+  else if (wanted)
+    chosen(text);
+}
+
+/* the steps */
+
+function step({ step: name, state, text }) {
+  const item = document.querySelector(`[data-step="${name}"]`);
+  item.classList.remove('doing', 'done', 'failed');
+  item.classList.add(state);
+  if (state === 'doing')
+    item.setAttribute('aria-current', 'step');
+  else
+    item.removeAttribute('aria-current');
+  if (text)
+    item.querySelector('small').textContent = text;
+  if (state === 'doing')
+    find('spoken').textContent = `${item.querySelector('b').textContent}: ${text}`;
+}
+
+function clearSteps() {
+  for (const item of find('steps').children) {
+    item.dataset.text ??= item.querySelector('small').textContent;
+    item.querySelector('small').textContent = item.dataset.text;
+    item.classList.remove('doing', 'done', 'failed');
+    item.removeAttribute('aria-current');
+  }
+}
+
+function failed(text) {
+  const current = document.querySelector('.steps .doing, .steps li:not(.done)') ?? document.querySelector('[data-step="simulation"]');
+  step({ step: current.dataset.step, state: 'failed' });
+  find('problem-text').textContent = text;
+  find('problem-advice').textContent = advice(text);
+  find('problem').hidden = false;
+  leave();
+}
+
+/* the way */
+
+function start(event) {
+  event.preventDefault();
+  leave();
+  clearSteps();
+  find('problem').hidden = true;
+  wanted = find('url').value.trim();
+  busy(true);
+  step({ step: 'session', state: 'doing', text: 'choosing a simulation server' });
+  if (door.readyState === WebSocket.OPEN)
+    door.send(JSON.stringify({ url: wanted }));
+  else
+    failed('The session server could not be reached.');
+}
+
+function chosen(answer) {
+  const world = wanted;
+  wanted = undefined;
+  if (answer.startsWith('Error:')) {
+    failed(answer.slice('Error:'.length).trim());
+    return;
+  }
+  step({ step: 'session', state: 'done', text: 'has chosen a simulation server' });
+  const current = new Simulation(answer, world);
+  simulation = current;
+  const on = (kind, handler) => current.addEventListener(kind, ({ detail }) => {
+    if (simulation === current)
+      handler(detail);
+  });
+  on('step', step);
+  on('left', countDown);
+  on('failed', failed);
+  on('ready', (address) => show(address, answer, current));
+}
+
+function countDown(seconds) {
+  const end = Date.now() + 1000 * seconds;
+  const tick = () => { find('left').textContent = `It will be closed in ${duration((end - Date.now()) / 1000)}.`; };
+  tick();
+  find('left').hidden = false;
+  countdown = setInterval(tick, 1000);
+}
+
+/** Where Webots' own viewer can be had: from the simulation server, or from the configured address. */
+async function webotsViewer(server) {
+  const base = server.replace(/^ws/, 'http');
+  try {
+    const status = await (await fetch(`${base}/status`)).json();
+    if (status.viewer)
+      return `${base}/${status.viewer}`;
+  } catch {
+    // Another kind of server, which has none.
+  }
+  return form.dataset.script;
+}
+
+async function show(address, server, current) {
+  step({ step: 'simulation', state: 'doing', text: 'connecting to the simulator' });
+  const kind = find('kind').value;
+  const script = kind === 'small' ? undefined : await webotsViewer(server);
+  const small = !script || (kind === 'automatic' && await isDemonstration(address));
+  if (simulation !== current)
+    return;
+  if (small)
+    showSmall(address);
+  else
+    showWebots(address, script);
+  if (kind === 'webots' && small)
+    find('spoken').textContent = 'Webots’ own viewer is not to be had here; the small viewer shows the simulation.';
+}
+
+function showSmall(address) {
+  try {
+    viewer = new SmallViewer(find('stage'), address);
+  } catch (error) {
+    failed(`The scene can’t be shown: ${error.message}.`);
+    return;
+  }
+  const shown = viewer;
+  viewer.addEventListener('loading', ({ detail }) => step({ step: 'simulation', state: 'doing', text: detail }));
+  viewer.addEventListener('ready', ({ detail }) => step({ step: 'simulation', state: 'done', text: detail || 'is shown' }));
+  viewer.addEventListener('lost', ({ detail }) => {
+    if (viewer === shown && simulation)
+      step({ step: 'simulation', state: 'failed', text: detail ?? 'the simulator has closed its connection' });
+  });
+}
+
+function showWebots(address, script) {
+  const frame = document.createElement('iframe');
+  frame.title = 'Webots’ viewer';
+  frame.allow = 'fullscreen';
+  frame.src = `webots-viewer#${new URLSearchParams({ script, stream: address })}`;
+  find('stage').replaceChildren(frame);
+  viewer = { close: () => frame.remove() };
+  step({ step: 'simulation', state: 'done', text: 'is shown by Webots’ own viewer' });
+}
+
+/* leaving */
+
+function busy(now) {
+  find('connect').disabled = now;
+  find('disconnect').disabled = !now;
+}
+
+function leave() {
+  clearInterval(countdown);
+  find('left').hidden = true;
+  wanted = undefined;
+  const [oldViewer, oldSimulation] = [viewer, simulation];
+  viewer = simulation = undefined;
+  oldViewer?.close();
+  oldSimulation?.close();
+  busy(false);
+}
+
+function disconnect() {
+  leave();
+  clearSteps();
+  const empty = Object.assign(document.createElement('p'), { className: 'none empty', textContent: 'You have left the simulation; it has ended.' });
+  find('stage').replaceChildren(empty);
+  find('spoken').textContent = empty.textContent;
+  find('connect').focus();
+}
+
+form.addEventListener('submit', start);
+find('disconnect').addEventListener('click', disconnect);
+for (const example of form.querySelectorAll('[data-url]')) {
+  example.addEventListener('click', () => {
+    find('url').value = example.dataset.url;
+    find('connect').focus();
+  });
+}
+find('url').value = new URLSearchParams(location.search).get('url') ?? '';
+addEventListener('pagehide', leave);
+openDoor();

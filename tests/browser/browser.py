@@ -1,0 +1,74 @@
+"""Chromium, driven by Playwright, and what every page must keep to."""
+
+import os
+import tempfile
+import urllib.parse
+
+from axe_playwright_python.sync_playwright import Axe
+from playwright.sync_api import sync_playwright
+
+from fleet import SOON
+
+CHROMIUM = os.environ.get("CHROMIUM", "/usr/bin/chromium")
+# The browser itself must not call home either; it draws without a graphics card.
+SWITCHES = [
+    "--no-sandbox", "--disable-background-networking", "--disable-component-update", "--disable-sync", "--no-first-run",
+    "--disable-features=Translate,OptimizationHints,MediaRouter", "--use-gl=angle", "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+]
+
+
+class Browser:
+    """A Chromium with a profile of its own: use it with `with`."""
+
+    def __enter__(self):
+        self.profile = tempfile.TemporaryDirectory(prefix="chromium-")
+        self.playwright = sync_playwright().start()
+        self.context = None
+        self.chromium = self.playwright.chromium.launch(executable_path=CHROMIUM, args=SWITCHES)
+        return self
+
+    def __exit__(self, *_):
+        self.chromium.close()
+        self.playwright.stop()
+        self.profile.cleanup()
+
+    def page(self, scheme="light", width=1280, height=900, javascript=True):
+        context = self.chromium.new_context(
+            color_scheme=scheme, viewport={"width": width, "height": height}, java_script_enabled=javascript)
+        context.set_default_timeout(1000 * SOON)
+        return Page(context)
+
+
+class Page:
+    """A tab that writes down what it asks for and what it complains about."""
+
+    def __init__(self, context):
+        self.context = context
+        self.tab = context.new_page()
+        self.asked, self.complaints = [], []
+        self.tab.on("request", lambda request: self.asked.append(request.url))
+        self.tab.on("websocket", lambda socket: self.asked.append(socket.url))
+        self.tab.on("console", self._console)
+        self.tab.on("pageerror", lambda error: self.complaints.append(str(error)))
+
+    def _console(self, message):
+        if message.type in ("error", "warning"):
+            self.complaints.append(f"{message.type}: {message.text}")
+
+    def hosts(self):
+        parts = (urllib.parse.urlsplit(url) for url in self.asked)
+        return {part.hostname for part in parts if part.scheme not in ("data", "blob", "about")}
+
+    def faults(self):
+        """What axe-core finds that is serious or critical."""
+        violations = Axe().run(self.tab).response["violations"]
+        grave = [one for one in violations if one["impact"] in ("serious", "critical")]
+        return [f"{one['id']}: {node['html'][:200]} {node['failureSummary']}" for one in grave for node in one["nodes"]]
+
+    def overflow(self):
+        """By how many pixels the page is wider than the window."""
+        return self.tab.evaluate("document.documentElement.scrollWidth - document.documentElement.clientWidth")
+
+    def close(self):
+        self.context.close()

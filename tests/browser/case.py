@@ -1,0 +1,54 @@
+"""What all browser tests stand on: one fleet and one browser per class; the logs of a test that fails are printed."""
+
+import sys
+import unittest
+
+from playwright.sync_api import expect
+
+from browser import Browser
+from fleet import SOON, Fleet
+
+expect.set_options(timeout=1000 * SOON)
+
+
+class BrowserTest(unittest.TestCase):
+    """A class of tests with a fleet of its own."""
+
+    session = None
+    simulation = None
+
+    @classmethod
+    def setUpClass(cls):
+        cls.fleet = cls.enterClassContext(Fleet(cls.session, cls.simulation))
+        cls.browser = cls.enterClassContext(Browser())
+
+    def run(self, result=None):
+        before = len(result.failures) + len(result.errors)
+        super().run(result)
+        if len(result.failures) + len(result.errors) > before:
+            print(self.fleet.logs(), file=sys.stderr)
+        return result
+
+    def open(self, url, **options):
+        """A page in a tab of its own, which keeps to the rules of all pages."""
+        page = self.browser.page(**options)
+        self.addCleanup(page.close)
+        self.addCleanup(self.keeps_to_the_rules, page)
+        page.tab.goto(url)
+        return page
+
+    def keeps_to_the_rules(self, page):
+        self.assertEqual(page.complaints, [], "the console")
+        self.assertEqual(page.hosts(), {"127.0.0.1"}, "who was asked")
+
+    def start_world(self, name="Playground", **options):
+        """The viewer page with a running simulation, and the simulation server that was chosen."""
+        page = self.open(self.fleet.session.url("viewer"), **options)
+        expect(page.tab.locator("#light")).to_contain_text("Available")
+        page.tab.get_by_role("button", name=name).click()
+        page.tab.get_by_role("button", name="Connect", exact=True).click()
+        expect(page.tab.locator("[data-step=simulation].done")).to_be_visible()
+        chosen = page.tab.locator("[data-step=server] small").inner_text()
+        servers = [one for one in (self.fleet.simulation, self.fleet.other) if chosen == f"ws://{one.address}"]
+        self.assertEqual(len(servers), 1, chosen)
+        return page, servers[0]

@@ -1,0 +1,183 @@
+"""A fleet for one test run: a session server, two simulation servers, the demo simulator, and git repositories.
+
+Everything is on the loopback, in folders that end with the test; the programs come from the folder FLEET_BIN.
+"""
+
+import json
+import os
+import pathlib
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+import urllib.error
+import urllib.request
+
+ROOT = pathlib.Path(__file__).resolve().parents[2]
+BIN = pathlib.Path(os.environ.get("FLEET_BIN", ROOT / "target/debug")).resolve()
+# How long anything may take that should happen soon. Far more than it needs: the machine may be busy.
+SOON = 30.0
+WORLD = "https://github.com/demo/worlds/blob/main/worlds/{}.wbt"
+
+
+def free_ports(count):
+    """The first of so many free ports in a row."""
+    start = 12_000 + os.getpid() % 150 * 100
+    for first in list(range(start, 32_000, count)) + list(range(12_000, start, count)):
+        try:
+            for port in range(first, first + count):
+                with socket.socket() as probe:
+                    probe.bind(("0.0.0.0", port))
+            return first
+        except OSError:
+            continue
+    raise RuntimeError(f"no {count} free ports in a row")
+
+
+def until(what, condition):
+    """Waits until a condition holds; gives back what it gave."""
+    deadline = time.monotonic() + SOON
+    while True:
+        found = condition()
+        if found:
+            return found
+        if time.monotonic() > deadline:
+            raise AssertionError(f"waited in vain until {what}")
+        time.sleep(0.02)
+
+
+class Server:
+    """A running program with its configuration and log."""
+
+    def __init__(self, program, folder, config):
+        self.program, self.folder, self.port = program, folder, config["port"]
+        folder.mkdir(parents=True, exist_ok=True)
+        self.config = {
+            "server": "127.0.0.1", "bind": "127.0.0.1", "ssl": False, "portRewrite": False, "debug": True,
+            "logDir": str(folder / "log"), **config,
+        }
+        file = folder / "config.json"
+        file.write_text(json.dumps(self.config, indent=2))
+        self.log = folder / "output.txt"
+        environment = {**os.environ, "DEMO_SIMULATOR_BIND": "127.0.0.1"}
+        environment.pop("WEBOTS_HOME", None)
+        with self.log.open("a") as log:
+            self.process = subprocess.Popen(
+                [BIN / program, file], stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=environment)
+        until(f"{program} answers", self.answers)
+
+    def answers(self):
+        if self.process.poll() is not None:
+            raise AssertionError(f"{self.program} has ended: {self.log.read_text()}")
+        try:
+            return self.get("health") == "ok"
+        except (urllib.error.URLError, OSError):
+            return False
+
+    @property
+    def address(self):
+        return f"127.0.0.1:{self.port}"
+
+    def url(self, path):
+        return f"http://{self.address}/{path}"
+
+    def get(self, path):
+        with urllib.request.urlopen(self.url(path), timeout=SOON) as answer:
+            return answer.read().decode()
+
+    def status(self):
+        return json.loads(self.get("status"))
+
+    def kill(self):
+        """Ends it without a warning, as a power failure would."""
+        self.process.send_signal(signal.SIGKILL)
+        self.process.wait()
+
+    def stop(self):
+        if self.process.poll() is None:
+            self.process.terminate()
+            try:
+                self.process.wait(15)
+            except subprocess.TimeoutExpired:
+                self.kill()
+
+
+class Fleet:
+    """The whole: use it with `with`."""
+
+    def __init__(self, session=None, simulation=None):
+        self.folder = pathlib.Path(tempfile.mkdtemp(prefix="fleet-browser-"))
+        self.servers = []
+        try:
+            self.forge = self._forge()
+            simulation = simulation or {}
+            self.simulation = self._simulation("one", {"title": "Demonstration", "description": (
+                "A simulation server that shows two small worlds."), **simulation})
+            self.other = self._simulation("two", {"title": "The other one", **simulation})
+            self.session = self._start("session-server", "session", {
+                "port": free_ports(1),
+                "simulationServers": [self.simulation.address, self.other.address],
+                # Whatever else keeps this machine busy is no concern of the tests.
+                "loadRefresh": 0.2, "loadThreshold": 1000,
+                "examples": [
+                    {"title": "Playground", "url": WORLD.format("playground")},
+                    {"title": "Carousel", "url": WORLD.format("carousel")},
+                ],
+                **(session or {}),
+            })
+            until("a simulation server is available", lambda: self.session.status()["available"])
+        except BaseException:
+            self.close()
+            raise
+
+    def _forge(self):
+        """A folder that has the demonstration's worlds as https://github.com/demo/worlds does."""
+        forge = self.folder / "forge"
+        work = self.folder / "work"
+        shutil.copytree(ROOT / "config/demo", work)
+        git = ["git", "-c", "user.name=Test", "-c", "user.email=test@localhost", "-c", "commit.gpgSign=false"]
+        bare = forge / "demo/worlds"
+        bare.mkdir(parents=True)
+        for folder, *command in [
+            (bare, "init", "--quiet", "--bare", "--initial-branch=main"),
+            (work, "init", "--quiet", "--initial-branch=main"),
+            (work, "add", "--all"),
+            (work, "commit", "--quiet", "--message", "worlds"),
+            (work, "push", "--quiet", str(bare), "main"),
+        ]:
+            subprocess.run([*git, *command], cwd=folder, check=True)
+        return forge
+
+    def _simulation(self, name, more):
+        places = 4
+        return self._start("simulation-server", name, {
+            "port": free_ports(places + 12), "maxConnections": places, "webots": str(BIN / "demo-simulator"),
+            "cacheDir": str(self.folder / name / "cache"),
+            "allowedRepositories": ["https://github.com/demo"],
+            "gitMirrors": {"https://github.com/": f"file:{self.forge}"},
+            **more,
+        })
+
+    def _start(self, program, name, config):
+        server = Server(program, self.folder / name, config)
+        self.servers.append(server)
+        return server
+
+    def close(self):
+        for server in reversed(self.servers):
+            server.stop()
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+    def logs(self):
+        return "\n".join(f"--- {server.program} {server.address} ---\n{server.log.read_text()}" for server in self.servers)
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, kind, *_):
+        if kind is not None:
+            print(self.logs(), file=sys.stderr)
+        self.close()

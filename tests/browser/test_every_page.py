@@ -1,0 +1,66 @@
+"""What holds for every page, in both schemes, wide and narrow."""
+
+import unittest
+import urllib.request
+
+from playwright.sync_api import expect
+
+from case import BrowserTest
+from fleet import SOON
+
+
+class EveryPage(BrowserTest):
+    def pages(self):
+        session, simulation = self.fleet.session, self.fleet.simulation
+        return [
+            (session.url("monitor"), "#live:text('Live')"),
+            (session.url("viewer"), "#light.on"),
+            (session.url("webots-viewer"), "#problem:not(:empty)"),
+            (simulation.url("monitor"), "#charts figure:nth-of-type(3)"),
+        ]
+
+    def test_no_serious_fault_of_accessibility_and_no_sideways_scrolling(self):
+        for scheme in ["light", "dark"]:
+            for width in [1280, 360]:
+                for url, ready in self.pages():
+                    with self.subTest(url, scheme=scheme, width=width):
+                        page = self.open(url, scheme=scheme, width=width)
+                        expect(page.tab.locator(ready)).to_be_visible()
+                        self.assertEqual(page.faults(), [])
+                        self.assertLessEqual(page.overflow(), 0, "pixels too wide")
+
+    def test_a_page_with_a_simulation_has_no_serious_fault_either(self):
+        for scheme, width in [("light", 1280), ("dark", 360)]:
+            with self.subTest(scheme=scheme, width=width):
+                page, server = self.start_world(scheme=scheme, width=width)
+                self.assertEqual(page.faults(), [])
+                self.assertLessEqual(page.overflow(), 0)
+                monitor = self.open(server.url("monitor"), scheme=scheme, width=width)
+                expect(monitor.tab.locator("#simulations tr")).to_be_visible()
+                self.assertEqual(monitor.faults(), [])
+                self.assertLessEqual(monitor.overflow(), 0)
+                page.close()
+
+    def test_pages_may_run_only_what_their_server_sends(self):
+        for url, _ in self.pages():
+            with self.subTest(url), urllib.request.urlopen(url, timeout=SOON) as answer:
+                policy, text = answer.headers["Content-Security-Policy"], answer.read().decode()
+                self.assertIn("default-src 'none'", policy)
+                self.assertNotIn("unsafe-inline", policy)
+                self.assertEqual(answer.headers["X-Content-Type-Options"], "nosniff")
+                for word in [" style=", "<style", " onclick=", "<script>"]:
+                    self.assertNotIn(word, text)
+
+    def test_everything_can_be_reached_by_tab(self):
+        page = self.open(self.fleet.session.url("viewer"))
+        expect(page.tab.locator("#light.on")).to_be_visible()
+        reached = []
+        for _ in range(12):
+            page.tab.keyboard.press("Tab")
+            reached.append(page.tab.evaluate("document.activeElement.id || document.activeElement.textContent.trim()"))
+        for wanted in ["Skip to the content", "Monitor", "url", "kind", "connect", "Playground", "Carousel"]:
+            self.assertIn(wanted, reached)
+
+
+if __name__ == "__main__":
+    unittest.main()

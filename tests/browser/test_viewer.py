@@ -1,0 +1,104 @@
+"""The viewer: from the light to a scene that moves."""
+
+import unittest
+
+from playwright.sync_api import expect
+
+from case import BrowserTest
+from fleet import WORLD, until
+
+
+def clock(page):
+    """The simulation's time in milliseconds."""
+    minutes, seconds = page.tab.locator("#clock").inner_text().split(":")
+    return round(60_000 * int(minutes) + 1000 * float(seconds))
+
+
+class Viewing(BrowserTest):
+    def picture(self, page):
+        return page.tab.locator("#view").screenshot()
+
+    def test_a_world_is_started_and_moves_pauses_steps_and_resets(self):
+        page, server = self.start_world()
+        monitor = self.open(server.url("monitor"))
+        row = monitor.tab.locator("#simulations tr")
+        expect(row).to_contain_text("playground.wbt")
+        expect(row).to_contain_text("idle")
+        expect(page.tab.locator("#mode")).to_have_text("paused")
+        self.assertEqual(clock(page), 0)
+        first = self.picture(page)
+        self.assertGreater(len(first), 5000, "an empty picture is small")
+
+        page.tab.get_by_role("button", name="Play", exact=True).click()
+        until("half a second has passed", lambda: clock(page) > 500)
+        expect(row).to_contain_text("running")
+        page.tab.get_by_role("button", name="Pause", exact=True).click()
+        expect(page.tab.locator("#mode")).to_have_text("paused")
+        paused = clock(page)
+        self.assertNotEqual(self.picture(page), first, "nothing has moved")
+        expect(row).to_contain_text("idle")
+        self.assertEqual(clock(page), paused, "time stands still")
+
+        page.tab.get_by_role("button", name="Step", exact=True).click()
+        until("one step is made", lambda: clock(page) == paused + 16)
+        page.tab.get_by_role("button", name="Reset", exact=True).click()
+        until("time is zero", lambda: clock(page) == 0)
+        until("all is where it was", lambda: self.picture(page) == first)
+
+        self.assertEqual(len(server.status()["simulations"]), 1)
+        page.close()
+        expect(row).to_have_count(0)
+        expect(monitor.tab.get_by_text("Nobody is here.")).to_be_visible()
+
+    def test_the_view_turns_by_keyboard_and_pointer(self):
+        page, _ = self.start_world("Carousel")
+        view = page.tab.locator("#view")
+        first = self.picture(page)
+        for key in ["ArrowLeft", "ArrowUp", "+", "Shift+ArrowRight"]:
+            before = self.picture(page)
+            view.press(key)
+            until(f"{key} changes the view", lambda: self.picture(page) != before)
+        before = self.picture(page)
+        box = view.bounding_box()
+        page.tab.mouse.move(box["x"] + 200, box["y"] + 200)
+        page.tab.mouse.down()
+        page.tab.mouse.move(box["x"] + 300, box["y"] + 220)
+        page.tab.mouse.up()
+        until("dragging changes the view", lambda: self.picture(page) != before)
+        # The focus ring is part of a picture: the button takes it away.
+        page.tab.get_by_role("button", name="Home view").click()
+        until("the view is the first again", lambda: self.picture(page) == first)
+
+    def test_disconnect_ends_the_simulation(self):
+        page, server = self.start_world()
+        page.tab.get_by_role("button", name="Disconnect").click()
+        expect(page.tab.locator("#stage")).to_contain_text("it has ended")
+        until("the simulation is gone", lambda: not server.status()["simulations"])
+        page.tab.get_by_role("button", name="Connect", exact=True).click()
+        expect(page.tab.locator("[data-step=simulation].done")).to_be_visible()
+
+    def test_a_failure_is_told_in_words_with_what_to_do(self):
+        table = [
+            ("https://github.com/stranger/worlds/blob/main/worlds/a.wbt", "no simulation server accepts", "monitor page"),
+            ("https://github.com/demo/worlds/blob/main/a.wbt", "worlds", "Copy the address"),
+            (WORLD.format("missing"), "missing.wbt", "Look whether"),
+            ("https://github.com/demo/nothing/blob/main/worlds/a.wbt", "nothing", "Look whether"),
+        ]
+        page = self.open(self.fleet.session.url("viewer"))
+        expect(page.tab.locator("#light")).to_contain_text("Available")
+        for world, words, what_to_do in table:
+            with self.subTest(world):
+                page.tab.get_by_label("URL of a world").fill(world)
+                page.tab.get_by_role("button", name="Connect", exact=True).click()
+                expect(page.tab.locator("#problem-text")).to_contain_text(words)
+                expect(page.tab.locator("#problem-advice")).to_contain_text(what_to_do)
+                expect(page.tab.locator(".steps .failed")).to_have_count(1)
+                expect(page.tab.get_by_role("button", name="Connect", exact=True)).to_be_enabled()
+
+    def test_a_link_can_name_the_world(self):
+        page = self.open(self.fleet.session.url(f"viewer?url={WORLD.format('carousel')}"))
+        expect(page.tab.get_by_label("URL of a world")).to_have_value(WORLD.format("carousel"))
+
+
+if __name__ == "__main__":
+    unittest.main()

@@ -1,0 +1,159 @@
+//! The shipped configuration files, and the page that explains every key.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+use std::process::{Command, Output};
+
+use serde_json::{Value, json};
+use webots_fleet::session::config::SessionConfig;
+use webots_fleet::shared::config::Configuration;
+use webots_fleet::simulation::config::SimulationConfig;
+
+use crate::copy::{root, walk};
+
+/// A server: its program, its part of the page, the least that it must be told, and other names of its keys.
+struct Kind {
+    program: &'static str,
+    heading: &'static str,
+    least: Value,
+    aliases: &'static [&'static str],
+}
+
+fn kinds() -> [Kind; 2] {
+    [
+        Kind {
+            program: env!("CARGO_BIN_EXE_session-server"),
+            heading: "## Session server",
+            least: json!({"port": 1999, "simulationServers": []}),
+            aliases: SessionConfig::ALIASES,
+        },
+        Kind {
+            program: env!("CARGO_BIN_EXE_simulation-server"),
+            heading: "## Simulation server",
+            least: json!({}),
+            aliases: SimulationConfig::ALIASES,
+        },
+    ]
+}
+
+impl Kind {
+    /// What `--check` says of a configuration.
+    fn check(&self, config: &str) -> Output {
+        let file = tempfile::NamedTempFile::new().unwrap();
+        std::fs::write(file.path(), config).unwrap();
+        check(self.program, file.path())
+    }
+
+    /// Every key with its default; of a part, as `part.key`.
+    fn defaults(&self) -> BTreeMap<String, Value> {
+        let output = self.check(&self.least.to_string());
+        let Value::Object(all) = serde_json::from_slice(&output.stdout).unwrap() else { panic!("{output:?}") };
+        let mut keys = BTreeMap::new();
+        for (key, value) in all {
+            match value {
+                Value::Object(part) if !part.is_empty() => {
+                    keys.extend(part.into_iter().map(|(inner, value)| (format!("{key}.{inner}"), value)));
+                }
+                value => drop(keys.insert(key, value)),
+            }
+        }
+        keys
+    }
+
+    /// Its part of the page.
+    fn page(&self) -> String {
+        let page = std::fs::read_to_string(root().join("docs/configuration.md")).unwrap();
+        let (_, part) = page.split_once(&format!("{}\n", self.heading)).unwrap();
+        part.split("\n## ").next().unwrap().to_owned()
+    }
+
+    /// The rows of the tables on the page: a key, and what its row says of the default.
+    fn rows(&self) -> Vec<(String, String)> {
+        let page = self.page();
+        let rows = page.lines().filter_map(|line| line.strip_prefix("| `"));
+        rows.map(|row| {
+            let cells: Vec<&str> = row.split(" | ").collect();
+            (cells[0].trim_end_matches('`').to_owned(), cells[2].to_owned())
+        })
+        .collect()
+    }
+}
+
+/// Runs `--check`, and keeps of its remarks what they say of the file.
+fn check(program: &str, file: &Path) -> Output {
+    let output = Command::new(program).arg("--check").arg(file).env_remove("WEBOTS_HOME").output().unwrap();
+    let name = file.display().to_string();
+    let remarks = String::from_utf8(output.stderr).unwrap();
+    let about: Vec<&str> = remarks.lines().filter(|line| line.contains(&name)).collect();
+    Output { stderr: about.join("\n").into_bytes(), ..output }
+}
+
+#[test]
+fn every_shipped_configuration_is_taken_without_a_warning() {
+    for kind in ["session", "simulation"] {
+        let program = if kind == "session" {
+            env!("CARGO_BIN_EXE_session-server")
+        } else {
+            env!("CARGO_BIN_EXE_simulation-server")
+        };
+        let files = walk(&root().join("config").join(kind));
+        assert!(files.len() >= 2, "{files:?}");
+        for file in files {
+            let output = check(program, &file);
+            assert!(output.status.success() && output.stderr.is_empty(), "{}: {output:?}", file.display());
+        }
+    }
+}
+
+#[test]
+fn the_page_names_every_key_once_with_its_default_and_no_other() {
+    for kind in kinds() {
+        let (defaults, rows) = (kind.defaults(), kind.rows());
+        let mut named: Vec<&str> = rows.iter().map(|(key, _)| key.as_str()).collect();
+        named.sort_unstable();
+        let known: Vec<&str> = defaults.keys().map(String::as_str).collect();
+        assert_eq!(named, known, "{}", kind.heading);
+        for (key, told) in &rows {
+            let default = &defaults[key];
+            if told == "required" {
+                let mut config = kind.least.clone();
+                config.as_object_mut().unwrap().remove(key).unwrap();
+                assert_eq!(kind.check(&config.to_string()).status.code(), Some(2), "{key} is not required");
+            } else if told == "none" {
+                let empty = [json!(null), json!([]), json!({})];
+                assert!(empty.contains(default), "{key}: the page says none, it is {default}");
+            } else {
+                let value = serde_json::from_str(told.trim_matches('`'));
+                let value: Value = value.unwrap_or_else(|error| panic!("{key}: {told}: {error}"));
+                let same = match (value.as_f64(), default.as_f64()) {
+                    (Some(one), Some(other)) => one == other,
+                    _ => &value == default,
+                };
+                assert!(same, "{key}: the page says {told}, it is {default}");
+            }
+        }
+    }
+}
+
+#[test]
+fn the_page_names_what_else_keys_may_be_called() {
+    for kind in kinds() {
+        for alias in kind.aliases {
+            assert!(kind.page().contains(&format!("`{alias}`")), "{alias}");
+        }
+    }
+}
+
+#[test]
+fn the_examples_of_the_page_are_taken_without_a_warning() {
+    for kind in kinds() {
+        let page = kind.page();
+        let examples: Vec<&str> =
+            page.split("```json\n").skip(1).map(|text| text.split("```").next().unwrap()).collect();
+        assert!(!examples.is_empty(), "{}", kind.heading);
+        for example in examples {
+            let output = kind.check(example);
+            assert!(output.status.success() && output.stderr.is_empty(), "{example}{output:?}");
+        }
+    }
+}

@@ -1,0 +1,220 @@
+//! A copy of the project in a folder of the test, on ports of its own, with the programs under test.
+
+use std::path::{Path, PathBuf};
+use std::process::Stdio;
+use std::time::Duration;
+
+use serde_json::{Value, json};
+
+use crate::support::{SOON, http, ports};
+
+/// How long `server.sh` may take for anything.
+const LIMIT: Duration = Duration::from_secs(90);
+
+/// How long this machine may be too busy to take a client.
+const BUSY: Duration = Duration::from_secs(180);
+
+/// The folder of the project under test.
+pub fn root() -> &'static Path {
+    Path::new(env!("CARGO_MANIFEST_DIR"))
+}
+
+/// A copy of the project. Whatever runs from it ends with it, and is shown if the test fails.
+pub struct Project {
+    temporary: tempfile::TempDir,
+    /// Port of the session server.
+    pub session: u16,
+    /// Port of the simulation server.
+    pub simulation: u16,
+}
+
+/// What came of a command.
+#[derive(Debug)]
+pub struct Outcome {
+    pub code: Option<i32>,
+    pub output: String,
+    pub errors: String,
+}
+
+impl Project {
+    /// Copies what `server.sh` needs.
+    pub fn copy() -> Self {
+        // Webots may take one of the ten ports that follow its own.
+        let session = ports::block(24);
+        let project = Self { temporary: tempfile::tempdir().unwrap(), session, simulation: session + 1 };
+        copy(&root().join("server.sh"), &project.path("server.sh"));
+        copy(&root().join("config"), &project.path("config"));
+        copy(&root().join("tests/websocket.sh"), &project.path("tests/websocket.sh"));
+        for name in ["demo", "local"] {
+            project.configure(&format!("session/{name}"), |config| {
+                config["port"] = session.into();
+                config["bind"] = "127.0.0.1".into();
+                config["simulationServers"] = json!([format!("localhost:{}", session + 1)]);
+                config["loadRefresh"] = 0.1.into();
+            });
+            project.configure(&format!("simulation/{name}"), |config| {
+                config["port"] = (session + 1).into();
+                config["bind"] = "127.0.0.1".into();
+            });
+        }
+        project.configure("simulation/demo", |config| config["webots"] = env!("CARGO_BIN_EXE_demo-simulator").into());
+        project
+    }
+
+    /// The project's folder; its name has a space in it.
+    pub fn folder(&self) -> PathBuf {
+        self.temporary.path().join("a project")
+    }
+
+    pub fn path(&self, inside: &str) -> PathBuf {
+        self.folder().join(inside)
+    }
+
+    /// Changes a configuration file, `KIND/NAME`.
+    pub fn configure(&self, name: &str, change: impl FnOnce(&mut Value)) {
+        let file = self.path(&format!("config/{name}.json"));
+        let mut config = serde_json::from_str(&std::fs::read_to_string(&file).unwrap()).unwrap();
+        change(&mut config);
+        std::fs::write(&file, config.to_string()).unwrap();
+    }
+
+    /// Runs `server.sh`, from another folder.
+    pub async fn server_sh(&self, arguments: &[&str]) -> Outcome {
+        run(&self.path("server.sh"), self.temporary.path(), arguments).await
+    }
+
+    /// The same, for what has to succeed; gives back what it prints.
+    pub async fn done(&self, arguments: &[&str]) -> String {
+        let outcome = self.server_sh(arguments).await;
+        assert_eq!(outcome.code, Some(0), "{arguments:?}: {outcome:#?}");
+        assert_eq!(outcome.errors, "", "{arguments:?}: {outcome:#?}");
+        outcome.output
+    }
+
+    /// Waits until a client can be placed. A machine that is busy with something else takes none: its load is real.
+    pub async fn available(&self) {
+        let deadline = std::time::Instant::now() + BUSY;
+        while http::get(&self.session_url("/request")).await.text() != "1" {
+            let load = http::get(&self.session_url("/load")).await.text();
+            assert!(std::time::Instant::now() < deadline, "this machine is too busy: its load is {load} %");
+            actix_rt::time::sleep(Duration::from_millis(100)).await;
+        }
+    }
+
+    /// A URL of the session server.
+    pub fn session_url(&self, path: &str) -> String {
+        format!("http://localhost:{}{path}", self.session)
+    }
+
+    /// What is left of servers that have run: processes, their files, folders of simulations, ports.
+    pub fn leftovers(&self) -> Vec<String> {
+        let mut left = processes_in(&self.folder());
+        let names = |folder: &str| {
+            let entries = std::fs::read_dir(self.path(folder)).into_iter().flatten();
+            entries.map(|entry| entry.unwrap().path().display().to_string()).collect::<Vec<_>>()
+        };
+        left.extend(names("log").into_iter().filter(|name| name.ends_with(".pid")));
+        left.extend(names("cache/runs"));
+        for port in self.session..self.session + 12 {
+            if std::net::TcpStream::connect(("127.0.0.1", port)).is_ok() {
+                left.push(format!("port {port}"));
+            }
+        }
+        left
+    }
+
+    /// The folders of simulations.
+    pub fn instances(&self) -> Vec<PathBuf> {
+        let runs = std::fs::read_dir(self.path("cache/runs")).into_iter().flatten();
+        let entries = runs.flat_map(|run| std::fs::read_dir(run.unwrap().path()).into_iter().flatten());
+        let paths = entries.map(|entry| entry.unwrap().path());
+        paths.filter(|path| path.file_name().unwrap().to_string_lossy().starts_with("instance-")).collect()
+    }
+
+    /// The process of a server, `KIND`, of a configuration.
+    pub fn pid(&self, kind: &str, name: &str) -> i32 {
+        let text = std::fs::read_to_string(self.path(&format!("log/{name}.{kind}.pid"))).unwrap();
+        text.trim().parse().unwrap()
+    }
+}
+
+impl Drop for Project {
+    fn drop(&mut self) {
+        let stop = ["90", "bash"].into_iter().map(PathBuf::from).chain([self.path("server.sh"), "stop".into()]);
+        std::process::Command::new("timeout")
+            .args(stop)
+            .env("FLEET_BIN", programs())
+            .stdin(Stdio::null())
+            .stdout(Stdio::null())
+            .status()
+            .ok();
+        if std::thread::panicking() {
+            for log in walk(&self.path("log")) {
+                eprintln!("--- {} ---\n{}", log.display(), std::fs::read_to_string(&log).unwrap_or_default());
+            }
+        }
+    }
+}
+
+/// The folder of the programs under test.
+fn programs() -> &'static Path {
+    Path::new(env!("CARGO_BIN_EXE_session-server")).parent().unwrap()
+}
+
+/// Runs a script to its end.
+pub async fn run(script: &Path, folder: &Path, arguments: &[&str]) -> Outcome {
+    let command = tokio::process::Command::new(script)
+        .args(arguments)
+        .current_dir(folder)
+        .env("FLEET_BIN", programs())
+        .stdin(Stdio::null())
+        .kill_on_drop(true)
+        .output();
+    let output = actix_rt::time::timeout(LIMIT, command).await;
+    let output = output.unwrap_or_else(|_| panic!("{} {arguments:?} does not end", script.display())).unwrap();
+    let text = |bytes| String::from_utf8(bytes).unwrap();
+    Outcome { code: output.status.code(), output: text(output.stdout), errors: text(output.stderr) }
+}
+
+/// The processes that work in a folder or below it.
+pub fn processes_in(folder: &Path) -> Vec<String> {
+    let folder = folder.canonicalize().unwrap();
+    let processes = procfs::process::all_processes().unwrap().flatten();
+    processes
+        .filter(|process| process.cwd().is_ok_and(|cwd| cwd.starts_with(&folder)))
+        .map(|process| format!("process {} {}", process.pid(), process.cmdline().unwrap_or_default().join(" ")))
+        .collect()
+}
+
+/// Waits until nothing of a project is left, and says what is.
+pub async fn nothing_is_left(project: &Project) {
+    let deadline = std::time::Instant::now() + SOON;
+    while !project.leftovers().is_empty() {
+        assert!(std::time::Instant::now() < deadline, "left: {:#?}", project.leftovers());
+        actix_rt::time::sleep(Duration::from_millis(20)).await;
+    }
+}
+
+/// All files below a folder.
+pub fn walk(folder: &Path) -> Vec<PathBuf> {
+    let mut files = Vec::new();
+    for entry in std::fs::read_dir(folder).into_iter().flatten() {
+        let path = entry.unwrap().path();
+        if path.is_dir() {
+            files.extend(walk(&path));
+        } else {
+            files.push(path);
+        }
+    }
+    files.sort();
+    files
+}
+
+fn copy(from: &Path, to: &Path) {
+    let files = if from.is_dir() { walk(from) } else { vec![from.to_owned()] };
+    for file in files {
+        let to = if file == from { to.to_owned() } else { to.join(file.strip_prefix(from).unwrap()) };
+        std::fs::create_dir_all(to.parent().unwrap()).unwrap();
+        std::fs::copy(&file, &to).unwrap();
+    }
+}

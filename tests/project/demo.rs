@@ -1,0 +1,192 @@
+//! The demo, as the README has a newcomer try it.
+
+use std::process::Stdio;
+
+use nix::sys::signal::{Signal, kill, killpg};
+use nix::unistd::Pid;
+use tokio::io::AsyncBufReadExt;
+
+use crate::copy::{Project, nothing_is_left, processes_in, run};
+use crate::support::client::Client;
+use crate::support::{SOON, http, until};
+
+const WORLD: &str = "https://github.com/webots-fleet/demo/blob/main/worlds/playground.wbt";
+
+/// A client whose simulation of the demo's world is ready, and the URL of its Webots.
+async fn simulate(project: &Project) -> (Client, String) {
+    let mut client = Client::connect(&format!("ws://localhost:{}/client", project.simulation)).await;
+    client.send(&serde_json::json!({"start": {"url": WORLD}}).to_string()).await;
+    let url = client.until("webots:").await.trim_start_matches("webots:").to_owned();
+    (client, url)
+}
+
+/// A viewer that has seen the scene.
+async fn watch(url: &str) -> Client {
+    let mut viewer = Client::connect(&format!("{url}/")).await;
+    viewer.send("x3d").await;
+    viewer.until("scene load completed").await;
+    viewer
+}
+
+/// The simulation time of an update, in milliseconds.
+fn time(update: &str) -> f64 {
+    let json: serde_json::Value = serde_json::from_str(update.trim_start_matches("application/json:")).unwrap();
+    json["time"].as_f64().unwrap()
+}
+
+#[actix_rt::test]
+async fn the_demo_runs_from_its_start_to_its_stop() {
+    let project = Project::copy();
+    let told = project.done(&["start", "demo"]).await;
+    let (session, simulation) = (project.session, project.simulation);
+    for part in [
+        format!("http://localhost:{session}/monitor"),
+        format!("ws://localhost:{session}/session"),
+        format!("http://localhost:{simulation}/monitor"),
+        format!("ws://localhost:{simulation}/client"),
+    ] {
+        assert!(told.contains(&part), "{part} is missing: {told}");
+    }
+
+    project.available().await;
+    let mut visitor = Client::connect(&format!("ws://localhost:{session}/session")).await;
+    visitor.until("1").await;
+    let chosen = http::get(&project.session_url(&format!("/session?url={WORLD}"))).await.text();
+    assert_eq!(chosen, format!("ws://localhost:{simulation}"));
+    for path in ["/monitor", "/status", "/load", "/metrics", "/health", "/request"] {
+        assert_eq!(http::get(&project.session_url(path)).await.status, 200, "{path}");
+    }
+
+    let (client, url) = simulate(&project).await;
+    assert_eq!(url, format!("ws://localhost:{}", simulation + 1));
+    let mut viewer = watch(&url).await;
+    assert!(viewer.heard.iter().any(|text| text.starts_with("model:") && text.contains("beetle")));
+    viewer.send("real-time:-1").await;
+    viewer.until("real-time").await;
+    while time(&viewer.until("application/json:").await) < 100.0 {}
+    viewer.send("pause").await;
+    viewer.until("paused by client").await;
+    viewer.send("step").await;
+    let stepped = time(&viewer.until("application/json:").await);
+    assert!(stepped > 100.0, "{stepped}");
+    viewer.until("paused by client").await;
+    viewer.send("reset").await;
+    assert_eq!(time(&viewer.until("application/json:").await), 0.0);
+    viewer.until("reset finished").await;
+
+    client.leave().await;
+    until("neither a process nor a folder of the simulation is left", async || {
+        project.instances().is_empty() && processes_in(&project.path("cache")).is_empty()
+    })
+    .await;
+    assert!(project.done(&["status"]).await.contains("demo: the session server runs"));
+    let stopped = project.done(&["stop"]).await;
+    assert!(stopped.contains("stopped the session server") && stopped.contains("stopped the simulation server"));
+    assert_eq!(project.leftovers(), [""; 0]);
+    assert_eq!(project.server_sh(&["status"]).await.code, Some(3));
+    assert_eq!(project.server_sh(&["status", "demo"]).await.code, Some(3));
+    assert_eq!(project.done(&["stop", "demo"]).await, "nothing of demo runs\n");
+}
+
+#[actix_rt::test]
+async fn a_stop_ends_the_simulations_of_clients_that_are_still_there() {
+    let project = Project::copy();
+    project.done(&["start", "demo"]).await;
+    let (mut client, url) = simulate(&project).await;
+    let mut viewer = watch(&url).await;
+    project.done(&["stop"]).await;
+    assert_eq!(project.leftovers(), [""; 0]);
+    client.closed().await;
+    viewer.closed().await;
+}
+
+#[actix_rt::test]
+async fn a_server_that_does_not_end_is_killed_with_what_it_started() {
+    let project = Project::copy();
+    project.configure("simulation/demo", |config| config["timing"] = serde_json::json!({"stop": 1}));
+    project.done(&["start", "demo"]).await;
+    let (_client, _) = simulate(&project).await;
+    kill(Pid::from_raw(project.pid("simulation", "demo")), Signal::SIGSTOP).unwrap();
+    let stopped = project.done(&["stop"]).await;
+    assert!(stopped.contains("killed the simulation server of demo"), "{stopped}");
+    // Nobody was left to remove the folder of the run: the next start does.
+    assert_eq!(processes_in(&project.folder()), [""; 0]);
+    project.done(&["start", "demo"]).await;
+    project.done(&["stop"]).await;
+    nothing_is_left(&project).await;
+}
+
+#[actix_rt::test]
+async fn a_restart_shows_what_was_changed_in_the_demos_project() {
+    let project = Project::copy();
+    // Through a link, as from a folder for commands.
+    let link = project.folder().parent().unwrap().join("fleet");
+    std::os::unix::fs::symlink(project.path("server.sh"), &link).unwrap();
+    let through_the_link = async |arguments: &[&str]| {
+        let outcome = run(&link, std::path::Path::new("/"), arguments).await;
+        assert_eq!(outcome.code, Some(0), "{outcome:#?}");
+    };
+    through_the_link(&["start", "demo"]).await;
+    let before = project.pid("session", "demo");
+    let world = project.path("config/demo/worlds/playground.wbt");
+    let text = std::fs::read_to_string(&world).unwrap();
+    std::fs::write(&world, text.replace("\"beetle\"", "\"ladybird\"")).unwrap();
+    through_the_link(&["restart"]).await;
+    assert_ne!(before, project.pid("session", "demo"));
+    let (_client, url) = simulate(&project).await;
+    let viewer = watch(&url).await;
+    assert!(viewer.heard.iter().any(|text| text.contains("ladybird")), "{:?}", viewer.heard);
+}
+
+#[actix_rt::test]
+async fn the_client_of_the_readme_works() {
+    let project = Project::copy();
+    project.done(&["start", "demo"]).await;
+    let talk = async |port: u16, path: &str, message: &str, last: &str| {
+        let mut child = tokio::process::Command::new(project.path("tests/websocket.sh"))
+            .args([&format!("ws://localhost:{port}{path}"), message])
+            .stdin(Stdio::null())
+            .stdout(Stdio::piped())
+            .process_group(0)
+            .spawn()
+            .unwrap();
+        let group = Pid::from_raw(child.id().unwrap().try_into().unwrap());
+        let mut reader = tokio::io::BufReader::new(child.stdout.take().unwrap()).lines();
+        let mut heard: Vec<String> = Vec::new();
+        while !heard.last().is_some_and(|line| line.starts_with(last)) {
+            let line = actix_rt::time::timeout(SOON, reader.next_line()).await;
+            let Ok(Ok(Some(line))) = line else { panic!("only {heard:?} came") };
+            heard.push(line);
+        }
+        // As Ctrl-C does.
+        killpg(group, Signal::SIGINT).unwrap();
+        actix_rt::time::timeout(SOON, child.wait()).await.unwrap().unwrap();
+        heard
+    };
+    project.available().await;
+    let answer = talk(project.session, "/session", WORLD, "ws:").await;
+    assert_eq!(answer, ["1".to_owned(), format!("ws://localhost:{}", project.simulation)]);
+    let start = serde_json::json!({"start": {"url": WORLD}}).to_string();
+    let answer = talk(project.simulation, "/client", &start, "webots:").await;
+    assert_eq!(answer.last(), Some(&format!("webots:ws://localhost:{}", project.simulation + 1)));
+}
+
+#[actix_rt::test]
+async fn without_webots_everything_runs_and_a_client_is_told_what_to_do() {
+    let project = Project::copy();
+    let home = project.path("no webots here");
+    project.configure("simulation/local", |config| config["webotsHome"] = home.to_str().unwrap().into());
+    // Without a name: local.
+    let started = project.server_sh(&["start"]).await;
+    assert_eq!(started.code, Some(0), "{started:#?}");
+    assert!(started.errors.contains("warning: webots: there is no program"), "{started:#?}");
+    let mut client = Client::connect(&format!("ws://localhost:{}/client", project.simulation)).await;
+    let world = "https://github.com/cyberbotics/webots/blob/released/projects/languages/python/worlds/example.wbt";
+    client.send(&serde_json::json!({"start": {"url": world}}).to_string()).await;
+    client.closed().await;
+    let [told] = client.heard.as_slice() else { panic!("{:?}", client.heard) };
+    assert!(told.starts_with("loading: Error: "), "{told}");
+    assert!(told.contains(home.join("webots").to_str().unwrap()) && told.contains("webotsHome"), "{told}");
+    project.done(&["stop"]).await;
+    assert_eq!(project.leftovers(), [""; 0]);
+}

@@ -1,0 +1,93 @@
+//! What `server.sh` refuses, and that it leaves everything as it was.
+
+use std::net::TcpListener;
+
+use crate::copy::{Outcome, Project};
+use crate::support::http;
+
+/// Runs `server.sh` for what has to fail with this exit code; gives back what it says.
+async fn refused(project: &Project, arguments: &[&str], code: i32) -> String {
+    let Outcome { code: found, output, errors } = project.server_sh(arguments).await;
+    assert_eq!(found, Some(code), "{arguments:?}: {output}{errors}");
+    errors
+}
+
+#[actix_rt::test]
+async fn a_name_that_is_not_configured_is_refused_with_those_that_are() {
+    let project = Project::copy();
+    for action in ["start", "stop", "restart", "status"] {
+        for name in ["nowhere", "../session/demo", "de mo", "-demo", ""] {
+            let told = refused(&project, &[action, name], 2).await;
+            assert!(told.contains("there is no configuration") && told.contains("demo, local"), "{told}");
+        }
+    }
+    assert!(refused(&project, &["begin"], 2).await.contains("usage:"));
+    assert!(refused(&project, &[], 2).await.contains("usage:"));
+    assert_eq!(project.leftovers(), [""; 0]);
+}
+
+#[actix_rt::test]
+async fn what_runs_already_is_not_started_twice() {
+    let project = Project::copy();
+    let (one, other) =
+        futures_util::join!(project.server_sh(&["start", "demo"]), project.server_sh(&["start", "demo"]));
+    let (lost, won) = if one.code == Some(0) { (other, one) } else { (one, other) };
+    assert_eq!((won.code, lost.code), (Some(0), Some(1)), "{won:#?} {lost:#?}");
+    assert!(lost.errors.contains("already runs"), "{lost:#?}");
+    // The other configuration has the same ports.
+    let told = refused(&project, &["start", "local"], 1).await;
+    assert!(told.contains("is taken") && told.contains("this runs already: demo"), "{told}");
+    assert_eq!(http::get(&project.session_url("/health")).await.text(), "ok");
+}
+
+#[actix_rt::test]
+async fn a_port_that_is_taken_is_named() {
+    let project = Project::copy();
+    for port in [project.simulation, project.session] {
+        let listener = TcpListener::bind(("127.0.0.1", port)).unwrap();
+        let told = refused(&project, &["start", "demo"], 1).await;
+        assert!(told.contains(&format!("port {port}")), "{told}");
+        drop(listener);
+        assert_eq!(project.leftovers(), [""; 0]);
+    }
+}
+
+#[actix_rt::test]
+async fn when_one_server_does_not_start_its_last_words_are_shown_and_the_other_is_stopped() {
+    let project = Project::copy();
+    project.configure("session/demo", |config| config["logDir"] = "server.sh".into());
+    let told = refused(&project, &["start", "demo"], 1).await;
+    assert!(told.contains("the session server of demo has ended") && told.contains("can't be written"), "{told}");
+    assert_eq!(project.leftovers(), [""; 0]);
+}
+
+#[actix_rt::test]
+async fn a_wrong_configuration_is_refused_in_one_line_and_stops_nothing_that_runs() {
+    let project = Project::copy();
+    project.done(&["start", "demo"]).await;
+    project.configure("simulation/demo", |config| config["maxConnections"] = "many".into());
+    for action in ["restart", "start"] {
+        let told = refused(&project, &[action, "demo"], 2).await;
+        assert_eq!(told.lines().count(), 1, "{told}");
+        assert!(told.starts_with("error: config/simulation/demo.json: maxConnections: "), "{told}");
+    }
+    assert_eq!(http::get(&project.session_url("/health")).await.text(), "ok");
+    project.done(&["stop"]).await;
+    assert_eq!(project.leftovers(), [""; 0]);
+}
+
+#[actix_rt::test]
+async fn a_stale_pid_file_neither_hinders_a_start_nor_ends_another_process() {
+    let project = Project::copy();
+    let file = project.path("log/demo.simulation.pid");
+    std::fs::create_dir_all(file.parent().unwrap()).unwrap();
+    // This very process, as if the id had been given out again.
+    for text in [format!("{}\n", std::process::id()), "4194304\n".to_owned(), "nonsense".to_owned(), String::new()] {
+        std::fs::write(&file, text).unwrap();
+        assert_eq!(project.server_sh(&["status"]).await.code, Some(3));
+        assert_eq!(project.done(&["stop", "demo"]).await, "nothing of demo runs\n");
+        assert!(!file.exists());
+    }
+    std::fs::write(&file, format!("{}\n", std::process::id())).unwrap();
+    project.done(&["start", "demo"]).await;
+}

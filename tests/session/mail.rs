@@ -1,0 +1,76 @@
+//! From a failure to a mail: the built program, a stand-in that fails, a real SMTP server. `tests/python.sh` prepares it.
+
+use serde_json::json;
+
+use crate::smtp::Smtp;
+use crate::stand_in::{Manner, StandIn};
+use crate::support::program::{Builder, session_server};
+use crate::{addresses, until_states};
+
+fn with_mails(servers: &[StandIn], smtp: &Smtp) -> Builder {
+    session_server(&addresses(servers))
+        .set("administrator", "admin@example.org")
+        .set("mailSender", "fleet@example.org")
+        .set("mailServer", "127.0.0.1")
+        .set("mailServerPort", smtp.port)
+        .set("timing", json!({"answer": 0.5, "gather": 0.5, "flapping": 0.5}))
+}
+
+#[actix_rt::test]
+async fn every_kind_of_failure_is_mailed_and_so_is_its_end() {
+    let failures = [
+        (Manner::Reset, "no connection"),
+        (Manner::Hang, "no answer within 0.5 s"),
+        (Manner::Drip, "no answer within 0.5 s"),
+        (Manner::Body(500, Vec::new()), "status 500"),
+        (Manner::Load("NaN".to_owned()), "NaN"),
+    ];
+    let mut smtp = Smtp::start(&[]).await;
+    let servers: Vec<StandIn> = failures.iter().map(|_| StandIn::start(Manner::idle(7.0, 10))).collect();
+    let session = with_mails(&servers, &smtp).start().await;
+    until_states(&session, &["up"; 5]).await;
+    for (server, (manner, _)) in servers.iter().zip(&failures) {
+        server.set(manner.clone());
+    }
+    let mut text = String::new();
+    for (server, (manner, words)) in servers.iter().zip(&failures) {
+        let address = server.address();
+        while !text.contains(&format!("{address}: not responding")) {
+            text.push_str(smtp.mail().await.field("text"));
+        }
+        let entry = text.split(&format!("{address}: not responding")).nth(1).unwrap();
+        let entry = entry.split("responding").next().unwrap();
+        assert!(entry.contains(words), "{manner:?}: {entry}");
+    }
+    assert!(text.contains(&format!("http://localhost:{}/monitor", session.port)), "{text}");
+    for server in &servers {
+        server.set(Manner::idle(7.0, 10));
+    }
+    let mut text = String::new();
+    for server in &servers {
+        while !text.contains(&format!("{}: working again", server.address())) {
+            text.push_str(smtp.mail().await.field("text"));
+        }
+    }
+}
+
+#[actix_rt::test]
+async fn a_full_server_is_mailed_and_so_is_its_room() {
+    let mut smtp = Smtp::start(&[]).await;
+    let servers = [StandIn::start(Manner::idle(97.0, 10))];
+    let _session = with_mails(&servers, &smtp).start().await;
+    let address = servers[0].address();
+    assert_eq!(smtp.mail().await.subject(), format!("Simulation server reached maximum load: {address}"));
+    servers[0].set(Manner::idle(7.0, 10));
+    assert_eq!(smtp.mail().await.subject(), format!("Simulation server available again: {address}"));
+}
+
+#[actix_rt::test]
+async fn a_server_that_was_never_there_is_mailed() {
+    let mut smtp = Smtp::start(&[]).await;
+    let servers = [StandIn::start(Manner::Reset)];
+    let session = with_mails(&servers, &smtp).start().await;
+    let mail = smtp.mail().await;
+    assert_eq!(mail.subject(), format!("Simulation server not responding: {}", servers[0].address()));
+    until_states(&session, &["down"]).await;
+}

@@ -1,0 +1,128 @@
+//! Whom clients are sent to.
+
+use std::collections::BTreeMap;
+
+use crate::stand_in::{Manner, StandIn};
+use crate::support::client::Client;
+use crate::support::git::world;
+use crate::support::http;
+use crate::support::program::{Builder, Server, session_server};
+use crate::{addresses, until_states};
+
+/// A session server whose simulation servers report once, so that a test stands between two reports.
+fn between_reports(servers: &[StandIn], client_cost: f64) -> Builder {
+    session_server(&addresses(servers)).set("loadRefresh", 600).set("clientCost", client_cost)
+}
+
+/// Sends so many requests; how many clients each server got.
+async fn requests(session: &Server, count: usize) -> BTreeMap<String, usize> {
+    let client = awc::Client::default();
+    let mut got = BTreeMap::new();
+    let next = async || {
+        let mut answer = client.get(session.url("/session")).send().await.unwrap();
+        String::from_utf8(answer.body().await.unwrap().to_vec()).unwrap()
+    };
+    for _ in 0..count.div_ceil(20) {
+        for text in futures_util::future::join_all((0..20).map(|_| next())).await {
+            *got.entry(text).or_default() += 1;
+        }
+    }
+    got
+}
+
+#[actix_rt::test]
+async fn a_burst_between_two_reports_is_spread_evenly() {
+    let servers = [(); 5].map(|()| StandIn::start(Manner::idle(3.0, 1000)));
+    let session = between_reports(&servers, 0.05).start().await;
+    until_states(&session, &["up"; 5]).await;
+    let got = requests(&session, 1000).await;
+    let expected = servers.iter().map(|server| (server.url(), 200)).collect();
+    assert_eq!(got, expected);
+}
+
+#[actix_rt::test]
+async fn a_burst_over_servers_that_report_only_their_load_is_spread_evenly() {
+    let servers = [(); 5].map(|()| StandIn::start(Manner::Load("3.0".to_owned())));
+    let session = between_reports(&servers, 0.05).start().await;
+    until_states(&session, &["up"; 5]).await;
+    let got = requests(&session, 1000).await;
+    assert_eq!(got, servers.iter().map(|server| (server.url(), 200)).collect());
+}
+
+#[actix_rt::test]
+async fn a_burst_over_unequal_servers_ends_level() {
+    let loads = [0.0, 10.0, 20.0, 30.0, 40.0];
+    let servers = loads.map(|load| StandIn::start(Manner::idle(load, 1000)));
+    let session = between_reports(&servers, 0.25).start().await;
+    until_states(&session, &["up"; 5]).await;
+    let got = requests(&session, 1000).await;
+    for (server, load) in servers.iter().zip(loads) {
+        let ends_at = load + 0.25 * got.get(&server.url()).copied().unwrap_or_default() as f64;
+        assert!((69.75..=70.25).contains(&ends_at), "one server ends at {ends_at} %: {got:?}");
+    }
+}
+
+#[actix_rt::test]
+async fn availability_ends_when_placements_use_up_the_room_and_comes_back_when_they_expire() {
+    let servers = [StandIn::start(Manner::idle(90.0, 100))];
+    let session = between_reports(&servers, 2.0).set("timing", serde_json::json!({"placement": 1.5})).start().await;
+    let mut client = Client::connect(&session.websocket("/")).await;
+    client.until("1").await;
+    for _ in 0..3 {
+        assert_eq!(http::get(&session.url("/session")).await.text(), servers[0].url());
+    }
+    client.until("0").await;
+    assert_eq!(http::get(&session.url("/session")).await.status, 503);
+    client.until("1").await;
+    assert_eq!(servers[0].requests(), 1, "the test was to stand between two reports");
+}
+
+#[actix_rt::test]
+async fn a_server_without_a_free_place_gets_nobody() {
+    let servers = [StandIn::start(Manner::status(10.0, 4, 4)), StandIn::start(Manner::status(80.0, 2, 4))];
+    let session = between_reports(&servers, 1.0).start().await;
+    until_states(&session, &["full", "up"]).await;
+    for _ in 0..2 {
+        assert_eq!(http::get(&session.url("/session")).await.text(), servers[1].url());
+    }
+    assert_eq!(http::get(&session.url("/request")).await.text(), "0");
+    assert_eq!(http::get(&session.url("/session")).await.status, 503);
+}
+
+#[actix_rt::test]
+async fn a_world_goes_only_where_it_will_be_accepted() {
+    let servers = ["lab", "school"].map(|owner| StandIn::start(Manner::of_owner(owner)));
+    let session = session_server(&addresses(&servers)).start().await;
+    until_states(&session, &["up"; 2]).await;
+    let session_for = async |url: &str| http::get(&session.url(&format!("/session?url={url}"))).await;
+    let mut client = Client::connect(&session.websocket("/session")).await;
+    client.until("1").await;
+    for (owner, server) in ["lab", "school"].into_iter().zip(&servers) {
+        let url = world(&format!("{owner}/arm"), "main", "worlds/a.wbt");
+        for _ in 0..3 {
+            assert_eq!(session_for(&url).await.text(), server.url());
+            client.send(&url).await;
+            assert_eq!(client.until("").await, server.url());
+            client.send(&serde_json::json!({"url": url}).to_string()).await;
+            assert_eq!(client.until("").await, server.url());
+        }
+    }
+    let url = world("stranger/arm", "main", "worlds/a.wbt");
+    let refused = session_for(&url).await;
+    let words = "Error: no simulation server accepts https://github.com/stranger/arm.";
+    assert_eq!((refused.status.as_u16(), refused.text().as_str()), (403, words));
+    client.send(&url).await;
+    assert_eq!(client.until("").await, words);
+    let wrong = session_for("https://github.com/lab").await;
+    assert_eq!(wrong.status, 400);
+    assert!(wrong.text().starts_with("Error: "), "{}", wrong.text());
+}
+
+#[actix_rt::test]
+async fn a_server_that_reports_only_its_load_is_taken_as_accepting() {
+    let servers = [StandIn::start(Manner::of_owner("lab")), StandIn::start(Manner::Load("50".to_owned()))];
+    let session = session_server(&addresses(&servers)).start().await;
+    until_states(&session, &["up"; 2]).await;
+    let url = world("stranger/arm", "main", "worlds/a.wbt");
+    assert_eq!(http::get(&session.url(&format!("/session?url={url}"))).await.text(), servers[1].url());
+}

@@ -1,0 +1,117 @@
+//! What connected clients are told, and which of them are sent away.
+
+use std::time::Duration;
+
+use futures_util::future::join_all;
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::net::TcpStream;
+
+use crate::stand_in::{Manner, StandIn};
+use crate::support::client::Client;
+use crate::support::program::{Server, session_server};
+use crate::support::{http, until};
+use crate::{addresses, until_states};
+
+async fn clients_of(session: &Server) -> u64 {
+    http::get(&session.url("/status")).await.json()["clients"].as_u64().unwrap()
+}
+
+/// A WebSocket that is opened and then left alone.
+async fn deaf(session: &Server) -> TcpStream {
+    let mut stream = TcpStream::connect(session.address()).await.unwrap();
+    let request = format!(
+        "GET /session HTTP/1.1\r\nHost: {}\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n\
+         Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n",
+        session.address()
+    );
+    stream.write_all(request.as_bytes()).await.unwrap();
+    stream
+}
+
+#[actix_rt::test]
+async fn no_value_comes_twice_however_a_server_flaps() {
+    let servers = [StandIn::start(Manner::idle(1.0, 1000))];
+    let session = session_server(&addresses(&servers)).set("loadRefresh", 0.01).set("clientCost", 0.1).start().await;
+    let paths = ["/session", "/"].into_iter().cycle().map(|path| session.websocket(path));
+    let mut clients = join_all(paths.take(50).map(|url| async move { Client::connect(&url).await })).await;
+    let flap = async {
+        for turn in 0..60 {
+            let manner = match turn % 4 {
+                0 => Manner::idle(99.0, 10),
+                2 => Manner::Reset,
+                _ => Manner::idle(1.0, 1000),
+            };
+            servers[0].set(manner);
+            let seen = servers[0].requests();
+            until("it was looked at", async || servers[0].requests() > seen + 1).await;
+        }
+    };
+    flap.await;
+    // More come in the same moment as the next change.
+    servers[0].set(Manner::idle(99.0, 10));
+    let url = session.websocket("/session");
+    clients.extend(join_all((0..50).map(|_| Client::connect(&url))).await);
+    until_states(&session, &["full"]).await;
+    servers[0].set(Manner::idle(1.0, 1000));
+    until_states(&session, &["up"]).await;
+    for client in &mut clients {
+        // A value for each turn of the server, and no others before this answer.
+        client.send("").await;
+        client.until("ws://").await;
+        let values: Vec<&String> = client.heard.iter().filter(|text| !text.starts_with("ws://")).collect();
+        assert!(values.iter().all(|value| ["0", "1"].contains(&value.as_str())), "{values:?}");
+        assert!(values.windows(2).all(|pair| pair[0] != pair[1]), "{values:?}");
+        assert_eq!(values.last().unwrap().as_str(), "1");
+    }
+    assert!(clients[0].heard.len() > 20, "the server did not flap: {:?}", clients[0].heard);
+}
+
+#[actix_rt::test]
+async fn a_client_that_does_not_read_is_sent_away_and_one_that_reads_stays() {
+    let session = session_server(&[]).set("timing", serde_json::json!({"ping": 0.2, "silence": 1})).start().await;
+    let mut reader = Client::connect(&session.websocket("/session")).await;
+    let mut deaf = deaf(&session).await;
+    until("both are there", async || clients_of(&session).await == 2).await;
+    let closed = until("the deaf one is gone", async || clients_of(&session).await == 1);
+    // Reading is what answers pings.
+    reader.until("0").await;
+    let reads = reader.is_silent(Duration::from_secs(3));
+    let ((), silent) = futures_util::future::join(closed, reads).await;
+    assert!(silent, "{:?}", reader.heard);
+    let mut rest = Vec::new();
+    let end = actix_rt::time::timeout(Duration::from_secs(5), deaf.read_to_end(&mut rest)).await;
+    assert!(end.is_ok(), "its connection is still open");
+    assert_eq!(clients_of(&session).await, 1);
+}
+
+#[actix_rt::test]
+async fn nothing_piles_up_for_a_client_that_asks_without_reading() {
+    let session = session_server(&[]).start().await;
+    let mut stream = deaf(&session).await;
+    // A masked ping of 125 bytes.
+    let frame = [&[0x89, 0x80 | 125, 0, 0, 0, 0][..], &[b'x'; 125]].concat();
+    let mut flood = 0;
+    let end = async {
+        while stream.write_all(&frame).await.is_ok() {
+            flood += 1;
+            assert!(flood < 1_000_000, "it may ask for ever");
+            if flood % 100 == 0 {
+                actix_rt::time::sleep(Duration::from_millis(1)).await;
+            }
+        }
+    };
+    actix_rt::time::timeout(crate::support::SOON, end).await.expect("it is sent away");
+    until("it is forgotten", async || clients_of(&session).await == 0).await;
+    assert!(session.log().contains("asks without reading the answers"));
+}
+
+#[actix_rt::test]
+async fn more_clients_than_allowed_are_refused() {
+    let session = session_server(&[]).set("maxClients", 2).start().await;
+    let first = Client::connect(&session.websocket("/session")).await;
+    let _second = Client::connect(&session.websocket("/session")).await;
+    let refused = tokio_tungstenite::connect_async(session.websocket("/session")).await.unwrap_err();
+    assert!(refused.to_string().contains("503"), "{refused}");
+    first.leave().await;
+    until("there is room again", async || tokio_tungstenite::connect_async(session.websocket("/")).await.is_ok()).await;
+}

@@ -1,0 +1,185 @@
+//! What administrators and other programs see: pages, headers, logs, faults of the configuration.
+
+use std::collections::HashSet;
+
+use serde_json::json;
+
+use crate::stand_in::{Manner, StandIn};
+use crate::support::program::session_server;
+use crate::support::{http, until};
+use crate::{addresses, times_logged, until_states};
+
+#[actix_rt::test]
+async fn a_refusal_carries_a_time_to_come_back_that_is_drawn_at_random() {
+    let session = session_server(&[]).start().await;
+    let mut seconds = HashSet::new();
+    for _ in 0..100 {
+        let refused = http::get(&session.url("/session")).await;
+        assert_eq!(refused.status, 503);
+        assert_eq!(refused.text(), "Error: no simulation server available at the moment.");
+        seconds.insert(refused.header("retry-after").unwrap().parse::<u32>().unwrap());
+    }
+    assert_eq!(seconds, HashSet::from([2, 3, 4, 5, 6]));
+}
+
+#[actix_rt::test]
+async fn pages_of_other_origins_may_ask() {
+    let session = session_server(&[]).start().await;
+    for path in ["/", "/request", "/session", "/load", "/status", "/nothing"] {
+        for method in [awc::http::Method::GET, awc::http::Method::OPTIONS] {
+            let answer = awc::Client::default().request(method.clone(), session.url(path)).send().await.unwrap();
+            let header = |name| answer.headers().get(name).and_then(|value| value.to_str().ok());
+            assert_eq!(header("access-control-allow-origin"), Some("*"), "{method} {path}");
+            assert_eq!(header("access-control-allow-headers"), Some("x-requested-with"), "{method} {path}");
+            assert_eq!(header("access-control-allow-methods"), Some("POST, GET, OPTIONS"), "{method} {path}");
+            if method == awc::http::Method::OPTIONS {
+                assert!(answer.status().is_success(), "{method} {path}");
+            }
+        }
+    }
+    let nothing = http::get(&session.url("/nothing")).await;
+    assert_eq!(nothing.status, 404);
+    assert!(nothing.text().starts_with("Error: "));
+}
+
+#[actix_rt::test]
+async fn the_status_tells_all_of_each_server() {
+    let lab = json!({"load": 20, "version": "9", "docker": false, "allowedRepositories": ["https://github.com/lab"],
+        "instances": {"queued": 0, "starting": 1, "idle": 2, "running": 3, "places": 9, "arrivals": 6}});
+    let servers = [StandIn::start(Manner::Status(lab)), StandIn::start(Manner::Body(500, Vec::new()))];
+    let session = session_server(&addresses(&servers)).set("loadRefresh", 600).set("clientCost", 3).start().await;
+    until_states(&session, &["up", "down"]).await;
+    assert_eq!(http::get(&session.url("/session")).await.text(), servers[0].url());
+    let status = http::get(&session.url("/status")).await.json();
+    assert_eq!((&status["version"], &status["available"]), (&json!(env!("CARGO_PKG_VERSION")), &json!(true)));
+    assert_eq!((&status["clients"], &status["load"]), (&json!(0), &json!(20.0)));
+    assert!(status["uptime"].is_u64());
+    let (up, down) = (&status["servers"][0], &status["servers"][1]);
+    assert_eq!(up["address"], servers[0].address());
+    assert_eq!((&up["load"], &up["effectiveLoad"], &up["inFlight"]), (&json!(20.0), &json!(23.0), &json!(1)));
+    assert_eq!((&up["instances"]["running"], &up["instances"]["places"]), (&json!(3), &json!(9)));
+    assert_eq!(up["allowedRepositories"], json!(["https://github.com/lab"]));
+    assert!(up["age"].as_f64().unwrap() < 20.0 && up["latency"].as_f64().unwrap() < 3.0);
+    assert_eq!((&down["state"], &down["load"], &down["age"]), (&json!("down"), &json!(null), &json!(null)));
+    assert!(down["error"].as_str().unwrap().contains("500"));
+    assert_eq!(status["changes"].as_array().unwrap().len(), 2);
+    let page = http::get(&session.url("/monitor")).await;
+    assert!(page.header("content-type").unwrap().starts_with("text/html"));
+    for server in &servers {
+        assert!(page.text().contains(&server.address()));
+    }
+}
+
+#[actix_rt::test]
+async fn what_a_server_says_is_data_on_the_page_and_in_the_log() {
+    let evil = "<script>alert(1)</script>\r\n2026-01-01T00:00:00Z [ERROR] forged";
+    let servers = [StandIn::start(Manner::Body(200, evil.as_bytes().to_vec()))];
+    let session = session_server(&addresses(&servers)).start().await;
+    until_states(&session, &["down"]).await;
+    let page = http::get(&session.url("/monitor")).await.text();
+    assert!(!page.contains("<script>alert"), "{page}");
+    assert!(session.log().lines().all(|line| !line.starts_with("2026-01-01T00:00:00Z [ERROR]")));
+}
+
+#[actix_rt::test]
+async fn the_metrics_tell_what_an_alarm_needs() {
+    let servers = [StandIn::start(Manner::idle(20.0, 9)), StandIn::start(Manner::Reset)];
+    let session = session_server(&addresses(&servers)).set("loadRefresh", 600).set("clientCost", 3).start().await;
+    until_states(&session, &["up", "down"]).await;
+    let fresh = http::get(&session.url("/metrics")).await.text();
+    for outcome in ["placed", "unavailable", "not_accepted", "wrong_url"] {
+        assert!(fresh.contains(&format!("session_requests_total{{outcome=\"{outcome}\"}} 0")), "{fresh}");
+    }
+    http::get(&session.url("/session")).await;
+    http::get(&session.url("/session?url=nonsense")).await;
+    let answer = http::get(&session.url("/metrics")).await;
+    assert!(answer.header("content-type").unwrap().starts_with("text/plain"));
+    let text = answer.text();
+    let (up, down) = (servers[0].address(), servers[1].address());
+    for line in [
+        "session_available 1".to_owned(),
+        "session_clients 0".to_owned(),
+        "session_load_percent 20".to_owned(),
+        "session_requests_total{outcome=\"placed\"} 1".to_owned(),
+        "session_requests_total{outcome=\"wrong_url\"} 1".to_owned(),
+        "session_servers{state=\"up\"} 1".to_owned(),
+        "session_servers{state=\"down\"} 1".to_owned(),
+        format!("session_server_up{{server=\"{up}\"}} 1"),
+        format!("session_server_up{{server=\"{down}\"}} 0"),
+        format!("session_server_load_percent{{server=\"{up}\"}} 20"),
+        format!("session_server_effective_load_percent{{server=\"{up}\"}} 23"),
+        format!("session_server_in_flight{{server=\"{up}\"}} 1"),
+        "session_report_seconds_count 2".to_owned(),
+    ] {
+        assert!(text.lines().any(|found| found == line), "no {line:?} in {text}");
+    }
+    assert!(text.contains(&format!("session_server_latency_seconds{{server=\"{up}\"}}")), "{text}");
+    assert!(!text.contains(&format!("session_server_load_percent{{server=\"{down}\"}}")), "{text}");
+    assert_eq!(http::get(&session.url("/health")).await.text(), "ok");
+}
+
+#[actix_rt::test]
+async fn the_log_goes_to_a_file_that_is_rotated() {
+    let folder = tempfile::tempdir().unwrap();
+    let log = folder.path().join("log/session");
+    std::fs::create_dir_all(&log).unwrap();
+    let file = |suffix: &str| log.join(format!("output.log{suffix}"));
+    for old in 1..=10 {
+        std::fs::write(file(&format!(".{old}")), format!("old file {old}\n")).unwrap();
+    }
+    std::fs::write(file(""), vec![b'x'; 500_000]).unwrap();
+    let session = session_server(&[]).set("debug", false).folder(folder.path()).start().await;
+    until("the log is rotated", async || {
+        std::fs::read_to_string(file("")).is_ok_and(|text| text.contains("listens on"))
+    })
+    .await;
+    let first = std::fs::read(file(".1")).unwrap();
+    assert!(first.len() >= 500_000 && first.starts_with(b"xxx"));
+    assert_eq!(std::fs::read_to_string(file(".10")).unwrap(), "old file 9\n");
+    assert!(!file(".11").exists());
+    assert_eq!(times_logged(&session, "listens on"), 0, "standard output is for debug");
+}
+
+#[actix_rt::test]
+async fn port_0_takes_a_free_port_and_says_which() {
+    let session = session_server(&[]).set("port", 0).set("portRewrite", true).spawn();
+    let line = async || session.log().lines().find(|line| line.starts_with("session server: ")).map(str::to_owned);
+    until("it says where it is", async || line().await.is_some()).await;
+    let line = line().await.unwrap();
+    let port: u16 = line.rsplit_once("local port ").unwrap().1.trim_end_matches(')').parse().unwrap();
+    assert!(line.contains(&format!("http://localhost/{port}/monitor")), "{line}");
+    assert_eq!(http::get(&format!("http://127.0.0.1:{port}/health")).await.status, 200);
+    assert_eq!(times_logged(&session, &format!("listens on port {port}: http://localhost/{port}")), 1);
+}
+
+#[actix_rt::test]
+async fn a_fault_of_the_configuration_is_one_line_and_exit_code_2() {
+    for (key, value, words) in [
+        ("port", json!(65536), ["port", "65535"]),
+        ("simulationServers", json!("localhost:2000"), ["simulationServers", "sequence"]),
+        ("simulationServers", json!(["localhost"]), ["simulationServers[0]", "HOST:PORT"]),
+        ("simulationServers", json!(["a:1", "a:1"]), ["simulationServers", "twice"]),
+        ("drainedServers", json!(["a:1"]), ["drainedServers", "a:1"]),
+        ("loadThreshold", json!(-1), ["loadThreshold", "-1"]),
+        ("loadRefresh", json!(0), ["loadRefresh", "0"]),
+        ("timing", json!({"answer": "fast"}), ["timing.answer", "fast"]),
+        ("timing", json!({"anser": 1}), ["timing", "anser"]),
+        ("administrator", json!("nobody"), ["administrator", "nobody"]),
+    ] {
+        let mut session = session_server(&[]).set(key, value.clone()).spawn();
+        assert_eq!(session.ended().await, Some(2), "{key}: {value}");
+        let said = session.log();
+        assert_eq!(said.lines().count(), 1, "{said}");
+        assert!(said.starts_with("error: ") && said.contains("config.json: "), "{said}");
+        assert!(words.iter().all(|word| said.contains(word)), "{key}: {value} gives {said}");
+    }
+}
+
+#[actix_rt::test]
+async fn a_port_that_is_taken_is_one_line_and_exit_code_1() {
+    let taken = StandIn::start(Manner::Hang);
+    let mut session = session_server(&[]).set("port", taken.port()).spawn();
+    assert_eq!(session.ended().await, Some(1));
+    let said = session.log();
+    assert!(said.contains(&format!("error: can't listen on {}: ", taken.address())), "{said}");
+}

@@ -1,0 +1,213 @@
+//! Stand-ins for simulation servers, which behave as a test says: well, like a Python server, or badly.
+
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex};
+use std::time::Duration;
+
+use serde_json::{Value, json};
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::net::{TcpListener, TcpSocket, TcpStream};
+use tokio_util::sync::CancellationToken;
+
+/// How a stand-in answers.
+#[derive(Debug, Clone)]
+pub enum Manner {
+    /// Tells this in `/status`.
+    Status(Value),
+    /// Has no `/status`; tells this in `/load`, as Python servers do.
+    Load(String),
+    /// Gives this status and body to every request.
+    Body(u16, Vec<u8>),
+    /// Sends these bytes, whatever they are, and ends the connection.
+    Raw(Vec<u8>),
+    /// Waits so long before it tells a load of 1 %.
+    Slow(Duration),
+    /// Takes connections and says nothing.
+    Hang,
+    /// Takes connections and breaks them.
+    Reset,
+    /// Sends an answer byte by byte, without an end.
+    Drip,
+}
+
+impl Manner {
+    /// A status with a load and so many places, all free.
+    pub fn idle(load: f64, places: u32) -> Self {
+        Self::status(load, 0, places)
+    }
+
+    /// A status with so many simulations in so many places.
+    pub fn status(load: f64, running: u32, places: u32) -> Self {
+        let instances = json!({"queued": 0, "starting": 0, "idle": 0, "running": running, "places": places,
+            "arrivals": running});
+        Self::Status(json!({"version": "stand-in", "load": load, "instances": instances}))
+    }
+
+    /// A status that allows one owner's worlds and no others.
+    pub fn of_owner(owner: &str) -> Self {
+        let instances = json!({"places": 100});
+        let allowed = [format!("https://github.com/{owner}")];
+        Self::Status(json!({"load": 1, "instances": instances, "docker": false, "allowedRepositories": allowed}))
+    }
+}
+
+/// A stand-in. Its port refuses connections when it is dropped.
+pub struct StandIn {
+    port: u16,
+    shared: Arc<Shared>,
+    end: CancellationToken,
+}
+
+struct Shared {
+    manner: Mutex<Manner>,
+    connections: AtomicUsize,
+    busy: AtomicUsize,
+    most_busy: AtomicUsize,
+    paths: Mutex<Vec<String>>,
+}
+
+impl StandIn {
+    /// Starts one on any free port.
+    pub fn start(manner: Manner) -> Self {
+        Self::start_at(0, manner)
+    }
+
+    /// Starts one on this port.
+    pub fn start_at(port: u16, manner: Manner) -> Self {
+        let socket = TcpSocket::new_v4().unwrap();
+        socket.set_reuseaddr(true).unwrap();
+        socket.bind(([127, 0, 0, 1], port).into()).unwrap();
+        let listener = socket.listen(1024).unwrap();
+        let port = listener.local_addr().unwrap().port();
+        let shared = Arc::new(Shared {
+            manner: Mutex::new(manner),
+            connections: AtomicUsize::new(0),
+            busy: AtomicUsize::new(0),
+            most_busy: AtomicUsize::new(0),
+            paths: Mutex::new(Vec::new()),
+        });
+        let end = CancellationToken::new();
+        let serving = serve(listener, Arc::clone(&shared), end.clone());
+        actix_rt::spawn(end.clone().run_until_cancelled_owned(serving));
+        Self { port, shared, end }
+    }
+
+    /// `HOST:PORT`.
+    pub fn address(&self) -> String {
+        format!("127.0.0.1:{}", self.port)
+    }
+
+    /// Its port.
+    pub fn port(&self) -> u16 {
+        self.port
+    }
+
+    /// What the session server tells a client that is sent here.
+    pub fn url(&self) -> String {
+        format!("ws://{}", self.address())
+    }
+
+    /// Behaves so from now on. A connection that hangs goes on hanging.
+    pub fn set(&self, manner: Manner) {
+        *self.shared.manner.lock().unwrap() = manner;
+    }
+
+    /// How many connections it has had.
+    pub fn connections(&self) -> usize {
+        self.shared.connections.load(Ordering::SeqCst)
+    }
+
+    /// How many requests it was busy with at the same time, at most.
+    pub fn most_busy(&self) -> usize {
+        self.shared.most_busy.load(Ordering::SeqCst)
+    }
+
+    /// What it was asked for.
+    pub fn paths(&self) -> Vec<String> {
+        self.shared.paths.lock().unwrap().clone()
+    }
+
+    /// How many requests it has had.
+    pub fn requests(&self) -> usize {
+        self.shared.paths.lock().unwrap().len()
+    }
+}
+
+impl Drop for StandIn {
+    fn drop(&mut self) {
+        self.end.cancel();
+    }
+}
+
+async fn serve(listener: TcpListener, shared: Arc<Shared>, end: CancellationToken) {
+    while let Ok((stream, _)) = listener.accept().await {
+        shared.connections.fetch_add(1, Ordering::SeqCst);
+        let shared = Arc::clone(&shared);
+        actix_rt::spawn(end.clone().run_until_cancelled_owned(async move { converse(stream, &shared).await }));
+    }
+}
+
+/// Answers on one connection until it ends.
+async fn converse(mut stream: TcpStream, shared: &Shared) -> std::io::Result<()> {
+    stream.set_nodelay(true)?;
+    while let Some(path) = next_request(&mut stream).await? {
+        shared.paths.lock().unwrap().push(path.clone());
+        let busy = shared.busy.fetch_add(1, Ordering::SeqCst) + 1;
+        shared.most_busy.fetch_max(busy, Ordering::SeqCst);
+        let manner = shared.manner.lock().unwrap().clone();
+        let answered = answer(&mut stream, &path, manner).await;
+        shared.busy.fetch_sub(1, Ordering::SeqCst);
+        if !answered? {
+            break;
+        }
+    }
+    Ok(())
+}
+
+/// The path of the next request; nothing at the end of the connection.
+async fn next_request(stream: &mut TcpStream) -> std::io::Result<Option<String>> {
+    let mut head = Vec::new();
+    while !head.ends_with(b"\r\n\r\n") {
+        if stream.read_buf(&mut head).await? == 0 {
+            return Ok(None);
+        }
+    }
+    let text = String::from_utf8_lossy(&head).into_owned();
+    Ok(text.split(' ').nth(1).map(str::to_owned))
+}
+
+/// Whether the connection goes on.
+async fn answer(stream: &mut TcpStream, path: &str, manner: Manner) -> std::io::Result<bool> {
+    match manner {
+        Manner::Status(status) if path == "/status" => send(stream, 200, status.to_string().as_bytes()).await?,
+        Manner::Load(load) if path == "/load" => send(stream, 200, load.as_bytes()).await?,
+        Manner::Status(_) | Manner::Load(_) => send(stream, 404, b"404: Not Found").await?,
+        Manner::Body(status, body) => send(stream, status, &body).await?,
+        Manner::Slow(time) => {
+            actix_rt::time::sleep(time).await;
+            send(stream, 200, br#"{"load": 1}"#).await?;
+        }
+        Manner::Raw(bytes) => {
+            stream.write_all(&bytes).await?;
+            return Ok(false);
+        }
+        Manner::Hang => std::future::pending().await,
+        Manner::Reset => {
+            stream.set_zero_linger()?;
+            return Ok(false);
+        }
+        Manner::Drip => {
+            stream.write_all(b"HTTP/1.1 200 OK\r\nContent-Length: 100000\r\n\r\n").await?;
+            loop {
+                stream.write_all(b" ").await?;
+                actix_rt::time::sleep(Duration::from_millis(20)).await;
+            }
+        }
+    }
+    Ok(true)
+}
+
+async fn send(stream: &mut TcpStream, status: u16, body: &[u8]) -> std::io::Result<()> {
+    let head = format!("HTTP/1.1 {status} -\r\nContent-Length: {}\r\n\r\n", body.len());
+    stream.write_all(&[head.as_bytes(), body].concat()).await
+}

@@ -1,0 +1,180 @@
+//! How simulation servers are watched, and what those do no harm that misbehave.
+
+use std::time::{Duration, Instant};
+
+use crate::stand_in::{Manner, StandIn};
+use crate::support::client::Client;
+use crate::support::program::session_server;
+use crate::support::{http, until};
+use crate::{addresses, times_logged, until_states};
+
+fn good() -> Manner {
+    Manner::idle(5.0, 10)
+}
+
+fn load(text: &str) -> Manner {
+    Manner::Load(text.to_owned())
+}
+
+fn json(text: &str) -> Manner {
+    Manner::Body(200, text.as_bytes().to_vec())
+}
+
+/// Everything that is no usable answer.
+fn bad_manners() -> Vec<Manner> {
+    vec![
+        Manner::Hang,
+        Manner::Reset,
+        Manner::Drip,
+        Manner::Slow(Duration::from_secs(5)),
+        Manner::Raw(b"".to_vec()),
+        Manner::Raw(b"SSH-2.0-OpenSSH_9.2\r\n".to_vec()),
+        Manner::Raw(b"HTTP/1.1 200 OK\r\nContent-Length: 50\r\n\r\n{\"load\": 1".to_vec()),
+        Manner::Raw([b"HTTP/1.1 200 OK\r\nX: ".to_vec(), vec![b'x'; 2_000_000]].concat()),
+        Manner::Body(500, b"5.0".to_vec()),
+        Manner::Body(302, b"5.0".to_vec()),
+        Manner::Body(404, b"5.0".to_vec()),
+        Manner::Body(200, vec![b' '; 10_000_000]),
+        Manner::Body(200, vec![0xff; 100]),
+        json(""),
+        json("[]"),
+        json("{}"),
+        json("<html>5</html>"),
+        json(r#"{"load": "5"}"#),
+        json(r#"{"load": -1}"#),
+        json(r#"{"load": NaN}"#),
+        json(r#"{"load": 1e300}"#),
+        json(r#"{"load": 1, "instances": {"places": -5}}"#),
+        json(&"[".repeat(100_000)),
+        load(""),
+        load("NaN"),
+        load("inf"),
+        load("-1"),
+        load("1e300"),
+        load("5 %"),
+    ]
+}
+
+#[actix_rt::test]
+async fn no_bad_answer_is_taken_for_a_good_one_and_each_server_recovers() {
+    let bad = bad_manners();
+    let servers: Vec<StandIn> = bad.iter().map(|_| StandIn::start(good())).collect();
+    let session = session_server(&addresses(&servers)).set("timing", serde_json::json!({"answer": 1})).start().await;
+    let mut client = Client::connect(&session.websocket("/session")).await;
+    client.until("1").await;
+    until_states(&session, &vec!["up"; bad.len()]).await;
+    for (server, manner) in servers.iter().zip(&bad) {
+        server.set(manner.clone());
+    }
+    until_states(&session, &vec!["down"; bad.len()]).await;
+    client.until("0").await;
+    assert_eq!(http::get(&session.url("/load")).await.text(), "-1");
+    // Several looks more at each of them.
+    let requests: Vec<usize> = servers.iter().map(StandIn::requests).collect();
+    for (server, before) in servers.iter().zip(requests) {
+        until("each server is looked at again", async || server.requests() > before + 1).await;
+    }
+    assert_eq!(http::get(&session.url("/request")).await.text(), "0");
+    for server in &servers {
+        server.set(good());
+    }
+    client.until("1").await;
+    until_states(&session, &vec!["up"; bad.len()]).await;
+    for (server, manner) in servers.iter().zip(&bad) {
+        let address = server.address();
+        let logged =
+            (times_logged(&session, &format!("{address}: down")), times_logged(&session, &format!("{address}: up")));
+        assert_eq!(logged, (1, 2), "{manner:?}");
+    }
+    assert_eq!(client.heard, ["0", "1", "0", "1"].map(str::to_owned)[usize::from(client.heard[0] == "1")..]);
+}
+
+#[actix_rt::test]
+async fn absurd_numbers_do_no_harm() {
+    let most = u32::MAX;
+    let absurd = serde_json::json!({"load": 1, "instances": {"queued": most, "starting": most, "idle": most,
+        "running": most, "places": most, "arrivals": u64::MAX}});
+    let servers = [StandIn::start(Manner::Status(absurd)), StandIn::start(good())];
+    let session = session_server(&addresses(&servers)).start().await;
+    until_states(&session, &["full", "up"]).await;
+    assert_eq!(http::get(&session.url("/session")).await.text(), servers[1].url());
+}
+
+#[actix_rt::test]
+async fn a_crashed_server_is_noticed_within_one_refresh_and_costs_nothing_while_another_is_there() {
+    let mut servers = vec![StandIn::start(good()), StandIn::start(good())];
+    let session = session_server(&addresses(&servers)).set("loadRefresh", 1).start().await;
+    let mut client = Client::connect(&session.websocket("/session")).await;
+    until_states(&session, &["up", "up"]).await;
+    let (crash, left) = (Instant::now(), servers.remove(0).address());
+    until_states(&session, &["down", "up"]).await;
+    assert!(crash.elapsed() < Duration::from_millis(1500), "noticed after {:?}", crash.elapsed());
+    for _ in 0..5 {
+        assert_eq!(http::get(&session.url("/session")).await.text(), servers[0].url());
+    }
+    assert_eq!(client.until("1").await, "1");
+    drop(servers);
+    client.until("0").await;
+    let port = left.rsplit_once(':').unwrap().1.parse().unwrap();
+    let _again = StandIn::start_at(port, good());
+    client.until("1").await;
+    assert_eq!(client.heard.last().unwrap(), "1");
+}
+
+#[actix_rt::test]
+async fn a_hung_server_is_noticed_within_the_time_limit_and_holds_up_nobody() {
+    let servers = [(); 10].map(|()| StandIn::start(Manner::idle(5.0, 1000)));
+    let timing = serde_json::json!({"answer": 2, "placement": 0.2});
+    let session = session_server(&addresses(&servers)).set("timing", timing).start().await;
+    until_states(&session, &["up"; 10]).await;
+    let hung = Instant::now();
+    servers[0].set(Manner::Hang);
+    let states = ["down", "up", "up", "up", "up", "up", "up", "up", "up", "up"];
+    while session.log().matches(&format!("{}: down: no answer within 2 s", servers[0].address())).count() == 0 {
+        let begin = Instant::now();
+        assert_eq!(http::get(&session.url("/session")).await.status, 200);
+        assert!(begin.elapsed() < Duration::from_secs(1), "an answer took {:?}", begin.elapsed());
+        assert!(hung.elapsed() < Duration::from_secs(4), "not noticed after {:?}", hung.elapsed());
+    }
+    let others: Vec<usize> = servers.iter().map(StandIn::requests).collect();
+    until_states(&session, &states).await;
+    for (server, before) in servers.iter().zip(others).skip(1) {
+        until("the others are still asked", async || server.requests() > before).await;
+    }
+}
+
+#[actix_rt::test]
+async fn each_server_has_one_connection_and_one_request_in_flight() {
+    let servers = [StandIn::start(good()), StandIn::start(Manner::Slow(Duration::from_millis(250)))];
+    let session = session_server(&addresses(&servers)).set("loadRefresh", 0.05).start().await;
+    for server in &servers {
+        until("some looks are over", async || server.requests() >= 6).await;
+        assert_eq!((server.connections(), server.most_busy()), (1, 1));
+    }
+    until_states(&session, &["up", "up"]).await;
+}
+
+#[actix_rt::test]
+async fn a_python_server_is_asked_for_its_load_and_not_for_a_status_each_time() {
+    let servers = [StandIn::start(load("12.5"))];
+    let session = session_server(&addresses(&servers)).start().await;
+    until("some looks are over", async || servers[0].requests() >= 6).await;
+    let paths = servers[0].paths();
+    assert_eq!(paths[0], "/status");
+    assert!(paths[1..].iter().all(|path| path == "/load"), "{paths:?}");
+    assert_eq!(http::get(&session.url("/load")).await.text(), "12.5");
+}
+
+#[actix_rt::test]
+async fn no_report_of_a_thousand_servers_is_lost() {
+    let servers: Vec<StandIn> = (0..1000).map(|_| StandIn::start(good())).collect();
+    let session =
+        session_server(&addresses(&servers)).set("loadRefresh", 600).set("timing", serde_json::json!({"answer": 15}));
+    let session = session.start().await;
+    until("all have reported", async || {
+        http::get(&session.url("/metrics")).await.text().contains("session_servers{state=\"up\"} 1000")
+    })
+    .await;
+    // Each was looked at when the server started, and perhaps once more.
+    assert!(servers.iter().all(|server| server.requests() <= 2));
+}

@@ -1,0 +1,38 @@
+//! Whose worlds run here.
+
+use crate::support::client::Client;
+use crate::support::git::Forge;
+use crate::support::program::simulation_server;
+use crate::support::webots::Webots;
+
+#[actix_rt::test]
+async fn a_world_runs_only_where_its_repository_is_allowed() {
+    let (forge, webots) = (Forge::with_arm(), Webots::script("echo ran; exit 1"));
+    for name in ["lab-evil/arm", "lab/secret"] {
+        forge.commit(name, "main", &[("worlds/a.wbt", "#VRML_SIM R2025a utf8\n")]);
+    }
+    let builder = simulation_server(&webots.path(), forge.path(), 2);
+    let server = builder.set("blockedRepositories", "https://github.com/lab/secret").start().await;
+    let end = "blob/main/worlds/a.wbt";
+    let not_allowed = "is not one of the repositories that this simulation server allows";
+    let wrong = "Wrong Webots simulation URL";
+    let table = [
+        (format!("https://github.com/lab/arm/{end}"), "Its last output: ran"),
+        (format!("https://GITHUB.com/lab/arm/{end}"), "Its last output: ran"),
+        (format!("https://github.com/lab-evil/arm/{end}"), not_allowed),
+        (format!("https://github.com/lab/secret/{end}"), "Cannot run simulation from blocked repository"),
+        (format!("https://github.com/LAB/Secret/{end}"), "Cannot run simulation from blocked repository"),
+        (format!("https://github.com/lab/../lab-evil/arm/{end}"), wrong),
+        (format!("https://github.com/lab/%2e%2e/lab-evil/arm/{end}"), wrong),
+        (format!("https://github.com/lab%2farm/x/{end}"), wrong),
+        (format!("https://github.com//lab/arm/{end}"), wrong),
+        (format!("https://github.com@evil.org/lab/arm/{end}"), wrong),
+        (format!("https://github.com:444/lab/arm/{end}"), not_allowed),
+        (format!("https://evil.org/github.com/lab/{end}"), not_allowed),
+        (format!("https://github.com.evil.org/lab/arm/{end}"), not_allowed),
+    ];
+    for (url, words) in table {
+        let told = Client::start(&server, &url).await.until("loading: Error:").await;
+        assert!(told.contains(words), "{url}: {told}");
+    }
+}

@@ -1,0 +1,487 @@
+//! Checkouts: what a URL names, the cache, limits, and what an evil repository can't do.
+
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+use futures_util::future::join_all;
+use nix::sys::signal::{Signal, kill};
+use nix::unistd::Pid;
+
+use crate::git_wrapper::GitWrapper;
+use crate::scene::{arm, instance_folders, nothing_left};
+use crate::support::client::Client;
+use crate::support::git::{Forge, WORLD, git, world};
+use crate::support::program::{Server, simulation_server};
+use crate::support::until;
+use crate::support::webots::{Webots, instances_below};
+
+/// A Webots that tells which world it was given, and ends: its client hears the world's second line.
+fn reader() -> Webots {
+    Webots::script("for last; do :; done\necho \"opened [$(sed -n 2p \"$last\")] $last\"\nexit 1")
+}
+
+fn world_text(mark: &str) -> String {
+    format!("#VRML_SIM R2025a utf8\n{mark}\n")
+}
+
+/// What a client that asks for a world is told in the end.
+async fn outcome(server: &Server, world: &str) -> String {
+    let mut client = Client::start(server, world).await;
+    let told = client.until("loading: Error:").await;
+    assert_eq!(client.closed().await, Some(1000));
+    told
+}
+
+fn size_of(folder: &Path) -> u64 {
+    let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
+    entries
+        .map(|entry| {
+            if entry.path().is_dir() { size_of(&entry.path()) } else { entry.metadata().map_or(0, |about| about.len()) }
+        })
+        .sum()
+}
+
+/// Bytes that can't be packed.
+fn noise(bytes: usize) -> Vec<u8> {
+    let mut state = 0x9e37_79b9_7f4a_7c15_u64 ^ (bytes as u64);
+    let mut next = || {
+        state ^= state << 13;
+        state ^= state >> 7;
+        state ^= state << 17;
+        state
+    };
+    (0..bytes.div_ceil(8)).flat_map(|_| next().to_le_bytes()).collect()
+}
+
+fn cached(server: &Server) -> Vec<PathBuf> {
+    let entries = std::fs::read_dir(server.folder.join("cache/git")).unwrap().flatten().map(|entry| entry.path());
+    entries.filter(|path| path.is_dir()).collect()
+}
+
+#[actix_rt::test]
+async fn every_kind_of_url_opens_its_world() {
+    let (forge, webots) = (Forge::new(), reader());
+    let first = forge.commit("lab/arm", "main", &[("worlds/a.wbt", &world_text("root of main"))]);
+    forge.tag("lab/arm", "v1.0");
+    forge.commit(
+        "lab/arm",
+        "main",
+        &[("worlds/a.wbt", &world_text("newer")), ("p q/worlds/b é.wbt", &world_text("spaces"))],
+    );
+    forge.commit("lab/arm", "feature/arm", &[("sub/worlds/a.wbt", &world_text("slashes"))]);
+    let quote = "q'\"$(touch${IFS}pwned)`id`";
+    forge.commit("lab/arm", quote, &[("worlds/a.wbt", &world_text("quotes"))]);
+    forge.commit("group/team/leg", "main", &[("worlds/a.wbt", &world_text("gitlab"))]);
+    let file = format!("file:{}", forge.path().display());
+    let mirrors =
+        serde_json::json!({"https://github.com/": file, "https://gitlab.lab/": file, "https://gitea.lab:3000/": file});
+    let allowed = serde_json::json!(["https://github.com/lab", "https://gitlab.lab", "https://gitea.lab:3000"]);
+    let builder = simulation_server(&webots.path(), forge.path(), 2);
+    let server = builder.set("gitMirrors", mirrors).set("allowedRepositories", allowed).start().await;
+    let table = [
+        ("https://github.com/lab/arm/blob/main/worlds/a.wbt".to_owned(), "newer"),
+        ("https://github.com/lab/arm/tree/main/worlds/a.wbt".to_owned(), "newer"),
+        ("https://GitHub.com/lab/arm/blob/v1.0/worlds/a.wbt".to_owned(), "root of main"),
+        (format!("https://github.com/lab/arm/blob/{first}/worlds/a.wbt"), "root of main"),
+        ("https://github.com/lab/arm/blob/main/p%20q/worlds/b%20%C3%A9.wbt".to_owned(), "spaces"),
+        ("https://github.com/lab/arm/blob/feature/arm/sub/worlds/a.wbt".to_owned(), "slashes"),
+        ("https://github.com/lab/arm/blob/q'%22$(touch$%7BIFS%7Dpwned)%60id%60/worlds/a.wbt".to_owned(), "quotes"),
+        ("https://gitlab.lab/group/team/leg/-/blob/main/worlds/a.wbt".to_owned(), "gitlab"),
+        ("https://gitea.lab:3000/lab/arm/src/branch/feature/arm/sub/worlds/a.wbt".to_owned(), "slashes"),
+        ("https://gitea.lab:3000/lab/arm/src/tag/v1.0/worlds/a.wbt".to_owned(), "root of main"),
+        (format!("https://gitea.lab:3000/lab/arm/src/commit/{first}/worlds/a.wbt"), "root of main"),
+    ];
+    for (url, mark) in table {
+        let told = outcome(&server, &url).await;
+        assert!(told.contains(&format!("opened [{mark}]")), "{url}: {told}");
+    }
+    assert!(!server.folder.join("pwned").exists() && !Path::new("pwned").exists(), "a name was run");
+    assert!(server.log().contains("is for Webots R2025a"));
+}
+
+#[actix_rt::test]
+async fn what_is_not_there_or_no_world_is_told_in_words() {
+    let (forge, webots) = (Forge::with_arm(), reader());
+    let work = forge.work_tree("lab/arm", "main");
+    for (target, link) in
+        [("/etc/passwd", "passwd.wbt"), ("../../../../outside.wbt", "outside.wbt"), ("a.wbt", "inside.wbt")]
+    {
+        std::os::unix::fs::symlink(target, work.join("worlds").join(link)).unwrap();
+    }
+    std::fs::write(work.join("worlds/page.wbt"), "<html>").unwrap();
+    forge.commit_work_tree("lab/arm", "main");
+    let server = simulation_server(&webots.path(), forge.path(), 2).start().await;
+    std::fs::write(server.folder.join("outside.wbt"), world_text("outside")).unwrap();
+    let none = "0123456789012345678901234567890123456789";
+    let table = [
+        (world("lab/none", "main", "worlds/a.wbt"), "https://github.com/lab/none does not exist or is not public"),
+        (
+            world("lab/arm", "none", "worlds/a.wbt"),
+            "https://github.com/lab/arm has no branch, tag or commit called \"none\"",
+        ),
+        (world("lab/arm", none, "worlds/a.wbt"), "https://github.com/lab/arm has no branch, tag or commit called"),
+        (world("lab/arm", "main", "worlds/none.wbt"), "worlds/none.wbt in main does not exist"),
+        (world("lab/arm", "main", "p/worlds/a.wbt"), "p/worlds/a.wbt in main does not exist"),
+        (world("lab/arm", "main", "worlds/passwd.wbt"), "passwd.wbt leads out of its repository"),
+        (world("lab/arm", "main", "worlds/outside.wbt"), "outside.wbt"),
+        (world("lab/arm", "main", "worlds/page.wbt"), "page.wbt is no world file: its first line is \"<html>\""),
+        (world("lab/arm", "main", "worlds/inside.wbt"), "opened [WorldInfo"),
+    ];
+    for (url, words) in table {
+        let told = outcome(&server, &url).await;
+        assert!(told.contains(words) && !told.contains("root:"), "{url}: {told}");
+        nothing_left(&server, 2).await;
+    }
+}
+
+#[actix_rt::test]
+async fn a_repository_can_run_nothing() {
+    let (forge, webots) = (Forge::with_arm(), reader());
+    let trap = tempfile::tempdir().unwrap();
+    let touch = |name: &str| format!("touch {}", trap.path().join(name).display());
+    let work = forge.work_tree("lab/arm", "main");
+    std::fs::write(work.join(".gitattributes"), "* filter=evil diff=evil\n").unwrap();
+    std::fs::write(
+        work.join(".gitmodules"),
+        format!("[submodule \"m\"]\n\tpath = m\n\turl = ext::sh -c {}\n", touch("m").replace(' ', "% ")),
+    )
+    .unwrap();
+    git(&work, &["add", "--all"]);
+    git(&work, &["update-index", "--add", "--cacheinfo", "160000,0123456789012345678901234567890123456789,m"]);
+    forge.commit_work_tree("lab/arm", "main");
+    // Hooks and filters of the forge's own repository.
+    let bare = forge.path().join("lab/arm");
+    for hook in ["post-checkout", "pre-auto-gc", "reference-transaction"] {
+        std::fs::write(bare.join("hooks").join(hook), format!("#!/bin/sh\n{}\n", touch(hook))).ok();
+        git(&bare, &["config", "filter.evil.smudge", &touch("smudge")]);
+    }
+    // Settings of the user as whom the server runs.
+    let home = trap.path().join("home");
+    std::fs::create_dir(&home).unwrap();
+    std::fs::write(
+        home.join(".gitconfig"),
+        format!("[filter \"evil\"]\n\tsmudge = {}\n[core]\n\tsshCommand = false\n", touch("home")),
+    )
+    .unwrap();
+    let server = simulation_server(&webots.path(), forge.path(), 2).env("HOME", home.to_str().unwrap()).start().await;
+    let told = outcome(&server, &arm()).await;
+    assert!(told.contains("opened [WorldInfo"), "{told}");
+    let left: Vec<_> = std::fs::read_dir(trap.path()).unwrap().flatten().map(|entry| entry.file_name()).collect();
+    assert_eq!(left, ["home"]);
+}
+
+#[actix_rt::test]
+async fn a_remote_that_hangs_costs_only_its_own_client() {
+    let (forge, webots) = (Forge::with_arm(), reader());
+    let hanging = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+    let mirrors = serde_json::json!({
+        "https://github.com/": format!("file:{}", forge.path().display()),
+        "https://github.com/lab/hangs": format!("https://127.0.0.1:{}/", hanging.local_addr().unwrap().port()),
+    });
+    let builder = simulation_server(&webots.path(), forge.path(), 12).set("gitMirrors", mirrors);
+    let server = builder.set("timing.checkout", 3.0).start().await;
+    let begin = Instant::now();
+    let mut stuck = Client::start(&server, &world("lab/hangs", "main", "worlds/a.wbt")).await;
+    stuck.until("loading: looking for").await;
+    let all = join_all((0..10).map(|_| async { outcome(&server, &arm()).await })).await;
+    assert!(all.iter().all(|told| told.contains("opened [WorldInfo")), "{all:?}");
+    assert!(instances_below(&server.folder).iter().any(|one| one.1.contains("ls-remote")), "it still hangs");
+    let told = stuck.until("loading: Error:").await;
+    assert!(told.contains("Fetching https://github.com/lab/hangs took longer than 3 seconds"), "{told}");
+    assert!(begin.elapsed() >= Duration::from_secs(3));
+    nothing_left(&server, 12).await;
+}
+
+#[actix_rt::test]
+async fn sizes_are_limited() {
+    let (forge, webots) = (Forge::with_arm(), reader());
+    let work = forge.work_tree("lab/arm", "main");
+    std::fs::write(work.join("noise"), noise(6 << 20)).unwrap();
+    forge.commit_work_tree("lab/arm", "main");
+    forge.commit("lab/zeros", "main", &[("worlds/a.wbt", &world_text("zeros")), ("zeros", &"0".repeat(6 << 20))]);
+    // A project beside it is small, but all of its commit is fetched.
+    let server = simulation_server(&webots.path(), forge.path(), 2).set("projectSize", 1).start().await;
+    let told = outcome(&server, &arm()).await;
+    assert!(told.ends_with("is larger than 1 MiB"), "{told}");
+    let told = outcome(&server, &world("lab/zeros", "main", "worlds/a.wbt")).await;
+    assert_eq!(told, "loading: Error: The project is larger than 1 MiB", "it is small only as it is packed");
+    nothing_left(&server, 2).await;
+}
+
+#[actix_rt::test]
+async fn equal_checkouts_are_done_once_and_a_cached_start_fetches_nothing() {
+    let (forge, webots) = (Forge::with_arm(), reader());
+    let wrapper = GitWrapper::new("case \"$*\" in *fetch*) sleep 0.7;; esac");
+    let server = simulation_server(&webots.path(), forge.path(), 6).env("PATH", &wrapper.path()).start().await;
+    let all = join_all((0..5).map(|_| async { outcome(&server, &arm()).await })).await;
+    assert!(all.iter().all(|told| told.contains("opened [WorldInfo")), "{all:?}");
+    let count = |what: &str| wrapper.calls().iter().filter(|call| call.split(' ').any(|word| word == what)).count();
+    assert_eq!((count("ls-remote"), count("init"), count("fetch"), count("checkout")), (1, 1, 1, 5));
+    outcome(&server, &arm()).await;
+    assert_eq!((count("ls-remote"), count("fetch"), count("checkout")), (2, 1, 6));
+    // Only what has changed is fetched.
+    let work = forge.work_tree("lab/arm", "main");
+    std::fs::write(work.join("noise"), noise(1 << 20)).unwrap();
+    forge.commit_work_tree("lab/arm", "main");
+    outcome(&server, &arm()).await;
+    let before = size_of(&server.folder.join("cache/git"));
+    forge.commit("lab/arm", "main", &[("worlds/a.wbt", &world_text("changed"))]);
+    assert!(outcome(&server, &arm()).await.contains("opened [changed]"));
+    let grown = size_of(&server.folder.join("cache/git")) - before;
+    assert!(before > 1 << 20 && grown < 20_000, "{grown} bytes were fetched");
+    // A client that waits alone ends git when it leaves.
+    forge.commit("lab/arm", "main", &[("worlds/a.wbt", &world_text("once more"))]);
+    let mut impatient = Client::start(&server, &arm()).await;
+    impatient.until("loading: looking for").await;
+    until("it fetches", async || count("fetch") == 4).await;
+    impatient.leave().await;
+    nothing_left(&server, 6).await;
+}
+
+#[actix_rt::test]
+async fn progress_moves_in_percent() {
+    let (forge, webots) = (Forge::with_arm(), reader());
+    let wrapper = GitWrapper::new(
+        "case \"$*\" in *fetch*) for n in 10 35 60 85; do printf 'Receiving objects: %s%% (1/2)\\r' $n >&2; sleep 0.15; done;; esac",
+    );
+    let server = simulation_server(&webots.path(), forge.path(), 1).env("PATH", &wrapper.path()).start().await;
+    let mut client = Client::start(&server, &arm()).await;
+    for percent in [10, 35, 60, 85] {
+        client.until(&format!("loading: fetching https://github.com/lab/arm: Receiving objects: {percent}%")).await;
+    }
+    client.until("loading: checkout done").await;
+}
+
+#[actix_rt::test]
+async fn the_cache_keeps_to_its_budget() {
+    let (forge, webots) = (Forge::new(), reader());
+    for name in ["lab/one", "lab/two", "lab/three"] {
+        forge.commit(name, "main", &[("worlds/a.wbt", &world_text(name))]);
+    }
+    let grow = |name: &str, bytes: usize| {
+        let work = forge.work_tree(name, "main");
+        std::fs::write(work.join(format!("noise{bytes}")), noise(bytes)).unwrap();
+        forge.commit_work_tree(name, "main");
+    };
+    let server = simulation_server(&webots.path(), forge.path(), 2).set("cacheSize", 1).start().await;
+    let ask = async |name: &str| assert!(outcome(&server, &world(name, "main", "worlds/a.wbt")).await.contains(name));
+    let has = |name: &str| cached(&server).iter().any(|path| path.to_string_lossy().contains(&name.replace('/', "-")));
+    for name in ["lab/one", "lab/two", "lab/three"] {
+        grow(name, 200_000);
+        ask(name).await;
+        actix_rt::time::sleep(Duration::from_millis(20)).await;
+    }
+    assert!(has("lab/one") && has("lab/two") && has("lab/three"));
+    // One that was there already grows: it counts too, and the one that was used least recently goes.
+    grow("lab/one", 600_000);
+    ask("lab/one").await;
+    until("the oldest is gone", async || !has("lab/two")).await;
+    assert!(has("lab/one") && has("lab/three"));
+}
+
+/// Breaks a cached repository.
+type Damage = fn(&Path);
+
+#[actix_rt::test]
+async fn a_damaged_cache_heals() {
+    let (forge, webots) = (Forge::with_arm(), reader());
+    let server = simulation_server(&webots.path(), forge.path(), 2).start().await;
+    let damage: [(&str, Damage); 5] = [
+        ("a pack is cut", |repository| {
+            for pack in std::fs::read_dir(repository.join("objects/pack")).unwrap().flatten() {
+                if pack.path().extension().is_some_and(|extension| extension == "pack") {
+                    std::fs::remove_file(pack.path()).unwrap();
+                    std::fs::write(pack.path(), "PACK").unwrap();
+                }
+            }
+        }),
+        ("no objects", |repository| std::fs::remove_dir_all(repository.join("objects")).unwrap()),
+        ("its settings are noise", |repository| std::fs::write(repository.join("config"), [0xff; 99]).unwrap()),
+        ("HEAD is gone", |repository| std::fs::remove_file(repository.join("HEAD")).unwrap()),
+        ("an empty reference", |repository| {
+            for reference in std::fs::read_dir(repository.join("refs/fleet")).unwrap().flatten() {
+                std::fs::write(reference.path(), "").unwrap();
+            }
+        }),
+    ];
+    assert!(outcome(&server, &arm()).await.contains("opened"));
+    for (what, damage) in damage {
+        damage(&cached(&server)[0]);
+        let told = outcome(&server, &arm()).await;
+        assert!(told.contains("opened [WorldInfo"), "{what}: {told}");
+    }
+    // Locks that a killed git has left.
+    forge.commit("lab/arm", "main", &[("worlds/a.wbt", &world_text("next"))]);
+    std::fs::write(cached(&server)[0].join("shallow.lock"), "").unwrap();
+    assert!(outcome(&server, &arm()).await.contains("opened [next]"));
+}
+
+#[actix_rt::test]
+async fn a_kill_in_the_middle_of_a_fetch_harms_no_later_start() {
+    let (forge, webots) = (Forge::with_arm(), reader());
+    let work = forge.work_tree("lab/arm", "main");
+    std::fs::write(work.join("noise"), noise(3 << 20)).unwrap();
+    forge.commit_work_tree("lab/arm", "main");
+    let folder = tempfile::tempdir().unwrap();
+    let start = || simulation_server(&webots.path(), forge.path(), 2).folder(folder.path());
+    // Half a pack, then nothing more.
+    let slow = GitWrapper::new(
+        "case \"$*\" in *fetch*) \"$REAL\" \"$@\" & sleep 0.03; kill -STOP $!; echo 'halted: 50%' >&2; sleep 1000;; esac",
+    );
+    for victim in ["git", "server"] {
+        let mut server = start().env("PATH", &slow.path()).start().await;
+        let mut client = Client::start(&server, &arm()).await;
+        client.until("loading: fetching https://github.com/lab/arm: halted").await;
+        if victim == "git" {
+            let marked = instances_below(folder.path());
+            let fetch = marked.iter().find(|one| one.1.contains("fetch") && one.1.contains("guard")).unwrap();
+            kill(Pid::from_raw(fetch.0), Signal::SIGKILL).unwrap();
+            let told = client.until("loading: Error:").await;
+            assert!(told.contains("git fetch was ended by the signal SIGKILL"), "{told}");
+            nothing_left(&server, 2).await;
+        }
+        server.signal(Signal::SIGKILL);
+        server.ended().await;
+        until("git has ended", async || instances_below(folder.path()).is_empty()).await;
+        let server = start().start().await;
+        assert!(outcome(&server, &arm()).await.contains("opened [WorldInfo"));
+        assert!(!cached(&server).iter().any(|path| has_half_a_pack(path)), "a broken pack is left");
+        std::fs::remove_dir_all(folder.path().join("cache/git")).unwrap();
+    }
+}
+
+fn has_half_a_pack(repository: &Path) -> bool {
+    let packs = std::fs::read_dir(repository.join("objects/pack")).unwrap().flatten();
+    packs.map(|entry| entry.file_name()).any(|name| name.to_string_lossy().starts_with("tmp_"))
+}
+
+#[actix_rt::test]
+async fn two_servers_share_a_cache() {
+    let (forge, webots) = (Forge::with_arm(), reader());
+    forge.commit("lab/leg", "main", &[("worlds/a.wbt", WORLD)]);
+    let cache = tempfile::tempdir().unwrap();
+    let start = || {
+        simulation_server(&webots.path(), forge.path(), 4)
+            .set("cacheDir", cache.path().to_str().unwrap())
+            .set("cacheSize", 1)
+            .start()
+    };
+    let (one, other) = (start().await, start().await);
+    for _ in 0..3 {
+        let asks = [&one, &other, &one, &other].into_iter().zip(["lab/arm", "lab/arm", "lab/leg", "lab/leg"]);
+        let all = join_all(
+            asks.map(|(server, name)| async move { outcome(server, &world(name, "main", "worlds/a.wbt")).await }),
+        )
+        .await;
+        assert!(all.iter().all(|told| told.contains("opened [WorldInfo")), "{all:?}");
+    }
+    assert!(!one.log().contains("earlier run") && !other.log().contains("earlier run"), "they swept each other");
+}
+
+const POINTER: &str = "version https://git-lfs.github.com/spec/v1\noid sha256:0000000000000000000000000000000000000000000000000000000000000000\nsize 12345\n";
+
+#[actix_rt::test]
+async fn files_that_are_missing_from_git_lfs_are_told() {
+    let (forge, webots) = (Forge::with_arm(), reader());
+    forge.commit(
+        "lab/arm",
+        "main",
+        &[("meshes/a.dae", POINTER), (".gitattributes", "*.dae filter=lfs diff=lfs merge=lfs -text\n")],
+    );
+    let server = simulation_server(&webots.path(), forge.path(), 1).start().await;
+    let mut client = Client::start(&server, &arm()).await;
+    let told = client.until("loading: Warning:").await;
+    assert!(told.starts_with("loading: Warning: 1 files of this project are kept in Git LFS and c"), "{told}");
+    client.until("loading: Error: Webots ended with exit code 1").await;
+    // Without git-lfs it is told that this is what is missing.
+    let bin = tempfile::tempdir().unwrap();
+    for program in ["git", "bash", "sed", "env", "sh"] {
+        let found = std::env::split_paths(&std::env::var_os("PATH").unwrap())
+            .map(|folder| folder.join(program))
+            .find(|path| path.is_file());
+        std::os::unix::fs::symlink(found.unwrap(), bin.path().join(program)).unwrap();
+    }
+    let server =
+        simulation_server(&webots.path(), forge.path(), 1).env("PATH", bin.path().to_str().unwrap()).start().await;
+    let told = Client::start(&server, &arm()).await.until("loading: Warning:").await;
+    assert!(told.ends_with("can't be loaded: this server has no git-lfs"), "{told}");
+}
+
+#[actix_rt::test]
+async fn files_in_git_lfs_are_loaded() {
+    if !std::env::split_paths(&std::env::var_os("PATH").unwrap()).any(|folder| folder.join("git-lfs").is_file()) {
+        eprintln!("git-lfs is missing here: loading from Git LFS is NOT tested");
+        return;
+    }
+    let forge = Forge::with_arm();
+    let webots = Webots::script(
+        "for last; do :; done\ncd \"$(dirname \"$last\")/..\"\necho \"mesh [$(head -c 20 meshes/a.dae)]\"\nexit 1",
+    );
+    let work = forge.work_tree("lab/arm", "main");
+    std::fs::create_dir(work.join("meshes")).unwrap();
+    std::fs::write(work.join("meshes/a.dae"), "the real mesh".repeat(200)).unwrap();
+    std::fs::write(work.join(".gitattributes"), "*.dae filter=lfs diff=lfs merge=lfs -text\n").unwrap();
+    git(&work, &["lfs", "install", "--local", "--force"]);
+    forge.commit_work_tree("lab/arm", "main");
+    git(&work, &["lfs", "push", "--all", "origin"]);
+    let server = simulation_server(&webots.path(), forge.path(), 1).start().await;
+    for _ in 0..2 {
+        let told = outcome(&server, &arm()).await;
+        assert!(told.contains("mesh [the real mesh"), "{told}\n{}", server.log());
+    }
+    let limited = simulation_server(&webots.path(), forge.path(), 1).set("projectSize", 1).start().await;
+    std::fs::write(work.join("meshes/a.dae"), "x".repeat(3 << 20)).unwrap();
+    forge.commit_work_tree("lab/arm", "main");
+    let told = outcome(&limited, &arm()).await;
+    assert_eq!(told, "loading: Error: What the project keeps in Git LFS is larger than 1 MiB");
+}
+
+#[actix_rt::test]
+async fn a_controller_is_reset_and_nothing_else() {
+    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
+    forge.commit("lab/arm", "main", &[("protos/p.txt", "original")]);
+    let server = simulation_server(&webots.path(), forge.path(), 1).start().await;
+    let mut client = Client::start(&server, &arm()).await;
+    client.until("webots:").await;
+    let project = instance_folders(&server.folder)[0].join("project");
+    let file = project.join("controllers/c/c.py");
+    let outside = server.folder.join("outside");
+    std::fs::create_dir(&outside).unwrap();
+    let reset = async |client: &mut Client, name: &str| {
+        client.send(&serde_json::json!({ "reset controller": name }).to_string()).await;
+        loop {
+            let answer = client.until("").await;
+            if answer.starts_with("reset") || answer.starts_with("loading: Error") {
+                return answer;
+            }
+        }
+    };
+    std::fs::write(&file, "changed").unwrap();
+    assert_eq!(reset(&mut client, "c/c.py").await, "reset controller: c/c.py");
+    assert_eq!(std::fs::read_to_string(&file).unwrap(), "print('original')\n");
+    std::fs::remove_file(&file).unwrap();
+    assert_eq!(reset(&mut client, "c/c.py").await, "reset controller: c/c.py");
+    assert!(file.is_file());
+    std::fs::write(project.join("protos/p.txt"), "changed").unwrap();
+    for name in [
+        "../protos/p.txt",
+        "c/../../protos/p.txt",
+        "/etc/passwd",
+        "c/none.py",
+        "c.py",
+        "",
+        "c/",
+        "c/c.py\0",
+        ":/protos/p.txt",
+        "*/c.py",
+    ] {
+        let answer = reset(&mut client, name).await;
+        assert!(answer.ends_with("is no file below the project's controllers folder"), "{name:?}: {answer}");
+    }
+    assert_eq!(std::fs::read_to_string(project.join("protos/p.txt")).unwrap(), "changed");
+    // A link in place of the controller's folder leads nowhere.
+    std::fs::remove_dir_all(project.join("controllers/c")).unwrap();
+    std::os::unix::fs::symlink(&outside, project.join("controllers/c")).unwrap();
+    reset(&mut client, "c/c.py").await;
+    assert_eq!(std::fs::read_dir(&outside).unwrap().count(), 0, "it was written outside of the project");
+}

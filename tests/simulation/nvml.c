@@ -1,0 +1,32 @@
+/* A stand-in for NVIDIA's management library: two GPUs, whose readings come from the environment. */
+#include <stdlib.h>
+#include <string.h>
+#include <unistd.h>
+
+typedef struct { unsigned gpu, memory; } rates;
+typedef struct { unsigned version; unsigned long long total, reserved, free, used; } memory;
+
+static const char *at(const char *name) { const char *value = getenv(name); return value ? value : ""; }
+static void hang(const char *where) { if (!strcmp(at("NVML_HANG"), where)) for (;;) pause(); }
+
+int nvmlInit_v2(void) { hang("init"); return strcmp(at("NVML_HANG"), "no driver") ? 0 : 9; }
+int nvmlInitWithFlags(unsigned flags) { (void)flags; return nvmlInit_v2(); }
+int nvmlShutdown(void) { return 0; }
+int nvmlSystemGetDriverVersion(char *text, unsigned length) { strncpy(text, "550.54.15", length); return 0; }
+int nvmlDeviceGetCount_v2(unsigned *count) { *count = 2; return 0; }
+int nvmlDeviceGetHandleByIndex_v2(unsigned index, void **device) { *device = (void *)(unsigned long)(index + 1); return 0; }
+int nvmlDeviceGetUtilizationRates(void *device, rates *out) {
+  hang("read");
+  out->gpu = atoi(at(device == (void *)1 ? "NVML_COMPUTE_0" : "NVML_COMPUTE_1"));
+  out->memory = 7;
+  return 0;
+}
+int nvmlDeviceGetMemoryInfo_v2(void *device, memory *out) {
+  out->total = 8ULL << 30;
+  out->used = device == (void *)1 ? 6ULL << 30 : 1ULL << 30;
+  out->reserved = 0;
+  out->free = out->total - out->used;
+  return 0;
+}
+int nvmlDeviceGetName(void *device, char *text, unsigned length) { strncpy(text, device == (void *)1 ? "Stand-in A" : "Stand-in B", length); return 0; }
+const char *nvmlErrorString(int code) { (void)code; return "stand-in"; }

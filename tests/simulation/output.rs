@@ -1,0 +1,87 @@
+//! Simulators that misbehave harm nobody.
+
+use std::path::PathBuf;
+use std::time::{Duration, Instant};
+
+use crate::scene::{DEMO, arm, nothing_left};
+use crate::support::client::Client;
+use crate::support::git::Forge;
+use crate::support::http;
+use crate::support::program::{Server, simulation_server};
+use crate::support::webots::{Webots, instances_below};
+
+/// The file of a simulation's output, as the server tells.
+async fn log_of(server: &Server) -> PathBuf {
+    let status = http::get(&server.url("/status")).await.json();
+    PathBuf::from(status["simulations"][0]["log"].as_str().unwrap())
+}
+
+#[actix_rt::test]
+async fn a_flood_of_output_harms_nobody_and_its_file_is_bounded() {
+    let forge = Forge::with_arm();
+    let floods = ["yes 'a line of a flood that never ends'", "tr '\\0' x < /dev/zero", "cat /dev/urandom"];
+    for flood in floods {
+        let webots = Webots::script(&format!("{DEMO} \"$@\" >/dev/null &\n{flood} & wait"));
+        let builder = simulation_server(&webots.path(), forge.path(), 2).set("timing.grace", 0.5);
+        let server = builder.start().await;
+        let mut client = Client::start(&server, &arm()).await;
+        client.until("webots:").await;
+        let end = Instant::now() + Duration::from_secs(1);
+        while Instant::now() < end {
+            assert!(http::get(&server.url("/load")).await.text().parse::<f64>().is_ok());
+            actix_rt::time::sleep(Duration::from_millis(20)).await;
+        }
+        let log = log_of(&server).await;
+        assert_eq!(log, server.folder.join(format!("log/simulation/instances/{}.log", server.port + 1)));
+        let files = std::fs::read_dir(log.parent().unwrap()).unwrap().flatten();
+        let size: u64 = files.map(|file| file.metadata().unwrap().len()).sum();
+        // A line that never ends is never written.
+        assert!((size > 500 || flood.starts_with("tr")) && size < 1_200_000, "{flood}: {size} bytes");
+        client.leave().await;
+        nothing_left(&server, 2).await;
+    }
+}
+
+#[actix_rt::test]
+async fn a_simulator_that_forks_and_hides_and_ignores_signals_leaves_nothing() {
+    let forge = Forge::with_arm();
+    // Children of children, in sessions of their own, without parents, deaf to SIGTERM.
+    let hide = "for n in $(seq 40); do (trap '' TERM HUP; setsid bash -c 'trap \"\" TERM; sleep 1000 & wait' &) ; done";
+    let webots = Webots::script(&format!("{hide}\n{DEMO} \"$@\" & wait"));
+    let server = simulation_server(&webots.path(), forge.path(), 1).set("timing.grace", 0.3).start().await;
+    let mut client = Client::start(&server, &arm()).await;
+    client.until("webots:").await;
+    assert!(instances_below(&server.folder).len() > 40);
+    client.leave().await;
+    nothing_left(&server, 1).await;
+}
+
+#[actix_rt::test]
+async fn a_simulator_that_forks_without_end_is_ended() {
+    let forge = Forge::with_arm();
+    let webots = Webots::script(&format!(
+        "{DEMO} \"$@\" &\ntrap '' TERM\nwhile true; do (sleep 0.05; sleep 1000) & sleep 0.02; done"
+    ));
+    let server = simulation_server(&webots.path(), forge.path(), 1).set("timing.grace", 0.3).start().await;
+    let mut client = Client::start(&server, &arm()).await;
+    client.until("webots:").await;
+    client.leave().await;
+    nothing_left(&server, 1).await;
+}
+
+#[actix_rt::test]
+async fn the_output_of_a_simulation_is_kept_and_printable() {
+    let forge = Forge::with_arm();
+    let webots = Webots::script(&format!(
+        "printf 'one\\nred \\033[31m text\\n\\377 no text\\nlast without end' >&2\n{DEMO} \"$@\" & wait"
+    ));
+    let server = simulation_server(&webots.path(), forge.path(), 1).set("timing.heartbeat", 0.1).start().await;
+    let mut client = Client::start(&server, &arm()).await;
+    client.until("webots:").await;
+    let log = log_of(&server).await;
+    client.until(".").await;
+    client.leave().await;
+    nothing_left(&server, 1).await;
+    let text = std::fs::read_to_string(log).unwrap();
+    assert!(text.starts_with("one\nred  [31m text\n\u{fffd} no text\nlast without end"), "{text:?}");
+}

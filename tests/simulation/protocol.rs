@@ -1,0 +1,164 @@
+//! What clients and pages may ask, and what they are told.
+
+use futures_util::{SinkExt, StreamExt};
+use tokio_tungstenite::tungstenite::Message;
+use tokio_tungstenite::tungstenite::client::IntoClientRequest;
+
+use crate::scene::arm;
+use crate::support::client::Client;
+use crate::support::git::{Forge, world};
+use crate::support::http;
+use crate::support::program::{Server, simulation_server};
+use crate::support::until;
+use crate::support::webots::Webots;
+
+async fn server() -> (Server, Forge, Webots) {
+    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
+    (simulation_server(&webots.path(), forge.path(), 2).start().await, forge, webots)
+}
+
+#[actix_rt::test]
+async fn a_message_that_is_none_is_answered_in_words() {
+    let (server, _forge, _webots) = server().await;
+    let start = |url: &str| serde_json::json!({"start": {"url": url}}).to_string();
+    let table = [
+        ("garbage".to_owned(), "Wrong message"),
+        ("{}".to_owned(), "Wrong message"),
+        ("[".repeat(5000), "Wrong message"),
+        (r#"{"start":{"url":"x","mode":"vr"}}"#.to_owned(), "unknown variant"),
+        (r#"{"reset controller":"c/c.py"}"#.to_owned(), "only while a simulation runs"),
+        (start("https://github.com/lab/arm"), "Wrong Webots simulation URL"),
+        (start("ftp://github.com/lab/arm/blob/main/worlds/a.wbt"), "does not begin with https://"),
+    ];
+    for (text, words) in table {
+        let mut client = Client::connect(&server.websocket("/client")).await;
+        client.send(&text).await;
+        let told = client.until("").await;
+        assert!(told.starts_with("loading: Error: ") && told.contains(words), "{text}: {told}");
+        assert_eq!(client.closed().await, Some(1000));
+    }
+    assert!(http::get(&server.url("/health")).await.status.is_success());
+}
+
+#[actix_rt::test]
+async fn oversized_and_binary_messages_end_the_connection() {
+    let (server, _forge, _webots) = server().await;
+    let table = [(Message::text("x".repeat(9000)), Some(1002)), (Message::binary(vec![0; 10]), Some(1000))];
+    for (message, code) in table {
+        let (mut socket, _) = tokio_tungstenite::connect_async(server.websocket("/client")).await.unwrap();
+        socket.send(message).await.unwrap();
+        let mut end = None;
+        while let Some(Ok(heard)) = actix_rt::time::timeout(crate::support::SOON, socket.next()).await.unwrap() {
+            if let Message::Close(frame) = heard {
+                end = frame.map(|frame| u16::from(frame.code));
+            }
+        }
+        assert_eq!(end, code);
+    }
+}
+
+#[actix_rt::test]
+async fn who_asks_without_reading_is_sent_away() {
+    let (server, _forge, _webots) = server().await;
+    let mut client = Client::start(&server, &arm()).await;
+    client.until("webots:").await;
+    for _ in 0..150 {
+        client.send(&serde_json::json!({"start": {"url": arm()}}).to_string()).await;
+    }
+    assert_eq!(client.closed().await, Some(1008));
+    until("it is gone", async || crate::scene::stages(&server).await.is_empty()).await;
+}
+
+#[actix_rt::test]
+async fn a_second_start_on_a_connection_is_ignored() {
+    let (server, _forge, _webots) = server().await;
+    let mut client = Client::start(&server, &arm()).await;
+    client.until("webots:").await;
+    client.send(&serde_json::json!({"start": {"url": arm()}}).to_string()).await;
+    until("it is logged", async || server.log().contains("second simulation on one connection; ignored")).await;
+    assert_eq!(crate::scene::stages(&server).await.len(), 1);
+}
+
+#[actix_rt::test]
+async fn only_pages_of_allowed_origins_may_start_simulations() {
+    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
+    let builder = simulation_server(&webots.path(), forge.path(), 1);
+    let server = builder.set("allowedOrigins", serde_json::json!(["https://lab.org"])).start().await;
+    for (origin, allowed) in
+        [(Some("https://lab.org"), true), (Some("https://evil.org"), false), (Some("null"), false), (None, true)]
+    {
+        let mut request = server.websocket("/client").into_client_request().unwrap();
+        if let Some(origin) = origin {
+            request.headers_mut().insert("origin", origin.parse().unwrap());
+        }
+        let result = tokio_tungstenite::connect_async(request).await;
+        assert_eq!(result.is_ok(), allowed, "{origin:?}");
+        if let Err(tokio_tungstenite::tungstenite::Error::Http(answer)) = result {
+            assert_eq!(answer.status(), 403);
+        }
+    }
+}
+
+#[actix_rt::test]
+async fn connections_are_bounded() {
+    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
+    let server = simulation_server(&webots.path(), forge.path(), 1).set("maxClients", 2).start().await;
+    let one = Client::connect(&server.websocket("/client")).await;
+    let _other = Client::connect(&server.websocket("/client")).await;
+    let third = tokio_tungstenite::connect_async(server.websocket("/client")).await;
+    assert!(matches!(third, Err(tokio_tungstenite::tungstenite::Error::Http(answer)) if answer.status() == 503));
+    one.leave().await;
+    until("there is room", async || tokio_tungstenite::connect_async(server.websocket("/client")).await.is_ok()).await;
+}
+
+#[actix_rt::test]
+async fn pages_tell_what_they_should() {
+    let (server, _forge, _webots) = server().await;
+    let load = http::get(&server.url("/load")).await;
+    assert!(load.text().parse::<f64>().unwrap() >= 0.0);
+    assert_eq!(load.header("access-control-allow-origin"), Some("*"));
+    let none = http::get(&server.url("/none")).await;
+    assert_eq!(none.status, 404);
+    let options = awc::Client::new().options(server.url("/load")).send().await.unwrap();
+    assert_eq!(options.status(), 204);
+    let mut client = Client::start(&server, &arm()).await;
+    client.until("webots:").await;
+    let status = http::get(&server.url("/status")).await.json();
+    let one = &status["simulations"][0];
+    assert_eq!(one["world"], arm());
+    assert_eq!((one["stage"].as_str(), one["version"].as_str()), (Some("idle"), Some("R2025a")));
+    assert_eq!(one["port"], server.port + 1);
+    assert_eq!((&status["docker"], &status["draining"]), (&false.into(), &false.into()));
+    assert_eq!(status["allowedRepositories"], serde_json::json!(["https://github.com/lab"]));
+    assert_eq!(status["version"], env!("CARGO_PKG_VERSION"));
+    assert!(status["machine"]["memory"].is_number() && status["host"]["threads"].as_u64() > Some(0));
+    let page = http::get(&server.url("/monitor")).await.text();
+    assert!(page.contains("github.com/lab/arm") && page.contains("Idle"), "{page}");
+}
+
+#[actix_rt::test]
+async fn outcomes_are_counted() {
+    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
+    let server = simulation_server(&webots.path(), forge.path(), 1).set("waitingLine", 1).start().await;
+    let count = async |outcome: &str| {
+        let text = http::get(&server.url("/metrics")).await.text();
+        let name = format!("simulation_starts_total{{outcome=\"{outcome}\"}} ");
+        text.lines().find_map(|line| line.strip_prefix(&name)).unwrap().parse::<u32>().unwrap()
+    };
+    assert_eq!(count("ready").await, 0);
+    let mut ready = Client::start(&server, &arm()).await;
+    ready.until("webots:").await;
+    let mut waits = Client::start(&server, &arm()).await;
+    waits.until("queue: 0").await;
+    Client::start(&server, &arm()).await.until("loading: Error: All 1 places").await;
+    Client::start(&server, &world("other/x", "main", "worlds/a.wbt")).await.until("loading: Error:").await;
+    waits.leave().await;
+    ready.leave().await;
+    crate::scene::nothing_left(&server, 1).await;
+    Client::start(&server, &world("lab/none", "main", "worlds/a.wbt")).await.until("loading: Error:").await;
+    for (outcome, expected) in
+        [("ready", 1), ("left", 1), ("full", 1), ("refused", 1), ("no_checkout", 1), ("no_webots", 0)]
+    {
+        until(outcome, async || count(outcome).await == expected).await;
+    }
+}

@@ -1,0 +1,92 @@
+//! Readings of the machine and of its GPUs.
+
+use std::path::Path;
+use std::process::Command;
+
+use nix::sys::signal::Signal;
+
+use crate::scene::arm;
+use crate::support::client::Client;
+use crate::support::git::Forge;
+use crate::support::program::{Builder, simulation_server};
+use crate::support::webots::Webots;
+use crate::support::{http, until};
+
+/// A folder with the stand-in for NVIDIA's library; nothing without a C compiler.
+fn stand_in() -> Option<tempfile::TempDir> {
+    let folder = tempfile::tempdir().unwrap();
+    let source = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/simulation/nvml.c");
+    let library = folder.path().join("libnvidia-ml.so.1");
+    match Command::new("cc").args(["-shared", "-fPIC", "-o"]).arg(library).arg(source).status() {
+        Ok(status) => assert!(status.success()),
+        Err(error) => {
+            eprintln!("no C compiler ({error}): readings of GPUs are NOT tested");
+            return None;
+        }
+    }
+    Some(folder)
+}
+
+fn with(library: &Path, forge: &Forge, webots: &Webots) -> Builder {
+    simulation_server(&webots.path(), forge.path(), 1).env("LD_LIBRARY_PATH", library.to_str().unwrap())
+}
+
+#[actix_rt::test]
+async fn gpus_are_read_and_the_least_busy_one_counts() {
+    let Some(library) = stand_in() else { return };
+    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
+    let server =
+        with(library.path(), &forge, &webots).env("NVML_COMPUTE_0", "100").env("NVML_COMPUTE_1", "99").start().await;
+    let status = async || http::get(&server.url("/status")).await.json();
+    until("GPUs are told", async || status().await["gpus"].as_array().is_some_and(|gpus| gpus.len() == 2)).await;
+    let gpus = status().await["gpus"].clone();
+    assert_eq!((gpus[0]["name"].as_str(), gpus[0]["compute"].as_f64()), (Some("Stand-in A"), Some(100.0)));
+    assert_eq!((gpus[0]["memory"].as_f64(), gpus[1]["memory"].as_f64()), (Some(75.0), Some(12.5)));
+    assert_eq!(gpus[0]["memoryTraffic"].as_f64(), Some(7.0));
+    assert_eq!(gpus[0]["memoryTotal"].as_u64(), Some(8 << 30));
+    let load = async || http::get(&server.url("/load")).await.text().parse::<f64>().unwrap();
+    until("the mean is that of the less busy GPU", async || (99.0..100.0).contains(&load().await)).await;
+    let metrics = http::get(&server.url("/metrics")).await.text();
+    assert!(metrics.contains("machine_gpu_compute_percent{gpu=\"0\",name=\"Stand-in A\"} 100"), "{metrics}");
+}
+
+#[actix_rt::test]
+async fn a_driver_that_hangs_or_is_missing_holds_up_nothing() {
+    let Some(library) = stand_in() else { return };
+    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
+    for hang in ["init", "read", "no driver"] {
+        let mut server = with(library.path(), &forge, &webots).env("NVML_HANG", hang).start().await;
+        let csv = server.folder.join("log/simulation/monitor.csv");
+        until("samples go on", async || std::fs::read_to_string(&csv).is_ok_and(|text| text.lines().count() >= 4))
+            .await;
+        Client::start(&server, &arm()).await.until("webots:").await;
+        assert_eq!(http::get(&server.url("/status")).await.json()["gpus"], serde_json::json!([]));
+        if hang == "no driver" {
+            assert_eq!(server.log().matches("no NVIDIA GPU is read").count(), 1);
+        }
+        server.signal(Signal::SIGTERM);
+        assert_eq!(server.ended().await, Some(0), "{hang}: it can't end");
+    }
+}
+
+#[actix_rt::test]
+async fn samples_are_written_with_the_columns_of_the_original() {
+    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
+    let server = simulation_server(&webots.path(), forge.path(), 1).start().await;
+    let mut client = Client::start(&server, &arm()).await;
+    client.until("webots:").await;
+    let csv = server.folder.join("log/simulation/monitor.csv");
+    let text = || std::fs::read_to_string(&csv).unwrap_or_default();
+    until("an idle simulation is counted", async || text().lines().skip(1).any(|line| line.contains(", 0, 1, "))).await;
+    let header = "Timestamp, Webots running, Webots idle, CPU load, CPU memory, GPU load compute, GPU load memory, \
+                  GPU memory, Swap, Disk, Network sent, Network received";
+    assert_eq!(text().lines().next(), Some(header));
+    for line in text().lines().skip(1) {
+        let values: Vec<f64> = line.split(", ").map(|value| value.parse().unwrap()).collect();
+        assert_eq!(values.len(), 12, "{line}");
+        assert!(values[0] > 1.0e9 && (0.0..=100.0).contains(&values[3]) && values[4] > 0.0, "{line}");
+    }
+    let quiet = simulation_server(&webots.path(), forge.path(), 1).set("monitorLogEnabled", false).start().await;
+    until("it has read", async || http::get(&quiet.url("/load")).await.text() != "0").await;
+    assert!(!quiet.folder.join("log/simulation/monitor.csv").exists());
+}

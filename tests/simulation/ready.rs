@@ -1,0 +1,173 @@
+//! When Webots is ready, where, and when it is not.
+
+use std::net::TcpListener;
+use std::time::Duration;
+
+use crate::scene::{DEMO, arm, nothing_left, stages};
+use crate::support::client::Client;
+use crate::support::git::Forge;
+use crate::support::program::simulation_server;
+use crate::support::until;
+use crate::support::webots::Webots;
+
+#[actix_rt::test]
+async fn the_port_that_webots_really_took_is_handed_out() {
+    let (forge, folder) = (Forge::with_arm(), tempfile::tempdir().unwrap());
+    let go = folder.path().join("go");
+    let webots = Webots::script(&format!("until [ -e {} ]; do sleep 0.01; done\n{DEMO} \"$@\" & wait", go.display()));
+    let server = simulation_server(&webots.path(), forge.path(), 3).start().await;
+    let mut client = Client::start(&server, &arm()).await;
+    client.until("shutdownTimeout").await;
+    // Somebody takes the port after it was lent; Webots silently moves on.
+    let foreign = TcpListener::bind(("127.0.0.1", server.port + 1)).unwrap();
+    assert!(client.is_silent(Duration::from_millis(300)).await, "a listener of somebody else was taken for Webots");
+    std::fs::write(&go, "").unwrap();
+    assert_eq!(client.until("webots:").await, format!("webots:ws://localhost:{}", server.port + 2));
+    let mut viewer = Client::connect(&format!("ws://127.0.0.1:{}/", server.port + 2)).await;
+    viewer.send("x3d").await;
+    viewer.until("scene load completed").await;
+    // The next client gets neither of the two.
+    let mut next = Client::start(&server, &arm()).await;
+    assert_eq!(next.until("webots:").await, format!("webots:ws://localhost:{}", server.port + 3));
+    drop(foreign);
+}
+
+#[actix_rt::test]
+async fn a_port_outside_of_the_servers_range_fails_the_start() {
+    let forge = Forge::with_arm();
+    let webots = Webots::script(&format!(
+        "args=()\nfor one; do case $one in --port=*) one=--port=$((${{one#--port=}} + 1));; esac; args+=(\"$one\"); done\n{DEMO} \"${{args[@]}}\" & wait"
+    ));
+    let server = simulation_server(&webots.path(), forge.path(), 1).start().await;
+    let mut client = Client::start(&server, &arm()).await;
+    let told = client.until("loading: Error:").await;
+    let (first, next) = (server.port + 1, server.port + 2);
+    let words = format!("Webots listens on port {next}, outside of this server's ports {first} to {first}");
+    assert!(told.contains(&words), "{told}");
+    assert_eq!(client.closed().await, Some(1000));
+    nothing_left(&server, 2).await;
+}
+
+#[actix_rt::test]
+async fn a_launch_that_never_listens_ends_with_its_last_words() {
+    let forge = Forge::with_arm();
+    let webots = Webots::script("for n in $(seq 30); do echo \"line $n\"; done; sleep 1000 & wait");
+    let server = simulation_server(&webots.path(), forge.path(), 1)
+        .set("timing.launch", 0.5)
+        .set("display", ":57")
+        .start()
+        .await;
+    let mut client = Client::start(&server, &arm()).await;
+    let told = client.until("loading: Error:").await;
+    assert!(told.contains("Webots did not become ready within") && told.contains("line 11 | "), "{told}");
+    assert!(told.contains("| line 30") && !told.contains("line 10 "), "{told}");
+    assert!(told.contains("no display answers at :57") && told.contains("xvfb: true"), "{told}");
+    nothing_left(&server, 1).await;
+}
+
+#[actix_rt::test]
+async fn a_webots_that_hangs_is_told_and_ended() {
+    let forge = Forge::with_arm();
+    // A simulator without heartbeat.
+    let webots = Webots::script(&format!(
+        "args=()\nfor one; do case $one in --heartbeat*) ;; *) args+=(\"$one\");; esac; done\n{DEMO} \"${{args[@]}}\" & wait"
+    ));
+    let builder = simulation_server(&webots.path(), forge.path(), 1).set("timing.heartbeat", 0.1);
+    let server = builder.set("hangLimit", 0.6).start().await;
+    let mut client = Client::start(&server, &arm()).await;
+    client.until("webots:").await;
+    client.until("loading: Webots has given no sign of life for").await;
+    let told = client.until("loading: Error:").await;
+    assert!(told.contains("Webots gave no sign of life for"), "{told}");
+    assert_eq!(client.closed().await, Some(1000));
+    nothing_left(&server, 1).await;
+}
+
+#[actix_rt::test]
+async fn signs_of_life_are_passed_on_and_the_pace_is_shown() {
+    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
+    let server = simulation_server(&webots.path(), forge.path(), 1).set("timing.heartbeat", 0.1).start().await;
+    let mut client = Client::start(&server, &arm()).await;
+    client.until("webots:").await;
+    for _ in 0..3 {
+        assert_eq!(client.until("").await, ".");
+    }
+    let mut viewer = Client::connect(&format!("ws://127.0.0.1:{}/", server.port + 1)).await;
+    viewer.send("x3d").await;
+    viewer.until("scene load completed").await;
+    for (ask, shown) in [("real-time:-1", "running"), ("pause", "idle"), ("fast:-1", "running")] {
+        viewer.send(ask).await;
+        until(shown, async || stages(&server).await == [shown]).await;
+    }
+}
+
+#[actix_rt::test]
+async fn webots_is_given_the_documented_command_line() {
+    let forge = Forge::with_arm();
+    let webots = Webots::script("echo \"args: $*\"; exit 1");
+    let server = simulation_server(&webots.path(), forge.path(), 1).start().await;
+    let port = server.port + 1;
+    let rest = format!("--port={port} --heartbeat=5000");
+    let table = [
+        ("x3d", format!("args: --batch --mode=pause --minimize --no-rendering {rest} --stream /")),
+        ("w3d", format!("args: --batch --mode=pause --minimize --no-rendering {rest} --stream /")),
+        ("mjpeg", format!("args: --batch --mode=pause {rest} --stream=mjpeg /")),
+    ];
+    for (mode, words) in table {
+        let mut client = Client::connect(&server.websocket("/client")).await;
+        client.send(&serde_json::json!({"start": {"url": arm(), "mode": mode}}).to_string()).await;
+        let told = client.until("loading: Error:").await;
+        assert!(told.contains(&words) && told.contains("/project/worlds/a.wbt"), "{told}");
+        nothing_left(&server, 1).await;
+    }
+}
+
+#[actix_rt::test]
+async fn a_missing_webots_or_xvfb_is_told_with_what_to_do() {
+    let forge = Forge::with_arm();
+    let server = simulation_server(std::path::Path::new("/nowhere/webots"), forge.path(), 1).start().await;
+    let told = Client::start(&server, &arm()).await.until("loading: Error:").await;
+    assert!(told.contains("has no Webots at /nowhere/webots") && told.contains("webotsHome"), "{told}");
+    let webots = Webots::launcher();
+    let git = tempfile::tempdir().unwrap();
+    for program in ["git", "bash", "env", "sh"] {
+        let paths = std::env::var_os("PATH").unwrap();
+        let real =
+            std::env::split_paths(&paths).map(|folder| folder.join(program)).find(|path| path.is_file()).unwrap();
+        std::os::unix::fs::symlink(real, git.path().join(program)).unwrap();
+    }
+    let builder = simulation_server(&webots.path(), forge.path(), 1).set("xvfb", true);
+    let server = builder.env("PATH", git.path().to_str().unwrap()).start().await;
+    let told = Client::start(&server, &arm()).await.until("loading: Error:").await;
+    assert!(told.contains("(xvfb), but has no xvfb-run"), "{told}");
+    nothing_left(&server, 1).await;
+}
+
+#[actix_rt::test]
+async fn each_webots_gets_a_virtual_display_of_its_own() {
+    let paths = std::env::var_os("PATH").unwrap();
+    if !std::env::split_paths(&paths).any(|folder| folder.join("xvfb-run").is_file()) {
+        eprintln!("xvfb-run is missing here: virtual displays are NOT tested");
+        return;
+    }
+    let forge = Forge::with_arm();
+    let webots = Webots::script(&format!(
+        "test -S /tmp/.X11-unix/X${{DISPLAY#:}} || exit 9\necho \"display $DISPLAY\"\n{DEMO} \"$@\" & wait"
+    ));
+    let server = simulation_server(&webots.path(), forge.path(), 2).set("xvfb", true).start().await;
+    let mut clients = Vec::new();
+    let mut displays = Vec::new();
+    for place in 1..=2 {
+        let mut client = Client::start(&server, &arm()).await;
+        client.until("webots:").await;
+        clients.push(client);
+        let log = server.folder.join(format!("log/simulation/instances/{}.log", server.port + place));
+        let text = std::fs::read_to_string(log).unwrap();
+        displays.push(text.lines().find_map(|line| line.strip_prefix("display ")).unwrap().to_owned());
+    }
+    assert_ne!(displays[0], displays[1]);
+    for client in clients {
+        client.leave().await;
+    }
+    nothing_left(&server, 2).await;
+}

@@ -1,0 +1,123 @@
+//! Many starts and stops in a row leave the server as it was.
+
+use std::path::Path;
+
+use procfs::process::Process;
+
+use crate::support::client::Client;
+use crate::support::git::{Forge, world};
+use crate::support::program::{Server, simulation_server};
+use crate::support::webots::{Webots, instances_below};
+use crate::support::{http, until};
+
+/// What a server holds at one moment.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Holdings {
+    processes: u64,
+    descriptors: u64,
+    threads: u64,
+    ports: u64,
+    folders: u64,
+    memory_kib: u64,
+}
+
+/// Clients at a time: the server has so many places.
+const AT_A_TIME: usize = 4;
+/// Starts before the first count: pools of threads and allocators fill.
+const WARM_UP: usize = 40;
+
+impl Holdings {
+    fn of(server: &Server) -> Self {
+        let process = Process::new(server.pid()).unwrap();
+        let status = process.status().unwrap();
+        let used = |port: &u16| std::net::TcpListener::bind(("0.0.0.0", *port)).is_err();
+        Self {
+            processes: instances_below(&server.folder).len() as u64,
+            descriptors: process.fd_count().unwrap() as u64,
+            threads: status.threads,
+            ports: (server.port + 1..=server.port + AT_A_TIME as u16 + 10).filter(used).count() as u64,
+            folders: folders(&server.folder.join("cache")),
+            memory_kib: status.vmrss.unwrap(),
+        }
+    }
+
+    /// Names and numbers.
+    pub fn rows(&self) -> [(&'static str, u64); 6] {
+        [
+            ("processes", self.processes),
+            ("file descriptors", self.descriptors),
+            ("threads", self.threads),
+            ("ports in use", self.ports),
+            ("folders", self.folders),
+            ("resident memory, KiB", self.memory_kib),
+        ]
+    }
+
+    /// What has grown. Memory may move a little; what leaks with each start does not stay below.
+    pub fn leaks_since(&self, before: &Self, starts: usize) -> Vec<String> {
+        let slack = |name: &str| match name {
+            "resident memory, KiB" => 2048 + starts as u64,
+            // The pool of the runtime keeps idle threads for some seconds.
+            "threads" => 8,
+            _ => 0,
+        };
+        let rows = before.rows().into_iter().zip(self.rows());
+        rows.filter(|((name, before), (_, after))| *after > before + slack(name))
+            .map(|((name, before), (_, after))| format!("{name}: {before} before, {after} after"))
+            .collect()
+    }
+}
+
+fn folders(folder: &Path) -> u64 {
+    let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
+    entries.filter(|entry| entry.path().is_dir()).map(|entry| 1 + folders(&entry.path())).sum()
+}
+
+/// Starts and stops so many simulations; gives back what the server held before and after.
+pub async fn soak(starts: usize) -> (Holdings, Holdings) {
+    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
+    let server = simulation_server(&webots.path(), forge.path(), AT_A_TIME as u16).start().await;
+    visit(&server, WARM_UP).await;
+    let before = Holdings::of(&server);
+    visit(&server, starts).await;
+    (before, Holdings::of(&server))
+}
+
+/// So many visits, some of which end before Webots is ready; waits until all are gone.
+async fn visit(server: &Server, visits: usize) {
+    let url = world("lab/arm", "main", "worlds/a.wbt");
+    let next = std::cell::Cell::new(0);
+    let visitor = async || {
+        while next.get() < visits {
+            let number = next.replace(next.get() + 1);
+            let mut client = Client::start(server, &url).await;
+            client.until(if number % 5 == 4 { "loading: checking" } else { "webots:" }).await;
+            client.leave().await;
+        }
+    };
+    futures_util::future::join_all((0..AT_A_TIME).map(|_| visitor())).await;
+    until("all are gone", async || {
+        let status = http::get(&server.url("/status")).await.json();
+        status["simulations"].as_array().unwrap().is_empty() && instances_below(&server.folder).is_empty()
+    })
+    .await;
+    // Connections that have just been closed, and folders that are just being removed.
+    let pid = server.pid();
+    until("descriptors are closed", async || {
+        let count = || Process::new(pid).unwrap().fd_count().unwrap();
+        let first = count();
+        actix_rt::time::sleep(std::time::Duration::from_millis(300)).await;
+        first == count()
+    })
+    .await;
+}
+
+#[cfg(test)]
+#[allow(dead_code, reason = "a bench has no tests")]
+mod tests {
+    #[actix_rt::test]
+    async fn starts_and_stops_leave_the_server_as_it_was() {
+        let (before, after) = super::soak(40).await;
+        assert_eq!(after.leaks_since(&before, 40), Vec::<String>::new(), "{before:?} {after:?}");
+    }
+}

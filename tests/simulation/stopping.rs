@@ -1,0 +1,115 @@
+//! Start, drain and stop of the server itself; announcing.
+
+use std::io::{Read, Write};
+use std::net::TcpListener;
+use std::time::{Duration, Instant};
+
+use nix::sys::signal::Signal;
+
+use crate::scene::{arm, stages};
+use crate::support::client::Client;
+use crate::support::git::Forge;
+use crate::support::program::simulation_server;
+use crate::support::webots::Webots;
+use crate::support::{http, until};
+
+#[actix_rt::test]
+async fn a_server_that_drains_keeps_its_clients_takes_no_others_and_ends_with_the_last() {
+    for by in ["signal", "page"] {
+        let (forge, webots) = (Forge::with_arm(), Webots::launcher());
+        let builder = simulation_server(&webots.path(), forge.path(), 1);
+        let mut server = builder.set("adminPassword", "secret").start().await;
+        let mut running = Client::start(&server, &arm()).await;
+        running.until("webots:").await;
+        let mut waiting = Client::start(&server, &arm()).await;
+        waiting.until("queue: 0").await;
+        let drain =
+            |password: &'static str| awc::Client::new().post(server.url("/drain")).basic_auth("admin", password).send();
+        if by == "signal" {
+            server.signal(Signal::SIGUSR1);
+        } else {
+            assert_eq!(drain("wrong").await.unwrap().status(), 401);
+            assert_eq!(awc::Client::new().post(server.url("/drain")).send().await.unwrap().status(), 401);
+            assert_ne!(http::get(&server.url("/load")).await.text(), "100");
+            assert_eq!(drain("secret").await.unwrap().status(), 202);
+        }
+        until("it drains", async || http::get(&server.url("/load")).await.text() == "100").await;
+        assert_eq!(http::get(&server.url("/status")).await.json()["draining"], true);
+        let mut late = Client::start(&server, &arm()).await;
+        assert!(late.until("loading: Error:").await.contains("about to end, and takes no new clients"));
+        running.leave().await;
+        waiting.until("webots:").await;
+        assert_eq!(stages(&server).await, ["idle"], "who was in the line is served");
+        waiting.leave().await;
+        assert_eq!(server.ended().await, Some(0));
+    }
+}
+
+#[actix_rt::test]
+async fn drain_is_off_without_a_password_and_ends_an_empty_server() {
+    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
+    let mut server = simulation_server(&webots.path(), forge.path(), 1).start().await;
+    assert_eq!(awc::Client::new().post(server.url("/drain")).send().await.unwrap().status(), 403);
+    server.signal(Signal::SIGHUP);
+    until("it is logged", async || server.log().contains("SIGHUP changes nothing")).await;
+    server.signal(Signal::SIGUSR1);
+    assert_eq!(server.ended().await, Some(0));
+}
+
+#[actix_rt::test]
+async fn a_port_that_is_taken_ends_the_program_with_1() {
+    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
+    let first = simulation_server(&webots.path(), forge.path(), 1).start().await;
+    let mut second = simulation_server(&webots.path(), forge.path(), 1).set("port", first.port).spawn();
+    assert_eq!(second.ended().await, Some(1));
+    assert!(second.log().contains("can't listen on"), "{}", second.log());
+}
+
+/// Answers each request with the next of these codes; gives back the requests.
+fn listener(codes: &'static [u16]) -> (String, std::sync::mpsc::Receiver<String>) {
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    let url = format!("http://{}/announce", listener.local_addr().unwrap());
+    let (sender, requests) = std::sync::mpsc::channel();
+    std::thread::spawn(move || {
+        for code in codes {
+            let (mut socket, _) = listener.accept().unwrap();
+            socket.set_read_timeout(Some(Duration::from_millis(200))).unwrap();
+            let mut text = Vec::new();
+            socket.read_to_end(&mut text).ok();
+            write!(socket, "HTTP/1.1 {code} X\r\nContent-Length: 0\r\nConnection: close\r\n\r\n").ok();
+            sender.send(String::from_utf8(text).unwrap()).ok();
+        }
+    });
+    (url, requests)
+}
+
+#[actix_rt::test]
+async fn the_server_announces_itself_and_waits_for_nobody() {
+    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
+    let (url, requests) = listener(&[500, 200]);
+    let hanging = TcpListener::bind("127.0.0.1:0").unwrap();
+    let closed = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap();
+    let notify =
+        serde_json::json!([url, format!("http://{}/", hanging.local_addr().unwrap()), format!("http://{closed}/")]);
+    let allowed = serde_json::json!(["https://github.com/lab", "https://github.com/other/x"]);
+    let builder = simulation_server(&webots.path(), forge.path(), 1).set("notify", notify);
+    let begin = Instant::now();
+    let server =
+        builder.set("timing.announce", 0.05).set("allowedRepositories", allowed).set("shareIdleTime", 25).start().await;
+    assert!(begin.elapsed() < Duration::from_secs(5), "the start waited for an announcement");
+    let body = format!(
+        "url=http%3A%2F%2Flocalhost%3A{}&shareIdleTime=25&allowedRepositories=https%3A%2F%2Fgithub.com%2Flab%2Chttps%3A%2F%2Fgithub.com%2Fother%2Fx",
+        server.port
+    );
+    for _ in 0..2 {
+        let request = requests.recv_timeout(crate::support::SOON).unwrap();
+        assert!(request.starts_with("POST /announce HTTP/1.1\r\n"), "{request}");
+        assert!(request.to_lowercase().contains("content-type: application/x-www-form-urlencoded"), "{request}");
+        assert!(request.ends_with(&format!("\r\n\r\n{body}")), "{request}");
+    }
+    until("it was told", async || server.log().contains(&format!("announced to {url}"))).await;
+    until("it gave up", async || server.log().contains(&format!("gave up announcing to http://{closed}/"))).await;
+    assert_eq!(server.log().matches(&format!("can't announce to http://{closed}/")).count(), 6);
+    let mut client = Client::start(&server, &arm()).await;
+    client.until("webots:").await;
+}
