@@ -4,12 +4,12 @@
 # The Debian is made by debootstrap once, and kept in target/deploy/root. Each run looks at it through an overlay in
 # memory, in namespaces of its own (processes, mounts, network), so that nothing of a run is left, however it ends.
 # FLEET_BIN, an absolute path, names a folder with programs to package in place of building them.
-set -euo pipefail
+set -Eeuo pipefail
 
 cd "$(dirname "$(readlink -f "${BASH_SOURCE[0]}")")/../.."
 readonly WORK=$PWD/target/deploy
 readonly ROOT=$WORK/root
-readonly PACKAGES=systemd,dbus,adduser,ca-certificates,git,curl
+readonly PACKAGES=systemd,dbus,adduser,ca-certificates,git,curl,openssl,nginx-light
 
 fail() {
     printf 'error: %s\n' "$*" >&2
@@ -118,7 +118,7 @@ boot() {
 }
 
 make_root() {
-    [[ -e $ROOT/.complete ]] && return
+    [[ -e $ROOT/.complete && $(<"$ROOT/.complete") == "$PACKAGES" ]] && return
     local mirror
     mirror=$(sed -nE 's/^URIs: *([^ ]+).*/\1/p; s/^deb (\[[^]]*\] )?([^ ]+).*/\2/p' \
         /etc/apt/sources.list /etc/apt/sources.list.d/*.{sources,list} 2>/dev/null || true)
@@ -131,7 +131,7 @@ make_root() {
         tail -n 5 "$WORK/debootstrap.log" >&2
         fail 'debootstrap failed'
     }
-    touch "$ROOT/.complete"
+    echo "$PACKAGES" >"$ROOT/.complete"
 }
 
 # Two packages with the same content: revisions 1 and 2.
@@ -197,6 +197,10 @@ main() {
     done
     mkdir -p "$WORK"
     make_root
+    if ! command -v cargo-deb >/dev/null && [[ ! -x target/tools/bin/cargo-deb ]]; then
+        echo 'builds cargo-deb, once'
+        cargo install --quiet --locked --root target/tools cargo-deb
+    fi
     make_packages
     boot
 
@@ -230,7 +234,6 @@ main() {
 
     echo 'runs a simulation within the limits of the unit'
     simulate &
-    local client=$!
     eventually runs demo-simulator
     eventually grep --quiet --text 'webots:ws://localhost:2001' "$WORK/client.log"
 
@@ -262,7 +265,7 @@ main() {
     eventually drains webots-simulation@main
     sleep 2
     runs demo-simulator >/dev/null || fail 'the simulation was lost'
-    kill "$client"
+    in_machine sh -c "kill $(in_machine cat /run/client.pid)"
     wait "$renewal" || fail "it was not renewed: $(<"$WORK/renew.log")"
     [[ $(property webots-simulation@main MainPID) != "$old" ]] || fail 'it is the old one'
     answers 2000 /status '"places":7' || fail 'it has not read its configuration'
@@ -288,16 +291,70 @@ main() {
     in_machine sh -c "kill -STOP $old"
     eventually is_another webots-simulation@main "$old"
 
+    echo 'follows docs/deployment.md to https://fleet.example.org/viewer'
+    follow_guide
+
     echo 'is removed: nothing runs, configurations stay'
     in_machine apt-get remove --yes --quiet webots-fleet >"$WORK/remove.log" 2>&1 || fail "$(<"$WORK/remove.log")"
     ! runs 'session-server|simulation-serv' || fail 'a server still runs'
     in_machine test -e /etc/webots-fleet/simulation/main.json || fail 'the configuration is gone'
 
     echo 'is purged: nothing is left'
+    in_machine rm -rf /etc/nginx/sites-enabled/fleet /etc/nginx/sites-available/fleet
     in_machine rm -rf /run/systemd/system/webots-simulation@.service.d /srv/webots-demo
     in_machine dpkg --purge webots-fleet >"$WORK/purge.log" 2>&1 || fail "$(<"$WORK/purge.log")"
     [[ -z $(traces) ]] || fail "this is left: $(traces)"
     echo 'ok'
+}
+
+# Steps 4 to 6 of the guide, with its own configurations, and a certificate of a lab's authority as
+# docs/deployment-web-server.md has it.
+follow_guide() {
+    local kind
+    for kind in simulation session; do
+        guided_configuration "$kind" | in_machine tee "/etc/webots-fleet/$kind/main.json" >/dev/null
+        in_machine runuser -u "webots-$kind" -- "$kind-server" --check "/etc/webots-fleet/$kind/main.json" >/dev/null 2>"$WORK/check.log" ||
+            fail "$(<"$WORK/check.log")"
+        ! grep 'unknown key\|is not set' "$WORK/check.log" || fail 'the configuration in the guide has faults'
+    done
+    # shellcheck disable=SC2016
+    in_machine sh -c '
+        set -e
+        echo 127.0.1.1 fleet.example.org >>/etc/hosts
+        certificates=/etc/letsencrypt/live/fleet.example.org
+        mkdir -p $certificates
+        cd $certificates
+        openssl req -x509 -newkey ec -pkeyopt ec_paramgen_curve:P-256 -nodes -keyout authority.key -subj "/CN=Lab" \
+            -out /usr/local/share/ca-certificates/lab-authority.crt 2>/dev/null
+        openssl req -newkey ec -pkeyopt ec_paramgen_curve:P-256 -nodes -keyout privkey.pem -subj "/CN=fleet" -out request 2>/dev/null
+        printf "subjectAltName=DNS:fleet.example.org\nbasicConstraints=critical,CA:FALSE\n" >extensions
+        openssl x509 -req -in request -CA /usr/local/share/ca-certificates/lab-authority.crt -CAkey authority.key -CAcreateserial \
+            -extfile extensions -out fullchain.pem 2>/dev/null
+        update-ca-certificates >/dev/null 2>&1
+        rm /etc/nginx/sites-enabled/default
+        ln -s ../sites-available/fleet /etc/nginx/sites-enabled/
+        cat >/etc/nginx/sites-available/fleet' <deploy/nginx.conf
+    in_machine systemctl restart webots-simulation@main
+    in_machine systemctl restart webots-session@main
+    in_machine systemctl restart nginx || fail "$(in_machine nginx -t 2>&1)"
+    secure /monitor
+    secure /viewer
+    secure /2000/monitor
+    eventually answers 1999 /status '"state":"\(up\|full\)"'
+}
+
+# A page through the web server, as visitors get it.
+secure() { # PATH
+    in_machine curl --silent --show-error --fail --max-time 3 --output /dev/null "https://fleet.example.org$1" || fail "https://fleet.example.org$1 is not there"
+}
+
+# The configuration that the guide shows for a server.
+guided_configuration() { # KIND
+    awk -v file="/etc/webots-fleet/$1/main.json" '
+        index($0, "`" file "`") == 1 { wanted = 1 }
+        /^```$/ { if (inside) exit }
+        inside { print }
+        /^```json$/ { if (wanted) inside = 1 }' docs/deployment.md
 }
 
 # A project to simulate, and the demo simulator in place of Webots.
@@ -324,7 +381,8 @@ simulate() {
         exec 3<>/dev/tcp/127.0.0.1/2000
         printf "GET /client HTTP/1.1\r\nHost: localhost:2000\r\nConnection: Upgrade\r\nUpgrade: websocket\r\nSec-WebSocket-Version: 13\r\nSec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n" >&3
         printf "$1" >&3
-        exec cat <&3' simulate "$text" >"$WORK/client.log"
+        echo $$ >/run/client.pid
+        exec cat <&3' simulate "$text" >"$WORK/client.log" 2>/dev/null || true
 }
 
 if [[ ${1-} == machine ]]; then
