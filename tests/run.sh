@@ -9,9 +9,12 @@ command -v cargo >/dev/null || {
     echo 'error: cargo is missing; https://rustup.rs tells how to install it' >&2
     exit 1
 }
-# The C compiler links the programs; python3 and openssl make counterparts for mail and TLS; xvfb gives a display.
+# Debian has web servers where only root looks for programs.
+PATH=$PATH:/usr/sbin
+# The C compiler links the programs; python3 and openssl make counterparts for mail and TLS; xvfb gives a display; the
+# fleet is tested behind both web servers.
 tests/install.sh cc=gcc,libc6-dev git=git flock=util-linux openssl=openssl python3=python3 python3-venv=python3-venv \
-    xvfb-run=xvfb,xauth
+    xvfb-run=xvfb,xauth apache2=apache2-bin nginx=nginx setpriv=util-linux
 tests/python.sh >/dev/null
 
 start=$SECONDS

@@ -6,7 +6,7 @@ use std::process::ExitCode;
 use clap::Parser;
 use webots_fleet::shared::start;
 use webots_fleet::simulation::config::SimulationConfig;
-use webots_fleet::simulation::{app, guardian};
+use webots_fleet::simulation::{app, guardian, preflight};
 
 /// Runs one Webots per web client.
 #[derive(Parser)]
@@ -15,7 +15,7 @@ struct Arguments {
     /// Configuration file
     #[arg(default_value = "config/simulation/local.json")]
     config: PathBuf,
-    /// Print the effective configuration and end
+    /// Print the effective configuration, look for what simulations need, and end
     #[arg(long)]
     check: bool,
     #[command(subcommand)]
@@ -39,7 +39,11 @@ fn main() -> ExitCode {
         Err(code) => return code,
     };
     if arguments.check {
-        return start::check(&loaded);
+        let code = start::check(&loaded);
+        for finding in preflight::look(&loaded.config) {
+            eprintln!("{finding}");
+        }
+        return code;
     }
     let log = loaded.config.log_dir.0.join("simulation/output.log");
     start::serve(&log, loaded.config.debug, &loaded.warnings, app::run(loaded.config.clone()))

@@ -6,16 +6,20 @@ use std::time::{Instant, SystemTime};
 
 use actix::prelude::*;
 use actix_web::{App, HttpServer, web};
-use tokio::sync::{Semaphore, watch};
+use nix::sys::resource::{Resource, getrlimit, setrlimit};
+use tokio::sync::watch;
 
+use super::audience::Audience;
 use super::config::SessionConfig;
 use super::mailer;
-use super::registry::{Reconfigure, Registry};
+use super::registry::{IsAvailable, Reconfigure, Registry};
 use super::routes;
 use super::server::Server;
 use crate::shared::config;
+use crate::shared::connections::Connections;
 use crate::shared::live::Live;
 use crate::shared::metrics::Metrics;
+use crate::shared::notify;
 use crate::shared::permanent;
 use crate::shared::shutdown::{Phase, Request, Signals};
 
@@ -50,6 +54,7 @@ const OUTCOMES: [&str; 4] = ["placed", "unavailable", "not_accepted", "wrong_url
 /// When it can't start, or an actor that must live is gone.
 pub async fn run(mut config: SessionConfig, file: PathBuf) -> Result<(), AppError> {
     let mut signals = Signals::catch()?;
+    allow_open_files();
     let (phase_sender, phase) = watch::channel(Phase::Open);
     let address = format!("{}:{}", config.bind, config.port);
     let socket = std::net::TcpListener::bind(&address).map_err(|source| AppError::Bind { address, source })?;
@@ -59,16 +64,21 @@ pub async fn run(mut config: SessionConfig, file: PathBuf) -> Result<(), AppErro
     let told = config.address().http_url(config.ssl);
     let server = Arc::new(assemble(config, phase)?);
     let shared = web::Data::from(Arc::clone(&server));
-    let http = HttpServer::new(move || App::new().app_data(shared.clone()).configure(routes::configure))
-        .disable_signals()
-        .shutdown_timeout(stop.as_secs())
-        .backlog(4096)
-        .listen(socket)?
-        .run();
+    // This is called in each thread that serves connections.
+    let app = move || {
+        let audience = Audience::new(Arc::clone(&shared)).start();
+        App::new().app_data(shared.clone()).app_data(web::Data::new(audience)).configure(routes::configure)
+    };
+    let http =
+        HttpServer::new(app).disable_signals().shutdown_timeout(stop.as_secs()).backlog(4096).listen(socket)?.run();
     let handle = http.handle();
     let serving = actix_rt::spawn(http);
     log::info!("session server {} listens on port {port}: {told}", env!("CARGO_PKG_VERSION"));
     println!("session server: {told}/monitor (local port {port})");
+    let listening = format!("listens on port {port}");
+    notify::ready(&listening);
+    let registry = server.registry.clone();
+    actix_rt::spawn(notify::feed_watchdog(async move || registry.send(IsAvailable).await.is_ok()));
     let mut lost = std::pin::pin!(permanent::gone("Registry", server.registry.clone()));
     loop {
         let request = tokio::select! {
@@ -77,17 +87,32 @@ pub async fn run(mut config: SessionConfig, file: PathBuf) -> Result<(), AppErro
         };
         match request {
             Request::Stop => break,
-            Request::Reload => reload(&file, &server.registry),
+            Request::Reload => {
+                notify::reloading();
+                reload(&file, &server.registry);
+                notify::ready(&listening);
+            }
             Request::Drain => log::info!("SIGUSR1 changes nothing here: simulation servers are drained"),
         }
     }
     log::info!("stopping");
+    notify::stopping();
     phase_sender.send_replace(Phase::Closing);
     // A connection that doesn't end in time is cut.
     actix_rt::time::timeout(stop, handle.stop(true)).await.ok();
     drop(serving);
     log::info!("stopped");
     Ok(())
+}
+
+/// Lets the server open as many files as the system allows it: each client is one, and the usual limit is 1,024.
+fn allow_open_files() {
+    let raised = getrlimit(Resource::RLIMIT_NOFILE)
+        .and_then(|(_, most)| setrlimit(Resource::RLIMIT_NOFILE, most, most).map(|()| most));
+    match raised {
+        Ok(most) => log::debug!("{most} files may be open"),
+        Err(error) => log::warn!("the limit of open files can't be raised: {error}"),
+    }
 }
 
 /// Makes everything that the server is made of, and starts its actors.
@@ -100,7 +125,8 @@ fn assemble(config: SessionConfig, phase: watch::Receiver<Phase>) -> Result<Serv
     }
     let notices = mailer::start(&config).map(Addr::recipient);
     let (timing, ssl) = (config.timing.clone(), config.ssl);
-    let connections = Arc::new(Semaphore::new(config.max_clients));
+    let connections = Connections::new(config.max_clients, config.max_clients_per_address);
+    let trusted_proxies = config.trusted_proxies.clone();
     let (examples, viewer_script) = (config.examples.clone(), config.viewer_script.clone());
     let registry = Registry::new(Arc::new(config), notices, latencies).start();
     let (started, started_at) = (Instant::now(), SystemTime::now());
@@ -110,6 +136,7 @@ fn assemble(config: SessionConfig, phase: watch::Receiver<Phase>) -> Result<Serv
         ssl,
         phase,
         connections,
+        trusted_proxies,
         metrics,
         picks,
         live: Live::new(),

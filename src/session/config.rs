@@ -9,6 +9,7 @@ use crate::shared::address::PublicAddress;
 use crate::shared::config::{
     Configuration, ExpandedPath, Secret, Unfit, one_or_many, optional_port, percent, seconds, threshold, whole,
 };
+use crate::shared::peer::TrustedProxies;
 
 /// Every key of the session server. The original's keys keep their meaning.
 #[derive(Debug, Clone, Serialize, Deserialize)]
@@ -75,6 +76,13 @@ pub struct SessionConfig {
     /// How many client `WebSockets` may be open in all. Default: 20000.
     #[serde(default = "many_clients", deserialize_with = "whole::<1, 1_000_000, _, _>")]
     pub max_clients: usize,
+    /// How many of them one client address may have. Default: 1000, for a class sits behind one address.
+    #[serde(default = "a_class", deserialize_with = "whole::<1, 1_000_000, _, _>")]
+    pub max_clients_per_address: usize,
+    /// Web servers, as addresses or networks, whose `X-Forwarded-For` or `Forwarded` tells their clients' addresses.
+    /// Default: `["127.0.0.0/8", "::1/128"]`.
+    #[serde(default)]
+    pub trusted_proxies: TrustedProxies,
     /// Worlds that the page `/viewer` offers: URLs, or `{"title": ..., "url": ...}`. Default: none.
     #[serde(default, deserialize_with = "one_or_many")]
     pub examples: Vec<Example>,
@@ -239,6 +247,10 @@ fn one_second() -> Duration {
 
 fn client_cost() -> f64 {
     2.0
+}
+
+fn a_class() -> usize {
+    1000
 }
 
 fn many_clients() -> usize {

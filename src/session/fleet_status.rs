@@ -12,8 +12,6 @@ use crate::shared::status::Dispatch;
 pub struct FleetStatus {
     /// Whether some simulation server can take a client.
     pub available: bool,
-    /// How many web clients are connected.
-    pub clients: usize,
     /// The mean load of the servers that answer.
     pub mean_load: Option<f64>,
     /// Each simulation server, in the order of the configuration.

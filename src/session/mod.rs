@@ -2,6 +2,7 @@
 
 pub mod app;
 pub mod asking;
+pub mod audience;
 pub mod changes;
 pub mod config;
 pub mod fleet_status;

@@ -38,8 +38,8 @@ pub fn configure(app: &mut web::ServiceConfig) {
 }
 
 async fn monitor(server: web::Data<Server>) -> HttpResponse {
-    let (ssl, started) = (server.ssl, server.started_at);
-    with_status(&server, |status| html(pages::monitor(status, ssl, started), &Policy::own())).await
+    let (clients, ssl, started) = (server.clients(), server.ssl, server.started_at);
+    with_status(&server, |status| html(pages::monitor(status, clients, ssl, started), &Policy::own())).await
 }
 
 async fn events(server: web::Data<Server>) -> HttpResponse {
@@ -48,7 +48,7 @@ async fn events(server: web::Data<Server>) -> HttpResponse {
         let server = shown.clone();
         async move {
             let status = ask(&server, GetStatus).await?;
-            let view = pages::view(&status, server.ssl);
+            let view = pages::view(&status, server.clients(), server.ssl);
             view.inspect_err(|error| log::error!("the monitor page can't be rendered: {error}")).ok()
         }
     };

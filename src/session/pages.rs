@@ -92,14 +92,16 @@ pub struct WebotsViewer {
 ///
 /// # Errors
 /// When a template can't be rendered.
-pub fn view(status: &FleetStatus, ssl: bool) -> Result<View, askama::Error> {
+pub fn view(status: &FleetStatus, clients: usize, ssl: bool) -> Result<View, askama::Error> {
     let rows = status.servers.iter().map(|server| {
         let html = ServerRow::new(server, ssl).render()?;
         Ok(Row { key: server.address.to_string(), html })
     });
     let rows = rows.collect::<Result<Vec<Row>, askama::Error>>()?;
-    let parts =
-        [("glance", Glance::new(status).render()?), ("changes", Changes { changes: &status.changes }.render()?)];
+    let parts = [
+        ("glance", Glance::new(status, clients).render()?),
+        ("changes", Changes { changes: &status.changes }.render()?),
+    ];
     Ok(View { parts: parts.into(), tables: [("servers", rows)].into(), sample: Vec::new() })
 }
 
@@ -107,8 +109,8 @@ pub fn view(status: &FleetStatus, ssl: bool) -> Result<View, askama::Error> {
 ///
 /// # Errors
 /// When a template can't be rendered.
-pub fn monitor(status: &FleetStatus, ssl: bool, started: SystemTime) -> Result<String, askama::Error> {
-    let view = view(status, ssl)?;
+pub fn monitor(status: &FleetStatus, clients: usize, ssl: bool, started: SystemTime) -> Result<String, askama::Error> {
+    let view = view(status, clients, ssl)?;
     let part = |id| view.parts.get(id).map(String::as_str).unwrap_or_default();
     let page = Monitor {
         version: env!("CARGO_PKG_VERSION"),
@@ -121,13 +123,13 @@ pub fn monitor(status: &FleetStatus, ssl: bool, started: SystemTime) -> Result<S
 }
 
 impl Glance {
-    fn new(status: &FleetStatus) -> Self {
+    fn new(status: &FleetStatus, clients: usize) -> Self {
         let count = |wanted: &[State]| status.servers.iter().filter(|server| wanted.contains(&server.state)).count();
         let instances = || status.servers.iter().filter_map(known_instances);
         let sum = |part: fn(Instances) -> u32| instances().map(part).sum::<u32>();
         Self {
             available: status.available,
-            clients: status.clients,
+            clients,
             mean_load: status.mean_load,
             servers: status.servers.len(),
             answering: count(&[State::Up, State::Full, State::Draining]),

@@ -17,7 +17,7 @@ use super::notices::Notice;
 use super::pick::{NoServer, Pick};
 use super::placement::{Fleet, Policy};
 use super::server_monitor::{self, Forget, Reported, ServerMonitor, Unreachable, Watch};
-use super::subscribers::{Availability, Subscribers};
+use super::subscribers::{News, Subscribers};
 use super::watched::Watched;
 use crate::shared::address::PublicAddress;
 use crate::shared::project_url::ProjectUrl;
@@ -25,15 +25,8 @@ use crate::shared::status::Dispatch;
 
 /// Asks to be told of availability, now and whenever it changes.
 #[derive(Message)]
-#[rtype(result = "Subscription")]
-pub struct Subscribe(pub Recipient<Availability>);
-
-/// A place among the subscribers. Dropping it gives it up.
-#[derive(Debug)]
-pub struct Subscription {
-    id: u64,
-    registry: Addr<Registry>,
-}
+#[rtype(result = "()")]
+pub struct Subscribe(pub Recipient<News>);
 
 /// Asks for everything that is known.
 #[derive(Message)]
@@ -49,10 +42,6 @@ pub struct IsAvailable;
 #[derive(Message)]
 #[rtype(result = "()")]
 pub struct Reconfigure(pub Arc<SessionConfig>);
-
-#[derive(Message)]
-#[rtype(result = "()")]
-struct Unsubscribe(u64);
 
 /// The actor.
 pub struct Registry {
@@ -153,7 +142,7 @@ impl Registry {
             }
         }
         self.publish();
-        self.subscribers.tell_late(self.available);
+        self.subscribers.tell_late(self.news());
     }
 
     /// Tells the subscribers, if availability has changed.
@@ -164,8 +153,12 @@ impl Registry {
         }
         self.available = available;
         let words = if available { "a simulation server is available" } else { "no simulation server is available" };
-        log::info!("{words}: {} clients are told", self.subscribers.count());
-        self.subscribers.tell(available);
+        log::info!("{words}");
+        self.subscribers.tell(self.news());
+    }
+
+    fn news(&self) -> News {
+        News::Availability(self.available)
     }
 
     /// Takes in what came of a server at this time.
@@ -264,19 +257,10 @@ impl Handler<Pick> for Registry {
 }
 
 impl Handler<Subscribe> for Registry {
-    type Result = MessageResult<Subscribe>;
-
-    fn handle(&mut self, Subscribe(client): Subscribe, ctx: &mut Self::Context) -> Self::Result {
-        let id = self.subscribers.add(client, self.available);
-        MessageResult(Subscription { id, registry: ctx.address() })
-    }
-}
-
-impl Handler<Unsubscribe> for Registry {
     type Result = ();
 
-    fn handle(&mut self, Unsubscribe(id): Unsubscribe, _: &mut Self::Context) {
-        self.subscribers.remove(id);
+    fn handle(&mut self, Subscribe(audience): Subscribe, _: &mut Self::Context) {
+        self.subscribers.add(audience, Some(self.news()));
     }
 }
 
@@ -296,7 +280,6 @@ impl Handler<GetStatus> for Registry {
         let servers = self.config.simulation_servers.iter().filter_map(|address| self.status_of(address, now));
         MessageResult(Arc::new(FleetStatus {
             available: self.available,
-            clients: self.subscribers.count(),
             mean_load: self.fleet.mean_load(),
             servers: servers.collect(),
             changes: self.changes.recent().clone(),
@@ -309,7 +292,7 @@ impl Handler<Reconfigure> for Registry {
 
     fn handle(&mut self, Reconfigure(config): Reconfigure, ctx: &mut Self::Context) {
         let before = self.watch();
-        self.fleet.set_policy(policy(&config));
+        self.fleet.set_policy(Instant::now(), policy(&config));
         self.config = config;
         self.apply(ctx);
         let watch = self.watch();
@@ -320,11 +303,5 @@ impl Handler<Reconfigure> for Registry {
         }
         self.judge_again();
         self.publish();
-    }
-}
-
-impl Drop for Subscription {
-    fn drop(&mut self) {
-        self.registry.do_send(Unsubscribe(self.id));
     }
 }

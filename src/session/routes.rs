@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 
+use actix::Addr;
 use actix_web::http::{Method, StatusCode, header};
 use actix_web::middleware::DefaultHeaders;
 use actix_web::{HttpRequest, HttpResponse, web};
@@ -9,6 +10,7 @@ use actix_web_actors::ws::WsResponseBuilder;
 use rand::RngExt;
 
 use super::asking::{ask, with_status};
+use super::audience::Audience;
 use super::fleet_status::told_mean;
 use super::page_routes;
 use super::pick::{NoServer, Pick};
@@ -52,13 +54,23 @@ fn wants_websocket(request: &HttpRequest) -> bool {
     upgrade.is_some_and(|value| value.eq_ignore_ascii_case("websocket"))
 }
 
-async fn root(request: HttpRequest, stream: web::Payload, server: web::Data<Server>) -> HttpResponse {
-    if wants_websocket(&request) { websocket(&request, stream, &server) } else { availability(server).await }
+async fn root(
+    request: HttpRequest,
+    stream: web::Payload,
+    server: web::Data<Server>,
+    audience: web::Data<Addr<Audience>>,
+) -> HttpResponse {
+    if wants_websocket(&request) { websocket(&request, stream, &server, &audience) } else { availability(server).await }
 }
 
-async fn session(request: HttpRequest, stream: web::Payload, server: web::Data<Server>) -> HttpResponse {
+async fn session(
+    request: HttpRequest,
+    stream: web::Payload,
+    server: web::Data<Server>,
+    audience: web::Data<Addr<Audience>>,
+) -> HttpResponse {
     if wants_websocket(&request) {
-        return websocket(&request, stream, &server);
+        return websocket(&request, stream, &server, &audience);
     }
     let answer = server.pick(Pick::parse(wanted_world(request.query_string()))).await;
     let status = match answer.refusal {
@@ -81,12 +93,18 @@ fn wanted_world(query: &str) -> Option<&str> {
     begin.filter(|world| !world.is_empty())
 }
 
-fn websocket(request: &HttpRequest, stream: web::Payload, server: &web::Data<Server>) -> HttpResponse {
-    let Ok(permit) = Arc::clone(&server.connections).try_acquire_owned() else {
-        return HttpResponse::ServiceUnavailable().body("Error: too many connections.");
+fn websocket(
+    request: &HttpRequest,
+    stream: web::Payload,
+    server: &web::Data<Server>,
+    audience: &Addr<Audience>,
+) -> HttpResponse {
+    let peer = server.trusted_proxies.peer(request);
+    let connection = match server.connections.admit(peer) {
+        Ok(connection) => connection,
+        Err(crowded) => return crowded.answer(),
     };
-    let peer = request.peer_addr().map(|address| address.ip());
-    let actor = WebClient::new(Arc::clone(server), peer, permit);
+    let actor = WebClient::new(Arc::clone(server), audience.clone(), peer, connection);
     WsResponseBuilder::new(actor, request, stream).frame_size(LARGEST_MESSAGE).start().unwrap_or_else(|error| {
         let problem = format!("Error: this is a WebSocket: {error}.");
         HttpResponse::build(error.as_response_error().status_code()).body(problem)
@@ -108,7 +126,7 @@ async fn status_json(server: web::Data<Server>) -> HttpResponse {
 }
 
 async fn metrics(server: web::Data<Server>) -> HttpResponse {
-    with_status(&server, |status| match server.metrics.render(&status::gauges(status)) {
+    with_status(&server, |status| match server.metrics.render(&status::gauges(server.clients(), status)) {
         Ok(text) => HttpResponse::Ok().content_type(CONTENT_TYPE).body(text),
         Err(error) => HttpResponse::InternalServerError().body(format!("Error: {error}.")),
     })

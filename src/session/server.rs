@@ -1,16 +1,17 @@
 //! What the routes, the pages and the web clients of a session server share. Made by `app`.
 
-use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
 use actix::prelude::*;
-use tokio::sync::{Semaphore, watch};
+use tokio::sync::watch;
 
 use super::config::{Example, Timing};
 use super::pick::{NoServer, Pick};
 use super::registry::Registry;
+use crate::shared::connections::Connections;
 use crate::shared::live::Live;
 use crate::shared::metrics::Metrics;
+use crate::shared::peer::TrustedProxies;
 use crate::shared::shutdown::Phase;
 
 /// What routes and web clients share.
@@ -24,7 +25,9 @@ pub struct Server {
     /// Whether clients are taken.
     pub phase: watch::Receiver<Phase>,
     /// Counts WebSockets.
-    pub connections: Arc<Semaphore>,
+    pub connections: Connections,
+    /// Whose word on clients' addresses is taken.
+    pub trusted_proxies: TrustedProxies,
     /// What is counted.
     pub metrics: Metrics,
     /// Requests for a simulation server, by what came of them.
@@ -53,6 +56,12 @@ pub struct Answer {
 const PATIENCE: Duration = Duration::from_secs(2);
 
 impl Server {
+    /// How many web clients are connected.
+    #[must_use]
+    pub fn clients(&self) -> usize {
+        self.connections.count()
+    }
+
     /// Asks for a simulation server, and puts the answer in the words of the protocol.
     pub async fn pick(&self, wanted: Result<Pick, NoServer>) -> Answer {
         let picked = match wanted {

@@ -17,6 +17,7 @@ use awc::error::{ConnectError, SendRequestError};
 use crate::shared::address::PublicAddress;
 use crate::shared::load::Load;
 use crate::shared::status::Dispatch;
+use crate::shared::tls;
 
 /// What was learned about a simulation server.
 #[derive(Message, Debug)]
@@ -92,7 +93,10 @@ enum Answer {
 pub fn client(refresh: Duration) -> awc::Client {
     let idle = (refresh * 3).max(Duration::from_secs(15));
     // The default limit of the pool is 100 connections. A look as a whole has a time limit, its parts have none.
-    let connector = awc::Connector::new().limit(0).conn_keep_alive(idle).timeout(NEVER);
+    let mut connector = awc::Connector::new().limit(0).conn_keep_alive(idle).timeout(NEVER);
+    if let Some(config) = tls::client_config() {
+        connector = connector.rustls_0_23(config);
+    }
     awc::Client::builder().connector(connector).disable_timeout().disable_redirects().finish()
 }
 
@@ -227,7 +231,7 @@ fn is_broken(error: &SendRequestError) -> bool {
 fn no_answer(error: SendRequestError) -> Unreachable {
     Unreachable::Refused(match error {
         SendRequestError::Connect(ConnectError::Disconnected) => "it was closed without an answer".to_owned(),
-        error => shortened(&error.to_string()),
+        error => tls::reason(&error).unwrap_or_else(|| shortened(&error.to_string())),
     })
 }
 

@@ -69,7 +69,7 @@ impl StatusPage {
             version: env!("CARGO_PKG_VERSION"),
             uptime: server.started.elapsed().as_secs(),
             available: status.available,
-            clients: status.clients,
+            clients: server.clients(),
             load: status.mean_load,
             servers: status.servers.iter().map(|one| ServerPage::new(one, server.ssl)).collect(),
             changes: changes.collect(),
@@ -103,7 +103,7 @@ impl ServerPage {
 
 /// The gauges of `/metrics`.
 #[must_use]
-pub fn gauges<'text>(status: &FleetStatus) -> Vec<Gauge<'text>> {
+pub fn gauges<'text>(clients: usize, status: &FleetStatus) -> Vec<Gauge<'text>> {
     let of_each = |value: &dyn Fn(&ServerStatus) -> Option<f64>| {
         let servers = status.servers.iter();
         servers.filter_map(|server| Some((vec![server.address.to_string()], value(server)?))).collect()
@@ -117,7 +117,7 @@ pub fn gauges<'text>(status: &FleetStatus) -> Vec<Gauge<'text>> {
             "1 while some simulation server can take a client",
             f64::from(u8::from(status.available)),
         ),
-        Gauge::plain("session_clients", "Web clients connected", number(status.clients)),
+        Gauge::plain("session_clients", "Web clients connected", number(clients)),
         Gauge::plain(
             "session_load_percent",
             "Mean load of the servers that answer, -1 where none does",

@@ -1,15 +1,20 @@
-//! Who is told of availability, and what each was told last. Part of the registry.
+//! Who is told the news, and what each was told last. Part of the registry and of each audience.
 
 use std::collections::HashMap;
 
 use actix::prelude::*;
 
-/// Whether some simulation server can take a client.
+/// What web clients are told without asking.
 #[derive(Message, Debug, Clone, Copy, PartialEq, Eq)]
 #[rtype(result = "()")]
-pub struct Availability(pub bool);
+pub enum News {
+    /// Whether some simulation server can take a client.
+    Availability(bool),
+    /// The server ends.
+    Closing,
+}
 
-/// The subscribers: each is told a value once.
+/// The subscribers: each is told the same news once.
 #[derive(Default)]
 pub struct Subscribers {
     members: HashMap<u64, Subscriber>,
@@ -19,8 +24,8 @@ pub struct Subscribers {
 }
 
 struct Subscriber {
-    client: Recipient<Availability>,
-    told: Option<bool>,
+    client: Recipient<News>,
+    told: Option<News>,
 }
 
 /// How telling somebody went.
@@ -32,12 +37,12 @@ enum Told {
 }
 
 impl Subscribers {
-    /// Takes in a subscriber and tells it the present value. Gives back its number.
-    pub fn add(&mut self, client: Recipient<Availability>, available: bool) -> u64 {
+    /// Takes in a subscriber and tells it what is known. Gives back its number.
+    pub fn add(&mut self, client: Recipient<News>, news: Option<News>) -> u64 {
         self.last += 1;
         let id = self.last;
         let mut subscriber = Subscriber { client, told: None };
-        let told = subscriber.tell(available);
+        let told = news.map_or(Told::Now, |news| subscriber.tell(news));
         if told == Told::Later {
             self.late.push(id);
         }
@@ -52,17 +57,11 @@ impl Subscribers {
         self.members.remove(&id);
     }
 
-    /// How many there are.
-    #[must_use]
-    pub fn count(&self) -> usize {
-        self.members.len()
-    }
-
     /// Tells everybody who was told something else.
-    pub fn tell(&mut self, available: bool) {
+    pub fn tell(&mut self, news: News) {
         self.late.clear();
         self.members.retain(|id, subscriber| {
-            let told = subscriber.tell(available);
+            let told = subscriber.tell(news);
             if told == Told::Later {
                 self.late.push(*id);
             }
@@ -71,9 +70,9 @@ impl Subscribers {
     }
 
     /// Tells those who could not be told before.
-    pub fn tell_late(&mut self, available: bool) {
+    pub fn tell_late(&mut self, news: News) {
         for id in std::mem::take(&mut self.late) {
-            match self.members.get_mut(&id).map(|subscriber| subscriber.tell(available)) {
+            match self.members.get_mut(&id).map(|subscriber| subscriber.tell(news)) {
                 Some(Told::Later) => self.late.push(id),
                 Some(Told::Gone) => self.remove(id),
                 Some(Told::Now) | None => {}
@@ -83,13 +82,13 @@ impl Subscribers {
 }
 
 impl Subscriber {
-    fn tell(&mut self, available: bool) -> Told {
-        if self.told == Some(available) {
+    fn tell(&mut self, news: News) -> Told {
+        if self.told == Some(news) {
             return Told::Now;
         }
-        match self.client.try_send(Availability(available)) {
+        match self.client.try_send(news) {
             Ok(()) => {
-                self.told = Some(available);
+                self.told = Some(news);
                 Told::Now
             }
             Err(SendError::Full(_)) => Told::Later,

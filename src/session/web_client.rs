@@ -1,40 +1,48 @@
 //! Actor: one web client's WebSocket. Tells it whether a simulation server can take a client, and which.
 //!
-//! Created by the route for each connection; ends with it. It subscribes to the registry's changes, and never tells
-//! the same value twice. A text from the client asks for a simulation server.
+//! Created by the route for each connection; ends with it. It joins the audience of its thread, and never tells the
+//! same value twice. A text from the client asks for a simulation server.
 
-use std::net::IpAddr;
 use std::sync::Arc;
 
 use actix::prelude::*;
 use actix_web_actors::ws::{CloseCode, CloseReason, Message, ProtocolError, WebsocketContext};
 use serde::Deserialize;
-use tokio::sync::OwnedSemaphorePermit;
 
+use super::audience::{Audience, Join, Membership};
 use super::pick::Pick;
-use super::registry::{Subscribe, Subscription};
 use super::server::Server;
-use super::subscribers::Availability;
+use super::subscribers::News;
+use crate::shared::connections::Connection;
 use crate::shared::liveness::Liveness;
-use crate::shared::shutdown::closing;
+use crate::shared::peer::Peer;
 
 /// The actor.
 pub struct WebClient {
     server: Arc<Server>,
-    peer: Option<IpAddr>,
+    peer: Peer,
     liveness: Liveness,
     told: Option<bool>,
-    subscription: Option<Subscription>,
-    _permit: OwnedSemaphorePermit,
+    audience: Addr<Audience>,
+    membership: Option<Membership>,
+    _connection: Connection,
 }
 
 type Context = WebsocketContext<WebClient>;
 
 impl WebClient {
-    /// A client that has just connected; `permit` counts it.
+    /// A client that has just connected; `connection` counts it.
     #[must_use]
-    pub fn new(server: Arc<Server>, peer: Option<IpAddr>, permit: OwnedSemaphorePermit) -> Self {
-        Self { server, peer, liveness: Liveness::new(), told: None, subscription: None, _permit: permit }
+    pub fn new(server: Arc<Server>, audience: Addr<Audience>, peer: Peer, connection: Connection) -> Self {
+        Self {
+            server,
+            peer,
+            liveness: Liveness::new(),
+            told: None,
+            audience,
+            membership: None,
+            _connection: connection,
+        }
     }
 
     fn close(code: CloseCode, ctx: &mut Context) {
@@ -44,7 +52,7 @@ impl WebClient {
 
     fn ping(&mut self, ctx: &mut Context) {
         if self.liveness.is_gone(self.server.timing.silence) {
-            log::debug!("client {:?}: silent for too long", self.peer);
+            log::debug!("client {}: silent for too long", self.peer);
             ctx.stop();
         } else {
             ctx.ping(&self.liveness.ping());
@@ -77,27 +85,29 @@ impl Actor for WebClient {
 
     fn started(&mut self, ctx: &mut Self::Context) {
         ctx.run_interval(self.server.timing.ping, Self::ping);
-        let subscribed = self.server.registry.send(Subscribe(ctx.address().recipient())).into_actor(self);
+        let subscribed = self.audience.send(Join(ctx.address().recipient())).into_actor(self);
         subscribed
             .map(|answer, client, ctx| match answer {
-                Ok(subscription) => client.subscription = Some(subscription),
+                Ok(membership) => client.membership = Some(membership),
                 Err(error) => {
                     log::error!("a client can't be told of changes: {error}");
                     Self::close(CloseCode::Error, ctx);
                 }
             })
             .spawn(ctx);
-        let ending = closing(self.server.phase.clone()).into_actor(self);
-        ending.map(|(), _, ctx| Self::close(CloseCode::Away, ctx)).spawn(ctx);
     }
 }
 
-impl Handler<Availability> for WebClient {
+impl Handler<News> for WebClient {
     type Result = ();
 
-    fn handle(&mut self, Availability(available): Availability, ctx: &mut Self::Context) {
-        if self.told.replace(available) != Some(available) {
-            ctx.text(if available { "1" } else { "0" });
+    fn handle(&mut self, news: News, ctx: &mut Self::Context) {
+        match news {
+            News::Closing => Self::close(CloseCode::Away, ctx),
+            News::Availability(available) if self.told.replace(available) != Some(available) => {
+                ctx.text(if available { "1" } else { "0" });
+            }
+            News::Availability(_) => {}
         }
     }
 }
@@ -114,12 +124,12 @@ impl StreamHandler<Result<Message, ProtocolError>> for WebClient {
             }
             Ok(Message::Nop) => {}
             Ok(Message::Text(_) | Message::Ping(_)) => {
-                log::warn!("client {:?}: asks without reading the answers", self.peer);
+                log::warn!("client {}: asks without reading the answers", self.peer);
                 Self::close(CloseCode::Policy, ctx);
             }
             Ok(Message::Binary(_) | Message::Continuation(_)) => Self::close(CloseCode::Unsupported, ctx),
             Err(error) => {
-                log::debug!("client {:?}: {error}", self.peer);
+                log::debug!("client {}: {error}", self.peer);
                 Self::close(CloseCode::Protocol, ctx);
             }
         }

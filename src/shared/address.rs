@@ -1,4 +1,5 @@
 //! Where a server is reached from outside: `HOST:PORT`, or `HOST/PORT` behind a web server that rewrites ports.
+//! A web server that is not on its usual port makes that `HOST:WEBPORT/PORT`.
 
 use std::fmt;
 use std::str::FromStr;
@@ -85,8 +86,13 @@ impl FromStr for PublicAddress {
             Some((host, port)) => (host, port, true),
             None => text.rsplit_once(':').map(|(host, port)| (host, port, false)).ok_or_else(no_address)?,
         };
-        url::Host::parse(host).map_err(|_| no_address())?;
-        let port = port.parse().ok().filter(|port| *port > 0).ok_or_else(no_address)?;
+        let number = |text: &str| text.parse().ok().filter(|port: &u16| *port > 0).ok_or_else(no_address);
+        let name = match host.rsplit_once(':') {
+            Some((name, web_port)) if rewritten && !host.ends_with(']') => number(web_port).map(|_| name)?,
+            _ => host,
+        };
+        url::Host::parse(name).map_err(|_| no_address())?;
+        let port = number(port)?;
         Ok(Self { host: host.to_owned(), port, rewritten })
     }
 }
@@ -97,7 +103,8 @@ mod tests {
 
     #[test]
     fn both_forms_are_read_and_written_as_they_were() {
-        for text in ["localhost:2000", "cyberbotics1.epfl.ch/2000", "[::1]:2000", "10.0.0.7/65535"] {
+        let texts = ["localhost:2000", "cyberbotics1.epfl.ch/2000", "[::1]:2000", "10.0.0.7/65535"];
+        for text in texts.into_iter().chain(["lab.org:8443/2000", "[::1]/2000", "[::1]:8443/2000"]) {
             assert_eq!(text.parse::<PublicAddress>().unwrap().to_string(), text);
         }
     }
@@ -113,6 +120,8 @@ mod tests {
     fn anything_else_is_refused_by_name() {
         for text in
             ["", "host", "host:", "host:0", "host:65536", "host/2000/x", "http://host:1", "a b:1", ":2000", "h:-1"]
+                .into_iter()
+                .chain(["host:x/2000", "host:0/2000", ":8443/2000", "host:1:2/2000", "host:1:2"])
         {
             let error = text.parse::<PublicAddress>().unwrap_err().to_string();
             assert!(error.contains(&format!("{text:?}")), "{error}");

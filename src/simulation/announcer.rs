@@ -9,6 +9,7 @@ use actix::prelude::*;
 use futures_util::future::join_all;
 
 use super::config::SimulationConfig;
+use crate::shared::tls;
 
 /// How often each address is tried.
 const TRIES: u32 = 6;
@@ -38,7 +39,11 @@ impl Announcer {
 }
 
 async fn announce(address: String, form: Vec<(&'static str, String)>, pause: Duration) {
-    let client = awc::Client::builder().timeout(ANSWER).finish();
+    let mut connector = awc::Connector::new();
+    if let Some(config) = tls::client_config() {
+        connector = connector.rustls_0_23(config);
+    }
+    let client = awc::Client::builder().connector(connector).timeout(ANSWER).finish();
     for attempt in 1..=TRIES {
         let problem = match client.post(&address).send_form(&form).await {
             Ok(answer) if answer.status().is_success() => {
@@ -46,7 +51,7 @@ async fn announce(address: String, form: Vec<(&'static str, String)>, pause: Dur
                 return;
             }
             Ok(answer) => format!("it answered {}", answer.status()),
-            Err(error) => error.to_string(),
+            Err(error) => tls::reason(&error).unwrap_or_else(|| error.to_string()),
         };
         log::warn!("can't announce to {address} ({attempt} of {TRIES}): {problem}");
         actix_rt::time::sleep(pause).await;

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use actix::prelude::*;
 use actix_web::dev::ServerHandle;
 use actix_web::{App, HttpServer, web};
-use tokio::sync::{Semaphore, watch};
+use tokio::sync::watch;
 
 use super::announcer::Announcer;
 use super::checkout::Checkouts;
@@ -23,8 +23,10 @@ use super::routes;
 use super::server::Server;
 use super::usage::UsageMonitor;
 use crate::shared::admission::Rules;
+use crate::shared::connections::Connections;
 use crate::shared::live::Live;
 use crate::shared::metrics::Metrics;
+use crate::shared::notify;
 use crate::shared::permanent;
 use crate::shared::shutdown::{Phase, Request, Signals};
 
@@ -81,6 +83,8 @@ pub async fn run(config: SimulationConfig) -> Result<(), AppError> {
     let serving = actix_rt::spawn(http);
     tell_start(&server.config);
     let places = server.places.clone();
+    let asked_for_life = places.clone();
+    actix_rt::spawn(notify::feed_watchdog(async move || asked_for_life.send(Census).await.is_ok()));
     let mut no_places = std::pin::pin!(permanent::gone("Places", places.clone()));
     let mut no_readings = std::pin::pin!(permanent::gone("LoadMonitor", server.load_monitor.clone()));
     loop {
@@ -96,11 +100,13 @@ pub async fn run(config: SimulationConfig) -> Result<(), AppError> {
             Request::Drain => {
                 log::info!("draining: no new clients, the server ends when the last has gone");
                 phase_sender.send_replace(Phase::Draining);
+                notify::status("draining: it ends when the last simulation has ended");
             }
             Request::Reload => log::info!("SIGHUP changes nothing here: the configuration is read at start"),
         }
     }
     log::info!("stopping");
+    notify::stopping();
     phase_sender.send_replace(Phase::Closing);
     actix_rt::time::timeout(server.config.timing.stop, empty(&places)).await.ok();
     stop(&handle).await;
@@ -158,7 +164,7 @@ fn assemble(
         phase,
         requests,
         main_thread: Arbiter::current(),
-        connections: Arc::new(Semaphore::new(config.max_clients)),
+        connections: Connections::new(config.max_clients, config.max_clients_per_address),
         metrics,
         starts,
         live: Live::new(),
@@ -172,6 +178,7 @@ fn tell_start(config: &SimulationConfig) {
     let address = config.address(config.port).http_url(config.ssl);
     log::info!("simulation server {} listens on port {}: {address}", env!("CARGO_PKG_VERSION"), config.port);
     println!("simulation server: {address}/monitor (local port {})", config.port);
+    notify::ready(&format!("listens on port {}", config.port));
 }
 
 /// Waits until the server is draining and its last client has gone.

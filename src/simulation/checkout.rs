@@ -7,6 +7,7 @@ use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use actix::prelude::*;
 use tokio::runtime::Handle;
 use tokio::sync::Semaphore;
 use tokio_util::task::AbortOnDropHandle;
@@ -27,6 +28,11 @@ pub struct Checkouts {
     /// How many copies are made at a time: more would only be slower together.
     copies: Semaphore,
 }
+
+/// A step of a checkout, in words.
+#[derive(Message)]
+#[rtype(result = "()")]
+pub struct Progress(pub String);
 
 /// A project that was checked out for one client.
 #[derive(Debug)]

@@ -8,6 +8,7 @@ use serde::{Deserialize, Serialize};
 use super::mirrors::Mirrors;
 use crate::shared::address::PublicAddress;
 use crate::shared::config::{Configuration, ExpandedPath, Unfit, one_or_many, percent, seconds, whole};
+use crate::shared::peer::TrustedProxies;
 use crate::shared::repositories::UrlPrefix;
 
 /// Every key of the simulation server. The original's keys keep their meaning.
@@ -78,6 +79,13 @@ pub struct SimulationConfig {
     /// How many client connections may be open in all, those without a simulation included. Default: 1000.
     #[serde(default = "many_clients", deserialize_with = "whole::<1, 1_000_000, _, _>")]
     pub max_clients: usize,
+    /// How many of them one client address may have. Default: 1000, for a class sits behind one address.
+    #[serde(default = "a_class", deserialize_with = "whole::<1, 1_000_000, _, _>")]
+    pub max_clients_per_address: usize,
+    /// Web servers, as addresses or networks, whose `X-Forwarded-For` or `Forwarded` tells their clients' addresses.
+    /// Default: `["127.0.0.0/8", "::1/128"]`.
+    #[serde(default)]
+    pub trusted_proxies: TrustedProxies,
     /// Seconds after which a simulation is closed, at least 360. Default: 7200.
     #[serde(default = "two_hours", deserialize_with = "whole::<360, 31_536_000, _, _>")]
     pub timeout: u64,
@@ -253,6 +261,10 @@ fn places() -> u16 {
 
 fn waiting_line() -> usize {
     100
+}
+
+fn a_class() -> usize {
+    1000
 }
 
 fn many_clients() -> usize {

@@ -1,62 +1,107 @@
-//! The X display that Webots opens its window on: which one, and whether it answers.
+//! The X display that Webots opens its window on: which one, and whether it takes clients of this user.
 
-use std::net::{TcpStream, ToSocketAddrs};
-use std::os::unix::net::UnixStream;
+use std::sync::mpsc;
 use std::time::Duration;
 
-/// How long a display on another machine may take to answer.
-const PATIENCE: Duration = Duration::from_secs(1);
-/// The port of display 0; the others follow.
-const FIRST_PORT: u16 = 6000;
-/// Where the sockets of local displays are.
-const SOCKETS: &str = "/tmp/.X11-unix/X";
+use x11rb::errors::ConnectError;
+use x11rb::reexports::x11rb_protocol::parse_display::parse_display;
+use x11rb::rust_connection::RustConnection;
+
+/// How long a display may take to answer.
+const PATIENCE: Duration = Duration::from_secs(2);
+/// The port of display 0 is 6000; those of the others follow.
+const LAST_NUMBER: u16 = u16::MAX - 6000;
+
+/// Why Webots can't open its window on a display.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum Trouble {
+    /// The name is none.
+    #[error("{0:?} is no display: allowed is HOST:NUMBER or :NUMBER")]
+    NoName(String),
+    /// No X server is there.
+    #[error(
+        "no display answers at {0}: start an X server there (without a monitor: Xvfb, or Xorg after nvidia-xconfig \
+         --allow-empty-initial-configuration), or set xvfb: true in the server's configuration"
+    )]
+    NoServer(String),
+    /// There is one, but this user may not use it.
+    #[error(
+        "the display {display} refuses this user ({reason}): run 'xhost +si:localuser:{user}' as its owner, or let \
+         the environment variable XAUTHORITY name its authority file"
+    )]
+    Refused {
+        /// The display.
+        display: String,
+        /// What the X server says.
+        reason: String,
+        /// Who asked.
+        user: String,
+    },
+    /// Something is there that is silent, or talks in another way.
+    #[error("what is at {display} does not answer as a display does: {reason}")]
+    Strange {
+        /// The display.
+        display: String,
+        /// What is wrong.
+        reason: String,
+    },
+}
 
 /// The display that is used where none is configured: the server's own, else the first.
 #[must_use]
 pub fn effective(configured: Option<&str>) -> String {
-    let own = || std::env::var("DISPLAY").ok().filter(|display| !display.is_empty());
-    configured.map(str::to_owned).or_else(own).unwrap_or_else(|| ":0".to_owned())
+    configured.map(str::to_owned).or_else(of_environment).unwrap_or_else(|| ":0".to_owned())
 }
 
-/// Splits `HOST:NUMBER.SCREEN` into host and number; a local display has no host.
-fn parse(display: &str) -> Option<(&str, u16)> {
-    let (host, number) = display.rsplit_once(':')?;
-    let number = number.split('.').next().unwrap_or_default();
-    let host = if host == "unix" { "" } else { host };
-    number.parse().ok().map(|number| (host, number))
-}
-
-/// Whether somebody answers at a display. Waits up to a second: not for a thread that serves others.
+/// The display that the environment names.
 #[must_use]
-pub fn answers(display: &str) -> bool {
-    let Some((host, number)) = parse(display) else {
-        return false;
-    };
-    if host.is_empty() {
-        let path = format!("{SOCKETS}{number}");
-        // Servers on Linux may have only the abstract socket of the same name.
-        return UnixStream::connect(&path).is_ok() || abstract_answers(&path);
+pub fn of_environment() -> Option<String> {
+    std::env::var("DISPLAY").ok().filter(|display| !display.is_empty())
+}
+
+/// Connects to a display as Webots would. Waits up to two seconds: not for a thread that serves others.
+///
+/// # Errors
+/// Why Webots can't open its window there, and what to do about it.
+pub fn look(display: &str) -> Result<(), Trouble> {
+    if !parse_display(Some(display)).is_ok_and(|parsed| parsed.display <= LAST_NUMBER) {
+        return Err(Trouble::NoName(display.to_owned()));
     }
-    let addresses = (host, FIRST_PORT.saturating_add(number)).to_socket_addrs();
-    addresses.into_iter().flatten().any(|address| TcpStream::connect_timeout(&address, PATIENCE).is_ok())
+    let (sender, answer) = mpsc::channel();
+    let name = display.to_owned();
+    // A display that never answers would hold whoever waits for it.
+    std::thread::spawn(move || sender.send(RustConnection::connect(Some(&name)).map(drop)));
+    match answer.recv_timeout(PATIENCE) {
+        Ok(Ok(())) => Ok(()),
+        Ok(Err(error)) => Err(explain(display, error)),
+        Err(_) => {
+            let reason = format!("it is silent for {} s", PATIENCE.as_secs());
+            Err(Trouble::Strange { display: display.to_owned(), reason })
+        }
+    }
 }
 
-#[cfg(target_os = "linux")]
-fn abstract_answers(path: &str) -> bool {
-    use std::os::linux::net::SocketAddrExt;
-    let address = std::os::unix::net::SocketAddr::from_abstract_name(path);
-    address.is_ok_and(|address| UnixStream::connect_addr(&address).is_ok())
+fn explain(display: &str, error: ConnectError) -> Trouble {
+    let display = display.to_owned();
+    let refused = |reason: &[u8]| {
+        let reason = String::from_utf8_lossy(reason).trim().to_owned();
+        Trouble::Refused { display: display.clone(), reason, user: user() }
+    };
+    match error {
+        ConnectError::SetupFailed(setup) => refused(&setup.reason),
+        ConnectError::SetupAuthenticate(setup) => refused(&setup.reason),
+        ConnectError::DisplayParsingError(_) => Trouble::NoName(display),
+        ConnectError::IoError(error) if error.kind() == std::io::ErrorKind::UnexpectedEof => {
+            Trouble::Strange { display, reason: "it has closed the connection".to_owned() }
+        }
+        ConnectError::IoError(_) => Trouble::NoServer(display),
+        other => Trouble::Strange { display, reason: other.to_string() },
+    }
 }
 
-#[cfg(not(target_os = "linux"))]
-fn abstract_answers(_: &str) -> bool {
-    false
-}
-
-/// What to do about a display that does not answer.
-#[must_use]
-pub fn hint(display: &str) -> String {
-    format!("no display answers at {display}: start an X server there, or set xvfb: true in the server's configuration")
+fn user() -> String {
+    let own = nix::unistd::getuid();
+    nix::unistd::User::from_uid(own).ok().flatten().map_or_else(|| format!("#{own}"), |user| user.name)
 }
 
 #[cfg(test)]
@@ -64,28 +109,36 @@ mod tests {
     use super::*;
 
     #[test]
-    fn displays_are_read() {
-        let table = [
-            (":0", Some(("", 0))),
-            (":12.1", Some(("", 12))),
-            ("unix:3", Some(("", 3))),
-            ("host.lab:1.0", Some(("host.lab", 1))),
-            ("", None),
-            ("0", None),
-            (":x", None),
-        ];
-        for (text, display) in table {
-            assert_eq!(parse(text), display, "{text}");
+    fn a_text_that_is_no_display_is_told() {
+        for text in ["nonsense", ":x", "", "0", ":65000"] {
+            assert_eq!(look(text), Err(Trouble::NoName(text.to_owned())));
         }
     }
 
     #[test]
-    fn a_display_answers_where_somebody_listens() {
-        let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
-        let port = listener.local_addr().unwrap().port();
-        if port > FIRST_PORT {
-            assert!(answers(&format!("127.0.0.1:{}", port - FIRST_PORT)));
+    fn a_display_without_a_server_is_told() {
+        for display in [":59000", "127.0.0.1:59000"] {
+            assert_eq!(look(display), Err(Trouble::NoServer(display.to_owned())));
         }
-        assert!(!answers(":59999") && !answers("nonsense"));
+    }
+
+    #[test]
+    fn something_else_than_a_display_is_told() {
+        use std::io::Read;
+        // Displays on other machines are at 6000 and the ports that follow.
+        let listener =
+            (20_000..30_000u16).find_map(|port| std::net::TcpListener::bind(("127.0.0.1", port)).ok()).unwrap();
+        let display = format!("127.0.0.1:{}", listener.local_addr().unwrap().port() - 6000);
+        let silent = std::thread::spawn(move || {
+            let (mut first, _) = listener.accept().unwrap();
+            first.read_exact(&mut [0; 12]).unwrap();
+            drop(first);
+            let (mut second, _) = listener.accept().unwrap();
+            second.read_to_end(&mut Vec::new()).ok();
+        });
+        let strange = |reason: &str| Err(Trouble::Strange { display: display.clone(), reason: reason.to_owned() });
+        assert_eq!(look(&display), strange("it has closed the connection"));
+        assert_eq!(look(&display), strange("it is silent for 2 s"));
+        drop(silent);
     }
 }

@@ -56,8 +56,7 @@ pub fn settings(remote: &Remote) -> Vec<OsString> {
     let location = &remote.location;
     let url = match remote.protocol {
         "file" => format!("file://{location}"),
-        _ if location.ends_with(".git") => format!("{location}/info/lfs"),
-        _ => format!("{}.git/info/lfs", location.trim_end_matches('/')),
+        _ => format!("{}.git/info/lfs", location.trim_end_matches('/').trim_end_matches(".git")),
     };
     let settings = [
         format!("lfs.url={url}"),

@@ -59,8 +59,8 @@ pub fn counter(metrics: &Metrics) -> Result<IntCounterVec, prometheus::Error> {
     Ok(counter)
 }
 
-/// A start whose outcome is not known yet. Dropping it means that the client has left.
-#[derive(Debug)]
+/// A start whose outcome is not known yet, if one was asked for. Dropping it means that the client has left.
+#[derive(Debug, Default)]
 pub struct Pending(Option<IntCounterVec>);
 
 impl Pending {

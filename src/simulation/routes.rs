@@ -45,11 +45,12 @@ async fn client(request: HttpRequest, stream: web::Payload, server: web::Data<Se
     if let Some(refusal) = refuse_origin(&request, &server) {
         return refusal;
     }
-    let Ok(permit) = Arc::clone(&server.connections).try_acquire_owned() else {
-        return HttpResponse::ServiceUnavailable().body("Error: too many connections.");
+    let peer = server.config.trusted_proxies.peer(&request);
+    let connection = match server.connections.admit(peer) {
+        Ok(connection) => connection,
+        Err(crowded) => return crowded.answer(),
     };
-    let peer = request.peer_addr().map(|address| address.ip());
-    let actor = WebClient::new(Arc::clone(&server), peer, permit);
+    let actor = WebClient::new(Arc::clone(&server), peer, connection);
     WsResponseBuilder::new(actor, &request, stream).frame_size(LARGEST_MESSAGE).start().unwrap_or_else(|error| {
         let problem = format!("Error: this is a WebSocket: {error}.");
         HttpResponse::build(error.as_response_error().status_code()).body(problem)

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use actix::prelude::*;
-use tokio::sync::{Semaphore, watch};
+use tokio::sync::watch;
 
 use super::checkout::Checkouts;
 use super::command::is_in_path;
@@ -15,9 +15,11 @@ use super::load_monitor::{LoadMonitor, Readings};
 use super::places::Places;
 use super::usage::UsageMonitor;
 use crate::shared::admission::Rules;
+use crate::shared::connections::Connections;
 use crate::shared::live::Live;
 use crate::shared::load::Load;
 use crate::shared::metrics::Metrics;
+use crate::shared::project_url::ProjectUrl;
 use crate::shared::shutdown::{Phase, Request};
 
 /// What routes and web clients share.
@@ -43,7 +45,7 @@ pub struct Server {
     /// Where Webots' actors live.
     pub main_thread: ArbiterHandle,
     /// Counts connections.
-    pub connections: Arc<Semaphore>,
+    pub connections: Connections,
     /// What is counted.
     pub metrics: Metrics,
     /// Clients that asked for a simulation, by what came of it.
@@ -67,6 +69,20 @@ impl Server {
     #[must_use]
     pub fn is_draining(&self) -> bool {
         *self.phase.borrow() != Phase::Open
+    }
+
+    /// Whether a world may run here, now. Nobody has to wait for a checkout only to learn that there is no Webots.
+    ///
+    /// # Errors
+    /// Why not, in words for the client.
+    pub fn admit(&self, url: &str) -> Result<ProjectUrl, String> {
+        let world = ProjectUrl::parse(url).map_err(|wrong| wrong.to_string())?;
+        if self.is_draining() {
+            return Err("This simulation server is about to end, and takes no new clients".to_owned());
+        }
+        self.rules.admit(&world, self.load()).map_err(|refusal| refusal.to_string())?;
+        self.webots_program()?;
+        Ok(world)
     }
 
     /// The program that is started for each client.

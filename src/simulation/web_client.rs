@@ -3,56 +3,58 @@
 //! Created by the route for each connection; ends with it. The connection is the lease: whatever this actor holds in
 //! any state (a place in the line, a checkout under way, a running Webots) is given back when it is dropped.
 
-use std::net::IpAddr;
 use std::sync::Arc;
 
 use actix::prelude::*;
 use actix_web_actors::ws::{self, CloseCode, CloseReason, Message, ProtocolError, WebsocketContext};
-use tokio::sync::OwnedSemaphorePermit;
 
 use super::census::Change;
-use super::checkout::Project;
-use super::checkout_error::CheckoutError;
+use super::checkout::{Progress, Project};
 use super::lease::{Lease, Stage, Wanted};
+use super::orders::Orders;
 use super::outcome::{Outcome, Pending};
 use super::places::{Ask, PlaceEvent, Ticket};
 use super::protocol::{self, Mode, Request};
 use super::server::Server;
-use super::webots::{Orders, RestoreController, Webots};
+use super::webots::{RestoreController, Webots};
 use super::webots_event::{Exit, WebotsEvent};
+use crate::shared::connections::Connection;
 use crate::shared::liveness::Liveness;
-use crate::shared::project_url::ProjectUrl;
-use crate::shared::shutdown::{Phase, closing};
+use crate::shared::peer::Peer;
+use crate::shared::shutdown::closing;
 
 /// The actor.
 pub struct WebClient {
     server: Arc<Server>,
-    peer: Option<IpAddr>,
+    peer: Peer,
     stage: Stage,
     liveness: Liveness,
     restoring: bool,
     /// Set from the wish for a simulation on.
-    start: Option<Pending>,
-    _permit: OwnedSemaphorePermit,
+    start: Pending,
+    _connection: Connection,
 }
-
-/// Progress of a checkout.
-#[derive(Message)]
-#[rtype(result = "()")]
-struct Progress(String);
 
 type Context = WebsocketContext<WebClient>;
 
 impl WebClient {
-    /// A client that has just connected; `permit` counts it.
+    /// A client that has just connected; `connection` counts it.
     #[must_use]
-    pub fn new(server: Arc<Server>, peer: Option<IpAddr>, permit: OwnedSemaphorePermit) -> Self {
+    pub fn new(server: Arc<Server>, peer: Peer, connection: Connection) -> Self {
         let stage = Stage::Connected;
-        Self { server, peer, stage, liveness: Liveness::new(), restoring: false, start: None, _permit: permit }
+        Self {
+            server,
+            peer,
+            stage,
+            liveness: Liveness::new(),
+            restoring: false,
+            start: Pending::default(),
+            _connection: connection,
+        }
     }
 
     fn name(&self) -> String {
-        self.peer.map_or_else(|| "client".to_owned(), |peer| format!("client {peer}"))
+        format!("client {}", self.peer)
     }
 
     /// Tells a failure, and closes the connection.
@@ -63,14 +65,8 @@ impl WebClient {
 
     /// The start that was asked for has failed.
     fn fail_start(&mut self, outcome: Outcome, why: &str, ctx: &mut Context) {
-        self.comes_to(outcome);
+        self.start.is(outcome);
         self.fail(why, ctx);
-    }
-
-    fn comes_to(&mut self, outcome: Outcome) {
-        if let Some(start) = &mut self.start {
-            start.is(outcome);
-        }
     }
 
     fn finish(&mut self, last_words: &str, code: CloseCode, ctx: &mut Context) {
@@ -93,19 +89,8 @@ impl WebClient {
             log::warn!("{}: asks for a second simulation on one connection; ignored", self.name());
             return;
         }
-        self.start = Some(Pending::new(&self.server.starts));
-        let admitted = ProjectUrl::parse(url).map_err(|wrong| wrong.to_string()).and_then(|world| {
-            let load = self.server.load();
-            let phase = *self.server.phase.borrow();
-            if phase != Phase::Open {
-                return Err("This simulation server is about to end, and takes no new clients".to_owned());
-            }
-            self.server.rules.admit(&world, load).map_err(|refusal| refusal.to_string())?;
-            // Nobody has to wait for a checkout only to learn that there is nothing to start.
-            self.server.webots_program()?;
-            Ok(world)
-        });
-        let world = match admitted {
+        self.start = Pending::new(&self.server.starts);
+        let world = match self.server.admit(url) {
             Ok(world) => world,
             Err(why) => return self.fail_start(Outcome::Refused, &why, ctx),
         };
@@ -171,7 +156,7 @@ impl WebClient {
             config: Arc::clone(&self.server.config),
             program,
             checkouts: Arc::clone(&self.server.checkouts),
-            project,
+            project: Arc::new(project),
             mode,
             place,
             events: ctx.address().recipient(),
@@ -195,22 +180,17 @@ impl WebClient {
                 this.restoring = false;
                 match answer {
                     Ok(Ok(())) => ctx.text(protocol::reset_controller(&file)),
-                    Ok(Err(error)) => this.warn(&error, ctx),
+                    // That does not end the simulation.
+                    Ok(Err(error)) => ctx.text(protocol::error(&error.to_string())),
                     Err(error) => log::warn!("{}: no controller was reset: {error}", this.name()),
                 }
             })
             .spawn(ctx);
     }
 
-    /// Tells a failure that does not end the simulation.
-    fn warn(&self, error: &CheckoutError, ctx: &mut Context) {
-        log::warn!("{}: {error}", self.name());
-        ctx.text(protocol::error(&error.to_string()));
-    }
-
     fn exited(&mut self, Exit { clean, why }: &Exit, ctx: &mut Context) {
         let words = if *clean { protocol::loading(why) } else { protocol::error(why) };
-        self.comes_to(Outcome::NoWebots);
+        self.start.is(Outcome::NoWebots);
         self.finish(&words, CloseCode::Normal, ctx);
     }
 
@@ -233,7 +213,7 @@ impl Actor for WebClient {
         closing(self.server.phase.clone())
             .into_actor(self)
             .map(|(), this, ctx| {
-                this.comes_to(Outcome::Stopped);
+                this.start.is(Outcome::Stopped);
                 this.finish(&protocol::error("This simulation server is stopping"), CloseCode::Away, ctx);
             })
             .spawn(ctx);
@@ -306,7 +286,7 @@ impl Handler<WebotsEvent> for WebClient {
     fn handle(&mut self, event: WebotsEvent, ctx: &mut Self::Context) {
         match event {
             WebotsEvent::Listening(port) => {
-                self.comes_to(Outcome::Ready);
+                self.start.is(Outcome::Ready);
                 ctx.text(protocol::webots(&self.server.config.address(port), self.server.config.ssl));
             }
             WebotsEvent::Heartbeat => ctx.text(protocol::HEARTBEAT),

@@ -4,23 +4,18 @@
 //! watches its signs of life and the time limit, and tells its client with [`WebotsEvent`]s. It ends when nothing of
 //! Webots' process tree is left, and is never restarted.
 
-use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use actix::prelude::*;
 
 use super::census::{Change, Stage};
-use super::checkout::{Checkouts, Project};
 use super::checkout_error::CheckoutError;
-use super::command::Launch;
-use super::config::SimulationConfig;
 use super::display;
+use super::orders::Orders;
 use super::output::{self, Sign, Tail};
-use super::places::Ticket;
-use super::process_group::{Ending, Plan, ProcessGroup};
+use super::process_group::{Ending, ProcessGroup};
 use super::process_tree;
-use super::protocol::Mode;
 use super::webots_event::{Exit, LastWord, WebotsEvent};
 use crate::shared::timestamp::seconds_since_1970;
 
@@ -34,33 +29,10 @@ pub struct End;
 #[rtype(result = "Result<(), CheckoutError>")]
 pub struct RestoreController(pub String);
 
-/// What a Webots is started with.
-pub struct Orders {
-    /// The server's configuration.
-    pub config: Arc<SimulationConfig>,
-    /// The program to start.
-    pub program: PathBuf,
-    /// Where controllers are restored from.
-    pub checkouts: Arc<Checkouts>,
-    /// What was checked out.
-    pub project: Project,
-    /// How it is shown.
-    pub mode: Mode,
-    /// The place, and its port.
-    pub place: (Ticket, u16),
-    /// Who hears of it.
-    pub events: Recipient<WebotsEvent>,
-}
-
 /// The actor.
 pub struct Webots {
-    config: Arc<SimulationConfig>,
-    program: PathBuf,
-    checkouts: Arc<Checkouts>,
-    project: Arc<Project>,
-    mode: Mode,
+    orders: Orders,
     port: u16,
-    ticket: Ticket,
     events: LastWord,
     group: Option<ProcessGroup>,
     tail: Tail,
@@ -88,16 +60,10 @@ impl Webots {
     /// Prepares a Webots; it starts with the actor.
     #[must_use]
     pub fn new(orders: Orders) -> Self {
-        let Orders { config, program, checkouts, project, mode, place: (ticket, port), events } = orders;
         Self {
-            config,
-            program,
-            checkouts,
-            project: Arc::new(project),
-            mode,
-            port,
-            ticket,
-            events: LastWord::new(events),
+            port: orders.place.1,
+            events: LastWord::new(orders.events.clone()),
+            orders,
             group: None,
             tail: Tail::default(),
             listening: false,
@@ -109,22 +75,22 @@ impl Webots {
     }
 
     fn launch(&mut self, ctx: &mut Context<Self>) -> std::io::Result<()> {
-        let log = self.config.log_dir.0.join("simulation/instances").join(format!("{}.log", self.port));
+        let log = self.orders.config.log_dir.0.join("simulation/instances").join(format!("{}.log", self.port));
         let begin = std::fs::metadata(&log).map_or(0, |file| file.len());
         let (reader, output) = std::io::pipe()?;
         let (tail, all_read) = output::follow(reader, &log, ctx.address())?;
         self.tail = tail;
         let errors = output.try_clone()?;
-        let (group, ended) = ProcessGroup::start(&self.plan(), output.into(), errors.into())?;
+        let (group, ended) = ProcessGroup::start(&self.orders.plan(), output.into(), errors.into())?;
         log::info!(
             "port {}: started {} for {} (guardian {})",
             self.port,
-            self.program.display(),
-            self.project.world.path.display(),
+            self.orders.program.display(),
+            self.orders.project.world.path.display(),
             group.guardian()
         );
         let (at, pid) = (seconds_since_1970(), group.guardian());
-        self.ticket.update(Change::Launched { at, pid, port: self.port, log, begin });
+        self.orders.place.0.update(Change::Launched { at, pid, port: self.port, log, begin });
         self.group = Some(group);
         let ended = async move {
             let ending = ended.await;
@@ -134,38 +100,18 @@ impl Webots {
         };
         ended.into_actor(self).map(|ending, this, ctx| this.ended(ending, ctx)).spawn(ctx);
         self.look_for_port(FIRST_LOOK, ctx);
-        ctx.run_interval(self.config.timing.heartbeat, Self::check_signs);
-        let limit = self.config.timing.launch;
+        ctx.run_interval(self.orders.config.timing.heartbeat, Self::check_signs);
+        let limit = self.orders.config.timing.launch;
         ctx.run_later(limit, move |this, _| {
             if !this.listening {
                 this.end(&format!("Webots did not become ready within {} seconds", limit.as_secs()));
             }
         });
-        let limit = self.config.timeout;
+        let limit = self.orders.config.timeout;
         ctx.run_later(Duration::from_secs(limit), move |this, _| {
             this.end(&format!("The time limit of {limit} seconds was reached"));
         });
         Ok(())
-    }
-
-    fn plan(&self) -> Plan {
-        let launch = Launch {
-            program: &self.program,
-            mode: self.mode,
-            port: self.port,
-            heartbeat: self.config.timing.heartbeat,
-            world: &self.project.world.path,
-            xvfb: self.config.xvfb,
-        };
-        let display = display::effective(self.config.display.as_deref());
-        Plan {
-            command: launch.arguments(),
-            environment: vec![("DISPLAY".into(), display.into())],
-            folder: Some(self.project.folder().to_owned()),
-            mark: self.project.instance.path().to_owned(),
-            remove: Some(self.project.instance.path().to_owned()),
-            grace: self.config.timing.grace,
-        }
     }
 
     /// Looks whether a process of this instance listens on a port that Webots may have taken.
@@ -187,7 +133,7 @@ impl Webots {
     }
 
     fn ready(&mut self, port: u16) {
-        let allowed = self.config.streaming_ports();
+        let allowed = self.orders.config.streaming_ports();
         if !allowed.contains(&port) {
             let (first, last) = (allowed.start(), allowed.end());
             return self
@@ -198,7 +144,7 @@ impl Webots {
         }
         log::info!("port {port}: ready");
         self.listening = true;
-        self.ticket.update(Change::Port(port));
+        self.orders.place.0.update(Change::Port(port));
         self.show_pace();
         self.tell(WebotsEvent::Listening(port));
     }
@@ -206,14 +152,14 @@ impl Webots {
     /// Shows whether the simulation runs; a Webots that is starting or ending is shown as that.
     fn show_pace(&self) {
         if self.listening && self.asked.is_none() {
-            self.ticket.update(Change::Stage(if self.runs { Stage::Running } else { Stage::Idle }));
+            self.orders.place.0.update(Change::Stage(if self.runs { Stage::Running } else { Stage::Idle }));
         }
     }
 
     fn check_signs(&mut self, _: &mut Context<Self>) {
         let silence = self.last_sign.elapsed();
-        let hangs_after = self.config.timing.heartbeat * MISSED_HEARTBEATS;
-        if silence > hangs_after + self.config.hang_limit {
+        let hangs_after = self.orders.config.timing.heartbeat * MISSED_HEARTBEATS;
+        if silence > hangs_after + self.orders.config.hang_limit {
             self.end(&format!("Webots gave no sign of life for {} seconds", silence.as_secs()));
         } else if silence > hangs_after && !self.hanging {
             self.hanging = true;
@@ -227,7 +173,7 @@ impl Webots {
         if self.asked.is_none() {
             log::info!("port {}: ending: {why}", self.port);
             self.asked = Some(why.to_owned());
-            self.ticket.update(Change::Stage(Stage::Stopping));
+            self.orders.place.0.update(Change::Stage(Stage::Stopping));
             if let Some(group) = &mut self.group {
                 group.ask_to_end();
             }
@@ -241,12 +187,11 @@ impl Webots {
             None if ending == Ending::Code(0) => Exit { clean: true, why: "Webots has ended".to_owned() },
             None => Exit { clean: false, why: self.with_last_lines(&format!("Webots {ending}")) },
         };
-        if exit.clean || self.listening || self.config.xvfb {
+        if exit.clean || self.listening || self.orders.config.xvfb {
             return self.exited(exit, ctx);
         }
-        let display = display::effective(self.config.display.as_deref());
-        let look =
-            actix_rt::task::spawn_blocking(move || (!display::answers(&display)).then(|| display::hint(&display)));
+        let display = display::effective(self.orders.config.display.as_deref());
+        let look = actix_rt::task::spawn_blocking(move || display::look(&display).err());
         look.into_actor(self)
             .map(move |hint, this, ctx| {
                 let hint = hint.ok().flatten().map(|hint| format!(" Note: {hint}.")).unwrap_or_default();
@@ -304,7 +249,7 @@ impl Handler<RestoreController> for Webots {
     type Result = ResponseFuture<Result<(), CheckoutError>>;
 
     fn handle(&mut self, RestoreController(file): RestoreController, _: &mut Self::Context) -> Self::Result {
-        let (checkouts, project) = (Arc::clone(&self.checkouts), Arc::clone(&self.project));
+        let (checkouts, project) = (Arc::clone(&self.orders.checkouts), Arc::clone(&self.orders.project));
         Box::pin(async move { checkouts.restore_controller(&project, &file).await })
     }
 }

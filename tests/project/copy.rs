@@ -6,10 +6,13 @@ use std::time::Duration;
 
 use serde_json::{Value, json};
 
-use crate::support::{SOON, ports};
+use crate::support::{SOON, http, ports};
 
 /// How long `server.sh` may take for anything.
 const LIMIT: Duration = Duration::from_secs(90);
+
+/// How long this machine may be too busy to take a client.
+const BUSY: Duration = Duration::from_secs(180);
 
 /// The folder of the project under test.
 pub fn root() -> &'static Path {
@@ -86,6 +89,16 @@ impl Project {
         assert_eq!(outcome.code, Some(0), "{arguments:?}: {outcome:#?}");
         assert_eq!(outcome.errors, "", "{arguments:?}: {outcome:#?}");
         outcome.output
+    }
+
+    /// Waits until a client can be placed. A machine that is busy with something else takes none: its load is real.
+    pub async fn available(&self) {
+        let deadline = std::time::Instant::now() + BUSY;
+        while http::get(&self.session_url("/request")).await.text() != "1" {
+            let load = http::get(&self.session_url("/load")).await.text();
+            assert!(std::time::Instant::now() < deadline, "this machine is too busy: its load is {load} %");
+            actix_rt::time::sleep(Duration::from_millis(100)).await;
+        }
     }
 
     /// A URL of the session server.

@@ -37,7 +37,7 @@ async fn what_runs_already_is_not_started_twice() {
     // The other configuration has the same ports.
     let told = refused(&project, &["start", "local"], 1).await;
     assert!(told.contains("is taken") && told.contains("this runs already: demo"), "{told}");
-    assert_eq!(http::get(&project.session_url("/request")).await.text(), "1");
+    assert_eq!(http::get(&project.session_url("/health")).await.text(), "ok");
 }
 
 #[actix_rt::test]
@@ -71,7 +71,7 @@ async fn a_wrong_configuration_is_refused_in_one_line_and_stops_nothing_that_run
         assert_eq!(told.lines().count(), 1, "{told}");
         assert!(told.starts_with("error: config/simulation/demo.json: maxConnections: "), "{told}");
     }
-    assert_eq!(http::get(&project.session_url("/request")).await.text(), "1");
+    assert_eq!(http::get(&project.session_url("/health")).await.text(), "ok");
     project.done(&["stop"]).await;
     assert_eq!(project.leftovers(), [""; 0]);
 }

@@ -48,7 +48,8 @@ async fn a_stop_takes_no_new_clients() {
 async fn servers_are_added_drained_and_removed_without_dropping_a_client() {
     let servers = [1.0, 2.0, 3.0].map(|load| StandIn::start(Manner::idle(load, 100)));
     let [one, two, three] = servers.each_ref().map(StandIn::address);
-    let session = session_server(&[one.clone()]).set("loadRefresh", 600).set("clientCost", 0.001).start().await;
+    let session =
+        session_server(std::slice::from_ref(&one)).set("loadRefresh", 600).set("clientCost", 0.001).start().await;
     let mut client = Client::connect(&session.websocket("/session")).await;
     client.until("1").await;
     let place = async || http::get(&session.url("/session")).await.text();

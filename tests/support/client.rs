@@ -28,6 +28,11 @@ impl Client {
     /// Connects.
     pub async fn connect(url: &str) -> Self {
         let (socket, _) = tokio_tungstenite::connect_async(url).await.unwrap_or_else(|error| panic!("{url}: {error}"));
+        Self::new(socket)
+    }
+
+    /// Takes over a connection.
+    pub fn new(socket: WebSocketStream<MaybeTlsStream<TcpStream>>) -> Self {
         Self { socket, heard: Vec::new() }
     }
 

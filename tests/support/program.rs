@@ -74,6 +74,12 @@ impl Builder {
         self
     }
 
+    /// Uses this port, to follow another server at its place.
+    pub fn port(mut self, port: u16) -> Self {
+        self.port = port;
+        self.set("port", port)
+    }
+
     /// Uses a folder that outlives the server, to start another one in it.
     pub fn folder(mut self, folder: &Path) -> Self {
         self.folder = Some(folder.to_owned());

@@ -16,12 +16,12 @@ const HOPELESS: usize = 1024 * 1024;
 /// Everybody who is connected.
 #[derive(Default)]
 pub(crate) struct Audience {
-    seats: BTreeMap<ClientId, Seat>,
+    connections: BTreeMap<ClientId, Connection>,
     /// What it takes to show the world, in bytes.
     scene_size: usize,
 }
 
-struct Seat {
+struct Connection {
     outbox: Outbox,
     /// Whether it has asked to see the scene.
     watching: bool,
@@ -32,7 +32,7 @@ struct Seat {
 impl Audience {
     /// Someone connected.
     pub(crate) fn join(&mut self, id: ClientId, outbox: Outbox) {
-        self.seats.insert(id, Seat { outbox, watching: false, missed: false });
+        self.connections.insert(id, Connection { outbox, watching: false, missed: false });
     }
 
     /// Another world will be shown, which takes so many bytes.
@@ -42,33 +42,33 @@ impl Audience {
 
     /// Someone is gone.
     pub(crate) fn leave(&mut self, id: ClientId) {
-        self.seats.remove(&id);
+        self.connections.remove(&id);
     }
 
     /// Someone wants to see the scene from now on.
     pub(crate) fn watch(&mut self, id: ClientId) {
-        if let Some(seat) = self.seats.get_mut(&id) {
-            seat.watching = true;
+        if let Some(connection) = self.connections.get_mut(&id) {
+            connection.watching = true;
         }
     }
 
     /// Those who see the scene.
     pub(crate) fn watchers(&self) -> Vec<ClientId> {
-        self.seats.iter().filter(|(_, seat)| seat.watching).map(|(id, _)| *id).collect()
+        self.connections.iter().filter(|(_, connection)| connection.watching).map(|(id, _)| *id).collect()
     }
 
     /// Whether nobody sees the scene.
     pub(crate) fn is_blind(&self) -> bool {
-        !self.seats.values().any(|seat| seat.watching)
+        !self.connections.values().any(|connection| connection.watching)
     }
 
     /// Sends a text to one.
     pub(crate) fn tell(&mut self, id: ClientId, text: impl Into<ByteString>) {
         let patience = self.patience();
-        if let Some(seat) = self.seats.get(&id)
-            && !seat.send(text.into(), patience)
+        if let Some(connection) = self.connections.get(&id)
+            && !connection.send(text.into(), patience)
         {
-            self.seats.remove(&id);
+            self.connections.remove(&id);
         }
     }
 
@@ -76,20 +76,20 @@ impl Audience {
     pub(crate) fn tell_watchers(&mut self, text: impl Into<ByteString>) {
         let text = text.into();
         let patience = self.patience();
-        self.seats.retain(|_, seat| !seat.watching || seat.send(text.clone(), patience));
+        self.connections.retain(|_, connection| !connection.watching || connection.send(text.clone(), patience));
     }
 
     /// Sends an update to all who see the scene and read fast enough; `everything` makes the one for
     /// those who missed some before.
     pub(crate) fn show(&mut self, changes: impl Into<ByteString>, mut everything: impl FnMut() -> String) {
         let changes = changes.into();
-        for seat in self.seats.values_mut().filter(|seat| seat.watching) {
-            if seat.outbox.waiting() > SLOW {
-                seat.missed = true;
-            } else if std::mem::take(&mut seat.missed) {
-                seat.outbox.send(everything().into());
+        for connection in self.connections.values_mut().filter(|connection| connection.watching) {
+            if connection.outbox.waiting() > SLOW {
+                connection.missed = true;
+            } else if std::mem::take(&mut connection.missed) {
+                connection.outbox.send(everything().into());
             } else {
-                seat.outbox.send(changes.clone());
+                connection.outbox.send(changes.clone());
             }
         }
     }
@@ -97,13 +97,15 @@ impl Audience {
     /// Sends everything to those who missed an update, since time stops and no other will come.
     pub(crate) fn catch_up(&mut self, mut everything: impl FnMut() -> String) {
         let patience = self.patience();
-        self.seats.retain(|_, seat| !std::mem::take(&mut seat.missed) || seat.send(everything().into(), patience));
+        self.connections.retain(|_, connection| {
+            !std::mem::take(&mut connection.missed) || connection.send(everything().into(), patience)
+        });
     }
 
     /// Says goodbye to everybody.
     pub(crate) fn close(&mut self) {
-        for seat in std::mem::take(&mut self.seats).into_values() {
-            seat.outbox.close(CloseCode::Away);
+        for connection in std::mem::take(&mut self.connections).into_values() {
+            connection.outbox.close(CloseCode::Away);
         }
     }
 
@@ -112,7 +114,7 @@ impl Audience {
     }
 }
 
-impl Seat {
+impl Connection {
     /// Sends a text that must arrive. To a client with more than `patience` bytes waiting it cannot: then
     /// the connection is broken, and false is returned.
     fn send(&self, text: ByteString, patience: usize) -> bool {

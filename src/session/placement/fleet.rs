@@ -1,6 +1,7 @@
 //! The servers of the fleet, and the choice between them.
 
 use super::cost::{Common, Estimate};
+use super::order::{Order, Rank};
 use super::policy::Policy;
 use super::server::{Report, Server};
 use std::collections::BTreeMap;
@@ -27,6 +28,7 @@ pub struct Fleet<Id> {
     policy: Policy,
     servers: BTreeMap<Id, Server>,
     common: Common,
+    order: Order<Id>,
     turns: u64,
 }
 
@@ -34,12 +36,15 @@ impl<Id: Clone + Ord> Fleet<Id> {
     /// A fleet without servers.
     #[must_use]
     pub fn new(policy: Policy) -> Self {
-        Self { policy, servers: BTreeMap::new(), common: Common::new(), turns: 0 }
+        Self { policy, servers: BTreeMap::new(), common: Common::new(), order: Order::new(), turns: 0 }
     }
 
     /// Changes the policy for all that follows. What servers have learned by the `initial_cost` until now stays.
-    pub fn set_policy(&mut self, policy: Policy) {
+    pub fn set_policy(&mut self, now: Instant, policy: Policy) {
         self.policy = policy;
+        for id in self.servers.keys().cloned().collect::<Vec<_>>() {
+            self.rank(&id, now);
+        }
     }
 
     /// Adds a server, which is down until its first report. One that is there already stays as it is.
@@ -52,6 +57,7 @@ impl<Id: Clone + Ord> Fleet<Id> {
     pub fn remove(&mut self, id: &Id) {
         if let Some(server) = self.servers.remove(id) {
             self.common.replace(server.estimate(), Estimate::default());
+            self.order.remove(id);
         }
     }
 
@@ -59,6 +65,7 @@ impl<Id: Clone + Ord> Fleet<Id> {
     pub fn report(&mut self, id: &Id, now: Instant, report: Report) {
         if let Some(server) = self.servers.get_mut(id) {
             server.report(now, report, &self.policy, &mut self.common);
+            self.rank(id, now);
         }
     }
 
@@ -66,38 +73,51 @@ impl<Id: Clone + Ord> Fleet<Id> {
     pub fn lose(&mut self, id: &Id) {
         if let Some(server) = self.servers.get_mut(id) {
             server.lose();
+            self.order.put(id, None, None);
         }
     }
 
     /// Chooses the server of least effective load among those that have room and are `eligible`, and counts the client as
     /// sent there. Of equal servers the one is taken that has waited longest for its turn.
     pub fn place(&mut self, now: Instant, eligible: impl Fn(&Id) -> bool) -> Option<Id> {
-        let policy = &self.policy;
-        let mut best: Option<(f64, &Id, &mut Server)> = None;
-        for (id, server) in &mut self.servers {
-            if let Some(load) = server.effective_load_if_room(now, policy)
-                && best.as_ref().is_none_or(|(least, _, first)| (load, server.turn) < (*least, first.turn))
-                && eligible(id)
-            {
-                best = Some((load, id, server));
-            }
+        for id in self.order.expired(now).cloned().collect::<Vec<_>>() {
+            self.rank(&id, now);
         }
-        let (_, id, server) = best?;
+        let id = self.order.servers().find(|id| eligible(id))?.clone();
         self.turns += 1;
-        server.place(now, self.turns, policy);
-        Some(id.clone())
+        self.servers.get_mut(&id)?.place(now, self.turns, &self.policy);
+        self.rank(&id, now);
+        Some(id)
+    }
+
+    /// Puts a server in its place after something happened to it.
+    fn rank(&mut self, id: &Id, now: Instant) {
+        let Some(server) = self.servers.get(id) else {
+            return;
+        };
+        let load = server.effective_load_if_room(now, &self.policy);
+        let rank = load.map(|load| Rank { load, turn: server.turn });
+        // A server that is down has no room whatever expires.
+        let expiry = server.load().and_then(|_| server.next_expiry(now, &self.policy));
+        self.order.put(id, rank, expiry);
+    }
+
+    fn has_room(&self, id: &Id, now: Instant) -> bool {
+        self.servers.get(id).is_some_and(|server| server.effective_load_if_room(now, &self.policy).is_some())
     }
 
     /// Whether some server can take a client.
     #[must_use]
     pub fn available(&self, now: Instant) -> bool {
-        self.servers.values().any(|server| server.effective_load_if_room(now, &self.policy).is_some())
+        // What expires leaves only more room.
+        self.order.servers().next().is_some() || self.order.expired(now).any(|id| self.has_room(id, now))
     }
 
     /// When placements are given up next: the one moment at which availability can change without a call to this fleet.
     #[must_use]
     pub fn next_change(&self, now: Instant) -> Option<Instant> {
-        self.servers.values().filter_map(|server| server.next_expiry(now, &self.policy)).min()
+        let expired = self.order.expired(now).filter_map(|id| self.servers.get(id)?.next_expiry(now, &self.policy));
+        expired.chain(self.order.next_expiry(now)).min()
     }
 
     /// The load that a server will have once all that was sent to it shows, in percent; `None` if it is down.

@@ -5,6 +5,7 @@
 //! long as the reports cannot show it, at the cost per client that it has learned from that server's reports.
 //!
 //! - `fleet`: the servers, and the choice between them; `policy`: what its owner can set;
+//! - `order`: the servers by their effective load, so that a large fleet is as fast as a small one;
 //! - `server`: what is known of one server;
 //! - `cost`: how the cost of a client is learned.
 //!
@@ -13,6 +14,7 @@
 
 mod cost;
 mod fleet;
+mod order;
 mod policy;
 mod server;
 

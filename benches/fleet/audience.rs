@@ -1,0 +1,101 @@
+//! How long it takes until 10,000 connected clients know of a change.
+//!
+//! The decision is the registry's log line, which is written before anybody is told. The system notes when each client's
+//! message arrives at its socket, so that the clients need no processor time of their own while they are told.
+
+use std::io::{IoSliceMut, Read, Write};
+use std::net::TcpStream;
+use std::os::fd::AsRawFd;
+use std::time::{Duration, SystemTime};
+
+use nix::sys::socket::{ControlMessageOwned, MsgFlags, recvmsg, setsockopt, sockopt};
+
+use super::Verdict;
+use super::server::Server;
+use super::stand_ins::StandIns;
+
+const CLIENTS: usize = 10_000;
+const CHANGES: usize = 10;
+/// For how long the clients leave the processor to the server.
+const PAUSE: Duration = Duration::from_millis(600);
+const HANDSHAKE: &[u8] = b"GET /session HTTP/1.1\r\nHost: localhost\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n\
+    Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n";
+/// The begin of an unmasked text message of one letter.
+const TEXT: [u8; 2] = [0x81, 1];
+
+/// A client that was told the first value.
+fn connect(port: u16) -> TcpStream {
+    let mut stream = TcpStream::connect(("127.0.0.1", port)).expect("a client connects");
+    stream.write_all(HANDSHAKE).expect("a client asks");
+    let (mut heard, mut piece) = (Vec::new(), [0; 512]);
+    while !tells(&heard, b'1') {
+        let length = stream.read(&mut piece).expect("a client hears");
+        assert!(length > 0, "a client was sent away");
+        heard.extend_from_slice(&piece[..length]);
+    }
+    setsockopt(&stream, sockopt::ReceiveTimestampns, &true).expect("the system notes times");
+    stream
+}
+
+fn tells(heard: &[u8], value: u8) -> bool {
+    heard.windows(3).any(|text| text == [TEXT[0], TEXT[1], value])
+}
+
+/// When a client's message arrived, as the time since 1970.
+fn arrival(stream: &TcpStream, value: u8) -> Duration {
+    loop {
+        let mut heard = [0; 64];
+        let mut parts = [IoSliceMut::new(&mut heard)];
+        let mut control = nix::cmsg_space!(nix::sys::time::TimeSpec);
+        let message = recvmsg::<()>(stream.as_raw_fd(), &mut parts, Some(&mut control), MsgFlags::empty());
+        let message = message.expect("a client hears");
+        let length = message.bytes;
+        assert!(length > 0, "a client was sent away");
+        let at = message.cmsgs().expect("whole notes").find_map(|note| match note {
+            ControlMessageOwned::ScmTimestampns(at) => Some(Duration::from(at)),
+            _ => None,
+        });
+        // Anything else is a ping.
+        if tells(&heard[..length], value) {
+            return at.expect("the system has noted when");
+        }
+    }
+}
+
+/// When the registry decided the last change, as its log says, to the millisecond.
+fn decision(server: &Server) -> Duration {
+    let log = server.log();
+    let line = log.lines().rfind(|line| line.contains("simulation server is available")).expect("a decision");
+    let at = line.split(' ').next().expect("a line begins with its time");
+    let at: SystemTime = at.parse::<jiff::Timestamp>().expect("a time").into();
+    at.duration_since(SystemTime::UNIX_EPOCH).expect("it is later than 1970")
+}
+
+pub(crate) fn measure(verdict: &mut Verdict) {
+    let fleet = StandIns::start(1);
+    let server = Server::start(&fleet.addresses);
+    println!("telling {CLIENTS} clients, {CHANGES} changes:");
+    let clients: Vec<TcpStream> = (0..CLIENTS).map(|_| connect(server.port)).collect();
+    let mut worst = Vec::new();
+    for change in 0..CHANGES {
+        // The only simulation server has a load of 5 %.
+        let (threshold, value) = if change % 2 == 0 { (4, b'0') } else { (95, b'1') };
+        let decisions = server.log().matches("simulation server is available").count();
+        server.reread(threshold);
+        server.wait_until(|server| server.log().matches("simulation server is available").count() > decisions);
+        std::thread::sleep(PAUSE);
+        let arrivals: Vec<Duration> = clients.iter().map(|client| arrival(client, value)).collect();
+        let decided = decision(&server);
+        let mut after: Vec<f64> = arrivals.iter().map(|at| 1000.0 * at.saturating_sub(decided).as_secs_f64()).collect();
+        after.sort_unstable_by(f64::total_cmp);
+        let [first, half, last] = [after[0], after[CLIENTS / 2], after[CLIENTS - 1]];
+        println!(
+            "  told {}: first {first:.1} ms, half {half:.1} ms, last {last:.1} ms after the decision",
+            char::from(value)
+        );
+        worst.push(last);
+    }
+    worst.sort_unstable_by(f64::total_cmp);
+    verdict.bound("the last client, median of the changes", worst[CHANGES / 2], 50.0, "ms");
+    println!("  the worst change: {:.1} ms", worst[CHANGES - 1]);
+}

@@ -1,0 +1,78 @@
+//! How long a request for a simulation server takes.
+
+use std::io::{Read, Write};
+use std::net::TcpStream;
+use std::time::{Duration, Instant};
+
+use super::Verdict;
+use super::server::Server;
+use super::stand_ins::StandIns;
+
+/// Each fleet is asked in turns, so that what else the machine does meets all of them.
+const ROUNDS: usize = 40;
+const REQUESTS: usize = 250;
+/// Between two requests: a busy door, not one that is stormed.
+const PAUSE: Duration = Duration::from_micros(500);
+
+/// A fleet, its session server, and how long its requests took.
+struct Door {
+    name: &'static str,
+    path: &'static str,
+    _fleet: StandIns,
+    server: Server,
+    took: Vec<Duration>,
+}
+
+impl Door {
+    fn open(name: &'static str, servers: usize, hung: bool) -> Self {
+        let fleet = StandIns::start(servers);
+        let server = Server::start(&fleet.addresses);
+        if hung {
+            fleet.hang_first();
+        }
+        Self { name, path: "/session", _fleet: fleet, server, took: Vec::new() }
+    }
+
+    fn ask(&mut self) {
+        let mut stream = TcpStream::connect(("127.0.0.1", self.server.port)).expect("the door is open");
+        stream.set_nodelay(true).expect("a socket");
+        let request = format!("GET {} HTTP/1.1\r\nHost: localhost\r\n\r\n", self.path);
+        let mut answer = [0; 2048];
+        for _ in 0..REQUESTS {
+            let begin = Instant::now();
+            stream.write_all(request.as_bytes()).expect("a request");
+            let length = stream.read(&mut answer).expect("an answer");
+            self.took.push(begin.elapsed());
+            assert!(answer[..length].starts_with(b"HTTP/1.1 200"), "{}", String::from_utf8_lossy(&answer[..length]));
+            std::thread::sleep(PAUSE);
+        }
+    }
+
+    fn at(&self, share: f64) -> f64 {
+        let mut took = self.took.clone();
+        took.sort_unstable();
+        1000.0 * took[((took.len() - 1) as f64 * share) as usize].as_secs_f64()
+    }
+}
+
+pub(crate) fn measure(verdict: &mut Verdict) {
+    println!("/session, {} requests for each fleet, in turns:", ROUNDS * REQUESTS);
+    let yardstick = Door { path: "/health", ..Door::open("nothing asked of ten (/health)", 10, false) };
+    let mut doors = [
+        yardstick,
+        Door::open("10 servers", 10, false),
+        Door::open("10 servers, one hung", 10, true),
+        Door::open("1,000 servers", 1000, false),
+    ];
+    for _ in 0..ROUNDS {
+        doors.iter_mut().for_each(Door::ask);
+    }
+    println!("  {:<32} {:>9} {:>9} {:>9}", "fleet", "p50", "p99", "p99.9");
+    for door in &doors {
+        println!("  {:<32} {:>6.3} ms {:>6.3} ms {:>6.3} ms", door.name, door.at(0.5), door.at(0.99), door.at(0.999));
+    }
+    let [_, ten, hung, thousand] = &doors;
+    verdict.bound("p99 with one server hung", hung.at(0.99), 5.0, "ms");
+    verdict.bound("median with 1,000 servers / with 10", thousand.at(0.5) / ten.at(0.5), 1.1, "times");
+    println!("  p99 with 1,000 servers / with 10: {:.2} times", thousand.at(0.99) / ten.at(0.99));
+}

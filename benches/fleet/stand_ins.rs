@@ -1,0 +1,72 @@
+//! Many cheap stand-ins for simulation servers, in one thread: each answers every request with the same bytes.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::net::{TcpListener, TcpStream};
+use tokio::sync::Notify;
+
+/// So many stand-ins.
+pub(crate) struct StandIns {
+    /// `HOST:PORT` of each.
+    pub(crate) addresses: Vec<String>,
+    hung: Arc<AtomicBool>,
+    end: Arc<Notify>,
+}
+
+impl StandIns {
+    /// Starts them; the first one can be made to hang.
+    pub(crate) fn start(count: usize) -> Self {
+        let sockets: Vec<_> =
+            (0..count).map(|_| std::net::TcpListener::bind("127.0.0.1:0").expect("a free port")).collect();
+        let addresses = sockets.iter().map(|socket| socket.local_addr().expect("it is bound").to_string()).collect();
+        let (hung, end) = (Arc::new(AtomicBool::new(false)), Arc::new(Notify::new()));
+        let (seen, ended) = (Arc::clone(&hung), Arc::clone(&end));
+        std::thread::spawn(move || {
+            let runtime = tokio::runtime::Builder::new_current_thread().enable_io().build().expect("a runtime");
+            runtime.block_on(async {
+                for (index, socket) in sockets.into_iter().enumerate() {
+                    socket.set_nonblocking(true).expect("a socket");
+                    let listener = TcpListener::from_std(socket).expect("a socket");
+                    tokio::spawn(serve(listener, (index == 0).then(|| Arc::clone(&seen))));
+                }
+                ended.notified().await;
+            });
+        });
+        Self { addresses, hung, end }
+    }
+
+    /// Makes the first one accept and say nothing.
+    pub(crate) fn hang_first(&self) {
+        self.hung.store(true, Ordering::SeqCst);
+    }
+}
+
+impl Drop for StandIns {
+    /// All of them die in the same moment.
+    fn drop(&mut self) {
+        self.end.notify_one();
+    }
+}
+
+async fn serve(listener: TcpListener, hung: Option<Arc<AtomicBool>>) {
+    while let Ok((stream, _)) = listener.accept().await {
+        tokio::spawn(converse(stream, hung.clone()));
+    }
+}
+
+async fn converse(mut stream: TcpStream, hung: Option<Arc<AtomicBool>>) -> std::io::Result<()> {
+    stream.set_nodelay(true)?;
+    let body = r#"{"load":5.0,"version":"1","instances":{"queued":0,"starting":1,"idle":2,"running":3,"places":100000,"arrivals":6},"allowedRepositories":["https://github.com/lab"],"docker":false}"#;
+    let answer = format!("HTTP/1.1 200 OK\r\nContent-Length: {}\r\n\r\n{body}", body.len());
+    let mut request = [0; 2048];
+    // A request is small enough to come in one piece.
+    while stream.read(&mut request).await? > 0 {
+        if hung.as_ref().is_some_and(|hung| hung.load(Ordering::SeqCst)) {
+            std::future::pending::<()>().await;
+        }
+        stream.write_all(answer.as_bytes()).await?;
+    }
+    Ok(())
+}

@@ -1,0 +1,106 @@
+//! Actor: the web clients of one worker thread, and what they are to be told.
+//!
+//! Created by the app in each thread that serves connections; it never ends. The registry tells it of a change once, and
+//! it tells its clients: from thread to thread each of ten thousand would be woken with a lock, and the registry would
+//! be busy with that instead of with requests.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use actix::prelude::*;
+
+use super::registry::Subscribe;
+use super::server::Server;
+use super::subscribers::{News, Subscribers};
+use crate::shared::shutdown::closing;
+
+/// Asks to be told the news, now and whenever there are others.
+#[derive(Message)]
+#[rtype(result = "Membership")]
+pub struct Join(pub Recipient<News>);
+
+/// A place in the audience. Dropping it gives it up.
+#[derive(Debug)]
+pub struct Membership {
+    id: u64,
+    audience: Addr<Audience>,
+}
+
+#[derive(Message)]
+#[rtype(result = "()")]
+struct Leave(u64);
+
+/// The actor.
+pub struct Audience {
+    server: Arc<Server>,
+    clients: Subscribers,
+    news: Option<News>,
+}
+
+/// Between two tries to tell a client whose mailbox was full.
+const AGAIN: Duration = Duration::from_millis(250);
+/// How many clients may join in one moment; more wait outside.
+const CROWD: usize = 4096;
+
+impl Audience {
+    /// An audience without clients.
+    #[must_use]
+    pub fn new(server: Arc<Server>) -> Self {
+        Self { server, clients: Subscribers::default(), news: None }
+    }
+
+    fn tell(&mut self, news: News) {
+        // Nothing is news any more once the server ends.
+        if self.news != Some(News::Closing) {
+            self.news = Some(news);
+            self.clients.tell(news);
+        }
+    }
+}
+
+impl Actor for Audience {
+    type Context = Context<Self>;
+
+    fn started(&mut self, ctx: &mut Self::Context) {
+        ctx.set_mailbox_capacity(CROWD);
+        self.server.registry.do_send(Subscribe(ctx.address().recipient()));
+        let ending = closing(self.server.phase.clone()).into_actor(self);
+        ending.map(|(), audience, _| audience.tell(News::Closing)).spawn(ctx);
+        ctx.run_interval(AGAIN, |audience, _| {
+            if let Some(news) = audience.news {
+                audience.clients.tell_late(news);
+            }
+        });
+    }
+}
+
+impl Handler<News> for Audience {
+    type Result = ();
+
+    fn handle(&mut self, news: News, _: &mut Self::Context) {
+        self.tell(news);
+    }
+}
+
+impl Handler<Join> for Audience {
+    type Result = MessageResult<Join>;
+
+    fn handle(&mut self, Join(client): Join, ctx: &mut Self::Context) -> Self::Result {
+        let id = self.clients.add(client, self.news);
+        MessageResult(Membership { id, audience: ctx.address() })
+    }
+}
+
+impl Handler<Leave> for Audience {
+    type Result = ();
+
+    fn handle(&mut self, Leave(id): Leave, _: &mut Self::Context) {
+        self.clients.remove(id);
+    }
+}
+
+impl Drop for Membership {
+    fn drop(&mut self) {
+        self.audience.do_send(Leave(self.id));
+    }
+}

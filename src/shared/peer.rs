@@ -1,0 +1,198 @@
+//! Who is at the other end of a connection, where a web server may stand in between.
+//!
+//! A web server that forwards requests tells the address of its client in a header: `X-Forwarded-For`, or `Forwarded`
+//! (RFC 7239). Anybody can write these headers. They count only on connections from a trusted proxy, and are read from
+//! their end: each trusted proxy added the address that it saw, and the last address that is none of theirs is the
+//! client's.
+
+use std::fmt;
+use std::net::{IpAddr, SocketAddr};
+
+use actix_web::HttpRequest;
+use actix_web::http::header::HeaderMap;
+use ipnet::IpNet;
+use serde::{Deserialize, Serialize};
+
+/// The networks whose word on their clients' addresses is taken.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(try_from = "Vec<String>", into = "Vec<String>")]
+pub struct TrustedProxies(Vec<IpNet>);
+
+/// A text that names no network.
+#[derive(Debug, PartialEq, Eq, thiserror::Error)]
+#[error("{found:?} is no network; allowed are addresses (10.0.0.1, fd00::1) and networks (10.0.0.0/8, fd00::/8)")]
+pub struct NoNetwork {
+    found: String,
+}
+
+/// The other end of a connection.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Peer {
+    /// A client's own address, or that of the last proxy which said something sensible.
+    Client(IpAddr),
+    /// A trusted proxy that says nothing of its clients, or a client on its machine: it may stand for many.
+    Proxy(IpAddr),
+    /// Not known: no TCP connection.
+    Unknown,
+}
+
+impl TrustedProxies {
+    /// The other end of a request.
+    #[must_use]
+    pub fn peer(&self, request: &HttpRequest) -> Peer {
+        match request.peer_addr() {
+            Some(address) => self.resolve(address.ip().to_canonical(), request.headers()),
+            None => Peer::Unknown,
+        }
+    }
+
+    fn resolve(&self, connected: IpAddr, headers: &HeaderMap) -> Peer {
+        if !self.trusts(connected) {
+            return Peer::Client(connected);
+        }
+        let common = joined(headers, "x-forwarded-for").map(|text| self.client(connected, common_chain(&text)));
+        let standard = joined(headers, "forwarded").map(|text| self.client(connected, standard_chain(&text)));
+        match (common, standard) {
+            (None, None) => Peer::Proxy(connected),
+            (Some(client), None) | (None, Some(client)) => Peer::Client(client),
+            // Proxies write one of the headers and pass the other on as the client wrote it.
+            (Some(one), Some(other)) => Peer::Client(if one == other { one } else { connected }),
+        }
+    }
+
+    /// The last address of a chain that is no trusted proxy's. What is no address ends the chain.
+    fn client(&self, connected: IpAddr, chain: Vec<Option<IpAddr>>) -> IpAddr {
+        let mut nearest = connected;
+        for hop in chain.into_iter().rev() {
+            match hop {
+                Some(address) if self.trusts(address) => nearest = address,
+                Some(address) => return address,
+                None => break,
+            }
+        }
+        nearest
+    }
+
+    fn trusts(&self, address: IpAddr) -> bool {
+        self.0.iter().any(|network| network.contains(&address))
+    }
+}
+
+/// All lines of a header as one; nothing where there is none. What is no text ends up as no address.
+fn joined(headers: &HeaderMap, name: &str) -> Option<String> {
+    let lines: Vec<&str> = headers.get_all(name).map(|line| line.to_str().unwrap_or("?")).collect();
+    (!lines.is_empty()).then(|| lines.join(","))
+}
+
+fn common_chain(text: &str) -> Vec<Option<IpAddr>> {
+    text.split(',').map(|hop| address(hop.trim())).collect()
+}
+
+fn standard_chain(text: &str) -> Vec<Option<IpAddr>> {
+    let said = |element: rfc7239::Forwarded<'_>| element.forwarded_for?.ip().map(IpAddr::to_canonical);
+    rfc7239::parse(text).map(|element| element.ok().and_then(said)).collect()
+}
+
+/// An address as web servers write it: some add the port.
+fn address(text: &str) -> Option<IpAddr> {
+    let bare = text.strip_prefix('[').and_then(|text| text.strip_suffix(']')).unwrap_or(text);
+    let address = bare.parse().ok().or_else(|| text.parse::<SocketAddr>().ok().map(|address| address.ip()));
+    address.as_ref().map(IpAddr::to_canonical)
+}
+
+impl Default for TrustedProxies {
+    fn default() -> Self {
+        let loopback = ["127.0.0.0/8", "::1/128"];
+        Self(loopback.iter().filter_map(|network| network.parse().ok()).collect())
+    }
+}
+
+impl TryFrom<Vec<String>> for TrustedProxies {
+    type Error = NoNetwork;
+
+    fn try_from(texts: Vec<String>) -> Result<Self, NoNetwork> {
+        let network = |text: String| {
+            let alone = text.parse::<IpAddr>().map(IpNet::from);
+            alone.or_else(|_| text.parse::<IpNet>()).map_err(|_| NoNetwork { found: text })
+        };
+        texts.into_iter().map(network).collect::<Result<_, _>>().map(Self)
+    }
+}
+
+impl From<TrustedProxies> for Vec<String> {
+    fn from(TrustedProxies(networks): TrustedProxies) -> Self {
+        networks.iter().map(ToString::to_string).collect()
+    }
+}
+
+impl fmt::Display for Peer {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Client(address) | Self::Proxy(address) => address.fmt(out),
+            Self::Unknown => out.write_str("?"),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    use actix_web::http::header::{HeaderName, HeaderValue};
+
+    fn resolve(trusted: &[&str], connected: &str, headers: Headers<'_>) -> Peer {
+        let trusted: Vec<String> = trusted.iter().map(|&text| text.to_owned()).collect();
+        let mut map = HeaderMap::new();
+        for (name, value) in headers {
+            map.append(HeaderName::from_static(name), HeaderValue::from_str(value).unwrap());
+        }
+        TrustedProxies::try_from(trusted).unwrap().resolve(connected.parse().unwrap(), &map)
+    }
+
+    type Headers<'a> = &'a [(&'static str, &'a str)];
+
+    #[test]
+    fn the_client_is_who_the_nearest_trusted_proxy_saw() {
+        let (common, standard) = ("x-forwarded-for", "forwarded");
+        let table: &[(&str, Headers<'_>, &str, &str)] = &[
+            ("203.0.113.9", &[(common, "1.1.1.1")], "203.0.113.9", "a stranger's word on itself"),
+            ("127.0.0.1", &[(common, "203.0.113.9")], "203.0.113.9", "one proxy"),
+            ("127.0.0.1", &[(common, "1.1.1.1, 203.0.113.9")], "203.0.113.9", "the client wrote one itself"),
+            ("127.0.0.1", &[(common, "1.1.1.1"), (common, "203.0.113.9")], "203.0.113.9", "the same, in two lines"),
+            ("127.0.0.1", &[(common, "203.0.113.9, 10.1.2.3")], "203.0.113.9", "two proxies"),
+            ("127.0.0.1", &[(common, "10.1.2.3")], "10.1.2.3", "a client in the proxies' network"),
+            ("127.0.0.1", &[(common, "203.0.113.9, ?, 10.1.2.3")], "10.1.2.3", "what is no address ends the chain"),
+            ("127.0.0.1", &[(common, "unknown")], "127.0.0.1", "nothing sensible is said"),
+            ("127.0.0.1", &[(common, "203.0.113.9:4711")], "203.0.113.9", "with a port"),
+            ("127.0.0.1", &[(common, "2001:db8::9")], "2001:db8::9", "IPv6"),
+            ("127.0.0.1", &[(common, "[2001:db8::9]:4711")], "2001:db8::9", "IPv6 with a port"),
+            ("127.0.0.1", &[(common, "::ffff:203.0.113.9")], "203.0.113.9", "IPv4 in IPv6"),
+            ("::1", &[(standard, "for=1.1.1.1;proto=https, For=203.0.113.9")], "203.0.113.9", "the standard's form"),
+            ("::1", &[(standard, r#"for="[2001:db8::9]:4711""#)], "2001:db8::9", "the standard's IPv6"),
+            ("::1", &[(standard, "for=_hidden")], "::1", "the standard's way to say nothing"),
+            ("::1", &[(common, "203.0.113.9"), (standard, "for=203.0.113.9")], "203.0.113.9", "both agree"),
+            ("::1", &[(common, "203.0.113.9"), (standard, "for=1.1.1.1")], "::1", "one of them is forged"),
+        ];
+        for (connected, headers, client, why) in table {
+            let peer = resolve(&["127.0.0.0/8", "::1", "10.0.0.0/8"], connected, headers);
+            assert_eq!(peer, Peer::Client(client.parse().unwrap()), "{why}");
+        }
+    }
+
+    #[test]
+    fn a_proxy_that_says_nothing_is_known_as_one() {
+        assert_eq!(resolve(&["127.0.0.0/8"], "127.0.0.1", &[]), Peer::Proxy("127.0.0.1".parse().unwrap()));
+        assert_eq!(resolve(&[], "127.0.0.1", &[]), Peer::Client("127.0.0.1".parse().unwrap()));
+    }
+
+    #[test]
+    fn networks_are_read_from_texts() {
+        let read = |text: &str| serde_json::from_str::<TrustedProxies>(text);
+        let default = serde_json::to_string(&TrustedProxies::default()).unwrap();
+        assert_eq!(default, r#"["127.0.0.0/8","::1/128"]"#);
+        assert_eq!(read(&default).unwrap(), TrustedProxies::default());
+        assert!(read(r#"["10.0.0.1", "fd00::/8"]"#).is_ok());
+        let error = read(r#"["10.0.0.0/33"]"#).unwrap_err().to_string();
+        assert!(error.contains(r#""10.0.0.0/33" is no network"#), "{error}");
+    }
+}

@@ -1,0 +1,98 @@
+//! What a simulation needs from the machine: Webots, a display, git. Told by `--check`, beside the configuration.
+
+use std::path::PathBuf;
+use std::process::Command;
+
+use super::config::SimulationConfig;
+use super::display;
+
+/// One thing that was looked at.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Finding {
+    /// What.
+    pub topic: &'static str,
+    /// How it is; or what is missing, and what to do about it.
+    pub result: Result<String, String>,
+}
+
+impl std::fmt::Display for Finding {
+    fn fmt(&self, out: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match &self.result {
+            Ok(fine) => write!(out, "{}: {fine}", self.topic),
+            Err(trouble) => write!(out, "warning: {}: {trouble}", self.topic),
+        }
+    }
+}
+
+/// Looks at everything. Takes up to some seconds: programs are run, and a display is asked.
+#[must_use]
+pub fn look(config: &SimulationConfig) -> Vec<Finding> {
+    vec![
+        Finding { topic: "webots", result: webots(config) },
+        Finding { topic: "display", result: display(config) },
+        Finding {
+            topic: "git",
+            result: version(&["git", "--version"], "git is not there: no world can be checked out"),
+        },
+        Finding {
+            topic: "git-lfs",
+            result: version(&["git-lfs", "--version"], "git-lfs is not there: large files of Git LFS will be missing"),
+        },
+        Finding { topic: "xvfb-run", result: xvfb_run(config) },
+    ]
+}
+
+fn webots(config: &SimulationConfig) -> Result<String, String> {
+    let Some(program) = config.webots_program() else {
+        return Err("neither webotsHome nor the environment variable WEBOTS_HOME is set".to_owned());
+    };
+    let shown = program.display();
+    match nix::unistd::access(&program, nix::unistd::AccessFlags::X_OK) {
+        Ok(()) if program.is_file() => Ok(shown.to_string()),
+        Ok(()) | Err(nix::errno::Errno::ENOENT | nix::errno::Errno::ENOTDIR) => {
+            Err(format!("there is no program {shown}; webotsHome is the folder that Webots is installed in"))
+        }
+        Err(error) => Err(format!("{shown} can't be run by this user: {}", error.desc())),
+    }
+}
+
+fn display(config: &SimulationConfig) -> Result<String, String> {
+    if config.xvfb {
+        return Ok("each Webots gets a virtual display of its own (xvfb), without the graphics card".to_owned());
+    }
+    let display = display::effective(config.display.as_deref());
+    let source = match (&config.display, display::of_environment()) {
+        (Some(_), _) => "the configuration names it",
+        (None, Some(_)) => "the environment variable DISPLAY names it",
+        (None, None) => "DISPLAY is not set, and the configuration names no display",
+    };
+    match display::look(&display) {
+        Ok(()) => Ok(format!("{display} answers ({source})")),
+        Err(trouble) => Err(format!("{trouble} ({source})")),
+    }
+}
+
+fn xvfb_run(config: &SimulationConfig) -> Result<String, String> {
+    match in_path("xvfb-run") {
+        Some(program) => Ok(program.display().to_string()),
+        None if config.xvfb => Err("xvfb-run is not there, but xvfb is true: no Webots can start. On Debian and \
+                                    Ubuntu the packages xvfb and xauth have it"
+            .to_owned()),
+        None => Ok("it is not there, and not needed: xvfb is false".to_owned()),
+    }
+}
+
+/// The first line that a program prints; `missing` if there is no such program.
+fn version(command: &[&str], missing: &str) -> Result<String, String> {
+    let Some((program, arguments)) = command.split_first() else {
+        return Err(missing.to_owned());
+    };
+    let output = Command::new(program).args(arguments).output().map_err(|_| missing.to_owned())?;
+    let text = String::from_utf8_lossy(&output.stdout);
+    text.lines().next().map(str::to_owned).ok_or_else(|| missing.to_owned())
+}
+
+fn in_path(program: &str) -> Option<PathBuf> {
+    let folders = std::env::var_os("PATH").unwrap_or_default();
+    std::env::split_paths(&folders).map(|folder| folder.join(program)).find(|file| file.is_file())
+}

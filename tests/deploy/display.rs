@@ -1,0 +1,104 @@
+//! Real X servers: one that takes everybody, one that wants a cookie, and none.
+
+use std::path::Path;
+use std::process::{Child, Command, Stdio};
+
+use webots_fleet::simulation::display::{Trouble, look};
+
+/// A virtual X server, ended with the test.
+struct Xvfb {
+    child: Child,
+    display: String,
+}
+
+impl Xvfb {
+    /// Starts one; with an authority file, it takes only those who know a cookie in it. Nothing where there is no Xvfb.
+    fn start(authority: Option<&Path>) -> Option<Self> {
+        let mut command = Command::new("Xvfb");
+        command.args(["-displayfd", "1", "-screen", "0", "64x64x24", "-nolisten", "tcp", "-noreset"]);
+        if let Some(file) = authority {
+            command.arg("-auth").arg(file);
+        }
+        let child = command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::null()).spawn();
+        let Ok(mut child) = child else {
+            assert!(std::env::var_os("CI").is_none(), "Xvfb is missing");
+            eprintln!("not tested: Xvfb is not installed");
+            return None;
+        };
+        let mut number = String::new();
+        std::io::BufRead::read_line(&mut std::io::BufReader::new(child.stdout.take().unwrap()), &mut number).unwrap();
+        assert!(!number.trim().is_empty(), "Xvfb has ended");
+        Some(Self { child, display: format!(":{}", number.trim()) })
+    }
+}
+
+impl Drop for Xvfb {
+    fn drop(&mut self) {
+        // In order: it removes its socket and its lock.
+        let pid = nix::unistd::Pid::from_raw(i32::try_from(self.child.id()).unwrap());
+        nix::sys::signal::kill(pid, nix::sys::signal::Signal::SIGTERM).ok();
+        self.child.wait().ok();
+    }
+}
+
+/// An authority file with one cookie for all displays of this machine.
+fn authority(folder: &Path) -> std::path::PathBuf {
+    let file = folder.join("authority");
+    let mut entry = vec![0xff, 0xff, 0, 0, 0, 0];
+    for part in [b"MIT-MAGIC-COOKIE-1".as_slice(), b"sixteen letters!".as_slice()] {
+        entry.extend(u16::try_from(part.len()).unwrap().to_be_bytes());
+        entry.extend(part);
+    }
+    std::fs::write(&file, entry).unwrap();
+    file
+}
+
+#[test]
+fn an_open_display_is_told_from_one_that_refuses_and_one_that_is_gone() {
+    let folder = tempfile::tempdir().unwrap();
+    let Some(open) = Xvfb::start(None) else { return };
+    assert_eq!(look(&open.display), Ok(()));
+    let gone = open.display.clone();
+    drop(open);
+    assert_eq!(look(&gone), Err(Trouble::NoServer(gone.clone())));
+
+    let cookies = authority(folder.path());
+    let locked = Xvfb::start(Some(&cookies)).unwrap();
+    match look(&locked.display) {
+        Err(trouble @ Trouble::Refused { .. }) => {
+            let words = trouble.to_string();
+            assert!(words.contains("Authorization required"), "{words}");
+            assert!(words.contains("xhost +si:localuser:"), "{words}");
+        }
+        other => panic!("{other:?}"),
+    }
+}
+
+#[test]
+fn check_tells_which_case_it_is() {
+    let folder = tempfile::tempdir().unwrap();
+    let Some(open) = Xvfb::start(None) else { return };
+    let cookies = authority(folder.path());
+    let locked = Xvfb::start(Some(&cookies)).unwrap();
+    let (open, locked) = (open.display.as_str(), locked.display.as_str());
+    let table = [
+        (Some(open), None, None, format!("display: {open} answers (the environment variable DISPLAY names it)")),
+        (Some("nonsense"), Some(open), None, format!("display: {open} answers (the configuration names it)")),
+        (Some(locked), None, None, format!("warning: display: the display {locked} refuses this user")),
+        (Some(locked), None, Some(cookies.to_str().unwrap()), format!("display: {locked} answers")),
+        (Some(":59000"), None, None, "warning: display: no display answers at :59000: start an X server".to_owned()),
+        (Some("nonsense"), None, None, "warning: display: \"nonsense\" is no display".to_owned()),
+    ];
+    for (display, configured, authority, words) in table {
+        let (_, told) = crate::preflight::check(
+            &configured.map(|display| serde_json::json!({"display": display})).unwrap_or(serde_json::json!({})),
+            |command| {
+                command.env_remove("DISPLAY").env("XAUTHORITY", authority.unwrap_or("/nowhere"));
+                if let Some(display) = display {
+                    command.env("DISPLAY", display);
+                }
+            },
+        );
+        assert!(told.lines().any(|line| line.starts_with(&words)), "{words} is not in\n{told}");
+    }
+}

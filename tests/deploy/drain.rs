@@ -1,0 +1,86 @@
+//! An upgrade that costs nobody a simulation: the server takes no new clients, and ends when the last has gone.
+
+use nix::sys::signal::Signal;
+
+use crate::support::client::Client;
+use crate::support::git::{Forge, world};
+use crate::support::program::{Server, session_server, simulation_server};
+use crate::support::webots::Webots;
+use crate::support::{SOON, http, until};
+
+async fn post(server: &Server, path: &str, password: Option<&str>) -> u16 {
+    let request = awc::Client::builder().timeout(SOON).finish().post(server.url(path));
+    let request = match password {
+        Some(password) => request.basic_auth("admin", password),
+        None => request,
+    };
+    request.send().await.unwrap().status().as_u16()
+}
+
+/// Has a client whose simulation runs, drains the server in some way, and looks at everything until its end.
+async fn drain(how: impl AsyncFnOnce(&Server)) {
+    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
+    let mut server =
+        simulation_server(&webots.path(), forge.path(), 2).set("adminPassword", "open sesame").start().await;
+    let session = session_server(&[server.address()]).start().await;
+    until("it is available", async || http::get(&session.url("/request")).await.text() == "1").await;
+    let arm = world("lab/arm", "main", "worlds/a.wbt");
+    let mut client = Client::start(&server, &arm).await;
+    client.until("webots:").await;
+    let viewer = format!("ws://127.0.0.1:{}/", server.port + 1);
+    let mut first = Client::connect(&viewer).await;
+    first.send("x3d").await;
+    first.until("scene load completed").await;
+
+    how(&server).await;
+
+    until("it is not offered any more", async || http::get(&session.url("/request")).await.text() == "0").await;
+    assert_eq!(http::get(&server.url("/load")).await.text(), "100");
+    let mut late = Client::start(&server, &arm).await;
+    late.until("loading: Error:").await;
+    late.closed().await;
+    // The simulation goes on as if nothing had happened, for its client and for those who look on.
+    assert!(client.is_silent(std::time::Duration::from_millis(500)).await, "{:#?}", client.heard);
+    first.send("real-time:-1").await;
+    first.until("application/json:").await;
+    let mut second = Client::connect(&viewer).await;
+    second.send("x3d").await;
+    second.until("scene load completed").await;
+
+    client.leave().await;
+    assert_eq!(server.ended().await, Some(0));
+    assert!(std::net::TcpListener::bind(("127.0.0.1", server.port)).is_ok(), "its successor can have the port");
+}
+
+#[actix_rt::test]
+async fn a_server_that_drains_by_signal_ends_with_its_last_simulation() {
+    drain(async |server| server.signal(Signal::SIGUSR1)).await;
+}
+
+#[actix_rt::test]
+async fn a_server_that_drains_by_request_ends_with_its_last_simulation() {
+    drain(async |server| {
+        assert_eq!(post(server, "/drain", None).await, 401);
+        assert_eq!(post(server, "/drain", Some("guess")).await, 401);
+        assert_eq!(http::get(&server.url("/load")).await.text().parse::<f64>().map(|load| load < 100.0), Ok(true));
+        assert_eq!(post(server, "/drain", Some("open sesame")).await, 202);
+    })
+    .await;
+}
+
+#[actix_rt::test]
+async fn a_drained_server_is_followed_by_a_new_one_at_the_same_place() {
+    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
+    let folder = tempfile::tempdir().unwrap();
+    let builder = || simulation_server(&webots.path(), forge.path(), 1).folder(folder.path());
+    let mut old = builder().start().await;
+    let session = session_server(&[old.address()]).start().await;
+    until("the old one is available", async || http::get(&session.url("/request")).await.text() == "1").await;
+    old.signal(Signal::SIGUSR1);
+    assert_eq!(old.ended().await, Some(0));
+    until("nothing is available", async || http::get(&session.url("/request")).await.text() == "0").await;
+    let new = builder().port(old.port).start().await;
+    until("the new one is available", async || http::get(&session.url("/request")).await.text() == "1").await;
+    let mut client = Client::start(&new, &world("lab/arm", "main", "worlds/a.wbt")).await;
+    client.until("webots:").await;
+}

@@ -1,0 +1,78 @@
+//! `simulation-server --check`: the configuration on standard output, what the machine has and lacks beside it.
+
+use std::os::unix::fs::symlink;
+use std::path::Path;
+use std::process::Command;
+
+use serde_json::{Value, json};
+
+use crate::support::webots::Webots;
+
+/// Runs `--check` with these keys; gives back what it prints and what it tells beside.
+pub fn check(keys: &Value, change: impl FnOnce(&mut Command)) -> (Value, String) {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("config.json");
+    let mut config = json!({"server": "localhost", "allowedRepositories": "https://github.com/lab"});
+    config.as_object_mut().unwrap().extend(keys.as_object().unwrap().clone());
+    std::fs::write(&file, config.to_string()).unwrap();
+    let mut command = Command::new(env!("CARGO_BIN_EXE_simulation-server"));
+    command.arg("--check").arg(&file).env_remove("WEBOTS_HOME");
+    change(&mut command);
+    let output = command.output().unwrap();
+    let told = String::from_utf8(output.stderr).unwrap();
+    assert_eq!(output.status.code(), Some(0), "{told}");
+    (serde_json::from_slice(&output.stdout).unwrap(), told)
+}
+
+fn path(folder: &Path) -> impl FnOnce(&mut Command) {
+    move |command| {
+        command.env("PATH", folder);
+    }
+}
+
+#[test]
+fn nothing_is_warned_about_where_all_is_there() {
+    let (webots, programs) = (Webots::script("exit 0"), tempfile::tempdir().unwrap());
+    for program in ["git-lfs", "xvfb-run"] {
+        symlink(webots.path(), programs.path().join(program)).unwrap();
+    }
+    let echo = Webots::script("echo \"git version 2.39.5 $*\"");
+    for program in ["git", "git-lfs"] {
+        std::fs::remove_file(programs.path().join(program)).ok();
+        symlink(echo.path(), programs.path().join(program)).unwrap();
+    }
+    let search = format!("{}:/usr/bin:/bin", programs.path().display());
+    let (config, told) = check(&json!({"webots": webots.path(), "xvfb": true}), |command| {
+        command.env("PATH", search);
+    });
+    assert_eq!(config["xvfb"], true);
+    let expected = format!(
+        "webots: {}\ndisplay: each Webots gets a virtual display of its own (xvfb), without the graphics card\n\
+         git: git version 2.39.5 --version\ngit-lfs: git version 2.39.5 --version\nxvfb-run: {}/xvfb-run\n",
+        webots.path().display(),
+        programs.path().display()
+    );
+    assert_eq!(told, expected);
+}
+
+#[test]
+fn what_is_missing_is_warned_about() {
+    let empty = tempfile::tempdir().unwrap();
+    let (config, told) = check(&json!({"webotsHome": "/nowhere", "xvfb": true}), path(empty.path()));
+    assert_eq!(config["webotsHome"], "/nowhere");
+    for words in [
+        "warning: webots: there is no program /nowhere/webots; webotsHome is the folder that Webots is installed in\n",
+        "warning: git: git is not there: no world can be checked out\n",
+        "warning: git-lfs: git-lfs is not there: large files of Git LFS will be missing\n",
+        "warning: xvfb-run: xvfb-run is not there, but xvfb is true: no Webots can start.",
+    ] {
+        assert!(told.contains(words), "{words} is not in\n{told}");
+    }
+    let (_, told) = check(&json!({"display": ":59000"}), path(empty.path()));
+    for words in [
+        "warning: webots: neither webotsHome nor the environment variable WEBOTS_HOME is set\n",
+        "xvfb-run: it is not there, and not needed: xvfb is false\n",
+    ] {
+        assert!(told.contains(words), "{words} is not in\n{told}");
+    }
+}

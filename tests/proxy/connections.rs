@@ -1,0 +1,125 @@
+//! Long connections: quiet times, and web servers that are told to read their configuration again or are restarted.
+
+use std::time::Duration;
+
+use futures_util::StreamExt;
+
+use crate::fleet::{Fleet, IDLE};
+use crate::rules::Rules;
+use crate::support::client::{Client, Heard};
+
+/// Longer than the web server's patience.
+const QUIET: Duration = Duration::from_millis(IDLE.as_millis() as u64 * 3 / 2);
+
+async fn quiet_connections_last(rules: Rules) {
+    let fleet = Fleet::start(rules).await;
+    let browser = &fleet.browser;
+    let mut door = browser.connect(&rules.session_path(fleet.session.port, "/session")).await;
+    let mut idle = browser.open(&format!("{}/client", fleet.wss(&fleet.here))).await;
+    let (mut client, stream) = fleet.simulate(browser, &fleet.there).await;
+    let mut viewer = browser.open(&format!("{stream}/")).await;
+    viewer.send("x3d").await;
+    viewer.until("scene load completed").await;
+    viewer.send("pause").await;
+    viewer.until("paused by client").await;
+    // Nothing but pings goes over these connections; over Webots' stream not even these.
+    assert!(idle.is_silent(QUIET).await, "{:?}", idle.heard);
+    viewer.send("real-time:-1").await;
+    viewer.until("application/json:").await;
+    client.until(".").await;
+    a_door_still_answers(&mut door).await;
+}
+
+/// With a URL; or with an error, if the machine that runs the tests is too busy for a simulation.
+async fn a_door_still_answers(door: &mut Client) {
+    door.send("").await;
+    loop {
+        match door.next().await {
+            Heard::Text(text) if text.len() > 1 => return,
+            Heard::Text(_) => {}
+            Heard::Closed(frame) => panic!("closed: {frame:?}"),
+        }
+    }
+}
+
+#[actix_rt::test]
+async fn quiet_connections_through_apache_last() {
+    quiet_connections_last(Rules::Apache).await;
+}
+
+#[actix_rt::test]
+async fn quiet_connections_through_nginx_last() {
+    quiet_connections_last(Rules::Nginx).await;
+}
+
+#[actix_rt::test]
+async fn the_documents_rules_keep_what_is_pinged_and_cut_what_is_silent() {
+    let fleet = Fleet::start(Rules::DocumentsMachine).await;
+    let mut door = fleet.browser.connect(&format!("/{}/session", fleet.session.port)).await;
+    let (mut client, stream) = fleet.simulate(&fleet.browser, &fleet.here).await;
+    let mut viewer = fleet.browser.open(&format!("{stream}/")).await;
+    viewer.send("x3d").await;
+    viewer.until("scene load completed").await;
+    viewer.closed().await;
+    client.until(".").await;
+    a_door_still_answers(&mut door).await;
+}
+
+/// Far more connections than a web server's defaults have room for.
+const CLASS: usize = 200;
+
+async fn a_class_has_room(rules: Rules) {
+    let fleet = Fleet::start(rules).await;
+    let doors = futures_util::stream::iter(0..CLASS).map(|_| fleet.browser.connect("/session"));
+    let mut doors: Vec<Client> = doors.buffer_unordered(8).collect().await;
+    for door in &mut doors {
+        door.until("").await;
+    }
+    for door in &mut doors {
+        a_door_still_answers(door).await;
+    }
+    fleet.both_up().await;
+}
+
+#[actix_rt::test]
+async fn a_class_has_room_behind_apache() {
+    a_class_has_room(Rules::Apache).await;
+}
+
+#[actix_rt::test]
+async fn a_class_has_room_behind_nginx() {
+    a_class_has_room(Rules::Nginx).await;
+}
+
+async fn a_restart_costs_only_connections_of_its_own(rules: Rules) {
+    let mut fleet = Fleet::start(rules).await;
+    let (mut proxied, _) = fleet.simulate(&fleet.browser, &fleet.here).await;
+    let mut direct = Client::start(&fleet.here, &crate::fleet::arm()).await;
+    direct.until("webots:").await;
+    // With a new certificate, say.
+    fleet.web.reload();
+    let (other, _) = fleet.simulate(&fleet.browser, &fleet.here).await;
+    other.leave().await;
+    for _ in 0..3 {
+        proxied.until(".").await;
+    }
+    fleet.web.stop();
+    proxied.closed().await;
+    fleet.web.go().await;
+    let (mut again, _) = fleet.simulate(&fleet.browser, &fleet.here).await;
+    again.until(".").await;
+    for _ in 0..3 {
+        direct.until(".").await;
+    }
+    fleet.both_up().await;
+}
+
+#[actix_rt::test]
+async fn a_restart_of_apache_costs_only_connections_of_its_own() {
+    a_restart_costs_only_connections_of_its_own(Rules::Apache).await;
+}
+
+#[actix_rt::test]
+async fn a_restart_of_nginx_costs_only_connections_of_its_own() {
+    a_restart_costs_only_connections_of_its_own(Rules::Nginx).await;
+}

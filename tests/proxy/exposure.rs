@@ -1,0 +1,99 @@
+//! Which ports of the machine are reachable from outside, and where pages are sent on.
+
+use std::io::{Read, Write};
+use std::net::TcpListener;
+
+use crate::fleet::Fleet;
+use crate::rules::Rules;
+
+/// A service of the machine that belongs to no fleet: a database's page of administration, say. It runs until the
+/// test program ends.
+fn private_service() -> u16 {
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    let port = listener.local_addr().unwrap().port();
+    std::thread::spawn(move || {
+        for mut connection in listener.incoming().flatten() {
+            // Whoever goes away before the answer gets none.
+            if connection.read(&mut [0; 4096]).is_ok_and(|length| length > 0) {
+                connection.write_all(b"HTTP/1.1 200 OK\r\nContent-Length: 6\r\nConnection: close\r\n\r\nsecret").ok();
+            }
+        }
+    });
+    port
+}
+
+async fn only_the_fleet_is_reachable(rules: Rules) {
+    let fleet = Fleet::start(rules).await;
+    let private = private_service();
+    let here = fleet.here.port;
+    let plain = ["22", "5432", "1", "80", "443"].map(|port| format!("/{port}/"));
+    let session = fleet.session.port;
+    let tricks = [
+        format!("/{private}/"),
+        format!("/{private}/x"),
+        format!("//{private}/"),
+        format!("/{here}/../{private}/"),
+        format!("/{here}/%2e%2e/{private}/"),
+        format!("/{here}/..%2f{private}/"),
+        format!("/{here}@127.0.0.1:{private}/"),
+        format!("/{here}%40127.0.0.1:{private}/"),
+        format!("/{here}:{private}/"),
+        format!("/0{private}/"),
+        format!("/{here}0/"),
+        format!("/{session}/status"),
+        format!("/assets/../{private}/"),
+        "/server-status".to_owned(),
+    ];
+    for path in plain.iter().chain(&tricks) {
+        let answer = fleet.browser.get(path).await;
+        assert!([400, 403, 404].contains(&answer.status.as_u16()), "{path}: {}", answer.status);
+        assert!(!answer.text().contains("secret"), "{path}");
+        let url = format!("wss://{}{path}", fleet.browser.host);
+        assert!(fleet.browser.try_open(&url, &[]).await.is_err(), "{path}");
+    }
+}
+
+#[actix_rt::test]
+async fn only_the_fleet_is_reachable_through_apache() {
+    only_the_fleet_is_reachable(Rules::Apache).await;
+}
+
+#[actix_rt::test]
+async fn only_the_fleet_is_reachable_through_nginx() {
+    only_the_fleet_is_reachable(Rules::Nginx).await;
+}
+
+#[actix_rt::test]
+async fn the_documents_rule_reaches_every_port_of_the_machine() {
+    let fleet = Fleet::start(Rules::DocumentsPorts).await;
+    let private = private_service();
+    assert_eq!(fleet.browser.get(&format!("/{private}/")).await.text(), "secret");
+    for port in ["22", "5432", "1"] {
+        let answer = fleet.browser.get(&format!("/{port}/")).await;
+        assert_ne!(answer.status, 404, "port {port} was tried, whether somebody listens there or not");
+    }
+}
+
+async fn pages_are_sent_on_to_https_and_the_bare_name(rules: Rules) {
+    let fleet = Fleet::start(rules).await;
+    let browser = &fleet.browser;
+    let plain = format!("http://localhost:{}", browser.plain);
+    let secure = format!("https://{}", browser.host);
+    let www = ("Host", "www.localhost");
+    let table = [(&plain, ("Host", "localhost")), (&plain, www), (&secure, www)];
+    for (server, host) in table {
+        let answer = browser.ask(&format!("{server}/monitor?x=a%20b"), &[host]).await;
+        assert_eq!(answer.status, 301, "{server} {host:?}");
+        assert_eq!(answer.header("location"), Some("https://localhost/monitor?x=a%20b"), "{server} {host:?}");
+    }
+}
+
+#[actix_rt::test]
+async fn apache_sends_pages_on_to_https_and_the_bare_name() {
+    pages_are_sent_on_to_https_and_the_bare_name(Rules::Apache).await;
+}
+
+#[actix_rt::test]
+async fn nginx_sends_pages_on_to_https_and_the_bare_name() {
+    pages_are_sent_on_to_https_and_the_bare_name(Rules::Nginx).await;
+}

@@ -1,0 +1,110 @@
+//! A session server and two simulation servers behind a web server, one of them on another machine.
+
+use std::time::Duration;
+
+use crate::authority::{Authority, trusting};
+use crate::browser::Browser;
+use crate::rules::{Place, Rules};
+use crate::support::client::Client;
+use crate::support::git::{Forge, world};
+use crate::support::http;
+use crate::support::ports;
+use crate::support::program::{Builder, Server, session_server, simulation_server};
+use crate::support::until;
+use crate::support::webots::Webots;
+use crate::web_server::WebServer;
+
+/// Everything; each part ends with it.
+pub struct Fleet {
+    pub browser: Browser,
+    pub web: WebServer,
+    pub session: Server,
+    /// On the web server's machine.
+    pub here: Server,
+    /// On another: 127.0.0.2.
+    pub there: Server,
+    _authority: Authority,
+    _webots: Webots,
+    _forge: Forge,
+}
+
+/// How many simulations fit on each simulation server.
+const PLACES: u16 = 3;
+/// A web server's default, shortened: connections on which nothing is sent for so long are closed.
+pub const IDLE: Duration = Duration::from_secs(2);
+
+impl Fleet {
+    pub async fn start(rules: Rules) -> Self {
+        Self::start_with(rules, |server| server).await
+    }
+
+    /// A fleet whose servers have some keys in common.
+    pub async fn start_with(rules: Rules, keys: impl Fn(Builder) -> Builder) -> Self {
+        let authority = Authority::new();
+        let certificate = authority.issue(&["localhost", "www.localhost"]);
+        let (http, https) = (ports::block(1), ports::block(1));
+        let host = format!("localhost:{https}");
+        let (webots, forge) = (Webots::launcher(), Forge::with_arm());
+        forge.commit("lab/arm", "main", &[("worlds/textures/old wood.png", "a picture")]);
+        let simulation = |address: &str| {
+            let server = simulation_server(&webots.path(), forge.path(), PLACES).env("DEMO_SIMULATOR_BIND", address);
+            let server = server.set("bind", address).set("timing.heartbeat", 0.2);
+            keys(behind(server, &host)).spawn()
+        };
+        let (here, there) = (simulation("127.0.0.1"), simulation("127.0.0.2"));
+        let addresses = [&here, &there].map(|server| format!("{host}/{}", server.port));
+        // The machine that runs the tests may be busy.
+        let session = session_server(&addresses)
+            .set("loadThreshold", 100)
+            .env("SSL_CERT_FILE", authority.file().to_str().unwrap());
+        let session = keys(behind(session, &host)).spawn();
+        let ports = |server: &Server| (server.port..=server.port + PLACES).collect::<Vec<_>>();
+        let place = Place {
+            http,
+            https,
+            session: session.port,
+            here: &ports(&here),
+            there: &ports(&there),
+            chain: certificate.chain.to_str().unwrap(),
+            key: certificate.key.to_str().unwrap(),
+        };
+        let web = WebServer::start(rules.kind(), (http, https), &rules.text(&place), IDLE).await;
+        let browser = Browser { address: "127.0.0.1", trust: trusting(&authority.file()), host, plain: http };
+        let fleet = Self { browser, web, session, here, there, _authority: authority, _webots: webots, _forge: forge };
+        fleet.both_up().await;
+        fleet
+    }
+
+    /// Waits until the session server has heard of both simulation servers.
+    pub async fn both_up(&self) {
+        until("both simulation servers answer", async || {
+            let status = http::try_get(&self.session.url("/status")).await;
+            status
+                .is_ok_and(|page| page.json()["servers"].as_array().unwrap().iter().all(|one| one["load"].is_number()))
+        })
+        .await;
+    }
+
+    /// Starts a simulation; gives back its client, and the URL of its stream.
+    pub async fn simulate(&self, browser: &Browser, server: &Server) -> (Client, String) {
+        let mut client = browser.open(&format!("{}/client", self.wss(server))).await;
+        client.send(&serde_json::json!({"start": {"url": arm()}}).to_string()).await;
+        let webots = client.until("webots:").await;
+        (client, webots.strip_prefix("webots:").unwrap().to_owned())
+    }
+
+    /// `wss://HOST/PORT` of a simulation server.
+    pub fn wss(&self, server: &Server) -> String {
+        format!("wss://{}/{}", self.browser.host, server.port)
+    }
+}
+
+/// A world that the fleet runs.
+pub fn arm() -> String {
+    world("lab/arm", "main", "worlds/a.wbt")
+}
+
+fn behind(server: Builder, host: &str) -> Builder {
+    let server = server.set("server", host).set("ssl", true).set("portRewrite", true);
+    server.set("timing.ping", 0.5).set("timing.silence", 10)
+}

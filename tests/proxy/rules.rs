@@ -1,0 +1,139 @@
+//! Rules of web servers: ours, and those of the original documents.
+
+use super::web_server::Kind;
+
+/// A set of rules, which is made to fit the machine of a test.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Rules {
+    /// `deploy/apache.conf`
+    Apache,
+    /// `deploy/nginx.conf`
+    Nginx,
+    /// The documents' page on port rewrite: every port, of the host that was asked for.
+    DocumentsPorts,
+    /// The documents' page on a machine with a session server: every port of the machine, and three pages.
+    DocumentsMachine,
+}
+
+/// What is particular to a machine.
+pub struct Place<'a> {
+    /// Of the web server.
+    pub http: u16,
+    pub https: u16,
+    pub session: u16,
+    /// Ports of the fleet on this machine.
+    pub here: &'a [u16],
+    /// Ports of the fleet on the other machine, which is 127.0.0.2.
+    pub there: &'a [u16],
+    pub chain: &'a str,
+    pub key: &'a str,
+}
+
+impl Rules {
+    pub fn kind(self) -> Kind {
+        if self == Self::Nginx { Kind::Nginx } else { Kind::Apache }
+    }
+
+    /// Where a client finds the session server's door.
+    pub fn session_path(self, session: u16, path: &str) -> String {
+        match self {
+            Self::Apache | Self::Nginx => path.to_owned(),
+            Self::DocumentsPorts | Self::DocumentsMachine => format!("/{session}{path}"),
+        }
+    }
+
+    pub fn text(self, place: &Place) -> String {
+        let Place { http, https, session, here, there, chain, key } = place;
+        let pattern = |ports: &[u16]| ports.iter().map(u16::to_string).collect::<Vec<_>>().join("|");
+        let any_address = |port: &str| format!("listen [::]:{port};\n");
+        match self {
+            Self::Apache => adapt(
+                include_str!("../../deploy/apache.conf"),
+                &[
+                    ("fleet.example.org", "localhost"),
+                    ("*:80>", &format!("127.0.0.1:{http}>")),
+                    ("*:443>", &format!("127.0.0.1:{https}>")),
+                    ("/etc/letsencrypt/live/${FLEET_HOST}/fullchain.pem", chain),
+                    ("/etc/letsencrypt/live/${FLEET_HOST}/privkey.pem", key),
+                    ("20[0-9][0-9]|2100", &pattern(here)),
+                    ("30[0-9][0-9]|3100", &pattern(there)),
+                    ("1999", &session.to_string()),
+                    ("192.0.2.3", "127.0.0.2"),
+                ],
+            ),
+            Self::Nginx => adapt(
+                include_str!("../../deploy/nginx.conf"),
+                &[
+                    ("/etc/letsencrypt/live/fleet.example.org/fullchain.pem", chain),
+                    ("/etc/letsencrypt/live/fleet.example.org/privkey.pem", key),
+                    ("fleet.example.org", "localhost"),
+                    (&any_address("80"), "\n"),
+                    (&any_address("443 ssl"), "\n"),
+                    ("listen 80;", &format!("listen 127.0.0.1:{http};")),
+                    ("listen 443 ssl;", &format!("listen 127.0.0.1:{https} ssl;")),
+                    ("20[0-9][0-9]|2100", &pattern(here)),
+                    ("30[0-9][0-9]|3100", &pattern(there)),
+                    ("1999", &session.to_string()),
+                    ("192.0.2.3", "127.0.0.2"),
+                ],
+            ),
+            Self::DocumentsPorts | Self::DocumentsMachine => {
+                let (redirect, rules) = if self == Self::DocumentsPorts {
+                    (PORTS_HTTP, PORTS_HTTPS)
+                } else {
+                    (MACHINE_HTTP, MACHINE_HTTPS)
+                };
+                let rules = rules.replace("1999", &session.to_string()).replace("webserver.com", "localhost");
+                let there = pattern(there);
+                format!(
+                    "<VirtualHost 127.0.0.1:{http}>\nServerName localhost\nServerAlias www.localhost\n{redirect}</VirtualHost>\n\
+                     <VirtualHost 127.0.0.1:{https}>\nServerName localhost\nServerAlias www.localhost\n\
+                     SSLEngine on\nSSLCertificateFile {chain}\nSSLCertificateKeyFile {key}\n\
+                     RewriteEngine on\n\
+                     RewriteCond %{{HTTP:Upgrade}} websocket [NC]\n\
+                     RewriteCond %{{HTTP:Connection}} upgrade [NC]\n\
+                     RewriteRule ^/({there})/(.*)$ \"ws://127.0.0.2:$1/$2\" [P,L]\n\
+                     RewriteRule ^/({there})/(.*)$ \"http://127.0.0.2:$1/$2\" [P,L]\n\
+                     {rules}</VirtualHost>\n"
+                )
+            }
+        }
+    }
+}
+
+fn adapt(text: &str, changes: &[(&str, &str)]) -> String {
+    changes.iter().fold(text.to_owned(), |text, (from, to)| {
+        assert!(text.contains(from), "{from:?} is not in\n{text}");
+        text.replace(from, to)
+    })
+}
+
+const PORTS_HTTP: &str = r"
+  RewriteEngine on
+  RewriteCond %{SERVER_NAME} =%{SERVER_NAME} [OR]
+  RewriteCond %{SERVER_NAME} =www.%{SERVER_NAME}
+  RewriteRule ^ https://%{SERVER_NAME}%{REQUEST_URI} [END,NE,R=permanent]
+";
+
+const PORTS_HTTPS: &str = r#"
+  RewriteCond %{SERVER_NAME} =www.webserver.com
+  RewriteRule ^ https://webserver.com%{REQUEST_URI} [END,NE,R=permanent]
+  RewriteCond %{HTTP:Upgrade} websocket [NC]
+  RewriteCond %{HTTP:Connection} upgrade [NC]
+  RewriteRule ^/(\d*)/(.*)$ "ws://%{SERVER_NAME}:$1/$2" [P,L]
+  RewriteRule ^/(\d*)/(.*)$ "http://%{SERVER_NAME}:$1/$2" [P,L]
+"#;
+
+const MACHINE_HTTP: &str = r#"
+  Redirect "/" "https://localhost/"
+"#;
+
+const MACHINE_HTTPS: &str = r#"
+  RewriteCond %{HTTP:Upgrade} websocket [NC]
+  RewriteCond %{HTTP:Connection} upgrade [NC]
+  RewriteRule ^/(\d*)/(.*)$ "ws://localhost:$1/$2" [P,L]
+  RewriteRule ^/load$ "http://localhost:1999/load" [P,L]
+  RewriteRule ^/monitor$ "http://localhost:1999/monitor" [P,L]
+  RewriteRule ^/session$ "http://localhost:1999/session" [P,L]
+  RewriteRule ^/(\d*)/(.*)$ "http://localhost:$1/$2" [P,L]
+"#;
