@@ -57,9 +57,11 @@ impl Policy {
     /// Lets a page run scripts of these sources, which may be WebAssembly, with their styles and pictures.
     #[must_use]
     pub fn run(mut self, sources: &[String]) -> Self {
-        for list in [&mut self.scripts, &mut self.styles, &mut self.pictures, &mut self.connections] {
-            list.extend_from_slice(sources);
+        let files = || sources.iter().filter(|source| !source.starts_with("ws")).cloned();
+        for list in [&mut self.scripts, &mut self.styles, &mut self.pictures] {
+            list.extend(files());
         }
+        self.connections.extend_from_slice(sources);
         self.scripts.push("'wasm-unsafe-eval'".to_owned());
         self
     }
