@@ -89,7 +89,7 @@ async fn each_node_becomes_an_element_with_its_number() {
         viewer.hear().await,
         concat!(
             r#"model:<?xml version="1.0" encoding="UTF-8"?><X3D><head><meta name="generator" content="Webots"/>"#,
-            r#"<meta name="version" content="R2025a"/></head><Scene>"#,
+            r#"<meta name="version" content="R2025a"/><meta name="simulator" content="demo"/></head><Scene>"#,
             r#"<WorldInfo id="n1" title="&lt;a&gt; &amp; &quot;b&quot;" basicTimeStep="16"/>"#,
             r#"<Viewpoint id="n2" position="-4 0 2" zNear="0.1"/>"#,
             r#"<Solid id="n3" name="it&apos;s" translation="0 0 0.5"><Shape id="n4" castShadows="true">"#,
