@@ -89,7 +89,10 @@ running_names() {
 declare -A effective
 read_configuration() { # KIND NAME
     local text line secure='' separator=:
-    text=$("$BIN/$1-server" --check "$(config_of "$1" "$2")") || return
+    text=$("$BIN/$1-server" --check "$(config_of "$1" "$2")" 2>"$REMARKS") || {
+        cat "$REMARKS" >&2
+        return 2
+    }
     effective=()
     while IFS= read -r line; do
         [[ $line =~ ^\ +\"([A-Za-z]+)\":\ \"?([^\",]*)\"?,?$ ]] && effective[${BASH_REMATCH[1]}]=${BASH_REMATCH[2]}
@@ -105,6 +108,15 @@ read_configuration() { # KIND NAME
         0.0.0.0) HOST=127.0.0.1 ;;
         ::) HOST=::1 ;;
     esac
+}
+
+# Passes on what the last check warns of. The demo simulator needs no display.
+warn() {
+    local line
+    while IFS= read -r line; do
+        [[ $line == 'warning: '* ]] || continue
+        [[ $line == 'warning: display: '* && ${effective[webots]-} == */demo-simulator ]] || printf '%s\n' "$line" >&2
+    done <"$REMARKS"
 }
 
 # Whether something listens on HOST and PORT.
@@ -182,6 +194,7 @@ prepare() { # NAME
     build
     for kind in $(kinds_of "$1"); do
         read_configuration "$kind" "$1" || exit
+        warn
         ((PORT > 0)) || fail 2 "$(config_of "$kind" "$1"): port: a server that is started here needs a port of its own, not 0"
     done
 }
@@ -331,6 +344,8 @@ main() {
         mapfile -t names < <(running_names)
     fi
     BIN=${FLEET_BIN:-$PWD/target/release}
+    REMARKS=$(mktemp) || exit 1
+    trap 'rm -f "$REMARKS"' EXIT
     case $1 in
         start)
             names=("${2-local}")

@@ -12,13 +12,16 @@ command -v cargo >/dev/null || {
 # Debian has web servers where only root looks for programs.
 PATH=$PATH:/usr/sbin
 # The C compiler links the programs; python3 and openssl make counterparts for mail and TLS; xvfb gives a display; the
-# fleet is tested behind both web servers.
+# fleet is tested behind both web servers, by a real browser too, and its package in a Debian that debootstrap makes.
 tests/install.sh cc=gcc,libc6-dev git=git flock=util-linux openssl=openssl python3=python3 python3-venv=python3-venv \
-    xvfb-run=xvfb,xauth apache2=apache2-bin nginx=nginx setpriv=util-linux
+    xvfb-run=xvfb,xauth apache2=apache2-bin nginx=nginx setpriv=util-linux chromium=chromium \
+    debootstrap=debootstrap
 tests/python.sh >/dev/null
 
 start=$SECONDS
 code=0
 cargo test --locked --no-fail-fast "$@" || code=$?
+# With arguments, only some tests are wanted.
+(($# > 0)) || FLEET_BIN=${FLEET_BIN:-$PWD/target/debug} tests/deploy/package.sh || code=$?
 echo "tests: $(((SECONDS - start) / 60)) min $(((SECONDS - start) % 60)) s, build included"
 exit "$code"

@@ -5,6 +5,7 @@ use std::time::Duration;
 use serde::{Deserialize, Serialize};
 
 use super::mail_address::{self, MailAddress};
+use super::placement::Policy;
 use crate::shared::address::PublicAddress;
 use crate::shared::config::{
     Configuration, ExpandedPath, Secret, Unfit, one_or_many, optional_port, percent, seconds, threshold, whole,
@@ -174,7 +175,21 @@ impl Default for Timing {
     }
 }
 
+/// How long a client that came needs until its load shows: the start, and the mean of five seconds.
+const SETTLING: Duration = Duration::from_secs(8);
+
 impl SessionConfig {
+    /// How clients are placed.
+    #[must_use]
+    pub fn policy(&self) -> Policy {
+        Policy {
+            threshold: self.load_threshold,
+            initial_cost: self.client_cost,
+            patience: self.timing.placement,
+            settling: SETTLING,
+        }
+    }
+
     /// Where this server is reached from outside.
     #[must_use]
     pub fn address(&self) -> PublicAddress {

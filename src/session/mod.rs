@@ -22,5 +22,6 @@ pub mod server_monitor;
 pub mod smtp;
 pub mod status;
 pub mod subscribers;
+pub mod unreachable;
 pub mod watched;
 pub mod web_client;

@@ -15,9 +15,10 @@ use super::config::SessionConfig;
 use super::fleet_status::{FleetStatus, ServerStatus};
 use super::notices::Notice;
 use super::pick::{NoServer, Pick};
-use super::placement::{Fleet, Policy};
-use super::server_monitor::{self, Forget, Reported, ServerMonitor, Unreachable, Watch};
+use super::placement::Fleet;
+use super::server_monitor::{self, Forget, Reported, ServerMonitor, Watch};
 use super::subscribers::{News, Subscribers};
+use super::unreachable::Unreachable;
 use super::watched::Watched;
 use crate::shared::address::PublicAddress;
 use crate::shared::project_url::ProjectUrl;
@@ -63,8 +64,6 @@ struct Member {
 
 /// Between two looks at what changes without a report: placements that expire, monitors that are gone.
 const LOOK: Duration = Duration::from_millis(250);
-/// How long a client that came needs until its load shows: the start, and the mean of five seconds.
-const SETTLING: Duration = Duration::from_secs(8);
 
 impl Registry {
     /// Prepares the registry; its monitors start with it.
@@ -75,7 +74,7 @@ impl Registry {
         latencies: prometheus::Histogram,
     ) -> Self {
         Self {
-            fleet: Fleet::new(policy(&config)),
+            fleet: Fleet::new(config.policy()),
             client: server_monitor::client(config.load_refresh),
             config,
             latencies,
@@ -212,15 +211,6 @@ impl Registry {
     }
 }
 
-fn policy(config: &SessionConfig) -> Policy {
-    Policy {
-        threshold: config.load_threshold,
-        initial_cost: config.client_cost,
-        patience: config.timing.placement,
-        settling: SETTLING,
-    }
-}
-
 impl Actor for Registry {
     type Context = Context<Self>;
 
@@ -292,7 +282,7 @@ impl Handler<Reconfigure> for Registry {
 
     fn handle(&mut self, Reconfigure(config): Reconfigure, ctx: &mut Self::Context) {
         let before = self.watch();
-        self.fleet.set_policy(Instant::now(), policy(&config));
+        self.fleet.set_policy(Instant::now(), config.policy());
         self.config = config;
         self.apply(ctx);
         let watch = self.watch();

@@ -8,12 +8,12 @@
 //! It asks for `/status`; a server that has no such page is asked for `/load`, as the original is. Nothing that comes is
 //! trusted: the whole exchange has one time limit, an answer has a largest size, and a load must be one.
 
-use std::fmt;
 use std::time::{Duration, Instant};
 
 use actix::prelude::*;
 use awc::error::{ConnectError, SendRequestError};
 
+use super::unreachable::Unreachable;
 use crate::shared::address::PublicAddress;
 use crate::shared::load::Load;
 use crate::shared::status::Dispatch;
@@ -29,17 +29,6 @@ pub struct Reported {
     pub latency: Duration,
     /// What it said of itself, or why it can't be counted on.
     pub answer: Result<Dispatch, Unreachable>,
-}
-
-/// Why a simulation server gave no usable answer.
-#[derive(Debug, Clone, PartialEq)]
-pub enum Unreachable {
-    /// No connection, or one that broke.
-    Refused(String),
-    /// No whole answer in time.
-    TimedOut(Duration),
-    /// An answer that makes no sense.
-    BadAnswer(String),
 }
 
 /// How often and how patiently a server is asked. As a message it changes a monitor's ways.
@@ -181,16 +170,6 @@ impl Handler<Forget> for ServerMonitor {
 
     fn handle(&mut self, _: Forget, ctx: &mut Self::Context) {
         ctx.stop();
-    }
-}
-
-impl fmt::Display for Unreachable {
-    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::Refused(why) => write!(out, "no connection: {why}"),
-            Self::TimedOut(limit) => write!(out, "no answer within {} s", limit.as_secs_f64()),
-            Self::BadAnswer(what) => write!(out, "an answer that makes no sense: {what}"),
-        }
     }
 }
 

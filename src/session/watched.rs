@@ -5,7 +5,7 @@ use std::time::{Duration, Instant, SystemTime};
 use super::fleet_status::State;
 use super::notices::Event;
 use super::placement;
-use super::server_monitor::Unreachable;
+use super::unreachable::Unreachable;
 use crate::shared::load::Load;
 use crate::shared::status::Dispatch;
 

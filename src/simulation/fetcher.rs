@@ -159,7 +159,8 @@ impl Fetcher {
             if !repository.has(&reference) {
                 self.download(world, remote, repository, &revision, progress).await?;
             }
-            let call = call(remote, repository.path(), revision.list_arguments(&reference));
+            let mut call = call(remote, repository.path(), revision.list_arguments(&reference));
+            call.is_alone = true;
             let listing = self.git.run(call, |_| ()).await.map_err(|source| damaged(world, source))?;
             let listing = revision::Listing::parse(&listing);
             if listing.size > self.limits.size {
@@ -252,7 +253,7 @@ impl Fetcher {
     /// Whether git finds everything in order in a cached repository. It reads all of it: for use after a failure.
     async fn is_sound(&self, repository: &Path) -> bool {
         let arguments = ["fsck", "--full", "--no-dangling", "--no-progress"].map(OsString::from).to_vec();
-        let call = Call { repository, arguments, protocol: "https", environment: Vec::new() };
+        let call = Call { repository, arguments, protocol: "https", is_alone: false, environment: Vec::new() };
         self.git.run(call, |_| ()).await.is_ok()
     }
 
@@ -283,5 +284,5 @@ impl Fetcher {
 /// A git command on a cached repository.
 #[must_use]
 pub fn call<'call>(remote: &Remote, repository: &'call Path, arguments: Vec<OsString>) -> Call<'call> {
-    Call { repository, arguments, protocol: remote.protocol, environment: Vec::new() }
+    Call { repository, arguments, protocol: remote.protocol, is_alone: false, environment: Vec::new() }
 }

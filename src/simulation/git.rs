@@ -5,10 +5,12 @@ use std::io::PipeReader;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use futures_util::FutureExt;
 use tokio::io::{AsyncRead, AsyncReadExt};
 use tokio::net::unix::pipe::Receiver;
 
-use super::process_group::{Ending, Plan, ProcessGroup};
+use super::command::is_in_path;
+use super::process_group::{self, Ending, Plan, ProcessGroup};
 use crate::shared::logging::one_line;
 
 /// How git is run by this server.
@@ -16,6 +18,8 @@ use crate::shared::logging::one_line;
 pub struct Git {
     settings: PathBuf,
     mark: PathBuf,
+    /// Whether the system has a program that makes another end with its parent.
+    has_setpriv: bool,
 }
 
 /// One git command.
@@ -27,6 +31,9 @@ pub struct Call<'call> {
     pub arguments: Vec<OsString>,
     /// The one protocol that it may use.
     pub protocol: &'static str,
+    /// Whether it starts no further process and asks nobody: then the kernel alone can see to it that it ends with the
+    /// server, which takes a fraction of a guardian's time.
+    pub is_alone: bool,
     /// Further variables.
     pub environment: Vec<(OsString, OsString)>,
 }
@@ -80,7 +87,7 @@ impl Git {
     pub fn new(run: &Path) -> std::io::Result<Self> {
         let settings = run.join("gitconfig");
         std::fs::write(&settings, SETTINGS)?;
-        Ok(Self { settings, mark: run.to_owned() })
+        Ok(Self { settings, mark: run.to_owned(), has_setpriv: is_in_path("setpriv") })
     }
 
     /// Runs a command to its end and gives back its answer. `progress` hears each line of progress.
@@ -97,7 +104,14 @@ impl Git {
         let broken = |error: std::io::Error| failed("can't be started", error.to_string());
         let (answer, output) = std::io::pipe().map_err(broken)?;
         let (complaints, errors) = std::io::pipe().map_err(broken)?;
-        let (group, ended) = ProcessGroup::start(&self.plan(call), output.into(), errors.into()).map_err(broken)?;
+        let is_alone = call.is_alone && self.has_setpriv;
+        let plan = self.plan(call);
+        let (group, ended) = if is_alone {
+            (None, process_group::start_alone(&plan, output.into(), errors.into()).map_err(broken)?.boxed())
+        } else {
+            let (group, ended) = ProcessGroup::start(&plan, output.into(), errors.into()).map_err(broken)?;
+            (Some(group), ended.boxed())
+        };
         let answer = asynchronous(answer).map_err(broken)?;
         let complaints = asynchronous(complaints).map_err(broken)?;
         let (answer, last_words, ending) = tokio::join!(read_all(answer), follow(complaints, progress), ended);

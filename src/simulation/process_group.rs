@@ -102,6 +102,27 @@ impl ProcessGroup {
     }
 }
 
+/// Starts a program that starts no other; dropping the future kills it, and so does the kernel when the server ends.
+///
+/// # Errors
+/// When the system can start no more processes.
+pub fn start_alone(
+    plan: &Plan,
+    output: Stdio,
+    errors: Stdio,
+) -> std::io::Result<impl Future<Output = Ending> + Send + 'static> {
+    let mut command = tokio::process::Command::new("setpriv");
+    command.args(["--pdeathsig", "KILL", "--"]).args(&plan.command);
+    command.envs(plan.environment.iter().map(|(name, value)| (name, value))).env(process_tree::MARK, &plan.mark);
+    command.stdin(Stdio::null()).stdout(output).stderr(errors).process_group(0).kill_on_drop(true);
+    let mut child = command.spawn()?;
+    Ok(async move {
+        let status = child.wait().await;
+        let signal = |status: &ExitStatus| status.signal().and_then(|number| u8::try_from(number).ok());
+        status.map_or(Ending::NotStarted, |status| signal(&status).map_or(Ending::of_guardian(status), Ending::Signal))
+    })
+}
+
 impl Ending {
     fn of_guardian(status: ExitStatus) -> Self {
         match u8::try_from(status.code().unwrap_or_default()).unwrap_or_default() {

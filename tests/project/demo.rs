@@ -177,7 +177,9 @@ async fn without_webots_everything_runs_and_a_client_is_told_what_to_do() {
     let home = project.path("no webots here");
     project.configure("simulation/local", |config| config["webotsHome"] = home.to_str().unwrap().into());
     // Without a name: local.
-    project.done(&["start"]).await;
+    let started = project.server_sh(&["start"]).await;
+    assert_eq!(started.code, Some(0), "{started:#?}");
+    assert!(started.errors.contains("warning: webots: there is no program"), "{started:#?}");
     let mut client = Client::connect(&format!("ws://localhost:{}/client", project.simulation)).await;
     let world = "https://github.com/cyberbotics/webots/blob/released/projects/languages/python/worlds/example.wbt";
     client.send(&serde_json::json!({"start": {"url": world}}).to_string()).await;

@@ -9,7 +9,7 @@ const LONGEST_FILE: usize = 300;
 
 /// An actor, or what holds addresses of actors.
 fn is_about_actors(source: &Source) -> bool {
-    source.shipped.contains("impl Actor for") || source.shipped.contains("Addr<")
+    ["impl Actor for", "Addr<", "Recipient<"].iter().any(|sign| source.shipped.contains(sign))
 }
 
 /// The floor that a module is on: it may name what is on its own floor or below. The pages of `status` are made of what

@@ -13,6 +13,9 @@ use crate::support::SOON;
 use crate::support::client::Client;
 use crate::support::http::Answer;
 
+/// A page of which the head has come.
+pub type Page = awc::ClientResponse;
+
 /// A browser on a machine with this address.
 #[derive(Clone)]
 pub struct Browser {
@@ -34,8 +37,8 @@ impl Browser {
         self.ask(&format!("https://{}{path}", self.host), &[]).await
     }
 
-    /// A page of any server, with headers.
-    pub async fn ask(&self, url: &str, headers: &[(&str, &str)]) -> Answer {
+    /// The beginning of a page that may go on for long.
+    pub async fn begin(&self, url: &str, headers: &[(&str, &str)]) -> Page {
         let connector =
             awc::Connector::new().rustls_0_23(self.trust.clone()).local_address(self.address.parse().unwrap());
         let client = awc::Client::builder().connector(connector).timeout(SOON).disable_redirects().finish();
@@ -43,7 +46,12 @@ impl Browser {
         for &header in headers {
             request = request.insert_header(header);
         }
-        let mut answer = request.send().await.unwrap_or_else(|error| panic!("{url}: {error}"));
+        request.send().await.unwrap_or_else(|error| panic!("{url}: {error}"))
+    }
+
+    /// A page of any server, with headers.
+    pub async fn ask(&self, url: &str, headers: &[(&str, &str)]) -> Answer {
+        let mut answer = self.begin(url, headers).await;
         let body = answer.body().await.unwrap_or_else(|error| panic!("{url}: {error}"));
         Answer { status: answer.status(), headers: answer.headers().clone(), body }
     }

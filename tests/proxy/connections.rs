@@ -1,11 +1,14 @@
 //! Long connections: quiet times, and web servers that are told to read their configuration again or are restarted.
 
+use std::io::{Read, Write};
+use std::net::TcpListener;
 use std::time::Duration;
 
 use futures_util::StreamExt;
 
 use crate::fleet::{Fleet, IDLE};
 use crate::rules::Rules;
+use crate::support::SOON;
 use crate::support::client::{Client, Heard};
 
 /// Longer than the web server's patience.
@@ -89,6 +92,50 @@ async fn a_class_has_room_behind_apache() {
 #[actix_rt::test]
 async fn a_class_has_room_behind_nginx() {
     a_class_has_room(Rules::Nginx).await;
+}
+
+/// What a live page is told, or the pictures of a Webots that streams a video.
+async fn what_is_sent_in_pieces_comes_in_pieces(rules: Rules) {
+    let fleet = Fleet::start(rules).await;
+    let port = fleet.here.port + 2;
+    let listener = TcpListener::bind(("127.0.0.1", port)).unwrap();
+    let (next, wanted) = std::sync::mpsc::channel::<()>();
+    let sender = std::thread::spawn(move || {
+        let (mut connection, _) = listener.accept().unwrap();
+        assert_ne!(connection.read(&mut [0; 4096]).unwrap(), 0);
+        connection.write_all(b"HTTP/1.1 200 OK\r\nContent-Type: text/event-stream\r\n\r\n").unwrap();
+        for piece in ["one", "two", "three"] {
+            connection.write_all(format!("data: {piece}\n\n").as_bytes()).unwrap();
+            wanted.recv_timeout(SOON).unwrap();
+        }
+    });
+    let url = format!("https://{}/{port}/events", fleet.browser.host);
+    let mut page = fleet.browser.begin(&url, &[]).await;
+    for piece in ["one", "two", "three"] {
+        let mut came = Vec::new();
+        while !came.ends_with(b"\n\n") {
+            let more = actix_rt::time::timeout(SOON, page.next()).await.expect("it is held back");
+            came.extend_from_slice(&more.unwrap().unwrap());
+        }
+        assert_eq!(came, format!("data: {piece}\n\n").as_bytes());
+        next.send(()).unwrap();
+    }
+    sender.join().unwrap();
+}
+
+#[actix_rt::test]
+async fn what_is_sent_in_pieces_comes_in_pieces_through_apache() {
+    what_is_sent_in_pieces_comes_in_pieces(Rules::Apache).await;
+}
+
+#[actix_rt::test]
+async fn what_is_sent_in_pieces_comes_in_pieces_through_nginx() {
+    what_is_sent_in_pieces_comes_in_pieces(Rules::Nginx).await;
+}
+
+#[actix_rt::test]
+async fn what_is_sent_in_pieces_comes_in_pieces_with_the_documents_rules() {
+    what_is_sent_in_pieces_comes_in_pieces(Rules::DocumentsMachine).await;
 }
 
 async fn a_restart_costs_only_connections_of_its_own(rules: Rules) {

@@ -53,9 +53,11 @@ impl Fleet {
         };
         let (here, there) = (simulation("127.0.0.1"), simulation("127.0.0.2"));
         let addresses = [&here, &there].map(|server| format!("{host}/{}", server.port));
-        // The machine that runs the tests may be busy.
+        let examples = serde_json::json!([{"title": "Arm", "url": arm()}]);
         let session = session_server(&addresses)
-            .set("loadThreshold", 100)
+            .set("examples", examples)
+            // The machine that runs the tests may be busy.
+            .set("loadThreshold", 1000)
             .env("SSL_CERT_FILE", authority.file().to_str().unwrap());
         let session = keys(behind(session, &host)).spawn();
         let ports = |server: &Server| (server.port..=server.port + PLACES).collect::<Vec<_>>();

@@ -24,5 +24,7 @@ mod web_server;
 mod addresses;
 mod connections;
 mod exposure;
+mod pages;
 mod trust;
+mod visitor;
 mod whole_way;

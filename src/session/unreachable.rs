@@ -1,0 +1,25 @@
+//! Why nothing usable came from a simulation server. Pure.
+
+use std::fmt;
+use std::time::Duration;
+
+/// Why a simulation server gave no usable answer.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Unreachable {
+    /// No connection, or one that broke.
+    Refused(String),
+    /// No whole answer in time.
+    TimedOut(Duration),
+    /// An answer that makes no sense.
+    BadAnswer(String),
+}
+
+impl fmt::Display for Unreachable {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Refused(why) => write!(out, "no connection: {why}"),
+            Self::TimedOut(limit) => write!(out, "no answer within {} s", limit.as_secs_f64()),
+            Self::BadAnswer(what) => write!(out, "an answer that makes no sense: {what}"),
+        }
+    }
+}

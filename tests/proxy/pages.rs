@@ -1,0 +1,70 @@
+//! Pages with all that they load, and what live pages are told.
+
+use futures_util::StreamExt;
+
+use crate::browser::Browser;
+use crate::fleet::{Fleet, IDLE};
+use crate::rules::Rules;
+use crate::support::SOON;
+
+/// What a page names in `src` and `href`, but for other pages.
+fn loaded(html: &str) -> Vec<&str> {
+    let names = html.split(" src=\"").chain(html.split(" href=\"")).skip(1).filter_map(|rest| rest.split('"').next());
+    names.filter(|name| name.contains("assets/") && !name.contains('<')).collect()
+}
+
+async fn has_all_that_it_loads(browser: &Browser, path: &str) {
+    let url = url::Url::parse(&format!("https://{}{path}", browser.host)).unwrap();
+    let page = browser.ask(url.as_str(), &[]).await;
+    assert_eq!(page.status, 200, "{path}");
+    let html = page.text();
+    assert!(!loaded(&html).is_empty(), "{path}: {html}");
+    for name in loaded(&html) {
+        let part = url.join(name).unwrap();
+        assert_eq!(browser.ask(part.as_str(), &[]).await.status, 200, "{path} loads {name}");
+    }
+}
+
+/// Events come at once and go on for longer than the web server waits for a word.
+async fn is_told_what_happens(browser: &Browser, path: &str) {
+    let mut events =
+        browser.begin(&format!("https://{}{path}", browser.host), &[("Accept", "text/event-stream")]).await;
+    assert_eq!(events.status(), 200, "{path}");
+    let begun = std::time::Instant::now();
+    while begun.elapsed() < IDLE * 3 / 2 {
+        let event = actix_rt::time::timeout(SOON, events.next()).await.expect("nothing is told");
+        event.unwrap_or_else(|| panic!("{path}: the end")).unwrap();
+    }
+}
+
+async fn pages_are_complete_and_live(rules: Rules) {
+    let fleet = Fleet::start(rules).await;
+    let browser = &fleet.browser;
+    let machine = |page: &str| format!("/{}{page}", fleet.here.port);
+    for page in ["/monitor", "/viewer"] {
+        has_all_that_it_loads(browser, &rules.session_path(fleet.session.port, page)).await;
+    }
+    has_all_that_it_loads(browser, &machine("/monitor")).await;
+    let door = rules.session_path(fleet.session.port, "/events");
+    let here = machine("/events");
+    futures_util::join!(is_told_what_happens(browser, &here), is_told_what_happens(browser, &door));
+}
+
+#[actix_rt::test]
+async fn pages_behind_apache_are_complete_and_live() {
+    pages_are_complete_and_live(Rules::Apache).await;
+}
+
+#[actix_rt::test]
+async fn pages_behind_nginx_are_complete_and_live() {
+    pages_are_complete_and_live(Rules::Nginx).await;
+}
+
+#[actix_rt::test]
+async fn pages_behind_the_documents_rules_are_complete() {
+    let fleet = Fleet::start(Rules::DocumentsMachine).await;
+    for page in ["/monitor", "/viewer"] {
+        has_all_that_it_loads(&fleet.browser, &format!("/{}{page}", fleet.session.port)).await;
+    }
+    has_all_that_it_loads(&fleet.browser, &format!("/{}/monitor", fleet.there.port)).await;
+}
