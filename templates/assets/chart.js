@@ -149,8 +149,7 @@ export class Chart {
   /** A number on the axis, with the unit where it fits. */
   #written(value) {
     const { unit, most } = this.#group;
-    const digits = value === 0 || value >= 10 || Number.isInteger(value) ? 0 : value >= 1 ? 1 : value >= 0.01 ? 2 : 4;
-    const text = value.toFixed(digits).replace(/(\.\d*?)0+$/, '$1').replace(/\.$/, '');
+    const text = String(Number(value.toPrecision(3)));
     return most && unit === '%' ? `${text} %` : text;
   }
 

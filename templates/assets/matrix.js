@@ -28,7 +28,7 @@ export function times(a, b) {
 
 /** The matrix of a pose: a translation, a rotation as axis and angle, and a scale. */
 export function pose(translation, rotation, factors = [1, 1, 1]) {
-  const [x, y, z] = unit(rotation);
+  const [x, y, z] = unit(rotation.slice(0, 3));
   const [c, s] = [Math.cos(rotation[3]), Math.sin(rotation[3])];
   const t = 1 - c;
   const columns = [
