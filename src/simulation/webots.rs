@@ -144,6 +144,7 @@ impl Webots {
         }
         log::info!("port {port}: ready");
         self.listening = true;
+        self.last_sign = Instant::now();
         self.orders.place.0.update(Change::Port(port));
         self.show_pace();
         self.tell(WebotsEvent::Listening(port));
@@ -157,6 +158,10 @@ impl Webots {
     }
 
     fn check_signs(&mut self, _: &mut Context<Self>) {
+        // Until it listens, the time for its launch counts.
+        if !self.listening {
+            return;
+        }
         let silence = self.last_sign.elapsed();
         let hangs_after = self.orders.config.timing.heartbeat * MISSED_HEARTBEATS;
         if silence > hangs_after + self.orders.config.hang_limit {
