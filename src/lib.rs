@@ -10,11 +10,11 @@
 //! session server
 //!
 //!   routes ----------- Pick, GetStatus ------------> Registry --- Notice --> Mailer --> SMTP
-//!     | one per WebSocket                             ^    | one per simulation server
-//!   WebClient -- Subscribe, Pick --------------------'     |
-//!     ^--------- Availability (changes only) ----------'   v
-//!                                                     ServerMonitor -- GET /status, /load --> simulation server
-//!                                                          '-- Reported --> Registry
+//!     | one per WebSocket                             ^  |  | one per simulation server
+//!   WebClient ---------- Pick ------------------------'  |  v
+//!     |  ^                                               | ServerMonitor -- GET /status, /load --> simulation server
+//!     |  '- News -- Audience <--- News (changes only) ---'  '-- Reported --> Registry
+//!     '--- Join ------^  one per worker thread
 //!
 //! simulation server
 //!
@@ -38,7 +38,8 @@
 //! |---|---|---|
 //! | Registry, Places, `LoadMonitor` | never | the server logs it and ends with exit code 1: the service manager starts it again |
 //! | `ServerMonitor` | when its server leaves the configuration | the registry makes a new one |
-//! | Mailer | never | it is off until the server is started again; the loss of each notice is logged |
+//! | Mailer | never | the registry makes a new one |
+//! | Audience | never | its clients hear nothing more until they connect again |
 //! | Announcer | when all are told or given up | it is not started again: announcing is a courtesy |
 //! | `WebClient` | with its connection | its connection closes; what it leased is freed |
 //! | Webots | with its process tree; it is never restarted, its client is told | its process tree is killed at once, its folder removed, its place freed |

@@ -123,12 +123,12 @@ fn assemble(config: SessionConfig, phase: watch::Receiver<Phase>) -> Result<Serv
     for outcome in OUTCOMES {
         picks.with_label_values(&[outcome]).reset();
     }
-    let notices = mailer::start(&config).map(Addr::recipient);
+    let mailer = mailer::start(&config);
     let (timing, ssl) = (config.timing.clone(), config.ssl);
     let connections = Connections::new(config.max_clients, config.max_clients_per_address);
     let trusted_proxies = config.trusted_proxies.clone();
     let (examples, viewer_script) = (config.examples.clone(), config.viewer_script.clone());
-    let registry = Registry::new(Arc::new(config), notices, latencies).start();
+    let registry = Registry::new(Arc::new(config), mailer, latencies).start();
     let (started, started_at) = (Instant::now(), SystemTime::now());
     Ok(Server {
         registry,

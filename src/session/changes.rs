@@ -5,7 +5,9 @@ use std::collections::VecDeque;
 
 use actix::prelude::*;
 
+use super::config::SessionConfig;
 use super::fleet_status::{State, StateChange};
+use super::mailer::{self, Mailer};
 use super::notices::Notice;
 use super::watched::{Change, Watched};
 use crate::shared::address::PublicAddress;
@@ -13,7 +15,7 @@ use crate::shared::address::PublicAddress;
 /// The last changes, and who else is told of them.
 pub struct Changes {
     recent: VecDeque<StateChange>,
-    notices: Option<Recipient<Notice>>,
+    mailer: Option<Addr<Mailer>>,
 }
 
 /// How many changes are kept.
@@ -22,8 +24,16 @@ const KEPT: usize = 50;
 impl Changes {
     /// No changes yet; notices go to this actor.
     #[must_use]
-    pub fn new(notices: Option<Recipient<Notice>>) -> Self {
-        Self { recent: VecDeque::new(), notices }
+    pub fn new(mailer: Option<Addr<Mailer>>) -> Self {
+        Self { recent: VecDeque::new(), mailer }
+    }
+
+    /// Starts another mailer if the one that was there has panicked: an actor is not started again by itself.
+    pub fn look_after_mailer(&mut self, config: &SessionConfig) {
+        if self.mailer.as_ref().is_some_and(|mailer| !mailer.connected()) {
+            log::error!("the mailer is gone, a new one is started; what it had not sent is lost");
+            self.mailer = mailer::start(config);
+        }
     }
 
     /// The last changes, the newest first.
@@ -39,13 +49,13 @@ impl Changes {
         log::log!(level, "{server}: {}: {why}", state.word());
         self.recent.truncate(KEPT - 1);
         self.recent.push_front(StateChange { at, server: server.clone(), state, why });
-        let Some(notices) = &self.notices else {
+        let Some(mailer) = &self.mailer else {
             return;
         };
         let error = watched.error.as_ref().map(ToString::to_string);
         for event in events {
             let notice = Notice { server: server.clone(), event, load: watched.load(), error: error.clone(), at };
-            if let Err(lost) = notices.try_send(notice) {
+            if let Err(lost) = mailer.try_send(notice) {
                 log::error!("{server}: no notice is sent: {lost}");
             }
         }

@@ -10,7 +10,7 @@ use super::registry::GetStatus;
 use super::server::Server;
 use crate::asset;
 use crate::shared::assets::{self, Asset};
-use crate::shared::page::{Policy, fleet_sources, html};
+use crate::shared::page::{Policy, fleet_sources, get, html};
 
 /// What pages of this server load, besides what all pages do.
 const ASSETS: &[Asset] = &[
@@ -30,11 +30,11 @@ const ASSETS: &[Asset] = &[
 
 /// Adds the paths to an app.
 pub fn configure(app: &mut web::ServiceConfig) {
-    app.route("/monitor", web::get().to(monitor))
+    app.route("/monitor", get().to(monitor))
         .route("/events", web::get().to(events))
-        .route("/viewer", web::get().to(viewer))
-        .route("/webots-viewer", web::get().to(webots_viewer))
-        .route("/assets/{name}", web::get().to(asset));
+        .route("/viewer", get().to(viewer))
+        .route("/webots-viewer", get().to(webots_viewer))
+        .route("/assets/{name}", get().to(asset));
 }
 
 async fn monitor(server: web::Data<Server>) -> HttpResponse {

@@ -13,7 +13,7 @@ use actix::prelude::*;
 use super::changes::Changes;
 use super::config::SessionConfig;
 use super::fleet_status::{FleetStatus, ServerStatus};
-use super::notices::Notice;
+use super::mailer::Mailer;
 use super::pick::{NoServer, Pick};
 use super::placement::Fleet;
 use super::server_monitor::{self, Forget, Reported, ServerMonitor, Watch};
@@ -68,11 +68,7 @@ const LOOK: Duration = Duration::from_millis(250);
 impl Registry {
     /// Prepares the registry; its monitors start with it.
     #[must_use]
-    pub fn new(
-        config: Arc<SessionConfig>,
-        notices: Option<Recipient<Notice>>,
-        latencies: prometheus::Histogram,
-    ) -> Self {
+    pub fn new(config: Arc<SessionConfig>, mailer: Option<Addr<Mailer>>, latencies: prometheus::Histogram) -> Self {
         Self {
             fleet: Fleet::new(config.policy()),
             client: server_monitor::client(config.load_refresh),
@@ -81,7 +77,7 @@ impl Registry {
             servers: BTreeMap::new(),
             subscribers: Subscribers::default(),
             available: false,
-            changes: Changes::new(notices),
+            changes: Changes::new(mailer),
         }
     }
 
@@ -140,6 +136,7 @@ impl Registry {
                 member.monitor = monitor;
             }
         }
+        self.changes.look_after_mailer(&self.config);
         self.publish();
         self.subscribers.tell_late(self.news());
     }

@@ -19,6 +19,7 @@ use super::server::Server;
 use super::status::{self, StatusPage};
 use super::web_client::WebClient;
 use crate::shared::metrics::CONTENT_TYPE;
+use crate::shared::page::get;
 
 /// The largest message of a client, in bytes.
 const LARGEST_MESSAGE: usize = 8 * 1024;
@@ -37,13 +38,13 @@ pub fn configure(app: &mut web::ServiceConfig) {
         web::scope("")
             .wrap(cors)
             .route("/", web::get().to(root))
-            .route("/request", web::get().to(availability))
+            .route("/request", get().to(availability))
             .route("/session", web::get().to(session))
-            .route("/load", web::get().to(load))
+            .route("/load", get().to(load))
             .configure(page_routes::configure)
-            .route("/status", web::get().to(status_json))
-            .route("/metrics", web::get().to(metrics))
-            .route("/health", web::get().to(health))
+            .route("/status", get().to(status_json))
+            .route("/metrics", get().to(metrics))
+            .route("/health", get().to(health))
             .route("/{path:.*}", web::method(Method::OPTIONS).to(HttpResponse::NoContent))
             .default_service(web::to(nothing_here)),
     );

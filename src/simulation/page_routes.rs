@@ -17,7 +17,7 @@ use super::webots_viewer;
 use crate::asset;
 use crate::shared::assets::{self, Asset};
 use crate::shared::auth::is_authorised;
-use crate::shared::page::{Policy, html};
+use crate::shared::page::{Policy, get, html};
 
 /// What the page loads, besides what all pages do.
 const ASSETS: &[Asset] =
@@ -27,11 +27,11 @@ const LARGEST_TAIL: u64 = 32 * 1024;
 
 /// Adds the paths to an app.
 pub fn configure(app: &mut web::ServiceConfig) {
-    app.route("/monitor", web::get().to(monitor))
+    app.route("/monitor", get().to(monitor))
         .route("/events", web::get().to(events))
         .route("/history", web::get().to(history))
         .route("/output", web::get().to(output))
-        .route("/assets/{name}", web::get().to(asset))
+        .route("/assets/{name}", get().to(asset))
         .route("/wwi/{path:.*}", web::get().to(wwi));
 }
 

@@ -14,6 +14,7 @@ use super::status::{self, StatusPage};
 use super::web_client::WebClient;
 use crate::shared::auth::is_authorised;
 use crate::shared::metrics::CONTENT_TYPE;
+use crate::shared::page::get;
 use crate::shared::shutdown::Request;
 
 /// The largest message of a client, in bytes.
@@ -30,11 +31,11 @@ pub fn configure(app: &mut web::ServiceConfig) {
         web::scope("")
             .wrap(cors)
             .route("/client", web::get().to(client))
-            .route("/load", web::get().to(load))
+            .route("/load", get().to(load))
             .configure(page_routes::configure)
-            .route("/status", web::get().to(status_json))
-            .route("/metrics", web::get().to(metrics))
-            .route("/health", web::get().to(health))
+            .route("/status", get().to(status_json))
+            .route("/metrics", get().to(metrics))
+            .route("/health", get().to(health))
             .route("/drain", web::post().to(drain))
             .route("/{path:.*}", web::method(actix_web::http::Method::OPTIONS).to(HttpResponse::NoContent))
             .default_service(web::to(nothing_here)),

@@ -183,3 +183,12 @@ async fn a_port_that_is_taken_is_one_line_and_exit_code_1() {
     let said = session.log();
     assert!(said.contains(&format!("error: can't listen on {}: ", taken.address())), "{said}");
 }
+
+#[actix_rt::test]
+async fn what_watches_over_servers_may_ask_for_the_head_alone() {
+    let session = session_server(&[]).start().await;
+    for path in ["/health", "/status", "/monitor"] {
+        let answer = awc::Client::new().head(session.url(path)).send().await.unwrap();
+        assert_eq!(answer.status(), 200, "{path}");
+    }
+}
