@@ -22,6 +22,7 @@ start=$SECONDS
 code=0
 cargo test --locked --no-fail-fast "$@" || code=$?
 # With arguments, only some tests are wanted.
+(($# > 0)) || FLEET_BIN=${FLEET_BIN:-$PWD/target/debug} tests/browser/run || code=$?
 (($# > 0)) || FLEET_BIN=${FLEET_BIN:-$PWD/target/debug} tests/deploy/package.sh || code=$?
 echo "tests: $(((SECONDS - start) / 60)) min $(((SECONDS - start) % 60)) s, build included"
 exit "$code"

@@ -161,6 +161,12 @@ pub fn html(page: Result<String, askama::Error>, policy: &Policy) -> HttpRespons
     }
 }
 
+/// Matches GET, and HEAD too: what watches over servers likes to ask for the head alone (RFC 9110, section 9.3.2).
+#[must_use]
+pub fn get() -> actix_web::Route {
+    actix_web::web::route().guard(guard::Any(guard::Get()).or(guard::Head()))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -187,10 +193,4 @@ mod tests {
             assert!(policy.text().starts_with("default-src 'none'; script-src 'self'"), "{}", policy.text());
         }
     }
-}
-
-/// Matches GET, and HEAD too: what watches over servers likes to ask for the head alone (RFC 9110, section 9.3.2).
-#[must_use]
-pub fn get() -> actix_web::Route {
-    actix_web::web::route().guard(guard::Any(guard::Get()).or(guard::Head()))
 }
