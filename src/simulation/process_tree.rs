@@ -52,15 +52,18 @@ pub fn kill_descendants(root: i32) {
 
 /// Ends every process that carries the mark of an instance below `folder`, in whatever tree it is now.
 ///
-/// It looks again until none is left, for one of them may have forked meanwhile. Gives back how many there were.
+/// It looks until none was found twice in a row: one of them may have forked meanwhile, and one that is just becoming
+/// another program has no environment for a moment. Gives back how many there were.
 #[must_use]
 pub fn kill_marked(folder: &Path) -> usize {
     let mut known = HashSet::new();
+    let mut found_none = false;
     for _ in 0..MOST_LOOKS {
         let found = marked(folder);
-        if found.is_empty() {
+        if found.is_empty() && found_none {
             break;
         }
+        found_none = found.is_empty();
         signal_each(&found, Signal::SIGKILL);
         known.extend(found);
         std::thread::sleep(BETWEEN_LOOKS);
