@@ -1,6 +1,6 @@
 //! What each simulation takes of the machine: CPU and memory of its process tree. Linux: `/proc`.
 //!
-//! One pass over all processes serves all simulations, at most once in [`AGE`], and only when somebody looks.
+//! One pass over all processes serves all simulations, at most once in a while (`AGE`), and only when somebody looks.
 
 use std::collections::{BTreeMap, HashMap};
 use std::sync::{Arc, Mutex, PoisonError};
