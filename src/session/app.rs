@@ -1,5 +1,6 @@
 //! The session server as a whole: what it is made of, how it starts, and how it ends.
 
+use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Instant, SystemTime};
@@ -74,7 +75,8 @@ pub async fn run(mut config: SessionConfig, file: PathBuf) -> Result<(), AppErro
     let handle = http.handle();
     let serving = actix_rt::spawn(http);
     log::info!("session server {} listens on port {port}: {told}", env!("CARGO_PKG_VERSION"));
-    println!("session server: {told}/monitor (local port {port})");
+    // Nobody may be listening any more.
+    writeln!(std::io::stdout(), "session server: {told}/monitor (local port {port})").ok();
     let listening = format!("listens on port {port}");
     notify::ready(&listening);
     let registry = server.registry.clone();

@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use super::mail_address::{self, MailAddress};
 use super::placement::Policy;
-use crate::shared::address::PublicAddress;
+use crate::shared::address::{PublicAddress, check_host};
 use crate::shared::config::{
     Configuration, ExpandedPath, Secret, Unfit, one_or_many, optional_port, percent, seconds, threshold, whole,
 };
@@ -179,6 +179,15 @@ impl Default for Timing {
 const SETTLING: Duration = Duration::from_secs(8);
 
 impl SessionConfig {
+    /// This configuration as a server can take it that was started with another one.
+    #[must_use]
+    pub fn after(&self, before: &Self) -> Self {
+        if self.ssl != before.ssl {
+            log::warn!("ssl counts only from a restart on: URLs that were handed out would no longer fit");
+        }
+        Self { ssl: before.ssl, ..self.clone() }
+    }
+
     /// How clients are placed.
     #[must_use]
     pub fn policy(&self) -> Policy {
@@ -206,6 +215,7 @@ impl Configuration for SessionConfig {
             warnings.push("server is not set: URLs will name localhost".to_owned());
             "localhost".clone_into(&mut self.server);
         }
+        check_host(&self.server, self.port_rewrite).map_err(|problem| Unfit { key: "server", problem })?;
         let mut seen = std::collections::HashSet::new();
         for address in &self.simulation_servers {
             if !seen.insert(address) {

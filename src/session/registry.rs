@@ -12,7 +12,7 @@ use actix::prelude::*;
 
 use super::changes::Changes;
 use super::config::SessionConfig;
-use super::fleet_status::{FleetStatus, ServerStatus};
+use super::fleet_status::{FleetStatus, ServerStatus, State};
 use super::mailer::Mailer;
 use super::pick::{NoServer, Pick};
 use super::placement::Fleet;
@@ -179,8 +179,11 @@ impl Registry {
     fn pick(&mut self, world: Option<&ProjectUrl>) -> Result<PublicAddress, NoServer> {
         let Self { fleet, servers, .. } = self;
         let accepts = |address: &PublicAddress, world: &ProjectUrl| {
-            let report = servers.get(address).and_then(|member| member.watched.report.as_ref());
-            report.is_none_or(|report| report.accepts(world))
+            let Some(Member { watched, .. }) = servers.get(address) else {
+                return false;
+            };
+            // One that was not heard of yet may accept it.
+            watched.report.as_ref().map_or(watched.state == State::Unknown, |report| report.accepts(world))
         };
         let picked = fleet.place(Instant::now(), |address| world.is_none_or(|world| accepts(address, world)));
         picked.ok_or_else(|| match world {
@@ -279,6 +282,7 @@ impl Handler<Reconfigure> for Registry {
 
     fn handle(&mut self, Reconfigure(config): Reconfigure, ctx: &mut Self::Context) {
         let before = self.watch();
+        let config = Arc::new(config.after(&self.config));
         self.fleet.set_policy(Instant::now(), config.policy());
         self.config = config;
         self.apply(ctx);

@@ -6,7 +6,6 @@ use actix::Addr;
 use actix_web::http::{Method, StatusCode, header};
 use actix_web::middleware::DefaultHeaders;
 use actix_web::{HttpRequest, HttpResponse, web};
-use actix_web_actors::ws::WsResponseBuilder;
 use rand::RngExt;
 
 use super::asking::{ask, with_status};
@@ -20,9 +19,8 @@ use super::status::{self, StatusPage};
 use super::web_client::WebClient;
 use crate::shared::metrics::CONTENT_TYPE;
 use crate::shared::page::get;
+use crate::shared::websocket;
 
-/// The largest message of a client, in bytes.
-const LARGEST_MESSAGE: usize = 8 * 1024;
 /// After how many seconds a client that was refused may come back: drawn at random, so that a class that was refused
 /// together does not come back together.
 const COME_BACK: std::ops::RangeInclusive<u32> = 2..=6;
@@ -61,7 +59,11 @@ async fn root(
     server: web::Data<Server>,
     audience: web::Data<Addr<Audience>>,
 ) -> HttpResponse {
-    if wants_websocket(&request) { websocket(&request, stream, &server, &audience) } else { availability(server).await }
+    if wants_websocket(&request) {
+        open_websocket(&request, stream, &server, &audience)
+    } else {
+        availability(server).await
+    }
 }
 
 async fn session(
@@ -71,7 +73,7 @@ async fn session(
     audience: web::Data<Addr<Audience>>,
 ) -> HttpResponse {
     if wants_websocket(&request) {
-        return websocket(&request, stream, &server, &audience);
+        return open_websocket(&request, stream, &server, &audience);
     }
     let answer = server.pick(Pick::parse(wanted_world(request.query_string()))).await;
     let status = match answer.refusal {
@@ -94,7 +96,7 @@ fn wanted_world(query: &str) -> Option<&str> {
     begin.filter(|world| !world.is_empty())
 }
 
-fn websocket(
+fn open_websocket(
     request: &HttpRequest,
     stream: web::Payload,
     server: &web::Data<Server>,
@@ -105,11 +107,8 @@ fn websocket(
         Ok(connection) => connection,
         Err(crowded) => return crowded.answer(),
     };
-    let actor = WebClient::new(Arc::clone(server), audience.clone(), peer, connection);
-    WsResponseBuilder::new(actor, request, stream).frame_size(LARGEST_MESSAGE).start().unwrap_or_else(|error| {
-        let problem = format!("Error: this is a WebSocket: {error}.");
-        HttpResponse::build(error.as_response_error().status_code()).body(problem)
-    })
+    let (server, audience) = (Arc::clone(server), audience.clone());
+    websocket::open(request, stream, |inflow| WebClient::new(server, audience, peer, (connection, inflow)))
 }
 
 async fn availability(server: web::Data<Server>) -> HttpResponse {

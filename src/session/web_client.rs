@@ -16,6 +16,7 @@ use super::subscribers::News;
 use crate::shared::connections::Connection;
 use crate::shared::liveness::Liveness;
 use crate::shared::peer::Peer;
+use crate::shared::websocket::Inflow;
 
 /// The actor.
 pub struct WebClient {
@@ -25,15 +26,21 @@ pub struct WebClient {
     told: Option<bool>,
     audience: Addr<Audience>,
     membership: Option<Membership>,
+    inflow: Inflow,
     _connection: Connection,
 }
 
 type Context = WebsocketContext<WebClient>;
 
 impl WebClient {
-    /// A client that has just connected; `connection` counts it.
+    /// A client that has just connected; `connection` counts it, `inflow` what comes from it.
     #[must_use]
-    pub fn new(server: Arc<Server>, audience: Addr<Audience>, peer: Peer, connection: Connection) -> Self {
+    pub fn new(
+        server: Arc<Server>,
+        audience: Addr<Audience>,
+        peer: Peer,
+        (connection, inflow): (Connection, Inflow),
+    ) -> Self {
         Self {
             server,
             peer,
@@ -41,6 +48,7 @@ impl WebClient {
             told: None,
             audience,
             membership: None,
+            inflow,
             _connection: connection,
         }
     }
@@ -114,6 +122,7 @@ impl Handler<News> for WebClient {
 
 impl StreamHandler<Result<Message, ProtocolError>> for WebClient {
     fn handle(&mut self, message: Result<Message, ProtocolError>, ctx: &mut Self::Context) {
+        self.inflow.took(&message);
         match message {
             Ok(Message::Text(text)) if self.liveness.may_answer() => self.pick(&text, ctx),
             Ok(Message::Ping(data)) if self.liveness.may_answer() => ctx.pong(&data),

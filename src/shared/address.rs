@@ -25,6 +25,16 @@ pub struct NoAddress {
     found: String,
 }
 
+/// Whether a text can stand for a host in an address.
+///
+/// # Errors
+/// What was found, and what is allowed.
+pub fn check_host(host: &str, rewritten: bool) -> Result<(), String> {
+    let address = format!("{host}{}1", if rewritten { '/' } else { ':' });
+    let plain = address.parse::<PublicAddress>().is_ok();
+    if plain { Ok(()) } else { Err(format!("{host:?} is no host; allowed are names and addresses")) }
+}
+
 impl PublicAddress {
     /// The address of `port` on `host`; `rewritten` tells whether a web server in front rewrites ports.
     #[must_use]

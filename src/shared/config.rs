@@ -7,6 +7,7 @@ use std::fmt;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use super::config_error::ConfigError;
 use serde::de::{DeserializeOwned, Error as _, Unexpected, Visitor};
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
@@ -40,39 +41,6 @@ pub struct Loaded<C> {
     pub warnings: Vec<String>,
 }
 
-/// Why a configuration can't be used, in one line.
-#[derive(Debug, thiserror::Error)]
-pub enum ConfigError {
-    /// The file can't be read.
-    #[error("{}: can't be read: {source}", file.display())]
-    Unreadable {
-        /// The configuration file.
-        file: PathBuf,
-        /// What the system says.
-        source: std::io::Error,
-    },
-    /// The text is no JSON, or a key is missing or of the wrong type.
-    #[error("{}: {}{source}", file.display(), key.as_ref().map(|key| format!("{key}: ")).unwrap_or_default())]
-    Malformed {
-        /// The configuration file.
-        file: PathBuf,
-        /// The key, where the fault lies in one.
-        key: Option<String>,
-        /// What was found and what is allowed.
-        source: serde_json::Error,
-    },
-    /// A value doesn't fit the others.
-    #[error("{}: {key}: {problem}", file.display())]
-    Unfit {
-        /// The configuration file.
-        file: PathBuf,
-        /// The key.
-        key: &'static str,
-        /// What was found and what is allowed.
-        problem: String,
-    },
-}
-
 /// Reads a configuration file.
 ///
 /// # Errors
@@ -80,6 +48,9 @@ pub enum ConfigError {
 pub fn load<C: Configuration>(file: &Path) -> Result<Loaded<C>, ConfigError> {
     let text =
         std::fs::read_to_string(file).map_err(|source| ConfigError::Unreadable { file: file.to_owned(), source })?;
+    if !text.trim_start().starts_with('{') {
+        return Err(ConfigError::NoObject { file: file.to_owned() });
+    }
     let mut unknown = Vec::new();
     let mut json = serde_json::Deserializer::from_str(&text);
     let mut track = serde_path_to_error::Track::new();
@@ -87,7 +58,7 @@ pub fn load<C: Configuration>(file: &Path) -> Result<Loaded<C>, ConfigError> {
     let parsed = serde_ignored::deserialize(tracked, |path| unknown.push(path.to_string()))
         .and_then(|config| json.end().map(|()| config));
     let mut config: C = parsed.map_err(|source| {
-        let key = Some(track.path().to_string()).filter(|key| key != ".");
+        let key = Some(track.path().to_string()).filter(|key| key != "." && key != "?");
         ConfigError::Malformed { file: file.to_owned(), key, source }
     })?;
     let known = known_keys(&config);

@@ -66,8 +66,11 @@ impl ProjectUrl {
     /// When it is not `https`, names a user or a query, holds `.`, `..` or empty segments, encoded slashes or control
     /// characters, or does not end in `/worlds/NAME.wbt`.
     pub fn parse(text: &str) -> Result<Self, NoProject> {
-        let (host, segments) = split_url(text)?;
+        let (host, mut segments) = split_url(text)?;
         let (repository, reference, kind) = split_repository(&segments)?;
+        if let Some(name) = repository.checked_sub(1).and_then(|last| segments.get_mut(last)) {
+            *name = without_git(name)?;
+        }
         let inside = segments.get(reference..).unwrap_or_default();
         let world = match inside {
             [.., folder, world] if folder == "worlds" => world,
@@ -142,6 +145,13 @@ impl fmt::Display for ProjectUrl {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(out, "https://{}/{}", self.host, self.segments.join("/"))
     }
+}
+
+/// A repository's name without the `.git` that git may add to it: both mean the same repository.
+pub(super) fn without_git(name: &str) -> Result<String, NoProject> {
+    let plain = name.get(name.len().saturating_sub(4)..).filter(|end| end.eq_ignore_ascii_case(".git"));
+    let plain = plain.and_then(|end| name.get(..name.len() - end.len())).unwrap_or(name);
+    if plain.is_empty() { Err(no_project("it names no repository")) } else { Ok(plain.to_owned()) }
 }
 
 /// Splits an `https` URL into its host and its percent-decoded path segments, and refuses every trick.
@@ -235,6 +245,8 @@ mod tests {
             ("https://gitlab.lab.org/g/s/r/-/blob/main/p/worlds/a.wbt", "https://gitlab.lab.org/g/s/r", "main", "p"),
             ("https://git.lab:3000/u/r/src/branch/main/p/worlds/a.wbt", "https://git.lab:3000/u/r", "main", "p"),
             ("https://git.lab/u/r/src/tag/v1/worlds/a.WBT", "https://git.lab/u/r", "v1", ""),
+            ("https://github.com/u/r.git/blob/main/worlds/a.wbt", "https://github.com/u/r", "main", ""),
+            ("https://github.com/u/r%2eGIT/blob/main/worlds/a.wbt", "https://github.com/u/r", "main", ""),
         ];
         for (text, repository, reference, folder) in table {
             let url = ProjectUrl::parse(text).unwrap_or_else(|error| panic!("{text}: {error}"));

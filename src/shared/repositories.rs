@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::project_url::{NoProject, ProjectUrl, split_url};
+use super::project_url::{NoProject, ProjectUrl, split_url, without_git};
 
 /// A URL prefix by whole path segments: `https://github.com/lab` covers `https://github.com/lab/x`, and not
 /// `https://github.com/lab-evil/x` (the original compares letters, and lets that pass).
@@ -57,7 +57,12 @@ impl TryFrom<String> for UrlPrefix {
     type Error = NoProject;
 
     fn try_from(text: String) -> Result<Self, NoProject> {
-        let (host, segments) = split_url(text.trim_end_matches('/'))?;
+        let (host, mut segments) = split_url(text.trim_end_matches('/'))?;
+        if segments.len() >= 2
+            && let Some(name) = segments.last_mut()
+        {
+            *name = without_git(name)?;
+        }
         Ok(Self { text, host, segments })
     }
 }
@@ -95,6 +100,8 @@ mod tests {
             ("https://github.com/lab/x", "lab/xy", false, "another repository with the same beginning"),
             ("https://github.com/lab/x/tree/main", "lab/x", true, "tree and blob are the same place"),
             ("https://github.com/lab/x/blob/next", "lab/x", false, "another branch"),
+            ("https://github.com/lab/x.git", "lab/x", true, "git's ending changes nothing"),
+            ("https://github.com/lab/x", "lab/x.git", true, "nor does it in the world's URL"),
             ("https://gitlab.com/lab", "lab/x", false, "another host"),
             ("https://github.com:444/lab", "lab/x", false, "another port"),
         ];

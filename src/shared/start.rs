@@ -1,5 +1,6 @@
 //! How a program starts: configuration, log, then the server, and an exit code.
 
+use std::io::Write;
 use std::path::Path;
 use std::process::ExitCode;
 
@@ -30,7 +31,8 @@ pub fn check<C: Configuration>(loaded: &Loaded<C>) -> ExitCode {
     }
     match serde_json::to_string_pretty(&loaded.config) {
         Ok(text) => {
-            println!("{text}");
+            // Nobody may be listening any more.
+            writeln!(std::io::stdout(), "{text}").ok();
             ExitCode::SUCCESS
         }
         Err(error) => {

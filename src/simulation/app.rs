@@ -1,5 +1,6 @@
 //! The simulation server as a whole: what it is made of, how it starts, and how it ends.
 
+use std::io::Write;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -135,7 +136,8 @@ fn assemble(
     }
     let git = Git::new(run.path()).map_err(cache_fault)?;
     let cache = RepositoryCache::open(&folder, config.cache_size << 20).map_err(cache_fault)?;
-    let limits = Limits { time: config.timing.checkout, size: config.project_size << 20 };
+    let (time, size) = (config.timing.checkout, config.project_size << 20);
+    let limits = Limits { time, size, any_commit: config.any_commit };
     let runtime = tokio::runtime::Handle::current();
     let fetcher = Fetcher::new(git, cache, config.git_mirrors.clone(), limits, runtime.clone());
     let checkouts = Checkouts::new(fetcher, limits, runtime);
@@ -177,7 +179,8 @@ fn assemble(
 fn tell_start(config: &SimulationConfig) {
     let address = config.address(config.port).http_url(config.ssl);
     log::info!("simulation server {} listens on port {}: {address}", env!("CARGO_PKG_VERSION"), config.port);
-    println!("simulation server: {address}/monitor (local port {})", config.port);
+    // Nobody may be listening any more.
+    writeln!(std::io::stdout(), "simulation server: {address}/monitor (local port {})", config.port).ok();
     notify::ready(&format!("listens on port {}", config.port));
 }
 

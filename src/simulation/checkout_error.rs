@@ -30,6 +30,17 @@ pub enum CheckoutError {
     /// The world can't be opened.
     #[error(transparent)]
     World(#[from] NoWorld),
+    /// The commit is not one that the repository's owner vouches for.
+    #[error(
+        "{commit} is not the newest commit of a branch or tag of {repository}. Forges also hand out commits that a \
+         repository's owner never accepted; this simulation server runs them only if its administrator sets anyCommit"
+    )]
+    NoTip {
+        /// The repository's URL.
+        repository: String,
+        /// The hash.
+        commit: String,
+    },
     /// It took too long.
     #[error("Fetching {repository} took longer than {seconds} seconds")]
     TooSlow {

@@ -6,7 +6,7 @@ use std::time::Duration;
 use serde::{Deserialize, Serialize};
 
 use super::mirrors::Mirrors;
-use crate::shared::address::PublicAddress;
+use crate::shared::address::{PublicAddress, check_host};
 use crate::shared::config::{Configuration, ExpandedPath, Unfit, one_or_many, percent, seconds, whole};
 use crate::shared::peer::TrustedProxies;
 use crate::shared::repositories::UrlPrefix;
@@ -92,6 +92,10 @@ pub struct SimulationConfig {
     /// Write `simulation/monitor.csv`. Default: true.
     #[serde(default = "yes")]
     pub monitor_log_enabled: bool,
+    /// Whether a world's URL may name any commit by its hash, not only the newest of a branch or tag. Forges hand out
+    /// commits of forks and proposals too, which the repository's owner never accepted. Default: false.
+    #[serde(default)]
+    pub any_commit: bool,
     /// From where repositories are cloned in place of their URL: {URL prefix: replacement}.
     #[serde(default)]
     pub git_mirrors: Mirrors,
@@ -202,6 +206,7 @@ impl Configuration for SimulationConfig {
             warnings.push("server is not set: URLs will name localhost".to_owned());
             "localhost".clone_into(&mut self.server);
         }
+        check_host(&self.server, self.port_rewrite).map_err(|problem| Unfit { key: "server", problem })?;
         if self.webots_home.is_none() {
             self.webots_home = std::env::var_os("WEBOTS_HOME").map(ExpandedPath::plain);
         }

@@ -15,9 +15,7 @@ use futures_util::future::{BoxFuture, Shared, WeakShared};
 use tokio::runtime::Handle;
 use tokio::sync::watch;
 
-use super::checkout_error::{
-    CheckoutError, damaged, fetch_failed, git_failed, machine, no_reference, too_large, too_slow,
-};
+use super::checkout_error::{CheckoutError, damaged, fetch_failed, git_failed, machine, no_reference, too_large};
 use super::git::{Call, Git};
 use super::mirrors::{Mirrors, Remote};
 use super::repository_cache::{InUse, RepositoryCache};
@@ -44,6 +42,8 @@ pub struct Limits {
     pub time: Duration,
     /// In bytes: what is fetched, and what is checked out.
     pub size: u64,
+    /// Whether any commit may be fetched by its hash, not only the newest of a branch or tag.
+    pub any_commit: bool,
 }
 
 /// A world's commit in the cache.
@@ -116,11 +116,8 @@ impl Fetcher {
         }
         let (sender, progress) = watch::channel(String::new());
         let (this, wanted) = (Arc::clone(self), world.clone());
-        let job = async move {
-            let limit = this.limits.time;
-            let found = actix_rt::time::timeout(limit, this.fetch(&wanted, &sender)).await;
-            found.unwrap_or_else(|_| Err(too_slow(&wanted, limit))).map(Arc::new)
-        };
+        // Each of those who wait has a time limit of its own; the job ends with the last of them.
+        let job = async move { this.fetch(&wanted, &sender).await.map(Arc::new) };
         let result = job.boxed().shared();
         if let Some(weak) = result.downgrade() {
             fetches.insert(world.clone(), Fetch { progress: progress.clone(), result: weak });
@@ -137,7 +134,7 @@ impl Fetcher {
             Ok((revision, reference)) => Ok(Fetched { repository, remote, reference, revision }),
             // The remote's fault, unless it is the cache that git could not read.
             Err(CheckoutError::Git { repository: url, source })
-                if repository.is_made() && !self.is_sound(repository.path()).await =>
+                if repository.is_made() && !self.git.is_sound(repository.path()).await =>
             {
                 Err(CheckoutError::Damaged { repository: url, source })
             }
@@ -182,11 +179,31 @@ impl Fetcher {
         repository: &InUse,
     ) -> Result<Vec<Revision>, CheckoutError> {
         if let Some(commit) = revision::commit_of(world) {
-            return Ok(vec![commit]);
+            // What is in the cache was accepted before.
+            let known = self.limits.any_commit || repository.has(&format!("refs/fleet/{}", commit.commit));
+            return if known || self.is_tip(world, remote, repository, &commit).await? {
+                Ok(vec![commit])
+            } else {
+                Err(CheckoutError::NoTip { repository: world.repository(), commit: commit.name })
+            };
         }
         let call = call(remote, repository.path(), revision::search_arguments(world, &remote.location));
         let answer = self.git.run(call, |_| ()).await.map_err(|source| git_failed(world, source))?;
         Ok(revision::found(world, &String::from_utf8_lossy(&answer)))
+    }
+
+    /// Whether a commit is the newest of a branch or tag. Forges hand out by their hash also commits of forks and of
+    /// proposals, which the repository's owner never accepted: allowing a repository must not allow those.
+    async fn is_tip(
+        &self,
+        world: &ProjectUrl,
+        remote: &Remote,
+        repository: &InUse,
+        revision: &Revision,
+    ) -> Result<bool, CheckoutError> {
+        let call = call(remote, repository.path(), revision::tips_arguments(&remote.location));
+        let answer = self.git.run(call, |_| ()).await.map_err(|source| git_failed(world, source))?;
+        Ok(revision::is_tip(&String::from_utf8_lossy(&answer), &revision.commit))
     }
 
     /// Fetches one commit, and ends git when it brings too much.
@@ -250,13 +267,6 @@ impl Fetcher {
         tokio::fs::rename(&new, path).await.map_err(|error| machine(world, &error))
     }
 
-    /// Whether git finds everything in order in a cached repository. It reads all of it: for use after a failure.
-    async fn is_sound(&self, repository: &Path) -> bool {
-        let arguments = ["fsck", "--full", "--no-dangling", "--no-progress"].map(OsString::from).to_vec();
-        let call = Call { repository, arguments, protocol: "https", is_alone: false, environment: Vec::new() };
-        self.git.run(call, |_| ()).await.is_ok()
-    }
-
     /// Removes the cached repository of a world if it is damaged, so that the next fetch begins anew.
     ///
     /// # Errors
@@ -267,7 +277,7 @@ impl Fetcher {
         };
         let repository = self.cache.take(&remote.location).await?;
         let _fetching = repository.fetching().await?;
-        if repository.path().exists() && !self.is_sound(repository.path()).await {
+        if repository.path().exists() && !self.git.is_sound(repository.path()).await {
             log::warn!("{} is damaged: it is removed and fetched anew", repository.path().display());
             tokio::fs::remove_dir_all(repository.path()).await?;
         }

@@ -50,6 +50,14 @@ pub struct GitError {
     pub message: String,
 }
 
+impl GitError {
+    /// Whether git has come to this end by itself: it could be started, and nobody has ended it.
+    #[must_use]
+    pub fn is_verdict(&self) -> bool {
+        self.ending.starts_with("ended with")
+    }
+}
+
 /// git reads this in place of the settings of its user and machine. Any repository may be read: a mirror may belong
 /// to somebody else, and nothing that it holds is run.
 const SETTINGS: &str = "\
@@ -119,6 +127,17 @@ impl Git {
         match ending {
             Ending::Code(0) => Ok(answer),
             ending => Err(failed(&ending.to_string(), last_words)),
+        }
+    }
+
+    /// Whether everything is in order in a repository. It reads all of it: for use after a failure.
+    pub async fn is_sound(&self, repository: &Path) -> bool {
+        let arguments = ["fsck", "--full", "--no-dangling", "--no-progress"].map(OsString::from).to_vec();
+        let call = Call { repository, arguments, protocol: "https", is_alone: false, environment: Vec::new() };
+        match self.run(call, |_| ()).await {
+            Ok(_) => true,
+            // A machine that can't run git says nothing of the repository.
+            Err(error) => !error.is_verdict(),
         }
     }
 

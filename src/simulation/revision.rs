@@ -31,6 +31,20 @@ pub fn commit_of(world: &ProjectUrl) -> Option<Revision> {
     (is_hash && kind).then(|| Revision { remote_name: commit.clone(), name: reference, commit, folder })
 }
 
+/// Asks the remote for all its branches and tags.
+#[must_use]
+pub fn tips_arguments(location: &str) -> Vec<OsString> {
+    ["ls-remote", "--quiet", "--heads", "--tags", "--", location].map(OsString::from).to_vec()
+}
+
+/// Whether a commit is the newest of a branch or tag in such an answer.
+#[must_use]
+pub fn is_tip(answer: &str, commit: &str) -> bool {
+    let tips = answer.lines().filter_map(|line| line.split_once('\t'));
+    let accepted = |name: &str| name.starts_with("refs/heads/") || name.starts_with("refs/tags/");
+    tips.filter(|(_, name)| accepted(name)).any(|(tip, _)| tip == commit)
+}
+
 /// Asks the remote for all branches and tags that a URL may mean.
 #[must_use]
 pub fn search_arguments(world: &ProjectUrl, location: &str) -> Vec<OsString> {
@@ -164,6 +178,12 @@ mod tests {
         assert_eq!(commit.world_path(&world("blob/x/worlds/a.wbt")), "p/worlds/a.wbt");
         assert_eq!(commit_of(&world("blob/aaaaaaa/worlds/a.wbt")), None, "short hashes are not unique");
         assert_eq!(commit_of(&world(&format!("src/branch/{A}/worlds/a.wbt"))), None, "it says that it is a branch");
+    }
+
+    #[test]
+    fn only_branches_and_tags_vouch_for_a_commit() {
+        let answer = format!("{A}\trefs/pull/1/head\n{B}\trefs/tags/v1^{{}}\n");
+        assert!(is_tip(&answer, B) && !is_tip(&answer, A));
     }
 
     #[test]

@@ -5,7 +5,6 @@ use std::sync::Arc;
 use actix_web::http::header;
 use actix_web::middleware::DefaultHeaders;
 use actix_web::{HttpRequest, HttpResponse, web};
-use actix_web_actors::ws::WsResponseBuilder;
 
 use super::asking::{everybody, locked, too_busy};
 use super::page_routes;
@@ -16,9 +15,7 @@ use crate::shared::auth::is_authorised;
 use crate::shared::metrics::CONTENT_TYPE;
 use crate::shared::page::get;
 use crate::shared::shutdown::Request;
-
-/// The largest message of a client, in bytes.
-const LARGEST_MESSAGE: usize = 8 * 1024;
+use crate::shared::websocket;
 
 /// Adds all paths to an app.
 pub fn configure(app: &mut web::ServiceConfig) {
@@ -51,11 +48,8 @@ async fn client(request: HttpRequest, stream: web::Payload, server: web::Data<Se
         Ok(connection) => connection,
         Err(crowded) => return crowded.answer(),
     };
-    let actor = WebClient::new(Arc::clone(&server), peer, connection);
-    WsResponseBuilder::new(actor, &request, stream).frame_size(LARGEST_MESSAGE).start().unwrap_or_else(|error| {
-        let problem = format!("Error: this is a WebSocket: {error}.");
-        HttpResponse::build(error.as_response_error().status_code()).body(problem)
-    })
+    let server = Arc::clone(&server);
+    websocket::open(&request, stream, |inflow| WebClient::new(server, peer, (connection, inflow)))
 }
 
 /// A page of another origin may use visitors' browsers to start simulations, unless origins are listed.

@@ -22,6 +22,7 @@ use crate::shared::connections::Connection;
 use crate::shared::liveness::Liveness;
 use crate::shared::peer::Peer;
 use crate::shared::shutdown::closing;
+use crate::shared::websocket::Inflow;
 
 /// The actor.
 pub struct WebClient {
@@ -30,25 +31,25 @@ pub struct WebClient {
     stage: Stage,
     liveness: Liveness,
     restoring: bool,
-    /// Set from the wish for a simulation on.
     start: Pending,
+    inflow: Inflow,
     _connection: Connection,
 }
 
 type Context = WebsocketContext<WebClient>;
 
 impl WebClient {
-    /// A client that has just connected; `connection` counts it.
+    /// A client that has just connected; `connection` counts it, `inflow` what comes from it.
     #[must_use]
-    pub fn new(server: Arc<Server>, peer: Peer, connection: Connection) -> Self {
-        let stage = Stage::Connected;
+    pub fn new(server: Arc<Server>, peer: Peer, (connection, inflow): (Connection, Inflow)) -> Self {
         Self {
             server,
             peer,
-            stage,
+            stage: Stage::Connected,
             liveness: Liveness::new(),
             restoring: false,
             start: Pending::default(),
+            inflow,
             _connection: connection,
         }
     }
@@ -197,10 +198,9 @@ impl WebClient {
     fn ping(&mut self, ctx: &mut Context) {
         if self.liveness.is_gone(self.server.config.timing.silence) {
             log::info!("{}: silent for too long", self.name());
-            ctx.stop();
-        } else {
-            ctx.ping(&self.liveness.ping());
+            return ctx.stop();
         }
+        ctx.ping(&self.liveness.ping());
     }
 }
 
@@ -226,6 +226,7 @@ impl Actor for WebClient {
 
 impl StreamHandler<Result<Message, ProtocolError>> for WebClient {
     fn handle(&mut self, message: Result<Message, ProtocolError>, ctx: &mut Self::Context) {
+        self.inflow.took(&message);
         match message {
             Ok(Message::Text(text)) if self.liveness.may_answer() => self.understand(&text, ctx),
             Ok(Message::Ping(data)) if self.liveness.may_answer() => ctx.pong(&data),

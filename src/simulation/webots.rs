@@ -133,6 +133,9 @@ impl Webots {
     }
 
     fn ready(&mut self, port: u16) {
+        if self.asked.is_some() {
+            return;
+        }
         let allowed = self.orders.config.streaming_ports();
         if !allowed.contains(&port) {
             let (first, last) = (allowed.start(), allowed.end());

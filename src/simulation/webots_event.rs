@@ -41,7 +41,10 @@ impl LastWord {
     /// Tells an event.
     pub fn tell(&mut self, event: WebotsEvent) {
         self.told |= matches!(event, WebotsEvent::Exited(_));
-        if let Err(lost) = self.events.try_send(event) {
+        // A heartbeat may be lost where a client can't keep up; how to reach Webots and its end may not.
+        if matches!(event, WebotsEvent::Listening(_) | WebotsEvent::Exited(_)) {
+            self.events.do_send(event);
+        } else if let Err(lost) = self.events.try_send(event) {
             log::debug!("a client does not listen: {lost}");
         }
     }

@@ -115,3 +115,29 @@ async fn more_clients_than_allowed_are_refused() {
     first.leave().await;
     until("there is room again", async || tokio_tungstenite::connect_async(session.websocket("/")).await.is_ok()).await;
 }
+
+#[actix_rt::test]
+async fn a_message_without_end_is_cut_off_before_it_fills_the_memory() {
+    use std::io::{Read, Write};
+    let session = session_server(&[]).start().await;
+    let resident = || procfs::process::Process::new(session.pid()).unwrap().statm().unwrap().resident;
+    let before = resident();
+    let address = session.address();
+    let sent = actix_rt::task::spawn_blocking(move || {
+        let mut socket = std::net::TcpStream::connect(address).unwrap();
+        let head = "GET /session HTTP/1.1\r\nHost: x\r\nConnection: Upgrade\r\nUpgrade: websocket\r\nSec-WebSocket-Version: 13\r\n\
+                    Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n";
+        socket.write_all(head.as_bytes()).unwrap();
+        assert!(socket.read(&mut [0; 1024]).unwrap() > 0);
+        // A text frame that says it will have 300 MB.
+        let mut frame = vec![0x81, 0xff];
+        frame.extend(300_000_000_u64.to_be_bytes());
+        frame.extend([0; 4]);
+        socket.write_all(&frame).unwrap();
+        let part = [b'x'; 64 * 1024];
+        // The server may close the connection meanwhile.
+        (0..4000).take_while(|_| socket.write_all(&part).is_ok()).count()
+    });
+    assert!(sent.await.unwrap() > 2, "too little was sent to see anything");
+    assert!(resident() < before + 20 * 256, "from {before} to {} pages of 4 KiB", resident());
+}

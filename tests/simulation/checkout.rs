@@ -119,7 +119,10 @@ async fn what_is_not_there_or_no_world_is_told_in_words() {
             world("lab/arm", "none", "worlds/a.wbt"),
             "https://github.com/lab/arm has no branch, tag or commit called \"none\"",
         ),
-        (world("lab/arm", none, "worlds/a.wbt"), "https://github.com/lab/arm has no branch, tag or commit called"),
+        (
+            world("lab/arm", none, "worlds/a.wbt"),
+            "is not the newest commit of a branch or tag of https://github.com/lab/arm",
+        ),
         (world("lab/arm", "main", "worlds/none.wbt"), "worlds/none.wbt in main does not exist"),
         (world("lab/arm", "main", "p/worlds/a.wbt"), "p/worlds/a.wbt in main does not exist"),
         (world("lab/arm", "main", "worlds/passwd.wbt"), "passwd.wbt leads out of its repository"),
@@ -484,4 +487,19 @@ async fn a_controller_is_reset_and_nothing_else() {
     std::os::unix::fs::symlink(&outside, project.join("controllers/c")).unwrap();
     reset(&mut client, "c/c.py").await;
     assert_eq!(std::fs::read_dir(&outside).unwrap().count(), 0, "it was written outside of the project");
+}
+
+#[actix_rt::test]
+async fn a_commit_that_no_branch_or_tag_vouches_for_runs_only_where_that_is_allowed() {
+    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
+    let proposed = forge.commit("lab/arm", "proposal", &[("worlds/a.wbt", WORLD), ("controllers/c/c.py", "evil")]);
+    let bare = forge.path().join("lab/arm");
+    git(&bare, &["update-ref", "refs/pull/1/head", &proposed]);
+    git(&bare, &["update-ref", "-d", "refs/heads/proposal"]);
+    let url = world("lab/arm", &proposed, "worlds/a.wbt");
+    let server = simulation_server(&webots.path(), forge.path(), 2).start().await;
+    let told = Client::start(&server, &url).await.until("loading: Error:").await;
+    assert!(told.contains("not the newest commit of a branch or tag"), "{told}");
+    let server = simulation_server(&webots.path(), forge.path(), 2).set("anyCommit", true).start().await;
+    Client::start(&server, &url).await.until("webots:").await;
 }
