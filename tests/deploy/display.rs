@@ -2,6 +2,7 @@
 
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
+use std::sync::{Mutex, PoisonError};
 
 use webots_fleet::simulation::display::{Trouble, look};
 
@@ -41,6 +42,9 @@ impl Drop for Xvfb {
     }
 }
 
+/// Held while displays come and go: the number of one that is gone must not be taken by another test's.
+static DISPLAYS: Mutex<()> = Mutex::new(());
+
 /// An authority file with one cookie for all displays of this machine.
 fn authority(folder: &Path) -> std::path::PathBuf {
     let file = folder.join("authority");
@@ -55,6 +59,7 @@ fn authority(folder: &Path) -> std::path::PathBuf {
 
 #[test]
 fn an_open_display_is_told_from_one_that_refuses_and_one_that_is_gone() {
+    let _alone = DISPLAYS.lock().unwrap_or_else(PoisonError::into_inner);
     let folder = tempfile::tempdir().unwrap();
     let Some(open) = Xvfb::start(None) else { return };
     assert_eq!(look(&open.display), Ok(()));
@@ -76,6 +81,7 @@ fn an_open_display_is_told_from_one_that_refuses_and_one_that_is_gone() {
 
 #[test]
 fn check_tells_which_case_it_is() {
+    let _alone = DISPLAYS.lock().unwrap_or_else(PoisonError::into_inner);
     let folder = tempfile::tempdir().unwrap();
     let Some(open) = Xvfb::start(None) else { return };
     let cookies = authority(folder.path());
