@@ -70,8 +70,14 @@ pub async fn run(mut config: SessionConfig, file: PathBuf) -> Result<(), AppErro
         let audience = Audience::new(Arc::clone(&shared)).start();
         App::new().app_data(shared.clone()).app_data(web::Data::new(audience)).configure(routes::configure)
     };
-    let http =
-        HttpServer::new(app).disable_signals().shutdown_timeout(stop.as_secs()).backlog(4096).listen(socket)?.run();
+    let http = HttpServer::new(app)
+        // Messages are small, and must not wait for the answer to the one before.
+        .tcp_nodelay(true)
+        .disable_signals()
+        .shutdown_timeout(stop.as_secs())
+        .backlog(4096)
+        .listen(socket)?
+        .run();
     let handle = http.handle();
     let serving = actix_rt::spawn(http);
     log::info!("session server {} listens on port {port}: {told}", env!("CARGO_PKG_VERSION"));

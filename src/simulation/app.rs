@@ -76,6 +76,8 @@ pub async fn run(config: SimulationConfig) -> Result<(), AppError> {
     let server = Arc::new(assemble(config, phase, requests)?);
     let shared = web::Data::from(Arc::clone(&server));
     let http = HttpServer::new(move || App::new().app_data(shared.clone()).configure(routes::configure))
+        // Messages are small, and must not wait for the answer to the one before.
+        .tcp_nodelay(true)
         .disable_signals()
         .shutdown_timeout(1)
         .listen(socket)?
