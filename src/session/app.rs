@@ -1,6 +1,7 @@
 //! The session server as a whole: what it is made of, how it starts, and how it ends.
 
 use std::io::Write;
+use std::net::{SocketAddr, TcpListener};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Instant, SystemTime};
@@ -31,7 +32,7 @@ pub enum AppError {
     #[error("can't listen on {address}: {source}")]
     Bind {
         /// Host and port.
-        address: String,
+        address: SocketAddr,
         /// What the system says.
         source: std::io::Error,
     },
@@ -57,8 +58,8 @@ pub async fn run(mut config: SessionConfig, file: PathBuf) -> Result<(), AppErro
     let mut signals = Signals::catch()?;
     allow_open_files();
     let (phase_sender, phase) = watch::channel(Phase::Open);
-    let address = format!("{}:{}", config.bind, config.port);
-    let socket = std::net::TcpListener::bind(&address).map_err(|source| AppError::Bind { address, source })?;
+    let address = SocketAddr::new(config.bind, config.port);
+    let socket = TcpListener::bind(address).map_err(|source| AppError::Bind { address, source })?;
     let port = socket.local_addr()?.port();
     config.port = port;
     let stop = config.timing.stop;

@@ -1,5 +1,6 @@
 //! The session server's configuration, `config/session/NAME.json`.
 
+use std::net::{IpAddr, Ipv4Addr};
 use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
@@ -8,7 +9,7 @@ use super::mail_address::{self, MailAddress};
 use super::placement::Policy;
 use crate::shared::address::{PublicAddress, check_host};
 use crate::shared::config::{
-    Configuration, ExpandedPath, Secret, Unfit, one_or_many, optional_port, percent, seconds, threshold, whole,
+    Configuration, ExpandedPath, Secret, Unfit, folder, local_address, one_or_many, optional_port, percent, seconds, threshold, whole,
 };
 use crate::shared::peer::TrustedProxies;
 
@@ -26,8 +27,8 @@ pub struct SessionConfig {
     #[serde(deserialize_with = "whole::<0, 65535, _, _>")]
     pub port: u16,
     /// Local address to listen on. Default: all of them.
-    #[serde(default = "everywhere")]
-    pub bind: String,
+    #[serde(default = "everywhere", deserialize_with = "local_address")]
+    pub bind: IpAddr,
     /// Whether a web server in front rewrites ports in URLs: HOST/PORT, not HOST:PORT. Default: true.
     #[serde(default = "yes")]
     pub port_rewrite: bool,
@@ -58,7 +59,7 @@ pub struct SessionConfig {
     #[serde(default)]
     pub mail_sender_password: Option<Secret>,
     /// Folder of `session/output.log`. Default: `log`.
-    #[serde(default = "log_folder")]
+    #[serde(default = "log_folder", deserialize_with = "folder")]
     pub log_dir: ExpandedPath,
     /// Log to standard output. Default: false.
     #[serde(default)]
@@ -254,8 +255,8 @@ fn yes() -> bool {
     true
 }
 
-fn everywhere() -> String {
-    "0.0.0.0".to_owned()
+fn everywhere() -> IpAddr {
+    Ipv4Addr::UNSPECIFIED.into()
 }
 
 fn log_folder() -> ExpandedPath {

@@ -4,9 +4,7 @@
 //!
 //! 1. The first notice waits for `gather`, so that servers that fail together are one mail.
 //! 2. For `flapping` after a mail, notices are held back and counted; what is left then is one entry with the newest
-//!    notice and the count.
-//! 3. One failure and its end are no flapping: an end that has lasted for a tenth of `flapping` is told at once, if
-//!    nothing else was held back.
+//!    notice and the count. So a server that comes and goes is never more than one mail in that time.
 
 use std::collections::HashMap;
 use std::time::{Duration, Instant, SystemTime};
@@ -74,10 +72,6 @@ impl Event {
             Self::MaximumLoad | Self::AvailableAgain => Topic::Room,
         }
     }
-
-    fn ends_trouble(self) -> bool {
-        matches!(self, Self::WorkingAgain | Self::AvailableAgain)
-    }
 }
 
 /// One entry of a mail: the newest notice of a server and topic, and how many it stands for.
@@ -113,25 +107,12 @@ pub struct Notices {
     topics: HashMap<(PublicAddress, Topic), State>,
 }
 
-#[derive(Debug)]
+#[derive(Debug, Default)]
 struct State {
-    pending: Option<Pending>,
-    quiet: Option<Quiet>,
-}
-
-#[derive(Debug)]
-struct Pending {
-    entry: Entry,
-    first: Instant,
-    newest: Instant,
-}
-
-/// The time after a mail.
-#[derive(Debug)]
-struct Quiet {
-    end: Instant,
-    /// Whether the mail before it came after a time without any.
-    fresh: bool,
+    /// What is to be mailed, and when it happened first.
+    pending: Option<(Entry, Instant)>,
+    /// Until when there is no other mail.
+    quiet: Option<Instant>,
 }
 
 impl Notices {
@@ -145,57 +126,46 @@ impl Notices {
     pub fn add(&mut self, notice: Notice, now: Instant) {
         let key = (notice.server.clone(), notice.event.topic());
         let entry = Entry { notice, held_back: 0 };
-        let state = self.topics.entry(key).or_insert(State { pending: None, quiet: None });
-        if let Some(pending) = &mut state.pending {
-            pending.entry.renew(entry);
-            pending.newest = now;
+        let state = self.topics.entry(key).or_default();
+        if let Some((pending, _)) = &mut state.pending {
+            pending.renew(entry);
         } else {
-            state.quiet.take_if(|quiet| quiet.end <= now);
-            state.pending = Some(Pending { entry, first: now, newest: now });
+            state.quiet.take_if(|end| *end <= now);
+            state.pending = Some((entry, now));
         }
     }
 
     /// When there will be something to mail, if nothing else happens.
     #[must_use]
     pub fn due(&self) -> Option<Instant> {
-        self.topics.values().filter_map(|state| self.ready(state)).min()
+        self.topics.values().filter_map(|state| state.ready(self.gather)).min()
     }
 
     /// What is to be mailed now; it counts as mailed from now on.
     pub fn take(&mut self, now: Instant) -> Vec<Entry> {
-        self.topics.retain(|_, state| state.pending.is_some() || state.quiet.as_ref().is_some_and(|q| q.end > now));
+        self.topics.retain(|_, state| state.pending.is_some() || state.quiet.is_some_and(|end| end > now));
         if self.due().is_none_or(|due| due > now) {
             return Vec::new();
         }
-        let (gather, flapping) = (self.gather, self.flapping);
         let mut mailed = Vec::new();
         for state in self.topics.values_mut() {
             // A mail that goes anyway takes along what nothing but the gathering holds up.
-            let ready = ready(state, gather, flapping).is_some_and(|ready| state.quiet.is_none() || ready <= now);
-            if let Some(pending) = state.pending.take_if(|_| ready) {
-                let fresh = state.quiet.is_none();
-                state.quiet = Some(Quiet { end: now + flapping, fresh });
-                mailed.push(pending.entry);
+            if state.quiet.is_none_or(|end| end <= now)
+                && let Some((entry, _)) = state.pending.take()
+            {
+                state.quiet = Some(now + self.flapping);
+                mailed.push(entry);
             }
         }
         mailed
     }
-
-    fn ready(&self, state: &State) -> Option<Instant> {
-        ready(state, self.gather, self.flapping)
-    }
 }
 
-/// When the pending entry may be mailed.
-fn ready(state: &State, gather: Duration, flapping: Duration) -> Option<Instant> {
-    let pending = state.pending.as_ref()?;
-    let Some(quiet) = &state.quiet else {
-        return Some(pending.first + gather);
-    };
-    if quiet.fresh && pending.entry.held_back == 0 && pending.entry.notice.event.ends_trouble() {
-        Some(quiet.end.min(pending.newest + gather.max(flapping / 10)))
-    } else {
-        Some(quiet.end)
+impl State {
+    /// When the pending entry may be mailed.
+    fn ready(&self, gather: Duration) -> Option<Instant> {
+        let (_, first) = self.pending.as_ref()?;
+        Some(self.quiet.unwrap_or(*first + gather))
     }
 }
 
@@ -245,9 +215,9 @@ mod tests {
     }
 
     #[test]
-    fn a_failure_and_its_end_are_two_mails_in_good_time() {
+    fn the_end_of_a_failure_is_told_once_the_time_of_flapping_is_over() {
         let mails = play(&[(0, 1, NotResponding), (100, 1, WorkingAgain)]);
-        assert_eq!(mails, [(10, vec![(1, NotResponding, 0)]), (160, vec![(1, WorkingAgain, 0)])]);
+        assert_eq!(mails, [(10, vec![(1, NotResponding, 0)]), (610, vec![(1, WorkingAgain, 0)])]);
         let mails = play(&[(0, 1, MaximumLoad), (590, 1, AvailableAgain)]);
         assert_eq!(mails, [(10, vec![(1, MaximumLoad, 0)]), (610, vec![(1, AvailableAgain, 0)])]);
     }
@@ -272,8 +242,7 @@ mod tests {
     #[test]
     fn a_second_failure_soon_after_the_first_waits() {
         let notices = [(0, 1, NotResponding), (100, 1, WorkingAgain), (200, 1, NotResponding)];
-        let mails: Vec<_> = play(&notices).into_iter().map(|(when, entries)| (when, entries[0].1)).collect();
-        assert_eq!(mails, [(10, NotResponding), (160, WorkingAgain), (760, NotResponding)]);
+        assert_eq!(play(&notices), [(10, vec![(1, NotResponding, 0)]), (610, vec![(1, NotResponding, 1)])]);
     }
 
     #[test]

@@ -96,14 +96,18 @@ impl FromStr for PublicAddress {
             Some((host, port)) => (host, port, true),
             None => text.rsplit_once(':').map(|(host, port)| (host, port, false)).ok_or_else(no_address)?,
         };
-        let number = |text: &str| text.parse().ok().filter(|port: &u16| *port > 0).ok_or_else(no_address);
+        let is_number = |text: &str| text.chars().all(|digit| digit.is_ascii_digit());
+        let number = |text: &str| {
+            text.parse().ok().filter(|port: &u16| *port > 0 && is_number(text)).ok_or_else(no_address)
+        };
         let name = match host.rsplit_once(':') {
             Some((name, web_port)) if rewritten && !host.ends_with(']') => number(web_port).map(|_| name)?,
             _ => host,
         };
         url::Host::parse(name).map_err(|_| no_address())?;
         let port = number(port)?;
-        Ok(Self { host: host.to_owned(), port, rewritten })
+        // Names are the same in any case (RFC 4343), and one server must not count as two.
+        Ok(Self { host: host.to_ascii_lowercase(), port, rewritten })
     }
 }
 
@@ -120,6 +124,11 @@ mod tests {
     }
 
     #[test]
+    fn a_name_is_the_same_in_any_case() {
+        assert_eq!("Lab.ORG:2000".parse::<PublicAddress>().unwrap().to_string(), "lab.org:2000");
+    }
+
+    #[test]
     fn the_scheme_follows_ssl() {
         let address: PublicAddress = "host/2000".parse().unwrap();
         assert_eq!(address.websocket_url(true), "wss://host/2000");
@@ -131,7 +140,7 @@ mod tests {
         for text in
             ["", "host", "host:", "host:0", "host:65536", "host/2000/x", "http://host:1", "a b:1", ":2000", "h:-1"]
                 .into_iter()
-                .chain(["host:x/2000", "host:0/2000", ":8443/2000", "host:1:2/2000", "host:1:2"])
+                .chain(["host:x/2000", "host:0/2000", ":8443/2000", "host:1:2/2000", "host:1:2", "h:+5"])
         {
             let error = text.parse::<PublicAddress>().unwrap_err().to_string();
             assert!(error.contains(&format!("{text:?}")), "{error}");

@@ -4,6 +4,7 @@
 //! what is allowed. Unknown keys are warned about, with the nearest known one.
 
 use std::fmt;
+use std::net::IpAddr;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
@@ -114,11 +115,33 @@ impl TryFrom<String> for ExpandedPath {
     type Error = String;
 
     fn try_from(text: String) -> Result<Self, String> {
+        if text.contains('\0') {
+            return Err(format!("{text:?} is no path; it has a NUL in it"));
+        }
         match shellexpand::full(&text) {
             Ok(expanded) => Ok(Self(PathBuf::from(expanded.into_owned()))),
             Err(error) => Err(format!("{text:?} names the environment variable {}, which is not set", error.var_name)),
         }
     }
+}
+
+/// Reads the path of a folder, which must not be empty.
+///
+/// # Errors
+/// When the value is something else.
+pub fn folder<'de, D: Deserializer<'de>>(deserializer: D) -> Result<ExpandedPath, D::Error> {
+    let path = ExpandedPath::deserialize(deserializer)?;
+    let is_empty = path.0.as_os_str().is_empty();
+    if is_empty { Err(D::Error::custom("\"\" is no folder; \".\" is the working folder")) } else { Ok(path) }
+}
+
+/// Reads a local address to listen on.
+///
+/// # Errors
+/// When the value is something else.
+pub fn local_address<'de, D: Deserializer<'de>>(deserializer: D) -> Result<IpAddr, D::Error> {
+    let text = String::deserialize(deserializer)?;
+    text.parse().map_err(|_| D::Error::custom(format!("{text:?} is no address; allowed are such as 127.0.0.1 or ::1")))
 }
 
 /// A text that is never shown.

@@ -1,6 +1,7 @@
 //! The simulation server as a whole: what it is made of, how it starts, and how it ends.
 
 use std::io::Write;
+use std::net::{SocketAddr, TcpListener};
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -38,7 +39,7 @@ pub enum AppError {
     #[error("can't listen on {address}: {source}")]
     Bind {
         /// Host and port.
-        address: String,
+        address: SocketAddr,
         /// What the system says.
         source: std::io::Error,
     },
@@ -119,9 +120,9 @@ pub async fn run(config: SimulationConfig) -> Result<(), AppError> {
     Ok(())
 }
 
-fn bind(config: &SimulationConfig) -> Result<std::net::TcpListener, AppError> {
-    let address = format!("{}:{}", config.bind, config.port);
-    std::net::TcpListener::bind(&address).map_err(|source| AppError::Bind { address, source })
+fn bind(config: &SimulationConfig) -> Result<TcpListener, AppError> {
+    let address = SocketAddr::new(config.bind, config.port);
+    TcpListener::bind(address).map_err(|source| AppError::Bind { address, source })
 }
 
 /// Makes everything that the server is made of, and starts its actors.

@@ -1,13 +1,14 @@
 //! The simulation server's configuration, `config/simulation/NAME.json`.
 
 use std::path::PathBuf;
+use std::net::{IpAddr, Ipv4Addr};
 use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
 use super::mirrors::Mirrors;
 use crate::shared::address::{PublicAddress, check_host};
-use crate::shared::config::{Configuration, ExpandedPath, Unfit, one_or_many, percent, seconds, whole};
+use crate::shared::config::{Configuration, ExpandedPath, Unfit, folder, local_address, one_or_many, percent, seconds, whole};
 use crate::shared::peer::TrustedProxies;
 use crate::shared::repositories::UrlPrefix;
 
@@ -26,13 +27,13 @@ pub struct SimulationConfig {
     #[serde(default = "port", deserialize_with = "whole::<1, 65000, _, _>")]
     pub port: u16,
     /// Local address to listen on. Default: all of them.
-    #[serde(default = "everywhere")]
-    pub bind: String,
+    #[serde(default = "everywhere", deserialize_with = "local_address")]
+    pub bind: IpAddr,
     /// Whether a web server in front rewrites ports in URLs: HOST/PORT, not HOST:PORT. Default: true.
     #[serde(default = "yes")]
     pub port_rewrite: bool,
     /// Folder of `simulation/output.log`, `simulation/monitor.csv` and the instances' output. Default: `log`.
-    #[serde(default = "log_folder")]
+    #[serde(default = "log_folder", deserialize_with = "folder")]
     pub log_dir: ExpandedPath,
     /// Log to standard output. Default: false.
     #[serde(default)]
@@ -100,7 +101,7 @@ pub struct SimulationConfig {
     #[serde(default)]
     pub git_mirrors: Mirrors,
     /// Folder of cached repositories and of the projects of running simulations. Default: `cache`.
-    #[serde(default = "cache_folder")]
+    #[serde(default = "cache_folder", deserialize_with = "folder")]
     pub cache_dir: ExpandedPath,
     /// How much room cached repositories may take, in MiB. Default: 10240.
     #[serde(default = "ten_gigabytes", deserialize_with = "whole::<1, 100_000_000, _, _>")]
@@ -244,8 +245,8 @@ fn port() -> u16 {
     2000
 }
 
-fn everywhere() -> String {
-    "0.0.0.0".to_owned()
+fn everywhere() -> IpAddr {
+    Ipv4Addr::UNSPECIFIED.into()
 }
 
 fn log_folder() -> ExpandedPath {
