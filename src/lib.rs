@@ -16,6 +16,8 @@
 //!     |  '- News -- Audience <--- News (changes only) ---'  '-- Reported --> Registry
 //!     '--- Join ------^  one per worker thread
 //!
+//!   The monitors share a thread of their own: however many they are, the door never waits for them.
+//!
 //! simulation server
 //!
 //!   routes --- Census --> Places <-- Census -- LoadMonitor --> monitor.csv

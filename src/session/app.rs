@@ -47,6 +47,13 @@ pub enum AppError {
     Gone(String),
 }
 
+/// The usual limit of open files, where the system does not tell.
+const USUAL_FILES: u64 = 1024;
+/// Files that the server needs for itself: logs, threads, mail.
+const OWN_FILES: usize = 128;
+/// Connections to one simulation server: one that is used, one that is being closed.
+const FILES_PER_SERVER: usize = 2;
+
 /// What can come of a request: each is counted from the start.
 const OUTCOMES: [&str; 4] = ["placed", "unavailable", "not_accepted", "wrong_url"];
 
@@ -56,7 +63,7 @@ const OUTCOMES: [&str; 4] = ["placed", "unavailable", "not_accepted", "wrong_url
 /// When it can't start, or an actor that must live is gone.
 pub async fn run(mut config: SessionConfig, file: PathBuf) -> Result<(), AppError> {
     let mut signals = Signals::catch()?;
-    allow_open_files();
+    let connections = bound_clients(open_files(), &mut config);
     let (phase_sender, phase) = watch::channel(Phase::Open);
     let address = SocketAddr::new(config.bind, config.port);
     let socket = TcpListener::bind(address).map_err(|source| AppError::Bind { address, source })?;
@@ -74,6 +81,9 @@ pub async fn run(mut config: SessionConfig, file: PathBuf) -> Result<(), AppErro
     let http = HttpServer::new(app)
         // Messages are small, and must not wait for the answer to the one before.
         .tcp_nodelay(true)
+        .workers(threads())
+        // More wait outside, where they can't use up the files.
+        .max_connections((connections / threads()).max(1))
         .disable_signals()
         .shutdown_timeout(stop.as_secs())
         .backlog(4096)
@@ -115,13 +125,39 @@ pub async fn run(mut config: SessionConfig, file: PathBuf) -> Result<(), AppErro
 }
 
 /// Lets the server open as many files as the system allows it: each client is one, and the usual limit is 1,024.
-fn allow_open_files() {
+/// Gives back how many that are.
+fn open_files() -> u64 {
     let raised = getrlimit(Resource::RLIMIT_NOFILE)
         .and_then(|(_, most)| setrlimit(Resource::RLIMIT_NOFILE, most, most).map(|()| most));
     match raised {
-        Ok(most) => log::debug!("{most} files may be open"),
-        Err(error) => log::warn!("the limit of open files can't be raised: {error}"),
+        Ok(most) => most,
+        Err(error) => {
+            log::warn!("the limit of open files can't be raised: {error}");
+            getrlimit(Resource::RLIMIT_NOFILE).map_or(USUAL_FILES, |(now, _)| now)
+        }
     }
+}
+
+/// How many connections there may be, so that files are left for the rest of the server. Fewer clients than that are
+/// taken, so that there is one for who is to be told that there are too many.
+fn bound_clients(files: u64, config: &mut SessionConfig) -> usize {
+    let files = usize::try_from(files).unwrap_or(usize::MAX);
+    let connections = files.saturating_sub(OWN_FILES + FILES_PER_SERVER * config.simulation_servers.len());
+    let clients = connections - connections / 16;
+    if clients < config.max_clients {
+        log::warn!(
+            "{files} files may be open, which is enough for {clients} clients, not for maxClients ({}); ulimit -Hn, or \
+             LimitNOFILE of systemd, allows more",
+            config.max_clients
+        );
+        config.max_clients = clients;
+    }
+    connections
+}
+
+/// How many threads serve connections.
+fn threads() -> usize {
+    std::thread::available_parallelism().map_or(1, usize::from)
 }
 
 /// Makes everything that the server is made of, and starts its actors.

@@ -9,7 +9,8 @@ use super::mail_address::{self, MailAddress};
 use super::placement::Policy;
 use crate::shared::address::{PublicAddress, check_host};
 use crate::shared::config::{
-    Configuration, ExpandedPath, Secret, Unfit, folder, local_address, one_or_many, optional_port, percent, seconds, threshold, whole,
+    Configuration, ExpandedPath, Secret, Unfit, folder, local_address, one_or_many, optional_port, percent, seconds,
+    threshold, whole,
 };
 use crate::shared::peer::TrustedProxies;
 

@@ -10,7 +10,8 @@ use super::registry::GetStatus;
 use super::server::Server;
 use crate::asset;
 use crate::shared::assets::{self, Asset};
-use crate::shared::page::{Policy, fleet_sources, get, html};
+use crate::shared::page::{Policy, fleet_sources, html};
+use crate::shared::paths::{GET, READ, path};
 
 /// What pages of this server load, besides what all pages do.
 const ASSETS: &[Asset] = &[
@@ -30,11 +31,11 @@ const ASSETS: &[Asset] = &[
 
 /// Adds the paths to an app.
 pub fn configure(app: &mut web::ServiceConfig) {
-    app.route("/monitor", get().to(monitor))
-        .route("/events", web::get().to(events))
-        .route("/viewer", get().to(viewer))
-        .route("/webots-viewer", get().to(webots_viewer))
-        .route("/assets/{name}", get().to(asset));
+    app.service(path("/monitor", READ, monitor))
+        .service(path("/events", GET, events))
+        .service(path("/viewer", READ, viewer))
+        .service(path("/webots-viewer", READ, webots_viewer))
+        .service(path("/assets/{name}", READ, asset));
 }
 
 async fn monitor(server: web::Data<Server>) -> HttpResponse {

@@ -9,6 +9,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use actix::prelude::*;
+use rustls::ClientConfig;
 
 use super::changes::Changes;
 use super::config::SessionConfig;
@@ -16,13 +17,14 @@ use super::fleet_status::{FleetStatus, ServerStatus, State};
 use super::mailer::Mailer;
 use super::pick::{NoServer, Pick};
 use super::placement::Fleet;
-use super::server_monitor::{self, Forget, Reported, ServerMonitor, Watch};
+use super::server_monitor::{Forget, Reported, ServerMonitor, Watch};
 use super::subscribers::{News, Subscribers};
 use super::unreachable::Unreachable;
 use super::watched::Watched;
 use crate::shared::address::PublicAddress;
 use crate::shared::project_url::ProjectUrl;
 use crate::shared::status::Dispatch;
+use crate::shared::tls;
 
 /// Asks to be told of availability, now and whenever it changes.
 #[derive(Message)]
@@ -47,7 +49,9 @@ pub struct Reconfigure(pub Arc<SessionConfig>);
 /// The actor.
 pub struct Registry {
     config: Arc<SessionConfig>,
-    client: awc::Client,
+    /// The monitors' thread: what they do must not keep the door waiting.
+    watchers: Arbiter,
+    trust: Option<Arc<ClientConfig>>,
     latencies: prometheus::Histogram,
     fleet: Fleet<PublicAddress>,
     servers: BTreeMap<PublicAddress, Member>,
@@ -71,7 +75,8 @@ impl Registry {
     pub fn new(config: Arc<SessionConfig>, mailer: Option<Addr<Mailer>>, latencies: prometheus::Histogram) -> Self {
         Self {
             fleet: Fleet::new(config.policy()),
-            client: server_monitor::client(config.load_refresh),
+            watchers: Arbiter::new(),
+            trust: tls::client_config(),
             config,
             latencies,
             servers: BTreeMap::new(),
@@ -123,7 +128,10 @@ impl Registry {
 
     fn monitor(&self, address: &PublicAddress, ctx: &mut Context<Self>) -> Addr<ServerMonitor> {
         let reports = ctx.address().recipient();
-        ServerMonitor::new(address.clone(), self.watch(), self.client.clone(), reports).start()
+        let (address, watch, trust) = (address.clone(), self.watch(), self.trust.clone());
+        ServerMonitor::start_in_arbiter(&self.watchers.handle(), move |_| {
+            ServerMonitor::new(address, watch, trust, reports)
+        })
     }
 
     /// What happens without a message.
@@ -195,18 +203,12 @@ impl Registry {
     }
 
     fn status_of(&self, address: &PublicAddress, now: Instant) -> Option<ServerStatus> {
-        let watched = &self.servers.get(address)?.watched;
+        let status = self.servers.get(address)?.watched.status(address);
         Some(ServerStatus {
-            address: address.clone(),
-            state: watched.state,
-            since: watched.since,
-            report: watched.report.clone(),
-            error: watched.error.as_ref().map(ToString::to_string),
             effective_load: self.fleet.effective_load(address, now),
             in_flight: self.fleet.in_flight(address, now),
             client_cost: self.fleet.learned_cost(address),
-            latency: watched.latency,
-            answered: watched.answered,
+            ..status
         })
     }
 }

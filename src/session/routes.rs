@@ -3,8 +3,7 @@
 use std::sync::Arc;
 
 use actix::Addr;
-use actix_web::http::{Method, StatusCode, header};
-use actix_web::middleware::DefaultHeaders;
+use actix_web::http::{StatusCode, header};
 use actix_web::{HttpRequest, HttpResponse, web};
 use rand::RngExt;
 
@@ -18,7 +17,7 @@ use super::server::Server;
 use super::status::{self, StatusPage};
 use super::web_client::WebClient;
 use crate::shared::metrics::CONTENT_TYPE;
-use crate::shared::page::get;
+use crate::shared::paths::{self, GET, READ, path};
 use crate::shared::websocket;
 
 /// After how many seconds a client that was refused may come back: drawn at random, so that a class that was refused
@@ -27,25 +26,18 @@ const COME_BACK: std::ops::RangeInclusive<u32> = 2..=6;
 
 /// Adds all paths to an app.
 pub fn configure(app: &mut web::ServiceConfig) {
-    let cors = DefaultHeaders::new()
-        .add((header::ACCESS_CONTROL_ALLOW_ORIGIN, "*"))
-        .add((header::ACCESS_CONTROL_ALLOW_HEADERS, "x-requested-with"))
-        .add((header::ACCESS_CONTROL_ALLOW_METHODS, "POST, GET, OPTIONS"))
-        .add((header::CACHE_CONTROL, "no-store"));
-    app.service(
-        web::scope("")
-            .wrap(cors)
-            .route("/", web::get().to(root))
-            .route("/request", get().to(availability))
-            .route("/session", web::get().to(session))
-            .route("/load", get().to(load))
-            .configure(page_routes::configure)
-            .route("/status", get().to(status_json))
-            .route("/metrics", get().to(metrics))
-            .route("/health", get().to(health))
-            .route("/{path:.*}", web::method(Method::OPTIONS).to(HttpResponse::NoContent))
-            .default_service(web::to(nothing_here)),
-    );
+    app.service(paths::all(add, "/session, /monitor, /viewer, /status, /load, /metrics or /health"));
+}
+
+fn add(app: &mut web::ServiceConfig) {
+    app.service(path("/", GET, root))
+        .service(path("/request", READ, availability))
+        .service(path("/session", GET, session))
+        .service(path("/load", READ, load))
+        .configure(page_routes::configure)
+        .service(path("/status", READ, status_json))
+        .service(path("/metrics", READ, metrics))
+        .service(path("/health", READ, health));
 }
 
 fn wants_websocket(request: &HttpRequest) -> bool {
@@ -135,11 +127,6 @@ async fn metrics(server: web::Data<Server>) -> HttpResponse {
 
 async fn health() -> HttpResponse {
     HttpResponse::Ok().content_type("text/plain").body("ok")
-}
-
-async fn nothing_here() -> HttpResponse {
-    HttpResponse::NotFound()
-        .body("Error: there is nothing here. Try /session, /monitor, /viewer, /status, /load, /metrics or /health.")
 }
 
 #[cfg(test)]

@@ -8,10 +8,12 @@
 //! It asks for `/status`; a server that has no such page is asked for `/load`, as the original is. Nothing that comes is
 //! trusted: the whole exchange has one time limit, an answer has a largest size, and a load must be one.
 
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use actix::prelude::*;
 use awc::error::{ConnectError, SendRequestError};
+use rustls::ClientConfig;
 
 use super::unreachable::Unreachable;
 use crate::shared::address::PublicAddress;
@@ -77,23 +79,28 @@ enum Answer {
     Load(Load),
 }
 
-/// What all monitors ask with: it keeps one connection to each simulation server.
-#[must_use]
-pub fn client(refresh: Duration) -> awc::Client {
+/// What a monitor asks with: it keeps one connection to its simulation server.
+fn client(refresh: Duration, trust: Option<Arc<ClientConfig>>) -> awc::Client {
     let idle = (refresh * 3).max(Duration::from_secs(15));
-    // The default limit of the pool is 100 connections. A look as a whole has a time limit, its parts have none.
-    let mut connector = awc::Connector::new().limit(0).conn_keep_alive(idle).timeout(NEVER);
-    if let Some(config) = tls::client_config() {
+    // A look as a whole has a time limit, its parts have none.
+    let mut connector = awc::Connector::new().conn_keep_alive(idle).timeout(NEVER);
+    if let Some(config) = trust {
         connector = connector.rustls_0_23(config);
     }
     awc::Client::builder().connector(connector).disable_timeout().disable_redirects().finish()
 }
 
 impl ServerMonitor {
-    /// A monitor of one server. `client` is shared by all: it keeps the connections.
+    /// A monitor of one server, which trusts these authorities. To be made in the thread in which it is to live.
     #[must_use]
-    pub fn new(server: PublicAddress, watch: Watch, client: awc::Client, reports: Recipient<Reported>) -> Self {
+    pub fn new(
+        server: PublicAddress,
+        watch: Watch,
+        trust: Option<Arc<ClientConfig>>,
+        reports: Recipient<Reported>,
+    ) -> Self {
         let looks = SpawnHandle::default();
+        let client = client(watch.refresh, trust);
         Self { server, watch, client, reports, asking: false, looks, load_only_until: None }
     }
 

@@ -14,6 +14,14 @@ pub enum Unreachable {
     BadAnswer(String),
 }
 
+impl Unreachable {
+    /// Whether both are of one kind, whatever their words.
+    #[must_use]
+    pub fn is_like(&self, other: &Self) -> bool {
+        std::mem::discriminant(self) == std::mem::discriminant(other)
+    }
+}
+
 impl fmt::Display for Unreachable {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {

@@ -2,10 +2,11 @@
 
 use std::time::{Duration, Instant, SystemTime};
 
-use super::fleet_status::State;
+use super::fleet_status::{ServerStatus, State};
 use super::notices::Event;
 use super::placement;
 use super::unreachable::Unreachable;
+use crate::shared::address::PublicAddress;
 use crate::shared::load::Load;
 use crate::shared::status::Dispatch;
 
@@ -30,7 +31,7 @@ pub struct Watched {
     full_told: bool,
 }
 
-/// A server has changed its state.
+/// A server has changed its state, or is down for another reason than before.
 #[derive(Debug, PartialEq)]
 pub struct Change {
     /// Its new state.
@@ -71,8 +72,12 @@ impl Watched {
     /// Takes in that there is no good answer.
     pub fn failed(&mut self, error: Unreachable) -> Option<Change> {
         let why = error.to_string();
+        let another = self.error.as_ref().is_some_and(|before| !before.is_like(&error));
         self.error = Some(error);
-        self.enter(State::Down, || why)
+        let change = self.enter(State::Down, || why.clone());
+        // It is down as before, but for another reason: who mends it should know.
+        change
+            .or_else(|| another.then(|| Change { state: State::Down, at: SystemTime::now(), why, events: Vec::new() }))
     }
 
     /// The last report, if it still holds.
@@ -94,6 +99,23 @@ impl Watched {
             accepting,
         });
         (accepting || instances.is_some()).then(|| placement::Report { load: report.load.percent(), instances })
+    }
+
+    /// All of it, to be shown; what the placement knows is still to be filled in.
+    #[must_use]
+    pub fn status(&self, address: &PublicAddress) -> ServerStatus {
+        ServerStatus {
+            address: address.clone(),
+            state: self.state,
+            since: self.since,
+            report: self.report.clone(),
+            error: self.error.as_ref().map(ToString::to_string),
+            effective_load: None,
+            in_flight: 0,
+            client_cost: None,
+            latency: self.latency,
+            answered: self.answered,
+        }
     }
 
     /// The load for a notice.
@@ -183,6 +205,18 @@ mod tests {
                 vec![WorkingAgain, AvailableAgain]
             ]
         );
+    }
+
+    #[test]
+    fn another_reason_is_a_change_without_an_event() {
+        let mut watched = Watched::new(false);
+        let refused = |why: &str| Unreachable::Refused(why.to_owned());
+        assert!(watched.failed(refused("one")).is_some());
+        assert_eq!(watched.failed(refused("other words")), None);
+        let slow = Unreachable::TimedOut(Duration::from_secs(3));
+        let change = watched.failed(slow.clone()).unwrap();
+        assert_eq!((change.state, change.why, change.events), (State::Down, "no answer within 3 s".to_owned(), vec![]));
+        assert_eq!(watched.failed(slow), None);
     }
 
     #[test]

@@ -133,7 +133,8 @@ impl StreamHandler<Result<Message, ProtocolError>> for WebClient {
             }
             Ok(Message::Nop) => {}
             Ok(Message::Text(_) | Message::Ping(_)) => {
-                log::warn!("client {}: asks without reading the answers", self.peer);
+                log::warn!("client {}: asks too much between two pings", self.peer);
+                ctx.text("Error: too many requests on one connection.");
                 Self::close(CloseCode::Policy, ctx);
             }
             Ok(Message::Binary(_) | Message::Continuation(_)) => Self::close(CloseCode::Unsupported, ctx),

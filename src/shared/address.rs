@@ -3,6 +3,7 @@
 
 use std::fmt;
 use std::str::FromStr;
+use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
 
@@ -13,7 +14,8 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
 pub struct PublicAddress {
-    host: String,
+    /// Shared, for addresses name servers wherever servers are counted, and are copied all the time.
+    host: Arc<str>,
     port: u16,
     rewritten: bool,
 }
@@ -39,7 +41,7 @@ impl PublicAddress {
     /// The address of `port` on `host`; `rewritten` tells whether a web server in front rewrites ports.
     #[must_use]
     pub fn new(host: &str, port: u16, rewritten: bool) -> Self {
-        Self { host: host.to_owned(), port, rewritten }
+        Self { host: host.into(), port, rewritten }
     }
 
     /// The host alone.
@@ -97,9 +99,8 @@ impl FromStr for PublicAddress {
             None => text.rsplit_once(':').map(|(host, port)| (host, port, false)).ok_or_else(no_address)?,
         };
         let is_number = |text: &str| text.chars().all(|digit| digit.is_ascii_digit());
-        let number = |text: &str| {
-            text.parse().ok().filter(|port: &u16| *port > 0 && is_number(text)).ok_or_else(no_address)
-        };
+        let number =
+            |text: &str| text.parse().ok().filter(|port: &u16| *port > 0 && is_number(text)).ok_or_else(no_address);
         let name = match host.rsplit_once(':') {
             Some((name, web_port)) if rewritten && !host.ends_with(']') => number(web_port).map(|_| name)?,
             _ => host,
@@ -107,7 +108,7 @@ impl FromStr for PublicAddress {
         url::Host::parse(name).map_err(|_| no_address())?;
         let port = number(port)?;
         // Names are the same in any case (RFC 4343), and one server must not count as two.
-        Ok(Self { host: host.to_ascii_lowercase(), port, rewritten })
+        Ok(Self { host: host.to_ascii_lowercase().into(), port, rewritten })
     }
 }
 

@@ -14,6 +14,7 @@ pub mod logging;
 pub mod metrics;
 pub mod notify;
 pub mod page;
+pub mod paths;
 pub mod peer;
 pub mod permanent;
 pub mod project_url;

@@ -1,6 +1,5 @@
 //! How pages are sent: their type, and headers that let them do only what they need.
 
-use actix_web::guard;
 use actix_web::http::header;
 use actix_web::{HttpRequest, HttpResponse};
 
@@ -159,12 +158,6 @@ pub fn html(page: Result<String, askama::Error>, policy: &Policy) -> HttpRespons
             .body(page),
         Err(error) => HttpResponse::InternalServerError().body(format!("Error: {error}.")),
     }
-}
-
-/// Matches GET, and HEAD too: what watches over servers likes to ask for the head alone (RFC 9110, section 9.3.2).
-#[must_use]
-pub fn get() -> actix_web::Route {
-    actix_web::web::route().guard(guard::Any(guard::Get()).or(guard::Head()))
 }
 
 #[cfg(test)]

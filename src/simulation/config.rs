@@ -1,14 +1,16 @@
 //! The simulation server's configuration, `config/simulation/NAME.json`.
 
-use std::path::PathBuf;
 use std::net::{IpAddr, Ipv4Addr};
+use std::path::PathBuf;
 use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
 use super::mirrors::Mirrors;
 use crate::shared::address::{PublicAddress, check_host};
-use crate::shared::config::{Configuration, ExpandedPath, Unfit, folder, local_address, one_or_many, percent, seconds, whole};
+use crate::shared::config::{
+    Configuration, ExpandedPath, Unfit, folder, local_address, one_or_many, percent, seconds, whole,
+};
 use crate::shared::peer::TrustedProxies;
 use crate::shared::repositories::UrlPrefix;
 

@@ -17,7 +17,8 @@ use super::webots_viewer;
 use crate::asset;
 use crate::shared::assets::{self, Asset};
 use crate::shared::auth::is_authorised;
-use crate::shared::page::{Policy, get, html};
+use crate::shared::page::{Policy, html};
+use crate::shared::paths::{GET, READ, path};
 
 /// What the page loads, besides what all pages do.
 const ASSETS: &[Asset] =
@@ -27,12 +28,12 @@ const LARGEST_TAIL: u64 = 32 * 1024;
 
 /// Adds the paths to an app.
 pub fn configure(app: &mut web::ServiceConfig) {
-    app.route("/monitor", get().to(monitor))
-        .route("/events", web::get().to(events))
-        .route("/history", web::get().to(history))
-        .route("/output", web::get().to(output))
-        .route("/assets/{name}", get().to(asset))
-        .route("/wwi/{path:.*}", web::get().to(wwi));
+    app.service(path("/monitor", READ, monitor))
+        .service(path("/events", GET, events))
+        .service(path("/history", GET, history))
+        .service(path("/output", GET, output))
+        .service(path("/assets/{name}", READ, asset))
+        .service(path("/wwi/{path:.*}", GET, wwi));
 }
 
 async fn monitor(server: web::Data<Server>) -> HttpResponse {

@@ -3,7 +3,6 @@
 use std::sync::Arc;
 
 use actix_web::http::header;
-use actix_web::middleware::DefaultHeaders;
 use actix_web::{HttpRequest, HttpResponse, web};
 
 use super::asking::{everybody, locked, too_busy};
@@ -13,30 +12,23 @@ use super::status::{self, StatusPage};
 use super::web_client::WebClient;
 use crate::shared::auth::is_authorised;
 use crate::shared::metrics::CONTENT_TYPE;
-use crate::shared::page::get;
+use crate::shared::paths::{self, GET, POST, READ, path};
 use crate::shared::shutdown::Request;
 use crate::shared::websocket;
 
 /// Adds all paths to an app.
 pub fn configure(app: &mut web::ServiceConfig) {
-    let cors = DefaultHeaders::new()
-        .add((header::ACCESS_CONTROL_ALLOW_ORIGIN, "*"))
-        .add((header::ACCESS_CONTROL_ALLOW_HEADERS, "x-requested-with"))
-        .add((header::ACCESS_CONTROL_ALLOW_METHODS, "POST, GET, OPTIONS"))
-        .add((header::CACHE_CONTROL, "no-store"));
-    app.service(
-        web::scope("")
-            .wrap(cors)
-            .route("/client", web::get().to(client))
-            .route("/load", get().to(load))
-            .configure(page_routes::configure)
-            .route("/status", get().to(status_json))
-            .route("/metrics", get().to(metrics))
-            .route("/health", get().to(health))
-            .route("/drain", web::post().to(drain))
-            .route("/{path:.*}", web::method(actix_web::http::Method::OPTIONS).to(HttpResponse::NoContent))
-            .default_service(web::to(nothing_here)),
-    );
+    app.service(paths::all(add, "/monitor, /status, /load, /metrics or /health"));
+}
+
+fn add(app: &mut web::ServiceConfig) {
+    app.service(path("/client", GET, client))
+        .service(path("/load", READ, load))
+        .configure(page_routes::configure)
+        .service(path("/status", READ, status_json))
+        .service(path("/metrics", READ, metrics))
+        .service(path("/health", READ, health))
+        .service(path("/drain", POST, drain));
 }
 
 async fn client(request: HttpRequest, stream: web::Payload, server: web::Data<Server>) -> HttpResponse {
@@ -98,8 +90,4 @@ async fn drain(request: HttpRequest, server: web::Data<Server>) -> HttpResponse 
         Ok(()) => HttpResponse::Accepted().body("draining"),
         Err(error) => HttpResponse::ServiceUnavailable().body(format!("Error: {error}.")),
     }
-}
-
-async fn nothing_here() -> HttpResponse {
-    HttpResponse::NotFound().body("Error: there is nothing here. Try /monitor, /status, /load, /metrics or /health.")
 }

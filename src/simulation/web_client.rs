@@ -237,7 +237,7 @@ impl StreamHandler<Result<Message, ProtocolError>> for WebClient {
             }
             Ok(Message::Nop) => {}
             Ok(Message::Text(_) | Message::Ping(_)) => {
-                log::warn!("{}: asks without reading the answers", self.name());
+                log::warn!("{}: asks too much between two pings", self.name());
                 ctx.close(Some(CloseCode::Policy.into()));
                 ctx.stop();
             }

@@ -102,7 +102,7 @@ async fn nothing_piles_up_for_a_client_that_asks_without_reading() {
     };
     actix_rt::time::timeout(crate::support::SOON, end).await.expect("it is sent away");
     until("it is forgotten", async || clients_of(&session).await == 0).await;
-    assert!(session.log().contains("asks without reading the answers"));
+    assert!(session.log().contains("asks too much between two pings"));
 }
 
 #[actix_rt::test]
@@ -114,6 +114,29 @@ async fn more_clients_than_allowed_are_refused() {
     assert!(refused.to_string().contains("503"), "{refused}");
     first.leave().await;
     until("there is room again", async || tokio_tungstenite::connect_async(session.websocket("/")).await.is_ok()).await;
+}
+
+#[actix_rt::test]
+async fn running_out_of_files_is_said_at_the_start_and_costs_only_those_who_are_too_many() {
+    let session = session_server(&[]).files(200).start().await;
+    assert!(session.log().contains("200 files may be open, which is enough for"), "{}", session.log());
+    let connect = || async { tokio_tungstenite::connect_async(session.websocket("/session")).await };
+    let mut clients = Vec::new();
+    let refused = loop {
+        match connect().await {
+            Ok(client) => clients.push(client),
+            Err(refused) => break refused,
+        }
+        assert!(clients.len() < 200, "there are more clients than files");
+    };
+    assert!(refused.to_string().contains("503"), "{refused}");
+    assert!(clients.len() > 20, "only {} clients", clients.len());
+    // Those who come all the same wait outside; the server is well, and takes others when there is room.
+    let waiting: Vec<_> = join_all((0..300).map(|_| TcpStream::connect(session.address()))).await;
+    drop(waiting);
+    clients.clear();
+    until("there is room again", async || connect().await.is_ok()).await;
+    assert!(!session.log().contains("open files"), "{}", session.log());
 }
 
 #[actix_rt::test]

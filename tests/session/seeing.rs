@@ -192,3 +192,14 @@ async fn what_watches_over_servers_may_ask_for_the_head_alone() {
         assert_eq!(answer.status(), 200, "{path}");
     }
 }
+
+#[actix_rt::test]
+async fn a_wrong_method_is_refused_by_name() {
+    let session = session_server(&[]).start().await;
+    for path in ["/session", "/status", "/monitor", "/request"] {
+        let answer = awc::Client::default().post(session.url(path)).send().await.unwrap();
+        let allow = answer.headers().get("allow").and_then(|value| value.to_str().ok()).map(str::to_owned);
+        assert_eq!(answer.status(), 405, "{path}");
+        assert!(allow.is_some_and(|allow| allow.starts_with("GET")), "{path}");
+    }
+}

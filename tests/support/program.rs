@@ -30,6 +30,7 @@ pub struct Builder {
     port: u16,
     environment: Vec<(String, String)>,
     folder: Option<PathBuf>,
+    files: Option<u32>,
 }
 
 /// A session server that watches these simulation servers (`HOST:PORT`).
@@ -58,7 +59,7 @@ pub fn simulation_server(webots: &Path, repositories: &Path, places: u16) -> Bui
 
 impl Builder {
     fn new(program: &'static str, name: &'static str, config: Value, port: u16) -> Self {
-        Self { program, name, config, port, environment: Vec::new(), folder: None }
+        Self { program, name, config, port, environment: Vec::new(), folder: None, files: None }
     }
 
     /// Sets a key of the configuration; `a.b` is a key of a part.
@@ -86,6 +87,12 @@ impl Builder {
         self
     }
 
+    /// Lets the server open so many files.
+    pub fn files(mut self, most: u32) -> Self {
+        self.files = Some(most);
+        self
+    }
+
     /// Writes the configuration and starts the program, without waiting for it.
     pub fn spawn(mut self) -> Server {
         let temporary = self.folder.is_none().then(|| tempfile::tempdir().unwrap());
@@ -98,7 +105,15 @@ impl Builder {
         let file = folder.join("config.json");
         std::fs::write(&file, serde_json::to_string_pretty(&self.config).unwrap()).unwrap();
         let log = File::options().create(true).append(true).open(folder.join("output.txt")).unwrap();
-        let child = Command::new(self.program)
+        let mut command = match self.files {
+            Some(files) => {
+                let mut command = Command::new("prlimit");
+                command.arg(format!("--nofile={files}:{files}")).arg(self.program);
+                command
+            }
+            None => Command::new(self.program),
+        };
+        let child = command
             .arg(&file)
             .envs(self.environment)
             .stdin(Stdio::null())

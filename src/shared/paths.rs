@@ -1,0 +1,49 @@
+//! What the paths of both servers have in common: methods, headers for pages of other origins, words for what is not there.
+
+use actix_web::dev::HttpServiceFactory;
+use actix_web::http::{Method, StatusCode, header};
+use actix_web::middleware::DefaultHeaders;
+use actix_web::{FromRequest, Handler, HttpResponse, Resource, Responder, guard, web};
+
+/// For what is read. What watches over servers likes to ask for the head alone (RFC 9110, section 9.3.2).
+pub const READ: &[Method] = &[Method::GET, Method::HEAD];
+/// For what has no end: WebSockets and streams of events.
+pub const GET: &[Method] = &[Method::GET];
+/// For what changes something.
+pub const POST: &[Method] = &[Method::POST];
+
+/// A path that takes these methods. Others are refused by name (RFC 9110, section 15.5.6), and OPTIONS is answered.
+pub fn path<F, Arguments>(name: &str, methods: &'static [Method], handler: F) -> Resource
+where
+    F: Handler<Arguments, Output: Responder + 'static>,
+    Arguments: FromRequest + 'static,
+{
+    let route = web::route().guard(guard::fn_guard(move |request| methods.contains(&request.head().method)));
+    web::resource(name)
+        .route(route.to(handler))
+        .route(web::method(Method::OPTIONS).to(HttpResponse::NoContent))
+        .default_service(web::to(move || wrong_method(methods)))
+}
+
+async fn wrong_method(methods: &[Method]) -> HttpResponse {
+    let allowed = methods.iter().map(Method::as_str).collect::<Vec<_>>().join(", ");
+    let words = format!("Error: wrong method; allowed here: {allowed}.");
+    HttpResponse::MethodNotAllowed().insert_header((header::ALLOW, allowed)).body(words)
+}
+
+/// All paths of a server, which pages of any origin may use; `hint` names those that people look for.
+pub fn all(configure: fn(&mut web::ServiceConfig), hint: &'static str) -> impl HttpServiceFactory + 'static {
+    let headers = DefaultHeaders::new()
+        .add((header::ACCESS_CONTROL_ALLOW_ORIGIN, "*"))
+        .add((header::ACCESS_CONTROL_ALLOW_HEADERS, "x-requested-with"))
+        .add((header::ACCESS_CONTROL_ALLOW_METHODS, "POST, GET, OPTIONS"))
+        .add((header::CACHE_CONTROL, "no-store"));
+    web::scope("")
+        .wrap(headers)
+        .configure(configure)
+        .route("/{path:.*}", web::method(Method::OPTIONS).to(HttpResponse::NoContent))
+        .default_service(web::to(move || async move {
+            let words = format!("Error: there is nothing here. Try {hint}.");
+            HttpResponse::build(StatusCode::NOT_FOUND).body(words)
+        }))
+}
