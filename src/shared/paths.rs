@@ -22,10 +22,10 @@ where
     web::resource(name)
         .route(route.to(handler))
         .route(web::method(Method::OPTIONS).to(HttpResponse::NoContent))
-        .default_service(web::to(move || wrong_method(methods)))
+        .default_service(web::to(move || async move { wrong_method(methods) }))
 }
 
-async fn wrong_method(methods: &[Method]) -> HttpResponse {
+fn wrong_method(methods: &[Method]) -> HttpResponse {
     let allowed = methods.iter().map(Method::as_str).collect::<Vec<_>>().join(", ");
     let words = format!("Error: wrong method; allowed here: {allowed}.");
     HttpResponse::MethodNotAllowed().insert_header((header::ALLOW, allowed)).body(words)

@@ -87,7 +87,9 @@ impl Project {
     pub async fn done(&self, arguments: &[&str]) -> String {
         let outcome = self.server_sh(arguments).await;
         assert_eq!(outcome.code, Some(0), "{arguments:?}: {outcome:#?}");
-        assert_eq!(outcome.errors, "", "{arguments:?}: {outcome:#?}");
+        // What the machine lacks and simulations can do without is no fault.
+        let faults = outcome.errors.lines().filter(|line| !line.starts_with("warning: git-lfs: "));
+        assert_eq!(faults.collect::<Vec<_>>(), Vec::<&str>::new(), "{arguments:?}: {outcome:#?}");
         outcome.output
     }
 
