@@ -1,5 +1,7 @@
 //! What a client asks the registry for, and how it is told that there is none.
 
+use std::net::IpAddr;
+
 use actix::prelude::*;
 
 use crate::shared::address::PublicAddress;
@@ -11,6 +13,8 @@ use crate::shared::project_url::{NoProject, ProjectUrl};
 pub struct Pick {
     /// The world, where one is named.
     pub world: Option<ProjectUrl>,
+    /// The client's address, where it is known.
+    pub from: Option<IpAddr>,
 }
 
 /// No simulation server is given. The words are those of the protocol.
@@ -28,12 +32,12 @@ pub enum NoServer {
 }
 
 impl Pick {
-    /// Reads what a client wants: nothing in particular, or a world.
+    /// Reads what a client of this address wants: nothing in particular, or a world.
     ///
     /// # Errors
     /// When the URL is none.
-    pub fn parse(world: Option<&str>) -> Result<Self, NoServer> {
+    pub fn parse(world: Option<&str>, from: Option<IpAddr>) -> Result<Self, NoServer> {
         let world = world.filter(|text| !text.is_empty()).map(ProjectUrl::parse).transpose();
-        world.map(|world| Self { world }).map_err(NoServer::NoWorld)
+        world.map(|world| Self { world, from }).map_err(NoServer::NoWorld)
     }
 }

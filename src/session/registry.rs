@@ -5,6 +5,7 @@
 //! a monitor has panicked.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::net::IpAddr;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -146,7 +147,7 @@ impl Registry {
         }
         self.changes.look_after_mailer(&self.config);
         self.publish();
-        self.subscribers.tell_late(self.news());
+        self.subscribers.tell_late(News::Availability(self.available));
     }
 
     /// Tells the subscribers, if availability has changed.
@@ -156,13 +157,8 @@ impl Registry {
             return;
         }
         self.available = available;
-        let words = if available { "a simulation server is available" } else { "no simulation server is available" };
-        log::info!("{words}");
-        self.subscribers.tell(self.news());
-    }
-
-    fn news(&self) -> News {
-        News::Availability(self.available)
+        log::info!("{} simulation server is available", if available { "a" } else { "no" });
+        self.subscribers.tell(News::Availability(self.available));
     }
 
     /// Takes in what came of a server at this time.
@@ -184,16 +180,18 @@ impl Registry {
     }
 
     /// Which server gets a client.
-    fn pick(&mut self, world: Option<&ProjectUrl>) -> Result<PublicAddress, NoServer> {
+    fn pick(&mut self, world: Option<&ProjectUrl>, from: Option<IpAddr>) -> Result<PublicAddress, NoServer> {
         let Self { fleet, servers, .. } = self;
         let accepts = |address: &PublicAddress, world: &ProjectUrl| {
-            let Some(Member { watched, .. }) = servers.get(address) else {
-                return false;
-            };
             // One that was not heard of yet may accept it.
-            watched.report.as_ref().map_or(watched.state == State::Unknown, |report| report.accepts(world))
+            let says = |Member { watched, .. }: &Member| match &watched.report {
+                Some(report) => report.accepts(world),
+                None => watched.state == State::Unknown,
+            };
+            servers.get(address).is_some_and(says)
         };
-        let picked = fleet.place(Instant::now(), |address| world.is_none_or(|world| accepts(address, world)));
+        let eligible = |address: &PublicAddress| world.is_none_or(|world| accepts(address, world));
+        let picked = fleet.place_from(Instant::now(), from, eligible);
         picked.ok_or_else(|| match world {
             Some(world) if !servers.keys().any(|address| accepts(address, world)) => {
                 NoServer::NotAccepted(world.repository())
@@ -241,8 +239,8 @@ impl Handler<Reported> for Registry {
 impl Handler<Pick> for Registry {
     type Result = Result<PublicAddress, NoServer>;
 
-    fn handle(&mut self, Pick { world }: Pick, _: &mut Self::Context) -> Self::Result {
-        let answer = self.pick(world.as_ref());
+    fn handle(&mut self, Pick { world, from }: Pick, _: &mut Self::Context) -> Self::Result {
+        let answer = self.pick(world.as_ref(), from);
         self.publish();
         answer
     }
@@ -252,7 +250,7 @@ impl Handler<Subscribe> for Registry {
     type Result = ();
 
     fn handle(&mut self, Subscribe(audience): Subscribe, _: &mut Self::Context) {
-        self.subscribers.add(audience, Some(self.news()));
+        self.subscribers.add(audience, Some(News::Availability(self.available)));
     }
 }
 

@@ -67,7 +67,8 @@ async fn session(
     if wants_websocket(&request) {
         return open_websocket(&request, stream, &server, &audience);
     }
-    let answer = server.pick(Pick::parse(wanted_world(request.query_string()))).await;
+    let from = server.trusted_proxies.peer(&request).household();
+    let answer = server.pick(Pick::parse(wanted_world(request.query_string()), from)).await;
     let status = match answer.refusal {
         None => StatusCode::OK,
         Some(NoServer::Unavailable) => StatusCode::SERVICE_UNAVAILABLE,

@@ -69,8 +69,8 @@ impl WebClient {
 
     fn pick(&self, text: &str, ctx: &mut Context) {
         let server = Arc::clone(&self.server);
-        let wanted = wanted_world(text);
-        let picked = async move { server.pick(Pick::parse(wanted.as_deref())).await };
+        let (wanted, from) = (wanted_world(text), self.peer.household());
+        let picked = async move { server.pick(Pick::parse(wanted.as_deref(), from)).await };
         picked.into_actor(self).map(|answer, _, ctx| ctx.text(answer.text)).spawn(ctx);
     }
 }

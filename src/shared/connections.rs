@@ -1,7 +1,7 @@
 //! How many WebSockets may be open: in all, and per client address.
 
 use std::collections::HashMap;
-use std::net::{IpAddr, Ipv6Addr};
+use std::net::IpAddr;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use actix_web::HttpResponse;
@@ -62,10 +62,7 @@ impl Connections {
     /// When there are too many connections.
     pub fn admit(&self, peer: Peer) -> Result<Connection, Crowded> {
         let permit = Arc::clone(&self.all).try_acquire_owned().map_err(|_| Crowded::Everywhere)?;
-        let place = match peer {
-            Peer::Client(address) => Some(self.place(household(address))?),
-            Peer::Proxy(_) | Peer::Unknown => None,
-        };
+        let place = peer.household().map(|address| self.place(address)).transpose()?;
         Ok(Connection { _permit: permit, _place: place })
     }
 
@@ -100,14 +97,6 @@ impl Crowded {
             Self::Everywhere => HttpResponse::ServiceUnavailable().body(self.to_string()),
             Self::FromThere => HttpResponse::TooManyRequests().body(self.to_string()),
         }
-    }
-}
-
-/// One IPv6 client has a whole /64 of addresses.
-fn household(address: IpAddr) -> IpAddr {
-    match address {
-        IpAddr::V4(_) => address,
-        IpAddr::V6(address) => Ipv6Addr::from_bits(address.to_bits() >> 64 << 64).into(),
     }
 }
 

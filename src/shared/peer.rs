@@ -6,7 +6,7 @@
 //! client's.
 
 use std::fmt;
-use std::net::{IpAddr, SocketAddr};
+use std::net::{IpAddr, Ipv6Addr, SocketAddr};
 
 use actix_web::HttpRequest;
 use actix_web::http::header::HeaderMap;
@@ -34,6 +34,19 @@ pub enum Peer {
     Proxy(IpAddr),
     /// Not known: no TCP connection.
     Unknown,
+}
+
+impl Peer {
+    /// The address by which a client is known, where it is: one IPv6 client has a whole /64 of addresses, which count as
+    /// one.
+    #[must_use]
+    pub fn household(self) -> Option<IpAddr> {
+        match self {
+            Self::Client(IpAddr::V6(address)) => Some(Ipv6Addr::from_bits(address.to_bits() >> 64 << 64).into()),
+            Self::Client(address) => Some(address),
+            Self::Proxy(_) | Self::Unknown => None,
+        }
+    }
 }
 
 impl TrustedProxies {

@@ -2,6 +2,8 @@
 
 use std::collections::BTreeMap;
 
+use serde_json::json;
+
 use crate::stand_in::{Manner, StandIn};
 use crate::support::client::Client;
 use crate::support::git::world;
@@ -125,4 +127,30 @@ async fn a_server_that_reports_only_its_load_is_taken_as_accepting() {
     until_states(&session, &["up"; 2]).await;
     let url = world("stranger/arm", "main", "worlds/a.wbt");
     assert_eq!(http::get(&session.url(&format!("/session?url={url}"))).await.text(), servers[1].url());
+}
+
+#[actix_rt::test]
+async fn somebody_who_only_asks_does_not_close_the_fleet() {
+    let idle = json!({"load": 10, "instances": {"queued": 0, "starting": 0, "idle": 0, "running": 0, "places": 100,
+        "arrivals": 0}});
+    let servers = [StandIn::start(Manner::Status(idle))];
+    // The tests' own address is a proxy's; what it says of its clients counts.
+    let session = session_server(&addresses(&servers)).set("timing", json!({"placement": 0.5})).start().await;
+    until_states(&session, &["up"]).await;
+    let ask = async || {
+        let client =
+            awc::Client::default().get(session.url("/session")).insert_header(("X-Forwarded-For", "203.0.113.9"));
+        client.send().await.unwrap().status().as_u16()
+    };
+    // It has room for 43; so many and more are asked for within each half second.
+    let begin = std::time::Instant::now();
+    let mut refused_late = 0;
+    while begin.elapsed() < std::time::Duration::from_secs(4) {
+        let status = ask().await;
+        if begin.elapsed() > std::time::Duration::from_secs(2) {
+            refused_late += u32::from(status != 200);
+        }
+        actix_rt::time::sleep(std::time::Duration::from_millis(4)).await;
+    }
+    assert_eq!(refused_late, 0, "the one server is closed though nobody comes");
 }

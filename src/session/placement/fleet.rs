@@ -1,10 +1,12 @@
 //! The servers of the fleet, and the choice between them.
 
+use super::allowance::Allowances;
 use super::cost::{Common, Estimate};
 use super::order::{Order, Rank};
 use super::policy::Policy;
 use super::server::{Report, Server};
 use std::collections::BTreeMap;
+use std::net::IpAddr;
 use std::time::Instant;
 
 /// The simulation servers, what is known of each, and the choice between them. `Id` is whatever the owner knows a server
@@ -28,6 +30,7 @@ pub struct Fleet<Id> {
     policy: Policy,
     servers: BTreeMap<Id, Server>,
     common: Common,
+    allowances: Allowances,
     order: Order<Id>,
     turns: u64,
 }
@@ -36,7 +39,14 @@ impl<Id: Clone + Ord> Fleet<Id> {
     /// A fleet without servers.
     #[must_use]
     pub fn new(policy: Policy) -> Self {
-        Self { policy, servers: BTreeMap::new(), common: Common::new(), order: Order::new(), turns: 0 }
+        Self {
+            policy,
+            servers: BTreeMap::new(),
+            common: Common::new(),
+            allowances: Allowances::default(),
+            order: Order::new(),
+            turns: 0,
+        }
     }
 
     /// Changes the policy for all that follows. What servers have learned by the `initial_cost` until now stays.
@@ -64,7 +74,7 @@ impl<Id: Clone + Ord> Fleet<Id> {
     /// A server answered at `now`. Says nothing of a server that is not in the fleet.
     pub fn report(&mut self, id: &Id, now: Instant, report: Report) {
         if let Some(server) = self.servers.get_mut(id) {
-            server.report(now, report, &self.policy, &mut self.common);
+            server.report(now, report, &self.policy, (&mut self.common, &mut self.allowances));
             self.rank(id, now);
         }
     }
@@ -80,12 +90,24 @@ impl<Id: Clone + Ord> Fleet<Id> {
     /// Chooses the server of least effective load among those that have room and are `eligible`, and counts the client as
     /// sent there. Of equal servers the one is taken that has waited longest for its turn.
     pub fn place(&mut self, now: Instant, eligible: impl Fn(&Id) -> bool) -> Option<Id> {
+        self.place_from(now, None, eligible)
+    }
+
+    /// Does the same for a client of this address: of an address whose clients have not come lately only few count.
+    pub fn place_from(&mut self, now: Instant, from: Option<IpAddr>, eligible: impl Fn(&Id) -> bool) -> Option<Id> {
         for id in self.order.expired(now).cloned().collect::<Vec<_>>() {
+            if let Some(server) = self.servers.get_mut(&id) {
+                server.forget_missing(now, &self.policy, &mut self.allowances);
+            }
             self.rank(&id, now);
         }
         let id = self.order.servers().find(|id| eligible(id))?.clone();
         self.turns += 1;
-        self.servers.get_mut(&id)?.place(now, self.turns, &self.policy);
+        let server = self.servers.get_mut(&id)?;
+        server.turn = self.turns;
+        if from.is_none_or(|from| self.allowances.take(from, now, self.policy.patience)) {
+            server.place(now, from);
+        }
         self.rank(&id, now);
         Some(id)
     }
@@ -283,6 +305,30 @@ mod tests {
         assert_eq!(fleet.in_flight(&0, now + seconds(16.0)), 0);
         assert!(fleet.available(now + seconds(16.0)));
         assert_eq!(fleet.next_change(now + seconds(16.0)), None);
+    }
+
+    #[test]
+    fn an_address_whose_clients_never_come_closes_no_fleet() {
+        let start = Instant::now();
+        let mut fleet = Fleet::new(Policy::default());
+        let stranger = Some("203.0.113.9".parse().unwrap());
+        (0..2).for_each(|id| fleet.add(id));
+        let mut closed = 0;
+        for tenth in 0..1_200 {
+            let now = start + seconds(f64::from(tenth) / 10.0);
+            if tenth % 10 == 0 {
+                (0..2).for_each(|id| fleet.report(&id, now, full_report(10.0, 0, 0)));
+            }
+            // Ten requests a second: 150 within the patience, which two servers have no room for.
+            fleet.place_from(now, stranger, |_| true);
+            closed += i32::from(!fleet.available(now));
+        }
+        assert!((0..=150).contains(&closed), "closed for {closed} tenths of a second");
+        let now = start + seconds(120.0);
+        assert!(fleet.in_flight(&0, now) + fleet.in_flight(&1, now) <= 1);
+        // Those of another address count as ever.
+        assert_eq!([(); 4].map(|()| fleet.place_from(now, Some("203.0.113.10".parse().unwrap()), |_| true)).len(), 4);
+        assert!(fleet.in_flight(&0, now) + fleet.in_flight(&1, now) >= 4);
     }
 
     #[test]

@@ -7,11 +7,13 @@
 //! - `fleet`: the servers, and the choice between them; `policy`: what its owner can set;
 //! - `order`: the servers by their effective load, so that a large fleet is as fast as a small one;
 //! - `server`: what is known of one server;
-//! - `cost`: how the cost of a client is learned.
+//! - `cost`: how the cost of a client is learned;
+//! - `allowance`: how many placements of one client address count.
 //!
 //! Nothing here reads a clock or does any input or output: every call is told the time.
 //! `docs/placement.md` explains the policy, and `cargo bench --bench placement` measures it.
 
+mod allowance;
 mod cost;
 mod fleet;
 mod order;

@@ -1,8 +1,10 @@
 //! What is known of one simulation server: its last report, and what has been sent to it since.
 
+use super::allowance::Allowances;
 use super::cost::{Common, Cost, Estimate, FULL, believable};
 use super::policy::Policy;
 use std::collections::VecDeque;
+use std::net::IpAddr;
 use std::time::{Duration, Instant};
 
 /// A server's load is the mean of samples over so long: a client that left stays in it that long.
@@ -30,6 +32,14 @@ pub struct Instances {
     pub accepting: bool,
 }
 
+/// A client that was sent to a server.
+#[derive(Debug, Clone, Copy)]
+struct Placement {
+    at: Instant,
+    /// Its address, if whether it comes counts for that.
+    from: Option<IpAddr>,
+}
+
 /// Clients that came (positive) or left (negative) and that the mean load does not fully show yet.
 #[derive(Debug, Clone, Copy)]
 struct Change {
@@ -55,8 +65,8 @@ pub(super) struct Server {
     up: bool,
     /// The last good report and when it came; kept while the server is down, to know what is new when it comes back.
     last: Option<(Instant, Report)>,
-    /// When each placement was made whose client has not been seen yet, oldest first.
-    in_flight: VecDeque<Instant>,
+    /// The placements whose clients have not been seen yet, oldest first.
+    in_flight: VecDeque<Placement>,
     settling: VecDeque<Change>,
     /// The sum of what `settling` hid from the last report.
     unseen: f64,
@@ -89,7 +99,13 @@ impl Server {
     }
 
     /// Takes in a report that came at `now`; one that is older than the last is passed over.
-    pub(super) fn report(&mut self, now: Instant, report: Report, policy: &Policy, common: &mut Common) {
+    pub(super) fn report(
+        &mut self,
+        now: Instant,
+        report: Report,
+        policy: &Policy,
+        (common, allowances): (&mut Common, &mut Allowances),
+    ) {
         if !report.load.is_finite() || report.load < 0.0 {
             self.lose();
             return;
@@ -97,8 +113,8 @@ impl Server {
         if self.last.is_some_and(|(at, _)| now < at) {
             return;
         }
-        self.forget_missing(now, policy);
-        self.note_changes(now, report.instances);
+        self.forget_missing(now, policy, allowances);
+        self.note_changes(now, report.instances, allowances);
         self.settling.retain(|change| change.unseen(now, policy.settling) != 0.0);
         self.unseen = self.settling.iter().map(|change| change.unseen(now, policy.settling)).sum();
         self.learn(now, report);
@@ -110,14 +126,14 @@ impl Server {
     /// The server does not answer.
     pub(super) fn lose(&mut self) {
         self.up = false;
+        // It is not its clients' fault if they can't come.
+        self.in_flight.iter_mut().for_each(|placement| placement.from = None);
     }
 
-    /// A client has been sent here.
-    pub(super) fn place(&mut self, now: Instant, turn: u64, policy: &Policy) {
-        self.forget_missing(now, policy);
-        self.in_flight.push_back(now);
+    /// A client of this address has been sent here, and counts until it comes or is given up.
+    pub(super) fn place(&mut self, now: Instant, from: Option<IpAddr>) {
+        self.in_flight.push_back(Placement { at: now, from });
         self.sent += 1.0;
-        self.turn = turn;
     }
 
     /// The effective load, in percent, if a client can be sent here.
@@ -155,7 +171,7 @@ impl Server {
 
     /// How many placements are on their way: made, their client not seen yet and not given up.
     pub(super) fn in_flight(&self, now: Instant, policy: &Policy) -> usize {
-        let missing = |placed: &Instant| now.saturating_duration_since(*placed) >= policy.patience;
+        let missing = |placed: &Placement| now.saturating_duration_since(placed.at) >= policy.patience;
         if self.in_flight.front().is_some_and(missing) {
             self.in_flight.len() - self.in_flight.partition_point(missing)
         } else {
@@ -166,7 +182,7 @@ impl Server {
     /// When the next placement is given up, if none of their clients comes before.
     pub(super) fn next_expiry(&self, now: Instant, policy: &Policy) -> Option<Instant> {
         let first = self.in_flight.len() - self.in_flight(now, policy);
-        self.in_flight.get(first).and_then(|placed| placed.checked_add(policy.patience))
+        self.in_flight.get(first).and_then(|placed| placed.at.checked_add(policy.patience))
     }
 
     /// What one more client is expected to add to the load, in percent.
@@ -207,17 +223,18 @@ impl Server {
         self.fit.learn(shown, report.load, now.saturating_duration_since(before), trust * trust);
     }
 
-    fn forget_missing(&mut self, now: Instant, policy: &Policy) {
+    /// Gives up the clients that should have come by now.
+    pub(super) fn forget_missing(&mut self, now: Instant, policy: &Policy, allowances: &mut Allowances) {
         let present = self.in_flight(now, policy);
         let missing = self.in_flight.len() - present;
-        self.in_flight.drain(..missing);
+        self.in_flight.drain(..missing).filter_map(|placement| placement.from).for_each(|from| allowances.missed(from));
     }
 
     /// Compares the report with the one before: who came, who left.
-    fn note_changes(&mut self, now: Instant, new: Option<Instances>) {
+    fn note_changes(&mut self, now: Instant, new: Option<Instances>, allowances: &mut Allowances) {
         let Some(new) = new else {
             // A load alone does not tell who came: every placement is taken to have come as it was made.
-            self.settling.extend(self.in_flight.drain(..).map(|at| Change { at, clients: 1.0 }));
+            self.settling.extend(self.in_flight.drain(..).map(|Placement { at, .. }| Change { at, clients: 1.0 }));
             return;
         };
         let old = self.last.and_then(|(at, report)| report.instances.map(|old| (at, old)));
@@ -233,7 +250,10 @@ impl Server {
         // The latest placements are taken to be those that came. Nothing tells clients apart; were the oldest taken, then
         // a client that never comes would stay in flight as long as others follow it.
         let first = self.in_flight.len() - came;
-        self.settling.extend(self.in_flight.drain(first..).map(|at| Change { at, clients: 1.0 }));
+        for Placement { at, from } in self.in_flight.drain(first..) {
+            self.settling.push_back(Change { at, clients: 1.0 });
+            from.into_iter().for_each(|from| allowances.came(from));
+        }
         // Those who left, less those who came without having been sent; some time since the last report.
         let came = f64::from(u32::try_from(came).unwrap_or(u32::MAX));
         let others = f64::from(new.present) - f64::from(old.present) - came;

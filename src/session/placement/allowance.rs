@@ -1,0 +1,103 @@
+//! How many placements of one client address count: so that an address whose clients never come can't close a fleet.
+//!
+//! Each placement uses up room until its client comes or is given up, so that somebody who only asks, again and again,
+//! could keep everybody out. An address starts with an allowance that is enough for a class behind one address. A client
+//! that does not come halves it, one that comes doubles it, as TCP does with its window (Chiu and Jain, 1989, on why such
+//! a rule is fair and stable). What exceeds the allowance is placed like everything else, but takes no room.
+
+use std::collections::{HashMap, VecDeque};
+use std::net::IpAddr;
+use std::time::{Duration, Instant};
+
+/// The allowance of an address that nothing is known of: more than a large class.
+const CLASS: usize = 1024;
+/// From so many addresses on, those are forgotten of which nothing is on its way.
+const MANY: usize = 10_000;
+
+/// What is known of client addresses.
+#[derive(Debug, Default)]
+pub(super) struct Allowances {
+    addresses: HashMap<IpAddr, Allowance>,
+}
+
+/// One address.
+#[derive(Debug)]
+struct Allowance {
+    most: usize,
+    /// When its placements that count were made, oldest first; none is older than the policy's patience.
+    recent: VecDeque<Instant>,
+    /// When it asked last.
+    asked: Instant,
+}
+
+impl Allowances {
+    /// Whether another placement of this address counts; if so, it is one of its allowance for so long.
+    pub(super) fn take(&mut self, address: IpAddr, now: Instant, patience: Duration) -> bool {
+        if self.addresses.len() >= MANY && !self.addresses.contains_key(&address) {
+            self.addresses.retain(|_, known| now.saturating_duration_since(known.asked) < patience);
+        }
+        let new = || Allowance { most: CLASS, recent: VecDeque::new(), asked: now };
+        let known = self.addresses.entry(address).or_insert_with(new);
+        known.asked = now;
+        let old = known.recent.partition_point(|made| now.saturating_duration_since(*made) >= patience);
+        known.recent.drain(..old);
+        let counts = known.recent.len() < known.most;
+        if counts {
+            known.recent.push_back(now);
+        }
+        counts
+    }
+
+    /// A client of this address has come to where it was sent.
+    pub(super) fn came(&mut self, address: IpAddr) {
+        if let Some(known) = self.addresses.get_mut(&address) {
+            known.most = (known.most * 2).min(CLASS);
+        }
+    }
+
+    /// A client of this address has not come.
+    pub(super) fn missed(&mut self, address: IpAddr) {
+        if let Some(known) = self.addresses.get_mut(&address) {
+            known.most = (known.most / 2).max(1);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const PATIENCE: Duration = Duration::from_secs(15);
+
+    fn address(number: u32) -> IpAddr {
+        std::net::Ipv4Addr::from_bits(number).into()
+    }
+
+    fn taken(allowances: &mut Allowances, now: Instant) -> usize {
+        (0..2 * CLASS).filter(|_| allowances.take(address(1), now, PATIENCE)).count()
+    }
+
+    #[test]
+    fn a_class_counts_and_those_who_never_come_count_less_and_less() {
+        let start = Instant::now();
+        let mut allowances = Allowances::default();
+        assert_eq!(taken(&mut allowances, start), CLASS);
+        assert_eq!(taken(&mut allowances, start + PATIENCE / 2), 0, "all of it is in use");
+        (0..4).for_each(|_| allowances.missed(address(1)));
+        assert_eq!(taken(&mut allowances, start + PATIENCE), CLASS / 16);
+        (0..99).for_each(|_| allowances.missed(address(1)));
+        assert_eq!(taken(&mut allowances, start + PATIENCE * 2), 1, "one is left to prove itself by");
+        (0..99).for_each(|_| allowances.came(address(1)));
+        assert_eq!(taken(&mut allowances, start + PATIENCE * 3), CLASS);
+    }
+
+    #[test]
+    fn what_is_known_of_addresses_is_bounded() {
+        let start = Instant::now();
+        let mut allowances = Allowances::default();
+        for number in 0..3 * u32::try_from(MANY).unwrap() {
+            allowances.take(address(number), start + PATIENCE / 1000 * number, PATIENCE);
+        }
+        assert!(allowances.addresses.len() <= MANY);
+    }
+}
