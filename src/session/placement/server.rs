@@ -252,7 +252,9 @@ impl Server {
         let first = self.in_flight.len() - came;
         for Placement { at, from } in self.in_flight.drain(first..) {
             self.settling.push_back(Change { at, clients: 1.0 });
-            from.into_iter().for_each(|from| allowances.came(from));
+            if let Some(from) = from {
+                allowances.came(from);
+            }
         }
         // Those who left, less those who came without having been sent; some time since the last report.
         let came = f64::from(u32::try_from(came).unwrap_or(u32::MAX));
