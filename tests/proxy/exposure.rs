@@ -40,7 +40,12 @@ async fn only_the_fleet_is_reachable(rules: Rules) {
         format!("/{here}:{private}/"),
         format!("/0{private}/"),
         format!("/{here}0/"),
-        format!("/{session}/status"),
+        format!("/{session}/x"),
+        format!("/{session}/{private}/"),
+        format!("/{session}/../{private}/"),
+        format!("/{session}@127.0.0.1:{private}/"),
+        format!("/{session}0/status"),
+        format!("/{here}/{private}"),
         format!("/assets/../{private}/"),
         "/server-status".to_owned(),
     ];
@@ -63,15 +68,27 @@ async fn only_the_fleet_is_reachable_through_nginx() {
     only_the_fleet_is_reachable(Rules::Nginx).await;
 }
 
-#[actix_rt::test]
-async fn the_documents_rule_reaches_every_port_of_the_machine() {
-    let fleet = Fleet::start(Rules::DocumentsPorts).await;
+async fn every_port_is_reached(rules: Rules) {
+    let fleet = Fleet::start(rules).await;
     let private = private_service();
     assert_eq!(fleet.browser.get(&format!("/{private}/")).await.text(), "secret");
     for port in ["22", "5432", "1"] {
         let answer = fleet.browser.get(&format!("/{port}/")).await;
         assert_ne!(answer.status, 404, "port {port} was tried, whether somebody listens there or not");
+        // Where nobody listens, Apache tells of its attempt; else it tells how it was answered.
+        let tried = fleet.web.log().contains(&format!("127.0.0.1:{port} ")) || answer.status == 502;
+        assert!(tried || answer.status.is_success(), "{port}: {} {}", answer.status, fleet.web.log());
     }
+}
+
+#[actix_rt::test]
+async fn the_documents_rule_for_ports_reaches_every_port_of_the_machine() {
+    every_port_is_reached(Rules::DocumentsPorts).await;
+}
+
+#[actix_rt::test]
+async fn the_documents_rules_for_a_machine_reach_every_port_of_the_machine() {
+    every_port_is_reached(Rules::DocumentsMachine).await;
 }
 
 async fn pages_are_sent_on_to_https_and_the_bare_name(rules: Rules) {

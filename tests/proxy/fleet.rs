@@ -58,6 +58,8 @@ impl Fleet {
             .set("examples", examples)
             // The machine that runs the tests may be busy.
             .set("loadThreshold", 1000)
+            .set("timing.gather", 0.1)
+            .set("timing.flapping", 0.1)
             .env("SSL_CERT_FILE", authority.file().to_str().unwrap());
         let session = keys(behind(session, &host)).spawn();
         let ports = |server: &Server| (server.port..=server.port + PLACES).collect::<Vec<_>>();

@@ -12,6 +12,9 @@
 )]
 #![allow(clippy::pedantic, reason = "tests are read one by one")]
 
+#[path = "../mail/smtp.rs"]
+#[expect(dead_code, reason = "the tests of mails use the rest")]
+mod smtp;
 #[path = "../support/mod.rs"]
 mod support;
 
@@ -26,5 +29,6 @@ mod connections;
 mod exposure;
 mod pages;
 mod trust;
+mod urls;
 mod visitor;
 mod whole_way;

@@ -50,6 +50,7 @@ impl Rules {
             Self::Apache => adapt(
                 include_str!("../../deploy/apache.conf"),
                 &[
+                    ("  #Rewrite", "  Rewrite"),
                     ("fleet.example.org", "localhost"),
                     ("*:80>", &format!("127.0.0.1:{http}>")),
                     ("*:443>", &format!("127.0.0.1:{https}>")),
@@ -64,6 +65,9 @@ impl Rules {
             Self::Nginx => adapt(
                 include_str!("../../deploy/nginx.conf"),
                 &[
+                    ("  #location", "  location"),
+                    ("  #  ", "    "),
+                    ("  #}", "  }"),
                     ("/etc/letsencrypt/live/fleet.example.org/fullchain.pem", chain),
                     ("/etc/letsencrypt/live/fleet.example.org/privkey.pem", key),
                     ("fleet.example.org", "localhost"),

@@ -4,6 +4,7 @@ use rcgen::CertificateParams;
 use serde_json::Value;
 
 use crate::authority::{Authority, Certificate};
+use crate::smtp::Smtp;
 use crate::support::program::{Builder, Server, session_server};
 use crate::support::{http, ports, until};
 use crate::web_server::{Kind, WebServer};
@@ -31,14 +32,21 @@ async fn page_of_the_server(session: &Server, state: &str) -> Value {
     server().await
 }
 
-/// What the session server says of a server with this certificate, when it trusts this authority.
+/// What the session server says of a server with this certificate, when it trusts this authority: the same in its
+/// answers, its log, its page and its mail.
 async fn verdict(certificate: &Certificate, trusted: &Authority) -> String {
     let (_web, port) = web_server(certificate).await;
+    let mut smtp = Smtp::start(&[]).await;
     let session = watcher(&format!("localhost:{port}/2000")).env("SSL_CERT_FILE", trusted.file().to_str().unwrap());
+    let session = session.set("administrator", "admin@example.org").set("mailSender", "fleet@example.org");
+    let session = session.set("mailServer", "127.0.0.1").set("mailServerPort", smtp.port).set("timing.gather", 0.1);
     let session = session.start().await;
     let error = page_of_the_server(&session, "down").await["error"].as_str().unwrap().to_owned();
     assert!(session.log().contains(&error), "{error} is not in the log");
     assert!(http::get(&session.url("/monitor")).await.text().contains("its certificate is not trusted"));
+    let mail = smtp.mail().await;
+    let told = mail.field("text").split_whitespace().collect::<Vec<_>>().join(" ");
+    assert!(told.contains(&error), "{error} is not in the mail: {told}");
     error.strip_prefix("no connection: its certificate is not trusted: ").unwrap_or(&error).to_owned()
 }
 

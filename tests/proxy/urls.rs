@@ -1,0 +1,81 @@
+//! URLs that the servers hand out: they lead through the web server, from wherever they were read.
+
+use crate::fleet::Fleet;
+use crate::rules::Rules;
+use crate::smtp::Smtp;
+use crate::support::http;
+use crate::support::until;
+
+/// The first URL of a text.
+fn first_url(text: &str) -> &str {
+    let begin = text.find("http").unwrap_or_else(|| panic!("no URL in {text}"));
+    text[begin..].split([' ', '\n', '\r', '"']).next().unwrap()
+}
+
+async fn urls_lead_through_the_web_server(rules: Rules) {
+    let mut smtp = Smtp::start(&[]).await;
+    let port = smtp.port;
+    let fleet = Fleet::start_with(rules, |server| {
+        let server = server.set("administrator", "admin@example.org").set("mailSender", "fleet@example.org");
+        server.set("mailServer", "127.0.0.1").set("mailServerPort", port)
+    })
+    .await;
+    let Fleet { browser, session, here, there, .. } = fleet;
+
+    // A page, and what its parts are told.
+    for server in [&here, &there] {
+        let monitor = format!("https://{}/{}/monitor", browser.host, server.port);
+        assert!(browser.get(&rules.session_path(session.port, "/monitor")).await.text().contains(&monitor));
+        let status = browser.get(&rules.session_path(session.port, "/status")).await.json();
+        let named: Vec<_> = status["servers"].as_array().unwrap().iter().map(|one| one["monitor"].clone()).collect();
+        assert!(named.contains(&monitor.clone().into()), "{named:?}");
+        assert_eq!(browser.ask(&monitor, &[]).await.status, 200);
+    }
+    // An answer.
+    let question = format!("{}?url={}", rules.session_path(session.port, "/session"), crate::fleet::arm());
+    until("a page is given a simulation server", async || browser.get(&question).await.status == 200).await;
+    let given = browser.get(&question).await.text();
+    assert!(given.starts_with(&format!("wss://{}/", browser.host)), "{given}");
+    browser.open(&format!("{given}/client")).await.leave().await;
+    // The log, and the first line that is printed.
+    let door = format!("https://{}/{}", browser.host, session.port);
+    assert!(session.log().contains(&format!("listens on port {}: {door}", session.port)), "{}", session.log());
+    assert_eq!(browser.ask(&format!("{door}/monitor"), &[]).await.status, 200);
+
+    // A mail.
+    let lost = format!("{}/{}", browser.host, there.port);
+    drop(there);
+    let mail = loop {
+        let mail = smtp.mail().await;
+        // Before there was a web server, none of them answered.
+        if mail.subject() == format!("Simulation server not responding: {lost}") {
+            break mail;
+        }
+    };
+    for body in [mail.field("text"), mail.field("html")] {
+        assert!(body.contains(&format!("{door}/monitor")), "{body}");
+    }
+    let link = first_url(mail.field("text"));
+    assert_eq!(browser.ask(link, &[]).await.status, 200, "{link} in {}", mail.field("text"));
+    assert_eq!(http::get(&session.url("/health")).await.status, 200);
+}
+
+#[actix_rt::test]
+async fn urls_lead_through_apache() {
+    urls_lead_through_the_web_server(Rules::Apache).await;
+}
+
+#[actix_rt::test]
+async fn urls_lead_through_nginx() {
+    urls_lead_through_the_web_server(Rules::Nginx).await;
+}
+
+#[actix_rt::test]
+async fn urls_lead_through_apache_with_the_documents_rule_for_ports() {
+    urls_lead_through_the_web_server(Rules::DocumentsPorts).await;
+}
+
+#[actix_rt::test]
+async fn urls_lead_through_apache_with_the_documents_rules_for_a_machine() {
+    urls_lead_through_the_web_server(Rules::DocumentsMachine).await;
+}
