@@ -66,6 +66,8 @@ fn an_open_display_is_told_from_one_that_refuses_and_one_that_is_gone() {
     let gone = open.display.clone();
     drop(open);
     assert_eq!(look(&gone), Err(Trouble::NoServer(gone.clone())));
+    let words = Trouble::NoServer(gone).to_string();
+    assert!(words.contains("Xvfb") && words.contains("nvidia-xconfig --allow-empty-initial-configuration"), "{words}");
 
     let cookies = authority(folder.path());
     let locked = Xvfb::start(Some(&cookies)).unwrap();
@@ -77,6 +79,26 @@ fn an_open_display_is_told_from_one_that_refuses_and_one_that_is_gone() {
         }
         other => panic!("{other:?}"),
     }
+}
+
+#[test]
+fn a_display_that_refuses_is_opened_by_what_is_told() {
+    let _alone = DISPLAYS.lock().unwrap_or_else(PoisonError::into_inner);
+    let folder = tempfile::tempdir().unwrap();
+    let cookies = authority(folder.path());
+    let Some(locked) = Xvfb::start(Some(&cookies)) else { return };
+    let words = look(&locked.display).unwrap_err().to_string();
+    let told = words.split("run '").nth(1).and_then(|rest| rest.split('\'').next()).unwrap();
+    let mut xhost = Command::new("sh");
+    xhost.args(["-c", told]).env("DISPLAY", &locked.display).env("XAUTHORITY", &cookies);
+    let output = xhost.output().unwrap();
+    if output.status.code() == Some(127) {
+        assert!(std::env::var_os("CI").is_none(), "xhost is missing");
+        eprintln!("not tested: xhost is not installed");
+        return;
+    }
+    assert!(output.status.success(), "{told}: {}", String::from_utf8_lossy(&output.stderr));
+    assert_eq!(look(&locked.display), Ok(()));
 }
 
 #[test]
@@ -107,4 +129,11 @@ fn check_tells_which_case_it_is() {
         );
         assert!(told.lines().any(|line| line.starts_with(&words)), "{words} is not in\n{told}");
     }
+    // Whether this machine has a display :0 or not.
+    let (_, told) = crate::preflight::check(&serde_json::json!({}), |command| {
+        command.env_remove("DISPLAY");
+    });
+    let line = told.lines().find(|line| line.contains("display: ")).unwrap_or_else(|| panic!("{told}"));
+    assert!(line.contains(":0 ") || line.contains(":0:"), "{line}");
+    assert!(line.ends_with("(DISPLAY is not set, and the configuration names no display)"), "{line}");
 }

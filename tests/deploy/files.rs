@@ -57,8 +57,14 @@ fn systemd_finds_no_fault_in_the_units() {
 #[test]
 fn the_units_expose_little() {
     // The simulation server runs programs of others on the graphics card and a display, and can't close itself off more.
-    for (unit, most) in [("webots-session@.service", 2.0), ("webots-simulation@.service", 5.0)] {
-        let file = deploy("systemd/system").join(unit);
+    // A user's own manager can't take away more than system calls.
+    for (unit, most) in [
+        ("system/webots-session@.service", 1.5),
+        ("system/webots-simulation@.service", 4.0),
+        ("user/webots-session@.service", 6.5),
+        ("user/webots-simulation@.service", 8.0),
+    ] {
+        let file = deploy("systemd").join(unit);
         let arguments = ["security", "--offline=true", "--no-pager", file.to_str().unwrap()];
         let Some((_, said)) = run("systemd-analyze", &arguments) else { return };
         let line =
@@ -66,6 +72,28 @@ fn the_units_expose_little() {
         let level: f64 = line.rsplit(": ").next().unwrap().split_whitespace().next().unwrap().parse().unwrap();
         assert!(level <= most, "{unit}: {level}\n{said}");
     }
+}
+
+#[test]
+fn the_units_and_the_script_start_the_same_programs_with_a_configuration_each() {
+    for unit in units().iter().filter(|unit| unit.extension().is_some_and(|kind| kind == "service")) {
+        let text = std::fs::read_to_string(unit).unwrap();
+        let kind = if unit.to_str().unwrap().contains("webots-session@") { "session" } else { "simulation" };
+        let command = text.lines().find_map(|line| line.strip_prefix("ExecStart=")).unwrap();
+        let folder = if unit.to_str().unwrap().contains("/user/") { "%E" } else { "/etc" };
+        assert_eq!(
+            command,
+            format!("/usr/bin/{kind}-server {folder}/webots-fleet/{kind}/%i.json"),
+            "{}",
+            unit.display()
+        );
+        for line in ["Type=notify", "WatchdogSec=30", "Restart=on-failure", "RestartPreventExitStatus=2"] {
+            assert!(text.lines().any(|one| one == line), "{line} is not in {}", unit.display());
+        }
+    }
+    let script = std::fs::read_to_string(deploy("../server.sh")).unwrap();
+    assert!(script.contains(r#""$BIN/$1-server" "$(config_of "$1" "$2")""#));
+    assert!(script.contains("config_of() { printf 'config/%s/%s.json' "));
 }
 
 #[test]
