@@ -15,7 +15,7 @@ PATH=$PATH:/usr/sbin
 # fleet is tested behind both web servers, by a real browser too, and its package in a Debian that debootstrap makes.
 tests/install.sh cc=gcc,libc6-dev git=git flock=util-linux openssl=openssl python3=python3 python3-venv=python3-venv \
     xvfb-run=xvfb,xauth apache2=apache2-bin nginx=nginx setpriv=util-linux chromium=chromium \
-    debootstrap=debootstrap
+    debootstrap=debootstrap desktop-file-validate=desktop-file-utils xhost=x11-xserver-utils ip=iproute2
 tests/python.sh >/dev/null
 
 start=$SECONDS
@@ -24,5 +24,6 @@ cargo test --locked --no-fail-fast "$@" || code=$?
 # With arguments, only some tests are wanted.
 (($# > 0)) || FLEET_BIN=${FLEET_BIN:-$PWD/target/debug} tests/browser/run || code=$?
 (($# > 0)) || FLEET_BIN=${FLEET_BIN:-$PWD/target/debug} tests/deploy/package.sh || code=$?
+(($# > 0)) || FLEET_BIN=${FLEET_BIN:-$PWD/target/debug} tests/deploy/guide.sh || code=$?
 echo "tests: $(((SECONDS - start) / 60)) min $(((SECONDS - start) % 60)) s, build included"
 exit "$code"
