@@ -114,3 +114,15 @@ async fn apache_sends_pages_on_to_https_and_the_bare_name() {
 async fn nginx_sends_pages_on_to_https_and_the_bare_name() {
     pages_are_sent_on_to_https_and_the_bare_name(Rules::Nginx).await;
 }
+
+#[actix_rt::test]
+async fn of_the_documents_redirects_one_works_and_the_other_never_applies() {
+    let table =
+        [(Rules::DocumentsMachine, 302, Some("https://localhost/2000/monitor")), (Rules::DocumentsPorts, 404, None)];
+    for (rules, status, location) in table {
+        let fleet = Fleet::start(rules).await;
+        let plain = format!("http://localhost:{}/2000/monitor", fleet.browser.plain);
+        let answer = fleet.browser.ask(&plain, &[]).await;
+        assert_eq!((answer.status.as_u16(), answer.header("location")), (status, location), "{rules:?}");
+    }
+}
