@@ -15,7 +15,9 @@
 mod support;
 
 mod admission;
+mod cache;
 mod checkout;
+mod commits;
 mod git_wrapper;
 mod life;
 mod output;
