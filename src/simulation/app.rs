@@ -19,12 +19,12 @@ use super::git::Git;
 use super::instance_dir::{RunDir, Swept};
 use super::limits::Limits;
 use super::load_monitor::LoadMonitor;
-use super::outcome;
 use super::places::{Census, Places};
 use super::repository_cache::RepositoryCache;
 use super::routes;
 use super::server::Server;
 use super::usage::UsageMonitor;
+use super::{orphans, outcome};
 use crate::shared::admission::Rules;
 use crate::shared::connections::Connections;
 use crate::shared::live::Live;
@@ -72,6 +72,8 @@ const LOOK: Duration = Duration::from_millis(50);
 /// When it can't start, or an actor that must live is gone.
 pub async fn run(config: SimulationConfig) -> Result<(), AppError> {
     let mut signals = Signals::catch()?;
+    orphans::adopt()?;
+    actix_rt::spawn(orphans::watch());
     let (phase_sender, phase) = watch::channel(Phase::Open);
     let (requests, mut asked) = tokio::sync::mpsc::channel(4);
     let socket = bind(&config)?;

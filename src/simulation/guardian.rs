@@ -11,6 +11,7 @@
 //!
 //! It is synchronous: three threads that wait, and nothing else.
 
+use std::collections::BTreeSet;
 use std::io::Read;
 use std::os::unix::process::CommandExt;
 use std::path::PathBuf;
@@ -22,9 +23,9 @@ use nix::errno::Errno;
 use nix::sys::prctl;
 use nix::sys::signal::{SigSet, Signal, killpg};
 use nix::sys::wait::{WaitStatus, waitpid};
-use nix::unistd::Pid;
+use nix::unistd::{Pid, setsid};
 
-use super::process_tree;
+use super::{process_tree, x_lock};
 
 /// What a guardian is told on its command line.
 #[derive(Debug, clap::Args)]
@@ -72,6 +73,8 @@ pub fn guard(orders: &Orders) -> u8 {
 
 fn run(orders: &Orders) -> Result<u8, String> {
     let (program, arguments) = orders.command.split_first().ok_or("no program is named")?;
+    // Nothing of the program's can come back into the server's session: by that the server knows its own children.
+    setsid().map_err(|error| format!("can't lead a session: {error}"))?;
     prctl::set_child_subreaper(true).map_err(|error| format!("can't adopt orphans: {error}"))?;
     let child = Command::new(program)
         .args(arguments)
@@ -133,10 +136,11 @@ fn end_tree(events: &Receiver<Event>) {
     let end = Instant::now() + VANISH;
     let own = i32::try_from(std::process::id()).unwrap_or_default();
     let mut pause = Duration::from_millis(1);
+    let mut killed = BTreeSet::new();
     while Instant::now() < end {
-        process_tree::kill_descendants(own);
+        killed.extend(process_tree::kill_descendants(own));
         match events.recv_timeout(pause) {
-            Ok(Event::Empty) | Err(RecvTimeoutError::Disconnected) => return,
+            Ok(Event::Empty) | Err(RecvTimeoutError::Disconnected) => return x_lock::remove_of(&killed),
             Ok(_) | Err(RecvTimeoutError::Timeout) => pause = (pause * 2).min(Duration::from_millis(100)),
         }
     }

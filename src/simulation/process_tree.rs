@@ -28,8 +28,10 @@ pub fn descendants(root: i32) -> Vec<i32> {
     found
 }
 
-/// A process that has ended has no children; that is no fault.
-fn children(pid: i32) -> Vec<i32> {
+/// The children of a process, those that were not buried yet among them. One that has ended has none; that is no
+/// fault.
+#[must_use]
+pub fn children(pid: i32) -> Vec<i32> {
     let Ok(tasks) = Process::new(pid).and_then(|process| process.tasks()) else {
         return Vec::new();
     };
@@ -37,9 +39,19 @@ fn children(pid: i32) -> Vec<i32> {
     tasks.flatten().flat_map(of_task).filter_map(|child| i32::try_from(child).ok()).collect()
 }
 
-/// Ends all descendants of a process. They are stopped first, so that none can fork its way out, then killed.
-pub fn kill_descendants(root: i32) {
-    let mut known = HashSet::new();
+/// Ends all descendants of a process, and gives back which they were.
+pub fn kill_descendants(root: i32) -> HashSet<i32> {
+    kill_below(root, HashSet::new())
+}
+
+/// Ends a process and all its descendants, and gives back which they were.
+pub fn kill_tree(root: i32) -> HashSet<i32> {
+    signal_each([&root], Signal::SIGSTOP);
+    kill_below(root, HashSet::from([root]))
+}
+
+/// They are stopped first, so that none can fork its way out, then killed.
+fn kill_below(root: i32, mut known: HashSet<i32>) -> HashSet<i32> {
     loop {
         let fresh: Vec<i32> = descendants(root).into_iter().filter(|pid| known.insert(*pid)).collect();
         if fresh.is_empty() {
@@ -48,6 +60,7 @@ pub fn kill_descendants(root: i32) {
         signal_each(&fresh, Signal::SIGSTOP);
     }
     signal_each(known.iter(), Signal::SIGKILL);
+    known
 }
 
 /// Ends every process that carries the mark of an instance below `folder`, in whatever tree it is now.

@@ -146,6 +146,43 @@ async fn a_guardian_that_is_killed_takes_its_tree_along_and_the_client_is_told()
 }
 
 #[actix_rt::test]
+async fn nothing_hides_from_the_death_of_its_guardian() {
+    let (forge, folder) = (Forge::with_arm(), tempfile::tempdir().unwrap());
+    let pids = folder.path().join("pids");
+    // Without environment, in sessions of their own, without parents.
+    let hide = "for n in 1 2 3; do (env -i setsid bash -c 'echo $$ >> \"$0\"; sleep 1000 & wait'";
+    let webots = Webots::script(&format!("{hide} {} &); done\n{DEMO} \"$@\" & wait", pids.display()));
+    let server = quick(simulation_server(&webots.path(), forge.path(), 1)).start().await;
+    let mut client = Client::start(&server, &arm()).await;
+    client.until("webots:").await;
+    let hidden = || -> Vec<i32> {
+        let text = std::fs::read_to_string(&pids).unwrap_or_default();
+        text.lines().map(|line| line.parse().unwrap()).collect()
+    };
+    until("they hide", async || hidden().len() == 3).await;
+    let hidden: Vec<i32> = hidden().into_iter().flat_map(|pid| [vec![pid], children(pid)].concat()).collect();
+    assert!(hidden.len() > 3 && hidden.iter().all(|pid| is_there(*pid)));
+    let marked = instances_below(&server.folder);
+    assert!(!marked.iter().any(|(pid, _)| hidden.contains(pid)), "the mark tells of them");
+    let guardian = marked.iter().find(|one| one.1.contains("guard") && one.1.contains("--remove")).unwrap().0;
+    kill(Pid::from_raw(guardian), Signal::SIGKILL).unwrap();
+    let told = client.until("loading: Error:").await;
+    assert!(told.contains("Webots was ended by the signal SIGKILL"), "{told}");
+    assert!(!hidden.iter().any(|pid| is_there(*pid)), "it was told before they were gone");
+    nothing_left(&server, 1).await;
+    until("all are buried", async || children(server.pid()).is_empty()).await;
+}
+
+fn is_there(pid: i32) -> bool {
+    procfs::process::Process::new(pid).is_ok_and(|process| process.stat().is_ok_and(|stat| stat.state != 'Z'))
+}
+
+fn children(pid: i32) -> Vec<i32> {
+    let all = procfs::process::all_processes().unwrap().flatten();
+    all.filter(|one| one.stat().is_ok_and(|stat| stat.ppid == pid)).map(|one| one.pid()).collect()
+}
+
+#[actix_rt::test]
 async fn a_client_is_told_how_webots_ended() {
     let table = [
         ("exit 0", "loading: Webots has ended"),
