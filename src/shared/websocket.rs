@@ -119,10 +119,14 @@ impl Inbox {
     fn count(&self, message: &Result<Message, ProtocolError>) {
         let content = match message {
             Ok(Message::Text(text)) => text.len(),
-            Ok(Message::Binary(data) | Message::Ping(data) | Message::Pong(data)) => data.len(),
-            Ok(Message::Continuation(
-                Item::FirstText(data) | Item::FirstBinary(data) | Item::Continue(data) | Item::Last(data),
-            )) => data.len(),
+            Ok(
+                Message::Binary(data)
+                | Message::Ping(data)
+                | Message::Pong(data)
+                | Message::Continuation(
+                    Item::FirstText(data) | Item::FirstBinary(data) | Item::Continue(data) | Item::Last(data),
+                ),
+            ) => data.len(),
             Ok(Message::Close(_) | Message::Nop) => 0,
             Err(_) => return,
         };

@@ -24,7 +24,7 @@ use super::repository_cache::RepositoryCache;
 use super::routes;
 use super::server::Server;
 use super::usage::UsageMonitor;
-use super::{orphans, outcome};
+use super::{orphans, outcome, process_group};
 use crate::shared::admission::Rules;
 use crate::shared::connections::Connections;
 use crate::shared::live::Live;
@@ -78,6 +78,7 @@ pub async fn run(config: SimulationConfig) -> Result<(), AppError> {
     let (requests, mut asked) = tokio::sync::mpsc::channel(4);
     let socket = bind(&config)?;
     let server = Arc::new(assemble(config, phase, requests)?);
+    let _last_will = process_group::remove_in_the_end(server.run.path())?;
     let shared = web::Data::from(Arc::clone(&server));
     let http = HttpServer::new(move || App::new().app_data(shared.clone()).configure(routes::configure))
         // Messages are small, and must not wait for the answer to the one before.

@@ -5,7 +5,7 @@ use std::fmt;
 use std::future::Future;
 use std::io::{PipeWriter, Write};
 use std::os::unix::process::ExitStatusExt;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::{ExitStatus, Stdio};
 use std::time::Duration;
 
@@ -104,6 +104,18 @@ impl ProcessGroup {
         // A guardian that no longer reads has nothing left to end.
         self.lifeline.write_all(b".").ok();
     }
+}
+
+/// Has a folder removed when the server ends, in whatever way: as soon as nobody holds what is given back.
+///
+/// # Errors
+/// When the system can start no more processes.
+pub fn remove_in_the_end(folder: &Path) -> std::io::Result<PipeWriter> {
+    let (reader, lifeline) = std::io::pipe()?;
+    let mut command = tokio::process::Command::new("/proc/self/exe");
+    command.arg0("simulation-server").args(["guard", "--remove"]).arg(folder);
+    orphans::start(command.stdin(reader).stdout(Stdio::null()).stderr(Stdio::null()))?;
+    Ok(lifeline)
 }
 
 /// Starts a program that starts no other; dropping the future kills it, and so does the kernel when the server ends.

@@ -40,11 +40,13 @@ pub fn children(pid: i32) -> Vec<i32> {
 }
 
 /// Ends all descendants of a process, and gives back which they were.
+#[must_use]
 pub fn kill_descendants(root: i32) -> HashSet<i32> {
     kill_below(root, HashSet::new())
 }
 
 /// Ends a process and all its descendants, and gives back which they were.
+#[must_use]
 pub fn kill_tree(root: i32) -> HashSet<i32> {
     signal_each([&root], Signal::SIGSTOP);
     kill_below(root, HashSet::from([root]))
@@ -153,7 +155,7 @@ mod tests {
         std::io::BufRead::read_line(&mut std::io::BufReader::new(shell.stdout.take().unwrap()), &mut line).unwrap();
         let pid = i32::try_from(shell.id()).unwrap();
         assert_eq!(descendants(pid).len(), 2);
-        kill_descendants(pid);
+        assert_eq!(kill_descendants(pid).len(), 2);
         assert!(shell.wait().is_ok());
         assert!(descendants(pid).is_empty());
     }

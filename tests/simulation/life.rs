@@ -8,7 +8,7 @@ use nix::unistd::Pid;
 use crate::scene::{ALL, DEMO, Scene, State, arm, instance_folders, nothing_left, stages};
 use crate::support::client::Client;
 use crate::support::git::Forge;
-use crate::support::program::{Builder, simulation_server};
+use crate::support::program::{Builder, Server, simulation_server};
 use crate::support::until;
 use crate::support::webots::{Webots, instances_below};
 
@@ -106,15 +106,16 @@ async fn a_server_that_is_killed_leaves_nothing_in_any_state() {
         scene.server.signal(Signal::SIGKILL);
         scene.server.ended().await;
         until("all processes are gone", async || instances_below(scene.folder.path()).is_empty()).await;
-        if !matches!(state, State::Connected | State::CheckingOut) {
-            until("its folder is gone", async || instance_folders(scene.folder.path()).is_empty()).await;
-        }
+        let runs = scene.folder.path().join("cache/runs");
+        until("its folder is gone", async || std::fs::read_dir(&runs).unwrap().count() == 0).await;
     }
 }
 
 #[actix_rt::test]
 async fn what_a_killed_server_has_left_is_removed_at_the_next_start() {
     let mut scene = Scene::new(State::CheckingOut, quick).await;
+    // The one that removes the folder is killed too.
+    kill(Pid::from_raw(last_will(&scene.server)), Signal::SIGKILL).unwrap();
     scene.server.signal(Signal::SIGKILL);
     scene.server.ended().await;
     assert_eq!(instance_folders(scene.folder.path()).len(), 1);
@@ -170,7 +171,14 @@ async fn nothing_hides_from_the_death_of_its_guardian() {
     assert!(told.contains("Webots was ended by the signal SIGKILL"), "{told}");
     assert!(!hidden.iter().any(|pid| is_there(*pid)), "it was told before they were gone");
     nothing_left(&server, 1).await;
-    until("all are buried", async || children(server.pid()).is_empty()).await;
+    until("all are buried", async || children(server.pid()) == [last_will(&server)]).await;
+}
+
+/// The child of a server that removes the folder of its run.
+fn last_will(server: &Server) -> i32 {
+    let line = |pid: &i32| procfs::process::Process::new(*pid).and_then(|one| one.cmdline()).unwrap_or_default();
+    let is_it = |pid: &i32| line(pid).get(1..3).is_some_and(|words| words == ["guard", "--remove"]);
+    children(server.pid()).into_iter().find(is_it).unwrap()
 }
 
 fn is_there(pid: i32) -> bool {

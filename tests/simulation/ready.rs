@@ -193,7 +193,7 @@ async fn a_virtual_display_that_is_killed_leaves_no_trace() {
         client.until("webots:").await;
         let log = server.folder.join(format!("log/simulation/instances/{}.log", server.port + 1));
         let text = std::fs::read_to_string(log).unwrap();
-        let display = text.lines().filter_map(|line| line.strip_prefix("display :")).last().unwrap().to_owned();
+        let display = text.lines().filter_map(|line| line.strip_prefix("display :")).next_back().unwrap().to_owned();
         let traces = [format!("/tmp/.X{display}-lock"), format!("/tmp/.X11-unix/X{display}")].map(PathBuf::from);
         assert!(traces.iter().all(|path| path.exists()), "{traces:?}");
         let is_victim = |one: &&(i32, String)| match victim {
