@@ -27,7 +27,7 @@ static ENDING: Mutex<()> = Mutex::new(());
 
 /// Between two looks at orphans that are ending.
 const LOOK: Duration = Duration::from_millis(20);
-/// Between two looks for orphans: many processes end in a busy second.
+/// From the end of a child to the look for orphans: many end in a busy second, and one look serves all.
 const PAUSE: Duration = Duration::from_millis(50);
 /// How long killed processes may take to vanish.
 const VANISH: Duration = Duration::from_secs(10);
@@ -59,8 +59,8 @@ pub fn start(command: &mut Command) -> io::Result<Child> {
 pub async fn watch() -> io::Result<()> {
     let mut deaths = signal(SignalKind::child())?;
     while deaths.recv().await.is_some() {
-        actix_rt::task::spawn_blocking(end_all).await.ok();
         actix_rt::time::sleep(PAUSE).await;
+        actix_rt::task::spawn_blocking(end_all).await.ok();
     }
     Ok(())
 }

@@ -36,7 +36,7 @@ async fn a_message_may_come_in_pieces_and_must_not_be_large() {
     let mut client = connect().await;
     client.until("0").await;
     client.send_pieces(&[b"https://github.com/lab/arm", b"", b"/blob/main/worlds/a.wbt"]).await;
-    assert_eq!(client.until("Error").await, "Error: no simulation server available at the moment.");
+    assert_eq!(client.until("Error").await, "Error: no simulation server accepts https://github.com/lab/arm.");
     let piece = [b'x'; 5000];
     client.send_pieces(&[&piece, &piece]).await;
     assert_eq!(client.closed().await, Some(1009));
