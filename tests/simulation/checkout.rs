@@ -11,6 +11,7 @@ use crate::git_wrapper::GitWrapper;
 use crate::scene::{arm, instance_folders, nothing_left};
 use crate::support::client::Client;
 use crate::support::git::{Forge, WORLD, git, world};
+use crate::support::http;
 use crate::support::program::{Server, simulation_server};
 use crate::support::until;
 use crate::support::webots::{Webots, instances_below};
@@ -185,6 +186,7 @@ async fn a_remote_that_hangs_costs_only_its_own_client() {
     stuck.until("loading: looking for").await;
     let all = join_all((0..10).map(|_| async { outcome(&server, &arm()).await })).await;
     assert!(all.iter().all(|told| told.contains("opened [WorldInfo")), "{all:?}");
+    assert!(http::get(&server.url("/load")).await.text().parse::<f64>().is_ok());
     assert!(instances_below(&server.folder).iter().any(|one| one.1.contains("ls-remote")), "it still hangs");
     let told = stuck.until("loading: Error:").await;
     assert!(told.contains("Fetching https://github.com/lab/hangs took longer than 3 seconds"), "{told}");

@@ -199,8 +199,9 @@ async fn a_client_is_told_how_webots_ended() {
     ];
     let forge = Forge::with_arm();
     for (end, words) in table {
-        // It ends while it is launching, or when it was ready.
-        for start in [String::new(), format!("{DEMO} \"$@\" &\nsleep 0.5; echo pause")] {
+        // It ends while it is launching, when it was ready, or while it runs.
+        let ready = |pace: &str| format!("{DEMO} \"$@\" &\nsleep 0.5; echo {pace}");
+        for start in [String::new(), ready("pause"), ready("real-time")] {
             let webots = Webots::script(&format!("{start}\n{end}"));
             let server = quick(simulation_server(&webots.path(), forge.path(), 1)).start().await;
             let mut client = Client::start(&server, &arm()).await;
@@ -215,4 +216,15 @@ async fn a_client_is_told_how_webots_ended() {
             nothing_left(&server, 1).await;
         }
     }
+}
+
+#[actix_rt::test]
+async fn a_server_that_stops_takes_no_new_clients() {
+    let mut scene = Scene::new(State::Stopping, |builder| quick(builder).set("timing.grace", 2.0)).await;
+    scene.server.signal(Signal::SIGTERM);
+    until("it stops", async || scene.server.log().contains("stopping")).await;
+    let mut late = Client::start(&scene.server, &arm()).await;
+    assert_eq!(late.until("loading: Error:").await, "loading: Error: This simulation server is stopping");
+    assert_eq!(late.closed().await, Some(1001));
+    assert_eq!(scene.server.ended().await, Some(0));
 }

@@ -19,6 +19,7 @@ mod cache;
 mod checkout;
 mod commits;
 mod git_wrapper;
+mod https;
 mod life;
 mod output;
 mod places;
