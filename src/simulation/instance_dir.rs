@@ -119,6 +119,7 @@ fn sweep(runs: &Path) -> Swept {
             continue;
         }
         swept.runs += 1;
+        process_tree::await_guardians(&folder);
         swept.processes += process_tree::kill_marked(&folder);
         remove(&folder);
     }

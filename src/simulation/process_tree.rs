@@ -3,7 +3,7 @@
 use std::collections::HashSet;
 use std::ops::RangeInclusive;
 use std::path::Path;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
@@ -86,6 +86,21 @@ pub fn kill_marked(folder: &Path) -> usize {
     known.len()
 }
 
+/// Waits until the guardians of instances below `folder` have ended, whose server is gone: each is ending its tree, and
+/// knows more of it than the mark tells. Gives up after some seconds.
+pub fn await_guardians(folder: &Path) {
+    let deadline = Instant::now() + GUARDIANS;
+    let is_guardian = |pid: i32| {
+        let line = Process::new(pid).and_then(|process| process.cmdline());
+        line.is_ok_and(|line| line.get(1).is_some_and(|word| word == "guard"))
+    };
+    while marked(folder).into_iter().any(is_guardian) && Instant::now() < deadline {
+        std::thread::sleep(BETWEEN_LOOKS);
+    }
+}
+
+/// How long guardians that have lost their server may take.
+const GUARDIANS: Duration = Duration::from_secs(5);
 /// How often marked processes are looked for.
 const MOST_LOOKS: usize = 200;
 /// Between two looks: killed processes need a moment to vanish.

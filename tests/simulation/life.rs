@@ -1,5 +1,6 @@
 //! Leaving a simulation in every state and for every reason: nothing of it is left.
 
+use std::path::Path;
 use std::time::{Duration, Instant};
 
 use nix::sys::signal::{Signal, kill};
@@ -9,8 +10,8 @@ use crate::scene::{ALL, DEMO, Scene, State, arm, instance_folders, nothing_left,
 use crate::support::client::Client;
 use crate::support::git::Forge;
 use crate::support::program::{Builder, Server, simulation_server};
-use crate::support::until;
 use crate::support::webots::{Webots, instances_below};
+use crate::support::{http, until};
 
 fn quick(builder: Builder) -> Builder {
     builder.set("timing.grace", 0.3).set("timing.heartbeat", 0.2)
@@ -146,25 +147,30 @@ async fn a_guardian_that_is_killed_takes_its_tree_along_and_the_client_is_told()
     }
 }
 
-#[actix_rt::test]
-async fn nothing_hides_from_the_death_of_its_guardian() {
-    let (forge, folder) = (Forge::with_arm(), tempfile::tempdir().unwrap());
-    let pids = folder.path().join("pids");
-    // Without environment, in sessions of their own, without parents.
+/// A server whose Webots has hidden processes: without environment, in sessions of their own, without parents.
+async fn hiding(folder: &Path) -> (Server, Client, Vec<i32>, (Forge, Webots)) {
+    let forge = Forge::with_arm();
+    let pids = folder.join("pids");
     let hide = "for n in 1 2 3; do (env -i setsid bash -c 'echo $$ >> \"$0\"; sleep 1000 & wait'";
     let webots = Webots::script(&format!("{hide} {} &); done\n{DEMO} \"$@\" & wait", pids.display()));
-    let server = quick(simulation_server(&webots.path(), forge.path(), 1)).start().await;
+    let server = quick(simulation_server(&webots.path(), forge.path(), 1)).folder(folder).start().await;
     let mut client = Client::start(&server, &arm()).await;
     client.until("webots:").await;
-    let hidden = || -> Vec<i32> {
-        let text = std::fs::read_to_string(&pids).unwrap_or_default();
-        text.lines().map(|line| line.parse().unwrap()).collect()
-    };
-    until("they hide", async || hidden().len() == 3).await;
-    let hidden: Vec<i32> = hidden().into_iter().flat_map(|pid| [vec![pid], children(pid)].concat()).collect();
-    assert!(hidden.len() > 3 && hidden.iter().all(|pid| is_there(*pid)));
-    let marked = instances_below(&server.folder);
-    assert!(!marked.iter().any(|(pid, _)| hidden.contains(pid)), "the mark tells of them");
+    let told = || std::fs::read_to_string(&pids).unwrap_or_default();
+    until("they hide", async || told().lines().count() == 3).await;
+    let hidden: Vec<i32> = told().lines().map(|line| line.parse().unwrap()).collect();
+    until("each has a child", async || hidden.iter().all(|pid| !children(*pid).is_empty())).await;
+    let hidden: Vec<i32> = hidden.into_iter().flat_map(|pid| [vec![pid], children(pid)].concat()).collect();
+    assert!(hidden.iter().all(|pid| is_there(*pid)));
+    assert!(!instances_below(folder).iter().any(|(pid, _)| hidden.contains(pid)), "the mark tells of them");
+    (server, client, hidden, (forge, webots))
+}
+
+#[actix_rt::test]
+async fn nothing_hides_from_the_death_of_its_guardian() {
+    let folder = tempfile::tempdir().unwrap();
+    let (server, mut client, hidden, _parts) = hiding(folder.path()).await;
+    let marked = instances_below(folder.path());
     let guardian = marked.iter().find(|one| one.1.contains("guard") && one.1.contains("--remove")).unwrap().0;
     kill(Pid::from_raw(guardian), Signal::SIGKILL).unwrap();
     let told = client.until("loading: Error:").await;
@@ -172,6 +178,18 @@ async fn nothing_hides_from_the_death_of_its_guardian() {
     assert!(!hidden.iter().any(|pid| is_there(*pid)), "it was told before they were gone");
     nothing_left(&server, 1).await;
     until("all are buried", async || children(server.pid()) == [last_will(&server)]).await;
+}
+
+#[actix_rt::test]
+async fn nothing_hides_from_a_server_that_follows_a_killed_one_at_once() {
+    let folder = tempfile::tempdir().unwrap();
+    let (mut server, _client, hidden, (forge, webots)) = hiding(folder.path()).await;
+    server.signal(Signal::SIGKILL);
+    let next = quick(simulation_server(&webots.path(), forge.path(), 1)).folder(folder.path()).spawn();
+    server.ended().await;
+    until("they are gone", async || !hidden.iter().any(|pid| is_there(*pid))).await;
+    until("the next one answers", async || http::try_get(&next.url("/health")).await.is_ok()).await;
+    nothing_left(&next, 1).await;
 }
 
 /// The child of a server that removes the folder of its run.
