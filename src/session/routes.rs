@@ -101,7 +101,7 @@ fn open_websocket(
         Err(crowded) => return crowded.answer(),
     };
     let (server, audience) = (Arc::clone(server), audience.clone());
-    websocket::open(request, stream, |inflow| WebClient::new(server, audience, peer, (connection, inflow)))
+    websocket::open(request, stream, |inbox| WebClient::new(server, audience, peer, (connection, inbox)))
 }
 
 async fn availability(server: web::Data<Server>) -> HttpResponse {

@@ -16,7 +16,7 @@ use super::subscribers::News;
 use crate::shared::connections::Connection;
 use crate::shared::liveness::Liveness;
 use crate::shared::peer::Peer;
-use crate::shared::websocket::Inflow;
+use crate::shared::websocket::{Heard, Inbox};
 
 /// The actor.
 pub struct WebClient {
@@ -26,20 +26,20 @@ pub struct WebClient {
     told: Option<bool>,
     audience: Addr<Audience>,
     membership: Option<Membership>,
-    inflow: Inflow,
+    inbox: Inbox,
     _connection: Connection,
 }
 
 type Context = WebsocketContext<WebClient>;
 
 impl WebClient {
-    /// A client that has just connected; `connection` counts it, `inflow` what comes from it.
+    /// A client that has just connected; `connection` counts it, `inbox` takes what comes from it.
     #[must_use]
     pub fn new(
         server: Arc<Server>,
         audience: Addr<Audience>,
         peer: Peer,
-        (connection, inflow): (Connection, Inflow),
+        (connection, inbox): (Connection, Inbox),
     ) -> Self {
         Self {
             server,
@@ -48,7 +48,7 @@ impl WebClient {
             told: None,
             audience,
             membership: None,
-            inflow,
+            inbox,
             _connection: connection,
         }
     }
@@ -122,25 +122,23 @@ impl Handler<News> for WebClient {
 
 impl StreamHandler<Result<Message, ProtocolError>> for WebClient {
     fn handle(&mut self, message: Result<Message, ProtocolError>, ctx: &mut Self::Context) {
-        self.inflow.took(&message);
-        match message {
-            Ok(Message::Text(text)) if self.liveness.may_answer() => self.pick(&text, ctx),
-            Ok(Message::Ping(data)) if self.liveness.may_answer() => ctx.pong(&data),
-            Ok(Message::Pong(content)) => self.liveness.pong(&content),
-            Ok(Message::Close(reason)) => {
+        match self.inbox.take(message) {
+            Heard::Text(text) if self.liveness.may_answer() => self.pick(&text, ctx),
+            Heard::Ping(data) if self.liveness.may_answer() => ctx.pong(&data),
+            Heard::Pong(content) => self.liveness.pong(&content),
+            Heard::Close(reason) => {
                 ctx.close(reason);
                 ctx.stop();
             }
-            Ok(Message::Nop) => {}
-            Ok(Message::Text(_) | Message::Ping(_)) => {
+            Heard::Nothing => {}
+            Heard::Text(_) | Heard::Ping(_) => {
                 log::warn!("client {}: asks too much between two pings", self.peer);
                 ctx.text("Error: too many requests on one connection.");
                 Self::close(CloseCode::Policy, ctx);
             }
-            Ok(Message::Binary(_) | Message::Continuation(_)) => Self::close(CloseCode::Unsupported, ctx),
-            Err(error) => {
-                log::debug!("client {}: {error}", self.peer);
-                Self::close(CloseCode::Protocol, ctx);
+            Heard::Wrong(wrong) => {
+                log::debug!("client {}: {wrong}", self.peer);
+                Self::close(wrong.code(), ctx);
             }
         }
     }

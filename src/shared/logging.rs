@@ -4,14 +4,11 @@ use std::io::Write;
 use std::path::Path;
 
 use env_logger::{Builder, Env, Target};
-use file_rotate::compression::Compression;
-use file_rotate::suffix::AppendCount;
-use file_rotate::{ContentLimit, FileRotate};
+
+use super::rotated_file::RotatedFile;
 
 /// How many old files are kept beside the newest, as the original does.
 const OLD_FILES: usize = 10;
-/// How large a file grows before it is rotated, in bytes, as the original does.
-const FILE_SIZE: usize = 500_000;
 
 /// Where log lines go.
 #[derive(Debug, Clone, Copy)]
@@ -37,7 +34,7 @@ pub fn start(target: LogTarget<'_>) -> std::io::Result<()> {
     let mut builder = Builder::from_env(Env::default().default_filter_or(default_level));
     builder.target(match target {
         LogTarget::Stdout => Target::Stdout,
-        LogTarget::File(path) => Target::Pipe(Box::new(rotated(path, OLD_FILES)?)),
+        LogTarget::File(path) => Target::Pipe(Box::new(RotatedFile::open(path, OLD_FILES)?)),
     });
     builder.format(|out, record| {
         let time = timestamp(std::time::SystemTime::now());
@@ -50,20 +47,6 @@ pub fn start(target: LogTarget<'_>) -> std::io::Result<()> {
         )
     });
     builder.try_init().map_err(std::io::Error::other)
-}
-
-/// A file that is rotated by its size, with so many older ones kept beside it.
-///
-/// # Errors
-/// When its folder can't be made, or the file can't be written.
-pub fn rotated(path: &Path, old_files: usize) -> std::io::Result<FileRotate<AppendCount>> {
-    if let Some(folder) = path.parent() {
-        std::fs::create_dir_all(folder)?;
-    }
-    // FileRotate opens files lazily and keeps quiet about faults, so that the fault is looked for here.
-    std::fs::OpenOptions::new().append(true).create(true).open(path)?;
-    let limit = ContentLimit::BytesSurpassed(FILE_SIZE);
-    Ok(FileRotate::new(path, AppendCount::new(old_files), limit, Compression::None, None))
 }
 
 /// `webots_fleet::session::registry` is read as `session::registry`.

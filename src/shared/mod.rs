@@ -20,6 +20,7 @@ pub mod permanent;
 pub mod project_url;
 pub mod repositories;
 
+pub mod rotated_file;
 pub mod shutdown;
 pub mod start;
 pub mod status;

@@ -1,4 +1,4 @@
-//! Opens WebSockets, and bounds what a peer can make this server hold.
+//! Opens WebSockets, puts what comes in pieces together, and bounds what a peer can make this server hold.
 
 use std::pin::Pin;
 use std::sync::Arc;
@@ -6,10 +6,12 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::task::{Context, Poll};
 
 use actix::{Actor, StreamHandler};
+use actix_http::ws::Item;
 use actix_web::error::PayloadError;
 use actix_web::web::{Bytes, Payload};
 use actix_web::{HttpRequest, HttpResponse};
-use actix_web_actors::ws::{Message, ProtocolError, WebsocketContext, WsResponseBuilder};
+use actix_web_actors::ws::{CloseCode, CloseReason, Message, ProtocolError, WebsocketContext, WsResponseBuilder};
+use bytestring::ByteString;
 use futures_util::Stream;
 
 /// The largest message of a client, in bytes.
@@ -20,28 +22,124 @@ const LARGEST_BACKLOG: usize = 128 * 1024;
 /// What a frame has besides its content, at most (RFC 6455, section 5.2).
 const FRAME_HEADER: usize = 14;
 
-/// Bytes that came from a peer and were not yet handed over as messages.
-#[derive(Debug, Clone, Default)]
-pub struct Inflow(Arc<AtomicUsize>);
+/// What came from a peer: bytes that were not yet handed over as messages, and a text of which more is to come.
+#[derive(Debug, Default)]
+pub struct Inbox {
+    backlog: Backlog,
+    /// The pieces of a text until now (RFC 6455, section 5.4).
+    pieces: Option<Vec<u8>>,
+}
 
-impl Inflow {
-    /// Counts a message that was handed over.
-    pub fn took(&self, message: &Result<Message, ProtocolError>) {
+type Backlog = Arc<AtomicUsize>;
+
+/// What a peer has said.
+#[derive(Debug)]
+pub enum Heard {
+    /// A whole text.
+    Text(ByteString),
+    /// It wants to know whether this server lives.
+    Ping(Bytes),
+    /// It lives.
+    Pong(Bytes),
+    /// It leaves.
+    Close(Option<CloseReason>),
+    /// Nothing that is whole.
+    Nothing,
+    /// Nothing that can be understood: the connection must be closed.
+    Wrong(Wrong),
+}
+
+/// Why a connection must be closed. The words are for the peer.
+#[derive(Debug, thiserror::Error)]
+pub enum Wrong {
+    /// It is too large.
+    #[error("Wrong message: it is longer than {} KiB", LARGEST_MESSAGE / 1024)]
+    TooLarge,
+    /// It is no text.
+    #[error("Wrong message: allowed are short texts")]
+    NoText,
+    /// It breaks the rules of WebSockets.
+    #[error("Wrong message: {0}")]
+    Broken(ProtocolError),
+}
+
+impl Wrong {
+    /// The code to close with.
+    #[must_use]
+    pub fn code(&self) -> CloseCode {
+        match self {
+            Self::TooLarge => CloseCode::Size,
+            Self::NoText => CloseCode::Unsupported,
+            Self::Broken(_) => CloseCode::Protocol,
+        }
+    }
+}
+
+impl Inbox {
+    /// Takes what was handed over, and makes something whole of it.
+    pub fn take(&mut self, message: Result<Message, ProtocolError>) -> Heard {
+        self.count(&message);
+        match message {
+            Ok(Message::Text(text)) => Heard::Text(text),
+            Ok(Message::Ping(content)) => Heard::Ping(content),
+            Ok(Message::Pong(content)) => Heard::Pong(content),
+            Ok(Message::Close(reason)) => Heard::Close(reason),
+            Ok(Message::Nop) => Heard::Nothing,
+            Ok(Message::Binary(_) | Message::Continuation(Item::FirstBinary(_))) => Heard::Wrong(Wrong::NoText),
+            Ok(Message::Continuation(Item::FirstText(piece))) => {
+                self.pieces = Some(Vec::new());
+                self.add(&piece, false)
+            }
+            Ok(Message::Continuation(Item::Continue(piece))) => self.add(&piece, false),
+            Ok(Message::Continuation(Item::Last(piece))) => self.add(&piece, true),
+            Err(ProtocolError::Overflow) => Heard::Wrong(Wrong::TooLarge),
+            Err(_) if self.backlog.load(Ordering::Relaxed) > LARGEST_BACKLOG => Heard::Wrong(Wrong::TooLarge),
+            Err(error) => Heard::Wrong(Wrong::Broken(error)),
+        }
+    }
+
+    fn add(&mut self, piece: &[u8], is_last: bool) -> Heard {
+        let Some(mut text) = self.pieces.take() else {
+            return Heard::Wrong(Wrong::Broken(ProtocolError::ContinuationNotStarted));
+        };
+        text.extend_from_slice(piece);
+        if text.len() > LARGEST_MESSAGE {
+            return Heard::Wrong(Wrong::TooLarge);
+        }
+        if !is_last {
+            self.pieces = Some(text);
+            return Heard::Nothing;
+        }
+        match String::from_utf8(text) {
+            Ok(text) => Heard::Text(text.into()),
+            Err(_) => Heard::Wrong(Wrong::NoText),
+        }
+    }
+
+    fn count(&self, message: &Result<Message, ProtocolError>) {
         let content = match message {
             Ok(Message::Text(text)) => text.len(),
-            Ok(Message::Binary(data) | Message::Ping(data) | Message::Pong(data)) => data.len(),
-            _ => 0,
+            Ok(
+                Message::Binary(data)
+                | Message::Ping(data)
+                | Message::Pong(data)
+                | Message::Continuation(
+                    Item::FirstText(data) | Item::FirstBinary(data) | Item::Continue(data) | Item::Last(data),
+                ),
+            ) => data.len(),
+            Ok(Message::Close(_) | Message::Nop) => 0,
+            Err(_) => return,
         };
         let took = |backlog: usize| Some(backlog.saturating_sub(content + FRAME_HEADER));
         // The closure always gives a value.
-        self.0.fetch_update(Ordering::Relaxed, Ordering::Relaxed, took).ok();
+        self.backlog.fetch_update(Ordering::Relaxed, Ordering::Relaxed, took).ok();
     }
 }
 
 /// The bytes of a peer, up to the largest backlog.
 struct Bounded {
     stream: Payload,
-    backlog: Inflow,
+    backlog: Backlog,
 }
 
 impl Stream for Bounded {
@@ -50,7 +148,7 @@ impl Stream for Bounded {
     fn poll_next(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Option<Self::Item>> {
         let next = Pin::new(&mut self.stream).poll_next(context);
         if let Poll::Ready(Some(Ok(bytes))) = &next {
-            let backlog = self.backlog.0.fetch_add(bytes.len(), Ordering::Relaxed) + bytes.len();
+            let backlog = self.backlog.fetch_add(bytes.len(), Ordering::Relaxed) + bytes.len();
             if backlog > LARGEST_BACKLOG {
                 return Poll::Ready(Some(Err(PayloadError::Overflow)));
             }
@@ -59,15 +157,15 @@ impl Stream for Bounded {
     }
 }
 
-/// Opens a WebSocket for the actor that is made, or answers why that can't be. The actor counts each message with
-/// [`Inflow::took`].
-pub fn open<A>(request: &HttpRequest, stream: Payload, actor: impl FnOnce(Inflow) -> A) -> HttpResponse
+/// Opens a WebSocket for the actor that is made, or answers why that can't be. The actor understands what comes with
+/// [`Inbox::take`].
+pub fn open<A>(request: &HttpRequest, stream: Payload, actor: impl FnOnce(Inbox) -> A) -> HttpResponse
 where
     A: Actor<Context = WebsocketContext<A>> + StreamHandler<Result<Message, ProtocolError>>,
 {
-    let backlog = Inflow::default();
-    let stream = Bounded { stream, backlog: backlog.clone() };
-    let socket = WsResponseBuilder::new(actor(backlog), request, stream).frame_size(LARGEST_MESSAGE).start();
+    let inbox = Inbox::default();
+    let stream = Bounded { stream, backlog: Arc::clone(&inbox.backlog) };
+    let socket = WsResponseBuilder::new(actor(inbox), request, stream).frame_size(LARGEST_MESSAGE).start();
     socket.unwrap_or_else(|error| {
         let status = error.as_response_error().error_response().status();
         HttpResponse::build(status).body(format!("Error: this is a WebSocket: {error}."))

@@ -14,16 +14,17 @@ use tokio::sync::watch;
 use super::announcer::Announcer;
 use super::checkout::Checkouts;
 use super::config::SimulationConfig;
-use super::fetcher::{Fetcher, Limits};
+use super::fetcher::Fetcher;
 use super::git::Git;
 use super::instance_dir::{RunDir, Swept};
+use super::limits::Limits;
 use super::load_monitor::LoadMonitor;
-use super::outcome;
 use super::places::{Census, Places};
 use super::repository_cache::RepositoryCache;
 use super::routes;
 use super::server::Server;
 use super::usage::UsageMonitor;
+use super::{orphans, outcome, process_group};
 use crate::shared::admission::Rules;
 use crate::shared::connections::Connections;
 use crate::shared::live::Live;
@@ -71,10 +72,13 @@ const LOOK: Duration = Duration::from_millis(50);
 /// When it can't start, or an actor that must live is gone.
 pub async fn run(config: SimulationConfig) -> Result<(), AppError> {
     let mut signals = Signals::catch()?;
+    orphans::adopt()?;
+    actix_rt::spawn(orphans::watch());
     let (phase_sender, phase) = watch::channel(Phase::Open);
     let (requests, mut asked) = tokio::sync::mpsc::channel(4);
     let socket = bind(&config)?;
     let server = Arc::new(assemble(config, phase, requests)?);
+    let _last_will = process_group::remove_in_the_end(server.run.path())?;
     let shared = web::Data::from(Arc::clone(&server));
     let http = HttpServer::new(move || App::new().app_data(shared.clone()).configure(routes::configure))
         // Messages are small, and must not wait for the answer to the one before.
@@ -142,7 +146,7 @@ fn assemble(
     let (time, size) = (config.timing.checkout, config.project_size << 20);
     let limits = Limits { time, size, any_commit: config.any_commit };
     let runtime = tokio::runtime::Handle::current();
-    let fetcher = Fetcher::new(git, cache, config.git_mirrors.clone(), limits, runtime.clone());
+    let fetcher = Fetcher::new(git, cache, config.git_mirrors.clone(), limits, &runtime);
     let checkouts = Checkouts::new(fetcher, limits, runtime);
     let places = Places::new(config.streaming_ports(), config.waiting_line).start();
     let csv = config.monitor_log_enabled.then(|| config.log_dir.0.join("simulation/monitor.csv"));

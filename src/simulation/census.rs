@@ -23,7 +23,7 @@ pub enum Change {
         /// The port that was granted.
         port: u16,
         /// The file.
-        log: PathBuf,
+        log: Option<PathBuf>,
         /// How long the file was before: what earlier simulations on this port have printed.
         begin: u64,
     },
@@ -97,7 +97,7 @@ impl Simulation {
                 self.launched = Some(at);
                 self.pid = Some(pid);
                 self.port = Some(port);
-                self.log = Some(log);
+                self.log = log;
                 self.stage = Stage::Launching;
             }
         }

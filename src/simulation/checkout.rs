@@ -13,11 +13,13 @@ use tokio::sync::Semaphore;
 use tokio_util::task::AbortOnDropHandle;
 
 use super::checkout_error::{CheckoutError, damaged, machine, too_large, too_slow};
-use super::fetcher::{Fetched, Fetcher, Limits, call};
+use super::download::call;
+use super::fetcher::{Fetched, Fetcher};
 use super::git::Call;
 use super::instance_dir::InstanceDir;
 use super::large_files::{self, Pointer};
-use super::world_file::WorldFile;
+use super::limits::Limits;
+use super::world_file::{NoWorld, WorldFile};
 use crate::shared::project_url::ProjectUrl;
 
 /// Checks worlds out; one for the whole server.
@@ -90,11 +92,14 @@ impl Checkouts {
             other => other,
         };
         let (fetched, folder) = copied?;
-        let pointers = self.load_large_files(world, &fetched, &instance, &folder, &progress).await?;
-        let path = folder.join("worlds").join(world.world());
-        let root = instance.path().to_owned();
-        let opened = actix_rt::task::spawn_blocking(move || WorldFile::open(&root, &path)).await;
-        let file = opened.map_err(|error| machine(world, &error.into()))??;
+        let (pointers, file) = look(world, &instance, &folder).await?;
+        let (pointers, file) = if pointers.is_empty() || !large_files::is_installed() {
+            (pointers, file)
+        } else {
+            self.load_large_files(world, &fetched, &instance, &pointers, &progress).await?;
+            look(world, &instance, &folder).await?
+        };
+        let (file, pointers) = (file?, pointers.len());
         let warnings = (pointers > 0).then(|| large_files::warning(pointers));
         let revision = fetched.revision.commit.clone();
         progress("checkout done".to_owned());
@@ -130,37 +135,33 @@ impl Checkouts {
                 progress(line.to_owned());
             }
         };
-        self.fetcher.git.run(call, told).await.map_err(|source| damaged(world, source))?;
+        self.fetcher.git().run(call, told).await.map_err(|source| damaged(world, source))?;
         Ok(tree.join(&fetched.revision.folder))
     }
 
-    /// Loads the files that the project keeps in Git LFS. Gives back how many could not be loaded.
+    /// Loads the files that the project keeps in Git LFS. Those that can't be had stay pointers.
     async fn load_large_files(
         &self,
         world: &ProjectUrl,
         fetched: &Fetched,
         instance: &InstanceDir,
-        folder: &Path,
+        pointers: &[Pointer],
         progress: &(impl Fn(String) + Send + Sync),
-    ) -> Result<usize, CheckoutError> {
-        let pointers = pointers_below(world, folder).await?;
-        if pointers.is_empty() || !large_files::is_installed() {
-            return Ok(pointers.len());
-        }
+    ) -> Result<(), CheckoutError> {
         if pointers.iter().fold(0_u64, |sum, pointer| sum.saturating_add(pointer.size)) > self.limits.size {
             return Err(too_large("What the project keeps in Git LFS".to_owned(), self.limits.size));
         }
         progress(format!("loading {} files from Git LFS", pointers.len()));
-        for Pointer { path, .. } in &pointers {
+        for Pointer { path, .. } in pointers {
             // git writes again only what is not there.
             tokio::fs::remove_file(path).await.map_err(|error| machine(world, &error))?;
         }
         let mut call = copy_call(fetched, instance, inside(&fetched.revision.folder));
         call.is_alone = false;
         call.arguments.splice(0..0, large_files::settings(&fetched.remote));
-        self.fetcher.git.run(call, |_| ()).await.map_err(|source| damaged(world, source))?;
+        self.fetcher.git().run(call, |_| ()).await.map_err(|source| damaged(world, source))?;
         self.fetcher.shrink_soon();
-        Ok(pointers_below(world, folder).await?.len())
+        Ok(())
     }
 
     /// Restores a file below the project's `controllers` folder to the state of the checkout.
@@ -177,7 +178,7 @@ impl Checkouts {
         let slash = if folder.is_empty() { "" } else { "/" };
         let path = format!("{folder}{slash}controllers/{file}");
         let call = copy_call(&project.fetched, &project.instance, &path);
-        self.fetcher.git.run(call, |_| ()).await.map(drop).map_err(|_| refused())
+        self.fetcher.git().run(call, |_| ()).await.map(drop).map_err(|_| refused())
     }
 }
 
@@ -199,10 +200,17 @@ fn copy_call<'call>(fetched: &'call Fetched, instance: &InstanceDir, path: &str)
     call
 }
 
-async fn pointers_below(world: &ProjectUrl, folder: &Path) -> Result<Vec<Pointer>, CheckoutError> {
-    let folder = folder.to_owned();
-    let found = actix_rt::task::spawn_blocking(move || large_files::pointers(&folder)).await;
-    found.map_err(|error| machine(world, &error.into()))
+/// What is in a copy: files that only point to larger ones, and the world.
+async fn look(
+    world: &ProjectUrl,
+    instance: &InstanceDir,
+    folder: &Path,
+) -> Result<(Vec<Pointer>, Result<WorldFile, NoWorld>), CheckoutError> {
+    let (root, folder) = (instance.path().to_owned(), folder.to_owned());
+    let path = folder.join("worlds").join(world.world());
+    let seen =
+        actix_rt::task::spawn_blocking(move || (large_files::pointers(&folder), WorldFile::open(&root, &path))).await;
+    seen.map_err(|error| machine(world, &error.into()))
 }
 
 impl Project {

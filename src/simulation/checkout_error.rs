@@ -32,15 +32,18 @@ pub enum CheckoutError {
     World(#[from] NoWorld),
     /// The commit is not one that the repository's owner vouches for.
     #[error(
-        "{commit} is not the newest commit of a branch or tag of {repository}. Forges also hand out commits that a \
-         repository's owner never accepted; this simulation server runs them only if its administrator sets anyCommit"
+        "{commit} is in no branch or tag of {repository}. Forges also hand out commits that a repository's owner never \
+         accepted; this simulation server runs them only if its administrator sets anyCommit"
     )]
-    NoTip {
+    NotReachable {
         /// The repository's URL.
         repository: String,
         /// The hash.
         commit: String,
     },
+    /// It has too many files.
+    #[error("The project has more than {0} files and folders")]
+    TooMany(u64),
     /// It took too long.
     #[error("Fetching {repository} took longer than {seconds} seconds")]
     TooSlow {

@@ -21,6 +21,8 @@ pub struct Launch<'path> {
     pub world: &'path Path,
     /// Whether to give it a virtual display of its own.
     pub xvfb: bool,
+    /// The instance's folder, for the display's authority file: it is removed in whatever way the display ends.
+    pub instance: &'path Path,
 }
 
 impl Launch<'_> {
@@ -34,6 +36,12 @@ impl Launch<'_> {
         if self.xvfb {
             let screen = "-screen 0 1280x1024x24 -nolisten tcp";
             arguments.extend(["xvfb-run", "--auto-servernum", "--server-args", screen].map(OsString::from));
+            let authority = self.instance.join("Xauthority");
+            // xvfb-run hands the name on without quotes.
+            let is_plain = |byte: &u8| byte.is_ascii_alphanumeric() || b"/._-".contains(byte);
+            if authority.as_os_str().as_encoded_bytes().iter().all(is_plain) {
+                arguments.extend([OsString::from("--auth-file"), authority.into()]);
+            }
         }
         arguments.push(self.program.into());
         arguments.extend(["--batch", "--mode=pause"].map(OsString::from));
@@ -68,6 +76,7 @@ mod tests {
             heartbeat: Duration::from_secs(5),
             world: Path::new("/tmp/a b/worlds/$(id).wbt"),
             xvfb: false,
+            instance: Path::new("/tmp/a b"),
         };
         let text = |launch: &Launch| launch.arguments().join(std::ffi::OsStr::new("|")).into_string().unwrap();
         let common = "/usr/local/webots/webots|--batch|--mode=pause|";
@@ -78,6 +87,9 @@ mod tests {
         assert_eq!(text(&w3d), text(&launch));
         let mjpeg = Launch { mode: Mode::Mjpeg, ..launch.clone() };
         assert_eq!(text(&mjpeg), format!("{common}{rest}--stream=mjpeg{world}"));
-        assert!(text(&Launch { xvfb: true, ..launch }).starts_with("xvfb-run|"));
+        let xvfb = Launch { xvfb: true, ..launch };
+        assert!(text(&xvfb).starts_with("xvfb-run|") && !text(&xvfb).contains("--auth-file"));
+        let plain = Launch { instance: Path::new("/tmp/a"), ..xvfb };
+        assert!(text(&plain).contains("|--auth-file|/tmp/a/Xauthority|/usr/local/webots/webots|"));
     }
 }

@@ -6,7 +6,6 @@
 use std::collections::HashMap;
 use std::ffi::OsString;
 use std::io;
-use std::path::Path;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
@@ -14,36 +13,27 @@ use futures_util::FutureExt;
 use futures_util::future::{BoxFuture, Shared, WeakShared};
 use tokio::runtime::Handle;
 use tokio::sync::watch;
+use tokio_util::task::AbortOnDropHandle;
 
-use super::checkout_error::{CheckoutError, damaged, fetch_failed, git_failed, machine, no_reference, too_large};
-use super::git::{Call, Git};
+use super::cached_repository::{CommitInUse, InUse};
+use super::checkout_error::{CheckoutError, damaged, git_failed, machine, no_reference, too_large};
+use super::download::{Downloads, Errand, call};
+use super::git::Git;
+use super::housekeeping;
+use super::limits::Limits;
 use super::mirrors::{Mirrors, Remote};
-use super::repository_cache::{InUse, RepositoryCache};
-use super::revision::{self, Revision};
+use super::repository_cache::RepositoryCache;
+use super::revision::{self, Listing, Revision};
 use super::world_file::NoWorld;
 use crate::shared::project_url::ProjectUrl;
 
 /// Brings commits into the cache; one for the whole server.
 pub struct Fetcher {
-    /// Runs git.
-    pub git: Git,
-    cache: RepositoryCache,
+    downloads: Downloads,
     mirrors: Mirrors,
-    limits: Limits,
-    runtime: Handle,
     /// What is being fetched now. An entry ends with the last client that waits for it.
     fetches: Mutex<HashMap<ProjectUrl, Fetch>>,
-}
-
-/// What a checkout may take.
-#[derive(Debug, Clone, Copy)]
-pub struct Limits {
-    /// For all of it.
-    pub time: Duration,
-    /// In bytes: what is fetched, and what is checked out.
-    pub size: u64,
-    /// Whether any commit may be fetched by its hash, not only the newest of a branch or tag.
-    pub any_commit: bool,
+    _housekeeping: AbortOnDropHandle<()>,
 }
 
 /// A world's commit in the cache.
@@ -57,6 +47,7 @@ pub struct Fetched {
     pub reference: String,
     /// What it is.
     pub revision: Revision,
+    _commit: CommitInUse,
 }
 
 #[derive(Clone)]
@@ -69,14 +60,21 @@ type FetchJob = BoxFuture<'static, Result<Arc<Fetched>, CheckoutError>>;
 
 /// Progress is told so often at most: nobody reads faster.
 const BETWEEN_NEWS: Duration = Duration::from_millis(100);
-/// Between two looks at how much a fetch has brought.
-const BETWEEN_LOOKS: Duration = Duration::from_millis(200);
 
 impl Fetcher {
-    /// Prepares fetches into this cache.
+    /// Prepares fetches into this cache, and keeps it tidy, on the thread whose runtime this is.
     #[must_use]
-    pub fn new(git: Git, cache: RepositoryCache, mirrors: Mirrors, limits: Limits, runtime: Handle) -> Self {
-        Self { git, cache, mirrors, limits, runtime, fetches: Mutex::default() }
+    pub fn new(git: Git, cache: RepositoryCache, mirrors: Mirrors, limits: Limits, runtime: &Handle) -> Self {
+        let git = Arc::new(git);
+        let housekeeping = runtime.spawn(housekeeping::keep(cache.clone(), Arc::clone(&git)));
+        let downloads = Downloads { git, cache, limits };
+        Self { downloads, mirrors, fetches: Mutex::default(), _housekeeping: AbortOnDropHandle::new(housekeeping) }
+    }
+
+    /// Runs git.
+    #[must_use]
+    pub fn git(&self) -> &Git {
+        &self.downloads.git
     }
 
     /// Waits for a world's commit to be in the cache, together with everybody who waits for the same.
@@ -128,13 +126,18 @@ impl Fetcher {
     /// Finds the commit that a world's URL means, and brings it into the cache if it is new.
     async fn fetch(&self, world: &ProjectUrl, progress: &watch::Sender<String>) -> Result<Fetched, CheckoutError> {
         let remote = self.mirrors.remote(world).ok_or_else(|| CheckoutError::Forge(world.host().to_owned()))?;
-        let repository = self.cache.take(&remote.location).await.map_err(|error| machine(world, &error))?;
+        let taken = self.downloads.cache.take(&remote.location).await;
+        let repository = taken.map_err(|error| machine(world, &error))?;
         progress.send_replace(format!("looking for {}", world.repository()));
-        match self.find(world, &remote, &repository, progress).await {
-            Ok((revision, reference)) => Ok(Fetched { repository, remote, reference, revision }),
+        let errand = Errand { world, remote: &remote, progress };
+        match self.find(errand, &repository).await {
+            Ok((revision, commit)) => {
+                let reference = revision.reference();
+                Ok(Fetched { repository, remote, reference, revision, _commit: commit })
+            }
             // The remote's fault, unless it is the cache that git could not read.
             Err(CheckoutError::Git { repository: url, source })
-                if repository.is_made() && !self.git.is_sound(repository.path()).await =>
+                if repository.is_made() && !self.git().is_sound(repository.path()).await =>
             {
                 Err(CheckoutError::Damaged { repository: url, source })
             }
@@ -142,129 +145,82 @@ impl Fetcher {
         }
     }
 
-    /// The first of the commits that a URL may mean in which its world is, and its name in the cache.
-    async fn find(
-        &self,
-        world: &ProjectUrl,
-        remote: &Remote,
-        repository: &InUse,
-        progress: &watch::Sender<String>,
-    ) -> Result<(Revision, String), CheckoutError> {
+    /// The first of the commits that a URL may mean in which its world is.
+    async fn find(&self, errand: Errand<'_>, repository: &InUse) -> Result<(Revision, CommitInUse), CheckoutError> {
+        let Errand { world, remote, .. } = errand;
         let mut missing = None;
-        for revision in self.revisions(world, remote, repository).await? {
-            let reference = format!("refs/fleet/{}", revision.commit);
-            if !repository.has(&reference) {
-                self.download(world, remote, repository, &revision, progress).await?;
-            }
-            let mut call = call(remote, repository.path(), revision.list_arguments(&reference));
+        for revision in self.revisions(errand, repository).await? {
+            let commit = match repository.commit(&revision.reference()) {
+                Some(commit) => commit,
+                None => self.downloads.commit(errand, repository, &revision).await?,
+            };
+            let path = revision.world_path(world);
+            let mut call = call(remote, repository.path(), revision.list_arguments());
             call.is_alone = true;
-            let listing = self.git.run(call, |_| ()).await.map_err(|source| damaged(world, source))?;
-            let listing = revision::Listing::parse(&listing);
-            if listing.size > self.limits.size {
-                return Err(too_large("The project".to_owned(), self.limits.size));
+            let answer = self.git().run(call, |_| ()).await;
+            let limit = self.downloads.limits.entries();
+            let listing = match answer {
+                Ok(answer) => Listing::parse(&answer, &path),
+                Err(error) if error.is_endless() => return Err(CheckoutError::TooMany(limit)),
+                Err(source) => return Err(damaged(world, source)),
+            };
+            if listing.entries > limit {
+                return Err(CheckoutError::TooMany(limit));
             }
-            if listing.has(&revision.world_path(world)) {
-                return Ok((revision, reference));
+            if listing.size > self.downloads.limits.size {
+                return Err(too_large("The project".to_owned(), self.downloads.limits.size));
             }
-            missing = Some(NoWorld::Missing(format!("{} in {}", revision.world_path(world), revision.name)));
+            if listing.has_world {
+                return Ok((revision, commit));
+            }
+            missing = Some(NoWorld::Missing(format!("{path} in {}", revision.name)));
         }
         Err(missing.map_or_else(|| no_reference(world), CheckoutError::World))
     }
 
     /// The commits that a URL may mean, the likeliest first.
-    async fn revisions(
-        &self,
-        world: &ProjectUrl,
-        remote: &Remote,
-        repository: &InUse,
-    ) -> Result<Vec<Revision>, CheckoutError> {
-        if let Some(commit) = revision::commit_of(world) {
-            // What is in the cache was accepted before.
-            let known = self.limits.any_commit || repository.has(&format!("refs/fleet/{}", commit.commit));
-            return if known || self.is_tip(world, remote, repository, &commit).await? {
+    async fn revisions(&self, errand: Errand<'_>, repository: &InUse) -> Result<Vec<Revision>, CheckoutError> {
+        let Errand { world, remote, .. } = errand;
+        if let Some(commit) = revision::commit_of(world, self.downloads.limits.any_commit) {
+            return if self.is_accepted(errand, repository, &commit).await? {
                 Ok(vec![commit])
             } else {
-                Err(CheckoutError::NoTip { repository: world.repository(), commit: commit.name })
+                Err(CheckoutError::NotReachable { repository: world.repository(), commit: commit.name })
             };
         }
-        let call = call(remote, repository.path(), revision::search_arguments(world, &remote.location));
-        let answer = self.git.run(call, |_| ()).await.map_err(|source| git_failed(world, source))?;
-        Ok(revision::found(world, &String::from_utf8_lossy(&answer)))
+        let answer = self.ask(errand, repository, revision::search_arguments(world, &remote.location)).await?;
+        Ok(revision::found(world, &answer))
     }
 
-    /// Whether a commit is the newest of a branch or tag. Forges hand out by their hash also commits of forks and of
+    /// Whether a commit may run that is named by its hash. Forges hand out by their hash also commits of forks and of
     /// proposals, which the repository's owner never accepted: allowing a repository must not allow those.
-    async fn is_tip(
+    async fn is_accepted(
         &self,
-        world: &ProjectUrl,
-        remote: &Remote,
+        errand: Errand<'_>,
         repository: &InUse,
         revision: &Revision,
     ) -> Result<bool, CheckoutError> {
-        let call = call(remote, repository.path(), revision::tips_arguments(&remote.location));
-        let answer = self.git.run(call, |_| ()).await.map_err(|source| git_failed(world, source))?;
-        Ok(revision::is_tip(&String::from_utf8_lossy(&answer), &revision.commit))
+        // What is in the cache was accepted before.
+        if self.downloads.limits.any_commit || repository.commit(&revision.reference()).is_some() {
+            return Ok(true);
+        }
+        let answer = self.ask(errand, repository, revision::tips_arguments(&errand.remote.location)).await?;
+        Ok(revision::is_tip(&answer, &revision.commit)
+            || self.downloads.is_in_history(errand, &revision.commit).await?)
     }
 
-    /// Fetches one commit, and ends git when it brings too much.
-    async fn download(
+    /// Asks the remote what it has.
+    async fn ask(
         &self,
-        world: &ProjectUrl,
-        remote: &Remote,
+        errand: Errand<'_>,
         repository: &InUse,
-        revision: &Revision,
-        progress: &watch::Sender<String>,
-    ) -> Result<(), CheckoutError> {
-        let _fetching = repository.fetching().await.map_err(|error| machine(world, &error))?;
-        if repository.has(&format!("refs/fleet/{}", revision.commit)) {
-            return Ok(());
-        }
-        self.make_repository(world, remote, repository).await?;
-        let call = call(remote, repository.path(), revision.fetch_arguments(&remote.location));
-        let tell = |line: &str| {
-            if line.contains('%') {
-                let step = line.trim_start_matches("remote: ");
-                progress.send_replace(format!("fetching {}: {step}", world.repository()));
-            }
-        };
-        let mut fetch = std::pin::pin!(self.git.run(call, tell));
-        let mut look = actix_rt::time::interval(BETWEEN_LOOKS);
-        loop {
-            tokio::select! {
-                result = &mut fetch => {
-                    result.map_err(|source| fetch_failed(world, revision, source))?;
-                    self.shrink_soon();
-                    return Ok(());
-                }
-                _ = look.tick() => {
-                    if repository.received() > self.limits.size {
-                        return Err(too_large(format!("{} (at depth 1)", world.repository()), self.limits.size));
-                    }
-                }
-            }
-        }
-    }
-
-    /// Makes the bare repository, unless it is there. It takes its place only when it is whole.
-    async fn make_repository(
-        &self,
-        world: &ProjectUrl,
-        remote: &Remote,
-        repository: &InUse,
-    ) -> Result<(), CheckoutError> {
-        if repository.is_made() {
-            return Ok(());
-        }
-        let path = repository.path();
-        let new = path.with_extension("new");
-        for broken in [&new, path] {
-            if broken.exists() {
-                tokio::fs::remove_dir_all(broken).await.map_err(|error| machine(world, &error))?;
-            }
-        }
-        let call = call(remote, &new, vec!["init".into(), "--quiet".into(), "--bare".into()]);
-        self.git.run(call, |_| ()).await.map_err(|source| git_failed(world, source))?;
-        tokio::fs::rename(&new, path).await.map_err(|error| machine(world, &error))
+        arguments: Vec<OsString>,
+    ) -> Result<String, CheckoutError> {
+        let mut call = call(errand.remote, repository.path(), arguments);
+        // For a folder, git's only child reads from its pipe, and ends with it. What asks over the network may hang.
+        call.is_alone = errand.remote.protocol == "file";
+        let answer = self.git().run(call, |_| ()).await.map_err(|source| git_failed(errand.world, source))?;
+        Ok(String::from_utf8_lossy(&answer).into_owned())
     }
 
     /// Removes the cached repository of a world if it is damaged, so that the next fetch begins anew.
@@ -272,27 +228,14 @@ impl Fetcher {
     /// # Errors
     /// When it can't be removed.
     pub async fn mend(&self, world: &ProjectUrl) -> io::Result<()> {
-        let Some(remote) = self.mirrors.remote(world) else {
-            return Ok(());
-        };
-        let repository = self.cache.take(&remote.location).await?;
-        let _fetching = repository.fetching().await?;
-        if repository.path().exists() && !self.git.is_sound(repository.path()).await {
-            log::warn!("{} is damaged: it is removed and fetched anew", repository.path().display());
-            tokio::fs::remove_dir_all(repository.path()).await?;
+        match self.mirrors.remote(world) {
+            Some(remote) => self.downloads.mend(&remote).await,
+            None => Ok(()),
         }
-        Ok(())
     }
 
-    /// Brings the cache back into its budget. Nobody waits for that.
+    /// Has the cache brought back into its budget. Nobody waits for that.
     pub fn shrink_soon(&self) {
-        let cache = self.cache.clone();
-        drop(self.runtime.spawn_blocking(move || cache.shrink()));
+        self.downloads.cache.grown();
     }
-}
-
-/// A git command on a cached repository.
-#[must_use]
-pub fn call<'call>(remote: &Remote, repository: &'call Path, arguments: Vec<OsString>) -> Call<'call> {
-    Call { repository, arguments, protocol: remote.protocol, is_alone: false, environment: Vec::new() }
 }

@@ -56,6 +56,12 @@ impl GitError {
     pub fn is_verdict(&self) -> bool {
         self.ending.starts_with("ended with")
     }
+
+    /// Whether its answer was longer than what is read of one.
+    #[must_use]
+    pub fn is_endless(&self) -> bool {
+        self.ending == ENDLESS
+    }
 }
 
 /// git reads this in place of the settings of its user and machine. Any repository may be read: a mirror may belong
@@ -75,6 +81,7 @@ const SETTINGS: &str = "\
 	recurse = false
 [gc]
 	auto = 0
+	packRefs = false
 [maintenance]
 	auto = false
 [init]
@@ -85,7 +92,9 @@ const SETTINGS: &str = "\
 ";
 
 /// The most that is read of a command's answer, in bytes.
-const LARGEST_ANSWER: u64 = 64 * 1024 * 1024;
+const LARGEST_ANSWER: usize = 64 * 1024 * 1024;
+/// How a command ends that answers more.
+const ENDLESS: &str = "was ended";
 
 impl Git {
     /// Prepares git for the server whose run has this folder.
@@ -125,6 +134,9 @@ impl Git {
         let (answer, last_words, ending) = tokio::join!(read_all(answer), follow(complaints, progress), ended);
         drop(group);
         match ending {
+            _ if answer.len() > LARGEST_ANSWER => {
+                Err(failed(ENDLESS, format!("its answer is longer than {} MiB", LARGEST_ANSWER >> 20)))
+            }
             Ending::Code(0) => Ok(answer),
             ending => Err(failed(&ending.to_string(), last_words)),
         }
@@ -173,7 +185,7 @@ fn asynchronous(pipe: PipeReader) -> std::io::Result<Receiver> {
 async fn read_all(pipe: Receiver) -> Vec<u8> {
     let mut answer = Vec::new();
     // A broken pipe is the end of the answer; whether that is right is told by how git ended.
-    pipe.take(LARGEST_ANSWER).read_to_end(&mut answer).await.ok();
+    pipe.take(LARGEST_ANSWER as u64 + 1).read_to_end(&mut answer).await.ok();
     answer
 }
 

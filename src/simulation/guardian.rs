@@ -9,8 +9,11 @@
 //! - ends the rest of the tree when the program itself ends, removes the instance's folder when asked to, and passes
 //!   the program's exit code on (128 + N for signal N, as shells do).
 //!
+//! One more guardian, without a program, removes the folder of the run when the server was killed.
+//!
 //! It is synchronous: three threads that wait, and nothing else.
 
+use std::collections::BTreeSet;
 use std::io::Read;
 use std::os::unix::process::CommandExt;
 use std::path::PathBuf;
@@ -22,9 +25,10 @@ use nix::errno::Errno;
 use nix::sys::prctl;
 use nix::sys::signal::{SigSet, Signal, killpg};
 use nix::sys::wait::{WaitStatus, waitpid};
-use nix::unistd::Pid;
+use nix::unistd::{Pid, setsid};
 
-use super::process_tree;
+use super::instance_dir::{remove, remove_patiently};
+use super::{process_tree, x_lock};
 
 /// What a guardian is told on its command line.
 #[derive(Debug, clap::Args)]
@@ -35,8 +39,8 @@ pub struct Orders {
     /// Folder to remove at the end
     #[arg(long)]
     remove: Option<PathBuf>,
-    /// Program to start, and its arguments
-    #[arg(last = true, required = true)]
+    /// Program to start, and its arguments; without one it only waits for the server's end, and removes the folder
+    #[arg(last = true)]
     command: Vec<std::ffi::OsString>,
 }
 
@@ -65,13 +69,19 @@ pub fn guard(orders: &Orders) -> u8 {
     });
     if let Some(folder) = &orders.remove {
         // The server removes it too, if it still lives.
-        std::fs::remove_dir_all(folder).ok();
+        if orders.command.is_empty() { remove_patiently(folder) } else { remove(folder) }
     }
     code
 }
 
 fn run(orders: &Orders) -> Result<u8, String> {
-    let (program, arguments) = orders.command.split_first().ok_or("no program is named")?;
+    // Nothing of the program's can come back into the server's session: by that the server knows its own children.
+    setsid().map_err(|error| format!("can't lead a session: {error}"))?;
+    let Some((program, arguments)) = orders.command.split_first() else {
+        become_deaf()?;
+        std::io::copy(&mut std::io::stdin().lock(), &mut std::io::sink()).ok();
+        return Ok(0);
+    };
     prctl::set_child_subreaper(true).map_err(|error| format!("can't adopt orphans: {error}"))?;
     let child = Command::new(program)
         .args(arguments)
@@ -79,9 +89,8 @@ fn run(orders: &Orders) -> Result<u8, String> {
         .process_group(0)
         .spawn()
         .map_err(|error| format!("{} can't be started: {error}", program.display()))?;
-    // It is the server who decides when the program ends. The program itself has inherited no blocked signal.
-    let deaf_to: SigSet = [Signal::SIGINT, Signal::SIGTERM, Signal::SIGHUP].into_iter().collect();
-    deaf_to.thread_block().map_err(|error| format!("can't block signals: {error}"))?;
+    // The program itself has inherited no blocked signal.
+    become_deaf()?;
     let group = Pid::from_raw(i32::try_from(child.id()).map_err(|error| error.to_string())?);
     let (sender, events) = channel();
     let lifeline = sender.clone();
@@ -92,6 +101,12 @@ fn run(orders: &Orders) -> Result<u8, String> {
         end_tree(&events);
     }
     Ok(code)
+}
+
+/// It is the server who decides when a guardian ends.
+fn become_deaf() -> Result<(), String> {
+    let deaf_to: SigSet = [Signal::SIGINT, Signal::SIGTERM, Signal::SIGHUP].into_iter().collect();
+    deaf_to.thread_block().map_err(|error| format!("can't block signals: {error}"))
 }
 
 /// What is left of a tree.
@@ -133,10 +148,11 @@ fn end_tree(events: &Receiver<Event>) {
     let end = Instant::now() + VANISH;
     let own = i32::try_from(std::process::id()).unwrap_or_default();
     let mut pause = Duration::from_millis(1);
+    let mut killed = BTreeSet::new();
     while Instant::now() < end {
-        process_tree::kill_descendants(own);
+        killed.extend(process_tree::kill_descendants(own));
         match events.recv_timeout(pause) {
-            Ok(Event::Empty) | Err(RecvTimeoutError::Disconnected) => return,
+            Ok(Event::Empty) | Err(RecvTimeoutError::Disconnected) => return x_lock::remove_of(&killed),
             Ok(_) | Err(RecvTimeoutError::Timeout) => pause = (pause * 2).min(Duration::from_millis(100)),
         }
     }

@@ -1,9 +1,11 @@
 //! The folders of running simulations: guards whose drop removes them, and records by which a later run of the server
 //! finds what an earlier one left.
 
-use std::fs::{File, TryLockError};
+use std::fs::{File, Permissions, TryLockError};
 use std::io;
+use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 use super::process_tree;
 
@@ -31,6 +33,15 @@ pub struct Swept {
 }
 
 const LOCK: &str = "lock";
+/// Between two tries to remove a folder; then it is left to the next start.
+const PAUSES: [Duration; 6] = [
+    Duration::from_millis(20),
+    Duration::from_millis(200),
+    Duration::from_secs(1),
+    Duration::from_secs(4),
+    Duration::from_secs(15),
+    Duration::from_secs(40),
+];
 
 impl RunDir {
     /// Makes the folder of this run below `cache`, and removes what dead runs have left there.
@@ -91,7 +102,7 @@ impl Drop for InstanceDir {
         // A project may hold many files, and this may run on a thread that serves others.
         let folder = std::mem::take(&mut self.folder);
         let spare = folder.clone();
-        if std::thread::Builder::new().spawn(move || remove(&folder)).is_err() {
+        if std::thread::Builder::new().spawn(move || remove_patiently(&folder)).is_err() {
             remove(&spare);
         }
     }
@@ -108,6 +119,7 @@ fn sweep(runs: &Path) -> Swept {
             continue;
         }
         swept.runs += 1;
+        process_tree::await_guardians(&folder);
         swept.processes += process_tree::kill_marked(&folder);
         remove(&folder);
     }
@@ -122,20 +134,54 @@ fn is_alive(folder: &Path) -> bool {
         Err(_) => folder
             .metadata()
             .and_then(|about| about.modified())
-            .is_ok_and(|time| time.elapsed().is_ok_and(|age| age < std::time::Duration::from_secs(10))),
+            .is_ok_and(|time| time.elapsed().is_ok_and(|age| age < Duration::from_secs(10))),
     }
 }
 
-fn remove(folder: &Path) {
+/// Removes a folder, as far as that can be done at once.
+pub fn remove(folder: &Path) {
     // A process that is just ending may still write: what it adds is removed by the second try.
-    let gone = |result: io::Result<()>| match result {
-        Err(error) if error.kind() != io::ErrorKind::NotFound => Some(error),
-        _ => None,
-    };
-    if gone(std::fs::remove_dir_all(folder)).is_some()
-        && let Some(error) = gone(std::fs::remove_dir_all(folder))
+    if try_to_remove(folder).is_err()
+        && let Err(error) = try_to_remove(folder)
     {
         log::error!("{} can't be removed: {error}", folder.display());
+    }
+}
+
+/// Removes a folder, and tries again for a while where it can't. Waits: only for threads of their own.
+pub fn remove_patiently(folder: &Path) {
+    for pause in PAUSES {
+        match try_to_remove(folder) {
+            Ok(()) => return,
+            Err(error) => log::warn!("{} can't be removed yet: {error}", folder.display()),
+        }
+        std::thread::sleep(pause);
+    }
+    remove(folder);
+}
+
+fn try_to_remove(folder: &Path) -> io::Result<()> {
+    let removed = match std::fs::remove_dir_all(folder) {
+        // A simulation may have taken the right to write from its own folders.
+        Err(error) if error.kind() == io::ErrorKind::PermissionDenied => {
+            open_up(folder);
+            std::fs::remove_dir_all(folder)
+        }
+        other => other,
+    };
+    match removed {
+        Err(error) if error.kind() == io::ErrorKind::NotFound && !folder.exists() => Ok(()),
+        other => other,
+    }
+}
+
+/// Lets this user change all folders below one. Links are not followed.
+fn open_up(folder: &Path) {
+    let mut open = vec![folder.to_owned()];
+    while let Some(folder) = open.pop() {
+        std::fs::set_permissions(&folder, Permissions::from_mode(0o700)).ok();
+        let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
+        open.extend(entries.filter(|one| one.file_type().is_ok_and(|kind| kind.is_dir())).map(|one| one.path()));
     }
 }
 
@@ -156,6 +202,36 @@ mod tests {
         assert_eq!(swept, Swept { runs: 1, processes: 1 });
         assert!(!orphan.wait().unwrap().success());
         assert!(first.path().exists() && !dead.exists());
+    }
+
+    #[test]
+    fn what_can_not_be_removed_at_once_is_removed_later() {
+        let cache = tempfile::tempdir().unwrap();
+        let (run, _) = RunDir::open(cache.path()).unwrap();
+        let instance = run.instance().unwrap();
+        let folder = instance.path().to_owned();
+        let locked = folder.join("locked");
+        std::fs::create_dir_all(locked.join("inside")).unwrap();
+        std::fs::set_permissions(&locked, Permissions::from_mode(0o500)).unwrap();
+        // Somebody who makes files faster than they can be removed, for a while.
+        let busy = folder.join("busy");
+        let writer = std::thread::spawn(move || {
+            let end = std::time::Instant::now() + Duration::from_millis(150);
+            for number in 0.. {
+                std::fs::create_dir_all(busy.join(format!("{number}"))).ok();
+                if std::time::Instant::now() > end {
+                    return;
+                }
+            }
+        });
+        std::thread::sleep(Duration::from_millis(20));
+        drop(instance);
+        writer.join().unwrap();
+        let end = std::time::Instant::now() + Duration::from_secs(20);
+        while folder.exists() {
+            assert!(std::time::Instant::now() < end, "it is still there");
+            std::thread::sleep(Duration::from_millis(10));
+        }
     }
 
     #[test]

@@ -43,6 +43,7 @@ impl Orders {
             heartbeat: self.config.timing.heartbeat,
             world: &self.project.world.path,
             xvfb: self.config.xvfb,
+            instance: self.project.instance.path(),
         };
         let display = display::effective(self.config.display.as_deref());
         Plan {

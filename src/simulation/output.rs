@@ -5,7 +5,6 @@
 
 use std::collections::VecDeque;
 use std::io::{BufRead, BufReader, PipeReader, Write};
-use std::path::Path;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
@@ -13,7 +12,8 @@ use actix::dev::ToEnvelope;
 use actix::prelude::*;
 use tokio::sync::oneshot;
 
-use crate::shared::logging::{one_line, rotated};
+use crate::shared::logging::one_line;
+use crate::shared::rotated_file::RotatedFile;
 
 /// Something that a line of Webots' output says of its state.
 #[derive(Message, Debug, Clone, Copy, PartialEq, Eq)]
@@ -65,21 +65,21 @@ impl Tail {
     }
 }
 
-/// How many older files are kept beside the newest.
-const OLD_FILES: usize = 1;
-
-/// Reads an output until its end: signs go to `signs`, other lines to the file at `log` and to the tail. The receiver
-/// that is given back with the tail hears when the end was reached.
+/// Reads an output until its end: signs go to `signs`, other lines to the file and to the tail. The receiver that is
+/// given back with the tail hears when the end was reached.
 ///
 /// # Errors
-/// When the file or the thread can't be made.
-pub fn follow<A>(output: PipeReader, log: &Path, signs: Addr<A>) -> std::io::Result<(Tail, oneshot::Receiver<()>)>
+/// When the thread can't be made.
+pub fn follow<A>(
+    output: PipeReader,
+    mut file: Option<RotatedFile>,
+    signs: Addr<A>,
+) -> std::io::Result<(Tail, oneshot::Receiver<()>)>
 where
     A: Actor<Context: ToEnvelope<A, Sign>> + Handler<Sign>,
 {
     let tail = Tail::default();
     let kept = tail.clone();
-    let mut file = rotated(log, OLD_FILES)?;
     let (end, ended) = oneshot::channel();
     std::thread::Builder::new().name("output".to_owned()).spawn(move || {
         let mut reader = BufReader::with_capacity(64 * 1024, output);
@@ -87,8 +87,10 @@ where
             if let Some(sign) = Sign::of(&line) {
                 deliver(&signs, sign);
             } else {
-                // A full disk costs the lines, not the simulation.
-                writeln!(file, "{line}").ok();
+                if let Some(file) = &mut file {
+                    // A full disk costs the lines, not the simulation.
+                    file.write_all(format!("{line}\n").as_bytes()).ok();
+                }
                 kept.push(line);
             }
         }

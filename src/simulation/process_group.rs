@@ -5,12 +5,12 @@ use std::fmt;
 use std::future::Future;
 use std::io::{PipeWriter, Write};
 use std::os::unix::process::ExitStatusExt;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::{ExitStatus, Stdio};
 use std::time::Duration;
 
 use super::guardian::NOT_STARTED;
-use super::process_tree;
+use super::{orphans, process_tree};
 
 /// What to start, and how it ends.
 #[derive(Debug)]
@@ -72,16 +72,20 @@ impl ProcessGroup {
         if let Some(folder) = &plan.folder {
             command.current_dir(folder);
         }
-        let mut child = command.stdin(reader).stdout(output).stderr(errors).process_group(0).spawn()?;
+        let mut child = orphans::start(command.stdin(reader).stdout(output).stderr(errors))?;
         let guardian = child.id().and_then(|id| i32::try_from(id).ok()).unwrap_or_default();
         let mark = plan.mark.clone();
         let ended = async move {
             match child.wait().await {
                 Ok(status) if status.signal().is_none() => Ending::of_guardian(status),
-                // Somebody has killed the guardian: what it guarded is found by its mark.
+                // Somebody has killed the guardian: what it guarded is now the server's.
                 _ => {
-                    log::error!("the guardian {guardian} was killed, its processes are ended by their mark");
-                    actix_rt::task::spawn_blocking(move || process_tree::kill_marked(&mark)).await.ok();
+                    log::error!("the guardian {guardian} was killed, its processes are ended");
+                    let end = move || {
+                        orphans::end_all();
+                        process_tree::kill_marked(&mark)
+                    };
+                    actix_rt::task::spawn_blocking(end).await.ok();
                     Ending::Signal(9)
                 }
             }
@@ -102,6 +106,18 @@ impl ProcessGroup {
     }
 }
 
+/// Has a folder removed when the server ends, in whatever way: as soon as nobody holds what is given back.
+///
+/// # Errors
+/// When the system can start no more processes.
+pub fn remove_in_the_end(folder: &Path) -> std::io::Result<PipeWriter> {
+    let (reader, lifeline) = std::io::pipe()?;
+    let mut command = tokio::process::Command::new("/proc/self/exe");
+    command.arg0("simulation-server").args(["guard", "--remove"]).arg(folder);
+    orphans::start(command.stdin(reader).stdout(Stdio::null()).stderr(Stdio::null()))?;
+    Ok(lifeline)
+}
+
 /// Starts a program that starts no other; dropping the future kills it, and so does the kernel when the server ends.
 ///
 /// # Errors
@@ -115,7 +131,7 @@ pub fn start_alone(
     command.args(["--pdeathsig", "KILL", "--"]).args(&plan.command);
     command.envs(plan.environment.iter().map(|(name, value)| (name, value))).env(process_tree::MARK, &plan.mark);
     command.stdin(Stdio::null()).stdout(output).stderr(errors).process_group(0).kill_on_drop(true);
-    let mut child = command.spawn()?;
+    let mut child = orphans::start(&mut command)?;
     Ok(async move {
         let status = child.wait().await;
         let signal = |status: &ExitStatus| status.signal().and_then(|number| u8::try_from(number).ok());

@@ -3,7 +3,7 @@
 use std::collections::HashSet;
 use std::ops::RangeInclusive;
 use std::path::Path;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
@@ -28,8 +28,10 @@ pub fn descendants(root: i32) -> Vec<i32> {
     found
 }
 
-/// A process that has ended has no children; that is no fault.
-fn children(pid: i32) -> Vec<i32> {
+/// The children of a process, those that were not buried yet among them. One that has ended has none; that is no
+/// fault.
+#[must_use]
+pub fn children(pid: i32) -> Vec<i32> {
     let Ok(tasks) = Process::new(pid).and_then(|process| process.tasks()) else {
         return Vec::new();
     };
@@ -37,9 +39,21 @@ fn children(pid: i32) -> Vec<i32> {
     tasks.flatten().flat_map(of_task).filter_map(|child| i32::try_from(child).ok()).collect()
 }
 
-/// Ends all descendants of a process. They are stopped first, so that none can fork its way out, then killed.
-pub fn kill_descendants(root: i32) {
-    let mut known = HashSet::new();
+/// Ends all descendants of a process, and gives back which they were.
+#[must_use]
+pub fn kill_descendants(root: i32) -> HashSet<i32> {
+    kill_below(root, HashSet::new())
+}
+
+/// Ends a process and all its descendants, and gives back which they were.
+#[must_use]
+pub fn kill_tree(root: i32) -> HashSet<i32> {
+    signal_each([&root], Signal::SIGSTOP);
+    kill_below(root, HashSet::from([root]))
+}
+
+/// They are stopped first, so that none can fork its way out, then killed.
+fn kill_below(root: i32, mut known: HashSet<i32>) -> HashSet<i32> {
     loop {
         let fresh: Vec<i32> = descendants(root).into_iter().filter(|pid| known.insert(*pid)).collect();
         if fresh.is_empty() {
@@ -48,6 +62,7 @@ pub fn kill_descendants(root: i32) {
         signal_each(&fresh, Signal::SIGSTOP);
     }
     signal_each(known.iter(), Signal::SIGKILL);
+    known
 }
 
 /// Ends every process that carries the mark of an instance below `folder`, in whatever tree it is now.
@@ -71,6 +86,21 @@ pub fn kill_marked(folder: &Path) -> usize {
     known.len()
 }
 
+/// Waits until the guardians of instances below `folder` have ended, whose server is gone: each is ending its tree, and
+/// knows more of it than the mark tells. Gives up after some seconds.
+pub fn await_guardians(folder: &Path) {
+    let deadline = Instant::now() + GUARDIANS;
+    let is_guardian = |pid: i32| {
+        let line = Process::new(pid).and_then(|process| process.cmdline());
+        line.is_ok_and(|line| line.get(1).is_some_and(|word| word == "guard"))
+    };
+    while marked(folder).into_iter().any(is_guardian) && Instant::now() < deadline {
+        std::thread::sleep(BETWEEN_LOOKS);
+    }
+}
+
+/// How long guardians that have lost their server may take.
+const GUARDIANS: Duration = Duration::from_secs(5);
 /// How often marked processes are looked for.
 const MOST_LOOKS: usize = 200;
 /// Between two looks: killed processes need a moment to vanish.
@@ -140,7 +170,7 @@ mod tests {
         std::io::BufRead::read_line(&mut std::io::BufReader::new(shell.stdout.take().unwrap()), &mut line).unwrap();
         let pid = i32::try_from(shell.id()).unwrap();
         assert_eq!(descendants(pid).len(), 2);
-        kill_descendants(pid);
+        assert_eq!(kill_descendants(pid).len(), 2);
         assert!(shell.wait().is_ok());
         assert!(descendants(pid).is_empty());
     }

@@ -1,38 +1,56 @@
 //! Cached bare repositories on disk, under a size budget. Safe for several servers that share the folder.
 //!
-//! `CACHE/git/NAME` is a bare repository, `NAME.use` is locked (shared) by everybody who reads it, `NAME.fetch` is
-//! locked by whoever adds to it. The time of the `.use` file says when a repository was used last.
+//! `CACHE/git/NAME` is a bare repository, `NAME.use` is locked (shared) by everybody who uses it, `NAME.fetch` is
+//! locked by whoever adds to it or tidies it up. The time of the `.use` file says when a repository was used last.
+//! `NAME.damaged` marks a repository that is broken while others still use it: whoever comes takes the next one,
+//! `NAME~1`, and the broken one is removed when the last has left (see [`super::housekeeping`]).
 
-use std::fs::{File, TryLockError};
+use std::fs::File;
 use std::hash::{DefaultHasher, Hash, Hasher};
 use std::io;
 use std::path::{Path, PathBuf};
-use std::time::{Duration, SystemTime};
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
+use std::time::SystemTime;
+
+use super::cache_lock::{Departure, Work, beside, lock_file, wait};
+use super::cached_repository::{Fetching, InUse};
 
 /// The folder of cached repositories.
 #[derive(Debug, Clone)]
 pub struct RepositoryCache {
     folder: PathBuf,
     budget: u64,
+    work: Arc<Work>,
 }
 
-/// A cached repository that is in use: as long as this lives it is not removed.
+/// What a look at the cache has found.
+#[derive(Debug, Default, PartialEq, Eq)]
+pub struct Survey {
+    /// Repositories that were removed.
+    pub removed: usize,
+    /// How many bytes are left above the budget.
+    pub excess: u64,
+    /// The repositories that are left, the largest first.
+    pub left: Vec<PathBuf>,
+}
+
+/// A repository for [`RepositoryCache::mend`].
 #[derive(Debug)]
-pub struct InUse {
-    path: PathBuf,
-    fetch_lock: PathBuf,
-    #[expect(dead_code, reason = "it is held, not read")]
-    lock: File,
+pub enum Patient {
+    /// Nobody else uses it.
+    Alone {
+        /// Where it is.
+        path: PathBuf,
+        /// Keeps others away.
+        lock: File,
+    },
+    /// Others use it too.
+    Shared(InUse, Fetching),
 }
 
-/// The right to add to a cached repository.
-#[derive(Debug)]
-pub struct Fetching {
-    _lock: File,
-}
-
-/// Between two looks at a lock that somebody else holds.
-const PATIENCE: Duration = Duration::from_millis(20);
+/// So many broken repositories of one remote may wait for their users to leave.
+const MOST_GENERATIONS: usize = 100;
 
 impl RepositoryCache {
     /// Opens the cache below `folder`, which may take `budget` bytes.
@@ -42,7 +60,7 @@ impl RepositoryCache {
     pub fn open(folder: &Path, budget: u64) -> io::Result<Self> {
         let folder = folder.join("git");
         std::fs::create_dir_all(&folder)?;
-        Ok(Self { folder: folder.canonicalize()?, budget })
+        Ok(Self { folder: folder.canonicalize()?, budget, work: Arc::default() })
     }
 
     /// Takes a repository into use. It may not exist yet: then its path is where it belongs.
@@ -50,116 +68,136 @@ impl RepositoryCache {
     /// # Errors
     /// When its lock can't be opened.
     pub async fn take(&self, location: &str) -> io::Result<InUse> {
-        let name = file_name(location);
-        let lock = File::options().create(true).append(true).open(self.folder.join(format!("{name}.use")))?;
-        wait(|| lock.try_lock_shared()).await?;
-        lock.set_modified(SystemTime::now())?;
-        let fetch_lock = self.folder.join(format!("{name}.fetch"));
-        Ok(InUse { path: self.folder.join(&name), fetch_lock, lock })
+        loop {
+            let path = self.current(location)?;
+            let lock = lock_file(&path, "use")?;
+            wait(|| lock.try_lock_shared()).await?;
+            lock.set_modified(SystemTime::now())?;
+            let repository = InUse::new(path, lock, Departure(Arc::clone(&self.work)));
+            if !beside(repository.path(), "damaged").exists() {
+                return Ok(repository);
+            }
+        }
     }
 
-    /// Removes the repositories that were not used for longest, until all fit into the budget. Those in use stay.
-    ///
-    /// Gives back how many were removed. Reads the whole folder: not for a thread that serves others.
+    /// Takes a repository into use for a look at it, unless it is being removed. Nobody is told when that ends.
     #[must_use]
-    pub fn shrink(&self) -> usize {
+    pub fn visit(&self, path: &Path) -> Option<InUse> {
+        let lock = lock_file(path, "use").ok()?;
+        lock.try_lock_shared().ok()?;
+        Some(InUse::new(path.to_owned(), lock, Departure(Arc::default())))
+    }
+
+    /// Takes a repository for [`RepositoryCache::mend`]: alone, if nobody else uses it.
+    ///
+    /// # Errors
+    /// When its locks can't be opened.
+    pub async fn examine(&self, location: &str) -> io::Result<Patient> {
+        let path = self.current(location)?;
+        let lock = lock_file(&path, "use")?;
+        if lock.try_lock().is_ok() {
+            return Ok(Patient::Alone { path, lock });
+        }
+        let repository = self.take(location).await?;
+        let fetching = repository.fetching().await?;
+        Ok(Patient::Shared(repository, fetching))
+    }
+
+    /// Removes a repository that was found to be damaged. While others use it, it is only put aside.
+    ///
+    /// # Errors
+    /// When that can't be done.
+    pub async fn mend(&self, patient: Patient) -> io::Result<()> {
+        match patient {
+            Patient::Alone { path, lock } => {
+                let removed = tokio::fs::remove_dir_all(path).await;
+                drop(lock);
+                removed
+            }
+            Patient::Shared(repository, fetching) => {
+                File::create(beside(repository.path(), "damaged"))?;
+                self.work.left_over.store(true, Ordering::Relaxed);
+                drop((fetching, repository));
+                Ok(())
+            }
+        }
+    }
+
+    /// Says that something was added.
+    pub fn grown(&self) {
+        self.work.wake.notify_one();
+    }
+
+    /// Waits until there may be something to tidy up.
+    pub async fn change(&self) {
+        self.work.wake.notified().await;
+    }
+
+    /// Removes what is damaged, and the repositories that were not used for longest until all fit into the budget.
+    /// Those in use stay. Reads the whole folder: not for a thread that serves others.
+    #[must_use]
+    pub fn shrink(&self) -> Survey {
+        let mut survey = Survey::default();
         let Ok(entries) = std::fs::read_dir(&self.folder) else {
-            return 0;
+            return survey;
         };
         let locks = entries.flatten().map(|entry| entry.path());
         let locks = locks.filter(|path| path.extension().is_some_and(|extension| extension == "use"));
-        let mut repositories: Vec<(SystemTime, u64, PathBuf)> = locks
+        let mut repositories: Vec<(bool, SystemTime, u64, PathBuf)> = locks
             .filter_map(|lock| {
                 let used = lock.metadata().and_then(|about| about.modified()).ok()?;
-                Some((used, size_of(&lock.with_extension("")), lock))
+                let path = lock.with_extension("");
+                Some((!beside(&path, "damaged").exists(), used, size_of(&path), path))
             })
             .collect();
         repositories.sort();
-        let mut total: u64 = repositories.iter().map(|(_, size, _)| size).sum();
-        let mut removed = 0;
-        for (_, size, lock) in repositories {
-            if total <= self.budget {
-                break;
-            }
-            if size > 0 && remove_unused(&lock) {
-                log::info!("removed {} from the cache", lock.with_extension("").display());
+        let mut total: u64 = repositories.iter().map(|(_, _, size, _)| size).sum();
+        let mut left = Vec::new();
+        let mut is_mended = true;
+        for (is_sound, _, size, path) in repositories {
+            let must_go = !is_sound || (total > self.budget && size > 0);
+            if must_go && remove_unused(&path) {
+                log::info!("removed {} from the cache", path.display());
                 total -= size;
-                removed += 1;
+                survey.removed += 1;
+            } else {
+                is_mended &= is_sound;
+                left.push((size, path));
             }
         }
-        removed
-    }
-}
-
-impl InUse {
-    /// Where the bare repository is, or belongs.
-    #[must_use]
-    pub fn path(&self) -> &Path {
-        &self.path
+        left.sort();
+        survey.left = left.into_iter().rev().filter(|(size, _)| *size > 0).map(|(_, path)| path).collect();
+        survey.excess = total.saturating_sub(self.budget);
+        self.work.left_over.store(survey.excess > 0 || !is_mended, Ordering::Relaxed);
+        survey
     }
 
-    /// Waits for the right to add to the repository, and removes what a broken fetch has left.
-    ///
-    /// # Errors
-    /// When its lock can't be opened.
-    pub async fn fetching(&self) -> io::Result<Fetching> {
-        let lock = File::options().create(true).append(true).open(&self.fetch_lock)?;
-        wait(|| lock.try_lock()).await?;
-        for broken in self.incoming().chain(self.locks()) {
-            std::fs::remove_file(broken).ok();
-        }
-        Ok(Fetching { _lock: lock })
-    }
-
-    /// How many bytes a fetch that is under way has received.
-    #[must_use]
-    pub fn received(&self) -> u64 {
-        self.incoming().filter_map(|path| path.metadata().ok()).map(|about| about.len()).sum()
-    }
-
-    /// Packs that are being received, or were when git was ended.
-    fn incoming(&self) -> impl Iterator<Item = PathBuf> {
-        let entries = std::fs::read_dir(self.path.join("objects/pack")).into_iter().flatten().flatten();
-        entries.filter(|entry| entry.file_name().as_encoded_bytes().starts_with(b"tmp_")).map(|entry| entry.path())
-    }
-
-    /// Locks that git leaves behind when it is killed: each would make every later fetch fail.
-    fn locks(&self) -> impl Iterator<Item = PathBuf> {
-        let folders = [self.path.clone(), self.path.join("refs/fleet")];
-        let entries = folders.into_iter().flat_map(|folder| std::fs::read_dir(folder).into_iter().flatten().flatten());
-        entries.map(|entry| entry.path()).filter(|path| path.extension().is_some_and(|extension| extension == "lock"))
-    }
-
-    /// Whether the bare repository is there.
-    #[must_use]
-    pub fn is_made(&self) -> bool {
-        self.path.join("HEAD").is_file()
-    }
-
-    /// Whether a commit was fetched, with all that belongs to it.
-    #[must_use]
-    pub fn has(&self, reference: &str) -> bool {
-        self.path.join(reference).is_file()
+    /// Where the repository of a remote is, or belongs: the first that is not known as damaged.
+    fn current(&self, location: &str) -> io::Result<PathBuf> {
+        let name = file_name(location);
+        let generations = (1..MOST_GENERATIONS).map(|generation| self.folder.join(format!("{name}~{generation}")));
+        let mut all = std::iter::once(self.folder.join(&name)).chain(generations);
+        let sound = all.find(|path| !beside(path, "damaged").exists());
+        sound.ok_or_else(|| io::Error::other("what is cached of it was damaged too often"))
     }
 }
 
 /// Removes a repository unless somebody uses it.
-fn remove_unused(lock: &Path) -> bool {
-    let Ok(held) = File::options().append(true).open(lock) else {
+fn remove_unused(path: &Path) -> bool {
+    let Ok(lock) = lock_file(path, "use") else {
         return false;
     };
-    // The locks' files stay: one that was removed could still be locked by another who has it open.
-    held.try_lock().is_ok() && std::fs::remove_dir_all(lock.with_extension("")).is_ok()
-}
-
-async fn wait(mut attempt: impl FnMut() -> Result<(), TryLockError>) -> io::Result<()> {
-    loop {
-        match attempt() {
-            Ok(()) => return Ok(()),
-            Err(TryLockError::WouldBlock) => actix_rt::time::sleep(PATIENCE).await,
-            Err(TryLockError::Error(error)) => return Err(error),
-        }
+    if lock.try_lock().is_err() {
+        return false;
     }
+    let removed = match std::fs::remove_dir_all(path) {
+        Err(error) => error.kind() == io::ErrorKind::NotFound,
+        Ok(()) => true,
+    };
+    // What is gone is no longer damaged; the mark must not outlive it, nor go before it.
+    removed
+        && std::fs::remove_file(beside(path, "damaged"))
+            .map_or_else(|error| error.kind() == io::ErrorKind::NotFound, |()| true)
 }
 
 /// A readable name, made unique by a hash.
@@ -190,6 +228,7 @@ fn size_of(folder: &Path) -> u64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use std::time::Duration;
 
     fn age_of(cache: &RepositoryCache, name: &str, seconds: u64) {
         let lock = cache.folder.join(format!("{}.use", file_name(name)));
@@ -209,7 +248,7 @@ mod tests {
         }
         let _used = cache.take("in use").await.unwrap();
         age_of(&cache, "in use", 30);
-        assert_eq!(cache.shrink(), 1);
+        assert_eq!(cache.shrink().removed, 1);
         let exists = |name| cache.folder.join(file_name(name)).exists();
         assert!(exists("in use") && !exists("old") && exists("new"));
     }
@@ -230,6 +269,25 @@ mod tests {
         drop(fetching);
         let _fetching = other.fetching().await.unwrap();
         assert_eq!(other.received(), 0);
+    }
+
+    #[actix_rt::test]
+    async fn what_is_damaged_stays_as_long_as_it_is_used_and_nobody_new_gets_it() {
+        let folder = tempfile::tempdir().unwrap();
+        let cache = RepositoryCache::open(folder.path(), 1000).unwrap();
+        let user = cache.take("x").await.unwrap();
+        std::fs::create_dir(user.path()).unwrap();
+        let patient = cache.examine("x").await.unwrap();
+        assert!(matches!(patient, Patient::Shared(..)));
+        cache.mend(patient).await.unwrap();
+        let next = cache.take("x").await.unwrap();
+        assert!(next.path() != user.path() && user.path().exists());
+        let old = user.path().to_owned();
+        assert_eq!(cache.shrink().removed, 0);
+        drop(user);
+        assert_eq!(cache.shrink().removed, 1);
+        assert!(!old.exists() && cache.take("x").await.unwrap().path() == old);
+        assert!(matches!(cache.examine("x").await.unwrap(), Patient::Alone { .. }));
     }
 
     #[test]

@@ -1,6 +1,5 @@
 //! Which commit a world's URL means, and what lies in it: arguments for git and the reading of its answers. Pure.
 
-use std::collections::HashSet;
 use std::ffi::OsString;
 
 use crate::shared::project_url::{ProjectUrl, Reading, RefKind};
@@ -14,6 +13,8 @@ pub struct Revision {
     pub name: String,
     /// What is asked for on the remote.
     remote_name: String,
+    /// Whether it need not be one that the repository's owner has accepted.
+    is_any: bool,
     /// The project's folder; empty for the root.
     pub folder: String,
 }
@@ -21,14 +22,15 @@ pub struct Revision {
 /// How many readings of a URL are looked for: no real branch has more slashes in its name.
 const MOST_READINGS: usize = 12;
 
-/// The commit that a URL names by its full hash: then nobody need be asked what it is.
+/// The commit that a URL names by its full hash: then nobody need be asked what it is. `is_any` tells whether any will
+/// do, or only one that is in a branch or tag.
 #[must_use]
-pub fn commit_of(world: &ProjectUrl) -> Option<Revision> {
+pub fn commit_of(world: &ProjectUrl, is_any: bool) -> Option<Revision> {
     let Reading { reference, folder } = world.candidates().into_iter().next()?;
     let is_hash = [40, 64].contains(&reference.len()) && reference.bytes().all(|byte| byte.is_ascii_hexdigit());
     let kind = matches!(world.kind(), RefKind::Any | RefKind::Commit);
     let commit = reference.to_ascii_lowercase();
-    (is_hash && kind).then(|| Revision { remote_name: commit.clone(), name: reference, commit, folder })
+    (is_hash && kind).then(|| Revision { remote_name: commit.clone(), name: reference, commit, folder, is_any })
 }
 
 /// Asks the remote for all its branches and tags.
@@ -43,6 +45,22 @@ pub fn is_tip(answer: &str, commit: &str) -> bool {
     let tips = answer.lines().filter_map(|line| line.split_once('\t'));
     let accepted = |name: &str| name.starts_with("refs/heads/") || name.starts_with("refs/tags/");
     tips.filter(|(_, name)| accepted(name)).any(|(tip, _)| tip == commit)
+}
+
+/// Fetches all branches and tags from the remote of this name: only their commits where it can do that, else
+/// everything. git keeps note of that only for remotes that have a name.
+#[must_use]
+pub fn history_arguments(remote: &str) -> Vec<OsString> {
+    let options = ["fetch", "--filter=tree:0", "--prune", "--no-tags", "--no-write-fetch-head", "--progress", "--"];
+    let all = ["+refs/heads/*:refs/heads/*", "+refs/tags/*:refs/tags/*"];
+    options.into_iter().chain([remote]).chain(all).map(OsString::from).collect()
+}
+
+/// Names a branch or tag of a fetched history in which a commit is.
+#[must_use]
+pub fn reachable_arguments(commit: &str) -> Vec<OsString> {
+    let fixed = ["for-each-ref", "--count=1", "--contains", commit, "refs/heads", "refs/tags"];
+    fixed.map(OsString::from).to_vec()
 }
 
 /// Asks the remote for all branches and tags that a URL may mean.
@@ -79,6 +97,7 @@ pub fn found(world: &ProjectUrl, answer: &str) -> Vec<Revision> {
                 name: reading.reference,
                 remote_name: name,
                 folder: reading.folder,
+                is_any: false,
             })
         })
         .collect()
@@ -91,18 +110,24 @@ impl Revision {
         self.remote_name == self.commit
     }
 
+    /// Its name in the cached repository. What was accepted because any commit is may not be taken for more later.
+    #[must_use]
+    pub fn reference(&self) -> String {
+        format!("refs/{}/{}", if self.is_any { "any" } else { "fleet" }, self.commit)
+    }
+
     /// Fetches this commit alone.
     #[must_use]
     pub fn fetch_arguments(&self, location: &str) -> Vec<OsString> {
-        let refspec = format!("+{}:refs/fleet/{}", self.remote_name, self.commit);
+        let refspec = format!("+{}:{}", self.remote_name, self.reference());
         let options = ["fetch", "--depth=1", "--no-tags", "--no-write-fetch-head", "--progress", "--"];
         options.into_iter().map(OsString::from).chain([location.into(), refspec.into()]).collect()
     }
 
     /// Lists the files of the project.
     #[must_use]
-    pub fn list_arguments(&self, reference: &str) -> Vec<OsString> {
-        let fixed = ["ls-tree", "-r", "-l", "-z", "--full-tree", reference].map(OsString::from);
+    pub fn list_arguments(&self) -> Vec<OsString> {
+        let fixed = ["ls-tree", "-r", "-l", "-z", "--full-tree", &self.reference()].map(OsString::from);
         let folder = (!self.folder.is_empty()).then(|| OsString::from(format!("{}/", self.folder)));
         fixed.into_iter().chain(folder).collect()
     }
@@ -120,31 +145,39 @@ impl Revision {
 pub struct Listing {
     /// Of all files, in bytes.
     pub size: u64,
-    paths: HashSet<Vec<u8>>,
+    /// How many files there are, and folders.
+    pub entries: u64,
+    /// Whether the world is among them.
+    pub has_world: bool,
 }
 
 impl Listing {
     /// Reads the answer of `git ls-tree -r -l -z`.
     #[must_use]
-    pub fn parse(answer: &[u8]) -> Self {
+    pub fn parse(answer: &[u8], world_path: &str) -> Self {
         let mut listing = Self::default();
+        let mut last_path: &[u8] = b"";
         for entry in answer.split(|byte| *byte == 0) {
             let Some(tab) = entry.iter().position(|byte| *byte == b'\t') else {
                 continue;
             };
             let (about, path) = entry.split_at(tab);
+            let path = path.get(1..).unwrap_or_default();
             let size = about.rsplit(|byte| *byte == b' ').next().and_then(|size| str::from_utf8(size).ok());
             listing.size = listing.size.saturating_add(size.and_then(|size| size.parse().ok()).unwrap_or(0));
-            listing.paths.insert(path.get(1..).unwrap_or_default().to_vec());
+            listing.entries += 1 + new_folders(last_path, path);
+            listing.has_world |= path == world_path.as_bytes();
+            last_path = path;
         }
         listing
     }
+}
 
-    /// Whether a file is there.
-    #[must_use]
-    pub fn has(&self, path: &str) -> bool {
-        self.paths.contains(path.as_bytes())
-    }
+/// How many folders of a path are not in the one before it; git lists what is in a folder together.
+fn new_folders(before: &[u8], path: &[u8]) -> u64 {
+    let common = before.iter().zip(path).take_while(|(one, other)| one == other).count();
+    let rest = path.get(common..).unwrap_or_default();
+    rest.iter().fold(0, |count, byte| count + u64::from(*byte == b'/'))
 }
 
 #[cfg(test)]
@@ -173,11 +206,15 @@ mod tests {
 
     #[test]
     fn a_full_hash_is_a_commit() {
-        let commit = commit_of(&world(&format!("tree/{A}/p/worlds/a.wbt"))).unwrap();
+        let commit = commit_of(&world(&format!("tree/{A}/p/worlds/a.wbt")), false).unwrap();
         assert!(commit.is_commit());
         assert_eq!(commit.world_path(&world("blob/x/worlds/a.wbt")), "p/worlds/a.wbt");
-        assert_eq!(commit_of(&world("blob/aaaaaaa/worlds/a.wbt")), None, "short hashes are not unique");
-        assert_eq!(commit_of(&world(&format!("src/branch/{A}/worlds/a.wbt"))), None, "it says that it is a branch");
+        assert_eq!(commit_of(&world("blob/aaaaaaa/worlds/a.wbt"), false), None, "short hashes are not unique");
+        assert_eq!(
+            commit_of(&world(&format!("src/branch/{A}/worlds/a.wbt")), false),
+            None,
+            "it says that it is a branch"
+        );
     }
 
     #[test]
@@ -196,9 +233,8 @@ mod tests {
     #[test]
     fn a_listing_knows_sizes_and_paths() {
         let answer = b"100644 blob aaa      12\tp/worlds/a b.wbt\x00120000 blob bbb       3\tp/link\x00160000 commit ccc -\tp/module\x00";
-        let listing = Listing::parse(answer);
-        assert_eq!(listing.size, 15);
-        assert!(listing.has("p/worlds/a b.wbt") && !listing.has("p/worlds"));
-        assert_eq!(Listing::parse(b""), Listing::default());
+        let listing = Listing::parse(answer, "p/worlds/a b.wbt");
+        assert_eq!(listing, Listing { size: 15, entries: 5, has_world: true });
+        assert!(!Listing::parse(answer, "worlds/a b.wbt").has_world);
     }
 }

@@ -41,7 +41,7 @@ async fn client(request: HttpRequest, stream: web::Payload, server: web::Data<Se
         Err(crowded) => return crowded.answer(),
     };
     let server = Arc::clone(&server);
-    websocket::open(&request, stream, |inflow| WebClient::new(server, peer, (connection, inflow)))
+    websocket::open(&request, stream, |inbox| WebClient::new(server, peer, (connection, inbox)))
 }
 
 /// A page of another origin may use visitors' browsers to start simulations, unless origins are listed.

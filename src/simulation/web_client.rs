@@ -6,7 +6,7 @@
 use std::sync::Arc;
 
 use actix::prelude::*;
-use actix_web_actors::ws::{self, CloseCode, CloseReason, Message, ProtocolError, WebsocketContext};
+use actix_web_actors::ws::{CloseCode, CloseReason, Message, ProtocolError, WebsocketContext};
 
 use super::census::Change;
 use super::checkout::{Progress, Project};
@@ -22,7 +22,7 @@ use crate::shared::connections::Connection;
 use crate::shared::liveness::Liveness;
 use crate::shared::peer::Peer;
 use crate::shared::shutdown::closing;
-use crate::shared::websocket::Inflow;
+use crate::shared::websocket::{Heard, Inbox};
 
 /// The actor.
 pub struct WebClient {
@@ -32,16 +32,16 @@ pub struct WebClient {
     liveness: Liveness,
     restoring: bool,
     start: Pending,
-    inflow: Inflow,
+    inbox: Inbox,
     _connection: Connection,
 }
 
 type Context = WebsocketContext<WebClient>;
 
 impl WebClient {
-    /// A client that has just connected; `connection` counts it, `inflow` what comes from it.
+    /// A client that has just connected; `connection` counts it, `inbox` takes what comes from it.
     #[must_use]
-    pub fn new(server: Arc<Server>, peer: Peer, (connection, inflow): (Connection, Inflow)) -> Self {
+    pub fn new(server: Arc<Server>, peer: Peer, (connection, inbox): (Connection, Inbox)) -> Self {
         Self {
             server,
             peer,
@@ -49,7 +49,7 @@ impl WebClient {
             liveness: Liveness::new(),
             restoring: false,
             start: Pending::default(),
-            inflow,
+            inbox,
             _connection: connection,
         }
     }
@@ -169,7 +169,8 @@ impl WebClient {
 
     fn reset_controller(&mut self, file: String, ctx: &mut Context) {
         let Stage::Launched(Lease(webots)) = &self.stage else {
-            return self.fail("A controller can be reset only while a simulation runs", ctx);
+            // A start that is under way goes on.
+            return ctx.text(protocol::error("A controller can be reset only while a simulation runs"));
         };
         if std::mem::replace(&mut self.restoring, true) {
             log::warn!("{}: asks to reset a controller while another is being reset; ignored", self.name());
@@ -226,28 +227,23 @@ impl Actor for WebClient {
 
 impl StreamHandler<Result<Message, ProtocolError>> for WebClient {
     fn handle(&mut self, message: Result<Message, ProtocolError>, ctx: &mut Self::Context) {
-        self.inflow.took(&message);
-        match message {
-            Ok(Message::Text(text)) if self.liveness.may_answer() => self.understand(&text, ctx),
-            Ok(Message::Ping(data)) if self.liveness.may_answer() => ctx.pong(&data),
-            Ok(Message::Pong(content)) => self.liveness.pong(&content),
-            Ok(Message::Close(reason)) => {
+        match self.inbox.take(message) {
+            Heard::Text(text) if self.liveness.may_answer() => self.understand(&text, ctx),
+            Heard::Ping(data) if self.liveness.may_answer() => ctx.pong(&data),
+            Heard::Pong(content) => self.liveness.pong(&content),
+            Heard::Close(reason) => {
                 ctx.close(reason);
                 ctx.stop();
             }
-            Ok(Message::Nop) => {}
-            Ok(Message::Text(_) | Message::Ping(_)) => {
+            Heard::Nothing => {}
+            Heard::Text(_) | Heard::Ping(_) => {
                 log::warn!("{}: asks too much between two pings", self.name());
                 ctx.close(Some(CloseCode::Policy.into()));
                 ctx.stop();
             }
-            Ok(Message::Binary(_) | Message::Continuation(_)) => {
-                self.fail("Wrong message: allowed are short texts", ctx);
-            }
-            Err(error) => {
-                log::info!("{}: {error}", self.name());
-                ctx.close(Some(ws::CloseCode::Protocol.into()));
-                ctx.stop();
+            Heard::Wrong(wrong) => {
+                log::info!("{}: {wrong}", self.name());
+                self.finish(&protocol::error(&wrong.to_string()), wrong.code(), ctx);
             }
         }
     }

@@ -17,6 +17,7 @@ use super::output::{self, Sign, Tail};
 use super::process_group::{Ending, ProcessGroup};
 use super::process_tree;
 use super::webots_event::{Exit, LastWord, WebotsEvent};
+use crate::shared::rotated_file::RotatedFile;
 use crate::shared::timestamp::seconds_since_1970;
 
 /// Asks Webots to end.
@@ -49,6 +50,8 @@ pub struct Webots {
 const MISSED_HEARTBEATS: u32 = 6;
 /// If its port is taken, Webots silently takes one of so many that follow.
 const NEXT_PORTS: u16 = 10;
+/// How many older files of its output are kept beside the newest.
+const OLD_LOGS: usize = 1;
 /// How long the rest of an output may take to be read.
 const LAST_WORDS: Duration = Duration::from_secs(1);
 /// Between two looks whether Webots listens, at first.
@@ -78,7 +81,16 @@ impl Webots {
         let log = self.orders.config.log_dir.0.join("simulation/instances").join(format!("{}.log", self.port));
         let begin = std::fs::metadata(&log).map_or(0, |file| file.len());
         let (reader, output) = std::io::pipe()?;
-        let (tail, all_read) = output::follow(reader, &log, ctx.address())?;
+        let file = RotatedFile::open(&log, OLD_LOGS);
+        if let Err(error) = &file {
+            log::warn!(
+                "port {}: what Webots prints is not kept: {} can't be written: {error}",
+                self.port,
+                log.display()
+            );
+        }
+        let log = file.is_ok().then_some(log);
+        let (tail, all_read) = output::follow(reader, file.ok(), ctx.address())?;
         self.tail = tail;
         let errors = output.try_clone()?;
         let (group, ended) = ProcessGroup::start(&self.orders.plan(), output.into(), errors.into())?;

@@ -28,3 +28,19 @@ async fn a_client_is_led_to_the_simulation_server_that_is_there() {
     assert_eq!(answer.text(), "Error: no simulation server available at the moment.");
     assert_eq!(answer.status, 503);
 }
+
+#[actix_rt::test]
+async fn a_message_may_come_in_pieces_and_must_not_be_large() {
+    let session = session_server(&[]).start().await;
+    let connect = async || Client::connect(&session.websocket("/")).await;
+    let mut client = connect().await;
+    client.until("0").await;
+    client.send_pieces(&[b"https://github.com/lab/arm", b"", b"/blob/main/worlds/a.wbt"]).await;
+    assert_eq!(client.until("Error").await, "Error: no simulation server accepts https://github.com/lab/arm.");
+    let piece = [b'x'; 5000];
+    client.send_pieces(&[&piece, &piece]).await;
+    assert_eq!(client.closed().await, Some(1009));
+    let mut client = connect().await;
+    client.send(&"x".repeat(9000)).await;
+    assert_eq!(client.closed().await, Some(1009));
+}

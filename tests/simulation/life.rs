@@ -1,5 +1,6 @@
 //! Leaving a simulation in every state and for every reason: nothing of it is left.
 
+use std::path::Path;
 use std::time::{Duration, Instant};
 
 use nix::sys::signal::{Signal, kill};
@@ -8,9 +9,9 @@ use nix::unistd::Pid;
 use crate::scene::{ALL, DEMO, Scene, State, arm, instance_folders, nothing_left, stages};
 use crate::support::client::Client;
 use crate::support::git::Forge;
-use crate::support::program::{Builder, simulation_server};
-use crate::support::until;
+use crate::support::program::{Builder, Server, simulation_server};
 use crate::support::webots::{Webots, instances_below};
+use crate::support::{http, until};
 
 fn quick(builder: Builder) -> Builder {
     builder.set("timing.grace", 0.3).set("timing.heartbeat", 0.2)
@@ -106,15 +107,16 @@ async fn a_server_that_is_killed_leaves_nothing_in_any_state() {
         scene.server.signal(Signal::SIGKILL);
         scene.server.ended().await;
         until("all processes are gone", async || instances_below(scene.folder.path()).is_empty()).await;
-        if !matches!(state, State::Connected | State::CheckingOut) {
-            until("its folder is gone", async || instance_folders(scene.folder.path()).is_empty()).await;
-        }
+        let runs = scene.folder.path().join("cache/runs");
+        until("its folder is gone", async || std::fs::read_dir(&runs).unwrap().count() == 0).await;
     }
 }
 
 #[actix_rt::test]
 async fn what_a_killed_server_has_left_is_removed_at_the_next_start() {
     let mut scene = Scene::new(State::CheckingOut, quick).await;
+    // The one that removes the folder is killed too.
+    kill(Pid::from_raw(last_will(&scene.server)), Signal::SIGKILL).unwrap();
     scene.server.signal(Signal::SIGKILL);
     scene.server.ended().await;
     assert_eq!(instance_folders(scene.folder.path()).len(), 1);
@@ -145,6 +147,67 @@ async fn a_guardian_that_is_killed_takes_its_tree_along_and_the_client_is_told()
     }
 }
 
+/// A server whose Webots has hidden processes: without environment, in sessions of their own, without parents.
+async fn hiding(folder: &Path) -> (Server, Client, Vec<i32>, (Forge, Webots)) {
+    let forge = Forge::with_arm();
+    let pids = folder.join("pids");
+    let hide = "for n in 1 2 3; do (env -i setsid bash -c 'echo $$ >> \"$0\"; sleep 1000 & wait'";
+    let webots = Webots::script(&format!("{hide} {} &); done\n{DEMO} \"$@\" & wait", pids.display()));
+    let server = quick(simulation_server(&webots.path(), forge.path(), 1)).folder(folder).start().await;
+    let mut client = Client::start(&server, &arm()).await;
+    client.until("webots:").await;
+    let told = || std::fs::read_to_string(&pids).unwrap_or_default();
+    until("they hide", async || told().lines().count() == 3).await;
+    let hidden: Vec<i32> = told().lines().map(|line| line.parse().unwrap()).collect();
+    until("each has a child", async || hidden.iter().all(|pid| !children(*pid).is_empty())).await;
+    let hidden: Vec<i32> = hidden.into_iter().flat_map(|pid| [vec![pid], children(pid)].concat()).collect();
+    assert!(hidden.iter().all(|pid| is_there(*pid)));
+    assert!(!instances_below(folder).iter().any(|(pid, _)| hidden.contains(pid)), "the mark tells of them");
+    (server, client, hidden, (forge, webots))
+}
+
+#[actix_rt::test]
+async fn nothing_hides_from_the_death_of_its_guardian() {
+    let folder = tempfile::tempdir().unwrap();
+    let (server, mut client, hidden, _parts) = hiding(folder.path()).await;
+    let marked = instances_below(folder.path());
+    let guardian = marked.iter().find(|one| one.1.contains("guard") && one.1.contains("--remove")).unwrap().0;
+    kill(Pid::from_raw(guardian), Signal::SIGKILL).unwrap();
+    let told = client.until("loading: Error:").await;
+    assert!(told.contains("Webots was ended by the signal SIGKILL"), "{told}");
+    assert!(!hidden.iter().any(|pid| is_there(*pid)), "it was told before they were gone");
+    nothing_left(&server, 1).await;
+    until("all are buried", async || children(server.pid()) == [last_will(&server)]).await;
+}
+
+#[actix_rt::test]
+async fn nothing_hides_from_a_server_that_follows_a_killed_one_at_once() {
+    let folder = tempfile::tempdir().unwrap();
+    let (mut server, _client, hidden, (forge, webots)) = hiding(folder.path()).await;
+    server.signal(Signal::SIGKILL);
+    let next = quick(simulation_server(&webots.path(), forge.path(), 1)).folder(folder.path()).spawn();
+    server.ended().await;
+    until("they are gone", async || !hidden.iter().any(|pid| is_there(*pid))).await;
+    until("the next one answers", async || http::try_get(&next.url("/health")).await.is_ok()).await;
+    nothing_left(&next, 1).await;
+}
+
+/// The child of a server that removes the folder of its run.
+fn last_will(server: &Server) -> i32 {
+    let line = |pid: &i32| procfs::process::Process::new(*pid).and_then(|one| one.cmdline()).unwrap_or_default();
+    let is_it = |pid: &i32| line(pid).get(1..3).is_some_and(|words| words == ["guard", "--remove"]);
+    children(server.pid()).into_iter().find(is_it).unwrap()
+}
+
+fn is_there(pid: i32) -> bool {
+    procfs::process::Process::new(pid).is_ok_and(|process| process.stat().is_ok_and(|stat| stat.state != 'Z'))
+}
+
+fn children(pid: i32) -> Vec<i32> {
+    let all = procfs::process::all_processes().unwrap().flatten();
+    all.filter(|one| one.stat().is_ok_and(|stat| stat.ppid == pid)).map(|one| one.pid()).collect()
+}
+
 #[actix_rt::test]
 async fn a_client_is_told_how_webots_ended() {
     let table = [
@@ -154,8 +217,9 @@ async fn a_client_is_told_how_webots_ended() {
     ];
     let forge = Forge::with_arm();
     for (end, words) in table {
-        // It ends while it is launching, or when it was ready.
-        for start in [String::new(), format!("{DEMO} \"$@\" &\nsleep 0.5; echo pause")] {
+        // It ends while it is launching, when it was ready, or while it runs.
+        let ready = |pace: &str| format!("{DEMO} \"$@\" &\nsleep 0.5; echo {pace}");
+        for start in [String::new(), ready("pause"), ready("real-time")] {
             let webots = Webots::script(&format!("{start}\n{end}"));
             let server = quick(simulation_server(&webots.path(), forge.path(), 1)).start().await;
             let mut client = Client::start(&server, &arm()).await;
@@ -170,4 +234,15 @@ async fn a_client_is_told_how_webots_ended() {
             nothing_left(&server, 1).await;
         }
     }
+}
+
+#[actix_rt::test]
+async fn a_server_that_stops_takes_no_new_clients() {
+    let mut scene = Scene::new(State::Stopping, |builder| quick(builder).set("timing.grace", 2.0)).await;
+    scene.server.signal(Signal::SIGTERM);
+    until("it stops", async || scene.server.log().contains("stopping")).await;
+    let mut late = Client::start(&scene.server, &arm()).await;
+    assert_eq!(late.until("loading: Error:").await, "loading: Error: This simulation server is stopping");
+    assert_eq!(late.closed().await, Some(1001));
+    assert_eq!(scene.server.ended().await, Some(0));
 }

@@ -15,8 +15,11 @@
 mod support;
 
 mod admission;
+mod cache;
 mod checkout;
+mod commits;
 mod git_wrapper;
+mod https;
 mod life;
 mod output;
 mod places;

@@ -85,3 +85,18 @@ async fn the_output_of_a_simulation_is_kept_and_printable() {
     let text = std::fs::read_to_string(log).unwrap();
     assert!(text.starts_with("one\nred  [31m text\n\u{fffd} no text\nlast without end"), "{text:?}");
 }
+
+#[actix_rt::test]
+async fn an_output_that_can_not_be_kept_fails_no_start() {
+    let (forge, webots) = (Forge::with_arm(), Webots::script("echo 'last words'; exit 3"));
+    let server = simulation_server(&webots.path(), forge.path(), 1).start().await;
+    let logs = server.folder.join("log/simulation");
+    std::fs::create_dir_all(&logs).unwrap();
+    // Not even root can make a folder in a file.
+    std::fs::write(logs.join("instances"), "").unwrap();
+    let mut client = Client::start(&server, &arm()).await;
+    let told = client.until("loading: Error:").await;
+    assert!(told.contains("Webots ended with exit code 3. Its last output: last words"), "{told}");
+    assert_eq!(server.log().matches("what Webots prints is not kept").count(), 1);
+    nothing_left(&server, 1).await;
+}

@@ -1,7 +1,5 @@
 //! What clients and pages may ask, and what they are told.
 
-use futures_util::{SinkExt, StreamExt};
-use tokio_tungstenite::tungstenite::Message;
 use tokio_tungstenite::tungstenite::client::IntoClientRequest;
 
 use crate::scene::arm;
@@ -26,7 +24,6 @@ async fn a_message_that_is_none_is_answered_in_words() {
         ("{}".to_owned(), "Wrong message"),
         ("[".repeat(5000), "Wrong message"),
         (r#"{"start":{"url":"x","mode":"vr"}}"#.to_owned(), "unknown variant"),
-        (r#"{"reset controller":"c/c.py"}"#.to_owned(), "only while a simulation runs"),
         (start("https://github.com/lab/arm"), "Wrong Webots simulation URL"),
         (start("ftp://github.com/lab/arm/blob/main/worlds/a.wbt"), "does not begin with https://"),
     ];
@@ -41,20 +38,53 @@ async fn a_message_that_is_none_is_answered_in_words() {
 }
 
 #[actix_rt::test]
-async fn oversized_and_binary_messages_end_the_connection() {
+async fn oversized_and_binary_messages_end_the_connection_in_words() {
     let (server, _forge, _webots) = server().await;
-    let table = [(Message::text("x".repeat(9000)), Some(1002)), (Message::binary(vec![0; 10]), Some(1000))];
-    for (message, code) in table {
-        let (mut socket, _) = tokio_tungstenite::connect_async(server.websocket("/client")).await.unwrap();
-        socket.send(message).await.unwrap();
-        let mut end = None;
-        while let Some(Ok(heard)) = actix_rt::time::timeout(crate::support::SOON, socket.next()).await.unwrap() {
-            if let Message::Close(frame) = heard {
-                end = frame.map(|frame| u16::from(frame.code));
-            }
-        }
-        assert_eq!(end, code);
+    let connect = async || Client::connect(&server.websocket("/client")).await;
+    let large = "loading: Error: Wrong message: it is longer than 8 KiB";
+    let piece = [b'x'; 5000];
+    let mut clients = [connect().await, connect().await, connect().await];
+    clients[0].send(&"x".repeat(9000)).await;
+    clients[1].send_pieces(&[&piece, &piece]).await;
+    clients[2].send(&"x".repeat(200_000)).await;
+    for mut client in clients {
+        assert_eq!(client.until("").await, large);
+        assert_eq!(client.closed().await, Some(1009));
     }
+    let mut clients = [connect().await, connect().await];
+    clients[0].send_binary(&[0; 10]).await;
+    clients[1].send_pieces(&[b"\xff", b"\xff"]).await;
+    for mut client in clients {
+        assert_eq!(client.until("").await, "loading: Error: Wrong message: allowed are short texts");
+        assert_eq!(client.closed().await, Some(1003));
+    }
+}
+
+#[actix_rt::test]
+async fn a_message_may_come_in_pieces() {
+    let (server, _forge, _webots) = server().await;
+    let text = serde_json::json!({"start": {"url": arm()}, "é": "é".repeat(3000)}).to_string();
+    let mut client = Client::connect(&server.websocket("/client")).await;
+    let pieces: Vec<&[u8]> = text.as_bytes().chunks(1001).collect();
+    assert!(pieces.len() > 5);
+    client.send_pieces(&pieces).await;
+    client.until("webots:").await;
+    client.send_pieces(&[b"{\"reset controller\": ", b"", b"\"c/c.py\"}"]).await;
+    client.until("reset controller: c/c.py").await;
+}
+
+#[actix_rt::test]
+async fn a_reset_that_comes_too_early_ends_nothing() {
+    let (server, _forge, _webots) = server().await;
+    let mut client = Client::connect(&server.websocket("/client")).await;
+    let refused = "loading: Error: A controller can be reset only while a simulation runs";
+    let reset = r#"{"reset controller": "c/c.py"}"#;
+    client.send(reset).await;
+    assert_eq!(client.until("").await, refused);
+    client.send(&serde_json::json!({"start": {"url": arm()}}).to_string()).await;
+    client.send(reset).await;
+    client.until(refused).await;
+    client.until("webots:").await;
 }
 
 #[actix_rt::test]

@@ -1,14 +1,18 @@
 //! When Webots is ready, where, and when it is not.
 
 use std::net::TcpListener;
+use std::path::PathBuf;
 use std::time::Duration;
+
+use nix::sys::signal::{Signal, kill};
+use nix::unistd::Pid;
 
 use crate::scene::{DEMO, arm, nothing_left, stages};
 use crate::support::client::Client;
 use crate::support::git::Forge;
 use crate::support::program::simulation_server;
 use crate::support::until;
-use crate::support::webots::Webots;
+use crate::support::webots::{Webots, instances_below};
 
 #[actix_rt::test]
 async fn the_port_that_webots_really_took_is_handed_out() {
@@ -170,4 +174,38 @@ async fn each_webots_gets_a_virtual_display_of_its_own() {
         client.leave().await;
     }
     nothing_left(&server, 2).await;
+}
+
+#[actix_rt::test]
+async fn a_virtual_display_that_is_killed_leaves_no_trace() {
+    let paths = std::env::var_os("PATH").unwrap();
+    if !std::env::split_paths(&paths).any(|folder| folder.join("xvfb-run").is_file()) {
+        eprintln!("xvfb-run is missing here: virtual displays are NOT tested");
+        return;
+    }
+    let forge = Forge::with_arm();
+    let webots = Webots::script(&format!("echo \"display $DISPLAY\"\n{DEMO} \"$@\" & wait"));
+    let temporary = tempfile::tempdir().unwrap();
+    let builder = simulation_server(&webots.path(), forge.path(), 1).set("xvfb", true);
+    let server = builder.env("TMPDIR", temporary.path().to_str().unwrap()).start().await;
+    for victim in ["xvfb-run", "guard"] {
+        let mut client = Client::start(&server, &arm()).await;
+        client.until("webots:").await;
+        let log = server.folder.join(format!("log/simulation/instances/{}.log", server.port + 1));
+        let text = std::fs::read_to_string(log).unwrap();
+        let display = text.lines().filter_map(|line| line.strip_prefix("display :")).next_back().unwrap().to_owned();
+        let traces = [format!("/tmp/.X{display}-lock"), format!("/tmp/.X11-unix/X{display}")].map(PathBuf::from);
+        assert!(traces.iter().all(|path| path.exists()), "{traces:?}");
+        let is_victim = |one: &&(i32, String)| match victim {
+            "guard" => one.1.contains("--remove"),
+            _ => one.1.contains("xvfb-run") && !one.1.contains("guard"),
+        };
+        let pid = instances_below(&server.folder).iter().find(is_victim).unwrap().0;
+        kill(Pid::from_raw(pid), Signal::SIGKILL).unwrap();
+        client.until("loading: Error:").await;
+        assert!(!traces.iter().any(|path| path.exists()), "{victim}: {traces:?}");
+        let left: Vec<_> = std::fs::read_dir(temporary.path()).unwrap().flatten().map(|one| one.path()).collect();
+        assert!(left.is_empty(), "{left:?}");
+        nothing_left(&server, 1).await;
+    }
 }

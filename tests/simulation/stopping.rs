@@ -73,14 +73,29 @@ fn listener(codes: &'static [u16]) -> (String, std::sync::mpsc::Receiver<String>
     std::thread::spawn(move || {
         for code in codes {
             let (mut socket, _) = listener.accept().unwrap();
-            socket.set_read_timeout(Some(Duration::from_millis(200))).unwrap();
+            socket.set_read_timeout(Some(crate::support::SOON)).unwrap();
             let mut text = Vec::new();
-            socket.read_to_end(&mut text).ok();
+            while !is_whole(&text) {
+                let mut chunk = [0; 4096];
+                let length = socket.read(&mut chunk).unwrap();
+                assert!(length > 0, "the request broke off");
+                text.extend_from_slice(&chunk[..length]);
+            }
             write!(socket, "HTTP/1.1 {code} X\r\nContent-Length: 0\r\nConnection: close\r\n\r\n").ok();
             sender.send(String::from_utf8(text).unwrap()).ok();
         }
     });
     (url, requests)
+}
+
+/// Whether a request is there with all of its content.
+fn is_whole(text: &[u8]) -> bool {
+    let text = String::from_utf8_lossy(text).to_lowercase();
+    let Some((head, content)) = text.split_once("\r\n\r\n") else {
+        return false;
+    };
+    let length = head.lines().find_map(|line| line.strip_prefix("content-length: "));
+    length.is_none_or(|length| content.len() >= length.parse::<usize>().unwrap())
 }
 
 #[actix_rt::test]

@@ -6,6 +6,8 @@ use futures_util::{SinkExt, StreamExt};
 use tokio::net::TcpStream;
 use tokio_tungstenite::tungstenite::Message;
 use tokio_tungstenite::tungstenite::protocol::CloseFrame;
+use tokio_tungstenite::tungstenite::protocol::frame::Frame;
+use tokio_tungstenite::tungstenite::protocol::frame::coding::{Data, OpCode};
 use tokio_tungstenite::{MaybeTlsStream, WebSocketStream};
 
 use super::SOON;
@@ -46,6 +48,22 @@ impl Client {
     /// Sends a text.
     pub async fn send(&mut self, text: &str) {
         self.socket.send(Message::text(text)).await.unwrap();
+    }
+
+    /// Sends a text in so many frames.
+    pub async fn send_pieces(&mut self, pieces: &[&[u8]]) {
+        for (number, piece) in pieces.iter().enumerate() {
+            let kind = if number == 0 { Data::Text } else { Data::Continue };
+            let frame = Frame::message(piece.to_vec(), OpCode::Data(kind), number + 1 == pieces.len());
+            self.socket.send(Message::Frame(frame)).await.unwrap();
+            // What controls a connection may come in between.
+            self.socket.send(Message::Ping(vec![1].into())).await.unwrap();
+        }
+    }
+
+    /// Sends bytes that are no text.
+    pub async fn send_binary(&mut self, content: &[u8]) {
+        self.socket.send(Message::binary(content.to_vec())).await.unwrap();
     }
 
     /// The next text, or the end.

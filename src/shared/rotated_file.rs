@@ -1,0 +1,111 @@
+//! A file of lines that is rotated by its size. Nothing that the disk does makes it panic.
+
+use std::ffi::OsString;
+use std::fs::File;
+use std::io::{self, Write};
+use std::path::{Path, PathBuf};
+
+/// How large a file grows before it is rotated, in bytes, as the original does.
+const FILE_SIZE: u64 = 500_000;
+
+/// A file to which lines are added. The older ones beside it are `NAME.1` (the newest), `NAME.2` and so on.
+#[derive(Debug)]
+pub struct RotatedFile {
+    path: PathBuf,
+    old_files: usize,
+    file: File,
+    size: u64,
+}
+
+impl RotatedFile {
+    /// Opens a file, and keeps so many older ones beside it.
+    ///
+    /// # Errors
+    /// When its folder can't be made, or the file can't be written.
+    pub fn open(path: &Path, old_files: usize) -> io::Result<Self> {
+        if let Some(folder) = path.parent() {
+            std::fs::create_dir_all(folder)?;
+        }
+        let file = File::options().create(true).append(true).open(path)?;
+        let size = file.metadata()?.len();
+        Ok(Self { path: path.to_owned(), old_files, file, size })
+    }
+
+    fn rotate(&mut self) -> io::Result<()> {
+        let names: Vec<PathBuf> = (0..=self.old_files).map(|age| self.older(age)).collect();
+        for (newer, older) in names.iter().zip(names.iter().skip(1)).rev() {
+            match std::fs::rename(newer, older) {
+                Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(error),
+                _ => {}
+            }
+        }
+        self.file = File::options().create(true).append(true).open(&self.path)?;
+        Ok(())
+    }
+
+    fn older(&self, age: usize) -> PathBuf {
+        let mut name = OsString::from(&self.path);
+        if age > 0 {
+            name.push(format!(".{age}"));
+        }
+        name.into()
+    }
+}
+
+impl Write for RotatedFile {
+    /// Writes whole lines. A disk that is full costs lines, not more.
+    fn write(&mut self, lines: &[u8]) -> io::Result<usize> {
+        if self.size >= FILE_SIZE {
+            // What can't be put aside must not grow either.
+            if self.rotate().is_err() {
+                self.file.set_len(0)?;
+            }
+            self.size = 0;
+        }
+        let written = self.file.write(lines)?;
+        self.size += written as u64;
+        Ok(written)
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        self.file.flush()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn it_is_bounded_whatever_happens() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("logs/a.log");
+        let mut file = RotatedFile::open(&path, 2).unwrap();
+        let line = [b'x'; 999];
+        let size = |name: &str| std::fs::metadata(folder.path().join("logs").join(name)).map_or(0, |about| about.len());
+        for _ in 0..2100 {
+            file.write_all(&line).unwrap();
+            file.write_all(b"\n").unwrap();
+        }
+        for name in ["a.log", "a.log.1", "a.log.2"] {
+            assert!((1..=FILE_SIZE + 1000).contains(&size(name)), "{name}: {}", size(name));
+        }
+        assert_eq!(size("a.log.3"), 0);
+        let before = size("a.log");
+        drop(file);
+        RotatedFile::open(&path, 2).unwrap().write_all(b"more").unwrap();
+        assert_eq!(size("a.log"), before + 4);
+        // The older ones can't be put aside.
+        let mut file = RotatedFile::open(&path, 2).unwrap();
+        std::fs::remove_file(folder.path().join("logs/a.log.2")).unwrap();
+        std::fs::create_dir_all(folder.path().join("logs/a.log.2/full")).unwrap();
+        for _ in 0..2000 {
+            file.write_all(&line).unwrap();
+        }
+        assert!(size("a.log") <= FILE_SIZE + 1000);
+        std::fs::remove_dir_all(folder.path().join("logs")).unwrap();
+        for _ in 0..2000 {
+            file.write_all(&line).ok();
+        }
+    }
+}

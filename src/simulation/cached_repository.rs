@@ -1,0 +1,158 @@
+//! One cached repository that is in use: its commits, and what a fetch is adding to it.
+
+use std::fs::File;
+use std::io;
+use std::os::unix::fs::MetadataExt;
+use std::path::{Path, PathBuf};
+use std::time::SystemTime;
+
+use super::cache_lock::{Departure, lock_file, wait};
+
+/// A cached repository that is in use: as long as this lives it is not removed.
+#[derive(Debug)]
+pub struct InUse {
+    path: PathBuf,
+    // Fields are dropped in this order: it is told that it is free when it is.
+    #[expect(dead_code, reason = "it is held, not read")]
+    lock: File,
+    _departure: Departure,
+}
+
+/// The right to add to a cached repository, or to tidy it up.
+#[derive(Debug)]
+pub struct Fetching {
+    _lock: File,
+}
+
+/// A commit that is in use: as long as this lives it is not removed from its repository.
+#[derive(Debug)]
+pub struct CommitInUse {
+    _lock: File,
+}
+
+/// Where the fetched commits are named: those that the repository's owner vouches for, and others.
+const COMMITS: [&str; 2] = ["refs/fleet", "refs/any"];
+
+impl InUse {
+    /// The repository at this path, whose lock is held.
+    #[must_use]
+    pub fn new(path: PathBuf, lock: File, departure: Departure) -> Self {
+        Self { path, lock, _departure: departure }
+    }
+
+    /// Where the bare repository is, or belongs.
+    #[must_use]
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Waits for the right to add to the repository, and removes what a broken fetch has left.
+    ///
+    /// # Errors
+    /// When its lock can't be opened.
+    pub async fn fetching(&self) -> io::Result<Fetching> {
+        let lock = lock_file(&self.path, "fetch")?;
+        wait(|| lock.try_lock()).await?;
+        self.clean();
+        Ok(Fetching { _lock: lock })
+    }
+
+    /// The same if nobody else has that right now.
+    #[must_use]
+    pub fn try_fetching(&self) -> Option<Fetching> {
+        let lock = lock_file(&self.path, "fetch").ok()?;
+        lock.try_lock().ok()?;
+        self.clean();
+        Some(Fetching { _lock: lock })
+    }
+
+    fn clean(&self) {
+        for broken in self.incoming().chain(self.locks()) {
+            std::fs::remove_file(broken).ok();
+        }
+    }
+
+    /// How many bytes a fetch that is under way has received.
+    #[must_use]
+    pub fn received(&self) -> u64 {
+        self.incoming().filter_map(|path| path.metadata().ok()).map(|about| about.len()).sum()
+    }
+
+    /// Packs that are being received or made, or were when git was ended.
+    fn incoming(&self) -> impl Iterator<Item = PathBuf> {
+        let is_new = |name: &[u8]| name.starts_with(b"tmp_") || name.starts_with(b".tmp-");
+        let files = files(self.path.join("objects/pack"));
+        files.filter(move |path| path.file_name().is_some_and(|name| is_new(name.as_encoded_bytes())))
+    }
+
+    /// Locks that git leaves behind when it is killed: each would make every later fetch fail.
+    fn locks(&self) -> impl Iterator<Item = PathBuf> {
+        let folders = COMMITS.map(|folder| self.path.join(folder)).into_iter().chain([self.path.clone()]);
+        folders.flat_map(files).filter(|path| path.extension().is_some_and(|extension| extension == "lock"))
+    }
+
+    /// Whether the bare repository is there.
+    #[must_use]
+    pub fn is_made(&self) -> bool {
+        self.path.join("HEAD").is_file()
+    }
+
+    /// Takes a commit into use that was fetched with all that belongs to it.
+    #[must_use]
+    pub fn commit(&self, reference: &str) -> Option<CommitInUse> {
+        let path = self.path.join(reference);
+        let file = File::options().append(true).open(&path).ok()?;
+        file.try_lock_shared().ok()?;
+        // It may have been removed before it was locked.
+        let is_same = path.metadata().is_ok_and(|there| file.metadata().is_ok_and(|here| there.ino() == here.ino()));
+        file.set_modified(SystemTime::now()).ok()?;
+        is_same.then_some(CommitInUse { _lock: file })
+    }
+
+    /// How many commits there are.
+    #[must_use]
+    pub fn commits(&self) -> usize {
+        self.commit_files().count()
+    }
+
+    /// How many packs there are: each fetch adds one.
+    #[must_use]
+    pub fn packs(&self) -> usize {
+        self.pack_files().count()
+    }
+
+    /// How many bytes the packs have.
+    #[must_use]
+    pub fn packed(&self) -> u64 {
+        self.pack_files().filter_map(|path| path.metadata().ok()).map(|about| about.len()).sum()
+    }
+
+    fn pack_files(&self) -> impl Iterator<Item = PathBuf> {
+        let is_pack = |path: &PathBuf| path.extension().is_some_and(|extension| extension == "pack");
+        files(self.path.join("objects/pack")).filter(is_pack)
+    }
+
+    /// Forgets the commits that were not used for longest, and keeps so many. Those in use stay. Gives back how many
+    /// were forgotten; their objects are still there.
+    #[must_use]
+    pub fn forget(&self, _right: &Fetching, keep: usize) -> usize {
+        let mut commits: Vec<(SystemTime, PathBuf)> =
+            self.commit_files().filter_map(|path| Some((path.metadata().ok()?.modified().ok()?, path))).collect();
+        commits.sort();
+        let spare = commits.len().saturating_sub(keep);
+        let is_forgotten = |path: &PathBuf| {
+            let file = File::options().append(true).open(path);
+            file.is_ok_and(|file| file.try_lock().is_ok() && std::fs::remove_file(path).is_ok())
+        };
+        commits.into_iter().map(|(_, path)| path).filter(is_forgotten).take(spare).count()
+    }
+
+    fn commit_files(&self) -> impl Iterator<Item = PathBuf> {
+        let is_commit = |path: &PathBuf| path.extension().is_none();
+        COMMITS.map(|folder| self.path.join(folder)).into_iter().flat_map(files).filter(is_commit)
+    }
+}
+
+fn files(folder: PathBuf) -> impl Iterator<Item = PathBuf> {
+    std::fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.path())
+}

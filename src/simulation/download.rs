@@ -1,0 +1,199 @@
+//! Brings commits from remotes into cached repositories: one fetch at a time for each repository, bounded in size.
+
+use std::ffi::OsString;
+use std::io;
+use std::path::Path;
+use std::sync::Arc;
+use std::time::Duration;
+
+use tokio::sync::watch;
+
+use super::cached_repository::{CommitInUse, InUse};
+use super::checkout_error::{CheckoutError, damaged, fetch_failed, git_failed, machine, too_large};
+use super::git::{Call, Git, GitError};
+use super::limits::Limits;
+use super::mirrors::Remote;
+use super::repository_cache::{Patient, RepositoryCache};
+use super::revision::{self, Revision};
+use crate::shared::project_url::ProjectUrl;
+
+/// Fetches; one for the whole server.
+#[derive(Debug)]
+pub struct Downloads {
+    /// Runs git.
+    pub git: Arc<Git>,
+    /// Where to.
+    pub cache: RepositoryCache,
+    /// What may be fetched.
+    pub limits: Limits,
+}
+
+/// What is fetched for whom.
+#[derive(Debug, Clone, Copy)]
+pub struct Errand<'job> {
+    /// The world that is wanted.
+    pub world: &'job ProjectUrl,
+    /// Where its repository is.
+    pub remote: &'job Remote,
+    /// Hears each step in words.
+    pub progress: &'job watch::Sender<String>,
+}
+
+/// Between two looks at how much a fetch has brought.
+const BETWEEN_LOOKS: Duration = Duration::from_millis(200);
+
+impl Downloads {
+    /// Fetches one commit, unless it is there.
+    ///
+    /// # Errors
+    /// Why it can't be fetched.
+    pub async fn commit(
+        &self,
+        errand: Errand<'_>,
+        repository: &InUse,
+        revision: &Revision,
+    ) -> Result<CommitInUse, CheckoutError> {
+        let Errand { world, remote, .. } = errand;
+        let _fetching = repository.fetching().await.map_err(|error| machine(world, &error))?;
+        if let Some(commit) = repository.commit(&revision.reference()) {
+            return Ok(commit);
+        }
+        self.make_repository(errand, repository).await?;
+        let call = call(remote, repository.path(), revision.fetch_arguments(&remote.location));
+        let what = format!("fetching {}", world.repository());
+        let too_much = || too_large(format!("{} (at depth 1)", world.repository()), self.limits.size);
+        let fetched = self.receive(errand, repository, call, &what).await.ok_or_else(too_much)?;
+        fetched.map_err(|source| fetch_failed(world, revision, source))?;
+        // Taken before anybody else may tidy up.
+        let lost = || machine(world, &io::Error::other("the commit that was fetched is not there"));
+        repository.commit(&revision.reference()).ok_or_else(lost)
+    }
+
+    /// Whether a commit was ever part of a branch or tag. For that the history is fetched: all commits, as far as the
+    /// remote allows without the files that belong to them.
+    ///
+    /// # Errors
+    /// Why the history can't be had.
+    pub async fn is_in_history(&self, errand: Errand<'_>, commit: &str) -> Result<bool, CheckoutError> {
+        let Errand { world, remote, .. } = errand;
+        let failed = |error| machine(world, &error);
+        let history = self.cache.take(&history_of(&remote.location)).await.map_err(failed)?;
+        if history.is_made()
+            && history.packed() <= self.limits.size
+            && self.is_reachable(errand, &history, commit).await?
+        {
+            return Ok(true);
+        }
+        let _fetching = history.fetching().await.map_err(failed)?;
+        self.make_repository(errand, &history).await?;
+        let mut call = call(remote, history.path(), revision::history_arguments("origin"));
+        call.environment.extend(setting("remote.origin.url", &remote.location));
+        let what = format!("fetching the history of {}", world.repository());
+        let too_much = || too_large(format!("The history of {}", world.repository()), self.limits.size);
+        let fetched = self.receive(errand, &history, call, &what).await.ok_or_else(too_much)?;
+        fetched.map_err(|source| git_failed(world, source))?;
+        if history.packed() > self.limits.size {
+            return Err(too_much());
+        }
+        self.is_reachable(errand, &history, commit).await
+    }
+
+    async fn is_reachable(&self, errand: Errand<'_>, history: &InUse, commit: &str) -> Result<bool, CheckoutError> {
+        let mut call = call(errand.remote, history.path(), revision::reachable_arguments(commit));
+        // A commit that is not there must not be asked for: the remote might have it from elsewhere.
+        call.protocol = "none";
+        call.environment.push(("GIT_NO_LAZY_FETCH".into(), "1".into()));
+        match self.git.run(call, |_| ()).await {
+            Ok(answer) => Ok(!answer.is_empty()),
+            Err(error) if error.message.contains("no such commit") => Ok(false),
+            // git before 2.44 wants to fetch it, and may not.
+            Err(error) if error.message.contains("transport") && error.message.contains("not allowed") => Ok(false),
+            Err(source) => Err(damaged(errand.world, source)),
+        }
+    }
+
+    /// Runs a fetch, and ends git when it brings too much; then nothing is given back.
+    async fn receive(
+        &self,
+        errand: Errand<'_>,
+        repository: &InUse,
+        call: Call<'_>,
+        what: &str,
+    ) -> Option<Result<(), GitError>> {
+        let tell = |line: &str| {
+            if line.contains('%') {
+                errand.progress.send_replace(format!("{what}: {}", line.trim_start_matches("remote: ")));
+            }
+        };
+        let mut fetch = std::pin::pin!(self.git.run(call, tell));
+        let mut look = actix_rt::time::interval(BETWEEN_LOOKS);
+        loop {
+            tokio::select! {
+                result = &mut fetch => {
+                    self.cache.grown();
+                    return Some(result.map(drop));
+                }
+                _ = look.tick() => {
+                    if repository.received() > self.limits.size {
+                        return None;
+                    }
+                }
+            }
+        }
+    }
+
+    /// Makes the bare repository, unless it is there. It takes its place only when it is whole.
+    async fn make_repository(&self, errand: Errand<'_>, repository: &InUse) -> Result<(), CheckoutError> {
+        if repository.is_made() {
+            return Ok(());
+        }
+        let failed = |error| machine(errand.world, &error);
+        let path = repository.path();
+        let new = path.with_extension("new");
+        for broken in [&new, path] {
+            if broken.exists() {
+                tokio::fs::remove_dir_all(broken).await.map_err(failed)?;
+            }
+        }
+        let call = call(errand.remote, &new, vec!["init".into(), "--quiet".into(), "--bare".into()]);
+        self.git.run(call, |_| ()).await.map_err(|source| git_failed(errand.world, source))?;
+        tokio::fs::rename(&new, path).await.map_err(failed)
+    }
+
+    /// Removes what is cached of a remote if it is damaged, so that the next fetch begins anew.
+    ///
+    /// # Errors
+    /// When it can't be removed.
+    pub async fn mend(&self, remote: &Remote) -> io::Result<()> {
+        for location in [&remote.location, &history_of(&remote.location)] {
+            let patient = self.cache.examine(location).await?;
+            let path = match &patient {
+                Patient::Alone { path, .. } => path,
+                Patient::Shared(repository, _) => repository.path(),
+            };
+            if path.exists() && !self.git.is_sound(path).await {
+                log::warn!("{} is damaged: it is removed and fetched anew", path.display());
+                self.cache.mend(patient).await?;
+            }
+        }
+        Ok(())
+    }
+}
+
+/// By which the history of a remote is known in the cache.
+fn history_of(location: &str) -> String {
+    format!("{location} history")
+}
+
+/// The variables that give git one more setting.
+#[must_use]
+pub fn setting(name: &str, value: &str) -> [(OsString, OsString); 3] {
+    [("GIT_CONFIG_COUNT", "1"), ("GIT_CONFIG_KEY_0", name), ("GIT_CONFIG_VALUE_0", value)]
+        .map(|(name, value)| (name.into(), value.into()))
+}
+
+/// A git command on a cached repository.
+#[must_use]
+pub fn call<'call>(remote: &Remote, repository: &'call Path, arguments: Vec<OsString>) -> Call<'call> {
+    Call { repository, arguments, protocol: remote.protocol, is_alone: false, environment: Vec::new() }
+}

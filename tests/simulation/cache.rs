@@ -1,0 +1,182 @@
+//! The cache of repositories: its budget, what is damaged, and who may still use what.
+
+use std::path::Path;
+use std::time::Duration;
+
+use crate::checkout::{cached, noise, outcome, reader, size_of, world_text};
+use crate::scene::{arm, instance_folders, nothing_left};
+use crate::support::client::Client;
+use crate::support::git::{Forge, world};
+use crate::support::program::simulation_server;
+use crate::support::until;
+use crate::support::webots::Webots;
+
+#[actix_rt::test]
+async fn the_cache_keeps_to_its_budget() {
+    let (forge, webots) = (Forge::new(), reader());
+    for name in ["lab/one", "lab/two", "lab/three"] {
+        forge.commit(name, "main", &[("worlds/a.wbt", &world_text(name))]);
+    }
+    let grow = |name: &str, bytes: usize| {
+        let work = forge.work_tree(name, "main");
+        std::fs::write(work.join(format!("noise{bytes}")), noise(bytes)).unwrap();
+        forge.commit_work_tree(name, "main");
+    };
+    let server = simulation_server(&webots.path(), forge.path(), 2).set("cacheSize", 1).start().await;
+    let ask = async |name: &str| assert!(outcome(&server, &world(name, "main", "worlds/a.wbt")).await.contains(name));
+    let has = |name: &str| cached(&server).iter().any(|path| path.to_string_lossy().contains(&name.replace('/', "-")));
+    for name in ["lab/one", "lab/two", "lab/three"] {
+        grow(name, 200_000);
+        ask(name).await;
+        actix_rt::time::sleep(Duration::from_millis(20)).await;
+    }
+    assert!(has("lab/one") && has("lab/two") && has("lab/three"));
+    // One that was there already grows: it counts too, and the one that was used least recently goes.
+    grow("lab/one", 600_000);
+    ask("lab/one").await;
+    until("the oldest is gone", async || !has("lab/two")).await;
+    assert!(has("lab/one") && has("lab/three"));
+}
+
+/// Breaks a cached repository.
+type Damage = fn(&Path);
+
+#[actix_rt::test]
+async fn a_damaged_cache_heals() {
+    let (forge, webots) = (Forge::with_arm(), reader());
+    let server = simulation_server(&webots.path(), forge.path(), 2).start().await;
+    let damage: [(&str, Damage); 5] = [
+        ("a pack is cut", |repository| {
+            for pack in std::fs::read_dir(repository.join("objects/pack")).unwrap().flatten() {
+                if pack.path().extension().is_some_and(|extension| extension == "pack") {
+                    std::fs::remove_file(pack.path()).unwrap();
+                    std::fs::write(pack.path(), "PACK").unwrap();
+                }
+            }
+        }),
+        ("no objects", |repository| std::fs::remove_dir_all(repository.join("objects")).unwrap()),
+        ("its settings are noise", |repository| std::fs::write(repository.join("config"), [0xff; 99]).unwrap()),
+        ("HEAD is gone", |repository| std::fs::remove_file(repository.join("HEAD")).unwrap()),
+        ("an empty reference", |repository| {
+            for reference in std::fs::read_dir(repository.join("refs/fleet")).unwrap().flatten() {
+                std::fs::write(reference.path(), "").unwrap();
+            }
+        }),
+    ];
+    assert!(outcome(&server, &arm()).await.contains("opened"));
+    for (what, damage) in damage {
+        damage(&cached(&server)[0]);
+        let told = outcome(&server, &arm()).await;
+        assert!(told.contains("opened [WorldInfo"), "{what}: {told}");
+    }
+    // Locks that a killed git has left.
+    forge.commit("lab/arm", "main", &[("worlds/a.wbt", &world_text("next"))]);
+    std::fs::write(cached(&server)[0].join("shallow.lock"), "").unwrap();
+    assert!(outcome(&server, &arm()).await.contains("opened [next]"));
+}
+
+/// Adds a commit with so many bytes that can't be packed.
+fn grow(forge: &Forge, branch: &str, bytes: usize) {
+    let work = forge.work_tree("lab/arm", branch);
+    std::fs::write(work.join("noise"), noise(bytes)).unwrap();
+    forge.commit_work_tree("lab/arm", branch);
+}
+
+#[actix_rt::test]
+async fn a_repository_in_use_keeps_to_the_budget_too_and_who_runs_keeps_its_commit() {
+    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
+    let server = simulation_server(&webots.path(), forge.path(), 3).set("cacheSize", 1).start().await;
+    let mut running = Client::start(&server, &arm()).await;
+    running.until("webots:").await;
+    let instance = instance_folders(&server.folder).remove(0);
+    for number in 0..6 {
+        grow(&forge, "main", 300_000 + number);
+        let mut client = Client::start(&server, &arm()).await;
+        client.until("webots:").await;
+        client.leave().await;
+    }
+    let folder = server.folder.join("cache/git");
+    until("the oldest commits are gone", async || size_of(&folder) < 1 << 20).await;
+    assert_eq!(cached(&server).len(), 1);
+    let file = instance.join("project/controllers/c/c.py");
+    std::fs::write(&file, "changed").unwrap();
+    running.send(r#"{"reset controller": "c/c.py"}"#).await;
+    running.until("reset controller: c/c.py").await;
+    assert_eq!(std::fs::read_to_string(&file).unwrap(), "print('original')\n");
+}
+
+#[actix_rt::test]
+async fn the_budget_is_kept_at_start_and_when_the_last_user_leaves() {
+    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
+    let folder = tempfile::tempdir().unwrap();
+    let start =
+        |size: u32| simulation_server(&webots.path(), forge.path(), 3).folder(folder.path()).set("cacheSize", size);
+    let server = start(1).start().await;
+    grow(&forge, "main", 2 << 20);
+    let mut running = Client::start(&server, &arm()).await;
+    running.until("webots:").await;
+    assert_eq!(cached(&server).len(), 1, "it is in use");
+    running.leave().await;
+    until("it is gone with its user", async || cached(&server).is_empty()).await;
+    drop(server);
+    let server = start(100).start().await;
+    let mut running = Client::start(&server, &arm()).await;
+    running.until("webots:").await;
+    running.leave().await;
+    nothing_left(&server, 3).await;
+    assert_eq!(cached(&server).len(), 1);
+    drop(server);
+    let server = start(1).start().await;
+    until("it is gone", async || cached(&server).is_empty()).await;
+}
+
+#[actix_rt::test]
+async fn a_repository_keeps_a_bounded_number_of_commits() {
+    let (forge, webots) = (Forge::with_arm(), reader());
+    let server = simulation_server(&webots.path(), forge.path(), 1).start().await;
+    outcome(&server, &arm()).await;
+    let commits = cached(&server)[0].join("refs/fleet");
+    let one = std::fs::read_dir(&commits).unwrap().flatten().next().unwrap().path();
+    for number in 0..200 {
+        std::fs::copy(&one, commits.join(format!("{number:040x}"))).unwrap();
+    }
+    forge.commit("lab/arm", "main", &[("worlds/a.wbt", &world_text("newer"))]);
+    assert!(outcome(&server, &arm()).await.contains("[newer]"));
+    let count = || std::fs::read_dir(&commits).unwrap().count();
+    until("most are gone", async || count() <= 64).await;
+    assert!(count() > 30, "too many are gone");
+    until("it is packed", async || server.log().contains("commits from")).await;
+    assert!(outcome(&server, &arm()).await.contains("[newer]"));
+}
+
+#[actix_rt::test]
+async fn mending_hurts_nobody_who_uses_what_is_damaged() {
+    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
+    let cache = tempfile::tempdir().unwrap();
+    let start = || {
+        let builder = simulation_server(&webots.path(), forge.path(), 2);
+        builder.set("cacheDir", cache.path().to_str().unwrap()).start()
+    };
+    let (one, other) = (start().await, start().await);
+    let mut running = Client::start(&one, &arm()).await;
+    running.until("webots:").await;
+    let repositories = || {
+        let entries = std::fs::read_dir(cache.path().join("git")).unwrap().flatten().map(|entry| entry.path());
+        entries.filter(|path| path.is_dir()).collect::<Vec<_>>()
+    };
+    let damaged = repositories().remove(0);
+    std::fs::write(damaged.join("objects/pack/pack-0123456789012345678901234567890123456789.idx"), "noise").unwrap();
+    std::fs::write(damaged.join("objects/pack/pack-0123456789012345678901234567890123456789.pack"), "noise").unwrap();
+    for reference in std::fs::read_dir(damaged.join("refs/fleet")).unwrap().flatten() {
+        std::fs::write(reference.path(), "").unwrap();
+    }
+    let mut late = Client::start(&other, &arm()).await;
+    late.until("webots:").await;
+    assert!(damaged.exists() && repositories().len() == 2, "it was removed from below a running simulation");
+    late.leave().await;
+    running.leave().await;
+    // Whoever tidies up next removes it.
+    drop((one, other));
+    let _next = start().await;
+    until("it is gone", async || !damaged.exists()).await;
+}

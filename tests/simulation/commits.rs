@@ -1,0 +1,87 @@
+//! Commits by their hash: those of branches and tags, and nothing that a forge has from elsewhere.
+
+use crate::checkout::{cached, outcome, reader, world_text};
+use crate::git_wrapper::GitWrapper;
+use crate::support::git::{Forge, WORLD, git, world};
+use crate::support::program::simulation_server;
+
+#[actix_rt::test]
+async fn any_commit_of_a_branch_or_tag_runs() {
+    let (forge, webots) = (Forge::new(), reader());
+    let commit = |branch: &str, text: &str| forge.commit("lab/arm", branch, &[("worlds/a.wbt", &world_text(text))]);
+    let commits = [commit("main", "first"), commit("main", "second"), commit("main", "third")];
+    let tagged = [commit("side", "tagged before"), commit("side", "tagged")];
+    forge.tag("lab/arm", "v1");
+    let bare = forge.path().join("lab/arm");
+    git(&bare, &["update-ref", "-d", "refs/heads/side"]);
+    // One forge sends commits alone when it is asked to, the other does not know how.
+    for can_filter in ["true", "false"] {
+        git(&bare, &["config", "uploadpack.allowFilter", can_filter]);
+        let wrapper = GitWrapper::new("");
+        let builder = simulation_server(&webots.path(), forge.path(), 2).env("PATH", &wrapper.path());
+        let server = builder.start().await;
+        let run = async |commit: &str| outcome(&server, &world("lab/arm", commit, "worlds/a.wbt")).await;
+        for (commit, text) in [(&commits[0], "first"), (&tagged[0], "tagged before"), (&commits[1], "second")] {
+            let told = run(commit).await;
+            assert!(told.contains(&format!("opened [{text}]")), "{told}");
+        }
+        let repositories = cached(&server);
+        let history = repositories.iter().find(|path| path.to_string_lossy().contains("history")).unwrap();
+        let objects = git(history, &["cat-file", "--batch-all-objects", "--batch-check"]);
+        assert_eq!(objects.contains(" blob "), can_filter == "false", "{objects}");
+        let fetches = || wrapper.calls().iter().filter(|call| call.contains(" fetch ")).count();
+        assert_eq!(fetches(), 4, "three commits, and the history once: {:#?}", wrapper.calls());
+        // What is known is not asked for again.
+        let calls = wrapper.calls().len();
+        assert!(run(&commits[0]).await.contains("opened [first]"));
+        assert_eq!(wrapper.calls().len(), calls + 2, "ls-tree and checkout: {:#?}", wrapper.calls());
+        // A newer commit than the history has.
+        let next = commit("main", can_filter);
+        commit("main", "newest");
+        assert!(run(&next).await.contains(&format!("opened [{can_filter}]")));
+    }
+}
+
+#[actix_rt::test]
+async fn a_commit_that_no_branch_or_tag_vouches_for_runs_only_where_that_is_allowed() {
+    let (forge, webots) = (Forge::with_arm(), reader());
+    let proposed = forge.commit("lab/arm", "proposal", &[("worlds/a.wbt", WORLD), ("controllers/c/c.py", "evil")]);
+    let bare = forge.path().join("lab/arm");
+    git(&bare, &["update-ref", "refs/pull/1/head", &proposed]);
+    git(&bare, &["update-ref", "-d", "refs/heads/proposal"]);
+    let tree = git(&bare, &["rev-parse", "main^{tree}"]);
+    let folder = tempfile::tempdir().unwrap();
+    let start = |any: bool| {
+        let builder = simulation_server(&webots.path(), forge.path(), 2).folder(folder.path());
+        builder.set("anyCommit", any).start()
+    };
+    for can_filter in ["true", "false"] {
+        git(&bare, &["config", "uploadpack.allowFilter", can_filter]);
+        let none = "0123456789012345678901234567890123456789";
+        for hash in [proposed.as_str(), tree.trim(), none] {
+            let url = world("lab/arm", hash, "worlds/a.wbt");
+            let server = start(false).await;
+            for _ in 0..2 {
+                let told = outcome(&server, &url).await;
+                assert!(told.contains("is in no branch or tag of https://github.com/lab/arm. Forges"), "{told}");
+            }
+            drop(server);
+            // What was allowed once is not allowed for ever.
+            let server = start(true).await;
+            let told = outcome(&server, &url).await;
+            assert_eq!(told.contains("opened [WorldInfo"), hash != none, "{told}");
+        }
+    }
+}
+
+#[actix_rt::test]
+async fn a_history_that_is_too_large_is_told() {
+    let (forge, webots) = (Forge::with_arm(), reader());
+    let work = forge.work_tree("lab/arm", "main");
+    let old = forge.commit("lab/arm", "main", &[("worlds/a.wbt", &world_text("old"))]);
+    std::fs::write(work.join("noise"), crate::checkout::noise(6 << 20)).unwrap();
+    forge.commit_work_tree("lab/arm", "main");
+    let server = simulation_server(&webots.path(), forge.path(), 2).set("projectSize", 1).start().await;
+    let told = outcome(&server, &world("lab/arm", &old, "worlds/a.wbt")).await;
+    assert_eq!(told, "loading: Error: The history of https://github.com/lab/arm is larger than 1 MiB");
+}

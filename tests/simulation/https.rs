@@ -1,0 +1,134 @@
+//! Repositories over HTTPS, as from a real forge: git's own server behind TLS.
+
+use std::io::{BufRead, BufReader, Read, Write};
+use std::net::{TcpListener, TcpStream};
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+use std::sync::Arc;
+
+use rustls::pki_types::PrivateKeyDer;
+use rustls::{ServerConfig, ServerConnection, StreamOwned};
+
+use crate::checkout::{outcome, reader, world_text};
+use crate::support::git::{Forge, git, world};
+use crate::support::program::{Builder, simulation_server};
+use crate::support::webots::Webots;
+
+/// A forge that is reached by HTTPS alone.
+struct Https {
+    forge: Forge,
+    port: u16,
+    folder: tempfile::TempDir,
+}
+
+impl Https {
+    /// Serves the forge's repositories. What is below `/private` wants a password, `/away` is said to be at `elsewhere`.
+    fn new(forge: Forge, elsewhere: String) -> Self {
+        let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+        let port = listener.local_addr().unwrap().port();
+        let made = rcgen::generate_simple_self_signed(vec!["127.0.0.1".to_owned()]).unwrap();
+        let folder = tempfile::tempdir().unwrap();
+        std::fs::write(folder.path().join("cert.pem"), made.cert.pem()).unwrap();
+        let key = PrivateKeyDer::Pkcs8(made.signing_key.serialize_der().into());
+        let provider = Arc::new(rustls::crypto::ring::default_provider());
+        let config = ServerConfig::builder_with_provider(provider).with_safe_default_protocol_versions().unwrap();
+        let config = config.with_no_client_auth().with_single_cert(vec![made.cert.der().clone()], key).unwrap();
+        let (config, root) = (Arc::new(config), forge.path().to_owned());
+        std::thread::spawn(move || {
+            for socket in listener.incoming().flatten() {
+                let (config, root, elsewhere) = (Arc::clone(&config), root.clone(), elsewhere.clone());
+                std::thread::spawn(move || answer(socket, config, &root, &elsewhere));
+            }
+        });
+        Self { forge, port, folder }
+    }
+
+    fn certificate(&self) -> PathBuf {
+        self.folder.path().join("cert.pem")
+    }
+
+    /// A simulation server that takes all repositories from here.
+    fn server(&self, webots: &Webots) -> Builder {
+        let mirrors = serde_json::json!({"https://github.com/": format!("https://127.0.0.1:{}/", self.port)});
+        simulation_server(&webots.path(), self.forge.path(), 2).set("gitMirrors", mirrors)
+    }
+}
+
+/// Answers one request; who breaks off is not answered.
+fn answer(socket: TcpStream, config: Arc<ServerConfig>, root: &Path, elsewhere: &str) -> Option<()> {
+    let tls = StreamOwned::new(ServerConnection::new(config).unwrap(), socket);
+    let mut reader = BufReader::new(tls);
+    let mut line = String::new();
+    reader.read_line(&mut line).ok()?;
+    let mut words = line.split(' ');
+    let (method, target) = (words.next()?.to_owned(), words.next()?.to_owned());
+    let mut headers = std::collections::HashMap::new();
+    loop {
+        let mut line = String::new();
+        reader.read_line(&mut line).ok()?;
+        let Some((name, value)) = line.trim_end().split_once(": ") else { break };
+        headers.insert(name.to_lowercase(), value.to_owned());
+    }
+    let header = |name: &str| headers.get(name).cloned().unwrap_or_default();
+    let mut body = vec![0; header("content-length").parse().unwrap_or(0)];
+    reader.read_exact(&mut body).ok()?;
+    let (path, query) = target.split_once('?').unwrap_or((&target, ""));
+    let (head, content) = if path.starts_with("/lab/private") {
+        ("Status: 401 Unauthorized\r\nWWW-Authenticate: Basic realm=\"x\"".to_owned(), Vec::new())
+    } else if path.starts_with("/lab/away") {
+        (format!("Status: 302 Found\r\nLocation: {elsewhere}{target}"), Vec::new())
+    } else {
+        let mut backend = Command::new("git");
+        backend.arg("http-backend").env("GIT_PROJECT_ROOT", root).env("GIT_HTTP_EXPORT_ALL", "1");
+        backend.envs([("REQUEST_METHOD", method.as_str()), ("PATH_INFO", path), ("QUERY_STRING", query)]);
+        backend.env("CONTENT_TYPE", header("content-type")).env("CONTENT_LENGTH", body.len().to_string());
+        backend.env("HTTP_CONTENT_ENCODING", header("content-encoding"));
+        backend.env("GIT_PROTOCOL", header("git-protocol")).env("REMOTE_ADDR", "127.0.0.1");
+        let mut backend = backend.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::null()).spawn().unwrap();
+        let mut input = backend.stdin.take().unwrap();
+        let fed = std::thread::spawn(move || input.write_all(&body));
+        let output = backend.wait_with_output().unwrap().stdout;
+        fed.join().unwrap().ok();
+        let end = output.windows(4).position(|four| four == b"\r\n\r\n")?;
+        (String::from_utf8_lossy(&output[..end]).into_owned(), output[end + 4..].to_vec())
+    };
+    let status = head.lines().find_map(|line| line.strip_prefix("Status: ")).unwrap_or("200 OK").to_owned();
+    let length = content.len();
+    let tls = reader.get_mut();
+    write!(tls, "HTTP/1.1 {status}\r\nConnection: close\r\nContent-Length: {length}\r\n{head}\r\n\r\n").ok()?;
+    tls.write_all(&content).ok()?;
+    tls.conn.send_close_notify();
+    tls.flush().ok()
+}
+
+#[actix_rt::test]
+async fn a_forge_is_asked_over_https_and_nothing_else() {
+    let (forge, webots) = (Forge::new(), reader());
+    let old = forge.commit("lab/arm", "main", &[("worlds/a.wbt", &world_text("old"))]);
+    forge.commit("lab/arm", "main", &[("worlds/a.wbt", &world_text("new"))]);
+    git(&forge.path().join("lab/arm"), &["config", "uploadpack.allowFilter", "true"]);
+    let plain = TcpListener::bind("127.0.0.1:0").unwrap();
+    plain.set_nonblocking(true).unwrap();
+    let https = Https::new(forge, format!("http://{}", plain.local_addr().unwrap()));
+    let server = https.server(&webots).env("GIT_SSL_CAINFO", https.certificate().to_str().unwrap()).start().await;
+    let missing = "does not exist or is not public";
+    let table = [
+        (world("lab/arm", "main", "worlds/a.wbt"), "opened [new]"),
+        (world("lab/arm", &old, "worlds/a.wbt"), "opened [old]"),
+        (world("lab/arm", "main", "worlds/a.wbt"), "opened [new]"),
+        (world("lab/none", "main", "worlds/a.wbt"), missing),
+        // Nobody is asked for a password.
+        (world("lab/private", "main", "worlds/a.wbt"), missing),
+        // Nobody is led from one protocol to another.
+        (world("lab/away", "main", "worlds/a.wbt"), "lab/away can't be checked out: git ls-remote ended with"),
+    ];
+    for (url, words) in table {
+        let told = outcome(&server, &url).await;
+        assert!(told.contains(words), "{url}: {told}");
+    }
+    assert!(plain.accept().is_err(), "somebody was asked without encryption");
+    // A forge whose certificate nobody trusts is none.
+    let server = https.server(&webots).start().await;
+    let told = outcome(&server, &world("lab/arm", "main", "worlds/a.wbt")).await;
+    assert!(told.contains("certificate"), "{told}");
+}
