@@ -24,6 +24,7 @@ use crate::shared::metrics::Metrics;
 use crate::shared::notify;
 use crate::shared::permanent;
 use crate::shared::shutdown::{Phase, Request, Signals};
+use crate::shared::sockets::Sockets;
 
 /// Why the server can't go on.
 #[derive(Debug, thiserror::Error)]
@@ -63,7 +64,13 @@ const OUTCOMES: [&str; 4] = ["placed", "unavailable", "not_accepted", "wrong_url
 /// When it can't start, or an actor that must live is gone.
 pub async fn run(mut config: SessionConfig, file: PathBuf) -> Result<(), AppError> {
     let mut signals = Signals::catch()?;
-    let connections = bound_clients(open_files(), &mut config);
+    let (connections, clients) = bound_clients(open_files(), &config);
+    let sockets = Arc::new(Sockets::new(
+        connections,
+        config.max_clients_per_address,
+        config.trusted_proxies.clone(),
+        config.timing.silence,
+    ));
     let (phase_sender, phase) = watch::channel(Phase::Open);
     let address = SocketAddr::new(config.bind, config.port);
     let socket = TcpListener::bind(address).map_err(|source| AppError::Bind { address, source })?;
@@ -71,7 +78,7 @@ pub async fn run(mut config: SessionConfig, file: PathBuf) -> Result<(), AppErro
     config.port = port;
     let stop = config.timing.stop;
     let told = config.address().http_url(config.ssl);
-    let server = Arc::new(assemble(config, phase)?);
+    let server = Arc::new(assemble(config, clients, phase)?);
     let shared = web::Data::from(Arc::clone(&server));
     // This is called in each thread that serves connections.
     let app = move || {
@@ -82,6 +89,7 @@ pub async fn run(mut config: SessionConfig, file: PathBuf) -> Result<(), AppErro
         // Messages are small, and must not wait for the answer to the one before.
         .tcp_nodelay(true)
         .workers(threads())
+        .on_connect(move |socket, extensions| sockets.accept(socket, extensions))
         // More wait outside, where they can't use up the files.
         .max_connections((connections / threads()).max(1))
         .disable_signals()
@@ -138,9 +146,9 @@ fn open_files() -> u64 {
     }
 }
 
-/// How many connections there may be, so that files are left for the rest of the server. Fewer clients than that are
+/// How many connections there may be, and clients, so that files are left for the rest of the server. Fewer clients than that are
 /// taken, so that there is one for who is to be told that there are too many.
-fn bound_clients(files: u64, config: &mut SessionConfig) -> usize {
+fn bound_clients(files: u64, config: &SessionConfig) -> (usize, usize) {
     let files = usize::try_from(files).unwrap_or(usize::MAX);
     let connections = files.saturating_sub(OWN_FILES + FILES_PER_SERVER * config.simulation_servers.len());
     let clients = connections - connections / 16;
@@ -150,9 +158,8 @@ fn bound_clients(files: u64, config: &mut SessionConfig) -> usize {
              LimitNOFILE of systemd, allows more",
             config.max_clients
         );
-        config.max_clients = clients;
     }
-    connections
+    (connections, clients.min(config.max_clients))
 }
 
 /// How many threads serve connections.
@@ -161,7 +168,7 @@ fn threads() -> usize {
 }
 
 /// Makes everything that the server is made of, and starts its actors.
-fn assemble(config: SessionConfig, phase: watch::Receiver<Phase>) -> Result<Server, AppError> {
+fn assemble(config: SessionConfig, clients: usize, phase: watch::Receiver<Phase>) -> Result<Server, AppError> {
     let metrics = Metrics::new();
     let latencies = metrics.histogram("session_report_seconds", "Time in which simulation servers answer")?;
     let picks = metrics.counter("session_requests_total", "Requests for a simulation server", "outcome")?;
@@ -170,7 +177,7 @@ fn assemble(config: SessionConfig, phase: watch::Receiver<Phase>) -> Result<Serv
     }
     let mailer = mailer::start(&config);
     let (timing, ssl) = (config.timing.clone(), config.ssl);
-    let connections = Connections::new(config.max_clients, config.max_clients_per_address);
+    let connections = Connections::new(clients, config.max_clients_per_address);
     let trusted_proxies = config.trusted_proxies.clone();
     let (examples, viewer_script) = (config.examples.clone(), config.viewer_script.clone());
     let registry = Registry::new(Arc::new(config), mailer, latencies).start();

@@ -8,7 +8,7 @@ use actix::prelude::*;
 use super::config::SessionConfig;
 use super::fleet_status::{State, StateChange};
 use super::mailer::{self, Mailer};
-use super::notices::Notice;
+use super::notices::{Notice, Topic};
 use super::watched::{Change, Watched};
 use crate::shared::address::PublicAddress;
 
@@ -44,17 +44,19 @@ impl Changes {
 
     /// Tells a change of a server, which is now as it is `watched`.
     pub fn tell(&mut self, server: &PublicAddress, watched: &Watched, change: Change) {
-        let Change { state, at, why, events } = change;
+        let Change { state, still, at, why, events } = change;
         let level = if state == State::Down { log::Level::Warn } else { log::Level::Info };
-        log::log!(level, "{server}: {}: {why}", state.word());
+        log::log!(level, "{server}: {}{}: {why}", if still { "still " } else { "" }, state.word());
         self.recent.truncate(KEPT - 1);
         self.recent.push_front(StateChange { at, server: server.clone(), state, why });
         let Some(mailer) = &self.mailer else {
             return;
         };
-        let error = watched.error.as_ref().map(ToString::to_string);
+        // The last that is known: a server that does not answer tells no load, and one that works again no error.
+        let load = watched.report.as_ref().map(|report| report.load);
         for event in events {
-            let notice = Notice { server: server.clone(), event, load: watched.load(), error: error.clone(), at };
+            let error = watched.last_error.as_ref().filter(|_| event.topic() == Topic::Life).map(ToString::to_string);
+            let notice = Notice { server: server.clone(), event, load, error, at };
             if let Err(lost) = mailer.try_send(notice) {
                 log::error!("{server}: no notice is sent: {lost}");
             }

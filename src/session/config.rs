@@ -8,9 +8,9 @@ use serde::{Deserialize, Serialize};
 use super::mail_address::{self, MailAddress};
 use super::placement::Policy;
 use crate::shared::address::{PublicAddress, check_host};
-use crate::shared::config::{
-    Configuration, ExpandedPath, Secret, Unfit, folder, local_address, one_or_many, optional_port, percent, seconds,
-    threshold, whole,
+use crate::shared::config::{Configuration, Unfit, differences};
+use crate::shared::config_value::{
+    ExpandedPath, Secret, folder, local_address, one_or_many, optional_port, percent, seconds, threshold, whole,
 };
 use crate::shared::peer::TrustedProxies;
 
@@ -108,7 +108,7 @@ pub struct Example {
 }
 
 #[derive(Deserialize)]
-#[serde(untagged)]
+#[serde(untagged, expecting = "it is neither a URL nor {\"title\": ..., \"url\": ...}")]
 enum WireExample {
     Url(String),
     Titled { title: Option<String>, url: String },
@@ -126,7 +126,7 @@ impl From<WireExample> for Example {
 
 /// Durations, in seconds.
 #[derive(Debug, Clone, Serialize, Deserialize)]
-#[serde(rename_all = "camelCase", default, deny_unknown_fields)]
+#[serde(rename_all = "camelCase", default, deny_unknown_fields, expecting = "an object of durations")]
 pub struct Timing {
     /// How long a simulation server may take to answer. Default: 3.
     #[serde(with = "seconds")]
@@ -180,12 +180,17 @@ impl Default for Timing {
 /// How long a client that came needs until its load shows: the start, and the mean of five seconds.
 const SETTLING: Duration = Duration::from_secs(8);
 
+/// The keys that count as soon as the configuration is read again; of `timing` those of watching and placing.
+const AT_ONCE: [&str; 6] =
+    ["simulationServers", "drainedServers", "loadThreshold", "loadRefresh", "clientCost", "timing"];
+
 impl SessionConfig {
     /// This configuration as a server can take it that was started with another one.
     #[must_use]
     pub fn after(&self, before: &Self) -> Self {
-        if self.ssl != before.ssl {
-            log::warn!("ssl counts only from a restart on: URLs that were handed out would no longer fit");
+        let kept = |key: &&String| AT_ONCE.contains(&key.as_str()) || (*key == "port" && self.port == 0);
+        for key in differences(self, before).iter().filter(|key| !kept(key)) {
+            log::warn!("{key} has changed, which counts only from a restart on");
         }
         Self { ssl: before.ssl, ..self.clone() }
     }
@@ -233,8 +238,10 @@ impl Configuration for SessionConfig {
             let problem = format!("{} s is not more than timing.ping", self.timing.silence.as_secs_f64());
             return Err(Unfit { key: "timing.silence", problem });
         }
-        if let Some(script) = self.viewer_script.as_ref().filter(|script| !script.has_host()) {
-            let problem = format!("{script} has no host; allowed are http and https URLs");
+        if let Some(script) =
+            self.viewer_script.as_ref().filter(|script| !script.has_host() || !script.scheme().starts_with("http"))
+        {
+            let problem = format!("{script} is no URL of a web server; allowed are http and https");
             return Err(Unfit { key: "viewerScript", problem });
         }
         self.mail_server = self.mail_server.take().filter(|host| !host.is_empty());

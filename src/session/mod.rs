@@ -9,6 +9,7 @@ pub mod fleet_status;
 pub mod letter;
 pub mod mail_address;
 pub mod mailer;
+pub mod names;
 pub mod notices;
 pub mod outbox;
 pub mod page_routes;

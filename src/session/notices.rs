@@ -1,12 +1,14 @@
 //! Decides which notice is mailed when: gathering, and the limit for flapping servers. Pure; time is passed in.
 //!
-//! A simulation server has two topics: whether it responds, and whether its load leaves room. For each topic:
+//! A simulation server has two topics: whether it responds, and whether its load leaves room.
 //!
 //! 1. The first notice waits for `gather`, so that servers that fail together are one mail.
-//! 2. For `flapping` after a mail, notices are held back and counted; what is left then is one entry with the newest
-//!    notice and the count. So a server that comes and goes is never more than one mail in that time.
+//! 2. For `flapping` after a mail about a server, its notices are held back and counted; what is left then is one entry
+//!    for each topic with the newest notice and the count. So a server that comes and goes is one mail in that time.
+//! 3. One thing does not wait: that a server does not respond of which the mail told only that it is full, or has room
+//!    again. It is no flapping when a machine is full and then fails.
 
-use std::collections::HashMap;
+use std::collections::{BTreeMap, HashMap};
 use std::time::{Duration, Instant, SystemTime};
 
 use actix::Message;
@@ -44,7 +46,7 @@ pub enum Event {
 }
 
 /// The two things that mails are about.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Topic {
     /// Whether a server responds.
     Life,
@@ -104,57 +106,62 @@ impl Entry {
 pub struct Notices {
     gather: Duration,
     flapping: Duration,
-    topics: HashMap<(PublicAddress, Topic), State>,
+    servers: HashMap<PublicAddress, State>,
 }
 
 #[derive(Debug, Default)]
 struct State {
-    /// What is to be mailed, and when it happened first.
-    pending: Option<(Entry, Instant)>,
-    /// Until when there is no other mail.
-    quiet: Option<Instant>,
+    /// What is to be mailed of each topic, and when it happened first.
+    pending: BTreeMap<Topic, (Entry, Instant)>,
+    quiet: Option<Quiet>,
+}
+
+/// The time after a mail.
+#[derive(Debug, Clone, Copy)]
+struct Quiet {
+    end: Instant,
+    /// Whether that mail told whether the server responds.
+    of_life: bool,
 }
 
 impl Notices {
     /// Nothing happened yet.
     #[must_use]
     pub fn new(gather: Duration, flapping: Duration) -> Self {
-        Self { gather, flapping, topics: HashMap::new() }
+        Self { gather, flapping, servers: HashMap::new() }
     }
 
     /// Takes in a notice.
     pub fn add(&mut self, notice: Notice, now: Instant) {
-        let key = (notice.server.clone(), notice.event.topic());
+        let state = self.servers.entry(notice.server.clone()).or_default();
+        state.quiet.take_if(|quiet| quiet.end <= now);
+        let topic = notice.event.topic();
         let entry = Entry { notice, held_back: 0 };
-        let state = self.topics.entry(key).or_default();
-        if let Some((pending, _)) = &mut state.pending {
-            pending.renew(entry);
-        } else {
-            state.quiet.take_if(|end| *end <= now);
-            state.pending = Some((entry, now));
+        match state.pending.get_mut(&topic) {
+            Some((pending, _)) => pending.renew(entry),
+            None => drop(state.pending.insert(topic, (entry, now))),
         }
     }
 
     /// When there will be something to mail, if nothing else happens.
     #[must_use]
     pub fn due(&self) -> Option<Instant> {
-        self.topics.values().filter_map(|state| state.ready(self.gather)).min()
+        self.servers.values().filter_map(|state| state.due(self.gather)).min()
     }
 
     /// What is to be mailed now; it counts as mailed from now on.
     pub fn take(&mut self, now: Instant) -> Vec<Entry> {
-        self.topics.retain(|_, state| state.pending.is_some() || state.quiet.is_some_and(|end| end > now));
+        self.servers.retain(|_, state| !state.pending.is_empty() || state.quiet.is_some_and(|quiet| quiet.end > now));
         if self.due().is_none_or(|due| due > now) {
             return Vec::new();
         }
         let mut mailed = Vec::new();
-        for state in self.topics.values_mut() {
+        for state in self.servers.values_mut() {
             // A mail that goes anyway takes along what nothing but the gathering holds up.
-            if state.quiet.is_none_or(|end| end <= now)
-                && let Some((entry, _)) = state.pending.take()
-            {
-                state.quiet = Some(now + self.flapping);
-                mailed.push(entry);
+            if !state.pending.is_empty() && state.held_until().is_none_or(|end| end <= now) {
+                let of_life = state.pending.contains_key(&Topic::Life);
+                state.quiet = Some(Quiet { end: now + self.flapping, of_life });
+                mailed.extend(std::mem::take(&mut state.pending).into_values().map(|(entry, _)| entry));
             }
         }
         mailed
@@ -162,10 +169,18 @@ impl Notices {
 }
 
 impl State {
-    /// When the pending entry may be mailed.
-    fn ready(&self, gather: Duration) -> Option<Instant> {
-        let (_, first) = self.pending.as_ref()?;
-        Some(self.quiet.unwrap_or(*first + gather))
+    /// Until when what is pending is held back, if it is.
+    fn held_until(&self) -> Option<Instant> {
+        let quiet = self.quiet?;
+        let fails = |(entry, _): &(Entry, Instant)| entry.notice.event == Event::NotResponding;
+        let is_worse = !quiet.of_life && self.pending.get(&Topic::Life).is_some_and(fails);
+        (!is_worse).then_some(quiet.end)
+    }
+
+    /// When the pending entries may be mailed.
+    fn due(&self, gather: Duration) -> Option<Instant> {
+        let first = self.pending.values().map(|(_, first)| *first).min()?;
+        Some(self.held_until().unwrap_or(first + gather))
     }
 }
 
@@ -203,7 +218,7 @@ mod tests {
                 mails.push((second, mail));
             }
         }
-        assert!(state.topics.is_empty(), "something is kept for good: {state:?}");
+        assert!(state.servers.is_empty(), "something is kept for good: {state:?}");
         mails
     }
 
@@ -249,6 +264,28 @@ mod tests {
     fn a_failure_is_told_though_the_same_server_was_at_maximum_load_before() {
         let mails = play(&[(0, 1, MaximumLoad), (60, 1, NotResponding)]);
         assert_eq!(mails, [(10, vec![(1, MaximumLoad, 0)]), (70, vec![(1, NotResponding, 0)])]);
+    }
+
+    #[test]
+    fn a_server_that_is_full_and_fails_again_and_again_is_one_mail_in_ten_minutes_after_the_first_two() {
+        let notices: Vec<_> = (0..300)
+            .flat_map(|turn| {
+                [
+                    (turn * 4, MaximumLoad),
+                    (turn * 4 + 1, NotResponding),
+                    (turn * 4 + 2, WorkingAgain),
+                    (turn * 4 + 3, AvailableAgain),
+                ]
+            })
+            .map(|(second, event)| (second, 1, event))
+            .collect();
+        let mails: Vec<u64> = play(&notices).into_iter().map(|(when, _)| when).collect();
+        assert_eq!(mails, [10, 610, 1_210]);
+        let full_then_flapping: Vec<_> = std::iter::once((0, 1, MaximumLoad))
+            .chain((20..500).map(|second| (second, 1, if second % 2 == 0 { NotResponding } else { WorkingAgain })))
+            .collect();
+        let mails: Vec<u64> = play(&full_then_flapping).into_iter().map(|(when, _)| when).collect();
+        assert_eq!(mails, [10, 30, 630]);
     }
 
     #[test]

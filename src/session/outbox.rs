@@ -124,10 +124,13 @@ impl Outbox {
         given_up.into_iter().map(|waiting| waiting.entry).collect()
     }
 
-    /// An older entry that goes with this one keeps its place and its patience.
+    /// An older entry that goes with this one keeps its place; what is new has all of the patience before it.
     fn join(&mut self, entry: Entry) {
         match self.waiting.iter_mut().find(|waiting| waiting.entry.goes_with(&entry)) {
-            Some(waiting) => waiting.entry.renew(entry),
+            Some(waiting) => {
+                waiting.entry.renew(entry);
+                waiting.first_try = None;
+            }
             None => self.waiting.push(Waiting { entry, first_try: None }),
         }
     }

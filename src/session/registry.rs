@@ -14,7 +14,7 @@ use rustls::ClientConfig;
 
 use super::changes::Changes;
 use super::config::SessionConfig;
-use super::fleet_status::{FleetStatus, ServerStatus, State};
+use super::fleet_status::{FleetStatus, ServerStatus};
 use super::mailer::Mailer;
 use super::pick::{NoServer, Pick};
 use super::placement::Fleet;
@@ -23,6 +23,7 @@ use super::subscribers::{News, Subscribers};
 use super::unreachable::Unreachable;
 use super::watched::Watched;
 use crate::shared::address::PublicAddress;
+use crate::shared::load::Load;
 use crate::shared::project_url::ProjectUrl;
 use crate::shared::status::Dispatch;
 use crate::shared::tls;
@@ -183,17 +184,14 @@ impl Registry {
     fn pick(&mut self, world: Option<&ProjectUrl>, from: Option<IpAddr>) -> Result<PublicAddress, NoServer> {
         let Self { fleet, servers, .. } = self;
         let accepts = |address: &PublicAddress, world: &ProjectUrl| {
-            // One that was not heard of yet may accept it.
-            let says = |Member { watched, .. }: &Member| match &watched.report {
-                Some(report) => report.accepts(world),
-                None => watched.state == State::Unknown,
-            };
-            servers.get(address).is_some_and(says)
+            // One that has said nothing yet may accept it.
+            let says = |report: &Dispatch| report.accepts(world);
+            servers.get(address).is_some_and(|member| member.watched.report.as_ref().is_none_or(says))
         };
         let eligible = |address: &PublicAddress| world.is_none_or(|world| accepts(address, world));
         let picked = fleet.place_from(Instant::now(), from, eligible);
         picked.ok_or_else(|| match world {
-            Some(world) if !servers.keys().any(|address| accepts(address, world)) => {
+            Some(world) if !servers.is_empty() && !servers.keys().any(|address| accepts(address, world)) => {
                 NoServer::NotAccepted(world.repository())
             }
             _ => NoServer::Unavailable,
@@ -270,7 +268,7 @@ impl Handler<GetStatus> for Registry {
         let servers = self.config.simulation_servers.iter().filter_map(|address| self.status_of(address, now));
         MessageResult(Arc::new(FleetStatus {
             available: self.available,
-            mean_load: self.fleet.mean_load(),
+            mean_load: Load::mean(self.servers.values().filter_map(|member| member.watched.load())),
             servers: servers.collect(),
             changes: self.changes.recent().clone(),
         }))

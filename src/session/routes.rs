@@ -1,11 +1,12 @@
 //! The session server's public paths: each reads the request, asks the registry, and maps the answer.
 
+use std::borrow::Cow;
 use std::sync::Arc;
 
 use actix::Addr;
 use actix_web::http::{StatusCode, header};
 use actix_web::{HttpRequest, HttpResponse, web};
-use rand::RngExt;
+use percent_encoding::percent_decode_str;
 
 use super::asking::{ask, with_status};
 use super::audience::Audience;
@@ -17,12 +18,8 @@ use super::server::Server;
 use super::status::{self, StatusPage};
 use super::web_client::WebClient;
 use crate::shared::metrics::CONTENT_TYPE;
-use crate::shared::paths::{self, GET, READ, path};
+use crate::shared::paths::{self, GET, READ, come_back, path};
 use crate::shared::websocket;
-
-/// After how many seconds a client that was refused may come back: drawn at random, so that a class that was refused
-/// together does not come back together.
-const COME_BACK: std::ops::RangeInclusive<u32> = 2..=6;
 
 /// Adds all paths to an app.
 pub fn configure(app: &mut web::ServiceConfig) {
@@ -68,7 +65,7 @@ async fn session(
         return open_websocket(&request, stream, &server, &audience);
     }
     let from = server.trusted_proxies.peer(&request).household();
-    let answer = server.pick(Pick::parse(wanted_world(request.query_string()), from)).await;
+    let answer = server.pick(Pick::parse(wanted_world(request.query_string()).as_deref(), from)).await;
     let status = match answer.refusal {
         None => StatusCode::OK,
         Some(NoServer::Unavailable) => StatusCode::SERVICE_UNAVAILABLE,
@@ -77,16 +74,21 @@ async fn session(
     };
     let mut response = HttpResponse::build(status);
     if status == StatusCode::SERVICE_UNAVAILABLE {
-        response.insert_header((header::RETRY_AFTER, rand::rng().random_range(COME_BACK)));
+        response.insert_header(come_back());
     }
     response.content_type("text/plain; charset=utf-8").body(answer.text)
 }
 
 /// The world of a query. `webots.js` does not percent-encode it, so that it is all that follows `url=`: a plus sign
-/// or an ampersand may be part of it.
-fn wanted_world(query: &str) -> Option<&str> {
+/// or an ampersand may be part of it. Others do, as is usual in queries, and then it has no `:` in it.
+fn wanted_world(query: &str) -> Option<Cow<'_, str>> {
     let begin = query.strip_prefix("url=").or_else(|| query.split_once("&url=").map(|(_, world)| world));
-    begin.filter(|world| !world.is_empty())
+    let world = begin.filter(|world| !world.is_empty())?;
+    if world.contains(':') {
+        return Some(Cow::Borrowed(world));
+    }
+    let whole = world.split_once('&').map_or(world, |(whole, _)| whole);
+    Some(percent_decode_str(whole).decode_utf8_lossy())
 }
 
 fn open_websocket(
@@ -147,7 +149,7 @@ mod tests {
             ("mode=x3d&url=https://x", Some("https://x")),
         ];
         for (query, world) in table {
-            assert_eq!(wanted_world(query), world, "{query:?}");
+            assert_eq!(wanted_world(query).as_deref(), world, "{query:?}");
         }
     }
 }

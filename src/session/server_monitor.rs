@@ -12,9 +12,12 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use actix::prelude::*;
+use actix_tls::connect::{Connector as TcpConnector, Resolver};
 use awc::error::{ConnectError, SendRequestError};
+use awc::http::StatusCode;
 use rustls::ClientConfig;
 
+use super::names::Names;
 use super::unreachable::Unreachable;
 use crate::shared::address::PublicAddress;
 use crate::shared::load::Load;
@@ -72,6 +75,10 @@ const NEVER: Duration = Duration::from_hours(24);
 /// For how long a server is taken to have no `/status`.
 const LOAD_ONLY: Duration = Duration::from_mins(1);
 
+/// What a server says that has no such page: some know no better than that the request is wrong.
+const NO_SUCH_PAGE: [StatusCode; 4] =
+    [StatusCode::NOT_FOUND, StatusCode::BAD_REQUEST, StatusCode::METHOD_NOT_ALLOWED, StatusCode::NOT_IMPLEMENTED];
+
 /// What was understood of an answer.
 enum Answer {
     Status(Dispatch),
@@ -83,7 +90,9 @@ enum Answer {
 fn client(refresh: Duration, trust: Option<Arc<ClientConfig>>) -> awc::Client {
     let idle = (refresh * 3).max(Duration::from_secs(15));
     // A look as a whole has a time limit, its parts have none.
-    let mut connector = awc::Connector::new().conn_keep_alive(idle).timeout(NEVER);
+    let names = Resolver::custom(Names::default());
+    let tcp = TcpConnector::new(names).service();
+    let mut connector = awc::Connector::new().connector(tcp).conn_keep_alive(idle).timeout(NEVER);
     if let Some(config) = trust {
         connector = connector.rustls_0_23(config);
     }
@@ -199,7 +208,7 @@ async fn get(client: &awc::Client, url: &str) -> Result<Option<actix_web::web::B
     }
     .map_err(no_answer)?;
     let status = answer.status();
-    if status == awc::http::StatusCode::NOT_FOUND {
+    if NO_SUCH_PAGE.contains(&status) {
         return Ok(None);
     }
     if !status.is_success() {

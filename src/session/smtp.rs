@@ -14,7 +14,7 @@ use tokio::time::{Instant, timeout_at};
 
 use super::config::SessionConfig;
 use super::letter::{Letter, Unwritable};
-use crate::shared::config::Secret;
+use crate::shared::config_value::Secret;
 use crate::shared::logging::one_line;
 
 /// The port whose connections are usually encrypted from their first byte.

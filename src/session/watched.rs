@@ -23,6 +23,8 @@ pub struct Watched {
     pub report: Option<Dispatch>,
     /// Why it gave no usable answer, if it did not.
     pub error: Option<Unreachable>,
+    /// Why it gave none the last time that it did not.
+    pub last_error: Option<Unreachable>,
     /// How long it took to answer.
     pub latency: Option<Duration>,
     /// When it last gave a good answer.
@@ -36,6 +38,8 @@ pub struct Watched {
 pub struct Change {
     /// Its new state.
     pub state: State,
+    /// Whether it was in that state before, for another reason.
+    pub still: bool,
     /// When.
     pub at: SystemTime,
     /// Why, in words.
@@ -54,6 +58,7 @@ impl Watched {
             since: SystemTime::now(),
             report: None,
             error: None,
+            last_error: None,
             latency: None,
             answered: None,
             full_told: false,
@@ -73,11 +78,13 @@ impl Watched {
     pub fn failed(&mut self, error: Unreachable) -> Option<Change> {
         let why = error.to_string();
         let another = self.error.as_ref().is_some_and(|before| !before.is_like(&error));
-        self.error = Some(error);
+        self.error = Some(error.clone());
+        self.last_error = Some(error);
         let change = self.enter(State::Down, || why.clone());
         // It is down as before, but for another reason: who mends it should know.
-        change
-            .or_else(|| another.then(|| Change { state: State::Down, at: SystemTime::now(), why, events: Vec::new() }))
+        change.or_else(|| {
+            another.then(|| Change { state: State::Down, still: true, at: SystemTime::now(), why, events: Vec::new() })
+        })
     }
 
     /// The last report, if it still holds.
@@ -118,7 +125,7 @@ impl Watched {
         }
     }
 
-    /// The load for a notice.
+    /// Its load, if it answers.
     #[must_use]
     pub fn load(&self) -> Option<Load> {
         self.current().map(|report| report.load)
@@ -149,7 +156,7 @@ impl Watched {
             return None;
         }
         self.since = SystemTime::now();
-        Some(Change { state, at: self.since, why: why(), events: self.events(before) })
+        Some(Change { state, still: false, at: self.since, why: why(), events: self.events(before) })
     }
 
     /// The four events of the original. A server that was full, then down, then up is told of as working again and as

@@ -14,7 +14,7 @@ use super::pick::Pick;
 use super::server::Server;
 use super::subscribers::News;
 use crate::shared::connections::Connection;
-use crate::shared::liveness::Liveness;
+use crate::shared::liveness::{self, Liveness};
 use crate::shared::peer::Peer;
 use crate::shared::websocket::{Heard, Inbox};
 
@@ -58,15 +58,6 @@ impl WebClient {
         ctx.stop();
     }
 
-    fn ping(&mut self, ctx: &mut Context) {
-        if self.liveness.is_gone(self.server.timing.silence) {
-            log::debug!("client {}: silent for too long", self.peer);
-            ctx.stop();
-        } else {
-            ctx.ping(&self.liveness.ping());
-        }
-    }
-
     fn pick(&self, text: &str, ctx: &mut Context) {
         let server = Arc::clone(&self.server);
         let (wanted, from) = (wanted_world(text), self.peer.household());
@@ -79,11 +70,11 @@ impl WebClient {
 fn wanted_world(text: &str) -> Option<String> {
     #[derive(Deserialize)]
     struct Wanted {
-        url: String,
+        url: serde_json::Value,
     }
     let text = text.trim();
     if let Ok(Wanted { url }) = serde_json::from_str(text) {
-        return Some(url);
+        return Some(url.as_str().map_or_else(|| url.to_string(), str::to_owned));
     }
     text.contains("://").then(|| text.to_owned())
 }
@@ -92,7 +83,8 @@ impl Actor for WebClient {
     type Context = Context;
 
     fn started(&mut self, ctx: &mut Self::Context) {
-        ctx.run_interval(self.server.timing.ping, Self::ping);
+        let timing = &self.server.timing;
+        liveness::watch(ctx, timing.ping, timing.silence, |client| &mut client.liveness);
         let subscribed = self.audience.send(Join(ctx.address().recipient())).into_actor(self);
         subscribed
             .map(|answer, client, ctx| match answer {
@@ -155,6 +147,7 @@ mod tests {
             ("", None),
             ("please", None),
             (r#"{"other": 1}"#, None),
+            (r#"{"url": 5}"#, Some("5")),
             (world, Some(world)),
             (&format!(r#"{{"url": "{world}"}}"#), Some(world)),
             ("http://no.world", Some("http://no.world")),

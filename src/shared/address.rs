@@ -105,10 +105,11 @@ impl FromStr for PublicAddress {
             Some((name, web_port)) if rewritten && !host.ends_with(']') => number(web_port).map(|_| name)?,
             _ => host,
         };
-        url::Host::parse(name).map_err(|_| no_address())?;
+        // As it is asked for: names in lower case, as RFC 4343 has it, and in ASCII. One server must not count as two.
+        let plain = url::Host::parse(name).map_err(|_| no_address())?.to_string();
+        let host = format!("{plain}{}", host.strip_prefix(name).unwrap_or_default());
         let port = number(port)?;
-        // Names are the same in any case (RFC 4343), and one server must not count as two.
-        Ok(Self { host: host.to_ascii_lowercase().into(), port, rewritten })
+        Ok(Self { host: host.into(), port, rewritten })
     }
 }
 
@@ -125,8 +126,15 @@ mod tests {
     }
 
     #[test]
-    fn a_name_is_the_same_in_any_case() {
-        assert_eq!("Lab.ORG:2000".parse::<PublicAddress>().unwrap().to_string(), "lab.org:2000");
+    fn a_name_is_written_in_one_way() {
+        for (text, plain) in [
+            ("Lab.ORG:2000", "lab.org:2000"),
+            ("Lab.ORG:8443/2000", "lab.org:8443/2000"),
+            ("bücher.example:2000", "xn--bcher-kva.example:2000"),
+            ("a%2eb/2000", "a.b/2000"),
+        ] {
+            assert_eq!(text.parse::<PublicAddress>().unwrap().to_string(), plain);
+        }
     }
 
     #[test]

@@ -5,7 +5,7 @@ use actix_web::http::header::Header;
 use actix_web_httpauth::headers::authorization::{Authorization, Basic};
 use constant_time_eq::constant_time_eq;
 
-use super::config::Secret;
+use super::config_value::Secret;
 
 /// Whether a request carries this password. How long the answer takes tells nothing of it.
 #[must_use]

@@ -5,8 +5,10 @@ use std::net::IpAddr;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use actix_web::HttpResponse;
+use actix_web::http::StatusCode;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 
+use super::paths::come_back;
 use super::peer::Peer;
 
 /// Counts open connections.
@@ -93,10 +95,11 @@ impl Crowded {
     /// The answer to a client that is refused.
     #[must_use]
     pub fn answer(self) -> HttpResponse {
-        match self {
-            Self::Everywhere => HttpResponse::ServiceUnavailable().body(self.to_string()),
-            Self::FromThere => HttpResponse::TooManyRequests().body(self.to_string()),
-        }
+        let status = match self {
+            Self::Everywhere => StatusCode::SERVICE_UNAVAILABLE,
+            Self::FromThere => StatusCode::TOO_MANY_REQUESTS,
+        };
+        HttpResponse::build(status).insert_header(come_back()).body(self.to_string())
     }
 }
 

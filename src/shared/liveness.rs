@@ -2,6 +2,9 @@
 
 use std::time::{Duration, Instant};
 
+use actix::prelude::*;
+use actix_web_actors::ws::WebsocketContext;
+
 /// Watches one WebSocket connection.
 ///
 /// A half-open connection never says that it is one; RFC 6455, section 5.5.2, has pings for this. Each ping carries a
@@ -45,11 +48,31 @@ impl Liveness {
         self.answers <= ANSWERS
     }
 
-    /// Whether the peer has not answered a ping for longer than this.
-    #[must_use]
-    pub fn is_gone(&self, silence: Duration) -> bool {
-        self.alive.elapsed() > silence
+    /// Whether the peer has not answered a ping for so long.
+    fn is_gone(&self, silence: Duration) -> bool {
+        self.alive.elapsed() >= silence
     }
+}
+
+/// Pings a peer, and ends its actor when it is gone; `of` tells where the actor has its liveness.
+pub fn watch<A>(ctx: &mut WebsocketContext<A>, ping: Duration, silence: Duration, of: fn(&mut A) -> &mut Liveness)
+where
+    A: Actor<Context = WebsocketContext<A>>,
+{
+    ctx.run_interval(ping, move |actor, ctx| {
+        let liveness = of(actor);
+        let left = silence.saturating_sub(liveness.alive.elapsed());
+        ctx.ping(&liveness.ping());
+        // The time is up between two pings, mostly.
+        if left < ping {
+            ctx.run_later(left, move |actor, ctx| {
+                if of(actor).is_gone(silence) {
+                    log::info!("a client was silent for too long");
+                    ctx.stop();
+                }
+            });
+        }
+    });
 }
 
 impl Default for Liveness {

@@ -26,6 +26,13 @@ impl Load {
         self.0
     }
 
+    /// The mean of loads, in percent; nothing where there are none.
+    #[must_use]
+    pub fn mean(loads: impl Iterator<Item = Self>) -> Option<f64> {
+        let (sum, count) = loads.fold((0.0, 0_u32), |(sum, count), load| (sum + load.0, count + 1));
+        (count > 0).then(|| sum / f64::from(count))
+    }
+
     /// Reads the body of a `/load` answer: a plain decimal number.
     ///
     /// # Errors

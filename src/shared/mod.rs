@@ -6,6 +6,7 @@ pub mod assets;
 pub mod auth;
 pub mod config;
 pub mod config_error;
+pub mod config_value;
 pub mod connections;
 pub mod live;
 pub mod liveness;
@@ -22,6 +23,7 @@ pub mod repositories;
 
 pub mod rotated_file;
 pub mod shutdown;
+pub mod sockets;
 pub mod start;
 pub mod status;
 pub mod timestamp;

@@ -1,9 +1,14 @@
 //! What the paths of both servers have in common: methods, headers for pages of other origins, words for what is not there.
 
 use actix_web::dev::HttpServiceFactory;
-use actix_web::http::{Method, StatusCode, header};
+use actix_web::http::header::{self, HeaderName, HeaderValue};
+use actix_web::http::{Method, StatusCode};
 use actix_web::middleware::DefaultHeaders;
 use actix_web::{FromRequest, Handler, HttpResponse, Resource, Responder, guard, web};
+use rand::RngExt;
+
+/// In seconds.
+const COME_BACK: std::ops::RangeInclusive<u16> = 2..=6;
 
 /// For what is read. What watches over servers likes to ask for the head alone (RFC 9110, section 9.3.2).
 pub const READ: &[Method] = &[Method::GET, Method::HEAD];
@@ -31,12 +36,20 @@ fn wrong_method(methods: &[Method]) -> HttpResponse {
     HttpResponse::MethodNotAllowed().insert_header((header::ALLOW, allowed)).body(words)
 }
 
+/// After how many seconds a client that was refused may come back: drawn at random, so that a class that was refused
+/// together does not come back together.
+#[must_use]
+pub fn come_back() -> (HeaderName, HeaderValue) {
+    (header::RETRY_AFTER, HeaderValue::from(rand::rng().random_range(COME_BACK)))
+}
+
 /// All paths of a server, which pages of any origin may use; `hint` names those that people look for.
 pub fn all(configure: fn(&mut web::ServiceConfig), hint: &'static str) -> impl HttpServiceFactory + 'static {
     let headers = DefaultHeaders::new()
         .add((header::ACCESS_CONTROL_ALLOW_ORIGIN, "*"))
         .add((header::ACCESS_CONTROL_ALLOW_HEADERS, "x-requested-with"))
         .add((header::ACCESS_CONTROL_ALLOW_METHODS, "POST, GET, OPTIONS"))
+        .add((header::ACCESS_CONTROL_EXPOSE_HEADERS, "Retry-After"))
         .add((header::CACHE_CONTROL, "no-store"));
     web::scope("")
         .wrap(headers)

@@ -59,6 +59,13 @@ impl TrustedProxies {
         }
     }
 
+    /// The other end of a connection on which nothing was said yet.
+    #[must_use]
+    pub fn of_connection(&self, address: IpAddr) -> Peer {
+        let address = address.to_canonical();
+        if self.trusts(address) { Peer::Proxy(address) } else { Peer::Client(address) }
+    }
+
     fn resolve(&self, connected: IpAddr, headers: &HeaderMap) -> Peer {
         if !self.trusts(connected) {
             return Peer::Client(connected);

@@ -1,11 +1,12 @@
 //! How a program starts: configuration, log, then the server, and an exit code.
 
 use std::io::Write;
+use std::mem::ManuallyDrop;
 use std::path::Path;
 use std::process::ExitCode;
 
 use super::config::{self, Configuration, Loaded};
-use super::logging::{self, LogTarget};
+use super::logging::{self, LogTarget, one_line};
 
 /// The server failed at run time: a port that is taken, an actor that is gone.
 pub const FAILED: u8 = 1;
@@ -18,7 +19,8 @@ pub const WRONG_CONFIGURATION: u8 = 2;
 /// The exit code.
 pub fn read<C: Configuration>(file: &Path) -> Result<Loaded<C>, ExitCode> {
     config::load(file).map_err(|error| {
-        eprintln!("error: {error}");
+        // A key may hold anything.
+        eprintln!("error: {}", one_line(&error.to_string()));
         ExitCode::from(WRONG_CONFIGURATION)
     })
 }
@@ -27,7 +29,7 @@ pub fn read<C: Configuration>(file: &Path) -> Result<Loaded<C>, ExitCode> {
 #[must_use]
 pub fn check<C: Configuration>(loaded: &Loaded<C>) -> ExitCode {
     for warning in &loaded.warnings {
-        eprintln!("warning: {warning}");
+        eprintln!("warning: {}", one_line(warning));
     }
     match serde_json::to_string_pretty(&loaded.config) {
         Ok(text) => {
@@ -59,7 +61,10 @@ pub fn serve<E: std::error::Error>(
     for warning in warnings {
         log::warn!("{warning}");
     }
-    match actix_rt::System::new().block_on(server) {
+    // It is left to the end of the process: dropped, it would wait for threads that the system keeps, in a lookup of a
+    // name that takes long.
+    let system = ManuallyDrop::new(actix_rt::System::new());
+    match system.block_on(server) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             log::error!("{error}");

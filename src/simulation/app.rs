@@ -32,6 +32,7 @@ use crate::shared::metrics::Metrics;
 use crate::shared::notify;
 use crate::shared::permanent;
 use crate::shared::shutdown::{Phase, Request, Signals};
+use crate::shared::sockets::Sockets;
 
 /// Why the server can't go on.
 #[derive(Debug, thiserror::Error)]
@@ -80,9 +81,16 @@ pub async fn run(config: SimulationConfig) -> Result<(), AppError> {
     let server = Arc::new(assemble(config, phase, requests)?);
     let _last_will = process_group::remove_in_the_end(server.run.path())?;
     let shared = web::Data::from(Arc::clone(&server));
+    let sockets = Arc::new(Sockets::new(
+        server.config.max_clients.saturating_mul(2),
+        server.config.max_clients_per_address,
+        server.config.trusted_proxies.clone(),
+        server.config.timing.silence,
+    ));
     let http = HttpServer::new(move || App::new().app_data(shared.clone()).configure(routes::configure))
         // Messages are small, and must not wait for the answer to the one before.
         .tcp_nodelay(true)
+        .on_connect(move |socket, extensions| sockets.accept(socket, extensions))
         .disable_signals()
         .shutdown_timeout(1)
         .listen(socket)?

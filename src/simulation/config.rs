@@ -8,9 +8,8 @@ use serde::{Deserialize, Serialize};
 
 use super::mirrors::Mirrors;
 use crate::shared::address::{PublicAddress, check_host};
-use crate::shared::config::{
-    Configuration, ExpandedPath, Unfit, folder, local_address, one_or_many, percent, seconds, whole,
-};
+use crate::shared::config::{Configuration, Unfit};
+use crate::shared::config_value::{ExpandedPath, folder, local_address, one_or_many, percent, seconds, whole};
 use crate::shared::peer::TrustedProxies;
 use crate::shared::repositories::UrlPrefix;
 
@@ -125,7 +124,7 @@ pub struct SimulationConfig {
     pub allowed_origins: Vec<String>,
     /// Password of actions such as `/drain`. Default: none, and actions are off.
     #[serde(default)]
-    pub admin_password: Option<crate::shared::config::Secret>,
+    pub admin_password: Option<crate::shared::config_value::Secret>,
     /// Every other duration.
     #[serde(default)]
     pub timing: Timing,
@@ -133,7 +132,7 @@ pub struct SimulationConfig {
 
 /// Durations, in seconds.
 #[derive(Debug, Clone, Serialize, Deserialize)]
-#[serde(rename_all = "camelCase", default, deny_unknown_fields)]
+#[serde(rename_all = "camelCase", default, deny_unknown_fields, expecting = "an object of durations")]
 pub struct Timing {
     /// How long a checkout may take. Default: 120.
     #[serde(with = "seconds")]

@@ -19,7 +19,7 @@ use super::server::Server;
 use super::webots::{RestoreController, Webots};
 use super::webots_event::{Exit, WebotsEvent};
 use crate::shared::connections::Connection;
-use crate::shared::liveness::Liveness;
+use crate::shared::liveness::{self, Liveness};
 use crate::shared::peer::Peer;
 use crate::shared::shutdown::closing;
 use crate::shared::websocket::{Heard, Inbox};
@@ -169,7 +169,6 @@ impl WebClient {
 
     fn reset_controller(&mut self, file: String, ctx: &mut Context) {
         let Stage::Launched(Lease(webots)) = &self.stage else {
-            // A start that is under way goes on.
             return ctx.text(protocol::error("A controller can be reset only while a simulation runs"));
         };
         if std::mem::replace(&mut self.restoring, true) {
@@ -195,14 +194,6 @@ impl WebClient {
         self.start.is(Outcome::NoWebots);
         self.finish(&words, CloseCode::Normal, ctx);
     }
-
-    fn ping(&mut self, ctx: &mut Context) {
-        if self.liveness.is_gone(self.server.config.timing.silence) {
-            log::info!("{}: silent for too long", self.name());
-            return ctx.stop();
-        }
-        ctx.ping(&self.liveness.ping());
-    }
 }
 
 impl Actor for WebClient {
@@ -210,7 +201,8 @@ impl Actor for WebClient {
 
     fn started(&mut self, ctx: &mut Self::Context) {
         log::info!("{}: connected", self.name());
-        ctx.run_interval(self.server.config.timing.ping, Self::ping);
+        let timing = &self.server.config.timing;
+        liveness::watch(ctx, timing.ping, timing.silence, |client| &mut client.liveness);
         closing(self.server.phase.clone())
             .into_actor(self)
             .map(|(), this, ctx| {
@@ -238,8 +230,7 @@ impl StreamHandler<Result<Message, ProtocolError>> for WebClient {
             Heard::Nothing => {}
             Heard::Text(_) | Heard::Ping(_) => {
                 log::warn!("{}: asks too much between two pings", self.name());
-                ctx.close(Some(CloseCode::Policy.into()));
-                ctx.stop();
+                self.finish(&protocol::error("Too many requests on one connection"), CloseCode::Policy, ctx);
             }
             Heard::Wrong(wrong) => {
                 log::info!("{}: {wrong}", self.name());

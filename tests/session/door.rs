@@ -1,5 +1,6 @@
 //! What web clients get at the door.
 
+use crate::stand_in::{Manner, StandIn};
 use crate::support::client::Client;
 use crate::support::git::{Forge, world};
 use crate::support::http;
@@ -31,10 +32,12 @@ async fn a_client_is_led_to_the_simulation_server_that_is_there() {
 
 #[actix_rt::test]
 async fn a_message_may_come_in_pieces_and_must_not_be_large() {
-    let session = session_server(&[]).start().await;
+    let other = serde_json::json!({"load": 1, "allowedRepositories": ["https://github.com/other"]});
+    let server = StandIn::start(Manner::Status(other));
+    let session = session_server(&[server.address()]).start().await;
     let connect = async || Client::connect(&session.websocket("/")).await;
     let mut client = connect().await;
-    client.until("0").await;
+    client.until("1").await;
     client.send_pieces(&[b"https://github.com/lab/arm", b"", b"/blob/main/worlds/a.wbt"]).await;
     assert_eq!(client.until("Error").await, "Error: no simulation server accepts https://github.com/lab/arm.");
     let piece = [b'x'; 5000];

@@ -41,16 +41,20 @@ async fn every_kind_of_failure_is_mailed_and_so_is_its_end() {
         let entry = text.split(&format!("{address}: not responding")).nth(1).unwrap();
         let entry = entry.split("responding").next().unwrap();
         assert!(entry.contains(words), "{manner:?}: {entry}");
+        assert!(entry.contains("7.0%"), "the last known load of {manner:?}: {entry}");
     }
     assert!(text.contains(&format!("http://localhost:{}/monitor", session.port)), "{text}");
     for server in &servers {
         server.set(Manner::idle(7.0, 10));
     }
     let mut text = String::new();
-    for server in &servers {
-        while !text.contains(&format!("{}: working again", server.address())) {
+    for (server, (manner, words)) in servers.iter().zip(&failures) {
+        let told = format!("{}: working again", server.address());
+        while !text.contains(&told) {
             text.push_str(smtp.mail().await.field("text"));
         }
+        let entry = text.split(&told).nth(1).unwrap().split("working again").next().unwrap();
+        assert!(entry.contains(words), "the last error of {manner:?}: {entry}");
     }
 }
 

@@ -154,3 +154,35 @@ async fn somebody_who_only_asks_does_not_close_the_fleet() {
     }
     assert_eq!(refused_late, 0, "the one server is closed though nobody comes");
 }
+
+#[actix_rt::test]
+async fn a_fleet_that_is_down_is_not_said_to_refuse_a_world() {
+    let server = StandIn::start(Manner::Reset);
+    let session = session_server(&[server.address()]).start().await;
+    until_states(&session, &["down"]).await;
+    let answer = http::get(&session.url(&format!("/session?url={}", world("lab/arm", "main", "worlds/arm.wbt")))).await;
+    assert_eq!(answer.status, 503, "{}", answer.text());
+    assert!(answer.header("retry-after").is_some());
+    assert_eq!(answer.header("access-control-expose-headers"), Some("Retry-After"));
+}
+
+#[actix_rt::test]
+async fn a_world_may_be_percent_encoded_and_a_wrong_one_is_said_so() {
+    let servers =
+        [StandIn::start(Manner::Status(json!({"load": 1, "allowedRepositories": ["https://github.com/lab"]})))];
+    let session = session_server(&addresses(&servers)).start().await;
+    until_states(&session, &["up"]).await;
+    let encoded = |url: String| url.replace(':', "%3A").replace('/', "%2F");
+    let got = http::get(
+        &session.url(&format!("/session?url={}&mode=x3d", encoded(world("lab/arm", "main", "worlds/arm.wbt")))),
+    )
+    .await;
+    assert_eq!(got.text(), servers[0].url());
+    let refused =
+        http::get(&session.url(&format!("/session?url={}", encoded(world("other/arm", "main", "worlds/arm.wbt")))))
+            .await;
+    assert_eq!(refused.status, 403, "{}", refused.text());
+    let mut client = Client::connect(&session.websocket("/session")).await;
+    client.send(r#"{"url": 5}"#).await;
+    client.until("Error: ").await;
+}

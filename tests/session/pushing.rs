@@ -164,3 +164,54 @@ async fn a_message_without_end_is_cut_off_before_it_fills_the_memory() {
     assert!(sent.await.unwrap() > 2, "too little was sent to see anything");
     assert!(resident() < before + 20 * 256, "from {before} to {} pages of 4 KiB", resident());
 }
+
+#[actix_rt::test]
+async fn a_client_that_reads_no_page_is_sent_away_and_holds_up_no_stop() {
+    let session = session_server(&[]).set("timing", serde_json::json!({"ping": 0.5, "silence": 1})).start().await;
+    let mut deaf = TcpStream::connect(session.address()).await.unwrap();
+    let request = b"GET /assets/viewer.js HTTP/1.1\r\nHost: localhost\r\n\r\n";
+    let flood = async {
+        // Until it no longer takes requests in, for its answers are not read; then until the connection is cut.
+        loop {
+            let sent = actix_rt::time::timeout(Duration::from_secs(20), deaf.write_all(request)).await;
+            if sent.expect("the connection is still open").is_err() {
+                return;
+            }
+        }
+    };
+    actix_rt::time::timeout(Duration::from_secs(40), flood).await.expect("it may ask for ever");
+    assert_eq!(http::get(&session.url("/health")).await.status, 200);
+}
+
+#[actix_rt::test]
+async fn a_silent_client_is_gone_when_its_time_is_up() {
+    let timing = serde_json::json!({"ping": 1, "silence": 1.5});
+    let session = session_server(&[]).set("timing", timing).start().await;
+    let mut silent = deaf(&session).await;
+    let begin = std::time::Instant::now();
+    let mut rest = Vec::new();
+    // It takes everything in, and answers no ping.
+    let end = actix_rt::time::timeout(Duration::from_secs(10), silent.read_to_end(&mut rest)).await;
+    assert!(end.is_ok(), "its connection is still open");
+    let took = begin.elapsed().as_secs_f64();
+    assert!((1.4..2.5).contains(&took), "closed after {took} s; the silence is 1.5 s");
+}
+
+#[actix_rt::test]
+async fn an_address_has_only_so_many_connections_of_any_kind() {
+    let builder = session_server(&[]).set("trustedProxies", serde_json::json!([])).set("maxClientsPerAddress", 2);
+    let session = builder.start().await;
+    let refused = async || {
+        let mut all = join_all((0..8).map(|_| TcpStream::connect(session.address()))).await;
+        actix_rt::time::sleep(Duration::from_millis(300)).await;
+        let mut cut = 0;
+        for stream in all.iter_mut().map(|stream| stream.as_mut().unwrap()) {
+            let mut nothing = [0];
+            let read = actix_rt::time::timeout(Duration::from_millis(50), stream.read(&mut nothing)).await;
+            cut += usize::from(matches!(read, Ok(Ok(0) | Err(_))));
+        }
+        cut
+    };
+    assert!(refused().await >= 4);
+    until("there is room again", async || http::try_get(&session.url("/health")).await.is_ok()).await;
+}

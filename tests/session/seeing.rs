@@ -203,3 +203,12 @@ async fn a_wrong_method_is_refused_by_name() {
         assert!(allow.is_some_and(|allow| allow.starts_with("GET")), "{path}");
     }
 }
+
+#[actix_rt::test]
+async fn the_mean_load_is_that_of_all_who_answer() {
+    let servers = [StandIn::start(Manner::Load("10".into())), StandIn::start(Manner::Load("40".into()))];
+    let session =
+        session_server(&addresses(&servers)).set("drainedServers", json!([servers[1].address()])).start().await;
+    until_states(&session, &["up", "draining"]).await;
+    assert_eq!(http::get(&session.url("/load")).await.text(), "25");
+}

@@ -101,15 +101,23 @@ impl<Id: Clone + Ord> Fleet<Id> {
             }
             self.rank(&id, now);
         }
-        let id = self.order.servers().find(|id| eligible(id))?.clone();
+        let least_loaded = self.order.servers().find(|id| eligible(id))?.clone();
+        let counts = from.is_none_or(|from| self.allowances.take(from, now, self.policy.patience));
+        let id = if counts { least_loaded } else { self.next_in_turn(eligible).unwrap_or(least_loaded) };
         self.turns += 1;
         let server = self.servers.get_mut(&id)?;
         server.turn = self.turns;
-        if from.is_none_or(|from| self.allowances.take(from, now, self.policy.patience)) {
+        if counts {
             server.place(now, from);
         }
         self.rank(&id, now);
         Some(id)
+    }
+
+    /// The server that has waited longest for its turn. Clients that don't count change no load, and would all go to one.
+    fn next_in_turn(&self, eligible: impl Fn(&Id) -> bool) -> Option<Id> {
+        let turn = |id: &&Id| self.servers.get(id).map(|server| server.turn);
+        self.order.servers().filter(|id| eligible(id)).min_by_key(turn).cloned()
     }
 
     /// Puts a server in its place after something happened to it.
@@ -159,18 +167,6 @@ impl<Id: Clone + Ord> Fleet<Id> {
     pub fn learned_cost(&self, id: &Id) -> Option<f64> {
         self.servers.get(id).map(Server::learned_cost)
     }
-
-    /// The mean of the last reported loads of the servers that are up, in percent; `None` if none is.
-    #[must_use]
-    pub fn mean_load(&self) -> Option<f64> {
-        let mut count = 0_u32;
-        let mut sum = 0.0;
-        for load in self.servers.values().filter_map(Server::load) {
-            count += 1;
-            sum += load;
-        }
-        (count > 0).then(|| sum / f64::from(count))
-    }
 }
 
 #[cfg(test)]
@@ -215,16 +211,15 @@ mod tests {
         assert!(!fleet.available(now));
         fleet.add("a");
         assert!(!fleet.available(now));
-        assert_eq!((fleet.place(now, |_| true), fleet.mean_load()), (None, None));
+        assert_eq!(fleet.place(now, |_| true), None);
         fleet.report(&"a", now, load_only(20.0));
         assert!(fleet.available(now));
         assert_eq!(fleet.place(now, |_| true), Some("a"));
         fleet.lose(&"a");
         assert!(!fleet.available(now));
-        assert_eq!((fleet.effective_load(&"a", now), fleet.mean_load()), (None, None));
+        assert_eq!(fleet.effective_load(&"a", now), None);
         fleet.report(&"a", now, load_only(20.0));
         assert!(fleet.available(now));
-        assert_eq!(fleet.mean_load(), Some(20.0));
         fleet.remove(&"a");
         assert_eq!((fleet.available(now), fleet.learned_cost(&"a")), (false, None));
         fleet.report(&"unknown", now, load_only(20.0));
@@ -329,6 +324,27 @@ mod tests {
         // Those of another address count as ever.
         assert_eq!([(); 4].map(|()| fleet.place_from(now, Some("203.0.113.10".parse().unwrap()), |_| true)).len(), 4);
         assert!(fleet.in_flight(&0, now) + fleet.in_flight(&1, now) >= 4);
+    }
+
+    #[test]
+    fn those_over_the_allowance_are_spread_all_the_same() {
+        let now = Instant::now();
+        let mut fleet = Fleet::new(policy(0.25));
+        for (id, load) in [(0_usize, 10.0), (1, 11.0), (2, 12.0)] {
+            fleet.add(id);
+            fleet.report(&id, now, full_report(load, 0, 0));
+        }
+        let class = Some("203.0.113.9".parse().unwrap());
+        let mut got = [0; 3];
+        // More than the three have room for if all counted, and more than the allowance; those it takes fill the fleet.
+        for step in 0..4_000 {
+            let now = now + seconds(f64::from(step) / 1_000.0);
+            if let Some(id) = fleet.place_from(now, class, |_| true) {
+                got[id] += 1;
+            }
+        }
+        let (least, most) = (got.iter().min().unwrap(), got.iter().max().unwrap());
+        assert!(most - least <= 12, "{got:?}");
     }
 
     #[test]
