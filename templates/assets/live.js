@@ -7,6 +7,8 @@ import { showTimes } from './times.js';
 const listeners = [];
 const lamp = document.getElementById('live');
 const cells = new WeakMap();
+/** Compares as people do: 2 comes before 10. */
+const alphabet = new Intl.Collator(undefined, { numeric: true });
 let source;
 
 /** Calls a function with the numbers of each event that has some; `fresh` tells that events may have been missed. */
@@ -86,7 +88,7 @@ function sort(body) {
     const sign = heads[column].getAttribute('aria-sort') === 'descending' ? -1 : 1;
     wanted.sort((one, other) => {
       const [a, b] = [cellValue(one, column, kind), cellValue(other, column, kind)];
-      const order = kind === 'number' ? a - b : a.localeCompare(b, undefined, { numeric: true });
+      const order = kind === 'number' ? a - b : alphabet.compare(a, b);
       return sign * order;
     });
   }

@@ -59,7 +59,7 @@ class Monitors(BrowserTest):
         memory.uncheck()
         expect(line).to_have_attribute("points", "")
         memory.check()
-        chart = page.tab.locator("#charts figure svg[role=img]").first
+        chart = page.tab.locator("#charts figure svg[role=slider]").first
         box = chart.bounding_box()
         page.tab.mouse.move(box["x"] + box["width"] - 30, box["y"] + 80)
         moment = page.tab.locator(".moment").first
@@ -69,6 +69,10 @@ class Monitors(BrowserTest):
         expect(moment).to_have_text("now")
         chart.press("ArrowLeft")
         expect(moment).to_contain_text("at ")
+        # A screen reader reads this.
+        self.assertRegex(chart.get_attribute("aria-valuetext"), r"^at .*: CPU load \d+\.\d %, .*Disk \d+\.\d %$")
+        chart.press("Escape")
+        expect(moment).to_have_text("now")
 
     def test_the_output_of_a_simulation_is_shown_on_demand(self):
         viewer, server = self.start_world()
