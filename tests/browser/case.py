@@ -16,17 +16,12 @@ def picture(page):
     return page.tab.locator("#view").screenshot()
 
 
-def clock(page):
-    """The simulation's time in milliseconds."""
-    minutes, seconds = page.tab.locator("#clock").inner_text().split(":")
-    return round(60_000 * int(minutes) + 1000 * float(seconds))
-
-
 class BrowserTest(unittest.TestCase):
     """A class of tests with a fleet of its own."""
 
     session = None
     simulation = None
+    strangers = ()
     # The only one that pages may ask.
     host = "127.0.0.1"
 
@@ -37,7 +32,7 @@ class BrowserTest(unittest.TestCase):
 
     @classmethod
     def make_fleet(cls):
-        return Fleet(cls.session, cls.simulation)
+        return Fleet(cls.session, cls.simulation, cls.strangers)
 
     def run(self, result=None):
         before = len(result.failures) + len(result.errors)

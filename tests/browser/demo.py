@@ -14,6 +14,8 @@ from fleet import BIN, ROOT, free_ports
 
 # How long server.sh may take for anything.
 LIMIT = 90
+# How many simulation servers there can be, and how many ports each may take.
+MOST, EACH = 3, 24
 
 
 class Demo:
@@ -29,22 +31,36 @@ class Demo:
         # Where server.sh puts what it builds.
         (self.folder / "target").mkdir()
         (self.folder / "target/release").symlink_to(BIN)
-        port = free_ports(24)
-        self.ports = range(port, port + 12)
+        # Each simulation server needs some ports after its own.
+        port = free_ports(1 + MOST * EACH)
+        self.ports = range(port, port + 1 + MOST * EACH)
+        self.servers = 1
         self.session, self.simulation = f"localhost:{port}", f"localhost:{port + 1}"
         # Whatever else keeps this machine busy is no concern of the tests.
-        self._configure("session", {
+        self.configure("session", "demo", {
             "port": port, "simulationServers": [self.simulation], "loadThreshold": 1000, **(session or {})})
-        self._configure("simulation", {"port": port + 1, **(simulation or {})})
+        self.configure("simulation", "demo", {"port": port + 1, **(simulation or {})})
         try:
             self.server_sh("start", "demo")
         except BaseException:
             self.close()
             raise
 
-    def _configure(self, kind, more):
-        file = self.folder / f"config/{kind}/demo.json"
-        file.write_text(json.dumps({**json.loads(file.read_text()), **more}))
+    def configure(self, kind, name, more):
+        """Makes a configuration out of the demo's."""
+        demo = json.loads((self.folder / f"config/{kind}/demo.json").read_text())
+        (self.folder / f"config/{kind}/{name}.json").write_text(json.dumps({**demo, **more}))
+
+    def add(self, name, title):
+        """Starts one more simulation server, as if on another machine."""
+        port = self.ports[1 + self.servers * EACH]
+        self.servers += 1
+        assert self.servers <= MOST, "there are no more ports"
+        self.configure("simulation", name, {"port": port, "title": title, "cacheDir": f"cache/{name}"})
+        addresses = [f"localhost:{self.ports[1 + number * EACH]}" for number in range(self.servers)]
+        self.configure("session", "demo", {"simulationServers": addresses})
+        self.server_sh("start", name)
+        os.kill(self.process("session"), signal.SIGHUP)
 
     def server_sh(self, *arguments):
         """Runs server.sh, which has to succeed; gives back what it prints."""
@@ -57,7 +73,10 @@ class Demo:
 
     def kill(self, kind):
         """Ends a server without a warning, as a power failure would."""
-        os.kill(int((self.folder / f"log/demo.{kind}.pid").read_text()), signal.SIGKILL)
+        os.kill(self.process(kind), signal.SIGKILL)
+
+    def process(self, kind):
+        return int((self.folder / f"log/demo.{kind}.pid").read_text())
 
     def leftovers(self):
         """What is left of it: processes, files that say that one runs, folders of simulations, ports."""

@@ -4,9 +4,15 @@ import unittest
 
 from playwright.sync_api import expect
 
-from case import BrowserTest, clock, picture
+from case import BrowserTest, picture
 from demo import Demo
 from fleet import until
+
+
+def clock(page):
+    """The simulation's time in milliseconds."""
+    minutes, seconds = page.tab.locator("#clock").inner_text().split(":")
+    return round(60_000 * int(minutes) + 1000 * float(seconds))
 
 
 class TheDemo(BrowserTest):

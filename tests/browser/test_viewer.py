@@ -4,43 +4,11 @@ import unittest
 
 from playwright.sync_api import expect
 
-from case import BrowserTest, clock, picture
+from case import BrowserTest, picture
 from fleet import WORLD, until
 
 
 class Viewing(BrowserTest):
-    def test_a_world_is_started_and_moves_pauses_steps_and_resets(self):
-        page, server = self.start_world()
-        monitor = self.open(server.url("monitor"))
-        row = monitor.tab.locator("#simulations tr")
-        expect(row).to_contain_text("playground.wbt")
-        expect(row).to_contain_text("idle")
-        expect(page.tab.locator("#mode")).to_have_text("paused")
-        self.assertEqual(clock(page), 0)
-        first = picture(page)
-        self.assertGreater(len(first), 5000, "an empty picture is small")
-
-        page.tab.get_by_role("button", name="Play", exact=True).click()
-        until("half a second has passed", lambda: clock(page) > 500)
-        expect(row).to_contain_text("running")
-        page.tab.get_by_role("button", name="Pause", exact=True).click()
-        expect(page.tab.locator("#mode")).to_have_text("paused")
-        paused = clock(page)
-        self.assertNotEqual(picture(page), first, "nothing has moved")
-        expect(row).to_contain_text("idle")
-        self.assertEqual(clock(page), paused, "time stands still")
-
-        page.tab.get_by_role("button", name="Step", exact=True).click()
-        until("one step is made", lambda: clock(page) == paused + 16)
-        page.tab.get_by_role("button", name="Reset", exact=True).click()
-        until("time is zero", lambda: clock(page) == 0)
-        until("all is where it was", lambda: picture(page) == first)
-
-        self.assertEqual(len(server.status()["simulations"]), 1)
-        page.close()
-        expect(row).to_have_count(0)
-        expect(monitor.tab.get_by_text("Nobody is here.")).to_be_visible()
-
     def test_the_view_turns_by_keyboard_and_pointer(self):
         page, _ = self.start_world("Carousel")
         view = page.tab.locator("#view")
@@ -86,9 +54,29 @@ class Viewing(BrowserTest):
                 expect(page.tab.locator(".steps .failed")).to_have_count(1)
                 expect(page.tab.get_by_role("button", name="Connect", exact=True)).to_be_enabled()
 
+    def test_on_a_phone_the_scene_comes_into_sight(self):
+        page, _ = self.start_world(width=360, height=740)
+        expect(page.tab.locator("#view")).to_be_in_viewport(ratio=0.9)
+
     def test_a_link_can_name_the_world(self):
         page = self.open(self.fleet.session.url(f"viewer?url={WORLD.format('carousel')}"))
         expect(page.tab.get_by_label("URL of a world")).to_have_value(WORLD.format("carousel"))
+
+
+class Stranger(BrowserTest):
+    # The fleet knows it as 127.0.0.1.
+    simulation = {"server": "localhost"}
+
+    def test_a_server_that_calls_itself_otherwise_is_told_of_in_words(self):
+        page = self.browser.page()
+        self.addCleanup(page.close)
+        page.tab.goto(self.fleet.session.url("viewer"))
+        expect(page.tab.locator("#light.on")).to_be_visible()
+        page.tab.get_by_role("button", name="Playground").click()
+        page.tab.get_by_role("button", name="Connect", exact=True).click()
+        expect(page.tab.locator("#problem-text")).to_contain_text("may not connect to ws://localhost:")
+        expect(page.tab.locator("#problem-advice")).to_contain_text("simulationServers")
+        expect(page.tab.locator("[data-step=simulation].failed")).to_be_visible()
 
 
 if __name__ == "__main__":
