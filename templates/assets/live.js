@@ -21,29 +21,33 @@ function say(text, lost) {
   lamp.classList.toggle('lost', lost);
 }
 
-/** The rows of HTML cells; a template understands them outside of a table. */
+/** A cell of HTML; a template understands it outside of a table. */
 function parsed(html) {
   const template = document.createElement('template');
   template.innerHTML = `<table><tbody><tr>${html}</tr></tbody></table>`;
-  return template.content.querySelector('tr');
+  return template.content.querySelector('tr').firstElementChild;
 }
 
-/** Replaces only those cells that differ, so that a focused link stays focused and an opened list open. */
-function fill(row, html) {
-  const fresh = [...parsed(html).children];
-  const texts = fresh.map((cell) => cell.outerHTML);
-  const known = cells.get(row);
-  cells.set(row, texts);
-  fresh.forEach((cell, index) => {
-    if (known && known[index] === texts[index])
-      return;
-    const old = row.children[index];
+/**
+ * Takes a row's cells by their columns. Replaces only those that differ, so that a focused link stays focused and an
+ * opened list open: after a lost connection all are sent.
+ */
+function fill(row, changed) {
+  const known = cells.get(row) ?? [];
+  cells.set(row, known);
+  for (const [column, html] of Object.entries(changed)) {
+    const cell = parsed(html);
+    const text = cell.outerHTML;
+    if (known[column] === text)
+      continue;
+    known[column] = text;
+    const old = row.children[column];
     showTimes(cell);
     if (old)
       old.replaceWith(cell);
     else
       row.append(cell);
-  });
+  }
 }
 
 function changeTable(body, { order, rows }) {

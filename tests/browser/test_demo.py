@@ -54,6 +54,7 @@ class TheDemo(BrowserTest):
 
         # What the one that was killed has left goes with the next.
         self.fleet.server_sh("restart", "demo")
+        self.assertNotEqual(self.fleet.leftovers(), [], "what runs is seen")
         self.fleet.server_sh("stop", "demo")
         self.assertEqual(self.fleet.leftovers(), [])
 
