@@ -156,6 +156,8 @@ async fn answer(listener: tokio::net::TcpListener, number: u16) {
 async fn compare(name: &str, server: &Server, time: Duration) {
     let alone = used(server, time).await;
     let pages: Vec<Listener> = (0..PAGES).map(|_| Listener::open(server.port)).collect();
+    // Each is sent everything first.
+    actix_rt::time::sleep(Duration::from_secs(5)).await;
     let with_pages = used(server, time).await;
     let heard: Vec<Received> = pages.into_iter().map(Listener::heard).collect();
     let events: usize = heard.iter().map(|one| one.events).sum();
