@@ -1,4 +1,5 @@
-//! What pages cost: rendering the session server's monitor with 1,000 simulation servers, and a hundred open pages.
+//! What pages cost: rendering the session server's monitor with 1,000 simulation servers, and a hundred open pages of
+//! either server, at the demo's size and with 1,000 simulation servers.
 //!
 //! `cargo bench --bench pages [-- --seconds N]`
 
@@ -21,21 +22,28 @@ use std::io::{Read, Write};
 use std::net::TcpStream;
 use std::time::{Duration, Instant, SystemTime};
 
-use support::git::Forge;
+use nix::sys::resource::{Resource, getrlimit, setrlimit};
+use support::client::{Client, Heard};
+use support::git::{Forge, world};
 use support::program::{Server, session_server, simulation_server};
 use support::webots::Webots;
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use webots_fleet::session::fleet_status::{FleetStatus, ServerStatus, State, StateChange};
 use webots_fleet::session::pages;
 
 const SERVERS: u16 = 1000;
 const PAGES: usize = 100;
+/// How many simulations run on the simulation server whose pages are open.
+const SIMULATIONS: u16 = 4;
 
 fn main() {
     let arguments: Vec<String> = std::env::args().collect();
     let seconds =
         arguments.iter().position(|one| one == "--seconds").map_or(20, |at| arguments[at + 1].parse().unwrap());
     rendering();
-    actix_rt::System::new().block_on(open_pages(Duration::from_secs(seconds)));
+    let time = Duration::from_secs(seconds);
+    actix_rt::System::new().block_on(open_pages(time));
+    actix_rt::System::new().block_on(open_pages_of_a_large_fleet(time));
 }
 
 fn rendering() {
@@ -86,25 +94,80 @@ fn fleet() -> FleetStatus {
     FleetStatus { available: true, mean_load: Some(42.5), servers: servers.collect(), changes }
 }
 
+/// The demo's size: three simulation servers, one of which runs simulations that somebody watches.
 async fn open_pages(time: Duration) {
-    let (forge, webots) = (Forge::new(), Webots::script("exit 0"));
+    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
     let mut fleet = Vec::new();
     for _ in 0..3 {
-        fleet.push(simulation_server(&webots.path(), forge.path(), 4).start().await);
+        fleet.push(simulation_server(&webots.path(), forge.path(), SIMULATIONS).start().await);
     }
     let addresses: Vec<String> = fleet.iter().map(Server::address).collect();
     let session = session_server(&addresses).set("loadRefresh", 1).start().await;
-    for (name, server) in [("session", &session), ("simulation", &fleet[0])] {
-        let alone = used(server, time).await;
-        let pages: Vec<Listener> = (0..PAGES).map(|_| Listener::open(server.port)).collect();
-        let with_pages = used(server, time).await;
-        let events: usize = pages.into_iter().map(Listener::events).sum();
-        println!(
-            "{name} server: {alone:.2} % of a core without pages, {with_pages:.2} % with {PAGES}: {:.2} % more, {} events each",
-            with_pages - alone,
-            events / PAGES
-        );
+    let mut clients = Vec::new();
+    for _ in 0..SIMULATIONS {
+        let mut client = Client::start(&fleet[0], &world("lab/arm", "main", "worlds/a.wbt")).await;
+        let simulator = client.until("webots:").await.replace("webots:", "").replace("localhost", "127.0.0.1");
+        let mut viewer = Client::connect(&format!("{simulator}/")).await;
+        viewer.send("x3d").await;
+        viewer.until("scene load completed").await;
+        viewer.send("real-time:-1").await;
+        actix_rt::spawn(async move { while let Heard::Text(_) = viewer.next().await {} });
+        clients.push(client);
     }
+    compare("session server", &session, time).await;
+    compare("simulation server", &fleet[0], time).await;
+}
+
+/// A session server with many simulation servers, all of whose loads change all the time.
+async fn open_pages_of_a_large_fleet(time: Duration) {
+    let (_, most) = getrlimit(Resource::RLIMIT_NOFILE).unwrap();
+    setrlimit(Resource::RLIMIT_NOFILE, most, most).unwrap();
+    let mut addresses = Vec::new();
+    for number in 0..SERVERS {
+        let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
+        addresses.push(listener.local_addr().unwrap().to_string());
+        actix_rt::spawn(answer(listener, number));
+    }
+    let session = session_server(&addresses).set("loadRefresh", 1).start().await;
+    compare(&format!("session server with {SERVERS} servers"), &session, time).await;
+}
+
+/// A stand-in for a simulation server, which tells another load each time.
+async fn answer(listener: tokio::net::TcpListener, number: u16) {
+    let (mut stream, _) = listener.accept().await.unwrap();
+    let mut request = [0; 2048];
+    // A request is small enough to come in one piece.
+    for turn in 0.. {
+        if stream.read(&mut request).await.unwrap_or_default() == 0 {
+            return;
+        }
+        let load = (u32::from(number) + turn * 7) % 90;
+        let body = format!(
+            r#"{{"load":{load},"version":"1","instances":{{"queued":0,"starting":1,"idle":2,"running":3,"places":10,"arrivals":6}},"docker":false,"allowedRepositories":["https://github.com/lab"]}}"#
+        );
+        let answer = format!("HTTP/1.1 200 OK\r\nContent-Length: {}\r\n\r\n{body}", body.len());
+        if stream.write_all(answer.as_bytes()).await.is_err() {
+            return;
+        }
+    }
+}
+
+/// What a server takes without and with open pages.
+async fn compare(name: &str, server: &Server, time: Duration) {
+    let alone = used(server, time).await;
+    let pages: Vec<Listener> = (0..PAGES).map(|_| Listener::open(server.port)).collect();
+    // Each is sent everything first.
+    actix_rt::time::sleep(Duration::from_secs(5)).await;
+    let with_pages = used(server, time).await;
+    let heard: Vec<Received> = pages.into_iter().map(Listener::heard).collect();
+    let events: usize = heard.iter().map(|one| one.events).sum();
+    let bytes: usize = heard.iter().map(|one| one.bytes).sum();
+    println!(
+        "{name}: {alone:.2} % of a core without pages, {with_pages:.2} % with {PAGES}: {:.2} % more, {} events and {} KiB each",
+        with_pages - alone,
+        events / PAGES,
+        bytes / PAGES / 1024
+    );
 }
 
 /// The CPU that a server takes in a time, in percent of one core.
@@ -121,7 +184,14 @@ async fn used(server: &Server, time: Duration) -> f64 {
 /// A page that listens: a thread reads all that comes.
 struct Listener {
     socket: TcpStream,
-    reader: std::thread::JoinHandle<usize>,
+    reader: std::thread::JoinHandle<Received>,
+}
+
+/// What came to a page.
+#[derive(Default)]
+struct Received {
+    events: usize,
+    bytes: usize,
 }
 
 impl Listener {
@@ -130,16 +200,18 @@ impl Listener {
         write!(socket, "GET /events HTTP/1.1\r\nHost: localhost\r\n\r\n").unwrap();
         let mut stream = socket.try_clone().unwrap();
         let reader = std::thread::spawn(move || {
-            let (mut events, mut buffer) = (0, [0; 16 * 1024]);
+            let (mut received, mut buffer) = (Received::default(), [0; 64 * 1024]);
             while let Ok(count @ 1..) = stream.read(&mut buffer) {
-                events += buffer[..count].windows(6).filter(|window| window == b"data: ").count();
+                received.bytes += count;
+                // An event is one chunk: where it ends, a reading ends, if not just then the next one comes.
+                received.events += usize::from(buffer[..count].ends_with(b"\n\n\r\n"));
             }
-            events
+            received
         });
         Self { socket, reader }
     }
 
-    fn events(self) -> usize {
+    fn heard(self) -> Received {
         self.socket.shutdown(std::net::Shutdown::Both).unwrap();
         self.reader.join().unwrap()
     }

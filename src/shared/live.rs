@@ -19,6 +19,11 @@ use super::shutdown::{Phase, closing};
 
 /// Between two renderings.
 const PERIOD: Duration = Duration::from_secs(1);
+/// An event costs a pause of one more period for each so many bytes of it: a hundred pages of a large fleet must not
+/// keep its server busy.
+const LARGE: usize = 32 * 1024;
+/// The longest pause, in periods.
+const LONGEST: usize = 5;
 /// After so many renderings without a change a sign of life is sent.
 const QUIET: u32 = 15;
 /// How many pages may listen.
@@ -42,7 +47,7 @@ pub struct View {
 pub struct Row {
     /// What tells it from the others.
     pub key: String,
-    /// Its cells.
+    /// Its cells, each beginning on a line of its own.
     pub html: String,
 }
 
@@ -65,8 +70,8 @@ struct Table<'view> {
     /// The keys of all rows in their order, where that has changed.
     #[serde(skip_serializing_if = "Option::is_none")]
     order: Option<Vec<&'view str>>,
-    /// The rows that have changed.
-    rows: BTreeMap<&'view str, &'view str>,
+    /// The cells that have changed, by the keys of their rows and their columns.
+    rows: BTreeMap<&'view str, BTreeMap<usize, &'view str>>,
 }
 
 /// The pages of a server that listen.
@@ -127,10 +132,8 @@ impl Live {
         F: Future<Output = Option<View>>,
     {
         loop {
-            if let Some(view) = render().await {
-                self.publish(view);
-            }
-            actix_rt::time::sleep(PERIOD).await;
+            let periods = render().await.map_or(1, |view| self.publish(view));
+            actix_rt::time::sleep(PERIOD * periods).await;
             let mut state = self.lock();
             if self.events.receiver_count() == 0 {
                 *state = State::default();
@@ -139,9 +142,12 @@ impl Live {
         }
     }
 
-    fn publish(&self, view: View) {
+    /// Sends what has changed; gives back how many periods to wait until the next time.
+    fn publish(&self, view: View) -> u32 {
         let mut state = self.lock();
         let event = difference(state.view.as_ref(), &view);
+        // The first one is the whole page, and nobody waits for the second because of it.
+        let size = event.as_ref().filter(|_| state.view.is_some()).map_or(0, Bytes::len);
         state.quiet = if event.is_some() { 0 } else { state.quiet + 1 };
         let quiet = state.quiet.is_multiple_of(QUIET).then(|| Bytes::from_static(b": nothing new\n\n"));
         state.view = Some(view);
@@ -149,6 +155,7 @@ impl Live {
             // Nobody may be there to hear it.
             self.events.send(event).ok();
         }
+        u32::try_from((1 + size / LARGE).min(LONGEST)).unwrap_or(1)
     }
 
     fn lock(&self) -> MutexGuard<'_, State> {
@@ -224,12 +231,30 @@ impl<'view> Table<'view> {
             before.into_iter().flatten().map(|row| (row.key.as_str(), row.html.as_str())).collect();
         let same_order =
             before.is_some_and(|before| before.iter().map(|row| &row.key).eq(after.iter().map(|row| &row.key)));
-        let changed = after.iter().filter(|row| known.get(row.key.as_str()) != Some(&row.html.as_str()));
-        Self {
-            order: (!same_order).then(|| keys(after)),
-            rows: changed.map(|row| (row.key.as_str(), row.html.as_str())).collect(),
-        }
+        let changed = after.iter().filter_map(|row| {
+            let old = known.get(row.key.as_str()).copied();
+            (old != Some(row.html.as_str())).then(|| (row.key.as_str(), changed_cells(old, &row.html)))
+        });
+        Self { order: (!same_order).then(|| keys(after)), rows: changed.collect() }
     }
+}
+
+/// The cells of a row that differ from those before, all where there were none.
+fn changed_cells<'view>(before: Option<&str>, after: &'view str) -> BTreeMap<usize, &'view str> {
+    let mut old = before.map(cells).into_iter().flatten();
+    cells(after).enumerate().filter(|(_, cell)| old.next() != Some(*cell)).collect()
+}
+
+/// The cells of a row. What stands in them is escaped: only a cell of its own can begin like one.
+fn cells(html: &str) -> impl Iterator<Item = &str> {
+    let mut rest = Some(html);
+    std::iter::from_fn(move || {
+        let html = rest?;
+        let (cell, more) =
+            html.find("\n<t").map_or((html, None), |end| (html.get(..end).unwrap_or_default(), html.get(end + 1..)));
+        rest = more;
+        Some(cell)
+    })
 }
 
 #[cfg(test)]
@@ -259,12 +284,34 @@ mod tests {
         );
         assert_eq!(
             event(&before, &view("one", &[("a", "1"), ("b", "3")])),
-            "data: {\"tables\":{\"servers\":{\"rows\":{\"b\":\"3\"}}}}\n\n"
+            "data: {\"tables\":{\"servers\":{\"rows\":{\"b\":{\"0\":\"3\"}}}}}\n\n"
         );
         assert_eq!(
             event(&before, &view("one", &[("b", "2")])),
             "data: {\"tables\":{\"servers\":{\"order\":[\"b\"],\"rows\":{}}}}\n\n"
         );
+    }
+
+    #[test]
+    fn of_a_row_only_the_cells_that_have_changed_are_sent() {
+        let columns = |load: &str| format!("<th>a</th>\n<td>{load}</td>\n<td>two\nlines</td>");
+        let before = view("one", &[("a", &columns("1"))]);
+        assert_eq!(
+            event(&before, &view("one", &[("a", &columns("2"))])),
+            "data: {\"tables\":{\"servers\":{\"rows\":{\"a\":{\"1\":\"<td>2</td>\"}}}}}\n\n"
+        );
+        let all: Vec<String> = cells(&columns("3")).map(str::to_owned).collect();
+        assert_eq!(all, ["<th>a</th>", "<td>3</td>", "<td>two\nlines</td>"]);
+    }
+
+    #[test]
+    fn after_a_large_event_the_pause_is_longer() {
+        let live = Live::new();
+        let large = |letter: &str| view(&letter.repeat(LARGE), &[]);
+        for (view, pause) in [(large("a"), 1), (large("a"), 1), (large("b"), 2), (view("small", &[]), 1)] {
+            assert_eq!(live.publish(view), pause);
+        }
+        assert_eq!(live.publish(view(&"c".repeat(100 * LARGE), &[])), 5);
     }
 
     #[actix_rt::test]

@@ -114,7 +114,8 @@ impl Policy {
 }
 
 /// The sources from which a fleet is reached: its hosts, with any port where ports are not rewritten, since each
-/// simulation has a port of its own.
+/// simulation has a port of its own. Any host, where one of them can't be named in a policy: it knows letters of ASCII
+/// and no IPv6 addresses (CSP Level 3, section 2.3.1).
 #[must_use]
 pub fn fleet_sources<'address>(addresses: impl Iterator<Item = &'address PublicAddress>, ssl: bool) -> Vec<String> {
     let (http, websocket) = if ssl { ("https", "wss") } else { ("http", "ws") };
@@ -123,7 +124,8 @@ pub fn fleet_sources<'address>(addresses: impl Iterator<Item = &'address PublicA
         .collect();
     hosts.sort_unstable();
     hosts.dedup();
-    if hosts.len() > MOST_HOSTS {
+    let can_be_named = |host: &String| host.chars().all(|one| one.is_ascii_alphanumeric() || ".:*-".contains(one));
+    if hosts.len() > MOST_HOSTS || !hosts.iter().all(can_be_named) {
         return vec![format!("{http}:"), format!("{websocket}:")];
     }
     hosts.iter().flat_map(|host| [format!("{http}://{host}"), format!("{websocket}://{host}")]).collect()
@@ -173,6 +175,10 @@ mod tests {
         let sources = |texts: &[&str], ssl| fleet_sources(addresses(texts).iter(), ssl);
         assert_eq!(sources(&["a:1", "a:2"], false), ["http://a:*", "ws://a:*"]);
         assert_eq!(sources(&["b/2000", "a/2000"], true), ["https://a", "wss://a", "https://b", "wss://b"]);
+        assert_eq!(sources(&["b:8443/2000"], true), ["https://b:8443", "wss://b:8443"]);
+        for host in ["[::1]:2000", "b\u{fc}ro.example:2000"] {
+            assert_eq!(sources(&["a:1", host], false), ["http:", "ws:"], "{host} can't be named");
+        }
         let many: Vec<String> = (0..50).map(|number| format!("h{number}:1")).collect();
         let many: Vec<&str> = many.iter().map(String::as_str).collect();
         assert_eq!(sources(&many, true), ["https:", "wss:"], "too long to be named one by one");

@@ -29,7 +29,7 @@ function roundUp(number) {
 export class Chart {
   #group;
   #hidden;
-  #root = svg('svg', { tabindex: 0, role: 'img', preserveAspectRatio: 'none' });
+  #root = svg('svg', { tabindex: 0, role: 'slider', 'aria-valuemin': -SPAN, 'aria-valuemax': 0, 'aria-valuenow': 0, preserveAspectRatio: 'none' });
   #axes = svg('g', { class: 'axes' });
   #lines = svg('g', { class: 'lines' });
   #cross = svg('line', { class: 'cross', visibility: 'hidden' });
@@ -60,11 +60,12 @@ export class Chart {
     this.#root.append(this.#axes, this.#lines, this.#cross);
     const unit = group.unit ? ` (${group.unit})` : '';
     const title = html('h3', {}, group.title, html('span', { textContent: unit }));
-    this.#root.setAttribute('aria-label', `${group.title}${unit} over the last ten minutes; the arrow keys read values`);
+    this.#root.setAttribute('aria-label', `${group.title}${unit} over the last ten minutes`);
     const head = html('figcaption', {}, title, this.#moment);
     root.append(html('figure', {}, head, html('div', { className: 'plot' }, this.#root), legend));
     this.#root.addEventListener('pointermove', (event) => pointed(this.#timeAt(event)));
     this.#root.addEventListener('pointerleave', () => pointed());
+    this.#root.addEventListener('focus', () => this.#tell());
     this.#root.addEventListener('blur', () => pointed());
     this.#root.addEventListener('keydown', (event) => this.#key(event, pointed));
     new ResizeObserver(() => this.draw(this.#samples)).observe(this.#root);
@@ -90,12 +91,22 @@ export class Chart {
   }
 
   #key(event, pointed) {
-    const steps = { ArrowLeft: -5, ArrowRight: 5, Home: -SPAN, End: SPAN };
-    if (!steps[event.key])
+    const steps = { ArrowLeft: -5, ArrowDown: -5, PageDown: -60, Home: -SPAN, ArrowRight: 5, ArrowUp: 5, PageUp: 60, End: SPAN };
+    const step = steps[event.key];
+    if (!step && event.key !== 'Escape')
       return;
     event.preventDefault();
     const first = this.#samples[0]?.[0] ?? 0;
-    pointed(Math.max(first, Math.min(this.#end, (this.#pointed ?? this.#end) + steps[event.key])));
+    const time = Math.max(first, (this.#pointed ?? this.#end) + step);
+    pointed(step && time < this.#end ? time : undefined);
+    this.#tell();
+  }
+
+  /** Puts the values into words, which a screen reader reads out; not with each second, which nobody could listen to. */
+  #tell() {
+    const values = this.#group.series.map(([name], index) => `${name} ${this.#values[index].textContent}`);
+    this.#root.setAttribute('aria-valuenow', Math.round((this.#pointed ?? this.#end) - this.#end));
+    this.#root.setAttribute('aria-valuetext', `${this.#moment.textContent}: ${values.join(', ')}`);
   }
 
   #top() {

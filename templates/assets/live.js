@@ -7,6 +7,8 @@ import { showTimes } from './times.js';
 const listeners = [];
 const lamp = document.getElementById('live');
 const cells = new WeakMap();
+/** Compares as people do: 2 comes before 10. */
+const alphabet = new Intl.Collator(undefined, { numeric: true });
 let source;
 
 /** Calls a function with the numbers of each event that has some; `fresh` tells that events may have been missed. */
@@ -19,29 +21,33 @@ function say(text, lost) {
   lamp.classList.toggle('lost', lost);
 }
 
-/** The rows of HTML cells; a template understands them outside of a table. */
+/** A cell of HTML; a template understands it outside of a table. */
 function parsed(html) {
   const template = document.createElement('template');
   template.innerHTML = `<table><tbody><tr>${html}</tr></tbody></table>`;
-  return template.content.querySelector('tr');
+  return template.content.querySelector('tr').firstElementChild;
 }
 
-/** Replaces only those cells that differ, so that a focused link stays focused and an opened list open. */
-function fill(row, html) {
-  const fresh = [...parsed(html).children];
-  const texts = fresh.map((cell) => cell.outerHTML);
-  const known = cells.get(row);
-  cells.set(row, texts);
-  fresh.forEach((cell, index) => {
-    if (known && known[index] === texts[index])
-      return;
-    const old = row.children[index];
+/**
+ * Takes a row's cells by their columns. Replaces only those that differ, so that a focused link stays focused and an
+ * opened list open: after a lost connection all are sent.
+ */
+function fill(row, changed) {
+  const known = cells.get(row) ?? [];
+  cells.set(row, known);
+  for (const [column, html] of Object.entries(changed)) {
+    const cell = parsed(html);
+    const text = cell.outerHTML;
+    if (known[column] === text)
+      continue;
+    known[column] = text;
+    const old = row.children[column];
     showTimes(cell);
     if (old)
       old.replaceWith(cell);
     else
       row.append(cell);
-  });
+  }
 }
 
 function changeTable(body, { order, rows }) {
@@ -86,7 +92,7 @@ function sort(body) {
     const sign = heads[column].getAttribute('aria-sort') === 'descending' ? -1 : 1;
     wanted.sort((one, other) => {
       const [a, b] = [cellValue(one, column, kind), cellValue(other, column, kind)];
-      const order = kind === 'number' ? a - b : a.localeCompare(b, undefined, { numeric: true });
+      const order = kind === 'number' ? a - b : alphabet.compare(a, b);
       return sign * order;
     });
   }

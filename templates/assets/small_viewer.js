@@ -152,6 +152,8 @@ export class SmallViewer extends EventTarget {
   }
 
   close() {
+    for (const button of [this.#parts.play, this.#parts.step, this.#parts.reset])
+      button.disabled = true;
     this.#watch.disconnect();
     this.#stream.close();
   }

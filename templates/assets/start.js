@@ -15,6 +15,8 @@ export function advice(text) {
     [/larger than|longer than/i, 'Try a smaller project, or ask the administrator for a higher limit.'],
     [/Webots is installed|no Webots at/, 'The administrator of this simulation server has to set where Webots is.'],
     [/time limit/i, 'Connect again for another simulation.'],
+    [/may not connect to/, 'Load this page again: the fleet may have grown. Else the key server of that simulation server has to name the host that the session server lists in simulationServers.'],
+    [/simulator could not be reached/, 'A firewall may be in the way: the ports above the simulation server’s own have to be open, or forwarded.'],
     [/places .* are taken/i, 'Connect again in a few minutes.'],
   ];
   const found = table.find(([pattern]) => pattern.test(text));

@@ -74,7 +74,8 @@ function clearSteps() {
 function failed(text) {
   const current = document.querySelector('.steps .doing, .steps li:not(.done)') ?? document.querySelector('[data-step="simulation"]');
   step({ step: current.dataset.step, state: 'failed' });
-  find('problem-text').textContent = text;
+  // A sentence; but what begins with an address is left as it is.
+  find('problem-text').textContent = text.replace(/^[a-z]+ /, (word) => word[0].toUpperCase() + word.slice(1));
   find('problem-advice').textContent = advice(text);
   find('problem').hidden = false;
   leave();
@@ -86,6 +87,7 @@ function start(event) {
   event.preventDefault();
   leave();
   clearSteps();
+  clearStage('The simulation appears here.');
   find('problem').hidden = true;
   wanted = find('url').value.trim();
   busy(true);
@@ -160,11 +162,23 @@ function showSmall(address) {
     return;
   }
   const shown = viewer;
+  let seen = false;
   viewer.addEventListener('loading', ({ detail }) => step({ step: 'simulation', state: 'doing', text: detail }));
-  viewer.addEventListener('ready', ({ detail }) => step({ step: 'simulation', state: 'done', text: detail || 'is shown' }));
+  viewer.addEventListener('ready', ({ detail }) => {
+    seen = true;
+    step({ step: 'simulation', state: 'done', text: detail || 'is shown' });
+    // On a phone the scene would lie below the steps.
+    find('stage').scrollIntoView({ block: 'nearest' });
+  });
   viewer.addEventListener('lost', ({ detail }) => {
-    if (viewer === shown && simulation)
-      step({ step: 'simulation', state: 'failed', text: detail ?? 'the simulator has closed its connection' });
+    if (viewer !== shown || !simulation)
+      return;
+    if (detail)
+      failed(`The scene can’t be shown: ${detail}.`);
+    else if (seen)
+      step({ step: 'simulation', state: 'failed', text: 'the simulator has closed its connection' });
+    else
+      failed(`The simulator could not be reached at ${address}.`);
   });
 }
 
@@ -196,16 +210,27 @@ function leave() {
   busy(false);
 }
 
+function clearStage(text) {
+  find('stage').replaceChildren(Object.assign(document.createElement('p'), { className: 'none empty', textContent: text }));
+}
+
 function disconnect() {
   leave();
   clearSteps();
-  const empty = Object.assign(document.createElement('p'), { className: 'none empty', textContent: 'You have left the simulation; it has ended.' });
-  find('stage').replaceChildren(empty);
-  find('spoken').textContent = empty.textContent;
+  const text = 'You have left the simulation; it has ended.';
+  clearStage(text);
+  find('spoken').textContent = text;
   find('connect').focus();
 }
 
+/** The page may reach the fleet alone; a server that calls itself otherwise than the fleet does is a stranger. */
+function forbidden({ effectiveDirective, blockedURI }) {
+  if (simulation && effectiveDirective === 'connect-src')
+    failed(`This page may not connect to ${blockedURI}: no simulation server of the fleet is known by that name.`);
+}
+
 form.addEventListener('submit', start);
+document.addEventListener('securitypolicyviolation', forbidden);
 find('disconnect').addEventListener('click', disconnect);
 for (const example of form.querySelectorAll('[data-url]')) {
   example.addEventListener('click', () => {

@@ -11,16 +11,28 @@ from fleet import SOON, Fleet
 expect.set_options(timeout=1000 * SOON)
 
 
+def picture(page):
+    """The scene as it is drawn."""
+    return page.tab.locator("#view").screenshot()
+
+
 class BrowserTest(unittest.TestCase):
     """A class of tests with a fleet of its own."""
 
     session = None
     simulation = None
+    strangers = ()
+    # The only one that pages may ask.
+    host = "127.0.0.1"
 
     @classmethod
     def setUpClass(cls):
-        cls.fleet = cls.enterClassContext(Fleet(cls.session, cls.simulation))
+        cls.fleet = cls.enterClassContext(cls.make_fleet())
         cls.browser = cls.enterClassContext(Browser())
+
+    @classmethod
+    def make_fleet(cls):
+        return Fleet(cls.session, cls.simulation, cls.strangers)
 
     def run(self, result=None):
         before = len(result.failures) + len(result.errors)
@@ -39,7 +51,7 @@ class BrowserTest(unittest.TestCase):
 
     def keeps_to_the_rules(self, page):
         self.assertEqual(page.complaints, [], "the console")
-        self.assertEqual(page.hosts(), {"127.0.0.1"}, "who was asked")
+        self.assertEqual(page.hosts(), {self.host}, "who was asked")
 
     def start_world(self, name="Playground", **options):
         """The viewer page with a running simulation, and the simulation server that was chosen."""

@@ -55,19 +55,28 @@ class Server:
     def __init__(self, program, folder, config):
         self.program, self.folder, self.port = program, folder, config["port"]
         folder.mkdir(parents=True, exist_ok=True)
+        self.file = folder / "config.json"
         self.config = {
             "server": "127.0.0.1", "bind": "127.0.0.1", "ssl": False, "portRewrite": False, "debug": True,
             "logDir": str(folder / "log"), **config,
         }
-        file = folder / "config.json"
-        file.write_text(json.dumps(self.config, indent=2))
+        self.write()
         self.log = folder / "output.txt"
         environment = {**os.environ, "DEMO_SIMULATOR_BIND": "127.0.0.1"}
         environment.pop("WEBOTS_HOME", None)
         with self.log.open("a") as log:
             self.process = subprocess.Popen(
-                [BIN / program, file], stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=environment)
+                [BIN / program, self.file], stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=environment)
         until(f"{program} answers", self.answers)
+
+    def write(self):
+        self.file.write_text(json.dumps(self.config, indent=2))
+
+    def reload(self, **changes):
+        """Makes it take other values of its keys."""
+        self.config.update(changes)
+        self.write()
+        self.process.send_signal(signal.SIGHUP)
 
     def answers(self):
         if self.process.poll() is not None:
@@ -108,7 +117,8 @@ class Server:
 class Fleet:
     """The whole: use it with `with`."""
 
-    def __init__(self, session=None, simulation=None):
+    def __init__(self, session=None, simulation=None, strangers=()):
+        """Starts it; the arguments are further keys of the configurations, and addresses that don't answer."""
         self.folder = pathlib.Path(tempfile.mkdtemp(prefix="fleet-browser-"))
         self.servers = []
         try:
@@ -117,9 +127,9 @@ class Fleet:
             self.simulation = self._simulation("one", {"title": "Demonstration", "description": (
                 "A simulation server that shows two small worlds."), **simulation})
             self.other = self._simulation("two", {"title": "The other one", **simulation})
-            self.session = self._start("session-server", "session", {
+            self.session = self.start("session-server", "session", {
                 "port": free_ports(1),
-                "simulationServers": [self.simulation.address, self.other.address],
+                "simulationServers": [self.simulation.address, self.other.address, *strangers],
                 # Whatever else keeps this machine busy is no concern of the tests.
                 "loadRefresh": 0.2, "loadThreshold": 1000,
                 "examples": [
@@ -153,7 +163,7 @@ class Fleet:
 
     def _simulation(self, name, more):
         places = 4
-        return self._start("simulation-server", name, {
+        return self.start("simulation-server", name, {
             "port": free_ports(places + 12), "maxConnections": places, "webots": str(BIN / "demo-simulator"),
             "cacheDir": str(self.folder / name / "cache"),
             "allowedRepositories": ["https://github.com/demo"],
@@ -161,7 +171,8 @@ class Fleet:
             **more,
         })
 
-    def _start(self, program, name, config):
+    def start(self, program, name, config):
+        """Starts a server that ends with the fleet."""
         server = Server(program, self.folder / name, config)
         self.servers.append(server)
         return server

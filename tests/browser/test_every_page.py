@@ -6,7 +6,7 @@ import urllib.request
 from playwright.sync_api import expect
 
 from case import BrowserTest
-from fleet import SOON
+from fleet import SOON, free_ports, until
 
 
 class EveryPage(BrowserTest):
@@ -60,6 +60,39 @@ class EveryPage(BrowserTest):
             reached.append(page.tab.evaluate("document.activeElement.id || document.activeElement.textContent.trim()"))
         for wanted in ["Skip to the content", "Monitor", "url", "kind", "connect", "Playground", "Carousel"]:
             self.assertIn(wanted, reached)
+
+
+LONG = "a-simulation-server-{}.with-a-long-name.department-of-robotics.faculty-of-engineering.university.invalid:2000"
+
+
+class Crowded(BrowserTest):
+    strangers = [LONG.format(number) for number in range(40)]
+
+    def test_many_servers_with_long_names_and_long_reasons_leave_the_page_in_order(self):
+        for scheme, width in [("light", 1280), ("dark", 1160), ("light", 1000), ("dark", 360)]:
+            with self.subTest(scheme=scheme, width=width):
+                page = self.open(self.fleet.session.url("monitor"), scheme=scheme, width=width)
+                expect(page.tab.locator("#servers .state.down")).to_have_count(40)
+                self.assertEqual(page.faults(), [])
+                self.assertLessEqual(page.overflow(), 0, "pixels too wide")
+                since = page.tab.locator("#servers tr").last.locator("td").last
+                box = since.bounding_box()
+                self.assertLessEqual(box["x"] + box["width"], width, "the last column is out of sight")
+                changes = page.tab.get_by_role("list", name="Last changes")
+                changes.focus()
+                page.tab.keyboard.press("End")
+                until("the list is scrolled", lambda: changes.evaluate("list => list.scrollTop") > 0)
+
+    def test_a_fleet_of_no_servers_says_so_until_there_is_one(self):
+        empty = self.fleet.start("session-server", "empty", {"port": free_ports(1), "simulationServers": []})
+        page = self.open(empty.url("monitor"))
+        words = page.tab.get_by_text("The configuration lists none")
+        expect(page.tab.locator("#live")).to_have_text("Live")
+        expect(words).to_be_visible()
+        self.assertEqual(page.faults(), [])
+        empty.reload(simulationServers=[self.fleet.simulation.address])
+        expect(page.tab.locator("#servers .state")).to_have_text("up")
+        expect(words).to_be_hidden()
 
 
 if __name__ == "__main__":

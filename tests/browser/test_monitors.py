@@ -1,6 +1,7 @@
 """The monitor pages: they stay true without reloading."""
 
 import base64
+import re
 import unittest
 import urllib.error
 import urllib.request
@@ -11,7 +12,14 @@ from case import BrowserTest
 from fleet import SOON, Server
 
 
+COLUMNS = [
+    "Address", "State", "Load", "Effective load", "Instances", "Repositories", "Version", "Latency", "Since",
+]
+
+
 class Monitors(BrowserTest):
+    simulation = {"blockedRepositories": ["https://github.com/demo/blocked"]}
+
     def test_a_server_that_is_killed_turns_red_without_a_reload(self):
         page = self.open(self.fleet.session.url("monitor"))
         expect(page.tab.locator("#live")).to_have_text("Live")
@@ -44,6 +52,55 @@ class Monitors(BrowserTest):
         head.get_by_role("button").press("Enter")
         expect(head).to_have_attribute("aria-sort", "descending")
         expect(first).to_have_text(texts[1])
+        for name in COLUMNS:
+            head = page.tab.get_by_role("columnheader", name=name, exact=True)
+            head.get_by_role("button").press("Space")
+            expect(head).to_have_attribute("aria-sort", "ascending")
+            expect(page.tab.locator("th[aria-sort]")).to_have_count(1)
+
+    def test_the_fleet_is_seen_at_one_glance(self):
+        page = self.open(self.fleet.session.url("monitor"))
+        version = self.fleet.simulation.status()["version"]
+        glance = page.tab.locator("#glance")
+        for words in ["Available", "of 8 places", "2 of 2 answer", "Web clients", "Mean load"]:
+            expect(glance).to_contain_text(words)
+        self.assertEqual(page.tab.locator("#servers-title + table thead th").all_inner_texts(), COLUMNS)
+        row = page.tab.locator(f'#servers tr[data-key="{self.fleet.other.address}"]')
+        for words in ["up", "%", "run", "idle", "wait", "of 4 places", "github.com/demo", version, "ms"]:
+            expect(row).to_contain_text(words)
+        expect(row.locator("td[data-label=Load] svg.bar")).to_be_visible()
+        expect(page.tab.locator("footer")).to_contain_text(f"Version {version}, started ")
+        row.get_by_role("link", name=self.fleet.other.address).click()
+        expect(page.tab.get_by_role("heading", name="The other one")).to_be_visible()
+
+    def test_a_machine_tells_what_it_is_and_whose_worlds_it_takes(self):
+        page = self.open(self.fleet.simulation.url("monitor"))
+        expect(page.tab.get_by_role("heading", name="Demonstration")).to_be_visible()
+        expect(page.tab.get_by_text("A simulation server that shows two small worlds.")).to_be_visible()
+        expect(page.tab.locator("#glance")).to_contain_text("made by")
+        facts = {one.locator("dt").inner_text(): one.locator("dd").inner_text() for one in page.tab.locator(".facts > div").all()}
+        host = self.fleet.simulation.status()["host"]
+        self.assertEqual(facts["Host"], host["name"])
+        self.assertEqual(facts["Operating system"], host["system"])
+        self.assertIn(f"{host['cores']} cores", facts["CPU"])
+        self.assertEqual(facts["Allowed repositories"], "https://github.com/demo")
+        self.assertEqual(facts["Blocked repositories"], "https://github.com/demo/blocked")
+        for name in ["Memory", "Swap", "GPU", "Share idle time"]:
+            self.assertTrue(facts[name], name)
+
+    def test_a_simulation_is_listed_with_all_that_is_known_of_it(self):
+        viewer, server = self.start_world()
+        page = self.open(server.url("monitor"))
+        row = page.tab.locator("#simulations tr")
+        cell = lambda name: row.locator(f'td[data-label="{name}"]')
+        expect(row.locator("th")).to_contain_text("playground.wbt")
+        expect(row.locator("th")).to_contain_text("github.com/demo/worlds")
+        for name, pattern in [
+            ("State", "idle"), ("Since", r"\d+:\d\d"), ("Time left", r"1 h 59 min"), ("CPU", r"\d+ %"),
+            ("Memory", r"\d+(\.\d)? MiB"), ("Port", str(server.status()["simulations"][0]["port"])),
+        ]:
+            expect(cell(name)).to_have_text(re.compile(pattern))
+        viewer.close()
 
     def test_charts_have_all_series_and_tell_values(self):
         page = self.open(self.fleet.simulation.url("monitor"))
@@ -59,7 +116,7 @@ class Monitors(BrowserTest):
         memory.uncheck()
         expect(line).to_have_attribute("points", "")
         memory.check()
-        chart = page.tab.locator("#charts figure svg[role=img]").first
+        chart = page.tab.locator("#charts figure svg[role=slider]").first
         box = chart.bounding_box()
         page.tab.mouse.move(box["x"] + box["width"] - 30, box["y"] + 80)
         moment = page.tab.locator(".moment").first
@@ -69,6 +126,10 @@ class Monitors(BrowserTest):
         expect(moment).to_have_text("now")
         chart.press("ArrowLeft")
         expect(moment).to_contain_text("at ")
+        # A screen reader reads this.
+        self.assertRegex(chart.get_attribute("aria-valuetext"), r"^at .*: CPU load \d+\.\d %, .*Disk \d+\.\d %$")
+        chart.press("Escape")
+        expect(moment).to_have_text("now")
 
     def test_the_output_of_a_simulation_is_shown_on_demand(self):
         viewer, server = self.start_world()

@@ -4,70 +4,29 @@ import unittest
 
 from playwright.sync_api import expect
 
-from case import BrowserTest
+from case import BrowserTest, picture
 from fleet import WORLD, until
 
 
-def clock(page):
-    """The simulation's time in milliseconds."""
-    minutes, seconds = page.tab.locator("#clock").inner_text().split(":")
-    return round(60_000 * int(minutes) + 1000 * float(seconds))
-
-
 class Viewing(BrowserTest):
-    def picture(self, page):
-        return page.tab.locator("#view").screenshot()
-
-    def test_a_world_is_started_and_moves_pauses_steps_and_resets(self):
-        page, server = self.start_world()
-        monitor = self.open(server.url("monitor"))
-        row = monitor.tab.locator("#simulations tr")
-        expect(row).to_contain_text("playground.wbt")
-        expect(row).to_contain_text("idle")
-        expect(page.tab.locator("#mode")).to_have_text("paused")
-        self.assertEqual(clock(page), 0)
-        first = self.picture(page)
-        self.assertGreater(len(first), 5000, "an empty picture is small")
-
-        page.tab.get_by_role("button", name="Play", exact=True).click()
-        until("half a second has passed", lambda: clock(page) > 500)
-        expect(row).to_contain_text("running")
-        page.tab.get_by_role("button", name="Pause", exact=True).click()
-        expect(page.tab.locator("#mode")).to_have_text("paused")
-        paused = clock(page)
-        self.assertNotEqual(self.picture(page), first, "nothing has moved")
-        expect(row).to_contain_text("idle")
-        self.assertEqual(clock(page), paused, "time stands still")
-
-        page.tab.get_by_role("button", name="Step", exact=True).click()
-        until("one step is made", lambda: clock(page) == paused + 16)
-        page.tab.get_by_role("button", name="Reset", exact=True).click()
-        until("time is zero", lambda: clock(page) == 0)
-        until("all is where it was", lambda: self.picture(page) == first)
-
-        self.assertEqual(len(server.status()["simulations"]), 1)
-        page.close()
-        expect(row).to_have_count(0)
-        expect(monitor.tab.get_by_text("Nobody is here.")).to_be_visible()
-
     def test_the_view_turns_by_keyboard_and_pointer(self):
         page, _ = self.start_world("Carousel")
         view = page.tab.locator("#view")
-        first = self.picture(page)
+        first = picture(page)
         for key in ["ArrowLeft", "ArrowUp", "+", "Shift+ArrowRight"]:
-            before = self.picture(page)
+            before = picture(page)
             view.press(key)
-            until(f"{key} changes the view", lambda: self.picture(page) != before)
-        before = self.picture(page)
+            until(f"{key} changes the view", lambda: picture(page) != before)
+        before = picture(page)
         box = view.bounding_box()
         page.tab.mouse.move(box["x"] + 200, box["y"] + 200)
         page.tab.mouse.down()
         page.tab.mouse.move(box["x"] + 300, box["y"] + 220)
         page.tab.mouse.up()
-        until("dragging changes the view", lambda: self.picture(page) != before)
+        until("dragging changes the view", lambda: picture(page) != before)
         # The focus ring is part of a picture: the button takes it away.
         page.tab.get_by_role("button", name="Home view").click()
-        until("the view is the first again", lambda: self.picture(page) == first)
+        until("the view is the first again", lambda: picture(page) == first)
 
     def test_disconnect_ends_the_simulation(self):
         page, server = self.start_world()
@@ -79,7 +38,7 @@ class Viewing(BrowserTest):
 
     def test_a_failure_is_told_in_words_with_what_to_do(self):
         table = [
-            ("https://github.com/stranger/worlds/blob/main/worlds/a.wbt", "no simulation server accepts", "monitor page"),
+            ("https://github.com/stranger/worlds/blob/main/worlds/a.wbt", "No simulation server accepts", "monitor page"),
             ("https://github.com/demo/worlds/blob/main/a.wbt", "worlds", "Copy the address"),
             (WORLD.format("missing"), "missing.wbt", "Look whether"),
             ("https://github.com/demo/nothing/blob/main/worlds/a.wbt", "nothing", "Look whether"),
@@ -95,9 +54,29 @@ class Viewing(BrowserTest):
                 expect(page.tab.locator(".steps .failed")).to_have_count(1)
                 expect(page.tab.get_by_role("button", name="Connect", exact=True)).to_be_enabled()
 
+    def test_on_a_phone_the_scene_comes_into_sight(self):
+        page, _ = self.start_world(width=360, height=740)
+        expect(page.tab.locator("#view")).to_be_in_viewport(ratio=0.9)
+
     def test_a_link_can_name_the_world(self):
         page = self.open(self.fleet.session.url(f"viewer?url={WORLD.format('carousel')}"))
         expect(page.tab.get_by_label("URL of a world")).to_have_value(WORLD.format("carousel"))
+
+
+class Stranger(BrowserTest):
+    # The fleet knows it as 127.0.0.1.
+    simulation = {"server": "localhost"}
+
+    def test_a_server_that_calls_itself_otherwise_is_told_of_in_words(self):
+        page = self.browser.page()
+        self.addCleanup(page.close)
+        page.tab.goto(self.fleet.session.url("viewer"))
+        expect(page.tab.locator("#light.on")).to_be_visible()
+        page.tab.get_by_role("button", name="Playground").click()
+        page.tab.get_by_role("button", name="Connect", exact=True).click()
+        expect(page.tab.locator("#problem-text")).to_contain_text("may not connect to ws://localhost:")
+        expect(page.tab.locator("#problem-advice")).to_contain_text("simulationServers")
+        expect(page.tab.locator("[data-step=simulation].failed")).to_be_visible()
 
 
 if __name__ == "__main__":

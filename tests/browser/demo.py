@@ -1,0 +1,112 @@
+"""The demo as a newcomer has it: `./server.sh start demo`, in a copy of the project with ports of its own."""
+
+import json
+import os
+import pathlib
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+
+from fleet import BIN, ROOT, free_ports
+
+# How long server.sh may take for anything.
+LIMIT = 90
+# How many simulation servers there can be, and how many ports each may take.
+MOST, EACH = 3, 24
+
+
+class Demo:
+    """The running demo: use it with `with`."""
+
+    def __init__(self, session=None, simulation=None):
+        """Starts it; the arguments are further keys of its configuration."""
+        self.temporary = pathlib.Path(tempfile.mkdtemp(prefix="fleet-demo-"))
+        self.folder = self.temporary / "webots-fleet"
+        self.folder.mkdir()
+        shutil.copy(ROOT / "server.sh", self.folder)
+        shutil.copytree(ROOT / "config", self.folder / "config")
+        # Where server.sh puts what it builds.
+        (self.folder / "target").mkdir()
+        (self.folder / "target/release").symlink_to(BIN)
+        # Each simulation server needs some ports after its own.
+        port = free_ports(1 + MOST * EACH)
+        self.ports = range(port, port + 1 + MOST * EACH)
+        self.servers = 1
+        self.session, self.simulation = f"localhost:{port}", f"localhost:{port + 1}"
+        # Whatever else keeps this machine busy is no concern of the tests.
+        self.configure("session", "demo", {
+            "port": port, "simulationServers": [self.simulation], "loadThreshold": 1000, **(session or {})})
+        self.configure("simulation", "demo", {"port": port + 1, **(simulation or {})})
+        try:
+            self.server_sh("start", "demo")
+        except BaseException:
+            self.close()
+            raise
+
+    def configure(self, kind, name, more):
+        """Makes a configuration out of the demo's."""
+        demo = json.loads((self.folder / f"config/{kind}/demo.json").read_text())
+        (self.folder / f"config/{kind}/{name}.json").write_text(json.dumps({**demo, **more}))
+
+    def add(self, name, title):
+        """Starts one more simulation server, as if on another machine."""
+        port = self.ports[1 + self.servers * EACH]
+        self.servers += 1
+        assert self.servers <= MOST, "there are no more ports"
+        self.configure("simulation", name, {"port": port, "title": title, "cacheDir": f"cache/{name}"})
+        addresses = [f"localhost:{self.ports[1 + number * EACH]}" for number in range(self.servers)]
+        self.configure("session", "demo", {"simulationServers": addresses})
+        self.server_sh("start", name)
+        os.kill(self.process("session"), signal.SIGHUP)
+
+    def server_sh(self, *arguments):
+        """Runs server.sh, which has to succeed; gives back what it prints."""
+        done = subprocess.run(
+            [self.folder / "server.sh", *arguments], env={**os.environ, "FLEET_BIN": str(BIN)}, timeout=LIMIT,
+            stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        if done.returncode != 0:
+            raise AssertionError(f"server.sh {arguments}: {done.returncode}\n{done.stdout}{done.stderr}{self.logs()}")
+        return done.stdout
+
+    def kill(self, kind):
+        """Ends a server without a warning, as a power failure would."""
+        os.kill(self.process(kind), signal.SIGKILL)
+
+    def process(self, kind):
+        return int((self.folder / f"log/demo.{kind}.pid").read_text())
+
+    def leftovers(self):
+        """What is left of it: processes, files that say that one runs, folders of simulations, ports."""
+        left = [str(path) for path in [*self.folder.glob("log/*.pid"), *self.folder.glob("cache/runs/*")]]
+        for process in pathlib.Path("/proc").glob("[0-9]*"):
+            try:
+                if (process / "cwd").resolve(strict=True).is_relative_to(self.folder):
+                    left.append(f"process {process.name} {(process / 'cmdline').read_text()}")
+            except OSError:
+                continue
+        for port in self.ports:
+            with socket.socket() as probe:
+                if probe.connect_ex(("127.0.0.1", port)) == 0:
+                    left.append(f"port {port}")
+        return left
+
+    def logs(self):
+        files = [path for path in sorted(self.folder.glob("log/**/*")) if path.is_file()]
+        return "\n".join(f"--- {path.name} ---\n{path.read_text()}" for path in files)
+
+    def close(self):
+        try:
+            self.server_sh("stop")
+        finally:
+            shutil.rmtree(self.temporary, ignore_errors=True)
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, kind, *_):
+        if kind is not None:
+            print(self.logs(), file=sys.stderr)
+        self.close()
