@@ -1,14 +1,14 @@
 //! Actor: watches one simulation server.
 //!
 //! Created by the registry for each address in `simulationServers`. Every [`Watch::refresh`] it asks the server for its
-//! state, with one request in flight at most, and tells the registry what came: it judges nothing itself. It asks again
-//! only when the registry has taken that in, so that no report is lost and none piles up. It ends when the registry says
-//! so; after a panic the registry makes a new one.
+//! state, with one request in flight at most, and tells the registry what came: it judges nothing itself. A report for which
+//! the registry has no room is lost: the next look makes another. It ends when the registry says so; after a panic the
+//! registry makes a new one.
 //!
 //! It asks for `/status`; a server that has no such page is asked for `/load`, as the original is. Nothing that comes is
 //! trusted: the whole exchange has one time limit, an answer has a largest size, and a load must be one.
 
-use std::sync::Arc;
+use std::sync::{Arc, LazyLock};
 use std::time::{Duration, Instant};
 
 use actix::prelude::*;
@@ -72,6 +72,10 @@ const LARGEST_ANSWER: usize = 1024 * 1024;
 const LARGEST_LOAD: f64 = 1000.0;
 /// Longer than any time limit of a look.
 const NEVER: Duration = Duration::from_hours(24);
+/// Monitors are woken together that are to look within so much time.
+const MOMENT: Duration = Duration::from_millis(10);
+/// From when moments are counted.
+static BEGIN: LazyLock<Instant> = LazyLock::new(Instant::now);
 /// For how long a server is taken to have no `/status`.
 const LOAD_ONLY: Duration = Duration::from_mins(1);
 
@@ -113,12 +117,14 @@ impl ServerMonitor {
         Self { server, watch, client, reports, asking: false, looks, load_only_until: None }
     }
 
-    /// Asks now, and then at regular times that are not those of the other monitors: were the whole fleet asked in the
-    /// same moment, the door would wait meanwhile.
+    /// Asks now, and then at regular times that are those of few other monitors: were the whole fleet asked in the same
+    /// moment, the door would wait meanwhile; were each asked in a moment of its own, the thread would be woken for each.
     fn begin(&mut self, ctx: &mut Context<Self>) {
         ctx.cancel_future(self.looks);
         self.ask(ctx);
-        let first = self.watch.refresh.mul_f64(rand::random());
+        let since = BEGIN.elapsed();
+        let first = (since + self.watch.refresh.mul_f64(rand::random())).div_duration_f64(MOMENT).ceil();
+        let first = MOMENT.mul_f64(first).saturating_sub(since);
         self.looks = ctx.run_later(first, |monitor, ctx| {
             monitor.ask(ctx);
             monitor.looks = ctx.run_interval(monitor.watch.refresh, Self::ask);
@@ -136,19 +142,19 @@ impl ServerMonitor {
             let answer = actix_rt::time::timeout(patience, exchange(&client, &url, load_only)).await;
             (answer.unwrap_or(Err(Unreachable::TimedOut(patience))), begun.elapsed())
         };
-        let told = exchange.into_actor(self).then(|(answer, latency), monitor, _| {
-            let answer = answer.map(|answer| monitor.understood(answer));
-            let report = Reported { server: monitor.server.clone(), latency, answer };
-            monitor.reports.send(report).into_actor(monitor)
-        });
-        told.map(|taken, monitor, ctx| {
-            monitor.asking = false;
-            // Without a registry there is nothing to do.
-            if taken.is_err() {
-                ctx.stop();
-            }
-        })
-        .spawn(ctx);
+        exchange
+            .into_actor(self)
+            .map(|(answer, latency), monitor, ctx| {
+                monitor.asking = false;
+                let answer = answer.map(|answer| monitor.understood(answer));
+                match monitor.reports.try_send(Reported { server: monitor.server.clone(), latency, answer }) {
+                    Ok(()) => {}
+                    Err(SendError::Full(_)) => log::warn!("{}: a report is lost, too many are waiting", monitor.server),
+                    // Without a registry there is nothing to do.
+                    Err(SendError::Closed(_)) => ctx.stop(),
+                }
+            })
+            .spawn(ctx);
     }
 
     fn understood(&mut self, answer: Answer) -> Dispatch {

@@ -226,7 +226,8 @@ impl Configuration for SimulationConfig {
             return Err(Unfit { key: "timing.silence", problem });
         }
         for address in &self.notify {
-            if url::Url::parse(address).is_err() {
+            let is_web = url::Url::parse(address).is_ok_and(|url| matches!(url.scheme(), "http" | "https"));
+            if !is_web {
                 let problem = format!("{address:?} is no URL; allowed are http and https URLs");
                 return Err(Unfit { key: "notify", problem });
             }

@@ -69,7 +69,9 @@ impl TryFrom<BTreeMap<String, String>> for Mirrors {
                 let replacement = shellexpand::full(&replacement)
                     .map_err(|error| format!("{replacement:?} names {}, which is not set", error.var_name))?
                     .into_owned();
-                if replacement.starts_with("file:") || replacement.starts_with("https://") {
+                let names_something =
+                    |begin: &str| replacement.strip_prefix(begin).is_some_and(|rest| !rest.is_empty());
+                if names_something("file:") || names_something("https://") {
                     Ok(Mirror { prefix, replacement })
                 } else {
                     Err(format!("{replacement:?} is no replacement; allowed are https://... and file:FOLDER"))

@@ -5,7 +5,8 @@
 //! or frees the port, so that it can't be forgotten in any state or by any panic.
 
 use std::collections::{BTreeMap, VecDeque};
-use std::net::{Ipv4Addr, TcpListener};
+use std::io::ErrorKind;
+use std::net::{Ipv4Addr, Ipv6Addr, TcpListener};
 use std::ops::RangeInclusive;
 use std::time::Duration;
 
@@ -140,10 +141,7 @@ impl Places {
     /// The lowest port that is neither lent nor used by anybody else.
     fn free_port(&self) -> Option<u16> {
         let taken = |port: u16| self.present.values().any(|one| one.lent == Some(port) || one.shown.port == Some(port));
-        self.ports
-            .clone()
-            .filter(|port| !taken(*port))
-            .find(|port| TcpListener::bind((Ipv4Addr::UNSPECIFIED, *port)).is_ok())
+        self.ports.clone().filter(|port| !taken(*port)).find(|port| is_free(*port))
     }
 
     fn instances(&self) -> Instances {
@@ -160,6 +158,13 @@ impl Places {
             arrivals: self.last,
         }
     }
+}
+
+/// Whether nobody listens on a port, by either version of IP; a machine may have but one of them.
+fn is_free(port: u16) -> bool {
+    let is_taken = |error: std::io::Error| error.kind() == ErrorKind::AddrInUse;
+    TcpListener::bind((Ipv4Addr::UNSPECIFIED, port)).is_ok()
+        && !TcpListener::bind((Ipv6Addr::UNSPECIFIED, port)).is_err_and(is_taken)
 }
 
 impl Actor for Places {
