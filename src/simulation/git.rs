@@ -154,7 +154,8 @@ impl Git {
     }
 
     fn plan(&self, call: Call<'_>) -> Plan {
-        let mut command: Vec<OsString> = vec!["git".into(), "--literal-pathspecs".into(), "--git-dir".into()];
+        // Whoever watches over the servers, and whoever runs a simulation already, comes before a checkout.
+        let mut command: Vec<OsString> = ["nice", "git", "--literal-pathspecs", "--git-dir"].map(OsString::from).into();
         command.push(call.repository.into());
         command.extend(call.arguments);
         let fixed: [(&str, &OsStr); 7] = [
