@@ -9,14 +9,15 @@
 //! - ends the rest of the tree when the program itself ends, removes the instance's folder when asked to, and passes
 //!   the program's exit code on (128 + N for signal N, as shells do).
 //!
-//! One more guardian, without a program, removes the folder of the run when the server was killed.
+//! One more guardian, without a program, ends processes that have lost both server and guardian, and removes the folder
+//! of the run.
 //!
 //! It is synchronous: three threads that wait, and nothing else.
 
 use std::collections::BTreeSet;
 use std::io::Read;
 use std::os::unix::process::CommandExt;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
 use std::time::{Duration, Instant};
@@ -69,9 +70,17 @@ pub fn guard(orders: &Orders) -> u8 {
     });
     if let Some(folder) = &orders.remove {
         // The server removes it too, if it still lives.
-        if orders.command.is_empty() { remove_patiently(folder) } else { remove(folder) }
+        if orders.command.is_empty() { end_run(folder) } else { remove(folder) }
     }
     code
+}
+
+/// Ends what is left of a server's run. Its folder goes last: by it a later server would know whom to end.
+fn end_run(folder: &Path) {
+    process_tree::await_guardians(folder);
+    // None where the server has ended in order, or each guardian has done its work.
+    let _ = process_tree::kill_marked(folder);
+    remove_patiently(folder);
 }
 
 fn run(orders: &Orders) -> Result<u8, String> {

@@ -5,7 +5,7 @@ use std::fs::{File, Permissions, TryLockError};
 use std::io;
 use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use super::process_tree;
 
@@ -33,6 +33,10 @@ pub struct Swept {
 }
 
 const LOCK: &str = "lock";
+/// How long others may take for their start; it takes milliseconds.
+const TURN: Duration = Duration::from_secs(10);
+/// Between two looks whether it is this server's turn.
+const LOOK: Duration = Duration::from_millis(5);
 /// Between two tries to remove a folder; then it is left to the next start.
 const PAUSES: [Duration; 6] = [
     Duration::from_millis(20),
@@ -53,11 +57,13 @@ impl RunDir {
         std::fs::create_dir_all(&runs)?;
         // Marks of processes are compared with this path: it must be the one without links.
         let runs = runs.canonicalize()?;
-        let swept = sweep(&runs);
+        let turn = take_turn(&runs)?;
+        let dead = dead(&runs);
         let folder = tempfile::Builder::new().prefix("run-").tempdir_in(&runs)?.keep();
         let lock = File::create(folder.join(LOCK))?;
         lock.lock()?;
-        Ok((Self { folder, _lock: lock }, swept))
+        drop(turn);
+        Ok((Self { folder, _lock: lock }, sweep(&dead)))
     }
 
     /// Makes a folder for a simulation.
@@ -108,34 +114,48 @@ impl Drop for InstanceDir {
     }
 }
 
-/// Removes the folders of runs whose lock nobody holds, and ends processes that carry their mark.
-fn sweep(runs: &Path) -> Swept {
-    let mut swept = Swept::default();
-    let Ok(entries) = std::fs::read_dir(runs) else {
-        return swept;
-    };
-    for folder in entries.flatten().map(|entry| entry.path()) {
-        if is_alive(&folder) {
-            continue;
+/// Waits until no other server looks for dead runs or makes its own folder: one whose lock is not yet held would count
+/// as dead. The turn ends with what is given back.
+fn take_turn(runs: &Path) -> io::Result<File> {
+    let turn = File::open(runs)?;
+    let deadline = Instant::now() + TURN;
+    loop {
+        match turn.try_lock() {
+            Ok(()) => return Ok(turn),
+            Err(TryLockError::WouldBlock) if Instant::now() < deadline => std::thread::sleep(LOOK),
+            Err(TryLockError::WouldBlock) => {
+                return Err(io::Error::new(io::ErrorKind::TimedOut, "another program keeps its folder 'runs' locked"));
+            }
+            Err(TryLockError::Error(error)) => return Err(error),
         }
-        swept.runs += 1;
-        process_tree::await_guardians(&folder);
-        swept.processes += process_tree::kill_marked(&folder);
-        remove(&folder);
     }
-    swept
 }
 
-/// Whether the server of a run still lives. One that is just making its folder has no lock yet, and counts as alive
-/// while the folder is young.
-fn is_alive(folder: &Path) -> bool {
-    match File::open(folder.join(LOCK)) {
-        Ok(lock) => matches!(lock.try_lock(), Err(TryLockError::WouldBlock)),
-        Err(_) => folder
-            .metadata()
-            .and_then(|about| about.modified())
-            .is_ok_and(|time| time.elapsed().is_ok_and(|age| age < Duration::from_secs(10))),
+/// The folders of runs whose server has ended, with their locks: who holds them sweeps, nobody else.
+fn dead(runs: &Path) -> Vec<(PathBuf, Option<File>)> {
+    let entries = std::fs::read_dir(runs).into_iter().flatten().flatten();
+    let claim = |folder: PathBuf| match File::open(folder.join(LOCK)) {
+        Ok(lock) => lock.try_lock().is_ok().then_some((folder, Some(lock))),
+        // It is being removed, or its server died while it made it.
+        Err(_) => is_old(&folder).then_some((folder, None)),
+    };
+    entries.filter_map(|entry| claim(entry.path())).collect()
+}
+
+fn is_old(folder: &Path) -> bool {
+    let modified = folder.metadata().and_then(|about| about.modified());
+    modified.is_ok_and(|time| time.elapsed().is_ok_and(|age| age >= Duration::from_secs(10)))
+}
+
+/// Removes the folders of dead runs, and ends processes that carry their mark.
+fn sweep(dead: &[(PathBuf, Option<File>)]) -> Swept {
+    let mut swept = Swept { runs: dead.len(), processes: 0 };
+    for (folder, _) in dead {
+        process_tree::await_guardians(folder);
+        swept.processes += process_tree::kill_marked(folder);
+        remove(folder);
     }
+    swept
 }
 
 /// Removes a folder, as far as that can be done at once.

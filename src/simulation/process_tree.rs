@@ -87,14 +87,19 @@ pub fn kill_marked(folder: &Path) -> usize {
 }
 
 /// Waits until the guardians of instances below `folder` have ended, whose server is gone: each is ending its tree, and
-/// knows more of it than the mark tells. Gives up after some seconds.
+/// knows more of it than the mark tells. One that was stopped goes on. Gives up after some seconds.
 pub fn await_guardians(folder: &Path) {
     let deadline = Instant::now() + GUARDIANS;
-    let is_guardian = |pid: i32| {
-        let line = Process::new(pid).and_then(|process| process.cmdline());
+    let is_guardian = |pid: &i32| {
+        let line = Process::new(*pid).and_then(|process| process.cmdline());
         line.is_ok_and(|line| line.get(1).is_some_and(|word| word == "guard"))
     };
-    while marked(folder).into_iter().any(is_guardian) && Instant::now() < deadline {
+    loop {
+        let guardians: Vec<i32> = marked(folder).into_iter().filter(|pid| is_guardian(pid)).collect();
+        if guardians.is_empty() || Instant::now() >= deadline {
+            return;
+        }
+        signal_each(&guardians, Signal::SIGCONT);
         std::thread::sleep(BETWEEN_LOOKS);
     }
 }

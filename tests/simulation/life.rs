@@ -13,7 +13,7 @@ use crate::support::program::{Builder, Server, simulation_server};
 use crate::support::webots::{Webots, instances_below};
 use crate::support::{http, until};
 
-fn quick(builder: Builder) -> Builder {
+pub fn quick(builder: Builder) -> Builder {
     builder.set("timing.grace", 0.3).set("timing.heartbeat", 0.2)
 }
 

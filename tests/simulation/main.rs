@@ -29,3 +29,4 @@ mod ready;
 mod scene;
 mod soak;
 mod stopping;
+mod trees;

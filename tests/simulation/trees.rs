@@ -1,0 +1,60 @@
+//! What is ended where guardians are killed or stopped, and what is not: processes that the server did not start.
+
+use std::collections::BTreeSet;
+use std::path::Path;
+
+use nix::sys::signal::{Signal, kill};
+use nix::unistd::Pid;
+
+use crate::life::quick;
+use crate::scene::{Scene, State};
+use crate::support::git::Forge;
+use crate::support::program::{Server, simulation_server};
+use crate::support::webots::{Webots, instances_below};
+use crate::support::{http, until};
+
+fn runs(folder: &Path) -> BTreeSet<std::path::PathBuf> {
+    std::fs::read_dir(folder.join("runs")).into_iter().flatten().map(|entry| entry.unwrap().path()).collect()
+}
+
+/// The guardian of the only simulation.
+fn guardian(folder: &Path) -> i32 {
+    let marked = instances_below(folder);
+    marked.iter().find(|one| one.1.contains("guard") && one.1.contains("--remove")).unwrap().0
+}
+
+#[actix_rt::test]
+async fn servers_that_start_at_once_in_one_cache_keep_their_folders() {
+    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
+    for round in 0..6 {
+        let cache = tempfile::tempdir().unwrap();
+        let path = cache.path().to_str().unwrap();
+        let start = |_| simulation_server(&webots.path(), forge.path(), 1).set("cacheDir", path).spawn();
+        let mut servers: Vec<Server> = (0..8).map(start).collect();
+        for server in &servers {
+            until("it answers", async || http::try_get(&server.url("/health")).await.is_ok()).await;
+            assert!(!server.log().contains("earlier runs"), "{}", server.log());
+        }
+        assert_eq!(runs(cache.path()).len(), 8, "round {round}");
+        for server in &mut servers {
+            server.signal(Signal::SIGTERM);
+        }
+        for server in &mut servers {
+            assert_eq!(server.ended().await, Some(0));
+        }
+    }
+}
+
+#[actix_rt::test]
+async fn a_simulation_outlives_not_the_death_of_both_its_guardian_and_the_server() {
+    let mut scene = Scene::new(State::Running, quick).await;
+    let guardian = guardian(scene.folder.path());
+    // The server can't see the guardian's death.
+    scene.server.signal(Signal::SIGSTOP);
+    kill(Pid::from_raw(guardian), Signal::SIGKILL).unwrap();
+    assert!(instances_below(scene.folder.path()).len() >= 2, "script and simulator");
+    scene.server.signal(Signal::SIGKILL);
+    scene.server.ended().await;
+    until("all processes are gone", async || instances_below(scene.folder.path()).is_empty()).await;
+    until("its folder is gone", async || runs(&scene.folder.path().join("cache")).is_empty()).await;
+}
