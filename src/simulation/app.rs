@@ -24,7 +24,7 @@ use super::repository_cache::RepositoryCache;
 use super::routes;
 use super::server::Server;
 use super::usage::UsageMonitor;
-use super::{orphans, outcome, process_group};
+use super::{orphans, outcome, process_group, process_tree};
 use crate::shared::admission::Rules;
 use crate::shared::connections::Connections;
 use crate::shared::live::Live;
@@ -66,6 +66,9 @@ pub enum AppError {
 
 /// Between two looks whether all simulations have ended.
 const LOOK: Duration = Duration::from_millis(50);
+
+/// How long it may take to end what has not ended in time.
+const LAST_TRY: Duration = Duration::from_millis(500);
 
 /// Runs the server until it is asked to stop.
 ///
@@ -124,7 +127,9 @@ pub async fn run(config: SimulationConfig) -> Result<(), AppError> {
     log::info!("stopping");
     notify::stopping();
     phase_sender.send_replace(Phase::Closing);
-    actix_rt::time::timeout(server.config.timing.stop, empty(&places)).await.ok();
+    if actix_rt::time::timeout(server.config.timing.stop, empty(&places)).await.is_err() {
+        end_all(server.run.path().to_owned()).await;
+    }
     stop(&handle).await;
     drop(serving);
     server.run.remove();
@@ -211,6 +216,16 @@ async fn empty(places: &Addr<Places>) {
     while places.send(Census).await.is_ok_and(|census| !census.simulations.is_empty()) {
         actix_rt::time::sleep(LOOK).await;
     }
+}
+
+/// Ends what has not ended in time, whether its guardian can or not.
+async fn end_all(run: PathBuf) {
+    let end = move || {
+        let count = process_tree::kill_marked(&run);
+        orphans::end_all();
+        log::error!("ended {count} processes that had not ended in time");
+    };
+    actix_rt::time::timeout(LAST_TRY, actix_rt::task::spawn_blocking(end)).await.ok();
 }
 
 async fn stop(http: &ServerHandle) {

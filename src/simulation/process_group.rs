@@ -9,6 +9,8 @@ use std::path::{Path, PathBuf};
 use std::process::{ExitStatus, Stdio};
 use std::time::Duration;
 
+use tokio::sync::oneshot;
+
 use super::guardian::NOT_STARTED;
 use super::{orphans, process_tree};
 
@@ -32,12 +34,18 @@ pub struct Plan {
 /// A guard for a running program and all its descendants.
 ///
 /// Dropping it closes the guardian's lifeline (see [`super::guardian`]): everything is killed at once, also when the
-/// drop comes from a panic, and also when the server itself is killed.
+/// drop comes from a panic, and also when the server itself is killed. A guardian that does not do so in time, for
+/// what it guards has stopped it, is ended by the server with the whole tree.
 #[derive(Debug)]
 pub struct ProcessGroup {
     lifeline: PipeWriter,
     guardian: i32,
+    /// Used once, when it is asked to end.
+    asked: Option<oneshot::Sender<()>>,
 }
+
+/// How long a guardian may take beyond the grace time, before the server does its work.
+const GUARDIAN: Duration = Duration::from_secs(2);
 
 /// How a program ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -74,9 +82,23 @@ impl ProcessGroup {
         }
         let mut child = orphans::start(command.stdin(reader).stdout(output).stderr(errors))?;
         let guardian = child.id().and_then(|id| i32::try_from(id).ok()).unwrap_or_default();
-        let mark = plan.mark.clone();
+        let (mark, grace) = (plan.mark.clone(), plan.grace);
+        let (asked, order) = oneshot::channel();
+        let overdue = async move {
+            // Where nobody asked, the lifeline has ended: then no grace time is given.
+            let grace = order.await.map_or(Duration::ZERO, |()| grace);
+            actix_rt::time::sleep(grace + GUARDIAN).await;
+        };
         let ended = async move {
-            match child.wait().await {
+            let status = tokio::select! {
+                status = child.wait() => status,
+                () = overdue => {
+                    log::error!("the guardian {guardian} does not end what it guards, the server does");
+                    actix_rt::task::spawn_blocking(move || process_tree::kill_tree(guardian)).await.ok();
+                    child.wait().await
+                }
+            };
+            match status {
                 Ok(status) if status.signal().is_none() => Ending::of_guardian(status),
                 // Somebody has killed the guardian: what it guarded is now the server's.
                 _ => {
@@ -90,7 +112,7 @@ impl ProcessGroup {
                 }
             }
         };
-        Ok((Self { lifeline, guardian }, ended))
+        Ok((Self { lifeline, guardian, asked: Some(asked) }, ended))
     }
 
     /// The process from which the whole tree descends.
@@ -101,6 +123,9 @@ impl ProcessGroup {
 
     /// Asks for an orderly end: SIGTERM, the grace time, SIGKILL.
     pub fn ask_to_end(&mut self) {
+        if let Some(asked) = self.asked.take() {
+            asked.send(()).ok();
+        }
         // A guardian that no longer reads has nothing left to end.
         self.lifeline.write_all(b".").ok();
     }

@@ -199,11 +199,11 @@ fn last_will(server: &Server) -> i32 {
     children(server.pid()).into_iter().find(is_it).unwrap()
 }
 
-fn is_there(pid: i32) -> bool {
+pub fn is_there(pid: i32) -> bool {
     procfs::process::Process::new(pid).is_ok_and(|process| process.stat().is_ok_and(|stat| stat.state != 'Z'))
 }
 
-fn children(pid: i32) -> Vec<i32> {
+pub fn children(pid: i32) -> Vec<i32> {
     let all = procfs::process::all_processes().unwrap().flatten();
     all.filter(|one| one.stat().is_ok_and(|stat| stat.ppid == pid)).map(|one| one.pid()).collect()
 }

@@ -2,12 +2,14 @@
 
 use std::collections::BTreeSet;
 use std::path::Path;
+use std::time::{Duration, Instant};
 
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 
-use crate::life::quick;
-use crate::scene::{Scene, State};
+use crate::life::{children, is_there, quick};
+use crate::scene::{DEMO, Scene, State, arm, nothing_left};
+use crate::support::client::Client;
 use crate::support::git::Forge;
 use crate::support::program::{Server, simulation_server};
 use crate::support::webots::{Webots, instances_below};
@@ -57,4 +59,47 @@ async fn a_simulation_outlives_not_the_death_of_both_its_guardian_and_the_server
     scene.server.ended().await;
     until("all processes are gone", async || instances_below(scene.folder.path()).is_empty()).await;
     until("its folder is gone", async || runs(&scene.folder.path().join("cache")).is_empty()).await;
+}
+
+/// A simulator that stops its guardian, and hides a process.
+fn stopper() -> Webots {
+    Webots::script(&format!("kill -STOP $PPID\n(env -i setsid sleep 1000 &)\nexec {DEMO} \"$@\""))
+}
+
+#[actix_rt::test]
+async fn a_simulator_that_stops_its_guardian_ends() {
+    let (forge, webots) = (Forge::with_arm(), stopper());
+    let server = quick(simulation_server(&webots.path(), forge.path(), 1)).start().await;
+    let mut client = Client::start(&server, &arm()).await;
+    client.until("webots:").await;
+    let tree = below(server.pid());
+    assert!(tree.len() >= 3, "last will, guardian, simulator and what it hides");
+    client.leave().await;
+    nothing_left(&server, 1).await;
+    until("the whole tree is gone", async || below(server.pid()).len() == 1).await;
+    assert!(server.log().contains("does not end what it guards"));
+}
+
+#[actix_rt::test]
+async fn a_server_that_stops_ends_also_a_simulator_that_stops_its_guardian() {
+    // The server's own time is over first, or the guardian's.
+    for (grace, stop) in [(5.0, 1.0), (0.3, 9.0)] {
+        let (forge, webots, folder) = (Forge::with_arm(), stopper(), tempfile::tempdir().unwrap());
+        let builder = quick(simulation_server(&webots.path(), forge.path(), 1)).folder(folder.path());
+        let mut server = builder.set("timing.grace", grace).set("timing.stop", stop).start().await;
+        let mut client = Client::start(&server, &arm()).await;
+        client.until("webots:").await;
+        let tree = below(server.pid());
+        let asked = Instant::now();
+        server.signal(Signal::SIGTERM);
+        assert_eq!(server.ended().await, Some(0));
+        assert!(asked.elapsed() < Duration::from_secs(10));
+        until("nothing is left", async || !tree.iter().any(|pid| is_there(*pid))).await;
+        assert!(runs(&folder.path().join("cache")).is_empty());
+    }
+}
+
+/// All processes below one.
+fn below(pid: i32) -> Vec<i32> {
+    children(pid).into_iter().flat_map(|pid| [vec![pid], below(pid)].concat()).collect()
 }
