@@ -2,7 +2,7 @@
 
 use std::collections::HashSet;
 use std::ops::RangeInclusive;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use nix::sys::signal::{Signal, kill};
@@ -111,14 +111,20 @@ const MOST_LOOKS: usize = 200;
 /// Between two looks: killed processes need a moment to vanish.
 const BETWEEN_LOOKS: Duration = Duration::from_millis(5);
 
+/// Whether a process carries the mark of any instance.
+#[must_use]
+pub fn is_marked(pid: i32) -> bool {
+    Process::new(pid).is_ok_and(|process| mark(&process).is_some())
+}
+
+fn mark(process: &Process) -> Option<PathBuf> {
+    // A process that has ended, and is not yet buried, has no environment.
+    process.environ().ok()?.remove(std::ffi::OsStr::new(MARK)).map(PathBuf::from)
+}
+
 fn marked(folder: &Path) -> Vec<i32> {
-    let carries_mark = |process: &Process| {
-        // A process that has ended, and is not yet buried, has no environment.
-        process.environ().is_ok_and(|environment| {
-            environment.get(std::ffi::OsStr::new(MARK)).is_some_and(|value| Path::new(value).starts_with(folder))
-        })
-    };
     let processes = all_processes().into_iter().flatten().flatten();
+    let carries_mark = |process: &Process| mark(process).is_some_and(|mark| mark.starts_with(folder));
     processes.filter(carries_mark).map(|process| process.pid()).collect()
 }
 

@@ -103,3 +103,45 @@ async fn a_server_that_stops_ends_also_a_simulator_that_stops_its_guardian() {
 fn below(pid: i32) -> Vec<i32> {
     children(pid).into_iter().flat_map(|pid| [vec![pid], below(pid)].concat()).collect()
 }
+
+#[actix_rt::test]
+async fn children_that_a_server_had_before_its_start_are_spared_with_all_they_leave() {
+    let (forge, folder) = (Forge::with_arm(), tempfile::tempdir().unwrap());
+    let file = |name: &str| folder.path().join(name);
+    let pid_in = async |name: &str| {
+        let text = || std::fs::read_to_string(file(name)).unwrap_or_default();
+        until(name, async || text().ends_with('\n')).await;
+        text().trim().parse::<i32>().unwrap()
+    };
+    // The one that was there leaves an orphan when it is told to; the simulator hides a process.
+    let at = folder.path().display();
+    let leave = "while [ ! -e go ]; do sleep 0.02; done; (setsid sleep 1000 & echo $! > left); sleep 1000";
+    let before = format!("(cd {at}; exec setsid bash -c '{leave}') &\necho $! > {at}/earlier");
+    let webots = Webots::script(&format!("(env -i setsid sleep 1000 & echo $! > {at}/hidden)\n{DEMO} \"$@\" & wait"));
+    let builder = quick(simulation_server(&webots.path(), forge.path(), 1)).folder(folder.path());
+    let server = builder.before(&before).start().await;
+    let mut client = Client::start(&server, &arm()).await;
+    client.until("webots:").await;
+    std::fs::write(file("go"), "").unwrap();
+    let (earlier, left, hidden) = (pid_in("earlier").await, pid_in("left").await, pid_in("hidden").await);
+    let _ends = Ends([earlier, left]);
+    until("the orphan is the server's", async || children(server.pid()).contains(&left)).await;
+    // The server looks each second at what is below its guardians.
+    actix_rt::time::sleep(Duration::from_secs(2)).await;
+    kill(Pid::from_raw(guardian(folder.path())), Signal::SIGKILL).unwrap();
+    client.until("loading: Error:").await;
+    nothing_left(&server, 1).await;
+    until("what had hidden is gone", async || !is_there(hidden)).await;
+    assert!(is_there(earlier) && is_there(left), "{}", server.log());
+}
+
+/// Processes that end with a test.
+struct Ends([i32; 2]);
+
+impl Drop for Ends {
+    fn drop(&mut self) {
+        for pid in self.0 {
+            kill(Pid::from_raw(pid), Signal::SIGKILL).ok();
+        }
+    }
+}

@@ -31,6 +31,7 @@ pub struct Builder {
     environment: Vec<(String, String)>,
     folder: Option<PathBuf>,
     files: Option<u32>,
+    before: Option<String>,
 }
 
 /// A session server that watches these simulation servers (`HOST:PORT`).
@@ -59,7 +60,7 @@ pub fn simulation_server(webots: &Path, repositories: &Path, places: u16) -> Bui
 
 impl Builder {
     fn new(program: &'static str, name: &'static str, config: Value, port: u16) -> Self {
-        Self { program, name, config, port, environment: Vec::new(), folder: None, files: None }
+        Self { program, name, config, port, environment: Vec::new(), folder: None, files: None, before: None }
     }
 
     /// Sets a key of the configuration; `a.b` is a key of a part.
@@ -93,6 +94,12 @@ impl Builder {
         self
     }
 
+    /// Has a shell do this, which then becomes the server.
+    pub fn before(mut self, script: &str) -> Self {
+        self.before = Some(script.to_owned());
+        self
+    }
+
     /// Writes the configuration and starts the program, without waiting for it.
     pub fn spawn(mut self) -> Server {
         let temporary = self.folder.is_none().then(|| tempfile::tempdir().unwrap());
@@ -105,13 +112,18 @@ impl Builder {
         let file = folder.join("config.json");
         std::fs::write(&file, serde_json::to_string_pretty(&self.config).unwrap()).unwrap();
         let log = File::options().create(true).append(true).open(folder.join("output.txt")).unwrap();
-        let mut command = match self.files {
-            Some(files) => {
+        let mut command = match (self.files, &self.before) {
+            (_, Some(script)) => {
+                let mut command = Command::new("bash");
+                command.args(["-c", &format!("{script}\nexec \"$0\" \"$@\""), self.program]);
+                command
+            }
+            (Some(files), None) => {
                 let mut command = Command::new("prlimit");
                 command.arg(format!("--nofile={files}:{files}")).arg(self.program);
                 command
             }
-            None => Command::new(self.program),
+            (None, None) => Command::new(self.program),
         };
         let child = command
             .arg(&file)
