@@ -79,7 +79,7 @@ pub fn guard(orders: &Orders) -> u8 {
 fn end_run(folder: &Path) {
     process_tree::await_guardians(folder);
     // None where the server has ended in order, or each guardian has done its work.
-    let _ = process_tree::kill_marked(folder);
+    let _count = process_tree::kill_marked(folder);
     remove_patiently(folder);
 }
 
