@@ -147,6 +147,9 @@ impl RepositoryCache {
             .filter_map(|lock| {
                 let used = lock.metadata().and_then(|about| about.modified()).ok()?;
                 let path = lock.with_extension("");
+                if let Some(repository) = self.visit(&path) {
+                    repository.tidy_up();
+                }
                 Some((!beside(&path, "damaged").exists(), used, size_of(&path), path))
             })
             .collect();
