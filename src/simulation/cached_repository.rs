@@ -6,14 +6,13 @@ use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
-use super::cache_lock::{Departure, lock_file, wait};
+use super::cache_lock::{Departure, lock_file, remove_locks, wait};
 
 /// A cached repository that is in use: as long as this lives it is not removed.
 #[derive(Debug)]
 pub struct InUse {
     path: PathBuf,
     // Fields are dropped in this order: it is told that it is free when it is.
-    #[expect(dead_code, reason = "it is held, not read")]
     lock: File,
     _departure: Departure,
 }
@@ -34,6 +33,13 @@ pub struct CommitInUse {
 const INCOMING: &str = "refs/incoming";
 /// Where the fetched commits are named: those that the repository's owner vouches for, and others.
 const COMMITS: [&str; 2] = ["refs/fleet", "refs/any"];
+
+impl Drop for InUse {
+    fn drop(&mut self) {
+        // A repository that could not be had leaves nothing behind.
+        remove_locks(&self.path, &self.lock);
+    }
+}
 
 impl InUse {
     /// The repository at this path, whose lock is held.

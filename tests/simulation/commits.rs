@@ -4,6 +4,7 @@ use crate::checkout::{cached, outcome, reader, world_text};
 use crate::git_wrapper::GitWrapper;
 use crate::support::git::{Forge, WORLD, git, world};
 use crate::support::program::simulation_server;
+use crate::support::until;
 
 #[actix_rt::test]
 async fn any_commit_of_a_branch_or_tag_runs() {
@@ -123,4 +124,31 @@ async fn locks_that_a_killed_fetch_of_the_history_has_left_stop_no_other() {
     commit("third");
     let told = outcome(&server, &world("lab/arm", &commits[1], "worlds/a.wbt")).await;
     assert!(told.contains("opened [second]"), "{told}");
+}
+
+#[actix_rt::test]
+async fn wrong_names_are_told_in_words_and_no_cache_is_examined_for_them() {
+    let (forge, webots) = (Forge::with_arm(), reader());
+    let bare = forge.path().join("lab/arm");
+    let file = git(&bare, &["rev-parse", "main:worlds/a.wbt"]);
+    git(&bare, &["tag", "file", file.trim()]);
+    git(&bare, &["tag", "--annotate", "--message", "file", "note", file.trim()]);
+    for any in [false, true] {
+        let wrapper = GitWrapper::new("");
+        let builder = simulation_server(&webots.path(), forge.path(), 2).env("PATH", &wrapper.path());
+        let server = builder.set("anyCommit", any).start().await;
+        assert!(outcome(&server, &world("lab/arm", "main", "worlds/a.wbt")).await.contains("opened"));
+        for name in ["file", "note", &"a".repeat(64)] {
+            let told = outcome(&server, &world("lab/arm", name, "worlds/a.wbt")).await;
+            assert!(told.contains(&format!("has no branch, tag or commit called {name:?}")), "{told}");
+        }
+        assert!(!wrapper.calls().iter().any(|call| call.contains("fsck")), "{:#?}", wrapper.calls());
+        let told = outcome(&server, &world("lab/none", "main", "worlds/a.wbt")).await;
+        assert!(told.contains("does not exist"), "{told}");
+        let entries = || std::fs::read_dir(server.folder.join("cache/git")).unwrap().flatten();
+        until("nothing is left of it", async || {
+            !entries().any(|entry| entry.file_name().to_string_lossy().contains("none"))
+        })
+        .await;
+    }
 }
