@@ -2,7 +2,7 @@
 
 use super::load::Load;
 use super::project_url::ProjectUrl;
-use super::repositories::{UrlPrefix, any_covers};
+use super::repositories::{UrlPrefix, any_covers, any_may_cover};
 
 /// The rules of a server.
 #[derive(Debug, Clone)]
@@ -50,7 +50,7 @@ impl Rules {
     /// # Errors
     /// Why it may not.
     pub fn admit(&self, world: &ProjectUrl, load: Load) -> Result<(), Refusal> {
-        if any_covers(&self.blocked, world) {
+        if any_may_cover(&self.blocked, world) {
             return Err(Refusal::Blocked(world.repository()));
         }
         if any_covers(&self.allowed, world) {

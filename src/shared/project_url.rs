@@ -114,6 +114,11 @@ impl ProjectUrl {
         format!("https://{}/{}", self.host, self.repository_segments().join("/"))
     }
 
+    /// The path segments after the repository: reference, folder and world, without the words that a forge puts before.
+    pub(super) fn inside(&self) -> &[String] {
+        self.segments.get(self.reference..).unwrap_or_default()
+    }
+
     /// What the URL says of its reference.
     #[must_use]
     pub fn kind(&self) -> RefKind {
@@ -129,7 +134,7 @@ impl ProjectUrl {
     /// The possible readings, that with the shortest reference first.
     #[must_use]
     pub fn candidates(&self) -> Vec<Reading> {
-        let inside = self.segments.get(self.reference..).unwrap_or_default();
+        let inside = self.inside();
         let before_worlds = inside.len().saturating_sub(2);
         (1..=before_worlds)
             .filter_map(|length| {
@@ -151,7 +156,14 @@ impl fmt::Display for ProjectUrl {
 pub(super) fn without_git(name: &str) -> Result<String, NoProject> {
     let plain = name.get(name.len().saturating_sub(4)..).filter(|end| end.eq_ignore_ascii_case(".git"));
     let plain = plain.and_then(|end| name.get(..name.len() - end.len())).unwrap_or(name);
-    if plain.is_empty() { Err(no_project("it names no repository")) } else { Ok(plain.to_owned()) }
+    if plain.is_empty() {
+        return Err(no_project("it names no repository"));
+    }
+    // git would find the same repository by this name, and who blocks it would not.
+    if plain.len() < name.len() && plain.to_ascii_lowercase().ends_with(".git") {
+        return Err(no_project(format!("the repository's name {name:?} ends in .git more than once")));
+    }
+    Ok(plain.to_owned())
 }
 
 /// Splits an `https` URL into its host and its percent-decoded path segments, and refuses every trick.
@@ -206,7 +218,7 @@ fn decode_segment(raw: &str) -> Result<String, NoProject> {
 }
 
 /// Finds where the repository ends and where the reference begins.
-fn split_repository(segments: &[String]) -> Result<(usize, usize, RefKind), NoProject> {
+pub(super) fn split_repository(segments: &[String]) -> Result<(usize, usize, RefKind), NoProject> {
     let words: Vec<&str> = segments.iter().map(String::as_str).collect();
     if let Some(dash) = words.iter().position(|word| *word == "-")
         && dash >= 2
@@ -278,6 +290,8 @@ mod tests {
             "https://github.com/u/r",
             "https://github.com/u/r/blob/worlds/a.wbt",
             "https://github.com/u/r/blob/main/a.wbt",
+            "https://github.com/u/r.git.git/blob/main/worlds/a.wbt",
+            "https://github.com/u/r.GIT%2egit/blob/main/worlds/a.wbt",
             "https://github.com/u/r/blob/main/worlds/.wbt",
             "https://github.com/u/r/blob/main/worlds/a.txt",
             "https://github.com/u/r/wiki/main/worlds/a.wbt",

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::project_url::{NoProject, ProjectUrl, split_url, without_git};
+use super::project_url::{NoProject, ProjectUrl, RefKind, split_repository, split_url, without_git};
 
 /// A URL prefix by whole path segments: `https://github.com/lab` covers `https://github.com/lab/x`, and not
 /// `https://github.com/lab-evil/x` (the original compares letters, and lets that pass).
@@ -12,26 +12,53 @@ pub struct UrlPrefix {
     text: String,
     host: String,
     segments: Vec<String>,
+    inside: Option<Inside>,
+}
+
+/// What a prefix names within one repository, whatever form its forge gives to the URL.
+#[derive(Debug, Clone, PartialEq, Eq)]
+struct Inside {
+    /// How many of the segments name the repository.
+    repository: usize,
+    /// How many of them come before the reference.
+    reference: usize,
+    kind: RefKind,
 }
 
 impl UrlPrefix {
     /// Whether this prefix covers a world's URL.
     ///
     /// Hosts, owners and repositories are compared without regard to case, for the forges do so too; what follows
-    /// them lies inside the repository, where git tells cases apart. `tree` and `blob` name the same place.
+    /// them lies inside the repository, where git tells cases apart. Of that the reference and the folder count, not
+    /// the words by which the forges tell that they follow: `tree`, `blob`, `-/blob` and `src/branch` name the same.
     #[must_use]
     pub fn covers(&self, world: &ProjectUrl) -> bool {
-        let canonical = |segment: &str| if segment == "tree" { "blob".to_owned() } else { segment.to_owned() };
-        let repository = world.repository_segments();
-        self.host == world.host()
-            && self.segments.len() <= world.segments().len()
+        self.host == world.host() && (self.covers_segments(world) || self.covers_inside(world, false))
+    }
+
+    /// Whether a world's URL may mean something that this prefix covers: `blob/v1` may mean the tag of `src/tag/v1`.
+    #[must_use]
+    pub fn may_cover(&self, world: &ProjectUrl) -> bool {
+        self.covers(world) || (self.host == world.host() && self.covers_inside(world, true))
+    }
+
+    fn covers_segments(&self, world: &ProjectUrl) -> bool {
+        let repository = world.repository_segments().len();
+        self.segments.len() <= world.segments().len()
             && self.segments.iter().zip(world.segments()).enumerate().all(|(index, (ours, theirs))| {
-                if index < repository.len() {
-                    ours.eq_ignore_ascii_case(theirs)
-                } else {
-                    canonical(ours) == canonical(theirs)
-                }
+                if index < repository { ours.eq_ignore_ascii_case(theirs) } else { ours == theirs }
             })
+    }
+
+    fn covers_inside(&self, world: &ProjectUrl, any_kind: bool) -> bool {
+        let Some(Inside { repository, reference, kind }) = self.inside else {
+            return false;
+        };
+        let (ours, theirs) = (self.segments.get(..repository).unwrap_or_default(), world.repository_segments());
+        ours.len() == theirs.len()
+            && ours.iter().zip(theirs).all(|(ours, theirs)| ours.eq_ignore_ascii_case(theirs))
+            && (kind == RefKind::Any || kind == world.kind() || (any_kind && world.kind() == RefKind::Any))
+            && world.inside().starts_with(self.segments.get(reference..).unwrap_or_default())
     }
 
     /// How many path segments this prefix has: the longer of two prefixes is the more exact one.
@@ -58,12 +85,15 @@ impl TryFrom<String> for UrlPrefix {
 
     fn try_from(text: String) -> Result<Self, NoProject> {
         let (host, mut segments) = split_url(text.trim_end_matches('/'))?;
-        if segments.len() >= 2
-            && let Some(name) = segments.last_mut()
+        let inside = split_repository(&segments).ok();
+        let inside = inside.map(|(repository, reference, kind)| Inside { repository, reference, kind });
+        let repository = inside.as_ref().map_or(segments.len(), |inside| inside.repository);
+        if repository >= 2
+            && let Some(name) = segments.get_mut(repository - 1)
         {
             *name = without_git(name)?;
         }
-        Ok(Self { text, host, segments })
+        Ok(Self { text, host, segments, inside })
     }
 }
 
@@ -77,6 +107,12 @@ impl From<UrlPrefix> for String {
 #[must_use]
 pub fn any_covers(prefixes: &[UrlPrefix], world: &ProjectUrl) -> bool {
     prefixes.iter().any(|prefix| prefix.covers(world))
+}
+
+/// Whether a world's URL may mean something that any of these prefixes covers.
+#[must_use]
+pub fn any_may_cover(prefixes: &[UrlPrefix], world: &ProjectUrl) -> bool {
+    prefixes.iter().any(|prefix| prefix.may_cover(world))
 }
 
 #[cfg(test)]
@@ -108,5 +144,26 @@ mod tests {
         for (text, path, covered, why) in table {
             assert_eq!(prefix(text).covers(&world(path)), covered, "{text} and {path}: {why}");
         }
+    }
+
+    #[test]
+    fn a_branch_is_the_same_in_every_form_of_url() {
+        let world = |path: &str| ProjectUrl::parse(&format!("https://forge.org/lab/x/{path}/worlds/a.wbt")).unwrap();
+        let forms = ["blob/evil", "tree/evil", "-/blob/evil", "-/tree/evil", "src/branch/evil"];
+        for blocked in forms {
+            for asked in forms {
+                let prefix = prefix(&format!("https://forge.org/LAB/x.git/{blocked}"));
+                assert!(prefix.may_cover(&world(asked)), "{blocked} and {asked}");
+                assert!(prefix.may_cover(&world(&format!("{asked}/p"))), "{blocked} and a folder of {asked}");
+                assert!(!prefix.may_cover(&world(&asked.replace("evil", "evil2"))), "{blocked} and not {asked}2");
+            }
+        }
+        let tag = prefix("https://forge.org/lab/x/src/tag/v1");
+        assert!(!tag.covers(&world("blob/v1")) && tag.may_cover(&world("blob/v1")), "it may mean the branch v1");
+        assert!(!tag.may_cover(&world("src/branch/v1")));
+        assert!(prefix("https://forge.org/lab/x/blob/main/p").covers(&world("src/branch/main/p/q")));
+        assert!(!prefix("https://forge.org/lab/x/blob/main/p").covers(&world("-/blob/main/q")));
+        let named_blob = "https://forge.org/g/s/blob/-/blob/main/worlds/a.wbt";
+        assert!(prefix("https://forge.org/g/s/blob").covers(&ProjectUrl::parse(named_blob).unwrap()));
     }
 }

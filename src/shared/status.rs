@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 use super::admission::Rules;
 use super::load::Load;
 use super::project_url::ProjectUrl;
-use super::repositories::{UrlPrefix, any_covers};
+use super::repositories::{UrlPrefix, any_covers, any_may_cover};
 
 /// The part of a simulation server's `/status` that decides where clients go.
 ///
@@ -89,7 +89,7 @@ impl Dispatch {
     #[must_use]
     pub fn accepts(&self, world: &ProjectUrl) -> bool {
         let Some(docker) = self.docker else {
-            let blocked = any_covers(&self.blocked_repositories, world);
+            let blocked = any_may_cover(&self.blocked_repositories, world);
             let open = self.allowed_repositories.is_empty() || self.share_idle_time > 0.0;
             return !blocked && (open || any_covers(&self.allowed_repositories, world));
         };

@@ -2,6 +2,7 @@
 
 use std::fs::{File, TryLockError};
 use std::io;
+use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -39,13 +40,29 @@ pub fn beside(path: &Path, extension: &str) -> PathBuf {
     path.with_extension(extension)
 }
 
-/// Opens one of the files that are locked in place of a repository. They stay: one that was removed could still be
-/// locked by another who has it open.
+/// Opens one of the files that are locked in place of a repository. They stay as long as there is one.
 ///
 /// # Errors
 /// When it can't be made.
 pub fn lock_file(path: &Path, extension: &str) -> io::Result<File> {
     File::options().create(true).append(true).open(beside(path, extension))
+}
+
+/// Whether a file that was locked is still the one that others find.
+#[must_use]
+pub fn is_there(path: &Path, extension: &str, lock: &File) -> bool {
+    let (there, here) = (beside(path, extension).metadata(), lock.metadata());
+    there.is_ok_and(|there| here.is_ok_and(|here| (there.dev(), there.ino()) == (here.dev(), here.ino())))
+}
+
+/// Removes the files that are locked in place of a repository that is not there, unless somebody uses them. Others may
+/// have them open: whoever has got a lock looks whether it is still there.
+pub fn remove_locks(path: &Path, lock: &File) {
+    let is_nothing = || !path.exists() && !beside(path, "damaged").exists();
+    if is_nothing() && lock.try_lock().is_ok() && is_nothing() && is_there(path, "use", lock) {
+        std::fs::remove_file(beside(path, "fetch")).ok();
+        std::fs::remove_file(beside(path, "use")).ok();
+    }
 }
 
 /// Waits until a lock is had.

@@ -6,14 +6,13 @@ use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
-use super::cache_lock::{Departure, lock_file, wait};
+use super::cache_lock::{Departure, lock_file, remove_locks, wait};
 
 /// A cached repository that is in use: as long as this lives it is not removed.
 #[derive(Debug)]
 pub struct InUse {
     path: PathBuf,
     // Fields are dropped in this order: it is told that it is free when it is.
-    #[expect(dead_code, reason = "it is held, not read")]
     lock: File,
     _departure: Departure,
 }
@@ -30,8 +29,17 @@ pub struct CommitInUse {
     _lock: File,
 }
 
+/// Where a fetch names what came before it has its own name.
+const INCOMING: &str = "refs/incoming";
 /// Where the fetched commits are named: those that the repository's owner vouches for, and others.
 const COMMITS: [&str; 2] = ["refs/fleet", "refs/any"];
+
+impl Drop for InUse {
+    fn drop(&mut self) {
+        // A repository that could not be had leaves nothing behind.
+        remove_locks(&self.path, &self.lock);
+    }
+}
 
 impl InUse {
     /// The repository at this path, whose lock is held.
@@ -67,8 +75,15 @@ impl InUse {
     }
 
     fn clean(&self) {
-        for broken in self.incoming().chain(self.locks()) {
+        for broken in self.incoming().chain(self.locks()).chain(files(self.path.join(INCOMING))) {
             std::fs::remove_file(broken).ok();
+        }
+    }
+
+    /// Removes what a broken fetch has left, unless one is under way.
+    pub fn tidy_up(&self) {
+        if self.incoming().next().is_some() {
+            drop(self.try_fetching());
         }
     }
 
@@ -87,8 +102,15 @@ impl InUse {
 
     /// Locks that git leaves behind when it is killed: each would make every later fetch fail.
     fn locks(&self) -> impl Iterator<Item = PathBuf> {
-        let folders = COMMITS.map(|folder| self.path.join(folder)).into_iter().chain([self.path.clone()]);
-        folders.flat_map(files).filter(|path| path.extension().is_some_and(|extension| extension == "lock"))
+        let mut open = vec![self.path.join("refs")];
+        let mut all: Vec<PathBuf> = files(self.path.clone()).collect();
+        while let Some(folder) = open.pop() {
+            for entry in std::fs::read_dir(folder).into_iter().flatten().flatten() {
+                let is_folder = entry.file_type().is_ok_and(|kind| kind.is_dir());
+                if is_folder { &mut open } else { &mut all }.push(entry.path());
+            }
+        }
+        all.into_iter().filter(|path| path.extension().is_some_and(|extension| extension == "lock"))
     }
 
     /// Whether the bare repository is there.
@@ -107,6 +129,27 @@ impl InUse {
         let is_same = path.metadata().is_ok_and(|there| file.metadata().is_ok_and(|here| there.ino() == here.ino()));
         file.set_modified(SystemTime::now()).ok()?;
         is_same.then_some(CommitInUse { _lock: file })
+    }
+
+    /// The object that a fetch has brought under this name.
+    #[must_use]
+    pub fn arrived(&self, incoming: &str) -> Option<String> {
+        let hash = std::fs::read_to_string(self.path.join(incoming)).ok()?;
+        let hash = hash.trim_end();
+        (hash.len() >= 40 && hash.bytes().all(|byte| byte.is_ascii_hexdigit())).then(|| hash.to_owned())
+    }
+
+    /// Gives what a fetch has brought its own name, and takes it into use.
+    #[must_use]
+    pub fn name(&self, _right: &Fetching, incoming: &str, reference: &str) -> Option<CommitInUse> {
+        // Who uses a commit has locked its file, which must not be replaced.
+        if let Some(known) = self.commit(reference) {
+            return Some(known);
+        }
+        let path = self.path.join(reference);
+        std::fs::create_dir_all(path.parent()?).ok()?;
+        std::fs::rename(self.path.join(incoming), path).ok()?;
+        self.commit(reference)
     }
 
     /// How many commits there are.

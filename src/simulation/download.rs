@@ -10,6 +10,7 @@ use tokio::sync::watch;
 
 use super::cached_repository::{CommitInUse, InUse};
 use super::checkout_error::{CheckoutError, damaged, fetch_failed, git_failed, machine, too_large};
+use super::examined::Examined;
 use super::git::{Call, Git, GitError};
 use super::limits::Limits;
 use super::mirrors::Remote;
@@ -26,6 +27,8 @@ pub struct Downloads {
     pub cache: RepositoryCache,
     /// What may be fetched.
     pub limits: Limits,
+    /// What was found to be in order.
+    pub examined: Examined,
 }
 
 /// What is fetched for whom.
@@ -43,7 +46,7 @@ pub struct Errand<'job> {
 const BETWEEN_LOOKS: Duration = Duration::from_millis(200);
 
 impl Downloads {
-    /// Fetches one commit, unless it is there.
+    /// Fetches one commit, unless it is there. Gives back what came: a branch may have moved on in the meantime.
     ///
     /// # Errors
     /// Why it can't be fetched.
@@ -52,11 +55,11 @@ impl Downloads {
         errand: Errand<'_>,
         repository: &InUse,
         revision: &Revision,
-    ) -> Result<CommitInUse, CheckoutError> {
+    ) -> Result<(Revision, CommitInUse), CheckoutError> {
         let Errand { world, remote, .. } = errand;
-        let _fetching = repository.fetching().await.map_err(|error| machine(world, &error))?;
+        let fetching = repository.fetching().await.map_err(|error| machine(world, &error))?;
         if let Some(commit) = repository.commit(&revision.reference()) {
-            return Ok(commit);
+            return Ok((revision.clone(), commit));
         }
         self.make_repository(errand, repository).await?;
         let call = call(remote, repository.path(), revision.fetch_arguments(&remote.location));
@@ -66,7 +69,10 @@ impl Downloads {
         fetched.map_err(|source| fetch_failed(world, revision, source))?;
         // Taken before anybody else may tidy up.
         let lost = || machine(world, &io::Error::other("the commit that was fetched is not there"));
-        repository.commit(&revision.reference()).ok_or_else(lost)
+        let came = repository.arrived(&revision.incoming()).ok_or_else(lost)?;
+        let came = revision.with_commit(came);
+        let commit = repository.name(&fetching, &revision.incoming(), &came.reference());
+        Ok((came, commit.ok_or_else(lost)?))
     }
 
     /// Whether a commit was ever part of a branch or tag. For that the history is fetched: all commits, as far as the
@@ -125,14 +131,13 @@ impl Downloads {
                 errand.progress.send_replace(format!("{what}: {}", line.trim_start_matches("remote: ")));
             }
         };
+        // Also what was broken off has added something: what is left of it is removed when its lock is free.
+        let _grown = Grown(&self.cache);
         let mut fetch = std::pin::pin!(self.git.run(call, tell));
         let mut look = actix_rt::time::interval(BETWEEN_LOOKS);
         loop {
             tokio::select! {
-                result = &mut fetch => {
-                    self.cache.grown();
-                    return Some(result.map(drop));
-                }
+                result = &mut fetch => return Some(result.map(drop)),
                 _ = look.tick() => {
                     if repository.received() > self.limits.size {
                         return None;
@@ -171,12 +176,21 @@ impl Downloads {
                 Patient::Alone { path, .. } => path,
                 Patient::Shared(repository, _) => repository.path(),
             };
-            if path.exists() && !self.git.is_sound(path).await {
+            if path.exists() && !self.examined.is_sound(&self.git, path).await {
                 log::warn!("{} is damaged: it is removed and fetched anew", path.display());
                 self.cache.mend(patient).await?;
             }
         }
         Ok(())
+    }
+}
+
+/// Says in the end, whichever that is, that something was added to the cache.
+struct Grown<'cache>(&'cache RepositoryCache);
+
+impl Drop for Grown<'_> {
+    fn drop(&mut self) {
+        self.0.grown();
     }
 }
 

@@ -18,6 +18,7 @@ use tokio_util::task::AbortOnDropHandle;
 use super::cached_repository::{CommitInUse, InUse};
 use super::checkout_error::{CheckoutError, damaged, git_failed, machine, no_reference, too_large};
 use super::download::{Downloads, Errand, call};
+use super::examined::Examined;
 use super::git::Git;
 use super::housekeeping;
 use super::limits::Limits;
@@ -67,7 +68,7 @@ impl Fetcher {
     pub fn new(git: Git, cache: RepositoryCache, mirrors: Mirrors, limits: Limits, runtime: &Handle) -> Self {
         let git = Arc::new(git);
         let housekeeping = runtime.spawn(housekeeping::keep(cache.clone(), Arc::clone(&git)));
-        let downloads = Downloads { git, cache, limits };
+        let downloads = Downloads { git, cache, limits, examined: Examined::default() };
         Self { downloads, mirrors, fetches: Mutex::default(), _housekeeping: AbortOnDropHandle::new(housekeeping) }
     }
 
@@ -137,7 +138,7 @@ impl Fetcher {
             }
             // The remote's fault, unless it is the cache that git could not read.
             Err(CheckoutError::Git { repository: url, source })
-                if repository.is_made() && !self.git().is_sound(repository.path()).await =>
+                if repository.is_made() && !self.downloads.examined.is_sound(self.git(), repository.path()).await =>
             {
                 Err(CheckoutError::Damaged { repository: url, source })
             }
@@ -150,14 +151,20 @@ impl Fetcher {
         let Errand { world, remote, .. } = errand;
         let mut missing = None;
         for revision in self.revisions(errand, repository).await? {
-            let commit = match repository.commit(&revision.reference()) {
-                Some(commit) => commit,
+            let (revision, commit) = match repository.commit(&revision.reference()) {
+                Some(commit) => (revision, commit),
                 None => self.downloads.commit(errand, repository, &revision).await?,
             };
             let path = revision.world_path(world);
             let mut call = call(remote, repository.path(), revision.list_arguments());
             call.is_alone = true;
             let answer = self.git().run(call, |_| ()).await;
+            if answer.as_ref().is_err_and(|error| error.message.contains("not a tree object"))
+                && self.is_file(remote, repository, &revision).await
+            {
+                // A tag may name a file alone.
+                continue;
+            }
             let limit = self.downloads.limits.entries();
             let listing = match answer {
                 Ok(answer) => Listing::parse(&answer, &path),
@@ -176,6 +183,13 @@ impl Fetcher {
             missing = Some(NoWorld::Missing(format!("{path} in {}", revision.name)));
         }
         Err(missing.map_or_else(|| no_reference(world), CheckoutError::World))
+    }
+
+    /// Whether there are no files below a revision, for it is one.
+    async fn is_file(&self, remote: &Remote, repository: &InUse, revision: &Revision) -> bool {
+        let mut call = call(remote, repository.path(), revision.kind_arguments());
+        call.is_alone = true;
+        self.git().run(call, |_| ()).await.is_ok_and(|kind| kind.starts_with(b"blob"))
     }
 
     /// The commits that a URL may mean, the likeliest first.
@@ -205,6 +219,9 @@ impl Fetcher {
             return Ok(true);
         }
         let answer = self.ask(errand, repository, revision::tips_arguments(&errand.remote.location)).await?;
+        if revision::is_of_other_length(&answer, &revision.commit) {
+            return Err(no_reference(errand.world));
+        }
         Ok(revision::is_tip(&answer, &revision.commit)
             || self.downloads.is_in_history(errand, &revision.commit).await?)
     }

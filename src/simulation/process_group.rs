@@ -157,14 +157,20 @@ pub fn start_alone(
     command.envs(plan.environment.iter().map(|(name, value)| (name, value))).env(process_tree::MARK, &plan.mark);
     command.stdin(Stdio::null()).stdout(output).stderr(errors).process_group(0).kill_on_drop(true);
     let mut child = orphans::start(&mut command)?;
-    Ok(async move {
-        let status = child.wait().await;
-        let signal = |status: &ExitStatus| status.signal().and_then(|number| u8::try_from(number).ok());
-        status.map_or(Ending::NotStarted, |status| signal(&status).map_or(Ending::of_guardian(status), Ending::Signal))
-    })
+    Ok(async move { child.wait().await.map_or(Ending::NotStarted, Ending::of_program) })
 }
 
 impl Ending {
+    /// Of a program that the server has started itself: its exit codes are its own, also those above 128.
+    fn of_program(status: ExitStatus) -> Self {
+        let signal = status.signal().and_then(|number| u8::try_from(number).ok());
+        match u8::try_from(status.code().unwrap_or_default()).unwrap_or_default() {
+            _ if signal.is_some() => Self::Signal(signal.unwrap_or_default()),
+            NOT_STARTED => Self::NotStarted,
+            code => Self::Code(code),
+        }
+    }
+
     fn of_guardian(status: ExitStatus) -> Self {
         match u8::try_from(status.code().unwrap_or_default()).unwrap_or_default() {
             NOT_STARTED => Self::NotStarted,
@@ -185,5 +191,18 @@ impl fmt::Display for Ending {
                 Err(_) => write!(out, "was ended by signal {number}"),
             },
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_a_signal_is_told_as_one() {
+        let ending = |raw| Ending::of_program(ExitStatus::from_raw(raw));
+        assert_eq!(ending(129 << 8), Ending::Code(129), "git's wrong usage is no SIGHUP");
+        assert_eq!(ending(127 << 8), Ending::NotStarted);
+        assert_eq!(ending(9), Ending::Signal(9));
     }
 }

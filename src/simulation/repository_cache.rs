@@ -13,7 +13,7 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::SystemTime;
 
-use super::cache_lock::{Departure, Work, beside, lock_file, wait};
+use super::cache_lock::{Departure, Work, beside, is_there, lock_file, remove_locks, wait};
 use super::cached_repository::{Fetching, InUse};
 
 /// The folder of cached repositories.
@@ -72,6 +72,9 @@ impl RepositoryCache {
             let path = self.current(location)?;
             let lock = lock_file(&path, "use")?;
             wait(|| lock.try_lock_shared()).await?;
+            if !is_there(&path, "use", &lock) {
+                continue;
+            }
             lock.set_modified(SystemTime::now())?;
             let repository = InUse::new(path, lock, Departure(Arc::clone(&self.work)));
             if !beside(repository.path(), "damaged").exists() {
@@ -85,6 +88,9 @@ impl RepositoryCache {
     pub fn visit(&self, path: &Path) -> Option<InUse> {
         let lock = lock_file(path, "use").ok()?;
         lock.try_lock_shared().ok()?;
+        if !is_there(path, "use", &lock) {
+            return None;
+        }
         Some(InUse::new(path.to_owned(), lock, Departure(Arc::default())))
     }
 
@@ -95,7 +101,7 @@ impl RepositoryCache {
     pub async fn examine(&self, location: &str) -> io::Result<Patient> {
         let path = self.current(location)?;
         let lock = lock_file(&path, "use")?;
-        if lock.try_lock().is_ok() {
+        if lock.try_lock().is_ok() && is_there(&path, "use", &lock) {
             return Ok(Patient::Alone { path, lock });
         }
         let repository = self.take(location).await?;
@@ -147,6 +153,9 @@ impl RepositoryCache {
             .filter_map(|lock| {
                 let used = lock.metadata().and_then(|about| about.modified()).ok()?;
                 let path = lock.with_extension("");
+                if let Some(repository) = self.visit(&path) {
+                    repository.tidy_up();
+                }
                 Some((!beside(&path, "damaged").exists(), used, size_of(&path), path))
             })
             .collect();
@@ -187,7 +196,7 @@ fn remove_unused(path: &Path) -> bool {
     let Ok(lock) = lock_file(path, "use") else {
         return false;
     };
-    if lock.try_lock().is_err() {
+    if lock.try_lock().is_err() || !is_there(path, "use", &lock) {
         return false;
     }
     let removed = match std::fs::remove_dir_all(path) {
@@ -195,9 +204,11 @@ fn remove_unused(path: &Path) -> bool {
         Ok(()) => true,
     };
     // What is gone is no longer damaged; the mark must not outlive it, nor go before it.
-    removed
+    let gone = removed
         && std::fs::remove_file(beside(path, "damaged"))
-            .map_or_else(|error| error.kind() == io::ErrorKind::NotFound, |()| true)
+            .map_or_else(|error| error.kind() == io::ErrorKind::NotFound, |()| true);
+    remove_locks(path, &lock);
+    gone
 }
 
 /// A readable name, made unique by a hash.
@@ -288,6 +299,28 @@ mod tests {
         assert_eq!(cache.shrink().removed, 1);
         assert!(!old.exists() && cache.take("x").await.unwrap().path() == old);
         assert!(matches!(cache.examine("x").await.unwrap(), Patient::Alone { .. }));
+    }
+
+    #[actix_rt::test]
+    async fn a_repository_that_was_never_there_leaves_nothing_and_its_lock_is_never_one_that_is_gone() {
+        let folder = tempfile::tempdir().unwrap();
+        let cache = RepositoryCache::open(folder.path(), 1000).unwrap();
+        let count = || std::fs::read_dir(&cache.folder).unwrap().count();
+        let (one, other) = (cache.take("x").await.unwrap(), cache.take("x").await.unwrap());
+        drop(one.fetching().await.unwrap());
+        drop(one);
+        assert_eq!(count(), 2, "somebody still uses it");
+        // Somebody has opened the file and not locked it yet.
+        let late = lock_file(other.path(), "use").unwrap();
+        let path = other.path().to_owned();
+        drop(other);
+        assert_eq!(count(), 0);
+        late.try_lock_shared().unwrap();
+        assert!(!is_there(&path, "use", &late));
+        let taken = cache.take("x").await.unwrap();
+        std::fs::create_dir(taken.path()).unwrap();
+        drop(taken);
+        assert_eq!(count(), 2, "it is there");
     }
 
     #[test]

@@ -47,6 +47,13 @@ pub fn is_tip(answer: &str, commit: &str) -> bool {
     tips.filter(|(_, name)| accepted(name)).any(|(tip, _)| tip == commit)
 }
 
+/// Whether the remote's hashes have another length than this one: then it can't have that commit.
+#[must_use]
+pub fn is_of_other_length(answer: &str, commit: &str) -> bool {
+    let mut tips = answer.lines().filter_map(|line| line.split_once('\t')).peekable();
+    tips.peek().is_some() && tips.all(|(tip, _)| tip.len() != commit.len())
+}
+
 /// Fetches all branches and tags from the remote of this name: only their commits where it can do that, else
 /// everything. git keeps note of that only for remotes that have a name.
 #[must_use]
@@ -116,10 +123,23 @@ impl Revision {
         format!("refs/{}/{}", if self.is_any { "any" } else { "fleet" }, self.commit)
     }
 
+    /// Where a fetch puts it until it is known what came: a branch may have moved since the remote was asked.
+    #[must_use]
+    pub fn incoming(&self) -> String {
+        format!("refs/incoming/{}", self.commit)
+    }
+
+    /// The same name with the object that came.
+    #[must_use]
+    pub fn with_commit(&self, commit: String) -> Self {
+        let remote_name = if self.is_commit() { commit.clone() } else { self.remote_name.clone() };
+        Self { commit, remote_name, ..self.clone() }
+    }
+
     /// Fetches this commit alone.
     #[must_use]
     pub fn fetch_arguments(&self, location: &str) -> Vec<OsString> {
-        let refspec = format!("+{}:{}", self.remote_name, self.reference());
+        let refspec = format!("+{}:{}", self.remote_name, self.incoming());
         let options = ["fetch", "--depth=1", "--no-tags", "--no-write-fetch-head", "--progress", "--"];
         options.into_iter().map(OsString::from).chain([location.into(), refspec.into()]).collect()
     }
@@ -127,9 +147,15 @@ impl Revision {
     /// Lists the files of the project.
     #[must_use]
     pub fn list_arguments(&self) -> Vec<OsString> {
-        let fixed = ["ls-tree", "-r", "-l", "-z", "--full-tree", &self.reference()].map(OsString::from);
+        let fixed = ["ls-tree", "-r", "-l", "-z", "--full-tree", &self.reference(), "--"].map(OsString::from);
         let folder = (!self.folder.is_empty()).then(|| OsString::from(format!("{}/", self.folder)));
         fixed.into_iter().chain(folder).collect()
+    }
+
+    /// Asks what kind of object stands behind the name.
+    #[must_use]
+    pub fn kind_arguments(&self) -> Vec<OsString> {
+        ["cat-file", "-t", &format!("{}^{{}}", self.reference())].map(OsString::from).to_vec()
     }
 
     /// Where the world lies in the repository.
@@ -221,6 +247,13 @@ mod tests {
     fn only_branches_and_tags_vouch_for_a_commit() {
         let answer = format!("{A}\trefs/pull/1/head\n{B}\trefs/tags/v1^{{}}\n");
         assert!(is_tip(&answer, B) && !is_tip(&answer, A));
+    }
+
+    #[test]
+    fn a_hash_of_another_length_is_of_no_commit() {
+        let answer = format!("{A}\trefs/heads/main\n");
+        assert!(is_of_other_length(&answer, &"a".repeat(64)) && !is_of_other_length(&answer, B));
+        assert!(!is_of_other_length("", B), "nothing is known of an empty repository");
     }
 
     #[test]

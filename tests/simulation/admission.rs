@@ -12,7 +12,8 @@ async fn a_world_runs_only_where_its_repository_is_allowed() {
         forge.commit(name, "main", &[("worlds/a.wbt", "#VRML_SIM R2025a utf8\n")]);
     }
     let builder = simulation_server(&webots.path(), forge.path(), 2);
-    let server = builder.set("blockedRepositories", "https://github.com/lab/secret").start().await;
+    let blocked = serde_json::json!(["https://github.com/lab/secret", "https://github.com/lab/arm/blob/evil"]);
+    let server = builder.set("blockedRepositories", blocked).start().await;
     let end = "blob/main/worlds/a.wbt";
     let not_allowed = "is not one of the repositories that this simulation server allows";
     let wrong = "Wrong Webots simulation URL";
@@ -22,6 +23,11 @@ async fn a_world_runs_only_where_its_repository_is_allowed() {
         (format!("https://github.com/lab-evil/arm/{end}"), not_allowed),
         (format!("https://github.com/lab/secret/{end}"), "Cannot run simulation from blocked repository"),
         (format!("https://github.com/LAB/Secret/{end}"), "Cannot run simulation from blocked repository"),
+        (format!("https://github.com/lab/secret.git/{end}"), "Cannot run simulation from blocked repository"),
+        (format!("https://github.com/lab/secret.git.git/{end}"), "ends in .git more than once"),
+        ("https://github.com/lab/arm/blob/evil/worlds/a.wbt".to_owned(), "blocked repository"),
+        ("https://github.com/lab/arm/src/branch/evil/worlds/a.wbt".to_owned(), "blocked repository"),
+        ("https://github.com/lab/arm/-/blob/evil/worlds/a.wbt".to_owned(), "blocked repository"),
         (format!("https://github.com/lab/../lab-evil/arm/{end}"), wrong),
         (format!("https://github.com/lab/%2e%2e/lab-evil/arm/{end}"), wrong),
         (format!("https://github.com/lab%2farm/x/{end}"), wrong),

@@ -180,3 +180,15 @@ async fn mending_hurts_nobody_who_uses_what_is_damaged() {
     let _next = start().await;
     until("it is gone", async || !damaged.exists()).await;
 }
+
+#[actix_rt::test]
+async fn a_fetch_that_is_broken_off_leaves_nothing_in_the_cache() {
+    let (forge, webots) = (Forge::with_arm(), reader());
+    grow(&forge, "main", 30 << 20);
+    let builder = simulation_server(&webots.path(), forge.path(), 2).set("cacheSize", 1).set("projectSize", 2);
+    let server = builder.start().await;
+    let told = outcome(&server, &arm()).await;
+    assert!(told.contains("is larger than 2 MiB"), "{told}");
+    let folder = server.folder.join("cache/git");
+    until("the cache is within its budget", async || size_of(&folder) < 1 << 20).await;
+}

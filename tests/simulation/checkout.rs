@@ -72,6 +72,11 @@ async fn every_kind_of_url_opens_its_world() {
     forge.commit("lab/arm", "feature/arm", &[("sub/worlds/a.wbt", &world_text("slashes"))]);
     let quote = "q'\"$(touch${IFS}pwned)`id`";
     forge.commit("lab/arm", quote, &[("worlds/a.wbt", &world_text("quotes"))]);
+    forge.commit(
+        "lab/arm",
+        "dash",
+        &[("-p/worlds/a.wbt", &world_text("dash")), ("--/worlds/a.wbt", &world_text("two"))],
+    );
     forge.commit("group/team/leg", "main", &[("worlds/a.wbt", &world_text("gitlab"))]);
     let file = format!("file:{}", forge.path().display());
     let mirrors =
@@ -87,6 +92,8 @@ async fn every_kind_of_url_opens_its_world() {
         ("https://github.com/lab/arm/blob/main/p%20q/worlds/b%20%C3%A9.wbt".to_owned(), "spaces"),
         ("https://github.com/lab/arm/blob/feature/arm/sub/worlds/a.wbt".to_owned(), "slashes"),
         ("https://github.com/lab/arm/blob/q'%22$(touch$%7BIFS%7Dpwned)%60id%60/worlds/a.wbt".to_owned(), "quotes"),
+        ("https://github.com/lab/arm/blob/dash/-p/worlds/a.wbt".to_owned(), "dash"),
+        ("https://github.com/lab/arm/blob/dash/--/worlds/a.wbt".to_owned(), "two"),
         ("https://gitlab.lab/group/team/leg/-/blob/main/worlds/a.wbt".to_owned(), "gitlab"),
         ("https://gitea.lab:3000/lab/arm/src/branch/feature/arm/sub/worlds/a.wbt".to_owned(), "slashes"),
         ("https://gitea.lab:3000/lab/arm/src/tag/v1.0/worlds/a.wbt".to_owned(), "root of main"),

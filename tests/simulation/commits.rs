@@ -4,6 +4,7 @@ use crate::checkout::{cached, outcome, reader, world_text};
 use crate::git_wrapper::GitWrapper;
 use crate::support::git::{Forge, WORLD, git, world};
 use crate::support::program::simulation_server;
+use crate::support::until;
 
 #[actix_rt::test]
 async fn any_commit_of_a_branch_or_tag_runs() {
@@ -84,4 +85,70 @@ async fn a_history_that_is_too_large_is_told() {
     let server = simulation_server(&webots.path(), forge.path(), 2).set("projectSize", 1).start().await;
     let told = outcome(&server, &world("lab/arm", &old, "worlds/a.wbt")).await;
     assert_eq!(told, "loading: Error: The history of https://github.com/lab/arm is larger than 1 MiB");
+}
+
+#[actix_rt::test]
+async fn a_branch_that_moves_while_it_is_fetched_is_cached_under_the_commit_that_came() {
+    let (forge, webots) = (Forge::new(), reader());
+    let first = forge.commit("lab/arm", "main", &[("worlds/a.wbt", &world_text("first"))]);
+    let second = forge.commit("lab/arm", "next", &[("worlds/a.wbt", &world_text("second"))]);
+    let bare = forge.path().join("lab/arm");
+    let moves = format!(
+        "case \"$*\" in *\" fetch \"*) env -u GIT_CONFIG_GLOBAL $REAL --git-dir {} update-ref refs/heads/main {second};; esac",
+        bare.display()
+    );
+    let wrapper = GitWrapper::new(&moves);
+    let server = simulation_server(&webots.path(), forge.path(), 2).env("PATH", &wrapper.path()).start().await;
+    let told = outcome(&server, &world("lab/arm", "main", "worlds/a.wbt")).await;
+    assert!(told.contains("opened [second]"), "{told}");
+    let commits = std::fs::read_dir(cached(&server)[0].join("refs/fleet")).unwrap().flatten();
+    let names: Vec<String> = commits.map(|entry| entry.file_name().into_string().unwrap()).collect();
+    assert_eq!(names, [second.as_str()]);
+    git(&bare, &["update-ref", "refs/heads/main", &first]);
+    git(&bare, &["tag", "old", &first]);
+    let told = outcome(&server, &world("lab/arm", &first, "worlds/a.wbt")).await;
+    assert!(told.contains("opened [first]"), "{told}");
+}
+
+#[actix_rt::test]
+async fn locks_that_a_killed_fetch_of_the_history_has_left_stop_no_other() {
+    let (forge, webots) = (Forge::new(), reader());
+    let commit = |text: &str| forge.commit("lab/arm", "main", &[("worlds/a.wbt", &world_text(text))]);
+    let commits = [commit("first"), commit("second")];
+    let server = simulation_server(&webots.path(), forge.path(), 2).start().await;
+    assert!(outcome(&server, &world("lab/arm", &commits[0], "worlds/a.wbt")).await.contains("opened [first]"));
+    let history = cached(&server).into_iter().find(|path| path.to_string_lossy().contains("history")).unwrap();
+    for lock in ["refs/heads/main.lock", "packed-refs.lock"] {
+        std::fs::write(history.join(lock), "").unwrap();
+    }
+    commit("third");
+    let told = outcome(&server, &world("lab/arm", &commits[1], "worlds/a.wbt")).await;
+    assert!(told.contains("opened [second]"), "{told}");
+}
+
+#[actix_rt::test]
+async fn wrong_names_are_told_in_words_and_no_cache_is_examined_for_them() {
+    let (forge, webots) = (Forge::with_arm(), reader());
+    let bare = forge.path().join("lab/arm");
+    let file = git(&bare, &["rev-parse", "main:worlds/a.wbt"]);
+    git(&bare, &["tag", "file", file.trim()]);
+    git(&bare, &["tag", "--annotate", "--message", "file", "note", file.trim()]);
+    for any in [false, true] {
+        let wrapper = GitWrapper::new("");
+        let builder = simulation_server(&webots.path(), forge.path(), 2).env("PATH", &wrapper.path());
+        let server = builder.set("anyCommit", any).start().await;
+        assert!(outcome(&server, &world("lab/arm", "main", "worlds/a.wbt")).await.contains("opened"));
+        for name in ["file", "note", &"a".repeat(64)] {
+            let told = outcome(&server, &world("lab/arm", name, "worlds/a.wbt")).await;
+            assert!(told.contains(&format!("has no branch, tag or commit called {name:?}")), "{told}");
+        }
+        assert!(!wrapper.calls().iter().any(|call| call.contains("fsck")), "{:#?}", wrapper.calls());
+        let told = outcome(&server, &world("lab/none", "main", "worlds/a.wbt")).await;
+        assert!(told.contains("does not exist"), "{told}");
+        let entries = || std::fs::read_dir(server.folder.join("cache/git")).unwrap().flatten();
+        until("nothing is left of it", async || {
+            !entries().any(|entry| entry.file_name().to_string_lossy().contains("none"))
+        })
+        .await;
+    }
 }
