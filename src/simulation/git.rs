@@ -20,6 +20,7 @@ pub struct Git {
     mark: PathBuf,
     /// Whether the system has a program that makes another end with its parent.
     has_setpriv: bool,
+    has_nice: bool,
 }
 
 /// One git command.
@@ -104,7 +105,7 @@ impl Git {
     pub fn new(run: &Path) -> std::io::Result<Self> {
         let settings = run.join("gitconfig");
         std::fs::write(&settings, SETTINGS)?;
-        Ok(Self { settings, mark: run.to_owned(), has_setpriv: is_in_path("setpriv") })
+        Ok(Self { settings, mark: run.to_owned(), has_setpriv: is_in_path("setpriv"), has_nice: is_in_path("nice") })
     }
 
     /// Runs a command to its end and gives back its answer. `progress` hears each line of progress.
@@ -156,6 +157,9 @@ impl Git {
     fn plan(&self, call: Call<'_>) -> Plan {
         // Whoever watches over the servers, and whoever runs a simulation already, comes before a checkout.
         let mut command: Vec<OsString> = ["nice", "git", "--literal-pathspecs", "--git-dir"].map(OsString::from).into();
+        if !self.has_nice {
+            command.remove(0);
+        }
         command.push(call.repository.into());
         command.extend(call.arguments);
         let fixed: [(&str, &OsStr); 7] = [

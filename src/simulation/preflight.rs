@@ -73,12 +73,15 @@ fn display(config: &SimulationConfig) -> Result<String, String> {
 }
 
 fn xvfb_run(config: &SimulationConfig) -> Result<String, String> {
-    match in_path("xvfb-run") {
-        Some(program) => Ok(program.display().to_string()),
-        None if config.xvfb => Err("xvfb-run is not there, but xvfb is true: no Webots can start. On Debian and \
-                                    Ubuntu the packages xvfb and xauth have it"
-            .to_owned()),
-        None => Ok("it is not there, and not needed: xvfb is false".to_owned()),
+    // It is a script that needs the other two.
+    let missing = ["xvfb-run", "Xvfb", "xauth"].into_iter().find(|program| in_path(program).is_none());
+    match (missing, in_path("xvfb-run")) {
+        (Some(missing), _) if config.xvfb => Err(format!(
+            "{missing} is not there, but xvfb is true: no Webots can start. On Debian and Ubuntu the packages xvfb and \
+             xauth have it"
+        )),
+        (_, Some(program)) => Ok(program.display().to_string()),
+        (_, None) => Ok("it is not there, and not needed: xvfb is false".to_owned()),
     }
 }
 
