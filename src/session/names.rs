@@ -35,9 +35,10 @@ impl Names {
         if let Some(lookup) = under_way.as_ref().filter(|lookup| lookup.peek().is_none()) {
             return lookup.clone();
         }
-        let name = host.to_owned();
+        // As one text, for an IPv6 address has brackets here.
+        let name = format!("{host}:{port}");
         let lookup = actix_rt::spawn(async move {
-            let found = tokio::net::lookup_host((name, port)).await;
+            let found = tokio::net::lookup_host(name).await;
             found.map(Iterator::collect).map_err(|error| error.to_string())
         });
         let lookup = lookup.map(|ended| ended.unwrap_or_else(|error| Err(error.to_string()))).boxed_local().shared();

@@ -33,11 +33,11 @@ struct Glance {
     answering: usize,
     taking: usize,
     down: usize,
-    running: u32,
-    idle: u32,
-    starting: u32,
-    queued: u32,
-    places: u32,
+    running: u64,
+    idle: u64,
+    starting: u64,
+    queued: u64,
+    places: u64,
 }
 
 /// The cells of one simulation server.
@@ -126,7 +126,8 @@ impl Glance {
     fn new(status: &FleetStatus, clients: usize) -> Self {
         let count = |wanted: &[State]| status.servers.iter().filter(|server| wanted.contains(&server.state)).count();
         let instances = || status.servers.iter().filter_map(known_instances);
-        let sum = |part: fn(Instances) -> u32| instances().map(part).sum::<u32>();
+        // Another server's numbers may be anything.
+        let sum = |part: fn(Instances) -> u32| instances().map(|one| u64::from(part(one))).sum::<u64>();
         Self {
             available: status.available,
             clients,

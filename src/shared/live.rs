@@ -115,7 +115,10 @@ impl Live {
         };
         if !std::mem::replace(&mut state.running, true) {
             let live = self.clone();
-            actix_rt::spawn(async move { live.render_each_period(render).await });
+            actix_rt::spawn(async move {
+                let _task = Task(live.clone());
+                live.render_each_period(render).await;
+            });
         }
         drop(state);
         HttpResponse::Ok()
@@ -134,9 +137,7 @@ impl Live {
         loop {
             let periods = render().await.map_or(1, |view| self.publish(view));
             actix_rt::time::sleep(PERIOD * periods).await;
-            let mut state = self.lock();
             if self.events.receiver_count() == 0 {
-                *state = State::default();
                 return;
             }
         }
@@ -149,7 +150,7 @@ impl Live {
         // The first one is the whole page, and nobody waits for the second because of it.
         let size = event.as_ref().filter(|_| state.view.is_some()).map_or(0, Bytes::len);
         state.quiet = if event.is_some() { 0 } else { state.quiet + 1 };
-        let quiet = state.quiet.is_multiple_of(QUIET).then(|| Bytes::from_static(b": nothing new\n\n"));
+        let quiet = state.quiet.is_multiple_of(QUIET).then(|| Bytes::from_static(b"data: {}\n\n"));
         state.view = Some(view);
         if let Some(event) = event.or(quiet) {
             // Nobody may be there to hear it.
@@ -166,6 +167,18 @@ impl Live {
 impl Default for Live {
     fn default() -> Self {
         Self::new()
+    }
+}
+
+/// The task that renders. When it ends, be it by a panic, the pages that still listen are sent away: they come back,
+/// and the next one starts another.
+struct Task(Live);
+
+impl Drop for Task {
+    fn drop(&mut self) {
+        let mut state = self.0.lock();
+        *state = State::default();
+        self.0.events.send(Bytes::new()).ok();
     }
 }
 
@@ -186,6 +199,7 @@ impl Listener {
             () = &mut self.closing => return None,
         };
         match event {
+            Ok(end) if end.is_empty() => None,
             Ok(event) => Some((Ok(event), self)),
             Err(broadcast::error::RecvError::Closed) => None,
             Err(broadcast::error::RecvError::Lagged(_)) => {
@@ -326,5 +340,17 @@ mod tests {
             assert!(std::time::Instant::now() < deadline, "it runs for nobody");
             actix_rt::time::sleep(Duration::from_millis(20)).await;
         }
+    }
+
+    #[actix_rt::test]
+    async fn a_page_whose_task_has_failed_is_sent_away_and_may_come_back() {
+        let live = Live::new();
+        let (_sender, phase) = watch::channel(Phase::Open);
+        let page = live.listen(phase.clone(), || async { panic!("this panic is part of a test") });
+        let end = actix_web::body::to_bytes(page.into_body());
+        assert!(actix_rt::time::timeout(Duration::from_secs(10), end).await.is_ok(), "it waits for ever");
+        assert!(!live.lock().running);
+        let _again = live.listen(phase, || async { Some(View::default()) });
+        assert!(live.lock().running);
     }
 }

@@ -10,6 +10,9 @@ const cells = new WeakMap();
 /** Compares as people do: 2 comes before 10. */
 const alphabet = new Intl.Collator(undefined, { numeric: true });
 let source;
+/** When the server was heard last; it says something every 15 seconds. */
+let heard;
+const SILENCE = 40_000;
 
 /** Calls a function with the numbers of each event that has some; `fresh` tells that events may have been missed. */
 export function onSample(listener) {
@@ -125,6 +128,7 @@ function makeSortable(table) {
 }
 
 function take(event) {
+  heard = Date.now();
   const { version, parts = {}, tables = {}, sample } = JSON.parse(event.data);
   if (version && version !== document.documentElement.dataset.version) {
     location.reload();
@@ -145,19 +149,36 @@ function take(event) {
 function listen() {
   if (document.hidden || source)
     return;
+  heard = Date.now();
   source = new EventSource('events');
-  source.addEventListener('open', () => say('Live', false));
+  source.addEventListener('open', () => {
+    heard = Date.now();
+    say('Live', false);
+  });
   source.addEventListener('message', take);
   source.addEventListener('error', () => {
-    const since = new Date().toLocaleTimeString();
-    if (!lamp.classList.contains('lost'))
-      say(`No connection since ${since}: what you see is old. Trying again …`, true);
+    lose();
     if (source?.readyState === EventSource.CLOSED) {
       rest();
       setTimeout(listen, 3000);
     }
   });
 }
+
+function lose() {
+  const since = new Date(heard).toLocaleTimeString();
+  if (!lamp.classList.contains('lost'))
+    say(`No connection since ${since}: what you see is old. Trying again …`, true);
+}
+
+/** A server that hangs and a network that swallows everything close no connection. */
+setInterval(() => {
+  if (source && Date.now() - heard > SILENCE) {
+    lose();
+    rest();
+    listen();
+  }
+}, 5000);
 
 function rest() {
   source?.close();

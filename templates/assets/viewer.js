@@ -11,12 +11,16 @@ let simulation;
 let viewer;
 let countdown;
 let wanted;
+let patience;
 
 /* the light */
 
 let door;
+/** How many answers nobody waits for any more are still to come. */
+let stale = 0;
 
 function openDoor() {
+  stale = 0;
   const url = new URL('session', location.href);
   url.protocol = url.protocol === 'https:' ? 'wss:' : 'ws:';
   door = new WebSocket(url);
@@ -42,6 +46,8 @@ function hear(text) {
     light('on', 'Available', 'A simulation server can take you.');
   else if (text === '0')
     light('off', 'Not available', 'All simulation servers are busy or do not answer.');
+  else if (stale > 0)
+    stale -= 1;
   else if (wanted)
     chosen(text);
 }
@@ -92,13 +98,17 @@ function start(event) {
   wanted = find('url').value.trim();
   busy(true);
   step({ step: 'session', state: 'doing', text: 'choosing a simulation server' });
-  if (door.readyState === WebSocket.OPEN)
-    door.send(JSON.stringify({ url: wanted }));
-  else
+  if (door.readyState !== WebSocket.OPEN) {
+    wanted = undefined;
     failed('The session server could not be reached.');
+    return;
+  }
+  door.send(JSON.stringify({ url: wanted }));
+  patience = setTimeout(() => failed('The session server does not answer.'), 10_000);
 }
 
 function chosen(answer) {
+  clearTimeout(patience);
   const world = wanted;
   wanted = undefined;
   if (answer.startsWith('Error:')) {
@@ -201,6 +211,9 @@ function busy(now) {
 
 function leave() {
   clearInterval(countdown);
+  clearTimeout(patience);
+  if (wanted)
+    stale += 1;
   find('left').hidden = true;
   wanted = undefined;
   const [oldViewer, oldSimulation] = [viewer, simulation];

@@ -98,6 +98,28 @@ async fn absurd_numbers_do_no_harm() {
     let session = session_server(&addresses(&servers)).start().await;
     until_states(&session, &["full", "up"]).await;
     assert_eq!(http::get(&session.url("/session")).await.text(), servers[1].url());
+    assert_eq!(http::get(&session.url("/monitor")).await.status, 200);
+    assert!(!session.log().contains("overflow"));
+}
+
+#[actix_rt::test]
+async fn a_server_may_be_named_by_an_ipv6_address() {
+    use std::io::{Read, Write};
+    let socket = std::net::TcpListener::bind("[::1]:0").unwrap();
+    let address = socket.local_addr().unwrap().to_string();
+    std::thread::spawn(move || {
+        for mut stream in socket.incoming().flatten() {
+            let mut request = [0; 2048];
+            while stream.read(&mut request).is_ok_and(|length| length > 0) {
+                let answer = b"HTTP/1.1 200 OK\r\nContent-Length: 11\r\nConnection: close\r\n\r\n{\"load\": 5}";
+                if stream.write_all(answer).is_err() {
+                    break;
+                }
+            }
+        }
+    });
+    let session = session_server(&[address]).start().await;
+    until_states(&session, &["up"]).await;
 }
 
 #[actix_rt::test]
