@@ -159,14 +159,16 @@ fn with_sizes(gpus: &[Gpu]) -> Vec<(&Gpu, String)> {
     gpus.iter().map(|gpu| (gpu, bytes(gpu.memory_total))).collect()
 }
 
+/// What the forges have between a repository and what is in it.
+const WORDS: [&str; 4] = ["/-/", "/blob/", "/tree/", "/src/"];
+
 impl<'one> SimulationRow<'one> {
     fn new(one: &'one Simulation, usage: Option<Usage>, limit: u64) -> Self {
         let (stage, class) = words(one.stage);
         let ends = one.launched.map_or(0, |launched| launched + limit);
         let now = seconds_since_1970();
         let path = one.world.split_once("://").map_or(one.world.as_str(), |(_, path)| path);
-        let (repository, file) =
-            path.split_once("/blob/").or_else(|| path.split_once("/tree/")).unwrap_or((path, path));
+        let (repository, file) = WORDS.iter().find_map(|word| path.split_once(word)).unwrap_or((path, path));
         Self {
             one,
             world: file.rsplit('/').next().unwrap_or(file),
@@ -235,11 +237,10 @@ mod tests {
         }
     }
 
-    #[test]
-    fn what_a_client_names_is_only_text() {
-        let one = Simulation {
+    fn simulation(world: &str) -> Simulation {
+        Simulation {
             id: 1,
-            world: "https://github.com/u/<b>\"'&/blob/main/worlds/<script>.wbt".to_owned(),
+            world: world.to_owned(),
             stage: Stage::Idle,
             since: 0,
             launched: Some(1),
@@ -248,7 +249,24 @@ mod tests {
             version: None,
             log: None,
             log_begin: 0,
-        };
+        }
+    }
+
+    #[test]
+    fn a_repository_is_named_as_its_forge_does() {
+        for (world, name) in [
+            ("https://github.com/u/r/blob/main/src/worlds/a.wbt", "github.com/u/r"),
+            ("https://github.com/u/r/tree/main/worlds/a.wbt", "github.com/u/r"),
+            ("https://gitlab.com/g/s/r/-/blob/main/worlds/a.wbt", "gitlab.com/g/s/r"),
+            ("https://codeberg.org/u/r/src/branch/main/worlds/a.wbt", "codeberg.org/u/r"),
+        ] {
+            assert_eq!(SimulationRow::new(&simulation(world), None, 7200).repository, name);
+        }
+    }
+
+    #[test]
+    fn what_a_client_names_is_only_text() {
+        let one = simulation("https://github.com/u/<b>\"'&/blob/main/worlds/<script>.wbt");
         let html = SimulationRow::new(&one, None, 7200).render().unwrap();
         assert!(!html.contains("<script>") && !html.contains("<b>"), "{html}");
     }
