@@ -3,6 +3,7 @@
 Everything is on the loopback, in folders that end with the test; the programs come from the folder FLEET_BIN.
 """
 
+import contextlib
 import json
 import os
 import pathlib
@@ -99,6 +100,15 @@ class Server:
 
     def status(self):
         return json.loads(self.get("status"))
+
+    @contextlib.contextmanager
+    def hanging(self):
+        """Lets it do nothing, while its connections stay open."""
+        self.process.send_signal(signal.SIGSTOP)
+        try:
+            yield
+        finally:
+            self.process.send_signal(signal.SIGCONT)
 
     def kill(self):
         """Ends it without a warning, as a power failure would."""

@@ -20,6 +20,15 @@ COLUMNS = [
 class Monitors(BrowserTest):
     simulation = {"blockedRepositories": ["https://github.com/demo/blocked"]}
 
+    def test_a_page_notices_that_its_server_hangs(self):
+        page = self.open(self.fleet.session.url("monitor"))
+        lamp = page.tab.locator("#live")
+        expect(lamp).to_have_text("Live")
+        with self.fleet.session.hanging():
+            # No connection ends by that: the page misses the sign of life.
+            expect(lamp).to_contain_text("what you see is old", timeout=60_000)
+        expect(lamp).to_have_text("Live", timeout=20_000)
+
     def test_a_server_that_is_killed_turns_red_without_a_reload(self):
         page = self.open(self.fleet.session.url("monitor"))
         expect(page.tab.locator("#live")).to_have_text("Live")

@@ -54,6 +54,21 @@ class Viewing(BrowserTest):
                 expect(page.tab.locator(".steps .failed")).to_have_count(1)
                 expect(page.tab.get_by_role("button", name="Connect", exact=True)).to_be_enabled()
 
+    def test_a_session_server_that_hangs_is_told_and_its_late_answer_is_nobodys(self):
+        page = self.open(self.fleet.session.url("viewer"))
+        expect(page.tab.locator("#light")).to_contain_text("Available")
+        connect = page.tab.get_by_role("button", name="Connect", exact=True)
+        with self.fleet.session.hanging():
+            page.tab.get_by_label("URL of a world").fill("https://github.com/stranger/worlds/blob/main/worlds/a.wbt")
+            connect.click()
+            expect(page.tab.locator("#problem-text")).to_contain_text("does not answer", timeout=20_000)
+            expect(connect).to_be_enabled()
+        # The refusal of the stranger's world comes now, before the answer to this one.
+        page.tab.get_by_role("button", name="Playground").click()
+        connect.click()
+        expect(page.tab.locator("[data-step=simulation].done")).to_be_visible(timeout=20_000)
+        expect(page.tab.locator("#problem")).to_be_hidden()
+
     def test_on_a_phone_the_scene_comes_into_sight(self):
         page, _ = self.start_world(width=360, height=740)
         expect(page.tab.locator("#view")).to_be_in_viewport(ratio=0.9)
