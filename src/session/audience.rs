@@ -39,6 +39,9 @@ pub struct Audience {
 
 /// Between two tries to tell a client whose mailbox was full.
 const AGAIN: Duration = Duration::from_millis(250);
+/// So many clients are told at a time, and then write before others are told: what a client needs for that is then still
+/// in the processor's cache.
+const BATCH: usize = 32;
 /// How many clients may join in one moment; more wait outside.
 const CROWD: usize = 4096;
 
@@ -49,11 +52,20 @@ impl Audience {
         Self { server, clients: Subscribers::default(), news: None }
     }
 
-    fn tell(&mut self, news: News) {
+    fn tell(&mut self, news: News, ctx: &mut Context<Self>) {
         // Nothing is news any more once the server ends.
         if self.news != Some(News::Closing) {
             self.news = Some(news);
-            self.clients.tell(news);
+            self.tell_from(0, ctx);
+        }
+    }
+
+    /// Tells the newest, a batch at a time.
+    fn tell_from(&mut self, id: u64, ctx: &mut Context<Self>) {
+        let Some(news) = self.news else { return };
+        if let Some(next) = self.clients.tell_some(id, BATCH, news) {
+            let turn = tokio::task::yield_now().into_actor(self);
+            turn.map(move |(), audience, ctx| audience.tell_from(next, ctx)).spawn(ctx);
         }
     }
 }
@@ -65,7 +77,7 @@ impl Actor for Audience {
         ctx.set_mailbox_capacity(CROWD);
         self.server.registry.do_send(Subscribe(ctx.address().recipient()));
         let ending = closing(self.server.phase.clone()).into_actor(self);
-        ending.map(|(), audience, _| audience.tell(News::Closing)).spawn(ctx);
+        ending.map(|(), audience, ctx| audience.tell(News::Closing, ctx)).spawn(ctx);
         ctx.run_interval(AGAIN, |audience, _| {
             if let Some(news) = audience.news {
                 audience.clients.tell_late(news);
@@ -77,8 +89,8 @@ impl Actor for Audience {
 impl Handler<News> for Audience {
     type Result = ();
 
-    fn handle(&mut self, news: News, _: &mut Self::Context) {
-        self.tell(news);
+    fn handle(&mut self, news: News, ctx: &mut Self::Context) {
+        self.tell(news, ctx);
     }
 }
 

@@ -1,6 +1,6 @@
 //! Who is told the news, and what each was told last. Part of the registry and of each audience.
 
-use std::collections::HashMap;
+use std::collections::BTreeMap;
 
 use actix::prelude::*;
 
@@ -17,7 +17,9 @@ pub enum News {
 /// The subscribers: each is told the same news once.
 #[derive(Default)]
 pub struct Subscribers {
-    members: HashMap<u64, Subscriber>,
+    /// In the order in which they came: their sockets lie in the system's memory in that order too, mostly, so that
+    /// telling them takes less time in it than in any other (`cargo bench --bench fleet -- push` measures it).
+    members: BTreeMap<u64, Subscriber>,
     last: u64,
     /// Those who could not be told the last change, for their mailboxes were full.
     late: Vec<u64>,
@@ -60,13 +62,25 @@ impl Subscribers {
     /// Tells everybody who was told something else.
     pub fn tell(&mut self, news: News) {
         self.late.clear();
-        self.members.retain(|id, subscriber| {
-            let told = subscriber.tell(news);
-            if told == Told::Later {
-                self.late.push(*id);
+        self.tell_some(0, usize::MAX, news);
+    }
+
+    /// The same for so many of them, from this number on. Gives back where to go on, if there are more.
+    pub fn tell_some(&mut self, from: u64, most: usize, news: News) -> Option<u64> {
+        let mut gone = Vec::new();
+        let mut members = self.members.range_mut(from..);
+        for (id, subscriber) in members.by_ref().take(most) {
+            match subscriber.tell(news) {
+                Told::Now => {}
+                Told::Later => self.late.push(*id),
+                Told::Gone => gone.push(*id),
             }
-            told != Told::Gone
-        });
+        }
+        let next = members.next().map(|(id, _)| *id);
+        for id in gone {
+            self.remove(id);
+        }
+        next
     }
 
     /// Tells those who could not be told before.

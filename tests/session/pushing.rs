@@ -33,7 +33,8 @@ async fn no_value_comes_twice_however_a_server_flaps() {
     let servers = [StandIn::start(Manner::idle(1.0, 1000))];
     let session = session_server(&addresses(&servers)).set("loadRefresh", 0.01).set("clientCost", 0.1).start().await;
     let paths = ["/session", "/"].into_iter().cycle().map(|path| session.websocket(path));
-    let mut clients = join_all(paths.take(50).map(|url| async move { Client::connect(&url).await })).await;
+    // More than are told at a time.
+    let mut clients = join_all(paths.take(150).map(|url| async move { Client::connect(&url).await })).await;
     let flap = async {
         for turn in 0..60 {
             let manner = match turn % 4 {
