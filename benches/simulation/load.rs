@@ -1,38 +1,20 @@
 //! How fast `/load` answers while ten checkouts run, one remote hangs, and a simulator floods its output.
-//!
-//! `cargo bench --bench simulation_load [-- --requests N]`
-
-#![allow(
-    missing_docs,
-    unreachable_pub,
-    clippy::pedantic,
-    clippy::unwrap_used,
-    clippy::expect_used,
-    clippy::panic,
-    clippy::indexing_slicing,
-    reason = "a measurement that fails ends with a panic"
-)]
-
-#[path = "../tests/support/mod.rs"]
-mod support;
 
 use std::io::{Read, Write};
 use std::net::TcpStream;
 use std::time::{Duration, Instant};
 
-use support::client::Client;
-use support::git::{Forge, world};
-use support::program::simulation_server;
-use support::webots::Webots;
+use crate::Verdict;
+use crate::support::client::Client;
+use crate::support::git::{Forge, world};
+use crate::support::program::simulation_server;
+use crate::support::webots::Webots;
 
-fn main() {
-    let arguments: Vec<String> = std::env::args().collect();
-    let requests =
-        arguments.iter().position(|one| one == "--requests").map_or(2000, |at| arguments[at + 1].parse().unwrap());
-    actix_rt::System::new().block_on(measure(requests));
-}
+/// So long may an answer take, whatever else the server does.
+const BOUND: Duration = Duration::from_millis(1);
 
-async fn measure(requests: usize) {
+pub async fn measure(verdict: &mut Verdict, requests: usize) {
+    println!("/load, {requests} requests in a row:");
     let forge = Forge::new();
     for n in 0..10 {
         let text = "#VRML_SIM R2025a utf8\nWorldInfo { }\n";
@@ -54,13 +36,13 @@ async fn measure(requests: usize) {
         "https://github.com/lab/hangs": format!("https://127.0.0.1:{}/", hanging.local_addr().unwrap().port()),
     });
     let server = simulation_server(&webots.path(), forge.path(), 12).set("gitMirrors", mirrors).start().await;
-    report("idle", &ask(server.port, requests).await);
+    report(verdict, "idle", &ask(server.port, requests).await);
     let _stuck = Client::start(&server, &world("lab/hangs", "main", "worlds/a.wbt")).await;
     let mut clients = Vec::new();
     for n in 0..10 {
         clients.push(Client::start(&server, &world(&format!("lab/r{n}"), "main", "worlds/a.wbt")).await);
     }
-    report("ten checkouts, one hangs", &ask(server.port, requests).await);
+    report(verdict, "ten checkouts, one hangs", &ask(server.port, requests).await);
     for client in &mut clients {
         client.until("webots:").await;
     }
@@ -68,7 +50,7 @@ async fn measure(requests: usize) {
     let flooded = simulation_server(&flood.path(), forge.path(), 1).start().await;
     let mut client = Client::start(&flooded, &world("lab/r0", "main", "worlds/a.wbt")).await;
     client.until("webots:").await;
-    report("a flood of output", &ask(flooded.port, requests).await);
+    report(verdict, "a flood of output", &ask(flooded.port, requests).await);
 }
 
 /// Times of requests on one open connection, as a session server asks.
@@ -96,7 +78,8 @@ async fn ask(port: u16, requests: usize) -> Vec<Duration> {
     .unwrap()
 }
 
-fn report(what: &str, times: &[Duration]) {
+fn report(verdict: &mut Verdict, what: &str, times: &[Duration]) {
     let at = |part: f64| times[((times.len() - 1) as f64 * part) as usize];
-    println!("{what:<26} median {:>9.3?}  p99 {:>9.3?}  worst {:>9.3?}", at(0.5), at(0.99), at(1.0));
+    println!("  {what:<26} median {:>9.3?}  p99 {:>9.3?}  worst {:>9.3?}", at(0.5), at(0.99), at(1.0));
+    verdict.bound("p99", at(0.99), BOUND);
 }

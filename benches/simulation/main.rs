@@ -1,0 +1,104 @@
+//! Measures the simulation server: `cargo bench --bench simulation [-- PART ...]`.
+//!
+//! It starts the built program, with a stand-in for the forge and the demo simulator for Webots:
+//! - `load`: how fast `/load` answers while ten checkouts run, one remote hangs, and a simulator floods its output;
+//! - `start`: what a cached start costs over the git commands that it runs;
+//! - `soak`: whether a thousand starts and stops in a row leave anything: processes, file descriptors, ports, folders,
+//!   threads, memory.
+//!
+//! It fails if a bound is not kept. What else runs on the machine counts too.
+
+#![allow(
+    missing_docs,
+    unreachable_pub,
+    clippy::pedantic,
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::panic,
+    clippy::indexing_slicing,
+    reason = "a measurement that fails ends with a panic"
+)]
+
+mod load;
+#[path = "../../tests/simulation/soak.rs"]
+mod soak;
+mod start;
+#[path = "../../tests/support/mod.rs"]
+mod support;
+
+use std::process::ExitCode;
+use std::time::{Duration, Instant};
+
+use clap::{Parser, ValueEnum};
+
+#[derive(Parser)]
+struct Arguments {
+    /// What to measure; everything, if nothing is named.
+    #[arg(value_enum)]
+    parts: Vec<Part>,
+    /// Starts in a row for `soak`.
+    #[arg(long, default_value_t = 1000)]
+    starts: usize,
+    /// Requests of each row of `load`.
+    #[arg(long, default_value_t = 2000)]
+    requests: usize,
+    /// Cached starts for `start`.
+    #[arg(long, default_value_t = 100)]
+    cached: usize,
+    /// cargo adds this.
+    #[arg(long, hide = true)]
+    bench: bool,
+}
+
+#[derive(Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum Part {
+    Load,
+    Start,
+    Soak,
+}
+
+/// Whether each bound was kept.
+#[derive(Default)]
+struct Verdict {
+    failed: bool,
+}
+
+impl Verdict {
+    fn bound(&mut self, what: &str, value: Duration, most: Duration) {
+        let kept = value <= most;
+        self.failed |= !kept;
+        println!("  {} {what}: {value:.3?}, bound {most:?}", if kept { "kept  " } else { "BROKEN" });
+    }
+}
+
+#[actix_rt::main]
+async fn main() -> ExitCode {
+    let arguments = Arguments::parse();
+    let is_wanted = |part| arguments.parts.is_empty() || arguments.parts.contains(&part);
+    let mut verdict = Verdict::default();
+    if is_wanted(Part::Load) {
+        load::measure(&mut verdict, arguments.requests).await;
+    }
+    if is_wanted(Part::Start) {
+        start::measure(&mut verdict, arguments.cached).await;
+    }
+    if is_wanted(Part::Soak) {
+        soak_and_tell(&mut verdict, arguments.starts).await;
+    }
+    if verdict.failed { ExitCode::FAILURE } else { ExitCode::SUCCESS }
+}
+
+async fn soak_and_tell(verdict: &mut Verdict, starts: usize) {
+    let begin = Instant::now();
+    let (before, after) = soak::soak(starts).await;
+    println!("{starts} starts and stops in {:.0?}", begin.elapsed());
+    println!("{:<24}{:>10}{:>10}", "", "before", "after");
+    for ((name, before), (_, after)) in before.rows().iter().zip(after.rows()) {
+        println!("{name:<24}{before:>10}{after:>10}");
+    }
+    let leaks = after.leaks_since(&before, starts);
+    for leak in &leaks {
+        println!("  BROKEN {leak}");
+    }
+    verdict.failed |= !leaks.is_empty();
+}
