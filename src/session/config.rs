@@ -10,7 +10,7 @@ use super::placement::Policy;
 use crate::shared::address::{PublicAddress, check_host};
 use crate::shared::config::{Configuration, Unfit, differences};
 use crate::shared::config_value::{
-    ExpandedPath, Secret, folder, local_address, one_or_many, optional_port, percent, seconds, threshold, whole,
+    ExpandedPath, Secret, folder, local_address, object, one_or_many, optional_port, percent, seconds, threshold, whole,
 };
 use crate::shared::peer::TrustedProxies;
 
@@ -93,7 +93,7 @@ pub struct SessionConfig {
     #[serde(default)]
     pub viewer_script: Option<url::Url>,
     /// Every other duration.
-    #[serde(default)]
+    #[serde(default, deserialize_with = "object")]
     pub timing: Timing,
 }
 
@@ -108,7 +108,7 @@ pub struct Example {
 }
 
 #[derive(Deserialize)]
-#[serde(untagged, expecting = "it is neither a URL nor {\"title\": ..., \"url\": ...}")]
+#[serde(untagged, deny_unknown_fields, expecting = "it is neither a URL nor {\"title\": ..., \"url\": ...}")]
 enum WireExample {
     Url(String),
     Titled { title: Option<String>, url: String },
@@ -126,7 +126,7 @@ impl From<WireExample> for Example {
 
 /// Durations, in seconds.
 #[derive(Debug, Clone, Serialize, Deserialize)]
-#[serde(rename_all = "camelCase", default, deny_unknown_fields, expecting = "an object of durations")]
+#[serde(rename_all = "camelCase", default, deny_unknown_fields)]
 pub struct Timing {
     /// How long a simulation server may take to answer. Default: 3.
     #[serde(with = "seconds")]
@@ -155,7 +155,7 @@ pub struct Timing {
     /// How long an SMTP server may take for one mail. Default: 30.
     #[serde(with = "seconds")]
     pub mail_answer: Duration,
-    /// How long open connections may take to end when the server stops. Default: 4.
+    /// How long open connections may take to end when the server stops, at most 4.5. Default: 4.
     #[serde(with = "seconds")]
     pub stop: Duration,
 }
@@ -176,6 +176,9 @@ impl Default for Timing {
         }
     }
 }
+
+/// The most that open connections may take to end, for the server ends within five seconds.
+const LONGEST_STOP: Duration = Duration::from_millis(4500);
 
 /// How long a client that came needs until its load shows: the start, and the mean of five seconds.
 const SETTLING: Duration = Duration::from_secs(8);
@@ -237,6 +240,11 @@ impl Configuration for SessionConfig {
         if self.timing.silence <= self.timing.ping {
             let problem = format!("{} s is not more than timing.ping", self.timing.silence.as_secs_f64());
             return Err(Unfit { key: "timing.silence", problem });
+        }
+        if self.timing.stop > LONGEST_STOP {
+            let (stop, most) = (self.timing.stop.as_secs_f64(), LONGEST_STOP.as_secs_f64());
+            let problem = format!("{stop} s is too long; allowed is at most {most} s, for the server ends within 5 s");
+            return Err(Unfit { key: "timing.stop", problem });
         }
         if let Some(script) =
             self.viewer_script.as_ref().filter(|script| !script.has_host() || !script.scheme().starts_with("http"))

@@ -1,11 +1,13 @@
 //! How values of a configuration are read: a value that is not allowed is told with what is.
 
 use std::fmt;
+use std::marker::PhantomData;
 use std::net::IpAddr;
 use std::path::PathBuf;
 use std::time::Duration;
 
-use serde::de::{DeserializeOwned, Error as _, Unexpected, Visitor};
+use serde::de::value::MapAccessDeserializer;
+use serde::de::{DeserializeOwned, Error as _, MapAccess, Unexpected, Visitor};
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
 /// A path in which `~` and `$VAR` were replaced.
@@ -182,6 +184,26 @@ impl Visitor<'_> for Between {
         #[expect(clippy::cast_precision_loss, reason = "numbers that large are out of range anyway")]
         self.visit_f64(number as f64)
     }
+}
+
+/// Reads a part that is an object. By itself serde takes a list for one too, and its values for those of the first keys.
+///
+/// # Errors
+/// When the value is something else.
+pub fn object<'de, T: Deserialize<'de>, D: Deserializer<'de>>(deserializer: D) -> Result<T, D::Error> {
+    struct Object<T>(PhantomData<T>);
+    impl<'de, T: Deserialize<'de>> Visitor<'de> for Object<T> {
+        type Value = T;
+
+        fn expecting(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+            out.write_str("an object: {\"KEY\": VALUE, ...}")
+        }
+
+        fn visit_map<A: MapAccess<'de>>(self, map: A) -> Result<T, A::Error> {
+            T::deserialize(MapAccessDeserializer::new(map))
+        }
+    }
+    deserializer.deserialize_map(Object(PhantomData))
 }
 
 /// Reads a list of texts; a single text counts as a list of one.

@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 use super::mirrors::Mirrors;
 use crate::shared::address::{PublicAddress, check_host};
 use crate::shared::config::{Configuration, Unfit};
-use crate::shared::config_value::{ExpandedPath, folder, local_address, one_or_many, percent, seconds, whole};
+use crate::shared::config_value::{ExpandedPath, folder, local_address, object, one_or_many, percent, seconds, whole};
 use crate::shared::peer::TrustedProxies;
 use crate::shared::repositories::UrlPrefix;
 
@@ -126,13 +126,13 @@ pub struct SimulationConfig {
     #[serde(default)]
     pub admin_password: Option<crate::shared::config_value::Secret>,
     /// Every other duration.
-    #[serde(default)]
+    #[serde(default, deserialize_with = "object")]
     pub timing: Timing,
 }
 
 /// Durations, in seconds.
 #[derive(Debug, Clone, Serialize, Deserialize)]
-#[serde(rename_all = "camelCase", default, deny_unknown_fields, expecting = "an object of durations")]
+#[serde(rename_all = "camelCase", default, deny_unknown_fields)]
 pub struct Timing {
     /// How long a checkout may take. Default: 120.
     #[serde(with = "seconds")]

@@ -157,3 +157,31 @@ fn the_examples_of_the_page_are_taken_without_a_warning() {
         }
     }
 }
+
+#[test]
+fn a_list_is_taken_for_no_object() {
+    let tables: [&[(&str, Value)]; 2] = [
+        &[("timing", json!([1])), ("timing", json!([])), ("examples", json!([["a title", "https://a.world"]]))],
+        &[("timing", json!([1])), ("timing", json!([])), ("gitMirrors", json!([["https://a.forge", "file:b"]]))],
+    ];
+    for (kind, table) in kinds().iter().zip(tables) {
+        for (key, value) in table {
+            let mut config = kind.least.clone();
+            config[*key] = value.clone();
+            let output = kind.check(&config.to_string());
+            let told = String::from_utf8_lossy(&output.stderr);
+            assert_eq!((output.status.code(), told.lines().count()), (Some(2), 1), "{key}: {value}: {told}");
+            assert!(told.contains(&format!(" {key}: ")), "{told}");
+        }
+    }
+}
+
+#[test]
+fn what_is_wrong_inside_an_object_is_named_by_its_key() {
+    for kind in kinds() {
+        let mut config = kind.least.clone();
+        config["timing"] = json!({"ping": 10, "silence": "long"});
+        let told = String::from_utf8(kind.check(&config.to_string()).stderr).unwrap();
+        assert!(told.contains("timing.silence: ") && told.contains("a number of seconds"), "{told}");
+    }
+}

@@ -164,6 +164,9 @@ async fn a_fault_of_the_configuration_is_one_line_and_exit_code_2() {
         ("loadRefresh", json!(0), ["loadRefresh", "0"]),
         ("timing", json!({"answer": "fast"}), ["timing.answer", "fast"]),
         ("timing", json!({"anser": 1}), ["timing", "anser"]),
+        ("timing", json!({"stop": 4.6}), ["timing.stop", "4.5"]),
+        ("timing", json!({"ping": 10, "silence": 10}), ["timing.silence", "timing.ping"]),
+        ("examples", json!({"titel": "a", "url": "b"}), ["examples", "title"]),
         ("administrator", json!("nobody"), ["administrator", "nobody"]),
     ] {
         let mut session = session_server(&[]).set(key, value.clone()).spawn();
