@@ -62,7 +62,8 @@ impl WebClient {
         let server = Arc::clone(&self.server);
         let (wanted, from) = (wanted_world(text), self.peer.household());
         let picked = async move { server.pick(Pick::parse(wanted.as_deref(), from)).await };
-        picked.into_actor(self).map(|answer, _, ctx| ctx.text(answer.text)).spawn(ctx);
+        // Nothing else is done meanwhile, so that answers come in the order of the texts, and before a close.
+        picked.into_actor(self).map(|answer, _, ctx| ctx.text(answer.text)).wait(ctx);
     }
 }
 

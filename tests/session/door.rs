@@ -47,3 +47,33 @@ async fn a_message_may_come_in_pieces_and_must_not_be_large() {
     client.send(&"x".repeat(9000)).await;
     assert_eq!(client.closed().await, Some(1009));
 }
+
+#[actix_rt::test]
+async fn texts_that_come_at_once_are_answered_in_their_order_and_too_many_are_refused_after_that() {
+    let server = StandIn::start(Manner::of_owner("other"));
+    let session = session_server(&[server.address()]).start().await;
+    let mut client = Client::connect(&session.websocket("/session")).await;
+    client.until("1").await;
+    // Some of the answers are known at once, others only to the registry.
+    let project = |number: usize| if number % 2 == 0 { "lab" } else { "other" };
+    let text = |number: usize| match number % 3 {
+        0 => world("lab/arm", "main", &format!("worlds/{number}.txt")),
+        _ => world(&format!("{}/p{number}", project(number)), "main", "worlds/a.wbt"),
+    };
+    for number in 0..=100 {
+        client.send(&text(number)).await;
+    }
+    assert_eq!(client.closed().await, Some(1008));
+    let heard = client.heard.split_off(1);
+    let is_answer = |number: usize, answer: &str| match number % 3 {
+        0 => answer.starts_with(&format!("Error: Wrong Webots simulation URL: \"{number}.txt\" is no world file")),
+        _ if number % 2 == 0 => {
+            answer == format!("Error: no simulation server accepts https://github.com/lab/p{number}.")
+        }
+        _ => answer == server.url(),
+    };
+    for (number, answer) in heard.iter().take(100).enumerate() {
+        assert!(is_answer(number, answer), "{number}: {answer}");
+    }
+    assert_eq!(heard[100..], ["Error: too many requests on one connection."]);
+}
