@@ -11,7 +11,7 @@ use actix_web::{App, HttpServer, web};
 use nix::sys::resource::{Resource, getrlimit, setrlimit};
 use tokio::sync::watch;
 
-use super::audience::Audience;
+use super::audience::CurrentAudience;
 use super::config::SessionConfig;
 use super::mailer;
 use super::registry::{IsAvailable, Reconfigure, Registry};
@@ -82,8 +82,8 @@ pub async fn run(mut config: SessionConfig, file: PathBuf) -> Result<(), AppErro
     let shared = web::Data::from(Arc::clone(&server));
     // This is called in each thread that serves connections.
     let app = move || {
-        let audience = Audience::new(Arc::clone(&shared)).start();
-        App::new().app_data(shared.clone()).app_data(web::Data::new(audience)).configure(routes::configure)
+        let audience = web::Data::new(CurrentAudience::start(Arc::clone(&shared)));
+        App::new().app_data(shared.clone()).app_data(audience).configure(routes::configure)
     };
     let http = HttpServer::new(app)
         // Messages are small, and must not wait for the answer to the one before.
@@ -210,5 +210,60 @@ fn reload(file: &Path, registry: &Addr<Registry>) {
             registry.do_send(Reconfigure(Arc::new(loaded.config)));
         }
         Err(error) => log::error!("the configuration stays as it was: {error}"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use futures_util::StreamExt;
+    use tokio_tungstenite::tungstenite::Message as Frame;
+
+    use super::*;
+    use crate::session::audience::Audience;
+
+    #[derive(Message)]
+    #[rtype(result = "()")]
+    struct Panic;
+
+    impl Handler<Panic> for Audience {
+        type Result = ();
+
+        fn handle(&mut self, _: Panic, _: &mut Self::Context) {
+            panic!("a test asks for it");
+        }
+    }
+
+    #[actix_rt::test]
+    async fn clients_whose_audience_panics_are_sent_away_and_find_another_one() {
+        let config = serde_json::from_str(r#"{"port": 0, "simulationServers": []}"#).unwrap();
+        let (phase_sender, phase) = watch::channel(Phase::Open);
+        let server = web::Data::new(assemble(config, 10, phase).unwrap());
+        let (audiences, started) = std::sync::mpsc::channel();
+        let app = move || {
+            let audience = web::Data::new(CurrentAudience::start(Arc::clone(&server)));
+            audiences.send(audience.get()).unwrap();
+            App::new().app_data(server.clone()).app_data(audience).configure(routes::configure)
+        };
+        let http = HttpServer::new(app).workers(1).disable_signals().bind(("127.0.0.1", 0)).unwrap();
+        let url = format!("ws://{}/session", http.addrs()[0]);
+        let http = http.run();
+        let handle = http.handle();
+        actix_rt::spawn(http);
+        let connect = async || tokio_tungstenite::connect_async(&url).await.unwrap().0;
+        let soon = std::time::Duration::from_secs(20);
+
+        let mut client = connect().await;
+        assert_eq!(client.next().await.unwrap().unwrap(), Frame::text("0"));
+        started.try_recv().unwrap().do_send(Panic);
+        let end = actix_rt::time::timeout(soon, client.next()).await.unwrap().unwrap().unwrap();
+        assert!(matches!(&end, Frame::Close(Some(reason)) if u16::from(reason.code) == 1011), "{end:?}");
+
+        let mut client = connect().await;
+        assert_eq!(actix_rt::time::timeout(soon, client.next()).await.unwrap().unwrap().unwrap(), Frame::text("0"));
+        phase_sender.send_replace(Phase::Closing);
+        let end = actix_rt::time::timeout(soon, client.next()).await.unwrap().unwrap().unwrap();
+        assert!(matches!(&end, Frame::Close(Some(reason)) if u16::from(reason.code) == 1001), "{end:?}");
+        drop(client);
+        handle.stop(false).await;
     }
 }

@@ -2,8 +2,10 @@
 //!
 //! Created by the app in each thread that serves connections; it never ends. The registry tells it of a change once, and
 //! it tells its clients: from thread to thread each of ten thousand would be woken with a lock, and the registry would
-//! be busy with that instead of with requests.
+//! be busy with that instead of with requests. After a panic its clients are sent away, and find another one when they
+//! come back.
 
+use std::cell::RefCell;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -70,6 +72,32 @@ impl Audience {
     }
 }
 
+/// The audience of this thread.
+pub struct CurrentAudience {
+    server: Arc<Server>,
+    audience: RefCell<Addr<Audience>>,
+}
+
+impl CurrentAudience {
+    /// Starts the first one.
+    #[must_use]
+    pub fn start(server: Arc<Server>) -> Self {
+        let audience = Audience::new(Arc::clone(&server)).start();
+        Self { server, audience: RefCell::new(audience) }
+    }
+
+    /// The one to join, or a new one if it has panicked.
+    #[must_use]
+    pub fn get(&self) -> Addr<Audience> {
+        let mut audience = self.audience.borrow_mut();
+        if !audience.connected() {
+            log::error!("an audience is gone, a new one is started");
+            *audience = Audience::new(Arc::clone(&self.server)).start();
+        }
+        audience.clone()
+    }
+}
+
 impl Actor for Audience {
     type Context = Context<Self>;
 
@@ -108,6 +136,12 @@ impl Handler<Leave> for Audience {
 
     fn handle(&mut self, Leave(id): Leave, _: &mut Self::Context) {
         self.clients.remove(id);
+    }
+}
+
+impl Drop for Audience {
+    fn drop(&mut self) {
+        self.tell(News::Lost);
     }
 }
 

@@ -3,13 +3,12 @@
 use std::borrow::Cow;
 use std::sync::Arc;
 
-use actix::Addr;
 use actix_web::http::{StatusCode, header};
 use actix_web::{HttpRequest, HttpResponse, web};
 use percent_encoding::percent_decode_str;
 
 use super::asking::{ask, with_status};
-use super::audience::Audience;
+use super::audience::CurrentAudience;
 use super::fleet_status::told_mean;
 use super::page_routes;
 use super::pick::{NoServer, Pick};
@@ -46,7 +45,7 @@ async fn root(
     request: HttpRequest,
     stream: web::Payload,
     server: web::Data<Server>,
-    audience: web::Data<Addr<Audience>>,
+    audience: web::Data<CurrentAudience>,
 ) -> HttpResponse {
     if wants_websocket(&request) {
         open_websocket(&request, stream, &server, &audience)
@@ -59,7 +58,7 @@ async fn session(
     request: HttpRequest,
     stream: web::Payload,
     server: web::Data<Server>,
-    audience: web::Data<Addr<Audience>>,
+    audience: web::Data<CurrentAudience>,
 ) -> HttpResponse {
     if wants_websocket(&request) {
         return open_websocket(&request, stream, &server, &audience);
@@ -95,14 +94,14 @@ fn open_websocket(
     request: &HttpRequest,
     stream: web::Payload,
     server: &web::Data<Server>,
-    audience: &Addr<Audience>,
+    audience: &CurrentAudience,
 ) -> HttpResponse {
     let peer = server.trusted_proxies.peer(request);
     let connection = match server.connections.admit(peer) {
         Ok(connection) => connection,
         Err(crowded) => return crowded.answer(),
     };
-    let (server, audience) = (Arc::clone(server), audience.clone());
+    let (server, audience) = (Arc::clone(server), audience.get());
     websocket::open(request, stream, |inbox| WebClient::new(server, audience, peer, (connection, inbox)))
 }
 

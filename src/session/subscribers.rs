@@ -12,6 +12,8 @@ pub enum News {
     Availability(bool),
     /// The server ends.
     Closing,
+    /// Nobody is there any more to tell it the news.
+    Lost,
 }
 
 /// The subscribers: each is told the same news once.

@@ -105,6 +105,7 @@ impl Handler<News> for WebClient {
     fn handle(&mut self, news: News, ctx: &mut Self::Context) {
         match news {
             News::Closing => Self::close(CloseCode::Away, ctx),
+            News::Lost => Self::close(CloseCode::Error, ctx),
             News::Availability(available) if self.told.replace(available) != Some(available) => {
                 ctx.text(if available { "1" } else { "0" });
             }
