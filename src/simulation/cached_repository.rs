@@ -1,4 +1,4 @@
-//! One cached repository that is in use: its commits, and what a fetch is adding to it.
+//! One cached repository that is in use: its commits, and what is added to it.
 
 use std::fs::File;
 use std::io;
@@ -17,7 +17,7 @@ pub struct InUse {
     _departure: Departure,
 }
 
-/// The right to add to a cached repository, or to tidy it up.
+/// The right to change a cached repository: to add what was fetched, or to tidy it up.
 #[derive(Debug)]
 pub struct Fetching {
     _lock: File,
@@ -29,8 +29,6 @@ pub struct CommitInUse {
     _lock: File,
 }
 
-/// Where a fetch names what came before it has its own name.
-const INCOMING: &str = "refs/incoming";
 /// Where the fetched commits are named: those that the repository's owner vouches for, and others.
 const COMMITS: [&str; 2] = ["refs/fleet", "refs/any"];
 
@@ -54,7 +52,7 @@ impl InUse {
         &self.path
     }
 
-    /// Waits for the right to add to the repository, and removes what a broken fetch has left.
+    /// Waits for the right to change the repository, and removes what a broken fetch has left.
     ///
     /// # Errors
     /// When its lock can't be opened.
@@ -75,29 +73,16 @@ impl InUse {
     }
 
     fn clean(&self) {
-        for broken in self.incoming().chain(self.locks()).chain(files(self.path.join(INCOMING))) {
+        for broken in incoming(&self.path).chain(self.locks()) {
             std::fs::remove_file(broken).ok();
         }
     }
 
     /// Removes what a broken fetch has left, unless one is under way.
     pub fn tidy_up(&self) {
-        if self.incoming().next().is_some() {
+        if incoming(&self.path).next().is_some() {
             drop(self.try_fetching());
         }
-    }
-
-    /// How many bytes a fetch that is under way has received.
-    #[must_use]
-    pub fn received(&self) -> u64 {
-        self.incoming().filter_map(|path| path.metadata().ok()).map(|about| about.len()).sum()
-    }
-
-    /// Packs that are being received or made, or were when git was ended.
-    fn incoming(&self) -> impl Iterator<Item = PathBuf> {
-        let is_new = |name: &[u8]| name.starts_with(b"tmp_") || name.starts_with(b".tmp-");
-        let files = files(self.path.join("objects/pack"));
-        files.filter(move |path| path.file_name().is_some_and(|name| is_new(name.as_encoded_bytes())))
     }
 
     /// Locks that git leaves behind when it is killed: each would make every later fetch fail.
@@ -131,24 +116,16 @@ impl InUse {
         is_same.then_some(CommitInUse { _lock: file })
     }
 
-    /// The object that a fetch has brought under this name.
+    /// Names a commit that was handed over by the file in which its fetch has named it, and takes it into use.
     #[must_use]
-    pub fn arrived(&self, incoming: &str) -> Option<String> {
-        let hash = std::fs::read_to_string(self.path.join(incoming)).ok()?;
-        let hash = hash.trim_end();
-        (hash.len() >= 40 && hash.bytes().all(|byte| byte.is_ascii_hexdigit())).then(|| hash.to_owned())
-    }
-
-    /// Gives what a fetch has brought its own name, and takes it into use.
-    #[must_use]
-    pub fn name(&self, _right: &Fetching, incoming: &str, reference: &str) -> Option<CommitInUse> {
+    pub fn name(&self, _right: &Fetching, incoming: &Path, reference: &str) -> Option<CommitInUse> {
         // Who uses a commit has locked its file, which must not be replaced.
         if let Some(known) = self.commit(reference) {
             return Some(known);
         }
         let path = self.path.join(reference);
         std::fs::create_dir_all(path.parent()?).ok()?;
-        std::fs::rename(self.path.join(incoming), path).ok()?;
+        std::fs::rename(incoming, path).ok()?;
         self.commit(reference)
     }
 
@@ -190,12 +167,35 @@ impl InUse {
         commits.into_iter().map(|(_, path)| path).filter(is_forgotten).take(spare).count()
     }
 
-    fn commit_files(&self) -> impl Iterator<Item = PathBuf> {
+    /// The files that name the commits.
+    pub fn commit_files(&self) -> impl Iterator<Item = PathBuf> {
         let is_commit = |path: &PathBuf| path.extension().is_none();
         COMMITS.map(|folder| self.path.join(folder)).into_iter().flat_map(files).filter(is_commit)
     }
 }
 
-fn files(folder: PathBuf) -> impl Iterator<Item = PathBuf> {
+/// How many bytes a fetch that is under way in a repository has received.
+#[must_use]
+pub fn received(repository: &Path) -> u64 {
+    incoming(repository).filter_map(|path| path.metadata().ok()).map(|about| about.len()).sum()
+}
+
+/// Packs that are being received or made, or were when git was ended.
+fn incoming(repository: &Path) -> impl Iterator<Item = PathBuf> {
+    let is_new = |name: &[u8]| name.starts_with(b"tmp_") || name.starts_with(b".tmp-");
+    let files = files(repository.join("objects/pack"));
+    files.filter(move |path| path.file_name().is_some_and(|name| is_new(name.as_encoded_bytes())))
+}
+
+/// The object that the file of a reference names.
+#[must_use]
+pub fn arrived(reference: &Path) -> Option<String> {
+    let hash = std::fs::read_to_string(reference).ok()?;
+    let hash = hash.trim_end();
+    (hash.len() >= 40 && hash.bytes().all(|byte| byte.is_ascii_hexdigit())).then(|| hash.to_owned())
+}
+
+/// What is in a folder.
+pub fn files(folder: PathBuf) -> impl Iterator<Item = PathBuf> {
     std::fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.path())
 }

@@ -1,19 +1,23 @@
-//! Brings commits from remotes into cached repositories: one fetch at a time for each repository, bounded in size.
+//! Brings commits from remotes into cached repositories: each once, side by side, bounded in size.
+//!
+//! A fetch that stands still is begun anew, so that nobody who has joined it late loses time by that.
 
 use std::ffi::OsString;
 use std::io;
 use std::path::Path;
 use std::sync::Arc;
-use std::time::Duration;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::time::{Duration, Instant};
 
 use tokio::sync::watch;
 
-use super::cached_repository::{CommitInUse, InUse};
+use super::cached_repository::{CommitInUse, InUse, arrived, received};
 use super::checkout_error::{CheckoutError, damaged, fetch_failed, git_failed, machine, too_large};
 use super::examined::Examined;
 use super::git::{Call, Git, GitError};
 use super::limits::Limits;
 use super::mirrors::Remote;
+use super::quarantine::Quarantine;
 use super::repository_cache::{Patient, RepositoryCache};
 use super::revision::{self, Revision};
 use crate::shared::project_url::ProjectUrl;
@@ -57,22 +61,45 @@ impl Downloads {
         revision: &Revision,
     ) -> Result<(Revision, CommitInUse), CheckoutError> {
         let Errand { world, remote, .. } = errand;
-        let fetching = repository.fetching().await.map_err(|error| machine(world, &error))?;
-        if let Some(commit) = repository.commit(&revision.reference()) {
-            return Ok((revision.clone(), commit));
-        }
-        self.make_repository(errand, repository).await?;
-        let call = call(remote, repository.path(), revision.fetch_arguments(&remote.location));
-        let what = format!("fetching {}", world.repository());
-        let too_much = || too_large(format!("{} (at depth 1)", world.repository()), self.limits.size);
-        let fetched = self.receive(errand, repository, call, &what).await.ok_or_else(too_much)?;
-        fetched.map_err(|source| fetch_failed(world, revision, source))?;
-        // Taken before anybody else may tidy up.
+        let failed = |error| machine(world, &error);
+        // In the end, what is left of the fetch may be removed.
+        let _grown = Grown(&self.cache);
+        let fetched = loop {
+            if !repository.is_made() {
+                let _right = repository.fetching().await.map_err(failed)?;
+                self.make_repository(errand, repository).await?;
+            }
+            let quarantine = Quarantine::enter(repository, &revision.commit).await.map_err(failed)?;
+            if let Some(commit) = repository.commit(&revision.reference()) {
+                return Ok((revision.clone(), commit));
+            }
+            let right = repository.fetching().await.map_err(failed)?;
+            quarantine.make(repository, &right).map_err(failed)?;
+            drop(right);
+            let call = call(remote, quarantine.path(), revision.fetch_arguments(&remote.location));
+            match self.receive(errand, call, &format!("fetching {}", world.repository())).await {
+                Received::Silence => self.tell_silence(errand),
+                Received::All(result) => break result.map(|()| quarantine),
+                Received::TooMuch => {
+                    return Err(too_large(format!("{} (at depth 1)", world.repository()), self.limits.size));
+                }
+            }
+        };
+        let quarantine = fetched.map_err(|source| fetch_failed(world, revision, source))?;
+        let incoming = quarantine.path().join(revision.incoming());
         let lost = || machine(world, &io::Error::other("the commit that was fetched is not there"));
-        let came = repository.arrived(&revision.incoming()).ok_or_else(lost)?;
-        let came = revision.with_commit(came);
-        let commit = repository.name(&fetching, &revision.incoming(), &came.reference());
+        let came = revision.with_commit(arrived(&incoming).ok_or_else(lost)?);
+        let right = repository.fetching().await.map_err(failed)?;
+        quarantine.hand_over(repository, &right).map_err(failed)?;
+        // Taken before anybody else may tidy up.
+        let commit = repository.name(&right, &incoming, &came.reference());
         Ok((came, commit.ok_or_else(lost)?))
+    }
+
+    /// Says that a remote is asked anew.
+    pub fn tell_silence(&self, errand: Errand<'_>) {
+        let seconds = self.limits.patience().as_secs_f64();
+        log::warn!("{}: nothing has come for {seconds} s, git starts anew", errand.world.repository());
     }
 
     /// Whether a commit was ever part of a branch or tag. For that the history is fetched: all commits, as far as the
@@ -90,18 +117,23 @@ impl Downloads {
         {
             return Ok(true);
         }
-        let _fetching = history.fetching().await.map_err(failed)?;
-        self.make_repository(errand, &history).await?;
-        let mut call = call(remote, history.path(), revision::history_arguments("origin"));
-        call.environment.extend(setting("remote.origin.url", &remote.location));
-        let what = format!("fetching the history of {}", world.repository());
         let too_much = || too_large(format!("The history of {}", world.repository()), self.limits.size);
-        let fetched = self.receive(errand, &history, call, &what).await.ok_or_else(too_much)?;
-        fetched.map_err(|source| git_failed(world, source))?;
-        if history.packed() > self.limits.size {
-            return Err(too_much());
+        let _grown = Grown(&self.cache);
+        loop {
+            // There is but one history to fetch: others who want it wait for it.
+            let _right = history.fetching().await.map_err(failed)?;
+            self.make_repository(errand, &history).await?;
+            let mut call = call(remote, history.path(), revision::history_arguments("origin"));
+            call.environment.extend(setting("remote.origin.url", &remote.location));
+            match self.receive(errand, call, &format!("fetching the history of {}", world.repository())).await {
+                Received::Silence => self.tell_silence(errand),
+                Received::All(Err(source)) => return Err(git_failed(world, source)),
+                Received::All(Ok(())) if history.packed() <= self.limits.size => {
+                    return self.is_reachable(errand, &history, commit).await;
+                }
+                Received::All(Ok(())) | Received::TooMuch => return Err(too_much()),
+            }
         }
-        self.is_reachable(errand, &history, commit).await
     }
 
     async fn is_reachable(&self, errand: Errand<'_>, history: &InUse, commit: &str) -> Result<bool, CheckoutError> {
@@ -118,29 +150,31 @@ impl Downloads {
         }
     }
 
-    /// Runs a fetch, and ends git when it brings too much; then nothing is given back.
-    async fn receive(
-        &self,
-        errand: Errand<'_>,
-        repository: &InUse,
-        call: Call<'_>,
-        what: &str,
-    ) -> Option<Result<(), GitError>> {
+    /// Runs a fetch, and ends git when it brings too much, or nothing any more.
+    async fn receive(&self, errand: Errand<'_>, call: Call<'_>, what: &str) -> Received {
+        let repository = call.repository;
+        let lines = AtomicUsize::new(0);
         let tell = |line: &str| {
+            lines.fetch_add(1, Ordering::Relaxed);
             if line.contains('%') {
                 errand.progress.send_replace(format!("{what}: {}", line.trim_start_matches("remote: ")));
             }
         };
-        // Also what was broken off has added something: what is left of it is removed when its lock is free.
-        let _grown = Grown(&self.cache);
         let mut fetch = std::pin::pin!(self.git.run(call, tell));
         let mut look = actix_rt::time::interval(BETWEEN_LOOKS);
+        let mut last_sign = (Instant::now(), (0, 0));
         loop {
             tokio::select! {
-                result = &mut fetch => return Some(result.map(drop)),
+                result = &mut fetch => return Received::All(result.map(drop)),
                 _ = look.tick() => {
-                    if repository.received() > self.limits.size {
-                        return None;
+                    let signs = (received(repository), lines.load(Ordering::Relaxed));
+                    if signs.0 > self.limits.size {
+                        return Received::TooMuch;
+                    }
+                    if signs != last_sign.1 {
+                        last_sign = (Instant::now(), signs);
+                    } else if last_sign.0.elapsed() > self.limits.patience() {
+                        return Received::Silence;
                     }
                 }
             }
@@ -183,6 +217,16 @@ impl Downloads {
         }
         Ok(())
     }
+}
+
+/// How a fetch has ended.
+enum Received {
+    /// git has ended by itself.
+    All(Result<(), GitError>),
+    /// It has brought more than may come.
+    TooMuch,
+    /// Nothing has come for too long.
+    Silence,
 }
 
 /// Says in the end, whichever that is, that something was added to the cache.

@@ -233,11 +233,17 @@ impl Fetcher {
         repository: &InUse,
         arguments: Vec<OsString>,
     ) -> Result<String, CheckoutError> {
-        let mut call = call(errand.remote, repository.path(), arguments);
-        // For a folder, git's only child reads from its pipe, and ends with it. What asks over the network may hang.
-        call.is_alone = errand.remote.protocol == "file";
-        let answer = self.git().run(call, |_| ()).await.map_err(|source| git_failed(errand.world, source))?;
-        Ok(String::from_utf8_lossy(&answer).into_owned())
+        loop {
+            let mut call = call(errand.remote, repository.path(), arguments.clone());
+            // For a folder, git's only child reads from its pipe, and ends with it. What asks over the network may hang.
+            call.is_alone = errand.remote.protocol == "file";
+            let answer = self.git().run(call, |_| ());
+            match actix_rt::time::timeout(self.downloads.limits.patience(), answer).await {
+                Ok(Ok(answer)) => return Ok(String::from_utf8_lossy(&answer).into_owned()),
+                Ok(Err(source)) => return Err(git_failed(errand.world, source)),
+                Err(_) => self.downloads.tell_silence(errand),
+            }
+        }
     }
 
     /// Removes the cached repository of a world if it is damaged, so that the next fetch begins anew.

@@ -8,13 +8,14 @@ use std::time::Duration;
 
 use super::download::setting;
 use super::git::{Call, Git};
+use super::quarantine;
 use super::repository_cache::RepositoryCache;
 
 /// So many commits of one repository are kept: those that were used last.
 const MOST_COMMITS: usize = 64;
 /// So many more may come before some are removed, for git then packs the whole repository anew.
 const SLACK: usize = 32;
-/// How long git may take for that. Fetches into the repository wait for it.
+/// How long git may take for that. New fetches into the repository wait for it.
 const LIMIT: Duration = Duration::from_mins(2);
 
 /// Tidies up for ever.
@@ -43,10 +44,13 @@ async fn tidy_up(cache: &RepositoryCache, git: &Git) -> bool {
             continue;
         }
         let keep = if is_too_large { (commits / 2).min(MOST_COMMITS) } else { MOST_COMMITS };
-        // While a fetch is under way there is nothing to do: it is followed by another round.
+        // A fetch that is under way counts on all that is there, and is followed by another round.
         let Some(right) = repository.try_fetching() else {
             continue;
         };
+        if quarantine::sweep(path) > 0 {
+            continue;
+        }
         let forgotten = repository.forget(&right, keep);
         if is_crowded || forgotten > 0 {
             pack(git, path, forgotten).await;

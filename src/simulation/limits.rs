@@ -19,6 +19,12 @@ const ENTRY: u64 = 4096;
 const FEW_ENTRIES: u64 = 10_000;
 
 impl Limits {
+    /// A remote that is silent for so long is asked anew: often it is but a connection that has died.
+    #[must_use]
+    pub fn patience(&self) -> Duration {
+        self.time / 4
+    }
+
     /// How many files and folders may be checked out.
     #[must_use]
     pub fn entries(&self) -> u64 {

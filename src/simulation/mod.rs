@@ -34,6 +34,7 @@ pub mod preflight;
 pub mod process_group;
 pub mod process_tree;
 pub mod protocol;
+pub mod quarantine;
 pub mod repository_cache;
 pub mod revision;
 pub mod routes;

@@ -1,7 +1,7 @@
 //! Cached bare repositories on disk, under a size budget. Safe for several servers that share the folder.
 //!
 //! `CACHE/git/NAME` is a bare repository, `NAME.use` is locked (shared) by everybody who uses it, `NAME.fetch` is
-//! locked by whoever adds to it or tidies it up. The time of the `.use` file says when a repository was used last.
+//! locked by whoever changes it for as long as that takes; fetches work aside (see [`super::quarantine`]). The time of the `.use` file says when a repository was used last.
 //! `NAME.damaged` marks a repository that is broken while others still use it: whoever comes takes the next one,
 //! `NAME~1`, and the broken one is removed when the last has left (see [`super::housekeeping`]).
 
@@ -15,6 +15,7 @@ use std::time::SystemTime;
 
 use super::cache_lock::{Departure, Work, beside, is_there, lock_file, remove_locks, wait};
 use super::cached_repository::{Fetching, InUse};
+use super::quarantine;
 
 /// The folder of cached repositories.
 #[derive(Debug, Clone)]
@@ -155,6 +156,7 @@ impl RepositoryCache {
                 let path = lock.with_extension("");
                 if let Some(repository) = self.visit(&path) {
                     repository.tidy_up();
+                    quarantine::sweep(repository.path());
                 }
                 Some((!beside(&path, "damaged").exists(), used, size_of(&path), path))
             })
@@ -238,6 +240,7 @@ fn size_of(folder: &Path) -> u64 {
 
 #[cfg(test)]
 mod tests {
+    use super::super::cached_repository::received;
     use super::*;
     use std::time::Duration;
 
@@ -265,7 +268,7 @@ mod tests {
     }
 
     #[actix_rt::test]
-    async fn only_one_fetches_at_a_time_and_finds_no_rest_of_another() {
+    async fn only_one_changes_it_at_a_time_and_finds_no_rest_of_another() {
         let folder = tempfile::tempdir().unwrap();
         let cache = RepositoryCache::open(folder.path(), 1).unwrap();
         let one = cache.take("x").await.unwrap();
@@ -274,12 +277,12 @@ mod tests {
         std::fs::create_dir_all(&packs).unwrap();
         let fetching = one.fetching().await.unwrap();
         std::fs::write(packs.join("tmp_pack_x"), [0; 10]).unwrap();
-        assert_eq!(other.received(), 10);
+        assert_eq!(received(other.path()), 10);
         let soon = Duration::from_millis(60);
         assert!(actix_rt::time::timeout(soon, other.fetching()).await.is_err());
         drop(fetching);
         let _fetching = other.fetching().await.unwrap();
-        assert_eq!(other.received(), 0);
+        assert_eq!(received(other.path()), 0);
     }
 
     #[actix_rt::test]

@@ -18,6 +18,7 @@ mod admission;
 mod cache;
 mod checkout;
 mod commits;
+mod fetching;
 mod git_wrapper;
 mod https;
 mod life;

@@ -1,0 +1,112 @@
+//! Fetches into one cached repository: side by side, each once, and begun anew where they stand still.
+
+use std::path::{Path, PathBuf};
+
+use crate::checkout::{outcome, reader, world_text};
+use crate::git_wrapper::GitWrapper;
+use crate::scene::nothing_left;
+use crate::support::client::Client;
+use crate::support::git::{Forge, git, world};
+use crate::support::program::simulation_server;
+use crate::support::until;
+
+/// A forge with `lab/arm`: each of these branches has two worlds that name it.
+fn forge(branches: &[&str]) -> Forge {
+    let forge = Forge::new();
+    for branch in branches {
+        let text = world_text(branch);
+        forge.commit("lab/arm", branch, &[("worlds/a.wbt", &text), ("worlds/b.wbt", &text)]);
+    }
+    forge
+}
+
+fn repositories(cache: &Path) -> Vec<PathBuf> {
+    let entries = std::fs::read_dir(cache.join("git")).unwrap().flatten().map(|entry| entry.path());
+    entries.filter(|path| path.is_dir()).collect()
+}
+
+#[actix_rt::test]
+async fn a_fetch_that_hangs_holds_up_nobody_else_who_uses_its_repository() {
+    let branches = ["main", "slow", "one", "two", "three"];
+    let (forge, webots) = (forge(&branches), reader());
+    let cache = tempfile::tempdir().unwrap();
+    let hangs = cache.path().join("hangs");
+    std::fs::write(&hangs, "").unwrap();
+    let wrapper = GitWrapper::new(&format!(
+        "case \"$*\" in *fetch*refs/heads/slow:*) while [ -e {} ]; do sleep 0.05; done;; esac",
+        hangs.display()
+    ));
+    let start = || {
+        let builder = simulation_server(&webots.path(), forge.path(), 4).env("PATH", &wrapper.path());
+        builder.set("cacheDir", cache.path().to_str().unwrap()).start()
+    };
+    let (one, other) = (start().await, start().await);
+    let main = world("lab/arm", "main", "worlds/a.wbt");
+    assert!(outcome(&one, &main).await.contains("opened [main]"));
+    let fetches =
+        |branch: &str| wrapper.calls().iter().filter(|call| call.contains(&format!("heads/{branch}:"))).count();
+    let mut stuck = Client::start(&one, &world("lab/arm", "slow", "worlds/a.wbt")).await;
+    until("it hangs", async || fetches("slow") == 1).await;
+    // Other branches, be they cached or not, and a commit that is cached.
+    let commit = git(&forge.path().join("lab/arm"), &["rev-parse", "main"]);
+    for (server, name, text) in [
+        (&one, "one", "one"),
+        (&other, "two", "two"),
+        (&one, "main", "main"),
+        (&other, "main", "main"),
+        (&one, commit.trim(), "main"),
+        (&other, commit.trim(), "main"),
+    ] {
+        let told = outcome(server, &world("lab/arm", name, "worlds/a.wbt")).await;
+        assert!(told.contains(&format!("opened [{text}]")), "{name}: {told}");
+    }
+    // The same commit is fetched once, for worlds and servers that differ. The next takes over when the first has left.
+    let mut heirs = [
+        Client::start(&one, &world("lab/arm", "slow", "worlds/b.wbt")).await,
+        Client::start(&other, &world("lab/arm", "slow", "worlds/b.wbt")).await,
+    ];
+    for heir in &mut heirs {
+        heir.until("loading: looking for").await;
+    }
+    assert!(outcome(&one, &world("lab/arm", "three", "worlds/a.wbt")).await.contains("opened [three]"));
+    assert_eq!(fetches("slow"), 1, "{:#?}", wrapper.calls());
+    stuck.send("nothing that is known").await;
+    stuck.until("loading: Error:").await;
+    until("somebody takes over", async || fetches("slow") == 2).await;
+    std::fs::remove_file(&hangs).unwrap();
+    for heir in &mut heirs {
+        let told = heir.until("loading: Error:").await;
+        assert!(told.contains("opened [slow]"), "{told}");
+    }
+    assert_eq!(fetches("slow"), 2, "{:#?}", wrapper.calls());
+    for server in [&one, &other] {
+        nothing_left(server, 4).await;
+    }
+    // The cache is in order, has all five commits, and no rest of the fetches.
+    let repository = repositories(cache.path()).remove(0);
+    git(&repository, &["fsck", "--full"]);
+    assert_eq!(std::fs::read_dir(repository.join("refs/fleet")).unwrap().count(), branches.len());
+    let rests = || std::fs::read_dir(repository.join("quarantine")).unwrap().count();
+    until("what fetches have left is gone", async || rests() == 0).await;
+}
+
+#[actix_rt::test]
+async fn what_stands_still_is_begun_anew_and_what_moves_is_not() {
+    let (forge, webots) = (forge(&["main", "slow"]), reader());
+    let marks = tempfile::tempdir().unwrap();
+    // Each kind of command hangs once; the fetch of another branch takes its time, but moves.
+    let wrapper = GitWrapper::new(&format!(
+        "case \"$*\" in *ls-remote*) mkdir {0}/asked 2>/dev/null && exec sleep 1000;; *fetch*heads/main:*) mkdir {0}/fetched 2>/dev/null && exec sleep 1000;; \
+         *fetch*heads/slow:*) for n in 1 2 3 4 5 6 7 8 9; do echo \"Receiving objects: $n%\" >&2; sleep 0.5; done;; esac",
+        marks.path().display()
+    ));
+    let builder = simulation_server(&webots.path(), forge.path(), 1).env("PATH", &wrapper.path());
+    let server = builder.set("timing.checkout", 12).start().await;
+    let told = outcome(&server, &world("lab/arm", "main", "worlds/a.wbt")).await;
+    assert!(told.contains("opened [main]"), "{told}");
+    assert_eq!(server.log().matches("nothing has come for 3 s, git starts anew").count(), 2, "{}", server.log());
+    assert!(marks.path().join("asked").exists() && marks.path().join("fetched").exists());
+    let told = outcome(&server, &world("lab/arm", "slow", "worlds/a.wbt")).await;
+    assert!(told.contains("opened [slow]"), "{told}");
+    assert_eq!(wrapper.calls().iter().filter(|call| call.contains("heads/slow:")).count(), 1, "{:#?}", wrapper.calls());
+}
