@@ -129,7 +129,7 @@ impl Checkouts {
         let tree = instance.path().join("project");
         tokio::fs::create_dir_all(&tree).await.map_err(|error| machine(world, &error))?;
         progress(format!("checking {} out", fetched.revision.name));
-        let call = copy_call(fetched, instance, inside(&fetched.revision.folder));
+        let call = copy_call(fetched, instance, fetched.revision.needed());
         let told = |line: &str| {
             if line.contains('%') {
                 progress(line.to_owned());
@@ -156,7 +156,7 @@ impl Checkouts {
             // git writes again only what is not there.
             tokio::fs::remove_file(path).await.map_err(|error| machine(world, &error))?;
         }
-        let mut call = copy_call(fetched, instance, inside(&fetched.revision.folder));
+        let mut call = copy_call(fetched, instance, fetched.revision.needed());
         call.is_alone = false;
         call.arguments.splice(0..0, large_files::settings(&fetched.remote));
         self.fetcher.git().run(call, |_| ()).await.map_err(|source| damaged(world, source))?;
@@ -180,11 +180,6 @@ impl Checkouts {
         let call = copy_call(&project.fetched, &project.instance, &path);
         self.fetcher.git().run(call, |_| ()).await.map(drop).map_err(|_| refused())
     }
-}
-
-/// A folder of the repository as git wants it named.
-fn inside(folder: &str) -> &str {
-    if folder.is_empty() { "." } else { folder }
 }
 
 fn copy_call<'call>(fetched: &'call Fetched, instance: &InstanceDir, path: &str) -> Call<'call> {

@@ -148,41 +148,61 @@ impl Fetcher {
 
     /// The first of the commits that a URL may mean in which its world is.
     async fn find(&self, errand: Errand<'_>, repository: &InUse) -> Result<(Revision, CommitInUse), CheckoutError> {
-        let Errand { world, remote, .. } = errand;
+        let world = errand.world;
         let mut missing = None;
         for revision in self.revisions(errand, repository).await? {
             let (revision, commit) = match repository.commit(&revision.reference()) {
                 Some(commit) => (revision, commit),
                 None => self.downloads.commit(errand, repository, &revision).await?,
             };
-            let path = revision.world_path(world);
-            let mut call = call(remote, repository.path(), revision.list_arguments());
-            call.is_alone = true;
-            let answer = self.git().run(call, |_| ()).await;
-            if answer.as_ref().is_err_and(|error| error.message.contains("not a tree object"))
-                && self.is_file(remote, repository, &revision).await
-            {
-                // A tag may name a file alone.
+            // A tag may name a file alone.
+            let Some(mut listing) = self.list(errand, repository, &revision).await? else {
                 continue;
-            }
-            let limit = self.downloads.limits.entries();
-            let listing = match answer {
-                Ok(answer) => Listing::parse(&answer, &path),
-                Err(error) if error.is_endless() => return Err(CheckoutError::TooMany(limit)),
-                Err(source) => return Err(damaged(world, source)),
             };
-            if listing.entries > limit {
-                return Err(CheckoutError::TooMany(limit));
+            let path = revision.world_path(world);
+            let mut needed = revision;
+            if !listing.has_world && (listing.has_link || listing.entries == 0) {
+                match self.list(errand, repository, &needed.whole()).await {
+                    Ok(Some(all)) if all.has_link => (needed, listing) = (needed.whole(), all),
+                    Err(error) if listing.has_link => return Err(error),
+                    _ => {}
+                }
             }
-            if listing.size > self.downloads.limits.size {
-                return Err(too_large("The project".to_owned(), self.downloads.limits.size));
+            let limits = &self.downloads.limits;
+            if listing.entries > limits.entries() {
+                return Err(CheckoutError::TooMany(limits.entries()));
             }
-            if listing.has_world {
-                return Ok((revision, commit));
+            if listing.size > limits.size {
+                return Err(too_large("The project".to_owned(), limits.size));
             }
-            missing = Some(NoWorld::Missing(format!("{path} in {}", revision.name)));
+            // Where a link leads is seen in the checkout.
+            if listing.has_world || listing.has_link {
+                return Ok((needed, commit));
+            }
+            missing = Some(NoWorld::Missing(format!("{path} in {}", needed.name)));
         }
         Err(missing.map_or_else(|| no_reference(world), CheckoutError::World))
+    }
+
+    /// What is in a commit, or in the project's folder alone; nothing where it has no files, for it is one.
+    async fn list(
+        &self,
+        Errand { world, remote, .. }: Errand<'_>,
+        repository: &InUse,
+        revision: &Revision,
+    ) -> Result<Option<Listing>, CheckoutError> {
+        let mut call = call(remote, repository.path(), revision.list_arguments());
+        call.is_alone = true;
+        match self.git().run(call, |_| ()).await {
+            Ok(answer) => Ok(Some(Listing::parse(&answer, &revision.world_path(world)))),
+            Err(error) if error.is_endless() => Err(CheckoutError::TooMany(self.downloads.limits.entries())),
+            Err(error)
+                if error.message.contains("not a tree object") && self.is_file(remote, repository, revision).await =>
+            {
+                Ok(None)
+            }
+            Err(source) => Err(damaged(world, source)),
+        }
     }
 
     /// Whether there are no files below a revision, for it is one.

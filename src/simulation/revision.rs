@@ -17,6 +17,8 @@ pub struct Revision {
     is_any: bool,
     /// The project's folder; empty for the root.
     pub folder: String,
+    /// Whether more than that folder is needed: a link on the way to the world may lead anywhere in the repository.
+    pub is_whole: bool,
 }
 
 /// How many readings of a URL are looked for: no real branch has more slashes in its name.
@@ -30,7 +32,14 @@ pub fn commit_of(world: &ProjectUrl, is_any: bool) -> Option<Revision> {
     let is_hash = [40, 64].contains(&reference.len()) && reference.bytes().all(|byte| byte.is_ascii_hexdigit());
     let kind = matches!(world.kind(), RefKind::Any | RefKind::Commit);
     let commit = reference.to_ascii_lowercase();
-    (is_hash && kind).then(|| Revision { remote_name: commit.clone(), name: reference, commit, folder, is_any })
+    (is_hash && kind).then(|| Revision {
+        remote_name: commit.clone(),
+        name: reference,
+        commit,
+        folder,
+        is_any,
+        is_whole: false,
+    })
 }
 
 /// Asks the remote for all its branches and tags.
@@ -105,6 +114,7 @@ pub fn found(world: &ProjectUrl, answer: &str) -> Vec<Revision> {
                 remote_name: name,
                 folder: reading.folder,
                 is_any: false,
+                is_whole: false,
             })
         })
         .collect()
@@ -144,11 +154,23 @@ impl Revision {
         options.into_iter().map(OsString::from).chain([location.into(), refspec.into()]).collect()
     }
 
-    /// Lists the files of the project.
+    /// The same with all of the repository.
+    #[must_use]
+    pub fn whole(&self) -> Self {
+        Self { is_whole: true, ..self.clone() }
+    }
+
+    /// The folder to check out, as git wants it named.
+    #[must_use]
+    pub fn needed(&self) -> &str {
+        if self.is_whole || self.folder.is_empty() { "." } else { &self.folder }
+    }
+
+    /// Lists the files of the project, or of the repository.
     #[must_use]
     pub fn list_arguments(&self) -> Vec<OsString> {
         let fixed = ["ls-tree", "-r", "-l", "-z", "--full-tree", &self.reference(), "--"].map(OsString::from);
-        let folder = (!self.folder.is_empty()).then(|| OsString::from(format!("{}/", self.folder)));
+        let folder = (self.needed() != ".").then(|| OsString::from(format!("{}/", self.folder)));
         fixed.into_iter().chain(folder).collect()
     }
 
@@ -175,6 +197,8 @@ pub struct Listing {
     pub entries: u64,
     /// Whether the world is among them.
     pub has_world: bool,
+    /// Whether a folder on the way to the world is a link.
+    pub has_link: bool,
 }
 
 impl Listing {
@@ -193,6 +217,8 @@ impl Listing {
             listing.size = listing.size.saturating_add(size.and_then(|size| size.parse().ok()).unwrap_or(0));
             listing.entries += 1 + new_folders(last_path, path);
             listing.has_world |= path == world_path.as_bytes();
+            let rest = world_path.as_bytes().strip_prefix(path);
+            listing.has_link |= about.starts_with(b"120000 ") && rest.is_some_and(|rest| rest.starts_with(b"/"));
             last_path = path;
         }
         listing
@@ -267,7 +293,11 @@ mod tests {
     fn a_listing_knows_sizes_and_paths() {
         let answer = b"100644 blob aaa      12\tp/worlds/a b.wbt\x00120000 blob bbb       3\tp/link\x00160000 commit ccc -\tp/module\x00";
         let listing = Listing::parse(answer, "p/worlds/a b.wbt");
-        assert_eq!(listing, Listing { size: 15, entries: 5, has_world: true });
+        assert_eq!(listing, Listing { size: 15, entries: 5, has_world: true, has_link: false });
         assert!(!Listing::parse(answer, "worlds/a b.wbt").has_world);
+        assert!(Listing::parse(answer, "p/link/worlds/a.wbt").has_link);
+        for other in ["p/link", "p/linked/a.wbt", "p/module/a.wbt"] {
+            assert!(!Listing::parse(answer, other).has_link, "{other}");
+        }
     }
 }

@@ -12,6 +12,9 @@ pub enum NoWorld {
     /// It is a link to a file outside of the checkout.
     #[error("{0} leads out of its repository")]
     Outside(String),
+    /// It is a link, or behind one, that leads nowhere.
+    #[error("{0} is behind a link that leads to nothing in its project")]
+    Dangling(String),
     /// It does not begin as worlds do.
     #[error("{name} is no world file: its first line is {found:?}, not like \"#VRML_SIM R2025a utf8\"")]
     Header {
@@ -40,7 +43,11 @@ impl WorldFile {
         let name = || path.file_name().unwrap_or_default().to_string_lossy().into_owned();
         let missing = |_| NoWorld::Missing(name());
         let root = root.canonicalize().map_err(missing)?;
-        let path = path.canonicalize().map_err(missing)?;
+        let is_link = |path: &Path| path.symlink_metadata().is_ok_and(|about| about.is_symlink());
+        let path = path.canonicalize().map_err(|error| {
+            let dangling = path.ancestors().any(|part| is_link(part) && !part.exists());
+            if dangling { NoWorld::Dangling(name()) } else { missing(error) }
+        })?;
         if !path.starts_with(&root) {
             return Err(NoWorld::Outside(name()));
         }
@@ -73,7 +80,13 @@ mod tests {
         write("bad.wbt", "<html>");
         write("empty.wbt", "");
         std::fs::write(folder.path().join("outside.wbt"), "#VRML_SIM R2025a utf8\n").unwrap();
-        for (target, link) in [("../outside.wbt", "out.wbt"), ("/etc/passwd", "passwd.wbt"), ("good.wbt", "in.wbt")] {
+        for (target, link) in [
+            ("../outside.wbt", "out.wbt"),
+            ("/etc/passwd", "passwd.wbt"),
+            ("good.wbt", "in.wbt"),
+            ("nothing", "none"),
+            ("loop", "loop"),
+        ] {
             std::os::unix::fs::symlink(target, inside.join(link)).unwrap();
         }
         let open = |name: &str| WorldFile::open(&inside, &inside.join(name)).map(|world| world.version);
@@ -82,7 +95,10 @@ mod tests {
         assert_eq!(open("in.wbt").unwrap(), "R2025a");
         assert_eq!(open("out.wbt"), Err(NoWorld::Outside("out.wbt".to_owned())));
         assert_eq!(open("passwd.wbt"), Err(NoWorld::Outside("passwd.wbt".to_owned())));
-        assert_eq!(open("none.wbt"), Err(NoWorld::Missing("none.wbt".to_owned())));
+        assert_eq!(open("missing.wbt"), Err(NoWorld::Missing("missing.wbt".to_owned())));
+        assert_eq!(open("none"), Err(NoWorld::Dangling("none".to_owned())));
+        assert_eq!(open("none/a.wbt"), Err(NoWorld::Dangling("a.wbt".to_owned())));
+        assert_eq!(open("loop/a.wbt"), Err(NoWorld::Dangling("a.wbt".to_owned())));
         assert!(matches!(open("bad.wbt"), Err(NoWorld::Header { .. })));
         assert!(matches!(open("empty.wbt"), Err(NoWorld::Header { .. })));
     }

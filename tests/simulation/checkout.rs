@@ -117,9 +117,26 @@ async fn what_is_not_there_or_no_world_is_told_in_words() {
         std::os::unix::fs::symlink(target, work.join("worlds").join(link)).unwrap();
     }
     std::fs::write(work.join("worlds/page.wbt"), "<html>").unwrap();
+    // Folders that are links: to one inside of the repository, to nothing, out of it.
+    std::fs::create_dir_all(work.join("real/worlds")).unwrap();
+    std::fs::create_dir_all(work.join("r/q")).unwrap();
+    std::fs::write(work.join("real/worlds/b.wbt"), world_text("linked")).unwrap();
+    for (target, link) in [
+        ("real/worlds", "linked"),
+        ("real", "project"),
+        ("../real/worlds", "r/worlds"),
+        ("../../project", "r/q/deep"),
+        ("nothing", "dangling"),
+        ("/etc", "etc"),
+        ("../../../../../outside", "outside"),
+    ] {
+        std::os::unix::fs::symlink(target, work.join(link)).unwrap();
+    }
     forge.commit_work_tree("lab/arm", "main");
     let server = simulation_server(&webots.path(), forge.path(), 2).start().await;
     std::fs::write(server.folder.join("outside.wbt"), world_text("outside")).unwrap();
+    std::fs::create_dir_all(server.folder.join("outside/worlds")).unwrap();
+    std::fs::write(server.folder.join("outside/worlds/b.wbt"), world_text("outside")).unwrap();
     let none = "0123456789012345678901234567890123456789";
     let table = [
         (world("lab/none", "main", "worlds/a.wbt"), "https://github.com/lab/none does not exist or is not public"),
@@ -134,6 +151,13 @@ async fn what_is_not_there_or_no_world_is_told_in_words() {
         (world("lab/arm", "main", "worlds/outside.wbt"), "outside.wbt"),
         (world("lab/arm", "main", "worlds/page.wbt"), "page.wbt is no world file: its first line is \"<html>\""),
         (world("lab/arm", "main", "worlds/inside.wbt"), "opened [WorldInfo"),
+        (world("lab/arm", "main", "project/worlds/b.wbt"), "opened [linked]"),
+        (world("lab/arm", "main", "r/worlds/b.wbt"), "opened [linked]"),
+        (world("lab/arm", "main", "r/q/deep/worlds/b.wbt"), "opened [linked]"),
+        (world("lab/arm", "main", "r/worlds/none.wbt"), "none.wbt does not exist"),
+        (world("lab/arm", "main", "dangling/worlds/b.wbt"), "b.wbt is behind a link that leads to nothing in"),
+        (world("lab/arm", "main", "etc/worlds/b.wbt"), "b.wbt does not exist"),
+        (world("lab/arm", "main", "outside/worlds/b.wbt"), "b.wbt leads out of its repository"),
     ];
     for (url, words) in table {
         let told = outcome(&server, &url).await;
