@@ -9,6 +9,7 @@ use std::time::{Duration, Instant};
 use actix::prelude::*;
 use actix_web::dev::ServerHandle;
 use actix_web::{App, HttpServer, web};
+use tokio::sync::mpsc::Receiver;
 use tokio::sync::watch;
 
 use super::announcer::Announcer;
@@ -75,13 +76,47 @@ const LAST_TRY: Duration = Duration::from_millis(500);
 /// # Errors
 /// When it can't start, or an actor that must live is gone.
 pub async fn run(config: SimulationConfig) -> Result<(), AppError> {
-    let mut signals = Signals::catch()?;
-    orphans::adopt()?;
-    actix_rt::spawn(orphans::watch());
-    let (phase_sender, phase) = watch::channel(Phase::Open);
-    let (requests, mut asked) = tokio::sync::mpsc::channel(4);
-    let socket = bind(&config)?;
-    let server = Arc::new(assemble(config, phase, requests)?);
+    serve(Assembly::new(config)?).await
+}
+
+/// A server whose parts are there: it holds its port, its actors live, and nobody is served yet.
+pub struct Assembly {
+    server: Arc<Server>,
+    socket: TcpListener,
+    signals: Signals,
+    phase: watch::Sender<Phase>,
+    asked: Receiver<Request>,
+}
+
+impl Assembly {
+    /// Makes all parts.
+    ///
+    /// # Errors
+    /// When the server can't start.
+    pub fn new(config: SimulationConfig) -> Result<Self, AppError> {
+        let signals = Signals::catch()?;
+        orphans::adopt()?;
+        actix_rt::spawn(orphans::watch());
+        let (phase_sender, phase) = watch::channel(Phase::Open);
+        let (requests, asked) = tokio::sync::mpsc::channel(4);
+        let socket = bind(&config)?;
+        let server = Arc::new(assemble(config, phase, requests)?);
+        Ok(Self { server, socket, signals, phase: phase_sender, asked })
+    }
+
+    /// What its routes and web clients share.
+    #[must_use]
+    pub fn server(&self) -> &Arc<Server> {
+        &self.server
+    }
+}
+
+/// Runs a server until it is asked to stop.
+///
+/// # Errors
+/// When an actor that must live is gone, or the system can't go on.
+pub async fn serve(assembly: Assembly) -> Result<(), AppError> {
+    let Assembly { server, socket, mut signals, phase: phase_sender, mut asked } = assembly;
     let _last_will = process_group::remove_in_the_end(server.run.path())?;
     let shared = web::Data::from(Arc::clone(&server));
     let sockets = Arc::new(Sockets::new(

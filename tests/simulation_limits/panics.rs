@@ -1,0 +1,184 @@
+//! Panics of actors: what they held is freed, and a server that can't go on ends.
+
+use std::net::TcpListener;
+use std::sync::Arc;
+
+use actix::prelude::*;
+use actix_web::{App, HttpRequest, HttpResponse, HttpServer, web};
+use actix_web_actors::ws::WsResponseBuilder;
+use tokio::sync::mpsc::{UnboundedReceiver, UnboundedSender, unbounded_channel};
+use webots_fleet::shared::project_url::ProjectUrl;
+use webots_fleet::shared::websocket::Inbox;
+use webots_fleet::simulation::census::Stage;
+use webots_fleet::simulation::load_monitor::LoadMonitor;
+use webots_fleet::simulation::orders::Orders;
+use webots_fleet::simulation::places::{Ask, PlaceEvent, Places, Ticket};
+use webots_fleet::simulation::protocol::Mode;
+use webots_fleet::simulation::server::Server;
+use webots_fleet::simulation::web_client::WebClient;
+use webots_fleet::simulation::webots::{End, Webots};
+use webots_fleet::simulation::webots_event::{Exit, WebotsEvent};
+
+use crate::inside::{Inside, arm, ask};
+use crate::support::SOON;
+use crate::support::client::Client;
+
+/// Whoever gets this panics.
+#[derive(Message)]
+#[rtype(result = "()")]
+struct Panic;
+
+/// Lets actors get it.
+macro_rules! panics {
+    ($($actor:ty),*) => {
+        $(impl Handler<Panic> for $actor {
+            type Result = ();
+
+            fn handle(&mut self, _: Panic, _: &mut Self::Context) {
+                // A panic that prints nothing.
+                std::panic::resume_unwind(Box::new("a test has asked for it"));
+            }
+        })*
+    };
+}
+
+panics!(WebClient, Webots, Places, LoadMonitor);
+
+/// Opens a WebSocket as the server does, and gives away its actor's address.
+async fn gate(
+    request: HttpRequest,
+    stream: web::Payload,
+    server: web::Data<Server>,
+    clients: web::Data<UnboundedSender<Addr<WebClient>>>,
+) -> HttpResponse {
+    let peer = server.config.trusted_proxies.peer(&request);
+    let connection = server.connections.admit(peer).unwrap();
+    let client = WebClient::new(Arc::clone(&server), peer, (connection, Inbox::default()));
+    let (address, response) = WsResponseBuilder::new(client, &request, stream).start_with_addr().unwrap();
+    clients.send(address).unwrap();
+    response
+}
+
+pub async fn a_client_leaves_nothing_in_any_state() {
+    let stages = [Stage::Queued, Stage::CheckingOut, Stage::Launching, Stage::Idle, Stage::Running];
+    for stage in std::iter::once(None).chain(stages.map(Some)) {
+        let inside = Inside::new(stage.unwrap_or(Stage::Idle), |_| ()).await;
+        let (sender, mut clients) = unbounded_channel::<Addr<WebClient>>();
+        let (server, socket) = (web::Data::from(Arc::clone(&inside.server)), TcpListener::bind("127.0.0.1:0").unwrap());
+        let port = socket.local_addr().unwrap().port();
+        let app = move || {
+            App::new()
+                .app_data(server.clone())
+                .app_data(web::Data::new(sender.clone()))
+                .route("/client", web::get().to(gate))
+        };
+        let door = HttpServer::new(app).workers(1).disable_signals().shutdown_timeout(1).listen(socket).unwrap().run();
+        let handle = door.handle();
+        actix_rt::spawn(door);
+        let mut first = None;
+        if stage == Some(Stage::Queued) {
+            first = Some(inside.client().await);
+            inside.until(Stage::Idle).await;
+        }
+        let mut client = Client::connect(&format!("ws://127.0.0.1:{port}/client")).await;
+        let address = clients.recv().await.unwrap();
+        if let Some(stage) = stage {
+            ask(&mut client).await;
+            inside.until(stage).await;
+        }
+        address.do_send(Panic);
+        client.closed().await;
+        assert!(!address.connected(), "{stage:?}: it lives on");
+        if let Some(first) = first {
+            crate::support::until("the line is empty", async || inside.stages().await == [Stage::Idle]).await;
+            first.leave().await;
+        }
+        inside.until_nothing_is_left().await;
+        handle.stop(true).await;
+        inside.stop().await;
+    }
+}
+
+/// Hears what a web client would.
+struct Listener {
+    places: UnboundedSender<u16>,
+    exits: UnboundedSender<Exit>,
+}
+
+impl Actor for Listener {
+    type Context = Context<Self>;
+}
+
+impl Handler<PlaceEvent> for Listener {
+    type Result = ();
+
+    fn handle(&mut self, event: PlaceEvent, _: &mut Self::Context) {
+        if let PlaceEvent::Granted(port) = event {
+            self.places.send(port).unwrap();
+        }
+    }
+}
+
+impl Handler<WebotsEvent> for Listener {
+    type Result = ();
+
+    fn handle(&mut self, event: WebotsEvent, _: &mut Self::Context) {
+        if let WebotsEvent::Exited(exit) = event {
+            self.exits.send(exit).unwrap();
+        }
+    }
+}
+
+/// Starts a Webots as a web client does.
+async fn launch(server: &Server) -> (Addr<Webots>, UnboundedReceiver<Exit>) {
+    let (places, mut granted) = unbounded_channel();
+    let (exits, ended) = unbounded_channel();
+    let listener = Listener { places, exits }.start();
+    let asked = server.places.send(Ask { client: listener.clone().recipient(), world: arm() });
+    let ticket: Ticket = asked.await.unwrap().unwrap();
+    let port = granted.recv().await.unwrap();
+    let world = ProjectUrl::parse(&arm()).unwrap();
+    let project = server.checkouts.start(world, server.run.instance().unwrap(), |_| ()).await.unwrap().unwrap();
+    let orders = Orders {
+        config: Arc::clone(&server.config),
+        program: server.webots_program().unwrap(),
+        checkouts: Arc::clone(&server.checkouts),
+        project: Arc::new(project),
+        mode: Mode::X3d,
+        place: (ticket, port),
+        events: listener.recipient(),
+    };
+    (Webots::new(orders).start(), ended)
+}
+
+pub async fn a_webots_leaves_nothing_in_any_state() {
+    for stage in [Stage::Launching, Stage::Idle, Stage::Running, Stage::Stopping] {
+        let inside = Inside::new(stage, |_| ()).await;
+        let (webots, mut ended) = launch(&inside.server).await;
+        if stage == Stage::Stopping {
+            inside.until(Stage::Idle).await;
+            webots.do_send(End);
+        }
+        inside.until(stage).await;
+        let begin = std::time::Instant::now();
+        webots.do_send(Panic);
+        let exit = actix_rt::time::timeout(SOON, ended.recv()).await.unwrap().unwrap();
+        assert!(!exit.clean && !exit.why.is_empty(), "{stage:?}: {exit:?}");
+        inside.until_nothing_is_left().await;
+        assert!(begin.elapsed().as_secs() < 4, "{stage:?}: the grace time was waited for, in which all may go wrong");
+        inside.stop().await;
+    }
+}
+
+pub async fn an_actor_that_must_live_ends_the_server() {
+    for name in ["Places", "LoadMonitor"] {
+        let inside = Inside::new(Stage::Idle, |_| ()).await;
+        match name {
+            "Places" => inside.server.places.do_send(Panic),
+            _ => inside.server.load_monitor.do_send(Panic),
+        }
+        // The program ends with exit code 1 for whatever is told here.
+        let fault = inside.ended().await.unwrap_err();
+        assert_eq!(fault.to_string(), format!("the actor {name} is gone"));
+    }
+}

@@ -1,0 +1,56 @@
+//! The time limit of a simulation: it counts from the start of Webots.
+
+use std::time::{Duration, Instant};
+
+use webots_fleet::simulation::census::Stage;
+
+use crate::inside::Inside;
+
+pub async fn a_simulation_ends_at_its_time_limit_in_any_state() {
+    for stage in [Stage::Launching, Stage::Idle, Stage::Running, Stage::Stopping] {
+        let inside = Inside::new(stage, |config| {
+            config.timeout = 2;
+            config.timing.grace = Duration::from_millis(500);
+        })
+        .await;
+        let mut client = inside.client().await;
+        let begin = Instant::now();
+        assert_eq!(client.until("shutdownTimeout").await, "shutdownTimeout: 2");
+        if stage != Stage::Stopping {
+            inside.until(stage).await;
+        }
+        let told = client.until("loading: Error:").await;
+        assert!(told.starts_with("loading: Error: The time limit of 2 seconds was reached"), "{stage:?}: {told}");
+        assert_eq!(client.closed().await, Some(1000));
+        assert!(begin.elapsed() >= Duration::from_secs(2), "{stage:?}: it came too early");
+        inside.until_nothing_is_left().await;
+        inside.stop().await;
+    }
+}
+
+/// A checkout has a limit of its own (`timing.checkout`). In the line there is none: it moves, for those ahead have one.
+pub async fn who_waits_or_checks_out_has_no_such_limit() {
+    let inside = Inside::new(Stage::CheckingOut, |config| {
+        config.timeout = 1;
+        config.timing.checkout = Duration::from_secs(3);
+    })
+    .await;
+    let begin = Instant::now();
+    let mut client = inside.client().await;
+    let told = client.until("loading: Error:").await;
+    assert!(told.ends_with("took longer than 3 seconds"), "{told}");
+    assert!(begin.elapsed() >= Duration::from_secs(3));
+    inside.until_nothing_is_left().await;
+    inside.stop().await;
+
+    let inside = Inside::new(Stage::Idle, |config| config.timeout = 2).await;
+    let mut first = inside.client().await;
+    first.until("webots:").await;
+    let mut second = inside.client().await;
+    assert_eq!(second.until("").await, "queue: 0");
+    first.until("loading: Error: The time limit of 2 seconds was reached").await;
+    second.until("webots:").await;
+    second.leave().await;
+    inside.until_nothing_is_left().await;
+    inside.stop().await;
+}
