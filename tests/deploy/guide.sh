@@ -83,7 +83,7 @@ status_of() { # URL OPTION...
 }
 
 # Ports that are no part of the fleet, on which services of the machine listen.
-readonly PRIVATE=(1 22 5432 8000)
+readonly PRIVATE=(1 22 2021 5432 8000)
 only_the_fleet_is_reachable() { # HOST
     local port
     for port in "${PRIVATE[@]}"; do
@@ -236,7 +236,7 @@ main() {
     here=nginx
     commands 'A web server on each' | sed 's/gpu2.example.org/gpu2.lab.example/' | follow fleet.lab.example
     visit_the_other 2001 gpu2
-    ! firewall_lets_in "$FURTHER" gpu2 2050 || fail "everybody reaches Webots"
+    ! firewall_lets_in "$FURTHER" gpu2 2010 || fail "everybody reaches Webots"
     shut_down gpu2
     shut_down nginx
 
@@ -255,8 +255,8 @@ main() {
     here=apache
     { commands 'One web server in front of all' 3 && commands 'One web server in front of all' 4; } | follow fleet.lab.example
     visit_the_other 3001 behind
-    firewall_lets_in "$FURTHER" behind 3050 || fail 'the web server does not reach Webots'
-    ! firewall_lets_in "$FURTHER" behind 2050 || fail "what is no part of the fleet is reachable"
+    firewall_lets_in "$FURTHER" behind 3010 || fail 'the web server does not reach Webots'
+    ! firewall_lets_in "$FURTHER" behind 2010 || fail "what is no part of the fleet is reachable"
     echo 'ok'
 }
 

@@ -18,4 +18,5 @@ mod display;
 mod drain;
 mod files;
 mod notify;
+mod ports;
 mod preflight;
