@@ -98,11 +98,32 @@ async fn pages_are_sent_on_to_https_and_the_bare_name(rules: Rules) {
     let secure = format!("https://{}", browser.host);
     let www = ("Host", "www.localhost");
     let table = [(&plain, ("Host", "localhost")), (&plain, www), (&secure, www)];
+    // What was asked for arrives as it was sent; none of it becomes a header, another host or a query.
+    let paths = [
+        "/",
+        "/monitor?x=a%20b",
+        "/a%20b/%C3%BC+&?a=b&c=%20&d=%0d%0a",
+        "/x%0D%0ASet-Cookie:%20a=b?y=%0d%0aSet-Cookie:%20a=b",
+        "/a%3Fb%23c?d",
+        "/session?url=https://github.com/lab/arm/blob/main/worlds/a.wbt",
+        "/.well-known/other?x",
+    ];
     for (server, host) in table {
-        let answer = browser.ask(&format!("{server}/monitor?x=a%20b"), &[host]).await;
-        assert_eq!(answer.status, 301, "{server} {host:?}");
-        assert_eq!(answer.header("location"), Some("https://localhost/monitor?x=a%20b"), "{server} {host:?}");
+        for path in paths {
+            let answer = browser.ask(&format!("{server}{path}"), &[host]).await;
+            assert_eq!(answer.status, 301, "{server} {host:?} {path}");
+            let location = answer.header("location").unwrap_or_default();
+            let wanted = format!("https://localhost{path}");
+            // Digits in either case are the same.
+            assert_eq!(location.to_lowercase(), wanted.to_lowercase(), "{server} {host:?}");
+            assert_eq!(answer.header("set-cookie"), None, "{server} {host:?} {path}");
+        }
+        // No way to send a visitor elsewhere.
+        let answer = browser.ask(&format!("{server}//other.example/"), &[host]).await;
+        assert!(answer.header("location").unwrap().starts_with("https://localhost/"), "{server} {host:?}");
     }
+    let question = format!("{plain}/.well-known/acme-challenge/token");
+    assert_eq!(browser.ask(&question, &[]).await.status, 404, "certbot's questions are answered here");
 }
 
 #[actix_rt::test]

@@ -26,6 +26,7 @@ mod web_server;
 
 mod addresses;
 mod connections;
+mod encoded;
 mod exposure;
 mod pages;
 mod trust;

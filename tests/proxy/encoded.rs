@@ -1,0 +1,78 @@
+//! Paths as they are sent and as they arrive at what a simulation has listening: names of files with blanks and
+//! letters of any language do, and no way leads out of a port.
+
+use std::io::{Read, Write};
+use std::net::TcpListener;
+use std::sync::mpsc::{Receiver, channel};
+
+use crate::fleet::Fleet;
+use crate::rules::Rules;
+use crate::web_server::Kind;
+
+/// Stands in for the files of a Webots: tells which path it was asked for. It runs until the test program ends.
+fn files_of_webots(port: u16) -> Receiver<String> {
+    let listener = TcpListener::bind(("127.0.0.1", port)).unwrap();
+    let (told, asked) = channel();
+    std::thread::spawn(move || {
+        for mut connection in listener.incoming().flatten() {
+            let mut head = Vec::new();
+            let mut byte = [0];
+            while !head.ends_with(b"\r\n\r\n") && connection.read(&mut byte).is_ok_and(|length| length > 0) {
+                head.push(byte[0]);
+            }
+            let head = String::from_utf8_lossy(&head).into_owned();
+            let path = head.split(' ').nth(1).unwrap_or_default().to_owned();
+            // The test may have ended.
+            if told.send(path).is_ok() {
+                connection.write_all(b"HTTP/1.1 200 OK\r\nContent-Length: 4\r\nConnection: close\r\n\r\nfile").ok();
+            }
+        }
+    });
+    asked
+}
+
+/// What is asked for, and what arrives through Apache and through nginx; nothing where they refuse.
+const PATHS: [(&str, Option<&str>, Option<&str>); 13] = [
+    ("/textures/my%20file.png", Some("/textures/my%20file.png"), Some("/textures/my%20file.png")),
+    ("/%C3%BC+%2B.png?x=a%20b&y=%2F", Some("/%C3%BC++.png?x=a%20b&y=%2F"), Some("/%C3%BC++.png?x=a%20b&y=%2F")),
+    ("/a%25b.png", Some("/a%25b.png"), Some("/a%25b.png")),
+    ("/a%252fb.png", Some("/a%252fb.png"), Some("/a%252fb.png")),
+    ("/a%23b.png", Some("/a%23b.png"), Some("/a%23b.png")),
+    // Apache takes a question mark in a name for an attack.
+    ("/a%3Fb.png", None, Some("/a%3Fb.png")),
+    // A name with a slash is that of a folder, or of nothing.
+    ("/a%2Fb.png", None, Some("/a/b.png")),
+    ("/a/%2e%2e/b.png", Some("/b.png"), Some("/b.png")),
+    ("/%2e%2e/b.png", None, None),
+    ("/a/..%2F..%2Fb.png", None, None),
+    // What would end a line stays a part of the name.
+    ("/a%0D%0AX:%20y.png", Some("/a%0D%0AX:%20y.png"), Some("/a%0D%0AX:%20y.png")),
+    ("/a%00.png", None, None),
+    ("//a.png", Some("/a.png"), Some("/a.png")),
+];
+
+async fn paths_arrive(rules: Rules) {
+    let fleet = Fleet::start(rules).await;
+    let port = fleet.here.port + 2;
+    let asked = files_of_webots(port);
+    for (path, apache, nginx) in PATHS {
+        let wanted = if rules.kind() == Kind::Apache { apache } else { nginx };
+        let answer = fleet.browser.get(&format!("/{port}{path}")).await;
+        if wanted.is_some() {
+            assert_eq!((answer.status.as_u16(), answer.text().as_str()), (200, "file"), "{path}");
+        } else {
+            assert!([400, 403, 404].contains(&answer.status.as_u16()), "{path}: {}", answer.status);
+        }
+        assert_eq!(asked.try_recv().ok().as_deref(), wanted, "{path}");
+    }
+}
+
+#[actix_rt::test]
+async fn paths_arrive_through_apache_as_they_were_meant() {
+    paths_arrive(Rules::Apache).await;
+}
+
+#[actix_rt::test]
+async fn paths_arrive_through_nginx_as_they_were_meant() {
+    paths_arrive(Rules::Nginx).await;
+}
