@@ -27,6 +27,7 @@ use super::server::Server;
 use super::usage::UsageMonitor;
 use super::{orphans, outcome, process_group, process_tree};
 use crate::shared::admission::Rules;
+use crate::shared::auth::Lock;
 use crate::shared::connections::Connections;
 use crate::shared::live::Live;
 use crate::shared::metrics::Metrics;
@@ -221,6 +222,7 @@ fn assemble(
         phase,
         requests,
         main_thread: Arbiter::current(),
+        lock: config.admin_password.clone().map(Lock::new),
         connections: Connections::new(config.max_clients, config.max_clients_per_address),
         metrics,
         starts,

@@ -3,7 +3,6 @@
 use std::time::Duration;
 
 use actix_web::HttpResponse;
-use actix_web::http::header;
 
 use super::census::Everybody;
 use super::places::Census;
@@ -22,12 +21,4 @@ pub async fn everybody(server: &Server) -> Option<Everybody> {
 #[must_use]
 pub fn too_busy() -> HttpResponse {
     HttpResponse::ServiceUnavailable().body("Error: the server is too busy to tell.")
-}
-
-/// The answer to a request without the administrator's password.
-#[must_use]
-pub fn locked() -> HttpResponse {
-    HttpResponse::Unauthorized()
-        .insert_header((header::WWW_AUTHENTICATE, "Basic realm=\"simulation server\""))
-        .body("Error: a password is needed.")
 }

@@ -8,7 +8,7 @@ use actix_web::http::header::{self, HeaderValue};
 use actix_web::{HttpRequest, HttpResponse, web};
 use serde::Deserialize;
 
-use super::asking::{everybody, locked, too_busy};
+use super::asking::{everybody, too_busy};
 use super::census::Everybody;
 use super::pages;
 use super::server::Server;
@@ -16,7 +16,6 @@ use super::usage::Usages;
 use super::webots_viewer;
 use crate::asset;
 use crate::shared::assets::{self, Asset};
-use crate::shared::auth::is_authorised;
 use crate::shared::page::{Policy, html};
 use crate::shared::paths::{GET, READ, path};
 
@@ -79,10 +78,10 @@ struct Which {
 /// The last lines that a simulation has printed. They may hold what is nobody else's business: a password protects
 /// them, where there is one.
 async fn output(request: HttpRequest, which: web::Query<Which>, server: web::Data<Server>) -> HttpResponse {
-    if let Some(password) = &server.config.admin_password
-        && !is_authorised(&request, password)
+    if let Some(lock) = &server.lock
+        && let Err(locked) = lock.admit(&request, server.config.trusted_proxies.peer(&request))
     {
-        return locked();
+        return locked.answer();
     }
     let Some(everybody) = everybody(&server).await else {
         return too_busy();

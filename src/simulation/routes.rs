@@ -5,12 +5,11 @@ use std::sync::Arc;
 use actix_web::http::header;
 use actix_web::{HttpRequest, HttpResponse, web};
 
-use super::asking::{everybody, locked, too_busy};
+use super::asking::{everybody, too_busy};
 use super::page_routes;
 use super::server::Server;
 use super::status::{self, StatusPage};
 use super::web_client::WebClient;
-use crate::shared::auth::is_authorised;
 use crate::shared::metrics::CONTENT_TYPE;
 use crate::shared::paths::{self, GET, POST, READ, path};
 use crate::shared::shutdown::Request;
@@ -80,11 +79,11 @@ async fn health() -> HttpResponse {
 }
 
 async fn drain(request: HttpRequest, server: web::Data<Server>) -> HttpResponse {
-    let Some(password) = &server.config.admin_password else {
+    let Some(lock) = &server.lock else {
         return HttpResponse::Forbidden().body("Error: actions are off; adminPassword is not set.");
     };
-    if !is_authorised(&request, password) {
-        return locked();
+    if let Err(locked) = lock.admit(&request, server.config.trusted_proxies.peer(&request)) {
+        return locked.answer();
     }
     match server.requests.try_send(Request::Drain) {
         Ok(()) => HttpResponse::Accepted().body("draining"),

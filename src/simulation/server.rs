@@ -15,6 +15,7 @@ use super::load_monitor::{LoadMonitor, Readings};
 use super::places::Places;
 use super::usage::UsageMonitor;
 use crate::shared::admission::Rules;
+use crate::shared::auth::Lock;
 use crate::shared::connections::Connections;
 use crate::shared::live::Live;
 use crate::shared::load::Load;
@@ -44,6 +45,8 @@ pub struct Server {
     pub requests: tokio::sync::mpsc::Sender<Request>,
     /// Where Webots' actors live.
     pub main_thread: ArbiterHandle,
+    /// Guards what is the administrator's, where there is a password.
+    pub lock: Option<Lock>,
     /// Counts connections.
     pub connections: Connections,
     /// What is counted.

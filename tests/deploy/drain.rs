@@ -9,7 +9,10 @@ use crate::support::webots::Webots;
 use crate::support::{SOON, http, until};
 
 async fn post(server: &Server, path: &str, password: Option<&str>) -> u16 {
-    let request = awc::Client::builder().timeout(SOON).finish().post(server.url(path));
+    ask(awc::Client::builder().timeout(SOON).finish().post(server.url(path)), password).await
+}
+
+async fn ask(request: awc::ClientRequest, password: Option<&str>) -> u16 {
     let request = match password {
         Some(password) => request.basic_auth("admin", password),
         None => request,
@@ -66,6 +69,29 @@ async fn a_server_that_drains_by_request_ends_with_its_last_simulation() {
         assert_eq!(post(server, "/drain", Some("open sesame")).await, 202);
     })
     .await;
+}
+
+#[actix_rt::test]
+async fn passwords_can_not_be_guessed_at_without_end() {
+    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
+    let mut server =
+        simulation_server(&webots.path(), forge.path(), 1).set("adminPassword", "open sesame").start().await;
+    let clients = awc::Client::builder().timeout(SOON).finish();
+    let at = |request: awc::ClientRequest, address| request.insert_header(("x-forwarded-for", address));
+    let output = async |address, password| ask(at(clients.get(server.url("/output?id=1")), address), password).await;
+    let drain = async |address, password| ask(at(clients.post(server.url("/drain")), address), password).await;
+    let mut answers = Vec::new();
+    for _ in 0..20 {
+        answers.push(output("203.0.113.9", Some("guess")).await);
+        answers.push(drain("203.0.113.9", Some("guess")).await);
+    }
+    assert!(answers.starts_with(&[401; 30]) && answers.ends_with(&[429; 5]), "{answers:?}");
+    assert_eq!(drain("203.0.113.9", Some("open sesame")).await, 429, "it must not learn which one is right");
+    assert_eq!(drain("203.0.113.9", None).await, 401, "nothing was tried");
+    assert!(server.log().contains("client 203.0.113.9: a wrong administrator password"));
+    assert_eq!(output("203.0.113.10", Some("open sesame")).await, 404, "others are let in");
+    assert_eq!(drain("203.0.113.10", Some("open sesame")).await, 202);
+    assert_eq!(server.ended().await, Some(0));
 }
 
 #[actix_rt::test]

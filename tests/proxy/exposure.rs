@@ -48,6 +48,11 @@ async fn only_the_fleet_is_reachable(rules: Rules) {
         format!("/{here}/{private}"),
         format!("/assets/../{private}/"),
         "/server-status".to_owned(),
+        // What is for administrators alone.
+        format!("/{here}/drain"),
+        format!("/{here}//drain?x"),
+        format!("/{here}/%64rain"),
+        format!("/{}/drain", fleet.there.port),
     ];
     for path in plain.iter().chain(&tricks) {
         let answer = fleet.browser.get(path).await;
