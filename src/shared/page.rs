@@ -36,11 +36,11 @@ impl Policy {
         }
     }
 
-    /// Lets a page open WebSockets to the server that it comes from: older browsers don't take them for its own.
+    /// Lets a page open WebSockets to the server that it comes from: older browsers don't take them for its own. Only
+    /// `Host` tells which that is: `X-Forwarded-Host` and `Forwarded` may be anybody's word.
     #[must_use]
     pub fn own_websocket(mut self, request: &HttpRequest) -> Self {
-        let info = request.connection_info();
-        let host = info.host();
+        let host = request.headers().get(header::HOST).and_then(|host| host.to_str().ok()).unwrap_or_default();
         if !host.is_empty() && host.chars().all(|one| one.is_ascii_alphanumeric() || ".:-".contains(one)) {
             self.connections.push(format!("ws://{host} wss://{host}"));
         }
@@ -184,6 +184,25 @@ mod tests {
         let many: Vec<String> = (0..50).map(|number| format!("h{number}:1")).collect();
         let many: Vec<&str> = many.iter().map(String::as_str).collect();
         assert_eq!(sources(&many, true), ["https:", "wss:"], "too long to be named one by one");
+    }
+
+    #[test]
+    fn a_page_reaches_the_host_that_it_was_asked_from() {
+        let policy = |headers: &[(&'static str, &'static str)]| {
+            let request = actix_web::test::TestRequest::default();
+            let request = headers.iter().fold(request, |request, header| request.insert_header(*header));
+            Policy::own().own_websocket(&request.to_http_request()).text()
+        };
+        assert!(
+            policy(&[("host", "a.example:8443")])
+                .contains("connect-src 'self' ws://a.example:8443 wss://a.example:8443;")
+        );
+        assert!(policy(&[("host", "a.example; img-src *")]).contains("connect-src 'self';"));
+        let forged = [("x-forwarded-host", "evil.example"), ("forwarded", "host=evil.example")];
+        for forged in forged {
+            assert!(!policy(&[("host", "a.example"), forged]).contains("evil.example"), "{forged:?}");
+            assert!(!policy(&[forged]).contains("evil.example"), "{forged:?}");
+        }
     }
 
     #[test]
