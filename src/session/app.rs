@@ -123,7 +123,7 @@ pub async fn run(mut config: SessionConfig, file: PathBuf) -> Result<(), AppErro
         }
     }
     log::info!("stopping");
-    notify::stopping();
+    notify::stopping("stopping");
     phase_sender.send_replace(Phase::Closing);
     // A connection that doesn't end in time is cut.
     actix_rt::time::timeout(stop, handle.stop(true)).await.ok();

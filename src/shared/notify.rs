@@ -25,9 +25,9 @@ pub fn status(what: &str) {
     tell(&[NotifyState::Status(what)]);
 }
 
-/// The server ends in order.
-pub fn stopping() {
-    tell(&[NotifyState::Stopping, NotifyState::Status("stopping")]);
+/// The server ends in order, and why.
+pub fn stopping(why: &str) {
+    tell(&[NotifyState::Stopping, NotifyState::Status(why)]);
 }
 
 /// Feeds the watchdog, if there is one, each time that `answers` says so. Never ends.

@@ -142,16 +142,17 @@ pub async fn serve(assembly: Assembly) -> Result<(), AppError> {
     actix_rt::spawn(notify::feed_watchdog(async move || asked_for_life.send(Census).await.is_ok()));
     let mut no_places = std::pin::pin!(permanent::gone("Places", places.clone()));
     let mut no_readings = std::pin::pin!(permanent::gone("LoadMonitor", server.load_monitor.clone()));
-    loop {
+    // webots-fleet-renew starts a server again that was drained, and none that somebody has stopped.
+    let why = loop {
         let request = tokio::select! {
             request = signals.next() => request,
             Some(request) = asked.recv() => request,
-            () = drained(&server) => Request::Stop,
+            () = drained(&server) => break "drained: its last simulation has ended",
             fault = &mut no_places => return Err(AppError::Gone(fault)),
             fault = &mut no_readings => return Err(AppError::Gone(fault)),
         };
         match request {
-            Request::Stop => break,
+            Request::Stop => break "stopping",
             Request::Drain => {
                 log::info!("draining: no new clients, the server ends when the last has gone");
                 phase_sender.send_replace(Phase::Draining);
@@ -159,9 +160,9 @@ pub async fn serve(assembly: Assembly) -> Result<(), AppError> {
             }
             Request::Reload => log::info!("SIGHUP changes nothing here: the configuration is read at start"),
         }
-    }
+    };
     log::info!("stopping");
-    notify::stopping();
+    notify::stopping(why);
     phase_sender.send_replace(Phase::Closing);
     if actix_rt::time::timeout(server.config.timing.stop, empty(&places)).await.is_err() {
         end_all(server.run.path().to_owned()).await;

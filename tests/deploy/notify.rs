@@ -67,8 +67,14 @@ async fn a_simulation_server_tells_when_it_is_ready_drains_and_stops() {
     assert_eq!(http::try_get(&server.url("/health")).await.unwrap().status, 200, "at once");
     server.signal(Signal::SIGUSR1);
     manager.expect("STATUS=draining");
-    manager.expect("STOPPING=1\n");
+    manager.expect("STOPPING=1\nSTATUS=drained");
     assert_eq!(server.ended().await, Some(0));
+
+    let mut other = manager.start(simulation_server(&webots.path(), forge.path(), 1));
+    manager.expect("READY=1\n");
+    other.signal(Signal::SIGTERM);
+    manager.expect("STOPPING=1\nSTATUS=stopping");
+    assert_eq!(other.ended().await, Some(0));
 }
 
 #[actix_rt::test]
