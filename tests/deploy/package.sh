@@ -16,9 +16,37 @@ install_package() { # REVISION OPTION...
     in_machine apt-get install --yes --quiet --no-install-recommends "$@" "/mnt/packages/$revision.deb" 2>&1
 }
 
+nothing_runs() {
+    ! runs 'session-server|simulation-serv'
+}
+
+user_property() { # UNIT NAME
+    as_lab systemctl --user show --property="$2" --value "$1"
+}
+
 # What a user with a session of its own does.
 as_lab() { # COMMAND...
     in_machine runuser -u lab -- env HOME=/home/lab XDG_RUNTIME_DIR="/run/user/$(in_machine id -u lab)" "$@"
+}
+
+# Another unit that runs a program of the package: needrestart does restart such units.
+spared_by_needrestart_begins() {
+    # shellcheck disable=SC2016
+    in_machine sh -c '
+        set -e
+        apt-get install --yes --quiet --no-install-recommends needrestart
+        sed "s/1999/1998/; /logDir/d; s/\],$/]/" /etc/webots-fleet/session/main.json >/srv/other.json
+        printf "[Service]\nExecStart=/usr/bin/session-server /srv/other.json\nWorkingDirectory=/run\n" >/etc/systemd/system/other.service
+        systemctl start other' >"$WORK/needrestart.log" 2>&1 || fail "$(<"$WORK/needrestart.log")"
+    eventually answers 1998 /health ok
+}
+
+spared_by_needrestart_ends() { # PID OF THE SIMULATION SERVER
+    in_machine needrestart -l -r a >"$WORK/needrestart.log" 2>&1 || fail "$(<"$WORK/needrestart.log")"
+    is_later "/proc/$(property other MainPID)/exe" || fail "needrestart restarts nothing: $(<"$WORK/needrestart.log")"
+    [[ $(property webots-simulation@main MainPID) == "$1" ]] || fail 'needrestart has ended simulations'
+    in_machine systemctl stop other
+    in_machine rm -f /etc/systemd/system/other.service /srv/other.json
 }
 
 main() {
@@ -64,6 +92,15 @@ main() {
     in_machine sed -i 's/"localhost:2000"/"localhost:2000", "localhost:2200"/' /etc/webots-fleet/session/main.json
     in_machine systemctl reload webots-session@main
     eventually answers 1999 /status 2200
+    in_machine cp /etc/webots-fleet/session/main.json /srv/good.json
+    in_machine sed -i 's/"port": 1999/"port": "many"/; s/, "localhost:2200"//' /etc/webots-fleet/session/main.json
+    ! in_machine systemctl reload webots-session@main 2>"$WORK/reload.log" || fail 'a reload of a wrong configuration succeeds'
+    grep --quiet 'webots-session@main.service failed' "$WORK/reload.log" || fail "$(<"$WORK/reload.log")"
+    in_machine journalctl --unit=webots-session@main --output=cat | grep --quiet 'main.json.*port' || fail 'nobody is told what is wrong'
+    answers 1999 /status 2200 || fail 'it does not go on as before'
+    in_machine mv /srv/good.json /etc/webots-fleet/session/main.json
+    in_machine chmod 644 /etc/webots-fleet/session/main.json
+    in_machine systemctl reload webots-session@main
     local old
     old=$(property webots-session@main MainPID)
     in_machine sh -c "kill -KILL $old"
@@ -75,11 +112,18 @@ main() {
     old=$(property webots-simulation@main MainPID)
     local old_session
     old_session=$(property webots-session@main MainPID)
-    install_package 2 >"$WORK/install.log" || fail "$(<"$WORK/install.log")"
+    spared_by_needrestart_begins
+    install_package 2 -o Dpkg::Options::=--force-confold >"$WORK/install.log" || fail "$(<"$WORK/install.log")"
+    [[ $(in_machine dpkg-query --show webots-fleet) == *999.0.0-2 ]] || fail 'it is not upgraded'
+    is_later /usr/share/webots-fleet/nginx.conf || fail 'the examples are the old ones'
+    in_machine grep --quiet '"maxConnections": 19' /etc/webots-fleet/simulation/main.json.dpkg-dist || fail 'the new example is not there'
     grep --quiet 'webots-simulation@main.service runs on as it was' "$WORK/install.log" || fail "$(<"$WORK/install.log")"
     in_machine grep --quiet '"maxConnections": 7' /etc/webots-fleet/simulation/main.json || fail 'the configuration is lost'
     [[ $(property webots-simulation@main MainPID) == "$old" ]] || fail 'the simulation server was restarted'
     [[ $(property webots-session@main MainPID) != "$old_session" ]] || fail 'the session server was not restarted'
+    is_later "/proc/$(property webots-session@main MainPID)/exe" || fail 'the session server is the old one'
+    ! is_later "/proc/$old/exe" || fail 'the packages do not differ'
+    spared_by_needrestart_ends "$old"
     runs demo-simulator || fail 'the simulation is gone'
     eventually hears_more "$(stat --format=%s "$WORK/client.log")"
 
@@ -93,9 +137,25 @@ main() {
     leave
     wait "$renewal" || fail "it was not renewed: $(<"$WORK/renew.log")"
     [[ $(property webots-simulation@main MainPID) != "$old" ]] || fail 'it is the old one'
+    is_later "/proc/$(property webots-simulation@main MainPID)/exe" || fail 'it is the old program'
     answers 2000 /status '"places":7' || fail 'it has not read its configuration'
     # A machine that is busy otherwise makes it full.
     eventually answers 1999 /status '"state":"\(up\|full\)"'
+
+    echo 'leaves alone what an administrator does during a renewal'
+    for act in stop restart; do
+        simulate https://github.com/cyberbotics/demo/blob/main/worlds/a.wbt &
+        eventually runs demo-simulator
+        in_machine webots-fleet-renew main >"$WORK/renew.log" 2>&1 &
+        renewal=$!
+        eventually drains webots-simulation@main
+        in_machine systemctl "$act" webots-simulation@main
+        old=$(property webots-simulation@main MainPID)
+        wait "$renewal" || fail "it has failed: $(<"$WORK/renew.log")"
+        [[ $(property webots-simulation@main MainPID) == "$old" ]] || fail "a server was started after '$act'"
+        [[ $act != stop ]] || grep --quiet 'was stopped meanwhile' "$WORK/renew.log" || fail "$(<"$WORK/renew.log")"
+        in_machine systemctl start webots-simulation@main
+    done
 
     echo 'does not try again with a wrong configuration'
     in_machine sh -c 'echo "{}" >/etc/webots-fleet/session/wrong.json'
@@ -127,6 +187,9 @@ main() {
     as_lab sed -i 's|"webotsHome": .*|"webots": "/usr/bin/demo-simulator", "gitMirrors": {"https://github.com/cyberbotics/demo": "file:/srv/webots-demo/project"},|; s|"xvfb": true|"xvfb": false|' \
         /home/lab/.config/webots-fleet/simulation/main.json
     commands 'Units of a user' | sed -n '/^systemctl/p' >"$WORK/packages/commands"
+    # Of a desktop session there is what starts the units of a user.
+    in_machine sh -c 'printf "[Unit]\nBindsTo=graphical-session.target\nBefore=graphical-session.target\n" >/etc/systemd/user/desktop.target'
+    as_lab systemctl --user daemon-reload
     as_lab bash -euo pipefail /mnt/packages/commands 2>/dev/null || fail "$(as_lab systemctl --user status 'webots-*' 2>&1)"
     eventually answers 1999 /status '"state":"\(up\|full\)"'
     simulate https://github.com/cyberbotics/demo/blob/main/worlds/a.wbt &
@@ -136,17 +199,37 @@ main() {
     # shellcheck disable=SC2016
     in_machine sh -c 'for process in $(pidof session-server simulation-server); do grep --quiet "^Seccomp:.2" /proc/$process/status || exit 1; done' ||
         fail 'they may do everything'
-    as_lab systemctl --user disable --quiet --now 'webots-simulation@main' 'webots-session@main'
+    as_lab systemctl --user stop 'webots-*'
+    for _ in 1 2; do
+        as_lab systemctl --user start desktop.target
+        eventually answers 1999 /health ok
+        simulation=$(user_property webots-simulation@main ActiveEnterTimestampMonotonic)
+        session=$(user_property webots-session@main InactiveExitTimestampMonotonic)
+        ((simulation > 0 && simulation <= session)) || fail 'the session server of a user was started first'
+        as_lab systemctl --user stop desktop.target
+        eventually nothing_runs
+    done
+    as_lab systemctl --user start desktop.target
+    eventually answers 1999 /health ok
 
     echo 'is removed: nothing runs, configurations stay'
+    in_machine systemctl --quiet --global enable webots-simulation@lab
+    in_machine mkdir -p /etc/systemd/system/webots-session@main.service.d /etc/systemd/user/webots-simulation@.service.d
+    in_machine touch /etc/systemd/system/webots-session@main.service.d/override.conf /etc/systemd/user/webots-simulation@.service.d/override.conf
+    in_machine systemctl --quiet mask webots-session@other
+    in_machine sh -c 'sed s/1999/1998/ /etc/webots-fleet/session/main.json >/etc/webots-fleet/session/second.json'
+    in_machine systemctl start webots-session@second
     in_machine apt-get remove --yes --quiet webots-fleet >"$WORK/remove.log" 2>&1 || fail "$(<"$WORK/remove.log")"
-    ! runs 'session-server|simulation-serv' || fail 'a server still runs'
+    nothing_runs || fail 'a server still runs'
+    ! as_lab systemctl --user cat webots-session@new.service >/dev/null 2>&1 || fail "a user's manager still knows the units"
     in_machine test -e /etc/webots-fleet/simulation/main.json || fail 'the configuration is gone'
 
     echo 'is purged: nothing is left'
+    in_machine test -L /home/lab/.config/systemd/user/graphical-session.target.wants/webots-session@main.service || fail 'what was enabled is elsewhere'
     in_machine userdel --force --remove lab 2>/dev/null
     in_machine rm -rf /run/systemd/system/webots-simulation@.service.d /srv/webots-demo
     in_machine dpkg --purge webots-fleet >"$WORK/purge.log" 2>&1 || fail "$(<"$WORK/purge.log")"
+    in_machine rm /etc/systemd/user/desktop.target
     [[ -z $(traces) ]] || fail "this is left: $(traces)"
     echo 'ok'
 }
