@@ -141,7 +141,10 @@ impl Handler<Leave> for Audience {
 
 impl Drop for Audience {
     fn drop(&mut self) {
-        self.tell(News::Lost);
+        // Nothing is news any more once the server ends.
+        if self.news != Some(News::Closing) {
+            self.clients.tell(News::Lost);
+        }
     }
 }
 

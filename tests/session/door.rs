@@ -55,7 +55,7 @@ async fn texts_that_come_at_once_are_answered_in_their_order_and_too_many_are_re
     let mut client = Client::connect(&session.websocket("/session")).await;
     client.until("1").await;
     // Some of the answers are known at once, others only to the registry.
-    let project = |number: usize| if number % 2 == 0 { "lab" } else { "other" };
+    let project = |number: usize| if number.is_multiple_of(2) { "lab" } else { "other" };
     let text = |number: usize| match number % 3 {
         0 => world("lab/arm", "main", &format!("worlds/{number}.txt")),
         _ => world(&format!("{}/p{number}", project(number)), "main", "worlds/a.wbt"),
@@ -67,7 +67,7 @@ async fn texts_that_come_at_once_are_answered_in_their_order_and_too_many_are_re
     let heard = client.heard.split_off(1);
     let is_answer = |number: usize, answer: &str| match number % 3 {
         0 => answer.starts_with(&format!("Error: Wrong Webots simulation URL: \"{number}.txt\" is no world file")),
-        _ if number % 2 == 0 => {
+        _ if number.is_multiple_of(2) => {
             answer == format!("Error: no simulation server accepts https://github.com/lab/p{number}.")
         }
         _ => answer == server.url(),
