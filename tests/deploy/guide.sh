@@ -104,6 +104,26 @@ firewall_lets_in() { # ADDRESS ITS MACHINE PORT
     in_machine curl --silent --fail --max-time 2 --output /dev/null "http://$1:$3/"
 }
 
+# A class of visitors with several WebSockets each, which all stay open.
+a_class_has_room() { # HOST
+    in_machine python3 - "$1" 900 <<'END' || fail "there is no room for a class: $(in_machine tail -n 5 /var/log/nginx/error.log /var/log/apache2/error.log 2>&1)"
+import resource, socket, ssl, sys
+
+host, count = sys.argv[1], int(sys.argv[2])
+resource.setrlimit(resource.RLIMIT_NOFILE, (count + 100, count + 100))
+context, doors = ssl.create_default_context(), []
+asked = (f"GET /session HTTP/1.1\r\nHost: {host}\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n"
+         "Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n")
+for number in range(count):
+    door = context.wrap_socket(socket.create_connection((host, 443), timeout=10), server_hostname=host)
+    door.sendall(asked.encode())
+    answer = door.recv(100)
+    if b" 101 " not in answer:
+        sys.exit(f"WebSocket {number}: {answer!r}")
+    doors.append(door)
+END
+}
+
 # A visitor's way, in a browser on this machine.
 visit() { # HOST
     in_machine cat /etc/hosts >"$WORK/hosts"
@@ -143,6 +163,7 @@ one_machine() { # MACHINE HEADING OF THE WEB SERVER
     [[ $(status_of https://www.fleet.lab.example/monitor) == 301 ]] || fail 'www is not sent on'
     visit fleet.lab.example
     ended_with_all_it_had
+    a_class_has_room fleet.lab.example
     only_the_fleet_is_reachable fleet.lab.example
 }
 
@@ -175,6 +196,7 @@ upgrade() {
     renewal=$!
     eventually drains webots-simulation@main
     [[ $(in_machine dpkg-query --show webots-fleet) == *999.0.0-2 ]] || fail 'it is not upgraded'
+    ! is_later "/proc/$old/exe" || fail 'the simulation runs with the new version already'
     eventually page https://fleet.lab.example/request '^0$'
     eventually hears_more "$length"
     eventually hears_more "$(stat --format=%s "$WORK/client.log")"
@@ -182,6 +204,9 @@ upgrade() {
     leave
     wait "$renewal"
     is_another webots-simulation@main "$old" || fail 'it was not renewed'
+    is_later "/proc/$(property webots-simulation@main MainPID)/exe" || fail 'the old version runs on'
+    is_later "/proc/$(property webots-session@main MainPID)/exe" || fail 'the old session server runs on'
+    in_machine grep --quiet gitMirrors /etc/webots-fleet/simulation/main.json || fail 'the configuration is lost'
     eventually page https://fleet.lab.example/request '^1$'
     visit fleet.lab.example
 }
