@@ -16,10 +16,10 @@ use super::config_value::Secret;
 use super::paths::come_back;
 use super::peer::Peer;
 
-/// How many passwords an address may send at once.
-const AT_ONCE: NonZeroU32 = NonZeroU32::new(30).unwrap();
-/// And after that.
-const PER_MINUTE: NonZeroU32 = NonZeroU32::new(12).unwrap();
+/// How many passwords an address may send at once: 30.
+const AT_ONCE: NonZeroU32 = NonZeroU32::MIN.saturating_add(29);
+/// And in each minute after that: 12.
+const PER_MINUTE: NonZeroU32 = NonZeroU32::MIN.saturating_add(11);
 /// Of so many addresses is it known how many passwords they have sent lately. Nobody else may send one then.
 const MOST_ADDRESSES: usize = 10_000;
 
