@@ -20,6 +20,7 @@ mod support;
 
 mod door;
 mod mail;
+mod names;
 mod placement;
 mod pushing;
 mod seeing;
