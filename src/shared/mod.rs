@@ -14,6 +14,7 @@ pub mod load;
 pub mod logging;
 pub mod metrics;
 pub mod notify;
+pub mod origin;
 pub mod page;
 pub mod paths;
 pub mod peer;

@@ -49,7 +49,8 @@ pub struct Reading {
     "Wrong Webots simulation URL: {problem}. Allowed is https://github.com/USER/REPOSITORY/blob/REFERENCE/PATH/worlds/NAME.wbt."
 )]
 pub struct NoProject {
-    problem: String,
+    /// What is wrong with it, without a capital and a period.
+    pub problem: String,
 }
 
 fn no_project(problem: impl Into<String>) -> NoProject {

@@ -15,6 +15,14 @@ pub struct UrlPrefix {
     inside: Option<Inside>,
 }
 
+/// A text of the configuration that is no prefix.
+#[derive(Debug, thiserror::Error)]
+#[error("{text:?} is no URL prefix: {problem}; allowed are such as https://github.com/USER")]
+pub struct NoPrefix {
+    text: String,
+    problem: String,
+}
+
 /// What a prefix names within one repository, whatever form its forge gives to the URL.
 #[derive(Debug, Clone, PartialEq, Eq)]
 struct Inside {
@@ -81,17 +89,18 @@ impl UrlPrefix {
 }
 
 impl TryFrom<String> for UrlPrefix {
-    type Error = NoProject;
+    type Error = NoPrefix;
 
-    fn try_from(text: String) -> Result<Self, NoProject> {
-        let (host, mut segments) = split_url(text.trim_end_matches('/'))?;
+    fn try_from(text: String) -> Result<Self, NoPrefix> {
+        let wrong = |NoProject { problem }| NoPrefix { text: text.clone(), problem };
+        let (host, mut segments) = split_url(text.trim_end_matches('/')).map_err(wrong)?;
         let inside = split_repository(&segments).ok();
         let inside = inside.map(|(repository, reference, kind)| Inside { repository, reference, kind });
         let repository = inside.as_ref().map_or(segments.len(), |inside| inside.repository);
         if repository >= 2
             && let Some(name) = segments.get_mut(repository - 1)
         {
-            *name = without_git(name)?;
+            *name = without_git(name).map_err(wrong)?;
         }
         Ok(Self { text, host, segments, inside })
     }

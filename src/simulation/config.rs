@@ -6,10 +6,12 @@ use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
+use super::display::DisplayName;
 use super::mirrors::Mirrors;
 use crate::shared::address::{PublicAddress, check_host};
 use crate::shared::config::{Configuration, Unfit};
 use crate::shared::config_value::{ExpandedPath, folder, local_address, object, one_or_many, percent, seconds, whole};
+use crate::shared::origin::Origin;
 use crate::shared::peer::TrustedProxies;
 use crate::shared::repositories::UrlPrefix;
 
@@ -112,7 +114,7 @@ pub struct SimulationConfig {
     pub project_size: u64,
     /// The display that Webots opens its window on. Default: the environment variable `DISPLAY`, else `:0`.
     #[serde(default)]
-    pub display: Option<String>,
+    pub display: Option<DisplayName>,
     /// Give each Webots a virtual display of its own (needs `xvfb-run`). Default: false.
     #[serde(default)]
     pub xvfb: bool,
@@ -121,7 +123,7 @@ pub struct SimulationConfig {
     pub hang_limit: Duration,
     /// Pages from which browsers may open `/client`, as origins (`https://lab.org`). Default: any.
     #[serde(default, deserialize_with = "one_or_many")]
-    pub allowed_origins: Vec<String>,
+    pub allowed_origins: Vec<Origin>,
     /// Password of actions such as `/drain`. Default: none, and actions are off.
     #[serde(default)]
     pub admin_password: Option<crate::shared::config_value::Secret>,

@@ -3,6 +3,7 @@
 use std::sync::mpsc;
 use std::time::Duration;
 
+use serde::{Deserialize, Serialize};
 use x11rb::errors::ConnectError;
 use x11rb::reexports::x11rb_protocol::parse_display::parse_display;
 use x11rb::rust_connection::RustConnection;
@@ -16,7 +17,7 @@ const LAST_NUMBER: u16 = u16::MAX - 6000;
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum Trouble {
     /// The name is none.
-    #[error("{0:?} is no display: allowed is HOST:NUMBER or :NUMBER")]
+    #[error("{0:?} is no display; allowed is HOST:NUMBER or :NUMBER")]
     NoName(String),
     /// No X server is there.
     #[error(
@@ -47,10 +48,27 @@ pub enum Trouble {
     },
 }
 
+/// The name of a display, such as `:0`.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(try_from = "String")]
+pub struct DisplayName(String);
+
+impl TryFrom<String> for DisplayName {
+    type Error = Trouble;
+
+    fn try_from(name: String) -> Result<Self, Trouble> {
+        if parse_display(Some(&name)).is_ok_and(|parsed| parsed.display <= LAST_NUMBER) {
+            Ok(Self(name))
+        } else {
+            Err(Trouble::NoName(name))
+        }
+    }
+}
+
 /// The display that is used where none is configured: the server's own, else the first.
 #[must_use]
-pub fn effective(configured: Option<&str>) -> String {
-    configured.map(str::to_owned).or_else(of_environment).unwrap_or_else(|| ":0".to_owned())
+pub fn effective(configured: Option<&DisplayName>) -> String {
+    configured.map(|display| display.0.clone()).or_else(of_environment).unwrap_or_else(|| ":0".to_owned())
 }
 
 /// The display that the environment names.
@@ -64,9 +82,7 @@ pub fn of_environment() -> Option<String> {
 /// # Errors
 /// Why Webots can't open its window there, and what to do about it.
 pub fn look(display: &str) -> Result<(), Trouble> {
-    if !parse_display(Some(display)).is_ok_and(|parsed| parsed.display <= LAST_NUMBER) {
-        return Err(Trouble::NoName(display.to_owned()));
-    }
+    DisplayName::try_from(display.to_owned())?;
     let (sender, answer) = mpsc::channel();
     let name = display.to_owned();
     // A display that never answers would hold whoever waits for it.

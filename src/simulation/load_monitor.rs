@@ -244,3 +244,47 @@ impl Handler<GpusRead> for LoadMonitor {
         self.gpus = Some((Instant::now(), gpus));
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[actix_rt::test]
+    async fn the_load_is_the_mean_of_five_seconds_and_the_history_is_ten_minutes_long() {
+        let places = Places::new(2001..=2001, 1).start();
+        let (mut monitor, readings) = LoadMonitor::new(places, Path::new("/"), None);
+        let load = || readings.borrow().load.map(Load::percent);
+        assert_eq!(load(), None);
+        let mut read = |cpu: f64| {
+            monitor.machine.cpu = cpu;
+            monitor.publish(0, 0);
+        };
+        let table = [(10.0, 10.0), (20.0, 15.0), (30.0, 20.0), (40.0, 25.0), (50.0, 30.0), (60.0, 40.0), (0.0, 36.0)];
+        for (cpu, mean) in table {
+            read(cpu);
+            assert_eq!(load(), Some(mean), "after {cpu}");
+        }
+        for second in 0..700 {
+            read(f64::from(second));
+        }
+        let history: Vec<f64> = readings.borrow().history.iter().map(|sample| sample.machine.cpu).collect();
+        assert_eq!(history, (100..700).map(f64::from).collect::<Vec<f64>>());
+        assert_eq!(PERIOD * 600, Duration::from_mins(10));
+    }
+
+    #[actix_rt::test]
+    async fn gpus_that_are_no_longer_read_do_not_count() {
+        let places = Places::new(2001..=2001, 1).start();
+        let (mut monitor, readings) = LoadMonitor::new(places, Path::new("/"), None);
+        let gpu = Gpu { compute: 90.0, ..Gpu::default() };
+        let before = |age: Duration| Instant::now().checked_sub(age).unwrap();
+        monitor.gpus = Some((before(GPU_AGE / 2), vec![gpu.clone()]));
+        monitor.publish(0, 0);
+        assert_eq!(readings.borrow().gpus.len(), 1);
+        assert_eq!(readings.borrow().load.map(Load::percent), Some(90.0));
+        monitor.gpus = Some((before(GPU_AGE * 2), vec![gpu]));
+        monitor.publish(0, 0);
+        assert_eq!(readings.borrow().gpus, []);
+        assert_eq!(readings.borrow().load.map(Load::percent), Some(45.0));
+    }
+}

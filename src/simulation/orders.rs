@@ -45,7 +45,7 @@ impl Orders {
             xvfb: self.config.xvfb,
             instance: self.project.instance.path(),
         };
-        let display = display::effective(self.config.display.as_deref());
+        let display = display::effective(self.config.display.as_ref());
         Plan {
             command: launch.arguments(),
             environment: vec![("DISPLAY".into(), display.into())],

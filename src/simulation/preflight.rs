@@ -60,7 +60,7 @@ fn display(config: &SimulationConfig) -> Result<String, String> {
     if config.xvfb {
         return Ok("each Webots gets a virtual display of its own (xvfb), without the graphics card".to_owned());
     }
-    let display = display::effective(config.display.as_deref());
+    let display = display::effective(config.display.as_ref());
     let source = match (&config.display, display::of_environment()) {
         (Some(_), _) => "the configuration names it",
         (None, Some(_)) => "the environment variable DISPLAY names it",

@@ -210,7 +210,7 @@ impl Webots {
         if exit.clean || self.listening || self.orders.config.xvfb {
             return self.exited(exit, ctx);
         }
-        let display = display::effective(self.orders.config.display.as_deref());
+        let display = display::effective(self.orders.config.display.as_ref());
         let look = actix_rt::task::spawn_blocking(move || display::look(&display).err());
         look.into_actor(self)
             .map(move |hint, this, ctx| {

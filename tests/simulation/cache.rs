@@ -4,6 +4,7 @@ use std::path::Path;
 use std::time::Duration;
 
 use crate::checkout::{cached, noise, outcome, reader, size_of, world_text};
+use crate::git_wrapper::GitWrapper;
 use crate::scene::{arm, instance_folders, nothing_left};
 use crate::support::client::Client;
 use crate::support::git::{Forge, world};
@@ -179,6 +180,27 @@ async fn mending_hurts_nobody_who_uses_what_is_damaged() {
     drop((one, other));
     let _next = start().await;
     until("it is gone", async || !damaged.exists()).await;
+}
+
+#[actix_rt::test]
+async fn a_remote_that_fails_has_the_cache_examined_once_in_three_minutes() {
+    let (forge, webots) = (Forge::with_arm(), reader());
+    let fails = tempfile::tempdir().unwrap();
+    let fail = format!("case \"$*\" in *fetch*) [ ! -e {}/now ] || exit 128;; esac", fails.path().display());
+    let wrapper = GitWrapper::new(&fail);
+    let server = simulation_server(&webots.path(), forge.path(), 1).env("PATH", &wrapper.path()).start().await;
+    assert!(outcome(&server, &arm()).await.contains("opened"));
+    let examined = || wrapper.calls().iter().filter(|call| call.contains(" fsck ")).count();
+    assert_eq!(examined(), 0);
+    std::fs::write(fails.path().join("now"), "").unwrap();
+    forge.commit("lab/arm", "main", &[("worlds/a.wbt", &world_text("next"))]);
+    for _ in 0..3 {
+        let told = outcome(&server, &arm()).await;
+        assert!(told.contains("git fetch ended with exit code 128"), "{told}");
+        assert_eq!(examined(), 1, "{:#?}", wrapper.calls());
+    }
+    std::fs::remove_file(fails.path().join("now")).unwrap();
+    assert!(outcome(&server, &arm()).await.contains("opened [next]"));
 }
 
 #[actix_rt::test]

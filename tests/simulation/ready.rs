@@ -1,15 +1,16 @@
 //! When Webots is ready, where, and when it is not.
 
 use std::net::TcpListener;
-use std::path::PathBuf;
-use std::time::Duration;
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
 
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 
-use crate::scene::{DEMO, arm, nothing_left, stages};
+use crate::checkout::{outcome, world_text};
+use crate::scene::{DEMO, arm, instance_folders_in, nothing_left, stages};
 use crate::support::client::Client;
-use crate::support::git::Forge;
+use crate::support::git::{Forge, world};
 use crate::support::program::simulation_server;
 use crate::support::until;
 use crate::support::webots::{Webots, instances_below};
@@ -76,13 +77,17 @@ async fn a_webots_that_hangs_is_told_and_ended() {
     let webots = Webots::script(&format!(
         "args=()\nfor one; do case $one in --heartbeat*) ;; *) args+=(\"$one\");; esac; done\n{DEMO} \"${{args[@]}}\" & wait"
     ));
-    let builder = simulation_server(&webots.path(), forge.path(), 1).set("timing.heartbeat", 0.1);
-    let server = builder.set("hangLimit", 0.6).start().await;
+    let builder = simulation_server(&webots.path(), forge.path(), 1).set("timing.heartbeat", 0.5);
+    let server = builder.set("hangLimit", 1.1).start().await;
     let mut client = Client::start(&server, &arm()).await;
     client.until("webots:").await;
-    client.until("loading: Webots has given no sign of life for").await;
+    let ready = Instant::now();
+    let told = client.until("loading: Webots has given no sign of life for").await;
+    // Six periods, and the time to the next look.
+    assert!(told.ends_with("for 3 seconds") && ready.elapsed() > Duration::from_millis(2900), "{told}");
     let told = client.until("loading: Error:").await;
-    assert!(told.contains("Webots gave no sign of life for"), "{told}");
+    assert!(told.contains("Webots gave no sign of life for 4 seconds"), "{told}");
+    assert!(ready.elapsed() > Duration::from_millis(4000), "hangLimit was not waited for");
     assert_eq!(client.closed().await, Some(1000));
     nothing_left(&server, 1).await;
 }
@@ -127,9 +132,38 @@ async fn webots_is_given_the_documented_command_line() {
 }
 
 #[actix_rt::test]
+async fn paths_may_have_spaces_and_quotes() {
+    let paths = std::env::var_os("PATH").unwrap();
+    let has_xvfb = std::env::split_paths(&paths).any(|folder| folder.join("xvfb-run").is_file());
+    let (forge, folder) = (Forge::new(), tempfile::tempdir().unwrap());
+    forge.commit("lab/arm", "main", &[("p q's/worlds/b  \"c\".wbt", &world_text("opened"))]);
+    let script = "for last; do :; done\ntest -S /tmp/.X11-unix/X${DISPLAY#:} && echo 'with a display'\necho \"$PWD [$(sed -n 2p \"$last\")] $last\"\nexit 1";
+    let (reader, home) = (Webots::script(script), folder.path().join("my \"own\" webots"));
+    std::fs::create_dir(&home).unwrap();
+    let program = home.join("webots");
+    std::fs::copy(reader.path(), &program).unwrap();
+    let at = |name: &str| folder.path().join(name).to_str().unwrap().to_owned();
+    for xvfb in [false, true] {
+        if xvfb && !has_xvfb {
+            eprintln!("xvfb-run is missing here: paths with spaces are NOT tested with it");
+            continue;
+        }
+        let builder = simulation_server(&program, forge.path(), 1).set("cacheDir", at("the cache's")).set("xvfb", xvfb);
+        let server = builder.set("logDir", at("the log's")).start().await;
+        let told = outcome(&server, &world("lab/arm", "main", "p%20q's/worlds/b%20%20%22c%22.wbt")).await;
+        assert!(told.contains("/project/p q's [opened] /"), "{told}");
+        assert!(!xvfb || told.contains("with a display | "), "{told}");
+        assert!(told.contains("/the cache's/") && told.contains("/p q's/worlds/b  \"c\".wbt"), "{told}");
+        let log = format!("{}/simulation/instances/{}.log", at("the log's"), server.port + 1);
+        assert!(std::fs::read_to_string(log).unwrap().contains("[opened]"));
+        until("its folder is gone", async || instance_folders_in(Path::new(&at("the cache's"))).is_empty()).await;
+    }
+}
+
+#[actix_rt::test]
 async fn a_missing_webots_or_xvfb_is_told_with_what_to_do() {
     let forge = Forge::with_arm();
-    let server = simulation_server(std::path::Path::new("/nowhere/webots"), forge.path(), 1).start().await;
+    let server = simulation_server(Path::new("/nowhere/webots"), forge.path(), 1).start().await;
     let told = Client::start(&server, &arm()).await.until("loading: Error:").await;
     assert!(told.contains("has no Webots at /nowhere/webots") && told.contains("webotsHome"), "{told}");
     let webots = Webots::launcher();

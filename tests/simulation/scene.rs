@@ -133,8 +133,13 @@ pub async fn nothing_left(server: &Server, places: u16) {
 
 /// The folders of simulations below a server's folder.
 pub fn instance_folders(folder: &Path) -> Vec<PathBuf> {
+    instance_folders_in(&folder.join("cache"))
+}
+
+/// Those in a cache.
+pub fn instance_folders_in(cache: &Path) -> Vec<PathBuf> {
     let inside = |folder: PathBuf| std::fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.path());
-    let runs = inside(folder.join("cache/runs"));
+    let runs = inside(cache.join("runs"));
     let is_instance = |path: &PathBuf| path.file_name().unwrap().to_string_lossy().starts_with("instance-");
     runs.flat_map(inside).filter(is_instance).collect()
 }

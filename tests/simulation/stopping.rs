@@ -5,6 +5,7 @@ use std::net::TcpListener;
 use std::time::{Duration, Instant};
 
 use nix::sys::signal::Signal;
+use serde_json::json;
 
 use crate::scene::{arm, stages};
 use crate::support::client::Client;
@@ -54,6 +55,46 @@ async fn drain_is_off_without_a_password_and_ends_an_empty_server() {
     until("it is logged", async || server.log().contains("SIGHUP changes nothing")).await;
     server.signal(Signal::SIGUSR1);
     assert_eq!(server.ended().await, Some(0));
+}
+
+#[actix_rt::test]
+async fn a_fault_of_the_configuration_is_one_line_and_exit_code_2() {
+    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
+    for (key, value, words) in [
+        (
+            "allowedOrigins",
+            json!("https://lab.org/viewer"),
+            ["allowedOrigins", "no origin; allowed is \"https://lab.org\""],
+        ),
+        (
+            "allowedOrigins",
+            json!(["https://lab.org", "lab"]),
+            ["allowedOrigins", "\"lab\" is no origin; allowed are such as"],
+        ),
+        ("display", json!("screen"), ["display", "\"screen\" is no display; allowed is HOST:NUMBER or :NUMBER"]),
+        ("display", json!(""), ["display", "\"\" is no display"]),
+        ("notify", json!("lab.org"), ["notify", "\"lab.org\" is no URL"]),
+        (
+            "allowedRepositories",
+            json!(["github.com/lab"]),
+            ["allowedRepositories", "\"github.com/lab\" is no URL prefix: it"],
+        ),
+        ("blockedRepositories", json!("https://x/../y"), ["blockedRepositories", "allowed are such as https://git"]),
+        ("gitMirrors", json!({"x": "file:/y"}), ["gitMirrors", "\"x\" is no URL prefix"]),
+        ("timeout", json!(359), ["timeout", "360"]),
+        ("maxConnections", json!(0), ["maxConnections", "a whole number from 1 to 10000"]),
+        ("shareIdleTime", json!(101), ["shareIdleTime", "101"]),
+        ("timing", json!({"checkout": -1}), ["timing.checkout", "-1"]),
+        ("timing", json!({"silence": 20}), ["timing.silence", "not more than timing.ping"]),
+        ("docker", json!(true), ["docker", "allowed is false"]),
+    ] {
+        let mut server = simulation_server(&webots.path(), forge.path(), 1).set(key, value.clone()).spawn();
+        assert_eq!(server.ended().await, Some(2), "{key}: {value}");
+        let said = server.log();
+        assert_eq!(said.lines().count(), 1, "{said}");
+        assert!(said.starts_with("error: ") && said.contains("config.json: "), "{said}");
+        assert!(words.iter().all(|word| said.contains(word)), "{key}: {value} gives {said}");
+    }
 }
 
 #[actix_rt::test]

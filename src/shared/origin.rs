@@ -1,0 +1,68 @@
+//! Origins of web pages, as browsers tell them (RFC 6454, section 6.1). Pure.
+
+use serde::{Deserialize, Serialize};
+use url::Url;
+
+/// Scheme, host and port of web pages, such as `https://lab.org`.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(try_from = "String")]
+pub struct Origin(String);
+
+impl Origin {
+    /// Whether a browser tells this origin.
+    #[must_use]
+    pub fn is(&self, told: &str) -> bool {
+        self.0 == told
+    }
+}
+
+impl TryFrom<String> for Origin {
+    type Error = String;
+
+    fn try_from(text: String) -> Result<Self, String> {
+        match Url::parse(&text) {
+            Ok(url) if ["http", "https"].contains(&url.scheme()) => {
+                let origin = url.origin().ascii_serialization();
+                // What would never be told must not be taken for a rule that lets somebody in.
+                if text.eq_ignore_ascii_case(&origin) {
+                    Ok(Self(origin))
+                } else {
+                    Err(format!("{text:?} is no origin; allowed is {origin:?}"))
+                }
+            }
+            _ => Err(format!("{text:?} is no origin; allowed are such as \"https://lab.org\"")),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_origin_is_what_browsers_tell() {
+        for (text, told) in [
+            ("https://lab.org", "https://lab.org"),
+            ("HTTPS://Lab.org", "https://lab.org"),
+            ("http://127.0.0.1:8080", "http://127.0.0.1:8080"),
+            ("http://[::1]:8080", "http://[::1]:8080"),
+        ] {
+            assert!(Origin::try_from(text.to_owned()).unwrap().is(told), "{text}");
+        }
+        for (text, words) in [
+            ("https://lab.org/", "allowed is \"https://lab.org\""),
+            ("https://lab.org:443", "allowed is \"https://lab.org\""),
+            ("https://me@lab.org/viewer", "allowed is \"https://lab.org\""),
+            ("https://bücher.de", "allowed is \"https://xn--bcher-kva.de\""),
+            ("lab.org", "allowed are such as"),
+            ("lab.org:443", "allowed are such as"),
+            ("*", "allowed are such as"),
+            ("null", "allowed are such as"),
+            ("file:///tmp", "allowed are such as"),
+            ("", "allowed are such as"),
+        ] {
+            let wrong = Origin::try_from(text.to_owned()).unwrap_err();
+            assert!(wrong.contains(words), "{text}: {wrong}");
+        }
+    }
+}
