@@ -132,12 +132,20 @@ async fn wrong_names_are_told_in_words_and_no_cache_is_examined_for_them() {
     let bare = forge.path().join("lab/arm");
     let file = git(&bare, &["rev-parse", "main:worlds/a.wbt"]);
     git(&bare, &["tag", "file", file.trim()]);
+    // Folders have all that is needed, though they are no commits.
+    let folder = git(&bare, &["rev-parse", "main^{tree}"]);
+    git(&bare, &["tag", "folder", folder.trim()]);
+    git(&bare, &["tag", "--annotate", "--message", "folder", "noted", folder.trim()]);
     git(&bare, &["tag", "--annotate", "--message", "file", "note", file.trim()]);
     for any in [false, true] {
         let wrapper = GitWrapper::new("");
         let builder = simulation_server(&webots.path(), forge.path(), 2).env("PATH", &wrapper.path());
         let server = builder.set("anyCommit", any).start().await;
         assert!(outcome(&server, &world("lab/arm", "main", "worlds/a.wbt")).await.contains("opened"));
+        for name in ["folder", "noted"] {
+            let told = outcome(&server, &world("lab/arm", name, "worlds/a.wbt")).await;
+            assert!(told.contains("opened [WorldInfo"), "{told}");
+        }
         for name in ["file", "note", &"a".repeat(64)] {
             let told = outcome(&server, &world("lab/arm", name, "worlds/a.wbt")).await;
             assert!(told.contains(&format!("has no branch, tag or commit called {name:?}")), "{told}");

@@ -1,4 +1,22 @@
 //! Leaving a simulation in every state and for every reason: nothing of it is left.
+//!
+//! The states are those of [`State`]: connected, waiting, checking out, launching, idle, running, stopping.
+//!
+//! | reason | in which states | tested by |
+//! |---|---|---|
+//! | its client closes | all but stopping, in which it has no client | `a_client_that_closes_leaves_nothing_in_any_state` |
+//! | the connection breaks | the same | `a_connection_that_breaks_leaves_nothing_in_any_state` |
+//! | the connection is half open | the same | `a_half_open_connection_is_found_by_ping_in_any_state` |
+//! | Webots ends, in three ways | launching, idle, running: in others there is none | `a_client_is_told_how_webots_ended` |
+//! | Webots does not end when asked | stopping | `a_simulator_that_ignores_sigterm_and_hides_ends_after_the_grace_time` |
+//! | git is killed, or hangs | checking out | `checkout::a_kill_in_the_middle_of_a_fetch...`, `checkout::a_remote_that_hangs...` |
+//! | its guardian is killed | launching, idle, running, stopping | `a_guardian_that_is_killed_takes_its_tree_along...` |
+//! | the time limit | launching, idle, running, stopping: it counts from the start of Webots | `simulation_limits` (`time`) |
+//! | the limits of a checkout and of a launch | checking out, launching | `simulation_limits` (`time`), `ready::a_launch_that_never_listens...` |
+//! | SIGTERM to the server | all | `a_server_that_stops_tells_its_clients_and_leaves_nothing_in_any_state` |
+//! | SIGKILL to the server | all | `a_server_that_is_killed_leaves_nothing_in_any_state` |
+//! | the client's actor panics | all but stopping, in which there is none | `simulation_limits` (`panics`) |
+//! | Webots' actor panics | launching, idle, running, stopping: in others there is none | `simulation_limits` (`panics`) |
 
 use std::path::Path;
 use std::time::{Duration, Instant};
