@@ -66,13 +66,15 @@ impl GitError {
 }
 
 /// git reads this in place of the settings of its user and machine. Any repository may be read: a mirror may belong
-/// to somebody else, and nothing that it holds is run.
+/// to somebody else, and nothing that it holds is run. Of a repository whose objects are borrowed, commits that have
+/// come since must not be taken for known: whether they have all their ancestors is not known.
 const SETTINGS: &str = "\
 [safe]
 	directory = *
 [core]
 	hooksPath = /dev/null
 	fsmonitor = false
+	alternateRefsPrefixes = refs/none/
 [credential]
 	helper =
 [fetch]

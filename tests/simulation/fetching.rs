@@ -91,6 +91,32 @@ async fn a_fetch_that_hangs_holds_up_nobody_else_who_uses_its_repository() {
 }
 
 #[actix_rt::test]
+async fn a_commit_that_comes_while_its_parent_is_about_to_be_fetched_is_not_taken_for_its_history() {
+    let (forge, webots, marks) = (Forge::new(), reader(), tempfile::tempdir().unwrap());
+    forge.commit("lab/arm", "old", &[("worlds/a.wbt", &world_text("old"))]);
+    let bare = forge.path().join("lab/arm");
+    forge.commit("lab/arm", "old", &[("worlds/a.wbt", &world_text("parent"))]);
+    git(&bare, &["branch", "parent", "old"]);
+    forge.commit("lab/arm", "old", &[("worlds/a.wbt", &world_text("child"))]);
+    git(&bare, &["branch", "child", "old"]);
+    // The fetch of the parent waits until the child has come.
+    let wrapper = GitWrapper::new(&format!(
+        "case \"$*\" in *fetch*heads/parent:*) until [ -e {}/go ]; do sleep 0.05; done;; esac",
+        marks.path().display()
+    ));
+    let server = simulation_server(&webots.path(), forge.path(), 2).env("PATH", &wrapper.path()).start().await;
+    let mut parent = Client::start(&server, &world("lab/arm", "parent", "worlds/a.wbt")).await;
+    until("it is about to be fetched", async || wrapper.calls().iter().any(|call| call.contains("heads/parent:")))
+        .await;
+    let told = outcome(&server, &world("lab/arm", "child", "worlds/a.wbt")).await;
+    assert!(told.contains("opened [child]"), "{told}");
+    std::fs::write(marks.path().join("go"), "").unwrap();
+    let told = parent.until("loading: Error:").await;
+    assert!(told.contains("opened [parent]"), "{told}");
+    git(&repositories(&server.folder.join("cache")).remove(0), &["fsck", "--full"]);
+}
+
+#[actix_rt::test]
 async fn what_stands_still_is_begun_anew_and_what_moves_is_not() {
     let (forge, webots) = (forge(&["main", "slow"]), reader());
     let marks = tempfile::tempdir().unwrap();
