@@ -47,6 +47,8 @@ pub struct Project {
     pub warnings: Vec<String>,
     /// The project's folder.
     folder: PathBuf,
+    /// Where the project is that Webots sees, in its repository: elsewhere if the world is behind a link.
+    place: String,
     fetched: Arc<Fetched>,
     /// Removed with the project.
     pub instance: InstanceDir,
@@ -102,8 +104,19 @@ impl Checkouts {
         let (file, pointers) = (file?, pointers.len());
         let warnings = (pointers > 0).then(|| large_files::warning(pointers));
         let revision = fetched.revision.commit.clone();
+        let root = instance.path().join("project").canonicalize().map_err(|error| machine(world, &error))?;
+        let seen = file.path.ancestors().nth(2).and_then(|project| project.strip_prefix(root).ok()?.to_str());
+        let place = seen.unwrap_or(&fetched.revision.folder).to_owned();
         progress("checkout done".to_owned());
-        Ok(Project { world: file, revision, warnings: warnings.into_iter().collect(), folder, fetched, instance })
+        Ok(Project {
+            world: file,
+            revision,
+            warnings: warnings.into_iter().collect(),
+            folder,
+            place,
+            fetched,
+            instance,
+        })
     }
 
     async fn fetch_and_copy(
@@ -174,9 +187,8 @@ impl Checkouts {
         if !file.split('/').all(plain) || !file.contains('/') {
             return Err(refused());
         }
-        let folder = &project.fetched.revision.folder;
-        let slash = if folder.is_empty() { "" } else { "/" };
-        let path = format!("{folder}{slash}controllers/{file}");
+        let slash = if project.place.is_empty() { "" } else { "/" };
+        let path = format!("{}{slash}controllers/{file}", project.place);
         let call = copy_call(&project.fetched, &project.instance, &path);
         self.fetcher.git().run(call, |_| ()).await.map(drop).map_err(|_| refused())
     }

@@ -136,6 +136,24 @@ fn the_page_names_every_key_once_with_its_default_and_no_other() {
 }
 
 #[test]
+fn simulations_have_the_limits_that_were_agreed_on() {
+    let defaults = kinds().into_iter().find(|kind| kind.heading.contains("imulation")).unwrap().defaults();
+    for (key, default) in [
+        ("timing.checkout", 120.0),
+        ("timing.launch", 120.0),
+        ("timing.heartbeat", 5.0),
+        ("timing.grace", 5.0),
+        ("projectSize", 1024.0),
+        ("cacheSize", 10_240.0),
+        ("waitingLine", 100.0),
+        ("timeout", 7200.0),
+    ] {
+        assert_eq!(defaults[key].as_f64(), Some(default), "{key}");
+    }
+    assert_eq!(defaults["display"], json!(null));
+}
+
+#[test]
 fn the_page_names_what_else_keys_may_be_called() {
     for kind in kinds() {
         for alias in kind.aliases {

@@ -474,6 +474,17 @@ async fn a_controller_is_reset_and_nothing_else() {
         assert!(answer.ends_with("is no file below the project's controllers folder"), "{name:?}: {answer}");
     }
     assert_eq!(std::fs::read_to_string(project.join("protos/p.txt")).unwrap(), "changed");
+    // The project of a world behind a link is where the link leads.
+    forge.commit("lab/linked", "main", &[("real/worlds/a.wbt", WORLD), ("real/controllers/c/c.py", "original")]);
+    std::os::unix::fs::symlink("real", forge.work_tree("lab/linked", "main").join("project")).unwrap();
+    forge.commit_work_tree("lab/linked", "main");
+    let other = simulation_server(&webots.path(), forge.path(), 1).start().await;
+    let mut visitor = Client::start(&other, &world("lab/linked", "main", "project/worlds/a.wbt")).await;
+    visitor.until("webots:").await;
+    let linked = instance_folders(&other.folder)[0].join("project/real/controllers/c/c.py");
+    std::fs::write(&linked, "changed").unwrap();
+    assert_eq!(reset(&mut visitor, "c/c.py").await, "reset controller: c/c.py");
+    assert_eq!(std::fs::read_to_string(&linked).unwrap(), "original");
     // A link in place of the controller's folder leads nowhere.
     std::fs::remove_dir_all(project.join("controllers/c")).unwrap();
     std::os::unix::fs::symlink(&outside, project.join("controllers/c")).unwrap();
