@@ -132,6 +132,22 @@ async fn webots_is_given_the_documented_command_line() {
 }
 
 #[actix_rt::test]
+async fn webots_gets_the_configured_display_else_the_servers_own_else_the_first() {
+    let (forge, webots) = (Forge::with_arm(), Webots::script("echo \"display [$DISPLAY]\"\nexit 1"));
+    for (configured, environment, display) in [
+        (Some(":57"), "export DISPLAY=:58", ":57"),
+        (None, "export DISPLAY=:58", ":58"),
+        (None, "export DISPLAY=", ":0"),
+        (None, "unset DISPLAY", ":0"),
+    ] {
+        let builder = simulation_server(&webots.path(), forge.path(), 1).before(environment);
+        let builder = if let Some(name) = configured { builder.set("display", name) } else { builder };
+        let told = outcome(&builder.start().await, &arm()).await;
+        assert!(told.contains(&format!("display [{display}]")), "{configured:?}, {environment}: {told}");
+    }
+}
+
+#[actix_rt::test]
 async fn paths_may_have_spaces_and_quotes() {
     let paths = std::env::var_os("PATH").unwrap();
     let has_xvfb = std::env::split_paths(&paths).any(|folder| folder.join("xvfb-run").is_file());
