@@ -2,6 +2,8 @@
 
 use std::path::{Path, PathBuf};
 
+use nix::sys::signal::Signal;
+
 use crate::checkout::{outcome, reader, world_text};
 use crate::git_wrapper::GitWrapper;
 use crate::scene::nothing_left;
@@ -88,6 +90,41 @@ async fn a_fetch_that_hangs_holds_up_nobody_else_who_uses_its_repository() {
     assert_eq!(std::fs::read_dir(repository.join("refs/fleet")).unwrap().count(), branches.len());
     let rests = || std::fs::read_dir(repository.join("quarantine")).unwrap().count();
     until("what fetches have left is gone", async || rests() == 0).await;
+}
+
+#[actix_rt::test]
+async fn who_waits_for_the_fetch_of_a_server_that_is_killed_takes_over() {
+    let (forge, webots, cache) = (forge(&["main"]), reader(), tempfile::tempdir().unwrap());
+    let start = |wrapper: &GitWrapper| {
+        let builder = simulation_server(&webots.path(), forge.path(), 1).env("PATH", &wrapper.path());
+        builder.set("cacheDir", cache.path().to_str().unwrap()).start()
+    };
+    // Half a pack and a lock, and nothing more.
+    let hangs = GitWrapper::new(
+        "case \"$*\" in *fetch*) mkdir -p \"$3/objects/pack\"; echo PACK > \"$3/objects/pack/tmp_pack_x\"; echo > \"$3/shallow.lock\"; exec sleep 1000;; esac",
+    );
+    let watched = GitWrapper::new("");
+    let (mut one, other) = (start(&hangs).await, start(&watched).await);
+    let _stuck = Client::start(&one, &world("lab/arm", "main", "worlds/a.wbt")).await;
+    let half =
+        || repositories(cache.path()).iter().any(|path| holds(path, "tmp_pack_x") && holds(path, "shallow.lock"));
+    until("it hangs", async || half()).await;
+    let mut heir = Client::start(&other, &world("lab/arm", "main", "worlds/a.wbt")).await;
+    heir.until("loading: looking for").await;
+    let fetches = || watched.calls().iter().any(|call| call.contains(" fetch "));
+    until("its commit is known", async || watched.calls().iter().any(|call| call.contains("ls-remote"))).await;
+    assert!(!fetches(), "{:#?}", watched.calls());
+    one.signal(Signal::SIGKILL);
+    one.ended().await;
+    let told = heir.until("loading: Error:").await;
+    assert!(told.contains("opened [main]"), "{told}");
+    until("the half is gone", async || !half()).await;
+}
+
+/// Whether there is a file of this name anywhere below a folder.
+fn holds(folder: &Path, name: &str) -> bool {
+    let entries = std::fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.path());
+    entries.into_iter().any(|path| path.file_name().is_some_and(|one| one == name) || holds(&path, name))
 }
 
 #[actix_rt::test]
