@@ -22,6 +22,8 @@ mod world;
 fn no_rival_is_better_in_a_small_fleet() {
     for scenario in compare::scenarios(&[5], &[3.0]) {
         let row = compare::compare(&scenario);
-        assert_eq!(compare::better_rivals(&row, 0), Vec::<String>::new(), "{scenario:?}");
+        for (policy, name) in compare::POLICIES.iter().enumerate().take(compare::FIRST_RIVAL) {
+            assert_eq!(compare::better_rivals(&row, policy), Vec::<String>::new(), "{name}: {scenario:?}");
+        }
     }
 }

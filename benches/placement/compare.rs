@@ -8,7 +8,7 @@ use crate::world::run;
 pub(crate) const POLICIES: [&str; 6] =
     ["ours", "ours, load only", "least reported", "random", "two choices", "round robin"];
 /// The first rival in a row: what stands before it is the project's own.
-const FIRST_RIVAL: usize = 2;
+pub(crate) const FIRST_RIVAL: usize = 2;
 /// Highest loads that differ by no more are tied: two clients, in percent.
 pub(crate) const HIGHEST_TIE: f64 = 4.0;
 /// Overload shares that differ by no more are tied, in percent.

@@ -6,8 +6,8 @@
 //! look alike are taken as alike, and a new one starts from what the others have learned.
 //!
 //! A server that reports only its load does not tell how many clients it has. There the fit is of the steps between
-//! reports: how the load changed while so many clients that were sent there began to show. Who left is not known and makes
-//! such an estimate less sure.
+//! reports: how the load changed while so many clients that were sent there began to show. Who left is not known; that it
+//! is the more the higher the load was is learned with it: `change = cost * clients - leaving * load * seconds`.
 
 use std::time::{Duration, Instant};
 
@@ -26,13 +26,15 @@ const NOISE: f64 = 2.0 * 2.0 * 5.0;
 const VARIETY: f64 = 0.16;
 /// The least time that is a step for the fit of steps: the mean load of five seconds is another one then.
 const STEP: Duration = Duration::from_secs(5);
-/// How much a step tells, compared with a report of a server that tells how many clients it has.
-const STEP_TRUST: f64 = 0.15;
-/// How much a client tells of its cost in the fit of steps, compared with one that is known to be there.
-const STEP_CLIENT: f64 = 0.25;
+/// How far a step lies from what the fit says while nobody leaves, as a variance in percent squared.
+const STEP_NOISE: f64 = 0.5;
+/// What share of a load is expected to leave in a second, where sessions are short.
+const LEAVING: f64 = 0.01;
+/// What a machine without clients is expected to report, in percent: that much of its load never leaves.
+const USUAL_IDLE: f64 = 3.0;
 /// Steps are not believed if they say that a client costs less than this share of the guess: their errors are great, and
 /// a server that is thought too able is sent too many.
-const STEP_LOWEST: f64 = 0.5;
+const STEP_LOWEST: f64 = 0.4;
 /// From this load on a report only says 'at least so much', because the machine has no more to give.
 pub(super) const FULL: f64 = 99.0;
 /// The lowest cost that is believed, in percent: clients that do nothing yet may start to.
@@ -52,14 +54,17 @@ pub(super) struct Estimate {
     precision: f64,
 }
 
-/// The fit for one server: the weighted sums of the samples seen with clients, and what follows from them.
+/// The fit for one server, of `load = base * unit + cost * clients`: the weighted sums of the samples, and what follows
+/// from them. Of reports the unit is 1, and the base what the machine does besides. Of steps the load is how much it
+/// changed, the unit the load that was there while it did, times the seconds, and the base what share of that came in a
+/// second: less than none, for it left.
 #[derive(Debug, Clone)]
 pub(super) struct Cost {
     guess: f64,
-    weight: f64,
-    clients: f64,
+    units_squared: f64,
+    units_by_clients: f64,
     clients_squared: f64,
-    load: f64,
+    units_by_load: f64,
     clients_by_load: f64,
     /// The load without clients, and how many seconds it was seen.
     idle_load: f64,
@@ -81,10 +86,10 @@ impl Cost {
         let guess = believable(guess);
         Self {
             guess,
-            weight: 0.0,
-            clients: 0.0,
+            units_squared: 0.0,
+            units_by_clients: 0.0,
             clients_squared: 0.0,
-            load: 0.0,
+            units_by_load: 0.0,
             clients_by_load: 0.0,
             idle_load: 0.0,
             idle_weight: BASE_TRUST,
@@ -128,21 +133,14 @@ impl Cost {
             self.idle_load += (load - self.idle_load) * seconds / weight;
             self.idle_weight = weight;
         } else {
-            let fade = (-seconds / MEMORY.as_secs_f64()).exp();
-            let weight = trust * seconds;
-            self.weight = self.weight * fade + weight;
-            self.clients = self.clients * fade + weight * clients;
-            self.clients_squared = self.clients_squared * fade + weight * clients * clients;
-            self.load = self.load * fade + weight * load;
-            self.clients_by_load = self.clients_by_load * fade + weight * clients * load;
-            self.seen *= fade;
+            self.add(1.0, clients, load, trust * seconds, seconds);
         }
         self.fit();
     }
 
     /// Learns from a server that tells its load only: of all clients that were ever sent there, `shown` are expected to be
-    /// in this load.
-    pub(super) fn learn_step(&mut self, now: Instant, shown: f64, load: f64) {
+    /// in this load. `believed` is what one has been taken to cost until now, in percent.
+    pub(super) fn learn_step(&mut self, now: Instant, shown: f64, load: f64, believed: f64) {
         self.of_steps = true;
         if let Some((begin, shown_before, load_before)) = self.step {
             let elapsed = now.saturating_duration_since(begin);
@@ -152,28 +150,46 @@ impl Cost {
             // What a full machine reports is no measure of anything.
             if load_before < FULL && load < FULL {
                 let clients = (shown - shown_before).max(0.0);
-                self.meet(STEP_CLIENT * clients);
-                self.learn(clients, load - load_before, elapsed, STEP_TRUST);
+                let seconds = elapsed.min(LONGEST_STEP).as_secs_f64();
+                let was_there = seconds * (f64::midpoint(load_before, load) - USUAL_IDLE).max(0.0);
+                // Clients leave one by one, each with its cost, and those who come differ.
+                let noise = STEP_NOISE + believed * (LEAVING * was_there + VARIETY * believed * clients);
+                self.add(was_there, clients, load - load_before, NOISE / noise, seconds);
+                self.meet(clients);
+                self.fit();
             }
         }
         self.step = Some((now, shown, load));
     }
 
+    fn add(&mut self, unit: f64, clients: f64, load: f64, weight: f64, seconds: f64) {
+        let fade = (-seconds / MEMORY.as_secs_f64()).exp();
+        self.units_squared = self.units_squared * fade + weight * unit * unit;
+        self.units_by_clients = self.units_by_clients * fade + weight * unit * clients;
+        self.clients_squared = self.clients_squared * fade + weight * clients * clients;
+        self.units_by_load = self.units_by_load * fade + weight * unit * load;
+        self.clients_by_load = self.clients_by_load * fade + weight * clients * load;
+        self.seen *= fade;
+    }
+
     fn fit(&mut self) {
         let trust = NOISE / (self.guess * self.guess);
-        let weight = self.weight + self.idle_weight;
-        let load = self.load + self.idle_weight * self.idle_load;
+        // What is expected of the base.
+        let (expected, sure) =
+            if self.of_steps { (0.0, NOISE / (2.0 * LEAVING).powi(2)) } else { (self.idle_load, self.idle_weight) };
+        let (weight, load) = (self.units_squared + sure, self.units_by_load + sure * expected);
         let squares = self.clients_squared + trust;
         let products = self.clients_by_load + trust * self.guess;
-        // Positive, because weight * squares >= clients * clients holds already without what is added to the two.
-        let determinant = weight * squares - self.clients * self.clients;
-        let base = (load * squares - self.clients * products) / determinant;
-        // No machine is less than idle, though its load may well sink from step to step: if the best fit says so, then
-        // the best one that has no base.
-        let (base, cost, variance) = if base < 0.0 && !self.of_steps {
+        let mixed = self.units_by_clients;
+        // Positive, because weight * squares >= mixed * mixed holds already without what is added to the two.
+        let determinant = weight * squares - mixed * mixed;
+        let base = (load * squares - mixed * products) / determinant;
+        // No machine is less than idle, and no load comes from itself: if the best fit says so, then the best one that has
+        // no base.
+        let (base, cost, variance) = if (base < 0.0) != self.of_steps {
             (0.0, products / squares, NOISE / squares)
         } else {
-            let cost = (weight * products - self.clients * load) / determinant;
+            let cost = (weight * products - mixed * load) / determinant;
             (base, cost, NOISE * weight / determinant)
         };
         self.base = base;

@@ -444,6 +444,27 @@ mod tests {
     }
 
     #[test]
+    fn a_load_alone_teaches_the_cost_of_clients_who_leave_as_others_come() {
+        let start = Instant::now();
+        for cost in [1.0, 2.0, 4.0, 8.0] {
+            let mut fleet = fleet_of_one(start, load_only(3.0));
+            let (mut came, mut drawn) = (Vec::new(), 1_u32);
+            for second in 1..600 {
+                let (time, now) = (f64::from(second), start + seconds(f64::from(second)));
+                // One in eight seconds, on average. Each stays a minute, and the load is a mean of five seconds.
+                drawn = drawn.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+                if drawn >> 29 == 0 && fleet.place(now, |_| true).is_some() {
+                    came.push(time);
+                }
+                let shown = |at: &f64| ((time - at - 2.0).min(5.0) - (time - at - 62.0).max(0.0)).max(0.0) / 5.0;
+                let load = 3.0 + cost * came.iter().map(shown).sum::<f64>();
+                fleet.report(&0, now, load_only(load));
+            }
+            assert_near(fleet.learned_cost(&0), cost, 0.25 * cost);
+        }
+    }
+
+    #[test]
     fn the_cost_of_a_client_is_learned_for_each_server() {
         let start = Instant::now();
         let costs = [0.5, 1.0, 2.0, 4.0, 8.0];

@@ -212,7 +212,7 @@ impl Server {
             self.fit = Cost::new(self.cost);
         }
         let Some(instances) = report.instances else {
-            self.fit.learn_step(now, self.sent - self.unseen, report.load);
+            self.fit.learn_step(now, self.sent - self.unseen, report.load, self.cost);
             return;
         };
         // Those who wait for a place cost nothing yet.
