@@ -186,11 +186,11 @@ impl Cost {
         let base = (load * squares - mixed * products) / determinant;
         // No machine is less than idle, and no load comes from itself: if the best fit says so, then the best one that has
         // no base.
-        let (base, cost, variance) = if (base < 0.0) != self.of_steps {
-            (0.0, products / squares, NOISE / squares)
-        } else {
+        let (base, cost, variance) = if (base < 0.0) == self.of_steps {
             let cost = (weight * products - mixed * load) / determinant;
             (base, cost, NOISE * weight / determinant)
+        } else {
+            (0.0, products / squares, NOISE / squares)
         };
         self.base = base;
         self.slope = believable(cost);
