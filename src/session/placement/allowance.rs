@@ -3,7 +3,8 @@
 //! Each placement uses up room until its client comes or is given up, so that somebody who only asks, again and again,
 //! could keep everybody out. An address starts with an allowance that is enough for a class behind one address. A client
 //! that does not come halves it, one that comes doubles it, as TCP does with its window (Chiu and Jain, 1989, on why such
-//! a rule is fair and stable). What exceeds the allowance is placed like everything else, but takes no room.
+//! a rule is fair and stable). What exceeds the allowance is placed like everything else, but takes no room. Who came is
+//! told by a server's arrivals, or by its load where it tells nothing else.
 
 use std::collections::{HashMap, VecDeque};
 use std::net::IpAddr;

@@ -30,6 +30,8 @@ const STEP: Duration = Duration::from_secs(5);
 const STEP_NOISE: f64 = 0.5;
 /// What share of a load is expected to leave in a second, where sessions are short.
 const LEAVING: f64 = 0.01;
+/// A load that should have risen by so much, in percent, and has by hardly anything tells that nobody came.
+const CLEAR_RISE: f64 = 20.0;
 /// What a machine without clients is expected to report, in percent: that much of its load never leaves.
 const USUAL_IDLE: f64 = 3.0;
 /// Steps are not believed if they say that a client costs less than this share of the guess: their errors are great, and
@@ -47,11 +49,37 @@ pub(super) fn believable(cost: f64) -> f64 {
     if cost.is_nan() { HIGHEST } else { cost.clamp(LOWEST, HIGHEST) }
 }
 
+/// Judges by how much a load has risen whether so many clients came, who are believed to cost so much each. Loads move by
+/// themselves too, so that many must be missing before it is said.
+fn who_came(risen: f64, clients: f64, believed: f64) -> Told {
+    let expected = clients * believed;
+    if clients > 0.5 && risen > expected * 0.5 {
+        Told::Came
+    } else if expected > CLEAR_RISE && risen < expected * 0.1 {
+        Told::Missed
+    } else {
+        Told::Nothing
+    }
+}
+
 /// What one server says about its cost: the logarithm, and how sure it is (one over the variance of that logarithm).
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Estimate {
     log: f64,
     precision: f64,
+}
+
+/// What a step between two loads tells of those who were sent there.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Told {
+    /// The step is not over.
+    NotYet,
+    /// Nothing for sure.
+    Nothing,
+    /// Most of them have come.
+    Came,
+    /// Hardly anybody has.
+    Missed,
 }
 
 /// The fit for one server, of `load = base * unit + cost * clients`: the weighted sums of the samples, and what follows
@@ -140,26 +168,32 @@ impl Cost {
 
     /// Learns from a server that tells its load only: of all clients that were ever sent there, `shown` are expected to be
     /// in this load. `believed` is what one has been taken to cost until now, in percent.
-    pub(super) fn learn_step(&mut self, now: Instant, shown: f64, load: f64, believed: f64) {
+    pub(super) fn learn_step(&mut self, now: Instant, shown: f64, load: f64, believed: f64) -> Told {
         self.of_steps = true;
+        let mut told = Told::Nothing;
         if let Some((begin, shown_before, load_before)) = self.step {
             let elapsed = now.saturating_duration_since(begin);
             if elapsed < STEP {
-                return;
+                return Told::NotYet;
             }
             // What a full machine reports is no measure of anything.
             if load_before < FULL && load < FULL {
                 let clients = (shown - shown_before).max(0.0);
                 let seconds = elapsed.min(LONGEST_STEP).as_secs_f64();
                 let was_there = seconds * (f64::midpoint(load_before, load) - USUAL_IDLE).max(0.0);
+                told = who_came(load - load_before - self.base * was_there, clients, believed);
                 // Clients leave one by one, each with its cost, and those who come differ.
                 let noise = STEP_NOISE + believed * (LEAVING * was_there + VARIETY * believed * clients);
-                self.add(was_there, clients, load - load_before, NOISE / noise, seconds);
-                self.meet(clients);
-                self.fit();
+                // Who has not come tells nothing of those who do.
+                if told != Told::Missed {
+                    self.add(was_there, clients, load - load_before, NOISE / noise, seconds);
+                    self.meet(clients);
+                    self.fit();
+                }
             }
         }
         self.step = Some((now, shown, load));
+        told
     }
 
     fn add(&mut self, unit: f64, clients: f64, load: f64, weight: f64, seconds: f64) {
@@ -186,11 +220,12 @@ impl Cost {
         let base = (load * squares - mixed * products) / determinant;
         // No machine is less than idle, and no load comes from itself: if the best fit says so, then the best one that has
         // no base.
-        let (base, cost, variance) = if (base < 0.0) == self.of_steps {
+        let is_absurd = if self.of_steps { base > 0.0 } else { base < 0.0 };
+        let (base, cost, variance) = if is_absurd {
+            (0.0, products / squares, NOISE / squares)
+        } else {
             let cost = (weight * products - mixed * load) / determinant;
             (base, cost, NOISE * weight / determinant)
-        } else {
-            (0.0, products / squares, NOISE / squares)
         };
         self.base = base;
         self.slope = believable(cost);

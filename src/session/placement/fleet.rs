@@ -327,6 +327,59 @@ mod tests {
     }
 
     #[test]
+    fn an_address_whose_clients_never_come_closes_no_fleet_of_loads_alone() {
+        let start = Instant::now();
+        let mut fleet = Fleet::new(Policy::default());
+        let stranger = Some("203.0.113.9".parse().unwrap());
+        (0..2).for_each(|id| fleet.add(id));
+        let (mut closed_early, mut closed_late) = (0, 0);
+        for tenth in 0..3_000 {
+            let now = start + seconds(f64::from(tenth) / 10.0);
+            if tenth % 10 == 0 {
+                (0..2).for_each(|id| fleet.report(&id, now, load_only(10.0)));
+            }
+            // Fifty requests a second: 200 are half settled at a time, and there is room for 85.
+            for _ in 0..5 {
+                fleet.place_from(now, stranger, |_| true);
+            }
+            let closed = if tenth < 200 { &mut closed_early } else { &mut closed_late };
+            *closed += i32::from(!fleet.available(now));
+        }
+        assert!(closed_early > 0, "there was room for all, which tests nothing");
+        assert_eq!(closed_late, 0, "of 2,800 tenths of a second");
+        // Others count, if only with the least that is believed of them.
+        let now = start + seconds(300.0);
+        let before = fleet.effective_load(&0, now).unwrap() + fleet.effective_load(&1, now).unwrap();
+        for _ in 0..20 {
+            fleet.place_from(now, Some("203.0.113.10".parse().unwrap()), |_| true);
+        }
+        let after = fleet.effective_load(&0, now).unwrap() + fleet.effective_load(&1, now).unwrap();
+        assert!(after - before >= 20.0 * 0.8 - 0.01, "from {before} to {after}");
+    }
+
+    #[test]
+    fn a_class_that_shows_in_the_load_alone_counts_on() {
+        let start = Instant::now();
+        let mut fleet = fleet_of_one(start, load_only(3.0));
+        let school = Some("203.0.113.9".parse().unwrap());
+        for second in 0..30 {
+            let now = start + seconds(f64::from(second));
+            if second < 15 {
+                (0..2).for_each(|_| assert!(fleet.place_from(now, school, |_| true).is_some()));
+            }
+            // They come within a second, and their load within five.
+            let shown: f64 = (0..15).map(|at| (f64::from(second - at - 1) / 5.0).clamp(0.0, 1.0)).sum();
+            fleet.report(&0, now, load_only(3.0 + 2.0 * 2.0 * shown));
+        }
+        let now = start + seconds(30.0);
+        let before = fleet.effective_load(&0, now).unwrap();
+        for _ in 0..10 {
+            fleet.place_from(now, school, |_| true);
+        }
+        assert_near(fleet.effective_load(&0, now).map(|after| after - before), 20.0, 5.0);
+    }
+
+    #[test]
     fn those_over_the_allowance_are_spread_all_the_same() {
         let now = Instant::now();
         let mut fleet = Fleet::new(policy(0.25));

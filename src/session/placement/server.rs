@@ -1,7 +1,7 @@
 //! What is known of one simulation server: its last report, and what has been sent to it since.
 
 use super::allowance::Allowances;
-use super::cost::{Common, Cost, Estimate, FULL, believable};
+use super::cost::{Common, Cost, Estimate, FULL, Told, believable};
 use super::policy::Policy;
 use std::collections::VecDeque;
 use std::net::IpAddr;
@@ -68,6 +68,8 @@ pub(super) struct Server {
     /// The placements whose clients have not been seen yet, oldest first.
     in_flight: VecDeque<Placement>,
     settling: VecDeque<Change>,
+    /// Whose placements were made when, if only the load will tell whether they came.
+    unproven: VecDeque<(Instant, IpAddr)>,
     /// The sum of what `settling` hid from the last report.
     unseen: f64,
     /// How many clients have been sent here in all.
@@ -89,6 +91,7 @@ impl Server {
             last: None,
             in_flight: VecDeque::new(),
             settling: VecDeque::new(),
+            unproven: VecDeque::new(),
             unseen: 0.0,
             fit: Cost::new(policy.initial_cost),
             cost: believable(policy.initial_cost),
@@ -117,7 +120,7 @@ impl Server {
         self.note_changes(now, report.instances, allowances);
         self.settling.retain(|change| change.unseen(now, policy.settling) != 0.0);
         self.unseen = self.settling.iter().map(|change| change.unseen(now, policy.settling)).sum();
-        self.learn(now, report);
+        self.learn(now, report, policy, allowances);
         self.last = Some((now, report));
         self.up = true;
         self.share_cost(common, policy);
@@ -128,6 +131,7 @@ impl Server {
         self.up = false;
         // It is not its clients' fault if they can't come.
         self.in_flight.iter_mut().for_each(|placement| placement.from = None);
+        self.unproven.clear();
     }
 
     /// A client of this address has been sent here, and counts until it comes or is given up.
@@ -203,16 +207,18 @@ impl Server {
         self.cost = common.cost(estimate, policy.initial_cost);
     }
 
-    fn learn(&mut self, now: Instant, report: Report) {
+    fn learn(&mut self, now: Instant, report: Report, policy: &Policy, allowances: &mut Allowances) {
         let Some((before, last)) = self.last else {
             return;
         };
         if last.instances.is_some() != report.instances.is_some() {
             // Another program answers there now.
             self.fit = Cost::new(self.cost);
+            self.unproven.clear();
         }
         let Some(instances) = report.instances else {
-            self.fit.learn_step(now, self.sent - self.unseen, report.load, self.cost);
+            let told = self.fit.learn_step(now, self.sent - self.unseen, report.load, self.cost);
+            self.judge(now, told, policy, allowances);
             return;
         };
         // Those who wait for a place cost nothing yet.
@@ -221,6 +227,23 @@ impl Server {
         // While many are starting, it is not well known how much of them the load shows.
         let trust = if shown < present { shown / present } else { 1.0 };
         self.fit.learn(shown, report.load, now.saturating_duration_since(before), trust * trust);
+    }
+
+    /// Counts what a step has told for those whose clients show in it, which they do, on average, after half of the
+    /// settling.
+    fn judge(&mut self, now: Instant, told: Told, policy: &Policy, allowances: &mut Allowances) {
+        if told == Told::NotYet {
+            return;
+        }
+        let shows = |(at, _): &(Instant, IpAddr)| now.saturating_duration_since(*at) > policy.settling / 2;
+        let first = self.unproven.partition_point(shows);
+        for (_, from) in self.unproven.drain(..first) {
+            match told {
+                Told::Came => allowances.came(from),
+                Told::Missed => allowances.missed(from),
+                Told::NotYet | Told::Nothing => {}
+            }
+        }
     }
 
     /// Gives up the clients that should have come by now.
@@ -234,7 +257,10 @@ impl Server {
     fn note_changes(&mut self, now: Instant, new: Option<Instances>, allowances: &mut Allowances) {
         let Some(new) = new else {
             // A load alone does not tell who came: every placement is taken to have come as it was made.
-            self.settling.extend(self.in_flight.drain(..).map(|Placement { at, .. }| Change { at, clients: 1.0 }));
+            for Placement { at, from } in self.in_flight.drain(..) {
+                self.settling.push_back(Change { at, clients: 1.0 });
+                self.unproven.extend(from.map(|from| (at, from)));
+            }
             return;
         };
         let old = self.last.and_then(|(at, report)| report.instances.map(|old| (at, old)));
