@@ -1,4 +1,7 @@
 //! A file of lines that is rotated by its size. Nothing that the disk does makes it panic.
+//!
+//! That is why it is not the crate file-rotate: its version 0.8 panics where a folder can't be made, and by an assertion
+//! in a rotation where files come or go that it does not know of (its issue 34). A log is no reason to end a simulation.
 
 use std::ffi::OsString;
 use std::fs::File;
