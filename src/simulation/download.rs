@@ -15,6 +15,7 @@ use super::cached_repository::{CommitInUse, InUse, arrived, received};
 use super::checkout_error::{CheckoutError, damaged, fetch_failed, git_failed, machine, too_large};
 use super::examined::Examined;
 use super::git::{Call, Git, GitError};
+use super::joint::Joint;
 use super::limits::Limits;
 use super::mirrors::Remote;
 use super::quarantine::Quarantine;
@@ -33,7 +34,12 @@ pub struct Downloads {
     pub limits: Limits,
     /// What was found to be in order.
     pub examined: Examined,
+    /// The commits that are being fetched now, by what git is asked for.
+    commits: Joint<Vec<OsString>, Result<Arrival, CheckoutError>>,
 }
+
+/// The hash of a commit that was fetched.
+type Arrival = (String, Arc<CommitInUse>);
 
 /// What is fetched for whom.
 #[derive(Debug, Clone, Copy)]
@@ -50,18 +56,37 @@ pub struct Errand<'job> {
 const BETWEEN_LOOKS: Duration = Duration::from_millis(200);
 
 impl Downloads {
-    /// Fetches one commit, unless it is there. Gives back what came: a branch may have moved on in the meantime.
+    /// Prepares fetches into this cache.
+    #[must_use]
+    pub fn new(git: Arc<Git>, cache: RepositoryCache, limits: Limits) -> Self {
+        Self { git, cache, limits, examined: Examined::default(), commits: Joint::default() }
+    }
+
+    /// Fetches one commit, unless it is there, together with everybody who wants it for whatever world. Gives back what
+    /// came: a branch may have moved on in the meantime.
     ///
     /// # Errors
     /// Why it can't be fetched.
     pub async fn commit(
-        &self,
+        self: &Arc<Self>,
         errand: Errand<'_>,
-        repository: &InUse,
         revision: &Revision,
-    ) -> Result<(Revision, CommitInUse), CheckoutError> {
+    ) -> Result<(Revision, Arc<CommitInUse>), CheckoutError> {
+        let Errand { world, remote, progress } = errand;
+        let (this, world, remote, wanted) = (Arc::clone(self), world.clone(), remote.clone(), revision.clone());
+        let key = revision.fetch_arguments(&remote.location);
+        let fetch = |progress| async move {
+            this.fetch(Errand { world: &world, remote: &remote, progress: &progress }, &wanted).await
+        };
+        let tell = |step| drop(progress.send_replace(step));
+        let (came, commit) = self.commits.join(key, &tell, fetch).await?;
+        Ok((revision.with_commit(came), commit))
+    }
+
+    async fn fetch(&self, errand: Errand<'_>, revision: &Revision) -> Result<Arrival, CheckoutError> {
         let Errand { world, remote, .. } = errand;
         let failed = |error| machine(world, &error);
+        let repository = &self.cache.take(&remote.location).await.map_err(failed)?;
         // In the end, what is left of the fetch may be removed.
         let _grown = Grown(&self.cache);
         let fetched = loop {
@@ -71,7 +96,7 @@ impl Downloads {
             }
             let quarantine = Quarantine::enter(repository, &revision.commit).await.map_err(failed)?;
             if let Some(commit) = repository.commit(&revision.reference()) {
-                return Ok((revision.clone(), commit));
+                return Ok((revision.commit.clone(), Arc::new(commit)));
             }
             let right = repository.fetching().await.map_err(failed)?;
             quarantine.make(repository, &right).map_err(failed)?;
@@ -88,12 +113,13 @@ impl Downloads {
         let quarantine = fetched.map_err(|source| fetch_failed(world, revision, source))?;
         let incoming = quarantine.path().join(revision.incoming());
         let lost = || machine(world, &io::Error::other("the commit that was fetched is not there"));
-        let came = revision.with_commit(arrived(&incoming).ok_or_else(lost)?);
+        let came = arrived(&incoming).ok_or_else(lost)?;
+        let reference = revision.with_commit(came.clone()).reference();
         let right = repository.fetching().await.map_err(failed)?;
         quarantine.hand_over(repository, &right).map_err(failed)?;
         // Taken before anybody else may tidy up.
-        let commit = repository.name(&right, &incoming, &came.reference());
-        Ok((came, commit.ok_or_else(lost)?))
+        let commit = repository.name(&right, &incoming, &reference).ok_or_else(lost)?;
+        Ok((came, Arc::new(commit)))
     }
 
     /// Says that a remote is asked anew.

@@ -1,16 +1,9 @@
 //! Brings the commits of worlds into the cache: once for all who wait for the same, and only what is new.
-//!
-//! A fetch is a future that all its clients share. It runs as long as one of them waits; when the last has gone it is
-//! dropped, and git ends with it.
 
-use std::collections::HashMap;
 use std::ffi::OsString;
 use std::io;
-use std::sync::{Arc, Mutex, PoisonError};
-use std::time::{Duration, Instant};
+use std::sync::Arc;
 
-use futures_util::FutureExt;
-use futures_util::future::{BoxFuture, Shared, WeakShared};
 use tokio::runtime::Handle;
 use tokio::sync::watch;
 use tokio_util::task::AbortOnDropHandle;
@@ -18,9 +11,9 @@ use tokio_util::task::AbortOnDropHandle;
 use super::cached_repository::{CommitInUse, InUse};
 use super::checkout_error::{CheckoutError, damaged, git_failed, machine, no_reference, too_large};
 use super::download::{Downloads, Errand, call};
-use super::examined::Examined;
 use super::git::Git;
 use super::housekeeping;
+use super::joint::Joint;
 use super::limits::Limits;
 use super::mirrors::{Mirrors, Remote};
 use super::repository_cache::RepositoryCache;
@@ -30,10 +23,10 @@ use crate::shared::project_url::ProjectUrl;
 
 /// Brings commits into the cache; one for the whole server.
 pub struct Fetcher {
-    downloads: Downloads,
+    downloads: Arc<Downloads>,
     mirrors: Mirrors,
-    /// What is being fetched now. An entry ends with the last client that waits for it.
-    fetches: Mutex<HashMap<ProjectUrl, Fetch>>,
+    /// What is being fetched now.
+    fetches: Joint<ProjectUrl, Result<Arc<Fetched>, CheckoutError>>,
     _housekeeping: AbortOnDropHandle<()>,
 }
 
@@ -48,19 +41,8 @@ pub struct Fetched {
     pub reference: String,
     /// What it is.
     pub revision: Revision,
-    _commit: CommitInUse,
+    _commit: Arc<CommitInUse>,
 }
-
-#[derive(Clone)]
-struct Fetch {
-    progress: watch::Receiver<String>,
-    result: WeakShared<FetchJob>,
-}
-
-type FetchJob = BoxFuture<'static, Result<Arc<Fetched>, CheckoutError>>;
-
-/// Progress is told so often at most: nobody reads faster.
-const BETWEEN_NEWS: Duration = Duration::from_millis(100);
 
 impl Fetcher {
     /// Prepares fetches into this cache, and keeps it tidy, on the thread whose runtime this is.
@@ -68,8 +50,8 @@ impl Fetcher {
     pub fn new(git: Git, cache: RepositoryCache, mirrors: Mirrors, limits: Limits, runtime: &Handle) -> Self {
         let git = Arc::new(git);
         let housekeeping = runtime.spawn(housekeeping::keep(cache.clone(), Arc::clone(&git)));
-        let downloads = Downloads { git, cache, limits, examined: Examined::default() };
-        Self { downloads, mirrors, fetches: Mutex::default(), _housekeeping: AbortOnDropHandle::new(housekeeping) }
+        let downloads = Arc::new(Downloads::new(git, cache, limits));
+        Self { downloads, mirrors, fetches: Joint::default(), _housekeeping: AbortOnDropHandle::new(housekeeping) }
     }
 
     /// Runs git.
@@ -87,41 +69,9 @@ impl Fetcher {
         world: &ProjectUrl,
         progress: &(impl Fn(String) + Send + Sync),
     ) -> Result<Arc<Fetched>, CheckoutError> {
-        let (mut result, mut news) = self.join_or_start(world);
-        let mut told = Instant::now().checked_sub(BETWEEN_NEWS).unwrap_or_else(Instant::now);
-        loop {
-            let step = async {
-                // What comes too soon waits, and only the newest of it is told.
-                actix_rt::time::sleep_until((told + BETWEEN_NEWS).into()).await;
-                news.changed().await.map(|()| news.borrow_and_update().clone())
-            };
-            tokio::select! {
-                fetched = &mut result => return fetched,
-                Ok(step) = step => {
-                    told = Instant::now();
-                    progress(step);
-                }
-            }
-        }
-    }
-
-    fn join_or_start(self: &Arc<Self>, world: &ProjectUrl) -> (Shared<FetchJob>, watch::Receiver<String>) {
-        let mut fetches = self.fetches.lock().unwrap_or_else(PoisonError::into_inner);
-        fetches.retain(|_, fetch| fetch.result.upgrade().is_some_and(|result| result.peek().is_none()));
-        if let Some(fetch) = fetches.get(world)
-            && let Some(result) = fetch.result.upgrade()
-        {
-            return (result, fetch.progress.clone());
-        }
-        let (sender, progress) = watch::channel(String::new());
         let (this, wanted) = (Arc::clone(self), world.clone());
-        // Each of those who wait has a time limit of its own; the job ends with the last of them.
-        let job = async move { this.fetch(&wanted, &sender).await.map(Arc::new) };
-        let result = job.boxed().shared();
-        if let Some(weak) = result.downgrade() {
-            fetches.insert(world.clone(), Fetch { progress: progress.clone(), result: weak });
-        }
-        (result, progress)
+        let fetch = |told| async move { this.fetch(&wanted, &told).await.map(Arc::new) };
+        self.fetches.join(world.clone(), progress, fetch).await
     }
 
     /// Finds the commit that a world's URL means, and brings it into the cache if it is new.
@@ -147,13 +97,17 @@ impl Fetcher {
     }
 
     /// The first of the commits that a URL may mean in which its world is.
-    async fn find(&self, errand: Errand<'_>, repository: &InUse) -> Result<(Revision, CommitInUse), CheckoutError> {
+    async fn find(
+        &self,
+        errand: Errand<'_>,
+        repository: &InUse,
+    ) -> Result<(Revision, Arc<CommitInUse>), CheckoutError> {
         let world = errand.world;
         let mut missing = None;
         for revision in self.revisions(errand, repository).await? {
             let (revision, commit) = match repository.commit(&revision.reference()) {
-                Some(commit) => (revision, commit),
-                None => self.downloads.commit(errand, repository, &revision).await?,
+                Some(commit) => (revision, Arc::new(commit)),
+                None => self.downloads.commit(errand, &revision).await?,
             };
             // A tag may name a file alone.
             let Some(mut listing) = self.list(errand, repository, &revision).await? else {

@@ -18,6 +18,7 @@ pub mod git;
 pub mod guardian;
 pub mod housekeeping;
 pub mod instance_dir;
+pub mod joint;
 pub mod large_files;
 pub mod lease;
 pub mod limits;

@@ -6,10 +6,10 @@ use nix::sys::signal::Signal;
 
 use crate::checkout::{outcome, reader, world_text};
 use crate::git_wrapper::GitWrapper;
-use crate::scene::nothing_left;
+use crate::scene::{nothing_left, stages};
 use crate::support::client::Client;
 use crate::support::git::{Forge, git, world};
-use crate::support::program::simulation_server;
+use crate::support::program::{Server, simulation_server};
 use crate::support::until;
 
 /// A forge with `lab/arm`: each of these branches has two worlds that name it.
@@ -20,6 +20,11 @@ fn forge(branches: &[&str]) -> Forge {
         forge.commit("lab/arm", branch, &[("worlds/a.wbt", &text), ("worlds/b.wbt", &text)]);
     }
     forge
+}
+
+/// Waits until no more than so many simulations are left.
+async fn gone_but_for(server: &Server, others: usize) {
+    until("it has gone", async || stages(server).await.len() == others).await;
 }
 
 fn repositories(cache: &Path) -> Vec<PathBuf> {
@@ -62,7 +67,7 @@ async fn a_fetch_that_hangs_holds_up_nobody_else_who_uses_its_repository() {
         let told = outcome(server, &world("lab/arm", name, "worlds/a.wbt")).await;
         assert!(told.contains(&format!("opened [{text}]")), "{name}: {told}");
     }
-    // The same commit is fetched once, for worlds and servers that differ. The next takes over when the first has left.
+    // The same commit is fetched once, for worlds and servers that differ, also when the first has left.
     let mut heirs = [
         Client::start(&one, &world("lab/arm", "slow", "worlds/b.wbt")).await,
         Client::start(&other, &world("lab/arm", "slow", "worlds/b.wbt")).await,
@@ -74,13 +79,13 @@ async fn a_fetch_that_hangs_holds_up_nobody_else_who_uses_its_repository() {
     assert_eq!(fetches("slow"), 1, "{:#?}", wrapper.calls());
     stuck.send("nothing that is known").await;
     stuck.until("loading: Error:").await;
-    until("somebody takes over", async || fetches("slow") == 2).await;
+    gone_but_for(&one, 1).await;
     std::fs::remove_file(&hangs).unwrap();
     for heir in &mut heirs {
         let told = heir.until("loading: Error:").await;
         assert!(told.contains("opened [slow]"), "{told}");
     }
-    assert_eq!(fetches("slow"), 2, "{:#?}", wrapper.calls());
+    assert_eq!(fetches("slow"), 1, "{:#?}", wrapper.calls());
     for server in [&one, &other] {
         nothing_left(server, 4).await;
     }
@@ -151,6 +156,24 @@ async fn a_commit_that_comes_while_its_parent_is_about_to_be_fetched_is_not_take
     let told = parent.until("loading: Error:").await;
     assert!(told.contains("opened [parent]"), "{told}");
     git(&repositories(&server.folder.join("cache")).remove(0), &["fsck", "--full"]);
+}
+
+#[actix_rt::test]
+async fn a_slow_fetch_goes_on_for_who_came_later_for_another_world_of_the_same_commit() {
+    let (forge, webots) = (forge(&["main"]), reader());
+    let wrapper = GitWrapper::new(
+        "case \"$*\" in *fetch*) for n in $(seq 22); do echo \"Receiving objects: $n%\" >&2; sleep 0.5; done;; esac",
+    );
+    let builder = simulation_server(&webots.path(), forge.path(), 2).env("PATH", &wrapper.path());
+    let server = builder.set("timing.checkout", 8).start().await;
+    let mut first = Client::start(&server, &world("lab/arm", "main", "worlds/a.wbt")).await;
+    first.until("loading: fetching https://github.com/lab/arm: Receiving objects: 11%").await;
+    let mut second = Client::start(&server, &world("lab/arm", "main", "worlds/b.wbt")).await;
+    second.until("loading: fetching https://github.com/lab/arm: Receiving objects: 1").await;
+    assert!(first.until("loading: Error:").await.contains("took longer than 8 seconds"));
+    let told = second.until("loading: Error:").await;
+    assert!(told.contains("opened [main]"), "{told}");
+    assert_eq!(wrapper.calls().iter().filter(|call| call.contains(" fetch ")).count(), 1, "{:#?}", wrapper.calls());
 }
 
 #[actix_rt::test]
