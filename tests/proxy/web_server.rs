@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::{Pid, Uid};
 
-use crate::support::SOON;
+use crate::support::{SOON, until};
 
 /// The program.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -93,8 +93,16 @@ impl WebServer {
         kill(self.pid(), signal).unwrap();
     }
 
-    /// Ends the program with all its connections.
-    pub fn stop(&mut self) {
+    /// Ends the program with all its connections. Whatever else goes on in the test goes on meanwhile.
+    pub async fn stop(&mut self) {
+        kill(self.pid(), Signal::SIGTERM).unwrap();
+        let child = self.child.as_mut().unwrap();
+        until("the web server has ended", async || child.try_wait().unwrap().is_some()).await;
+        self.child = None;
+    }
+
+    /// Ends the program; nothing else goes on in the test until it has ended.
+    fn end(&mut self) {
         let Some(mut child) = self.child.take() else { return };
         kill(Pid::from_raw(i32::try_from(child.id()).unwrap()), Signal::SIGTERM).ok();
         let deadline = Instant::now() + SOON;
@@ -123,7 +131,7 @@ impl WebServer {
 
 impl Drop for WebServer {
     fn drop(&mut self) {
-        self.stop();
+        self.end();
         if std::thread::panicking() {
             eprintln!("--- {} ---\n{}---", self.program(), self.log());
         }
