@@ -166,6 +166,7 @@ fn nginx_conf(folder: &Path, idle: Duration) -> String {
         "{user}daemon off;\nworker_processes 1;\npid {folder}/pid;\nerror_log {folder}/error.log warn;\n\
          events {{ worker_connections 512; }}\n\
          http {{\n{temporary}  access_log off;\n  client_header_timeout {idle}s;\n  client_body_timeout {idle}s;\n\
-         send_timeout {idle}s;\n  include {folder}/site.conf;\n}}\n"
+         send_timeout {idle}s;\n  proxy_read_timeout {idle}s;\n  proxy_send_timeout {idle}s;\n\
+         include {folder}/site.conf;\n}}\n"
     )
 }
