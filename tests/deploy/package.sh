@@ -157,6 +157,16 @@ main() {
         in_machine systemctl start webots-simulation@main
     done
 
+    echo 'renews nothing whose configuration is wrong'
+    old=$(property webots-simulation@main MainPID)
+    in_machine sed -i.good 's/"port": 2000/"port": "many"/' /etc/webots-fleet/simulation/main.json
+    ! in_machine webots-fleet-renew >"$WORK/renew.log" 2>&1 || fail 'a wrong configuration is taken'
+    grep --quiet 'main.json: port' "$WORK/renew.log" || fail "$(<"$WORK/renew.log")"
+    grep --quiet "webots-simulation@main.service runs on as it was" "$WORK/renew.log" || fail "$(<"$WORK/renew.log")"
+    in_machine mv /etc/webots-fleet/simulation/main.json.good /etc/webots-fleet/simulation/main.json
+    [[ $(property webots-simulation@main MainPID) == "$old" ]] || fail 'it was drained, and has ended'
+    ! drains webots-simulation@main || fail 'it drains'
+
     echo 'does not try again with a wrong configuration'
     in_machine sh -c 'echo "{}" >/etc/webots-fleet/session/wrong.json'
     ! in_machine systemctl start webots-session@wrong 2>/dev/null || fail 'a wrong configuration is used'
