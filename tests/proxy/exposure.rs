@@ -4,7 +4,9 @@ use std::io::{Read, Write};
 use std::net::TcpListener;
 
 use crate::fleet::Fleet;
-use crate::rules::Rules;
+use crate::rules::{Place, Rules};
+use crate::support::ports;
+use crate::web_server::{Kind, WebServer};
 
 /// A service of the machine that belongs to no fleet: a database's page of administration, say. It runs until the
 /// test program ends.
@@ -151,4 +153,19 @@ async fn of_the_documents_redirects_one_works_and_the_other_never_applies() {
         let answer = fleet.browser.ask(&plain, &[]).await;
         assert_eq!((answer.status.as_u16(), answer.header("location")), (status, location), "{rules:?}");
     }
+}
+
+#[actix_rt::test]
+async fn nginx_takes_names_of_any_length() {
+    let authority = crate::authority::Authority::new();
+    let certificate = authority.issue(&["localhost"]);
+    let (http, https) = (ports::block(1), ports::block(1));
+    let chain = certificate.chain.to_str().unwrap();
+    let key = certificate.key.to_str().unwrap();
+    let text = Rules::Nginx.text(&Place { http, https, session: 1999, here: &[2000], there: &[3000], chain, key });
+    // With its www. as long as a name may be: 253 characters.
+    let name = ["a".repeat(63), "b".repeat(63), "c".repeat(63), "d".repeat(57)].join(".");
+    let text = text.replace("localhost", &name);
+    assert!(text.contains(&format!("server_name {name};")));
+    WebServer::start(Kind::Nginx, (http, https), &text, crate::fleet::IDLE).await;
 }
