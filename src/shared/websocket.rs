@@ -94,6 +94,8 @@ impl Inbox {
             Ok(Message::Continuation(Item::Last(piece))) => self.add(&piece, true),
             Err(ProtocolError::Overflow) => Heard::Wrong(Wrong::TooLarge),
             Err(_) if self.backlog.load(Ordering::Relaxed) > LARGEST_BACKLOG => Heard::Wrong(Wrong::TooLarge),
+            // It has gone without a word, as every closed laptop does.
+            Err(ProtocolError::Io(_)) => Heard::Close(None),
             Err(error) => Heard::Wrong(Wrong::Broken(error)),
         }
     }

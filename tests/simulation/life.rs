@@ -76,6 +76,7 @@ async fn a_connection_that_breaks_leaves_nothing_in_any_state() {
         // Dropped without a word.
         drop((scene.client.take(), scene.other.take()));
         nothing_left(&scene.server, 1).await;
+        assert!(!scene.server.log().contains("Wrong message"), "every closed laptop does that");
     }
 }
 
