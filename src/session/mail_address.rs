@@ -58,6 +58,10 @@ fn mailbox(text: &str) -> Option<Mailbox> {
         Some(rest) => rest.rsplit_once('<').map(|(name, bare)| (name.trim().trim_matches('"').trim(), bare))?,
         None => ("", text.trim()),
     };
+    // That is an address too: whoever writes two means both.
+    if name.contains(['<', '>']) {
+        return None;
+    }
     let address: Address = bare.parse().ok()?;
     // Any other letter needs SMTPUTF8, which few servers of a lab speak.
     let plain = bare.is_ascii() && !bare.contains([' ', ',', '<', '>', '"']);
@@ -107,6 +111,7 @@ mod tests {
             "admin@example.org, other@example.org",
             "admin@example.org other",
             "Ada <ada@example.org> x",
+            "Ada <ada@example.org>, Bo <bo@example.org>",
             "Ada ada@example.org>",
             "a b@example.org",
             "admin@exa mple.org",
