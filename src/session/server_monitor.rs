@@ -238,7 +238,7 @@ fn no_answer(error: SendRequestError) -> Unreachable {
 
 /// Some servers of the Python family have a `/status` with less in it; a page that is no status at all counts as none.
 fn parse_status(body: &[u8]) -> Result<Dispatch, Unreachable> {
-    let dispatch: Dispatch = serde_json::from_slice(body).map_err(|error| {
+    let dispatch = Dispatch::parse(body).map_err(|error| {
         let text = String::from_utf8_lossy(body.get(..body.len().min(40)).unwrap_or_default()).into_owned();
         Unreachable::BadAnswer(shortened(&format!("{error} in {text:?}")))
     })?;
@@ -271,6 +271,9 @@ mod tests {
             "{}",
             "[]",
             "12",
+            "[12]",
+            r#"{"load": 1} x"#,
+            r#"{"load": 1, "instances": [0, 0, 0, 0, 9, 5]}"#,
             r#"{"load": -1}"#,
             r#"{"load": "1"}"#,
             r#"{"load": null}"#,

@@ -206,6 +206,17 @@ pub fn object<'de, T: Deserialize<'de>, D: Deserializer<'de>>(deserializer: D) -
     deserializer.deserialize_map(Object(PhantomData))
 }
 
+/// Like [`object`], for a part that may be `null`.
+///
+/// # Errors
+/// When the value is something else.
+pub fn optional_object<'de, T: DeserializeOwned, D: Deserializer<'de>>(deserializer: D) -> Result<Option<T>, D::Error> {
+    #[derive(Deserialize)]
+    #[serde(bound = "T: DeserializeOwned")]
+    struct Part<T>(#[serde(deserialize_with = "object")] T);
+    Ok(Option::<Part<T>>::deserialize(deserializer)?.map(|part| part.0))
+}
+
 /// Reads a list of texts; a single text counts as a list of one.
 ///
 /// # Errors

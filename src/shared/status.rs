@@ -3,6 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::admission::Rules;
+use super::config_value::{object, optional_object};
 use super::load::Load;
 use super::project_url::ProjectUrl;
 use super::repositories::{UrlPrefix, any_covers, any_may_cover};
@@ -20,7 +21,7 @@ pub struct Dispatch {
     #[serde(default)]
     pub version: String,
     /// The simulations of the server, where it counts them.
-    #[serde(default)]
+    #[serde(default, deserialize_with = "optional_object")]
     pub instances: Option<Instances>,
     /// Whose worlds the server runs at any load.
     #[serde(default)]
@@ -67,6 +68,16 @@ impl Instances {
 }
 
 impl Dispatch {
+    /// Reads the page.
+    ///
+    /// # Errors
+    /// When it is something else.
+    pub fn parse(page: &[u8]) -> serde_json::Result<Self> {
+        let mut json = serde_json::Deserializer::from_slice(page);
+        let dispatch = object(&mut json)?;
+        json.end().map(|()| dispatch)
+    }
+
     /// What is known of a server that tells its load alone.
     #[must_use]
     pub fn load_only(load: Load) -> Self {
