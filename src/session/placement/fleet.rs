@@ -380,6 +380,49 @@ mod tests {
     }
 
     #[test]
+    fn a_class_of_which_a_few_never_came_counts_the_next_time() {
+        let start = Instant::now();
+        let mut fleet = Fleet::new(Policy::default());
+        let school = Some("203.0.113.9".parse().unwrap());
+        (0..10).for_each(|id| fleet.add(id));
+        let report = |fleet: &mut Fleet<u32>, at: f64, present: u32, arrivals| {
+            let now = start + seconds(at);
+            let load = 3.0 + 2.0 * f64::from(present);
+            (0..10).for_each(|id| fleet.report(&id, now, full_report(load, present, arrivals)));
+            now
+        };
+        // Of 200 one in twenty never comes; the others have left long before the next class.
+        let now = report(&mut fleet, 0.0, 0, 0);
+        (0..200).for_each(|_| assert!(fleet.place_from(now, school, |_| true).is_some()));
+        for (at, present) in [(10.0, 19), (20.0, 19), (60.0, 0), (300.0, 0)] {
+            report(&mut fleet, at, present, 19);
+        }
+        let now = start + seconds(300.0);
+        let placed = (0..2_000).take_while(|_| fleet.place_from(now, school, |_| true).is_some()).count();
+        assert!((400..600).contains(&placed), "there is room for some 460, and {placed} were placed");
+    }
+
+    #[test]
+    fn a_class_whose_simulations_start_slowly_counts_on() {
+        let start = Instant::now();
+        let mut fleet = fleet_of_one(start, load_only(3.0));
+        let school = Some("203.0.113.9".parse().unwrap());
+        // A checkout takes a while: nothing of thirty clients shows for ten seconds, then all of them.
+        for second in 0..120 {
+            let now = start + seconds(f64::from(second));
+            if second == 1 {
+                (0..30).for_each(|_| assert!(fleet.place_from(now, school, |_| true).is_some()));
+            }
+            let shown = (f64::from(second - 11) / 5.0).clamp(0.0, 1.0) - (f64::from(second - 90) / 5.0).clamp(0.0, 1.0);
+            fleet.report(&0, now, load_only(3.0 + 60.0 * shown));
+        }
+        // The next class: there is room for some 46.
+        let now = start + seconds(120.0);
+        let placed = (0..1_000).take_while(|_| fleet.place_from(now, school, |_| true).is_some()).count();
+        assert!((30..70).contains(&placed), "{placed} placed at {:?} % each", fleet.learned_cost(&0));
+    }
+
+    #[test]
     fn those_over_the_allowance_are_spread_all_the_same() {
         let now = Instant::now();
         let mut fleet = Fleet::new(policy(0.25));
