@@ -52,7 +52,7 @@ pub enum State {
     Unknown,
     /// It takes clients.
     Up,
-    /// Its load is at the threshold, or it has no place left.
+    /// Its load leaves no room for one more client, or it has no place left.
     Full,
     /// It takes no new clients because somebody wants it to end.
     Draining,

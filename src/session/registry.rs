@@ -168,7 +168,7 @@ impl Registry {
             return;
         };
         let change = match answer {
-            Ok(report) => watched.said(report, at, self.config.load_threshold),
+            Ok(report) => watched.said(report, at, self.fleet.limit(server).unwrap_or(self.config.load_threshold)),
             Err(error) => watched.failed(error),
         };
         match watched.for_placement() {

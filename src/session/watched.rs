@@ -65,9 +65,9 @@ impl Watched {
         }
     }
 
-    /// Takes in a good answer that came at this time.
-    pub fn said(&mut self, report: Dispatch, at: Instant, threshold: f64) -> Option<Change> {
-        let (state, why) = self.judge(&report, threshold);
+    /// Takes in a good answer that came at this time. From this load on, in percent, the server takes nobody.
+    pub fn said(&mut self, report: Dispatch, at: Instant, limit: f64) -> Option<Change> {
+        let (state, why) = self.judge(&report, limit);
         self.report = Some(report);
         self.error = None;
         self.answered = Some(at);
@@ -131,12 +131,12 @@ impl Watched {
         self.current().map(|report| report.load)
     }
 
-    fn judge(&self, report: &Dispatch, threshold: f64) -> (State, impl FnOnce() -> String + use<>) {
+    fn judge(&self, report: &Dispatch, limit: f64) -> (State, impl FnOnce() -> String + use<>) {
         let load = report.load.percent();
         let no_place = report.instances.filter(|instances| instances.present() >= instances.places);
         let state = if self.drained || report.draining {
             State::Draining
-        } else if load >= threshold || no_place.is_some() {
+        } else if load >= limit || no_place.is_some() {
             State::Full
         } else {
             State::Up
@@ -145,6 +145,7 @@ impl Watched {
             (State::Draining, _) if self.drained => " (drained by drainedServers)".to_owned(),
             (State::Draining, _) => " (it drains itself)".to_owned(),
             (State::Full, Some(full)) => format!(", {} clients in {} places", full.present(), full.places),
+            (State::Full, None) => format!(" of {limit:.1} %"),
             _ => String::new(),
         };
         (state, move || format!("load {load:.1} %{reason}"))

@@ -9,7 +9,7 @@ use crate::support::client::Client;
 use crate::support::git::world;
 use crate::support::http;
 use crate::support::program::{Builder, Server, session_server};
-use crate::{addresses, until_states};
+use crate::{addresses, times_logged, until_states};
 
 /// A session server whose simulation servers report once, so that a test stands between two reports.
 fn between_reports(servers: &[StandIn], client_cost: f64) -> Builder {
@@ -88,6 +88,15 @@ async fn a_server_without_a_free_place_gets_nobody() {
         assert_eq!(http::get(&session.url("/session")).await.text(), servers[1].url());
     }
     assert_eq!(http::get(&session.url("/request")).await.text(), "0");
+    assert_eq!(http::get(&session.url("/session")).await.status, 503);
+}
+
+#[actix_rt::test]
+async fn a_server_in_which_one_more_client_does_not_fit_is_called_full() {
+    let server = StandIn::start(Manner::status(91.0, 9, 100));
+    let session = between_reports(std::slice::from_ref(&server), 10.0).start().await;
+    until_states(&session, &["full"]).await;
+    assert_eq!(times_logged(&session, "full: load 91.0 % of 90.0 %"), 1);
     assert_eq!(http::get(&session.url("/session")).await.status, 503);
 }
 

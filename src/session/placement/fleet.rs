@@ -156,6 +156,12 @@ impl<Id: Clone + Ord> Fleet<Id> {
         self.servers.get(id)?.effective_load(now, &self.policy)
     }
 
+    /// The load from which on a server takes no client, in percent; `None` if the fleet does not have that server.
+    #[must_use]
+    pub fn limit(&self, id: &Id) -> Option<f64> {
+        self.servers.get(id).map(|server| server.limit(&self.policy))
+    }
+
     /// How many clients have been sent to a server and not been seen there yet.
     #[must_use]
     pub fn in_flight(&self, id: &Id, now: Instant) -> usize {

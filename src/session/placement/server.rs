@@ -149,10 +149,14 @@ impl Server {
             instances.accepting && taken < instances.places as usize
         });
         let load = self.load_ahead(report.load, in_flight);
+        (has_place && load < self.limit(policy)).then_some(load)
+    }
+
+    /// The load, in percent, from which on this server takes no client.
+    pub(super) fn limit(&self, policy: &Policy) -> f64 {
         // A client that costs much is turned away earlier, because it would take more than the machine has.
         // A threshold that no load reaches says that the load is to close no server.
-        let limit = if policy.threshold > 100.0 { policy.threshold } else { policy.threshold.min(100.0 - self.cost) };
-        (has_place && load < limit).then_some(load)
+        if policy.threshold > 100.0 { policy.threshold } else { policy.threshold.min(100.0 - self.cost) }
     }
 
     /// The last report's load, in percent, if the server is up.
