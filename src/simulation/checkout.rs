@@ -19,7 +19,7 @@ use super::git::Call;
 use super::instance_dir::InstanceDir;
 use super::large_files::{self, Pointer};
 use super::limits::Limits;
-use super::world_file::{NoWorld, WorldFile};
+use super::world_file::{self, NoWorld, WorldFile};
 use crate::shared::project_url::ProjectUrl;
 
 /// Checks worlds out; one for the whole server.
@@ -213,11 +213,13 @@ async fn look(
     instance: &InstanceDir,
     folder: &Path,
 ) -> Result<(Vec<Pointer>, Result<WorldFile, NoWorld>), CheckoutError> {
-    let (root, folder) = (instance.path().to_owned(), folder.to_owned());
+    let (root, folder) = (instance.path().join("project"), folder.to_owned());
     let path = folder.join("worlds").join(world.world());
-    let seen =
-        actix_rt::task::spawn_blocking(move || (large_files::pointers(&folder), WorldFile::open(&root, &path))).await;
-    seen.map_err(|error| machine(world, &error.into()))
+    let seen = actix_rt::task::spawn_blocking(move || {
+        let project = world_file::project_of(&root, &path).map(|project| large_files::pointers(&project));
+        (project.unwrap_or_default(), WorldFile::open(&root, &path))
+    });
+    seen.await.map_err(|error| machine(world, &error.into()))
 }
 
 impl Project {

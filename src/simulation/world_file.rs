@@ -65,6 +65,16 @@ impl WorldFile {
     }
 }
 
+/// The project that a world of the checkout `root` belongs to, without links: the folder above that of its file, and the
+/// one that the URL names where the file lies elsewhere. Nothing where that is not inside: a link may lead anywhere.
+#[must_use]
+pub fn project_of(root: &Path, path: &Path) -> Option<PathBuf> {
+    let root = root.canonicalize().ok()?;
+    let above = |file: &Path| file.ancestors().nth(2).and_then(|project| project.canonicalize().ok());
+    let project = path.canonicalize().ok().and_then(|file| above(&file));
+    [project, above(path)].into_iter().flatten().find(|project| project.starts_with(&root))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

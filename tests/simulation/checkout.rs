@@ -403,6 +403,34 @@ async fn files_that_are_missing_from_git_lfs_are_told() {
 }
 
 #[actix_rt::test]
+async fn files_in_git_lfs_are_looked_for_where_the_world_is_and_nowhere_outside() {
+    let (forge, webots, outside) = (Forge::with_arm(), reader(), tempfile::tempdir().unwrap());
+    let strange = outside.path().join("meshes/a.dae");
+    std::fs::create_dir_all(strange.parent().unwrap()).unwrap();
+    std::fs::write(&strange, POINTER).unwrap();
+    let files = [("real/worlds/a.wbt", world_text("real")), ("real/meshes/a.dae", POINTER.to_owned())];
+    let work = forge.work_tree("lab/arm", "main");
+    for (name, target) in [("out", outside.path()), ("in/worlds", Path::new("../real/worlds"))] {
+        std::fs::create_dir_all(work.join(name).parent().unwrap()).unwrap();
+        std::os::unix::fs::symlink(target, work.join(name)).unwrap();
+    }
+    forge.commit("lab/arm", "main", &files.each_ref().map(|(path, text)| (*path, text.as_str())));
+    // A git-lfs that loads nothing.
+    let wrapper = GitWrapper::new("");
+    let lfs = wrapper.path().split(':').next().map(|folder| Path::new(folder).join("git-lfs")).unwrap();
+    std::os::unix::fs::symlink("/bin/false", lfs).unwrap();
+    let server = simulation_server(&webots.path(), forge.path(), 1).env("PATH", &wrapper.path()).start().await;
+    let told = outcome(&server, &world("lab/arm", "main", "out/worlds/a.wbt")).await;
+    assert_eq!(told, "loading: Error: a.wbt does not exist");
+    assert_eq!(std::fs::read_to_string(&strange).unwrap(), POINTER);
+    for folder in ["real", "in"] {
+        let url = world("lab/arm", "main", &format!("{folder}/worlds/a.wbt"));
+        let told = Client::start(&server, &url).await.until("loading: Warning:").await;
+        assert!(told.contains("1 files of this project are kept in Git LFS"), "{folder}: {told}");
+    }
+}
+
+#[actix_rt::test]
 async fn files_in_git_lfs_are_loaded() {
     if !std::env::split_paths(&std::env::var_os("PATH").unwrap()).any(|folder| folder.join("git-lfs").is_file()) {
         eprintln!("git-lfs is missing here: loading from Git LFS is NOT tested");
