@@ -1,7 +1,7 @@
 //! The session server as a whole: what it is made of, how it starts, and how it ends.
 
 use std::io::Write;
-use std::net::{SocketAddr, TcpListener};
+use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Instant, SystemTime};
@@ -24,7 +24,7 @@ use crate::shared::metrics::Metrics;
 use crate::shared::notify;
 use crate::shared::permanent;
 use crate::shared::shutdown::{Phase, Request, Signals};
-use crate::shared::sockets::Sockets;
+use crate::shared::sockets::{self, Sockets};
 
 /// Why the server can't go on.
 #[derive(Debug, thiserror::Error)]
@@ -73,7 +73,7 @@ pub async fn run(mut config: SessionConfig, file: PathBuf) -> Result<(), AppErro
     ));
     let (phase_sender, phase) = watch::channel(Phase::Open);
     let address = SocketAddr::new(config.bind, config.port);
-    let socket = TcpListener::bind(address).map_err(|source| AppError::Bind { address, source })?;
+    let socket = sockets::listen(address).map_err(|source| AppError::Bind { address, source })?;
     let port = socket.local_addr()?.port();
     config.port = port;
     let stop = config.timing.stop;
@@ -94,7 +94,6 @@ pub async fn run(mut config: SessionConfig, file: PathBuf) -> Result<(), AppErro
         .max_connections((connections / threads()).max(1))
         .disable_signals()
         .shutdown_timeout(stop.as_secs())
-        .backlog(4096)
         .listen(socket)?
         .run();
     let handle = http.handle();

@@ -5,15 +5,28 @@
 //! has only so many connections.
 
 use std::any::Any;
+use std::io;
+use std::net::{SocketAddr, TcpListener};
 use std::os::fd::AsRawFd;
 use std::time::Duration;
 
 use actix_web::dev::Extensions;
 use actix_web::rt::net::TcpStream;
-use nix::sys::socket::{Shutdown, setsockopt, shutdown, sockopt};
+use nix::sys::socket::{self, Backlog, Shutdown, setsockopt, shutdown, sockopt};
 
 use super::connections::Connections;
 use super::peer::TrustedProxies;
+
+/// Listens on an address. As many connections as the system allows may wait to be accepted: of the standard library's
+/// 128, those that come in a larger burst would be lost, and tried again a second later.
+///
+/// # Errors
+/// When the address is taken, or may not be used.
+pub fn listen(address: SocketAddr) -> io::Result<TcpListener> {
+    let socket = TcpListener::bind(address)?;
+    socket::listen(&socket, Backlog::MAXALLOWABLE)?;
+    Ok(socket)
+}
 
 /// Looks after the connections of a server.
 #[derive(Debug)]

@@ -34,7 +34,7 @@ use crate::shared::metrics::Metrics;
 use crate::shared::notify;
 use crate::shared::permanent;
 use crate::shared::shutdown::{Phase, Request, Signals};
-use crate::shared::sockets::Sockets;
+use crate::shared::sockets::{self, Sockets};
 
 /// Why the server can't go on.
 #[derive(Debug, thiserror::Error)]
@@ -176,7 +176,7 @@ pub async fn serve(assembly: Assembly) -> Result<(), AppError> {
 
 fn bind(config: &SimulationConfig) -> Result<TcpListener, AppError> {
     let address = SocketAddr::new(config.bind, config.port);
-    TcpListener::bind(address).map_err(|source| AppError::Bind { address, source })
+    sockets::listen(address).map_err(|source| AppError::Bind { address, source })
 }
 
 /// Makes everything that the server is made of, and starts its actors.

@@ -31,6 +31,13 @@ async fn a_client_is_led_to_the_simulation_server_that_is_there() {
 }
 
 #[actix_rt::test]
+async fn many_may_come_at_once() {
+    let session = session_server(&[]).start().await;
+    session.crowd(1000);
+    until("it answers", async || http::try_get(&session.url("/health")).await.is_ok()).await;
+}
+
+#[actix_rt::test]
 async fn a_message_may_come_in_pieces_and_must_not_be_large() {
     let other = serde_json::json!({"load": 1, "allowedRepositories": ["https://github.com/other"]});
     let server = StandIn::start(Manner::Status(other));

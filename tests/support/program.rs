@@ -175,6 +175,16 @@ impl Server {
         kill(Pid::from_raw(self.pid()), signal).unwrap();
     }
 
+    /// Stops the server, and connects so many clients that it can't accept: they wait in the system's queue.
+    pub fn crowd(&self, clients: usize) {
+        self.signal(Signal::SIGSTOP);
+        let address = self.address().parse().unwrap();
+        let connect = |_| std::net::TcpStream::connect_timeout(&address, SOON).unwrap();
+        let crowd: Vec<_> = (0..clients).map(connect).collect();
+        self.signal(Signal::SIGCONT);
+        drop(crowd);
+    }
+
     /// Waits until the server has ended by itself; gives back its exit code.
     pub async fn ended(&mut self) -> Option<i32> {
         let deadline = Instant::now() + SOON;
