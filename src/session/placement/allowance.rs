@@ -15,6 +15,8 @@ const CLASS: usize = 1024;
 /// Which part of its allowance one client is worth: were it a half, ten who change their minds would leave a class of
 /// hundreds with next to nothing.
 const PART: usize = 16;
+/// Nothing that was held against an address counts any more when it has not asked for so long: a school has another class.
+const FORGIVEN: Duration = Duration::from_mins(30);
 /// From so many addresses on, those are forgotten that have not asked lately, and new ones are not noted in between.
 const MANY: usize = 10_000;
 
@@ -49,6 +51,9 @@ impl Allowances {
         }
         let new = || Allowance { most: CLASS, recent: VecDeque::new(), asked: now };
         let known = self.addresses.entry(address).or_insert_with(new);
+        if now.saturating_duration_since(known.asked) >= FORGIVEN {
+            known.most = CLASS;
+        }
         known.asked = now;
         let old = known.recent.partition_point(|made| now.saturating_duration_since(*made) >= patience);
         known.recent.drain(..old);
@@ -101,6 +106,9 @@ mod tests {
         assert_eq!(taken(&mut allowances, start + PATIENCE * 2), 1, "one is left to prove itself by");
         (0..150).for_each(|_| allowances.came(address(1)));
         assert_eq!(taken(&mut allowances, start + PATIENCE * 3), CLASS);
+        (0..200).for_each(|_| allowances.missed(address(1)));
+        assert_eq!(taken(&mut allowances, start + PATIENCE * 4), 1);
+        assert_eq!(taken(&mut allowances, start + PATIENCE * 4 + FORGIVEN), CLASS);
     }
 
     #[test]

@@ -53,7 +53,9 @@ pub(super) fn believable(cost: f64) -> f64 {
 /// themselves too, so that many must be missing before it is said.
 fn who_came(risen: f64, clients: f64, believed: f64) -> Told {
     let expected = clients * believed;
-    if clients > 0.5 && risen > expected * 0.5 {
+    if expected < CLEAR_RISE / 2.0 && risen > CLEAR_RISE {
+        Told::Late
+    } else if clients > 0.5 && risen > expected * 0.5 {
         Told::Came
     } else if expected > CLEAR_RISE && risen < expected * 0.1 {
         Told::Missed
@@ -78,8 +80,10 @@ pub(super) enum Told {
     Nothing,
     /// Most of them have come.
     Came,
-    /// Hardly anybody has.
+    /// Hardly anybody has, until now.
     Missed,
+    /// More than were to be expected: those who had been missing.
+    Late,
 }
 
 /// The fit for one server, of `load = base * unit + cost * clients`: the weighted sums of the samples, and what follows
@@ -184,8 +188,8 @@ impl Cost {
                 told = who_came(load - load_before - self.base * was_there, clients, believed);
                 // Clients leave one by one, each with its cost, and those who come differ.
                 let noise = STEP_NOISE + believed * (LEAVING * was_there + VARIETY * believed * clients);
-                // Who has not come tells nothing of those who do.
-                if told != Told::Missed {
+                // Who has not come tells nothing of those who do, and how many come late is not known.
+                if !matches!(told, Told::Missed | Told::Late) {
                     self.add(was_there, clients, load - load_before, NOISE / noise, seconds);
                     self.meet(clients);
                     self.fit();

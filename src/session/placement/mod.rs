@@ -19,6 +19,7 @@ mod fleet;
 mod order;
 mod policy;
 mod server;
+mod unproven;
 
 pub use fleet::Fleet;
 pub use policy::Policy;

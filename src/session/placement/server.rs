@@ -1,8 +1,9 @@
 //! What is known of one simulation server: its last report, and what has been sent to it since.
 
 use super::allowance::Allowances;
-use super::cost::{Common, Cost, Estimate, FULL, Told, believable};
+use super::cost::{Common, Cost, Estimate, FULL, believable};
 use super::policy::Policy;
+use super::unproven::Unproven;
 use std::collections::VecDeque;
 use std::net::IpAddr;
 use std::time::{Duration, Instant};
@@ -68,8 +69,7 @@ pub(super) struct Server {
     /// The placements whose clients have not been seen yet, oldest first.
     in_flight: VecDeque<Placement>,
     settling: VecDeque<Change>,
-    /// Whose placements were made when, if only the load will tell whether they came.
-    unproven: VecDeque<(Instant, IpAddr)>,
+    unproven: Unproven,
     /// The sum of what `settling` hid from the last report.
     unseen: f64,
     /// How many clients have been sent here in all.
@@ -91,7 +91,7 @@ impl Server {
             last: None,
             in_flight: VecDeque::new(),
             settling: VecDeque::new(),
-            unproven: VecDeque::new(),
+            unproven: Unproven::default(),
             unseen: 0.0,
             fit: Cost::new(policy.initial_cost),
             cost: believable(policy.initial_cost),
@@ -222,7 +222,7 @@ impl Server {
         }
         let Some(instances) = report.instances else {
             let told = self.fit.learn_step(now, self.sent - self.unseen, report.load, self.cost);
-            self.judge(now, told, policy, allowances);
+            self.unproven.judge(now, told, policy, allowances);
             return;
         };
         // Those who wait for a place cost nothing yet.
@@ -231,23 +231,6 @@ impl Server {
         // While many are starting, it is not well known how much of them the load shows.
         let trust = if shown < present { shown / present } else { 1.0 };
         self.fit.learn(shown, report.load, now.saturating_duration_since(before), trust * trust);
-    }
-
-    /// Counts what a step has told for those whose clients show in it, which they do, on average, after half of the
-    /// settling.
-    fn judge(&mut self, now: Instant, told: Told, policy: &Policy, allowances: &mut Allowances) {
-        if told == Told::NotYet {
-            return;
-        }
-        let shows = |(at, _): &(Instant, IpAddr)| now.saturating_duration_since(*at) > policy.settling / 2;
-        let first = self.unproven.partition_point(shows);
-        for (_, from) in self.unproven.drain(..first) {
-            match told {
-                Told::Came => allowances.came(from),
-                Told::Missed => allowances.missed(from),
-                Told::NotYet | Told::Nothing => {}
-            }
-        }
     }
 
     /// Gives up the clients that should have come by now.
@@ -263,7 +246,9 @@ impl Server {
             // A load alone does not tell who came: every placement is taken to have come as it was made.
             for Placement { at, from } in self.in_flight.drain(..) {
                 self.settling.push_back(Change { at, clients: 1.0 });
-                self.unproven.extend(from.map(|from| (at, from)));
+                if let Some(from) = from {
+                    self.unproven.add((at, from));
+                }
             }
             return;
         };
