@@ -8,7 +8,7 @@
 //! - `order`: the servers by their effective load, so that a large fleet is as fast as a small one;
 //! - `server`: what is known of one server;
 //! - `cost`: how the cost of a client is learned;
-//! - `allowance`: how many placements of one client address count.
+//! - `allowance`: how many placements of one client address count; `unproven`: those of which only the load tells.
 //!
 //! Nothing here reads a clock or does any input or output: every call is told the time.
 //! `docs/placement.md` explains the policy, and `cargo bench --bench placement` measures it.
