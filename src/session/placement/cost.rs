@@ -53,7 +53,7 @@ pub(super) fn believable(cost: f64) -> f64 {
 /// themselves too, so that many must be missing before it is said.
 fn who_came(risen: f64, clients: f64, believed: f64) -> Told {
     let expected = clients * believed;
-    if expected < CLEAR_RISE / 2.0 && risen > CLEAR_RISE {
+    if clients <= 0.5 && risen > CLEAR_RISE {
         Told::Late
     } else if clients > 0.5 && risen > expected * 0.5 {
         Told::Came
@@ -82,7 +82,7 @@ pub(super) enum Told {
     Came,
     /// Hardly anybody has, until now.
     Missed,
-    /// More than were to be expected: those who had been missing.
+    /// Some, although nobody was to be expected: those who had been missing.
     Late,
 }
 
@@ -188,7 +188,7 @@ impl Cost {
                 told = who_came(load - load_before - self.base * was_there, clients, believed);
                 // Clients leave one by one, each with its cost, and those who come differ.
                 let noise = STEP_NOISE + believed * (LEAVING * was_there + VARIETY * believed * clients);
-                // Who has not come tells nothing of those who do, and how many come late is not known.
+                // Who has not come tells nothing of those who do, and how many have come late is not known.
                 if !matches!(told, Told::Missed | Told::Late) {
                     self.add(was_there, clients, load - load_before, NOISE / noise, seconds);
                     self.meet(clients);
