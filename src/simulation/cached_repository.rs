@@ -4,7 +4,7 @@ use std::fs::File;
 use std::io;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
-use std::time::SystemTime;
+use std::time::{Duration, SystemTime};
 
 use super::cache_lock::{Departure, lock_file, remove_locks, wait};
 
@@ -31,6 +31,9 @@ pub struct CommitInUse {
 
 /// Where the fetched commits are named: those that the repository's owner vouches for, and others.
 const COMMITS: [&str; 2] = ["refs/fleet", "refs/any"];
+
+/// Nobody is told of a wait that is no longer than this.
+const MOMENT: Duration = Duration::from_millis(500);
 
 impl Drop for InUse {
     fn drop(&mut self) {
@@ -61,6 +64,19 @@ impl InUse {
         wait(|| lock.try_lock()).await?;
         self.clean();
         Ok(Fetching { _lock: lock })
+    }
+
+    /// The same. `tell` is called where that takes its time.
+    ///
+    /// # Errors
+    /// When its lock can't be opened.
+    pub async fn fetching_later(&self, tell: impl FnOnce()) -> io::Result<Fetching> {
+        let mut right = std::pin::pin!(self.fetching());
+        if let Ok(right) = actix_rt::time::timeout(MOMENT, &mut right).await {
+            return right;
+        }
+        tell();
+        right.await
     }
 
     /// The same if nobody else has that right now.

@@ -52,6 +52,12 @@ pub struct Errand<'job> {
     pub progress: &'job watch::Sender<String>,
 }
 
+impl Errand<'_> {
+    fn tell_wait(self) {
+        self.progress.send_replace(format!("waiting while what is cached of {} is tidied up", self.world.repository()));
+    }
+}
+
 /// Between two looks at how much a fetch has brought.
 const BETWEEN_LOOKS: Duration = Duration::from_millis(200);
 
@@ -98,7 +104,7 @@ impl Downloads {
             if let Some(commit) = repository.commit(&revision.reference()) {
                 return Ok((revision.commit.clone(), Arc::new(commit)));
             }
-            let right = repository.fetching().await.map_err(failed)?;
+            let right = repository.fetching_later(|| errand.tell_wait()).await.map_err(failed)?;
             quarantine.make(repository, &right).map_err(failed)?;
             drop(right);
             let call = call(remote, quarantine.path(), revision.fetch_arguments(&remote.location));
@@ -147,7 +153,7 @@ impl Downloads {
         let _grown = Grown(&self.cache);
         loop {
             // There is but one history to fetch: others who want it wait for it.
-            let _right = history.fetching().await.map_err(failed)?;
+            let _right = history.fetching_later(|| errand.tell_wait()).await.map_err(failed)?;
             self.make_repository(errand, &history).await?;
             let mut call = call(remote, history.path(), revision::history_arguments("origin"));
             call.environment.extend(setting("remote.origin.url", &remote.location));

@@ -49,7 +49,7 @@ impl Fetcher {
     #[must_use]
     pub fn new(git: Git, cache: RepositoryCache, mirrors: Mirrors, limits: Limits, runtime: &Handle) -> Self {
         let git = Arc::new(git);
-        let housekeeping = runtime.spawn(housekeeping::keep(cache.clone(), Arc::clone(&git)));
+        let housekeeping = runtime.spawn(housekeeping::keep(cache.clone(), Arc::clone(&git), limits.patience()));
         let downloads = Arc::new(Downloads::new(git, cache, limits));
         Self { downloads, mirrors, fetches: Joint::default(), _housekeeping: AbortOnDropHandle::new(housekeeping) }
     }

@@ -1,10 +1,11 @@
 //! Keeps the cache within its budget, in the background: at start, after each fetch, and when somebody has left a
 //! repository that could not be removed before.
 
+use std::collections::HashMap;
 use std::ffi::OsString;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use super::download::setting;
 use super::git::{Call, Git};
@@ -15,24 +16,31 @@ use super::repository_cache::RepositoryCache;
 const MOST_COMMITS: usize = 64;
 /// So many more may come before some are removed, for git then packs the whole repository anew.
 const SLACK: usize = 32;
-/// How long git may take for that. New fetches into the repository wait for it.
-const LIMIT: Duration = Duration::from_mins(2);
+/// A repository that git can't pack is left alone for so long, and twice as long after each further failure.
+const FIRST_REST: Duration = Duration::from_mins(10);
+/// The longest of these pauses.
+const LONGEST_REST: Duration = Duration::from_hours(24);
 
-/// Tidies up for ever.
-pub async fn keep(cache: RepositoryCache, git: Arc<Git>) {
+/// Tidies up for ever. git may take `limit` for one repository: new fetches into it wait for that.
+pub async fn keep(cache: RepositoryCache, git: Arc<Git>, limit: Duration) {
+    let mut rests = Rests::default();
     loop {
-        while tidy_up(&cache, &git).await {}
+        while tidy_up(&cache, &git, limit, &mut rests).await {}
         cache.change().await;
     }
 }
 
 /// One round. Gives back whether another one may achieve more.
-async fn tidy_up(cache: &RepositoryCache, git: &Git) -> bool {
+async fn tidy_up(cache: &RepositoryCache, git: &Git, limit: Duration, rests: &mut Rests) -> bool {
     let looked_at = cache.clone();
     let Ok(survey) = actix_rt::task::spawn_blocking(move || looked_at.shrink()).await else {
         return false;
     };
+    rests.0.retain(|path, _| survey.left.contains(path));
     for path in &survey.left {
+        if rests.is_resting(path, Instant::now()) {
+            continue;
+        }
         let Some(repository) = cache.visit(path) else {
             continue;
         };
@@ -53,7 +61,16 @@ async fn tidy_up(cache: &RepositoryCache, git: &Git) -> bool {
         }
         let forgotten = repository.forget(&right, keep);
         if is_crowded || forgotten > 0 {
-            pack(git, path, forgotten).await;
+            match pack(git, path, limit).await {
+                Ok(()) => {
+                    rests.0.remove(path);
+                    log::info!("removed {forgotten} commits from {}", path.display());
+                }
+                Err(why) => {
+                    let minutes = rests.start(path, Instant::now()).as_secs() / 60;
+                    log::warn!("{} can't be tidied up, it is left alone for {minutes} minutes: {why}", path.display());
+                }
+            }
         }
         if is_too_large && forgotten > 0 {
             return true;
@@ -63,14 +80,50 @@ async fn tidy_up(cache: &RepositoryCache, git: &Git) -> bool {
 }
 
 /// Removes what no commit needs any more, and makes one pack of the rest.
-async fn pack(git: &Git, path: &Path, forgotten: usize) {
+async fn pack(git: &Git, path: &Path, limit: Duration) -> Result<(), String> {
     let arguments = ["gc", "--quiet", "--force", "--prune=now"].map(OsString::from).to_vec();
     // There is no hurry, and others use the machine.
     let environment = setting("pack.threads", "1").to_vec();
     let call = Call { repository: path, arguments, protocol: "none", is_alone: false, environment };
-    match actix_rt::time::timeout(LIMIT, git.run(call, |_| ())).await {
-        Ok(Ok(_)) => log::info!("removed {forgotten} commits from {}", path.display()),
-        Ok(Err(error)) => log::warn!("{} can't be tidied up: {error}", path.display()),
-        Err(_) => log::warn!("{} can't be tidied up within {} seconds", path.display(), LIMIT.as_secs()),
+    match actix_rt::time::timeout(limit, git.run(call, |_| ())).await {
+        Ok(packed) => packed.map(drop).map_err(|error| error.to_string()),
+        Err(_) => Err(format!("git gc took longer than {} seconds", limit.as_secs_f64())),
+    }
+}
+
+/// Repositories that git could not pack: until when each is left alone, and how long that pause is in all.
+#[derive(Default)]
+struct Rests(HashMap<PathBuf, (Instant, Duration)>);
+
+impl Rests {
+    fn is_resting(&self, path: &Path, now: Instant) -> bool {
+        self.0.get(path).is_some_and(|(end, _)| now < *end)
+    }
+
+    /// Notes a failure. Gives back how long the repository is left alone.
+    fn start(&mut self, path: &Path, now: Instant) -> Duration {
+        let last = self.0.get(path).map(|(_, rest)| *rest);
+        let rest = last.map_or(FIRST_REST, |rest| (2 * rest).min(LONGEST_REST));
+        self.0.insert(path.to_owned(), (now + rest, rest));
+        rest
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_fails_again_and_again_is_left_alone_for_longer_and_longer() {
+        let (mut rests, path, mut now) = (Rests::default(), Path::new("a"), Instant::now());
+        assert!(!rests.is_resting(path, now));
+        let pauses = std::iter::repeat_with(|| {
+            let rest = rests.start(path, now);
+            assert!(rests.is_resting(path, now + rest - Duration::from_secs(1)));
+            assert!(!rests.is_resting(path, now + rest) && !rests.is_resting(Path::new("b"), now));
+            now += rest;
+            rest.as_secs() / 60
+        });
+        assert_eq!(pauses.take(10).collect::<Vec<_>>(), [10, 20, 40, 80, 160, 320, 640, 1280, 1440, 1440]);
     }
 }

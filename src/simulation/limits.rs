@@ -19,7 +19,8 @@ const ENTRY: u64 = 4096;
 const FEW_ENTRIES: u64 = 10_000;
 
 impl Limits {
-    /// A remote that is silent for so long is asked anew: often it is but a connection that has died.
+    /// A remote that is silent for so long is asked anew: often it is but a connection that has died. Tidying up holds
+    /// a fetch up for no longer either.
     #[must_use]
     pub fn patience(&self) -> Duration {
         self.time / 4

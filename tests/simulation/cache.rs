@@ -151,6 +151,47 @@ async fn a_repository_keeps_a_bounded_number_of_commits() {
 }
 
 #[actix_rt::test]
+async fn tidying_up_that_takes_long_holds_nobody_up_for_long_and_is_not_tried_again_at_once() {
+    let forge = Forge::new();
+    let branches = ["main", "one", "two", "three", "four"];
+    for branch in branches {
+        forge.commit("lab/arm", branch, &[("worlds/a.wbt", &world_text(branch))]);
+    }
+    let webots = reader();
+    let wrapper = GitWrapper::new("case \"$*\" in *\" gc \"*) sleep 15;; esac");
+    let builder = simulation_server(&webots.path(), forge.path(), 1).env("PATH", &wrapper.path());
+    let server = builder.set("timing.checkout", 12).start().await;
+    let ask = async |branch: &str| {
+        let mut client = Client::start(&server, &world("lab/arm", branch, "worlds/a.wbt")).await;
+        let told = client.until("loading: Error:").await;
+        assert!(told.contains(&format!("opened [{branch}]")), "{told}");
+        client.closed().await;
+        client.heard.join("\n")
+    };
+    ask("main").await;
+    // As many packs as a hundred fetches leave.
+    let packs = cached(&server)[0].join("objects/pack");
+    for file in std::fs::read_dir(&packs).unwrap().flatten().map(|entry| entry.path()).collect::<Vec<_>>() {
+        for number in 0..100 {
+            let copy = packs.join(format!("pack-{number:040x}")).with_extension(file.extension().unwrap());
+            std::fs::copy(&file, copy).unwrap();
+        }
+    }
+    ask("one").await;
+    let tried = || wrapper.calls().iter().filter(|call| call.contains(" gc ")).count();
+    until("it is tidied up", async || tried() > 0).await;
+    let told = ask("two").await;
+    assert!(told.contains("waiting while what is cached of https://github.com/lab/arm is tidied up"), "{told}");
+    let words = "can't be tidied up, it is left alone for 10 minutes: git gc took longer than 3 seconds";
+    assert!(server.log().contains(words), "{}", server.log());
+    for branch in ["three", "four"] {
+        let told = ask(branch).await;
+        assert!(!told.contains("waiting"), "{told}");
+    }
+    assert_eq!(tried(), 1, "{:#?}", wrapper.calls());
+}
+
+#[actix_rt::test]
 async fn mending_hurts_nobody_who_uses_what_is_damaged() {
     let (forge, webots) = (Forge::with_arm(), Webots::launcher());
     let cache = tempfile::tempdir().unwrap();
