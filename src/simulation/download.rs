@@ -34,12 +34,14 @@ pub struct Downloads {
     pub limits: Limits,
     /// What was found to be in order.
     pub examined: Examined,
-    /// The commits that are being fetched now, by what git is asked for.
-    commits: Joint<Vec<OsString>, Result<Arrival, CheckoutError>>,
+    /// The commits that are being fetched now, by where they are and what they are; or by what git is asked for.
+    commits: Joint<Vec<OsString>, Attempt>,
 }
 
 /// The hash of a commit that was fetched.
 type Arrival = (String, Arc<CommitInUse>);
+/// What git was asked for, and what came.
+type Attempt = (Vec<OsString>, Result<Arrival, CheckoutError>);
 
 /// What is fetched for whom.
 #[derive(Debug, Clone, Copy)]
@@ -79,13 +81,22 @@ impl Downloads {
         revision: &Revision,
     ) -> Result<(Revision, Arc<CommitInUse>), CheckoutError> {
         let Errand { world, remote, progress } = errand;
-        let (this, world, remote, wanted) = (Arc::clone(self), world.clone(), remote.clone(), revision.clone());
-        let key = revision.fetch_arguments(&remote.location);
-        let fetch = |progress| async move {
-            this.fetch(Errand { world: &world, remote: &remote, progress: &progress }, &wanted).await
-        };
+        let asked = revision.fetch_arguments(&remote.location);
         let tell = |step| drop(progress.send_replace(step));
-        let (came, commit) = self.commits.join(key, &tell, fetch).await?;
+        let join = |key| {
+            let (this, world, remote, wanted) = (Arc::clone(self), world.clone(), remote.clone(), revision.clone());
+            let asked = asked.clone();
+            self.commits.join(key, &tell, |progress| async move {
+                (asked, this.fetch(Errand { world: &world, remote: &remote, progress: &progress }, &wanted).await)
+            })
+        };
+        let (by_name, mut result) = join(vec![remote.location.clone().into(), revision.reference().into()]).await;
+        let is_it = result.as_ref().is_ok_and(|(came, _)| *came == revision.commit);
+        if by_name != asked && !is_it {
+            // Another name of the commit: what has become of that one says nothing of this.
+            (_, result) = join(asked.clone()).await;
+        }
+        let (came, commit) = result?;
         Ok((revision.with_commit(came), commit))
     }
 

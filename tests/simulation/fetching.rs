@@ -196,3 +196,71 @@ async fn what_stands_still_is_begun_anew_and_what_moves_is_not() {
     assert!(told.contains("opened [slow]"), "{told}");
     assert_eq!(wrapper.calls().iter().filter(|call| call.contains("heads/slow:")).count(), 1, "{:#?}", wrapper.calls());
 }
+
+#[actix_rt::test]
+async fn a_commit_by_several_names_is_fetched_once() {
+    let (forge, webots) = (forge(&["main"]), reader());
+    let bare = forge.path().join("lab/arm");
+    git(&bare, &["tag", "v1", "main"]);
+    let hash = git(&bare, &["rev-parse", "main"]);
+    let wrapper = GitWrapper::new(
+        "case \"$*\" in *fetch*) for n in $(seq 12); do echo \"Receiving objects: $n%\" >&2; sleep 0.5; done;; esac",
+    );
+    let builder = simulation_server(&webots.path(), forge.path(), 3).env("PATH", &wrapper.path());
+    let server = builder.set("timing.checkout", 9).start().await;
+    let mut first = Client::start(&server, &world("lab/arm", "main", "worlds/a.wbt")).await;
+    first.until("loading: fetching https://github.com/lab/arm: Receiving objects: 1%").await;
+    let mut others = [
+        Client::start(&server, &world("lab/arm", "v1", "worlds/a.wbt")).await,
+        Client::start(&server, &world("lab/arm", hash.trim(), "worlds/b.wbt")).await,
+    ];
+    for other in &mut others {
+        other.until("loading: fetching https://github.com/lab/arm: Receiving objects: ").await;
+    }
+    first.until("loading: fetching https://github.com/lab/arm: Receiving objects: 8%").await;
+    first.send("nothing that is known").await;
+    for other in &mut others {
+        let told = other.until("loading: Error:").await;
+        assert!(told.contains("opened [main]"), "{told}");
+    }
+    assert_eq!(wrapper.calls().iter().filter(|call| call.contains(" fetch ")).count(), 1, "{:#?}", wrapper.calls());
+}
+
+#[actix_rt::test]
+async fn who_joins_the_fetch_of_a_commit_by_another_name_inherits_nothing_of_that_name() {
+    // The fetch by the first name takes until both wait for it, and then ends otherwise than that by the second.
+    let (refused, moved) =
+        ("echo 'fatal: not our ref' >&2; exit 128", "$REAL --git-dir $BARE update-ref refs/heads/main next");
+    for (is_hash_first, what_happens, opened) in [(true, refused, ["", "first"]), (false, moved, ["second", "first"])] {
+        let (forge, webots, marks) = (Forge::new(), reader(), tempfile::tempdir().unwrap());
+        let hash = forge.commit("lab/arm", "main", &[("worlds/a.wbt", &world_text("first"))]);
+        forge.commit("lab/arm", "next", &[("worlds/a.wbt", &world_text("second"))]);
+        let bare = forge.path().join("lab/arm");
+        git(&bare, &["tag", "old", &hash]);
+        let [first, second] = if is_hash_first { [hash.as_str(), "main"] } else { ["main", hash.as_str()] };
+        let asked = if is_hash_first { format!("+{hash}:") } else { "heads/main:".to_owned() };
+        let wrapper = GitWrapper::new(&format!(
+            "BARE={}\ncase \"$*\" in *fetch*{asked}*) until [ -e {}/go ]; do echo \"Receiving objects: 1%\" >&2; sleep 0.05; done; {what_happens};; esac",
+            bare.display(),
+            marks.path().display()
+        ));
+        let server = simulation_server(&webots.path(), forge.path(), 2).env("PATH", &wrapper.path()).start().await;
+        let mut clients = Vec::new();
+        for name in [first, second] {
+            let mut client = Client::start(&server, &world("lab/arm", name, "worlds/a.wbt")).await;
+            client.until("loading: fetching").await;
+            clients.push(client);
+        }
+        std::fs::write(marks.path().join("go"), "").unwrap();
+        for (client, opened) in clients.iter_mut().zip(opened) {
+            let told = client.until("loading: Error:").await;
+            let expected = if opened.is_empty() {
+                "has no branch, tag or commit called".to_owned()
+            } else {
+                format!("opened [{opened}]")
+            };
+            assert!(told.contains(&expected), "{told}");
+        }
+        assert_eq!(wrapper.calls().iter().filter(|call| call.contains(" fetch ")).count(), 2, "{:#?}", wrapper.calls());
+    }
+}
