@@ -5,6 +5,9 @@
 //! Each guardian leads a session of its own, which its tree can't leave for the server's: so orphans can be told from
 //! helpers that libraries start and wait for.
 //!
+//! What git has started and left where it runs without a guardian is in the server's session: that is ended too, and is
+//! nothing to tell of.
+//!
 //! Others may leave orphans to the server too: children that it had before it became this program (of a shell that has
 //! started them, and then the server in its place), and everybody where it is the first process of a container. Such
 //! children are never ended. Where there are such, an orphan is ended only if it is known to come from a guardian: it
@@ -138,18 +141,29 @@ fn identity(pid: i32) -> Option<Identity> {
     Some((pid, stat.starttime))
 }
 
+/// Whether a process is in the server's session, where nothing can be that a guardian has started.
+fn is_in_own_session(pid: i32) -> bool {
+    let session =
+        |process: procfs::ProcResult<Process>| process.and_then(|process| process.stat()).map(|stat| stat.session);
+    matches!((session(Process::new(pid)), session(Process::myself())), (Ok(its), Ok(own)) if its == own)
+}
+
 fn own_pid() -> i32 {
     std::process::id().cast_signed()
 }
 
-/// Ends orphans, or buries them. Gives back whether some have not vanished yet.
+/// Ends orphans, or buries them, and adds those that had a guardian. Gives back whether some have not vanished yet.
 fn end(ended: &mut BTreeSet<i32>) -> bool {
     let mut is_left = false;
     for pid in orphans() {
         if let Ok(WaitStatus::StillAlive) = waitpid(Pid::from_raw(pid), Some(WaitPidFlag::WNOHANG))
             && is_ours(pid)
         {
-            ended.extend(process_tree::kill_tree(pid));
+            let had_guardian = !is_in_own_session(pid);
+            let tree = process_tree::kill_tree(pid);
+            if had_guardian {
+                ended.extend(tree);
+            }
             is_left = true;
         }
     }

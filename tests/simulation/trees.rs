@@ -7,6 +7,7 @@ use std::time::{Duration, Instant};
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 
+use crate::git_wrapper::GitWrapper;
 use crate::life::{children, is_there, quick};
 use crate::scene::{DEMO, Scene, State, arm, nothing_left};
 use crate::support::client::Client;
@@ -133,6 +134,23 @@ async fn children_that_a_server_had_before_its_start_are_spared_with_all_they_le
     nothing_left(&server, 1).await;
     until("what had hidden is gone", async || !is_there(hidden)).await;
     assert!(is_there(earlier) && is_there(left), "{}", server.log());
+    assert!(server.log().contains("processes that had lost their guardian"), "{}", server.log());
+}
+
+#[actix_rt::test]
+async fn what_git_leaves_that_had_no_guardian_ends_without_a_word() {
+    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
+    // As git's own child that reads the remote's folder.
+    let wrapper = GitWrapper::new("case \"$*\" in *ls-remote*) sleep 1000;; esac");
+    let server = simulation_server(&webots.path(), forge.path(), 1).env("PATH", &wrapper.path()).start().await;
+    let sleeps = || instances_below(&server.folder).iter().any(|one| one.1.starts_with("sleep"));
+    let client = Client::start(&server, &arm()).await;
+    until("git asks", async || sleeps()).await;
+    client.leave().await;
+    until("what git has started is gone", async || !sleeps()).await;
+    until("all is gone", async || below(server.pid()).len() == 1).await;
+    nothing_left(&server, 1).await;
+    assert!(!server.log().contains("guardian"), "{}", server.log());
 }
 
 /// Processes that end with a test.
