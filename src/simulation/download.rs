@@ -67,7 +67,8 @@ impl Downloads {
     /// Prepares fetches into this cache.
     #[must_use]
     pub fn new(git: Arc<Git>, cache: RepositoryCache, limits: Limits) -> Self {
-        Self { git, cache, limits, examined: Examined::default(), commits: Joint::default() }
+        let examined = Examined::new(Arc::clone(&git), cache.clone(), limits.patience());
+        Self { git, cache, limits, examined, commits: Joint::default() }
     }
 
     /// Fetches one commit, unless it is there, together with everybody who wants it for whatever world. Gives back what
@@ -248,12 +249,17 @@ impl Downloads {
     /// When it can't be removed.
     pub async fn mend(&self, remote: &Remote) -> io::Result<()> {
         for location in [&remote.location, &history_of(&remote.location)] {
+            let repository = self.cache.take(location).await?;
+            if !repository.path().exists() || self.examined.is_sound(repository.path()).await {
+                continue;
+            }
+            drop(repository);
             let patient = self.cache.examine(location).await?;
             let path = match &patient {
                 Patient::Alone { path, .. } => path,
                 Patient::Shared(repository, _) => repository.path(),
             };
-            if path.exists() && !self.examined.is_sound(&self.git, path).await {
+            if self.examined.forget_broken(path) {
                 log::warn!("{} is damaged: it is removed and fetched anew", path.display());
                 self.cache.mend(patient).await?;
             }

@@ -88,7 +88,7 @@ impl Fetcher {
             }
             // The remote's fault, unless it is the cache that git could not read.
             Err(CheckoutError::Git { repository: url, source })
-                if repository.is_made() && !self.downloads.examined.is_sound(self.git(), repository.path()).await =>
+                if repository.is_made() && !self.downloads.examined.is_sound(repository.path()).await =>
             {
                 Err(CheckoutError::Damaged { repository: url, source })
             }

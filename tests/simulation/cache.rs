@@ -3,6 +3,8 @@
 use std::path::Path;
 use std::time::Duration;
 
+use futures_util::future::join_all;
+
 use crate::checkout::{cached, noise, outcome, reader, size_of, world_text};
 use crate::git_wrapper::GitWrapper;
 use crate::scene::{arm, instance_folders, nothing_left};
@@ -10,7 +12,7 @@ use crate::support::client::Client;
 use crate::support::git::{Forge, world};
 use crate::support::program::simulation_server;
 use crate::support::until;
-use crate::support::webots::Webots;
+use crate::support::webots::{Webots, instances_below};
 
 #[actix_rt::test]
 async fn the_cache_keeps_to_its_budget() {
@@ -242,6 +244,54 @@ async fn a_remote_that_fails_has_the_cache_examined_once_in_three_minutes() {
     }
     std::fs::remove_file(fails.path().join("now")).unwrap();
     assert!(outcome(&server, &arm()).await.contains("opened [next]"));
+}
+
+#[actix_rt::test]
+async fn an_examination_that_takes_long_holds_up_nobody_and_goes_on_without_whom_it_is_for() {
+    let (forge, webots, marks) = (Forge::with_arm(), reader(), tempfile::tempdir().unwrap());
+    forge.commit("lab/leg", "main", &[("worlds/a.wbt", &world_text("leg"))]);
+    let wrapper = GitWrapper::new(&format!(
+        "case \"$*\" in *\\ fetch\\ *) [ ! -e {0}/fail ] || exit 128;; *\\ fsck\\ *) until [ -e {0}/go ]; do sleep 0.05; done;; esac",
+        marks.path().display()
+    ));
+    let builder = simulation_server(&webots.path(), forge.path(), 4).env("PATH", &wrapper.path());
+    let server = builder.set("timing.checkout", 12).start().await;
+    let names = ["lab/arm", "lab/leg"];
+    for name in names {
+        assert!(outcome(&server, &world(name, "main", "worlds/a.wbt")).await.contains("opened"));
+        forge.commit(name, "main", &[("worlds/a.wbt", &world_text("next"))]);
+    }
+    std::fs::write(marks.path().join("fail"), "").unwrap();
+    let examined = || wrapper.calls().iter().filter(|call| call.contains(" fsck ")).count();
+    let ask = async || {
+        let all = names.map(|name| world(name, "main", "worlds/a.wbt"));
+        for told in join_all(all.iter().map(|world| outcome(&server, world))).await {
+            assert!(told.contains("git fetch ended with exit code 128"), "{told}");
+        }
+        assert_eq!(examined(), 2, "{:#?}", wrapper.calls());
+    };
+    ask().await;
+    // Who comes next finds the same examinations under way.
+    ask().await;
+    // What one finds that nobody waits for is known later.
+    let broken = cached(&server).into_iter().find(|path| path.to_string_lossy().contains("lab-arm")).unwrap();
+    for reference in std::fs::read_dir(broken.join("refs/fleet")).unwrap().flatten() {
+        std::fs::write(reference.path(), "").unwrap();
+    }
+    std::fs::write(marks.path().join("go"), "").unwrap();
+    until("both have ended", async || !instances_below(&server.folder).iter().any(|one| one.1.contains("fsck"))).await;
+    for name in names {
+        let told = outcome(&server, &world(name, "main", "worlds/a.wbt")).await;
+        assert!(told.contains("git fetch ended with exit code 128"), "{told}");
+    }
+    let damaged: Vec<String> =
+        server.log().lines().filter(|line| line.contains("is damaged")).map(str::to_owned).collect();
+    assert!(damaged.len() == 1 && damaged[0].contains("lab-arm"), "{damaged:#?}");
+    assert_eq!(examined(), 3, "what is new is not known yet: {:#?}", wrapper.calls());
+    std::fs::remove_file(marks.path().join("fail")).unwrap();
+    for name in names {
+        assert!(outcome(&server, &world(name, "main", "worlds/a.wbt")).await.contains("opened [next]"));
+    }
 }
 
 #[actix_rt::test]
