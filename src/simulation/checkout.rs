@@ -19,6 +19,7 @@ use super::git::Call;
 use super::instance_dir::InstanceDir;
 use super::large_files::{self, Pointer};
 use super::limits::Limits;
+use super::revision::ALL;
 use super::world_file::{self, NoWorld, WorldFile};
 use crate::shared::project_url::ProjectUrl;
 
@@ -94,11 +95,20 @@ impl Checkouts {
             other => other,
         };
         let (fetched, folder) = copied?;
-        let (pointers, file) = look(world, &instance, &folder).await?;
+        let mut needed = fetched.revision.needed();
+        let mut seen = look(world, &instance, &folder).await?;
+        if needed != ALL && matches!(seen.1, Err(NoWorld::Dangling(_))) {
+            // The world is a link itself, which may lead anywhere in its repository.
+            self.fetcher.check_whole(world, &fetched).await?;
+            needed = ALL;
+            self.copy(world, &fetched, needed, &instance, &progress).await?;
+            seen = look(world, &instance, &folder).await?;
+        }
+        let (pointers, file) = seen;
         let (pointers, file) = if pointers.is_empty() || !large_files::is_installed() {
             (pointers, file)
         } else {
-            self.load_large_files(world, &fetched, &instance, &pointers, &progress).await?;
+            self.load_large_files(world, &fetched, needed, &instance, &pointers, &progress).await?;
             look(world, &instance, &folder).await?
         };
         let (file, pointers) = (file?, pointers.len());
@@ -126,15 +136,16 @@ impl Checkouts {
         progress: &(impl Fn(String) + Send + Sync),
     ) -> Result<(Arc<Fetched>, PathBuf), CheckoutError> {
         let fetched = self.fetcher.fetched(world, progress).await?;
-        let folder = self.copy(world, &fetched, instance, progress).await?;
+        let folder = self.copy(world, &fetched, fetched.revision.needed(), instance, progress).await?;
         Ok((fetched, folder))
     }
 
-    /// Copies the project's folder out of the cache. Gives back where it is.
+    /// Copies what is needed out of the cache. Gives back where the project's folder is.
     async fn copy(
         &self,
         world: &ProjectUrl,
         fetched: &Fetched,
+        needed: &str,
         instance: &InstanceDir,
         progress: &(impl Fn(String) + Send + Sync),
     ) -> Result<PathBuf, CheckoutError> {
@@ -142,7 +153,7 @@ impl Checkouts {
         let tree = instance.path().join("project");
         tokio::fs::create_dir_all(&tree).await.map_err(|error| machine(world, &error))?;
         progress(format!("checking {} out", fetched.revision.name));
-        let call = copy_call(fetched, instance, fetched.revision.needed());
+        let call = copy_call(fetched, instance, needed);
         let told = |line: &str| {
             if line.contains('%') {
                 progress(line.to_owned());
@@ -157,6 +168,7 @@ impl Checkouts {
         &self,
         world: &ProjectUrl,
         fetched: &Fetched,
+        needed: &str,
         instance: &InstanceDir,
         pointers: &[Pointer],
         progress: &(impl Fn(String) + Send + Sync),
@@ -169,7 +181,7 @@ impl Checkouts {
             // git writes again only what is not there.
             tokio::fs::remove_file(path).await.map_err(|error| machine(world, &error))?;
         }
-        let mut call = copy_call(fetched, instance, fetched.revision.needed());
+        let mut call = copy_call(fetched, instance, needed);
         call.is_alone = false;
         call.arguments.splice(0..0, large_files::settings(&fetched.remote));
         self.fetcher.git().run(call, |_| ()).await.map_err(|source| damaged(world, source))?;

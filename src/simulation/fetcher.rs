@@ -110,25 +110,19 @@ impl Fetcher {
                 None => self.downloads.commit(errand, &revision).await?,
             };
             // A tag may name a file alone.
-            let Some(mut listing) = self.list(errand, repository, &revision).await? else {
+            let Some(mut listing) = self.list(world, errand.remote, repository, &revision).await? else {
                 continue;
             };
             let path = revision.world_path(world);
             let mut needed = revision;
             if !listing.has_world && (listing.has_link || listing.entries == 0) {
-                match self.list(errand, repository, &needed.whole()).await {
+                match self.list(world, errand.remote, repository, &needed.whole()).await {
                     Ok(Some(all)) if all.has_link => (needed, listing) = (needed.whole(), all),
                     Err(error) if listing.has_link => return Err(error),
                     _ => {}
                 }
             }
-            let limits = &self.downloads.limits;
-            if listing.entries > limits.entries() {
-                return Err(CheckoutError::TooMany(limits.entries()));
-            }
-            if listing.size > limits.size {
-                return Err(too_large("The project".to_owned(), limits.size));
-            }
+            self.check(&listing)?;
             // Where a link leads is seen in the checkout.
             if listing.has_world || listing.has_link {
                 return Ok((needed, commit));
@@ -138,10 +132,32 @@ impl Fetcher {
         Err(missing.map_or_else(|| no_reference(world), CheckoutError::World))
     }
 
+    /// Whether all of a commit may be checked out, not its project's folder alone.
+    ///
+    /// # Errors
+    /// When it is too large for that.
+    pub async fn check_whole(&self, world: &ProjectUrl, fetched: &Fetched) -> Result<(), CheckoutError> {
+        let whole = fetched.revision.whole();
+        let listing = self.list(world, &fetched.remote, &fetched.repository, &whole).await?;
+        self.check(&listing.unwrap_or_default())
+    }
+
+    fn check(&self, listing: &Listing) -> Result<(), CheckoutError> {
+        let limits = &self.downloads.limits;
+        if listing.entries > limits.entries() {
+            return Err(CheckoutError::TooMany(limits.entries()));
+        }
+        if listing.size > limits.size {
+            return Err(too_large("The project".to_owned(), limits.size));
+        }
+        Ok(())
+    }
+
     /// What is in a commit, or in the project's folder alone; nothing where it has no files, for it is one.
     async fn list(
         &self,
-        Errand { world, remote, .. }: Errand<'_>,
+        world: &ProjectUrl,
+        remote: &Remote,
         repository: &InUse,
         revision: &Revision,
     ) -> Result<Option<Listing>, CheckoutError> {

@@ -21,6 +21,8 @@ pub struct Revision {
     pub is_whole: bool,
 }
 
+/// All of a repository, as git wants it named.
+pub const ALL: &str = ".";
 /// How many readings of a URL are looked for: no real branch has more slashes in its name.
 const MOST_READINGS: usize = 12;
 
@@ -163,14 +165,14 @@ impl Revision {
     /// The folder to check out, as git wants it named.
     #[must_use]
     pub fn needed(&self) -> &str {
-        if self.is_whole || self.folder.is_empty() { "." } else { &self.folder }
+        if self.is_whole || self.folder.is_empty() { ALL } else { &self.folder }
     }
 
     /// Lists the files of the project, or of the repository.
     #[must_use]
     pub fn list_arguments(&self) -> Vec<OsString> {
         let fixed = ["ls-tree", "-r", "-l", "-z", "--full-tree", &self.reference(), "--"].map(OsString::from);
-        let folder = (self.needed() != ".").then(|| OsString::from(format!("{}/", self.folder)));
+        let folder = (self.needed() != ALL).then(|| OsString::from(format!("{}/", self.folder)));
         fixed.into_iter().chain(folder).collect()
     }
 

@@ -13,7 +13,7 @@ pub enum NoWorld {
     #[error("{0} leads out of its repository")]
     Outside(String),
     /// It is a link, or behind one, that leads nowhere.
-    #[error("{0} is behind a link that leads to nothing in its project")]
+    #[error("{0} is a link, or behind one, that leads to nothing in its repository")]
     Dangling(String),
     /// It does not begin as worlds do.
     #[error("{name} is no world file: its first line is {found:?}, not like \"#VRML_SIM R2025a utf8\"")]

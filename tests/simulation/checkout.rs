@@ -120,10 +120,15 @@ async fn what_is_not_there_or_no_world_is_told_in_words() {
     // Folders that are links: to one inside of the repository, to nothing, out of it.
     std::fs::create_dir_all(work.join("real/worlds")).unwrap();
     std::fs::create_dir_all(work.join("r/q")).unwrap();
+    std::fs::create_dir_all(work.join("far/worlds")).unwrap();
     std::fs::write(work.join("real/worlds/b.wbt"), world_text("linked")).unwrap();
     for (target, link) in [
         ("real/worlds", "linked"),
         ("real", "project"),
+        ("../../real/worlds/b.wbt", "far/worlds/b.wbt"),
+        ("../../linked/b.wbt", "far/worlds/chain.wbt"),
+        ("../../none.wbt", "far/worlds/none.wbt"),
+        ("../../../../../outside.wbt", "far/worlds/outside.wbt"),
         ("../real/worlds", "r/worlds"),
         ("../../project", "r/q/deep"),
         ("nothing", "dangling"),
@@ -155,7 +160,14 @@ async fn what_is_not_there_or_no_world_is_told_in_words() {
         (world("lab/arm", "main", "r/worlds/b.wbt"), "opened [linked]"),
         (world("lab/arm", "main", "r/q/deep/worlds/b.wbt"), "opened [linked]"),
         (world("lab/arm", "main", "r/worlds/none.wbt"), "none.wbt does not exist"),
-        (world("lab/arm", "main", "dangling/worlds/b.wbt"), "b.wbt is behind a link that leads to nothing in"),
+        (world("lab/arm", "main", "dangling/worlds/b.wbt"), "b.wbt is a link, or behind one, that leads to nothing in"),
+        (world("lab/arm", "main", "far/worlds/b.wbt"), "opened [linked]"),
+        (world("lab/arm", "main", "far/worlds/chain.wbt"), "opened [linked]"),
+        (
+            world("lab/arm", "main", "far/worlds/none.wbt"),
+            "none.wbt is a link, or behind one, that leads to nothing in",
+        ),
+        (world("lab/arm", "main", "far/worlds/outside.wbt"), "outside.wbt"),
         (world("lab/arm", "main", "etc/worlds/b.wbt"), "b.wbt does not exist"),
         (world("lab/arm", "main", "outside/worlds/b.wbt"), "b.wbt leads out of its repository"),
     ];
@@ -164,6 +176,23 @@ async fn what_is_not_there_or_no_world_is_told_in_words() {
         assert!(told.contains(words) && !told.contains("root:"), "{url}: {told}");
         nothing_left(&server, 2).await;
     }
+}
+
+#[actix_rt::test]
+async fn a_world_that_is_a_link_takes_all_of_its_repository_within_the_limits() {
+    let (forge, webots) = (Forge::with_arm(), reader());
+    let work = forge.work_tree("lab/arm", "main");
+    std::fs::create_dir_all(work.join("far/worlds")).unwrap();
+    for (target, link) in [("../../worlds/a.wbt", "a.wbt"), ("near.wbt", "b.wbt")] {
+        std::os::unix::fs::symlink(target, work.join("far/worlds").join(link)).unwrap();
+    }
+    // What is small as it is packed counts as it is checked out.
+    let zeros = "0".repeat(6 << 20);
+    forge.commit("lab/arm", "main", &[("zeros", &zeros), ("far/worlds/near.wbt", &world_text("near"))]);
+    let server = simulation_server(&webots.path(), forge.path(), 1).set("projectSize", 1).start().await;
+    let ask = async |name: &str| outcome(&server, &world("lab/arm", "main", &format!("far/worlds/{name}"))).await;
+    assert_eq!(ask("a.wbt").await, "loading: Error: The project is larger than 1 MiB");
+    assert!(ask("b.wbt").await.contains("opened [near]"), "the project's folder has all that it needs");
 }
 
 #[actix_rt::test]
@@ -508,6 +537,18 @@ async fn a_controller_is_reset_and_nothing_else() {
     forge.commit_work_tree("lab/linked", "main");
     let other = simulation_server(&webots.path(), forge.path(), 1).start().await;
     let mut visitor = Client::start(&other, &world("lab/linked", "main", "project/worlds/a.wbt")).await;
+    visitor.until("webots:").await;
+    let linked = instance_folders(&other.folder)[0].join("project/real/controllers/c/c.py");
+    std::fs::write(&linked, "changed").unwrap();
+    assert_eq!(reset(&mut visitor, "c/c.py").await, "reset controller: c/c.py");
+    assert_eq!(std::fs::read_to_string(&linked).unwrap(), "original");
+    drop(visitor);
+    nothing_left(&other, 1).await;
+    let work = forge.work_tree("lab/linked", "main");
+    std::fs::create_dir_all(work.join("far/worlds")).unwrap();
+    std::os::unix::fs::symlink("../../real/worlds/a.wbt", work.join("far/worlds/a.wbt")).unwrap();
+    forge.commit_work_tree("lab/linked", "main");
+    let mut visitor = Client::start(&other, &world("lab/linked", "main", "far/worlds/a.wbt")).await;
     visitor.until("webots:").await;
     let linked = instance_folders(&other.folder)[0].join("project/real/controllers/c/c.py");
     std::fs::write(&linked, "changed").unwrap();
