@@ -89,14 +89,14 @@ impl InUse {
     }
 
     fn clean(&self) {
-        for broken in incoming(&self.path).chain(self.locks()) {
+        for broken in incoming(&self.path).chain(unfinished(&self.path)).chain(self.locks()) {
             std::fs::remove_file(broken).ok();
         }
     }
 
     /// Removes what a broken fetch has left, unless one is under way.
     pub fn tidy_up(&self) {
-        if incoming(&self.path).next().is_some() {
+        if incoming(&self.path).chain(unfinished(&self.path)).next().is_some() {
             drop(self.try_fetching());
         }
     }
@@ -201,6 +201,14 @@ fn incoming(repository: &Path) -> impl Iterator<Item = PathBuf> {
     let is_new = |name: &[u8]| name.starts_with(b"tmp_") || name.starts_with(b".tmp-");
     let files = files(repository.join("objects/pack"));
     files.filter(move |path| path.file_name().is_some_and(|name| is_new(name.as_encoded_bytes())))
+}
+
+/// Packs without an index, and what belongs to them: nobody finds these. They are there while somebody adds or removes
+/// a pack, or was ended at that.
+fn unfinished(repository: &Path) -> impl Iterator<Item = PathBuf> {
+    let is_pack = |path: &PathBuf| path.file_name().is_some_and(|name| name.as_encoded_bytes().starts_with(b"pack-"));
+    let files = files(repository.join("objects/pack")).filter(is_pack);
+    files.filter(|path| path.with_extension("idx").try_exists().is_ok_and(|is_there| !is_there))
 }
 
 /// The object that the file of a reference names.

@@ -74,8 +74,7 @@ impl Quarantine {
     pub fn hand_over(&self, repository: &InUse, _right: &Fetching) -> io::Result<()> {
         // First of all it must be known that the commits' ancestors are missing on purpose.
         let there = repository.path().join("shallow");
-        let read = |path: &Path| std::fs::read_to_string(path).unwrap_or_default();
-        let (known, came) = (read(&there), read(&self.path.join("shallow")));
+        let (known, came) = (text_of(&there)?, text_of(&self.path.join("shallow"))?);
         let new: String = came.split_inclusive('\n').filter(|line| !known.contains(*line)).collect();
         if !new.is_empty() {
             let whole = there.with_extension("new");
@@ -84,7 +83,7 @@ impl Quarantine {
         }
         // A pack is found by its index.
         let is_index = |path: &PathBuf| path.extension().is_some_and(|extension| extension == "idx");
-        let (indexes, packs): (Vec<_>, Vec<_>) = files(self.path.join("objects/pack")).partition(is_index);
+        let (indexes, packs): (Vec<_>, Vec<_>) = packs_of(&self.path)?.into_iter().partition(is_index);
         let target = repository.path().join("objects/pack");
         std::fs::create_dir_all(&target)?;
         for file in packs.into_iter().chain(indexes) {
@@ -112,6 +111,21 @@ pub fn sweep(repository: &Path) -> usize {
         }
     }
     under_way
+}
+
+/// The text of a file; nothing where there is none.
+fn text_of(path: &Path) -> io::Result<String> {
+    let text = std::fs::read_to_string(path);
+    text.or_else(|error| if error.kind() == io::ErrorKind::NotFound { Ok(String::new()) } else { Err(error) })
+}
+
+/// The packs that have come, if there are any, and what belongs to them.
+fn packs_of(repository: &Path) -> io::Result<Vec<PathBuf>> {
+    match std::fs::read_dir(repository.join("objects/pack")) {
+        Ok(entries) => entries.map(|entry| Ok(entry?.path())).collect(),
+        Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(Vec::new()),
+        Err(error) => Err(error),
+    }
 }
 
 /// What is not there need not be removed or copied.
@@ -168,5 +182,54 @@ mod tests {
             quarantine.hand_over(&repository, &right).unwrap();
         }
         assert_eq!(std::fs::read_to_string(shallow).unwrap(), format!("{A}\n{B}\n"));
+    }
+    #[actix_rt::test]
+    async fn what_cannot_be_read_is_not_taken_for_empty() {
+        let folder = tempfile::tempdir().unwrap();
+        let cache = RepositoryCache::open(folder.path(), 1000).unwrap();
+        let repository = cache.take("x").await.unwrap();
+        let right = repository.fetching().await.unwrap();
+        let quarantine = Quarantine::enter(&repository, A).await.unwrap();
+        quarantine.make(&repository, &right).unwrap();
+        let (known, came) = (repository.path().join("shallow"), quarantine.path().join("shallow"));
+        let (text, unreadable): (_, &[u8]) = (format!("{A}\n"), &[0xff]);
+        std::fs::write(&came, &text).unwrap();
+        std::fs::write(&known, unreadable).unwrap();
+        quarantine.hand_over(&repository, &right).unwrap_err();
+        assert_eq!(std::fs::read(&known).unwrap(), unreadable, "it is as it was");
+        std::fs::write(&known, &text).unwrap();
+        std::fs::write(&came, unreadable).unwrap();
+        quarantine.hand_over(&repository, &right).unwrap_err();
+        std::fs::remove_file(&came).unwrap();
+        let packs = quarantine.path().join("objects/pack");
+        std::fs::write(&packs, "no folder").unwrap();
+        quarantine.hand_over(&repository, &right).unwrap_err();
+        std::fs::remove_file(&packs).unwrap();
+        quarantine.hand_over(&repository, &right).unwrap();
+    }
+
+    #[actix_rt::test]
+    async fn a_pack_that_was_handed_over_without_its_index_is_swept() {
+        let folder = tempfile::tempdir().unwrap();
+        let cache = RepositoryCache::open(folder.path(), 1000).unwrap();
+        let repository = cache.take("x").await.unwrap();
+        let packs = repository.path().join("objects/pack");
+        std::fs::create_dir_all(&packs).unwrap();
+        for name in ["pack-a.pack", "pack-a.rev", "pack-b.pack", "pack-b.rev", "pack-b.idx", "multi-pack-index"] {
+            std::fs::write(packs.join(name), name).unwrap();
+        }
+        let there = || {
+            let mut all: Vec<String> =
+                files(packs.clone()).map(|path| path.file_name().unwrap().to_str().unwrap().to_owned()).collect();
+            all.sort();
+            all
+        };
+        let right = repository.fetching().await.unwrap();
+        std::fs::write(packs.join("pack-c.pack"), "").unwrap();
+        let _ = cache.shrink();
+        assert_eq!(repository.packs(), 2, "one is just being handed over");
+        drop(right);
+        let _ = cache.shrink();
+        assert_eq!(there(), ["multi-pack-index", "pack-b.idx", "pack-b.pack", "pack-b.rev"]);
     }
 }
