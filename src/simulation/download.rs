@@ -110,7 +110,7 @@ impl Downloads {
         let fetched = loop {
             if !repository.is_made() {
                 let _right = repository.fetching().await.map_err(failed)?;
-                self.make_repository(errand, repository).await?;
+                self.make_repository(errand, repository, &revision.commit).await?;
             }
             let quarantine = Quarantine::enter(repository, &revision.commit).await.map_err(failed)?;
             if let Some(commit) = repository.commit(&revision.reference()) {
@@ -166,7 +166,7 @@ impl Downloads {
         loop {
             // There is but one history to fetch: others who want it wait for it.
             let _right = history.fetching_later(|| errand.tell_wait()).await.map_err(failed)?;
-            self.make_repository(errand, &history).await?;
+            self.make_repository(errand, &history, commit).await?;
             let mut call = call(remote, history.path(), revision::history_arguments("origin"));
             call.environment.extend(setting("remote.origin.url", &remote.location));
             match self.receive(errand, call, &format!("fetching the history of {}", world.repository())).await {
@@ -225,8 +225,8 @@ impl Downloads {
         }
     }
 
-    /// Makes the bare repository, unless it is there. It takes its place only when it is whole.
-    async fn make_repository(&self, errand: Errand<'_>, repository: &InUse) -> Result<(), CheckoutError> {
+    /// Makes the bare repository for commits like this one, unless it is there. It takes its place only when it is whole.
+    async fn make_repository(&self, errand: Errand<'_>, repository: &InUse, commit: &str) -> Result<(), CheckoutError> {
         if repository.is_made() {
             return Ok(());
         }
@@ -238,7 +238,7 @@ impl Downloads {
                 tokio::fs::remove_dir_all(broken).await.map_err(failed)?;
             }
         }
-        let call = call(errand.remote, &new, vec!["init".into(), "--quiet".into(), "--bare".into()]);
+        let call = call(errand.remote, &new, revision::init_arguments(commit));
         self.git.run(call, |_| ()).await.map_err(|source| git_failed(errand.world, source))?;
         tokio::fs::rename(&new, path).await.map_err(failed)
     }

@@ -44,6 +44,14 @@ pub fn commit_of(world: &ProjectUrl, is_any: bool) -> Option<Revision> {
     })
 }
 
+/// Makes a bare repository whose hashes are of the same kind as a commit's. git before 2.29 knows only the older kind,
+/// and no name for it.
+#[must_use]
+pub fn init_arguments(commit: &str) -> Vec<OsString> {
+    let kind = (commit.len() == 64).then_some("--object-format=sha256");
+    ["init", "--quiet", "--bare"].into_iter().chain(kind).map(OsString::from).collect()
+}
+
 /// Asks the remote for all its branches and tags.
 #[must_use]
 pub fn tips_arguments(location: &str) -> Vec<OsString> {
