@@ -13,7 +13,7 @@ use tokio::sync::Semaphore;
 use tokio_util::task::AbortOnDropHandle;
 
 use super::checkout_error::{CheckoutError, damaged, machine, too_large, too_slow};
-use super::download::call;
+use super::errand::call;
 use super::fetcher::{Fetched, Fetcher};
 use super::git::Call;
 use super::instance_dir::InstanceDir;

@@ -4,15 +4,13 @@
 
 use std::ffi::OsString;
 use std::io;
-use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
-use tokio::sync::watch;
-
 use super::cached_repository::{CommitInUse, InUse, arrived, received};
 use super::checkout_error::{CheckoutError, damaged, fetch_failed, git_failed, machine, too_large};
+use super::errand::{Errand, call};
 use super::examined::Examined;
 use super::git::{Call, Git, GitError};
 use super::joint::Joint;
@@ -21,7 +19,6 @@ use super::mirrors::Remote;
 use super::quarantine::Quarantine;
 use super::repository_cache::{Patient, RepositoryCache};
 use super::revision::{self, Revision};
-use crate::shared::project_url::ProjectUrl;
 
 /// Fetches; one for the whole server.
 #[derive(Debug)]
@@ -42,23 +39,6 @@ pub struct Downloads {
 type Arrival = (String, Arc<CommitInUse>);
 /// What git was asked for, and what came.
 type Attempt = (Vec<OsString>, Result<Arrival, CheckoutError>);
-
-/// What is fetched for whom.
-#[derive(Debug, Clone, Copy)]
-pub struct Errand<'job> {
-    /// The world that is wanted.
-    pub world: &'job ProjectUrl,
-    /// Where its repository is.
-    pub remote: &'job Remote,
-    /// Hears each step in words.
-    pub progress: &'job watch::Sender<String>,
-}
-
-impl Errand<'_> {
-    fn tell_wait(self) {
-        self.progress.send_replace(format!("waiting while what is cached of {} is tidied up", self.world.repository()));
-    }
-}
 
 /// Between two looks at how much a fetch has brought.
 const BETWEEN_LOOKS: Duration = Duration::from_millis(200);
@@ -297,10 +277,4 @@ fn history_of(location: &str) -> String {
 pub fn setting(name: &str, value: &str) -> [(OsString, OsString); 3] {
     [("GIT_CONFIG_COUNT", "1"), ("GIT_CONFIG_KEY_0", name), ("GIT_CONFIG_VALUE_0", value)]
         .map(|(name, value)| (name.into(), value.into()))
-}
-
-/// A git command on a cached repository.
-#[must_use]
-pub fn call<'call>(remote: &Remote, repository: &'call Path, arguments: Vec<OsString>) -> Call<'call> {
-    Call { repository, arguments, protocol: remote.protocol, is_alone: false, environment: Vec::new() }
 }

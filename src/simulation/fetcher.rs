@@ -10,7 +10,8 @@ use tokio_util::task::AbortOnDropHandle;
 
 use super::cached_repository::{CommitInUse, InUse};
 use super::checkout_error::{CheckoutError, damaged, git_failed, machine, no_reference, too_large};
-use super::download::{Downloads, Errand, call};
+use super::download::Downloads;
+use super::errand::{Errand, call};
 use super::git::Git;
 use super::housekeeping;
 use super::joint::Joint;

@@ -12,6 +12,7 @@ pub mod command;
 pub mod config;
 pub mod display;
 pub mod download;
+pub mod errand;
 pub mod examined;
 pub mod fetcher;
 pub mod git;
