@@ -117,6 +117,19 @@ impl Git {
     /// # Errors
     /// When git can't be started or fails.
     pub async fn run(&self, call: Call<'_>, progress: impl FnMut(&str)) -> Result<Vec<u8>, GitError> {
+        self.run_until(std::future::pending(), call, progress).await
+    }
+
+    /// The same, but git is killed when `end` comes, unless it is alone. It gives back only when nothing of git is left.
+    ///
+    /// # Errors
+    /// When git can't be started, fails or is killed.
+    pub async fn run_until(
+        &self,
+        end: impl Future<Output = ()>,
+        call: Call<'_>,
+        progress: impl FnMut(&str),
+    ) -> Result<Vec<u8>, GitError> {
         let command = call.arguments.iter().find(|argument| !argument.as_encoded_bytes().starts_with(b"-"));
         let command = command.map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
         let failed =
@@ -126,7 +139,7 @@ impl Git {
         let (complaints, errors) = std::io::pipe().map_err(broken)?;
         let is_alone = call.is_alone && self.has_setpriv;
         let plan = self.plan(call);
-        let (group, ended) = if is_alone {
+        let (group, mut ended) = if is_alone {
             (None, process_group::start_alone(&plan, output.into(), errors.into()).map_err(broken)?.boxed())
         } else {
             let (group, ended) = ProcessGroup::start(&plan, output.into(), errors.into()).map_err(broken)?;
@@ -134,8 +147,14 @@ impl Git {
         };
         let answer = asynchronous(answer).map_err(broken)?;
         let complaints = asynchronous(complaints).map_err(broken)?;
+        let ended = async move {
+            tokio::select! {
+                ending = &mut ended => return ending,
+                () = end => drop(group),
+            }
+            ended.await
+        };
         let (answer, last_words, ending) = tokio::join!(read_all(answer), follow(complaints, progress), ended);
-        drop(group);
         match ending {
             _ if answer.len() > LARGEST_ANSWER => {
                 Err(failed(ENDLESS, format!("its answer is longer than {} MiB", LARGEST_ANSWER >> 20)))

@@ -226,10 +226,10 @@ mod tests {
         };
         let right = repository.fetching().await.unwrap();
         std::fs::write(packs.join("pack-c.pack"), "").unwrap();
-        let _ = cache.shrink();
+        assert_eq!(cache.shrink().removed, 0);
         assert_eq!(repository.packs(), 2, "one is just being handed over");
         drop(right);
-        let _ = cache.shrink();
+        assert_eq!(cache.shrink().removed, 0);
         assert_eq!(there(), ["multi-pack-index", "pack-b.idx", "pack-b.pack", "pack-b.rev"]);
     }
 }
