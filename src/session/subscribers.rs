@@ -19,8 +19,7 @@ pub enum News {
 /// The subscribers: each is told the same news once.
 #[derive(Default)]
 pub struct Subscribers {
-    /// In the order in which they came: their sockets lie in the system's memory in that order too, mostly, so that
-    /// telling them takes less time in it than in any other (`cargo bench --bench fleet -- push` measures it).
+    /// In the order in which they came: what belongs to them lies in memory in that order too, mostly.
     members: BTreeMap<u64, Subscriber>,
     last: u64,
     /// Those who could not be told the last change, for their mailboxes were full.
