@@ -1,9 +1,9 @@
 //! Actor: the web clients of one worker thread, and what they are to be told.
 //!
-//! Created by the app in each thread that serves connections; it never ends. The registry tells it of a change once, and
-//! it tells its clients: from thread to thread each of ten thousand would be woken with a lock, and the registry would
-//! be busy with that instead of with requests. After a panic its clients are sent away, and find another one when they
-//! come back.
+//! Created by the app in each thread that serves connections; it lasts as long as that. The registry tells it of a
+//! change once, and it tells its clients: from thread to thread each of ten thousand would be woken with a lock, and the
+//! registry would be busy with that instead of with requests. After a panic its clients are sent away, and find another
+//! one when they come back.
 
 use std::cell::RefCell;
 use std::sync::Arc;
