@@ -28,8 +28,8 @@ use support::git::{Forge, world};
 use support::program::{Server, session_server, simulation_server};
 use support::webots::Webots;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
-use webots_fleet::session::fleet_status::{FleetStatus, ServerStatus, State, StateChange};
-use webots_fleet::session::pages;
+use webots_fleet::session::fleet::{FleetStatus, ServerStatus, State, StateChange};
+use webots_fleet::session::web::pages;
 
 const SERVERS: u16 = 1000;
 const PAGES: usize = 100;

@@ -1,8 +1,28 @@
 //! A fleet for interactive robot simulations in the browser: a session server and simulation servers.
 //!
-//! This page is the map. Imports point down only: `bin` -> `app` -> `routes` -> actors -> pure files and guards ->
-//! [`shared`]. [`session`] and [`simulation`] never see each other. A child never names its parent: it is given a
-//! `Recipient` of its events, which are defined in the child's file.
+//! This page is the map. Each folder is a room: its `mod.rs` says what belongs together there and hands out a few names.
+//!
+//! | room | holds |
+//! |---|---|
+//! | [`shared::config`] | configuration files: loading, errors, kinds of values |
+//! | [`shared::domain`] | addresses, loads, world URLs, repositories, a server's report |
+//! | [`shared::run`] | start, readiness, log, stop |
+//! | [`shared::http`] | pages, live updates, WebSockets, limits, certificates, metrics |
+//! | [`session::placement`] | which server gets the next client |
+//! | [`session::mail`] | mail to the administrator |
+//! | [`session::fleet`] | the registry and the monitors of simulation servers |
+//! | [`session::web`] | paths, pages and the WebSocket of the session server |
+//! | [`simulation::process`] | process trees and folders of simulations |
+//! | [`simulation::machine`] | readings of the machine, the load |
+//! | [`simulation::checkout`] | worlds out of git |
+//! | [`simulation::webots`] | one running Webots |
+//! | [`simulation::client`] | one web client, the life of its simulation |
+//! | `simulation::web` | paths and pages of the simulation server |
+//!
+//! Beside the folders of a server are its `app` (start and end), `config` (every key), `state` (what its paths share), and
+//! in `simulation` the wire [`protocol`](simulation::protocol) and the [`places`](simulation::places).
+//! Imports point down only, in the order that `tests/project/layering.rs` lists. `session` and `simulation` never see each
+//! other. A child never names its parent: it is given a `Recipient` of its events, which are defined in the child's file.
 //!
 //! # Who talks to whom
 //!
@@ -29,10 +49,10 @@
 //!     '------ WebotsEvent ---'
 //! ```
 //!
-//! The [`session::registry`] alone decides availability: it hears of every report and of every pick.
-//! A [`simulation::webots`] owns its process group, its folder and its place through guards, so that leaving in any
+//! The [`session::fleet::Registry`] alone decides availability: it hears of every report and of every pick.
+//! A [`simulation::webots::Webots`] owns its process group, its folder and its place through guards, so that leaving in any
 //! state, even by a panic, frees all three. Whatever the simulation server starts runs below a
-//! [`simulation::guardian`], which ends it when the server is gone in whatever way.
+//! [`simulation::process::guardian`], which ends it when the server is gone in whatever way.
 //!
 //! # What ends, and what is started again
 //!
@@ -53,7 +73,9 @@
 //! 3. When the system ends, an actor is dropped without `stopped`. Only `Drop` is sure to run.
 //! 4. tokio's `kill_on_drop` reaches the direct child only; Webots' launcher has a child of its own.
 //! 5. An actor whose WebSocket's peer does not read is not polled once the buffers are full: whoever must be closed
-//!    for that reason has to be closed before, see [`shared::liveness`].
+//!    for that reason has to be closed before, see [`shared::http::liveness`].
+
+#![warn(clippy::missing_docs_in_private_items)]
 
 pub mod session;
 pub mod shared;

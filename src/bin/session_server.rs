@@ -5,9 +5,10 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 
 use clap::Parser;
+use webots_fleet::session::app;
 use webots_fleet::session::config::SessionConfig;
-use webots_fleet::session::{app, mailer};
-use webots_fleet::shared::start;
+use webots_fleet::session::mail::mailer;
+use webots_fleet::shared::run::start;
 
 /// The one door to a fleet of simulation servers.
 #[derive(Parser)]
@@ -41,6 +42,7 @@ fn main() -> ExitCode {
     start::serve(&log, loaded.config.debug, &loaded.warnings, server)
 }
 
+/// Sends one mail to the administrator and says how that went.
 fn test_mail(config: &SessionConfig) -> ExitCode {
     match actix_rt::System::new().block_on(mailer::test_mail(config)) {
         Ok(how) => {

@@ -4,9 +4,10 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 
 use clap::Parser;
-use webots_fleet::shared::start;
+use webots_fleet::shared::run::start;
 use webots_fleet::simulation::config::SimulationConfig;
-use webots_fleet::simulation::{app, guardian, preflight};
+use webots_fleet::simulation::process::guardian;
+use webots_fleet::simulation::{app, preflight};
 
 /// Runs one Webots per web client.
 #[derive(Parser)]
@@ -18,10 +19,12 @@ struct Arguments {
     /// Print the effective configuration, look for what simulations need, and end
     #[arg(long)]
     check: bool,
+    /// The server itself, or a part of it.
     #[command(subcommand)]
     part: Option<Part>,
 }
 
+/// Parts of the server that are processes of their own.
 #[derive(clap::Subcommand)]
 enum Part {
     /// Used by the server itself: runs a program and ends with it

@@ -11,20 +11,19 @@ use actix_web::{App, HttpServer, web};
 use nix::sys::resource::{Resource, getrlimit, setrlimit};
 use tokio::sync::watch;
 
-use super::audience::CurrentAudience;
 use super::config::SessionConfig;
-use super::mailer;
-use super::registry::{IsAvailable, Reconfigure, Registry};
-use super::routes;
-use super::server::Server;
+use super::state::AppState;
+use crate::session::fleet::{IsAvailable, Reconfigure, Registry};
+use crate::session::mail::mailer;
+use crate::session::web::{CurrentAudience, configure};
 use crate::shared::config;
-use crate::shared::connections::Connections;
-use crate::shared::live::Live;
-use crate::shared::metrics::Metrics;
-use crate::shared::notify;
-use crate::shared::permanent;
-use crate::shared::shutdown::{Phase, Request, Signals};
-use crate::shared::sockets::{self, Sockets};
+use crate::shared::http::Connections;
+use crate::shared::http::Live;
+use crate::shared::http::Metrics;
+use crate::shared::http::sockets::{self, Sockets};
+use crate::shared::run::notify;
+use crate::shared::run::permanent;
+use crate::shared::run::{Phase, Request, Signals};
 
 /// Why the server can't go on.
 #[derive(Debug, thiserror::Error)]
@@ -83,7 +82,7 @@ pub async fn run(mut config: SessionConfig, file: PathBuf) -> Result<(), AppErro
     // This is called in each thread that serves connections.
     let app = move || {
         let audience = web::Data::new(CurrentAudience::start(Arc::clone(&shared)));
-        App::new().app_data(shared.clone()).app_data(audience).configure(routes::configure)
+        App::new().app_data(shared.clone()).app_data(audience).configure(configure)
     };
     let http = HttpServer::new(app)
         // Messages are small, and must not wait for the answer to the one before.
@@ -167,7 +166,7 @@ fn threads() -> usize {
 }
 
 /// Makes everything that the server is made of, and starts its actors.
-fn assemble(config: SessionConfig, clients: usize, phase: watch::Receiver<Phase>) -> Result<Server, AppError> {
+fn assemble(config: SessionConfig, clients: usize, phase: watch::Receiver<Phase>) -> Result<AppState, AppError> {
     let metrics = Metrics::new();
     let latencies = metrics.histogram("session_report_seconds", "Time in which simulation servers answer")?;
     let picks = metrics.counter("session_requests_total", "Requests for a simulation server", "outcome")?;
@@ -181,7 +180,7 @@ fn assemble(config: SessionConfig, clients: usize, phase: watch::Receiver<Phase>
     let (examples, viewer_script) = (config.examples.clone(), config.viewer_script.clone());
     let registry = Registry::new(Arc::new(config), mailer, latencies).start();
     let (started, started_at) = (Instant::now(), SystemTime::now());
-    Ok(Server {
+    Ok(AppState {
         registry,
         timing,
         ssl,
@@ -218,7 +217,7 @@ mod tests {
     use tokio_tungstenite::tungstenite::Message as Frame;
 
     use super::*;
-    use crate::session::audience::Audience;
+    use crate::session::web::Audience;
 
     #[derive(Message)]
     #[rtype(result = "()")]
@@ -241,7 +240,7 @@ mod tests {
         let app = move || {
             let audience = web::Data::new(CurrentAudience::start(Arc::clone(&server)));
             audiences.send(audience.get()).unwrap();
-            App::new().app_data(server.clone()).app_data(audience).configure(routes::configure)
+            App::new().app_data(server.clone()).app_data(audience).configure(configure)
         };
         let http = HttpServer::new(app).workers(1).disable_signals().bind(("127.0.0.1", 0)).unwrap();
         let url = format!("ws://{}/session", http.addrs()[0]);

@@ -7,12 +7,12 @@ use serde::{Deserialize, Serialize};
 
 use super::mail_address::{self, MailAddress};
 use super::placement::Policy;
-use crate::shared::address::{PublicAddress, check_host};
 use crate::shared::config::{Configuration, Unfit, differences};
-use crate::shared::config_value::{
+use crate::shared::config::{
     ExpandedPath, Secret, folder, local_address, object, one_or_many, optional_port, percent, seconds, threshold, whole,
 };
-use crate::shared::peer::TrustedProxies;
+use crate::shared::domain::{PublicAddress, check_host};
+use crate::shared::http::TrustedProxies;
 
 /// Every key of the session server. The original's keys keep their meaning.
 #[derive(Debug, Clone, Serialize, Deserialize)]

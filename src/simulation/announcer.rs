@@ -9,7 +9,7 @@ use actix::prelude::*;
 use futures_util::future::join_all;
 
 use super::config::SimulationConfig;
-use crate::shared::tls;
+use crate::shared::http::tls;
 
 /// How often each address is tried.
 const TRIES: u32 = 6;
@@ -28,7 +28,7 @@ impl Announcer {
     #[must_use]
     pub fn new(config: &SimulationConfig) -> Self {
         let allowed: Vec<&str> =
-            config.allowed_repositories.iter().map(super::super::shared::repositories::UrlPrefix::as_str).collect();
+            config.allowed_repositories.iter().map(crate::shared::domain::UrlPrefix::as_str).collect();
         let form = vec![
             ("url", config.address(config.port).http_url(config.ssl)),
             ("shareIdleTime", config.share_idle_time.to_string()),

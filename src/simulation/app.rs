@@ -13,28 +13,29 @@ use tokio::sync::mpsc::Receiver;
 use tokio::sync::watch;
 
 use super::announcer::Announcer;
-use super::checkout::Checkouts;
 use super::config::SimulationConfig;
-use super::fetcher::Fetcher;
-use super::git::Git;
-use super::instance_dir::{RunDir, Swept};
-use super::limits::Limits;
-use super::load_monitor::LoadMonitor;
 use super::places::{Census, Places};
-use super::repository_cache::RepositoryCache;
-use super::routes;
-use super::server::Server;
-use super::usage::UsageMonitor;
-use super::{orphans, outcome, process_group, process_tree};
-use crate::shared::admission::Rules;
-use crate::shared::auth::Lock;
-use crate::shared::connections::Connections;
-use crate::shared::live::Live;
-use crate::shared::metrics::Metrics;
-use crate::shared::notify;
-use crate::shared::permanent;
-use crate::shared::shutdown::{Phase, Request, Signals};
-use crate::shared::sockets::{self, Sockets};
+use super::state::AppState;
+use crate::shared::domain::Rules;
+use crate::shared::http::Connections;
+use crate::shared::http::Live;
+use crate::shared::http::Lock;
+use crate::shared::http::Metrics;
+use crate::shared::http::sockets::{self, Sockets};
+use crate::shared::run::notify;
+use crate::shared::run::permanent;
+use crate::shared::run::{Phase, Request, Signals};
+use crate::simulation::checkout::Checkouts;
+use crate::simulation::checkout::Fetcher;
+use crate::simulation::checkout::Git;
+use crate::simulation::checkout::Limits;
+use crate::simulation::checkout::RepositoryCache;
+use crate::simulation::client::outcome;
+use crate::simulation::machine::LoadMonitor;
+use crate::simulation::machine::UsageMonitor;
+use crate::simulation::process::{RunDir, Swept};
+use crate::simulation::process::{orphans, process_group, process_tree};
+use crate::simulation::web::configure;
 
 /// Why the server can't go on.
 #[derive(Debug, thiserror::Error)]
@@ -82,7 +83,7 @@ pub async fn run(config: SimulationConfig) -> Result<(), AppError> {
 
 /// A server whose parts are there: it holds its port, its actors live, and nobody is served yet.
 pub struct Assembly {
-    server: Arc<Server>,
+    server: Arc<AppState>,
     socket: TcpListener,
     signals: Signals,
     phase: watch::Sender<Phase>,
@@ -107,7 +108,7 @@ impl Assembly {
 
     /// What its routes and web clients share.
     #[must_use]
-    pub fn server(&self) -> &Arc<Server> {
+    pub fn server(&self) -> &Arc<AppState> {
         &self.server
     }
 }
@@ -126,7 +127,7 @@ pub async fn serve(assembly: Assembly) -> Result<(), AppError> {
         server.config.trusted_proxies.clone(),
         server.config.timing.silence,
     ));
-    let http = HttpServer::new(move || App::new().app_data(shared.clone()).configure(routes::configure))
+    let http = HttpServer::new(move || App::new().app_data(shared.clone()).configure(configure))
         // Messages are small, and must not wait for the answer to the one before.
         .tcp_nodelay(true)
         .on_connect(move |socket, extensions| sockets.accept(socket, extensions))
@@ -184,7 +185,7 @@ fn assemble(
     config: SimulationConfig,
     phase: watch::Receiver<Phase>,
     requests: tokio::sync::mpsc::Sender<Request>,
-) -> Result<Server, AppError> {
+) -> Result<AppState, AppError> {
     let folder = config.cache_dir.0.clone();
     let cache_fault = |source| AppError::Cache { folder: folder.clone(), source };
     let (run, swept) = RunDir::open(&folder).map_err(cache_fault)?;
@@ -213,7 +214,7 @@ fn assemble(
         docker: config.docker,
         share_idle_time: config.share_idle_time,
     };
-    Ok(Server {
+    Ok(AppState {
         rules,
         places,
         load_monitor,
@@ -243,7 +244,7 @@ fn tell_start(config: &SimulationConfig) {
 }
 
 /// Waits until the server is draining and its last client has gone.
-async fn drained(server: &Server) {
+async fn drained(server: &AppState) {
     let mut phase = server.phase.clone();
     phase.wait_for(|phase| *phase == Phase::Draining).await.ok();
     empty(&server.places).await;

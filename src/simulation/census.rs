@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use actix::prelude::*;
 use serde::Serialize;
 
-use crate::shared::status::Instances;
+use crate::shared::domain::Instances;
 
 /// What has changed in a simulation.
 #[derive(Debug)]

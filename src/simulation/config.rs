@@ -6,14 +6,14 @@ use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
-use super::display::DisplayName;
-use super::mirrors::Mirrors;
-use crate::shared::address::{PublicAddress, check_host};
 use crate::shared::config::{Configuration, Unfit};
-use crate::shared::config_value::{ExpandedPath, folder, local_address, object, one_or_many, percent, seconds, whole};
-use crate::shared::origin::Origin;
-use crate::shared::peer::TrustedProxies;
-use crate::shared::repositories::UrlPrefix;
+use crate::shared::config::{ExpandedPath, folder, local_address, object, one_or_many, percent, seconds, whole};
+use crate::shared::domain::UrlPrefix;
+use crate::shared::domain::{PublicAddress, check_host};
+use crate::shared::http::Origin;
+use crate::shared::http::TrustedProxies;
+use crate::simulation::checkout::Mirrors;
+use crate::simulation::machine::display::DisplayName;
 
 /// Every key of the simulation server. The original's keys keep their meaning.
 #[derive(Debug, Clone, Serialize, Deserialize)]
@@ -126,7 +126,7 @@ pub struct SimulationConfig {
     pub allowed_origins: Vec<Origin>,
     /// Password of actions such as `/drain`. Default: none, and actions are off.
     #[serde(default)]
-    pub admin_password: Option<crate::shared::config_value::Secret>,
+    pub admin_password: Option<crate::shared::config::Secret>,
     /// Every other duration.
     #[serde(default, deserialize_with = "object")]
     pub timing: Timing,

@@ -13,8 +13,8 @@ use std::time::Duration;
 use actix::prelude::*;
 
 use super::census::{Change, Everybody, Simulation, Stage};
-use crate::shared::status::Instances;
-use crate::shared::timestamp::seconds_since_1970;
+use crate::shared::domain::Instances;
+use crate::shared::run::seconds_since_1970;
 
 /// Asks for a place.
 #[derive(Message)]

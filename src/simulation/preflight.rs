@@ -4,7 +4,7 @@ use std::path::PathBuf;
 use std::process::Command;
 
 use super::config::SimulationConfig;
-use super::display;
+use crate::simulation::machine::display;
 
 /// One thing that was looked at.
 #[derive(Debug, Clone, PartialEq, Eq)]

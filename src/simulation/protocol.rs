@@ -17,7 +17,7 @@
 
 use serde::Deserialize;
 
-use crate::shared::address::PublicAddress;
+use crate::shared::domain::PublicAddress;
 
 /// What a client asks for.
 #[derive(Debug, Clone, PartialEq, Eq)]

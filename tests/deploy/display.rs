@@ -4,7 +4,7 @@ use std::path::Path;
 use std::process::{Child, Command, Stdio};
 use std::sync::{Mutex, PoisonError};
 
-use webots_fleet::simulation::display::{Trouble, look};
+use webots_fleet::simulation::machine::display::{Trouble, look};
 
 /// A virtual X server, ended with the test.
 struct Xvfb {

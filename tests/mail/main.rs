@@ -16,11 +16,11 @@ use actix::Addr;
 use log::Level;
 use serde_json::{Value, json};
 use webots_fleet::session::config::SessionConfig;
-use webots_fleet::session::mailer::{self, Mailer, test_mail};
-use webots_fleet::session::notices::{Event, Notice};
-use webots_fleet::shared::address::PublicAddress;
+use webots_fleet::session::mail::mailer::{self, Mailer, test_mail};
+use webots_fleet::session::mail::{Event, Notice};
 use webots_fleet::shared::config::{Configuration, load};
-use webots_fleet::shared::load::Load;
+use webots_fleet::shared::domain::Load;
+use webots_fleet::shared::domain::PublicAddress;
 
 use smtp::{Smtp, dead_port, keep_log, logged, trusted_authority, wait_for_log};
 

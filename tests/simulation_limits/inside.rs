@@ -12,7 +12,7 @@ use webots_fleet::simulation::app::{self, AppError, Assembly};
 use webots_fleet::simulation::census::Stage;
 use webots_fleet::simulation::config::SimulationConfig;
 use webots_fleet::simulation::places::Census;
-use webots_fleet::simulation::server::Server;
+use webots_fleet::simulation::state::AppState;
 
 use crate::support::client::Client;
 use crate::support::git::{Forge, world};
@@ -21,7 +21,7 @@ use crate::support::{ports, until};
 
 /// A server with one place, and what it stands on. Its Webots is one of these scripts.
 pub struct Inside {
-    pub server: Arc<Server>,
+    pub server: Arc<AppState>,
     pub port: u16,
     running: JoinHandle<Result<(), AppError>>,
     folder: tempfile::TempDir,

@@ -23,7 +23,7 @@ mod time;
 use std::future::Future;
 
 use clap::Parser;
-use webots_fleet::simulation::guardian;
+use webots_fleet::simulation::process::guardian;
 
 #[derive(Parser)]
 struct Arguments {

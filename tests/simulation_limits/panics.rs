@@ -7,17 +7,17 @@ use actix::prelude::*;
 use actix_web::{App, HttpRequest, HttpResponse, HttpServer, web};
 use actix_web_actors::ws::WsResponseBuilder;
 use tokio::sync::mpsc::{UnboundedReceiver, UnboundedSender, unbounded_channel};
-use webots_fleet::shared::project_url::ProjectUrl;
-use webots_fleet::shared::websocket::Inbox;
+use webots_fleet::shared::domain::ProjectUrl;
+use webots_fleet::shared::http::websocket::Inbox;
 use webots_fleet::simulation::census::Stage;
-use webots_fleet::simulation::load_monitor::LoadMonitor;
-use webots_fleet::simulation::orders::Orders;
+use webots_fleet::simulation::client::WebClient;
+use webots_fleet::simulation::machine::LoadMonitor;
 use webots_fleet::simulation::places::{Ask, PlaceEvent, Places, Ticket};
 use webots_fleet::simulation::protocol::Mode;
-use webots_fleet::simulation::server::Server;
-use webots_fleet::simulation::web_client::WebClient;
+use webots_fleet::simulation::state::AppState;
+use webots_fleet::simulation::webots::Orders;
 use webots_fleet::simulation::webots::{End, Webots};
-use webots_fleet::simulation::webots_event::{Exit, WebotsEvent};
+use webots_fleet::simulation::webots::{Exit, WebotsEvent};
 
 use crate::inside::{Inside, arm, ask};
 use crate::support::SOON;
@@ -48,7 +48,7 @@ panics!(WebClient, Webots, Places, LoadMonitor);
 async fn gate(
     request: HttpRequest,
     stream: web::Payload,
-    server: web::Data<Server>,
+    server: web::Data<AppState>,
     clients: web::Data<UnboundedSender<Addr<WebClient>>>,
 ) -> HttpResponse {
     let peer = server.config.trusted_proxies.peer(&request);
@@ -130,7 +130,7 @@ impl Handler<WebotsEvent> for Listener {
 }
 
 /// Starts a Webots as a web client does.
-async fn launch(server: &Server) -> (Addr<Webots>, UnboundedReceiver<Exit>) {
+async fn launch(server: &AppState) -> (Addr<Webots>, UnboundedReceiver<Exit>) {
     let (places, mut granted) = unbounded_channel();
     let (exits, ended) = unbounded_channel();
     let listener = Listener { places, exits }.start();

@@ -33,6 +33,7 @@ use std::{env, process, thread};
 
 use crate::args::Request;
 
+/// What `--help` prints.
 const USAGE: &str = "\
 Usage: webots [options] [worldfile]
 
@@ -75,6 +76,7 @@ fn main() {
     process::exit(code);
 }
 
+/// What `--sysinfo` prints: system, processor and cores.
 fn system_info() -> String {
     let cores = thread::available_parallelism().map_or(1, std::num::NonZero::get);
     let (system, processor) = (env::consts::OS, env::consts::ARCH);

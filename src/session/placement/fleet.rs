@@ -14,7 +14,7 @@ use std::time::Instant;
 ///
 /// ```
 /// use std::time::Instant;
-/// use webots_fleet::session::placement::{Fleet, Policy, Report};
+/// use crate::session::placement::{Fleet, Policy, Report};
 ///
 /// let now = Instant::now();
 /// let mut fleet = Fleet::new(Policy::default());
@@ -177,8 +177,8 @@ impl<Id: Clone + Ord> Fleet<Id> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::server::Instances;
     use super::*;
+    use crate::session::placement::Instances;
     use proptest::prelude::*;
     use std::time::Duration;
 

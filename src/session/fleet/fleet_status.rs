@@ -1,0 +1,94 @@
+//! What the session server knows of its fleet, as it is shown. Plain data.
+
+use std::collections::VecDeque;
+use std::time::{Duration, Instant, SystemTime};
+
+use crate::shared::domain::Dispatch;
+use crate::shared::domain::Load;
+use crate::shared::domain::PublicAddress;
+
+/// Everything that is known of the fleet.
+#[derive(Debug, Clone)]
+pub struct FleetStatus {
+    /// Whether some simulation server can take a client.
+    pub available: bool,
+    /// The mean load of the servers that answer.
+    pub mean_load: Option<f64>,
+    /// Each simulation server, in the order of the configuration.
+    pub servers: Vec<ServerStatus>,
+    /// The last changes of state, the newest first.
+    pub changes: VecDeque<StateChange>,
+}
+
+/// What is known of one simulation server.
+#[derive(Debug, Clone)]
+pub struct ServerStatus {
+    /// Its address.
+    pub address: PublicAddress,
+    /// Its state.
+    pub state: State,
+    /// Since when.
+    pub since: SystemTime,
+    /// What it said last.
+    pub report: Option<Dispatch>,
+    /// Why it gave no usable answer, if it did not.
+    pub error: Option<String>,
+    /// Last report, and the clients that it can't show yet.
+    pub effective_load: Option<f64>,
+    /// Clients that were sent there and have not come yet.
+    pub in_flight: usize,
+    /// What one more client is expected to cost, in percent.
+    pub client_cost: Option<f64>,
+    /// How long it took to answer.
+    pub latency: Option<Duration>,
+    /// When it last gave a good answer.
+    pub answered: Option<Instant>,
+}
+
+/// The state of a simulation server.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum State {
+    /// It was not heard of yet.
+    Unknown,
+    /// It takes clients.
+    Up,
+    /// Its load leaves no room for one more client, or it has no place left.
+    Full,
+    /// It takes no new clients because somebody wants it to end.
+    Draining,
+    /// It gives no usable answer.
+    Down,
+}
+
+/// A simulation server has changed its state.
+#[derive(Debug, Clone)]
+pub struct StateChange {
+    /// When.
+    pub at: SystemTime,
+    /// The simulation server.
+    pub server: PublicAddress,
+    /// Its new state.
+    pub state: State,
+    /// Why.
+    pub why: String,
+}
+
+impl State {
+    /// In one word.
+    #[must_use]
+    pub fn word(self) -> &'static str {
+        match self {
+            Self::Unknown => "unknown",
+            Self::Up => "up",
+            Self::Full => "full",
+            Self::Draining => "draining",
+            Self::Down => "down",
+        }
+    }
+}
+
+/// The mean load as `/load` tells it: -1 where no server answers.
+#[must_use]
+pub fn told_mean(mean_load: Option<f64>) -> f64 {
+    mean_load.and_then(|mean| Load::try_from(mean).ok()).map_or(-1.0, Load::percent)
+}

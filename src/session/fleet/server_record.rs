@@ -1,0 +1,240 @@
+//! What the registry knows of one simulation server, and what a change of it means. Part of the registry.
+
+use std::time::{Duration, Instant, SystemTime};
+
+use super::fleet_status::{ServerStatus, State};
+use super::probe_error::Unreachable;
+use crate::session::mail::Event;
+use crate::session::placement;
+use crate::shared::domain::Dispatch;
+use crate::shared::domain::Load;
+use crate::shared::domain::PublicAddress;
+
+/// One simulation server.
+#[derive(Debug)]
+pub struct Watched {
+    /// Whether the configuration has it drained.
+    pub drained: bool,
+    /// Its state.
+    pub state: State,
+    /// Since when.
+    pub since: SystemTime,
+    /// What it said last; kept when it is down.
+    pub report: Option<Dispatch>,
+    /// Why it gave no usable answer, if it did not.
+    pub error: Option<Unreachable>,
+    /// Why it gave none the last time that it did not.
+    pub last_error: Option<Unreachable>,
+    /// How long it took to answer.
+    pub latency: Option<Duration>,
+    /// When it last gave a good answer.
+    pub answered: Option<Instant>,
+    /// Whether the administrator was told that it is full, and not yet that it has room again.
+    full_told: bool,
+}
+
+/// A server has changed its state, or is down for another reason than before.
+#[derive(Debug, PartialEq)]
+pub struct Change {
+    /// Its new state.
+    pub state: State,
+    /// Whether it was in that state before, for another reason.
+    pub still: bool,
+    /// When.
+    pub at: SystemTime,
+    /// Why, in words.
+    pub why: String,
+    /// What the administrator is told of it.
+    pub events: Vec<Event>,
+}
+
+impl Watched {
+    /// A server that was not heard of yet.
+    #[must_use]
+    pub fn new(drained: bool) -> Self {
+        Self {
+            drained,
+            state: State::Unknown,
+            since: SystemTime::now(),
+            report: None,
+            error: None,
+            last_error: None,
+            latency: None,
+            answered: None,
+            full_told: false,
+        }
+    }
+
+    /// Takes in a good answer that came at this time. From this load on, in percent, the server takes nobody.
+    pub fn said(&mut self, report: Dispatch, at: Instant, limit: f64) -> Option<Change> {
+        let (state, why) = self.judge(&report, limit);
+        self.report = Some(report);
+        self.error = None;
+        self.answered = Some(at);
+        self.enter(state, why)
+    }
+
+    /// Takes in that there is no good answer.
+    pub fn failed(&mut self, error: Unreachable) -> Option<Change> {
+        let why = error.to_string();
+        let another = self.error.as_ref().is_some_and(|before| !before.is_like(&error));
+        self.error = Some(error.clone());
+        self.last_error = Some(error);
+        let change = self.enter(State::Down, || why.clone());
+        // It is down as before, but for another reason: who mends it should know.
+        change.or_else(|| {
+            another.then(|| Change { state: State::Down, still: true, at: SystemTime::now(), why, events: Vec::new() })
+        })
+    }
+
+    /// The last report, if it still holds.
+    #[must_use]
+    pub fn current(&self) -> Option<&Dispatch> {
+        self.report.as_ref().filter(|_| self.state != State::Down)
+    }
+
+    /// The last report in the terms of the placement policy; nothing for a server that must not get clients and has
+    /// no other way to say so.
+    #[must_use]
+    pub fn for_placement(&self) -> Option<placement::Report> {
+        let report = self.current()?;
+        let accepting = self.state != State::Draining;
+        let instances = report.instances.map(|instances| placement::Instances {
+            present: instances.present(),
+            places: instances.places,
+            arrivals: instances.arrivals,
+            accepting,
+        });
+        (accepting || instances.is_some()).then(|| placement::Report { load: report.load.percent(), instances })
+    }
+
+    /// All of it, to be shown; what the placement knows is still to be filled in.
+    #[must_use]
+    pub fn status(&self, address: &PublicAddress) -> ServerStatus {
+        ServerStatus {
+            address: address.clone(),
+            state: self.state,
+            since: self.since,
+            report: self.report.clone(),
+            error: self.error.as_ref().map(ToString::to_string),
+            effective_load: None,
+            in_flight: 0,
+            client_cost: None,
+            latency: self.latency,
+            answered: self.answered,
+        }
+    }
+
+    /// Its load, if it answers.
+    #[must_use]
+    pub fn load(&self) -> Option<Load> {
+        self.current().map(|report| report.load)
+    }
+
+    fn judge(&self, report: &Dispatch, limit: f64) -> (State, impl FnOnce() -> String + use<>) {
+        let load = report.load.percent();
+        let no_place = report.instances.filter(|instances| instances.present() >= instances.places);
+        let state = if self.drained || report.draining {
+            State::Draining
+        } else if load >= limit || no_place.is_some() {
+            State::Full
+        } else {
+            State::Up
+        };
+        let reason = match (state, no_place) {
+            (State::Draining, _) if self.drained => " (drained by drainedServers)".to_owned(),
+            (State::Draining, _) => " (it drains itself)".to_owned(),
+            (State::Full, Some(full)) => format!(", {} clients in {} places", full.present(), full.places),
+            (State::Full, None) => format!(" of {limit:.1} %"),
+            _ => String::new(),
+        };
+        (state, move || format!("load {load:.1} %{reason}"))
+    }
+
+    fn enter(&mut self, state: State, why: impl FnOnce() -> String) -> Option<Change> {
+        let before = std::mem::replace(&mut self.state, state);
+        if before == state {
+            return None;
+        }
+        self.since = SystemTime::now();
+        Some(Change { state, still: false, at: self.since, why: why(), events: self.events(before) })
+    }
+
+    /// The four events of the original. A server that was full, then down, then up is told of as working again and as
+    /// available again.
+    fn events(&mut self, before: State) -> Vec<Event> {
+        let mut events = Vec::new();
+        match (before, self.state) {
+            (_, State::Down) => events.push(Event::NotResponding),
+            (State::Down, _) => events.push(Event::WorkingAgain),
+            _ => {}
+        }
+        if self.state == State::Full && !std::mem::replace(&mut self.full_told, true) {
+            events.push(Event::MaximumLoad);
+        } else if self.state == State::Up && std::mem::replace(&mut self.full_told, false) {
+            events.push(Event::AvailableAgain);
+        }
+        events
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn report(load: f64) -> Dispatch {
+        Dispatch::load_only(Load::try_from(load).unwrap())
+    }
+
+    /// The events of each step: a load, or nothing for a failure.
+    fn events(steps: &[Option<f64>]) -> Vec<Vec<Event>> {
+        let mut watched = Watched::new(false);
+        let change = |step: &Option<f64>| match step {
+            Some(load) => watched.said(report(*load), Instant::now(), 95.0),
+            None => watched.failed(Unreachable::Refused(String::new())),
+        };
+        steps.iter().map(change).map(|change| change.map(|change| change.events).unwrap_or_default()).collect()
+    }
+
+    #[test]
+    fn the_administrator_hears_of_four_events() {
+        use Event::{AvailableAgain, MaximumLoad, NotResponding, WorkingAgain};
+        assert_eq!(events(&[Some(1.0), Some(2.0)]), [vec![], vec![]], "a server that is well is no news");
+        assert_eq!(events(&[None, None, Some(1.0)]), [vec![NotResponding], vec![], vec![WorkingAgain]]);
+        assert_eq!(events(&[Some(95.0), Some(99.0), Some(94.9)]), [vec![MaximumLoad], vec![], vec![AvailableAgain]]);
+        assert_eq!(events(&[None, Some(96.0)]), [vec![NotResponding], vec![WorkingAgain, MaximumLoad]]);
+        assert_eq!(
+            events(&[Some(96.0), None, Some(96.0), None, Some(1.0)]),
+            [
+                vec![MaximumLoad],
+                vec![NotResponding],
+                vec![WorkingAgain],
+                vec![NotResponding],
+                vec![WorkingAgain, AvailableAgain]
+            ]
+        );
+    }
+
+    #[test]
+    fn another_reason_is_a_change_without_an_event() {
+        let mut watched = Watched::new(false);
+        let refused = |why: &str| Unreachable::Refused(why.to_owned());
+        assert!(watched.failed(refused("one")).is_some());
+        assert_eq!(watched.failed(refused("other words")), None);
+        let slow = Unreachable::TimedOut(Duration::from_secs(3));
+        let change = watched.failed(slow.clone()).unwrap();
+        assert_eq!((change.state, change.why, change.events), (State::Down, "no answer within 3 s".to_owned(), vec![]));
+        assert_eq!(watched.failed(slow), None);
+    }
+
+    #[test]
+    fn a_drained_server_is_for_nobody_whether_it_counts_or_not() {
+        let mut watched = Watched::new(true);
+        let change = watched.said(report(1.0), Instant::now(), 95.0).unwrap();
+        assert_eq!((change.state, change.why.as_str()), (State::Draining, "load 1.0 % (drained by drainedServers)"));
+        assert_eq!(watched.for_placement(), None);
+        watched.drained = false;
+        watched.said(report(1.0), Instant::now(), 95.0);
+        assert!(watched.for_placement().is_some());
+    }
+}

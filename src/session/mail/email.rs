@@ -1,0 +1,229 @@
+//! Writes mails: the words, the two templates and the headers. Sends nothing.
+//!
+//! What comes from outside (a server's error, say) is data: it never has a line break, and the HTML escapes it.
+
+use std::time::SystemTime;
+
+use askama::Template;
+use lettre::Message;
+use lettre::message::MultiPart;
+use lettre::message::header::{Header, HeaderName, HeaderValue};
+
+use super::notices::{Entry, Event};
+use crate::session::config::SessionConfig;
+use crate::session::mail_address::MailAddress;
+use crate::shared::run::one_line;
+
+/// How much of a text from outside is shown, in letters.
+const MOST_LETTERS: usize = 500;
+
+/// Who writes to whom about which server.
+#[derive(Debug, Clone)]
+pub struct Letterhead {
+    from: MailAddress,
+    to: MailAddress,
+    session_server: String,
+    monitor: String,
+}
+
+/// A mail that is ready to be sent.
+#[derive(Debug, Clone)]
+pub struct Letter {
+    /// Where it comes from.
+    pub from: MailAddress,
+    /// Where it goes to.
+    pub to: MailAddress,
+    /// Headers and body as they go over the wire.
+    pub bytes: Vec<u8>,
+}
+
+/// A mail that can't be made.
+#[derive(Debug, thiserror::Error)]
+#[error("the mail can't be written: {0}")]
+pub struct Unwritable(String);
+
+#[derive(Template)]
+#[template(path = "mail.txt")]
+struct Text<'mail>(&'mail Content<'mail>);
+
+#[derive(Template)]
+#[template(path = "mail.html")]
+struct Html<'mail>(&'mail Content<'mail>);
+
+/// What both templates show.
+struct Content<'mail> {
+    summary: &'mail str,
+    lines: Vec<Line>,
+    letterhead: &'mail Letterhead,
+}
+
+/// What a mail says of one server.
+struct Line {
+    server: String,
+    event: &'static str,
+    at: String,
+    load: Option<String>,
+    error: Option<String>,
+    held_back: usize,
+}
+
+impl Letterhead {
+    /// What the configuration says; nothing if it is not for mails.
+    #[must_use]
+    pub fn new(config: &SessionConfig) -> Option<Self> {
+        Some(Self {
+            from: config.mail_sender.clone()?,
+            to: config.administrator.clone()?,
+            session_server: shown(&config.address().to_string()),
+            monitor: format!("{}/monitor", shown(&config.address().http_url(config.ssl))),
+        })
+    }
+
+    /// The mail that tells these entries.
+    ///
+    /// # Errors
+    /// When the mail can't be made of them.
+    pub fn tell<'entries>(&self, entries: impl Iterator<Item = &'entries Entry>) -> Result<Letter, Unwritable> {
+        let mut events = Vec::new();
+        let lines: Vec<Line> = entries
+            .map(|entry| {
+                events.push(entry.notice.event);
+                Line::new(entry)
+            })
+            .collect();
+        let mut subject = summary(&events);
+        if let [only] = lines.as_slice() {
+            subject = format!("{subject}: {}", only.server);
+        }
+        self.write(&subject, lines)
+    }
+
+    /// The mail that tells that mails arrive.
+    ///
+    /// # Errors
+    /// When the mail can't be made.
+    pub fn test(&self) -> Result<Letter, Unwritable> {
+        self.write("Test of the session server's notifications", Vec::new())
+    }
+
+    fn write(&self, subject: &str, lines: Vec<Line>) -> Result<Letter, Unwritable> {
+        let content = Content { summary: subject, lines, letterhead: self };
+        let text = Text(&content).render().map_err(unwritable)?;
+        let html = Html(&content).render().map_err(unwritable)?;
+        let message = Message::builder()
+            .from(self.from.mailbox().clone())
+            .to(self.to.mailbox().clone())
+            .subject(subject)
+            .message_id(None)
+            .header(AutoSubmitted)
+            .multipart(MultiPart::alternative_plain_html(text, html))
+            .map_err(unwritable)?;
+        Ok(Letter { from: self.from.clone(), to: self.to.clone(), bytes: message.formatted() })
+    }
+}
+
+impl Line {
+    fn new(entry: &Entry) -> Self {
+        let notice = &entry.notice;
+        Self {
+            server: shown(&notice.server.to_string()),
+            event: notice.event.words(),
+            at: time(notice.at),
+            load: notice.load.map(|load| format!("{:.1}%", load.percent())),
+            error: notice.error.as_deref().map(shown),
+            held_back: entry.held_back,
+        }
+    }
+}
+
+/// Tells answering machines that nobody reads their answers (RFC 3834).
+#[derive(Clone)]
+struct AutoSubmitted;
+
+impl Header for AutoSubmitted {
+    fn name() -> HeaderName {
+        HeaderName::new_from_ascii_str("Auto-Submitted")
+    }
+
+    fn parse(_: &str) -> Result<Self, Box<dyn std::error::Error + Send + Sync>> {
+        Ok(Self)
+    }
+
+    fn display(&self) -> HeaderValue {
+        HeaderValue::new(Self::name(), "auto-generated".to_owned())
+    }
+}
+
+fn unwritable(error: impl std::error::Error) -> Unwritable {
+    Unwritable(error.to_string())
+}
+
+/// `Simulation server not responding`, or `3 simulation servers not responding, 1 working again`.
+fn summary(events: &[Event]) -> String {
+    if let [only] = events {
+        return format!("Simulation server {}", only.words());
+    }
+    let all = [Event::NotResponding, Event::WorkingAgain, Event::MaximumLoad, Event::AvailableAgain];
+    let counts = all.map(|event| (events.iter().filter(|other| **other == event).count(), event));
+    let mut parts: Vec<String> = Vec::new();
+    for (count, event) in counts.into_iter().filter(|(count, _)| *count > 0) {
+        parts.push(match (parts.is_empty(), count) {
+            (true, 1) => format!("1 simulation server {}", event.words()),
+            (true, _) => format!("{count} simulation servers {}", event.words()),
+            (false, _) => format!("{count} {}", event.words()),
+        });
+    }
+    parts.join(", ")
+}
+
+/// A text from outside as it is shown: one line of bounded length.
+fn shown(text: &str) -> String {
+    let mut short: String = one_line(text).chars().take(MOST_LETTERS).collect();
+    if text.chars().nth(MOST_LETTERS).is_some() {
+        short.push_str("...");
+    }
+    short
+}
+
+/// `2026-03-01 14:05:09 UTC`, the clock of the log.
+fn time(at: SystemTime) -> String {
+    jiff::Timestamp::try_from(at)
+        .map_or_else(|_| "unknown".to_owned(), |time| time.strftime("%Y-%m-%d %H:%M:%S UTC").to_string())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn subjects_count_what_happened() {
+        use Event::{AvailableAgain, MaximumLoad, NotResponding, WorkingAgain};
+        for (events, subject) in [
+            (vec![NotResponding], "Simulation server not responding"),
+            (vec![WorkingAgain], "Simulation server working again"),
+            (vec![MaximumLoad], "Simulation server reached maximum load"),
+            (vec![AvailableAgain], "Simulation server available again"),
+            (vec![NotResponding; 3], "3 simulation servers not responding"),
+            (vec![WorkingAgain, NotResponding], "1 simulation server not responding, 1 working again"),
+            (
+                vec![MaximumLoad, AvailableAgain, MaximumLoad],
+                "2 simulation servers reached maximum load, 1 available again",
+            ),
+        ] {
+            assert_eq!(summary(&events), subject);
+        }
+    }
+
+    #[test]
+    fn a_text_from_outside_is_one_short_line() {
+        assert_eq!(shown("a\r\nBcc: x\u{7}\u{85}y"), "a  Bcc: x  y");
+        let long = shown(&"\u{e9}".repeat(600));
+        assert_eq!((long.chars().count(), long.ends_with("\u{e9}...")), (503, true));
+    }
+
+    #[test]
+    fn the_time_is_that_of_the_log() {
+        let at = SystemTime::UNIX_EPOCH + std::time::Duration::from_secs(1_772_373_909);
+        assert_eq!(time(at), "2026-03-01 14:05:09 UTC");
+    }
+}

@@ -1,0 +1,87 @@
+//! The paths of the session server's pages, with what they load and listen to.
+
+use actix_web::{HttpRequest, HttpResponse, web};
+use askama::Template;
+
+use super::pages::{self, Viewer, WebotsViewer};
+use super::queries::{ask, with_status};
+use crate::asset;
+use crate::session::fleet::FleetStatus;
+use crate::session::fleet::GetStatus;
+use crate::session::state::AppState;
+use crate::shared::http::assets::{self, Asset};
+use crate::shared::http::paths::{GET, READ, path};
+use crate::shared::http::{Policy, fleet_sources, html};
+
+/// What pages of this server load, besides what all pages do.
+const ASSETS: &[Asset] = &[
+    asset!("viewer.css"),
+    asset!("viewer.js"),
+    asset!("start.js"),
+    asset!("stream.js"),
+    asset!("small_viewer.js"),
+    asset!("scene.js"),
+    asset!("shapes.js"),
+    asset!("matrix.js"),
+    asset!("camera.js"),
+    asset!("draw.js"),
+    asset!("webots_viewer.css"),
+    asset!("webots_viewer.js"),
+];
+
+/// Adds the paths to an app.
+pub fn configure(app: &mut web::ServiceConfig) {
+    app.service(path("/monitor", READ, monitor))
+        .service(path("/events", GET, events))
+        .service(path("/viewer", READ, viewer))
+        .service(path("/webots-viewer", READ, webots_viewer))
+        .service(path("/assets/{name}", READ, asset));
+}
+
+async fn monitor(server: web::Data<AppState>) -> HttpResponse {
+    let (clients, ssl, started) = (server.clients(), server.ssl, server.started_at);
+    with_status(&server, |status| html(pages::monitor(status, clients, ssl, started), &Policy::own())).await
+}
+
+async fn events(server: web::Data<AppState>) -> HttpResponse {
+    let shown = server.clone();
+    let render = move || {
+        let server = shown.clone();
+        async move {
+            let status = ask(&server, GetStatus).await?;
+            let view = pages::view(&status, server.clients(), server.ssl);
+            view.inspect_err(|error| log::error!("the monitor page can't be rendered: {error}")).ok()
+        }
+    };
+    server.live.listen(server.phase.clone(), render)
+}
+
+async fn viewer(request: HttpRequest, server: web::Data<AppState>) -> HttpResponse {
+    with_status(&server, |status| {
+        let script = server.viewer_script.as_ref().map(url::Url::as_str);
+        let page = Viewer { version: env!("CARGO_PKG_VERSION"), examples: &server.examples, script };
+        let policy = Policy::own().own_websocket(&request).connect(&fleet(&server, status)).frames();
+        html(page.render(), &policy)
+    })
+    .await
+}
+
+/// Webots' own viewer is a program of somebody else, and a link to this page can name another that lies on a host of the
+/// fleet: it gets a page without anything of ours in it, whose scripts count as those of no server.
+async fn webots_viewer(server: web::Data<AppState>) -> HttpResponse {
+    with_status(&server, |status| {
+        let mut sources = fleet(&server, status);
+        sources.extend(server.viewer_script.as_ref().map(|script| script.origin().ascii_serialization()));
+        let page = WebotsViewer { version: env!("CARGO_PKG_VERSION") };
+        html(page.render(), &Policy::own().run(&sources).any_picture().framed().foreign())
+    })
+    .await
+}
+
+fn fleet(server: &AppState, status: &FleetStatus) -> Vec<String> {
+    fleet_sources(status.servers.iter().map(|one| &one.address), server.ssl)
+}
+
+async fn asset(request: HttpRequest) -> HttpResponse {
+    assets::answer(&request, ASSETS)
+}

@@ -1,0 +1,215 @@
+//! The session server's pages for people: the monitor of its fleet, and the viewer.
+
+use std::collections::VecDeque;
+use std::time::{Duration, SystemTime};
+
+use askama::Template;
+
+use crate::session::config::Example;
+use crate::session::fleet::{FleetStatus, ServerStatus, State, StateChange};
+use crate::shared::domain::Instances;
+use crate::shared::http::{Row, View};
+use crate::shared::run::timestamp;
+
+/// The whole page `/monitor`.
+#[derive(Template)]
+#[template(path = "session/monitor.html")]
+struct Monitor<'view> {
+    version: &'static str,
+    started: String,
+    glance: &'view str,
+    changes: &'view str,
+    rows: &'view [Row],
+}
+
+/// Whether the fleet is well.
+#[derive(Template)]
+#[template(path = "session/glance.html")]
+struct Glance {
+    available: bool,
+    clients: usize,
+    mean_load: Option<f64>,
+    servers: usize,
+    answering: usize,
+    taking: usize,
+    down: usize,
+    running: u64,
+    idle: u64,
+    starting: u64,
+    queued: u64,
+    places: u64,
+}
+
+/// The cells of one simulation server.
+#[derive(Template)]
+#[template(path = "session/row.html")]
+struct ServerRow<'server> {
+    server: &'server ServerStatus,
+    monitor: String,
+    rank: u8,
+    error: Option<&'server str>,
+    load: Option<f64>,
+    load_value: f64,
+    effective: Option<f64>,
+    effective_value: f64,
+    instances: Option<Instances>,
+    repositories: Vec<&'server str>,
+    whose: &'static str,
+    version: &'server str,
+    latency: String,
+    latency_value: u128,
+    since: String,
+}
+
+/// The last changes of state.
+#[derive(Template)]
+#[template(path = "session/changes.html")]
+struct Changes<'status> {
+    changes: &'status VecDeque<StateChange>,
+}
+
+/// The page `/viewer`.
+#[derive(Template)]
+#[template(path = "session/viewer.html")]
+pub struct Viewer<'config> {
+    /// Of the server.
+    pub version: &'static str,
+    /// Worlds to try.
+    pub examples: &'config [Example],
+    /// Where Webots' own viewer comes from, if it is configured.
+    pub script: Option<&'config str>,
+}
+
+/// The page that holds Webots' own viewer.
+#[derive(Template)]
+#[template(path = "session/webots_viewer.html")]
+pub struct WebotsViewer {
+    /// Of the server.
+    pub version: &'static str,
+}
+
+/// The parts of `/monitor` that change.
+///
+/// # Errors
+/// When a template can't be rendered.
+pub fn view(status: &FleetStatus, clients: usize, ssl: bool) -> Result<View, askama::Error> {
+    let rows = status.servers.iter().map(|server| {
+        let html = ServerRow::new(server, ssl).render()?;
+        Ok(Row { key: server.address.to_string(), html })
+    });
+    let rows = rows.collect::<Result<Vec<Row>, askama::Error>>()?;
+    let parts = [
+        ("glance", Glance::new(status, clients).render()?),
+        ("changes", Changes { changes: &status.changes }.render()?),
+    ];
+    Ok(View { parts: parts.into(), tables: [("servers", rows)].into(), sample: Vec::new() })
+}
+
+/// The whole of `/monitor`.
+///
+/// # Errors
+/// When a template can't be rendered.
+pub fn monitor(status: &FleetStatus, clients: usize, ssl: bool, started: SystemTime) -> Result<String, askama::Error> {
+    let view = view(status, clients, ssl)?;
+    let part = |id| view.parts.get(id).map(String::as_str).unwrap_or_default();
+    let page = Monitor {
+        version: env!("CARGO_PKG_VERSION"),
+        started: timestamp(started),
+        glance: part("glance"),
+        changes: part("changes"),
+        rows: view.tables.get("servers").map(Vec::as_slice).unwrap_or_default(),
+    };
+    page.render()
+}
+
+impl Glance {
+    fn new(status: &FleetStatus, clients: usize) -> Self {
+        let count = |wanted: &[State]| status.servers.iter().filter(|server| wanted.contains(&server.state)).count();
+        let instances = || status.servers.iter().filter_map(known_instances);
+        // Another server's numbers may be anything.
+        let sum = |part: fn(Instances) -> u32| instances().map(|one| u64::from(part(one))).sum::<u64>();
+        Self {
+            available: status.available,
+            clients,
+            mean_load: status.mean_load,
+            servers: status.servers.len(),
+            answering: count(&[State::Up, State::Full, State::Draining]),
+            taking: count(&[State::Up]),
+            down: count(&[State::Down]),
+            running: sum(|one| one.running),
+            idle: sum(|one| one.idle),
+            starting: sum(|one| one.starting),
+            queued: sum(|one| one.queued),
+            places: sum(|one| one.places),
+        }
+    }
+}
+
+impl<'server> ServerRow<'server> {
+    fn new(server: &'server ServerStatus, ssl: bool) -> Self {
+        let report = server.report.as_ref().filter(|_| server.state != State::Down);
+        let load = report.map(|report| report.load.percent());
+        let repositories = report.map(|report| report.allowed_repositories.as_slice()).unwrap_or_default();
+        let whose = match report {
+            None => "–",
+            Some(report) if report.docker.is_none() => "any that it does not rule out",
+            Some(_) => "none",
+        };
+        Self {
+            server,
+            monitor: format!("{}/monitor", server.address.http_url(ssl)),
+            rank: rank(server.state),
+            error: server.error.as_deref().filter(|_| server.state == State::Down),
+            load,
+            load_value: sort_value(load),
+            effective: server.effective_load,
+            effective_value: sort_value(server.effective_load),
+            instances: known_instances(server),
+            repositories: repositories.iter().map(|prefix| without_scheme(prefix.as_str())).collect(),
+            whose,
+            version: report.map(|report| report.version.as_str()).unwrap_or_default(),
+            latency: server.latency.map(milliseconds).unwrap_or_default(),
+            latency_value: server.latency.unwrap_or_default().as_micros(),
+            since: timestamp(server.since),
+        }
+    }
+}
+
+impl Changes<'_> {
+    fn time(at: &SystemTime) -> String {
+        timestamp(*at)
+    }
+}
+
+fn known_instances(server: &ServerStatus) -> Option<Instances> {
+    server.report.as_ref().filter(|_| server.state != State::Down)?.instances
+}
+
+/// By how much a state wants somebody's attention.
+fn rank(state: State) -> u8 {
+    match state {
+        State::Down => 0,
+        State::Unknown => 1,
+        State::Draining => 2,
+        State::Full => 3,
+        State::Up => 4,
+    }
+}
+
+fn without_scheme(url: &str) -> &str {
+    url.split_once("://").map_or(url, |(_, rest)| rest)
+}
+
+/// In steps coarse enough that a calm fleet's page has nothing to send.
+fn milliseconds(time: Duration) -> String {
+    match time.as_millis() {
+        0 => "< 1 ms".to_owned(),
+        millis @ 1..1000 => format!("{millis} ms"),
+        _ => format!("{:.1} s", time.as_secs_f64()),
+    }
+}
+
+/// By which rows are sorted: what is not known comes first.
+fn sort_value(number: Option<f64>) -> f64 {
+    number.map_or(-1.0, |number| (number * 10.0).round() / 10.0)
+}

@@ -1,0 +1,154 @@
+//! The session server's public paths: each reads the request, asks the registry, and maps the answer.
+
+use std::borrow::Cow;
+use std::sync::Arc;
+
+use actix_web::http::{StatusCode, header};
+use actix_web::{HttpRequest, HttpResponse, web};
+use percent_encoding::percent_decode_str;
+
+use super::broadcaster::CurrentAudience;
+use super::page_routes;
+use super::queries::{ask, with_status};
+use super::status::{self, StatusPage};
+use super::web_client::WebClient;
+use crate::session::fleet::told_mean;
+use crate::session::fleet::{GetStatus, IsAvailable};
+use crate::session::fleet::{NoServer, Pick};
+use crate::session::state::AppState;
+use crate::shared::http::CONTENT_TYPE;
+use crate::shared::http::paths::{self, GET, READ, come_back, path};
+use crate::shared::http::websocket;
+
+/// Adds all paths to an app.
+pub fn configure(app: &mut web::ServiceConfig) {
+    app.service(paths::all(add, "/session, /monitor, /viewer, /status, /load, /metrics or /health"));
+}
+
+fn add(app: &mut web::ServiceConfig) {
+    app.service(path("/", GET, root))
+        .service(path("/request", READ, availability))
+        .service(path("/session", GET, session))
+        .service(path("/load", READ, load))
+        .configure(page_routes::configure)
+        .service(path("/status", READ, status_json))
+        .service(path("/metrics", READ, metrics))
+        .service(path("/health", READ, health));
+}
+
+fn wants_websocket(request: &HttpRequest) -> bool {
+    let upgrade = request.headers().get(header::UPGRADE).and_then(|value| value.to_str().ok());
+    upgrade.is_some_and(|value| value.eq_ignore_ascii_case("websocket"))
+}
+
+async fn root(
+    request: HttpRequest,
+    stream: web::Payload,
+    server: web::Data<AppState>,
+    audience: web::Data<CurrentAudience>,
+) -> HttpResponse {
+    if wants_websocket(&request) {
+        open_websocket(&request, stream, &server, &audience)
+    } else {
+        availability(server).await
+    }
+}
+
+async fn session(
+    request: HttpRequest,
+    stream: web::Payload,
+    server: web::Data<AppState>,
+    audience: web::Data<CurrentAudience>,
+) -> HttpResponse {
+    if wants_websocket(&request) {
+        return open_websocket(&request, stream, &server, &audience);
+    }
+    let from = server.trusted_proxies.peer(&request).household();
+    let answer = server.pick(Pick::parse(wanted_world(request.query_string()).as_deref(), from)).await;
+    let status = match answer.refusal {
+        None => StatusCode::OK,
+        Some(NoServer::Unavailable) => StatusCode::SERVICE_UNAVAILABLE,
+        Some(NoServer::NotAccepted(_)) => StatusCode::FORBIDDEN,
+        Some(NoServer::NoWorld(_)) => StatusCode::BAD_REQUEST,
+    };
+    let mut response = HttpResponse::build(status);
+    if status == StatusCode::SERVICE_UNAVAILABLE {
+        response.insert_header(come_back());
+    }
+    response.content_type("text/plain; charset=utf-8").body(answer.text)
+}
+
+/// The world of a query. `webots.js` does not percent-encode it, so that it is all that follows `url=`: a plus sign
+/// or an ampersand may be part of it. Others do, as is usual in queries, and then it has no `:` in it.
+fn wanted_world(query: &str) -> Option<Cow<'_, str>> {
+    let begin = query.strip_prefix("url=").or_else(|| query.split_once("&url=").map(|(_, world)| world));
+    let world = begin.filter(|world| !world.is_empty())?;
+    if world.contains(':') {
+        return Some(Cow::Borrowed(world));
+    }
+    let whole = world.split_once('&').map_or(world, |(whole, _)| whole);
+    Some(percent_decode_str(whole).decode_utf8_lossy())
+}
+
+fn open_websocket(
+    request: &HttpRequest,
+    stream: web::Payload,
+    server: &web::Data<AppState>,
+    audience: &CurrentAudience,
+) -> HttpResponse {
+    let peer = server.trusted_proxies.peer(request);
+    let connection = match server.connections.admit(peer) {
+        Ok(connection) => connection,
+        Err(crowded) => return crowded.answer(),
+    };
+    let (server, audience) = (Arc::clone(server), audience.get());
+    websocket::open(request, stream, |inbox| WebClient::new(server, audience, peer, (connection, inbox)))
+}
+
+async fn availability(server: web::Data<AppState>) -> HttpResponse {
+    let available = ask(&server, IsAvailable).await.unwrap_or(false);
+    HttpResponse::Ok().content_type("text/plain").body(if available { "1" } else { "0" })
+}
+
+async fn load(server: web::Data<AppState>) -> HttpResponse {
+    let mean = ask(&server, GetStatus).await.and_then(|status| status.mean_load);
+    HttpResponse::Ok().content_type("text/plain").body(told_mean(mean).to_string())
+}
+
+async fn status_json(server: web::Data<AppState>) -> HttpResponse {
+    with_status(&server, |status| HttpResponse::Ok().json(StatusPage::new(&server, status))).await
+}
+
+async fn metrics(server: web::Data<AppState>) -> HttpResponse {
+    with_status(&server, |status| match server.metrics.render(&status::gauges(server.clients(), status)) {
+        Ok(text) => HttpResponse::Ok().content_type(CONTENT_TYPE).body(text),
+        Err(error) => HttpResponse::InternalServerError().body(format!("Error: {error}.")),
+    })
+    .await
+}
+
+async fn health() -> HttpResponse {
+    HttpResponse::Ok().content_type("text/plain").body("ok")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_world_is_all_that_follows_url() {
+        let table = [
+            ("", None),
+            ("url=", None),
+            ("mode=x3d", None),
+            (
+                "url=https://github.com/u/c++/blob/a&b/worlds/x.wbt",
+                Some("https://github.com/u/c++/blob/a&b/worlds/x.wbt"),
+            ),
+            ("mode=x3d&url=https://x", Some("https://x")),
+        ];
+        for (query, world) in table {
+            assert_eq!(wanted_world(query).as_deref(), world, "{query:?}");
+        }
+    }
+}

@@ -1,0 +1,170 @@
+//! What the session server tells programs of its fleet: `/status` and `/metrics`.
+
+use std::time::Duration;
+
+use serde::Serialize;
+
+use crate::session::fleet::{FleetStatus, ServerStatus, State, told_mean};
+use crate::session::state::AppState;
+use crate::shared::domain::Instances;
+use crate::shared::domain::Load;
+use crate::shared::http::Gauge;
+use crate::shared::run::timestamp;
+
+/// The page `/status`.
+#[derive(Debug, Serialize)]
+#[serde(rename_all = "camelCase")]
+pub struct StatusPage {
+    version: &'static str,
+    /// In seconds.
+    uptime: u64,
+    available: bool,
+    clients: usize,
+    /// Percent; absent where no server answers.
+    load: Option<f64>,
+    servers: Vec<ServerPage>,
+    changes: Vec<ChangePage>,
+}
+
+#[derive(Debug, Serialize)]
+#[serde(rename_all = "camelCase")]
+struct ServerPage {
+    address: String,
+    monitor: String,
+    state: &'static str,
+    since: String,
+    load: Option<Load>,
+    effective_load: Option<f64>,
+    in_flight: usize,
+    client_cost: Option<f64>,
+    instances: Option<Instances>,
+    allowed_repositories: Vec<String>,
+    version: String,
+    /// Seconds since the last good answer.
+    age: Option<f64>,
+    /// Seconds.
+    latency: Option<f64>,
+    error: Option<String>,
+}
+
+#[derive(Debug, Serialize)]
+struct ChangePage {
+    at: String,
+    server: String,
+    state: &'static str,
+    why: String,
+}
+
+impl StatusPage {
+    /// The state of the fleet.
+    #[must_use]
+    pub fn new(server: &AppState, status: &FleetStatus) -> Self {
+        let changes = status.changes.iter().map(|change| ChangePage {
+            at: timestamp(change.at),
+            server: change.server.to_string(),
+            state: change.state.word(),
+            why: change.why.clone(),
+        });
+        Self {
+            version: env!("CARGO_PKG_VERSION"),
+            uptime: server.started.elapsed().as_secs(),
+            available: status.available,
+            clients: server.clients(),
+            load: status.mean_load,
+            servers: status.servers.iter().map(|one| ServerPage::new(one, server.ssl)).collect(),
+            changes: changes.collect(),
+        }
+    }
+}
+
+impl ServerPage {
+    fn new(server: &ServerStatus, ssl: bool) -> Self {
+        let known = server.report.as_ref().filter(|_| server.state != State::Down);
+        let allowed =
+            known.map(|report| report.allowed_repositories.iter().map(|prefix| prefix.as_str().to_owned()).collect());
+        Self {
+            address: server.address.to_string(),
+            monitor: format!("{}/monitor", server.address.http_url(ssl)),
+            state: server.state.word(),
+            since: timestamp(server.since),
+            load: known.map(|report| report.load),
+            effective_load: server.effective_load,
+            in_flight: server.in_flight,
+            client_cost: server.client_cost,
+            instances: known.and_then(|report| report.instances),
+            allowed_repositories: allowed.unwrap_or_default(),
+            version: known.map(|report| report.version.clone()).unwrap_or_default(),
+            age: server.answered.map(|answered| answered.elapsed().as_secs_f64()),
+            latency: server.latency.as_ref().map(Duration::as_secs_f64),
+            error: server.error.clone(),
+        }
+    }
+}
+
+/// The gauges of `/metrics`.
+#[must_use]
+pub fn gauges<'text>(clients: usize, status: &FleetStatus) -> Vec<Gauge<'text>> {
+    let of_each = |value: &dyn Fn(&ServerStatus) -> Option<f64>| {
+        let servers = status.servers.iter();
+        servers.filter_map(|server| Some((vec![server.address.to_string()], value(server)?))).collect()
+    };
+    let labels: &[&str] = &["server"];
+    let count = |wanted: State| status.servers.iter().filter(move |server| server.state == wanted).count();
+    let every = [State::Unknown, State::Up, State::Full, State::Draining, State::Down];
+    vec![
+        Gauge::plain(
+            "session_available",
+            "1 while some simulation server can take a client",
+            f64::from(u8::from(status.available)),
+        ),
+        Gauge::plain("session_clients", "Web clients connected", number(clients)),
+        Gauge::plain(
+            "session_load_percent",
+            "Mean load of the servers that answer, -1 where none does",
+            told_mean(status.mean_load),
+        ),
+        Gauge {
+            name: "session_servers",
+            help: "Simulation servers by state",
+            labels: &["state"],
+            values: every.iter().map(|one| (vec![one.word().to_owned()], number(count(*one)))).collect(),
+        },
+        Gauge {
+            name: "session_server_up",
+            help: "1 while a simulation server gives good answers",
+            labels,
+            values: of_each(&|server| Some(f64::from(u8::from(!matches!(server.state, State::Down | State::Unknown))))),
+        },
+        Gauge {
+            name: "session_server_load_percent",
+            help: "Load that a simulation server reported last",
+            labels,
+            values: of_each(&|server| {
+                server.report.as_ref().filter(|_| server.state != State::Down).map(|report| report.load.percent())
+            }),
+        },
+        Gauge {
+            name: "session_server_effective_load_percent",
+            help: "The same, and the clients that it can't show yet",
+            labels,
+            values: of_each(&|server| server.effective_load),
+        },
+        Gauge {
+            name: "session_server_in_flight",
+            help: "Clients that were sent to a simulation server and have not come yet",
+            labels,
+            values: of_each(&|server| Some(number(server.in_flight))),
+        },
+        Gauge {
+            name: "session_server_latency_seconds",
+            help: "Time in which a simulation server answered last",
+            labels,
+            values: of_each(&|server| server.latency.map(|latency| latency.as_secs_f64())),
+        },
+    ]
+}
+
+#[expect(clippy::cast_precision_loss, reason = "counts here are far below 2^52")]
+fn number(count: usize) -> f64 {
+    count as f64
+}

@@ -1,0 +1,161 @@
+//! Actor: one web client's WebSocket. Tells it whether a simulation server can take a client, and which.
+//!
+//! Created by the route for each connection; ends with it. It joins the audience of its thread, and never tells the
+//! same value twice. A text from the client asks for a simulation server.
+
+use std::sync::Arc;
+
+use actix::prelude::*;
+use actix_web_actors::ws::{CloseCode, CloseReason, Message, ProtocolError, WebsocketContext};
+use serde::Deserialize;
+
+use super::broadcaster::{Audience, Join, Membership};
+use crate::session::fleet::News;
+use crate::session::fleet::Pick;
+use crate::session::state::AppState;
+use crate::shared::http::Connection;
+use crate::shared::http::Peer;
+use crate::shared::http::liveness::{self, Liveness};
+use crate::shared::http::websocket::{Heard, Inbox};
+
+/// The actor.
+pub struct WebClient {
+    server: Arc<AppState>,
+    peer: Peer,
+    liveness: Liveness,
+    told: Option<bool>,
+    audience: Addr<Audience>,
+    membership: Option<Membership>,
+    inbox: Inbox,
+    _connection: Connection,
+}
+
+type Context = WebsocketContext<WebClient>;
+
+impl WebClient {
+    /// A client that has just connected; `connection` counts it, `inbox` takes what comes from it.
+    #[must_use]
+    pub fn new(
+        server: Arc<AppState>,
+        audience: Addr<Audience>,
+        peer: Peer,
+        (connection, inbox): (Connection, Inbox),
+    ) -> Self {
+        Self {
+            server,
+            peer,
+            liveness: Liveness::new(),
+            told: None,
+            audience,
+            membership: None,
+            inbox,
+            _connection: connection,
+        }
+    }
+
+    fn close(code: CloseCode, ctx: &mut Context) {
+        ctx.close(Some(CloseReason { code, description: None }));
+        ctx.stop();
+    }
+
+    fn pick(&self, text: &str, ctx: &mut Context) {
+        let server = Arc::clone(&self.server);
+        let (wanted, from) = (wanted_world(text), self.peer.household());
+        let picked = async move { server.pick(Pick::parse(wanted.as_deref(), from)).await };
+        // Nothing else is done meanwhile, so that answers come in the order of the texts, and before a close.
+        picked.into_actor(self).map(|answer, _, ctx| ctx.text(answer.text)).wait(ctx);
+    }
+}
+
+/// The world that a message names: a URL, `{"url": ...}`, or nothing in particular.
+fn wanted_world(text: &str) -> Option<String> {
+    #[derive(Deserialize)]
+    struct Wanted {
+        url: serde_json::Value,
+    }
+    let text = text.trim();
+    if let Ok(Wanted { url }) = serde_json::from_str(text) {
+        return Some(url.as_str().map_or_else(|| url.to_string(), str::to_owned));
+    }
+    text.contains("://").then(|| text.to_owned())
+}
+
+impl Actor for WebClient {
+    type Context = Context;
+
+    fn started(&mut self, ctx: &mut Self::Context) {
+        let timing = &self.server.timing;
+        liveness::watch(ctx, timing.ping, timing.silence, |client| &mut client.liveness);
+        let subscribed = self.audience.send(Join(ctx.address().recipient())).into_actor(self);
+        subscribed
+            .map(|answer, client, ctx| match answer {
+                Ok(membership) => client.membership = Some(membership),
+                Err(error) => {
+                    log::error!("a client can't be told of changes: {error}");
+                    Self::close(CloseCode::Error, ctx);
+                }
+            })
+            .spawn(ctx);
+    }
+}
+
+impl Handler<News> for WebClient {
+    type Result = ();
+
+    fn handle(&mut self, news: News, ctx: &mut Self::Context) {
+        match news {
+            News::Closing => Self::close(CloseCode::Away, ctx),
+            News::Lost => Self::close(CloseCode::Error, ctx),
+            News::Availability(available) if self.told.replace(available) != Some(available) => {
+                ctx.text(if available { "1" } else { "0" });
+            }
+            News::Availability(_) => {}
+        }
+    }
+}
+
+impl StreamHandler<Result<Message, ProtocolError>> for WebClient {
+    fn handle(&mut self, message: Result<Message, ProtocolError>, ctx: &mut Self::Context) {
+        match self.inbox.take(message) {
+            Heard::Text(text) if self.liveness.may_answer() => self.pick(&text, ctx),
+            Heard::Ping(data) if self.liveness.may_answer() => ctx.pong(&data),
+            Heard::Pong(content) => self.liveness.pong(&content),
+            Heard::Close(reason) => {
+                ctx.close(reason);
+                ctx.stop();
+            }
+            Heard::Nothing => {}
+            Heard::Text(_) | Heard::Ping(_) => {
+                log::warn!("client {}: asks too much between two pings", self.peer);
+                ctx.text("Error: too many requests on one connection.");
+                Self::close(CloseCode::Policy, ctx);
+            }
+            Heard::Wrong(wrong) => {
+                log::debug!("client {}: {wrong}", self.peer);
+                Self::close(wrong.code(), ctx);
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_message_may_name_a_world() {
+        let world = "https://github.com/u/r/blob/main/worlds/a.wbt";
+        let table = [
+            ("", None),
+            ("please", None),
+            (r#"{"other": 1}"#, None),
+            (r#"{"url": 5}"#, Some("5")),
+            (world, Some(world)),
+            (&format!(r#"{{"url": "{world}"}}"#), Some(world)),
+            ("http://no.world", Some("http://no.world")),
+        ];
+        for (text, expected) in table {
+            assert_eq!(wanted_world(text).as_deref(), expected, "{text:?}");
+        }
+    }
+}

@@ -1,0 +1,106 @@
+//! Reading configuration files: JSON with camelCase keys.
+//!
+//! A wrong type, a missing key or a value out of range is one line that names the file, the key, what was found and
+//! what is allowed. Unknown keys are warned about, with the nearest known one.
+
+use std::path::Path;
+
+use super::error::ConfigError;
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+
+/// A server's configuration.
+pub trait Configuration: DeserializeOwned + Serialize {
+    /// Other names of keys, which are accepted too.
+    const ALIASES: &'static [&'static str];
+
+    /// What no single value shows: rules between values, defaults that depend on the machine. Gives back warnings.
+    ///
+    /// # Errors
+    /// A key, and what is wrong with it.
+    fn complete(&mut self) -> Result<Vec<String>, Unfit>;
+}
+
+/// A value that doesn't fit the others.
+#[derive(Debug)]
+pub struct Unfit {
+    /// The key of the value.
+    pub key: &'static str,
+    /// What was found, and what is allowed.
+    pub problem: String,
+}
+
+/// A configuration that was read.
+#[derive(Debug)]
+pub struct Loaded<C> {
+    /// The effective values.
+    pub config: C,
+    /// What the administrator should know.
+    pub warnings: Vec<String>,
+}
+
+/// Reads a configuration file.
+///
+/// # Errors
+/// When it can't be read, or a value is not allowed.
+pub fn load<C: Configuration>(file: &Path) -> Result<Loaded<C>, ConfigError> {
+    let text =
+        std::fs::read_to_string(file).map_err(|source| ConfigError::Unreadable { file: file.to_owned(), source })?;
+    // Some editors begin a file with a mark of its encoding.
+    let text = text.strip_prefix('\u{feff}').unwrap_or(&text);
+    if !text.trim_start().starts_with('{') {
+        return Err(ConfigError::NoObject { file: file.to_owned() });
+    }
+    let mut unknown = Vec::new();
+    let mut json = serde_json::Deserializer::from_str(text);
+    let mut track = serde_path_to_error::Track::new();
+    let tracked = serde_path_to_error::Deserializer::new(&mut json, &mut track);
+    let parsed = serde_ignored::deserialize(tracked, |path| unknown.push(path.to_string()))
+        .and_then(|config| json.end().map(|()| config));
+    let mut config: C = parsed.map_err(|source| {
+        let key = Some(track.path().to_string()).filter(|key| key != "." && key != "?");
+        ConfigError::Malformed { file: file.to_owned(), key, source }
+    })?;
+    let known = known_keys(&config);
+    let mut warnings: Vec<String> = unknown.iter().map(|key| unknown_key(file, key, &known)).collect();
+    let more = config.complete().map_err(|Unfit { key, problem }| ConfigError::Unfit {
+        file: file.to_owned(),
+        key,
+        problem,
+    })?;
+    warnings.extend(more.iter().map(|warning| format!("{}: {warning}", file.display())));
+    Ok(Loaded { config, warnings })
+}
+
+/// The keys whose values differ. That of a secret is never among them.
+pub fn differences<C: Serialize>(one: &C, other: &C) -> Vec<String> {
+    let values = |config: &C| serde_json::to_value(config).unwrap_or_default();
+    let (one, other) = (values(one), values(other));
+    let keys = one.as_object().into_iter().flat_map(serde_json::Map::keys);
+    keys.filter(|key| one.get(key) != other.get(key)).cloned().collect()
+}
+
+/// Every key that a configuration has, with the keys of its parts as `part.key`.
+fn known_keys<C: Configuration>(config: &C) -> Vec<String> {
+    let mut keys: Vec<String> = C::ALIASES.iter().map(|&alias| alias.to_owned()).collect();
+    let Ok(serde_json::Value::Object(values)) = serde_json::to_value(config) else {
+        return keys;
+    };
+    for (key, value) in values {
+        if let serde_json::Value::Object(part) = value {
+            keys.extend(part.keys().map(|inner| format!("{key}.{inner}")));
+        }
+        keys.push(key);
+    }
+    keys
+}
+
+fn unknown_key(file: &Path, key: &str, known: &[String]) -> String {
+    let nearest = known
+        .iter()
+        .map(|candidate| (strsim::normalized_damerau_levenshtein(key, candidate), candidate))
+        .filter(|(likeness, _)| *likeness > 0.5)
+        .max_by(|(one, _), (other, _)| one.total_cmp(other));
+    let hint = nearest.map(|(_, candidate)| format!("; did you mean {candidate:?}?")).unwrap_or_default();
+    format!("{}: unknown key {key:?} is ignored{hint}", file.display())
+}

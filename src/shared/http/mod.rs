@@ -1,0 +1,23 @@
+//! What the web sides of both servers use: pages, live updates, WebSockets, limits, certificates, metrics.
+
+pub mod assets;
+mod auth;
+mod connections;
+mod live;
+pub mod liveness;
+mod metrics;
+mod origin;
+mod page;
+pub mod paths;
+mod peer;
+pub mod sockets;
+pub mod tls;
+pub mod websocket;
+
+pub use auth::Lock;
+pub use connections::{Connection, Connections};
+pub use live::{Live, Row, View};
+pub use metrics::{CONTENT_TYPE, Gauge, Metrics};
+pub use origin::Origin;
+pub use page::{Policy, fleet_sources, heat, html, width};
+pub use peer::{Peer, TrustedProxies};

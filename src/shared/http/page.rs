@@ -1,0 +1,216 @@
+//! How pages are sent: their type, and headers that let them do only what they need.
+
+use actix_web::http::header;
+use actix_web::{HttpRequest, HttpResponse};
+
+use crate::shared::domain::PublicAddress;
+
+/// What a page may load and reach: the value of `Content-Security-Policy`.
+#[derive(Debug, Clone)]
+pub struct Policy {
+    scripts: Vec<String>,
+    styles: Vec<String>,
+    pictures: Vec<String>,
+    connections: Vec<String>,
+    frames: bool,
+    framed: bool,
+    foreign: bool,
+}
+
+/// A policy that names more hosts than this would be too long for a header.
+const MOST_HOSTS: usize = 40;
+
+impl Policy {
+    /// A page that loads nothing but what its own server has, and no script or style that stands in the page itself.
+    #[must_use]
+    pub fn own() -> Self {
+        let own = || vec!["'self'".to_owned()];
+        Self {
+            scripts: own(),
+            styles: own(),
+            pictures: own(),
+            connections: own(),
+            frames: false,
+            framed: false,
+            foreign: false,
+        }
+    }
+
+    /// Lets a page open WebSockets to the server that it comes from: older browsers don't take them for its own. Only
+    /// `Host` tells which that is: `X-Forwarded-Host` and `Forwarded` may be anybody's word.
+    #[must_use]
+    pub fn own_websocket(mut self, request: &HttpRequest) -> Self {
+        let host = request.headers().get(header::HOST).and_then(|host| host.to_str().ok()).unwrap_or_default();
+        if !host.is_empty() && host.chars().all(|one| one.is_ascii_alphanumeric() || ".:-".contains(one)) {
+            self.connections.push(format!("ws://{host} wss://{host}"));
+        }
+        self
+    }
+
+    /// Lets a page connect to these sources.
+    #[must_use]
+    pub fn connect(mut self, sources: &[String]) -> Self {
+        self.connections.extend_from_slice(sources);
+        self
+    }
+
+    /// Lets a page run scripts of these sources, which may be WebAssembly, with their styles and pictures.
+    #[must_use]
+    pub fn run(mut self, sources: &[String]) -> Self {
+        let files = || sources.iter().filter(|source| !source.starts_with("ws")).cloned();
+        for list in [&mut self.scripts, &mut self.styles, &mut self.pictures] {
+            list.extend(files());
+        }
+        self.connections.extend_from_slice(sources);
+        self.scripts.push("'wasm-unsafe-eval'".to_owned());
+        self
+    }
+
+    /// Lets a page show pictures and fetch data that a world names, wherever they are.
+    #[must_use]
+    pub fn any_picture(mut self) -> Self {
+        self.pictures.extend(["data:".to_owned(), "blob:".to_owned(), "https:".to_owned()]);
+        self.connections.extend(["data:".to_owned(), "blob:".to_owned(), "https:".to_owned()]);
+        self
+    }
+
+    /// Lets a page hold pages of its own server.
+    #[must_use]
+    pub fn frames(mut self) -> Self {
+        self.frames = true;
+        self
+    }
+
+    /// Lets pages of the same server hold this one.
+    #[must_use]
+    pub fn framed(mut self) -> Self {
+        self.framed = true;
+        self
+    }
+
+    /// Makes a page a stranger to its own server: its scripts get no passwords, and nothing that is kept for others.
+    #[must_use]
+    pub fn foreign(mut self) -> Self {
+        self.foreign = true;
+        self
+    }
+
+    /// The header's value.
+    #[must_use]
+    pub fn text(&self) -> String {
+        let own_or_none = |allowed| if allowed { "'self'" } else { "'none'" };
+        format!(
+            "default-src 'none'; script-src {}; style-src {}; img-src {}; connect-src {}; frame-src {}; \
+             frame-ancestors {}; base-uri 'none'; form-action 'self'{}",
+            self.scripts.join(" "),
+            self.styles.join(" "),
+            self.pictures.join(" "),
+            self.connections.join(" "),
+            own_or_none(self.frames),
+            own_or_none(self.framed),
+            if self.foreign { "; sandbox allow-scripts allow-modals allow-pointer-lock" } else { "" },
+        )
+    }
+}
+
+/// The sources from which a fleet is reached: its hosts, with any port where ports are not rewritten, since each
+/// simulation has a port of its own. Any host, where one of them can't be named in a policy: it knows letters of ASCII
+/// and no IPv6 addresses (CSP Level 3, section 2.3.1).
+#[must_use]
+pub fn fleet_sources<'address>(addresses: impl Iterator<Item = &'address PublicAddress>, ssl: bool) -> Vec<String> {
+    let (http, websocket) = if ssl { ("https", "wss") } else { ("http", "ws") };
+    let mut hosts: Vec<String> = addresses
+        .map(|address| format!("{}{}", address.host(), if address.is_rewritten() { "" } else { ":*" }))
+        .collect();
+    hosts.sort_unstable();
+    hosts.dedup();
+    let can_be_named = |host: &String| host.chars().all(|one| one.is_ascii_alphanumeric() || ".:*-".contains(one));
+    if hosts.len() > MOST_HOSTS || !hosts.iter().all(can_be_named) {
+        return vec![format!("{http}:"), format!("{websocket}:")];
+    }
+    hosts.iter().flat_map(|host| [format!("{http}://{host}"), format!("{websocket}://{host}")]).collect()
+}
+
+/// How a bar of so many percent is coloured.
+#[must_use]
+pub fn heat(percent: &f64) -> &'static str {
+    match *percent {
+        ..70.0 => "cool",
+        70.0..95.0 => "warm",
+        _ => "hot",
+    }
+}
+
+/// How long a bar of so many percent is.
+#[must_use]
+pub fn width(percent: &f64) -> String {
+    format!("{:.1}", percent.clamp(0.0, 100.0))
+}
+
+/// Sends a page.
+#[must_use]
+pub fn html(page: Result<String, askama::Error>, policy: &Policy) -> HttpResponse {
+    match page {
+        Ok(page) => HttpResponse::Ok()
+            .insert_header((header::CONTENT_SECURITY_POLICY, policy.text()))
+            .insert_header((header::X_CONTENT_TYPE_OPTIONS, "nosniff"))
+            .insert_header((header::REFERRER_POLICY, "no-referrer"))
+            .insert_header(("Cross-Origin-Opener-Policy", "same-origin"))
+            .content_type("text/html; charset=utf-8")
+            .body(page),
+        Err(error) => HttpResponse::InternalServerError().body(format!("Error: {error}.")),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn addresses(texts: &[&str]) -> Vec<PublicAddress> {
+        texts.iter().map(|text| text.parse().unwrap()).collect()
+    }
+
+    #[test]
+    fn a_fleet_is_named_by_its_hosts() {
+        let sources = |texts: &[&str], ssl| fleet_sources(addresses(texts).iter(), ssl);
+        assert_eq!(sources(&["a:1", "a:2"], false), ["http://a:*", "ws://a:*"]);
+        assert_eq!(sources(&["b/2000", "a/2000"], true), ["https://a", "wss://a", "https://b", "wss://b"]);
+        assert_eq!(sources(&["b:8443/2000"], true), ["https://b:8443", "wss://b:8443"]);
+        assert_eq!(
+            sources(&["b\u{fc}ro.example:1"], true),
+            ["https://xn--bro-hoa.example:*", "wss://xn--bro-hoa.example:*"]
+        );
+        assert_eq!(sources(&["a:1", "[::1]:2000"], false), ["http:", "ws:"], "an IPv6 address can't be named");
+        let many: Vec<String> = (0..50).map(|number| format!("h{number}:1")).collect();
+        let many: Vec<&str> = many.iter().map(String::as_str).collect();
+        assert_eq!(sources(&many, true), ["https:", "wss:"], "too long to be named one by one");
+    }
+
+    #[test]
+    fn a_page_reaches_the_host_that_it_was_asked_from() {
+        let policy = |headers: &[(&'static str, &'static str)]| {
+            let request = actix_web::test::TestRequest::default();
+            let request = headers.iter().fold(request, |request, header| request.insert_header(*header));
+            Policy::own().own_websocket(&request.to_http_request()).text()
+        };
+        assert!(
+            policy(&[("host", "a.example:8443")])
+                .contains("connect-src 'self' ws://a.example:8443 wss://a.example:8443;")
+        );
+        assert!(policy(&[("host", "a.example; img-src *")]).contains("connect-src 'self';"));
+        let forged = [("x-forwarded-host", "evil.example"), ("forwarded", "host=evil.example")];
+        for forged in forged {
+            assert!(!policy(&[("host", "a.example"), forged]).contains("evil.example"), "{forged:?}");
+            assert!(!policy(&[forged]).contains("evil.example"), "{forged:?}");
+        }
+    }
+
+    #[test]
+    fn no_policy_lets_a_page_run_what_stands_in_it() {
+        let fleet = vec!["http://a:*".to_owned()];
+        for policy in [Policy::own(), Policy::own().connect(&fleet).frames(), Policy::own().run(&fleet).any_picture()] {
+            assert!(!policy.text().contains("unsafe-inline"), "{}", policy.text());
+            assert!(policy.text().starts_with("default-src 'none'; script-src 'self'"), "{}", policy.text());
+        }
+    }
+}

@@ -1,0 +1,136 @@
+//! Why a world can't be checked out, in words for its client. Pure.
+
+use std::io;
+use std::time::Duration;
+
+use super::git::GitError;
+use super::revision::Revision;
+use super::world_file::NoWorld;
+use crate::shared::domain::ProjectUrl;
+
+/// Why a checkout failed. Its words are for the client.
+#[derive(Debug, Clone, thiserror::Error)]
+pub enum CheckoutError {
+    /// No way to this forge.
+    #[error(
+        "This simulation server takes worlds from github.com and from the mirrors that it is configured with, not from {0}"
+    )]
+    Forge(String),
+    /// The repository is not there.
+    #[error("{0} does not exist or is not public")]
+    NoRepository(String),
+    /// The reference is not there.
+    #[error("{repository} has no branch, tag or commit called {reference:?}")]
+    NoReference {
+        /// The repository's URL.
+        repository: String,
+        /// As the URL has it.
+        reference: String,
+    },
+    /// The world can't be opened.
+    #[error(transparent)]
+    World(#[from] NoWorld),
+    /// The commit is not one that the repository's owner vouches for.
+    #[error(
+        "{commit} is in no branch or tag of {repository}. Forges also hand out commits that a repository's owner never \
+         accepted; this simulation server runs them only if its administrator sets anyCommit"
+    )]
+    NotReachable {
+        /// The repository's URL.
+        repository: String,
+        /// The hash.
+        commit: String,
+    },
+    /// It has too many files.
+    #[error("The project has more than {0} files and folders")]
+    TooMany(u64),
+    /// It took too long.
+    #[error("Fetching {repository} took longer than {seconds} seconds")]
+    TooSlow {
+        /// The repository's URL.
+        repository: String,
+        /// The limit.
+        seconds: u64,
+    },
+    /// It is too large.
+    #[error("{what} is larger than {limit} MiB")]
+    TooLarge {
+        /// What.
+        what: String,
+        /// The limit.
+        limit: u64,
+    },
+    /// git failed.
+    #[error("{repository} can't be checked out: {source}")]
+    Git {
+        /// The repository's URL.
+        repository: String,
+        /// What git says.
+        source: GitError,
+    },
+    /// git failed on what is in the cache.
+    #[error("{repository} can't be checked out: {source}")]
+    Damaged {
+        /// The repository's URL.
+        repository: String,
+        /// What git says.
+        source: GitError,
+    },
+    /// The machine failed.
+    #[error("{0} can't be checked out: {1}")]
+    Machine(String, String),
+    /// The file to restore is not there.
+    #[error("{0:?} is no file below the project's controllers folder")]
+    NoController(String),
+}
+
+/// The world's URL names nothing that is there.
+#[must_use]
+pub fn no_reference(world: &ProjectUrl) -> CheckoutError {
+    let reference = world.candidates().into_iter().next().map(|reading| reading.reference).unwrap_or_default();
+    CheckoutError::NoReference { repository: world.repository(), reference }
+}
+
+/// What a failed fetch means. A commit that the remote does not know is the client's fault, not git's.
+#[must_use]
+pub fn fetch_failed(world: &ProjectUrl, revision: &Revision, source: GitError) -> CheckoutError {
+    let unknown = ["not our ref", "unadvertised object", "couldn't find remote ref", "remote did not send"];
+    if revision.is_commit() && unknown.iter().any(|words| source.message.contains(words)) {
+        return no_reference(world);
+    }
+    git_failed(world, source)
+}
+
+/// What a failed command means that asks the remote. git asks for a password where a forge says 'not found': forges don't tell private from missing.
+#[must_use]
+pub fn git_failed(world: &ProjectUrl, source: GitError) -> CheckoutError {
+    let missing = ["could not read Username", "not found", "does not appear to be a git repository", "does not exist"];
+    if missing.iter().any(|words| source.message.contains(words)) {
+        return CheckoutError::NoRepository(world.repository());
+    }
+    CheckoutError::Git { repository: world.repository(), source }
+}
+
+/// git failed on what is in the cache, without asking anybody.
+#[must_use]
+pub fn damaged(world: &ProjectUrl, source: GitError) -> CheckoutError {
+    CheckoutError::Damaged { repository: world.repository(), source }
+}
+
+/// The time limit has passed.
+#[must_use]
+pub fn too_slow(world: &ProjectUrl, limit: Duration) -> CheckoutError {
+    CheckoutError::TooSlow { repository: world.repository(), seconds: limit.as_secs() }
+}
+
+/// The size limit, in bytes, has passed.
+#[must_use]
+pub fn too_large(what: String, limit: u64) -> CheckoutError {
+    CheckoutError::TooLarge { what, limit: limit >> 20 }
+}
+
+/// The machine has failed.
+#[must_use]
+pub fn machine(world: &ProjectUrl, error: &io::Error) -> CheckoutError {
+    CheckoutError::Machine(world.repository(), error.to_string())
+}

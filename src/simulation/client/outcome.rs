@@ -1,0 +1,85 @@
+//! What came of a client's wish for a simulation: counted once for each start that was asked for.
+
+use prometheus::IntCounterVec;
+
+use crate::shared::http::Metrics;
+
+/// What came of it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Outcome {
+    /// The rules do not allow this world, or its URL is wrong.
+    Refused,
+    /// All places and the waiting line are taken.
+    Full,
+    /// The world could not be checked out.
+    NoCheckout,
+    /// Webots did not become ready.
+    NoWebots,
+    /// The client left before Webots was ready.
+    Left,
+    /// The server was asked to stop before Webots was ready.
+    Stopped,
+    /// Webots was ready.
+    Ready,
+}
+
+const ALL: [Outcome; 7] = [
+    Outcome::Refused,
+    Outcome::Full,
+    Outcome::NoCheckout,
+    Outcome::NoWebots,
+    Outcome::Left,
+    Outcome::Stopped,
+    Outcome::Ready,
+];
+
+impl Outcome {
+    fn label(self) -> &'static str {
+        match self {
+            Self::Refused => "refused",
+            Self::Full => "full",
+            Self::NoCheckout => "no_checkout",
+            Self::NoWebots => "no_webots",
+            Self::Left => "left",
+            Self::Stopped => "stopped",
+            Self::Ready => "ready",
+        }
+    }
+}
+
+/// The counter `simulation_starts_total`, with a zero for each outcome.
+///
+/// # Errors
+/// When there is one already.
+pub fn counter(metrics: &Metrics) -> Result<IntCounterVec, prometheus::Error> {
+    let counter = metrics.counter("simulation_starts_total", "Simulations that were asked for", "outcome")?;
+    for outcome in ALL {
+        counter.with_label_values(&[outcome.label()]);
+    }
+    Ok(counter)
+}
+
+/// A start whose outcome is not known yet, if one was asked for. Dropping it means that the client has left.
+#[derive(Debug, Default)]
+pub struct Pending(Option<IntCounterVec>);
+
+impl Pending {
+    /// A start was asked for.
+    #[must_use]
+    pub fn new(counter: &IntCounterVec) -> Self {
+        Self(Some(counter.clone()))
+    }
+
+    /// The outcome is known. Only the first one counts.
+    pub fn is(&mut self, outcome: Outcome) {
+        if let Some(counter) = self.0.take() {
+            counter.with_label_values(&[outcome.label()]).inc();
+        }
+    }
+}
+
+impl Drop for Pending {
+    fn drop(&mut self) {
+        self.is(Outcome::Left);
+    }
+}

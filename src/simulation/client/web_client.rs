@@ -1,0 +1,287 @@
+//! Actor: one WebSocket on `/client`. Its life is the life of one simulation, as one state machine.
+//!
+//! Created by the route for each connection; ends with it. The connection is the lease: whatever this actor holds in
+//! any state (a place in the line, a checkout under way, a running Webots) is given back when it is dropped.
+
+use std::sync::Arc;
+
+use actix::prelude::*;
+use actix_web_actors::ws::{CloseCode, CloseReason, Message, ProtocolError, WebsocketContext};
+
+use super::lease::{Lease, Stage, Wanted};
+use super::outcome::{Outcome, Pending};
+use crate::shared::http::Connection;
+use crate::shared::http::Peer;
+use crate::shared::http::liveness::{self, Liveness};
+use crate::shared::http::websocket::{Heard, Inbox};
+use crate::shared::run::closing;
+use crate::simulation::census::Change;
+use crate::simulation::checkout::{Progress, Project};
+use crate::simulation::places::{Ask, PlaceEvent, Ticket};
+use crate::simulation::protocol::{self, Mode, Request};
+use crate::simulation::state::AppState;
+use crate::simulation::webots::Orders;
+use crate::simulation::webots::{Exit, WebotsEvent};
+use crate::simulation::webots::{RestoreController, Webots};
+
+/// The actor.
+pub struct WebClient {
+    server: Arc<AppState>,
+    peer: Peer,
+    stage: Stage,
+    liveness: Liveness,
+    restoring: bool,
+    start: Pending,
+    inbox: Inbox,
+    _connection: Connection,
+}
+
+type Context = WebsocketContext<WebClient>;
+
+impl WebClient {
+    /// A client that has just connected; `connection` counts it, `inbox` takes what comes from it.
+    #[must_use]
+    pub fn new(server: Arc<AppState>, peer: Peer, (connection, inbox): (Connection, Inbox)) -> Self {
+        Self {
+            server,
+            peer,
+            stage: Stage::Connected,
+            liveness: Liveness::new(),
+            restoring: false,
+            start: Pending::default(),
+            inbox,
+            _connection: connection,
+        }
+    }
+
+    fn name(&self) -> String {
+        format!("client {}", self.peer)
+    }
+
+    /// Tells a failure, and closes the connection.
+    fn fail(&mut self, why: &str, ctx: &mut Context) {
+        log::info!("{}: {why}", self.name());
+        self.finish(&protocol::error(why), CloseCode::Normal, ctx);
+    }
+
+    /// The start that was asked for has failed.
+    fn fail_start(&mut self, outcome: Outcome, why: &str, ctx: &mut Context) {
+        self.start.is(outcome);
+        self.fail(why, ctx);
+    }
+
+    fn finish(&mut self, last_words: &str, code: CloseCode, ctx: &mut Context) {
+        self.stage = Stage::Over;
+        ctx.text(last_words.to_owned());
+        ctx.close(Some(CloseReason { code, description: None }));
+        ctx.stop();
+    }
+
+    fn understand(&mut self, text: &str, ctx: &mut Context) {
+        match Request::parse(text) {
+            Ok(Request::Start { url, mode }) => self.start(&url, mode, ctx),
+            Ok(Request::ResetController(file)) => self.reset_controller(file, ctx),
+            Err(wrong) => self.fail(&wrong.to_string(), ctx),
+        }
+    }
+
+    fn start(&mut self, url: &str, mode: Mode, ctx: &mut Context) {
+        if !matches!(self.stage, Stage::Connected) {
+            log::warn!("{}: asks for a second simulation on one connection; ignored", self.name());
+            return;
+        }
+        self.start = Pending::new(&self.server.starts);
+        let world = match self.server.admit(url) {
+            Ok(world) => world,
+            Err(why) => return self.fail_start(Outcome::Refused, &why, ctx),
+        };
+        log::info!("{}: asks for {world}", self.name());
+        let ask = Ask { client: ctx.address().recipient(), world: world.to_string() };
+        self.stage = Stage::Asking { wanted: Wanted { world, mode }, granted: None };
+        let asked = self.server.places.send(ask).into_actor(self);
+        asked
+            .map(|answer, this, ctx| match answer {
+                Ok(Ok(ticket)) => this.ticket_came(ticket, ctx),
+                Ok(Err(refused)) => this.fail_start(Outcome::Full, &refused.to_string(), ctx),
+                Err(error) => this.fail(&format!("This simulation server can't lend a place: {error}"), ctx),
+            })
+            .spawn(ctx);
+    }
+
+    fn ticket_came(&mut self, ticket: Ticket, ctx: &mut Context) {
+        match std::mem::replace(&mut self.stage, Stage::Over) {
+            Stage::Asking { wanted, granted: Some(port) } => self.check_out(wanted, ticket, port, ctx),
+            Stage::Asking { wanted, granted: None } => self.stage = Stage::Waiting { wanted, ticket },
+            other => self.stage = other,
+        }
+    }
+
+    fn check_out(&mut self, Wanted { world, mode }: Wanted, ticket: Ticket, port: u16, ctx: &mut Context) {
+        let instance = match self.server.run.instance() {
+            Ok(instance) => instance,
+            Err(error) => {
+                let why = format!("This simulation server has no room for a project: {error}");
+                return self.fail_start(Outcome::NoCheckout, &why, ctx);
+            }
+        };
+        self.stage = Stage::CheckingOut { mode, place: (ticket, port) };
+        let me = ctx.address();
+        // A step that is told while the mailbox is full is one step less on the screen.
+        let progress = move |text: String| drop(me.try_send(Progress(text)));
+        let job = self.server.checkouts.start(world, instance, progress);
+        job.into_actor(self)
+            .map(|result, this, ctx| match result {
+                Ok(Ok(project)) => this.launch(project, ctx),
+                Ok(Err(error)) => this.fail_start(Outcome::NoCheckout, &error.to_string(), ctx),
+                Err(error) => this.fail_start(Outcome::NoCheckout, &format!("The checkout broke off: {error}"), ctx),
+            })
+            .spawn(ctx);
+    }
+
+    fn launch(&mut self, project: Project, ctx: &mut Context) {
+        let (mode, place) = match std::mem::replace(&mut self.stage, Stage::Over) {
+            Stage::CheckingOut { mode, place } => (mode, place),
+            other => return self.stage = other,
+        };
+        let program = match self.server.webots_program() {
+            Ok(program) => program,
+            Err(why) => return self.fail_start(Outcome::NoWebots, &why, ctx),
+        };
+        log::info!("{}: {} is for Webots {}", self.name(), project.world.path.display(), project.world.version);
+        place.0.update(Change::Version(project.world.version.clone()));
+        for warning in &project.warnings {
+            ctx.text(protocol::loading(warning));
+        }
+        ctx.text(protocol::loading("webots is starting"));
+        let orders = Orders {
+            config: Arc::clone(&self.server.config),
+            program,
+            checkouts: Arc::clone(&self.server.checkouts),
+            project: Arc::new(project),
+            mode,
+            place,
+            events: ctx.address().recipient(),
+        };
+        let webots = Webots::start_in_arbiter(&self.server.main_thread, |_| Webots::new(orders));
+        self.stage = Stage::Launched(Lease(webots));
+        ctx.text(protocol::shutdown_timeout(self.server.config.timeout));
+    }
+
+    fn reset_controller(&mut self, file: String, ctx: &mut Context) {
+        let Stage::Launched(Lease(webots)) = &self.stage else {
+            return ctx.text(protocol::error("A controller can be reset only while a simulation runs"));
+        };
+        if std::mem::replace(&mut self.restoring, true) {
+            log::warn!("{}: asks to reset a controller while another is being reset; ignored", self.name());
+            return;
+        }
+        let restored = webots.send(RestoreController(file.clone())).into_actor(self);
+        restored
+            .map(move |answer, this, ctx| {
+                this.restoring = false;
+                match answer {
+                    Ok(Ok(())) => ctx.text(protocol::reset_controller(&file)),
+                    // That does not end the simulation.
+                    Ok(Err(error)) => ctx.text(protocol::error(&error.to_string())),
+                    Err(error) => log::warn!("{}: no controller was reset: {error}", this.name()),
+                }
+            })
+            .spawn(ctx);
+    }
+
+    fn exited(&mut self, Exit { clean, why }: &Exit, ctx: &mut Context) {
+        let words = if *clean { protocol::loading(why) } else { protocol::error(why) };
+        self.start.is(Outcome::NoWebots);
+        self.finish(&words, CloseCode::Normal, ctx);
+    }
+}
+
+impl Actor for WebClient {
+    type Context = Context;
+
+    fn started(&mut self, ctx: &mut Self::Context) {
+        log::info!("{}: connected", self.name());
+        let timing = &self.server.config.timing;
+        liveness::watch(ctx, timing.ping, timing.silence, |client| &mut client.liveness);
+        closing(self.server.phase.clone())
+            .into_actor(self)
+            .map(|(), this, ctx| {
+                this.start.is(Outcome::Stopped);
+                this.finish(&protocol::error("This simulation server is stopping"), CloseCode::Away, ctx);
+            })
+            .spawn(ctx);
+    }
+
+    fn stopped(&mut self, _: &mut Self::Context) {
+        log::info!("{}: gone", self.name());
+    }
+}
+
+impl StreamHandler<Result<Message, ProtocolError>> for WebClient {
+    fn handle(&mut self, message: Result<Message, ProtocolError>, ctx: &mut Self::Context) {
+        match self.inbox.take(message) {
+            Heard::Text(text) if self.liveness.may_answer() => self.understand(&text, ctx),
+            Heard::Ping(data) if self.liveness.may_answer() => ctx.pong(&data),
+            Heard::Pong(content) => self.liveness.pong(&content),
+            Heard::Close(reason) => {
+                ctx.close(reason);
+                ctx.stop();
+            }
+            Heard::Nothing => {}
+            Heard::Text(_) | Heard::Ping(_) => {
+                log::warn!("{}: asks too much between two pings", self.name());
+                self.finish(&protocol::error("Too many requests on one connection"), CloseCode::Policy, ctx);
+            }
+            Heard::Wrong(wrong) => {
+                log::info!("{}: {wrong}", self.name());
+                self.finish(&protocol::error(&wrong.to_string()), wrong.code(), ctx);
+            }
+        }
+    }
+}
+
+impl Handler<PlaceEvent> for WebClient {
+    type Result = ();
+
+    fn handle(&mut self, event: PlaceEvent, ctx: &mut Self::Context) {
+        match (event, std::mem::replace(&mut self.stage, Stage::Over)) {
+            (PlaceEvent::Granted(port), Stage::Waiting { wanted, ticket }) => self.check_out(wanted, ticket, port, ctx),
+            (PlaceEvent::Granted(port), Stage::Asking { wanted, .. }) => {
+                self.stage = Stage::Asking { wanted, granted: Some(port) };
+            }
+            (PlaceEvent::Ahead(ahead), stage @ (Stage::Waiting { .. } | Stage::Asking { .. })) => {
+                self.stage = stage;
+                ctx.text(protocol::queue(ahead));
+            }
+            (_, stage) => self.stage = stage,
+        }
+    }
+}
+
+impl Handler<Progress> for WebClient {
+    type Result = ();
+
+    fn handle(&mut self, Progress(text): Progress, ctx: &mut Self::Context) {
+        if matches!(self.stage, Stage::CheckingOut { .. }) {
+            ctx.text(protocol::loading(&text));
+        }
+    }
+}
+
+impl Handler<WebotsEvent> for WebClient {
+    type Result = ();
+
+    fn handle(&mut self, event: WebotsEvent, ctx: &mut Self::Context) {
+        match event {
+            WebotsEvent::Listening(port) => {
+                self.start.is(Outcome::Ready);
+                ctx.text(protocol::webots(&self.server.config.address(port), self.server.config.ssl));
+            }
+            WebotsEvent::Heartbeat => ctx.text(protocol::HEARTBEAT),
+            WebotsEvent::Hanging(seconds) => {
+                ctx.text(protocol::loading(&format!("Webots has given no sign of life for {seconds} seconds")));
+            }
+            WebotsEvent::Exited(exit) => self.exited(&exit, ctx),
+        }
+    }
+}

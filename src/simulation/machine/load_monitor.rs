@@ -1,0 +1,290 @@
+//! Actor: takes a sample of the machine each second, keeps ten minutes of them, and writes them to a CSV file.
+//!
+//! One for the whole server, created at start; it never ends. Two threads read the machine and the GPUs, so that a
+//! driver that hangs holds up nothing: readings of GPUs that are too old no longer count. Everybody else reads the
+//! newest [`Readings`] from a watch channel, which costs no wait.
+
+use std::collections::VecDeque;
+use std::io::Write;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::{Duration, Instant, SystemTime};
+
+use actix::prelude::*;
+use serde::Serialize;
+use tokio::sync::watch;
+
+use super::sensors::{self, Gpu, GpuSensor, Host, Machine, MachineSensor};
+use crate::shared::domain::Load;
+use crate::simulation::places::{Census, Places};
+
+/// Between two samples.
+const PERIOD: Duration = Duration::from_secs(1);
+/// How many samples the load is a mean of.
+const MEAN_OF: usize = 5;
+/// How many samples are kept: ten minutes.
+const KEPT: usize = 600;
+/// Older readings of GPUs don't count.
+const GPU_AGE: Duration = Duration::from_secs(10);
+/// How many lines `monitor.csv` has before it is put aside: a day.
+const CSV_LINES: usize = 86_400;
+/// The columns of the original.
+const CSV_HEADER: &str = "Timestamp, Webots running, Webots idle, CPU load, CPU memory, GPU load compute, GPU load memory, \
+                          GPU memory, Swap, Disk, Network sent, Network received";
+
+/// What is known of the machine's load.
+#[derive(Debug, Clone, Default)]
+pub struct Readings {
+    /// The mean of the last five seconds.
+    pub load: Option<Load>,
+    /// What the machine is.
+    pub host: Host,
+    /// The newest reading.
+    pub machine: Machine,
+    /// The newest reading; empty without GPUs.
+    pub gpus: Vec<Gpu>,
+    /// The last ten minutes, the oldest first.
+    pub history: VecDeque<Sample>,
+}
+
+/// One line of `monitor.csv`.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+#[serde(rename_all = "camelCase")]
+pub struct Sample {
+    /// Seconds since 1970.
+    pub timestamp: u64,
+    /// Simulations that run.
+    pub running: u32,
+    /// Simulations that are paused.
+    pub idle: u32,
+    /// The machine.
+    #[serde(flatten)]
+    pub machine: Machine,
+    /// The least busy GPU: percent.
+    pub gpu_compute: f64,
+    /// Percent.
+    pub gpu_memory_traffic: f64,
+    /// Percent.
+    pub gpu_memory: f64,
+    /// The load of this second, percent.
+    #[serde(skip)]
+    pub load: Load,
+}
+
+#[derive(Message)]
+#[rtype(result = "()")]
+struct MachineRead(Machine);
+
+#[derive(Message)]
+#[rtype(result = "()")]
+struct GpusRead(Vec<Gpu>);
+
+/// The actor.
+pub struct LoadMonitor {
+    places: Addr<Places>,
+    published: watch::Sender<Arc<Readings>>,
+    csv: Option<PathBuf>,
+    csv_lines: usize,
+    disk: PathBuf,
+    machine: Machine,
+    gpus: Option<(Instant, Vec<Gpu>)>,
+}
+
+impl LoadMonitor {
+    /// Creates the actor. `disk` is a folder on the disk that is watched, `csv` the file that samples are written to.
+    #[must_use]
+    pub fn new(places: Addr<Places>, disk: &Path, csv: Option<PathBuf>) -> (Self, watch::Receiver<Arc<Readings>>) {
+        let (published, readings) = watch::channel(Arc::default());
+        let (machine, disk) = (Machine::default(), disk.to_owned());
+        (Self { places, published, csv, csv_lines: 0, disk, machine, gpus: None }, readings)
+    }
+
+    fn sample(&mut self, ctx: &mut Context<Self>) {
+        let census = self.places.send(Census).timeout(PERIOD);
+        census
+            .into_actor(self)
+            .map(|census, this, _| {
+                let instances = census.map(|census| census.instances).unwrap_or_default();
+                this.publish(instances.running, instances.idle);
+            })
+            .spawn(ctx);
+    }
+
+    fn publish(&mut self, running: u32, idle: u32) {
+        if self.gpus.as_ref().is_some_and(|(read, _)| read.elapsed() > GPU_AGE) {
+            log::error!("the GPUs' driver no longer answers: they don't count for the load");
+            self.gpus = None;
+        }
+        let gpus = self.gpus.as_ref().map(|(_, gpus)| gpus.clone()).unwrap_or_default();
+        let least = gpus.iter().min_by(|one, other| one.compute.total_cmp(&other.compute)).cloned().unwrap_or_default();
+        let sample = Sample {
+            timestamp: SystemTime::UNIX_EPOCH.elapsed().map_or(0, |age| age.as_secs()),
+            running,
+            idle,
+            machine: self.machine,
+            gpu_compute: least.compute,
+            gpu_memory_traffic: least.memory_traffic,
+            gpu_memory: least.memory,
+            load: sensors::load(&self.machine, &gpus),
+        };
+        self.write(sample);
+        self.published.send_modify(|readings| {
+            let readings = Arc::make_mut(readings);
+            readings.machine = self.machine;
+            readings.gpus = gpus;
+            if readings.history.len() == KEPT {
+                readings.history.pop_front();
+            }
+            readings.history.push_back(sample);
+            readings.load = mean(readings.history.iter().rev().take(MEAN_OF).map(|sample| sample.load.percent()));
+        });
+    }
+
+    fn write(&mut self, sample: Sample) {
+        let Some(path) = self.csv.clone() else {
+            return;
+        };
+        let first = self.csv_lines.is_multiple_of(CSV_LINES);
+        let put_aside = first && self.csv_lines > 0;
+        self.csv_lines += 1;
+        // A disk that is full or slow costs the lines, nothing else.
+        drop(actix_rt::task::spawn_blocking(move || append(&path, &sample, first, put_aside)));
+    }
+}
+
+fn mean(values: impl Iterator<Item = f64>) -> Option<Load> {
+    let (sum, count) = values.fold((0.0, 0_u32), |(sum, count), value| (sum + value, count + 1));
+    Load::try_from(sum / f64::from(count)).ok()
+}
+
+fn append(path: &Path, sample: &Sample, first: bool, put_aside: bool) -> std::io::Result<()> {
+    if let Some(folder) = path.parent() {
+        std::fs::create_dir_all(folder)?;
+    }
+    if put_aside {
+        std::fs::rename(path, path.with_extension("csv.1"))?;
+    }
+    let mut file = std::fs::File::options().create(true).append(!first).write(true).truncate(first).open(path)?;
+    if file.metadata()?.len() == 0 {
+        writeln!(file, "{CSV_HEADER}")?;
+    }
+    let Sample { timestamp, running, idle, machine, gpu_compute, gpu_memory_traffic, gpu_memory, .. } = sample;
+    let Machine { cpu, memory, swap, disk, network_sent, network_received } = machine;
+    writeln!(
+        file,
+        "{timestamp}, {running}, {idle}, {cpu:.1}, {memory:.1}, {gpu_compute}, {gpu_memory_traffic}, {gpu_memory:.1}, \
+         {swap:.1}, {disk:.1}, {network_sent:.6}, {network_received:.6}"
+    )
+}
+
+impl Actor for LoadMonitor {
+    type Context = Context<Self>;
+
+    fn started(&mut self, ctx: &mut Self::Context) {
+        match MachineSensor::open(&self.disk) {
+            Ok(mut sensor) => {
+                let host = sensor.host();
+                self.published.send_modify(|readings| Arc::make_mut(readings).host = host);
+                read_each_period(ctx.address().recipient(), move || MachineRead(sensor.read()));
+            }
+            Err(error) => log::error!("the machine can't be read: {error}"),
+        }
+        read_gpus(ctx.address().recipient());
+        ctx.run_interval(PERIOD, Self::sample);
+    }
+}
+
+/// Opens the driver and reads the GPUs. Both may hang, which must not hold up even the end of the program: the thread
+/// is none of the runtime's.
+fn read_gpus(actor: Recipient<GpusRead>) {
+    let opening = std::thread::Builder::new().name("gpus".to_owned()).spawn(move || match GpuSensor::open() {
+        Ok(sensor) => read_each_period(actor, move || GpusRead(sensor.read())),
+        Err(error) => log::info!("no NVIDIA GPU is read: {error}"),
+    });
+    if let Err(error) = opening {
+        log::error!("no thread can be started to read the GPUs: {error}");
+    }
+}
+
+/// Reads a sensor on a thread of its own, for as long as the actor takes the readings.
+fn read_each_period<M>(actor: Recipient<M>, mut read: impl FnMut() -> M + Send + 'static)
+where
+    M: Message<Result = ()> + Send + 'static,
+{
+    let reading = std::thread::Builder::new().name("sensor".to_owned()).spawn(move || {
+        loop {
+            // A full mailbox costs one reading.
+            if let Err(SendError::Closed(_)) = actor.try_send(read()) {
+                return;
+            }
+            std::thread::sleep(PERIOD);
+        }
+    });
+    if let Err(error) = reading {
+        log::error!("no thread can be started to read the machine: {error}");
+    }
+}
+
+impl Handler<MachineRead> for LoadMonitor {
+    type Result = ();
+
+    fn handle(&mut self, MachineRead(machine): MachineRead, _: &mut Self::Context) {
+        self.machine = machine;
+    }
+}
+
+impl Handler<GpusRead> for LoadMonitor {
+    type Result = ();
+
+    fn handle(&mut self, GpusRead(gpus): GpusRead, _: &mut Self::Context) {
+        if self.gpus.is_none() {
+            let names: Vec<&str> = gpus.iter().map(|gpu| gpu.name.as_str()).collect();
+            log::info!("GPUs: {}", names.join(", "));
+        }
+        self.gpus = Some((Instant::now(), gpus));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[actix_rt::test]
+    async fn the_load_is_the_mean_of_five_seconds_and_the_history_is_ten_minutes_long() {
+        let places = Places::new(2001..=2001, 1).start();
+        let (mut monitor, readings) = LoadMonitor::new(places, Path::new("/"), None);
+        let load = || readings.borrow().load.map(Load::percent);
+        assert_eq!(load(), None);
+        let mut read = |cpu: f64| {
+            monitor.machine.cpu = cpu;
+            monitor.publish(0, 0);
+        };
+        let table = [(10.0, 10.0), (20.0, 15.0), (30.0, 20.0), (40.0, 25.0), (50.0, 30.0), (60.0, 40.0), (0.0, 36.0)];
+        for (cpu, mean) in table {
+            read(cpu);
+            assert_eq!(load(), Some(mean), "after {cpu}");
+        }
+        for second in 0..700 {
+            read(f64::from(second));
+        }
+        let history: Vec<f64> = readings.borrow().history.iter().map(|sample| sample.machine.cpu).collect();
+        assert_eq!(history, (100..700).map(f64::from).collect::<Vec<f64>>());
+        assert_eq!(PERIOD * 600, Duration::from_mins(10));
+    }
+
+    #[actix_rt::test]
+    async fn gpus_that_are_no_longer_read_do_not_count() {
+        let places = Places::new(2001..=2001, 1).start();
+        let (mut monitor, readings) = LoadMonitor::new(places, Path::new("/"), None);
+        let gpu = Gpu { compute: 90.0, ..Gpu::default() };
+        let before = |age: Duration| Instant::now().checked_sub(age).unwrap();
+        monitor.gpus = Some((before(GPU_AGE / 2), vec![gpu.clone()]));
+        monitor.publish(0, 0);
+        assert_eq!(readings.borrow().gpus.len(), 1);
+        assert_eq!(readings.borrow().load.map(Load::percent), Some(90.0));
+        monitor.gpus = Some((before(GPU_AGE * 2), vec![gpu]));
+        monitor.publish(0, 0);
+        assert_eq!(readings.borrow().gpus, []);
+        assert_eq!(readings.borrow().load.map(Load::percent), Some(45.0));
+    }
+}

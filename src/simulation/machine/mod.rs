@@ -1,0 +1,9 @@
+//! The machine: CPU, memory, disk, network, GPUs and display, and the load that is made of them.
+
+pub mod display;
+mod load_monitor;
+pub mod sensors;
+mod usage;
+
+pub use load_monitor::{LoadMonitor, Readings, Sample};
+pub use usage::{Usage, UsageMonitor, Usages};

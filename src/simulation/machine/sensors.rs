@@ -1,0 +1,238 @@
+//! Readings of the machine (sysinfo) and of its NVIDIA GPUs (NVML).
+
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+use nvml_wrapper::Nvml;
+use nvml_wrapper::error::NvmlError;
+use serde::Serialize;
+use sysinfo::{CpuRefreshKind, Disks, MemoryRefreshKind, Networks, RefreshKind, System};
+
+use crate::shared::domain::Load;
+
+/// What the machine is doing.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
+#[serde(rename_all = "camelCase")]
+pub struct Machine {
+    /// Percent of all cores.
+    pub cpu: f64,
+    /// Percent in use.
+    pub memory: f64,
+    /// Percent in use; 0 without swap.
+    pub swap: f64,
+    /// Percent in use of the disk that holds the cache.
+    pub disk: f64,
+    /// MB per second, all interfaces but the loopback.
+    pub network_sent: f64,
+    /// MB per second, all interfaces but the loopback.
+    pub network_received: f64,
+}
+
+/// What a GPU is doing.
+#[derive(Debug, Clone, Default, PartialEq, Serialize)]
+#[serde(rename_all = "camelCase")]
+pub struct Gpu {
+    /// Its name.
+    pub name: String,
+    /// Percent of the time in which a kernel ran.
+    pub compute: f64,
+    /// Percent of the time in which its memory was read or written.
+    pub memory_traffic: f64,
+    /// Percent of its memory in use.
+    pub memory: f64,
+    /// Of its memory, in bytes.
+    pub memory_total: u64,
+}
+
+/// The load of a machine: `max(CPU, (swap + memory + GPU memory) / 3, GPU compute)`, all in percent, as the original
+/// has it. With several GPUs the least busy one counts, for that is the one a new client could use.
+#[must_use]
+pub fn load(machine: &Machine, gpus: &[Gpu]) -> Load {
+    let with = |compute: f64, memory: f64| machine.cpu.max((machine.swap + machine.memory + memory) / 3.0).max(compute);
+    let least = gpus.iter().map(|gpu| with(gpu.compute, gpu.memory)).min_by(f64::total_cmp);
+    Load::try_from(least.unwrap_or_else(|| with(0.0, 0.0))).unwrap_or(Load::ZERO)
+}
+
+/// Which gauge makes the load, in words.
+#[must_use]
+pub fn busiest(machine: &Machine, gpus: &[Gpu]) -> &'static str {
+    let total = load(machine, gpus).percent();
+    let close = |value: f64| (value - total).abs() < 1e-9;
+    if close(machine.cpu) {
+        "the CPU"
+    } else if gpus.iter().any(|gpu| close(gpu.compute)) {
+        "the GPU"
+    } else if gpus.is_empty() {
+        "a third of memory and swap"
+    } else {
+        "a third of memory, swap and GPU memory"
+    }
+}
+
+/// What the machine is, which does not change.
+#[derive(Debug, Clone, Default, Serialize)]
+#[serde(rename_all = "camelCase")]
+pub struct Host {
+    /// Its name.
+    pub name: String,
+    /// Operating system and version.
+    pub system: String,
+    /// The processor's name.
+    pub cpu: String,
+    /// Physical cores.
+    pub cores: usize,
+    /// Logical cores.
+    pub threads: usize,
+    /// Memory, in bytes.
+    pub memory: u64,
+    /// Swap, in bytes.
+    pub swap: u64,
+}
+
+/// Reads the machine.
+pub struct MachineSensor {
+    system: System,
+    networks: Networks,
+    disks: Disks,
+    disk: PathBuf,
+    read: Instant,
+}
+
+impl MachineSensor {
+    /// Prepares readings; `disk` is a folder on the disk that is watched.
+    ///
+    /// # Errors
+    /// When the system tells nothing of itself.
+    pub fn open(disk: &Path) -> Result<Self, sysinfo::Error> {
+        let kinds = RefreshKind::nothing()
+            .with_cpu(CpuRefreshKind::nothing().with_usage())
+            .with_memory(MemoryRefreshKind::everything());
+        Ok(Self {
+            system: System::new_with_specifics(kinds)?,
+            networks: Networks::new_with_refreshed_list()?,
+            disks: Disks::new_with_refreshed_list()?,
+            disk: disk.to_owned(),
+            read: Instant::now(),
+        })
+    }
+
+    /// What the machine is.
+    #[must_use]
+    pub fn host(&self) -> Host {
+        let cpu = self.system.cpus().first().map(|cpu| cpu.brand().trim().to_owned()).unwrap_or_default();
+        Host {
+            name: System::host_name().unwrap_or_default(),
+            system: System::long_os_version().unwrap_or_default(),
+            cpu,
+            cores: System::physical_core_count().unwrap_or_default(),
+            threads: self.system.cpus().len(),
+            memory: self.system.total_memory(),
+            swap: self.system.total_swap(),
+        }
+    }
+
+    /// Reads everything. CPU and network are means since the last reading.
+    pub fn read(&mut self) -> Machine {
+        self.system.refresh_cpu_usage();
+        self.system.refresh_memory();
+        self.networks.refresh(true);
+        self.disks.refresh(true);
+        let seconds = std::mem::replace(&mut self.read, Instant::now()).elapsed().as_secs_f64().max(0.001);
+        let outside = || self.networks.iter().filter(|(name, _)| *name != "lo").map(|(_, data)| data);
+        let sent = outside().map(sysinfo::NetworkData::transmitted).sum::<u64>();
+        let received = outside().map(sysinfo::NetworkData::received).sum::<u64>();
+        Machine {
+            cpu: f64::from(self.system.global_cpu_usage()),
+            memory: percent(self.system.used_memory(), self.system.total_memory()),
+            swap: percent(self.system.used_swap(), self.system.total_swap()),
+            disk: self.disk_use(),
+            network_sent: megabytes(sent) / seconds,
+            network_received: megabytes(received) / seconds,
+        }
+    }
+
+    fn disk_use(&self) -> f64 {
+        let holding = self.disks.iter().filter(|disk| self.disk.starts_with(disk.mount_point()));
+        let nearest = holding.max_by_key(|disk| disk.mount_point().as_os_str().len());
+        nearest
+            .map_or(0.0, |disk| percent(disk.total_space().saturating_sub(disk.available_space()), disk.total_space()))
+    }
+}
+
+#[expect(clippy::cast_precision_loss, reason = "a percentage needs no more digits than f64 has")]
+fn percent(part: u64, whole: u64) -> f64 {
+    if whole == 0 { 0.0 } else { 100.0 * part as f64 / whole as f64 }
+}
+
+#[expect(clippy::cast_precision_loss, reason = "a rate needs no more digits than f64 has")]
+fn megabytes(bytes: u64) -> f64 {
+    bytes as f64 / 1e6
+}
+
+/// Reads the NVIDIA GPUs.
+pub struct GpuSensor {
+    nvml: Nvml,
+}
+
+impl GpuSensor {
+    /// Loads NVIDIA's library.
+    ///
+    /// # Errors
+    /// When it is not there or finds no driver: then there is no GPU to read.
+    pub fn open() -> Result<Self, NvmlError> {
+        // The driver installs the name with the version; the other one comes with the development package only.
+        let versioned = Nvml::builder().lib_path(std::ffi::OsStr::new("libnvidia-ml.so.1")).init();
+        Ok(Self { nvml: versioned.or_else(|_| Nvml::init())? })
+    }
+
+    /// Reads all GPUs. What a GPU does not tell counts as 0: some tell no utilisation.
+    #[must_use]
+    pub fn read(&self) -> Vec<Gpu> {
+        let count = self.nvml.device_count().unwrap_or(0);
+        let devices = (0..count).filter_map(|index| self.nvml.device_by_index(index).ok());
+        devices
+            .map(|device| {
+                let utilisation = device.utilization_rates().ok();
+                let memory = device.memory_info().ok();
+                Gpu {
+                    name: device.name().unwrap_or_else(|_| "NVIDIA GPU".to_owned()),
+                    compute: utilisation.as_ref().map_or(0.0, |rates| f64::from(rates.gpu)),
+                    memory_traffic: utilisation.as_ref().map_or(0.0, |rates| f64::from(rates.memory)),
+                    memory: memory.as_ref().map_or(0.0, |memory| percent(memory.used, memory.total)),
+                    memory_total: memory.map_or(0, |memory| memory.total),
+                }
+            })
+            .collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_load_is_that_of_the_busiest_part_and_the_least_busy_gpu() {
+        let machine = |cpu, memory, swap| Machine { cpu, memory, swap, ..Machine::default() };
+        let gpu = |compute, memory| Gpu { compute, memory, ..Gpu::default() };
+        let table = [
+            (machine(20.0, 30.0, 0.0), vec![], 20.0, "the CPU"),
+            (machine(5.0, 60.0, 0.0), vec![], 20.0, "a third of the memory"),
+            (machine(5.0, 90.0, 60.0), vec![gpu(10.0, 90.0)], 80.0, "memories full together"),
+            (machine(5.0, 30.0, 0.0), vec![gpu(70.0, 0.0)], 70.0, "the GPU"),
+            (machine(5.0, 30.0, 0.0), vec![gpu(70.0, 0.0), gpu(15.0, 0.0)], 15.0, "the other GPU is free"),
+            (machine(5.0, 30.0, 0.0), vec![gpu(0.0, 99.0), gpu(15.0, 0.0)], 15.0, "the first GPU's memory is full"),
+        ];
+        for (machine, gpus, expected, why) in table {
+            assert!((load(&machine, &gpus).percent() - expected).abs() < 1e-9, "{why}: {}", load(&machine, &gpus));
+        }
+    }
+
+    #[test]
+    fn this_machine_can_be_read() {
+        let mut sensor = MachineSensor::open(Path::new("/")).unwrap();
+        let machine = sensor.read();
+        assert!((0.0..=100.0).contains(&machine.cpu) && (0.0..=100.0).contains(&machine.disk), "{machine:?}");
+        assert!(machine.memory > 0.0 && machine.memory <= 100.0, "{machine:?}");
+        assert!(sensor.host().threads > 0);
+    }
+}

@@ -1,0 +1,113 @@
+//! What the routes, the pages and the web clients of a simulation server share. Made by `app`.
+
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::time::Instant;
+
+use actix::prelude::*;
+use tokio::sync::watch;
+use which::which;
+
+use super::config::SimulationConfig;
+use super::places::Places;
+use crate::shared::domain::Load;
+use crate::shared::domain::ProjectUrl;
+use crate::shared::domain::Rules;
+use crate::shared::http::Connections;
+use crate::shared::http::Live;
+use crate::shared::http::Lock;
+use crate::shared::http::Metrics;
+use crate::shared::run::{Phase, Request};
+use crate::simulation::checkout::Checkouts;
+use crate::simulation::machine::UsageMonitor;
+use crate::simulation::machine::{LoadMonitor, Readings};
+use crate::simulation::process::RunDir;
+
+/// What routes and web clients share.
+pub struct AppState {
+    /// The effective configuration.
+    pub config: Arc<SimulationConfig>,
+    /// Whose worlds run here.
+    pub rules: Rules,
+    /// Lends places.
+    pub places: Addr<Places>,
+    /// Reads the machine.
+    pub load_monitor: Addr<LoadMonitor>,
+    /// The machine's load.
+    pub readings: watch::Receiver<Arc<Readings>>,
+    /// Checks worlds out.
+    pub checkouts: Arc<Checkouts>,
+    /// Folders of simulations.
+    pub run: Arc<RunDir>,
+    /// Whether clients are taken.
+    pub phase: watch::Receiver<Phase>,
+    /// Where drains are asked for.
+    pub requests: tokio::sync::mpsc::Sender<Request>,
+    /// Where Webots' actors live.
+    pub main_thread: ArbiterHandle,
+    /// Guards what is the administrator's, where there is a password.
+    pub lock: Option<Lock>,
+    /// Counts connections.
+    pub connections: Connections,
+    /// What is counted.
+    pub metrics: Metrics,
+    /// Clients that asked for a simulation, by what came of it.
+    pub starts: prometheus::IntCounterVec,
+    /// Monitor pages that are open.
+    pub live: Live,
+    /// What simulations take of the machine.
+    pub usage: UsageMonitor,
+    /// When the server was started.
+    pub started: Instant,
+}
+
+impl AppState {
+    /// The load that is told: of a machine that drains, 100.
+    #[must_use]
+    pub fn load(&self) -> Load {
+        if self.is_draining() { Load::FULL } else { self.readings.borrow().load.unwrap_or(Load::ZERO) }
+    }
+
+    /// Whether no new clients are taken.
+    #[must_use]
+    pub fn is_draining(&self) -> bool {
+        *self.phase.borrow() != Phase::Open
+    }
+
+    /// Whether a world may run here, now. Nobody has to wait for a checkout only to learn that there is no Webots.
+    ///
+    /// # Errors
+    /// Why not, in words for the client.
+    pub fn admit(&self, url: &str) -> Result<ProjectUrl, String> {
+        let world = ProjectUrl::parse(url).map_err(|wrong| wrong.to_string())?;
+        if self.is_draining() {
+            return Err("This simulation server is about to end, and takes no new clients".to_owned());
+        }
+        self.rules.admit(&world, self.load()).map_err(|refusal| refusal.to_string())?;
+        self.webots_program()?;
+        Ok(world)
+    }
+
+    /// The program that is started for each client.
+    ///
+    /// # Errors
+    /// What is missing, and how to set it, in words for the client.
+    pub fn webots_program(&self) -> Result<PathBuf, String> {
+        if self.config.xvfb && which("xvfb-run").is_err() {
+            return Err("This simulation server gives each Webots a display of its own (xvfb), but has no xvfb-run. \
+                        Its administrator can install it, or set xvfb: false and display"
+                .to_owned());
+        }
+        let how = "Its administrator can set webotsHome in the server's configuration, or the environment variable \
+                   WEBOTS_HOME";
+        let Some(program) = self.config.webots_program() else {
+            return Err(format!("This simulation server does not know where Webots is installed. {how}."));
+        };
+        let program = std::path::absolute(&program).unwrap_or(program);
+        if program.is_file() {
+            Ok(program)
+        } else {
+            Err(format!("This simulation server has no Webots at {}. {how}.", program.display()))
+        }
+    }
+}

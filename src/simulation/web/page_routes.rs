@@ -1,0 +1,150 @@
+//! The paths of the simulation server's page, with what it loads and listens to, and of Webots' own viewer.
+
+use std::io::{Read, Seek, SeekFrom};
+use std::path::Path;
+
+use actix_files::NamedFile;
+use actix_web::http::header::{self, HeaderValue};
+use actix_web::{HttpRequest, HttpResponse, web};
+use serde::Deserialize;
+
+use super::pages;
+use super::queries::{everybody, too_busy};
+use super::webots_viewer;
+use crate::asset;
+use crate::shared::http::assets::{self, Asset};
+use crate::shared::http::paths::{GET, READ, path};
+use crate::shared::http::{Policy, html};
+use crate::simulation::census::Everybody;
+use crate::simulation::machine::Usages;
+use crate::simulation::state::AppState;
+
+/// What the page loads, besides what all pages do.
+const ASSETS: &[Asset] =
+    &[asset!("charts.css"), asset!("charts.js"), asset!("chart.js"), asset!("simulation_monitor.js")];
+/// How much of an output's end is shown, in bytes.
+const LARGEST_TAIL: u64 = 32 * 1024;
+
+/// Adds the paths to an app.
+pub fn configure(app: &mut web::ServiceConfig) {
+    app.service(path("/monitor", READ, monitor))
+        .service(path("/events", GET, events))
+        .service(path("/history", GET, history))
+        .service(path("/output", GET, output))
+        .service(path("/assets/{name}", READ, asset))
+        .service(path("/wwi/{path:.*}", GET, wwi));
+}
+
+async fn monitor(server: web::Data<AppState>) -> HttpResponse {
+    let Some(everybody) = everybody(&server).await else {
+        return too_busy();
+    };
+    let usages = usages(&server, &everybody).await;
+    html(pages::monitor(&server, &everybody, &usages), &Policy::own())
+}
+
+async fn usages(server: &AppState, everybody: &Everybody) -> Usages {
+    server.usage.read(everybody.simulations.iter().filter_map(|one| one.pid).collect()).await
+}
+
+async fn events(server: web::Data<AppState>) -> HttpResponse {
+    let shown = server.clone();
+    let render = move || {
+        let server = shown.clone();
+        async move {
+            let everybody = everybody(&server).await?;
+            let usages = usages(&server, &everybody).await;
+            let view = pages::view(&server, &everybody, &usages);
+            view.inspect_err(|error| log::error!("the monitor page can't be rendered: {error}")).ok()
+        }
+    };
+    server.live.listen(server.phase.clone(), render)
+}
+
+async fn history(server: web::Data<AppState>) -> HttpResponse {
+    let readings = server.readings.borrow().clone();
+    HttpResponse::Ok().json(pages::history(&readings))
+}
+
+async fn asset(request: HttpRequest) -> HttpResponse {
+    assets::answer(&request, ASSETS)
+}
+
+#[derive(Deserialize)]
+struct Which {
+    id: u64,
+}
+
+/// The last lines that a simulation has printed. They may hold what is nobody else's business: a password protects
+/// them, where there is one.
+async fn output(request: HttpRequest, which: web::Query<Which>, server: web::Data<AppState>) -> HttpResponse {
+    if let Some(lock) = &server.lock
+        && let Err(locked) = lock.admit(&request, server.config.trusted_proxies.peer(&request))
+    {
+        return locked.answer();
+    }
+    let Some(everybody) = everybody(&server).await else {
+        return too_busy();
+    };
+    let one = everybody.simulations.into_iter().find(|one| one.id == which.id);
+    let log = one.and_then(|one| Some((one.log?, one.log_begin)));
+    let Some((log, begin)) = log else {
+        return HttpResponse::NotFound().body("Error: this simulation has ended.");
+    };
+    let tail = web::block(move || tail(&log, begin)).await.map(Result::unwrap_or_default);
+    HttpResponse::Ok()
+        .insert_header((header::X_CONTENT_TYPE_OPTIONS, "nosniff"))
+        .insert_header((header::CONTENT_SECURITY_POLICY, "default-src 'none'; frame-ancestors 'none'"))
+        .content_type("text/plain; charset=utf-8")
+        .body(tail.unwrap_or_default())
+}
+
+/// The last whole lines of a file, none that lie before `begin`: those are of somebody else. A file that was put aside
+/// since then begins anew.
+fn tail(path: &Path, begin: u64) -> std::io::Result<String> {
+    let mut file = std::fs::File::open(path)?;
+    let size = file.metadata()?.len();
+    let begin = if begin > size { 0 } else { begin };
+    let skipped = size.saturating_sub(LARGEST_TAIL).max(begin);
+    file.seek(SeekFrom::Start(skipped))?;
+    let mut bytes = Vec::new();
+    file.take(LARGEST_TAIL).read_to_end(&mut bytes)?;
+    let text = String::from_utf8_lossy(&bytes);
+    let whole = if skipped > begin { text.split_once('\n').map_or("", |(_, rest)| rest) } else { &text };
+    Ok(whole.to_owned())
+}
+
+/// A file of Webots' own viewer.
+async fn wwi(request: HttpRequest, server: web::Data<AppState>) -> HttpResponse {
+    let path = request.match_info().query("path").to_owned();
+    let file = web::block(move || {
+        let file = webots_viewer::file_below(&webots_viewer::folder(&server.config)?, &path)?;
+        NamedFile::open(file).ok()
+    });
+    let Ok(Some(file)) = file.await else {
+        return HttpResponse::NotFound().body("Error: there is no such file.");
+    };
+    let mut response = file.disable_content_disposition().into_response(&request);
+    response.headers_mut().insert(header::CACHE_CONTROL, HeaderValue::from_static("no-cache"));
+    response.headers_mut().insert(header::X_CONTENT_TYPE_OPTIONS, HeaderValue::from_static("nosniff"));
+    response
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::fs;
+
+    #[test]
+    fn only_the_end_of_an_output_is_read() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("1.log");
+        fs::write(&path, "a short one\n").unwrap();
+        assert_eq!(tail(&path, 0).unwrap(), "a short one\n");
+        assert_eq!(tail(&path, 2).unwrap(), "short one\n");
+        assert_eq!(tail(&path, 100).unwrap(), "a short one\n");
+        fs::write(&path, "a line of the flood\n".repeat(10_000)).unwrap();
+        let end = tail(&path, 7).unwrap();
+        assert!(end.len() as u64 <= LARGEST_TAIL && end.starts_with("a line"), "{}", end.len());
+    }
+}

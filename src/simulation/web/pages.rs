@@ -1,0 +1,273 @@
+//! The simulation server's page for people.
+
+use std::time::{Duration, SystemTime};
+
+use askama::Template;
+
+use crate::shared::domain::UrlPrefix;
+use crate::shared::http::{Row, View};
+use crate::shared::run::{seconds_since_1970, timestamp};
+use crate::simulation::census::{Everybody, Simulation, Stage};
+use crate::simulation::machine::sensors::{self, Gpu, Host, Machine};
+use crate::simulation::machine::{Readings, Sample};
+use crate::simulation::machine::{Usage, Usages};
+use crate::simulation::state::AppState;
+
+/// The whole page `/monitor`.
+#[derive(Template)]
+#[template(path = "simulation/monitor.html")]
+struct Monitor<'server> {
+    version: &'static str,
+    started: String,
+    title: &'server str,
+    description: &'server str,
+    glance: &'server str,
+    rows: &'server [Row],
+    host: &'server Host,
+    gpus: Vec<(&'server Gpu, String)>,
+    memory: String,
+    swap: String,
+    allowed: &'server [UrlPrefix],
+    blocked: &'server [UrlPrefix],
+    docker: bool,
+    share_idle_time: f64,
+    limit: String,
+}
+
+/// How the server is.
+#[derive(Template)]
+#[template(path = "simulation/glance.html")]
+struct Glance<'readings> {
+    draining: bool,
+    load: f64,
+    maker: &'static str,
+    machine: Machine,
+    memory: String,
+    gpus: Vec<(&'readings Gpu, String)>,
+    running: u32,
+    idle: u32,
+    starting: u32,
+    queued: u32,
+    present: u32,
+    places: u32,
+}
+
+/// The cells of one simulation.
+#[derive(Template)]
+#[template(path = "simulation/row.html")]
+struct SimulationRow<'one> {
+    one: &'one Simulation,
+    world: &'one str,
+    repository: &'one str,
+    stage: &'static str,
+    class: &'static str,
+    since: String,
+    /// Seconds since 1970; 0 where it is not launched.
+    ends: u64,
+    left: String,
+    cpu: String,
+    cpu_value: f64,
+    memory: String,
+    memory_value: u64,
+    port: u16,
+}
+
+/// The parts of `/monitor` that change.
+///
+/// # Errors
+/// When a template can't be rendered.
+pub fn view(server: &AppState, everybody: &Everybody, usages: &Usages) -> Result<View, askama::Error> {
+    let readings = server.readings.borrow().clone();
+    let rows = everybody.simulations.iter().map(|one| {
+        let usage = one.pid.and_then(|pid| usages.get(&pid)).copied();
+        let html = SimulationRow::new(one, usage, server.config.timeout).render()?;
+        Ok(Row { key: one.id.to_string(), html })
+    });
+    let rows = rows.collect::<Result<Vec<Row>, askama::Error>>()?;
+    let glance = Glance::new(server, everybody, &readings).render()?;
+    let sample = readings.history.back().map(numbers).unwrap_or_default();
+    Ok(View { parts: [("glance", glance)].into(), tables: [("simulations", rows)].into(), sample })
+}
+
+/// The whole of `/monitor`.
+///
+/// # Errors
+/// When a template can't be rendered.
+pub fn monitor(server: &AppState, everybody: &Everybody, usages: &Usages) -> Result<String, askama::Error> {
+    let view = view(server, everybody, usages)?;
+    let readings = server.readings.borrow().clone();
+    let page = Monitor {
+        version: env!("CARGO_PKG_VERSION"),
+        started: timestamp(SystemTime::now() - server.started.elapsed()),
+        title: server.config.title.as_deref().unwrap_or("Webots simulation server"),
+        description: server.config.description.as_deref().unwrap_or_default(),
+        glance: view.parts.get("glance").map(String::as_str).unwrap_or_default(),
+        rows: view.tables.get("simulations").map(Vec::as_slice).unwrap_or_default(),
+        host: &readings.host,
+        gpus: with_sizes(&readings.gpus),
+        memory: bytes(readings.host.memory),
+        swap: bytes(readings.host.swap),
+        allowed: &server.rules.allowed,
+        blocked: &server.rules.blocked,
+        docker: server.rules.docker,
+        share_idle_time: server.rules.share_idle_time,
+        limit: duration(server.config.timeout),
+    };
+    page.render()
+}
+
+/// The charts' numbers of the last ten minutes, the oldest first.
+#[must_use]
+pub fn history(readings: &Readings) -> Vec<Vec<f64>> {
+    let values = |sample| numbers(sample).iter().filter_map(|text| text.parse().ok()).collect();
+    readings.history.iter().map(values).collect()
+}
+
+/// A sample as the charts want it: the time, then the columns of `monitor.csv`.
+fn numbers(sample: &Sample) -> Vec<String> {
+    let Sample { timestamp, running, idle, machine, gpu_compute, gpu_memory_traffic, gpu_memory, .. } = sample;
+    let percents =
+        [machine.cpu, machine.memory, *gpu_compute, *gpu_memory_traffic, *gpu_memory, machine.swap, machine.disk];
+    let rates = [machine.network_sent, machine.network_received];
+    let counts = [timestamp.to_string(), running.to_string(), idle.to_string()];
+    let percents = percents.map(|percent| format!("{percent:.1}"));
+    counts.into_iter().chain(percents).chain(rates.map(|rate| format!("{rate:.4}"))).collect()
+}
+
+impl<'readings> Glance<'readings> {
+    fn new(server: &AppState, everybody: &Everybody, readings: &'readings Readings) -> Self {
+        let instances = everybody.instances;
+        Self {
+            draining: server.is_draining(),
+            load: server.load().percent(),
+            maker: sensors::busiest(&readings.machine, &readings.gpus),
+            machine: readings.machine,
+            memory: bytes(readings.host.memory),
+            gpus: with_sizes(&readings.gpus),
+            running: instances.running,
+            idle: instances.idle,
+            starting: instances.starting,
+            queued: instances.queued,
+            present: instances.present(),
+            places: instances.places,
+        }
+    }
+}
+
+/// Each GPU with the size of its memory in words.
+fn with_sizes(gpus: &[Gpu]) -> Vec<(&Gpu, String)> {
+    gpus.iter().map(|gpu| (gpu, bytes(gpu.memory_total))).collect()
+}
+
+/// What the forges have between a repository and what is in it.
+const WORDS: [&str; 4] = ["/-/", "/blob/", "/tree/", "/src/"];
+
+impl<'one> SimulationRow<'one> {
+    fn new(one: &'one Simulation, usage: Option<Usage>, limit: u64) -> Self {
+        let (stage, class) = words(one.stage);
+        let ends = one.launched.map_or(0, |launched| launched + limit);
+        let now = seconds_since_1970();
+        let path = one.world.split_once("://").map_or(one.world.as_str(), |(_, path)| path);
+        let (repository, file) = WORDS.iter().find_map(|word| path.split_once(word)).unwrap_or((path, path));
+        Self {
+            one,
+            world: file.rsplit('/').next().unwrap_or(file),
+            repository,
+            stage,
+            class,
+            since: timestamp(SystemTime::UNIX_EPOCH + Duration::from_secs(one.since)),
+            ends,
+            left: duration(ends.saturating_sub(now)),
+            cpu: usage.and_then(|usage| usage.cpu).map(|cpu| format!("{cpu:.0} %")).unwrap_or_default(),
+            cpu_value: usage.and_then(|usage| usage.cpu).unwrap_or(-1.0),
+            memory: usage.map(|usage| bytes(usage.memory)).unwrap_or_default(),
+            memory_value: usage.map_or(0, |usage| usage.memory),
+            port: one.port.unwrap_or_default(),
+        }
+    }
+}
+
+/// A stage in words, and the class by which it gets its colour.
+fn words(stage: Stage) -> (&'static str, &'static str) {
+    match stage {
+        Stage::Queued => ("waiting", "queued"),
+        Stage::CheckingOut => ("checking out", "checkingout"),
+        Stage::Launching => ("launching", "launching"),
+        Stage::Idle => ("idle", "idle"),
+        Stage::Running => ("running", "running"),
+        Stage::Stopping => ("stopping", "stopping"),
+    }
+}
+
+#[expect(clippy::cast_precision_loss, reason = "three digits are shown")]
+fn bytes(count: u64) -> String {
+    let count = count as f64;
+    let units = [("TiB", 2_f64.powi(40)), ("GiB", 2_f64.powi(30)), ("MiB", 2_f64.powi(20))];
+    match units.iter().find(|(_, size)| count >= *size) {
+        Some((unit, size)) => {
+            let number = count / size;
+            if number < 10.0 { format!("{number:.1} {unit}") } else { format!("{number:.0} {unit}") }
+        }
+        None if count > 0.0 => format!("{:.0} KiB", count / 1024.0),
+        None => "none".to_owned(),
+    }
+}
+
+/// A number of seconds in words, without the seconds, which the page's script adds.
+fn duration(seconds: u64) -> String {
+    match (seconds / 3600, seconds / 60 % 60) {
+        (0, minutes) => format!("{minutes} min"),
+        (hours, 0) => format!("{hours} h"),
+        (hours, minutes) => format!("{hours} h {minutes:02} min"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn sizes_and_times_are_short() {
+        let sizes = [(0, "none"), (2048, "2 KiB"), (5 << 20, "5.0 MiB"), (130 << 20, "130 MiB"), (3 << 30, "3.0 GiB")];
+        for (count, text) in sizes {
+            assert_eq!(bytes(count), text);
+        }
+        for (seconds, text) in [(0, "0 min"), (360, "6 min"), (7200, "2 h"), (7260, "2 h 01 min")] {
+            assert_eq!(duration(seconds), text);
+        }
+    }
+
+    fn simulation(world: &str) -> Simulation {
+        Simulation {
+            id: 1,
+            world: world.to_owned(),
+            stage: Stage::Idle,
+            since: 0,
+            launched: Some(1),
+            pid: None,
+            port: Some(2001),
+            version: None,
+            log: None,
+            log_begin: 0,
+        }
+    }
+
+    #[test]
+    fn a_repository_is_named_as_its_forge_does() {
+        for (world, name) in [
+            ("https://github.com/u/r/blob/main/src/worlds/a.wbt", "github.com/u/r"),
+            ("https://github.com/u/r/tree/main/worlds/a.wbt", "github.com/u/r"),
+            ("https://gitlab.com/g/s/r/-/blob/main/worlds/a.wbt", "gitlab.com/g/s/r"),
+            ("https://codeberg.org/u/r/src/branch/main/worlds/a.wbt", "codeberg.org/u/r"),
+        ] {
+            assert_eq!(SimulationRow::new(&simulation(world), None, 7200).repository, name);
+        }
+    }
+
+    #[test]
+    fn what_a_client_names_is_only_text() {
+        let one = simulation("https://github.com/u/<b>\"'&/blob/main/worlds/<script>.wbt");
+        let html = SimulationRow::new(&one, None, 7200).render().unwrap();
+        assert!(!html.contains("<script>") && !html.contains("<b>"), "{html}");
+    }
+}

@@ -1,0 +1,92 @@
+//! The simulation server's public paths: each reads the request, asks for what it needs, and maps the answer.
+
+use std::sync::Arc;
+
+use actix_web::http::header;
+use actix_web::{HttpRequest, HttpResponse, web};
+
+use super::page_routes;
+use super::queries::{everybody, too_busy};
+use super::status::{self, StatusPage};
+use crate::shared::http::CONTENT_TYPE;
+use crate::shared::http::paths::{self, GET, POST, READ, path};
+use crate::shared::http::websocket;
+use crate::shared::run::Request;
+use crate::simulation::client::WebClient;
+use crate::simulation::state::AppState;
+
+/// Adds all paths to an app.
+pub fn configure(app: &mut web::ServiceConfig) {
+    app.service(paths::all(add, "/monitor, /status, /load, /metrics or /health"));
+}
+
+fn add(app: &mut web::ServiceConfig) {
+    app.service(path("/client", GET, client))
+        .service(path("/load", READ, load))
+        .configure(page_routes::configure)
+        .service(path("/status", READ, status_json))
+        .service(path("/metrics", READ, metrics))
+        .service(path("/health", READ, health))
+        .service(path("/drain", POST, drain));
+}
+
+async fn client(request: HttpRequest, stream: web::Payload, server: web::Data<AppState>) -> HttpResponse {
+    if let Some(refusal) = refuse_origin(&request, &server) {
+        return refusal;
+    }
+    let peer = server.config.trusted_proxies.peer(&request);
+    let connection = match server.connections.admit(peer) {
+        Ok(connection) => connection,
+        Err(crowded) => return crowded.answer(),
+    };
+    let server = Arc::clone(&server);
+    websocket::open(&request, stream, |inbox| WebClient::new(server, peer, (connection, inbox)))
+}
+
+/// A page of another origin may use visitors' browsers to start simulations, unless origins are listed.
+fn refuse_origin(request: &HttpRequest, server: &AppState) -> Option<HttpResponse> {
+    let allowed = &server.config.allowed_origins;
+    let origin = request.headers().get(header::ORIGIN)?.to_str().unwrap_or_default();
+    if allowed.is_empty() || allowed.iter().any(|one| one.is(origin)) {
+        return None;
+    }
+    Some(HttpResponse::Forbidden().body("Error: this page is not one of those that may start simulations here."))
+}
+
+async fn load(server: web::Data<AppState>) -> HttpResponse {
+    HttpResponse::Ok().content_type("text/plain").body(server.load().to_string())
+}
+
+async fn status_json(server: web::Data<AppState>) -> HttpResponse {
+    match everybody(&server).await {
+        Some(everybody) => HttpResponse::Ok().json(StatusPage::new(&server, everybody)),
+        None => too_busy(),
+    }
+}
+
+async fn metrics(server: web::Data<AppState>) -> HttpResponse {
+    let Some(everybody) = everybody(&server).await else {
+        return too_busy();
+    };
+    match server.metrics.render(&status::gauges(&server, &everybody)) {
+        Ok(text) => HttpResponse::Ok().content_type(CONTENT_TYPE).body(text),
+        Err(error) => HttpResponse::InternalServerError().body(format!("Error: {error}.")),
+    }
+}
+
+async fn health() -> HttpResponse {
+    HttpResponse::Ok().content_type("text/plain").body("ok")
+}
+
+async fn drain(request: HttpRequest, server: web::Data<AppState>) -> HttpResponse {
+    let Some(lock) = &server.lock else {
+        return HttpResponse::Forbidden().body("Error: actions are off; adminPassword is not set.");
+    };
+    if let Err(locked) = lock.admit(&request, server.config.trusted_proxies.peer(&request)) {
+        return locked.answer();
+    }
+    match server.requests.try_send(Request::Drain) {
+        Ok(()) => HttpResponse::Accepted().body("draining"),
+        Err(error) => HttpResponse::ServiceUnavailable().body(format!("Error: {error}.")),
+    }
+}

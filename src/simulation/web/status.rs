@@ -1,0 +1,106 @@
+//! What the simulation server tells programs of itself: `/status` and `/metrics`.
+
+use serde::Serialize;
+
+use super::webots_viewer;
+use crate::shared::domain::Dispatch;
+use crate::shared::http::Gauge;
+use crate::simulation::census::{Everybody, Simulation};
+use crate::simulation::machine::sensors::{Gpu, Host, Machine};
+use crate::simulation::state::AppState;
+
+/// The page `/status`.
+#[derive(Debug, Serialize)]
+#[serde(rename_all = "camelCase")]
+pub struct StatusPage {
+    /// What decides where clients go.
+    #[serde(flatten)]
+    pub dispatch: Dispatch,
+    /// In seconds.
+    pub uptime: u64,
+    /// What the machine is.
+    pub host: Host,
+    /// What the machine is doing.
+    pub machine: Machine,
+    /// What its GPUs are doing.
+    pub gpus: Vec<Gpu>,
+    /// Where Webots' own viewer can be had from this server.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub viewer: Option<&'static str>,
+    /// Each simulation.
+    pub simulations: Vec<Simulation>,
+}
+
+impl StatusPage {
+    /// The state of the server at this moment.
+    #[must_use]
+    pub fn new(server: &AppState, everybody: Everybody) -> Self {
+        let readings = server.readings.borrow().clone();
+        let rules = &server.rules;
+        let dispatch = Dispatch {
+            load: server.load(),
+            version: env!("CARGO_PKG_VERSION").to_owned(),
+            instances: Some(everybody.instances),
+            allowed_repositories: rules.allowed.clone(),
+            blocked_repositories: rules.blocked.clone(),
+            share_idle_time: rules.share_idle_time,
+            docker: Some(rules.docker),
+            draining: server.is_draining(),
+        };
+        Self {
+            dispatch,
+            uptime: server.started.elapsed().as_secs(),
+            host: readings.host.clone(),
+            machine: readings.machine,
+            gpus: readings.gpus.clone(),
+            viewer: webots_viewer::folder(&server.config).map(|_| webots_viewer::PATH),
+            simulations: everybody.simulations,
+        }
+    }
+}
+
+/// The gauges of `/metrics`.
+#[must_use]
+pub fn gauges<'text>(server: &AppState, everybody: &Everybody) -> Vec<Gauge<'text>> {
+    let readings = server.readings.borrow();
+    let instances = everybody.instances;
+    let machine = readings.machine;
+    let by_state = [
+        ("queued", instances.queued),
+        ("starting", instances.starting),
+        ("idle", instances.idle),
+        ("running", instances.running),
+    ];
+    let gpu = |value: fn(&Gpu) -> f64| {
+        let numbered = readings.gpus.iter().enumerate();
+        numbered.map(|(index, gpu)| (vec![index.to_string(), gpu.name.clone()], value(gpu))).collect()
+    };
+    let draining = f64::from(u8::from(server.is_draining()));
+    vec![
+        Gauge::plain("simulation_load_percent", "Load as /load tells it", server.load().percent()),
+        Gauge::plain("simulation_draining", "1 while no new clients are taken", draining),
+        Gauge::plain("simulation_places", "Simulations that fit", f64::from(instances.places)),
+        Gauge {
+            name: "simulation_instances",
+            help: "Simulations by state",
+            labels: &["state"],
+            values: by_state.iter().map(|(state, count)| (vec![(*state).to_owned()], f64::from(*count))).collect(),
+        },
+        Gauge::plain("machine_cpu_percent", "CPU in use", machine.cpu),
+        Gauge::plain("machine_memory_percent", "Memory in use", machine.memory),
+        Gauge::plain("machine_swap_percent", "Swap in use", machine.swap),
+        Gauge::plain("machine_disk_percent", "Disk in use where the cache is", machine.disk),
+        Gauge {
+            name: "machine_gpu_compute_percent",
+            help: "GPU: time in which a kernel ran",
+            labels: &["gpu", "name"],
+            values: gpu(|gpu| gpu.compute),
+        },
+        Gauge {
+            name: "machine_gpu_memory_percent",
+            help: "GPU: memory in use",
+            labels: &["gpu", "name"],
+            values: gpu(|gpu| gpu.memory),
+        },
+    ]
+}

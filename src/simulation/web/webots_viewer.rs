@@ -1,0 +1,69 @@
+//! Webots' own viewer for browsers, where Webots is installed: which of its files may be sent.
+
+use std::path::{Component, Path, PathBuf};
+
+use percent_encoding::percent_decode_str;
+
+use crate::simulation::config::SimulationConfig;
+
+/// Where Webots keeps it, below its folder.
+const FOLDER: &str = "resources/web/wwi";
+/// The viewer itself.
+const SCRIPT: &str = "WebotsView.js";
+/// Its path on this server, as `/status` tells it.
+pub const PATH: &str = "wwi/WebotsView.js";
+
+/// The viewer's folder, if Webots is installed here.
+#[must_use]
+pub fn folder(config: &SimulationConfig) -> Option<PathBuf> {
+    let home = &config.webots_home.as_ref()?.0;
+    let places = [home.join(FOLDER), home.join("Contents").join(FOLDER)];
+    places.into_iter().find(|folder| folder.join(SCRIPT).is_file())
+}
+
+/// A file of a folder, unless the path or a link leads out of it.
+#[must_use]
+pub fn file_below(folder: &Path, path: &str) -> Option<PathBuf> {
+    let path = percent_decode_str(path).decode_utf8().ok()?;
+    let path = Path::new(path.as_ref());
+    if !path.components().all(|part| matches!(part, Component::Normal(_))) {
+        return None;
+    }
+    let folder = folder.canonicalize().ok()?;
+    let file = folder.join(path).canonicalize().ok()?;
+    (file.starts_with(&folder) && file.is_file()).then_some(file)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::fs;
+
+    #[test]
+    fn nothing_outside_of_the_viewers_folder_is_sent() {
+        let home = tempfile::tempdir().unwrap();
+        let folder = home.path().join("wwi");
+        fs::create_dir_all(folder.join("css")).unwrap();
+        for file in ["WebotsView.js", "css/wwi.css", "../secret.js"] {
+            fs::write(folder.join(file), "").unwrap();
+        }
+        std::os::unix::fs::symlink("../secret.js", folder.join("link.js")).unwrap();
+        let table = [
+            ("WebotsView.js", true),
+            ("css/wwi.css", true),
+            ("css%2Fwwi.css", true),
+            ("css", false),
+            ("", false),
+            ("../secret.js", false),
+            ("%2e%2e/secret.js", false),
+            ("css/../../secret.js", false),
+            ("/etc/passwd", false),
+            ("link.js", false),
+            ("WebotsView.js%00", false),
+            ("%ff", false),
+        ];
+        for (path, found) in table {
+            assert_eq!(file_below(&folder, path).is_some(), found, "{path:?}");
+        }
+    }
+}

@@ -1,0 +1,165 @@
+//! What a simulator prints: signs of its state, and lines that are kept for whoever looks for a fault.
+//!
+//! A thread per simulator reads its output, so that neither a flood of it nor a slow disk holds up anybody else: a
+//! simulator that prints faster than this thread reads waits in its own write.
+
+use std::collections::VecDeque;
+use std::io::{BufRead, BufReader, PipeReader, Write};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
+
+use actix::dev::ToEnvelope;
+use actix::prelude::*;
+use tokio::sync::oneshot;
+
+use crate::shared::run::RotatedFile;
+use crate::shared::run::one_line;
+
+/// Something that a line of Webots' output says of its state.
+#[derive(Message, Debug, Clone, Copy, PartialEq, Eq)]
+#[rtype(result = "()")]
+pub enum Sign {
+    /// `.`: it lives.
+    Heartbeat,
+    /// `pause`: the simulation is paused.
+    Paused,
+    /// `real-time`, `fast`, `step`: the simulation runs.
+    Running,
+}
+
+/// The last lines of an output.
+#[derive(Debug, Clone, Default)]
+pub struct Tail(Arc<Mutex<VecDeque<String>>>);
+
+/// How many lines are kept.
+const LINES: usize = 20;
+/// How much of a line is kept, in bytes; what comes after it, up to the next line break, is dropped.
+const LINE_SIZE: usize = 1000;
+
+impl Sign {
+    /// The meaning of a line. All other lines are the simulation's own.
+    #[must_use]
+    pub fn of(line: &str) -> Option<Self> {
+        match line {
+            "." => Some(Self::Heartbeat),
+            "pause" => Some(Self::Paused),
+            "real-time" | "fast" | "step" => Some(Self::Running),
+            _ => None,
+        }
+    }
+}
+
+impl Tail {
+    /// The lines, the oldest first.
+    #[must_use]
+    pub fn lines(&self) -> Vec<String> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner).iter().cloned().collect()
+    }
+
+    fn push(&self, line: String) {
+        let mut lines = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        if lines.len() == LINES {
+            lines.pop_front();
+        }
+        lines.push_back(line);
+    }
+}
+
+/// Reads an output until its end: signs go to `signs`, other lines to the file and to the tail. The receiver that is
+/// given back with the tail hears when the end was reached.
+///
+/// # Errors
+/// When the thread can't be made.
+pub fn follow<A>(
+    output: PipeReader,
+    mut file: Option<RotatedFile>,
+    signs: Addr<A>,
+) -> std::io::Result<(Tail, oneshot::Receiver<()>)>
+where
+    A: Actor<Context: ToEnvelope<A, Sign>> + Handler<Sign>,
+{
+    let tail = Tail::default();
+    let kept = tail.clone();
+    let (end, ended) = oneshot::channel();
+    std::thread::Builder::new().name("output".to_owned()).spawn(move || {
+        let mut reader = BufReader::with_capacity(64 * 1024, output);
+        while let Some(line) = next_line(&mut reader) {
+            if let Some(sign) = Sign::of(&line) {
+                deliver(&signs, sign);
+            } else {
+                if let Some(file) = &mut file {
+                    // A full disk costs the lines, not the simulation.
+                    file.write_all(format!("{line}\n").as_bytes()).ok();
+                }
+                kept.push(line);
+            }
+        }
+        // Nobody may wait for it.
+        end.send(()).ok();
+    })?;
+    Ok((tail, ended))
+}
+
+/// Hands a sign over. An actor that can't keep up makes the simulator wait, not the mailbox grow.
+fn deliver<A>(signs: &Addr<A>, sign: Sign)
+where
+    A: Actor<Context: ToEnvelope<A, Sign>> + Handler<Sign>,
+{
+    while let Err(SendError::Full(_)) = signs.try_send(sign) {
+        std::thread::sleep(Duration::from_millis(5));
+    }
+}
+
+/// The next line, cut to [`LINE_SIZE`] and made printable; nothing at the end of the output.
+fn next_line(reader: &mut impl BufRead) -> Option<String> {
+    let mut line = Vec::new();
+    loop {
+        let chunk = match reader.fill_buf() {
+            Ok([]) => return (!line.is_empty()).then(|| printable(&line)),
+            Ok(chunk) => chunk,
+            Err(error) if error.kind() == std::io::ErrorKind::Interrupted => continue,
+            Err(_) => return None,
+        };
+        let end = chunk.iter().position(|byte| *byte == b'\n');
+        let text = chunk.get(..end.unwrap_or(chunk.len())).unwrap_or_default();
+        let room = LINE_SIZE.saturating_sub(line.len()).min(text.len());
+        line.extend_from_slice(text.get(..room).unwrap_or_default());
+        let used = end.map_or(chunk.len(), |end| end + 1);
+        reader.consume(used);
+        if end.is_some() {
+            return Some(printable(&line));
+        }
+    }
+}
+
+fn printable(line: &[u8]) -> String {
+    one_line(String::from_utf8_lossy(line).trim_end())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn lines_are_cut_and_made_printable() {
+        let flood = "x".repeat(1_000_000);
+        let text = format!(".\n{flood}\npause\r\n\u{1b}[31mred\n");
+        let mut bytes = text.into_bytes();
+        bytes.extend_from_slice(b"\xff\xfe no text\nlast");
+        let mut reader = BufReader::with_capacity(16, bytes.as_slice());
+        let lines: Vec<String> = std::iter::from_fn(|| next_line(&mut reader)).collect();
+        let kept = "x".repeat(LINE_SIZE);
+        assert_eq!(lines, [".", &kept, "pause", " [31mred", "\u{fffd}\u{fffd} no text", "last"]);
+    }
+
+    #[test]
+    fn only_whole_lines_are_signs() {
+        let table = [(".", Some(Sign::Heartbeat)), ("pause", Some(Sign::Paused)), ("step", Some(Sign::Running))];
+        for (line, sign) in table {
+            assert_eq!(Sign::of(line), sign);
+        }
+        for line in ["..", "", "paused", "real-time:", "open", "INFO: pause"] {
+            assert_eq!(Sign::of(line), None, "{line:?}");
+        }
+    }
+}
