@@ -1,14 +1,5 @@
 //! A small part of what `cargo bench --bench placement` measures, so that a change that spoils the policy fails the tests.
 
-#![expect(
-    clippy::cast_possible_truncation,
-    clippy::cast_precision_loss,
-    clippy::cast_sign_loss,
-    clippy::float_cmp,
-    clippy::indexing_slicing,
-    reason = "the simulation is shared with the benchmark, which says why"
-)]
-
 #[path = "../benches/placement/compare.rs"]
 mod compare;
 #[path = "../benches/placement/dispatch.rs"]

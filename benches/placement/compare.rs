@@ -1,8 +1,8 @@
 //! Which scenarios are run, and who wins.
 
-use crate::dispatch::{Own, Rival, Rule};
-use crate::scenario::{Arrivals, Outcome, Scenario, Sessions, Sizes};
-use crate::world::run;
+use super::dispatch::{Own, Rival, Rule};
+use super::scenario::{Arrivals, Outcome, Scenario, Sessions, Sizes};
+use super::world::run;
 
 /// The policies in the order of an outcome's row. The first is the one that has to win.
 pub(crate) const POLICIES: [&str; 6] =

@@ -1,7 +1,7 @@
 //! A fleet of machines, the clients that want to use it, and a clock that runs as fast as it can.
 
-use crate::dispatch::{Dispatcher, Sight};
-use crate::scenario::{Client, HORIZON, Outcome, Scenario, Sizes, clients};
+use super::dispatch::{Dispatcher, Sight};
+use super::scenario::{Client, HORIZON, Outcome, Scenario, Sizes, clients};
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
 use std::cmp::Reverse;

@@ -1,6 +1,6 @@
 //! The command line, from outside.
 
-use crate::simulator::{SMALL_WORLD, Start, project};
+use super::simulator::{SMALL_WORLD, Start, project};
 
 #[tokio::test]
 async fn a_bad_option_ends_it_with_a_message_and_1() {

@@ -5,8 +5,8 @@ use tokio::time::timeout;
 use tokio_tungstenite::tungstenite::Message;
 use tokio_tungstenite::tungstenite::protocol::frame::coding::CloseCode;
 
-use crate::simulator::{DEADLINE, SMALL_WORLD, Start, project};
-use crate::viewer::time_of;
+use super::simulator::{DEADLINE, SMALL_WORLD, Start, project};
+use super::viewer::time_of;
 
 #[tokio::test]
 async fn many_viewers_see_the_same() {

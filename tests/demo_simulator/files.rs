@@ -3,7 +3,7 @@
 use std::fs;
 use std::os::unix::fs::symlink;
 
-use crate::simulator::{SMALL_WORLD, Simulator, Start, project};
+use super::simulator::{SMALL_WORLD, Simulator, Start, project};
 
 async fn started() -> (tempfile::TempDir, Simulator) {
     let project = project(&[("a.wbt", SMALL_WORLD)]);

@@ -8,7 +8,7 @@ use nix::sys::stat::Mode;
 use nix::unistd::mkfifo;
 use tokio_tungstenite::tungstenite::protocol::frame::coding::CloseCode;
 
-use crate::simulator::{PORT, SMALL_WORLD, Start, own_address, project};
+use super::simulator::{PORT, SMALL_WORLD, Start, own_address, project};
 
 #[tokio::test]
 async fn it_listens_at_once_and_beats_first_after_one_period() {

@@ -15,7 +15,7 @@ use tokio::process::{Child, Command};
 use tokio::sync::mpsc;
 use tokio::time::timeout;
 
-use crate::viewer::Viewer;
+use super::viewer::Viewer;
 
 /// The port that simulators are asked to use, below those that systems deal out.
 pub(crate) const PORT: u16 = 21_234;

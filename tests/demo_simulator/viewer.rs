@@ -9,7 +9,7 @@ use tokio_tungstenite::tungstenite::Message;
 use tokio_tungstenite::tungstenite::protocol::frame::coding::CloseCode;
 use tokio_tungstenite::{WebSocketStream, client_async};
 
-use crate::simulator::DEADLINE;
+use super::simulator::DEADLINE;
 
 /// A WebSocket client.
 pub(crate) struct Viewer {

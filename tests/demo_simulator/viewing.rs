@@ -1,7 +1,7 @@
 //! Each message of a viewer, and what it hears.
 
-use crate::simulator::{SMALL_WORLD, Simulator, Start, project};
-use crate::viewer::time_of;
+use super::simulator::{SMALL_WORLD, Simulator, Start, project};
+use super::viewer::time_of;
 
 async fn paused() -> (tempfile::TempDir, Simulator) {
     started_with(&[]).await

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use crate::simulator::{Start, project};
+use super::simulator::{Start, project};
 
 const HEADER: &str = "#VRML_SIM R2025a utf8\n";
 

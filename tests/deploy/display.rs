@@ -118,7 +118,7 @@ fn check_tells_which_case_it_is() {
         (Some("nonsense"), None, None, "warning: display: \"nonsense\" is no display".to_owned()),
     ];
     for (display, configured, authority, words) in table {
-        let (_, told) = crate::preflight::check(
+        let (_, told) = super::preflight::check(
             &configured.map(|display| serde_json::json!({"display": display})).unwrap_or(serde_json::json!({})),
             |command| {
                 command.env_remove("DISPLAY").env("XAUTHORITY", authority.unwrap_or("/nowhere"));
@@ -130,7 +130,7 @@ fn check_tells_which_case_it_is() {
         assert!(told.lines().any(|line| line.starts_with(&words)), "{words} is not in\n{told}");
     }
     // Whether this machine has a display :0 or not.
-    let (_, told) = crate::preflight::check(&serde_json::json!({}), |command| {
+    let (_, told) = super::preflight::check(&serde_json::json!({}), |command| {
         command.env_remove("DISPLAY");
     });
     let line = told.lines().find(|line| line.contains("display: ")).unwrap_or_else(|| panic!("{told}"));

@@ -169,7 +169,7 @@ pub(crate) fn trusted_authority(test: &str) -> Option<String> {
         return std::env::var(key).ok();
     }
     let output = Command::new(std::env::current_exe().unwrap())
-        .args(["--exact", test, "--nocapture"])
+        .args(["--exact", &format!("mail::{test}"), "--nocapture"])
         .env(key, &file)
         .env("FLEET_TEST_OWN_PROCESS", test)
         .output()

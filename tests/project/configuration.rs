@@ -9,7 +9,7 @@ use webots_fleet::session::config::SessionConfig;
 use webots_fleet::shared::config::Configuration;
 use webots_fleet::simulation::config::SimulationConfig;
 
-use crate::copy::{root, walk};
+use super::copy::{root, walk};
 
 /// A server: its program, its part of the page, the least that it must be told, and other names of its keys.
 struct Kind {

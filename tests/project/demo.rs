@@ -6,7 +6,7 @@ use nix::sys::signal::{Signal, kill, killpg};
 use nix::unistd::Pid;
 use tokio::io::AsyncBufReadExt;
 
-use crate::copy::{Project, nothing_is_left, processes_in, run};
+use super::copy::{Project, nothing_is_left, processes_in, run};
 use crate::support::client::Client;
 use crate::support::{SOON, http, until};
 

@@ -2,7 +2,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use crate::source::{Source, sources};
+use super::source::{Source, sources};
 
 /// Without inline tests.
 const LONGEST_FILE: usize = 300;

@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use crate::copy::{root, walk};
+use super::copy::{root, walk};
 
 fn pages() -> Vec<PathBuf> {
     let docs = walk(&root().join("docs")).into_iter().filter(|path| path.extension().is_some_and(|end| end == "md"));

@@ -2,7 +2,7 @@
 
 use std::net::TcpListener;
 
-use crate::copy::{Outcome, Project};
+use super::copy::{Outcome, Project};
 use crate::support::http;
 
 /// Runs `server.sh` for what has to fail with this exit code; gives back what it says.

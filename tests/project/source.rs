@@ -2,7 +2,7 @@
 
 use std::collections::BTreeSet;
 
-use crate::copy::{root, walk};
+use super::copy::{root, walk};
 
 /// A source file.
 pub struct Source {

@@ -1,8 +1,8 @@
 //! Clients' addresses: they come from the web server, serve limits and logs, and can't be forged.
 
-use crate::browser::Browser;
-use crate::fleet::Fleet;
-use crate::rules::Rules;
+use super::browser::Browser;
+use super::fleet::Fleet;
+use super::rules::Rules;
 use crate::support::until;
 
 const FORGED: &[(&str, &str)] = &[("x-forwarded-for", "203.0.113.9"), ("forwarded", "for=203.0.113.9")];

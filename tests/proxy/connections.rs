@@ -6,8 +6,8 @@ use std::time::Duration;
 
 use futures_util::StreamExt;
 
-use crate::fleet::{Fleet, IDLE};
-use crate::rules::Rules;
+use super::fleet::{Fleet, IDLE};
+use super::rules::Rules;
 use crate::support::SOON;
 use crate::support::client::{Client, Heard};
 
@@ -141,7 +141,7 @@ async fn what_is_sent_in_pieces_comes_in_pieces_with_the_documents_rules() {
 async fn a_restart_costs_only_connections_of_its_own(rules: Rules) {
     let mut fleet = Fleet::start(rules).await;
     let (mut proxied, _) = fleet.simulate(&fleet.browser, &fleet.here).await;
-    let mut direct = Client::start(&fleet.here, &crate::fleet::arm()).await;
+    let mut direct = Client::start(&fleet.here, &super::fleet::arm()).await;
     direct.until("webots:").await;
     // It is read all the time, so that it answers pings, and ends if the connection does.
     let passing_by = actix_rt::spawn(async move {

@@ -5,9 +5,9 @@ use std::io::{Read, Write};
 use std::net::TcpListener;
 use std::sync::mpsc::{Receiver, channel};
 
-use crate::fleet::Fleet;
-use crate::rules::Rules;
-use crate::web_server::Kind;
+use super::fleet::Fleet;
+use super::rules::Rules;
+use super::web_server::Kind;
 
 /// Stands in for the files of a Webots: tells which path it was asked for. It runs until the test program ends.
 fn files_of_webots(port: u16) -> Receiver<String> {

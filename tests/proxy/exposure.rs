@@ -3,10 +3,10 @@
 use std::io::{Read, Write};
 use std::net::TcpListener;
 
-use crate::fleet::Fleet;
-use crate::rules::{Place, Rules};
+use super::fleet::Fleet;
+use super::rules::{Place, Rules};
+use super::web_server::{Kind, WebServer};
 use crate::support::ports;
-use crate::web_server::{Kind, WebServer};
 
 /// A service of the machine that belongs to no fleet: a database's page of administration, say. It runs until the
 /// test program ends.
@@ -157,7 +157,7 @@ async fn of_the_documents_redirects_one_works_and_the_other_never_applies() {
 
 #[actix_rt::test]
 async fn nginx_takes_names_of_any_length() {
-    let authority = crate::authority::Authority::new();
+    let authority = super::authority::Authority::new();
     let certificate = authority.issue(&["localhost"]);
     let (http, https) = (ports::block(1), ports::block(1));
     let chain = certificate.chain.to_str().unwrap();
@@ -167,5 +167,5 @@ async fn nginx_takes_names_of_any_length() {
     let name = ["a".repeat(63), "b".repeat(63), "c".repeat(63), "d".repeat(57)].join(".");
     let text = text.replace("localhost", &name);
     assert!(text.contains(&format!("server_name {name};")));
-    WebServer::start(Kind::Nginx, (http, https), &text, crate::fleet::IDLE).await;
+    WebServer::start(Kind::Nginx, (http, https), &text, super::fleet::IDLE).await;
 }

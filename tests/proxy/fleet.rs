@@ -2,9 +2,10 @@
 
 use std::time::Duration;
 
-use crate::authority::{Authority, trusting};
-use crate::browser::Browser;
-use crate::rules::{Place, Rules};
+use super::authority::{Authority, trusting};
+use super::browser::Browser;
+use super::rules::{Place, Rules};
+use super::web_server::WebServer;
 use crate::support::client::Client;
 use crate::support::git::{Forge, world};
 use crate::support::http;
@@ -12,7 +13,6 @@ use crate::support::ports;
 use crate::support::program::{Builder, Server, session_server, simulation_server};
 use crate::support::until;
 use crate::support::webots::Webots;
-use crate::web_server::WebServer;
 
 /// Everything; each part ends with it.
 pub struct Fleet {

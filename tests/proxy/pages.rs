@@ -2,9 +2,9 @@
 
 use futures_util::StreamExt;
 
-use crate::browser::Browser;
-use crate::fleet::{Fleet, IDLE};
-use crate::rules::Rules;
+use super::browser::Browser;
+use super::fleet::{Fleet, IDLE};
+use super::rules::Rules;
 use crate::support::SOON;
 
 /// What a page names in `src` and `href`, but for other pages.

@@ -3,11 +3,11 @@
 use rcgen::CertificateParams;
 use serde_json::Value;
 
-use crate::authority::{Authority, Certificate};
-use crate::smtp::Smtp;
+use super::authority::{Authority, Certificate};
+use super::web_server::{Kind, WebServer};
+use crate::mail::smtp::Smtp;
 use crate::support::program::{Builder, Server, session_server};
 use crate::support::{http, ports, until};
-use crate::web_server::{Kind, WebServer};
 
 /// A web server with this certificate and nothing behind it.
 async fn web_server(certificate: &Certificate) -> (WebServer, u16) {
@@ -19,7 +19,7 @@ async fn web_server(certificate: &Certificate) -> (WebServer, u16) {
         certificate.chain.display(),
         certificate.key.display()
     );
-    (WebServer::start(Kind::Nginx, ports, &site, crate::fleet::IDLE).await, ports.1)
+    (WebServer::start(Kind::Nginx, ports, &site, super::fleet::IDLE).await, ports.1)
 }
 
 fn watcher(address: &str) -> Builder {

@@ -1,8 +1,8 @@
 //! URLs that the servers hand out: they lead through the web server, from wherever they were read.
 
-use crate::fleet::Fleet;
-use crate::rules::Rules;
-use crate::smtp::Smtp;
+use super::fleet::Fleet;
+use super::rules::Rules;
+use crate::mail::smtp::Smtp;
 use crate::support::http;
 use crate::support::until;
 
@@ -31,7 +31,7 @@ async fn urls_lead_through_the_web_server(rules: Rules) {
         assert_eq!(browser.ask(&monitor, &[]).await.status, 200);
     }
     // An answer.
-    let question = format!("{}?url={}", rules.session_path(session.port, "/session"), crate::fleet::arm());
+    let question = format!("{}?url={}", rules.session_path(session.port, "/session"), super::fleet::arm());
     until("a page is given a simulation server", async || browser.get(&question).await.status == 200).await;
     let given = browser.get(&question).await.text();
     assert!(given.starts_with(&format!("wss://{}/", browser.host)), "{given}");

@@ -5,8 +5,8 @@ use std::process::Stdio;
 
 use tokio::process::Command;
 
-use crate::fleet::Fleet;
-use crate::rules::Rules;
+use super::fleet::Fleet;
+use super::rules::Rules;
 use crate::support::{http, until};
 
 fn program(variable: &str, default: &str, how: &str) -> PathBuf {

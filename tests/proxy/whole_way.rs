@@ -2,8 +2,8 @@
 
 use tokio::net::TcpStream;
 
-use crate::fleet::{Fleet, arm};
-use crate::rules::Rules;
+use super::fleet::{Fleet, arm};
+use super::rules::Rules;
 use crate::support::until;
 
 async fn the_whole_way(rules: Rules) {

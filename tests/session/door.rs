@@ -1,6 +1,6 @@
 //! What web clients get at the door.
 
-use crate::stand_in::{Manner, StandIn};
+use super::stand_in::{Manner, StandIn};
 use crate::support::client::Client;
 use crate::support::git::{Forge, world};
 use crate::support::http;

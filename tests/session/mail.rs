@@ -2,10 +2,10 @@
 
 use serde_json::json;
 
-use crate::smtp::Smtp;
-use crate::stand_in::{Manner, StandIn};
+use super::stand_in::{Manner, StandIn};
+use super::{addresses, until_states};
+use crate::mail::smtp::Smtp;
 use crate::support::program::{Builder, session_server};
-use crate::{addresses, until_states};
 
 fn with_mails(servers: &[StandIn], smtp: &Smtp) -> Builder {
     session_server(&addresses(servers))

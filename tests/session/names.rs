@@ -8,10 +8,10 @@ use std::time::{Duration, Instant};
 use nix::sys::signal::Signal;
 use nix::sys::stat::Mode;
 
-use crate::stand_in::{Manner, StandIn};
+use super::stand_in::{Manner, StandIn};
+use super::until_states;
 use crate::support::program::session_server;
 use crate::support::{http, until};
-use crate::until_states;
 
 /// How to get a view of the file system of one's own, if that is allowed here: for root, or with a user of one's own.
 fn own_mounts() -> Option<&'static str> {

@@ -4,12 +4,12 @@ use std::collections::BTreeMap;
 
 use serde_json::json;
 
-use crate::stand_in::{Manner, StandIn};
+use super::stand_in::{Manner, StandIn};
+use super::{addresses, times_logged, until_states};
 use crate::support::client::Client;
 use crate::support::git::world;
 use crate::support::http;
 use crate::support::program::{Builder, Server, session_server};
-use crate::{addresses, times_logged, until_states};
 
 /// A session server whose simulation servers report once, so that a test stands between two reports.
 fn between_reports(servers: &[StandIn], client_cost: f64) -> Builder {

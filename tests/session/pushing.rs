@@ -6,11 +6,11 @@ use futures_util::future::join_all;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
 
-use crate::stand_in::{Manner, StandIn};
+use super::stand_in::{Manner, StandIn};
+use super::{addresses, until_states};
 use crate::support::client::Client;
 use crate::support::program::{Server, session_server};
 use crate::support::{http, until};
-use crate::{addresses, until_states};
 
 async fn clients_of(session: &Server) -> u64 {
     http::get(&session.url("/status")).await.json()["clients"].as_u64().unwrap()

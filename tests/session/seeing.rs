@@ -4,10 +4,10 @@ use std::collections::HashSet;
 
 use serde_json::json;
 
-use crate::stand_in::{Manner, StandIn};
+use super::stand_in::{Manner, StandIn};
+use super::{addresses, times_logged, until_states};
 use crate::support::program::session_server;
 use crate::support::{http, until};
-use crate::{addresses, times_logged, until_states};
 
 #[actix_rt::test]
 async fn a_refusal_carries_a_time_to_come_back_that_is_drawn_at_random() {

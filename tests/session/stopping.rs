@@ -6,11 +6,11 @@ use futures_util::future::join_all;
 use nix::sys::signal::Signal;
 use serde_json::json;
 
-use crate::stand_in::{Manner, StandIn};
+use super::stand_in::{Manner, StandIn};
+use super::{addresses, times_logged, until_states};
 use crate::support::client::Client;
 use crate::support::program::session_server;
 use crate::support::{http, until};
-use crate::{addresses, times_logged, until_states};
 
 #[actix_rt::test]
 async fn clients_are_told_to_go_and_the_server_ends_within_five_seconds() {

@@ -2,11 +2,11 @@
 
 use std::time::{Duration, Instant};
 
-use crate::stand_in::{Manner, StandIn};
+use super::stand_in::{Manner, StandIn};
+use super::{addresses, times_logged, until_states};
 use crate::support::client::Client;
 use crate::support::program::session_server;
 use crate::support::{http, until};
-use crate::{addresses, times_logged, until_states};
 
 fn good() -> Manner {
     Manner::idle(5.0, 10)

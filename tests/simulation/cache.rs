@@ -5,9 +5,9 @@ use std::time::Duration;
 
 use futures_util::future::join_all;
 
-use crate::checkout::{cached, noise, outcome, reader, size_of, world_text};
-use crate::git_wrapper::GitWrapper;
-use crate::scene::{arm, instance_folders, nothing_left};
+use super::checkout::{cached, noise, outcome, reader, size_of, world_text};
+use super::git_wrapper::GitWrapper;
+use super::scene::{arm, instance_folders, nothing_left};
 use crate::support::client::Client;
 use crate::support::git::{Forge, world};
 use crate::support::program::simulation_server;

@@ -7,8 +7,8 @@ use futures_util::future::join_all;
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 
-use crate::git_wrapper::GitWrapper;
-use crate::scene::{arm, instance_folders, nothing_left};
+use super::git_wrapper::GitWrapper;
+use super::scene::{arm, instance_folders, nothing_left};
 use crate::support::client::Client;
 use crate::support::git::{Forge, WORLD, git, world};
 use crate::support::http;

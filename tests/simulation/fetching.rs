@@ -4,9 +4,9 @@ use std::path::{Path, PathBuf};
 
 use nix::sys::signal::Signal;
 
-use crate::checkout::{outcome, reader, world_text};
-use crate::git_wrapper::GitWrapper;
-use crate::scene::{nothing_left, stages};
+use super::checkout::{outcome, reader, world_text};
+use super::git_wrapper::GitWrapper;
+use super::scene::{nothing_left, stages};
 use crate::support::client::Client;
 use crate::support::git::{Forge, git, world};
 use crate::support::program::{Server, simulation_server};

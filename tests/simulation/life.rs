@@ -24,7 +24,7 @@ use std::time::{Duration, Instant};
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 
-use crate::scene::{ALL, DEMO, Scene, State, arm, instance_folders, nothing_left, stages};
+use super::scene::{ALL, DEMO, Scene, State, arm, instance_folders, nothing_left, stages};
 use crate::support::client::Client;
 use crate::support::git::Forge;
 use crate::support::program::{Builder, Server, simulation_server};

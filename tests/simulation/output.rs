@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
-use crate::scene::{DEMO, arm, nothing_left};
+use super::scene::{DEMO, arm, nothing_left};
 use crate::support::client::Client;
 use crate::support::git::Forge;
 use crate::support::http;

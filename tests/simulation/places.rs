@@ -3,7 +3,7 @@
 use std::net::TcpListener;
 use std::time::Duration;
 
-use crate::scene::{arm, nothing_left};
+use super::scene::{arm, nothing_left};
 use crate::support::client::Client;
 use crate::support::git::Forge;
 use crate::support::program::simulation_server;

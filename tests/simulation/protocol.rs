@@ -2,7 +2,7 @@
 
 use tokio_tungstenite::tungstenite::client::IntoClientRequest;
 
-use crate::scene::arm;
+use super::scene::arm;
 use crate::support::client::Client;
 use crate::support::git::{Forge, world};
 use crate::support::http;
@@ -96,7 +96,7 @@ async fn who_asks_without_reading_is_sent_away() {
         client.send(&serde_json::json!({"start": {"url": arm()}}).to_string()).await;
     }
     assert_eq!(client.closed().await, Some(1008));
-    until("it is gone", async || crate::scene::stages(&server).await.is_empty()).await;
+    until("it is gone", async || super::scene::stages(&server).await.is_empty()).await;
 }
 
 #[actix_rt::test]
@@ -106,7 +106,7 @@ async fn a_second_start_on_a_connection_is_ignored() {
     client.until("webots:").await;
     client.send(&serde_json::json!({"start": {"url": arm()}}).to_string()).await;
     until("it is logged", async || server.log().contains("second simulation on one connection; ignored")).await;
-    assert_eq!(crate::scene::stages(&server).await.len(), 1);
+    assert_eq!(super::scene::stages(&server).await.len(), 1);
 }
 
 #[actix_rt::test]
@@ -184,7 +184,7 @@ async fn outcomes_are_counted() {
     Client::start(&server, &world("other/x", "main", "worlds/a.wbt")).await.until("loading: Error:").await;
     waits.leave().await;
     ready.leave().await;
-    crate::scene::nothing_left(&server, 1).await;
+    super::scene::nothing_left(&server, 1).await;
     Client::start(&server, &world("lab/none", "main", "worlds/a.wbt")).await.until("loading: Error:").await;
     for (outcome, expected) in
         [("ready", 1), ("left", 1), ("full", 1), ("refused", 1), ("no_checkout", 1), ("no_webots", 0)]

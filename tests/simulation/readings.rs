@@ -5,7 +5,7 @@ use std::process::Command;
 
 use nix::sys::signal::Signal;
 
-use crate::scene::arm;
+use super::scene::arm;
 use crate::support::client::Client;
 use crate::support::git::Forge;
 use crate::support::program::{Builder, simulation_server};

@@ -7,8 +7,8 @@ use std::time::{Duration, Instant};
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 
-use crate::checkout::{outcome, world_text};
-use crate::scene::{DEMO, arm, instance_folders_in, nothing_left, stages};
+use super::checkout::{outcome, world_text};
+use super::scene::{DEMO, arm, instance_folders_in, nothing_left, stages};
 use crate::support::client::Client;
 use crate::support::git::{Forge, world};
 use crate::support::program::simulation_server;

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use nix::sys::signal::Signal;
 use serde_json::json;
 
-use crate::scene::{arm, stages};
+use super::scene::{arm, stages};
 use crate::support::client::Client;
 use crate::support::git::Forge;
 use crate::support::program::simulation_server;
@@ -114,7 +114,6 @@ fn listener(codes: &'static [u16]) -> (String, std::sync::mpsc::Receiver<String>
     std::thread::spawn(move || {
         for code in codes {
             let (mut socket, _) = listener.accept().unwrap();
-            socket.set_read_timeout(Some(crate::support::SOON)).unwrap();
             let mut text = Vec::new();
             while !is_whole(&text) {
                 let mut chunk = [0; 4096];

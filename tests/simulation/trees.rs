@@ -7,9 +7,9 @@ use std::time::{Duration, Instant};
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 
-use crate::git_wrapper::GitWrapper;
-use crate::life::{children, is_there, quick};
-use crate::scene::{DEMO, Scene, State, arm, nothing_left};
+use super::git_wrapper::GitWrapper;
+use super::life::{children, is_there, quick};
+use super::scene::{DEMO, Scene, State, arm, nothing_left};
 use crate::support::client::Client;
 use crate::support::git::Forge;
 use crate::support::program::{Server, simulation_server};

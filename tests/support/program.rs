@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::time::Instant;
 
+use nix::sys::resource::{Resource, getrlimit, setrlimit};
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 use serde_json::Value;
@@ -177,6 +178,9 @@ impl Server {
 
     /// Stops the server, and connects so many clients that it can't accept: they wait in the system's queue.
     pub fn crowd(&self, clients: usize) {
+        // Other tests of this process need files as well.
+        let (_, most) = getrlimit(Resource::RLIMIT_NOFILE).unwrap();
+        setrlimit(Resource::RLIMIT_NOFILE, most, most).unwrap();
         self.signal(Signal::SIGSTOP);
         let address = self.address().parse().unwrap();
         let connect = |_| std::net::TcpStream::connect_timeout(&address, SOON).unwrap();

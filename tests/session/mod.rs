@@ -1,22 +1,6 @@
 //! The session server, seen from outside: the built program, real sockets, stand-ins for simulation servers.
 
-#![allow(
-    missing_docs,
-    unreachable_pub,
-    clippy::unwrap_used,
-    clippy::expect_used,
-    clippy::panic,
-    clippy::indexing_slicing,
-    reason = "tests fail by panics"
-)]
-#![allow(clippy::pedantic, reason = "tests are read one by one")]
-
-#[path = "../mail/smtp.rs"]
-#[expect(dead_code, reason = "the tests of mails use the rest")]
-mod smtp;
 mod stand_in;
-#[path = "../support/mod.rs"]
-mod support;
 
 mod door;
 mod mail;
@@ -27,9 +11,9 @@ mod seeing;
 mod stopping;
 mod watching;
 
+use crate::support::program::Server;
+use crate::support::{http, until};
 use stand_in::StandIn;
-use support::program::Server;
-use support::{http, until};
 
 /// `HOST:PORT` of each.
 fn addresses(servers: &[StandIn]) -> Vec<String> {

@@ -1,0 +1,8 @@
+//! What a service manager, an administrator and a display see of the servers.
+
+mod display;
+mod drain;
+mod files;
+mod notify;
+mod ports;
+mod preflight;

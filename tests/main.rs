@@ -1,0 +1,24 @@
+//! The tests from outside: built programs, real sockets, processes and files. They are one crate so that they are linked
+//! once; `cargo test --test integration proxy::` runs one part.
+
+#![allow(
+    missing_docs,
+    unreachable_pub,
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::panic,
+    clippy::indexing_slicing,
+    clippy::string_slice,
+    reason = "tests fail by panics"
+)]
+#![allow(clippy::pedantic, reason = "tests are read one by one")]
+
+mod demo_simulator;
+mod deploy;
+mod mail;
+mod placement;
+mod project;
+mod proxy;
+mod session;
+mod simulation;
+mod support;

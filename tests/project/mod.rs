@@ -1,0 +1,10 @@
+//! The project as a whole: `server.sh` and the demo as a newcomer meets them, the shipped configuration files and
+//! pages, and the rules that the source keeps.
+
+mod configuration;
+mod copy;
+mod demo;
+mod layering;
+mod pages;
+mod refusals;
+mod source;

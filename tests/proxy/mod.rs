@@ -1,0 +1,18 @@
+//! The fleet behind real web servers: Debian's apache2 and nginx, started here on free ports of the loopback, with our
+//! rules (`deploy/`) and with those of the original documents.
+
+mod authority;
+mod browser;
+mod fleet;
+mod rules;
+mod web_server;
+
+mod addresses;
+mod connections;
+mod encoded;
+mod exposure;
+mod pages;
+mod trust;
+mod urls;
+mod visitor;
+mod whole_way;
