@@ -17,9 +17,9 @@ use super::config::SimulationConfig;
 use super::places::{Census, Places};
 use super::state::AppState;
 use crate::shared::domain::Rules;
+use crate::shared::http::BasicAuth;
 use crate::shared::http::Connections;
 use crate::shared::http::Live;
-use crate::shared::http::Lock;
 use crate::shared::http::Metrics;
 use crate::shared::http::sockets::{self, Sockets};
 use crate::shared::run::notify;
@@ -224,7 +224,7 @@ fn assemble(
         phase,
         requests,
         main_thread: Arbiter::current(),
-        lock: config.admin_password.clone().map(Lock::new),
+        admin_auth: config.admin_password.clone().map(BasicAuth::new),
         connections: Connections::new(config.max_clients, config.max_clients_per_address),
         metrics,
         starts,

@@ -13,9 +13,9 @@ use super::places::Places;
 use crate::shared::domain::Load;
 use crate::shared::domain::ProjectUrl;
 use crate::shared::domain::Rules;
+use crate::shared::http::BasicAuth;
 use crate::shared::http::Connections;
 use crate::shared::http::Live;
-use crate::shared::http::Lock;
 use crate::shared::http::Metrics;
 use crate::shared::run::{Phase, Request};
 use crate::simulation::checkout::Checkouts;
@@ -45,8 +45,8 @@ pub struct AppState {
     pub requests: tokio::sync::mpsc::Sender<Request>,
     /// Where Webots' actors live.
     pub main_thread: ArbiterHandle,
-    /// Guards what is the administrator's, where there is a password.
-    pub lock: Option<Lock>,
+    /// Checks the administrator's password, where one is configured.
+    pub admin_auth: Option<BasicAuth>,
     /// Counts connections.
     pub connections: Connections,
     /// What is counted.

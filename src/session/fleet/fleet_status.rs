@@ -3,9 +3,9 @@
 use std::collections::VecDeque;
 use std::time::{Duration, Instant, SystemTime};
 
-use crate::shared::domain::Dispatch;
 use crate::shared::domain::Load;
 use crate::shared::domain::PublicAddress;
+use crate::shared::domain::ServerReport;
 
 /// Everything that is known of the fleet.
 #[derive(Debug, Clone)]
@@ -30,7 +30,7 @@ pub struct ServerStatus {
     /// Since when.
     pub since: SystemTime,
     /// What it said last.
-    pub report: Option<Dispatch>,
+    pub report: Option<ServerReport>,
     /// Why it gave no usable answer, if it did not.
     pub error: Option<String>,
     /// Last report, and the clients that it can't show yet.

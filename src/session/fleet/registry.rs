@@ -22,10 +22,10 @@ use super::subscribers::{News, Subscribers};
 use crate::session::config::SessionConfig;
 use crate::session::mail::mailer::Mailer;
 use crate::session::placement::Fleet;
-use crate::shared::domain::Dispatch;
 use crate::shared::domain::Load;
 use crate::shared::domain::ProjectUrl;
 use crate::shared::domain::PublicAddress;
+use crate::shared::domain::ServerReport;
 use crate::shared::http::tls;
 
 /// Asks to be told of availability, now and whenever it changes.
@@ -163,7 +163,7 @@ impl Registry {
     }
 
     /// Takes in what came of a server at this time.
-    fn take_in(&mut self, server: &PublicAddress, answer: Result<Dispatch, Unreachable>, at: Instant) {
+    fn take_in(&mut self, server: &PublicAddress, answer: Result<ServerReport, Unreachable>, at: Instant) {
         let Some(Member { watched, .. }) = self.servers.get_mut(server) else {
             return;
         };
@@ -185,7 +185,7 @@ impl Registry {
         let Self { fleet, servers, .. } = self;
         let accepts = |address: &PublicAddress, world: &ProjectUrl| {
             // One that has said nothing yet may accept it.
-            let says = |report: &Dispatch| report.accepts(world);
+            let says = |report: &ServerReport| report.accepts(world);
             servers.get(address).is_some_and(|member| member.watched.report.as_ref().is_none_or(says))
         };
         let eligible = |address: &PublicAddress| world.is_none_or(|world| accepts(address, world));

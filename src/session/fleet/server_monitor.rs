@@ -19,9 +19,9 @@ use rustls::ClientConfig;
 
 use super::probe_error::Unreachable;
 use super::resolver::Names;
-use crate::shared::domain::Dispatch;
 use crate::shared::domain::Load;
 use crate::shared::domain::PublicAddress;
+use crate::shared::domain::ServerReport;
 use crate::shared::http::tls;
 
 /// What was learned about a simulation server.
@@ -33,7 +33,7 @@ pub struct Reported {
     /// How long it took to answer, or until that was given up.
     pub latency: Duration,
     /// What it said of itself, or why it can't be counted on.
-    pub answer: Result<Dispatch, Unreachable>,
+    pub answer: Result<ServerReport, Unreachable>,
 }
 
 /// How often and how patiently a server is asked. As a message it changes a monitor's ways.
@@ -85,7 +85,7 @@ const NO_SUCH_PAGE: [StatusCode; 4] =
 
 /// What was understood of an answer.
 enum Answer {
-    Status(Dispatch),
+    Status(ServerReport),
     /// There is no `/status`, but a `/load`.
     Load(Load),
 }
@@ -157,14 +157,14 @@ impl ServerMonitor {
             .spawn(ctx);
     }
 
-    fn understood(&mut self, answer: Answer) -> Dispatch {
+    fn understood(&mut self, answer: Answer) -> ServerReport {
         match answer {
-            Answer::Status(dispatch) => dispatch,
+            Answer::Status(report) => report,
             Answer::Load(load) => {
                 if self.load_only_until.is_none_or(|end| Instant::now() >= end) {
                     self.load_only_until = Some(Instant::now() + LOAD_ONLY);
                 }
-                Dispatch::load_only(load)
+                ServerReport::load_only(load)
             }
         }
     }
@@ -237,13 +237,13 @@ fn no_answer(error: SendRequestError) -> Unreachable {
 }
 
 /// Some servers of the Python family have a `/status` with less in it; a page that is no status at all counts as none.
-fn parse_status(body: &[u8]) -> Result<Dispatch, Unreachable> {
-    let dispatch = Dispatch::parse(body).map_err(|error| {
+fn parse_status(body: &[u8]) -> Result<ServerReport, Unreachable> {
+    let report = ServerReport::parse(body).map_err(|error| {
         let text = String::from_utf8_lossy(body.get(..body.len().min(40)).unwrap_or_default()).into_owned();
         Unreachable::BadAnswer(shortened(&format!("{error} in {text:?}")))
     })?;
-    plausible(dispatch.load)?;
-    Ok(dispatch)
+    plausible(report.load)?;
+    Ok(report)
 }
 
 fn plausible(load: Load) -> Result<Load, Unreachable> {

@@ -6,9 +6,9 @@ use super::fleet_status::{ServerStatus, State};
 use super::probe_error::Unreachable;
 use crate::session::mail::Event;
 use crate::session::placement;
-use crate::shared::domain::Dispatch;
 use crate::shared::domain::Load;
 use crate::shared::domain::PublicAddress;
+use crate::shared::domain::ServerReport;
 
 /// One simulation server.
 #[derive(Debug)]
@@ -20,7 +20,7 @@ pub struct Watched {
     /// Since when.
     pub since: SystemTime,
     /// What it said last; kept when it is down.
-    pub report: Option<Dispatch>,
+    pub report: Option<ServerReport>,
     /// Why it gave no usable answer, if it did not.
     pub error: Option<Unreachable>,
     /// Why it gave none the last time that it did not.
@@ -66,7 +66,7 @@ impl Watched {
     }
 
     /// Takes in a good answer that came at this time. From this load on, in percent, the server takes nobody.
-    pub fn said(&mut self, report: Dispatch, at: Instant, limit: f64) -> Option<Change> {
+    pub fn said(&mut self, report: ServerReport, at: Instant, limit: f64) -> Option<Change> {
         let (state, why) = self.judge(&report, limit);
         self.report = Some(report);
         self.error = None;
@@ -89,7 +89,7 @@ impl Watched {
 
     /// The last report, if it still holds.
     #[must_use]
-    pub fn current(&self) -> Option<&Dispatch> {
+    pub fn current(&self) -> Option<&ServerReport> {
         self.report.as_ref().filter(|_| self.state != State::Down)
     }
 
@@ -131,7 +131,7 @@ impl Watched {
         self.current().map(|report| report.load)
     }
 
-    fn judge(&self, report: &Dispatch, limit: f64) -> (State, impl FnOnce() -> String + use<>) {
+    fn judge(&self, report: &ServerReport, limit: f64) -> (State, impl FnOnce() -> String + use<>) {
         let load = report.load.percent();
         let no_place = report.instances.filter(|instances| instances.present() >= instances.places);
         let state = if self.drained || report.draining {
@@ -182,8 +182,8 @@ impl Watched {
 mod tests {
     use super::*;
 
-    fn report(load: f64) -> Dispatch {
-        Dispatch::load_only(Load::try_from(load).unwrap())
+    fn report(load: f64) -> ServerReport {
+        ServerReport::load_only(Load::try_from(load).unwrap())
     }
 
     /// The events of each step: a load, or nothing for a failure.

@@ -17,7 +17,7 @@ use crate::session::fleet::{GetStatus, IsAvailable};
 use crate::session::fleet::{NoServer, Pick};
 use crate::session::state::AppState;
 use crate::shared::http::CONTENT_TYPE;
-use crate::shared::http::paths::{self, GET, READ, come_back, path};
+use crate::shared::http::paths::{self, GET, READ, path, retry_after};
 use crate::shared::http::websocket;
 
 /// Adds all paths to an app.
@@ -63,7 +63,7 @@ async fn session(
     if wants_websocket(&request) {
         return open_websocket(&request, stream, &server, &audience);
     }
-    let from = server.trusted_proxies.peer(&request).household();
+    let from = server.trusted_proxies.peer(&request).rate_limit_key();
     let answer = server.pick(Pick::parse(wanted_world(request.query_string()).as_deref(), from)).await;
     let status = match answer.refusal {
         None => StatusCode::OK,
@@ -73,7 +73,7 @@ async fn session(
     };
     let mut response = HttpResponse::build(status);
     if status == StatusCode::SERVICE_UNAVAILABLE {
-        response.insert_header(come_back());
+        response.insert_header(retry_after());
     }
     response.content_type("text/plain; charset=utf-8").body(answer.text)
 }

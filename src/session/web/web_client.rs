@@ -16,7 +16,7 @@ use crate::session::state::AppState;
 use crate::shared::http::Connection;
 use crate::shared::http::Peer;
 use crate::shared::http::liveness::{self, Liveness};
-use crate::shared::http::websocket::{Heard, Inbox};
+use crate::shared::http::websocket::{ClientMessage, MessageReader};
 
 /// The actor.
 pub struct WebClient {
@@ -26,20 +26,20 @@ pub struct WebClient {
     told: Option<bool>,
     audience: Addr<Audience>,
     membership: Option<Membership>,
-    inbox: Inbox,
+    reader: MessageReader,
     _connection: Connection,
 }
 
 type Context = WebsocketContext<WebClient>;
 
 impl WebClient {
-    /// A client that has just connected; `connection` counts it, `inbox` takes what comes from it.
+    /// A client that has just connected; `connection` counts it, `reader` takes what comes from it.
     #[must_use]
     pub fn new(
         server: Arc<AppState>,
         audience: Addr<Audience>,
         peer: Peer,
-        (connection, inbox): (Connection, Inbox),
+        (connection, reader): (Connection, MessageReader),
     ) -> Self {
         Self {
             server,
@@ -48,7 +48,7 @@ impl WebClient {
             told: None,
             audience,
             membership: None,
-            inbox,
+            reader,
             _connection: connection,
         }
     }
@@ -60,7 +60,7 @@ impl WebClient {
 
     fn pick(&self, text: &str, ctx: &mut Context) {
         let server = Arc::clone(&self.server);
-        let (wanted, from) = (wanted_world(text), self.peer.household());
+        let (wanted, from) = (wanted_world(text), self.peer.rate_limit_key());
         let picked = async move { server.pick(Pick::parse(wanted.as_deref(), from)).await };
         // Nothing else is done meanwhile, so that answers come in the order of the texts, and before a close.
         picked.into_actor(self).map(|answer, _, ctx| ctx.text(answer.text)).wait(ctx);
@@ -116,23 +116,23 @@ impl Handler<News> for WebClient {
 
 impl StreamHandler<Result<Message, ProtocolError>> for WebClient {
     fn handle(&mut self, message: Result<Message, ProtocolError>, ctx: &mut Self::Context) {
-        match self.inbox.take(message) {
-            Heard::Text(text) if self.liveness.may_answer() => self.pick(&text, ctx),
-            Heard::Ping(data) if self.liveness.may_answer() => ctx.pong(&data),
-            Heard::Pong(content) => self.liveness.pong(&content),
-            Heard::Close(reason) => {
+        match self.reader.read(message) {
+            Ok(Some(ClientMessage::Text(text))) if self.liveness.may_answer() => self.pick(&text, ctx),
+            Ok(Some(ClientMessage::Ping(data))) if self.liveness.may_answer() => ctx.pong(&data),
+            Ok(Some(ClientMessage::Pong(content))) => self.liveness.pong(&content),
+            Ok(Some(ClientMessage::Close(reason))) => {
                 ctx.close(reason);
                 ctx.stop();
             }
-            Heard::Nothing => {}
-            Heard::Text(_) | Heard::Ping(_) => {
+            Ok(None) => {}
+            Ok(Some(ClientMessage::Text(_) | ClientMessage::Ping(_))) => {
                 log::warn!("client {}: asks too much between two pings", self.peer);
                 ctx.text("Error: too many requests on one connection.");
                 Self::close(CloseCode::Policy, ctx);
             }
-            Heard::Wrong(wrong) => {
-                log::debug!("client {}: {wrong}", self.peer);
-                Self::close(wrong.code(), ctx);
+            Err(error) => {
+                log::debug!("client {}: {error}", self.peer);
+                Self::close(error.code(), ctx);
             }
         }
     }

@@ -11,5 +11,5 @@ pub use address::{PublicAddress, check_host};
 pub use admission::Rules;
 pub use load::Load;
 pub use project_url::{NoProject, ProjectUrl, Reading, RefKind};
-pub use report::{Dispatch, Instances};
+pub use report::{Instances, ServerReport};
 pub use repositories::UrlPrefix;

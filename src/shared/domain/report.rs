@@ -1,4 +1,4 @@
-//! What a simulation server tells in `GET /status`, the one page that both servers know.
+//! A simulation server's report: the part of `GET /status` that both servers know.
 
 use serde::{Deserialize, Serialize};
 
@@ -8,39 +8,39 @@ use super::project_url::ProjectUrl;
 use super::repositories::{UrlPrefix, any_covers, any_may_cover};
 use crate::shared::config::{object, optional_object};
 
-/// The part of a simulation server's `/status` that decides where clients go.
+/// The part of a simulation server's `/status` by which the session server places clients.
 ///
-/// Only `load` is required: everything else has a default that means 'not said', so that an older or another
-/// server's page is understood as far as it goes.
+/// Only `load` is required. Every other field has a default for 'not reported', so that the report of an older server,
+/// or of a Python one, can be read too.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "camelCase")]
-pub struct Dispatch {
-    /// Percent, the mean of the last five seconds.
+pub struct ServerReport {
+    /// Mean load of the last five seconds, in percent.
     pub load: Load,
     /// The server's version.
     #[serde(default)]
     pub version: String,
-    /// The simulations of the server, where it counts them.
+    /// Simulations by state, if the server counts them.
     #[serde(default, deserialize_with = "optional_object")]
     pub instances: Option<Instances>,
-    /// Whose worlds the server runs at any load.
+    /// Repositories whose worlds the server runs at any load.
     #[serde(default)]
     pub allowed_repositories: Vec<UrlPrefix>,
-    /// Whose worlds it never runs.
+    /// Repositories whose worlds it never runs.
     #[serde(default)]
     pub blocked_repositories: Vec<UrlPrefix>,
-    /// The highest load, in percent, at which worlds of others may run; 0: never.
+    /// The highest load, in percent, at which other worlds may run; 0: never.
     #[serde(default)]
     pub share_idle_time: f64,
-    /// Whether the server can run worlds of others in containers.
+    /// Whether the server can run other worlds in containers.
     #[serde(default)]
     pub docker: Option<bool>,
-    /// Whether the server takes no new clients because it is to end.
+    /// Whether the server takes no new clients because it is about to stop.
     #[serde(default)]
     pub draining: bool,
 }
 
-/// How many simulations a server has, by their state.
+/// Number of simulations of a server by state.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "camelCase", default)]
 pub struct Instances {
@@ -67,18 +67,18 @@ impl Instances {
     }
 }
 
-impl Dispatch {
-    /// Reads the page.
+impl ServerReport {
+    /// Reads the JSON of `/status`.
     ///
     /// # Errors
-    /// When it is something else.
+    /// When it is no JSON object with a `load`.
     pub fn parse(page: &[u8]) -> serde_json::Result<Self> {
         let mut json = serde_json::Deserializer::from_slice(page);
-        let dispatch = object(&mut json)?;
-        json.end().map(|()| dispatch)
+        let report = object(&mut json)?;
+        json.end().map(|()| report)
     }
 
-    /// What is known of a server that tells its load alone.
+    /// The report of a server that has only `/load`.
     #[must_use]
     pub fn load_only(load: Load) -> Self {
         Self {
@@ -93,10 +93,10 @@ impl Dispatch {
         }
     }
 
-    /// Whether the server will run this world, by what it says of itself.
+    /// Whether the server will run this world, as far as the report tells.
     ///
-    /// A server that doesn't say whether it has docker is another's: it is taken to run every world that it does not
-    /// rule out, as the original's session server takes it.
+    /// A report without `docker` comes from a Python server: it is expected to run every world that it does not rule
+    /// out, as the Python session server expects it.
     #[must_use]
     pub fn accepts(&self, world: &ProjectUrl) -> bool {
         let Some(docker) = self.docker else {
@@ -152,7 +152,7 @@ mod tests {
             ),
         ];
         for (text, runs_lab, runs_other, why) in table {
-            let status: Dispatch = serde_json::from_str(text).unwrap();
+            let status: ServerReport = serde_json::from_str(text).unwrap();
             assert_eq!((status.accepts(&lab), status.accepts(&other)), (runs_lab, runs_other), "{why}");
         }
     }

@@ -8,7 +8,7 @@ use actix_web::HttpResponse;
 use actix_web::http::StatusCode;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 
-use super::paths::come_back;
+use super::paths::retry_after;
 use super::peer::Peer;
 
 /// Counts open connections.
@@ -64,7 +64,7 @@ impl Connections {
     /// When there are too many connections.
     pub fn admit(&self, peer: Peer) -> Result<Connection, Crowded> {
         let permit = Arc::clone(&self.all).try_acquire_owned().map_err(|_| Crowded::Everywhere)?;
-        let place = peer.household().map(|address| self.place(address)).transpose()?;
+        let place = peer.rate_limit_key().map(|address| self.place(address)).transpose()?;
         Ok(Connection { _permit: permit, _place: place })
     }
 
@@ -99,7 +99,7 @@ impl Crowded {
             Self::Everywhere => StatusCode::SERVICE_UNAVAILABLE,
             Self::FromThere => StatusCode::TOO_MANY_REQUESTS,
         };
-        HttpResponse::build(status).insert_header(come_back()).body(self.to_string())
+        HttpResponse::build(status).insert_header(retry_after()).body(self.to_string())
     }
 }
 

@@ -14,7 +14,7 @@ pub mod sockets;
 pub mod tls;
 pub mod websocket;
 
-pub use auth::Lock;
+pub use auth::BasicAuth;
 pub use connections::{Connection, Connections};
 pub use live::{Live, Row, View};
 pub use metrics::{CONTENT_TYPE, Gauge, Metrics};

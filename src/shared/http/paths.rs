@@ -8,7 +8,7 @@ use actix_web::{FromRequest, Handler, HttpResponse, Resource, Responder, guard, 
 use rand::RngExt;
 
 /// In seconds.
-const COME_BACK: std::ops::RangeInclusive<u16> = 2..=6;
+const RETRY_AFTER: std::ops::RangeInclusive<u16> = 2..=6;
 
 /// For what is read. What watches over servers likes to ask for the head alone (RFC 9110, section 9.3.2).
 pub const READ: &[Method] = &[Method::GET, Method::HEAD];
@@ -39,8 +39,8 @@ fn wrong_method(methods: &[Method]) -> HttpResponse {
 /// After how many seconds a client that was refused may come back: drawn at random, so that a class that was refused
 /// together does not come back together.
 #[must_use]
-pub fn come_back() -> (HeaderName, HeaderValue) {
-    (header::RETRY_AFTER, HeaderValue::from(rand::rng().random_range(COME_BACK)))
+pub fn retry_after() -> (HeaderName, HeaderValue) {
+    (header::RETRY_AFTER, HeaderValue::from(rand::rng().random_range(RETRY_AFTER)))
 }
 
 /// All paths of a server, which pages of any origin may use; `hint` names those that people look for.

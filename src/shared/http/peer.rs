@@ -40,7 +40,7 @@ impl Peer {
     /// The address by which a client is known, where it is: one IPv6 client has a whole /64 of addresses, which count as
     /// one.
     #[must_use]
-    pub fn household(self) -> Option<IpAddr> {
+    pub fn rate_limit_key(self) -> Option<IpAddr> {
         match self {
             Self::Client(IpAddr::V6(address)) => Some(Ipv6Addr::from_bits(address.to_bits() >> 64 << 64).into()),
             Self::Client(address) => Some(address),

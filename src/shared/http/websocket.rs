@@ -1,4 +1,5 @@
-//! Opens WebSockets, puts what comes in pieces together, and bounds what a peer can make this server hold.
+//! WebSockets: opening them, joining messages that come in several frames, and bounding what a client can make the
+//! server hold in memory.
 
 use std::pin::Pin;
 use std::sync::Arc;
@@ -15,109 +16,109 @@ use bytestring::ByteString;
 use futures_util::Stream;
 
 /// The largest message of a client, in bytes.
-const LARGEST_MESSAGE: usize = 8 * 1024;
-/// How much may have come that was not yet understood as messages. The size of a message is known to actix only once
-/// it is there as a whole, and it reads on while earlier ones wait: without a bound, one peer could fill the memory.
-const LARGEST_BACKLOG: usize = 128 * 1024;
-/// What a frame has besides its content, at most (RFC 6455, section 5.2).
+const MAX_MESSAGE: usize = 8 * 1024;
+/// How many received bytes may wait to be read as messages. actix tells the size of a message only when all of it is
+/// there, and goes on reading while earlier messages wait: without this bound one client could fill the memory.
+const MAX_BACKLOG: usize = 128 * 1024;
+/// The largest header of a WebSocket frame, in bytes (RFC 6455, section 5.2).
 const FRAME_HEADER: usize = 14;
 
-/// What came from a peer: bytes that were not yet handed over as messages, and a text of which more is to come.
+/// Reads the messages of one WebSocket, and joins those that come in several frames.
 #[derive(Debug, Default)]
-pub struct Inbox {
+pub struct MessageReader {
     backlog: Backlog,
-    /// The pieces of a text until now (RFC 6455, section 5.4).
-    pieces: Option<Vec<u8>>,
+    /// The frames so far of a text whose last frame has not come yet (RFC 6455, section 5.4).
+    partial: Option<Vec<u8>>,
 }
 
+/// How many bytes were received and not yet read as messages.
 type Backlog = Arc<AtomicUsize>;
 
-/// What a peer has said.
+/// A complete message of a client.
 #[derive(Debug)]
-pub enum Heard {
-    /// A whole text.
+pub enum ClientMessage {
+    /// A text.
     Text(ByteString),
-    /// It wants to know whether this server lives.
+    /// A ping, which wants a pong with the same content.
     Ping(Bytes),
-    /// It lives.
+    /// The answer to a ping.
     Pong(Bytes),
-    /// It leaves.
+    /// The client closes the connection, or is gone.
     Close(Option<CloseReason>),
-    /// Nothing that is whole.
-    Nothing,
-    /// Nothing that can be understood: the connection must be closed.
-    Wrong(Wrong),
 }
 
-/// Why a connection must be closed. The words are for the peer.
+/// Why a message can't be read; the connection must be closed. The words are for the client.
 #[derive(Debug, thiserror::Error)]
-pub enum Wrong {
-    /// It is too large.
-    #[error("Wrong message: it is longer than {} KiB", LARGEST_MESSAGE / 1024)]
+pub enum MessageError {
+    /// The message is longer than [`MAX_MESSAGE`].
+    #[error("Wrong message: it is longer than {} KiB", MAX_MESSAGE / 1024)]
     TooLarge,
-    /// It is no text.
+    /// The message is binary, or no UTF-8.
     #[error("Wrong message: allowed are short texts")]
-    NoText,
-    /// It breaks the rules of WebSockets.
+    NotText,
+    /// The frame breaks the rules of WebSockets.
     #[error("Wrong message: {0}")]
-    Broken(ProtocolError),
+    Protocol(ProtocolError),
 }
 
-impl Wrong {
-    /// The code to close with.
+impl MessageError {
+    /// The code to close the WebSocket with.
     #[must_use]
     pub fn code(&self) -> CloseCode {
         match self {
             Self::TooLarge => CloseCode::Size,
-            Self::NoText => CloseCode::Unsupported,
-            Self::Broken(_) => CloseCode::Protocol,
+            Self::NotText => CloseCode::Unsupported,
+            Self::Protocol(_) => CloseCode::Protocol,
         }
     }
 }
 
-impl Inbox {
-    /// Takes what was handed over, and makes something whole of it.
-    pub fn take(&mut self, message: Result<Message, ProtocolError>) -> Heard {
+impl MessageReader {
+    /// Reads what actix hands over. Returns nothing while a message is incomplete.
+    ///
+    /// # Errors
+    /// When the message is too large, is no text, or breaks the rules of WebSockets.
+    pub fn read(&mut self, message: Result<Message, ProtocolError>) -> Result<Option<ClientMessage>, MessageError> {
         self.count(&message);
         match message {
-            Ok(Message::Text(text)) => Heard::Text(text),
-            Ok(Message::Ping(content)) => Heard::Ping(content),
-            Ok(Message::Pong(content)) => Heard::Pong(content),
-            Ok(Message::Close(reason)) => Heard::Close(reason),
-            Ok(Message::Nop) => Heard::Nothing,
-            Ok(Message::Binary(_) | Message::Continuation(Item::FirstBinary(_))) => Heard::Wrong(Wrong::NoText),
+            Ok(Message::Text(text)) => Ok(Some(ClientMessage::Text(text))),
+            Ok(Message::Ping(content)) => Ok(Some(ClientMessage::Ping(content))),
+            Ok(Message::Pong(content)) => Ok(Some(ClientMessage::Pong(content))),
+            Ok(Message::Close(reason)) => Ok(Some(ClientMessage::Close(reason))),
+            Ok(Message::Nop) => Ok(None),
+            Ok(Message::Binary(_) | Message::Continuation(Item::FirstBinary(_))) => Err(MessageError::NotText),
             Ok(Message::Continuation(Item::FirstText(piece))) => {
-                self.pieces = Some(Vec::new());
-                self.add(&piece, false)
+                self.partial = Some(Vec::new());
+                self.join(&piece, false)
             }
-            Ok(Message::Continuation(Item::Continue(piece))) => self.add(&piece, false),
-            Ok(Message::Continuation(Item::Last(piece))) => self.add(&piece, true),
-            Err(ProtocolError::Overflow) => Heard::Wrong(Wrong::TooLarge),
-            Err(_) if self.backlog.load(Ordering::Relaxed) > LARGEST_BACKLOG => Heard::Wrong(Wrong::TooLarge),
-            // It has gone without a word, as every closed laptop does.
-            Err(ProtocolError::Io(_)) => Heard::Close(None),
-            Err(error) => Heard::Wrong(Wrong::Broken(error)),
+            Ok(Message::Continuation(Item::Continue(piece))) => self.join(&piece, false),
+            Ok(Message::Continuation(Item::Last(piece))) => self.join(&piece, true),
+            Err(ProtocolError::Overflow) => Err(MessageError::TooLarge),
+            Err(_) if self.backlog.load(Ordering::Relaxed) > MAX_BACKLOG => Err(MessageError::TooLarge),
+            // The connection broke without a close frame, as with every closed laptop.
+            Err(ProtocolError::Io(_)) => Ok(Some(ClientMessage::Close(None))),
+            Err(error) => Err(MessageError::Protocol(error)),
         }
     }
 
-    fn add(&mut self, piece: &[u8], is_last: bool) -> Heard {
-        let Some(mut text) = self.pieces.take() else {
-            return Heard::Wrong(Wrong::Broken(ProtocolError::ContinuationNotStarted));
+    /// Appends a frame to the text that is under way.
+    fn join(&mut self, piece: &[u8], is_last: bool) -> Result<Option<ClientMessage>, MessageError> {
+        let Some(mut text) = self.partial.take() else {
+            return Err(MessageError::Protocol(ProtocolError::ContinuationNotStarted));
         };
         text.extend_from_slice(piece);
-        if text.len() > LARGEST_MESSAGE {
-            return Heard::Wrong(Wrong::TooLarge);
+        if text.len() > MAX_MESSAGE {
+            return Err(MessageError::TooLarge);
         }
         if !is_last {
-            self.pieces = Some(text);
-            return Heard::Nothing;
+            self.partial = Some(text);
+            return Ok(None);
         }
-        match String::from_utf8(text) {
-            Ok(text) => Heard::Text(text.into()),
-            Err(_) => Heard::Wrong(Wrong::NoText),
-        }
+        let text = String::from_utf8(text).map_err(|_| MessageError::NotText)?;
+        Ok(Some(ClientMessage::Text(text.into())))
     }
 
+    /// Takes the bytes of a message off the backlog.
     fn count(&self, message: &Result<Message, ProtocolError>) {
         let content = match message {
             Ok(Message::Text(text)) => text.len(),
@@ -132,26 +133,26 @@ impl Inbox {
             Ok(Message::Close(_) | Message::Nop) => 0,
             Err(_) => return,
         };
-        let took = |backlog: usize| Some(backlog.saturating_sub(content + FRAME_HEADER));
-        // The closure always gives a value.
-        self.backlog.fetch_update(Ordering::Relaxed, Ordering::Relaxed, took).ok();
+        let rest = |backlog: usize| Some(backlog.saturating_sub(content + FRAME_HEADER));
+        // It can't fail: the closure always returns a value.
+        self.backlog.fetch_update(Ordering::Relaxed, Ordering::Relaxed, rest).ok();
     }
 }
 
-/// The bytes of a peer, up to the largest backlog.
-struct Bounded {
-    stream: Payload,
+/// The bytes that a client sends; ends with an error once the backlog is too large.
+struct BoundedPayload {
+    payload: Payload,
     backlog: Backlog,
 }
 
-impl Stream for Bounded {
+impl Stream for BoundedPayload {
     type Item = Result<Bytes, PayloadError>;
 
     fn poll_next(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Option<Self::Item>> {
-        let next = Pin::new(&mut self.stream).poll_next(context);
+        let next = Pin::new(&mut self.payload).poll_next(context);
         if let Poll::Ready(Some(Ok(bytes))) = &next {
             let backlog = self.backlog.fetch_add(bytes.len(), Ordering::Relaxed) + bytes.len();
-            if backlog > LARGEST_BACKLOG {
+            if backlog > MAX_BACKLOG {
                 return Poll::Ready(Some(Err(PayloadError::Overflow)));
             }
         }
@@ -159,15 +160,15 @@ impl Stream for Bounded {
     }
 }
 
-/// Opens a WebSocket for the actor that is made, or answers why that can't be. The actor understands what comes with
-/// [`Inbox::take`].
-pub fn open<A>(request: &HttpRequest, stream: Payload, actor: impl FnOnce(Inbox) -> A) -> HttpResponse
+/// Upgrades a request to a WebSocket that the given actor serves, or answers why that can't be. The actor must hand all
+/// messages to the reader that it is given.
+pub fn open<A>(request: &HttpRequest, payload: Payload, actor: impl FnOnce(MessageReader) -> A) -> HttpResponse
 where
     A: Actor<Context = WebsocketContext<A>> + StreamHandler<Result<Message, ProtocolError>>,
 {
-    let inbox = Inbox::default();
-    let stream = Bounded { stream, backlog: Arc::clone(&inbox.backlog) };
-    let socket = WsResponseBuilder::new(actor(inbox), request, stream).frame_size(LARGEST_MESSAGE).start();
+    let reader = MessageReader::default();
+    let payload = BoundedPayload { payload, backlog: Arc::clone(&reader.backlog) };
+    let socket = WsResponseBuilder::new(actor(reader), request, payload).frame_size(MAX_MESSAGE).start();
     socket.unwrap_or_else(|error| {
         let status = error.as_response_error().error_response().status();
         HttpResponse::build(status).body(format!("Error: this is a WebSocket: {error}."))

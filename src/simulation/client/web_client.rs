@@ -13,7 +13,7 @@ use super::outcome::{Outcome, Pending};
 use crate::shared::http::Connection;
 use crate::shared::http::Peer;
 use crate::shared::http::liveness::{self, Liveness};
-use crate::shared::http::websocket::{Heard, Inbox};
+use crate::shared::http::websocket::{ClientMessage, MessageReader};
 use crate::shared::run::closing;
 use crate::simulation::census::Change;
 use crate::simulation::checkout::{Progress, Project};
@@ -32,16 +32,16 @@ pub struct WebClient {
     liveness: Liveness,
     restoring: bool,
     start: Pending,
-    inbox: Inbox,
+    reader: MessageReader,
     _connection: Connection,
 }
 
 type Context = WebsocketContext<WebClient>;
 
 impl WebClient {
-    /// A client that has just connected; `connection` counts it, `inbox` takes what comes from it.
+    /// A client that has just connected; `connection` counts it, `reader` takes what comes from it.
     #[must_use]
-    pub fn new(server: Arc<AppState>, peer: Peer, (connection, inbox): (Connection, Inbox)) -> Self {
+    pub fn new(server: Arc<AppState>, peer: Peer, (connection, reader): (Connection, MessageReader)) -> Self {
         Self {
             server,
             peer,
@@ -49,7 +49,7 @@ impl WebClient {
             liveness: Liveness::new(),
             restoring: false,
             start: Pending::default(),
-            inbox,
+            reader,
             _connection: connection,
         }
     }
@@ -219,22 +219,22 @@ impl Actor for WebClient {
 
 impl StreamHandler<Result<Message, ProtocolError>> for WebClient {
     fn handle(&mut self, message: Result<Message, ProtocolError>, ctx: &mut Self::Context) {
-        match self.inbox.take(message) {
-            Heard::Text(text) if self.liveness.may_answer() => self.understand(&text, ctx),
-            Heard::Ping(data) if self.liveness.may_answer() => ctx.pong(&data),
-            Heard::Pong(content) => self.liveness.pong(&content),
-            Heard::Close(reason) => {
+        match self.reader.read(message) {
+            Ok(Some(ClientMessage::Text(text))) if self.liveness.may_answer() => self.understand(&text, ctx),
+            Ok(Some(ClientMessage::Ping(data))) if self.liveness.may_answer() => ctx.pong(&data),
+            Ok(Some(ClientMessage::Pong(content))) => self.liveness.pong(&content),
+            Ok(Some(ClientMessage::Close(reason))) => {
                 ctx.close(reason);
                 ctx.stop();
             }
-            Heard::Nothing => {}
-            Heard::Text(_) | Heard::Ping(_) => {
+            Ok(None) => {}
+            Ok(Some(ClientMessage::Text(_) | ClientMessage::Ping(_))) => {
                 log::warn!("{}: asks too much between two pings", self.name());
                 self.finish(&protocol::error("Too many requests on one connection"), CloseCode::Policy, ctx);
             }
-            Heard::Wrong(wrong) => {
-                log::info!("{}: {wrong}", self.name());
-                self.finish(&protocol::error(&wrong.to_string()), wrong.code(), ctx);
+            Err(error) => {
+                log::info!("{}: {error}", self.name());
+                self.finish(&protocol::error(&error.to_string()), error.code(), ctx);
             }
         }
     }

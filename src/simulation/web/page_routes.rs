@@ -78,10 +78,10 @@ struct Which {
 /// The last lines that a simulation has printed. They may hold what is nobody else's business: a password protects
 /// them, where there is one.
 async fn output(request: HttpRequest, which: web::Query<Which>, server: web::Data<AppState>) -> HttpResponse {
-    if let Some(lock) = &server.lock
-        && let Err(locked) = lock.admit(&request, server.config.trusted_proxies.peer(&request))
+    if let Some(auth) = &server.admin_auth
+        && let Err(refused) = auth.check(&request, server.config.trusted_proxies.peer(&request))
     {
-        return locked.answer();
+        return refused.answer();
     }
     let Some(everybody) = everybody(&server).await else {
         return too_busy();

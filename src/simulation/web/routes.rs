@@ -79,11 +79,11 @@ async fn health() -> HttpResponse {
 }
 
 async fn drain(request: HttpRequest, server: web::Data<AppState>) -> HttpResponse {
-    let Some(lock) = &server.lock else {
+    let Some(auth) = &server.admin_auth else {
         return HttpResponse::Forbidden().body("Error: actions are off; adminPassword is not set.");
     };
-    if let Err(locked) = lock.admit(&request, server.config.trusted_proxies.peer(&request)) {
-        return locked.answer();
+    if let Err(refused) = auth.check(&request, server.config.trusted_proxies.peer(&request)) {
+        return refused.answer();
     }
     match server.requests.try_send(Request::Drain) {
         Ok(()) => HttpResponse::Accepted().body("draining"),

@@ -3,7 +3,7 @@
 use serde::Serialize;
 
 use super::webots_viewer;
-use crate::shared::domain::Dispatch;
+use crate::shared::domain::ServerReport;
 use crate::shared::http::Gauge;
 use crate::simulation::census::{Everybody, Simulation};
 use crate::simulation::machine::sensors::{Gpu, Host, Machine};
@@ -15,7 +15,7 @@ use crate::simulation::state::AppState;
 pub struct StatusPage {
     /// What decides where clients go.
     #[serde(flatten)]
-    pub dispatch: Dispatch,
+    pub report: ServerReport,
     /// In seconds.
     pub uptime: u64,
     /// What the machine is.
@@ -37,7 +37,7 @@ impl StatusPage {
     pub fn new(server: &AppState, everybody: Everybody) -> Self {
         let readings = server.readings.borrow().clone();
         let rules = &server.rules;
-        let dispatch = Dispatch {
+        let report = ServerReport {
             load: server.load(),
             version: env!("CARGO_PKG_VERSION").to_owned(),
             instances: Some(everybody.instances),
@@ -48,7 +48,7 @@ impl StatusPage {
             draining: server.is_draining(),
         };
         Self {
-            dispatch,
+            report,
             uptime: server.started.elapsed().as_secs(),
             host: readings.host.clone(),
             machine: readings.machine,
