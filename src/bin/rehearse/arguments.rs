@@ -1,0 +1,86 @@
+//! What can be asked of the program.
+
+use std::path::PathBuf;
+use std::time::Duration;
+
+use clap::Parser;
+use url::Url;
+
+use crate::behaviour::Mix;
+
+/// Plays a class of web clients against a fleet, and says how many fit.
+///
+/// It speaks to a session server as Webots' web page does: availability, a simulation server, the start, the scene and its
+/// updates, run, leave. Exit code 0: as expected; 1: not, or nothing could be measured; 2: wrong arguments.
+#[derive(Parser, Debug, Clone)]
+#[command(version)]
+pub(crate) struct Arguments {
+    /// The session server
+    #[arg(value_name = "http://HOST:PORT", value_parser = fleet)]
+    pub(crate) fleet: Url,
+    /// The world that all clients start
+    #[arg(long, value_name = "https://github.com/USER/REPOSITORY/blob/BRANCH/worlds/NAME.wbt")]
+    pub(crate) world: String,
+    /// How many clients come
+    #[arg(long, default_value_t = 20, value_parser = clap::value_parser!(u32).range(1..=10_000))]
+    pub(crate) clients: u32,
+    /// Within what time they come, evenly: 0s for all at once
+    #[arg(long, default_value = "60s", value_parser = humantime::parse_duration)]
+    pub(crate) over: Duration,
+    /// How long each stays once its simulation runs
+    #[arg(long, default_value = "2m", value_parser = humantime::parse_duration)]
+    pub(crate) stay: Duration,
+    /// How long a client waits for its simulation before it gives up
+    #[arg(long, default_value = "5m", value_parser = humantime::parse_duration)]
+    pub(crate) patience: Duration,
+    /// Shares of clients that misbehave, in percent: reload, drop (leave without closing), sleep (a tab that reads nothing),
+    /// vanish (a network that is gone), hasty (start and go at once). Example: reload=10,vanish=5
+    #[arg(long, default_value = "", value_parser = str::parse::<Mix>)]
+    pub(crate) misbehave: Mix,
+    /// Clients come again and again for this time, in place of once
+    #[arg(long, value_parser = humantime::parse_duration)]
+    pub(crate) soak: Option<Duration>,
+    /// A simulation below this share of real time does not count as one that fits
+    #[arg(long, default_value_t = 0.9, value_parser = share)]
+    pub(crate) real_time: f64,
+    /// How many clients have to fit for exit code 0
+    #[arg(long, value_name = "CLIENTS")]
+    pub(crate) expect: Option<u32>,
+    /// Where to write the numbers for machines
+    #[arg(long, value_name = "FILE")]
+    pub(crate) json: Option<PathBuf>,
+    /// What the viewer asks Webots for: w3d (R2025a), x3d (up to R2023b)
+    #[arg(long, default_value = "w3d", value_parser = ["w3d", "x3d"])]
+    pub(crate) viewer: String,
+    /// Walk through all steps with one client, and compare what comes with what is expected of a fleet and of Webots
+    #[arg(long)]
+    pub(crate) explain: bool,
+    /// Draw the clients that misbehave from this number; the same number draws the same
+    #[arg(long, default_value_t = 1)]
+    pub(crate) seed: u64,
+    /// Don't ask before loading a fleet that is not on this machine
+    #[arg(long)]
+    pub(crate) yes: bool,
+}
+
+impl Arguments {
+    /// What is going to happen, in words: `200 clients within 1m, each for 10m`.
+    pub(crate) fn summary(&self) -> String {
+        if self.explain {
+            return "one client".to_owned();
+        }
+        let time = |time| humantime::format_duration(time).to_string();
+        let how_long = self.soak.map(|soak| format!(", again and again for {}", time(soak))).unwrap_or_default();
+        format!("{} clients within {}, each for {}{how_long}", self.clients, time(self.over), time(self.stay))
+    }
+}
+
+fn fleet(text: &str) -> Result<Url, String> {
+    let url = Url::parse(text).map_err(|error| error.to_string())?;
+    let is_usable = matches!(url.scheme(), "http" | "https") && url.has_host();
+    if is_usable { Ok(url) } else { Err("allowed is http://HOST:PORT or https://HOST".to_owned()) }
+}
+
+fn share(text: &str) -> Result<f64, String> {
+    text.parse().ok().filter(|share| (0.0..=1.0).contains(share)).ok_or_else(|| "allowed is 0 to 1".to_owned())
+}

@@ -1,0 +1,114 @@
+//! How clients behave, well or not. Pure.
+
+use std::fmt;
+use std::str::FromStr;
+
+use rand::rngs::SmallRng;
+use rand::{RngExt, SeedableRng};
+use serde::Serialize;
+
+/// How one client behaves.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub(crate) enum Behaviour {
+    /// Watches its simulation and closes its page.
+    Ordinary,
+    /// Reloads its page in the middle, and so begins anew.
+    Reload,
+    /// Leaves without closing its connections: a browser that crashes.
+    Drop,
+    /// Reads nothing for the second half: a tab that sleeps.
+    Sleep,
+    /// Neither reads nor closes from the middle on: a network that is gone.
+    Vanish,
+    /// Leaves as soon as it has asked for its simulation.
+    Hasty,
+}
+
+/// Shares of behaviours, in percent; what is left of 100 is ordinary.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub(crate) struct Mix(Vec<(Behaviour, u32)>);
+
+const NAMES: [(&str, Behaviour); 5] = [
+    ("reload", Behaviour::Reload),
+    ("drop", Behaviour::Drop),
+    ("sleep", Behaviour::Sleep),
+    ("vanish", Behaviour::Vanish),
+    ("hasty", Behaviour::Hasty),
+];
+
+impl FromStr for Mix {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let wrong = |part: &str| format!("{part:?} is no share; allowed is NAME=PERCENT of {}", names());
+        let shares = text.split(',').filter(|part| !part.is_empty()).map(|part| {
+            let (name, percent) = part.split_once('=').ok_or_else(|| wrong(part))?;
+            let (_, behaviour) = NAMES.iter().find(|(known, _)| *known == name).ok_or_else(|| wrong(part))?;
+            Ok((*behaviour, percent.parse().map_err(|_| wrong(part))?))
+        });
+        let mix = Self(shares.collect::<Result<_, String>>()?);
+        let sum = mix.0.iter().fold(0_u32, |sum, (_, percent)| sum.saturating_add(*percent));
+        if sum <= 100 { Ok(mix) } else { Err(format!("the shares are {sum} percent; allowed is up to 100")) }
+    }
+}
+
+impl fmt::Display for Behaviour {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let name = NAMES.iter().find(|(_, behaviour)| behaviour == self).map_or("ordinary", |(name, _)| name);
+        out.write_str(name)
+    }
+}
+
+fn names() -> String {
+    NAMES.map(|(name, _)| name).join(", ")
+}
+
+/// Draws behaviours by their shares.
+pub(crate) struct Draw {
+    mix: Mix,
+    random: SmallRng,
+}
+
+impl Draw {
+    /// Draws from a mix; the same seed draws the same.
+    pub(crate) fn new(mix: Mix, seed: u64) -> Self {
+        Self { mix, random: SmallRng::seed_from_u64(seed) }
+    }
+
+    /// The behaviour of the next client.
+    pub(crate) fn next(&mut self) -> Behaviour {
+        let mut number = self.random.random_range(0..100_u32);
+        for (behaviour, percent) in &self.mix.0 {
+            match number.checked_sub(*percent) {
+                Some(rest) => number = rest,
+                None => return *behaviour,
+            }
+        }
+        Behaviour::Ordinary
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn shares_are_drawn_as_they_are_set() {
+        let mut draw = Draw::new("reload=20,vanish=30".parse().unwrap(), 7);
+        let drawn: Vec<Behaviour> = std::iter::repeat_with(|| draw.next()).take(10_000).collect();
+        let percent = |wanted| drawn.iter().filter(|one| **one == wanted).count() / 100;
+        for (behaviour, share) in [(Behaviour::Reload, 20), (Behaviour::Vanish, 30), (Behaviour::Ordinary, 50)] {
+            assert!(percent(behaviour).abs_diff(share) <= 2, "{behaviour}: {}", percent(behaviour));
+        }
+        assert_eq!(percent(Behaviour::Hasty), 0);
+    }
+
+    #[test]
+    fn what_is_no_share_is_told() {
+        for wrong in ["reload", "reload=x", "dance=5", "reload=60,drop=41", "reload=-1"] {
+            assert!(wrong.parse::<Mix>().is_err(), "{wrong}");
+        }
+        assert_eq!("".parse::<Mix>(), Ok(Mix::default()));
+    }
+}

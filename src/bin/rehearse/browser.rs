@@ -1,0 +1,244 @@
+//! One client: the steps of Webots' web page from the wish for a simulation to its end.
+
+use std::time::{Duration, Instant};
+
+use serde::Deserialize;
+
+use crate::arguments::Arguments;
+use crate::behaviour::Behaviour;
+use crate::board::{Board, Stage};
+use crate::conversation::{Conversation, Ended};
+use crate::session::Session;
+use crate::visit::{Outcome, Pace, Steps, Visit};
+
+/// How long simulated time is watched for one value of the pace.
+const PACE_PERIOD: Duration = Duration::from_secs(1);
+
+/// A client and what it knows.
+pub(crate) struct Browser<'class> {
+    arguments: &'class Arguments,
+    board: &'class Board,
+    session: &'class Session,
+    behaviour: Behaviour,
+    visit: Visit,
+}
+
+/// A simulation that runs: the connection that keeps it, and the one to its Webots.
+struct Running {
+    lease: Conversation,
+    stream: Conversation,
+}
+
+/// An update of the scene; only its time counts here.
+#[derive(Deserialize)]
+struct Update {
+    /// Simulated time, in milliseconds.
+    time: f64,
+}
+
+/// Why a start came to nothing.
+enum NoStart {
+    Refused(String),
+    Failed(String),
+    Left,
+}
+
+impl From<Ended> for NoStart {
+    fn from(ended: Ended) -> Self {
+        Self::Failed(ended.to_string())
+    }
+}
+
+impl<'class> Browser<'class> {
+    /// A client that asks now.
+    pub(crate) fn new(
+        arguments: &'class Arguments,
+        board: &'class Board,
+        session: &'class Session,
+        client: u32,
+        behaviour: Behaviour,
+    ) -> Self {
+        let asked = board.now();
+        let visit = Visit {
+            client,
+            behaviour,
+            asked,
+            server: None,
+            outcome: Outcome::Left,
+            steps: Steps::default(),
+            pace: Vec::new(),
+            ended: asked,
+        };
+        Self { arguments, board, session, behaviour, visit }
+    }
+
+    /// Goes through all steps. `meet` hears which simulation server the client was sent to.
+    pub(crate) async fn visit(mut self, meet: impl Fn(&str)) -> Visit {
+        self.board.came();
+        let patience = self.arguments.patience;
+        let started = actix_rt::time::timeout(patience, self.start(meet)).await;
+        let started = started.unwrap_or_else(|_| Err(NoStart::Failed(format!("no simulation within {patience:?}"))));
+        self.visit.outcome = match started {
+            Ok(running) => {
+                let _stage = self.board.enter(Stage::Running);
+                self.watch(running).await
+            }
+            Err(NoStart::Refused(why)) => Outcome::Refused(why),
+            Err(NoStart::Failed(why)) => Outcome::Failed(why),
+            Err(NoStart::Left) => Outcome::Left,
+        };
+        self.visit.ended = self.board.now();
+        self.board.gone(matches!(self.visit.outcome, Outcome::Ran | Outcome::Left));
+        self.visit
+    }
+
+    async fn start(&mut self, meet: impl Fn(&str)) -> Result<Running, NoStart> {
+        let waiting = self.board.enter(Stage::Waiting);
+        let asked = Instant::now();
+        self.session.until_available().await?;
+        let server = self.session.simulation_server(&self.arguments.world).await.map_err(NoStart::Refused)?;
+        meet(&server);
+        self.visit.server = server.split_once("://").map(|(_, address)| address.to_owned());
+        let mut lease = Conversation::open(&format!("{server}/client")).await?;
+        let start = serde_json::json!({"start": {"url": self.arguments.world}});
+        lease.say(&start.to_string()).await?;
+        if self.behaviour == Behaviour::Hasty {
+            lease.close().await;
+            return Err(NoStart::Left);
+        }
+        let mut first = self.hear_of_start(&mut lease).await?;
+        while is_of_waiting(&first) {
+            first = self.hear_of_start(&mut lease).await?;
+        }
+        drop(waiting);
+        let _starting = self.board.enter(Stage::Starting);
+        let granted = Instant::now();
+        self.visit.steps.waiting = Some((granted - asked).as_secs_f64());
+        let mut launched = None;
+        let mut text = first;
+        let webots = loop {
+            if text.starts_with("shutdownTimeout:") && launched.is_none() {
+                launched = Some(Instant::now());
+            }
+            if let Some(url) = text.strip_prefix("webots:") {
+                break url.to_owned();
+            }
+            text = self.hear_of_start(&mut lease).await?;
+        };
+        let launched = launched.unwrap_or(granted);
+        self.visit.steps.checkout = Some((launched - granted).as_secs_f64());
+        let stream = self.open_stream(&webots).await?;
+        self.visit.steps.launch = Some(launched.elapsed().as_secs_f64());
+        self.visit.steps.until_running = Some(asked.elapsed().as_secs_f64());
+        Ok(Running { lease, stream })
+    }
+
+    /// The next text of the simulation server; a refusal is one whatever it begins with.
+    async fn hear_of_start(&self, lease: &mut Conversation) -> Result<String, NoStart> {
+        let text = lease.hear().await?;
+        let refusal = ["loading: Error: ", "error:", "Error: "].iter().find_map(|begin| text.strip_prefix(begin));
+        match refusal {
+            Some(why) => Err(NoStart::Refused(why.trim().to_owned())),
+            None => Ok(text),
+        }
+    }
+
+    /// Connects to Webots as its viewer does, waits for the scene, and lets time pass.
+    async fn open_stream(&self, url: &str) -> Result<Conversation, NoStart> {
+        let mut stream = Conversation::open(&format!("{}/", url.trim_end_matches('/'))).await?;
+        stream.say(&self.arguments.viewer).await?;
+        while !stream.hear().await?.starts_with("model:") {}
+        stream.say("pause").await?;
+        while stream.hear().await? != "paused by client" {}
+        stream.say("real-time:-1").await?;
+        let mut first = None;
+        loop {
+            let time = time(&stream.hear().await?);
+            match (first, time) {
+                (Some(first), Some(time)) if time > first => return Ok(stream),
+                (None, Some(time)) => first = Some(time),
+                _ => {}
+            }
+        }
+    }
+
+    /// Watches a simulation until its client leaves, in whatever way.
+    async fn watch(&mut self, mut running: Running) -> Outcome {
+        let stay = self.arguments.stay;
+        let attentive = match self.behaviour {
+            Behaviour::Ordinary | Behaviour::Drop | Behaviour::Hasty => stay,
+            Behaviour::Reload | Behaviour::Sleep | Behaviour::Vanish => stay / 2,
+        };
+        let watched = actix_rt::time::timeout(attentive, self.look_on(&mut running)).await;
+        if let Ok(why) = watched {
+            return Outcome::BrokeOff(why);
+        }
+        if attentive < stay && self.behaviour != Behaviour::Reload {
+            actix_rt::time::sleep(stay.saturating_sub(attentive)).await;
+        }
+        if matches!(self.behaviour, Behaviour::Ordinary | Behaviour::Reload | Behaviour::Sleep) {
+            // The page closes both at once.
+            futures_util::future::join(running.stream.close(), running.lease.close()).await;
+        }
+        // Who vanishes or crashes says nothing: the connections are dropped.
+        Outcome::Ran
+    }
+
+    /// Reads what comes and measures the pace, until the simulation ends. Returns why it ended.
+    async fn look_on(&mut self, running: &mut Running) -> String {
+        let (mut since, mut first, mut last) = (Instant::now(), None, None);
+        let mut period = actix_rt::time::interval(PACE_PERIOD);
+        loop {
+            tokio::select! {
+                text = running.stream.hear() => match text {
+                    Ok(text) => if let Some(time) = time(&text) {
+                        first.get_or_insert(time);
+                        last = Some(time);
+                    },
+                    Err(ended) => return format!("the connection to Webots: {ended}"),
+                },
+                text = running.lease.hear() => match text {
+                    Ok(text) => if let Some(why) = text.strip_prefix("loading: ") {
+                        return why.to_owned();
+                    },
+                    Err(ended) => return format!("the connection to the simulation server: {ended}"),
+                },
+                _ = period.tick() => {
+                    let wall = since.elapsed().as_secs_f64();
+                    if wall < PACE_PERIOD.as_secs_f64() / 2.0 {
+                        continue;
+                    }
+                    // A simulation that stands still sends nothing.
+                    let simulated = first.zip(last).map_or(0.0, |(first, last): (f64, f64)| last - first) / 1000.0;
+                    let factor = simulated / wall;
+                    self.board.paced(factor);
+                    self.visit.pace.push(Pace { at: self.board.now(), factor });
+                    (since, first) = (Instant::now(), last);
+                }
+            }
+        }
+    }
+}
+
+/// The simulated time of an update, in milliseconds.
+fn time(text: &str) -> Option<f64> {
+    let update: Update = serde_json::from_str(text.strip_prefix("application/json:")?).ok()?;
+    Some(update.time)
+}
+
+/// Whether a text says that there is no place yet.
+fn is_of_waiting(text: &str) -> bool {
+    text.starts_with("queue:") || text.to_ascii_lowercase().starts_with("loading: waiting for a place")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_time_of_updates_alone_is_read() {
+        assert_eq!(time(r#"application/json:{"time":1.024e+06,"updates":[{"id":1}]}"#), Some(1_024_000.0));
+        assert_eq!(time("application/json:{}"), None);
+        assert_eq!(time("pause: 12"), None);
+    }
+}

@@ -1,0 +1,74 @@
+//! Lets the clients come, each at its time.
+
+use std::cell::RefCell;
+use std::collections::BTreeMap;
+use std::time::Duration;
+
+use futures_util::future::join_all;
+
+use crate::arguments::Arguments;
+use crate::behaviour::{Behaviour, Draw};
+use crate::board::Board;
+use crate::browser::Browser;
+use crate::servers::Servers;
+use crate::session::Session;
+use crate::visit::Visit;
+
+/// Between two visits of a client that comes again and again.
+const PAUSE: Duration = Duration::from_millis(500);
+
+/// Plays the whole class. Returns what each client has met, and the highest load of each server.
+pub(crate) async fn play(arguments: &Arguments) -> (Vec<Visit>, BTreeMap<String, Option<f64>>) {
+    let class = Class {
+        arguments,
+        board: Board::new(),
+        session: Session::new(&arguments.fleet),
+        servers: Servers::default(),
+        draw: RefCell::new(Draw::new(arguments.misbehave.clone(), arguments.seed)),
+        visits: RefCell::default(),
+    };
+    let clients = join_all((0..arguments.clients).map(|client| class.come(client)));
+    let aside = futures_util::future::join(class.board.show(), class.servers.watch());
+    tokio::select! {
+        _ = clients => {}
+        _ = aside => {}
+    }
+    class.board.clear();
+    (class.visits.take(), class.servers.peaks())
+}
+
+/// What all clients share.
+struct Class<'arguments> {
+    arguments: &'arguments Arguments,
+    board: Board,
+    session: Session,
+    servers: Servers,
+    draw: RefCell<Draw>,
+    visits: RefCell<Vec<Visit>>,
+}
+
+impl Class<'_> {
+    /// One client, who comes once, or again and again in a soak.
+    async fn come(&self, client: u32) {
+        actix_rt::time::sleep(self.arguments.over * client / self.arguments.clients).await;
+        let end = self.arguments.soak.map_or(0.0, |soak| soak.as_secs_f64());
+        loop {
+            let behaviour = self.draw.borrow_mut().next();
+            self.visit(client, behaviour).await;
+            if behaviour == Behaviour::Reload {
+                // The page is there again, and stays.
+                self.visit(client, Behaviour::Ordinary).await;
+            }
+            if self.board.now() >= end {
+                return;
+            }
+            actix_rt::time::sleep(PAUSE).await;
+        }
+    }
+
+    async fn visit(&self, client: u32, behaviour: Behaviour) {
+        let browser = Browser::new(self.arguments, &self.board, &self.session, client, behaviour);
+        let visit = browser.visit(|server| self.servers.met(server)).await;
+        self.visits.borrow_mut().push(visit);
+    }
+}

@@ -1,0 +1,101 @@
+//! A WebSocket as a browser's page sees it: texts that come and go, each wait with a limit.
+
+use std::time::Duration;
+
+use futures_util::{SinkExt, StreamExt};
+use tokio::net::TcpStream;
+use tokio_tungstenite::tungstenite::protocol::WebSocketConfig;
+use tokio_tungstenite::tungstenite::{Error, Message};
+use tokio_tungstenite::{MaybeTlsStream, WebSocketStream, connect_async_with_config};
+
+/// How long a connection may take.
+const CONNECT: Duration = Duration::from_secs(20);
+/// The scene of a large world comes in one message.
+const LARGEST_MESSAGE: usize = 512 << 20;
+
+/// An open WebSocket.
+pub(crate) struct Conversation {
+    socket: WebSocketStream<MaybeTlsStream<TcpStream>>,
+}
+
+/// Why a conversation is over.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub(crate) enum Ended {
+    /// The connection can't be made.
+    #[error("{0} can't be reached: {1}")]
+    Unreachable(String, String),
+    /// The other side has closed it.
+    #[error("closed with {0}")]
+    Closed(String),
+    /// It broke.
+    #[error("broken: {0}")]
+    Broken(String),
+    /// Nothing came in time.
+    #[error("nothing came for {} s", .0.as_secs())]
+    Silent(Duration),
+}
+
+impl Conversation {
+    /// Connects to a WebSocket URL.
+    ///
+    /// # Errors
+    /// When nobody takes the connection in time.
+    pub(crate) async fn open(url: &str) -> Result<Self, Ended> {
+        let config =
+            WebSocketConfig::default().max_message_size(Some(LARGEST_MESSAGE)).max_frame_size(Some(LARGEST_MESSAGE));
+        let failed = |why: String| Ended::Unreachable(url.to_owned(), why);
+        let connecting = connect_async_with_config(url, Some(config), true);
+        let connected =
+            actix_rt::time::timeout(CONNECT, connecting).await.map_err(|_| failed("too slow".to_owned()))?;
+        let (socket, _) = connected.map_err(|error| failed(error.to_string()))?;
+        Ok(Self { socket })
+    }
+
+    /// Sends a text.
+    ///
+    /// # Errors
+    /// When the connection is broken.
+    pub(crate) async fn say(&mut self, text: &str) -> Result<(), Ended> {
+        self.socket.send(Message::text(text)).await.map_err(|error| Ended::Broken(error.to_string()))
+    }
+
+    /// The next text.
+    ///
+    /// # Errors
+    /// When the connection is over.
+    pub(crate) async fn hear(&mut self) -> Result<String, Ended> {
+        loop {
+            match self.socket.next().await {
+                Some(Ok(Message::Text(text))) => return Ok(text.to_string()),
+                Some(Ok(Message::Close(frame))) => {
+                    let code = frame.map_or_else(|| "no code".to_owned(), |frame| frame.code.to_string());
+                    return Err(Ended::Closed(code));
+                }
+                Some(Ok(_)) => {}
+                None | Some(Err(Error::ConnectionClosed | Error::AlreadyClosed)) => {
+                    return Err(Ended::Closed("no code".to_owned()));
+                }
+                Some(Err(error)) => return Err(Ended::Broken(error.to_string())),
+            }
+        }
+    }
+
+    /// The next text, if it comes in time.
+    ///
+    /// # Errors
+    /// When the connection is over, or nothing comes.
+    pub(crate) async fn hear_within(&mut self, limit: Duration) -> Result<String, Ended> {
+        actix_rt::time::timeout(limit, self.hear()).await.unwrap_or(Err(Ended::Silent(limit)))
+    }
+
+    /// Closes the connection as a page does that is left, and does not wait for long.
+    pub(crate) async fn close(mut self) {
+        let closing = async {
+            if self.socket.close(None).await.is_ok() {
+                while let Some(Ok(_)) = self.socket.next().await {}
+            }
+        };
+        // Who does not answer is left all the same.
+        actix_rt::time::timeout(Duration::from_secs(2), closing).await.ok();
+    }
+}

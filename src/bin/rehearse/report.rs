@@ -1,0 +1,363 @@
+//! What came of a rehearsal, in numbers.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use serde::Serialize;
+
+use crate::arguments::Arguments;
+use crate::visit::{Outcome, Steps, Visit};
+
+/// The numbers of a rehearsal.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+#[serde(rename_all = "camelCase")]
+pub(crate) struct Report {
+    /// The fleet, as it was named.
+    pub(crate) fleet: String,
+    /// The world that was started.
+    pub(crate) world: String,
+    /// What was played, in words.
+    pub(crate) played: String,
+    /// Seats.
+    pub(crate) seats: Seats,
+    /// How long it took until a simulation ran, in seconds.
+    pub(crate) times: Vec<Row>,
+    /// How fast simulated time passed; 1 is real time. Nothing if no simulation ran for long enough.
+    pub(crate) pace: Option<Factors>,
+    /// Each simulation server.
+    pub(crate) servers: Vec<Server>,
+    /// The result in one sentence.
+    pub(crate) verdict: String,
+    /// How many had to fit.
+    pub(crate) expected: Option<u32>,
+}
+
+/// Seats that were asked for, and what came of them.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "camelCase")]
+pub(crate) struct Seats {
+    /// Simulations that were asked for.
+    pub(crate) asked: u32,
+    /// Simulations that ran.
+    pub(crate) given: u32,
+    /// Those of them that ran to their client's end, not below the share of real time that was asked for.
+    pub(crate) fit: u32,
+    /// Clients that were told why they get none, or got none, by the reason.
+    pub(crate) refused: BTreeMap<String, u32>,
+    /// Simulations that ended before their client left, by the reason.
+    pub(crate) broke_off: BTreeMap<String, u32>,
+    /// Clients that left on purpose before their simulation ran.
+    pub(crate) left: u32,
+}
+
+/// One step to a running simulation, over all clients, in seconds.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub(crate) struct Row {
+    /// The step.
+    pub(crate) step: &'static str,
+    /// Half of the clients took no longer.
+    pub(crate) median: f64,
+    /// 95 % took no longer.
+    pub(crate) p95: f64,
+    /// The slowest.
+    pub(crate) worst: f64,
+}
+
+/// How fast simulated time passed; 1 is real time.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub(crate) struct Factors {
+    /// In 5 % of the seconds it was this or less.
+    pub(crate) p5: f64,
+    /// In half of the seconds.
+    pub(crate) median: f64,
+}
+
+/// One simulation server.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+#[serde(rename_all = "camelCase")]
+pub(crate) struct Server {
+    /// `HOST:PORT` or `HOST/PORT`.
+    pub(crate) address: String,
+    /// Simulations that ran there.
+    pub(crate) seats: u32,
+    /// The most that ran at the same time.
+    pub(crate) most_at_once: u32,
+    /// The highest load that it told, in percent.
+    pub(crate) peak_load: Option<f64>,
+    /// How fast simulated time passed there.
+    pub(crate) pace: Option<Factors>,
+    /// The first second in which its simulations ran below real time on the average.
+    pub(crate) slow: Option<Slow>,
+}
+
+/// When a server was too slow for its simulations.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+#[serde(rename_all = "camelCase")]
+pub(crate) struct Slow {
+    /// Seconds since the beginning.
+    pub(crate) at: f64,
+    /// How many simulations ran there.
+    pub(crate) simulations: u32,
+}
+
+/// What is written for machines: the numbers, and each client's visit.
+#[derive(Serialize)]
+struct File<'report> {
+    #[serde(flatten)]
+    report: &'report Report,
+    visits: &'report [Visit],
+}
+
+impl Report {
+    /// Makes the numbers of what each client has met and of the highest load of each server.
+    pub(crate) fn new(arguments: &Arguments, visits: &[Visit], peaks: &BTreeMap<String, Option<f64>>) -> Self {
+        let seats = seats(visits, arguments.real_time);
+        let servers: Vec<Server> = peaks
+            .iter()
+            .map(|(address, peak)| {
+                let here: Vec<&Visit> =
+                    visits.iter().filter(|visit| visit.server.as_ref() == Some(address) && visit.has_run()).collect();
+                server(address, *peak, &here, arguments.real_time)
+            })
+            .collect();
+        Self {
+            fleet: arguments.fleet.to_string(),
+            world: arguments.world.clone(),
+            played: arguments.summary(),
+            times: times(visits),
+            pace: factors(visits.iter().flat_map(factors_of)),
+            verdict: verdict(&seats, &servers),
+            expected: arguments.expect,
+            seats,
+            servers,
+        }
+    }
+
+    /// Whether as many fit as were expected; without an expectation, whether any did.
+    pub(crate) fn is_as_expected(&self) -> bool {
+        self.seats.fit >= self.expected.unwrap_or(1)
+    }
+
+    /// Writes the numbers and all visits as JSON.
+    ///
+    /// # Errors
+    /// When the file can't be written.
+    pub(crate) fn write(&self, visits: &[Visit], file: &Path) -> std::io::Result<()> {
+        let text = serde_json::to_string_pretty(&File { report: self, visits })?;
+        std::fs::write(file, text + "\n")
+    }
+}
+
+fn seats(visits: &[Visit], real_time: f64) -> Seats {
+    let mut seats = Seats::default();
+    for visit in visits {
+        seats.asked += 1;
+        seats.given += u32::from(visit.has_run());
+        match &visit.outcome {
+            Outcome::Ran => {
+                let is_fast = factors(factors_of(visit)).is_none_or(|pace| pace.median >= real_time);
+                seats.fit += u32::from(is_fast);
+            }
+            Outcome::Refused(why) | Outcome::Failed(why) => *seats.refused.entry(why.clone()).or_default() += 1,
+            Outcome::BrokeOff(why) => *seats.broke_off.entry(why.clone()).or_default() += 1,
+            Outcome::Left => seats.left += 1,
+        }
+    }
+    seats
+}
+
+fn times(visits: &[Visit]) -> Vec<Row> {
+    type Pick = fn(&Steps) -> Option<f64>;
+    let steps: [(&'static str, Pick); 4] = [
+        ("waiting", |steps| steps.waiting),
+        ("checkout", |steps| steps.checkout),
+        ("launch", |steps| steps.launch),
+        ("all", |steps| steps.until_running),
+    ];
+    let row = |(step, pick): (&'static str, Pick)| {
+        let times = sorted(visits.iter().filter(|visit| visit.has_run()).filter_map(|visit| pick(&visit.steps)));
+        let at = |share| quantile(&times, share);
+        Some(Row { step, median: at(0.5)?, p95: at(0.95)?, worst: *times.last()? })
+    };
+    steps.into_iter().filter_map(row).collect()
+}
+
+/// The paces of a simulation, but for its first second, in which it gets going.
+fn factors_of(visit: &Visit) -> impl Iterator<Item = f64> {
+    visit.pace.iter().skip(1).map(|pace| pace.factor)
+}
+
+fn factors(values: impl Iterator<Item = f64>) -> Option<Factors> {
+    let values = sorted(values);
+    Some(Factors { p5: quantile(&values, 0.05)?, median: quantile(&values, 0.5)? })
+}
+
+fn server(address: &str, peak_load: Option<f64>, here: &[&Visit], real_time: f64) -> Server {
+    Server {
+        address: address.to_owned(),
+        seats: u32::try_from(here.len()).unwrap_or(u32::MAX),
+        most_at_once: most_at_once(here),
+        peak_load,
+        pace: factors(here.iter().flat_map(|visit| factors_of(visit))),
+        slow: first_slow(here, real_time),
+    }
+}
+
+/// When a visit's simulation began to run, in seconds since the beginning.
+fn began(visit: &Visit) -> f64 {
+    visit.asked + visit.steps.until_running.unwrap_or_default()
+}
+
+fn most_at_once(here: &[&Visit]) -> u32 {
+    let mut changes: Vec<(f64, i32)> = here.iter().flat_map(|visit| [(began(visit), 1), (visit.ended, -1)]).collect();
+    changes.sort_by(|one, other| one.0.total_cmp(&other.0).then(one.1.cmp(&other.1)));
+    let mut now = 0_i32;
+    let most = changes.into_iter().map(|(_, change)| {
+        now += change;
+        now
+    });
+    most.max().and_then(|most| u32::try_from(most).ok()).unwrap_or_default()
+}
+
+/// The first second in which the simulations of a server ran below a share of real time on the average.
+fn first_slow(here: &[&Visit], real_time: f64) -> Option<Slow> {
+    let mut seconds: BTreeMap<u64, Vec<f64>> = BTreeMap::new();
+    for pace in here.iter().flat_map(|visit| visit.pace.iter().skip(1)) {
+        // Seconds of a rehearsal are few and not negative.
+        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "the second counts")]
+        seconds.entry(pace.at as u64).or_default().push(pace.factor);
+    }
+    let is_slow = |factors: &Vec<f64>| factors.iter().sum::<f64>() < real_time * f64::from(count(factors.len()));
+    // One slow second is noise.
+    let mut before = None;
+    for (second, factors) in seconds {
+        if !is_slow(&factors) {
+            before = None;
+        } else if let Some(slow) = before {
+            return Some(slow);
+        } else {
+            #[expect(clippy::cast_precision_loss, reason = "a second of the rehearsal")]
+            let at = second as f64;
+            let simulations = here.iter().filter(|visit| began(visit) <= at && at <= visit.ended).count();
+            before = Some(Slow { at, simulations: count(simulations) });
+        }
+    }
+    None
+}
+
+fn count(number: usize) -> u32 {
+    u32::try_from(number).unwrap_or(u32::MAX)
+}
+
+fn verdict(seats: &Seats, servers: &[Server]) -> String {
+    let all = seats.asked - seats.left;
+    let mut sentence = match (seats.fit, all) {
+        (0, _) => "None fits".to_owned(),
+        (fit, all) if fit == all => format!("All {all} fit"),
+        (fit, all) => format!("{fit} of {all} fit"),
+    };
+    let first = servers.iter().filter_map(|server| Some((server, server.slow?)));
+    if let Some((server, slow)) = first.min_by(|(_, one), (_, other)| one.at.total_cmp(&other.at)) {
+        let what =
+            format!("{} was the first to run below real time, at {} simulations", server.address, slow.simulations);
+        sentence = format!("{sentence}; {what}");
+    } else if let Some((why, number)) = seats.refused.iter().max_by_key(|(_, number)| **number) {
+        sentence = format!("{sentence}; {number} got none: {}", why.trim_end_matches('.'));
+    }
+    sentence + "."
+}
+
+fn sorted(values: impl Iterator<Item = f64>) -> Vec<f64> {
+    let mut values: Vec<f64> = values.collect();
+    values.sort_by(f64::total_cmp);
+    values
+}
+
+/// The value that a share of the sorted ones does not exceed (nearest rank).
+fn quantile(sorted: &[f64], share: f64) -> Option<f64> {
+    #[expect(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a rank")]
+    let rank = (share * sorted.len() as f64).ceil() as usize;
+    sorted.get(rank.saturating_sub(1)).copied()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::behaviour::Behaviour;
+    use crate::visit::Pace;
+    use clap::Parser;
+
+    fn visit(client: u32, server: &str, asked: f64, outcome: Outcome, factors: &[f64]) -> Visit {
+        let ran = matches!(outcome, Outcome::Ran | Outcome::BrokeOff(_)).then_some(1.0);
+        let pace = (0_u32..)
+            .zip(factors)
+            .map(|(second, factor)| Pace { at: asked + 3.0 + f64::from(second), factor: *factor });
+        let steps = Steps { waiting: ran, checkout: ran, launch: ran, until_running: ran.map(|step| 3.0 * step) };
+        let server = Some(server.to_owned());
+        Visit {
+            client,
+            behaviour: Behaviour::Ordinary,
+            asked,
+            server,
+            outcome,
+            steps,
+            pace: pace.collect(),
+            ended: asked + 10.0,
+        }
+    }
+
+    fn report(more: &[&str], visits: &[Visit]) -> Report {
+        let fixed = ["rehearse", "http://localhost:1999", "--world", "https://github.com/a/b/blob/m/worlds/w.wbt"];
+        let arguments = Arguments::parse_from(fixed.iter().chain(more));
+        let peaks = BTreeMap::from([("gpu-1:2000".to_owned(), Some(60.0)), ("gpu-2:2000".to_owned(), Some(99.0))]);
+        Report::new(&arguments, visits, &peaks)
+    }
+
+    #[test]
+    fn who_ran_to_the_end_in_real_time_fits() {
+        let full = Outcome::Refused("Error: full.".to_owned());
+        let visits = [
+            visit(0, "gpu-1:2000", 0.0, Outcome::Ran, &[0.1, 1.0, 1.0]),
+            visit(1, "gpu-1:2000", 1.0, Outcome::Ran, &[]),
+            visit(2, "gpu-2:2000", 2.0, Outcome::Ran, &[1.0, 0.5, 0.5]),
+            visit(3, "gpu-2:2000", 3.0, Outcome::BrokeOff("Webots was killed".to_owned()), &[1.0, 1.0]),
+            visit(4, "gpu-2:2000", 4.0, full.clone(), &[]),
+            visit(5, "gpu-2:2000", 5.0, full, &[]),
+            visit(6, "gpu-2:2000", 6.0, Outcome::Left, &[]),
+        ];
+        let of_two = report(&["--expect", "2"], &visits);
+        let seats = &of_two.seats;
+        assert_eq!((seats.asked, seats.given, seats.fit, seats.left), (7, 4, 2, 1));
+        assert_eq!(seats.refused, BTreeMap::from([("Error: full.".to_owned(), 2)]));
+        assert_eq!(seats.broke_off.values().sum::<u32>(), 1);
+        assert!(of_two.is_as_expected() && !report(&["--expect", "3"], &visits).is_as_expected());
+        assert_eq!(of_two.verdict, "2 of 6 fit; gpu-2:2000 was the first to run below real time, at 2 simulations.");
+        let servers: Vec<_> =
+            of_two.servers.iter().map(|server| (server.seats, server.most_at_once, server.peak_load)).collect();
+        assert_eq!(servers, [(2, 2, Some(60.0)), (2, 2, Some(99.0))]);
+        assert!(report(&["--real-time", "0.4"], &visits).is_as_expected());
+    }
+
+    #[test]
+    fn times_are_told_by_nearest_rank() {
+        let visits: Vec<Visit> = (1_u32..=100)
+            .map(|number| {
+                let mut one = visit(number, "gpu-1:2000", 0.0, Outcome::Ran, &[1.0, 1.0]);
+                one.steps.until_running = Some(f64::from(number));
+                one
+            })
+            .collect();
+        let all = report(&[], &visits);
+        let row = all.times.last().unwrap();
+        assert_eq!((row.step, row.median, row.p95, row.worst), ("all", 50.0, 95.0, 100.0));
+        assert_eq!(all.verdict, "All 100 fit.");
+        assert_eq!(all.pace, Some(Factors { p5: 1.0, median: 1.0 }));
+    }
+
+    #[test]
+    fn a_fleet_that_gives_nothing_is_told() {
+        let nothing = report(&[], &[visit(0, "gpu-1:2000", 0.0, Outcome::Failed("closed".to_owned()), &[])]);
+        assert_eq!(nothing.verdict, "None fits; 1 got none: closed.");
+        assert!(!nothing.is_as_expected() && nothing.times.is_empty() && nothing.pace.is_none());
+    }
+}

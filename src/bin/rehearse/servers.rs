@@ -1,0 +1,47 @@
+//! Watches the load of the simulation servers that clients are sent to.
+
+use std::cell::RefCell;
+use std::collections::BTreeMap;
+use std::time::Duration;
+
+use crate::session::{client, get, to_http};
+
+/// The simulation servers that were met, by their WebSocket URL, and the highest load of each, in percent.
+#[derive(Default)]
+pub(crate) struct Servers(RefCell<BTreeMap<String, Option<f64>>>);
+
+/// Between two looks at each server.
+const PERIOD: Duration = Duration::from_secs(1);
+
+impl Servers {
+    /// A client was sent to this one.
+    pub(crate) fn met(&self, url: &str) {
+        self.0.borrow_mut().entry(url.to_owned()).or_default();
+    }
+
+    /// Asks each server for its load, again and again, until dropped.
+    pub(crate) async fn watch(&self) {
+        let http = client();
+        loop {
+            let known: Vec<String> = self.0.borrow().keys().cloned().collect();
+            let asked = known.iter().map(|server| self.ask(&http, server));
+            futures_util::future::join_all(asked).await;
+            actix_rt::time::sleep(PERIOD).await;
+        }
+    }
+
+    async fn ask(&self, http: &awc::Client, server: &str) {
+        let answer = get(http, &format!("{}/load", to_http(server))).await;
+        // A server that is too busy to answer keeps the load that was seen.
+        let load = answer.ok().and_then(|text| text.trim().parse::<f64>().ok()).filter(|load| load.is_finite());
+        if let (Some(load), Some(peak)) = (load, self.0.borrow_mut().get_mut(server)) {
+            *peak = Some(peak.map_or(load, |peak| peak.max(load)));
+        }
+    }
+
+    /// The highest load of each server, by its address, in percent; nothing where it never told one.
+    pub(crate) fn peaks(&self) -> BTreeMap<String, Option<f64>> {
+        let known = self.0.borrow();
+        known.iter().filter_map(|(url, peak)| Some((url.split_once("://")?.1.to_owned(), *peak))).collect()
+    }
+}

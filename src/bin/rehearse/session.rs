@@ -1,0 +1,95 @@
+//! The session server as a web page meets it.
+
+use std::time::Duration;
+
+use awc::Client;
+use url::Url;
+
+use crate::conversation::{Conversation, Ended};
+
+/// How long an answer may take.
+const ANSWER: Duration = Duration::from_secs(20);
+/// No answer is longer, in bytes.
+const LONGEST_ANSWER: usize = 64 << 10;
+
+/// A session server.
+#[derive(Clone)]
+pub(crate) struct Session {
+    url: Url,
+    http: Client,
+}
+
+impl Session {
+    /// The session server at this URL.
+    pub(crate) fn new(url: &Url) -> Self {
+        Self { url: url.clone(), http: client() }
+    }
+
+    /// Looks whether there is a session server at all.
+    ///
+    /// # Errors
+    /// What came in place of a load.
+    pub(crate) async fn answers(&self) -> Result<(), String> {
+        let url = format!("{}/load", self.base());
+        let text = get(&self.http, &url).await?;
+        text.trim().parse::<f64>().map(drop).map_err(|_| format!("{url} is no load but {text:.80?}: no session server"))
+    }
+
+    /// Waits until the session server says that a simulation server can take a client. Its WebSocket tells that at once,
+    /// and then whenever it changes.
+    ///
+    /// # Errors
+    /// When the connection is over.
+    pub(crate) async fn until_available(&self) -> Result<(), Ended> {
+        let mut availability = Conversation::open(&self.availability_url()).await?;
+        while availability.hear().await? != "1" {}
+        availability.close().await;
+        Ok(())
+    }
+
+    /// The URL of the WebSocket that tells the availability: the original has it at `/`.
+    pub(crate) fn availability_url(&self) -> String {
+        format!("{}/", to_web_socket(&self.base()))
+    }
+
+    /// Asks for a simulation server for a world: `ws://HOST:PORT` or `wss://HOST/PORT`.
+    ///
+    /// # Errors
+    /// What was said in place of it.
+    pub(crate) async fn simulation_server(&self, world: &str) -> Result<String, String> {
+        // As the page writes it: not percent-encoded.
+        let answer = get(&self.http, &format!("{}/session?url={world}", self.base())).await?;
+        let answer = answer.trim();
+        let is_one = answer.starts_with("ws://") || answer.starts_with("wss://");
+        if is_one { Ok(answer.trim_end_matches('/').to_owned()) } else { Err(answer.to_owned()) }
+    }
+
+    fn base(&self) -> String {
+        self.url.as_str().trim_end_matches('/').trim_end_matches("/session").to_owned()
+    }
+}
+
+/// A client for short answers.
+pub(crate) fn client() -> Client {
+    Client::builder().timeout(ANSWER).finish()
+}
+
+/// The body of an answer, whatever its status is: the page reads no more of it either.
+///
+/// # Errors
+/// Why there is none.
+pub(crate) async fn get(http: &Client, url: &str) -> Result<String, String> {
+    let mut answer = http.get(url).send().await.map_err(|error| format!("{url} can't be reached: {error}"))?;
+    let body = answer.body().limit(LONGEST_ANSWER).await.map_err(|error| format!("{url} can't be read: {error}"))?;
+    Ok(String::from_utf8_lossy(&body).into_owned())
+}
+
+/// `ws://...` of `http://...`, `wss://...` of `https://...`.
+pub(crate) fn to_web_socket(url: &str) -> String {
+    url.replacen("http", "ws", 1)
+}
+
+/// `http://...` of `ws://...`, `https://...` of `wss://...`.
+pub(crate) fn to_http(url: &str) -> String {
+    url.replacen("ws", "http", 1)
+}

@@ -1,0 +1,108 @@
+//! The numbers of a rehearsal as a text that a teacher reads. Pure.
+
+use std::collections::BTreeMap;
+
+use comfy_table::presets::ASCII_MARKDOWN;
+use comfy_table::{CellAlignment, ContentArrangement, Table};
+
+use crate::report::{Factors, Report};
+
+/// As wide as a terminal is, at least.
+const WIDTH: u16 = 100;
+
+/// All tables, and the verdict below them.
+pub(crate) fn text(report: &Report) -> String {
+    let mut parts = vec![format!("Rehearsal of {}: {}\n{}", report.fleet, report.played, report.world)];
+    parts.push(seats(report));
+    if !report.times.is_empty() {
+        parts.push(times(report));
+    }
+    if !report.servers.is_empty() {
+        parts.push(servers(report));
+    }
+    let mut verdict = report.verdict.clone();
+    if let Some(expected) = report.expected {
+        let met = if report.is_as_expected() { "as expected" } else { "NOT as expected" };
+        verdict = format!("{verdict} {expected} had to: {met}.");
+    }
+    parts.push(verdict);
+    parts.join("\n\n")
+}
+
+fn seats(report: &Report) -> String {
+    let seats = &report.seats;
+    let mut table = table(&["Seats", ""]);
+    let mut add = |what: &str, number: u32| {
+        table.add_row(vec![what.to_owned(), number.to_string()]);
+    };
+    add("asked for", seats.asked);
+    add("given", seats.given);
+    add("of these fit: to the end, in real time", seats.fit);
+    for (why, number) in reasons(&seats.refused) {
+        add(&format!("refused: {why}"), *number);
+    }
+    for (why, number) in reasons(&seats.broke_off) {
+        add(&format!("broke off: {why}"), *number);
+    }
+    if seats.left > 0 {
+        add("left on purpose before it ran", seats.left);
+    }
+    right(&mut table, 1);
+    table.to_string()
+}
+
+fn reasons(reasons: &BTreeMap<String, u32>) -> impl Iterator<Item = (&String, &u32)> {
+    let mut all: Vec<(&String, &u32)> = reasons.iter().collect();
+    all.sort_by(|one, other| other.1.cmp(one.1));
+    all.into_iter()
+}
+
+fn times(report: &Report) -> String {
+    let mut table = table(&["Until it runs", "median", "95 %", "worst"]);
+    for row in &report.times {
+        let seconds = [row.median, row.p95, row.worst].map(|time| format!("{time:.1} s"));
+        table.add_row(std::iter::once(row.step.to_owned()).chain(seconds).collect::<Vec<_>>());
+    }
+    (1..=3).for_each(|column| right(&mut table, column));
+    table.to_string()
+}
+
+fn servers(report: &Report) -> String {
+    let mut table = table(&["Simulation server", "seats", "at once", "peak load", "real time, 5 %", "median"]);
+    for server in &report.servers {
+        let load = server.peak_load.map_or_else(|| "-".to_owned(), |load| format!("{load:.0} %"));
+        let [p5, median] = pace(server.pace);
+        table.add_row(vec![
+            server.address.clone(),
+            server.seats.to_string(),
+            server.most_at_once.to_string(),
+            load,
+            p5,
+            median,
+        ]);
+    }
+    if report.servers.len() > 1 {
+        let [p5, median] = pace(report.pace);
+        let given = report.seats.given.to_string();
+        table.add_row(vec!["all".to_owned(), given, String::new(), String::new(), p5, median]);
+    }
+    (1..=5).for_each(|column| right(&mut table, column));
+    table.to_string()
+}
+
+fn pace(factors: Option<Factors>) -> [String; 2] {
+    factors.map_or_else(|| ["-".to_owned(), "-".to_owned()], |all| [all.p5, all.median].map(|one| format!("{one:.2}")))
+}
+
+fn table(header: &[&str]) -> Table {
+    let mut table = Table::new();
+    table.load_style(ASCII_MARKDOWN).set_content_arrangement(ContentArrangement::Dynamic).set_width(WIDTH);
+    table.set_header(header.to_vec());
+    table
+}
+
+fn right(table: &mut Table, column: usize) {
+    if let Some(column) = table.column_mut(column) {
+        column.set_cell_alignment(CellAlignment::Right);
+    }
+}
