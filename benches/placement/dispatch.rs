@@ -1,6 +1,6 @@
 //! The policies that are compared: the project's own, and those of others, which see the same reports.
 
-use super::world::THRESHOLD;
+use super::scenario::THRESHOLD;
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
 use std::time::{Duration, Instant};

@@ -3,6 +3,8 @@
 use rand::RngExt;
 use rand::rngs::StdRng;
 
+/// The load at which a server's own rule stops taking clients, in percent.
+pub(crate) const THRESHOLD: f64 = 95.0;
 /// Seconds that a run lasts.
 pub(crate) const HORIZON: f64 = 300.0;
 /// When a class comes.

@@ -1,7 +1,7 @@
 //! A fleet of machines, the clients that want to use it, and a clock that runs as fast as it can.
 
 use super::dispatch::{Dispatcher, Sight};
-use super::scenario::{Client, HORIZON, Outcome, Scenario, Sizes, clients};
+use super::scenario::{Client, HORIZON, Outcome, Scenario, Sizes, THRESHOLD, clients};
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
 use std::cmp::Reverse;
@@ -11,8 +11,6 @@ use std::collections::{BinaryHeap, VecDeque};
 const UNIT_COST: f64 = 2.0;
 /// Seconds until a new simulation needs all that it is going to need.
 const RAMP: f64 = 3.0;
-/// The load at which a server's own rule stops taking clients, in percent.
-pub(crate) const THRESHOLD: f64 = 95.0;
 
 /// One machine.
 struct Machine {
