@@ -143,7 +143,10 @@ async fn the_client_of_the_readme_works() {
     let project = Project::copy();
     project.done(&["start", "demo"]).await;
     let talk = async |port: u16, path: &str, message: &str, last: &str| {
-        let mut child = tokio::process::Command::new(project.path("tests/websocket.sh"))
+        // A shell can't take back that SIGINT is ignored, as it is below `nohup tests/run.sh &`.
+        let mut child = tokio::process::Command::new("env")
+            .arg("--default-signal=INT")
+            .arg(project.path("tests/websocket.sh"))
             .args([&format!("ws://localhost:{port}{path}"), message])
             .stdin(Stdio::null())
             .stdout(Stdio::piped())
