@@ -14,10 +14,10 @@ PATH=$PATH:/usr/sbin
 # The C compiler links the programs; python3 and openssl make counterparts for mail and TLS; xvfb gives a display; the
 # fleet is tested behind both web servers, by a real browser too, and its package and the guide to it in a Debian that
 # debootstrap makes.
-tests/install.sh cc=gcc,libc6-dev git=git flock=util-linux openssl=openssl python3=python3 python3-venv=python3-venv \
+tests/install.sh cc=gcc,libc6-dev git=git git-lfs=git-lfs flock=util-linux openssl=openssl python3=python3 python3-venv=python3-venv \
     xvfb-run=xvfb,xauth apache2=apache2-bin nginx=nginx setpriv=util-linux chromium=chromium \
     debootstrap=debootstrap dpkg-shlibdeps=dpkg-dev desktop-file-validate=desktop-file-utils xhost=x11-xserver-utils \
-    ip=iproute2
+    systemd-analyze=systemd ip=iproute2
 tests/python.sh >/dev/null
 
 start=$SECONDS

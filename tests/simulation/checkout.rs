@@ -13,8 +13,8 @@ use crate::support::client::Client;
 use crate::support::git::{Forge, WORLD, git, world};
 use crate::support::http;
 use crate::support::program::{Server, simulation_server};
-use crate::support::until;
 use crate::support::webots::{Webots, instances_below};
+use crate::support::{needs, until};
 
 /// A Webots that tells which world it was given, and ends: its client hears the world's second line.
 pub fn reader() -> Webots {
@@ -461,10 +461,7 @@ async fn files_in_git_lfs_are_looked_for_where_the_world_is_and_nowhere_outside(
 
 #[actix_rt::test]
 async fn files_in_git_lfs_are_loaded() {
-    if !std::env::split_paths(&std::env::var_os("PATH").unwrap()).any(|folder| folder.join("git-lfs").is_file()) {
-        eprintln!("git-lfs is missing here: loading from Git LFS is NOT tested");
-        return;
-    }
+    needs("git-lfs", "git-lfs");
     let forge = Forge::with_arm();
     let webots = Webots::script(
         "for last; do :; done\ncd \"$(dirname \"$last\")/..\"\necho \"mesh [$(head -c 20 meshes/a.dae)]\"\nexit 1",

@@ -10,21 +10,17 @@ use crate::support::client::Client;
 use crate::support::git::Forge;
 use crate::support::program::{Builder, simulation_server};
 use crate::support::webots::Webots;
-use crate::support::{http, until};
+use crate::support::{http, needs, until};
 
-/// A folder with the stand-in for NVIDIA's library; nothing without a C compiler.
-fn stand_in() -> Option<tempfile::TempDir> {
+/// A folder with the stand-in for NVIDIA's library.
+fn stand_in() -> tempfile::TempDir {
+    needs("cc", "gcc");
     let folder = tempfile::tempdir().unwrap();
     let source = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/simulation/nvml.c");
     let library = folder.path().join("libnvidia-ml.so.1");
-    match Command::new("cc").args(["-shared", "-fPIC", "-o"]).arg(library).arg(source).status() {
-        Ok(status) => assert!(status.success()),
-        Err(error) => {
-            eprintln!("no C compiler ({error}): readings of GPUs are NOT tested");
-            return None;
-        }
-    }
-    Some(folder)
+    let made = Command::new("cc").args(["-shared", "-fPIC", "-o"]).arg(library).arg(source).status().unwrap();
+    assert!(made.success());
+    folder
 }
 
 fn with(library: &Path, forge: &Forge, webots: &Webots) -> Builder {
@@ -33,7 +29,7 @@ fn with(library: &Path, forge: &Forge, webots: &Webots) -> Builder {
 
 #[actix_rt::test]
 async fn gpus_are_read_and_the_least_busy_one_counts() {
-    let Some(library) = stand_in() else { return };
+    let library = stand_in();
     let (forge, webots) = (Forge::with_arm(), Webots::launcher());
     let server =
         with(library.path(), &forge, &webots).env("NVML_COMPUTE_0", "100").env("NVML_COMPUTE_1", "99").start().await;
@@ -52,7 +48,7 @@ async fn gpus_are_read_and_the_least_busy_one_counts() {
 
 #[actix_rt::test]
 async fn a_driver_that_hangs_or_is_missing_holds_up_nothing() {
-    let Some(library) = stand_in() else { return };
+    let library = stand_in();
     let (forge, webots) = (Forge::with_arm(), Webots::launcher());
     for hang in ["init", "read", "no driver"] {
         let mut server = with(library.path(), &forge, &webots).env("NVML_HANG", hang).start().await;

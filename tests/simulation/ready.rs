@@ -12,8 +12,8 @@ use super::scene::{DEMO, arm, instance_folders_in, nothing_left, stages};
 use crate::support::client::Client;
 use crate::support::git::{Forge, world};
 use crate::support::program::simulation_server;
-use crate::support::until;
 use crate::support::webots::{Webots, instances_below};
+use crate::support::{display, until};
 
 #[actix_rt::test]
 async fn the_port_that_webots_really_took_is_handed_out() {
@@ -149,8 +149,7 @@ async fn webots_gets_the_configured_display_else_the_servers_own_else_the_first(
 
 #[actix_rt::test]
 async fn paths_may_have_spaces_and_quotes() {
-    let paths = std::env::var_os("PATH").unwrap();
-    let has_xvfb = std::env::split_paths(&paths).any(|folder| folder.join("xvfb-run").is_file());
+    let _alone = display::alone().await;
     let (forge, folder) = (Forge::new(), tempfile::tempdir().unwrap());
     forge.commit("lab/arm", "main", &[("p q's/worlds/b  \"c\".wbt", &world_text("opened"))]);
     let script = "for last; do :; done\ntest -S /tmp/.X11-unix/X${DISPLAY#:} && echo 'with a display'\necho \"$PWD [$(sed -n 2p \"$last\")] $last\"\nexit 1";
@@ -160,10 +159,6 @@ async fn paths_may_have_spaces_and_quotes() {
     std::fs::copy(reader.path(), &program).unwrap();
     let at = |name: &str| folder.path().join(name).to_str().unwrap().to_owned();
     for xvfb in [false, true] {
-        if xvfb && !has_xvfb {
-            eprintln!("xvfb-run is missing here: paths with spaces are NOT tested with it");
-            continue;
-        }
         let builder = simulation_server(&program, forge.path(), 1).set("cacheDir", at("the cache's")).set("xvfb", xvfb);
         let server = builder.set("logDir", at("the log's")).start().await;
         let told = outcome(&server, &world("lab/arm", "main", "p%20q's/worlds/b%20%20%22c%22.wbt")).await;
@@ -197,22 +192,9 @@ async fn a_missing_webots_or_xvfb_is_told_with_what_to_do() {
     nothing_left(&server, 1).await;
 }
 
-/// Whether virtual displays can be tested here; where everything has to be tested they must.
-fn has_virtual_displays() -> bool {
-    let paths = std::env::var_os("PATH").unwrap();
-    let has = std::env::split_paths(&paths).any(|folder| folder.join("xvfb-run").is_file());
-    assert!(has || std::env::var_os("CI").is_none(), "xvfb-run is missing");
-    if !has {
-        eprintln!("xvfb-run is missing here: virtual displays are NOT tested");
-    }
-    has
-}
-
 #[actix_rt::test]
 async fn each_webots_gets_a_virtual_display_of_its_own() {
-    if !has_virtual_displays() {
-        return;
-    }
+    let _alone = display::alone().await;
     let forge = Forge::with_arm();
     let webots = Webots::script(&format!(
         "test -S /tmp/.X11-unix/X${{DISPLAY#:}} || exit 9\necho \"display $DISPLAY\"\n{DEMO} \"$@\" & wait"
@@ -237,9 +219,7 @@ async fn each_webots_gets_a_virtual_display_of_its_own() {
 
 #[actix_rt::test]
 async fn a_virtual_display_that_is_killed_leaves_no_trace() {
-    if !has_virtual_displays() {
-        return;
-    }
+    let _alone = display::alone().await;
     let forge = Forge::with_arm();
     let webots = Webots::script(&format!("echo \"display $DISPLAY\"\n{DEMO} \"$@\" & wait"));
     let temporary = tempfile::tempdir().unwrap();

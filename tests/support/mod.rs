@@ -5,6 +5,7 @@
 #![allow(dead_code, reason = "each test crate uses its own part of this")]
 
 pub mod client;
+pub mod display;
 pub mod git;
 pub mod http;
 pub mod ports;
@@ -15,6 +16,13 @@ use std::time::{Duration, Instant};
 
 /// How long anything may take that should happen soon. Far more than it needs: the machine may be busy.
 pub const SOON: Duration = Duration::from_secs(20);
+
+/// Fails where a program is missing that a test needs; `package` is what has it in Debian.
+pub fn needs(program: &str, package: &str) {
+    let paths = std::env::var_os("PATH").unwrap();
+    let is_there = std::env::split_paths(&paths).any(|folder| folder.join(program).is_file());
+    assert!(is_there, "this test needs {program}: apt install {package}");
+}
 
 /// Waits until a condition holds, and says what was waited for when it never does.
 pub async fn until(what: &str, mut condition: impl AsyncFnMut() -> bool) {
