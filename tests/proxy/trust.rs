@@ -80,12 +80,59 @@ async fn a_certificate_that_is_not_trusted_is_named_with_the_reason() {
         (
             careless.issue_as(&["localhost"], is_authority),
             &careless,
-            "it is that of an authority (CA:TRUE), where one of a server is needed",
+            "it is that of an authority (CA:TRUE) and not itself known here",
         ),
     ];
     for (certificate, trusted, words) in &table {
         let said = verdict(certificate, trusted).await;
         assert!(said.starts_with(words), "{said:?} is not {words:?}");
+    }
+}
+
+/// What `openssl req -x509` makes for a name: a certificate that has signed itself and may sign others.
+fn self_signed(folder: &std::path::Path, name: &str) -> Certificate {
+    let files = Certificate { chain: folder.join(format!("{name}.pem")), key: folder.join(format!("{name}.key")) };
+    let output = std::process::Command::new("openssl")
+        .args(["req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "30", "-subj", &format!("/CN={name}")])
+        .args(["-addext", &format!("subjectAltName=DNS:{name}"), "-out"])
+        .args([files.chain.as_os_str(), "-keyout".as_ref(), files.key.as_os_str()])
+        .output()
+        .unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    files
+}
+
+#[actix_rt::test]
+async fn a_certificate_that_has_signed_itself_is_trusted_where_it_is_in_the_trust_store() {
+    let folder = tempfile::tempdir().unwrap();
+    let own = self_signed(folder.path(), "localhost");
+    let (_web, port) = web_server(&own).await;
+    let watch = async |store: &std::path::Path, state: &str| {
+        let server = watcher(&format!("localhost:{port}/2000")).env("SSL_CERT_FILE", store.to_str().unwrap());
+        page_of_the_server(&server.start().await, state).await
+    };
+    assert_eq!(watch(&own.chain, "up").await["load"], 12.5);
+    // Another one for the same name is not that one.
+    let others = tempfile::tempdir().unwrap();
+    let error = watch(&self_signed(others.path(), "localhost").chain, "down").await["error"].to_string();
+    assert!(error.contains("it is that of an authority (CA:TRUE) and not itself known here"), "{error}");
+
+    let mut params = CertificateParams::new(["localhost".to_owned()]).unwrap();
+    params.is_ca = rcgen::IsCa::Ca(rcgen::BasicConstraints::Unconstrained);
+    params.not_after = rcgen::date_time_ymd(2011, 1, 1);
+    let key = rcgen::KeyPair::generate().unwrap();
+    let expired = Certificate { chain: folder.path().join("expired.pem"), key: folder.path().join("expired.key") };
+    std::fs::write(&expired.chain, params.self_signed(&key).unwrap().pem()).unwrap();
+    std::fs::write(&expired.key, key.serialize_pem()).unwrap();
+    for (certificate, words) in [
+        (&self_signed(folder.path(), "lab.example"), "it is for lab.example, not for localhost"),
+        (&expired, "it expired on 2011-01-01"),
+    ] {
+        let (_web, port) = web_server(certificate).await;
+        let server =
+            watcher(&format!("localhost:{port}/2000")).env("SSL_CERT_FILE", certificate.chain.to_str().unwrap());
+        let error = page_of_the_server(&server.start().await, "down").await["error"].to_string();
+        assert!(error.contains(words), "{error}");
     }
 }
 

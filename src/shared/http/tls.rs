@@ -1,15 +1,23 @@
-//! Requests to https servers: whom they trust, and why they don't, in words.
+//! Requests to https servers: which certificates are trusted, and why others are not, in words.
 //!
-//! Trusted are the authorities of the system's store, where a lab adds its own with `update-ca-certificates`; or those
-//! of the file `SSL_CERT_FILE` and the folders `SSL_CERT_DIR` alone, where one of these variables is set.
+//! The trust store is the system's, where a lab adds its own authority with `update-ca-certificates`. Where one of the
+//! environment variables `SSL_CERT_FILE` and `SSL_CERT_DIR` is set, it is that file or folder alone.
 
 use std::sync::Arc;
 
 use awc::error::{ConnectError, SendRequestError};
-use rustls::{CertificateError, ClientConfig, Error, RootCertStore};
+use rustls::client::danger::{HandshakeSignatureValid, ServerCertVerified, ServerCertVerifier};
+use rustls::client::{WebPkiServerVerifier, verify_server_name};
+use rustls::crypto::CryptoProvider;
+use rustls::pki_types::{CertificateDer, ServerName, UnixTime};
+use rustls::server::ParsedCertificate;
+use rustls::{
+    CertificateError, ClientConfig, DigitallySignedStruct, Error, OtherError, RootCertStore, SignatureScheme,
+};
 
-/// How requests are encrypted. What can't be read of the authorities is told in the log: their servers won't be
-/// trusted, all others will.
+/// Returns how requests are encrypted; `None` where rustls can't be set up.
+///
+/// Parts of the trust store that can't be read are logged. Only servers that need them are not trusted.
 #[must_use]
 pub fn client_config() -> Option<Arc<ClientConfig>> {
     let found = rustls_native_certs::load_native_certs();
@@ -17,7 +25,7 @@ pub fn client_config() -> Option<Arc<ClientConfig>> {
         log::warn!("some certificate authorities can't be read: {problem}");
     }
     let mut roots = RootCertStore::empty();
-    let (_, unusable) = roots.add_parsable_certificates(found.certs);
+    let (_, unusable) = roots.add_parsable_certificates(found.certs.iter().cloned());
     if unusable > 0 {
         log::warn!("{unusable} certificates of authorities can't be used");
     }
@@ -25,17 +33,86 @@ pub fn client_config() -> Option<Arc<ClientConfig>> {
         log::warn!("no certificate authority is known: no https server will be trusted");
     }
     let provider = Arc::new(rustls::crypto::ring::default_provider());
-    let builder = ClientConfig::builder_with_provider(provider).with_safe_default_protocol_versions();
-    match builder {
-        Ok(builder) => Some(Arc::new(builder.with_root_certificates(roots).with_no_client_auth())),
-        Err(error) => {
-            log::error!("https is off: {error}");
-            None
-        }
+    let builder = ClientConfig::builder_with_provider(Arc::clone(&provider)).with_safe_default_protocol_versions();
+    let builder = builder.inspect_err(|error| log::error!("https is off: {error}")).ok()?;
+    let builder = match Verifier::new(roots, found.certs, provider) {
+        Some(verifier) => builder.dangerous().with_custom_certificate_verifier(Arc::new(verifier)),
+        None => builder.with_root_certificates(RootCertStore::empty()),
+    };
+    Some(Arc::new(builder.with_no_client_auth()))
+}
+
+/// Verifies certificates as webpki does, and accepts also those of servers that are themselves in the trust store.
+///
+/// webpki refuses a certificate that may sign others (`CA:TRUE`) as a server's own. `openssl req -x509` makes such
+/// certificates, and OpenSSL and curl accept them. Nothing is lost by that: whoever has the key of a trusted authority
+/// can make a certificate for every name.
+#[derive(Debug)]
+struct Verifier {
+    webpki: Arc<WebPkiServerVerifier>,
+    trusted: Vec<CertificateDer<'static>>,
+}
+
+impl Verifier {
+    /// Returns `None` where the trust store is empty.
+    fn new(roots: RootCertStore, trusted: Vec<CertificateDer<'static>>, crypto: Arc<CryptoProvider>) -> Option<Self> {
+        let webpki = WebPkiServerVerifier::builder_with_provider(Arc::new(roots), crypto).build().ok()?;
+        Some(Self { webpki, trusted })
     }
 }
 
-/// Why a request failed, where encryption is the cause.
+impl ServerCertVerifier for Verifier {
+    fn verify_server_cert(
+        &self,
+        certificate: &CertificateDer<'_>,
+        intermediates: &[CertificateDer<'_>],
+        name: &ServerName<'_>,
+        ocsp_response: &[u8],
+        now: UnixTime,
+    ) -> Result<ServerCertVerified, Error> {
+        let verified = self.webpki.verify_server_cert(certificate, intermediates, name, ocsp_response, now);
+        match verified {
+            // Before this error webpki has checked the dates, and after it the name would be checked.
+            Err(Error::InvalidCertificate(error)) if is_of_authority(&error) && self.trusted.contains(certificate) => {
+                verify_server_name(&ParsedCertificate::try_from(certificate)?, name)?;
+                Ok(ServerCertVerified::assertion())
+            }
+            verified => verified,
+        }
+    }
+
+    fn verify_tls12_signature(
+        &self,
+        message: &[u8],
+        certificate: &CertificateDer<'_>,
+        signature: &DigitallySignedStruct,
+    ) -> Result<HandshakeSignatureValid, Error> {
+        self.webpki.verify_tls12_signature(message, certificate, signature)
+    }
+
+    fn verify_tls13_signature(
+        &self,
+        message: &[u8],
+        certificate: &CertificateDer<'_>,
+        signature: &DigitallySignedStruct,
+    ) -> Result<HandshakeSignatureValid, Error> {
+        self.webpki.verify_tls13_signature(message, certificate, signature)
+    }
+
+    fn supported_verify_schemes(&self) -> Vec<SignatureScheme> {
+        self.webpki.supported_verify_schemes()
+    }
+}
+
+/// Whether a certificate was refused because it may sign others (`CA:TRUE`).
+fn is_of_authority(error: &CertificateError) -> bool {
+    let CertificateError::Other(OtherError(source)) = error else {
+        return false;
+    };
+    source.downcast_ref() == Some(&webpki::Error::CaUsedAsEndEntity)
+}
+
+/// Says why a request failed, where encryption is the cause.
 #[must_use]
 pub fn reason(error: &SendRequestError) -> Option<String> {
     let SendRequestError::Connect(ConnectError::Io(error)) = error else {
@@ -43,14 +120,14 @@ pub fn reason(error: &SendRequestError) -> Option<String> {
     };
     let error = error.get_ref()?.downcast_ref::<Error>()?;
     Some(match error {
-        Error::InvalidCertificate(problem) => format!("its certificate is not trusted: {}", mistrust(problem)),
+        Error::InvalidCertificate(problem) => format!("its certificate is not trusted: {}", distrust(problem)),
         Error::InvalidMessage(_) => "it does not speak https there".to_owned(),
         Error::AlertReceived(alert) => format!("it refuses to encrypt: {alert:?}"),
         other => format!("encryption failed: {other}"),
     })
 }
 
-fn mistrust(problem: &CertificateError) -> String {
+fn distrust(problem: &CertificateError) -> String {
     match problem {
         CertificateError::UnknownIssuer => {
             "it comes from an authority that is not known here (update-ca-certificates and SSL_CERT_FILE make one known)"
@@ -67,14 +144,16 @@ fn mistrust(problem: &CertificateError) -> String {
         }
         CertificateError::BadSignature => "the authority that it names has not signed it".to_owned(),
         CertificateError::Revoked => "it was revoked".to_owned(),
-        other if format!("{other:?}").contains("CaUsedAsEndEntity") => {
-            "it is that of an authority (CA:TRUE), where one of a server is needed".to_owned()
+        other if is_of_authority(other) => {
+            "it is that of an authority (CA:TRUE) and not itself known here (update-ca-certificates and SSL_CERT_FILE make \
+             it known)"
+                .to_owned()
         }
         other => other.to_string(),
     }
 }
 
-/// A name as rustls tells it, `DnsName("lab.org")`, without its kind.
+/// Returns the name alone of what rustls writes as `DnsName("lab.org")`.
 fn bare(name: &str) -> &str {
     let inner = name.split_once('(').and_then(|(_, rest)| rest.strip_suffix(')'));
     inner.map_or(name, |inner| inner.trim_matches('"'))

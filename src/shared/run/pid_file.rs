@@ -1,0 +1,45 @@
+//! A file that tells other programs whether a server runs, and in which process.
+
+use std::fs::{File, TryLockError};
+use std::io::{self, Read, Write};
+use std::path::Path;
+
+/// Writes the process id to a file, and locks the file (`flock`) until the returned file is closed, which the system does
+/// when the process ends in whatever way.
+///
+/// # Errors
+/// When the file can't be written, or another server holds it.
+pub fn write(path: &Path) -> io::Result<File> {
+    let mut file = File::options().read(true).write(true).create(true).truncate(false).open(path)?;
+    match file.try_lock() {
+        Ok(()) => {}
+        Err(TryLockError::WouldBlock) => {
+            let mut pid = String::new();
+            file.read_to_string(&mut pid)?;
+            return Err(io::Error::other(format!("a server that runs holds it: process {}", pid.trim())));
+        }
+        Err(TryLockError::Error(error)) => return Err(error),
+    }
+    file.set_len(0)?;
+    writeln!(file, "{}", std::process::id())?;
+    Ok(file)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn one_process_holds_the_file_and_a_stale_one_is_taken_over() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("server.pid");
+        std::fs::write(&path, "a text that is longer than a process id\n").unwrap();
+        let own = format!("{}\n", std::process::id());
+        let file = write(&path).unwrap();
+        assert_eq!(std::fs::read_to_string(&path).unwrap(), own);
+        let error = write(&path).unwrap_err().to_string();
+        assert!(error.contains(own.trim()), "{error}");
+        drop(file);
+        write(&path).unwrap();
+    }
+}
