@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use super::mail_address::{self, MailAddress};
 use super::placement::Policy;
-use crate::shared::config::{Configuration, Unfit, differences};
+use crate::shared::config::{Configuration, InvalidValue, changed_keys};
 use crate::shared::config::{
     ExpandedPath, Secret, folder, local_address, object, one_or_many, optional_port, percent, seconds, threshold, whole,
 };
@@ -22,26 +22,26 @@ pub struct SessionConfig {
     #[serde(default)]
     pub server: String,
     /// Whether URLs begin with `https` and `wss`. Default: true.
-    #[serde(default = "yes")]
+    #[serde(default = "default_true")]
     pub ssl: bool,
     /// Local port; 0 takes any free one.
     #[serde(deserialize_with = "whole::<0, 65535, _, _>")]
     pub port: u16,
     /// Local address to listen on. Default: all of them.
-    #[serde(default = "everywhere", deserialize_with = "local_address")]
+    #[serde(default = "default_bind", deserialize_with = "local_address")]
     pub bind: IpAddr,
     /// Whether a web server in front rewrites ports in URLs: HOST/PORT, not HOST:PORT. Default: true.
-    #[serde(default = "yes")]
+    #[serde(default = "default_true")]
     pub port_rewrite: bool,
     /// The simulation servers, as HOST:PORT or HOST/PORT.
     pub simulation_servers: Vec<PublicAddress>,
-    /// Those of the simulation servers that get no new clients, while they are still watched. Default: none.
+    /// Those of `simulationServers` that get no new clients. They are still watched. Default: none.
     #[serde(default)]
     pub drained_servers: Vec<PublicAddress>,
-    /// Mail address that receives notifications.
+    /// Mail address of the administrator, who gets notifications. Default: none, and there are no notifications.
     #[serde(default, deserialize_with = "mail_address::optional")]
     pub administrator: Option<MailAddress>,
-    /// SMTP host.
+    /// Host of the SMTP server. Default: none, and there are no notifications.
     #[serde(default)]
     pub mail_server: Option<String>,
     /// SMTP port. Default: 25, with a password 587.
@@ -50,58 +50,58 @@ pub struct SessionConfig {
     /// Whether the SMTP server encrypts from the first byte, without STARTTLS. Default: true for port 465, else false.
     #[serde(default)]
     pub mail_server_implicit_tls: Option<bool>,
-    /// Mail address that notifications come from.
+    /// Mail address that notifications come from. Default: none, and there are no notifications.
     #[serde(default, deserialize_with = "mail_address::optional")]
     pub mail_sender: Option<MailAddress>,
     /// User name for SMTP. Default: `mailSender`.
     #[serde(default)]
     pub mail_sender_user: Option<String>,
-    /// Password for SMTP: with it the connection is always encrypted.
+    /// Password for SMTP. With a password the connection is always encrypted. Default: none.
     #[serde(default)]
     pub mail_sender_password: Option<Secret>,
     /// Folder of `session/output.log`. Default: `log`.
-    #[serde(default = "log_folder", deserialize_with = "folder")]
+    #[serde(default = "default_log_dir", deserialize_with = "folder")]
     pub log_dir: ExpandedPath,
     /// Log to standard output. Default: false.
     #[serde(default)]
     pub debug: bool,
-    /// A simulation server with this load (percent) or more takes no client; above 100 the load closes no server.
+    /// A simulation server with this load (percent) or more gets no client. Above 100, the load does not matter.
     /// Default: 95.
-    #[serde(default = "usual_threshold", deserialize_with = "threshold")]
+    #[serde(default = "default_load_threshold", deserialize_with = "threshold")]
     pub load_threshold: f64,
-    /// Seconds between two looks at each simulation server. Default: 1.
-    #[serde(default = "one_second", with = "seconds")]
+    /// Seconds between two requests for the load of a simulation server. Default: 1.
+    #[serde(default = "default_load_refresh", with = "seconds")]
     pub load_refresh: Duration,
-    /// What a client is expected to cost a simulation server (percent of load) until its reports teach better.
+    /// How much load (percent) a client is expected to add to a simulation server, until its reports show how much it is.
     /// Default: 2.
-    #[serde(default = "client_cost", deserialize_with = "percent")]
+    #[serde(default = "default_client_cost", deserialize_with = "percent")]
     pub client_cost: f64,
     /// How many client `WebSockets` may be open in all. Default: 20000.
-    #[serde(default = "many_clients", deserialize_with = "whole::<1, 1_000_000, _, _>")]
+    #[serde(default = "default_max_clients", deserialize_with = "whole::<1, 1_000_000, _, _>")]
     pub max_clients: usize,
     /// How many of them one client address may have. Default: 1000, for a class sits behind one address.
-    #[serde(default = "a_class", deserialize_with = "whole::<1, 1_000_000, _, _>")]
+    #[serde(default = "default_max_clients_per_address", deserialize_with = "whole::<1, 1_000_000, _, _>")]
     pub max_clients_per_address: usize,
-    /// Web servers, as addresses or networks, whose `X-Forwarded-For` or `Forwarded` tells their clients' addresses.
+    /// Web servers, as addresses or networks, whose headers `X-Forwarded-For` and `Forwarded` are believed.
     /// Default: `["127.0.0.0/8", "::1/128"]`.
     #[serde(default)]
     pub trusted_proxies: TrustedProxies,
     /// Worlds that the page `/viewer` offers: URLs, or `{"title": ..., "url": ...}`. Default: none.
     #[serde(default, deserialize_with = "one_or_many")]
     pub examples: Vec<Example>,
-    /// Address of Webots' own viewer (`WebotsView.js`), for simulation servers that don't have it. Default: none.
+    /// URL of Webots' own viewer (`WebotsView.js`), for simulation servers that don't have it. Default: none.
     #[serde(default)]
     pub viewer_script: Option<url::Url>,
-    /// Every other duration.
+    /// All other durations.
     #[serde(default, deserialize_with = "object")]
     pub timing: Timing,
 }
 
-/// A world to try.
+/// An example on the page `/viewer`.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(from = "WireExample")]
 pub struct Example {
-    /// What it is called; the URL where nothing was said.
+    /// Its title. Default: the URL.
     pub title: String,
     /// The world's URL.
     pub url: String,
@@ -134,22 +134,22 @@ pub struct Timing {
     /// Between two pings of a client. Default: 20.
     #[serde(with = "seconds")]
     pub ping: Duration,
-    /// A client that is silent for so long is gone. Default: 60.
+    /// A client that has sent nothing for so long is disconnected. Default: 60.
     #[serde(with = "seconds")]
     pub silence: Duration,
-    /// How long a placement counts whose client never came. Default: 15.
+    /// How long a client that was sent to a simulation server is counted there if it never arrives. Default: 15.
     #[serde(with = "seconds")]
     pub placement: Duration,
-    /// How long notices are gathered before one mail tells them all. Default: 10.
+    /// How long notices are collected before they are sent in one mail. Default: 10.
     #[serde(with = "seconds")]
     pub gather: Duration,
-    /// Least time between two mails about one flapping simulation server. Default: 600.
+    /// Least time between two mails about the same simulation server. Default: 600.
     #[serde(with = "seconds")]
     pub flapping: Duration,
-    /// The first wait before a failed mail is tried again; it doubles each time. Default: 10.
+    /// How long to wait before a mail that failed is sent again. The wait doubles each time. Default: 10.
     #[serde(with = "seconds")]
     pub mail_retry: Duration,
-    /// After so long a failing mail is given up. Default: 3600.
+    /// How long a mail that fails is tried. Default: 3600.
     #[serde(with = "seconds")]
     pub mail_patience: Duration,
     /// How long an SMTP server may take for one mail. Default: 30.
@@ -177,28 +177,29 @@ impl Default for Timing {
     }
 }
 
-/// The most that open connections may take to end, for the server ends within five seconds.
+/// The upper limit of `timing.stop`: the server stops within five seconds.
 const LONGEST_STOP: Duration = Duration::from_millis(4500);
 
-/// How long a client that came needs until its load shows: the start, and the mean of five seconds.
+/// How long it takes until a new client shows in the load: its start, and the five seconds over which the load is a mean.
 const SETTLING: Duration = Duration::from_secs(8);
 
-/// The keys that count as soon as the configuration is read again; of `timing` those of watching and placing.
+/// The keys that take effect when the configuration is read again; of `timing` only `answer` and `placement`.
 const AT_ONCE: [&str; 6] =
     ["simulationServers", "drainedServers", "loadThreshold", "loadRefresh", "clientCost", "timing"];
 
 impl SessionConfig {
-    /// This configuration as a server can take it that was started with another one.
+    /// Returns this configuration as a server takes it that was started with another one. Changes that need a restart are
+    /// logged.
     #[must_use]
     pub fn after(&self, before: &Self) -> Self {
         let kept = |key: &&String| AT_ONCE.contains(&key.as_str()) || (*key == "port" && self.port == 0);
-        for key in differences(self, before).iter().filter(|key| !kept(key)) {
-            log::warn!("{key} has changed, which counts only from a restart on");
+        for key in changed_keys(self, before).iter().filter(|key| !kept(key)) {
+            log::warn!("{key} has changed, which takes effect with a restart");
         }
         Self { ssl: before.ssl, ..self.clone() }
     }
 
-    /// How clients are placed.
+    /// The parameters of placement.
     #[must_use]
     pub fn policy(&self) -> Policy {
         Policy {
@@ -209,7 +210,7 @@ impl SessionConfig {
         }
     }
 
-    /// Where this server is reached from outside.
+    /// Returns the address under which clients reach this server.
     #[must_use]
     pub fn address(&self) -> PublicAddress {
         PublicAddress::new(&self.server, self.port, self.port_rewrite)
@@ -219,44 +220,44 @@ impl SessionConfig {
 impl Configuration for SessionConfig {
     const ALIASES: &'static [&'static str] = &[];
 
-    fn complete(&mut self) -> Result<Vec<String>, Unfit> {
+    fn complete(&mut self) -> Result<Vec<String>, InvalidValue> {
         let mut warnings = Vec::new();
         if self.server.is_empty() {
             warnings.push("server is not set: URLs will name localhost".to_owned());
             "localhost".clone_into(&mut self.server);
         }
-        check_host(&self.server, self.port_rewrite).map_err(|problem| Unfit { key: "server", problem })?;
+        check_host(&self.server, self.port_rewrite).map_err(|problem| InvalidValue { key: "server", problem })?;
         let mut seen = std::collections::HashSet::new();
         for address in &self.simulation_servers {
             if !seen.insert(address) {
                 let problem = format!("{address} is listed twice; each simulation server is listed once");
-                return Err(Unfit { key: "simulationServers", problem });
+                return Err(InvalidValue { key: "simulationServers", problem });
             }
         }
         if let Some(address) = self.drained_servers.iter().find(|address| !seen.contains(address)) {
             let problem = format!("{address} is not one of simulationServers");
-            return Err(Unfit { key: "drainedServers", problem });
+            return Err(InvalidValue { key: "drainedServers", problem });
         }
         if self.timing.silence <= self.timing.ping {
             let problem = format!("{} s is not more than timing.ping", self.timing.silence.as_secs_f64());
-            return Err(Unfit { key: "timing.silence", problem });
+            return Err(InvalidValue { key: "timing.silence", problem });
         }
         if self.timing.stop > LONGEST_STOP {
             let (stop, most) = (self.timing.stop.as_secs_f64(), LONGEST_STOP.as_secs_f64());
             let problem = format!("{stop} s is too long; allowed is at most {most} s, for the server ends within 5 s");
-            return Err(Unfit { key: "timing.stop", problem });
+            return Err(InvalidValue { key: "timing.stop", problem });
         }
         if let Some(script) =
             self.viewer_script.as_ref().filter(|script| !script.has_host() || !script.scheme().starts_with("http"))
         {
             let problem = format!("{script} is no URL of a web server; allowed are http and https");
-            return Err(Unfit { key: "viewerScript", problem });
+            return Err(InvalidValue { key: "viewerScript", problem });
         }
         self.mail_server = self.mail_server.take().filter(|host| !host.is_empty());
         if let Some(host) = self.mail_server.as_deref().filter(|host| !mail_address::is_host(host)) {
             let problem =
                 format!("{host:?} is no host; allowed is a name or an IP address (mailServerPort has the port)");
-            return Err(Unfit { key: "mailServer", problem });
+            return Err(InvalidValue { key: "mailServer", problem });
         }
         if self.administrator.is_some() && self.mail_server.is_none() {
             warnings.push("mailServer is not set: notifications are off".to_owned());
@@ -267,34 +268,34 @@ impl Configuration for SessionConfig {
     }
 }
 
-fn yes() -> bool {
+fn default_true() -> bool {
     true
 }
 
-fn everywhere() -> IpAddr {
+fn default_bind() -> IpAddr {
     Ipv4Addr::UNSPECIFIED.into()
 }
 
-fn log_folder() -> ExpandedPath {
+fn default_log_dir() -> ExpandedPath {
     ExpandedPath::plain("log")
 }
 
-fn usual_threshold() -> f64 {
+fn default_load_threshold() -> f64 {
     95.0
 }
 
-fn one_second() -> Duration {
+fn default_load_refresh() -> Duration {
     Duration::from_secs(1)
 }
 
-fn client_cost() -> f64 {
+fn default_client_cost() -> f64 {
     2.0
 }
 
-fn a_class() -> usize {
+fn default_max_clients_per_address() -> usize {
     1000
 }
 
-fn many_clients() -> usize {
+fn default_max_clients() -> usize {
     20_000
 }

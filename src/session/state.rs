@@ -1,4 +1,4 @@
-//! What the routes, the pages and the web clients of a session server share. Made by `app`.
+//! The state that the routes, the pages and the web clients of a session server share. `app` makes it.
 
 use std::time::{Duration, Instant, SystemTime};
 
@@ -14,33 +14,33 @@ use crate::shared::http::Metrics;
 use crate::shared::http::TrustedProxies;
 use crate::shared::run::Phase;
 
-/// What routes and web clients share.
+/// The shared state.
 pub struct AppState {
-    /// Owns the fleet's state.
+    /// The registry of simulation servers.
     pub registry: Addr<Registry>,
-    /// Durations.
+    /// `timing` of the configuration.
     pub timing: Timing,
-    /// Whether URLs begin with `wss`.
+    /// Whether clients get URLs that begin with `wss`.
     pub ssl: bool,
     /// Whether clients are taken.
     pub phase: watch::Receiver<Phase>,
     /// Counts WebSockets.
     pub connections: Connections,
-    /// Whose word on clients' addresses is taken.
+    /// Web servers whose headers are believed.
     pub trusted_proxies: TrustedProxies,
-    /// What is counted.
+    /// The metrics.
     pub metrics: Metrics,
-    /// Requests for a simulation server, by what came of them.
+    /// Counts requests for a simulation server, by outcome.
     pub picks: prometheus::IntCounterVec,
-    /// Monitor pages that are open.
+    /// The open monitor pages.
     pub live: Live,
-    /// Worlds to try in the viewer.
+    /// The examples on the page `/viewer`.
     pub examples: Vec<Example>,
-    /// Where Webots' own viewer comes from.
+    /// URL of Webots' own viewer.
     pub viewer_script: Option<url::Url>,
     /// When the server was started.
     pub started: Instant,
-    /// The same, as a time of day.
+    /// The same moment as a time of day.
     pub started_at: SystemTime,
 }
 
@@ -53,20 +53,20 @@ pub struct Answer {
 }
 
 /// How long the registry may take to pick a server.
-const PATIENCE: Duration = Duration::from_secs(2);
+const PICK_TIMEOUT: Duration = Duration::from_secs(2);
 
 impl AppState {
-    /// How many web clients are connected.
+    /// Returns how many web clients are connected.
     #[must_use]
     pub fn clients(&self) -> usize {
         self.connections.count()
     }
 
-    /// Asks for a simulation server, and puts the answer in the words of the protocol.
+    /// Asks the registry for a simulation server. A registry that does not answer in time counts as unavailable.
     pub async fn pick(&self, wanted: Result<Pick, NoServer>) -> Answer {
         let picked = match wanted {
             Ok(pick) => {
-                let picked = actix_rt::time::timeout(PATIENCE, self.registry.send(pick)).await;
+                let picked = actix_rt::time::timeout(PICK_TIMEOUT, self.registry.send(pick)).await;
                 picked.ok().and_then(Result::ok).unwrap_or(Err(NoServer::Unavailable))
             }
             Err(wrong) => Err(wrong),

@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
-use crate::shared::config::{Configuration, Unfit};
+use crate::shared::config::{Configuration, InvalidValue};
 use crate::shared::config::{ExpandedPath, folder, local_address, object, one_or_many, percent, seconds, whole};
 use crate::shared::domain::UrlPrefix;
 use crate::shared::domain::{PublicAddress, check_host};
@@ -24,19 +24,19 @@ pub struct SimulationConfig {
     #[serde(default, alias = "fullyQualifiedDomainName")]
     pub server: String,
     /// Whether URLs begin with `https` and `wss`. Default: true.
-    #[serde(default = "yes")]
+    #[serde(default = "default_true")]
     pub ssl: bool,
     /// Local port. Webots uses the ports that follow it. Default: 2000.
-    #[serde(default = "port", deserialize_with = "whole::<1, 65000, _, _>")]
+    #[serde(default = "default_port", deserialize_with = "whole::<1, 65000, _, _>")]
     pub port: u16,
     /// Local address to listen on. Default: all of them.
-    #[serde(default = "everywhere", deserialize_with = "local_address")]
+    #[serde(default = "default_bind", deserialize_with = "local_address")]
     pub bind: IpAddr,
     /// Whether a web server in front rewrites ports in URLs: HOST/PORT, not HOST:PORT. Default: true.
-    #[serde(default = "yes")]
+    #[serde(default = "default_true")]
     pub port_rewrite: bool,
     /// Folder of `simulation/output.log`, `simulation/monitor.csv` and the instances' output. Default: `log`.
-    #[serde(default = "log_folder", deserialize_with = "folder")]
+    #[serde(default = "default_log_dir", deserialize_with = "folder")]
     pub log_dir: ExpandedPath,
     /// Log to standard output. Default: false.
     #[serde(default)]
@@ -53,64 +53,64 @@ pub struct SimulationConfig {
     /// The program to start in place of the one in `webotsHome`.
     #[serde(default)]
     pub webots: Option<ExpandedPath>,
-    /// Folder of local projects. It is accepted for existing files; nothing is read from it.
+    /// Folder of local projects. Accepted for existing files; not used.
     #[serde(default)]
     pub projects_dir: Option<ExpandedPath>,
-    /// Run Webots in containers. Not supported: only `false` is accepted.
+    /// Run Webots in containers. Only `false` is supported.
     #[serde(default)]
     pub docker: bool,
-    /// Images that pruning keeps. It is accepted for existing files, and used with docker only.
+    /// Images that pruning keeps. Accepted for existing files; not used without docker.
     #[serde(default, alias = "persistentDockerImages", deserialize_with = "one_or_many")]
     pub persistant_docker_images: Vec<String>,
-    /// Whose worlds run here, as URL prefixes by whole path segments. Default: nobody's.
+    /// Repositories whose worlds may run, as URL prefixes of whole path segments. Default: none.
     #[serde(default, deserialize_with = "one_or_many")]
     pub allowed_repositories: Vec<UrlPrefix>,
-    /// Whose worlds never run here.
+    /// Repositories whose worlds never run, as URL prefixes. Default: none.
     #[serde(default, deserialize_with = "one_or_many")]
     pub blocked_repositories: Vec<UrlPrefix>,
-    /// With docker, worlds of others may run while the load (percent) is at most this; 0: never. Default: 50.
-    #[serde(default = "half", deserialize_with = "percent")]
+    /// With docker, worlds of other repositories run while the load (percent) is at most this; 0: never. Default: 50.
+    #[serde(default = "default_share_idle_time", deserialize_with = "percent")]
     pub share_idle_time: f64,
-    /// Addresses that are told, at start, that this server is there. Default: none.
+    /// URLs to which the server announces itself when it starts. Default: none.
     #[serde(default, deserialize_with = "one_or_many")]
     pub notify: Vec<String>,
     /// How many simulations may run at a time. Webots uses port+1 .. port+maxConnections. Default: 100.
-    #[serde(default = "places", deserialize_with = "whole::<1, 10_000, _, _>")]
+    #[serde(default = "default_max_connections", deserialize_with = "whole::<1, 10_000, _, _>")]
     pub max_connections: u16,
     /// How many clients may wait for a place. Default: 100.
-    #[serde(default = "waiting_line", deserialize_with = "whole::<0, 100_000, _, _>")]
+    #[serde(default = "default_waiting_line", deserialize_with = "whole::<0, 100_000, _, _>")]
     pub waiting_line: usize,
-    /// How many client connections may be open in all, those without a simulation included. Default: 1000.
-    #[serde(default = "many_clients", deserialize_with = "whole::<1, 1_000_000, _, _>")]
+    /// How many client `WebSockets` may be open in all, with or without a simulation. Default: 1000.
+    #[serde(default = "default_max_clients", deserialize_with = "whole::<1, 1_000_000, _, _>")]
     pub max_clients: usize,
     /// How many of them one client address may have. Default: 1000, for a class sits behind one address.
-    #[serde(default = "a_class", deserialize_with = "whole::<1, 1_000_000, _, _>")]
+    #[serde(default = "default_max_clients_per_address", deserialize_with = "whole::<1, 1_000_000, _, _>")]
     pub max_clients_per_address: usize,
-    /// Web servers, as addresses or networks, whose `X-Forwarded-For` or `Forwarded` tells their clients' addresses.
+    /// Web servers, as addresses or networks, whose headers `X-Forwarded-For` and `Forwarded` are believed.
     /// Default: `["127.0.0.0/8", "::1/128"]`.
     #[serde(default)]
     pub trusted_proxies: TrustedProxies,
     /// Seconds after which a simulation is closed, at least 360. Default: 7200.
-    #[serde(default = "two_hours", deserialize_with = "whole::<360, 31_536_000, _, _>")]
+    #[serde(default = "default_timeout", deserialize_with = "whole::<360, 31_536_000, _, _>")]
     pub timeout: u64,
     /// Write `simulation/monitor.csv`. Default: true.
-    #[serde(default = "yes")]
+    #[serde(default = "default_true")]
     pub monitor_log_enabled: bool,
-    /// Whether a world's URL may name any commit by its hash, not only the newest of a branch or tag. Forges hand out
-    /// commits of forks and proposals too, which the repository's owner never accepted. Default: false.
+    /// Whether a world's URL may name any commit by its hash, not only one that is in a branch or tag. Forges also serve
+    /// commits of forks and pull requests, which the repository's owner never accepted. Default: false.
     #[serde(default)]
     pub any_commit: bool,
-    /// From where repositories are cloned in place of their URL: {URL prefix: replacement}.
+    /// Where repositories are fetched from in place of their URL: {URL prefix: replacement}. Default: none.
     #[serde(default)]
     pub git_mirrors: Mirrors,
     /// Folder of cached repositories and of the projects of running simulations. Default: `cache`.
-    #[serde(default = "cache_folder", deserialize_with = "folder")]
+    #[serde(default = "default_cache_dir", deserialize_with = "folder")]
     pub cache_dir: ExpandedPath,
-    /// How much room cached repositories may take, in MiB. Default: 10240.
-    #[serde(default = "ten_gigabytes", deserialize_with = "whole::<1, 100_000_000, _, _>")]
+    /// Size limit of the cached repositories together, in MiB. Default: 10240.
+    #[serde(default = "default_cache_size", deserialize_with = "whole::<1, 100_000_000, _, _>")]
     pub cache_size: u64,
-    /// How large a project may be, in MiB: what is fetched, and what is checked out. Default: 1024.
-    #[serde(default = "one_gigabyte", deserialize_with = "whole::<1, 100_000_000, _, _>")]
+    /// Size limit of a project, in MiB; for what is fetched and for what is checked out. Default: 1024.
+    #[serde(default = "default_project_size", deserialize_with = "whole::<1, 100_000_000, _, _>")]
     pub project_size: u64,
     /// The display that Webots opens its window on. Default: the environment variable `DISPLAY`, else `:0`.
     #[serde(default)]
@@ -118,16 +118,16 @@ pub struct SimulationConfig {
     /// Give each Webots a virtual display of its own (needs `xvfb-run`). Default: false.
     #[serde(default)]
     pub xvfb: bool,
-    /// A simulation that is silent for six heartbeats is ended after so many more seconds. Default: 60.
-    #[serde(default = "one_minute", with = "seconds")]
+    /// How many seconds after six missed heartbeats a simulation is ended. Default: 60.
+    #[serde(default = "default_hang_limit", with = "seconds")]
     pub hang_limit: Duration,
     /// Pages from which browsers may open `/client`, as origins (`https://lab.org`). Default: any.
     #[serde(default, deserialize_with = "one_or_many")]
     pub allowed_origins: Vec<Origin>,
-    /// Password of actions such as `/drain`. Default: none, and actions are off.
+    /// Password for actions such as `/drain`. Default: none, and actions are off.
     #[serde(default)]
     pub admin_password: Option<crate::shared::config::Secret>,
-    /// Every other duration.
+    /// All other durations.
     #[serde(default, deserialize_with = "object")]
     pub timing: Timing,
 }
@@ -139,10 +139,10 @@ pub struct Timing {
     /// How long a checkout may take. Default: 120.
     #[serde(with = "seconds")]
     pub checkout: Duration,
-    /// How long Webots may take until it listens. Default: 120.
+    /// How long Webots may take until it listens on its port. Default: 120.
     #[serde(with = "seconds")]
     pub launch: Duration,
-    /// Between two signs of life of Webots. Default: 5.
+    /// Between two heartbeats of Webots. Default: 5.
     #[serde(with = "seconds")]
     pub heartbeat: Duration,
     /// How long Webots may take to end after SIGTERM, before SIGKILL. Default: 5.
@@ -151,7 +151,7 @@ pub struct Timing {
     /// Between two pings of a client. Default: 20.
     #[serde(with = "seconds")]
     pub ping: Duration,
-    /// A client that is silent for so long is gone. Default: 60.
+    /// A client that has sent nothing for so long is disconnected, and its simulation ends. Default: 60.
     #[serde(with = "seconds")]
     pub silence: Duration,
     /// How long open connections and simulations may take to end when the server stops. Default: 9.
@@ -178,19 +178,19 @@ impl Default for Timing {
 }
 
 impl SimulationConfig {
-    /// Where this server, or a Webots of it, is reached from outside.
+    /// Returns the address under which clients reach a port of this server: its own, or that of a Webots.
     #[must_use]
     pub fn address(&self, port: u16) -> PublicAddress {
         PublicAddress::new(&self.server, port, self.port_rewrite)
     }
 
-    /// The ports that Webots may use.
+    /// Returns the ports that Webots may use.
     #[must_use]
     pub fn streaming_ports(&self) -> std::ops::RangeInclusive<u16> {
         self.port + 1..=self.port.saturating_add(self.max_connections)
     }
 
-    /// The program that is started for each client, if it is known.
+    /// Returns the program that is started for each client; `None` where neither `webots` nor `webotsHome` says.
     #[must_use]
     pub fn webots_program(&self) -> Option<PathBuf> {
         if let Some(program) = &self.webots {
@@ -204,34 +204,34 @@ impl SimulationConfig {
 impl Configuration for SimulationConfig {
     const ALIASES: &'static [&'static str] = &["fullyQualifiedDomainName", "persistentDockerImages"];
 
-    fn complete(&mut self) -> Result<Vec<String>, Unfit> {
+    fn complete(&mut self) -> Result<Vec<String>, InvalidValue> {
         let mut warnings = Vec::new();
         if self.server.is_empty() {
             warnings.push("server is not set: URLs will name localhost".to_owned());
             "localhost".clone_into(&mut self.server);
         }
-        check_host(&self.server, self.port_rewrite).map_err(|problem| Unfit { key: "server", problem })?;
+        check_host(&self.server, self.port_rewrite).map_err(|problem| InvalidValue { key: "server", problem })?;
         if self.webots_home.is_none() {
             self.webots_home = std::env::var_os("WEBOTS_HOME").map(ExpandedPath::plain);
         }
         if self.docker {
             let problem = "true is not supported; allowed is false. Worlds would run without the container that was \
                            asked for";
-            return Err(Unfit { key: "docker", problem: problem.to_owned() });
+            return Err(InvalidValue { key: "docker", problem: problem.to_owned() });
         }
         if self.port.checked_add(self.max_connections).is_none() {
             let problem = format!("{} places above port {} leave the range of ports", self.max_connections, self.port);
-            return Err(Unfit { key: "maxConnections", problem });
+            return Err(InvalidValue { key: "maxConnections", problem });
         }
         if self.timing.silence <= self.timing.ping {
             let problem = format!("{} s is not more than timing.ping", self.timing.silence.as_secs_f64());
-            return Err(Unfit { key: "timing.silence", problem });
+            return Err(InvalidValue { key: "timing.silence", problem });
         }
         for address in &self.notify {
             let is_web = url::Url::parse(address).is_ok_and(|url| matches!(url.scheme(), "http" | "https"));
             if !is_web {
                 let problem = format!("{address:?} is no URL; allowed are http and https URLs");
-                return Err(Unfit { key: "notify", problem });
+                return Err(InvalidValue { key: "notify", problem });
             }
         }
         if self.allowed_repositories.is_empty() {
@@ -241,58 +241,58 @@ impl Configuration for SimulationConfig {
     }
 }
 
-fn yes() -> bool {
+fn default_true() -> bool {
     true
 }
 
-fn port() -> u16 {
+fn default_port() -> u16 {
     2000
 }
 
-fn everywhere() -> IpAddr {
+fn default_bind() -> IpAddr {
     Ipv4Addr::UNSPECIFIED.into()
 }
 
-fn log_folder() -> ExpandedPath {
+fn default_log_dir() -> ExpandedPath {
     ExpandedPath::plain("log")
 }
 
-fn cache_folder() -> ExpandedPath {
+fn default_cache_dir() -> ExpandedPath {
     ExpandedPath::plain("cache")
 }
 
-fn half() -> f64 {
+fn default_share_idle_time() -> f64 {
     50.0
 }
 
-fn places() -> u16 {
+fn default_max_connections() -> u16 {
     100
 }
 
-fn waiting_line() -> usize {
+fn default_waiting_line() -> usize {
     100
 }
 
-fn a_class() -> usize {
+fn default_max_clients_per_address() -> usize {
     1000
 }
 
-fn many_clients() -> usize {
+fn default_max_clients() -> usize {
     1000
 }
 
-fn two_hours() -> u64 {
+fn default_timeout() -> u64 {
     7200
 }
 
-fn ten_gigabytes() -> u64 {
+fn default_cache_size() -> u64 {
     10 * 1024
 }
 
-fn one_gigabyte() -> u64 {
+fn default_project_size() -> u64 {
     1024
 }
 
-fn one_minute() -> Duration {
+fn default_hang_limit() -> Duration {
     Duration::from_mins(1)
 }

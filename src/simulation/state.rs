@@ -1,4 +1,4 @@
-//! What the routes, the pages and the web clients of a simulation server share. Made by `app`.
+//! The state that the routes, the pages and the web clients of a simulation server share. `app` makes it.
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -23,61 +23,62 @@ use crate::simulation::machine::UsageMonitor;
 use crate::simulation::machine::{LoadMonitor, Readings};
 use crate::simulation::process::RunDir;
 
-/// What routes and web clients share.
+/// The shared state.
 pub struct AppState {
     /// The effective configuration.
     pub config: Arc<SimulationConfig>,
-    /// Whose worlds run here.
+    /// Which worlds may run.
     pub rules: Rules,
     /// Lends places.
     pub places: Addr<Places>,
     /// Reads the machine.
     pub load_monitor: Addr<LoadMonitor>,
-    /// The machine's load.
+    /// The newest readings of the machine.
     pub readings: watch::Receiver<Arc<Readings>>,
     /// Checks worlds out.
     pub checkouts: Arc<Checkouts>,
-    /// Folders of simulations.
+    /// The folder of this run, with the folders of simulations in it.
     pub run: Arc<RunDir>,
     /// Whether clients are taken.
     pub phase: watch::Receiver<Phase>,
-    /// Where drains are asked for.
+    /// Takes requests to drain.
     pub requests: tokio::sync::mpsc::Sender<Request>,
-    /// Where Webots' actors live.
+    /// The thread on which the actors of Webots run.
     pub main_thread: ArbiterHandle,
     /// Checks the administrator's password, where one is configured.
     pub admin_auth: Option<BasicAuth>,
     /// Counts connections.
     pub connections: Connections,
-    /// What is counted.
+    /// The metrics.
     pub metrics: Metrics,
-    /// Clients that asked for a simulation, by what came of it.
+    /// Counts clients that asked for a simulation, by outcome.
     pub starts: prometheus::IntCounterVec,
-    /// Monitor pages that are open.
+    /// The open monitor pages.
     pub live: Live,
-    /// What simulations take of the machine.
+    /// CPU and memory of each simulation.
     pub usage: UsageMonitor,
     /// When the server was started.
     pub started: Instant,
 }
 
 impl AppState {
-    /// The load that is told: of a machine that drains, 100.
+    /// Returns the load to report: 100 % while the server is draining.
     #[must_use]
     pub fn load(&self) -> Load {
         if self.is_draining() { Load::FULL } else { self.readings.borrow().load.unwrap_or(Load::ZERO) }
     }
 
-    /// Whether no new clients are taken.
+    /// Whether new clients are refused.
     #[must_use]
     pub fn is_draining(&self) -> bool {
         *self.phase.borrow() != Phase::Open
     }
 
-    /// Whether a world may run here, now. Nobody has to wait for a checkout only to learn that there is no Webots.
+    /// Checks whether a world may run here now: its URL, the rules, and that Webots is there, so that nobody waits for a
+    /// checkout in vain.
     ///
     /// # Errors
-    /// Why not, in words for the client.
+    /// The reason why not, in words for the client.
     pub fn admit(&self, url: &str) -> Result<ProjectUrl, String> {
         let world = ProjectUrl::parse(url).map_err(|wrong| wrong.to_string())?;
         if self.is_draining() {
@@ -88,10 +89,10 @@ impl AppState {
         Ok(world)
     }
 
-    /// The program that is started for each client.
+    /// Returns the program that is started for each client.
     ///
     /// # Errors
-    /// What is missing, and how to set it, in words for the client.
+    /// When it is not there, or `xvfb-run` is missing; in words for the client.
     pub fn webots_program(&self) -> Result<PathBuf, String> {
         if self.config.xvfb && which("xvfb-run").is_err() {
             return Err("This simulation server gives each Webots a display of its own (xvfb), but has no xvfb-run. \

@@ -1,4 +1,4 @@
-//! What can be wrong with a configuration file, each in one line. Pure.
+//! The errors of a configuration file. Each is one line. Pure.
 
 use std::path::PathBuf;
 
@@ -13,25 +13,25 @@ pub enum ConfigError {
         /// What the system says.
         source: std::io::Error,
     },
-    /// The text does not begin as a JSON object does.
-    #[error("{}: it is no JSON object; allowed is {{\"KEY\": VALUE, ...}}", file.display())]
-    NoObject {
+    /// The text does not begin with a brace.
+    #[error("{}: it is not a JSON object; allowed is {{\"KEY\": VALUE, ...}}", file.display())]
+    NotAnObject {
         /// The configuration file.
         file: PathBuf,
     },
-    /// The text is no JSON, or a key is missing or of the wrong type.
+    /// The text is not JSON, or a key is missing, or the value of one is not allowed.
     #[error("{}: {}{source}", file.display(), key.as_ref().map(|key| format!("{key}: ")).unwrap_or_default())]
     Malformed {
         /// The configuration file.
         file: PathBuf,
-        /// The key, where the fault lies in one.
+        /// The key, where the error is in the value of one.
         key: Option<String>,
         /// What was found and what is allowed.
         source: serde_json::Error,
     },
-    /// A value doesn't fit the others.
+    /// A value contradicts others.
     #[error("{}: {key}: {problem}", file.display())]
-    Unfit {
+    InvalidValue {
         /// The configuration file.
         file: PathBuf,
         /// The key.

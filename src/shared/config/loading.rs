@@ -1,7 +1,7 @@
-//! Reading configuration files: JSON with camelCase keys.
+//! Reads configuration files: JSON with camelCase keys.
 //!
-//! A wrong type, a missing key or a value out of range is one line that names the file, the key, what was found and
-//! what is allowed. Unknown keys are warned about, with the nearest known one.
+//! An error is one line with the file, the key, what was found and what is allowed. An unknown key is a warning that
+//! names the most similar known one.
 
 use std::path::Path;
 
@@ -11,45 +11,45 @@ use serde::de::DeserializeOwned;
 
 /// A server's configuration.
 pub trait Configuration: DeserializeOwned + Serialize {
-    /// Other names of keys, which are accepted too.
+    /// Other names of keys that are accepted.
     const ALIASES: &'static [&'static str];
 
-    /// What no single value shows: rules between values, defaults that depend on the machine. Gives back warnings.
+    /// Sets the defaults that depend on the machine, and checks the rules between values. Returns warnings.
     ///
     /// # Errors
-    /// A key, and what is wrong with it.
-    fn complete(&mut self) -> Result<Vec<String>, Unfit>;
+    /// When a value contradicts others.
+    fn complete(&mut self) -> Result<Vec<String>, InvalidValue>;
 }
 
-/// A value that doesn't fit the others.
+/// A value that contradicts others.
 #[derive(Debug)]
-pub struct Unfit {
+pub struct InvalidValue {
     /// The key of the value.
     pub key: &'static str,
     /// What was found, and what is allowed.
     pub problem: String,
 }
 
-/// A configuration that was read.
+/// A configuration that was read from a file.
 #[derive(Debug)]
-pub struct Loaded<C> {
+pub struct LoadedConfig<C> {
     /// The effective values.
     pub config: C,
-    /// What the administrator should know.
+    /// Warnings for the administrator, a line each.
     pub warnings: Vec<String>,
 }
 
 /// Reads a configuration file.
 ///
 /// # Errors
-/// When it can't be read, or a value is not allowed.
-pub fn load<C: Configuration>(file: &Path) -> Result<Loaded<C>, ConfigError> {
+/// When the file can't be read, or a value is not allowed.
+pub fn load<C: Configuration>(file: &Path) -> Result<LoadedConfig<C>, ConfigError> {
     let text =
         std::fs::read_to_string(file).map_err(|source| ConfigError::Unreadable { file: file.to_owned(), source })?;
-    // Some editors begin a file with a mark of its encoding.
+    // Some editors begin a file with a byte order mark.
     let text = text.strip_prefix('\u{feff}').unwrap_or(&text);
     if !text.trim_start().starts_with('{') {
-        return Err(ConfigError::NoObject { file: file.to_owned() });
+        return Err(ConfigError::NotAnObject { file: file.to_owned() });
     }
     let mut unknown = Vec::new();
     let mut json = serde_json::Deserializer::from_str(text);
@@ -63,24 +63,24 @@ pub fn load<C: Configuration>(file: &Path) -> Result<Loaded<C>, ConfigError> {
     })?;
     let known = known_keys(&config);
     let mut warnings: Vec<String> = unknown.iter().map(|key| unknown_key(file, key, &known)).collect();
-    let more = config.complete().map_err(|Unfit { key, problem }| ConfigError::Unfit {
+    let more = config.complete().map_err(|InvalidValue { key, problem }| ConfigError::InvalidValue {
         file: file.to_owned(),
         key,
         problem,
     })?;
     warnings.extend(more.iter().map(|warning| format!("{}: {warning}", file.display())));
-    Ok(Loaded { config, warnings })
+    Ok(LoadedConfig { config, warnings })
 }
 
-/// The keys whose values differ. That of a secret is never among them.
-pub fn differences<C: Serialize>(one: &C, other: &C) -> Vec<String> {
+/// Returns the keys whose values differ. The key of a secret is never among them.
+pub fn changed_keys<C: Serialize>(one: &C, other: &C) -> Vec<String> {
     let values = |config: &C| serde_json::to_value(config).unwrap_or_default();
     let (one, other) = (values(one), values(other));
     let keys = one.as_object().into_iter().flat_map(serde_json::Map::keys);
     keys.filter(|key| one.get(key) != other.get(key)).cloned().collect()
 }
 
-/// Every key that a configuration has, with the keys of its parts as `part.key`.
+/// Returns every key of a configuration; the keys of its parts as `part.key`.
 fn known_keys<C: Configuration>(config: &C) -> Vec<String> {
     let mut keys: Vec<String> = C::ALIASES.iter().map(|&alias| alias.to_owned()).collect();
     let Ok(serde_json::Value::Object(values)) = serde_json::to_value(config) else {
@@ -95,11 +95,12 @@ fn known_keys<C: Configuration>(config: &C) -> Vec<String> {
     keys
 }
 
+/// A warning about an unknown key, with the most similar known one.
 fn unknown_key(file: &Path, key: &str, known: &[String]) -> String {
     let nearest = known
         .iter()
         .map(|candidate| (strsim::normalized_damerau_levenshtein(key, candidate), candidate))
-        .filter(|(likeness, _)| *likeness > 0.5)
+        .filter(|(similarity, _)| *similarity > 0.5)
         .max_by(|(one, _), (other, _)| one.total_cmp(other));
     let hint = nearest.map(|(_, candidate)| format!("; did you mean {candidate:?}?")).unwrap_or_default();
     format!("{}: unknown key {key:?} is ignored{hint}", file.display())

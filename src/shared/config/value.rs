@@ -1,4 +1,4 @@
-//! How values of a configuration are read: a value that is not allowed is told with what is.
+//! Types of configuration values. The error for a value that is not allowed says what is.
 
 use std::fmt;
 use std::marker::PhantomData;
@@ -10,13 +10,13 @@ use serde::de::value::MapAccessDeserializer;
 use serde::de::{DeserializeOwned, Error as _, MapAccess, Unexpected, Visitor};
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
-/// A path in which `~` and `$VAR` were replaced.
+/// A path in which `~` and `$VARIABLE` have been replaced.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(try_from = "String")]
 pub struct ExpandedPath(pub PathBuf);
 
 impl ExpandedPath {
-    /// A path that needs no replacements.
+    /// Takes a path as it is.
     #[must_use]
     pub fn plain(path: impl Into<PathBuf>) -> Self {
         Self(path.into())
@@ -28,7 +28,7 @@ impl TryFrom<String> for ExpandedPath {
 
     fn try_from(text: String) -> Result<Self, String> {
         if text.contains('\0') {
-            return Err(format!("{text:?} is no path; it has a NUL in it"));
+            return Err(format!("{text:?} is not a path: it contains a NUL"));
         }
         match shellexpand::full(&text) {
             Ok(expanded) => Ok(Self(PathBuf::from(expanded.into_owned()))),
@@ -37,31 +37,32 @@ impl TryFrom<String> for ExpandedPath {
     }
 }
 
-/// Reads the path of a folder, which must not be empty.
+/// Reads the path of a folder.
 ///
 /// # Errors
-/// When the value is something else.
+/// When the value is not a text, or empty.
 pub fn folder<'de, D: Deserializer<'de>>(deserializer: D) -> Result<ExpandedPath, D::Error> {
     let path = ExpandedPath::deserialize(deserializer)?;
     let is_empty = path.0.as_os_str().is_empty();
     if is_empty { Err(D::Error::custom("\"\" is no folder; \".\" is the working folder")) } else { Ok(path) }
 }
 
-/// Reads a local address to listen on.
+/// Reads an IP address.
 ///
 /// # Errors
 /// When the value is something else.
 pub fn local_address<'de, D: Deserializer<'de>>(deserializer: D) -> Result<IpAddr, D::Error> {
     let text = String::deserialize(deserializer)?;
-    text.parse().map_err(|_| D::Error::custom(format!("{text:?} is no address; allowed are such as 127.0.0.1 or ::1")))
+    text.parse()
+        .map_err(|_| D::Error::custom(format!("{text:?} is not an IP address; allowed are such as 127.0.0.1 or ::1")))
 }
 
-/// A text that is never shown.
+/// A text that is never printed or logged: `********` stands for it.
 #[derive(Clone, Deserialize)]
 pub struct Secret(String);
 
 impl Secret {
-    /// The text, for the one who needs it.
+    /// Returns the text.
     #[must_use]
     pub fn reveal(&self) -> &str {
         &self.0
@@ -80,7 +81,7 @@ impl Serialize for Secret {
     }
 }
 
-/// Reads a whole number from `MIN` to `MAX`, and says so when it is something else.
+/// Reads a whole number from `MIN` to `MAX`.
 ///
 /// # Errors
 /// When the value is something else.
@@ -109,7 +110,7 @@ where
     T::try_from(number).map_err(|_| D::Error::custom(format!("{number} is too large")))
 }
 
-/// Like [`whole`], for a key that may be absent or `null`.
+/// Reads a port from 1 to 65535, or `null`.
 ///
 /// # Errors
 /// When the value is something else.
@@ -127,7 +128,7 @@ pub fn percent<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f64, D::Err
     deserializer.deserialize_any(Between { least: 0.0, most: 100.0, what: "a number of percent" })
 }
 
-/// Reads a percentage that may pass 100, which nothing that is measured does.
+/// Reads a percentage from 0 to 1000. No measured load is more than 100.
 ///
 /// # Errors
 /// When the value is something else.
@@ -158,7 +159,7 @@ pub mod seconds {
     }
 }
 
-/// Reads a number between two others.
+/// A number between two others, both included.
 struct Between {
     least: f64,
     most: f64,
@@ -186,7 +187,7 @@ impl Visitor<'_> for Between {
     }
 }
 
-/// Reads a part that is an object. By itself serde takes a list for one too, and its values for those of the first keys.
+/// Reads an object. Without this, serde accepts a list as well, with the values of the first keys.
 ///
 /// # Errors
 /// When the value is something else.
@@ -206,7 +207,7 @@ pub fn object<'de, T: Deserialize<'de>, D: Deserializer<'de>>(deserializer: D) -
     deserializer.deserialize_map(Object(PhantomData))
 }
 
-/// Like [`object`], for a part that may be `null`.
+/// Reads an object or `null`, like [`object`].
 ///
 /// # Errors
 /// When the value is something else.
@@ -217,7 +218,7 @@ pub fn optional_object<'de, T: DeserializeOwned, D: Deserializer<'de>>(deseriali
     Ok(Option::<Part<T>>::deserialize(deserializer)?.map(|part| part.0))
 }
 
-/// Reads a list of texts; a single text counts as a list of one.
+/// Reads a list; a single value is a list of one, and `null` an empty one.
 ///
 /// # Errors
 /// When the value is something else.
