@@ -1,4 +1,4 @@
-//! The session server's program: arguments, configuration, log, then the server.
+//! The program `session-server`: reads its arguments and its configuration, then runs the server.
 
 use std::io::Write;
 use std::path::PathBuf;
@@ -8,7 +8,7 @@ use clap::Parser;
 use webots_fleet::session::app;
 use webots_fleet::session::config::SessionConfig;
 use webots_fleet::session::mail::mailer;
-use webots_fleet::shared::run::start;
+use webots_fleet::shared::run::{LogTarget, start};
 
 /// The one door to a fleet of simulation servers.
 #[derive(Parser)]
@@ -17,11 +17,10 @@ struct Arguments {
     /// Configuration file
     #[arg(default_value = "config/session/local.json")]
     config: PathBuf,
-    /// Print the effective configuration and end
-    #[arg(long, conflicts_with = "test_mail")]
-    check: bool,
+    #[command(flatten)]
+    options: start::Options,
     /// Send one mail to the administrator, say how it went, and end
-    #[arg(long)]
+    #[arg(long, conflicts_with = "check")]
     test_mail: bool,
 }
 
@@ -31,22 +30,23 @@ fn main() -> ExitCode {
         Ok(loaded) => loaded,
         Err(code) => return code,
     };
-    if arguments.check {
+    if arguments.options.check {
         return start::check(&loaded);
     }
     if arguments.test_mail {
         return test_mail(&loaded.config);
     }
     let log = loaded.config.log_dir.0.join("session/output.log");
+    let target = LogTarget::new(loaded.config.debug, &log);
     let server = app::run(loaded.config.clone(), arguments.config);
-    start::serve(&log, loaded.config.debug, &loaded.warnings, server)
+    start::serve(target, &arguments.options, &loaded.warnings, server)
 }
 
 /// Sends one mail to the administrator and says how that went.
 fn test_mail(config: &SessionConfig) -> ExitCode {
     match actix_rt::System::new().block_on(mailer::test_mail(config)) {
         Ok(how) => {
-            // Nobody may be listening any more.
+            // The reader may have gone.
             writeln!(std::io::stdout(), "{how}").ok();
             ExitCode::SUCCESS
         }

@@ -1,10 +1,10 @@
-//! The simulation server's program: arguments, configuration, log, then the server.
+//! The program `simulation-server`: reads its arguments and its configuration, then runs the server.
 
 use std::path::PathBuf;
 use std::process::ExitCode;
 
 use clap::Parser;
-use webots_fleet::shared::run::start;
+use webots_fleet::shared::run::{LogTarget, start};
 use webots_fleet::simulation::config::SimulationConfig;
 use webots_fleet::simulation::process::guardian;
 use webots_fleet::simulation::{app, preflight};
@@ -16,9 +16,8 @@ struct Arguments {
     /// Configuration file
     #[arg(default_value = "config/simulation/local.json")]
     config: PathBuf,
-    /// Print the effective configuration, look for what simulations need, and end
-    #[arg(long)]
-    check: bool,
+    #[command(flatten)]
+    options: start::Options,
     /// The server itself, or a part of it.
     #[command(subcommand)]
     part: Option<Part>,
@@ -41,13 +40,14 @@ fn main() -> ExitCode {
         Ok(loaded) => loaded,
         Err(code) => return code,
     };
-    if arguments.check {
+    if arguments.options.check {
         let code = start::check(&loaded);
-        for finding in preflight::look(&loaded.config) {
+        for finding in preflight::check(&loaded.config) {
             eprintln!("{finding}");
         }
         return code;
     }
     let log = loaded.config.log_dir.0.join("simulation/output.log");
-    start::serve(&log, loaded.config.debug, &loaded.warnings, app::run(loaded.config.clone()))
+    let target = LogTarget::new(loaded.config.debug, &log);
+    start::serve(target, &arguments.options, &loaded.warnings, app::run(loaded.config.clone()))
 }

@@ -1,6 +1,5 @@
-//! The session server as a whole: what it is made of, how it starts, and how it ends.
+//! The session server as a whole: its parts, its start and its end.
 
-use std::io::Write;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -21,14 +20,12 @@ use crate::shared::http::Connections;
 use crate::shared::http::Live;
 use crate::shared::http::Metrics;
 use crate::shared::http::sockets::{self, Sockets};
-use crate::shared::run::notify;
-use crate::shared::run::permanent;
-use crate::shared::run::{Phase, Request, Signals};
+use crate::shared::run::{Phase, Request, Signals, notify, permanent, start};
 
-/// Why the server can't go on.
+/// Why the server ends with an error.
 #[derive(Debug, thiserror::Error)]
 pub enum AppError {
-    /// The port is taken, or may not be used.
+    /// The port is taken, or the system does not allow it.
     #[error("can't listen on {address}: {source}")]
     Bind {
         /// Host and port.
@@ -36,31 +33,31 @@ pub enum AppError {
         /// What the system says.
         source: std::io::Error,
     },
-    /// Something else in the system.
+    /// Another error of the system.
     #[error(transparent)]
     System(#[from] std::io::Error),
-    /// A name of a metric is wrong.
+    /// A metric has an invalid name.
     #[error(transparent)]
     Metrics(#[from] prometheus::Error),
-    /// A fault in this program.
+    /// An actor that must live has stopped. This is a fault in this program.
     #[error("{0}")]
-    Gone(String),
+    ActorStopped(String),
 }
 
-/// The usual limit of open files, where the system does not tell.
+/// The limit of open files that is assumed where the system does not say.
 const USUAL_FILES: u64 = 1024;
-/// Files that the server needs for itself: logs, threads, mail.
+/// How many open files the server needs for itself: logs, threads, mail.
 const OWN_FILES: usize = 128;
-/// Connections to one simulation server: one that is used, one that is being closed.
+/// How many connections there are to one simulation server: one in use, one that is being closed.
 const FILES_PER_SERVER: usize = 2;
 
-/// What can come of a request: each is counted from the start.
+/// The values of the metric's label `outcome`. All of them are exported from the start.
 const OUTCOMES: [&str; 4] = ["placed", "unavailable", "not_accepted", "wrong_url"];
 
-/// Runs the server until it is asked to stop. `file` is read again on SIGHUP.
+/// Runs the server until a signal stops it. SIGHUP reads the configuration `file` again.
 ///
 /// # Errors
-/// When it can't start, or an actor that must live is gone.
+/// When the server can't start, or an actor that must live has stopped.
 pub async fn run(mut config: SessionConfig, file: PathBuf) -> Result<(), AppError> {
     let mut signals = Signals::catch()?;
     let (connections, clients) = bound_clients(open_files(), &config);
@@ -76,20 +73,20 @@ pub async fn run(mut config: SessionConfig, file: PathBuf) -> Result<(), AppErro
     let port = socket.local_addr()?.port();
     config.port = port;
     let stop = config.timing.stop;
-    let told = config.address().http_url(config.ssl);
+    let (address, ssl) = (config.address(), config.ssl);
     let server = Arc::new(assemble(config, clients, phase)?);
     let shared = web::Data::from(Arc::clone(&server));
-    // This is called in each thread that serves connections.
+    // Called once in each thread that serves connections.
     let app = move || {
         let audience = web::Data::new(CurrentAudience::start(Arc::clone(&shared)));
         App::new().app_data(shared.clone()).app_data(audience).configure(configure)
     };
     let http = HttpServer::new(app)
-        // Messages are small, and must not wait for the answer to the one before.
+        // Messages are small, and must not wait until the one before is acknowledged.
         .tcp_nodelay(true)
         .workers(threads())
         .on_connect(move |socket, extensions| sockets.accept(socket, extensions))
-        // More wait outside, where they can't use up the files.
+        // Further connections wait in the system's queue, where they need no open files.
         .max_connections((connections / threads()).max(1))
         .disable_signals()
         .shutdown_timeout(stop.as_secs())
@@ -97,25 +94,21 @@ pub async fn run(mut config: SessionConfig, file: PathBuf) -> Result<(), AppErro
         .run();
     let handle = http.handle();
     let serving = actix_rt::spawn(http);
-    log::info!("session server {} listens on port {port}: {told}", env!("CARGO_PKG_VERSION"));
-    // Nobody may be listening any more.
-    writeln!(std::io::stdout(), "session server: {told}/monitor (local port {port})").ok();
-    let listening = format!("listens on port {port}");
-    notify::ready(&listening);
+    start::announce("session server", &address, ssl, "/session", port);
     let registry = server.registry.clone();
     actix_rt::spawn(notify::feed_watchdog(async move || registry.send(IsAvailable).await.is_ok()));
-    let mut lost = std::pin::pin!(permanent::gone("Registry", server.registry.clone()));
+    let mut no_registry = std::pin::pin!(permanent::stopped("Registry", server.registry.clone()));
     loop {
         let request = tokio::select! {
             request = signals.next() => request,
-            name = &mut lost => return Err(AppError::Gone(name)),
+            fault = &mut no_registry => return Err(AppError::ActorStopped(fault)),
         };
         match request {
             Request::Stop => break,
             Request::Reload => {
                 notify::reloading();
                 reload(&file, &server.registry);
-                notify::ready(&listening);
+                notify::ready(port);
             }
             Request::Drain => log::info!("SIGUSR1 changes nothing here: simulation servers are drained"),
         }
@@ -123,15 +116,15 @@ pub async fn run(mut config: SessionConfig, file: PathBuf) -> Result<(), AppErro
     log::info!("stopping");
     notify::stopping("stopping");
     phase_sender.send_replace(Phase::Closing);
-    // A connection that doesn't end in time is cut.
+    // Connections that don't end in time are cut.
     actix_rt::time::timeout(stop, handle.stop(true)).await.ok();
     drop(serving);
     log::info!("stopped");
     Ok(())
 }
 
-/// Lets the server open as many files as the system allows it: each client is one, and the usual limit is 1,024.
-/// Gives back how many that are.
+/// Raises the limit of open files as far as the system allows, and returns it. Each client needs one, and the usual limit
+/// is 1,024.
 fn open_files() -> u64 {
     let raised = getrlimit(Resource::RLIMIT_NOFILE)
         .and_then(|(_, most)| setrlimit(Resource::RLIMIT_NOFILE, most, most).map(|()| most));
@@ -144,8 +137,9 @@ fn open_files() -> u64 {
     }
 }
 
-/// How many connections there may be, and clients, so that files are left for the rest of the server. Fewer clients than that are
-/// taken, so that there is one for who is to be told that there are too many.
+/// Returns how many connections and how many clients there may be, so that `files` open files are enough for them and the
+/// rest of the server. There are fewer clients than connections, so that some are left to tell others that there are too
+/// many clients.
 fn bound_clients(files: u64, config: &SessionConfig) -> (usize, usize) {
     let files = usize::try_from(files).unwrap_or(usize::MAX);
     let connections = files.saturating_sub(OWN_FILES + FILES_PER_SERVER * config.simulation_servers.len());
@@ -160,12 +154,12 @@ fn bound_clients(files: u64, config: &SessionConfig) -> (usize, usize) {
     (connections, clients.min(config.max_clients))
 }
 
-/// How many threads serve connections.
+/// Returns how many threads serve connections.
 fn threads() -> usize {
     std::thread::available_parallelism().map_or(1, usize::from)
 }
 
-/// Makes everything that the server is made of, and starts its actors.
+/// Makes the server's state, and starts its actors.
 fn assemble(config: SessionConfig, clients: usize, phase: watch::Receiver<Phase>) -> Result<AppState, AppError> {
     let metrics = Metrics::new();
     let latencies = metrics.histogram("session_report_seconds", "Time in which simulation servers answer")?;
@@ -197,7 +191,7 @@ fn assemble(config: SessionConfig, clients: usize, phase: watch::Receiver<Phase>
     })
 }
 
-/// Reads the configuration again. One that can't be used changes nothing.
+/// Reads the configuration file again. One that can't be used changes nothing.
 fn reload(file: &Path, registry: &Addr<Registry>) {
     match config::load::<SessionConfig>(file) {
         Ok(loaded) => {

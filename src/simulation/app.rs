@@ -1,13 +1,11 @@
-//! The simulation server as a whole: what it is made of, how it starts, and how it ends.
+//! The simulation server as a whole: its parts, its start and its end.
 
-use std::io::Write;
 use std::net::{SocketAddr, TcpListener};
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use actix::prelude::*;
-use actix_web::dev::ServerHandle;
 use actix_web::{App, HttpServer, web};
 use tokio::sync::mpsc::Receiver;
 use tokio::sync::watch;
@@ -22,9 +20,7 @@ use crate::shared::http::Connections;
 use crate::shared::http::Live;
 use crate::shared::http::Metrics;
 use crate::shared::http::sockets::{self, Sockets};
-use crate::shared::run::notify;
-use crate::shared::run::permanent;
-use crate::shared::run::{Phase, Request, Signals};
+use crate::shared::run::{Phase, Request, Signals, notify, permanent, start};
 use crate::simulation::checkout::Checkouts;
 use crate::simulation::checkout::Fetcher;
 use crate::simulation::checkout::Git;
@@ -37,10 +33,10 @@ use crate::simulation::process::{RunDir, Swept};
 use crate::simulation::process::{orphans, process_group, process_tree};
 use crate::simulation::web::configure;
 
-/// Why the server can't go on.
+/// Why the server ends with an error.
 #[derive(Debug, thiserror::Error)]
 pub enum AppError {
-    /// The port is taken, or may not be used.
+    /// The port is taken, or the system does not allow it.
     #[error("can't listen on {address}: {source}")]
     Bind {
         /// Host and port.
@@ -56,32 +52,32 @@ pub enum AppError {
         /// What the system says.
         source: std::io::Error,
     },
-    /// Something else in the system.
+    /// Another error of the system.
     #[error(transparent)]
     System(#[from] std::io::Error),
-    /// A name of a metric is wrong.
+    /// A metric has an invalid name.
     #[error(transparent)]
     Metrics(#[from] prometheus::Error),
-    /// A fault in this program.
+    /// An actor that must live has stopped. This is a fault in this program.
     #[error("{0}")]
-    Gone(String),
+    ActorStopped(String),
 }
 
-/// Between two looks whether all simulations have ended.
-const LOOK: Duration = Duration::from_millis(50);
+/// How often it is checked whether all simulations have ended.
+const POLL_INTERVAL: Duration = Duration::from_millis(50);
 
-/// How long it may take to end what has not ended in time.
-const LAST_TRY: Duration = Duration::from_millis(500);
+/// How long it may take to kill what has not ended in time.
+const KILL_TIMEOUT: Duration = Duration::from_millis(500);
 
 /// Runs the server until it is asked to stop.
 ///
 /// # Errors
-/// When it can't start, or an actor that must live is gone.
+/// When the server can't start, or an actor that must live has stopped.
 pub async fn run(config: SimulationConfig) -> Result<(), AppError> {
     serve(Assembly::new(config)?).await
 }
 
-/// A server whose parts are there: it holds its port, its actors live, and nobody is served yet.
+/// A server before it serves: it holds its port, and its actors run.
 pub struct Assembly {
     server: Arc<AppState>,
     socket: TcpListener,
@@ -91,7 +87,7 @@ pub struct Assembly {
 }
 
 impl Assembly {
-    /// Makes all parts.
+    /// Takes the port, starts the actors, and removes what earlier runs left.
     ///
     /// # Errors
     /// When the server can't start.
@@ -106,7 +102,7 @@ impl Assembly {
         Ok(Self { server, socket, signals, phase: phase_sender, asked })
     }
 
-    /// What its routes and web clients share.
+    /// Returns the state that routes and web clients share.
     #[must_use]
     pub fn server(&self) -> &Arc<AppState> {
         &self.server
@@ -116,7 +112,7 @@ impl Assembly {
 /// Runs a server until it is asked to stop.
 ///
 /// # Errors
-/// When an actor that must live is gone, or the system can't go on.
+/// When an actor that must live has stopped, or the system refuses what the server needs.
 pub async fn serve(assembly: Assembly) -> Result<(), AppError> {
     let Assembly { server, socket, mut signals, phase: phase_sender, mut asked } = assembly;
     let _last_will = process_group::remove_in_the_end(server.run.path())?;
@@ -128,7 +124,7 @@ pub async fn serve(assembly: Assembly) -> Result<(), AppError> {
         server.config.timing.silence,
     ));
     let http = HttpServer::new(move || App::new().app_data(shared.clone()).configure(configure))
-        // Messages are small, and must not wait for the answer to the one before.
+        // Messages are small, and must not wait until the one before is acknowledged.
         .tcp_nodelay(true)
         .on_connect(move |socket, extensions| sockets.accept(socket, extensions))
         .disable_signals()
@@ -137,20 +133,21 @@ pub async fn serve(assembly: Assembly) -> Result<(), AppError> {
         .run();
     let handle = http.handle();
     let serving = actix_rt::spawn(http);
-    tell_start(&server.config);
+    let (address, port) = (server.config.address(server.config.port), server.config.port);
+    start::announce("simulation server", &address, server.config.ssl, "/client", port);
     let places = server.places.clone();
     let asked_for_life = places.clone();
     actix_rt::spawn(notify::feed_watchdog(async move || asked_for_life.send(Census).await.is_ok()));
-    let mut no_places = std::pin::pin!(permanent::gone("Places", places.clone()));
-    let mut no_readings = std::pin::pin!(permanent::gone("LoadMonitor", server.load_monitor.clone()));
-    // webots-fleet-renew starts a server again that was drained, and none that somebody has stopped.
+    let mut no_places = std::pin::pin!(permanent::stopped("Places", places.clone()));
+    let mut no_readings = std::pin::pin!(permanent::stopped("LoadMonitor", server.load_monitor.clone()));
+    // `webots-fleet-renew` tells by this text whether a server was drained or stopped.
     let why = loop {
         let request = tokio::select! {
             request = signals.next() => request,
             Some(request) = asked.recv() => request,
             () = drained(&server) => break "drained: its last simulation has ended",
-            fault = &mut no_places => return Err(AppError::Gone(fault)),
-            fault = &mut no_readings => return Err(AppError::Gone(fault)),
+            fault = &mut no_places => return Err(AppError::ActorStopped(fault)),
+            fault = &mut no_readings => return Err(AppError::ActorStopped(fault)),
         };
         match request {
             Request::Stop => break "stopping",
@@ -166,9 +163,9 @@ pub async fn serve(assembly: Assembly) -> Result<(), AppError> {
     notify::stopping(why);
     phase_sender.send_replace(Phase::Closing);
     if actix_rt::time::timeout(server.config.timing.stop, empty(&places)).await.is_err() {
-        end_all(server.run.path().to_owned()).await;
+        kill_all(server.run.path().to_owned()).await;
     }
-    stop(&handle).await;
+    handle.stop(true).await;
     drop(serving);
     server.run.remove();
     log::info!("stopped");
@@ -180,7 +177,7 @@ fn bind(config: &SimulationConfig) -> Result<TcpListener, AppError> {
     sockets::listen(address).map_err(|source| AppError::Bind { address, source })
 }
 
-/// Makes everything that the server is made of, and starts its actors.
+/// Makes the server's state, and starts its actors.
 fn assemble(
     config: SimulationConfig,
     phase: watch::Receiver<Phase>,
@@ -235,38 +232,26 @@ fn assemble(
     })
 }
 
-fn tell_start(config: &SimulationConfig) {
-    let address = config.address(config.port).http_url(config.ssl);
-    log::info!("simulation server {} listens on port {}: {address}", env!("CARGO_PKG_VERSION"), config.port);
-    // Nobody may be listening any more.
-    writeln!(std::io::stdout(), "simulation server: {address}/monitor (local port {})", config.port).ok();
-    notify::ready(&format!("listens on port {}", config.port));
-}
-
-/// Waits until the server is draining and its last client has gone.
+/// Waits until the server is draining and has no client any more.
 async fn drained(server: &AppState) {
     let mut phase = server.phase.clone();
     phase.wait_for(|phase| *phase == Phase::Draining).await.ok();
     empty(&server.places).await;
 }
 
-/// Waits until no simulation is left, nor anybody who waits for one.
+/// Waits until there is no simulation, and nobody waits for one.
 async fn empty(places: &Addr<Places>) {
     while places.send(Census).await.is_ok_and(|census| !census.simulations.is_empty()) {
-        actix_rt::time::sleep(LOOK).await;
+        actix_rt::time::sleep(POLL_INTERVAL).await;
     }
 }
 
-/// Ends what has not ended in time, whether its guardian can or not.
-async fn end_all(run: PathBuf) {
+/// Kills the processes of all simulations, also those whose guardian does not.
+async fn kill_all(run: PathBuf) {
     let end = move || {
         let count = process_tree::kill_marked(&run);
         orphans::end_all();
         log::error!("ended {count} processes that had not ended in time");
     };
-    actix_rt::time::timeout(LAST_TRY, actix_rt::task::spawn_blocking(end)).await.ok();
-}
-
-async fn stop(http: &ServerHandle) {
-    http.stop(true).await;
+    actix_rt::time::timeout(KILL_TIMEOUT, actix_rt::task::spawn_blocking(end)).await.ok();
 }

@@ -1,4 +1,4 @@
-//! What a simulation needs from the machine: Webots, a display, git. Told by `--check`, beside the configuration.
+//! Checks whether the machine has what simulations need: Webots, a display, git. `--check` prints the findings.
 
 use std::path::PathBuf;
 use std::process::Command;
@@ -6,27 +6,27 @@ use std::process::Command;
 use super::config::SimulationConfig;
 use crate::simulation::machine::display;
 
-/// One thing that was looked at.
+/// The result of one check.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Finding {
-    /// What.
+    /// What was checked.
     pub topic: &'static str,
-    /// How it is; or what is missing, and what to do about it.
+    /// What was found; or what is missing, and what to do about it.
     pub result: Result<String, String>,
 }
 
 impl std::fmt::Display for Finding {
     fn fmt(&self, out: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         match &self.result {
-            Ok(fine) => write!(out, "{}: {fine}", self.topic),
-            Err(trouble) => write!(out, "warning: {}: {trouble}", self.topic),
+            Ok(found) => write!(out, "{}: {found}", self.topic),
+            Err(problem) => write!(out, "warning: {}: {problem}", self.topic),
         }
     }
 }
 
-/// Looks at everything. Takes up to some seconds: programs are run, and a display is asked.
+/// Checks everything. It runs programs and connects to the display, so it can take some seconds.
 #[must_use]
-pub fn look(config: &SimulationConfig) -> Vec<Finding> {
+pub fn check(config: &SimulationConfig) -> Vec<Finding> {
     vec![
         Finding { topic: "webots", result: webots(config) },
         Finding { topic: "display", result: display(config) },
@@ -85,7 +85,10 @@ fn xvfb_run(config: &SimulationConfig) -> Result<String, String> {
     }
 }
 
-/// The first line that a program prints; `missing` if there is no such program.
+/// Returns the first line that a program prints.
+///
+/// # Errors
+/// `missing`, if there is no such program or it prints nothing.
 fn version(command: &[&str], missing: &str) -> Result<String, String> {
     let Some((program, arguments)) = command.split_first() else {
         return Err(missing.to_owned());

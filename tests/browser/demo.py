@@ -76,11 +76,11 @@ class Demo:
         os.kill(self.process(kind), signal.SIGKILL)
 
     def process(self, kind):
-        return int((self.folder / f"log/demo.{kind}.pid").read_text())
+        return int((self.folder / f"log/{kind}/demo.pid").read_text())
 
     def leftovers(self):
         """What is left of it: processes, files that say that one runs, folders of simulations, ports."""
-        left = [str(path) for path in [*self.folder.glob("log/*.pid"), *self.folder.glob("cache/runs/*")]]
+        left = [str(path) for path in [*self.folder.glob("log/*/*.pid"), *self.folder.glob("cache/runs/*")]]
         for process in pathlib.Path("/proc").glob("[0-9]*"):
             try:
                 if (process / "cwd").resolve(strict=True).is_relative_to(self.folder):

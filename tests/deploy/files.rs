@@ -90,8 +90,7 @@ fn the_units_and_the_script_start_the_same_programs_with_a_configuration_each() 
         }
     }
     let script = std::fs::read_to_string(deploy("../server.sh")).unwrap();
-    assert!(script.contains(r#""$BIN/$1-server" "$(config_of "$1" "$2")""#));
-    assert!(script.contains("config_of() { printf 'config/%s/%s.json' "));
+    assert!(script.contains("\"$BIN/$kind-server\" --pid-file \"log/$1.pid\" \\\n        \"config/$1.json\""));
 }
 
 #[test]

@@ -111,12 +111,10 @@ impl Project {
     /// What is left of servers that have run: processes, their files, folders of simulations, ports.
     pub fn leftovers(&self) -> Vec<String> {
         let mut left = processes_in(&self.folder());
-        let names = |folder: &str| {
-            let entries = std::fs::read_dir(self.path(folder)).into_iter().flatten();
-            entries.map(|entry| entry.unwrap().path().display().to_string()).collect::<Vec<_>>()
-        };
-        left.extend(names("log").into_iter().filter(|name| name.ends_with(".pid")));
-        left.extend(names("cache/runs"));
+        let pid_files =
+            walk(&self.path("log")).into_iter().filter(|path| path.extension().is_some_and(|kind| kind == "pid"));
+        let runs = std::fs::read_dir(self.path("cache/runs")).into_iter().flatten().map(|entry| entry.unwrap().path());
+        left.extend(pid_files.chain(runs).map(|path| path.display().to_string()));
         for port in self.session..self.session + 12 {
             if std::net::TcpStream::connect(("127.0.0.1", port)).is_ok() {
                 left.push(format!("port {port}"));
@@ -135,7 +133,7 @@ impl Project {
 
     /// The process of a server, `KIND`, of a configuration.
     pub fn pid(&self, kind: &str, name: &str) -> i32 {
-        let text = std::fs::read_to_string(self.path(&format!("log/{name}.{kind}.pid"))).unwrap();
+        let text = std::fs::read_to_string(self.path(&format!("log/{kind}/{name}.pid"))).unwrap();
         text.trim().parse().unwrap()
     }
 }

@@ -110,7 +110,7 @@ async fn a_server_that_does_not_end_is_killed_with_what_it_started() {
     let stopped = project.done(&["stop"]).await;
     assert!(stopped.contains("killed the simulation server of demo"), "{stopped}");
     // Nobody was left to remove the folder of the run: the next start does.
-    assert_eq!(processes_in(&project.folder()), [""; 0]);
+    until("no process is left", async || processes_in(&project.folder()).is_empty()).await;
     project.done(&["start", "demo"]).await;
     project.done(&["stop"]).await;
     nothing_is_left(&project).await;

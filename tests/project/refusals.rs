@@ -18,7 +18,7 @@ async fn a_name_that_is_not_configured_is_refused_with_those_that_are() {
     for action in ["start", "stop", "restart", "status"] {
         for name in ["nowhere", "../session/demo", "de mo", "-demo", ""] {
             let told = refused(&project, &[action, name], 2).await;
-            assert!(told.contains("there is no configuration") && told.contains("demo, local"), "{told}");
+            assert!(told.contains("there is neither config/simulation/") && told.contains("demo\nlocal"), "{told}");
         }
     }
     assert!(refused(&project, &["begin"], 2).await.contains("usage:"));
@@ -36,7 +36,7 @@ async fn what_runs_already_is_not_started_twice() {
     assert!(lost.errors.contains("already runs"), "{lost:#?}");
     // The other configuration has the same ports.
     let told = refused(&project, &["start", "local"], 1).await;
-    assert!(told.contains("is taken") && told.contains("this runs already: demo"), "{told}");
+    assert!(told.contains("in use") && told.contains("this runs already: demo"), "{told}");
     assert_eq!(http::get(&project.session_url("/health")).await.text(), "ok");
 }
 
@@ -46,7 +46,7 @@ async fn a_port_that_is_taken_is_named() {
     for port in [project.simulation, project.session] {
         let listener = TcpListener::bind(("127.0.0.1", port)).unwrap();
         let told = refused(&project, &["start", "demo"], 1).await;
-        assert!(told.contains(&format!("port {port}")), "{told}");
+        assert!(told.contains(&format!("can't listen on 127.0.0.1:{port}: Address already in use")), "{told}");
         drop(listener);
         assert_eq!(project.leftovers(), [""; 0]);
     }
@@ -57,7 +57,7 @@ async fn when_one_server_does_not_start_its_last_words_are_shown_and_the_other_i
     let project = Project::copy();
     project.configure("session/demo", |config| config["logDir"] = "server.sh".into());
     let told = refused(&project, &["start", "demo"], 1).await;
-    assert!(told.contains("the session server of demo has ended") && told.contains("can't be written"), "{told}");
+    assert!(told.contains("the session server of demo has not started") && told.contains("can't be written"), "{told}");
     assert_eq!(project.leftovers(), [""; 0]);
 }
 
@@ -79,7 +79,7 @@ async fn a_wrong_configuration_is_refused_in_one_line_and_stops_nothing_that_run
 #[actix_rt::test]
 async fn a_stale_pid_file_neither_hinders_a_start_nor_ends_another_process() {
     let project = Project::copy();
-    let file = project.path("log/demo.simulation.pid");
+    let file = project.path("log/simulation/demo.pid");
     std::fs::create_dir_all(file.parent().unwrap()).unwrap();
     // This very process, as if the id had been given out again.
     for text in [format!("{}\n", std::process::id()), "4194304\n".to_owned(), "nonsense".to_owned(), String::new()] {

@@ -143,11 +143,11 @@ async fn the_log_goes_to_a_file_that_is_rotated() {
 #[actix_rt::test]
 async fn port_0_takes_a_free_port_and_says_which() {
     let session = session_server(&[]).set("port", 0).set("portRewrite", true).spawn();
-    let line = async || session.log().lines().find(|line| line.starts_with("session server: ")).map(str::to_owned);
+    let line = async || session.log().lines().find(|line| line.starts_with("session server ")).map(str::to_owned);
     until("it says where it is", async || line().await.is_some()).await;
     let line = line().await.unwrap();
-    let port: u16 = line.rsplit_once("local port ").unwrap().1.trim_end_matches(')').parse().unwrap();
-    assert!(line.contains(&format!("http://localhost/{port}/monitor")), "{line}");
+    let port = line.split_once("http://localhost/").and_then(|(_, rest)| rest.split_once("/monitor")).unwrap().0;
+    assert!(line.ends_with(&format!(" ws://localhost/{port}/session")), "{line}");
     assert_eq!(http::get(&format!("http://127.0.0.1:{port}/health")).await.status, 200);
     assert_eq!(times_logged(&session, &format!("listens on port {port}: http://localhost/{port}")), 1);
 }

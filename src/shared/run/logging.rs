@@ -1,5 +1,6 @@
 //! Where log lines go: a file that is rotated, or standard output.
 
+use std::fmt;
 use std::io::Write;
 use std::path::Path;
 
@@ -7,7 +8,7 @@ use env_logger::{Builder, Env, Target};
 
 use super::rotated_file::RotatedFile;
 
-/// How many old files are kept beside the newest, as the original does.
+/// How many old files are kept beside the newest. The Python servers keep as many.
 const OLD_FILES: usize = 10;
 
 /// Where log lines go.
@@ -15,16 +16,33 @@ const OLD_FILES: usize = 10;
 pub enum LogTarget<'path> {
     /// To standard output, debug lines included.
     Stdout,
-    /// To this file, rotated.
+    /// To this file, which is rotated.
     File(&'path Path),
 }
 
-/// Starts logging. `RUST_LOG` overrides which lines are written.
+impl<'path> LogTarget<'path> {
+    /// Standard output where `debug` is set, else this file.
+    #[must_use]
+    pub fn new(debug: bool, file: &'path Path) -> Self {
+        if debug { Self::Stdout } else { Self::File(file) }
+    }
+}
+
+impl fmt::Display for LogTarget<'_> {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Stdout => out.write_str("standard output"),
+            Self::File(path) => path.display().fmt(out),
+        }
+    }
+}
+
+/// Starts logging. The environment variable `RUST_LOG` can change which lines are written.
 ///
 /// # Errors
-/// When the file's folder can't be made or written.
+/// When the file or its folder can't be made.
 pub fn start(target: LogTarget<'_>) -> std::io::Result<()> {
-    // The decoder logs each malformed message as an error, and who sends them decides how many there are.
+    // The decoder of HTTP logs each malformed message as an error. Strangers could fill the log with them.
     let default_level = match target {
         LogTarget::Stdout => {
             "debug,actix_http=info,actix_http::h1::decoder=off,actix_server=info,mio=info,rustls=info,h2=info"
@@ -42,24 +60,24 @@ pub fn start(target: LogTarget<'_>) -> std::io::Result<()> {
             out,
             "{time} [{:<5}] {}: {}",
             record.level(),
-            room(record.target()),
+            short(record.target()),
             one_line(&record.args().to_string())
         )
     });
     builder.try_init().map_err(std::io::Error::other)
 }
 
-/// `crate::session::fleet::registry` is read as `session::registry`.
-fn room(target: &str) -> &str {
+/// A module's path without the name of the crate.
+fn short(target: &str) -> &str {
     target.strip_prefix("webots_fleet::").unwrap_or(target)
 }
 
-/// A text in which nothing can start a new line or steer a terminal: what comes from outside can't forge log lines.
+/// Replaces control characters by spaces, so that a text from outside can neither begin a new log line nor steer a terminal.
 #[must_use]
 pub fn one_line(text: &str) -> String {
     text.chars().map(|letter| if letter.is_control() { ' ' } else { letter }).collect()
 }
 
-fn timestamp(now: std::time::SystemTime) -> impl std::fmt::Display {
+fn timestamp(now: std::time::SystemTime) -> impl fmt::Display {
     jiff::Timestamp::try_from(now).map_or_else(|_| String::from("-"), |time| format!("{time:.3}"))
 }

@@ -1,57 +1,48 @@
-//! Tells the service manager (systemd) what the server is doing. Without one, nothing is told.
+//! Messages to the service manager (systemd). Without one nothing is sent.
 //!
-//! A watchdog is fed from here only when an actor without which the server is of no use has answered: a server that
-//! hangs is ended and started again.
-
-use std::time::Duration;
+//! Its watchdog ends and restarts a server that sends no message for too long, so a message is sent only after an actor
+//! that the server can't do without has answered.
 
 use sd_notify::NotifyState;
 
-/// The server can be reached, and its actors run.
-pub fn ready(what: &str) {
-    tell(&[NotifyState::Ready, NotifyState::Status(what)]);
+/// Says that the server listens on `port` and its actors run.
+pub fn ready(port: u16) {
+    send(&[NotifyState::Ready, NotifyState::Status(&format!("listens on port {port}"))]);
 }
 
-/// The server reads its configuration again. [`ready`] tells the end of it.
+/// Says that the server reads its configuration again. [`ready`] says when that is done.
 pub fn reloading() {
     match NotifyState::monotonic_usec_now() {
-        Ok(now) => tell(&[NotifyState::Reloading, now]),
+        Ok(now) => send(&[NotifyState::Reloading, now]),
         Err(error) => log::warn!("the service manager can't be told of the reload: {error}"),
     }
 }
 
-/// What the server is doing, for the administrator to read.
+/// Says what the server is doing, for `systemctl status`.
 pub fn status(what: &str) {
-    tell(&[NotifyState::Status(what)]);
+    send(&[NotifyState::Status(what)]);
 }
 
-/// The server ends in order, and why.
+/// Says that the server ends in order, and why.
 pub fn stopping(why: &str) {
-    tell(&[NotifyState::Stopping, NotifyState::Status(why)]);
+    send(&[NotifyState::Stopping, NotifyState::Status(why)]);
 }
 
-/// Feeds the watchdog, if there is one, each time that `answers` says so. Never ends.
-///
-/// `answers` may take as long as it likes: without an answer the watchdog is not fed.
+/// Sends the watchdog, if there is one, a message three times within its limit, each after `answers` has returned true.
+/// Never returns.
 pub async fn feed_watchdog(mut answers: impl AsyncFnMut() -> bool) {
     let Some(limit) = sd_notify::watchdog_enabled() else {
         return std::future::pending().await;
     };
     loop {
         if answers().await {
-            tell(&[NotifyState::Watchdog]);
+            send(&[NotifyState::Watchdog]);
         }
-        actix_rt::time::sleep(pause(limit)).await;
+        actix_rt::time::sleep(limit / 3).await;
     }
 }
 
-/// Between two meals: short enough that one may come late.
-fn pause(limit: Duration) -> Duration {
-    limit / 3
-}
-
-fn tell(state: &[NotifyState<'_>]) {
-    // A server that can't talk to its service manager still serves; systemd will end it if it must hear from it.
+fn send(state: &[NotifyState<'_>]) {
     if let Err(error) = sd_notify::notify(state) {
         log::warn!("the service manager can't be told: {error}");
     }

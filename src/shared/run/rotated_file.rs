@@ -1,17 +1,17 @@
-//! A file of lines that is rotated by its size. Nothing that the disk does makes it panic.
+//! A log file that is rotated by its size. It never panics, and never grows beyond its size.
 //!
-//! That is why it is not the crate file-rotate: its version 0.8 panics where a folder can't be made, and by an assertion
-//! in a rotation where files come or go that it does not know of (its issue 34). A log is no reason to end a simulation.
+//! The crates for this do one or the other: file-rotate 0.8 panics where a folder can't be read, and rolling-file 0.2 and
+//! logroller 0.1 let the file grow for ever, or write nothing more, where it can't be renamed.
 
 use std::ffi::OsString;
 use std::fs::File;
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
-/// How large a file grows before it is rotated, in bytes, as the original does.
+/// How large a file may be before it is rotated, in bytes. The Python servers have the same limit.
 const FILE_SIZE: u64 = 500_000;
 
-/// A file to which lines are added. The older ones beside it are `NAME.1` (the newest), `NAME.2` and so on.
+/// A file to which lines are added. Beside it are older ones: `NAME.1` is the newest, then `NAME.2` and so on.
 #[derive(Debug)]
 pub struct RotatedFile {
     path: PathBuf,
@@ -21,10 +21,10 @@ pub struct RotatedFile {
 }
 
 impl RotatedFile {
-    /// Opens a file, and keeps so many older ones beside it.
+    /// Opens a file for appending, and makes its folder. `old_files` older ones are kept.
     ///
     /// # Errors
-    /// When its folder can't be made, or the file can't be written.
+    /// When the folder can't be made, or the file can't be opened.
     pub fn open(path: &Path, old_files: usize) -> io::Result<Self> {
         if let Some(folder) = path.parent() {
             std::fs::create_dir_all(folder)?;
@@ -56,10 +56,10 @@ impl RotatedFile {
 }
 
 impl Write for RotatedFile {
-    /// Writes whole lines. A disk that is full costs lines, not more.
+    /// Writes whole lines. Those that the disk has no room for are lost.
     fn write(&mut self, lines: &[u8]) -> io::Result<usize> {
         if self.size >= FILE_SIZE {
-            // What can't be put aside must not grow either.
+            // A file that can't be renamed must not grow without limit either.
             if self.rotate().is_err() {
                 self.file.set_len(0)?;
             }
@@ -98,7 +98,7 @@ mod tests {
         drop(file);
         RotatedFile::open(&path, 2).unwrap().write_all(b"more").unwrap();
         assert_eq!(size("a.log"), before + 4);
-        // The older ones can't be put aside.
+        // The older ones can't be renamed.
         let mut file = RotatedFile::open(&path, 2).unwrap();
         std::fs::remove_file(folder.path().join("logs/a.log.2")).unwrap();
         std::fs::create_dir_all(folder.path().join("logs/a.log.2/full")).unwrap();

@@ -1,8 +1,8 @@
-//! Signals that end or steer a server.
+//! Signals to a server, and the phases of its life that follow from them.
 
 use actix_rt::signal::unix::{Signal, SignalKind, signal};
 
-/// The signals of a server, caught from the moment this is made.
+/// The signals of a server. They are caught as long as this exists.
 pub struct Signals {
     terminate: Signal,
     interrupt: Signal,
@@ -10,22 +10,22 @@ pub struct Signals {
     user: Signal,
 }
 
-/// What a signal asks for.
+/// What a signal, or an administrator's request, asks for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Request {
-    /// SIGTERM or SIGINT: end in order.
+    /// SIGTERM or SIGINT: stop.
     Stop,
     /// SIGHUP: read the configuration again.
     Reload,
-    /// SIGUSR1: take no new clients, end when the last has gone.
+    /// SIGUSR1: take no new clients, and stop when the last one has gone.
     Drain,
 }
 
 impl Signals {
-    /// Catches the signals.
+    /// Starts to catch the signals.
     ///
     /// # Errors
-    /// When the system refuses.
+    /// When the system does not allow it.
     pub fn catch() -> std::io::Result<Self> {
         Ok(Self {
             terminate: signal(SignalKind::terminate())?,
@@ -46,19 +46,19 @@ impl Signals {
     }
 }
 
-/// What a server is doing, as everybody in it can see from a watch channel.
+/// The phase of a server's life. Its parts see it in a watch channel.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Phase {
     /// It takes clients.
     Open,
-    /// It keeps the clients that it has, and takes no others.
+    /// It keeps its clients, and takes no new ones.
     Draining,
-    /// It ends: clients are told to go.
+    /// It stops: connections are closed.
     Closing,
 }
 
 /// Waits until a server is closing.
 pub async fn closing(mut phase: tokio::sync::watch::Receiver<Phase>) {
-    // A sender that is gone means the same.
+    // Without a sender the server has stopped already.
     phase.wait_for(|phase| *phase == Phase::Closing).await.ok();
 }

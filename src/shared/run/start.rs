@@ -2,22 +2,35 @@
 
 use std::io::Write;
 use std::mem::ManuallyDrop;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use super::logging::{self, LogTarget, one_line};
-use crate::shared::config::{self, Configuration, Loaded};
+use super::{notify, pid_file};
+use crate::shared::config::{self, Configuration, LoadedConfig};
+use crate::shared::domain::PublicAddress;
 
-/// The server failed at run time: a port that is taken, an actor that is gone.
+/// Exit code: the server failed at run time, as where its port is taken.
 pub const FAILED: u8 = 1;
-/// The configuration can't be used.
+/// Exit code: the configuration can't be used.
 pub const WRONG_CONFIGURATION: u8 = 2;
 
-/// Reads a configuration, or says in one line why it can't be used.
+/// The options that both programs have.
+#[derive(clap::Args)]
+pub struct Options {
+    /// Print the effective configuration, and on the simulation server what the machine lacks, and end
+    #[arg(long)]
+    pub check: bool,
+    /// Write the process id to this file, and keep the file locked while the server runs
+    #[arg(long, value_name = "FILE")]
+    pub pid_file: Option<PathBuf>,
+}
+
+/// Reads a configuration file. What is wrong in it is printed, in one line.
 ///
 /// # Errors
-/// The exit code.
-pub fn read<C: Configuration>(file: &Path) -> Result<Loaded<C>, ExitCode> {
+/// The program's exit code, where the configuration can't be used.
+pub fn read<C: Configuration>(file: &Path) -> Result<LoadedConfig<C>, ExitCode> {
     config::load(file).map_err(|error| {
         // A key may hold anything.
         eprintln!("error: {}", one_line(&error.to_string()));
@@ -25,15 +38,15 @@ pub fn read<C: Configuration>(file: &Path) -> Result<Loaded<C>, ExitCode> {
     })
 }
 
-/// Prints the effective configuration, and warnings to the error output.
+/// Prints the effective configuration to standard output, and warnings to the error output.
 #[must_use]
-pub fn check<C: Configuration>(loaded: &Loaded<C>) -> ExitCode {
+pub fn check<C: Configuration>(loaded: &LoadedConfig<C>) -> ExitCode {
     for warning in &loaded.warnings {
         eprintln!("warning: {}", one_line(warning));
     }
     match serde_json::to_string_pretty(&loaded.config) {
         Ok(text) => {
-            // Nobody may be listening any more.
+            // The reader may have gone.
             writeln!(std::io::stdout(), "{text}").ok();
             ExitCode::SUCCESS
         }
@@ -44,32 +57,48 @@ pub fn check<C: Configuration>(loaded: &Loaded<C>) -> ExitCode {
     }
 }
 
-/// Starts the log and runs a server to its end.
+/// Starts the log, writes the process id where that is asked for, and runs a server to its end.
 pub fn serve<E: std::error::Error>(
-    log: &Path,
-    debug: bool,
+    target: LogTarget<'_>,
+    options: &Options,
     warnings: &[String],
     server: impl Future<Output = Result<(), E>>,
 ) -> ExitCode {
-    let target = if debug { LogTarget::Stdout } else { LogTarget::File(log) };
+    // The file is locked until the end of the process.
+    let _pid_file = match options.pid_file.as_deref().map(pid_file::write).transpose() {
+        Ok(file) => file,
+        Err(error) => return failed(&format!("the process id can't be written: {error}")),
+    };
     if let Err(error) = logging::start(target) {
-        eprintln!("error: the log {} can't be written: {error}", log.display());
-        return ExitCode::from(FAILED);
+        return failed(&format!("the log {target} can't be written: {error}"));
     }
-    // A panic is a fault in this program; without this it would be told to a terminal that nobody looks at.
+    // A panic is a fault in this program. It is logged, as nobody reads the terminal of a service.
     std::panic::set_hook(Box::new(|panic| log::error!("{panic}")));
     for warning in warnings {
         log::warn!("{warning}");
     }
-    // It is left to the end of the process: dropped, it would wait for threads that the system keeps, in a lookup of a
-    // name that takes long.
+    // It is not dropped: that would wait for threads which the system keeps busy, as in a slow lookup of a name.
     let system = ManuallyDrop::new(actix_rt::System::new());
     match system.block_on(server) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             log::error!("{error}");
-            eprintln!("error: {error}");
-            ExitCode::from(FAILED)
+            failed(&error.to_string())
         }
     }
+}
+
+/// Tells the log, standard output and the service manager that a server can be reached, and where. `path` is that of its
+/// WebSocket.
+pub fn announce(server: &str, address: &PublicAddress, ssl: bool, path: &str, port: u16) {
+    let (http, websocket) = (address.http_url(ssl), address.websocket_url(ssl));
+    log::info!("{server} {} listens on port {port}: {http}", env!("CARGO_PKG_VERSION"));
+    // The reader may have gone.
+    writeln!(std::io::stdout(), "{server:<18} {http}/monitor   {websocket}{path}").ok();
+    notify::ready(port);
+}
+
+fn failed(why: &str) -> ExitCode {
+    eprintln!("error: {why}");
+    ExitCode::from(FAILED)
 }
