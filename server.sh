@@ -82,6 +82,7 @@ launch() { # SERVER
     mkdir -p "log/$kind"
     # The demo simulator is to be reached from where its server is.
     bind=$(setting "$1" bind)
+    : >"log/$1.out"
     DEMO_SIMULATOR_BIND=${DEMO_SIMULATOR_BIND-$bind} setsid "$BIN/$kind-server" --pid-file "log/$1.pid" \
         "config/$1.json" </dev/null >"log/$1.out" 2>&1 9<&- &
     until grep --max-count=1 "^$kind server " "log/$1.out"; do

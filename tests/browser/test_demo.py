@@ -56,7 +56,7 @@ class TheDemo(BrowserTest):
         self.fleet.server_sh("restart", "demo")
         self.assertNotEqual(self.fleet.leftovers(), [], "what runs is seen")
         self.fleet.server_sh("stop", "demo")
-        self.assertEqual(self.fleet.leftovers(), [])
+        until("nothing is left", lambda: self.fleet.leftovers() == [])
 
     def moves_pauses_steps_and_resets(self, page, rows):
         press = lambda name: page.tab.get_by_role("button", name=name, exact=True).click()

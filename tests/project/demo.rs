@@ -82,7 +82,7 @@ async fn the_demo_runs_from_its_start_to_its_stop() {
     assert!(project.done(&["status"]).await.contains("demo: the session server runs"));
     let stopped = project.done(&["stop"]).await;
     assert!(stopped.contains("stopped the session server") && stopped.contains("stopped the simulation server"));
-    assert_eq!(project.leftovers(), [""; 0]);
+    nothing_is_left(&project).await;
     assert_eq!(project.server_sh(&["status"]).await.code, Some(3));
     assert_eq!(project.server_sh(&["status", "demo"]).await.code, Some(3));
     assert_eq!(project.done(&["stop", "demo"]).await, "nothing of demo runs\n");
@@ -95,7 +95,7 @@ async fn a_stop_ends_the_simulations_of_clients_that_are_still_there() {
     let (mut client, url) = simulate(&project).await;
     let mut viewer = watch(&url).await;
     project.done(&["stop"]).await;
-    assert_eq!(project.leftovers(), [""; 0]);
+    nothing_is_left(&project).await;
     client.closed().await;
     viewer.closed().await;
 }
@@ -191,5 +191,5 @@ async fn without_webots_everything_runs_and_a_client_is_told_what_to_do() {
     assert!(told.starts_with("loading: Error: "), "{told}");
     assert!(told.contains(home.join("webots").to_str().unwrap()) && told.contains("webotsHome"), "{told}");
     project.done(&["stop"]).await;
-    assert_eq!(project.leftovers(), [""; 0]);
+    nothing_is_left(&project).await;
 }

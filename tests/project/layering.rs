@@ -92,7 +92,7 @@ fn imports_are_found_at_all() {
         ("session::web::routes", "session::fleet"),
         ("simulation::client::web_client", "simulation::webots"),
         ("simulation::webots::webots", "simulation::webots::output"),
-        ("simulation::config", "shared::config"),
+        ("simulation::config::simulation_config", "shared::config"),
     ] {
         assert!(map.imports[from].contains(to), "{from} names {to}, but only {:?} was found", map.imports[from]);
     }

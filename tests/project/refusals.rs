@@ -2,7 +2,7 @@
 
 use std::net::TcpListener;
 
-use super::copy::{Outcome, Project};
+use super::copy::{Outcome, Project, nothing_is_left};
 use crate::support::http;
 
 /// Runs `server.sh` for what has to fail with this exit code; gives back what it says.
@@ -23,7 +23,7 @@ async fn a_name_that_is_not_configured_is_refused_with_those_that_are() {
     }
     assert!(refused(&project, &["begin"], 2).await.contains("usage:"));
     assert!(refused(&project, &[], 2).await.contains("usage:"));
-    assert_eq!(project.leftovers(), [""; 0]);
+    nothing_is_left(&project).await;
 }
 
 #[actix_rt::test]
@@ -48,7 +48,7 @@ async fn a_port_that_is_taken_is_named() {
         let told = refused(&project, &["start", "demo"], 1).await;
         assert!(told.contains(&format!("can't listen on 127.0.0.1:{port}: Address already in use")), "{told}");
         drop(listener);
-        assert_eq!(project.leftovers(), [""; 0]);
+        nothing_is_left(&project).await;
     }
 }
 
@@ -58,7 +58,7 @@ async fn when_one_server_does_not_start_its_last_words_are_shown_and_the_other_i
     project.configure("session/demo", |config| config["logDir"] = "server.sh".into());
     let told = refused(&project, &["start", "demo"], 1).await;
     assert!(told.contains("the session server of demo has not started") && told.contains("can't be written"), "{told}");
-    assert_eq!(project.leftovers(), [""; 0]);
+    nothing_is_left(&project).await;
 }
 
 #[actix_rt::test]
@@ -73,7 +73,7 @@ async fn a_wrong_configuration_is_refused_in_one_line_and_stops_nothing_that_run
     }
     assert_eq!(http::get(&project.session_url("/health")).await.text(), "ok");
     project.done(&["stop"]).await;
-    assert_eq!(project.leftovers(), [""; 0]);
+    nothing_is_left(&project).await;
 }
 
 #[actix_rt::test]

@@ -5,8 +5,10 @@ use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
-use super::mail_address::{self, MailAddress};
-use super::placement::Policy;
+use super::example::Example;
+use super::timing::Timing;
+use crate::session::mail_address::{self, MailAddress};
+use crate::session::placement::Policy;
 use crate::shared::config::{Configuration, InvalidValue, changed_keys};
 use crate::shared::config::{
     ExpandedPath, Secret, folder, local_address, object, one_or_many, optional_port, percent, seconds, threshold, whole,
@@ -97,90 +99,10 @@ pub struct SessionConfig {
     pub timing: Timing,
 }
 
-/// An example on the page `/viewer`.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(from = "WireExample")]
-pub struct Example {
-    /// Its title. Default: the URL.
-    pub title: String,
-    /// The world's URL.
-    pub url: String,
-}
-
-#[derive(Deserialize)]
-#[serde(untagged, deny_unknown_fields, expecting = "it is neither a URL nor {\"title\": ..., \"url\": ...}")]
-enum WireExample {
-    Url(String),
-    Titled { title: Option<String>, url: String },
-}
-
-impl From<WireExample> for Example {
-    fn from(wire: WireExample) -> Self {
-        let (title, url) = match wire {
-            WireExample::Url(url) => (None, url),
-            WireExample::Titled { title, url } => (title, url),
-        };
-        Self { title: title.unwrap_or_else(|| url.clone()), url }
-    }
-}
-
-/// Durations, in seconds.
-#[derive(Debug, Clone, Serialize, Deserialize)]
-#[serde(rename_all = "camelCase", default, deny_unknown_fields)]
-pub struct Timing {
-    /// How long a simulation server may take to answer. Default: 3.
-    #[serde(with = "seconds")]
-    pub answer: Duration,
-    /// Between two pings of a client. Default: 20.
-    #[serde(with = "seconds")]
-    pub ping: Duration,
-    /// A client that has sent nothing for so long is disconnected. Default: 60.
-    #[serde(with = "seconds")]
-    pub silence: Duration,
-    /// How long a client that was sent to a simulation server is counted there if it never arrives. Default: 15.
-    #[serde(with = "seconds")]
-    pub placement: Duration,
-    /// How long notices are collected before they are sent in one mail. Default: 10.
-    #[serde(with = "seconds")]
-    pub gather: Duration,
-    /// Least time between two mails about the same simulation server. Default: 600.
-    #[serde(with = "seconds")]
-    pub flapping: Duration,
-    /// How long to wait before a mail that failed is sent again. The wait doubles each time. Default: 10.
-    #[serde(with = "seconds")]
-    pub mail_retry: Duration,
-    /// How long a mail that fails is tried. Default: 3600.
-    #[serde(with = "seconds")]
-    pub mail_patience: Duration,
-    /// How long an SMTP server may take for one mail. Default: 30.
-    #[serde(with = "seconds")]
-    pub mail_answer: Duration,
-    /// How long open connections may take to end when the server stops, at most 4.5. Default: 4.
-    #[serde(with = "seconds")]
-    pub stop: Duration,
-}
-
-impl Default for Timing {
-    fn default() -> Self {
-        Self {
-            answer: Duration::from_secs(3),
-            ping: Duration::from_secs(20),
-            silence: Duration::from_mins(1),
-            placement: Duration::from_secs(15),
-            gather: Duration::from_secs(10),
-            flapping: Duration::from_mins(10),
-            mail_retry: Duration::from_secs(10),
-            mail_patience: Duration::from_hours(1),
-            mail_answer: Duration::from_secs(30),
-            stop: Duration::from_secs(4),
-        }
-    }
-}
-
 /// The upper limit of `timing.stop`: the server stops within five seconds.
 const LONGEST_STOP: Duration = Duration::from_millis(4500);
 
-/// How long it takes until a new client shows in the load: its start, and the five seconds over which the load is a mean.
+/// How long a new client takes to show in the load: its start, and the five seconds of which the load is the mean.
 const SETTLING: Duration = Duration::from_secs(8);
 
 /// The keys that take effect when the configuration is read again; of `timing` only `answer` and `placement`.

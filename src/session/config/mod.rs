@@ -1,0 +1,9 @@
+//! The session server's configuration: every key, its default, and the rules between keys.
+
+mod example;
+mod session_config;
+mod timing;
+
+pub use example::Example;
+pub use session_config::SessionConfig;
+pub use timing::Timing;
