@@ -1,6 +1,6 @@
 //! The session server's configuration, `config/session/NAME.json`.
 
-use std::net::{IpAddr, Ipv4Addr};
+use std::net::{IpAddr, Ipv6Addr};
 use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
@@ -29,7 +29,7 @@ pub struct SessionConfig {
     /// Local port; 0 takes any free one.
     #[serde(deserialize_with = "whole::<0, 65535, _, _>")]
     pub port: u16,
-    /// Local address to listen on. Default: all of them.
+    /// Local address to listen on. Default: `::`, all addresses of IPv4 and IPv6.
     #[serde(default = "default_bind", deserialize_with = "local_address")]
     pub bind: IpAddr,
     /// Whether a web server in front rewrites ports in URLs: HOST/PORT, not HOST:PORT. Default: true.
@@ -195,7 +195,7 @@ fn default_true() -> bool {
 }
 
 fn default_bind() -> IpAddr {
-    Ipv4Addr::UNSPECIFIED.into()
+    Ipv6Addr::UNSPECIFIED.into()
 }
 
 fn default_log_dir() -> ExpandedPath {

@@ -6,26 +6,43 @@
 
 use std::any::Any;
 use std::io;
-use std::net::{SocketAddr, TcpListener};
+use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr, TcpListener};
 use std::os::fd::AsRawFd;
 use std::time::Duration;
 
 use actix_web::dev::Extensions;
 use actix_web::rt::net::TcpStream;
-use nix::sys::socket::{self, Backlog, Shutdown, setsockopt, shutdown, sockopt};
+use nix::errno::Errno;
+use nix::sys::socket::{Shutdown, setsockopt, shutdown, sockopt};
+use socket2::{Domain, Protocol, Socket, Type};
 
 use super::connections::Connections;
 use super::peer::TrustedProxies;
 
-/// Listens on an address. As many connections as the system allows may wait to be accepted: of the standard library's
-/// 128, those that come in a larger burst would be lost, and tried again a second later.
+/// How many connections may wait to be accepted. The system has a limit of its own, which counts where it is smaller.
+///
+/// Of the standard library's 128, those that come in a larger burst would be lost, and tried again a second later.
+const BACKLOG: i32 = i32::MAX;
+
+/// Listens on an address. `::` is all addresses, of IPv6 and IPv4; of IPv4 alone where the machine has no IPv6.
 ///
 /// # Errors
 /// When the address is taken, or may not be used.
 pub fn listen(address: SocketAddr) -> io::Result<TcpListener> {
-    let socket = TcpListener::bind(address)?;
-    socket::listen(&socket, Backlog::MAXALLOWABLE)?;
-    Ok(socket)
+    let is_everywhere = address.ip() == IpAddr::V6(Ipv6Addr::UNSPECIFIED);
+    let socket = match Socket::new(Domain::for_address(address), Type::STREAM, Some(Protocol::TCP)) {
+        Err(error) if is_everywhere && error.raw_os_error() == Some(Errno::EAFNOSUPPORT as i32) => {
+            return listen((Ipv4Addr::UNSPECIFIED, address.port()).into());
+        }
+        socket => socket?,
+    };
+    if is_everywhere {
+        socket.set_only_v6(false)?;
+    }
+    socket.set_reuse_address(true)?;
+    socket.bind(&address.into())?;
+    socket.listen(BACKLOG)?;
+    Ok(socket.into())
 }
 
 /// Looks after the connections of a server.

@@ -1,6 +1,6 @@
 //! The simulation server's configuration, `config/simulation/NAME.json`.
 
-use std::net::{IpAddr, Ipv4Addr};
+use std::net::{IpAddr, Ipv6Addr};
 use std::path::PathBuf;
 use std::time::Duration;
 
@@ -30,7 +30,7 @@ pub struct SimulationConfig {
     /// Local port. Webots uses the ports that follow it. Default: 2000.
     #[serde(default = "default_port", deserialize_with = "whole::<1, 65000, _, _>")]
     pub port: u16,
-    /// Local address to listen on. Default: all of them.
+    /// Local address to listen on. Default: `::`, all addresses of IPv4 and IPv6.
     #[serde(default = "default_bind", deserialize_with = "local_address")]
     pub bind: IpAddr,
     /// Whether a web server in front rewrites ports in URLs: HOST/PORT, not HOST:PORT. Default: true.
@@ -206,7 +206,7 @@ fn default_port() -> u16 {
 }
 
 fn default_bind() -> IpAddr {
-    Ipv4Addr::UNSPECIFIED.into()
+    Ipv6Addr::UNSPECIFIED.into()
 }
 
 fn default_log_dir() -> ExpandedPath {

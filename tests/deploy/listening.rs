@@ -1,0 +1,51 @@
+//! Where the servers listen if `bind` says nothing: on all addresses of IPv4 and IPv6.
+
+use std::process::Command;
+
+use serde_json::json;
+
+/// Starts a server in a network of its own, and asks it over both families. Prints the first line of each answer.
+const ASK: &str = r#"
+    ip link set lo up
+    "$1" "$2" >/dev/null &
+    for host in 127.0.0.1 ::1; do
+        for ((try = 0; try < 200; try++)); do
+            if { exec 3<>"/dev/tcp/$host/$3"; } 2>/dev/null; then
+                printf 'GET /health HTTP/1.0\r\n\r\n' >&3
+                head --lines=1 <&3
+                break
+            fi
+            sleep 0.1
+        done
+    done
+    kill $!
+    wait $!
+"#;
+
+#[test]
+fn without_a_word_on_it_a_server_listens_on_both_families() {
+    let own_network = ["unshare --net", "unshare --net --map-root-user"]
+        .into_iter()
+        .find(|command| Command::new("sh").args(["-c", &format!("{command} true")]).output().unwrap().status.success());
+    let Some(own_network) = own_network else {
+        assert!(std::env::var_os("CI").is_none(), "unshare --net is not allowed here");
+        return eprintln!("SKIPPED, for unshare --net is not allowed here");
+    };
+    for (program, more) in [
+        (env!("CARGO_BIN_EXE_session-server"), json!({"simulationServers": []})),
+        (env!("CARGO_BIN_EXE_simulation-server"), json!({})),
+    ] {
+        let folder = tempfile::tempdir().unwrap();
+        let inside = |name: &str| folder.path().join(name).to_str().unwrap().to_owned();
+        let mut config =
+            json!({"server": "localhost", "port": 2000, "logDir": inside("log"), "cacheDir": inside("cache")});
+        config.as_object_mut().unwrap().extend(more.as_object().unwrap().clone());
+        std::fs::write(inside("config.json"), config.to_string()).unwrap();
+        let mut command = Command::new("timeout");
+        command.args(["60"]).args(own_network.split(' ')).args(["bash", "-c", ASK, "ask", program]);
+        let output = command.args([&inside("config.json"), "2000"]).output().unwrap();
+        let said = String::from_utf8(output.stdout).unwrap();
+        let errors = String::from_utf8_lossy(&output.stderr);
+        assert_eq!(said.replace('\r', ""), "HTTP/1.0 200 OK\nHTTP/1.0 200 OK\n", "{program}: {errors}");
+    }
+}
