@@ -33,6 +33,14 @@ pub enum AppError {
         /// What the system says.
         source: std::io::Error,
     },
+    /// The limit of open files is too low.
+    #[error(
+        "{files} files may be open, which is not enough for one client; ulimit -Hn, or LimitNOFILE of systemd, allows more"
+    )]
+    NoClients {
+        /// The limit of open files.
+        files: u64,
+    },
     /// Another error of the system.
     #[error(transparent)]
     System(#[from] std::io::Error),
@@ -60,7 +68,11 @@ const OUTCOMES: [&str; 4] = ["placed", "unavailable", "not_accepted", "wrong_url
 /// When the server can't start, or an actor that must live has stopped.
 pub async fn run(mut config: SessionConfig, file: PathBuf) -> Result<(), AppError> {
     let mut signals = Signals::catch()?;
-    let (connections, clients) = bound_clients(open_files(), &config);
+    let files = open_files();
+    let (connections, clients) = bound_clients(files, &config);
+    if clients == 0 {
+        return Err(AppError::NoClients { files });
+    }
     let sockets = Arc::new(Sockets::new(
         connections,
         config.max_clients_per_address,

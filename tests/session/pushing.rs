@@ -141,6 +141,15 @@ async fn running_out_of_files_is_said_at_the_start_and_costs_only_those_who_are_
 }
 
 #[actix_rt::test]
+async fn a_limit_of_files_that_allows_no_client_is_refused_in_one_line() {
+    let mut session = session_server(&[]).set("debug", false).files(128).spawn();
+    assert_eq!(session.ended().await, Some(1));
+    let said = session.log();
+    assert!(said.starts_with("error: 128 files may be open, which is not enough for one client"), "{said}");
+    assert_eq!(said.lines().count(), 1, "{said}");
+}
+
+#[actix_rt::test]
 async fn a_message_without_end_is_cut_off_before_it_fills_the_memory() {
     use std::io::{Read, Write};
     let session = session_server(&[]).start().await;

@@ -215,3 +215,19 @@ async fn the_mean_load_is_that_of_all_who_answer() {
     until_states(&session, &["up", "draining"]).await;
     assert_eq!(http::get(&session.url("/load")).await.text(), "25");
 }
+
+#[actix_rt::test]
+async fn what_hides_or_turns_letters_around_is_shown_as_such() {
+    let hidden = "1\u{202e}gpj\u{200b}.exe\u{2028}";
+    let repository = "https://github.com/lab\u{202e}bal";
+    let status = json!({"load": 1, "version": hidden, "allowedRepositories": [repository]});
+    let [well, bad] =
+        [Manner::Status(status), Manner::Body(200, format!("{hidden}\n").into_bytes())].map(StandIn::start);
+    let session = session_server(&addresses(&[well, bad])).start().await;
+    until_states(&session, &["up", "down"]).await;
+    let page = http::get(&session.url("/monitor")).await.text();
+    assert!(page.contains("1\u{fffd}gpj\u{fffd}.exe") && page.contains("lab\u{fffd}bal"), "{page}");
+    for text in [page, session.log()] {
+        assert!(!text.contains(['\u{202e}', '\u{200b}', '\u{2028}']), "{text}");
+    }
+}

@@ -22,6 +22,7 @@ use super::resolver::Names;
 use crate::shared::domain::Load;
 use crate::shared::domain::PublicAddress;
 use crate::shared::domain::ServerReport;
+use crate::shared::domain::one_line;
 use crate::shared::http::tls;
 
 /// What was learned about a simulation server.
@@ -253,7 +254,7 @@ fn plausible(load: Load) -> Result<Load, Unreachable> {
 
 /// Words that may hold what somebody else wrote are kept short.
 fn shortened(text: &str) -> String {
-    text.chars().take(120).collect()
+    one_line(text).chars().take(120).collect()
 }
 
 #[cfg(test)]

@@ -8,6 +8,7 @@ use askama::Template;
 use crate::session::config::Example;
 use crate::session::fleet::{FleetStatus, ServerStatus, State, StateChange};
 use crate::shared::domain::Instances;
+use crate::shared::domain::one_line;
 use crate::shared::http::{Row, View};
 use crate::shared::run::timestamp;
 
@@ -53,7 +54,7 @@ struct ServerRow<'server> {
     effective: Option<f64>,
     effective_value: f64,
     instances: Option<Instances>,
-    repositories: Vec<&'server str>,
+    repositories: Vec<String>,
     whose: &'static str,
     version: &'server str,
     latency: String,
@@ -165,7 +166,7 @@ impl<'server> ServerRow<'server> {
             effective: server.effective_load,
             effective_value: sort_value(server.effective_load),
             instances: known_instances(server),
-            repositories: repositories.iter().map(|prefix| without_scheme(prefix.as_str())).collect(),
+            repositories: repositories.iter().map(|prefix| one_line(without_scheme(prefix.as_str()))).collect(),
             whose,
             version: report.map(|report| report.version.as_str()).unwrap_or_default(),
             latency: server.latency.map(milliseconds).unwrap_or_default(),

@@ -3,6 +3,7 @@
 //! An error is one line with the file, the key, what was found and what is allowed. An unknown key is a warning that
 //! names the most similar known one.
 
+use std::io;
 use std::path::Path;
 
 use super::error::ConfigError;
@@ -44,8 +45,7 @@ pub struct LoadedConfig<C> {
 /// # Errors
 /// When the file can't be read, or a value is not allowed.
 pub fn load<C: Configuration>(file: &Path) -> Result<LoadedConfig<C>, ConfigError> {
-    let text =
-        std::fs::read_to_string(file).map_err(|source| ConfigError::Unreadable { file: file.to_owned(), source })?;
+    let text = read_file(file).map_err(|source| ConfigError::Unreadable { file: file.to_owned(), source })?;
     // Some editors begin a file with a byte order mark.
     let text = text.strip_prefix('\u{feff}').unwrap_or(&text);
     if !text.trim_start().starts_with('{') {
@@ -70,6 +70,14 @@ pub fn load<C: Configuration>(file: &Path) -> Result<LoadedConfig<C>, ConfigErro
     })?;
     warnings.extend(more.iter().map(|warning| format!("{}: {warning}", file.display())));
     Ok(LoadedConfig { config, warnings })
+}
+
+/// Reads a regular file. A FIFO would block until somebody writes to it, and a device may never end.
+fn read_file(file: &Path) -> io::Result<String> {
+    if !std::fs::metadata(file)?.is_file() {
+        return Err(io::Error::other("it is not a regular file"));
+    }
+    std::fs::read_to_string(file)
 }
 
 /// Returns the keys whose values differ. The key of a secret is never among them.

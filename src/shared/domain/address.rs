@@ -106,7 +106,11 @@ impl FromStr for PublicAddress {
             _ => host,
         };
         // As it is asked for: names in lower case, as RFC 4343 has it, and in ASCII. One server must not count as two.
-        let plain = url::Host::parse(name).map_err(|_| no_address())?.to_string();
+        let plain = url::Host::parse(name).map_err(|_| no_address())?;
+        let is_of_name = |letter: char| letter.is_ascii_alphanumeric() || "-._".contains(letter);
+        if matches!(&plain, url::Host::Domain(domain) if !domain.chars().all(is_of_name)) {
+            return Err(no_address());
+        }
         let host = format!("{plain}{}", host.strip_prefix(name).unwrap_or_default());
         let port = number(port)?;
         Ok(Self { host: host.into(), port, rewritten })
@@ -149,7 +153,16 @@ mod tests {
         for text in
             ["", "host", "host:", "host:0", "host:65536", "host/2000/x", "http://host:1", "a b:1", ":2000", "h:-1"]
                 .into_iter()
-                .chain(["host:x/2000", "host:0/2000", ":8443/2000", "host:1:2/2000", "host:1:2", "h:+5"])
+                .chain([
+                    "host:x/2000",
+                    "host:0/2000",
+                    ":8443/2000",
+                    "host:1:2/2000",
+                    "host:1:2",
+                    "h:+5",
+                    "a\"b:1",
+                    "a;b:1",
+                ])
         {
             let error = text.parse::<PublicAddress>().unwrap_err().to_string();
             assert!(error.contains(&format!("{text:?}")), "{error}");

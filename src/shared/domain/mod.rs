@@ -6,6 +6,7 @@ mod load;
 mod project_url;
 mod report;
 mod repositories;
+mod text;
 
 pub use address::{PublicAddress, check_host};
 pub use admission::Rules;
@@ -13,3 +14,4 @@ pub use load::Load;
 pub use project_url::{NoProject, ProjectUrl, Reading, RefKind};
 pub use report::{Instances, ServerReport};
 pub use repositories::UrlPrefix;
+pub use text::one_line;

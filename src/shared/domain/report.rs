@@ -6,6 +6,7 @@ use super::admission::Rules;
 use super::load::Load;
 use super::project_url::ProjectUrl;
 use super::repositories::{UrlPrefix, any_covers, any_may_cover};
+use super::text::one_line;
 use crate::shared::config::{object, optional_object};
 
 /// The part of a simulation server's `/status` by which the session server places clients.
@@ -18,7 +19,7 @@ pub struct ServerReport {
     /// Mean load of the last five seconds, in percent.
     pub load: Load,
     /// The server's version.
-    #[serde(default)]
+    #[serde(default, deserialize_with = "line")]
     pub version: String,
     /// Simulations by state, if the server counts them.
     #[serde(default, deserialize_with = "optional_object")]
@@ -56,6 +57,10 @@ pub struct Instances {
     pub places: u32,
     /// Clients that asked for a start since the server began; it only grows.
     pub arrivals: u64,
+}
+
+fn line<'de, D: serde::Deserializer<'de>>(deserializer: D) -> Result<String, D::Error> {
+    String::deserialize(deserializer).map(|text| one_line(&text))
 }
 
 impl Instances {

@@ -7,6 +7,7 @@ use std::path::Path;
 use env_logger::{Builder, Env, Target};
 
 use super::rotated_file::RotatedFile;
+use crate::shared::domain::one_line;
 
 /// How many old files are kept beside the newest. The Python servers keep as many.
 const OLD_FILES: usize = 10;
@@ -70,12 +71,6 @@ pub fn start(target: LogTarget<'_>) -> std::io::Result<()> {
 /// A module's path without the name of the crate.
 fn short(target: &str) -> &str {
     target.strip_prefix("webots_fleet::").unwrap_or(target)
-}
-
-/// Replaces control characters by spaces, so that a text from outside can neither begin a new log line nor steer a terminal.
-#[must_use]
-pub fn one_line(text: &str) -> String {
-    text.chars().map(|letter| if letter.is_control() { ' ' } else { letter }).collect()
 }
 
 fn timestamp(now: std::time::SystemTime) -> impl fmt::Display {

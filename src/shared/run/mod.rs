@@ -9,7 +9,8 @@ mod shutdown;
 pub mod start;
 mod timestamp;
 
-pub use logging::{LogTarget, one_line};
+pub use crate::shared::domain::one_line;
+pub use logging::LogTarget;
 pub use rotated_file::RotatedFile;
 pub use shutdown::{Phase, Request, Signals, closing};
 pub use timestamp::{seconds_since_1970, timestamp};

@@ -5,10 +5,10 @@ use std::mem::ManuallyDrop;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
-use super::logging::{self, LogTarget, one_line};
+use super::logging::{self, LogTarget};
 use super::{notify, pid_file};
 use crate::shared::config::{self, Configuration, LoadedConfig};
-use crate::shared::domain::PublicAddress;
+use crate::shared::domain::{PublicAddress, one_line};
 
 /// Exit code: the server failed at run time, as where its port is taken.
 pub const FAILED: u8 = 1;

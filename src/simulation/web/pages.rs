@@ -5,6 +5,7 @@ use std::time::{Duration, SystemTime};
 use askama::Template;
 
 use crate::shared::domain::UrlPrefix;
+use crate::shared::domain::one_line;
 use crate::shared::http::{Row, View};
 use crate::shared::run::{seconds_since_1970, timestamp};
 use crate::simulation::census::{Everybody, Simulation, Stage};
@@ -57,8 +58,8 @@ struct Glance<'readings> {
 #[template(path = "simulation/row.html")]
 struct SimulationRow<'one> {
     one: &'one Simulation,
-    world: &'one str,
-    repository: &'one str,
+    world: String,
+    repository: String,
     stage: &'static str,
     class: &'static str,
     since: String,
@@ -171,8 +172,8 @@ impl<'one> SimulationRow<'one> {
         let (repository, file) = WORDS.iter().find_map(|word| path.split_once(word)).unwrap_or((path, path));
         Self {
             one,
-            world: file.rsplit('/').next().unwrap_or(file),
-            repository,
+            world: one_line(file.rsplit('/').next().unwrap_or(file)),
+            repository: one_line(repository),
             stage,
             class,
             since: timestamp(SystemTime::UNIX_EPOCH + Duration::from_secs(one.since)),

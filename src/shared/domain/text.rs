@@ -1,0 +1,34 @@
+//! Texts from outside. Pure.
+
+use icu_properties::props::{BinaryProperty, DefaultIgnorableCodePoint};
+
+/// Returns a text in which nothing begins a new line, steers a terminal, changes the direction of writing, or is invisible.
+///
+/// Control characters become spaces; invisible characters, which those for the direction are among, become U+FFFD.
+#[must_use]
+pub fn one_line(text: &str) -> String {
+    let visible = |letter: char| match letter {
+        '\u{2028}' | '\u{2029}' => ' ',
+        letter if letter.is_control() => ' ',
+        letter if DefaultIgnorableCodePoint::for_char(letter) => char::REPLACEMENT_CHARACTER,
+        letter => letter,
+    };
+    text.chars().map(visible).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn nothing_hides_in_a_line() {
+        for (text, line) in [
+            ("a plain text, e\u{301}t\u{e9}, \u{6587}", "a plain text, e\u{301}t\u{e9}, \u{6587}"),
+            ("one\r\ntwo\u{85}\u{2028}\u{1b}[31m", "one  two   [31m"),
+            ("\u{202e}gpj.exe\u{2066}", "\u{fffd}gpj.exe\u{fffd}"),
+            ("a\u{200b}b\u{feff}\u{e0041}\u{3164}", "a\u{fffd}b\u{fffd}\u{fffd}\u{fffd}"),
+        ] {
+            assert_eq!(one_line(text), line, "{text:?}");
+        }
+    }
+}
