@@ -7,7 +7,7 @@ use std::process::ExitCode;
 use clap::Parser;
 use webots_fleet::session::app;
 use webots_fleet::session::config::SessionConfig;
-use webots_fleet::session::mail::mailer;
+use webots_fleet::session::mail;
 use webots_fleet::shared::run::{LogTarget, start};
 
 /// The one door to a fleet of simulation servers.
@@ -44,7 +44,7 @@ fn main() -> ExitCode {
 
 /// Sends one mail to the administrator and says how that went.
 fn test_mail(config: &SessionConfig) -> ExitCode {
-    match actix_rt::System::new().block_on(mailer::test_mail(config)) {
+    match actix_rt::System::new().block_on(mail::test_mail(config)) {
         Ok(how) => {
             // The reader may have gone.
             writeln!(std::io::stdout(), "{how}").ok();

@@ -13,7 +13,7 @@ use tokio::sync::watch;
 use super::config::SessionConfig;
 use super::state::AppState;
 use crate::session::fleet::{IsAvailable, Reconfigure, Registry};
-use crate::session::mail::mailer;
+use crate::session::mail;
 use crate::session::web::{CurrentAudience, configure};
 use crate::shared::config;
 use crate::shared::http::Connections;
@@ -179,7 +179,7 @@ fn assemble(config: SessionConfig, clients: usize, phase: watch::Receiver<Phase>
     for outcome in OUTCOMES {
         picks.with_label_values(&[outcome]).reset();
     }
-    let mailer = mailer::start(&config);
+    let mailer = mail::start(&config);
     let (timing, ssl) = (config.timing.clone(), config.ssl);
     let connections = Connections::new(clients, config.max_clients_per_address);
     let trusted_proxies = config.trusted_proxies.clone();

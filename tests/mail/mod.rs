@@ -8,13 +8,12 @@ use actix::Addr;
 use log::Level;
 use serde_json::{Value, json};
 use webots_fleet::session::config::SessionConfig;
-use webots_fleet::session::mail::mailer::{self, Mailer, test_mail};
-use webots_fleet::session::mail::{Event, Notice};
+use webots_fleet::session::mail::{self, Event, Mailer, Notice, test_mail};
 use webots_fleet::shared::config::{Configuration, load};
 use webots_fleet::shared::domain::Load;
 use webots_fleet::shared::domain::PublicAddress;
 
-use smtp::{Smtp, dead_port, keep_log, logged, trusted_authority, wait_for_log};
+use smtp::{DEADLINE, Smtp, dead_port, keep_log, logged, trusted_authority, wait_for_log};
 
 const LOGIN: &[&str] = &["--login", "fleet:s3cret"];
 
@@ -54,7 +53,7 @@ fn with(keys: &Value, more: &Value) -> Value {
 
 fn start(port: u16, more: &Value) -> Addr<Mailer> {
     keep_log();
-    mailer::start(&config(port, more)).expect("mails are on")
+    mail::start(&config(port, more)).expect("mails are on")
 }
 
 fn notice(host: &str, event: Event) -> Notice {
@@ -341,6 +340,27 @@ async fn a_silent_server_holds_up_nobody_and_leaves_nothing_open() {
 }
 
 #[actix_rt::test]
+async fn a_server_that_sends_a_line_without_an_end_is_cut_off() {
+    use tokio::io::AsyncWriteExt;
+    let listener = tokio::net::TcpListener::bind(("127.0.0.1", 0)).await.unwrap();
+    let port = listener.local_addr().unwrap().port();
+    let flood = actix_rt::spawn(async move {
+        let (mut connection, _) = listener.accept().await.unwrap();
+        let mut sent = 0;
+        while connection.write_all(&[b'2'; 64 * 1024]).await.is_ok() {
+            sent += 64 * 1024;
+        }
+        sent
+    });
+    let error = test_mail(&config(port, &json!({}))).await.unwrap_err().to_string();
+    let words = "the connection broke: it sends more than 1024 KiB";
+    assert_eq!(error, format!("127.0.0.1:{port}: {words}"));
+    let sent = tokio::time::timeout(DEADLINE, flood).await.expect("the connection is closed").unwrap();
+    // What the system keeps of a connection comes on top.
+    assert!(sent < 32 * 1024 * 1024, "{sent} bytes were taken");
+}
+
+#[actix_rt::test]
 async fn a_server_that_is_silent_at_the_end_has_the_mail_once() {
     let mut smtp = Smtp::start(&["--hang", "quit"]).await;
     let mailer = start(smtp.port, &json!({"timing": {"mailAnswer": 0.5}}));
@@ -362,7 +382,7 @@ async fn without_one_of_the_three_keys_mails_are_off() {
             "mailServer" => config.mail_server = None,
             _ => config.mail_sender = None,
         }
-        assert!(mailer::start(&config).is_none(), "there is a mailer without {key}");
+        assert!(mail::start(&config).is_none(), "there is a mailer without {key}");
         let error = test_mail(&config).await.unwrap_err().to_string();
         assert_eq!(error, format!("notifications are off: {key} is not set"));
     }

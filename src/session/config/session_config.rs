@@ -3,11 +3,12 @@
 use std::net::{IpAddr, Ipv6Addr};
 use std::time::Duration;
 
+use lettre::message::Mailbox;
 use serde::{Deserialize, Serialize};
 
 use super::example::Example;
 use super::timing::Timing;
-use crate::session::mail_address::{self, MailAddress};
+use crate::session::mail_address;
 use crate::session::placement::Policy;
 use crate::shared::config::{Configuration, InvalidValue, changed_keys};
 use crate::shared::config::{
@@ -42,7 +43,7 @@ pub struct SessionConfig {
     pub drained_servers: Vec<PublicAddress>,
     /// Mail address of the administrator, who gets notifications. Default: none, and there are no notifications.
     #[serde(default, deserialize_with = "mail_address::optional")]
-    pub administrator: Option<MailAddress>,
+    pub administrator: Option<Mailbox>,
     /// Host of the SMTP server. Default: none, and there are no notifications.
     #[serde(default)]
     pub mail_server: Option<String>,
@@ -54,7 +55,7 @@ pub struct SessionConfig {
     pub mail_server_implicit_tls: Option<bool>,
     /// Mail address that notifications come from. Default: none, and there are no notifications.
     #[serde(default, deserialize_with = "mail_address::optional")]
-    pub mail_sender: Option<MailAddress>,
+    pub mail_sender: Option<Mailbox>,
     /// User name for SMTP. Default: `mailSender`.
     #[serde(default)]
     pub mail_sender_user: Option<String>,

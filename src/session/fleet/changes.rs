@@ -8,8 +8,7 @@ use actix::prelude::*;
 use super::fleet_status::{State, StateChange};
 use super::server_record::{Change, Watched};
 use crate::session::config::SessionConfig;
-use crate::session::mail::mailer::{self, Mailer};
-use crate::session::mail::{Notice, Topic};
+use crate::session::mail::{self, Mailer, Notice, Topic};
 use crate::shared::domain::PublicAddress;
 
 /// The last changes, and who else is told of them.
@@ -32,7 +31,7 @@ impl Changes {
     pub fn look_after_mailer(&mut self, config: &SessionConfig) {
         if self.mailer.as_ref().is_some_and(|mailer| !mailer.connected()) {
             log::error!("the mailer is gone, a new one is started; what it had not sent is lost");
-            self.mailer = mailer::start(config);
+            self.mailer = mail::start(config);
         }
     }
 
@@ -55,7 +54,7 @@ impl Changes {
         // The last that is known: a server that does not answer tells no load, and one that works again no error.
         let load = watched.report.as_ref().map(|report| report.load);
         for event in events {
-            let error = watched.last_error.as_ref().filter(|_| event.topic() == Topic::Life).map(ToString::to_string);
+            let error = watched.last_error.as_ref().filter(|_| event.topic() == Topic::Health).map(ToString::to_string);
             let notice = Notice { server: server.clone(), event, load, error, at };
             if let Err(lost) = mailer.try_send(notice) {
                 log::error!("{server}: no notice is sent: {lost}");

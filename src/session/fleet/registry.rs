@@ -20,7 +20,7 @@ use super::server_monitor::{Forget, Reported, ServerMonitor, Watch};
 use super::server_record::Watched;
 use super::subscribers::{News, Subscribers};
 use crate::session::config::SessionConfig;
-use crate::session::mail::mailer::Mailer;
+use crate::session::mail::Mailer;
 use crate::session::placement::Fleet;
 use crate::shared::domain::Load;
 use crate::shared::domain::ProjectUrl;

@@ -1,46 +1,40 @@
-//! Writes mails: the words, the two templates and the headers. Sends nothing.
+//! Composes e-mails: subject, text and HTML out of two templates, and headers.
 //!
-//! What comes from outside (a server's error, say) is data: it never has a line break, and the HTML escapes it.
+//! Text from outside, such as a server's error, never has a line break in a header, and is escaped in the HTML.
 
 use std::time::SystemTime;
 
 use askama::Template;
 use lettre::Message;
-use lettre::message::MultiPart;
 use lettre::message::header::{Header, HeaderName, HeaderValue};
+use lettre::message::{Mailbox, MultiPart};
 
 use super::notices::{Entry, Event};
 use crate::session::config::SessionConfig;
-use crate::session::mail_address::MailAddress;
 use crate::shared::run::one_line;
 
-/// How much of a text from outside is shown, in letters.
-const MOST_LETTERS: usize = 500;
+/// How many letters of a text from outside are shown.
+const MAX_LETTERS: usize = 500;
 
-/// Who writes to whom about which server.
+/// Composes the e-mails of one session server.
 #[derive(Debug, Clone)]
-pub struct Letterhead {
-    from: MailAddress,
-    to: MailAddress,
+pub struct EmailComposer {
+    from: Mailbox,
+    to: Mailbox,
     session_server: String,
     monitor: String,
 }
 
-/// A mail that is ready to be sent.
-#[derive(Debug, Clone)]
-pub struct Letter {
-    /// Where it comes from.
-    pub from: MailAddress,
-    /// Where it goes to.
-    pub to: MailAddress,
-    /// Headers and body as they go over the wire.
-    pub bytes: Vec<u8>,
-}
-
-/// A mail that can't be made.
+/// Why an e-mail can't be composed.
 #[derive(Debug, thiserror::Error)]
-#[error("the mail can't be written: {0}")]
-pub struct Unwritable(String);
+pub enum EmailError {
+    /// A template failed.
+    #[error("the mail can't be written: {0}")]
+    Template(#[from] askama::Error),
+    /// A header or an address is wrong.
+    #[error("the mail can't be written: {0}")]
+    Message(#[from] lettre::error::Error),
+}
 
 #[derive(Template)]
 #[template(path = "mail.txt")]
@@ -54,10 +48,10 @@ struct Html<'mail>(&'mail Content<'mail>);
 struct Content<'mail> {
     summary: &'mail str,
     lines: Vec<Line>,
-    letterhead: &'mail Letterhead,
+    composer: &'mail EmailComposer,
 }
 
-/// What a mail says of one server.
+/// What an e-mail says about one server.
 struct Line {
     server: String,
     event: &'static str,
@@ -67,8 +61,8 @@ struct Line {
     held_back: usize,
 }
 
-impl Letterhead {
-    /// What the configuration says; nothing if it is not for mails.
+impl EmailComposer {
+    /// Composes e-mails as the configuration says; nothing if it names no administrator or sender.
     #[must_use]
     pub fn new(config: &SessionConfig) -> Option<Self> {
         Some(Self {
@@ -79,11 +73,17 @@ impl Letterhead {
         })
     }
 
-    /// The mail that tells these entries.
+    /// The address of the administrator.
+    #[must_use]
+    pub fn recipient(&self) -> &str {
+        self.to.email.as_ref()
+    }
+
+    /// The e-mail about these entries.
     ///
     /// # Errors
-    /// When the mail can't be made of them.
-    pub fn tell<'entries>(&self, entries: impl Iterator<Item = &'entries Entry>) -> Result<Letter, Unwritable> {
+    /// When a template or a header can't be written.
+    pub fn compose<'entries>(&self, entries: impl Iterator<Item = &'entries Entry>) -> Result<Message, EmailError> {
         let mut events = Vec::new();
         let lines: Vec<Line> = entries
             .map(|entry| {
@@ -95,30 +95,28 @@ impl Letterhead {
         if let [only] = lines.as_slice() {
             subject = format!("{subject}: {}", only.server);
         }
-        self.write(&subject, lines)
+        self.message(&subject, lines)
     }
 
-    /// The mail that tells that mails arrive.
+    /// The e-mail of `--test-mail`.
     ///
     /// # Errors
-    /// When the mail can't be made.
-    pub fn test(&self) -> Result<Letter, Unwritable> {
-        self.write("Test of the session server's notifications", Vec::new())
+    /// When a template or a header can't be written.
+    pub fn test(&self) -> Result<Message, EmailError> {
+        self.message("Test of the session server's notifications", Vec::new())
     }
 
-    fn write(&self, subject: &str, lines: Vec<Line>) -> Result<Letter, Unwritable> {
-        let content = Content { summary: subject, lines, letterhead: self };
-        let text = Text(&content).render().map_err(unwritable)?;
-        let html = Html(&content).render().map_err(unwritable)?;
+    fn message(&self, subject: &str, lines: Vec<Line>) -> Result<Message, EmailError> {
+        let content = Content { summary: subject, lines, composer: self };
+        let (text, html) = (Text(&content).render()?, Html(&content).render()?);
         let message = Message::builder()
-            .from(self.from.mailbox().clone())
-            .to(self.to.mailbox().clone())
+            .from(self.from.clone())
+            .to(self.to.clone())
             .subject(subject)
             .message_id(None)
             .header(AutoSubmitted)
-            .multipart(MultiPart::alternative_plain_html(text, html))
-            .map_err(unwritable)?;
-        Ok(Letter { from: self.from.clone(), to: self.to.clone(), bytes: message.formatted() })
+            .multipart(MultiPart::alternative_plain_html(text, html))?;
+        Ok(message)
     }
 }
 
@@ -136,7 +134,7 @@ impl Line {
     }
 }
 
-/// Tells answering machines that nobody reads their answers (RFC 3834).
+/// Tells automatic responders not to answer (RFC 3834).
 #[derive(Clone)]
 struct AutoSubmitted;
 
@@ -154,11 +152,7 @@ impl Header for AutoSubmitted {
     }
 }
 
-fn unwritable(error: impl std::error::Error) -> Unwritable {
-    Unwritable(error.to_string())
-}
-
-/// `Simulation server not responding`, or `3 simulation servers not responding, 1 working again`.
+/// The subject: `Simulation server not responding`, or `3 simulation servers not responding, 1 working again`.
 fn summary(events: &[Event]) -> String {
     if let [only] = events {
         return format!("Simulation server {}", only.words());
@@ -176,16 +170,16 @@ fn summary(events: &[Event]) -> String {
     parts.join(", ")
 }
 
-/// A text from outside as it is shown: one line of bounded length.
+/// A text from outside as one line of at most [`MAX_LETTERS`] letters.
 fn shown(text: &str) -> String {
-    let mut short: String = one_line(text).chars().take(MOST_LETTERS).collect();
-    if text.chars().nth(MOST_LETTERS).is_some() {
+    let mut short: String = one_line(text).chars().take(MAX_LETTERS).collect();
+    if text.chars().nth(MAX_LETTERS).is_some() {
         short.push_str("...");
     }
     short
 }
 
-/// `2026-03-01 14:05:09 UTC`, the clock of the log.
+/// A time as the log writes it: `2026-03-01 14:05:09 UTC`.
 fn time(at: SystemTime) -> String {
     jiff::Timestamp::try_from(at)
         .map_or_else(|_| "unknown".to_owned(), |time| time.strftime("%Y-%m-%d %H:%M:%S UTC").to_string())

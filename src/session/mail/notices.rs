@@ -1,12 +1,11 @@
-//! Decides which notice is mailed when: gathering, and the limit for flapping servers. Pure; time is passed in.
+//! Which notices are mailed when: gathering, and the limit for flapping servers. Pure; time is passed in.
 //!
-//! A simulation server has two topics: whether it responds, and whether its load leaves room.
+//! There are two topics about a simulation server: whether it responds, and whether it has room.
 //!
-//! 1. The first notice waits for `gather`, so that servers that fail together are one mail.
-//! 2. For `flapping` after a mail about a server, its notices are held back and counted; what is left then is one entry
-//!    for each topic with the newest notice and the count. So a server that comes and goes is one mail in that time.
-//! 3. One thing does not wait: that a server does not respond of which the mail told only that it is full, or has room
-//!    again. It is no flapping when a machine is full and then fails.
+//! 1. The first notice waits for `gather`, so that servers that fail together are reported in one e-mail.
+//! 2. For `flapping` after an e-mail about a server, its notices are held back and counted. After that time the next
+//!    e-mail has one entry for each topic, with the newest notice and the count.
+//! 3. One notice is not held back: that a server does not respond, if the last e-mail was only about its load.
 
 use std::collections::{BTreeMap, HashMap};
 use std::time::{Duration, Instant, SystemTime};
@@ -16,7 +15,7 @@ use actix::Message;
 use crate::shared::domain::Load;
 use crate::shared::domain::PublicAddress;
 
-/// Something the administrator should know of a simulation server.
+/// A change of a simulation server that the administrator should know of.
 #[derive(Message, Debug, Clone, PartialEq)]
 #[rtype(result = "()")]
 pub struct Notice {
@@ -24,15 +23,15 @@ pub struct Notice {
     pub server: PublicAddress,
     /// What happened.
     pub event: Event,
-    /// Its load, where one is known.
+    /// Its load, if known.
     pub load: Option<Load>,
-    /// The last error, where there was one. It may hold anything.
+    /// The last error, if any. It may hold any text.
     pub error: Option<String>,
     /// When it happened.
     pub at: SystemTime,
 }
 
-/// What can happen to a simulation server. The order is that of the lines in a mail.
+/// What happened to a simulation server, in the order of the lines in an e-mail.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Event {
     /// It gives no usable answer.
@@ -45,17 +44,17 @@ pub enum Event {
     AvailableAgain,
 }
 
-/// The two things that mails are about.
+/// What an event is about.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Topic {
     /// Whether a server responds.
-    Life,
-    /// Whether a server has room.
-    Room,
+    Health,
+    /// Whether a server has room for clients.
+    Capacity,
 }
 
 impl Event {
-    /// In words, to follow 'simulation server' or 'simulation servers'.
+    /// The event in words that follow 'simulation server' or 'simulation servers'.
     #[must_use]
     pub fn words(self) -> &'static str {
         match self {
@@ -66,20 +65,20 @@ impl Event {
         }
     }
 
-    /// What it is about.
+    /// The topic of the event.
     #[must_use]
     pub fn topic(self) -> Topic {
         match self {
-            Self::NotResponding | Self::WorkingAgain => Topic::Life,
-            Self::MaximumLoad | Self::AvailableAgain => Topic::Room,
+            Self::NotResponding | Self::WorkingAgain => Topic::Health,
+            Self::MaximumLoad | Self::AvailableAgain => Topic::Capacity,
         }
     }
 }
 
-/// One entry of a mail: the newest notice of a server and topic, and how many it stands for.
+/// One entry of an e-mail: the newest notice about a server and topic, and how many it stands for.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Entry {
-    /// The newest notice; its error is the last one known.
+    /// The newest notice, with the last error that is known.
     pub notice: Notice,
     /// How many earlier notices were held back.
     pub held_back: usize,
@@ -88,12 +87,12 @@ pub struct Entry {
 impl Entry {
     /// Whether both are about the same topic of the same server.
     #[must_use]
-    pub fn goes_with(&self, other: &Self) -> bool {
+    pub fn is_about_the_same(&self, other: &Self) -> bool {
         self.notice.event.topic() == other.notice.event.topic() && self.notice.server == other.notice.server
     }
 
-    /// Takes in a newer entry that goes with this one.
-    pub fn renew(&mut self, newer: Self) {
+    /// Replaces this entry with a newer one about the same, and counts it as held back.
+    pub fn replace(&mut self, newer: Self) {
         let error = self.notice.error.take();
         self.notice = newer.notice;
         self.notice.error = self.notice.error.take().or(error);
@@ -101,7 +100,7 @@ impl Entry {
     }
 }
 
-/// What happened since the last mail, and what was mailed lately.
+/// The notices since the last e-mail, and when each server was mailed about.
 #[derive(Debug)]
 pub struct Notices {
     gather: Duration,
@@ -111,56 +110,57 @@ pub struct Notices {
 
 #[derive(Debug, Default)]
 struct State {
-    /// What is to be mailed of each topic, and when it happened first.
+    /// The entry of each topic that waits, and when it began to.
     pending: BTreeMap<Topic, (Entry, Instant)>,
-    quiet: Option<Quiet>,
+    cooldown: Option<Cooldown>,
 }
 
-/// The time after a mail.
+/// The time after an e-mail about a server in which its notices are held back.
 #[derive(Debug, Clone, Copy)]
-struct Quiet {
+struct Cooldown {
     end: Instant,
-    /// Whether that mail told whether the server responds.
-    of_life: bool,
+    /// Whether that e-mail had an entry about the server's health.
+    about_health: bool,
 }
 
 impl Notices {
-    /// Nothing happened yet.
+    /// No notices yet.
     #[must_use]
     pub fn new(gather: Duration, flapping: Duration) -> Self {
         Self { gather, flapping, servers: HashMap::new() }
     }
 
-    /// Takes in a notice.
+    /// Adds a notice.
     pub fn add(&mut self, notice: Notice, now: Instant) {
         let state = self.servers.entry(notice.server.clone()).or_default();
-        state.quiet.take_if(|quiet| quiet.end <= now);
+        state.cooldown.take_if(|cooldown| cooldown.end <= now);
         let topic = notice.event.topic();
         let entry = Entry { notice, held_back: 0 };
         match state.pending.get_mut(&topic) {
-            Some((pending, _)) => pending.renew(entry),
+            Some((pending, _)) => pending.replace(entry),
             None => drop(state.pending.insert(topic, (entry, now))),
         }
     }
 
-    /// When there will be something to mail, if nothing else happens.
+    /// When the next e-mail is due, if no other notice comes.
     #[must_use]
     pub fn due(&self) -> Option<Instant> {
         self.servers.values().filter_map(|state| state.due(self.gather)).min()
     }
 
-    /// What is to be mailed now; it counts as mailed from now on.
+    /// Returns what is to be mailed now, and counts it as mailed.
     pub fn take(&mut self, now: Instant) -> Vec<Entry> {
-        self.servers.retain(|_, state| !state.pending.is_empty() || state.quiet.is_some_and(|quiet| quiet.end > now));
+        self.servers
+            .retain(|_, state| !state.pending.is_empty() || state.cooldown.is_some_and(|cooldown| cooldown.end > now));
         if self.due().is_none_or(|due| due > now) {
             return Vec::new();
         }
         let mut mailed = Vec::new();
         for state in self.servers.values_mut() {
-            // A mail that goes anyway takes along what nothing but the gathering holds up.
+            // An e-mail that is sent anyway includes what would else wait for `gather` only.
             if !state.pending.is_empty() && state.held_until().is_none_or(|end| end <= now) {
-                let of_life = state.pending.contains_key(&Topic::Life);
-                state.quiet = Some(Quiet { end: now + self.flapping, of_life });
+                let about_health = state.pending.contains_key(&Topic::Health);
+                state.cooldown = Some(Cooldown { end: now + self.flapping, about_health });
                 mailed.extend(std::mem::take(&mut state.pending).into_values().map(|(entry, _)| entry));
             }
         }
@@ -169,12 +169,12 @@ impl Notices {
 }
 
 impl State {
-    /// Until when what is pending is held back, if it is.
+    /// Until when the pending entries are held back, if they are.
     fn held_until(&self) -> Option<Instant> {
-        let quiet = self.quiet?;
+        let cooldown = self.cooldown?;
         let fails = |(entry, _): &(Entry, Instant)| entry.notice.event == Event::NotResponding;
-        let is_worse = !quiet.of_life && self.pending.get(&Topic::Life).is_some_and(fails);
-        (!is_worse).then_some(quiet.end)
+        let fails_now = !cooldown.about_health && self.pending.get(&Topic::Health).is_some_and(fails);
+        (!fails_now).then_some(cooldown.end)
     }
 
     /// When the pending entries may be mailed.
@@ -309,7 +309,7 @@ mod tests {
             held_back: 0,
         };
         let mut entry = notice(NotResponding, Some("connection refused"));
-        entry.renew(notice(WorkingAgain, None));
+        entry.replace(notice(WorkingAgain, None));
         assert_eq!(entry.notice.error.as_deref(), Some("connection refused"));
         assert_eq!((entry.notice.event, entry.held_back), (WorkingAgain, 1));
     }

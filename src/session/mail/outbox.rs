@@ -1,53 +1,52 @@
-//! Decides when a mail that failed is tried again, and when it is given up. Pure; time is passed in.
+//! Entries that wait to be mailed: when a failed e-mail is sent again, and when it is given up. Pure; time is passed in.
 //!
-//! Entries that wait go together: what became due while the mail server was away joins the next try, and a newer
-//! entry of the same server and topic takes the place of the older, so that no line waits behind another.
+//! All entries that wait go into the next e-mail. A newer entry of the same server and topic replaces the older one.
 
 use std::time::{Duration, Instant};
 
 use super::notices::Entry;
 
-/// How failing mails are treated.
+/// When a failed e-mail is sent again, and when it is given up.
 #[derive(Debug, Clone, Copy)]
-pub struct Persistence {
-    /// The wait after the first failure; it doubles with each.
-    pub retry: Duration,
-    /// After so long of tries an entry is given up.
-    pub patience: Duration,
-    /// How many entries wait at most; the oldest make room.
-    pub most: usize,
+pub struct RetryPolicy {
+    /// The delay after the first failure; it doubles with each.
+    pub first_delay: Duration,
+    /// How long an entry is tried before it is given up.
+    pub give_up_after: Duration,
+    /// How many entries may wait; the oldest are dropped for newer ones.
+    pub max_waiting: usize,
 }
 
-impl Persistence {
-    /// The longest wait between two tries.
-    fn longest(self) -> Duration {
-        self.retry.max(self.patience / 6)
+impl RetryPolicy {
+    /// The longest delay between two tries.
+    fn longest_delay(self) -> Duration {
+        self.first_delay.max(self.give_up_after / 6)
     }
 }
 
-/// Entries that are to be mailed.
+/// The entries that wait to be mailed.
 #[derive(Debug)]
 pub struct Outbox {
-    persistence: Persistence,
+    policy: RetryPolicy,
     waiting: Vec<Waiting>,
-    /// The wait after the next failure.
-    wait: Duration,
+    /// The delay after the next failure.
+    delay: Duration,
     not_before: Option<Instant>,
 }
 
-/// An entry on its way.
+/// An entry that waits.
 #[derive(Debug, Clone)]
 struct Waiting {
     entry: Entry,
     first_try: Option<Instant>,
 }
 
-/// What one try mails.
+/// The entries of one e-mail.
 #[derive(Debug, Clone)]
 pub struct Batch(Vec<Waiting>);
 
 impl Batch {
-    /// The entries in the order of the mail: by event, then by server.
+    /// The entries in the order of the e-mail: by event, then by server.
     pub fn entries(&self) -> impl Iterator<Item = &Entry> {
         let mut entries: Vec<&Entry> = self.0.iter().map(|waiting| &waiting.entry).collect();
         entries.sort_by_key(|entry| (entry.notice.event, entry.notice.server.clone()));
@@ -55,40 +54,40 @@ impl Batch {
     }
 }
 
-/// Whether a failure may pass by itself.
+/// Whether another try can succeed (RFC 5321, section 4.2.1).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Failure {
-    /// Such as a refused connection.
-    Passing,
-    /// Such as a wrong password. It is tried again too, for only a mail can tell the administrator, and a password, a
-    /// full mailbox or a relay's rules are often put right within the hour; but with the longest wait from the start,
-    /// so that no account is locked for too many wrong logins.
-    Lasting,
+    /// It may, as after a refused connection.
+    Transient,
+    /// Not before somebody changes something, such as a wrong password. It is tried again too, since only an e-mail can
+    /// tell the administrator, and such things are often corrected within the hour; but with the longest delay from the
+    /// start, so that no account is locked for too many wrong logins.
+    Permanent,
 }
 
 impl Outbox {
     /// An empty outbox.
     #[must_use]
-    pub fn new(persistence: Persistence) -> Self {
-        Self { persistence, waiting: Vec::new(), wait: persistence.retry, not_before: None }
+    pub fn new(policy: RetryPolicy) -> Self {
+        Self { policy, waiting: Vec::new(), delay: policy.first_delay, not_before: None }
     }
 
-    /// Takes in entries that are to be mailed. Gives back how many of the oldest had to make room.
+    /// Adds entries. Returns how many of the oldest were dropped.
     pub fn put(&mut self, entries: Vec<Entry>) -> usize {
         for entry in entries {
             self.join(entry);
         }
-        let surplus = self.waiting.len().saturating_sub(self.persistence.most);
+        let surplus = self.waiting.len().saturating_sub(self.policy.max_waiting);
         self.waiting.drain(..surplus).count()
     }
 
-    /// When the next try is due; with nothing to mail, never.
+    /// When the next try is due; nothing if no entry waits.
     #[must_use]
     pub fn due(&self, now: Instant) -> Option<Instant> {
         (!self.waiting.is_empty()).then(|| self.not_before.unwrap_or(now))
     }
 
-    /// Takes out what is to be tried now. Its fate is to be told by [`Self::succeeded`] or [`Self::failed`].
+    /// Takes out what is to be mailed now. How it went is to be reported by [`Self::succeeded`] or [`Self::failed`].
     pub fn take(&mut self, now: Instant) -> Option<Batch> {
         self.due(now).filter(|due| *due <= now)?;
         let mut batch = std::mem::take(&mut self.waiting);
@@ -98,37 +97,37 @@ impl Outbox {
         Some(Batch(batch))
     }
 
-    /// The last try went well.
+    /// The last batch was sent.
     pub fn succeeded(&mut self) {
-        self.wait = self.persistence.retry;
+        self.delay = self.policy.first_delay;
         self.not_before = None;
     }
 
-    /// The last try failed. Gives back the entries that are given up.
+    /// A batch was not sent. Returns the entries that are given up.
     pub fn failed(&mut self, batch: Batch, failure: Failure, now: Instant) -> Vec<Entry> {
-        let patience = self.persistence.patience;
-        let end = |waiting: &Waiting| waiting.first_try.unwrap_or(now) + patience;
+        let give_up_after = self.policy.give_up_after;
+        let end = |waiting: &Waiting| waiting.first_try.unwrap_or(now) + give_up_after;
         let (given_up, kept): (Vec<_>, Vec<_>) = batch.0.into_iter().partition(|waiting| end(waiting) <= now);
         let newer = std::mem::replace(&mut self.waiting, kept);
         for waiting in newer {
             self.join(waiting.entry);
         }
-        if failure == Failure::Lasting {
-            self.wait = self.persistence.longest();
+        if failure == Failure::Permanent {
+            self.delay = self.policy.longest_delay();
         }
-        // The last try of an entry is at the end of its patience, not some time before.
+        // The last try of an entry is at the end of its time, not some time before.
         let last = self.waiting.iter().filter(|waiting| waiting.first_try.is_some()).map(end).min();
-        let next = now + self.wait;
+        let next = now + self.delay;
         self.not_before = Some(last.map_or(next, |last| next.min(last)));
-        self.wait = (self.wait * 2).min(self.persistence.longest());
+        self.delay = (self.delay * 2).min(self.policy.longest_delay());
         given_up.into_iter().map(|waiting| waiting.entry).collect()
     }
 
-    /// An older entry that goes with this one keeps its place; what is new has all of the patience before it.
+    /// Adds an entry. It replaces an older one about the same, at its place, and may be tried for the whole time again.
     fn join(&mut self, entry: Entry) {
-        match self.waiting.iter_mut().find(|waiting| waiting.entry.goes_with(&entry)) {
+        match self.waiting.iter_mut().find(|waiting| waiting.entry.is_about_the_same(&entry)) {
             Some(waiting) => {
-                waiting.entry.renew(entry);
+                waiting.entry.replace(entry);
                 waiting.first_try = None;
             }
             None => self.waiting.push(Waiting { entry, first_try: None }),
@@ -149,9 +148,9 @@ mod tests {
         Entry { notice: Notice { server, event, load: None, error: None, at: SystemTime::UNIX_EPOCH }, held_back: 0 }
     }
 
-    fn outbox(most: usize) -> Outbox {
-        let (retry, patience) = (Duration::from_secs(10), Duration::from_hours(1));
-        Outbox::new(Persistence { retry, patience, most })
+    fn outbox(max_waiting: usize) -> Outbox {
+        let (first_delay, give_up_after) = (Duration::from_secs(10), Duration::from_hours(1));
+        Outbox::new(RetryPolicy { first_delay, give_up_after, max_waiting })
     }
 
     /// The seconds of all tries until a mail is given up.
@@ -172,12 +171,12 @@ mod tests {
 
     #[test]
     fn delays_grow_for_an_hour_then_the_mail_is_given_up() {
-        assert_eq!(tries(Failure::Passing), [0, 10, 30, 70, 150, 310, 630, 1_230, 1_830, 2_430, 3_030, 3_600]);
+        assert_eq!(tries(Failure::Transient), [0, 10, 30, 70, 150, 310, 630, 1_230, 1_830, 2_430, 3_030, 3_600]);
     }
 
     #[test]
     fn what_will_hardly_pass_is_tried_seldom() {
-        assert_eq!(tries(Failure::Lasting), [0, 600, 1_200, 1_800, 2_400, 3_000, 3_600]);
+        assert_eq!(tries(Failure::Permanent), [0, 600, 1_200, 1_800, 2_400, 3_000, 3_600]);
     }
 
     #[test]
@@ -186,7 +185,7 @@ mod tests {
         let mut outbox = outbox(9);
         outbox.put(vec![entry(1, Event::NotResponding)]);
         let batch = outbox.take(now).unwrap();
-        outbox.failed(batch, Failure::Lasting, now);
+        outbox.failed(batch, Failure::Permanent, now);
         let later = outbox.due(now).unwrap();
         assert!(outbox.take(now).is_none(), "tried before it was due");
         assert!(outbox.take(later).is_some());
@@ -203,7 +202,7 @@ mod tests {
         outbox.put(vec![entry(1, Event::NotResponding), entry(2, Event::NotResponding)]);
         let batch = outbox.take(now).unwrap();
         outbox.put(vec![entry(3, Event::MaximumLoad), entry(1, Event::WorkingAgain)]);
-        outbox.failed(batch, Failure::Passing, now);
+        outbox.failed(batch, Failure::Transient, now);
         let later = outbox.due(now).unwrap();
         let entries: Vec<_> =
             outbox.take(later).unwrap().entries().map(|entry| (entry.notice.event, entry.held_back)).collect();

@@ -1,154 +1,67 @@
-//! Hands mails to the SMTP server, and says in plain words why one did not get there.
+//! Delivers e-mails to the SMTP server with lettre's connection, one step at a time, so that an error names its step.
 //!
-//! With a password the connection is encrypted before anything else: from its first byte where the server does so, else
-//! by STARTTLS. Who is trusted is read from the system for each mail, or from the file that `SSL_CERT_FILE` names.
+//! With a password the connection is encrypted before anything else is sent: from the first byte (implicit TLS), or by
+//! STARTTLS. Which authorities are trusted is read from the system for each e-mail.
 
-use std::error::Error as _;
+use std::error::Error;
+use std::fmt::Display;
+use std::net::SocketAddr;
 use std::time::Duration;
 
+use lettre::Message;
+use lettre::transport::smtp::Error as SmtpError;
 use lettre::transport::smtp::authentication::{Credentials, DEFAULT_MECHANISMS};
 use lettre::transport::smtp::client::{AsyncSmtpConnection, TlsParameters};
 use lettre::transport::smtp::commands::{Data, Mail, Rcpt};
 use lettre::transport::smtp::extension::ClientId;
+use rustls::pki_types::ServerName;
+use tokio::net::{TcpStream, lookup_host};
 use tokio::time::{Instant, timeout_at};
+use tokio_rustls::TlsConnector;
 
-use super::email::{Letter, Unwritable};
+use super::bounded_stream::BoundedStream;
+use super::mail_error::MailError;
 use crate::session::config::SessionConfig;
 use crate::shared::config::Secret;
+use crate::shared::http::tls;
 use crate::shared::run::one_line;
 
-/// The port whose connections are usually encrypted from their first byte.
+/// The port on which connections are usually encrypted from the first byte.
 const IMPLICIT_TLS_PORT: u16 = 465;
 const DEFAULT_PORT: u16 = 25;
 const DEFAULT_PORT_WITH_PASSWORD: u16 = 587;
 
-/// Why a mail did not get to the SMTP server. Each is one line that names the server.
-#[derive(Debug, thiserror::Error)]
-pub enum MailError {
-    /// A key without which no mail is sent is not set.
-    #[error("notifications are off: {0} is not set")]
-    Off(&'static str),
-    /// The mail can't be made.
-    #[error(transparent)]
-    Unwritable(#[from] Unwritable),
-    /// The SMTP server's name has no address.
-    #[error("{server}: the name can't be resolved: {reason}")]
-    Unresolved {
-        /// HOST:PORT of the SMTP server.
-        server: String,
-        /// What the system says.
-        reason: String,
-    },
-    /// No connection comes about.
-    #[error("{server}: can't connect: {reason}")]
-    Unreachable {
-        /// HOST:PORT of the SMTP server.
-        server: String,
-        /// What the system says.
-        reason: String,
-    },
-    /// The SMTP server's certificate is not to be trusted.
-    #[error("{server}: its certificate is not trusted: {reason} (SSL_CERT_FILE may name another authority)")]
-    Untrusted {
-        /// HOST:PORT of the SMTP server.
-        server: String,
-        /// What is wrong with the certificate.
-        reason: String,
-    },
-    /// The connection can't be encrypted.
-    #[error("{server}: no encrypted connection: {reason}")]
-    Unencrypted {
-        /// HOST:PORT of the SMTP server.
-        server: String,
-        /// What is missing.
-        reason: String,
-    },
-    /// The SMTP server doesn't know or like the user or the password.
-    #[error("{server}: wrong user or password, logging in as {user}: {reason}")]
-    Login {
-        /// HOST:PORT of the SMTP server.
-        server: String,
-        /// The user name.
-        user: String,
-        /// The SMTP server's words.
-        reason: String,
-    },
-    /// The SMTP server says no.
-    #[error("{server}: refuses {what}: {reason}")]
-    Refused {
-        /// HOST:PORT of the SMTP server.
-        server: String,
-        /// The connection, the login, the sender, the recipient, or the mail.
-        what: String,
-        /// The SMTP server's words.
-        reason: String,
-        /// Whether the SMTP server says so for good.
-        lasting: bool,
-    },
-    /// The connection broke.
-    #[error("{server}: the connection broke: {reason}")]
-    Broken {
-        /// HOST:PORT of the SMTP server.
-        server: String,
-        /// What was noticed.
-        reason: String,
-    },
-    /// The SMTP server is silent.
-    #[error("{server}: no answer within {} s", patience.as_secs_f64())]
-    Silent {
-        /// HOST:PORT of the SMTP server.
-        server: String,
-        /// How long it was waited for.
-        patience: Duration,
-    },
-}
-
-impl MailError {
-    /// Whether somebody has to do something before the next try can do better.
-    #[must_use]
-    pub fn is_lasting(&self) -> bool {
-        match self {
-            Self::Unresolved { .. } | Self::Unreachable { .. } | Self::Broken { .. } | Self::Silent { .. } => false,
-            Self::Refused { lasting, .. } => *lasting,
-            _ => true,
-        }
-    }
-}
-
-/// The SMTP server, and how it is talked to.
+/// The SMTP server that takes the e-mails.
 #[derive(Debug, Clone)]
 pub struct Relay {
     host: String,
     port: u16,
     implicit_tls: bool,
     login: Option<(String, Secret)>,
-    patience: Duration,
+    time_limit: Duration,
 }
 
 impl Relay {
-    /// What the configuration says.
+    /// The SMTP server of the configuration.
     ///
     /// # Errors
-    /// When a key without which no mail is sent is not set.
+    /// When a key without which no e-mail is sent is not set.
     pub fn new(config: &SessionConfig) -> Result<Self, MailError> {
         if config.administrator.is_none() {
             return Err(MailError::Off("administrator"));
         }
         let sender = config.mail_sender.as_ref().ok_or(MailError::Off("mailSender"))?;
         let host = config.mail_server.clone().ok_or(MailError::Off("mailServer"))?;
-        let login =
-            config.mail_sender_password.clone().filter(|password| !password.reveal().is_empty()).map(|password| {
-                let user = config.mail_sender_user.clone().filter(|user| !user.is_empty());
-                let user = user.unwrap_or_else(|| sender.bare().to_owned());
-                (user, password)
-            });
-        let usual = if login.is_some() { DEFAULT_PORT_WITH_PASSWORD } else { DEFAULT_PORT };
-        let port = config.mail_server_port.unwrap_or(usual);
+        let password = config.mail_sender_password.clone().filter(|password| !password.reveal().is_empty());
+        let user = config.mail_sender_user.clone().filter(|user| !user.is_empty());
+        let login = password.map(|password| (user.unwrap_or_else(|| sender.email.to_string()), password));
+        let default_port = if login.is_some() { DEFAULT_PORT_WITH_PASSWORD } else { DEFAULT_PORT };
+        let port = config.mail_server_port.unwrap_or(default_port);
         let implicit_tls = config.mail_server_implicit_tls.unwrap_or(port == IMPLICIT_TLS_PORT);
-        Ok(Self { host, port, implicit_tls, login, patience: config.timing.mail_answer })
+        Ok(Self { host, port, implicit_tls, login, time_limit: config.timing.mail_answer })
     }
 
-    /// How the connection is, in a word: `encrypted` or `not encrypted`.
+    /// `encrypted` or `not encrypted`.
     #[must_use]
     pub fn privacy(&self) -> &'static str {
         if self.login.is_some() || self.implicit_tls { "encrypted" } else { "not encrypted" }
@@ -160,131 +73,161 @@ impl Relay {
         format!("{}:{}", self.host, self.port)
     }
 
-    /// Hands over a mail, and gives back what the SMTP server said. Takes `timing.mailAnswer` at most.
+    /// Delivers an e-mail and returns the SMTP server's answer, within `timing.mailAnswer`.
     ///
     /// # Errors
-    /// When the SMTP server did not take it, or did not say so in time.
-    pub async fn deliver(&self, letter: &Letter) -> Result<String, MailError> {
-        let deadline = Instant::now() + self.patience;
-        let silent = || MailError::Silent { server: self.name(), patience: self.patience };
-        let mut line = timeout_at(deadline, self.connect()).await.map_err(|_| silent())??;
-        let handed_over = timeout_at(deadline, self.hand_over(&mut line, letter)).await;
-        // What is said to say good-bye can't change whether the mail was taken.
-        if timeout_at(deadline, line.abort()).await.is_err() {
-            log::debug!("{}: closed without a good-bye", self.name());
+    /// When the SMTP server does not take it, or does not say so in time.
+    pub async fn deliver(&self, message: &Message) -> Result<String, MailError> {
+        let deadline = Instant::now() + self.time_limit;
+        let late = || self.transient(&format!("no answer within {} s", self.time_limit.as_secs_f64()));
+        let mut connection = timeout_at(deadline, self.connect()).await.map_err(|_| late())??;
+        let sent = timeout_at(deadline, self.send(&mut connection, message)).await;
+        // The SMTP server has the e-mail or not, whatever it answers to QUIT.
+        if timeout_at(deadline, connection.abort()).await.is_err() {
+            log::debug!("{}: no answer to QUIT", self.name());
         }
-        handed_over.map_err(|_| silent())?
+        sent.map_err(|_| late())?
     }
 
     async fn connect(&self) -> Result<AsyncSmtpConnection, MailError> {
-        let addresses: Vec<_> = tokio::net::lookup_host((self.host.as_str(), self.port))
-            .await
-            .map_err(|error| MailError::Unresolved { server: self.name(), reason: one_line(&error.to_string()) })?
-            .collect();
+        let unresolved = |error| self.transient(&format!("the name can't be resolved: {error}"));
+        let unreachable = |error| self.transient(&format!("can't connect: {error}"));
+        let addresses = lookup_host((self.host.as_str(), self.port)).await.map_err(unresolved)?;
+        let stream = TcpStream::connect(addresses.collect::<Vec<_>>().as_slice()).await.map_err(unreachable)?;
+        let peer = stream.peer_addr().map_err(unreachable)?;
         let me = ClientId::default();
-        let implicit = if self.implicit_tls { Some(self.trust().await?) } else { None };
-        let mut line = AsyncSmtpConnection::connect_tokio1(addresses.as_slice(), None, &me, implicit, None)
-            .await
-            .map_err(|error| self.no_connection(&error))?;
-        if self.login.is_some() && !line.is_encrypted() {
-            if !line.can_starttls() {
-                line.abort().await;
-                let reason = "the server offers no STARTTLS, and a password is never sent over plain text".to_owned();
-                return Err(MailError::Unencrypted { server: self.name(), reason });
+        if self.implicit_tls {
+            return self.connect_with_tls(stream, peer, &me).await;
+        }
+        let stream = Box::new(BoundedStream::new(stream, peer));
+        let connected = AsyncSmtpConnection::connect_with_transport(stream, &me).await;
+        let mut connection = connected.map_err(|error| self.refused("the connection", &error))?;
+        if self.login.is_some() {
+            if !connection.can_starttls() {
+                connection.abort().await;
+                let reason = "the server offers no STARTTLS, and a password is never sent over plain text";
+                return Err(self.not_encrypted(reason));
             }
-            let trust = self.trust().await?;
-            line.starttls(trust, &me).await.map_err(|error| self.no_connection(&error))?;
+            let parameters = self.read_trusted(TlsParameters::new).await?.map_err(|error| self.not_encrypted(error))?;
+            let encrypted = connection.starttls(parameters, &me).await;
+            encrypted.map_err(|error| match error.status() {
+                Some(_) => self.refused("STARTTLS", &error),
+                None => self.no_tls(&error),
+            })?;
         }
-        Ok(line)
+        Ok(connection)
     }
 
-    /// Whom to trust. Read from the disk, and so in a thread of its own.
-    async fn trust(&self) -> Result<TlsParameters, MailError> {
+    async fn connect_with_tls(
+        &self,
+        stream: TcpStream,
+        peer: SocketAddr,
+        me: &ClientId,
+    ) -> Result<AsyncSmtpConnection, MailError> {
+        let config = self.read_trusted(|_| tls::client_config()).await?;
+        let connector = TlsConnector::from(config.ok_or_else(|| self.not_encrypted("TLS is off"))?);
+        let name = ServerName::try_from(self.host.clone()).map_err(|error| self.not_encrypted(error))?;
+        let stream = connector.connect(name, stream).await.map_err(|error| self.no_tls(&error))?;
+        let stream = Box::new(BoundedStream::new(stream, peer));
+        let connected = AsyncSmtpConnection::connect_with_transport(stream, me).await;
+        connected.map_err(|error| self.refused("the connection", &error))
+    }
+
+    /// Reads the trusted authorities from the disk, in a thread of its own.
+    async fn read_trusted<T: Send + 'static>(&self, read: fn(String) -> T) -> Result<T, MailError> {
         let host = self.host.clone();
-        let unencrypted = |reason| MailError::Unencrypted { server: self.name(), reason };
-        match actix_rt::task::spawn_blocking(|| TlsParameters::new(host)).await {
-            Ok(Ok(trust)) => Ok(trust),
-            Ok(Err(error)) => Err(unencrypted(error.to_string())),
-            Err(error) => Err(unencrypted(error.to_string())),
-        }
+        actix_rt::task::spawn_blocking(move || read(host)).await.map_err(|error| self.not_encrypted(error))
     }
 
-    async fn hand_over(&self, line: &mut AsyncSmtpConnection, letter: &Letter) -> Result<String, MailError> {
+    async fn send(&self, connection: &mut AsyncSmtpConnection, message: &Message) -> Result<String, MailError> {
         if let Some((user, password)) = &self.login {
             let credentials = Credentials::new(user.clone(), password.reveal().to_owned());
-            line.auth(DEFAULT_MECHANISMS, &credentials).await.map_err(|error| self.no_login(user, &error))?;
+            let login = connection.auth(DEFAULT_MECHANISMS, &credentials).await;
+            login.map_err(|error| self.login_failed(user, &error))?;
         }
-        let (from, to) = (&letter.from.mailbox().email, &letter.to.mailbox().email);
-        let no = |error: &lettre::transport::smtp::Error, what: String| self.refused(what, error);
-        let mail = Mail::new(Some(from.clone()), Vec::new());
-        line.command(mail).await.map_err(|error| no(&error, format!("the sender {from}")))?;
-        let recipient = Rcpt::new(to.clone(), Vec::new());
-        line.command(recipient).await.map_err(|error| no(&error, format!("the recipient {to}")))?;
-        line.command(Data).await.map_err(|error| no(&error, "the mail".to_owned()))?;
-        let answer = line.message(&letter.bytes).await.map_err(|error| no(&error, "the mail".to_owned()))?;
+        let sender = message.envelope().from();
+        let sent = connection.command(Mail::new(sender.cloned(), Vec::new())).await;
+        sent.map_err(|error| {
+            self.refused(sender.map(|sender| format!("the sender {sender}")).unwrap_or_default(), &error)
+        })?;
+        for recipient in message.envelope().to() {
+            let sent = connection.command(Rcpt::new(recipient.clone(), Vec::new())).await;
+            sent.map_err(|error| self.refused(format!("the recipient {recipient}"), &error))?;
+        }
+        connection.command(Data).await.map_err(|error| self.refused("the mail", &error))?;
+        let sent = connection.message(&message.formatted()).await;
+        let answer = sent.map_err(|error| self.refused("the mail", &error))?;
         Ok(one_line(answer.first_line().unwrap_or_default()))
     }
 
-    fn no_connection(&self, error: &lettre::transport::smtp::Error) -> MailError {
-        let server = self.name();
-        let reason = root(error);
-        match tls_fault(error) {
-            Some(rustls::Error::InvalidCertificate(_)) => MailError::Untrusted { server, reason },
-            Some(_) => MailError::Unencrypted { server, reason },
-            None if error.status().is_some() => self.refused("the connection".to_owned(), error),
-            None if error.is_response() => MailError::Broken { server, reason },
-            None => MailError::Unreachable { server, reason },
-        }
-    }
-
-    fn no_login(&self, user: &str, error: &lettre::transport::smtp::Error) -> MailError {
-        let server = self.name();
+    fn login_failed(&self, user: &str, error: &SmtpError) -> MailError {
         if error.is_permanent() {
-            MailError::Login { server, user: user.to_owned(), reason: answer(error) }
+            self.permanent(&format!("wrong user or password, logging in as {user}: {}", answer(error)))
         } else if error.is_client() {
-            MailError::Refused { server, what: "any login".to_owned(), reason: root(error), lasting: true }
+            self.permanent(&format!("refuses any login: {}", root(error)))
         } else {
             self.refused(format!("the login of {user}"), error)
         }
     }
 
-    fn refused(&self, what: String, error: &lettre::transport::smtp::Error) -> MailError {
-        let server = self.name();
-        if error.status().is_some() {
-            MailError::Refused { server, what, reason: answer(error), lasting: error.is_permanent() }
-        } else {
-            MailError::Broken { server, reason: root(error) }
+    /// The SMTP server refused a step, or the connection broke in it.
+    fn refused(&self, what: impl Display, error: &SmtpError) -> MailError {
+        match error.status() {
+            Some(_) => self.delivery(&format!("refuses {what}: {}", answer(error)), error.is_permanent()),
+            None => self.transient(&format!("the connection broke: {}", root(error))),
         }
+    }
+
+    fn no_tls(&self, error: &(dyn Error + 'static)) -> MailError {
+        let reason = root(error);
+        match tls_error(error) {
+            Some(rustls::Error::InvalidCertificate(_)) => self.permanent(&format!(
+                "its certificate is not trusted: {reason} (SSL_CERT_FILE may name another authority)"
+            )),
+            Some(_) => self.not_encrypted(reason),
+            None => self.transient(&format!("the connection broke: {reason}")),
+        }
+    }
+
+    fn not_encrypted(&self, reason: impl Display) -> MailError {
+        self.permanent(&format!("no encrypted connection: {reason}"))
+    }
+
+    fn permanent(&self, problem: &str) -> MailError {
+        self.delivery(problem, true)
+    }
+
+    fn transient(&self, problem: &str) -> MailError {
+        self.delivery(problem, false)
+    }
+
+    fn delivery(&self, problem: &str, permanent: bool) -> MailError {
+        MailError::Delivery { server: self.name(), problem: one_line(problem), permanent }
     }
 }
 
-/// What the SMTP server answered: its code and its words.
-fn answer(error: &lettre::transport::smtp::Error) -> String {
+/// The SMTP server's answer: its code and its words.
+fn answer(error: &SmtpError) -> String {
     let code = error.status().map(|code| format!("{code} ")).unwrap_or_default();
     format!("{code}{}", root(error))
 }
 
-/// The innermost cause, in one line.
-fn root(error: &lettre::transport::smtp::Error) -> String {
-    let mut cause: &dyn std::error::Error = error;
-    while let Some(inner) = cause.source() {
-        cause = inner;
-    }
-    one_line(&cause.to_string())
+/// An error and its causes.
+fn chain<'error>(error: &'error (dyn Error + 'static)) -> impl Iterator<Item = &'error (dyn Error + 'static)> {
+    std::iter::successors(Some(error), |error| (*error).source())
 }
 
-/// The TLS fault behind an error.
-fn tls_fault(error: &lettre::transport::smtp::Error) -> Option<&rustls::Error> {
-    let mut cause = error.source();
-    while let Some(error) = cause {
+/// The words of the innermost cause.
+fn root(error: &(dyn Error + 'static)) -> String {
+    chain(error).last().unwrap_or(error).to_string()
+}
+
+/// The TLS error among the causes of an error.
+fn tls_error<'error>(error: &'error (dyn Error + 'static)) -> Option<&'error rustls::Error> {
+    chain(error).find_map(|error| {
         let inside = error.downcast_ref::<std::io::Error>().and_then(std::io::Error::get_ref);
-        let fault = inside.and_then(|inside| inside.downcast_ref()).or_else(|| error.downcast_ref());
-        if fault.is_some() {
-            return fault;
-        }
-        cause = error.source();
-    }
-    None
+        inside.and_then(|inside| inside.downcast_ref()).or_else(|| error.downcast_ref())
+    })
 }
 
 #[cfg(test)]
