@@ -40,19 +40,19 @@
 //!
 //! simulation server
 //!
-//!   routes --- Census --> Places <-- Census -- LoadMonitor --> monitor.csv
-//!     | one per WebSocket  ^  |                     '-- Readings (watch channel) --> routes
-//!   WebClient -- Ask -----'   |
-//!     ^  ^------- PlaceEvent -'
+//!   routes - GetSnapshot -> Places <- GetSnapshot - LoadMonitor --> monitor.csv
+//!     | one per WebSocket   ^  |                      '-- Readings (watch channel) --> routes
+//!   WebClient - Ticket -----'  |
+//!     ^  ^------- PlaceEvent --'
 //!     |  |--- checkout (a task on the main thread, shared by all who want the same world) --> git
-//!     |  '--- starts ---> Webots (one per simulation) --> guardian process --> Webots' process tree
+//!     |  '--- starts ---> Webots (one per simulation) --> Webots' process group
 //!     '------ WebotsEvent ---'
 //! ```
 //!
 //! The [`session::fleet::Registry`] alone decides availability: it hears of every report and of every pick.
 //! A [`simulation::webots::Webots`] owns its process group, its folder and its place through guards, so that leaving in any
-//! state, even by a panic, frees all three. Whatever the simulation server starts runs below a
-//! [`simulation::process::guardian`], which ends it when the server is gone in whatever way.
+//! state, even by a panic, frees all three. One [`simulation::process::guardian`] process ends everything that the
+//! simulation server has started when the server is gone in whatever way.
 //!
 //! # What ends, and what is started again
 //!

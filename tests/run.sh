@@ -15,7 +15,7 @@ PATH=$PATH:/usr/sbin
 # fleet is tested behind both web servers, by a real browser too, and its package and the guide to it in a Debian that
 # debootstrap makes.
 tests/install.sh cc=gcc,libc6-dev git=git git-lfs=git-lfs flock=util-linux openssl=openssl python3=python3 python3-venv=python3-venv \
-    xvfb-run=xvfb,xauth apache2=apache2-bin nginx=nginx setpriv=util-linux chromium=chromium \
+    Xvfb=xvfb apache2=apache2-bin nginx=nginx setpriv=util-linux chromium=chromium \
     debootstrap=debootstrap dpkg-shlibdeps=dpkg-dev desktop-file-validate=desktop-file-utils xhost=x11-xserver-utils \
     systemd-analyze=systemd ip=iproute2
 tests/python.sh >/dev/null

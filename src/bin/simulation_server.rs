@@ -26,15 +26,15 @@ struct Arguments {
 /// Parts of the server that are processes of their own.
 #[derive(clap::Subcommand)]
 enum Part {
-    /// Used by the server itself: runs a program and ends with it
+    /// Used by the server itself: ends the simulations when the server is gone
     #[command(hide = true)]
-    Guard(guardian::Orders),
+    Guard(guardian::Arguments),
 }
 
 fn main() -> ExitCode {
     let arguments = Arguments::parse();
-    if let Some(Part::Guard(orders)) = &arguments.part {
-        return ExitCode::from(guardian::guard(orders));
+    if let Some(Part::Guard(arguments)) = &arguments.part {
+        return ExitCode::from(guardian::guard(arguments));
     }
     let loaded = match start::read::<SimulationConfig>(&arguments.config) {
         Ok(loaded) => loaded,

@@ -12,7 +12,7 @@ use tokio::sync::watch;
 
 use super::announcer::Announcer;
 use super::config::SimulationConfig;
-use super::places::{Census, Places};
+use super::places::{GetSnapshot, Places};
 use super::state::AppState;
 use crate::shared::domain::Rules;
 use crate::shared::http::BasicAuth;
@@ -29,8 +29,7 @@ use crate::simulation::checkout::RepositoryCache;
 use crate::simulation::client::outcome;
 use crate::simulation::machine::LoadMonitor;
 use crate::simulation::machine::UsageMonitor;
-use crate::simulation::process::{RunDir, Swept};
-use crate::simulation::process::{orphans, process_group, process_tree};
+use crate::simulation::process::{Guardian, Leftovers, RunDir, process_tree};
 use crate::simulation::web::configure;
 
 /// Why the server ends with an error.
@@ -93,8 +92,6 @@ impl Assembly {
     /// When the server can't start.
     pub fn new(config: SimulationConfig) -> Result<Self, AppError> {
         let signals = Signals::catch()?;
-        orphans::adopt()?;
-        actix_rt::spawn(orphans::watch());
         let (phase_sender, phase) = watch::channel(Phase::Open);
         let (requests, asked) = tokio::sync::mpsc::channel(4);
         let socket = bind(&config)?;
@@ -115,7 +112,7 @@ impl Assembly {
 /// When an actor that must live has stopped, or the system refuses what the server needs.
 pub async fn serve(assembly: Assembly) -> Result<(), AppError> {
     let Assembly { server, socket, mut signals, phase: phase_sender, mut asked } = assembly;
-    let _last_will = process_group::remove_in_the_end(server.run.path())?;
+    let _guardian = Guardian::start(server.run.path())?;
     let shared = web::Data::from(Arc::clone(&server));
     let sockets = Arc::new(Sockets::new(
         server.config.max_clients.saturating_mul(2),
@@ -137,7 +134,7 @@ pub async fn serve(assembly: Assembly) -> Result<(), AppError> {
     start::announce("simulation server", &address, server.config.ssl, "/client", port);
     let places = server.places.clone();
     let asked_for_life = places.clone();
-    actix_rt::spawn(notify::feed_watchdog(async move || asked_for_life.send(Census).await.is_ok()));
+    actix_rt::spawn(notify::feed_watchdog(async move || asked_for_life.send(GetSnapshot).await.is_ok()));
     let mut no_places = std::pin::pin!(permanent::stopped("Places", places.clone()));
     let mut no_readings = std::pin::pin!(permanent::stopped("LoadMonitor", server.load_monitor.clone()));
     // `webots-fleet-renew` tells by this text whether a server was drained or stopped.
@@ -185,9 +182,10 @@ fn assemble(
 ) -> Result<AppState, AppError> {
     let folder = config.cache_dir.0.clone();
     let cache_fault = |source| AppError::Cache { folder: folder.clone(), source };
-    let (run, swept) = RunDir::open(&folder).map_err(cache_fault)?;
-    if swept != Swept::default() {
-        log::warn!("removed what {} earlier runs had left, {} processes among it", swept.runs, swept.processes);
+    let (run, leftovers) = RunDir::open(&folder).map_err(cache_fault)?;
+    if leftovers != Leftovers::default() {
+        let Leftovers { runs, processes } = leftovers;
+        log::warn!("removed what {runs} earlier runs had left, {processes} processes among it");
     }
     let git = Git::new(run.path()).map_err(cache_fault)?;
     let cache = RepositoryCache::open(&folder, config.cache_size << 20).map_err(cache_fault)?;
@@ -241,16 +239,15 @@ async fn drained(server: &AppState) {
 
 /// Waits until there is no simulation, and nobody waits for one.
 async fn empty(places: &Addr<Places>) {
-    while places.send(Census).await.is_ok_and(|census| !census.simulations.is_empty()) {
+    while places.send(GetSnapshot).await.is_ok_and(|snapshot| !snapshot.simulations.is_empty()) {
         actix_rt::time::sleep(POLL_INTERVAL).await;
     }
 }
 
-/// Kills the processes of all simulations, also those whose guardian does not.
+/// Kills the processes of all simulations.
 async fn kill_all(run: PathBuf) {
     let end = move || {
         let count = process_tree::kill_marked(&run);
-        orphans::end_all();
         log::error!("ended {count} processes that had not ended in time");
     };
     actix_rt::time::timeout(KILL_TIMEOUT, actix_rt::task::spawn_blocking(end)).await.ok();

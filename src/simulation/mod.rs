@@ -2,7 +2,6 @@
 
 mod announcer;
 pub mod app;
-pub mod census;
 pub mod checkout;
 pub mod client;
 pub mod config;
@@ -11,6 +10,7 @@ pub mod places;
 pub mod preflight;
 pub mod process;
 pub mod protocol;
+pub mod snapshot;
 pub mod state;
 mod web;
 pub mod webots;

@@ -1,47 +1,44 @@
-//! Actor: lends places to simulations, keeps the waiting line, and knows who is here.
+//! Actor: lends places to simulations, keeps the waiting line, and knows all simulations of this server.
 //!
-//! One for the whole server, created at start; it never ends. A place is a streaming port. Whoever wants one gets a
-//! [`Ticket`] at once and then hears how many are ahead, until a port is granted. Dropping the ticket leaves the line
-//! or frees the port, so that it can't be forgotten in any state or by any panic.
+//! One for the whole server, created at start; it never ends. A place is a streaming port. Whoever wants one makes a
+//! [`Ticket`] and then hears how many are ahead, until a port is granted. Dropping the ticket leaves the line or frees
+//! the port, so that neither is lost in any state or by any panic.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::io::ErrorKind;
 use std::net::{Ipv4Addr, Ipv6Addr, TcpListener};
 use std::ops::RangeInclusive;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
 use actix::prelude::*;
 
-use super::census::{Change, Everybody, Simulation, Stage};
+use super::snapshot::{Change, Simulation, Snapshot, Stage};
 use crate::shared::domain::Instances;
 use crate::shared::run::seconds_since_1970;
 
-/// Asks for a place.
+/// Asks for a place, in the name of a ticket.
 #[derive(Message)]
-#[rtype(result = "Result<Ticket, Refused>")]
-pub struct Ask {
-    /// Who wants to know when there is one.
-    pub client: Recipient<PlaceEvent>,
-    /// The world's URL, to show who is here.
-    pub world: String,
+#[rtype(result = "()")]
+struct Acquire {
+    id: u64,
+    client: Recipient<PlaceEvent>,
+    world: String,
 }
 
-/// No place is given.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub enum Refused {
-    /// Everything is taken, the waiting line too.
-    #[error(
-        "All {places} places of this simulation server are taken, and {waiting} clients are waiting already. Try again later"
-    )]
-    Full {
-        /// Places in all.
-        places: usize,
-        /// Length of the waiting line.
-        waiting: usize,
-    },
+/// Why there is no place: everything is taken, the waiting line too. The words are for the client.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[error(
+    "All {places} places of this simulation server are taken, and {waiting} clients are waiting already. Try again later"
+)]
+pub struct Full {
+    /// Places in all.
+    pub places: usize,
+    /// Length of the waiting line.
+    pub waiting: usize,
 }
 
-/// What the one who asked hears.
+/// What the holder of a ticket hears.
 #[derive(Message, Debug, Clone, Copy, PartialEq, Eq)]
 #[rtype(result = "()")]
 pub enum PlaceEvent {
@@ -49,6 +46,8 @@ pub enum PlaceEvent {
     Ahead(usize),
     /// This port may be used as long as the ticket lives.
     Granted(u16),
+    /// There is no room in the waiting line either.
+    Refused(Full),
 }
 
 /// A place, or a place in the line for one. Dropping it gives it back.
@@ -58,28 +57,29 @@ pub struct Ticket {
     places: Addr<Places>,
 }
 
-/// Tells what a simulation is doing, to show it.
+/// Tells what has changed in a simulation.
 #[derive(Message)]
 #[rtype(result = "()")]
-pub struct Update {
+struct Update {
     id: u64,
     change: Change,
 }
 
-/// Asks who is here.
+/// Asks for a snapshot of all simulations.
 #[derive(Message)]
-#[rtype(result = "Everybody")]
-pub struct Census;
+#[rtype(result = "Snapshot")]
+pub struct GetSnapshot;
 
 #[derive(Message)]
 #[rtype(result = "()")]
-struct Leave(u64);
+struct Release(u64);
 
 /// The actor.
 pub struct Places {
     ports: RangeInclusive<u16>,
     longest_line: usize,
-    last: u64,
+    /// How many tickets there were, also of clients that were refused.
+    arrivals: u64,
     present: BTreeMap<u64, Present>,
     line: VecDeque<Waiting>,
 }
@@ -96,14 +96,14 @@ struct Waiting {
     told: Option<usize>,
 }
 
-/// Between two looks for a port that somebody outside of this server has taken.
-const LOOK_AGAIN: Duration = Duration::from_secs(1);
+/// Time between two checks whether a port is free again that somebody outside of this server has taken.
+const RECHECK: Duration = Duration::from_secs(1);
 
 impl Places {
     /// Lends these ports; `longest_line` clients may wait.
     #[must_use]
     pub fn new(ports: RangeInclusive<u16>, longest_line: usize) -> Self {
-        Self { ports, longest_line, last: 0, present: BTreeMap::new(), line: VecDeque::new() }
+        Self { ports, longest_line, arrivals: 0, present: BTreeMap::new(), line: VecDeque::new() }
     }
 
     /// Gives free places to those who wait, and tells the others how many are ahead.
@@ -114,7 +114,7 @@ impl Places {
         {
             match first.client.try_send(PlaceEvent::Granted(port)) {
                 Ok(()) => self.lend(first.id, port),
-                // It is told at the next look, and nobody passes it.
+                // It is told at the next check, and nobody passes it.
                 Err(SendError::Full(_)) => {
                     self.line.push_front(first);
                     break;
@@ -155,7 +155,7 @@ impl Places {
             idle: count(&[Stage::Idle, Stage::Stopping]),
             running: count(&[Stage::Running]),
             places: u32::try_from(self.ports.len()).unwrap_or(u32::MAX),
-            arrivals: self.last,
+            arrivals: self.arrivals,
         }
     }
 }
@@ -171,23 +171,23 @@ impl Actor for Places {
     type Context = Context<Self>;
 
     fn started(&mut self, ctx: &mut Self::Context) {
-        ctx.run_interval(LOOK_AGAIN, |places, _| places.serve());
+        ctx.run_interval(RECHECK, |places, _| places.serve());
     }
 }
 
-impl Handler<Ask> for Places {
-    type Result = Result<Ticket, Refused>;
+impl Handler<Acquire> for Places {
+    type Result = ();
 
-    fn handle(&mut self, ask: Ask, ctx: &mut Self::Context) -> Self::Result {
-        self.last += 1;
+    fn handle(&mut self, Acquire { id, client, world }: Acquire, _: &mut Self::Context) {
+        self.arrivals += 1;
         let free = self.line.is_empty() && self.free_port().is_some();
         if !free && self.line.len() >= self.longest_line {
-            return Err(Refused::Full { places: self.ports.len(), waiting: self.line.len() });
+            let full = Full { places: self.ports.len(), waiting: self.line.len() };
+            return client.do_send(PlaceEvent::Refused(full));
         }
-        let id = self.last;
         let shown = Simulation {
             id,
-            world: ask.world,
+            world,
             stage: Stage::Queued,
             since: seconds_since_1970(),
             launched: None,
@@ -198,16 +198,15 @@ impl Handler<Ask> for Places {
             log_begin: 0,
         };
         self.present.insert(id, Present { lent: None, shown });
-        self.line.push_back(Waiting { id, client: ask.client, told: None });
+        self.line.push_back(Waiting { id, client, told: None });
         self.serve();
-        Ok(Ticket { id, places: ctx.address() })
     }
 }
 
-impl Handler<Leave> for Places {
+impl Handler<Release> for Places {
     type Result = ();
 
-    fn handle(&mut self, Leave(id): Leave, _: &mut Self::Context) {
+    fn handle(&mut self, Release(id): Release, _: &mut Self::Context) {
         self.present.remove(&id);
         self.line.retain(|waiting| waiting.id != id);
         self.serve();
@@ -225,17 +224,28 @@ impl Handler<Update> for Places {
     }
 }
 
-impl Handler<Census> for Places {
-    type Result = Everybody;
+impl Handler<GetSnapshot> for Places {
+    type Result = Snapshot;
 
-    fn handle(&mut self, _: Census, _: &mut Self::Context) -> Everybody {
+    fn handle(&mut self, _: GetSnapshot, _: &mut Self::Context) -> Snapshot {
         let simulations = self.present.values().map(|one| one.shown.clone()).collect();
-        Everybody { instances: self.instances(), simulations }
+        Snapshot { instances: self.instances(), simulations }
     }
 }
 
+/// The number of the next ticket.
+static NEXT: AtomicU64 = AtomicU64::new(1);
+
 impl Ticket {
-    /// Tells what the simulation is doing.
+    /// Gets into the line for a place. `client` hears what comes of it, `world` is the URL that is shown.
+    #[must_use]
+    pub fn new(places: &Addr<Places>, client: Recipient<PlaceEvent>, world: String) -> Self {
+        let id = NEXT.fetch_add(1, Ordering::Relaxed);
+        places.do_send(Acquire { id, client, world });
+        Self { id, places: places.clone() }
+    }
+
+    /// Tells what has changed in the simulation.
     pub fn update(&self, change: Change) {
         // The actor lives as long as the server; without it there is nothing to show.
         self.places.do_send(Update { id: self.id, change });
@@ -244,6 +254,6 @@ impl Ticket {
 
 impl Drop for Ticket {
     fn drop(&mut self) {
-        self.places.do_send(Leave(self.id));
+        self.places.do_send(Release(self.id));
     }
 }

@@ -38,7 +38,7 @@ pub fn check(config: &SimulationConfig) -> Vec<Finding> {
             topic: "git-lfs",
             result: version(&["git-lfs", "--version"], "git-lfs is not there: large files of Git LFS will be missing"),
         },
-        Finding { topic: "xvfb-run", result: xvfb_run(config) },
+        Finding { topic: "Xvfb", result: xvfb(config) },
     ]
 }
 
@@ -66,22 +66,19 @@ fn display(config: &SimulationConfig) -> Result<String, String> {
         (None, Some(_)) => "the environment variable DISPLAY names it",
         (None, None) => "DISPLAY is not set, and the configuration names no display",
     };
-    match display::look(&display) {
+    match display::check(&display) {
         Ok(()) => Ok(format!("{display} answers ({source})")),
         Err(trouble) => Err(format!("{trouble} ({source})")),
     }
 }
 
-fn xvfb_run(config: &SimulationConfig) -> Result<String, String> {
-    // It is a script that needs the other two.
-    let missing = ["xvfb-run", "Xvfb", "xauth"].into_iter().find(|program| in_path(program).is_none());
-    match (missing, in_path("xvfb-run")) {
-        (Some(missing), _) if config.xvfb => Err(format!(
-            "{missing} is not there, but xvfb is true: no Webots can start. On Debian and Ubuntu the packages xvfb and \
-             xauth have it"
-        )),
-        (_, Some(program)) => Ok(program.display().to_string()),
-        (_, None) => Ok("it is not there, and not needed: xvfb is false".to_owned()),
+fn xvfb(config: &SimulationConfig) -> Result<String, String> {
+    match in_path("Xvfb") {
+        Some(program) => Ok(program.display().to_string()),
+        None if config.xvfb => Err("it is not there, but xvfb is true: no Webots can start. On Debian and Ubuntu the \
+                                    package xvfb has it"
+            .to_owned()),
+        None => Ok("it is not there, and not needed: xvfb is false".to_owned()),
     }
 }
 

@@ -94,8 +94,8 @@ impl AppState {
     /// # Errors
     /// When it is not there, or `xvfb-run` is missing; in words for the client.
     pub fn webots_program(&self) -> Result<PathBuf, String> {
-        if self.config.xvfb && which("xvfb-run").is_err() {
-            return Err("This simulation server gives each Webots a display of its own (xvfb), but has no xvfb-run. \
+        if self.config.xvfb && which("Xvfb").is_err() {
+            return Err("This simulation server gives each Webots a display of its own (xvfb), but has no Xvfb. \
                         Its administrator can install it, or set xvfb: false and display"
                 .to_owned());
         }

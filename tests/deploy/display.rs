@@ -3,7 +3,7 @@
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
 
-use webots_fleet::simulation::machine::display::{Trouble, look};
+use webots_fleet::simulation::machine::display::{DisplayError, check};
 
 use crate::support::{display, needs};
 
@@ -55,17 +55,17 @@ async fn an_open_display_is_told_from_one_that_refuses_and_one_that_is_gone() {
     let _alone = display::alone().await;
     let folder = tempfile::tempdir().unwrap();
     let open = Xvfb::start(None);
-    assert_eq!(look(&open.display), Ok(()));
+    assert_eq!(check(&open.display), Ok(()));
     let gone = open.display.clone();
     drop(open);
-    assert_eq!(look(&gone), Err(Trouble::NoServer(gone.clone())));
-    let words = Trouble::NoServer(gone).to_string();
+    assert_eq!(check(&gone), Err(DisplayError::NoServer(gone.clone())));
+    let words = DisplayError::NoServer(gone).to_string();
     assert!(words.contains("Xvfb") && words.contains("nvidia-xconfig --allow-empty-initial-configuration"), "{words}");
 
     let cookies = authority(folder.path());
     let locked = Xvfb::start(Some(&cookies));
-    match look(&locked.display) {
-        Err(trouble @ Trouble::Refused { .. }) => {
+    match check(&locked.display) {
+        Err(trouble @ DisplayError::Refused { .. }) => {
             let words = trouble.to_string();
             assert!(words.contains("Authorization required"), "{words}");
             assert!(words.contains("xhost +si:localuser:"), "{words}");
@@ -81,13 +81,13 @@ async fn a_display_that_refuses_is_opened_by_what_is_told() {
     let cookies = authority(folder.path());
     let locked = Xvfb::start(Some(&cookies));
     needs("xhost", "x11-xserver-utils");
-    let words = look(&locked.display).unwrap_err().to_string();
+    let words = check(&locked.display).unwrap_err().to_string();
     let told = words.split("run '").nth(1).and_then(|rest| rest.split('\'').next()).unwrap();
     let mut xhost = Command::new("sh");
     xhost.args(["-c", told]).env("DISPLAY", &locked.display).env("XAUTHORITY", &cookies);
     let output = xhost.output().unwrap();
     assert!(output.status.success(), "{told}: {}", String::from_utf8_lossy(&output.stderr));
-    assert_eq!(look(&locked.display), Ok(()));
+    assert_eq!(check(&locked.display), Ok(()));
 }
 
 #[actix_rt::test]

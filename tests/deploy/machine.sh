@@ -16,7 +16,7 @@ readonly WORK=$PWD/target/deploy
 readonly ROOT=$WORK/$DISTRIBUTION
 readonly PACKAGES=systemd,systemd-sysv,libpam-systemd,dbus,dbus-user-session,sudo,adduser,ca-certificates,openssl,curl
 # What is installed later, in machines that can't reach the internet.
-readonly LATER=(git git-lfs xvfb xauth ufw nginx apache2 certbot needrestart)
+readonly LATER=(git git-lfs xvfb ufw nginx apache2 certbot needrestart)
 
 fail() {
     printf 'error: %s\n' "$*" >&2

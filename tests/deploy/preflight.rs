@@ -33,7 +33,7 @@ fn path(folder: &Path) -> impl FnOnce(&mut Command) {
 #[test]
 fn nothing_is_warned_about_where_all_is_there() {
     let (webots, programs) = (Webots::script("exit 0"), tempfile::tempdir().unwrap());
-    for program in ["git-lfs", "xvfb-run"] {
+    for program in ["git-lfs", "Xvfb"] {
         symlink(webots.path(), programs.path().join(program)).unwrap();
     }
     let echo = Webots::script("echo \"git version 2.39.5 $*\"");
@@ -48,7 +48,7 @@ fn nothing_is_warned_about_where_all_is_there() {
     assert_eq!(config["xvfb"], true);
     let expected = format!(
         "webots: {}\ndisplay: each Webots gets a virtual display of its own (xvfb), without the graphics card\n\
-         git: git version 2.39.5 --version\ngit-lfs: git version 2.39.5 --version\nxvfb-run: {}/xvfb-run\n",
+         git: git version 2.39.5 --version\ngit-lfs: git version 2.39.5 --version\nXvfb: {}/Xvfb\n",
         webots.path().display(),
         programs.path().display()
     );
@@ -64,14 +64,14 @@ fn what_is_missing_is_warned_about() {
         "warning: webots: there is no program /nowhere/webots; webotsHome is the folder that Webots is installed in\n",
         "warning: git: git is not there: no world can be checked out\n",
         "warning: git-lfs: git-lfs is not there: large files of Git LFS will be missing\n",
-        "warning: xvfb-run: xvfb-run is not there, but xvfb is true: no Webots can start.",
+        "warning: Xvfb: it is not there, but xvfb is true: no Webots can start.",
     ] {
         assert!(told.contains(words), "{words} is not in\n{told}");
     }
     let (_, told) = check(&json!({"display": ":59000"}), path(empty.path()));
     for words in [
         "warning: webots: neither webotsHome nor the environment variable WEBOTS_HOME is set\n",
-        "xvfb-run: it is not there, and not needed: xvfb is false\n",
+        "Xvfb: it is not there, and not needed: xvfb is false\n",
     ] {
         assert!(told.contains(words), "{words} is not in\n{told}");
     }

@@ -21,7 +21,7 @@ const SESSION: [&str; 8] = [
     "session::app",
 ];
 const SIMULATION: [&str; 14] = [
-    "simulation::census",
+    "simulation::snapshot",
     "simulation::places",
     "simulation::protocol",
     "simulation::process",

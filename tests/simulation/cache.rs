@@ -194,38 +194,6 @@ async fn tidying_up_that_takes_long_holds_nobody_up_for_long_and_is_not_tried_ag
 }
 
 #[actix_rt::test]
-async fn mending_hurts_nobody_who_uses_what_is_damaged() {
-    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
-    let cache = tempfile::tempdir().unwrap();
-    let start = || {
-        let builder = simulation_server(&webots.path(), forge.path(), 2);
-        builder.set("cacheDir", cache.path().to_str().unwrap()).start()
-    };
-    let (one, other) = (start().await, start().await);
-    let mut running = Client::start(&one, &arm()).await;
-    running.until("webots:").await;
-    let repositories = || {
-        let entries = std::fs::read_dir(cache.path().join("git")).unwrap().flatten().map(|entry| entry.path());
-        entries.filter(|path| path.is_dir()).collect::<Vec<_>>()
-    };
-    let damaged = repositories().remove(0);
-    std::fs::write(damaged.join("objects/pack/pack-0123456789012345678901234567890123456789.idx"), "noise").unwrap();
-    std::fs::write(damaged.join("objects/pack/pack-0123456789012345678901234567890123456789.pack"), "noise").unwrap();
-    for reference in std::fs::read_dir(damaged.join("refs/fleet")).unwrap().flatten() {
-        std::fs::write(reference.path(), "").unwrap();
-    }
-    let mut late = Client::start(&other, &arm()).await;
-    late.until("webots:").await;
-    assert!(damaged.exists() && repositories().len() == 2, "it was removed from below a running simulation");
-    late.leave().await;
-    running.leave().await;
-    // Whoever tidies up next removes it.
-    drop((one, other));
-    let _next = start().await;
-    until("it is gone", async || !damaged.exists()).await;
-}
-
-#[actix_rt::test]
 async fn a_remote_that_fails_has_the_cache_examined_once_in_three_minutes() {
     let (forge, webots) = (Forge::with_arm(), reader());
     let fails = tempfile::tempdir().unwrap();

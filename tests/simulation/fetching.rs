@@ -2,14 +2,11 @@
 
 use std::path::{Path, PathBuf};
 
-use nix::sys::signal::Signal;
-
 use super::checkout::{outcome, reader, world_text};
 use super::git_wrapper::GitWrapper;
-use super::scene::{nothing_left, stages};
 use crate::support::client::Client;
 use crate::support::git::{Forge, git, world};
-use crate::support::program::{Server, simulation_server};
+use crate::support::program::simulation_server;
 use crate::support::until;
 
 /// A forge with `lab/arm`: each of these branches has two worlds that name it.
@@ -22,114 +19,9 @@ fn forge(branches: &[&str]) -> Forge {
     forge
 }
 
-/// Waits until no more than so many simulations are left.
-async fn gone_but_for(server: &Server, others: usize) {
-    until("it has gone", async || stages(server).await.len() == others).await;
-}
-
 fn repositories(cache: &Path) -> Vec<PathBuf> {
     let entries = std::fs::read_dir(cache.join("git")).unwrap().flatten().map(|entry| entry.path());
     entries.filter(|path| path.is_dir()).collect()
-}
-
-#[actix_rt::test]
-async fn a_fetch_that_hangs_holds_up_nobody_else_who_uses_its_repository() {
-    let branches = ["main", "slow", "one", "two", "three"];
-    let (forge, webots) = (forge(&branches), reader());
-    let cache = tempfile::tempdir().unwrap();
-    let hangs = cache.path().join("hangs");
-    std::fs::write(&hangs, "").unwrap();
-    let wrapper = GitWrapper::new(&format!(
-        "case \"$*\" in *fetch*refs/heads/slow:*) while [ -e {} ]; do sleep 0.05; done;; esac",
-        hangs.display()
-    ));
-    let start = || {
-        let builder = simulation_server(&webots.path(), forge.path(), 4).env("PATH", &wrapper.path());
-        builder.set("cacheDir", cache.path().to_str().unwrap()).start()
-    };
-    let (one, other) = (start().await, start().await);
-    let main = world("lab/arm", "main", "worlds/a.wbt");
-    assert!(outcome(&one, &main).await.contains("opened [main]"));
-    let fetches =
-        |branch: &str| wrapper.calls().iter().filter(|call| call.contains(&format!("heads/{branch}:"))).count();
-    let mut stuck = Client::start(&one, &world("lab/arm", "slow", "worlds/a.wbt")).await;
-    until("it hangs", async || fetches("slow") == 1).await;
-    // Other branches, be they cached or not, and a commit that is cached.
-    let commit = git(&forge.path().join("lab/arm"), &["rev-parse", "main"]);
-    for (server, name, text) in [
-        (&one, "one", "one"),
-        (&other, "two", "two"),
-        (&one, "main", "main"),
-        (&other, "main", "main"),
-        (&one, commit.trim(), "main"),
-        (&other, commit.trim(), "main"),
-    ] {
-        let told = outcome(server, &world("lab/arm", name, "worlds/a.wbt")).await;
-        assert!(told.contains(&format!("opened [{text}]")), "{name}: {told}");
-    }
-    // The same commit is fetched once, for worlds and servers that differ, also when the first has left.
-    let mut heirs = [
-        Client::start(&one, &world("lab/arm", "slow", "worlds/b.wbt")).await,
-        Client::start(&other, &world("lab/arm", "slow", "worlds/b.wbt")).await,
-    ];
-    for heir in &mut heirs {
-        heir.until("loading: looking for").await;
-    }
-    assert!(outcome(&one, &world("lab/arm", "three", "worlds/a.wbt")).await.contains("opened [three]"));
-    assert_eq!(fetches("slow"), 1, "{:#?}", wrapper.calls());
-    stuck.send("nothing that is known").await;
-    stuck.until("loading: Error:").await;
-    gone_but_for(&one, 1).await;
-    std::fs::remove_file(&hangs).unwrap();
-    for heir in &mut heirs {
-        let told = heir.until("loading: Error:").await;
-        assert!(told.contains("opened [slow]"), "{told}");
-    }
-    assert_eq!(fetches("slow"), 1, "{:#?}", wrapper.calls());
-    for server in [&one, &other] {
-        nothing_left(server, 4).await;
-    }
-    // The cache is in order, has all five commits, and no rest of the fetches.
-    let repository = repositories(cache.path()).remove(0);
-    git(&repository, &["fsck", "--full"]);
-    assert_eq!(std::fs::read_dir(repository.join("refs/fleet")).unwrap().count(), branches.len());
-    let rests = || std::fs::read_dir(repository.join("quarantine")).unwrap().count();
-    until("what fetches have left is gone", async || rests() == 0).await;
-}
-
-#[actix_rt::test]
-async fn who_waits_for_the_fetch_of_a_server_that_is_killed_takes_over() {
-    let (forge, webots, cache) = (forge(&["main"]), reader(), tempfile::tempdir().unwrap());
-    let start = |wrapper: &GitWrapper| {
-        let builder = simulation_server(&webots.path(), forge.path(), 1).env("PATH", &wrapper.path());
-        builder.set("cacheDir", cache.path().to_str().unwrap()).start()
-    };
-    // Half a pack and a lock, and nothing more.
-    let hangs = GitWrapper::new(
-        "case \"$*\" in *fetch*) mkdir -p \"$3/objects/pack\"; echo PACK > \"$3/objects/pack/tmp_pack_x\"; echo > \"$3/shallow.lock\"; exec sleep 1000;; esac",
-    );
-    let watched = GitWrapper::new("");
-    let (mut one, other) = (start(&hangs).await, start(&watched).await);
-    let _stuck = Client::start(&one, &world("lab/arm", "main", "worlds/a.wbt")).await;
-    let half =
-        || repositories(cache.path()).iter().any(|path| holds(path, "tmp_pack_x") && holds(path, "shallow.lock"));
-    until("it hangs", async || half()).await;
-    let mut heir = Client::start(&other, &world("lab/arm", "main", "worlds/a.wbt")).await;
-    heir.until("loading: looking for").await;
-    let fetches = || watched.calls().iter().any(|call| call.contains(" fetch "));
-    until("its commit is known", async || watched.calls().iter().any(|call| call.contains("ls-remote"))).await;
-    assert!(!fetches(), "{:#?}", watched.calls());
-    one.signal(Signal::SIGKILL);
-    one.ended().await;
-    let told = heir.until("loading: Error:").await;
-    assert!(told.contains("opened [main]"), "{told}");
-    until("the half is gone", async || !half()).await;
-}
-
-/// Whether there is a file of this name anywhere below a folder.
-fn holds(folder: &Path, name: &str) -> bool {
-    let entries = std::fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.path());
-    entries.into_iter().any(|path| path.file_name().is_some_and(|one| one == name) || holds(&path, name))
 }
 
 #[actix_rt::test]

@@ -10,7 +10,6 @@
 //! | Webots ends, in three ways | launching, idle, running: in others there is none | `a_client_is_told_how_webots_ended` |
 //! | Webots does not end when asked | stopping | `a_simulator_that_ignores_sigterm_and_hides_ends_after_the_grace_time` |
 //! | git is killed, or hangs | checking out | `checkout::a_kill_in_the_middle_of_a_fetch...`, `checkout::a_remote_that_hangs...` |
-//! | its guardian is killed | launching, idle, running, stopping | `a_guardian_that_is_killed_takes_its_tree_along...` |
 //! | the time limit | launching, idle, running, stopping: it counts from the start of Webots | `simulation_limits` (`time`) |
 //! | the limits of a checkout and of a launch | checking out, launching | `simulation_limits` (`time`), `ready::a_launch_that_never_listens...` |
 //! | SIGTERM to the server | all | `a_server_that_stops_tells_its_clients_and_leaves_nothing_in_any_state` |
@@ -18,7 +17,6 @@
 //! | the client's actor panics | all but stopping, in which there is none | `simulation_limits` (`panics`) |
 //! | Webots' actor panics | launching, idle, running, stopping: in others there is none | `simulation_limits` (`panics`) |
 
-use std::path::Path;
 use std::time::{Duration, Instant};
 
 use nix::sys::signal::{Signal, kill};
@@ -28,8 +26,8 @@ use super::scene::{ALL, DEMO, Scene, State, arm, instance_folders, nothing_left,
 use crate::support::client::Client;
 use crate::support::git::Forge;
 use crate::support::program::{Builder, Server, simulation_server};
+use crate::support::until;
 use crate::support::webots::{Webots, instances_below};
-use crate::support::{http, until};
 
 pub fn quick(builder: Builder) -> Builder {
     builder.set("timing.grace", 0.3).set("timing.heartbeat", 0.2)
@@ -49,7 +47,7 @@ async fn a_simulation_runs_from_the_first_message_to_the_last_trace() {
     let mut viewer = Client::connect(&format!("ws://127.0.0.1:{}/", server.port + 1)).await;
     viewer.send("x3d").await;
     viewer.until("scene load completed").await;
-    assert!(instances_below(&server.folder).len() >= 3, "guardian, launcher and simulator");
+    assert!(instances_below(&server.folder).len() >= 2, "launcher and simulator");
     let left = Instant::now();
     client.leave().await;
     nothing_left(&server, 2).await;
@@ -134,12 +132,12 @@ async fn a_server_that_is_killed_leaves_nothing_in_any_state() {
 #[actix_rt::test]
 async fn what_a_killed_server_has_left_is_removed_at_the_next_start() {
     let mut scene = Scene::new(State::CheckingOut, quick).await;
-    // The one that removes the folder is killed too.
-    kill(Pid::from_raw(last_will(&scene.server)), Signal::SIGKILL).unwrap();
+    // The guardian, which does it otherwise, is killed too.
+    kill(Pid::from_raw(guardian(&scene.server)), Signal::SIGKILL).unwrap();
     scene.server.signal(Signal::SIGKILL);
     scene.server.ended().await;
     assert_eq!(instance_folders(scene.folder.path()).len(), 1);
-    // A process that even left the guardian's tree is known by its mark.
+    // A process is known by its mark.
     let mark = instance_folders(scene.folder.path()).remove(0).canonicalize().unwrap();
     let mut orphan =
         std::process::Command::new("sleep").arg("1000").env("WEBOTS_FLEET_INSTANCE", mark).spawn().unwrap();
@@ -147,75 +145,14 @@ async fn what_a_killed_server_has_left_is_removed_at_the_next_start() {
     let next = simulation_server(&webots.path(), forge.path(), 1).folder(scene.folder.path()).start().await;
     assert!(!orphan.wait().unwrap().success(), "it was killed");
     assert_eq!(instance_folders(scene.folder.path()).len(), 0);
-    assert!(next.log().contains("removed what 1 earlier runs had left, 1 processes among it"), "{}", next.log());
+    assert!(next.log().contains("removed what 1 earlier runs had left"), "{}", next.log());
+    until("git is gone", async || instances_below(scene.folder.path()).is_empty()).await;
 }
 
-#[actix_rt::test]
-async fn a_guardian_that_is_killed_takes_its_tree_along_and_the_client_is_told() {
-    for state in [State::Launching, State::Idle, State::Running, State::Stopping] {
-        let mut scene = Scene::new(state, |builder| quick(builder).set("timing.grace", 4.0)).await;
-        let guardian = |one: &&(i32, String)| one.1.contains("guard") && one.1.contains("--remove");
-        let guardian = instances_below(scene.folder.path()).iter().find(guardian).unwrap().0;
-        kill(Pid::from_raw(guardian), Signal::SIGKILL).unwrap();
-        if let Some(client) = &mut scene.client {
-            let told = client.until("loading: Error:").await;
-            assert!(told.contains("Webots was ended by the signal SIGKILL"), "{told}");
-            assert_eq!(client.closed().await, Some(1000));
-        }
-        nothing_left(&scene.server, 1).await;
-    }
-}
-
-/// A server whose Webots has hidden processes: without environment, in sessions of their own, without parents.
-async fn hiding(folder: &Path) -> (Server, Client, Vec<i32>, (Forge, Webots)) {
-    let forge = Forge::with_arm();
-    let pids = folder.join("pids");
-    let hide = "for n in 1 2 3; do (env -i setsid bash -c 'echo $$ >> \"$0\"; sleep 1000 & wait'";
-    let webots = Webots::script(&format!("{hide} {} &); done\n{DEMO} \"$@\" & wait", pids.display()));
-    let server = quick(simulation_server(&webots.path(), forge.path(), 1)).folder(folder).start().await;
-    let mut client = Client::start(&server, &arm()).await;
-    client.until("webots:").await;
-    let told = || std::fs::read_to_string(&pids).unwrap_or_default();
-    until("they hide", async || told().lines().count() == 3).await;
-    let hidden: Vec<i32> = told().lines().map(|line| line.parse().unwrap()).collect();
-    until("each has a child", async || hidden.iter().all(|pid| !children(*pid).is_empty())).await;
-    let hidden: Vec<i32> = hidden.into_iter().flat_map(|pid| [vec![pid], children(pid)].concat()).collect();
-    assert!(hidden.iter().all(|pid| is_there(*pid)));
-    assert!(!instances_below(folder).iter().any(|(pid, _)| hidden.contains(pid)), "the mark tells of them");
-    (server, client, hidden, (forge, webots))
-}
-
-#[actix_rt::test]
-async fn nothing_hides_from_the_death_of_its_guardian() {
-    let folder = tempfile::tempdir().unwrap();
-    let (server, mut client, hidden, _parts) = hiding(folder.path()).await;
-    let marked = instances_below(folder.path());
-    let guardian = marked.iter().find(|one| one.1.contains("guard") && one.1.contains("--remove")).unwrap().0;
-    kill(Pid::from_raw(guardian), Signal::SIGKILL).unwrap();
-    let told = client.until("loading: Error:").await;
-    assert!(told.contains("Webots was ended by the signal SIGKILL"), "{told}");
-    assert!(!hidden.iter().any(|pid| is_there(*pid)), "it was told before they were gone");
-    nothing_left(&server, 1).await;
-    until("all are buried", async || children(server.pid()) == [last_will(&server)]).await;
-}
-
-#[actix_rt::test]
-async fn nothing_hides_from_a_server_that_follows_a_killed_one_at_once() {
-    let folder = tempfile::tempdir().unwrap();
-    let (mut server, _client, hidden, (forge, webots)) = hiding(folder.path()).await;
-    server.signal(Signal::SIGKILL);
-    let next = quick(simulation_server(&webots.path(), forge.path(), 1)).folder(folder.path()).spawn();
-    server.ended().await;
-    until("they are gone", async || !hidden.iter().any(|pid| is_there(*pid))).await;
-    until("the next one answers", async || http::try_get(&next.url("/health")).await.is_ok()).await;
-    nothing_left(&next, 1).await;
-}
-
-/// The child of a server that removes the folder of its run.
-fn last_will(server: &Server) -> i32 {
+/// The child of a server that ends the simulations when the server is gone.
+pub fn guardian(server: &Server) -> i32 {
     let line = |pid: &i32| procfs::process::Process::new(*pid).and_then(|one| one.cmdline()).unwrap_or_default();
-    let is_it = |pid: &i32| line(pid).get(1..3).is_some_and(|words| words == ["guard", "--remove"]);
-    children(server.pid()).into_iter().find(is_it).unwrap()
+    children(server.pid()).into_iter().find(|pid| line(pid).get(1).is_some_and(|word| word == "guard")).unwrap()
 }
 
 pub fn is_there(pid: i32) -> bool {

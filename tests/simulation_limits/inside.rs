@@ -9,9 +9,9 @@ use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 use webots_fleet::shared::config;
 use webots_fleet::simulation::app::{self, AppError, Assembly};
-use webots_fleet::simulation::census::Stage;
 use webots_fleet::simulation::config::SimulationConfig;
-use webots_fleet::simulation::places::Census;
+use webots_fleet::simulation::places::GetSnapshot;
+use webots_fleet::simulation::snapshot::Stage;
 use webots_fleet::simulation::state::AppState;
 
 use crate::support::client::Client;
@@ -93,8 +93,8 @@ impl Inside {
     }
 
     pub async fn stages(&self) -> Vec<Stage> {
-        let everybody = self.server.places.send(Census).await.unwrap();
-        everybody.simulations.iter().map(|one| one.stage).collect()
+        let snapshot = self.server.places.send(GetSnapshot).await.unwrap();
+        snapshot.simulations.iter().map(|one| one.stage).collect()
     }
 
     /// Waits until nothing of any simulation is left: connection, process, place, port and folder.
@@ -104,7 +104,7 @@ impl Inside {
         until("nothing is left", async || {
             self.stages().await.is_empty()
                 && self.server.connections.count() == 0
-                && instances_below(&runs).iter().all(|one| one.1.contains("guard --remove"))
+                && instances_below(&runs).is_empty()
                 && !folders().any(|entry| entry.file_name().to_string_lossy().starts_with("instance-"))
                 && TcpListener::bind(("0.0.0.0", self.port + 1)).is_ok()
         })

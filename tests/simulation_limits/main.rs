@@ -33,13 +33,13 @@ struct Arguments {
 
 #[derive(clap::Subcommand)]
 enum Part {
-    Guard(guardian::Orders),
+    Guard(guardian::Arguments),
 }
 
 fn main() {
     if std::env::args().nth(1).as_deref() == Some("guard") {
-        let Part::Guard(orders) = Arguments::parse().part;
-        std::process::exit(guardian::guard(&orders).into());
+        let Part::Guard(arguments) = Arguments::parse().part;
+        std::process::exit(guardian::guard(&arguments).into());
     }
     run(
         "time::a_simulation_ends_at_its_time_limit_in_any_state",

@@ -9,15 +9,13 @@ use actix_web_actors::ws::WsResponseBuilder;
 use tokio::sync::mpsc::{UnboundedReceiver, UnboundedSender, unbounded_channel};
 use webots_fleet::shared::domain::ProjectUrl;
 use webots_fleet::shared::http::websocket::MessageReader;
-use webots_fleet::simulation::census::Stage;
 use webots_fleet::simulation::client::WebClient;
 use webots_fleet::simulation::machine::LoadMonitor;
-use webots_fleet::simulation::places::{Ask, PlaceEvent, Places, Ticket};
+use webots_fleet::simulation::places::{PlaceEvent, Places, Ticket};
 use webots_fleet::simulation::protocol::Mode;
+use webots_fleet::simulation::snapshot::Stage;
 use webots_fleet::simulation::state::AppState;
-use webots_fleet::simulation::webots::Orders;
-use webots_fleet::simulation::webots::{End, Webots};
-use webots_fleet::simulation::webots::{Exit, WebotsEvent};
+use webots_fleet::simulation::webots::{Exit, LaunchSpec, Stop, Webots, WebotsEvent};
 
 use crate::inside::{Inside, arm, ask};
 use crate::support::SOON;
@@ -134,12 +132,11 @@ async fn launch(server: &AppState) -> (Addr<Webots>, UnboundedReceiver<Exit>) {
     let (places, mut granted) = unbounded_channel();
     let (exits, ended) = unbounded_channel();
     let listener = Listener { places, exits }.start();
-    let asked = server.places.send(Ask { client: listener.clone().recipient(), world: arm() });
-    let ticket: Ticket = asked.await.unwrap().unwrap();
+    let ticket = Ticket::new(&server.places, listener.clone().recipient(), arm());
     let port = granted.recv().await.unwrap();
     let world = ProjectUrl::parse(&arm()).unwrap();
     let project = server.checkouts.start(world, server.run.instance().unwrap(), |_| ()).await.unwrap().unwrap();
-    let orders = Orders {
+    let spec = LaunchSpec {
         config: Arc::clone(&server.config),
         program: server.webots_program().unwrap(),
         checkouts: Arc::clone(&server.checkouts),
@@ -148,7 +145,7 @@ async fn launch(server: &AppState) -> (Addr<Webots>, UnboundedReceiver<Exit>) {
         place: (ticket, port),
         events: listener.recipient(),
     };
-    (Webots::new(orders).start(), ended)
+    (Webots::new(spec).start(), ended)
 }
 
 pub async fn a_webots_leaves_nothing_in_any_state() {
@@ -157,7 +154,7 @@ pub async fn a_webots_leaves_nothing_in_any_state() {
         let (webots, mut ended) = launch(&inside.server).await;
         if stage == Stage::Stopping {
             inside.until(Stage::Idle).await;
-            webots.do_send(End);
+            webots.do_send(Stop);
         }
         inside.until(stage).await;
         let begin = std::time::Instant::now();

@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use webots_fleet::simulation::census::Stage;
+use webots_fleet::simulation::snapshot::Stage;
 
 use crate::inside::Inside;
 

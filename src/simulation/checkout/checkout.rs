@@ -182,7 +182,6 @@ impl Checkouts {
             tokio::fs::remove_file(path).await.map_err(|error| machine(world, &error))?;
         }
         let mut call = copy_call(fetched, instance, needed);
-        call.is_alone = false;
         call.arguments.splice(0..0, lfs::settings(&fetched.remote));
         self.fetcher.git().run(call, |_| ()).await.map_err(|source| damaged(world, source))?;
         self.fetcher.shrink_soon();
@@ -213,7 +212,6 @@ fn copy_call<'call>(fetched: &'call Fetched, instance: &InstanceDir, path: &str)
     let what = [fetched.reference.as_str(), "--", path].map(OsString::from);
     let arguments = std::iter::once(work_tree).chain(options).chain(what).collect();
     let mut call = call(&fetched.remote, fetched.repository.path(), arguments);
-    call.is_alone = true;
     call.environment.push(("GIT_INDEX_FILE".into(), instance.path().join("index").into()));
     call.environment.push(("GIT_ATTR_SOURCE".into(), fetched.reference.clone().into()));
     call

@@ -30,5 +30,5 @@ impl Errand<'_> {
 /// A git command on a cached repository.
 #[must_use]
 pub fn call<'call>(remote: &Remote, repository: &'call Path, arguments: Vec<OsString>) -> Call<'call> {
-    Call { repository, arguments, protocol: remote.protocol, is_alone: false, environment: Vec::new() }
+    Call { repository, arguments, protocol: remote.protocol, environment: Vec::new() }
 }

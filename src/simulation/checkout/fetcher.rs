@@ -162,8 +162,7 @@ impl Fetcher {
         repository: &InUse,
         revision: &Revision,
     ) -> Result<Option<Listing>, CheckoutError> {
-        let mut call = call(remote, repository.path(), revision.list_arguments());
-        call.is_alone = true;
+        let call = call(remote, repository.path(), revision.list_arguments());
         match self.git().run(call, |_| ()).await {
             Ok(answer) => Ok(Some(Listing::parse(&answer, &revision.world_path(world)))),
             Err(error) if error.is_endless() => Err(CheckoutError::TooMany(self.downloads.limits.entries())),
@@ -178,8 +177,7 @@ impl Fetcher {
 
     /// Whether there are no files below a revision, for it is one.
     async fn is_file(&self, remote: &Remote, repository: &InUse, revision: &Revision) -> bool {
-        let mut call = call(remote, repository.path(), revision.kind_arguments());
-        call.is_alone = true;
+        let call = call(remote, repository.path(), revision.kind_arguments());
         self.git().run(call, |_| ()).await.is_ok_and(|kind| kind.starts_with(b"blob"))
     }
 
@@ -225,9 +223,8 @@ impl Fetcher {
         arguments: Vec<OsString>,
     ) -> Result<String, CheckoutError> {
         loop {
-            let mut call = call(errand.remote, repository.path(), arguments.clone());
+            let call = call(errand.remote, repository.path(), arguments.clone());
             // For a folder, git's only child reads from its pipe, and ends with it. What asks over the network may hang.
-            call.is_alone = errand.remote.protocol == "file";
             let answer = self.git().run(call, |_| ());
             match actix_rt::time::timeout(self.downloads.limits.patience(), answer).await {
                 Ok(Ok(answer)) => return Ok(String::from_utf8_lossy(&answer).into_owned()),

@@ -11,15 +11,13 @@ use tokio::net::unix::pipe::Receiver;
 use which::which;
 
 use crate::shared::run::one_line;
-use crate::simulation::process::process_group::{self, Ending, Plan, ProcessGroup};
+use crate::simulation::process::{ExitReason, ProcessGroup, SpawnSpec};
 
 /// How git is run by this server.
 #[derive(Debug)]
 pub struct Git {
     settings: PathBuf,
     mark: PathBuf,
-    /// Whether the system has a program that makes another end with its parent.
-    has_setpriv: bool,
     has_nice: bool,
 }
 
@@ -32,9 +30,6 @@ pub struct Call<'call> {
     pub arguments: Vec<OsString>,
     /// The one protocol that it may use.
     pub protocol: &'static str,
-    /// Whether it starts no further process and asks nobody: then the kernel alone can see to it that it ends with the
-    /// server, which takes a fraction of a guardian's time.
-    pub is_alone: bool,
     /// Further variables.
     pub environment: Vec<(OsString, OsString)>,
 }
@@ -107,12 +102,7 @@ impl Git {
     pub fn new(run: &Path) -> std::io::Result<Self> {
         let settings = run.join("gitconfig");
         std::fs::write(&settings, SETTINGS)?;
-        Ok(Self {
-            settings,
-            mark: run.to_owned(),
-            has_setpriv: which("setpriv").is_ok(),
-            has_nice: which("nice").is_ok(),
-        })
+        Ok(Self { settings, mark: run.to_owned(), has_nice: which("nice").is_ok() })
     }
 
     /// Runs a command to its end and gives back its answer. `progress` hears each line of progress.
@@ -125,7 +115,7 @@ impl Git {
         self.run_until(std::future::pending(), call, progress).await
     }
 
-    /// The same, but git is killed when `end` comes, unless it is alone. It gives back only when nothing of git is left.
+    /// The same, but git is killed when `end` comes. It gives back only when nothing of git is left.
     ///
     /// # Errors
     /// When git can't be started, fails or is killed.
@@ -142,14 +132,8 @@ impl Git {
         let broken = |error: std::io::Error| failed("can't be started", error.to_string());
         let (answer, output) = std::io::pipe().map_err(broken)?;
         let (complaints, errors) = std::io::pipe().map_err(broken)?;
-        let is_alone = call.is_alone && self.has_setpriv;
-        let plan = self.plan(call);
-        let (group, mut ended) = if is_alone {
-            (None, process_group::start_alone(&plan, output.into(), errors.into()).map_err(broken)?.boxed())
-        } else {
-            let (group, ended) = ProcessGroup::start(&plan, output.into(), errors.into()).map_err(broken)?;
-            (Some(group), ended.boxed())
-        };
+        let (group, ended) = ProcessGroup::start(&self.spec(call), output.into(), errors.into()).map_err(broken)?;
+        let mut ended = ended.boxed();
         let answer = asynchronous(answer).map_err(broken)?;
         let complaints = asynchronous(complaints).map_err(broken)?;
         let ended = async move {
@@ -164,7 +148,7 @@ impl Git {
             _ if answer.len() > LARGEST_ANSWER => {
                 Err(failed(ENDLESS, format!("its answer is longer than {} MiB", LARGEST_ANSWER >> 20)))
             }
-            Ending::Code(0) => Ok(answer),
+            ExitReason::Code(0) => Ok(answer),
             ending => Err(failed(&ending.to_string(), last_words)),
         }
     }
@@ -172,7 +156,7 @@ impl Git {
     /// Whether everything is in order in a repository. It reads all of it: for use after a failure.
     pub async fn is_sound(&self, repository: &Path) -> bool {
         let arguments = ["fsck", "--full", "--no-dangling", "--no-progress"].map(OsString::from).to_vec();
-        let call = Call { repository, arguments, protocol: "https", is_alone: false, environment: Vec::new() };
+        let call = Call { repository, arguments, protocol: "https", environment: Vec::new() };
         match self.run(call, |_| ()).await {
             Ok(_) => true,
             // A machine that can't run git says nothing of the repository.
@@ -180,7 +164,7 @@ impl Git {
         }
     }
 
-    fn plan(&self, call: Call<'_>) -> Plan {
+    fn spec(&self, call: Call<'_>) -> SpawnSpec {
         // Whoever watches over the servers, and whoever runs a simulation already, comes before a checkout.
         let mut command: Vec<OsString> = ["nice", "git", "--literal-pathspecs", "--git-dir"].map(OsString::from).into();
         if !self.has_nice {
@@ -198,12 +182,11 @@ impl Git {
             ("LC_ALL", OsStr::new("C")),
         ];
         let fixed = fixed.into_iter().map(|(name, value)| (name.into(), value.into()));
-        Plan {
+        SpawnSpec {
             command,
             environment: fixed.chain(call.environment).collect(),
             folder: None,
             mark: self.mark.clone(),
-            remove: None,
             grace: Duration::from_millis(100),
         }
     }

@@ -84,7 +84,7 @@ async fn pack(git: &Git, path: &Path, limit: Duration) -> Result<(), String> {
     let arguments = ["gc", "--quiet", "--force", "--prune=now"].map(OsString::from).to_vec();
     // There is no hurry, and others use the machine.
     let environment = setting("pack.threads", "1").to_vec();
-    let call = Call { repository: path, arguments, protocol: "none", is_alone: false, environment };
+    let call = Call { repository: path, arguments, protocol: "none", environment };
     let start = Instant::now();
     // Nobody else may change the repository as long as anything of git is left.
     let packed = git.run_until(actix_rt::time::sleep(limit), call, |_| ()).await;

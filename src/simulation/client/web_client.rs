@@ -8,27 +8,25 @@ use std::sync::Arc;
 use actix::prelude::*;
 use actix_web_actors::ws::{CloseCode, CloseReason, Message, ProtocolError, WebsocketContext};
 
-use super::lease::{Lease, Stage, Wanted};
 use super::outcome::{Outcome, Pending};
+use super::state::{StartRequest, State, WebotsHandle};
 use crate::shared::http::Connection;
 use crate::shared::http::Peer;
 use crate::shared::http::liveness::{self, Liveness};
 use crate::shared::http::websocket::{ClientMessage, MessageReader};
 use crate::shared::run::closing;
-use crate::simulation::census::Change;
 use crate::simulation::checkout::{Progress, Project};
-use crate::simulation::places::{Ask, PlaceEvent, Ticket};
+use crate::simulation::places::{PlaceEvent, Ticket};
 use crate::simulation::protocol::{self, Mode, Request};
+use crate::simulation::snapshot::Change;
 use crate::simulation::state::AppState;
-use crate::simulation::webots::Orders;
-use crate::simulation::webots::{Exit, WebotsEvent};
-use crate::simulation::webots::{RestoreController, Webots};
+use crate::simulation::webots::{Exit, LaunchSpec, RestoreController, Webots, WebotsEvent};
 
 /// The actor.
 pub struct WebClient {
     server: Arc<AppState>,
     peer: Peer,
-    stage: Stage,
+    state: State,
     liveness: Liveness,
     restoring: bool,
     start: Pending,
@@ -45,7 +43,7 @@ impl WebClient {
         Self {
             server,
             peer,
-            stage: Stage::Connected,
+            state: State::Connected,
             liveness: Liveness::new(),
             restoring: false,
             start: Pending::default(),
@@ -71,7 +69,7 @@ impl WebClient {
     }
 
     fn finish(&mut self, last_words: &str, code: CloseCode, ctx: &mut Context) {
-        self.stage = Stage::Over;
+        self.state = State::Over;
         ctx.text(last_words.to_owned());
         ctx.close(Some(CloseReason { code, description: None }));
         ctx.stop();
@@ -86,7 +84,7 @@ impl WebClient {
     }
 
     fn start(&mut self, url: &str, mode: Mode, ctx: &mut Context) {
-        if !matches!(self.stage, Stage::Connected) {
+        if !matches!(self.state, State::Connected) {
             log::warn!("{}: asks for a second simulation on one connection; ignored", self.name());
             return;
         }
@@ -96,27 +94,11 @@ impl WebClient {
             Err(why) => return self.fail_start(Outcome::Refused, &why, ctx),
         };
         log::info!("{}: asks for {world}", self.name());
-        let ask = Ask { client: ctx.address().recipient(), world: world.to_string() };
-        self.stage = Stage::Asking { wanted: Wanted { world, mode }, granted: None };
-        let asked = self.server.places.send(ask).into_actor(self);
-        asked
-            .map(|answer, this, ctx| match answer {
-                Ok(Ok(ticket)) => this.ticket_came(ticket, ctx),
-                Ok(Err(refused)) => this.fail_start(Outcome::Full, &refused.to_string(), ctx),
-                Err(error) => this.fail(&format!("This simulation server can't lend a place: {error}"), ctx),
-            })
-            .spawn(ctx);
+        let ticket = Ticket::new(&self.server.places, ctx.address().recipient(), world.to_string());
+        self.state = State::Waiting { request: StartRequest { world, mode }, ticket };
     }
 
-    fn ticket_came(&mut self, ticket: Ticket, ctx: &mut Context) {
-        match std::mem::replace(&mut self.stage, Stage::Over) {
-            Stage::Asking { wanted, granted: Some(port) } => self.check_out(wanted, ticket, port, ctx),
-            Stage::Asking { wanted, granted: None } => self.stage = Stage::Waiting { wanted, ticket },
-            other => self.stage = other,
-        }
-    }
-
-    fn check_out(&mut self, Wanted { world, mode }: Wanted, ticket: Ticket, port: u16, ctx: &mut Context) {
+    fn check_out(&mut self, StartRequest { world, mode }: StartRequest, ticket: Ticket, port: u16, ctx: &mut Context) {
         let instance = match self.server.run.instance() {
             Ok(instance) => instance,
             Err(error) => {
@@ -124,7 +106,7 @@ impl WebClient {
                 return self.fail_start(Outcome::NoCheckout, &why, ctx);
             }
         };
-        self.stage = Stage::CheckingOut { mode, place: (ticket, port) };
+        self.state = State::CheckingOut { mode, place: (ticket, port) };
         let me = ctx.address();
         // A step that is told while the mailbox is full is one step less on the screen.
         let progress = move |text: String| drop(me.try_send(Progress(text)));
@@ -139,9 +121,9 @@ impl WebClient {
     }
 
     fn launch(&mut self, project: Project, ctx: &mut Context) {
-        let (mode, place) = match std::mem::replace(&mut self.stage, Stage::Over) {
-            Stage::CheckingOut { mode, place } => (mode, place),
-            other => return self.stage = other,
+        let (mode, place) = match std::mem::replace(&mut self.state, State::Over) {
+            State::CheckingOut { mode, place } => (mode, place),
+            other => return self.state = other,
         };
         let program = match self.server.webots_program() {
             Ok(program) => program,
@@ -153,7 +135,7 @@ impl WebClient {
             ctx.text(protocol::loading(warning));
         }
         ctx.text(protocol::loading("webots is starting"));
-        let orders = Orders {
+        let spec = LaunchSpec {
             config: Arc::clone(&self.server.config),
             program,
             checkouts: Arc::clone(&self.server.checkouts),
@@ -162,13 +144,13 @@ impl WebClient {
             place,
             events: ctx.address().recipient(),
         };
-        let webots = Webots::start_in_arbiter(&self.server.main_thread, |_| Webots::new(orders));
-        self.stage = Stage::Launched(Lease(webots));
+        let webots = Webots::start_in_arbiter(&self.server.main_thread, |_| Webots::new(spec));
+        self.state = State::Launched(WebotsHandle(webots));
         ctx.text(protocol::shutdown_timeout(self.server.config.timeout));
     }
 
     fn reset_controller(&mut self, file: String, ctx: &mut Context) {
-        let Stage::Launched(Lease(webots)) = &self.stage else {
+        let State::Launched(WebotsHandle(webots)) = &self.state else {
             return ctx.text(protocol::error("A controller can be reset only while a simulation runs"));
         };
         if std::mem::replace(&mut self.restoring, true) {
@@ -244,16 +226,18 @@ impl Handler<PlaceEvent> for WebClient {
     type Result = ();
 
     fn handle(&mut self, event: PlaceEvent, ctx: &mut Self::Context) {
-        match (event, std::mem::replace(&mut self.stage, Stage::Over)) {
-            (PlaceEvent::Granted(port), Stage::Waiting { wanted, ticket }) => self.check_out(wanted, ticket, port, ctx),
-            (PlaceEvent::Granted(port), Stage::Asking { wanted, .. }) => {
-                self.stage = Stage::Asking { wanted, granted: Some(port) };
+        match (event, std::mem::replace(&mut self.state, State::Over)) {
+            (PlaceEvent::Granted(port), State::Waiting { request, ticket }) => {
+                self.check_out(request, ticket, port, ctx);
             }
-            (PlaceEvent::Ahead(ahead), stage @ (Stage::Waiting { .. } | Stage::Asking { .. })) => {
-                self.stage = stage;
+            (PlaceEvent::Refused(full), State::Waiting { .. }) => {
+                self.fail_start(Outcome::Full, &full.to_string(), ctx);
+            }
+            (PlaceEvent::Ahead(ahead), state @ State::Waiting { .. }) => {
+                self.state = state;
                 ctx.text(protocol::queue(ahead));
             }
-            (_, stage) => self.stage = stage,
+            (_, state) => self.state = state,
         }
     }
 }
@@ -262,7 +246,7 @@ impl Handler<Progress> for WebClient {
     type Result = ();
 
     fn handle(&mut self, Progress(text): Progress, ctx: &mut Self::Context) {
-        if matches!(self.stage, Stage::CheckingOut { .. }) {
+        if matches!(self.state, State::CheckingOut { .. }) {
             ctx.text(protocol::loading(&text));
         }
     }

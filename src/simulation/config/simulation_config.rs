@@ -116,7 +116,7 @@ pub struct SimulationConfig {
     /// The display that Webots opens its window on. Default: the environment variable `DISPLAY`, else `:0`.
     #[serde(default)]
     pub display: Option<DisplayName>,
-    /// Give each Webots a virtual display of its own (needs `xvfb-run`). Default: false.
+    /// Give each Webots a virtual display of its own (needs `Xvfb`). Default: false.
     #[serde(default)]
     pub xvfb: bool,
     /// How many seconds after six missed heartbeats a simulation is ended. Default: 60.

@@ -9,16 +9,16 @@ use x11rb::reexports::x11rb_protocol::parse_display::parse_display;
 use x11rb::rust_connection::RustConnection;
 
 /// How long a display may take to answer.
-const PATIENCE: Duration = Duration::from_secs(2);
+const ANSWER: Duration = Duration::from_secs(2);
 /// The port of display 0 is 6000; those of the others follow.
 const LAST_NUMBER: u16 = u16::MAX - 6000;
 
 /// Why Webots can't open its window on a display.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub enum Trouble {
-    /// The name is none.
+pub enum DisplayError {
+    /// It is no display's name.
     #[error("{0:?} is no display; allowed is HOST:NUMBER or :NUMBER")]
-    NoName(String),
+    BadName(String),
     /// No X server is there.
     #[error(
         "no display answers at {0}: start an X server there (without a monitor: Xvfb, or Xorg after nvidia-xconfig \
@@ -54,13 +54,13 @@ pub enum Trouble {
 pub struct DisplayName(String);
 
 impl TryFrom<String> for DisplayName {
-    type Error = Trouble;
+    type Error = DisplayError;
 
-    fn try_from(name: String) -> Result<Self, Trouble> {
+    fn try_from(name: String) -> Result<Self, DisplayError> {
         if parse_display(Some(&name)).is_ok_and(|parsed| parsed.display <= LAST_NUMBER) {
             Ok(Self(name))
         } else {
-            Err(Trouble::NoName(name))
+            Err(DisplayError::BadName(name))
         }
     }
 }
@@ -81,37 +81,37 @@ pub fn of_environment() -> Option<String> {
 ///
 /// # Errors
 /// Why Webots can't open its window there, and what to do about it.
-pub fn look(display: &str) -> Result<(), Trouble> {
+pub fn check(display: &str) -> Result<(), DisplayError> {
     DisplayName::try_from(display.to_owned())?;
     let (sender, answer) = mpsc::channel();
     let name = display.to_owned();
     // A display that never answers would hold whoever waits for it.
     std::thread::spawn(move || sender.send(RustConnection::connect(Some(&name)).map(drop)));
-    match answer.recv_timeout(PATIENCE) {
+    match answer.recv_timeout(ANSWER) {
         Ok(Ok(())) => Ok(()),
         Ok(Err(error)) => Err(explain(display, error)),
         Err(_) => {
-            let reason = format!("it is silent for {} s", PATIENCE.as_secs());
-            Err(Trouble::Strange { display: display.to_owned(), reason })
+            let reason = format!("it is silent for {} s", ANSWER.as_secs());
+            Err(DisplayError::Strange { display: display.to_owned(), reason })
         }
     }
 }
 
-fn explain(display: &str, error: ConnectError) -> Trouble {
+fn explain(display: &str, error: ConnectError) -> DisplayError {
     let display = display.to_owned();
     let refused = |reason: &[u8]| {
         let reason = String::from_utf8_lossy(reason).trim().to_owned();
-        Trouble::Refused { display: display.clone(), reason, user: user() }
+        DisplayError::Refused { display: display.clone(), reason, user: user() }
     };
     match error {
         ConnectError::SetupFailed(setup) => refused(&setup.reason),
         ConnectError::SetupAuthenticate(setup) => refused(&setup.reason),
-        ConnectError::DisplayParsingError(_) => Trouble::NoName(display),
+        ConnectError::DisplayParsingError(_) => DisplayError::BadName(display),
         ConnectError::IoError(error) if error.kind() == std::io::ErrorKind::UnexpectedEof => {
-            Trouble::Strange { display, reason: "it has closed the connection".to_owned() }
+            DisplayError::Strange { display, reason: "it has closed the connection".to_owned() }
         }
-        ConnectError::IoError(_) => Trouble::NoServer(display),
-        other => Trouble::Strange { display, reason: other.to_string() },
+        ConnectError::IoError(_) => DisplayError::NoServer(display),
+        other => DisplayError::Strange { display, reason: other.to_string() },
     }
 }
 
@@ -127,14 +127,14 @@ mod tests {
     #[test]
     fn a_text_that_is_no_display_is_told() {
         for text in ["nonsense", ":x", "", "0", ":65000"] {
-            assert_eq!(look(text), Err(Trouble::NoName(text.to_owned())));
+            assert_eq!(check(text), Err(DisplayError::BadName(text.to_owned())));
         }
     }
 
     #[test]
     fn a_display_without_a_server_is_told() {
         for display in [":59000", "127.0.0.1:59000"] {
-            assert_eq!(look(display), Err(Trouble::NoServer(display.to_owned())));
+            assert_eq!(check(display), Err(DisplayError::NoServer(display.to_owned())));
         }
     }
 
@@ -152,9 +152,9 @@ mod tests {
             let (mut second, _) = listener.accept().unwrap();
             second.read_to_end(&mut Vec::new()).ok();
         });
-        let strange = |reason: &str| Err(Trouble::Strange { display: display.clone(), reason: reason.to_owned() });
-        assert_eq!(look(&display), strange("it has closed the connection"));
-        assert_eq!(look(&display), strange("it is silent for 2 s"));
+        let strange = |reason: &str| Err(DisplayError::Strange { display: display.clone(), reason: reason.to_owned() });
+        assert_eq!(check(&display), strange("it has closed the connection"));
+        assert_eq!(check(&display), strange("it is silent for 2 s"));
         drop(silent);
     }
 }

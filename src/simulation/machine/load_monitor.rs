@@ -16,7 +16,7 @@ use tokio::sync::watch;
 
 use super::sensors::{self, Gpu, GpuSensor, Host, Machine, MachineSensor};
 use crate::shared::domain::Load;
-use crate::simulation::places::{Census, Places};
+use crate::simulation::places::{GetSnapshot, Places};
 
 /// Between two samples.
 const PERIOD: Duration = Duration::from_secs(1);
@@ -28,9 +28,24 @@ const KEPT: usize = 600;
 const GPU_AGE: Duration = Duration::from_secs(10);
 /// How many lines `monitor.csv` has before it is put aside: a day.
 const CSV_LINES: usize = 86_400;
-/// The columns of the original.
-const CSV_HEADER: &str = "Timestamp, Webots running, Webots idle, CPU load, CPU memory, GPU load compute, GPU load memory, \
-                          GPU memory, Swap, Disk, Network sent, Network received";
+/// A column of `monitor.csv`: its heading, and its value in a sample.
+type Column = (&'static str, fn(&Sample) -> String);
+
+/// The columns of `monitor.csv`, in the order of the original.
+const COLUMNS: [Column; 12] = [
+    ("Timestamp", |sample| sample.timestamp.to_string()),
+    ("Webots running", |sample| sample.running.to_string()),
+    ("Webots idle", |sample| sample.idle.to_string()),
+    ("CPU load", |sample| format!("{:.1}", sample.machine.cpu)),
+    ("CPU memory", |sample| format!("{:.1}", sample.machine.memory)),
+    ("GPU load compute", |sample| sample.gpu_compute.to_string()),
+    ("GPU load memory", |sample| sample.gpu_memory_traffic.to_string()),
+    ("GPU memory", |sample| format!("{:.1}", sample.gpu_memory)),
+    ("Swap", |sample| format!("{:.1}", sample.machine.swap)),
+    ("Disk", |sample| format!("{:.1}", sample.machine.disk)),
+    ("Network sent", |sample| format!("{:.6}", sample.machine.network_sent)),
+    ("Network received", |sample| format!("{:.6}", sample.machine.network_received)),
+];
 
 /// What is known of the machine's load.
 #[derive(Debug, Clone, Default)]
@@ -100,11 +115,11 @@ impl LoadMonitor {
     }
 
     fn sample(&mut self, ctx: &mut Context<Self>) {
-        let census = self.places.send(Census).timeout(PERIOD);
-        census
+        let snapshot = self.places.send(GetSnapshot).timeout(PERIOD);
+        snapshot
             .into_actor(self)
-            .map(|census, this, _| {
-                let instances = census.map(|census| census.instances).unwrap_or_default();
+            .map(|snapshot, this, _| {
+                let instances = snapshot.map(|snapshot| snapshot.instances).unwrap_or_default();
                 this.publish(instances.running, instances.idle);
             })
             .spawn(ctx);
@@ -166,15 +181,17 @@ fn append(path: &Path, sample: &Sample, first: bool, put_aside: bool) -> std::io
     }
     let mut file = std::fs::File::options().create(true).append(!first).write(true).truncate(first).open(path)?;
     if file.metadata()?.len() == 0 {
-        writeln!(file, "{CSV_HEADER}")?;
+        writeln!(file, "{}", COLUMNS.map(|(heading, _)| heading).join(", "))?;
     }
-    let Sample { timestamp, running, idle, machine, gpu_compute, gpu_memory_traffic, gpu_memory, .. } = sample;
-    let Machine { cpu, memory, swap, disk, network_sent, network_received } = machine;
-    writeln!(
-        file,
-        "{timestamp}, {running}, {idle}, {cpu:.1}, {memory:.1}, {gpu_compute}, {gpu_memory_traffic}, {gpu_memory:.1}, \
-         {swap:.1}, {disk:.1}, {network_sent:.6}, {network_received:.6}"
-    )
+    writeln!(file, "{}", sample.columns().join(", "))
+}
+
+impl Sample {
+    /// The values of `monitor.csv`, in the order of its columns.
+    #[must_use]
+    pub fn columns(&self) -> Vec<String> {
+        COLUMNS.iter().map(|(_, value)| value(self)).collect()
+    }
 }
 
 impl Actor for LoadMonitor {

@@ -1,8 +1,8 @@
 //! What each simulation takes of the machine: CPU and memory of its process tree. Linux: `/proc`.
 //!
-//! One pass over all processes serves all simulations, at most once in a while (`AGE`), and only when somebody looks.
+//! One pass over all processes serves all simulations, at most once in 1.8 s, and only when somebody asks.
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::{BTreeMap, HashMap, HashSet};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
@@ -17,10 +17,10 @@ pub struct Usage {
     pub memory: u64,
 }
 
-/// Readings of process trees, by the process that each descends from.
+/// Readings of process trees, by the process at the root.
 pub type Usages = BTreeMap<i32, Usage>;
 
-/// Reads process trees for whoever looks.
+/// Reads process trees for whoever asks.
 #[derive(Debug, Clone, Default)]
 pub struct UsageMonitor(Arc<Mutex<Readings>>);
 
@@ -31,7 +31,7 @@ struct Readings {
     usages: Usages,
 }
 
-/// A reading that is younger is not made anew.
+/// How long a reading is cached.
 const AGE: Duration = Duration::from_millis(1800);
 
 impl UsageMonitor {
@@ -71,25 +71,28 @@ impl Readings {
     }
 }
 
-/// All processes by their parents.
+/// All processes, each below its parent and below the leader of its group.
 fn processes() -> HashMap<i32, Vec<Stat>> {
-    let mut by_parent: HashMap<i32, Vec<Stat>> = HashMap::new();
+    let mut below: HashMap<i32, Vec<Stat>> = HashMap::new();
     let all = all_processes().into_iter().flatten().flatten();
     for stat in all.filter_map(|process| process.stat().ok()) {
-        by_parent.entry(stat.ppid).or_default().push(stat);
+        if stat.pgrp != stat.ppid {
+            below.entry(stat.pgrp).or_default().push(stat.clone());
+        }
+        below.entry(stat.ppid).or_default().push(stat);
     }
-    by_parent
+    below
 }
 
-/// CPU ticks and pages of memory of all that descends from a process.
-fn tree_sum(root: i32, by_parent: &HashMap<i32, Vec<Stat>>) -> (u64, u64) {
+/// CPU ticks and pages of memory of a process, of its group and of all that descends from it.
+fn tree_sum(root: i32, below: &HashMap<i32, Vec<Stat>>) -> (u64, u64) {
     let (mut ticks, mut pages) = (0, 0);
-    let mut open = vec![root];
+    let (mut seen, mut open) = (HashSet::new(), vec![root]);
     while let Some(pid) = open.pop() {
-        for child in by_parent.get(&pid).into_iter().flatten() {
-            ticks += child.utime + child.stime;
-            pages += child.rss;
-            open.push(child.pid);
+        for stat in below.get(&pid).into_iter().flatten().filter(|stat| seen.insert(stat.pid)) {
+            ticks += stat.utime + stat.stime;
+            pages += stat.rss;
+            open.push(stat.pid);
         }
     }
     (ticks, pages)

@@ -2,9 +2,9 @@
 
 pub mod guardian;
 mod instance_dir;
-pub mod orphans;
-pub mod process_group;
+mod process_group;
 pub mod process_tree;
-mod x_lock;
 
-pub use instance_dir::{InstanceDir, RunDir, Swept};
+pub use guardian::Guardian;
+pub use instance_dir::{InstanceDir, Leftovers, RunDir};
+pub use process_group::{ExitReason, ProcessGroup, SpawnSpec};

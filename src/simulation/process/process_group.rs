@@ -1,192 +1,173 @@
-//! A program that the server has started, with all that it starts: dropping it ends them.
+//! A program that the server has started, with the process group that it leads.
+//!
+//! The lines are our own because the crates that offer this (process-wrap, command-group) kill on drop only the leader,
+//! and know no grace time; what they would save is the call of `killpg`.
 
 use std::ffi::OsString;
 use std::fmt;
 use std::future::Future;
-use std::io::{PipeWriter, Write};
 use std::os::unix::process::ExitStatusExt;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::process::{ExitStatus, Stdio};
 use std::time::Duration;
 
+use nix::errno::Errno;
+use nix::sys::signal::{Signal, killpg};
+use nix::unistd::Pid;
+use tokio::process::{Child, Command};
 use tokio::sync::oneshot;
 
-use super::guardian::NOT_STARTED;
-use super::{orphans, process_tree};
+use super::process_tree;
 
-/// What to start, and how it ends.
+/// What to start, and how it is ended.
 #[derive(Debug)]
-pub struct Plan {
+pub struct SpawnSpec {
     /// The program and its arguments; no shell ever sees them.
     pub command: Vec<OsString>,
     /// Variables that are added to the server's own environment.
     pub environment: Vec<(OsString, OsString)>,
     /// Working folder; the server's own where absent.
     pub folder: Option<PathBuf>,
-    /// By which every process of the tree is known, and what a later server sweeps.
+    /// The folder by which all processes of the tree are found again, see [`process_tree::MARK`].
     pub mark: PathBuf,
-    /// Folder that is removed with the tree.
-    pub remove: Option<PathBuf>,
     /// Time between SIGTERM and SIGKILL.
     pub grace: Duration,
 }
 
-/// A guard for a running program and all its descendants.
-///
-/// Dropping it closes the guardian's lifeline (see [`super::guardian`]): everything is killed at once, also when the
-/// drop comes from a panic, and also when the server itself is killed. A guardian that does not do so in time, for
-/// what it guards has stopped it, is ended by the server with the whole tree.
+/// A running process group. Dropping it kills the group.
 #[derive(Debug)]
 pub struct ProcessGroup {
-    lifeline: PipeWriter,
-    guardian: i32,
-    /// Used once, when it is asked to end.
-    asked: Option<oneshot::Sender<()>>,
+    leader: i32,
+    terminate: Option<oneshot::Sender<()>>,
 }
-
-/// How long a guardian may take beyond the grace time, before the server does its work.
-const GUARDIAN: Duration = Duration::from_secs(2);
 
 /// How a program ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Ending {
+pub enum ExitReason {
     /// With this exit code.
     Code(u8),
     /// By this signal.
     Signal(u8),
-    /// It could not be started.
+    /// It could not be started: a launcher did not find it.
     NotStarted,
 }
 
+/// Exit code of a launcher (a shell, `env`, `nice`) that does not find its program.
+const NOT_FOUND: u8 = 127;
+/// How long killed processes may take to vanish.
+const VANISH: Duration = Duration::from_secs(1);
+/// Time between two checks whether the group is empty.
+const POLL: Duration = Duration::from_millis(5);
+
 impl ProcessGroup {
-    /// Starts a program; the future ends when nothing of its tree is left.
+    /// Starts a program as the leader of a new group. The future resolves when the program has ended and the rest of
+    /// its group was killed; dropping the future kills the group too.
     ///
     /// # Errors
-    /// When the system can start no more processes.
+    /// When the program is not there, or the system can start no more processes.
     pub fn start(
-        plan: &Plan,
+        spec: &SpawnSpec,
         output: Stdio,
         errors: Stdio,
-    ) -> std::io::Result<(Self, impl Future<Output = Ending> + Send + 'static)> {
-        let (reader, lifeline) = std::io::pipe()?;
-        let mut command = tokio::process::Command::new("/proc/self/exe");
-        command.arg0("simulation-server").arg("guard");
-        command.args(["--grace", &plan.grace.as_millis().to_string()]);
-        if let Some(folder) = &plan.remove {
-            command.arg("--remove").arg(folder);
-        }
-        command.arg("--").args(&plan.command);
-        command.envs(plan.environment.iter().map(|(name, value)| (name, value))).env(process_tree::MARK, &plan.mark);
-        if let Some(folder) = &plan.folder {
+    ) -> std::io::Result<(Self, impl Future<Output = ExitReason> + Send + 'static)> {
+        let (program, arguments) = spec.command.split_first().ok_or(std::io::ErrorKind::InvalidInput)?;
+        let mut command = Command::new(program);
+        command.args(arguments).envs(spec.environment.iter().map(|(name, value)| (name, value)));
+        command.env(process_tree::MARK, &spec.mark).process_group(0);
+        if let Some(folder) = &spec.folder {
             command.current_dir(folder);
         }
-        let mut child = orphans::start(command.stdin(reader).stdout(output).stderr(errors))?;
-        let guardian = child.id().and_then(|id| i32::try_from(id).ok()).unwrap_or_default();
-        let (mark, grace) = (plan.mark.clone(), plan.grace);
-        let (asked, order) = oneshot::channel();
-        let overdue = async move {
-            // Where nobody asked, the lifeline has ended: then no grace time is given.
-            let grace = order.await.map_or(Duration::ZERO, |()| grace);
-            actix_rt::time::sleep(grace + GUARDIAN).await;
-        };
-        let ended = async move {
-            let status = tokio::select! {
-                status = child.wait() => status,
-                () = overdue => {
-                    log::error!("the guardian {guardian} does not end what it guards, the server does");
-                    actix_rt::task::spawn_blocking(move || process_tree::kill_tree(guardian)).await.ok();
-                    child.wait().await
-                }
-            };
-            match status {
-                Ok(status) if status.signal().is_none() => Ending::of_guardian(status),
-                // Somebody has killed the guardian: what it guarded is now the server's.
-                _ => {
-                    log::error!("the guardian {guardian} was killed, its processes are ended");
-                    let end = move || {
-                        orphans::end_all();
-                        process_tree::kill_marked(&mark)
-                    };
-                    actix_rt::task::spawn_blocking(end).await.ok();
-                    Ending::Signal(9)
-                }
-            }
-        };
-        Ok((Self { lifeline, guardian, asked: Some(asked) }, ended))
+        let child = command.stdin(Stdio::null()).stdout(output).stderr(errors).spawn()?;
+        let leader = child.id().and_then(|id| i32::try_from(id).ok()).ok_or(std::io::ErrorKind::Other)?;
+        let (terminate, asked) = oneshot::channel();
+        let ended = wait(KillOnDrop(Some(Pid::from_raw(leader))), child, asked, spec.grace);
+        Ok((Self { leader, terminate: Some(terminate) }, ended))
     }
 
-    /// The process from which the whole tree descends.
+    /// The process id of the program, which is the number of the group.
     #[must_use]
-    pub fn guardian(&self) -> i32 {
-        self.guardian
+    pub fn leader(&self) -> i32 {
+        self.leader
     }
 
     /// Asks for an orderly end: SIGTERM, the grace time, SIGKILL.
-    pub fn ask_to_end(&mut self) {
-        if let Some(asked) = self.asked.take() {
-            asked.send(()).ok();
+    pub fn terminate(&mut self) {
+        if let Some(terminate) = self.terminate.take() {
+            // A group that has ended needs no signal.
+            terminate.send(()).ok();
         }
-        // A guardian that no longer reads has nothing left to end.
-        self.lifeline.write_all(b".").ok();
     }
 }
 
-/// Has a folder removed when the server ends, in whatever way: as soon as nobody holds what is given back.
-///
-/// # Errors
-/// When the system can start no more processes.
-pub fn remove_in_the_end(folder: &Path) -> std::io::Result<PipeWriter> {
-    let (reader, lifeline) = std::io::pipe()?;
-    let mut command = tokio::process::Command::new("/proc/self/exe");
-    command.arg0("simulation-server").args(["guard", "--remove"]).arg(folder);
-    orphans::start(command.stdin(reader).stdout(Stdio::null()).stderr(Stdio::null()))?;
-    Ok(lifeline)
+/// Waits for the end of a program. `asked` brings the wish for an orderly end; where its sender is dropped without one,
+/// the group is killed at once.
+async fn wait(mut group: KillOnDrop, mut child: Child, asked: oneshot::Receiver<()>, grace: Duration) -> ExitReason {
+    let status = tokio::select! {
+        status = child.wait() => status,
+        asked = asked => {
+            if asked.is_ok() {
+                group.signal(Signal::SIGTERM);
+                // A launcher may end before what it has launched.
+                let end = async {
+                    child.wait().await.ok();
+                    group.emptied().await;
+                };
+                actix_rt::time::timeout(grace, end).await.ok();
+            }
+            group.signal(Signal::SIGKILL);
+            child.wait().await
+        }
+    };
+    group.signal(Signal::SIGKILL);
+    actix_rt::time::timeout(VANISH, group.emptied()).await.ok();
+    // The number of an empty group may be given to another one.
+    group.0 = None;
+    status.map_or(ExitReason::NotStarted, ExitReason::of)
 }
 
-/// Starts a program that starts no other; dropping the future kills it, and so does the kernel when the server ends.
-///
-/// # Errors
-/// When the system can start no more processes.
-pub fn start_alone(
-    plan: &Plan,
-    output: Stdio,
-    errors: Stdio,
-) -> std::io::Result<impl Future<Output = Ending> + Send + 'static> {
-    let mut command = tokio::process::Command::new("setpriv");
-    command.args(["--pdeathsig", "KILL", "--"]).args(&plan.command);
-    command.envs(plan.environment.iter().map(|(name, value)| (name, value))).env(process_tree::MARK, &plan.mark);
-    command.stdin(Stdio::null()).stdout(output).stderr(errors).process_group(0).kill_on_drop(true);
-    let mut child = orphans::start(&mut command)?;
-    Ok(async move { child.wait().await.map_or(Ending::NotStarted, Ending::of_program) })
+/// Kills a process group when it is dropped.
+struct KillOnDrop(Option<Pid>);
+
+impl KillOnDrop {
+    fn signal(&self, signal: Signal) {
+        if let Some(group) = self.0 {
+            // The only fault is that the group is empty, which is what is wanted.
+            killpg(group, signal).ok();
+        }
+    }
+
+    /// Waits until the group has no process any more.
+    async fn emptied(&self) {
+        while self.0.is_some_and(|group| killpg(group, None) != Err(Errno::ESRCH)) {
+            actix_rt::time::sleep(POLL).await;
+        }
+    }
 }
 
-impl Ending {
-    /// Of a program that the server has started itself: its exit codes are its own, also those above 128.
-    fn of_program(status: ExitStatus) -> Self {
+impl Drop for KillOnDrop {
+    fn drop(&mut self) {
+        self.signal(Signal::SIGKILL);
+    }
+}
+
+impl ExitReason {
+    fn of(status: ExitStatus) -> Self {
         let signal = status.signal().and_then(|number| u8::try_from(number).ok());
         match u8::try_from(status.code().unwrap_or_default()).unwrap_or_default() {
             _ if signal.is_some() => Self::Signal(signal.unwrap_or_default()),
-            NOT_STARTED => Self::NotStarted,
-            code => Self::Code(code),
-        }
-    }
-
-    fn of_guardian(status: ExitStatus) -> Self {
-        match u8::try_from(status.code().unwrap_or_default()).unwrap_or_default() {
-            NOT_STARTED => Self::NotStarted,
-            code if code > 128 => Self::Signal(code - 128),
+            NOT_FOUND => Self::NotStarted,
             code => Self::Code(code),
         }
     }
 }
 
-impl fmt::Display for Ending {
+impl fmt::Display for ExitReason {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Code(0) => out.write_str("ended"),
             Self::Code(code) => write!(out, "ended with exit code {code}"),
             Self::NotStarted => out.write_str("could not be started"),
-            Self::Signal(number) => match nix::sys::signal::Signal::try_from(i32::from(*number)) {
+            Self::Signal(number) => match Signal::try_from(i32::from(*number)) {
                 Ok(signal) => write!(out, "was ended by the signal {signal}"),
                 Err(_) => write!(out, "was ended by signal {number}"),
             },
@@ -200,9 +181,62 @@ mod tests {
 
     #[test]
     fn only_a_signal_is_told_as_one() {
-        let ending = |raw| Ending::of_program(ExitStatus::from_raw(raw));
-        assert_eq!(ending(129 << 8), Ending::Code(129), "git's wrong usage is no SIGHUP");
-        assert_eq!(ending(127 << 8), Ending::NotStarted);
-        assert_eq!(ending(9), Ending::Signal(9));
+        let reason = |raw| ExitReason::of(ExitStatus::from_raw(raw));
+        assert_eq!(reason(129 << 8), ExitReason::Code(129), "git's wrong usage is no SIGHUP");
+        assert_eq!(reason(127 << 8), ExitReason::NotStarted);
+        assert_eq!(reason(9), ExitReason::Signal(9));
+    }
+
+    fn shell(script: &str) -> SpawnSpec {
+        SpawnSpec {
+            command: ["bash", "-c", script].map(OsString::from).to_vec(),
+            environment: Vec::new(),
+            folder: None,
+            mark: "/nowhere".into(),
+            grace: Duration::from_secs(20),
+        }
+    }
+
+    fn is_empty(group: i32) -> bool {
+        killpg(Pid::from_raw(group), None) == Err(Errno::ESRCH)
+    }
+
+    #[actix_rt::test]
+    async fn dropping_the_guard_or_the_future_kills_the_group() {
+        for drop_guard in [true, false] {
+            let (group, ended) =
+                ProcessGroup::start(&shell("trap '' TERM; sleep 1000 & sleep 1000"), Stdio::null(), Stdio::null())
+                    .unwrap();
+            let leader = group.leader();
+            assert!(!is_empty(leader));
+            if drop_guard {
+                drop(group);
+                assert_eq!(ended.await, ExitReason::Signal(9));
+            } else {
+                drop(ended);
+                let deadline = std::time::Instant::now() + Duration::from_secs(20);
+                while !is_empty(leader) {
+                    assert!(std::time::Instant::now() < deadline, "it lives on");
+                    actix_rt::time::sleep(POLL).await;
+                }
+            }
+        }
+    }
+
+    #[actix_rt::test]
+    async fn what_a_launcher_has_launched_gets_the_grace_time_too() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("written");
+        // The launcher ends at once, what it has launched does its last work.
+        let script = format!("(trap 'sleep 0.2; echo done > {}; exit' TERM; sleep 1000 & wait) & wait", file.display());
+        let (reader, output) = std::io::pipe().unwrap();
+        let script = format!("echo ready; {script}");
+        let (mut group, ended) = ProcessGroup::start(&shell(&script), output.into(), Stdio::null()).unwrap();
+        let mut line = String::new();
+        std::io::BufRead::read_line(&mut std::io::BufReader::new(reader), &mut line).unwrap();
+        actix_rt::time::sleep(Duration::from_millis(100)).await;
+        group.terminate();
+        assert_eq!(ended.await, ExitReason::Signal(15));
+        assert_eq!(std::fs::read_to_string(file).unwrap(), "done\n");
     }
 }

@@ -9,14 +9,14 @@ use actix_web::{HttpRequest, HttpResponse, web};
 use serde::Deserialize;
 
 use super::pages;
-use super::queries::{everybody, too_busy};
+use super::queries::{snapshot, too_busy};
 use super::webots_viewer;
 use crate::asset;
 use crate::shared::http::assets::{self, Asset};
 use crate::shared::http::paths::{GET, READ, path};
 use crate::shared::http::{Policy, html};
-use crate::simulation::census::Everybody;
 use crate::simulation::machine::Usages;
+use crate::simulation::snapshot::Snapshot;
 use crate::simulation::state::AppState;
 
 /// What the page loads, besides what all pages do.
@@ -36,15 +36,15 @@ pub fn configure(app: &mut web::ServiceConfig) {
 }
 
 async fn monitor(server: web::Data<AppState>) -> HttpResponse {
-    let Some(everybody) = everybody(&server).await else {
+    let Some(snapshot) = snapshot(&server).await else {
         return too_busy();
     };
-    let usages = usages(&server, &everybody).await;
-    html(pages::monitor(&server, &everybody, &usages), &Policy::own())
+    let usages = usages(&server, &snapshot).await;
+    html(pages::monitor(&server, &snapshot, &usages), &Policy::own())
 }
 
-async fn usages(server: &AppState, everybody: &Everybody) -> Usages {
-    server.usage.read(everybody.simulations.iter().filter_map(|one| one.pid).collect()).await
+async fn usages(server: &AppState, snapshot: &Snapshot) -> Usages {
+    server.usage.read(snapshot.simulations.iter().filter_map(|one| one.pid).collect()).await
 }
 
 async fn events(server: web::Data<AppState>) -> HttpResponse {
@@ -52,9 +52,9 @@ async fn events(server: web::Data<AppState>) -> HttpResponse {
     let render = move || {
         let server = shown.clone();
         async move {
-            let everybody = everybody(&server).await?;
-            let usages = usages(&server, &everybody).await;
-            let view = pages::view(&server, &everybody, &usages);
+            let snapshot = snapshot(&server).await?;
+            let usages = usages(&server, &snapshot).await;
+            let view = pages::view(&server, &snapshot, &usages);
             view.inspect_err(|error| log::error!("the monitor page can't be rendered: {error}")).ok()
         }
     };
@@ -83,10 +83,10 @@ async fn output(request: HttpRequest, which: web::Query<Which>, server: web::Dat
     {
         return refused.answer();
     }
-    let Some(everybody) = everybody(&server).await else {
+    let Some(snapshot) = snapshot(&server).await else {
         return too_busy();
     };
-    let one = everybody.simulations.into_iter().find(|one| one.id == which.id);
+    let one = snapshot.simulations.into_iter().find(|one| one.id == which.id);
     let log = one.and_then(|one| Some((one.log?, one.log_begin)));
     let Some((log, begin)) = log else {
         return HttpResponse::NotFound().body("Error: this simulation has ended.");

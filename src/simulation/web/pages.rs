@@ -8,10 +8,10 @@ use crate::shared::domain::UrlPrefix;
 use crate::shared::domain::one_line;
 use crate::shared::http::{Row, View};
 use crate::shared::run::{seconds_since_1970, timestamp};
-use crate::simulation::census::{Everybody, Simulation, Stage};
 use crate::simulation::machine::sensors::{self, Gpu, Host, Machine};
 use crate::simulation::machine::{Readings, Sample};
 use crate::simulation::machine::{Usage, Usages};
+use crate::simulation::snapshot::{Simulation, Snapshot, Stage};
 use crate::simulation::state::AppState;
 
 /// The whole page `/monitor`.
@@ -77,16 +77,16 @@ struct SimulationRow<'one> {
 ///
 /// # Errors
 /// When a template can't be rendered.
-pub fn view(server: &AppState, everybody: &Everybody, usages: &Usages) -> Result<View, askama::Error> {
+pub fn view(server: &AppState, snapshot: &Snapshot, usages: &Usages) -> Result<View, askama::Error> {
     let readings = server.readings.borrow().clone();
-    let rows = everybody.simulations.iter().map(|one| {
+    let rows = snapshot.simulations.iter().map(|one| {
         let usage = one.pid.and_then(|pid| usages.get(&pid)).copied();
         let html = SimulationRow::new(one, usage, server.config.timeout).render()?;
         Ok(Row { key: one.id.to_string(), html })
     });
     let rows = rows.collect::<Result<Vec<Row>, askama::Error>>()?;
-    let glance = Glance::new(server, everybody, &readings).render()?;
-    let sample = readings.history.back().map(numbers).unwrap_or_default();
+    let glance = Glance::new(server, snapshot, &readings).render()?;
+    let sample = readings.history.back().map(Sample::columns).unwrap_or_default();
     Ok(View { parts: [("glance", glance)].into(), tables: [("simulations", rows)].into(), sample })
 }
 
@@ -94,8 +94,8 @@ pub fn view(server: &AppState, everybody: &Everybody, usages: &Usages) -> Result
 ///
 /// # Errors
 /// When a template can't be rendered.
-pub fn monitor(server: &AppState, everybody: &Everybody, usages: &Usages) -> Result<String, askama::Error> {
-    let view = view(server, everybody, usages)?;
+pub fn monitor(server: &AppState, snapshot: &Snapshot, usages: &Usages) -> Result<String, askama::Error> {
+    let view = view(server, snapshot, usages)?;
     let readings = server.readings.borrow().clone();
     let page = Monitor {
         version: env!("CARGO_PKG_VERSION"),
@@ -120,24 +120,13 @@ pub fn monitor(server: &AppState, everybody: &Everybody, usages: &Usages) -> Res
 /// The charts' numbers of the last ten minutes, the oldest first.
 #[must_use]
 pub fn history(readings: &Readings) -> Vec<Vec<f64>> {
-    let values = |sample| numbers(sample).iter().filter_map(|text| text.parse().ok()).collect();
+    let values = |sample: &Sample| sample.columns().iter().filter_map(|text| text.parse().ok()).collect();
     readings.history.iter().map(values).collect()
 }
 
-/// A sample as the charts want it: the time, then the columns of `monitor.csv`.
-fn numbers(sample: &Sample) -> Vec<String> {
-    let Sample { timestamp, running, idle, machine, gpu_compute, gpu_memory_traffic, gpu_memory, .. } = sample;
-    let percents =
-        [machine.cpu, machine.memory, *gpu_compute, *gpu_memory_traffic, *gpu_memory, machine.swap, machine.disk];
-    let rates = [machine.network_sent, machine.network_received];
-    let counts = [timestamp.to_string(), running.to_string(), idle.to_string()];
-    let percents = percents.map(|percent| format!("{percent:.1}"));
-    counts.into_iter().chain(percents).chain(rates.map(|rate| format!("{rate:.4}"))).collect()
-}
-
 impl<'readings> Glance<'readings> {
-    fn new(server: &AppState, everybody: &Everybody, readings: &'readings Readings) -> Self {
-        let instances = everybody.instances;
+    fn new(server: &AppState, snapshot: &Snapshot, readings: &'readings Readings) -> Self {
+        let instances = snapshot.instances;
         Self {
             draining: server.is_draining(),
             load: server.load().percent(),

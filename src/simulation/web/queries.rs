@@ -1,20 +1,20 @@
-//! Asking who is here on behalf of a request, and answers that several paths give.
+//! Asking for a snapshot on behalf of a request, and answers that several paths give.
 
 use std::time::Duration;
 
 use actix_web::HttpResponse;
 
-use crate::simulation::census::Everybody;
-use crate::simulation::places::Census;
+use crate::simulation::places::GetSnapshot;
+use crate::simulation::snapshot::Snapshot;
 use crate::simulation::state::AppState;
 
 /// How long an actor may take to answer a page.
 const PATIENCE: Duration = Duration::from_secs(2);
 
-/// Who is here; nothing when the actor that knows is too busy to answer.
-pub async fn everybody(server: &AppState) -> Option<Everybody> {
-    let census = server.places.send(Census);
-    actix_rt::time::timeout(PATIENCE, census).await.ok().and_then(Result::ok)
+/// All simulations of this server; none when the actor that knows them is too busy to answer.
+pub async fn snapshot(server: &AppState) -> Option<Snapshot> {
+    let snapshot = server.places.send(GetSnapshot);
+    actix_rt::time::timeout(PATIENCE, snapshot).await.ok().and_then(Result::ok)
 }
 
 /// The answer when nobody tells.

@@ -6,7 +6,7 @@ use actix_web::http::header;
 use actix_web::{HttpRequest, HttpResponse, web};
 
 use super::page_routes;
-use super::queries::{everybody, too_busy};
+use super::queries::{snapshot, too_busy};
 use super::status::{self, StatusPage};
 use crate::shared::http::CONTENT_TYPE;
 use crate::shared::http::paths::{self, GET, POST, READ, path};
@@ -58,17 +58,17 @@ async fn load(server: web::Data<AppState>) -> HttpResponse {
 }
 
 async fn status_json(server: web::Data<AppState>) -> HttpResponse {
-    match everybody(&server).await {
-        Some(everybody) => HttpResponse::Ok().json(StatusPage::new(&server, everybody)),
+    match snapshot(&server).await {
+        Some(snapshot) => HttpResponse::Ok().json(StatusPage::new(&server, snapshot)),
         None => too_busy(),
     }
 }
 
 async fn metrics(server: web::Data<AppState>) -> HttpResponse {
-    let Some(everybody) = everybody(&server).await else {
+    let Some(snapshot) = snapshot(&server).await else {
         return too_busy();
     };
-    match server.metrics.render(&status::gauges(&server, &everybody)) {
+    match server.metrics.render(&status::gauges(&server, &snapshot)) {
         Ok(text) => HttpResponse::Ok().content_type(CONTENT_TYPE).body(text),
         Err(error) => HttpResponse::InternalServerError().body(format!("Error: {error}.")),
     }

@@ -5,8 +5,8 @@ use serde::Serialize;
 use super::webots_viewer;
 use crate::shared::domain::ServerReport;
 use crate::shared::http::Gauge;
-use crate::simulation::census::{Everybody, Simulation};
 use crate::simulation::machine::sensors::{Gpu, Host, Machine};
+use crate::simulation::snapshot::{Simulation, Snapshot};
 use crate::simulation::state::AppState;
 
 /// The page `/status`.
@@ -34,13 +34,13 @@ pub struct StatusPage {
 impl StatusPage {
     /// The state of the server at this moment.
     #[must_use]
-    pub fn new(server: &AppState, everybody: Everybody) -> Self {
+    pub fn new(server: &AppState, snapshot: Snapshot) -> Self {
         let readings = server.readings.borrow().clone();
         let rules = &server.rules;
         let report = ServerReport {
             load: server.load(),
             version: env!("CARGO_PKG_VERSION").to_owned(),
-            instances: Some(everybody.instances),
+            instances: Some(snapshot.instances),
             allowed_repositories: rules.allowed.clone(),
             blocked_repositories: rules.blocked.clone(),
             share_idle_time: rules.share_idle_time,
@@ -54,16 +54,16 @@ impl StatusPage {
             machine: readings.machine,
             gpus: readings.gpus.clone(),
             viewer: webots_viewer::folder(&server.config).map(|_| webots_viewer::PATH),
-            simulations: everybody.simulations,
+            simulations: snapshot.simulations,
         }
     }
 }
 
 /// The gauges of `/metrics`.
 #[must_use]
-pub fn gauges<'text>(server: &AppState, everybody: &Everybody) -> Vec<Gauge<'text>> {
+pub fn gauges<'text>(server: &AppState, snapshot: &Snapshot) -> Vec<Gauge<'text>> {
     let readings = server.readings.borrow();
-    let instances = everybody.instances;
+    let instances = snapshot.instances;
     let machine = readings.machine;
     let by_state = [
         ("queued", instances.queued),

@@ -8,9 +8,9 @@ use actix::prelude::*;
 pub enum WebotsEvent {
     /// It listens on this port.
     Listening(u16),
-    /// It lives.
+    /// It has sent a heartbeat.
     Heartbeat,
-    /// It has given no sign of life for so many seconds.
+    /// It has sent no heartbeat for so many seconds.
     Hanging(u64),
     /// It has ended, and why.
     Exited(Exit),
@@ -25,22 +25,22 @@ pub struct Exit {
     pub why: String,
 }
 
-/// Tells the client, and tells it the end in any case: also where the actor panics and is dropped.
-pub struct LastWord {
+/// Tells a client the events of its Webots. Tells the exit in any case: also where the actor panics and is dropped.
+pub struct ExitNotifier {
     events: Recipient<WebotsEvent>,
-    told: bool,
+    exit_told: bool,
 }
 
-impl LastWord {
+impl ExitNotifier {
     /// Tells through this recipient.
     #[must_use]
     pub fn new(events: Recipient<WebotsEvent>) -> Self {
-        Self { events, told: false }
+        Self { events, exit_told: false }
     }
 
     /// Tells an event.
     pub fn tell(&mut self, event: WebotsEvent) {
-        self.told |= matches!(event, WebotsEvent::Exited(_));
+        self.exit_told |= matches!(event, WebotsEvent::Exited(_));
         // A heartbeat may be lost where a client can't keep up; how to reach Webots and its end may not.
         if matches!(event, WebotsEvent::Listening(_) | WebotsEvent::Exited(_)) {
             self.events.do_send(event);
@@ -50,9 +50,9 @@ impl LastWord {
     }
 }
 
-impl Drop for LastWord {
+impl Drop for ExitNotifier {
     fn drop(&mut self) {
-        if !self.told {
+        if !self.exit_told {
             let why = "The simulation was lost by a fault of this server".to_owned();
             self.tell(WebotsEvent::Exited(Exit { clean: false, why }));
         }

@@ -1,21 +1,21 @@
 //! What a Webots is started with.
 
+use std::ffi::OsString;
 use std::path::PathBuf;
 use std::sync::Arc;
 
 use actix::prelude::*;
 
-use super::command::Launch;
+use super::command::WebotsCommand;
 use super::event::WebotsEvent;
 use crate::simulation::checkout::{Checkouts, Project};
 use crate::simulation::config::SimulationConfig;
-use crate::simulation::machine::display;
 use crate::simulation::places::Ticket;
-use crate::simulation::process::process_group::Plan;
+use crate::simulation::process::SpawnSpec;
 use crate::simulation::protocol::Mode;
 
 /// What a Webots is started with.
-pub struct Orders {
+pub struct LaunchSpec {
     /// The server's configuration.
     pub config: Arc<SimulationConfig>,
     /// The program to start.
@@ -32,26 +32,22 @@ pub struct Orders {
     pub events: Recipient<WebotsEvent>,
 }
 
-impl Orders {
-    /// How it is started and ended.
+impl LaunchSpec {
+    /// How its process is started and ended; `display` are the variables by which it finds its display.
     #[must_use]
-    pub fn plan(&self) -> Plan {
-        let launch = Launch {
+    pub fn spawn_spec(&self, display: Vec<(OsString, OsString)>) -> SpawnSpec {
+        let command = WebotsCommand {
             program: &self.program,
             mode: self.mode,
             port: self.place.1,
             heartbeat: self.config.timing.heartbeat,
             world: &self.project.world.path,
-            xvfb: self.config.xvfb,
-            instance: self.project.instance.path(),
         };
-        let display = display::effective(self.config.display.as_ref());
-        Plan {
-            command: launch.arguments(),
-            environment: vec![("DISPLAY".into(), display.into())],
+        SpawnSpec {
+            command: command.to_arguments(),
+            environment: display,
             folder: Some(self.project.folder().to_owned()),
             mark: self.project.instance.path().to_owned(),
-            remove: Some(self.project.instance.path().to_owned()),
             grace: self.config.timing.grace,
         }
     }

@@ -4,8 +4,9 @@ mod command;
 mod event;
 mod launch_spec;
 mod output;
+mod virtual_display;
 mod webots;
 
 pub use event::{Exit, WebotsEvent};
-pub use launch_spec::Orders;
-pub use webots::{End, RestoreController, Webots};
+pub use launch_spec::LaunchSpec;
+pub use webots::{RestoreController, Stop, Webots};

@@ -1,4 +1,4 @@
-//! What a simulator prints: signs of its state, and lines that are kept for whoever looks for a fault.
+//! What a simulator prints: a few lines tell its state, all others are kept for whoever looks for a fault.
 //!
 //! A thread per simulator reads its output, so that neither a flood of it nor a slow disk holds up anybody else: a
 //! simulator that prints faster than this thread reads waits in its own write.
@@ -15,11 +15,11 @@ use tokio::sync::oneshot;
 use crate::shared::run::RotatedFile;
 use crate::shared::run::one_line;
 
-/// Something that a line of Webots' output says of its state.
+/// What a line of Webots' output tells of its state.
 #[derive(Message, Debug, Clone, Copy, PartialEq, Eq)]
 #[rtype(result = "()")]
-pub enum Sign {
-    /// `.`: it lives.
+pub enum OutputEvent {
+    /// `.`: the heartbeat.
     Heartbeat,
     /// `pause`: the simulation is paused.
     Paused,
@@ -33,13 +33,13 @@ pub struct Tail(Arc<Mutex<VecDeque<String>>>);
 
 /// How many lines are kept.
 const LINES: usize = 20;
-/// How much of a line is kept, in bytes; what comes after it, up to the next line break, is dropped.
+/// Bytes that are kept of a line; what comes after it, up to the next line break, is dropped.
 const LINE_SIZE: usize = 1000;
 
-impl Sign {
-    /// The meaning of a line. All other lines are the simulation's own.
+impl OutputEvent {
+    /// The meaning of a line, if it has one. All other lines are the simulation's own.
     #[must_use]
-    pub fn of(line: &str) -> Option<Self> {
+    pub fn parse(line: &str) -> Option<Self> {
         match line {
             "." => Some(Self::Heartbeat),
             "pause" => Some(Self::Paused),
@@ -65,18 +65,18 @@ impl Tail {
     }
 }
 
-/// Reads an output until its end: signs go to `signs`, other lines to the file and to the tail. The receiver that is
-/// given back with the tail hears when the end was reached.
+/// Reads an output until its end: events go to `events`, other lines to the file and to the tail. Returns the tail, and
+/// a receiver that hears when the end was reached.
 ///
 /// # Errors
 /// When the thread can't be made.
 pub fn follow<A>(
     output: PipeReader,
     mut file: Option<RotatedFile>,
-    signs: Addr<A>,
+    events: Addr<A>,
 ) -> std::io::Result<(Tail, oneshot::Receiver<()>)>
 where
-    A: Actor<Context: ToEnvelope<A, Sign>> + Handler<Sign>,
+    A: Actor<Context: ToEnvelope<A, OutputEvent>> + Handler<OutputEvent>,
 {
     let tail = Tail::default();
     let kept = tail.clone();
@@ -84,8 +84,8 @@ where
     std::thread::Builder::new().name("output".to_owned()).spawn(move || {
         let mut reader = BufReader::with_capacity(64 * 1024, output);
         while let Some(line) = next_line(&mut reader) {
-            if let Some(sign) = Sign::of(&line) {
-                deliver(&signs, sign);
+            if let Some(event) = OutputEvent::parse(&line) {
+                deliver(&events, event);
             } else {
                 if let Some(file) = &mut file {
                     // A full disk costs the lines, not the simulation.
@@ -100,12 +100,12 @@ where
     Ok((tail, ended))
 }
 
-/// Hands a sign over. An actor that can't keep up makes the simulator wait, not the mailbox grow.
-fn deliver<A>(signs: &Addr<A>, sign: Sign)
+/// Sends an event. An actor that can't keep up makes the simulator wait, not the mailbox grow.
+fn deliver<A>(events: &Addr<A>, event: OutputEvent)
 where
-    A: Actor<Context: ToEnvelope<A, Sign>> + Handler<Sign>,
+    A: Actor<Context: ToEnvelope<A, OutputEvent>> + Handler<OutputEvent>,
 {
-    while let Err(SendError::Full(_)) = signs.try_send(sign) {
+    while let Err(SendError::Full(_)) = events.try_send(event) {
         std::thread::sleep(Duration::from_millis(5));
     }
 }
@@ -153,13 +153,17 @@ mod tests {
     }
 
     #[test]
-    fn only_whole_lines_are_signs() {
-        let table = [(".", Some(Sign::Heartbeat)), ("pause", Some(Sign::Paused)), ("step", Some(Sign::Running))];
-        for (line, sign) in table {
-            assert_eq!(Sign::of(line), sign);
+    fn only_whole_lines_are_events() {
+        let table = [
+            (".", Some(OutputEvent::Heartbeat)),
+            ("pause", Some(OutputEvent::Paused)),
+            ("step", Some(OutputEvent::Running)),
+        ];
+        for (line, event) in table {
+            assert_eq!(OutputEvent::parse(line), event);
         }
         for line in ["..", "", "paused", "real-time:", "open", "INFO: pause"] {
-            assert_eq!(Sign::of(line), None, "{line:?}");
+            assert_eq!(OutputEvent::parse(line), None, "{line:?}");
         }
     }
 }

@@ -1,7 +1,7 @@
 //! Actor: one running Webots. Owns its process group, its folder and its place; ends with all three.
 //!
 //! Created by a web client once its project is checked out. It starts Webots, finds the port on which it listens,
-//! watches its signs of life and the time limit, and tells its client with [`WebotsEvent`]s. It ends when nothing of
+//! watches its heartbeat and the time limit, and tells its client with [`WebotsEvent`]s. It ends when nothing of
 //! Webots' process tree is left, and is never restarted.
 
 use std::sync::Arc;
@@ -9,21 +9,21 @@ use std::time::{Duration, Instant};
 
 use actix::prelude::*;
 
-use super::event::{Exit, LastWord, WebotsEvent};
-use super::launch_spec::Orders;
-use super::output::{self, Sign, Tail};
+use super::event::{Exit, ExitNotifier, WebotsEvent};
+use super::launch_spec::LaunchSpec;
+use super::output::{self, OutputEvent, Tail};
+use super::virtual_display::VirtualDisplay;
 use crate::shared::run::RotatedFile;
 use crate::shared::run::seconds_since_1970;
-use crate::simulation::census::{Change, Stage};
 use crate::simulation::checkout::CheckoutError;
 use crate::simulation::machine::display;
-use crate::simulation::process::process_group::{Ending, ProcessGroup};
-use crate::simulation::process::process_tree;
+use crate::simulation::process::{ExitReason, ProcessGroup, process_tree};
+use crate::simulation::snapshot::{Change, Stage};
 
 /// Asks Webots to end.
 #[derive(Message)]
 #[rtype(result = "()")]
-pub struct End;
+pub struct Stop;
 
 /// Asks for the original state of a file below the project's `controllers` folder.
 #[derive(Message)]
@@ -32,18 +32,18 @@ pub struct RestoreController(pub String);
 
 /// The actor.
 pub struct Webots {
-    orders: Orders,
+    spec: LaunchSpec,
     port: u16,
-    events: LastWord,
+    events: ExitNotifier,
     group: Option<ProcessGroup>,
     tail: Tail,
     listening: bool,
     /// Whether the simulation is not paused.
     runs: bool,
-    last_sign: Instant,
+    last_heartbeat: Instant,
     hanging: bool,
     /// Why it was asked to end, if it was.
-    asked: Option<String>,
+    stopped_for: Option<String>,
 }
 
 /// So many heartbeats may be missed before Webots counts as hanging.
@@ -53,134 +53,159 @@ const NEXT_PORTS: u16 = 10;
 /// How many older files of its output are kept beside the newest.
 const OLD_LOGS: usize = 1;
 /// How long the rest of an output may take to be read.
-const LAST_WORDS: Duration = Duration::from_secs(1);
-/// Between two looks whether Webots listens, at first.
-const FIRST_LOOK: Duration = Duration::from_millis(10);
-/// Between two looks whether Webots listens, at most.
-const SLOWEST_LOOK: Duration = Duration::from_millis(200);
+const LAST_OUTPUT: Duration = Duration::from_secs(1);
+/// Time between the first two checks whether Webots listens.
+const FIRST_POLL: Duration = Duration::from_millis(10);
+/// Time between two checks whether Webots listens, at most.
+const SLOWEST_POLL: Duration = Duration::from_millis(200);
 
 impl Webots {
     /// Prepares a Webots; it starts with the actor.
     #[must_use]
-    pub fn new(orders: Orders) -> Self {
+    pub fn new(spec: LaunchSpec) -> Self {
         Self {
-            port: orders.place.1,
-            events: LastWord::new(orders.events.clone()),
-            orders,
+            port: spec.place.1,
+            events: ExitNotifier::new(spec.events.clone()),
+            spec,
             group: None,
             tail: Tail::default(),
             listening: false,
             runs: false,
-            last_sign: Instant::now(),
+            last_heartbeat: Instant::now(),
             hanging: false,
-            asked: None,
+            stopped_for: None,
         }
     }
 
-    fn launch(&mut self, ctx: &mut Context<Self>) -> std::io::Result<()> {
-        let log = self.orders.config.log_dir.0.join("simulation/instances").join(format!("{}.log", self.port));
-        let begin = std::fs::metadata(&log).map_or(0, |file| file.len());
-        let (reader, output) = std::io::pipe()?;
-        let file = RotatedFile::open(&log, OLD_LOGS);
-        if let Err(error) = &file {
-            log::warn!(
-                "port {}: what Webots prints is not kept: {} can't be written: {error}",
-                self.port,
-                log.display()
-            );
+    /// Starts Webots' own display, then Webots.
+    fn launch_with_display(&mut self, ctx: &mut Context<Self>) {
+        let instance = self.spec.project.instance.path().to_owned();
+        let display = async move { VirtualDisplay::start(&instance).await };
+        display
+            .into_actor(self)
+            .map(|display, this, ctx| match display {
+                Ok(display) => this.launch(Some(display), ctx),
+                Err(error) => this.not_started(&format!("The virtual display (Xvfb) can't be started: {error}"), ctx),
+            })
+            .spawn(ctx);
+    }
+
+    fn launch(&mut self, display: Option<VirtualDisplay>, ctx: &mut Context<Self>) {
+        if let Some(why) = self.stopped_for.take() {
+            return self.not_started(&why, ctx);
         }
+        if let Err(error) = self.spawn(display, ctx) {
+            log::error!("port {}: Webots can't be started: {error}", self.port);
+            return self.not_started(&format!("Webots can't be started: {error}"), ctx);
+        }
+        self.poll_port(FIRST_POLL, ctx);
+        ctx.run_interval(self.spec.config.timing.heartbeat, Self::check_heartbeat);
+        let limit = self.spec.config.timing.launch;
+        ctx.run_later(limit, move |this, _| {
+            if !this.listening {
+                this.stop(&format!("Webots did not become ready within {} seconds", limit.as_secs()));
+            }
+        });
+        let limit = self.spec.config.timeout;
+        ctx.run_later(Duration::from_secs(limit), move |this, _| {
+            this.stop(&format!("The time limit of {limit} seconds was reached"));
+        });
+    }
+
+    /// Starts Webots' processes, and has their end told.
+    fn spawn(&mut self, display: Option<VirtualDisplay>, ctx: &mut Context<Self>) -> std::io::Result<()> {
+        let log = self.spec.config.log_dir.0.join("simulation/instances").join(format!("{}.log", self.port));
+        let begin = std::fs::metadata(&log).map_or(0, |file| file.len());
+        let file = RotatedFile::open(&log, OLD_LOGS).inspect_err(|error| {
+            let log = log.display();
+            log::warn!("port {}: what Webots prints is not kept: {log} can't be written: {error}", self.port);
+        });
         let log = file.is_ok().then_some(log);
+        let (reader, output) = std::io::pipe()?;
         let (tail, all_read) = output::follow(reader, file.ok(), ctx.address())?;
         self.tail = tail;
         let errors = output.try_clone()?;
-        let (group, ended) = ProcessGroup::start(&self.orders.plan(), output.into(), errors.into())?;
-        log::info!(
-            "port {}: started {} for {} (guardian {})",
-            self.port,
-            self.orders.program.display(),
-            self.orders.project.world.path.display(),
-            group.guardian()
+        let on_display = display.as_ref().map_or_else(
+            || vec![("DISPLAY".into(), display::effective(self.spec.config.display.as_ref()).into())],
+            VirtualDisplay::environment,
         );
-        let (at, pid) = (seconds_since_1970(), group.guardian());
-        self.orders.place.0.update(Change::Launched { at, pid, port: self.port, log, begin });
+        let (group, ended) = ProcessGroup::start(&self.spec.spawn_spec(on_display), output.into(), errors.into())?;
+        let (program, world) = (self.spec.program.display(), self.spec.project.world.path.display());
+        log::info!("port {}: started {program} for {world} (process {})", self.port, group.leader());
+        let (at, pid) = (seconds_since_1970(), group.leader());
+        self.spec.place.0.update(Change::Launched { at, pid, port: self.port, log, begin });
         self.group = Some(group);
+        let instance = self.spec.project.instance.path().to_owned();
         let ended = async move {
-            let ending = ended.await;
-            // What was printed last tells why. A process that nobody can end may keep the pipe open.
-            actix_rt::time::timeout(LAST_WORDS, all_read).await.ok();
-            ending
-        };
-        ended.into_actor(self).map(|ending, this, ctx| this.ended(ending, ctx)).spawn(ctx);
-        self.look_for_port(FIRST_LOOK, ctx);
-        ctx.run_interval(self.orders.config.timing.heartbeat, Self::check_signs);
-        let limit = self.orders.config.timing.launch;
-        ctx.run_later(limit, move |this, _| {
-            if !this.listening {
-                this.end(&format!("Webots did not become ready within {} seconds", limit.as_secs()));
+            let reason = ended.await;
+            if let Some(display) = display {
+                display.stop().await;
             }
-        });
-        let limit = self.orders.config.timeout;
-        ctx.run_later(Duration::from_secs(limit), move |this, _| {
-            this.end(&format!("The time limit of {limit} seconds was reached"));
-        });
+            // What has left the group.
+            actix_rt::task::spawn_blocking(move || process_tree::kill_marked(&instance)).await.ok();
+            // What was printed last tells why. A process that nobody can end may keep the pipe open.
+            actix_rt::time::timeout(LAST_OUTPUT, all_read).await.ok();
+            reason
+        };
+        ended.into_actor(self).map(|reason, this, ctx| this.ended(reason, ctx)).spawn(ctx);
         Ok(())
     }
 
-    /// Looks whether a process of this instance listens on a port that Webots may have taken.
-    fn look_for_port(&self, pause: Duration, ctx: &mut Context<Self>) {
-        let Some(root) = self.group.as_ref().map(ProcessGroup::guardian) else {
+    /// Checks whether a process of this instance listens on a port that Webots may have taken.
+    fn poll_port(&self, pause: Duration, ctx: &mut Context<Self>) {
+        let Some(root) = self.group.as_ref().map(ProcessGroup::leader) else {
             return;
         };
         let ports = self.port..=self.port.saturating_add(NEXT_PORTS);
-        let look = async move {
+        let poll = async move {
             actix_rt::time::sleep(pause).await;
             actix_rt::task::spawn_blocking(move || process_tree::listening_port(root, &ports)).await.unwrap_or_default()
         };
-        look.into_actor(self)
+        poll.into_actor(self)
             .map(move |port, this, ctx| match port {
                 Some(port) => this.ready(port),
-                None => this.look_for_port((pause * 3 / 2).min(SLOWEST_LOOK), ctx),
+                None => this.poll_port((pause * 3 / 2).min(SLOWEST_POLL), ctx),
             })
             .spawn(ctx);
     }
 
     fn ready(&mut self, port: u16) {
-        if self.asked.is_some() {
+        if self.stopped_for.is_some() {
             return;
         }
-        let allowed = self.orders.config.streaming_ports();
+        let allowed = self.spec.config.streaming_ports();
         if !allowed.contains(&port) {
             let (first, last) = (allowed.start(), allowed.end());
             return self
-                .end(&format!("Webots listens on port {port}, outside of this server's ports {first} to {last}"));
+                .stop(&format!("Webots listens on port {port}, outside of this server's ports {first} to {last}"));
         }
         if port != self.port {
             log::warn!("port {}: it was taken, Webots listens on {port}", self.port);
         }
         log::info!("port {port}: ready");
         self.listening = true;
-        self.last_sign = Instant::now();
-        self.orders.place.0.update(Change::Port(port));
+        self.last_heartbeat = Instant::now();
+        self.spec.place.0.update(Change::Port(port));
         self.show_pace();
         self.tell(WebotsEvent::Listening(port));
     }
 
-    /// Shows whether the simulation runs; a Webots that is starting or ending is shown as that.
+    /// Shows whether the simulation runs, unless Webots is starting or ending.
     fn show_pace(&self) {
-        if self.listening && self.asked.is_none() {
-            self.orders.place.0.update(Change::Stage(if self.runs { Stage::Running } else { Stage::Idle }));
+        if self.listening && self.stopped_for.is_none() {
+            self.spec.place.0.update(Change::Stage(if self.runs { Stage::Running } else { Stage::Idle }));
         }
     }
 
-    fn check_signs(&mut self, _: &mut Context<Self>) {
+    fn check_heartbeat(&mut self, _: &mut Context<Self>) {
         // Until it listens, the time for its launch counts.
         if !self.listening {
             return;
         }
-        let silence = self.last_sign.elapsed();
-        let hangs_after = self.orders.config.timing.heartbeat * MISSED_HEARTBEATS;
-        if silence > hangs_after + self.orders.config.hang_limit {
-            self.end(&format!("Webots gave no sign of life for {} seconds", silence.as_secs()));
+        let silence = self.last_heartbeat.elapsed();
+        let hangs_after = self.spec.config.timing.heartbeat * MISSED_HEARTBEATS;
+        if silence > hangs_after + self.spec.config.hang_limit {
+            self.stop(&format!("Webots gave no sign of life for {} seconds", silence.as_secs()));
         } else if silence > hangs_after && !self.hanging {
             self.hanging = true;
             log::warn!("port {}: no sign of life for {} s", self.port, silence.as_secs());
@@ -189,35 +214,40 @@ impl Webots {
     }
 
     /// Asks for an orderly end. The first reason is the one that is told.
-    fn end(&mut self, why: &str) {
-        if self.asked.is_none() {
+    fn stop(&mut self, why: &str) {
+        if self.stopped_for.is_none() {
             log::info!("port {}: ending: {why}", self.port);
-            self.asked = Some(why.to_owned());
-            self.orders.place.0.update(Change::Stage(Stage::Stopping));
+            self.stopped_for = Some(why.to_owned());
+            self.spec.place.0.update(Change::Stage(Stage::Stopping));
             if let Some(group) = &mut self.group {
-                group.ask_to_end();
+                group.terminate();
             }
         }
     }
 
-    fn ended(&mut self, ending: Ending, ctx: &mut Context<Self>) {
-        log::info!("port {}: Webots {ending}", self.port);
-        let exit = match self.asked.take() {
-            Some(why) => Exit { clean: false, why: self.with_last_lines(&why) },
-            None if ending == Ending::Code(0) => Exit { clean: true, why: "Webots has ended".to_owned() },
-            None => Exit { clean: false, why: self.with_last_lines(&format!("Webots {ending}")) },
+    fn ended(&mut self, reason: ExitReason, ctx: &mut Context<Self>) {
+        log::info!("port {}: Webots {reason}", self.port);
+        let exit = match self.stopped_for.take() {
+            Some(why) => Exit { clean: false, why: self.with_output(&why) },
+            None if reason == ExitReason::Code(0) => Exit { clean: true, why: "Webots has ended".to_owned() },
+            None => Exit { clean: false, why: self.with_output(&format!("Webots {reason}")) },
         };
-        if exit.clean || self.listening || self.orders.config.xvfb {
+        if exit.clean || self.listening || self.spec.config.xvfb {
             return self.exited(exit, ctx);
         }
-        let display = display::effective(self.orders.config.display.as_ref());
-        let look = actix_rt::task::spawn_blocking(move || display::look(&display).err());
-        look.into_actor(self)
+        let display = display::effective(self.spec.config.display.as_ref());
+        let check = actix_rt::task::spawn_blocking(move || display::check(&display).err());
+        check
+            .into_actor(self)
             .map(move |hint, this, ctx| {
                 let hint = hint.ok().flatten().map(|hint| format!(" Note: {hint}.")).unwrap_or_default();
                 this.exited(Exit { clean: false, why: exit.why.clone() + &hint }, ctx);
             })
             .spawn(ctx);
+    }
+
+    fn not_started(&mut self, why: &str, ctx: &mut Context<Self>) {
+        self.exited(Exit { clean: false, why: why.to_owned() }, ctx);
     }
 
     fn exited(&mut self, exit: Exit, ctx: &mut Context<Self>) {
@@ -226,7 +256,7 @@ impl Webots {
     }
 
     /// What a user needs to understand an end: the last of what was printed.
-    fn with_last_lines(&self, why: &str) -> String {
+    fn with_output(&self, why: &str) -> String {
         let lines = self.tail.lines();
         if lines.is_empty() { format!("{why}.") } else { format!("{why}. Its last output: {}", lines.join(" | ")) }
     }
@@ -240,25 +270,25 @@ impl Actor for Webots {
     type Context = Context<Self>;
 
     fn started(&mut self, ctx: &mut Self::Context) {
-        if let Err(error) = self.launch(ctx) {
-            log::error!("port {}: Webots can't be started: {error}", self.port);
-            self.tell(WebotsEvent::Exited(Exit { clean: false, why: format!("Webots can't be started: {error}") }));
-            ctx.stop();
+        if self.spec.config.xvfb {
+            self.launch_with_display(ctx);
+        } else {
+            self.launch(None, ctx);
         }
     }
 }
 
-impl Handler<Sign> for Webots {
+impl Handler<OutputEvent> for Webots {
     type Result = ();
 
-    fn handle(&mut self, sign: Sign, _: &mut Self::Context) {
-        self.last_sign = Instant::now();
+    fn handle(&mut self, event: OutputEvent, _: &mut Self::Context) {
+        self.last_heartbeat = Instant::now();
         self.hanging = false;
-        match sign {
-            Sign::Heartbeat if self.listening => self.tell(WebotsEvent::Heartbeat),
-            Sign::Heartbeat => {}
-            Sign::Paused | Sign::Running => {
-                self.runs = sign == Sign::Running;
+        match event {
+            OutputEvent::Heartbeat if self.listening => self.tell(WebotsEvent::Heartbeat),
+            OutputEvent::Heartbeat => {}
+            OutputEvent::Paused | OutputEvent::Running => {
+                self.runs = event == OutputEvent::Running;
                 self.show_pace();
             }
         }
@@ -269,15 +299,15 @@ impl Handler<RestoreController> for Webots {
     type Result = ResponseFuture<Result<(), CheckoutError>>;
 
     fn handle(&mut self, RestoreController(file): RestoreController, _: &mut Self::Context) -> Self::Result {
-        let (checkouts, project) = (Arc::clone(&self.orders.checkouts), Arc::clone(&self.orders.project));
+        let (checkouts, project) = (Arc::clone(&self.spec.checkouts), Arc::clone(&self.spec.project));
         Box::pin(async move { checkouts.restore_controller(&project, &file).await })
     }
 }
 
-impl Handler<End> for Webots {
+impl Handler<Stop> for Webots {
     type Result = ();
 
-    fn handle(&mut self, _: End, _: &mut Self::Context) {
-        self.end("Its client has gone");
+    fn handle(&mut self, _: Stop, _: &mut Self::Context) {
+        self.stop("Its client has gone");
     }
 }

@@ -1,4 +1,4 @@
-//! Who is here, and what each simulation is doing: what is shown of it.
+//! A snapshot of all simulations of this server, for pages and programs.
 
 use std::path::PathBuf;
 
@@ -49,9 +49,9 @@ pub enum Stage {
     Stopping,
 }
 
-/// Who is here.
+/// All simulations at one moment.
 #[derive(Debug, Clone, Default, MessageResponse)]
-pub struct Everybody {
+pub struct Snapshot {
     /// How many, by state.
     pub instances: Instances,
     /// Each simulation, the oldest first.
@@ -86,7 +86,7 @@ pub struct Simulation {
 }
 
 impl Simulation {
-    /// Notes what has changed.
+    /// Takes over what has changed.
     pub fn apply(&mut self, change: Change) {
         match change {
             Change::Stage(stage) => self.stage = stage,

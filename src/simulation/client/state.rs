@@ -1,0 +1,49 @@
+//! The states of a web client, and what it holds in each. Dropping a state gives everything back.
+
+use actix::prelude::*;
+
+use crate::shared::domain::ProjectUrl;
+use crate::simulation::places::Ticket;
+use crate::simulation::protocol::Mode;
+use crate::simulation::webots::{Stop, Webots};
+
+/// The life of a simulation, as its client's actor knows it.
+pub enum State {
+    /// Nothing was asked for yet.
+    Connected,
+    /// Waiting for a place.
+    Waiting {
+        /// What was asked for.
+        request: StartRequest,
+        /// The place in the line.
+        ticket: Ticket,
+    },
+    /// The project is being checked out; the job ends with the actor.
+    CheckingOut {
+        /// How it is shown.
+        mode: Mode,
+        /// The place and its port.
+        place: (Ticket, u16),
+    },
+    /// Webots was started.
+    Launched(WebotsHandle),
+    /// The client was told the end.
+    Over,
+}
+
+/// The simulation that a client has asked for.
+pub struct StartRequest {
+    /// Where the world is.
+    pub world: ProjectUrl,
+    /// How it is shown.
+    pub mode: Mode,
+}
+
+/// A running Webots. Dropping the handle stops it.
+pub struct WebotsHandle(pub Addr<Webots>);
+
+impl Drop for WebotsHandle {
+    fn drop(&mut self) {
+        self.0.do_send(Stop);
+    }
+}

@@ -1,0 +1,90 @@
+//! A virtual display (Xvfb) for one Webots.
+//!
+//! Xvfb chooses a free display number by itself and prints it (`-displayfd`). Started so, it writes no lock file, and
+//! takes over the socket that a killed one has left in `/tmp/.X11-unix`: nothing has to be removed after it.
+
+use std::ffi::OsString;
+use std::fs::File;
+use std::io::Write;
+use std::os::unix::fs::OpenOptionsExt;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use actix_rt::task::JoinHandle;
+use tokio::io::{AsyncBufReadExt, BufReader};
+use tokio::net::unix::pipe::Receiver;
+
+use crate::simulation::process::{ExitReason, ProcessGroup, SpawnSpec};
+
+/// A running Xvfb. Dropping it kills it.
+pub struct VirtualDisplay {
+    name: String,
+    authority: PathBuf,
+    group: ProcessGroup,
+    ended: JoinHandle<ExitReason>,
+}
+
+/// How long Xvfb may take to start.
+const START: Duration = Duration::from_secs(10);
+/// How long Xvfb may take to end after SIGTERM.
+const GRACE: Duration = Duration::from_secs(1);
+/// Its only screen: width, height and bits of a pixel, as `xvfb-run` has it.
+const SCREEN: &str = "1280x1024x24";
+/// In an authority file: the entry counts for every host. `FamilyWild` of X11/Xauth.h.
+const EVERY_HOST: u16 = 0xffff;
+/// The only kind of authorization that all clients know.
+const COOKIE: &[u8] = b"MIT-MAGIC-COOKIE-1";
+
+impl VirtualDisplay {
+    /// Starts Xvfb. It keeps its files in the instance's folder, whose mark it carries.
+    ///
+    /// # Errors
+    /// When Xvfb can't be started, ends, or names no display within ten seconds.
+    pub async fn start(instance: &Path) -> std::io::Result<Self> {
+        let (authority, log) = (instance.join("Xauthority"), instance.join("xvfb.log"));
+        write_authority(&authority)?;
+        let (reader, output) = std::io::pipe()?;
+        let mut command: Vec<OsString> =
+            ["Xvfb", "-displayfd", "1", "-screen", "0", SCREEN, "-nolisten", "tcp", "-auth"].map(OsString::from).into();
+        command.push(authority.clone().into());
+        let mark = instance.to_owned();
+        let spec = SpawnSpec { command, environment: Vec::new(), folder: None, mark, grace: GRACE };
+        let (group, ended) = ProcessGroup::start(&spec, output.into(), File::create(&log)?.into())?;
+        let ended = actix_rt::spawn(ended);
+        let mut line = String::new();
+        let mut reader = BufReader::new(Receiver::from_owned_fd(reader.into())?);
+        let read = actix_rt::time::timeout(START, reader.read_line(&mut line)).await;
+        match line.trim().parse::<u16>() {
+            Ok(number) => Ok(Self { name: format!(":{number}"), authority, group, ended }),
+            Err(_) if read.is_err() => Err(std::io::ErrorKind::TimedOut.into()),
+            Err(_) => {
+                let text = std::fs::read_to_string(log).unwrap_or_default();
+                Err(std::io::Error::other(text.trim().lines().last().unwrap_or("it has ended").to_owned()))
+            }
+        }
+    }
+
+    /// The variables by which programs find the display.
+    #[must_use]
+    pub fn environment(&self) -> Vec<(OsString, OsString)> {
+        vec![("DISPLAY".into(), self.name.clone().into()), ("XAUTHORITY".into(), self.authority.clone().into())]
+    }
+
+    /// Ends Xvfb. Returns when it has ended.
+    pub async fn stop(mut self) {
+        self.group.terminate();
+        self.ended.await.ok();
+    }
+}
+
+/// Writes an authority file with one random cookie.
+fn write_authority(path: &Path) -> std::io::Result<()> {
+    let cookie: [u8; 16] = rand::random();
+    let mut entry = EVERY_HOST.to_be_bytes().to_vec();
+    // No address and no display number: the entry counts for all.
+    for field in [&[], &[], COOKIE, &cookie] {
+        entry.extend(u16::try_from(field.len()).unwrap_or_default().to_be_bytes());
+        entry.extend(field);
+    }
+    File::options().create(true).truncate(true).write(true).mode(0o600).open(path)?.write_all(&entry)
+}
