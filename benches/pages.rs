@@ -30,6 +30,7 @@ use support::webots::Webots;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use webots_fleet::session::fleet::{FleetStatus, ServerStatus, State, StateChange};
 use webots_fleet::session::web::pages;
+use webots_fleet::shared::domain::ClientUrls;
 
 const SERVERS: u16 = 1000;
 const PAGES: usize = 100;
@@ -47,12 +48,12 @@ fn main() {
 }
 
 fn rendering() {
-    let fleet = fleet();
-    let page = pages::monitor(&fleet, 1000, false, SystemTime::now()).unwrap();
+    let (fleet, urls) = (fleet(), ClientUrls { ssl: false, public: None });
+    let page = pages::monitor(&fleet, 1000, &urls, SystemTime::now()).unwrap();
     let mut times: Vec<Duration> = (0..50)
         .map(|_| {
             let begun = Instant::now();
-            std::hint::black_box(pages::monitor(&fleet, 1000, false, SystemTime::now()).unwrap());
+            std::hint::black_box(pages::monitor(&fleet, 1000, &urls, SystemTime::now()).unwrap());
             begun.elapsed()
         })
         .collect();

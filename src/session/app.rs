@@ -85,7 +85,7 @@ pub async fn run(mut config: SessionConfig, file: PathBuf) -> Result<(), AppErro
     let port = socket.local_addr()?.port();
     config.port = port;
     let stop = config.timing.stop;
-    let (address, ssl) = (config.address(), config.ssl);
+    let (http_url, websocket_url) = (config.http_url(), config.websocket_url());
     let server = Arc::new(assemble(config, clients, phase)?);
     let shared = web::Data::from(Arc::clone(&server));
     // Called once in each thread that serves connections.
@@ -106,7 +106,7 @@ pub async fn run(mut config: SessionConfig, file: PathBuf) -> Result<(), AppErro
         .run();
     let handle = http.handle();
     let serving = actix_rt::spawn(http);
-    start::announce("session server", &address, ssl, "/session", port);
+    start::announce("session server", &http_url, &websocket_url, port);
     let registry = server.registry.clone();
     actix_rt::spawn(notify::feed_watchdog(async move || registry.send(IsAvailable).await.is_ok()));
     let mut no_registry = std::pin::pin!(permanent::stopped("Registry", server.registry.clone()));
@@ -180,7 +180,7 @@ fn assemble(config: SessionConfig, clients: usize, phase: watch::Receiver<Phase>
         picks.with_label_values(&[outcome]).reset();
     }
     let mailer = mail::start(&config);
-    let (timing, ssl) = (config.timing.clone(), config.ssl);
+    let (timing, client_urls) = (config.timing.clone(), config.client_urls());
     let connections = Connections::new(clients, config.max_clients_per_address);
     let trusted_proxies = config.trusted_proxies.clone();
     let (examples, viewer_script) = (config.examples.clone(), config.viewer_script.clone());
@@ -189,7 +189,7 @@ fn assemble(config: SessionConfig, clients: usize, phase: watch::Receiver<Phase>
     Ok(AppState {
         registry,
         timing,
-        ssl,
+        client_urls,
         phase,
         connections,
         trusted_proxies,

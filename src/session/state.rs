@@ -8,6 +8,7 @@ use tokio::sync::watch;
 use super::config::{Example, Timing};
 use crate::session::fleet::Registry;
 use crate::session::fleet::{NoServer, Pick};
+use crate::shared::domain::ClientUrls;
 use crate::shared::http::Connections;
 use crate::shared::http::Live;
 use crate::shared::http::Metrics;
@@ -20,8 +21,8 @@ pub struct AppState {
     pub registry: Addr<Registry>,
     /// `timing` of the configuration.
     pub timing: Timing,
-    /// Whether clients get URLs that begin with `wss`.
-    pub ssl: bool,
+    /// How the URLs of simulation servers are formed for clients.
+    pub client_urls: ClientUrls,
     /// Whether clients are taken.
     pub phase: watch::Receiver<Phase>,
     /// Counts WebSockets.
@@ -79,7 +80,7 @@ impl AppState {
         };
         self.picks.with_label_values(&[outcome]).inc();
         match picked {
-            Ok(address) => Answer { text: address.websocket_url(self.ssl), refusal: None },
+            Ok(address) => Answer { text: self.client_urls.websocket_url(&address), refusal: None },
             Err(refusal) => Answer { text: refusal.to_string(), refusal: Some(refusal) },
         }
     }

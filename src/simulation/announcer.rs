@@ -30,7 +30,7 @@ impl Announcer {
         let allowed: Vec<&str> =
             config.allowed_repositories.iter().map(crate::shared::domain::UrlPrefix::as_str).collect();
         let form = vec![
-            ("url", config.address(config.port).http_url(config.ssl)),
+            ("url", config.http_url()),
             ("shareIdleTime", config.share_idle_time.to_string()),
             ("allowedRepositories", allowed.join(",")),
         ];

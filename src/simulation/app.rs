@@ -130,8 +130,8 @@ pub async fn serve(assembly: Assembly) -> Result<(), AppError> {
         .run();
     let handle = http.handle();
     let serving = actix_rt::spawn(http);
-    let (address, port) = (server.config.address(server.config.port), server.config.port);
-    start::announce("simulation server", &address, server.config.ssl, "/client", port);
+    let (config, port) = (&server.config, server.config.port);
+    start::announce("simulation server", &config.http_url(), &format!("{}/client", config.websocket_url(port)), port);
     let places = server.places.clone();
     let asked_for_life = places.clone();
     actix_rt::spawn(notify::feed_watchdog(async move || asked_for_life.send(GetSnapshot).await.is_ok()));

@@ -17,8 +17,6 @@
 
 use serde::Deserialize;
 
-use crate::shared::domain::PublicAddress;
-
 /// What a client asks for.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Request {
@@ -113,8 +111,8 @@ pub fn shutdown_timeout(seconds: u64) -> String {
 
 /// Where Webots is ready.
 #[must_use]
-pub fn webots(address: &PublicAddress, ssl: bool) -> String {
-    format!("webots:{}", address.websocket_url(ssl))
+pub fn webots(url: &str) -> String {
+    format!("webots:{url}")
 }
 
 /// A controller's file was restored.
@@ -159,8 +157,7 @@ mod tests {
 
     #[test]
     fn answers_are_those_of_the_original() {
-        let address = PublicAddress::new("host", 2001, true);
-        assert_eq!(webots(&address, true), "webots:wss://host/2001");
+        assert_eq!(webots("wss://host/2001"), "webots:wss://host/2001");
         assert_eq!(shutdown_timeout(7200), "shutdownTimeout: 7200");
         assert_eq!(error("no"), "loading: Error: no");
         assert_eq!(queue(3), "queue: 3");

@@ -10,7 +10,7 @@ use crate::support::ports;
 
 /// A service of the machine that belongs to no fleet: a database's page of administration, say. It runs until the
 /// test program ends.
-fn private_service() -> u16 {
+pub fn private_service() -> u16 {
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let port = listener.local_addr().unwrap().port();
     std::thread::spawn(move || {

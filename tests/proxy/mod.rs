@@ -11,6 +11,7 @@ mod addresses;
 mod connections;
 mod encoded;
 mod exposure;
+mod one_door;
 mod pages;
 mod trust;
 mod urls;

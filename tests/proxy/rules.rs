@@ -105,7 +105,8 @@ impl Rules {
     }
 }
 
-fn adapt(text: &str, changes: &[(&str, &str)]) -> String {
+/// A text in which each of some words, which must be there, is another one.
+pub fn adapt(text: &str, changes: &[(&str, &str)]) -> String {
     changes.iter().fold(text.to_owned(), |text, (from, to)| {
         assert!(text.contains(from), "{from:?} is not in\n{text}");
         text.replace(from, to)

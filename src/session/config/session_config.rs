@@ -12,9 +12,10 @@ use crate::session::mail_address;
 use crate::session::placement::Policy;
 use crate::shared::config::{Configuration, InvalidValue, changed_keys};
 use crate::shared::config::{
-    ExpandedPath, Secret, folder, local_address, object, one_or_many, optional_port, percent, seconds, threshold, whole,
+    ExpandedPath, Secret, expanded, folder, local_address, object, one_or_many, optional_port, percent, seconds,
+    threshold, whole,
 };
-use crate::shared::domain::{PublicAddress, check_host};
+use crate::shared::domain::{ClientUrls, PublicAddress, PublicUrl, check_host};
 use crate::shared::http::TrustedProxies;
 
 /// Every key of the session server. The original's keys keep their meaning.
@@ -22,7 +23,7 @@ use crate::shared::http::TrustedProxies;
 #[serde(rename_all = "camelCase")]
 pub struct SessionConfig {
     /// Fully qualified domain name of the session server. Default: `localhost`, with a warning.
-    #[serde(default)]
+    #[serde(default, deserialize_with = "expanded")]
     pub server: String,
     /// Whether URLs begin with `https` and `wss`. Default: true.
     #[serde(default = "default_true")]
@@ -36,6 +37,10 @@ pub struct SessionConfig {
     /// Whether a web server in front rewrites ports in URLs: HOST/PORT, not HOST:PORT. Default: true.
     #[serde(default = "default_true")]
     pub port_rewrite: bool,
+    /// How clients reach the simulation servers through one web server: a URL with the placeholders `{host}` and `{port}`.
+    /// Default: none, and each is reached under its own address.
+    #[serde(default)]
+    pub public_url: Option<PublicUrl>,
     /// The simulation servers, as HOST:PORT or HOST/PORT.
     pub simulation_servers: Vec<PublicAddress>,
     /// Those of `simulationServers` that get no new clients. They are still watched. Default: none.
@@ -133,10 +138,29 @@ impl SessionConfig {
         }
     }
 
-    /// Returns the address under which clients reach this server.
+    /// Returns the address of this server.
     #[must_use]
     pub fn address(&self) -> PublicAddress {
         PublicAddress::new(&self.server, self.port, self.port_rewrite)
+    }
+
+    /// Returns the HTTP URL under which clients reach this server. With a public URL, it is that of the web server.
+    #[must_use]
+    pub fn http_url(&self) -> String {
+        self.public_url.as_ref().map_or_else(|| self.address().http_url(self.ssl), PublicUrl::http_door)
+    }
+
+    /// Returns the WebSocket URL under which clients reach this server.
+    #[must_use]
+    pub fn websocket_url(&self) -> String {
+        let door = self.public_url.as_ref().map(PublicUrl::websocket_door);
+        format!("{}/session", door.unwrap_or_else(|| self.address().websocket_url(self.ssl)))
+    }
+
+    /// Returns how the URLs of simulation servers are formed for clients.
+    #[must_use]
+    pub fn client_urls(&self) -> ClientUrls {
+        ClientUrls { ssl: self.ssl, public: self.public_url.clone() }
     }
 }
 

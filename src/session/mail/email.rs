@@ -69,7 +69,7 @@ impl EmailComposer {
             from: config.mail_sender.clone()?,
             to: config.administrator.clone()?,
             session_server: shown(&config.address().to_string()),
-            monitor: format!("{}/monitor", shown(&config.address().http_url(config.ssl))),
+            monitor: format!("{}/monitor", shown(&config.http_url())),
         })
     }
 

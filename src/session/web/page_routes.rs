@@ -39,8 +39,9 @@ pub fn configure(app: &mut web::ServiceConfig) {
 }
 
 async fn monitor(server: web::Data<AppState>) -> HttpResponse {
-    let (clients, ssl, started) = (server.clients(), server.ssl, server.started_at);
-    with_status(&server, |status| html(pages::monitor(status, clients, ssl, started), &Policy::own())).await
+    let (clients, started) = (server.clients(), server.started_at);
+    with_status(&server, |status| html(pages::monitor(status, clients, &server.client_urls, started), &Policy::own()))
+        .await
 }
 
 async fn events(server: web::Data<AppState>) -> HttpResponse {
@@ -49,7 +50,7 @@ async fn events(server: web::Data<AppState>) -> HttpResponse {
         let server = shown.clone();
         async move {
             let status = ask(&server, GetStatus).await?;
-            let view = pages::view(&status, server.clients(), server.ssl);
+            let view = pages::view(&status, server.clients(), &server.client_urls);
             view.inspect_err(|error| log::error!("the monitor page can't be rendered: {error}")).ok()
         }
     };
@@ -79,7 +80,10 @@ async fn webots_viewer(server: web::Data<AppState>) -> HttpResponse {
 }
 
 fn fleet(server: &AppState, status: &FleetStatus) -> Vec<String> {
-    fleet_sources(status.servers.iter().map(|one| &one.address), server.ssl)
+    match &server.client_urls.public {
+        Some(public) => vec![public.http_door(), public.websocket_door()],
+        None => fleet_sources(status.servers.iter().map(|one| &one.address), server.client_urls.ssl),
+    }
 }
 
 async fn asset(request: HttpRequest) -> HttpResponse {

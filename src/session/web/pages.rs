@@ -7,6 +7,7 @@ use askama::Template;
 
 use crate::session::config::Example;
 use crate::session::fleet::{FleetStatus, ServerStatus, State, StateChange};
+use crate::shared::domain::ClientUrls;
 use crate::shared::domain::Instances;
 use crate::shared::domain::one_line;
 use crate::shared::http::{Row, View};
@@ -93,9 +94,9 @@ pub struct WebotsViewer {
 ///
 /// # Errors
 /// When a template can't be rendered.
-pub fn view(status: &FleetStatus, clients: usize, ssl: bool) -> Result<View, askama::Error> {
+pub fn view(status: &FleetStatus, clients: usize, urls: &ClientUrls) -> Result<View, askama::Error> {
     let rows = status.servers.iter().map(|server| {
-        let html = ServerRow::new(server, ssl).render()?;
+        let html = ServerRow::new(server, urls).render()?;
         Ok(Row { key: server.address.to_string(), html })
     });
     let rows = rows.collect::<Result<Vec<Row>, askama::Error>>()?;
@@ -110,8 +111,13 @@ pub fn view(status: &FleetStatus, clients: usize, ssl: bool) -> Result<View, ask
 ///
 /// # Errors
 /// When a template can't be rendered.
-pub fn monitor(status: &FleetStatus, clients: usize, ssl: bool, started: SystemTime) -> Result<String, askama::Error> {
-    let view = view(status, clients, ssl)?;
+pub fn monitor(
+    status: &FleetStatus,
+    clients: usize,
+    urls: &ClientUrls,
+    started: SystemTime,
+) -> Result<String, askama::Error> {
+    let view = view(status, clients, urls)?;
     let part = |id| view.parts.get(id).map(String::as_str).unwrap_or_default();
     let page = Monitor {
         version: env!("CARGO_PKG_VERSION"),
@@ -147,7 +153,7 @@ impl Glance {
 }
 
 impl<'server> ServerRow<'server> {
-    fn new(server: &'server ServerStatus, ssl: bool) -> Self {
+    fn new(server: &'server ServerStatus, urls: &ClientUrls) -> Self {
         let report = server.report.as_ref().filter(|_| server.state != State::Down);
         let load = report.map(|report| report.load.percent());
         let repositories = report.map(|report| report.allowed_repositories.as_slice()).unwrap_or_default();
@@ -158,7 +164,7 @@ impl<'server> ServerRow<'server> {
         };
         Self {
             server,
-            monitor: format!("{}/monitor", server.address.http_url(ssl)),
+            monitor: format!("{}/monitor", urls.http_url(&server.address)),
             rank: rank(server.state),
             error: server.error.as_deref().filter(|_| server.state == State::Down),
             load,

@@ -6,6 +6,7 @@ use serde::Serialize;
 
 use crate::session::fleet::{FleetStatus, ServerStatus, State, told_mean};
 use crate::session::state::AppState;
+use crate::shared::domain::ClientUrls;
 use crate::shared::domain::Instances;
 use crate::shared::domain::Load;
 use crate::shared::http::Gauge;
@@ -71,20 +72,20 @@ impl StatusPage {
             available: status.available,
             clients: server.clients(),
             load: status.mean_load,
-            servers: status.servers.iter().map(|one| ServerPage::new(one, server.ssl)).collect(),
+            servers: status.servers.iter().map(|one| ServerPage::new(one, &server.client_urls)).collect(),
             changes: changes.collect(),
         }
     }
 }
 
 impl ServerPage {
-    fn new(server: &ServerStatus, ssl: bool) -> Self {
+    fn new(server: &ServerStatus, urls: &ClientUrls) -> Self {
         let known = server.report.as_ref().filter(|_| server.state != State::Down);
         let allowed =
             known.map(|report| report.allowed_repositories.iter().map(|prefix| prefix.as_str().to_owned()).collect());
         Self {
             address: server.address.to_string(),
-            monitor: format!("{}/monitor", server.address.http_url(ssl)),
+            monitor: format!("{}/monitor", urls.http_url(&server.address)),
             state: server.state.word(),
             since: timestamp(server.since),
             load: known.map(|report| report.load),

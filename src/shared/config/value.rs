@@ -1,5 +1,6 @@
 //! Types of configuration values. The error for a value that is not allowed says what is.
 
+use std::borrow::Cow;
 use std::fmt;
 use std::marker::PhantomData;
 use std::net::IpAddr;
@@ -35,6 +36,17 @@ impl TryFrom<String> for ExpandedPath {
             Err(error) => Err(format!("{text:?} names the environment variable {}, which is not set", error.var_name)),
         }
     }
+}
+
+/// Reads a text in which `$VARIABLE` is replaced.
+///
+/// # Errors
+/// When the value is not a text, or names a variable that is not set.
+pub fn expanded<'de, D: Deserializer<'de>>(deserializer: D) -> Result<String, D::Error> {
+    let text = String::deserialize(deserializer)?;
+    shellexpand::env(&text).map(Cow::into_owned).map_err(|error| {
+        D::Error::custom(format!("{text:?} names the environment variable {}, which is not set", error.var_name))
+    })
 }
 
 /// Reads the path of a folder.

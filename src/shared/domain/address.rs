@@ -50,6 +50,12 @@ impl PublicAddress {
         &self.host
     }
 
+    /// The port alone.
+    #[must_use]
+    pub fn port(&self) -> u16 {
+        self.port
+    }
+
     /// Whether a web server in front rewrites ports.
     #[must_use]
     pub fn is_rewritten(&self) -> bool {

@@ -2,6 +2,7 @@
 
 mod address;
 mod admission;
+mod client_urls;
 mod load;
 mod project_url;
 mod report;
@@ -10,6 +11,7 @@ mod text;
 
 pub use address::{PublicAddress, check_host};
 pub use admission::Rules;
+pub use client_urls::{ClientUrls, PublicUrl};
 pub use load::Load;
 pub use project_url::{NoProject, ProjectUrl, Reading, RefKind};
 pub use report::{Instances, ServerReport};

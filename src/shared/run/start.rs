@@ -8,7 +8,7 @@ use std::process::ExitCode;
 use super::logging::{self, LogTarget};
 use super::{notify, pid_file};
 use crate::shared::config::{self, Configuration, LoadedConfig};
-use crate::shared::domain::{PublicAddress, one_line};
+use crate::shared::domain::one_line;
 
 /// Exit code: the server failed at run time, as where its port is taken.
 pub const FAILED: u8 = 1;
@@ -88,13 +88,12 @@ pub fn serve<E: std::error::Error>(
     }
 }
 
-/// Tells the log, standard output and the service manager that a server can be reached, and where. `path` is that of its
+/// Tells the log, standard output and the service manager that a server can be reached: its HTTP URL, and that of its
 /// WebSocket.
-pub fn announce(server: &str, address: &PublicAddress, ssl: bool, path: &str, port: u16) {
-    let (http, websocket) = (address.http_url(ssl), address.websocket_url(ssl));
+pub fn announce(server: &str, http: &str, websocket: &str, port: u16) {
     log::info!("{server} {} listens on port {port}: {http}", env!("CARGO_PKG_VERSION"));
     // The reader may have gone.
-    writeln!(std::io::stdout(), "{server:<18} {http}/monitor   {websocket}{path}").ok();
+    writeln!(std::io::stdout(), "{server:<18} {http}/monitor   {websocket}").ok();
     notify::ready(port);
 }
 

@@ -259,7 +259,7 @@ impl Handler<WebotsEvent> for WebClient {
         match event {
             WebotsEvent::Listening(port) => {
                 self.start.is(Outcome::Ready);
-                ctx.text(protocol::webots(&self.server.config.address(port), self.server.config.ssl));
+                ctx.text(protocol::webots(&self.server.config.websocket_url(port)));
             }
             WebotsEvent::Heartbeat => ctx.text(protocol::HEARTBEAT),
             WebotsEvent::Hanging(seconds) => {

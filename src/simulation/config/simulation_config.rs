@@ -8,9 +8,11 @@ use serde::{Deserialize, Serialize};
 
 use super::timing::Timing;
 use crate::shared::config::{Configuration, InvalidValue};
-use crate::shared::config::{ExpandedPath, folder, local_address, object, one_or_many, percent, seconds, whole};
+use crate::shared::config::{
+    ExpandedPath, expanded, folder, local_address, object, one_or_many, percent, seconds, whole,
+};
 use crate::shared::domain::UrlPrefix;
-use crate::shared::domain::{PublicAddress, check_host};
+use crate::shared::domain::{ClientUrls, PublicAddress, PublicUrl, check_host};
 use crate::shared::http::Origin;
 use crate::shared::http::TrustedProxies;
 use crate::simulation::checkout::Mirrors;
@@ -22,7 +24,7 @@ use crate::simulation::machine::display::DisplayName;
 #[expect(clippy::struct_excessive_bools, reason = "they are keys of a file that exists")]
 pub struct SimulationConfig {
     /// Fully qualified domain name of the simulation server. Default: `localhost`, with a warning.
-    #[serde(default, alias = "fullyQualifiedDomainName")]
+    #[serde(default, alias = "fullyQualifiedDomainName", deserialize_with = "expanded")]
     pub server: String,
     /// Whether URLs begin with `https` and `wss`. Default: true.
     #[serde(default = "default_true")]
@@ -36,6 +38,10 @@ pub struct SimulationConfig {
     /// Whether a web server in front rewrites ports in URLs: HOST/PORT, not HOST:PORT. Default: true.
     #[serde(default = "default_true")]
     pub port_rewrite: bool,
+    /// How clients reach this server and its simulations through one web server: a URL with the placeholders `{host}`
+    /// (that is `server`) and `{port}`. Default: none, and they are reached under their own addresses.
+    #[serde(default)]
+    pub public_url: Option<PublicUrl>,
     /// Folder of `simulation/output.log`, `simulation/monitor.csv` and the instances' output. Default: `log`.
     #[serde(default = "default_log_dir", deserialize_with = "folder")]
     pub log_dir: ExpandedPath,
@@ -134,9 +140,23 @@ pub struct SimulationConfig {
 }
 
 impl SimulationConfig {
-    /// Returns the address under which clients reach a port of this server: its own, or that of a Webots.
+    /// Returns the HTTP URL under which clients reach this server.
     #[must_use]
-    pub fn address(&self, port: u16) -> PublicAddress {
+    pub fn http_url(&self) -> String {
+        self.client_urls().http_url(&self.address(self.port))
+    }
+
+    /// Returns the WebSocket URL under which clients reach a port of this server: its own, or that of a Webots.
+    #[must_use]
+    pub fn websocket_url(&self, port: u16) -> String {
+        self.client_urls().websocket_url(&self.address(port))
+    }
+
+    fn client_urls(&self) -> ClientUrls {
+        ClientUrls { ssl: self.ssl, public: self.public_url.clone() }
+    }
+
+    fn address(&self, port: u16) -> PublicAddress {
         PublicAddress::new(&self.server, port, self.port_rewrite)
     }
 

@@ -1,0 +1,150 @@
+//! The URLs under which clients reach the servers of a fleet. Pure.
+
+use serde::{Deserialize, Serialize};
+
+use super::address::PublicAddress;
+
+/// The WebSocket URL of servers that are reached through one web server, with placeholders: `wss://DOOR/{host}/{port}`.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(try_from = "String", into = "String")]
+pub struct PublicUrl {
+    /// The web server, `HOST` or `HOST:PORT`.
+    door: String,
+    ssl: bool,
+    /// What follows the web server, with placeholders.
+    path: String,
+}
+
+/// A text that is not a public URL.
+#[derive(Debug, thiserror::Error)]
+#[error("{found:?} is not allowed; allowed is such as \"wss://fleet.example.org/{{host}}/{{port}}\"")]
+pub struct NotAPublicUrl {
+    found: String,
+}
+
+impl PublicUrl {
+    /// Returns the WebSocket URL of a server, without a slash at its end.
+    #[must_use]
+    pub fn websocket_url(&self, address: &PublicAddress) -> String {
+        format!("{}{}", self.websocket_door(), self.path_of(address))
+    }
+
+    /// Returns the HTTP URL of a server, without a slash at its end.
+    #[must_use]
+    pub fn http_url(&self, address: &PublicAddress) -> String {
+        format!("{}{}", self.http_door(), self.path_of(address))
+    }
+
+    /// Returns the WebSocket URL of the web server itself, without a slash at its end.
+    #[must_use]
+    pub fn websocket_door(&self) -> String {
+        format!("{}://{}", if self.ssl { "wss" } else { "ws" }, self.door)
+    }
+
+    /// Returns the HTTP URL of the web server itself, without a slash at its end.
+    #[must_use]
+    pub fn http_door(&self) -> String {
+        format!("{}://{}", if self.ssl { "https" } else { "http" }, self.door)
+    }
+
+    fn path_of(&self, address: &PublicAddress) -> String {
+        self.path.replace("{host}", address.host()).replace("{port}", &address.port().to_string())
+    }
+}
+
+impl TryFrom<String> for PublicUrl {
+    type Error = NotAPublicUrl;
+
+    fn try_from(text: String) -> Result<Self, NotAPublicUrl> {
+        let parts = || {
+            let (scheme, rest) = text.split_once("://")?;
+            let ssl = match scheme {
+                "ws" => false,
+                "wss" => true,
+                _ => return None,
+            };
+            let (door, path) = rest.split_at_checked(rest.find('/')?)?;
+            // As in an address of a server, the name is written in one way only.
+            let door: PublicAddress = format!("{door}/1").parse().ok()?;
+            let plain = path.replacen("{host}", "", 1).replacen("{port}", "", 1);
+            let is_of_path = |letter: char| letter.is_ascii_alphanumeric() || "/-._".contains(letter);
+            let fits = path.contains("{port}") && !path.ends_with('/') && plain.chars().all(is_of_path);
+            fits.then(|| Self { door: door.host().to_owned(), ssl, path: path.to_owned() })
+        };
+        parts().ok_or_else(|| NotAPublicUrl { found: text.clone() })
+    }
+}
+
+impl From<PublicUrl> for String {
+    fn from(url: PublicUrl) -> Self {
+        format!("{}{}", url.websocket_door(), url.path)
+    }
+}
+
+/// How the URLs of a fleet's servers are formed for clients.
+#[derive(Debug, Clone)]
+pub struct ClientUrls {
+    /// Whether URLs begin with `https` and `wss`, where there is no public URL.
+    pub ssl: bool,
+    /// The URL of servers behind one web server.
+    pub public: Option<PublicUrl>,
+}
+
+impl ClientUrls {
+    /// Returns the WebSocket URL of a server, without a slash at its end.
+    #[must_use]
+    pub fn websocket_url(&self, address: &PublicAddress) -> String {
+        self.public.as_ref().map_or_else(|| address.websocket_url(self.ssl), |public| public.websocket_url(address))
+    }
+
+    /// Returns the HTTP URL of a server, without a slash at its end.
+    #[must_use]
+    pub fn http_url(&self, address: &PublicAddress) -> String {
+        self.public.as_ref().map_or_else(|| address.http_url(self.ssl), |public| public.http_url(address))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn public(text: &str) -> Result<PublicUrl, NotAPublicUrl> {
+        text.to_owned().try_into()
+    }
+
+    #[test]
+    fn host_and_port_are_filled_in() {
+        let address: PublicAddress = "10.0.1.7:2000".parse().unwrap();
+        for (text, websocket, http) in [
+            ("wss://fleet.org/{host}/{port}", "wss://fleet.org/10.0.1.7/2000", "https://fleet.org/10.0.1.7/2000"),
+            ("ws://Fleet.org:8080/a/{port}", "ws://fleet.org:8080/a/2000", "http://fleet.org:8080/a/2000"),
+            ("wss://[::1]/{port}-{host}", "wss://[::1]/2000-10.0.1.7", "https://[::1]/2000-10.0.1.7"),
+        ] {
+            let url = public(text).unwrap();
+            assert_eq!((url.websocket_url(&address).as_str(), url.http_url(&address).as_str()), (websocket, http));
+        }
+        let url = public("wss://fleet.org/{host}/{port}").unwrap();
+        assert_eq!((url.websocket_door(), url.http_door()), ("wss://fleet.org".into(), "https://fleet.org".into()));
+        assert_eq!(String::from(url), "wss://fleet.org/{host}/{port}");
+    }
+
+    #[test]
+    fn other_texts_are_refused_with_one_that_is_allowed() {
+        for text in [
+            "",
+            "https://fleet.org/{port}",
+            "wss://fleet.org",
+            "wss://fleet.org/",
+            "wss://fleet.org/{host}",
+            "wss://fleet.org/{port}/",
+            "wss://{host}/{port}",
+            "wss://fleet.org/{port}?a",
+            "wss://fleet.org/{port}/{port}",
+            "wss://fleet.org/{name}/{port}",
+            "wss://a:b@fleet.org/{port}",
+        ] {
+            let error = public(text).unwrap_err().to_string();
+            assert!(error.contains(r#""wss://fleet.example.org/{host}/{port}""#), "{error}");
+        }
+    }
+}
