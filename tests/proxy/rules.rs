@@ -50,6 +50,8 @@ impl Rules {
             Self::Apache => adapt(
                 include_str!("../../deploy/apache.conf"),
                 &[
+                    // First, as other numbers may hold this one.
+                    ("1999", &session.to_string()),
                     ("  #Rewrite", "  Rewrite"),
                     ("fleet.example.org", "localhost"),
                     ("*:80>", &format!("127.0.0.1:{http}>")),
@@ -58,13 +60,14 @@ impl Rules {
                     ("/etc/letsencrypt/live/${FLEET_HOST}/privkey.pem", key),
                     ("20[01][0-9]|2020", &pattern(here)),
                     ("30[01][0-9]|3020", &pattern(there)),
-                    ("1999", &session.to_string()),
                     ("192.0.2.3", "127.0.0.2"),
                 ],
             ),
             Self::Nginx => adapt(
                 include_str!("../../deploy/nginx.conf"),
                 &[
+                    // First, as other numbers may hold this one.
+                    ("1999", &session.to_string()),
                     ("  #location", "  location"),
                     ("  #  ", "    "),
                     ("  #}", "  }"),
@@ -77,7 +80,6 @@ impl Rules {
                     ("listen 443 ssl;", &format!("listen 127.0.0.1:{https} ssl;")),
                     ("20[01][0-9]|2020", &pattern(here)),
                     ("30[01][0-9]|3020", &pattern(there)),
-                    ("1999", &session.to_string()),
                     ("192.0.2.3", "127.0.0.2"),
                 ],
             ),
