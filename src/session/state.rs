@@ -8,7 +8,7 @@ use tokio::sync::watch;
 use super::config::{Example, Timing};
 use crate::session::fleet::Registry;
 use crate::session::fleet::{NoServer, Pick};
-use crate::shared::domain::ClientUrls;
+use crate::shared::domain::{ClientUrls, client_text};
 use crate::shared::http::Connections;
 use crate::shared::http::Live;
 use crate::shared::http::Metrics;
@@ -81,7 +81,7 @@ impl AppState {
         self.picks.with_label_values(&[outcome]).inc();
         match picked {
             Ok(address) => Answer { text: self.client_urls.websocket_url(&address), refusal: None },
-            Err(refusal) => Answer { text: refusal.to_string(), refusal: Some(refusal) },
+            Err(refusal) => Answer { text: client_text(&refusal.to_string()), refusal: Some(refusal) },
         }
     }
 }

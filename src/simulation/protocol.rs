@@ -1,84 +1,85 @@
-//! What web clients say on `/client`, and what they are told. Pure.
+//! The messages of the WebSocket `/client`. Pure.
 //!
 //! | from the client (JSON) | |
 //! |---|---|
 //! | `{"start": {"url": WORLD, "mode": "x3d" \| "w3d" \| "mjpeg"}}` | start a simulation |
 //! | `{"reset controller": "NAME/FILE"}` | restore a file below `controllers/` |
+//! | any other JSON | ignored, as the Python server does: old pages send it |
 //!
 //! | to the client (text) | |
 //! |---|---|
 //! | `queue: N` | N clients are ahead in the waiting line |
-//! | `loading: TEXT` | what is going on |
-//! | `loading: Error: TEXT` | why it failed; the connection is closed after it |
-//! | `shutdownTimeout: SECONDS` | the process was launched, and will be closed after so long |
+//! | `loading: TEXT` | progress |
+//! | `loading: Error: TEXT` | why the simulation failed; the connection is closed after it |
+//! | `shutdownTimeout: SECONDS` | the process was launched, and will be closed after so many seconds |
 //! | `webots:URL` | Webots is ready there |
-//! | `.` | Webots lives |
+//! | `.` | Webots is alive |
 //! | `reset controller: NAME/FILE` | done |
+//!
+//! Webots' page puts every TEXT into `innerHTML`: it passes through [`client_text`] here, and nowhere else.
 
-use serde::Deserialize;
+use serde_json::Value;
 
-/// What a client asks for.
+use crate::shared::domain::client_text;
+
+/// A request of a client.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Request {
-    /// A simulation of the world at this URL.
+    /// Start a simulation of the world at this URL.
     Start {
-        /// As the client wrote it.
+        /// The URL as the client wrote it.
         url: String,
-        /// How it is shown.
+        /// How the simulation is shown.
         mode: Mode,
     },
-    /// The original state of this file below `controllers/`.
+    /// Restore this file below `controllers/`.
     ResetController(String),
 }
 
 /// How a simulation is shown.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
-#[serde(rename_all = "lowercase")]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub enum Mode {
-    /// A 3D scene, rendered by the browser; the name of R2023b and before.
+    /// A 3D scene that the browser renders; its name until R2023b.
     #[default]
     X3d,
-    /// A 3D scene, rendered by the browser; the name since R2025a.
+    /// A 3D scene that the browser renders; its name since R2025a.
     W3d,
     /// A video.
     Mjpeg,
 }
 
-/// A message that can't be understood; its words are for the client.
+/// Why a message can't be understood. The words are for the client.
 #[derive(Debug, PartialEq, Eq, thiserror::Error)]
 #[error(
     "Wrong message: {0}. Allowed are {{\"start\": {{\"url\": ..., \"mode\": \"x3d\", \"w3d\" or \"mjpeg\"}}}} and {{\"reset controller\": \"NAME/FILE\"}}."
 )]
 pub struct WrongMessage(String);
 
-#[derive(Deserialize)]
-struct Wire {
-    start: Option<WireStart>,
-    #[serde(rename = "reset controller")]
-    reset_controller: Option<String>,
-}
-
-#[derive(Deserialize)]
-struct WireStart {
-    url: String,
-    #[serde(default)]
-    mode: Option<Mode>,
-}
-
 impl Request {
-    /// Reads a message of a client.
+    /// Reads a message of a client; nothing if it is JSON that asks for nothing.
     ///
     /// # Errors
-    /// When it is none.
-    pub fn parse(text: &str) -> Result<Self, WrongMessage> {
-        let wire: Wire = serde_json::from_str(text).map_err(|error| WrongMessage(error.to_string()))?;
-        match wire {
-            Wire { reset_controller: Some(file), .. } => Ok(Self::ResetController(file)),
-            Wire { start: Some(WireStart { url, mode }), .. } => {
-                Ok(Self::Start { url, mode: mode.unwrap_or_default() })
-            }
-            Wire { .. } => Err(WrongMessage("it asks for nothing".to_owned())),
+    /// When the message is no JSON, or its request has a wrong form.
+    pub fn parse(text: &str) -> Result<Option<Self>, WrongMessage> {
+        let wrong = |problem: &str| WrongMessage(problem.to_owned());
+        let message: Value = serde_json::from_str(text).map_err(|_| wrong("it is no JSON"))?;
+        if let Some(file) = message.get("reset controller") {
+            let file = file.as_str().ok_or_else(|| wrong("\"reset controller\" is no text"))?;
+            return Ok(Some(Self::ResetController(file.to_owned())));
         }
+        let Some(start) = message.get("start") else {
+            return Ok(None);
+        };
+        let url =
+            start.get("url").and_then(Value::as_str).ok_or_else(|| wrong("\"start\" has no \"url\" that is a text"))?;
+        let mode = match start.get("mode").map(|mode| (mode, mode.as_str())) {
+            None | Some((Value::Null, _)) => Mode::default(),
+            Some((_, Some("x3d"))) => Mode::X3d,
+            Some((_, Some("w3d"))) => Mode::W3d,
+            Some((_, Some("mjpeg"))) => Mode::Mjpeg,
+            Some((other, _)) => return Err(WrongMessage(format!("there is no \"mode\" {other}"))),
+        };
+        Ok(Some(Self::Start { url: url.to_owned(), mode }))
     }
 }
 
@@ -88,19 +89,25 @@ pub const HEARTBEAT: &str = ".";
 /// Progress, in words.
 #[must_use]
 pub fn loading(text: &str) -> String {
-    format!("loading: {text}")
+    format!("loading: {}", client_text(text))
 }
 
 /// Why a simulation failed.
 #[must_use]
 pub fn error(text: &str) -> String {
-    format!("loading: Error: {text}")
+    format!("loading: Error: {}", client_text(text))
 }
 
-/// How many clients are ahead.
+/// How many clients are ahead in the waiting line: once for programs, and once in words, since Webots' page shows only
+/// those.
 #[must_use]
-pub fn queue(ahead: usize) -> String {
-    format!("queue: {ahead}")
+pub fn queue(ahead: usize) -> [String; 2] {
+    let clients = match ahead {
+        0 => "you are next".to_owned(),
+        1 => "1 client is ahead".to_owned(),
+        more => format!("{more} clients are ahead"),
+    };
+    [format!("queue: {ahead}"), loading(&format!("waiting for a place, {clients}"))]
 }
 
 /// After how many seconds the simulation will be closed.
@@ -118,7 +125,7 @@ pub fn webots(url: &str) -> String {
 /// A controller's file was restored.
 #[must_use]
 pub fn reset_controller(file: &str) -> String {
-    format!("reset controller: {file}")
+    format!("reset controller: {}", client_text(file))
 }
 
 #[cfg(test)]
@@ -135,19 +142,27 @@ mod tests {
             (r#"{ "reset controller" : "a/a.py" }"#, Request::ResetController("a/a.py".to_owned())),
         ];
         for (text, request) in table {
-            assert_eq!(Request::parse(text), Ok(request), "{text}");
+            assert_eq!(Request::parse(text), Ok(Some(request)), "{text}");
+        }
+    }
+
+    #[test]
+    fn other_json_is_ignored() {
+        for text in ["{}", "[1]", "5", "null", r#"{"init":["host","project"]}"#, r#""start""#] {
+            assert_eq!(Request::parse(text), Ok(None), "{text}");
         }
     }
 
     #[test]
     fn anything_else_is_refused_in_words() {
         let table = [
-            ("", "EOF"),
-            ("{}", "asks for nothing"),
-            (r#"{"start":{}}"#, "missing field `url`"),
-            (r#"{"start":{"url":"x","mode":"vr"}}"#, "unknown variant `vr`"),
-            (r#"{"start":{"url":5}}"#, "expected a string"),
-            ("[1]", "invalid"),
+            ("", "it is no JSON"),
+            ("garbage", "it is no JSON"),
+            (r#"{"start":{}}"#, "\"start\" has no \"url\""),
+            (r#"{"start":5}"#, "\"start\" has no \"url\""),
+            (r#"{"start":{"url":"x","mode":"vr"}}"#, "there is no \"mode\" \"vr\""),
+            (r#"{"start":{"url":5}}"#, "\"start\" has no \"url\""),
+            (r#"{"reset controller":5}"#, "\"reset controller\" is no text"),
         ];
         for (text, words) in table {
             let error = Request::parse(text).unwrap_err().to_string();
@@ -160,6 +175,12 @@ mod tests {
         assert_eq!(webots("wss://host/2001"), "webots:wss://host/2001");
         assert_eq!(shutdown_timeout(7200), "shutdownTimeout: 7200");
         assert_eq!(error("no"), "loading: Error: no");
-        assert_eq!(queue(3), "queue: 3");
+        assert_eq!(queue(3), ["queue: 3", "loading: waiting for a place, 3 clients are ahead"]);
+    }
+
+    #[test]
+    fn no_text_to_a_client_is_html() {
+        let texts = [loading("<b>"), error("<b>"), reset_controller("<b>")];
+        assert!(texts.iter().all(|text| !text.contains(['<', '>'])), "{texts:?}");
     }
 }

@@ -78,6 +78,9 @@ export class Simulation extends EventTarget {
   }
 
   #loading(text) {
+    // `queue:` says the same, for programs.
+    if (text.startsWith('waiting for a place'))
+      return;
     this.#step('place', 'done', 'taken');
     if (this.#launched)
       this.#step('simulation', 'doing', text);

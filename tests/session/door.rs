@@ -75,7 +75,9 @@ async fn texts_that_come_at_once_are_answered_in_their_order_and_too_many_are_re
     assert_eq!(client.closed().await, Some(1008));
     let heard = client.heard.split_off(told);
     let is_answer = |number: usize, answer: &str| match number % 3 {
-        0 => answer.starts_with(&format!("Error: Wrong Webots simulation URL: \"{number}.txt\" is no world file")),
+        0 => answer.starts_with(&format!(
+            "Error: Wrong Webots simulation URL: missing world file: \"{number}.txt\" is no world file"
+        )),
         _ if number.is_multiple_of(2) => {
             answer == format!("Error: no simulation server accepts https://github.com/lab/p{number}.")
         }

@@ -25,6 +25,7 @@ async fn the_waiting_line_is_served_in_order_and_forgets_who_leaves() {
     for ahead in 0..4 {
         let mut client = Client::start(&server, &arm()).await;
         assert_eq!(client.until("").await, format!("queue: {ahead}"));
+        client.until("loading: waiting for a place").await;
         line.push(client);
     }
     let mut late = Client::start(&server, &arm()).await;
@@ -34,8 +35,8 @@ async fn the_waiting_line_is_served_in_order_and_forgets_who_leaves() {
     assert_eq!(late.closed().await, Some(1000));
     // Who leaves the line is forgotten at once, and only those behind are told.
     line.remove(1).leave().await;
-    assert_eq!(line[1].until("").await, "queue: 1");
-    assert_eq!(line[2].until("").await, "queue: 2");
+    assert_eq!(line[1].until("queue:").await, "queue: 1");
+    assert_eq!(line[2].until("queue:").await, "queue: 2");
     assert!(line[0].is_silent(Duration::from_millis(50)).await);
     let instances = http::get(&server.url("/status")).await.json()["instances"].clone();
     assert_eq!((instances["queued"].as_u64(), instances["places"].as_u64()), (Some(3), Some(2)));
@@ -43,8 +44,8 @@ async fn the_waiting_line_is_served_in_order_and_forgets_who_leaves() {
     // The first in the line gets the place that becomes free, at its port.
     inside.remove(1).leave().await;
     assert_eq!(line[0].until("webots:").await, format!("webots:ws://localhost:{}", server.port + 2));
-    assert_eq!(line[1].until("").await, "queue: 0");
-    assert_eq!(line[2].until("").await, "queue: 1");
+    assert_eq!(line[1].until("queue:").await, "queue: 0");
+    assert_eq!(line[2].until("queue:").await, "queue: 1");
     for client in inside.into_iter().chain(line) {
         client.leave().await;
     }

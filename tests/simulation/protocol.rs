@@ -21,9 +21,8 @@ async fn a_message_that_is_none_is_answered_in_words() {
     let start = |url: &str| serde_json::json!({"start": {"url": url}}).to_string();
     let table = [
         ("garbage".to_owned(), "Wrong message"),
-        ("{}".to_owned(), "Wrong message"),
         ("[".repeat(5000), "Wrong message"),
-        (r#"{"start":{"url":"x","mode":"vr"}}"#.to_owned(), "unknown variant"),
+        (r#"{"start":{"url":"x","mode":"vr"}}"#.to_owned(), "there is no \"mode\" \"vr\""),
         (start("https://github.com/lab/arm"), "Wrong Webots simulation URL"),
         (start("ftp://github.com/lab/arm/blob/main/worlds/a.wbt"), "does not begin with https://"),
     ];
@@ -35,6 +34,35 @@ async fn a_message_that_is_none_is_answered_in_words() {
         assert_eq!(client.closed().await, Some(1000));
     }
     assert!(http::get(&server.url("/health")).await.status.is_success());
+}
+
+#[actix_rt::test]
+async fn other_json_is_ignored() {
+    let (server, _forge, _webots) = server().await;
+    let mut client = Client::connect(&server.websocket("/client")).await;
+    for text in ["{}", r#"{"init": ["host", "project", "world"]}"#, "[1]"] {
+        client.send(text).await;
+    }
+    client.send(&serde_json::json!({"start": {"url": arm()}}).to_string()).await;
+    client.until("webots:").await;
+    assert!(!client.heard.iter().any(|text| text.contains("Error")), "{:?}", client.heard);
+}
+
+#[actix_rt::test]
+async fn no_text_to_a_client_is_html() {
+    let (server, _forge, _webots) = server().await;
+    let image = "%3Cimg%20src=x%20onerror=alert(1)%3E";
+    for url in [
+        world("lab/arm", "main", &format!("worlds/{image}.wbt")),
+        world("lab/arm", image, "worlds/a.wbt"),
+        world(&format!("lab/{image}"), "main", "worlds/a.wbt"),
+        world("lab/arm", "main", &format!("worlds/{image}.txt")),
+    ] {
+        let mut client = Client::start(&server, &url).await;
+        client.until("loading: Error: ").await;
+        let html = client.heard.iter().find(|text| text.contains(['<', '>', '&']));
+        assert!(html.is_none() && client.heard.iter().any(|text| text.contains("\u{2039}img")), "{:?}", client.heard);
+    }
 }
 
 #[actix_rt::test]

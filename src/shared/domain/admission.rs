@@ -25,7 +25,7 @@ pub enum Refusal {
     Blocked(String),
     /// Not allowed, and no way to run it safely.
     #[error(
-        "{0} is not one of the repositories that this simulation server allows, and it runs no others, for Docker is not enabled"
+        "Docker not enabled: cannot host simulations from repositories outside of those that this simulation server allows, and {0} is not one of them"
     )]
     NotAllowed(String),
     /// Not allowed, and the server shares nothing.

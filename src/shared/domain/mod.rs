@@ -16,4 +16,4 @@ pub use load::Load;
 pub use project_url::{NoProject, ProjectUrl, Reading, RefKind};
 pub use report::{Instances, ServerReport};
 pub use repositories::UrlPrefix;
-pub use text::one_line;
+pub use text::{client_text, one_line};

@@ -75,12 +75,12 @@ impl ProjectUrl {
         let inside = segments.get(reference..).unwrap_or_default();
         let world = match inside {
             [.., folder, world] if folder == "worlds" => world,
-            _ => return Err(no_project("it does not end in /worlds/NAME.wbt")),
+            _ => return Err(no_project("missing worlds folder: it does not end in /worlds/NAME.wbt")),
         };
         let is_world =
             world.len() > 4 && world.get(world.len() - 4..).is_some_and(|end| end.eq_ignore_ascii_case(".wbt"));
         if !is_world {
-            return Err(no_project(format!("{world:?} is no world file")));
+            return Err(no_project(format!("missing world file: {world:?} is no world file")));
         }
         if inside.len() < 3 {
             return Err(no_project("it names no branch or tag"));
@@ -233,7 +233,7 @@ pub(super) fn split_repository(segments: &[String]) -> Result<(usize, usize, Ref
         [_, _, "src", "tag", ..] => Ok((2, 4, RefKind::Tag)),
         [_, _, "src", "commit", ..] => Ok((2, 4, RefKind::Commit)),
         [_, _, other, ..] => {
-            Err(no_project(format!("blob or tree is missing after the repository, {other:?} stands there")))
+            Err(no_project(format!("missing blob or tree after the repository, where {other:?} stands")))
         }
         _ => Err(no_project("it names no repository")),
     }

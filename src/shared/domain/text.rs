@@ -16,9 +16,31 @@ pub fn one_line(text: &str) -> String {
     text.chars().map(visible).collect()
 }
 
+/// Returns a text for a web client in one line, in which nothing begins a tag or a character reference of HTML.
+///
+/// Webots' page puts such texts into `innerHTML`. Other clients show them as they are, so that the characters are replaced
+/// by similar ones instead of being escaped.
+#[must_use]
+pub fn client_text(text: &str) -> String {
+    let harmless = |letter: char| match letter {
+        '<' => '\u{2039}',
+        '>' => '\u{203a}',
+        '&' => '\u{ff06}',
+        letter => letter,
+    };
+    one_line(text).chars().map(harmless).collect()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_text_for_a_client_is_no_html() {
+        let text = "<img src=x onerror='alert(1)'>\n&lt;b&gt;";
+        let shown = "\u{2039}img src=x onerror='alert(1)'\u{203a} \u{ff06}lt;b\u{ff06}gt;";
+        assert_eq!(client_text(text), shown);
+    }
 
     #[test]
     fn nothing_hides_in_a_line() {

@@ -77,8 +77,9 @@ impl WebClient {
 
     fn understand(&mut self, text: &str, ctx: &mut Context) {
         match Request::parse(text) {
-            Ok(Request::Start { url, mode }) => self.start(&url, mode, ctx),
-            Ok(Request::ResetController(file)) => self.reset_controller(file, ctx),
+            Ok(Some(Request::Start { url, mode })) => self.start(&url, mode, ctx),
+            Ok(Some(Request::ResetController(file))) => self.reset_controller(file, ctx),
+            Ok(None) => log::debug!("{}: a message that asks for nothing is ignored", self.name()),
             Err(wrong) => self.fail(&wrong.to_string(), ctx),
         }
     }
@@ -235,7 +236,9 @@ impl Handler<PlaceEvent> for WebClient {
             }
             (PlaceEvent::Ahead(ahead), state @ State::Waiting { .. }) => {
                 self.state = state;
-                ctx.text(protocol::queue(ahead));
+                for text in protocol::queue(ahead) {
+                    ctx.text(text);
+                }
             }
             (_, state) => self.state = state,
         }
