@@ -1,0 +1,58 @@
+//! Disks that are full or can't be written, in a view of the file system that only this test and what it starts have.
+
+use std::fs::File;
+use std::io::Write;
+use std::path::{Path, PathBuf};
+
+use nix::mount::{MntFlags, MsFlags, mount, umount2};
+use nix::sched::{CloneFlags, unshare};
+
+/// What is mounted from here on is seen by this thread and its children alone, and is gone with them. Without the rights
+/// for that, the faults of disks are not possible.
+pub fn hide_mounts_from_others() {
+    if unshare(CloneFlags::CLONE_NEWNS).is_ok() {
+        mount(None::<&str>, "/", None::<&str>, MsFlags::MS_REC | MsFlags::MS_PRIVATE, None::<&str>).unwrap();
+    }
+}
+
+/// A disk of 64 MiB at a folder.
+pub fn small_disk(folder: &Path) -> bool {
+    std::fs::create_dir_all(folder).unwrap();
+    mount(Some("small"), folder, Some("tmpfs"), MsFlags::empty(), Some("size=64m")).is_ok()
+}
+
+/// A file that takes all room of a disk.
+pub struct Full(PathBuf);
+
+impl Full {
+    pub fn at(folder: &Path) -> Self {
+        let path = folder.join("filler");
+        let mut file = File::create(&path).unwrap();
+        for size in [1 << 20, 4096, 1] {
+            while file.write_all(&vec![0; size]).is_ok() {}
+        }
+        Self(path)
+    }
+}
+
+impl Drop for Full {
+    fn drop(&mut self) {
+        std::fs::remove_file(&self.0).ok();
+    }
+}
+
+/// A folder in whose place an empty one is found that can't be written.
+pub struct ReadOnly(PathBuf);
+
+impl ReadOnly {
+    pub fn at(folder: &Path) -> Option<Self> {
+        mount(Some("nothing"), folder, Some("tmpfs"), MsFlags::MS_RDONLY, None::<&str>).ok()?;
+        Some(Self(folder.to_owned()))
+    }
+}
+
+impl Drop for ReadOnly {
+    fn drop(&mut self) {
+        umount2(&self.0, MntFlags::MNT_DETACH).ok();
+    }
+}
