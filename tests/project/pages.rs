@@ -6,7 +6,7 @@ use super::copy::{root, walk};
 
 fn pages() -> Vec<PathBuf> {
     let docs = walk(&root().join("docs")).into_iter().filter(|path| path.extension().is_some_and(|end| end == "md"));
-    docs.chain(["README.md", "CHANGELOG.md"].map(|name| root().join(name))).collect()
+    docs.chain(["README.md", "CHANGELOG.md", "CONTRIBUTING.md"].map(|name| root().join(name))).collect()
 }
 
 #[test]
@@ -36,4 +36,35 @@ fn the_changelog_has_the_version_of_the_program() {
     let text = std::fs::read_to_string(root().join("CHANGELOG.md")).unwrap();
     let version = env!("CARGO_PKG_VERSION");
     assert!(text.contains("## [Unreleased]") || text.contains(&format!("## [{version}]")), "{version}");
+}
+
+#[test]
+fn every_guarantee_names_tests_that_exist() {
+    let is_rust = |path: &PathBuf| path.extension().is_some_and(|end| end == "rs");
+    let tests = walk(&root().join("tests")).into_iter().filter(is_rust);
+    let tests: String = tests.map(|file| std::fs::read_to_string(file).unwrap()).collect();
+    let page = std::fs::read_to_string(root().join("docs/guarantees.md")).unwrap();
+    let mut promises = 0;
+    for row in page.lines().filter(|line| line.starts_with("| ") && !line.ends_with("| shown by |")) {
+        let shown_by = row.trim_end_matches(" |").rsplit(" | ").next().unwrap();
+        let names: Vec<&str> = shown_by.split('`').skip(1).step_by(2).collect();
+        assert!(!names.is_empty(), "nothing shows: {row}");
+        for name in names.iter().filter(|name| !name.starts_with("cargo bench ")) {
+            assert!(tests.contains(&format!("fn {name}(")), "there is no test {name}");
+        }
+        promises += 1;
+    }
+    assert!(promises > 15, "{promises}");
+}
+
+#[test]
+fn every_file_that_contributors_are_sent_to_is_there() {
+    let page = std::fs::read_to_string(root().join("CONTRIBUTING.md")).unwrap();
+    let table = page.lines().filter(|line| line.starts_with("| ") && line.contains("`s"));
+    let files: Vec<&str> =
+        table.flat_map(|row| row.split('`').skip(1).step_by(2)).filter(|name| name.contains('/')).collect();
+    assert!(files.len() > 8, "{files:?}");
+    for file in files {
+        assert!(root().join("src").join(file).exists() || root().join(file).exists(), "{file} is not there");
+    }
 }
