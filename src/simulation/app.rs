@@ -21,11 +21,7 @@ use crate::shared::http::Live;
 use crate::shared::http::Metrics;
 use crate::shared::http::sockets::{self, Sockets};
 use crate::shared::run::{Phase, Request, Signals, notify, permanent, start};
-use crate::simulation::checkout::Checkouts;
-use crate::simulation::checkout::Fetcher;
-use crate::simulation::checkout::Git;
-use crate::simulation::checkout::Limits;
-use crate::simulation::checkout::RepositoryCache;
+use crate::simulation::checkout::{CacheDir, Checkouts, Limits};
 use crate::simulation::client::outcome;
 use crate::simulation::machine::LoadMonitor;
 use crate::simulation::machine::UsageMonitor;
@@ -182,18 +178,17 @@ fn assemble(
 ) -> Result<AppState, AppError> {
     let folder = config.cache_dir.0.clone();
     let cache_fault = |source| AppError::Cache { folder: folder.clone(), source };
+    let cache_dir = CacheDir::claim(&folder).map_err(cache_fault)?;
     let (run, leftovers) = RunDir::open(&folder).map_err(cache_fault)?;
     if leftovers != Leftovers::default() {
         let Leftovers { runs, processes } = leftovers;
         log::warn!("removed what {runs} earlier runs had left, {processes} processes among it");
     }
-    let git = Git::new(run.path()).map_err(cache_fault)?;
-    let cache = RepositoryCache::open(&folder, config.cache_size << 20).map_err(cache_fault)?;
     let (time, size) = (config.timing.checkout, config.project_size << 20);
     let limits = Limits { time, size, any_commit: config.any_commit };
+    let (budget, mirrors) = (config.cache_size << 20, config.git_mirrors.clone());
     let runtime = tokio::runtime::Handle::current();
-    let fetcher = Fetcher::new(git, cache, config.git_mirrors.clone(), limits, &runtime);
-    let checkouts = Checkouts::new(fetcher, limits, runtime);
+    let checkouts = Checkouts::open(cache_dir, run.path(), budget, mirrors, limits, runtime).map_err(cache_fault)?;
     let places = Places::new(config.streaming_ports(), config.waiting_line).start();
     let csv = config.monitor_log_enabled.then(|| config.log_dir.0.join("simulation/monitor.csv"));
     let (load_monitor, readings) = LoadMonitor::new(places.clone(), run.path(), csv);

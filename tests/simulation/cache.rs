@@ -1,18 +1,18 @@
-//! The cache of repositories: its budget, what is damaged, and who may still use what.
+//! The cache of repositories: its budget, what is damaged, and whose it is.
 
 use std::path::Path;
 use std::time::Duration;
 
-use futures_util::future::join_all;
+use nix::sys::signal::Signal;
 
 use super::checkout::{cached, noise, outcome, reader, size_of, world_text};
 use super::git_wrapper::GitWrapper;
-use super::scene::{arm, instance_folders, nothing_left};
+use super::scene::{arm, instance_folders};
 use crate::support::client::Client;
 use crate::support::git::{Forge, world};
-use crate::support::program::simulation_server;
+use crate::support::program::{Server, simulation_server};
 use crate::support::until;
-use crate::support::webots::{Webots, instances_below};
+use crate::support::webots::Webots;
 
 #[actix_rt::test]
 async fn the_cache_keeps_to_its_budget() {
@@ -48,7 +48,7 @@ type Damage = fn(&Path);
 async fn a_damaged_cache_heals() {
     let (forge, webots) = (Forge::with_arm(), reader());
     let server = simulation_server(&webots.path(), forge.path(), 2).start().await;
-    let damage: [(&str, Damage); 5] = [
+    let damage: [(&str, Damage); 8] = [
         ("a pack is cut", |repository| {
             for pack in std::fs::read_dir(repository.join("objects/pack")).unwrap().flatten() {
                 if pack.path().extension().is_some_and(|extension| extension == "pack") {
@@ -57,6 +57,22 @@ async fn a_damaged_cache_heals() {
                 }
             }
         }),
+        ("a pack has noise", |repository| {
+            for pack in std::fs::read_dir(repository.join("objects/pack")).unwrap().flatten() {
+                if pack.path().extension().is_some_and(|extension| extension == "pack") {
+                    let length = pack.metadata().unwrap().len() as usize;
+                    let mut bytes = std::fs::read(pack.path()).unwrap();
+                    bytes[40..length - 30].fill(0x55);
+                    std::fs::remove_file(pack.path()).unwrap();
+                    std::fs::write(pack.path(), bytes).unwrap();
+                }
+            }
+        }),
+        ("it is empty", |repository| {
+            std::fs::remove_dir_all(repository).unwrap();
+            std::fs::create_dir(repository).unwrap();
+        }),
+        ("it is gone", |repository| std::fs::remove_dir_all(repository).unwrap()),
         ("no objects", |repository| std::fs::remove_dir_all(repository.join("objects")).unwrap()),
         ("its settings are noise", |repository| std::fs::write(repository.join("config"), [0xff; 99]).unwrap()),
         ("HEAD is gone", |repository| std::fs::remove_file(repository.join("HEAD")).unwrap()),
@@ -73,9 +89,13 @@ async fn a_damaged_cache_heals() {
         assert!(told.contains("opened [WorldInfo"), "{what}: {told}");
     }
     // Locks that a killed git has left.
-    forge.commit("lab/arm", "main", &[("worlds/a.wbt", &world_text("next"))]);
-    std::fs::write(cached(&server)[0].join("shallow.lock"), "").unwrap();
-    assert!(outcome(&server, &arm()).await.contains("opened [next]"));
+    for (mark, lock) in [("next", "shallow.lock"), ("last", "refs/fleet/COMMIT.lock")] {
+        let commit = forge.commit("lab/arm", "main", &[("worlds/a.wbt", &world_text(mark))]);
+        std::fs::write(cached(&server)[0].join(lock.replace("COMMIT", &commit)), "").unwrap();
+        let told = outcome(&server, &arm()).await;
+        assert!(told.contains(&format!("opened [{mark}]")), "{lock}: {told}");
+    }
+    assert_eq!(cached(&server).len(), 1, "what was broken is gone");
 }
 
 /// Adds a commit with so many bytes that can't be packed.
@@ -86,81 +106,80 @@ fn grow(forge: &Forge, branch: &str, bytes: usize) {
 }
 
 #[actix_rt::test]
-async fn a_repository_in_use_keeps_to_the_budget_too_and_who_runs_keeps_its_commit() {
+async fn who_runs_is_not_hurt_when_the_cached_repository_goes() {
     let (forge, webots) = (Forge::with_arm(), Webots::launcher());
-    let server = simulation_server(&webots.path(), forge.path(), 3).set("cacheSize", 1).start().await;
+    let server = simulation_server(&webots.path(), forge.path(), 2).start().await;
     let mut running = Client::start(&server, &arm()).await;
     running.until("webots:").await;
-    let instance = instance_folders(&server.folder).remove(0);
-    for number in 0..6 {
-        grow(&forge, "main", 300_000 + number);
-        let mut client = Client::start(&server, &arm()).await;
-        client.until("webots:").await;
-        client.leave().await;
-    }
-    let folder = server.folder.join("cache/git");
-    until("the oldest commits are gone", async || size_of(&folder) < 1 << 20).await;
-    assert_eq!(cached(&server).len(), 1);
-    let file = instance.join("project/controllers/c/c.py");
-    std::fs::write(&file, "changed").unwrap();
-    running.send(r#"{"reset controller": "c/c.py"}"#).await;
-    running.until("reset controller: c/c.py").await;
-    assert_eq!(std::fs::read_to_string(&file).unwrap(), "print('original')\n");
+    let file = instance_folders(&server.folder)[0].join("project/controllers/c/c.py");
+    let mut reset = async || {
+        std::fs::write(&file, "changed").unwrap();
+        running.send(r#"{"reset controller": "c/c.py"}"#).await;
+        let answer = loop {
+            let answer = running.until("").await;
+            if answer != "." {
+                break answer;
+            }
+        };
+        assert_eq!(answer, "reset controller: c/c.py");
+        assert_eq!(std::fs::read_to_string(&file).unwrap(), "print('original')\n");
+    };
+    // Another start finds it broken, and has it fetched anew.
+    std::fs::write(cached(&server)[0].join("config"), "[noise").unwrap();
+    let mut late = Client::start(&server, &arm()).await;
+    late.until("webots:").await;
+    late.leave().await;
+    reset().await;
+    // It is gone: the client's commit is fetched again, also when its branch has moved on.
+    std::fs::remove_dir_all(&cached(&server)[0]).unwrap();
+    forge.commit("lab/arm", "main", &[("controllers/c/c.py", "newer")]);
+    reset().await;
+    // It is broken.
+    std::fs::write(cached(&server)[0].join("shallow"), "noise").unwrap();
+    reset().await;
 }
 
 #[actix_rt::test]
-async fn the_budget_is_kept_at_start_and_when_the_last_user_leaves() {
-    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
-    let folder = tempfile::tempdir().unwrap();
-    let start =
-        |size: u32| simulation_server(&webots.path(), forge.path(), 3).folder(folder.path()).set("cacheSize", size);
-    let server = start(1).start().await;
+async fn a_repository_that_is_being_used_stays_and_goes_with_its_last_user_where_the_budget_is_exceeded() {
+    let (forge, webots, marks) = (Forge::with_arm(), reader(), tempfile::tempdir().unwrap());
     grow(&forge, "main", 2 << 20);
-    let mut running = Client::start(&server, &arm()).await;
-    running.until("webots:").await;
-    assert_eq!(cached(&server).len(), 1, "it is in use");
-    running.leave().await;
+    forge.commit("lab/leg", "main", &[("worlds/a.wbt", &world_text("leg"))]);
+    let wrapper = GitWrapper::new(&format!(
+        "case \"$*\" in *lab-arm*checkout*) until [ -e {}/go ]; do sleep 0.05; done;; esac",
+        marks.path().display()
+    ));
+    let folder = tempfile::tempdir().unwrap();
+    let start = |size: u32| {
+        let builder = simulation_server(&webots.path(), forge.path(), 2).folder(folder.path());
+        builder.env("PATH", &wrapper.path()).set("cacheSize", size).start()
+    };
+    let has = |server: &Server, name: &str| cached(server).iter().any(|path| path.to_string_lossy().contains(name));
+    let server = start(1).await;
+    let mut user = Client::start(&server, &arm()).await;
+    user.until("loading: checking main out").await;
+    // Others come and go.
+    assert!(outcome(&server, &world("lab/leg", "main", "worlds/a.wbt")).await.contains("opened [leg]"));
+    until("the other has gone", async || !has(&server, "lab-leg")).await;
+    assert!(has(&server, "lab-arm"), "it is in use");
+    std::fs::write(marks.path().join("go"), "").unwrap();
+    assert!(user.until("loading: Error:").await.contains("opened"));
     until("it is gone with its user", async || cached(&server).is_empty()).await;
     drop(server);
-    let server = start(100).start().await;
-    let mut running = Client::start(&server, &arm()).await;
-    running.until("webots:").await;
-    running.leave().await;
-    nothing_left(&server, 3).await;
+    let server = start(100).await;
+    assert!(outcome(&server, &arm()).await.contains("opened"));
     assert_eq!(cached(&server).len(), 1);
     drop(server);
-    let server = start(1).start().await;
-    until("it is gone", async || cached(&server).is_empty()).await;
+    let server = start(1).await;
+    until("it is gone at the start", async || cached(&server).is_empty()).await;
 }
 
 #[actix_rt::test]
-async fn a_repository_keeps_a_bounded_number_of_commits() {
-    let (forge, webots) = (Forge::with_arm(), reader());
-    let server = simulation_server(&webots.path(), forge.path(), 1).start().await;
-    outcome(&server, &arm()).await;
-    let commits = cached(&server)[0].join("refs/fleet");
-    let one = std::fs::read_dir(&commits).unwrap().flatten().next().unwrap().path();
-    for number in 0..200 {
-        std::fs::copy(&one, commits.join(format!("{number:040x}"))).unwrap();
-    }
-    forge.commit("lab/arm", "main", &[("worlds/a.wbt", &world_text("newer"))]);
-    assert!(outcome(&server, &arm()).await.contains("[newer]"));
-    let count = || std::fs::read_dir(&commits).unwrap().count();
-    until("most are gone", async || count() <= 64).await;
-    assert!(count() > 30, "too many are gone");
-    until("it is packed", async || server.log().contains("commits from")).await;
-    assert!(outcome(&server, &arm()).await.contains("[newer]"));
-}
-
-#[actix_rt::test]
-async fn tidying_up_that_takes_long_holds_nobody_up_for_long_and_is_not_tried_again_at_once() {
-    let forge = Forge::new();
-    let branches = ["main", "one", "two", "three", "four"];
-    for branch in branches {
+async fn packing_that_takes_long_holds_nobody_up_for_long() {
+    let (forge, webots) = (Forge::new(), reader());
+    for branch in ["main", "one"] {
         forge.commit("lab/arm", branch, &[("worlds/a.wbt", &world_text(branch))]);
     }
-    let webots = reader();
-    let wrapper = GitWrapper::new("case \"$*\" in *\" gc \"*) sleep 15;; esac");
+    let wrapper = GitWrapper::new("case \"$*\" in *\" gc \"*) exec sleep 1000;; esac");
     let builder = simulation_server(&webots.path(), forge.path(), 1).env("PATH", &wrapper.path());
     let server = builder.set("timing.checkout", 12).start().await;
     let ask = async |branch: &str| {
@@ -171,95 +190,52 @@ async fn tidying_up_that_takes_long_holds_nobody_up_for_long_and_is_not_tried_ag
         client.heard.join("\n")
     };
     ask("main").await;
-    // As many packs as a hundred fetches leave.
-    let packs = cached(&server)[0].join("objects/pack");
-    for file in std::fs::read_dir(&packs).unwrap().flatten().map(|entry| entry.path()).collect::<Vec<_>>() {
-        for number in 0..100 {
-            let copy = packs.join(format!("pack-{number:040x}")).with_extension(file.extension().unwrap());
-            std::fs::copy(&file, copy).unwrap();
-        }
-    }
-    ask("one").await;
-    let tried = || wrapper.calls().iter().filter(|call| call.contains(" gc ")).count();
-    until("it is tidied up", async || tried() > 0).await;
-    let told = ask("two").await;
-    assert!(told.contains("waiting while what is cached of https://github.com/lab/arm is tidied up"), "{told}");
-    let words = "can't be tidied up, it is left alone for 10 minutes: git gc took longer than 3 seconds";
-    assert!(server.log().contains(words), "{}", server.log());
-    for branch in ["three", "four"] {
-        let told = ask(branch).await;
-        assert!(!told.contains("waiting"), "{told}");
-    }
-    assert_eq!(tried(), 1, "{:#?}", wrapper.calls());
+    assert!(!ask("main").await.contains("waiting"), "what is cached needs no turn");
+    let told = ask("one").await;
+    assert!(told.contains("fetching https://github.com/lab/arm: waiting for another fetch"), "{told}");
+    assert!(server.log().contains("can't be packed"), "{}", server.log());
 }
 
 #[actix_rt::test]
-async fn a_remote_that_fails_has_the_cache_examined_once_in_three_minutes() {
+async fn a_remote_that_fails_costs_nothing_of_the_cache() {
     let (forge, webots) = (Forge::with_arm(), reader());
     let fails = tempfile::tempdir().unwrap();
-    let fail = format!("case \"$*\" in *fetch*) [ ! -e {}/now ] || exit 128;; esac", fails.path().display());
-    let wrapper = GitWrapper::new(&fail);
+    let fail = "echo 'fatal: early EOF' >&2; exit 128";
+    let script = format!("case \"$*\" in *fetch*) [ ! -e {}/now ] || {{ {fail}; }};; esac", fails.path().display());
+    let wrapper = GitWrapper::new(&script);
     let server = simulation_server(&webots.path(), forge.path(), 1).env("PATH", &wrapper.path()).start().await;
+    grow(&forge, "main", 1 << 20);
     assert!(outcome(&server, &arm()).await.contains("opened"));
-    let examined = || wrapper.calls().iter().filter(|call| call.contains(" fsck ")).count();
-    assert_eq!(examined(), 0);
+    let before = size_of(&cached(&server)[0]);
     std::fs::write(fails.path().join("now"), "").unwrap();
-    forge.commit("lab/arm", "main", &[("worlds/a.wbt", &world_text("next"))]);
-    for _ in 0..3 {
+    let commit = forge.commit("lab/arm", "main", &[("worlds/a.wbt", &world_text("next"))]);
+    let fetches = || wrapper.calls().iter().filter(|call| call.contains(&format!("+{commit}"))).count();
+    for number in 1..=2 {
         let told = outcome(&server, &arm()).await;
-        assert!(told.contains("git fetch ended with exit code 128"), "{told}");
-        assert_eq!(examined(), 1, "{:#?}", wrapper.calls());
+        assert!(told.contains("git fetch ended with exit code 128: fatal: early EOF"), "{told}");
+        assert_eq!(fetches(), number, "it is not tried again by itself");
+        assert_eq!(size_of(&cached(&server)[0]), before);
     }
     std::fs::remove_file(fails.path().join("now")).unwrap();
     assert!(outcome(&server, &arm()).await.contains("opened [next]"));
 }
 
 #[actix_rt::test]
-async fn an_examination_that_takes_long_holds_up_nobody_and_goes_on_without_whom_it_is_for() {
-    let (forge, webots, marks) = (Forge::with_arm(), reader(), tempfile::tempdir().unwrap());
-    forge.commit("lab/leg", "main", &[("worlds/a.wbt", &world_text("leg"))]);
-    let wrapper = GitWrapper::new(&format!(
-        "case \"$*\" in *\\ fetch\\ *) [ ! -e {0}/fail ] || exit 128;; *\\ fsck\\ *) until [ -e {0}/go ]; do sleep 0.05; done;; esac",
-        marks.path().display()
-    ));
-    let builder = simulation_server(&webots.path(), forge.path(), 4).env("PATH", &wrapper.path());
-    let server = builder.set("timing.checkout", 12).start().await;
-    let names = ["lab/arm", "lab/leg"];
-    for name in names {
-        assert!(outcome(&server, &world(name, "main", "worlds/a.wbt")).await.contains("opened"));
-        forge.commit(name, "main", &[("worlds/a.wbt", &world_text("next"))]);
-    }
-    std::fs::write(marks.path().join("fail"), "").unwrap();
-    let examined = || wrapper.calls().iter().filter(|call| call.contains(" fsck ")).count();
-    let ask = async || {
-        let all = names.map(|name| world(name, "main", "worlds/a.wbt"));
-        for told in join_all(all.iter().map(|world| outcome(&server, world))).await {
-            assert!(told.contains("git fetch ended with exit code 128"), "{told}");
-        }
-        assert_eq!(examined(), 2, "{:#?}", wrapper.calls());
+async fn a_cache_belongs_to_one_server() {
+    let (forge, webots, folder) = (Forge::with_arm(), reader(), tempfile::tempdir().unwrap());
+    let builder = || {
+        let builder = simulation_server(&webots.path(), forge.path(), 1);
+        builder.set("cacheDir", folder.path().to_str().unwrap())
     };
-    ask().await;
-    // Who comes next finds the same examinations under way.
-    ask().await;
-    // What one finds that nobody waits for is known later.
-    let broken = cached(&server).into_iter().find(|path| path.to_string_lossy().contains("lab-arm")).unwrap();
-    for reference in std::fs::read_dir(broken.join("refs/fleet")).unwrap().flatten() {
-        std::fs::write(reference.path(), "").unwrap();
-    }
-    std::fs::write(marks.path().join("go"), "").unwrap();
-    until("both have ended", async || !instances_below(&server.folder).iter().any(|one| one.1.contains("fsck"))).await;
-    for name in names {
-        let told = outcome(&server, &world(name, "main", "worlds/a.wbt")).await;
-        assert!(told.contains("git fetch ended with exit code 128"), "{told}");
-    }
-    let damaged: Vec<String> =
-        server.log().lines().filter(|line| line.contains("is damaged")).map(str::to_owned).collect();
-    assert!(damaged.len() == 1 && damaged[0].contains("lab-arm"), "{damaged:#?}");
-    assert_eq!(examined(), 3, "what is new is not known yet: {:#?}", wrapper.calls());
-    std::fs::remove_file(marks.path().join("fail")).unwrap();
-    for name in names {
-        assert!(outcome(&server, &world(name, "main", "worlds/a.wbt")).await.contains("opened [next]"));
-    }
+    let mut one = builder().start().await;
+    let mut other = builder().spawn();
+    assert_eq!(other.ended().await, Some(1));
+    let words = "(cacheDir) can't be used: another simulation server uses it, and each needs one of its own";
+    assert_eq!(other.log().lines().filter(|line| line.contains(words)).count(), other.log().lines().count());
+    assert!(outcome(&one, &arm()).await.contains("opened"), "the first is not disturbed");
+    one.signal(Signal::SIGKILL);
+    one.ended().await;
+    assert!(outcome(&builder().start().await, &arm()).await.contains("opened"), "its lock ends with it");
 }
 
 #[actix_rt::test]

@@ -1,9 +1,10 @@
-//! Fetches into one cached repository: side by side, each once, and begun anew where they stand still.
+//! Fetches into one cached repository: one at a time, each commit once, and begun anew where they stand still.
 
-use std::path::{Path, PathBuf};
+use futures_util::future::join_all;
 
-use super::checkout::{outcome, reader, world_text};
+use super::checkout::{cached, outcome, reader, world_text};
 use super::git_wrapper::GitWrapper;
+use super::scene::stages;
 use crate::support::client::Client;
 use crate::support::git::{Forge, git, world};
 use crate::support::program::simulation_server;
@@ -19,35 +20,69 @@ fn forge(branches: &[&str]) -> Forge {
     forge
 }
 
-fn repositories(cache: &Path) -> Vec<PathBuf> {
-    let entries = std::fs::read_dir(cache.join("git")).unwrap().flatten().map(|entry| entry.path());
-    entries.filter(|path| path.is_dir()).collect()
+/// The commit of a branch.
+fn commit(forge: &Forge, branch: &str) -> String {
+    git(&forge.path().join("lab/arm"), &["rev-parse", branch]).trim().to_owned()
 }
 
 #[actix_rt::test]
-async fn a_commit_that_comes_while_its_parent_is_about_to_be_fetched_is_not_taken_for_its_history() {
-    let (forge, webots, marks) = (Forge::new(), reader(), tempfile::tempdir().unwrap());
-    forge.commit("lab/arm", "old", &[("worlds/a.wbt", &world_text("old"))]);
-    let bare = forge.path().join("lab/arm");
-    forge.commit("lab/arm", "old", &[("worlds/a.wbt", &world_text("parent"))]);
-    git(&bare, &["branch", "parent", "old"]);
-    forge.commit("lab/arm", "old", &[("worlds/a.wbt", &world_text("child"))]);
-    git(&bare, &["branch", "child", "old"]);
-    // The fetch of the parent waits until the child has come.
+async fn a_fetch_that_hangs_holds_up_nobody_who_needs_no_fetch_and_others_only_for_a_while() {
+    let (forge, webots, marks) = (forge(&["main", "slow", "one"]), reader(), tempfile::tempdir().unwrap());
+    let (main, slow) = (commit(&forge, "main"), commit(&forge, "slow"));
     let wrapper = GitWrapper::new(&format!(
-        "case \"$*\" in *fetch*heads/parent:*) until [ -e {}/go ]; do sleep 0.05; done;; esac",
+        "case \"$*\" in *fetch*+{slow}:*) [ -e {}/go ] || exec sleep 1000;; esac",
         marks.path().display()
     ));
-    let server = simulation_server(&webots.path(), forge.path(), 2).env("PATH", &wrapper.path()).start().await;
-    let mut parent = Client::start(&server, &world("lab/arm", "parent", "worlds/a.wbt")).await;
-    until("it is about to be fetched", async || wrapper.calls().iter().any(|call| call.contains("heads/parent:")))
-        .await;
-    let told = outcome(&server, &world("lab/arm", "child", "worlds/a.wbt")).await;
-    assert!(told.contains("opened [child]"), "{told}");
+    let builder = simulation_server(&webots.path(), forge.path(), 5).env("PATH", &wrapper.path());
+    let server = builder.set("timing.checkout", 20).start().await;
+    let ask = async |name: &str, text: &str| {
+        let told = outcome(&server, &world("lab/arm", name, "worlds/a.wbt")).await;
+        assert!(told.contains(&format!("opened [{text}]")), "{name}: {told}");
+    };
+    ask("main", "main").await;
+    let fetches = |commit: &str| wrapper.calls().iter().filter(|call| call.contains(&format!("+{commit}:"))).count();
+    let mut stuck = Client::start(&server, &world("lab/arm", "slow", "worlds/a.wbt")).await;
+    until("it hangs", async || fetches(&slow) == 1).await;
+    ask("main", "main").await;
+    ask(&main, "main").await;
+    // The same commit is fetched once, for whatever world, also when the first has left.
+    let mut heir = Client::start(&server, &world("lab/arm", "slow", "worlds/b.wbt")).await;
+    heir.until("loading: looking for").await;
+    let mut next = Client::start(&server, &world("lab/arm", "one", "worlds/a.wbt")).await;
+    next.until("loading: fetching https://github.com/lab/arm: waiting for another fetch").await;
+    assert_eq!(fetches(&slow), 1);
+    stuck.send("nothing that is known").await;
+    stuck.until("loading: Error:").await;
+    until("it has gone", async || stages(&server).await.len() == 2).await;
+    // What stands still is begun anew, after who waited for it.
+    let told = next.until("loading: Error:").await;
+    assert!(told.contains("opened [one]"), "{told}");
     std::fs::write(marks.path().join("go"), "").unwrap();
-    let told = parent.until("loading: Error:").await;
-    assert!(told.contains("opened [parent]"), "{told}");
-    git(&repositories(&server.folder.join("cache")).remove(0), &["fsck", "--full"]);
+    let told = heir.until("loading: Error:").await;
+    assert!(told.contains("opened [slow]"), "{told}");
+    git(&cached(&server)[0], &["fsck", "--full"]);
+}
+
+#[actix_rt::test]
+async fn many_commits_that_are_wanted_at_once_all_come() {
+    let branches = ["main", "one", "two", "three", "four"];
+    let (forge, webots) = (forge(&branches), reader());
+    // Of a line of commits, each is fetched alone, whichever comes first.
+    let old = commit(&forge, "main");
+    forge.commit("lab/arm", "main", &[("worlds/a.wbt", &world_text("newer"))]);
+    git(&forge.path().join("lab/arm"), &["tag", "old", &old]);
+    let server = simulation_server(&webots.path(), forge.path(), 8).start().await;
+    let wanted =
+        [("main", "newer"), ("old", "main"), ("one", "one"), ("two", "two"), ("three", "three"), ("four", "four")];
+    let all = wanted.map(|(name, text)| {
+        let server = &server;
+        async move { (outcome(server, &world("lab/arm", name, "worlds/a.wbt")).await, text) }
+    });
+    for (told, text) in join_all(all).await {
+        assert!(told.contains(&format!("opened [{text}]")), "{text}: {told}");
+    }
+    assert_eq!(cached(&server).len(), 1, "one repository for one remote");
+    git(&cached(&server)[0], &["fsck", "--full"]);
 }
 
 #[actix_rt::test]
@@ -71,11 +106,12 @@ async fn a_slow_fetch_goes_on_for_who_came_later_for_another_world_of_the_same_c
 #[actix_rt::test]
 async fn what_stands_still_is_begun_anew_and_what_moves_is_not() {
     let (forge, webots) = (forge(&["main", "slow"]), reader());
+    let (main, slow) = (commit(&forge, "main"), commit(&forge, "slow"));
     let marks = tempfile::tempdir().unwrap();
     // Each kind of command hangs once; the fetch of another branch takes its time, but moves.
     let wrapper = GitWrapper::new(&format!(
-        "case \"$*\" in *ls-remote*) mkdir {0}/asked 2>/dev/null && exec sleep 1000;; *fetch*heads/main:*) mkdir {0}/fetched 2>/dev/null && exec sleep 1000;; \
-         *fetch*heads/slow:*) for n in 1 2 3 4 5 6 7 8 9; do echo \"Receiving objects: $n%\" >&2; sleep 0.5; done;; esac",
+        "case \"$*\" in *ls-remote*) mkdir {0}/asked 2>/dev/null && exec sleep 1000;; *fetch*+{main}:*) mkdir {0}/fetched 2>/dev/null && exec sleep 1000;; \
+         *fetch*+{slow}:*) for n in 1 2 3 4 5 6 7 8 9; do echo \"Receiving objects: $n%\" >&2; sleep 0.5; done;; esac",
         marks.path().display()
     ));
     let builder = simulation_server(&webots.path(), forge.path(), 1).env("PATH", &wrapper.path());
@@ -86,7 +122,12 @@ async fn what_stands_still_is_begun_anew_and_what_moves_is_not() {
     assert!(marks.path().join("asked").exists() && marks.path().join("fetched").exists());
     let told = outcome(&server, &world("lab/arm", "slow", "worlds/a.wbt")).await;
     assert!(told.contains("opened [slow]"), "{told}");
-    assert_eq!(wrapper.calls().iter().filter(|call| call.contains("heads/slow:")).count(), 1, "{:#?}", wrapper.calls());
+    assert_eq!(
+        wrapper.calls().iter().filter(|call| call.contains(&format!("+{slow}:"))).count(),
+        1,
+        "{:#?}",
+        wrapper.calls()
+    );
 }
 
 #[actix_rt::test]
@@ -116,43 +157,4 @@ async fn a_commit_by_several_names_is_fetched_once() {
         assert!(told.contains("opened [main]"), "{told}");
     }
     assert_eq!(wrapper.calls().iter().filter(|call| call.contains(" fetch ")).count(), 1, "{:#?}", wrapper.calls());
-}
-
-#[actix_rt::test]
-async fn who_joins_the_fetch_of_a_commit_by_another_name_inherits_nothing_of_that_name() {
-    // The fetch by the first name takes until both wait for it, and then ends otherwise than that by the second.
-    let (refused, moved) =
-        ("echo 'fatal: not our ref' >&2; exit 128", "$REAL --git-dir $BARE update-ref refs/heads/main next");
-    for (is_hash_first, what_happens, opened) in [(true, refused, ["", "first"]), (false, moved, ["second", "first"])] {
-        let (forge, webots, marks) = (Forge::new(), reader(), tempfile::tempdir().unwrap());
-        let hash = forge.commit("lab/arm", "main", &[("worlds/a.wbt", &world_text("first"))]);
-        forge.commit("lab/arm", "next", &[("worlds/a.wbt", &world_text("second"))]);
-        let bare = forge.path().join("lab/arm");
-        git(&bare, &["tag", "old", &hash]);
-        let [first, second] = if is_hash_first { [hash.as_str(), "main"] } else { ["main", hash.as_str()] };
-        let asked = if is_hash_first { format!("+{hash}:") } else { "heads/main:".to_owned() };
-        let wrapper = GitWrapper::new(&format!(
-            "BARE={}\ncase \"$*\" in *fetch*{asked}*) until [ -e {}/go ]; do echo \"Receiving objects: 1%\" >&2; sleep 0.05; done; {what_happens};; esac",
-            bare.display(),
-            marks.path().display()
-        ));
-        let server = simulation_server(&webots.path(), forge.path(), 2).env("PATH", &wrapper.path()).start().await;
-        let mut clients = Vec::new();
-        for name in [first, second] {
-            let mut client = Client::start(&server, &world("lab/arm", name, "worlds/a.wbt")).await;
-            client.until("loading: fetching").await;
-            clients.push(client);
-        }
-        std::fs::write(marks.path().join("go"), "").unwrap();
-        for (client, opened) in clients.iter_mut().zip(opened) {
-            let told = client.until("loading: Error:").await;
-            let expected = if opened.is_empty() {
-                "has no branch, tag or commit called".to_owned()
-            } else {
-                format!("opened [{opened}]")
-            };
-            assert!(told.contains(&expected), "{told}");
-        }
-        assert_eq!(wrapper.calls().iter().filter(|call| call.contains(" fetch ")).count(), 2, "{:#?}", wrapper.calls());
-    }
 }

@@ -1,35 +1,42 @@
-//! Checks worlds out of git for clients: cached, deduplicated, cancellable, with progress.
+//! Checks worlds out of git for clients: cached, joined, cancellable, with progress.
 //!
-//! First the commit is brought into the cache (see [`super::fetcher`]); then each client gets its own copy of the
+//! First the commit is brought into the cache (see [`super::finder`]); then each client gets its own copy of the
 //! project's folder. Both run on the server's main thread as tasks: whoever drops the handle no longer waits.
 
-use std::ffi::OsString;
+use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::time::Instant;
 
 use actix::prelude::*;
 use tokio::runtime::Handle;
 use tokio::sync::Semaphore;
 use tokio_util::task::AbortOnDropHandle;
 
-use super::errand::call;
-use super::error::{CheckoutError, damaged, machine, too_large, too_slow};
-use super::fetcher::{Fetched, Fetcher};
-use super::git::Call;
+use super::cache::Cache;
+use super::cache_dir::CacheDir;
+use super::copy::{Copied, copy_call, look};
+use super::error::{CheckoutError, git_failed, machine, too_large, too_slow};
+use super::finder::{Finder, Found};
+use super::git::Git;
 use super::lfs::{self, Pointer};
 use super::limits::Limits;
-use super::revision::ALL;
-use super::world_file::{self, NoWorld, WorldFile};
+use super::mirrors::Mirrors;
+use super::revision::{ALL, Revision};
+use super::world_file::{NoWorld, WorldFile};
 use crate::shared::domain::ProjectUrl;
 use crate::simulation::process::InstanceDir;
 
 /// Checks worlds out; one for the whole server.
 pub struct Checkouts {
-    fetcher: Arc<Fetcher>,
+    git: Arc<Git>,
+    cache: Arc<Cache>,
+    finder: Arc<Finder>,
     limits: Limits,
     runtime: Handle,
     /// How many copies are made at a time: more would only be slower together.
     copies: Semaphore,
+    _keeps_within_budget: AbortOnDropHandle<()>,
 }
 
 /// A step of a checkout, in words.
@@ -42,25 +49,40 @@ pub struct Progress(pub String);
 pub struct Project {
     /// The world to open.
     pub world: WorldFile,
-    /// The commit.
-    pub revision: String,
     /// What the client should know.
     pub warnings: Vec<String>,
+    /// Where it came from.
+    url: ProjectUrl,
+    revision: Revision,
     /// The project's folder.
     folder: PathBuf,
     /// Where the project is that Webots sees, in its repository: elsewhere if the world is behind a link.
     place: String,
-    fetched: Arc<Fetched>,
     /// Removed with the project.
     pub instance: InstanceDir,
 }
 
 impl Checkouts {
-    /// Prepares checkouts on the thread whose runtime this is.
-    #[must_use]
-    pub fn new(fetcher: Fetcher, limits: Limits, runtime: Handle) -> Self {
+    /// Prepares checkouts on the thread whose runtime this is. `run` is the folder of this run of the server; the
+    /// cached repositories may take `budget` bytes.
+    ///
+    /// # Errors
+    /// When the cache can't be made.
+    pub fn open(
+        dir: CacheDir,
+        run: &Path,
+        budget: u64,
+        mirrors: Mirrors,
+        limits: Limits,
+        runtime: Handle,
+    ) -> io::Result<Self> {
+        let git = Arc::new(Git::new(run)?);
+        let cache = Arc::new(Cache::open(dir, budget, Arc::clone(&git), limits)?);
+        let finder = Arc::new(Finder::new(Arc::clone(&git), Arc::clone(&cache), mirrors, limits));
+        let keeper = AbortOnDropHandle::new(runtime.spawn(Arc::clone(&cache).keep_within_budget()));
         let cores = std::thread::available_parallelism().map_or(2, usize::from);
-        Self { fetcher: Arc::new(fetcher), limits, runtime, copies: Semaphore::new(2 * cores) }
+        let copies = Semaphore::new(2 * cores);
+        Ok(Self { git, cache, finder, limits, runtime, copies, _keeps_within_budget: keeper })
     }
 
     /// Starts to check a world out into a client's folder. `progress` hears each step in words.
@@ -85,89 +107,94 @@ impl Checkouts {
         instance: InstanceDir,
         progress: impl Fn(String) + Send + Sync,
     ) -> Result<Project, CheckoutError> {
-        let copied = match self.fetch_and_copy(world, &instance, &progress).await {
-            // A disk that failed, a crash, or somebody's hand: what is cached can be had again.
-            Err(CheckoutError::Damaged { source, .. }) => {
-                log::warn!("{world}: {source}");
-                self.fetcher.mend(world).await.map_err(|error| machine(world, &error))?;
-                self.fetch_and_copy(world, &instance, &progress).await
+        let start = Instant::now();
+        let checked_out = match self.attempt(world, &instance, &progress).await {
+            Err(error) => {
+                self.mend(world, start, error).await?;
+                self.attempt(world, &instance, &progress).await
             }
-            other => other,
+            done => done,
         };
-        let (fetched, folder) = copied?;
-        let mut needed = fetched.revision.needed();
-        let mut seen = look(world, &instance, &folder).await?;
-        if needed != ALL && matches!(seen.1, Err(NoWorld::Dangling(_))) {
-            // The world is a link itself, which may lead anywhere in its repository.
-            self.fetcher.check_whole(world, &fetched).await?;
-            needed = ALL;
-            self.copy(world, &fetched, needed, &instance, &progress).await?;
-            seen = look(world, &instance, &folder).await?;
-        }
-        let (pointers, file) = seen;
-        let (pointers, file) = if pointers.is_empty() || !lfs::is_installed() {
-            (pointers, file)
-        } else {
-            self.load_large_files(world, &fetched, needed, &instance, &pointers, &progress).await?;
-            look(world, &instance, &folder).await?
-        };
-        let (file, pointers) = (file?, pointers.len());
-        let warnings = (pointers > 0).then(|| lfs::warning(pointers));
-        let revision = fetched.revision.commit.clone();
-        let root = instance.path().join("project").canonicalize().map_err(|error| machine(world, &error))?;
-        let seen = file.path.ancestors().nth(2).and_then(|project| project.strip_prefix(root).ok()?.to_str());
-        let place = seen.unwrap_or(&fetched.revision.folder).to_owned();
+        let (revision, Copied { pointers, has_lfs, world: file, place }) = checked_out?;
+        let file = file?;
+        let warning = (!pointers.is_empty()).then(|| lfs::warning(pointers.len(), has_lfs));
         progress("checkout done".to_owned());
         Ok(Project {
             world: file,
+            warnings: warning.into_iter().collect(),
+            url: world.clone(),
+            folder: instance.path().join("project").join(&revision.folder),
+            place: place.unwrap_or_else(|| revision.folder.clone()),
             revision,
-            warnings: warnings.into_iter().collect(),
-            folder,
-            place,
-            fetched,
             instance,
         })
     }
 
-    async fn fetch_and_copy(
+    /// Throws a cached repository away that was found to be broken, unless it was made after `since`: it can be fetched
+    /// anew.
+    ///
+    /// # Errors
+    /// The failure, if it is another one.
+    async fn mend(&self, world: &ProjectUrl, since: Instant, failure: CheckoutError) -> Result<(), CheckoutError> {
+        let CheckoutError::Damaged { .. } = &failure else {
+            return Err(failure);
+        };
+        log::warn!("{failure}. The cached repository is broken: it is fetched anew");
+        self.finder.discard(world, since).await
+    }
+
+    /// Finds and copies a project, with its large files.
+    async fn attempt(
         &self,
         world: &ProjectUrl,
         instance: &InstanceDir,
         progress: &(impl Fn(String) + Send + Sync),
-    ) -> Result<(Arc<Fetched>, PathBuf), CheckoutError> {
-        let fetched = self.fetcher.fetched(world, progress).await?;
-        let folder = self.copy(world, &fetched, fetched.revision.needed(), instance, progress).await?;
-        Ok((fetched, folder))
+    ) -> Result<(Revision, Copied), CheckoutError> {
+        let found = self.finder.find(world, progress).await?;
+        let mut needed = found.revision.needed();
+        self.copy(world, &found, needed, instance, progress).await?;
+        let mut copied = look(world, instance, &found.revision).await?;
+        if needed != ALL && matches!(copied.world, Err(NoWorld::Dangling(_))) {
+            // The world is a link itself, which may lead anywhere in its repository.
+            self.finder.check_whole(world, &found).await?;
+            needed = ALL;
+            self.copy(world, &found, needed, instance, progress).await?;
+            copied = look(world, instance, &found.revision).await?;
+        }
+        if copied.has_lfs && !copied.pointers.is_empty() {
+            self.load_large_files(world, &found, needed, instance, &copied.pointers, progress).await?;
+            copied = look(world, instance, &found.revision).await?;
+        }
+        Ok((found.revision.clone(), copied))
     }
 
-    /// Copies what is needed out of the cache. Gives back where the project's folder is.
+    /// Copies what is needed out of the cache.
     async fn copy(
         &self,
         world: &ProjectUrl,
-        fetched: &Fetched,
+        found: &Found,
         needed: &str,
         instance: &InstanceDir,
         progress: &(impl Fn(String) + Send + Sync),
-    ) -> Result<PathBuf, CheckoutError> {
-        let _turn = self.copies.acquire().await.map_err(|error| machine(world, &std::io::Error::other(error)))?;
+    ) -> Result<(), CheckoutError> {
+        let _turn = self.copies.acquire().await.map_err(|error| machine(world, &io::Error::other(error)))?;
         let tree = instance.path().join("project");
-        tokio::fs::create_dir_all(&tree).await.map_err(|error| machine(world, &error))?;
-        progress(format!("checking {} out", fetched.revision.name));
-        let call = copy_call(fetched, instance, needed);
+        tokio::fs::create_dir_all(tree).await.map_err(|error| machine(world, &error))?;
+        progress(format!("checking {} out", found.revision.name));
+        let call = copy_call(&found.repository, &found.revision, instance, needed);
         let told = |line: &str| {
             if line.contains('%') {
                 progress(line.to_owned());
             }
         };
-        self.fetcher.git().run(call, told).await.map_err(|source| damaged(world, source))?;
-        Ok(tree.join(&fetched.revision.folder))
+        self.git.run(call, told).await.map(drop).map_err(|source| git_failed(world, source))
     }
 
     /// Loads the files that the project keeps in Git LFS. Those that can't be had stay pointers.
     async fn load_large_files(
         &self,
         world: &ProjectUrl,
-        fetched: &Fetched,
+        found: &Found,
         needed: &str,
         instance: &InstanceDir,
         pointers: &[Pointer],
@@ -181,17 +208,17 @@ impl Checkouts {
             // git writes again only what is not there.
             tokio::fs::remove_file(path).await.map_err(|error| machine(world, &error))?;
         }
-        let mut call = copy_call(fetched, instance, needed);
-        call.arguments.splice(0..0, lfs::settings(&fetched.remote));
-        self.fetcher.git().run(call, |_| ()).await.map_err(|source| damaged(world, source))?;
-        self.fetcher.shrink_soon();
+        let mut call = copy_call(&found.repository, &found.revision, instance, needed);
+        call.settings = lfs::settings(found.repository.remote());
+        self.git.run(call, |_| ()).await.map_err(|source| git_failed(world, source))?;
+        self.cache.grown();
         Ok(())
     }
 
     /// Restores a file below the project's `controllers` folder to the state of the checkout.
     ///
     /// # Errors
-    /// When it is no file of the checkout there.
+    /// When it is no file of the checkout there, or git fails.
     pub async fn restore_controller(&self, project: &Project, file: &str) -> Result<(), CheckoutError> {
         let refused = || CheckoutError::NoController(file.to_owned());
         let plain = |segment: &str| !segment.is_empty() && segment != "." && segment != ".." && !segment.contains('\0');
@@ -200,36 +227,27 @@ impl Checkouts {
         }
         let slash = if project.place.is_empty() { "" } else { "/" };
         let path = format!("{}{slash}controllers/{file}", project.place);
-        let call = copy_call(&project.fetched, &project.instance, &path);
-        self.fetcher.git().run(call, |_| ()).await.map(drop).map_err(|_| refused())
+        let start = Instant::now();
+        let is_there = match self.restore(project, &path).await {
+            Err(error) => {
+                self.mend(&project.url, start, error).await?;
+                self.restore(project, &path).await?
+            }
+            Ok(is_there) => is_there,
+        };
+        if is_there { Ok(()) } else { Err(refused()) }
     }
-}
 
-fn copy_call<'call>(fetched: &'call Fetched, instance: &InstanceDir, path: &str) -> Call<'call> {
-    let mut work_tree = OsString::from("--work-tree=");
-    work_tree.push(instance.path().join("project"));
-    let options = ["checkout", "--force", "--progress"].map(OsString::from);
-    let what = [fetched.reference.as_str(), "--", path].map(OsString::from);
-    let arguments = std::iter::once(work_tree).chain(options).chain(what).collect();
-    let mut call = call(&fetched.remote, fetched.repository.path(), arguments);
-    call.environment.push(("GIT_INDEX_FILE".into(), instance.path().join("index").into()));
-    call.environment.push(("GIT_ATTR_SOURCE".into(), fetched.reference.clone().into()));
-    call
-}
-
-/// What is in a copy: files that only point to larger ones, and the world.
-async fn look(
-    world: &ProjectUrl,
-    instance: &InstanceDir,
-    folder: &Path,
-) -> Result<(Vec<Pointer>, Result<WorldFile, NoWorld>), CheckoutError> {
-    let (root, folder) = (instance.path().join("project"), folder.to_owned());
-    let path = folder.join("worlds").join(world.world());
-    let seen = actix_rt::task::spawn_blocking(move || {
-        let project = world_file::project_of(&root, &path).map(|project| lfs::pointers(&project));
-        (project.unwrap_or_default(), WorldFile::open(&root, &path))
-    });
-    seen.await.map_err(|error| machine(world, &error.into()))
+    /// Restores a file of a project's repository. Returns whether it is there.
+    async fn restore(&self, project: &Project, path: &str) -> Result<bool, CheckoutError> {
+        let Project { url, revision, instance, .. } = project;
+        let Some(repository) = self.finder.file(url, revision, path).await? else {
+            return Ok(false);
+        };
+        let call = copy_call(&repository, revision, instance, path);
+        self.git.run(call, |_| ()).await.map_err(|source| git_failed(url, source))?;
+        Ok(true)
+    }
 }
 
 impl Project {

@@ -1,10 +1,10 @@
-//! Why a world can't be checked out, in words for its client. Pure.
+//! Why a checkout failed, in words for its client. Pure.
 
 use std::io;
 use std::time::Duration;
 
-use super::git::GitError;
-use super::revision::Revision;
+use super::git_error::{Cause, GitError};
+use super::repository::FetchError;
 use super::world_file::NoWorld;
 use crate::shared::domain::ProjectUrl;
 
@@ -68,7 +68,7 @@ pub enum CheckoutError {
         /// What git says.
         source: GitError,
     },
-    /// git failed on what is in the cache.
+    /// The cached repository is broken.
     #[error("{repository} can't be checked out: {source}")]
     Damaged {
         /// The repository's URL.
@@ -91,30 +91,26 @@ pub fn no_reference(world: &ProjectUrl) -> CheckoutError {
     CheckoutError::NoReference { repository: world.repository(), reference }
 }
 
-/// What a failed fetch means. A commit that the remote does not know is the client's fault, not git's.
-#[must_use]
-pub fn fetch_failed(world: &ProjectUrl, revision: &Revision, source: GitError) -> CheckoutError {
-    let unknown = ["not our ref", "unadvertised object", "couldn't find remote ref", "remote did not send"];
-    if revision.is_commit() && unknown.iter().any(|words| source.message.contains(words)) {
-        return no_reference(world);
-    }
-    git_failed(world, source)
-}
-
-/// What a failed command means that asks the remote. git asks for a password where a forge says 'not found': forges don't tell private from missing.
+/// A git command that works on a cached repository, or asks a remote, has failed.
 #[must_use]
 pub fn git_failed(world: &ProjectUrl, source: GitError) -> CheckoutError {
-    let missing = ["could not read Username", "not found", "does not appear to be a git repository", "does not exist"];
-    if missing.iter().any(|words| source.message.contains(words)) {
-        return CheckoutError::NoRepository(world.repository());
+    let repository = world.repository();
+    match source.cause() {
+        Cause::NoRepository => CheckoutError::NoRepository(repository),
+        Cause::NoCommit => no_reference(world),
+        Cause::Damaged => CheckoutError::Damaged { repository, source },
+        Cause::Other => CheckoutError::Git { repository, source },
     }
-    CheckoutError::Git { repository: world.repository(), source }
 }
 
-/// git failed on what is in the cache, without asking anybody.
+/// A fetch has failed; `what` was fetched.
 #[must_use]
-pub fn damaged(world: &ProjectUrl, source: GitError) -> CheckoutError {
-    CheckoutError::Damaged { repository: world.repository(), source }
+pub fn fetch_failed(world: &ProjectUrl, what: impl FnOnce() -> String, limit: u64, error: FetchError) -> CheckoutError {
+    match error {
+        FetchError::Git(source) => git_failed(world, source),
+        FetchError::TooLarge => too_large(what(), limit),
+        FetchError::Machine(why) => CheckoutError::Machine(world.repository(), why),
+    }
 }
 
 /// The time limit has passed.

@@ -10,6 +10,7 @@ use tokio::io::{AsyncRead, AsyncReadExt};
 use tokio::net::unix::pipe::Receiver;
 use which::which;
 
+use super::git_error::GitError;
 use crate::shared::run::one_line;
 use crate::simulation::process::{ExitReason, ProcessGroup, SpawnSpec};
 
@@ -26,6 +27,8 @@ pub struct Git {
 pub struct Call<'call> {
     /// The bare repository it works on.
     pub repository: &'call Path,
+    /// Settings that it needs, each as `name=value`.
+    pub settings: Vec<String>,
     /// The command and its arguments.
     pub arguments: Vec<OsString>,
     /// The one protocol that it may use.
@@ -34,42 +37,14 @@ pub struct Call<'call> {
     pub environment: Vec<(OsString, OsString)>,
 }
 
-/// A git command that failed.
-#[derive(Debug, Clone, thiserror::Error)]
-#[error("git {command} {ending}: {message}")]
-pub struct GitError {
-    /// Which one.
-    pub command: String,
-    /// How it ended.
-    pub ending: String,
-    /// What it said last.
-    pub message: String,
-}
-
-impl GitError {
-    /// Whether git has come to this end by itself: it could be started, and nobody has ended it.
-    #[must_use]
-    pub fn is_verdict(&self) -> bool {
-        self.ending.starts_with("ended with")
-    }
-
-    /// Whether its answer was longer than what is read of one.
-    #[must_use]
-    pub fn is_endless(&self) -> bool {
-        self.ending == ENDLESS
-    }
-}
-
 /// git reads this in place of the settings of its user and machine. Any repository may be read: a mirror may belong
-/// to somebody else, and nothing that it holds is run. Of a repository whose objects are borrowed, commits that have
-/// come since must not be taken for known: whether they have all their ancestors is not known.
+/// to somebody else, and nothing that it holds is run.
 const SETTINGS: &str = "\
 [safe]
 	directory = *
 [core]
 	hooksPath = /dev/null
 	fsmonitor = false
-	alternateRefsPrefixes = refs/none/
 [credential]
 	helper =
 [fetch]
@@ -78,8 +53,7 @@ const SETTINGS: &str = "\
 [submodule]
 	recurse = false
 [gc]
-	auto = 0
-	packRefs = false
+	autoDetach = false
 [maintenance]
 	auto = false
 [init]
@@ -91,8 +65,6 @@ const SETTINGS: &str = "\
 
 /// The most that is read of a command's answer, in bytes.
 const LARGEST_ANSWER: usize = 64 * 1024 * 1024;
-/// How a command ends that answers more.
-const ENDLESS: &str = "was ended";
 
 impl Git {
     /// Prepares git for the server whose run has this folder.
@@ -105,7 +77,7 @@ impl Git {
         Ok(Self { settings, mark: run.to_owned(), has_nice: which("nice").is_ok() })
     }
 
-    /// Runs a command to its end and gives back its answer. `progress` hears each line of progress.
+    /// Runs a command to its end. Returns its answer. `progress` hears each line of progress.
     ///
     /// Dropping the future ends git and all that it has started.
     ///
@@ -115,7 +87,7 @@ impl Git {
         self.run_until(std::future::pending(), call, progress).await
     }
 
-    /// The same, but git is killed when `end` comes. It gives back only when nothing of git is left.
+    /// The same, but git is killed when `end` comes. Returns only when nothing of git is left.
     ///
     /// # Errors
     /// When git can't be started, fails or is killed.
@@ -127,9 +99,7 @@ impl Git {
     ) -> Result<Vec<u8>, GitError> {
         let command = call.arguments.iter().find(|argument| !argument.as_encoded_bytes().starts_with(b"-"));
         let command = command.map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
-        let failed =
-            |ending: &str, message: String| GitError { command: command.clone(), ending: ending.to_owned(), message };
-        let broken = |error: std::io::Error| failed("can't be started", error.to_string());
+        let broken = |error: std::io::Error| GitError::NotStarted(error.to_string());
         let (answer, output) = std::io::pipe().map_err(broken)?;
         let (complaints, errors) = std::io::pipe().map_err(broken)?;
         let (group, ended) = ProcessGroup::start(&self.spec(call), output.into(), errors.into()).map_err(broken)?;
@@ -143,24 +113,12 @@ impl Git {
             }
             ended.await
         };
-        let (answer, last_words, ending) = tokio::join!(read_all(answer), follow(complaints, progress), ended);
+        let (answer, message, ending) = tokio::join!(read_all(answer), follow(complaints, progress), ended);
         match ending {
-            _ if answer.len() > LARGEST_ANSWER => {
-                Err(failed(ENDLESS, format!("its answer is longer than {} MiB", LARGEST_ANSWER >> 20)))
-            }
+            _ if answer.len() > LARGEST_ANSWER => Err(GitError::TooLong(command)),
             ExitReason::Code(0) => Ok(answer),
-            ending => Err(failed(&ending.to_string(), last_words)),
-        }
-    }
-
-    /// Whether everything is in order in a repository. It reads all of it: for use after a failure.
-    pub async fn is_sound(&self, repository: &Path) -> bool {
-        let arguments = ["fsck", "--full", "--no-dangling", "--no-progress"].map(OsString::from).to_vec();
-        let call = Call { repository, arguments, protocol: "https", environment: Vec::new() };
-        match self.run(call, |_| ()).await {
-            Ok(_) => true,
-            // A machine that can't run git says nothing of the repository.
-            Err(error) => !error.is_verdict(),
+            ExitReason::NotStarted => Err(GitError::NotStarted(message)),
+            ending => Err(GitError::Failed { command, ending, message }),
         }
     }
 
@@ -171,6 +129,7 @@ impl Git {
             command.remove(0);
         }
         command.push(call.repository.into());
+        command.extend(call.settings.into_iter().flat_map(|setting| ["-c".into(), setting.into()]));
         command.extend(call.arguments);
         let fixed: [(&str, &OsStr); 7] = [
             ("GIT_CONFIG_GLOBAL", self.settings.as_os_str()),
@@ -203,36 +162,35 @@ async fn read_all(pipe: Receiver) -> Vec<u8> {
     answer
 }
 
-/// Hands on each line that git prints, also those that it overwrites, and keeps the last that tells of a fault.
+/// Passes on each line that git prints, also those that it overwrites. Returns the one that names the cause of a failure.
 async fn follow(mut pipe: impl AsyncRead + Unpin, mut progress: impl FnMut(&str)) -> String {
-    let mut last_words = String::new();
+    let mut cause = String::new();
     let mut line = Vec::new();
     let mut chunk = [0; 4096];
     while let Ok(length @ 1..) = pipe.read(&mut chunk).await {
         for byte in chunk.iter().take(length) {
             match byte {
-                b'\r' | b'\n' => {
-                    finish(&mut line, &mut last_words, &mut progress);
-                }
+                b'\r' | b'\n' => finish(&mut line, &mut cause, &mut progress),
                 _ if line.len() < 500 => line.push(*byte),
                 _ => {}
             }
         }
     }
-    finish(&mut line, &mut last_words, &mut progress);
-    last_words
+    finish(&mut line, &mut cause, &mut progress);
+    cause
 }
 
-fn finish(line: &mut Vec<u8>, last_words: &mut String, progress: &mut impl FnMut(&str)) {
+fn finish(line: &mut Vec<u8>, cause: &mut String, progress: &mut impl FnMut(&str)) {
     let text = one_line(String::from_utf8_lossy(line).trim());
     line.clear();
     if text.is_empty() {
         return;
     }
     progress(&text);
-    // The first fatal line names the cause; those that follow it only tell what came of it.
-    if !last_words.starts_with("fatal:") {
-        *last_words = text;
+    // The first fatal line names the cause, else the first error; what follows only tells what came of it.
+    let weight = |text: &str| if text.starts_with("fatal:") { 2 } else { u8::from(text.starts_with("error:")) };
+    if weight(&text) > weight(cause) || weight(cause) == 0 {
+        *cause = text;
     }
 }
 
@@ -248,5 +206,8 @@ mod tests {
         assert_eq!(lines.len(), 5);
         assert_eq!(lines[2], "Receiving objects:  10%");
         assert_eq!(last, "fatal: no room");
+        let text: &[u8] = b"error: no lock\nerror: no reference\nRemove the file by hand.\n";
+        assert_eq!(follow(text, |_: &str| ()).await, "error: no lock");
+        assert_eq!(follow(&b"one\ntwo\n"[..], |_: &str| ()).await, "two");
     }
 }

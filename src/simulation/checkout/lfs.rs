@@ -1,6 +1,5 @@
 //! Git LFS: large files that a repository only points to.
 
-use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 
 use which::which;
@@ -46,7 +45,7 @@ fn size(text: &[u8]) -> Option<u64> {
     text.lines().find_map(|line| line.strip_prefix("size ")).and_then(|size| size.trim().parse().ok())
 }
 
-/// Whether git finds its part for LFS.
+/// Whether git finds its part for LFS. Looks on disk: not for a thread that serves others.
 #[must_use]
 pub fn is_installed() -> bool {
     which("git-lfs").is_ok()
@@ -54,13 +53,13 @@ pub fn is_installed() -> bool {
 
 /// Settings with which a checkout loads large files from where the repository is, whatever the repository says.
 #[must_use]
-pub fn settings(remote: &Remote) -> Vec<OsString> {
+pub fn settings(remote: &Remote) -> Vec<String> {
     let location = &remote.location;
     let url = match remote.protocol {
         "file" => format!("file://{location}"),
         _ => format!("{}.git/info/lfs", location.trim_end_matches('/').trim_end_matches(".git")),
     };
-    let settings = [
+    vec![
         format!("lfs.url={url}"),
         // For a folder, git-lfs looks here.
         format!("remote.origin.url={url}"),
@@ -71,14 +70,13 @@ pub fn settings(remote: &Remote) -> Vec<OsString> {
         // A file that can't be had stays a pointer, and is told.
         "lfs.skipdownloaderrors=true".to_owned(),
         "lfs.locksverify=false".to_owned(),
-    ];
-    settings.into_iter().flat_map(|setting| ["-c".into(), setting.into()]).collect()
+    ]
 }
 
 /// What a client is told of pointers that are left.
 #[must_use]
-pub fn warning(count: usize) -> String {
-    let why = if is_installed() { "could not be loaded" } else { "can't be loaded: this server has no git-lfs" };
+pub fn warning(count: usize, is_installed: bool) -> String {
+    let why = if is_installed { "could not be loaded" } else { "can't be loaded: this server has no git-lfs" };
     format!("Warning: {count} files of this project are kept in Git LFS and {why}")
 }
 
@@ -100,7 +98,7 @@ mod tests {
     fn large_files_come_from_where_the_repository_is() {
         let first = |location: &str, protocol| {
             let location = location.to_owned();
-            settings(&Remote { location, protocol })[1].clone().into_string().unwrap()
+            settings(&Remote { location, protocol })[0].clone()
         };
         assert_eq!(first("https://github.com/l/a.git", "https"), "lfs.url=https://github.com/l/a.git/info/lfs");
         assert_eq!(first("https://forge.org/l/a", "https"), "lfs.url=https://forge.org/l/a.git/info/lfs");

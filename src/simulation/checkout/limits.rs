@@ -13,14 +13,14 @@ pub struct Limits {
     pub any_commit: bool,
 }
 
-/// So many bytes of the size that a project may have allow for one file or folder: it takes about that of a disk.
+/// How many bytes of a project's size allow for one file or folder: each takes about that much of a disk.
 const ENTRY: u64 = 4096;
-/// So many files and folders any project may have.
+/// How many files and folders any project may have.
 const FEW_ENTRIES: u64 = 10_000;
 
 impl Limits {
-    /// A remote that is silent for so long is asked anew: often it is but a connection that has died. Tidying up holds
-    /// a fetch up for no longer either.
+    /// How long a remote may be silent before it is asked anew: often it is but a connection that has died. Packing a
+    /// cached repository holds a fetch up for no longer either.
     #[must_use]
     pub fn patience(&self) -> Duration {
         self.time / 4

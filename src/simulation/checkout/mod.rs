@@ -1,28 +1,28 @@
 //! A client's world, checked out of git: cached, fetched once for all who want it, cancellable, with progress.
+//!
+//! To change how long a fetch may take, or how much it may bring, see [`limits`]; what git obeys, see [`git`].
 
-mod cache_lock;
-mod cached_repository;
+mod cache;
+mod cache_dir;
 mod checkout;
-mod download;
-mod errand;
+mod copy;
+mod disk;
 mod error;
-mod examined;
-mod fetcher;
+mod finder;
 mod git;
-mod housekeeping;
+mod git_error;
+mod growth;
 mod lfs;
 mod limits;
+mod listing;
 mod mirrors;
-mod quarantine;
-mod repository_cache;
+mod repository;
 mod revision;
 mod single_flight;
 mod world_file;
 
+pub use cache_dir::CacheDir;
 pub use checkout::{Checkouts, Progress, Project};
 pub use error::CheckoutError;
-pub use fetcher::Fetcher;
-pub use git::Git;
 pub use limits::Limits;
 pub use mirrors::Mirrors;
-pub use repository_cache::RepositoryCache;

@@ -7,18 +7,41 @@ use crate::shared::domain::{ProjectUrl, Reading, RefKind};
 /// One commit that a world's URL may mean.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Revision {
-    /// The object that git names: a commit, or the tag that stands for one.
+    /// The hash: of a commit, or of the tag that stands for one.
     pub commit: String,
     /// Branch, tag or commit, as the URL has it.
     pub name: String,
-    /// What is asked for on the remote.
-    remote_name: String,
-    /// Whether it need not be one that the repository's owner has accepted.
-    is_any: bool,
     /// The project's folder; empty for the root.
     pub folder: String,
+    /// Who vouches for the commit.
+    pub voucher: Voucher,
     /// Whether more than that folder is needed: a link on the way to the world may lead anywhere in the repository.
     pub is_whole: bool,
+}
+
+/// Who vouches for a commit. Forges hand out by their hash also commits of forks and of proposals, which the
+/// repository's owner never accepted: allowing a repository must not allow those.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Voucher {
+    /// The remote, which has it as the newest of a branch or tag.
+    Tip,
+    /// The URL alone: it must be looked for in the branches and tags before it is fetched.
+    Url,
+    /// The configuration, which allows any commit.
+    AnyCommit,
+}
+
+/// Something to fetch.
+#[derive(Debug, Clone)]
+pub struct Wish {
+    /// Equal wishes have equal names.
+    pub name: String,
+    /// Settings that git needs for it, each as `name=value`.
+    pub settings: Vec<String>,
+    /// What git is to do.
+    pub arguments: Vec<OsString>,
+    /// Whether the repository's hashes are of SHA-256.
+    pub is_sha256: bool,
 }
 
 /// All of a repository, as git wants it named.
@@ -34,21 +57,14 @@ pub fn commit_of(world: &ProjectUrl, is_any: bool) -> Option<Revision> {
     let is_hash = [40, 64].contains(&reference.len()) && reference.bytes().all(|byte| byte.is_ascii_hexdigit());
     let kind = matches!(world.kind(), RefKind::Any | RefKind::Commit);
     let commit = reference.to_ascii_lowercase();
-    (is_hash && kind).then(|| Revision {
-        remote_name: commit.clone(),
-        name: reference,
-        commit,
-        folder,
-        is_any,
-        is_whole: false,
-    })
+    let voucher = if is_any { Voucher::AnyCommit } else { Voucher::Url };
+    (is_hash && kind).then_some(Revision { commit, name: reference, folder, voucher, is_whole: false })
 }
 
-/// Makes a bare repository whose hashes are of the same kind as a commit's. git before 2.29 knows only the older kind,
-/// and no name for it.
+/// Makes a bare repository. git before 2.29 knows only the older kind of hashes, and no name for it.
 #[must_use]
-pub fn init_arguments(commit: &str) -> Vec<OsString> {
-    let kind = (commit.len() == 64).then_some("--object-format=sha256");
+pub fn init_arguments(is_sha256: bool) -> Vec<OsString> {
+    let kind = is_sha256.then_some("--object-format=sha256");
     ["init", "--quiet", "--bare"].into_iter().chain(kind).map(OsString::from).collect()
 }
 
@@ -73,13 +89,25 @@ pub fn is_of_other_length(answer: &str, commit: &str) -> bool {
     tips.peek().is_some() && tips.all(|(tip, _)| tip.len() != commit.len())
 }
 
-/// Fetches all branches and tags from the remote of this name: only their commits where it can do that, else
-/// everything. git keeps note of that only for remotes that have a name.
+/// Fetches all branches and tags: only their commits where the remote can do that, else everything. git keeps note of
+/// that only for remotes that have a name.
 #[must_use]
-pub fn history_arguments(remote: &str) -> Vec<OsString> {
+pub fn history(location: &str, commit: &str) -> Wish {
+    let settings = vec![format!("remote.origin.url={location}")];
     let options = ["fetch", "--filter=tree:0", "--prune", "--no-tags", "--no-write-fetch-head", "--progress", "--"];
-    let all = ["+refs/heads/*:refs/heads/*", "+refs/tags/*:refs/tags/*"];
-    options.into_iter().chain([remote]).chain(all).map(OsString::from).collect()
+    let all = ["origin", "+refs/heads/*:refs/heads/*", "+refs/tags/*:refs/tags/*"];
+    let arguments = options.into_iter().chain(all).map(OsString::from).collect();
+    Wish { name: "history".to_owned(), settings, arguments, is_sha256: is_sha256(commit) }
+}
+
+fn is_sha256(hash: &str) -> bool {
+    hash.len() == 64
+}
+
+/// Asks whether a commit is in a repository.
+#[must_use]
+pub fn known_arguments(commit: &str) -> Vec<OsString> {
+    ["cat-file", "-e", commit].map(OsString::from).to_vec()
 }
 
 /// Names a branch or tag of a fetched history in which a commit is.
@@ -121,9 +149,8 @@ pub fn found(world: &ProjectUrl, answer: &str) -> Vec<Revision> {
             is_hash.then(|| Revision {
                 commit: (*commit).to_owned(),
                 name: reading.reference,
-                remote_name: name,
                 folder: reading.folder,
-                is_any: false,
+                voucher: Voucher::Tip,
                 is_whole: false,
             })
         })
@@ -131,37 +158,20 @@ pub fn found(world: &ProjectUrl, answer: &str) -> Vec<Revision> {
 }
 
 impl Revision {
-    /// Whether the URL names a commit, not a branch or tag.
-    #[must_use]
-    pub fn is_commit(&self) -> bool {
-        self.remote_name == self.commit
-    }
-
     /// Its name in the cached repository. What was accepted because any commit is may not be taken for more later.
     #[must_use]
     pub fn reference(&self) -> String {
-        format!("refs/{}/{}", if self.is_any { "any" } else { "fleet" }, self.commit)
-    }
-
-    /// Where a fetch puts it until it is known what came: a branch may have moved since the remote was asked.
-    #[must_use]
-    pub fn incoming(&self) -> String {
-        format!("refs/incoming/{}", self.commit)
-    }
-
-    /// The same name with the object that came.
-    #[must_use]
-    pub fn with_commit(&self, commit: String) -> Self {
-        let remote_name = if self.is_commit() { commit.clone() } else { self.remote_name.clone() };
-        Self { commit, remote_name, ..self.clone() }
+        let kind = if self.voucher == Voucher::AnyCommit { "any" } else { "fleet" };
+        format!("refs/{kind}/{}", self.commit)
     }
 
     /// Fetches this commit alone.
     #[must_use]
-    pub fn fetch_arguments(&self, location: &str) -> Vec<OsString> {
-        let refspec = format!("+{}:{}", self.remote_name, self.incoming());
+    pub fn wish(&self, location: &str) -> Wish {
+        let refspec = format!("+{}:{}", self.commit, self.reference());
         let options = ["fetch", "--depth=1", "--no-tags", "--no-write-fetch-head", "--progress", "--"];
-        options.into_iter().map(OsString::from).chain([location.into(), refspec.into()]).collect()
+        let arguments = options.into_iter().chain([location, &refspec]).map(OsString::from).collect();
+        Wish { name: self.reference(), settings: Vec::new(), arguments, is_sha256: is_sha256(&self.commit) }
     }
 
     /// The same with all of the repository.
@@ -176,12 +186,24 @@ impl Revision {
         if self.is_whole || self.folder.is_empty() { ALL } else { &self.folder }
     }
 
+    /// Says what the entry at a path of the repository is.
+    #[must_use]
+    pub fn entry_arguments(&self, path: &str) -> Vec<OsString> {
+        ["ls-tree", "-z", "--full-tree", &self.reference(), "--", path].map(OsString::from).to_vec()
+    }
+
     /// Lists the files of the project, or of the repository.
     #[must_use]
     pub fn list_arguments(&self) -> Vec<OsString> {
         let fixed = ["ls-tree", "-r", "-l", "-z", "--full-tree", &self.reference(), "--"].map(OsString::from);
         let folder = (self.needed() != ALL).then(|| OsString::from(format!("{}/", self.folder)));
         fixed.into_iter().chain(folder).collect()
+    }
+
+    /// Asks whether the name is there.
+    #[must_use]
+    pub fn exists_arguments(&self) -> Vec<OsString> {
+        ["rev-parse", "--quiet", "--verify", &self.reference()].map(OsString::from).to_vec()
     }
 
     /// Asks what kind of object stands behind the name.
@@ -196,50 +218,6 @@ impl Revision {
         let slash = if self.folder.is_empty() { "" } else { "/" };
         format!("{}{slash}worlds/{}", self.folder, world.world())
     }
-}
-
-/// The files of a project as the commit has them.
-#[derive(Debug, Default, PartialEq, Eq)]
-pub struct Listing {
-    /// Of all files, in bytes.
-    pub size: u64,
-    /// How many files there are, and folders.
-    pub entries: u64,
-    /// Whether the world is among them.
-    pub has_world: bool,
-    /// Whether a folder on the way to the world is a link.
-    pub has_link: bool,
-}
-
-impl Listing {
-    /// Reads the answer of `git ls-tree -r -l -z`.
-    #[must_use]
-    pub fn parse(answer: &[u8], world_path: &str) -> Self {
-        let mut listing = Self::default();
-        let mut last_path: &[u8] = b"";
-        for entry in answer.split(|byte| *byte == 0) {
-            let Some(tab) = entry.iter().position(|byte| *byte == b'\t') else {
-                continue;
-            };
-            let (about, path) = entry.split_at(tab);
-            let path = path.get(1..).unwrap_or_default();
-            let size = about.rsplit(|byte| *byte == b' ').next().and_then(|size| str::from_utf8(size).ok());
-            listing.size = listing.size.saturating_add(size.and_then(|size| size.parse().ok()).unwrap_or(0));
-            listing.entries += 1 + new_folders(last_path, path);
-            listing.has_world |= path == world_path.as_bytes();
-            let rest = world_path.as_bytes().strip_prefix(path);
-            listing.has_link |= about.starts_with(b"120000 ") && rest.is_some_and(|rest| rest.starts_with(b"/"));
-            last_path = path;
-        }
-        listing
-    }
-}
-
-/// How many folders of a path are not in the one before it; git lists what is in a folder together.
-fn new_folders(before: &[u8], path: &[u8]) -> u64 {
-    let common = before.iter().zip(path).take_while(|(one, other)| one == other).count();
-    let rest = path.get(common..).unwrap_or_default();
-    rest.iter().fold(0, |count, byte| count + u64::from(*byte == b'/'))
 }
 
 #[cfg(test)]
@@ -269,7 +247,7 @@ mod tests {
     #[test]
     fn a_full_hash_is_a_commit() {
         let commit = commit_of(&world(&format!("tree/{A}/p/worlds/a.wbt")), false).unwrap();
-        assert!(commit.is_commit());
+        assert_eq!((commit.commit.as_str(), commit.voucher), (A, Voucher::Url));
         assert_eq!(commit.world_path(&world("blob/x/worlds/a.wbt")), "p/worlds/a.wbt");
         assert_eq!(commit_of(&world("blob/aaaaaaa/worlds/a.wbt"), false), None, "short hashes are not unique");
         assert_eq!(
@@ -297,17 +275,5 @@ mod tests {
         let url = world("blob/main/worlds/a.wbt");
         assert_eq!(found(&url, "--upload-pack=evil\trefs/heads/main\n"), []);
         assert_eq!(found(&url, "nonsense"), []);
-    }
-
-    #[test]
-    fn a_listing_knows_sizes_and_paths() {
-        let answer = b"100644 blob aaa      12\tp/worlds/a b.wbt\x00120000 blob bbb       3\tp/link\x00160000 commit ccc -\tp/module\x00";
-        let listing = Listing::parse(answer, "p/worlds/a b.wbt");
-        assert_eq!(listing, Listing { size: 15, entries: 5, has_world: true, has_link: false });
-        assert!(!Listing::parse(answer, "worlds/a b.wbt").has_world);
-        assert!(Listing::parse(answer, "p/link/worlds/a.wbt").has_link);
-        for other in ["p/link", "p/linked/a.wbt", "p/module/a.wbt"] {
-            assert!(!Listing::parse(answer, other).has_link, "{other}");
-        }
     }
 }

@@ -15,17 +15,17 @@ use futures_util::future::{BoxFuture, Shared, WeakShared};
 use tokio::sync::watch;
 
 /// The jobs of one kind that are under way, by what is wanted.
-pub struct Joint<K, T: Clone>(Mutex<HashMap<K, Job<T>>>);
+pub struct SingleFlight<K, T: Clone>(Mutex<HashMap<K, Job<T>>>);
 
 struct Job<T: Clone> {
     progress: watch::Receiver<String>,
     result: WeakShared<BoxFuture<'static, T>>,
 }
 
-/// Progress is told so often at most: nobody reads faster.
-const BETWEEN_NEWS: Duration = Duration::from_millis(100);
+/// The shortest time between two steps that are told: nobody reads faster.
+const BETWEEN_STEPS: Duration = Duration::from_millis(100);
 
-impl<K: Eq + Hash, T: Clone + Send + Sync + 'static> Joint<K, T> {
+impl<K: Eq + Hash, T: Clone + Send + Sync + 'static> SingleFlight<K, T> {
     /// Waits for a job, together with everybody who waits for the same. `progress` hears each step in words, also those
     /// of a job that others have started.
     pub async fn join<F>(
@@ -38,11 +38,11 @@ impl<K: Eq + Hash, T: Clone + Send + Sync + 'static> Joint<K, T> {
         F: Future<Output = T> + Send + 'static,
     {
         let (mut result, mut news) = self.join_or_start(key, start);
-        let mut told = Instant::now().checked_sub(BETWEEN_NEWS).unwrap_or_else(Instant::now);
+        let mut told = Instant::now().checked_sub(BETWEEN_STEPS).unwrap_or_else(Instant::now);
         loop {
             let step = async {
                 // What comes too soon waits, and only the newest of it is told.
-                actix_rt::time::sleep_until((told + BETWEEN_NEWS).into()).await;
+                actix_rt::time::sleep_until((told + BETWEEN_STEPS).into()).await;
                 news.changed().await.map(|()| news.borrow_and_update().clone())
             };
             tokio::select! {
@@ -80,14 +80,14 @@ impl<K: Eq + Hash, T: Clone + Send + Sync + 'static> Joint<K, T> {
     }
 }
 
-impl<K, T: Clone> Default for Joint<K, T> {
+impl<K, T: Clone> Default for SingleFlight<K, T> {
     fn default() -> Self {
         Self(Mutex::default())
     }
 }
 
-impl<K, T: Clone> fmt::Debug for Joint<K, T> {
+impl<K, T: Clone> fmt::Debug for SingleFlight<K, T> {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
-        out.write_str("Joint")
+        out.write_str("SingleFlight")
     }
 }

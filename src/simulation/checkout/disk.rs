@@ -1,0 +1,82 @@
+//! File work on cached repositories, all of which blocks.
+
+use std::fs;
+use std::io;
+use std::path::{Path, PathBuf};
+
+/// Does file work on a thread that serves nobody.
+///
+/// # Errors
+/// Those of the work.
+pub async fn blocking<T: Send + 'static>(work: impl FnOnce() -> io::Result<T> + Send + 'static) -> io::Result<T> {
+    actix_rt::task::spawn_blocking(work).await?
+}
+
+/// Removes what a git that was killed has left: a lock that would make every later fetch fail, and half a pack.
+///
+/// # Errors
+/// When that can't be done.
+pub fn remove_leftovers(repository: &Path) -> io::Result<()> {
+    let lock = repository.join("shallow.lock");
+    for path in unfinished(repository).chain(std::iter::once(lock)) {
+        absent(fs::remove_file(path))?;
+    }
+    Ok(())
+}
+
+/// Removes folders, with all that is inside, as far as they are there.
+///
+/// # Errors
+/// When that can't be done.
+pub fn remove_all(folders: &[&Path]) -> io::Result<()> {
+    folders.iter().try_for_each(|folder| absent(fs::remove_dir_all(folder)))
+}
+
+/// What is not there need not be removed.
+fn absent(result: io::Result<()>) -> io::Result<()> {
+    result.or_else(|error| if error.kind() == io::ErrorKind::NotFound { Ok(()) } else { Err(error) })
+}
+
+/// How many bytes the packs of a repository have.
+#[must_use]
+pub fn packed(repository: &Path) -> u64 {
+    files(&repository.join("objects/pack")).map(|path| length(&path)).sum()
+}
+
+/// How many bytes a running fetch has received.
+#[must_use]
+pub fn received(repository: &Path) -> u64 {
+    unfinished(repository).map(|path| length(&path)).sum()
+}
+
+/// The packs that are being received or made.
+fn unfinished(repository: &Path) -> impl Iterator<Item = PathBuf> {
+    let is_new = |name: &[u8]| name.starts_with(b"tmp_") || name.starts_with(b".tmp-");
+    files(&repository.join("objects/pack"))
+        .filter(move |path| path.file_name().is_some_and(|name| is_new(name.as_encoded_bytes())))
+}
+
+fn files(folder: &Path) -> impl Iterator<Item = PathBuf> + use<> {
+    fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.path())
+}
+
+fn length(file: &Path) -> u64 {
+    file.metadata().map_or(0, |about| about.len())
+}
+
+/// The bytes of all files below a folder.
+#[must_use]
+pub fn size_of(folder: &Path) -> u64 {
+    let mut total = 0;
+    let mut open = vec![folder.to_owned()];
+    while let Some(folder) = open.pop() {
+        for entry in fs::read_dir(folder).into_iter().flatten().flatten() {
+            match entry.metadata() {
+                Ok(about) if about.is_dir() => open.push(entry.path()),
+                Ok(about) => total += about.len(),
+                Err(_) => {}
+            }
+        }
+    }
+    total
+}

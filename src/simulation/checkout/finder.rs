@@ -1,0 +1,290 @@
+//! Finds the commit that a world's URL names, and brings it into the cache: once for all who want it at the same time.
+
+use std::ffi::OsString;
+use std::sync::Arc;
+use std::time::Instant;
+
+use tokio::sync::watch;
+
+use super::cache::Cache;
+use super::error::{CheckoutError, fetch_failed, git_failed, machine, no_reference, too_large};
+use super::git::Git;
+use super::git_error::GitError;
+use super::limits::Limits;
+use super::listing::Listing;
+use super::mirrors::{Mirrors, Remote};
+use super::repository::Repository;
+use super::revision::{self, Revision, Voucher};
+use super::single_flight::SingleFlight;
+use super::world_file::NoWorld;
+use crate::shared::domain::ProjectUrl;
+
+/// Finds commits; one for the whole server.
+#[derive(Debug)]
+pub struct Finder {
+    git: Arc<Git>,
+    cache: Arc<Cache>,
+    mirrors: Mirrors,
+    limits: Limits,
+    searches: SingleFlight<ProjectUrl, Result<Arc<Found>, CheckoutError>>,
+}
+
+/// A world's commit in the cache.
+#[derive(Debug)]
+pub struct Found {
+    /// Where it is.
+    pub repository: Arc<Repository>,
+    /// What it is.
+    pub revision: Revision,
+}
+
+/// What a world is looked for with.
+#[derive(Clone, Copy)]
+struct Search<'job> {
+    world: &'job ProjectUrl,
+    repository: &'job Arc<Repository>,
+    progress: &'job (dyn Fn(String) + Send + Sync),
+}
+
+/// What git says of a commit in the cache.
+enum Answer {
+    /// What it was asked for.
+    Text(Vec<u8>),
+    /// The reference names a file alone.
+    File,
+    /// The commit is not there.
+    Absent,
+}
+
+impl Finder {
+    /// Finds commits by `git`, and keeps them in `cache`.
+    #[must_use]
+    pub fn new(git: Arc<Git>, cache: Arc<Cache>, mirrors: Mirrors, limits: Limits) -> Self {
+        Self { git, cache, mirrors, limits, searches: SingleFlight::default() }
+    }
+
+    /// Waits for a world's commit to be in the cache, together with everybody who waits for the same.
+    ///
+    /// # Errors
+    /// Why it can't be there.
+    pub async fn find(
+        self: &Arc<Self>,
+        world: &ProjectUrl,
+        progress: &(impl Fn(String) + Send + Sync),
+    ) -> Result<Arc<Found>, CheckoutError> {
+        let (this, wanted) = (Arc::clone(self), world.clone());
+        let search = |told| async move { this.search(&wanted, &told).await.map(Arc::new) };
+        self.searches.join(world.clone(), progress, search).await
+    }
+
+    /// The first of the commits that a URL may mean in which its world is.
+    async fn search(&self, world: &ProjectUrl, told: &watch::Sender<String>) -> Result<Found, CheckoutError> {
+        let progress = |step| drop(told.send_replace(step));
+        progress(format!("looking for {}", world.repository()));
+        let repository = self.repository(world).await?;
+        let search = Search { world, repository: &repository, progress: &progress };
+        let mut missing = None;
+        for mut revision in self.revisions(search).await? {
+            let Some(mut listing) = self.list(search, &revision).await? else {
+                continue;
+            };
+            let path = revision.world_path(world);
+            if !listing.has_world && (listing.has_link || listing.entries == 0) {
+                match self.list(search, &revision.whole()).await {
+                    Ok(Some(all)) if all.has_link => (revision, listing) = (revision.whole(), all),
+                    Err(error) if listing.has_link => return Err(error),
+                    _ => {}
+                }
+            }
+            self.check(&listing)?;
+            // Where a link leads is seen in the checkout.
+            if listing.has_world || listing.has_link {
+                return Ok(Found { repository, revision });
+            }
+            missing = Some(NoWorld::Missing(format!("{path} in {}", revision.name)));
+        }
+        Err(missing.map_or_else(|| no_reference(world), CheckoutError::World))
+    }
+
+    async fn repository(&self, world: &ProjectUrl) -> Result<Arc<Repository>, CheckoutError> {
+        let remote = self.remote(world)?;
+        self.cache.commits(&remote).await.map_err(|error| machine(world, &error))
+    }
+
+    fn remote(&self, world: &ProjectUrl) -> Result<Remote, CheckoutError> {
+        self.mirrors.remote(world).ok_or_else(|| CheckoutError::Forge(world.host().to_owned()))
+    }
+
+    /// The commits that a URL may mean, the likeliest first.
+    async fn revisions(&self, search: Search<'_>) -> Result<Vec<Revision>, CheckoutError> {
+        if let Some(commit) = revision::commit_of(search.world, self.limits.any_commit) {
+            return Ok(vec![commit]);
+        }
+        let location = &search.repository.remote().location;
+        let answer = self.ask(search, revision::search_arguments(search.world, location)).await?;
+        Ok(revision::found(search.world, &answer))
+    }
+
+    /// The files of the project, or of the repository if that is needed; nothing where the revision is no folder.
+    async fn list(&self, search: Search<'_>, revision: &Revision) -> Result<Option<Listing>, CheckoutError> {
+        let answer = self.read(search, revision, revision.list_arguments()).await?;
+        Ok(answer.map(|answer| Listing::parse(&answer, &revision.world_path(search.world))))
+    }
+
+    /// Whether all of a commit may be checked out, not its project's folder alone.
+    ///
+    /// # Errors
+    /// When it is too large for that.
+    pub async fn check_whole(&self, world: &ProjectUrl, found: &Found) -> Result<(), CheckoutError> {
+        let search = Search { world, repository: &found.repository, progress: &drop };
+        let listing = self.list(search, &found.revision.whole()).await?;
+        self.check(&listing.unwrap_or_default())
+    }
+
+    fn check(&self, listing: &Listing) -> Result<(), CheckoutError> {
+        if listing.entries > self.limits.entries() {
+            return Err(CheckoutError::TooMany(self.limits.entries()));
+        }
+        if listing.size > self.limits.size {
+            return Err(too_large("The project".to_owned(), self.limits.size));
+        }
+        Ok(())
+    }
+
+    /// Whether there is a file at a path of a commit that was found before. It is fetched again if it has left the cache
+    /// meanwhile. Returns the repository if so.
+    ///
+    /// # Errors
+    /// When the commit can't be read.
+    pub async fn file(
+        &self,
+        world: &ProjectUrl,
+        revision: &Revision,
+        path: &str,
+    ) -> Result<Option<Arc<Repository>>, CheckoutError> {
+        let repository = self.repository(world).await?;
+        let search = Search { world, repository: &repository, progress: &drop };
+        let answer = self.read(search, revision, revision.entry_arguments(path)).await?;
+        let is_file = answer.is_some_and(|entry| entry.starts_with(b"100") || entry.starts_with(b"120"));
+        Ok(is_file.then_some(repository))
+    }
+
+    /// Has git read a commit, which is fetched before if it is not in the cache. Nothing where the revision is no folder.
+    async fn read(
+        &self,
+        search: Search<'_>,
+        revision: &Revision,
+        arguments: Vec<OsString>,
+    ) -> Result<Option<Vec<u8>>, CheckoutError> {
+        let mut answer = self.answer(search, revision, arguments.clone()).await?;
+        if matches!(answer, Answer::Absent) {
+            if revision.voucher == Voucher::Url && !self.is_accepted(search, revision).await? {
+                let (repository, commit) = (search.world.repository(), revision.name.clone());
+                return Err(CheckoutError::NotReachable { repository, commit });
+            }
+            self.fetch(search, revision).await?;
+            answer = self.answer(search, revision, arguments).await?;
+        }
+        match answer {
+            Answer::Text(text) => Ok(Some(text)),
+            Answer::File => Ok(None),
+            Answer::Absent => {
+                Err(machine(search.world, &std::io::Error::other("the commit that was fetched is not there")))
+            }
+        }
+    }
+
+    async fn answer(
+        &self,
+        Search { world, repository, .. }: Search<'_>,
+        revision: &Revision,
+        arguments: Vec<OsString>,
+    ) -> Result<Answer, CheckoutError> {
+        match repository.read(arguments).await {
+            Ok(text) => Ok(Answer::Text(text)),
+            Err(GitError::TooLong(_)) => Err(CheckoutError::TooMany(self.limits.entries())),
+            Err(error @ GitError::NotStarted(_)) => Err(git_failed(world, error)),
+            Err(error) if repository.read(revision.exists_arguments()).await.is_err() => {
+                log::debug!("{} is not in the cache: {error}", revision.commit);
+                Ok(Answer::Absent)
+            }
+            Err(source) => match repository.read(revision.kind_arguments()).await {
+                Ok(kind) if kind.starts_with(b"blob") => Ok(Answer::File),
+                _ => Err(CheckoutError::Damaged { repository: world.repository(), source }),
+            },
+        }
+    }
+
+    async fn fetch(&self, search: Search<'_>, revision: &Revision) -> Result<(), CheckoutError> {
+        let Search { world, repository, progress } = search;
+        let tell = |step: String| progress(format!("fetching {}: {step}", world.repository()));
+        let fetched = repository.fetch(&revision.wish(&repository.remote().location), &tell).await;
+        let what = || format!("{} (at depth 1)", world.repository());
+        fetched.map_err(|error| fetch_failed(world, what, self.limits.size, error))
+    }
+
+    /// Whether a commit that is named by its hash is in a branch or tag.
+    async fn is_accepted(&self, search: Search<'_>, revision: &Revision) -> Result<bool, CheckoutError> {
+        let answer = self.ask(search, revision::tips_arguments(&search.repository.remote().location)).await?;
+        if revision::is_of_other_length(&answer, &revision.commit) {
+            return Err(no_reference(search.world));
+        }
+        Ok(revision::is_tip(&answer, &revision.commit) || self.is_in_history(search, &revision.commit).await?)
+    }
+
+    /// Whether a commit was ever part of a branch or tag. For that the history is fetched.
+    async fn is_in_history(&self, search: Search<'_>, commit: &str) -> Result<bool, CheckoutError> {
+        let Search { world, repository, progress } = search;
+        let remote = repository.remote();
+        let history = self.cache.history(remote).await.map_err(|error| machine(world, &error))?;
+        let what = || format!("The history of {}", world.repository());
+        if history.packed().await <= self.limits.size && self.is_reachable(world, &history, commit).await? {
+            return Ok(true);
+        }
+        let tell = |step: String| progress(format!("fetching the history of {}: {step}", world.repository()));
+        let fetched = history.fetch(&revision::history(&remote.location, commit), &tell).await;
+        fetched.map_err(|error| fetch_failed(world, what, self.limits.size, error))?;
+        if history.packed().await > self.limits.size {
+            return Err(too_large(what(), self.limits.size));
+        }
+        self.is_reachable(world, &history, commit).await
+    }
+
+    async fn is_reachable(
+        &self,
+        world: &ProjectUrl,
+        history: &Repository,
+        commit: &str,
+    ) -> Result<bool, CheckoutError> {
+        if history.read(revision::known_arguments(commit)).await.is_err() {
+            return Ok(false);
+        }
+        let branches = history.read(revision::reachable_arguments(commit)).await;
+        branches.map(|answer| !answer.is_empty()).map_err(|error| git_failed(world, error))
+    }
+
+    /// Asks the remote what it has.
+    async fn ask(&self, search: Search<'_>, arguments: Vec<OsString>) -> Result<String, CheckoutError> {
+        loop {
+            let answer = self.git.run(search.repository.call(arguments.clone()), |_| ());
+            match actix_rt::time::timeout(self.limits.patience(), answer).await {
+                Ok(Ok(answer)) => return Ok(String::from_utf8_lossy(&answer).into_owned()),
+                Ok(Err(source)) => return Err(git_failed(search.world, source)),
+                Err(_) => search.repository.tell_silence(),
+            }
+        }
+    }
+
+    /// Throws away what is cached of a world's repository, unless it was made after `since`.
+    ///
+    /// # Errors
+    /// When it can't be removed.
+    pub async fn discard(&self, world: &ProjectUrl, since: Instant) -> Result<(), CheckoutError> {
+        let remote = self.remote(world)?;
+        let discarded = async {
+            self.cache.commits(&remote).await?.discard(since).await?;
+            self.cache.history(&remote).await?.discard(since).await
+        };
+        discarded.await.map_err(|error| machine(world, &error))
+    }
+}

@@ -1,0 +1,101 @@
+//! Why a git command failed. Pure.
+
+use crate::simulation::process::ExitReason;
+
+/// A git command that failed.
+#[derive(Debug, Clone, thiserror::Error)]
+pub enum GitError {
+    /// The machine can't run git.
+    #[error("git can't be started: {0}")]
+    NotStarted(String),
+    /// It ended with another exit code than 0, or by a signal.
+    #[error("git {command} {ending}: {message}")]
+    Failed {
+        /// Which command.
+        command: String,
+        /// How it ended.
+        ending: ExitReason,
+        /// What it said of the cause.
+        message: String,
+    },
+    /// It answered more than is read.
+    #[error("the answer of git {0} is too long")]
+    TooLong(String),
+}
+
+/// What a failure means for whoever wanted the command.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Cause {
+    /// The remote has no such repository, or shows it to nobody.
+    NoRepository,
+    /// The remote does not hand out the commit.
+    NoCommit,
+    /// The cached repository is broken.
+    Damaged,
+    /// Something else: the network, the remote, the machine.
+    Other,
+}
+
+/// git ends with the same exit codes whatever the cause is, so its words must tell (`LC_ALL=C`). This is the only place
+/// that reads them. The first that is found counts. git asks for a user's name where a forge says 'not found': forges
+/// don't tell private from missing.
+const WORDS: &[(&str, Cause)] = &[
+    ("could not read Username", Cause::NoRepository),
+    ("not found", Cause::NoRepository),
+    ("does not appear to be a git repository", Cause::NoRepository),
+    ("does not exist", Cause::NoRepository),
+    ("couldn't find remote ref", Cause::NoCommit),
+    ("not our ref", Cause::NoCommit),
+    ("unadvertised object", Cause::NoCommit),
+    ("remote did not send", Cause::NoCommit),
+    ("mismatched algorithms", Cause::Damaged),
+    ("not a git repository", Cause::Damaged),
+    ("bad config", Cause::Damaged),
+    ("bad shallow", Cause::Damaged),
+    ("bad object", Cause::Damaged),
+    ("bad tree", Cause::Damaged),
+    ("corrupt", Cause::Damaged),
+    ("too short to be a packfile", Cause::Damaged),
+    ("unresolved delta", Cause::Damaged),
+    ("unable to read", Cause::Damaged),
+    ("reference broken", Cause::Damaged),
+    ("invalid reference", Cause::Damaged),
+    ("did not send all necessary objects", Cause::Damaged),
+    // A lock that a killed git has left.
+    ("File exists", Cause::Damaged),
+];
+
+impl GitError {
+    /// What the failure means.
+    #[must_use]
+    pub fn cause(&self) -> Cause {
+        let Self::Failed { ending: ExitReason::Code(_), message, .. } = self else {
+            return Cause::Other;
+        };
+        WORDS.iter().find(|(words, _)| message.contains(words)).map_or(Cause::Other, |(_, cause)| *cause)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn causes_are_told_apart() {
+        let cause = |message: &str, ending| {
+            GitError::Failed { command: "fetch".to_owned(), ending, message: message.to_owned() }.cause()
+        };
+        for (message, expected) in [
+            ("fatal: repository 'https://github.com/lab/none.git/' not found", Cause::NoRepository),
+            ("fatal: could not read Username for 'https://github.com': terminal prompts disabled", Cause::NoRepository),
+            ("fatal: remote error: upload-pack: not our ref 0123", Cause::NoCommit),
+            ("fatal: packed object 9ed5 (stored in pack-1115.pack) is corrupt", Cause::Damaged),
+            ("error: cannot lock ref 'refs/fleet/01': Unable to create '01.lock': File exists.", Cause::Damaged),
+            ("error: unable to create file a: No space left on device", Cause::Other),
+            ("fatal: early EOF", Cause::Other),
+        ] {
+            assert_eq!(cause(message, ExitReason::Code(128)), expected, "{message}");
+        }
+        assert_eq!(cause("fatal: bad object", ExitReason::Signal(9)), Cause::Other, "somebody has killed it");
+    }
+}

@@ -1,0 +1,270 @@
+//! One cached repository: an ordinary bare one, into which git fetches commits of one remote, one fetch at a time.
+
+use std::ffi::OsString;
+use std::io;
+use std::path::PathBuf;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::{Duration, Instant};
+
+use tokio::sync::{OwnedMutexGuard, watch};
+use tokio_util::sync::CancellationToken;
+
+use super::disk::{blocking, packed, received, remove_all, remove_leftovers};
+use super::git::{Call, Git};
+use super::git_error::GitError;
+use super::growth::Growth;
+use super::limits::Limits;
+use super::mirrors::Remote;
+use super::revision::{self, Wish};
+use super::single_flight::SingleFlight;
+
+/// A cached repository. It is not removed from the cache as long as this lives.
+#[derive(Debug)]
+pub struct Repository {
+    path: PathBuf,
+    remote: Remote,
+    git: Arc<Git>,
+    limits: Limits,
+    growth: Arc<Growth>,
+    /// Held by whoever changes the repository.
+    turn: Arc<tokio::sync::Mutex<()>>,
+    /// The fetches that are wanted, by the name of the wish.
+    fetches: SingleFlight<String, Result<(), FetchError>>,
+    /// When it was made, if this server has made it since it came into use.
+    made: Mutex<Option<Instant>>,
+}
+
+/// Why a fetch failed.
+#[derive(Debug, Clone, thiserror::Error)]
+pub enum FetchError {
+    /// git failed.
+    #[error(transparent)]
+    Git(#[from] GitError),
+    /// It has brought more than may come.
+    #[error("it is too large")]
+    TooLarge,
+    /// The machine failed.
+    #[error("{0}")]
+    Machine(String),
+}
+
+impl From<io::Error> for FetchError {
+    fn from(error: io::Error) -> Self {
+        Self::Machine(error.to_string())
+    }
+}
+
+/// Why a running fetch is ended.
+enum Cut {
+    /// Nobody waits for it any more.
+    Unwanted,
+    /// It has brought more than may come.
+    TooLarge,
+    /// Nothing has come for too long.
+    Silent,
+}
+
+/// Time between two looks at how much a fetch has brought.
+const BETWEEN_LOOKS: Duration = Duration::from_millis(200);
+
+impl Repository {
+    /// The repository at `path`, which need not exist yet, for commits of `remote`.
+    #[must_use]
+    pub fn new(path: PathBuf, remote: Remote, git: Arc<Git>, limits: Limits, growth: Arc<Growth>) -> Self {
+        let (turn, fetches, made) = (Arc::default(), SingleFlight::default(), Mutex::default());
+        Self { path, remote, git, limits, growth, turn, fetches, made }
+    }
+
+    /// Where it is fetched from.
+    #[must_use]
+    pub fn remote(&self) -> &Remote {
+        &self.remote
+    }
+
+    /// A git command on this repository.
+    #[must_use]
+    pub fn call(&self, arguments: Vec<OsString>) -> Call<'_> {
+        Call {
+            repository: &self.path,
+            settings: Vec::new(),
+            arguments,
+            protocol: self.remote.protocol,
+            environment: Vec::new(),
+        }
+    }
+
+    /// Runs a command that only reads the repository. Returns its answer.
+    ///
+    /// # Errors
+    /// When git fails.
+    pub async fn read(&self, arguments: Vec<OsString>) -> Result<Vec<u8>, GitError> {
+        let mut call = self.call(arguments);
+        // What is missing must not be asked for: the remote of a history would be.
+        call.protocol = "none";
+        call.environment.push(("GIT_NO_LAZY_FETCH".into(), "1".into()));
+        self.git.run(call, |_| ()).await
+    }
+
+    /// Fetches what is wished for, together with everybody who wishes for the same. It ends with the last of them.
+    /// `progress` is told git's progress.
+    ///
+    /// # Errors
+    /// Why it can't be fetched.
+    pub async fn fetch(
+        self: &Arc<Self>,
+        wish: &Wish,
+        progress: &(impl Fn(String) + Send + Sync),
+    ) -> Result<(), FetchError> {
+        let (this, wanted) = (Arc::clone(self), wish.clone());
+        let fetch = |told| async move {
+            // It is a task of its own: git must have ended, however it ends, before the next one may begin.
+            let cancelled = CancellationToken::new();
+            let _cancels = cancelled.clone().drop_guard();
+            let task = tokio::spawn(async move { this.fetch_in_turn(&wanted, &told, &cancelled).await });
+            task.await.unwrap_or_else(|error| Err(FetchError::Machine(error.to_string())))
+        };
+        self.fetches.join(wish.name.clone(), progress, fetch).await
+    }
+
+    async fn fetch_in_turn(
+        self: &Arc<Self>,
+        wish: &Wish,
+        told: &watch::Sender<String>,
+        cancelled: &CancellationToken,
+    ) -> Result<(), FetchError> {
+        let _grown = Grown(&self.growth);
+        loop {
+            let Some(turn) = cancelled.run_until_cancelled(self.turn(told)).await else {
+                return Err(FetchError::Machine("nobody waits for it".to_owned()));
+            };
+            self.make(wish).await?;
+            let mut cut = None;
+            let lines = AtomicUsize::new(0);
+            let tell = |line: &str| {
+                lines.fetch_add(1, Ordering::Relaxed);
+                if line.contains('%') {
+                    told.send_replace(line.trim_start_matches("remote: ").to_owned());
+                }
+            };
+            let end = async {
+                cut = Some(tokio::select! {
+                    () = cancelled.cancelled() => Cut::Unwanted,
+                    cut = self.watch(&lines) => cut,
+                });
+            };
+            let call = Call { settings: wish.settings.clone(), ..self.call(wish.arguments.clone()) };
+            let ended = self.git.run_until(end, call, tell).await;
+            match cut {
+                Some(Cut::TooLarge) => return Err(FetchError::TooLarge),
+                Some(Cut::Silent) if ended.is_err() => self.tell_silence(),
+                _ => {
+                    ended?;
+                    self.collect_garbage(turn);
+                    return Ok(());
+                }
+            }
+        }
+    }
+
+    /// Waits until nobody else changes the repository.
+    async fn turn(&self, told: &watch::Sender<String>) -> OwnedMutexGuard<()> {
+        let turn = Arc::clone(&self.turn);
+        if let Ok(turn) = Arc::clone(&turn).try_lock_owned() {
+            return turn;
+        }
+        told.send_replace("waiting for another fetch".to_owned());
+        turn.lock_owned().await
+    }
+
+    /// Makes the bare repository unless it is there. Else removes what a git that was killed has left.
+    async fn make(&self, wish: &Wish) -> Result<(), FetchError> {
+        let (path, new) = (self.path.clone(), self.path.with_extension("new"));
+        let is_there = blocking(move || {
+            let is_there = path.join("HEAD").is_file();
+            let done = if is_there { remove_leftovers(&path) } else { remove_all(&[&path, &new]) };
+            done.map(|()| is_there)
+        });
+        if is_there.await? {
+            return Ok(());
+        }
+        // It takes its place when it is whole.
+        let new = self.path.with_extension("new");
+        let call = Call { repository: &new, ..self.call(revision::init_arguments(wish.is_sha256)) };
+        self.git.run(call, |_| ()).await?;
+        tokio::fs::rename(&new, &self.path).await?;
+        *self.made.lock().unwrap_or_else(PoisonError::into_inner) = Some(Instant::now());
+        Ok(())
+    }
+
+    /// Waits until a fetch has brought too much, or nothing any more for too long.
+    async fn watch(&self, lines: &AtomicUsize) -> Cut {
+        let mut last_sign = (Instant::now(), (0, 0));
+        loop {
+            actix_rt::time::sleep(BETWEEN_LOOKS).await;
+            let path = self.path.clone();
+            let received = blocking(move || Ok(received(&path))).await.unwrap_or_default();
+            if received > self.limits.size {
+                return Cut::TooLarge;
+            }
+            let signs = (received, lines.load(Ordering::Relaxed));
+            if signs != last_sign.1 {
+                last_sign = (Instant::now(), signs);
+            } else if last_sign.0.elapsed() > self.limits.patience() {
+                return Cut::Silent;
+            }
+        }
+    }
+
+    /// Says that the remote is asked anew.
+    pub fn tell_silence(&self) {
+        let seconds = self.limits.patience().as_secs_f64();
+        log::warn!("{}: nothing has come for {seconds} s, git starts anew", self.remote.location);
+    }
+
+    /// Has git pack what many fetches have left. Nobody waits for that but the next fetch, and that not for long.
+    fn collect_garbage(self: &Arc<Self>, turn: OwnedMutexGuard<()>) {
+        let this = Arc::clone(self);
+        tokio::spawn(async move {
+            let _turn = turn;
+            let call = this.call(["gc", "--auto", "--quiet"].map(OsString::from).to_vec());
+            if let Err(error) = this.git.run_until(actix_rt::time::sleep(this.limits.patience()), call, |_| ()).await {
+                log::warn!("{} can't be packed: {error}", this.path.display());
+            }
+        });
+    }
+
+    /// Throws the repository away, unless it was made after `since`.
+    ///
+    /// # Errors
+    /// When it can't be removed.
+    pub async fn discard(&self, since: Instant) -> io::Result<()> {
+        let _turn = self.turn.lock().await;
+        if self.made.lock().unwrap_or_else(PoisonError::into_inner).is_some_and(|made| made > since) {
+            return Ok(());
+        }
+        let path = self.path.clone();
+        blocking(move || remove_all(&[&path])).await
+    }
+
+    /// How many bytes its packs have.
+    pub async fn packed(&self) -> u64 {
+        let path = self.path.clone();
+        blocking(move || Ok(packed(&path))).await.unwrap_or_default()
+    }
+}
+
+impl Drop for Repository {
+    fn drop(&mut self) {
+        self.growth.left();
+    }
+}
+
+/// Says in the end, whichever that is, that the cache has grown.
+struct Grown<'cache>(&'cache Growth);
+
+impl Drop for Grown<'_> {
+    fn drop(&mut self) {
+        self.0.grown();
+    }
+}
