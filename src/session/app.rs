@@ -7,7 +7,6 @@ use std::time::{Instant, SystemTime};
 
 use actix::prelude::*;
 use actix_web::{App, HttpServer, web};
-use nix::sys::resource::{Resource, getrlimit, setrlimit};
 use tokio::sync::watch;
 
 use super::config::SessionConfig;
@@ -20,7 +19,7 @@ use crate::shared::http::Connections;
 use crate::shared::http::Live;
 use crate::shared::http::Metrics;
 use crate::shared::http::sockets::{self, Sockets};
-use crate::shared::run::{Phase, Request, Signals, notify, permanent, start};
+use crate::shared::run::{Phase, Request, Signals, notify, permanent, raise_open_files, start};
 
 /// Why the server ends with an error.
 #[derive(Debug, thiserror::Error)]
@@ -52,8 +51,6 @@ pub enum AppError {
     ActorStopped(String),
 }
 
-/// The limit of open files that is assumed where the system does not say.
-const USUAL_FILES: u64 = 1024;
 /// How many open files the server needs for itself: logs, threads, mail.
 const OWN_FILES: usize = 128;
 /// How many connections there are to one simulation server: one in use, one that is being closed.
@@ -68,7 +65,7 @@ const OUTCOMES: [&str; 4] = ["placed", "unavailable", "not_accepted", "wrong_url
 /// When the server can't start, or an actor that must live has stopped.
 pub async fn run(mut config: SessionConfig, file: PathBuf) -> Result<(), AppError> {
     let mut signals = Signals::catch()?;
-    let files = open_files();
+    let files = raise_open_files(u64::MAX);
     let (connections, clients) = bound_clients(files, &config);
     if clients == 0 {
         return Err(AppError::NoClients { files });
@@ -133,20 +130,6 @@ pub async fn run(mut config: SessionConfig, file: PathBuf) -> Result<(), AppErro
     drop(serving);
     log::info!("stopped");
     Ok(())
-}
-
-/// Raises the limit of open files as far as the system allows, and returns it. Each client needs one, and the usual limit
-/// is 1,024.
-fn open_files() -> u64 {
-    let raised = getrlimit(Resource::RLIMIT_NOFILE)
-        .and_then(|(_, most)| setrlimit(Resource::RLIMIT_NOFILE, most, most).map(|()| most));
-    match raised {
-        Ok(most) => most,
-        Err(error) => {
-            log::warn!("the limit of open files can't be raised: {error}");
-            getrlimit(Resource::RLIMIT_NOFILE).map_or(USUAL_FILES, |(now, _)| now)
-        }
-    }
 }
 
 /// Returns how many connections and how many clients there may be, so that `files` open files are enough for them and the

@@ -13,6 +13,7 @@ use tokio::sync::watch;
 use super::announcer::Announcer;
 use super::config::SimulationConfig;
 use super::places::{GetSnapshot, Places};
+use super::readiness;
 use super::state::AppState;
 use crate::shared::domain::Rules;
 use crate::shared::http::BasicAuth;
@@ -20,7 +21,7 @@ use crate::shared::http::Connections;
 use crate::shared::http::Live;
 use crate::shared::http::Metrics;
 use crate::shared::http::sockets::{self, Sockets};
-use crate::shared::run::{Phase, Request, Signals, notify, permanent, start};
+use crate::shared::run::{Phase, Request, Signals, notify, permanent, raise_open_files, start};
 use crate::simulation::checkout::{CacheDir, Checkouts, Limits};
 use crate::simulation::client::outcome;
 use crate::simulation::machine::LoadMonitor;
@@ -47,6 +48,17 @@ pub enum AppError {
         /// What the system says.
         source: std::io::Error,
     },
+    /// The limit of open files is too low.
+    #[error(
+        "{files} files may be open, which is not enough for {places} places and one client; ulimit -Hn, or LimitNOFILE of \
+         systemd, allows more"
+    )]
+    NoClients {
+        /// The limit of open files.
+        files: u64,
+        /// `maxConnections`.
+        places: u16,
+    },
     /// Another error of the system.
     #[error(transparent)]
     System(#[from] std::io::Error),
@@ -60,6 +72,16 @@ pub enum AppError {
 
 /// How often it is checked whether all simulations have ended.
 const POLL_INTERVAL: Duration = Duration::from_millis(50);
+
+/// How many open files the server needs for itself: logs, threads, pages.
+const OWN_FILES: usize = 128;
+
+/// How many connections there may be for each client: browsers load pages beside their WebSocket.
+const CONNECTIONS_PER_CLIENT: usize = 2;
+
+/// How many open files a simulation needs at most, besides its client's connection: pipes and processes of git and Webots,
+/// its log.
+const FILES_PER_SIMULATION: usize = 8;
 
 /// How long it may take to kill what has not ended in time.
 const KILL_TIMEOUT: Duration = Duration::from_millis(500);
@@ -86,8 +108,9 @@ impl Assembly {
     ///
     /// # Errors
     /// When the server can't start.
-    pub fn new(config: SimulationConfig) -> Result<Self, AppError> {
+    pub fn new(mut config: SimulationConfig) -> Result<Self, AppError> {
         let signals = Signals::catch()?;
+        config.max_clients = bound_clients(&config)?;
         let (phase_sender, phase) = watch::channel(Phase::Open);
         let (requests, asked) = tokio::sync::mpsc::channel(4);
         let socket = bind(&config)?;
@@ -102,6 +125,28 @@ impl Assembly {
     }
 }
 
+/// Raises the limit of open files, and returns how many clients it allows. `maxClients` may be lowered: each client has
+/// connections for pages besides its WebSocket.
+fn bound_clients(config: &SimulationConfig) -> Result<usize, AppError> {
+    let places = config.max_connections;
+    let needed = OWN_FILES + FILES_PER_SIMULATION * usize::from(places);
+    let wanted = config.max_clients.saturating_mul(CONNECTIONS_PER_CLIENT).saturating_add(needed);
+    let files = raise_open_files(u64::try_from(wanted).unwrap_or(u64::MAX));
+    let rest = usize::try_from(files).unwrap_or(usize::MAX).saturating_sub(needed);
+    let clients = (rest / CONNECTIONS_PER_CLIENT).min(config.max_clients);
+    if clients == 0 {
+        return Err(AppError::NoClients { files, places });
+    }
+    if clients < config.max_clients {
+        log::warn!(
+            "{files} files may be open, which is enough for {clients} clients, not for maxClients ({}); ulimit -Hn, or \
+             LimitNOFILE of systemd, allows more",
+            config.max_clients
+        );
+    }
+    Ok(clients)
+}
+
 /// Runs a server until it is asked to stop.
 ///
 /// # Errors
@@ -111,7 +156,7 @@ pub async fn serve(assembly: Assembly) -> Result<(), AppError> {
     let _guardian = Guardian::start(server.run.path())?;
     let shared = web::Data::from(Arc::clone(&server));
     let sockets = Arc::new(Sockets::new(
-        server.config.max_clients.saturating_mul(2),
+        server.config.max_clients.saturating_mul(CONNECTIONS_PER_CLIENT),
         server.config.max_clients_per_address,
         server.config.trusted_proxies.clone(),
         server.config.timing.silence,
@@ -204,8 +249,11 @@ fn assemble(
         docker: config.docker,
         share_idle_time: config.share_idle_time,
     };
+    let config = Arc::new(config);
+    let problem = readiness::watch(Arc::clone(&config), run.path().to_owned());
     Ok(AppState {
         rules,
+        problem,
         places,
         load_monitor,
         readings,
@@ -221,7 +269,7 @@ fn assemble(
         live: Live::new(),
         usage: UsageMonitor::default(),
         started: Instant::now(),
-        config: Arc::new(config),
+        config,
     })
 }
 

@@ -10,6 +10,7 @@ pub mod places;
 pub mod preflight;
 pub mod process;
 pub mod protocol;
+pub mod readiness;
 pub mod snapshot;
 pub mod state;
 mod web;

@@ -114,12 +114,12 @@ impl Places {
         {
             match first.client.try_send(PlaceEvent::Granted(port)) {
                 Ok(()) => self.lend(first.id, port),
-                // It is told at the next check, and nobody passes it.
+                // It stays first in the line until the next check.
                 Err(SendError::Full(_)) => {
                     self.line.push_front(first);
                     break;
                 }
-                // It is gone, and drops its ticket too.
+                // Its actor has stopped, which drops its ticket too.
                 Err(SendError::Closed(_)) => {}
             }
         }

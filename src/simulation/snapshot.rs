@@ -31,7 +31,7 @@ pub enum Change {
     Port(u16),
 }
 
-/// The states of a simulation as they are shown.
+/// The states of a simulation, as pages and programs see them.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Stage {
@@ -86,7 +86,7 @@ pub struct Simulation {
 }
 
 impl Simulation {
-    /// Takes over what has changed.
+    /// Applies a change.
     pub fn apply(&mut self, change: Change) {
         match change {
             Change::Stage(stage) => self.stage = stage,

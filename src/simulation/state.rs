@@ -1,15 +1,14 @@
 //! The state that the routes, the pages and the web clients of a simulation server share. `app` makes it.
 
-use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Instant;
 
 use actix::prelude::*;
 use tokio::sync::watch;
-use which::which;
 
 use super::config::SimulationConfig;
 use super::places::Places;
+use super::readiness;
 use crate::shared::domain::Load;
 use crate::shared::domain::ProjectUrl;
 use crate::shared::domain::Rules;
@@ -41,6 +40,8 @@ pub struct AppState {
     pub run: Arc<RunDir>,
     /// Whether clients are taken.
     pub phase: watch::Receiver<Phase>,
+    /// Why the server can start no simulation, if so.
+    pub problem: watch::Receiver<Option<String>>,
     /// Takes requests to drain.
     pub requests: tokio::sync::mpsc::Sender<Request>,
     /// The thread on which the actors of Webots run.
@@ -62,10 +63,11 @@ pub struct AppState {
 }
 
 impl AppState {
-    /// Returns the load to report: 100 % while the server is draining.
+    /// Returns the load to report: 100 % while the server is draining or can start no simulation.
     #[must_use]
     pub fn load(&self) -> Load {
-        if self.is_draining() { Load::FULL } else { self.readings.borrow().load.unwrap_or(Load::ZERO) }
+        let takes_nobody = self.is_draining() || self.problem.borrow().is_some();
+        if takes_nobody { Load::FULL } else { self.readings.borrow().load.unwrap_or(Load::ZERO) }
     }
 
     /// Whether new clients are refused.
@@ -84,31 +86,17 @@ impl AppState {
         if self.is_draining() {
             return Err("This simulation server is about to end, and takes no new clients".to_owned());
         }
+        if let Some(problem) = self.problem() {
+            return Err(problem);
+        }
         self.rules.admit(&world, self.load()).map_err(|refusal| refusal.to_string())?;
-        self.webots_program()?;
+        readiness::webots_program(&self.config)?;
         Ok(world)
     }
 
-    /// Returns the program that is started for each client.
-    ///
-    /// # Errors
-    /// When it is not there, or `xvfb-run` is missing; in words for the client.
-    pub fn webots_program(&self) -> Result<PathBuf, String> {
-        if self.config.xvfb && which("Xvfb").is_err() {
-            return Err("This simulation server gives each Webots a display of its own (xvfb), but has no Xvfb. \
-                        Its administrator can install it, or set xvfb: false and display"
-                .to_owned());
-        }
-        let how = "Its administrator can set webotsHome in the server's configuration, or the environment variable \
-                   WEBOTS_HOME";
-        let Some(program) = self.config.webots_program() else {
-            return Err(format!("This simulation server does not know where Webots is installed. {how}."));
-        };
-        let program = std::path::absolute(&program).unwrap_or(program);
-        if program.is_file() {
-            Ok(program)
-        } else {
-            Err(format!("This simulation server has no Webots at {}. {how}.", program.display()))
-        }
+    /// Returns why this server can start no simulation at all, if so.
+    #[must_use]
+    pub fn problem(&self) -> Option<String> {
+        self.problem.borrow().clone()
     }
 }

@@ -20,7 +20,7 @@ const SESSION: [&str; 8] = [
     "session::web",
     "session::app",
 ];
-const SIMULATION: [&str; 14] = [
+const SIMULATION: [&str; 15] = [
     "simulation::snapshot",
     "simulation::places",
     "simulation::protocol",
@@ -31,6 +31,7 @@ const SIMULATION: [&str; 14] = [
     "simulation::preflight",
     "simulation::announcer",
     "simulation::webots",
+    "simulation::readiness",
     "simulation::state",
     "simulation::client",
     "simulation::web",

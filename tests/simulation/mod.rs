@@ -11,6 +11,7 @@ mod life;
 mod output;
 mod places;
 mod protocol;
+mod readiness;
 mod readings;
 mod ready;
 mod scene;

@@ -1,10 +1,15 @@
 //! What ends with a simulation: its process group, and all that carries its mark.
 
+use std::path::Path;
+use std::time::{Duration, Instant};
+
+use nix::fcntl::OFlag;
 use nix::sys::signal::Signal;
+use nix::sys::stat::Mode;
 
 use super::git_wrapper::GitWrapper;
 use super::life::{children, guardian, is_there, quick};
-use super::scene::{DEMO, arm, instance_folders, nothing_left};
+use super::scene::{DEMO, arm, instance_folders, nothing_left, stages};
 use crate::support::client::Client;
 use crate::support::git::Forge;
 use crate::support::program::simulation_server;
@@ -70,4 +75,35 @@ async fn what_git_has_started_ends_with_its_client() {
     until("what git has started is gone", async || !sleeps()).await;
     until("all is gone", async || children(server.pid()) == [guardian(&server)]).await;
     nothing_left(&server, 1).await;
+}
+
+/// Makes a chain of nested folders.
+fn nest(folder: &Path, levels: usize) {
+    let flags = OFlag::O_RDONLY | OFlag::O_DIRECTORY;
+    let mut deepest = nix::fcntl::open(folder, flags, Mode::empty()).unwrap();
+    for _ in 0..levels {
+        nix::sys::stat::mkdirat(&deepest, "nested", Mode::S_IRWXU).unwrap();
+        deepest = nix::fcntl::openat(&deepest, "nested", flags, Mode::empty()).unwrap();
+    }
+}
+
+#[actix_rt::test]
+async fn a_tree_of_20_000_nested_folders_is_removed_and_ends_nobody_elses_simulation() {
+    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
+    let server = simulation_server(&webots.path(), forge.path(), 2).start().await;
+    let mut client = Client::start(&server, &arm()).await;
+    client.until("webots:").await;
+    let folder = instance_folders(&server.folder).remove(0);
+    let mut other = Client::start(&server, &arm()).await;
+    other.until("webots:").await;
+    nest(&folder, 20_000);
+    client.leave().await;
+    let begin = Instant::now();
+    while folder.exists() {
+        assert!(begin.elapsed() < Duration::from_mins(2), "it is still there");
+        actix_rt::time::sleep(Duration::from_millis(20)).await;
+    }
+    assert_eq!(stages(&server).await, ["idle"]);
+    other.leave().await;
+    nothing_left(&server, 2).await;
 }

@@ -13,6 +13,7 @@ use webots_fleet::simulation::client::WebClient;
 use webots_fleet::simulation::machine::LoadMonitor;
 use webots_fleet::simulation::places::{PlaceEvent, Places, Ticket};
 use webots_fleet::simulation::protocol::Mode;
+use webots_fleet::simulation::readiness;
 use webots_fleet::simulation::snapshot::Stage;
 use webots_fleet::simulation::state::AppState;
 use webots_fleet::simulation::webots::{Exit, LaunchSpec, Stop, Webots, WebotsEvent};
@@ -138,7 +139,7 @@ async fn launch(server: &AppState) -> (Addr<Webots>, UnboundedReceiver<Exit>) {
     let project = server.checkouts.start(world, server.run.instance().unwrap(), |_| ()).await.unwrap().unwrap();
     let spec = LaunchSpec {
         config: Arc::clone(&server.config),
-        program: server.webots_program().unwrap(),
+        program: readiness::webots_program(&server.config).unwrap(),
         checkouts: Arc::clone(&server.checkouts),
         project: Arc::new(project),
         mode: Mode::X3d,

@@ -12,6 +12,8 @@ pub enum Unreachable {
     TimedOut(Duration),
     /// An answer that makes no sense.
     BadAnswer(String),
+    /// It answers, and says that it can start no simulation.
+    NotReady(String),
 }
 
 impl Unreachable {
@@ -27,6 +29,7 @@ impl fmt::Display for Unreachable {
         match self {
             Self::Refused(why) => write!(out, "no connection: {why}"),
             Self::TimedOut(limit) => write!(out, "no answer within {} s", limit.as_secs_f64()),
+            Self::NotReady(why) => write!(out, "it can start no simulation: {why}"),
             Self::BadAnswer(what) => write!(out, "an answer that makes no sense: {what}"),
         }
     }

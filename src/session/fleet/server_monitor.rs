@@ -244,7 +244,10 @@ fn parse_status(body: &[u8]) -> Result<ServerReport, Unreachable> {
         Unreachable::BadAnswer(shortened(&format!("{error} in {text:?}")))
     })?;
     plausible(report.load)?;
-    Ok(report)
+    match &report.problem {
+        Some(problem) => Err(Unreachable::NotReady(shortened(problem))),
+        None => Ok(report),
+    }
 }
 
 fn plausible(load: Load) -> Result<Load, Unreachable> {

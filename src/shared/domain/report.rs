@@ -39,6 +39,9 @@ pub struct ServerReport {
     /// Whether the server takes no new clients because it is about to stop.
     #[serde(default)]
     pub draining: bool,
+    /// Why the server can start no simulation at all, if so.
+    #[serde(default, skip_serializing_if = "Option::is_none", deserialize_with = "optional_line")]
+    pub problem: Option<String>,
 }
 
 /// Number of simulations of a server by state.
@@ -61,6 +64,10 @@ pub struct Instances {
 
 fn line<'de, D: serde::Deserializer<'de>>(deserializer: D) -> Result<String, D::Error> {
     String::deserialize(deserializer).map(|text| one_line(&text))
+}
+
+fn optional_line<'de, D: serde::Deserializer<'de>>(deserializer: D) -> Result<Option<String>, D::Error> {
+    Option::<String>::deserialize(deserializer).map(|text| text.map(|text| one_line(&text)))
 }
 
 impl Instances {
@@ -95,6 +102,7 @@ impl ServerReport {
             share_idle_time: 0.0,
             docker: None,
             draining: false,
+            problem: None,
         }
     }
 

@@ -2,6 +2,7 @@
 
 mod logging;
 pub mod notify;
+mod open_files;
 pub mod permanent;
 mod pid_file;
 mod rotated_file;
@@ -11,6 +12,7 @@ mod timestamp;
 
 pub use crate::shared::domain::one_line;
 pub use logging::LogTarget;
+pub use open_files::raise_open_files;
 pub use rotated_file::RotatedFile;
 pub use shutdown::{Phase, Request, Signals, closing};
 pub use timestamp::{seconds_since_1970, timestamp};

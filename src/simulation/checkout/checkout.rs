@@ -123,7 +123,7 @@ impl Checkouts {
             world: file,
             warnings: warning.into_iter().collect(),
             url: world.clone(),
-            folder: instance.path().join("project").join(&revision.folder),
+            folder: instance.project().join(&revision.folder),
             place: place.unwrap_or_else(|| revision.folder.clone()),
             revision,
             instance,
@@ -178,8 +178,6 @@ impl Checkouts {
         progress: &(impl Fn(String) + Send + Sync),
     ) -> Result<(), CheckoutError> {
         let _turn = self.copies.acquire().await.map_err(|error| machine(world, &io::Error::other(error)))?;
-        let tree = instance.path().join("project");
-        tokio::fs::create_dir_all(tree).await.map_err(|error| machine(world, &error))?;
         progress(format!("checking {} out", found.revision.name));
         let call = copy_call(&found.repository, &found.revision, instance, needed);
         let told = |line: &str| {

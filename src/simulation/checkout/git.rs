@@ -72,9 +72,19 @@ impl Git {
     /// # Errors
     /// When its settings can't be written.
     pub fn new(run: &Path) -> std::io::Result<Self> {
-        let settings = run.join("gitconfig");
-        std::fs::write(&settings, SETTINGS)?;
-        Ok(Self { settings, mark: run.to_owned(), has_nice: which("nice").is_ok() })
+        let git = Self { settings: run.join("gitconfig"), mark: run.to_owned(), has_nice: which("nice").is_ok() };
+        git.write_settings()?;
+        Ok(git)
+    }
+
+    /// Writes git's settings where they are missing: git ignores a missing file without a word, and with it all that the
+    /// settings forbid.
+    fn write_settings(&self) -> std::io::Result<()> {
+        if self.settings.exists() {
+            return Ok(());
+        }
+        std::fs::create_dir_all(&self.mark)?;
+        std::fs::write(&self.settings, SETTINGS)
     }
 
     /// Runs a command to its end. Returns its answer. `progress` hears each line of progress.
@@ -100,6 +110,7 @@ impl Git {
         let command = call.arguments.iter().find(|argument| !argument.as_encoded_bytes().starts_with(b"-"));
         let command = command.map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
         let broken = |error: std::io::Error| GitError::NotStarted(error.to_string());
+        self.write_settings().map_err(broken)?;
         let (answer, output) = std::io::pipe().map_err(broken)?;
         let (complaints, errors) = std::io::pipe().map_err(broken)?;
         let (group, ended) = ProcessGroup::start(&self.spec(call), output.into(), errors.into()).map_err(broken)?;

@@ -1,10 +1,10 @@
-//! What came of a client's wish for a simulation: counted once for each start that was asked for.
+//! The outcome of each request to start a simulation, counted for `/metrics`.
 
 use prometheus::IntCounterVec;
 
 use crate::shared::http::Metrics;
 
-/// What came of it.
+/// The outcome of a request to start a simulation.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Outcome {
     /// The rules do not allow this world, or its URL is wrong.
@@ -47,10 +47,10 @@ impl Outcome {
     }
 }
 
-/// The counter `simulation_starts_total`, with a zero for each outcome.
+/// Makes the counter `simulation_starts_total`, with a zero for each outcome.
 ///
 /// # Errors
-/// When there is one already.
+/// When a counter of this name exists.
 pub fn counter(metrics: &Metrics) -> Result<IntCounterVec, prometheus::Error> {
     let counter = metrics.counter("simulation_starts_total", "Simulations that were asked for", "outcome")?;
     for outcome in ALL {
@@ -59,18 +59,18 @@ pub fn counter(metrics: &Metrics) -> Result<IntCounterVec, prometheus::Error> {
     Ok(counter)
 }
 
-/// A start whose outcome is not known yet, if one was asked for. Dropping it means that the client has left.
+/// A start whose outcome is not known yet, or no start at all. Dropping a start counts it as `Left`.
 #[derive(Debug, Default)]
 pub struct Pending(Option<IntCounterVec>);
 
 impl Pending {
-    /// A start was asked for.
+    /// A start that has just been asked for.
     #[must_use]
     pub fn new(counter: &IntCounterVec) -> Self {
         Self(Some(counter.clone()))
     }
 
-    /// The outcome is known. Only the first one counts.
+    /// Counts the outcome. Only the first one counts.
     pub fn is(&mut self, outcome: Outcome) {
         if let Some(counter) = self.0.take() {
             counter.with_label_values(&[outcome.label()]).inc();

@@ -18,6 +18,7 @@ use crate::shared::run::closing;
 use crate::simulation::checkout::{Progress, Project};
 use crate::simulation::places::{PlaceEvent, Ticket};
 use crate::simulation::protocol::{self, Mode, Request};
+use crate::simulation::readiness;
 use crate::simulation::snapshot::Change;
 use crate::simulation::state::AppState;
 use crate::simulation::webots::{Exit, LaunchSpec, RestoreController, Webots, WebotsEvent};
@@ -56,13 +57,13 @@ impl WebClient {
         format!("client {}", self.peer)
     }
 
-    /// Tells a failure, and closes the connection.
+    /// Tells the client why its simulation failed, and closes the connection.
     fn fail(&mut self, why: &str, ctx: &mut Context) {
         log::info!("{}: {why}", self.name());
         self.finish(&protocol::error(why), CloseCode::Normal, ctx);
     }
 
-    /// The start that was asked for has failed.
+    /// Counts the failed start, tells the client why, and closes the connection.
     fn fail_start(&mut self, outcome: Outcome, why: &str, ctx: &mut Context) {
         self.start.is(outcome);
         self.fail(why, ctx);
@@ -109,7 +110,7 @@ impl WebClient {
         };
         self.state = State::CheckingOut { mode, place: (ticket, port) };
         let me = ctx.address();
-        // A step that is told while the mailbox is full is one step less on the screen.
+        // Where the mailbox is full, the client misses one line of progress.
         let progress = move |text: String| drop(me.try_send(Progress(text)));
         let job = self.server.checkouts.start(world, instance, progress);
         job.into_actor(self)
@@ -126,7 +127,7 @@ impl WebClient {
             State::CheckingOut { mode, place } => (mode, place),
             other => return self.state = other,
         };
-        let program = match self.server.webots_program() {
+        let program = match readiness::webots_program(&self.server.config) {
             Ok(program) => program,
             Err(why) => return self.fail_start(Outcome::NoWebots, &why, ctx),
         };

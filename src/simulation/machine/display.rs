@@ -1,4 +1,4 @@
-//! The X display that Webots opens its window on: which one, and whether it takes clients of this user.
+//! The X display on which Webots opens its window: its name, and whether this user may connect to it.
 
 use std::sync::mpsc;
 use std::time::Duration;
@@ -16,7 +16,7 @@ const LAST_NUMBER: u16 = u16::MAX - 6000;
 /// Why Webots can't open its window on a display.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum DisplayError {
-    /// It is no display's name.
+    /// The name of the display is malformed.
     #[error("{0:?} is no display; allowed is HOST:NUMBER or :NUMBER")]
     BadName(String),
     /// No X server is there.
@@ -38,7 +38,7 @@ pub enum DisplayError {
         /// Who asked.
         user: String,
     },
-    /// Something is there that is silent, or talks in another way.
+    /// What listens there is silent, or does not speak the X protocol.
     #[error("what is at {display} does not answer as a display does: {reason}")]
     Strange {
         /// The display.
@@ -65,19 +65,19 @@ impl TryFrom<String> for DisplayName {
     }
 }
 
-/// The display that is used where none is configured: the server's own, else the first.
+/// The display to use: the configured one, else that of the environment variable `DISPLAY`, else `:0`.
 #[must_use]
 pub fn effective(configured: Option<&DisplayName>) -> String {
     configured.map(|display| display.0.clone()).or_else(of_environment).unwrap_or_else(|| ":0".to_owned())
 }
 
-/// The display that the environment names.
+/// The display that the environment variable `DISPLAY` names.
 #[must_use]
 pub fn of_environment() -> Option<String> {
     std::env::var("DISPLAY").ok().filter(|display| !display.is_empty())
 }
 
-/// Connects to a display as Webots would. Waits up to two seconds: not for a thread that serves others.
+/// Connects to a display as Webots would. Blocks for two seconds at most.
 ///
 /// # Errors
 /// Why Webots can't open its window there, and what to do about it.
@@ -85,7 +85,7 @@ pub fn check(display: &str) -> Result<(), DisplayError> {
     DisplayName::try_from(display.to_owned())?;
     let (sender, answer) = mpsc::channel();
     let name = display.to_owned();
-    // A display that never answers would hold whoever waits for it.
+    // The connection has no time limit of its own.
     std::thread::spawn(move || sender.send(RustConnection::connect(Some(&name)).map(drop)));
     match answer.recv_timeout(ANSWER) {
         Ok(Ok(())) => Ok(()),

@@ -18,15 +18,15 @@ use super::sensors::{self, Gpu, GpuSensor, Host, Machine, MachineSensor};
 use crate::shared::domain::Load;
 use crate::simulation::places::{GetSnapshot, Places};
 
-/// Between two samples.
+/// Time between two samples.
 const PERIOD: Duration = Duration::from_secs(1);
 /// How many samples the load is a mean of.
 const MEAN_OF: usize = 5;
 /// How many samples are kept: ten minutes.
 const KEPT: usize = 600;
-/// Older readings of GPUs don't count.
+/// How long a reading of the GPUs is used.
 const GPU_AGE: Duration = Duration::from_secs(10);
-/// How many lines `monitor.csv` has before it is put aside: a day.
+/// Lines of `monitor.csv` until it is renamed to `monitor.csv.1`: a day.
 const CSV_LINES: usize = 86_400;
 /// A column of `monitor.csv`: its heading, and its value in a sample.
 type Column = (&'static str, fn(&Sample) -> String);
@@ -47,7 +47,7 @@ const COLUMNS: [Column; 12] = [
     ("Network received", |sample| format!("{:.6}", sample.machine.network_received)),
 ];
 
-/// What is known of the machine's load.
+/// The newest readings of the machine, and its load.
 #[derive(Debug, Clone, Default)]
 pub struct Readings {
     /// The mean of the last five seconds.
@@ -75,11 +75,11 @@ pub struct Sample {
     /// The machine.
     #[serde(flatten)]
     pub machine: Machine,
-    /// The least busy GPU: percent.
+    /// Compute load of the least busy GPU, in percent.
     pub gpu_compute: f64,
-    /// Percent.
+    /// Memory traffic of that GPU, in percent of the time.
     pub gpu_memory_traffic: f64,
-    /// Percent.
+    /// Memory of that GPU in use, in percent.
     pub gpu_memory: f64,
     /// The load of this second, percent.
     #[serde(skip)]
@@ -162,7 +162,7 @@ impl LoadMonitor {
         let first = self.csv_lines.is_multiple_of(CSV_LINES);
         let put_aside = first && self.csv_lines > 0;
         self.csv_lines += 1;
-        // A disk that is full or slow costs the lines, nothing else.
+        // Where the disk is full, the lines are lost and nothing else.
         drop(actix_rt::task::spawn_blocking(move || append(&path, &sample, first, put_aside)));
     }
 }
@@ -211,8 +211,7 @@ impl Actor for LoadMonitor {
     }
 }
 
-/// Opens the driver and reads the GPUs. Both may hang, which must not hold up even the end of the program: the thread
-/// is none of the runtime's.
+/// Opens the driver and reads the GPUs, on a thread that the runtime does not wait for: both may hang.
 fn read_gpus(actor: Recipient<GpusRead>) {
     let opening = std::thread::Builder::new().name("gpus".to_owned()).spawn(move || match GpuSensor::open() {
         Ok(sensor) => read_each_period(actor, move || GpusRead(sensor.read())),

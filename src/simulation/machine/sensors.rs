@@ -3,14 +3,15 @@
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
+use nix::sys::statvfs::statvfs;
 use nvml_wrapper::Nvml;
 use nvml_wrapper::error::NvmlError;
 use serde::Serialize;
-use sysinfo::{CpuRefreshKind, Disks, MemoryRefreshKind, Networks, RefreshKind, System};
+use sysinfo::{CpuRefreshKind, MemoryRefreshKind, Networks, RefreshKind, System};
 
 use crate::shared::domain::Load;
 
-/// What the machine is doing.
+/// A reading of the machine.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
 #[serde(rename_all = "camelCase")]
 pub struct Machine {
@@ -20,7 +21,7 @@ pub struct Machine {
     pub memory: f64,
     /// Percent in use; 0 without swap.
     pub swap: f64,
-    /// Percent in use of the disk that holds the cache.
+    /// Percent in use of the disk that holds the cache, as `df` tells it.
     pub disk: f64,
     /// MB per second, all interfaces but the loopback.
     pub network_sent: f64,
@@ -28,7 +29,7 @@ pub struct Machine {
     pub network_received: f64,
 }
 
-/// What a GPU is doing.
+/// A reading of a GPU.
 #[derive(Debug, Clone, Default, PartialEq, Serialize)]
 #[serde(rename_all = "camelCase")]
 pub struct Gpu {
@@ -40,7 +41,7 @@ pub struct Gpu {
     pub memory_traffic: f64,
     /// Percent of its memory in use.
     pub memory: f64,
-    /// Of its memory, in bytes.
+    /// Size of its memory, in bytes.
     pub memory_total: u64,
 }
 
@@ -53,7 +54,7 @@ pub fn load(machine: &Machine, gpus: &[Gpu]) -> Load {
     Load::try_from(least.unwrap_or_else(|| with(0.0, 0.0))).unwrap_or(Load::ZERO)
 }
 
-/// Which gauge makes the load, in words.
+/// Which reading the load comes from, in words.
 #[must_use]
 pub fn busiest(machine: &Machine, gpus: &[Gpu]) -> &'static str {
     let total = load(machine, gpus).percent();
@@ -69,7 +70,7 @@ pub fn busiest(machine: &Machine, gpus: &[Gpu]) -> &'static str {
     }
 }
 
-/// What the machine is, which does not change.
+/// The machine's name, system and hardware, which do not change.
 #[derive(Debug, Clone, Default, Serialize)]
 #[serde(rename_all = "camelCase")]
 pub struct Host {
@@ -93,7 +94,6 @@ pub struct Host {
 pub struct MachineSensor {
     system: System,
     networks: Networks,
-    disks: Disks,
     disk: PathBuf,
     read: Instant,
 }
@@ -102,7 +102,7 @@ impl MachineSensor {
     /// Prepares readings; `disk` is a folder on the disk that is watched.
     ///
     /// # Errors
-    /// When the system tells nothing of itself.
+    /// When the system does not give the readings.
     pub fn open(disk: &Path) -> Result<Self, sysinfo::Error> {
         let kinds = RefreshKind::nothing()
             .with_cpu(CpuRefreshKind::nothing().with_usage())
@@ -110,7 +110,6 @@ impl MachineSensor {
         Ok(Self {
             system: System::new_with_specifics(kinds)?,
             networks: Networks::new_with_refreshed_list()?,
-            disks: Disks::new_with_refreshed_list()?,
             disk: disk.to_owned(),
             read: Instant::now(),
         })
@@ -136,7 +135,6 @@ impl MachineSensor {
         self.system.refresh_cpu_usage();
         self.system.refresh_memory();
         self.networks.refresh(true);
-        self.disks.refresh(true);
         let seconds = std::mem::replace(&mut self.read, Instant::now()).elapsed().as_secs_f64().max(0.001);
         let outside = || self.networks.iter().filter(|(name, _)| *name != "lo").map(|(_, data)| data);
         let sent = outside().map(sysinfo::NetworkData::transmitted).sum::<u64>();
@@ -145,18 +143,20 @@ impl MachineSensor {
             cpu: f64::from(self.system.global_cpu_usage()),
             memory: percent(self.system.used_memory(), self.system.total_memory()),
             swap: percent(self.system.used_swap(), self.system.total_swap()),
-            disk: self.disk_use(),
+            disk: disk_use(&self.disk),
             network_sent: megabytes(sent) / seconds,
             network_received: megabytes(received) / seconds,
         }
     }
+}
 
-    fn disk_use(&self) -> f64 {
-        let holding = self.disks.iter().filter(|disk| self.disk.starts_with(disk.mount_point()));
-        let nearest = holding.max_by_key(|disk| disk.mount_point().as_os_str().len());
-        nearest
-            .map_or(0.0, |disk| percent(disk.total_space().saturating_sub(disk.available_space()), disk.total_space()))
-    }
+/// Percent in use of the disk that holds a folder, as `df` tells it: of what users can have, without the blocks that are
+/// reserved for root. 0 where the folder is not there.
+fn disk_use(folder: &Path) -> f64 {
+    statvfs(folder).map_or(0.0, |disk| {
+        let used = disk.blocks().saturating_sub(disk.blocks_free());
+        percent(used, used.saturating_add(disk.blocks_available()))
+    })
 }
 
 #[expect(clippy::cast_precision_loss, reason = "a percentage needs no more digits than f64 has")]
@@ -185,7 +185,7 @@ impl GpuSensor {
         Ok(Self { nvml: versioned.or_else(|_| Nvml::init())? })
     }
 
-    /// Reads all GPUs. What a GPU does not tell counts as 0: some tell no utilisation.
+    /// Reads all GPUs. A value that a GPU does not report is 0: some report no utilisation.
     #[must_use]
     pub fn read(&self) -> Vec<Gpu> {
         let count = self.nvml.device_count().unwrap_or(0);
@@ -209,6 +209,16 @@ impl GpuSensor {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn disk_use_is_what_df_tells() {
+        let output = std::process::Command::new("df").args(["--output=pcent", "/tmp"]).output().unwrap();
+        let told = String::from_utf8(output.stdout).unwrap();
+        let told: f64 = told.lines().nth(1).unwrap().trim().trim_end_matches('%').parse().unwrap();
+        let own = disk_use(Path::new("/tmp"));
+        // df rounds up, and others write meanwhile.
+        assert!((told - 1.5..=told + 0.5).contains(&own), "{own} where df says {told}");
+    }
 
     #[test]
     fn the_load_is_that_of_the_busiest_part_and_the_least_busy_gpu() {

@@ -1,4 +1,4 @@
-//! What each simulation takes of the machine: CPU and memory of its process tree. Linux: `/proc`.
+//! CPU and memory of each simulation's process tree. Linux: `/proc`.
 //!
 //! One pass over all processes serves all simulations, at most once in 1.8 s, and only when somebody asks.
 
@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use procfs::process::{Stat, all_processes};
 
-/// What a process tree takes.
+/// CPU and memory of a process tree.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Usage {
     /// Percent of one core, the mean since the reading before; nothing at the first.

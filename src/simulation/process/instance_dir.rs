@@ -1,12 +1,12 @@
 //! The folders of running simulations: guards that remove them when they are dropped.
 
-use std::fs::Permissions;
 use std::io;
-use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use super::process_tree;
+use super::remove_tree::remove_tree;
 
 /// The folder of one run of the server: `runs/run-*` in the cache folder. It holds a folder for each simulation.
 #[derive(Debug)]
@@ -18,6 +18,8 @@ pub struct RunDir {
 #[derive(Debug)]
 pub struct InstanceDir {
     folder: PathBuf,
+    /// Whether what carries its mark was killed already, so that it need not be looked for again.
+    is_cleared: AtomicBool,
 }
 
 /// What earlier runs had left.
@@ -54,13 +56,17 @@ impl RunDir {
         Ok((Self { folder }, leftovers))
     }
 
-    /// Makes a folder for a simulation.
+    /// Makes a folder for a simulation, with the folder of its project inside.
     ///
     /// # Errors
-    /// When the folder can't be made.
+    /// When a folder can't be made.
     pub fn instance(&self) -> io::Result<InstanceDir> {
+        // Somebody may have removed the folder of the run.
+        std::fs::create_dir_all(&self.folder)?;
         let folder = tempfile::Builder::new().prefix("instance-").tempdir_in(&self.folder)?.keep();
-        Ok(InstanceDir { folder })
+        let instance = InstanceDir { folder, is_cleared: AtomicBool::new(false) };
+        std::fs::create_dir(instance.project())?;
+        Ok(instance)
     }
 
     /// The folder itself.
@@ -87,6 +93,20 @@ impl InstanceDir {
     pub fn path(&self) -> &Path {
         &self.folder
     }
+
+    /// The folder of the project. It is there as long as the instance is: whoever made it later could make it again after
+    /// the instance was removed.
+    #[must_use]
+    pub fn project(&self) -> PathBuf {
+        self.folder.join("project")
+    }
+
+    /// Kills every process that carries the mark of this folder. For the end of the simulation: what is started later is
+    /// not found. Blocks for a moment.
+    pub fn kill_processes(&self) {
+        process_tree::kill_marked(&self.folder);
+        self.is_cleared.store(true, Ordering::Relaxed);
+    }
 }
 
 impl Drop for InstanceDir {
@@ -94,8 +114,11 @@ impl Drop for InstanceDir {
         // A project may hold many files, and this may run on a thread that serves others.
         let folder = std::mem::take(&mut self.folder);
         let spare = folder.clone();
+        let is_cleared = self.is_cleared.load(Ordering::Relaxed);
         let remove_all = move || {
-            process_tree::kill_marked(&folder);
+            if !is_cleared {
+                process_tree::kill_marked(&folder);
+            }
             remove_patiently(&folder);
         };
         if std::thread::Builder::new().spawn(remove_all).is_err() {
@@ -104,11 +127,11 @@ impl Drop for InstanceDir {
     }
 }
 
-/// Removes a folder, as far as that can be done at once.
+/// Removes a folder. Tries twice, and logs where it fails.
 fn remove(folder: &Path) {
     // A process that is just ending may still write: what it adds is removed by the second try.
-    if try_to_remove(folder).is_err()
-        && let Err(error) = try_to_remove(folder)
+    if remove_tree(folder).is_err()
+        && let Err(error) = remove_tree(folder)
     {
         log::error!("{} can't be removed: {error}", folder.display());
     }
@@ -118,7 +141,7 @@ fn remove(folder: &Path) {
 /// Blocks: only for threads of their own.
 pub fn remove_patiently(folder: &Path) {
     for pause in PAUSES {
-        match try_to_remove(folder) {
+        match remove_tree(folder) {
             Ok(()) => return,
             Err(error) => log::warn!("{} can't be removed yet: {error}", folder.display()),
         }
@@ -127,34 +150,11 @@ pub fn remove_patiently(folder: &Path) {
     remove(folder);
 }
 
-fn try_to_remove(folder: &Path) -> io::Result<()> {
-    let removed = match std::fs::remove_dir_all(folder) {
-        // A simulation may have taken the right to write from its own folders.
-        Err(error) if error.kind() == io::ErrorKind::PermissionDenied => {
-            open_up(folder);
-            std::fs::remove_dir_all(folder)
-        }
-        other => other,
-    };
-    match removed {
-        Err(error) if error.kind() == io::ErrorKind::NotFound && !folder.exists() => Ok(()),
-        other => other,
-    }
-}
-
-/// Lets this user change all folders below one. Links are not followed.
-fn open_up(folder: &Path) {
-    let mut open = vec![folder.to_owned()];
-    while let Some(folder) = open.pop() {
-        std::fs::set_permissions(&folder, Permissions::from_mode(0o700)).ok();
-        let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
-        open.extend(entries.filter(|one| one.file_type().is_ok_and(|kind| kind.is_dir())).map(|one| one.path()));
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+    use std::fs::Permissions;
+    use std::os::unix::fs::PermissionsExt;
 
     #[test]
     fn an_earlier_run_is_removed_with_its_processes() {
@@ -180,10 +180,11 @@ mod tests {
         std::fs::set_permissions(&locked, Permissions::from_mode(0o500)).unwrap();
         // Somebody who makes files faster than they can be removed, for a while.
         let busy = folder.join("busy");
+        std::fs::create_dir(&busy).unwrap();
         let writer = std::thread::spawn(move || {
             let end = std::time::Instant::now() + Duration::from_millis(150);
             for number in 0.. {
-                std::fs::create_dir_all(busy.join(format!("{number}"))).ok();
+                std::fs::create_dir(busy.join(format!("{number}"))).ok();
                 if std::time::Instant::now() > end {
                     return;
                 }

@@ -4,7 +4,9 @@ pub mod guardian;
 mod instance_dir;
 mod process_group;
 pub mod process_tree;
+mod remove_tree;
 
 pub use guardian::Guardian;
 pub use instance_dir::{InstanceDir, Leftovers, RunDir};
 pub use process_group::{ExitReason, ProcessGroup, SpawnSpec};
+pub use remove_tree::remove_tree;

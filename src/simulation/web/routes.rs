@@ -74,8 +74,13 @@ async fn metrics(server: web::Data<AppState>) -> HttpResponse {
     }
 }
 
-async fn health() -> HttpResponse {
-    HttpResponse::Ok().content_type("text/plain").body("ok")
+async fn health(server: web::Data<AppState>) -> HttpResponse {
+    match server.problem() {
+        None => HttpResponse::Ok().content_type("text/plain").body("ok"),
+        Some(problem) => {
+            HttpResponse::ServiceUnavailable().content_type("text/plain").body(format!("Error: {problem}"))
+        }
+    }
 }
 
 async fn drain(request: HttpRequest, server: web::Data<AppState>) -> HttpResponse {

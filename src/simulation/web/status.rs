@@ -46,6 +46,7 @@ impl StatusPage {
             share_idle_time: rules.share_idle_time,
             docker: Some(rules.docker),
             draining: server.is_draining(),
+            problem: server.problem(),
         };
         Self {
             report,
@@ -75,9 +76,11 @@ pub fn gauges<'text>(server: &AppState, snapshot: &Snapshot) -> Vec<Gauge<'text>
         let numbered = readings.gpus.iter().enumerate();
         numbered.map(|(index, gpu)| (vec![index.to_string(), gpu.name.clone()], value(gpu))).collect()
     };
+    let ready = f64::from(u8::from(server.problem().is_none()));
     let draining = f64::from(u8::from(server.is_draining()));
     vec![
         Gauge::plain("simulation_load_percent", "Load as /load tells it", server.load().percent()),
+        Gauge::plain("simulation_ready", "0 while no simulation can be started", ready),
         Gauge::plain("simulation_draining", "1 while no new clients are taken", draining),
         Gauge::plain("simulation_places", "Simulations that fit", f64::from(instances.places)),
         Gauge {

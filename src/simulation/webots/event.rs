@@ -1,8 +1,8 @@
-//! What a Webots tells its client.
+//! The events of a running Webots, for the actor of its web client.
 
 use actix::prelude::*;
 
-/// What a client hears of its Webots.
+/// An event of a running Webots.
 #[derive(Message, Debug, Clone, PartialEq, Eq)]
 #[rtype(result = "()")]
 pub enum WebotsEvent {
@@ -25,20 +25,20 @@ pub struct Exit {
     pub why: String,
 }
 
-/// Tells a client the events of its Webots. Tells the exit in any case: also where the actor panics and is dropped.
+/// Sends a client the events of its Webots. The exit is sent in any case, also where the actor panics and is dropped.
 pub struct ExitNotifier {
     events: Recipient<WebotsEvent>,
     exit_told: bool,
 }
 
 impl ExitNotifier {
-    /// Tells through this recipient.
+    /// Sends to this recipient.
     #[must_use]
     pub fn new(events: Recipient<WebotsEvent>) -> Self {
         Self { events, exit_told: false }
     }
 
-    /// Tells an event.
+    /// Sends an event.
     pub fn tell(&mut self, event: WebotsEvent) {
         self.exit_told |= matches!(event, WebotsEvent::Exited(_));
         // A heartbeat may be lost where a client can't keep up; how to reach Webots and its end may not.

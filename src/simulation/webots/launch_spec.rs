@@ -1,4 +1,4 @@
-//! What a Webots is started with.
+//! The launch specification: everything that one Webots is started with.
 
 use std::ffi::OsString;
 use std::path::PathBuf;
@@ -14,7 +14,7 @@ use crate::simulation::places::Ticket;
 use crate::simulation::process::SpawnSpec;
 use crate::simulation::protocol::Mode;
 
-/// What a Webots is started with.
+/// Everything that one Webots is started with.
 pub struct LaunchSpec {
     /// The server's configuration.
     pub config: Arc<SimulationConfig>,
@@ -28,12 +28,12 @@ pub struct LaunchSpec {
     pub mode: Mode,
     /// The place, and its port.
     pub place: (Ticket, u16),
-    /// Who hears of it.
+    /// Who gets the events.
     pub events: Recipient<WebotsEvent>,
 }
 
 impl LaunchSpec {
-    /// How its process is started and ended; `display` are the variables by which it finds its display.
+    /// How the process is started and ended. `display` holds the environment variables that name its X display.
     #[must_use]
     pub fn spawn_spec(&self, display: Vec<(OsString, OsString)>) -> SpawnSpec {
         let command = WebotsCommand {

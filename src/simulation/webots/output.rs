@@ -1,4 +1,4 @@
-//! What a simulator prints: a few lines tell its state, all others are kept for whoever looks for a fault.
+//! The output of a simulator: a few lines tell its state, all others are kept in a log.
 //!
 //! A thread per simulator reads its output, so that neither a flood of it nor a slow disk holds up anybody else: a
 //! simulator that prints faster than this thread reads waits in its own write.
@@ -94,7 +94,7 @@ where
                 kept.push(line);
             }
         }
-        // Nobody may wait for it.
+        // The receiver may be gone.
         end.send(()).ok();
     })?;
     Ok((tail, ended))

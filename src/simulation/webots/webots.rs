@@ -25,7 +25,7 @@ use crate::simulation::snapshot::{Change, Stage};
 #[rtype(result = "()")]
 pub struct Stop;
 
-/// Asks for the original state of a file below the project's `controllers` folder.
+/// Asks to restore a file below the project's `controllers` folder to the state of the checkout.
 #[derive(Message)]
 #[rtype(result = "Result<(), CheckoutError>")]
 pub struct RestoreController(pub String);
@@ -112,7 +112,7 @@ impl Webots {
         });
     }
 
-    /// Starts Webots' processes, and has their end told.
+    /// Starts the process, and has [`Self::ended`] called when it has ended.
     fn spawn(&mut self, display: Option<VirtualDisplay>, ctx: &mut Context<Self>) -> std::io::Result<()> {
         let log = self.spec.config.log_dir.0.join("simulation/instances").join(format!("{}.log", self.port));
         let begin = std::fs::metadata(&log).map_or(0, |file| file.len());
@@ -135,14 +135,14 @@ impl Webots {
         let (at, pid) = (seconds_since_1970(), group.leader());
         self.spec.place.0.update(Change::Launched { at, pid, port: self.port, log, begin });
         self.group = Some(group);
-        let instance = self.spec.project.instance.path().to_owned();
+        let project = Arc::clone(&self.spec.project);
         let ended = async move {
             let reason = ended.await;
             if let Some(display) = display {
                 display.stop().await;
             }
-            // What has left the group.
-            actix_rt::task::spawn_blocking(move || process_tree::kill_marked(&instance)).await.ok();
+            // Processes that have left the group are known by their mark.
+            actix_rt::task::spawn_blocking(move || project.instance.kill_processes()).await.ok();
             // What was printed last tells why. A process that nobody can end may keep the pipe open.
             actix_rt::time::timeout(LAST_OUTPUT, all_read).await.ok();
             reason
@@ -255,7 +255,7 @@ impl Webots {
         ctx.stop();
     }
 
-    /// What a user needs to understand an end: the last of what was printed.
+    /// Adds the last lines of the output, in which Webots mostly says what is wrong.
     fn with_output(&self, why: &str) -> String {
         let lines = self.tail.lines();
         if lines.is_empty() { format!("{why}.") } else { format!("{why}. Its last output: {}", lines.join(" | ")) }

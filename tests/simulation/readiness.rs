@@ -1,0 +1,117 @@
+//! A server that can start no simulation says so and is not offered; one that is limited says that too.
+
+use std::path::PathBuf;
+
+use serde_json::Value;
+
+use super::scene::{arm, instance_folders, nothing_left};
+use crate::support::client::Client;
+use crate::support::git::Forge;
+use crate::support::program::{Server, session_server, simulation_server};
+use crate::support::webots::Webots;
+use crate::support::{http, until};
+
+async fn health(server: &Server) -> (u16, String) {
+    let answer = http::try_get(&server.url("/health")).await.unwrap();
+    (answer.status.as_u16(), answer.text())
+}
+
+/// Whether the session server counts its only simulation server as one that works; a busy machine may make it full.
+async fn works(session: &Server) -> bool {
+    let page: Value = http::get(&session.url("/status")).await.json();
+    ["up", "full"].contains(&page["servers"][0]["state"].as_str().unwrap())
+}
+
+#[actix_rt::test]
+async fn a_server_without_webots_says_so_and_is_not_offered_until_there_is_one() {
+    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
+    let server = simulation_server(&webots.path(), forge.path(), 1).start().await;
+    let session = session_server(&[server.address()]).start().await;
+    until("it works", async || works(&session).await).await;
+    let away = webots.path().with_file_name("away");
+    std::fs::rename(webots.path(), &away).unwrap();
+    until("it does not work", async || !works(&session).await).await;
+    assert_eq!(http::get(&session.url("/request")).await.text(), "0");
+    let (status, text) = health(&server).await;
+    assert!(status == 503 && text.contains("has no Webots at"), "{status} {text}");
+    assert_eq!(http::get(&server.url("/load")).await.text(), "100");
+    let page: Value = http::get(&server.url("/status")).await.json();
+    assert!(page["problem"].as_str().unwrap().contains("has no Webots at"), "{page}");
+    assert!(server.log().contains("no simulation can be started"), "{}", server.log());
+    until("the session server tells why", async || session.log().contains("can start no simulation")).await;
+    std::fs::rename(&away, webots.path()).unwrap();
+    until("it works again", async || works(&session).await).await;
+    assert_eq!(health(&server).await, (200, "ok".to_owned()));
+}
+
+#[actix_rt::test]
+async fn a_display_that_is_missing_is_a_problem_for_webots_itself() {
+    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
+    let home = webots.path().parent().unwrap().to_str().unwrap().to_owned();
+    let server = simulation_server(&webots.path(), forge.path(), 1)
+        .set("webots", Value::Null)
+        .set("webotsHome", home)
+        .set("display", ":59")
+        .start()
+        .await;
+    until("it is told", async || health(&server).await.0 == 503).await;
+    assert!(health(&server).await.1.contains("no display answers at :59"));
+    let told = Client::start(&server, &arm()).await.until("loading: Error:").await;
+    assert!(told.contains("no display answers at :59"), "{told}");
+}
+
+#[actix_rt::test]
+async fn the_folder_of_the_run_is_made_anew_where_somebody_removes_it() {
+    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
+    let server = simulation_server(&webots.path(), forge.path(), 1).start().await;
+    for _ in 0..2 {
+        let runs = server.folder.join("cache/runs");
+        // The server may be making it anew meanwhile.
+        until("it is removed", async || std::fs::remove_dir_all(&runs).is_ok()).await;
+        let mut client = Client::start(&server, &arm()).await;
+        client.until("webots:").await;
+        let run = std::fs::read_dir(server.folder.join("cache/runs")).unwrap().next().unwrap().unwrap().path();
+        assert!(std::fs::read_to_string(run.join("gitconfig")).unwrap().contains("hooksPath"));
+        client.leave().await;
+        nothing_left(&server, 1).await;
+    }
+}
+
+#[actix_rt::test]
+async fn a_limit_of_files_that_allows_no_client_is_refused_in_one_line() {
+    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
+    let builder = simulation_server(&webots.path(), forge.path(), 1).set("debug", false);
+    let mut server = builder.files(128).spawn();
+    assert_eq!(server.ended().await, Some(1));
+    let said = server.log();
+    assert!(said.starts_with("error: 128 files may be open, which is not enough for 1 places"), "{said}");
+    assert_eq!(said.lines().count(), 1, "{said}");
+}
+
+#[actix_rt::test]
+async fn the_limit_of_files_is_raised_as_far_as_it_is_needed() {
+    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
+    let builder = simulation_server(&webots.path(), forge.path(), 10).set("maxClients", 300);
+    let server = builder.before("ulimit -Sn 256").start().await;
+    let limits = procfs::process::Process::new(server.pid()).unwrap().limits().unwrap();
+    let procfs::process::LimitValue::Value(soft) = limits.max_open_files.soft_limit else { panic!("{limits:?}") };
+    assert_eq!(soft, 128 + 10 * 8 + 300 * 2);
+    let few = simulation_server(&webots.path(), forge.path(), 10).files(300).start().await;
+    assert!(few.log().contains("300 files may be open, which is enough for 46 clients"), "{}", few.log());
+}
+
+#[actix_rt::test]
+async fn clients_that_leave_at_once_leave_no_folder() {
+    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
+    let server = simulation_server(&webots.path(), forge.path(), 8).start().await;
+    let visitor = async |number: u64| {
+        for visit in 0..40 {
+            let client = Client::start(&server, &arm()).await;
+            actix_rt::time::sleep(std::time::Duration::from_millis((number + 5 * visit) % 50)).await;
+            client.leave().await;
+        }
+    };
+    futures_util::future::join_all((0..8).map(visitor)).await;
+    until("no folder is left", async || instance_folders(&server.folder) == Vec::<PathBuf>::new()).await;
+    nothing_left(&server, 8).await;
+}
