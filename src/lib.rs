@@ -33,10 +33,10 @@
 //!     | one per WebSocket                             ^  |  | one per simulation server
 //!   WebClient ---------- Pick ------------------------'  |  v
 //!     |  ^                                               | ServerMonitor -- GET /status, /load --> simulation server
-//!     |  '- News -- Audience <--- News (changes only) ---'  '-- Reported --> Registry
-//!     '--- Join ------^  one per worker thread
+//!     |  '- Update -- Broadcaster <-- Update, Subscribe -'  '-- ProbeResult --> Registry
+//!     '--- SubscribeClient --^  one per worker thread
 //!
-//!   The monitors share a thread of their own: however many they are, the door never waits for them.
+//!   The monitors share a thread of their own, so that clients never wait for them.
 //!
 //! simulation server
 //!
@@ -61,7 +61,7 @@
 //! | Registry, Places, `LoadMonitor` | never | the server logs it and ends with exit code 1: the service manager starts it again |
 //! | `ServerMonitor` | when its server leaves the configuration | the registry makes a new one |
 //! | Mailer | never | the registry makes a new one |
-//! | Audience | never | its clients' connections close with 1011; who connects next gets a new one |
+//! | Broadcaster | never | its clients' connections close with 1011; who connects next gets a new one |
 //! | Announcer | when all are told or given up | it is not started again: announcing is a courtesy |
 //! | `WebClient` | with its connection | its connection closes; what it leased is freed |
 //! | Webots | with its process tree; it is never restarted, its client is told | its process tree is killed at once, its folder removed, its place freed |

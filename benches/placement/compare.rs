@@ -1,7 +1,7 @@
 //! Which scenarios are run, and who wins.
 
 use super::dispatch::{Own, Rival, Rule};
-use super::scenario::{Arrivals, Outcome, Scenario, Sessions, Sizes};
+use super::scenario::{Arrivals, Foreign, Outcome, Scenario, Sessions, Sizes};
 use super::world::run;
 
 /// The policies in the order of an outcome's row. The first is the one that has to win.
@@ -27,12 +27,20 @@ pub(crate) fn scenarios(fleets: &[usize], refreshes: &[f64]) -> Vec<Scenario> {
             for arrivals in Arrivals::ALL {
                 for sessions in [Sessions::Exponential, Sessions::Heavy] {
                     for &refresh in refreshes {
-                        all.push(Scenario { arrivals, refresh, servers, sizes, sessions });
+                        all.push(Scenario { arrivals, refresh, servers, sizes, sessions, foreign: Foreign::None });
                     }
                 }
             }
         }
     }
+    all
+}
+
+/// Scenarios in which other programs use the machines too.
+pub(crate) fn foreign_scenarios(fleets: &[usize]) -> Vec<Scenario> {
+    let mut all = scenarios(fleets, &[1.0]);
+    all.retain(|scenario| scenario.sessions == Sessions::Exponential);
+    all.iter_mut().for_each(|scenario| scenario.foreign = Foreign::ComesAndGoes);
     all
 }
 

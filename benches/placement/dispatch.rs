@@ -8,7 +8,7 @@ use webots_fleet::session::placement::{Fleet, Instances, Policy, Report};
 
 /// What a server reports.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Sight {
+pub(crate) struct Seen {
     pub(crate) load: f64,
     pub(crate) present: u32,
     pub(crate) arrivals: u64,
@@ -17,7 +17,7 @@ pub(crate) struct Sight {
 /// A policy at work.
 pub(crate) trait Dispatcher {
     /// A report of a server has come; `now` is in seconds.
-    fn report(&mut self, server: usize, now: f64, sight: Sight);
+    fn report(&mut self, server: usize, now: f64, seen: Seen);
     /// Chooses a server for a client, or refuses it.
     fn place(&mut self, now: f64) -> Option<usize>;
 }
@@ -43,10 +43,9 @@ impl Own {
 }
 
 impl Dispatcher for Own {
-    fn report(&mut self, server: usize, now: f64, sight: Sight) {
-        let instances =
-            Instances { present: sight.present, places: 100_000, arrivals: sight.arrivals, accepting: true };
-        let report = Report { load: sight.load, instances: self.instances.then_some(instances) };
+    fn report(&mut self, server: usize, now: f64, seen: Seen) {
+        let instances = Instances { present: seen.present, places: 100_000, arrivals: seen.arrivals, accepting: true };
+        let report = Report { load: seen.load, instances: self.instances.then_some(instances) };
         self.fleet.report(&server, self.at(now), report);
     }
 
@@ -95,9 +94,9 @@ impl Rival {
 }
 
 impl Dispatcher for Rival {
-    fn report(&mut self, server: usize, _now: f64, sight: Sight) {
-        self.loads[server] = sight.load;
-        match (self.open.binary_search(&server), sight.load < THRESHOLD) {
+    fn report(&mut self, server: usize, _now: f64, seen: Seen) {
+        self.loads[server] = seen.load;
+        match (self.open.binary_search(&server), seen.load < THRESHOLD) {
             (Ok(at), false) => drop(self.open.remove(at)),
             (Err(at), true) => self.open.insert(at, server),
             _ => {}

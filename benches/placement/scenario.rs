@@ -11,6 +11,8 @@ pub(crate) const HORIZON: f64 = 300.0;
 const BURST_AT: f64 = 150.0;
 /// The mean length of a session, in seconds: short, so that what a report says is soon wrong.
 const MEAN_SESSION: f64 = 100.0;
+/// The load from which on a server takes no client, in percent.
+pub(crate) const THRESHOLD: f64 = 95.0;
 /// The share of clients that are given a server and never go there.
 const NO_SHOW: f64 = 0.02;
 
@@ -51,6 +53,15 @@ pub(crate) enum Sessions {
     Heavy,
 }
 
+/// What else the machines do.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Foreign {
+    /// Nothing but what every machine does.
+    None,
+    /// Other programs, for half a minute on average, each machine once in a minute and a half.
+    ComesAndGoes,
+}
+
 /// What is simulated.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Scenario {
@@ -59,6 +70,7 @@ pub(crate) struct Scenario {
     pub(crate) servers: usize,
     pub(crate) sizes: Sizes,
     pub(crate) sessions: Sessions,
+    pub(crate) foreign: Foreign,
 }
 
 /// What came of a run.

@@ -1,7 +1,7 @@
 //! A fleet of machines, the clients that want to use it, and a clock that runs as fast as it can.
 
-use super::dispatch::{Dispatcher, Sight};
-use super::scenario::{Client, HORIZON, Outcome, Scenario, Sizes, THRESHOLD, clients};
+use super::dispatch::{Dispatcher, Seen};
+use super::scenario::{Client, Foreign, HORIZON, Outcome, Scenario, Sizes, THRESHOLD, clients};
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
 use std::cmp::Reverse;
@@ -24,6 +24,8 @@ struct Machine {
     /// Who is still starting: since when, and the cost.
     starting: VecDeque<(f64, f64)>,
     samples: VecDeque<f64>,
+    /// The load of other programs.
+    foreign: f64,
 }
 
 impl Machine {
@@ -46,8 +48,18 @@ impl Machine {
         self.samples.push_back((self.demand - not_yet + noise).clamp(0.0, 100.0));
     }
 
-    fn sight(&self) -> Sight {
-        Sight {
+    /// Begins or ends other programs once in a while; to be called each second.
+    fn run_others(&mut self, now: f64, random: &mut StdRng) {
+        let switches = random.random_range(0.0..1.0) < if self.foreign > 0.0 { 1.0 / 30.0 } else { 1.0 / 60.0 };
+        if switches {
+            let load = if self.foreign > 0.0 { 0.0 } else { random.random_range(20.0..60.0) };
+            self.change(now, load - self.foreign);
+            self.foreign = load;
+        }
+    }
+
+    fn seen(&self) -> Seen {
+        Seen {
             load: self.samples.iter().sum::<f64>() / self.samples.len() as f64,
             present: self.present,
             arrivals: self.arrivals,
@@ -81,7 +93,7 @@ pub(crate) fn run(scenario: &Scenario, seed: u64, dispatcher: &mut impl Dispatch
     }
     for (id, machine) in machines.iter_mut().enumerate() {
         machine.sample(0.0, 0.0);
-        dispatcher.report(id, 0.0, machine.sight());
+        dispatcher.report(id, 0.0, machine.seen());
     }
     let mut events: BinaryHeap<Reverse<(u64, Step, usize, usize)>> = BinaryHeap::new();
     let mut next_client = 0;
@@ -116,12 +128,15 @@ pub(crate) fn run(scenario: &Scenario, seed: u64, dispatcher: &mut impl Dispatch
             }
         } else if now == next_sample {
             for machine in &mut machines {
+                if scenario.foreign == Foreign::ComesAndGoes {
+                    machine.run_others(now, &mut random);
+                }
                 machine.sample(now, random.random_range(-1.5..1.5));
             }
             next_sample += 1.0;
         } else if now == next_report {
             let server = order[asked % order.len()];
-            dispatcher.report(server, now, machines[server].sight());
+            dispatcher.report(server, now, machines[server].seen());
             asked += 1;
         } else {
             let client = &clients[next_client];
@@ -163,6 +178,7 @@ fn machines(scenario: &Scenario, random: &mut StdRng) -> Vec<Machine> {
                 arrivals: 0,
                 starting: VecDeque::new(),
                 samples: VecDeque::new(),
+                foreign: 0.0,
             }
         })
         .collect()

@@ -13,7 +13,7 @@ use super::config::SessionConfig;
 use super::state::AppState;
 use crate::session::fleet::{IsAvailable, Reconfigure, Registry};
 use crate::session::mail;
-use crate::session::web::{CurrentAudience, configure};
+use crate::session::web::{LocalBroadcaster, configure};
 use crate::shared::config;
 use crate::shared::http::Connections;
 use crate::shared::http::Live;
@@ -87,8 +87,8 @@ pub async fn run(mut config: SessionConfig, file: PathBuf) -> Result<(), AppErro
     let shared = web::Data::from(Arc::clone(&server));
     // Called once in each thread that serves connections.
     let app = move || {
-        let audience = web::Data::new(CurrentAudience::start(Arc::clone(&shared)));
-        App::new().app_data(shared.clone()).app_data(audience).configure(configure)
+        let broadcaster = web::Data::new(LocalBroadcaster::start(Arc::clone(&shared)));
+        App::new().app_data(shared.clone()).app_data(broadcaster).configure(configure)
     };
     let http = HttpServer::new(app)
         // Messages are small, and must not wait until the one before is acknowledged.
@@ -206,13 +206,13 @@ mod tests {
     use tokio_tungstenite::tungstenite::Message as Frame;
 
     use super::*;
-    use crate::session::web::Audience;
+    use crate::session::web::Broadcaster;
 
     #[derive(Message)]
     #[rtype(result = "()")]
     struct Panic;
 
-    impl Handler<Panic> for Audience {
+    impl Handler<Panic> for Broadcaster {
         type Result = ();
 
         fn handle(&mut self, _: Panic, _: &mut Self::Context) {
@@ -221,15 +221,15 @@ mod tests {
     }
 
     #[actix_rt::test]
-    async fn clients_whose_audience_panics_are_sent_away_and_find_another_one() {
+    async fn clients_whose_broadcaster_panics_are_sent_away_and_find_another_one() {
         let config = serde_json::from_str(r#"{"port": 0, "simulationServers": []}"#).unwrap();
         let (phase_sender, phase) = watch::channel(Phase::Open);
         let server = web::Data::new(assemble(config, 10, phase).unwrap());
-        let (audiences, started) = std::sync::mpsc::channel();
+        let (broadcasters, started) = std::sync::mpsc::channel();
         let app = move || {
-            let audience = web::Data::new(CurrentAudience::start(Arc::clone(&server)));
-            audiences.send(audience.get()).unwrap();
-            App::new().app_data(server.clone()).app_data(audience).configure(configure)
+            let broadcaster = web::Data::new(LocalBroadcaster::start(Arc::clone(&server)));
+            broadcasters.send(broadcaster.get()).unwrap();
+            App::new().app_data(server.clone()).app_data(broadcaster).configure(configure)
         };
         let http = HttpServer::new(app).workers(1).disable_signals().bind(("127.0.0.1", 0)).unwrap();
         let url = format!("ws://{}/session", http.addrs()[0]);

@@ -8,8 +8,8 @@ use super::stand_in::{Manner, StandIn};
 use super::{addresses, times_logged, until_states};
 use crate::support::client::Client;
 use crate::support::git::world;
-use crate::support::http;
 use crate::support::program::{Builder, Server, session_server};
+use crate::support::{http, until};
 
 /// A session server whose simulation servers report once, so that a test stands between two reports.
 fn between_reports(servers: &[StandIn], client_cost: f64) -> Builder {
@@ -140,28 +140,32 @@ async fn a_server_that_reports_only_its_load_is_taken_as_accepting() {
 
 #[actix_rt::test]
 async fn somebody_who_only_asks_does_not_close_the_fleet() {
-    let idle = json!({"load": 10, "instances": {"queued": 0, "starting": 0, "idle": 0, "running": 0, "places": 100,
+    let counting = json!({"load": 10, "instances": {"queued": 0, "starting": 0, "idle": 0, "running": 0, "places": 100,
         "arrivals": 0}});
-    let servers = [StandIn::start(Manner::Status(idle))];
-    // The tests' own address is a proxy's; what it says of its clients counts.
-    let session = session_server(&addresses(&servers)).set("timing", json!({"placement": 0.5})).start().await;
-    until_states(&session, &["up"]).await;
-    let ask = async || {
-        let client =
-            awc::Client::default().get(session.url("/session")).insert_header(("X-Forwarded-For", "203.0.113.9"));
-        client.send().await.unwrap().status().as_u16()
-    };
-    // It has room for 43; so many and more are asked for within each half second.
-    let begin = std::time::Instant::now();
-    let mut refused_late = 0;
-    while begin.elapsed() < std::time::Duration::from_secs(4) {
-        let status = ask().await;
-        if begin.elapsed() > std::time::Duration::from_secs(2) {
-            refused_late += u32::from(status != 200);
+    // Each has room for 43 clients.
+    for manner in [Manner::Status(counting), Manner::Load("10".to_owned())] {
+        let servers = [StandIn::start(manner)];
+        // The tests' own address is that of a proxy, which is believed on its clients' addresses.
+        let session = session_server(&addresses(&servers)).set("timing", json!({"placement": 0.5})).start().await;
+        until_states(&session, &["up"]).await;
+        let url = session.url("/session");
+        let ask = async || {
+            let request = awc::Client::default().get(&url).insert_header(("X-Forwarded-For", "203.0.113.9"));
+            request.send().await.unwrap().body().await.unwrap().starts_with(b"ws://")
+        };
+        // The address uses up its quota.
+        let mut refused = 0;
+        until("it has asked for what closes the fleet, and is refused no longer", async || {
+            let answers = futures_util::future::join_all((0..50).map(|_| ask())).await;
+            refused += answers.iter().filter(|placed| !**placed).count();
+            refused > 0 && answers.iter().all(|placed| *placed)
+        })
+        .await;
+        // From then on, no number of requests closes the fleet.
+        for _ in 0..40 {
+            assert!(futures_util::future::join_all((0..50).map(|_| ask())).await.iter().all(|placed| *placed));
         }
-        actix_rt::time::sleep(std::time::Duration::from_millis(4)).await;
     }
-    assert_eq!(refused_late, 0, "the one server is closed though nobody comes");
 }
 
 #[actix_rt::test]

@@ -80,8 +80,8 @@ pub struct SessionConfig {
     /// Seconds between two requests for the load of a simulation server. Default: 1.
     #[serde(default = "default_load_refresh", with = "seconds")]
     pub load_refresh: Duration,
-    /// How much load (percent) a client is expected to add to a simulation server, until its reports show how much it is.
-    /// Default: 2.
+    /// How much load (percent) a client adds to a simulation server that reports only its load. For the others it is
+    /// learned, starting from this. Default: 2.
     #[serde(default = "default_client_cost", deserialize_with = "percent")]
     pub client_cost: f64,
     /// How many client `WebSockets` may be open in all. Default: 20000.
@@ -132,7 +132,7 @@ impl SessionConfig {
     pub fn policy(&self) -> Policy {
         Policy {
             threshold: self.load_threshold,
-            initial_cost: self.client_cost,
+            client_cost: self.client_cost,
             patience: self.timing.placement,
             settling: SETTLING,
         }

@@ -1,4 +1,4 @@
-//! Changes of simulation servers' states: each is one log line, one line of `/monitor`, and the notices to the
+//! Changes of the state of simulation servers: each is one log line, one line of `/monitor`, and the notices to the
 //! administrator. Part of the registry.
 
 use std::collections::VecDeque;
@@ -6,12 +6,12 @@ use std::collections::VecDeque;
 use actix::prelude::*;
 
 use super::fleet_status::{State, StateChange};
-use super::server_record::{Change, Watched};
+use super::server_record::{Change, ServerRecord};
 use crate::session::config::SessionConfig;
 use crate::session::mail::{self, Mailer, Notice, Topic};
 use crate::shared::domain::PublicAddress;
 
-/// The last changes, and who else is told of them.
+/// The last changes, and the mailer that tells the administrator.
 pub struct Changes {
     recent: VecDeque<StateChange>,
     mailer: Option<Addr<Mailer>>,
@@ -27,22 +27,22 @@ impl Changes {
         Self { recent: VecDeque::new(), mailer }
     }
 
-    /// Starts another mailer if the one that was there has panicked: an actor is not started again by itself.
-    pub fn look_after_mailer(&mut self, config: &SessionConfig) {
+    /// Starts another mailer if the last one has panicked: actix does not restart an actor that has.
+    pub fn restart_mailer_if_gone(&mut self, config: &SessionConfig) {
         if self.mailer.as_ref().is_some_and(|mailer| !mailer.connected()) {
             log::error!("the mailer is gone, a new one is started; what it had not sent is lost");
             self.mailer = mail::start(config);
         }
     }
 
-    /// The last changes, the newest first.
+    /// Returns the last changes, the newest first.
     #[must_use]
     pub fn recent(&self) -> &VecDeque<StateChange> {
         &self.recent
     }
 
-    /// Tells a change of a server, which is now as it is `watched`.
-    pub fn tell(&mut self, server: &PublicAddress, watched: &Watched, change: Change) {
+    /// Adds a change of a server whose record is now `record`.
+    pub fn add(&mut self, server: &PublicAddress, record: &ServerRecord, change: Change) {
         let Change { state, still, at, why, events } = change;
         let level = if state == State::Down { log::Level::Warn } else { log::Level::Info };
         log::log!(level, "{server}: {}{}: {why}", if still { "still " } else { "" }, state.word());
@@ -52,9 +52,9 @@ impl Changes {
             return;
         };
         // The last that is known: a server that does not answer tells no load, and one that works again no error.
-        let load = watched.report.as_ref().map(|report| report.load);
+        let load = record.report.as_ref().map(|report| report.load);
         for event in events {
-            let error = watched.last_error.as_ref().filter(|_| event.topic() == Topic::Health).map(ToString::to_string);
+            let error = record.last_error.as_ref().filter(|_| event.topic() == Topic::Health).map(ToString::to_string);
             let notice = Notice { server: server.clone(), event, load, error, at };
             if let Err(lost) = mailer.try_send(notice) {
                 log::error!("{server}: no notice is sent: {lost}");

@@ -1,4 +1,4 @@
-//! What the session server knows of its fleet, as it is shown. Plain data.
+//! The status of the fleet, for pages and metrics. Plain data.
 
 use std::collections::VecDeque;
 use std::time::{Duration, Instant, SystemTime};
@@ -27,19 +27,19 @@ pub struct ServerStatus {
     pub address: PublicAddress,
     /// Its state.
     pub state: State,
-    /// Since when.
+    /// Since when it has been in that state.
     pub since: SystemTime,
-    /// What it said last.
+    /// Its last report.
     pub report: Option<ServerReport>,
-    /// Why it gave no usable answer, if it did not.
+    /// Why the last probe failed, if it did.
     pub error: Option<String>,
-    /// Last report, and the clients that it can't show yet.
+    /// The reported load and that of the clients it does not show yet, in percent.
     pub effective_load: Option<f64>,
-    /// Clients that were sent there and have not come yet.
+    /// How many clients were sent there and have not come yet.
     pub in_flight: usize,
-    /// What one more client is expected to cost, in percent.
+    /// What one more client is expected to cost, in percent of load.
     pub client_cost: Option<f64>,
-    /// How long it took to answer.
+    /// How long the last probe took.
     pub latency: Option<Duration>,
     /// When it last gave a good answer.
     pub answered: Option<Instant>,
@@ -48,13 +48,13 @@ pub struct ServerStatus {
 /// The state of a simulation server.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum State {
-    /// It was not heard of yet.
+    /// It was not probed yet.
     Unknown,
     /// It takes clients.
     Up,
     /// Its load leaves no room for one more client, or it has no place left.
     Full,
-    /// It takes no new clients because somebody wants it to end.
+    /// It takes no new clients, because it or the configuration says so.
     Draining,
     /// It gives no usable answer.
     Down,
@@ -63,18 +63,18 @@ pub enum State {
 /// A simulation server has changed its state.
 #[derive(Debug, Clone)]
 pub struct StateChange {
-    /// When.
+    /// When it changed.
     pub at: SystemTime,
     /// The simulation server.
     pub server: PublicAddress,
     /// Its new state.
     pub state: State,
-    /// Why.
+    /// Why, in words.
     pub why: String,
 }
 
 impl State {
-    /// In one word.
+    /// The name of the state, as pages and metrics have it.
     #[must_use]
     pub fn word(self) -> &'static str {
         match self {
@@ -87,8 +87,8 @@ impl State {
     }
 }
 
-/// The mean load as `/load` tells it: -1 where no server answers.
+/// Returns the mean load as `/load` shows it, in percent: -1 where no server answers.
 #[must_use]
-pub fn told_mean(mean_load: Option<f64>) -> f64 {
+pub fn displayed_mean_load(mean_load: Option<f64>) -> f64 {
     mean_load.and_then(|mean| Load::try_from(mean).ok()).map_or(-1.0, Load::percent)
 }

@@ -1,16 +1,17 @@
 //! The simulation servers: who is there, what each last told, and which one gets the next client.
 
+mod caching_resolver;
 mod changes;
 mod fleet_status;
 mod pick;
 mod probe_error;
+mod quota;
 mod registry;
-mod resolver;
 mod server_monitor;
 mod server_record;
 mod subscribers;
 
-pub use fleet_status::{FleetStatus, ServerStatus, State, StateChange, told_mean};
+pub use fleet_status::{FleetStatus, ServerStatus, State, StateChange, displayed_mean_load};
 pub use pick::{NoServer, Pick};
 pub use registry::{GetStatus, IsAvailable, Reconfigure, Registry, Subscribe};
-pub use subscribers::{News, Subscribers};
+pub use subscribers::{Subscribers, Update};

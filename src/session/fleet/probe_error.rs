@@ -1,36 +1,28 @@
-//! Why nothing usable came from a simulation server. Pure.
+//! Why a probe of a simulation server failed. Pure.
 
-use std::fmt;
 use std::time::Duration;
 
 /// Why a simulation server gave no usable answer.
-#[derive(Debug, Clone, PartialEq)]
-pub enum Unreachable {
-    /// No connection, or one that broke.
-    Refused(String),
-    /// No whole answer in time.
-    TimedOut(Duration),
-    /// An answer that makes no sense.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum ProbeError {
+    /// There was no connection, or it broke.
+    #[error("no connection: {0}")]
+    Connection(String),
+    /// The answer was not complete in time.
+    #[error("no answer within {} s", .0.as_secs_f64())]
+    Timeout(Duration),
+    /// The answer can't be used.
+    #[error("an answer that makes no sense: {0}")]
     BadAnswer(String),
     /// It answers, and says that it can start no simulation.
+    #[error("it can start no simulation: {0}")]
     NotReady(String),
 }
 
-impl Unreachable {
-    /// Whether both are of one kind, whatever their words.
+impl ProbeError {
+    /// Whether both are the same variant, whatever their details.
     #[must_use]
-    pub fn is_like(&self, other: &Self) -> bool {
+    pub fn is_same_kind(&self, other: &Self) -> bool {
         std::mem::discriminant(self) == std::mem::discriminant(other)
-    }
-}
-
-impl fmt::Display for Unreachable {
-    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::Refused(why) => write!(out, "no connection: {why}"),
-            Self::TimedOut(limit) => write!(out, "no answer within {} s", limit.as_secs_f64()),
-            Self::NotReady(why) => write!(out, "it can start no simulation: {why}"),
-            Self::BadAnswer(what) => write!(out, "an answer that makes no sense: {what}"),
-        }
     }
 }

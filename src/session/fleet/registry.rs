@@ -1,8 +1,8 @@
-//! Actor: owns the fleet's state and the subscribers; answers picks; pushes changes.
+//! Actor: owns the state of the fleet and the subscribers; answers picks; sends updates.
 //!
-//! One for the whole server, created at start; it never ends. It alone decides availability: it hears of every report
-//! and of every pick, so that a pick counts at once. It makes a monitor for each simulation server, and a new one if
-//! a monitor has panicked.
+//! One for the whole server, created at start; it never ends. It alone decides availability: it gets every report and
+//! every pick, so that a pick counts at once. It starts a monitor for each simulation server, and another one if a
+//! monitor has panicked.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::net::IpAddr;
@@ -15,10 +15,11 @@ use rustls::ClientConfig;
 use super::changes::Changes;
 use super::fleet_status::{FleetStatus, ServerStatus};
 use super::pick::{NoServer, Pick};
-use super::probe_error::Unreachable;
-use super::server_monitor::{Forget, Reported, ServerMonitor, Watch};
-use super::server_record::Watched;
-use super::subscribers::{News, Subscribers};
+use super::probe_error::ProbeError;
+use super::quota::PlacementQuota;
+use super::server_monitor::{ProbeResult, ProbeSettings, ServerMonitor, Stop};
+use super::server_record::ServerRecord;
+use super::subscribers::{Subscribers, Update};
 use crate::session::config::SessionConfig;
 use crate::session::mail::Mailer;
 use crate::session::placement::Fleet;
@@ -28,22 +29,22 @@ use crate::shared::domain::PublicAddress;
 use crate::shared::domain::ServerReport;
 use crate::shared::http::tls;
 
-/// Asks to be told of availability, now and whenever it changes.
+/// Asks for an update now, and for another one whenever availability changes.
 #[derive(Message)]
 #[rtype(result = "()")]
-pub struct Subscribe(pub Recipient<News>);
+pub struct Subscribe(pub Recipient<Update>);
 
-/// Asks for everything that is known.
+/// Asks for everything that is known of the fleet.
 #[derive(Message)]
 #[rtype(result = "Arc<FleetStatus>")]
 pub struct GetStatus;
 
-/// Asks for availability alone.
+/// Asks whether some simulation server can take a client.
 #[derive(Message)]
 #[rtype(result = "bool")]
 pub struct IsAvailable;
 
-/// Gives another configuration: its simulation servers and thresholds count from now on.
+/// Replaces the configuration; see [`SessionConfig::after`] for what counts at once.
 #[derive(Message)]
 #[rtype(result = "()")]
 pub struct Reconfigure(pub Arc<SessionConfig>);
@@ -51,34 +52,36 @@ pub struct Reconfigure(pub Arc<SessionConfig>);
 /// The actor.
 pub struct Registry {
     config: Arc<SessionConfig>,
-    /// The monitors' thread: what they do must not keep the door waiting.
-    watchers: Arbiter,
-    trust: Option<Arc<ClientConfig>>,
+    /// The thread of all monitors, so that requests of clients do not wait for them.
+    monitors: Arbiter,
+    tls: Option<Arc<ClientConfig>>,
     latencies: prometheus::Histogram,
     fleet: Fleet<PublicAddress>,
-    servers: BTreeMap<PublicAddress, Member>,
+    quota: PlacementQuota,
+    servers: BTreeMap<PublicAddress, Entry>,
     subscribers: Subscribers,
     available: bool,
     changes: Changes,
 }
 
-/// One simulation server and who watches it.
-struct Member {
+/// One simulation server and its monitor.
+struct Entry {
     monitor: Addr<ServerMonitor>,
-    watched: Watched,
+    record: ServerRecord,
 }
 
-/// Between two looks at what changes without a report: placements that expire, monitors that are gone.
-const LOOK: Duration = Duration::from_millis(250);
+/// Time between two checks of what changes without a report: placements that expire, monitors that have panicked.
+const TICK: Duration = Duration::from_millis(250);
 
 impl Registry {
-    /// Prepares the registry; its monitors start with it.
+    /// A registry whose monitors are started with it.
     #[must_use]
     pub fn new(config: Arc<SessionConfig>, mailer: Option<Addr<Mailer>>, latencies: prometheus::Histogram) -> Self {
         Self {
             fleet: Fleet::new(config.policy()),
-            watchers: Arbiter::new(),
-            trust: tls::client_config(),
+            quota: PlacementQuota::new(),
+            monitors: Arbiter::new(),
+            tls: tls::client_config(),
             config,
             latencies,
             servers: BTreeMap::new(),
@@ -97,61 +100,61 @@ impl Registry {
         for address in gone {
             log::info!("{address}: no longer watched");
             self.fleet.remove(&address);
-            if let Some(member) = self.servers.remove(&address) {
-                member.monitor.do_send(Forget);
+            if let Some(entry) = self.servers.remove(&address) {
+                entry.monitor.do_send(Stop);
             }
         }
         for address in listed {
             let drained = drained.contains(address);
-            if let Some(member) = self.servers.get_mut(address) {
-                member.watched.drained = drained;
+            if let Some(entry) = self.servers.get_mut(address) {
+                entry.record.drained = drained;
                 continue;
             }
-            let monitor = self.monitor(address, ctx);
+            let monitor = self.start_monitor(address, ctx);
             self.fleet.add(address.clone());
-            self.servers.insert(address.clone(), Member { monitor, watched: Watched::new(drained) });
+            self.servers.insert(address.clone(), Entry { monitor, record: ServerRecord::new(drained) });
         }
     }
 
-    /// Judges what is known anew: thresholds or drained servers may be others.
-    fn judge_again(&mut self) {
-        let known = self.servers.iter().filter_map(|(address, member)| {
-            let watched = &member.watched;
-            Some((address.clone(), Ok(watched.current()?.clone()), watched.answered?))
+    /// Evaluates the last reports once more, after thresholds or drained servers have changed.
+    fn reevaluate(&mut self) {
+        let current = self.servers.iter().filter_map(|(address, entry)| {
+            let record = &entry.record;
+            Some((address.clone(), Ok(record.current()?.clone()), record.answered?))
         });
-        for (address, answer, at) in known.collect::<Vec<_>>() {
-            self.take_in(&address, answer, at);
+        for (address, answer, at) in current.collect::<Vec<_>>() {
+            self.record(&address, answer, at);
         }
     }
 
-    fn watch(&self) -> Watch {
-        Watch { refresh: self.config.load_refresh, patience: self.config.timing.answer, ssl: self.config.ssl }
+    fn probe_settings(&self) -> ProbeSettings {
+        ProbeSettings { interval: self.config.load_refresh, timeout: self.config.timing.answer, ssl: self.config.ssl }
     }
 
-    fn monitor(&self, address: &PublicAddress, ctx: &mut Context<Self>) -> Addr<ServerMonitor> {
-        let reports = ctx.address().recipient();
-        let (address, watch, trust) = (address.clone(), self.watch(), self.trust.clone());
-        ServerMonitor::start_in_arbiter(&self.watchers.handle(), move |_| {
-            ServerMonitor::new(address, watch, trust, reports)
+    fn start_monitor(&self, address: &PublicAddress, ctx: &mut Context<Self>) -> Addr<ServerMonitor> {
+        let results = ctx.address().recipient();
+        let (address, settings, tls) = (address.clone(), self.probe_settings(), self.tls.clone());
+        ServerMonitor::start_in_arbiter(&self.monitors.handle(), move |_| {
+            ServerMonitor::new(address, settings, tls, results)
         })
     }
 
-    /// What happens without a message.
-    fn look(&mut self, ctx: &mut Context<Self>) {
-        let lost = self.servers.iter().filter(|(_, member)| !member.monitor.connected());
-        for address in lost.map(|(address, _)| address.clone()).collect::<Vec<_>>() {
+    fn tick(&mut self, ctx: &mut Context<Self>) {
+        let panicked = self.servers.iter().filter(|(_, entry)| !entry.monitor.connected());
+        for address in panicked.map(|(address, _)| address.clone()).collect::<Vec<_>>() {
             log::error!("{address}: its monitor is gone, a new one is started");
-            let monitor = self.monitor(&address, ctx);
-            if let Some(member) = self.servers.get_mut(&address) {
-                member.monitor = monitor;
+            let monitor = self.start_monitor(&address, ctx);
+            if let Some(entry) = self.servers.get_mut(&address) {
+                entry.monitor = monitor;
             }
         }
-        self.changes.look_after_mailer(&self.config);
+        self.changes.restart_mailer_if_gone(&self.config);
+        self.quota.clean_up();
         self.publish();
-        self.subscribers.tell_late(News::Availability(self.available));
+        self.subscribers.retry(Update::Availability(self.available));
     }
 
-    /// Tells the subscribers, if availability has changed.
+    /// Sends an update to the subscribers if availability has changed.
     fn publish(&mut self) {
         let available = self.fleet.available(Instant::now());
         if available == self.available {
@@ -159,37 +162,39 @@ impl Registry {
         }
         self.available = available;
         log::info!("{} simulation server is available", if available { "a" } else { "no" });
-        self.subscribers.tell(News::Availability(self.available));
+        self.subscribers.send(Update::Availability(self.available));
     }
 
-    /// Takes in what came of a server at this time.
-    fn take_in(&mut self, server: &PublicAddress, answer: Result<ServerReport, Unreachable>, at: Instant) {
-        let Some(Member { watched, .. }) = self.servers.get_mut(server) else {
+    /// Records what a probe of a server brought at this time.
+    fn record(&mut self, server: &PublicAddress, answer: Result<ServerReport, ProbeError>, at: Instant) {
+        let Some(Entry { record, .. }) = self.servers.get_mut(server) else {
             return;
         };
         let change = match answer {
-            Ok(report) => watched.said(report, at, self.fleet.limit(server).unwrap_or(self.config.load_threshold)),
-            Err(error) => watched.failed(error),
+            Ok(report) => record.succeeded(report, at, self.fleet.limit(server).unwrap_or(self.config.load_threshold)),
+            Err(error) => record.failed(error),
         };
-        match watched.for_placement() {
+        match record.for_placement() {
             Some(report) => self.fleet.report(server, at, report),
             None => self.fleet.lose(server),
         }
         if let Some(change) = change {
-            self.changes.tell(server, watched, change);
+            self.changes.add(server, record, change);
         }
     }
 
-    /// Which server gets a client.
+    /// Chooses a server for a client of this address.
     fn pick(&mut self, world: Option<&ProjectUrl>, from: Option<IpAddr>) -> Result<PublicAddress, NoServer> {
         let Self { fleet, servers, .. } = self;
         let accepts = |address: &PublicAddress, world: &ProjectUrl| {
-            // One that has said nothing yet may accept it.
+            // One that has not answered yet may accept it.
             let says = |report: &ServerReport| report.accepts(world);
-            servers.get(address).is_some_and(|member| member.watched.report.as_ref().is_none_or(says))
+            servers.get(address).is_some_and(|entry| entry.record.report.as_ref().is_none_or(says))
         };
         let eligible = |address: &PublicAddress| world.is_none_or(|world| accepts(address, world));
-        let picked = fleet.place_from(Instant::now(), from, eligible);
+        let now = Instant::now();
+        let picked =
+            if self.quota.take(from) { fleet.place(now, eligible) } else { fleet.place_without_room(now, eligible) };
         picked.ok_or_else(|| match world {
             Some(world) if !servers.is_empty() && !servers.keys().any(|address| accepts(address, world)) => {
                 NoServer::NotAccepted(world.repository())
@@ -198,12 +203,12 @@ impl Registry {
         })
     }
 
-    fn status_of(&self, address: &PublicAddress, now: Instant) -> Option<ServerStatus> {
-        let status = self.servers.get(address)?.watched.status(address);
+    fn status_of(&self, address: &PublicAddress) -> Option<ServerStatus> {
+        let status = self.servers.get(address)?.record.status(address);
         Some(ServerStatus {
-            effective_load: self.fleet.effective_load(address, now),
-            in_flight: self.fleet.in_flight(address, now),
-            client_cost: self.fleet.learned_cost(address),
+            effective_load: self.fleet.effective_load(address),
+            in_flight: self.fleet.in_flight(address),
+            client_cost: self.fleet.client_cost(address),
             ..status
         })
     }
@@ -213,23 +218,22 @@ impl Actor for Registry {
     type Context = Context<Self>;
 
     fn started(&mut self, ctx: &mut Self::Context) {
-        // Requests and reports of a whole fleet may come in the same moment; what is more waits outside.
+        // The requests and reports of a whole fleet may come in the same moment.
         ctx.set_mailbox_capacity(4096);
         self.apply(ctx);
-        ctx.run_interval(LOOK, Self::look);
+        ctx.run_interval(TICK, Self::tick);
     }
 }
 
-impl Handler<Reported> for Registry {
+impl Handler<ProbeResult> for Registry {
     type Result = ();
 
-    fn handle(&mut self, report: Reported, _: &mut Self::Context) {
-        let Reported { server, latency, answer } = report;
+    fn handle(&mut self, ProbeResult { server, latency, answer }: ProbeResult, _: &mut Self::Context) {
         self.latencies.observe(latency.as_secs_f64());
-        if let Some(member) = self.servers.get_mut(&server) {
-            member.watched.latency = Some(latency);
+        if let Some(entry) = self.servers.get_mut(&server) {
+            entry.record.latency = Some(latency);
         }
-        self.take_in(&server, answer, Instant::now());
+        self.record(&server, answer, Instant::now());
         self.publish();
     }
 }
@@ -247,8 +251,8 @@ impl Handler<Pick> for Registry {
 impl Handler<Subscribe> for Registry {
     type Result = ();
 
-    fn handle(&mut self, Subscribe(audience): Subscribe, _: &mut Self::Context) {
-        self.subscribers.add(audience, Some(News::Availability(self.available)));
+    fn handle(&mut self, Subscribe(recipient): Subscribe, _: &mut Self::Context) {
+        self.subscribers.add(recipient, Some(Update::Availability(self.available)));
     }
 }
 
@@ -264,11 +268,10 @@ impl Handler<GetStatus> for Registry {
     type Result = MessageResult<GetStatus>;
 
     fn handle(&mut self, _: GetStatus, _: &mut Self::Context) -> Self::Result {
-        let now = Instant::now();
-        let servers = self.config.simulation_servers.iter().filter_map(|address| self.status_of(address, now));
+        let servers = self.config.simulation_servers.iter().filter_map(|address| self.status_of(address));
         MessageResult(Arc::new(FleetStatus {
             available: self.available,
-            mean_load: Load::mean(self.servers.values().filter_map(|member| member.watched.load())),
+            mean_load: Load::mean(self.servers.values().filter_map(|entry| entry.record.load())),
             servers: servers.collect(),
             changes: self.changes.recent().clone(),
         }))
@@ -279,18 +282,18 @@ impl Handler<Reconfigure> for Registry {
     type Result = ();
 
     fn handle(&mut self, Reconfigure(config): Reconfigure, ctx: &mut Self::Context) {
-        let before = self.watch();
+        let before = self.probe_settings();
         let config = Arc::new(config.after(&self.config));
-        self.fleet.set_policy(Instant::now(), config.policy());
+        self.fleet.set_policy(config.policy());
         self.config = config;
         self.apply(ctx);
-        let watch = self.watch();
-        if watch != before {
-            for member in self.servers.values() {
-                member.monitor.do_send(watch);
+        let settings = self.probe_settings();
+        if settings != before {
+            for entry in self.servers.values() {
+                entry.monitor.do_send(settings);
             }
         }
-        self.judge_again();
+        self.reevaluate();
         self.publish();
     }
 }

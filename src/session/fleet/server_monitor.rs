@@ -1,12 +1,12 @@
-//! Actor: watches one simulation server.
+//! Actor: probes one simulation server.
 //!
-//! Created by the registry for each address in `simulationServers`. Every [`Watch::refresh`] it asks the server for its
-//! state, with one request in flight at most, and tells the registry what came: it judges nothing itself. A report for which
-//! the registry has no room is lost: the next look makes another. It ends when the registry says so; after a panic the
-//! registry makes a new one.
+//! Created by the registry for each address in `simulationServers`. Every [`ProbeSettings::interval`] it asks the server
+//! for its state, one request at a time, and sends the result to the registry without judging it. A result for which the
+//! registry's mailbox has no room is dropped: there will be another one. The monitor ends when the registry says so; after
+//! a panic the registry starts a new one.
 //!
-//! It asks for `/status`; a server that has no such page is asked for `/load`, as the original is. Nothing that comes is
-//! trusted: the whole exchange has one time limit, an answer has a largest size, and a load must be one.
+//! It asks for `/status`, and for `/load` where a server has no such page, as the original is asked. No answer is trusted:
+//! a probe as a whole has a time limit, an answer has a largest size, and a load must be a number that makes sense.
 
 use std::sync::{Arc, LazyLock};
 use std::time::{Duration, Instant};
@@ -17,148 +17,150 @@ use awc::error::{ConnectError, SendRequestError};
 use awc::http::StatusCode;
 use rustls::ClientConfig;
 
-use super::probe_error::Unreachable;
-use super::resolver::Names;
+use super::caching_resolver::CachingResolver;
+use super::probe_error::ProbeError;
 use crate::shared::domain::Load;
 use crate::shared::domain::PublicAddress;
 use crate::shared::domain::ServerReport;
 use crate::shared::domain::one_line;
 use crate::shared::http::tls;
 
-/// What was learned about a simulation server.
+/// What a probe of a simulation server brought.
 #[derive(Message, Debug)]
 #[rtype(result = "()")]
-pub struct Reported {
+pub struct ProbeResult {
     /// The server.
     pub server: PublicAddress,
-    /// How long it took to answer, or until that was given up.
+    /// How long the probe took.
     pub latency: Duration,
-    /// What it said of itself, or why it can't be counted on.
-    pub answer: Result<ServerReport, Unreachable>,
+    /// The server's report, or why there is none.
+    pub answer: Result<ServerReport, ProbeError>,
 }
 
-/// How often and how patiently a server is asked. As a message it changes a monitor's ways.
+/// How a server is probed. As a message it changes the settings of a monitor.
 #[derive(Message, Debug, Clone, Copy, PartialEq)]
 #[rtype(result = "()")]
-pub struct Watch {
-    /// Between two looks.
-    pub refresh: Duration,
-    /// How long an answer may take.
-    pub patience: Duration,
+pub struct ProbeSettings {
+    /// Time between the begins of two probes.
+    pub interval: Duration,
+    /// How long a probe may take.
+    pub timeout: Duration,
     /// Whether the fleet is behind https.
     pub ssl: bool,
 }
 
-/// Asks a monitor to end: its server is no longer one of the fleet.
+/// Asks a monitor to end.
 #[derive(Message)]
 #[rtype(result = "()")]
-pub struct Forget;
+pub struct Stop;
 
 /// The actor.
 pub struct ServerMonitor {
     server: PublicAddress,
-    watch: Watch,
+    settings: ProbeSettings,
     client: awc::Client,
-    reports: Recipient<Reported>,
-    asking: bool,
-    /// The next look, or all that follow.
-    looks: SpawnHandle,
+    results: Recipient<ProbeResult>,
+    probing: bool,
+    /// The timer of the next probe, or of all that follow.
+    timer: SpawnHandle,
     /// Until when a server that has no `/status` is asked for `/load` alone.
     load_only_until: Option<Instant>,
 }
 
 /// The largest answer that is read, in bytes.
 const LARGEST_ANSWER: usize = 1024 * 1024;
-/// A load beyond this is none, in percent.
+/// The highest load that is believed, in percent.
 const LARGEST_LOAD: f64 = 1000.0;
-/// Longer than any time limit of a look.
+/// Longer than any probe may take: awc has time limits of its own, which can't all be turned off.
 const NEVER: Duration = Duration::from_hours(24);
-/// Monitors are woken together that are to look within so much time.
-const MOMENT: Duration = Duration::from_millis(10);
-/// From when moments are counted.
+/// Probes of all monitors begin at multiples of this time, so that the thread is woken once for many of them.
+const SLOT: Duration = Duration::from_millis(10);
+/// From when slots are counted.
 static BEGIN: LazyLock<Instant> = LazyLock::new(Instant::now);
-/// For how long a server is taken to have no `/status`.
+/// How long a server that has no `/status` is asked for `/load` alone.
 const LOAD_ONLY: Duration = Duration::from_mins(1);
 
-/// What a server says that has no such page: some know no better than that the request is wrong.
+/// The statuses of a server that has no such page; some servers answer only that the request is wrong.
 const NO_SUCH_PAGE: [StatusCode; 4] =
     [StatusCode::NOT_FOUND, StatusCode::BAD_REQUEST, StatusCode::METHOD_NOT_ALLOWED, StatusCode::NOT_IMPLEMENTED];
 
-/// What was understood of an answer.
+/// A usable answer.
 enum Answer {
     Status(ServerReport),
     /// There is no `/status`, but a `/load`.
     Load(Load),
 }
 
-/// What a monitor asks with: it keeps one connection to its simulation server.
-fn client(refresh: Duration, trust: Option<Arc<ClientConfig>>) -> awc::Client {
-    let idle = (refresh * 3).max(Duration::from_secs(15));
-    // A look as a whole has a time limit, its parts have none.
-    let names = Resolver::custom(Names::default());
-    let tcp = TcpConnector::new(names).service();
+/// An HTTP client that keeps one connection to the simulation server.
+fn client(interval: Duration, tls: Option<Arc<ClientConfig>>) -> awc::Client {
+    let idle = (interval * 3).max(Duration::from_secs(15));
+    // A probe as a whole has a time limit, its parts have none.
+    let resolver = Resolver::custom(CachingResolver::default());
+    let tcp = TcpConnector::new(resolver).service();
     let mut connector = awc::Connector::new().connector(tcp).conn_keep_alive(idle).timeout(NEVER);
-    if let Some(config) = trust {
+    if let Some(config) = tls {
         connector = connector.rustls_0_23(config);
     }
     awc::Client::builder().connector(connector).disable_timeout().disable_redirects().finish()
 }
 
 impl ServerMonitor {
-    /// A monitor of one server, which trusts these authorities. To be made in the thread in which it is to live.
+    /// A monitor of one server. To be created in the thread in which it will run.
     #[must_use]
     pub fn new(
         server: PublicAddress,
-        watch: Watch,
-        trust: Option<Arc<ClientConfig>>,
-        reports: Recipient<Reported>,
+        settings: ProbeSettings,
+        tls: Option<Arc<ClientConfig>>,
+        results: Recipient<ProbeResult>,
     ) -> Self {
-        let looks = SpawnHandle::default();
-        let client = client(watch.refresh, trust);
-        Self { server, watch, client, reports, asking: false, looks, load_only_until: None }
+        let timer = SpawnHandle::default();
+        let client = client(settings.interval, tls);
+        Self { server, settings, client, results, probing: false, timer, load_only_until: None }
     }
 
-    /// Asks now, and then at regular times that are those of few other monitors: were the whole fleet asked in the same
-    /// moment, the door would wait meanwhile; were each asked in a moment of its own, the thread would be woken for each.
-    fn begin(&mut self, ctx: &mut Context<Self>) {
-        ctx.cancel_future(self.looks);
-        self.ask(ctx);
+    /// Probes now, and then at regular times in a random slot: if all servers were probed in the same slot, clients would
+    /// wait meanwhile.
+    fn start_probing(&mut self, ctx: &mut Context<Self>) {
+        ctx.cancel_future(self.timer);
+        self.probe(ctx);
         let since = BEGIN.elapsed();
-        let first = (since + self.watch.refresh.mul_f64(rand::random())).div_duration_f64(MOMENT).ceil();
-        let first = MOMENT.mul_f64(first).saturating_sub(since);
-        self.looks = ctx.run_later(first, |monitor, ctx| {
-            monitor.ask(ctx);
-            monitor.looks = ctx.run_interval(monitor.watch.refresh, Self::ask);
+        let first = (since + self.settings.interval.mul_f64(rand::random())).div_duration_f64(SLOT).ceil();
+        let first = SLOT.mul_f64(first).saturating_sub(since);
+        self.timer = ctx.run_later(first, |monitor, ctx| {
+            monitor.probe(ctx);
+            monitor.timer = ctx.run_interval(monitor.settings.interval, Self::probe);
         });
     }
 
-    fn ask(&mut self, ctx: &mut Context<Self>) {
-        if std::mem::replace(&mut self.asking, true) {
+    fn probe(&mut self, ctx: &mut Context<Self>) {
+        if std::mem::replace(&mut self.probing, true) {
             return;
         }
-        let (client, url, patience) = (self.client.clone(), self.server.http_url(self.watch.ssl), self.watch.patience);
+        let ProbeSettings { timeout, ssl, .. } = self.settings;
+        let (client, url) = (self.client.clone(), self.server.http_url(ssl));
         let load_only = self.load_only_until.is_some_and(|end| Instant::now() < end);
         let begun = Instant::now();
-        let exchange = async move {
-            let answer = actix_rt::time::timeout(patience, exchange(&client, &url, load_only)).await;
-            (answer.unwrap_or(Err(Unreachable::TimedOut(patience))), begun.elapsed())
+        let probe = async move {
+            let answer = actix_rt::time::timeout(timeout, probe(&client, &url, load_only)).await;
+            (answer.unwrap_or(Err(ProbeError::Timeout(timeout))), begun.elapsed())
         };
-        exchange
+        probe
             .into_actor(self)
             .map(|(answer, latency), monitor, ctx| {
-                monitor.asking = false;
-                let answer = answer.map(|answer| monitor.understood(answer));
-                match monitor.reports.try_send(Reported { server: monitor.server.clone(), latency, answer }) {
+                monitor.probing = false;
+                let answer = answer.map(|answer| monitor.report(answer));
+                match monitor.results.try_send(ProbeResult { server: monitor.server.clone(), latency, answer }) {
                     Ok(()) => {}
                     Err(SendError::Full(_)) => log::warn!("{}: a report is lost, too many are waiting", monitor.server),
-                    // Without a registry there is nothing to do.
+                    // The registry is gone, and with it the server.
                     Err(SendError::Closed(_)) => ctx.stop(),
                 }
             })
             .spawn(ctx);
     }
 
-    fn understood(&mut self, answer: Answer) -> ServerReport {
+    /// Makes a report of an answer, and notes which page the server has.
+    fn report(&mut self, answer: Answer) -> ServerReport {
         match answer {
             Answer::Status(report) => report,
             Answer::Load(load) => {
@@ -175,41 +177,44 @@ impl Actor for ServerMonitor {
     type Context = Context<Self>;
 
     fn started(&mut self, ctx: &mut Self::Context) {
-        self.begin(ctx);
+        self.start_probing(ctx);
     }
 }
 
-impl Handler<Watch> for ServerMonitor {
+impl Handler<ProbeSettings> for ServerMonitor {
     type Result = ();
 
-    fn handle(&mut self, watch: Watch, ctx: &mut Self::Context) {
-        self.watch = watch;
-        self.begin(ctx);
+    fn handle(&mut self, settings: ProbeSettings, ctx: &mut Self::Context) {
+        self.settings = settings;
+        self.start_probing(ctx);
     }
 }
 
-impl Handler<Forget> for ServerMonitor {
+impl Handler<Stop> for ServerMonitor {
     type Result = ();
 
-    fn handle(&mut self, _: Forget, ctx: &mut Self::Context) {
+    fn handle(&mut self, _: Stop, ctx: &mut Self::Context) {
         ctx.stop();
     }
 }
 
-async fn exchange(client: &awc::Client, url: &str, load_only: bool) -> Result<Answer, Unreachable> {
+async fn probe(client: &awc::Client, url: &str, load_only: bool) -> Result<Answer, ProbeError> {
     if !load_only && let Some(body) = get(client, &format!("{url}/status")).await? {
         return parse_status(&body).map(Answer::Status);
     }
     let body = get(client, &format!("{url}/load")).await?;
-    let body = body.ok_or_else(|| Unreachable::BadAnswer("it has neither /status nor /load".to_owned()))?;
-    let load = Load::parse(&body).map_err(|error| Unreachable::BadAnswer(shortened(&error.to_string())))?;
+    let body = body.ok_or_else(|| ProbeError::BadAnswer("it has neither /status nor /load".to_owned()))?;
+    let load = Load::parse(&body).map_err(|error| ProbeError::BadAnswer(shortened(&error.to_string())))?;
     plausible(load).map(Answer::Load)
 }
 
-/// The body of a page; nothing where the server says that there is none.
-async fn get(client: &awc::Client, url: &str) -> Result<Option<actix_web::web::Bytes>, Unreachable> {
+/// Returns the body of a page, `None` if the server has no such page.
+///
+/// # Errors
+/// When there is no answer, or one that is neither.
+async fn get(client: &awc::Client, url: &str) -> Result<Option<actix_web::web::Bytes>, ProbeError> {
     let answer = match client.get(url).send().await {
-        // A connection that was kept may have ended just now: that says nothing of the server.
+        // A kept connection may have been closed meanwhile, which is no fault of the server.
         Err(error) if is_broken(&error) => client.get(url).send().await,
         answer => answer,
     }
@@ -219,43 +224,43 @@ async fn get(client: &awc::Client, url: &str) -> Result<Option<actix_web::web::B
         return Ok(None);
     }
     if !status.is_success() {
-        return Err(Unreachable::BadAnswer(format!("status {status}")));
+        return Err(ProbeError::BadAnswer(format!("status {status}")));
     }
     let body = answer.timeout(NEVER).body().limit(LARGEST_ANSWER).await;
-    body.map(Some).map_err(|error| Unreachable::BadAnswer(shortened(&error.to_string())))
+    body.map(Some).map_err(|error| ProbeError::BadAnswer(shortened(&error.to_string())))
 }
 
-/// Whether a connection ended, as opposed to one that could not be made.
+/// Whether a connection broke, as opposed to one that could not be made.
 fn is_broken(error: &SendRequestError) -> bool {
     !matches!(error, SendRequestError::Connect(reason) if !matches!(reason, ConnectError::Disconnected))
 }
 
-fn no_answer(error: SendRequestError) -> Unreachable {
-    Unreachable::Refused(match error {
+fn no_answer(error: SendRequestError) -> ProbeError {
+    ProbeError::Connection(match error {
         SendRequestError::Connect(ConnectError::Disconnected) => "it was closed without an answer".to_owned(),
         error => tls::reason(&error).unwrap_or_else(|| shortened(&error.to_string())),
     })
 }
 
-/// Some servers of the Python family have a `/status` with less in it; a page that is no status at all counts as none.
-fn parse_status(body: &[u8]) -> Result<ServerReport, Unreachable> {
+/// Reads a `/status`; it must have a load, and may lack anything else.
+fn parse_status(body: &[u8]) -> Result<ServerReport, ProbeError> {
     let report = ServerReport::parse(body).map_err(|error| {
         let text = String::from_utf8_lossy(body.get(..body.len().min(40)).unwrap_or_default()).into_owned();
-        Unreachable::BadAnswer(shortened(&format!("{error} in {text:?}")))
+        ProbeError::BadAnswer(shortened(&format!("{error} in {text:?}")))
     })?;
     plausible(report.load)?;
     match &report.problem {
-        Some(problem) => Err(Unreachable::NotReady(shortened(problem))),
+        Some(problem) => Err(ProbeError::NotReady(shortened(problem))),
         None => Ok(report),
     }
 }
 
-fn plausible(load: Load) -> Result<Load, Unreachable> {
+fn plausible(load: Load) -> Result<Load, ProbeError> {
     let is_none = load.percent() > LARGEST_LOAD;
-    if is_none { Err(Unreachable::BadAnswer(shortened(&format!("a load of {load} %")))) } else { Ok(load) }
+    if is_none { Err(ProbeError::BadAnswer(shortened(&format!("a load of {load} %")))) } else { Ok(load) }
 }
 
-/// Words that may hold what somebody else wrote are kept short.
+/// Cuts a text that may contain what somebody else wrote.
 fn shortened(text: &str) -> String {
     one_line(text).chars().take(120).collect()
 }
@@ -285,7 +290,7 @@ mod tests {
             "<html>",
             "\u{0}",
         ] {
-            assert!(matches!(parse_status(odd.as_bytes()), Err(Unreachable::BadAnswer(_))), "{odd:?}");
+            assert!(matches!(parse_status(odd.as_bytes()), Err(ProbeError::BadAnswer(_))), "{odd:?}");
         }
     }
 }

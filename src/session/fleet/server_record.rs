@@ -3,7 +3,7 @@
 use std::time::{Duration, Instant, SystemTime};
 
 use super::fleet_status::{ServerStatus, State};
-use super::probe_error::Unreachable;
+use super::probe_error::ProbeError;
 use crate::session::mail::Event;
 use crate::session::placement;
 use crate::shared::domain::Load;
@@ -12,25 +12,25 @@ use crate::shared::domain::ServerReport;
 
 /// One simulation server.
 #[derive(Debug)]
-pub struct Watched {
+pub struct ServerRecord {
     /// Whether the configuration has it drained.
     pub drained: bool,
     /// Its state.
     pub state: State,
     /// Since when.
     pub since: SystemTime,
-    /// What it said last; kept when it is down.
+    /// Its last report; kept when it is down.
     pub report: Option<ServerReport>,
-    /// Why it gave no usable answer, if it did not.
-    pub error: Option<Unreachable>,
-    /// Why it gave none the last time that it did not.
-    pub last_error: Option<Unreachable>,
-    /// How long it took to answer.
+    /// Why the last probe failed, if it did.
+    pub error: Option<ProbeError>,
+    /// The last error, also when the server has answered since.
+    pub last_error: Option<ProbeError>,
+    /// How long the last probe took.
     pub latency: Option<Duration>,
     /// When it last gave a good answer.
     pub answered: Option<Instant>,
-    /// Whether the administrator was told that it is full, and not yet that it has room again.
-    full_told: bool,
+    /// Whether the last mail about its load says that it is full.
+    told_full: bool,
 }
 
 /// A server has changed its state, or is down for another reason than before.
@@ -48,8 +48,8 @@ pub struct Change {
     pub events: Vec<Event>,
 }
 
-impl Watched {
-    /// A server that was not heard of yet.
+impl ServerRecord {
+    /// A server that was not probed yet.
     #[must_use]
     pub fn new(drained: bool) -> Self {
         Self {
@@ -61,12 +61,13 @@ impl Watched {
             last_error: None,
             latency: None,
             answered: None,
-            full_told: false,
+            told_full: false,
         }
     }
 
-    /// Takes in a good answer that came at this time. From this load on, in percent, the server takes nobody.
-    pub fn said(&mut self, report: ServerReport, at: Instant, limit: f64) -> Option<Change> {
+    /// Records a report that came at this time; the server counts as full from the load `limit` on, in percent. Returns
+    /// what has changed.
+    pub fn succeeded(&mut self, report: ServerReport, at: Instant, limit: f64) -> Option<Change> {
         let (state, why) = self.judge(&report, limit);
         self.report = Some(report);
         self.error = None;
@@ -74,14 +75,14 @@ impl Watched {
         self.enter(state, why)
     }
 
-    /// Takes in that there is no good answer.
-    pub fn failed(&mut self, error: Unreachable) -> Option<Change> {
+    /// Records that a probe has failed. Returns what has changed.
+    pub fn failed(&mut self, error: ProbeError) -> Option<Change> {
         let why = error.to_string();
-        let another = self.error.as_ref().is_some_and(|before| !before.is_like(&error));
+        let another = self.error.as_ref().is_some_and(|before| !before.is_same_kind(&error));
         self.error = Some(error.clone());
         self.last_error = Some(error);
         let change = self.enter(State::Down, || why.clone());
-        // It is down as before, but for another reason: who mends it should know.
+        // It is down as before, but for another reason, which whoever repairs it should know.
         change.or_else(|| {
             another.then(|| Change { state: State::Down, still: true, at: SystemTime::now(), why, events: Vec::new() })
         })
@@ -93,8 +94,8 @@ impl Watched {
         self.report.as_ref().filter(|_| self.state != State::Down)
     }
 
-    /// The last report in the terms of the placement policy; nothing for a server that must not get clients and has
-    /// no other way to say so.
+    /// The last report in the terms of the placement policy; `None` for a server that must not get clients and does not
+    /// count its instances, for which only being down keeps clients away.
     #[must_use]
     pub fn for_placement(&self) -> Option<placement::Report> {
         let report = self.current()?;
@@ -108,7 +109,7 @@ impl Watched {
         (accepting || instances.is_some()).then(|| placement::Report { load: report.load.percent(), instances })
     }
 
-    /// All of it, to be shown; what the placement knows is still to be filled in.
+    /// The status of the server, without what only the placement knows.
     #[must_use]
     pub fn status(&self, address: &PublicAddress) -> ServerStatus {
         ServerStatus {
@@ -125,7 +126,7 @@ impl Watched {
         }
     }
 
-    /// Its load, if it answers.
+    /// The last load, if the server is not down.
     #[must_use]
     pub fn load(&self) -> Option<Load> {
         self.current().map(|report| report.load)
@@ -160,8 +161,8 @@ impl Watched {
         Some(Change { state, still: false, at: self.since, why: why(), events: self.events(before) })
     }
 
-    /// The four events of the original. A server that was full, then down, then up is told of as working again and as
-    /// available again.
+    /// The four events of the original. A server that was full, then down, then up is both working again and available
+    /// again.
     fn events(&mut self, before: State) -> Vec<Event> {
         let mut events = Vec::new();
         match (before, self.state) {
@@ -169,9 +170,9 @@ impl Watched {
             (State::Down, _) => events.push(Event::WorkingAgain),
             _ => {}
         }
-        if self.state == State::Full && !std::mem::replace(&mut self.full_told, true) {
+        if self.state == State::Full && !std::mem::replace(&mut self.told_full, true) {
             events.push(Event::MaximumLoad);
-        } else if self.state == State::Up && std::mem::replace(&mut self.full_told, false) {
+        } else if self.state == State::Up && std::mem::replace(&mut self.told_full, false) {
             events.push(Event::AvailableAgain);
         }
         events
@@ -188,10 +189,10 @@ mod tests {
 
     /// The events of each step: a load, or nothing for a failure.
     fn events(steps: &[Option<f64>]) -> Vec<Vec<Event>> {
-        let mut watched = Watched::new(false);
+        let mut record = ServerRecord::new(false);
         let change = |step: &Option<f64>| match step {
-            Some(load) => watched.said(report(*load), Instant::now(), 95.0),
-            None => watched.failed(Unreachable::Refused(String::new())),
+            Some(load) => record.succeeded(report(*load), Instant::now(), 95.0),
+            None => record.failed(ProbeError::Connection(String::new())),
         };
         steps.iter().map(change).map(|change| change.map(|change| change.events).unwrap_or_default()).collect()
     }
@@ -217,24 +218,24 @@ mod tests {
 
     #[test]
     fn another_reason_is_a_change_without_an_event() {
-        let mut watched = Watched::new(false);
-        let refused = |why: &str| Unreachable::Refused(why.to_owned());
-        assert!(watched.failed(refused("one")).is_some());
-        assert_eq!(watched.failed(refused("other words")), None);
-        let slow = Unreachable::TimedOut(Duration::from_secs(3));
-        let change = watched.failed(slow.clone()).unwrap();
+        let mut record = ServerRecord::new(false);
+        let refused = |why: &str| ProbeError::Connection(why.to_owned());
+        assert!(record.failed(refused("one")).is_some());
+        assert_eq!(record.failed(refused("other words")), None);
+        let slow = ProbeError::Timeout(Duration::from_secs(3));
+        let change = record.failed(slow.clone()).unwrap();
         assert_eq!((change.state, change.why, change.events), (State::Down, "no answer within 3 s".to_owned(), vec![]));
-        assert_eq!(watched.failed(slow), None);
+        assert_eq!(record.failed(slow), None);
     }
 
     #[test]
     fn a_drained_server_is_for_nobody_whether_it_counts_or_not() {
-        let mut watched = Watched::new(true);
-        let change = watched.said(report(1.0), Instant::now(), 95.0).unwrap();
+        let mut record = ServerRecord::new(true);
+        let change = record.succeeded(report(1.0), Instant::now(), 95.0).unwrap();
         assert_eq!((change.state, change.why.as_str()), (State::Draining, "load 1.0 % (drained by drainedServers)"));
-        assert_eq!(watched.for_placement(), None);
-        watched.drained = false;
-        watched.said(report(1.0), Instant::now(), 95.0);
-        assert!(watched.for_placement().is_some());
+        assert_eq!(record.for_placement(), None);
+        record.drained = false;
+        record.succeeded(report(1.0), Instant::now(), 95.0);
+        assert!(record.for_placement().is_some());
     }
 }

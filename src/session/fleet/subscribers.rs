@@ -1,4 +1,4 @@
-//! Who is told the news, and what each was told last. Part of the registry and of each audience.
+//! Who is sent updates, and what each was sent last. Used by the registry and by each broadcaster.
 
 use std::collections::BTreeMap;
 
@@ -7,74 +7,75 @@ use actix::prelude::*;
 /// What web clients are told without asking.
 #[derive(Message, Debug, Clone, Copy, PartialEq, Eq)]
 #[rtype(result = "()")]
-pub enum News {
+pub enum Update {
     /// Whether some simulation server can take a client.
     Availability(bool),
-    /// The server ends.
+    /// The server stops.
     Closing,
-    /// Nobody is there any more to tell it the news.
+    /// The broadcaster is gone: there will be no more updates.
     Lost,
 }
 
-/// The subscribers: each is told the same news once.
+/// The subscribers: each is sent an update only if it differs from the last one.
 #[derive(Default)]
 pub struct Subscribers {
-    /// In the order in which they came: what belongs to them lies in memory in that order too, mostly.
+    /// In the order in which they came, which is mostly the order of their data in memory.
     members: BTreeMap<u64, Subscriber>,
     last: u64,
-    /// Those who could not be told the last change, for their mailboxes were full.
-    late: Vec<u64>,
+    /// Those whose mailbox was full.
+    pending: Vec<u64>,
 }
 
 struct Subscriber {
-    client: Recipient<News>,
-    told: Option<News>,
+    recipient: Recipient<Update>,
+    last: Option<Update>,
 }
 
-/// How telling somebody went.
+/// What became of an update for one subscriber.
 #[derive(PartialEq, Eq)]
-enum Told {
-    Now,
-    Later,
+enum Delivery {
+    Done,
+    MailboxFull,
     Gone,
 }
 
 impl Subscribers {
-    /// Takes in a subscriber and tells it what is known. Gives back its number.
-    pub fn add(&mut self, client: Recipient<News>, news: Option<News>) -> u64 {
+    /// Adds a subscriber and sends it the current state, if there is one. Returns the subscriber's number.
+    pub fn add(&mut self, recipient: Recipient<Update>, current: Option<Update>) -> u64 {
         self.last += 1;
         let id = self.last;
-        let mut subscriber = Subscriber { client, told: None };
-        let told = news.map_or(Told::Now, |news| subscriber.tell(news));
-        if told == Told::Later {
-            self.late.push(id);
+        let mut subscriber = Subscriber { recipient, last: None };
+        let delivery = current.map_or(Delivery::Done, |update| subscriber.send(update));
+        if delivery == Delivery::MailboxFull {
+            self.pending.push(id);
         }
-        if told != Told::Gone {
+        if delivery != Delivery::Gone {
             self.members.insert(id, subscriber);
         }
         id
     }
 
-    /// Forgets a subscriber.
+    /// Removes a subscriber.
     pub fn remove(&mut self, id: u64) {
         self.members.remove(&id);
     }
 
-    /// Tells everybody who was told something else.
-    pub fn tell(&mut self, news: News) {
-        self.late.clear();
-        self.tell_some(0, usize::MAX, news);
+    /// Sends an update to everybody.
+    pub fn send(&mut self, update: Update) {
+        self.pending.clear();
+        self.send_batch(0, usize::MAX, update);
     }
 
-    /// The same for so many of them, from this number on. Gives back where to go on, if there are more.
-    pub fn tell_some(&mut self, from: u64, most: usize, news: News) -> Option<u64> {
+    /// Sends an update to so many subscribers, beginning with this number. Returns where the next batch begins, if there
+    /// is one.
+    pub fn send_batch(&mut self, from: u64, size: usize, update: Update) -> Option<u64> {
         let mut gone = Vec::new();
         let mut members = self.members.range_mut(from..);
-        for (id, subscriber) in members.by_ref().take(most) {
-            match subscriber.tell(news) {
-                Told::Now => {}
-                Told::Later => self.late.push(*id),
-                Told::Gone => gone.push(*id),
+        for (id, subscriber) in members.by_ref().take(size) {
+            match subscriber.send(update) {
+                Delivery::Done => {}
+                Delivery::MailboxFull => self.pending.push(*id),
+                Delivery::Gone => gone.push(*id),
             }
         }
         let next = members.next().map(|(id, _)| *id);
@@ -84,30 +85,30 @@ impl Subscribers {
         next
     }
 
-    /// Tells those who could not be told before.
-    pub fn tell_late(&mut self, news: News) {
-        for id in std::mem::take(&mut self.late) {
-            match self.members.get_mut(&id).map(|subscriber| subscriber.tell(news)) {
-                Some(Told::Later) => self.late.push(id),
-                Some(Told::Gone) => self.remove(id),
-                Some(Told::Now) | None => {}
+    /// Sends the current state to those whose mailbox was full.
+    pub fn retry(&mut self, current: Update) {
+        for id in std::mem::take(&mut self.pending) {
+            match self.members.get_mut(&id).map(|subscriber| subscriber.send(current)) {
+                Some(Delivery::MailboxFull) => self.pending.push(id),
+                Some(Delivery::Gone) => self.remove(id),
+                Some(Delivery::Done) | None => {}
             }
         }
     }
 }
 
 impl Subscriber {
-    fn tell(&mut self, news: News) -> Told {
-        if self.told == Some(news) {
-            return Told::Now;
+    fn send(&mut self, update: Update) -> Delivery {
+        if self.last == Some(update) {
+            return Delivery::Done;
         }
-        match self.client.try_send(news) {
+        match self.recipient.try_send(update) {
             Ok(()) => {
-                self.told = Some(news);
-                Told::Now
+                self.last = Some(update);
+                Delivery::Done
             }
-            Err(SendError::Full(_)) => Told::Later,
-            Err(SendError::Closed(_)) => Told::Gone,
+            Err(SendError::Full(_)) => Delivery::MailboxFull,
+            Err(SendError::Closed(_)) => Delivery::Gone,
         }
     }
 }

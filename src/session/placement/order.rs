@@ -1,14 +1,13 @@
-//! The servers that have room, in the order of their effective load: so that a choice among a thousand costs no more than
-//! one among ten.
+//! The servers that have room, sorted by load, so that a choice among a thousand costs no more than one among ten.
 //!
-//! An effective load changes only with what happens to its server, and when a placement in flight is given up. So each
-//! server is put in its place after whatever happens to it, and again at its next expiry.
+//! A server's load changes only with a report, with a placement, and when a placement is given up. The fleet updates the
+//! order after each of these; `expired` tells which servers have placements to give up.
 
 use std::cmp::Ordering;
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Instant;
 
-/// Where a server stands: the least goes first. Of equal loads the one that has waited longest for its turn.
+/// What servers are sorted by: the least load goes first, and of equal loads the server that was chosen longest ago.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Rank {
     pub(super) load: f64,
@@ -32,20 +31,20 @@ impl PartialOrd for Rank {
 /// The order of a fleet.
 #[derive(Debug)]
 pub(super) struct Order<Id> {
-    /// What is noted of each server: its rank if it has room, and its next expiry.
-    noted: BTreeMap<Id, (Option<Rank>, Option<Instant>)>,
+    /// The current entries of each server: its rank if it has room, and its next expiry.
+    entries: BTreeMap<Id, (Option<Rank>, Option<Instant>)>,
     ranked: BTreeSet<(Rank, Id)>,
     expiries: BTreeSet<(Instant, Id)>,
 }
 
 impl<Id: Clone + Ord> Order<Id> {
     pub(super) fn new() -> Self {
-        Self { noted: BTreeMap::new(), ranked: BTreeSet::new(), expiries: BTreeSet::new() }
+        Self { entries: BTreeMap::new(), ranked: BTreeSet::new(), expiries: BTreeSet::new() }
     }
 
-    /// Notes where a server stands from now on; without a rank it has no room.
+    /// Sets the rank of a server, `None` if it has no room, and when its next placement is given up.
     pub(super) fn put(&mut self, id: &Id, rank: Option<Rank>, expiry: Option<Instant>) {
-        let before = self.noted.get(id).copied().unwrap_or_default();
+        let before = self.entries.get(id).copied().unwrap_or_default();
         if before == (rank, expiry) {
             return;
         }
@@ -57,13 +56,13 @@ impl<Id: Clone + Ord> Order<Id> {
             before.1.map(|at| self.expiries.remove(&(at, id.clone())));
             expiry.map(|at| self.expiries.insert((at, id.clone())));
         }
-        self.noted.insert(id.clone(), (rank, expiry));
+        self.entries.insert(id.clone(), (rank, expiry));
     }
 
     /// Forgets a server.
     pub(super) fn remove(&mut self, id: &Id) {
         self.put(id, None, None);
-        self.noted.remove(id);
+        self.entries.remove(id);
     }
 
     /// The servers with room, the least loaded first.
@@ -71,13 +70,8 @@ impl<Id: Clone + Ord> Order<Id> {
         self.ranked.iter().map(|(_, id)| id)
     }
 
-    /// The servers whose placements have expired since they were put in their place.
+    /// The servers that have placements to give up.
     pub(super) fn expired(&self, now: Instant) -> impl Iterator<Item = &Id> {
         self.expiries.iter().take_while(move |(at, _)| *at <= now).map(|(_, id)| id)
-    }
-
-    /// The next expiry after now.
-    pub(super) fn next_expiry(&self, now: Instant) -> Option<Instant> {
-        self.expiries.iter().map(|(at, _)| *at).find(|at| *at > now)
     }
 }

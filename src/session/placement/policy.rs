@@ -7,8 +7,8 @@ use std::time::Duration;
 pub struct Policy {
     /// A server takes clients while its effective load is under this, in percent. Default: 95.
     pub threshold: f64,
-    /// What a client is expected to cost until a server's reports teach better, in percent. Default: 2.
-    pub initial_cost: f64,
+    /// What a client costs a server that reports only its load, in percent; the others start from this and learn. Default: 2.
+    pub client_cost: f64,
     /// How long a placement counts whose client does not come. Default: 15 seconds.
     pub patience: Duration,
     /// How long it takes until a client that came shows fully in the reported load, which is a mean of five seconds, and a
@@ -18,6 +18,6 @@ pub struct Policy {
 
 impl Default for Policy {
     fn default() -> Self {
-        Self { threshold: 95.0, initial_cost: 2.0, patience: Duration::from_secs(15), settling: Duration::from_secs(8) }
+        Self { threshold: 95.0, client_cost: 2.0, patience: Duration::from_secs(15), settling: Duration::from_secs(8) }
     }
 }

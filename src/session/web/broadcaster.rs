@@ -1,9 +1,9 @@
-//! Actor: the web clients of one worker thread, and what they are to be told.
+//! Actor: sends updates to the web clients of one worker thread.
 //!
-//! Created by the app in each thread that serves connections; it lasts as long as that. The registry tells it of a
-//! change once, and it tells its clients: from thread to thread each of ten thousand would be woken with a lock, and the
-//! registry would be busy with that instead of with requests. After a panic its clients are sent away, and find another
-//! one when they come back.
+//! Created by the app in each thread that serves connections; it lasts as long as that. The registry sends each update
+//! once to each broadcaster. Were it to send it to ten thousand clients itself, it would not answer requests meanwhile,
+//! and each client would be woken from another thread, which takes a lock. After a panic of the broadcaster its clients'
+//! connections are closed; those who connect next get a new broadcaster.
 
 use std::cell::RefCell;
 use std::sync::Arc;
@@ -12,144 +12,144 @@ use std::time::Duration;
 use actix::prelude::*;
 
 use crate::session::fleet::Subscribe;
-use crate::session::fleet::{News, Subscribers};
+use crate::session::fleet::{Subscribers, Update};
 use crate::session::state::AppState;
 use crate::shared::run::closing;
 
-/// Asks to be told the news, now and whenever there are others.
+/// Asks for an update now, and for all that follow.
 #[derive(Message)]
-#[rtype(result = "Membership")]
-pub struct Join(pub Recipient<News>);
+#[rtype(result = "Subscription")]
+pub struct SubscribeClient(pub Recipient<Update>);
 
-/// A place in the audience. Dropping it gives it up.
+/// A client's subscription. Dropping it ends it.
 #[derive(Debug)]
-pub struct Membership {
+pub struct Subscription {
     id: u64,
-    audience: Addr<Audience>,
+    broadcaster: Addr<Broadcaster>,
 }
 
 #[derive(Message)]
 #[rtype(result = "()")]
-struct Leave(u64);
+struct Unsubscribe(u64);
 
 /// The actor.
-pub struct Audience {
+pub struct Broadcaster {
     server: Arc<AppState>,
     clients: Subscribers,
-    news: Option<News>,
+    current: Option<Update>,
 }
 
-/// Between two tries to tell a client whose mailbox was full.
-const AGAIN: Duration = Duration::from_millis(250);
-/// So many clients are told at a time, and then write before others are told: what a client needs for that is then still
-/// in the processor's cache.
+/// Time between two tries to reach clients whose mailboxes were full.
+const RETRY: Duration = Duration::from_millis(250);
+/// How many clients get an update at a time. They write it to their sockets before the next ones get it, so that what
+/// each needs for that is still in the processor's cache.
 const BATCH: usize = 32;
-/// How many clients may join in one moment; more wait outside.
-const CROWD: usize = 4096;
+/// How many clients may subscribe in the same moment without waiting.
+const MAILBOX: usize = 4096;
 
-impl Audience {
-    /// An audience without clients.
+impl Broadcaster {
+    /// A broadcaster without clients.
     #[must_use]
     pub fn new(server: Arc<AppState>) -> Self {
-        Self { server, clients: Subscribers::default(), news: None }
+        Self { server, clients: Subscribers::default(), current: None }
     }
 
-    fn tell(&mut self, news: News, ctx: &mut Context<Self>) {
-        // Nothing is news any more once the server ends.
-        if self.news != Some(News::Closing) {
-            self.news = Some(news);
-            self.tell_from(0, ctx);
+    fn send(&mut self, update: Update, ctx: &mut Context<Self>) {
+        // There are no more updates once the server stops.
+        if self.current != Some(Update::Closing) {
+            self.current = Some(update);
+            self.send_from(0, ctx);
         }
     }
 
-    /// Tells the newest, a batch at a time.
-    fn tell_from(&mut self, id: u64, ctx: &mut Context<Self>) {
-        let Some(news) = self.news else { return };
-        if let Some(next) = self.clients.tell_some(id, BATCH, news) {
+    /// Sends the current update to a batch of clients after another.
+    fn send_from(&mut self, id: u64, ctx: &mut Context<Self>) {
+        let Some(current) = self.current else { return };
+        if let Some(next) = self.clients.send_batch(id, BATCH, current) {
             let turn = tokio::task::yield_now().into_actor(self);
-            turn.map(move |(), audience, ctx| audience.tell_from(next, ctx)).spawn(ctx);
+            turn.map(move |(), broadcaster, ctx| broadcaster.send_from(next, ctx)).spawn(ctx);
         }
     }
 }
 
-/// The audience of this thread.
-pub struct CurrentAudience {
+/// The broadcaster of this thread.
+pub struct LocalBroadcaster {
     server: Arc<AppState>,
-    audience: RefCell<Addr<Audience>>,
+    broadcaster: RefCell<Addr<Broadcaster>>,
 }
 
-impl CurrentAudience {
-    /// Starts the first one.
+impl LocalBroadcaster {
+    /// Starts a broadcaster in this thread.
     #[must_use]
     pub fn start(server: Arc<AppState>) -> Self {
-        let audience = Audience::new(Arc::clone(&server)).start();
-        Self { server, audience: RefCell::new(audience) }
+        let broadcaster = Broadcaster::new(Arc::clone(&server)).start();
+        Self { server, broadcaster: RefCell::new(broadcaster) }
     }
 
-    /// The one to join, or a new one if it has panicked.
+    /// Returns the broadcaster, a new one if it has panicked.
     #[must_use]
-    pub fn get(&self) -> Addr<Audience> {
-        let mut audience = self.audience.borrow_mut();
-        if !audience.connected() {
-            log::error!("an audience is gone, a new one is started");
-            *audience = Audience::new(Arc::clone(&self.server)).start();
+    pub fn get(&self) -> Addr<Broadcaster> {
+        let mut broadcaster = self.broadcaster.borrow_mut();
+        if !broadcaster.connected() {
+            log::error!("a broadcaster is gone, a new one is started");
+            *broadcaster = Broadcaster::new(Arc::clone(&self.server)).start();
         }
-        audience.clone()
+        broadcaster.clone()
     }
 }
 
-impl Actor for Audience {
+impl Actor for Broadcaster {
     type Context = Context<Self>;
 
     fn started(&mut self, ctx: &mut Self::Context) {
-        ctx.set_mailbox_capacity(CROWD);
+        ctx.set_mailbox_capacity(MAILBOX);
         self.server.registry.do_send(Subscribe(ctx.address().recipient()));
         let ending = closing(self.server.phase.clone()).into_actor(self);
-        ending.map(|(), audience, ctx| audience.tell(News::Closing, ctx)).spawn(ctx);
-        ctx.run_interval(AGAIN, |audience, _| {
-            if let Some(news) = audience.news {
-                audience.clients.tell_late(news);
+        ending.map(|(), broadcaster, ctx| broadcaster.send(Update::Closing, ctx)).spawn(ctx);
+        ctx.run_interval(RETRY, |broadcaster, _| {
+            if let Some(current) = broadcaster.current {
+                broadcaster.clients.retry(current);
             }
         });
     }
 }
 
-impl Handler<News> for Audience {
+impl Handler<Update> for Broadcaster {
     type Result = ();
 
-    fn handle(&mut self, news: News, ctx: &mut Self::Context) {
-        self.tell(news, ctx);
+    fn handle(&mut self, update: Update, ctx: &mut Self::Context) {
+        self.send(update, ctx);
     }
 }
 
-impl Handler<Join> for Audience {
-    type Result = MessageResult<Join>;
+impl Handler<SubscribeClient> for Broadcaster {
+    type Result = MessageResult<SubscribeClient>;
 
-    fn handle(&mut self, Join(client): Join, ctx: &mut Self::Context) -> Self::Result {
-        let id = self.clients.add(client, self.news);
-        MessageResult(Membership { id, audience: ctx.address() })
+    fn handle(&mut self, SubscribeClient(client): SubscribeClient, ctx: &mut Self::Context) -> Self::Result {
+        let id = self.clients.add(client, self.current);
+        MessageResult(Subscription { id, broadcaster: ctx.address() })
     }
 }
 
-impl Handler<Leave> for Audience {
+impl Handler<Unsubscribe> for Broadcaster {
     type Result = ();
 
-    fn handle(&mut self, Leave(id): Leave, _: &mut Self::Context) {
+    fn handle(&mut self, Unsubscribe(id): Unsubscribe, _: &mut Self::Context) {
         self.clients.remove(id);
     }
 }
 
-impl Drop for Audience {
+impl Drop for Broadcaster {
     fn drop(&mut self) {
-        // Nothing is news any more once the server ends.
-        if self.news != Some(News::Closing) {
-            self.clients.tell(News::Lost);
+        // Clients that are closing anyway need not be told.
+        if self.current != Some(Update::Closing) {
+            self.clients.send(Update::Lost);
         }
     }
 }
 
-impl Drop for Membership {
+impl Drop for Subscription {
     fn drop(&mut self) {
-        self.audience.do_send(Leave(self.id));
+        self.broadcaster.do_send(Unsubscribe(self.id));
     }
 }

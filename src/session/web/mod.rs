@@ -8,5 +8,5 @@ mod routes;
 mod status;
 mod web_client;
 
-pub use broadcaster::{Audience, CurrentAudience};
+pub use broadcaster::{Broadcaster, LocalBroadcaster};
 pub use routes::configure;

@@ -7,12 +7,12 @@ use actix_web::http::{StatusCode, header};
 use actix_web::{HttpRequest, HttpResponse, web};
 use percent_encoding::percent_decode_str;
 
-use super::broadcaster::CurrentAudience;
+use super::broadcaster::LocalBroadcaster;
 use super::page_routes;
 use super::queries::{ask, with_status};
 use super::status::{self, StatusPage};
 use super::web_client::WebClient;
-use crate::session::fleet::told_mean;
+use crate::session::fleet::displayed_mean_load;
 use crate::session::fleet::{GetStatus, IsAvailable};
 use crate::session::fleet::{NoServer, Pick};
 use crate::session::state::AppState;
@@ -45,10 +45,10 @@ async fn root(
     request: HttpRequest,
     stream: web::Payload,
     server: web::Data<AppState>,
-    audience: web::Data<CurrentAudience>,
+    broadcaster: web::Data<LocalBroadcaster>,
 ) -> HttpResponse {
     if wants_websocket(&request) {
-        open_websocket(&request, stream, &server, &audience)
+        open_websocket(&request, stream, &server, &broadcaster)
     } else {
         availability(server).await
     }
@@ -58,10 +58,10 @@ async fn session(
     request: HttpRequest,
     stream: web::Payload,
     server: web::Data<AppState>,
-    audience: web::Data<CurrentAudience>,
+    broadcaster: web::Data<LocalBroadcaster>,
 ) -> HttpResponse {
     if wants_websocket(&request) {
-        return open_websocket(&request, stream, &server, &audience);
+        return open_websocket(&request, stream, &server, &broadcaster);
     }
     let from = server.trusted_proxies.peer(&request).rate_limit_key();
     let answer = server.pick(Pick::parse(wanted_world(request.query_string()).as_deref(), from)).await;
@@ -94,15 +94,15 @@ fn open_websocket(
     request: &HttpRequest,
     stream: web::Payload,
     server: &web::Data<AppState>,
-    audience: &CurrentAudience,
+    broadcaster: &LocalBroadcaster,
 ) -> HttpResponse {
     let peer = server.trusted_proxies.peer(request);
     let connection = match server.connections.admit(peer) {
         Ok(connection) => connection,
         Err(crowded) => return crowded.answer(),
     };
-    let (server, audience) = (Arc::clone(server), audience.get());
-    websocket::open(request, stream, |inbox| WebClient::new(server, audience, peer, (connection, inbox)))
+    let (server, broadcaster) = (Arc::clone(server), broadcaster.get());
+    websocket::open(request, stream, |inbox| WebClient::new(server, broadcaster, peer, (connection, inbox)))
 }
 
 async fn availability(server: web::Data<AppState>) -> HttpResponse {
@@ -112,7 +112,7 @@ async fn availability(server: web::Data<AppState>) -> HttpResponse {
 
 async fn load(server: web::Data<AppState>) -> HttpResponse {
     let mean = ask(&server, GetStatus).await.and_then(|status| status.mean_load);
-    HttpResponse::Ok().content_type("text/plain").body(told_mean(mean).to_string())
+    HttpResponse::Ok().content_type("text/plain").body(displayed_mean_load(mean).to_string())
 }
 
 async fn status_json(server: web::Data<AppState>) -> HttpResponse {

@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use serde::Serialize;
 
-use crate::session::fleet::{FleetStatus, ServerStatus, State, told_mean};
+use crate::session::fleet::{FleetStatus, ServerStatus, State, displayed_mean_load};
 use crate::session::state::AppState;
 use crate::shared::domain::ClientUrls;
 use crate::shared::domain::Instances;
@@ -122,7 +122,7 @@ pub fn gauges<'text>(clients: usize, status: &FleetStatus) -> Vec<Gauge<'text>> 
         Gauge::plain(
             "session_load_percent",
             "Mean load of the servers that answer, -1 where none does",
-            told_mean(status.mean_load),
+            displayed_mean_load(status.mean_load),
         ),
         Gauge {
             name: "session_servers",

@@ -1,7 +1,7 @@
-//! Actor: one web client's WebSocket. Tells it whether a simulation server can take a client, and which.
+//! Actor: the WebSocket of one web client, which is told whether some simulation server can take a client, and which.
 //!
-//! Created by the route for each connection; ends with it. It joins the audience of its thread, and never tells the
-//! same value twice. A text from the client asks for a simulation server.
+//! Created by the route for each connection; ends with it. It subscribes to the broadcaster of its thread, and never sends
+//! the same value twice in a row. A text from the client asks for a simulation server.
 
 use std::sync::Arc;
 
@@ -9,9 +9,8 @@ use actix::prelude::*;
 use actix_web_actors::ws::{CloseCode, CloseReason, Message, ProtocolError, WebsocketContext};
 use serde::Deserialize;
 
-use super::broadcaster::{Audience, Join, Membership};
-use crate::session::fleet::News;
-use crate::session::fleet::Pick;
+use super::broadcaster::{Broadcaster, SubscribeClient, Subscription};
+use crate::session::fleet::{Pick, Update};
 use crate::session::state::AppState;
 use crate::shared::http::Connection;
 use crate::shared::http::Peer;
@@ -23,9 +22,9 @@ pub struct WebClient {
     server: Arc<AppState>,
     peer: Peer,
     liveness: Liveness,
-    told: Option<bool>,
-    audience: Addr<Audience>,
-    membership: Option<Membership>,
+    sent: Option<bool>,
+    broadcaster: Addr<Broadcaster>,
+    subscription: Option<Subscription>,
     reader: MessageReader,
     _connection: Connection,
 }
@@ -37,7 +36,7 @@ impl WebClient {
     #[must_use]
     pub fn new(
         server: Arc<AppState>,
-        audience: Addr<Audience>,
+        broadcaster: Addr<Broadcaster>,
         peer: Peer,
         (connection, reader): (Connection, MessageReader),
     ) -> Self {
@@ -45,9 +44,9 @@ impl WebClient {
             server,
             peer,
             liveness: Liveness::new(),
-            told: None,
-            audience,
-            membership: None,
+            sent: None,
+            broadcaster,
+            subscription: None,
             reader,
             _connection: connection,
         }
@@ -86,10 +85,10 @@ impl Actor for WebClient {
     fn started(&mut self, ctx: &mut Self::Context) {
         let timing = &self.server.timing;
         liveness::watch(ctx, timing.ping, timing.silence, |client| &mut client.liveness);
-        let subscribed = self.audience.send(Join(ctx.address().recipient())).into_actor(self);
+        let subscribed = self.broadcaster.send(SubscribeClient(ctx.address().recipient())).into_actor(self);
         subscribed
             .map(|answer, client, ctx| match answer {
-                Ok(membership) => client.membership = Some(membership),
+                Ok(subscription) => client.subscription = Some(subscription),
                 Err(error) => {
                     log::error!("a client can't be told of changes: {error}");
                     Self::close(CloseCode::Error, ctx);
@@ -99,17 +98,17 @@ impl Actor for WebClient {
     }
 }
 
-impl Handler<News> for WebClient {
+impl Handler<Update> for WebClient {
     type Result = ();
 
-    fn handle(&mut self, news: News, ctx: &mut Self::Context) {
-        match news {
-            News::Closing => Self::close(CloseCode::Away, ctx),
-            News::Lost => Self::close(CloseCode::Error, ctx),
-            News::Availability(available) if self.told.replace(available) != Some(available) => {
+    fn handle(&mut self, update: Update, ctx: &mut Self::Context) {
+        match update {
+            Update::Closing => Self::close(CloseCode::Away, ctx),
+            Update::Lost => Self::close(CloseCode::Error, ctx),
+            Update::Availability(available) if self.sent.replace(available) != Some(available) => {
                 ctx.text(if available { "1" } else { "0" });
             }
-            News::Availability(_) => {}
+            Update::Availability(_) => {}
         }
     }
 }

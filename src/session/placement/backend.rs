@@ -1,0 +1,378 @@
+//! What is known of one simulation server: its last report, and the clients that were sent to it since.
+
+use super::cost::{CostFit, Estimate, FULL, FleetCost, believable};
+use super::policy::Policy;
+use std::collections::VecDeque;
+use std::time::{Duration, Instant};
+
+/// A server's load is the mean of samples over so long: a client that left stays in it that long.
+const MEAN_WINDOW: Duration = Duration::from_secs(5);
+
+/// What a simulation server answered when it was asked for its status.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Report {
+    /// The mean load of the last five seconds, in percent. A server that reports no finite number from 0 on is taken as lost.
+    pub load: f64,
+    /// Its simulations; `None` for a server that reports only a load.
+    pub instances: Option<Instances>,
+}
+
+/// The part of a report that tells of the server's simulations.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Instances {
+    /// The simulations that are there: queued, starting, idle and running.
+    pub present: u32,
+    /// How many the server can hold.
+    pub places: u32,
+    /// How many clients have started something since that server began.
+    pub arrivals: u64,
+    /// Whether the server takes new clients; `false` while it is drained.
+    pub accepting: bool,
+}
+
+/// A client that was sent to a server and has not been seen there.
+#[derive(Debug, Clone, Copy)]
+struct Placement {
+    at: Instant,
+    /// Whether it takes room, see [`super::Fleet::place_without_room`].
+    takes_room: bool,
+}
+
+/// Clients that came (positive) or left (negative) and that the mean load does not fully show yet.
+#[derive(Debug, Clone, Copy)]
+struct Change {
+    at: Instant,
+    clients: f64,
+    takes_room: bool,
+}
+
+impl Change {
+    /// The clients of this change that a mean load taken at `now` does not show.
+    fn unseen(&self, now: Instant, settling: Duration) -> f64 {
+        let span = if self.clients > 0.0 { settling } else { MEAN_WINDOW };
+        let age = now.saturating_duration_since(self.at);
+        if age >= span {
+            return 0.0;
+        }
+        self.clients * (1.0 - age.as_secs_f64() / span.as_secs_f64())
+    }
+}
+
+/// Clients that a report does not show.
+#[derive(Debug, Clone, Copy, Default)]
+struct Unseen {
+    /// Those that take room.
+    reserved: f64,
+    /// The others.
+    unreserved: f64,
+}
+
+/// One server of the fleet.
+#[derive(Debug)]
+pub(super) struct Backend {
+    up: bool,
+    /// The last good report and when it came; kept while the server is down, to know what is new when it comes back.
+    last: Option<(Instant, Report)>,
+    /// The placements whose clients have not been seen yet, oldest first.
+    in_flight: VecDeque<Placement>,
+    /// How many of them take room.
+    reserved: usize,
+    settling: VecDeque<Change>,
+    /// What `settling` hid from the last report.
+    unseen: Unseen,
+    fit: CostFit,
+    /// What the fleet has been told of that fit.
+    estimate: Estimate,
+    /// What a client is expected to add to the load, in percent.
+    cost: f64,
+    /// When this server was chosen last, as a number that grows with each placement of the fleet.
+    pub(super) turn: u64,
+}
+
+impl Backend {
+    /// A server that nothing is known of: down until its first report.
+    pub(super) fn new(policy: &Policy, turn: u64) -> Self {
+        Self {
+            up: false,
+            last: None,
+            in_flight: VecDeque::new(),
+            reserved: 0,
+            settling: VecDeque::new(),
+            unseen: Unseen::default(),
+            fit: CostFit::new(policy.client_cost),
+            cost: believable(policy.client_cost),
+            estimate: Estimate::default(),
+            turn,
+        }
+    }
+
+    /// Takes in a report that came at `now`; one that is older than the last is passed over.
+    pub(super) fn report(&mut self, now: Instant, report: Report, policy: &Policy, fleet: &mut FleetCost) {
+        if !report.load.is_finite() || report.load < 0.0 {
+            self.lose();
+            return;
+        }
+        if self.last.is_some_and(|(at, _)| now < at) {
+            return;
+        }
+        self.note_changes(now, report.instances);
+        self.settle(now, policy);
+        self.learn(now, report);
+        self.last = Some((now, report));
+        self.up = true;
+        self.update_cost(fleet, policy);
+    }
+
+    /// The server does not answer.
+    pub(super) fn lose(&mut self) {
+        self.up = false;
+    }
+
+    /// A client has been sent here.
+    pub(super) fn place(&mut self, now: Instant, takes_room: bool) {
+        self.in_flight.push_back(Placement { at: now, takes_room });
+        self.reserved += usize::from(takes_room);
+    }
+
+    /// Gives up the clients that should have come by now.
+    pub(super) fn expire(&mut self, now: Instant, policy: &Policy) {
+        let is_late = |placed: &Placement| now.saturating_duration_since(placed.at) >= policy.patience;
+        let late = self.in_flight.partition_point(is_late);
+        self.reserved -= self.in_flight.drain(..late).filter(|placed| placed.takes_room).count();
+    }
+
+    /// When the oldest placement is given up, if its client does not come before.
+    pub(super) fn next_expiry(&self, policy: &Policy) -> Option<Instant> {
+        self.in_flight.front().and_then(|placed| placed.at.checked_add(policy.patience))
+    }
+
+    /// Whether a client can be sent here.
+    pub(super) fn has_room(&self, policy: &Policy) -> bool {
+        let Some((_, report)) = self.last.filter(|_| self.up) else {
+            return false;
+        };
+        let has_place = report.instances.is_none_or(|instances| {
+            let taken = (instances.present as usize).saturating_add(self.reserved);
+            instances.accepting && taken < instances.places as usize
+        });
+        has_place && self.effective_load().is_some_and(|load| load < self.limit(policy))
+    }
+
+    /// The load, in percent, from which on this server takes no client.
+    pub(super) fn limit(&self, policy: &Policy) -> f64 {
+        // A client that costs much is turned away earlier, because it would take more than the machine has.
+        // A threshold that no load reaches says that the load is to close no server.
+        if policy.threshold > 100.0 { policy.threshold } else { policy.threshold.min(100.0 - self.cost) }
+    }
+
+    /// The load, in percent, that is expected once all clients show that take room here; `None` if the server is down.
+    pub(super) fn effective_load(&self) -> Option<f64> {
+        self.load_with(self.unseen.reserved, self.reserved)
+    }
+
+    /// The same with all clients that were sent here: what servers are compared by.
+    pub(super) fn rank_load(&self) -> Option<f64> {
+        self.load_with(self.unseen.reserved + self.unseen.unreserved, self.in_flight.len())
+    }
+
+    fn load_with(&self, unseen: f64, in_flight: usize) -> Option<f64> {
+        let (_, Report { load, .. }) = self.last.filter(|_| self.up)?;
+        // How far a full machine is over is not known, so those who left may not have made it less than full.
+        let unseen = if load < FULL { unseen } else { unseen.max(0.0) };
+        #[expect(clippy::cast_precision_loss, reason = "nobody sends 2^52 clients to a server")]
+        let ahead = unseen + in_flight as f64;
+        Some((load + self.cost * ahead).max(0.0))
+    }
+
+    /// How many clients were sent here and have neither been seen nor given up.
+    pub(super) fn in_flight(&self) -> usize {
+        self.in_flight.len()
+    }
+
+    /// What one more client is expected to add to the load, in percent.
+    pub(super) fn cost(&self) -> f64 {
+        self.cost
+    }
+
+    /// What this server says about the cost of a client.
+    pub(super) fn estimate(&self) -> Estimate {
+        self.estimate
+    }
+
+    /// Tells the fleet what has been learned here, and takes over what follows from all servers. A server that reports
+    /// only its load teaches nothing, because it does not tell which part of that are clients: its cost is the fixed one.
+    fn update_cost(&mut self, fleet: &mut FleetCost, policy: &Policy) {
+        let counts = self.last.is_some_and(|(_, report)| report.instances.is_some());
+        let estimate = if counts { self.fit.estimate(self.cost) } else { Estimate::default() };
+        fleet.replace(self.estimate, estimate);
+        self.estimate = estimate;
+        self.cost = if counts { fleet.cost(estimate, policy.client_cost) } else { believable(policy.client_cost) };
+    }
+
+    fn learn(&mut self, now: Instant, report: Report) {
+        let Some(((before, _), instances)) = self.last.zip(report.instances) else {
+            return;
+        };
+        let unseen = self.unseen.reserved + self.unseen.unreserved;
+        // Those who wait for a place cost nothing yet.
+        let present = f64::from(instances.present.min(instances.places));
+        let shown = (present - unseen).max(0.0);
+        // While many are starting, it is not well known how much of them the load shows.
+        let trust = if shown < present { shown / present } else { 1.0 };
+        self.fit.learn(shown, report.load, now.saturating_duration_since(before), trust * trust);
+    }
+
+    /// Forgets the changes that the load shows by now, and sums up the others.
+    fn settle(&mut self, now: Instant, policy: &Policy) {
+        self.settling.retain(|change| change.unseen(now, policy.settling) != 0.0);
+        self.unseen = Unseen::default();
+        for change in &self.settling {
+            let clients = change.unseen(now, policy.settling);
+            *(if change.takes_room { &mut self.unseen.reserved } else { &mut self.unseen.unreserved }) += clients;
+        }
+    }
+
+    /// Compares the report with the one before: who came, who left.
+    fn note_changes(&mut self, now: Instant, new: Option<Instances>) {
+        let Some(new) = new else {
+            // A load alone does not tell who came: every placement is taken to have come as it was made.
+            let all = self.in_flight.drain(..);
+            self.settling.extend(all.map(|Placement { at, takes_room }| Change { at, clients: 1.0, takes_room }));
+            self.reserved = 0;
+            return;
+        };
+        let old = self.last.and_then(|(at, report)| report.instances.map(|old| (at, old)));
+        let Some((before, old)) = old.filter(|(_, old)| old.arrivals <= new.arrivals) else {
+            // The first report, or a server that was started again: its load has nothing of the past in it. Placements in
+            // flight may still come.
+            self.settling.clear();
+            self.fit.meet(f64::from(new.present));
+            return;
+        };
+        let came = usize::try_from(new.arrivals - old.arrivals).unwrap_or(usize::MAX).min(self.in_flight.len());
+        // The latest placements are taken to be those that came. Nothing tells clients apart; were the oldest taken, then
+        // a client that never comes would stay in flight as long as others follow it.
+        for Placement { at, takes_room } in self.in_flight.drain(self.in_flight.len() - came..) {
+            self.settling.push_back(Change { at, clients: 1.0, takes_room: true });
+            self.reserved -= usize::from(takes_room);
+        }
+        // Those who left, less those who came without having been sent; some time since the last report.
+        let came = f64::from(u32::try_from(came).unwrap_or(u32::MAX));
+        let others = f64::from(new.present) - f64::from(old.present) - came;
+        self.fit.meet(came + others.max(0.0));
+        if others != 0.0 {
+            let at = before + now.saturating_duration_since(before) / 2;
+            self.settling.push_back(Change { at, clients: others, takes_room: true });
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// One server, the time from which its seconds are counted, and what its fleet has learned.
+    struct Server(Backend, Instant, FleetCost);
+
+    impl Server {
+        fn new(load: f64, counts: Option<(u32, u64)>) -> Self {
+            let mut server = Self(Backend::new(&Policy::default(), 0), Instant::now(), FleetCost::default());
+            server.report(0.0, load, counts);
+            server
+        }
+
+        fn at(&self, seconds: f64) -> Instant {
+            self.1 + Duration::from_secs_f64(seconds)
+        }
+
+        fn place(&mut self, seconds: f64) {
+            self.0.place(self.at(seconds), true);
+        }
+
+        /// A report with a load and, of the server's clients, those present and the arrivals.
+        fn report(&mut self, seconds: f64, load: f64, counts: Option<(u32, u64)>) {
+            let instances =
+                counts.map(|(present, arrivals)| Instances { present, places: 1000, arrivals, accepting: true });
+            let at = self.at(seconds);
+            self.0.expire(at, &Policy::default());
+            self.0.report(at, Report { load, instances }, &Policy::default(), &mut self.2);
+        }
+
+        fn assert_load(&self, expected: f64, tolerance: f64) {
+            let load = self.0.effective_load().unwrap();
+            assert!((load - expected).abs() <= tolerance, "{load} is not {expected}");
+        }
+    }
+
+    #[test]
+    fn a_client_that_came_counts_until_the_load_shows_it() {
+        let mut server = Server::new(10.0, Some((5, 5)));
+        server.place(0.0);
+        server.assert_load(12.0, 0.0);
+        for (after, load, expected) in [(1.0, 10.0, 11.75), (4.0, 11.0, 12.0), (8.0, 12.0, 12.0)] {
+            server.report(after, load, Some((6, 6)));
+            assert_eq!(server.0.in_flight(), 0);
+            server.assert_load(expected, 0.3);
+        }
+    }
+
+    #[test]
+    fn a_load_alone_shows_a_placement_after_a_while_and_teaches_no_cost() {
+        let mut server = Server::new(10.0, None);
+        server.place(0.0);
+        for (after, expected) in [(0.0, 12.0), (4.0, 11.0), (8.0, 10.0)] {
+            server.report(after, 10.0, None);
+            server.assert_load(expected, 0.1);
+        }
+        for second in 9..300 {
+            server.place(f64::from(second));
+            server.report(f64::from(second), f64::from(second % 90), None);
+            assert_eq!(server.0.cost().to_bits(), 2.0_f64.to_bits());
+        }
+    }
+
+    #[test]
+    fn a_client_that_never_comes_does_not_live_on_those_who_follow() {
+        let mut server = Server::new(10.0, Some((0, 0)));
+        server.place(0.0);
+        for second in 1..=20 {
+            server.place(f64::from(second) - 0.5);
+            server.report(second.into(), 10.0, Some((second, second.into())));
+        }
+        assert_eq!(server.0.in_flight(), 0);
+    }
+
+    #[test]
+    fn those_who_left_are_taken_off_the_load_that_still_shows_them() {
+        let mut server = Server::new(40.0, Some((20, 20)));
+        server.report(1.0, 40.0, Some((10, 20)));
+        server.assert_load(22.0, 1.0);
+        server.report(8.0, 21.0, Some((10, 20)));
+        server.assert_load(21.0, 0.0);
+    }
+
+    #[test]
+    fn a_repeated_or_late_report_changes_nothing() {
+        let mut server = Server::new(10.0, Some((5, 5)));
+        (0..2).for_each(|_| server.place(0.0));
+        server.report(1.0, 10.0, Some((6, 6)));
+        let before = server.0.effective_load().unwrap();
+        for (at, load, counts) in [(1.0, 10.0, (6, 6)), (0.0, 70.0, (0, 0))] {
+            server.report(at, load, Some(counts));
+            assert_eq!(server.0.in_flight(), 1);
+            server.assert_load(before, 0.01);
+        }
+    }
+
+    #[test]
+    fn a_server_that_was_started_again_keeps_what_is_on_its_way() {
+        let mut server = Server::new(60.0, Some((30, 500)));
+        server.place(0.0);
+        server.0.lose();
+        server.report(3.0, 1.0, Some((0, 0)));
+        assert_eq!(server.0.in_flight(), 1);
+        server.assert_load(3.0, 0.1);
+        server.report(4.0, 1.0, Some((1, 1)));
+        assert_eq!(server.0.in_flight(), 0);
+    }
+}
