@@ -11,8 +11,6 @@ pub(crate) const HORIZON: f64 = 300.0;
 const BURST_AT: f64 = 150.0;
 /// The mean length of a session, in seconds: short, so that what a report says is soon wrong.
 const MEAN_SESSION: f64 = 100.0;
-/// The load from which on a server takes no client, in percent.
-pub(crate) const THRESHOLD: f64 = 95.0;
 /// The share of clients that are given a server and never go there.
 const NO_SHOW: f64 = 0.02;
 

@@ -1,7 +1,8 @@
 //! What one client costs a server, learned from its reports.
 //!
 //! Each server has a least squares fit of `load = base + cost * clients` ([`CostFit`]), in which old reports fade and
-//! which starts from a guess. Clients differ, so a server that has seen few knows little. The fleet ([`FleetCost`]) knows
+//! which starts from a guess. Load of other programs only ever adds to that of the clients, so a report that lies far above
+//! the fit counts for little. Clients differ, so a server that has seen few knows little, and after one client nothing. The fleet ([`FleetCost`]) knows
 //! how far its servers differ, and draws each server's estimate towards the mean of all: servers that look alike are
 //! treated alike, and a new one starts from what the others have learned.
 
@@ -18,6 +19,11 @@ const IDLE_MEMORY: f64 = 60.0;
 /// How far a load lies from the fit, as a variance in percent squared, for one second of reports: 2 % for five seconds,
 /// because each load is a mean of five seconds.
 const NOISE: f64 = 2.0 * 2.0 * 5.0;
+/// A load that lies so far above the fit, in percent, is taken to be that of other programs.
+const FOREIGN: f64 = 15.0;
+/// How much a report counts that contains load of other programs: a fiftieth. Not nothing, because it may be that of
+/// clients which have become more expensive.
+const FOREIGN_TRUST: f64 = 0.02;
 /// How far clients differ: the variance of one client's cost, relative to the square of the mean cost.
 const VARIETY: f64 = 0.16;
 /// From this load on, in percent, a report only says 'at least so much', because the machine has no more to give.
@@ -30,6 +36,11 @@ const HIGHEST: f64 = 50.0;
 /// Limits a cost to what is believed, in percent; what is not a number becomes the highest.
 pub(super) fn believable(cost: f64) -> f64 {
     if cost.is_nan() { HIGHEST } else { cost.clamp(LOWEST, HIGHEST) }
+}
+
+/// Whether a load lies so far above the expected one, both in percent, that other programs must be running.
+fn is_foreign(load: f64, expected: f64) -> bool {
+    load > expected + FOREIGN
 }
 
 /// What one server says about its cost: the logarithm, and how sure it is (one over the variance of that logarithm).
@@ -54,6 +65,8 @@ pub(super) struct CostFit {
     idle_weight: f64,
     /// How many clients the fit rests on.
     seen: f64,
+    /// How many more were met since the last report that counts in full.
+    met: f64,
     base: f64,
     slope: f64,
     variance: f64,
@@ -73,6 +86,7 @@ impl CostFit {
             idle_load: 0.0,
             idle_weight: BASE_TRUST,
             seen: 0.0,
+            met: 0.0,
             base: 0.0,
             slope: guess,
             variance: guess * guess,
@@ -83,16 +97,15 @@ impl CostFit {
     /// estimate is not surer for being high.
     pub(super) fn estimate(&self, believed: f64) -> Estimate {
         let relative = self.variance / (believed * believed);
-        Estimate {
-            log: self.slope.ln(),
-            // This is 1 / (relative + VARIETY / seen), and 0 where none was seen.
-            precision: self.seen / (self.seen * relative + VARIETY),
-        }
+        // One start is no evidence: whatever else began at the same time would be taken for its load.
+        let seen = if self.seen > 1.0 { self.seen } else { 0.0 };
+        // The precision is 1 / (relative + VARIETY / seen), and 0 where there is no evidence.
+        Estimate { log: self.slope.ln(), precision: seen / (seen * relative + VARIETY) }
     }
 
     /// Counts clients that were seen for the first time.
     pub(super) fn meet(&mut self, clients: f64) {
-        self.seen += clients;
+        self.met += clients;
     }
 
     /// Learns that the server had this `load`, in percent, while it held so many `clients`. `elapsed` is the time since
@@ -106,12 +119,18 @@ impl CostFit {
             return;
         }
         if clients < 0.5 {
+            let seconds = if is_foreign(load, self.idle_load) { seconds * FOREIGN_TRUST } else { seconds };
             let weight = (self.idle_weight + seconds).min(IDLE_MEMORY);
             self.idle_load += (load - self.idle_load) * seconds / weight;
             self.idle_weight = weight;
         } else {
             let fade = (-seconds / MEMORY.as_secs_f64()).exp();
-            let weight = trust * seconds;
+            let weight = if is_foreign(load, self.base + self.slope * clients) {
+                trust * seconds * FOREIGN_TRUST
+            } else {
+                self.seen += std::mem::take(&mut self.met);
+                trust * seconds
+            };
             self.weight = self.weight * fade + weight;
             self.clients = self.clients * fade + weight * clients;
             self.clients_squared = self.clients_squared * fade + weight * clients * clients;
@@ -265,5 +284,49 @@ mod tests {
             assert!(!fleet.available(now));
         }
         assert!(fleet.client_cost(&0).is_some_and(|cost| cost >= 2.0));
+    }
+
+    /// One server, whose reports of so many seconds have these loads and clients.
+    fn taught(reports: &[(u32, f64, u32)]) -> (Fleet<u32>, Instant) {
+        let (mut fleet, start) = fleet(2.0, 1);
+        let (mut second, mut arrivals, mut before) = (0, 0, 0);
+        for (seconds, load, present) in reports {
+            arrivals += present.saturating_sub(before);
+            before = *present;
+            for _ in 0..*seconds {
+                fleet.report(&0, start + Duration::from_secs(second), report(*load, *present, arrivals));
+                second += 1;
+            }
+        }
+        (fleet, start + Duration::from_secs(second))
+    }
+
+    #[test]
+    fn one_noisy_start_teaches_nothing() {
+        // One client comes and goes while other programs take so much.
+        for noise in [5.0, 8.0, 13.0, 40.0] {
+            let (mut fleet, now) = taught(&[(30, 3.0, 0), (60, 5.0 + noise, 1), (10, 3.0, 0)]);
+            assert_near(fleet.client_cost(&0), 2.0, 0.1);
+            let placed = (0..40).filter(|_| fleet.place(now, |_| true).is_some()).count();
+            assert_eq!(placed, 40, "at {:?} % each", fleet.client_cost(&0));
+        }
+    }
+
+    #[test]
+    fn load_of_other_programs_that_comes_and_goes_is_not_that_of_clients() {
+        // Clients cost 2 %. Other programs take 40 % for two thirds of the time, also while nobody is there.
+        let mut reports = vec![(60, 3.0, 0), (30, 43.0, 0)];
+        for present in [2, 5, 8, 5, 8, 3] {
+            let load = 3.0 + 2.0 * f64::from(present);
+            reports.extend([(40, load + 40.0, present), (20, load, present)]);
+            let (fleet, _) = taught(&reports);
+            assert_near(fleet.client_cost(&0), 2.0, 0.6);
+        }
+    }
+
+    #[test]
+    fn clients_that_really_cost_more_are_believed() {
+        let (fleet, _) = taught(&[(30, 3.0, 0), (60, 11.0, 1), (60, 19.0, 2), (60, 35.0, 4), (60, 51.0, 6)]);
+        assert_near(fleet.client_cost(&0), 8.0, 2.5);
     }
 }
