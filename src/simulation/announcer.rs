@@ -16,6 +16,15 @@ const TRIES: u32 = 6;
 /// How long an address may take to answer.
 const ANSWER: Duration = Duration::from_secs(10);
 
+/// The largest answer that is read, in bytes.
+const LARGEST_ANSWER: usize = 64 * 1024;
+
+/// An answer that refuses an announcement, although its status is 200.
+#[derive(serde::Deserialize)]
+struct Refusal {
+    error: serde_json::Value,
+}
+
 /// The actor.
 pub struct Announcer {
     addresses: Vec<String>,
@@ -46,9 +55,15 @@ async fn announce(address: String, form: Vec<(&'static str, String)>, pause: Dur
     let client = awc::Client::builder().connector(connector).timeout(ANSWER).finish();
     for attempt in 1..=TRIES {
         let problem = match client.post(&address).send_form(&form).await {
-            Ok(answer) if answer.status().is_success() => {
-                log::info!("announced to {address}");
-                return;
+            Ok(mut answer) if answer.status().is_success() => {
+                match answer.json::<Refusal>().limit(LARGEST_ANSWER).await {
+                    Ok(Refusal { error }) => format!("it answered {error}"),
+                    // Anything else is a success, whatever it is.
+                    Err(_) => {
+                        log::info!("announced to {address}");
+                        return;
+                    }
+                }
             }
             Ok(answer) => format!("it answered {}", answer.status()),
             Err(error) => tls::reason(&error).unwrap_or_else(|| error.to_string()),

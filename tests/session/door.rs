@@ -27,6 +27,9 @@ async fn a_client_is_led_to_the_simulation_server_that_is_there() {
     until("the door is closed", async || http::get(&session.url("/request")).await.text() == "0").await;
     let answer = http::get(&session.url("/session")).await;
     assert_eq!(answer.text(), "Error: no simulation server available at the moment.");
+    assert_eq!((answer.status.as_u16(), answer.header("retry-after")), (200, None), "as the Python server answers");
+    let answer = http::get(&session.url(&format!("/session?url={url}"))).await;
+    assert_eq!(answer.text(), "Error: no simulation server available at the moment.");
     assert_eq!(answer.status, 503);
 }
 

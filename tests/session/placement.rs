@@ -11,6 +11,8 @@ use crate::support::git::world;
 use crate::support::program::{Builder, Server, session_server};
 use crate::support::{http, until};
 
+const NOBODY: &str = "Error: no simulation server available at the moment.";
+
 /// A session server whose simulation servers report once, so that a test stands between two reports.
 fn between_reports(servers: &[StandIn], client_cost: f64) -> Builder {
     session_server(&addresses(servers)).set("loadRefresh", 600).set("clientCost", client_cost)
@@ -74,7 +76,7 @@ async fn availability_ends_when_placements_use_up_the_room_and_comes_back_when_t
         assert_eq!(http::get(&session.url("/session")).await.text(), servers[0].url());
     }
     client.until("0").await;
-    assert_eq!(http::get(&session.url("/session")).await.status, 503);
+    assert_eq!(http::get(&session.url("/session")).await.text(), NOBODY);
     client.until("1").await;
     assert_eq!(servers[0].requests(), 1, "the test was to stand between two reports");
 }
@@ -88,7 +90,7 @@ async fn a_server_without_a_free_place_gets_nobody() {
         assert_eq!(http::get(&session.url("/session")).await.text(), servers[1].url());
     }
     assert_eq!(http::get(&session.url("/request")).await.text(), "0");
-    assert_eq!(http::get(&session.url("/session")).await.status, 503);
+    assert_eq!(http::get(&session.url("/session")).await.text(), NOBODY);
 }
 
 #[actix_rt::test]
@@ -97,7 +99,7 @@ async fn a_server_in_which_one_more_client_does_not_fit_is_called_full() {
     let session = between_reports(std::slice::from_ref(&server), 10.0).start().await;
     until_states(&session, &["full"]).await;
     assert_eq!(times_logged(&session, "full: load 91.0 % of 90.0 %"), 1);
-    assert_eq!(http::get(&session.url("/session")).await.status, 503);
+    assert_eq!(http::get(&session.url("/session")).await.text(), NOBODY);
 }
 
 #[actix_rt::test]
@@ -177,6 +179,15 @@ async fn a_fleet_that_is_down_is_not_said_to_refuse_a_world() {
     assert_eq!(answer.status, 503, "{}", answer.text());
     assert!(answer.header("retry-after").is_some());
     assert_eq!(answer.header("access-control-expose-headers"), Some("Retry-After"));
+}
+
+#[actix_rt::test]
+async fn a_world_that_nobody_accepts_is_refused_also_while_a_server_has_never_answered() {
+    let servers = [StandIn::start(Manner::of_owner("lab")), StandIn::start(Manner::Reset)];
+    let session = session_server(&addresses(&servers)).start().await;
+    until_states(&session, &["up", "down"]).await;
+    let url = world("stranger/arm", "main", "worlds/a.wbt");
+    assert_eq!(http::get(&session.url(&format!("/session?url={url}"))).await.status, 403);
 }
 
 #[actix_rt::test]

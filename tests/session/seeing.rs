@@ -6,6 +6,7 @@ use serde_json::json;
 
 use super::stand_in::{Manner, StandIn};
 use super::{addresses, times_logged, until_states};
+use crate::support::git::world;
 use crate::support::program::session_server;
 use crate::support::{http, until};
 
@@ -14,7 +15,8 @@ async fn a_refusal_carries_a_time_to_come_back_that_is_drawn_at_random() {
     let session = session_server(&[]).start().await;
     let mut seconds = HashSet::new();
     for _ in 0..100 {
-        let refused = http::get(&session.url("/session")).await;
+        let refused =
+            http::get(&session.url(&format!("/session?url={}", world("lab/arm", "main", "worlds/a.wbt")))).await;
         assert_eq!(refused.status, 503);
         assert_eq!(refused.text(), "Error: no simulation server available at the moment.");
         seconds.insert(refused.header("retry-after").unwrap().parse::<u32>().unwrap());

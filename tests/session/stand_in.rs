@@ -20,6 +20,8 @@ pub enum Manner {
     Body(u16, Vec<u8>),
     /// Sends these bytes, whatever they are, and ends the connection.
     Raw(Vec<u8>),
+    /// Has no `/status`; sends these bytes for `/load`, and ends the connection.
+    RawLoad(Vec<u8>),
     /// Waits so long before it tells a load of 1 %.
     Slow(Duration),
     /// Takes connections and says nothing.
@@ -181,7 +183,11 @@ async fn answer(stream: &mut TcpStream, path: &str, manner: Manner) -> std::io::
     match manner {
         Manner::Status(status) if path == "/status" => send(stream, 200, status.to_string().as_bytes()).await?,
         Manner::Load(load) if path == "/load" => send(stream, 200, load.as_bytes()).await?,
-        Manner::Status(_) | Manner::Load(_) => send(stream, 404, b"404: Not Found").await?,
+        Manner::RawLoad(bytes) if path == "/load" => {
+            stream.write_all(&bytes).await?;
+            return Ok(false);
+        }
+        Manner::Status(_) | Manner::Load(_) | Manner::RawLoad(_) => send(stream, 404, b"404: Not Found").await?,
         Manner::Body(status, body) => send(stream, status, &body).await?,
         Manner::Slow(time) => {
             actix_rt::time::sleep(time).await;

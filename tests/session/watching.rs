@@ -52,6 +52,9 @@ fn bad_manners() -> Vec<Manner> {
         load("-1"),
         load("1e300"),
         load("5 %"),
+        Manner::RawLoad(b"HTTP/1.1 200 OK\r\nContent-Length: 4\r\n\r\n9".to_vec()),
+        Manner::RawLoad(b"HTTP/1.1 200 OK\r\nTransfer-Encoding: chunked\r\n\r\n1\r\n9\r\n".to_vec()),
+        Manner::RawLoad(b"HTTP/1.0 200 OK\r\n\r\n9".to_vec()),
     ]
 }
 

@@ -106,13 +106,13 @@ async fn a_port_that_is_taken_ends_the_program_with_1() {
     assert!(second.log().contains("can't listen on"), "{}", second.log());
 }
 
-/// Answers each request with the next of these codes; gives back the requests.
-fn listener(codes: &'static [u16]) -> (String, std::sync::mpsc::Receiver<String>) {
+/// Answers each request with the next of these codes and bodies; returns the requests.
+fn listener(answers: &'static [(u16, &'static str)]) -> (String, std::sync::mpsc::Receiver<String>) {
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let url = format!("http://{}/announce", listener.local_addr().unwrap());
     let (sender, requests) = std::sync::mpsc::channel();
     std::thread::spawn(move || {
-        for code in codes {
+        for (code, body) in answers {
             let (mut socket, _) = listener.accept().unwrap();
             let mut text = Vec::new();
             while !is_whole(&text) {
@@ -121,7 +121,8 @@ fn listener(codes: &'static [u16]) -> (String, std::sync::mpsc::Receiver<String>
                 assert!(length > 0, "the request broke off");
                 text.extend_from_slice(&chunk[..length]);
             }
-            write!(socket, "HTTP/1.1 {code} X\r\nContent-Length: 0\r\nConnection: close\r\n\r\n").ok();
+            let head = format!("HTTP/1.1 {code} X\r\nContent-Type: application/json\r\nConnection: close");
+            write!(socket, "{head}\r\nContent-Length: {}\r\n\r\n{body}", body.len()).ok();
             sender.send(String::from_utf8(text).unwrap()).ok();
         }
     });
@@ -141,7 +142,7 @@ fn is_whole(text: &[u8]) -> bool {
 #[actix_rt::test]
 async fn the_server_announces_itself_and_waits_for_nobody() {
     let (forge, webots) = (Forge::with_arm(), Webots::launcher());
-    let (url, requests) = listener(&[500, 200]);
+    let (url, requests) = listener(&[(500, ""), (200, r#"{"error": "no room"}"#), (200, r#"{"success": true}"#)]);
     let hanging = TcpListener::bind("127.0.0.1:0").unwrap();
     let closed = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap();
     let notify =
@@ -156,13 +157,14 @@ async fn the_server_announces_itself_and_waits_for_nobody() {
         "url=http%3A%2F%2Flocalhost%3A{}&shareIdleTime=25&allowedRepositories=https%3A%2F%2Fgithub.com%2Flab%2Chttps%3A%2F%2Fgithub.com%2Fother%2Fx",
         server.port
     );
-    for _ in 0..2 {
+    for _ in 0..3 {
         let request = requests.recv_timeout(crate::support::SOON).unwrap();
         assert!(request.starts_with("POST /announce HTTP/1.1\r\n"), "{request}");
         assert!(request.to_lowercase().contains("content-type: application/x-www-form-urlencoded"), "{request}");
         assert!(request.ends_with(&format!("\r\n\r\n{body}")), "{request}");
     }
     until("it was told", async || server.log().contains(&format!("announced to {url}"))).await;
+    assert!(server.log().contains(&format!("can't announce to {url} (2 of 6): it answered \"no room\"")));
     until("it gave up", async || server.log().contains(&format!("gave up announcing to http://{closed}/"))).await;
     assert_eq!(server.log().matches(&format!("can't announce to http://{closed}/")).count(), 6);
     let mut client = Client::start(&server, &arm()).await;

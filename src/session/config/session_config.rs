@@ -174,6 +174,9 @@ impl Configuration for SessionConfig {
             "localhost".clone_into(&mut self.server);
         }
         check_host(&self.server, self.port_rewrite).map_err(|problem| InvalidValue { key: "server", problem })?;
+        for address in self.simulation_servers.iter_mut().chain(&mut self.drained_servers) {
+            *address = address.clone().without_usual_web_port(self.ssl);
+        }
         let mut seen = std::collections::HashSet::new();
         for address in &self.simulation_servers {
             if !seen.insert(address) {

@@ -13,7 +13,7 @@ use actix::prelude::*;
 use rustls::ClientConfig;
 
 use super::changes::Changes;
-use super::fleet_status::{FleetStatus, ServerStatus};
+use super::fleet_status::{FleetStatus, ServerStatus, State};
 use super::pick::{NoServer, Pick};
 use super::probe_error::ProbeError;
 use super::quota::PlacementQuota;
@@ -186,17 +186,13 @@ impl Registry {
     /// Chooses a server for a client of this address.
     fn pick(&mut self, world: Option<&ProjectUrl>, from: Option<IpAddr>) -> Result<PublicAddress, NoServer> {
         let Self { fleet, servers, .. } = self;
-        let accepts = |address: &PublicAddress, world: &ProjectUrl| {
-            // One that has not answered yet may accept it.
-            let says = |report: &ServerReport| report.accepts(world);
-            servers.get(address).is_some_and(|entry| entry.record.report.as_ref().is_none_or(says))
-        };
-        let eligible = |address: &PublicAddress| world.is_none_or(|world| accepts(address, world));
+        let accepts = |address: &PublicAddress, world| servers.get(address)?.record.accepts(world);
+        let eligible = |address: &PublicAddress| world.is_none_or(|world| accepts(address, world) == Some(true));
         let now = Instant::now();
         let picked =
             if self.quota.take(from) { fleet.place(now, eligible) } else { fleet.place_without_room(now, eligible) };
         picked.ok_or_else(|| match world {
-            Some(world) if !servers.is_empty() && !servers.keys().any(|address| accepts(address, world)) => {
+            Some(world) if is_refused(servers.values().map(|entry| &entry.record), world) => {
                 NoServer::NotAccepted(world.repository())
             }
             _ => NoServer::Unavailable,
@@ -212,6 +208,21 @@ impl Registry {
             ..status
         })
     }
+}
+
+/// Whether some server refuses a world, and no other accepts it or has yet to be asked for the first time. A server that
+/// has never answered may never do so: it does not count.
+fn is_refused<'a>(servers: impl Iterator<Item = &'a ServerRecord>, world: &ProjectUrl) -> bool {
+    let mut refused = false;
+    for server in servers {
+        match server.accepts(world) {
+            Some(true) => return false,
+            Some(false) => refused = true,
+            None if server.state == State::Unknown => return false,
+            None => {}
+        }
+    }
+    refused
 }
 
 impl Actor for Registry {

@@ -13,8 +13,10 @@ use std::time::{Duration, Instant};
 
 use actix::prelude::*;
 use actix_tls::connect::{Connector as TcpConnector, Resolver};
+use actix_web::web::Bytes;
 use awc::error::{ConnectError, SendRequestError};
 use awc::http::StatusCode;
+use awc::http::header::CONTENT_LENGTH;
 use rustls::ClientConfig;
 
 use super::caching_resolver::CachingResolver;
@@ -200,19 +202,31 @@ impl Handler<Stop> for ServerMonitor {
 
 async fn probe(client: &awc::Client, url: &str, load_only: bool) -> Result<Answer, ProbeError> {
     if !load_only && let Some(body) = get(client, &format!("{url}/status")).await? {
-        return parse_status(&body).map(Answer::Status);
+        // JSON shows itself whether it is complete.
+        return parse_status(&body.bytes).map(Answer::Status);
     }
     let body = get(client, &format!("{url}/load")).await?;
     let body = body.ok_or_else(|| ProbeError::BadAnswer("it has neither /status nor /load".to_owned()))?;
-    let load = Load::parse(&body).map_err(|error| ProbeError::BadAnswer(shortened(&error.to_string())))?;
+    let Body { bytes, length_known: true } = body else {
+        // Without its end, 95.5 may be 9.
+        return Err(ProbeError::BadAnswer("a load without Content-Length".to_owned()));
+    };
+    let load = Load::parse(&bytes).map_err(|error| ProbeError::BadAnswer(shortened(&error.to_string())))?;
     plausible(load).map(Answer::Load)
+}
+
+/// The body of a page.
+struct Body {
+    bytes: Bytes,
+    /// Whether the server told the length; awc takes the end of the connection for the end of the body.
+    length_known: bool,
 }
 
 /// Returns the body of a page, `None` if the server has no such page.
 ///
 /// # Errors
 /// When there is no answer, or one that is neither.
-async fn get(client: &awc::Client, url: &str) -> Result<Option<actix_web::web::Bytes>, ProbeError> {
+async fn get(client: &awc::Client, url: &str) -> Result<Option<Body>, ProbeError> {
     let answer = match client.get(url).send().await {
         // A kept connection may have been closed meanwhile, which is no fault of the server.
         Err(error) if is_broken(&error) => client.get(url).send().await,
@@ -226,8 +240,15 @@ async fn get(client: &awc::Client, url: &str) -> Result<Option<actix_web::web::B
     if !status.is_success() {
         return Err(ProbeError::BadAnswer(format!("status {status}")));
     }
-    let body = answer.timeout(NEVER).body().limit(LARGEST_ANSWER).await;
-    body.map(Some).map_err(|error| ProbeError::BadAnswer(shortened(&error.to_string())))
+    let length = answer.headers().get(CONTENT_LENGTH).and_then(|value| value.to_str().ok()?.parse().ok());
+    let bytes = answer.timeout(NEVER).body().limit(LARGEST_ANSWER).await;
+    let bytes = bytes.map_err(|error| ProbeError::BadAnswer(shortened(&error.to_string())))?;
+    match length {
+        Some(length) if bytes.len() < length => {
+            Err(ProbeError::BadAnswer(format!("{} of {length} bytes", bytes.len())))
+        }
+        length => Ok(Some(Body { bytes, length_known: length.is_some() })),
+    }
 }
 
 /// Whether a connection broke, as opposed to one that could not be made.

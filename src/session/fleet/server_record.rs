@@ -7,6 +7,7 @@ use super::probe_error::ProbeError;
 use crate::session::mail::Event;
 use crate::session::placement;
 use crate::shared::domain::Load;
+use crate::shared::domain::ProjectUrl;
 use crate::shared::domain::PublicAddress;
 use crate::shared::domain::ServerReport;
 
@@ -92,6 +93,12 @@ impl ServerRecord {
     #[must_use]
     pub fn current(&self) -> Option<&ServerReport> {
         self.report.as_ref().filter(|_| self.state != State::Down)
+    }
+
+    /// Whether the server runs a world, by its last report; `None` if it never answered.
+    #[must_use]
+    pub fn accepts(&self, world: &ProjectUrl) -> Option<bool> {
+        self.report.as_ref().map(|report| report.accepts(world))
     }
 
     /// The last report in the terms of the placement policy; `None` for a server that must not get clients and does not

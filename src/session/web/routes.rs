@@ -64,9 +64,12 @@ async fn session(
         return open_websocket(&request, stream, &server, &broadcaster);
     }
     let from = server.trusted_proxies.peer(&request).rate_limit_key();
-    let answer = server.pick(Pick::parse(wanted_world(request.query_string()).as_deref(), from)).await;
+    let world = wanted_world(request.query_string());
+    let answer = server.pick(Pick::parse(world.as_deref(), from)).await;
     let status = match answer.refusal {
         None => StatusCode::OK,
+        // As the Python server answers: clients such as PHP's `file_get_contents` read no body with another status.
+        Some(_) if world.is_none() => StatusCode::OK,
         Some(NoServer::Unavailable) => StatusCode::SERVICE_UNAVAILABLE,
         Some(NoServer::NotAccepted(_)) => StatusCode::FORBIDDEN,
         Some(NoServer::NoWorld(_)) => StatusCode::BAD_REQUEST,

@@ -56,6 +56,16 @@ impl PublicAddress {
         self.port
     }
 
+    /// The same address without the port of the web server in front, if that is the usual one.
+    #[must_use]
+    pub fn without_usual_web_port(self, ssl: bool) -> Self {
+        let usual = if ssl { ":443" } else { ":80" };
+        match self.host.strip_suffix(usual).filter(|_| self.rewritten) {
+            Some(host) => Self { host: host.into(), ..self },
+            None => self,
+        }
+    }
+
     /// Whether a web server in front rewrites ports.
     #[must_use]
     pub fn is_rewritten(&self) -> bool {
@@ -112,11 +122,13 @@ impl FromStr for PublicAddress {
             _ => host,
         };
         // As it is asked for: names in lower case, as RFC 4343 has it, and in ASCII. One server must not count as two.
-        let plain = url::Host::parse(name).map_err(|_| no_address())?;
         let is_of_name = |letter: char| letter.is_ascii_alphanumeric() || "-._".contains(letter);
-        if matches!(&plain, url::Host::Domain(domain) if !domain.chars().all(is_of_name)) {
-            return Err(no_address());
-        }
+        let plain = match url::Host::parse(name).map_err(|_| no_address())? {
+            url::Host::Domain(domain) if !domain.chars().all(is_of_name) => return Err(no_address()),
+            url::Host::Domain(domain) => url::Host::Domain(domain.trim_end_matches('.').to_owned()),
+            url::Host::Ipv6(address) => address.to_ipv4_mapped().map_or(url::Host::Ipv6(address), url::Host::Ipv4),
+            address @ url::Host::Ipv4(_) => address,
+        };
         let host = format!("{plain}{}", host.strip_prefix(name).unwrap_or_default());
         let port = number(port)?;
         Ok(Self { host: host.into(), port, rewritten })
@@ -142,8 +154,25 @@ mod tests {
             ("Lab.ORG:8443/2000", "lab.org:8443/2000"),
             ("bücher.example:2000", "xn--bcher-kva.example:2000"),
             ("a%2eb/2000", "a.b/2000"),
+            ("lab.org.:2000", "lab.org:2000"),
+            ("127.1:02000", "127.0.0.1:2000"),
+            ("[::ffff:10.0.0.7]/2000", "10.0.0.7/2000"),
+            ("[0:0::1]:2000", "[::1]:2000"),
         ] {
             assert_eq!(text.parse::<PublicAddress>().unwrap().to_string(), plain);
+        }
+    }
+
+    #[test]
+    fn the_usual_port_of_a_web_server_is_not_written() {
+        for (text, ssl, plain) in [
+            ("lab.org:443/2000", true, "lab.org/2000"),
+            ("lab.org:443/2000", false, "lab.org:443/2000"),
+            ("lab.org:80/2000", false, "lab.org/2000"),
+            ("[::443]/2000", true, "[::443]/2000"),
+            ("lab.org:443", true, "lab.org:443"),
+        ] {
+            assert_eq!(text.parse::<PublicAddress>().unwrap().without_usual_web_port(ssl).to_string(), plain);
         }
     }
 

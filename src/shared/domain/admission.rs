@@ -4,13 +4,13 @@ use super::load::Load;
 use super::project_url::ProjectUrl;
 use super::repositories::{UrlPrefix, any_covers, any_may_cover};
 
-/// The rules of a server.
+/// The rules of a server, with lists of its own or borrowed ones.
 #[derive(Debug, Clone)]
-pub struct Rules {
+pub struct Rules<Prefixes = Vec<UrlPrefix>> {
     /// Whose worlds run at any load.
-    pub allowed: Vec<UrlPrefix>,
+    pub allowed: Prefixes,
     /// Whose worlds never run.
-    pub blocked: Vec<UrlPrefix>,
+    pub blocked: Prefixes,
     /// Whether worlds of others can be shut into containers.
     pub docker: bool,
     /// The highest load, in percent, at which worlds of others run; 0: never.
@@ -43,17 +43,17 @@ pub enum Refusal {
     },
 }
 
-impl Rules {
+impl<Prefixes: AsRef<[UrlPrefix]>> Rules<Prefixes> {
     /// Whether a world may run at this load. A blocked repository never may; the original asks that only of worlds
     /// that are not allowed.
     ///
     /// # Errors
     /// Why it may not.
     pub fn admit(&self, world: &ProjectUrl, load: Load) -> Result<(), Refusal> {
-        if any_may_cover(&self.blocked, world) {
+        if any_may_cover(self.blocked.as_ref(), world) {
             return Err(Refusal::Blocked(world.repository()));
         }
-        if any_covers(&self.allowed, world) {
+        if any_covers(self.allowed.as_ref(), world) {
             return Ok(());
         }
         if !self.docker {

@@ -118,8 +118,8 @@ impl ServerReport {
             return !blocked && (open || any_covers(&self.allowed_repositories, world));
         };
         let rules = Rules {
-            allowed: self.allowed_repositories.clone(),
-            blocked: self.blocked_repositories.clone(),
+            allowed: self.allowed_repositories.as_slice(),
+            blocked: self.blocked_repositories.as_slice(),
             docker,
             share_idle_time: self.share_idle_time,
         };
