@@ -18,6 +18,7 @@ const PAUSE: Duration = Duration::from_micros(500);
 struct Door {
     name: &'static str,
     path: &'static str,
+    status: &'static str,
     _fleet: StandIns,
     server: Server,
     took: Vec<Duration>,
@@ -30,7 +31,15 @@ impl Door {
         if hung {
             fleet.hang_first();
         }
-        Self { name, path: "/session", _fleet: fleet, server, took: Vec::new() }
+        Self { name, path: "/session", status: "200", _fleet: fleet, server, took: Vec::new() }
+    }
+
+    /// A fleet that is asked for a world that nobody accepts.
+    fn open_for_strangers(name: &'static str, servers: usize, repositories: usize) -> Self {
+        let fleet = StandIns::with_repositories(servers, repositories);
+        let server = Server::start(&fleet.addresses);
+        let path = "/session?url=https://github.com/stranger/arm/blob/main/worlds/arm.wbt";
+        Self { name, path, status: "403", _fleet: fleet, server, took: Vec::new() }
     }
 
     fn ask(&mut self) {
@@ -43,7 +52,8 @@ impl Door {
             stream.write_all(request.as_bytes()).expect("a request");
             let length = stream.read(&mut answer).expect("an answer");
             self.took.push(begin.elapsed());
-            assert!(answer[..length].starts_with(b"HTTP/1.1 200"), "{}", String::from_utf8_lossy(&answer[..length]));
+            let answer = String::from_utf8_lossy(&answer[..length]);
+            assert_eq!(answer.split(' ').nth(1), Some(self.status), "{answer}");
             std::thread::sleep(PAUSE);
         }
     }
@@ -63,6 +73,7 @@ pub(crate) fn measure(verdict: &mut Verdict) {
         Door::open("10 servers", 10, false),
         Door::open("10 servers, one hung", 10, true),
         Door::open("1,000 servers", 1000, false),
+        Door::open_for_strangers("200 servers refuse, 200 owners", 200, 200),
     ];
     for _ in 0..ROUNDS {
         doors.iter_mut().for_each(Door::ask);
@@ -71,8 +82,9 @@ pub(crate) fn measure(verdict: &mut Verdict) {
     for door in &doors {
         println!("  {:<32} {:>6.3} ms {:>6.3} ms {:>6.3} ms", door.name, door.at(0.5), door.at(0.99), door.at(0.999));
     }
-    let [_, ten, hung, thousand] = &doors;
+    let [_, ten, hung, thousand, refusing] = &doors;
     verdict.bound("p99 with one server hung", hung.at(0.99), 5.0, "ms");
     verdict.bound("median with 1,000 servers / with 10", thousand.at(0.5) / ten.at(0.5), 1.1, "times");
+    verdict.bound("median of a refusal by 200 servers", refusing.at(0.5), 3.0, "ms");
     println!("  p99 with 1,000 servers / with 10: {:.2} times", thousand.at(0.99) / ten.at(0.99));
 }

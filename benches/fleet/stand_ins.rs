@@ -18,6 +18,18 @@ pub(crate) struct StandIns {
 impl StandIns {
     /// Starts them; the first one can be made to hang.
     pub(crate) fn start(count: usize) -> Self {
+        Self::with_repositories(count, 1)
+    }
+
+    /// Starts stand-ins that allow so many owners' repositories each.
+    pub(crate) fn with_repositories(count: usize, repositories: usize) -> Self {
+        let allowed: Vec<String> = (0..repositories).map(|owner| format!("https://github.com/lab{owner}")).collect();
+        let body = serde_json::json!({
+            "load": 5.0, "version": "1", "allowedRepositories": allowed, "docker": false,
+            "instances": {"queued": 0, "starting": 1, "idle": 2, "running": 3, "places": 100_000, "arrivals": 6},
+        })
+        .to_string();
+        let answer: Arc<str> = format!("HTTP/1.1 200 OK\r\nContent-Length: {}\r\n\r\n{body}", body.len()).into();
         let sockets: Vec<_> =
             (0..count).map(|_| std::net::TcpListener::bind("127.0.0.1:0").expect("a free port")).collect();
         let addresses = sockets.iter().map(|socket| socket.local_addr().expect("it is bound").to_string()).collect();
@@ -29,7 +41,7 @@ impl StandIns {
                 for (index, socket) in sockets.into_iter().enumerate() {
                     socket.set_nonblocking(true).expect("a socket");
                     let listener = TcpListener::from_std(socket).expect("a socket");
-                    tokio::spawn(serve(listener, (index == 0).then(|| Arc::clone(&seen))));
+                    tokio::spawn(serve(listener, Arc::clone(&answer), (index == 0).then(|| Arc::clone(&seen))));
                 }
                 ended.notified().await;
             });
@@ -50,16 +62,14 @@ impl Drop for StandIns {
     }
 }
 
-async fn serve(listener: TcpListener, hung: Option<Arc<AtomicBool>>) {
+async fn serve(listener: TcpListener, answer: Arc<str>, hung: Option<Arc<AtomicBool>>) {
     while let Ok((stream, _)) = listener.accept().await {
-        tokio::spawn(converse(stream, hung.clone()));
+        tokio::spawn(converse(stream, Arc::clone(&answer), hung.clone()));
     }
 }
 
-async fn converse(mut stream: TcpStream, hung: Option<Arc<AtomicBool>>) -> std::io::Result<()> {
+async fn converse(mut stream: TcpStream, answer: Arc<str>, hung: Option<Arc<AtomicBool>>) -> std::io::Result<()> {
     stream.set_nodelay(true)?;
-    let body = r#"{"load":5.0,"version":"1","instances":{"queued":0,"starting":1,"idle":2,"running":3,"places":100000,"arrivals":6},"allowedRepositories":["https://github.com/lab"],"docker":false}"#;
-    let answer = format!("HTTP/1.1 200 OK\r\nContent-Length: {}\r\n\r\n{body}", body.len());
     let mut request = [0; 2048];
     // A request is small enough to come in one piece.
     while stream.read(&mut request).await? > 0 {

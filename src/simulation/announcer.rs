@@ -56,14 +56,12 @@ async fn announce(address: String, form: Vec<(&'static str, String)>, pause: Dur
     for attempt in 1..=TRIES {
         let problem = match client.post(&address).send_form(&form).await {
             Ok(mut answer) if answer.status().is_success() => {
-                match answer.json::<Refusal>().limit(LARGEST_ANSWER).await {
-                    Ok(Refusal { error }) => format!("it answered {error}"),
-                    // Anything else is a success, whatever it is.
-                    Err(_) => {
-                        log::info!("announced to {address}");
-                        return;
-                    }
-                }
+                let body = answer.body().limit(LARGEST_ANSWER).await.unwrap_or_default();
+                let Ok(Refusal { error }) = serde_json::from_slice(&body) else {
+                    log::info!("announced to {address}");
+                    return;
+                };
+                format!("it answered {error}")
             }
             Ok(answer) => format!("it answered {}", answer.status()),
             Err(error) => tls::reason(&error).unwrap_or_else(|| error.to_string()),

@@ -121,7 +121,7 @@ fn listener(answers: &'static [(u16, &'static str)]) -> (String, std::sync::mpsc
                 assert!(length > 0, "the request broke off");
                 text.extend_from_slice(&chunk[..length]);
             }
-            let head = format!("HTTP/1.1 {code} X\r\nContent-Type: application/json\r\nConnection: close");
+            let head = format!("HTTP/1.1 {code} X\r\nConnection: close");
             write!(socket, "{head}\r\nContent-Length: {}\r\n\r\n{body}", body.len()).ok();
             sender.send(String::from_utf8(text).unwrap()).ok();
         }

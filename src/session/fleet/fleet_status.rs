@@ -1,6 +1,7 @@
 //! The status of the fleet, for pages and metrics. Plain data.
 
 use std::collections::VecDeque;
+use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
 use crate::shared::domain::Load;
@@ -30,7 +31,7 @@ pub struct ServerStatus {
     /// Since when it has been in that state.
     pub since: SystemTime,
     /// Its last report.
-    pub report: Option<ServerReport>,
+    pub report: Option<Arc<ServerReport>>,
     /// Why the last probe failed, if it did.
     pub error: Option<String>,
     /// The reported load and that of the clients it does not show yet, in percent.

@@ -13,12 +13,12 @@ use actix::prelude::*;
 use rustls::ClientConfig;
 
 use super::changes::Changes;
-use super::fleet_status::{FleetStatus, ServerStatus, State};
+use super::fleet_status::{FleetStatus, ServerStatus};
 use super::pick::{NoServer, Pick};
 use super::probe_error::ProbeError;
 use super::quota::PlacementQuota;
 use super::server_monitor::{ProbeResult, ProbeSettings, ServerMonitor, Stop};
-use super::server_record::ServerRecord;
+use super::server_record::{ServerRecord, is_refused};
 use super::subscribers::{Subscribers, Update};
 use crate::session::config::SessionConfig;
 use crate::session::mail::Mailer;
@@ -208,21 +208,6 @@ impl Registry {
             ..status
         })
     }
-}
-
-/// Whether some server refuses a world, and no other accepts it or has yet to be asked for the first time. A server that
-/// has never answered may never do so: it does not count.
-fn is_refused<'a>(servers: impl Iterator<Item = &'a ServerRecord>, world: &ProjectUrl) -> bool {
-    let mut refused = false;
-    for server in servers {
-        match server.accepts(world) {
-            Some(true) => return false,
-            Some(false) => refused = true,
-            None if server.state == State::Unknown => return false,
-            None => {}
-        }
-    }
-    refused
 }
 
 impl Actor for Registry {

@@ -240,7 +240,7 @@ async fn get(client: &awc::Client, url: &str) -> Result<Option<Body>, ProbeError
     if !status.is_success() {
         return Err(ProbeError::BadAnswer(format!("status {status}")));
     }
-    let length = answer.headers().get(CONTENT_LENGTH).and_then(|value| value.to_str().ok()?.parse().ok());
+    let length = answer.headers().get(CONTENT_LENGTH).and_then(|value| value.to_str().ok()?.parse::<usize>().ok());
     let bytes = answer.timeout(NEVER).body().limit(LARGEST_ANSWER).await;
     let bytes = bytes.map_err(|error| ProbeError::BadAnswer(shortened(&error.to_string())))?;
     match length {

@@ -1,5 +1,6 @@
 //! What the registry knows of one simulation server, and what a change of it means. Part of the registry.
 
+use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
 use super::fleet_status::{ServerStatus, State};
@@ -21,7 +22,7 @@ pub struct ServerRecord {
     /// Since when.
     pub since: SystemTime,
     /// Its last report; kept when it is down.
-    pub report: Option<ServerReport>,
+    pub report: Option<Arc<ServerReport>>,
     /// Why the last probe failed, if it did.
     pub error: Option<ProbeError>,
     /// The last error, also when the server has answered since.
@@ -70,7 +71,7 @@ impl ServerRecord {
     /// what has changed.
     pub fn succeeded(&mut self, report: ServerReport, at: Instant, limit: f64) -> Option<Change> {
         let (state, why) = self.judge(&report, limit);
-        self.report = Some(report);
+        self.report = Some(Arc::new(report));
         self.error = None;
         self.answered = Some(at);
         self.enter(state, why)
@@ -92,7 +93,7 @@ impl ServerRecord {
     /// The last report, if it still holds.
     #[must_use]
     pub fn current(&self) -> Option<&ServerReport> {
-        self.report.as_ref().filter(|_| self.state != State::Down)
+        self.report.as_deref().filter(|_| self.state != State::Down)
     }
 
     /// Whether the server runs a world, by its last report; `None` if it never answered.
@@ -184,6 +185,22 @@ impl ServerRecord {
         }
         events
     }
+}
+
+/// Whether some server refuses a world, and no other accepts it or has yet to be asked for the first time. A server that
+/// has never answered may never do so: it does not count.
+#[must_use]
+pub fn is_refused<'a>(servers: impl Iterator<Item = &'a ServerRecord>, world: &ProjectUrl) -> bool {
+    let mut refused = false;
+    for server in servers {
+        match server.accepts(world) {
+            Some(true) => return false,
+            Some(false) => refused = true,
+            None if server.state == State::Unknown => return false,
+            None => {}
+        }
+    }
+    refused
 }
 
 #[cfg(test)]

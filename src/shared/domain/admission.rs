@@ -75,8 +75,9 @@ mod tests {
 
     #[test]
     fn a_world_runs_by_its_repository_and_the_load() {
-        let prefixes =
-            |texts: &[&str]| texts.iter().map(|text| UrlPrefix::try_from((*text).to_owned()).unwrap()).collect();
+        let prefixes = |texts: &[&str]| {
+            texts.iter().map(|text| UrlPrefix::try_from((*text).to_owned()).unwrap()).collect::<Vec<_>>()
+        };
         let rules = |docker, share_idle_time| Rules {
             allowed: prefixes(&["https://github.com/lab"]),
             blocked: prefixes(&["https://github.com/lab/secret", "https://github.com/Evil"]),
