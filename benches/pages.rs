@@ -20,6 +20,7 @@ mod support;
 use std::collections::VecDeque;
 use std::io::{Read, Write};
 use std::net::TcpStream;
+use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
 use nix::sys::resource::{Resource, getrlimit, setrlimit};
@@ -77,7 +78,7 @@ fn fleet() -> FleetStatus {
         address: address(number),
         state: if number % 10 == 0 { State::Full } else { State::Up },
         since: SystemTime::now(),
-        report: Some(serde_json::from_value(report.clone()).unwrap()),
+        report: Some(Arc::new(serde_json::from_value(report.clone()).unwrap())),
         error: None,
         effective_load: Some(44.5),
         in_flight: 1,

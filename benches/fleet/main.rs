@@ -17,8 +17,8 @@
     reason = "a measurement that can't go on ends"
 )]
 
-mod audience;
 mod door;
+mod push;
 mod server;
 mod stand_ins;
 mod watch;
@@ -51,7 +51,7 @@ fn main() -> ExitCode {
         watch::measure(&mut verdict);
     }
     if is_wanted("push") {
-        audience::measure(&mut verdict);
+        push::measure(&mut verdict);
     }
     if verdict.failed { ExitCode::FAILURE } else { ExitCode::SUCCESS }
 }

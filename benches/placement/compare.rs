@@ -40,36 +40,41 @@ pub(crate) fn scenarios(fleets: &[usize], refreshes: &[f64]) -> Vec<Scenario> {
 pub(crate) fn foreign_scenarios(fleets: &[usize]) -> Vec<Scenario> {
     let mut all = scenarios(fleets, &[1.0]);
     all.retain(|scenario| scenario.sessions == Sessions::Exponential);
-    all.iter_mut().for_each(|scenario| scenario.foreign = Foreign::ComesAndGoes);
+    for scenario in &mut all {
+        scenario.foreign = Foreign::ComesAndGoes;
+    }
     all
 }
 
-/// Runs every policy on a scenario; a small fleet is left more to chance and needs more seeds.
-pub(crate) fn compare(scenario: &Scenario) -> Row {
+/// The mean outcome of a scenario over its seeds; a small fleet is left more to chance and needs more of them.
+pub(crate) fn mean(scenario: &Scenario, run: impl Fn(u64) -> Outcome) -> Outcome {
     let seeds = match scenario.servers {
         ..50 => 20,
         50..500 => 4,
         _ => 1,
     };
-    let mut row = Row::default();
-    for seed in 1..=seeds {
-        let servers = scenario.servers;
-        let rival = |rule| run(scenario, seed, &mut Rival::new(servers, rule, seed));
-        let outcomes = [
-            run(scenario, seed, &mut Own::new(servers, true)),
-            run(scenario, seed, &mut Own::new(servers, false)),
-            rival(Rule::LeastReported),
-            rival(Rule::Random),
-            rival(Rule::TwoChoices),
-            rival(Rule::RoundRobin),
-        ];
-        for (mean, outcome) in row.iter_mut().zip(outcomes) {
-            mean.highest += outcome.highest / seeds as f64;
-            mean.overload += outcome.overload / seeds as f64;
-            mean.refused += outcome.refused / seeds as f64;
-        }
+    let mut mean = Outcome::default();
+    for outcome in (1..=seeds).map(run) {
+        mean.highest += outcome.highest / seeds as f64;
+        mean.overload += outcome.overload / seeds as f64;
+        mean.refused += outcome.refused / seeds as f64;
     }
-    row
+    mean
+}
+
+/// Runs every policy on a scenario.
+pub(crate) fn compare(scenario: &Scenario) -> Row {
+    let servers = scenario.servers;
+    let own = |instances| mean(scenario, |seed| run(scenario, seed, &mut Own::new(servers, instances)));
+    let rival = |rule| mean(scenario, |seed| run(scenario, seed, &mut Rival::new(servers, rule, seed)));
+    [
+        own(true),
+        own(false),
+        rival(Rule::LeastReported),
+        rival(Rule::Random),
+        rival(Rule::TwoChoices),
+        rival(Rule::RoundRobin),
+    ]
 }
 
 /// The rivals that are better than the policy at this place of the row, and in what.

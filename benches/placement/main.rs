@@ -14,6 +14,7 @@
 
 mod compare;
 mod dispatch;
+mod replicas;
 mod scenario;
 mod world;
 
@@ -47,6 +48,7 @@ fn main() -> ExitCode {
     let lost = measure(&plain);
     println!("\nThe same where other programs use the machines too, which does not decide whether this fails:\n");
     measure(&foreign);
+    replicas::measure(if quick { &[5] } else { &[5, 50] }, if quick { &[1.0] } else { &[1.0, 3.0] });
     speed();
     println!("\n{} scenarios in {:.0} s", plain.len() + foreign.len(), begin.elapsed().as_secs_f64());
     if lost == 0 { ExitCode::SUCCESS } else { ExitCode::FAILURE }
