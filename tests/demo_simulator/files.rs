@@ -3,10 +3,10 @@
 use std::fs;
 use std::os::unix::fs::symlink;
 
-use super::simulator::{SMALL_WORLD, Simulator, Start, project};
+use super::simulator::{Simulator, Start, small_project};
 
 async fn started() -> (tempfile::TempDir, Simulator) {
-    let project = project(&[("a.wbt", SMALL_WORLD)]);
+    let project = small_project();
     fs::create_dir(project.path().join("worlds/textures")).unwrap();
     fs::write(project.path().join("worlds/textures/wood.png"), "a picture").unwrap();
     fs::write(project.path().join("index.html"), "<p>hello").unwrap();

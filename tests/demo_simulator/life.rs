@@ -3,16 +3,19 @@
 use std::net::TcpListener;
 use std::time::{Duration, Instant};
 
+use futures_util::StreamExt as _;
+use futures_util::future::join_all;
 use nix::sys::signal::Signal;
 use nix::sys::stat::Mode;
 use nix::unistd::mkfifo;
+use tokio::time::timeout;
 use tokio_tungstenite::tungstenite::protocol::frame::coding::CloseCode;
 
-use super::simulator::{PORT, SMALL_WORLD, Start, own_address, project};
+use super::simulator::{DEADLINE, PORT, Start, WORLD, own_address, project, small_project};
 
 #[tokio::test]
 async fn it_listens_at_once_and_beats_first_after_one_period() {
-    let project = project(&[("a.wbt", SMALL_WORLD)]);
+    let project = small_project();
     let started = Instant::now();
     let start = Start::paused(&project.path().join("worlds/a.wbt")).argument("--heartbeat=500");
     let mut simulator = start.listening().await;
@@ -25,7 +28,7 @@ async fn it_listens_at_once_and_beats_first_after_one_period() {
 
 #[tokio::test]
 async fn without_stdout_only_status_lines_are_printed() {
-    let project = project(&[("a.wbt", SMALL_WORLD)]);
+    let project = small_project();
     let start = Start::with(&["--batch", "--stream", "--heartbeat=20", "--port=21234"]);
     let mut simulator = start.world(&project.path().join("worlds/a.wbt")).spawn();
     simulator.prints(&[".", "."]).await;
@@ -42,21 +45,57 @@ async fn a_client_that_comes_before_the_world_is_told_so_and_then_shown_it() {
     viewer.say("w3d").await;
     viewer.hears(&["loading:Reading world file :0"]).await;
     simulator.prints(&[".", "."]).await;
-    tokio::fs::write(&world, SMALL_WORLD).await.unwrap();
+    tokio::fs::write(&world, WORLD).await.unwrap();
     viewer.hears(&["loading:Parsing world:100", "loading:Finalizing nodes:100"]).await;
     viewer.hears(&["world:worlds/slow.wbt:", "model:", "application/json:", "scene load completed", "pause: 0"]).await;
     viewer.hears_nothing().await;
 }
 
 #[tokio::test]
-async fn a_signal_ends_it_with_0_and_clients_are_told() {
-    let project = project(&[("a.wbt", SMALL_WORLD)]);
+async fn a_signal_ends_it_with_0_after_the_closing_handshake() {
+    let project = small_project();
     for signal in [Signal::SIGTERM, Signal::SIGINT, Signal::SIGHUP, Signal::SIGQUIT] {
         let mut simulator = Start::paused(&project.path().join("worlds/a.wbt")).listening().await;
-        let mut viewer = simulator.spectator().await;
+        let viewer = simulator.spectator().await;
+        let not_watching = simulator.viewer().await;
         simulator.signal(signal);
-        viewer.is_closed(CloseCode::Away).await;
+        // with any other code Webots' page shows a dialog
+        for mut client in [viewer, not_watching] {
+            client.is_closed(CloseCode::Normal).await;
+            let end = timeout(DEADLINE, client.socket.next()).await.expect("the connection did not end in time");
+            assert!(end.is_none(), "{end:?}");
+        }
         assert_eq!(simulator.end().await.code(), Some(0), "{signal}");
+    }
+}
+
+#[tokio::test]
+async fn a_client_that_does_not_answer_delays_the_end_by_a_second_only() {
+    let project = small_project();
+    let mut simulator = Start::paused(&project.path().join("worlds/a.wbt")).listening().await;
+    let silent = simulator.spectator().await;
+    simulator.signal(Signal::SIGTERM);
+    let signalled = Instant::now();
+    assert_eq!(simulator.end().await.code(), Some(0));
+    assert!(signalled.elapsed() >= Duration::from_secs(1), "the client had no time to answer");
+    drop(silent);
+}
+
+#[tokio::test]
+async fn it_ends_quietly_however_many_clients_there_are() {
+    let project = small_project();
+    for _ in 0..20 {
+        let world = project.path().join("worlds/a.wbt");
+        let mut simulator = Start::paused(&world).argument("--heartbeat=1").listening().await;
+        let mut viewers = Vec::new();
+        for _ in 0..50 {
+            viewers.push(simulator.spectator().await);
+        }
+        simulator.signal(Signal::SIGTERM);
+        let closing = viewers.into_iter().map(async |mut viewer| while let Some(Ok(_)) = viewer.socket.next().await {});
+        timeout(DEADLINE, join_all(closing)).await.expect("the connections did not end in time");
+        assert_eq!(simulator.end().await.code(), Some(0));
+        assert!(!simulator.printed().contains("stderr: "));
     }
 }
 
@@ -72,7 +111,7 @@ async fn a_signal_ends_it_even_while_it_reads_the_world() {
 
 #[tokio::test]
 async fn a_taken_port_is_passed_over_silently() {
-    let project = project(&[("a.wbt", SMALL_WORLD)]);
+    let project = small_project();
     let world = project.path().join("worlds/a.wbt");
     let address = own_address();
     let first = Start::paused(&world).on(address).listening().await;
@@ -89,7 +128,7 @@ async fn a_taken_port_is_passed_over_silently() {
 
 #[tokio::test]
 async fn with_eleven_ports_taken_it_gives_up() {
-    let project = project(&[("a.wbt", SMALL_WORLD)]);
+    let project = small_project();
     let address = own_address();
     let listeners: Vec<_> = (PORT..=PORT + 10).map(|port| TcpListener::bind((address, port)).unwrap()).collect();
     let mut simulator = Start::paused(&project.path().join("worlds/a.wbt")).on(address).spawn();
@@ -100,7 +139,7 @@ async fn with_eleven_ports_taken_it_gives_up() {
 
 #[tokio::test]
 async fn a_world_that_cannot_be_read_ends_it_with_a_failure() {
-    let project = project(&[("notes.txt", SMALL_WORLD)]);
+    let project = project(&[("notes.txt", WORLD)]);
     for name in ["missing.wbt", "notes.txt"] {
         let mut simulator = Start::paused(&project.path().join("worlds").join(name)).spawn();
         assert_eq!(simulator.end().await.code(), Some(1), "{name}");

@@ -22,12 +22,26 @@ pub(crate) const PORT: u16 = 21_234;
 /// How long anything may take.
 pub(crate) const DEADLINE: Duration = Duration::from_secs(30);
 
-/// A world with one robot that moves and one box that does not; steps are 10 ms long.
-pub(crate) const SMALL_WORLD: &str = "#VRML_SIM R2025a utf8\n\
-    WorldInfo { basicTimeStep 10 FPS 50 }\n\
-    Viewpoint { }\n\
-    Solid { name \"box\" children Shape { geometry Box { } } }\n\
-    Robot { name \"mover\" translation 1 2 0 }\n";
+/// A world file; of which the first line counts.
+pub(crate) const WORLD: &str = "#VRML_SIM R2025a utf8\nWorldInfo { }\nViewpoint { }\n";
+/// A model with one robot that moves and one box that does not.
+pub(crate) const MODEL: &str = r#"<?xml version="1.0" encoding="UTF-8"?>
+<X3D>
+  <head><meta name="simulator" content="demo"/></head>
+  <Scene>
+    <WorldInfo id="n1"/>
+    <Viewpoint id="n2"/>
+    <Solid id="n3" name="box"><Shape id="n4"><Box id="n5"/></Shape></Solid>
+    <Robot id="n6" name="mover" translation="1 2 0" rotation="0 0 1 0"/>
+  </Scene>
+</X3D>
+"#;
+/// How that robot moves; steps are 10 ms long.
+pub(crate) const MOTION: &str = r#"{
+    "basicTimeStep": 10,
+    "FPS": 50,
+    "robots": {"mover": {"id": 6, "start": [1, 2, 0], "heading": 0, "radius": 0.4, "speed": 0.25}}
+}"#;
 
 /// How to start a simulator.
 pub(crate) struct Start {
@@ -51,14 +65,27 @@ pub(crate) fn own_address() -> Ipv4Addr {
     Ipv4Addr::new(127, high, low, NEXT.fetch_add(1, Ordering::Relaxed))
 }
 
-/// A project folder with the given worlds, by file name.
-pub(crate) fn project(worlds: &[(&str, &str)]) -> tempfile::TempDir {
+/// A project whose folder `worlds` has these files.
+pub(crate) fn project(files: &[(&str, &str)]) -> tempfile::TempDir {
     let folder = tempfile::tempdir().unwrap();
     std::fs::create_dir(folder.path().join("worlds")).unwrap();
-    for (name, text) in worlds {
+    for (name, text) in files {
         std::fs::write(folder.path().join("worlds").join(name), text).unwrap();
     }
     folder
+}
+
+/// A project with the small world `a.wbt`.
+pub(crate) fn small_project() -> tempfile::TempDir {
+    project(&[("a.wbt", WORLD), ("a.x3d", MODEL), ("a.motion.json", MOTION)])
+}
+
+/// A project with the world `a.wbt`, in which so many robots move.
+pub(crate) fn crowded_project(robots: usize) -> tempfile::TempDir {
+    let robot = serde_json::json!({"id": 6, "start": [1, 2, 0], "heading": 0, "radius": 0.4, "speed": 0.25});
+    let robots: serde_json::Map<_, _> = (0..robots).map(|number| (number.to_string(), robot.clone())).collect();
+    let motion = serde_json::json!({"basicTimeStep": 10, "FPS": 50, "robots": robots});
+    project(&[("a.wbt", WORLD), ("a.x3d", MODEL), ("a.motion.json", &motion.to_string())])
 }
 
 impl Start {
@@ -84,6 +111,11 @@ impl Start {
     pub(crate) fn argument(mut self, argument: &str) -> Self {
         self.arguments.push(argument.to_owned());
         self
+    }
+
+    /// Adds some arguments.
+    pub(crate) fn arguments(self, arguments: &[&str]) -> Self {
+        arguments.iter().fold(self, |start, argument| start.argument(argument))
     }
 
     /// Listens on this address.

@@ -1,46 +1,68 @@
-//! What worlds become.
+//! What clients are shown of a world.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
-use super::simulator::{Start, project};
+use quick_xml::Reader;
+use quick_xml::events::Event;
 
-const HEADER: &str = "#VRML_SIM R2025a utf8\n";
+use super::simulator::{MODEL, MOTION, Simulator, Start, WORLD, project};
+
+/// The model that the simulator sends.
+async fn model(simulator: &Simulator) -> String {
+    let mut viewer = simulator.viewer().await;
+    viewer.say("w3d").await;
+    loop {
+        let heard = viewer.hear().await;
+        if heard.starts_with("model:") {
+            return heard;
+        }
+    }
+}
 
 #[tokio::test]
-async fn a_broken_world_is_replaced_by_an_empty_one_and_only_stderr_tells() {
-    let no_header = "WorldInfo { }".to_owned();
-    let unclosed = format!("{HEADER}Solid {{ name \"a");
-    let deep = format!("{HEADER}{}", "Group { children ".repeat(100_000));
-    let wild = format!("{HEADER}\u{0} }}}} ]] \"\\");
-    let huge = format!("{HEADER}{}", " ".repeat(9 * 1024 * 1024));
-    let doubling: Vec<String> =
-        (1..50).map(|i| format!("DEF N{i} Group {{ children [ USE N{0} USE N{0} ] }}", i - 1)).collect();
-    let doubling = doubling.concat();
-    let exploding = format!("{HEADER}DEF N0 Group {{ }}{doubling}");
-    for text in [no_header, unclosed, deep, wild, huge, exploding, String::new()] {
-        let project = project(&[("a.wbt", &text)]);
+async fn a_world_that_cannot_be_shown_is_replaced_by_an_empty_one_and_only_stderr_tells() {
+    for (files, reason) in [
+        (vec![("a.wbt", "")], "the first line must be '#VRML_SIM"),
+        (vec![("a.wbt", "WorldInfo { }"), ("a.x3d", MODEL)], "the first line must be '#VRML_SIM"),
+        (vec![("a.wbt", "#VRML_SIM utf8\n"), ("a.x3d", MODEL)], "the first line must be '#VRML_SIM"),
+        (vec![("a.wbt", "#VRML V2.0 utf8\n"), ("a.x3d", MODEL)], "the first line must be '#VRML_SIM"),
+        (vec![("a.wbt", WORLD), ("a.x3d", MODEL), ("a.motion.json", "{")], "the motion of the robots: EOF"),
+        (
+            vec![("a.wbt", WORLD), ("a.x3d", MODEL), ("a.motion.json", "{\"fps\": 1}")],
+            "the motion of the robots: unknown",
+        ),
+        (vec![("a.wbt", WORLD), ("a.x3d/b", "")], "cannot read '"),
+    ] {
+        let project = project(&[]);
         let world = project.path().join("worlds/a.wbt");
+        for (name, text) in &files {
+            let file = world.with_file_name(name);
+            std::fs::create_dir_all(file.parent().unwrap()).unwrap();
+            std::fs::write(file, text).unwrap();
+        }
         let mut quiet = Start::paused(&world).argument("--heartbeat=1").listening().await;
-        let mut viewer = quiet.viewer().await;
-        viewer.say("w3d").await;
-        let model = loop {
-            let heard = viewer.hear().await;
-            if heard.starts_with("model:") {
-                break heard;
-            }
-        };
-        assert!(model.contains("<Viewpoint") && !model.contains("<Solid"), "{model}");
+        let model = model(&quiet).await;
+        assert!(model.contains("<Viewpoint") && !model.contains("<Solid"), "{files:?}: {model}");
         quiet.prints(&["."]).await;
         assert!(!quiet.printed().contains("stderr"));
         let loud = Start::paused(&world).argument("--stderr").listening().await;
-        loud.has_printed("stderr: ERROR: '").await;
+        loud.has_printed(&format!("stderr: ERROR: '{}': {reason}", world.display())).await;
+    }
+}
+
+#[tokio::test]
+async fn headers_of_older_releases_are_taken() {
+    for header in ["#VRML_SIM R2023b utf8\r\n", "#VRML_SIM V8.6.2 utf8", "\u{feff}#VRML_SIM R2025a utf8\n"] {
+        let project = project(&[("a.wbt", header), ("a.x3d", MODEL)]);
+        let simulator = Start::paused(&project.path().join("worlds/a.wbt")).playing().await;
+        assert!(model(&simulator).await.contains("mover"), "{header:?}");
     }
 }
 
 #[tokio::test]
 async fn the_demo_worlds_have_robots_that_move() {
     for (name, robots) in [("playground.wbt", 3), ("carousel.wbt", 4)] {
-        let world = Path::new(env!("CARGO_MANIFEST_DIR")).join("config/demo/worlds").join(name);
+        let world = demo_worlds().join(name);
         let simulator = Start::paused(&world).argument("--stderr").playing().await;
         let mut viewer = simulator.viewer().await;
         viewer.say("w3d").await;
@@ -50,52 +72,111 @@ async fn the_demo_worlds_have_robots_that_move() {
         assert_eq!(model.matches("<Robot ").count(), robots);
         assert!(model.contains("<Background ") && model.contains("<DirectionalLight "));
         viewer.hears(&["application/json:", "scene load completed", "pause: 0"]).await;
+        let mut last = String::new();
         for _ in 0..2 {
             viewer.say("step").await;
             let update = viewer.hear().await;
             assert_eq!(update.matches("\"translation\"").count(), robots, "{update}");
+            let poses = update.split_once("updates").unwrap().1.to_owned();
+            assert_ne!(poses, last);
+            last = poses;
             viewer.hears(&["paused by client"]).await;
         }
         assert!(!simulator.printed().contains("stderr"));
     }
 }
 
-#[tokio::test]
-async fn each_node_becomes_an_element_with_its_number() {
-    let text = r#"#VRML_SIM R2025a utf8
-        EXTERNPROTO "https://example.org/Floor.proto"
-        Floor { size 3 3 appearance Parquetry { type "}" } }  # a comment }
-        WorldInfo { title "<a> & \"b\"" basicTimeStep 16 }
-        Viewpoint { position -4 0 2 near 0.1 }
-        Solid {
-          name "it's"
-          translation 0 0 .5
-          children Shape {
-            castShadows TRUE
-            appearance PBRAppearance { baseColor 1 0 0 baseColorMap ImageTexture { url "a.png" } }
-            geometry Box { size 1, 2, 3 }
-          }
-          boundingObject Box { }
+fn demo_worlds() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("config/demo/worlds")
+}
+
+/// The robots of a model: name, number of the node, translation, angle about the vertical axis.
+fn robots_of_model(model: &str) -> Vec<(String, u64, Vec<f64>, f64)> {
+    let numbers = |text: &str| text.split(' ').map(|number| number.parse().unwrap()).collect::<Vec<f64>>();
+    let mut reader = Reader::from_str(model);
+    let mut robots = Vec::new();
+    loop {
+        match reader.read_event().unwrap() {
+            Event::Eof => return robots,
+            Event::Start(tag) | Event::Empty(tag) if tag.name().as_ref() == "Robot" => {
+                let attribute = |name: &str| tag.try_get_attribute(name).unwrap().unwrap().value.into_owned();
+                let rotation = numbers(&attribute("rotation"));
+                assert_eq!(rotation[..3], [0.0, 0.0, 1.0], "robots turn about the vertical axis");
+                let id = attribute("id").trim_start_matches('n').parse().unwrap();
+                robots.push((attribute("name"), id, numbers(&attribute("translation")), rotation[3]));
+            }
+            _ => (),
         }
-        DEF PAIR Group { children [ Pose { } Group { } ] }
-        USE PAIR
-    "#;
-    let project = project(&[("a.wbt", text)]);
+    }
+}
+
+#[test]
+fn world_model_and_motion_of_the_demo_agree() {
+    for name in ["playground", "carousel"] {
+        let read =
+            |extension: &str| std::fs::read_to_string(demo_worlds().join(name).with_extension(extension)).unwrap();
+        let (world, model) = (read("wbt"), read("x3d"));
+        let motion: serde_json::Value = serde_json::from_str(&read("motion.json")).unwrap();
+        let robots = robots_of_model(&model);
+        assert_eq!(robots.len(), motion["robots"].as_object().unwrap().len(), "{name}");
+        for (robot, id, translation, angle) in robots {
+            let moves = &motion["robots"][&robot];
+            assert_eq!(moves["id"], id, "{robot}");
+            assert_eq!(serde_json::from_value::<Vec<f64>>(moves["start"].clone()).unwrap(), translation, "{robot}");
+            assert_eq!(moves["heading"].as_f64(), Some(angle), "{robot}");
+            assert!(world.contains(&format!("Robot {{\n  name \"{robot}\"")), "{robot}");
+        }
+        for setting in ["basicTimeStep", "FPS"] {
+            assert!(world.contains(&format!("{setting} {}\n", motion[setting])), "{name}: {setting}");
+            assert!(model.contains(&format!("{setting}=\"{}\"", motion[setting])), "{name}: {setting}");
+        }
+    }
+}
+
+#[tokio::test]
+async fn a_world_without_a_model_is_a_small_scene_with_the_files_name_as_its_title() {
+    let project = project(&[("<b> & \"c\".wbt", WORLD)]);
+    let simulator = Start::paused(&project.path().join("worlds/<b> & \"c\".wbt")).playing().await;
+    let model = model(&simulator).await;
+    let xml = model.strip_prefix("model:").unwrap();
+    assert_eq!(robots_of_model(xml).len(), 1);
+    assert!(xml.contains("<X3D><head>") && xml.contains("<Viewpoint "), "it is on one line: {xml}");
+    let title = xml.split("title=\"").nth(1).unwrap().split('"').next().unwrap();
+    assert_eq!(quick_xml::escape::unescape(title).unwrap(), "<b> & \"c\".wbt");
+    let mut viewer = simulator.spectator().await;
+    viewer.say("step").await;
+    viewer.hears(&["application/json:{\"time\":32,\"updates\":[{\"id\":9,", "paused by client"]).await;
+}
+
+#[tokio::test]
+async fn a_model_without_motion_stands_still() {
+    let project = project(&[("a.wbt", WORLD), ("a.x3d", MODEL)]);
     let simulator = Start::paused(&project.path().join("worlds/a.wbt")).playing().await;
+    let mut viewer = simulator.spectator().await;
+    viewer.say("step").await;
+    assert_eq!(viewer.hear().await, r#"application/json:{"time":32}"#);
+}
+
+#[tokio::test]
+async fn steps_have_limits() {
+    for (step, time) in [("8", "8"), ("0", "0.1"), ("-5", "0.1"), ("1e300", "10000")] {
+        let motion = MOTION.replace("\"basicTimeStep\": 10", &format!("\"basicTimeStep\": {step}"));
+        let project = project(&[("a.wbt", WORLD), ("a.x3d", MODEL), ("a.motion.json", &motion)]);
+        let simulator = Start::paused(&project.path().join("worlds/a.wbt")).playing().await;
+        let mut viewer = simulator.spectator().await;
+        viewer.say("step").await;
+        viewer.hears(&[&format!("application/json:{{\"time\":{time},")]).await;
+    }
+}
+
+#[tokio::test]
+async fn a_world_that_is_not_in_a_folder_worlds_has_its_own_folder_for_a_project() {
+    let folder = tempfile::tempdir().unwrap();
+    for name in ["a.wbt", "b.WBT", "notes.txt"] {
+        std::fs::write(folder.path().join(name), WORLD).unwrap();
+    }
+    let simulator = Start::paused(&folder.path().join("a.wbt")).playing().await;
     let mut viewer = simulator.viewer().await;
     viewer.say("w3d").await;
-    viewer.hears(&["world:"]).await;
-    assert_eq!(
-        viewer.hear().await,
-        concat!(
-            r#"model:<?xml version="1.0" encoding="UTF-8"?><X3D><head><meta name="generator" content="Webots"/>"#,
-            r#"<meta name="version" content="R2025a"/><meta name="simulator" content="demo"/></head><Scene>"#,
-            r#"<WorldInfo id="n1" title="&lt;a&gt; &amp; &quot;b&quot;" basicTimeStep="16"/>"#,
-            r#"<Viewpoint id="n2" position="-4 0 2" zNear="0.1"/>"#,
-            r#"<Solid id="n3" name="it&apos;s" translation="0 0 0.5"><Shape id="n4" castShadows="true">"#,
-            r#"<PBRAppearance id="n5" baseColor="1 0 0"/><Box id="n6" size="1 2 3"/></Shape></Solid>"#,
-            r#"<Group id="n7"><Pose id="n8"/><Group id="n9"/></Group>"#,
-            r#"<Group id="n10"><Pose id="n11"/><Group id="n12"/></Group></Scene></X3D>"#,
-        )
-    );
+    assert_eq!(viewer.hear().await, "world:a.wbt:a.wbt;b.WBT");
 }

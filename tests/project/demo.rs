@@ -128,9 +128,9 @@ async fn a_restart_shows_what_was_changed_in_the_demos_project() {
     };
     through_the_link(&["start", "demo"]).await;
     let before = project.pid("session", "demo");
-    let world = project.path("config/demo/worlds/playground.wbt");
-    let text = std::fs::read_to_string(&world).unwrap();
-    std::fs::write(&world, text.replace("\"beetle\"", "\"ladybird\"")).unwrap();
+    let model = project.path("config/demo/worlds/playground.x3d");
+    let text = std::fs::read_to_string(&model).unwrap();
+    std::fs::write(&model, text.replace("\"beetle\"", "\"ladybird\"")).unwrap();
     through_the_link(&["restart"]).await;
     assert_ne!(before, project.pid("session", "demo"));
     let (_client, url) = simulate(&project).await;

@@ -1,160 +1,136 @@
-//! The actor of one WebSocket. Created for each connection; passes what its peer says to the simulation as
-//! events, and writes out what the simulation puts in its `Outbox`.
+//! The actor of one WebSocket, created for each connection. It sends the simulation what the peer says, as
+//! events, and the peer what the simulation says. The simulation reaches it through a `ClientHandle`.
 //!
-//! Nothing piles up: a peer that talks faster than the simulation listens is sent away, and an actor whose
-//! peer does not read is not run at all, so the simulation sees its outbox fill up. (To make the actor wait
-//! until the simulation has listened would not do: what the peer says then piles up below the actor.)
+//! Queues are bounded. A peer that talks faster than the simulation handles it is disconnected. The actor of
+//! a peer that does not read is not run, so that its mailbox fills up; if the peer ever reads on, it is
+//! disconnected.
 
-use std::net::{Shutdown, TcpStream};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicU64, Ordering};
 
 use actix::{Actor, ActorContext as _, AsyncContext as _, Handler, Message, Recipient, StreamHandler};
-use actix_web_actors::ws;
+use actix_web_actors::ws::{self, CloseCode, CloseReason, WebsocketContext};
 use bytestring::ByteString;
+use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 
-/// Texts of a peer that the simulation has not heard yet, at most.
-const MOST_UNHEARD: usize = 256;
+/// Texts of the peer that the simulation has not handled yet, at most.
+const MAX_INCOMING: usize = 256;
+/// Texts that wait to be sent to the peer, at most.
+const MAX_OUTGOING: usize = 64;
+/// Of these, updates of poses.
+const MAX_UPDATES: usize = 4;
 
-/// Tells connections apart.
+/// Identifies a connection.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) struct ClientId(u64);
 
-/// A text to write out, or the end.
+/// What the simulation sends.
 #[derive(Message)]
 #[rtype(result = "()")]
 enum Outgoing {
-    Text(ByteString),
-    Close(ws::CloseCode),
+    Text(ByteString, Option<OwnedSemaphorePermit>),
+    Close,
 }
 
 /// What happens on a connection.
 #[derive(Message)]
 #[rtype(result = "()")]
 pub(crate) enum Event {
-    /// It was opened; here is how to write to it.
-    Joined(ClientId, Outbox),
-    /// Its peer said something.
-    Said(ClientId, ByteString, Unheard),
+    /// It was opened.
+    Connected(ClientId, ClientHandle),
+    /// The peer has sent a text. The permit counts it as one that is not handled yet.
+    Received(ClientId, ByteString, OwnedSemaphorePermit),
     /// It is closed.
-    Left(ClientId),
+    Disconnected(ClientId),
 }
 
-/// Counts a text as not heard yet, until it is dropped.
-pub(crate) struct Unheard(Arc<AtomicUsize>);
-
-/// The way to a client's peer.
-#[derive(Clone)]
-pub(crate) struct Outbox {
+/// How the simulation reaches a client.
+pub(crate) struct ClientHandle {
     client: Recipient<Outgoing>,
-    /// Bytes that wait for the peer.
-    waiting: Arc<AtomicUsize>,
-    connection: Arc<TcpStream>,
+    updates: Arc<Semaphore>,
 }
 
-impl Outbox {
-    /// Queues a text, however much waits already.
-    pub(crate) fn send(&self, text: ByteString) {
-        self.waiting.fetch_add(cost(&text), Ordering::Relaxed);
-        self.client.do_send(Outgoing::Text(text));
+impl ClientHandle {
+    /// Queues a text. Returns false if the queue is full or the client is gone.
+    pub(crate) fn send(&self, text: ByteString) -> bool {
+        self.client.try_send(Outgoing::Text(text, None)).is_ok()
     }
 
-    /// How many bytes of memory hold what waits for the peer to read.
-    pub(crate) fn waiting(&self) -> usize {
-        self.waiting.load(Ordering::Relaxed)
+    /// Queues an update of poses. Returns false if too many wait already.
+    pub(crate) fn send_update(&self, text: ByteString) -> bool {
+        let permit = Arc::clone(&self.updates).try_acquire_owned();
+        permit.is_ok_and(|permit| self.client.try_send(Outgoing::Text(text, Some(permit))).is_ok())
     }
 
-    /// Says goodbye after all that waits.
-    pub(crate) fn close(&self, code: ws::CloseCode) {
-        self.client.do_send(Outgoing::Close(code));
+    /// Starts the closing handshake, after what is queued.
+    pub(crate) fn close(&self) {
+        self.client.do_send(Outgoing::Close);
     }
 
-    /// Breaks the connection at once. The only way with a peer that does not read, since its actor is
-    /// not run.
-    pub(crate) fn hang_up(&self) {
-        // it fails only if the connection is gone already
-        drop(self.connection.shutdown(Shutdown::Both));
+    /// Disconnects the client before it sends any of what is queued.
+    pub(crate) fn disconnect(&self) {
+        self.updates.close();
     }
-}
-
-impl Unheard {
-    fn new(count: &Arc<AtomicUsize>) -> Self {
-        count.fetch_add(1, Ordering::Relaxed);
-        Self(Arc::clone(count))
-    }
-}
-
-impl Drop for Unheard {
-    fn drop(&mut self) {
-        self.0.fetch_sub(1, Ordering::Relaxed);
-    }
-}
-
-/// A queued text takes about this much memory, even a short one.
-fn cost(text: &ByteString) -> usize {
-    text.len() + 128
 }
 
 /// The actor of one WebSocket.
 pub(crate) struct Client {
     id: ClientId,
     simulation: Recipient<Event>,
-    unheard: Arc<AtomicUsize>,
-    waiting: Arc<AtomicUsize>,
-    connection: Arc<TcpStream>,
+    incoming: Arc<Semaphore>,
+    /// Closed when the client is to be disconnected.
+    updates: Arc<Semaphore>,
+    /// Whether the closing handshake was started from here.
+    closing: bool,
 }
 
 impl Client {
-    /// A client whose events go to `simulation`; `connection` is the one below the WebSocket.
-    pub(crate) fn new(simulation: Recipient<Event>, connection: Arc<TcpStream>) -> Self {
+    /// A client that sends its events to `simulation`.
+    pub(crate) fn new(simulation: Recipient<Event>) -> Self {
         static NEXT_ID: AtomicU64 = AtomicU64::new(1);
         let id = ClientId(NEXT_ID.fetch_add(1, Ordering::Relaxed));
-        Self { id, simulation, unheard: Arc::default(), waiting: Arc::default(), connection }
+        let [incoming, updates] = [MAX_INCOMING, MAX_UPDATES].map(|permits| Arc::new(Semaphore::new(permits)));
+        Self { id, simulation, incoming, updates, closing: false }
     }
 
-    fn pass_on(&self, text: ByteString, ctx: &mut ws::WebsocketContext<Self>) {
-        if self.unheard.load(Ordering::Relaxed) >= MOST_UNHEARD {
-            Self::end(ctx, Some(ws::CloseCode::Policy.into()));
-            return;
+    fn receive(&self, text: ByteString, ctx: &mut WebsocketContext<Self>) {
+        match Arc::clone(&self.incoming).try_acquire_owned() {
+            Ok(permit) => self.simulation.do_send(Event::Received(self.id, text, permit)),
+            Err(_) => end(ctx, Some(CloseCode::Policy.into())),
         }
-        let unheard = Unheard::new(&self.unheard);
-        self.simulation.do_send(Event::Said(self.id, text, unheard));
-    }
-
-    fn end(ctx: &mut ws::WebsocketContext<Self>, reason: Option<ws::CloseReason>) {
-        ctx.close(reason);
-        ctx.stop();
     }
 }
 
+/// Sends a close frame and ends without waiting for an answer.
+fn end(ctx: &mut WebsocketContext<Client>, reason: Option<CloseReason>) {
+    ctx.close(reason);
+    ctx.stop();
+}
+
 impl Actor for Client {
-    type Context = ws::WebsocketContext<Self>;
+    type Context = WebsocketContext<Self>;
 
     fn started(&mut self, ctx: &mut Self::Context) {
-        let outbox = Outbox {
-            client: ctx.address().recipient(),
-            waiting: Arc::clone(&self.waiting),
-            connection: Arc::clone(&self.connection),
-        };
-        self.simulation.do_send(Event::Joined(self.id, outbox));
+        ctx.set_mailbox_capacity(MAX_OUTGOING);
+        let handle = ClientHandle { client: ctx.address().recipient(), updates: Arc::clone(&self.updates) };
+        self.simulation.do_send(Event::Connected(self.id, handle));
     }
 
     fn stopped(&mut self, _: &mut Self::Context) {
-        self.simulation.do_send(Event::Left(self.id));
+        self.simulation.do_send(Event::Disconnected(self.id));
     }
 }
 
 impl StreamHandler<Result<ws::Message, ws::ProtocolError>> for Client {
     fn handle(&mut self, message: Result<ws::Message, ws::ProtocolError>, ctx: &mut Self::Context) {
         match message {
-            Ok(ws::Message::Text(text)) => self.pass_on(text, ctx),
+            Ok(ws::Message::Close(_)) if self.closing => ctx.stop(),
+            Ok(ws::Message::Close(reason)) => end(ctx, reason),
+            Ok(ws::Message::Text(text)) => self.receive(text, ctx),
             Ok(ws::Message::Ping(data)) => ctx.pong(&data),
             Ok(ws::Message::Pong(_) | ws::Message::Nop) => (),
-            Ok(ws::Message::Close(reason)) => Self::end(ctx, reason),
-            Ok(ws::Message::Binary(_) | ws::Message::Continuation(_)) => {
-                Self::end(ctx, Some(ws::CloseCode::Unsupported.into()));
-            }
-            Err(_) => Self::end(ctx, Some(ws::CloseCode::Protocol.into())),
+            Ok(ws::Message::Binary(_) | ws::Message::Continuation(_)) => end(ctx, Some(CloseCode::Unsupported.into())),
+            Err(_) => end(ctx, Some(CloseCode::Protocol.into())),
         }
     }
 }
@@ -164,11 +140,16 @@ impl Handler<Outgoing> for Client {
 
     fn handle(&mut self, message: Outgoing, ctx: &mut Self::Context) {
         match message {
-            Outgoing::Text(text) => {
-                self.waiting.fetch_sub(cost(&text), Ordering::Relaxed);
+            _ if self.updates.is_closed() => end(ctx, Some(CloseCode::Policy.into())),
+            Outgoing::Text(text, permit) => {
                 ctx.text(text);
+                drop(permit);
             }
-            Outgoing::Close(code) => Self::end(ctx, Some(code.into())),
+            Outgoing::Close => {
+                self.closing = true;
+                // with any other code Webots' page tells its user of a lost connection
+                ctx.close(Some(CloseCode::Normal.into()));
+            }
         }
     }
 }

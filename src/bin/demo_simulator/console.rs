@@ -1,21 +1,20 @@
-//! What the program prints. The status lines are Webots' and always on the standard output, each flushed
-//! at once, because whoever started the program reads them from a pipe; remarks need `--stdout`, warnings
-//! and errors `--stderr`.
+//! What the program prints. Each line is flushed at once, because whoever started the program reads it
+//! from a pipe.
 
 use std::fmt::Display;
 use std::io;
 
-/// Where remarks, warnings and errors go.
+/// Prints information and errors as far as the command line asks for them.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Console {
-    /// Whether remarks are printed.
+    /// Whether information is printed on the standard output.
     pub(crate) stdout: bool,
-    /// Whether warnings and errors are printed.
+    /// Whether warnings and errors are printed on the standard error.
     pub(crate) stderr: bool,
 }
 
 impl Console {
-    /// Prints a remark, with `--stdout`.
+    /// Prints information, with `--stdout`.
     pub(crate) fn info(self, text: impl Display) {
         if self.stdout {
             print(io::stdout(), &format!("INFO: {text}"));
@@ -37,19 +36,19 @@ impl Console {
     }
 }
 
-/// Prints what ends the program, whatever the options.
+/// Prints why the program ends with a failure; does not depend on the command line.
 pub(crate) fn fatal(text: impl Display) {
     print(io::stderr(), &format!("webots: {text}"));
 }
 
-/// Prints a line on the standard output, such as `.` or `pause`.
-pub(crate) fn status(line: &str) {
-    print(io::stdout(), line);
-}
-
-/// Prints plain text on the standard error.
+/// Prints a text on the standard error as it is.
 pub(crate) fn explain(text: &str) {
     print(io::stderr(), text);
+}
+
+/// Prints a line that simulation servers read, such as `.` or `pause`; does not depend on the command line.
+pub(crate) fn status(line: &str) {
+    print(io::stdout(), line);
 }
 
 fn print(mut stream: impl io::Write, line: &str) {

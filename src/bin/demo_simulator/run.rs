@@ -1,100 +1,87 @@
 //! A run of the simulator, from the open port to the exit code.
 
-use std::future::Future;
+use std::error::Error;
 use std::net::TcpListener;
+use std::sync::mpsc;
 use std::time::Duration;
+use std::{future, io, thread};
 
-use actix::{Actor as _, Addr, Recipient, System};
+use actix::{Actor as _, Recipient, System};
 use actix_web::dev::Server;
 use actix_web::{App, HttpServer, rt, web};
+use futures_util::future::select_all;
 use tokio::signal::unix::{Signal, SignalKind, signal};
 use tokio::sync::oneshot;
+use tokio::time;
 
-use crate::args::Options;
+use crate::args::Args;
 use crate::client::Event;
 use crate::console::{self, Console};
-use crate::files::{self, ProjectFolder};
+use crate::http::{self, ProjectFolder};
 use crate::port;
-use crate::simulation::{CloseAll, Simulation};
+use crate::simulation::{CloseClients, Simulation};
 use crate::world::WorldFile;
 
 /// Connections at a time; more wait.
-const MOST_CONNECTIONS: usize = 256;
-/// How long clients have to say goodbye, in seconds.
-const GOODBYE_SECS: u64 = 1;
+const MAX_CONNECTIONS: usize = 256;
+/// How long clients have for the closing handshake.
+const CLOSE_TIMEOUT: Duration = Duration::from_secs(1);
 
-/// Runs a simulation until it is told to end, then exits without waiting for the threads: one of them may
-/// be stuck with reading the world.
-pub(crate) fn run(options: &Options) -> ! {
-    let system = System::new();
-    let code = system.block_on(simulate(options)).unwrap_or_else(|error| {
-        console::fatal(error);
-        1
+/// Runs a simulation until it is told to end, and returns the exit code.
+///
+/// The process is to exit then without waiting for any thread: one may still be reading the world. None of
+/// the threads that run actors ends before, since actix's thread-local values panic when they are dropped on
+/// two threads at once.
+pub(crate) fn run(args: Args) -> i32 {
+    let (sender, code) = mpsc::channel();
+    thread::spawn(move || {
+        System::new().block_on(async {
+            let code = simulate(&args).await.map_or_else(fail, |()| 0);
+            sender.send(code).ok();
+            future::pending::<()>().await;
+        });
     });
-    std::process::exit(code);
+    code.recv().unwrap_or(1)
 }
 
-async fn simulate(options: &Options) -> Result<i32, Box<dyn std::error::Error>> {
-    let console = Console { stdout: options.stdout, stderr: options.stderr };
-    let told_to_end = signals()?;
-    let listener = port::listen(options.port, console)?;
-    warn_of(options, console);
-    if let Some(period) = options.heartbeat {
-        rt::spawn(beat(period));
-    }
-
-    let file = WorldFile::new(&options.world);
-    let project = ProjectFolder::new(file.project());
-    let (failed, failure) = oneshot::channel();
-    let simulation = Simulation::new(file, options.mode, options.stream, console, failed).start();
-    let server = serve(listener, simulation.clone().recipient(), project)?;
-    let handle = server.handle();
-    rt::spawn(server);
-
-    tokio::select! {
-        () = told_to_end => end(&simulation, &handle).await,
-        Ok(error) = failure => return Err(error.into()),
-    }
-    Ok(0)
+fn fail(error: Box<dyn Error>) -> i32 {
+    console::fatal(error);
+    1
 }
 
-async fn end(simulation: &Addr<Simulation>, server: &actix_web::dev::ServerHandle) {
-    if simulation.send(CloseAll).await.is_ok() {
-        let goodbye = Duration::from_secs(2 * GOODBYE_SECS);
-        drop(tokio::time::timeout(goodbye, server.stop(true)).await);
-    }
-}
-
-/// Ends with the first signal that asks the program to end.
-fn signals() -> std::io::Result<impl Future<Output = ()>> {
-    let [mut terminate, mut interrupt, mut hang_up, mut quit]: [Signal; 4] = [
-        signal(SignalKind::terminate())?,
-        signal(SignalKind::interrupt())?,
-        signal(SignalKind::hangup())?,
-        signal(SignalKind::quit())?,
-    ];
-    Ok(async move {
-        tokio::select! {
-            _ = terminate.recv() => (),
-            _ = interrupt.recv() => (),
-            _ = hang_up.recv() => (),
-            _ = quit.recv() => (),
-        }
-    })
-}
-
-fn warn_of(options: &Options, console: Console) {
-    if options.stream && !options.batch {
+async fn simulate(args: &Args) -> Result<(), Box<dyn Error>> {
+    let console = Console { stdout: args.stdout, stderr: args.stderr };
+    let kinds = [SignalKind::terminate(), SignalKind::interrupt(), SignalKind::hangup(), SignalKind::quit()];
+    let signals = kinds.into_iter().map(signal).collect::<Result<_, _>>()?;
+    let listener = port::listen(args.port, console)?;
+    if args.stream.is_some() && !args.batch {
         console.warning("Streaming should be used with --batch.");
     }
-    if options.deprecated_mode {
-        console::explain("The modes 'stop' and 'run' are deprecated: use 'pause' and 'fast'.");
+    if let Some(period) = args.heartbeat {
+        rt::spawn(beat(Duration::from_millis(period)));
     }
+
+    let file = WorldFile::new(args.world.as_deref().unwrap_or("".as_ref()));
+    let project = ProjectFolder::new(file.project());
+    let (report_failure, failure) = oneshot::channel();
+    let simulation = Simulation::new(file, args.mode, args.stream.is_some(), console, report_failure).start();
+    rt::spawn(serve(listener, simulation.clone().recipient(), project)?);
+
+    tokio::select! {
+        () = first_of(signals) => drop(time::timeout(CLOSE_TIMEOUT, simulation.send(CloseClients)).await),
+        Ok(error) = failure => return Err(error.into()),
+    }
+    Ok(())
 }
 
-/// The first beat comes one period after the start, as with Webots.
+/// Completes at the first signal that asks the program to end.
+async fn first_of(mut signals: Vec<Signal>) {
+    select_all(signals.iter_mut().map(|signal| Box::pin(signal.recv()))).await;
+}
+
+/// The first heartbeat comes one period after the start, as with Webots.
 async fn beat(period: Duration) {
-    let mut beats = tokio::time::interval(period);
+    let mut beats = time::interval(period);
     beats.tick().await;
     loop {
         beats.tick().await;
@@ -102,18 +89,16 @@ async fn beat(period: Duration) {
     }
 }
 
-fn serve(listener: TcpListener, simulation: Recipient<Event>, project: ProjectFolder) -> std::io::Result<Server> {
+fn serve(listener: TcpListener, simulation: Recipient<Event>, project: ProjectFolder) -> io::Result<Server> {
     let simulation = web::Data::new(simulation);
     let project = web::Data::new(project);
     let server = HttpServer::new(move || {
-        App::new().app_data(simulation.clone()).app_data(project.clone()).configure(files::configure)
+        App::new().app_data(simulation.clone()).app_data(project.clone()).configure(http::configure)
     });
     Ok(server
-        .on_connect(files::remember_connection)
         .workers(1)
         .worker_max_blocking_threads(2)
-        .max_connections(MOST_CONNECTIONS)
-        .shutdown_timeout(GOODBYE_SECS)
+        .max_connections(MAX_CONNECTIONS)
         .disable_signals()
         .listen(listener)?
         .run())

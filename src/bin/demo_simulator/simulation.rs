@@ -1,31 +1,41 @@
-//! The actor that runs the simulation: it has worlds loaded, makes time pass, and does what clients ask
-//! for. Created by `run`, lives as long as the program. Hears events from the clients and answers through
-//! their outboxes; tells `run` if the first world cannot be read.
+//! The actor that runs the simulation: it loads worlds, advances the clock and does what clients ask for.
+//! Created by `run`, lives as long as the program. Receives events from the clients and answers through their
+//! handles; tells `run` if the first world cannot be read.
 
 use std::time::{Duration, Instant};
 
-use actix::{Actor, ActorFutureExt as _, AsyncContext as _, Context, Handler, Message, SpawnHandle, WrapFuture as _};
+use actix::{
+    Actor, ActorFutureExt as _, AsyncContext as _, Context, Handler, Message, ResponseFuture, SpawnHandle,
+    WrapFuture as _,
+};
 use tokio::sync::oneshot;
 use tokio::task::spawn_blocking;
 
 use crate::client::{ClientId, Event};
-use crate::clock::{Mode, Progress};
+use crate::clients::Clients;
+use crate::clock::{Clock, Mode, Progress};
 use crate::console::{self, Console};
 use crate::protocol::{self, Command};
-use crate::stage::Stage;
-use crate::world::{Loaded, World, WorldError, WorldFile};
+use crate::scene::Scene;
+use crate::world::{WorldError, WorldFile, WorldNames};
 
-/// Says goodbye to all clients.
+/// Closes the WebSockets of all clients. Answered when all are closed.
 #[derive(Message)]
 #[rtype(result = "()")]
-pub(crate) struct CloseAll;
+pub(crate) struct CloseClients;
 
 /// The simulation.
 pub(crate) struct Simulation {
     file: WorldFile,
-    stage: Stage,
+    names: WorldNames,
+    /// `None` while it is being loaded.
+    scene: Option<Scene>,
+    clock: Clock,
+    clients: Clients,
+    /// Who asked for the scene while there was none.
+    waiting: Vec<ClientId>,
     console: Console,
-    /// Whether clients can watch at all.
+    /// Whether clients are served at all.
     stream: bool,
     /// Fires as long as time runs.
     ticker: Option<SpawnHandle>,
@@ -35,7 +45,7 @@ pub(crate) struct Simulation {
 }
 
 impl Simulation {
-    /// A simulation of `file` that starts in `mode`. If the file cannot be read, `failure` hears of it.
+    /// A simulation of `file` that starts in `mode`. `failure` is told if the file cannot be read.
     pub(crate) fn new(
         file: WorldFile,
         mode: Mode,
@@ -45,7 +55,11 @@ impl Simulation {
     ) -> Self {
         Self {
             file,
-            stage: Stage::new(mode),
+            names: WorldNames::default(),
+            clock: Clock::new(mode, Scene::empty().step()),
+            scene: None,
+            clients: Clients::default(),
+            waiting: Vec::new(),
             console,
             stream,
             ticker: None,
@@ -68,41 +82,34 @@ impl Handler<Event> for Simulation {
 
     fn handle(&mut self, event: Event, ctx: &mut Self::Context) {
         match event {
-            Event::Joined(id, outbox) => self.stage.audience.join(id, outbox),
-            Event::Left(id) => self.stage.audience.leave(id),
-            Event::Said(id, text, unheard) => {
-                self.hear(id, &text, ctx);
-                drop(unheard);
-            }
+            Event::Connected(id, handle) => self.clients.add(id, handle),
+            Event::Disconnected(id) => self.clients.remove(id),
+            // like Webots without `--stream`: the client gets no answer
+            Event::Received(..) if !self.stream => (),
+            Event::Received(id, text, _permit) => match Command::parse(&text) {
+                Some(command) => self.obey(command, id, ctx),
+                None => self.error(&format!("Unsupported message: {:?}.", text.chars().take(100).collect::<String>())),
+            },
         }
     }
 }
 
-impl Handler<CloseAll> for Simulation {
-    type Result = ();
+impl Handler<CloseClients> for Simulation {
+    type Result = ResponseFuture<()>;
 
-    fn handle(&mut self, _: CloseAll, _: &mut Self::Context) {
-        self.stage.audience.close();
+    fn handle(&mut self, _: CloseClients, _: &mut Self::Context) -> Self::Result {
+        let closed = self.clients.close();
+        Box::pin(async { drop(closed.await) })
     }
 }
 
 /// What clients ask for.
 impl Simulation {
-    fn hear(&mut self, id: ClientId, text: &str, ctx: &mut Context<Self>) {
-        match Command::parse(text) {
-            // like Webots without `--stream`: the client is left waiting
-            _ if !self.stream => (),
-            Some(command) => self.obey(command, id, ctx),
-            None => self.complain_about(text),
-        }
-    }
-
     fn obey(&mut self, command: Command, id: ClientId, ctx: &mut Context<Self>) {
         match command {
             Command::Watch { broadcast } => {
-                let timeout = if broadcast { f64::INFINITY } else { 0.0 };
-                self.stage.clock.set_timeout(timeout);
-                self.stage.admit(id);
+                self.clock.set_timeout(if broadcast { f64::INFINITY } else { 0.0 });
+                self.watch(id);
             }
             Command::WatchPictures => self.error("this simulator renders no pictures."),
             Command::Pause => self.pause(id, ctx),
@@ -110,105 +117,147 @@ impl Simulation {
             Command::Fast(timeout) => self.run(Mode::Fast, timeout, id, ctx),
             Command::Step => {
                 console::status("step");
-                self.stage.step();
+                self.clock.step();
+                self.send_update();
                 self.pause(id, ctx);
             }
-            Command::Reset => {
-                console::status("reset");
-                self.stage.reset();
-            }
+            Command::Reset => self.reset(),
             Command::Reload => self.change_world(self.file.clone(), ctx),
             Command::Load(name) => match self.file.sibling(&name) {
                 Some(file) => self.change_world(file, ctx),
                 None => self.error(&format!("there is no world {name:?}.")),
             },
-            Command::Timeout(timeout) => self.stage.clock.set_timeout(timeout),
-            Command::Robot => (), // no controller is there to hear it
+            Command::Timeout(timeout) => self.clock.set_timeout(timeout),
+            Command::Robot => (), // there are no controllers
+        }
+    }
+
+    fn watch(&mut self, id: ClientId) {
+        self.clients.watch(id);
+        if self.scene.is_some() {
+            for text in self.scene_texts() {
+                self.clients.send(id, text);
+            }
+            self.clients.send(id, self.state());
+        } else {
+            self.waiting.push(id);
+            self.clients.send(id, protocol::loading(protocol::READING, 0));
         }
     }
 
     fn pause(&mut self, id: ClientId, ctx: &mut Context<Self>) {
         self.set_mode(Mode::Pause, ctx);
         console::status("pause");
-        self.stage.audience.tell(id, protocol::PAUSED_BY_CLIENT);
+        self.clients.send(id, protocol::PAUSED_BY_CLIENT);
     }
 
     fn run(&mut self, mode: Mode, timeout: f64, id: ClientId, ctx: &mut Context<Self>) {
-        self.stage.clock.set_timeout(timeout);
+        self.clock.set_timeout(timeout);
         self.set_mode(mode, ctx);
-        let name = match mode {
-            Mode::Fast => protocol::FAST,
-            _ => protocol::REAL_TIME,
-        };
-        console::status(name);
-        self.stage.audience.tell(id, name);
+        let state = self.state();
+        console::status(&state);
+        self.clients.send(id, state);
     }
 
-    fn change_world(&mut self, file: WorldFile, ctx: &mut Context<Self>) {
-        if self.stage.clear() {
-            self.file = file;
-            self.load(ctx);
-        } else {
-            self.error("a world is being loaded already.");
+    fn reset(&mut self) {
+        console::status("reset");
+        self.clock.reset();
+        if let Some(scene) = &self.scene {
+            self.clients.broadcast(protocol::update(&scene.update(0.0)));
+            self.clients.broadcast(protocol::RESET_FINISHED);
         }
-    }
-
-    fn complain_about(&self, text: &str) {
-        let start: String = text.chars().take(100).collect();
-        self.error(&format!("Unsupported message: {start:?}."));
     }
 
     fn error(&self, text: &str) {
         self.console.error(format_args!("Streaming server: {text}"));
     }
+
+    /// The clock's state, as clients are told.
+    fn state(&self) -> String {
+        match self.clock.mode() {
+            Mode::Pause => protocol::paused(self.clock.now()),
+            Mode::RealTime => protocol::REAL_TIME.to_owned(),
+            Mode::Fast => protocol::FAST.to_owned(),
+        }
+    }
+
+    fn scene_texts(&self) -> Vec<String> {
+        let Some(scene) = &self.scene else { return Vec::new() };
+        vec![
+            protocol::world(&self.names),
+            protocol::model(&scene.model),
+            protocol::update(&scene.update(self.clock.now())),
+            protocol::SCENE_COMPLETED.to_owned(),
+        ]
+    }
 }
 
-/// How worlds come in.
+/// Loading of worlds.
 impl Simulation {
+    fn change_world(&mut self, file: WorldFile, ctx: &mut Context<Self>) {
+        if self.scene.take().is_none() {
+            self.error("a world is being loaded already.");
+            return;
+        }
+        self.file = file;
+        self.clients.broadcast(protocol::DELETE_WORLD);
+        self.clients.broadcast(protocol::loading(protocol::READING, 0));
+        self.load(ctx);
+    }
+
     fn load(&mut self, ctx: &mut Context<Self>) {
         self.stop_ticker(ctx);
         let file = self.file.clone();
-        let loading = spawn_blocking(move || file.load()).into_actor(self);
+        let loading = spawn_blocking(move || (file.names(), file.load())).into_actor(self);
         ctx.spawn(loading.map(|outcome, simulation, ctx| match outcome {
-            Ok(loaded) => simulation.loaded(loaded, ctx),
+            Ok((names, scene)) => simulation.loaded(names, scene, ctx),
             Err(error) => simulation.console.error(error),
         }));
     }
 
-    fn loaded(&mut self, loaded: Loaded, ctx: &mut Context<Self>) {
-        let world = match (loaded.world, self.failure.take()) {
-            (Ok(world), _) => Ok(world),
+    /// Shows the scene to all who watch: from time 0, in the same mode.
+    fn loaded(&mut self, names: WorldNames, scene: Result<Scene, WorldError>, ctx: &mut Context<Self>) {
+        let scene = match (scene, self.failure.take()) {
+            (Ok(scene), _) => scene,
             (Err(error @ WorldError::Unreadable { .. }), Some(failure)) => {
                 drop(failure.send(error));
                 return;
             }
+            // like Webots: the empty world takes its place
             (Err(error), _) => {
-                let path = self.file.path().display();
-                self.console.error(format_args!("'{path}': {error}"));
-                World::empty()
+                self.console.error(format_args!("'{}': {error}", self.file.path().display()));
+                Scene::empty()
             }
         };
-        match world {
-            Ok(world) => self.stage.open(world, loaded.names),
-            Err(error) => self.console.error(error),
+        self.clock.restart(scene.step());
+        self.names = names;
+        self.scene = Some(scene);
+        for status in ["Parsing world", "Finalizing nodes"] {
+            self.clients.broadcast(protocol::loading(status, 100));
         }
-        self.set_mode(self.stage.clock.mode(), ctx);
+        for text in self.scene_texts() {
+            self.clients.broadcast(text);
+        }
+        for id in std::mem::take(&mut self.waiting) {
+            self.clients.send(id, self.state());
+        }
+        self.set_mode(self.clock.mode(), ctx);
     }
 }
 
-/// How time passes.
+/// The passing of time.
 impl Simulation {
     fn set_mode(&mut self, mode: Mode, ctx: &mut Context<Self>) {
-        self.stage.clock.set_mode(mode);
+        self.clock.set_mode(mode);
         self.stop_ticker(ctx);
-        let Some(world) = self.stage.world() else {
-            return;
-        };
-        let frame = Duration::from_secs_f64(1.0 / world.fps);
-        let step = Duration::from_secs_f64(world.time_step / 1000.0);
+        let Some(scene) = &self.scene else { return };
+        let frame = Duration::from_secs_f64(1.0 / scene.fps());
         let period = match mode {
-            Mode::Pause => return self.stage.catch_up(),
-            Mode::RealTime => frame.max(step),
+            Mode::Pause => {
+                let update = protocol::update(&scene.update(self.clock.now()));
+                return self.clients.send_missed_update(update);
+            }
+            Mode::RealTime => frame.max(Duration::from_secs_f64(scene.step() / 1000.0)),
             Mode::Fast => frame,
         };
         self.last_tick = Instant::now();
@@ -223,17 +272,22 @@ impl Simulation {
 
     fn tick(&mut self, ctx: &mut Context<Self>) {
         let now = Instant::now();
-        let progress = self.stage.clock.advance(now - self.last_tick);
+        let progress = self.clock.advance(now - self.last_tick);
         self.last_tick = now;
-        if progress == Progress::Nothing {
+        if progress == Progress::None {
             return;
         }
-        self.stage.show_changes();
+        self.send_update();
         if progress == Progress::TimedOut {
             self.set_mode(Mode::Pause, ctx);
             console::status("pause");
-            let state = protocol::paused(self.stage.clock.now());
-            self.stage.audience.tell_watchers(state);
+            self.clients.broadcast(self.state());
+        }
+    }
+
+    fn send_update(&mut self) {
+        if let Some(scene) = &self.scene {
+            self.clients.broadcast_update(protocol::update(&scene.update(self.clock.now())));
         }
     }
 }
