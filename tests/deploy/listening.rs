@@ -11,7 +11,7 @@ const ASK: &str = r#"
     for host in 127.0.0.1 ::1; do
         for ((try = 0; try < 200; try++)); do
             if { exec 3<>"/dev/tcp/$host/$3"; } 2>/dev/null; then
-                printf 'GET /health HTTP/1.0\r\n\r\n' >&3
+                printf 'GET /load HTTP/1.0\r\n\r\n' >&3
                 head --lines=1 <&3
                 break
             fi

@@ -15,7 +15,7 @@ async fn a_world_runs_only_where_its_repository_is_allowed() {
     let blocked = serde_json::json!(["https://github.com/lab/secret", "https://github.com/lab/arm/blob/evil"]);
     let server = builder.set("blockedRepositories", blocked).start().await;
     let end = "blob/main/worlds/a.wbt";
-    let not_allowed = "is not one of the repositories that this simulation server allows";
+    let not_allowed = "Docker not enabled: cannot host simulations from repositories outside of those that this simulation server allows";
     let wrong = "Wrong Webots simulation URL";
     let table = [
         (format!("https://github.com/lab/arm/{end}"), "Its last output: ran"),

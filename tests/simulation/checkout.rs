@@ -154,7 +154,7 @@ async fn what_is_not_there_or_no_world_is_told_in_words() {
         (world("lab/arm", "main", "p/worlds/a.wbt"), "p/worlds/a.wbt in main does not exist"),
         (world("lab/arm", "main", "worlds/passwd.wbt"), "passwd.wbt leads out of its repository"),
         (world("lab/arm", "main", "worlds/outside.wbt"), "outside.wbt"),
-        (world("lab/arm", "main", "worlds/page.wbt"), "page.wbt is no world file: its first line is \"<html>\""),
+        (world("lab/arm", "main", "worlds/page.wbt"), "page.wbt is no world file: its first line is \"‹html›\""),
         (world("lab/arm", "main", "worlds/inside.wbt"), "opened [WorldInfo"),
         (world("lab/arm", "main", "project/worlds/b.wbt"), "opened [linked]"),
         (world("lab/arm", "main", "r/worlds/b.wbt"), "opened [linked]"),

@@ -70,6 +70,10 @@ pub fn kill_marked(folder: &Path) -> usize {
 const MOST_SCANS: usize = 200;
 /// Time between two scans: killed processes need a moment to vanish.
 const BETWEEN_SCANS: Duration = Duration::from_millis(5);
+/// Time between the first two checks whether a process listens.
+const FIRST_POLL: Duration = Duration::from_millis(10);
+/// Time between two of these checks, at most.
+const SLOWEST_POLL: Duration = Duration::from_millis(200);
 
 fn marked(folder: &Path) -> Vec<Process> {
     let carries_mark = |process: &Process| {
@@ -89,8 +93,7 @@ fn listeners(ports: &RangeInclusive<u16>) -> Vec<(u16, u64)> {
 }
 
 /// The lowest port of a range on which `root` or a descendant of it listens; a listener of somebody else never counts.
-#[must_use]
-pub fn listening_port(root: i32, ports: &RangeInclusive<u16>) -> Option<u16> {
+fn listening_port(root: i32, ports: &RangeInclusive<u16>) -> Option<u16> {
     let mut listeners = listeners(ports);
     if listeners.is_empty() {
         return None;
@@ -98,6 +101,20 @@ pub fn listening_port(root: i32, ports: &RangeInclusive<u16>) -> Option<u16> {
     listeners.sort_unstable();
     let own: HashSet<u64> = tree(root).into_iter().flat_map(sockets).collect();
     listeners.into_iter().find(|(_, inode)| own.contains(inode)).map(|(port, _)| port)
+}
+
+/// Waits until a descendant of `root` listens on a port of a range, and returns that port. It takes as long as that takes.
+pub async fn until_listening(root: i32, ports: RangeInclusive<u16>) -> u16 {
+    let mut pause = FIRST_POLL;
+    loop {
+        actix_rt::time::sleep(pause).await;
+        let ports = ports.clone();
+        let found = actix_rt::task::spawn_blocking(move || listening_port(root, &ports)).await;
+        if let Ok(Some(port)) = found {
+            return port;
+        }
+        pause = (pause * 3 / 2).min(SLOWEST_POLL);
+    }
 }
 
 /// The inodes of a process's sockets.

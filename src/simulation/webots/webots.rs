@@ -13,8 +13,7 @@ use super::event::{Exit, ExitNotifier, WebotsEvent};
 use super::launch_spec::LaunchSpec;
 use super::output::{self, OutputEvent, Tail};
 use super::virtual_display::VirtualDisplay;
-use crate::shared::run::RotatedFile;
-use crate::shared::run::seconds_since_1970;
+use crate::shared::run::{RotatedFile, seconds_since_1970};
 use crate::simulation::checkout::CheckoutError;
 use crate::simulation::machine::display;
 use crate::simulation::process::{ExitReason, ProcessGroup, process_tree};
@@ -54,10 +53,6 @@ const NEXT_PORTS: u16 = 10;
 const OLD_LOGS: usize = 1;
 /// How long the rest of an output may take to be read.
 const LAST_OUTPUT: Duration = Duration::from_secs(1);
-/// Time between the first two checks whether Webots listens.
-const FIRST_POLL: Duration = Duration::from_millis(10);
-/// Time between two checks whether Webots listens, at most.
-const SLOWEST_POLL: Duration = Duration::from_millis(200);
 
 impl Webots {
     /// Prepares a Webots; it starts with the actor.
@@ -98,7 +93,7 @@ impl Webots {
             log::error!("port {}: Webots can't be started: {error}", self.port);
             return self.not_started(&format!("Webots can't be started: {error}"), ctx);
         }
-        self.poll_port(FIRST_POLL, ctx);
+        self.await_port(ctx);
         ctx.run_interval(self.spec.config.timing.heartbeat, Self::check_heartbeat);
         let limit = self.spec.config.timing.launch;
         ctx.run_later(limit, move |this, _| {
@@ -151,22 +146,13 @@ impl Webots {
         Ok(())
     }
 
-    /// Checks whether a process of this instance listens on a port that Webots may have taken.
-    fn poll_port(&self, pause: Duration, ctx: &mut Context<Self>) {
-        let Some(root) = self.group.as_ref().map(ProcessGroup::leader) else {
-            return;
-        };
-        let ports = self.port..=self.port.saturating_add(NEXT_PORTS);
-        let poll = async move {
-            actix_rt::time::sleep(pause).await;
-            actix_rt::task::spawn_blocking(move || process_tree::listening_port(root, &ports)).await.unwrap_or_default()
-        };
-        poll.into_actor(self)
-            .map(move |port, this, ctx| match port {
-                Some(port) => this.ready(port),
-                None => this.poll_port((pause * 3 / 2).min(SLOWEST_POLL), ctx),
-            })
-            .spawn(ctx);
+    /// Waits until a process of this instance listens on a port that Webots may have taken.
+    fn await_port(&self, ctx: &mut Context<Self>) {
+        if let Some(root) = self.group.as_ref().map(ProcessGroup::leader) {
+            let ports = self.port..=self.port.saturating_add(NEXT_PORTS);
+            let listening = process_tree::until_listening(root, ports).into_actor(self);
+            listening.map(|port, this, _| this.ready(port)).spawn(ctx);
+        }
     }
 
     fn ready(&mut self, port: u16) {
