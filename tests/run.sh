@@ -22,23 +22,52 @@ tests/python.sh >/dev/null
 
 start=$SECONDS
 code=0
-cargo test --locked --no-fail-fast "$@" || code=$?
 skipped=()
-# Runs a script of tests. One that can't be run on this machine has said why, and ends with 77.
-run() { # SCRIPT
+logs=$(mktemp -d)
+declare -A scripts=()
+# shellcheck disable=SC2317 # The trap calls it.
+end_all() {
+    for script in "${!scripts[@]}"; do kill -- "-${scripts[$script]}" 2>/dev/null || true; done
+    wait
+    rm -rf "$logs"
+}
+trap end_all EXIT
+trap 'exit 130' INT TERM HUP
+
+# Starts a script beside whatever else runs, in a process group of its own.
+start() { # SCRIPT
+    set -m
+    FLEET_BIN=${FLEET_BIN:-$PWD/target/debug} "$1" >"$logs/${1//\//-}" 2>&1 </dev/null &
+    set +m
+    scripts[$1]=$!
+}
+
+# Waits for a script of tests, and shows what it said. One that can't be run on this machine has said why, and ends with 77.
+finish() { # SCRIPT
     local result=0
-    FLEET_BIN=${FLEET_BIN:-$PWD/target/debug} "$1" || result=$?
+    wait "${scripts[$1]}" || result=$?
+    unset "scripts[$1]"
+    printf '\n--- %s\n' "$1"
+    cat "$logs/${1//\//-}"
     case $result in
         0) ;;
         77) skipped+=("$1") ;;
         *) code=$result ;;
     esac
 }
+
 # With arguments, only some tests are wanted.
+(($# > 0)) || start tests/deploy/prepare.sh
+# Most tests wait most of the time, for servers and timers.
+RUST_TEST_THREADS=${RUST_TEST_THREADS:-$((2 * $(nproc)))} cargo test --locked --no-fail-fast "$@" || code=$?
 if (($# == 0)); then
-    run tests/browser/run
-    run tests/deploy/package.sh
-    run tests/deploy/guide.sh
+    # Where it has failed, the scripts that need it say why.
+    wait "${scripts[tests/deploy/prepare.sh]}" || true
+    unset 'scripts[tests/deploy/prepare.sh]'
+    all=(tests/browser/run tests/deploy/package.sh tests/deploy/guide.sh)
+    echo "runs side by side, and tells when each has ended: ${all[*]}"
+    for script in "${all[@]}"; do start "$script"; done
+    for script in "${all[@]}"; do finish "$script"; done
 fi
 echo "tests: $(((SECONDS - start) / 60)) min $(((SECONDS - start) % 60)) s, build included"
 ((${#skipped[@]} == 0)) || echo "SKIPPED, not passed: ${skipped[*]}" >&2

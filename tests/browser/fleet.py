@@ -23,11 +23,14 @@ BIN = pathlib.Path(os.environ.get("FLEET_BIN", ROOT / "target/debug")).resolve()
 SOON = 30.0
 WORLD = "https://github.com/demo/worlds/blob/main/worlds/{}.wbt"
 
+# Who is ended by tests/run.sh ends what it has started, as at Ctrl-C.
+signal.signal(signal.SIGTERM, signal.default_int_handler)
+
 
 def free_ports(count):
     """The first of so many free ports in a row."""
-    start = 12_000 + os.getpid() % 150 * 100
-    for first in list(range(start, 32_000, count)) + list(range(12_000, start, count)):
+    start = 22_000 + os.getpid() % 100 * 100
+    for first in list(range(start, 32_000, count)) + list(range(22_000, start, count)):
         try:
             for port in range(first, first + count):
                 with socket.socket() as probe:

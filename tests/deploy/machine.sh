@@ -1,6 +1,6 @@
 # Machines for the scripts beside this one: clean Debians whose systemd runs. To be sourced, with the script's own arguments.
 #
-# The Debian is made by debootstrap once, and kept in target/deploy. Each machine looks at it through an overlay in
+# The Debian is made by debootstrap once, and kept in target/deploy. The scripts can run side by side. Each machine looks at it through an overlay in
 # memory, in namespaces of its own (processes, mounts, network), so that nothing of a run is left, however it ends.
 #
 # FLEET_DISTRIBUTION and FLEET_MIRROR, say 'jammy' and 'http://archive.ubuntu.com/ubuntu', make another system of it.
@@ -12,8 +12,11 @@ SCRIPT=$(readlink -f "$0")
 cd "$(dirname "$(readlink -f "${BASH_SOURCE[0]}")")/../.."
 # shellcheck disable=SC1091
 readonly DISTRIBUTION=${FLEET_DISTRIBUTION:-$(. /etc/os-release && echo "${VERSION_CODENAME-}")}
-readonly WORK=$PWD/target/deploy
-readonly ROOT=$WORK/$DISTRIBUTION
+# Shared by all scripts, and this one's own.
+readonly DEPLOY=$PWD/target/deploy
+readonly ROOT=$DEPLOY/$DISTRIBUTION
+WORK=${SCRIPT##*/}
+readonly WORK=$DEPLOY/${WORK%.sh}
 readonly PACKAGES=systemd,systemd-sysv,libpam-systemd,dbus,dbus-user-session,sudo,adduser,ca-certificates,openssl,curl
 # What is installed later, in machines that can't reach the internet.
 readonly LATER=(git git-lfs xvfb ufw nginx apache2 certbot needrestart)
@@ -158,13 +161,15 @@ make_root() {
     echo "$made" >"$ROOT/.complete"
 }
 
+make_cargo_deb() {
+    ! command -v cargo-deb >/dev/null && [[ ! -x target/tools/bin/cargo-deb ]] || return 0
+    echo 'builds cargo-deb, once'
+    CARGO_PROFILE_DEV_DEBUG=0 cargo install --quiet --locked --debug --root target/tools cargo-deb
+}
+
 # Two packages: what is built here, and a later version in which every program, an example and a configuration differ.
 make_packages() {
     local file options=(--quiet --fast --compress-type gz --compress-system --deb-revision 1 --output "$WORK/packages/1.deb")
-    if ! command -v cargo-deb >/dev/null && [[ ! -x target/tools/bin/cargo-deb ]]; then
-        echo 'builds cargo-deb, once'
-        cargo install --quiet --locked --root target/tools cargo-deb
-    fi
     rm -rf "$WORK/packages" "$WORK/unpacked"
     mkdir -p "$WORK/packages"
     if [[ -n ${FLEET_BIN-} ]]; then
@@ -186,15 +191,24 @@ make_packages() {
     rm -rf "$WORK/unpacked"
 }
 
-# Everything that machines need.
-prepare() {
-    local tool
+# What all scripts need, and what takes no programs under test. One script makes it, the others wait.
+prepare_all() {
+    local tool lock
     [[ $(id -u) == 0 ]] || skip 'only root can make a Debian of its own'
     for tool in debootstrap dpkg-deb unshare nsenter setpriv pivot_root findmnt; do
         command -v "$tool" >/dev/null || skip "$tool is not installed"
     done
-    mkdir -p "$WORK"
+    mkdir -p "$DEPLOY" "$WORK"
+    exec {lock}>"$DEPLOY/.lock"
+    flock "$lock"
     make_root
+    make_cargo_deb
+    exec {lock}>&-
+}
+
+# Everything that machines need.
+prepare() {
+    prepare_all
     make_packages
 }
 
