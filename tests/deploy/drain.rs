@@ -3,7 +3,7 @@
 use nix::sys::signal::Signal;
 
 use crate::support::client::Client;
-use crate::support::git::{Forge, world};
+use crate::support::git::{Forge, arm};
 use crate::support::program::{Server, session_server, simulation_server};
 use crate::support::webots::Webots;
 use crate::support::{SOON, http, until};
@@ -27,7 +27,7 @@ async fn drain(how: impl AsyncFnOnce(&Server)) {
         simulation_server(&webots.path(), forge.path(), 2).set("adminPassword", "open sesame").start().await;
     let session = session_server(&[server.address()]).start().await;
     until("it is available", async || http::get(&session.url("/request")).await.text() == "1").await;
-    let arm = world("lab/arm", "main", "worlds/a.wbt");
+    let arm = arm();
     let mut client = Client::start(&server, &arm).await;
     client.until("webots:").await;
     let viewer = format!("ws://127.0.0.1:{}/", server.port + 1);
@@ -107,6 +107,6 @@ async fn a_drained_server_is_followed_by_a_new_one_at_the_same_place() {
     until("nothing is available", async || http::get(&session.url("/request")).await.text() == "0").await;
     let new = builder().port(old.port).start().await;
     until("the new one is available", async || http::get(&session.url("/request")).await.text() == "1").await;
-    let mut client = Client::start(&new, &world("lab/arm", "main", "worlds/a.wbt")).await;
+    let mut client = Client::start(&new, &arm()).await;
     client.until("webots:").await;
 }

@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use serde_json::{Value, json};
 
-use crate::support::{SOON, http, ports};
+use crate::support::{holds_soon, http, ports};
 
 /// How long `server.sh` may take for anything.
 const LIMIT: Duration = Duration::from_secs(90);
@@ -188,11 +188,8 @@ pub fn processes_in(folder: &Path) -> Vec<String> {
 
 /// Waits until nothing of a project is left, and says what is.
 pub async fn nothing_is_left(project: &Project) {
-    let deadline = std::time::Instant::now() + SOON;
-    while !project.leftovers().is_empty() {
-        assert!(std::time::Instant::now() < deadline, "left: {:#?}", project.leftovers());
-        actix_rt::time::sleep(Duration::from_millis(20)).await;
-    }
+    let nothing = holds_soon(async || project.leftovers().is_empty()).await;
+    assert!(nothing, "left: {:#?}", project.leftovers());
 }
 
 /// All files below a folder.

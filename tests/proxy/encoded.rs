@@ -1,33 +1,20 @@
 //! Paths as they are sent and as they arrive at what a simulation has listening: names of files with blanks and
 //! letters of any language do, and no way leads out of a port.
 
-use std::io::{Read, Write};
 use std::net::TcpListener;
 use std::sync::mpsc::{Receiver, channel};
 
 use super::fleet::Fleet;
 use super::rules::Rules;
 use super::web_server::Kind;
+use crate::support::listener::listen;
 
-/// Stands in for the files of a Webots: tells which path it was asked for. It runs until the test program ends.
+/// Stands in for the files of a Webots: tells which path it was asked for.
 fn files_of_webots(port: u16) -> Receiver<String> {
     let listener = TcpListener::bind(("127.0.0.1", port)).unwrap();
     let (told, asked) = channel();
-    std::thread::spawn(move || {
-        for mut connection in listener.incoming().flatten() {
-            let mut head = Vec::new();
-            let mut byte = [0];
-            while !head.ends_with(b"\r\n\r\n") && connection.read(&mut byte).is_ok_and(|length| length > 0) {
-                head.push(byte[0]);
-            }
-            let head = String::from_utf8_lossy(&head).into_owned();
-            let path = head.split(' ').nth(1).unwrap_or_default().to_owned();
-            // The test may have ended.
-            if told.send(path).is_ok() {
-                connection.write_all(b"HTTP/1.1 200 OK\r\nContent-Length: 4\r\nConnection: close\r\n\r\nfile").ok();
-            }
-        }
-    });
+    // Once the test has ended there is nobody to tell.
+    listen(listener, move |request| told.send(request.path().to_owned()).ok().map(|()| (200, "file")));
     asked
 }
 

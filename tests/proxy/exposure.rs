@@ -1,11 +1,11 @@
 //! Which ports of the machine are reachable from outside, and where pages are sent on.
 
-use std::io::{Read, Write};
 use std::net::TcpListener;
 
 use super::fleet::Fleet;
 use super::rules::{Place, Rules};
 use super::web_server::{Kind, WebServer};
+use crate::support::listener::listen;
 use crate::support::ports;
 
 /// A service of the machine that belongs to no fleet: a database's page of administration, say. It runs until the
@@ -13,14 +13,7 @@ use crate::support::ports;
 pub fn private_service() -> u16 {
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let port = listener.local_addr().unwrap().port();
-    std::thread::spawn(move || {
-        for mut connection in listener.incoming().flatten() {
-            // Whoever goes away before the answer gets none.
-            if connection.read(&mut [0; 4096]).is_ok_and(|length| length > 0) {
-                connection.write_all(b"HTTP/1.1 200 OK\r\nContent-Length: 6\r\nConnection: close\r\n\r\nsecret").ok();
-            }
-        }
-    });
+    listen(listener, |_| Some((200, "secret")));
     port
 }
 
@@ -157,7 +150,7 @@ async fn of_the_documents_redirects_one_works_and_the_other_never_applies() {
 
 #[actix_rt::test]
 async fn nginx_takes_names_of_any_length() {
-    let authority = super::authority::Authority::new();
+    let authority = crate::support::authority::Authority::new();
     let certificate = authority.issue(&["localhost"]);
     let (http, https) = (ports::block(1), ports::block(1));
     let chain = certificate.chain.to_str().unwrap();

@@ -2,12 +2,13 @@
 
 use std::time::Duration;
 
-use super::authority::{Authority, trusting};
 use super::browser::Browser;
 use super::rules::{Place, Rules};
 use super::web_server::WebServer;
+use crate::support::authority::{Authority, trusting};
 use crate::support::client::Client;
-use crate::support::git::{Forge, world};
+use crate::support::git::Forge;
+pub use crate::support::git::arm;
 use crate::support::http;
 use crate::support::ports;
 use crate::support::program::{Builder, Server, session_server, simulation_server};
@@ -101,11 +102,6 @@ impl Fleet {
     pub fn wss(&self, server: &Server) -> String {
         format!("wss://{}/{}", self.browser.host, server.port)
     }
-}
-
-/// A world that the fleet runs.
-pub fn arm() -> String {
-    world("lab/arm", "main", "worlds/a.wbt")
 }
 
 fn behind(server: Builder, host: &str) -> Builder {

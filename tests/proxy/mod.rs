@@ -1,7 +1,6 @@
 //! The fleet behind real web servers: Debian's apache2 and nginx, started here on free ports of the loopback, with our
 //! rules (`deploy/`) and with those of the original documents.
 
-mod authority;
 mod browser;
 mod fleet;
 mod rules;

@@ -3,12 +3,12 @@
 
 use tokio::net::TcpStream;
 
-use super::authority::{Authority, trusting};
 use super::browser::Browser;
 use super::exposure::private_service;
 use super::fleet::{IDLE, arm};
 use super::rules::adapt;
 use super::web_server::{Kind, WebServer};
+use crate::support::authority::{Authority, trusting};
 use crate::support::client::Client;
 use crate::support::git::Forge;
 use crate::support::program::{Builder, Server, session_server, simulation_server};

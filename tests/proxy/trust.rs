@@ -3,10 +3,10 @@
 use rcgen::CertificateParams;
 use serde_json::Value;
 
-use super::authority::{Authority, Certificate};
 use super::web_server::{Kind, WebServer};
-use crate::mail::smtp::Smtp;
+use crate::support::authority::{Authority, Certificate};
 use crate::support::program::{Builder, Server, session_server};
+use crate::support::smtp::Smtp;
 use crate::support::{http, ports, until};
 
 /// A web server with this certificate and nothing behind it.

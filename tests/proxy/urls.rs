@@ -2,8 +2,8 @@
 
 use super::fleet::Fleet;
 use super::rules::Rules;
-use crate::mail::smtp::Smtp;
 use crate::support::http;
+use crate::support::smtp::Smtp;
 use crate::support::until;
 
 /// The first URL of a text.

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::{Pid, Uid};
 
-use crate::support::{SOON, until};
+use crate::support::{SOON, holds_soon, until};
 
 /// The program.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -78,13 +78,12 @@ impl WebServer {
         let child = command.stdin(Stdio::null()).stdout(output.try_clone().unwrap()).stderr(output).spawn();
         let child = child.expect("this test needs setpriv: apt install util-linux");
         self.child = Some(child);
-        let deadline = Instant::now() + SOON;
-        while std::net::TcpStream::connect(("127.0.0.1", self.port)).is_err() {
+        let listens = holds_soon(async || {
             let ended = self.child.as_mut().unwrap().try_wait().unwrap();
             assert!(ended.is_none(), "{program} has ended: {}", self.log());
-            assert!(Instant::now() < deadline, "{program} does not listen: {}", self.log());
-            actix_rt::time::sleep(Duration::from_millis(10)).await;
-        }
+            std::net::TcpStream::connect(("127.0.0.1", self.port)).is_ok()
+        });
+        assert!(listens.await, "{program} does not listen: {}", self.log());
     }
 
     /// Reads its configuration again, as after the renewal of a certificate.

@@ -4,8 +4,8 @@ use serde_json::json;
 
 use super::stand_in::{Manner, StandIn};
 use super::{addresses, until_states};
-use crate::mail::smtp::Smtp;
 use crate::support::program::{Builder, session_server};
+use crate::support::smtp::Smtp;
 
 fn with_mails(servers: &[StandIn], smtp: &Smtp) -> Builder {
     session_server(&addresses(servers))

@@ -9,6 +9,8 @@ use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpSocket, TcpStream};
 use tokio_util::sync::CancellationToken;
 
+use crate::support::raise_file_limit;
+
 /// How a stand-in answers.
 #[derive(Debug, Clone)]
 pub enum Manner {
@@ -76,6 +78,8 @@ impl StandIn {
 
     /// Starts one on this port.
     pub fn start_at(port: u16, manner: Manner) -> Self {
+        // There may be a thousand of them.
+        raise_file_limit();
         let socket = TcpSocket::new_v4().unwrap();
         socket.set_reuseaddr(true).unwrap();
         socket.bind(([127, 0, 0, 1], port).into()).unwrap();

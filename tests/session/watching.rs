@@ -5,6 +5,7 @@ use std::time::{Duration, Instant};
 use super::stand_in::{Manner, StandIn};
 use super::{addresses, times_logged, until_states};
 use crate::support::client::Client;
+use crate::support::listener::listen;
 use crate::support::program::session_server;
 use crate::support::{http, until};
 
@@ -107,20 +108,9 @@ async fn absurd_numbers_do_no_harm() {
 
 #[actix_rt::test]
 async fn a_server_may_be_named_by_an_ipv6_address() {
-    use std::io::{Read, Write};
     let socket = std::net::TcpListener::bind("[::1]:0").unwrap();
     let address = socket.local_addr().unwrap().to_string();
-    std::thread::spawn(move || {
-        for mut stream in socket.incoming().flatten() {
-            let mut request = [0; 2048];
-            while stream.read(&mut request).is_ok_and(|length| length > 0) {
-                let answer = b"HTTP/1.1 200 OK\r\nContent-Length: 11\r\nConnection: close\r\n\r\n{\"load\": 5}";
-                if stream.write_all(answer).is_err() {
-                    break;
-                }
-            }
-        }
-    });
+    listen(socket, |_| Some((200, "{\"load\": 5}")));
     let session = session_server(&[address]).start().await;
     until_states(&session, &["up"]).await;
 }

@@ -4,7 +4,8 @@ use std::net::TcpListener;
 use std::path::{Path, PathBuf};
 
 use crate::support::client::Client;
-use crate::support::git::{Forge, world};
+use crate::support::git::Forge;
+pub use crate::support::git::arm;
 use crate::support::program::{Builder, Server, simulation_server};
 use crate::support::webots::{Webots, instances_below};
 use crate::support::{http, until};
@@ -42,11 +43,6 @@ pub struct Scene {
     pub other: Option<Client>,
     pub folder: tempfile::TempDir,
     _parts: (Forge, Webots, Option<TcpListener>),
-}
-
-/// The URL of the world that every [`Forge::with_arm`] has.
-pub fn arm() -> String {
-    world("lab/arm", "main", "worlds/a.wbt")
 }
 
 impl Scene {

@@ -2,13 +2,14 @@
 
 use std::path::Path;
 
+use procfs::net::TcpState;
 use procfs::process::Process;
 
 use crate::support::client::Client;
 use crate::support::git::{Forge, world};
 use crate::support::program::{Server, simulation_server};
 use crate::support::webots::{Webots, instances_below};
-use crate::support::{http, until};
+use crate::support::{holds_soon, http, until};
 
 /// What a server holds at one moment.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -80,7 +81,14 @@ pub async fn soak(starts: usize) -> (Holdings, Holdings) {
     visit(&server, WARM_UP).await;
     let before = Holdings::of(&server);
     visit(&server, starts).await;
-    (before, Holdings::of(&server))
+    // Folders may just be being removed.
+    let mut after = Holdings::of(&server);
+    holds_soon(async || {
+        after = Holdings::of(&server);
+        after.leaks_since(&before, starts).is_empty()
+    })
+    .await;
+    (before, after)
 }
 
 /// So many visits, some of which end before Webots is ready; waits until all are gone.
@@ -101,13 +109,10 @@ async fn visit(server: &Server, visits: usize) {
         status["simulations"].as_array().unwrap().is_empty() && instances_below(&server.folder).is_empty()
     })
     .await;
-    // Connections that have just been closed, and folders that are just being removed.
-    let pid = server.pid();
-    until("descriptors are closed", async || {
-        let count = || Process::new(pid).unwrap().fd_count().unwrap();
-        let first = count();
-        actix_rt::time::sleep(std::time::Duration::from_millis(300)).await;
-        first == count()
+    until("its connections are closed", async || {
+        let sockets = procfs::net::tcp().unwrap();
+        let mut own = sockets.iter().filter(|socket| socket.local_address.port() == server.port && socket.inode != 0);
+        own.all(|socket| socket.state == TcpState::Listen)
     })
     .await;
 }

@@ -1,6 +1,5 @@
 //! Start, drain and stop of the server itself; announcing.
 
-use std::io::{Read, Write};
 use std::net::TcpListener;
 use std::time::{Duration, Instant};
 
@@ -10,6 +9,7 @@ use serde_json::json;
 use super::scene::{arm, stages};
 use crate::support::client::Client;
 use crate::support::git::Forge;
+use crate::support::listener::{Request, listen};
 use crate::support::program::simulation_server;
 use crate::support::webots::Webots;
 use crate::support::{http, until};
@@ -106,43 +106,25 @@ async fn a_port_that_is_taken_ends_the_program_with_1() {
     assert!(second.log().contains("can't listen on"), "{}", second.log());
 }
 
-/// Answers each request with the next of these codes and bodies; returns the requests.
-fn listener(answers: &'static [(u16, &'static str)]) -> (String, std::sync::mpsc::Receiver<String>) {
+/// Answers each request with the next of these codes and contents; returns the requests.
+fn announced_to(answers: &'static [(u16, &'static str)]) -> (String, std::sync::mpsc::Receiver<Request>) {
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let url = format!("http://{}/announce", listener.local_addr().unwrap());
     let (sender, requests) = std::sync::mpsc::channel();
-    std::thread::spawn(move || {
-        for (code, body) in answers {
-            let (mut socket, _) = listener.accept().unwrap();
-            let mut text = Vec::new();
-            while !is_whole(&text) {
-                let mut chunk = [0; 4096];
-                let length = socket.read(&mut chunk).unwrap();
-                assert!(length > 0, "the request broke off");
-                text.extend_from_slice(&chunk[..length]);
-            }
-            let head = format!("HTTP/1.1 {code} X\r\nConnection: close");
-            write!(socket, "{head}\r\nContent-Length: {}\r\n\r\n{body}", body.len()).ok();
-            sender.send(String::from_utf8(text).unwrap()).ok();
-        }
+    let mut answers = answers.iter();
+    listen(listener, move |request| {
+        let answer = answers.next()?;
+        sender.send(request).ok()?;
+        Some(*answer)
     });
     (url, requests)
-}
-
-/// Whether a request is there with all of its content.
-fn is_whole(text: &[u8]) -> bool {
-    let text = String::from_utf8_lossy(text).to_lowercase();
-    let Some((head, content)) = text.split_once("\r\n\r\n") else {
-        return false;
-    };
-    let length = head.lines().find_map(|line| line.strip_prefix("content-length: "));
-    length.is_none_or(|length| content.len() >= length.parse::<usize>().unwrap())
 }
 
 #[actix_rt::test]
 async fn the_server_announces_itself_and_waits_for_nobody() {
     let (forge, webots) = (Forge::with_arm(), Webots::launcher());
-    let (url, requests) = listener(&[(500, ""), (200, r#"{"error": "no room"}"#), (200, r#"{"success": true}"#)]);
+    let answers = &[(500, ""), (200, r#"{"error": "no room"}"#), (200, r#"{"success": true}"#)];
+    let (url, requests) = announced_to(answers);
     let hanging = TcpListener::bind("127.0.0.1:0").unwrap();
     let closed = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap();
     let notify =
@@ -159,9 +141,10 @@ async fn the_server_announces_itself_and_waits_for_nobody() {
     );
     for _ in 0..3 {
         let request = requests.recv_timeout(crate::support::SOON).unwrap();
-        assert!(request.starts_with("POST /announce HTTP/1.1\r\n"), "{request}");
-        assert!(request.to_lowercase().contains("content-type: application/x-www-form-urlencoded"), "{request}");
-        assert!(request.ends_with(&format!("\r\n\r\n{body}")), "{request}");
+        let head = request.head;
+        assert!(head.starts_with("POST /announce HTTP/1.1\r\n"), "{head}");
+        assert!(head.to_lowercase().contains("content-type: application/x-www-form-urlencoded"), "{head}");
+        assert_eq!(request.content, body);
     }
     until("it was told", async || server.log().contains(&format!("announced to {url}"))).await;
     assert!(server.log().contains(&format!("can't announce to {url} (2 of 6): it answered \"no room\"")));

@@ -15,7 +15,8 @@ use webots_fleet::simulation::snapshot::Stage;
 use webots_fleet::simulation::state::AppState;
 
 use crate::support::client::Client;
-use crate::support::git::{Forge, world};
+use crate::support::git::Forge;
+pub use crate::support::git::arm;
 use crate::support::webots::{Webots, instances_below};
 use crate::support::{ports, until};
 
@@ -40,11 +41,6 @@ pub fn webots_that_is(stage: Stage) -> String {
         Stage::Stopping => format!("trap '' TERM\n(setsid sleep 1000) &\n{DEMO} while true; do wait; sleep 0.1; done"),
         _ => format!("{DEMO} wait"),
     }
-}
-
-/// The URL of the world that is there.
-pub fn arm() -> String {
-    world("lab/arm", "main", "worlds/a.wbt")
 }
 
 impl Inside {

@@ -79,6 +79,11 @@ pub fn world(repository: &str, reference: &str, path: &str) -> String {
     format!("https://github.com/{repository}/blob/{reference}/{path}")
 }
 
+/// The URL of the world of [`Forge::with_arm`].
+pub fn arm() -> String {
+    world("lab/arm", "main", "worlds/a.wbt")
+}
+
 /// Runs git in a folder; gives back what it prints.
 pub fn git(folder: &Path, arguments: &[&str]) -> String {
     let fixed = ["-c", "user.name=Test", "-c", "user.email=test@localhost", "-c", "commit.gpgSign=false"];

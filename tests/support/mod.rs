@@ -4,15 +4,20 @@
 
 #![allow(dead_code, reason = "each test crate uses its own part of this")]
 
+pub mod authority;
 pub mod client;
 pub mod display;
 pub mod git;
 pub mod http;
+pub mod listener;
 pub mod ports;
 pub mod program;
+pub mod smtp;
 pub mod webots;
 
 use std::time::{Duration, Instant};
+
+use nix::sys::resource::{Resource, getrlimit, setrlimit};
 
 /// How long anything may take that should happen soon. Far more than it needs: the machine may be busy.
 pub const SOON: Duration = Duration::from_secs(20);
@@ -24,11 +29,25 @@ pub fn needs(program: &str, package: &str) {
     assert!(is_there, "this test needs {program}: apt install {package}");
 }
 
-/// Waits until a condition holds, and says what was waited for when it never does.
-pub async fn until(what: &str, mut condition: impl AsyncFnMut() -> bool) {
+/// Whether a condition comes to hold before long.
+pub async fn holds_soon(mut condition: impl AsyncFnMut() -> bool) -> bool {
     let deadline = Instant::now() + SOON;
     while !condition().await {
-        assert!(Instant::now() < deadline, "waited in vain until {what}");
+        if Instant::now() > deadline {
+            return false;
+        }
         actix_rt::time::sleep(Duration::from_millis(10)).await;
     }
+    true
+}
+
+/// Waits until a condition holds, and says what was waited for when it never does.
+pub async fn until(what: &str, condition: impl AsyncFnMut() -> bool) {
+    assert!(holds_soon(condition).await, "waited in vain until {what}");
+}
+
+/// Lets this process, and all that it starts, open as many files as the system allows.
+pub fn raise_file_limit() {
+    let (_, most) = getrlimit(Resource::RLIMIT_NOFILE).unwrap();
+    setrlimit(Resource::RLIMIT_NOFILE, most, most).unwrap();
 }

@@ -1,7 +1,9 @@
-//! Blocks of free ports. Simulation servers need ports in a row, and test each for being free on all addresses.
+//! Blocks of free ports, and dead ones. Simulation servers need ports in a row, and test each for being free on all addresses.
 
 use std::net::{Ipv4Addr, TcpListener};
 use std::sync::atomic::{AtomicU16, Ordering};
+
+use tokio::net::TcpSocket;
 
 /// Below the ports that the system gives to outgoing connections, and below those that the demo simulator is tested at.
 const FIRST: u16 = 10_000;
@@ -22,4 +24,12 @@ pub fn block(count: u16) -> u16 {
         }
     }
     panic!("no {count} free ports in a row");
+}
+
+/// A port on which nobody listens, nor can anybody until the first value is dropped.
+pub fn dead_port() -> (TcpSocket, u16) {
+    let socket = TcpSocket::new_v4().unwrap();
+    socket.bind(([127, 0, 0, 1], 0).into()).unwrap();
+    let port = socket.local_addr().unwrap().port();
+    (socket, port)
 }

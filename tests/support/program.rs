@@ -3,14 +3,12 @@
 use std::fs::File;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
-use std::time::Instant;
 
-use nix::sys::resource::{Resource, getrlimit, setrlimit};
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 use serde_json::Value;
 
-use super::{SOON, http, ports};
+use super::{SOON, holds_soon, http, ports, raise_file_limit};
 
 /// A server that was started for one test. It is killed with the test, and its log is printed if the test fails.
 pub struct Server {
@@ -103,6 +101,8 @@ impl Builder {
 
     /// Writes the configuration and starts the program, without waiting for it.
     pub fn spawn(mut self) -> Server {
+        // Tests with a thousand connections run beside others.
+        raise_file_limit();
         let temporary = self.folder.is_none().then(|| tempfile::tempdir().unwrap());
         let folder = self.folder.take().unwrap_or_else(|| temporary.as_ref().unwrap().path().to_owned());
         for (key, name) in [("logDir", "log"), ("cacheDir", "cache")] {
@@ -140,12 +140,11 @@ impl Builder {
     /// Starts the program and waits until it answers.
     pub async fn start(self) -> Server {
         let mut server = self.spawn();
-        let deadline = Instant::now() + SOON;
-        while http::try_get(&server.url("/health")).await.is_err() {
+        let answers = holds_soon(async || {
             assert!(server.child.try_wait().unwrap().is_none(), "{} has ended", server.name);
-            assert!(Instant::now() < deadline, "{} does not answer", server.name);
-            actix_rt::time::sleep(std::time::Duration::from_millis(5)).await;
-        }
+            http::try_get(&server.url("/health")).await.is_ok()
+        });
+        assert!(answers.await, "{} does not answer", server.name);
         server
     }
 }
@@ -178,9 +177,6 @@ impl Server {
 
     /// Stops the server, and connects so many clients that it can't accept: they wait in the system's queue.
     pub fn crowd(&self, clients: usize) {
-        // Other tests of this process need files as well.
-        let (_, most) = getrlimit(Resource::RLIMIT_NOFILE).unwrap();
-        setrlimit(Resource::RLIMIT_NOFILE, most, most).unwrap();
         self.signal(Signal::SIGSTOP);
         let address = self.address().parse().unwrap();
         let connect = |_| std::net::TcpStream::connect_timeout(&address, SOON).unwrap();
@@ -191,14 +187,9 @@ impl Server {
 
     /// Waits until the server has ended by itself; gives back its exit code.
     pub async fn ended(&mut self) -> Option<i32> {
-        let deadline = Instant::now() + SOON;
-        loop {
-            if let Some(status) = self.child.try_wait().unwrap() {
-                return status.code();
-            }
-            assert!(Instant::now() < deadline, "{} does not end", self.name);
-            actix_rt::time::sleep(std::time::Duration::from_millis(5)).await;
-        }
+        let ends = holds_soon(async || self.child.try_wait().unwrap().is_some()).await;
+        assert!(ends, "{} does not end", self.name);
+        self.child.wait().unwrap().code()
     }
 
     /// What the server has printed until now.
