@@ -151,7 +151,9 @@ for_each() { # ACTION
     return "$code"
 }
 
-(($# == 1 || $# == 2)) && [[ $1 == @(start|stop|restart|status) ]] || fail 2 "$USAGE"
+if (($# < 1 || $# > 2)) || [[ $1 != @(start|stop|restart|status) ]]; then
+    fail 2 "$USAGE"
+fi
 cd "$(dirname "$(readlink -f "${BASH_SOURCE[0]}")")" || exit 1
 readonly BIN=${FLEET_BIN:-$PWD/target/release}
 if (($# == 2)); then
