@@ -33,7 +33,7 @@ pub fn copy_call<'call>(
     path: &str,
 ) -> Call<'call> {
     let mut work_tree = OsString::from("--work-tree=");
-    work_tree.push(instance.path().join("project"));
+    work_tree.push(instance.project());
     let reference = revision.reference();
     let rest = ["checkout", "--force", "--progress", &reference, "--", path].map(OsString::from);
     let mut call = repository.call(std::iter::once(work_tree).chain(rest).collect());
@@ -47,7 +47,7 @@ pub fn copy_call<'call>(
 /// # Errors
 /// When the machine fails.
 pub async fn look(world: &ProjectUrl, instance: &InstanceDir, revision: &Revision) -> Result<Copied, CheckoutError> {
-    let root = instance.path().join("project");
+    let root = instance.project();
     let path = root.join(revision.world_path(world));
     let seen = actix_rt::task::spawn_blocking(move || {
         let project = world_file::project_of(&root, &path).map(|project| lfs::pointers(&project));
