@@ -1,9 +1,10 @@
-"""A visitor's way through a web server, from the first click to the end: through_web_server.py https://HOST/viewer
+"""A visitor's way through a web server, from the first click to the end: through_web_server.py https://HOST/viewer [--own-origin]
 
 The session server behind it offers a world called Arm. The certificate is not looked at: the tests of the web servers
-do that.
+do that. With --own-origin the web server gives what Webots sends an origin of its own.
 """
 
+import re
 import sys
 import urllib.parse
 
@@ -13,7 +14,19 @@ from browser import Browser, Page
 from fleet import SOON, until
 
 
-def visit(browser, url):
+def cannot_read_what_is_the_administrators(context, webots):
+    """A page of a simulation, and the output that the administrator's password protects."""
+    tab = context.new_page()
+    tab.goto(webots + "nothing.html")
+    assert tab.evaluate("window.origin") == "null"
+    port = int(webots.rstrip("/").rsplit("/", 1)[1])
+    for server in range(port - 3, port):
+        read = f"fetch('/{server}/output?id=1', {{credentials: 'include'}}).then(() => 'read', () => 'blocked')"
+        assert tab.evaluate(read) == "blocked"
+    tab.close()
+
+
+def visit(browser, url, own_origin):
     context = browser.chromium.new_context(ignore_https_errors=True)
     context.set_default_timeout(1000 * SOON)
     page = Page(context)
@@ -26,6 +39,9 @@ def visit(browser, url):
     assert "wss://" in tab.locator("[data-step=server] small").inner_text()
     tab.get_by_role("button", name="Play", exact=True).click()
     until("the simulation runs", lambda: tab.locator("#clock").inner_text() not in ("", "0:00.000"))
+    if own_origin:
+        stream = next(one for one in page.asked if re.search(r"^wss://[^/]+/\d+/$", one))
+        cannot_read_what_is_the_administrators(context, stream.replace("wss:", "https:"))
     tab.get_by_role("button", name="Disconnect").click()
     expect(tab.locator("#stage")).to_contain_text("it has ended")
     assert not page.complaints, page.complaints
@@ -36,4 +52,4 @@ def visit(browser, url):
 
 expect.set_options(timeout=1000 * SOON)
 with Browser() as visitor:
-    visit(visitor, sys.argv[1])
+    visit(visitor, sys.argv[1], "--own-origin" in sys.argv)

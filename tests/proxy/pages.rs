@@ -37,6 +37,35 @@ async fn is_told_what_happens(browser: &Browser, path: &str) {
     }
 }
 
+async fn what_webots_sends_has_an_origin_of_its_own(rules: Rules) {
+    let fleet = Fleet::start(rules).await;
+    let policy = async |path: String| {
+        let url = format!("https://{}{path}", fleet.browser.host);
+        let answer = fleet.browser.ask(&url, &[]).await;
+        answer.header("content-security-policy").unwrap_or_default().to_owned()
+    };
+    for server in [&fleet.here, &fleet.there] {
+        for path in ["page.html", "", "%2e/page.html"] {
+            // Whatever answers there, also nobody.
+            assert_eq!(policy(format!("/{}/{path}", server.port + 1)).await, "sandbox allow-scripts", "{path}");
+        }
+        let own = policy(format!("/{}/monitor", server.port)).await;
+        assert!(own.starts_with("default-src 'none'") && !own.contains("sandbox"), "{own}");
+    }
+    let door = policy(rules.session_path(fleet.session.port, "/monitor")).await;
+    assert!(door.starts_with("default-src 'none'") && !door.contains("sandbox"), "{door}");
+}
+
+#[actix_rt::test]
+async fn what_webots_sends_through_apache_has_an_origin_of_its_own() {
+    what_webots_sends_has_an_origin_of_its_own(Rules::Apache).await;
+}
+
+#[actix_rt::test]
+async fn what_webots_sends_through_nginx_has_an_origin_of_its_own() {
+    what_webots_sends_has_an_origin_of_its_own(Rules::Nginx).await;
+}
+
 async fn pages_are_complete_and_live(rules: Rules) {
     let fleet = Fleet::start(rules).await;
     let browser = &fleet.browser;

@@ -29,6 +29,7 @@ async fn a_visitor_gets_a_simulation(rules: Rules) {
     let visit = Command::new(python)
         .arg(root.join("tests/browser/through_web_server.py"))
         .arg(page)
+        .args((rules != Rules::DocumentsMachine).then_some("--own-origin"))
         .env("PYTHONDONTWRITEBYTECODE", "1")
         .stdin(Stdio::null())
         .kill_on_drop(true)
