@@ -6,7 +6,7 @@ use std::sync::Arc;
 use std::time::{Instant, SystemTime};
 
 use actix::prelude::*;
-use actix_web::{App, HttpServer, web};
+use actix_web::{App, web};
 use tokio::sync::watch;
 
 use super::config::SessionConfig;
@@ -18,7 +18,7 @@ use crate::shared::config;
 use crate::shared::http::Connections;
 use crate::shared::http::Live;
 use crate::shared::http::Metrics;
-use crate::shared::http::sockets::{self, Sockets};
+use crate::shared::http::server::{self, Options};
 use crate::shared::run::{Phase, Request, Signals, notify, permanent, raise_open_files, start};
 
 /// Why the server ends with an error.
@@ -70,37 +70,29 @@ pub async fn run(mut config: SessionConfig, file: PathBuf) -> Result<(), AppErro
     if clients == 0 {
         return Err(AppError::NoClients { files });
     }
-    let sockets = Arc::new(Sockets::new(
-        connections,
-        config.max_clients_per_address,
-        config.trusted_proxies.clone(),
-        config.timing.silence,
-    ));
+    let options = Options {
+        workers: threads(),
+        max_per_worker: (connections / threads()).max(1),
+        silence: config.timing.silence,
+        stop: config.timing.stop,
+        trusted_proxies: config.trusted_proxies.clone(),
+    };
+    let connections = Connections::new(connections, clients, config.max_clients_per_address);
     let (phase_sender, phase) = watch::channel(Phase::Open);
     let address = SocketAddr::new(config.bind, config.port);
-    let socket = sockets::listen(address).map_err(|source| AppError::Bind { address, source })?;
+    let socket = server::listen(address).map_err(|source| AppError::Bind { address, source })?;
     let port = socket.local_addr()?.port();
     config.port = port;
     let stop = config.timing.stop;
     let (http_url, websocket_url) = (config.http_url(), config.websocket_url());
-    let server = Arc::new(assemble(config, clients, phase)?);
+    let server = Arc::new(assemble(config, connections, phase)?);
     let shared = web::Data::from(Arc::clone(&server));
     // Called once in each thread that serves connections.
     let app = move || {
         let broadcaster = web::Data::new(LocalBroadcaster::start(Arc::clone(&shared)));
         App::new().app_data(shared.clone()).app_data(broadcaster).configure(configure)
     };
-    let http = HttpServer::new(app)
-        // Messages are small, and must not wait until the one before is acknowledged.
-        .tcp_nodelay(true)
-        .workers(threads())
-        .on_connect(move |socket, extensions| sockets.accept(socket, extensions))
-        // Further connections wait in the system's queue, where they need no open files.
-        .max_connections((connections / threads()).max(1))
-        .disable_signals()
-        .shutdown_timeout(stop.as_secs())
-        .listen(socket)?
-        .run();
+    let http = server::serve(socket, server.connections.clone(), options, app)?;
     let handle = http.handle();
     let serving = actix_rt::spawn(http);
     start::announce("session server", &http_url, &websocket_url, port);
@@ -155,7 +147,11 @@ fn threads() -> usize {
 }
 
 /// Makes the server's state, and starts its actors.
-fn assemble(config: SessionConfig, clients: usize, phase: watch::Receiver<Phase>) -> Result<AppState, AppError> {
+fn assemble(
+    config: SessionConfig,
+    connections: Connections,
+    phase: watch::Receiver<Phase>,
+) -> Result<AppState, AppError> {
     let metrics = Metrics::new();
     let latencies = metrics.histogram("session_report_seconds", "Time in which simulation servers answer")?;
     let picks = metrics.counter("session_requests_total", "Requests for a simulation server", "outcome")?;
@@ -164,7 +160,6 @@ fn assemble(config: SessionConfig, clients: usize, phase: watch::Receiver<Phase>
     }
     let mailer = mail::start(&config);
     let (timing, client_urls) = (config.timing.clone(), config.client_urls());
-    let connections = Connections::new(clients, config.max_clients_per_address);
     let trusted_proxies = config.trusted_proxies.clone();
     let (examples, viewer_script) = (config.examples.clone(), config.viewer_script.clone());
     let registry = Registry::new(Arc::new(config), mailer, latencies).start();
@@ -202,6 +197,7 @@ fn reload(file: &Path, registry: &Addr<Registry>) {
 
 #[cfg(test)]
 mod tests {
+    use actix_web::HttpServer;
     use futures_util::StreamExt;
     use tokio_tungstenite::tungstenite::Message as Frame;
 
@@ -224,7 +220,7 @@ mod tests {
     async fn clients_whose_broadcaster_panics_are_sent_away_and_find_another_one() {
         let config = serde_json::from_str(r#"{"port": 0, "simulationServers": []}"#).unwrap();
         let (phase_sender, phase) = watch::channel(Phase::Open);
-        let server = web::Data::new(assemble(config, 10, phase).unwrap());
+        let server = web::Data::new(assemble(config, Connections::new(10, 10, 10), phase).unwrap());
         let (broadcasters, started) = std::sync::mpsc::channel();
         let app = move || {
             let broadcaster = web::Data::new(LocalBroadcaster::start(Arc::clone(&server)));

@@ -9,10 +9,10 @@ use super::config::{Example, Timing};
 use crate::session::fleet::Registry;
 use crate::session::fleet::{NoServer, Pick};
 use crate::shared::domain::{ClientUrls, client_text};
-use crate::shared::http::Connections;
 use crate::shared::http::Live;
 use crate::shared::http::Metrics;
 use crate::shared::http::TrustedProxies;
+use crate::shared::http::{Connections, Kind};
 use crate::shared::run::Phase;
 
 /// The shared state.
@@ -25,7 +25,7 @@ pub struct AppState {
     pub client_urls: ClientUrls,
     /// Whether clients are taken.
     pub phase: watch::Receiver<Phase>,
-    /// Counts WebSockets.
+    /// Limits and counts connections.
     pub connections: Connections,
     /// Web servers whose headers are believed.
     pub trusted_proxies: TrustedProxies,
@@ -60,7 +60,7 @@ impl AppState {
     /// Returns how many web clients are connected.
     #[must_use]
     pub fn clients(&self) -> usize {
-        self.connections.count()
+        self.connections.count(Kind::Client)
     }
 
     /// Asks the registry for a simulation server. A registry that does not answer in time counts as unavailable.

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use actix::prelude::*;
-use actix_web::{App, HttpServer, web};
+use actix_web::{App, web};
 use tokio::sync::mpsc::Receiver;
 use tokio::sync::watch;
 
@@ -20,7 +20,7 @@ use crate::shared::http::BasicAuth;
 use crate::shared::http::Connections;
 use crate::shared::http::Live;
 use crate::shared::http::Metrics;
-use crate::shared::http::sockets::{self, Sockets};
+use crate::shared::http::server::{self, Options};
 use crate::shared::run::{Phase, Request, Signals, notify, permanent, raise_open_files, start};
 use crate::simulation::checkout::{CacheDir, Checkouts, Limits};
 use crate::simulation::client::outcome;
@@ -155,20 +155,16 @@ pub async fn serve(assembly: Assembly) -> Result<(), AppError> {
     let Assembly { server, socket, mut signals, phase: phase_sender, mut asked } = assembly;
     let _guardian = Guardian::start(server.run.path())?;
     let shared = web::Data::from(Arc::clone(&server));
-    let sockets = Arc::new(Sockets::new(
-        server.config.max_clients.saturating_mul(CONNECTIONS_PER_CLIENT),
-        server.config.max_clients_per_address,
-        server.config.trusted_proxies.clone(),
-        server.config.timing.silence,
-    ));
-    let http = HttpServer::new(move || App::new().app_data(shared.clone()).configure(configure))
-        // Messages are small, and must not wait until the one before is acknowledged.
-        .tcp_nodelay(true)
-        .on_connect(move |socket, extensions| sockets.accept(socket, extensions))
-        .disable_signals()
-        .shutdown_timeout(1)
-        .listen(socket)?
-        .run();
+    let threads = std::thread::available_parallelism().map_or(1, usize::from);
+    let options = Options {
+        workers: threads,
+        max_per_worker: (max_tcp(&server.config) / threads).max(1),
+        silence: server.config.timing.silence,
+        stop: Duration::from_secs(1),
+        trusted_proxies: server.config.trusted_proxies.clone(),
+    };
+    let app = move || App::new().app_data(shared.clone()).configure(configure);
+    let http = server::serve(socket, server.connections.clone(), options, app)?;
     let handle = http.handle();
     let serving = actix_rt::spawn(http);
     let (config, port) = (&server.config, server.config.port);
@@ -212,7 +208,12 @@ pub async fn serve(assembly: Assembly) -> Result<(), AppError> {
 
 fn bind(config: &SimulationConfig) -> Result<TcpListener, AppError> {
     let address = SocketAddr::new(config.bind, config.port);
-    sockets::listen(address).map_err(|source| AppError::Bind { address, source })
+    server::listen(address).map_err(|source| AppError::Bind { address, source })
+}
+
+/// How many TCP connections may be open: those of clients, and as many again for pages and other requests.
+fn max_tcp(config: &SimulationConfig) -> usize {
+    config.max_clients.saturating_mul(CONNECTIONS_PER_CLIENT)
 }
 
 /// Makes the server's state, and starts its actors.
@@ -263,7 +264,7 @@ fn assemble(
         requests,
         main_thread: Arbiter::current(),
         admin_auth: config.admin_password.clone().map(BasicAuth::new),
-        connections: Connections::new(config.max_clients, config.max_clients_per_address),
+        connections: Connections::new(max_tcp(&config), config.max_clients, config.max_clients_per_address),
         metrics,
         starts,
         live: Live::new(),

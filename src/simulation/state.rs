@@ -48,7 +48,7 @@ pub struct AppState {
     pub main_thread: ArbiterHandle,
     /// Checks the administrator's password, where one is configured.
     pub admin_auth: Option<BasicAuth>,
-    /// Counts connections.
+    /// Limits and counts connections.
     pub connections: Connections,
     /// The metrics.
     pub metrics: Metrics,

@@ -24,33 +24,28 @@ function say(text, lost) {
   lamp.classList.toggle('lost', lost);
 }
 
-/** A cell of HTML; a template understands it outside of a table. */
+/** The cells of a row of HTML; a template understands them outside of a table. */
 function parsed(html) {
   const template = document.createElement('template');
   template.innerHTML = `<table><tbody><tr>${html}</tr></tbody></table>`;
-  return template.content.querySelector('tr').firstElementChild;
+  return [...template.content.querySelector('tr').children];
 }
 
-/**
- * Takes a row's cells by their columns. Replaces only those that differ, so that a focused link stays focused and an
- * opened list open: after a lost connection all are sent.
- */
-function fill(row, changed) {
+/** Fills a row. Replaces only the cells that differ, so that a focused link stays focused and an opened list open. */
+function fill(row, html) {
   const known = cells.get(row) ?? [];
-  cells.set(row, known);
-  for (const [column, html] of Object.entries(changed)) {
-    const cell = parsed(html);
-    const text = cell.outerHTML;
-    if (known[column] === text)
-      continue;
-    known[column] = text;
-    const old = row.children[column];
+  const fresh = parsed(html);
+  cells.set(row, fresh.map((cell) => cell.outerHTML));
+  fresh.forEach((cell, column) => {
+    if (known[column] === cell.outerHTML)
+      return;
     showTimes(cell);
+    const old = row.children[column];
     if (old)
       old.replaceWith(cell);
     else
       row.append(cell);
-  }
+  });
 }
 
 function changeTable(body, { order, rows }) {

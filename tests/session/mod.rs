@@ -4,6 +4,7 @@ mod stand_in;
 
 mod door;
 mod mail;
+mod memory;
 mod names;
 mod placement;
 mod pushing;

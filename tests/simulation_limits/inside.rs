@@ -8,6 +8,7 @@ use actix_rt::task::JoinHandle;
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 use webots_fleet::shared::config;
+use webots_fleet::shared::http::Kind;
 use webots_fleet::simulation::app::{self, AppError, Assembly};
 use webots_fleet::simulation::config::SimulationConfig;
 use webots_fleet::simulation::places::GetSnapshot;
@@ -99,7 +100,7 @@ impl Inside {
         let folders = || std::fs::read_dir(self.server.run.path()).unwrap().flatten();
         until("nothing is left", async || {
             self.stages().await.is_empty()
-                && self.server.connections.count() == 0
+                && self.server.connections.count(Kind::Client) == 0
                 && instances_below(&runs).is_empty()
                 && !folders().any(|entry| entry.file_name().to_string_lossy().starts_with("instance-"))
                 && TcpListener::bind(("0.0.0.0", self.port + 1)).is_ok()

@@ -8,6 +8,7 @@ use actix_web::{App, HttpRequest, HttpResponse, HttpServer, web};
 use actix_web_actors::ws::WsResponseBuilder;
 use tokio::sync::mpsc::{UnboundedReceiver, UnboundedSender, unbounded_channel};
 use webots_fleet::shared::domain::ProjectUrl;
+use webots_fleet::shared::http::Kind;
 use webots_fleet::shared::http::websocket::MessageReader;
 use webots_fleet::simulation::client::WebClient;
 use webots_fleet::simulation::machine::LoadMonitor;
@@ -51,7 +52,7 @@ async fn gate(
     clients: web::Data<UnboundedSender<Addr<WebClient>>>,
 ) -> HttpResponse {
     let peer = server.config.trusted_proxies.peer(&request);
-    let connection = server.connections.admit(peer).unwrap();
+    let connection = server.connections.admit(Kind::Client, peer).unwrap();
     let client = WebClient::new(Arc::clone(&server), peer, (connection, MessageReader::default()));
     let (address, response) = WsResponseBuilder::new(client, &request, stream).start_with_addr().unwrap();
     clients.send(address).unwrap();

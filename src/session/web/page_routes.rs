@@ -11,7 +11,7 @@ use crate::session::fleet::GetStatus;
 use crate::session::state::AppState;
 use crate::shared::http::assets::{self, Asset};
 use crate::shared::http::paths::{GET, READ, path};
-use crate::shared::http::{Policy, fleet_sources, html};
+use crate::shared::http::{Kind, Policy, fleet_sources, html};
 
 /// What pages of this server load, besides what all pages do.
 const ASSETS: &[Asset] = &[
@@ -44,7 +44,11 @@ async fn monitor(server: web::Data<AppState>) -> HttpResponse {
         .await
 }
 
-async fn events(server: web::Data<AppState>) -> HttpResponse {
+async fn events(request: HttpRequest, server: web::Data<AppState>) -> HttpResponse {
+    let permit = match server.connections.admit(Kind::Page, server.trusted_proxies.peer(&request)) {
+        Ok(permit) => permit,
+        Err(refused) => return refused.answer(),
+    };
     let shown = server.clone();
     let render = move || {
         let server = shown.clone();
@@ -54,7 +58,7 @@ async fn events(server: web::Data<AppState>) -> HttpResponse {
             view.inspect_err(|error| log::error!("the monitor page can't be rendered: {error}")).ok()
         }
     };
-    server.live.listen(server.phase.clone(), render)
+    server.live.listen(permit, server.phase.clone(), render)
 }
 
 async fn viewer(request: HttpRequest, server: web::Data<AppState>) -> HttpResponse {

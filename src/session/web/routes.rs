@@ -16,9 +16,9 @@ use crate::session::fleet::displayed_mean_load;
 use crate::session::fleet::{GetStatus, IsAvailable};
 use crate::session::fleet::{NoServer, Pick};
 use crate::session::state::AppState;
-use crate::shared::http::CONTENT_TYPE;
 use crate::shared::http::paths::{self, GET, READ, path, retry_after};
 use crate::shared::http::websocket;
+use crate::shared::http::{CONTENT_TYPE, Kind};
 
 /// Adds all paths to an app.
 pub fn configure(app: &mut web::ServiceConfig) {
@@ -100,12 +100,12 @@ fn open_websocket(
     broadcaster: &LocalBroadcaster,
 ) -> HttpResponse {
     let peer = server.trusted_proxies.peer(request);
-    let connection = match server.connections.admit(peer) {
-        Ok(connection) => connection,
-        Err(crowded) => return crowded.answer(),
+    let permit = match server.connections.admit(Kind::Client, peer) {
+        Ok(permit) => permit,
+        Err(refused) => return refused.answer(),
     };
     let (server, broadcaster) = (Arc::clone(server), broadcaster.get());
-    websocket::open(request, stream, |inbox| WebClient::new(server, broadcaster, peer, (connection, inbox)))
+    websocket::open(request, stream, |reader| WebClient::new(server, broadcaster, peer, (permit, reader)))
 }
 
 async fn availability(server: web::Data<AppState>) -> HttpResponse {

@@ -12,7 +12,7 @@ use serde::Deserialize;
 use super::broadcaster::{Broadcaster, SubscribeClient, Subscription};
 use crate::session::fleet::{Pick, Update};
 use crate::session::state::AppState;
-use crate::shared::http::Connection;
+use crate::shared::http::ConnectionPermit;
 use crate::shared::http::Peer;
 use crate::shared::http::liveness::{self, Liveness};
 use crate::shared::http::websocket::{ClientMessage, MessageReader};
@@ -26,19 +26,19 @@ pub struct WebClient {
     broadcaster: Addr<Broadcaster>,
     subscription: Option<Subscription>,
     reader: MessageReader,
-    _connection: Connection,
+    _permit: ConnectionPermit,
 }
 
 type Context = WebsocketContext<WebClient>;
 
 impl WebClient {
-    /// A client that has just connected; `connection` counts it, `reader` takes what comes from it.
+    /// A client that has just connected; `permit` counts it, `reader` reads its messages.
     #[must_use]
     pub fn new(
         server: Arc<AppState>,
         broadcaster: Addr<Broadcaster>,
         peer: Peer,
-        (connection, reader): (Connection, MessageReader),
+        (permit, reader): (ConnectionPermit, MessageReader),
     ) -> Self {
         Self {
             server,
@@ -48,7 +48,7 @@ impl WebClient {
             broadcaster,
             subscription: None,
             reader,
-            _connection: connection,
+            _permit: permit,
         }
     }
 

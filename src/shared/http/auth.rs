@@ -20,15 +20,21 @@ use crate::shared::config::Secret;
 const BURST: NonZeroU32 = NonZeroU32::MIN.saturating_add(29);
 /// How many passwords an address may send per minute after a burst: 12.
 const PER_MINUTE: NonZeroU32 = NonZeroU32::MIN.saturating_add(11);
-/// Of so many addresses is it known how many passwords they have sent lately. Nobody else may send one then.
-const MOST_ADDRESSES: usize = 10_000;
+/// How many times as many the network of an address may send.
+const NETWORK_FACTOR: NonZeroU32 = NonZeroU32::MIN.saturating_add(9);
+/// How many addresses are counted. Further ones may send no password until the others have been quiet for a while.
+const MAX_ADDRESSES: usize = 10_000;
 
 /// Checks the password of requests.
 #[derive(Debug)]
 pub struct BasicAuth {
     password: Secret,
-    attempts: RateLimiter<Option<IpAddr>, HashMapStateStore<Option<IpAddr>>, DefaultClock>,
+    attempts: Attempts,
+    /// The attempts of whole networks, so that one network can't use up the addresses that are counted.
+    network_attempts: Attempts,
 }
+
+type Attempts = RateLimiter<Option<IpAddr>, HashMapStateStore<Option<IpAddr>>, DefaultClock>;
 
 /// Why a request is refused. The words are for the client.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
@@ -45,7 +51,11 @@ impl BasicAuth {
     /// Authentication with this password.
     #[must_use]
     pub fn new(password: Secret) -> Self {
-        Self { password, attempts: RateLimiter::hashmap(Quota::per_minute(PER_MINUTE).allow_burst(BURST)) }
+        let limiter = |factor: NonZeroU32| {
+            let (rate, burst) = (PER_MINUTE.saturating_mul(factor), BURST.saturating_mul(factor));
+            RateLimiter::hashmap(Quota::per_minute(rate).allow_burst(burst))
+        };
+        Self { password, attempts: limiter(NonZeroU32::MIN), network_attempts: limiter(NETWORK_FACTOR) }
     }
 
     /// Checks the password of a request, in a time that does not depend on it. Right passwords count as attempts too,
@@ -58,7 +68,7 @@ impl BasicAuth {
         let given = given.map_err(|_| AuthError::NoPassword)?;
         let given = given.password().ok_or(AuthError::NoPassword)?;
         // A proxy that says nothing of its clients stands for all of them.
-        if !self.may_try(peer.rate_limit_key()) {
+        if !self.may_try(peer) {
             return Err(AuthError::TooMany);
         }
         if constant_time_eq(given.as_bytes(), self.password.reveal().as_bytes()) {
@@ -68,11 +78,14 @@ impl BasicAuth {
         Err(AuthError::NoPassword)
     }
 
-    fn may_try(&self, from: Option<IpAddr>) -> bool {
-        if self.attempts.len() >= MOST_ADDRESSES {
-            self.attempts.retain_recent();
-        }
-        self.attempts.len() < MOST_ADDRESSES && self.attempts.check_key(&from).is_ok()
+    fn may_try(&self, peer: Peer) -> bool {
+        let is_allowed = |attempts: &Attempts, key: Option<IpAddr>| {
+            if attempts.len() >= MAX_ADDRESSES {
+                attempts.retain_recent();
+            }
+            attempts.len() < MAX_ADDRESSES && attempts.check_key(&key).is_ok()
+        };
+        is_allowed(&self.network_attempts, peer.network()) && is_allowed(&self.attempts, peer.rate_limit_key())
     }
 }
 
@@ -93,17 +106,40 @@ impl AuthError {
 mod tests {
     use super::*;
 
+    fn auth() -> BasicAuth {
+        BasicAuth::new(serde_json::from_str("\"open sesame\"").unwrap())
+    }
+
     #[test]
-    fn attempts_are_counted_for_each_address_and_of_so_many_addresses_only() {
-        let auth = BasicAuth::new(serde_json::from_str("\"open sesame\"").unwrap());
-        let address = |number: usize| Some(IpAddr::from(u32::try_from(number).unwrap().to_be_bytes()));
+    fn attempts_are_counted_for_each_address() {
+        let auth = auth();
+        let client = |last| Peer::Client(IpAddr::from([203, 0, 113, last]));
         for _ in 0..BURST.get() {
-            assert!(auth.may_try(address(0)));
+            assert!(auth.may_try(client(1)));
         }
-        assert!(!auth.may_try(address(0)));
-        for number in 1..MOST_ADDRESSES + 9 {
-            assert_eq!(auth.may_try(address(number)), number < MOST_ADDRESSES, "{number}");
+        assert!(!auth.may_try(client(1)));
+        assert!(auth.may_try(client(2)));
+    }
+
+    #[test]
+    fn one_network_locks_out_nobody_else() {
+        let auth = auth();
+        for network in 0..20_000_u16 {
+            let attacker = std::net::Ipv6Addr::new(0x2001, 0xdb8, 7, network, 0, 0, 0, 1);
+            auth.may_try(Peer::Client(attacker.into()));
         }
-        assert!(auth.attempts.len() <= MOST_ADDRESSES);
+        assert!(auth.attempts.len() <= (BURST.get() * NETWORK_FACTOR.get()) as usize, "{}", auth.attempts.len());
+        assert!(auth.may_try(Peer::Client("2001:db8:8::1".parse().unwrap())));
+        assert!(auth.may_try(Peer::Client("203.0.113.9".parse().unwrap())));
+    }
+
+    #[test]
+    fn only_so_many_addresses_are_counted() {
+        let auth = auth();
+        for number in 0..MAX_ADDRESSES + 9 {
+            let address = IpAddr::from(u32::try_from(number << 8).unwrap().to_be_bytes());
+            assert_eq!(auth.may_try(Peer::Client(address)), number < MAX_ADDRESSES, "{number}");
+        }
+        assert!(auth.attempts.len() <= MAX_ADDRESSES);
     }
 }

@@ -1,4 +1,4 @@
-//! How many WebSockets may be open: in all, and per client address.
+//! Limits of connections: in all, and for each client address.
 
 use std::collections::HashMap;
 use std::net::IpAddr;
@@ -6,104 +6,135 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use actix_web::HttpResponse;
 use actix_web::http::StatusCode;
-use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 
 use super::paths::retry_after;
 use super::peer::Peer;
 
-/// Counts open connections.
-#[derive(Debug)]
+/// What is counted. Each has its own limits.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum Kind {
+    /// A TCP connection, whatever is sent on it.
+    Tcp,
+    /// The WebSocket of a web client.
+    Client,
+    /// A page that listens to `/events`.
+    Page,
+}
+
+/// How many TCP connections an address may have for each client that it may have: browsers open several.
+const TCP_PER_CLIENT: usize = 2;
+/// How many pages may listen to `/events`.
+const MAX_PAGES: usize = 1000;
+
+/// Counts the open connections of a server. Clones share their counts.
+#[derive(Debug, Clone)]
 pub struct Connections {
-    all: Arc<Semaphore>,
-    most: usize,
+    max_tcp: usize,
+    max_clients: usize,
     per_address: usize,
-    taken: Arc<Mutex<HashMap<IpAddr, usize>>>,
+    open: Arc<Mutex<Open>>,
 }
 
-/// One connection. Dropping it makes room for another.
-#[derive(Debug)]
-pub struct Connection {
-    _permit: OwnedSemaphorePermit,
-    _place: Option<Place>,
+#[derive(Debug, Default)]
+struct Open {
+    all: HashMap<Kind, usize>,
+    by_address: HashMap<(Kind, IpAddr), usize>,
 }
 
-/// A connection among those of its address.
+/// One connection that is counted until this is dropped.
 #[derive(Debug)]
-struct Place {
-    address: IpAddr,
-    taken: Arc<Mutex<HashMap<IpAddr, usize>>>,
+pub struct ConnectionPermit {
+    kind: Kind,
+    address: Option<IpAddr>,
+    open: Arc<Mutex<Open>>,
 }
 
 /// Why a connection is refused. The words are for the client.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
-pub enum Crowded {
-    /// The server is full.
+pub enum TooManyConnections {
+    /// The server has too many.
     #[error("Error: too many connections.")]
-    Everywhere,
-    /// The client's address is.
+    InAll,
+    /// The client's address has too many.
     #[error("Error: too many connections from your address.")]
-    FromThere,
+    FromAddress,
 }
 
 impl Connections {
-    /// So many in all, and so many per address.
+    /// Allows `max_tcp` TCP connections and `max_clients` web clients, of which one address may have `per_address`.
     #[must_use]
-    pub fn new(most: usize, per_address: usize) -> Self {
-        Self { all: Arc::new(Semaphore::new(most)), most, per_address, taken: Arc::default() }
+    pub fn new(max_tcp: usize, max_clients: usize, per_address: usize) -> Self {
+        Self { max_tcp, max_clients, per_address, open: Arc::default() }
     }
 
-    /// How many there are.
+    /// How many connections of a kind are open.
     #[must_use]
-    pub fn count(&self) -> usize {
-        self.most.saturating_sub(self.all.available_permits())
+    pub fn count(&self, kind: Kind) -> usize {
+        lock(&self.open).all.get(&kind).copied().unwrap_or_default()
     }
 
-    /// Admits a connection. A proxy that says nothing of its clients stands for many: it is counted among all alone.
+    /// Counts a connection. A proxy that does not tell its clients' addresses stands for many clients, so that only the
+    /// limits in all apply to it.
     ///
     /// # Errors
-    /// When there are too many connections.
-    pub fn admit(&self, peer: Peer) -> Result<Connection, Crowded> {
-        let permit = Arc::clone(&self.all).try_acquire_owned().map_err(|_| Crowded::Everywhere)?;
-        let place = peer.rate_limit_key().map(|address| self.place(address)).transpose()?;
-        Ok(Connection { _permit: permit, _place: place })
-    }
-
-    fn place(&self, address: IpAddr) -> Result<Place, Crowded> {
-        let mut taken = lock(&self.taken);
-        let count = taken.entry(address).or_default();
-        if *count >= self.per_address {
-            return Err(Crowded::FromThere);
+    /// When the server or the address has too many connections of this kind.
+    pub fn admit(&self, kind: Kind, peer: Peer) -> Result<ConnectionPermit, TooManyConnections> {
+        let (max, max_per_address) = match kind {
+            Kind::Tcp => (self.max_tcp, self.per_address.saturating_mul(TCP_PER_CLIENT)),
+            Kind::Client => (self.max_clients, self.per_address),
+            Kind::Page => (MAX_PAGES, self.per_address),
+        };
+        let address = peer.rate_limit_key();
+        let mut open = lock(&self.open);
+        let Open { all, by_address } = &mut *open;
+        let all = all.entry(kind).or_default();
+        if *all >= max {
+            return Err(TooManyConnections::InAll);
         }
-        *count += 1;
-        Ok(Place { address, taken: Arc::clone(&self.taken) })
+        if let Some(address) = address {
+            let count = by_address.entry((kind, address)).or_default();
+            if *count >= max_per_address {
+                return Err(TooManyConnections::FromAddress);
+            }
+            *count += 1;
+        }
+        *all += 1;
+        drop(open);
+        Ok(ConnectionPermit { kind, address, open: Arc::clone(&self.open) })
     }
 }
 
-impl Drop for Place {
+impl Drop for ConnectionPermit {
     fn drop(&mut self) {
-        let mut taken = lock(&self.taken);
-        if let Some(count) = taken.get_mut(&self.address) {
+        let mut open = lock(&self.open);
+        if let Some(all) = open.all.get_mut(&self.kind) {
+            *all -= 1;
+        }
+        let Some(key) = self.address.map(|address| (self.kind, address)) else {
+            return;
+        };
+        if let Some(count) = open.by_address.get_mut(&key) {
             *count -= 1;
             if *count == 0 {
-                taken.remove(&self.address);
+                open.by_address.remove(&key);
             }
         }
     }
 }
 
-impl Crowded {
-    /// The answer to a client that is refused.
+impl TooManyConnections {
+    /// The response to a client that is refused.
     #[must_use]
     pub fn answer(self) -> HttpResponse {
         let status = match self {
-            Self::Everywhere => StatusCode::SERVICE_UNAVAILABLE,
-            Self::FromThere => StatusCode::TOO_MANY_REQUESTS,
+            Self::InAll => StatusCode::SERVICE_UNAVAILABLE,
+            Self::FromAddress => StatusCode::TOO_MANY_REQUESTS,
         };
         HttpResponse::build(status).insert_header(retry_after()).body(self.to_string())
     }
 }
 
-/// A counter is right even if a thread has panicked that held it.
+/// The counts are right even if a thread panicked while it held them.
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
@@ -117,27 +148,33 @@ mod tests {
     }
 
     #[test]
-    fn seats_are_counted_in_all_and_per_address() {
-        let connections = Connections::new(4, 2);
-        let first = connections.admit(client("203.0.113.9")).unwrap();
-        let _second = connections.admit(client("203.0.113.9")).unwrap();
-        assert_eq!(connections.admit(client("203.0.113.9")).unwrap_err(), Crowded::FromThere);
-        let _other = connections.admit(client("203.0.113.10")).unwrap();
-        assert_eq!(connections.count(), 3);
+    fn connections_are_counted_in_all_and_per_address() {
+        let connections = Connections::new(9, 4, 2);
+        let admit = |peer| connections.admit(Kind::Client, peer);
+        let first = admit(client("203.0.113.9")).unwrap();
+        let _second = admit(client("203.0.113.9")).unwrap();
+        assert_eq!(admit(client("203.0.113.9")).unwrap_err(), TooManyConnections::FromAddress);
+        let _other = admit(client("203.0.113.10")).unwrap();
+        assert_eq!(connections.count(Kind::Client), 3);
         drop(first);
-        let _again = connections.admit(client("203.0.113.9")).unwrap();
-        let _proxy = connections.admit(Peer::Proxy("127.0.0.1".parse().unwrap())).unwrap();
-        assert_eq!(connections.admit(client("203.0.113.11")).unwrap_err(), Crowded::Everywhere);
+        let _again = admit(client("203.0.113.9")).unwrap();
+        let _proxy = admit(Peer::Proxy("127.0.0.1".parse().unwrap())).unwrap();
+        assert_eq!(admit(client("203.0.113.11")).unwrap_err(), TooManyConnections::InAll);
+        let _page = connections.admit(Kind::Page, client("203.0.113.9")).unwrap();
+        let tcp: Vec<_> = (0..9).map(|_| connections.admit(Kind::Tcp, client("203.0.113.9"))).collect();
+        assert_eq!(tcp.iter().filter(|one| one.is_ok()).count(), 2 * TCP_PER_CLIENT);
     }
 
     #[test]
     fn nothing_is_kept_of_those_who_have_left() {
-        let connections = Connections::new(9, 1);
-        let connection = connections.admit(client("2001:db8::1")).unwrap();
-        assert_eq!(connections.admit(client("2001:db8::2")).unwrap_err(), Crowded::FromThere, "the same household");
-        let _neighbour = connections.admit(client("2001:db8:0:1::1")).unwrap();
-        assert_eq!(lock(&connections.taken).len(), 2);
-        drop(connection);
-        assert_eq!(lock(&connections.taken).len(), 1);
+        let connections = Connections::new(9, 9, 1);
+        let admit = |address| connections.admit(Kind::Client, client(address));
+        let permit = admit("2001:db8::1").unwrap();
+        assert_eq!(admit("2001:db8::2").unwrap_err(), TooManyConnections::FromAddress, "the same /64");
+        let _neighbour = admit("2001:db8:0:1::1").unwrap();
+        assert_eq!(lock(&connections.open).by_address.len(), 2);
+        drop(permit);
+        assert_eq!(lock(&connections.open).by_address.len(), 1);
+        assert_eq!(connections.count(Kind::Client), 1);
     }
 }

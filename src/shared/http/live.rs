@@ -1,7 +1,7 @@
-//! Pages that stay true without reloading: server-sent events, made once per second for all who listen.
+//! Live pages: server-sent events with what has changed on a page.
 //!
-//! One task per server renders what its page shows, only while somebody listens, and sends what has changed since the
-//! second before. A page that has just come, or was too slow for some events, is sent everything.
+//! While pages listen, one task per server renders the page once per second, and sends what has changed to all of them. A
+//! page that has just connected, or was too slow for some events, is sent the whole view.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -15,23 +15,25 @@ use futures_util::stream;
 use serde::Serialize;
 use tokio::sync::{broadcast, watch};
 
+use super::connections::ConnectionPermit;
 use crate::shared::run::{Phase, closing};
 
-/// Between two renderings.
+/// The time between two renderings.
 const PERIOD: Duration = Duration::from_secs(1);
-/// An event costs a pause of one more period for each so many bytes of it: a hundred pages of a large fleet must not
-/// keep its server busy.
+/// For each so many bytes of an event the next rendering is one period later, so that a hundred pages of a large fleet do
+/// not keep the server busy.
 const LARGE: usize = 32 * 1024;
-/// The longest pause, in periods.
-const LONGEST: usize = 5;
-/// After so many renderings without a change a sign of life is sent.
-const QUIET: u32 = 15;
-/// How many pages may listen.
-const MOST_PAGES: usize = 1000;
-/// How many events a page may be behind before it is sent everything anew.
-const BEHIND: usize = 8;
+/// The longest time between two renderings, in periods.
+const MAX_PERIODS: usize = 5;
+/// After how many renderings without a change an empty event is sent, so that pages know that the server is there.
+const KEEP_ALIVE: u32 = 15;
+/// How many events a page may miss before it is sent the whole view.
+const MAX_LAG: usize = 8;
+/// How many bytes are handed to a connection at once. All connections share the bytes of an event; only what is handed to
+/// one is copied, so that a page which does not read costs little memory.
+const CHUNK: usize = 8 * 1024;
 
-/// What a page shows: the parts of it that change. Each text is HTML.
+/// The parts of a page that change. Each text is HTML.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct View {
     /// The contents of elements, by their `id`.
@@ -45,16 +47,16 @@ pub struct View {
 /// A row of a table.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Row {
-    /// What tells it from the others.
+    /// Identifies the row among those of its table.
     pub key: String,
-    /// Its cells, each beginning on a line of its own.
+    /// Its cells.
     pub html: String,
 }
 
 /// An event as the page's script reads it.
 #[derive(Serialize)]
 struct Event<'view> {
-    /// Of the server: a page of another version loads itself again.
+    /// The server's version: a page of another version reloads itself.
     #[serde(skip_serializing_if = "Option::is_none")]
     version: Option<&'static str>,
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
@@ -67,14 +69,14 @@ struct Event<'view> {
 
 #[derive(Serialize)]
 struct Table<'view> {
-    /// The keys of all rows in their order, where that has changed.
+    /// The keys of all rows in their order, if that has changed.
     #[serde(skip_serializing_if = "Option::is_none")]
     order: Option<Vec<&'view str>>,
-    /// The cells that have changed, by the keys of their rows and their columns.
-    rows: BTreeMap<&'view str, BTreeMap<usize, &'view str>>,
+    /// The rows that have changed, by their keys.
+    rows: BTreeMap<&'view str, &'view str>,
 }
 
-/// The pages of a server that listen.
+/// The live pages of a server.
 #[derive(Clone)]
 pub struct Live {
     state: Arc<Mutex<State>>,
@@ -87,31 +89,42 @@ struct State {
     running: bool,
     /// What was rendered last.
     view: Option<View>,
-    quiet: u32,
+    /// The event that holds all of `view`, made when the first page needs it.
+    whole: Option<Bytes>,
+    /// How many renderings have changed nothing.
+    unchanged: u32,
+}
+
+impl State {
+    /// The event that holds all of the view.
+    fn whole(&mut self) -> Option<Bytes> {
+        if self.whole.is_none() {
+            self.whole = difference(None, self.view.as_ref()?);
+        }
+        self.whole.clone()
+    }
 }
 
 impl Live {
-    /// Nobody listens yet.
+    /// No page listens yet.
     #[must_use]
     pub fn new() -> Self {
-        Self { state: Arc::default(), events: broadcast::Sender::new(BEHIND) }
+        Self { state: Arc::default(), events: broadcast::Sender::new(MAX_LAG) }
     }
 
-    /// Answers a page that wants to listen; `render` is what the task does each second.
-    pub fn listen<R, F>(&self, phase: watch::Receiver<Phase>, render: R) -> HttpResponse
+    /// Answers a page that wants to listen. `permit` counts it; `render` is called once per second.
+    pub fn listen<R, F>(&self, permit: ConnectionPermit, phase: watch::Receiver<Phase>, render: R) -> HttpResponse
     where
         R: Fn() -> F + 'static,
         F: Future<Output = Option<View>> + 'static,
     {
-        if self.events.receiver_count() >= MOST_PAGES {
-            return HttpResponse::ServiceUnavailable().body("Error: too many pages are open.");
-        }
         let mut state = self.lock();
         let listener = Listener {
             live: self.clone(),
             events: self.events.subscribe(),
-            first: Some(state.view.as_ref().map_or_else(|| Bytes::from_static(b"retry: 2000\n\n"), everything)),
+            unsent: state.whole().unwrap_or(Bytes::from_static(b"retry: 2000\n\n")),
             closing: Box::pin(closing(phase)),
+            _permit: permit,
         };
         if !std::mem::replace(&mut state.running, true) {
             let live = self.clone();
@@ -124,7 +137,7 @@ impl Live {
         HttpResponse::Ok()
             .content_type("text/event-stream")
             .insert_header((header::CACHE_CONTROL, "no-store"))
-            // A web server in front would keep events until there are many.
+            // A web server in front must not collect events.
             .insert_header(("X-Accel-Buffering", "no"))
             .streaming(stream::unfold(listener, Listener::next))
     }
@@ -143,20 +156,23 @@ impl Live {
         }
     }
 
-    /// Sends what has changed; gives back how many periods to wait until the next time.
+    /// Sends what has changed. Returns how many periods to wait until the next rendering.
     fn publish(&self, view: View) -> u32 {
         let mut state = self.lock();
-        let event = difference(state.view.as_ref(), &view);
-        // The first one is the whole page, and nobody waits for the second because of it.
-        let size = event.as_ref().filter(|_| state.view.is_some()).map_or(0, Bytes::len);
-        state.quiet = if event.is_some() { 0 } else { state.quiet + 1 };
-        let quiet = state.quiet.is_multiple_of(QUIET).then(|| Bytes::from_static(b"data: {}\n\n"));
-        state.view = Some(view);
-        if let Some(event) = event.or(quiet) {
-            // Nobody may be there to hear it.
-            self.events.send(event).ok();
-        }
-        u32::try_from((1 + size / LARGE).min(LONGEST)).unwrap_or(1)
+        let is_first = state.view.is_none();
+        let Some(event) = difference(state.view.as_ref(), &view) else {
+            state.unchanged += 1;
+            if state.unchanged.is_multiple_of(KEEP_ALIVE) {
+                self.events.send(Bytes::from_static(b"data: {}\n\n")).ok();
+            }
+            return 1;
+        };
+        // The first event is the whole page: the second need not wait because of it.
+        let size = if is_first { 0 } else { event.len() };
+        (state.view, state.whole, state.unchanged) = (Some(view), None, 0);
+        // It fails if no page listens any more.
+        self.events.send(event).ok();
+        u32::try_from((1 + size / LARGE).min(MAX_PERIODS)).unwrap_or(1)
     }
 
     fn lock(&self) -> MutexGuard<'_, State> {
@@ -170,8 +186,8 @@ impl Default for Live {
     }
 }
 
-/// The task that renders. When it ends, be it by a panic, the pages that still listen are sent away: they come back,
-/// and the next one starts another.
+/// The task that renders. When it ends, also by a panic, the pages that still listen are disconnected: they connect again,
+/// and the first of them starts another task.
 struct Task(Live);
 
 impl Drop for Task {
@@ -185,14 +201,16 @@ impl Drop for Task {
 struct Listener {
     live: Live,
     events: broadcast::Receiver<Bytes>,
-    first: Option<Bytes>,
+    /// The rest of an event.
+    unsent: Bytes,
     closing: LocalBoxFuture<'static, ()>,
+    _permit: ConnectionPermit,
 }
 
 impl Listener {
     async fn next(mut self) -> Option<(Result<Bytes, std::convert::Infallible>, Self)> {
-        if let Some(first) = self.first.take() {
-            return Some((Ok(first), self));
+        if !self.unsent.is_empty() {
+            return Some((Ok(self.chunk()), self));
         }
         let event = tokio::select! {
             event = self.events.recv() => event,
@@ -200,24 +218,31 @@ impl Listener {
         };
         match event {
             Ok(end) if end.is_empty() => None,
-            Ok(event) => Some((Ok(event), self)),
+            Ok(event) => {
+                self.unsent = event;
+                Some((Ok(self.chunk()), self))
+            }
             Err(broadcast::error::RecvError::Closed) => None,
             Err(broadcast::error::RecvError::Lagged(_)) => {
-                let state = self.live.lock();
-                self.events = self.events.resubscribe();
-                let all = state.view.as_ref().map_or_else(Bytes::new, everything);
+                let mut state = self.live.lock();
+                let events = self.events.resubscribe();
+                self.unsent = state.whole().unwrap_or_default();
                 drop(state);
-                Some((Ok(all), self))
+                self.events = events;
+                Some((Ok(self.chunk()), self))
             }
         }
     }
 }
 
-fn everything(view: &View) -> Bytes {
-    difference(None, view).unwrap_or_default()
+impl Listener {
+    /// Takes the next bytes out of the unsent ones.
+    fn chunk(&mut self) -> Bytes {
+        self.unsent.split_to(CHUNK.min(self.unsent.len()))
+    }
 }
 
-/// The event that turns one view into another; nothing where they are the same.
+/// The event that turns one view into another; nothing if they are the same.
 fn difference(before: Option<&View>, after: &View) -> Option<Bytes> {
     if before == Some(after) {
         return None;
@@ -247,33 +272,17 @@ impl<'view> Table<'view> {
             before.is_some_and(|before| before.iter().map(|row| &row.key).eq(after.iter().map(|row| &row.key)));
         let changed = after.iter().filter_map(|row| {
             let old = known.get(row.key.as_str()).copied();
-            (old != Some(row.html.as_str())).then(|| (row.key.as_str(), changed_cells(old, &row.html)))
+            (old != Some(row.html.as_str())).then_some((row.key.as_str(), row.html.as_str()))
         });
         Self { order: (!same_order).then(|| keys(after)), rows: changed.collect() }
     }
 }
 
-/// The cells of a row that differ from those before, all where there were none.
-fn changed_cells<'view>(before: Option<&str>, after: &'view str) -> BTreeMap<usize, &'view str> {
-    let mut old = before.map(cells).into_iter().flatten();
-    cells(after).enumerate().filter(|(_, cell)| old.next() != Some(*cell)).collect()
-}
-
-/// The cells of a row. What stands in them is escaped: only a cell of its own can begin like one.
-fn cells(html: &str) -> impl Iterator<Item = &str> {
-    let mut rest = Some(html);
-    std::iter::from_fn(move || {
-        let html = rest?;
-        let (cell, more) =
-            html.find("\n<t").map_or((html, None), |end| (html.get(..end).unwrap_or_default(), html.get(end + 1..)));
-        rest = more;
-        Some(cell)
-    })
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::shared::http::connections::{Connections, Kind};
+    use crate::shared::http::peer::Peer;
 
     fn view(glance: &str, rows: &[(&str, &str)]) -> View {
         let rows = rows.iter().map(|(key, html)| Row { key: (*key).to_owned(), html: (*html).to_owned() }).collect();
@@ -282,6 +291,10 @@ mod tests {
             tables: [("servers", rows)].into(),
             sample: Vec::new(),
         }
+    }
+
+    fn permit() -> ConnectionPermit {
+        Connections::new(1, 1, 1).admit(Kind::Page, Peer::Unknown).unwrap()
     }
 
     fn event(before: &View, after: &View) -> String {
@@ -298,24 +311,12 @@ mod tests {
         );
         assert_eq!(
             event(&before, &view("one", &[("a", "1"), ("b", "3")])),
-            "data: {\"tables\":{\"servers\":{\"rows\":{\"b\":{\"0\":\"3\"}}}}}\n\n"
+            "data: {\"tables\":{\"servers\":{\"rows\":{\"b\":\"3\"}}}}\n\n"
         );
         assert_eq!(
             event(&before, &view("one", &[("b", "2")])),
             "data: {\"tables\":{\"servers\":{\"order\":[\"b\"],\"rows\":{}}}}\n\n"
         );
-    }
-
-    #[test]
-    fn of_a_row_only_the_cells_that_have_changed_are_sent() {
-        let columns = |load: &str| format!("<th>a</th>\n<td>{load}</td>\n<td>two\nlines</td>");
-        let before = view("one", &[("a", &columns("1"))]);
-        assert_eq!(
-            event(&before, &view("one", &[("a", &columns("2"))])),
-            "data: {\"tables\":{\"servers\":{\"rows\":{\"a\":{\"1\":\"<td>2</td>\"}}}}}\n\n"
-        );
-        let all: Vec<String> = cells(&columns("3")).map(str::to_owned).collect();
-        assert_eq!(all, ["<th>a</th>", "<td>3</td>", "<td>two\nlines</td>"]);
     }
 
     #[test]
@@ -332,7 +333,7 @@ mod tests {
     async fn the_task_runs_only_while_somebody_listens() {
         let live = Live::new();
         let (_sender, phase) = watch::channel(Phase::Open);
-        let response = live.listen(phase, || async { Some(View::default()) });
+        let response = live.listen(permit(), phase, || async { Some(View::default()) });
         assert!(live.lock().running);
         drop(response);
         let deadline = std::time::Instant::now() + Duration::from_secs(10);
@@ -346,11 +347,11 @@ mod tests {
     async fn a_page_whose_task_has_failed_is_sent_away_and_may_come_back() {
         let live = Live::new();
         let (_sender, phase) = watch::channel(Phase::Open);
-        let page = live.listen(phase.clone(), || async { panic!("this panic is part of a test") });
+        let page = live.listen(permit(), phase.clone(), || async { panic!("this panic is part of a test") });
         let end = actix_web::body::to_bytes(page.into_body());
         assert!(actix_rt::time::timeout(Duration::from_secs(10), end).await.is_ok(), "it waits for ever");
         assert!(!live.lock().running);
-        let _again = live.listen(phase, || async { Some(View::default()) });
+        let _again = live.listen(permit(), phase, || async { Some(View::default()) });
         assert!(live.lock().running);
     }
 }

@@ -2,6 +2,7 @@
 
 pub mod assets;
 mod auth;
+mod client_stream;
 mod connections;
 mod live;
 pub mod liveness;
@@ -10,12 +11,12 @@ mod origin;
 mod page;
 pub mod paths;
 mod peer;
-pub mod sockets;
+pub mod server;
 pub mod tls;
 pub mod websocket;
 
 pub use auth::BasicAuth;
-pub use connections::{Connection, Connections};
+pub use connections::{ConnectionPermit, Connections, Kind};
 pub use live::{Live, Row, View};
 pub use metrics::{CONTENT_TYPE, Gauge, Metrics};
 pub use origin::Origin;

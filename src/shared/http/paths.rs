@@ -4,7 +4,7 @@ use actix_web::dev::HttpServiceFactory;
 use actix_web::http::header::{self, HeaderName, HeaderValue};
 use actix_web::http::{Method, StatusCode};
 use actix_web::middleware::DefaultHeaders;
-use actix_web::{FromRequest, Handler, HttpResponse, Resource, Responder, guard, web};
+use actix_web::{FromRequest, Handler, HttpRequest, HttpResponse, Resource, Responder, guard, web};
 use rand::RngExt;
 
 /// In seconds.
@@ -36,6 +36,23 @@ fn wrong_method(methods: &[Method]) -> HttpResponse {
     HttpResponse::MethodNotAllowed().insert_header((header::ALLOW, allowed)).body(words)
 }
 
+/// Refuses a request that a page of another site made, with the password that the browser remembers.
+///
+/// Browsers tell where a request comes from in `Sec-Fetch-Site`, older ones in `Origin`; other programs send neither.
+#[must_use]
+pub fn refuse_other_sites(request: &HttpRequest) -> Option<HttpResponse> {
+    let header = |name: HeaderName| request.headers().get(name).map(|value| value.to_str().unwrap_or_default());
+    let same_site =
+        header(HeaderName::from_static("sec-fetch-site")).is_none_or(|site| matches!(site, "same-origin" | "none"));
+    let host = header(header::HOST).unwrap_or_default();
+    let same_host = header(header::ORIGIN).is_none_or(|origin| {
+        let of_page = origin.split_once("://").map_or(origin, |(_, authority)| authority);
+        of_page.eq_ignore_ascii_case(host)
+    });
+    let refusal = || HttpResponse::Forbidden().body("Error: this request comes from a page of another site.");
+    (!same_site || !same_host).then(refusal)
+}
+
 /// After how many seconds a client that was refused may come back: drawn at random, so that a class that was refused
 /// together does not come back together.
 #[must_use]
@@ -50,7 +67,8 @@ pub fn all(configure: fn(&mut web::ServiceConfig), hint: &'static str) -> impl H
         .add((header::ACCESS_CONTROL_ALLOW_HEADERS, "x-requested-with"))
         .add((header::ACCESS_CONTROL_ALLOW_METHODS, "POST, GET, OPTIONS"))
         .add((header::ACCESS_CONTROL_EXPOSE_HEADERS, "Retry-After"))
-        .add((header::CACHE_CONTROL, "no-store"));
+        .add((header::CACHE_CONTROL, "no-store"))
+        .add((header::X_CONTENT_TYPE_OPTIONS, "nosniff"));
     web::scope("")
         .wrap(headers)
         .configure(configure)
@@ -59,4 +77,35 @@ pub fn all(configure: fn(&mut web::ServiceConfig), hint: &'static str) -> impl H
             let words = format!("Error: there is nothing here. Try {hint}.");
             HttpResponse::build(StatusCode::NOT_FOUND).body(words)
         }))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use actix_web::test::TestRequest;
+
+    #[test]
+    fn only_pages_of_the_same_site_and_other_programs_change_something() {
+        for (site, origin, allowed) in [
+            (None, None, true),
+            (Some("same-origin"), Some("https://lab.org:2000"), true),
+            (Some("none"), None, true),
+            (None, Some("http://LAB.org:2000"), true),
+            (Some("cross-site"), None, false),
+            (Some("same-site"), Some("https://lab.org:2000"), false),
+            (None, Some("https://lab.org"), false),
+            (None, Some("https://lab.org:2000.evil.example"), false),
+            (None, Some("null"), false),
+        ] {
+            let mut request = TestRequest::post().insert_header((header::HOST, "lab.org:2000"));
+            if let Some(site) = site {
+                request = request.insert_header(("sec-fetch-site", site));
+            }
+            if let Some(origin) = origin {
+                request = request.insert_header((header::ORIGIN, origin));
+            }
+            let refusal = refuse_other_sites(&request.to_http_request());
+            assert_eq!(refusal.is_none(), allowed, "{site:?} {origin:?}");
+        }
+    }
 }

@@ -6,7 +6,7 @@
 //! client's.
 
 use std::fmt;
-use std::net::{IpAddr, Ipv6Addr, SocketAddr};
+use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
 
 use actix_web::HttpRequest;
 use actix_web::http::header::HeaderMap;
@@ -37,13 +37,23 @@ pub enum Peer {
 }
 
 impl Peer {
-    /// The address by which a client is known, where it is: one IPv6 client has a whole /64 of addresses, which count as
-    /// one.
+    /// The key by which rate limits count a client, if its address is known. An IPv6 client has a whole /64 of addresses,
+    /// which count as one.
     #[must_use]
     pub fn rate_limit_key(self) -> Option<IpAddr> {
         match self {
             Self::Client(IpAddr::V6(address)) => Some(Ipv6Addr::from_bits(address.to_bits() >> 64 << 64).into()),
             Self::Client(address) => Some(address),
+            Self::Proxy(_) | Self::Unknown => None,
+        }
+    }
+
+    /// The network of a client: the /48 of an IPv6 address, which is what one customer gets, or the /24 of an IPv4 one.
+    #[must_use]
+    pub fn network(self) -> Option<IpAddr> {
+        match self {
+            Self::Client(IpAddr::V6(address)) => Some(Ipv6Addr::from_bits(address.to_bits() >> 80 << 80).into()),
+            Self::Client(IpAddr::V4(address)) => Some(Ipv4Addr::from_bits(address.to_bits() >> 8 << 8).into()),
             Self::Proxy(_) | Self::Unknown => None,
         }
     }

@@ -10,7 +10,7 @@ use actix_web_actors::ws::{CloseCode, CloseReason, Message, ProtocolError, Webso
 
 use super::outcome::{Outcome, Pending};
 use super::state::{StartRequest, State, WebotsHandle};
-use crate::shared::http::Connection;
+use crate::shared::http::ConnectionPermit;
 use crate::shared::http::Peer;
 use crate::shared::http::liveness::{self, Liveness};
 use crate::shared::http::websocket::{ClientMessage, MessageReader};
@@ -32,15 +32,15 @@ pub struct WebClient {
     restoring: bool,
     start: Pending,
     reader: MessageReader,
-    _connection: Connection,
+    _permit: ConnectionPermit,
 }
 
 type Context = WebsocketContext<WebClient>;
 
 impl WebClient {
-    /// A client that has just connected; `connection` counts it, `reader` takes what comes from it.
+    /// A client that has just connected; `permit` counts it, `reader` reads its messages.
     #[must_use]
-    pub fn new(server: Arc<AppState>, peer: Peer, (connection, reader): (Connection, MessageReader)) -> Self {
+    pub fn new(server: Arc<AppState>, peer: Peer, (permit, reader): (ConnectionPermit, MessageReader)) -> Self {
         Self {
             server,
             peer,
@@ -49,7 +49,7 @@ impl WebClient {
             restoring: false,
             start: Pending::default(),
             reader,
-            _connection: connection,
+            _permit: permit,
         }
     }
 

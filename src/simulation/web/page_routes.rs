@@ -14,7 +14,7 @@ use super::webots_viewer;
 use crate::asset;
 use crate::shared::http::assets::{self, Asset};
 use crate::shared::http::paths::{GET, READ, path};
-use crate::shared::http::{Policy, html};
+use crate::shared::http::{Kind, Policy, html};
 use crate::simulation::machine::Usages;
 use crate::simulation::snapshot::Snapshot;
 use crate::simulation::state::AppState;
@@ -47,7 +47,11 @@ async fn usages(server: &AppState, snapshot: &Snapshot) -> Usages {
     server.usage.read(snapshot.simulations.iter().filter_map(|one| one.pid).collect()).await
 }
 
-async fn events(server: web::Data<AppState>) -> HttpResponse {
+async fn events(request: HttpRequest, server: web::Data<AppState>) -> HttpResponse {
+    let permit = match server.connections.admit(Kind::Page, server.config.trusted_proxies.peer(&request)) {
+        Ok(permit) => permit,
+        Err(refused) => return refused.answer(),
+    };
     let shown = server.clone();
     let render = move || {
         let server = shown.clone();
@@ -58,7 +62,7 @@ async fn events(server: web::Data<AppState>) -> HttpResponse {
             view.inspect_err(|error| log::error!("the monitor page can't be rendered: {error}")).ok()
         }
     };
-    server.live.listen(server.phase.clone(), render)
+    server.live.listen(permit, server.phase.clone(), render)
 }
 
 async fn history(server: web::Data<AppState>) -> HttpResponse {

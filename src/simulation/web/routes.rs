@@ -8,9 +8,9 @@ use actix_web::{HttpRequest, HttpResponse, web};
 use super::page_routes;
 use super::queries::{snapshot, too_busy};
 use super::status::{self, StatusPage};
-use crate::shared::http::CONTENT_TYPE;
 use crate::shared::http::paths::{self, GET, POST, READ, path};
 use crate::shared::http::websocket;
+use crate::shared::http::{CONTENT_TYPE, Kind};
 use crate::shared::run::Request;
 use crate::simulation::client::WebClient;
 use crate::simulation::state::AppState;
@@ -35,12 +35,12 @@ async fn client(request: HttpRequest, stream: web::Payload, server: web::Data<Ap
         return refusal;
     }
     let peer = server.config.trusted_proxies.peer(&request);
-    let connection = match server.connections.admit(peer) {
-        Ok(connection) => connection,
-        Err(crowded) => return crowded.answer(),
+    let permit = match server.connections.admit(Kind::Client, peer) {
+        Ok(permit) => permit,
+        Err(refused) => return refused.answer(),
     };
     let server = Arc::clone(&server);
-    websocket::open(&request, stream, |inbox| WebClient::new(server, peer, (connection, inbox)))
+    websocket::open(&request, stream, |reader| WebClient::new(server, peer, (permit, reader)))
 }
 
 /// A page of another origin may use visitors' browsers to start simulations, unless origins are listed.
@@ -84,6 +84,9 @@ async fn health(server: web::Data<AppState>) -> HttpResponse {
 }
 
 async fn drain(request: HttpRequest, server: web::Data<AppState>) -> HttpResponse {
+    if let Some(refusal) = paths::refuse_other_sites(&request) {
+        return refusal;
+    }
     let Some(auth) = &server.admin_auth else {
         return HttpResponse::Forbidden().body("Error: actions are off; adminPassword is not set.");
     };

@@ -1,0 +1,116 @@
+//! A client's TCP connection, on which the next request is read only once the one before is being answered.
+//!
+//! actix decodes all requests that it has read before it answers the first. Without this a client that sends many requests
+//! and reads no answer would fill the memory.
+
+use std::io;
+use std::pin::Pin;
+use std::task::{Context, Poll, ready};
+
+use actix_web::rt::net::TcpStream;
+use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
+
+use super::connections::ConnectionPermit;
+
+/// How many bytes are taken from the system at once.
+const READ_AT_ONCE: usize = 4 * 1024;
+/// How the answer begins that makes a connection a WebSocket.
+const SWITCHING_PROTOCOLS: &[u8] = b"HTTP/1.1 101 ";
+
+/// What the connection is used for at the moment.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum State {
+    /// The head of a request is read.
+    Request,
+    /// A request was handed over, and nothing of its answer was written yet.
+    Answer,
+    /// Messages go in both directions.
+    WebSocket,
+}
+
+/// A client's TCP connection.
+#[derive(Debug)]
+pub struct ClientStream {
+    tcp: TcpStream,
+    /// What was taken from the system and not yet handed over.
+    unread: Vec<u8>,
+    /// Whether the byte before was the end of a line.
+    line_ended: bool,
+    /// Whether the system takes no more of an answer, since the client does not read.
+    is_blocked: bool,
+    state: State,
+    _permit: ConnectionPermit,
+}
+
+impl ClientStream {
+    /// A connection that `permit` counts.
+    #[must_use]
+    pub fn new(tcp: TcpStream, permit: ConnectionPermit) -> Self {
+        Self { tcp, unread: Vec::new(), line_ended: false, is_blocked: false, state: State::Request, _permit: permit }
+    }
+
+    /// How many of the unread bytes may be handed over, at most `room`: those of one request.
+    fn readable(&mut self, room: usize) -> usize {
+        let room = room.min(self.unread.len());
+        if self.state == State::WebSocket {
+            return room;
+        }
+        for (index, byte) in self.unread.iter().take(room).enumerate() {
+            match byte {
+                // An empty line ends the head of a request.
+                b'\n' if self.line_ended => {
+                    self.line_ended = false;
+                    self.state = State::Answer;
+                    return index + 1;
+                }
+                b'\n' => self.line_ended = true,
+                b'\r' => {}
+                _ => self.line_ended = false,
+            }
+        }
+        room
+    }
+}
+
+impl AsyncRead for ClientStream {
+    fn poll_read(
+        mut self: Pin<&mut Self>,
+        context: &mut Context<'_>,
+        buffer: &mut ReadBuf<'_>,
+    ) -> Poll<io::Result<()>> {
+        if self.is_blocked || self.state == State::Answer {
+            // The task is woken by the next write, or once the system takes more.
+            return Poll::Pending;
+        }
+        if self.unread.is_empty() {
+            let mut bytes = [0; READ_AT_ONCE];
+            let mut part = ReadBuf::new(&mut bytes);
+            ready!(Pin::new(&mut self.tcp).poll_read(context, &mut part))?;
+            self.unread.extend_from_slice(part.filled());
+        }
+        let count = self.readable(buffer.remaining());
+        buffer.put_slice(self.unread.get(..count).unwrap_or_default());
+        self.unread.drain(..count);
+        Poll::Ready(Ok(()))
+    }
+}
+
+impl AsyncWrite for ClientStream {
+    fn poll_write(mut self: Pin<&mut Self>, context: &mut Context<'_>, bytes: &[u8]) -> Poll<io::Result<usize>> {
+        let written = Pin::new(&mut self.tcp).poll_write(context, bytes);
+        self.is_blocked = written.is_pending();
+        if self.state == State::Answer && written.is_ready() {
+            self.state = if bytes.starts_with(SWITCHING_PROTOCOLS) { State::WebSocket } else { State::Request };
+            context.waker().wake_by_ref();
+        }
+        written
+    }
+
+    fn poll_flush(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
+        Pin::new(&mut self.tcp).poll_flush(context)
+    }
+
+    fn poll_shutdown(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
+        Pin::new(&mut self.tcp).poll_shutdown(context)
+    }
+}

@@ -1,0 +1,107 @@
+//! What clients that read nothing cost.
+
+use std::io::{ErrorKind, Write};
+use std::net::TcpStream;
+use std::time::{Duration, Instant};
+
+use socket2::{Domain, Socket, Type};
+
+use super::until_states;
+use crate::support::program::{Server, session_server};
+use crate::support::{SOON, http};
+
+const CLIENTS: usize = 100;
+/// What all of them together may cost, in bytes.
+const LIMIT: u64 = 50 << 20;
+
+/// The memory of a server, in bytes.
+fn memory(server: &Server) -> u64 {
+    let status = std::fs::read_to_string(format!("/proc/{}/status", server.pid())).unwrap();
+    let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:")).unwrap();
+    line.trim().trim_end_matches(" kB").parse::<u64>().unwrap() << 10
+}
+
+/// A client that takes little from its connection before it reads.
+fn connect(server: &Server) -> TcpStream {
+    let socket = Socket::new(Domain::IPV4, Type::STREAM, None).unwrap();
+    socket.set_recv_buffer_size(4096).unwrap();
+    let address: std::net::SocketAddr = server.address().parse().unwrap();
+    socket.connect(&address.into()).unwrap();
+    socket.set_nonblocking(true).unwrap();
+    socket.into()
+}
+
+/// Sends as much of this as the server takes from each of the clients.
+async fn fill(clients: &mut [TcpStream], requests: &[u8]) {
+    let (deadline, mut progress) = (Instant::now() + SOON, Instant::now());
+    while progress.elapsed() < Duration::from_secs(1) && Instant::now() < deadline {
+        for client in &mut *clients {
+            match client.write(requests) {
+                // Part of a request is cut off: the server waits for the rest of it.
+                Ok(written) => {
+                    assert!(written > 0);
+                    progress = Instant::now();
+                }
+                Err(error) => assert_eq!(error.kind(), ErrorKind::WouldBlock, "{error}"),
+            }
+        }
+        actix_rt::time::sleep(Duration::from_millis(5)).await;
+    }
+}
+
+async fn cost(server: &Server, requests: &[u8]) -> u64 {
+    let before = memory(server);
+    let mut clients: Vec<TcpStream> = (0..CLIENTS).map(|_| connect(server)).collect();
+    fill(&mut clients, requests).await;
+    let cost = memory(server).saturating_sub(before);
+    assert_eq!(http::get(&server.url("/health")).await.status, 200);
+    println!("{CLIENTS} clients cost {} KiB", cost >> 10);
+    cost
+}
+
+#[actix_rt::test]
+async fn clients_that_ask_much_and_read_nothing_cost_little() {
+    let session = session_server(&["127.0.0.1:1".to_owned()]).start().await;
+    until_states(&session, &["down"]).await;
+    for request in ["GET /monitor", "GET /status", "OPTIONS /load", "HEAD /monitor"] {
+        let requests = format!("{request} HTTP/1.1\r\nHost: x\r\n\r\n").repeat(1000);
+        let cost = cost(&session, requests.as_bytes()).await;
+        assert!(cost < LIMIT, "{request}: {cost} bytes");
+    }
+}
+
+#[actix_rt::test]
+async fn live_pages_that_read_nothing_cost_little() {
+    let fleet: Vec<String> = (1..=1000).map(|port| format!("127.0.0.1:{port}")).collect();
+    let session = session_server(&fleet).set("loadRefresh", 600).start().await;
+    until_states(&session, &vec!["down"; fleet.len()]).await;
+    // The page is rendered with the first.
+    let mut first = [connect(&session)];
+    fill(&mut first, b"GET /events HTTP/1.1\r\nHost: x\r\n\r\n").await;
+    let cost = cost(&session, b"GET /events HTTP/1.1\r\nHost: x\r\n\r\n").await;
+    assert!(cost < LIMIT, "{cost} bytes");
+}
+
+#[actix_rt::test]
+async fn requests_that_come_at_once_are_answered_in_their_order() {
+    let session = session_server(&[]).start().await;
+    let (sent, read) = (200, std::io::Read::read_to_end);
+    let mut client = TcpStream::connect(session.address()).unwrap();
+    client.set_read_timeout(Some(SOON)).unwrap();
+    let request = |number| match number % 2 {
+        0 => "GET /health HTTP/1.1\r\nHost: x\r\n\r\n",
+        _ => "GET /load HTTP/1.1\r\nHost: x\r\n\r\n",
+    };
+    let requests: String = (0..sent).map(request).collect();
+    let answers = actix_rt::task::spawn_blocking(move || {
+        client.write_all(requests.as_bytes()).unwrap();
+        client.write_all(b"GET /health HTTP/1.1\r\nHost: x\r\nConnection: close\r\n\r\n").unwrap();
+        let mut answers = Vec::new();
+        read(&mut client, &mut answers).unwrap();
+        String::from_utf8(answers).unwrap()
+    });
+    let answers = answers.await.unwrap();
+    let bodies = answers.split("\r\n\r\n").skip(1).map(|part| part.split("HTTP/1.1").next().unwrap());
+    let expected = (0..=sent).map(|number| if number % 2 == 0 { "ok" } else { "-1" });
+    assert!(bodies.eq(expected), "{answers}");
+}
