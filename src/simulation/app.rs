@@ -234,7 +234,8 @@ fn assemble(
     let limits = Limits { time, size, any_commit: config.any_commit };
     let (budget, mirrors) = (config.cache_size << 20, config.git_mirrors.clone());
     let runtime = tokio::runtime::Handle::current();
-    let checkouts = Checkouts::open(cache_dir, run.path(), budget, mirrors, limits, runtime).map_err(cache_fault)?;
+    let git = (mirrors, config.git_config.as_ref().map(|file| file.0.as_path()));
+    let checkouts = Checkouts::open(cache_dir, run.path(), budget, git, limits, runtime).map_err(cache_fault)?;
     let places = Places::new(config.streaming_ports(), config.waiting_line).start();
     let csv = config.monitor_log_enabled.then(|| config.log_dir.0.join("simulation/monitor.csv"));
     let (load_monitor, readings) = LoadMonitor::new(places.clone(), run.path(), csv);

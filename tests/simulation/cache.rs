@@ -249,3 +249,16 @@ async fn a_fetch_that_is_broken_off_leaves_nothing_in_the_cache() {
     let folder = server.folder.join("cache/git");
     until("the cache is within its budget", async || size_of(&folder) < 1 << 20).await;
 }
+
+#[actix_rt::test]
+async fn a_cache_folder_that_is_removed_is_made_anew() {
+    let (forge, webots) = (Forge::with_arm(), reader());
+    let server = simulation_server(&webots.path(), forge.path(), 1).start().await;
+    assert!(outcome(&server, &arm()).await.contains("opened"));
+    for folder in ["cache/runs", "cache/git", "cache"] {
+        // The server may still be writing into it.
+        until("it is removed", async || std::fs::remove_dir_all(server.folder.join(folder)).is_ok()).await;
+        let told = outcome(&server, &arm()).await;
+        assert!(told.contains("opened"), "{folder}: {told}");
+    }
+}

@@ -89,6 +89,10 @@ async fn every_kind_of_url_opens_its_world() {
         ("https://github.com/lab/arm/tree/main/worlds/a.wbt".to_owned(), "newer"),
         ("https://GitHub.com/lab/arm/blob/v1.0/worlds/a.wbt".to_owned(), "root of main"),
         (format!("https://github.com/lab/arm/blob/{first}/worlds/a.wbt"), "root of main"),
+        (format!("https://github.com/lab/arm/blob/{}/worlds/a.wbt", &first[..8]), "root of main"),
+        ("https://github.com/lab/arm/blob/main//worlds/a.wbt".to_owned(), "newer"),
+        ("https://github.com/lab/arm/blob/main/worlds/a.wbt?raw=true".to_owned(), "newer"),
+        ("https://www.github.com/lab/arm.git/blob/main/worlds/a.wbt#L5".to_owned(), "newer"),
         ("https://github.com/lab/arm/blob/main/p%20q/worlds/b%20%C3%A9.wbt".to_owned(), "spaces"),
         ("https://github.com/lab/arm/blob/feature/arm/sub/worlds/a.wbt".to_owned(), "slashes"),
         ("https://github.com/lab/arm/blob/q'%22$(touch$%7BIFS%7Dpwned)%60id%60/worlds/a.wbt".to_owned(), "quotes"),
@@ -188,7 +192,7 @@ async fn a_world_that_is_a_link_takes_all_of_its_repository_within_the_limits() 
     }
     // What is small as it is packed counts as it is checked out.
     let zeros = "0".repeat(6 << 20);
-    forge.commit("lab/arm", "main", &[("zeros", &zeros), ("far/worlds/near.wbt", &world_text("near"))]);
+    forge.commit("lab/arm", "main", &[("large/zeros", &zeros), ("far/worlds/near.wbt", &world_text("near"))]);
     let server = simulation_server(&webots.path(), forge.path(), 1).set("projectSize", 1).start().await;
     let ask = async |name: &str| outcome(&server, &world("lab/arm", "main", &format!("far/worlds/{name}"))).await;
     assert_eq!(ask("a.wbt").await, "loading: Error: The project is larger than 1 MiB");
@@ -534,4 +538,49 @@ async fn a_controller_is_reset_and_nothing_else() {
     std::os::unix::fs::symlink(&outside, project.join("controllers/c")).unwrap();
     reset(&mut client, "c/c.py").await;
     assert_eq!(std::fs::read_dir(&outside).unwrap().count(), 0, "it was written outside of the project");
+}
+
+#[actix_rt::test]
+async fn the_files_of_the_folders_above_a_project_are_there_and_no_other_folders() {
+    let forge = Forge::new();
+    let webots = Webots::script(
+        "for last; do :; done\ncd \"$(dirname \"$last\")/../../..\"\necho \"files [$(find . -type f | sort | tr '\\n' ' ')]\"\nexit 1",
+    );
+    let files =
+        ["top.proto", "a/mid.proto", "a/p q/worlds/a.wbt", "a/p q/protos/p.proto", "a/other/no.proto", "b/no.proto"];
+    let text = world_text("above");
+    forge.commit("lab/arm", "main", &files.map(|file| (file, text.as_str())));
+    let server = simulation_server(&webots.path(), forge.path(), 1).start().await;
+    let told = outcome(&server, &world("lab/arm", "main", "a/p%20q/worlds/a.wbt")).await;
+    let expected = "files [./a/mid.proto ./a/p q/protos/p.proto ./a/p q/worlds/a.wbt ./top.proto ]";
+    assert!(told.contains(expected), "{told}");
+    // They count for the size.
+    std::fs::write(forge.work_tree("lab/arm", "main").join("zeros"), vec![b'0'; 3 << 20]).unwrap();
+    forge.commit_work_tree("lab/arm", "main");
+    let server = simulation_server(&webots.path(), forge.path(), 1).set("projectSize", 1).start().await;
+    let told = outcome(&server, &world("lab/arm", "main", "a/p%20q/worlds/a.wbt")).await;
+    assert_eq!(told, "loading: Error: The project is larger than 1 MiB");
+}
+
+#[actix_rt::test]
+async fn git_is_bounded_in_memory_and_in_what_it_writes() {
+    let (forge, webots) = (Forge::with_arm(), reader());
+    // Small as it is listed, and four times as large as it is written.
+    let text = "0123456789\n".repeat(50_000);
+    let attributes = "*.txt working-tree-encoding=UTF-32LE\n";
+    let encoded: Vec<u8> = text.bytes().flat_map(|byte| [byte, 0, 0, 0]).collect();
+    let work = forge.work_tree("lab/arm", "main");
+    std::fs::write(work.join(".gitattributes"), attributes).unwrap();
+    std::fs::write(work.join("a.txt"), encoded).unwrap();
+    forge.commit_work_tree("lab/arm", "main");
+    let listed = git(&forge.path().join("lab/arm"), &["cat-file", "-s", "main:a.txt"]);
+    assert_eq!(listed.trim(), text.len().to_string());
+    let wrapper = GitWrapper::new("echo \"limit $(ulimit -d)\" >&2");
+    let builder = simulation_server(&webots.path(), forge.path(), 1).env("PATH", &wrapper.path());
+    let server = builder.set("projectSize", 1).start().await;
+    assert_eq!(outcome(&server, &arm()).await, "loading: Error: The project is larger than 1 MiB");
+    let wrapper = GitWrapper::new("[ $(ulimit -d) = 2097152 ] || { echo 'fatal: no limit' >&2; exit 128; }");
+    let server = simulation_server(&webots.path(), forge.path(), 1).env("PATH", &wrapper.path()).start().await;
+    let told = outcome(&server, &arm()).await;
+    assert!(told.contains("opened"), "{told}");
 }

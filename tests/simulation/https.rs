@@ -73,7 +73,8 @@ fn answer(socket: TcpStream, config: Arc<ServerConfig>, root: &Path, elsewhere: 
     let mut body = vec![0; header("content-length").parse().unwrap_or(0)];
     reader.read_exact(&mut body).ok()?;
     let (path, query) = target.split_once('?').unwrap_or((&target, ""));
-    let (head, content) = if path.starts_with("/lab/private") {
+    let is_known = header("authorization") == "Basic dTpw";
+    let (head, content) = if path.starts_with("/lab/private") && !is_known {
         ("Status: 401 Unauthorized\r\nWWW-Authenticate: Basic realm=\"x\"".to_owned(), Vec::new())
     } else if path.starts_with("/lab/away") {
         (format!("Status: 302 Found\r\nLocation: {elsewhere}{target}"), Vec::new())
@@ -109,7 +110,7 @@ async fn a_forge_is_asked_over_https_and_nothing_else() {
     git(&forge.path().join("lab/arm"), &["config", "uploadpack.allowFilter", "true"]);
     let plain = TcpListener::bind("127.0.0.1:0").unwrap();
     plain.set_nonblocking(true).unwrap();
-    let https = Https::new(forge, format!("http://{}", plain.local_addr().unwrap()));
+    let https = Https::new(forge, format!("https://{}", plain.local_addr().unwrap()));
     let server = https.server(&webots).env("GIT_SSL_CAINFO", https.certificate().to_str().unwrap()).start().await;
     let missing = "does not exist or is not public";
     let table = [
@@ -119,16 +120,36 @@ async fn a_forge_is_asked_over_https_and_nothing_else() {
         (world("lab/none", "main", "worlds/a.wbt"), missing),
         // Nobody is asked for a password.
         (world("lab/private", "main", "worlds/a.wbt"), missing),
-        // Nobody is led from one protocol to another.
-        (world("lab/away", "main", "worlds/a.wbt"), "lab/away can't be checked out: git ls-remote ended with"),
+        // Nobody is led elsewhere.
+        (world("lab/away", "main", "worlds/a.wbt"), "https://github.com/lab/away has moved"),
     ];
     for (url, words) in table {
         let told = outcome(&server, &url).await;
         assert!(told.contains(words), "{url}: {told}");
     }
-    assert!(plain.accept().is_err(), "somebody was asked without encryption");
+    assert!(plain.accept().is_err(), "a redirect was followed");
     // A forge whose certificate nobody trusts is none.
     let server = https.server(&webots).start().await;
     let told = outcome(&server, &world("lab/arm", "main", "worlds/a.wbt")).await;
     assert!(told.contains("certificate"), "{told}");
+}
+
+#[actix_rt::test]
+async fn what_the_administrator_has_set_for_git_holds_and_what_a_world_could_have_written_does_not() {
+    let (forge, webots, home) = (Forge::new(), reader(), tempfile::tempdir().unwrap());
+    forge.commit("lab/private", "main", &[("worlds/a.wbt", &world_text("private"))]);
+    let https = Https::new(forge, String::new());
+    let settings = "[credential]\n\thelper = \"!f() { echo username=u; echo password=p; }; f\"\n";
+    let ours = home.path().join("an administrator's");
+    std::fs::write(&ours, settings).unwrap();
+    std::fs::write(home.path().join(".gitconfig"), settings).unwrap();
+    let url = world("lab/private", "main", "worlds/a.wbt");
+    let start = || {
+        let builder = https.server(&webots).env("HOME", home.path().to_str().unwrap());
+        builder.env("GIT_SSL_CAINFO", https.certificate().to_str().unwrap())
+    };
+    let told = outcome(&start().start().await, &url).await;
+    assert!(told.contains("does not exist or is not public"), "the user's own file counts for nothing: {told}");
+    let told = outcome(&start().set("gitConfig", ours.to_str().unwrap()).start().await, &url).await;
+    assert!(told.contains("opened [private]"), "{told}");
 }

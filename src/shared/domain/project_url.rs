@@ -64,10 +64,13 @@ impl ProjectUrl {
     /// Reads a world's URL in the form of GitHub, GitLab (`/-/blob/`) or Gitea (`/src/branch/`).
     ///
     /// # Errors
-    /// When it is not `https`, names a user or a query, holds `.`, `..` or empty segments, encoded slashes or control
-    /// characters, or does not end in `/worlds/NAME.wbt`.
+    /// When it is not `https`, names a user, holds `.` or `..` as segments, encoded slashes or control characters, or does
+    /// not end in `/worlds/NAME.wbt`. A query and a fragment, as pages of forges add them, count for nothing.
     pub fn parse(text: &str) -> Result<Self, NoProject> {
-        let (host, mut segments) = split_url(text)?;
+        if text.len() > LONGEST {
+            return Err(no_project(format!("it is longer than {LONGEST} bytes")));
+        }
+        let (host, mut segments) = split_url(text.split(['?', '#']).next().unwrap_or_default())?;
         let (repository, reference, kind) = split_repository(&segments)?;
         if let Some(name) = repository.checked_sub(1).and_then(|last| segments.get_mut(last)) {
             *name = without_git(name)?;
@@ -190,7 +193,7 @@ pub(super) fn split_url(text: &str) -> Result<(String, Vec<String>), NoProject> 
     if path.is_empty() {
         return Ok((host, Vec::new()));
     }
-    let segments = path.split('/').map(decode_segment).collect::<Result<_, _>>()?;
+    let segments = path.split('/').filter(|raw| !raw.is_empty()).map(decode_segment).collect::<Result<_, _>>()?;
     Ok((host, segments))
 }
 
@@ -200,7 +203,8 @@ fn parse_host(authority: &str) -> Result<String, NoProject> {
     }
     let parsed = url::Url::parse(&format!("https://{authority}/"))
         .map_err(|error| no_project(format!("its host {authority:?} can't be read ({error})")))?;
-    let host = parsed.host_str().unwrap_or_default().to_owned();
+    let host = parsed.host_str().unwrap_or_default();
+    let host = if host == "www.github.com" { "github.com" } else { host }.to_owned();
     Ok(parsed.port().map_or(host.clone(), |port| format!("{host}:{port}")))
 }
 
@@ -260,6 +264,10 @@ mod tests {
             ("https://git.lab/u/r/src/tag/v1/worlds/a.WBT", "https://git.lab/u/r", "v1", ""),
             ("https://github.com/u/r.git/blob/main/worlds/a.wbt", "https://github.com/u/r", "main", ""),
             ("https://github.com/u/r%2eGIT/blob/main/worlds/a.wbt", "https://github.com/u/r", "main", ""),
+            ("https://github.com/u//r/blob/main//worlds/a.wbt", "https://github.com/u/r", "main", ""),
+            ("https://github.com/u/r/blob/main/p/worlds/a.wbt?raw=true", "https://github.com/u/r", "main", "p"),
+            ("https://github.com/u/r/blob/main/worlds/a.wbt#L5", "https://github.com/u/r", "main", ""),
+            ("https://www.GitHub.com/u/r/blob/main/worlds/a.wbt", "https://github.com/u/r", "main", ""),
         ];
         for (text, repository, reference, folder) in table {
             let url = ProjectUrl::parse(text).unwrap_or_else(|error| panic!("{text}: {error}"));
@@ -298,15 +306,15 @@ mod tests {
             "https://github.com/u/r/wiki/main/worlds/a.wbt",
             "https://github.com/u/r/blob/../worlds/a.wbt",
             "https://github.com/u/r/blob/%2e%2e/worlds/a.wbt",
-            "https://github.com/u//r/blob/main/worlds/a.wbt",
             "https://github.com/u/r/blob/main/p%2f..%2fq/worlds/a.wbt",
             "https://github.com/u/r/blob/main/p%5cq/worlds/a.wbt",
             "https://github.com/u/r/blob/main/.git/worlds/a.wbt",
             "https://me@github.com/u/r/blob/main/worlds/a.wbt",
             "https://github.com@evil.org/u/r/blob/main/worlds/a.wbt",
             "https://github.com\\@evil.org/u/r/blob/main/worlds/a.wbt",
-            "https://github.com/u/r/blob/main/worlds/a.wbt?x=.wbt",
-            "https://github.com/u/r/blob/main/worlds/a.wbt#.wbt",
+            "https://github.com/u/r/blob/main/worlds/a?x=.wbt",
+            "https://github.com/u/r/blob/main/worlds/a#/worlds/b.wbt",
+            "https://github.com?@evil.org/u/r/blob/main/worlds/a.wbt",
             "https://github.com/u/r/blob/ma\nin/worlds/a.wbt",
             "https://github.com/u/r/blob/ma%00in/worlds/a.wbt",
             "https:///u/r/blob/main/worlds/a.wbt",

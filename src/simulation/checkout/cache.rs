@@ -53,7 +53,7 @@ impl Cache {
     /// # Errors
     /// When the cache's folder can't be made.
     pub async fn commits(&self, remote: &Remote) -> io::Result<Arc<Repository>> {
-        self.repository(&remote.location, remote).await
+        self.repository(&remote.key(), remote).await
     }
 
     /// The repository that holds the history of `remote`: the commits of all branches and tags, without files where the
@@ -62,7 +62,7 @@ impl Cache {
     /// # Errors
     /// When the cache's folder can't be made.
     pub async fn history(&self, remote: &Remote) -> io::Result<Arc<Repository>> {
-        self.repository(&format!("{} history", remote.location), remote).await
+        self.repository(&format!("{} history", remote.key()), remote).await
     }
 
     async fn repository(&self, key: &str, remote: &Remote) -> io::Result<Arc<Repository>> {

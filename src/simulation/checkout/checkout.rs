@@ -6,7 +6,7 @@
 use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use actix::prelude::*;
 use tokio::runtime::Handle;
@@ -15,7 +15,8 @@ use tokio_util::task::AbortOnDropHandle;
 
 use super::cache::Cache;
 use super::cache_dir::CacheDir;
-use super::copy::{Copied, copy_call, look};
+use super::copy::{Copied, What, copy_call, look, what};
+use super::disk::{blocking, size_of};
 use super::error::{CheckoutError, git_failed, machine, too_large, too_slow};
 use super::finder::{Finder, Found};
 use super::git::Git;
@@ -38,6 +39,9 @@ pub struct Checkouts {
     copies: Semaphore,
     _keeps_within_budget: AbortOnDropHandle<()>,
 }
+
+/// Time between two looks at how much a copy has written.
+const BETWEEN_LOOKS: Duration = Duration::from_millis(500);
 
 /// A step of a checkout, in words.
 #[derive(Message)]
@@ -64,7 +68,7 @@ pub struct Project {
 
 impl Checkouts {
     /// Prepares checkouts on the thread whose runtime this is. `run` is the folder of this run of the server; the
-    /// cached repositories may take `budget` bytes.
+    /// cached repositories may take `budget` bytes; `config` is a file of settings for git.
     ///
     /// # Errors
     /// When the cache can't be made.
@@ -72,11 +76,11 @@ impl Checkouts {
         dir: CacheDir,
         run: &Path,
         budget: u64,
-        mirrors: Mirrors,
+        (mirrors, config): (Mirrors, Option<&Path>),
         limits: Limits,
         runtime: Handle,
     ) -> io::Result<Self> {
-        let git = Arc::new(Git::new(run)?);
+        let git = Arc::new(Git::new(run, config));
         let cache = Arc::new(Cache::open(dir, budget, Arc::clone(&git), limits)?);
         let finder = Arc::new(Finder::new(Arc::clone(&git), Arc::clone(&cache), mirrors, limits));
         let keeper = AbortOnDropHandle::new(runtime.spawn(Arc::clone(&cache).keep_within_budget()));
@@ -115,7 +119,7 @@ impl Checkouts {
             }
             done => done,
         };
-        let (revision, Copied { pointers, has_lfs, world: file, place }) = checked_out?;
+        let (revision, Copied { pointers, has_lfs, world: file, place, .. }) = checked_out?;
         let file = file?;
         let warning = (!pointers.is_empty()).then(|| lfs::warning(pointers.len(), has_lfs));
         progress("checkout done".to_owned());
@@ -151,19 +155,22 @@ impl Checkouts {
         progress: &(impl Fn(String) + Send + Sync),
     ) -> Result<(Revision, Copied), CheckoutError> {
         let found = self.finder.find(world, progress).await?;
-        let mut needed = found.revision.needed();
-        self.copy(world, &found, needed, instance, progress).await?;
+        let mut needed = what(&found, instance).await.map_err(|error| machine(world, &error))?;
+        self.copy(world, &found, &needed, instance, progress).await?;
         let mut copied = look(world, instance, &found.revision).await?;
-        if needed != ALL && matches!(copied.world, Err(NoWorld::Dangling(_))) {
+        if found.revision.needed() != ALL && matches!(copied.world, Err(NoWorld::Dangling(_))) {
             // The world is a link itself, which may lead anywhere in its repository.
             self.finder.check_whole(world, &found).await?;
-            needed = ALL;
-            self.copy(world, &found, needed, instance, progress).await?;
+            needed = What::Path(ALL);
+            self.copy(world, &found, &needed, instance, progress).await?;
             copied = look(world, instance, &found.revision).await?;
         }
         if copied.has_lfs && !copied.pointers.is_empty() {
-            self.load_large_files(world, &found, needed, instance, &copied.pointers, progress).await?;
+            self.load_large_files(world, &found, &needed, instance, &copied.pointers, progress).await?;
             copied = look(world, instance, &found.revision).await?;
+        }
+        if copied.size > self.limits.size {
+            return Err(too_large("The project".to_owned(), self.limits.size));
         }
         Ok((found.revision.clone(), copied))
     }
@@ -173,11 +180,12 @@ impl Checkouts {
         &self,
         world: &ProjectUrl,
         found: &Found,
-        needed: &str,
+        needed: &What<'_>,
         instance: &InstanceDir,
         progress: &(impl Fn(String) + Send + Sync),
     ) -> Result<(), CheckoutError> {
         let _turn = self.copies.acquire().await.map_err(|error| machine(world, &io::Error::other(error)))?;
+        let tree = instance.project();
         progress(format!("checking {} out", found.revision.name));
         let call = copy_call(&found.repository, &found.revision, instance, needed);
         let told = |line: &str| {
@@ -185,7 +193,26 @@ impl Checkouts {
                 progress(line.to_owned());
             }
         };
-        self.git.run(call, told).await.map(drop).map_err(|source| git_failed(world, source))
+        let mut is_too_large = false;
+        let end = async {
+            while blocking({
+                let tree = tree.clone();
+                move || Ok(size_of(&tree))
+            })
+            .await
+            .unwrap_or(0)
+                <= self.limits.size
+            {
+                actix_rt::time::sleep(BETWEEN_LOOKS).await;
+            }
+            is_too_large = true;
+        };
+        let copied = self.git.run_until(end, call, told).await;
+        if is_too_large {
+            // What is in the commit may be smaller than what git's attributes make of it.
+            return Err(too_large("The project".to_owned(), self.limits.size));
+        }
+        copied.map(drop).map_err(|source| git_failed(world, source))
     }
 
     /// Loads the files that the project keeps in Git LFS. Those that can't be had stay pointers.
@@ -193,7 +220,7 @@ impl Checkouts {
         &self,
         world: &ProjectUrl,
         found: &Found,
-        needed: &str,
+        needed: &What<'_>,
         instance: &InstanceDir,
         pointers: &[Pointer],
         progress: &(impl Fn(String) + Send + Sync),
@@ -242,7 +269,7 @@ impl Checkouts {
         let Some(repository) = self.finder.file(url, revision, path).await? else {
             return Ok(false);
         };
-        let call = copy_call(&repository, revision, instance, path);
+        let call = copy_call(&repository, revision, instance, &What::Path(path));
         self.git.run(call, |_| ()).await.map_err(|source| git_failed(url, source))?;
         Ok(true)
     }

@@ -1,12 +1,15 @@
 //! A client's own copy of a project: how git writes it, and what is in it.
 
 use std::ffi::OsString;
+use std::path::PathBuf;
 
+use super::disk::size_of;
 use super::error::{CheckoutError, machine};
+use super::finder::Found;
 use super::git::Call;
 use super::lfs::{self, Pointer};
 use super::repository::Repository;
-use super::revision::Revision;
+use super::revision::{ALL, Revision};
 use super::world_file::{self, NoWorld, WorldFile};
 use crate::shared::domain::ProjectUrl;
 use crate::simulation::process::InstanceDir;
@@ -14,6 +17,8 @@ use crate::simulation::process::InstanceDir;
 /// What is in a copy.
 #[derive(Debug)]
 pub struct Copied {
+    /// How many bytes there are.
+    pub size: u64,
     /// Files that only point to larger ones.
     pub pointers: Vec<Pointer>,
     /// Whether Git LFS is installed; not looked for where there are no such files.
@@ -24,19 +29,52 @@ pub struct Copied {
     pub place: Option<String>,
 }
 
+/// What to copy of a commit.
+#[derive(Debug, Clone)]
+pub enum What<'path> {
+    /// The file or folder at this path of the repository.
+    Path(&'path str),
+    /// The paths in this file, each ended by a zero byte.
+    Listed(PathBuf),
+}
+
+/// Says what is copied of a commit for a client: the project's folder, and the files of the folders above it.
+///
+/// # Errors
+/// When the list of these files can't be written.
+pub async fn what<'found>(found: &'found Found, instance: &InstanceDir) -> std::io::Result<What<'found>> {
+    let needed = found.revision.needed();
+    if found.above.is_empty() || needed == ALL {
+        return Ok(What::Path(needed));
+    }
+    let file = instance.path().join("paths");
+    let list = [needed.as_bytes(), b"\0", &found.above].concat();
+    tokio::fs::write(&file, list).await?;
+    Ok(What::Listed(file))
+}
+
 /// Writes a part of a commit into a client's folder, which has an index of its own.
 #[must_use]
 pub fn copy_call<'call>(
     repository: &'call Repository,
     revision: &Revision,
     instance: &InstanceDir,
-    path: &str,
+    what: &What<'_>,
 ) -> Call<'call> {
     let mut work_tree = OsString::from("--work-tree=");
     work_tree.push(instance.project());
     let reference = revision.reference();
-    let rest = ["checkout", "--force", "--progress", &reference, "--", path].map(OsString::from);
-    let mut call = repository.call(std::iter::once(work_tree).chain(rest).collect());
+    let mut arguments = vec![work_tree];
+    arguments.extend(["checkout", "--force", "--progress"].map(OsString::from));
+    match what {
+        What::Path(path) => arguments.extend([&reference, "--", path].map(OsString::from)),
+        What::Listed(file) => {
+            let mut list = OsString::from("--pathspec-from-file=");
+            list.push(file);
+            arguments.extend([list, "--pathspec-file-nul".into(), reference.clone().into()]);
+        }
+    }
+    let mut call = repository.call(arguments);
     call.environment.push(("GIT_INDEX_FILE".into(), instance.path().join("index").into()));
     call.environment.push(("GIT_ATTR_SOURCE".into(), reference.into()));
     call
@@ -50,6 +88,7 @@ pub async fn look(world: &ProjectUrl, instance: &InstanceDir, revision: &Revisio
     let root = instance.project();
     let path = root.join(revision.world_path(world));
     let seen = actix_rt::task::spawn_blocking(move || {
+        let size = size_of(&root);
         let project = world_file::project_of(&root, &path).map(|project| lfs::pointers(&project));
         let pointers = project.unwrap_or_default();
         let has_lfs = !pointers.is_empty() && lfs::is_installed();
@@ -58,7 +97,7 @@ pub async fn look(world: &ProjectUrl, instance: &InstanceDir, revision: &Revisio
             let project = world.path.ancestors().nth(2)?;
             Some(project.strip_prefix(root.canonicalize().ok()?).ok()?.to_str()?.to_owned())
         });
-        Copied { pointers, has_lfs, world, place }
+        Copied { size, pointers, has_lfs, world, place }
     });
     seen.await.map_err(|error| machine(world, &error.into()))
 }

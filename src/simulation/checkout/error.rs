@@ -19,6 +19,9 @@ pub enum CheckoutError {
     /// The repository is not there.
     #[error("{0} does not exist or is not public")]
     NoRepository(String),
+    /// Its forge sends elsewhere.
+    #[error("{0} has moved. This simulation server follows no forge elsewhere: give the URL of where it is now")]
+    Moved(String),
     /// The reference is not there.
     #[error("{repository} has no branch, tag or commit called {reference:?}")]
     NoReference {
@@ -98,6 +101,7 @@ pub fn git_failed(world: &ProjectUrl, source: GitError) -> CheckoutError {
     match source.cause() {
         Cause::NoRepository => CheckoutError::NoRepository(repository),
         Cause::NoCommit => no_reference(world),
+        Cause::Moved => CheckoutError::Moved(repository),
         Cause::Damaged => CheckoutError::Damaged { repository, source },
         Cause::Other => CheckoutError::Git { repository, source },
     }

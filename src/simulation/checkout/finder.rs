@@ -4,7 +4,7 @@ use std::ffi::OsString;
 use std::sync::Arc;
 use std::time::Instant;
 
-use tokio::sync::watch;
+use tokio::sync::{Semaphore, watch};
 
 use super::cache::Cache;
 use super::error::{CheckoutError, fetch_failed, git_failed, machine, no_reference, too_large};
@@ -15,6 +15,7 @@ use super::listing::Listing;
 use super::mirrors::{Mirrors, Remote};
 use super::repository::Repository;
 use super::revision::{self, Revision, Voucher};
+use super::search::Search;
 use super::single_flight::SingleFlight;
 use super::world_file::NoWorld;
 use crate::shared::domain::ProjectUrl;
@@ -26,8 +27,13 @@ pub struct Finder {
     cache: Arc<Cache>,
     mirrors: Mirrors,
     limits: Limits,
+    /// How many answers are read at a time.
+    answers: Semaphore,
     searches: SingleFlight<ProjectUrl, Result<Arc<Found>, CheckoutError>>,
 }
+
+/// How many answers of git about commits are read at a time.
+const ANSWERS: usize = 4;
 
 /// A world's commit in the cache.
 #[derive(Debug)]
@@ -36,14 +42,8 @@ pub struct Found {
     pub repository: Arc<Repository>,
     /// What it is.
     pub revision: Revision,
-}
-
-/// What a world is looked for with.
-#[derive(Clone, Copy)]
-struct Search<'job> {
-    world: &'job ProjectUrl,
-    repository: &'job Arc<Repository>,
-    progress: &'job (dyn Fn(String) + Send + Sync),
+    /// The files of the folders above the project's, each path ended by a zero byte: worlds may refer to them.
+    pub above: Vec<u8>,
 }
 
 /// What git says of a commit in the cache.
@@ -60,7 +60,7 @@ impl Finder {
     /// Finds commits by `git`, and keeps them in `cache`.
     #[must_use]
     pub fn new(git: Arc<Git>, cache: Arc<Cache>, mirrors: Mirrors, limits: Limits) -> Self {
-        Self { git, cache, mirrors, limits, searches: SingleFlight::default() }
+        Self { git, cache, mirrors, limits, answers: Semaphore::new(ANSWERS), searches: SingleFlight::default() }
     }
 
     /// Waits for a world's commit to be in the cache, together with everybody who waits for the same.
@@ -82,7 +82,7 @@ impl Finder {
         let progress = |step| drop(told.send_replace(step));
         progress(format!("looking for {}", world.repository()));
         let repository = self.repository(world).await?;
-        let search = Search { world, repository: &repository, progress: &progress };
+        let search = self.with(world, &repository, &progress);
         let mut missing = None;
         for mut revision in self.revisions(search).await? {
             let Some(mut listing) = self.list(search, &revision).await? else {
@@ -96,14 +96,28 @@ impl Finder {
                     _ => {}
                 }
             }
+            let mut above = Vec::new();
+            if revision.needed() != revision::ALL {
+                let answer = self.read(search, &revision, revision.above_arguments()).await?;
+                above = listing.add_files(&answer.unwrap_or_default());
+            }
             self.check(&listing)?;
             // Where a link leads is seen in the checkout.
             if listing.has_world || listing.has_link {
-                return Ok(Found { repository, revision });
+                return Ok(Found { repository, revision, above });
             }
             missing = Some(NoWorld::Missing(format!("{path} in {}", revision.name)));
         }
         Err(missing.map_or_else(|| no_reference(world), CheckoutError::World))
+    }
+
+    fn with<'job>(
+        &'job self,
+        world: &'job ProjectUrl,
+        repository: &'job Arc<Repository>,
+        progress: &'job (dyn Fn(String) + Send + Sync),
+    ) -> Search<'job> {
+        Search { git: &self.git, cache: &self.cache, limits: &self.limits, world, repository, progress }
     }
 
     async fn repository(&self, world: &ProjectUrl) -> Result<Arc<Repository>, CheckoutError> {
@@ -121,8 +135,12 @@ impl Finder {
             return Ok(vec![commit]);
         }
         let location = &search.repository.remote().location;
-        let answer = self.ask(search, revision::search_arguments(search.world, location)).await?;
-        Ok(revision::found(search.world, &answer))
+        let answer = search.ask(revision::search_arguments(search.world, location)).await?;
+        let found = revision::found(search.world, &answer);
+        match revision::short_hash_of(search.world) {
+            Some(short) if found.is_empty() => search.commits(&short).await,
+            _ => Ok(found),
+        }
     }
 
     /// The files of the project, or of the repository if that is needed; nothing where the revision is no folder.
@@ -136,7 +154,7 @@ impl Finder {
     /// # Errors
     /// When it is too large for that.
     pub async fn check_whole(&self, world: &ProjectUrl, found: &Found) -> Result<(), CheckoutError> {
-        let search = Search { world, repository: &found.repository, progress: &drop };
+        let search = self.with(world, &found.repository, &drop);
         let listing = self.list(search, &found.revision.whole()).await?;
         self.check(&listing.unwrap_or_default())
     }
@@ -163,7 +181,7 @@ impl Finder {
         path: &str,
     ) -> Result<Option<Arc<Repository>>, CheckoutError> {
         let repository = self.repository(world).await?;
-        let search = Search { world, repository: &repository, progress: &drop };
+        let search = self.with(world, &repository, &drop);
         let answer = self.read(search, revision, revision.entry_arguments(path)).await?;
         let is_file = answer.is_some_and(|entry| entry.starts_with(b"100") || entry.starts_with(b"120"));
         Ok(is_file.then_some(repository))
@@ -178,7 +196,7 @@ impl Finder {
     ) -> Result<Option<Vec<u8>>, CheckoutError> {
         let mut answer = self.answer(search, revision, arguments.clone()).await?;
         if matches!(answer, Answer::Absent) {
-            if revision.voucher == Voucher::Url && !self.is_accepted(search, revision).await? {
+            if revision.voucher == Voucher::Url && !search.is_accepted(revision).await? {
                 let (repository, commit) = (search.world.repository(), revision.name.clone());
                 return Err(CheckoutError::NotReachable { repository, commit });
             }
@@ -200,7 +218,12 @@ impl Finder {
         revision: &Revision,
         arguments: Vec<OsString>,
     ) -> Result<Answer, CheckoutError> {
-        match repository.read(arguments).await {
+        let answer = {
+            // Each answer may be long: few are held at a time.
+            let _turn = self.answers.acquire().await.map_err(|error| machine(world, &std::io::Error::other(error)))?;
+            repository.read(arguments).await
+        };
+        match answer {
             Ok(text) => Ok(Answer::Text(text)),
             Err(GitError::TooLong(_)) => Err(CheckoutError::TooMany(self.limits.entries())),
             Err(error @ GitError::NotStarted(_)) => Err(git_failed(world, error)),
@@ -216,63 +239,11 @@ impl Finder {
     }
 
     async fn fetch(&self, search: Search<'_>, revision: &Revision) -> Result<(), CheckoutError> {
-        let Search { world, repository, progress } = search;
+        let Search { world, repository, progress, .. } = search;
         let tell = |step: String| progress(format!("fetching {}: {step}", world.repository()));
         let fetched = repository.fetch(&revision.wish(&repository.remote().location), &tell).await;
         let what = || format!("{} (at depth 1)", world.repository());
         fetched.map_err(|error| fetch_failed(world, what, self.limits.size, error))
-    }
-
-    /// Whether a commit that is named by its hash is in a branch or tag.
-    async fn is_accepted(&self, search: Search<'_>, revision: &Revision) -> Result<bool, CheckoutError> {
-        let answer = self.ask(search, revision::tips_arguments(&search.repository.remote().location)).await?;
-        if revision::is_of_other_length(&answer, &revision.commit) {
-            return Err(no_reference(search.world));
-        }
-        Ok(revision::is_tip(&answer, &revision.commit) || self.is_in_history(search, &revision.commit).await?)
-    }
-
-    /// Whether a commit was ever part of a branch or tag. For that the history is fetched.
-    async fn is_in_history(&self, search: Search<'_>, commit: &str) -> Result<bool, CheckoutError> {
-        let Search { world, repository, progress } = search;
-        let remote = repository.remote();
-        let history = self.cache.history(remote).await.map_err(|error| machine(world, &error))?;
-        let what = || format!("The history of {}", world.repository());
-        if history.packed().await <= self.limits.size && self.is_reachable(world, &history, commit).await? {
-            return Ok(true);
-        }
-        let tell = |step: String| progress(format!("fetching the history of {}: {step}", world.repository()));
-        let fetched = history.fetch(&revision::history(&remote.location, commit), &tell).await;
-        fetched.map_err(|error| fetch_failed(world, what, self.limits.size, error))?;
-        if history.packed().await > self.limits.size {
-            return Err(too_large(what(), self.limits.size));
-        }
-        self.is_reachable(world, &history, commit).await
-    }
-
-    async fn is_reachable(
-        &self,
-        world: &ProjectUrl,
-        history: &Repository,
-        commit: &str,
-    ) -> Result<bool, CheckoutError> {
-        if history.read(revision::known_arguments(commit)).await.is_err() {
-            return Ok(false);
-        }
-        let branches = history.read(revision::reachable_arguments(commit)).await;
-        branches.map(|answer| !answer.is_empty()).map_err(|error| git_failed(world, error))
-    }
-
-    /// Asks the remote what it has.
-    async fn ask(&self, search: Search<'_>, arguments: Vec<OsString>) -> Result<String, CheckoutError> {
-        loop {
-            let answer = self.git.run(search.repository.call(arguments.clone()), |_| ());
-            match actix_rt::time::timeout(self.limits.patience(), answer).await {
-                Ok(Ok(answer)) => return Ok(String::from_utf8_lossy(&answer).into_owned()),
-                Ok(Err(source)) => return Err(git_failed(search.world, source)),
-                Err(_) => search.repository.tell_silence(),
-            }
-        }
     }
 
     /// Throws away what is cached of a world's repository, unless it was made after `since`.

@@ -17,9 +17,11 @@ use crate::simulation::process::{ExitReason, ProcessGroup, SpawnSpec};
 /// How git is run by this server.
 #[derive(Debug)]
 pub struct Git {
-    settings: PathBuf,
+    /// The file with its settings, and what belongs into it.
+    settings: (PathBuf, String),
     mark: PathBuf,
-    has_nice: bool,
+    /// Programs that start it with less priority and within a limit of memory.
+    launchers: Vec<OsString>,
 }
 
 /// One git command.
@@ -37,16 +39,24 @@ pub struct Call<'call> {
     pub environment: Vec<(OsString, OsString)>,
 }
 
-/// git reads this in place of the settings of its user and machine. Any repository may be read: a mirror may belong
-/// to somebody else, and nothing that it holds is run.
+/// git reads this in place of the settings of the user as whom the server runs, for a world's program could have written
+/// those. What the administrator has set for the machine, or in the file that `gitConfig` names, holds where this says
+/// nothing else. Any repository may be read: a mirror may belong to somebody else, and nothing that it holds is run.
+/// Redirects are not followed: they could lead to a repository, or into a network, that the configuration forbids.
 const SETTINGS: &str = "\
 [safe]
 	directory = *
 [core]
 	hooksPath = /dev/null
 	fsmonitor = false
-[credential]
-	helper =
+	packedGitLimit = 512m
+	packedGitWindowSize = 32m
+[http]
+	followRedirects = false
+[filter \"lfs\"]
+	process =
+	smudge =
+	required = false
 [fetch]
 	recurseSubmodules = false
 	unpackLimit = 1
@@ -63,28 +73,38 @@ const SETTINGS: &str = "\
 	detachedHead = false
 ";
 
+/// How much memory a git process may take, in bytes, without the files that it maps.
+const MOST_MEMORY: u64 = 2 << 30;
 /// The most that is read of a command's answer, in bytes.
 const LARGEST_ANSWER: usize = 64 * 1024 * 1024;
 
 impl Git {
-    /// Prepares git for the server whose run has this folder.
-    ///
-    /// # Errors
-    /// When its settings can't be written.
-    pub fn new(run: &Path) -> std::io::Result<Self> {
-        let git = Self { settings: run.join("gitconfig"), mark: run.to_owned(), has_nice: which("nice").is_ok() };
-        git.write_settings()?;
-        Ok(git)
+    /// Prepares git for the server whose run has this folder. `config` is the administrator's file of settings.
+    #[must_use]
+    pub fn new(run: &Path, config: Option<&Path>) -> Self {
+        let config = config.map(|file| std::path::absolute(file).unwrap_or_else(|_| file.to_owned()));
+        let quoted = |file: PathBuf| file.to_string_lossy().replace('\\', "\\\\").replace('"', "\\\"");
+        let include = config.map(|file| format!("[include]\n\tpath = \"{}\"\n", quoted(file)));
+        let settings = (run.join("gitconfig"), include.unwrap_or_default() + SETTINGS);
+        // Whoever watches over the servers, and whoever runs a simulation already, comes before a checkout.
+        let launchers = [vec!["nice".to_owned()], vec!["prlimit".to_owned(), format!("--data={MOST_MEMORY}")]];
+        let launchers = launchers.into_iter().filter(|words| words.first().is_some_and(|name| which(name).is_ok()));
+        Self { settings, mark: run.to_owned(), launchers: launchers.flatten().map(OsString::from).collect() }
     }
 
-    /// Writes git's settings where they are missing: git ignores a missing file without a word, and with it all that the
-    /// settings forbid.
-    fn write_settings(&self) -> std::io::Result<()> {
-        if self.settings.exists() {
-            return Ok(());
-        }
-        std::fs::create_dir_all(&self.mark)?;
-        std::fs::write(&self.settings, SETTINGS)
+    /// Writes the settings, unless they are there as they should be.
+    async fn write_settings(&self) -> std::io::Result<()> {
+        let (file, text) = self.settings.clone();
+        let write = move || {
+            if std::fs::read(&file).is_ok_and(|found| found == text.as_bytes()) {
+                return Ok(());
+            }
+            if let Some(folder) = file.parent() {
+                std::fs::create_dir_all(folder)?;
+            }
+            std::fs::write(&file, text)
+        };
+        actix_rt::task::spawn_blocking(write).await?
     }
 
     /// Runs a command to its end. Returns its answer. `progress` hears each line of progress.
@@ -110,7 +130,7 @@ impl Git {
         let command = call.arguments.iter().find(|argument| !argument.as_encoded_bytes().starts_with(b"-"));
         let command = command.map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
         let broken = |error: std::io::Error| GitError::NotStarted(error.to_string());
-        self.write_settings().map_err(broken)?;
+        self.write_settings().await.map_err(broken)?;
         let (answer, output) = std::io::pipe().map_err(broken)?;
         let (complaints, errors) = std::io::pipe().map_err(broken)?;
         let (group, ended) = ProcessGroup::start(&self.spec(call), output.into(), errors.into()).map_err(broken)?;
@@ -134,17 +154,13 @@ impl Git {
     }
 
     fn spec(&self, call: Call<'_>) -> SpawnSpec {
-        // Whoever watches over the servers, and whoever runs a simulation already, comes before a checkout.
-        let mut command: Vec<OsString> = ["nice", "git", "--literal-pathspecs", "--git-dir"].map(OsString::from).into();
-        if !self.has_nice {
-            command.remove(0);
-        }
+        let mut command = self.launchers.clone();
+        command.extend(["git", "--literal-pathspecs", "--git-dir"].map(OsString::from));
         command.push(call.repository.into());
         command.extend(call.settings.into_iter().flat_map(|setting| ["-c".into(), setting.into()]));
         command.extend(call.arguments);
-        let fixed: [(&str, &OsStr); 7] = [
-            ("GIT_CONFIG_GLOBAL", self.settings.as_os_str()),
-            ("GIT_CONFIG_NOSYSTEM", OsStr::new("1")),
+        let fixed: [(&str, &OsStr); 6] = [
+            ("GIT_CONFIG_GLOBAL", self.settings.0.as_os_str()),
             ("GIT_ALLOW_PROTOCOL", OsStr::new(call.protocol)),
             ("GIT_TERMINAL_PROMPT", OsStr::new("0")),
             ("GIT_ASKPASS", OsStr::new("/bin/false")),

@@ -30,6 +30,8 @@ pub enum Cause {
     NoRepository,
     /// The remote does not hand out the commit.
     NoCommit,
+    /// The remote sends elsewhere.
+    Moved,
     /// The cached repository is broken.
     Damaged,
     /// Something else: the network, the remote, the machine.
@@ -40,6 +42,11 @@ pub enum Cause {
 /// that reads them. The first that is found counts. git asks for a user's name where a forge says 'not found': forges
 /// don't tell private from missing.
 const WORDS: &[(&str, Cause)] = &[
+    ("returned error: 301", Cause::Moved),
+    ("returned error: 302", Cause::Moved),
+    ("returned error: 303", Cause::Moved),
+    ("returned error: 307", Cause::Moved),
+    ("returned error: 308", Cause::Moved),
     ("could not read Username", Cause::NoRepository),
     ("not found", Cause::NoRepository),
     ("does not appear to be a git repository", Cause::NoRepository),

@@ -37,6 +37,22 @@ impl Listing {
     }
 }
 
+impl Listing {
+    /// Adds files that `git ls-tree -l -z` lists beside folders. Returns their paths, each ended by a zero byte.
+    pub fn add_files(&mut self, answer: &[u8]) -> Vec<u8> {
+        let is_file = |entry: &&[u8]| entry.starts_with(b"100") || entry.starts_with(b"120");
+        let mut paths = Vec::new();
+        for entry in answer.split(|byte| *byte == 0).filter(is_file) {
+            let listing = Self::parse(entry, "");
+            self.size = self.size.saturating_add(listing.size);
+            self.entries += 1;
+            let path = entry.splitn(2, |byte| *byte == b'\t').nth(1).unwrap_or_default();
+            paths.extend(path.iter().chain(&[0]));
+        }
+        paths
+    }
+}
+
 /// How many folders of a path are not in the one before it; git lists what is in a folder together.
 fn new_folders(before: &[u8], path: &[u8]) -> u64 {
     let common = before.iter().zip(path).take_while(|(one, other)| one == other).count();

@@ -29,6 +29,18 @@ pub struct Remote {
     pub protocol: &'static str,
 }
 
+impl Remote {
+    /// What is the same for every spelling of the repository: forges ignore case, and git's ending.
+    #[must_use]
+    pub fn key(&self) -> String {
+        if self.protocol == "file" {
+            return self.location.clone();
+        }
+        let location = self.location.to_lowercase();
+        location.trim_end_matches('/').trim_end_matches(".git").to_owned()
+    }
+}
+
 /// What must be escaped in a path segment of a URL.
 const ESCAPED: &AsciiSet =
     &CONTROLS.add(b' ').add(b'"').add(b'#').add(b'%').add(b'<').add(b'>').add(b'?').add(b'`').add(b'{').add(b'}');
@@ -119,6 +131,14 @@ mod tests {
         let world = ProjectUrl::parse("https://github.com/u/a%20b/blob/m/worlds/a.wbt").unwrap();
         let remote = Mirrors::default().remote(&world).unwrap();
         assert_eq!(remote, Remote { location: "https://github.com/u/a%20b.git".to_owned(), protocol: "https" });
+    }
+
+    #[test]
+    fn a_repository_is_the_same_in_every_spelling() {
+        let key = |location: &str, protocol| Remote { location: location.to_owned(), protocol }.key();
+        let one = key("https://github.com/lab/arm.git", "https");
+        assert_eq!(one, key("https://github.com/Lab/ARM", "https"));
+        assert_ne!(key("/srv/lab/arm", "file"), key("/srv/Lab/arm", "file"));
     }
 
     #[test]

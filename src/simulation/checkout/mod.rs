@@ -18,6 +18,7 @@ mod listing;
 mod mirrors;
 mod repository;
 mod revision;
+mod search;
 mod single_flight;
 mod world_file;
 

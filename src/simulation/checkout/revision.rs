@@ -61,6 +61,29 @@ pub fn commit_of(world: &ProjectUrl, is_any: bool) -> Option<Revision> {
     (is_hash && kind).then_some(Revision { commit, name: reference, folder, voucher, is_whole: false })
 }
 
+/// The beginning of a hash that a URL may name a commit by.
+#[must_use]
+pub fn short_hash_of(world: &ProjectUrl) -> Option<String> {
+    let Reading { reference, .. } = world.candidates().into_iter().next()?;
+    let is_hash = (7..40).contains(&reference.len()) && reference.bytes().all(|byte| byte.is_ascii_hexdigit());
+    let kind = matches!(world.kind(), RefKind::Any | RefKind::Commit);
+    (is_hash && kind).then(|| reference.to_ascii_lowercase())
+}
+
+/// Asks for the hash of the only commit that begins like this.
+#[must_use]
+pub fn expand_arguments(short: &str) -> Vec<OsString> {
+    ["rev-parse", "--quiet", "--verify", &format!("{short}^{{commit}}")].map(OsString::from).to_vec()
+}
+
+/// The commit of this hash, which a URL names by its beginning.
+#[must_use]
+pub fn expanded(world: &ProjectUrl, commit: String) -> Option<Revision> {
+    let Reading { reference, folder } = world.candidates().into_iter().next()?;
+    let is_it = commit.starts_with(&reference.to_ascii_lowercase());
+    is_it.then_some(Revision { commit, name: reference, folder, voucher: Voucher::Url, is_whole: false })
+}
+
 /// Makes a bare repository. git before 2.29 knows only the older kind of hashes, and no name for it.
 #[must_use]
 pub fn init_arguments(is_sha256: bool) -> Vec<OsString> {
@@ -190,6 +213,14 @@ impl Revision {
     #[must_use]
     pub fn entry_arguments(&self, path: &str) -> Vec<OsString> {
         ["ls-tree", "-z", "--full-tree", &self.reference(), "--", path].map(OsString::from).to_vec()
+    }
+
+    /// Lists what is directly in the folders above the project's.
+    #[must_use]
+    pub fn above_arguments(&self) -> Vec<OsString> {
+        let above = self.folder.match_indices('/').filter_map(|(end, _)| Some(format!("{}/", self.folder.get(..end)?)));
+        let fixed = ["ls-tree", "-l", "-z", "--full-tree", &self.reference(), "--", "."].map(OsString::from);
+        fixed.into_iter().chain(above.map(OsString::from)).collect()
     }
 
     /// Lists the files of the project, or of the repository.

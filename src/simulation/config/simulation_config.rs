@@ -110,6 +110,10 @@ pub struct SimulationConfig {
     /// Where repositories are fetched from in place of their URL: {URL prefix: replacement}. Default: none.
     #[serde(default)]
     pub git_mirrors: Mirrors,
+    /// Settings for git, in git's own form: a proxy, certificates, credentials. They add to those of the machine.
+    /// Default: none.
+    #[serde(default)]
+    pub git_config: Option<ExpandedPath>,
     /// Folder of cached repositories and of the projects of running simulations. Default: `cache`.
     #[serde(default = "default_cache_dir", deserialize_with = "folder")]
     pub cache_dir: ExpandedPath,

@@ -1,0 +1,113 @@
+//! What a search for a commit asks the remote, and the history of its branches and tags.
+
+use std::ffi::OsString;
+use std::sync::Arc;
+
+use super::cache::Cache;
+use super::error::{CheckoutError, fetch_failed, git_failed, machine, no_reference, too_large};
+use super::git::Git;
+use super::limits::Limits;
+use super::repository::Repository;
+use super::revision::{self, Revision};
+use crate::shared::domain::ProjectUrl;
+
+/// What a world is looked for with.
+#[derive(Clone, Copy)]
+pub struct Search<'job> {
+    /// Runs git.
+    pub git: &'job Git,
+    /// Where histories are kept.
+    pub cache: &'job Cache,
+    /// What may be fetched.
+    pub limits: &'job Limits,
+    /// What is looked for.
+    pub world: &'job ProjectUrl,
+    /// Where its commits are kept.
+    pub repository: &'job Arc<Repository>,
+    /// Hears each step in words.
+    pub progress: &'job (dyn Fn(String) + Send + Sync),
+}
+
+impl Search<'_> {
+    /// The commit of a branch or tag whose hash begins like this, unless several do.
+    ///
+    /// # Errors
+    /// Why the history can't be had.
+    pub async fn commits(self, short: &str) -> Result<Vec<Revision>, CheckoutError> {
+        let history = self.history().await?;
+        let arguments = revision::expand_arguments(short);
+        let mut hash = history.read(arguments.clone()).await;
+        if hash.is_err() {
+            let tips = self.ask(revision::tips_arguments(&history.remote().location)).await?;
+            let tip = tips.split('\t').next().unwrap_or_default();
+            self.fetch_history(&history, tip).await?;
+            hash = history.read(arguments).await;
+        }
+        let hash = hash.map(|hash| String::from_utf8_lossy(&hash).trim().to_owned());
+        Ok(hash.ok().and_then(|hash| revision::expanded(self.world, hash)).into_iter().collect())
+    }
+
+    async fn history(self) -> Result<Arc<Repository>, CheckoutError> {
+        let history = self.cache.history(self.repository.remote()).await;
+        history.map_err(|error| machine(self.world, &error))
+    }
+
+    /// Fetches the commits of all branches and tags; `commit` tells which kind of hashes there are.
+    async fn fetch_history(self, history: &Arc<Repository>, commit: &str) -> Result<(), CheckoutError> {
+        let Search { world, progress, .. } = self;
+        let what = || format!("The history of {}", world.repository());
+        let tell = |step: String| progress(format!("fetching the history of {}: {step}", world.repository()));
+        let fetched = history.fetch(&revision::history(&history.remote().location, commit), &tell).await;
+        fetched.map_err(|error| fetch_failed(world, what, self.limits.size, error))?;
+        if history.packed().await > self.limits.size {
+            return Err(too_large(what(), self.limits.size));
+        }
+        Ok(())
+    }
+
+    /// Whether a commit that is named by its hash is in a branch or tag.
+    ///
+    /// # Errors
+    /// Why that can't be found out.
+    pub async fn is_accepted(self, revision: &Revision) -> Result<bool, CheckoutError> {
+        let answer = self.ask(revision::tips_arguments(&self.repository.remote().location)).await?;
+        if revision::is_of_other_length(&answer, &revision.commit) {
+            return Err(no_reference(self.world));
+        }
+        Ok(revision::is_tip(&answer, &revision.commit) || self.is_in_history(&revision.commit).await?)
+    }
+
+    /// Whether a commit was ever part of a branch or tag. For that the history is fetched.
+    async fn is_in_history(self, commit: &str) -> Result<bool, CheckoutError> {
+        let history = self.history().await?;
+        let is_small = history.packed().await <= self.limits.size;
+        if is_small && self.is_reachable(&history, commit).await? {
+            return Ok(true);
+        }
+        self.fetch_history(&history, commit).await?;
+        self.is_reachable(&history, commit).await
+    }
+
+    async fn is_reachable(self, history: &Repository, commit: &str) -> Result<bool, CheckoutError> {
+        if history.read(revision::known_arguments(commit)).await.is_err() {
+            return Ok(false);
+        }
+        let branches = history.read(revision::reachable_arguments(commit)).await;
+        branches.map(|answer| !answer.is_empty()).map_err(|error| git_failed(self.world, error))
+    }
+
+    /// Asks the remote what it has.
+    ///
+    /// # Errors
+    /// When it can't answer.
+    pub async fn ask(self, arguments: Vec<OsString>) -> Result<String, CheckoutError> {
+        loop {
+            let answer = self.git.run(self.repository.call(arguments.clone()), |_| ());
+            match actix_rt::time::timeout(self.limits.patience(), answer).await {
+                Ok(Ok(answer)) => return Ok(String::from_utf8_lossy(&answer).into_owned()),
+                Ok(Err(source)) => return Err(git_failed(self.world, source)),
+                Err(_) => self.repository.tell_silence(),
+            }
+        }
+    }
+}
