@@ -1,6 +1,6 @@
 //! A fleet for interactive robot simulations in the browser: a session server and simulation servers.
 //!
-//! This page is the map. Each folder is a room: its `mod.rs` says what belongs together there and hands out a few names.
+//! They are the successors of two Python servers, which comments call the original. This page is the map. Each folder is a room: its `mod.rs` says what belongs together there and hands out a few names.
 //!
 //! | room | holds |
 //! |---|---|
@@ -19,8 +19,10 @@
 //! | [`simulation::client`] | one web client, the life of its simulation |
 //! | `simulation::web` | paths and pages of the simulation server |
 //!
-//! Beside the folders of a server are its `app` (start and end), `config` (every key), `state` (what its paths share), and
-//! in `simulation` the wire [`protocol`](simulation::protocol) and the [`places`](simulation::places).
+//! Each server also has a folder `config` (every key), its `app` (start and end) and its `state` (what its paths share). Files
+//! of `simulation` are the wire [`protocol`](simulation::protocol), the [`places`](simulation::places) that clients wait for,
+//! the `snapshot` of them, the `announcer` (key `notify`), `preflight` (`--check`) and `readiness` (`/health`).
+//! The programs are in `src/bin`.
 //! Imports point down only, in the order that `tests/project/layering.rs` lists. `session` and `simulation` never see each
 //! other. A child never names its parent: it is given a `Recipient` of its events, which are defined in the child's file.
 //!

@@ -14,7 +14,7 @@ pub enum Change {
     Stage(Stage),
     /// Its world was made for this version of Webots.
     Version(String),
-    /// It streams on this port, and its output is kept in this file.
+    /// Its process was started: it was granted this port, and its output is kept in this file.
     Launched {
         /// When, in seconds since 1970.
         at: u64,

@@ -16,7 +16,7 @@ pub struct Timing {
     /// Between two pings of a client. Default: 20.
     #[serde(with = "seconds")]
     pub ping: Duration,
-    /// A client that has sent nothing for so long is disconnected. Default: 60.
+    /// A client that has answered no ping for so long is disconnected. Default: 60.
     #[serde(with = "seconds")]
     pub silence: Duration,
     /// How long a client that was sent to a simulation server is counted there if it never arrives. Default: 15.

@@ -179,7 +179,7 @@ fn shown(text: &str) -> String {
     short
 }
 
-/// A time as the log writes it: `2026-03-01 14:05:09 UTC`.
+/// A time for people, to the second: `2026-03-01 14:05:09 UTC`.
 fn time(at: SystemTime) -> String {
     jiff::Timestamp::try_from(at)
         .map_or_else(|_| "unknown".to_owned(), |time| time.strftime("%Y-%m-%d %H:%M:%S UTC").to_string())

@@ -108,7 +108,7 @@ impl Cache {
 
     /// Removes repositories until the others fit into the budget. Blocks.
     fn shrink(&self) {
-        // Whoever leaves from now on has the cache looked at once more.
+        // A repository that is released from now on triggers another pass.
         self.growth.set_over_budget(true);
         let mut all: Vec<(SystemTime, u64, PathBuf)> = Vec::new();
         for entry in std::fs::read_dir(&self.folder).into_iter().flatten().flatten() {

@@ -5,7 +5,7 @@ use std::time::Duration;
 /// What a checkout may take.
 #[derive(Debug, Clone, Copy)]
 pub struct Limits {
-    /// For all of it.
+    /// Time limit of a whole checkout: the fetch, the copy and large files.
     pub time: Duration,
     /// In bytes: what is fetched, and what is checked out.
     pub size: u64,
@@ -19,8 +19,8 @@ const ENTRY: u64 = 4096;
 const FEW_ENTRIES: u64 = 10_000;
 
 impl Limits {
-    /// How long a remote may be silent before it is asked anew: often it is but a connection that has died. Packing a
-    /// cached repository holds a fetch up for no longer either.
+    /// How long a remote may be silent before it is asked anew, for often only the connection has died. Packing a cached
+    /// repository holds a fetch up for no longer either.
     #[must_use]
     pub fn patience(&self) -> Duration {
         self.time / 4

@@ -181,7 +181,8 @@ pub fn found(world: &ProjectUrl, answer: &str) -> Vec<Revision> {
 }
 
 impl Revision {
-    /// Its name in the cached repository. What was accepted because any commit is may not be taken for more later.
+    /// Its reference in the cached repository. A commit that was fetched only because `anyCommit` is set has a name apart, so that it does not
+    /// run once that is off.
     #[must_use]
     pub fn reference(&self) -> String {
         let kind = if self.voucher == Voucher::AnyCommit { "any" } else { "fleet" };

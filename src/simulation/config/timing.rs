@@ -25,7 +25,7 @@ pub struct Timing {
     /// Between two pings of a client. Default: 20.
     #[serde(with = "seconds")]
     pub ping: Duration,
-    /// A client that has sent nothing for so long is disconnected, and its simulation ends. Default: 60.
+    /// A client that has answered no ping for so long is disconnected, and its simulation ends. Default: 60.
     #[serde(with = "seconds")]
     pub silence: Duration,
     /// How long open connections and simulations may take to end when the server stops. Default: 9.
