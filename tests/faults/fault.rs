@@ -51,7 +51,7 @@ pub fn all() -> Vec<Fault> {
         "a guardian is killed": async |fleet, random| signal(fleet, random, " guard ", Signal::SIGKILL).await;
         "a git is killed": async |fleet, random| signal(fleet, random, "git --literal-pathspecs", Signal::SIGKILL).await;
         "the disk is full": fill_disk;
-        "the cache can't be written": async |fleet, _| cover(fleet, "cache").await;
+        "the cached repositories can't be written": async |fleet, _| cover(fleet, "cache/git").await;
         "the log can't be written": async |fleet, _| cover(fleet, "log").await;
         "no more files can be opened": no_files;
         "a port is taken": take_port;
