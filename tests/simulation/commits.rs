@@ -37,9 +37,11 @@ async fn any_commit_of_a_branch_or_tag_runs() {
         assert!(told.contains("opened [first]"), "{told}");
         assert!(run(&"0".repeat(9)).await.contains("has no branch, tag or commit called"));
         // What is known is not asked for again.
-        let calls = wrapper.calls().len();
+        // A fetch is followed by gc, which nobody waits for.
+        let calls = || wrapper.calls().iter().filter(|call| !call.contains(" gc ")).count();
+        let before = calls();
         assert!(run(&commits[0]).await.contains("opened [first]"));
-        assert_eq!(wrapper.calls().len(), calls + 2, "ls-tree and checkout: {:#?}", wrapper.calls());
+        assert_eq!(calls(), before + 2, "ls-tree and checkout: {:#?}", wrapper.calls());
         // A newer commit than the history has.
         let next = commit("main", can_filter);
         commit("main", "newest");
