@@ -130,6 +130,19 @@ async fn a_server_that_is_killed_leaves_nothing_in_any_state() {
 }
 
 #[actix_rt::test]
+async fn what_a_server_was_starting_as_it_was_killed_is_ended_too() {
+    let mut scene = Scene::new(State::CheckingOut, quick).await;
+    let mark = instance_folders(scene.folder.path()).remove(0).canonicalize().unwrap();
+    // On a busy machine it takes a while from the fork to the program, and only the program carries the mark.
+    let script = "sleep 0.2; WEBOTS_FLEET_INSTANCE=$0 exec sleep 1000";
+    let mut late = tokio::process::Command::new("bash").args(["-c", script]).arg(mark).spawn().unwrap();
+    scene.server.signal(Signal::SIGKILL);
+    scene.server.ended().await;
+    let end = actix_rt::time::timeout(crate::support::SOON, late.wait()).await.expect("it is ended").unwrap();
+    assert!(!end.success(), "it was killed");
+}
+
+#[actix_rt::test]
 async fn what_a_killed_server_has_left_is_removed_at_the_next_start() {
     let mut scene = Scene::new(State::CheckingOut, quick).await;
     // The guardian, which does it otherwise, is killed too.

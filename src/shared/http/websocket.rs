@@ -53,6 +53,9 @@ pub enum MessageError {
     /// The message is longer than [`MAX_MESSAGE`].
     #[error("Wrong message: it is longer than {} KiB", MAX_MESSAGE / 1024)]
     TooLarge,
+    /// The client sends faster than its messages are read.
+    #[error("Too many messages: more than {} KiB wait to be read", MAX_BACKLOG / 1024)]
+    TooMany,
     /// The message is binary, or no UTF-8.
     #[error("Wrong message: allowed are short texts")]
     NotText,
@@ -67,6 +70,7 @@ impl MessageError {
     pub fn code(&self) -> CloseCode {
         match self {
             Self::TooLarge => CloseCode::Size,
+            Self::TooMany => CloseCode::Policy,
             Self::NotText => CloseCode::Unsupported,
             Self::Protocol(_) => CloseCode::Protocol,
         }
@@ -77,7 +81,7 @@ impl MessageReader {
     /// Reads what actix hands over. Returns nothing while a message is incomplete.
     ///
     /// # Errors
-    /// When the message is too large, is no text, or breaks the rules of WebSockets.
+    /// When the message is too large, is no text, breaks the rules of WebSockets, or too many wait.
     pub fn read(&mut self, message: Result<Message, ProtocolError>) -> Result<Option<ClientMessage>, MessageError> {
         self.count(&message);
         match message {
@@ -94,7 +98,7 @@ impl MessageReader {
             Ok(Message::Continuation(Item::Continue(piece))) => self.join(&piece, false),
             Ok(Message::Continuation(Item::Last(piece))) => self.join(&piece, true),
             Err(ProtocolError::Overflow) => Err(MessageError::TooLarge),
-            Err(_) if self.backlog.load(Ordering::Relaxed) > MAX_BACKLOG => Err(MessageError::TooLarge),
+            Err(_) if self.backlog.load(Ordering::Relaxed) > MAX_BACKLOG => Err(MessageError::TooMany),
             // The connection broke without a close frame, as with every closed laptop.
             Err(ProtocolError::Io(_)) => Ok(Some(ClientMessage::Close(None))),
             Err(error) => Err(MessageError::Protocol(error)),

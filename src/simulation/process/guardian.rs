@@ -10,12 +10,17 @@
 use std::io::PipeWriter;
 use std::path::{Path, PathBuf};
 use std::process::Stdio;
+use std::time::{Duration, Instant};
 
 use nix::sys::signal::{SigSet, Signal};
 use nix::unistd::setsid;
 
 use super::instance_dir::remove_patiently;
 use super::process_tree;
+
+/// How long the guardian looks for processes that the server was starting as it ended: a process has the mark only once
+/// it executes its program (`execve`), which takes a while on a busy machine.
+const LATECOMERS: Duration = Duration::from_millis(500);
 
 /// The command line of a guardian.
 #[derive(Debug, clap::Args)]
@@ -53,7 +58,10 @@ pub fn guard(arguments: &Arguments) -> u8 {
         return 1;
     }
     std::io::copy(&mut std::io::stdin().lock(), &mut std::io::sink()).ok();
-    process_tree::kill_marked(&arguments.folder);
+    let end = Instant::now() + LATECOMERS;
+    while Instant::now() < end {
+        process_tree::kill_marked(&arguments.folder);
+    }
     remove_patiently(&arguments.folder);
     0
 }
