@@ -4,6 +4,7 @@
 //!
 //! | room | holds |
 //! |---|---|
+//! | [`shared::text`] | texts from outside, made safe to show |
 //! | [`shared::config`] | configuration files: loading, errors, kinds of values |
 //! | [`shared::domain`] | addresses, loads, world URLs, repositories, a server's report |
 //! | [`shared::run`] | start, readiness, log, stop |

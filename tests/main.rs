@@ -15,10 +15,12 @@
 
 mod demo_simulator;
 mod deploy;
+mod inputs;
 mod mail;
 mod placement;
 mod project;
 mod proxy;
+mod rehearsal;
 mod session;
 mod simulation;
 mod support;

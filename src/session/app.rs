@@ -19,37 +19,7 @@ use crate::shared::http::Connections;
 use crate::shared::http::Live;
 use crate::shared::http::Metrics;
 use crate::shared::http::server::{self, Options};
-use crate::shared::run::{Phase, Request, Signals, notify, permanent, raise_open_files, start};
-
-/// Why the server ends with an error.
-#[derive(Debug, thiserror::Error)]
-pub enum AppError {
-    /// The port is taken, or the system does not allow it.
-    #[error("can't listen on {address}: {source}")]
-    Bind {
-        /// Host and port.
-        address: SocketAddr,
-        /// What the system says.
-        source: std::io::Error,
-    },
-    /// The limit of open files is too low.
-    #[error(
-        "{files} files may be open, which is not enough for one client; ulimit -Hn, or LimitNOFILE of systemd, allows more"
-    )]
-    NoClients {
-        /// The limit of open files.
-        files: u64,
-    },
-    /// Another error of the system.
-    #[error(transparent)]
-    System(#[from] std::io::Error),
-    /// A metric has an invalid name.
-    #[error(transparent)]
-    Metrics(#[from] prometheus::Error),
-    /// An actor that must live has stopped. This is a fault in this program.
-    #[error("{0}")]
-    ActorStopped(String),
-}
+use crate::shared::run::{AppError, Phase, Request, Signals, notify, permanent, raise_open_files, start};
 
 /// How many open files the server needs for itself: logs, threads, mail.
 const OWN_FILES: usize = 128;
@@ -68,15 +38,9 @@ pub async fn run(mut config: SessionConfig, file: PathBuf) -> Result<(), AppErro
     let files = raise_open_files(u64::MAX);
     let (connections, clients) = bound_clients(files, &config);
     if clients == 0 {
-        return Err(AppError::NoClients { files });
+        return Err(AppError::NoClients { files, needed: "one client".to_owned() });
     }
-    let options = Options {
-        workers: threads(),
-        max_per_worker: (connections / threads()).max(1),
-        silence: config.timing.silence,
-        stop: config.timing.stop,
-        trusted_proxies: config.trusted_proxies.clone(),
-    };
+    let options = options(&config, connections);
     let connections = Connections::new(connections, clients, config.max_clients_per_address);
     let (phase_sender, phase) = watch::channel(Phase::Open);
     let address = SocketAddr::new(config.bind, config.port);
@@ -98,21 +62,9 @@ pub async fn run(mut config: SessionConfig, file: PathBuf) -> Result<(), AppErro
     start::announce("session server", &http_url, &websocket_url, port);
     let registry = server.registry.clone();
     actix_rt::spawn(notify::feed_watchdog(async move || registry.send(IsAvailable).await.is_ok()));
-    let mut no_registry = std::pin::pin!(permanent::stopped("Registry", server.registry.clone()));
-    loop {
-        let request = tokio::select! {
-            request = signals.next() => request,
-            fault = &mut no_registry => return Err(AppError::ActorStopped(fault)),
-        };
-        match request {
-            Request::Stop => break,
-            Request::Reload => {
-                notify::reloading();
-                reload(&file, &server.registry);
-                notify::ready(port);
-            }
-            Request::Drain => log::info!("SIGUSR1 changes nothing here: simulation servers are drained"),
-        }
+    tokio::select! {
+        () = obey(&mut signals, &file, &server.registry, port) => {}
+        fault = permanent::stopped("Registry", server.registry.clone()) => return Err(AppError::ActorStopped(fault)),
     }
     log::info!("stopping");
     notify::stopping("stopping");
@@ -122,6 +74,32 @@ pub async fn run(mut config: SessionConfig, file: PathBuf) -> Result<(), AppErro
     drop(serving);
     log::info!("stopped");
     Ok(())
+}
+
+/// Does what signals ask for, until one asks for the end.
+async fn obey(signals: &mut Signals, file: &Path, registry: &Addr<Registry>, port: u16) {
+    loop {
+        match signals.next().await {
+            Request::Stop => return,
+            Request::Reload => {
+                notify::reloading();
+                reload(file, registry);
+                notify::ready(port);
+            }
+            Request::Drain => log::info!("SIGUSR1 changes nothing here: simulation servers are drained"),
+        }
+    }
+}
+
+/// How the HTTP server serves so many connections.
+fn options(config: &SessionConfig, connections: usize) -> Options {
+    Options {
+        workers: threads(),
+        max_per_worker: (connections / threads()).max(1),
+        silence: config.timing.silence,
+        stop: config.timing.stop,
+        trusted_proxies: config.trusted_proxies.clone(),
+    }
 }
 
 /// Returns how many connections and how many clients there may be, so that `files` open files are enough for them and the

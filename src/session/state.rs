@@ -8,12 +8,13 @@ use tokio::sync::watch;
 use super::config::{Example, Timing};
 use crate::session::fleet::Registry;
 use crate::session::fleet::{NoServer, Pick};
-use crate::shared::domain::{ClientUrls, client_text};
+use crate::shared::domain::ClientUrls;
 use crate::shared::http::Live;
 use crate::shared::http::Metrics;
 use crate::shared::http::TrustedProxies;
 use crate::shared::http::{Connections, Kind};
 use crate::shared::run::Phase;
+use crate::shared::text::client_text;
 
 /// The shared state.
 pub struct AppState {

@@ -21,54 +21,13 @@ use crate::shared::http::Connections;
 use crate::shared::http::Live;
 use crate::shared::http::Metrics;
 use crate::shared::http::server::{self, Options};
-use crate::shared::run::{Phase, Request, Signals, notify, permanent, raise_open_files, start};
+use crate::shared::run::{AppError, Phase, Request, Signals, notify, permanent, raise_open_files, start};
 use crate::simulation::checkout::{CacheDir, Checkouts, Limits};
 use crate::simulation::client::outcome;
 use crate::simulation::machine::LoadMonitor;
 use crate::simulation::machine::UsageMonitor;
 use crate::simulation::process::{Guardian, Leftovers, RunDir, process_tree};
 use crate::simulation::web::configure;
-
-/// Why the server ends with an error.
-#[derive(Debug, thiserror::Error)]
-pub enum AppError {
-    /// The port is taken, or the system does not allow it.
-    #[error("can't listen on {address}: {source}")]
-    Bind {
-        /// Host and port.
-        address: SocketAddr,
-        /// What the system says.
-        source: std::io::Error,
-    },
-    /// The cache folder can't be used.
-    #[error("the folder {} (cacheDir) can't be used: {source}", folder.display())]
-    Cache {
-        /// The folder.
-        folder: PathBuf,
-        /// What the system says.
-        source: std::io::Error,
-    },
-    /// The limit of open files is too low.
-    #[error(
-        "{files} files may be open, which is not enough for {places} places and one client; ulimit -Hn, or LimitNOFILE of \
-         systemd, allows more"
-    )]
-    NoClients {
-        /// The limit of open files.
-        files: u64,
-        /// `maxConnections`.
-        places: u16,
-    },
-    /// Another error of the system.
-    #[error(transparent)]
-    System(#[from] std::io::Error),
-    /// A metric has an invalid name.
-    #[error(transparent)]
-    Metrics(#[from] prometheus::Error),
-    /// An actor that must live has stopped. This is a fault in this program.
-    #[error("{0}")]
-    ActorStopped(String),
-}
 
 /// How often it is checked whether all simulations have ended.
 const POLL_INTERVAL: Duration = Duration::from_millis(50);
@@ -135,7 +94,7 @@ fn bound_clients(config: &SimulationConfig) -> Result<usize, AppError> {
     let rest = usize::try_from(files).unwrap_or(usize::MAX).saturating_sub(needed);
     let clients = (rest / CONNECTIONS_PER_CLIENT).min(config.max_clients);
     if clients == 0 {
-        return Err(AppError::NoClients { files, places });
+        return Err(AppError::NoClients { files, needed: format!("{places} places and one client") });
     }
     if clients < config.max_clients {
         log::warn!(
@@ -170,8 +129,8 @@ pub async fn serve(assembly: Assembly) -> Result<(), AppError> {
     let (config, port) = (&server.config, server.config.port);
     start::announce("simulation server", &config.http_url(), &format!("{}/client", config.websocket_url(port)), port);
     let places = server.places.clone();
-    let asked_for_life = places.clone();
-    actix_rt::spawn(notify::feed_watchdog(async move || asked_for_life.send(GetSnapshot).await.is_ok()));
+    let watched = places.clone();
+    actix_rt::spawn(notify::feed_watchdog(async move || watched.send(GetSnapshot).await.is_ok()));
     let mut no_places = std::pin::pin!(permanent::stopped("Places", places.clone()));
     let mut no_readings = std::pin::pin!(permanent::stopped("LoadMonitor", server.load_monitor.clone()));
     // `webots-fleet-renew` tells by this text whether a server was drained or stopped.
@@ -223,7 +182,7 @@ fn assemble(
     requests: tokio::sync::mpsc::Sender<Request>,
 ) -> Result<AppState, AppError> {
     let folder = config.cache_dir.0.clone();
-    let cache_fault = |source| AppError::Cache { folder: folder.clone(), source };
+    let cache_fault = |source| AppError::Folder { key: "cacheDir", folder: folder.clone(), source };
     let cache_dir = CacheDir::claim(&folder).map_err(cache_fault)?;
     let (run, leftovers) = RunDir::open(&folder).map_err(cache_fault)?;
     if leftovers != Leftovers::default() {

@@ -1,7 +1,8 @@
 //! Checks whether the machine has what simulations need: Webots, a display, git. `--check` prints the findings.
 
-use std::path::PathBuf;
 use std::process::Command;
+
+use which::which;
 
 use super::config::SimulationConfig;
 use crate::simulation::machine::display;
@@ -73,12 +74,14 @@ fn display(config: &SimulationConfig) -> Result<String, String> {
 }
 
 fn xvfb(config: &SimulationConfig) -> Result<String, String> {
-    match in_path("Xvfb") {
-        Some(program) => Ok(program.display().to_string()),
-        None if config.xvfb => Err("it is not there, but xvfb is true: no Webots can start. On Debian and Ubuntu the \
+    match which("Xvfb") {
+        Ok(program) => Ok(program.display().to_string()),
+        Err(_) if config.xvfb => {
+            Err("it is not there, but xvfb is true: no Webots can start. On Debian and Ubuntu the \
                                     package xvfb has it"
-            .to_owned()),
-        None => Ok("it is not there, and not needed: xvfb is false".to_owned()),
+                .to_owned())
+        }
+        Err(_) => Ok("it is not there, and not needed: xvfb is false".to_owned()),
     }
 }
 
@@ -93,9 +96,4 @@ fn version(command: &[&str], missing: &str) -> Result<String, String> {
     let output = Command::new(program).args(arguments).output().map_err(|_| missing.to_owned())?;
     let text = String::from_utf8_lossy(&output.stdout);
     text.lines().next().map(str::to_owned).ok_or_else(|| missing.to_owned())
-}
-
-fn in_path(program: &str) -> Option<PathBuf> {
-    let folders = std::env::var_os("PATH").unwrap_or_default();
-    std::env::split_paths(&folders).map(|folder| folder.join(program)).find(|file| file.is_file())
 }

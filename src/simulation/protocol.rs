@@ -20,7 +20,7 @@
 
 use serde_json::Value;
 
-use crate::shared::domain::client_text;
+use crate::shared::text::client_text;
 
 /// A request of a client.
 #[derive(Debug, Clone, PartialEq, Eq)]

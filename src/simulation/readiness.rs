@@ -74,9 +74,6 @@ pub fn webots_program(config: &SimulationConfig) -> Result<PathBuf, String> {
         return Err(format!("This simulation server does not know where Webots is installed. {how}."));
     };
     let program = std::path::absolute(&program).unwrap_or(program);
-    if program.is_file() {
-        Ok(program)
-    } else {
-        Err(format!("This simulation server has no Webots at {}. {how}.", program.display()))
-    }
+    which(&program)
+        .map_err(|_| format!("This simulation server has no Webots that it can run at {}. {how}.", program.display()))
 }

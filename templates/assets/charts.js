@@ -2,14 +2,14 @@
 
 import { Chart } from './chart.js';
 
-/** The columns of a sample that follow its time; each series has a colour of its own in its chart. */
+/** The series of each chart, by the headings of their columns; each has a colour of its own in its chart. */
 const GROUPS = [
   {
     title: 'Load and memory', unit: '%', most: 100,
-    series: [['CPU load', 3], ['CPU memory', 4], ['GPU load compute', 5], ['GPU load memory', 6], ['GPU memory', 7], ['Swap', 8], ['Disk', 9]],
+    series: ['CPU load', 'CPU memory', 'GPU load compute', 'GPU load memory', 'GPU memory', 'Swap', 'Disk'],
   },
-  { title: 'Simulations', unit: '', whole: true, least: 4, series: [['Webots running', 1], ['Webots idle', 2]] },
-  { title: 'Network', unit: 'MB/s', least: 0.1, series: [['Network sent', 10], ['Network received', 11]] },
+  { title: 'Simulations', unit: '', whole: true, least: 4, series: ['Webots running', 'Webots idle'] },
+  { title: 'Network', unit: 'MB/s', least: 0.1, series: ['Network sent', 'Network received'] },
 ];
 const KEPT = 600;
 const STORE = 'hidden-series';
@@ -27,10 +27,13 @@ export class Charts {
   #charts = [];
   #hidden = hiddenSeries();
 
-  /** Puts the charts into an element. */
+  /** Puts the charts into an element that names the columns of a sample. */
   constructor(root) {
-    for (const group of GROUPS)
+    const columns = root.dataset.columns.split(', ');
+    for (const { series, ...group } of GROUPS) {
+      group.series = series.map((name) => [name, columns.indexOf(name)]);
       this.#charts.push(new Chart(root, group, this.#hidden, () => this.#switched(), (time) => this.#point(time)));
+    }
   }
 
   #switched() {

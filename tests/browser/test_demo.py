@@ -28,7 +28,7 @@ class TheDemo(BrowserTest):
         fleet_monitor.tab.evaluate("window.same = true")
         machine_monitor = self.open(f"http://{self.fleet.simulation}/monitor")
         rows = machine_monitor.tab.locator("#simulations tr")
-        expect(machine_monitor.tab.get_by_text("Nobody is here.")).to_be_visible()
+        expect(machine_monitor.tab.get_by_text("No simulations.")).to_be_visible()
 
         page = self.open(f"http://{self.fleet.session}/viewer")
         expect(page.tab.locator("#light.on")).to_contain_text("Available")

@@ -227,7 +227,9 @@ fn configure(forge: &Forge, webots: &Webots) -> Builder {
 fn session_builder(addresses: &[String], port: u16, folder: &std::path::Path) -> Builder {
     let folder = folder.join("session");
     std::fs::create_dir_all(&folder).unwrap();
-    session_server(addresses).folder(&folder).port(port).set("timing", json!({"answer": 1}))
+    let builder = session_server(addresses).folder(&folder).port(port).set("timing", json!({"answer": 1}));
+    // What else runs on this machine must not close the fleet.
+    builder.set("loadThreshold", 1000)
 }
 
 /// Where the session server finds each simulation server.

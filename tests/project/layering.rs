@@ -9,7 +9,7 @@ const LONGEST_FILE: usize = 300;
 
 /// The rooms of the library from the bottom to the top: files and folders. Each may name those before it, and what is in
 /// it. `session` and `simulation` don't see each other.
-const SHARED: [&str; 4] = ["shared::config", "shared::domain", "shared::run", "shared::http"];
+const SHARED: [&str; 5] = ["shared::text", "shared::config", "shared::domain", "shared::run", "shared::http"];
 const SESSION: [&str; 8] = [
     "session::mail_address",
     "session::placement",

@@ -102,7 +102,10 @@ async fn nothing_piles_up_for_a_client_that_asks_without_reading() {
     until("it is forgotten", async || clients_of(&session).await == 0).await;
     // Which bound is met first depends on how much the system hands over at once.
     let log = session.log();
-    assert!(log.contains("asks too much between two pings") || log.contains("more than 128 KiB wait to be read"), "{log}");
+    assert!(
+        log.contains("asks too much between two pings") || log.contains("more than 128 KiB wait to be read"),
+        "{log}"
+    );
 }
 
 #[actix_rt::test]

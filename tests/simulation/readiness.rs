@@ -33,10 +33,10 @@ async fn a_server_without_webots_says_so_and_is_not_offered_until_there_is_one()
     until("it does not work", async || !works(&session).await).await;
     assert_eq!(http::get(&session.url("/request")).await.text(), "0");
     let (status, text) = health(&server).await;
-    assert!(status == 503 && text.contains("has no Webots at"), "{status} {text}");
+    assert!(status == 503 && text.contains("has no Webots that it can run at"), "{status} {text}");
     assert_eq!(http::get(&server.url("/load")).await.text(), "100");
     let page: Value = http::get(&server.url("/status")).await.json();
-    assert!(page["problem"].as_str().unwrap().contains("has no Webots at"), "{page}");
+    assert!(page["problem"].as_str().unwrap().contains("has no Webots that it can run at"), "{page}");
     assert!(server.log().contains("no simulation can be started"), "{}", server.log());
     until("the session server tells why", async || session.log().contains("can start no simulation")).await;
     std::fs::rename(&away, webots.path()).unwrap();

@@ -111,20 +111,27 @@ const LONGEST_STOP: Duration = Duration::from_millis(4500);
 /// How long a new client takes to show in the load: its start, and the five seconds of which the load is the mean.
 const SETTLING: Duration = Duration::from_secs(8);
 
-/// The keys that take effect when the configuration is read again; of `timing` only `answer` and `placement`.
-const AT_ONCE: [&str; 6] =
-    ["simulationServers", "drainedServers", "loadThreshold", "loadRefresh", "clientCost", "timing"];
+/// The keys that take effect when the configuration is read again.
+const RELOADED: [&str; 7] = [
+    "simulationServers",
+    "drainedServers",
+    "loadThreshold",
+    "loadRefresh",
+    "clientCost",
+    "timing.answer",
+    "timing.placement",
+];
 
 impl SessionConfig {
-    /// Returns this configuration as a server takes it that was started with another one. Changes that need a restart are
-    /// logged.
+    /// Returns the configuration to go on with when `new` was read while the server runs with this one. Changes that need
+    /// a restart are logged.
     #[must_use]
-    pub fn after(&self, before: &Self) -> Self {
-        let kept = |key: &&String| AT_ONCE.contains(&key.as_str()) || (*key == "port" && self.port == 0);
-        for key in changed_keys(self, before).iter().filter(|key| !kept(key)) {
+    pub fn reload(&self, new: &Self) -> Self {
+        let takes_effect = |key: &&String| RELOADED.contains(&key.as_str()) || (*key == "port" && new.port == 0);
+        for key in changed_keys(self, new).iter().filter(|key| !takes_effect(key)) {
             log::warn!("{key} has changed, which takes effect with a restart");
         }
-        Self { ssl: before.ssl, ..self.clone() }
+        Self { ssl: self.ssl, ..new.clone() }
     }
 
     /// The parameters of placement.

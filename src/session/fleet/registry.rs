@@ -267,7 +267,7 @@ impl Handler<GetStatus> for Registry {
         let servers = self.config.simulation_servers.iter().filter_map(|address| self.status_of(address));
         MessageResult(Arc::new(FleetStatus {
             available: self.available,
-            mean_load: Load::mean(self.servers.values().filter_map(|entry| entry.record.load())),
+            mean_load: Load::mean(self.servers.values().filter_map(|entry| entry.record.load())).map(Load::percent),
             servers: servers.collect(),
             changes: self.changes.recent().clone(),
         }))
@@ -279,7 +279,7 @@ impl Handler<Reconfigure> for Registry {
 
     fn handle(&mut self, Reconfigure(config): Reconfigure, ctx: &mut Self::Context) {
         let before = self.probe_settings();
-        let config = Arc::new(config.after(&self.config));
+        let config = Arc::new(self.config.reload(&config));
         self.fleet.set_policy(config.policy());
         self.config = config;
         self.apply(ctx);

@@ -24,8 +24,8 @@ use super::probe_error::ProbeError;
 use crate::shared::domain::Load;
 use crate::shared::domain::PublicAddress;
 use crate::shared::domain::ServerReport;
-use crate::shared::domain::one_line;
 use crate::shared::http::tls;
+use crate::shared::text::one_line;
 
 /// What a probe of a simulation server brought.
 #[derive(Message, Debug)]

@@ -11,7 +11,7 @@ use lettre::message::{Mailbox, MultiPart};
 
 use super::notices::{Entry, Event};
 use crate::session::config::SessionConfig;
-use crate::shared::run::one_line;
+use crate::shared::text::one_line;
 
 /// How many letters of a text from outside are shown.
 const MAX_LETTERS: usize = 500;
@@ -216,7 +216,7 @@ mod tests {
     }
 
     #[test]
-    fn the_time_is_that_of_the_log() {
+    fn the_time_is_in_utc() {
         let at = SystemTime::UNIX_EPOCH + std::time::Duration::from_secs(1_772_373_909);
         assert_eq!(time(at), "2026-03-01 14:05:09 UTC");
     }

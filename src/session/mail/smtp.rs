@@ -24,7 +24,7 @@ use super::mail_error::MailError;
 use crate::session::config::SessionConfig;
 use crate::shared::config::Secret;
 use crate::shared::http::tls;
-use crate::shared::run::one_line;
+use crate::shared::text::one_line;
 
 /// The port on which connections are usually encrypted from the first byte.
 const IMPLICIT_TLS_PORT: u16 = 465;

@@ -246,7 +246,7 @@ impl Backend {
             // The first report, or a server that was started again: its load has nothing of the past in it. Placements in
             // flight may still come.
             self.settling.clear();
-            self.fit.meet(f64::from(new.present));
+            self.fit.count_arrivals(f64::from(new.present));
             return;
         };
         let came = usize::try_from(new.arrivals - old.arrivals).unwrap_or(usize::MAX).min(self.in_flight.len());
@@ -259,7 +259,7 @@ impl Backend {
         // Those who left, less those who came without having been sent; some time since the last report.
         let came = f64::from(u32::try_from(came).unwrap_or(u32::MAX));
         let others = f64::from(new.present) - f64::from(old.present) - came;
-        self.fit.meet(came + others.max(0.0));
+        self.fit.count_arrivals(came + others.max(0.0));
         if others != 0.0 {
             let at = before + now.saturating_duration_since(before) / 2;
             self.settling.push_back(Change { at, clients: others, takes_room: true });

@@ -65,8 +65,8 @@ pub(super) struct CostFit {
     idle_weight: f64,
     /// How many clients the fit rests on.
     seen: f64,
-    /// How many more were met since the last report that counts in full.
-    met: f64,
+    /// How many more have arrived since the last report that counts in full.
+    arrived: f64,
     base: f64,
     slope: f64,
     variance: f64,
@@ -86,7 +86,7 @@ impl CostFit {
             idle_load: 0.0,
             idle_weight: BASE_TRUST,
             seen: 0.0,
-            met: 0.0,
+            arrived: 0.0,
             base: 0.0,
             slope: guess,
             variance: guess * guess,
@@ -103,9 +103,9 @@ impl CostFit {
         Estimate { log: self.slope.ln(), precision: seen / (seen * relative + VARIETY) }
     }
 
-    /// Counts clients that were seen for the first time.
-    pub(super) fn meet(&mut self, clients: f64) {
-        self.met += clients;
+    /// Counts clients that have arrived.
+    pub(super) fn count_arrivals(&mut self, clients: f64) {
+        self.arrived += clients;
     }
 
     /// Learns that the server had this `load`, in percent, while it held so many `clients`. `elapsed` is the time since
@@ -128,7 +128,7 @@ impl CostFit {
             let weight = if is_foreign(load, self.base + self.slope * clients) {
                 trust * seconds * FOREIGN_TRUST
             } else {
-                self.seen += std::mem::take(&mut self.met);
+                self.seen += std::mem::take(&mut self.arrived);
                 trust * seconds
             };
             self.weight = self.weight * fade + weight;

@@ -62,7 +62,7 @@ impl Broadcaster {
         }
     }
 
-    /// Sends the current update to a batch of clients after another.
+    /// Sends the current update to the clients, one batch after another.
     fn send_from(&mut self, id: u64, ctx: &mut Context<Self>) {
         let Some(current) = self.current else { return };
         if let Some(next) = self.clients.send_batch(id, BATCH, current) {

@@ -13,7 +13,7 @@ use crate::shared::http::assets::{self, Asset};
 use crate::shared::http::paths::{GET, READ, path};
 use crate::shared::http::{Kind, Policy, fleet_sources, html};
 
-/// What pages of this server load, besides what all pages do.
+/// Assets of this server's pages, besides those of all pages.
 const ASSETS: &[Asset] = &[
     asset!("viewer.css"),
     asset!("viewer.js"),
@@ -71,8 +71,8 @@ async fn viewer(request: HttpRequest, server: web::Data<AppState>) -> HttpRespon
     .await
 }
 
-/// Webots' own viewer is a program of somebody else, and a link to this page can name another that lies on a host of the
-/// fleet: it gets a page without anything of ours in it, whose scripts count as those of no server.
+/// Webots' own viewer is foreign code, and a link to this page can name another script on a host of the fleet. So it runs
+/// in an embedded page with an origin of its own.
 async fn webots_viewer(server: web::Data<AppState>) -> HttpResponse {
     with_status(&server, |status| {
         let mut sources = fleet(&server, status);

@@ -9,9 +9,9 @@ use crate::session::config::Example;
 use crate::session::fleet::{FleetStatus, ServerStatus, State, StateChange};
 use crate::shared::domain::ClientUrls;
 use crate::shared::domain::Instances;
-use crate::shared::domain::one_line;
 use crate::shared::http::{Row, View};
 use crate::shared::run::timestamp;
+use crate::shared::text::one_line;
 
 /// The whole page `/monitor`.
 #[derive(Template)]
@@ -24,7 +24,7 @@ struct Monitor<'view> {
     rows: &'view [Row],
 }
 
-/// Whether the fleet is well.
+/// The summary of the fleet.
 #[derive(Template)]
 #[template(path = "session/glance.html")]
 struct Glance {
@@ -56,7 +56,7 @@ struct ServerRow<'server> {
     effective_value: f64,
     instances: Option<Instances>,
     repositories: Vec<String>,
-    whose: &'static str,
+    accepted: &'static str,
     version: &'server str,
     latency: String,
     latency_value: u128,
@@ -74,7 +74,7 @@ struct Changes<'status> {
 #[derive(Template)]
 #[template(path = "session/viewer.html")]
 pub struct Viewer<'config> {
-    /// Of the server.
+    /// Version of the server.
     pub version: &'static str,
     /// Worlds to try.
     pub examples: &'config [Example],
@@ -86,7 +86,7 @@ pub struct Viewer<'config> {
 #[derive(Template)]
 #[template(path = "session/webots_viewer.html")]
 pub struct WebotsViewer {
-    /// Of the server.
+    /// Version of the server.
     pub version: &'static str,
 }
 
@@ -157,7 +157,7 @@ impl<'server> ServerRow<'server> {
         let report = server.report.as_ref().filter(|_| server.state != State::Down);
         let load = report.map(|report| report.load.percent());
         let repositories = report.map(|report| report.allowed_repositories.as_slice()).unwrap_or_default();
-        let whose = match report {
+        let accepted = match report {
             None => "–",
             Some(report) if report.docker.is_none() => "any that it does not rule out",
             Some(_) => "none",
@@ -173,7 +173,7 @@ impl<'server> ServerRow<'server> {
             effective_value: sort_value(server.effective_load),
             instances: known_instances(server),
             repositories: repositories.iter().map(|prefix| one_line(without_scheme(prefix.as_str()))).collect(),
-            whose,
+            accepted,
             version: report.map(|report| report.version.as_str()).unwrap_or_default(),
             latency: server.latency.map(milliseconds).unwrap_or_default(),
             latency_value: server.latency.unwrap_or_default().as_micros(),
@@ -192,7 +192,7 @@ fn known_instances(server: &ServerStatus) -> Option<Instances> {
     server.report.as_ref().filter(|_| server.state != State::Down)?.instances
 }
 
-/// By how much a state wants somebody's attention.
+/// The rank of a state in sorting: what needs attention comes first.
 fn rank(state: State) -> u8 {
     match state {
         State::Down => 0,
@@ -207,7 +207,7 @@ fn without_scheme(url: &str) -> &str {
     url.split_once("://").map_or(url, |(_, rest)| rest)
 }
 
-/// In steps coarse enough that a calm fleet's page has nothing to send.
+/// A latency in words, rounded so that the page of a calm fleet has nothing to send.
 fn milliseconds(time: Duration) -> String {
     match time.as_millis() {
         0 => "< 1 ms".to_owned(),
@@ -216,7 +216,7 @@ fn milliseconds(time: Duration) -> String {
     }
 }
 
-/// By which rows are sorted: what is not known comes first.
+/// The value by which rows are sorted; unknown values come first.
 fn sort_value(number: Option<f64>) -> f64 {
     number.map_or(-1.0, |number| (number * 10.0).round() / 10.0)
 }

@@ -1,4 +1,4 @@
-//! Asking the registry on behalf of a request.
+//! Asks the registry on behalf of a request.
 
 use std::time::Duration;
 

@@ -1,4 +1,4 @@
-//! What the session server tells programs of its fleet: `/status` and `/metrics`.
+//! What the session server tells other programs of its fleet: `/status` and `/metrics`.
 
 use std::time::Duration;
 

@@ -20,14 +20,14 @@ pub enum ConfigError {
         file: PathBuf,
     },
     /// The text is not JSON, or a key is missing, or the value of one is not allowed.
-    #[error("{}: {}{source}", file.display(), key.as_ref().map(|key| format!("{key}: ")).unwrap_or_default())]
+    #[error("{}: {}{problem}", file.display(), key.as_ref().map(|key| format!("{key}: ")).unwrap_or_default())]
     Malformed {
         /// The configuration file.
         file: PathBuf,
         /// The key, where the error is in the value of one.
         key: Option<String>,
         /// What was found and what is allowed.
-        source: serde_json::Error,
+        problem: String,
     },
     /// A value contradicts others.
     #[error("{}: {key}: {problem}", file.display())]

@@ -3,12 +3,15 @@
 //! An error is one line with the file, the key, what was found and what is allowed. An unknown key is a warning that
 //! names the most similar known one.
 
+use std::collections::{BTreeMap, BTreeSet};
 use std::io;
 use std::path::Path;
 
-use super::error::ConfigError;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
+
+use super::error::ConfigError;
+use crate::shared::text::one_line;
 
 /// A server's configuration.
 pub trait Configuration: DeserializeOwned + Serialize {
@@ -58,8 +61,8 @@ pub fn load<C: Configuration>(file: &Path) -> Result<LoadedConfig<C>, ConfigErro
     let parsed = serde_ignored::deserialize(tracked, |path| unknown.push(path.to_string()))
         .and_then(|config| json.end().map(|()| config));
     let mut config: C = parsed.map_err(|source| {
-        let key = Some(track.path().to_string()).filter(|key| key != "." && key != "?");
-        ConfigError::Malformed { file: file.to_owned(), key, source }
+        let key = Some(one_line(&track.path().to_string())).filter(|key| key != "." && key != "?");
+        ConfigError::Malformed { file: file.to_owned(), key, problem: one_line(&source.to_string()) }
     })?;
     let known = known_keys(&config);
     let mut warnings: Vec<String> = unknown.iter().map(|key| unknown_key(file, key, &known)).collect();
@@ -80,12 +83,26 @@ fn read_file(file: &Path) -> io::Result<String> {
     std::fs::read_to_string(file)
 }
 
-/// Returns the keys whose values differ. The key of a secret is never among them.
+/// Returns the keys whose values differ; the keys of parts as `part.key`. The key of a secret is never among them.
 pub fn changed_keys<C: Serialize>(one: &C, other: &C) -> Vec<String> {
-    let values = |config: &C| serde_json::to_value(config).unwrap_or_default();
-    let (one, other) = (values(one), values(other));
-    let keys = one.as_object().into_iter().flat_map(serde_json::Map::keys);
-    keys.filter(|key| one.get(key) != other.get(key)).cloned().collect()
+    let (one, other) = (flat_values(one), flat_values(other));
+    let keys: BTreeSet<&String> = one.keys().chain(other.keys()).collect();
+    keys.into_iter().filter(|key| one.get(*key) != other.get(*key)).cloned().collect()
+}
+
+/// Returns all values of a configuration; those of its parts under `part.key`.
+fn flat_values<C: Serialize>(config: &C) -> BTreeMap<String, serde_json::Value> {
+    let values = serde_json::to_value(config).unwrap_or_default();
+    let mut flat = BTreeMap::new();
+    for (key, value) in values.as_object().into_iter().flatten() {
+        match value {
+            serde_json::Value::Object(part) => {
+                flat.extend(part.iter().map(|(inner, value)| (format!("{key}.{inner}"), value.clone())));
+            }
+            value => drop(flat.insert(key.clone(), value.clone())),
+        }
+    }
+    flat
 }
 
 /// Returns every key of a configuration; the keys of its parts as `part.key`.

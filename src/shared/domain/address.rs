@@ -14,23 +14,23 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
 pub struct PublicAddress {
-    /// Shared, for addresses name servers wherever servers are counted, and are copied all the time.
+    /// Shared, because addresses are the keys of servers and are cloned often.
     host: Arc<str>,
     port: u16,
     rewritten: bool,
 }
 
-/// A text that is no public address.
+/// A text that is not a public address.
 #[derive(Debug, thiserror::Error)]
 #[error("{found:?} is no address; allowed is HOST:PORT, or HOST/PORT where a web server rewrites ports")]
 pub struct NoAddress {
     found: String,
 }
 
-/// Whether a text can stand for a host in an address.
+/// Checks that a text is a host name or an IP address.
 ///
 /// # Errors
-/// What was found, and what is allowed.
+/// When it is neither; the text says what was found, and what is allowed.
 pub fn check_host(host: &str, rewritten: bool) -> Result<(), String> {
     let address = format!("{host}{}1", if rewritten { '/' } else { ':' });
     let plain = address.parse::<PublicAddress>().is_ok();

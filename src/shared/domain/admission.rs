@@ -4,34 +4,34 @@ use super::load::Load;
 use super::project_url::ProjectUrl;
 use super::repositories::{UrlPrefix, any_covers, any_may_cover};
 
-/// The rules of a server, with lists of its own or borrowed ones.
+/// The rules of a server.
 #[derive(Debug, Clone)]
 pub struct Rules<Prefixes = Vec<UrlPrefix>> {
-    /// Whose worlds run at any load.
+    /// Repositories whose worlds run at any load.
     pub allowed: Prefixes,
-    /// Whose worlds never run.
+    /// Repositories whose worlds never run.
     pub blocked: Prefixes,
-    /// Whether worlds of others can be shut into containers.
+    /// Whether worlds of other repositories can run in containers.
     pub docker: bool,
-    /// The highest load, in percent, at which worlds of others run; 0: never.
+    /// The highest load, in percent, at which worlds of other repositories run; 0: never.
     pub share_idle_time: f64,
 }
 
 /// Why a world may not run. Its words are for the client.
 #[derive(Debug, PartialEq, thiserror::Error)]
 pub enum Refusal {
-    /// On the list of the blocked.
+    /// Its repository is blocked.
     #[error("Cannot run simulation from blocked repository: {0}")]
     Blocked(String),
-    /// Not allowed, and no way to run it safely.
+    /// Its repository is not allowed, and the server has no containers.
     #[error(
         "Docker not enabled: cannot host simulations from repositories outside of those that this simulation server allows, and {0} is not one of them"
     )]
     NotAllowed(String),
-    /// Not allowed, and the server shares nothing.
+    /// Its repository is not allowed, and the server shares no idle time.
     #[error("This simulation server is not configured to share idle time: it does not allow {0}")]
     NotShared(String),
-    /// Not allowed while the server is busy.
+    /// Its repository is allowed only while the server is less busy.
     #[error(
         "Cannot share idle time when current load is above threshold: {load:.0} % are more than {threshold} %. Try again later"
     )]

@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 #[serde(try_from = "f64", into = "f64")]
 pub struct Load(f64);
 
-/// A number that is no load.
+/// A number that is not a load.
 #[derive(Debug, PartialEq, thiserror::Error)]
 #[error("{0} is no load; a load is a finite number of percent that is not negative")]
 pub struct NoLoad(String);
@@ -17,7 +17,7 @@ pub struct NoLoad(String);
 impl Load {
     /// No load at all.
     pub const ZERO: Self = Self(0.0);
-    /// A machine that takes nobody any more.
+    /// The load of a machine that takes no more clients.
     pub const FULL: Self = Self(100.0);
 
     /// The load as a number of percent.
@@ -26,11 +26,11 @@ impl Load {
         self.0
     }
 
-    /// The mean of loads, in percent; nothing where there are none.
+    /// The mean of loads; nothing where there are none.
     #[must_use]
-    pub fn mean(loads: impl Iterator<Item = Self>) -> Option<f64> {
+    pub fn mean(loads: impl Iterator<Item = Self>) -> Option<Self> {
         let (sum, count) = loads.fold((0.0, 0_u32), |(sum, count), load| (sum + load.0, count + 1));
-        (count > 0).then(|| sum / f64::from(count))
+        (count > 0).then(|| Self(sum / f64::from(count)))
     }
 
     /// Reads the body of a `/load` answer: a plain decimal number.

@@ -7,7 +7,6 @@ mod load;
 mod project_url;
 mod report;
 mod repositories;
-mod text;
 
 pub use address::{PublicAddress, check_host};
 pub use admission::Rules;
@@ -16,4 +15,3 @@ pub use load::Load;
 pub use project_url::{NoProject, ProjectUrl, Reading, RefKind};
 pub use report::{Instances, ServerReport};
 pub use repositories::UrlPrefix;
-pub use text::{client_text, one_line};

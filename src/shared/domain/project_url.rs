@@ -1,6 +1,7 @@
 //! The URL of a world in a git repository, as a web client types it.
 
 use std::fmt;
+use std::hash::{DefaultHasher, Hash, Hasher};
 
 use percent_encoding::percent_decode_str;
 
@@ -19,6 +20,8 @@ pub struct ProjectUrl {
     reference: usize,
     /// What kind of reference the URL says it is; GitHub and GitLab don't say.
     kind: RefKind,
+    /// The hash of host and owner, see [`owner`].
+    owner: u64,
 }
 
 /// What a URL says of its reference.
@@ -43,7 +46,7 @@ pub struct Reading {
     pub folder: String,
 }
 
-/// Why a text is no world's URL. Its words are for the web client.
+/// Why a text is not a world's URL. The text is for the web client.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error(
     "Wrong Webots simulation URL: {problem}. Allowed is https://github.com/USER/REPOSITORY/blob/REFERENCE/PATH/worlds/NAME.wbt."
@@ -91,7 +94,8 @@ impl ProjectUrl {
         if inside.iter().any(|segment| segment.eq_ignore_ascii_case(".git")) {
             return Err(no_project("a folder is called .git"));
         }
-        Ok(Self { host, segments, repository, reference, kind })
+        let owner = owner(&host, &segments);
+        Ok(Self { host, segments, repository, reference, kind, owner })
     }
 
     /// The forge, in small letters, with its port where that is not 443.
@@ -116,6 +120,11 @@ impl ProjectUrl {
     #[must_use]
     pub fn repository(&self) -> String {
         format!("https://{}/{}", self.host, self.repository_segments().join("/"))
+    }
+
+    /// The hash of host and owner, see [`owner`].
+    pub(super) fn owner(&self) -> u64 {
+        self.owner
     }
 
     /// The path segments after the repository: reference, folder and world, without the words that a forge puts before.
@@ -156,6 +165,14 @@ impl fmt::Display for ProjectUrl {
     }
 }
 
+/// The hash of a host and the first path segment, the owner of a repository, by which long lists of repositories are
+/// searched quickly. It holds within one process only.
+pub(super) fn owner(host: &str, segments: &[String]) -> u64 {
+    let mut hasher = DefaultHasher::new();
+    (host, segments.first().map(|owner| owner.to_ascii_lowercase())).hash(&mut hasher);
+    hasher.finish()
+}
+
 /// A repository's name without the `.git` that git may add to it: both mean the same repository.
 pub(super) fn without_git(name: &str) -> Result<String, NoProject> {
     let plain = name.get(name.len().saturating_sub(4)..).filter(|end| end.eq_ignore_ascii_case(".git"));
@@ -170,7 +187,8 @@ pub(super) fn without_git(name: &str) -> Result<String, NoProject> {
     Ok(plain.to_owned())
 }
 
-/// Splits an `https` URL into its host and its percent-decoded path segments, and refuses every trick.
+/// Splits an `https` URL into its host and its percent-decoded path segments, and refuses what could mean another place to
+/// git or to the file system.
 ///
 /// # Errors
 /// See [`ProjectUrl::parse`].
@@ -204,6 +222,13 @@ fn parse_host(authority: &str) -> Result<String, NoProject> {
     let parsed = url::Url::parse(&format!("https://{authority}/"))
         .map_err(|error| no_project(format!("its host {authority:?} can't be read ({error})")))?;
     let host = parsed.host_str().unwrap_or_default();
+    let is_label = |label: &str| {
+        let mut letters = label.chars();
+        !label.starts_with('-') && letters.all(|letter| letter.is_ascii_alphanumeric() || "-_".contains(letter))
+    };
+    if matches!(parsed.host(), Some(url::Host::Domain(name)) if !name.split('.').all(is_label)) {
+        return Err(no_project(format!("its host {authority:?} is not the name of a host")));
+    }
     let host = if host == "www.github.com" { "github.com" } else { host }.to_owned();
     Ok(parsed.port().map_or(host.clone(), |port| format!("{host}:{port}")))
 }
@@ -318,6 +343,8 @@ mod tests {
             "https://github.com/u/r/blob/ma\nin/worlds/a.wbt",
             "https://github.com/u/r/blob/ma%00in/worlds/a.wbt",
             "https:///u/r/blob/main/worlds/a.wbt",
+            "https://--upload-pack=id/u/r/blob/main/worlds/a.wbt",
+            "https://a.-b.org/u/r/blob/main/worlds/a.wbt",
         ] {
             assert!(ProjectUrl::parse(text).is_err(), "{text:?} was taken for a world");
         }

@@ -6,8 +6,8 @@ use super::admission::Rules;
 use super::load::Load;
 use super::project_url::ProjectUrl;
 use super::repositories::{UrlPrefix, any_covers, any_may_cover};
-use super::text::one_line;
 use crate::shared::config::{object, optional_object};
+use crate::shared::text::one_line;
 
 /// The part of a simulation server's `/status` by which the session server places clients.
 ///

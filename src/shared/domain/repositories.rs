@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::project_url::{NoProject, ProjectUrl, RefKind, split_repository, split_url, without_git};
+use super::project_url::{NoProject, ProjectUrl, RefKind, owner, split_repository, split_url, without_git};
 
 /// A URL prefix by whole path segments: `https://github.com/lab` covers `https://github.com/lab/x`, and not
 /// `https://github.com/lab-evil/x` (the original compares letters, and lets that pass).
@@ -13,6 +13,8 @@ pub struct UrlPrefix {
     host: String,
     segments: Vec<String>,
     inside: Option<Inside>,
+    /// The hash of host and owner; nothing where the prefix is a whole host.
+    owner: Option<u64>,
 }
 
 /// A text of the configuration that is no prefix.
@@ -41,13 +43,20 @@ impl UrlPrefix {
     /// the words by which the forges tell that they follow: `tree`, `blob`, `-/blob` and `src/branch` name the same.
     #[must_use]
     pub fn covers(&self, world: &ProjectUrl) -> bool {
-        self.host == world.host() && (self.covers_segments(world) || self.covers_inside(world, false))
+        self.may_be_of(world)
+            && self.host == world.host()
+            && (self.covers_segments(world) || self.covers_inside(world, false))
     }
 
     /// Whether a world's URL may mean something that this prefix covers: `blob/v1` may mean the tag of `src/tag/v1`.
     #[must_use]
     pub fn may_cover(&self, world: &ProjectUrl) -> bool {
-        self.covers(world) || (self.host == world.host() && self.covers_inside(world, true))
+        self.may_be_of(world) && (self.covers(world) || (self.host == world.host() && self.covers_inside(world, true)))
+    }
+
+    /// Whether the owner may be the same. Most comparisons end here, without a look at any text.
+    fn may_be_of(&self, world: &ProjectUrl) -> bool {
+        self.owner.is_none_or(|owner| owner == world.owner())
     }
 
     fn covers_segments(&self, world: &ProjectUrl) -> bool {
@@ -102,7 +111,8 @@ impl TryFrom<String> for UrlPrefix {
         {
             *name = without_git(name).map_err(wrong)?;
         }
-        Ok(Self { text, host, segments, inside })
+        let owner = segments.first().map(|_| owner(&host, &segments));
+        Ok(Self { text, host, segments, inside, owner })
     }
 }
 

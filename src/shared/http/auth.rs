@@ -20,7 +20,7 @@ use crate::shared::config::Secret;
 const BURST: NonZeroU32 = NonZeroU32::MIN.saturating_add(29);
 /// How many passwords an address may send per minute after a burst: 12.
 const PER_MINUTE: NonZeroU32 = NonZeroU32::MIN.saturating_add(11);
-/// How many times as many the network of an address may send.
+/// How many times the quota of an address its whole network has.
 const NETWORK_FACTOR: NonZeroU32 = NonZeroU32::MIN.saturating_add(9);
 /// How many addresses are counted. Further ones may send no password until the others have been quiet for a while.
 const MAX_ADDRESSES: usize = 10_000;
@@ -48,7 +48,7 @@ pub enum AuthError {
 }
 
 impl BasicAuth {
-    /// Authentication with this password.
+    /// Creates an authenticator for this password.
     #[must_use]
     pub fn new(password: Secret) -> Self {
         let limiter = |factor: NonZeroU32| {

@@ -123,7 +123,7 @@ impl Drop for ConnectionPermit {
 }
 
 impl TooManyConnections {
-    /// The response to a client that is refused.
+    /// Returns the response to a client that is refused.
     #[must_use]
     pub fn answer(self) -> HttpResponse {
         let status = match self {

@@ -20,7 +20,7 @@ use crate::shared::run::{Phase, closing};
 
 /// The time between two renderings.
 const PERIOD: Duration = Duration::from_secs(1);
-/// For each so many bytes of an event the next rendering is one period later, so that a hundred pages of a large fleet do
+/// After an event, the next rendering waits one more period for each so many bytes, so that a hundred pages of a large fleet do
 /// not keep the server busy.
 const LARGE: usize = 32 * 1024;
 /// The longest time between two renderings, in periods.
@@ -106,7 +106,7 @@ impl State {
 }
 
 impl Live {
-    /// No page listens yet.
+    /// Creates live pages to which nobody listens yet.
     #[must_use]
     pub fn new() -> Self {
         Self { state: Arc::default(), events: broadcast::Sender::new(MAX_LAG) }

@@ -1,15 +1,15 @@
-//! Whether the other end of a WebSocket still lives and reads.
+//! Pings on a WebSocket, by which a peer that is gone, or does not read, is noticed.
 
 use std::time::{Duration, Instant};
 
 use actix::prelude::*;
 use actix_web_actors::ws::WebsocketContext;
 
-/// Watches one WebSocket connection.
+/// The pings of one WebSocket connection.
 ///
 /// A half-open connection never says that it is one; RFC 6455, section 5.5.2, has pings for this. Each ping carries a
-/// number that can't be guessed, and only its return counts: a peer that sends without reading is as good as gone,
-/// and would make answers pile up here. Between two pings it may therefore ask only so often.
+/// number that can't be guessed, and only its return counts. A peer that sends without reading would make answers
+/// pile up in memory, so the number of answers between two pings is limited.
 #[derive(Debug)]
 pub struct Liveness {
     alive: Instant,
@@ -17,23 +17,23 @@ pub struct Liveness {
     answers: u32,
 }
 
-/// How many answers a peer may ask for before it must answer a ping.
+/// The most answers between two pongs.
 const ANSWERS: u32 = 100;
 
 impl Liveness {
-    /// A connection that was just opened.
+    /// Starts with a connection that was just opened.
     #[must_use]
     pub fn new() -> Self {
         Self { alive: Instant::now(), asked: rand::random(), answers: 0 }
     }
 
-    /// The content of the next ping.
+    /// Returns the content of the next ping.
     pub fn ping(&mut self) -> [u8; 8] {
         self.asked = rand::random();
         self.asked
     }
 
-    /// A pong came from the peer.
+    /// Records a pong of the peer.
     pub fn pong(&mut self, content: &[u8]) {
         if content == self.asked {
             self.alive = Instant::now();
@@ -41,20 +41,20 @@ impl Liveness {
         }
     }
 
-    /// Counts an answer; false when the peer has asked for too many without reading.
+    /// Counts an answer. Returns whether it may be sent.
     #[must_use]
     pub fn may_answer(&mut self) -> bool {
         self.answers += 1;
         self.answers <= ANSWERS
     }
 
-    /// Whether the peer has not answered a ping for so long.
+    /// Whether the peer has answered no ping for so long.
     fn is_gone(&self, silence: Duration) -> bool {
         self.alive.elapsed() >= silence
     }
 }
 
-/// Pings a peer, and ends its actor when it is gone; `of` tells where the actor has its liveness.
+/// Pings a peer each `ping`, and stops the actor after `silence` without an answer; `of` returns the actor's liveness.
 pub fn watch<A>(ctx: &mut WebsocketContext<A>, ping: Duration, silence: Duration, of: fn(&mut A) -> &mut Liveness)
 where
     A: Actor<Context = WebsocketContext<A>>,

@@ -35,7 +35,7 @@ impl<'text> Gauge<'text> {
 }
 
 impl Metrics {
-    /// Metrics without counters.
+    /// Creates an empty registry.
     #[must_use]
     pub fn new() -> Self {
         Self { counters: Registry::new() }
@@ -44,7 +44,7 @@ impl Metrics {
     /// Adds a counter with one label.
     ///
     /// # Errors
-    /// When its name is no name, or is there already.
+    /// When the name is not a valid metric name, or is taken.
     pub fn counter(&self, name: &str, help: &str, label: &str) -> Result<IntCounterVec, prometheus::Error> {
         let counter = IntCounterVec::new(Opts::new(name, help), &[label])?;
         self.counters.register(Box::new(counter.clone()))?;
@@ -54,7 +54,7 @@ impl Metrics {
     /// Adds a histogram of seconds, with buckets from 1 ms to 10 s.
     ///
     /// # Errors
-    /// When its name is no name, or is there already.
+    /// When the name is not a valid metric name, or is taken.
     pub fn histogram(&self, name: &str, help: &str) -> Result<Histogram, prometheus::Error> {
         let buckets = vec![0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0];
         let histogram = Histogram::with_opts(HistogramOpts::new(name, help).buckets(buckets))?;
@@ -65,7 +65,7 @@ impl Metrics {
     /// Writes the counters and these gauges.
     ///
     /// # Errors
-    /// When a gauge's name or labels are no names.
+    /// When a gauge's name or a label is not valid.
     pub fn render(&self, gauges: &[Gauge<'_>]) -> Result<Vec<u8>, prometheus::Error> {
         let registry = Registry::new();
         for gauge in gauges {

@@ -9,9 +9,9 @@ use url::Url;
 pub struct Origin(String);
 
 impl Origin {
-    /// Whether a browser tells this origin.
+    /// Whether the `Origin` header of a request names this origin.
     #[must_use]
-    pub fn is(&self, told: &str) -> bool {
+    pub fn matches(&self, told: &str) -> bool {
         self.0 == told
     }
 }
@@ -23,7 +23,7 @@ impl TryFrom<String> for Origin {
         match Url::parse(&text) {
             Ok(url) if ["http", "https"].contains(&url.scheme()) => {
                 let origin = url.origin().ascii_serialization();
-                // What would never be told must not be taken for a rule that lets somebody in.
+                // A spelling that no browser sends would never match, so it is an error.
                 if text.eq_ignore_ascii_case(&origin) {
                     Ok(Self(origin))
                 } else {
@@ -47,7 +47,7 @@ mod tests {
             ("http://127.0.0.1:8080", "http://127.0.0.1:8080"),
             ("http://[::1]:8080", "http://[::1]:8080"),
         ] {
-            assert!(Origin::try_from(text.to_owned()).unwrap().is(told), "{text}");
+            assert!(Origin::try_from(text.to_owned()).unwrap().matches(told), "{text}");
         }
         for (text, words) in [
             ("https://lab.org/", "allowed is \"https://lab.org\""),

@@ -17,7 +17,7 @@ pub struct Policy {
     foreign: bool,
 }
 
-/// A policy that names more hosts than this would be too long for a header.
+/// The most hosts that a policy names, so that it fits into a header.
 const MOST_HOSTS: usize = 40;
 
 impl Policy {
@@ -74,28 +74,29 @@ impl Policy {
         self
     }
 
-    /// Lets a page hold pages of its own server.
+    /// Lets a page embed pages of its own server (`frame-src`).
     #[must_use]
     pub fn frames(mut self) -> Self {
         self.frames = true;
         self
     }
 
-    /// Lets pages of the same server hold this one.
+    /// Lets pages of the same server embed this one (`frame-ancestors`).
     #[must_use]
     pub fn framed(mut self) -> Self {
         self.framed = true;
         self
     }
 
-    /// Makes a page a stranger to its own server: its scripts get no passwords, and nothing that is kept for others.
+    /// Gives a page an origin of its own (`sandbox`): its scripts can't use the password or the storage of the server's
+    /// other pages.
     #[must_use]
     pub fn foreign(mut self) -> Self {
         self.foreign = true;
         self
     }
 
-    /// The header's value.
+    /// Returns the header's value.
     #[must_use]
     pub fn text(&self) -> String {
         let own_or_none = |allowed| if allowed { "'self'" } else { "'none'" };
@@ -131,7 +132,7 @@ pub fn fleet_sources<'address>(addresses: impl Iterator<Item = &'address PublicA
     hosts.iter().flat_map(|host| [format!("{http}://{host}"), format!("{websocket}://{host}")]).collect()
 }
 
-/// How a bar of so many percent is coloured.
+/// The CSS class of a bar that shows so many percent.
 #[must_use]
 pub fn heat(percent: &f64) -> &'static str {
     match *percent {
@@ -141,13 +142,13 @@ pub fn heat(percent: &f64) -> &'static str {
     }
 }
 
-/// How long a bar of so many percent is.
+/// The CSS class that sets the length of a bar that shows so many percent.
 #[must_use]
 pub fn width(percent: &f64) -> String {
     format!("{:.1}", percent.clamp(0.0, 100.0))
 }
 
-/// Sends a page.
+/// Answers with a page.
 #[must_use]
 pub fn html(page: Result<String, askama::Error>, policy: &Policy) -> HttpResponse {
     match page {

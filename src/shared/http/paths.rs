@@ -1,4 +1,4 @@
-//! What the paths of both servers have in common: methods, headers for pages of other origins, words for what is not there.
+//! What the paths of both servers share: allowed methods, CORS headers, the answer for unknown paths.
 
 use actix_web::dev::HttpServiceFactory;
 use actix_web::http::header::{self, HeaderName, HeaderValue};
@@ -7,12 +7,12 @@ use actix_web::middleware::DefaultHeaders;
 use actix_web::{FromRequest, Handler, HttpRequest, HttpResponse, Resource, Responder, guard, web};
 use rand::RngExt;
 
-/// In seconds.
+/// The values of `Retry-After`, in seconds.
 const RETRY_AFTER: std::ops::RangeInclusive<u16> = 2..=6;
 
 /// For what is read. What watches over servers likes to ask for the head alone (RFC 9110, section 9.3.2).
 pub const READ: &[Method] = &[Method::GET, Method::HEAD];
-/// For what has no end: WebSockets and streams of events.
+/// For WebSockets and event streams, whose answers have no end.
 pub const GET: &[Method] = &[Method::GET];
 /// For what changes something.
 pub const POST: &[Method] = &[Method::POST];
@@ -36,7 +36,7 @@ fn wrong_method(methods: &[Method]) -> HttpResponse {
     HttpResponse::MethodNotAllowed().insert_header((header::ALLOW, allowed)).body(words)
 }
 
-/// Refuses a request that a page of another site made, with the password that the browser remembers.
+/// Refuses a request that a page of another site made (CSRF): the browser would add the password that it remembers.
 ///
 /// Browsers tell where a request comes from in `Sec-Fetch-Site`, older ones in `Origin`; other programs send neither.
 #[must_use]
@@ -53,8 +53,7 @@ pub fn refuse_other_sites(request: &HttpRequest) -> Option<HttpResponse> {
     (!same_site || !same_host).then(refusal)
 }
 
-/// After how many seconds a client that was refused may come back: drawn at random, so that a class that was refused
-/// together does not come back together.
+/// The value of `Retry-After`, in seconds. Random, so that a class that was refused together does not come back together.
 #[must_use]
 pub fn retry_after() -> (HeaderName, HeaderValue) {
     (header::RETRY_AFTER, HeaderValue::from(rand::rng().random_range(RETRY_AFTER)))

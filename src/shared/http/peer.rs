@@ -13,26 +13,26 @@ use actix_web::http::header::HeaderMap;
 use ipnet::IpNet;
 use serde::{Deserialize, Serialize};
 
-/// The networks whose word on their clients' addresses is taken.
+/// The networks of proxies whose `X-Forwarded-For` and `Forwarded` headers are believed.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(try_from = "Vec<String>", into = "Vec<String>")]
 pub struct TrustedProxies(Vec<IpNet>);
 
-/// A text that names no network.
+/// A text that is not a network.
 #[derive(Debug, PartialEq, Eq, thiserror::Error)]
 #[error("{found:?} is no network; allowed are addresses (10.0.0.1, fd00::1) and networks (10.0.0.0/8, fd00::/8)")]
 pub struct NoNetwork {
     found: String,
 }
 
-/// The other end of a connection.
+/// The client at the other end of a connection.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Peer {
-    /// A client's own address, or that of the last proxy which said something sensible.
+    /// The client's own address; that of the last proxy, where the header before it can't be read.
     Client(IpAddr),
-    /// A trusted proxy that says nothing of its clients, or a client on its machine: it may stand for many.
+    /// A trusted proxy that sends no header, or a client on the same machine: it may stand for many clients.
     Proxy(IpAddr),
-    /// Not known: no TCP connection.
+    /// Unknown: not a TCP connection.
     Unknown,
 }
 
@@ -90,7 +90,7 @@ impl TrustedProxies {
         }
     }
 
-    /// The last address of a chain that is no trusted proxy's. What is no address ends the chain.
+    /// Returns the last address of a chain that is not a trusted proxy. A hop that is not an address ends the chain.
     fn client(&self, connected: IpAddr, chain: Vec<Option<IpAddr>>) -> IpAddr {
         let mut nearest = connected;
         for hop in chain.into_iter().rev() {
@@ -108,7 +108,7 @@ impl TrustedProxies {
     }
 }
 
-/// All lines of a header as one; nothing where there is none. What is no text ends up as no address.
+/// Joins all lines of a header; `None` where there is none. A line that is not text becomes `?`, which is not an address.
 fn joined(headers: &HeaderMap, name: &str) -> Option<String> {
     let lines: Vec<&str> = headers.get_all(name).map(|line| line.to_str().unwrap_or("?")).collect();
     (!lines.is_empty()).then(|| lines.join(","))

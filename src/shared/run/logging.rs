@@ -7,7 +7,7 @@ use std::path::Path;
 use env_logger::{Builder, Env, Target};
 
 use super::rotated_file::RotatedFile;
-use crate::shared::domain::one_line;
+use crate::shared::text::one_line;
 
 /// How many old files are kept beside the newest. The Python servers keep as many.
 const OLD_FILES: usize = 10;

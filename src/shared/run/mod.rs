@@ -1,5 +1,6 @@
 //! How a server starts, says that it is ready, writes its log, and handles signals.
 
+mod app_error;
 mod logging;
 pub mod notify;
 mod open_files;
@@ -10,7 +11,7 @@ mod shutdown;
 pub mod start;
 mod timestamp;
 
-pub use crate::shared::domain::one_line;
+pub use app_error::AppError;
 pub use logging::LogTarget;
 pub use open_files::raise_open_files;
 pub use rotated_file::RotatedFile;

@@ -8,7 +8,7 @@ use std::process::ExitCode;
 use super::logging::{self, LogTarget};
 use super::{notify, pid_file};
 use crate::shared::config::{self, Configuration, LoadedConfig};
-use crate::shared::domain::one_line;
+use crate::shared::text::one_line;
 
 /// Exit code: the server failed at run time, as where its port is taken.
 pub const FAILED: u8 = 1;

@@ -11,7 +11,7 @@ use tokio::net::unix::pipe::Receiver;
 use which::which;
 
 use super::git_error::GitError;
-use crate::shared::run::one_line;
+use crate::shared::text::one_line;
 use crate::simulation::process::{ExitReason, ProcessGroup, SpawnSpec};
 
 /// How git is run by this server.

@@ -71,7 +71,7 @@ impl Pending {
     }
 
     /// Counts the outcome. Only the first one counts.
-    pub fn is(&mut self, outcome: Outcome) {
+    pub fn resolve(&mut self, outcome: Outcome) {
         if let Some(counter) = self.0.take() {
             counter.with_label_values(&[outcome.label()]).inc();
         }
@@ -80,6 +80,6 @@ impl Pending {
 
 impl Drop for Pending {
     fn drop(&mut self) {
-        self.is(Outcome::Left);
+        self.resolve(Outcome::Left);
     }
 }

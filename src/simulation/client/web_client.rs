@@ -65,7 +65,7 @@ impl WebClient {
 
     /// Counts the failed start, tells the client why, and closes the connection.
     fn fail_start(&mut self, outcome: Outcome, why: &str, ctx: &mut Context) {
-        self.start.is(outcome);
+        self.start.resolve(outcome);
         self.fail(why, ctx);
     }
 
@@ -175,7 +175,7 @@ impl WebClient {
 
     fn exited(&mut self, Exit { clean, why }: &Exit, ctx: &mut Context) {
         let words = if *clean { protocol::loading(why) } else { protocol::error(why) };
-        self.start.is(Outcome::NoWebots);
+        self.start.resolve(Outcome::NoWebots);
         self.finish(&words, CloseCode::Normal, ctx);
     }
 }
@@ -190,7 +190,7 @@ impl Actor for WebClient {
         closing(self.server.phase.clone())
             .into_actor(self)
             .map(|(), this, ctx| {
-                this.start.is(Outcome::Stopped);
+                this.start.resolve(Outcome::Stopped);
                 this.finish(&protocol::error("This simulation server is stopping"), CloseCode::Away, ctx);
             })
             .spawn(ctx);
@@ -262,7 +262,7 @@ impl Handler<WebotsEvent> for WebClient {
     fn handle(&mut self, event: WebotsEvent, ctx: &mut Self::Context) {
         match event {
             WebotsEvent::Listening(port) => {
-                self.start.is(Outcome::Ready);
+                self.start.resolve(Outcome::Ready);
                 ctx.text(protocol::webots(&self.server.config.websocket_url(port)));
             }
             WebotsEvent::Heartbeat => ctx.text(protocol::HEARTBEAT),

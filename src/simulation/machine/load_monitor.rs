@@ -11,7 +11,6 @@ use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
 use actix::prelude::*;
-use serde::Serialize;
 use tokio::sync::watch;
 
 use super::sensors::{self, Gpu, GpuSensor, Host, Machine, MachineSensor};
@@ -63,8 +62,7 @@ pub struct Readings {
 }
 
 /// One line of `monitor.csv`.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
-#[serde(rename_all = "camelCase")]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Sample {
     /// Seconds since 1970.
     pub timestamp: u64,
@@ -73,7 +71,6 @@ pub struct Sample {
     /// Simulations that are paused.
     pub idle: u32,
     /// The machine.
-    #[serde(flatten)]
     pub machine: Machine,
     /// Compute load of the least busy GPU, in percent.
     pub gpu_compute: f64,
@@ -82,7 +79,6 @@ pub struct Sample {
     /// Memory of that GPU in use, in percent.
     pub gpu_memory: f64,
     /// The load of this second, percent.
-    #[serde(skip)]
     pub load: Load,
 }
 
@@ -131,7 +127,7 @@ impl LoadMonitor {
             self.gpus = None;
         }
         let gpus = self.gpus.as_ref().map(|(_, gpus)| gpus.clone()).unwrap_or_default();
-        let least = gpus.iter().min_by(|one, other| one.compute.total_cmp(&other.compute)).cloned().unwrap_or_default();
+        let least = sensors::least_busy(&self.machine, &gpus).cloned().unwrap_or_default();
         let sample = Sample {
             timestamp: SystemTime::UNIX_EPOCH.elapsed().map_or(0, |age| age.as_secs()),
             running,
@@ -151,7 +147,7 @@ impl LoadMonitor {
                 readings.history.pop_front();
             }
             readings.history.push_back(sample);
-            readings.load = mean(readings.history.iter().rev().take(MEAN_OF).map(|sample| sample.load.percent()));
+            readings.load = Load::mean(readings.history.iter().rev().take(MEAN_OF).map(|sample| sample.load));
         });
     }
 
@@ -167,11 +163,6 @@ impl LoadMonitor {
     }
 }
 
-fn mean(values: impl Iterator<Item = f64>) -> Option<Load> {
-    let (sum, count) = values.fold((0.0, 0_u32), |(sum, count), value| (sum + value, count + 1));
-    Load::try_from(sum / f64::from(count)).ok()
-}
-
 fn append(path: &Path, sample: &Sample, first: bool, put_aside: bool) -> std::io::Result<()> {
     if let Some(folder) = path.parent() {
         std::fs::create_dir_all(folder)?;
@@ -181,12 +172,18 @@ fn append(path: &Path, sample: &Sample, first: bool, put_aside: bool) -> std::io
     }
     let mut file = std::fs::File::options().create(true).append(!first).write(true).truncate(first).open(path)?;
     if file.metadata()?.len() == 0 {
-        writeln!(file, "{}", COLUMNS.map(|(heading, _)| heading).join(", "))?;
+        writeln!(file, "{}", Sample::headings())?;
     }
     writeln!(file, "{}", sample.columns().join(", "))
 }
 
 impl Sample {
+    /// The first line of `monitor.csv`: the headings of its columns.
+    #[must_use]
+    pub fn headings() -> String {
+        COLUMNS.map(|(heading, _)| heading).join(", ")
+    }
+
     /// The values of `monitor.csv`, in the order of its columns.
     #[must_use]
     pub fn columns(&self) -> Vec<String> {

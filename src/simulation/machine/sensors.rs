@@ -49,9 +49,20 @@ pub struct Gpu {
 /// has it. With several GPUs the least busy one counts, for that is the one a new client could use.
 #[must_use]
 pub fn load(machine: &Machine, gpus: &[Gpu]) -> Load {
-    let with = |compute: f64, memory: f64| machine.cpu.max((machine.swap + machine.memory + memory) / 3.0).max(compute);
-    let least = gpus.iter().map(|gpu| with(gpu.compute, gpu.memory)).min_by(f64::total_cmp);
-    Load::try_from(least.unwrap_or_else(|| with(0.0, 0.0))).unwrap_or(Load::ZERO)
+    let least =
+        least_busy(machine, gpus).map_or_else(|| load_with(machine, &Gpu::default()), |gpu| load_with(machine, gpu));
+    Load::try_from(least).unwrap_or(Load::ZERO)
+}
+
+/// The load that a machine would have with this GPU alone, in percent.
+fn load_with(machine: &Machine, gpu: &Gpu) -> f64 {
+    machine.cpu.max((machine.swap + machine.memory + gpu.memory) / 3.0).max(gpu.compute)
+}
+
+/// The GPU that a new client could use best.
+#[must_use]
+pub fn least_busy<'gpus>(machine: &Machine, gpus: &'gpus [Gpu]) -> Option<&'gpus Gpu> {
+    gpus.iter().min_by(|one, other| load_with(machine, one).total_cmp(&load_with(machine, other)))
 }
 
 /// Which reading the load comes from, in words.

@@ -63,8 +63,8 @@ impl Readings {
         self.usages.clear();
         for root in roots {
             let (ticks, pages) = tree_sum(*root, &processes);
-            let gone = before.get(root).zip(passed).filter(|(_, passed)| !passed.is_zero());
-            let cpu = gone.map(|(before, passed)| cpu_percent(ticks.saturating_sub(*before), passed));
+            let measured = before.get(root).zip(passed).filter(|(_, passed)| !passed.is_zero());
+            let cpu = measured.map(|(before, passed)| cpu_percent(ticks.saturating_sub(*before), passed));
             self.ticks.insert(*root, ticks);
             self.usages.insert(*root, Usage { cpu, memory: pages * procfs::page_size() });
         }

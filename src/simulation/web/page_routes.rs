@@ -19,7 +19,7 @@ use crate::simulation::machine::Usages;
 use crate::simulation::snapshot::Snapshot;
 use crate::simulation::state::AppState;
 
-/// What the page loads, besides what all pages do.
+/// Assets of this server's page, besides those of all pages.
 const ASSETS: &[Asset] =
     &[asset!("charts.css"), asset!("charts.js"), asset!("chart.js"), asset!("simulation_monitor.js")];
 /// How much of an output's end is shown, in bytes.
@@ -79,8 +79,8 @@ struct Which {
     id: u64,
 }
 
-/// The last lines that a simulation has printed. They may hold what is nobody else's business: a password protects
-/// them, where there is one.
+/// The last lines that a simulation has printed. They may be private, so the administrator's password protects them if one
+/// is configured.
 async fn output(request: HttpRequest, which: web::Query<Which>, server: web::Data<AppState>) -> HttpResponse {
     if let Some(auth) = &server.admin_auth
         && let Err(refused) = auth.check(&request, server.config.trusted_proxies.peer(&request))

@@ -5,9 +5,9 @@ use std::time::{Duration, SystemTime};
 use askama::Template;
 
 use crate::shared::domain::UrlPrefix;
-use crate::shared::domain::one_line;
 use crate::shared::http::{Row, View};
 use crate::shared::run::{seconds_since_1970, timestamp};
+use crate::shared::text::one_line;
 use crate::simulation::machine::sensors::{self, Gpu, Host, Machine};
 use crate::simulation::machine::{Readings, Sample};
 use crate::simulation::machine::{Usage, Usages};
@@ -23,6 +23,8 @@ struct Monitor<'server> {
     title: &'server str,
     description: &'server str,
     glance: &'server str,
+    /// The columns of the charts' numbers.
+    columns: String,
     rows: &'server [Row],
     host: &'server Host,
     gpus: Vec<(&'server Gpu, String)>,
@@ -35,13 +37,15 @@ struct Monitor<'server> {
     limit: String,
 }
 
-/// How the server is.
+/// The summary of the server.
 #[derive(Template)]
 #[template(path = "simulation/glance.html")]
 struct Glance<'readings> {
     draining: bool,
+    /// Why no simulation can be started, if so.
+    problem: Option<String>,
     load: f64,
-    maker: &'static str,
+    busiest_part: &'static str,
     machine: Machine,
     memory: String,
     gpus: Vec<(&'readings Gpu, String)>,
@@ -103,6 +107,7 @@ pub fn monitor(server: &AppState, snapshot: &Snapshot, usages: &Usages) -> Resul
         title: server.config.title.as_deref().unwrap_or("Webots simulation server"),
         description: server.config.description.as_deref().unwrap_or_default(),
         glance: view.parts.get("glance").map(String::as_str).unwrap_or_default(),
+        columns: Sample::headings(),
         rows: view.tables.get("simulations").map(Vec::as_slice).unwrap_or_default(),
         host: &readings.host,
         gpus: with_sizes(&readings.gpus),
@@ -129,8 +134,9 @@ impl<'readings> Glance<'readings> {
         let instances = snapshot.instances;
         Self {
             draining: server.is_draining(),
+            problem: server.problem(),
             load: server.load().percent(),
-            maker: sensors::busiest(&readings.machine, &readings.gpus),
+            busiest_part: sensors::busiest(&readings.machine, &readings.gpus),
             machine: readings.machine,
             memory: bytes(readings.host.memory),
             gpus: with_sizes(&readings.gpus),
@@ -149,8 +155,8 @@ fn with_sizes(gpus: &[Gpu]) -> Vec<(&Gpu, String)> {
     gpus.iter().map(|gpu| (gpu, bytes(gpu.memory_total))).collect()
 }
 
-/// What the forges have between a repository and what is in it.
-const WORDS: [&str; 4] = ["/-/", "/blob/", "/tree/", "/src/"];
+/// What forges put between a repository and a path in it.
+const SEPARATORS: [&str; 4] = ["/-/", "/blob/", "/tree/", "/src/"];
 
 impl<'one> SimulationRow<'one> {
     fn new(one: &'one Simulation, usage: Option<Usage>, limit: u64) -> Self {
@@ -158,7 +164,7 @@ impl<'one> SimulationRow<'one> {
         let ends = one.launched.map_or(0, |launched| launched + limit);
         let now = seconds_since_1970();
         let path = one.world.split_once("://").map_or(one.world.as_str(), |(_, path)| path);
-        let (repository, file) = WORDS.iter().find_map(|word| path.split_once(word)).unwrap_or((path, path));
+        let (repository, file) = SEPARATORS.iter().find_map(|word| path.split_once(word)).unwrap_or((path, path));
         Self {
             one,
             world: one_line(file.rsplit('/').next().unwrap_or(file)),

@@ -1,4 +1,4 @@
-//! Asking for a snapshot on behalf of a request, and answers that several paths give.
+//! Asks for the snapshot of simulations on behalf of a request.
 
 use std::time::Duration;
 
@@ -17,7 +17,7 @@ pub async fn snapshot(server: &AppState) -> Option<Snapshot> {
     actix_rt::time::timeout(PATIENCE, snapshot).await.ok().and_then(Result::ok)
 }
 
-/// The answer when nobody tells.
+/// The answer when the actor is too busy.
 #[must_use]
 pub fn too_busy() -> HttpResponse {
     HttpResponse::ServiceUnavailable().body("Error: the server is too busy to tell.")

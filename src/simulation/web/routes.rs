@@ -47,7 +47,7 @@ async fn client(request: HttpRequest, stream: web::Payload, server: web::Data<Ap
 fn refuse_origin(request: &HttpRequest, server: &AppState) -> Option<HttpResponse> {
     let allowed = &server.config.allowed_origins;
     let origin = request.headers().get(header::ORIGIN)?.to_str().unwrap_or_default();
-    if allowed.is_empty() || allowed.iter().any(|one| one.is(origin)) {
+    if allowed.is_empty() || allowed.iter().any(|one| one.matches(origin)) {
         return None;
     }
     Some(HttpResponse::Forbidden().body("Error: this page is not one of those that may start simulations here."))

@@ -1,4 +1,4 @@
-//! What the simulation server tells programs of itself: `/status` and `/metrics`.
+//! What the simulation server tells other programs: `/status` and `/metrics`.
 
 use serde::Serialize;
 
@@ -13,16 +13,16 @@ use crate::simulation::state::AppState;
 #[derive(Debug, Serialize)]
 #[serde(rename_all = "camelCase")]
 pub struct StatusPage {
-    /// What decides where clients go.
+    /// The part that session servers read.
     #[serde(flatten)]
     pub report: ServerReport,
-    /// In seconds.
+    /// Time since the start, in seconds.
     pub uptime: u64,
-    /// What the machine is.
+    /// Name, system and hardware of the machine.
     pub host: Host,
-    /// What the machine is doing.
+    /// The newest reading of the machine.
     pub machine: Machine,
-    /// What its GPUs are doing.
+    /// The newest readings of its GPUs.
     pub gpus: Vec<Gpu>,
     /// Where Webots' own viewer can be had from this server.
     #[serde(skip_serializing_if = "Option::is_none")]

@@ -13,7 +13,7 @@ use actix::prelude::*;
 use tokio::sync::oneshot;
 
 use crate::shared::run::RotatedFile;
-use crate::shared::run::one_line;
+use crate::shared::text::one_line;
 
 /// What a line of Webots' output tells of its state.
 #[derive(Message, Debug, Clone, Copy, PartialEq, Eq)]
@@ -138,6 +138,8 @@ fn printable(line: &[u8]) -> String {
 
 #[cfg(test)]
 mod tests {
+    use proptest::prelude::*;
+
     use super::*;
 
     #[test]
@@ -164,6 +166,22 @@ mod tests {
         }
         for line in ["..", "", "paused", "real-time:", "open", "INFO: pause"] {
             assert_eq!(OutputEvent::parse(line), None, "{line:?}");
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn every_line_is_short_and_printable_whatever_is_printed(
+            bytes in prop::collection::vec(prop_oneof![3 => any::<u8>(), 1 => Just(b'\n'), 1 => Just(0x1b)], 0..4000),
+            buffer in 1_usize..64,
+        ) {
+            let mut reader = BufReader::with_capacity(buffer, bytes.as_slice());
+            let lines: Vec<String> = std::iter::from_fn(|| next_line(&mut reader)).collect();
+            for line in &lines {
+                prop_assert!(!line.chars().any(char::is_control) && line.chars().count() <= LINE_SIZE, "{line:?}");
+            }
+            let breaks = bytes.split(|byte| *byte == b'\n').count();
+            prop_assert!(lines.len() <= breaks, "{} lines of {breaks}", lines.len());
         }
     }
 }

@@ -1,0 +1,104 @@
+//! `rehearse` from outside: what it says of a fleet that is large enough, of one that is too small, and of none.
+
+use std::process::{Output, Stdio};
+use std::time::Duration;
+
+use serde_json::Value;
+
+use crate::support::git::{Forge, arm};
+use crate::support::ports;
+use crate::support::program::{Server, session_server, simulation_server};
+use crate::support::webots::Webots;
+
+/// How long a rehearsal may take.
+const BOUND: Duration = Duration::from_secs(90);
+
+/// A fleet of one simulation server.
+struct Fleet {
+    session: Server,
+    _simulation: Server,
+    _stand_ins: (Forge, Webots),
+}
+
+impl Fleet {
+    async fn with_places(places: u16) -> Self {
+        let (forge, webots) = (Forge::with_arm(), Webots::launcher());
+        let simulation = simulation_server(&webots.path(), forge.path(), places).start().await;
+        // What else runs on this machine must not close the fleet.
+        let session = session_server(&[simulation.address()]).set("loadThreshold", 1000).start().await;
+        Self { session, _simulation: simulation, _stand_ins: (forge, webots) }
+    }
+
+    async fn rehearse(&self, arguments: &[&str]) -> Output {
+        rehearse(&self.session.url(""), arguments).await
+    }
+}
+
+async fn rehearse(fleet: &str, arguments: &[&str]) -> Output {
+    let mut command = tokio::process::Command::new(env!("CARGO_BIN_EXE_rehearse"));
+    command.arg(fleet).args(["--world", &arm()]).args(arguments).stdin(Stdio::null()).kill_on_drop(true);
+    actix_rt::time::timeout(BOUND, command.output()).await.expect("it ends").unwrap()
+}
+
+fn text(bytes: &[u8]) -> String {
+    String::from_utf8_lossy(bytes).into_owned()
+}
+
+#[actix_rt::test]
+async fn a_class_that_fits_is_told_so() {
+    let fleet = Fleet::with_places(3).await;
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("class.json");
+    let class = ["--clients", "3", "--over", "0s", "--stay", "3s", "--real-time", "0.1", "--expect", "3", "--json"];
+    let output = fleet.rehearse(&[&class[..], &[file.to_str().unwrap()]].concat()).await;
+    let said = text(&output.stdout);
+    assert!(output.status.success(), "{said}{}", text(&output.stderr));
+    assert!(said.contains("All 3 fit."), "{said}");
+    let report: Value = serde_json::from_str(&std::fs::read_to_string(file).unwrap()).unwrap();
+    assert_eq!((&report["seats"]["given"], &report["seats"]["fit"]), (&3.into(), &3.into()), "{report}");
+    assert_eq!(report["visits"].as_array().unwrap().len(), 3);
+}
+
+#[actix_rt::test]
+async fn a_class_that_does_not_fit_is_told_why_and_time_in_the_line_counts_as_waiting() {
+    let fleet = Fleet::with_places(1).await;
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("class.json");
+    let class =
+        ["--clients", "2", "--over", "1s", "--stay", "3s", "--real-time", "0.1", "--json", file.to_str().unwrap()];
+    let output = fleet.rehearse(&class).await;
+    let report: Value = serde_json::from_str(&std::fs::read_to_string(&file).unwrap()).unwrap();
+    assert!(output.status.success(), "{report}");
+    let waiting = report["times"].as_array().unwrap().iter().find(|row| row["step"] == "waiting").unwrap();
+    assert!(waiting["worst"].as_f64().unwrap() > 1.5, "one waited until the other had left: {report}");
+    // Nobody leaves soon enough for the second one.
+    let output = fleet.rehearse(&[&class[..4], &["--stay", "8s", "--patience", "3s", "--expect", "2"]].concat()).await;
+    let said = text(&output.stdout);
+    assert_eq!(output.status.code(), Some(1), "{said}");
+    assert!(said.contains("1 of 2"), "{said}");
+}
+
+#[actix_rt::test]
+async fn the_acceptance_run_finds_the_demo_as_expected() {
+    let fleet = Fleet::with_places(1).await;
+    let output = fleet.rehearse(&["--explain", "--stay", "2s"]).await;
+    let said = text(&output.stdout);
+    assert!(output.status.success(), "{said}{}", text(&output.stderr));
+    assert!(said.contains("| step | at | took | expected | came | |"), "{said}");
+    assert!(said.contains("| availability |") && said.matches("| ok |").count() >= 15, "{said}");
+}
+
+#[actix_rt::test]
+async fn a_fleet_that_is_not_there_and_one_elsewhere_are_refused_in_one_line() {
+    let (_taken, port) = ports::dead_port();
+    let output = rehearse(&format!("http://127.0.0.1:{port}"), &["--clients", "1"]).await;
+    let said = text(&output.stderr);
+    assert!(output.status.code() == Some(1) && said.starts_with("error: ") && said.lines().count() == 1, "{said}");
+    // Nobody is there to agree. Nothing is sent: the address is one for documentation.
+    let output = rehearse("http://192.0.2.1:1999", &["--clients", "1"]).await;
+    let said = text(&output.stderr);
+    assert_eq!(
+        (output.status.code(), said.as_str()),
+        (Some(2), "error: nobody agreed to load http://192.0.2.1:1999/; --yes agrees\n")
+    );
+}
