@@ -41,7 +41,7 @@ impl Server {
             .spawn()
             .expect("the session server starts");
         let server = Self { child, port, folder };
-        let all_up = format!("session_servers{{state=\"up\"}} {}", simulation_servers.len());
+        let all_up = format!("webots_session_servers{{state=\"up\"}} {}", simulation_servers.len());
         server.wait_until(|server| server.page("/metrics").is_some_and(|page| page.contains(&all_up)));
         server
     }

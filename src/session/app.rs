@@ -131,8 +131,8 @@ fn assemble(
     phase: watch::Receiver<Phase>,
 ) -> Result<AppState, AppError> {
     let metrics = Metrics::new();
-    let latencies = metrics.histogram("session_report_seconds", "Time in which simulation servers answer")?;
-    let picks = metrics.counter("session_requests_total", "Requests for a simulation server", "outcome")?;
+    let latencies = metrics.histogram("webots_session_report_seconds", "Time in which simulation servers answer")?;
+    let picks = metrics.counter("webots_session_requests_total", "Requests for a simulation server", "outcome")?;
     for outcome in OUTCOMES {
         picks.with_label_values(&[outcome]).reset();
     }

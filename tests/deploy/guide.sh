@@ -232,7 +232,7 @@ visit_the_other() { # PORT ITS MACHINE
 }
 
 knows_both() {
-    [[ $(in_machine curl --silent --fail --max-time 3 https://fleet.lab.example/metrics | grep --count '^session_server_up{.*} 1') == 2 ]]
+    [[ $(in_machine curl --silent --fail --max-time 3 https://fleet.lab.example/metrics | grep --count '^webots_session_server_up{.*} 1') == 2 ]]
 }
 
 step() { # WORDS

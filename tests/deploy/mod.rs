@@ -7,3 +7,4 @@ mod listening;
 mod notify;
 mod ports;
 mod preflight;
+mod prometheus;

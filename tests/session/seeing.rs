@@ -90,7 +90,7 @@ async fn the_metrics_tell_what_an_alarm_needs() {
     until_states(&session, &["up", "down"]).await;
     let fresh = http::get(&session.url("/metrics")).await.text();
     for outcome in ["placed", "unavailable", "not_accepted", "wrong_url"] {
-        assert!(fresh.contains(&format!("session_requests_total{{outcome=\"{outcome}\"}} 0")), "{fresh}");
+        assert!(fresh.contains(&format!("webots_session_requests_total{{outcome=\"{outcome}\"}} 0")), "{fresh}");
     }
     http::get(&session.url("/session")).await;
     http::get(&session.url("/session?url=nonsense")).await;
@@ -99,24 +99,24 @@ async fn the_metrics_tell_what_an_alarm_needs() {
     let text = answer.text();
     let (up, down) = (servers[0].address(), servers[1].address());
     for line in [
-        "session_available 1".to_owned(),
-        "session_clients 0".to_owned(),
-        "session_load_percent 20".to_owned(),
-        "session_requests_total{outcome=\"placed\"} 1".to_owned(),
-        "session_requests_total{outcome=\"wrong_url\"} 1".to_owned(),
-        "session_servers{state=\"up\"} 1".to_owned(),
-        "session_servers{state=\"down\"} 1".to_owned(),
-        format!("session_server_up{{server=\"{up}\"}} 1"),
-        format!("session_server_up{{server=\"{down}\"}} 0"),
-        format!("session_server_load_percent{{server=\"{up}\"}} 20"),
-        format!("session_server_effective_load_percent{{server=\"{up}\"}} 23"),
-        format!("session_server_in_flight{{server=\"{up}\"}} 1"),
-        "session_report_seconds_count 2".to_owned(),
+        "webots_session_available 1".to_owned(),
+        "webots_session_clients 0".to_owned(),
+        "webots_session_load_percent 20".to_owned(),
+        "webots_session_requests_total{outcome=\"placed\"} 1".to_owned(),
+        "webots_session_requests_total{outcome=\"wrong_url\"} 1".to_owned(),
+        "webots_session_servers{state=\"up\"} 1".to_owned(),
+        "webots_session_servers{state=\"down\"} 1".to_owned(),
+        format!("webots_session_server_up{{server=\"{up}\"}} 1"),
+        format!("webots_session_server_up{{server=\"{down}\"}} 0"),
+        format!("webots_session_server_load_percent{{server=\"{up}\"}} 20"),
+        format!("webots_session_server_effective_load_percent{{server=\"{up}\"}} 23"),
+        format!("webots_session_server_in_flight{{server=\"{up}\"}} 1"),
+        "webots_session_report_seconds_count 2".to_owned(),
     ] {
         assert!(text.lines().any(|found| found == line), "no {line:?} in {text}");
     }
-    assert!(text.contains(&format!("session_server_latency_seconds{{server=\"{up}\"}}")), "{text}");
-    assert!(!text.contains(&format!("session_server_load_percent{{server=\"{down}\"}}")), "{text}");
+    assert!(text.contains(&format!("webots_session_server_latency_seconds{{server=\"{up}\"}}")), "{text}");
+    assert!(!text.contains(&format!("webots_session_server_load_percent{{server=\"{down}\"}}")), "{text}");
     assert_eq!(http::get(&session.url("/health")).await.text(), "ok");
 }
 

@@ -189,7 +189,7 @@ async fn no_report_of_a_thousand_servers_is_lost() {
         session_server(&addresses(&servers)).set("loadRefresh", 600).set("timing", serde_json::json!({"answer": 15}));
     let session = session.start().await;
     until("all have reported", async || {
-        http::get(&session.url("/metrics")).await.text().contains("session_servers{state=\"up\"} 1000")
+        http::get(&session.url("/metrics")).await.text().contains("webots_session_servers{state=\"up\"} 1000")
     })
     .await;
     // Each was looked at when the server started, and perhaps once more.

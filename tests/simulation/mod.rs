@@ -12,7 +12,7 @@ mod output;
 mod places;
 mod protocol;
 mod readiness;
-mod readings;
+pub mod readings;
 mod ready;
 mod scene;
 mod soak;

@@ -80,7 +80,7 @@ async fn a_crowd_is_served_to_the_last_one() {
     assert!(urls.iter().all(|url| allowed.contains(url)), "{urls:?}");
     nothing_left(&server, 3).await;
     until("all are counted", async || {
-        http::get(&server.url("/metrics")).await.text().contains("simulation_starts_total{outcome=\"ready\"} 12")
+        http::get(&server.url("/metrics")).await.text().contains("webots_simulation_starts_total{outcome=\"ready\"} 12")
     })
     .await;
 }

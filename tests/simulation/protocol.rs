@@ -200,7 +200,7 @@ async fn outcomes_are_counted() {
     let server = simulation_server(&webots.path(), forge.path(), 1).set("waitingLine", 1).start().await;
     let count = async |outcome: &str| {
         let text = http::get(&server.url("/metrics")).await.text();
-        let name = format!("simulation_starts_total{{outcome=\"{outcome}\"}} ");
+        let name = format!("webots_simulation_starts_total{{outcome=\"{outcome}\"}} ");
         text.lines().find_map(|line| line.strip_prefix(&name)).unwrap().parse::<u32>().unwrap()
     };
     assert_eq!(count("ready").await, 0);

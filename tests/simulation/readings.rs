@@ -13,7 +13,7 @@ use crate::support::webots::Webots;
 use crate::support::{http, needs, until};
 
 /// A folder with the stand-in for NVIDIA's library.
-fn stand_in() -> tempfile::TempDir {
+pub fn gpu_driver() -> tempfile::TempDir {
     needs("cc", "gcc");
     let folder = tempfile::tempdir().unwrap();
     let source = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/simulation/nvml.c");
@@ -29,7 +29,7 @@ fn with(library: &Path, forge: &Forge, webots: &Webots) -> Builder {
 
 #[actix_rt::test]
 async fn gpus_are_read_and_the_least_busy_one_counts() {
-    let library = stand_in();
+    let library = gpu_driver();
     let (forge, webots) = (Forge::with_arm(), Webots::launcher());
     let server =
         with(library.path(), &forge, &webots).env("NVML_COMPUTE_0", "100").env("NVML_COMPUTE_1", "99").start().await;
@@ -43,12 +43,12 @@ async fn gpus_are_read_and_the_least_busy_one_counts() {
     let load = async || http::get(&server.url("/load")).await.text().parse::<f64>().unwrap();
     until("the mean is that of the less busy GPU", async || (99.0..100.0).contains(&load().await)).await;
     let metrics = http::get(&server.url("/metrics")).await.text();
-    assert!(metrics.contains("machine_gpu_compute_percent{gpu=\"0\",name=\"Stand-in A\"} 100"), "{metrics}");
+    assert!(metrics.contains("webots_machine_gpu_compute_percent{gpu=\"0\",name=\"Stand-in A\"} 100"), "{metrics}");
 }
 
 #[actix_rt::test]
 async fn a_driver_that_hangs_or_is_missing_holds_up_nothing() {
-    let library = stand_in();
+    let library = gpu_driver();
     let (forge, webots) = (Forge::with_arm(), Webots::launcher());
     for hang in ["init", "read", "no driver"] {
         let mut server = with(library.path(), &forge, &webots).env("NVML_HANG", hang).start().await;

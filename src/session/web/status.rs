@@ -114,30 +114,30 @@ pub fn gauges<'text>(clients: usize, status: &FleetStatus) -> Vec<Gauge<'text>> 
     let every = [State::Unknown, State::Up, State::Full, State::Draining, State::Down];
     vec![
         Gauge::plain(
-            "session_available",
+            "webots_session_available",
             "1 while some simulation server can take a client",
             f64::from(u8::from(status.available)),
         ),
-        Gauge::plain("session_clients", "Web clients connected", number(clients)),
+        Gauge::plain("webots_session_clients", "Web clients connected", number(clients)),
         Gauge::plain(
-            "session_load_percent",
+            "webots_session_load_percent",
             "Mean load of the servers that answer, -1 where none does",
             displayed_mean_load(status.mean_load),
         ),
         Gauge {
-            name: "session_servers",
+            name: "webots_session_servers",
             help: "Simulation servers by state",
             labels: &["state"],
             values: every.iter().map(|one| (vec![one.word().to_owned()], number(count(*one)))).collect(),
         },
         Gauge {
-            name: "session_server_up",
+            name: "webots_session_server_up",
             help: "1 while a simulation server gives good answers",
             labels,
             values: of_each(&|server| Some(f64::from(u8::from(!matches!(server.state, State::Down | State::Unknown))))),
         },
         Gauge {
-            name: "session_server_load_percent",
+            name: "webots_session_server_load_percent",
             help: "Load that a simulation server reported last",
             labels,
             values: of_each(&|server| {
@@ -145,19 +145,19 @@ pub fn gauges<'text>(clients: usize, status: &FleetStatus) -> Vec<Gauge<'text>> 
             }),
         },
         Gauge {
-            name: "session_server_effective_load_percent",
+            name: "webots_session_server_effective_load_percent",
             help: "The same, and the clients that it can't show yet",
             labels,
             values: of_each(&|server| server.effective_load),
         },
         Gauge {
-            name: "session_server_in_flight",
+            name: "webots_session_server_in_flight",
             help: "Clients that were sent to a simulation server and have not come yet",
             labels,
             values: of_each(&|server| Some(number(server.in_flight))),
         },
         Gauge {
-            name: "session_server_latency_seconds",
+            name: "webots_session_server_latency_seconds",
             help: "Time in which a simulation server answered last",
             labels,
             values: of_each(&|server| server.latency.map(|latency| latency.as_secs_f64())),

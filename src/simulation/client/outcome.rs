@@ -47,12 +47,12 @@ impl Outcome {
     }
 }
 
-/// Makes the counter `simulation_starts_total`, with a zero for each outcome.
+/// Makes the counter `webots_simulation_starts_total`, with a zero for each outcome.
 ///
 /// # Errors
 /// When a counter of this name exists.
 pub fn counter(metrics: &Metrics) -> Result<IntCounterVec, prometheus::Error> {
-    let counter = metrics.counter("simulation_starts_total", "Simulations that were asked for", "outcome")?;
+    let counter = metrics.counter("webots_simulation_starts_total", "Simulations that were asked for", "outcome")?;
     for outcome in ALL {
         counter.with_label_values(&[outcome.label()]);
     }

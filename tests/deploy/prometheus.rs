@@ -1,0 +1,110 @@
+//! `deploy/prometheus`: what promtool says of it, and whether it names what the servers export.
+
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use regex::Regex;
+use serde_json::Value;
+
+use crate::simulation::readings;
+use crate::support::git::Forge;
+use crate::support::program::{session_server, simulation_server};
+use crate::support::webots::Webots;
+use crate::support::{http, needs, until};
+
+fn project(path: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join(path)
+}
+
+fn read(path: &str) -> String {
+    std::fs::read_to_string(project(path)).unwrap()
+}
+
+/// Runs promtool, which has to be content.
+fn promtool(arguments: &[&str], file: &Path) {
+    needs("promtool", "prometheus");
+    let output = Command::new("promtool").args(arguments).arg(file).output().unwrap();
+    assert!(output.status.success(), "promtool {arguments:?} {}: {output:?}", file.display());
+}
+
+/// The queries of the dashboard.
+fn queries() -> Vec<String> {
+    let dashboard: Value = serde_json::from_str(&read("deploy/prometheus/dashboard.json")).unwrap();
+    let panels = dashboard["panels"].as_array().unwrap();
+    let targets = panels.iter().flat_map(|panel| panel["targets"].as_array().unwrap());
+    targets.map(|target| target["expr"].as_str().unwrap().to_owned()).collect()
+}
+
+/// The metrics of servers that a text names.
+fn named(text: &str) -> BTreeSet<String> {
+    let metric = Regex::new("webots_(session|simulation|machine)_[a-z_]+").unwrap();
+    metric.find_iter(text).map(|found| found.as_str().to_owned()).collect()
+}
+
+/// The metrics of a page `/metrics`.
+fn exported(page: &str) -> BTreeSet<String> {
+    let samples = page.lines().filter(|line| !line.starts_with('#'));
+    samples.map(|line| line.split(['{', ' ']).next().unwrap().to_owned()).collect()
+}
+
+/// A histogram stands for its three metrics.
+fn without_histograms(metrics: BTreeSet<String>) -> BTreeSet<String> {
+    let plain = |name: String| {
+        let base = ["_bucket", "_sum", "_count"].iter().find_map(|end| name.strip_suffix(end));
+        base.map(str::to_owned).unwrap_or(name)
+    };
+    metrics.into_iter().map(plain).collect()
+}
+
+#[test]
+fn promtool_finds_no_fault_in_the_alerts_and_they_tell_the_fleets_that_are_not_well() {
+    promtool(&["check", "rules"], &project("deploy/prometheus/alerts.yml"));
+    promtool(&["check", "config"], &project("deploy/prometheus/prometheus.yml"));
+    promtool(&["test", "rules"], &project("tests/deploy/alerts.yml"));
+}
+
+#[test]
+fn the_queries_of_the_dashboard_are_some() {
+    let queries = queries();
+    assert!(queries.len() > 20, "{queries:?}");
+    let rule = |(number, query): (usize, &String)| format!("  - {{record: query_{number}, expr: '{query}'}}\n");
+    let rules: String = queries.iter().enumerate().map(rule).collect();
+    let file = tempfile::NamedTempFile::new().unwrap();
+    std::fs::write(file.path(), format!("groups:\n- name: dashboard\n  rules:\n{rules}")).unwrap();
+    promtool(&["check", "rules"], file.path());
+}
+
+#[actix_rt::test]
+async fn alerts_dashboard_and_docs_name_the_metrics_that_the_servers_export() {
+    let driver = readings::gpu_driver();
+    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
+    let simulation = simulation_server(&webots.path(), forge.path(), 1)
+        .env("LD_LIBRARY_PATH", driver.path().to_str().unwrap())
+        .start()
+        .await;
+    let session = session_server(&[simulation.address()]).start().await;
+    let metrics = async |url: String| exported(&http::get(&url).await.text());
+    let all = async || {
+        let mut all = metrics(session.url("/metrics")).await;
+        all.extend(metrics(simulation.url("/metrics")).await);
+        all
+    };
+    until("the server is up, and its GPUs are read", async || {
+        let all = all().await;
+        all.contains("webots_session_server_load_percent") && all.contains("webots_machine_gpu_compute_percent")
+    })
+    .await;
+    let all = all().await;
+    for name in &all {
+        assert!(name.starts_with("webots_"), "{name}");
+    }
+    for (what, text) in [("the alerts", read("deploy/prometheus/alerts.yml")), ("the dashboard", queries().join("\n"))]
+    {
+        let named = named(&text);
+        let unknown: Vec<&String> = named.difference(&all).collect();
+        assert!(named.len() > 5 && unknown.is_empty(), "{what}: {unknown:?} of {named:?}");
+    }
+    let docs = [read("docs/operations.md"), read("docs/operations-simulation.md")].join("\n");
+    assert_eq!(named(&docs), without_histograms(all), "the docs on the left");
+}
