@@ -16,6 +16,16 @@ pub fn one_line(text: &str) -> String {
     text.chars().map(visible).collect()
 }
 
+/// Returns a text as one line of at most so many letters, with `...` where it was cut.
+#[must_use]
+pub fn excerpt(text: &str, most: usize) -> String {
+    let mut excerpt: String = one_line(text).chars().take(most).collect();
+    if text.chars().nth(most).is_some() {
+        excerpt.push_str("...");
+    }
+    excerpt
+}
+
 /// Returns a text for a web client in one line, in which nothing begins a tag or a character reference of HTML.
 ///
 /// Webots' page puts such texts into `innerHTML`. Other clients show them as they are, so that the characters are replaced
@@ -40,6 +50,13 @@ mod tests {
         let text = "<img src=x onerror='alert(1)'>\n&lt;b&gt;";
         let shown = "\u{2039}img src=x onerror='alert(1)'\u{203a} \u{ff06}lt;b\u{ff06}gt;";
         assert_eq!(client_text(text), shown);
+    }
+
+    #[test]
+    fn an_excerpt_is_one_short_line() {
+        assert_eq!(excerpt("a\r\nBcc: x\u{7}\u{85}y", 500), "a  Bcc: x  y");
+        let long = excerpt(&"\u{e9}".repeat(600), 500);
+        assert_eq!((long.chars().count(), long.ends_with("\u{e9}...")), (503, true));
     }
 
     #[test]
