@@ -194,7 +194,14 @@ fn assemble(
     let (budget, mirrors) = (config.cache_size << 20, config.git_mirrors.clone());
     let runtime = tokio::runtime::Handle::current();
     let git = (mirrors, config.git_config.as_ref().map(|file| file.0.as_path()));
-    let checkouts = Checkouts::open(cache_dir, run.path(), budget, git, limits, runtime).map_err(cache_fault)?;
+    let rules = Rules {
+        allowed: config.allowed_repositories.clone(),
+        blocked: config.blocked_repositories.clone(),
+        docker: config.docker,
+        share_idle_time: config.share_idle_time,
+    };
+    let checkouts = Checkouts::open(cache_dir, run.path(), budget, git, rules.clone(), limits, runtime);
+    let checkouts = checkouts.map_err(cache_fault)?;
     let places = Places::new(config.streaming_ports(), config.waiting_line).start();
     let csv = config.monitor_log_enabled.then(|| config.log_dir.0.join("simulation/monitor.csv"));
     let (load_monitor, readings) = LoadMonitor::new(places.clone(), run.path(), csv);
@@ -204,12 +211,6 @@ fn assemble(
     }
     let metrics = Metrics::new();
     let starts = outcome::counter(&metrics)?;
-    let rules = Rules {
-        allowed: config.allowed_repositories.clone(),
-        blocked: config.blocked_repositories.clone(),
-        docker: config.docker,
-        share_idle_time: config.share_idle_time,
-    };
     let config = Arc::new(config);
     let problem = readiness::watch(Arc::clone(&config), run.path().to_owned());
     Ok(AppState {

@@ -1,12 +1,14 @@
 // The way from a world's URL to a running simulation: the simulation server's WebSocket, whose life is the lease.
 
+/** What comes before a step for the sake of the bar on Webots' page. */
+const STEP_FOR_WEBOTS = /^Step \d\/\d : /;
 const CHECKOUT_IS_OVER = /^webots\b/i;
 
 /** What somebody can do about a failure, in words. */
 export function advice(text) {
   const table = [
     [/no simulation server available/i, 'All simulation servers are busy or do not answer. Connect again when the light above is on.'],
-    [/not one of the repositories|no simulation server accepts|blocked repository|does not allow/i,
+    [/Docker not enabled|not one of the repositories|no simulation server accepts|blocked repository|does not allow/i,
       'Only worlds of allowed repositories run here: the monitor page of each simulation server lists them.'],
     [/idle time/i, 'Worlds of others run here only while the servers have little to do. Try again later.'],
     [/wrong .*URL|\bno URL\b/i, 'Copy the address of the world’s page on its forge, such as https://github.com/USER/REPOSITORY/blob/main/worlds/NAME.wbt.'],
@@ -82,6 +84,7 @@ export class Simulation extends EventTarget {
     if (text.startsWith('waiting for a place'))
       return;
     this.#step('place', 'done', 'taken');
+    text = text.replace(STEP_FOR_WEBOTS, '');
     if (this.#launched)
       this.#step('simulation', 'doing', text);
     else if (CHECKOUT_IS_OVER.test(text)) {

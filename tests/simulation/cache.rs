@@ -156,7 +156,7 @@ async fn a_repository_that_is_being_used_stays_and_goes_with_its_last_user_where
     let has = |server: &Server, name: &str| cached(server).iter().any(|path| path.to_string_lossy().contains(name));
     let server = start(1).await;
     let mut user = Client::start(&server, &arm()).await;
-    user.until("loading: checking main out").await;
+    user.until("loading: Step 8/9 : checking main out").await;
     // Others come and go.
     assert!(outcome(&server, &world("lab/leg", "main", "worlds/a.wbt")).await.contains("opened [leg]"));
     until("the other has gone", async || !has(&server, "lab-leg")).await;

@@ -247,7 +247,7 @@ async fn a_remote_that_hangs_costs_only_its_own_client() {
     let server = builder.set("timing.checkout", 3.0).start().await;
     let begin = Instant::now();
     let mut stuck = Client::start(&server, &world("lab/hangs", "main", "worlds/a.wbt")).await;
-    stuck.until("loading: looking for").await;
+    stuck.until("loading: Step 1/9 : looking for").await;
     let all = join_all((0..10).map(|_| async { outcome(&server, &arm()).await })).await;
     assert!(all.iter().all(|told| told.contains("opened [WorldInfo")), "{all:?}");
     assert!(http::get(&server.url("/load")).await.text().parse::<f64>().is_ok());
@@ -322,7 +322,7 @@ async fn equal_checkouts_are_done_once_and_a_cached_start_fetches_nothing() {
     // A client that waits alone ends git when it leaves.
     forge.commit("lab/arm", "main", &[("worlds/a.wbt", &world_text("once more"))]);
     let mut impatient = Client::start(&server, &arm()).await;
-    impatient.until("loading: looking for").await;
+    impatient.until("loading: Step 1/9 : looking for").await;
     until("it fetches", async || count("fetch") == 4).await;
     impatient.leave().await;
     nothing_left(&server, 6).await;
@@ -336,10 +336,16 @@ async fn progress_moves_in_percent() {
     );
     let server = simulation_server(&webots.path(), forge.path(), 1).env("PATH", &wrapper.path()).start().await;
     let mut client = Client::start(&server, &arm()).await;
-    for percent in [10, 35, 60, 85] {
-        client.until(&format!("loading: fetching https://github.com/lab/arm: Receiving objects: {percent}%")).await;
+    // Of a step, Webots' page reads one digit before the slash and one after it.
+    client.until("loading: Step 1/9 : looking for").await;
+    for (step, percent) in [(2, 10), (3, 35), (5, 60), (6, 85)] {
+        let words =
+            format!("loading: Step {step}/9 : fetching https://github.com/lab/arm: Receiving objects: {percent}%");
+        client.until(&words).await;
     }
+    client.until("loading: Step 8/9 : checking main out").await;
     client.until("loading: checkout done").await;
+    client.until("loading: webots").await;
 }
 
 #[actix_rt::test]
@@ -357,7 +363,7 @@ async fn a_kill_in_the_middle_of_a_fetch_harms_no_later_start() {
     for victim in ["git", "server"] {
         let mut server = start().env("PATH", &slow.path()).start().await;
         let mut client = Client::start(&server, &arm()).await;
-        client.until("loading: fetching https://github.com/lab/arm: halted").await;
+        client.until("loading: Step 2/9 : fetching https://github.com/lab/arm: halted").await;
         if victim == "git" {
             let marked = instances_below(folder.path());
             let leads = |pid: i32| nix::unistd::getpgid(Some(Pid::from_raw(pid))) == Ok(Pid::from_raw(pid));
@@ -575,12 +581,64 @@ async fn git_is_bounded_in_memory_and_in_what_it_writes() {
     forge.commit_work_tree("lab/arm", "main");
     let listed = git(&forge.path().join("lab/arm"), &["cat-file", "-s", "main:a.txt"]);
     assert_eq!(listed.trim(), text.len().to_string());
-    let wrapper = GitWrapper::new("echo \"limit $(ulimit -d)\" >&2");
-    let builder = simulation_server(&webots.path(), forge.path(), 1).env("PATH", &wrapper.path());
-    let server = builder.set("projectSize", 1).start().await;
+    let server = simulation_server(&webots.path(), forge.path(), 1).set("projectSize", 1).start().await;
     assert_eq!(outcome(&server, &arm()).await, "loading: Error: The project is larger than 1 MiB");
-    let wrapper = GitWrapper::new("[ $(ulimit -d) = 2097152 ] || { echo 'fatal: no limit' >&2; exit 128; }");
+    let wrapper = GitWrapper::new("[ $(ulimit -d) -le 2097152 ] || { echo 'fatal: no limit' >&2; exit 128; }");
     let server = simulation_server(&webots.path(), forge.path(), 1).env("PATH", &wrapper.path()).start().await;
     let told = outcome(&server, &arm()).await;
     assert!(told.contains("opened"), "{told}");
+}
+
+#[actix_rt::test]
+async fn what_is_too_much_costs_once_and_not_once_for_each_client() {
+    let (forge, webots) = (Forge::new(), reader());
+    let worlds: Vec<String> = (0..24).map(|number| format!("worlds/{number}.wbt")).collect();
+    let work = forge.work_tree("lab/many", "main");
+    std::fs::create_dir_all(work.join("worlds")).unwrap();
+    for path in worlds.iter().cloned().chain((0..10_001).map(|number| format!("worlds/{number}.txt"))) {
+        std::fs::write(work.join(path), "").unwrap();
+    }
+    forge.commit_work_tree("lab/many", "main");
+    // Small as it is listed, and four times as large as it is written.
+    let work = forge.work_tree("lab/grows", "main");
+    std::fs::create_dir_all(work.join("worlds")).unwrap();
+    for path in &worlds {
+        std::fs::write(work.join(path), world_text("grows")).unwrap();
+    }
+    std::fs::write(work.join("a.txt"), "0123456789\n".repeat(50_000)).unwrap();
+    forge.commit_work_tree("lab/grows", "main");
+    std::fs::write(work.join(".gitattributes"), "*.txt working-tree-encoding=UTF-32LE\n").unwrap();
+    git(&work, &["add", ".gitattributes"]);
+    git(&work, &["commit", "--quiet", "--message", "attributes"]);
+    git(&work, &["push", "--quiet", "origin", "main"]);
+    forge.commit("lab/branches", "main", &[("worlds/a.wbt", &world_text("branches"))]);
+    let wrapper = GitWrapper::new(
+        "case \"$*\" in *ls-remote*lab/branches*) echo 'fatal: Out of memory, malloc failed (tried to allocate 9 bytes)' >&2; exit 128;; esac",
+    );
+    let builder = simulation_server(&webots.path(), forge.path(), 24).env("PATH", &wrapper.path());
+    let server = builder.set("projectSize", 1).start().await;
+    let count = |what: &str| wrapper.calls().iter().filter(|call| call.split(' ').any(|word| word == what)).count();
+    let all = async |repository: &str| {
+        let ask = |path: &String| {
+            let url = world(repository, "main", path);
+            let server = &server;
+            async move { outcome(server, &url).await }
+        };
+        join_all(worlds.iter().map(ask)).await
+    };
+    let told = all("lab/many").await;
+    assert!(
+        told.iter().all(|told| told == "loading: Error: The project has more than 10000 files and folders"),
+        "{told:?}"
+    );
+    // Each asks whether it is there, and one is answered.
+    assert!(count("ls-tree") <= worlds.len() + 1, "it was listed {} times", count("ls-tree"));
+    let told = all("lab/grows").await;
+    assert!(told.iter().all(|told| told == "loading: Error: The project is larger than 1 MiB"), "{told:?}");
+    let at_once = 2 * std::thread::available_parallelism().unwrap().get();
+    assert!((1..=at_once).contains(&count("checkout")), "{} copies were made", count("checkout"));
+    let before = count("ls-remote");
+    let told = all("lab/branches").await;
+    assert!(told.iter().all(|told| told.contains("takes more memory than this simulation server allows")), "{told:?}");
+    assert!(count("ls-remote") - before <= 4, "{} times its forge was asked", count("ls-remote") - before);
 }

@@ -47,9 +47,9 @@ async fn a_fetch_that_hangs_holds_up_nobody_who_needs_no_fetch_and_others_only_f
     ask(&main, "main").await;
     // The same commit is fetched once, for whatever world, also when the first has left.
     let mut heir = Client::start(&server, &world("lab/arm", "slow", "worlds/b.wbt")).await;
-    heir.until("loading: looking for").await;
+    heir.until("loading: Step 1/9 : looking for").await;
     let mut next = Client::start(&server, &world("lab/arm", "one", "worlds/a.wbt")).await;
-    next.until("loading: fetching https://github.com/lab/arm: waiting for another fetch").await;
+    next.until("loading: Step 2/9 : fetching https://github.com/lab/arm: waiting for another fetch").await;
     assert_eq!(fetches(&slow), 1);
     stuck.send("nothing that is known").await;
     stuck.until("loading: Error:").await;
@@ -94,9 +94,9 @@ async fn a_slow_fetch_goes_on_for_who_came_later_for_another_world_of_the_same_c
     let builder = simulation_server(&webots.path(), forge.path(), 2).env("PATH", &wrapper.path());
     let server = builder.set("timing.checkout", 8).start().await;
     let mut first = Client::start(&server, &world("lab/arm", "main", "worlds/a.wbt")).await;
-    first.until("loading: fetching https://github.com/lab/arm: Receiving objects: 11%").await;
+    first.until("loading: Step 2/9 : fetching https://github.com/lab/arm: Receiving objects: 11%").await;
     let mut second = Client::start(&server, &world("lab/arm", "main", "worlds/b.wbt")).await;
-    second.until("loading: fetching https://github.com/lab/arm: Receiving objects: 1").await;
+    second.until("loading: Step 2/9 : fetching https://github.com/lab/arm: Receiving objects: 1").await;
     assert!(first.until("loading: Error:").await.contains("took longer than 8 seconds"));
     let told = second.until("loading: Error:").await;
     assert!(told.contains("opened [main]"), "{told}");
@@ -142,15 +142,15 @@ async fn a_commit_by_several_names_is_fetched_once() {
     let builder = simulation_server(&webots.path(), forge.path(), 3).env("PATH", &wrapper.path());
     let server = builder.set("timing.checkout", 9).start().await;
     let mut first = Client::start(&server, &world("lab/arm", "main", "worlds/a.wbt")).await;
-    first.until("loading: fetching https://github.com/lab/arm: Receiving objects: 1%").await;
+    first.until("loading: Step 2/9 : fetching https://github.com/lab/arm: Receiving objects: 1%").await;
     let mut others = [
         Client::start(&server, &world("lab/arm", "v1", "worlds/a.wbt")).await,
         Client::start(&server, &world("lab/arm", hash.trim(), "worlds/b.wbt")).await,
     ];
     for other in &mut others {
-        other.until("loading: fetching https://github.com/lab/arm: Receiving objects: ").await;
+        other.until("loading: Step 2/9 : fetching https://github.com/lab/arm: Receiving objects: ").await;
     }
-    first.until("loading: fetching https://github.com/lab/arm: Receiving objects: 8%").await;
+    first.until("loading: Step 2/9 : fetching https://github.com/lab/arm: Receiving objects: 8%").await;
     first.send("nothing that is known").await;
     for other in &mut others {
         let told = other.until("loading: Error:").await;

@@ -22,7 +22,8 @@ struct Https {
 }
 
 impl Https {
-    /// Serves the forge's repositories. What is below `/private` wants a password, `/away` is said to be at `elsewhere`.
+    /// Serves the forge's repositories. What is below `/private` wants a password, `/away` is said to be at `elsewhere`,
+    /// and `/old-NAME` at NAME of the same owner or, where that has two dashes, at that of another.
     fn new(forge: Forge, elsewhere: String) -> Self {
         let listener = TcpListener::bind("127.0.0.1:0").unwrap();
         let port = listener.local_addr().unwrap().port();
@@ -78,6 +79,9 @@ fn answer(socket: TcpStream, config: Arc<ServerConfig>, root: &Path, elsewhere: 
         ("Status: 401 Unauthorized\r\nWWW-Authenticate: Basic realm=\"x\"".to_owned(), Vec::new())
     } else if path.starts_with("/lab/away") {
         (format!("Status: 302 Found\r\nLocation: {elsewhere}{target}"), Vec::new())
+    } else if let Some(name) = target.strip_prefix("/lab/old-") {
+        let there = name.split_once("--").map_or(format!("/lab/{name}"), |(owner, name)| format!("/{owner}/{name}"));
+        (format!("Status: 301 Moved Permanently\r\nLocation: {there}"), Vec::new())
     } else {
         let mut backend = Command::new("git");
         backend.arg("http-backend").env("GIT_PROJECT_ROOT", root).env("GIT_HTTP_EXPORT_ALL", "1");
@@ -103,15 +107,19 @@ fn answer(socket: TcpStream, config: Arc<ServerConfig>, root: &Path, elsewhere: 
 }
 
 #[actix_rt::test]
-async fn a_forge_is_asked_over_https_and_nothing_else() {
+async fn a_forge_is_asked_over_https_and_followed_nowhere_else() {
     let (forge, webots) = (Forge::new(), reader());
     let old = forge.commit("lab/arm", "main", &[("worlds/a.wbt", &world_text("old"))]);
     forge.commit("lab/arm", "main", &[("worlds/a.wbt", &world_text("new"))]);
+    for hidden in ["lab/secret", "other/arm"] {
+        forge.commit(hidden, "main", &[("worlds/a.wbt", &world_text("hidden"))]);
+    }
     git(&forge.path().join("lab/arm"), &["config", "uploadpack.allowFilter", "true"]);
     let plain = TcpListener::bind("127.0.0.1:0").unwrap();
     plain.set_nonblocking(true).unwrap();
     let https = Https::new(forge, format!("https://{}", plain.local_addr().unwrap()));
-    let server = https.server(&webots).env("GIT_SSL_CAINFO", https.certificate().to_str().unwrap()).start().await;
+    let server = https.server(&webots).env("GIT_SSL_CAINFO", https.certificate().to_str().unwrap());
+    let server = server.set("blockedRepositories", serde_json::json!(["https://github.com/lab/secret"])).start().await;
     let missing = "does not exist or is not public";
     let table = [
         (world("lab/arm", "main", "worlds/a.wbt"), "opened [new]"),
@@ -121,7 +129,20 @@ async fn a_forge_is_asked_over_https_and_nothing_else() {
         // Nobody is asked for a password.
         (world("lab/private", "main", "worlds/a.wbt"), missing),
         // Nobody is led elsewhere.
-        (world("lab/away", "main", "worlds/a.wbt"), "https://github.com/lab/away has moved"),
+        (world("lab/away", "main", "worlds/a.wbt"), "https://github.com/lab/away has moved to another host"),
+        // A repository that has moved within its forge is found, also in several steps, and by its commits.
+        (world("lab/old-arm", "main", "worlds/a.wbt"), "opened [new]"),
+        (world("lab/old-old-old-arm", "main", "worlds/a.wbt"), "opened [new]"),
+        (world("lab/old-arm", &old, "worlds/a.wbt"), "opened [old]"),
+        (world("lab/old-none", "main", "worlds/a.wbt"), "https://github.com/lab/none does not exist"),
+        // It is not where it would not be taken from by its own name, nor where nothing ends.
+        (
+            world("lab/old-lab--secret", "main", "worlds/a.wbt"),
+            "from blocked repository: https://github.com/lab/secret",
+        ),
+        (world("lab/old-other--arm", "main", "worlds/a.wbt"), "and https://github.com/other/arm is not one of them"),
+        (world("lab/old-private", "main", "worlds/a.wbt"), "https://github.com/lab/private does not exist"),
+        (world(&format!("lab/{}arm", "old-".repeat(9)), "main", "worlds/a.wbt"), "has moved again and again"),
     ];
     for (url, words) in table {
         let told = outcome(&server, &url).await;

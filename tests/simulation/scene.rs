@@ -86,7 +86,7 @@ impl Scene {
             State::Connected => {}
             State::Waiting => assert_eq!(client.until("queue:").await, "queue: 0"),
             State::CheckingOut => {
-                client.until("loading: looking for").await;
+                client.until("loading: Step 1/9 : looking for").await;
                 let folder = self.folder.path();
                 until("git runs", async || instances_below(folder).iter().any(|one| one.1.contains("ls-remote"))).await;
             }

@@ -99,7 +99,7 @@ async fn visit(server: &Server, visits: usize) {
         while next.get() < visits {
             let number = next.replace(next.get() + 1);
             let mut client = Client::start(server, &url).await;
-            client.until(if number % 5 == 4 { "loading: checking" } else { "webots:" }).await;
+            client.until(if number % 5 == 4 { "loading: Step 8/9 : checking" } else { "webots:" }).await;
             client.leave().await;
         }
     };

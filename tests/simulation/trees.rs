@@ -90,7 +90,7 @@ fn nest(folder: &Path, levels: usize) {
 #[actix_rt::test]
 async fn a_tree_of_20_000_nested_folders_is_removed_and_ends_nobody_elses_simulation() {
     let (forge, webots) = (Forge::with_arm(), Webots::launcher());
-    let server = simulation_server(&webots.path(), forge.path(), 2).start().await;
+    let server = simulation_server(&webots.path(), forge.path(), 2).files(1024).start().await;
     let mut client = Client::start(&server, &arm()).await;
     client.until("webots:").await;
     let folder = instance_folders(&server.folder).remove(0);

@@ -98,6 +98,20 @@ impl ProjectUrl {
         Ok(Self { host, segments, repository, reference, kind, owner })
     }
 
+    /// The same world in the repository at this URL.
+    ///
+    /// # Errors
+    /// When that is no URL of a repository.
+    pub fn in_repository(&self, url: &str) -> Result<Self, NoProject> {
+        let (host, mut segments) = split_url(url)?;
+        let name = segments.last_mut().ok_or_else(|| no_project("it names no repository"))?;
+        *name = without_git(name)?;
+        let repository = segments.len();
+        let reference = repository + self.reference.saturating_sub(self.repository);
+        segments.extend(self.segments.iter().skip(self.repository).cloned());
+        Ok(Self { host, segments, repository, reference, kind: self.kind })
+    }
+
     /// The forge, in small letters, with its port where that is not 443.
     #[must_use]
     pub fn host(&self) -> &str {

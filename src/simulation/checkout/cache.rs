@@ -19,6 +19,7 @@ use super::growth::Growth;
 use super::limits::Limits;
 use super::mirrors::Remote;
 use super::repository::Repository;
+use crate::simulation::process::remove_tree;
 
 /// The cached repositories of a server.
 #[derive(Debug)]
@@ -148,7 +149,8 @@ impl Cache {
 }
 
 fn remove(folder: &Path) {
-    if let Err(error) = std::fs::remove_dir_all(folder) {
+    // A branch's name may have a thousand levels of folders.
+    if let Err(error) = remove_tree(folder) {
         log::warn!("{} can't be removed: {error}", folder.display());
     }
 }

@@ -6,7 +6,7 @@
 use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use actix::prelude::*;
 use tokio::runtime::Handle;
@@ -16,16 +16,18 @@ use tokio_util::task::AbortOnDropHandle;
 use super::cache::Cache;
 use super::cache_dir::CacheDir;
 use super::copy::{Copied, What, copy_call, look, what};
-use super::disk::{blocking, size_of};
+use super::disk::outgrown;
 use super::error::{CheckoutError, git_failed, machine, too_large, too_slow};
 use super::finder::{Finder, Found};
 use super::git::Git;
 use super::lfs::{self, Pointer};
 use super::limits::Limits;
 use super::mirrors::Mirrors;
+use super::redirect;
 use super::revision::{ALL, Revision};
+use super::steps;
 use super::world_file::{NoWorld, WorldFile};
-use crate::shared::domain::ProjectUrl;
+use crate::shared::domain::{ProjectUrl, Rules};
 use crate::simulation::process::InstanceDir;
 
 /// Checks worlds out; one for the whole server.
@@ -39,9 +41,6 @@ pub struct Checkouts {
     copies: Semaphore,
     _keeps_within_budget: AbortOnDropHandle<()>,
 }
-
-/// Time between two looks at how much a copy has written.
-const BETWEEN_LOOKS: Duration = Duration::from_millis(500);
 
 /// A step of a checkout, in words.
 #[derive(Message)]
@@ -68,7 +67,8 @@ pub struct Project {
 
 impl Checkouts {
     /// Prepares checkouts on the thread whose runtime this is. `run` is the folder of this run of the server; the
-    /// cached repositories may take `budget` bytes; `config` is a file of settings for git.
+    /// cached repositories may take `budget` bytes; `config` is a file of settings for git; `rules` say where a forge may
+    /// send to.
     ///
     /// # Errors
     /// When the cache can't be made.
@@ -77,12 +77,13 @@ impl Checkouts {
         run: &Path,
         budget: u64,
         (mirrors, config): (Mirrors, Option<&Path>),
+        rules: Rules,
         limits: Limits,
         runtime: Handle,
     ) -> io::Result<Self> {
         let git = Arc::new(Git::new(run, config));
         let cache = Arc::new(Cache::open(dir, budget, Arc::clone(&git), limits)?);
-        let finder = Arc::new(Finder::new(Arc::clone(&git), Arc::clone(&cache), mirrors, limits));
+        let finder = Arc::new(Finder::new(Arc::clone(&git), Arc::clone(&cache), (mirrors, rules), limits));
         let keeper = AbortOnDropHandle::new(runtime.spawn(Arc::clone(&cache).keep_within_budget()));
         let cores = std::thread::available_parallelism().map_or(2, usize::from);
         let copies = Semaphore::new(2 * cores);
@@ -112,21 +113,28 @@ impl Checkouts {
         progress: impl Fn(String) + Send + Sync,
     ) -> Result<Project, CheckoutError> {
         let start = Instant::now();
-        let checked_out = match self.attempt(world, &instance, &progress).await {
-            Err(error) => {
-                self.mend(world, start, error).await?;
-                self.attempt(world, &instance, &progress).await
+        let (mut world, mut redirects, mut is_mended) = (world.clone(), 0, false);
+        let checked_out = loop {
+            match self.attempt(&world, &instance, &progress).await {
+                Err(CheckoutError::Moved(..)) if redirects < redirect::MOST => {
+                    redirects += 1;
+                    world = self.finder.moved(&world).await?;
+                }
+                Err(error) if !is_mended => {
+                    is_mended = true;
+                    self.mend(&world, start, error).await?;
+                }
+                done => break done,
             }
-            done => done,
         };
         let (revision, Copied { pointers, has_lfs, world: file, place, .. }) = checked_out?;
         let file = file?;
         let warning = (!pointers.is_empty()).then(|| lfs::warning(pointers.len(), has_lfs));
-        progress("checkout done".to_owned());
+        progress(steps::DONE.to_owned());
         Ok(Project {
             world: file,
             warnings: warning.into_iter().collect(),
-            url: world.clone(),
+            url: world,
             folder: instance.project().join(&revision.folder),
             place: place.unwrap_or_else(|| revision.folder.clone()),
             revision,
@@ -170,7 +178,7 @@ impl Checkouts {
             copied = look(world, instance, &found.revision).await?;
         }
         if copied.size > self.limits.size {
-            return Err(too_large("The project".to_owned(), self.limits.size));
+            return self.refuse(&found, &needed);
         }
         Ok((found.revision.clone(), copied))
     }
@@ -185,34 +193,32 @@ impl Checkouts {
         progress: &(impl Fn(String) + Send + Sync),
     ) -> Result<(), CheckoutError> {
         let _turn = self.copies.acquire().await.map_err(|error| machine(world, &io::Error::other(error)))?;
-        let tree = instance.project();
-        progress(format!("checking {} out", found.revision.name));
+        self.finder.refused().check(&needed.scope(found))?;
+        let name = &found.revision.name;
+        progress(steps::checking_out(name, None));
         let call = copy_call(&found.repository, &found.revision, instance, needed);
         let told = |line: &str| {
             if line.contains('%') {
-                progress(line.to_owned());
+                progress(steps::checking_out(name, Some(line)));
             }
         };
         let mut is_too_large = false;
         let end = async {
-            while blocking({
-                let tree = tree.clone();
-                move || Ok(size_of(&tree))
-            })
-            .await
-            .unwrap_or(0)
-                <= self.limits.size
-            {
-                actix_rt::time::sleep(BETWEEN_LOOKS).await;
-            }
+            outgrown(&instance.project(), self.limits.size).await;
             is_too_large = true;
         };
         let copied = self.git.run_until(end, call, told).await;
         if is_too_large {
             // What is in the commit may be smaller than what git's attributes make of it.
-            return Err(too_large("The project".to_owned(), self.limits.size));
+            return self.refuse(found, needed);
         }
         copied.map(drop).map_err(|source| git_failed(world, source))
+    }
+
+    /// Refuses what was copied of a commit: it is too large, and so it is for everybody else.
+    fn refuse<T>(&self, found: &Found, needed: &What<'_>) -> Result<T, CheckoutError> {
+        let refusal = too_large("The project".to_owned(), self.limits.size);
+        self.finder.refused().note(needed.scope(found), Err(refusal))
     }
 
     /// Loads the files that the project keeps in Git LFS. Those that can't be had stay pointers.
@@ -228,7 +234,7 @@ impl Checkouts {
         if pointers.iter().fold(0_u64, |sum, pointer| sum.saturating_add(pointer.size)) > self.limits.size {
             return Err(too_large("What the project keeps in Git LFS".to_owned(), self.limits.size));
         }
-        progress(format!("loading {} files from Git LFS", pointers.len()));
+        progress(steps::loading_large(pointers.len()));
         for Pointer { path, .. } in pointers {
             // git writes again only what is not there.
             tokio::fs::remove_file(path).await.map_err(|error| machine(world, &error))?;

@@ -8,6 +8,7 @@ use super::error::{CheckoutError, machine};
 use super::finder::Found;
 use super::git::Call;
 use super::lfs::{self, Pointer};
+use super::refused::Scope;
 use super::repository::Repository;
 use super::revision::{ALL, Revision};
 use super::world_file::{self, NoWorld, WorldFile};
@@ -36,6 +37,18 @@ pub enum What<'path> {
     Path(&'path str),
     /// The paths in this file, each ended by a zero byte.
     Listed(PathBuf),
+}
+
+impl What<'_> {
+    /// What a refusal of this is of.
+    #[must_use]
+    pub fn scope(&self, found: &Found) -> Scope {
+        let folder = match self {
+            Self::Path(path) => *path,
+            Self::Listed(_) => found.revision.needed(),
+        };
+        Scope::folder(found.repository.remote(), &found.revision, folder)
+    }
 }
 
 /// Says what is copied of a commit for a client: the project's folder, and the files of the folders above it.

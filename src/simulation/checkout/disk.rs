@@ -3,6 +3,12 @@
 use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use crate::simulation::process::remove_tree;
+
+/// Time between two looks at how much was written.
+const BETWEEN_LOOKS: Duration = Duration::from_millis(500);
 
 /// Does file work on a thread that serves nobody.
 ///
@@ -29,7 +35,7 @@ pub fn remove_leftovers(repository: &Path) -> io::Result<()> {
 /// # Errors
 /// When that can't be done.
 pub fn remove_all(folders: &[&Path]) -> io::Result<()> {
-    folders.iter().try_for_each(|folder| absent(fs::remove_dir_all(folder)))
+    folders.iter().try_for_each(|folder| remove_tree(folder))
 }
 
 /// What is not there need not be removed.
@@ -62,6 +68,17 @@ fn files(folder: &Path) -> impl Iterator<Item = PathBuf> + use<> {
 
 fn length(file: &Path) -> u64 {
     file.metadata().map_or(0, |about| about.len())
+}
+
+/// Waits until the files below a folder have more bytes than this.
+pub async fn outgrown(folder: &Path, size: u64) {
+    loop {
+        let folder = folder.to_owned();
+        if blocking(move || Ok(size_of(&folder))).await.is_ok_and(|found| found > size) {
+            return;
+        }
+        actix_rt::time::sleep(BETWEEN_LOOKS).await;
+    }
 }
 
 /// The bytes of all files below a folder.

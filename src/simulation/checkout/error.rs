@@ -20,8 +20,8 @@ pub enum CheckoutError {
     #[error("{0} does not exist or is not public")]
     NoRepository(String),
     /// Its forge sends elsewhere.
-    #[error("{0} has moved. This simulation server follows no forge elsewhere: give the URL of where it is now")]
-    Moved(String),
+    #[error("{0} has moved {1}")]
+    Moved(String, String),
     /// The reference is not there.
     #[error("{repository} has no branch, tag or commit called {reference:?}")]
     NoReference {
@@ -63,6 +63,14 @@ pub enum CheckoutError {
         /// The limit.
         limit: u64,
     },
+    /// It takes more of git, or of this server, than is allowed.
+    #[error("{repository} takes more memory than this simulation server allows: {source}")]
+    TooMuch {
+        /// The repository's URL.
+        repository: String,
+        /// What git says.
+        source: GitError,
+    },
     /// git failed.
     #[error("{repository} can't be checked out: {source}")]
     Git {
@@ -87,6 +95,14 @@ pub enum CheckoutError {
     NoController(String),
 }
 
+impl CheckoutError {
+    /// Whether it is because of a size, which is the same for everybody who wants the same.
+    #[must_use]
+    pub fn is_of_size(&self) -> bool {
+        matches!(self, Self::TooMany(_) | Self::TooLarge { .. } | Self::TooMuch { .. })
+    }
+}
+
 /// The world's URL names nothing that is there.
 #[must_use]
 pub fn no_reference(world: &ProjectUrl) -> CheckoutError {
@@ -101,7 +117,8 @@ pub fn git_failed(world: &ProjectUrl, source: GitError) -> CheckoutError {
     match source.cause() {
         Cause::NoRepository => CheckoutError::NoRepository(repository),
         Cause::NoCommit => no_reference(world),
-        Cause::Moved => CheckoutError::Moved(repository),
+        Cause::Moved => CheckoutError::Moved(repository, "again and again".to_owned()),
+        Cause::TooMuch => CheckoutError::TooMuch { repository, source },
         Cause::Damaged => CheckoutError::Damaged { repository, source },
         Cause::Other => CheckoutError::Git { repository, source },
     }

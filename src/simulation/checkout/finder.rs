@@ -13,12 +13,15 @@ use super::git_error::GitError;
 use super::limits::Limits;
 use super::listing::Listing;
 use super::mirrors::{Mirrors, Remote};
+use super::redirect;
+use super::refused::{Refused, Scope};
 use super::repository::Repository;
 use super::revision::{self, Revision, Voucher};
 use super::search::Search;
 use super::single_flight::SingleFlight;
+use super::steps;
 use super::world_file::NoWorld;
-use crate::shared::domain::ProjectUrl;
+use crate::shared::domain::{ProjectUrl, Rules};
 
 /// Finds commits; one for the whole server.
 #[derive(Debug)]
@@ -26,10 +29,12 @@ pub struct Finder {
     git: Arc<Git>,
     cache: Arc<Cache>,
     mirrors: Mirrors,
+    rules: Rules,
     limits: Limits,
     /// How many answers are read at a time.
     answers: Semaphore,
     searches: SingleFlight<ProjectUrl, Result<Arc<Found>, CheckoutError>>,
+    refused: Refused,
 }
 
 /// How many answers of git about commits are read at a time.
@@ -59,8 +64,9 @@ enum Answer {
 impl Finder {
     /// Finds commits by `git`, and keeps them in `cache`.
     #[must_use]
-    pub fn new(git: Arc<Git>, cache: Arc<Cache>, mirrors: Mirrors, limits: Limits) -> Self {
-        Self { git, cache, mirrors, limits, answers: Semaphore::new(ANSWERS), searches: SingleFlight::default() }
+    pub fn new(git: Arc<Git>, cache: Arc<Cache>, (mirrors, rules): (Mirrors, Rules), limits: Limits) -> Self {
+        let (answers, searches, refused) = (Semaphore::new(ANSWERS), SingleFlight::default(), Refused::default());
+        Self { git, cache, mirrors, rules, limits, answers, searches, refused }
     }
 
     /// Waits for a world's commit to be in the cache, together with everybody who waits for the same.
@@ -77,10 +83,19 @@ impl Finder {
         self.searches.join(world.clone(), progress, search).await
     }
 
+    /// The world in the repository to which its forge sends.
+    ///
+    /// # Errors
+    /// When that may not be followed.
+    pub async fn moved(&self, world: &ProjectUrl) -> Result<ProjectUrl, CheckoutError> {
+        let repository = self.repository(world).await?;
+        redirect::follow(&self.git, &repository, (&self.mirrors, &self.rules), world).await
+    }
+
     /// The first of the commits that a URL may mean in which its world is.
     async fn search(&self, world: &ProjectUrl, told: &watch::Sender<String>) -> Result<Found, CheckoutError> {
         let progress = |step| drop(told.send_replace(step));
-        progress(format!("looking for {}", world.repository()));
+        progress(steps::looking_for(&world.repository()));
         let repository = self.repository(world).await?;
         let search = self.with(world, &repository, &progress);
         let mut missing = None;
@@ -89,6 +104,9 @@ impl Finder {
                 continue;
             };
             let path = revision.world_path(world);
+            if listing.has_world {
+                self.check(&repository, &revision, &listing)?;
+            }
             if !listing.has_world && (listing.has_link || listing.entries == 0) {
                 match self.list(search, &revision.whole()).await {
                     Ok(Some(all)) if all.has_link => (revision, listing) = (revision.whole(), all),
@@ -101,7 +119,7 @@ impl Finder {
                 let answer = self.read(search, &revision, revision.above_arguments()).await?;
                 above = listing.add_files(&answer.unwrap_or_default());
             }
-            self.check(&listing)?;
+            self.check(&repository, &revision, &listing)?;
             // Where a link leads is seen in the checkout.
             if listing.has_world || listing.has_link {
                 return Ok(Found { repository, revision, above });
@@ -117,7 +135,8 @@ impl Finder {
         repository: &'job Arc<Repository>,
         progress: &'job (dyn Fn(String) + Send + Sync),
     ) -> Search<'job> {
-        Search { git: &self.git, cache: &self.cache, limits: &self.limits, world, repository, progress }
+        let (git, cache, limits, refused) = (&*self.git, &*self.cache, &self.limits, &self.refused);
+        Search { git, cache, limits, world, repository, refused, progress }
     }
 
     async fn repository(&self, world: &ProjectUrl) -> Result<Arc<Repository>, CheckoutError> {
@@ -134,8 +153,7 @@ impl Finder {
         if let Some(commit) = revision::commit_of(search.world, self.limits.any_commit) {
             return Ok(vec![commit]);
         }
-        let location = &search.repository.remote().location;
-        let answer = search.ask(revision::search_arguments(search.world, location)).await?;
+        let answer = search.ask().await?;
         let found = revision::found(search.world, &answer);
         match revision::short_hash_of(search.world) {
             Some(short) if found.is_empty() => search.commits(&short).await,
@@ -155,18 +173,27 @@ impl Finder {
     /// When it is too large for that.
     pub async fn check_whole(&self, world: &ProjectUrl, found: &Found) -> Result<(), CheckoutError> {
         let search = self.with(world, &found.repository, &drop);
-        let listing = self.list(search, &found.revision.whole()).await?;
-        self.check(&listing.unwrap_or_default())
+        let whole = found.revision.whole();
+        let listing = self.list(search, &whole).await?;
+        self.check(&found.repository, &whole, &listing.unwrap_or_default())
     }
 
-    fn check(&self, listing: &Listing) -> Result<(), CheckoutError> {
+    /// Whether what is listed of a revision may be checked out.
+    fn check(&self, repository: &Repository, revision: &Revision, listing: &Listing) -> Result<(), CheckoutError> {
+        let scope = Scope::folder(repository.remote(), revision, revision.needed());
         if listing.entries > self.limits.entries() {
-            return Err(CheckoutError::TooMany(self.limits.entries()));
+            return self.refused.note(scope, Err(CheckoutError::TooMany(self.limits.entries())));
         }
         if listing.size > self.limits.size {
-            return Err(too_large("The project".to_owned(), self.limits.size));
+            return self.refused.note(scope, Err(too_large("The project".to_owned(), self.limits.size)));
         }
         Ok(())
+    }
+
+    /// What was refused before.
+    #[must_use]
+    pub fn refused(&self) -> &Refused {
+        &self.refused
     }
 
     /// Whether there is a file at a path of a commit that was found before. It is fetched again if it has left the cache
@@ -218,14 +245,21 @@ impl Finder {
         revision: &Revision,
         arguments: Vec<OsString>,
     ) -> Result<Answer, CheckoutError> {
+        let scope = Scope::folder(repository.remote(), revision, revision.needed());
         let answer = {
-            // Each answer may be long: few are held at a time.
+            // Each answer may be long: few are read at a time.
+            let _listing = repository.may_list().await;
             let _turn = self.answers.acquire().await.map_err(|error| machine(world, &std::io::Error::other(error)))?;
-            repository.read(arguments).await
+            self.refused.check(&scope)?;
+            match repository.read(arguments).await {
+                Err(GitError::TooLong(_)) => {
+                    return self.refused.note(scope, Err(CheckoutError::TooMany(self.limits.entries())));
+                }
+                answer => answer,
+            }
         };
         match answer {
             Ok(text) => Ok(Answer::Text(text)),
-            Err(GitError::TooLong(_)) => Err(CheckoutError::TooMany(self.limits.entries())),
             Err(error @ GitError::NotStarted(_)) => Err(git_failed(world, error)),
             Err(error) if repository.read(revision.exists_arguments()).await.is_err() => {
                 log::debug!("{} is not in the cache: {error}", revision.commit);
@@ -240,10 +274,11 @@ impl Finder {
 
     async fn fetch(&self, search: Search<'_>, revision: &Revision) -> Result<(), CheckoutError> {
         let Search { world, repository, progress, .. } = search;
-        let tell = |step: String| progress(format!("fetching {}: {step}", world.repository()));
+        let tell = |said: String| progress(steps::fetching(&world.repository(), &said));
         let fetched = repository.fetch(&revision.wish(&repository.remote().location), &tell).await;
         let what = || format!("{} (at depth 1)", world.repository());
-        fetched.map_err(|error| fetch_failed(world, what, self.limits.size, error))
+        let fetched = fetched.map_err(|error| fetch_failed(world, what, self.limits.size, error));
+        self.refused.note(Scope::commit(repository.remote(), revision), fetched)
     }
 
     /// Throws away what is cached of a world's repository, unless it was made after `since`.

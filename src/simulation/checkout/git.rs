@@ -20,8 +20,10 @@ pub struct Git {
     /// The file with its settings, and what belongs into it.
     settings: (PathBuf, String),
     mark: PathBuf,
-    /// Programs that start it with less priority and within a limit of memory.
-    launchers: Vec<OsString>,
+    /// Whether there is a program that starts it with less priority.
+    has_nice: bool,
+    /// Whether there is one that starts it within a limit of memory.
+    has_prlimit: bool,
 }
 
 /// One git command.
@@ -35,6 +37,8 @@ pub struct Call<'call> {
     pub arguments: Vec<OsString>,
     /// The one protocol that it may use.
     pub protocol: &'static str,
+    /// How much memory it may take, in bytes, without the files that it maps.
+    pub memory: u64,
     /// Further variables.
     pub environment: Vec<(OsString, OsString)>,
 }
@@ -73,8 +77,8 @@ const SETTINGS: &str = "\
 	detachedHead = false
 ";
 
-/// How much memory a git process may take, in bytes, without the files that it maps.
-const MOST_MEMORY: u64 = 2 << 30;
+/// How much memory a git process may take at most.
+pub const MOST_MEMORY: u64 = 2 << 30;
 /// The most that is read of a command's answer, in bytes.
 const LARGEST_ANSWER: usize = 64 * 1024 * 1024;
 
@@ -86,10 +90,8 @@ impl Git {
         let quoted = |file: PathBuf| file.to_string_lossy().replace('\\', "\\\\").replace('"', "\\\"");
         let include = config.map(|file| format!("[include]\n\tpath = \"{}\"\n", quoted(file)));
         let settings = (run.join("gitconfig"), include.unwrap_or_default() + SETTINGS);
-        // Whoever watches over the servers, and whoever runs a simulation already, comes before a checkout.
-        let launchers = [vec!["nice".to_owned()], vec!["prlimit".to_owned(), format!("--data={MOST_MEMORY}")]];
-        let launchers = launchers.into_iter().filter(|words| words.first().is_some_and(|name| which(name).is_ok()));
-        Self { settings, mark: run.to_owned(), launchers: launchers.flatten().map(OsString::from).collect() }
+        let has = |name| which(name).is_ok();
+        Self { settings, mark: run.to_owned(), has_nice: has("nice"), has_prlimit: has("prlimit") }
     }
 
     /// Writes the settings, unless they are there as they should be.
@@ -154,7 +156,10 @@ impl Git {
     }
 
     fn spec(&self, call: Call<'_>) -> SpawnSpec {
-        let mut command = self.launchers.clone();
+        // Whoever watches over the servers, and whoever runs a simulation already, comes before a checkout.
+        let nice = self.has_nice.then(|| "nice".into());
+        let prlimit = self.has_prlimit.then(|| ["prlimit".into(), format!("--data={}", call.memory).into()]);
+        let mut command: Vec<OsString> = nice.into_iter().chain(prlimit.into_iter().flatten()).collect();
         command.extend(["git", "--literal-pathspecs", "--git-dir"].map(OsString::from));
         command.push(call.repository.into());
         command.extend(call.settings.into_iter().flat_map(|setting| ["-c".into(), setting.into()]));

@@ -32,6 +32,8 @@ pub enum Cause {
     NoCommit,
     /// The remote sends elsewhere.
     Moved,
+    /// It takes more memory than git may have, or more than is read of its answer.
+    TooMuch,
     /// The cached repository is broken.
     Damaged,
     /// Something else: the network, the remote, the machine.
@@ -47,6 +49,9 @@ const WORDS: &[(&str, Cause)] = &[
     ("returned error: 303", Cause::Moved),
     ("returned error: 307", Cause::Moved),
     ("returned error: 308", Cause::Moved),
+    ("Out of memory, ", Cause::TooMuch),
+    ("memory exhausted", Cause::TooMuch),
+    ("unable to create thread", Cause::TooMuch),
     ("could not read Username", Cause::NoRepository),
     ("not found", Cause::NoRepository),
     ("does not appear to be a git repository", Cause::NoRepository),
@@ -76,8 +81,10 @@ impl GitError {
     /// What the failure means.
     #[must_use]
     pub fn cause(&self) -> Cause {
-        let Self::Failed { ending: ExitReason::Code(_), message, .. } = self else {
-            return Cause::Other;
+        let message = match self {
+            Self::Failed { ending: ExitReason::Code(_), message, .. } => message,
+            Self::TooLong(_) => return Cause::TooMuch,
+            _ => return Cause::Other,
         };
         WORDS.iter().find(|(words, _)| message.contains(words)).map_or(Cause::Other, |(_, cause)| *cause)
     }
@@ -99,6 +106,7 @@ mod tests {
             ("fatal: packed object 9ed5 (stored in pack-1115.pack) is corrupt", Cause::Damaged),
             ("error: cannot lock ref 'refs/fleet/01': Unable to create '01.lock': File exists.", Cause::Damaged),
             ("error: unable to create file a: No space left on device", Cause::Other),
+            ("fatal: Out of memory, malloc failed (tried to allocate 9 bytes)", Cause::TooMuch),
             ("fatal: early EOF", Cause::Other),
         ] {
             assert_eq!(cause(message, ExitReason::Code(128)), expected, "{message}");

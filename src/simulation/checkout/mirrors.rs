@@ -41,18 +41,35 @@ impl Remote {
     }
 }
 
+/// The forge that needs no mirror.
+const GITHUB: &str = "https://github.com";
+
 /// What must be escaped in a path segment of a URL.
 const ESCAPED: &AsciiSet =
     &CONTROLS.add(b' ').add(b'"').add(b'#').add(b'%').add(b'<').add(b'>').add(b'?').add(b'`').add(b'{').add(b'}');
 
 impl Mirrors {
+    fn mirror(&self, world: &ProjectUrl) -> Option<&Mirror> {
+        self.0.iter().filter(|mirror| mirror.prefix.covers(world)).max_by_key(|mirror| mirror.prefix.depth())
+    }
+
+    /// The same world where its repository is cloned from this URL; nothing where none would be, from the same forge.
+    #[must_use]
+    pub fn moved(&self, world: &ProjectUrl, location: &str) -> Option<ProjectUrl> {
+        let mirror = self.mirror(world).map(|mirror| (mirror.prefix.as_str(), mirror.replacement.as_str()));
+        let (prefix, base) = mirror.unwrap_or((GITHUB, GITHUB));
+        let base = url::Url::parse(base).ok()?;
+        let rest = location.strip_prefix(base.as_str().trim_end_matches('/'))?.strip_prefix('/')?;
+        let moved = world.in_repository(&format!("{}/{rest}", prefix.trim_end_matches('/'))).ok()?;
+        let there = Remote { location: location.to_owned(), protocol: "https" };
+        (self.remote(&moved)?.key() == there.key()).then_some(moved)
+    }
+
     /// Where the repository of a world is cloned from; nothing for a forge that is neither GitHub nor in a mirror.
     #[must_use]
     pub fn remote(&self, world: &ProjectUrl) -> Option<Remote> {
-        let mirror =
-            self.0.iter().filter(|mirror| mirror.prefix.covers(world)).max_by_key(|mirror| mirror.prefix.depth());
-        let Some(Mirror { prefix, replacement }) = mirror else {
-            let location = format!("https://github.com/{}.git", escaped(world.repository_segments()));
+        let Some(Mirror { prefix, replacement }) = self.mirror(world) else {
+            let location = format!("{GITHUB}/{}.git", escaped(world.repository_segments()));
             return (world.host() == "github.com").then_some(Remote { location, protocol: "https" });
         };
         let rest = prefix.rest_of_repository(world);

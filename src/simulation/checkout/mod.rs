@@ -16,10 +16,13 @@ mod lfs;
 mod limits;
 mod listing;
 mod mirrors;
+mod redirect;
+mod refused;
 mod repository;
 mod revision;
 mod search;
 mod single_flight;
+mod steps;
 mod world_file;
 
 pub use cache_dir::CacheDir;

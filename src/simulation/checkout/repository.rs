@@ -7,11 +7,11 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
-use tokio::sync::{OwnedMutexGuard, watch};
+use tokio::sync::{AcquireError, MutexGuard, OwnedMutexGuard, Semaphore, SemaphorePermit, watch};
 use tokio_util::sync::CancellationToken;
 
 use super::disk::{blocking, packed, received, remove_all, remove_leftovers};
-use super::git::{Call, Git};
+use super::git::{Call, Git, MOST_MEMORY};
 use super::git_error::GitError;
 use super::growth::Growth;
 use super::limits::Limits;
@@ -29,6 +29,10 @@ pub struct Repository {
     growth: Arc<Growth>,
     /// Held by whoever changes the repository.
     turn: Arc<tokio::sync::Mutex<()>>,
+    /// Held by whoever asks the remote what it has.
+    asking: Semaphore,
+    /// Held by whoever reads what lies in a commit.
+    listing: tokio::sync::Mutex<()>,
     /// The fetches that are wanted, by the name of the wish.
     fetches: SingleFlight<String, Result<(), FetchError>>,
     /// When it was made, if this server has made it since it came into use.
@@ -65,6 +69,8 @@ enum Cut {
     Silent,
 }
 
+/// How many questions the remote is asked at a time: its answers may take memory.
+const QUESTIONS: usize = 4;
 /// Time between two looks at how much a fetch has brought.
 const BETWEEN_LOOKS: Duration = Duration::from_millis(200);
 
@@ -73,7 +79,8 @@ impl Repository {
     #[must_use]
     pub fn new(path: PathBuf, remote: Remote, git: Arc<Git>, limits: Limits, growth: Arc<Growth>) -> Self {
         let (turn, fetches, made) = (Arc::default(), SingleFlight::default(), Mutex::default());
-        Self { path, remote, git, limits, growth, turn, fetches, made }
+        let (asking, listing) = (Semaphore::new(QUESTIONS), tokio::sync::Mutex::default());
+        Self { path, remote, git, limits, growth, turn, asking, listing, fetches, made }
     }
 
     /// Where it is fetched from.
@@ -90,6 +97,7 @@ impl Repository {
             settings: Vec::new(),
             arguments,
             protocol: self.remote.protocol,
+            memory: MOST_MEMORY,
             environment: Vec::new(),
         }
     }
@@ -165,6 +173,19 @@ impl Repository {
                 }
             }
         }
+    }
+
+    /// Waits until the remote may be asked what it has.
+    ///
+    /// # Errors
+    /// Never: nobody closes the semaphore.
+    pub async fn may_ask(&self) -> Result<SemaphorePermit<'_>, AcquireError> {
+        self.asking.acquire().await
+    }
+
+    /// Waits until nobody else reads what lies in a commit: if that is too much, those who wait then know.
+    pub async fn may_list(&self) -> MutexGuard<'_, ()> {
+        self.listing.lock().await
     }
 
     /// Waits until nobody else changes the repository.

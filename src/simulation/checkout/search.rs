@@ -5,11 +5,16 @@ use std::sync::Arc;
 
 use super::cache::Cache;
 use super::error::{CheckoutError, fetch_failed, git_failed, machine, no_reference, too_large};
-use super::git::Git;
+use super::git::{Call, Git};
 use super::limits::Limits;
+use super::refused::{Refused, Scope};
 use super::repository::Repository;
 use super::revision::{self, Revision};
+use super::steps;
 use crate::shared::domain::ProjectUrl;
+
+/// How much memory git may take for an answer of a remote, in bytes: enough for a million branches.
+const ANSWER_MEMORY: u64 = 512 << 20;
 
 /// What a world is looked for with.
 #[derive(Clone, Copy)]
@@ -24,6 +29,8 @@ pub struct Search<'job> {
     pub world: &'job ProjectUrl,
     /// Where its commits are kept.
     pub repository: &'job Arc<Repository>,
+    /// What was refused before.
+    pub refused: &'job Refused,
     /// Hears each step in words.
     pub progress: &'job (dyn Fn(String) + Send + Sync),
 }
@@ -38,7 +45,7 @@ impl Search<'_> {
         let arguments = revision::expand_arguments(short);
         let mut hash = history.read(arguments.clone()).await;
         if hash.is_err() {
-            let tips = self.ask(revision::tips_arguments(&history.remote().location)).await?;
+            let tips = self.tips().await?;
             let tip = tips.split('\t').next().unwrap_or_default();
             self.fetch_history(&history, tip).await?;
             hash = history.read(arguments).await;
@@ -54,15 +61,15 @@ impl Search<'_> {
 
     /// Fetches the commits of all branches and tags; `commit` tells which kind of hashes there are.
     async fn fetch_history(self, history: &Arc<Repository>, commit: &str) -> Result<(), CheckoutError> {
-        let Search { world, progress, .. } = self;
+        let Search { world, progress, refused, .. } = self;
+        let scope = Scope::history(history.remote());
+        refused.check(&scope)?;
         let what = || format!("The history of {}", world.repository());
-        let tell = |step: String| progress(format!("fetching the history of {}: {step}", world.repository()));
+        let tell = |said: String| progress(steps::fetching(&format!("the history of {}", world.repository()), &said));
         let fetched = history.fetch(&revision::history(&history.remote().location, commit), &tell).await;
-        fetched.map_err(|error| fetch_failed(world, what, self.limits.size, error))?;
-        if history.packed().await > self.limits.size {
-            return Err(too_large(what(), self.limits.size));
-        }
-        Ok(())
+        let fetched = fetched.map_err(|error| fetch_failed(world, what, self.limits.size, error));
+        let is_too_large = fetched.is_ok() && history.packed().await > self.limits.size;
+        refused.note(scope, if is_too_large { Err(too_large(what(), self.limits.size)) } else { fetched })
     }
 
     /// Whether a commit that is named by its hash is in a branch or tag.
@@ -70,7 +77,7 @@ impl Search<'_> {
     /// # Errors
     /// Why that can't be found out.
     pub async fn is_accepted(self, revision: &Revision) -> Result<bool, CheckoutError> {
-        let answer = self.ask(revision::tips_arguments(&self.repository.remote().location)).await?;
+        let answer = self.tips().await?;
         if revision::is_of_other_length(&answer, &revision.commit) {
             return Err(no_reference(self.world));
         }
@@ -96,13 +103,31 @@ impl Search<'_> {
         branches.map(|answer| !answer.is_empty()).map_err(|error| git_failed(self.world, error))
     }
 
-    /// Asks the remote what it has.
+    /// All branches and tags of the remote.
+    async fn tips(self) -> Result<String, CheckoutError> {
+        let remote = self.repository.remote();
+        let scope = Scope::history(remote);
+        self.refused.check(&scope)?;
+        self.refused.note(scope, self.answer(revision::tips_arguments(&remote.location)).await)
+    }
+
+    /// Asks the remote for the branches and tags that the world's URL may mean.
     ///
     /// # Errors
     /// When it can't answer.
-    pub async fn ask(self, arguments: Vec<OsString>) -> Result<String, CheckoutError> {
+    pub async fn ask(self) -> Result<String, CheckoutError> {
+        let remote = self.repository.remote();
+        let arguments = revision::search_arguments(self.world, &remote.location);
+        self.refused.note(Scope::repository(remote), self.answer(arguments).await)
+    }
+
+    async fn answer(self, arguments: Vec<OsString>) -> Result<String, CheckoutError> {
         loop {
-            let answer = self.git.run(self.repository.call(arguments.clone()), |_| ());
+            let turn = self.repository.may_ask().await;
+            let _turn = turn.map_err(|error| machine(self.world, &std::io::Error::other(error)))?;
+            self.refused.check(&Scope::repository(self.repository.remote()))?;
+            let call = Call { memory: ANSWER_MEMORY, ..self.repository.call(arguments.clone()) };
+            let answer = self.git.run(call, |_| ());
             match actix_rt::time::timeout(self.limits.patience(), answer).await {
                 Ok(Ok(answer)) => return Ok(String::from_utf8_lossy(&answer).into_owned()),
                 Ok(Err(source)) => return Err(git_failed(self.world, source)),

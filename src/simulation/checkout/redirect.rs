@@ -1,0 +1,131 @@
+//! Repositories that have moved: where their forge sends to is followed within that forge, and only to what the lists
+//! allow.
+//!
+//! git follows all redirects or none, and none is what it is told. Where it meets one, it is had to tell what the forge has
+//! answered, and the world is looked for there: so the lists, and git's settings for proxies, certificates and passwords, hold
+//! for each step.
+
+use std::ffi::OsString;
+
+use url::Url;
+
+use super::error::CheckoutError;
+use super::git::{Call, Git};
+use super::mirrors::Mirrors;
+use super::repository::Repository;
+use crate::shared::domain::{Load, ProjectUrl, Rules};
+
+/// How many redirects are followed for a world.
+pub const MOST: usize = 5;
+
+/// What git asks a forge for first.
+const FIRST_QUESTION: &str = "/info/refs";
+
+/// The world in the repository to which its forge sends.
+///
+/// # Errors
+/// When that may not be followed.
+pub async fn follow(
+    git: &Git,
+    repository: &Repository,
+    (mirrors, rules): (&Mirrors, &Rules),
+    world: &ProjectUrl,
+) -> Result<ProjectUrl, CheckoutError> {
+    let target = match location(git, repository).await {
+        Some(location) => target(mirrors, rules, world, &location),
+        None => Err("to where its forge does not say".to_owned()),
+    };
+    let moved = target.map_err(|why| CheckoutError::Moved(world.repository(), why))?;
+    log::info!("{} has moved to {}", world.repository(), moved.repository());
+    Ok(moved)
+}
+
+/// Where a forge sends to who asks for a repository, as it says it.
+async fn location(git: &Git, repository: &Repository) -> Option<String> {
+    let arguments = ["ls-remote", "--quiet", "--", &repository.remote().location, "HEAD"].map(OsString::from).to_vec();
+    let trace = [("GIT_TRACE_CURL", "1"), ("GIT_TRACE_CURL_NO_DATA", "1")];
+    let environment = trace.map(|(name, value)| (name.into(), value.into())).to_vec();
+    let mut location = None;
+    let look = |line: &str| {
+        let header = line.split_once("Recv header: ").and_then(|(_, header)| header.split_once(": "));
+        if let Some((name, value)) = header
+            && name.eq_ignore_ascii_case("location")
+        {
+            location = Some(value.to_owned());
+        }
+    };
+    // It fails again, since the forge sends it elsewhere.
+    git.run(Call { environment, ..repository.call(arguments) }, look).await.ok();
+    location
+}
+
+/// The world in the repository at this location, or why it may not be taken from there, in words for the client.
+fn target(mirrors: &Mirrors, rules: &Rules, world: &ProjectUrl, location: &str) -> Result<ProjectUrl, String> {
+    let no_url = |_| format!("to {location:?}, which is no URL");
+    let remote = mirrors.remote(world).map(|remote| remote.location).unwrap_or_default();
+    let remote = Url::parse(&remote).map_err(no_url)?;
+    let mut target = remote.join(location).map_err(no_url)?;
+    if target.origin() != remote.origin() || !target.username().is_empty() || target.password().is_some() {
+        return Err("to another host. No forge is followed there: give the URL of where it is now".to_owned());
+    }
+    target.set_query(None);
+    target.set_fragment(None);
+    let elsewhere = || format!("to {target}, from where this simulation server takes no worlds");
+    let repository = target.as_str().strip_suffix(FIRST_QUESTION).ok_or_else(elsewhere)?;
+    let moved = mirrors.moved(world, repository).ok_or_else(elsewhere)?;
+    rules.admit(&moved, Load::ZERO).map_err(|refusal| format!("to {}. {refusal}", moved.repository()))?;
+    Ok(moved)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeMap;
+
+    use super::*;
+    use crate::shared::domain::UrlPrefix;
+
+    #[test]
+    fn a_forge_is_followed_within_itself_and_where_the_lists_allow() {
+        let mirrors = BTreeMap::from([
+            ("https://git.lab/".to_owned(), "https://git.lab:8443/".to_owned()),
+            ("https://git.lab/one".to_owned(), "https://git.lab:8443/lab/one.git".to_owned()),
+        ]);
+        let mirrors = Mirrors::try_from(mirrors).unwrap();
+        let prefixes =
+            |texts: &[&str]| texts.iter().map(|text| UrlPrefix::try_from((*text).to_owned()).unwrap()).collect();
+        let allowed = prefixes(&["https://github.com/lab", "https://git.lab"]);
+        let blocked = prefixes(&["https://github.com/lab/secret"]);
+        let rules = Rules { allowed, blocked, docker: false, share_idle_time: 0.0 };
+        let old = "https://github.com/lab/old/blob/main/p/worlds/a.wbt";
+        let mirrored = "https://git.lab/g/s/old/-/blob/main/worlds/a.wbt";
+        let table = [
+            (
+                old,
+                "https://github.com/lab/new.git/info/refs?service=git-upload-pack",
+                Ok("https://github.com/lab/new/blob/main/p/worlds/a.wbt"),
+            ),
+            (old, "/lab/new/info/refs", Ok("https://github.com/lab/new/blob/main/p/worlds/a.wbt")),
+            (old, "https://github.com/lab/secret.git/info/refs", Err("blocked")),
+            (old, "https://github.com/lab/Secret/info/refs", Err("blocked")),
+            (old, "https://github.com/lab%2fsecret/info/refs", Err("takes no worlds")),
+            (old, "https://github.com/other/new/info/refs", Err("Docker not enabled")),
+            (old, "https://github.com/lab/../other/new/info/refs", Err("Docker not enabled")),
+            (old, "https://github.com/login", Err("takes no worlds")),
+            (old, "https://gitlab.com/lab/new/info/refs", Err("another host")),
+            (old, "http://github.com/lab/new/info/refs", Err("another host")),
+            (old, "https://github.com:8443/lab/new/info/refs", Err("another host")),
+            (old, "https://me@github.com/lab/new/info/refs", Err("another host")),
+            (old, "https://", Err("no URL")),
+            (mirrored, "https://git.lab:8443/g/new/info/refs", Ok("https://git.lab/g/new/-/blob/main/worlds/a.wbt")),
+            (mirrored, "https://git.lab:8443/one/info/refs", Err("takes no worlds")),
+        ];
+        for (world, location, expected) in table {
+            let found = target(&mirrors, &rules, &ProjectUrl::parse(world).unwrap(), location);
+            match (found, expected) {
+                (Ok(found), Ok(expected)) => assert_eq!(found.to_string(), expected, "{location}"),
+                (Err(why), Err(words)) => assert!(why.contains(words), "{location}: {why}"),
+                (found, _) => panic!("{location}: {found:?}"),
+            }
+        }
+    }
+}
