@@ -198,7 +198,7 @@ mod tests {
     async fn clients_whose_broadcaster_panics_are_sent_away_and_find_another_one() {
         let config = serde_json::from_str(r#"{"port": 0, "simulationServers": []}"#).unwrap();
         let (phase_sender, phase) = watch::channel(Phase::Open);
-        let server = web::Data::new(assemble(config, Connections::new(10, 10, 10), phase).unwrap());
+        let server = web::Data::new(assemble(config, Connections::new(10, 10, None), phase).unwrap());
         let (broadcasters, started) = std::sync::mpsc::channel();
         let app = move || {
             let broadcaster = web::Data::new(LocalBroadcaster::start(Arc::clone(&server)));

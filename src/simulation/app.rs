@@ -16,14 +16,11 @@ use super::places::{GetSnapshot, Places};
 use super::readiness;
 use super::state::AppState;
 use crate::shared::domain::Rules;
-use crate::shared::http::BasicAuth;
-use crate::shared::http::Connections;
-use crate::shared::http::Live;
-use crate::shared::http::Metrics;
 use crate::shared::http::server::{self, Options};
+use crate::shared::http::{BasicAuth, Connections, Live, Metrics};
 use crate::shared::run::{AppError, Phase, Request, Signals, notify, permanent, raise_open_files, start};
 use crate::simulation::checkout::{CacheDir, Checkouts, Limits};
-use crate::simulation::client::outcome;
+use crate::simulation::client::{outcome, quota};
 use crate::simulation::machine::LoadMonitor;
 use crate::simulation::machine::UsageMonitor;
 use crate::simulation::process::{Guardian, Leftovers, RunDir, process_tree};
@@ -202,7 +199,7 @@ fn assemble(
     };
     let checkouts = Checkouts::open(cache_dir, run.path(), budget, git, rules.clone(), limits, runtime);
     let checkouts = checkouts.map_err(cache_fault)?;
-    let places = Places::new(config.streaming_ports(), config.waiting_line).start();
+    let places = Places::new(config.streaming_ports(), config.waiting_line, config.max_places_per_address).start();
     let csv = config.monitor_log_enabled.then(|| config.log_dir.0.join("simulation/monitor.csv"));
     let (load_monitor, readings) = LoadMonitor::new(places.clone(), run.path(), csv);
     let load_monitor = load_monitor.start();
@@ -228,6 +225,7 @@ fn assemble(
         connections: Connections::new(max_tcp(&config), config.max_clients, config.max_clients_per_address),
         metrics,
         starts,
+        start_quota: quota::starts(),
         live: Live::new(),
         usage: UsageMonitor::default(),
         started: Instant::now(),

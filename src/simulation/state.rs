@@ -12,6 +12,7 @@ use super::readiness;
 use crate::shared::domain::Load;
 use crate::shared::domain::ProjectUrl;
 use crate::shared::domain::Rules;
+use crate::shared::http::AddressQuota;
 use crate::shared::http::BasicAuth;
 use crate::shared::http::Connections;
 use crate::shared::http::Live;
@@ -50,6 +51,8 @@ pub struct AppState {
     pub admin_auth: Option<BasicAuth>,
     /// Limits and counts connections.
     pub connections: Connections,
+    /// How often one address may ask for a simulation.
+    pub start_quota: AddressQuota,
     /// The metrics.
     pub metrics: Metrics,
     /// Counts clients that asked for a simulation, by outcome.

@@ -53,6 +53,72 @@ async fn the_waiting_line_is_served_in_order_and_forgets_who_leaves() {
 }
 
 #[actix_rt::test]
+async fn one_address_leaves_places_and_a_part_of_the_line_to_others() {
+    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
+    let server = simulation_server(&webots.path(), forge.path(), 4).set("waitingLine", 4).start().await;
+    let (greedy, other, third) = ("203.0.113.9", "203.0.113.10", "203.0.113.11");
+    let mut inside = Vec::new();
+    for _ in 0..3 {
+        let mut client = Client::start_from(&server, greedy, &arm()).await;
+        client.until("webots:").await;
+        inside.push(client);
+    }
+    let mut line = Vec::new();
+    for ahead in 0..3 {
+        let mut client = Client::start_from(&server, greedy, &arm()).await;
+        assert_eq!(client.until("").await, format!("queue: {ahead}"));
+        line.push(client);
+    }
+    let told = Client::start_from(&server, greedy, &arm()).await.until("").await;
+    let words =
+        "loading: Error: Clients of your address have 3 places of this simulation server, and 3 more are waiting";
+    assert!(told.starts_with(words), "{told}");
+    // The fourth place is another's at once, though three wait; and so is the fourth place in the line.
+    let mut lucky = Client::start_from(&server, other, &arm()).await;
+    assert_eq!(lucky.until("webots:").await, format!("webots:ws://localhost:{}", server.port + 4));
+    let mut late = Client::start_from(&server, third, &arm()).await;
+    assert_eq!(late.until("").await, "queue: 3");
+    let told = Client::start_from(&server, other, &arm()).await.until("").await;
+    assert!(told.starts_with("loading: Error: All 4 places of this simulation server are taken"), "{told}");
+    // Of the greedy one's places the next is for the first who waits; what another leaves is not for it.
+    lucky.leave().await;
+    late.until("webots:").await;
+    inside.remove(0).leave().await;
+    line[0].until("webots:").await;
+    assert_eq!(line[1].until("queue: 0").await, "queue: 0");
+}
+
+#[actix_rt::test]
+async fn an_address_has_as_many_places_as_the_configuration_says() {
+    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
+    let builder = simulation_server(&webots.path(), forge.path(), 4).set("waitingLine", 0);
+    let server = builder.set("maxPlacesPerAddress", 1).start().await;
+    let mut first = Client::start_from(&server, "2001:db8::1", &arm()).await;
+    first.until("webots:").await;
+    let told = Client::start_from(&server, "2001:db8::2", &arm()).await.until("").await;
+    assert!(told.starts_with("loading: Error: Clients of your address have 1 places"), "the same /64: {told}");
+    let mut other = Client::start_from(&server, "2001:db8:0:1::1", &arm()).await;
+    other.until("webots:").await;
+}
+
+#[actix_rt::test]
+async fn an_address_may_ask_only_so_often() {
+    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
+    let server = simulation_server(&webots.path(), forge.path(), 1).start().await;
+    let ask = async |address: &str| {
+        Client::start_from(&server, address, "https://github.com/none").await.until("loading: Error:").await
+    };
+    let mut asked = 0;
+    until("it is told to wait", async || {
+        asked += 1;
+        ask("203.0.113.9").await.starts_with("loading: Error: Too many simulations were asked for from your address")
+    })
+    .await;
+    assert!((201..260).contains(&asked), "{asked}");
+    assert!(ask("203.0.113.10").await.contains("Wrong Webots simulation URL"));
+}
+
+#[actix_rt::test]
 async fn a_port_that_somebody_else_has_is_not_lent() {
     let (forge, webots) = (Forge::with_arm(), Webots::launcher());
     let server = simulation_server(&webots.path(), forge.path(), 2).start().await;

@@ -134,7 +134,7 @@ async fn launch(server: &AppState) -> (Addr<Webots>, UnboundedReceiver<Exit>) {
     let (places, mut granted) = unbounded_channel();
     let (exits, ended) = unbounded_channel();
     let listener = Listener { places, exits }.start();
-    let ticket = Ticket::new(&server.places, listener.clone().recipient(), arm());
+    let ticket = Ticket::new(&server.places, listener.clone().recipient(), arm(), None);
     let port = granted.recv().await.unwrap();
     let world = ProjectUrl::parse(&arm()).unwrap();
     let project = server.checkouts.start(world, server.run.instance().unwrap(), |_| ()).await.unwrap().unwrap();

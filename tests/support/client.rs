@@ -4,10 +4,11 @@ use std::time::Duration;
 
 use futures_util::{SinkExt, StreamExt};
 use tokio::net::TcpStream;
-use tokio_tungstenite::tungstenite::Message;
+use tokio_tungstenite::tungstenite::client::IntoClientRequest;
 use tokio_tungstenite::tungstenite::protocol::CloseFrame;
 use tokio_tungstenite::tungstenite::protocol::frame::Frame;
 use tokio_tungstenite::tungstenite::protocol::frame::coding::{Data, OpCode};
+use tokio_tungstenite::tungstenite::{Error, Message};
 use tokio_tungstenite::{MaybeTlsStream, WebSocketStream};
 
 use super::SOON;
@@ -43,6 +44,21 @@ impl Client {
         let mut client = Self::connect(&server.websocket("/client")).await;
         client.send(&serde_json::json!({"start": {"url": world}}).to_string()).await;
         client
+    }
+
+    /// The same as through a web server, which says that the client has this address.
+    pub async fn start_from(server: &super::program::Server, address: &str, world: &str) -> Self {
+        let mut client = Self::try_from_address(server, address).await.unwrap_or_else(|error| panic!("{error}"));
+        client.send(&serde_json::json!({"start": {"url": world}}).to_string()).await;
+        client
+    }
+
+    /// Connects to a simulation server as through a web server.
+    pub async fn try_from_address(server: &super::program::Server, address: &str) -> Result<Self, Box<Error>> {
+        let mut request = server.websocket("/client").into_client_request().unwrap();
+        request.headers_mut().insert("x-forwarded-for", address.parse().unwrap());
+        let connected = tokio_tungstenite::connect_async(request).await;
+        connected.map(|(socket, _)| Self::new(socket)).map_err(Box::new)
     }
 
     /// Sends a text.

@@ -12,7 +12,7 @@ use crate::session::mail_address;
 use crate::session::placement::Policy;
 use crate::shared::config::{Configuration, InvalidValue, changed_keys};
 use crate::shared::config::{
-    ExpandedPath, Secret, expanded, folder, local_address, object, one_or_many, optional_port, percent, seconds,
+    ExpandedPath, Secret, expanded, folder, local_address, object, one_or_many, optional_whole, percent, seconds,
     threshold, whole,
 };
 use crate::shared::domain::{ClientUrls, PublicAddress, PublicUrl, check_host};
@@ -53,7 +53,7 @@ pub struct SessionConfig {
     #[serde(default)]
     pub mail_server: Option<String>,
     /// SMTP port. Default: 25, with a password 587.
-    #[serde(default, deserialize_with = "optional_port")]
+    #[serde(default, deserialize_with = "optional_whole::<1, 65535, _, _>")]
     pub mail_server_port: Option<u16>,
     /// Whether the SMTP server encrypts from the first byte, without STARTTLS. Default: true for port 465, else false.
     #[serde(default)]
@@ -87,9 +87,10 @@ pub struct SessionConfig {
     /// How many client `WebSockets` may be open in all. Default: 20000.
     #[serde(default = "default_max_clients", deserialize_with = "whole::<1, 1_000_000, _, _>")]
     pub max_clients: usize,
-    /// How many of them one client address may have. Default: 1000, for a class sits behind one address.
-    #[serde(default = "default_max_clients_per_address", deserialize_with = "whole::<1, 1_000_000, _, _>")]
-    pub max_clients_per_address: usize,
+    /// How many of them one client address may have. Default: three quarters, but at most 1000, for a class sits behind
+    /// one address.
+    #[serde(default, deserialize_with = "optional_whole::<1, 1_000_000, _, _>")]
+    pub max_clients_per_address: Option<usize>,
     /// Web servers, as addresses or networks, whose headers `X-Forwarded-For` and `Forwarded` are believed.
     /// Default: `["127.0.0.0/8", "::1/128"]`.
     #[serde(default)]
@@ -247,10 +248,6 @@ fn default_load_refresh() -> Duration {
 
 fn default_client_cost() -> f64 {
     2.0
-}
-
-fn default_max_clients_per_address() -> usize {
-    1000
 }
 
 fn default_max_clients() -> usize {

@@ -16,7 +16,7 @@ use super::changes::Changes;
 use super::fleet_status::{FleetStatus, ServerStatus};
 use super::pick::{NoServer, Pick};
 use super::probe_error::ProbeError;
-use super::quota::PlacementQuota;
+use super::quota;
 use super::server_monitor::{ProbeResult, ProbeSettings, ServerMonitor, Stop};
 use super::server_record::{ServerRecord, is_refused};
 use super::subscribers::{Subscribers, Update};
@@ -27,7 +27,7 @@ use crate::shared::domain::Load;
 use crate::shared::domain::ProjectUrl;
 use crate::shared::domain::PublicAddress;
 use crate::shared::domain::ServerReport;
-use crate::shared::http::tls;
+use crate::shared::http::{AddressQuota, tls};
 
 /// Asks for an update now, and for another one whenever availability changes.
 #[derive(Message)]
@@ -57,7 +57,7 @@ pub struct Registry {
     tls: Option<Arc<ClientConfig>>,
     latencies: prometheus::Histogram,
     fleet: Fleet<PublicAddress>,
-    quota: PlacementQuota,
+    quota: AddressQuota,
     servers: BTreeMap<PublicAddress, Entry>,
     subscribers: Subscribers,
     available: bool,
@@ -79,7 +79,7 @@ impl Registry {
     pub fn new(config: Arc<SessionConfig>, mailer: Option<Addr<Mailer>>, latencies: prometheus::Histogram) -> Self {
         Self {
             fleet: Fleet::new(config.policy()),
-            quota: PlacementQuota::new(),
+            quota: quota::placements(),
             monitors: Arbiter::new(),
             tls: tls::client_config(),
             config,
@@ -149,7 +149,6 @@ impl Registry {
             }
         }
         self.changes.restart_mailer_if_gone(&self.config);
-        self.quota.clean_up();
         self.publish();
         self.subscribers.retry(Update::Availability(self.available));
     }

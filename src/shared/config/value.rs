@@ -122,14 +122,19 @@ where
     T::try_from(number).map_err(|_| D::Error::custom(format!("{number} is too large")))
 }
 
-/// Reads a port from 1 to 65535, or `null`.
+/// Reads a whole number from `MIN` to `MAX`, or `null`.
 ///
 /// # Errors
 /// When the value is something else.
-pub fn optional_port<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Option<u16>, D::Error> {
+pub fn optional_whole<'de, const MIN: u64, const MAX: u64, T, D>(deserializer: D) -> Result<Option<T>, D::Error>
+where
+    T: TryFrom<u64>,
+    D: Deserializer<'de>,
+{
     #[derive(Deserialize)]
-    struct Port(#[serde(deserialize_with = "whole::<1, 65535, _, _>")] u16);
-    Ok(Option::<Port>::deserialize(deserializer)?.map(|port| port.0))
+    #[serde(bound = "T: TryFrom<u64>")]
+    struct Number<const MIN: u64, const MAX: u64, T>(#[serde(deserialize_with = "whole::<MIN, MAX, _, _>")] T);
+    Ok(Option::<Number<MIN, MAX, T>>::deserialize(deserializer)?.map(|number| number.0))
 }
 
 /// Reads a percentage from 0 to 100.

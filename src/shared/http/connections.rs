@@ -7,6 +7,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use actix_web::HttpResponse;
 use actix_web::http::StatusCode;
 
+use super::address_quota::share;
 use super::paths::retry_after;
 use super::peer::Peer;
 
@@ -23,6 +24,8 @@ pub enum Kind {
 
 /// How many TCP connections an address may have for each client that it may have: browsers open several.
 const TCP_PER_CLIENT: usize = 2;
+/// How many web clients an address may have at most where the configuration does not say it.
+const MOST_CLIENTS: usize = 1000;
 /// How many pages may listen to `/events`.
 const MAX_PAGES: usize = 1000;
 
@@ -31,6 +34,7 @@ const MAX_PAGES: usize = 1000;
 pub struct Connections {
     max_tcp: usize,
     max_clients: usize,
+    /// How many web clients an address may have.
     per_address: usize,
     open: Arc<Mutex<Open>>,
 }
@@ -61,9 +65,11 @@ pub enum TooManyConnections {
 }
 
 impl Connections {
-    /// Allows `max_tcp` TCP connections and `max_clients` web clients, of which one address may have `per_address`.
+    /// Allows `max_tcp` TCP connections and `max_clients` web clients, of which one address may have `per_address`, or a
+    /// share where that is not said.
     #[must_use]
-    pub fn new(max_tcp: usize, max_clients: usize, per_address: usize) -> Self {
+    pub fn new(max_tcp: usize, max_clients: usize, per_address: Option<usize>) -> Self {
+        let per_address = per_address.unwrap_or_else(|| share(max_clients).min(MOST_CLIENTS));
         Self { max_tcp, max_clients, per_address, open: Arc::default() }
     }
 
@@ -80,9 +86,12 @@ impl Connections {
     /// When the server or the address has too many connections of this kind.
     pub fn admit(&self, kind: Kind, peer: Peer) -> Result<ConnectionPermit, TooManyConnections> {
         let (max, max_per_address) = match kind {
-            Kind::Tcp => (self.max_tcp, self.per_address.saturating_mul(TCP_PER_CLIENT)),
+            Kind::Tcp => {
+                let wanted = self.per_address.saturating_mul(TCP_PER_CLIENT);
+                (self.max_tcp, wanted.min(share(self.max_tcp)).max(self.per_address))
+            }
             Kind::Client => (self.max_clients, self.per_address),
-            Kind::Page => (MAX_PAGES, self.per_address),
+            Kind::Page => (MAX_PAGES, self.per_address.min(share(MAX_PAGES))),
         };
         let address = peer.rate_limit_key();
         let mut open = lock(&self.open);
@@ -149,7 +158,7 @@ mod tests {
 
     #[test]
     fn connections_are_counted_in_all_and_per_address() {
-        let connections = Connections::new(9, 4, 2);
+        let connections = Connections::new(9, 4, Some(2));
         let admit = |peer| connections.admit(Kind::Client, peer);
         let first = admit(client("203.0.113.9")).unwrap();
         let _second = admit(client("203.0.113.9")).unwrap();
@@ -166,8 +175,22 @@ mod tests {
     }
 
     #[test]
+    fn one_address_leaves_something_to_others() {
+        for (tcp, clients) in [(2000, 1000), (21_000, 20_000), (16, 15), (4000, 1000)] {
+            let connections = Connections::new(tcp, clients, None);
+            for (kind, all) in [(Kind::Tcp, tcp), (Kind::Client, clients), (Kind::Page, MAX_PAGES)] {
+                let one: Vec<_> =
+                    std::iter::repeat_with(|| connections.admit(kind, client("203.0.113.9"))).take(all).collect();
+                let had = one.iter().filter(|one| one.is_ok()).count();
+                assert!(had <= share(all) && had > 0, "{kind:?}: {had} of {all}");
+                connections.admit(kind, client("203.0.113.10")).unwrap();
+            }
+        }
+    }
+
+    #[test]
     fn nothing_is_kept_of_those_who_have_left() {
-        let connections = Connections::new(9, 9, 1);
+        let connections = Connections::new(9, 9, Some(1));
         let admit = |address| connections.admit(Kind::Client, client(address));
         let permit = admit("2001:db8::1").unwrap();
         assert_eq!(admit("2001:db8::2").unwrap_err(), TooManyConnections::FromAddress, "the same /64");

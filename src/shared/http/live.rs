@@ -294,7 +294,7 @@ mod tests {
     }
 
     fn permit() -> ConnectionPermit {
-        Connections::new(1, 1, 1).admit(Kind::Page, Peer::Unknown).unwrap()
+        Connections::new(1, 1, Some(1)).admit(Kind::Page, Peer::Unknown).unwrap()
     }
 
     fn event(before: &View, after: &View) -> String {

@@ -1,5 +1,6 @@
 //! What the web sides of both servers use: pages, live updates, WebSockets, limits, certificates, metrics.
 
+mod address_quota;
 pub mod assets;
 mod auth;
 mod client_stream;
@@ -15,6 +16,7 @@ pub mod server;
 pub mod tls;
 pub mod websocket;
 
+pub use address_quota::{AddressQuota, share};
 pub use auth::BasicAuth;
 pub use connections::{ConnectionPermit, Connections, Kind};
 pub use live::{Live, Row, View};

@@ -7,9 +7,9 @@ use crate::shared::http::Metrics;
 /// The outcome of a request to start a simulation.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Outcome {
-    /// The rules do not allow this world, or its URL is wrong.
+    /// The rules do not allow this world, its URL is wrong, or its address asks too often.
     Refused,
-    /// All places and the waiting line are taken.
+    /// All places and the waiting line are taken, or what the address may have of them.
     Full,
     /// The world could not be checked out.
     NoCheckout,

@@ -91,12 +91,17 @@ impl WebClient {
             return;
         }
         self.start = Pending::new(&self.server.starts);
+        let address = self.peer.rate_limit_key();
+        if !self.server.start_quota.take(address) {
+            let why = "Too many simulations were asked for from your address. Try again in a minute";
+            return self.fail_start(Outcome::Refused, why, ctx);
+        }
         let world = match self.server.admit(url) {
             Ok(world) => world,
             Err(why) => return self.fail_start(Outcome::Refused, &why, ctx),
         };
         log::info!("{}: asks for {world}", self.name());
-        let ticket = Ticket::new(&self.server.places, ctx.address().recipient(), world.to_string());
+        let ticket = Ticket::new(&self.server.places, ctx.address().recipient(), world.to_string(), address);
         self.state = State::Waiting { request: StartRequest { world, mode }, ticket };
     }
 

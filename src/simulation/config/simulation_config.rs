@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 use super::timing::Timing;
 use crate::shared::config::{Configuration, InvalidValue};
 use crate::shared::config::{
-    ExpandedPath, expanded, folder, local_address, object, one_or_many, percent, seconds, whole,
+    ExpandedPath, expanded, folder, local_address, object, one_or_many, optional_whole, percent, seconds, whole,
 };
 use crate::shared::domain::UrlPrefix;
 use crate::shared::domain::{ClientUrls, PublicAddress, PublicUrl, check_host};
@@ -90,9 +90,14 @@ pub struct SimulationConfig {
     /// How many client `WebSockets` may be open in all, with or without a simulation. Default: 1000.
     #[serde(default = "default_max_clients", deserialize_with = "whole::<1, 1_000_000, _, _>")]
     pub max_clients: usize,
-    /// How many of them one client address may have. Default: 1000, for a class sits behind one address.
-    #[serde(default = "default_max_clients_per_address", deserialize_with = "whole::<1, 1_000_000, _, _>")]
-    pub max_clients_per_address: usize,
+    /// How many of them one client address may have. Default: three quarters, but at most 1000, for a class sits behind
+    /// one address.
+    #[serde(default, deserialize_with = "optional_whole::<1, 1_000_000, _, _>")]
+    pub max_clients_per_address: Option<usize>,
+    /// How many of the places one client address may have, and the same share of the waiting line. Default: three
+    /// quarters.
+    #[serde(default, deserialize_with = "optional_whole::<1, 10_000, _, _>")]
+    pub max_places_per_address: Option<usize>,
     /// Web servers, as addresses or networks, whose headers `X-Forwarded-For` and `Forwarded` are believed.
     /// Default: `["127.0.0.0/8", "::1/128"]`.
     #[serde(default)]
@@ -251,10 +256,6 @@ fn default_max_connections() -> u16 {
 
 fn default_waiting_line() -> usize {
     100
-}
-
-fn default_max_clients_per_address() -> usize {
-    1000
 }
 
 fn default_max_clients() -> usize {

@@ -264,7 +264,7 @@ mod tests {
 
     #[actix_rt::test]
     async fn the_load_is_the_mean_of_five_seconds_and_the_history_is_ten_minutes_long() {
-        let places = Places::new(2001..=2001, 1).start();
+        let places = Places::new(2001..=2001, 1, None).start();
         let (mut monitor, readings) = LoadMonitor::new(places, Path::new("/"), None);
         let load = || readings.borrow().load.map(Load::percent);
         assert_eq!(load(), None);
@@ -287,7 +287,7 @@ mod tests {
 
     #[actix_rt::test]
     async fn gpus_that_are_no_longer_read_do_not_count() {
-        let places = Places::new(2001..=2001, 1).start();
+        let places = Places::new(2001..=2001, 1, None).start();
         let (mut monitor, readings) = LoadMonitor::new(places, Path::new("/"), None);
         let gpu = Gpu { compute: 90.0, ..Gpu::default() };
         let before = |age: Duration| Instant::now().checked_sub(age).unwrap();

@@ -4,18 +4,20 @@
 //! [`Ticket`] and then hears how many are ahead, until a port is granted. Dropping the ticket leaves the line or frees
 //! the port, so that neither is lost in any state or by any panic.
 
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::{BTreeMap, HashMap, VecDeque};
 use std::io::ErrorKind;
-use std::net::{Ipv4Addr, Ipv6Addr, TcpListener};
+use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, TcpListener};
 use std::ops::RangeInclusive;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
 use actix::prelude::*;
 
-use super::snapshot::{Change, Simulation, Snapshot, Stage};
+use super::no_place::NoPlace;
 use crate::shared::domain::Instances;
+use crate::shared::http::share;
 use crate::shared::run::seconds_since_1970;
+use crate::simulation::snapshot::{Change, Simulation, Snapshot, Stage};
 
 /// Asks for a place, in the name of a ticket.
 #[derive(Message)]
@@ -24,18 +26,7 @@ struct Acquire {
     id: u64,
     client: Recipient<PlaceEvent>,
     world: String,
-}
-
-/// Why there is no place: everything is taken, the waiting line too. The words are for the client.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
-#[error(
-    "All {places} places of this simulation server are taken, and {waiting} clients are waiting already. Try again later"
-)]
-pub struct Full {
-    /// Places in all.
-    pub places: usize,
-    /// Length of the waiting line.
-    pub waiting: usize,
+    address: Option<IpAddr>,
 }
 
 /// What the holder of a ticket hears.
@@ -47,7 +38,7 @@ pub enum PlaceEvent {
     /// This port may be used as long as the ticket lives.
     Granted(u16),
     /// There is no room in the waiting line either.
-    Refused(Full),
+    Refused(NoPlace),
 }
 
 /// A place, or a place in the line for one. Dropping it gives it back.
@@ -78,6 +69,8 @@ struct Release(u64);
 pub struct Places {
     ports: RangeInclusive<u16>,
     longest_line: usize,
+    /// How many places an address may have, and how many clients of it may wait.
+    per_address: (usize, usize),
     /// How many tickets there were, also of clients that were refused.
     arrivals: u64,
     present: BTreeMap<u64, Present>,
@@ -87,11 +80,13 @@ pub struct Places {
 struct Present {
     /// The port that is lent, which is not always the one that Webots took.
     lent: Option<u16>,
+    address: Option<IpAddr>,
     shown: Simulation,
 }
 
 struct Waiting {
     id: u64,
+    address: Option<IpAddr>,
     client: Recipient<PlaceEvent>,
     told: Option<usize>,
 }
@@ -100,23 +95,59 @@ struct Waiting {
 const RECHECK: Duration = Duration::from_secs(1);
 
 impl Places {
-    /// Lends these ports; `longest_line` clients may wait.
+    /// Lends these ports; `longest_line` clients may wait. One address may have `per_address` places, and the same part of
+    /// the line; where that is not said, a share of them.
     #[must_use]
-    pub fn new(ports: RangeInclusive<u16>, longest_line: usize) -> Self {
-        Self { ports, longest_line, arrivals: 0, present: BTreeMap::new(), line: VecDeque::new() }
+    pub fn new(ports: RangeInclusive<u16>, longest_line: usize, per_address: Option<usize>) -> Self {
+        let all = ports.len();
+        let places = per_address.unwrap_or_else(|| share(all)).min(all);
+        let per_address = (places, (longest_line * places).div_ceil(all.max(1)));
+        Self { ports, longest_line, per_address, arrivals: 0, present: BTreeMap::new(), line: VecDeque::new() }
+    }
+
+    /// The first in the line whose address may have another place.
+    fn next_in_line(&self) -> Option<usize> {
+        let mut lent: HashMap<IpAddr, usize> = HashMap::new();
+        for address in self.present.values().filter(|one| one.lent.is_some()).filter_map(|one| one.address) {
+            *lent.entry(address).or_default() += 1;
+        }
+        let has_room = |address: &IpAddr| lent.get(address).is_none_or(|count| *count < self.per_address.0);
+        self.line.iter().position(|waiting| waiting.address.as_ref().is_none_or(has_room))
+    }
+
+    /// How many places the clients of an address have, and how many of them wait.
+    fn of_address(&self, address: IpAddr) -> (usize, usize) {
+        let present = self.present.values().filter(|one| one.address == Some(address));
+        let (lent, waiting): (Vec<_>, Vec<_>) = present.partition(|one| one.lent.is_some());
+        (lent.len(), waiting.len())
+    }
+
+    /// Why another client of this address gets no place and may not wait, if so.
+    fn refusal(&self, address: Option<IpAddr>) -> Option<NoPlace> {
+        let (places, waiting) = address.map_or((0, 0), |address| self.of_address(address));
+        let (most_places, most_waiting) = self.per_address;
+        let may_have_one = places < most_places;
+        if may_have_one && self.next_in_line().is_none() && self.free_port().is_some() {
+            return None;
+        }
+        if waiting >= most_waiting && (!may_have_one || waiting > 0) {
+            return Some(NoPlace::Share { places, waiting });
+        }
+        let (places, waiting) = (self.ports.len(), self.line.len());
+        (waiting >= self.longest_line).then_some(NoPlace::Full { places, waiting })
     }
 
     /// Gives free places to those who wait, and tells the others how many are ahead.
     fn serve(&mut self) {
-        while !self.line.is_empty()
+        while let Some(next) = self.next_in_line()
             && let Some(port) = self.free_port()
-            && let Some(first) = self.line.pop_front()
+            && let Some(first) = self.line.remove(next)
         {
             match first.client.try_send(PlaceEvent::Granted(port)) {
                 Ok(()) => self.lend(first.id, port),
-                // It stays first in the line until the next check.
+                // It stays where it is in the line until the next check.
                 Err(SendError::Full(_)) => {
-                    self.line.push_front(first);
+                    self.line.insert(next, first);
                     break;
                 }
                 // Its actor has stopped, which drops its ticket too.
@@ -178,12 +209,10 @@ impl Actor for Places {
 impl Handler<Acquire> for Places {
     type Result = ();
 
-    fn handle(&mut self, Acquire { id, client, world }: Acquire, _: &mut Self::Context) {
+    fn handle(&mut self, Acquire { id, client, world, address }: Acquire, _: &mut Self::Context) {
         self.arrivals += 1;
-        let free = self.line.is_empty() && self.free_port().is_some();
-        if !free && self.line.len() >= self.longest_line {
-            let full = Full { places: self.ports.len(), waiting: self.line.len() };
-            return client.do_send(PlaceEvent::Refused(full));
+        if let Some(refusal) = self.refusal(address) {
+            return client.do_send(PlaceEvent::Refused(refusal));
         }
         let shown = Simulation {
             id,
@@ -197,8 +226,8 @@ impl Handler<Acquire> for Places {
             log: None,
             log_begin: 0,
         };
-        self.present.insert(id, Present { lent: None, shown });
-        self.line.push_back(Waiting { id, client, told: None });
+        self.present.insert(id, Present { lent: None, address, shown });
+        self.line.push_back(Waiting { id, address, client, told: None });
         self.serve();
     }
 }
@@ -237,11 +266,12 @@ impl Handler<GetSnapshot> for Places {
 static NEXT: AtomicU64 = AtomicU64::new(1);
 
 impl Ticket {
-    /// Gets into the line for a place. `client` hears what comes of it, `world` is the URL that is shown.
+    /// Gets into the line for a place. `client` hears what comes of it, `world` is the URL that is shown, `address` the
+    /// client's, where it is known.
     #[must_use]
-    pub fn new(places: &Addr<Places>, client: Recipient<PlaceEvent>, world: String) -> Self {
+    pub fn new(places: &Addr<Places>, client: Recipient<PlaceEvent>, world: String, address: Option<IpAddr>) -> Self {
         let id = NEXT.fetch_add(1, Ordering::Relaxed);
-        places.do_send(Acquire { id, client, world });
+        places.do_send(Acquire { id, client, world, address });
         Self { id, places: places.clone() }
     }
 

@@ -1,0 +1,77 @@
+//! How much one client address may have, so that others get something too.
+
+use std::net::IpAddr;
+use std::num::NonZeroU32;
+
+use governor::{DefaultKeyedRateLimiter, Quota, RateLimiter};
+
+/// How many addresses are remembered.
+const MOST_ADDRESSES: usize = 10_000;
+
+/// How much of so many places, connections or the like one address may have where the configuration does not say it: three
+/// quarters. A class often sits behind one address, and so may somebody who takes all that there is.
+#[must_use]
+pub fn share(all: usize) -> usize {
+    all - all / 4
+}
+
+/// How often each address may do something.
+#[derive(Debug)]
+pub struct AddressQuota(DefaultKeyedRateLimiter<IpAddr>);
+
+impl AddressQuota {
+    /// A quota that nobody has used yet: `burst` times at once, and `per_minute` times in each minute after that.
+    #[must_use]
+    pub fn new(burst: NonZeroU32, per_minute: NonZeroU32) -> Self {
+        Self(RateLimiter::keyed(Quota::per_minute(per_minute).allow_burst(burst)))
+    }
+
+    /// Whether an address may do it once more. It may where it is not known, and where too many addresses are remembered.
+    pub fn take(&self, address: Option<IpAddr>) -> bool {
+        let Some(address) = address else {
+            return true;
+        };
+        if self.0.len() >= MOST_ADDRESSES {
+            // Those whose whole quota is available again are forgotten.
+            self.0.retain_recent();
+        }
+        self.0.len() >= MOST_ADDRESSES || self.0.check_key(&address).is_ok()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn address(number: u32) -> IpAddr {
+        std::net::Ipv4Addr::from_bits(number).into()
+    }
+
+    fn quota() -> AddressQuota {
+        AddressQuota::new(NonZeroU32::new(200).unwrap(), NonZeroU32::new(12).unwrap())
+    }
+
+    #[test]
+    fn each_address_has_a_quota_of_its_own() {
+        let quota = quota();
+        let taken = |address| (0..1000).filter(|_| quota.take(address)).count();
+        for number in [1, 2] {
+            assert!((200..205).contains(&taken(Some(address(number)))));
+        }
+        assert_eq!(taken(None), 1000, "who asks through a proxy that tells no addresses is not limited");
+    }
+
+    #[test]
+    fn the_addresses_that_are_remembered_are_bounded() {
+        let quota = quota();
+        for number in 0..12_000 {
+            assert!(quota.take(Some(address(number))));
+        }
+        assert!(quota.0.len() <= MOST_ADDRESSES);
+    }
+
+    #[test]
+    fn one_address_may_have_most_of_few_and_not_all_of_many() {
+        assert_eq!([0, 1, 2, 3, 4, 100, 1000].map(share), [0, 1, 2, 3, 3, 75, 750]);
+    }
+}

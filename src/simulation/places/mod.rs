@@ -1,0 +1,6 @@
+//! The places that clients wait for: who has one, who is next, and how many one address may have.
+
+mod no_place;
+mod places;
+
+pub use places::{GetSnapshot, PlaceEvent, Places, Ticket};
