@@ -1,6 +1,7 @@
 //! How a server starts, says that it is ready, writes its log, and handles signals.
 
 mod app_error;
+mod log_limit;
 mod logging;
 pub mod notify;
 mod open_files;
