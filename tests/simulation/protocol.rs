@@ -71,14 +71,18 @@ async fn oversized_and_binary_messages_end_the_connection_in_words() {
     let connect = async || Client::connect(&server.websocket("/client")).await;
     let large = "loading: Error: Wrong message: it is longer than 8 KiB";
     let piece = [b'x'; 5000];
-    let mut clients = [connect().await, connect().await, connect().await];
+    let mut clients = [connect().await, connect().await];
     clients[0].send(&"x".repeat(9000)).await;
     clients[1].send_pieces(&[&piece, &piece]).await;
-    clients[2].send(&"x".repeat(200_000)).await;
     for mut client in clients {
         assert_eq!(client.until("").await, large);
         assert_eq!(client.closed().await, Some(1009));
     }
+    // Its size is told only when all of it is there.
+    let mut endless = connect().await;
+    endless.send(&"x".repeat(200_000)).await;
+    assert_eq!(endless.until("").await, "loading: Error: Too many messages: more than 128 KiB wait to be read");
+    assert_eq!(endless.closed().await, Some(1008));
     let mut clients = [connect().await, connect().await];
     clients[0].send_binary(&[0; 10]).await;
     clients[1].send_pieces(&[b"\xff", b"\xff"]).await;
@@ -167,6 +171,29 @@ async fn connections_are_bounded() {
     assert!(matches!(third, Err(tokio_tungstenite::tungstenite::Error::Http(answer)) if answer.status() == 503));
     one.leave().await;
     until("there is room", async || tokio_tungstenite::connect_async(server.websocket("/client")).await.is_ok()).await;
+    // One address leaves some to others.
+    let server = simulation_server(&webots.path(), forge.path(), 1).set("maxClients", 4).start().await;
+    let connect = async |address| Client::try_from_address(&server, address).await;
+    let greedy = [connect("203.0.113.9").await, connect("203.0.113.9").await, connect("203.0.113.9").await];
+    assert!(greedy.iter().all(Result::is_ok));
+    let refused = connect("203.0.113.9").await.map(drop).unwrap_err();
+    assert!(matches!(&*refused, tokio_tungstenite::tungstenite::Error::Http(answer) if answer.status() == 429));
+    connect("203.0.113.10").await.unwrap();
+}
+
+#[actix_rt::test]
+async fn a_flood_of_connections_leaves_the_log() {
+    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
+    let server = simulation_server(&webots.path(), forge.path(), 1).set("debug", false).start().await;
+    let come_and_go = async |_| {
+        for _ in 0..75 {
+            Client::connect(&server.websocket("/client")).await.leave().await;
+        }
+    };
+    futures_util::future::join_all((0..20).map(come_and_go)).await;
+    let log = std::fs::read_to_string(server.folder.join("log/simulation/output.log")).unwrap();
+    let count = log.matches(": connected").count();
+    assert!((1000..1100).contains(&count), "{count} lines of 1500 connections");
 }
 
 #[actix_rt::test]

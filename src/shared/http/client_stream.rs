@@ -1,4 +1,5 @@
-//! A client's TCP connection, on which the next request is read only once the one before is being answered.
+//! A client's TCP connection, on which the next request is read only once the one before is being answered, and none once
+//! the server stops.
 //!
 //! actix decodes all requests that it has read before it answers the first. Without this a client that sends many requests
 //! and reads no answer would fill the memory.
@@ -9,6 +10,7 @@ use std::task::{Context, Poll, ready};
 
 use actix_web::rt::net::TcpStream;
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
+use tokio_util::sync::{CancellationToken, WaitForCancellationFutureOwned};
 
 use super::connections::ConnectionPermit;
 
@@ -39,14 +41,23 @@ pub struct ClientStream {
     /// Whether the system takes no more of an answer, since the client does not read.
     is_blocked: bool,
     state: State,
+    stopping: Pin<Box<WaitForCancellationFutureOwned>>,
     _permit: ConnectionPermit,
 }
 
 impl ClientStream {
-    /// A connection that `permit` counts.
+    /// A connection that `permit` counts, of a server that stops when `stopping` is cancelled.
     #[must_use]
-    pub fn new(tcp: TcpStream, permit: ConnectionPermit) -> Self {
-        Self { tcp, unread: Vec::new(), line_ended: false, is_blocked: false, state: State::Request, _permit: permit }
+    pub fn new(tcp: TcpStream, permit: ConnectionPermit, stopping: CancellationToken) -> Self {
+        Self {
+            tcp,
+            unread: Vec::new(),
+            line_ended: false,
+            is_blocked: false,
+            state: State::Request,
+            stopping: Box::pin(stopping.cancelled_owned()),
+            _permit: permit,
+        }
     }
 
     /// How many of the unread bytes may be handed over, at most `room`: those of one request.
@@ -81,6 +92,10 @@ impl AsyncRead for ClientStream {
         if self.is_blocked || self.state == State::Answer {
             // The task is woken by the next write, or once the system takes more.
             return Poll::Pending;
+        }
+        if self.state == State::Request && self.stopping.as_mut().poll(context).is_ready() {
+            // The end of what the client sends: what is being answered is answered, and the connection closes.
+            return Poll::Ready(Ok(()));
         }
         if self.unread.is_empty() {
             let mut bytes = [0; READ_AT_ONCE];

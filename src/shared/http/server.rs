@@ -1,4 +1,7 @@
 //! Listening on a port, and serving an app on it.
+//!
+//! actix-web's `HttpServer` makes its connections itself, and decodes all requests of one at once. To count connections and to
+//! hold them to one request at a time, this builds the same service of the public parts that `HttpServer` is made of.
 
 use std::fmt::Debug;
 use std::future::ready;
@@ -15,6 +18,7 @@ use actix_web::rt::net::TcpStream;
 use nix::errno::Errno;
 use nix::sys::socket::{setsockopt, sockopt};
 use socket2::{Domain, Protocol, Socket, Type};
+use tokio_util::sync::CancellationToken;
 
 use super::client_stream::ClientStream;
 use super::connections::{Connections, Kind};
@@ -80,17 +84,17 @@ where
     let server = Server::build().workers(workers).max_concurrent_connections(max_per_worker);
     let server = server.disable_signals().shutdown_timeout(stop.as_secs());
     // When the server stops, connections that wait for another request end at once.
-    let stopping = server.graceful_shutdown_signal();
+    let (stops, stopping) = (server.graceful_shutdown_signal(), CancellationToken::new());
+    let told = stopping.clone();
+    actix_web::rt::spawn(async move {
+        stops.notified().await;
+        told.cancel();
+    });
     let server = server.listen("http", port, move || {
         let app = app().into_factory().map_err(|error| error.into().error_response());
-        let stopping = stopping.clone();
-        let http = HttpService::build().graceful_shutdown_signal(move || {
-            let stopping = stopping.clone();
-            async move { stopping.notified().await }
-        });
-        let http = http.h1(map_config(app, |()| AppConfig::default()));
-        let (connections, options) = (connections.clone(), options.clone());
-        fn_service(move |tcp| ready(accept(tcp, &connections, &options))).and_then(http)
+        let http = HttpService::build().h1(map_config(app, |()| AppConfig::default()));
+        let (connections, options, stopping) = (connections.clone(), options.clone(), stopping.clone());
+        fn_service(move |tcp| ready(accept(tcp, &connections, &options, &stopping))).and_then(http)
     })?;
     Ok(server.run())
 }
@@ -100,6 +104,7 @@ fn accept(
     tcp: TcpStream,
     connections: &Connections,
     options: &Options,
+    stopping: &CancellationToken,
 ) -> Result<(ClientStream, Option<SocketAddr>), DispatchError> {
     let address = tcp.peer_addr()?;
     let peer = options.trusted_proxies.of_connection(address.ip());
@@ -114,5 +119,5 @@ fn accept(
     if let Err(error) = setsockopt(&tcp, sockopt::TcpUserTimeout, &silence) {
         log::warn!("a connection has no time limit for its answers: {error}");
     }
-    Ok((ClientStream::new(tcp, permit), Some(address)))
+    Ok((ClientStream::new(tcp, permit, stopping.clone()), Some(address)))
 }
