@@ -24,11 +24,12 @@ async fn every_kind_of_failure_is_mailed_and_so_is_its_end() {
         (Manner::Drip, "no answer within 0.5 s"),
         (Manner::Body(500, Vec::new()), "status 500"),
         (Manner::Load("NaN".to_owned()), "NaN"),
+        (Manner::Status(json!({"load": 100, "problem": "no display answers at :0"})), "no display answers at :0"),
     ];
     let mut smtp = Smtp::start(&[]).await;
     let servers: Vec<StandIn> = failures.iter().map(|_| StandIn::start(Manner::idle(7.0, 10))).collect();
     let session = with_mails(&servers, &smtp).start().await;
-    until_states(&session, &["up"; 5]).await;
+    until_states(&session, &["up"; 6]).await;
     for (server, (manner, _)) in servers.iter().zip(&failures) {
         server.set(manner.clone());
     }
