@@ -81,7 +81,7 @@ async fn oversized_and_binary_messages_end_the_connection_in_words() {
     // Its size is told only when all of it is there.
     let mut endless = connect().await;
     endless.send(&"x".repeat(200_000)).await;
-    assert_eq!(endless.until("").await, "loading: Error: Too many messages: more than 128 KiB wait to be read");
+    assert_eq!(endless.until("").await, "loading: Error: Wrong message: more than 128 KiB wait to be read");
     assert_eq!(endless.closed().await, Some(1008));
     let mut clients = [connect().await, connect().await];
     clients[0].send_binary(&[0; 10]).await;

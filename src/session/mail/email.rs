@@ -128,7 +128,7 @@ impl Line {
             event: notice.event.words(),
             at: time(notice.at),
             load: notice.load.map(|load| format!("{:.1}%", load.percent())),
-            error: notice.error.as_deref().map(shown),
+            error: notice.error.as_deref().map(|error| excerpt(error, MAX_LETTERS)),
             held_back: entry.held_back,
         }
     }

@@ -109,7 +109,8 @@ impl ProjectUrl {
         let repository = segments.len();
         let reference = repository + self.reference.saturating_sub(self.repository);
         segments.extend(self.segments.iter().skip(self.repository).cloned());
-        Ok(Self { host, segments, repository, reference, kind: self.kind })
+        let owner = owner(&host, &segments);
+        Ok(Self { host, segments, repository, reference, kind: self.kind, owner })
     }
 
     /// The forge, in small letters, with its port where that is not 443.

@@ -54,7 +54,7 @@ pub enum MessageError {
     #[error("Wrong message: it is longer than {} KiB", MAX_MESSAGE / 1024)]
     TooLarge,
     /// The client sends faster than its messages are read.
-    #[error("Too many messages: more than {} KiB wait to be read", MAX_BACKLOG / 1024)]
+    #[error("Wrong message: more than {} KiB wait to be read", MAX_BACKLOG / 1024)]
     TooMany,
     /// The message is binary, or no UTF-8.
     #[error("Wrong message: allowed are short texts")]

@@ -11,8 +11,9 @@ use log::{Level, Log, Metadata, Record};
 
 /// How many lines of a kind are written at once: the starts of a large class several times over.
 const BURST: NonZeroU32 = NonZeroU32::MIN.saturating_add(999);
-/// How many of them in each minute after that: so somebody who causes them without end needs hours to fill all files.
-const PER_MINUTE: NonZeroU32 = NonZeroU32::MIN.saturating_add(9);
+/// How many of them in each minute after that: more than a busy server writes, and so few that somebody who causes them
+/// without end needs hours to fill all files.
+const PER_MINUTE: NonZeroU32 = NonZeroU32::MIN.saturating_add(119);
 
 /// Lines are of a kind when the same place of the source writes them.
 type Kind = (Option<&'static str>, Option<u32>);
