@@ -41,7 +41,7 @@ fn the_changelog_has_the_version_of_the_program() {
 #[test]
 fn every_guarantee_names_tests_that_exist() {
     let is_rust = |path: &PathBuf| path.extension().is_some_and(|end| end == "rs");
-    let tests = walk(&root().join("tests")).into_iter().filter(is_rust);
+    let tests = ["tests", "src"].into_iter().flat_map(|folder| walk(&root().join(folder))).filter(is_rust);
     let tests: String = tests.map(|file| std::fs::read_to_string(file).unwrap()).collect();
     let page = std::fs::read_to_string(root().join("docs/guarantees.md")).unwrap();
     let mut promises = 0;

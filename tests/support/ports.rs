@@ -16,10 +16,9 @@ pub fn block(count: u16) -> u16 {
     // Other test processes begin elsewhere.
     let start = u16::try_from(std::process::id() % 100).unwrap() * 100;
     for _ in 0..1000 {
-        let offset = start.wrapping_add(NEXT.fetch_add(count, Ordering::Relaxed)) % (LAST - FIRST - count);
-        let first = FIRST + offset;
+        let first = FIRST + start.wrapping_add(NEXT.fetch_add(count, Ordering::Relaxed)) % (LAST - FIRST);
         let free = |port| TcpListener::bind((Ipv4Addr::UNSPECIFIED, port)).is_ok();
-        if (first..first + count).all(free) {
+        if first + count <= LAST && (first..first + count).all(free) {
             return first;
         }
     }
