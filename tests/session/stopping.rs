@@ -5,6 +5,7 @@ use std::time::{Duration, Instant};
 use futures_util::future::join_all;
 use nix::sys::signal::Signal;
 use serde_json::json;
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
 
 use super::stand_in::{Manner, StandIn};
 use super::{addresses, times_logged, until_states};
@@ -32,6 +33,19 @@ async fn clients_are_told_to_go_and_the_server_ends_within_five_seconds() {
     assert!(begin.elapsed() < Duration::from_secs(5), "the end took {:?}", begin.elapsed());
     drop((silent, half));
     assert_eq!((times_logged(&session, ": stopping"), times_logged(&session, ": stopped")), (1, 1));
+}
+
+#[actix_rt::test]
+async fn connections_that_wait_for_another_request_end_at_once() {
+    let mut session = session_server(&[]).start().await;
+    let mut idle = tokio::net::TcpStream::connect(session.address()).await.unwrap();
+    idle.write_all(b"GET /health HTTP/1.1\r\nHost: localhost\r\n\r\n").await.unwrap();
+    assert!(idle.read(&mut [0; 1000]).await.unwrap() > 0);
+    let begin = Instant::now();
+    session.signal(Signal::SIGTERM);
+    idle.read_to_end(&mut Vec::new()).await.unwrap();
+    assert_eq!(session.ended().await, Some(0));
+    assert!(begin.elapsed() < Duration::from_secs(2), "the end took {:?} of 4 s", begin.elapsed());
 }
 
 #[actix_rt::test]
