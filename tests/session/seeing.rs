@@ -223,9 +223,8 @@ async fn what_hides_or_turns_letters_around_is_shown_as_such() {
     let hidden = "1\u{202e}gpj\u{200b}.exe\u{2028}";
     let repository = "https://github.com/lab\u{202e}bal";
     let status = json!({"load": 1, "version": hidden, "allowedRepositories": [repository]});
-    let [well, bad] =
-        [Manner::Status(status), Manner::Body(200, format!("{hidden}\n").into_bytes())].map(StandIn::start);
-    let session = session_server(&addresses(&[well, bad])).start().await;
+    let servers = [Manner::Status(status), Manner::Body(200, format!("{hidden}\n").into_bytes())].map(StandIn::start);
+    let session = session_server(&addresses(&servers)).start().await;
     until_states(&session, &["up", "down"]).await;
     let page = http::get(&session.url("/monitor")).await.text();
     assert!(page.contains("1\u{fffd}gpj\u{fffd}.exe") && page.contains("lab\u{fffd}bal"), "{page}");
