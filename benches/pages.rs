@@ -88,12 +88,12 @@ fn fleet() -> FleetStatus {
     });
     let change = |number| StateChange {
         at: SystemTime::now(),
-        server: address(number),
+        server: address(number).to_string(),
         state: State::Down,
         why: "no answer within 3 s".to_owned(),
     };
     let changes: VecDeque<StateChange> = (0..50).map(change).collect();
-    FleetStatus { available: true, mean_load: Some(42.5), servers: servers.collect(), changes }
+    FleetStatus { available: true, mean_load: Some(42.5), servers: servers.collect(), names: Vec::new(), changes }
 }
 
 /// The demo's size: three simulation servers, one of which runs simulations that somebody watches.

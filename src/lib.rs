@@ -39,6 +39,8 @@
 //!     |  '- Update -- Broadcaster <-- Update, Subscribe -'  '-- ProbeResult --> Registry
 //!     '--- SubscribeClient --^  one per worker thread
 //!
+//!   NameMonitor -- A, AAAA, SRV --> DNS server; -- LookupResult --> Registry (one per name in simulationServers)
+//!
 //!   The monitors share a thread of their own, so that clients never wait for them.
 //!
 //! simulation server
@@ -62,7 +64,8 @@
 //! | actor | ends by itself | after a panic |
 //! |---|---|---|
 //! | Registry, Places, `LoadMonitor` | never | the server logs it and ends with exit code 1: the service manager starts it again |
-//! | `ServerMonitor` | when its server leaves the configuration | the registry makes a new one |
+//! | `ServerMonitor` | when its server leaves the configuration, or has left its name and does not answer | the registry makes a new one |
+//! | `NameMonitor` | when its name leaves the configuration | the registry makes a new one |
 //! | Mailer | never | the registry makes a new one |
 //! | Broadcaster | never | its clients' connections close with 1011; who connects next gets a new one |
 //! | Announcer | when all are told or given up | it is not started again: announcing is a courtesy |

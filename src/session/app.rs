@@ -25,6 +25,8 @@ use crate::shared::run::{AppError, Phase, Request, Signals, notify, permanent, r
 const OWN_FILES: usize = 128;
 /// How many connections there are to one simulation server: one in use, one that is being closed.
 const FILES_PER_SERVER: usize = 2;
+/// To how many simulation servers a name leads at most, as far as open files are kept for them.
+const SERVERS_PER_NAME: usize = 1000;
 
 /// The values of the metric's label `outcome`. All of them are exported from the start.
 const OUTCOMES: [&str; 4] = ["placed", "unavailable", "not_accepted", "wrong_url"];
@@ -107,7 +109,11 @@ fn options(config: &SessionConfig, connections: usize) -> Options {
 /// many clients.
 fn bound_clients(files: u64, config: &SessionConfig) -> (usize, usize) {
     let files = usize::try_from(files).unwrap_or(usize::MAX);
-    let connections = files.saturating_sub(OWN_FILES + FILES_PER_SERVER * config.simulation_servers.len());
+    let names = config.simulation_servers.iter().filter(|entry| entry.name().is_some()).count();
+    let servers = config.simulation_servers.len() - names;
+    // Nobody knows yet to how many servers names lead: they don't take more than a quarter.
+    let looked_up = (FILES_PER_SERVER * SERVERS_PER_NAME * names).min(files / 4);
+    let connections = files.saturating_sub(OWN_FILES + FILES_PER_SERVER * servers + looked_up);
     let clients = connections - connections / 16;
     if clients < config.max_clients {
         log::warn!(
@@ -166,7 +172,8 @@ fn reload(file: &Path, registry: &Addr<Registry>) {
             for warning in &loaded.warnings {
                 log::warn!("{warning}");
             }
-            log::info!("read {} again: {} simulation servers", file.display(), loaded.config.simulation_servers.len());
+            let entries = loaded.config.simulation_servers.len();
+            log::info!("read {} again: {entries} entries in simulationServers", file.display());
             registry.do_send(Reconfigure(Arc::new(loaded.config)));
         }
         Err(error) => log::error!("the configuration stays as it was: {error}"),

@@ -88,7 +88,7 @@ class Crowded(BrowserTest):
         empty = self.fleet.start(
             "session-server", "empty", {"port": free_ports(1), "simulationServers": [], "loadThreshold": 1000})
         page = self.open(empty.url("monitor"))
-        words = page.tab.get_by_text("The configuration lists none")
+        words = page.tab.get_by_text("None is known")
         expect(page.tab.locator("#live")).to_have_text("Live")
         expect(words).to_be_visible()
         self.assertEqual(page.faults(), [])

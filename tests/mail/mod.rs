@@ -12,7 +12,6 @@ use webots_fleet::session::config::SessionConfig;
 use webots_fleet::session::mail::{self, Event, Mailer, Notice, test_mail};
 use webots_fleet::shared::config::{Configuration, load};
 use webots_fleet::shared::domain::Load;
-use webots_fleet::shared::domain::PublicAddress;
 
 use self::log::{keep_log, logged, wait_for_log};
 use self::own_process::trusted_authority;
@@ -62,7 +61,7 @@ fn start(port: u16, more: &Value) -> Addr<Mailer> {
 }
 
 fn notice(host: &str, event: Event) -> Notice {
-    let server = PublicAddress::new(host, 2000, false);
+    let server = format!("{host}:2000");
     let error = (event == Event::NotResponding).then(|| "connection refused".to_owned());
     Notice { server, event, load: Load::try_from(97.25).ok(), error, at: SystemTime::now() }
 }
@@ -95,7 +94,7 @@ async fn a_notice_becomes_a_mail_in_text_and_html() {
 }
 
 #[actix_rt::test]
-async fn each_of_the_four_events_has_its_subject() {
+async fn each_event_has_its_subject() {
     let mut smtp = Smtp::start(&[]).await;
     let mailer = start(smtp.port, &json!({}));
     for (host, event, subject) in [
@@ -103,6 +102,8 @@ async fn each_of_the_four_events_has_its_subject() {
         ("b", Event::WorkingAgain, "Simulation server working again: b:2000"),
         ("c", Event::MaximumLoad, "Simulation server reached maximum load: c:2000"),
         ("d", Event::AvailableAgain, "Simulation server available again: d:2000"),
+        ("dns+e", Event::LookupFails, "Lookup of simulation servers failing: dns+e:2000"),
+        ("dns+f", Event::LookupWorks, "Lookup of simulation servers working again: dns+f:2000"),
     ] {
         mailer.send(notice(host, event)).await.unwrap();
         assert_eq!(smtp.mail().await.subject(), subject);

@@ -1,7 +1,9 @@
 //! The session server, seen from outside: the built program, real sockets, stand-ins for simulation servers.
 
+mod name_server;
 mod stand_in;
 
+mod discovery;
 mod door;
 mod mail;
 mod memory;

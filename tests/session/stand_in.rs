@@ -1,5 +1,6 @@
 //! Stand-ins for simulation servers, which behave as a test says: well, like a Python server, or badly.
 
+use std::net::SocketAddr;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
@@ -57,7 +58,7 @@ impl Manner {
 
 /// A stand-in. Its port refuses connections when it is dropped.
 pub struct StandIn {
-    port: u16,
+    address: SocketAddr,
     shared: Arc<Shared>,
     end: CancellationToken,
 }
@@ -78,13 +79,18 @@ impl StandIn {
 
     /// Starts one on this port.
     pub fn start_at(port: u16, manner: Manner) -> Self {
+        Self::start_on(([127, 0, 0, 1], port).into(), manner)
+    }
+
+    /// Starts one on this address of the loopback.
+    pub fn start_on(address: SocketAddr, manner: Manner) -> Self {
         // There may be a thousand of them.
         raise_file_limit();
-        let socket = TcpSocket::new_v4().unwrap();
+        let socket = if address.is_ipv6() { TcpSocket::new_v6() } else { TcpSocket::new_v4() }.unwrap();
         socket.set_reuseaddr(true).unwrap();
-        socket.bind(([127, 0, 0, 1], port).into()).unwrap();
+        socket.bind(address).unwrap();
         let listener = socket.listen(1024).unwrap();
-        let port = listener.local_addr().unwrap().port();
+        let address = listener.local_addr().unwrap();
         let shared = Arc::new(Shared {
             manner: Mutex::new(manner),
             connections: AtomicUsize::new(0),
@@ -95,17 +101,17 @@ impl StandIn {
         let end = CancellationToken::new();
         let serving = serve(listener, Arc::clone(&shared), end.clone());
         actix_rt::spawn(end.clone().run_until_cancelled_owned(serving));
-        Self { port, shared, end }
+        Self { address, shared, end }
     }
 
     /// `HOST:PORT`.
     pub fn address(&self) -> String {
-        format!("127.0.0.1:{}", self.port)
+        self.address.to_string()
     }
 
     /// Its port.
     pub fn port(&self) -> u16 {
-        self.port
+        self.address.port()
     }
 
     /// What the session server tells a client that is sent here.

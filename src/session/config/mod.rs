@@ -1,9 +1,13 @@
 //! The session server's configuration: every key, its default, and the rules between keys.
 
 mod example;
+mod name_server;
+mod server_entry;
 mod session_config;
 mod timing;
 
 pub use example::Example;
+pub use name_server::NameServer;
+pub use server_entry::{DnsName, ServerEntry};
 pub use session_config::SessionConfig;
 pub use timing::Timing;

@@ -7,6 +7,8 @@ use lettre::message::Mailbox;
 use serde::{Deserialize, Serialize};
 
 use super::example::Example;
+use super::name_server::NameServer;
+use super::server_entry::ServerEntry;
 use super::timing::Timing;
 use crate::session::mail_address;
 use crate::session::placement::Policy;
@@ -41,8 +43,12 @@ pub struct SessionConfig {
     /// Default: none, and each is reached under its own address.
     #[serde(default)]
     pub public_url: Option<PublicUrl>,
-    /// The simulation servers, as HOST:PORT or HOST/PORT.
-    pub simulation_servers: Vec<PublicAddress>,
+    /// The simulation servers: HOST:PORT, HOST/PORT, `dns+NAME:PORT` for all addresses of a name, or `dnssrv+NAME` for all
+    /// targets of an SRV record.
+    pub simulation_servers: Vec<ServerEntry>,
+    /// DNS servers that are asked for these names. Default: none, and those of the machine are asked.
+    #[serde(default, deserialize_with = "one_or_many")]
+    pub name_servers: Vec<NameServer>,
     /// Those of `simulationServers` that get no new clients. They are still watched. Default: none.
     #[serde(default)]
     pub drained_servers: Vec<PublicAddress>,
@@ -172,6 +178,36 @@ impl SessionConfig {
     }
 }
 
+impl SessionConfig {
+    /// Writes the addresses of simulation servers in the usual way, and checks that each is there once.
+    fn check_servers(&mut self) -> Result<(), InvalidValue> {
+        let listed = self.simulation_servers.iter_mut().filter_map(|entry| match entry {
+            ServerEntry::Server(address) => Some(address),
+            ServerEntry::Name(_) => None,
+        });
+        for address in listed.chain(&mut self.drained_servers) {
+            *address = address.clone().without_usual_web_port(self.ssl);
+        }
+        let mut seen = std::collections::HashSet::new();
+        for entry in &self.simulation_servers {
+            if !seen.insert(entry) {
+                let problem = format!("{entry} is listed twice; each simulation server is listed once");
+                return Err(InvalidValue { key: "simulationServers", problem });
+            }
+        }
+        // A name may lead to any server.
+        let has_names = self.simulation_servers.iter().any(|entry| entry.name().is_some());
+        let is_listed = |address: &PublicAddress| seen.contains(&ServerEntry::Server(address.clone()));
+        match self.drained_servers.iter().find(|address| !has_names && !is_listed(address)) {
+            Some(address) => {
+                let problem = format!("{address} is not one of simulationServers");
+                Err(InvalidValue { key: "drainedServers", problem })
+            }
+            None => Ok(()),
+        }
+    }
+}
+
 impl Configuration for SessionConfig {
     const ALIASES: &'static [&'static str] = &[];
 
@@ -182,20 +218,7 @@ impl Configuration for SessionConfig {
             "localhost".clone_into(&mut self.server);
         }
         check_host(&self.server, self.port_rewrite).map_err(|problem| InvalidValue { key: "server", problem })?;
-        for address in self.simulation_servers.iter_mut().chain(&mut self.drained_servers) {
-            *address = address.clone().without_usual_web_port(self.ssl);
-        }
-        let mut seen = std::collections::HashSet::new();
-        for address in &self.simulation_servers {
-            if !seen.insert(address) {
-                let problem = format!("{address} is listed twice; each simulation server is listed once");
-                return Err(InvalidValue { key: "simulationServers", problem });
-            }
-        }
-        if let Some(address) = self.drained_servers.iter().find(|address| !seen.contains(address)) {
-            let problem = format!("{address} is not one of simulationServers");
-            return Err(InvalidValue { key: "drainedServers", problem });
-        }
+        self.check_servers()?;
         if self.timing.silence <= self.timing.ping {
             let problem = format!("{} s is not more than timing.ping", self.timing.silence.as_secs_f64());
             return Err(InvalidValue { key: "timing.silence", problem });

@@ -4,6 +4,7 @@ use std::collections::VecDeque;
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
+use crate::session::config::DnsName;
 use crate::shared::domain::Load;
 use crate::shared::domain::PublicAddress;
 use crate::shared::domain::ServerReport;
@@ -15,10 +16,25 @@ pub struct FleetStatus {
     pub available: bool,
     /// The mean load of the servers that answer.
     pub mean_load: Option<f64>,
-    /// Each simulation server, in the order of the configuration.
+    /// Each simulation server, in the order of the configuration; last those that no name leads to any more.
     pub servers: Vec<ServerStatus>,
+    /// Each name of the configuration that is looked up.
+    pub names: Vec<NameStatus>,
     /// The last changes of state, the newest first.
     pub changes: VecDeque<StateChange>,
+}
+
+/// What is known of a name that leads to simulation servers.
+#[derive(Debug, Clone)]
+pub struct NameStatus {
+    /// The name.
+    pub name: DnsName,
+    /// To how many servers it leads.
+    pub servers: usize,
+    /// Why the last lookup failed, if it did: the servers are those that were found before.
+    pub error: Option<String>,
+    /// Since when lookups fail or don't.
+    pub since: SystemTime,
 }
 
 /// What is known of one simulation server.
@@ -61,13 +77,13 @@ pub enum State {
     Down,
 }
 
-/// A simulation server has changed its state.
+/// A simulation server has changed its state, or a name that leads to some has begun to fail or works again.
 #[derive(Debug, Clone)]
 pub struct StateChange {
     /// When it changed.
     pub at: SystemTime,
-    /// The simulation server.
-    pub server: PublicAddress,
+    /// The simulation server's address, or the name.
+    pub server: String,
     /// Its new state.
     pub state: State,
     /// Why, in words.

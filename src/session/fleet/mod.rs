@@ -3,15 +3,20 @@
 mod caching_resolver;
 mod changes;
 mod fleet_status;
+mod lookup;
+mod monitors;
+mod name_monitor;
+mod names;
 mod pick;
 mod probe_error;
 mod quota;
 mod registry;
 mod server_monitor;
 mod server_record;
+mod servers;
 mod subscribers;
 
-pub use fleet_status::{FleetStatus, ServerStatus, State, StateChange, displayed_mean_load};
+pub use fleet_status::{FleetStatus, NameStatus, ServerStatus, State, StateChange, displayed_mean_load};
 pub use pick::{NoServer, Pick};
 pub use registry::{GetStatus, IsAvailable, Reconfigure, Registry, Subscribe};
 pub use subscribers::{Subscribers, Update};

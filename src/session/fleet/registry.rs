@@ -1,24 +1,26 @@
 //! Actor: owns the state of the fleet and the subscribers; answers picks; sends updates.
 //!
 //! One for the whole server, created at start; it never ends. It alone decides availability: it gets every report and
-//! every pick, so that a pick counts at once. It starts a monitor for each simulation server, and another one if a
-//! monitor has panicked.
+//! every pick, so that a pick counts at once. It starts a monitor for each simulation server and for each name that leads
+//! to some, and another one if a monitor has panicked.
 
-use std::collections::{BTreeMap, BTreeSet};
 use std::net::IpAddr;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use actix::prelude::*;
-use rustls::ClientConfig;
 
 use super::changes::Changes;
 use super::fleet_status::{FleetStatus, ServerStatus};
+use super::monitors::Results;
+use super::name_monitor::LookupResult;
+use super::names::NameChange;
 use super::pick::{NoServer, Pick};
 use super::probe_error::ProbeError;
 use super::quota;
-use super::server_monitor::{ProbeResult, ProbeSettings, ServerMonitor, Stop};
+use super::server_monitor::{ProbeResult, ProbeSettings};
 use super::server_record::{ServerRecord, is_refused};
+use super::servers::{ListChange, Servers};
 use super::subscribers::{Subscribers, Update};
 use crate::session::config::SessionConfig;
 use crate::session::mail::Mailer;
@@ -27,7 +29,7 @@ use crate::shared::domain::Load;
 use crate::shared::domain::ProjectUrl;
 use crate::shared::domain::PublicAddress;
 use crate::shared::domain::ServerReport;
-use crate::shared::http::{AddressQuota, tls};
+use crate::shared::http::AddressQuota;
 
 /// Asks for an update now, and for another one whenever availability changes.
 #[derive(Message)]
@@ -52,22 +54,13 @@ pub struct Reconfigure(pub Arc<SessionConfig>);
 /// The actor.
 pub struct Registry {
     config: Arc<SessionConfig>,
-    /// The thread of all monitors, so that requests of clients do not wait for them.
-    monitors: Arbiter,
-    tls: Option<Arc<ClientConfig>>,
     latencies: prometheus::Histogram,
     fleet: Fleet<PublicAddress>,
     quota: AddressQuota,
-    servers: BTreeMap<PublicAddress, Entry>,
+    servers: Servers,
     subscribers: Subscribers,
     available: bool,
     changes: Changes,
-}
-
-/// One simulation server and its monitor.
-struct Entry {
-    monitor: Addr<ServerMonitor>,
-    record: ServerRecord,
 }
 
 /// Time between two checks of what changes without a report: placements that expire, monitors that have panicked.
@@ -80,74 +73,38 @@ impl Registry {
         Self {
             fleet: Fleet::new(config.policy()),
             quota: quota::placements(),
-            monitors: Arbiter::new(),
-            tls: tls::client_config(),
             config,
             latencies,
-            servers: BTreeMap::new(),
+            servers: Servers::new(),
             subscribers: Subscribers::default(),
             available: false,
             changes: Changes::new(mailer),
         }
     }
 
-    /// Starts monitors for new servers and ends those of servers that are no longer listed.
-    fn apply(&mut self, ctx: &mut Context<Self>) {
-        let config = Arc::clone(&self.config);
-        let listed: BTreeSet<&PublicAddress> = config.simulation_servers.iter().collect();
-        let drained: BTreeSet<&PublicAddress> = config.drained_servers.iter().collect();
-        let gone: Vec<PublicAddress> = self.servers.keys().filter(|known| !listed.contains(known)).cloned().collect();
-        for address in gone {
-            log::info!("{address}: no longer watched");
-            self.fleet.remove(&address);
-            if let Some(entry) = self.servers.remove(&address) {
-                entry.monitor.do_send(Stop);
+    /// Follows another list of servers.
+    fn follow(&mut self, ListChange { added, gone, turned }: ListChange) {
+        for server in added {
+            self.fleet.add(server);
+        }
+        for server in gone {
+            self.fleet.remove(&server);
+        }
+        self.reevaluate(turned);
+    }
+
+    /// Evaluates the last reports of these servers once more: thresholds have changed, or who is drained.
+    fn reevaluate(&mut self, servers: Vec<PublicAddress>) {
+        for server in servers {
+            let record = self.servers.get(&server);
+            if let Some((report, at)) = record.and_then(|record| Some((record.current()?.clone(), record.answered?))) {
+                self.record(&server, Ok(report), at);
             }
         }
-        for address in listed {
-            let drained = drained.contains(address);
-            if let Some(entry) = self.servers.get_mut(address) {
-                entry.record.drained = drained;
-                continue;
-            }
-            let monitor = self.start_monitor(address, ctx);
-            self.fleet.add(address.clone());
-            self.servers.insert(address.clone(), Entry { monitor, record: ServerRecord::new(drained) });
-        }
-    }
-
-    /// Evaluates the last reports once more, after thresholds or drained servers have changed.
-    fn reevaluate(&mut self) {
-        let current = self.servers.iter().filter_map(|(address, entry)| {
-            let record = &entry.record;
-            Some((address.clone(), Ok(record.current()?.clone()), record.answered?))
-        });
-        for (address, answer, at) in current.collect::<Vec<_>>() {
-            self.record(&address, answer, at);
-        }
-    }
-
-    fn probe_settings(&self) -> ProbeSettings {
-        ProbeSettings { interval: self.config.load_refresh, timeout: self.config.timing.answer, ssl: self.config.ssl }
-    }
-
-    fn start_monitor(&self, address: &PublicAddress, ctx: &mut Context<Self>) -> Addr<ServerMonitor> {
-        let results = ctx.address().recipient();
-        let (address, settings, tls) = (address.clone(), self.probe_settings(), self.tls.clone());
-        ServerMonitor::start_in_arbiter(&self.monitors.handle(), move |_| {
-            ServerMonitor::new(address, settings, tls, results)
-        })
     }
 
     fn tick(&mut self, ctx: &mut Context<Self>) {
-        let panicked = self.servers.iter().filter(|(_, entry)| !entry.monitor.connected());
-        for address in panicked.map(|(address, _)| address.clone()).collect::<Vec<_>>() {
-            log::error!("{address}: its monitor is gone, a new one is started");
-            let monitor = self.start_monitor(&address, ctx);
-            if let Some(entry) = self.servers.get_mut(&address) {
-                entry.monitor = monitor;
-            }
-        }
+        self.servers.restart_gone(&self.config, &results(ctx));
         self.changes.restart_mailer_if_gone(&self.config);
         self.publish();
         self.subscribers.retry(Update::Availability(self.available));
@@ -166,9 +123,14 @@ impl Registry {
 
     /// Records what a probe of a server brought at this time.
     fn record(&mut self, server: &PublicAddress, answer: Result<ServerReport, ProbeError>, at: Instant) {
-        let Some(Entry { record, .. }) = self.servers.get_mut(server) else {
+        let Some(record) = self.servers.get_mut(server) else {
             return;
         };
+        if record.unlisted && answer.is_err() {
+            self.servers.forget(server);
+            self.fleet.remove(server);
+            return;
+        }
         let change = match answer {
             Ok(report) => record.succeeded(report, at, self.fleet.limit(server).unwrap_or(self.config.load_threshold)),
             Err(error) => record.failed(error),
@@ -185,21 +147,19 @@ impl Registry {
     /// Chooses a server for a client of this address.
     fn pick(&mut self, world: Option<&ProjectUrl>, from: Option<IpAddr>) -> Result<PublicAddress, NoServer> {
         let Self { fleet, servers, .. } = self;
-        let accepts = |address: &PublicAddress, world| servers.get(address)?.record.accepts(world);
+        let accepts = |address: &PublicAddress, world| servers.get(address)?.accepts(world);
         let eligible = |address: &PublicAddress| world.is_none_or(|world| accepts(address, world) == Some(true));
         let now = Instant::now();
         let picked =
             if self.quota.take(from) { fleet.place(now, eligible) } else { fleet.place_without_room(now, eligible) };
         picked.ok_or_else(|| match world {
-            Some(world) if is_refused(servers.values().map(|entry| &entry.record), world) => {
-                NoServer::NotAccepted(world.repository())
-            }
+            Some(world) if is_refused(servers.records(), world) => NoServer::NotAccepted(world.repository()),
             _ => NoServer::Unavailable,
         })
     }
 
     fn status_of(&self, address: &PublicAddress) -> Option<ServerStatus> {
-        let status = self.servers.get(address)?.record.status(address);
+        let status = self.servers.get(address)?.status(address);
         Some(ServerStatus {
             effective_load: self.fleet.effective_load(address),
             in_flight: self.fleet.in_flight(address),
@@ -209,13 +169,19 @@ impl Registry {
     }
 }
 
+/// Who hears what the monitors find: the registry.
+fn results(ctx: &Context<Registry>) -> Results {
+    Results { probes: ctx.address().recipient(), lookups: ctx.address().recipient() }
+}
+
 impl Actor for Registry {
     type Context = Context<Self>;
 
     fn started(&mut self, ctx: &mut Self::Context) {
         // The requests and reports of a whole fleet may come in the same moment.
         ctx.set_mailbox_capacity(4096);
-        self.apply(ctx);
+        let change = self.servers.apply(&self.config, &results(ctx));
+        self.follow(change);
         ctx.run_interval(TICK, Self::tick);
     }
 }
@@ -225,11 +191,32 @@ impl Handler<ProbeResult> for Registry {
 
     fn handle(&mut self, ProbeResult { server, latency, answer }: ProbeResult, _: &mut Self::Context) {
         self.latencies.observe(latency.as_secs_f64());
-        if let Some(entry) = self.servers.get_mut(&server) {
-            entry.record.latency = Some(latency);
+        if let Some(record) = self.servers.get_mut(&server) {
+            record.latency = Some(latency);
         }
         self.record(&server, answer, Instant::now());
         self.publish();
+    }
+}
+
+impl Handler<LookupResult> for Registry {
+    type Result = ();
+
+    fn handle(&mut self, result: LookupResult, ctx: &mut Self::Context) {
+        let name = result.name.clone();
+        let Some(NameChange { servers, turn }) = self.servers.record_lookup(result) else {
+            return;
+        };
+        if let Some(turn) = turn {
+            self.changes.add_name(&name, turn);
+        }
+        if servers {
+            let change = self.servers.follow_names(&self.config, &results(ctx));
+            let (added, gone) = (change.added.len(), change.gone.len() + change.turned.len());
+            log::info!("{name}: leads to other servers: {added} new, {gone} gone or back");
+            self.follow(change);
+            self.publish();
+        }
     }
 }
 
@@ -263,11 +250,12 @@ impl Handler<GetStatus> for Registry {
     type Result = MessageResult<GetStatus>;
 
     fn handle(&mut self, _: GetStatus, _: &mut Self::Context) -> Self::Result {
-        let servers = self.config.simulation_servers.iter().filter_map(|address| self.status_of(address));
+        let servers = self.servers.in_order().filter_map(|address| self.status_of(address));
         MessageResult(Arc::new(FleetStatus {
             available: self.available,
-            mean_load: Load::mean(self.servers.values().filter_map(|entry| entry.record.load())).map(Load::percent),
+            mean_load: Load::mean(self.servers.records().filter_map(ServerRecord::load)).map(Load::percent),
             servers: servers.collect(),
+            names: self.servers.names(),
             changes: self.changes.recent().clone(),
         }))
     }
@@ -277,18 +265,18 @@ impl Handler<Reconfigure> for Registry {
     type Result = ();
 
     fn handle(&mut self, Reconfigure(config): Reconfigure, ctx: &mut Self::Context) {
-        let before = self.probe_settings();
+        let before = ProbeSettings::new(&self.config);
         let config = Arc::new(self.config.reload(&config));
         self.fleet.set_policy(config.policy());
         self.config = config;
-        self.apply(ctx);
-        let settings = self.probe_settings();
+        let change = self.servers.apply(&self.config, &results(ctx));
+        self.follow(change);
+        let settings = ProbeSettings::new(&self.config);
         if settings != before {
-            for entry in self.servers.values() {
-                entry.monitor.do_send(settings);
-            }
+            self.servers.set_probes(settings);
         }
-        self.reevaluate();
+        let all = self.servers.in_order().cloned().collect();
+        self.reevaluate(all);
         self.publish();
     }
 }

@@ -21,6 +21,7 @@ use rustls::ClientConfig;
 
 use super::caching_resolver::CachingResolver;
 use super::probe_error::ProbeError;
+use crate::session::config::SessionConfig;
 use crate::shared::domain::Load;
 use crate::shared::domain::PublicAddress;
 use crate::shared::domain::ServerReport;
@@ -49,6 +50,14 @@ pub struct ProbeSettings {
     pub timeout: Duration,
     /// Whether the fleet is behind https.
     pub ssl: bool,
+}
+
+impl ProbeSettings {
+    /// As the configuration has it.
+    #[must_use]
+    pub fn new(config: &SessionConfig) -> Self {
+        Self { interval: config.load_refresh, timeout: config.timing.answer, ssl: config.ssl }
+    }
 }
 
 /// Asks a monitor to end.

@@ -17,6 +17,8 @@ use crate::shared::domain::ServerReport;
 pub struct ServerRecord {
     /// Whether the configuration has it drained.
     pub drained: bool,
+    /// Whether no name leads to it any more.
+    pub unlisted: bool,
     /// Its state.
     pub state: State,
     /// Since when.
@@ -56,6 +58,7 @@ impl ServerRecord {
     pub fn new(drained: bool) -> Self {
         Self {
             drained,
+            unlisted: false,
             state: State::Unknown,
             since: SystemTime::now(),
             report: None,
@@ -143,7 +146,7 @@ impl ServerRecord {
     fn judge(&self, report: &ServerReport, limit: f64) -> (State, impl FnOnce() -> String + use<>) {
         let load = report.load.percent();
         let no_place = report.instances.filter(|instances| instances.present() >= instances.places);
-        let state = if self.drained || report.draining {
+        let state = if self.drained || self.unlisted || report.draining {
             State::Draining
         } else if load >= limit || no_place.is_some() {
             State::Full
@@ -152,6 +155,7 @@ impl ServerRecord {
         };
         let reason = match (state, no_place) {
             (State::Draining, _) if self.drained => " (drained by drainedServers)".to_owned(),
+            (State::Draining, _) if self.unlisted => " (no name leads to it any more)".to_owned(),
             (State::Draining, _) => " (it drains itself)".to_owned(),
             (State::Full, Some(full)) => format!(", {} clients in {} places", full.present(), full.places),
             (State::Full, None) => format!(" of {limit:.1} %"),

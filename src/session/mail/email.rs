@@ -124,7 +124,7 @@ impl Line {
     fn new(entry: &Entry) -> Self {
         let notice = &entry.notice;
         Self {
-            server: excerpt(&notice.server.to_string(), MAX_LETTERS),
+            server: excerpt(&notice.server, MAX_LETTERS),
             event: notice.event.words(),
             at: time(notice.at),
             load: notice.load.map(|load| format!("{:.1}%", load.percent())),
@@ -154,18 +154,25 @@ impl Header for AutoSubmitted {
 
 /// The subject: `Simulation server not responding`, or `3 simulation servers not responding, 1 working again`.
 fn summary(events: &[Event]) -> String {
+    use Event::{AvailableAgain, LookupFails, LookupWorks, MaximumLoad, NotResponding, WorkingAgain};
     if let [only] = events {
-        return format!("Simulation server {}", only.words());
+        let [noun, _] = only.nouns();
+        let (first, rest) = noun.split_at_checked(1).unwrap_or_default();
+        return format!("{}{rest} {}", first.to_uppercase(), only.words());
     }
-    let all = [Event::NotResponding, Event::WorkingAgain, Event::MaximumLoad, Event::AvailableAgain];
+    let all = [NotResponding, WorkingAgain, MaximumLoad, AvailableAgain, LookupFails, LookupWorks];
     let counts = all.map(|event| (events.iter().filter(|other| **other == event).count(), event));
     let mut parts: Vec<String> = Vec::new();
+    let mut before = None;
     for (count, event) in counts.into_iter().filter(|(count, _)| *count > 0) {
-        parts.push(match (parts.is_empty(), count) {
-            (true, 1) => format!("1 simulation server {}", event.words()),
-            (true, _) => format!("{count} simulation servers {}", event.words()),
-            (false, _) => format!("{count} {}", event.words()),
+        let nouns = event.nouns();
+        let [one, many] = nouns;
+        parts.push(match count {
+            _ if before == Some(nouns) => format!("{count} {}", event.words()),
+            1 => format!("1 {one} {}", event.words()),
+            _ => format!("{count} {many} {}", event.words()),
         });
+        before = Some(nouns);
     }
     parts.join(", ")
 }
@@ -182,7 +189,7 @@ mod tests {
 
     #[test]
     fn subjects_count_what_happened() {
-        use Event::{AvailableAgain, MaximumLoad, NotResponding, WorkingAgain};
+        use Event::{AvailableAgain, LookupFails, LookupWorks, MaximumLoad, NotResponding, WorkingAgain};
         for (events, subject) in [
             (vec![NotResponding], "Simulation server not responding"),
             (vec![WorkingAgain], "Simulation server working again"),
@@ -193,6 +200,11 @@ mod tests {
             (
                 vec![MaximumLoad, AvailableAgain, MaximumLoad],
                 "2 simulation servers reached maximum load, 1 available again",
+            ),
+            (vec![LookupFails], "Lookup of simulation servers failing"),
+            (
+                vec![LookupWorks, NotResponding, LookupFails, LookupFails],
+                "1 simulation server not responding, 2 lookups of simulation servers failing, 1 working again",
             ),
         ] {
             assert_eq!(summary(&events), subject);

@@ -13,14 +13,13 @@ use std::time::{Duration, Instant, SystemTime};
 use actix::Message;
 
 use crate::shared::domain::Load;
-use crate::shared::domain::PublicAddress;
 
 /// A change of a simulation server that the administrator should know of.
 #[derive(Message, Debug, Clone, PartialEq)]
 #[rtype(result = "()")]
 pub struct Notice {
-    /// The simulation server.
-    pub server: PublicAddress,
+    /// The simulation server's address, or the name that leads to some.
+    pub server: String,
     /// What happened.
     pub event: Event,
     /// Its load, if known.
@@ -31,7 +30,7 @@ pub struct Notice {
     pub at: SystemTime,
 }
 
-/// What happened to a simulation server, in the order of the lines in an e-mail.
+/// What happened to a simulation server or to a name, in the order of the lines in an e-mail.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Event {
     /// It gives no usable answer.
@@ -42,24 +41,38 @@ pub enum Event {
     MaximumLoad,
     /// Its load is below the threshold again.
     AvailableAgain,
+    /// A name can't be looked up.
+    LookupFails,
+    /// It can be again.
+    LookupWorks,
 }
 
 /// What an event is about.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Topic {
-    /// Whether a server responds.
+    /// Whether a server responds, or a name.
     Health,
     /// Whether a server has room for clients.
     Capacity,
 }
 
 impl Event {
-    /// The event in words that follow 'simulation server' or 'simulation servers'.
+    /// What it happens to, one and many.
+    #[must_use]
+    pub fn nouns(self) -> [&'static str; 2] {
+        match self {
+            Self::LookupFails | Self::LookupWorks => ["lookup of simulation servers", "lookups of simulation servers"],
+            _ => ["simulation server", "simulation servers"],
+        }
+    }
+
+    /// The event in words that follow those of [`Event::nouns`].
     #[must_use]
     pub fn words(self) -> &'static str {
         match self {
+            Self::LookupFails => "failing",
             Self::NotResponding => "not responding",
-            Self::WorkingAgain => "working again",
+            Self::WorkingAgain | Self::LookupWorks => "working again",
             Self::MaximumLoad => "reached maximum load",
             Self::AvailableAgain => "available again",
         }
@@ -69,7 +82,7 @@ impl Event {
     #[must_use]
     pub fn topic(self) -> Topic {
         match self {
-            Self::NotResponding | Self::WorkingAgain => Topic::Health,
+            Self::NotResponding | Self::WorkingAgain | Self::LookupFails | Self::LookupWorks => Topic::Health,
             Self::MaximumLoad | Self::AvailableAgain => Topic::Capacity,
         }
     }
@@ -105,7 +118,7 @@ impl Entry {
 pub struct Notices {
     gather: Duration,
     flapping: Duration,
-    servers: HashMap<PublicAddress, State>,
+    servers: HashMap<String, State>,
 }
 
 #[derive(Debug, Default)]
@@ -172,7 +185,8 @@ impl State {
     /// Until when the pending entries are held back, if they are.
     fn held_until(&self) -> Option<Instant> {
         let cooldown = self.cooldown?;
-        let fails = |(entry, _): &(Entry, Instant)| entry.notice.event == Event::NotResponding;
+        let fails =
+            |(entry, _): &(Entry, Instant)| matches!(entry.notice.event, Event::NotResponding | Event::LookupFails);
         let fails_now = !cooldown.about_health && self.pending.get(&Topic::Health).is_some_and(fails);
         (!fails_now).then_some(cooldown.end)
     }
@@ -201,7 +215,7 @@ mod tests {
         for second in 0..5_000 {
             let now = start + Duration::from_secs(second);
             for (_, port, event) in notices.iter().filter(|(when, ..)| *when == second) {
-                let server = PublicAddress::new("host", *port, false);
+                let server = format!("host:{port}");
                 let notice = Notice { server, event: *event, load: None, error: None, at: SystemTime::UNIX_EPOCH };
                 state.add(notice, now);
             }
@@ -209,7 +223,7 @@ mod tests {
                 .take(now)
                 .into_iter()
                 .map(|entry| {
-                    let server = entry.notice.server.to_string();
+                    let server = entry.notice.server;
                     (server.rsplit_once(':').unwrap().1.parse().unwrap(), entry.notice.event, entry.held_back)
                 })
                 .collect();
@@ -300,7 +314,7 @@ mod tests {
     fn the_last_error_outlives_the_recovery() {
         let notice = |event, error: Option<&str>| Entry {
             notice: Notice {
-                server: PublicAddress::new("host", 1, false),
+                server: "host:1".to_owned(),
                 event,
                 load: None,
                 error: error.map(str::to_owned),

@@ -141,10 +141,9 @@ mod tests {
 
     use super::*;
     use crate::session::mail::{Event, Notice};
-    use crate::shared::domain::PublicAddress;
 
     fn entry(port: u16, event: Event) -> Entry {
-        let server = PublicAddress::new("host", port, false);
+        let server = format!("host:{port}");
         Entry { notice: Notice { server, event, load: None, error: None, at: SystemTime::UNIX_EPOCH }, held_back: 0 }
     }
 
@@ -214,7 +213,7 @@ mod tests {
         let mut outbox = outbox(2);
         assert_eq!(outbox.put((1..=5).map(|port| entry(port, Event::NotResponding)).collect()), 3);
         let batch = outbox.take(Instant::now()).unwrap();
-        let servers: Vec<_> = batch.entries().map(|entry| entry.notice.server.to_string()).collect();
+        let servers: Vec<_> = batch.entries().map(|entry| entry.notice.server.clone()).collect();
         assert_eq!(servers, ["host:4", "host:5"]);
     }
 }

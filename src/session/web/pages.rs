@@ -6,7 +6,7 @@ use std::time::{Duration, SystemTime};
 use askama::Template;
 
 use crate::session::config::Example;
-use crate::session::fleet::{FleetStatus, ServerStatus, State, StateChange};
+use crate::session::fleet::{FleetStatus, NameStatus, ServerStatus, State, StateChange};
 use crate::shared::domain::ClientUrls;
 use crate::shared::domain::Instances;
 use crate::shared::http::{Row, View};
@@ -27,7 +27,8 @@ struct Monitor<'view> {
 /// The summary of the fleet.
 #[derive(Template)]
 #[template(path = "session/glance.html")]
-struct Glance {
+struct Glance<'status> {
+    names: &'status [NameStatus],
     available: bool,
     clients: usize,
     mean_load: Option<f64>,
@@ -129,13 +130,14 @@ pub fn monitor(
     page.render()
 }
 
-impl Glance {
-    fn new(status: &FleetStatus, clients: usize) -> Self {
+impl<'status> Glance<'status> {
+    fn new(status: &'status FleetStatus, clients: usize) -> Self {
         let count = |wanted: &[State]| status.servers.iter().filter(|server| wanted.contains(&server.state)).count();
         let instances = || status.servers.iter().filter_map(known_instances);
         // Another server's numbers may be anything.
         let sum = |part: fn(Instances) -> u32| instances().map(|one| u64::from(part(one))).sum::<u64>();
         Self {
+            names: &status.names,
             available: status.available,
             clients,
             mean_load: status.mean_load,

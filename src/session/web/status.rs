@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use serde::Serialize;
 
-use crate::session::fleet::{FleetStatus, ServerStatus, State, displayed_mean_load};
+use crate::session::fleet::{FleetStatus, NameStatus, ServerStatus, State, displayed_mean_load};
 use crate::session::state::AppState;
 use crate::shared::domain::ClientUrls;
 use crate::shared::domain::Instances;
@@ -24,6 +24,7 @@ pub struct StatusPage {
     /// Percent; absent where no server answers.
     load: Option<f64>,
     servers: Vec<ServerPage>,
+    names: Vec<NamePage>,
     changes: Vec<ChangePage>,
 }
 
@@ -49,6 +50,14 @@ struct ServerPage {
 }
 
 #[derive(Debug, Serialize)]
+struct NamePage {
+    name: String,
+    servers: usize,
+    since: String,
+    error: Option<String>,
+}
+
+#[derive(Debug, Serialize)]
 struct ChangePage {
     at: String,
     server: String,
@@ -62,9 +71,15 @@ impl StatusPage {
     pub fn new(server: &AppState, status: &FleetStatus) -> Self {
         let changes = status.changes.iter().map(|change| ChangePage {
             at: timestamp(change.at),
-            server: change.server.to_string(),
+            server: change.server.clone(),
             state: change.state.word(),
             why: change.why.clone(),
+        });
+        let names = status.names.iter().map(|name| NamePage {
+            name: name.name.to_string(),
+            servers: name.servers,
+            since: timestamp(name.since),
+            error: name.error.clone(),
         });
         Self {
             version: env!("CARGO_PKG_VERSION"),
@@ -73,6 +88,7 @@ impl StatusPage {
             clients: server.clients(),
             load: status.mean_load,
             servers: status.servers.iter().map(|one| ServerPage::new(one, &server.client_urls)).collect(),
+            names: names.collect(),
             changes: changes.collect(),
         }
     }
@@ -108,6 +124,9 @@ pub fn gauges<'text>(clients: usize, status: &FleetStatus) -> Vec<Gauge<'text>> 
     let of_each = |value: &dyn Fn(&ServerStatus) -> Option<f64>| {
         let servers = status.servers.iter();
         servers.filter_map(|server| Some((vec![server.address.to_string()], value(server)?))).collect()
+    };
+    let of_each_name = |value: &dyn Fn(&NameStatus) -> f64| {
+        status.names.iter().map(|name| (vec![name.name.to_string()], value(name))).collect()
     };
     let labels: &[&str] = &["server"];
     let count = |wanted: State| status.servers.iter().filter(move |server| server.state == wanted).count();
@@ -161,6 +180,18 @@ pub fn gauges<'text>(clients: usize, status: &FleetStatus) -> Vec<Gauge<'text>> 
             help: "Time in which a simulation server answered last",
             labels,
             values: of_each(&|server| server.latency.map(|latency| latency.as_secs_f64())),
+        },
+        Gauge {
+            name: "webots_session_lookup_up",
+            help: "1 while a name of simulation servers can be looked up",
+            labels: &["name"],
+            values: of_each_name(&|name| f64::from(u8::from(name.error.is_none()))),
+        },
+        Gauge {
+            name: "webots_session_lookup_servers",
+            help: "Simulation servers that a name leads to",
+            labels: &["name"],
+            values: of_each_name(&|name| number(name.servers)),
         },
     ]
 }

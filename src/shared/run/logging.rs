@@ -45,12 +45,16 @@ impl fmt::Display for LogTarget<'_> {
 /// # Errors
 /// When the file or its folder can't be made.
 pub fn start(target: LogTarget<'_>) -> std::io::Result<()> {
-    // The decoder of HTTP logs each malformed message as an error. Strangers could fill the log with them.
+    // The decoder of HTTP logs each malformed message as an error. Strangers could fill the log with them. What the resolver
+    // finds out is told by who asks it.
     let default_level = match target {
         LogTarget::Stdout => {
-            "debug,actix_http=info,actix_http::h1::decoder=off,actix_server=info,mio=info,rustls=info,h2=info"
+            "debug,actix_http=info,actix_http::h1::decoder=off,actix_server=info,mio=info,rustls=info,h2=info,\
+             hickory_net=off,hickory_proto=off,hickory_resolver=off"
         }
-        LogTarget::File(_) => "info,actix_http::h1::decoder=off,actix_server=warn",
+        LogTarget::File(_) => {
+            "info,actix_http::h1::decoder=off,actix_server=warn,hickory_net=off,hickory_proto=off,hickory_resolver=off"
+        }
     };
     let mut builder = Builder::from_env(Env::default().default_filter_or(default_level));
     builder.target(match target {

@@ -1,0 +1,165 @@
+//! The key `simulationServers`: addresses of simulation servers, and names that DNS is asked for.
+
+use std::fmt;
+use std::net::IpAddr;
+
+use serde::{Deserialize, Serialize};
+
+use crate::shared::domain::PublicAddress;
+
+/// An entry of `simulationServers`.
+#[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(try_from = "String", into = "String")]
+pub enum ServerEntry {
+    /// A simulation server.
+    Server(PublicAddress),
+    /// A name that leads to simulation servers.
+    Name(DnsName),
+}
+
+/// A name that DNS is asked for again and again. A final dot makes it absolute, as everywhere in DNS.
+///
+/// It is written as Thanos, Loki and Mimir write theirs. A URL `dns://...` would look alike, but is something else: its
+/// host is the name server (RFC 4501), and so has gRPC it.
+#[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub enum DnsName {
+    /// `dns+HOST:PORT`: all addresses of a host (A and AAAA), each with this port.
+    Addresses {
+        /// The host.
+        host: String,
+        /// The port.
+        port: u16,
+    },
+    /// `dnssrv+NAME`: all targets of a service (SRV), with their ports.
+    Service(String),
+}
+
+/// A text that is no entry of `simulationServers`.
+#[derive(Debug, thiserror::Error)]
+#[error(
+    "{found:?} is no simulation server; allowed is HOST:PORT, or HOST/PORT where a web server rewrites ports, \
+     dns+NAME:PORT for all addresses of a name, and dnssrv+NAME for all targets of an SRV record"
+)]
+pub struct NoEntry {
+    found: String,
+}
+
+impl ServerEntry {
+    /// The address of the simulation server, unless this is a name.
+    #[must_use]
+    pub fn server(&self) -> Option<&PublicAddress> {
+        match self {
+            Self::Server(address) => Some(address),
+            Self::Name(_) => None,
+        }
+    }
+
+    /// The name to be looked up, if this is one.
+    #[must_use]
+    pub fn name(&self) -> Option<&DnsName> {
+        match self {
+            Self::Name(name) => Some(name),
+            Self::Server(_) => None,
+        }
+    }
+}
+
+impl TryFrom<String> for ServerEntry {
+    type Error = NoEntry;
+
+    fn try_from(text: String) -> Result<Self, NoEntry> {
+        let entry = if let Some(name) = text.strip_prefix("dnssrv+") {
+            plain_name(name).map(|name| Self::Name(DnsName::Service(name)))
+        } else if let Some(name) = text.strip_prefix("dns+") {
+            addresses(name).map(Self::Name)
+        } else {
+            text.parse().ok().map(Self::Server)
+        };
+        entry.ok_or(NoEntry { found: text })
+    }
+}
+
+impl From<ServerEntry> for String {
+    fn from(entry: ServerEntry) -> Self {
+        entry.to_string()
+    }
+}
+
+impl fmt::Display for ServerEntry {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Server(address) => address.fmt(out),
+            Self::Name(name) => name.fmt(out),
+        }
+    }
+}
+
+impl fmt::Display for DnsName {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Addresses { host, port } => write!(out, "dns+{host}:{port}"),
+            Self::Service(name) => write!(out, "dnssrv+{name}"),
+        }
+    }
+}
+
+fn addresses(text: &str) -> Option<DnsName> {
+    let (host, port) = text.rsplit_once(':')?;
+    let port = format!("host:{port}").parse::<PublicAddress>().ok().filter(|address| !address.is_rewritten())?.port();
+    plain_name(host).map(|host| DnsName::Addresses { host, port })
+}
+
+/// A name as DNS is asked for it, none for what is no name. A final dot stays.
+fn plain_name(text: &str) -> Option<String> {
+    let relative = text.strip_suffix('.').unwrap_or(text);
+    let address: PublicAddress = format!("{relative}:1").parse().ok()?;
+    let host = address.host();
+    let is_address = host.starts_with('[') || host.parse::<IpAddr>().is_ok();
+    (!is_address && !relative.ends_with('.'))
+        .then(|| format!("{host}{}", text.get(relative.len()..).unwrap_or_default()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn read(text: &str) -> Result<ServerEntry, NoEntry> {
+        text.to_owned().try_into()
+    }
+
+    #[test]
+    fn addresses_and_names_stand_side_by_side() {
+        for text in ["localhost:2000", "lab.org/2000", "dns+tasks.simulation:2000", "dnssrv+_webots._tcp.example.org"] {
+            assert_eq!(read(text).unwrap().to_string(), text);
+        }
+        for (text, plain) in
+            [("dns+Tasks.Simulation.:02000", "dns+tasks.simulation.:2000"), ("dnssrv+_W._TCP.a", "dnssrv+_w._tcp.a")]
+        {
+            assert_eq!(read(text).unwrap().to_string(), plain);
+        }
+    }
+
+    #[test]
+    fn what_is_no_name_is_refused_in_words() {
+        for text in [
+            "dns+",
+            "dns+host",
+            "dns+host:0",
+            "dns+host:port",
+            "dns+lab.org/2000",
+            "dns+lab.org:443/2000",
+            "dns+10.0.0.7:2000",
+            "dns+[::1]:2000",
+            "dns+a b:2000",
+            "dns+a..:2000",
+            "dnssrv+",
+            "dnssrv+name:2000",
+            "dnssrv+.",
+            "dns://tasks.simulation:2000",
+            "DNS+host:2000",
+        ] {
+            let error = read(text).unwrap_err().to_string();
+            assert!(error.contains(&format!("{text:?}")) && error.contains("dns+NAME:PORT"), "{error}");
+        }
+    }
+}

@@ -1,0 +1,49 @@
+//! The thread in which all monitors run, so that requests of clients do not wait for them. Part of the registry.
+
+use std::sync::Arc;
+
+use actix::prelude::*;
+use rustls::ClientConfig;
+
+use super::name_monitor::{LookupResult, NameMonitor};
+use super::server_monitor::{ProbeResult, ProbeSettings, ServerMonitor};
+use crate::session::config::{DnsName, SessionConfig};
+use crate::shared::domain::PublicAddress;
+use crate::shared::http::tls;
+
+/// Starts monitors.
+pub struct Monitors {
+    thread: Arbiter,
+    tls: Option<Arc<ClientConfig>>,
+}
+
+/// Who hears what the monitors find.
+pub struct Results {
+    /// For each look at a simulation server.
+    pub probes: Recipient<ProbeResult>,
+    /// For each lookup of a name.
+    pub lookups: Recipient<LookupResult>,
+}
+
+impl Monitors {
+    /// A thread without monitors.
+    #[must_use]
+    pub fn new() -> Self {
+        Self { thread: Arbiter::new(), tls: tls::client_config() }
+    }
+
+    /// Starts the monitor of a simulation server.
+    pub fn watch(&self, server: &PublicAddress, config: &SessionConfig, results: &Results) -> Addr<ServerMonitor> {
+        let (server, tls, results) = (server.clone(), self.tls.clone(), results.probes.clone());
+        let settings = ProbeSettings::new(config);
+        ServerMonitor::start_in_arbiter(&self.thread.handle(), move |_| {
+            ServerMonitor::new(server, settings, tls, results)
+        })
+    }
+
+    /// Starts the monitor of a name.
+    pub fn look_up(&self, name: &DnsName, config: &SessionConfig, results: &Results) -> Addr<NameMonitor> {
+        let (name, servers, results) = (name.clone(), config.name_servers.clone(), results.lookups.clone());
+        NameMonitor::start_in_arbiter(&self.thread.handle(), move |_| NameMonitor::new(name, servers, results))
+    }
+}

@@ -1,0 +1,199 @@
+//! Simulation servers that DNS leads to, asked of a real DNS server.
+
+use std::net::IpAddr;
+use std::time::{Duration, Instant};
+
+use nix::sys::signal::Signal;
+use serde_json::{Value, json};
+
+use super::name_server::NameServer;
+use super::stand_in::{Manner, StandIn};
+use super::{times_logged, until_states};
+use crate::support::program::{Builder, Server, session_server};
+use crate::support::smtp::Smtp;
+use crate::support::{http, ports, until};
+
+fn good() -> Manner {
+    Manner::idle(5.0, 1000)
+}
+
+/// Addresses of the loopback.
+fn loopback(last: impl IntoIterator<Item = u8>) -> Vec<IpAddr> {
+    last.into_iter().map(|last| [127, 0, 0, last].into()).collect()
+}
+
+fn stand_ins(addresses: &[IpAddr], port: u16) -> Vec<StandIn> {
+    addresses.iter().map(|address| StandIn::start_on((*address, port).into(), good())).collect()
+}
+
+/// A session server that looks these entries up.
+fn looking_up(entries: &[String], names: &NameServer) -> Builder {
+    session_server(entries).set("nameServers", json!([names.address()])).set("clientCost", 0.001)
+}
+
+/// What `/status` tells of each server: its address and its state.
+async fn servers(session: &Server) -> Vec<(String, String)> {
+    let status = http::get(&session.url("/status")).await.json();
+    let text = |value: &Value| value.as_str().unwrap().to_owned();
+    let servers = status["servers"].as_array().unwrap();
+    servers.iter().map(|server| (text(&server["address"]), text(&server["state"]))).collect()
+}
+
+#[actix_rt::test]
+async fn servers_behind_a_name_come_and_go() {
+    let (names, port) = (NameServer::start(&[]), ports::block(1));
+    let mut first = stand_ins(&loopback([2, 3]), port);
+    names.set("fleet.test", &loopback([2, 3]));
+    let fixed = StandIn::start(good());
+    let session = looking_up(&[fixed.address(), format!("dns+Fleet.test:{port}")], &names).start().await;
+    until_states(&session, &["up"; 3]).await;
+    assert_eq!(servers(&session).await[0].0, fixed.address(), "in the order of the configuration");
+
+    // More come, one of them by IPv6.
+    let (third, fourth): (IpAddr, IpAddr) = ([127, 0, 0, 4].into(), "::1".parse().unwrap());
+    let _more = stand_ins(&[third, fourth], port);
+    let begin = Instant::now();
+    names.set("fleet.test", &[loopback([2, 3]), vec![third, fourth]].concat());
+    until_states(&session, &["up"; 5]).await;
+    assert!(begin.elapsed() < Duration::from_secs(5), "used after {:?}", begin.elapsed());
+    assert!(servers(&session).await.iter().any(|(address, _)| *address == format!("[::1]:{port}")));
+
+    // One is listed no longer, and still answers: no client goes there.
+    let leaving = first.remove(0);
+    names.set("fleet.test", &[loopback([3]), vec![third, fourth]].concat());
+    until_states(&session, &["up", "up", "up", "up", "draining"]).await;
+    assert_eq!(servers(&session).await[4].0, leaving.address());
+    for _ in 0..20 {
+        assert_ne!(http::get(&session.url("/session")).await.text(), leaving.url());
+    }
+    // It comes back, and goes for good.
+    names.set("fleet.test", &[loopback([2, 3]), vec![third, fourth]].concat());
+    until_states(&session, &["up"; 5]).await;
+    names.set("fleet.test", &[loopback([3]), vec![third, fourth]].concat());
+    until_states(&session, &["up", "up", "up", "up", "draining"]).await;
+    let address = leaving.address();
+    drop(leaving);
+    until_states(&session, &["up"; 4]).await;
+    assert_eq!(times_logged(&session, &format!("{address}: no longer watched")), 1);
+    assert_eq!(times_logged(&session, &format!("{address}: down")), 0, "to leave is no failure");
+}
+
+#[actix_rt::test]
+async fn one_that_fails_and_is_then_listed_no_longer_is_forgotten() {
+    let (names, port) = (NameServer::start(&[]), ports::block(1));
+    let mut both = stand_ins(&loopback([2, 3]), port);
+    names.set("fleet.test", &loopback([2, 3]));
+    let session = looking_up(&[format!("dns+fleet.test:{port}")], &names).start().await;
+    until_states(&session, &["up"; 2]).await;
+    drop(both.pop());
+    until_states(&session, &["up", "down"]).await;
+    names.set("fleet.test", &loopback([2]));
+    until_states(&session, &["up"]).await;
+}
+
+#[actix_rt::test]
+async fn a_name_server_that_fails_or_has_nothing_to_tell_changes_nothing_and_is_told_once() {
+    let (mut names, port) = (NameServer::start(&[]), ports::block(1));
+    let mut smtp = Smtp::start(&[]).await;
+    let servers = stand_ins(&loopback([2, 3]), port);
+    names.set("fleet.test", &loopback([2, 3]));
+    let name = format!("dns+fleet.test:{port}");
+    let session = looking_up(std::slice::from_ref(&name), &names)
+        .set("administrator", "admin@example.org")
+        .set("mailSender", "fleet@example.org")
+        .set("mailServer", "127.0.0.1")
+        .set("mailServerPort", smtp.port)
+        .set("timing", json!({"gather": 0.1, "flapping": 0.1, "placement": 0.2}))
+        .start()
+        .await;
+    until_states(&session, &["up"; 2]).await;
+    let error = async || http::get(&session.url("/status")).await.json()["names"][0]["error"].clone();
+    for (outage, words) in [(0, "timed out"), (1, "no such records"), (2, "timed out")] {
+        match outage {
+            0 => names.signal(Signal::SIGSTOP),
+            1 => names.set("another.test", &loopback([2, 3])),
+            _ => names.end(),
+        }
+        until("the page tells it", async || error().await.as_str().is_some()).await;
+        assert!(error().await.as_str().unwrap().contains(words), "{}", error().await);
+        assert_eq!(smtp.mail().await.subject(), format!("Lookup of simulation servers failing: {name}"));
+        let page = http::get(&session.url("/monitor")).await.text();
+        assert!(page.contains(&format!("{name} can't be looked up.")), "{page}");
+        // It is asked again and again meanwhile, and nobody waits for that.
+        let asked = servers[0].requests();
+        while servers[0].requests() < asked + 40 {
+            let begin = Instant::now();
+            let given = http::get(&session.url("/session")).await.text();
+            assert!(given.starts_with("ws://127.0.0."), "{given}");
+            assert!(begin.elapsed() < Duration::from_secs(1), "an answer took {:?}", begin.elapsed());
+        }
+        until_states(&session, &["up"; 2]).await;
+        let told = |words: &str| times_logged(&session, &format!("{name}: {words}"));
+        assert_eq!((told("down: "), told("up: ")), (outage + 1, outage), "{}", session.log());
+        match outage {
+            0 => names.signal(Signal::SIGCONT),
+            1 => names.set("fleet.test", &loopback([2, 3])),
+            _ => {
+                names.start_again();
+            }
+        }
+        until("the page tells that it works", async || error().await.is_null()).await;
+        assert_eq!(smtp.mail().await.subject(), format!("Lookup of simulation servers working again: {name}"));
+    }
+    assert_eq!(times_logged(&session, "no longer watched"), 0);
+}
+
+#[actix_rt::test]
+async fn the_targets_of_a_service_are_servers_by_their_names() {
+    let found = [(); 2].map(|()| StandIn::start(good()));
+    let services: Vec<String> =
+        found.iter().map(|server| format!("_webots._tcp.fleet.test,localhost,{}", server.port())).collect();
+    let names = NameServer::start(&services);
+    let session = looking_up(&["dnssrv+_webots._tcp.fleet.test".to_owned()], &names).start().await;
+    until_states(&session, &["up"; 2]).await;
+    let mut expected: Vec<String> = found.iter().map(|server| format!("localhost:{}", server.port())).collect();
+    expected.sort_unstable();
+    assert_eq!(servers(&session).await.into_iter().map(|(address, _)| address).collect::<Vec<_>>(), expected);
+}
+
+#[actix_rt::test]
+async fn a_thousand_servers_are_found_behind_one_name() {
+    let (names, port) = (NameServer::start(&[]), ports::block(1));
+    let addresses: Vec<IpAddr> =
+        (0..1000).map(|number| [127, 1, (number / 250) as u8, (number % 250) as u8 + 1].into()).collect();
+    let _servers = stand_ins(&addresses, port);
+    names.set("fleet.test", &addresses);
+    let builder = looking_up(&[format!("dns+fleet.test:{port}")], &names);
+    let session = builder.set("loadRefresh", 600).set("timing", json!({"answer": 15})).start().await;
+    let metrics = async |line: String| http::get(&session.url("/metrics")).await.text().lines().any(|one| one == line);
+    until("all are found", async || metrics("webots_session_servers{state=\"up\"} 1000".to_owned()).await).await;
+    assert!(metrics(format!("webots_session_lookup_servers{{name=\"dns+fleet.test:{port}\"}} 1000")).await);
+    names.set("fleet.test", &addresses[..500]);
+    until("half of them get no clients", async || {
+        metrics("webots_session_servers{state=\"draining\"} 500".to_owned()).await
+    })
+    .await;
+}
+
+#[actix_rt::test]
+async fn names_come_and_go_with_the_configuration() {
+    let (names, port) = (NameServer::start(&[]), ports::block(1));
+    let _servers = stand_ins(&loopback([2, 3]), port);
+    names.set("fleet.test", &loopback([2, 3]));
+    let session = looking_up(&[], &names).start().await;
+    let reload = |entries: Value, drained: Value| {
+        session.rewrite_config(|config| {
+            config["simulationServers"] = entries;
+            config["drainedServers"] = drained;
+        });
+        session.signal(Signal::SIGHUP);
+    };
+    let name = json!([format!("dns+fleet.test:{port}")]);
+    reload(name.clone(), json!([]));
+    until_states(&session, &["up"; 2]).await;
+    reload(name, json!([format!("127.0.0.3:{port}")]));
+    until_states(&session, &["up", "draining"]).await;
+    reload(json!([]), json!([]));
+    until_states(&session, &[]).await;
+    assert_eq!(http::get(&session.url("/status")).await.json()["names"], json!([]));
+}
