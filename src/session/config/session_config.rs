@@ -14,8 +14,8 @@ use crate::session::mail_address;
 use crate::session::placement::Policy;
 use crate::shared::config::{Configuration, InvalidValue, changed_keys};
 use crate::shared::config::{
-    ExpandedPath, Secret, expanded, folder, local_address, object, one_or_many, optional_whole, percent, seconds,
-    threshold, whole,
+    ExpandedPath, Secret, expanded, folder, local_address, object, one_or_many, optional_expanded, optional_whole,
+    percent, seconds, threshold, whole,
 };
 use crate::shared::domain::{ClientUrls, PublicAddress, PublicUrl, check_host};
 use crate::shared::http::TrustedProxies;
@@ -41,7 +41,7 @@ pub struct SessionConfig {
     pub port_rewrite: bool,
     /// How clients reach the simulation servers through one web server: a URL with the placeholders `{host}` and `{port}`.
     /// Default: none, and each is reached under its own address.
-    #[serde(default)]
+    #[serde(default, deserialize_with = "optional_expanded")]
     pub public_url: Option<PublicUrl>,
     /// The simulation servers: HOST:PORT, HOST/PORT, `dns+NAME:PORT` for all addresses of a name, or `dnssrv+NAME` for all
     /// targets of an SRV record.

@@ -4,13 +4,13 @@
 //! names the most similar known one.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::io;
 use std::path::Path;
 
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
 use super::error::ConfigError;
+use super::value::read_file;
 use crate::shared::text::one_line;
 
 /// A server's configuration.
@@ -73,14 +73,6 @@ pub fn load<C: Configuration>(file: &Path) -> Result<LoadedConfig<C>, ConfigErro
     })?;
     warnings.extend(more.iter().map(|warning| format!("{}: {warning}", file.display())));
     Ok(LoadedConfig { config, warnings })
-}
-
-/// Reads a regular file. A FIFO would block until somebody writes to it, and a device may never end.
-fn read_file(file: &Path) -> io::Result<String> {
-    if !std::fs::metadata(file)?.is_file() {
-        return Err(io::Error::other("it is not a regular file"));
-    }
-    std::fs::read_to_string(file)
 }
 
 /// Returns the keys whose values differ; the keys of parts as `part.key`. The key of a secret is never among them.

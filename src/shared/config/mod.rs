@@ -7,6 +7,6 @@ mod value;
 pub use error::ConfigError;
 pub use loading::{Configuration, InvalidValue, LoadedConfig, changed_keys, load};
 pub use value::{
-    ExpandedPath, Secret, expanded, folder, local_address, object, one_or_many, optional_object, optional_whole,
-    percent, seconds, threshold, whole,
+    ExpandedPath, Secret, expanded, folder, local_address, object, one_or_many, optional_expanded, optional_object,
+    optional_whole, percent, seconds, threshold, whole,
 };

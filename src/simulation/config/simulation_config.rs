@@ -9,7 +9,8 @@ use serde::{Deserialize, Serialize};
 use super::timing::Timing;
 use crate::shared::config::{Configuration, InvalidValue};
 use crate::shared::config::{
-    ExpandedPath, expanded, folder, local_address, object, one_or_many, optional_whole, percent, seconds, whole,
+    ExpandedPath, expanded, folder, local_address, object, one_or_many, optional_expanded, optional_whole, percent, seconds,
+    whole,
 };
 use crate::shared::domain::UrlPrefix;
 use crate::shared::domain::{ClientUrls, PublicAddress, PublicUrl, check_host};
@@ -40,7 +41,7 @@ pub struct SimulationConfig {
     pub port_rewrite: bool,
     /// How clients reach this server and its simulations through one web server: a URL with the placeholders `{host}`
     /// (that is `server`) and `{port}`. Default: none, and they are reached under their own addresses.
-    #[serde(default)]
+    #[serde(default, deserialize_with = "optional_expanded")]
     pub public_url: Option<PublicUrl>,
     /// Folder of `simulation/output.log`, `simulation/monitor.csv` and the instances' output. Default: `log`.
     #[serde(default = "default_log_dir", deserialize_with = "folder")]

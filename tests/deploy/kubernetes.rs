@@ -1,0 +1,218 @@
+//! `deploy/kubernetes` and the images that it names: what programs say of them that read such files. No cluster is here.
+
+use std::io::Write;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+
+use serde_json::Value;
+
+use crate::support::authority::Authority;
+use crate::support::needs;
+
+fn project(path: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join(path)
+}
+
+fn text(output: Output) -> String {
+    assert!(output.status.success(), "{output:?}");
+    String::from_utf8(output.stdout).unwrap()
+}
+
+/// What a folder of kustomize comes to, as text.
+fn kustomize(folder: &Path) -> String {
+    text(Command::new("kubectl").arg("kustomize").arg(folder).output().unwrap())
+}
+
+fn python() -> Command {
+    let python = text(Command::new(project("tests/python.sh")).output().unwrap());
+    Command::new(python.trim())
+}
+
+/// The objects of a text of YAML.
+fn objects(yaml: &str) -> Vec<Value> {
+    let file = tempfile::NamedTempFile::new().unwrap();
+    std::fs::write(file.path(), yaml).unwrap();
+    let program = "import json, sys, yaml; print(json.dumps(list(yaml.safe_load_all(open(sys.argv[1])))))";
+    let output = python().args(["-c", program]).arg(file.path()).output().unwrap();
+    serde_json::from_str(&text(output)).unwrap()
+}
+
+/// The base, the overlays, and the base with all that may be added. Nothing, and a word, where kubectl is too old for them.
+fn all() -> Vec<(&'static str, String)> {
+    needs("kubectl", "kubernetes-client");
+    let version = text(Command::new("kubectl").args(["version", "--client", "--output=json"]).output().unwrap());
+    let version: Value = serde_json::from_str(&version).unwrap();
+    let minor = version["clientVersion"]["minor"].as_str().unwrap().trim_end_matches('+').parse::<u32>().unwrap();
+    if minor < 25 {
+        assert!(std::env::var_os("CI").is_none(), "this has to be tested where CI is set, with kubectl 1.25 or later");
+        // Not by a macro: what those print is shown for tests that fail only.
+        std::io::stderr().write_all(b"SKIPPED, for kubectl is older than 1.25: deploy::kubernetes\n").unwrap();
+        return Vec::new();
+    }
+    let mut all: Vec<(&str, String)> = ["base", "overlays/demo", "overlays/gpu"]
+        .map(|name| (name, kustomize(&project("deploy/kubernetes").join(name))))
+        .into();
+    let folder = tempfile::tempdir().unwrap();
+    // kustomize follows relative paths alone.
+    let up = "../".repeat(folder.path().canonicalize().unwrap().components().count() - 1);
+    let files = format!("{up}{}", project("deploy/kubernetes").display().to_string().trim_start_matches('/'));
+    let own = format!(
+        "resources: [{files}/base]\ncomponents: [{files}/components/monitoring, {files}/components/autoscaling]\n"
+    );
+    std::fs::write(folder.path().join("kustomization.yaml"), own).unwrap();
+    all.push(("base with components", kustomize(folder.path())));
+    all
+}
+
+fn of_kind<'all>(objects: &'all [Value], kind: &str) -> Vec<&'all Value> {
+    objects.iter().filter(|object| object["kind"] == kind).collect()
+}
+
+/// What a generated map of settings holds; its name has a hash at its end.
+fn settings<'all>(objects: &'all [Value], name: &str, key: &str) -> &'all str {
+    let is_it = |map: &&&Value| map["metadata"]["name"].as_str().unwrap().rsplit_once('-').unwrap().0 == name;
+    of_kind(objects, "ConfigMap").iter().find(is_it).unwrap()["data"][key].as_str().unwrap()
+}
+
+#[test]
+fn all_that_kustomize_makes_keeps_to_the_published_schemas() {
+    for (name, yaml) in all() {
+        let file = tempfile::Builder::new().suffix(".yaml").tempfile().unwrap();
+        std::fs::write(file.path(), &yaml).unwrap();
+        let output = python().args(["-m", "kubernetes_validate", "--strict"]).arg(file.path()).output().unwrap();
+        let told = String::from_utf8_lossy(&output.stdout);
+        let passed = told.lines().filter(|line| line.contains(" passed ")).count();
+        // Kinds that are not of Kubernetes itself are not known there.
+        let own = objects(&yaml).iter().filter(|object| object["kind"] != "ServiceMonitor").count();
+        assert!(passed == own && own >= 17, "{name}: {passed} of {own}\n{told}");
+        assert!(!told.contains("ERROR") || name == "base with components", "{name}: {told}");
+    }
+}
+
+#[test]
+fn pods_pass_the_restricted_standard_but_for_those_that_draw_on_the_nodes_display() {
+    for (name, yaml) in all() {
+        let objects = objects(&yaml);
+        let namespace = &of_kind(&objects, "Namespace")[0]["metadata"]["labels"]["pod-security.kubernetes.io/enforce"];
+        let deployments = of_kind(&objects, "Deployment");
+        assert_eq!(deployments.len(), 3, "{name}");
+        let mut restricted = true;
+        for deployment in deployments {
+            let pod = &deployment["spec"]["template"]["spec"];
+            assert_eq!(pod["securityContext"]["runAsNonRoot"], true, "{name}");
+            assert_eq!(pod["securityContext"]["seccompProfile"]["type"], "RuntimeDefault", "{name}");
+            assert_eq!(pod["automountServiceAccountToken"], false, "{name}");
+            for container in pod["containers"].as_array().unwrap() {
+                let context = &container["securityContext"];
+                assert_eq!(context["allowPrivilegeEscalation"], false, "{name}");
+                assert_eq!(context["readOnlyRootFilesystem"], true, "{name}");
+                assert_eq!(context["capabilities"]["drop"], serde_json::json!(["ALL"]), "{name}");
+            }
+            let volumes = pod["volumes"].as_array().unwrap();
+            restricted &= volumes.iter().all(|volume| volume.get("hostPath").is_none());
+        }
+        assert_eq!((restricted, namespace == "restricted"), (name != "overlays/gpu", name != "overlays/gpu"), "{name}");
+    }
+}
+
+#[test]
+fn the_images_are_stages_of_the_dockerfile() {
+    let dockerfile = std::fs::read_to_string(project("deploy/docker/Dockerfile")).unwrap();
+    let version = env!("CARGO_PKG_VERSION");
+    for (name, yaml) in all() {
+        let lines = yaml.lines().map(|line| line.trim_start_matches([' ', '-']));
+        let images: Vec<&str> = lines.filter_map(|line| line.strip_prefix("image: ")).collect();
+        assert_eq!(images.len(), 3, "{name}");
+        for image in images.into_iter().filter_map(|image| image.strip_prefix("webots-fleet/")) {
+            let (stage, tag) = image.split_once(':').unwrap();
+            assert!(dockerfile.contains(&format!(" AS {stage}\n")) && tag == version, "{name}: {image}");
+            assert!(dockerfile.contains(&format!("--target {stage} ")), "how {image} is built is not told");
+        }
+    }
+    // What is copied into images is there, and is given to the build.
+    let given = std::fs::read_to_string(project(".dockerignore")).unwrap();
+    for line in dockerfile.lines().filter_map(|line| line.strip_prefix("COPY ")).filter(|line| !line.starts_with("--"))
+    {
+        let source = line.split(' ').next().unwrap();
+        assert!(project(source).exists(), "{source}");
+        let is_given = |line: &str| line.strip_prefix('!').is_some_and(|folder| source.starts_with(folder));
+        assert!(source == "." || given.lines().any(is_given), "{source}");
+    }
+}
+
+#[test]
+fn the_configurations_are_taken_as_pods_get_them() {
+    let programs =
+        [("session", env!("CARGO_BIN_EXE_session-server")), ("simulation", env!("CARGO_BIN_EXE_simulation-server"))];
+    for (name, yaml) in all() {
+        let objects = objects(&yaml);
+        for (kind, program) in programs {
+            let file = tempfile::NamedTempFile::new().unwrap();
+            std::fs::write(file.path(), settings(&objects, kind, "config.json")).unwrap();
+            let mut command = Command::new(program);
+            command.arg("--check").arg(file.path()).env("FLEET_ADDRESS", "10.1.2.3");
+            let output = command.env("FLEET_URL", settings(&objects, "fleet", "FLEET_URL")).output().unwrap();
+            let told = String::from_utf8_lossy(&output.stderr).into_owned();
+            assert!(!told.contains(file.path().to_str().unwrap()), "{name}: {told}");
+            let config: Value = serde_json::from_slice(&output.stdout).unwrap_or_else(|_| panic!("{name}: {told}"));
+            let deployment = of_kind(&objects, "Deployment").into_iter().find(|one| one["metadata"]["name"] == kind);
+            let container = &deployment.unwrap()["spec"]["template"]["spec"]["containers"][0];
+            assert_eq!(container["ports"][0]["containerPort"], config["port"], "{name}");
+            if kind == "simulation" {
+                let first = config["port"].as_u64().unwrap();
+                let last = first + config["maxConnections"].as_u64().unwrap();
+                let policies = of_kind(&objects, "NetworkPolicy");
+                let policy = policies.into_iter().find(|one| one["metadata"]["name"] == "simulation").unwrap();
+                let ports = &policy["spec"]["ingress"][1]["ports"][0];
+                assert_eq!((ports["port"].as_u64(), ports["endPort"].as_u64()), (Some(first), Some(last)), "{name}");
+                let grace = deployment.unwrap()["spec"]["template"]["spec"]["terminationGracePeriodSeconds"].as_f64();
+                assert!(grace > config["timeout"].as_f64(), "{name}: a simulation would not end by itself");
+            }
+        }
+    }
+}
+
+#[test]
+fn nginx_finds_no_fault_in_the_doors_and_they_have_the_rules_of_the_example() {
+    needs("nginx", "nginx");
+    let (authority, folder) = (Authority::new(), tempfile::tempdir().unwrap());
+    let certificate = authority.issue(&["fleet.example.org"]);
+    let here = folder.path().display().to_string();
+    let example = std::fs::read_to_string(project("deploy/nginx-door.conf")).unwrap();
+    for (name, yaml) in all() {
+        let objects = objects(&yaml);
+        let door = settings(&objects, "door", "fleet.conf");
+        for rule in
+            ["rewrite ", "add_header ", "proxy_read_timeout ", "proxy_set_header ", "proxy_pass http://$", "map "]
+        {
+            let rules = |conf: &str| -> Vec<String> {
+                conf.lines().map(str::trim).filter(|line| line.starts_with(rule)).map(str::to_owned).collect()
+            };
+            assert_eq!(rules(door), rules(&example), "{name}");
+        }
+        // The service's name is known in the cluster alone.
+        let door = door.replace("/etc/nginx/conf.d", &here).replace("http://session:1999", "http://127.0.0.1:1999");
+        let tls = settings(&objects, "door", "tls.part")
+            .replace("/etc/nginx/tls/tls.crt", certificate.chain.to_str().unwrap())
+            .replace("/etc/nginx/tls/tls.key", certificate.key.to_str().unwrap());
+        assert_eq!(tls.is_empty(), name == "overlays/demo");
+        std::fs::write(folder.path().join("fleet.conf"), door).unwrap();
+        std::fs::write(folder.path().join("tls.part"), tls).unwrap();
+        let temporary: String = ["client_body", "proxy", "fastcgi", "uwsgi", "scgi"]
+            .iter()
+            .fold(String::new(), |text, part| text + &format!("{part}_temp_path {here}/{part};\n"));
+        let main =
+            format!("pid {here}/pid;\nevents {{}}\nhttp {{ {temporary} access_log off; include {here}/*.conf; }}\n");
+        std::fs::write(folder.path().join("main"), main).unwrap();
+        let log = folder.path().join("error.log");
+        let output = Command::new("nginx")
+            .arg("-t")
+            .arg("-c")
+            .arg(folder.path().join("main"))
+            .arg("-e")
+            .arg(log)
+            .output()
+            .unwrap();
+        assert!(output.status.success(), "{name}: {output:?}");
+    }
+}
