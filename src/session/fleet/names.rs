@@ -11,7 +11,8 @@ use super::fleet_status::NameStatus;
 use super::name_monitor::{LookupResult, NameMonitor};
 use super::server_monitor::Stop;
 use crate::session::config::{DnsName, ServerEntry};
-use crate::shared::domain::{PublicAddress, one_line};
+use crate::shared::domain::PublicAddress;
+use crate::shared::text::one_line;
 
 /// All names.
 #[derive(Default)]
