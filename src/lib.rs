@@ -16,6 +16,7 @@
 //! | [`simulation::process`] | process trees and folders of simulations |
 //! | [`simulation::machine`] | readings of the machine, the load |
 //! | [`simulation::checkout`] | worlds out of git |
+//! | `simulation::isolation` | how a simulation is launched: its level of isolation, environment and limits |
 //! | [`simulation::webots`] | one running Webots |
 //! | [`simulation::client`] | one web client, the life of its simulation |
 //! | `simulation::web` | paths and pages of the simulation server |
@@ -50,7 +51,7 @@
 //!   WebClient - Ticket -----'  |
 //!     ^  ^------- PlaceEvent --'
 //!     |  |--- checkout (a task on the main thread, shared by all who want the same world) --> git
-//!     |  '--- starts ---> Webots (one per simulation) --> Webots' process group
+//!     |  '--- starts ---> Webots (one per simulation) --> Webots' process group, in a sandbox
 //!     '------ WebotsEvent ---'
 //! ```
 //!

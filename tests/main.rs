@@ -16,6 +16,7 @@
 mod demo_simulator;
 mod deploy;
 mod inputs;
+mod isolation;
 mod mail;
 mod placement;
 mod project;

@@ -2,7 +2,7 @@
 //!
 //! It starts the built program, with a stand-in for the forge and the demo simulator for Webots:
 //! - `load`: how fast `/load` answers while ten checkouts run, one remote hangs, and a simulator floods its output;
-//! - `start`: what a cached start costs over the git commands that it runs;
+//! - `start`: what a cached start costs over the git commands that it runs, and what a sandbox adds to it;
 //! - `soak`: whether a thousand starts and stops in a row leave anything: processes, file descriptors, ports, folders,
 //!   threads, memory.
 //!
@@ -81,6 +81,7 @@ async fn main() -> ExitCode {
     }
     if is_wanted(Part::Start) {
         start::measure(&mut verdict, arguments.cached).await;
+        start::compare_levels(&mut verdict, arguments.cached).await;
     }
     if is_wanted(Part::Soak) {
         soak_and_tell(&mut verdict, arguments.starts).await;

@@ -1,4 +1,4 @@
-//! What a cached start costs over the git commands that it runs.
+//! What a cached start costs over the git commands that it runs, and what a sandbox adds to it.
 
 use std::path::Path;
 use std::process::{Command, Stdio};
@@ -31,6 +31,32 @@ pub async fn measure(verdict: &mut Verdict, starts: usize) {
     let over = ours.saturating_sub(plain);
     println!("  {:.2} times as long", ours.as_secs_f64() / plain.as_secs_f64());
     verdict.bound("over git", over, BOUND);
+}
+
+/// How much longer a program takes from its start to its end in a sandbox.
+pub async fn compare_levels(verdict: &mut Verdict, starts: usize) {
+    let forge = Forge::with_arm();
+    let at = |level: &str| simulation_server(Path::new("/bin/true"), forge.path(), 4).set("isolation", level).start();
+    let (none, sandbox) = (at("none").await, at("sandbox").await);
+    let url = world("lab/arm", "main", "worlds/a.wbt");
+    let (mut without, mut within) = (Vec::new(), Vec::new());
+    for _ in 0..starts {
+        without.push(launch(&none, &url).await);
+        within.push(launch(&sandbox, &url).await);
+    }
+    let (without, within) = (median(without), median(within));
+    println!("a program that does nothing, from its launch to its end: {without:.1?}, in a sandbox {within:.1?}");
+    verdict.bound("for the sandbox", within.saturating_sub(without), BOUND);
+}
+
+async fn launch(server: &crate::support::program::Server, url: &str) -> Duration {
+    let mut client = Client::start(server, url).await;
+    client.until("loading: webots is starting").await;
+    let begin = Instant::now();
+    client.until("loading: Webots has ended").await;
+    let time = begin.elapsed();
+    client.closed().await;
+    time
 }
 
 async fn checkout(server: &crate::support::program::Server, url: &str) -> Duration {

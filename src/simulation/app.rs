@@ -10,6 +10,7 @@ use actix_web::{App, web};
 use tokio::sync::mpsc::Receiver;
 use tokio::sync::watch;
 
+
 use super::announcer::Announcer;
 use super::config::SimulationConfig;
 use super::places::{GetSnapshot, Places};
@@ -21,6 +22,7 @@ use crate::shared::http::{BasicAuth, Connections, Live, Metrics};
 use crate::shared::run::{AppError, Phase, Request, Signals, notify, permanent, raise_open_files, start};
 use crate::simulation::checkout::{CacheDir, Checkouts, Limits};
 use crate::simulation::client::{outcome, quota};
+use crate::simulation::isolation::Launcher;
 use crate::simulation::machine::LoadMonitor;
 use crate::simulation::machine::UsageMonitor;
 use crate::simulation::process::{Guardian, Leftovers, RunDir, process_tree};
@@ -186,6 +188,7 @@ fn assemble(
         let Leftovers { runs, processes } = leftovers;
         log::warn!("removed what {runs} earlier runs had left, {processes} processes among it");
     }
+    let launcher = Launcher::start(&config)?;
     let (time, size) = (config.timing.checkout, config.project_size << 20);
     let limits = Limits { time, size, any_commit: config.any_commit };
     let (budget, mirrors) = (config.cache_size << 20, config.git_mirrors.clone());
@@ -217,6 +220,7 @@ fn assemble(
         load_monitor,
         readings,
         checkouts: Arc::new(checkouts),
+        launcher: Arc::new(launcher),
         run: Arc::new(run),
         phase,
         requests,

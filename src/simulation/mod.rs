@@ -5,6 +5,7 @@ pub mod app;
 pub mod checkout;
 pub mod client;
 pub mod config;
+mod isolation;
 pub mod machine;
 pub mod places;
 pub mod preflight;

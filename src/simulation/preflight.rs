@@ -5,6 +5,7 @@ use std::process::Command;
 use which::which;
 
 use super::config::SimulationConfig;
+use crate::simulation::isolation::Launcher;
 use crate::simulation::machine::display;
 
 /// The result of one check.
@@ -40,6 +41,7 @@ pub fn check(config: &SimulationConfig) -> Vec<Finding> {
             result: version(&["git-lfs", "--version"], "git-lfs is not there: large files of Git LFS will be missing"),
         },
         Finding { topic: "Xvfb", result: xvfb(config) },
+        Finding { topic: "isolation", result: isolation(config) },
     ]
 }
 
@@ -82,6 +84,14 @@ fn xvfb(config: &SimulationConfig) -> Result<String, String> {
                 .to_owned())
         }
         Err(_) => Ok("it is not there, and not needed: xvfb is false".to_owned()),
+    }
+}
+
+fn isolation(config: &SimulationConfig) -> Result<String, String> {
+    let launcher = Launcher::new(config).map_err(|error| format!("the server does not start: {error}"))?;
+    match launcher.shortcoming() {
+        Some(why) => Err(format!("none, worlds' programs may do whatever this user may: {why}")),
+        None => Ok(launcher.level().to_string()),
     }
 }
 

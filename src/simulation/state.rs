@@ -19,6 +19,7 @@ use crate::shared::http::Live;
 use crate::shared::http::Metrics;
 use crate::shared::run::{Phase, Request};
 use crate::simulation::checkout::Checkouts;
+use crate::simulation::isolation::Launcher;
 use crate::simulation::machine::UsageMonitor;
 use crate::simulation::machine::{LoadMonitor, Readings};
 use crate::simulation::process::RunDir;
@@ -35,6 +36,8 @@ pub struct AppState {
     pub load_monitor: Addr<LoadMonitor>,
     /// The newest readings of the machine.
     pub readings: watch::Receiver<Arc<Readings>>,
+    /// Launches simulations at a level of isolation.
+    pub launcher: Arc<Launcher>,
     /// Checks worlds out.
     pub checkouts: Arc<Checkouts>,
     /// The folder of this run, with the folders of simulations in it.

@@ -178,6 +178,7 @@ class Fleet:
         places = 4
         return self.start("simulation-server", name, {
             "port": free_ports(places + 12), "maxConnections": places, "webots": str(BIN / "demo-simulator"),
+            "environment": "DEMO_SIMULATOR_BIND",
             "cacheDir": str(self.folder / name / "cache"),
             "allowedRepositories": ["https://github.com/demo"],
             "gitMirrors": {"https://github.com/": f"file:{self.forge}"},

@@ -48,7 +48,8 @@ fn nothing_is_warned_about_where_all_is_there() {
     assert_eq!(config["xvfb"], true);
     let expected = format!(
         "webots: {}\ndisplay: each Webots gets a virtual display of its own (xvfb), without the graphics card\n\
-         git: git version 2.39.5 --version\ngit-lfs: git version 2.39.5 --version\nXvfb: {}/Xvfb\n",
+         git: git version 2.39.5 --version\ngit-lfs: git version 2.39.5 --version\nXvfb: {}/Xvfb\n\
+         isolation: sandbox\n",
         webots.path().display(),
         programs.path().display()
     );
@@ -65,9 +66,18 @@ fn what_is_missing_is_warned_about() {
         "warning: git: git is not there: no world can be checked out\n",
         "warning: git-lfs: git-lfs is not there: large files of Git LFS will be missing\n",
         "warning: Xvfb: it is not there, but xvfb is true: no Webots can start.",
+        "warning: isolation: none, worlds' programs may do whatever this user may: bubblewrap (bwrap) is not there; on \
+         Debian, Ubuntu and Fedora the package bubblewrap has it\n",
     ] {
         assert!(told.contains(words), "{words} is not in\n{told}");
     }
+    let (_, told) = check(&json!({"isolation": "sandbox"}), path(empty.path()));
+    assert!(
+        told.contains("warning: isolation: the server does not start: isolation is \"sandbox\", but bubblewrap"),
+        "{told}"
+    );
+    let (_, told) = check(&json!({"isolation": "none"}), path(empty.path()));
+    assert!(told.contains("\nisolation: none\n"), "{told}");
     let (_, told) = check(&json!({"display": ":59000"}), path(empty.path()));
     for words in [
         "warning: webots: neither webotsHome nor the environment variable WEBOTS_HOME is set\n",

@@ -20,7 +20,7 @@ const SESSION: [&str; 8] = [
     "session::web",
     "session::app",
 ];
-const SIMULATION: [&str; 15] = [
+const SIMULATION: [&str; 17] = [
     "simulation::snapshot",
     "simulation::places",
     "simulation::protocol",
@@ -28,6 +28,8 @@ const SIMULATION: [&str; 15] = [
     "simulation::machine",
     "simulation::checkout",
     "simulation::config",
+    "simulation::isolation",
+    "simulation::app_error",
     "simulation::preflight",
     "simulation::announcer",
     "simulation::webots",

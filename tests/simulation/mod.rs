@@ -14,7 +14,7 @@ mod protocol;
 mod readiness;
 pub mod readings;
 mod ready;
-mod scene;
+pub mod scene;
 mod soak;
 mod stopping;
 mod trees;

@@ -21,7 +21,8 @@ async fn the_port_that_webots_really_took_is_handed_out() {
     let (forge, folder) = (Forge::with_arm(), tempfile::tempdir().unwrap());
     let go = folder.path().join("go");
     let webots = Webots::script(&format!("until [ -e {} ]; do sleep 0.01; done\n{DEMO} \"$@\" & wait", go.display()));
-    let server = simulation_server(&webots.path(), forge.path(), 3).start().await;
+    let builder = simulation_server(&webots.path(), forge.path(), 3).set("isolation", "none");
+    let server = builder.start().await;
     let mut client = Client::start(&server, &arm()).await;
     client.until("shutdownTimeout").await;
     // Somebody takes the port after it was lent; Webots silently moves on.

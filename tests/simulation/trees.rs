@@ -1,4 +1,4 @@
-//! What ends with a simulation: its process group, and all that carries its mark.
+//! What ends with a simulation: without a sandbox its process group, and all that carries its mark.
 
 use std::path::Path;
 use std::time::{Duration, Instant};
@@ -25,7 +25,8 @@ async fn the_group_and_all_that_carries_the_mark_end_for_whatever_reason() {
         let tell = format!("echo $$ >> {}; exec sleep 1000", pids.display());
         let webots =
             Webots::script(&format!("(setsid bash -c '{tell}' &)\n(env -i bash -c '{tell}' &)\n{DEMO} \"$@\" & wait"));
-        let mut server = quick(simulation_server(&webots.path(), forge.path(), 1)).folder(folder.path()).start().await;
+        let builder = quick(simulation_server(&webots.path(), forge.path(), 1)).set("isolation", "none");
+        let mut server = builder.folder(folder.path()).start().await;
         let mut client = Client::start(&server, &arm()).await;
         client.until("webots:").await;
         let told = || std::fs::read_to_string(&pids).unwrap_or_default();

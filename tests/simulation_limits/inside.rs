@@ -61,6 +61,7 @@ impl Inside {
             "server": "localhost", "ssl": false, "portRewrite": false, "bind": "127.0.0.1", "port": port,
             "webots": webots.path(), "maxConnections": 1, "allowedRepositories": "https://github.com/lab",
             "gitMirrors": {"https://github.com/": mirror},
+            "sandbox": {"readable": env!("CARGO_BIN_EXE_demo-simulator")},
             "logDir": folder.path().join("log"), "cacheDir": folder.path().join("cache"),
         });
         std::fs::write(&file, text.to_string()).unwrap();

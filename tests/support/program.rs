@@ -52,6 +52,8 @@ pub fn simulation_server(webots: &Path, repositories: &Path, places: u16) -> Bui
         "server": "localhost", "ssl": false, "portRewrite": false, "bind": "127.0.0.1", "port": port, "debug": true,
         "webots": webots, "maxConnections": places, "allowedRepositories": ["https://github.com/lab"],
         "gitMirrors": {"https://github.com/": format!("file:{}", repositories.display())},
+        // The stand-in for Webots may be built in somebody's home.
+        "environment": ["DEMO_SIMULATOR_BIND"], "sandbox": {"readable": [env!("CARGO_BIN_EXE_demo-simulator")]},
     });
     Builder::new(env!("CARGO_BIN_EXE_simulation-server"), "simulation-server", config, port)
         .env("DEMO_SIMULATOR_BIND", "127.0.0.1")

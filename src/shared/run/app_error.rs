@@ -34,6 +34,9 @@ pub enum AppError {
         /// What at least must be possible.
         needed: String,
     },
+    /// What the configuration asks for can't be had on this machine.
+    #[error("{0}")]
+    Unavailable(String),
     /// Another error of the system.
     #[error(transparent)]
     System(#[from] std::io::Error),

@@ -1,9 +1,12 @@
 //! The folder `cacheDir`, which one server has to itself.
 
-use std::fs::{File, TryLockError};
+use std::fs::{File, Metadata, TryLockError};
 use std::io;
+use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
+
+use nix::fcntl::OFlag;
 
 /// The folder `cacheDir`, locked as long as this lives and the process runs.
 #[derive(Debug)]
@@ -25,7 +28,7 @@ impl CacheDir {
     pub fn claim(folder: &Path) -> io::Result<Self> {
         std::fs::create_dir_all(folder)?;
         let folder = folder.canonicalize()?;
-        let lock = File::create(folder.join("lock"))?;
+        let lock = open(&folder.join("lock"))?;
         let deadline = Instant::now() + LAST_BREATH;
         loop {
             match lock.try_lock() {
@@ -44,5 +47,36 @@ impl CacheDir {
     #[must_use]
     pub fn path(&self) -> &Path {
         &self.folder
+    }
+}
+
+/// Opens the file that is locked. Without a sandbox, a world's program may have put something else in its place: a FIFO
+/// would make the start wait for ever, a link lead elsewhere.
+fn open(path: &Path) -> io::Result<File> {
+    let is_file = |about: &Metadata| about.is_file();
+    if path.symlink_metadata().is_ok_and(|about| !is_file(&about)) {
+        std::fs::remove_file(path)?;
+    }
+    let flags = (OFlag::O_NONBLOCK | OFlag::O_NOFOLLOW).bits();
+    let file = File::options().read(true).write(true).create(true).truncate(false).custom_flags(flags).open(path)?;
+    if is_file(&file.metadata()?) { Ok(file) } else { Err(io::Error::other("lock is no regular file")) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_in_the_place_of_the_lock_does_not_hinder_the_start() {
+        let folder = tempfile::tempdir().unwrap();
+        let (lock, other) = (folder.path().join("lock"), folder.path().join("other"));
+        nix::unistd::mkfifo(&lock, nix::sys::stat::Mode::S_IRWXU).unwrap();
+        drop(CacheDir::claim(folder.path()).unwrap());
+        std::fs::remove_file(&lock).unwrap();
+        std::os::unix::fs::symlink(&other, &lock).unwrap();
+        let claimed = CacheDir::claim(folder.path()).unwrap();
+        assert!(lock.symlink_metadata().unwrap().is_file() && !other.exists());
+        assert!(CacheDir::claim(folder.path()).is_err());
+        drop(claimed);
     }
 }

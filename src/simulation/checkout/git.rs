@@ -175,7 +175,9 @@ impl Git {
         let fixed = fixed.into_iter().map(|(name, value)| (name.into(), value.into()));
         SpawnSpec {
             command,
+            inherits: true,
             environment: fixed.chain(call.environment).collect(),
+            in_sandbox: false,
             folder: None,
             mark: self.mark.clone(),
             grace: Duration::from_millis(100),

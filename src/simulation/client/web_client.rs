@@ -144,6 +144,7 @@ impl WebClient {
         ctx.text(protocol::loading("webots is starting"));
         let spec = LaunchSpec {
             config: Arc::clone(&self.server.config),
+            launcher: Arc::clone(&self.server.launcher),
             program,
             checkouts: Arc::clone(&self.server.checkouts),
             project: Arc::new(project),

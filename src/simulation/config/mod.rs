@@ -1,7 +1,11 @@
 //! The simulation server's configuration: every key, its default, and the rules between keys.
 
+mod isolation;
+mod resources;
 mod simulation_config;
 mod timing;
 
+pub use isolation::{Isolation, SandboxFolders, VariableName};
+pub use resources::Resources;
 pub use simulation_config::SimulationConfig;
 pub use timing::Timing;

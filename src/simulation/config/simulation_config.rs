@@ -6,6 +6,8 @@ use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
+use super::isolation::{Isolation, SandboxFolders, VariableName};
+use super::resources::Resources;
 use super::timing::Timing;
 use crate::shared::config::{Configuration, InvalidValue};
 use crate::shared::config::{
@@ -64,6 +66,18 @@ pub struct SimulationConfig {
     /// Folder of local projects. Accepted for existing files; not used.
     #[serde(default)]
     pub projects_dir: Option<ExpandedPath>,
+    /// At which level of isolation simulations run. Default: `auto`.
+    #[serde(default)]
+    pub isolation: Isolation,
+    /// What a sandbox has besides the system and Webots.
+    #[serde(default, deserialize_with = "object")]
+    pub sandbox: SandboxFolders,
+    /// Environment variables that simulations get besides those that Webots needs. Default: none.
+    #[serde(default, deserialize_with = "one_or_many")]
+    pub environment: Vec<VariableName>,
+    /// What one simulation may take.
+    #[serde(default, deserialize_with = "object")]
+    pub limits: Resources,
     /// Run Webots in containers. Only `false` is supported.
     #[serde(default)]
     pub docker: bool,
@@ -147,6 +161,9 @@ pub struct SimulationConfig {
     /// All other durations.
     #[serde(default, deserialize_with = "object")]
     pub timing: Timing,
+    /// The file that all this was read from; empty where it was not.
+    #[serde(skip)]
+    pub file: PathBuf,
 }
 
 impl SimulationConfig {
@@ -200,11 +217,8 @@ impl Configuration for SimulationConfig {
         if self.webots_home.is_none() {
             self.webots_home = std::env::var_os("WEBOTS_HOME").map(ExpandedPath::plain);
         }
-        if self.docker {
-            let problem = "true is not supported; allowed is false. Worlds would run without the container that was \
-                           asked for";
-            return Err(InvalidValue { key: "docker", problem: problem.to_owned() });
-        }
+        self.isolation.check(self.docker)?;
+        warnings.extend(self.sandbox.missing().map(|path| format!("sandbox: {} is not there", path.display())));
         if self.port.checked_add(self.max_connections).is_none() {
             let problem = format!("{} places above port {} leave the range of ports", self.max_connections, self.port);
             return Err(InvalidValue { key: "maxConnections", problem });

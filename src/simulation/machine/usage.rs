@@ -84,18 +84,28 @@ fn processes() -> HashMap<i32, Vec<Stat>> {
     below
 }
 
+/// How many processes and threads there are in the group of a process and among all that descends from it. Blocks.
+#[must_use]
+pub fn count_threads(root: i32) -> u64 {
+    let below = processes();
+    tree(root, &below).map(|stat| u64::try_from(stat.num_threads).unwrap_or_default()).sum()
+}
+
 /// CPU ticks and pages of memory of a process, of its group and of all that descends from it.
 fn tree_sum(root: i32, below: &HashMap<i32, Vec<Stat>>) -> (u64, u64) {
-    let (mut ticks, mut pages) = (0, 0);
-    let (mut seen, mut open) = (HashSet::new(), vec![root]);
+    tree(root, below).fold((0, 0), |(ticks, pages), stat| (ticks + stat.utime + stat.stime, pages + stat.rss))
+}
+
+/// A process, its group and all that descends from it.
+fn tree(root: i32, below: &HashMap<i32, Vec<Stat>>) -> impl Iterator<Item = &Stat> {
+    let (mut seen, mut open, mut found) = (HashSet::new(), vec![root], Vec::new());
     while let Some(pid) = open.pop() {
         for stat in below.get(&pid).into_iter().flatten().filter(|stat| seen.insert(stat.pid)) {
-            ticks += stat.utime + stat.stime;
-            pages += stat.rss;
+            found.push(stat);
             open.push(stat.pid);
         }
     }
-    (ticks, pages)
+    found.into_iter()
 }
 
 #[expect(clippy::cast_precision_loss, reason = "a percentage needs no more digits than f64 has")]

@@ -24,8 +24,13 @@ use super::process_tree;
 pub struct SpawnSpec {
     /// The program and its arguments; no shell ever sees them.
     pub command: Vec<OsString>,
-    /// Variables that are added to the server's own environment.
+    /// Whether it has the server's own environment.
+    pub inherits: bool,
+    /// Variables of its environment, in place of the server's own or besides them.
     pub environment: Vec<(OsString, OsString)>,
+    /// Whether the program is bubblewrap, which waits outside of a PID namespace: what it has started inside leads a group
+    /// of its own, and all of that ends with bubblewrap.
+    pub in_sandbox: bool,
     /// Working folder; the server's own where absent.
     pub folder: Option<PathBuf>,
     /// The folder by which all processes of the tree are found again, see [`process_tree::MARK`].
@@ -54,6 +59,8 @@ pub enum ExitReason {
 
 /// Exit code of a launcher (a shell, `env`, `nice`) that does not find its program.
 const NOT_FOUND: u8 = 127;
+/// What bubblewrap adds to the number of the signal that has ended its program.
+const SIGNALLED: u8 = 128;
 /// How long killed processes may take to vanish.
 const VANISH: Duration = Duration::from_secs(1);
 /// Time between two checks whether the group is empty.
@@ -69,9 +76,12 @@ impl ProcessGroup {
         spec: &SpawnSpec,
         output: Stdio,
         errors: Stdio,
-    ) -> std::io::Result<(Self, impl Future<Output = ExitReason> + Send + 'static)> {
+    ) -> std::io::Result<(Self, impl Future<Output = ExitReason> + Send + use<>)> {
         let (program, arguments) = spec.command.split_first().ok_or(std::io::ErrorKind::InvalidInput)?;
         let mut command = Command::new(program);
+        if !spec.inherits {
+            command.env_clear();
+        }
         command.args(arguments).envs(spec.environment.iter().map(|(name, value)| (name, value)));
         command.env(process_tree::MARK, &spec.mark).process_group(0);
         if let Some(folder) = &spec.folder {
@@ -80,7 +90,8 @@ impl ProcessGroup {
         let child = command.stdin(Stdio::null()).stdout(output).stderr(errors).spawn()?;
         let leader = child.id().and_then(|id| i32::try_from(id).ok()).ok_or(std::io::ErrorKind::Other)?;
         let (terminate, asked) = oneshot::channel();
-        let ended = wait(KillOnDrop(Some(Pid::from_raw(leader))), child, asked, spec.grace);
+        let group = KillOnDrop { leader: Some(Pid::from_raw(leader)), in_sandbox: spec.in_sandbox };
+        let ended = wait(group, child, asked, spec.grace);
         Ok((Self { leader, terminate: Some(terminate) }, ended))
     }
 
@@ -106,7 +117,7 @@ async fn wait(mut group: KillOnDrop, mut child: Child, asked: oneshot::Receiver<
         status = child.wait() => status,
         asked = asked => {
             if asked.is_ok() {
-                group.signal(Signal::SIGTERM);
+                group.ask_to_end();
                 // A launcher may end before what it has launched.
                 let end = async {
                     child.wait().await.ok();
@@ -121,24 +132,40 @@ async fn wait(mut group: KillOnDrop, mut child: Child, asked: oneshot::Receiver<
     group.signal(Signal::SIGKILL);
     actix_rt::time::timeout(VANISH, group.emptied()).await.ok();
     // The number of an empty group may be given to another one.
-    group.0 = None;
-    status.map_or(ExitReason::NotStarted, ExitReason::of)
+    group.leader = None;
+    status.map_or(ExitReason::NotStarted, |status| ExitReason::of(status, group.in_sandbox))
 }
 
 /// Kills a process group when it is dropped.
-struct KillOnDrop(Option<Pid>);
+struct KillOnDrop {
+    leader: Option<Pid>,
+    in_sandbox: bool,
+}
 
 impl KillOnDrop {
     fn signal(&self, signal: Signal) {
-        if let Some(group) = self.0 {
+        if let Some(group) = self.leader {
             // The only fault is that the group is empty, which is what is wanted.
             killpg(group, signal).ok();
         }
     }
 
+    /// Sends SIGTERM to what was started. bubblewrap must not get it: it would end at once, and all that is inside with it.
+    fn ask_to_end(&self) {
+        let Some(leader) = self.leader.filter(|_| self.in_sandbox) else {
+            return self.signal(Signal::SIGTERM);
+        };
+        let inside = process_tree::children(leader.as_raw());
+        let is_asked = inside.into_iter().any(|child| killpg(Pid::from_raw(child), Signal::SIGTERM).is_ok());
+        if !is_asked {
+            // It has not come so far as to start anything.
+            self.signal(Signal::SIGKILL);
+        }
+    }
+
     /// Waits until the group has no process any more.
     async fn emptied(&self) {
-        while self.0.is_some_and(|group| killpg(group, None) != Err(Errno::ESRCH)) {
+        while self.leader.is_some_and(|group| killpg(group, None) != Err(Errno::ESRCH)) {
             actix_rt::time::sleep(POLL).await;
         }
     }
@@ -151,11 +178,13 @@ impl Drop for KillOnDrop {
 }
 
 impl ExitReason {
-    fn of(status: ExitStatus) -> Self {
+    /// How a program ended. bubblewrap tells of a signal as shells do: 128 and its number.
+    fn of(status: ExitStatus, in_sandbox: bool) -> Self {
         let signal = status.signal().and_then(|number| u8::try_from(number).ok());
         match u8::try_from(status.code().unwrap_or_default()).unwrap_or_default() {
             _ if signal.is_some() => Self::Signal(signal.unwrap_or_default()),
             NOT_FOUND => Self::NotStarted,
+            code if in_sandbox && code > SIGNALLED => Self::Signal(code - SIGNALLED),
             code => Self::Code(code),
         }
     }
@@ -181,16 +210,19 @@ mod tests {
 
     #[test]
     fn only_a_signal_is_told_as_one() {
-        let reason = |raw| ExitReason::of(ExitStatus::from_raw(raw));
+        let reason = |raw| ExitReason::of(ExitStatus::from_raw(raw), false);
         assert_eq!(reason(129 << 8), ExitReason::Code(129), "git's wrong usage is no SIGHUP");
         assert_eq!(reason(127 << 8), ExitReason::NotStarted);
         assert_eq!(reason(9), ExitReason::Signal(9));
+        assert_eq!(ExitReason::of(ExitStatus::from_raw(139 << 8), true), ExitReason::Signal(11));
     }
 
     fn shell(script: &str) -> SpawnSpec {
         SpawnSpec {
             command: ["bash", "-c", script].map(OsString::from).to_vec(),
+            inherits: true,
             environment: Vec::new(),
+            in_sandbox: false,
             folder: None,
             mark: "/nowhere".into(),
             grace: Duration::from_secs(20),

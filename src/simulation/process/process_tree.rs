@@ -17,7 +17,8 @@ use procfs::process::{FDTarget, Process, all_processes};
 pub const MARK: &str = "WEBOTS_FLEET_INSTANCE";
 
 /// A process and all that descends from it at this moment.
-fn tree(root: i32) -> Vec<i32> {
+#[must_use]
+pub fn tree(root: i32) -> Vec<i32> {
     let mut found = vec![root];
     let mut next = 0;
     while let Some(pid) = found.get(next).copied() {
@@ -28,7 +29,8 @@ fn tree(root: i32) -> Vec<i32> {
 }
 
 /// The children of a process. One that has ended has none.
-fn children(pid: i32) -> Vec<i32> {
+#[must_use]
+pub fn children(pid: i32) -> Vec<i32> {
     let Ok(tasks) = Process::new(pid).and_then(|process| process.tasks()) else {
         return Vec::new();
     };
@@ -92,15 +94,21 @@ fn listeners(ports: &RangeInclusive<u16>) -> Vec<(u16, u64)> {
     listening.map(|entry| (entry.local_address.port(), entry.inode)).filter(|(port, _)| ports.contains(port)).collect()
 }
 
-/// The lowest port of a range on which `root` or a descendant of it listens; a listener of somebody else never counts.
-fn listening_port(root: i32, ports: &RangeInclusive<u16>) -> Option<u16> {
+/// The ports of a range on which `root` or a descendant of it listens, the lowest first; a listener of somebody else
+/// never counts.
+#[must_use]
+pub fn listening_ports(root: i32, ports: &RangeInclusive<u16>) -> Vec<u16> {
     let mut listeners = listeners(ports);
     if listeners.is_empty() {
-        return None;
+        return Vec::new();
     }
     listeners.sort_unstable();
     let own: HashSet<u64> = tree(root).into_iter().flat_map(sockets).collect();
-    listeners.into_iter().find(|(_, inode)| own.contains(inode)).map(|(port, _)| port)
+    let mut found: Vec<u16> =
+        listeners.into_iter().filter(|(_, inode)| own.contains(inode)).map(|(port, _)| port).collect();
+    // A socket for each of IPv4 and IPv6 may have the same port.
+    found.dedup();
+    found
 }
 
 /// Waits until a descendant of `root` listens on a port of a range, and returns that port. It takes as long as that takes.
@@ -109,8 +117,8 @@ pub async fn until_listening(root: i32, ports: RangeInclusive<u16>) -> u16 {
     loop {
         actix_rt::time::sleep(pause).await;
         let ports = ports.clone();
-        let found = actix_rt::task::spawn_blocking(move || listening_port(root, &ports)).await;
-        if let Ok(Some(port)) = found {
+        let found = actix_rt::task::spawn_blocking(move || listening_ports(root, &ports)).await;
+        if let Some(port) = found.ok().and_then(|ports| ports.first().copied()) {
             return port;
         }
         pause = (pause * 3 / 2).min(SLOWEST_POLL);
@@ -168,7 +176,7 @@ mod tests {
         let sleeper = Command::new("sleep").arg("100").spawn().unwrap();
         let sleeper = Ended(sleeper);
         assert_eq!(listeners(&(port..=port)).len(), 1);
-        assert_eq!(listening_port(i32::try_from(sleeper.0.id()).unwrap(), &(port..=port)), None);
+        assert!(listening_ports(i32::try_from(sleeper.0.id()).unwrap(), &(port..=port)).is_empty());
     }
 
     struct Ended(std::process::Child);

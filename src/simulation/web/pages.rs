@@ -8,6 +8,7 @@ use crate::shared::domain::UrlPrefix;
 use crate::shared::http::{Row, View};
 use crate::shared::run::{seconds_since_1970, timestamp};
 use crate::shared::text::one_line;
+use crate::simulation::isolation::Level;
 use crate::simulation::machine::sensors::{self, Gpu, Host, Machine};
 use crate::simulation::machine::{Readings, Sample};
 use crate::simulation::machine::{Usage, Usages};
@@ -34,6 +35,8 @@ struct Monitor<'server> {
     blocked: &'server [UrlPrefix],
     docker: bool,
     share_idle_time: f64,
+    isolation: Level,
+    shortcoming: Option<&'server str>,
     limit: String,
 }
 
@@ -117,6 +120,8 @@ pub fn monitor(server: &AppState, snapshot: &Snapshot, usages: &Usages) -> Resul
         blocked: &server.rules.blocked,
         docker: server.rules.docker,
         share_idle_time: server.rules.share_idle_time,
+        isolation: server.launcher.level(),
+        shortcoming: server.launcher.shortcoming(),
         limit: duration(server.config.timeout),
     };
     page.render()

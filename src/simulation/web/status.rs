@@ -5,6 +5,7 @@ use serde::Serialize;
 use super::webots_viewer;
 use crate::shared::domain::ServerReport;
 use crate::shared::http::Gauge;
+use crate::simulation::isolation::Level;
 use crate::simulation::machine::sensors::{Gpu, Host, Machine};
 use crate::simulation::snapshot::{Simulation, Snapshot};
 use crate::simulation::state::AppState;
@@ -16,6 +17,8 @@ pub struct StatusPage {
     /// The part that session servers read.
     #[serde(flatten)]
     pub report: ServerReport,
+    /// At which level of isolation simulations run.
+    pub isolation: Level,
     /// Time since the start, in seconds.
     pub uptime: u64,
     /// Name, system and hardware of the machine.
@@ -50,6 +53,7 @@ impl StatusPage {
         };
         Self {
             report,
+            isolation: server.launcher.level(),
             uptime: server.started.elapsed().as_secs(),
             host: readings.host.clone(),
             machine: readings.machine,

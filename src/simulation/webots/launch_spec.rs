@@ -10,6 +10,7 @@ use super::command::WebotsCommand;
 use super::event::WebotsEvent;
 use crate::simulation::checkout::{Checkouts, Project};
 use crate::simulation::config::SimulationConfig;
+use crate::simulation::isolation::{Cgroup, Launcher, Program, Watch};
 use crate::simulation::places::Ticket;
 use crate::simulation::process::SpawnSpec;
 use crate::simulation::protocol::Mode;
@@ -18,6 +19,8 @@ use crate::simulation::protocol::Mode;
 pub struct LaunchSpec {
     /// The server's configuration.
     pub config: Arc<SimulationConfig>,
+    /// How simulations are launched.
+    pub launcher: Arc<Launcher>,
     /// The program to start.
     pub program: PathBuf,
     /// Where controllers are restored from.
@@ -33,9 +36,12 @@ pub struct LaunchSpec {
 }
 
 impl LaunchSpec {
-    /// How the process is started and ended. `display` holds the environment variables that name its X display.
-    #[must_use]
-    pub fn spawn_spec(&self, display: Vec<(OsString, OsString)>) -> SpawnSpec {
+    /// How the process is started and ended, and its control group. `display` holds the environment variables that name
+    /// its X display.
+    ///
+    /// # Errors
+    /// When a folder that it needs can't be made.
+    pub fn spawn_spec(&self, display: &[(OsString, OsString)]) -> std::io::Result<(SpawnSpec, Option<Cgroup>)> {
         let command = WebotsCommand {
             program: &self.program,
             mode: self.mode,
@@ -43,12 +49,24 @@ impl LaunchSpec {
             heartbeat: self.config.timing.heartbeat,
             world: &self.project.world.path,
         };
-        SpawnSpec {
+        self.launcher.prepare(Program {
             command: command.to_arguments(),
-            environment: display,
-            folder: Some(self.project.folder().to_owned()),
-            mark: self.project.instance.path().to_owned(),
+            instance: self.project.instance.path(),
+            project: self.project.instance.project(),
+            folder: self.project.folder(),
+            display,
             grace: self.config.timing.grace,
+        })
+    }
+
+    /// What is watched of the simulation whose processes descend from this one.
+    #[must_use]
+    pub fn watch(&self, root: i32) -> Watch {
+        Watch {
+            root,
+            folder: self.project.instance.path().to_owned(),
+            limits: self.config.limits.clone(),
+            ports: self.config.streaming_ports(),
         }
     }
 }

@@ -3,7 +3,9 @@
 mod command;
 mod event;
 mod launch_spec;
+mod launched;
 mod output;
+mod paced_reader;
 mod virtual_display;
 mod webots;
 

@@ -4,14 +4,15 @@
 //! simulator that prints faster than this thread reads waits in its own write.
 
 use std::collections::VecDeque;
-use std::io::{BufRead, BufReader, PipeReader, Write};
+use std::io::{BufRead, BufReader, Write};
 use std::sync::{Arc, Mutex, PoisonError};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use actix::dev::ToEnvelope;
 use actix::prelude::*;
 use tokio::sync::oneshot;
 
+use super::paced_reader::PacedReader;
 use crate::shared::run::RotatedFile;
 use crate::shared::text::one_line;
 
@@ -35,6 +36,10 @@ pub struct Tail(Arc<Mutex<VecDeque<String>>>);
 const LINES: usize = 20;
 /// Bytes that are kept of a line; what comes after it, up to the next line break, is dropped.
 const LINE_SIZE: usize = 1000;
+/// How much is read at once, in bytes. What follows waits for its pace.
+const CHUNK: usize = 8 * 1024;
+/// Time between two events. Webots tells of its state every few seconds; a program that floods it waits.
+const BETWEEN_EVENTS: Duration = Duration::from_millis(20);
 
 impl OutputEvent {
     /// The meaning of a line, if it has one. All other lines are the simulation's own.
@@ -71,7 +76,7 @@ impl Tail {
 /// # Errors
 /// When the thread can't be made.
 pub fn follow<A>(
-    output: PipeReader,
+    output: PacedReader,
     mut file: Option<RotatedFile>,
     events: Addr<A>,
 ) -> std::io::Result<(Tail, oneshot::Receiver<()>)>
@@ -82,10 +87,15 @@ where
     let kept = tail.clone();
     let (end, ended) = oneshot::channel();
     std::thread::Builder::new().name("output".to_owned()).spawn(move || {
-        let mut reader = BufReader::with_capacity(64 * 1024, output);
+        let mut reader = BufReader::with_capacity(CHUNK, output);
+        let mut told = None;
         while let Some(line) = next_line(&mut reader) {
             if let Some(event) = OutputEvent::parse(&line) {
+                if let Some(told) = told {
+                    std::thread::sleep(BETWEEN_EVENTS.saturating_sub(Instant::elapsed(&told)));
+                }
                 deliver(&events, event);
+                told = Some(Instant::now());
             } else {
                 if let Some(file) = &mut file {
                     // A full disk costs the lines, not the simulation.

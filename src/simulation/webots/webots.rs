@@ -11,9 +11,10 @@ use actix::prelude::*;
 
 use super::event::{Exit, ExitNotifier, WebotsEvent};
 use super::launch_spec::LaunchSpec;
-use super::output::{self, OutputEvent, Tail};
+use super::launched::{self, End, Launched};
+use super::output::{OutputEvent, Tail};
 use super::virtual_display::VirtualDisplay;
-use crate::shared::run::{RotatedFile, seconds_since_1970};
+use crate::shared::run::seconds_since_1970;
 use crate::simulation::checkout::CheckoutError;
 use crate::simulation::machine::display;
 use crate::simulation::process::{ExitReason, ProcessGroup, process_tree};
@@ -49,10 +50,6 @@ pub struct Webots {
 const MISSED_HEARTBEATS: u32 = 6;
 /// If its port is taken, Webots silently takes one of so many that follow.
 const NEXT_PORTS: u16 = 10;
-/// How many older files of its output are kept beside the newest.
-const OLD_LOGS: usize = 1;
-/// How long the rest of an output may take to be read.
-const LAST_OUTPUT: Duration = Duration::from_secs(1);
 
 impl Webots {
     /// Prepares a Webots; it starts with the actor.
@@ -109,40 +106,16 @@ impl Webots {
 
     /// Starts the process, and has [`Self::ended`] called when it has ended.
     fn spawn(&mut self, display: Option<VirtualDisplay>, ctx: &mut Context<Self>) -> std::io::Result<()> {
-        let log = self.spec.config.log_dir.0.join("simulation/instances").join(format!("{}.log", self.port));
-        let begin = std::fs::metadata(&log).map_or(0, |file| file.len());
-        let file = RotatedFile::open(&log, OLD_LOGS).inspect_err(|error| {
-            let log = log.display();
-            log::warn!("port {}: what Webots prints is not kept: {log} can't be written: {error}", self.port);
-        });
-        let log = file.is_ok().then_some(log);
-        let (reader, output) = std::io::pipe()?;
-        let (tail, all_read) = output::follow(reader, file.ok(), ctx.address())?;
-        self.tail = tail;
-        let errors = output.try_clone()?;
-        let on_display = display.as_ref().map_or_else(
-            || vec![("DISPLAY".into(), display::effective(self.spec.config.display.as_ref()).into())],
-            VirtualDisplay::environment,
-        );
-        let (group, ended) = ProcessGroup::start(&self.spec.spawn_spec(on_display), output.into(), errors.into())?;
+        let (Launched { group, tail, log, begin }, ended) = launched::launch(&self.spec, display, ctx.address())?;
         let (program, world) = (self.spec.program.display(), self.spec.project.world.path.display());
-        log::info!("port {}: started {program} for {world} (process {})", self.port, group.leader());
         let (at, pid) = (seconds_since_1970(), group.leader());
+        log::info!("port {}: started {program} for {world} (process {pid})", self.port);
         self.spec.place.0.update(Change::Launched { at, pid, port: self.port, log, begin });
+        self.tail = tail;
         self.group = Some(group);
-        let project = Arc::clone(&self.spec.project);
-        let ended = async move {
-            let reason = ended.await;
-            if let Some(display) = display {
-                display.stop().await;
-            }
-            // Processes that have left the group are known by their mark.
-            actix_rt::task::spawn_blocking(move || project.instance.kill_processes()).await.ok();
-            // What was printed last tells why. A process that nobody can end may keep the pipe open.
-            actix_rt::time::timeout(LAST_OUTPUT, all_read).await.ok();
-            reason
-        };
-        ended.into_actor(self).map(|reason, this, ctx| this.ended(reason, ctx)).spawn(ctx);
+        ended.into_actor(self).map(|end, this, ctx| this.ended(&end, ctx)).spawn(ctx);
+        let excess = self.spec.watch(pid).until_too_much().into_actor(self);
+        excess.map(|why, this, _| this.end_at_once(&why)).spawn(ctx);
         Ok(())
     }
 
@@ -211,14 +184,30 @@ impl Webots {
         }
     }
 
-    fn ended(&mut self, reason: ExitReason, ctx: &mut Context<Self>) {
+    /// Ends Webots without a grace time, in which it could take even more.
+    fn end_at_once(&mut self, why: &str) {
+        if self.stopped_for.is_none() {
+            log::warn!("port {}: ended: {why}", self.port);
+            self.stopped_for = Some(why.to_owned());
+            self.spec.place.0.update(Change::Stage(Stage::Stopping));
+            self.group = None;
+        }
+    }
+
+    fn ended(&mut self, End { reason, out_of_memory }: &End, ctx: &mut Context<Self>) {
         log::info!("port {}: Webots {reason}", self.port);
-        let exit = match self.stopped_for.take() {
+        let out_of_memory =
+            out_of_memory.then(|| "The simulation has taken more memory than it may (limits.memory)".to_owned());
+        let mut exit = match self.stopped_for.take().or(out_of_memory) {
             Some(why) => Exit { clean: false, why: self.with_output(&why) },
-            None if reason == ExitReason::Code(0) => Exit { clean: true, why: "Webots has ended".to_owned() },
+            None if *reason == ExitReason::Code(0) => Exit { clean: true, why: "Webots has ended".to_owned() },
             None => Exit { clean: false, why: self.with_output(&format!("Webots {reason}")) },
         };
-        if exit.clean || self.listening || self.spec.config.xvfb {
+        if exit.clean || self.listening {
+            return self.exited(exit, ctx);
+        }
+        exit.why += self.spec.launcher.remark();
+        if self.spec.config.xvfb {
             return self.exited(exit, ctx);
         }
         let display = display::effective(self.spec.config.display.as_ref());

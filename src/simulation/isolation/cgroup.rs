@@ -1,0 +1,151 @@
+//! A control group (cgroup v2) for each simulation, where systemd delegates them to this server (`Delegate=yes`).
+//!
+//! They limit memory, processors and processes, and what is in one ends with it, however it hides. Nothing is delegated
+//! to a server that was started in a terminal: it shares its group with others, whose processes it must not move.
+
+use std::ffi::OsString;
+use std::io;
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+use procfs::process::Process;
+
+use crate::simulation::config::Resources;
+
+/// The control groups below this server's own.
+#[derive(Debug)]
+pub struct Cgroups {
+    folder: PathBuf,
+    settings: Vec<(&'static str, String)>,
+}
+
+/// The control group of one simulation. Dropping it ends all that is inside, and removes it.
+#[derive(Debug)]
+pub struct Cgroup {
+    folder: PathBuf,
+}
+
+/// The group of the server itself: where there are groups below, none of the kernel's limits holds for processes beside them.
+const OWN: &str = "server";
+/// What is limited.
+const CONTROLLERS: [&str; 3] = ["cpu", "memory", "pids"];
+/// The kernel's period for the time of processors, in microseconds.
+const PERIOD: u64 = 100_000;
+/// How long it may take until killed processes have gone.
+const VANISH: Duration = Duration::from_secs(2);
+/// Time between two looks whether they have.
+const PAUSE: Duration = Duration::from_millis(5);
+
+impl Cgroups {
+    /// The control groups that are delegated to this server, if they are.
+    #[must_use]
+    pub fn delegated(limits: &Resources) -> Option<Self> {
+        let folder = own_folder()?;
+        match Self::divide(&folder) {
+            Ok(()) => {
+                log::info!("each simulation gets a control group below {}", folder.display());
+                Some(Self { folder, settings: settings(limits) })
+            }
+            Err(error) => {
+                log::info!("simulations get no control groups: {} can't be divided: {error}", folder.display());
+                None
+            }
+        }
+    }
+
+    /// Moves this server into a group of its own, so that there can be others beside it.
+    fn divide(folder: &Path) -> io::Result<()> {
+        let own = folder.join(OWN);
+        if !own.is_dir() {
+            std::fs::create_dir(&own)?;
+        }
+        std::fs::write(own.join("cgroup.procs"), std::process::id().to_string())?;
+        let offered = std::fs::read_to_string(folder.join("cgroup.controllers"))?;
+        for controller in CONTROLLERS.iter().filter(|name| offered.split_whitespace().any(|one| one == **name)) {
+            std::fs::write(folder.join("cgroup.subtree_control"), format!("+{controller}"))?;
+        }
+        Ok(())
+    }
+
+    /// Makes a group for a simulation. Where that fails, it runs without.
+    pub fn make(&self) -> Option<Cgroup> {
+        let made = tempfile::Builder::new().prefix("simulation-").tempdir_in(&self.folder);
+        let made = made.inspect_err(|error| log::warn!("no control group can be made: {error}"));
+        let cgroup = Cgroup { folder: made.ok()?.keep() };
+        for (file, value) in &self.settings {
+            let file = cgroup.folder.join(file);
+            // What is not offered to this server can't be limited.
+            if file.exists()
+                && let Err(error) = std::fs::write(&file, value)
+            {
+                log::warn!("{} can't be set to {value}: {error}", file.display());
+            }
+        }
+        Some(cgroup)
+    }
+}
+
+impl Cgroup {
+    /// The words that run a program in this group.
+    pub fn joining(&self) -> Vec<OsString> {
+        let words = ["/bin/sh", "-c", "echo 0 >\"$0\" && exec \"$@\""].map(OsString::from);
+        words.into_iter().chain(std::iter::once(self.folder.join("cgroup.procs").into())).collect()
+    }
+
+    /// Whether the kernel has ended something inside because it took more memory than it may.
+    #[must_use]
+    pub fn has_run_out_of_memory(&self) -> bool {
+        let events = std::fs::read_to_string(self.folder.join("memory.events")).unwrap_or_default();
+        events.lines().any(|line| line.strip_prefix("oom_kill ").is_some_and(|count| count.trim() != "0"))
+    }
+
+    /// Ends all that is inside. Blocks until it has ended, for two seconds at most.
+    pub fn kill(&self) {
+        kill(&self.folder);
+    }
+}
+
+/// Ends all that is in a group. What is forked meanwhile is ended too.
+fn kill(folder: &Path) {
+    let deadline = Instant::now() + VANISH;
+    let events = || std::fs::read_to_string(folder.join("cgroup.events"));
+    while events().is_ok_and(|events| events.contains("populated 1")) && Instant::now() < deadline {
+        std::fs::write(folder.join("cgroup.kill"), "1").ok();
+        std::thread::sleep(PAUSE);
+    }
+}
+
+impl Drop for Cgroup {
+    fn drop(&mut self) {
+        let folder = std::mem::take(&mut self.folder);
+        let remove = move || {
+            kill(&folder);
+            if let Err(error) = std::fs::remove_dir(&folder) {
+                log::warn!("{} can't be removed: {error}", folder.display());
+            }
+        };
+        // Where there is no thread, systemd removes the group with the unit.
+        drop(std::thread::Builder::new().spawn(remove));
+    }
+}
+
+/// The limits as the kernel has them. A simulation that runs out of memory ends as a whole.
+fn settings(limits: &Resources) -> Vec<(&'static str, String)> {
+    let mut settings = vec![("pids.max", limits.processes.to_string()), ("memory.oom.group", "1".to_owned())];
+    settings.extend(limits.memory.map(|memory| ("memory.max", (memory << 20).to_string())));
+    settings.extend(limits.cores.map(|cores| ("cpu.max", format!("{} {PERIOD}", cores * PERIOD))));
+    settings
+}
+
+/// The folder of this server's control group, if nobody else is in it.
+fn own_folder() -> Option<PathBuf> {
+    let me = Process::myself().ok()?;
+    let mounts = me.mountinfo().ok()?;
+    let mount = mounts.into_iter().find(|mount| mount.fs_type == "cgroup2" && mount.root == "/")?;
+    let group = me.cgroups().ok()?.into_iter().find(|group| group.hierarchy == 0)?;
+    let below = Path::new(&group.pathname).strip_prefix("/").ok().filter(|path| !path.as_os_str().is_empty())?;
+    let folder = mount.mount_point.join(below);
+    let inside = std::fs::read_to_string(folder.join("cgroup.procs")).ok()?;
+    let is_alone = inside.lines().eq(std::iter::once(me.pid().to_string().as_str()));
+    is_alone.then_some(folder)
+}

@@ -1,0 +1,195 @@
+//! How simulations are launched on this server: decided once at its start, the same for all.
+//!
+//! A level of isolation is a way to turn a program into a command that runs it so ([`SpawnSpec`]).
+
+use std::ffi::OsString;
+use std::fmt;
+use std::io;
+use std::path::{Path, PathBuf};
+
+use nix::sys::resource::{Resource, getrlimit};
+use serde::Serialize;
+use which::which;
+
+use super::cgroup::{Cgroup, Cgroups};
+use super::environment;
+use super::program::Program;
+use super::sandbox::Sandbox;
+use crate::simulation::config::{Isolation, Resources, SimulationConfig, VariableName};
+use crate::simulation::process::SpawnSpec;
+
+/// The levels of isolation that this server can keep.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Level {
+    /// A process group of the server's own user.
+    None,
+    /// bubblewrap.
+    Sandbox,
+}
+
+/// `isolation` asks for a level that this machine does not have.
+#[derive(Debug, thiserror::Error)]
+#[error("isolation is \"sandbox\", but {0}; \"none\" runs worlds without it")]
+pub struct IsolationError(String);
+
+/// How many open files programs expect to be allowed; one that uses `select` can't stand more.
+const USUAL_FILES: u64 = 1024;
+
+/// How a program is run at a level.
+#[derive(Debug)]
+enum Method {
+    /// As it is.
+    Plain,
+    /// In a sandbox.
+    Sandbox(Sandbox),
+}
+
+/// Launches simulations at one level.
+#[derive(Debug)]
+pub struct Launcher {
+    method: Method,
+    /// Why it is not a sandbox, where the configuration leaves it to the machine.
+    shortcoming: Option<String>,
+    cgroups: Option<Cgroups>,
+    prlimit: Option<PathBuf>,
+    variables: Vec<VariableName>,
+    limits: Resources,
+}
+
+impl Launcher {
+    /// Finds out at which level simulations can run. Blocks for some milliseconds, for five seconds at most.
+    ///
+    /// # Errors
+    /// When the configuration demands a level that can't be had.
+    pub fn new(config: &SimulationConfig) -> Result<Self, IsolationError> {
+        let sandbox = || Sandbox::new(config).and_then(|sandbox| sandbox.try_out().map(|()| sandbox));
+        let (method, shortcoming) = match config.isolation {
+            Isolation::None => (Method::Plain, None),
+            // The configuration refuses containers before.
+            Isolation::Sandbox | Isolation::Container => (Method::Sandbox(sandbox().map_err(IsolationError)?), None),
+            Isolation::Auto => match sandbox() {
+                Ok(sandbox) => (Method::Sandbox(sandbox), None),
+                Err(why) => (Method::Plain, Some(why)),
+            },
+        };
+        Ok(Self {
+            method,
+            shortcoming,
+            cgroups: None,
+            prlimit: which("prlimit").ok(),
+            variables: config.environment.clone(),
+            limits: config.limits.clone(),
+        })
+    }
+
+    /// The same for a server that is starting: it logs the level, and each simulation gets a control group of its own
+    /// where these are delegated to this server.
+    ///
+    /// # Errors
+    /// When the configuration demands a level that can't be had.
+    pub fn start(config: &SimulationConfig) -> Result<Self, IsolationError> {
+        let mut launcher = Self::new(config)?;
+        match &launcher.shortcoming {
+            Some(why) => log::warn!("worlds' programs may do whatever this user may (isolation: none): {why}"),
+            None => log::info!("isolation: {}", launcher.level()),
+        }
+        launcher.cgroups = Cgroups::delegated(&launcher.limits);
+        Ok(launcher)
+    }
+
+    /// The level.
+    #[must_use]
+    pub fn level(&self) -> Level {
+        match self.method {
+            Method::Plain => Level::None,
+            Method::Sandbox(_) => Level::Sandbox,
+        }
+    }
+
+    /// Why simulations run at level `none` although the configuration does not say so, if they do.
+    #[must_use]
+    pub fn shortcoming(&self) -> Option<&str> {
+        self.shortcoming.as_deref()
+    }
+
+    /// What a client should know of the level where a program did not even become ready.
+    #[must_use]
+    pub fn remark(&self) -> &'static str {
+        match self.level() {
+            Level::None => "",
+            Level::Sandbox => {
+                " It ran in a sandbox, which shows it the system and Webots only; the server's administrator can show it \
+                 more (sandbox.readable, sandbox.writable), or run worlds without (isolation)."
+            }
+        }
+    }
+
+    /// How a program is started and ended, and its control group.
+    ///
+    /// # Errors
+    /// When a folder can't be made.
+    pub fn prepare(&self, mut program: Program<'_>) -> io::Result<(SpawnSpec, Option<Cgroup>)> {
+        let cgroup = self.cgroups.as_ref().and_then(Cgroups::make);
+        let mut command = cgroup.as_ref().map(Cgroup::joining).unwrap_or_default();
+        let mut environment = environment::allowed(&self.variables);
+        environment.extend(program.display.iter().cloned());
+        if let Method::Sandbox(sandbox) = &self.method {
+            // Links are not followed out of a sandbox.
+            if let Some(file) = program.command.first_mut()
+                && let Ok(real) = Path::new(&*file).canonicalize()
+            {
+                *file = real.into();
+            }
+            command.extend(sandbox.command(&program)?);
+            environment.extend(sandbox.environment());
+        }
+        command.extend(self.limited());
+        let spec = SpawnSpec {
+            command: command.into_iter().chain(program.command).collect(),
+            inherits: false,
+            environment,
+            in_sandbox: self.level() == Level::Sandbox,
+            folder: Some(program.folder.to_owned()),
+            mark: program.instance.to_owned(),
+            grace: program.grace,
+        };
+        Ok((spec, cgroup))
+    }
+
+    /// The words that run a program within the kernel's limits for processes.
+    fn limited(&self) -> Vec<OsString> {
+        let Some(prlimit) = &self.prlimit else {
+            return Vec::new();
+        };
+        let files = at_most(Resource::RLIMIT_NOFILE, self.limits.open_files);
+        let size = at_most(Resource::RLIMIT_FSIZE, self.limits.disk << 20);
+        let mut words = vec![format!("--nofile={}:{files}", files.min(USUAL_FILES)), format!("--fsize={size}")];
+        words.push("--core=0".to_owned());
+        // The kernel counts all processes of a user, but in a user namespace only those in it.
+        if self.level() == Level::Sandbox && !nix::unistd::getuid().is_root() && counts_by_namespace() {
+            words.push(format!("--nproc={}", at_most(Resource::RLIMIT_NPROC, self.limits.processes)));
+        }
+        let words = std::iter::once(prlimit.into()).chain(words.into_iter().map(OsString::from));
+        words.chain(std::iter::once("--".into())).collect()
+    }
+}
+
+/// A limit, or what this server itself may have at most, which nobody can raise for its programs.
+fn at_most(resource: Resource, limit: u64) -> u64 {
+    getrlimit(resource).map_or(limit, |(_, most)| limit.min(most))
+}
+
+/// Since Linux 5.14 the processes of a user are counted in each user namespace.
+fn counts_by_namespace() -> bool {
+    procfs::sys::kernel::Version::current().is_ok_and(|version| (version.major, version.minor) >= (5, 14))
+}
+
+impl fmt::Display for Level {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        out.write_str(match self {
+            Self::None => "none",
+            Self::Sandbox => "sandbox",
+        })
+    }
+}

@@ -1,0 +1,13 @@
+//! How a simulation is launched: at which level of isolation, with which environment and limits, and what ends with it.
+
+mod cgroup;
+mod environment;
+mod launcher;
+mod program;
+mod sandbox;
+mod watch;
+
+pub use cgroup::Cgroup;
+pub use launcher::{IsolationError, Launcher, Level};
+pub use program::Program;
+pub use watch::Watch;

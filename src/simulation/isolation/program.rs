@@ -1,0 +1,22 @@
+//! What is launched.
+
+use std::ffi::OsString;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+/// A program that is to be launched for a simulation.
+#[derive(Debug)]
+pub struct Program<'start> {
+    /// The program and its arguments.
+    pub command: Vec<OsString>,
+    /// The instance's folder.
+    pub instance: &'start Path,
+    /// The folder of its project, which it may change.
+    pub project: PathBuf,
+    /// The working folder.
+    pub folder: &'start Path,
+    /// The variables that name its display.
+    pub display: &'start [(OsString, OsString)],
+    /// Time between SIGTERM and SIGKILL.
+    pub grace: Duration,
+}

@@ -1,0 +1,261 @@
+//! A sandbox by bubblewrap: the system is there to be read, what is the server's own is not, and everything inside ends
+//! with it.
+//!
+//! Which folders are hidden and which are shown is one list, the outer folders before the inner ones: what is said of a
+//! folder holds for all that is inside, unless something else is said of that.
+
+use std::ffi::OsString;
+use std::io::{self, Seek};
+use std::path::PathBuf;
+use std::process::{Command, Stdio};
+use std::time::{Duration, Instant};
+
+use which::which;
+
+use super::program::Program;
+use crate::shared::run::one_line;
+use crate::simulation::config::SimulationConfig;
+
+/// What every sandbox of this server has in common.
+#[derive(Debug)]
+pub struct Sandbox {
+    bubblewrap: PathBuf,
+    user: u32,
+    homes: Vec<PathBuf>,
+    places: Vec<Place>,
+}
+
+/// A file or folder of which a sandbox shows something else than the system has there.
+#[derive(Debug, Clone)]
+struct Place {
+    at: PathBuf,
+    content: Content,
+}
+
+/// What a sandbox shows at a place.
+#[derive(Debug, Clone)]
+enum Content {
+    /// An empty folder.
+    Empty,
+    /// An empty file.
+    EmptyFile,
+    /// What is there, only to be read.
+    Readable,
+    /// What is at another path, to be read and written.
+    Writable(PathBuf),
+}
+
+/// The administrator's folder, in which a package of this server has its configuration.
+const ETC: &str = "/etc/webots-fleet";
+/// What of `/run` programs need to find names, users and graphics cards. The rest are sockets of services, some of which
+/// start programs for whoever asks.
+const SYSTEM_RUN: [&str; 8] = [
+    "/run/systemd/resolve",
+    "/run/resolvconf",
+    "/run/NetworkManager/resolv.conf",
+    "/run/nscd",
+    "/run/udev",
+    "/run/nvidia-persistenced",
+    "/run/opengl-driver",
+    "/run/current-system",
+];
+/// Graphics cards; also all in `/dev` that begins with `nvidia`.
+const DEVICES: [&str; 2] = ["/dev/dri", "/dev/kfd"];
+/// How long it may take to try whether a sandbox can be made.
+const TRIAL: Duration = Duration::from_secs(5);
+/// Where nothing of bubblewrap works: what may be done about it.
+const REMEDY: &str = "user namespaces must be allowed (sysctl user.max_user_namespaces, \
+                      kernel.unprivileged_userns_clone, kernel.apparmor_restrict_unprivileged_userns), and /proc not be \
+                      covered as in a container";
+
+impl Sandbox {
+    /// Prepares sandboxes for a server with this configuration.
+    ///
+    /// # Errors
+    /// When bubblewrap is not there, in words for an administrator.
+    pub fn new(config: &SimulationConfig) -> Result<Self, String> {
+        let bubblewrap = which("bwrap").map_err(|_| {
+            "bubblewrap (bwrap) is not there; on Debian, Ubuntu and Fedora the package bubblewrap has it".to_owned()
+        })?;
+        let shown = |path: &PathBuf| path.canonicalize().ok();
+        let mut places: Vec<Place> = ["/run", ETC].map(|at| Place::new(at, Content::Empty)).into();
+        places.extend(SYSTEM_RUN.map(|at| Place::new(at, Content::Readable)));
+        let readable = config.webots_home.iter().chain(&config.sandbox.readable).filter_map(|path| shown(&path.0));
+        places.extend(readable.map(|at| Place { at, content: Content::Readable }));
+        let writable = config.sandbox.writable.iter().filter_map(|path| shown(&path.0));
+        places.extend(writable.map(|at| Place { at: at.clone(), content: Content::Writable(at) }));
+        // Last, for nothing makes up for these.
+        places.extend(hidden_of(config));
+        places.retain(|place| place.at.exists());
+        Ok(Self { bubblewrap, user: nix::unistd::getuid().as_raw(), homes: homes(), places })
+    }
+
+    /// The command that runs a program in a sandbox of its own. Makes the folders that it needs in the instance's folder.
+    ///
+    /// # Errors
+    /// When a folder can't be made.
+    pub fn command(&self, program: &Program<'_>) -> io::Result<Vec<OsString>> {
+        let mut command: Vec<OsString> = vec![self.bubblewrap.clone().into()];
+        command.extend(
+            ["--die-with-parent", "--new-session", "--unshare-pid", "--unshare-ipc", "--cap-drop", "ALL"]
+                .map(Into::into),
+        );
+        command.extend(["--ro-bind", "/", "/", "--dev", "/dev", "--proc", "/proc"].map(Into::into));
+        for device in devices() {
+            command.extend(["--dev-bind-try".into(), device.clone().into(), device.into()]);
+        }
+        let mut places = self.own(program)?;
+        places.extend(self.places.iter().cloned());
+        // Sorting keeps the order of equals: of two at the same place the last one counts.
+        places.sort_by_key(|place| place.at.components().count());
+        command.extend(places.into_iter().flat_map(Place::into_arguments));
+        command.extend(["--chdir".into(), program.folder.into(), "--".into()]);
+        Ok(command)
+    }
+
+    /// What is different from one simulation to another.
+    fn own(&self, program: &Program<'_>) -> io::Result<Vec<Place>> {
+        let inside = |name: &str| {
+            let folder = program.instance.join(name);
+            std::fs::create_dir_all(&folder).map(|()| folder)
+        };
+        let (home, run, tmp) = (inside("home")?, inside("run")?, inside("tmp")?);
+        let mut own: Vec<Place> = ["/tmp", "/var/tmp"].map(|at| Place::new(at, Content::Writable(tmp.clone()))).into();
+        own.push(Place { at: self.runtime_folder(), content: Content::Writable(run) });
+        own.extend(self.homes.iter().map(|at| Place { at: at.clone(), content: Content::Writable(home.clone()) }));
+        own.push(Place { at: program.project.clone(), content: Content::Writable(program.project.clone()) });
+        // A link is looked up in the sandbox, where it may lead to what is not there.
+        let files = program.command.first().map(PathBuf::from).into_iter().chain(self.display_files(program));
+        let files = files.filter_map(|file| file.canonicalize().ok());
+        own.extend(files.map(|at| Place { at, content: Content::Readable }));
+        own.retain(|place| place.at.exists() || place.at == self.runtime_folder());
+        Ok(own)
+    }
+
+    /// The socket of the display, and the file that authorizes its users.
+    fn display_files(&self, program: &Program<'_>) -> Vec<PathBuf> {
+        let variable = |name: &str| program.display.iter().find(|(one, _)| one == name).map(|(_, value)| value.clone());
+        let socket = variable("DISPLAY").and_then(|display| socket_of(&display.to_string_lossy()));
+        let authority = variable("XAUTHORITY").or_else(|| std::env::var_os("XAUTHORITY")).map(PathBuf::from);
+        let usual = || self.homes.first().map(|home| home.join(".Xauthority"));
+        socket.into_iter().chain(authority.or_else(usual)).collect()
+    }
+
+    /// Variables that are different in a sandbox. Shared memory with the display is out of reach.
+    pub fn environment(&self) -> Vec<(OsString, OsString)> {
+        let home = self.homes.first().map_or_else(|| "/tmp".into(), Clone::clone);
+        vec![
+            ("HOME".into(), home.into()),
+            ("TMPDIR".into(), "/tmp".into()),
+            ("XDG_RUNTIME_DIR".into(), self.runtime_folder().into()),
+            ("QT_X11_NO_MITSHM".into(), "1".into()),
+        ]
+    }
+
+    fn runtime_folder(&self) -> PathBuf {
+        PathBuf::from(format!("/run/user/{}", self.user))
+    }
+
+    /// Tries whether a sandbox can be made here. Blocks for five seconds at most.
+    ///
+    /// # Errors
+    /// Why not, and what to do about it, in words for an administrator.
+    pub fn try_out(&self) -> Result<(), String> {
+        let told = |error: io::Error| one_line(error.to_string().trim());
+        self.trial().map_err(|error| format!("bubblewrap makes no sandbox here ({}): {REMEDY}", told(error)))
+    }
+
+    /// Runs a program that does nothing in a sandbox that has everything.
+    fn trial(&self) -> io::Result<()> {
+        let instance = tempfile::tempdir()?;
+        let project = instance.path().join("project");
+        std::fs::create_dir(&project)?;
+        let words = self.command(&Program {
+            command: Vec::new(),
+            instance: instance.path(),
+            folder: &project,
+            project: project.clone(),
+            display: &[],
+            grace: TRIAL,
+        })?;
+        let (bubblewrap, arguments) = words.split_first().ok_or(io::ErrorKind::InvalidInput)?;
+        let mut complaints = tempfile::tempfile()?;
+        let mut trial = Command::new(bubblewrap);
+        trial.args(arguments).arg("true").stdin(Stdio::null()).stdout(Stdio::null()).stderr(complaints.try_clone()?);
+        let mut trial = trial.spawn()?;
+        let deadline = Instant::now() + TRIAL;
+        while trial.try_wait()?.is_none() {
+            if Instant::now() >= deadline {
+                trial.kill()?;
+                trial.wait()?;
+                return Err(io::Error::other("it does not end"));
+            }
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        if trial.wait()?.success() {
+            return Ok(());
+        }
+        complaints.rewind()?;
+        Err(io::Error::other(io::read_to_string(complaints)?))
+    }
+}
+
+impl Place {
+    fn new(at: &str, content: Content) -> Self {
+        Self { at: at.into(), content }
+    }
+
+    fn into_arguments(self) -> Vec<OsString> {
+        match self.content {
+            Content::Empty => vec!["--tmpfs".into(), self.at.into()],
+            Content::EmptyFile => vec!["--ro-bind".into(), "/dev/null".into(), self.at.into()],
+            Content::Readable => vec!["--ro-bind-try".into(), self.at.clone().into(), self.at.into()],
+            Content::Writable(content) => vec!["--bind".into(), content.into(), self.at.into()],
+        }
+    }
+}
+
+/// What only the server may see: its log, its cache with all simulations, its configuration.
+fn hidden_of(config: &SimulationConfig) -> Vec<Place> {
+    let folders = [&config.log_dir.0, &config.cache_dir.0].into_iter().filter_map(|folder| folder.canonicalize().ok());
+    let mut hidden: Vec<Place> = folders.map(|at| Place { at, content: Content::Empty }).collect();
+    let files = std::iter::once(&config.file).chain(config.git_config.as_ref().map(|file| &file.0));
+    for file in files.filter_map(|file| file.canonicalize().ok()) {
+        hidden.push(Place { at: file.clone(), content: Content::EmptyFile });
+        // The other configurations are beside it: those of the session server are in a folder beside this one.
+        let Some(folder) = file.parent() else { continue };
+        let beside = ["session", "simulation"].map(|name| folder.with_file_name(name));
+        if beside.iter().any(|one| one == folder) {
+            hidden.extend(beside.map(|at| Place { at, content: Content::Empty }));
+        }
+    }
+    hidden
+}
+
+/// The homes of the server's user: the one that the environment names, and the one that the system knows.
+fn homes() -> Vec<PathBuf> {
+    let named = std::env::var_os("HOME").map(PathBuf::from);
+    let known = nix::unistd::User::from_uid(nix::unistd::getuid()).ok().flatten().map(|user| user.dir);
+    let mut homes: Vec<PathBuf> = named
+        .into_iter()
+        .chain(known)
+        .filter_map(|home| home.canonicalize().ok())
+        .filter(|home| home.parent().is_some())
+        .collect();
+    homes.dedup();
+    homes
+}
+
+/// The graphics cards of this machine.
+fn devices() -> impl Iterator<Item = PathBuf> {
+    let all = std::fs::read_dir("/dev").into_iter().flatten().flatten();
+    let nvidia = all.filter(|entry| entry.file_name().as_encoded_bytes().starts_with(b"nvidia"));
+    DEVICES.iter().map(PathBuf::from).chain(nvidia.map(|entry| entry.path()))
+}
+
+/// The socket of a display on this machine.
+fn socket_of(display: &str) -> Option<PathBuf> {
+    let (host, number) = display.rsplit_once(':')?;
+    let number = number.split('.').next().filter(|number| number.parse::<u16>().is_ok())?;
+    matches!(host, "" | "unix").then(|| PathBuf::from(format!("/tmp/.X11-unix/X{number}")))
+}

@@ -1,0 +1,95 @@
+//! Starts the process of a Webots, and waits until nothing of it is left.
+
+use std::future::Future;
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::time::Duration;
+
+use actix::dev::ToEnvelope;
+use actix::prelude::*;
+
+use super::launch_spec::LaunchSpec;
+use super::output::{self, OutputEvent, Tail};
+use super::paced_reader::PacedReader;
+use super::virtual_display::VirtualDisplay;
+use crate::shared::run::RotatedFile;
+use crate::simulation::machine::display;
+use crate::simulation::process::{ExitReason, ProcessGroup};
+
+/// A Webots that was started.
+pub struct Launched {
+    /// Its processes.
+    pub group: ProcessGroup,
+    /// The last lines of its output.
+    pub tail: Tail,
+    /// The file that its output is kept in.
+    pub log: Option<PathBuf>,
+    /// How long that file was before, in bytes.
+    pub begin: u64,
+}
+
+/// How a Webots has ended.
+#[derive(Debug)]
+pub struct End {
+    /// As its process tells.
+    pub reason: ExitReason,
+    /// Whether the kernel has ended something of it that took too much memory.
+    pub out_of_memory: bool,
+}
+
+/// How many older files of its output are kept beside the newest.
+const OLD_LOGS: usize = 1;
+/// How long the rest of an output may take to be read.
+const LAST_OUTPUT: Duration = Duration::from_secs(1);
+
+/// Starts a Webots, on a display of its own or the configured one. The future resolves when nothing of it is left.
+///
+/// # Errors
+/// When a process, a thread or a folder can't be made.
+pub fn launch<A>(
+    spec: &LaunchSpec,
+    display: Option<VirtualDisplay>,
+    events: Addr<A>,
+) -> std::io::Result<(Launched, impl Future<Output = End> + use<A>)>
+where
+    A: Actor<Context: ToEnvelope<A, OutputEvent>> + Handler<OutputEvent>,
+{
+    let port = spec.place.1;
+    let log = spec.config.log_dir.0.join("simulation/instances").join(format!("{port}.log"));
+    let begin = std::fs::metadata(&log).map_or(0, |file| file.len());
+    let file = RotatedFile::open(&log, OLD_LOGS).inspect_err(|error| {
+        log::warn!("port {port}: what Webots prints is not kept: {} can't be written: {error}", log.display());
+    });
+    let log = file.is_ok().then_some(log);
+    let (reader, output) = std::io::pipe()?;
+    let reader = PacedReader::new(reader, spec.config.limits.output << 10);
+    let (tail, all_read) = output::follow(reader, file.ok(), events)?;
+    let errors = output.try_clone()?;
+    let on_display = display.as_ref().map_or_else(
+        || vec![("DISPLAY".into(), display::effective(spec.config.display.as_ref()).into())],
+        VirtualDisplay::environment,
+    );
+    let (process, cgroup) = spec.spawn_spec(&on_display)?;
+    let (group, ended) = ProcessGroup::start(&process, output.into(), errors.into())?;
+    let project = Arc::clone(&spec.project);
+    let ended = async move {
+        let reason = ended.await;
+        if let Some(display) = display {
+            display.stop().await;
+        }
+        // Processes that have left the group are known by their control group or by their mark.
+        let end_all = move || {
+            let out_of_memory = cgroup.is_some_and(|cgroup| {
+                cgroup.kill();
+                cgroup.has_run_out_of_memory()
+            });
+            project.instance.kill_processes();
+            out_of_memory
+        };
+        let out_of_memory = actix_rt::task::spawn_blocking(end_all).await.unwrap_or_default();
+        // What was printed last tells why. A process that nobody can end may keep the pipe open.
+        actix_rt::time::timeout(LAST_OUTPUT, all_read).await.ok();
+        End { reason, out_of_memory }
+    };
+    Ok((Launched { group, tail, log, begin }, ended))
+}

@@ -1,0 +1,48 @@
+//! Reads an output no faster than its limit, so that a flood costs this server no more than a small part of a core.
+//!
+//! Who prints faster waits in its own write.
+
+use std::io::{PipeReader, Read};
+use std::time::Duration;
+
+/// The reading end of a pipe, with its pace.
+#[derive(Debug)]
+pub struct PacedReader {
+    output: PipeReader,
+    /// In bytes per second.
+    limit: u64,
+    /// What was read and not waited for, in bytes.
+    debt: u64,
+}
+
+/// What a line costs beside its length, in bytes: it is looked at, kept and written by itself.
+const LINE: u64 = 200;
+/// Bytes that are not waited for: ordinary output is read at once.
+const FREE: u64 = 1024;
+
+impl PacedReader {
+    /// Reads a pipe at so many bytes per second at most.
+    #[must_use]
+    pub fn new(output: PipeReader, limit: u64) -> Self {
+        Self { output, limit: limit.max(1), debt: 0 }
+    }
+}
+
+impl Read for PacedReader {
+    fn read(&mut self, buffer: &mut [u8]) -> std::io::Result<usize> {
+        if self.debt > FREE {
+            std::thread::sleep(Duration::from_secs(1).mul_f64(per_second(self.debt, self.limit)));
+            self.debt = 0;
+        }
+        let count = self.output.read(buffer)?;
+        let read = buffer.get(..count).unwrap_or_default();
+        let lines = read.split(|byte| *byte == b'\n').skip(1).count();
+        self.debt += u64::try_from(count).unwrap_or_default() + LINE * u64::try_from(lines).unwrap_or_default();
+        Ok(count)
+    }
+}
+
+#[expect(clippy::cast_precision_loss, reason = "a pause needs no more digits than f64 has")]
+fn per_second(bytes: u64, limit: u64) -> f64 {
+    bytes as f64 / limit as f64
+}

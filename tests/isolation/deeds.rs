@@ -1,0 +1,222 @@
+//! What a program of a world sees and reaches. Each deed is done by the stand-in for Webots, which tells how it went.
+
+use std::os::unix::fs::PermissionsExt;
+use std::path::{Path, PathBuf};
+
+use crate::simulation::scene::{DEMO, arm, nothing_left};
+use crate::support::client::Client;
+use crate::support::git::Forge;
+use crate::support::program::{Builder, Server, simulation_server};
+use crate::support::webots::Webots;
+use crate::support::{display, needs};
+
+/// Everything of a test: a server with things that are none of a world's business.
+struct Stage {
+    /// Holds the configuration, the log and the cache.
+    folder: tempfile::TempDir,
+    /// The home of the server's user.
+    home: tempfile::TempDir,
+    /// Somewhere that is neither in `/tmp` nor in a home.
+    elsewhere: tempfile::TempDir,
+    forge: Forge,
+}
+
+/// The levels in the order of the tables.
+const LEVELS: [&str; 2] = ["none", "sandbox"];
+
+impl Stage {
+    fn new() -> Self {
+        let everybody = |folder: tempfile::TempDir| {
+            std::fs::set_permissions(folder.path(), std::fs::Permissions::from_mode(0o777)).unwrap();
+            folder
+        };
+        let stage = Self {
+            folder: everybody(tempfile::tempdir().unwrap()),
+            home: everybody(tempfile::tempdir().unwrap()),
+            elsewhere: everybody(tempfile::tempdir_in(env!("CARGO_TARGET_TMPDIR")).unwrap()),
+            forge: Forge::with_arm(),
+        };
+        std::fs::write(stage.home.path().join("secret"), "a secret").unwrap();
+        std::fs::write(stage.elsewhere.path().join("data"), "data").unwrap();
+        stage
+    }
+
+    fn builder(&self, webots: &Webots, level: &str) -> Builder {
+        let builder = simulation_server(&webots.path(), self.forge.path(), 2).folder(self.folder.path());
+        let builder = builder.set("isolation", level).set("adminPassword", "a secret").set("timing.grace", 0.5);
+        builder.env("HOME", self.home.path().to_str().unwrap()).env("SECRET_OF_THE_SERVER", "a secret")
+    }
+
+    /// What a program of a world can do of these deeds, each a name and a line for a shell.
+    async fn tried(
+        &self,
+        deeds: &[(&str, String)],
+        level: &str,
+        change: impl FnOnce(Builder) -> Builder,
+    ) -> Vec<String> {
+        let one =
+            |(name, line): &(&str, String)| format!("if ( {line} ) >/dev/null 2>&1; then echo 'DONE {name}'; fi\n");
+        let webots = Webots::script(&format!("{}\necho THE END\nexit 1", deeds.iter().map(one).collect::<String>()));
+        std::fs::set_permissions(webots.path().parent().unwrap(), std::fs::Permissions::from_mode(0o755)).unwrap();
+        let server = change(self.builder(&webots, level)).start().await;
+        let told = Client::start(&server, &arm()).await.until("loading: Error:").await;
+        assert!(told.contains("THE END"), "{told}");
+        nothing_left(&server, 2).await;
+        told.split(" | ").filter_map(|line| line.split("DONE ").nth(1)).map(str::to_owned).collect()
+    }
+}
+
+fn shown(path: impl AsRef<Path>) -> String {
+    path.as_ref().display().to_string()
+}
+
+/// What is read and written, and at which levels that can be done.
+fn files(stage: &Stage) -> Vec<(&'static str, String, [bool; 2])> {
+    let (folder, home, elsewhere) = (shown(&stage.folder), shown(&stage.home), shown(&stage.elsewhere));
+    vec![
+        ("read the project", "test -f worlds/arm.wbt -o -d worlds".to_owned(), [true, true]),
+        ("write the project", "touch worlds/new".to_owned(), [true, true]),
+        ("write a home", "touch ~/.config-of-webots".to_owned(), [true, true]),
+        (
+            "write the runtime folder",
+            "touch ${XDG_RUNTIME_DIR:-/tmp}/x.$$; rm ${XDG_RUNTIME_DIR:-/tmp}/x.$$".to_owned(),
+            [true, true],
+        ),
+        ("use temporary files", "f=$(mktemp) && echo x > $f && rm $f".to_owned(), [true, true]),
+        ("use shared memory", "touch /dev/shm/fleet.$$ && rm /dev/shm/fleet.$$".to_owned(), [true, true]),
+        (
+            "read the system",
+            "test -r /etc/passwd -a -x /usr/bin/env -a -r /proc/cpuinfo -a -d /sys/class".to_owned(),
+            [true, true],
+        ),
+        ("read elsewhere", format!("grep data {elsewhere}/data"), [true, true]),
+        ("write elsewhere", format!("touch {elsewhere}/new"), [true, false]),
+        ("read the configuration", format!("grep secret {folder}/config.json"), [true, false]),
+        ("change the configuration", format!("echo >> {folder}/config.json"), [true, false]),
+        ("read the log", format!("ls {folder}/log/simulation/instances/*.log"), [true, false]),
+        ("read the cache", format!("ls {folder}/cache/git/*/HEAD"), [true, false]),
+        ("change the cache", format!("for one in {folder}/cache/git/*/HEAD; do echo >> $one; done"), [true, false]),
+        ("see all of its folder", format!("ls {folder}/cache/runs/*/*/index"), [true, false]),
+        ("read the home", format!("grep secret {home}/secret"), [true, false]),
+        ("write what git obeys", format!("touch {home}/.gitconfig && test -f {home}/secret"), [true, false]),
+        (
+            "read the environment of the server",
+            "grep -ls SECRET_OF_THE_SERVER /proc/[0-9]*/environ | grep .".to_owned(),
+            [true, false],
+        ),
+        ("see other processes", "grep -ls simulation-serv /proc/[0-9]*/comm | grep .".to_owned(), [true, false]),
+    ]
+}
+
+async fn compare(stage: &Stage, change: impl Fn(Builder) -> Builder, levels: &[usize]) {
+    let table = files(stage);
+    let deeds: Vec<(&str, String)> = table.iter().map(|(name, line, _)| (*name, line.clone())).collect();
+    for level in levels {
+        let expected: Vec<&str> = table.iter().filter(|(_, _, done)| done[*level]).map(|(name, ..)| *name).collect();
+        assert_eq!(stage.tried(&deeds, LEVELS[*level], &change).await, expected, "{}", LEVELS[*level]);
+    }
+}
+
+#[actix_rt::test]
+async fn a_world_sees_and_changes_what_its_level_allows() {
+    compare(&Stage::new(), |builder| builder.set("limits.output", 10_000), &[1, 0]).await;
+}
+
+#[actix_rt::test]
+async fn a_sandbox_holds_for_an_ordinary_user_too() {
+    let program = Path::new(env!("CARGO_BIN_EXE_simulation-server"));
+    let may_be_run = |folder: &Path| folder.metadata().unwrap().permissions().mode() & 1 == 1;
+    if !nix::unistd::getuid().is_root() || !program.ancestors().all(may_be_run) {
+        return eprintln!("skipped: only root can become somebody else, who may run what was built");
+    }
+    let stage = Stage::new();
+    let nobody = "exec setpriv --reuid=65534 --regid=65534 --clear-groups \"$0\" \"$@\"";
+    std::fs::set_permissions(stage.forge.path(), std::fs::Permissions::from_mode(0o755)).unwrap();
+    compare(&stage, |builder| builder.before(nobody), &[1]).await;
+    let processes = [("be bounded by the kernel", "test $(ulimit -u) = 70".to_owned())];
+    let done = stage.tried(&processes, "sandbox", |builder| builder.before(nobody).set("limits.processes", 70)).await;
+    assert_eq!(done, ["be bounded by the kernel"]);
+}
+
+#[actix_rt::test]
+async fn folders_are_shown_and_opened_by_keys() {
+    let stage = Stage::new();
+    let (home, elsewhere) = (shown(&stage.home), shown(&stage.elsewhere));
+    let deeds = [
+        ("read home", format!("grep secret {home}/secret")),
+        ("write home", format!("touch {home}/new")),
+        ("write elsewhere", format!("touch {elsewhere}/new")),
+        ("read the configuration", format!("grep secret {}/config.json", shown(&stage.folder))),
+    ];
+    let done = stage.tried(&deeds, "sandbox", |builder| {
+        // What holds the server's own folders shows all but those.
+        builder
+            .set("sandbox.readable", serde_json::json!([home, stage.folder.path()]))
+            .set("sandbox.writable", elsewhere.as_str())
+    });
+    assert_eq!(done.await, ["read home", "write elsewhere"]);
+    assert!(stage.elsewhere.path().join("new").exists());
+}
+
+#[actix_rt::test]
+async fn the_environment_is_what_webots_needs_and_what_a_key_adds() {
+    let stage = Stage::new();
+    let has = |name: &str| format!("test -n \"${{{name}}}\"");
+    let deeds = ["PATH", "HOME", "DISPLAY", "LC_ALL", "SECRET_OF_THE_SERVER", "ROS_DOMAIN_ID", "ONE"]
+        .map(|name| (name, has(name)));
+    for level in LEVELS {
+        let with = |builder: Builder| builder.env("ROS_DOMAIN_ID", "7").env("ONE", "1").env("LC_ALL", "C");
+        let done = stage.tried(&deeds, level, with).await;
+        assert_eq!(done, ["PATH", "HOME", "DISPLAY", "LC_ALL"], "{level}");
+        let added =
+            |builder| with(builder).set("environment", serde_json::json!(["ROS_*", "ONE", "DEMO_SIMULATOR_BIND"]));
+        let done = stage.tried(&deeds, level, added).await;
+        assert_eq!(done, ["PATH", "HOME", "DISPLAY", "LC_ALL", "ROS_DOMAIN_ID", "ONE"], "{level}");
+    }
+}
+
+#[actix_rt::test]
+async fn the_display_is_within_reach_of_a_sandbox() {
+    let _alone = display::alone().await;
+    needs("xhost", "x11-xserver-utils");
+    let stage = Stage::new();
+    let deeds = [
+        ("use the display", "xhost".to_owned()),
+        ("use it without its authority", "XAUTHORITY=/dev/null xhost".to_owned()),
+    ];
+    for level in LEVELS {
+        let done = stage.tried(&deeds, level, |builder| builder.set("xvfb", true)).await;
+        assert_eq!(done, ["use the display"], "{level}");
+    }
+}
+
+/// A running simulation whose program has tried to end the server.
+async fn attacked(stage: &Stage, level: &str) -> (Server, Client) {
+    let ready = stage.elsewhere.path().join(format!("ready-{level}"));
+    let config = stage.folder.path().join("config.json");
+    let webots = Webots::script(&format!(
+        "{DEMO} \"$@\" &\nuntil [ -e {} ]; do sleep 0.01; done\nfor one in /proc/[0-9]*; do\n  \
+         if grep -q {} $one/cmdline; then kill -9 ${{one#/proc/}}; fi\ndone 2>/dev/null\necho tried\nwait",
+        shown(&ready),
+        shown(&config)
+    ));
+    let server = stage.builder(&webots, level).start().await;
+    let mut client = Client::start(&server, &arm()).await;
+    client.until("webots:").await;
+    std::fs::write(&ready, "").unwrap();
+    (server, client)
+}
+
+#[actix_rt::test]
+async fn a_world_can_kill_the_server_only_without_a_sandbox() {
+    let stage = Stage::new();
+    let (mut server, _client) = attacked(&stage, "none").await;
+    assert_eq!(server.ended().await, None, "it was killed");
+    let stage = Stage::new();
+    let (server, client) = attacked(&stage, "sandbox").await;
+    let log: PathBuf = server.folder.join(format!("log/simulation/instances/{}.log", server.port + 1));
+    let tried = async || std::fs::read_to_string(&log).is_ok_and(|text| text.contains("tried"));
+    crate::support::until("it has tried", tried).await;
+    client.leave().await;
+    nothing_left(&server, 2).await;
+}

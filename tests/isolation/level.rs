@@ -1,0 +1,107 @@
+//! How a server gets its level, and what it says of it.
+
+use serde_json::json;
+
+use crate::simulation::scene::arm;
+use crate::support::client::Client;
+use crate::support::git::Forge;
+use crate::support::http;
+use crate::support::program::{Builder, simulation_server};
+use crate::support::webots::Webots;
+
+/// A folder with git and a shell, and with a bubblewrap that fails if one is wanted.
+fn programs(bubblewrap: Option<&str>) -> tempfile::TempDir {
+    let folder = tempfile::tempdir().unwrap();
+    for program in ["git", "bash", "env", "sh", "sleep"] {
+        let paths = std::env::var_os("PATH").unwrap();
+        let real = std::env::split_paths(&paths).map(|folder| folder.join(program)).find(|path| path.is_file());
+        std::os::unix::fs::symlink(real.unwrap(), folder.path().join(program)).unwrap();
+    }
+    if let Some(script) = bubblewrap {
+        let failing = Webots::script(script);
+        std::fs::copy(failing.path(), folder.path().join("bwrap")).unwrap();
+    }
+    folder
+}
+
+fn with(builder: Builder, programs: &tempfile::TempDir, isolation: &str) -> Builder {
+    builder.env("PATH", programs.path().to_str().unwrap()).set("isolation", isolation)
+}
+
+#[actix_rt::test]
+async fn a_sandbox_that_is_demanded_and_can_not_be_had_refuses_the_start_in_one_line() {
+    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
+    let table = [
+        (None, "the package bubblewrap has it; \"none\" runs worlds without it"),
+        (
+            Some("echo 'bwrap: setting up uid map: Permission denied' >&2; exit 1"),
+            "uid map: Permission denied): user namespaces",
+        ),
+        (Some("exec sleep 1000"), "it does not end"),
+    ];
+    for (bubblewrap, words) in table {
+        let programs = programs(bubblewrap);
+        let mut server = with(simulation_server(&webots.path(), forge.path(), 1), &programs, "sandbox").spawn();
+        assert_eq!(server.ended().await, Some(1));
+        let log = server.log();
+        let told: Vec<&str> = log.lines().filter(|line| line.starts_with("error: ")).collect();
+        assert_eq!(told.len(), 1, "{log}");
+        assert!(
+            told[0].starts_with("error: isolation is \"sandbox\", but bubblewrap") && told[0].contains(words),
+            "{log}"
+        );
+    }
+}
+
+#[actix_rt::test]
+async fn where_no_sandbox_can_be_had_auto_falls_back_with_a_warning_on_log_and_monitor_page() {
+    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
+    let programs = programs(Some("echo 'bwrap: No permissions' >&2; exit 1"));
+    let server = with(simulation_server(&webots.path(), forge.path(), 1), &programs, "auto").start().await;
+    let words = "bubblewrap makes no sandbox here (bwrap: No permissions)";
+    let log = server.log();
+    assert!(
+        log.lines().any(|line| line.contains("WARN") && line.contains("(isolation: none)") && line.contains(words)),
+        "{log}"
+    );
+    let page = http::get(&server.url("/monitor")).await.text();
+    assert!(page.contains(words) && page.contains("may do whatever this server may"), "{page}");
+    assert_eq!(http::get(&server.url("/status")).await.json()["isolation"], "none");
+    Client::start(&server, &arm()).await.until("webots:").await;
+}
+
+#[actix_rt::test]
+async fn a_sandbox_is_what_a_machine_has_by_itself() {
+    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
+    let server = simulation_server(&webots.path(), forge.path(), 1).start().await;
+    assert_eq!(http::get(&server.url("/status")).await.json()["isolation"], "sandbox");
+    let page = http::get(&server.url("/monitor")).await.text();
+    assert!(page.contains("<dt>Isolation</dt><dd>sandbox</dd>"), "{page}");
+    assert!(!server.log().contains("WARN"), "{}", server.log());
+}
+
+#[actix_rt::test]
+async fn containers_are_refused_in_one_line() {
+    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
+    for (key, value, words) in [
+        ("isolation", json!("container"), "isolation: \"container\" is not supported yet"),
+        ("docker", json!(true), "docker: true is not supported"),
+        ("isolation", json!("jail"), "isolation: unknown variant `jail`"),
+    ] {
+        let mut server = simulation_server(&webots.path(), forge.path(), 1).set(key, value).spawn();
+        assert_eq!(server.ended().await, Some(2));
+        let log = server.log();
+        assert!(log.lines().count() == 1 && log.contains(words), "{log}");
+    }
+}
+
+#[actix_rt::test]
+async fn a_webots_that_does_not_become_ready_tells_its_level_and_the_keys() {
+    let (forge, webots) = (Forge::with_arm(), Webots::script("echo 'no module named arm'; exit 1"));
+    for (isolation, is_told) in [("sandbox", true), ("none", false)] {
+        let server = simulation_server(&webots.path(), forge.path(), 1).set("isolation", isolation).start().await;
+        let told = Client::start(&server, &arm()).await.until("loading: Error:").await;
+        assert!(told.contains("no module named arm"), "{told}");
+        assert_eq!(told.contains("It ran in a sandbox") && told.contains("sandbox.readable"), is_told, "{told}");
+    }
+}

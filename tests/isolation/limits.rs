@@ -1,0 +1,187 @@
+//! What a simulation may take at each level, and what comes of it when it takes more.
+
+use std::time::{Duration, Instant};
+
+use crate::simulation::scene::{DEMO, arm, nothing_left};
+use crate::support::client::Client;
+use crate::support::git::Forge;
+use crate::support::program::{Server, simulation_server};
+use crate::support::webots::Webots;
+use crate::support::{http, until};
+
+const LEVELS: [&str; 2] = ["none", "sandbox"];
+
+/// What the client of a simulation is told that does this once it is ready, and is ended for it.
+async fn told_for(deed: &str, level: &str, key: &str, value: u64) -> String {
+    let forge = Forge::with_arm();
+    let webots = Webots::script(&format!("{DEMO} \"$@\" &\nsleep 0.5\n{deed}\nwait"));
+    let builder = simulation_server(&webots.path(), forge.path(), 4).set("isolation", level);
+    let server = builder.set(&format!("limits.{key}"), value).start().await;
+    let mut client = Client::start(&server, &arm()).await;
+    client.until("webots:").await;
+    let told = client.until("loading: Error:").await;
+    assert_eq!(client.closed().await, Some(1000));
+    nothing_left(&server, 4).await;
+    told
+}
+
+#[actix_rt::test]
+async fn who_fills_the_disk_is_told_and_ended() {
+    let words = "The simulation has written more than 5 MiB, the limit of this server (limits.disk)";
+    for level in LEVELS {
+        let many = "for n in $(seq 1000); do head -c 500000 /dev/zero > file$n; sleep 0.01; done";
+        assert!(told_for(many, level, "disk", 5).await.contains(words), "{level}");
+        let small = "for n in $(seq 3000); do echo > small$n; done";
+        assert!(told_for(small, level, "disk", 5).await.contains(words), "{level}");
+    }
+    for folder in ["/tmp", "$HOME", "$XDG_RUNTIME_DIR"] {
+        let many = format!("for n in $(seq 100); do head -c 500000 /dev/zero > {folder}/file$n; done");
+        assert!(told_for(&many, "sandbox", "disk", 5).await.contains(words), "{folder}");
+    }
+    let deep = "for n in $(seq 3000); do mkdir deep; cd deep; done";
+    assert!(told_for(deep, "sandbox", "disk", 100).await.contains("folders that nobody can look into"));
+}
+
+#[actix_rt::test]
+async fn a_file_can_not_be_larger_than_the_quota() {
+    let forge = Forge::with_arm();
+    let webots = Webots::script("head -c 20000000 /dev/zero > large; wc -c < large; exit 1");
+    for level in LEVELS {
+        let builder = simulation_server(&webots.path(), forge.path(), 1).set("isolation", level);
+        let server = builder.set("limits.disk", 5).start().await;
+        let told = Client::start(&server, &arm()).await.until("loading: Error:").await;
+        assert!(told.contains("5242880"), "{told}");
+    }
+}
+
+#[actix_rt::test]
+async fn who_forks_without_end_is_told_and_ended() {
+    // The kernel keeps an ordinary user's sandbox from it, which goes on.
+    let levels: &[&str] = if nix::unistd::getuid().is_root() { &LEVELS } else { &["none"] };
+    for level in levels {
+        let told = told_for("for n in $(seq 200); do sleep 1000 & done", level, "processes", 100).await;
+        assert!(told.contains("has more than 100 processes and threads"), "{level}: {told}");
+    }
+}
+
+#[actix_rt::test]
+async fn files_that_are_open_are_bounded() {
+    let forge = Forge::with_arm();
+    let webots = Webots::script("echo \"files $(ulimit -Sn) $(ulimit -Hn) core $(ulimit -c)\"; exit 1");
+    for level in LEVELS {
+        let table = [
+            (1500, 5000, "files 1024 1500 core 0"),
+            (1500, 1200, "files 1024 1200 core 0"),
+            (70, 1200, "files 70 70 core 0"),
+        ];
+        for (limit, of_the_server, words) in table {
+            let builder = simulation_server(&webots.path(), forge.path(), 1).set("isolation", level);
+            let server = builder.set("limits.openFiles", limit).files(of_the_server).start().await;
+            let told = Client::start(&server, &arm()).await.until("loading: Error:").await;
+            assert!(told.contains(words), "{told}");
+        }
+    }
+}
+
+#[actix_rt::test]
+async fn who_takes_the_ports_of_others_is_told_and_ended() {
+    let deed = "for one; do case $one in --port=*) port=${one#--port=};; esac; done\n\
+                python3 -c \"import socket, time; s = [socket.create_server(('127.0.0.1', p)) for p in range($port + 1, \
+                $port + 4)]; time.sleep(1000)\" &";
+    for level in LEVELS {
+        let told = told_for(deed, level, "processes", 4096).await;
+        assert!(
+            told.contains("The simulation listens on the ports ") && told.contains("only one is its own"),
+            "{told}"
+        );
+    }
+}
+
+/// The time of processors that a server has taken, in seconds.
+fn taken(server: &Server) -> f64 {
+    let stat = procfs::process::Process::new(server.pid()).unwrap().stat().unwrap();
+    (stat.utime + stat.stime) as f64 / procfs::ticks_per_second() as f64
+}
+
+#[actix_rt::test]
+async fn a_flood_of_output_costs_no_more_than_a_tenth_of_a_core() {
+    for (flood, level) in [
+        ("yes", "none"),
+        ("yes", "sandbox"),
+        ("yes .", "none"),
+        ("tr '\\0' x < /dev/zero", "none"),
+        ("while :; do echo pause; echo fast; done", "none"),
+    ] {
+        let forge = Forge::with_arm();
+        let webots = Webots::script(&format!("{DEMO} \"$@\" >/dev/null &\n{flood} & wait"));
+        let server = simulation_server(&webots.path(), forge.path(), 1).set("isolation", level).start().await;
+        let mut client = Client::start(&server, &arm()).await;
+        client.until("webots:").await;
+        let (begin, before) = (Instant::now(), taken(&server));
+        until("it has gone on for a while", async || begin.elapsed() > Duration::from_secs(3)).await;
+        let share = (taken(&server) - before) / begin.elapsed().as_secs_f64();
+        assert!(share < 0.1, "{flood}, {level}: {share}");
+        assert!(http::get(&server.url("/load")).await.text().parse::<f64>().is_ok());
+        client.leave().await;
+        nothing_left(&server, 1).await;
+    }
+}
+
+/// A control group that this process may divide as if systemd had delegated it; none where there is no cgroup v2.
+struct Delegated(std::path::PathBuf);
+
+impl Delegated {
+    fn new() -> Option<Self> {
+        let mounts = procfs::process::Process::myself().unwrap().mountinfo().unwrap();
+        let mount = mounts.into_iter().find(|mount| mount.fs_type == "cgroup2" && mount.root == "/")?;
+        let folder = mount.mount_point.join(format!("fleet-test-{}", rand::random::<u64>()));
+        std::fs::create_dir(&folder).ok().map(|()| Self(folder))
+    }
+
+    fn groups(&self) -> Vec<String> {
+        let inside = std::fs::read_dir(&self.0).unwrap().flatten().filter(|entry| entry.path().is_dir());
+        inside.map(|entry| entry.file_name().into_string().unwrap()).collect()
+    }
+}
+
+impl Drop for Delegated {
+    fn drop(&mut self) {
+        std::fs::write(self.0.join("cgroup.kill"), "1").ok();
+        let deadline = Instant::now() + Duration::from_secs(5);
+        while self.0.exists() && Instant::now() < deadline {
+            for group in self.groups() {
+                std::fs::remove_dir(self.0.join(group)).ok();
+            }
+            std::fs::remove_dir(&self.0).ok();
+        }
+    }
+}
+
+#[actix_rt::test]
+async fn a_simulation_has_a_control_group_of_its_own_where_they_are_delegated() {
+    let Some(delegated) = Delegated::new() else {
+        return eprintln!("skipped: there is no cgroup v2 in which this user may make groups");
+    };
+    for level in LEVELS {
+        let forge = Forge::with_arm();
+        let hidden = format!("1000.{}", rand::random::<u64>());
+        let webots = Webots::script(&format!("(env -i setsid sleep {hidden} &)\n{DEMO} \"$@\" & wait"));
+        let builder = simulation_server(&webots.path(), forge.path(), 1).set("isolation", level);
+        let join = format!("echo $$ > {}/cgroup.procs", delegated.0.display());
+        let server = builder.before(&join).set("timing.grace", 0.5).start().await;
+        let mut client = Client::start(&server, &arm()).await;
+        client.until("webots:").await;
+        let mut groups = delegated.groups();
+        groups.sort();
+        assert_eq!(groups.len(), 2, "{groups:?}");
+        assert!(groups[0] == "server" && groups[1].starts_with("simulation-"), "{groups:?}");
+        let members = std::fs::read_to_string(delegated.0.join(&groups[1]).join("cgroup.procs")).unwrap();
+        assert!(members.lines().count() >= 3, "{members}");
+        client.leave().await;
+        nothing_left(&server, 1).await;
+        until("its group is gone", async || delegated.groups() == ["server"]).await;
+        let all = procfs::process::all_processes().unwrap().flatten();
+        let hiding = all.filter(|one| one.cmdline().is_ok_and(|words| words.contains(&hidden)));
+        assert_eq!(hiding.count(), 0, "{level}: what hides ends too");
+    }
+}

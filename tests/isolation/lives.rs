@@ -1,0 +1,82 @@
+//! What ends with a simulation at each level, and how.
+
+use nix::sys::signal::{Signal, kill};
+use nix::unistd::Pid;
+
+use crate::simulation::scene::{DEMO, arm, nothing_left};
+use crate::support::client::Client;
+use crate::support::git::Forge;
+use crate::support::program::simulation_server;
+use crate::support::until;
+use crate::support::webots::Webots;
+
+/// The processes that have this word in their command line.
+fn named(word: &str) -> Vec<i32> {
+    let all = procfs::process::all_processes().unwrap().flatten();
+    let has = |one: &procfs::process::Process| one.cmdline().is_ok_and(|words| words.iter().any(|one| one == word));
+    all.filter(has).map(|one| one.pid()).collect()
+}
+
+/// A number of seconds that no other process sleeps.
+fn long() -> String {
+    format!("1000.{}", rand::random::<u64>())
+}
+
+#[actix_rt::test]
+async fn what_hides_on_purpose_ends_with_its_sandbox() {
+    for (level, reason) in [("sandbox", "client"), ("sandbox", "kill"), ("none", "client")] {
+        let (forge, hidden) = (Forge::with_arm(), long());
+        let webots = Webots::script(&format!("(env -i setsid sleep {hidden} &)\n{DEMO} \"$@\" & wait"));
+        let builder = simulation_server(&webots.path(), forge.path(), 1).set("isolation", level);
+        let mut server = builder.set("timing.grace", 0.5).start().await;
+        let mut client = Client::start(&server, &arm()).await;
+        client.until("webots:").await;
+        until("it hides", async || named(&hidden).len() == 1).await;
+        if reason == "client" {
+            client.leave().await;
+            nothing_left(&server, 1).await;
+        } else {
+            server.signal(Signal::SIGKILL);
+            server.ended().await;
+        }
+        if level == "sandbox" {
+            until("it has ended", async || named(&hidden).is_empty()).await;
+        } else {
+            // This is what the level does not promise.
+            assert_eq!(named(&hidden).len(), 1);
+            kill(Pid::from_raw(named(&hidden)[0]), Signal::SIGKILL).unwrap();
+        }
+    }
+}
+
+#[actix_rt::test]
+async fn a_simulation_has_its_grace_time_at_each_level() {
+    for level in ["none", "sandbox"] {
+        let (forge, folder) = (Forge::with_arm(), tempfile::tempdir_in(env!("CARGO_TARGET_TMPDIR")).unwrap());
+        let written = folder.path().join("written");
+        // As Webots' launcher does: it hands SIGTERM on, and waits.
+        let work = format!("sleep 0.3; echo saved > {}", written.display());
+        let webots = Webots::script(&format!("trap '{work}; exit 0' TERM\n{DEMO} \"$@\" & wait"));
+        let builder = simulation_server(&webots.path(), forge.path(), 1).set("isolation", level);
+        let server = builder.set("sandbox.writable", folder.path().to_str().unwrap()).start().await;
+        let mut client = Client::start(&server, &arm()).await;
+        client.until("webots:").await;
+        client.leave().await;
+        nothing_left(&server, 1).await;
+        assert_eq!(std::fs::read_to_string(&written).unwrap_or_default(), "saved\n", "{level}");
+    }
+}
+
+#[actix_rt::test]
+async fn a_simulation_that_takes_no_notice_is_killed_after_its_grace_time() {
+    for level in ["none", "sandbox"] {
+        let forge = Forge::with_arm();
+        let webots = Webots::script(&format!("trap '' TERM\n{DEMO} \"$@\" &\nwhile true; do wait; sleep 0.1; done"));
+        let builder = simulation_server(&webots.path(), forge.path(), 1).set("isolation", level);
+        let server = builder.set("timing.grace", 0.5).start().await;
+        let mut client = Client::start(&server, &arm()).await;
+        client.until("webots:").await;
+        client.leave().await;
+        nothing_left(&server, 1).await;
+    }
+}

@@ -1,0 +1,6 @@
+//! What a world's program may do at each level of isolation.
+
+mod deeds;
+mod level;
+mod limits;
+mod lives;
