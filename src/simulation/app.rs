@@ -10,7 +10,6 @@ use actix_web::{App, web};
 use tokio::sync::mpsc::Receiver;
 use tokio::sync::watch;
 
-
 use super::announcer::Announcer;
 use super::config::SimulationConfig;
 use super::places::{GetSnapshot, Places};
@@ -188,7 +187,7 @@ fn assemble(
         let Leftovers { runs, processes } = leftovers;
         log::warn!("removed what {runs} earlier runs had left, {processes} processes among it");
     }
-    let launcher = Launcher::start(&config)?;
+    let launcher = Launcher::start(&config).map_err(|error| AppError::Unavailable(error.to_string()))?;
     let (time, size) = (config.timing.checkout, config.project_size << 20);
     let limits = Limits { time, size, any_commit: config.any_commit };
     let (budget, mirrors) = (config.cache_size << 20, config.git_mirrors.clone());

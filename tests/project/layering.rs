@@ -20,7 +20,7 @@ const SESSION: [&str; 8] = [
     "session::web",
     "session::app",
 ];
-const SIMULATION: [&str; 17] = [
+const SIMULATION: [&str; 16] = [
     "simulation::snapshot",
     "simulation::places",
     "simulation::protocol",
@@ -29,7 +29,6 @@ const SIMULATION: [&str; 17] = [
     "simulation::checkout",
     "simulation::config",
     "simulation::isolation",
-    "simulation::app_error",
     "simulation::preflight",
     "simulation::announcer",
     "simulation::webots",

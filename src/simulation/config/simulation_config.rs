@@ -11,8 +11,8 @@ use super::resources::Resources;
 use super::timing::Timing;
 use crate::shared::config::{Configuration, InvalidValue};
 use crate::shared::config::{
-    ExpandedPath, expanded, folder, local_address, object, one_or_many, optional_expanded, optional_whole, percent, seconds,
-    whole,
+    ExpandedPath, expanded, folder, local_address, object, one_or_many, optional_expanded, optional_whole, percent,
+    seconds, whole,
 };
 use crate::shared::domain::UrlPrefix;
 use crate::shared::domain::{ClientUrls, PublicAddress, PublicUrl, check_host};

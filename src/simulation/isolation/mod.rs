@@ -8,6 +8,6 @@ mod sandbox;
 mod watch;
 
 pub use cgroup::Cgroup;
-pub use launcher::{IsolationError, Launcher, Level};
+pub use launcher::{Launcher, Level};
 pub use program::Program;
 pub use watch::Watch;

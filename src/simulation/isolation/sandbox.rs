@@ -13,7 +13,7 @@ use std::time::{Duration, Instant};
 use which::which;
 
 use super::program::Program;
-use crate::shared::run::one_line;
+use crate::shared::text::one_line;
 use crate::simulation::config::SimulationConfig;
 
 /// What every sandbox of this server has in common.
