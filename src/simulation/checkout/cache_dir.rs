@@ -16,7 +16,7 @@ pub struct CacheDir {
 }
 
 /// How long a server that was killed may still hold the lock: a child that it was just starting has it until it runs.
-const LAST_BREATH: Duration = Duration::from_secs(1);
+const LOCK_WAIT: Duration = Duration::from_secs(1);
 /// Time between two attempts to lock.
 const PAUSE: Duration = Duration::from_millis(20);
 
@@ -29,7 +29,7 @@ impl CacheDir {
         std::fs::create_dir_all(folder)?;
         let folder = folder.canonicalize()?;
         let lock = open(&folder.join("lock"))?;
-        let deadline = Instant::now() + LAST_BREATH;
+        let deadline = Instant::now() + LOCK_WAIT;
         loop {
             match lock.try_lock() {
                 Ok(()) => return Ok(Self { folder, _lock: lock }),

@@ -16,7 +16,7 @@ use super::mirrors::{Mirrors, Remote};
 use super::redirect;
 use super::refused::{Refused, Scope};
 use super::repository::Repository;
-use super::revision::{self, Revision, Voucher};
+use super::revision::{self, Revision, TrustSource};
 use super::search::Search;
 use super::single_flight::SingleFlight;
 use super::steps;
@@ -223,7 +223,7 @@ impl Finder {
     ) -> Result<Option<Vec<u8>>, CheckoutError> {
         let mut answer = self.answer(search, revision, arguments.clone()).await?;
         if matches!(answer, Answer::Absent) {
-            if revision.voucher == Voucher::Url && !search.is_accepted(revision).await? {
+            if revision.trust == TrustSource::Url && !search.is_accepted(revision).await? {
                 let (repository, commit) = (search.world.repository(), revision.name.clone());
                 return Err(CheckoutError::NotReachable { repository, commit });
             }
@@ -275,7 +275,7 @@ impl Finder {
     async fn fetch(&self, search: Search<'_>, revision: &Revision) -> Result<(), CheckoutError> {
         let Search { world, repository, progress, .. } = search;
         let tell = |said: String| progress(steps::fetching(&world.repository(), &said));
-        let fetched = repository.fetch(&revision.wish(&repository.remote().location), &tell).await;
+        let fetched = repository.fetch(&revision.request(&repository.remote().location), &tell).await;
         let what = || format!("{} (at depth 1)", world.repository());
         let fetched = fetched.map_err(|error| fetch_failed(world, what, self.limits.size, error));
         self.refused.note(Scope::commit(repository.remote(), revision), fetched)

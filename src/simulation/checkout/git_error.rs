@@ -43,7 +43,7 @@ pub enum Cause {
 /// git ends with the same exit codes whatever the cause is, so its words must tell (`LC_ALL=C`). This is the only place
 /// that reads them. The first that is found counts. git asks for a user's name where a forge says 'not found': forges
 /// don't tell private from missing.
-const WORDS: &[(&str, Cause)] = &[
+const MESSAGES: &[(&str, Cause)] = &[
     ("returned error: 301", Cause::Moved),
     ("returned error: 302", Cause::Moved),
     ("returned error: 303", Cause::Moved),
@@ -86,7 +86,7 @@ impl GitError {
             Self::TooLong(_) => return Cause::TooMuch,
             _ => return Cause::Other,
         };
-        WORDS.iter().find(|(words, _)| message.contains(words)).map_or(Cause::Other, |(_, cause)| *cause)
+        MESSAGES.iter().find(|(words, _)| message.contains(words)).map_or(Cause::Other, |(_, cause)| *cause)
     }
 }
 

@@ -94,15 +94,15 @@ impl Refused {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::simulation::checkout::revision::Voucher;
+    use crate::simulation::checkout::revision::TrustSource;
 
     #[test]
     fn a_refusal_holds_for_all_that_is_in_it_and_for_nothing_else() {
         let remote = Remote { location: "https://github.com/lab/arm".to_owned(), protocol: "https" };
         let of = |commit: &str, folder: &str| {
-            let (name, voucher) = (String::new(), Voucher::Tip);
+            let (name, trust) = (String::new(), TrustSource::Tip);
             let revision =
-                Revision { commit: commit.to_owned(), name, folder: folder.to_owned(), voucher, is_whole: false };
+                Revision { commit: commit.to_owned(), name, folder: folder.to_owned(), trust, is_whole: false };
             Scope::folder(&remote, &revision, folder)
         };
         let refused = Refused::default();

@@ -16,7 +16,7 @@ use super::git_error::GitError;
 use super::growth::Growth;
 use super::limits::Limits;
 use super::mirrors::Remote;
-use super::revision::{self, Wish};
+use super::revision::{self, FetchRequest};
 use super::single_flight::SingleFlight;
 
 /// A cached repository. It is not removed from the cache as long as this lives.
@@ -28,12 +28,12 @@ pub struct Repository {
     limits: Limits,
     growth: Arc<Growth>,
     /// Held by whoever changes the repository.
-    turn: Arc<tokio::sync::Mutex<()>>,
+    lock: Arc<tokio::sync::Mutex<()>>,
     /// Held by whoever asks the remote what it has.
     asking: Semaphore,
     /// Held by whoever reads what lies in a commit.
     listing: tokio::sync::Mutex<()>,
-    /// The fetches that are wanted, by the name of the wish.
+    /// The fetches that are wanted, by the name of the request.
     fetches: SingleFlight<String, Result<(), FetchError>>,
     /// When it was made, if this server has made it since it came into use.
     made: Mutex<Option<Instant>>,
@@ -78,9 +78,9 @@ impl Repository {
     /// The repository at `path`, which need not exist yet, for commits of `remote`.
     #[must_use]
     pub fn new(path: PathBuf, remote: Remote, git: Arc<Git>, limits: Limits, growth: Arc<Growth>) -> Self {
-        let (turn, fetches, made) = (Arc::default(), SingleFlight::default(), Mutex::default());
+        let (lock, fetches, made) = (Arc::default(), SingleFlight::default(), Mutex::default());
         let (asking, listing) = (Semaphore::new(QUESTIONS), tokio::sync::Mutex::default());
-        Self { path, remote, git, limits, growth, turn, asking, listing, fetches, made }
+        Self { path, remote, git, limits, growth, lock, asking, listing, fetches, made }
     }
 
     /// Where it is fetched from.
@@ -114,39 +114,39 @@ impl Repository {
         self.git.run(call, |_| ()).await
     }
 
-    /// Fetches what is wished for, together with everybody who wishes for the same. It ends with the last of them.
+    /// Fetches what is wished for, together with everybody who requests for the same. It ends with the last of them.
     /// `progress` is told git's progress.
     ///
     /// # Errors
     /// Why it can't be fetched.
     pub async fn fetch(
         self: &Arc<Self>,
-        wish: &Wish,
+        request: &FetchRequest,
         progress: &(impl Fn(String) + Send + Sync),
     ) -> Result<(), FetchError> {
-        let (this, wanted) = (Arc::clone(self), wish.clone());
+        let (this, wanted) = (Arc::clone(self), request.clone());
         let fetch = |told| async move {
             // It is a task of its own: git must have ended, however it ends, before the next one may begin.
             let cancelled = CancellationToken::new();
             let _cancels = cancelled.clone().drop_guard();
-            let task = tokio::spawn(async move { this.fetch_in_turn(&wanted, &told, &cancelled).await });
+            let task = tokio::spawn(async move { this.fetch_locked(&wanted, &told, &cancelled).await });
             task.await.unwrap_or_else(|error| Err(FetchError::Machine(error.to_string())))
         };
-        self.fetches.join(wish.name.clone(), progress, fetch).await
+        self.fetches.join(request.name.clone(), progress, fetch).await
     }
 
-    async fn fetch_in_turn(
+    async fn fetch_locked(
         self: &Arc<Self>,
-        wish: &Wish,
+        request: &FetchRequest,
         told: &watch::Sender<String>,
         cancelled: &CancellationToken,
     ) -> Result<(), FetchError> {
         let _grown = Grown(&self.growth);
         loop {
-            let Some(turn) = cancelled.run_until_cancelled(self.turn(told)).await else {
+            let Some(guard) = cancelled.run_until_cancelled(self.lock(told)).await else {
                 return Err(FetchError::Machine("nobody waits for it".to_owned()));
             };
-            self.make(wish).await?;
+            self.make(request).await?;
             let mut cut = None;
             let lines = AtomicUsize::new(0);
             let tell = |line: &str| {
@@ -161,14 +161,14 @@ impl Repository {
                     cut = self.watch(&lines) => cut,
                 });
             };
-            let call = Call { settings: wish.settings.clone(), ..self.call(wish.arguments.clone()) };
+            let call = Call { settings: request.settings.clone(), ..self.call(request.arguments.clone()) };
             let ended = self.git.run_until(end, call, tell).await;
             match cut {
                 Some(Cut::TooLarge) => return Err(FetchError::TooLarge),
                 Some(Cut::Silent) if ended.is_err() => self.tell_silence(),
                 _ => {
                     ended?;
-                    self.collect_garbage(turn);
+                    self.collect_garbage(guard);
                     return Ok(());
                 }
             }
@@ -189,17 +189,17 @@ impl Repository {
     }
 
     /// Waits until nobody else changes the repository.
-    async fn turn(&self, told: &watch::Sender<String>) -> OwnedMutexGuard<()> {
-        let turn = Arc::clone(&self.turn);
-        if let Ok(turn) = Arc::clone(&turn).try_lock_owned() {
-            return turn;
+    async fn lock(&self, told: &watch::Sender<String>) -> OwnedMutexGuard<()> {
+        let lock = Arc::clone(&self.lock);
+        if let Ok(guard) = Arc::clone(&lock).try_lock_owned() {
+            return guard;
         }
         told.send_replace("waiting for another fetch".to_owned());
-        turn.lock_owned().await
+        lock.lock_owned().await
     }
 
     /// Makes the bare repository unless it is there. Else removes what a git that was killed has left.
-    async fn make(&self, wish: &Wish) -> Result<(), FetchError> {
+    async fn make(&self, request: &FetchRequest) -> Result<(), FetchError> {
         let (path, new) = (self.path.clone(), self.path.with_extension("new"));
         let is_there = blocking(move || {
             let is_there = path.join("HEAD").is_file();
@@ -211,7 +211,7 @@ impl Repository {
         }
         // It takes its place when it is whole.
         let new = self.path.with_extension("new");
-        let call = Call { repository: &new, ..self.call(revision::init_arguments(wish.is_sha256)) };
+        let call = Call { repository: &new, ..self.call(revision::init_arguments(request.is_sha256)) };
         self.git.run(call, |_| ()).await?;
         tokio::fs::rename(&new, &self.path).await?;
         *self.made.lock().unwrap_or_else(PoisonError::into_inner) = Some(Instant::now());
@@ -244,10 +244,10 @@ impl Repository {
     }
 
     /// Has git pack what many fetches have left. Nobody waits for that but the next fetch, and that not for long.
-    fn collect_garbage(self: &Arc<Self>, turn: OwnedMutexGuard<()>) {
+    fn collect_garbage(self: &Arc<Self>, guard: OwnedMutexGuard<()>) {
         let this = Arc::clone(self);
         tokio::spawn(async move {
-            let _turn = turn;
+            let _guard = guard;
             let call = this.call(["gc", "--auto", "--quiet"].map(OsString::from).to_vec());
             if let Err(error) = this.git.run_until(actix_rt::time::sleep(this.limits.patience()), call, |_| ()).await {
                 log::warn!("{} can't be packed: {error}", this.path.display());
@@ -260,7 +260,7 @@ impl Repository {
     /// # Errors
     /// When it can't be removed.
     pub async fn discard(&self, since: Instant) -> io::Result<()> {
-        let _turn = self.turn.lock().await;
+        let _guard = self.lock.lock().await;
         if self.made.lock().unwrap_or_else(PoisonError::into_inner).is_some_and(|made| made > since) {
             return Ok(());
         }

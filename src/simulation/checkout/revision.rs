@@ -13,16 +13,16 @@ pub struct Revision {
     pub name: String,
     /// The project's folder; empty for the root.
     pub folder: String,
-    /// Who vouches for the commit.
-    pub voucher: Voucher,
+    /// Why the commit is trusted to be the repository's own.
+    pub trust: TrustSource,
     /// Whether more than that folder is needed: a link on the way to the world may lead anywhere in the repository.
     pub is_whole: bool,
 }
 
-/// Who vouches for a commit. Forges hand out by their hash also commits of forks and of proposals, which the
-/// repository's owner never accepted: allowing a repository must not allow those.
+/// Why a commit is trusted to be the repository's own. Forges hand out by their hash also commits of forks and of
+/// proposals, which the repository's owner never accepted: allowing a repository must not allow those.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Voucher {
+pub enum TrustSource {
     /// The remote, which has it as the newest of a branch or tag.
     Tip,
     /// The URL alone: it must be looked for in the branches and tags before it is fetched.
@@ -31,10 +31,10 @@ pub enum Voucher {
     AnyCommit,
 }
 
-/// Something to fetch.
+/// What to ask git to fetch.
 #[derive(Debug, Clone)]
-pub struct Wish {
-    /// Equal wishes have equal names.
+pub struct FetchRequest {
+    /// Equal requests have equal names.
     pub name: String,
     /// Settings that git needs for it, each as `name=value`.
     pub settings: Vec<String>,
@@ -49,16 +49,16 @@ pub const ALL: &str = ".";
 /// How many readings of a URL are looked for: no real branch has more slashes in its name.
 const MOST_READINGS: usize = 12;
 
-/// The commit that a URL names by its full hash: then nobody need be asked what it is. `is_any` tells whether any will
+/// The commit that a URL names by its full hash: then nobody need be asked what it is. `allow_any` tells whether any will
 /// do, or only one that is in a branch or tag.
 #[must_use]
-pub fn commit_of(world: &ProjectUrl, is_any: bool) -> Option<Revision> {
+pub fn commit_of(world: &ProjectUrl, allow_any: bool) -> Option<Revision> {
     let Reading { reference, folder } = world.candidates().into_iter().next()?;
     let is_hash = [40, 64].contains(&reference.len()) && reference.bytes().all(|byte| byte.is_ascii_hexdigit());
     let kind = matches!(world.kind(), RefKind::Any | RefKind::Commit);
     let commit = reference.to_ascii_lowercase();
-    let voucher = if is_any { Voucher::AnyCommit } else { Voucher::Url };
-    (is_hash && kind).then_some(Revision { commit, name: reference, folder, voucher, is_whole: false })
+    let trust = if allow_any { TrustSource::AnyCommit } else { TrustSource::Url };
+    (is_hash && kind).then_some(Revision { commit, name: reference, folder, trust, is_whole: false })
 }
 
 /// The beginning of a hash that a URL may name a commit by.
@@ -81,7 +81,7 @@ pub fn expand_arguments(short: &str) -> Vec<OsString> {
 pub fn expanded(world: &ProjectUrl, commit: String) -> Option<Revision> {
     let Reading { reference, folder } = world.candidates().into_iter().next()?;
     let is_it = commit.starts_with(&reference.to_ascii_lowercase());
-    is_it.then_some(Revision { commit, name: reference, folder, voucher: Voucher::Url, is_whole: false })
+    is_it.then_some(Revision { commit, name: reference, folder, trust: TrustSource::Url, is_whole: false })
 }
 
 /// Makes a bare repository. git before 2.29 knows only the older kind of hashes, and no name for it.
@@ -115,12 +115,12 @@ pub fn is_of_other_length(answer: &str, commit: &str) -> bool {
 /// Fetches all branches and tags: only their commits where the remote can do that, else everything. git keeps note of
 /// that only for remotes that have a name.
 #[must_use]
-pub fn history(location: &str, commit: &str) -> Wish {
+pub fn history(location: &str, commit: &str) -> FetchRequest {
     let settings = vec![format!("remote.origin.url={location}")];
     let options = ["fetch", "--filter=tree:0", "--prune", "--no-tags", "--no-write-fetch-head", "--progress", "--"];
     let all = ["origin", "+refs/heads/*:refs/heads/*", "+refs/tags/*:refs/tags/*"];
     let arguments = options.into_iter().chain(all).map(OsString::from).collect();
-    Wish { name: "history".to_owned(), settings, arguments, is_sha256: is_sha256(commit) }
+    FetchRequest { name: "history".to_owned(), settings, arguments, is_sha256: is_sha256(commit) }
 }
 
 fn is_sha256(hash: &str) -> bool {
@@ -173,7 +173,7 @@ pub fn found(world: &ProjectUrl, answer: &str) -> Vec<Revision> {
                 commit: (*commit).to_owned(),
                 name: reading.reference,
                 folder: reading.folder,
-                voucher: Voucher::Tip,
+                trust: TrustSource::Tip,
                 is_whole: false,
             })
         })
@@ -185,17 +185,17 @@ impl Revision {
     /// run once that is off.
     #[must_use]
     pub fn reference(&self) -> String {
-        let kind = if self.voucher == Voucher::AnyCommit { "any" } else { "fleet" };
+        let kind = if self.trust == TrustSource::AnyCommit { "any" } else { "fleet" };
         format!("refs/{kind}/{}", self.commit)
     }
 
     /// Fetches this commit alone.
     #[must_use]
-    pub fn wish(&self, location: &str) -> Wish {
+    pub fn request(&self, location: &str) -> FetchRequest {
         let refspec = format!("+{}:{}", self.commit, self.reference());
         let options = ["fetch", "--depth=1", "--no-tags", "--no-write-fetch-head", "--progress", "--"];
         let arguments = options.into_iter().chain([location, &refspec]).map(OsString::from).collect();
-        Wish { name: self.reference(), settings: Vec::new(), arguments, is_sha256: is_sha256(&self.commit) }
+        FetchRequest { name: self.reference(), settings: Vec::new(), arguments, is_sha256: is_sha256(&self.commit) }
     }
 
     /// The same with all of the repository.
@@ -279,7 +279,7 @@ mod tests {
     #[test]
     fn a_full_hash_is_a_commit() {
         let commit = commit_of(&world(&format!("tree/{A}/p/worlds/a.wbt")), false).unwrap();
-        assert_eq!((commit.commit.as_str(), commit.voucher), (A, Voucher::Url));
+        assert_eq!((commit.commit.as_str(), commit.trust), (A, TrustSource::Url));
         assert_eq!(commit.world_path(&world("blob/x/worlds/a.wbt")), "p/worlds/a.wbt");
         assert_eq!(commit_of(&world("blob/aaaaaaa/worlds/a.wbt"), false), None, "short hashes are not unique");
         assert_eq!(
