@@ -9,7 +9,7 @@ use std::sync::Arc;
 use rustls::pki_types::PrivateKeyDer;
 use rustls::{ServerConfig, ServerConnection, StreamOwned};
 
-use super::checkout::{outcome, reader, world_text};
+use super::checkout::{cached, outcome, reader, world_text};
 use crate::support::git::{Forge, git, world};
 use crate::support::program::{Builder, simulation_server};
 use crate::support::webots::Webots;
@@ -74,6 +74,9 @@ fn answer(socket: TcpStream, config: Arc<ServerConfig>, root: &Path, elsewhere: 
     let mut body = vec![0; header("content-length").parse().unwrap_or(0)];
     reader.read_exact(&mut body).ok()?;
     let (path, query) = target.split_once('?').unwrap_or((&target, ""));
+    // Forges ignore case.
+    let lowercase = path.to_lowercase();
+    let path = lowercase.as_str();
     let is_known = header("authorization") == "Basic dTpw";
     let (head, content) = if path.starts_with("/lab/private") && !is_known {
         ("Status: 401 Unauthorized\r\nWWW-Authenticate: Basic realm=\"x\"".to_owned(), Vec::new())
@@ -125,6 +128,7 @@ async fn a_forge_is_asked_over_https_and_followed_nowhere_else() {
         (world("lab/arm", "main", "worlds/a.wbt"), "opened [new]"),
         (world("lab/arm", &old, "worlds/a.wbt"), "opened [old]"),
         (world("lab/arm", "main", "worlds/a.wbt"), "opened [new]"),
+        ("https://www.GitHub.com/LAB/Arm.git/blob/main/worlds/a.wbt".to_owned(), "opened [new]"),
         (world("lab/none", "main", "worlds/a.wbt"), missing),
         // Nobody is asked for a password.
         (world("lab/private", "main", "worlds/a.wbt"), missing),
@@ -149,6 +153,8 @@ async fn a_forge_is_asked_over_https_and_followed_nowhere_else() {
         assert!(told.contains(words), "{url}: {told}");
     }
     assert!(plain.accept().is_err(), "a redirect was followed");
+    let cached: Vec<_> = cached(&server).into_iter().filter(|folder| folder.join("HEAD").is_file()).collect();
+    assert_eq!(cached.len(), 2, "the repository and its history, in whatever spelling: {cached:?}");
     // A forge whose certificate nobody trusts is none.
     let server = https.server(&webots).start().await;
     let told = outcome(&server, &world("lab/arm", "main", "worlds/a.wbt")).await;
