@@ -19,6 +19,8 @@ tests/install.sh cc=gcc,libc6-dev git=git git-lfs=git-lfs flock=util-linux opens
     Xvfb=xvfb bwrap=bubblewrap apache2=apache2-bin nginx=nginx setpriv=util-linux chromium=chromium \
     debootstrap=debootstrap dpkg-shlibdeps=dpkg-dev desktop-file-validate=desktop-file-utils xhost=x11-xserver-utils \
     systemd-analyze=systemd ip=iproute2 promtool=prometheus dnsmasq=dnsmasq-base kubectl=kubernetes-client
+# dockerd would begin to run on a machine that has not asked for it.
+[[ -z ${CI-} ]] || tests/install.sh dockerd=docker.io iptables=iptables
 tests/python.sh >/dev/null
 
 start=$SECONDS
@@ -70,7 +72,7 @@ else
     # Where it has failed, the scripts that need it say why.
     wait "${scripts[tests/deploy/prepare.sh]}" || true
     unset 'scripts[tests/deploy/prepare.sh]'
-    all=(tests/browser/run tests/deploy/package.sh tests/deploy/guide.sh tests/faults/run)
+    all=(tests/browser/run tests/deploy/package.sh tests/deploy/guide.sh tests/faults/run tests/swarm.sh)
     echo "runs side by side, and tells when each has ended: ${all[*]}"
     for script in "${all[@]}"; do start "$script"; done
     for script in "${all[@]}"; do finish "$script"; done

@@ -9,3 +9,4 @@ mod notify;
 mod ports;
 mod preflight;
 mod prometheus;
+mod swarm;

@@ -49,7 +49,7 @@ fn every_guarantee_names_tests_that_exist() {
         let shown_by = row.trim_end_matches(" |").rsplit(" | ").next().unwrap();
         let names: Vec<&str> = shown_by.split('`').skip(1).step_by(2).collect();
         assert!(!names.is_empty(), "nothing shows: {row}");
-        for name in names.iter().filter(|name| !name.starts_with("cargo bench ")) {
+        for name in names.iter().filter(|name| !name.starts_with("cargo bench ") && !root().join(name).is_file()) {
             assert!(tests.contains(&format!("fn {name}(")), "there is no test {name}");
         }
         promises += 1;
