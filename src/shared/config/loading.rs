@@ -10,7 +10,7 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 
 use super::error::ConfigError;
-use super::value::read_file;
+use super::secret::read_file;
 use crate::shared::text::one_line;
 
 /// A server's configuration.

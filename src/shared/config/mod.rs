@@ -2,11 +2,13 @@
 
 mod error;
 mod loading;
+mod secret;
 mod value;
 
 pub use error::ConfigError;
 pub use loading::{Configuration, InvalidValue, LoadedConfig, changed_keys, load};
+pub use secret::Secret;
 pub use value::{
-    ExpandedPath, Secret, expanded, folder, local_address, object, one_or_many, optional_expanded, optional_object,
+    ExpandedPath, expanded, folder, local_address, object, one_or_many, optional_expanded, optional_object,
     optional_whole, percent, seconds, threshold, whole,
 };

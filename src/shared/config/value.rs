@@ -2,26 +2,14 @@
 
 use std::borrow::Cow;
 use std::fmt;
-use std::io;
 use std::marker::PhantomData;
 use std::net::IpAddr;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::time::Duration;
 
 use serde::de::value::MapAccessDeserializer;
 use serde::de::{DeserializeOwned, Error as _, MapAccess, Unexpected, Visitor};
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
-
-/// Reads a regular file. A FIFO would block until somebody writes to it, and a device may never end.
-///
-/// # Errors
-/// When it can't be read, or is something else.
-pub fn read_file(file: &Path) -> io::Result<String> {
-    if !std::fs::metadata(file)?.is_file() {
-        return Err(io::Error::other("it is not a regular file"));
-    }
-    std::fs::read_to_string(file)
-}
 
 /// A path in which `~` and `$VARIABLE` have been replaced.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
@@ -94,51 +82,6 @@ where
     struct Text(#[serde(deserialize_with = "expanded")] String);
     let text = Option::<Text>::deserialize(deserializer)?;
     text.map(|Text(text)| T::try_from(text).map_err(D::Error::custom)).transpose()
-}
-
-/// A text that is never printed or logged: `********` stands for it. It is written as it is, or is in a file.
-#[derive(Clone, Deserialize)]
-#[serde(try_from = "WireSecret")]
-pub struct Secret(String);
-
-#[derive(Deserialize)]
-#[serde(untagged, deny_unknown_fields, expecting = "it is neither a text nor {\"file\": PATH}")]
-enum WireSecret {
-    Text(String),
-    File { file: ExpandedPath },
-}
-
-impl TryFrom<WireSecret> for Secret {
-    type Error = String;
-
-    fn try_from(wire: WireSecret) -> Result<Self, String> {
-        let ExpandedPath(file) = match wire {
-            WireSecret::Text(text) => return Ok(Self(text)),
-            WireSecret::File { file } => file,
-        };
-        let text = read_file(&file).map_err(|error| format!("{}: can't be read: {error}", file.display()))?;
-        Ok(Self(text.trim_end_matches(['\r', '\n']).to_owned()))
-    }
-}
-
-impl Secret {
-    /// Returns the text.
-    #[must_use]
-    pub fn reveal(&self) -> &str {
-        &self.0
-    }
-}
-
-impl fmt::Debug for Secret {
-    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
-        out.write_str("********")
-    }
-}
-
-impl Serialize for Secret {
-    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        serializer.serialize_str("********")
-    }
 }
 
 /// Reads a whole number from `MIN` to `MAX`.

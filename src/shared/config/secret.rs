@@ -1,0 +1,65 @@
+//! Secrets of a configuration, and the files they may be in.
+
+use std::fmt;
+use std::io;
+use std::path::Path;
+
+use serde::{Deserialize, Serialize, Serializer};
+
+use super::value::ExpandedPath;
+
+/// Reads a regular file. A FIFO would block until somebody writes to it, and a device may never end.
+///
+/// # Errors
+/// When it can't be read, or is something else.
+pub fn read_file(file: &Path) -> io::Result<String> {
+    if !std::fs::metadata(file)?.is_file() {
+        return Err(io::Error::other("it is not a regular file"));
+    }
+    std::fs::read_to_string(file)
+}
+
+/// A text that is never printed or logged: `********` stands for it. It is written as it is, or is in a file.
+#[derive(Clone, Deserialize)]
+#[serde(try_from = "WireSecret")]
+pub struct Secret(String);
+
+#[derive(Deserialize)]
+#[serde(untagged, deny_unknown_fields, expecting = "it is neither a text nor {\"file\": PATH}")]
+enum WireSecret {
+    Text(String),
+    File { file: ExpandedPath },
+}
+
+impl TryFrom<WireSecret> for Secret {
+    type Error = String;
+
+    fn try_from(wire: WireSecret) -> Result<Self, String> {
+        let ExpandedPath(file) = match wire {
+            WireSecret::Text(text) => return Ok(Self(text)),
+            WireSecret::File { file } => file,
+        };
+        let text = read_file(&file).map_err(|error| format!("{}: can't be read: {error}", file.display()))?;
+        Ok(Self(text.trim_end_matches(['\r', '\n']).to_owned()))
+    }
+}
+
+impl Secret {
+    /// Returns the text.
+    #[must_use]
+    pub fn reveal(&self) -> &str {
+        &self.0
+    }
+}
+
+impl fmt::Debug for Secret {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        out.write_str("********")
+    }
+}
+
+impl Serialize for Secret {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.serialize_str("********")
+    }
+}
