@@ -188,9 +188,15 @@ async fn names_come_and_go_with_the_configuration() {
         });
         session.signal(Signal::SIGHUP);
     };
+    let any_host = async || {
+        let viewer = http::get(&session.url("/viewer")).await;
+        viewer.header("content-security-policy").unwrap().contains(" http: ws:")
+    };
+    assert!(!any_host().await);
     let name = json!([format!("dns+fleet.test:{port}")]);
     reload(name.clone(), json!([]));
     until_states(&session, &["up"; 2]).await;
+    assert!(any_host().await, "a page that is open can't reach servers that come");
     reload(name, json!([format!("127.0.0.3:{port}")]));
     until_states(&session, &["up", "draining"]).await;
     reload(json!([]), json!([]));

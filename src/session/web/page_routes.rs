@@ -11,7 +11,7 @@ use crate::session::fleet::GetStatus;
 use crate::session::state::AppState;
 use crate::shared::http::assets::{self, Asset};
 use crate::shared::http::paths::{GET, READ, path};
-use crate::shared::http::{Kind, Policy, fleet_sources, html};
+use crate::shared::http::{Kind, Policy, any_host, fleet_sources, html};
 
 /// Assets of this server's pages, besides those of all pages.
 const ASSETS: &[Asset] = &[
@@ -86,6 +86,8 @@ async fn webots_viewer(server: web::Data<AppState>) -> HttpResponse {
 fn fleet(server: &AppState, status: &FleetStatus) -> Vec<String> {
     match &server.client_urls.public {
         Some(public) => vec![public.http_door(), public.websocket_door()],
+        // Names may lead to others by the time that the page starts a simulation.
+        None if !status.names.is_empty() => any_host(server.client_urls.ssl),
         None => fleet_sources(status.servers.iter().map(|one| &one.address), server.client_urls.ssl),
     }
 }

@@ -119,7 +119,6 @@ impl Policy {
 /// and no IPv6 addresses (CSP Level 3, section 2.3.1).
 #[must_use]
 pub fn fleet_sources<'address>(addresses: impl Iterator<Item = &'address PublicAddress>, ssl: bool) -> Vec<String> {
-    let (http, websocket) = if ssl { ("https", "wss") } else { ("http", "ws") };
     let mut hosts: Vec<String> = addresses
         .map(|address| format!("{}{}", address.host(), if address.is_rewritten() { "" } else { ":*" }))
         .collect();
@@ -127,9 +126,21 @@ pub fn fleet_sources<'address>(addresses: impl Iterator<Item = &'address PublicA
     hosts.dedup();
     let can_be_named = |host: &String| host.chars().all(|one| one.is_ascii_alphanumeric() || ".:*-".contains(one));
     if hosts.len() > MOST_HOSTS || !hosts.iter().all(can_be_named) {
-        return vec![format!("{http}:"), format!("{websocket}:")];
+        return any_host(ssl);
     }
+    let (http, websocket) = schemes(ssl);
     hosts.iter().flat_map(|host| [format!("{http}://{host}"), format!("{websocket}://{host}")]).collect()
+}
+
+/// The sources from which a fleet is reached whose hosts are not known yet: any host.
+#[must_use]
+pub fn any_host(ssl: bool) -> Vec<String> {
+    let (http, websocket) = schemes(ssl);
+    vec![format!("{http}:"), format!("{websocket}:")]
+}
+
+fn schemes(ssl: bool) -> (&'static str, &'static str) {
+    if ssl { ("https", "wss") } else { ("http", "ws") }
 }
 
 /// The CSS class of a bar that shows so many percent.
