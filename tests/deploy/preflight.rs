@@ -76,6 +76,8 @@ fn what_is_missing_is_warned_about() {
         told.contains("warning: isolation: the server does not start: isolation is \"sandbox\", but bubblewrap"),
         "{told}"
     );
+    let (_, told) = check(&json!({"sandbox": {"readable": "/nowhere/at/all"}}), path(empty.path()));
+    assert!(told.contains("sandbox: /nowhere/at/all is not there\n"), "{told}");
     let (_, told) = check(&json!({"isolation": "none"}), path(empty.path()));
     assert!(told.contains("\nisolation: none\n"), "{told}");
     let (_, told) = check(&json!({"display": ":59000"}), path(empty.path()));
