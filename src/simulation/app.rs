@@ -129,25 +129,11 @@ pub async fn serve(assembly: Assembly) -> Result<(), AppError> {
     let places = server.places.clone();
     let watched = places.clone();
     actix_rt::spawn(notify::feed_watchdog(async move || watched.send(GetSnapshot).await.is_ok()));
-    let mut no_places = std::pin::pin!(permanent::stopped("Places", places.clone()));
-    let mut no_readings = std::pin::pin!(permanent::stopped("LoadMonitor", server.load_monitor.clone()));
-    // `webots-fleet-renew` tells by this text whether a server was drained or stopped.
-    let why = loop {
-        let request = tokio::select! {
-            request = signals.next() => request,
-            Some(request) = asked.recv() => request,
-            () = drained(&server) => break "drained: its last simulation has ended",
-            fault = &mut no_places => return Err(AppError::ActorStopped(fault)),
-            fault = &mut no_readings => return Err(AppError::ActorStopped(fault)),
-        };
-        match request {
-            Request::Stop => break "stopping",
-            Request::Drain => {
-                log::info!("draining: no new clients, the server ends when the last has gone");
-                phase_sender.send_replace(Phase::Draining);
-                notify::status("draining: it ends when the last simulation has ended");
-            }
-            Request::Reload => log::info!("SIGHUP changes nothing here: the configuration is read at start"),
+    let why = tokio::select! {
+        why = obey(&mut signals, &mut asked, &server, &phase_sender) => why,
+        fault = permanent::stopped("Places", places.clone()) => return Err(AppError::ActorStopped(fault)),
+        fault = permanent::stopped("LoadMonitor", server.load_monitor.clone()) => {
+            return Err(AppError::ActorStopped(fault));
         }
     };
     log::info!("stopping");
@@ -161,6 +147,32 @@ pub async fn serve(assembly: Assembly) -> Result<(), AppError> {
     server.run.remove();
     log::info!("stopped");
     Ok(())
+}
+
+/// Does what signals and administrators ask for, until the server is to end. Returns why: `webots-fleet-renew` tells by
+/// this text whether a server was drained or stopped.
+async fn obey(
+    signals: &mut Signals,
+    asked: &mut Receiver<Request>,
+    server: &AppState,
+    phase: &watch::Sender<Phase>,
+) -> &'static str {
+    loop {
+        let request = tokio::select! {
+            request = signals.next() => request,
+            Some(request) = asked.recv() => request,
+            () = drained(server) => return "drained: its last simulation has ended",
+        };
+        match request {
+            Request::Stop => return "stopping",
+            Request::Drain => {
+                log::info!("draining: no new clients, the server ends when the last has gone");
+                phase.send_replace(Phase::Draining);
+                notify::status("draining: it ends when the last simulation has ended");
+            }
+            Request::Reload => log::info!("SIGHUP changes nothing here: the configuration is read at start"),
+        }
+    }
 }
 
 fn bind(config: &SimulationConfig) -> Result<TcpListener, AppError> {
@@ -188,19 +200,13 @@ fn assemble(
         log::warn!("removed what {runs} earlier runs had left, {processes} processes among it");
     }
     let launcher = Launcher::start(&config).map_err(|error| AppError::Unavailable(error.to_string()))?;
-    let (time, size) = (config.timing.checkout, config.project_size << 20);
-    let limits = Limits { time, size, any_commit: config.any_commit };
-    let (budget, mirrors) = (config.cache_size << 20, config.git_mirrors.clone());
-    let runtime = tokio::runtime::Handle::current();
-    let git = (mirrors, config.git_config.as_ref().map(|file| file.0.as_path()));
     let rules = Rules {
         allowed: config.allowed_repositories.clone(),
         blocked: config.blocked_repositories.clone(),
         docker: config.docker,
         share_idle_time: config.share_idle_time,
     };
-    let checkouts = Checkouts::open(cache_dir, run.path(), budget, git, rules.clone(), limits, runtime);
-    let checkouts = checkouts.map_err(cache_fault)?;
+    let checkouts = open_checkouts(&config, cache_dir, &run, &rules).map_err(cache_fault)?;
     let places = Places::new(config.streaming_ports(), config.waiting_line, config.max_places_per_address).start();
     let csv = config.monitor_log_enabled.then(|| config.log_dir.0.join("simulation/monitor.csv"));
     let (load_monitor, readings) = LoadMonitor::new(places.clone(), run.path(), csv);
@@ -234,6 +240,21 @@ fn assemble(
         started: Instant::now(),
         config,
     })
+}
+
+/// Opens the cache of repositories with the bounds that the configuration sets.
+fn open_checkouts(
+    config: &SimulationConfig,
+    cache_dir: CacheDir,
+    run: &RunDir,
+    rules: &Rules,
+) -> std::io::Result<Checkouts> {
+    let (time, size) = (config.timing.checkout, config.project_size << 20);
+    let limits = Limits { time, size, any_commit: config.any_commit };
+    let (budget, mirrors) = (config.cache_size << 20, config.git_mirrors.clone());
+    let git = (mirrors, config.git_config.as_ref().map(|file| file.0.as_path()));
+    let runtime = tokio::runtime::Handle::current();
+    Checkouts::open(cache_dir, run.path(), budget, git, rules.clone(), limits, runtime)
 }
 
 /// Waits until the server is draining and has no client any more.

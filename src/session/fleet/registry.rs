@@ -46,7 +46,7 @@ pub struct GetStatus;
 #[rtype(result = "bool")]
 pub struct IsAvailable;
 
-/// Replaces the configuration; see [`SessionConfig::after`] for what counts at once.
+/// Replaces the configuration; see [`SessionConfig::reload`] for what counts at once.
 #[derive(Message)]
 #[rtype(result = "()")]
 pub struct Reconfigure(pub Arc<SessionConfig>);

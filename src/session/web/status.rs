@@ -121,14 +121,14 @@ impl ServerPage {
 /// The gauges of `/metrics`.
 #[must_use]
 pub fn gauges<'text>(clients: usize, status: &FleetStatus) -> Vec<Gauge<'text>> {
-    let of_each = |value: &dyn Fn(&ServerStatus) -> Option<f64>| {
-        let servers = status.servers.iter();
-        servers.filter_map(|server| Some((vec![server.address.to_string()], value(server)?))).collect()
-    };
-    let of_each_name = |value: &dyn Fn(&NameStatus) -> f64| {
-        status.names.iter().map(|name| (vec![name.name.to_string()], value(name))).collect()
-    };
-    let labels: &[&str] = &["server"];
+    let mut gauges = fleet_gauges(clients, status);
+    gauges.extend(server_gauges(&status.servers));
+    gauges.extend(name_gauges(&status.names));
+    gauges
+}
+
+/// The gauges of the fleet as a whole.
+fn fleet_gauges<'text>(clients: usize, status: &FleetStatus) -> Vec<Gauge<'text>> {
     let count = |wanted: State| status.servers.iter().filter(move |server| server.state == wanted).count();
     let every = [State::Unknown, State::Up, State::Full, State::Draining, State::Down];
     vec![
@@ -149,6 +149,16 @@ pub fn gauges<'text>(clients: usize, status: &FleetStatus) -> Vec<Gauge<'text>> 
             labels: &["state"],
             values: every.iter().map(|one| (vec![one.word().to_owned()], number(count(*one)))).collect(),
         },
+    ]
+}
+
+/// The gauges of each simulation server.
+fn server_gauges<'text>(servers: &[ServerStatus]) -> Vec<Gauge<'text>> {
+    let of_each = |value: &dyn Fn(&ServerStatus) -> Option<f64>| {
+        servers.iter().filter_map(|server| Some((vec![server.address.to_string()], value(server)?))).collect()
+    };
+    let labels: &[&str] = &["server"];
+    vec![
         Gauge {
             name: "webots_session_server_up",
             help: "1 while a simulation server gives good answers",
@@ -181,17 +191,26 @@ pub fn gauges<'text>(clients: usize, status: &FleetStatus) -> Vec<Gauge<'text>> 
             labels,
             values: of_each(&|server| server.latency.map(|latency| latency.as_secs_f64())),
         },
+    ]
+}
+
+/// The gauges of each name that simulation servers are looked up by.
+fn name_gauges<'text>(names: &[NameStatus]) -> Vec<Gauge<'text>> {
+    let of_each = |value: &dyn Fn(&NameStatus) -> f64| {
+        names.iter().map(|name| (vec![name.name.to_string()], value(name))).collect()
+    };
+    vec![
         Gauge {
             name: "webots_session_lookup_up",
             help: "1 while a name of simulation servers can be looked up",
             labels: &["name"],
-            values: of_each_name(&|name| f64::from(u8::from(name.error.is_none()))),
+            values: of_each(&|name| f64::from(u8::from(name.error.is_none()))),
         },
         Gauge {
             name: "webots_session_lookup_servers",
             help: "Simulation servers that a name leads to",
             labels: &["name"],
-            values: of_each_name(&|name| number(name.servers)),
+            values: of_each(&|name| number(name.servers)),
         },
     ]
 }
