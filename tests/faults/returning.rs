@@ -41,5 +41,5 @@ async fn come(url: &str) -> Vec<Client> {
         client
     });
     // As many at a time as this one program can play.
-    coming.buffer_unordered(500).collect().await
+    coming.buffer_unordered(200).collect().await
 }

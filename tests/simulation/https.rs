@@ -22,7 +22,7 @@ struct Https {
 }
 
 impl Https {
-    /// Serves the forge's repositories. What is below `/private` wants a password, `/away` is said to be at `elsewhere`,
+    /// Serves the forge's repositories; `/lab/dotted` only with `.git` behind it. What is below `/private` wants a password, `/away` is said to be at `elsewhere`,
     /// and `/old-NAME` at NAME of the same owner or, where that has two dashes, at that of another.
     fn new(forge: Forge, elsewhere: String) -> Self {
         let listener = TcpListener::bind("127.0.0.1:0").unwrap();
@@ -82,6 +82,9 @@ fn answer(socket: TcpStream, config: Arc<ServerConfig>, root: &Path, elsewhere: 
         ("Status: 401 Unauthorized\r\nWWW-Authenticate: Basic realm=\"x\"".to_owned(), Vec::new())
     } else if path.starts_with("/lab/away") {
         (format!("Status: 302 Found\r\nLocation: {elsewhere}{target}"), Vec::new())
+    } else if let Some(rest) = target.strip_prefix("/lab/dotted/") {
+        // As GitLab does.
+        (format!("Status: 301 Moved Permanently\r\nLocation: /lab/dotted.git/{rest}"), Vec::new())
     } else if let Some(name) = target.strip_prefix("/lab/old-") {
         let there = name.split_once("--").map_or(format!("/lab/{name}"), |(owner, name)| format!("/{owner}/{name}"));
         (format!("Status: 301 Moved Permanently\r\nLocation: {there}"), Vec::new())
@@ -114,6 +117,7 @@ async fn a_forge_is_asked_over_https_and_followed_nowhere_else() {
     let (forge, webots) = (Forge::new(), reader());
     let old = forge.commit("lab/arm", "main", &[("worlds/a.wbt", &world_text("old"))]);
     forge.commit("lab/arm", "main", &[("worlds/a.wbt", &world_text("new"))]);
+    forge.commit("lab/dotted.git", "main", &[("worlds/a.wbt", &world_text("dotted"))]);
     for hidden in ["lab/secret", "other/arm"] {
         forge.commit(hidden, "main", &[("worlds/a.wbt", &world_text("hidden"))]);
     }
@@ -137,6 +141,7 @@ async fn a_forge_is_asked_over_https_and_followed_nowhere_else() {
         // A repository that has moved within its forge is found, also in several steps, and by its commits.
         (world("lab/old-arm", "main", "worlds/a.wbt"), "opened [new]"),
         (world("lab/old-old-old-arm", "main", "worlds/a.wbt"), "opened [new]"),
+        (world("lab/dotted", "main", "worlds/a.wbt"), "opened [dotted]"),
         (world("lab/old-arm", &old, "worlds/a.wbt"), "opened [old]"),
         (world("lab/old-none", "main", "worlds/a.wbt"), "https://github.com/lab/none does not exist"),
         // It is not where it would not be taken from by its own name, nor where nothing ends.
@@ -154,7 +159,7 @@ async fn a_forge_is_asked_over_https_and_followed_nowhere_else() {
     }
     assert!(plain.accept().is_err(), "a redirect was followed");
     let cached: Vec<_> = cached(&server).into_iter().filter(|folder| folder.join("HEAD").is_file()).collect();
-    assert_eq!(cached.len(), 2, "the repository and its history, in whatever spelling: {cached:?}");
+    assert_eq!(cached.len(), 3, "two repositories and the history of one, in whatever spelling: {cached:?}");
     // A forge whose certificate nobody trusts is none.
     let server = https.server(&webots).start().await;
     let told = outcome(&server, &world("lab/arm", "main", "worlds/a.wbt")).await;

@@ -26,7 +26,7 @@ use crate::shared::domain::Load;
 use crate::shared::domain::PublicAddress;
 use crate::shared::domain::ServerReport;
 use crate::shared::http::tls;
-use crate::shared::text::one_line;
+use crate::shared::text::excerpt;
 
 /// What a probe of a simulation server brought.
 #[derive(Message, Debug)]
@@ -290,9 +290,12 @@ fn plausible(load: Load) -> Result<Load, ProbeError> {
     if is_none { Err(ProbeError::BadAnswer(shortened(&format!("a load of {load} %")))) } else { Ok(load) }
 }
 
+/// The most letters that are kept of what a server says.
+const LONGEST_REASON: usize = 500;
+
 /// Cuts a text that may contain what somebody else wrote.
 fn shortened(text: &str) -> String {
-    one_line(text).chars().take(120).collect()
+    excerpt(text, LONGEST_REASON)
 }
 
 #[cfg(test)]

@@ -72,6 +72,9 @@ impl Cache {
             let mut in_use = self.in_use.lock().await;
             in_use.retain(|_, repository| repository.strong_count() > 0);
             let known = in_use.get(&path).and_then(Weak::upgrade);
+            if let Some(repository) = &known {
+                repository.set_remote(remote);
+            }
             known.unwrap_or_else(|| {
                 let (git, growth) = (Arc::clone(&self.git), Arc::clone(&self.growth));
                 let repository = Arc::new(Repository::new(path.clone(), remote.clone(), git, self.limits, growth));

@@ -240,10 +240,19 @@ impl Checkouts {
             tokio::fs::remove_file(path).await.map_err(|error| machine(world, &error))?;
         }
         let mut call = copy_call(&found.repository, &found.revision, instance, needed);
-        call.settings = lfs::settings(found.repository.remote());
-        self.git.run(call, |_| ()).await.map_err(|source| git_failed(world, source))?;
+        call.settings = lfs::settings(&found.repository.remote());
+        let (project, cached) = (instance.project(), call.repository.join("lfs"));
+        let mut is_too_large = false;
+        let end = async {
+            lfs::outgrown(&project, &cached, self.limits.size).await;
+            is_too_large = true;
+        };
+        let loaded = self.git.run_until(end, call, |_| ()).await;
         self.cache.grown();
-        Ok(())
+        if is_too_large {
+            return Err(too_large("What the project keeps in Git LFS".to_owned(), self.limits.size));
+        }
+        loaded.map(drop).map_err(|source| git_failed(world, source))
     }
 
     /// Restores a file below the project's `controllers` folder to the state of the checkout.

@@ -47,7 +47,7 @@ impl What<'_> {
             Self::Path(path) => *path,
             Self::Listed(_) => found.revision.needed(),
         };
-        Scope::folder(found.repository.remote(), &found.revision, folder)
+        Scope::folder(&found.repository.remote(), &found.revision, folder)
     }
 }
 

@@ -19,6 +19,7 @@ use super::repository::Repository;
 use super::revision::{self, Revision, TrustSource};
 use super::search::Search;
 use super::single_flight::SingleFlight;
+use super::spellings::Spellings;
 use super::steps;
 use super::world_file::NoWorld;
 use crate::shared::domain::{ProjectUrl, Rules};
@@ -35,6 +36,7 @@ pub struct Finder {
     answers: Semaphore,
     searches: SingleFlight<ProjectUrl, Result<Arc<Found>, CheckoutError>>,
     refused: Refused,
+    spellings: Spellings,
 }
 
 /// How many answers of git about commits are read at a time.
@@ -66,7 +68,7 @@ impl Finder {
     #[must_use]
     pub fn new(git: Arc<Git>, cache: Arc<Cache>, (mirrors, rules): (Mirrors, Rules), limits: Limits) -> Self {
         let (answers, searches, refused) = (Semaphore::new(ANSWERS), SingleFlight::default(), Refused::default());
-        Self { git, cache, mirrors, rules, limits, answers, searches, refused }
+        Self { git, cache, mirrors, rules, limits, answers, searches, refused, spellings: Spellings::default() }
     }
 
     /// Waits for a world's commit to be in the cache, together with everybody who waits for the same.
@@ -89,7 +91,9 @@ impl Finder {
     /// When that may not be followed.
     pub async fn moved(&self, world: &ProjectUrl) -> Result<ProjectUrl, CheckoutError> {
         let repository = self.repository(world).await?;
-        redirect::follow(&self.git, &repository, (&self.mirrors, &self.rules), world).await
+        let (moved, remote) = redirect::follow(&self.git, &repository, (&self.mirrors, &self.rules), world).await?;
+        self.spellings.insert(remote);
+        Ok(moved)
     }
 
     /// The first of the commits that a URL may mean in which its world is.
@@ -103,7 +107,6 @@ impl Finder {
             let Some(mut listing) = self.list(search, &revision).await? else {
                 continue;
             };
-            let path = revision.world_path(world);
             if listing.has_world {
                 self.check(&repository, &revision, &listing)?;
             }
@@ -124,7 +127,7 @@ impl Finder {
             if listing.has_world || listing.has_link {
                 return Ok(Found { repository, revision, above });
             }
-            missing = Some(NoWorld::Missing(format!("{path} in {}", revision.name)));
+            missing = Some(NoWorld::Missing(format!("{} in {}", revision.world_path(world), revision.name)));
         }
         Err(missing.map_or_else(|| no_reference(world), CheckoutError::World))
     }
@@ -145,7 +148,8 @@ impl Finder {
     }
 
     fn remote(&self, world: &ProjectUrl) -> Result<Remote, CheckoutError> {
-        self.mirrors.remote(world).ok_or_else(|| CheckoutError::Forge(world.host().to_owned()))
+        let remote = self.mirrors.remote(world).ok_or_else(|| CheckoutError::Forge(world.host().to_owned()))?;
+        Ok(self.spellings.of(remote))
     }
 
     /// The commits that a URL may mean, the likeliest first.
@@ -180,7 +184,7 @@ impl Finder {
 
     /// Whether what is listed of a revision may be checked out.
     fn check(&self, repository: &Repository, revision: &Revision, listing: &Listing) -> Result<(), CheckoutError> {
-        let scope = Scope::folder(repository.remote(), revision, revision.needed());
+        let scope = Scope::folder(&repository.remote(), revision, revision.needed());
         if listing.entries > self.limits.entries() {
             return self.refused.note(scope, Err(CheckoutError::TooMany(self.limits.entries())));
         }
@@ -245,7 +249,7 @@ impl Finder {
         revision: &Revision,
         arguments: Vec<OsString>,
     ) -> Result<Answer, CheckoutError> {
-        let scope = Scope::folder(repository.remote(), revision, revision.needed());
+        let scope = Scope::folder(&repository.remote(), revision, revision.needed());
         let answer = {
             // Each answer may be long: few are read at a time.
             let _listing = repository.may_list().await;
@@ -278,7 +282,7 @@ impl Finder {
         let fetched = repository.fetch(&revision.request(&repository.remote().location), &tell).await;
         let what = || format!("{} (at depth 1)", world.repository());
         let fetched = fetched.map_err(|error| fetch_failed(world, what, self.limits.size, error));
-        self.refused.note(Scope::commit(repository.remote(), revision), fetched)
+        self.refused.note(Scope::commit(&repository.remote(), revision), fetched)
     }
 
     /// Throws away what is cached of a world's repository, unless it was made after `since`.

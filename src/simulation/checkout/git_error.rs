@@ -51,7 +51,6 @@ const MESSAGES: &[(&str, Cause)] = &[
     ("returned error: 308", Cause::Moved),
     ("Out of memory, ", Cause::TooMuch),
     ("memory exhausted", Cause::TooMuch),
-    ("unable to create thread", Cause::TooMuch),
     ("could not read Username", Cause::NoRepository),
     ("not found", Cause::NoRepository),
     ("does not appear to be a git repository", Cause::NoRepository),

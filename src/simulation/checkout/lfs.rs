@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 
 use which::which;
 
+use super::disk;
 use super::mirrors::Remote;
 
 /// A file of a checkout that stands for a larger one.
@@ -71,6 +72,17 @@ pub fn settings(remote: &Remote) -> Vec<String> {
         "lfs.skipdownloaderrors=true".to_owned(),
         "lfs.locksverify=false".to_owned(),
     ]
+}
+
+/// Waits until large files take more than `size`, in bytes: a forge may send more than the pointers say. git-lfs keeps what
+/// it loads in the folder `cached`, into which others may load meanwhile, and copies it into the project.
+pub async fn outgrown(project: &Path, cached: &Path, size: u64) {
+    let counted = cached.to_owned();
+    let before = actix_rt::task::spawn_blocking(move || disk::size_of(&counted)).await.unwrap_or_default();
+    tokio::select! {
+        () = disk::outgrown(project, size) => {}
+        () = disk::outgrown(cached, before.saturating_add(size.saturating_mul(2))) => {}
+    }
 }
 
 /// What a client is told of pointers that are left.

@@ -22,6 +22,7 @@ mod repository;
 mod revision;
 mod search;
 mod single_flight;
+mod spellings;
 mod steps;
 mod world_file;
 

@@ -11,7 +11,7 @@ use url::Url;
 
 use super::error::CheckoutError;
 use super::git::{Call, Git};
-use super::mirrors::Mirrors;
+use super::mirrors::{Mirrors, Remote};
 use super::repository::Repository;
 use crate::shared::domain::{Load, ProjectUrl, Rules};
 
@@ -21,7 +21,7 @@ pub const MOST: usize = 5;
 /// What git asks a forge for first.
 const FIRST_QUESTION: &str = "/info/refs";
 
-/// The world in the repository to which its forge sends.
+/// The world in the repository to which its forge sends, and where that is.
 ///
 /// # Errors
 /// When that may not be followed.
@@ -30,14 +30,14 @@ pub async fn follow(
     repository: &Repository,
     (mirrors, rules): (&Mirrors, &Rules),
     world: &ProjectUrl,
-) -> Result<ProjectUrl, CheckoutError> {
+) -> Result<(ProjectUrl, Remote), CheckoutError> {
     let target = match location(git, repository).await {
         Some(location) => target(mirrors, rules, world, &location),
         None => Err("to where its forge does not say".to_owned()),
     };
-    let moved = target.map_err(|why| CheckoutError::Moved(world.repository(), why))?;
-    log::info!("{} has moved to {}", world.repository(), moved.repository());
-    Ok(moved)
+    let (moved, remote) = target.map_err(|why| CheckoutError::Moved(world.repository(), why))?;
+    log::info!("{} is at {}", world.repository(), remote.location);
+    Ok((moved, remote))
 }
 
 /// Where a forge sends to who asks for a repository, as it says it.
@@ -60,7 +60,12 @@ async fn location(git: &Git, repository: &Repository) -> Option<String> {
 }
 
 /// The world in the repository at this location, or why it may not be taken from there, in words for the client.
-fn target(mirrors: &Mirrors, rules: &Rules, world: &ProjectUrl, location: &str) -> Result<ProjectUrl, String> {
+fn target(
+    mirrors: &Mirrors,
+    rules: &Rules,
+    world: &ProjectUrl,
+    location: &str,
+) -> Result<(ProjectUrl, Remote), String> {
     let no_url = |_| format!("to {location:?}, which is no URL");
     let remote = mirrors.remote(world).map(|remote| remote.location).unwrap_or_default();
     let remote = Url::parse(&remote).map_err(no_url)?;
@@ -74,7 +79,7 @@ fn target(mirrors: &Mirrors, rules: &Rules, world: &ProjectUrl, location: &str) 
     let repository = target.as_str().strip_suffix(FIRST_QUESTION).ok_or_else(elsewhere)?;
     let moved = mirrors.moved(world, repository).ok_or_else(elsewhere)?;
     rules.admit(&moved, Load::ZERO).map_err(|refusal| format!("to {}. {refusal}", moved.repository()))?;
-    Ok(moved)
+    Ok((moved, Remote { location: repository.to_owned(), protocol: "https" }))
 }
 
 #[cfg(test)]
@@ -117,12 +122,17 @@ mod tests {
             (old, "https://me@github.com/lab/new/info/refs", Err("another host")),
             (old, "https://", Err("no URL")),
             (mirrored, "https://git.lab:8443/g/new/info/refs", Ok("https://git.lab/g/new/-/blob/main/worlds/a.wbt")),
+            (
+                mirrored,
+                "https://git.lab:8443/g/s/old.git/info/refs",
+                Ok("https://git.lab/g/s/old/-/blob/main/worlds/a.wbt"),
+            ),
             (mirrored, "https://git.lab:8443/one/info/refs", Err("takes no worlds")),
         ];
         for (world, location, expected) in table {
             let found = target(&mirrors, &rules, &ProjectUrl::parse(world).unwrap(), location);
             match (found, expected) {
-                (Ok(found), Ok(expected)) => assert_eq!(found.to_string(), expected, "{location}"),
+                (Ok((found, _)), Ok(expected)) => assert_eq!(found.to_string(), expected, "{location}"),
                 (Err(why), Err(words)) => assert!(why.contains(words), "{location}: {why}"),
                 (found, _) => panic!("{location}: {found:?}"),
             }

@@ -1,6 +1,7 @@
 //! What was refused for its size, for a while: it costs once, and not once for each client.
 
 use std::collections::HashMap;
+use std::collections::hash_map::Entry;
 use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
@@ -82,9 +83,12 @@ impl Refused {
         {
             let mut known = self.0.lock().unwrap_or_else(PoisonError::into_inner);
             known.retain(|_, (since, _)| since.elapsed() < REMEMBERED);
-            if known.len() < MOST {
+            // One that is known already is not made longer by being told again.
+            if known.len() < MOST
+                && let Entry::Vacant(vacant) = known.entry(scope)
+            {
                 log::info!("refused for {} s: {error}", REMEMBERED.as_secs());
-                known.insert(scope, (Instant::now(), error.clone()));
+                vacant.insert((Instant::now(), error.clone()));
             }
         }
         result
@@ -108,6 +112,10 @@ mod tests {
         let refused = Refused::default();
         let too_large = || Err::<(), _>(CheckoutError::TooMany(1));
         refused.note(of("a", "one"), too_large()).unwrap_err();
+        let since = || refused.0.lock().unwrap().get(&of("a", "one")).map(|(since, _)| *since);
+        let first = since();
+        refused.note(of("a", "one"), refused.check(&of("a", "one"))).unwrap_err();
+        assert_eq!(since(), first, "who is refused makes it last no longer");
         assert!(refused.check(&of("a", "one")).is_err());
         for other in [of("a", "two"), of("b", "one"), Scope::repository(&remote), Scope::history(&remote)] {
             refused.check(&other).unwrap();

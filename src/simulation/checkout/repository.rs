@@ -23,7 +23,8 @@ use super::single_flight::SingleFlight;
 #[derive(Debug)]
 pub struct Repository {
     path: PathBuf,
-    remote: Remote,
+    /// Where it is fetched from. Forges have several spellings of it.
+    remote: Mutex<Arc<Remote>>,
     git: Arc<Git>,
     limits: Limits,
     growth: Arc<Growth>,
@@ -80,13 +81,18 @@ impl Repository {
     pub fn new(path: PathBuf, remote: Remote, git: Arc<Git>, limits: Limits, growth: Arc<Growth>) -> Self {
         let (lock, fetches, made) = (Arc::default(), SingleFlight::default(), Mutex::default());
         let (asking, listing) = (Semaphore::new(QUESTIONS), tokio::sync::Mutex::default());
-        Self { path, remote, git, limits, growth, lock, asking, listing, fetches, made }
+        Self { path, remote: Mutex::new(Arc::new(remote)), git, limits, growth, lock, asking, listing, fetches, made }
     }
 
     /// Where it is fetched from.
     #[must_use]
-    pub fn remote(&self) -> &Remote {
-        &self.remote
+    pub fn remote(&self) -> Arc<Remote> {
+        Arc::clone(&self.remote.lock().unwrap_or_else(PoisonError::into_inner))
+    }
+
+    /// Goes on with another spelling of the remote, the newest that was asked for.
+    pub fn set_remote(&self, remote: &Remote) {
+        *self.remote.lock().unwrap_or_else(PoisonError::into_inner) = Arc::new(remote.clone());
     }
 
     /// A git command on this repository.
@@ -96,7 +102,7 @@ impl Repository {
             repository: &self.path,
             settings: Vec::new(),
             arguments,
-            protocol: self.remote.protocol,
+            protocol: self.remote().protocol,
             memory: MOST_MEMORY,
             environment: Vec::new(),
         }
@@ -240,7 +246,7 @@ impl Repository {
     /// Says that the remote is asked anew.
     pub fn tell_silence(&self) {
         let seconds = self.limits.patience().as_secs_f64();
-        log::warn!("{}: nothing has come for {seconds} s, git starts anew", self.remote.location);
+        log::warn!("{}: nothing has come for {seconds} s, git starts anew", self.remote().location);
     }
 
     /// Has git pack what many fetches have left. Nobody waits for that but the next fetch, and that not for long.

@@ -55,14 +55,14 @@ impl Search<'_> {
     }
 
     async fn history(self) -> Result<Arc<Repository>, CheckoutError> {
-        let history = self.cache.history(self.repository.remote()).await;
+        let history = self.cache.history(&self.repository.remote()).await;
         history.map_err(|error| machine(self.world, &error))
     }
 
     /// Fetches the commits of all branches and tags; `commit` tells which kind of hashes there are.
     async fn fetch_history(self, history: &Arc<Repository>, commit: &str) -> Result<(), CheckoutError> {
         let Search { world, progress, refused, .. } = self;
-        let scope = Scope::history(history.remote());
+        let scope = Scope::history(&history.remote());
         refused.check(&scope)?;
         let what = || format!("The history of {}", world.repository());
         let tell = |said: String| progress(steps::fetching(&format!("the history of {}", world.repository()), &said));
@@ -106,8 +106,9 @@ impl Search<'_> {
     /// All branches and tags of the remote.
     async fn tips(self) -> Result<String, CheckoutError> {
         let remote = self.repository.remote();
-        let scope = Scope::history(remote);
+        let scope = Scope::history(&remote);
         self.refused.check(&scope)?;
+        self.refused.check(&Scope::repository(&remote))?;
         self.refused.note(scope, self.answer(revision::tips_arguments(&remote.location)).await)
     }
 
@@ -118,14 +119,14 @@ impl Search<'_> {
     pub async fn ask(self) -> Result<String, CheckoutError> {
         let remote = self.repository.remote();
         let arguments = revision::search_arguments(self.world, &remote.location);
-        self.refused.note(Scope::repository(remote), self.answer(arguments).await)
+        self.refused.note(Scope::repository(&remote), self.answer(arguments).await)
     }
 
     async fn answer(self, arguments: Vec<OsString>) -> Result<String, CheckoutError> {
         loop {
             let turn = self.repository.may_ask().await;
             let _turn = turn.map_err(|error| machine(self.world, &std::io::Error::other(error)))?;
-            self.refused.check(&Scope::repository(self.repository.remote()))?;
+            self.refused.check(&Scope::repository(&self.repository.remote()))?;
             let call = Call { memory: ANSWER_MEMORY, ..self.repository.call(arguments.clone()) };
             let answer = self.git.run(call, |_| ());
             match actix_rt::time::timeout(self.limits.patience(), answer).await {

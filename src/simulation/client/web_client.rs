@@ -81,7 +81,11 @@ impl WebClient {
             Ok(Some(Request::Start { url, mode })) => self.start(&url, mode, ctx),
             Ok(Some(Request::ResetController(file))) => self.reset_controller(file, ctx),
             Ok(None) => log::debug!("{}: a message that asks for nothing is ignored", self.name()),
-            Err(wrong) => self.fail(&wrong.to_string(), ctx),
+            Err(wrong) => {
+                // Not by `fail`: floods of these must not crowd out, in the log, why simulations have failed.
+                log::info!("{}: {wrong}", self.name());
+                self.finish(&protocol::error(&wrong.to_string()), CloseCode::Normal, ctx);
+            }
         }
     }
 

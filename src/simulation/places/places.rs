@@ -96,12 +96,14 @@ const RECHECK: Duration = Duration::from_secs(1);
 
 impl Places {
     /// Lends these ports; `longest_line` clients may wait. One address may have `per_address` places, and the same part of
-    /// the line; where that is not said, a share of them.
+    /// the line; where that is not said, a share of each.
     #[must_use]
     pub fn new(ports: RangeInclusive<u16>, longest_line: usize, per_address: Option<usize>) -> Self {
         let all = ports.len();
         let places = per_address.unwrap_or_else(|| share(all)).min(all);
-        let per_address = (places, (longest_line * places).div_ceil(all.max(1)));
+        let waiting =
+            if per_address.is_some() { (longest_line * places).div_ceil(all.max(1)) } else { share(longest_line) };
+        let per_address = (places, waiting);
         Self { ports, longest_line, per_address, arrivals: 0, present: BTreeMap::new(), line: VecDeque::new() }
     }
 
