@@ -448,6 +448,22 @@ async fn files_in_git_lfs_are_looked_for_where_the_world_is_and_nowhere_outside(
 }
 
 #[actix_rt::test]
+async fn what_a_forge_sends_as_large_files_is_bounded_whatever_the_pointers_say() {
+    let (forge, webots) = (Forge::with_arm(), reader());
+    let attributes = "*.dae filter=lfs diff=lfs merge=lfs -text\n";
+    forge.commit("lab/arm", "main", &[("meshes/a.dae", POINTER), (".gitattributes", attributes)]);
+    // A git-lfs that loads more and more for 12345 bytes.
+    let wrapper = GitWrapper::new("");
+    let lfs = wrapper.path().split(':').next().map(|folder| Path::new(folder).join("git-lfs")).unwrap();
+    let script = "#!/bin/sh\nmkdir -p \"$GIT_DIR/lfs/tmp\"\nhead -c 5000000 /dev/zero >\"$GIT_DIR/lfs/tmp/a\"\nexec sleep 1000\n";
+    std::fs::write(&lfs, script).unwrap();
+    std::fs::set_permissions(&lfs, std::os::unix::fs::PermissionsExt::from_mode(0o755)).unwrap();
+    let server = simulation_server(&webots.path(), forge.path(), 1).set("projectSize", 1).env("PATH", &wrapper.path());
+    let told = outcome(&server.start().await, &arm()).await;
+    assert_eq!(told, "loading: Error: What the project keeps in Git LFS is larger than 1 MiB");
+}
+
+#[actix_rt::test]
 async fn files_in_git_lfs_are_loaded() {
     needs("git-lfs", "git-lfs");
     let forge = Forge::with_arm();

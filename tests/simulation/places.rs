@@ -89,6 +89,23 @@ async fn one_address_leaves_places_and_a_part_of_the_line_to_others() {
 }
 
 #[actix_rt::test]
+async fn one_address_leaves_a_part_of_the_line_where_one_place_is_all() {
+    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
+    let server = simulation_server(&webots.path(), forge.path(), 1).set("waitingLine", 4).start().await;
+    let (greedy, other) = ("203.0.113.9", "203.0.113.10");
+    let mut all = vec![Client::start_from(&server, greedy, &arm()).await];
+    all[0].until("webots:").await;
+    for ahead in 0..3 {
+        let mut client = Client::start_from(&server, greedy, &arm()).await;
+        assert_eq!(client.until("").await, format!("queue: {ahead}"));
+        all.push(client);
+    }
+    let told = Client::start_from(&server, greedy, &arm()).await.until("").await;
+    assert!(told.starts_with("loading: Error: Clients of your address have 1 places"), "{told}");
+    assert_eq!(Client::start_from(&server, other, &arm()).await.until("").await, "queue: 3");
+}
+
+#[actix_rt::test]
 async fn an_address_has_as_many_places_as_the_configuration_says() {
     let (forge, webots) = (Forge::with_arm(), Webots::launcher());
     let builder = simulation_server(&webots.path(), forge.path(), 4).set("waitingLine", 0);

@@ -141,6 +141,8 @@ impl Handler<Outgoing> for Client {
     fn handle(&mut self, message: Outgoing, ctx: &mut Self::Context) {
         match message {
             _ if self.updates.is_closed() => end(ctx, Some(CloseCode::Policy.into())),
+            // Nothing may follow a close frame (RFC 6455, section 5.5.1).
+            Outgoing::Text(..) if self.closing => {}
             Outgoing::Text(text, permit) => {
                 ctx.text(text);
                 drop(permit);
