@@ -22,21 +22,19 @@ pub enum Isolation {
 }
 
 impl Isolation {
-    /// Refuses the level that is not there yet. `docker` is the original's key for it.
+    /// The level that both keys ask for: `docker` is the original's key for containers.
     ///
     /// # Errors
-    /// When containers are asked for.
-    pub fn check(self, docker: bool) -> Result<(), InvalidValue> {
-        let (key, problem) = if docker {
-            let problem = "true is not supported; allowed is false. Worlds would run without the container that was asked \
-                           for";
-            ("docker", problem)
-        } else if self == Self::Container {
-            ("isolation", "\"container\" is not supported yet; allowed are \"auto\", \"sandbox\" and \"none\"")
-        } else {
-            return Ok(());
-        };
-        Err(InvalidValue { key, problem: problem.to_owned() })
+    /// When they contradict each other.
+    pub fn with_docker(self, docker: bool) -> Result<Self, InvalidValue> {
+        match self {
+            Self::Auto if docker => Ok(Self::Container),
+            Self::None | Self::Sandbox if docker => {
+                let problem = "true asks for containers, but isolation for another level; remove one of them";
+                Err(InvalidValue { key: "docker", problem: problem.to_owned() })
+            }
+            level => Ok(level),
+        }
     }
 }
 
