@@ -6,6 +6,7 @@ use std::process::ExitCode;
 use clap::Parser;
 use webots_fleet::shared::run::{LogTarget, start};
 use webots_fleet::simulation::config::SimulationConfig;
+use webots_fleet::simulation::container;
 use webots_fleet::simulation::process::guardian;
 use webots_fleet::simulation::{app, preflight};
 
@@ -34,7 +35,8 @@ enum Part {
 fn main() -> ExitCode {
     let arguments = Arguments::parse();
     if let Some(Part::Guard(arguments)) = &arguments.part {
-        return ExitCode::from(guardian::guard(arguments));
+        let remove = || arguments.containers.iter().for_each(|owner| container::sweep(&container::Owner::named(owner)));
+        return ExitCode::from(guardian::guard(arguments, remove));
     }
     let mut loaded = match start::read::<SimulationConfig>(&arguments.config) {
         Ok(loaded) => loaded,

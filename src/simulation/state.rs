@@ -19,6 +19,7 @@ use crate::shared::http::Live;
 use crate::shared::http::Metrics;
 use crate::shared::run::{Phase, Request};
 use crate::simulation::checkout::Checkouts;
+use crate::simulation::container::Containers;
 use crate::simulation::isolation::Launcher;
 use crate::simulation::machine::UsageMonitor;
 use crate::simulation::machine::{LoadMonitor, Readings};
@@ -38,6 +39,8 @@ pub struct AppState {
     pub readings: watch::Receiver<Arc<Readings>>,
     /// Launches simulations at a level of isolation.
     pub launcher: Arc<Launcher>,
+    /// Makes the containers in which simulations run, where they do.
+    pub containers: Option<Arc<Containers>>,
     /// Checks worlds out.
     pub checkouts: Arc<Checkouts>,
     /// The folder of this run, with the folders of simulations in it.

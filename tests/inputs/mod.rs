@@ -9,6 +9,7 @@ mod configuration;
 mod forwarded;
 mod mutations;
 mod report;
+mod webots_yml;
 mod world_url;
 
 use std::time::{Duration, Instant};

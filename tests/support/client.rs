@@ -115,6 +115,21 @@ impl Client {
         }
     }
 
+    /// The next text that begins with this, which may take so long.
+    pub async fn patiently(&mut self, beginning: &str, time: Duration) -> String {
+        let heard = async {
+            loop {
+                match self.read().await {
+                    Heard::Text(text) if text.starts_with(beginning) => return text,
+                    Heard::Text(_) => {}
+                    Heard::Closed(frame) => panic!("closed ({frame:?}) before {beginning:?}; heard {:#?}", self.heard),
+                }
+            }
+        };
+        let heard = actix_rt::time::timeout(time, heard).await;
+        heard.unwrap_or_else(|_| panic!("{beginning:?} did not come"))
+    }
+
     /// The close code that ends the connection; `None` where it just broke.
     pub async fn closed(&mut self) -> Option<u16> {
         loop {

@@ -4,7 +4,7 @@
 //! project's folder. Both run on the server's main thread as tasks: whoever drops the handle no longer waits.
 
 use std::io;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::sync::Arc;
 use std::time::Instant;
 
@@ -23,10 +23,11 @@ use super::git::Git;
 use super::lfs::{self, Pointer};
 use super::limits::Limits;
 use super::mirrors::Mirrors;
+use super::project::Project;
 use super::redirect;
 use super::revision::{ALL, Revision};
 use super::steps;
-use super::world_file::{NoWorld, WorldFile};
+use super::world_file::NoWorld;
 use crate::shared::domain::{ProjectUrl, Rules};
 use crate::simulation::process::InstanceDir;
 
@@ -46,24 +47,6 @@ pub struct Checkouts {
 #[derive(Message)]
 #[rtype(result = "()")]
 pub struct Progress(pub String);
-
-/// A project that was checked out for one client.
-#[derive(Debug)]
-pub struct Project {
-    /// The world to open.
-    pub world: WorldFile,
-    /// What the client should know.
-    pub warnings: Vec<String>,
-    /// Where it came from.
-    url: ProjectUrl,
-    revision: Revision,
-    /// The project's folder.
-    folder: PathBuf,
-    /// Where the project is that Webots sees, in its repository: elsewhere if the world is behind a link.
-    place: String,
-    /// Removed with the project.
-    pub instance: InstanceDir,
-}
 
 impl Checkouts {
     /// Prepares checkouts on the thread whose runtime this is. `run` is the folder of this run of the server; the
@@ -287,13 +270,5 @@ impl Checkouts {
         let call = copy_call(&repository, revision, instance, &What::Path(path));
         self.git.run(call, |_| ()).await.map_err(|source| git_failed(url, source))?;
         Ok(true)
-    }
-}
-
-impl Project {
-    /// The project's folder, with `worlds` and `controllers` inside.
-    #[must_use]
-    pub fn folder(&self) -> &Path {
-        &self.folder
     }
 }

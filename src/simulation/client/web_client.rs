@@ -148,6 +148,7 @@ impl WebClient {
         ctx.text(protocol::loading("webots is starting"));
         let spec = LaunchSpec {
             config: Arc::clone(&self.server.config),
+            containers: self.server.containers.clone(),
             launcher: Arc::clone(&self.server.launcher),
             program,
             checkouts: Arc::clone(&self.server.checkouts),
@@ -158,7 +159,6 @@ impl WebClient {
         };
         let webots = Webots::start_in_arbiter(&self.server.main_thread, |_| Webots::new(spec));
         self.state = State::Launched(WebotsHandle(webots));
-        ctx.text(protocol::shutdown_timeout(self.server.config.timeout));
     }
 
     fn reset_controller(&mut self, file: String, ctx: &mut Context) {
@@ -271,6 +271,9 @@ impl Handler<WebotsEvent> for WebClient {
 
     fn handle(&mut self, event: WebotsEvent, ctx: &mut Self::Context) {
         match event {
+            WebotsEvent::Progress(text) => ctx.text(protocol::loading(&text)),
+            WebotsEvent::Text(text) => ctx.text(protocol::of_project(&text)),
+            WebotsEvent::Started => ctx.text(protocol::shutdown_timeout(self.server.config.timeout)),
             WebotsEvent::Listening(port) => {
                 self.start.resolve(Outcome::Ready);
                 ctx.text(protocol::webots(&self.server.config.websocket_url(port)));

@@ -18,7 +18,10 @@ pub struct ContainerSettings {
     pub editor_image: String,
     /// Webots' launcher in the image. Default: `webots`.
     pub webots: String,
-    /// Whether Webots gets a virtual display inside (`xvfb-run` of its image), or that of the machine. Default: virtual.
+    /// Whether the variants of the templates are taken that help to find a fault in a project. Default: false.
+    pub debug: bool,
+    /// Which display Webots has: a virtual one inside (`xvfb-run` of its image), or that of the machine. Default:
+    /// virtual.
     pub display: ContainerDisplay,
     /// What of the network containers reach. Default: internet.
     pub network: ContainerNetwork,
@@ -93,6 +96,7 @@ impl Default for ContainerSettings {
             image: "cyberbotics/webots.cloud:{version}-ubuntu{ubuntu}".to_owned(),
             editor_image: "benjamindeleze/theia-test:test3".to_owned(),
             webots: "webots".to_owned(),
+            debug: false,
             display: ContainerDisplay::default(),
             network: ContainerNetwork::default(),
             gpu: true,

@@ -126,6 +126,8 @@ impl Images {
             news.send(steps::building(line)).ok();
         };
         let built = self.docker.follow(words, self.limit, told).await;
+        // Until here the folder that is copied from has to stay.
+        drop(build.project);
         built.map_err(|error| not_built(&step, &error))
     }
 

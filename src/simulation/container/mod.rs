@@ -1,16 +1,21 @@
-//! Simulations in containers of Docker, a compose project for each.
+//! Simulations in containers of Docker: what a project asks for, its image, and a compose project for each simulation.
 
+mod compose;
 mod containers;
+mod copy;
 mod docker;
 mod dockerfile;
 mod image;
+mod machine;
 mod objects;
 mod prepared;
 mod recipe;
-mod request;
-mod template;
+mod steps;
+mod templates;
+mod tidy;
+mod webots_yml;
 
-pub use containers::Containers;
+pub use containers::{Containers, Request, daemon_fault};
 pub use objects::{Owner, sweep};
 pub use prepared::Prepared;
-pub use request::Request;
+pub use webots_yml::{Kind, WebotsYml};

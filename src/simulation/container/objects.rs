@@ -7,7 +7,6 @@ use std::collections::HashSet;
 use std::ffi::OsString;
 use std::path::Path;
 use std::process::{Command, Stdio};
-use std::time::Duration;
 
 use sha2::{Digest, Sha256};
 
@@ -125,8 +124,6 @@ fn quietly(arguments: Vec<OsString>) -> String {
     command.output().map(|output| String::from_utf8_lossy(&output.stdout).into_owned()).unwrap_or_default()
 }
 
-/// How long it is waited between two tries to remove what could not be removed.
-pub const AGAIN: (Duration, Duration) = (Duration::from_secs(1), Duration::from_secs(30));
 
 #[cfg(test)]
 mod tests {

@@ -26,6 +26,8 @@ pub enum Level {
     None,
     /// bubblewrap.
     Sandbox,
+    /// Docker.
+    Container,
 }
 
 /// `isolation` asks for a level that this machine does not have.
@@ -43,6 +45,8 @@ enum Method {
     Plain,
     /// In a sandbox.
     Sandbox(Sandbox),
+    /// In a container, which is not started here.
+    Container,
 }
 
 /// Launches simulations at one level.
@@ -66,8 +70,8 @@ impl Launcher {
         let sandbox = || Sandbox::new(config).and_then(|sandbox| sandbox.try_out().map(|()| sandbox));
         let (method, shortcoming) = match config.isolation {
             Isolation::None => (Method::Plain, None),
-            // The configuration refuses containers before.
-            Isolation::Sandbox | Isolation::Container => (Method::Sandbox(sandbox().map_err(IsolationError)?), None),
+            Isolation::Container => (Method::Container, None),
+            Isolation::Sandbox => (Method::Sandbox(sandbox().map_err(IsolationError)?), None),
             Isolation::Auto => match sandbox() {
                 Ok(sandbox) => (Method::Sandbox(sandbox), None),
                 Err(why) => (Method::Plain, Some(why)),
@@ -104,6 +108,7 @@ impl Launcher {
         match self.method {
             Method::Plain => Level::None,
             Method::Sandbox(_) => Level::Sandbox,
+            Method::Container => Level::Container,
         }
     }
 
@@ -118,6 +123,10 @@ impl Launcher {
     pub fn remark(&self) -> &'static str {
         match self.level() {
             Level::None => "",
+            Level::Container => {
+                " It ran in a container, which has its image and its project only; the server's administrator can give it \
+                 more (container, limits)."
+            }
             Level::Sandbox => {
                 " It ran in a sandbox, which shows it the system and Webots only; the server's administrator can show it \
                  more (sandbox.readable, sandbox.writable), or run worlds without (isolation)."
@@ -190,6 +199,7 @@ impl fmt::Display for Level {
         out.write_str(match self {
             Self::None => "none",
             Self::Sandbox => "sandbox",
+            Self::Container => "container",
         })
     }
 }

@@ -10,4 +10,4 @@ mod watch;
 pub use cgroup::Cgroup;
 pub use launcher::{Launcher, Level};
 pub use program::Program;
-pub use watch::Watch;
+pub use watch::{Watch, folder_size};

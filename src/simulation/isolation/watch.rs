@@ -87,6 +87,15 @@ impl Watch {
     }
 }
 
+/// How many bytes of the disk a folder takes; nothing where nobody can tell, since folders in it are closed or too deep.
+#[must_use]
+pub fn folder_size(folder: &Path) -> Option<u64> {
+    match size_of(folder) {
+        Size::Bytes(bytes) => Some(bytes),
+        Size::Unknown => None,
+    }
+}
+
 /// What a folder takes of the disk. Links are not followed.
 fn size_of(folder: &Path) -> Size {
     let mut total = 0;

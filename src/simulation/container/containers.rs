@@ -1,0 +1,343 @@
+//! Makes the containers of simulations; one for the whole server.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use sha2::{Digest, Sha256};
+use tokio::sync::OnceCell;
+use tokio_util::task::AbortOnDropHandle;
+
+use super::compose::Parts;
+use super::copy::Copy;
+use super::docker::{Docker, DockerError, SHORT};
+use super::image::{Build, Images};
+use super::machine::Machine;
+use super::objects::{self, Owner};
+use super::prepared::{Lease, Prepared};
+use super::recipe::{self, PROJECT_PATH, Recipe};
+use super::steps;
+use super::templates::Templates;
+use super::tidy::{Live, keep_tidy};
+use super::webots_yml::Kind;
+use crate::simulation::checkout::Project;
+use crate::simulation::config::{ContainerDisplay, SimulationConfig};
+
+/// Makes the containers of simulations.
+#[derive(Debug)]
+pub struct Containers {
+    docker: Docker,
+    owner: Owner,
+    templates: Templates,
+    images: Arc<Images>,
+    live: Live,
+    machine: OnceCell<Machine>,
+    config: Arc<SimulationConfig>,
+    _keeper: AbortOnDropHandle<()>,
+}
+
+/// A simulation that is to run in containers.
+pub struct Request {
+    /// What was checked out.
+    pub project: Arc<Project>,
+    /// The port of Webots.
+    pub port: u16,
+    /// Webots and its arguments, given where its world is in the container.
+    pub command: Box<dyn Fn(&str) -> Vec<String> + Send>,
+}
+
+impl std::fmt::Debug for Request {
+    fn fmt(&self, out: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(out, "Request on port {}", self.port)
+    }
+}
+
+/// What runs a program on a virtual display: a part of the images of Webots.
+const VIRTUAL_DISPLAY: [&str; 3] = ["xvfb-run", "--auto-servernum", "--server-args=-screen 0 1280x1024x24 -nolisten tcp"];
+
+impl Containers {
+    /// Gets ready to make containers, on the thread whose runtime this is. `run` is the folder of this run of the server.
+    /// Removes what an earlier run has left. Blocks for a moment.
+    ///
+    /// # Errors
+    /// When Docker or compose is not installed, in words for an administrator.
+    pub fn open(config: Arc<SimulationConfig>, run: &Path) -> Result<Self, String> {
+        let docker = Docker::find(run)?;
+        let owner = Owner::of(&config.cache_dir.0);
+        objects::sweep(&owner);
+        let settings = &config.container;
+        let images = Images::new(docker.clone(), owner.clone(), settings.builds, config.timing.build);
+        let (images, live) = (Arc::new(images), Live::default());
+        let keeper = keep_tidy(docker.clone(), owner.clone(), live.clone(), Arc::clone(&images), Arc::clone(&config));
+        let templates = Templates { folder: settings.templates.as_ref().map(|folder| folder.0.clone()), debug: settings.debug };
+        let keeper = AbortOnDropHandle::new(actix_rt::spawn(keeper));
+        Ok(Self { docker, owner, templates, images, live, machine: OnceCell::new(), config, _keeper: keeper })
+    }
+
+    /// Whose containers these are, for a process that removes them after the server's end.
+    #[must_use]
+    pub fn owner(&self) -> &Owner {
+        &self.owner
+    }
+
+    /// Makes the containers of a simulation, but starts none. `progress` hears each step in words.
+    ///
+    /// Dropping the future gives up whatever was made.
+    ///
+    /// # Errors
+    /// Why not, in words for the client.
+    pub async fn prepare(&self, request: Request, progress: &(impl Fn(String) + Send + Sync)) -> Result<Prepared, String> {
+        let recipe = self.recipe(&request).await?;
+        let lease = Lease::take(self.owner.project(request.port), &self.live);
+        self.join_network().await?;
+        let network = self.config.container.network.name();
+        let version = &request.project.world.version;
+        let base = image_of(&self.config.container.image, version);
+        let mut image = base.clone();
+        match &recipe.dockerfile {
+            Some(text) => {
+                let build = self.build(&request, &base, text, "", recipe.make).await?;
+                image = self.images.build(Build { network, ..build }, progress).await?;
+                self.copy(&lease, &image, PROJECT_PATH.to_owned(), &request, request.project.folder()).await?;
+            }
+            None => self.images.pull(&base, progress).await?,
+        }
+        let controller = match &recipe.controller {
+            Some(text) => {
+                let build = self.build(&request, &base, text, "controllers", recipe.make).await?;
+                let image = self.images.build(Build { network, ..build }, progress).await?;
+                let folder = recipe.asks.kind.folder_in_project().unwrap_or_default();
+                let from = Path::new(PROJECT_PATH).join(folder).to_string_lossy().into_owned();
+                self.copy(&lease, &image, from, &request, &edited_in(&request.project)).await?;
+                Some(image)
+            }
+            None => None,
+        };
+        if recipe.asks.kind != Kind::Default {
+            self.images.pull(&self.config.container.editor_image, progress).await?;
+        }
+        self.make(request, recipe, lease, (image, controller), progress).await
+    }
+
+    async fn recipe(&self, request: &Request) -> Result<Recipe, String> {
+        let (folder, templates) = (request.project.folder().to_owned(), self.templates.clone());
+        let owner = self.owner.name().to_owned();
+        blocking(move || Recipe::read(&folder, &templates, &owner)).await
+    }
+
+    /// Makes the network of all containers, unless it is there.
+    async fn join_network(&self) -> Result<(), String> {
+        let name = self.config.container.network.name();
+        if self.docker.run(&["network", "inspect", name], SHORT).await.is_ok() {
+            return Ok(());
+        }
+        // One network for all: the pools of Docker end at some thirty. Containers in it can't reach each other.
+        let interface = format!("com.docker.network.bridge.name={name}");
+        let options = ["--opt", &interface, "--opt", "com.docker.network.bridge.enable_icc=false"];
+        let words: Vec<&str> =
+            ["network", "create", "--driver", "bridge"].into_iter().chain(options).chain(std::iter::once(name)).collect();
+        match self.docker.run(&words, SHORT).await {
+            // Another server, or another client of this one, was faster.
+            Err(DockerError::Failed { message, .. }) if message.contains("already exists") => Ok(()),
+            made => made.map(drop).map_err(|error| error.to_string()),
+        }
+    }
+
+    /// An image of a project, or of a folder of it.
+    async fn build(&self, request: &Request, base: &str, text: &str, folder: &str, make: bool) -> Result<Build, String> {
+        let mut arguments = vec![
+            format!("WEBOTS_DEFAULT_IMAGE={base}"),
+            format!("PROJECT_PATH={PROJECT_PATH}"),
+            format!("MAKE={}", u8::from(make)),
+        ];
+        if !folder.is_empty() {
+            arguments.extend(["WEBOTS_CONTROLLER_URL=participant", "DEFAULT_CONTROLLER=participant"].map(str::to_owned));
+        }
+        let identity = request.project.identity();
+        let parts = [identity.as_str(), folder, text].into_iter().chain(arguments.iter().map(String::as_str));
+        let key = Sha256::digest(parts.collect::<Vec<_>>().join("\0"));
+        let key = key.iter().take(12).map(|byte| format!("{byte:02x}")).collect();
+        let name = format!("Dockerfile{folder}");
+        let (dockerfile, text) = (request.project.instance.path().join(name), text.to_owned());
+        let file = dockerfile.clone();
+        blocking(move || std::fs::write(file, text).map_err(|error| error.to_string())).await?;
+        let (context, project) = (request.project.folder().join(folder), Arc::clone(&request.project));
+        Ok(Build { key, dockerfile, context, arguments, network: "", project })
+    }
+
+    /// Copies a folder of an image into the instance's folder.
+    async fn copy(&self, lease: &Lease, image: &str, from: String, request: &Request, to: &Path) -> Result<(), String> {
+        let through = request.project.instance.path().join("copied");
+        let copy = Copy { name: &lease.name, image, from, through, to, size: self.config.project_size };
+        copy.run(&self.docker).await
+    }
+
+    /// Writes the compose project, and lets compose make the containers.
+    async fn make(
+        &self,
+        request: Request,
+        recipe: Recipe,
+        lease: Lease,
+        (image, controller): (String, Option<String>),
+        progress: &(impl Fn(String) + Send + Sync),
+    ) -> Result<Prepared, String> {
+        let machine = self.machine.get_or_try_init(|| Machine::ask(&self.docker)).await.map_err(|error| error.to_string())?;
+        let volumes = self.volumes(&image, controller.as_deref(), &recipe).await?;
+        let (config, templates) = (Arc::clone(&self.config), self.templates.clone());
+        let (name, machine, asks) = (lease.name.clone(), machine.clone(), recipe.asks.clone());
+        let files = move || {
+            let world = world_in(&request.project)?;
+            if matches!(asks.kind, Kind::Competition { .. }) {
+                let opened = recipe::open_participant(&request.project.folder().join(&world));
+                opened.map_err(|error| format!("The world can't be changed: {error}"))?;
+            }
+            let edited = edited_folder(&asks.kind, &request.project)?;
+            let command = command(&config, &request, &world);
+            let project = request.project.folder().canonicalize().map_err(|error| error.to_string())?;
+            let parts = Parts {
+                name: &name,
+                instance: request.project.instance.path(),
+                project: &project,
+                edited,
+                volume: volume_of(&asks.kind),
+                image: &image,
+                controller: controller.as_deref(),
+                volumes,
+                command: &command,
+                port: request.port,
+                make: recipe.make,
+                machine: &machine,
+            };
+            let template = templates.compose(&asks.kind)?;
+            parts.write(&template, &config).map_err(|error| format!("The files for compose can't be written: {error}"))
+        };
+        let options = blocking(files).await?;
+        progress(steps::CREATING.to_owned());
+        let words = options.into_iter().chain(["up", "--no-start", "--no-build"].map(str::to_owned));
+        self.docker.compose(words.map(Into::into).collect(), SHORT).await.map_err(|error| error.to_string())?;
+        let texts = match recipe.asks.kind {
+            Kind::Default => recipe.asks.project_type.into_iter().collect(),
+            _ => std::iter::once("ide: enable".to_owned()).chain(recipe.asks.project_type).collect(),
+        };
+        let containers = self.made(&lease.name).await?;
+        Ok(Prepared::new(self.docker.clone(), lease, containers, texts, recipe.warnings))
+    }
+
+    /// Where the images of the services keep data: such places would be on the machine's disk without a limit.
+    async fn volumes(&self, image: &str, controller: Option<&str>, recipe: &Recipe) -> Result<Vec<(String, String)>, String> {
+        let editor = (recipe.asks.kind != Kind::Default).then_some(self.config.container.editor_image.as_str());
+        let mut all = Vec::new();
+        for (service, image) in [("webots", Some(image)), ("controller", controller), ("theia", editor)] {
+            let Some(image) = image else { continue };
+            for path in self.images.volumes(image).await? {
+                let (outer, inner) = (Path::new(&path), Path::new(PROJECT_PATH));
+                if outer.starts_with(inner) || inner.starts_with(outer) {
+                    return Err(format!("The image {image} has a VOLUME {path}, which would hide the project"));
+                }
+                all.push((service.to_owned(), path));
+            }
+        }
+        Ok(all)
+    }
+
+    /// The containers that compose has made: pairs of service and container.
+    async fn made(&self, name: &str) -> Result<Vec<(String, String)>, String> {
+        let filter = format!("label={}={name}", objects::PROJECT);
+        let format = "{{.Label \"com.docker.compose.service\"}} {{.ID}}";
+        let listed = self.docker.run(&["ps", "--all", "--filter", &filter, "--format", format], SHORT).await;
+        let listed = listed.map_err(|error| error.to_string())?;
+        let pairs = listed.lines().filter_map(|line| line.split_once(' '));
+        Ok(pairs.map(|(service, container)| (service.to_owned(), container.to_owned())).collect())
+    }
+}
+
+/// Why the daemon can't be used now, in words for clients and administrators. Blocks for five seconds at most.
+#[must_use]
+pub fn daemon_fault() -> Option<String> {
+    let mut command = std::process::Command::new("timeout");
+    command.args(["5", "docker", "version", "--format", "{{.Server.Version}}"]).stdin(std::process::Stdio::null());
+    let output = match command.output() {
+        Ok(output) if output.status.success() => return None,
+        Ok(output) => String::from_utf8_lossy(&output.stderr).trim().to_owned(),
+        Err(error) => error.to_string(),
+    };
+    let line = output.lines().last().unwrap_or("it gives no answer within 5 seconds");
+    Some(format!("Docker does not answer on this simulation server: {}", crate::shared::text::one_line(line)))
+}
+
+/// The image of Webots for a version: those up to R2023a are made on Ubuntu 20.04, later ones on 22.04.
+fn image_of(pattern: &str, version: &str) -> String {
+    let ubuntu = if version < "R2023b" { "20.04" } else { "22.04" };
+    pattern.replace("{version}", version).replace("{ubuntu}", ubuntu)
+}
+
+/// The world's path in its project's folder.
+fn world_in(project: &Project) -> Result<String, String> {
+    let outside = || "The world is behind a link that leads out of its project, which containers don't have".to_owned();
+    let root = project.folder().canonicalize().map_err(|error| error.to_string())?;
+    let name = project.world.path.file_name().unwrap_or_default();
+    let path = root.join("worlds").join(name);
+    let path = path.canonicalize().map_err(|_| format!("The image of this project has no worlds/{}", name.to_string_lossy()))?;
+    if !path.is_file() {
+        return Err(format!("worlds/{} of this project is no file in its image", name.to_string_lossy()));
+    }
+    let inside = path.strip_prefix(&root).map_err(|_| outside())?;
+    inside.to_str().map(str::to_owned).ok_or_else(|| "The world's name is no text".to_owned())
+}
+
+fn command(config: &SimulationConfig, request: &Request, world: &str) -> Vec<String> {
+    let webots = (request.command)(&format!("{PROJECT_PATH}/{world}"));
+    let display = match config.container.display {
+        ContainerDisplay::Virtual => &VIRTUAL_DISPLAY[..],
+        ContainerDisplay::Machine => &[],
+    };
+    display.iter().map(|word| (*word).to_owned()).chain(webots).collect()
+}
+
+/// The folder of a competition's participant. It is not in the project, where a world's program could put a link in its
+/// place before the controller is started anew.
+fn edited_in(project: &Project) -> PathBuf {
+    project.instance.path().join("edited")
+}
+
+/// The folder that an editor shows.
+fn edited_folder(kind: &Kind, project: &Project) -> Result<Option<PathBuf>, String> {
+    match kind {
+        Kind::Default => Ok(None),
+        Kind::Competition { .. } => Ok(Some(edited_in(project))),
+        Kind::Editor { .. } => {
+            let folder = kind.folder_in_project().unwrap_or_default();
+            recipe::inside(project.folder(), &folder.to_string_lossy()).map(Some)
+        }
+    }
+}
+
+fn volume_of(kind: &Kind) -> Option<&str> {
+    match kind {
+        Kind::Default => None,
+        Kind::Editor { folder } | Kind::Competition { folder } => Some(folder),
+    }
+}
+
+/// Does file work on a thread that serves nobody.
+async fn blocking<T: Send + 'static>(work: impl FnOnce() -> Result<T, String> + Send + 'static) -> Result<T, String> {
+    actix_rt::task::spawn_blocking(work).await.map_err(|error| error.to_string())?
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_image_follows_the_version() {
+        let pattern = "cyberbotics/webots.cloud:{version}-ubuntu{ubuntu}";
+        for (version, image) in [
+            ("R2022b", "cyberbotics/webots.cloud:R2022b-ubuntu20.04"),
+            ("R2023a", "cyberbotics/webots.cloud:R2023a-ubuntu20.04"),
+            ("R2023b", "cyberbotics/webots.cloud:R2023b-ubuntu22.04"),
+            ("R2025a", "cyberbotics/webots.cloud:R2025a-ubuntu22.04"),
+        ] {
+            assert_eq!(image_of(pattern, version), image);
+        }
+        assert_eq!(image_of("mine", "R2025a"), "mine");
+    }
+}
