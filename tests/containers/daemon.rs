@@ -89,6 +89,9 @@ impl Daemon {
     /// Starts the daemon as the first process of a namespace: with it everything inside ends.
     fn launch(&self) {
         let folder = self.folder.clone();
+        // What one that was killed has left.
+        std::fs::remove_file(folder.join("pid")).ok();
+        std::fs::remove_dir_all(folder.join("exec")).ok();
         let (socket, log) = (self.socket(), std::fs::File::create(self.folder.join("log")).unwrap());
         // The kernel ends it with the thread that has started it: one that lives as long as this process.
         std::thread::spawn(move || {
@@ -134,11 +137,6 @@ pub fn ask(arguments: &[&str]) -> String {
     let output = daemon().command(arguments).output().unwrap();
     assert!(output.status.success(), "docker {arguments:?}: {}", String::from_utf8_lossy(&output.stderr));
     String::from_utf8_lossy(&output.stdout).trim().to_owned()
-}
-
-/// Whether `docker` ends well with these arguments.
-pub fn does(arguments: &[&str]) -> bool {
-    daemon().command(arguments).output().unwrap().status.success()
 }
 
 /// A simulation server with so many places that runs simulations in containers of the daemon.

@@ -52,7 +52,7 @@ impl std::fmt::Debug for Request {
 }
 
 /// What runs a program on a virtual display: a part of the images of Webots.
-const VIRTUAL_DISPLAY: [&str; 3] = ["xvfb-run", "--auto-servernum", "--server-args=-screen 0 1280x1024x24 -nolisten tcp"];
+const VIRTUAL_DISPLAY: [&str; 2] = ["xvfb-run", "--auto-servernum"];
 
 impl Containers {
     /// Gets ready to make containers, on the thread whose runtime this is. `run` is the folder of this run of the server.

@@ -69,16 +69,17 @@ impl Docker {
     /// What is missing, in words for an administrator.
     pub fn find(mark: &Path) -> Result<Self, String> {
         which("docker").map_err(|_| "docker is not there; on Debian and Ubuntu the package docker.io has it".to_owned())?;
-        let works = |words: &[&str]| {
-            let mut command = std::process::Command::new("timeout");
-            command.arg(FIND.as_secs().to_string()).args(words).arg("version");
-            let quiet = command.stdin(std::process::Stdio::null()).output();
-            quiet.is_ok_and(|output| output.status.success())
+        let mut plugin = std::process::Command::new("timeout");
+        plugin.arg(FIND.as_secs().to_string()).args(["docker", "compose", "version"]);
+        let is_plugin = plugin.stdin(std::process::Stdio::null()).output().is_ok_and(|output| output.status.success());
+        let compose: &[&str] = if is_plugin {
+            &["docker", "compose"]
+        } else if which("docker-compose").is_ok() {
+            &["docker-compose"]
+        } else {
+            return Err("docker compose is not there; the package docker-compose or docker-compose-plugin has it".to_owned());
         };
-        let compose: [&[&str]; 2] = [&["docker", "compose"], &["docker-compose"]];
-        let found = compose.into_iter().find(|words| works(words));
-        let found = found.ok_or("docker compose is not there; the package docker-compose or docker-compose-plugin has it")?;
-        Ok(Self { compose: found.iter().map(OsString::from).collect(), mark: mark.to_owned() })
+        Ok(Self { compose: compose.iter().map(OsString::from).collect(), mark: mark.to_owned() })
     }
 
     /// Runs `docker` with these arguments, and returns what it prints.

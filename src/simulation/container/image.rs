@@ -123,7 +123,9 @@ impl Images {
             if line.starts_with("Step ") {
                 line.clone_into(&mut step);
             }
-            news.send(steps::building(line)).ok();
+            if let Some(text) = steps::building(line) {
+                news.send(text).ok();
+            }
         };
         let built = self.docker.follow(words, self.limit, told).await;
         // Until here the folder that is copied from has to stay.
