@@ -350,11 +350,8 @@ mod tests {
 
     #[test]
     fn references_of_references_take_neither_time_nor_memory() {
-        let mut bomb = "a0: &a0 [x, x, x, x, x, x, x, x, x]\n".to_owned();
-        for level in 1..15 {
-            let below = format!("*a{},", level - 1).repeat(9);
-            bomb += &format!("a{level}: &a{level} [{below}]\n");
-        }
+        let level = |level: usize| format!("a{level}: &a{level} [{}]\n", format!("*a{},", level - 1).repeat(9));
+        let bomb = format!("a0: &a0 [x, x, x, x, x, x, x, x, x]\n{}", (1..15).map(level).collect::<String>());
         let began = std::time::Instant::now();
         let deep = "[".repeat(SIZE / 2);
         let wide = "- ".repeat(SIZE / 2);
