@@ -1,5 +1,6 @@
 //! What a service manager, an administrator and a display see of the servers.
 
+mod containers;
 mod display;
 mod drain;
 mod files;

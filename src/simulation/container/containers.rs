@@ -1,6 +1,6 @@
 //! Makes the containers of simulations; one for the whole server.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::sync::Arc;
 
 use sha2::{Digest, Sha256};
@@ -13,6 +13,7 @@ use super::docker::{Docker, DockerError, SHORT};
 use super::image::{Build, Images};
 use super::machine::Machine;
 use super::objects::{self, Owner};
+use super::places::{edited_folder, edited_in, volume_of, world_in};
 use super::prepared::{Lease, Prepared};
 use super::recipe::{self, PROJECT_PATH, Recipe};
 use super::steps;
@@ -270,20 +271,6 @@ fn image_of(pattern: &str, version: &str) -> String {
     pattern.replace("{version}", version).replace("{ubuntu}", ubuntu)
 }
 
-/// The world's path in its project's folder.
-fn world_in(project: &Project) -> Result<String, String> {
-    let outside = || "The world is behind a link that leads out of its project, which containers don't have".to_owned();
-    let root = project.folder().canonicalize().map_err(|error| error.to_string())?;
-    let name = project.world.path.file_name().unwrap_or_default();
-    let path = root.join("worlds").join(name);
-    let path = path.canonicalize().map_err(|_| format!("The image of this project has no worlds/{}", name.to_string_lossy()))?;
-    if !path.is_file() {
-        return Err(format!("worlds/{} of this project is no file in its image", name.to_string_lossy()));
-    }
-    let inside = path.strip_prefix(&root).map_err(|_| outside())?;
-    inside.to_str().map(str::to_owned).ok_or_else(|| "The world's name is no text".to_owned())
-}
-
 fn command(config: &SimulationConfig, request: &Request, world: &str) -> Vec<String> {
     let webots = (request.command)(&format!("{PROJECT_PATH}/{world}"));
     let display = match config.container.display {
@@ -291,31 +278,6 @@ fn command(config: &SimulationConfig, request: &Request, world: &str) -> Vec<Str
         ContainerDisplay::Machine => &[],
     };
     display.iter().map(|word| (*word).to_owned()).chain(webots).collect()
-}
-
-/// The folder of a competition's participant. It is not in the project, where a world's program could put a link in its
-/// place before the controller is started anew.
-fn edited_in(project: &Project) -> PathBuf {
-    project.instance.path().join("edited")
-}
-
-/// The folder that an editor shows.
-fn edited_folder(kind: &Kind, project: &Project) -> Result<Option<PathBuf>, String> {
-    match kind {
-        Kind::Default => Ok(None),
-        Kind::Competition { .. } => Ok(Some(edited_in(project))),
-        Kind::Editor { .. } => {
-            let folder = kind.folder_in_project().unwrap_or_default();
-            recipe::inside(project.folder(), &folder.to_string_lossy()).map(Some)
-        }
-    }
-}
-
-fn volume_of(kind: &Kind) -> Option<&str> {
-    match kind {
-        Kind::Default => None,
-        Kind::Editor { folder } | Kind::Competition { folder } => Some(folder),
-    }
 }
 
 /// Does file work on a thread that serves nobody.

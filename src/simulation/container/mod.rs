@@ -8,6 +8,7 @@ mod dockerfile;
 mod image;
 mod machine;
 mod objects;
+mod places;
 mod prepared;
 mod recipe;
 mod steps;

@@ -31,6 +31,8 @@ const LENGTH: usize = 200;
 const SHOWN: usize = 60;
 /// The first part of each folder: it stands for the project.
 const PROJECT: &str = "webots-project";
+/// Where projects lie in a container. Some write this out, as a path that leads up to the root first.
+const ABOVE_PROJECT: &str = "usr/local/";
 /// What may be asked for, in words.
 const ALLOWED: &str =
     r#""theia:webots-project/FOLDER" for an editor or "competition:webots-project/FOLDER" for a competition"#;
@@ -43,12 +45,12 @@ pub enum Kind {
     Default,
     /// An editor of a folder of the project.
     Editor {
-        /// The folder as it is written, such as `webots-project/controllers/edit/`.
+        /// The folder, such as `webots-project/controllers/edit/`.
         folder: String,
     },
     /// The controller of a participant.
     Competition {
-        /// The folder of the participant as it is written, such as `webots-project/controllers/participant`.
+        /// The folder of the participant, such as `webots-project/controllers/participant/`.
         folder: String,
     },
 }
@@ -233,6 +235,8 @@ fn known(kind: &str, folder: &str) -> Result<Kind, String> {
         let shown = shown(folder);
         Err(format!("the folder {shown} of dockerCompose in webots.yml {why}; it is like {PROJECT}/controllers/edit"))
     };
+    let from_root = folder.trim_start_matches("../").trim_start_matches('/').strip_prefix(ABOVE_PROJECT);
+    let folder = from_root.unwrap_or(folder);
     let is_plain = |letter: char| letter.is_alphanumeric() || " _-+./".contains(letter);
     if folder.len() > LENGTH {
         return wrong("is too long");
@@ -289,6 +293,12 @@ mod tests {
             ("text: |\n  dockerCompose:theia:webots-project/x\n", Kind::Default),
             ("#dockerCompose:theia:webots-project/x\n", Kind::Default),
             ("a: &a webots-project/x\ndockerCompose: {theia: *a}\n", editor("webots-project/x")),
+            (
+                "publish: true\ntype: competition\nworld:\n  file: worlds/a.wbt\n  max-duration: 300\n\
+                dockerCompose: competition:../../../usr/local/webots-project/controllers/\n",
+                competition("webots-project/controllers/"),
+            ),
+            ("dockerCompose:theia:/usr/local/webots-project/x", editor("webots-project/x")),
         ] {
             assert_eq!(WebotsYml::parse(text).kind, kind, "{text:?}");
         }
@@ -306,6 +316,9 @@ mod tests {
             ("dockerCompose: {}", "one of them"),
             ("a: [\ndockerCompose:\n  theia: webots-project/x\n", "webots.yml is no YAML"),
             ("dockerCompose: theia:/etc", "must begin with webots-project"),
+            ("dockerCompose: theia:../../webots-project/x", "must not have the parts"),
+            ("dockerCompose: theia:../../../usr/local/webots/x", "must begin with webots-project"),
+            ("dockerCompose: theia:/usr/local/../local/webots-project/x", "must not have the parts"),
             ("dockerCompose: theia:controllers/x", "must begin with webots-project"),
             ("dockerCompose: 'theia:'", "must begin with webots-project"),
             ("dockerCompose: theia:webots-project/../x", "must not have the parts"),
@@ -350,11 +363,8 @@ mod tests {
 
     #[test]
     fn references_of_references_take_neither_time_nor_memory() {
-        let mut bomb = "a0: &a0 [x, x, x, x, x, x, x, x, x]\n".to_owned();
-        for level in 1..15 {
-            let below = format!("*a{},", level - 1).repeat(9);
-            bomb += &format!("a{level}: &a{level} [{below}]\n");
-        }
+        let level = |level: usize| format!("a{level}: &a{level} [{}]\n", format!("*a{},", level - 1).repeat(9));
+        let bomb = format!("a0: &a0 [x, x, x, x, x, x, x, x, x]\n{}", (1..15).map(level).collect::<String>());
         let began = std::time::Instant::now();
         let deep = "[".repeat(SIZE / 2);
         let wide = "- ".repeat(SIZE / 2);
