@@ -4,7 +4,8 @@ use std::process::Command;
 
 use which::which;
 
-use super::config::SimulationConfig;
+use super::config::{Isolation, SimulationConfig};
+use super::container;
 use crate::simulation::isolation::Launcher;
 use crate::simulation::machine::display;
 
@@ -29,9 +30,16 @@ impl std::fmt::Display for Finding {
 /// Checks everything. It runs programs and connects to the display, so it can take some seconds.
 #[must_use]
 pub fn check(config: &SimulationConfig) -> Vec<Finding> {
-    vec![
-        Finding { topic: "webots", result: webots(config) },
-        Finding { topic: "display", result: display(config) },
+    let on_machine = if config.isolation == Isolation::Container {
+        vec![Finding { topic: "docker", result: container::check(config) }]
+    } else {
+        vec![
+            Finding { topic: "webots", result: webots(config) },
+            Finding { topic: "display", result: display(config) },
+            Finding { topic: "Xvfb", result: xvfb(config) },
+        ]
+    };
+    let always = [
         Finding {
             topic: "git",
             result: version(&["git", "--version"], "git is not there: no world can be checked out"),
@@ -40,9 +48,9 @@ pub fn check(config: &SimulationConfig) -> Vec<Finding> {
             topic: "git-lfs",
             result: version(&["git-lfs", "--version"], "git-lfs is not there: large files of Git LFS will be missing"),
         },
-        Finding { topic: "Xvfb", result: xvfb(config) },
         Finding { topic: "isolation", result: isolation(config) },
-    ]
+    ];
+    on_machine.into_iter().chain(always).collect()
 }
 
 fn webots(config: &SimulationConfig) -> Result<String, String> {

@@ -24,7 +24,11 @@ async fn a_projects_own_dockerfile_is_built_once_for_all_who_want_it_and_what_it
         "FROM {NAME}\nARG PROJECT_PATH\nRUN mkdir -p $PROJECT_PATH\nCOPY . $PROJECT_PATH\nRUN sleep 2 && cp \
          $PROJECT_PATH/controllers/c/c.py $PROJECT_PATH/controllers/c/built\n"
     ));
-    forge.commit("lab/arm", "main", &[("docker-compose.yml", "services: {webots: {privileged: true}}\n"), (".env", "PORT=1\n")]);
+    forge.commit(
+        "lab/arm",
+        "main",
+        &[("docker-compose.yml", "services: {webots: {privileged: true}}\n"), (".env", "PORT=1\n")],
+    );
     let server = server(forge.path(), 2).start().await;
     let (mut one, mut two) = (Client::start(&server, &arm()).await, Client::start(&server, &arm()).await);
     for client in [&mut one, &mut two] {
@@ -103,8 +107,14 @@ async fn a_version_without_an_image_is_told_in_words() {
     let forge = Forge::with_arm();
     forge.commit("lab/old", "main", &[("worlds/a.wbt", &WORLD.replace("R2025a", "R2022b"))]);
     // A registry that says at once that it is not there.
-    let server = server(forge.path(), 1).set("container", serde_json::json!({"image": "127.0.0.1:1/webots:{version}"})).start().await;
-    let told = Client::start(&server, &world("lab/old", "main", "worlds/a.wbt")).await.patiently("loading: Error:", BUILT).await;
+    let server = server(forge.path(), 1)
+        .set("container", serde_json::json!({"image": "127.0.0.1:1/webots:{version}"}))
+        .start()
+        .await;
+    let told = Client::start(&server, &world("lab/old", "main", "worlds/a.wbt"))
+        .await
+        .patiently("loading: Error:", BUILT)
+        .await;
     assert!(told.contains("127.0.0.1:1/webots:R2022b"), "{told}");
 }
 

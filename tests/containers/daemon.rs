@@ -55,7 +55,9 @@ fn start() -> Option<Daemon> {
         eprintln!("skipped: dockerd needs root");
         return None;
     }
-    for (program, package) in [("dockerd", "docker.io"), ("docker-compose", "docker-compose"), ("unshare", "util-linux")] {
+    for (program, package) in
+        [("dockerd", "docker.io"), ("docker-compose", "docker-compose"), ("unshare", "util-linux")]
+    {
         crate::support::needs(program, package);
     }
     // Paths of sockets have to be short.
@@ -97,11 +99,32 @@ impl Daemon {
         std::thread::spawn(move || {
             let path = |name: &str| folder.join(name).display().to_string();
             let mut command = Command::new("setpriv");
-            command.args(["--pdeathsig", "KILL", "unshare", "--pid", "--fork", "--kill-child=KILL", "--mount", "--mount-proc"]);
+            command.args([
+                "--pdeathsig",
+                "KILL",
+                "unshare",
+                "--pid",
+                "--fork",
+                "--kill-child=KILL",
+                "--mount",
+                "--mount-proc",
+            ]);
             command.args(["dockerd", "--host", &socket, "--data-root", &path("data"), "--exec-root", &path("exec")]);
-            command.args(["--pidfile", &path("pid"), "--bridge=none", "--iptables=false", "--ip6tables=false", "--ip-masq=false"]);
-            let mut child: Child =
-                command.stdin(Stdio::null()).stdout(log.try_clone().unwrap()).stderr(log).process_group(0).spawn().unwrap();
+            command.args([
+                "--pidfile",
+                &path("pid"),
+                "--bridge=none",
+                "--iptables=false",
+                "--ip6tables=false",
+                "--ip-masq=false",
+            ]);
+            let mut child: Child = command
+                .stdin(Stdio::null())
+                .stdout(log.try_clone().unwrap())
+                .stderr(log)
+                .process_group(0)
+                .spawn()
+                .unwrap();
             std::fs::write(folder.join("keeper"), child.id().to_string()).unwrap();
             child.wait().ok();
             std::fs::remove_file(folder.join("keeper")).ok();

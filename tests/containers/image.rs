@@ -11,8 +11,8 @@ pub const EDITOR: &str = "benjamindeleze/theia-test:test3";
 
 /// Programs that scripts in the image use.
 const PROGRAMS: [&str; 24] = [
-    "sh", "bash", "cat", "ls", "cp", "mkdir", "rm", "touch", "sleep", "head", "env", "true", "id", "dd", "make", "ln", "mv",
-    "chmod", "mkfifo", "seq", "stat", "readlink", "perl", "tail",
+    "sh", "bash", "cat", "ls", "cp", "mkdir", "rm", "touch", "sleep", "head", "env", "true", "id", "dd", "make", "ln",
+    "mv", "chmod", "mkfifo", "seq", "stat", "readlink", "perl", "tail",
 ];
 /// Webots' launcher hands SIGTERM on.
 const WEBOTS: &str = "#!/bin/sh\nunset DEMO_SIMULATOR_BIND\ndemo-simulator \"$@\" &\nchild=$!\ntrap 'kill -TERM $child' TERM INT\nwait $child\n\
@@ -25,7 +25,12 @@ const THEIA: &str = "#!/bin/sh\nexec demo-simulator --port=3000 --stream /world/
 /// Makes the images in the daemon, with `folder` for what they are made of.
 pub fn make(folder: &Path) {
     let root = folder.join("root");
-    for (path, text) in [("usr/bin/webots", WEBOTS), ("usr/bin/xvfb-run", XVFB), ("usr/bin/theia", THEIA), ("world/worlds/a.wbt", crate::support::git::WORLD)] {
+    for (path, text) in [
+        ("usr/bin/webots", WEBOTS),
+        ("usr/bin/xvfb-run", XVFB),
+        ("usr/bin/theia", THEIA),
+        ("world/worlds/a.wbt", crate::support::git::WORLD),
+    ] {
         let path = root.join(path);
         std::fs::create_dir_all(path.parent().unwrap()).unwrap();
         std::fs::write(&path, text).unwrap();
@@ -65,5 +70,8 @@ pub fn make(folder: &Path) {
 fn libraries(program: &str) -> Vec<String> {
     let output = Command::new("ldd").arg(program).output().unwrap();
     let text = String::from_utf8(output.stdout).unwrap();
-    text.split_whitespace().filter(|word| word.starts_with('/')).map(|word| word.trim_end_matches(':').to_owned()).collect()
+    text.split_whitespace()
+        .filter(|word| word.starts_with('/'))
+        .map(|word| word.trim_end_matches(':').to_owned())
+        .collect()
 }

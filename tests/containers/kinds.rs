@@ -80,8 +80,14 @@ async fn a_competition_runs_the_participants_controller_beside_and_starts_it_ane
     let webots = of_service(&server, "webots")[0].clone();
     let inside = |command: &str| ask(&["exec", &webots, "sh", "-c", command]);
     assert!(inside("cat /usr/local/webots-project/worlds/a.wbt").contains("controller \"<extern>\""));
-    assert!(inside("ls /usr/local/webots-project /usr/local/webots-project/controllers").matches("remote_controller_launcher.py").count() == 2);
-    until("the controller has started", async || inside("cat /tmp/webots/starts 2>/dev/null || true") == "participant").await;
+    assert!(
+        inside("ls /usr/local/webots-project /usr/local/webots-project/controllers")
+            .matches("remote_controller_launcher.py")
+            .count()
+            == 2
+    );
+    until("the controller has started", async || inside("cat /tmp/webots/starts 2>/dev/null || true") == "participant")
+        .await;
     let theia = &of_service(&server, "theia")[0];
     assert_eq!(ask(&["exec", theia, "cat", "/home/project/webots-project/participant.py"]), "print(1)");
     inside("touch /tmp/webots/reset");
@@ -95,7 +101,9 @@ async fn a_competition_runs_the_participants_controller_beside_and_starts_it_ane
 async fn resets_without_end_start_a_controller_once_a_second_at_most() {
     let Some(_docker) = docker().await else { return };
     let forge = Forge::with_arm();
-    let controller = format!("FROM {NAME}\nCOPY . /usr/local/webots-project/controllers\nCMD [\"sh\", \"-c\", \"echo x >>/tmp/webots/starts; exec sleep 1000\"]\n");
+    let controller = format!(
+        "FROM {NAME}\nCOPY . /usr/local/webots-project/controllers\nCMD [\"sh\", \"-c\", \"echo x >>/tmp/webots/starts; exec sleep 1000\"]\n"
+    );
     let webots = "#!/bin/sh\necho .\nwhile :; do echo reset; done\n";
     forge.commit(
         "lab/arm",
@@ -128,12 +136,14 @@ async fn an_administrators_template_counts_and_what_protects_stays() {
                     privileged: true\n    read_only: false\n    ports: [\"${BIND}:${PORT}:${PORT}\"]\n    volumes: \
                     [\"${PROJECT}:${PROJECT_PATH}\"]\n";
     std::fs::write(templates.path().join("docker-compose-default.yml"), template).unwrap();
-    let settings = serde_json::json!({ "templates": templates.path(), "newPrivileges": true, "capabilities": ["SYS_PTRACE"] });
+    let settings =
+        serde_json::json!({ "templates": templates.path(), "newPrivileges": true, "capabilities": ["SYS_PTRACE"] });
     let server = server(forge.path(), 1).set("container", settings).start().await;
     let mut client = Client::start(&server, &arm()).await;
     client.patiently("webots:", BUILT).await;
     let webots = &of_service(&server, "webots")[0];
     ask(&["exec", webots, "ls", "/tmp/mine"]);
-    let format = "{{.HostConfig.Privileged}} {{.HostConfig.ReadonlyRootfs}} {{.HostConfig.CapAdd}} {{.HostConfig.SecurityOpt}}";
+    let format =
+        "{{.HostConfig.Privileged}} {{.HostConfig.ReadonlyRootfs}} {{.HostConfig.CapAdd}} {{.HostConfig.SecurityOpt}}";
     assert_eq!(ask(&["inspect", "--format", format, webots]), "false true [SYS_PTRACE] [no-new-privileges:false]");
 }

@@ -71,7 +71,8 @@ async fn a_container_has_no_more_than_it_needs() {
         assert_eq!(host[key], value, "{key}");
     }
     assert_eq!(host["RestartPolicy"]["Name"], "no");
-    let mounts: Vec<_> = about[0]["Mounts"].as_array().unwrap().iter().map(|mount| mount["Destination"].clone()).collect();
+    let mounts: Vec<_> =
+        about[0]["Mounts"].as_array().unwrap().iter().map(|mount| mount["Destination"].clone()).collect();
     assert_eq!(mounts, [json!("/usr/local/webots-project")]);
     assert_eq!(config["User"], format!("{}:{}", nix::unistd::getuid(), nix::unistd::getgid()));
     let environment = config["Env"].to_string();
@@ -83,7 +84,8 @@ async fn an_existing_configuration_with_docker_true_runs_every_world_in_a_contai
     let Some(_docker) = docker().await else { return };
     let forge = Forge::with_arm();
     forge.commit("other/world", "main", &[("worlds/a.wbt", crate::support::git::WORLD)]);
-    let server = server(forge.path(), 3).set("isolation", "auto").set("docker", true).set("shareIdleTime", 100).start().await;
+    let server =
+        server(forge.path(), 3).set("isolation", "auto").set("docker", true).set("shareIdleTime", 100).start().await;
     for world in [arm(), world("other/world", "main", "worlds/a.wbt")] {
         let mut client = Client::start(&server, &world).await;
         client.until("webots:").await;
@@ -99,7 +101,8 @@ async fn worlds_of_others_run_while_the_machine_is_idle_only() {
     let forge = Forge::with_arm();
     forge.commit("other/world", "main", &[("worlds/a.wbt", crate::support::git::WORLD)]);
     let server = server(forge.path(), 2).set("shareIdleTime", 0).start().await;
-    let told = Client::start(&server, &world("other/world", "main", "worlds/a.wbt")).await.until("loading: Error:").await;
+    let told =
+        Client::start(&server, &world("other/world", "main", "worlds/a.wbt")).await.until("loading: Error:").await;
     assert!(told.contains("not configured to share idle time"), "{told}");
 }
 

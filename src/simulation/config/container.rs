@@ -79,7 +79,7 @@ pub const EDITOR_PORT: u16 = 500;
 /// When there are too many places for that.
 pub fn check_ports(in_containers: bool, port: u16, places: u16) -> Result<(), InvalidValue> {
     let last = u32::from(port) + u32::from(places) + u32::from(EDITOR_PORT);
-    if !in_containers || (places <= EDITOR_PORT && last <= u32::from(u16::MAX)) {
+    if !in_containers || (places <= EDITOR_PORT && u16::try_from(last).is_ok()) {
         return Ok(());
     }
     let problem = format!(

@@ -6,7 +6,7 @@ mod resources;
 mod simulation_config;
 mod timing;
 
-pub use container::{EDITOR_PORT, ContainerDisplay, ContainerNetwork, ContainerSettings};
+pub use container::{ContainerDisplay, ContainerNetwork, ContainerSettings, EDITOR_PORT};
 pub use isolation::{Isolation, SandboxFolders, VariableName};
 pub use resources::Resources;
 pub use simulation_config::SimulationConfig;

@@ -1,5 +1,6 @@
 //! The files of a compose project: the template, its variables, and what holds for each service whatever the template says.
 
+use std::collections::BTreeMap;
 use std::io;
 use std::path::{Path, PathBuf};
 
@@ -63,7 +64,16 @@ impl Parts<'_> {
         std::fs::write(folder.join(".env"), self.variables(config))?;
         let path = |name: &str| folder.join(name).to_string_lossy().into_owned();
         let (name, folder) = (self.name.to_owned(), folder.to_string_lossy().into_owned());
-        let words = ["--project-name", &name, "--project-directory", &folder, "--file", &path(TEMPLATE), "--file", &path(OVERRIDE)];
+        let words = [
+            "--project-name",
+            &name,
+            "--project-directory",
+            &folder,
+            "--file",
+            &path(TEMPLATE),
+            "--file",
+            &path(OVERRIDE),
+        ];
         Ok(words.map(str::to_owned).into())
     }
 
@@ -96,62 +106,64 @@ impl Parts<'_> {
             ("THEIA_FOLDER", edited),
             ("THEIA_PORT", (self.port + EDITOR_PORT).to_string()),
             ("IPC", path(&self.exchange())),
-            ("DISPLAY", self.display(config).unwrap_or_default()),
+            ("DISPLAY", display_of(config).unwrap_or_default()),
         ];
-        pairs.iter().map(|(name, value)| format!("{name}={value}\n")).collect()
-    }
-
-    fn display(&self, config: &SimulationConfig) -> Option<String> {
-        let is_machine = config.container.display == ContainerDisplay::Machine;
-        is_machine.then(|| display::effective(config.display.as_ref()))
+        let lines: Vec<String> = pairs.iter().map(|(name, value)| format!("{name}={value}\n")).collect();
+        lines.concat()
     }
 
     /// What holds for each service.
     fn overridden(&self, template: &Template, config: &SimulationConfig) -> Value {
-        let services: serde_json::Map<String, Value> =
-            template.services.iter().map(|(name, has_command)| (name.clone(), self.service(name, *has_command, config))).collect();
+        let services: serde_json::Map<String, Value> = template
+            .services
+            .iter()
+            .map(|(name, has_command)| (name.clone(), self.service(name, *has_command, config)))
+            .collect();
         let network = json!({ "default": { "external": true, "name": config.container.network.name() } });
         json!({ "services": services, "networks": network })
     }
 
     fn service(&self, name: &str, has_command: bool, config: &SimulationConfig) -> Value {
         let (settings, limits) = (&config.container, &config.limits);
-        let mut service = json!({
-            "restart": "no",
-            "privileged": false,
-            "read_only": settings.read_only,
-            "cap_drop": ["ALL"],
-            "cap_add": settings.capabilities,
-            "security_opt": [format!("no-new-privileges:{}", !settings.new_privileges)],
-            "user": format!("{}:{}", nix::unistd::getuid(), nix::unistd::getgid()),
-            "environment": { "HOME": "/tmp", "USER": "webots", "XDG_RUNTIME_DIR": "/tmp", "QT_X11_NO_MITSHM": "1" },
-            "tmpfs": self.memory_folders(name, limits.disk),
-            "shm_size": SHARED_MEMORY,
-            "pids_limit": limits.processes,
-            "ulimits": { "nofile": { "soft": limits.open_files.min(1024), "hard": limits.open_files }, "core": 0 },
-            "logging": { "driver": "none" },
-            "init": self.machine.init,
-        });
-        let mut set = |key: &str, value: Value| service[key] = value;
         let memory = format!("{}m", limits.memory.unwrap_or(DEFAULT_MEMORY));
-        set("mem_limit", json!(memory));
-        set("memswap_limit", json!(memory));
-        if let Some(cores) = limits.cores {
-            set("cpus", json!(cores));
-        }
-        match name {
-            "webots" => set("image", json!(self.image)),
-            "controller" => set("image", json!(self.controller.unwrap_or(self.image))),
-            "theia" => set("image", json!(settings.editor_image)),
-            _ => {}
-        }
+        let mut service = Service::from_iter([
+            ("restart", json!("no")),
+            ("privileged", json!(false)),
+            ("read_only", json!(settings.read_only)),
+            ("cap_drop", json!(["ALL"])),
+            ("cap_add", json!(settings.capabilities)),
+            ("security_opt", json!([format!("no-new-privileges:{}", !settings.new_privileges)])),
+            ("user", json!(format!("{}:{}", nix::unistd::getuid(), nix::unistd::getgid()))),
+            ("tmpfs", json!(self.memory_folders(name, limits.disk))),
+            ("shm_size", json!(SHARED_MEMORY)),
+            ("mem_limit", json!(memory)),
+            ("memswap_limit", json!(memory)),
+            ("pids_limit", json!(limits.processes)),
+            (
+                "ulimits",
+                json!({ "nofile": { "soft": limits.open_files.min(1024), "hard": limits.open_files }, "core": 0 }),
+            ),
+            ("logging", json!({ "driver": "none" })),
+            ("init", json!(self.machine.init)),
+        ]);
+        let image = match name {
+            "webots" => Some(self.image),
+            "controller" => self.controller,
+            "theia" => Some(settings.editor_image.as_str()),
+            _ => None,
+        };
+        service.extend(image.map(|image| ("image", json!(image))));
+        service.extend(limits.cores.map(|cores| ("cpus", json!(cores))));
+        let mut environment = ENVIRONMENT.map(|(name, value)| (name, value.to_owned())).to_vec();
         if name == "webots" {
             if !has_command {
-                set("command", json!(self.command.iter().map(|word| word.replace('$', "$$")).collect::<Vec<_>>()));
+                let words: Vec<String> = self.command.iter().map(|word| word.replace('$', "$$")).collect();
+                service.insert("command", json!(words));
             }
-            self.show(&mut service, config);
+            self.show(&mut service, &mut environment, config);
         }
-        service
+        service.insert("environment", json!(BTreeMap::from_iter(environment)));
+        json!(service)
     }
 
     /// Folders that are memory, which is limited: those that programs need to write into, and those that an image declares.
@@ -163,28 +175,42 @@ impl Parts<'_> {
     }
 
     /// Gives Webots graphics cards, the display of the machine, and the administrator's folders.
-    fn show(&self, service: &mut Value, config: &SimulationConfig) {
+    fn show(&self, service: &mut Service, environment: &mut Vec<(&'static str, String)>, config: &SimulationConfig) {
         let mut volumes: Vec<String> = config.container.mounts.clone();
-        if let Some(display) = self.display(config) {
-            service["environment"]["DISPLAY"] = json!(display);
+        if let Some(display) = display_of(config) {
+            environment.push(("DISPLAY", display));
             volumes.push(format!("{DISPLAYS}:{DISPLAYS}"));
             if let Some(authority) = std::env::var_os("XAUTHORITY") {
-                volumes.push(format!("{0}:{0}:ro", authority.to_string_lossy()));
-                service["environment"]["XAUTHORITY"] = json!(authority.to_string_lossy());
+                let authority = authority.to_string_lossy().into_owned();
+                volumes.push(format!("{authority}:{authority}:ro"));
+                environment.push(("XAUTHORITY", authority));
             }
         }
-        service["volumes"] = json!(volumes);
+        service.insert("volumes", json!(volumes));
         if let Some(groups) = self.machine.graphics.as_ref().filter(|_| config.container.gpu) {
-            service["devices"] = json!(["/dev/dri:/dev/dri"]);
-            service["group_add"] = json!(groups.iter().map(u32::to_string).collect::<Vec<_>>());
+            service.insert("devices", json!(["/dev/dri:/dev/dri"]));
+            service.insert("group_add", json!(groups.iter().map(u32::to_string).collect::<Vec<_>>()));
         }
         if self.machine.nvidia && config.container.gpu {
             let all = json!([{ "driver": "nvidia", "count": "all", "capabilities": ["gpu"] }]);
-            service["deploy"] = json!({ "resources": { "reservations": { "devices": all } } });
-            service["environment"]["NVIDIA_DRIVER_CAPABILITIES"] = json!("all");
+            service.insert("deploy", json!({ "resources": { "reservations": { "devices": all } } }));
+            environment.push(("NVIDIA_DRIVER_CAPABILITIES", "all".to_owned()));
         }
     }
 }
+
+/// The display of the machine, where that is asked for.
+fn display_of(config: &SimulationConfig) -> Option<String> {
+    let is_machine = config.container.display == ContainerDisplay::Machine;
+    is_machine.then(|| display::effective(config.display.as_ref()))
+}
+
+/// What compose is told of a service.
+type Service = BTreeMap<&'static str, Value>;
+
+/// Variables that all services have: with them programs write where they may, and find each other.
+const ENVIRONMENT: [(&str, &str); 4] =
+    [("HOME", "/tmp"), ("USER", "webots"), ("XDG_RUNTIME_DIR", "/tmp"), ("QT_X11_NO_MITSHM", "1")];
 
 /// How much memory a container may take where `limits.memory` does not say, in MiB.
 pub const DEFAULT_MEMORY: u64 = 4096;

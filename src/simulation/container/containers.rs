@@ -3,7 +3,6 @@
 use std::path::Path;
 use std::sync::Arc;
 
-use sha2::{Digest, Sha256};
 use tokio::sync::OnceCell;
 use tokio_util::task::AbortOnDropHandle;
 
@@ -36,6 +35,9 @@ pub struct Containers {
     _keeper: AbortOnDropHandle<()>,
 }
 
+/// Makes a command, given where the world is in the container.
+pub type Command = Box<dyn Fn(&str) -> Vec<String> + Send>;
+
 /// A simulation that is to run in containers.
 pub struct Request {
     /// What was checked out.
@@ -43,7 +45,7 @@ pub struct Request {
     /// The port of Webots.
     pub port: u16,
     /// Webots and its arguments, given where its world is in the container.
-    pub command: Box<dyn Fn(&str) -> Vec<String> + Send>,
+    pub command: Command,
 }
 
 impl std::fmt::Debug for Request {
@@ -69,7 +71,8 @@ impl Containers {
         let images = Images::new(docker.clone(), owner.clone(), settings.builds, config.timing.build);
         let (images, live) = (Arc::new(images), Live::default());
         let keeper = keep_tidy(docker.clone(), owner.clone(), live.clone(), Arc::clone(&images), Arc::clone(&config));
-        let templates = Templates { folder: settings.templates.as_ref().map(|folder| folder.0.clone()), debug: settings.debug };
+        let templates =
+            Templates { folder: settings.templates.as_ref().map(|folder| folder.0.clone()), debug: settings.debug };
         let keeper = AbortOnDropHandle::new(actix_rt::spawn(keeper));
         Ok(Self { docker, owner, templates, images, live, machine: OnceCell::new(), config, _keeper: keeper })
     }
@@ -86,7 +89,11 @@ impl Containers {
     ///
     /// # Errors
     /// Why not, in words for the client.
-    pub async fn prepare(&self, request: Request, progress: &(impl Fn(String) + Send + Sync)) -> Result<Prepared, String> {
+    pub async fn prepare(
+        &self,
+        request: Request,
+        progress: &(impl Fn(String) + Send + Sync),
+    ) -> Result<Prepared, String> {
         let recipe = self.recipe(&request).await?;
         let lease = Lease::take(self.owner.project(request.port), &self.live);
         self.join_network().await?;
@@ -134,8 +141,11 @@ impl Containers {
         // One network for all: the pools of Docker end at some thirty. Containers in it can't reach each other.
         let interface = format!("com.docker.network.bridge.name={name}");
         let options = ["--opt", &interface, "--opt", "com.docker.network.bridge.enable_icc=false"];
-        let words: Vec<&str> =
-            ["network", "create", "--driver", "bridge"].into_iter().chain(options).chain(std::iter::once(name)).collect();
+        let words: Vec<&str> = ["network", "create", "--driver", "bridge"]
+            .into_iter()
+            .chain(options)
+            .chain(std::iter::once(name))
+            .collect();
         match self.docker.run(&words, SHORT).await {
             // Another server, or another client of this one, was faster.
             Err(DockerError::Failed { message, .. }) if message.contains("already exists") => Ok(()),
@@ -144,19 +154,26 @@ impl Containers {
     }
 
     /// An image of a project, or of a folder of it.
-    async fn build(&self, request: &Request, base: &str, text: &str, folder: &str, make: bool) -> Result<Build, String> {
+    async fn build(
+        &self,
+        request: &Request,
+        base: &str,
+        text: &str,
+        folder: &str,
+        make: bool,
+    ) -> Result<Build, String> {
         let mut arguments = vec![
             format!("WEBOTS_DEFAULT_IMAGE={base}"),
             format!("PROJECT_PATH={PROJECT_PATH}"),
             format!("MAKE={}", u8::from(make)),
         ];
         if !folder.is_empty() {
-            arguments.extend(["WEBOTS_CONTROLLER_URL=participant", "DEFAULT_CONTROLLER=participant"].map(str::to_owned));
+            arguments
+                .extend(["WEBOTS_CONTROLLER_URL=participant", "DEFAULT_CONTROLLER=participant"].map(str::to_owned));
         }
         let identity = request.project.identity();
         let parts = [identity.as_str(), folder, text].into_iter().chain(arguments.iter().map(String::as_str));
-        let key = Sha256::digest(parts.collect::<Vec<_>>().join("\0"));
-        let key = key.iter().take(12).map(|byte| format!("{byte:02x}")).collect();
+        let key = format!("{:032x}", objects::digest(parts.collect::<Vec<_>>().join("\0").as_bytes()));
         let name = format!("Dockerfile{folder}");
         let (dockerfile, text) = (request.project.instance.path().join(name), text.to_owned());
         let file = dockerfile.clone();
@@ -181,7 +198,8 @@ impl Containers {
         (image, controller): (String, Option<String>),
         progress: &(impl Fn(String) + Send + Sync),
     ) -> Result<Prepared, String> {
-        let machine = self.machine.get_or_try_init(|| Machine::ask(&self.docker)).await.map_err(|error| error.to_string())?;
+        let machine =
+            self.machine.get_or_try_init(|| Machine::ask(&self.docker)).await.map_err(|error| error.to_string())?;
         let volumes = self.volumes(&image, controller.as_deref(), &recipe).await?;
         let (config, templates) = (Arc::clone(&self.config), self.templates.clone());
         let (name, machine, asks) = (lease.name.clone(), machine.clone(), recipe.asks.clone());
@@ -224,7 +242,12 @@ impl Containers {
     }
 
     /// Where the images of the services keep data: such places would be on the machine's disk without a limit.
-    async fn volumes(&self, image: &str, controller: Option<&str>, recipe: &Recipe) -> Result<Vec<(String, String)>, String> {
+    async fn volumes(
+        &self,
+        image: &str,
+        controller: Option<&str>,
+        recipe: &Recipe,
+    ) -> Result<Vec<(String, String)>, String> {
         let editor = (recipe.asks.kind != Kind::Default).then_some(self.config.container.editor_image.as_str());
         let mut all = Vec::new();
         for (service, image) in [("webots", Some(image)), ("controller", controller), ("theia", editor)] {
@@ -249,20 +272,6 @@ impl Containers {
         let pairs = listed.lines().filter_map(|line| line.split_once(' '));
         Ok(pairs.map(|(service, container)| (service.to_owned(), container.to_owned())).collect())
     }
-}
-
-/// Why the daemon can't be used now, in words for clients and administrators. Blocks for five seconds at most.
-#[must_use]
-pub fn daemon_fault() -> Option<String> {
-    let mut command = std::process::Command::new("timeout");
-    command.args(["5", "docker", "version", "--format", "{{.Server.Version}}"]).stdin(std::process::Stdio::null());
-    let output = match command.output() {
-        Ok(output) if output.status.success() => return None,
-        Ok(output) => String::from_utf8_lossy(&output.stderr).trim().to_owned(),
-        Err(error) => error.to_string(),
-    };
-    let line = output.lines().last().unwrap_or("it gives no answer within 5 seconds");
-    Some(format!("Docker does not answer on this simulation server: {}", crate::shared::text::one_line(line)))
 }
 
 /// The image of Webots for a version: those up to R2023a are made on Ubuntu 20.04, later ones on 22.04.

@@ -59,7 +59,9 @@ impl Copy<'_> {
 
 fn not_copied(error: DockerError, from: &str) -> String {
     match error {
-        DockerError::Failed { message, .. } if message.contains("ould not find") || message.contains("o such container:path") => {
+        DockerError::Failed { message, .. }
+            if message.contains("ould not find") || message.contains("o such container:path") =>
+        {
             format!("The image of this project has no folder {from}: its Dockerfile has to COPY the project there")
         }
         error => error.to_string(),

@@ -59,8 +59,12 @@ const LONGEST_LINE: usize = 1000;
 /// How much is read at once, in bytes, and how long is waited after it: a build that prints without end waits.
 const CHUNK: (usize, Duration) = (16 * 1024, Duration::from_millis(5));
 /// How a message begins that says that nobody listens.
-const NO_DAEMON: [&str; 4] =
-    ["cannot connect to the docker daemon", "couldn't connect to docker daemon", "error during connect", "permission denied while trying to connect"];
+const NO_DAEMON: [&str; 4] = [
+    "cannot connect to the docker daemon",
+    "couldn't connect to docker daemon",
+    "error during connect",
+    "permission denied while trying to connect",
+];
 
 impl Docker {
     /// Finds out how Docker is called here. Blocks for some seconds at most.
@@ -68,7 +72,8 @@ impl Docker {
     /// # Errors
     /// What is missing, in words for an administrator.
     pub fn find(mark: &Path) -> Result<Self, String> {
-        which("docker").map_err(|_| "docker is not there; on Debian and Ubuntu the package docker.io has it".to_owned())?;
+        which("docker")
+            .map_err(|_| "docker is not there; on Debian and Ubuntu the package docker.io has it".to_owned())?;
         let mut plugin = std::process::Command::new("timeout");
         plugin.arg(FIND.as_secs().to_string()).args(["docker", "compose", "version"]);
         let is_plugin = plugin.stdin(std::process::Stdio::null()).output().is_ok_and(|output| output.status.success());
@@ -77,7 +82,9 @@ impl Docker {
         } else if which("docker-compose").is_ok() {
             &["docker-compose"]
         } else {
-            return Err("docker compose is not there; the package docker-compose or docker-compose-plugin has it".to_owned());
+            return Err(
+                "docker compose is not there; the package docker-compose or docker-compose-plugin has it".to_owned()
+            );
         };
         Ok(Self { compose: compose.iter().map(OsString::from).collect(), mark: mark.to_owned() })
     }
@@ -95,7 +102,12 @@ impl Docker {
     ///
     /// # Errors
     /// When it fails or takes longer than the limit.
-    pub async fn follow(&self, arguments: Vec<OsString>, limit: Duration, told: impl FnMut(&str)) -> Result<(), DockerError> {
+    pub async fn follow(
+        &self,
+        arguments: Vec<OsString>,
+        limit: Duration,
+        told: impl FnMut(&str),
+    ) -> Result<(), DockerError> {
         self.call(std::iter::once("docker".into()).chain(arguments).collect(), limit, told).await.map(drop)
     }
 
@@ -122,8 +134,14 @@ impl Docker {
         }
     }
 
-    async fn call(&self, command: Vec<OsString>, limit: Duration, told: impl FnMut(&str)) -> Result<String, DockerError> {
-        let name: Vec<_> = command.iter().take_while(|word| !word.as_encoded_bytes().starts_with(b"-")).take(3).collect();
+    async fn call(
+        &self,
+        command: Vec<OsString>,
+        limit: Duration,
+        told: impl FnMut(&str),
+    ) -> Result<String, DockerError> {
+        let name: Vec<_> =
+            command.iter().take_while(|word| !word.as_encoded_bytes().starts_with(b"-")).take(3).collect();
         let name = name.iter().map(|word| word.to_string_lossy()).collect::<Vec<_>>().join(" ");
         let broken = |error: std::io::Error| DockerError::NotStarted(error.to_string());
         let spec = self.spec(command, Duration::from_millis(500));

@@ -41,7 +41,8 @@ fn keyword(instruction: &str) -> String {
 
 fn check(instruction: &str) -> Result<(), String> {
     let words = keyword(instruction);
-    let added = if words == "ONBUILD" { keyword(instruction.trim().get(words.len()..).unwrap_or_default()) } else { words };
+    let added =
+        if words == "ONBUILD" { keyword(instruction.trim().get(words.len()..).unwrap_or_default()) } else { words };
     let is_remote = instruction.contains("://") || instruction.contains("git@") || instruction.contains('$');
     if added == "ADD" && is_remote {
         return Err(format!(

@@ -58,13 +58,7 @@ impl Images {
     /// The images of this owner.
     #[must_use]
     pub fn new(docker: Docker, owner: Owner, builds: usize, limit: Duration) -> Self {
-        Self {
-            docker,
-            owner,
-            limit,
-            builds: Semaphore::new(builds),
-            jobs: SingleFlight::default(),
-        }
+        Self { docker, owner, limit, builds: Semaphore::new(builds), jobs: SingleFlight::default() }
     }
 
     /// The name under which this server keeps its images. No other image has it.
@@ -114,7 +108,8 @@ impl Images {
 
     async fn build_now(&self, name: &str, build: Build, news: watch::Sender<String>) -> Result<(), String> {
         let _permit = self.permit(&news).await?;
-        let mut words = ["build", "--force-rm", "--network", build.network, "--tag", name, "--file"].map(OsString::from).to_vec();
+        let mut words =
+            ["build", "--force-rm", "--network", build.network, "--tag", name, "--file"].map(OsString::from).to_vec();
         words.push(build.dockerfile.clone().into());
         words.extend(build.arguments.iter().flat_map(|argument| ["--build-arg".into(), argument.into()]));
         words.push(build.context.clone().into());
@@ -127,10 +122,10 @@ impl Images {
                 news.send(text).ok();
             }
         };
-        let built = self.docker.follow(words, self.limit, told).await;
+        let done = self.docker.follow(words, self.limit, told).await;
         // Until here the folder that is copied from has to stay.
         drop(build.project);
-        built.map_err(|error| not_built(&step, &error))
+        done.map_err(|error| not_built(&step, &error))
     }
 
     async fn permit(&self, news: &watch::Sender<String>) -> Result<tokio::sync::SemaphorePermit<'_>, String> {
@@ -191,7 +186,8 @@ impl Images {
     /// The images that this server has built. What they share with others does not count for their size.
     async fn own(&self) -> Result<Vec<Own>, DockerError> {
         let repository = self.repository();
-        let names = self.docker.run(&["image", "ls", "--format", "{{.Repository}}:{{.Tag}}", &repository], SHORT).await?;
+        let names =
+            self.docker.run(&["image", "ls", "--format", "{{.Repository}}:{{.Tag}}", &repository], SHORT).await?;
         let names: Vec<&str> = names.lines().collect();
         if names.is_empty() {
             return Ok(Vec::new());
@@ -282,9 +278,14 @@ mod tests {
 
     #[test]
     fn an_image_that_is_not_there_is_told_in_words_and_only_where_a_stage_begins() {
-        let failed = |message: &str| DockerError::Failed { command: "docker build".to_owned(), message: message.to_owned() };
-        let told = not_built("Step 1/4 : FROM cyberbotics/webots.cloud:R1-ubuntu22.04 AS a", &failed("manifest unknown"));
-        assert!(told.starts_with("There is no image cyberbotics/webots.cloud:R1-ubuntu22.04 for this version"), "{told}");
+        let failed =
+            |message: &str| DockerError::Failed { command: "docker build".to_owned(), message: message.to_owned() };
+        let told =
+            not_built("Step 1/4 : FROM cyberbotics/webots.cloud:R1-ubuntu22.04 AS a", &failed("manifest unknown"));
+        assert!(
+            told.starts_with("There is no image cyberbotics/webots.cloud:R1-ubuntu22.04 for this version"),
+            "{told}"
+        );
         let told = not_built("Step 2/4 : RUN make", &failed("make: not found"));
         assert_eq!(told, "The image of this project can't be built: make: not found (Step 2/4 : RUN make)");
     }

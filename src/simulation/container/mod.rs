@@ -1,5 +1,6 @@
 //! Simulations in containers of Docker: what a project asks for, its image, and a compose project for each simulation.
 
+mod check;
 mod compose;
 mod containers;
 mod copy;
@@ -16,7 +17,8 @@ mod templates;
 mod tidy;
 mod webots_yml;
 
-pub use containers::{Containers, Request, daemon_fault};
+pub use check::{check, daemon_fault};
+pub use containers::{Containers, Request};
 pub use objects::{Owner, sweep};
 pub use prepared::Prepared;
 pub use webots_yml::{Kind, WebotsYml};

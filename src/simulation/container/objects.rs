@@ -22,15 +22,17 @@ pub struct Owner(String);
 /// How long a sweep may take for each command, in seconds.
 const SWEEP: &str = "20";
 /// What a project consists of besides containers: how these are listed, and removed.
-const REST: [(&str, &[&str], &[&str]); 2] =
-    [("volume", &["volume", "ls", "--quiet"], &["volume", "rm", "--force"]), ("network", &["network", "ls", "--quiet"], &["network", "rm"])];
+const REST: [(&str, &[&str], &[&str]); 2] = [
+    ("volume", &["volume", "ls", "--quiet"], &["volume", "rm", "--force"]),
+    ("network", &["network", "ls", "--quiet"], &["network", "rm"]),
+];
 
 impl Owner {
     /// The server that has this cache folder, which no other one has.
     #[must_use]
     pub fn of(cache: &Path) -> Self {
-        let digest = Sha256::digest(cache.canonicalize().unwrap_or_else(|_| cache.to_owned()).as_os_str().as_encoded_bytes());
-        Self(digest.iter().take(6).map(|byte| format!("{byte:02x}")).collect())
+        let cache = cache.canonicalize().unwrap_or_else(|_| cache.to_owned());
+        Self(format!("{:012x}", digest(cache.as_os_str().as_encoded_bytes()) >> 80))
     }
 
     /// The name of an owner as [`Self::name`] gives it.
@@ -65,6 +67,12 @@ impl Owner {
         let prefix = self.prefix();
         Ok(listed.lines().filter(|name| name.starts_with(&prefix)).map(str::to_owned).collect())
     }
+}
+
+/// A number that tells one text from all others.
+#[must_use]
+pub fn digest(text: &[u8]) -> u128 {
+    Sha256::digest(text).iter().take(16).fold(0, |number: u128, byte| (number << 8) | u128::from(*byte))
 }
 
 /// Removes a project with all that belongs to it.
@@ -123,7 +131,6 @@ fn quietly(arguments: Vec<OsString>) -> String {
     command.arg(SWEEP).arg("docker").args(arguments).stdin(Stdio::null()).stderr(Stdio::null());
     command.output().map(|output| String::from_utf8_lossy(&output.stdout).into_owned()).unwrap_or_default()
 }
-
 
 #[cfg(test)]
 mod tests {

@@ -15,7 +15,9 @@ pub fn world_in(project: &Project) -> Result<String, String> {
     let root = project.folder().canonicalize().map_err(|error| error.to_string())?;
     let name = project.world.path.file_name().unwrap_or_default();
     let path = root.join("worlds").join(name);
-    let path = path.canonicalize().map_err(|_| format!("The image of this project has no worlds/{}", name.to_string_lossy()))?;
+    let path = path
+        .canonicalize()
+        .map_err(|_| format!("The image of this project has no worlds/{}", name.to_string_lossy()))?;
     if !path.is_file() {
         return Err(format!("worlds/{} of this project is no file in its image", name.to_string_lossy()));
     }
@@ -53,4 +55,3 @@ pub fn volume_of(kind: &Kind) -> Option<&str> {
         Kind::Editor { folder } | Kind::Competition { folder } => Some(folder),
     }
 }
-

@@ -59,7 +59,13 @@ impl Drop for Lease {
 impl Prepared {
     /// The containers of a project that was made: pairs of service and container.
     #[must_use]
-    pub fn new(docker: Docker, lease: Lease, containers: Vec<(String, String)>, texts: Vec<String>, warnings: Vec<String>) -> Self {
+    pub fn new(
+        docker: Docker,
+        lease: Lease,
+        containers: Vec<(String, String)>,
+        texts: Vec<String>,
+        warnings: Vec<String>,
+    ) -> Self {
         Self { docker, lease, containers, texts, warnings, restart: None }
     }
 
@@ -80,7 +86,8 @@ impl Prepared {
     /// # Errors
     /// When Docker fails.
     pub async fn start_others(&mut self) -> Result<(), DockerError> {
-        let others = self.containers.iter().filter(|(service, _)| service != WEBOTS).map(|(_, container)| container.as_str());
+        let others =
+            self.containers.iter().filter(|(service, _)| service != WEBOTS).map(|(_, container)| container.as_str());
         let words: Vec<&str> = std::iter::once("start").chain(others).collect();
         if words.len() > 1 {
             self.docker.run(&words, SHORT).await?;

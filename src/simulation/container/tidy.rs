@@ -71,4 +71,3 @@ async fn tidy(docker: &Docker, owner: &Owner, live: &Live) -> Result<(), DockerE
     }
     Ok(())
 }
-
