@@ -30,27 +30,18 @@ impl std::fmt::Display for Finding {
 /// Checks everything. It runs programs and connects to the display, so it can take some seconds.
 #[must_use]
 pub fn check(config: &SimulationConfig) -> Vec<Finding> {
-    let on_machine = if config.isolation == Isolation::Container {
-        vec![Finding { topic: "docker", result: container::check(config) }]
+    let (first, last) = if config.isolation == Isolation::Container {
+        (vec![Finding { topic: "docker", result: container::check(config) }], None)
     } else {
-        vec![
-            Finding { topic: "webots", result: webots(config) },
-            Finding { topic: "display", result: display(config) },
-            Finding { topic: "Xvfb", result: xvfb(config) },
-        ]
+        let first = [("webots", webots(config)), ("display", display(config))];
+        let first = first.map(|(topic, result)| Finding { topic, result });
+        (first.into(), Some(Finding { topic: "Xvfb", result: xvfb(config) }))
     };
-    let always = [
-        Finding {
-            topic: "git",
-            result: version(&["git", "--version"], "git is not there: no world can be checked out"),
-        },
-        Finding {
-            topic: "git-lfs",
-            result: version(&["git-lfs", "--version"], "git-lfs is not there: large files of Git LFS will be missing"),
-        },
-        Finding { topic: "isolation", result: isolation(config) },
-    ];
-    on_machine.into_iter().chain(always).collect()
+    let git = version(&["git", "--version"], "git is not there: no world can be checked out");
+    let lfs = version(&["git-lfs", "--version"], "git-lfs is not there: large files of Git LFS will be missing");
+    let always = [("git", git), ("git-lfs", lfs)].map(|(topic, result)| Finding { topic, result });
+    let isolation = Finding { topic: "isolation", result: isolation(config) };
+    first.into_iter().chain(always).chain(last).chain([isolation]).collect()
 }
 
 fn webots(config: &SimulationConfig) -> Result<String, String> {

@@ -12,7 +12,7 @@ use crate::support::needs;
 const KINDS: [&str; 3] = ["default", "theia", "competition"];
 /// What the server tells compose.
 const VARIABLES: &str = "IMAGE=webots-fleet/project:1\nCONTROLLER_IMAGE=webots-fleet/controller:1\nTHEIA_IMAGE=editor:1\n\
-    PROJECT_PATH=/usr/local/webots-project\nMAKE=0\nPORT=2001\nTHEIA_PORT=2501\nCOMPOSE_PROJECT_NAME=one\n\
+    PROJECT_PATH=/usr/local/webots-project\nMAKE=0\nBIND=0.0.0.0\nPORT=2001\nTHEIA_PORT=2501\nCOMPOSE_PROJECT_NAME=one\n\
     THEIA_VOLUME=webots-project/controllers/edit/\nTHEIA_FOLDER=/srv/one/project/controllers/edit\n\
     PROJECT=/srv/one/project\nIPC=/srv/one/ipc\nDISPLAY=:0\n\
     WEBOTS=\"webots --batch --port=2001 '/usr/local/webots-project/worlds/a b.wbt'\"\n";
@@ -64,19 +64,15 @@ fn plain(mut service: Value) -> Value {
     service_map.remove("networks");
     for (key, entries) in service_map.iter_mut().filter(|(key, _)| *key == "ports" || *key == "volumes") {
         for entry in entries.as_array_mut().unwrap() {
-            let short = match (key.as_str(), &*entry) {
+            let short: String = match (key.as_str(), &*entry) {
                 ("ports", Value::Object(port)) => format!("{}:{}", number(&port["published"]), number(&port["target"])),
                 ("volumes", Value::Object(mount)) => {
                     format!("{}:{}", number(&mount["source"]), number(&mount["target"]))
                 }
-                (_, text) => text.as_str().unwrap().trim_end_matches(":rw").trim_end_matches("/tcp").to_owned(),
+                (_, text) => text.as_str().unwrap().trim_end_matches(":rw").trim_end_matches("/tcp").trim_start_matches("0.0.0.0:").to_owned(),
             };
             *entry = json!(short.replace("/edit/", "/edit"));
         }
-    }
-    if let Value::Array(words) = &service["command"] {
-        assert_eq!(words.len(), 4, "{words:?}");
-        service["command"] = json!("webots --batch --port=2001 '/usr/local/webots-project/worlds/a b.wbt'");
     }
     for empty in ["command", "entrypoint"] {
         if service[empty].is_null() {
@@ -94,9 +90,8 @@ fn expected(kind: &str) -> BTreeMap<String, Value> {
     let mounts = [&["/srv/one/project:/usr/local/webots-project"], shared].concat();
     let webots = json!({
         "image": "webots-fleet/project:1",
-        "command": "webots --batch --port=2001 '/usr/local/webots-project/worlds/a b.wbt'",
         "working_dir": "/usr/local/webots-project",
-        "environment": {"DISPLAY": ":0", "USER": "webots"},
+        "environment": {"USER": "webots"},
         "ports": ["2001:2001"],
         "volumes": mounts,
     });
