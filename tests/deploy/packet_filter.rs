@@ -129,6 +129,11 @@ impl Network {
             skip("only root may make networks");
             return None;
         };
+        let forwards = ["/proc/sys/net/ipv4/ip_forward", "/proc/sys/net/ipv6/conf/all/forwarding"];
+        if !machine.within(|| forwards.iter().all(|file| std::fs::write(file, "1").is_ok())) {
+            skip("this machine does not forward");
+            return None;
+        }
         if !Path::new("/usr/sbin/nft").exists() || !machine.nft(&["add", "table", "inet", "probe"]) {
             skip("there is no nft, or the kernel has no nftables");
             return None;
@@ -143,8 +148,6 @@ impl Network {
     fn lay_cables(&self) {
         self.machine.run(
             "ip link set lo up
-            echo 1 >/proc/sys/net/ipv4/ip_forward
-            echo 1 >/proc/sys/net/ipv6/conf/all/forwarding
             ip link add webots-fleet type bridge
             ip link add webots-closed type bridge
             ip link set webots-fleet up
