@@ -12,10 +12,9 @@ use crate::support::needs;
 const KINDS: [&str; 3] = ["default", "theia", "competition"];
 /// What the server tells compose.
 const VARIABLES: &str = "IMAGE=webots-fleet/project:1\nCONTROLLER_IMAGE=webots-fleet/controller:1\nTHEIA_IMAGE=editor:1\n\
-    PROJECT_PATH=/usr/local/webots-project\nMAKE=0\nBIND=0.0.0.0\nPORT=2001\nTHEIA_PORT=2501\nCOMPOSE_PROJECT_NAME=one\n\
+    PROJECT_PATH=/usr/local/webots-project\nMAKE=0\nPORT=2001\nTHEIA_PORT=2501\nCOMPOSE_PROJECT_NAME=one\n\
     THEIA_VOLUME=webots-project/controllers/edit/\nTHEIA_FOLDER=/srv/one/project/controllers/edit\n\
-    PROJECT=/srv/one/project\nIPC=/srv/one/ipc\nDISPLAY=:0\n\
-    WEBOTS=\"webots --batch --port=2001 '/usr/local/webots-project/worlds/a b.wbt'\"\n";
+    PROJECT=/srv/one/project\nIPC=/srv/one/ipc\nBIND=127.0.0.1\n";
 
 fn file(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("config/simulation/docker").join(name)
@@ -64,12 +63,14 @@ fn plain(mut service: Value) -> Value {
     service_map.remove("networks");
     for (key, entries) in service_map.iter_mut().filter(|(key, _)| *key == "ports" || *key == "volumes") {
         for entry in entries.as_array_mut().unwrap() {
-            let short: String = match (key.as_str(), &*entry) {
-                ("ports", Value::Object(port)) => format!("{}:{}", number(&port["published"]), number(&port["target"])),
+            let short = match (key.as_str(), &*entry) {
+                ("ports", Value::Object(port)) => {
+                    format!("{}:{}:{}", number(&port["host_ip"]), number(&port["published"]), number(&port["target"]))
+                }
                 ("volumes", Value::Object(mount)) => {
                     format!("{}:{}", number(&mount["source"]), number(&mount["target"]))
                 }
-                (_, text) => text.as_str().unwrap().trim_end_matches(":rw").trim_end_matches("/tcp").trim_start_matches("0.0.0.0:").to_owned(),
+                (_, text) => text.as_str().unwrap().trim_end_matches(":rw").trim_end_matches("/tcp").to_owned(),
             };
             *entry = json!(short.replace("/edit/", "/edit"));
         }
@@ -92,12 +93,12 @@ fn expected(kind: &str) -> BTreeMap<String, Value> {
         "image": "webots-fleet/project:1",
         "working_dir": "/usr/local/webots-project",
         "environment": {"USER": "webots"},
-        "ports": ["2001:2001"],
+        "ports": ["127.0.0.1:2001:2001"],
         "volumes": mounts,
     });
     let theia = json!({
         "image": "editor:1",
-        "ports": ["2501:3000"],
+        "ports": ["127.0.0.1:2501:3000"],
         "volumes": ["/srv/one/project/controllers/edit:/home/project/webots-project"],
     });
     let folder = "/srv/one/project/controllers/edit:/usr/local/webots-project/controllers/edit";

@@ -7,6 +7,7 @@ mod files;
 mod kubernetes;
 mod listening;
 mod notify;
+mod packet_filter;
 mod ports;
 mod preflight;
 mod prometheus;

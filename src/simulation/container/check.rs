@@ -4,6 +4,7 @@ use std::path::Path;
 use std::process::{Command, Stdio};
 
 use super::docker::Docker;
+use super::packet_filter;
 use crate::shared::text::one_line;
 use crate::simulation::config::SimulationConfig;
 
@@ -14,6 +15,7 @@ use crate::simulation::config::SimulationConfig;
 pub fn check(config: &SimulationConfig) -> Result<String, String> {
     Docker::find(Path::new("/"))?;
     daemon_fault().map_or(Ok(()), Err)?;
+    packet_filter::missing().map_or(Ok(()), Err)?;
     Ok(format!("it answers; worlds run in {}, or the image of their project's Dockerfile", config.container.image))
 }
 

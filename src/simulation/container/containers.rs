@@ -12,6 +12,7 @@ use super::docker::{Docker, DockerError, SHORT};
 use super::image::{Build, Images};
 use super::machine::Machine;
 use super::objects::{self, Owner};
+use super::packet_filter;
 use super::places::{edited_folder, edited_in, volume_of, world_in};
 use super::prepared::{Lease, Prepared};
 use super::recipe::{self, PROJECT_PATH, Recipe};
@@ -31,6 +32,7 @@ pub struct Containers {
     images: Arc<Images>,
     live: Live,
     machine: OnceCell<Machine>,
+    shortcoming: Option<String>,
     config: Arc<SimulationConfig>,
     _keeper: AbortOnDropHandle<()>,
 }
@@ -67,6 +69,10 @@ impl Containers {
         let docker = Docker::find(run)?;
         let owner = Owner::of(&config.cache_dir.0);
         objects::sweep(&owner);
+        let shortcoming = packet_filter::missing();
+        if let Some(why) = &shortcoming {
+            log::warn!("{why}");
+        }
         let settings = &config.container;
         let images = Images::new(docker.clone(), owner.clone(), settings.builds, config.timing.build);
         let (images, live) = (Arc::new(images), Live::default());
@@ -74,13 +80,19 @@ impl Containers {
         let templates =
             Templates { folder: settings.templates.as_ref().map(|folder| folder.0.clone()), debug: settings.debug };
         let keeper = AbortOnDropHandle::new(actix_rt::spawn(keeper));
-        Ok(Self { docker, owner, templates, images, live, machine: OnceCell::new(), config, _keeper: keeper })
+        Ok(Self { docker, owner, templates, images, live, machine: OnceCell::new(), shortcoming, config, _keeper: keeper })
     }
 
     /// Whose containers these are, for a process that removes them after the server's end.
     #[must_use]
     pub fn owner(&self) -> &Owner {
         &self.owner
+    }
+
+    /// What containers may do on this machine that they should not, if so.
+    #[must_use]
+    pub fn shortcoming(&self) -> Option<&str> {
+        self.shortcoming.as_deref()
     }
 
     /// Makes the containers of a simulation, but starts none. `progress` hears each step in words.
