@@ -19,6 +19,7 @@ mod mirrors;
 mod redirect;
 mod refused;
 mod repository;
+mod restored;
 mod revision;
 mod search;
 mod single_flight;
