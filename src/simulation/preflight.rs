@@ -29,7 +29,9 @@ impl std::fmt::Display for Finding {
 /// Checks everything. It runs programs and connects to the display, so it can take some seconds.
 #[must_use]
 pub fn check(config: &SimulationConfig) -> Vec<Finding> {
-    vec![
+    let launcher = Launcher::new(config).map_err(|error| format!("the server does not start: {error}"));
+    let unkept = launcher.as_ref().map(Launcher::unkept).unwrap_or_default();
+    let mut findings = vec![
         Finding { topic: "webots", result: webots(config) },
         Finding { topic: "display", result: display(config) },
         Finding {
@@ -41,8 +43,10 @@ pub fn check(config: &SimulationConfig) -> Vec<Finding> {
             result: version(&["git-lfs", "--version"], "git-lfs is not there: large files of Git LFS will be missing"),
         },
         Finding { topic: "Xvfb", result: xvfb(config) },
-        Finding { topic: "isolation", result: isolation(config) },
-    ]
+        Finding { topic: "isolation", result: launcher.and_then(|launcher| isolation(&launcher)) },
+    ];
+    findings.extend(unkept.into_iter().map(|line| Finding { topic: "limits", result: Err(line) }));
+    findings
 }
 
 fn webots(config: &SimulationConfig) -> Result<String, String> {
@@ -87,8 +91,7 @@ fn xvfb(config: &SimulationConfig) -> Result<String, String> {
     }
 }
 
-fn isolation(config: &SimulationConfig) -> Result<String, String> {
-    let launcher = Launcher::new(config).map_err(|error| format!("the server does not start: {error}"))?;
+fn isolation(launcher: &Launcher) -> Result<String, String> {
     match launcher.shortcoming() {
         Some(why) => Err(format!("none, worlds' programs may do whatever this user may: {why}")),
         None => Ok(launcher.level().to_string()),
