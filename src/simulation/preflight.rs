@@ -40,8 +40,11 @@ pub fn check(config: &SimulationConfig) -> Vec<Finding> {
     let git = version(&["git", "--version"], "git is not there: no world can be checked out");
     let lfs = version(&["git-lfs", "--version"], "git-lfs is not there: large files of Git LFS will be missing");
     let always = [("git", git), ("git-lfs", lfs)].map(|(topic, result)| Finding { topic, result });
-    let isolation = Finding { topic: "isolation", result: isolation(config) };
-    first.into_iter().chain(always).chain(last).chain([isolation]).collect()
+    let launcher = Launcher::new(config).map_err(|error| format!("the server does not start: {error}"));
+    let unkept = launcher.as_ref().map(Launcher::unkept).unwrap_or_default();
+    let unkept = unkept.into_iter().map(|line| Finding { topic: "limits", result: Err(line) });
+    let isolation = Finding { topic: "isolation", result: launcher.and_then(|launcher| isolation(&launcher)) };
+    first.into_iter().chain(always).chain(last).chain([isolation]).chain(unkept).collect()
 }
 
 fn webots(config: &SimulationConfig) -> Result<String, String> {
@@ -86,8 +89,7 @@ fn xvfb(config: &SimulationConfig) -> Result<String, String> {
     }
 }
 
-fn isolation(config: &SimulationConfig) -> Result<String, String> {
-    let launcher = Launcher::new(config).map_err(|error| format!("the server does not start: {error}"))?;
+fn isolation(launcher: &Launcher) -> Result<String, String> {
     match launcher.shortcoming() {
         Some(why) => Err(format!("none, worlds' programs may do whatever this user may: {why}")),
         None => Ok(launcher.level().to_string()),

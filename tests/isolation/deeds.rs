@@ -122,20 +122,49 @@ async fn a_world_sees_and_changes_what_its_level_allows() {
     compare(&Stage::new(), |builder| builder.set("limits.output", 10_000), &[1, 0]).await;
 }
 
-#[actix_rt::test]
-async fn a_sandbox_holds_for_an_ordinary_user_too() {
+/// What runs a server as an ordinary user; nothing where that can't be.
+fn as_nobody() -> Option<&'static str> {
     let program = Path::new(env!("CARGO_BIN_EXE_simulation-server"));
     let may_be_run = |folder: &Path| folder.metadata().unwrap().permissions().mode() & 1 == 1;
     if !nix::unistd::getuid().is_root() || !program.ancestors().all(may_be_run) {
-        return eprintln!("skipped: only root can become somebody else, who may run what was built");
+        eprintln!("skipped: only root can become somebody else, who may run what was built");
+        return None;
     }
+    Some("exec setpriv --reuid=65534 --regid=65534 --clear-groups \"$0\" \"$@\"")
+}
+
+#[actix_rt::test]
+async fn a_sandbox_holds_for_an_ordinary_user_too() {
+    let Some(nobody) = as_nobody() else { return };
     let stage = Stage::new();
-    let nobody = "exec setpriv --reuid=65534 --regid=65534 --clear-groups \"$0\" \"$@\"";
     std::fs::set_permissions(stage.forge.path(), std::fs::Permissions::from_mode(0o755)).unwrap();
     compare(&stage, |builder| builder.before(nobody), &[1]).await;
     let processes = [("be bounded by the kernel", "test $(ulimit -u) = 70".to_owned())];
     let done = stage.tried(&processes, "sandbox", |builder| builder.before(nobody).set("limits.processes", 70)).await;
     assert_eq!(done, ["be bounded by the kernel"]);
+}
+
+#[actix_rt::test]
+async fn a_sandbox_makes_no_user_namespaces_and_sets_nothing_of_the_kernel() {
+    let help = std::process::Command::new("bwrap").arg("--help").output().unwrap();
+    if !String::from_utf8_lossy(&help.stdout).contains("--disable-userns") {
+        return eprintln!("skipped: bubblewrap before 0.8 can't keep programs from making user namespaces");
+    }
+    let set = |file: &str| format!("value=$(cat {file}) && echo $value > {file}");
+    let deeds = [
+        ("read the settings of the kernel", "test -n \"$(cat /proc/sys/vm/swappiness)\"".to_owned()),
+        ("make a user namespace", "unshare --user true".to_owned()),
+        ("make another sandbox", "bwrap --bind / / true".to_owned()),
+        ("set swappiness", set("/proc/sys/vm/swappiness")),
+        ("set what a namespace has", set("/proc/sys/kernel/msgmax")),
+        ("set the limit of namespaces", set("/proc/sys/user/max_user_namespaces")),
+    ];
+    for user in std::iter::once("true").chain(as_nobody()) {
+        let stage = Stage::new();
+        std::fs::set_permissions(stage.forge.path(), std::fs::Permissions::from_mode(0o755)).unwrap();
+        let done = stage.tried(&deeds, "sandbox", |builder| builder.before(user)).await;
+        assert_eq!(done, ["read the settings of the kernel"], "{user}");
+    }
 }
 
 #[actix_rt::test]

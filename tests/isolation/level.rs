@@ -77,7 +77,38 @@ async fn a_sandbox_is_what_a_machine_has_by_itself() {
     assert_eq!(http::get(&server.url("/status")).await.json()["isolation"], "sandbox");
     let page = http::get(&server.url("/monitor")).await.text();
     assert!(page.contains("<dt>Isolation</dt><dd>sandbox</dd>"), "{page}");
-    assert!(!server.log().contains("WARN"), "{}", server.log());
+    let log = server.log();
+    let is_old = |line: &&str| line.contains("only bubblewrap from 0.8 on");
+    assert_eq!(log.lines().filter(|line| line.contains("WARN")).find(|line| !is_old(line)), None);
+}
+
+#[actix_rt::test]
+async fn limits_that_a_machine_can_not_keep_are_told_at_the_start_and_by_a_check() {
+    let (forge, webots, programs) = (Forge::with_arm(), Webots::launcher(), programs(None));
+    let lines = [
+        "limits.openFiles does not hold, and files, core dumps and processes have no limit",
+        "limits.memory does not hold: systemd has not delegated control groups with the controller memory",
+        "limits.cores does not hold: systemd has not delegated control groups with the controller cpu",
+    ];
+    let told = |text: &str, mark: &str| -> Vec<String> {
+        let marked = text.lines().filter(|line| line.contains(mark)).map(str::to_owned);
+        marked.filter(|line| lines.iter().any(|words| line.contains(words))).collect()
+    };
+    let limited = with(simulation_server(&webots.path(), forge.path(), 1), &programs, "none");
+    let server = limited.set("limits.memory", 1000).set("limits.cores", 1).start().await;
+    assert_eq!(told(&server.log(), "WARN").len(), 3, "{}", server.log());
+    let check = |path: &std::ffi::OsStr| {
+        let mut command = std::process::Command::new(env!("CARGO_BIN_EXE_simulation-server"));
+        let output = command.arg("--check").arg(server.folder.join("config.json")).env("PATH", path).output().unwrap();
+        String::from_utf8([output.stdout, output.stderr].concat()).unwrap()
+    };
+    let text = check(programs.path().as_os_str());
+    assert_eq!(told(&text, "warning: limits: ").len(), 3, "{text}");
+    let text = check(&std::env::var_os("PATH").unwrap());
+    assert_eq!(told(&text, "warning: limits: ").len(), 2, "{text}");
+    server.rewrite_config(|config| config["limits"] = json!({}));
+    let text = check(&std::env::var_os("PATH").unwrap());
+    assert_eq!(told(&text, "warning: limits: "), [""; 0], "{text}");
 }
 
 #[actix_rt::test]

@@ -4,3 +4,4 @@ mod deeds;
 mod level;
 mod limits;
 mod lives;
+mod resets;

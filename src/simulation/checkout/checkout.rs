@@ -25,6 +25,7 @@ use super::limits::Limits;
 use super::mirrors::Mirrors;
 use super::project::Project;
 use super::redirect;
+use super::restored::{self, Restored};
 use super::revision::{ALL, Revision};
 use super::steps;
 use super::world_file::NoWorld;
@@ -179,7 +180,8 @@ impl Checkouts {
         self.finder.refused().check(&needed.scope(found))?;
         let name = &found.revision.name;
         progress(steps::checking_out(name, None));
-        let call = copy_call(&found.repository, &found.revision, instance, needed);
+        let project = instance.project();
+        let call = copy_call(&found.repository, &found.revision, (instance, &project), needed);
         let told = |line: &str| {
             if line.contains('%') {
                 progress(steps::checking_out(name, Some(line)));
@@ -187,7 +189,7 @@ impl Checkouts {
         };
         let mut is_too_large = false;
         let end = async {
-            outgrown(&instance.project(), self.limits.size).await;
+            outgrown(&project, self.limits.size).await;
             is_too_large = true;
         };
         let copied = self.git.run_until(end, call, told).await;
@@ -222,9 +224,10 @@ impl Checkouts {
             // git writes again only what is not there.
             tokio::fs::remove_file(path).await.map_err(|error| machine(world, &error))?;
         }
-        let mut call = copy_call(&found.repository, &found.revision, instance, needed);
+        let project = instance.project();
+        let mut call = copy_call(&found.repository, &found.revision, (instance, &project), needed);
         call.settings = lfs::settings(&found.repository.remote());
-        let (project, cached) = (instance.project(), call.repository.join("lfs"));
+        let cached = call.repository.join("lfs");
         let mut is_too_large = false;
         let end = async {
             lfs::outgrown(&project, &cached, self.limits.size).await;
@@ -244,12 +247,7 @@ impl Checkouts {
     /// When it is no file of the checkout there, or git fails.
     pub async fn restore_controller(&self, project: &Project, file: &str) -> Result<(), CheckoutError> {
         let refused = || CheckoutError::NoController(file.to_owned());
-        let plain = |segment: &str| !segment.is_empty() && segment != "." && segment != ".." && !segment.contains('\0');
-        if !file.split('/').all(plain) || !file.contains('/') {
-            return Err(refused());
-        }
-        let slash = if project.place.is_empty() { "" } else { "/" };
-        let path = format!("{}{slash}controllers/{file}", project.place);
+        let path = restored::controller(&project.place, file).ok_or_else(refused)?;
         let start = Instant::now();
         let is_there = match self.restore(project, &path).await {
             Err(error) => {
@@ -267,8 +265,11 @@ impl Checkouts {
         let Some(repository) = self.finder.file(url, revision, path).await? else {
             return Ok(false);
         };
-        let call = copy_call(&repository, revision, instance, &What::Path(path));
+        let failed = |error| machine(url, &error);
+        let restored = Restored::new(instance.path()).map_err(failed)?;
+        let call = copy_call(&repository, revision, (instance, restored.path()), &What::Path(path));
         self.git.run(call, |_| ()).await.map_err(|source| git_failed(url, source))?;
+        restored.place(instance.project(), path.to_owned()).await.map_err(failed)?;
         Ok(true)
     }
 }

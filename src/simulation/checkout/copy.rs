@@ -1,7 +1,7 @@
 //! A client's own copy of a project: how git writes it, and what is in it.
 
 use std::ffi::OsString;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use super::disk::size_of;
 use super::error::{CheckoutError, machine};
@@ -66,16 +66,16 @@ pub async fn what<'found>(found: &'found Found, instance: &InstanceDir) -> std::
     Ok(What::Listed(file))
 }
 
-/// Writes a part of a commit into a client's folder, which has an index of its own.
+/// Writes a part of a commit into the project's folder, or into another one. A client's copy has an index of its own.
 #[must_use]
 pub fn copy_call<'call>(
     repository: &'call Repository,
     revision: &Revision,
-    instance: &InstanceDir,
+    (instance, into): (&InstanceDir, &Path),
     what: &What<'_>,
 ) -> Call<'call> {
     let mut work_tree = OsString::from("--work-tree=");
-    work_tree.push(instance.project());
+    work_tree.push(into);
     let reference = revision.reference();
     let mut arguments = vec![work_tree];
     arguments.extend(["checkout", "--force", "--progress"].map(OsString::from));

@@ -20,6 +20,7 @@ mod project;
 mod redirect;
 mod refused;
 mod repository;
+mod restored;
 mod revision;
 mod search;
 mod single_flight;

@@ -19,6 +19,9 @@ pub struct Cgroups {
     settings: Vec<(&'static str, String)>,
 }
 
+/// What control groups can limit, by the kernel's names.
+pub type Controllers = Vec<&'static str>;
+
 /// The control group of one simulation. Dropping it ends all that is inside, and removes it.
 #[derive(Debug)]
 pub struct Cgroup {
@@ -60,11 +63,16 @@ impl Cgroups {
             std::fs::create_dir(&own)?;
         }
         std::fs::write(own.join("cgroup.procs"), std::process::id().to_string())?;
-        let offered = std::fs::read_to_string(folder.join("cgroup.controllers"))?;
-        for controller in CONTROLLERS.iter().filter(|name| offered.split_whitespace().any(|one| one == **name)) {
+        for controller in offered(folder)? {
             std::fs::write(folder.join("cgroup.subtree_control"), format!("+{controller}"))?;
         }
         Ok(())
+    }
+
+    /// What the control groups of simulations limit on a server that starts now.
+    #[must_use]
+    pub fn controllers() -> Controllers {
+        own_folder().and_then(|folder| offered(&folder).ok()).unwrap_or_default()
     }
 
     /// Makes a group for a simulation. Where that fails, it runs without.
@@ -127,6 +135,13 @@ impl Drop for Cgroup {
         // Where there is no thread, systemd removes the group with the unit.
         drop(std::thread::Builder::new().spawn(remove));
     }
+}
+
+/// What can be limited below a group.
+fn offered(folder: &Path) -> io::Result<Controllers> {
+    let offered = std::fs::read_to_string(folder.join("cgroup.controllers"))?;
+    let is_offered = |name: &&str| offered.split_whitespace().any(|one| one == *name);
+    Ok(CONTROLLERS.into_iter().filter(is_offered).collect())
 }
 
 /// The limits as the kernel has them. A simulation that runs out of memory ends as a whole.

@@ -15,6 +15,7 @@ use super::cgroup::{Cgroup, Cgroups};
 use super::environment;
 use super::program::Program;
 use super::sandbox::Sandbox;
+use super::unkept::{Means, unkept};
 use crate::simulation::config::{Isolation, Resources, SimulationConfig, VariableName};
 use crate::simulation::process::SpawnSpec;
 
@@ -67,7 +68,7 @@ impl Launcher {
     /// # Errors
     /// When the configuration demands a level that can't be had.
     pub fn new(config: &SimulationConfig) -> Result<Self, IsolationError> {
-        let sandbox = || Sandbox::new(config).and_then(|sandbox| sandbox.try_out().map(|()| sandbox));
+        let sandbox = || Sandbox::new(config).and_then(Sandbox::tried);
         let (method, shortcoming) = match config.isolation {
             Isolation::None => (Method::Plain, None),
             Isolation::Container => (Method::Container, None),
@@ -98,8 +99,28 @@ impl Launcher {
             Some(why) => log::warn!("worlds' programs may do whatever this user may (isolation: none): {why}"),
             None => log::info!("isolation: {}", launcher.level()),
         }
-        launcher.cgroups = Cgroups::delegated(&launcher.limits);
+        for line in launcher.unkept() {
+            log::warn!("{line}");
+        }
+        if launcher.level() != Level::Container {
+            launcher.cgroups = Cgroups::delegated(&launcher.limits);
+        }
         Ok(launcher)
+    }
+
+    /// Which limits this machine can't keep, a line each. Before simulations have control groups.
+    #[must_use]
+    pub fn unkept(&self) -> Vec<String> {
+        if self.level() == Level::Container {
+            // Docker keeps them.
+            return Vec::new();
+        }
+        let means = Means {
+            has_prlimit: self.prlimit.is_some(),
+            leaves_namespaces: matches!(&self.method, Method::Sandbox(sandbox) if !sandbox.ends_namespaces()),
+            controllers: Cgroups::controllers(),
+        };
+        unkept(&means, &self.limits)
     }
 
     /// The level.

@@ -5,6 +5,7 @@ mod environment;
 mod launcher;
 mod program;
 mod sandbox;
+mod unkept;
 mod watch;
 
 pub use cgroup::Cgroup;

@@ -23,6 +23,8 @@ pub struct Sandbox {
     user: u32,
     homes: Vec<PathBuf>,
     places: Vec<Place>,
+    /// Whether programs inside can be kept from making user namespaces, which bubblewrap can from 0.8 on.
+    ends_namespaces: bool,
 }
 
 /// A file or folder of which a sandbox shows something else than the system has there.
@@ -87,7 +89,7 @@ impl Sandbox {
         // Last, for nothing makes up for these.
         places.extend(hidden_of(config));
         places.retain(|place| place.at.exists());
-        Ok(Self { bubblewrap, user: nix::unistd::getuid().as_raw(), homes: homes(), places })
+        Ok(Self { bubblewrap, user: nix::unistd::getuid().as_raw(), homes: homes(), places, ends_namespaces: true })
     }
 
     /// The command that runs a program in a sandbox of its own. Makes the folders that it needs in the instance's folder.
@@ -100,7 +102,12 @@ impl Sandbox {
             ["--die-with-parent", "--new-session", "--unshare-pid", "--unshare-ipc", "--cap-drop", "ALL"]
                 .map(Into::into),
         );
+        if self.ends_namespaces {
+            command.extend(["--unshare-user", "--disable-userns"].map(Into::into));
+        }
         command.extend(["--ro-bind", "/", "/", "--dev", "/dev", "--proc", "/proc"].map(Into::into));
+        // The kernel lets root write there without any capability.
+        command.extend(["--ro-bind-try", "/proc/sys", "/proc/sys"].map(Into::into));
         for device in devices() {
             command.extend(["--dev-bind-try".into(), device.clone().into(), device.into()]);
         }
@@ -160,9 +167,20 @@ impl Sandbox {
     ///
     /// # Errors
     /// Why not, and what to do about it, in words for an administrator.
-    pub fn try_out(&self) -> Result<(), String> {
+    pub fn tried(mut self) -> Result<Self, String> {
+        let mut tried = self.trial();
+        // One that does not end will not without these options.
+        if tried.as_ref().is_err_and(|error| error.kind() != io::ErrorKind::TimedOut) {
+            self.ends_namespaces = false;
+            tried = self.trial();
+        }
         let told = |error: io::Error| one_line(error.to_string().trim());
-        self.trial().map_err(|error| format!("bubblewrap makes no sandbox here ({}): {REMEDY}", told(error)))
+        tried.map(|()| self).map_err(|error| format!("bubblewrap makes no sandbox here ({}): {REMEDY}", told(error)))
+    }
+
+    /// Whether programs inside can't make user namespaces.
+    pub fn ends_namespaces(&self) -> bool {
+        self.ends_namespaces
     }
 
     /// Runs a program that does nothing in a sandbox that has everything.
@@ -188,7 +206,7 @@ impl Sandbox {
             if Instant::now() >= deadline {
                 trial.kill()?;
                 trial.wait()?;
-                return Err(io::Error::other("it does not end"));
+                return Err(io::Error::new(io::ErrorKind::TimedOut, "it does not end"));
             }
             std::thread::sleep(Duration::from_millis(1));
         }

@@ -1,0 +1,100 @@
+//! A reset of a controller writes into the project and nowhere else, whatever the world's program makes of its folders.
+
+use std::path::Path;
+
+use crate::simulation::scene::{DEMO, arm, instance_folders, nothing_left};
+use crate::support::client::Client;
+use crate::support::git::Forge;
+use crate::support::program::simulation_server;
+use crate::support::until;
+use crate::support::webots::Webots;
+
+const LEVELS: [&str; 2] = ["none", "sandbox"];
+/// What the controller of [`Forge::with_arm`] has.
+const ORIGINAL: &str = "print('original')\n";
+
+/// Asks for a reset, and gives back the answer.
+async fn reset(client: &mut Client) -> String {
+    client.send(r#"{"reset controller": "c/c.py"}"#).await;
+    loop {
+        let answer = client.until("").await;
+        if answer.starts_with("reset") || answer.starts_with("loading: Error") {
+            return answer;
+        }
+    }
+}
+
+#[actix_rt::test]
+async fn a_reset_replaces_links_and_does_not_follow_them() {
+    let table = [
+        ("ln -sf VICTIM controllers/c/c.py", true),
+        ("rm -r controllers/c; ln -s OUTSIDE controllers/c", true),
+        ("rm -r controllers; ln -s OUTSIDE controllers", true),
+        ("rm -r controllers; touch controllers", true),
+        ("rm -r controllers", true),
+        ("rm controllers/c/c.py; mkfifo controllers/c/c.py", true),
+        ("rm controllers/c/c.py; mkdir controllers/c/c.py; touch controllers/c/c.py/mine", false),
+    ];
+    for level in LEVELS {
+        for (deed, is_restored) in table {
+            let (forge, outside) = (Forge::with_arm(), tempfile::tempdir_in(env!("CARGO_TARGET_TMPDIR")).unwrap());
+            let victim = outside.path().join("victim");
+            std::fs::write(&victim, "untouched").unwrap();
+            std::fs::create_dir(outside.path().join("c")).unwrap();
+            let deed = deed.replace("VICTIM", victim.to_str().unwrap());
+            let deed = deed.replace("OUTSIDE", outside.path().to_str().unwrap());
+            // What a project's folder says of files and repositories is not for the server's git.
+            let git = "echo '*.py working-tree-encoding=UTF-16' > .gitattributes; echo 'gitdir: /tmp' > .git";
+            let webots = Webots::script(&format!("{deed}\n{git}\n{DEMO} \"$@\" & wait"));
+            let server = simulation_server(&webots.path(), forge.path(), 1).set("isolation", level).start().await;
+            let mut client = Client::start(&server, &arm()).await;
+            client.until("webots:").await;
+            let answer = reset(&mut client).await;
+            let folder = instance_folders(&server.folder)[0].clone();
+            let file = folder.join("project/controllers/c/c.py");
+            assert_eq!(answer.starts_with("reset"), is_restored, "{level}, {deed}: {answer}");
+            if is_restored {
+                assert!(file.symlink_metadata().unwrap().is_file(), "{level}, {deed}");
+                assert_eq!(std::fs::read_to_string(&file).unwrap(), ORIGINAL, "{level}, {deed}");
+                assert_eq!(file.canonicalize().unwrap(), file, "{level}, {deed}");
+            }
+            assert_eq!(std::fs::read_to_string(&victim).unwrap(), "untouched", "{level}, {deed}");
+            let inside = |folder: &Path| std::fs::read_dir(folder).unwrap().count();
+            assert_eq!((inside(outside.path()), inside(&outside.path().join("c"))), (2, 0), "{level}, {deed}");
+            let left: Vec<_> = std::fs::read_dir(&folder).unwrap().flatten().map(|entry| entry.file_name()).collect();
+            assert!(!left.iter().any(|name| name.to_string_lossy().starts_with("restored")), "{left:?}");
+            client.leave().await;
+            nothing_left(&server, 1).await;
+        }
+    }
+}
+
+/// Exchanges two names for ever: the folder of a controller, and a link that leads out of the project. Removes the file that
+/// is reset.
+const EXCHANGE: &str = "import ctypes, os, sys\n\
+    os.symlink(sys.argv[1], 'controllers/x')\n\
+    libc, folder = ctypes.CDLL(None), os.open('controllers/c', os.O_RDONLY)\n\
+    open('exchanging', 'w').close()\n\
+    while True: [libc.renameat2(-100, b'controllers/c', -100, b'controllers/x', 2) for n in range(7)], \
+    libc.unlinkat(folder, b'c.py', 0)\n";
+
+#[actix_rt::test]
+async fn who_exchanges_folders_and_links_during_a_reset_leads_nothing_out_of_the_project() {
+    let (forge, outside) = (Forge::with_arm(), tempfile::tempdir_in(env!("CARGO_TARGET_TMPDIR")).unwrap());
+    let outside_shown = outside.path().display();
+    let webots = Webots::script(&format!("python3 -c \"{EXCHANGE}\" {outside_shown} &\n{DEMO} \"$@\" & wait"));
+    let server = simulation_server(&webots.path(), forge.path(), 1).set("isolation", "sandbox");
+    // A client may ask for so much between two pings.
+    let server = server.set("timing.ping", 0.2).start().await;
+    let mut client = Client::start(&server, &arm()).await;
+    client.until("webots:").await;
+    let project = instance_folders(&server.folder)[0].join("project");
+    until("the names are exchanged", async || project.join("exchanging").exists()).await;
+    for _ in 0..100 {
+        reset(&mut client).await;
+    }
+    let written = std::fs::read_dir(outside.path()).unwrap().count();
+    assert_eq!(written, 0, "it was written outside of the project");
+    client.leave().await;
+    nothing_left(&server, 1).await;
+}
