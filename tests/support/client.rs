@@ -30,8 +30,14 @@ pub enum Heard {
 impl Client {
     /// Connects.
     pub async fn connect(url: &str) -> Self {
-        let (socket, _) = tokio_tungstenite::connect_async(url).await.unwrap_or_else(|error| panic!("{url}: {error}"));
-        Self::new(socket)
+        Self::try_connect(url).await.unwrap_or_else(|error| panic!("{url}: {error}"))
+    }
+
+    /// Connects to a server that may not be there.
+    pub async fn try_connect(url: &str) -> Result<Self, String> {
+        let connecting = actix_rt::time::timeout(SOON, tokio_tungstenite::connect_async(url)).await;
+        let connected = connecting.map_err(|error| error.to_string())?;
+        connected.map(|(socket, _)| Self::new(socket)).map_err(|error| error.to_string())
     }
 
     /// Takes over a connection.
@@ -61,9 +67,22 @@ impl Client {
         connected.map(|(socket, _)| Self::new(socket)).map_err(Box::new)
     }
 
+    /// The port of this end of the connection.
+    pub fn port(&self) -> u16 {
+        match self.socket.get_ref() {
+            MaybeTlsStream::Plain(socket) => socket.local_addr().unwrap().port(),
+            other => panic!("{other:?}"),
+        }
+    }
+
     /// Sends a text.
     pub async fn send(&mut self, text: &str) {
         self.socket.send(Message::text(text)).await.unwrap();
+    }
+
+    /// Sends a text over a connection that may be broken.
+    pub async fn try_send(&mut self, text: &str) -> Result<(), String> {
+        self.socket.send(Message::text(text)).await.map_err(|error| error.to_string())
     }
 
     /// Sends a text in so many frames.
@@ -88,6 +107,11 @@ impl Client {
             Ok(heard) => heard,
             Err(_) => panic!("nothing more came after {:#?}", self.heard),
         }
+    }
+
+    /// The next text, or the end, if one comes within this time.
+    pub async fn next_within(&mut self, time: Duration) -> Option<Heard> {
+        actix_rt::time::timeout(time, self.read()).await.ok()
     }
 
     async fn read(&mut self) -> Heard {

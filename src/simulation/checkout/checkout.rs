@@ -15,8 +15,7 @@ use tokio_util::task::AbortOnDropHandle;
 
 use super::cache::Cache;
 use super::cache_dir::CacheDir;
-use super::copy::{Copied, What, copy_call, look, what};
-use super::disk::outgrown;
+use super::copy::{self, Copied, What, copy_call, look, what};
 use super::error::{CheckoutError, git_failed, machine, too_large, too_slow};
 use super::finder::{Finder, Found};
 use super::git::Git;
@@ -187,17 +186,12 @@ impl Checkouts {
                 progress(steps::checking_out(name, Some(line)));
             }
         };
-        let mut is_too_large = false;
-        let end = async {
-            outgrown(&project, self.limits.size).await;
-            is_too_large = true;
-        };
-        let copied = self.git.run_until(end, call, told).await;
-        if is_too_large {
+        match copy::write(&self.git, &call, instance, (&self.limits, &found.repository), told).await {
+            Ok(true) => Ok(()),
             // What is in the commit may be smaller than what git's attributes make of it.
-            return self.refuse(found, needed);
+            Ok(false) => self.refuse(found, needed),
+            Err(source) => Err(git_failed(world, source)),
         }
-        copied.map(drop).map_err(|source| git_failed(world, source))
     }
 
     /// Refuses what was copied of a commit: it is too large, and so it is for everybody else.

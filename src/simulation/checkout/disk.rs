@@ -3,7 +3,7 @@
 use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use crate::simulation::process::remove_tree;
 
@@ -76,6 +76,19 @@ pub async fn outgrown(folder: &Path, size: u64) {
         let folder = folder.to_owned();
         if blocking(move || Ok(size_of(&folder))).await.is_ok_and(|found| found > size) {
             return;
+        }
+        actix_rt::time::sleep(BETWEEN_LOOKS).await;
+    }
+}
+
+/// Waits until the files below a folder have had the same size for so long.
+pub async fn stands_still(folder: &Path, limit: Duration) {
+    let (mut since, mut last) = (Instant::now(), None);
+    while since.elapsed() < limit {
+        let folder = folder.to_owned();
+        let now = blocking(move || Ok(size_of(&folder))).await.ok();
+        if now != last {
+            (since, last) = (Instant::now(), now);
         }
         actix_rt::time::sleep(BETWEEN_LOOKS).await;
     }
