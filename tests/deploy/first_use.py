@@ -9,7 +9,7 @@ import json
 import re
 import sys
 
-LIMIT = 10.0
+LIMIT = 8.0
 
 visits = json.load(open(sys.argv[1]))["visits"]
 began, old = float(sys.argv[2]), tuple(sys.argv[3:])
