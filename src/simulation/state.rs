@@ -75,8 +75,13 @@ impl AppState {
     /// Returns the load to report: 100 % while the server is draining or can start no simulation.
     #[must_use]
     pub fn load(&self) -> Load {
-        let takes_nobody = self.is_draining() || self.problem.borrow().is_some();
-        if takes_nobody { Load::FULL } else { self.readings.borrow().load.unwrap_or(Load::ZERO) }
+        if self.takes_nobody() { Load::FULL } else { self.readings.borrow().load.unwrap_or(Load::ZERO) }
+    }
+
+    /// Whether no client can have a simulation here, whatever its world is.
+    #[must_use]
+    pub fn takes_nobody(&self) -> bool {
+        self.is_draining() || self.problem.borrow().is_some()
     }
 
     /// Whether new clients are refused.
@@ -93,7 +98,9 @@ impl AppState {
     pub fn admit(&self, url: &str) -> Result<ProjectUrl, String> {
         let world = ProjectUrl::parse(url).map_err(|wrong| wrong.to_string())?;
         if self.is_draining() {
-            return Err("This simulation server is about to end, and takes no new clients".to_owned());
+            let why = "This simulation server is about to end, and takes no new clients: connect again, and the session server \
+                       chooses another one";
+            return Err(why.to_owned());
         }
         if let Some(problem) = self.problem() {
             return Err(problem);

@@ -69,6 +69,13 @@ impl WebClient {
         self.fail(why, ctx);
     }
 
+    /// Refuses a client that another server may take: the close code says so to programs.
+    fn refer(&mut self, why: &str, ctx: &mut Context) {
+        self.start.resolve(Outcome::Refused);
+        log::info!("{}: {why}", self.name());
+        self.finish(&protocol::error(why), CloseCode::Again, ctx);
+    }
+
     fn finish(&mut self, last_words: &str, code: CloseCode, ctx: &mut Context) {
         self.state = State::Over;
         ctx.text(last_words.to_owned());
@@ -102,6 +109,7 @@ impl WebClient {
         }
         let world = match self.server.admit(url) {
             Ok(world) => world,
+            Err(why) if self.server.takes_nobody() => return self.refer(&why, ctx),
             Err(why) => return self.fail_start(Outcome::Refused, &why, ctx),
         };
         log::info!("{}: asks for {world}", self.name());
