@@ -80,7 +80,17 @@ impl Containers {
         let templates =
             Templates { folder: settings.templates.as_ref().map(|folder| folder.0.clone()), debug: settings.debug };
         let keeper = AbortOnDropHandle::new(actix_rt::spawn(keeper));
-        Ok(Self { docker, owner, templates, images, live, machine: OnceCell::new(), shortcoming, config, _keeper: keeper })
+        Ok(Self {
+            docker,
+            owner,
+            templates,
+            images,
+            live,
+            machine: OnceCell::new(),
+            shortcoming,
+            config,
+            _keeper: keeper,
+        })
     }
 
     /// Whose containers these are, for a process that removes them after the server's end.

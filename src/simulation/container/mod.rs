@@ -9,7 +9,7 @@ mod dockerfile;
 mod image;
 mod machine;
 mod objects;
-mod packet_filter;
+pub mod packet_filter;
 mod places;
 mod prepared;
 mod recipe;
