@@ -144,11 +144,41 @@ async fn a_build_that_takes_too_long_is_ended_and_told() {
 }
 
 #[actix_rt::test]
-async fn a_hidden_volume_of_an_image_is_memory_with_a_limit() {
+async fn images_of_ours_that_are_too_many_are_removed_and_no_others() {
+    let Some(_docker) = docker().await else { return };
+    let folder = tempfile::tempdir().unwrap();
+    let large = format!("FROM {NAME}\nCOPY . /usr/local/webots-project\nRUN head -c 5000000 /dev/urandom >/large\n");
+    let forge = with(&large);
+    ask(&["tag", NAME, "postgres:15"]);
+    let build = server(forge.path(), 1).folder(folder.path()).start().await;
+    Client::start(&build, &arm()).await.patiently("webots:", BUILT).await;
+    let owner = webots_fleet::simulation::container::Owner::of(&build.cache());
+    let own = format!("webots-fleet/{}", owner.name());
+    let images = || ask(&["image", "ls", "--quiet", &own]).lines().count();
+    assert_eq!(images(), 1);
+    drop(build);
+    let settings = serde_json::json!({ "imagesSize": 1 });
+    let server = server(forge.path(), 1).folder(folder.path()).set("container", settings).start().await;
+    // An image is looked for what nobody needs when a simulation has ended.
+    forge.commit("lab/arm", "main", &[("Dockerfile", &format!("FROM {NAME}\nCOPY . /usr/local/webots-project\n"))]);
+    let mut client = Client::start(&server, &arm()).await;
+    client.patiently("webots:", BUILT).await;
+    client.leave().await;
+    until("the large one is gone", async || images() == 1).await;
+    assert_eq!(ask(&["image", "ls", "--quiet", "postgres:15"]).lines().count(), 1);
+    assert_eq!(ask(&["image", "ls", "--quiet", NAME]).lines().count(), 1);
+}
+
+#[actix_rt::test]
+async fn a_volume_of_an_image_is_memory_with_a_limit() {
     let Some(_docker) = docker().await else { return };
     let forge = with(&format!("FROM {NAME}\nCOPY . /usr/local/webots-project\nVOLUME /data\n"));
-    let server = server(forge.path(), 1).set("limits", serde_json::json!({"disk": 10})).start().await;
-    Client::start(&server, &arm()).await.patiently("webots:", BUILT).await;
-    let forge_server = &server;
-    until("it runs", async || of_service(forge_server, "webots").len() <= 1).await;
+    let server = server(forge.path(), 1).set("limits", serde_json::json!({ "disk": 10 })).start().await;
+    let mut client = Client::start(&server, &arm()).await;
+    client.patiently("webots:", BUILT).await;
+    let webots = &of_service(&server, "webots")[0];
+    assert_eq!(ask(&["inspect", "--format", "{{range .Mounts}}{{.Type}} {{end}}", webots]), "bind");
+    let fill = "dd if=/dev/zero of=/data/big bs=1M count=20 2>&1 || true";
+    let told = ask(&["exec", webots, "sh", "-c", fill]);
+    assert!(told.contains("No space left"), "{told}");
 }

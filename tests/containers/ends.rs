@@ -43,7 +43,7 @@ async fn a_server_that_stops_leaves_nothing() {
     let mut running = Client::start(&server, &arm()).await;
     running.patiently("webots:", Duration::from_secs(60)).await;
     let mut starting = Client::start(&server, &arm()).await;
-    starting.until("loading: Creating network").await;
+    starting.patiently("loading: Creating network", Duration::from_secs(60)).await;
     let prefix = prefix(&server);
     server.signal(Signal::SIGTERM);
     assert_eq!(server.ended().await, Some(0));

@@ -4,11 +4,13 @@ use std::time::{Duration, Instant};
 
 use serde_json::{Value, json};
 
-use super::daemon::{ask, containers, docker, of_service, server};
+use super::daemon::{alone, ask, containers, docker, of_service, server};
 use crate::support::client::Client;
 use crate::support::git::{Forge, arm, world};
 use crate::support::{http, until};
 
+/// How long a start may take on a busy machine.
+const READY: Duration = Duration::from_secs(90);
 /// All of a simulation has to be gone by then.
 const GONE: Duration = Duration::from_secs(10);
 
@@ -18,7 +20,7 @@ async fn a_world_runs_in_a_container_and_nothing_is_left_when_its_client_goes() 
     let forge = Forge::with_arm();
     let server = server(forge.path(), 2).start().await;
     let mut client = Client::start(&server, &arm()).await;
-    let address = client.until("webots:").await;
+    let address = client.patiently("webots:", READY).await;
     let steps = ["loading: Creating network", "shutdownTimeout: 7200", "webots:ws://localhost:"];
     let order: Vec<_> = steps.iter().map(|step| client.heard.iter().position(|text| text.starts_with(step))).collect();
     assert!(order.iter().all(Option::is_some) && order.is_sorted(), "{:?}", client.heard);
@@ -42,7 +44,7 @@ async fn a_world_runs_in_a_container_and_nothing_is_left_when_its_client_goes() 
     .await;
     // The port is free, and the next one gets it.
     let mut next = Client::start(&server, &arm()).await;
-    assert_eq!(next.until("webots:").await, address);
+    assert_eq!(next.patiently("webots:", READY).await, address);
 }
 
 #[actix_rt::test]
@@ -54,7 +56,7 @@ async fn a_container_has_no_more_than_it_needs() {
         .start()
         .await;
     let mut client = Client::start(&server, &arm()).await;
-    client.until("webots:").await;
+    client.patiently("webots:", READY).await;
     let about: Value = serde_json::from_str(&ask(&["inspect", &of_service(&server, "webots")[0]])).unwrap();
     let (host, config) = (&about[0]["HostConfig"], &about[0]["Config"]);
     for (key, value) in [
@@ -88,7 +90,7 @@ async fn an_existing_configuration_with_docker_true_runs_every_world_in_a_contai
         server(forge.path(), 3).set("isolation", "auto").set("docker", true).set("shareIdleTime", 100).start().await;
     for world in [arm(), world("other/world", "main", "worlds/a.wbt")] {
         let mut client = Client::start(&server, &world).await;
-        client.until("webots:").await;
+        client.patiently("webots:", READY).await;
         assert_eq!(containers(&server).len(), 1, "{world}");
         client.leave().await;
         until("it is gone", async || containers(&server).is_empty()).await;
@@ -108,7 +110,7 @@ async fn worlds_of_others_run_while_the_machine_is_idle_only() {
 
 #[actix_rt::test]
 async fn more_simulations_run_than_docker_has_networks() {
-    let Some(_docker) = docker().await else { return };
+    let Some(_docker) = alone().await else { return };
     let forge = Forge::with_arm();
     let count = 34;
     let server = server(forge.path(), count).set("maxPlacesPerAddress", count).set("timing.launch", 300).start().await;

@@ -3,7 +3,7 @@
 use std::path::Path;
 use std::sync::Arc;
 
-use tokio::sync::OnceCell;
+use tokio::sync::{OnceCell, Semaphore};
 use tokio_util::task::AbortOnDropHandle;
 
 use super::compose::Parts;
@@ -33,6 +33,8 @@ pub struct Containers {
     live: Live,
     machine: OnceCell<Machine>,
     shortcoming: Option<String>,
+    /// Who may have compose make containers now.
+    turns: Semaphore,
     config: Arc<SimulationConfig>,
     _keeper: AbortOnDropHandle<()>,
 }
@@ -88,6 +90,7 @@ impl Containers {
             live,
             machine: OnceCell::new(),
             shortcoming,
+            turns: Semaphore::new(2 * std::thread::available_parallelism().map_or(2, usize::from)),
             config,
             _keeper: keeper,
         })
@@ -252,9 +255,12 @@ impl Containers {
             parts.write(&template, &config).map_err(|error| format!("The files for compose can't be written: {error}"))
         };
         let options = blocking(files).await?;
+        // More at a time would only be slower together.
+        let turn = self.turns.acquire().await.map_err(|error| error.to_string())?;
         progress(steps::CREATING.to_owned());
         let words = options.into_iter().chain(["up", "--no-start", "--no-build"].map(str::to_owned));
         self.docker.compose(words.map(Into::into).collect(), SHORT).await.map_err(|error| error.to_string())?;
+        drop(turn);
         let texts = match recipe.asks.kind {
             Kind::Default => recipe.asks.project_type.into_iter().collect(),
             _ => std::iter::once("ide: enable".to_owned()).chain(recipe.asks.project_type).collect(),
