@@ -171,11 +171,10 @@ impl Containers {
             .chain(options)
             .chain(std::iter::once(name))
             .collect();
-        match self.docker.run(&words, SHORT).await {
-            // Another server, or another client of this one, was faster.
-            Err(DockerError::Failed { message, .. }) if message.contains("already exists") => Ok(()),
-            made => made.map(drop).map_err(|error| error.to_string()),
-        }
+        let Err(error) = self.docker.run(&words, SHORT).await else { return Ok(()) };
+        // Another server, or another client of this one, may have been faster.
+        let is_there = self.docker.run(&["network", "inspect", name], SHORT).await.is_ok();
+        if is_there { Ok(()) } else { Err(error.to_string()) }
     }
 
     /// An image of a project, or of a folder of it.
