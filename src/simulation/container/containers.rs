@@ -8,9 +8,10 @@ use tokio_util::task::AbortOnDropHandle;
 
 use super::compose::Parts;
 use super::copy::Copy;
-use super::docker::{Docker, DockerError, SHORT};
+use super::docker::{Docker, SHORT};
 use super::image::{Build, Images};
 use super::machine::Machine;
+use super::network;
 use super::objects::{self, Owner};
 use super::packet_filter;
 use super::places::{edited_folder, edited_in, volume_of, world_in};
@@ -121,10 +122,10 @@ impl Containers {
     ) -> Result<Prepared, String> {
         let recipe = self.recipe(&request).await?;
         let lease = Lease::take(self.owner.project(request.port), &self.live);
-        self.join_network().await?;
         let network = self.config.container.network.name();
+        network::join(&self.docker, network).await?;
         let version = &request.project.world.version;
-        let base = image_of(&self.config.container.image, version);
+        let base = recipe::image_of(&self.config.container.image, version);
         let mut image = base.clone();
         match &recipe.dockerfile {
             Some(text) => {
@@ -155,26 +156,6 @@ impl Containers {
         let (folder, templates) = (request.project.folder().to_owned(), self.templates.clone());
         let owner = self.owner.name().to_owned();
         blocking(move || Recipe::read(&folder, &templates, &owner)).await
-    }
-
-    /// Makes the network of all containers, unless it is there.
-    async fn join_network(&self) -> Result<(), String> {
-        let name = self.config.container.network.name();
-        if self.docker.run(&["network", "inspect", name], SHORT).await.is_ok() {
-            return Ok(());
-        }
-        // One network for all: the pools of Docker end at some thirty. Containers in it can't reach each other.
-        let interface = format!("com.docker.network.bridge.name={name}");
-        let options = ["--opt", &interface, "--opt", "com.docker.network.bridge.enable_icc=false"];
-        let words: Vec<&str> = ["network", "create", "--driver", "bridge"]
-            .into_iter()
-            .chain(options)
-            .chain(std::iter::once(name))
-            .collect();
-        let Err(error) = self.docker.run(&words, SHORT).await else { return Ok(()) };
-        // Another server, or another client of this one, may have been faster.
-        let is_there = self.docker.run(&["network", "inspect", name], SHORT).await.is_ok();
-        if is_there { Ok(()) } else { Err(error.to_string()) }
     }
 
     /// An image of a project, or of a folder of it.
@@ -301,12 +282,6 @@ impl Containers {
     }
 }
 
-/// The image of Webots for a version: those up to R2023a are made on Ubuntu 20.04, later ones on 22.04.
-fn image_of(pattern: &str, version: &str) -> String {
-    let ubuntu = if version < "R2023b" { "20.04" } else { "22.04" };
-    pattern.replace("{version}", version).replace("{ubuntu}", ubuntu)
-}
-
 fn command(config: &SimulationConfig, request: &Request, world: &str) -> Vec<String> {
     let webots = (request.command)(&format!("{PROJECT_PATH}/{world}"));
     let display = match config.container.display {
@@ -319,23 +294,4 @@ fn command(config: &SimulationConfig, request: &Request, world: &str) -> Vec<Str
 /// Does file work on a thread that serves nobody.
 async fn blocking<T: Send + 'static>(work: impl FnOnce() -> Result<T, String> + Send + 'static) -> Result<T, String> {
     actix_rt::task::spawn_blocking(work).await.map_err(|error| error.to_string())?
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn the_image_follows_the_version() {
-        let pattern = "cyberbotics/webots.cloud:{version}-ubuntu{ubuntu}";
-        for (version, image) in [
-            ("R2022b", "cyberbotics/webots.cloud:R2022b-ubuntu20.04"),
-            ("R2023a", "cyberbotics/webots.cloud:R2023a-ubuntu20.04"),
-            ("R2023b", "cyberbotics/webots.cloud:R2023b-ubuntu22.04"),
-            ("R2025a", "cyberbotics/webots.cloud:R2025a-ubuntu22.04"),
-        ] {
-            assert_eq!(image_of(pattern, version), image);
-        }
-        assert_eq!(image_of("mine", "R2025a"), "mine");
-    }
 }

@@ -8,6 +8,7 @@ mod docker;
 mod dockerfile;
 mod image;
 mod machine;
+mod network;
 mod objects;
 pub mod packet_filter;
 mod places;

@@ -134,9 +134,30 @@ pub fn open_participant(world: &Path) -> io::Result<()> {
     OpenOptions::new().write(true).truncate(true).custom_flags(flags).open(world)?.write_all(text.as_bytes())
 }
 
+/// The image of Webots for a version: those up to R2023a are made on Ubuntu 20.04, later ones on 22.04.
+#[must_use]
+pub fn image_of(pattern: &str, version: &str) -> String {
+    let ubuntu = if version < "R2023b" { "20.04" } else { "22.04" };
+    pattern.replace("{version}", version).replace("{ubuntu}", ubuntu)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn the_image_follows_the_version() {
+        let pattern = "cyberbotics/webots.cloud:{version}-ubuntu{ubuntu}";
+        for (version, image) in [
+            ("R2022b", "cyberbotics/webots.cloud:R2022b-ubuntu20.04"),
+            ("R2023a", "cyberbotics/webots.cloud:R2023a-ubuntu20.04"),
+            ("R2023b", "cyberbotics/webots.cloud:R2023b-ubuntu22.04"),
+            ("R2025a", "cyberbotics/webots.cloud:R2025a-ubuntu22.04"),
+        ] {
+            assert_eq!(image_of(pattern, version), image);
+        }
+        assert_eq!(image_of("mine", "R2025a"), "mine");
+    }
 
     fn templates() -> Templates {
         Templates { folder: None, debug: false }
