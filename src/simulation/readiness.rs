@@ -68,7 +68,7 @@ fn check(config: &SimulationConfig, run: &Path) -> Result<(), String> {
 /// What is missing, and how to set it, in words for the client.
 pub fn webots_program(config: &SimulationConfig) -> Result<PathBuf, String> {
     if config.isolation == Isolation::Container {
-        return Ok(PathBuf::from(&config.container.webots));
+        return Ok(PathBuf::from(&config.container.program));
     }
     if config.xvfb && which("Xvfb").is_err() {
         return Err("This simulation server gives each Webots a display of its own (xvfb), but has no Xvfb. \

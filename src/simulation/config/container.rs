@@ -17,7 +17,7 @@ pub struct ContainerSettings {
     /// The image of the editor that a project may ask for. Default: the one that the original names.
     pub editor_image: String,
     /// Webots' launcher in the image. Default: `webots`.
-    pub webots: String,
+    pub program: String,
     /// Whether the variants of the templates are taken that help to find a fault in a project. Default: false.
     pub debug: bool,
     /// Which display Webots has: a virtual one inside (`xvfb-run` of its image), or that of the machine. Default:
@@ -95,7 +95,7 @@ impl Default for ContainerSettings {
             templates: None,
             image: "cyberbotics/webots.cloud:{version}-ubuntu{ubuntu}".to_owned(),
             editor_image: "benjamindeleze/theia-test:test3".to_owned(),
-            webots: "webots".to_owned(),
+            program: "webots".to_owned(),
             debug: false,
             display: ContainerDisplay::default(),
             network: ContainerNetwork::default(),

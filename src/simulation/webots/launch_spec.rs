@@ -44,7 +44,7 @@ impl LaunchSpec {
     pub fn request(&self) -> Request {
         let (config, mode, port) = (Arc::clone(&self.config), self.mode, self.place.1);
         let command = move |world: &str| {
-            let program = Path::new(&config.container.webots);
+            let program = Path::new(&config.container.program);
             let world = Path::new(world);
             let command = WebotsCommand { program, mode, port, heartbeat: config.timing.heartbeat, world };
             command.to_arguments().into_iter().map(|word| word.to_string_lossy().into_owned()).collect()
