@@ -82,6 +82,10 @@ impl AppState {
         self.picks.with_label_values(&[outcome]).inc();
         match picked {
             Ok(address) => Answer { text: self.client_urls.websocket_url(&address), refusal: None },
+            // These words hold nothing from outside.
+            Err(NoServer::Unavailable) => {
+                Answer { text: NoServer::Unavailable.to_string(), refusal: Some(NoServer::Unavailable) }
+            }
             Err(refusal) => Answer { text: client_text(&refusal.to_string()), refusal: Some(refusal) },
         }
     }

@@ -18,6 +18,9 @@ use crate::support::program::Server;
 use crate::support::webots::instances_below;
 use crate::surroundings::*;
 
+/// What the command line of a guardian has.
+pub const GUARDIAN: &str = " guard ";
+
 type Injected<'fleet> = Pin<Box<dyn Future<Output = bool> + 'fleet>>;
 
 /// A fault. It tells whether it was possible.
@@ -28,8 +31,8 @@ pub struct Fault {
 
 /// How long something that stands still does so.
 pub const WHILE: Duration = Duration::from_secs(3);
-/// How long what a killed server leaves may live.
-const AT_ONCE: Duration = Duration::from_secs(2);
+/// How long what a killed server leaves may live on a busy machine: its guardian looks for so long.
+const AT_ONCE: Duration = Duration::from_secs(5);
 
 macro_rules! faults {
     ($($name:literal: $function:expr;)*) => {
@@ -47,7 +50,7 @@ pub fn all() -> Vec<Fault> {
         "a Webots is killed": async |fleet, random| signal(fleet, random, "demo-simulator", Signal::SIGKILL).await;
         "a Webots stands still": async |fleet, random| signal(fleet, random, "demo-simulator", Signal::SIGSTOP).await;
         "a launcher is killed": async |fleet, random| signal(fleet, random, "/webots --batch", Signal::SIGKILL).await;
-        "a guardian is killed": async |fleet, random| signal(fleet, random, " guard ", Signal::SIGKILL).await;
+        "a guardian is killed": async |fleet, random| signal(fleet, random, GUARDIAN, Signal::SIGKILL).await;
         "a launcher stands still": async |fleet, random| signal(fleet, random, "/webots --batch", Signal::SIGSTOP).await;
         "a guardian stands still for a while": stop_guardian;
         "a git is killed": async |fleet, random| signal(fleet, random, "git --literal-pathspecs", Signal::SIGKILL).await;
@@ -133,7 +136,7 @@ async fn signal(fleet: &Fleet, random: &mut SmallRng, words: &str, signal: Signa
 
 /// A guardian stands still, but not for good: nothing would be left to end what a server that is killed leaves.
 async fn stop_guardian(fleet: &mut Fleet, random: &mut SmallRng) -> bool {
-    let all = descendants(fleet, " guard ");
+    let all = descendants(fleet, GUARDIAN);
     if all.is_empty() {
         return false;
     }

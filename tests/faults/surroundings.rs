@@ -24,7 +24,7 @@ const LITTLE: u64 = 2 << 20;
 pub async fn fill_disk(fleet: &mut Fleet, _: &mut SmallRng) -> bool {
     let folder = fleet.folder(SMALL_DISK);
     let disk = nix::sys::statvfs::statvfs(&folder).unwrap();
-    if disk.blocks() * disk.fragment_size() > 62 << 20 {
+    if disk.blocks() * disk.fragment_size() > 64 << 20 {
         return false;
     }
     let _full = Full::at(&folder);

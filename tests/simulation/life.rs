@@ -145,7 +145,8 @@ async fn what_a_server_was_starting_as_it_was_killed_is_ended_too() {
 #[actix_rt::test]
 async fn what_a_killed_server_has_left_is_removed_at_the_next_start() {
     let mut scene = Scene::new(State::CheckingOut, quick).await;
-    // The guardian, which does it otherwise, is killed too.
+    // The guardian, which does it otherwise, is killed too, and the server can't replace it.
+    scene.server.signal(Signal::SIGSTOP);
     kill(Pid::from_raw(guardian(&scene.server)), Signal::SIGKILL).unwrap();
     scene.server.signal(Signal::SIGKILL);
     scene.server.ended().await;
@@ -162,10 +163,30 @@ async fn what_a_killed_server_has_left_is_removed_at_the_next_start() {
     until("git is gone", async || instances_below(scene.folder.path()).is_empty()).await;
 }
 
+#[actix_rt::test]
+async fn a_guardian_that_is_killed_is_replaced() {
+    let mut scene = Scene::new(State::Running, quick).await;
+    for _ in 0..3 {
+        let last = guardian(&scene.server);
+        kill(Pid::from_raw(last), Signal::SIGKILL).unwrap();
+        until("there is another one", async || find_guardian(&scene.server).is_some_and(|one| one != last)).await;
+    }
+    assert!(scene.server.log().contains("the guardian has ended"), "{}", scene.server.log());
+    scene.server.signal(Signal::SIGKILL);
+    scene.server.ended().await;
+    let runs = scene.folder.path().join("cache/runs");
+    until("its folder is gone", async || std::fs::read_dir(&runs).unwrap().count() == 0).await;
+    assert_eq!(instances_below(scene.folder.path()), []);
+}
+
 /// The child of a server that ends the simulations when the server is gone.
 pub fn guardian(server: &Server) -> i32 {
+    find_guardian(server).unwrap()
+}
+
+fn find_guardian(server: &Server) -> Option<i32> {
     let line = |pid: &i32| procfs::process::Process::new(*pid).and_then(|one| one.cmdline()).unwrap_or_default();
-    children(server.pid()).into_iter().find(|pid| line(pid).get(1).is_some_and(|word| word == "guard")).unwrap()
+    children(server.pid()).into_iter().find(|pid| line(pid).get(1).is_some_and(|word| word == "guard"))
 }
 
 pub fn is_there(pid: i32) -> bool {

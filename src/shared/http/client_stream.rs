@@ -41,7 +41,8 @@ pub struct ClientStream {
     /// Whether the system takes no more of an answer, since the client does not read.
     is_blocked: bool,
     state: State,
-    stopping: Pin<Box<WaitForCancellationFutureOwned>>,
+    /// Nothing once it is a WebSocket, which its actor closes.
+    stopping: Option<Pin<Box<WaitForCancellationFutureOwned>>>,
     _permit: ConnectionPermit,
 }
 
@@ -55,8 +56,18 @@ impl ClientStream {
             line_ended: false,
             is_blocked: false,
             state: State::Request,
-            stopping: Box::pin(stopping.cancelled_owned()),
+            stopping: Some(Box::pin(stopping.cancelled_owned())),
             _permit: permit,
+        }
+    }
+
+    /// Gives back what only requests need: thousands of WebSockets are open at a time, and most of them are idle.
+    fn release(&mut self) {
+        if self.state == State::WebSocket {
+            self.stopping = None;
+            if self.unread.is_empty() {
+                self.unread = Vec::new();
+            }
         }
     }
 
@@ -93,11 +104,15 @@ impl AsyncRead for ClientStream {
             // The task is woken by the next write, or once the system takes more.
             return Poll::Pending;
         }
-        if self.state == State::Request && self.stopping.as_mut().poll(context).is_ready() {
+        let is_stopping = |end: &mut Pin<Box<WaitForCancellationFutureOwned>>| end.as_mut().poll(context).is_ready();
+        if self.state == State::Request && self.stopping.as_mut().is_some_and(is_stopping) {
             // The end of what the client sends: what is being answered is answered, and the connection closes.
             return Poll::Ready(Ok(()));
         }
         if self.unread.is_empty() {
+            if self.state == State::WebSocket {
+                return Pin::new(&mut self.tcp).poll_read(context, buffer);
+            }
             let mut bytes = [0; READ_AT_ONCE];
             let mut part = ReadBuf::new(&mut bytes);
             ready!(Pin::new(&mut self.tcp).poll_read(context, &mut part))?;
@@ -106,6 +121,7 @@ impl AsyncRead for ClientStream {
         let count = self.readable(buffer.remaining());
         buffer.put_slice(self.unread.get(..count).unwrap_or_default());
         self.unread.drain(..count);
+        self.release();
         Poll::Ready(Ok(()))
     }
 }
@@ -116,6 +132,7 @@ impl AsyncWrite for ClientStream {
         self.is_blocked = written.is_pending();
         if self.state == State::Answer && written.is_ready() {
             self.state = if bytes.starts_with(SWITCHING_PROTOCOLS) { State::WebSocket } else { State::Request };
+            self.release();
             context.waker().wake_by_ref();
         }
         written

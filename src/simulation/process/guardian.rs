@@ -5,12 +5,16 @@
 //! server has ended, also after SIGKILL. Then the guardian kills every process that carries the mark of this run (see
 //! [`process_tree::MARK`]), and removes the folder. After an orderly stop it finds nothing left to do.
 //!
-//! If server and guardian are killed together, the next start of the server does the same.
+//! A guardian that ends while the server lives is replaced. If both are killed together, the next start of the server does
+//! the same.
 
 use std::io::PipeWriter;
 use std::path::{Path, PathBuf};
 use std::process::Stdio;
 use std::time::{Duration, Instant};
+
+use tokio::process::Child;
+use tokio_util::task::AbortOnDropHandle;
 
 use nix::sys::signal::{SigSet, Signal};
 use nix::unistd::setsid;
@@ -32,10 +36,17 @@ pub struct Arguments {
     pub containers: Option<String>,
 }
 
+/// For how long it goes on after that, less often.
+const STRAGGLERS: Duration = Duration::from_secs(5);
+/// Time between two looks for those.
+const BETWEEN_LOOKS: Duration = Duration::from_millis(100);
+/// Time until another guardian is started where one has ended, or can't be started.
+const REPLACEMENT: Duration = Duration::from_millis(100);
+
 /// A running guardian. It acts when this is dropped.
 #[derive(Debug)]
 pub struct Guardian {
-    _lifeline: PipeWriter,
+    _kept: AbortOnDropHandle<()>,
 }
 
 impl Guardian {
@@ -44,31 +55,58 @@ impl Guardian {
     /// # Errors
     /// When the system can start no more processes.
     pub fn start(run: &Path, containers: Option<&str>) -> std::io::Result<Self> {
-        let (reader, lifeline) = std::io::pipe()?;
-        let mut command = tokio::process::Command::new("/proc/self/exe");
-        command.arg0("simulation-server").arg("guard").arg(run);
-        command.args(containers.map(|owner| format!("--containers={owner}")));
-        command.stdin(reader).stdout(Stdio::null()).stderr(Stdio::null()).spawn()?;
-        Ok(Self { _lifeline: lifeline })
+        let containers = containers.map(|owner| format!("--containers={owner}"));
+        let first = spawn(run, containers.as_deref())?;
+        let kept = keep(run.to_owned(), containers, first);
+        Ok(Self { _kept: AbortOnDropHandle::new(actix_rt::spawn(kept)) })
+    }
+}
+
+/// Starts a guardian. It acts when what is returned beside it is dropped.
+fn spawn(run: &Path, containers: Option<&str>) -> std::io::Result<(Child, PipeWriter)> {
+    let (reader, lifeline) = std::io::pipe()?;
+    let mut command = tokio::process::Command::new("/proc/self/exe");
+    command.arg0("simulation-server").arg("guard").arg(run).args(containers);
+    let child = command.stdin(reader).stdout(Stdio::null()).stderr(Stdio::null()).spawn()?;
+    Ok((child, lifeline))
+}
+
+/// Replaces a guardian that has ended, without end.
+async fn keep(run: PathBuf, containers: Option<String>, mut guardian: (Child, PipeWriter)) {
+    loop {
+        match guardian.0.wait().await {
+            Ok(status) => log::warn!("the guardian has ended ({status}), another one is started"),
+            Err(error) => log::error!("the guardian can't be watched: {error}"),
+        }
+        guardian = loop {
+            actix_rt::time::sleep(REPLACEMENT).await;
+            match spawn(&run, containers.as_deref()) {
+                Ok(next) => break next,
+                Err(error) => log::error!("no guardian can be started: {error}"),
+            }
+        };
     }
 }
 
 /// What the guardian process does, from its start to its end; `remove` removes what is not a process. Returns its exit
 /// code.
 #[must_use]
-pub fn guard(arguments: &Arguments, remove: impl FnOnce()) -> u8 {
+pub fn guard(arguments: &Arguments, remove: impl Fn()) -> u8 {
     // A signal to the server's group, or Ctrl-C in its terminal, must not end the guardian before the server.
     if let Err(error) = setsid().and_then(|_| block_signals()) {
         eprintln!("can't get out of the reach of the server's signals: {error}");
         return 1;
     }
     std::io::copy(&mut std::io::stdin().lock(), &mut std::io::sink()).ok();
-    let end = Instant::now() + LATECOMERS;
-    while Instant::now() < end {
-        process_tree::kill_marked(&arguments.folder);
+    for (time, pause) in [(LATECOMERS, Duration::ZERO), (STRAGGLERS, BETWEEN_LOOKS)] {
+        let end = Instant::now() + time;
+        while Instant::now() < end {
+            process_tree::kill_marked(&arguments.folder);
+            std::thread::sleep(pause);
+        }
+        remove();
+        remove_patiently(&arguments.folder);
     }
-    remove();
-    remove_patiently(&arguments.folder);
     0
 }
 
