@@ -19,6 +19,7 @@ mod builds;
 mod daemon;
 mod deeds;
 mod ends;
+mod hostile;
 mod image;
 mod kinds;
 mod life;

@@ -41,6 +41,9 @@ pub struct Parts<'parts> {
     pub machine: &'parts Machine,
 }
 
+/// Variables: names and values.
+pub type Variables = Vec<(&'static str, String)>;
+
 /// The template.
 const TEMPLATE: &str = "docker-compose.yml";
 /// What holds for each service.
@@ -51,17 +54,18 @@ const SHARED_MEMORY: &str = "256m";
 const DISPLAYS: &str = "/tmp/.X11-unix";
 
 impl Parts<'_> {
-    /// Writes the files, and returns the options by which compose finds them.
+    /// Writes the files, and returns the options by which compose finds them, and the variables that it has to have. It
+    /// reads a file of variables in ways of its own, and those of this server's environment count for more.
     ///
     /// # Errors
     /// When a file can't be written.
-    pub fn write(&self, template: &Template, config: &SimulationConfig) -> io::Result<Vec<String>> {
+    pub fn write(&self, template: &Template, config: &SimulationConfig) -> io::Result<(Vec<String>, Variables)> {
         let folder = self.instance.join("compose");
         std::fs::create_dir_all(&folder)?;
         std::fs::create_dir_all(self.exchange())?;
         std::fs::write(folder.join(TEMPLATE), template.text.as_bytes())?;
         std::fs::write(folder.join(OVERRIDE), self.overridden(template, config).to_string())?;
-        std::fs::write(folder.join(".env"), self.variables(config))?;
+        std::fs::write(folder.join(".env"), self.lines(config))?;
         let path = |name: &str| folder.join(name).to_string_lossy().into_owned();
         let (name, folder) = (self.name.to_owned(), folder.to_string_lossy().into_owned());
         let words = [
@@ -74,7 +78,7 @@ impl Parts<'_> {
             "--file",
             &path(OVERRIDE),
         ];
-        Ok(words.map(str::to_owned).into())
+        Ok((words.map(str::to_owned).into(), self.variables(config)))
     }
 
     /// The folder through which Webots and a controller in another container talk.
@@ -82,16 +86,16 @@ impl Parts<'_> {
         self.instance.join("ipc")
     }
 
-    /// The variables of the template, one in each line.
-    fn variables(&self, config: &SimulationConfig) -> String {
+    /// The variables of the template.
+    fn variables(&self, config: &SimulationConfig) -> Variables {
         let command = self.command.join(" ");
         let plain = |letter: char| letter.is_alphanumeric() || " -_./=:+,".contains(letter);
-        // Compose reads quotes, dollars and backslashes in ways of its own.
-        let command = if command.chars().all(plain) { format!("\"{command}\"") } else { String::new() };
+        // A template may hand it to a shell, which reads quotes, dollars and backslashes in ways of its own.
+        let command = if command.chars().all(plain) { command } else { String::new() };
         let bind = if config.bind.is_ipv4() { config.bind.to_string() } else { "0.0.0.0".to_owned() };
         let path = |path: &Path| path.to_string_lossy().into_owned();
         let edited = self.edited.as_ref().map_or_else(|| path(self.project), |folder| path(folder));
-        let pairs = [
+        vec![
             ("IMAGE", self.image.to_owned()),
             ("CONTROLLER_IMAGE", self.controller.unwrap_or_default().to_owned()),
             ("PROJECT_PATH", PROJECT_PATH.to_owned()),
@@ -107,9 +111,17 @@ impl Parts<'_> {
             ("THEIA_PORT", (self.port + EDITOR_PORT).to_string()),
             ("IPC", path(&self.exchange())),
             ("DISPLAY", display_of(config).unwrap_or_default()),
-        ];
-        let lines: Vec<String> = pairs.iter().map(|(name, value)| format!("{name}={value}\n")).collect();
-        lines.concat()
+        ]
+    }
+
+    /// The same for who looks at the files, one in each line.
+    fn lines(&self, config: &SimulationConfig) -> String {
+        let quote = |name: &str| if name == "WEBOTS" { "\"" } else { "" };
+        let line = |(name, value): &(&str, String)| {
+            let quote = quote(name);
+            format!("{name}={quote}{value}{quote}\n")
+        };
+        self.variables(config).iter().map(line).collect::<Vec<String>>().concat()
     }
 
     /// What holds for each service.
@@ -145,6 +157,8 @@ impl Parts<'_> {
             ),
             ("logging", json!({ "driver": "none" })),
             ("init", json!(self.machine.init)),
+            // The daemon would run it, as often as the image says.
+            ("healthcheck", json!({ "disable": true })),
         ]);
         let image = match name {
             "webots" => Some(self.image),

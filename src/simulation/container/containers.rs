@@ -14,7 +14,7 @@ use super::machine::Machine;
 use super::network;
 use super::objects::{self, Owner};
 use super::packet_filter;
-use super::places::{edited_folder, edited_in, volume_of, world_in};
+use super::places::{edited_folder, edited_in, project_folder, volume_of, world_in};
 use super::prepared::{Lease, Prepared};
 use super::recipe::{self, PROJECT_PATH, Recipe};
 use super::steps;
@@ -77,7 +77,7 @@ impl Containers {
             log::warn!("{why}");
         }
         let settings = &config.container;
-        let images = Images::new(docker.clone(), owner.clone(), settings.builds, config.timing.build);
+        let images = Images::new(docker.clone(), owner.clone(), &config);
         let (images, live) = (Arc::new(images), Live::default());
         let keeper = keep_tidy(docker.clone(), owner.clone(), live.clone(), Arc::clone(&images), Arc::clone(&config));
         let templates =
@@ -183,7 +183,10 @@ impl Containers {
         let (dockerfile, text) = (request.project.instance.path().join(name), text.to_owned());
         let file = dockerfile.clone();
         blocking(move || std::fs::write(file, text).map_err(|error| error.to_string())).await?;
-        let (context, project) = (request.project.folder().join(folder), Arc::clone(&request.project));
+        let project = Arc::clone(&request.project);
+        let (root, folder) = (project.folder().to_owned(), folder.to_owned());
+        // What was copied out of an image may have put a link to anywhere in its place.
+        let context = blocking(move || recipe::inside(&root, &folder)).await?;
         Ok(Build { key, dockerfile, context, arguments, network: "", project })
     }
 
@@ -216,7 +219,7 @@ impl Containers {
             }
             let edited = edited_folder(&asks.kind, &request.project)?;
             let command = command(&config, &request, &world);
-            let project = request.project.folder().canonicalize().map_err(|error| error.to_string())?;
+            let project = project_folder(&request.project)?;
             let parts = Parts {
                 name: &name,
                 instance: request.project.instance.path(),
@@ -234,17 +237,16 @@ impl Containers {
             let template = templates.compose(&asks.kind)?;
             parts.write(&template, &config).map_err(|error| format!("The files for compose can't be written: {error}"))
         };
-        let options = blocking(files).await?;
+        let (options, variables) = blocking(files).await?;
         // More at a time would only be slower together.
         let turn = self.turns.acquire().await.map_err(|error| error.to_string())?;
         progress(steps::CREATING.to_owned());
-        let words = options.into_iter().chain(["up", "--no-start", "--no-build"].map(str::to_owned));
-        self.docker.compose(words.map(Into::into).collect(), SHORT).await.map_err(|error| error.to_string())?;
+        let up = ["up", "--no-start", "--no-build"].map(str::to_owned);
+        let words = options.into_iter().chain(up).map(Into::into).collect();
+        self.docker.compose(words, variables, SHORT).await.map_err(|error| error.to_string())?;
         drop(turn);
-        let texts = match recipe.asks.kind {
-            Kind::Default => recipe.asks.project_type.into_iter().collect(),
-            _ => std::iter::once("ide: enable".to_owned()).chain(recipe.asks.project_type).collect(),
-        };
+        let editor = (recipe.asks.kind != Kind::Default).then(|| "ide: enable".to_owned());
+        let texts = editor.into_iter().chain(recipe.asks.project_type).collect();
         let containers = self.made(&lease.name).await?;
         Ok(Prepared::new(self.docker.clone(), lease, containers, texts, recipe.warnings))
     }

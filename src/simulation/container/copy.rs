@@ -64,6 +64,12 @@ fn not_copied(error: DockerError, from: &str) -> String {
         {
             format!("The image of this project has no folder {from}: its Dockerfile has to COPY the project there")
         }
+        DockerError::Failed { message, .. } if message.contains("invalid symlink") => {
+            let target = message.split_once(" -> ").map_or("elsewhere", |(_, target)| target);
+            format!(
+                "{from} in the image of this project has a link to {target}, which leads out of it: `docker cp` refuses that"
+            )
+        }
         error => error.to_string(),
     }
 }
@@ -77,5 +83,18 @@ async fn outgrown(folder: &Path, most: u64) {
         if size.is_ok_and(|size| size.is_none_or(|bytes| bytes > most)) {
             return;
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_link_that_leads_out_of_the_project_is_told_without_the_folders_of_the_machine() {
+        let message = "invalid symlink \"/var/cache/x/copied/link\" -> \"../../outside\"".to_owned();
+        let told =
+            not_copied(DockerError::Failed { command: "docker cp".to_owned(), message }, "/usr/local/webots-project");
+        assert!(told.contains("a link to \"../../outside\"") && !told.contains("/var/cache"), "{told}");
     }
 }

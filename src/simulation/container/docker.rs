@@ -58,6 +58,8 @@ const LONGEST_OUTPUT: usize = 1 << 20;
 const LONGEST_LINE: usize = 1000;
 /// How much is read at once, in bytes, and how long is waited after it: a build that prints without end waits.
 const CHUNK: (usize, Duration) = (16 * 1024, Duration::from_millis(5));
+/// For so many lines it is waited once more: each is looked at and told, however short it is.
+const LINES: usize = 50;
 /// How a message begins that says that nobody listens.
 const NO_DAEMON: [&str; 4] = [
     "cannot connect to the docker daemon",
@@ -95,7 +97,8 @@ impl Docker {
     /// When it fails or takes longer than the limit.
     pub async fn run<A: AsRef<OsStr>>(&self, arguments: &[A], limit: Duration) -> Result<String, DockerError> {
         let arguments = arguments.iter().map(|word| word.as_ref().to_owned());
-        self.call(std::iter::once("docker".into()).chain(arguments).collect(), limit, |_| ()).await
+        let command = std::iter::once("docker".into()).chain(arguments).collect();
+        self.call(command, Vec::new(), limit, |_| ()).await
     }
 
     /// The same, but `told` hears each line that it prints.
@@ -108,15 +111,21 @@ impl Docker {
         limit: Duration,
         told: impl FnMut(&str),
     ) -> Result<(), DockerError> {
-        self.call(std::iter::once("docker".into()).chain(arguments).collect(), limit, told).await.map(drop)
+        let command = std::iter::once("docker".into()).chain(arguments).collect();
+        self.call(command, Vec::new(), limit, told).await.map(drop)
     }
 
-    /// Runs `docker compose` with these arguments.
+    /// Runs `docker compose` with these arguments and variables.
     ///
     /// # Errors
     /// When it fails or takes longer than the limit.
-    pub async fn compose(&self, arguments: Vec<OsString>, limit: Duration) -> Result<(), DockerError> {
-        self.call(self.compose.iter().cloned().chain(arguments).collect(), limit, |_| ()).await.map(drop)
+    pub async fn compose(
+        &self,
+        arguments: Vec<OsString>,
+        variables: Vec<(&'static str, String)>,
+        limit: Duration,
+    ) -> Result<(), DockerError> {
+        self.call(self.compose.iter().cloned().chain(arguments).collect(), variables, limit, |_| ()).await.map(drop)
     }
 
     /// How a program is started that talks to the daemon. Dropping its process group ends only that program.
@@ -137,6 +146,7 @@ impl Docker {
     async fn call(
         &self,
         command: Vec<OsString>,
+        variables: Vec<(&'static str, String)>,
         limit: Duration,
         told: impl FnMut(&str),
     ) -> Result<String, DockerError> {
@@ -144,7 +154,8 @@ impl Docker {
             command.iter().take_while(|word| !word.as_encoded_bytes().starts_with(b"-")).take(3).collect();
         let name = name.iter().map(|word| word.to_string_lossy()).collect::<Vec<_>>().join(" ");
         let broken = |error: std::io::Error| DockerError::NotStarted(error.to_string());
-        let spec = self.spec(command, Duration::from_millis(500));
+        let mut spec = self.spec(command, Duration::from_millis(500));
+        spec.environment.extend(variables.into_iter().map(|(name, value)| (name.into(), value.into())));
         let (reader, output) = std::io::pipe().map_err(broken)?;
         let errors = output.try_clone().map_err(broken)?;
         let (group, ended) = ProcessGroup::start(&spec, output.into(), errors.into()).map_err(broken)?;
@@ -188,7 +199,9 @@ async fn read(mut output: impl AsyncRead + Unpin, mut told: impl FnMut(&str)) ->
         if length == 0 {
             break;
         }
-        actix_rt::time::sleep(CHUNK.1).await;
+        let lines = chunk.iter().take(length).filter(|byte| **byte == b'\n').count();
+        let turns = u32::try_from(1 + lines / LINES).unwrap_or(u32::MAX);
+        actix_rt::time::sleep(CHUNK.1.saturating_mul(turns)).await;
     }
     finish(&mut line, &mut kept, &mut told);
     kept
@@ -219,6 +232,13 @@ mod tests {
         let kept = read(text, |line: &str| lines.push(line.to_owned())).await;
         assert_eq!(lines, ["Step 1/2 : FROM a", " [31mred", "last"]);
         assert_eq!(kept, "Step 1/2 : FROM a\n [31mred\nlast\n");
+    }
+
+    #[actix_rt::test]
+    async fn short_lines_without_end_are_read_at_their_pace() {
+        let begin = std::time::Instant::now();
+        read("x\n".repeat(10_000).as_bytes(), |_: &str| ()).await;
+        assert!(begin.elapsed() > Duration::from_millis(500), "{:?}", begin.elapsed());
     }
 
     #[test]

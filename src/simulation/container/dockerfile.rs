@@ -2,26 +2,30 @@
 
 use std::fmt::Write as _;
 
+use crate::shared::text::excerpt;
+
 /// The label of all that this server has built, also of what a build that failed has left.
 pub const LABEL: &str = "webots-fleet.owner";
+/// What is shown of a line in an error, in letters.
+const SHOWN: usize = 100;
 
 /// Labels every stage of a Dockerfile with its owner.
 ///
 /// # Errors
-/// When it asks the daemon to fetch something, which would be done from the machine's own network. In words for the client.
+/// When it asks the daemon to fetch something, which would be done from the machine's own network; or when it may be read
+/// in more than one way. In words for the client.
 pub fn labelled(text: &str, owner: &str) -> Result<String, String> {
-    let mut labelled = String::new();
-    let mut instruction = String::new();
-    for line in text.lines() {
+    let (mut labelled, mut instruction) = (String::new(), String::new());
+    for line in text.trim_start_matches('\u{feff}').lines() {
         labelled.push_str(line);
         labelled.push('\n');
         let words = line.trim();
         if words.is_empty() || words.starts_with('#') {
+            check_directive(words)?;
             continue;
         }
-        let continued = words.strip_suffix('\\');
-        instruction.push_str(continued.unwrap_or(words));
-        instruction.push(' ');
+        let continued = continued(line)?;
+        instruction.push_str(continued.unwrap_or(line));
         if continued.is_some() {
             continue;
         }
@@ -35,19 +39,53 @@ pub fn labelled(text: &str, owner: &str) -> Result<String, String> {
     check(&instruction).map(|()| labelled)
 }
 
+/// Refuses a comment that changes how the lines below are read.
+fn check_directive(comment: &str) -> Result<(), String> {
+    let directive = comment.trim_start_matches('#').trim().to_lowercase();
+    let escape = directive.strip_prefix("escape").and_then(|rest| rest.trim_start().strip_prefix('='));
+    match escape {
+        Some(value) if value.trim() != "\\" => {
+            Err("The Dockerfile of this project has another escape character than \\, which is not read here"
+                .to_owned())
+        }
+        _ => Ok(()),
+    }
+}
+
+/// What a line has before the backslash with which it goes on in the next one.
+fn continued(line: &str) -> Result<Option<&str>, String> {
+    let Some(before) = line.trim_end().strip_suffix('\\') else { return Ok(None) };
+    let after = line.get(before.len() + 1..).unwrap_or_default();
+    // For some versions of Docker such a line goes on, for others it does not.
+    if before.ends_with('\\') || after.contains(|letter: char| !" \t".contains(letter)) {
+        let line = excerpt(line.trim(), SHOWN);
+        return Err(format!(
+            "A line of the Dockerfile of this project must not end as `{line}` does: with one backslash or none"
+        ));
+    }
+    Ok(Some(before))
+}
+
 fn keyword(instruction: &str) -> String {
     instruction.split_whitespace().next().unwrap_or_default().to_uppercase()
 }
 
 fn check(instruction: &str) -> Result<(), String> {
-    let words = keyword(instruction);
-    let added =
-        if words == "ONBUILD" { keyword(instruction.trim().get(words.len()..).unwrap_or_default()) } else { words };
-    let is_remote = instruction.contains("://") || instruction.contains("git@") || instruction.contains('$');
-    if added == "ADD" && is_remote {
+    let words = instruction.split_whitespace();
+    let mut words = words.skip_while(|word| word.to_uppercase() == "ONBUILD");
+    if words.next().is_none_or(|word| word.to_uppercase() != "ADD") {
+        return Ok(());
+    }
+    let mut words: Vec<&str> = words.skip_while(|word| word.starts_with("--")).collect();
+    if !words.first().is_some_and(|word| word.starts_with('[')) {
+        // Where it goes to.
+        words.pop();
+    }
+    // An address has a colon, which a variable or a backslash may stand for.
+    if words.iter().any(|word| word.contains([':', '$', '\\'])) {
         return Err(format!(
             "The Dockerfile of this project has `{}`, but may ADD files of the project only; RUN can fetch others",
-            instruction.trim()
+            excerpt(instruction.trim(), SHOWN)
         ));
     }
     Ok(())
@@ -73,10 +111,29 @@ mod tests {
             "ADD git@forge:lab/arm.git /x",
             "ADD $URL /x",
             "ONBUILD ADD http://a /x",
+            "AD\\\nD http://a /x",
+            "ON\\\nBUILD ADD http://a /x",
+            "ADD http:/\\\n/a /x",
+            "ADD http:/'/'a /x",
+            r"ADD http:/\/a /x",
+            r#"ADD ["http:\/\/a", "/x"]"#,
+            r#"ADD ["http\u003a//a", "/x"]"#,
+            "RUN a \\\\\nADD http://a /x",
+            "RUN a \\\u{a0}\nADD http://a /x",
         ] {
             assert!(labelled(&format!("FROM a\n{line}\n"), "x").is_err(), "{line}");
         }
-        for line in ["ADD a.tar.gz /x", "RUN wget http://a/b", "COPY . $PROJECT_PATH", "RUN add $x"] {
+        assert!(labelled("# escape = `\nFROM a\nRUN b \\\nADD http://a /x\n", "x").is_err());
+        assert!(labelled("\u{feff}#ESCAPE=`\nFROM a\nRUN b \\\nADD http://a /x\n", "x").is_err());
+        assert!(labelled("# escape=\\\nFROM a\n", "x").is_ok());
+        for line in [
+            "ADD a.tar.gz /x",
+            "RUN wget http://a/b",
+            "COPY . $PROJECT_PATH",
+            "RUN add $x",
+            "ADD --chown=1:1 . $PROJECT_PATH",
+            "RUN a \\ \t\n b",
+        ] {
             assert!(labelled(&format!("FROM a\n{line}\n"), "x").is_ok(), "{line}");
         }
     }

@@ -11,11 +11,13 @@ use bytesize::ByteSize;
 use jiff::Timestamp;
 use tokio::sync::{Semaphore, watch};
 
+use super::compose::DEFAULT_MEMORY;
 use super::docker::{Docker, DockerError, SHORT};
 use super::dockerfile::LABEL;
 use super::objects::Owner;
 use super::steps;
 use crate::simulation::checkout::{Project, SingleFlight};
+use crate::simulation::config::SimulationConfig;
 
 /// The images of this server.
 pub struct Images {
@@ -23,6 +25,8 @@ pub struct Images {
     owner: Owner,
     /// How long an image may take.
     limit: Duration,
+    /// How much memory a step of a build may take, in MiB.
+    memory: u64,
     /// As many images are built at a time.
     builds: Semaphore,
     jobs: SingleFlight<String, Result<(), String>>,
@@ -57,8 +61,10 @@ struct Own {
 impl Images {
     /// The images of this owner.
     #[must_use]
-    pub fn new(docker: Docker, owner: Owner, builds: usize, limit: Duration) -> Self {
-        Self { docker, owner, limit, builds: Semaphore::new(builds), jobs: SingleFlight::default() }
+    pub fn new(docker: Docker, owner: Owner, config: &SimulationConfig) -> Self {
+        let (builds, limit) = (Semaphore::new(config.container.builds), config.timing.build);
+        let memory = config.limits.memory.unwrap_or(DEFAULT_MEMORY);
+        Self { docker, owner, limit, memory, builds, jobs: SingleFlight::default() }
     }
 
     /// The name under which this server keeps its images. No other image has it.
@@ -108,8 +114,10 @@ impl Images {
 
     async fn build_now(&self, name: &str, build: Build, news: watch::Sender<String>) -> Result<(), String> {
         let _permit = self.permit(&news).await?;
-        let mut words =
-            ["build", "--force-rm", "--network", build.network, "--tag", name, "--file"].map(OsString::from).to_vec();
+        let memory = format!("{}m", self.memory);
+        let limits = ["--memory", &memory, "--memory-swap", &memory];
+        let words = ["build", "--force-rm", "--network", build.network, "--tag", name].into_iter().chain(limits);
+        let mut words: Vec<OsString> = words.chain(["--file"]).map(OsString::from).collect();
         words.push(build.dockerfile.clone().into());
         words.extend(build.arguments.iter().flat_map(|argument| ["--build-arg".into(), argument.into()]));
         words.push(build.context.clone().into());
@@ -153,12 +161,14 @@ impl Images {
     /// Where an image wants to keep data: such places would be on the disk of the machine, without any limit.
     ///
     /// # Errors
-    /// When Docker fails.
+    /// When Docker fails, or such a place has a name that only its own author understands.
     pub async fn volumes(&self, image: &str) -> Result<Vec<String>, String> {
-        let format = "{{range $path, $_ := .Config.Volumes}}{{println $path}}{{end}}";
+        let format = "{{range $path, $_ := .Config.Volumes}}{{printf \"%+q\" $path}}{{println}}{{end}}";
         let listed = self.docker.run(&["image", "inspect", "--format", format, image], SHORT).await;
         let listed = listed.map_err(|error| error.to_string())?;
-        Ok(listed.lines().map(str::trim).filter(|path| path.starts_with('/')).map(str::to_owned).collect())
+        let strange =
+            |path: &str| format!("The image {image} has a VOLUME {path}, which can't be given to a container here");
+        listed.lines().map(|path| place_of(path).ok_or_else(|| strange(path))).collect()
     }
 
     /// Removes the images that this server has built and that nobody has used for so long, or that are too many for this
@@ -206,6 +216,21 @@ impl Images {
         }
         Ok(own)
     }
+}
+
+/// The place of a volume, from its quoted name: from the root on and without detours, as Docker reads it.
+fn place_of(quoted: &str) -> Option<String> {
+    let name = quoted.strip_prefix('"')?.strip_suffix('"')?;
+    let is_plain = |letter: char| letter.is_ascii_alphanumeric() || "/._-+@".contains(letter);
+    let mut place = Vec::new();
+    for part in name.split('/') {
+        match part {
+            "" | "." => {}
+            ".." => drop(place.pop()),
+            part => place.push(part),
+        }
+    }
+    (name.starts_with('/') && name.chars().all(is_plain)).then(|| format!("/{}", place.join("/")))
 }
 
 /// Those images that can go, the longest unused first.
@@ -263,6 +288,23 @@ impl fmt::Debug for Images {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_volume_is_known_by_the_place_where_docker_puts_it() {
+        for (name, place) in [
+            ("\"/data\"", Some("/data")),
+            ("\"data\"", None),
+            ("\"/x/..//./data/\"", Some("/data")),
+            ("\"/\"", Some("/")),
+            ("\"\"", None),
+            ("\"/a:size=1\"", None),
+            ("\"/a\\n/b\"", None),
+            ("\"/a,b\"", None),
+            ("\"/aaaa", None),
+        ] {
+            assert_eq!(place_of(name).as_deref(), place, "{name}");
+        }
+    }
 
     #[test]
     fn the_longest_unused_images_go_first_and_those_that_are_to_be_kept_stay() {

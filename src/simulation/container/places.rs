@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use super::recipe;
 use super::webots_yml::Kind;
+use crate::shared::text::one_line;
 use crate::simulation::checkout::Project;
 
 /// The world's path in its project's folder.
@@ -25,6 +26,14 @@ pub fn world_in(project: &Project) -> Result<String, String> {
     inside.to_str().map(str::to_owned).ok_or_else(|| "The world's name is no text".to_owned())
 }
 
+/// The folder of the project, as containers are told of it.
+///
+/// # Errors
+/// When they can't be, in words for the client.
+pub fn project_folder(project: &Project) -> Result<PathBuf, String> {
+    project.folder().canonicalize().map_err(|error| error.to_string()).and_then(mountable)
+}
+
 /// The folder of a competition's participant. It is not in the project, where a world's program could put a link in its
 /// place before the controller is started anew.
 #[must_use]
@@ -42,7 +51,7 @@ pub fn edited_folder(kind: &Kind, project: &Project) -> Result<Option<PathBuf>, 
         Kind::Competition { .. } => Ok(Some(edited_in(project))),
         Kind::Editor { .. } => {
             let folder = kind.folder_in_project().unwrap_or_default();
-            recipe::inside(project.folder(), &folder.to_string_lossy()).map(Some)
+            recipe::inside(project.folder(), &folder.to_string_lossy()).and_then(mountable).map(Some)
         }
     }
 }
@@ -54,4 +63,17 @@ pub fn volume_of(kind: &Kind) -> Option<&str> {
         Kind::Default => None,
         Kind::Editor { folder } | Kind::Competition { folder } => Some(folder),
     }
+}
+
+/// Checks that compose can be told of a folder: it takes `:` for the end of a path, and a line break for that of a variable.
+///
+/// # Errors
+/// When not, in words for the client.
+fn mountable(folder: PathBuf) -> Result<PathBuf, String> {
+    let is_plain = |name: &str| !name.contains(|letter: char| letter == ':' || letter.is_control());
+    if folder.to_str().is_some_and(is_plain) {
+        return Ok(folder);
+    }
+    let name = one_line(&folder.file_name().unwrap_or_default().to_string_lossy());
+    Err(format!("The path of the folder {name} of this project has a ':' or a line break, which containers can't have"))
 }

@@ -1,0 +1,105 @@
+//! What a project tries in the files that are read before its simulation runs, and what odd surroundings do to that.
+
+use std::time::Duration;
+
+use serde_json::json;
+
+use super::daemon::{ask, docker, of_service, server};
+use super::image::NAME;
+use crate::support::client::Client;
+use crate::support::git::{Forge, arm};
+
+/// How long a build may take on a busy machine.
+const BUILT: Duration = Duration::from_secs(90);
+
+fn with(dockerfile: &str) -> Forge {
+    let forge = Forge::with_arm();
+    forge.commit("lab/arm", "main", &[("Dockerfile", dockerfile)]);
+    forge
+}
+
+#[actix_rt::test]
+async fn a_link_in_an_image_leads_no_build_to_files_of_the_machine() {
+    let Some(_docker) = docker().await else { return };
+    let outside = tempfile::tempdir().unwrap();
+    std::fs::write(outside.path().join("secret"), "xyz").unwrap();
+    let forge = with(&format!(
+        "FROM {NAME}\nCOPY . /usr/local/webots-project\nRUN rm -r /usr/local/webots-project/controllers && ln -s {} \
+         /usr/local/webots-project/controllers\n",
+        outside.path().display()
+    ));
+    let controller = format!("FROM {NAME}\nCOPY . /stolen\nRUN cat /stolen/secret && false\n");
+    let yml = "dockerCompose: \"competition:webots-project/controllers/c\"\n";
+    forge.commit("lab/arm", "main", &[("webots.yml", yml), ("controllers/Dockerfile", &controller)]);
+    let server = server(forge.path(), 1).start().await;
+    let mut client = Client::start(&server, &arm()).await;
+    let told = client.patiently("loading: Error:", BUILT).await;
+    assert!(told.contains("The project has no folder controllers"), "{told}; heard {:#?}", client.heard);
+}
+
+#[actix_rt::test]
+async fn a_folders_name_mounts_nothing_else_of_the_machine() {
+    let Some(_docker) = docker().await else { return };
+    let forge = Forge::with_arm();
+    let work = forge.work_tree("lab/arm", "main");
+    // As a line of its own it would say where the project is.
+    let folder = work.join("controllers/x\nPROJECT=/etc");
+    std::fs::create_dir_all(&folder).unwrap();
+    std::fs::write(folder.join("file"), "").unwrap();
+    std::os::unix::fs::symlink("x\nPROJECT=/etc", work.join("controllers/edit")).unwrap();
+    std::fs::write(work.join("webots.yml"), "dockerCompose: \"theia:webots-project/controllers/edit\"\n").unwrap();
+    forge.commit_work_tree("lab/arm", "main");
+    let server = server(forge.path(), 1).start().await;
+    let mut client = Client::start(&server, &arm()).await;
+    let told = client.patiently("loading: Error:", BUILT).await;
+    assert!(told.contains("line break"), "{told}; heard {:#?}", client.heard);
+}
+
+#[actix_rt::test]
+async fn variables_of_the_servers_own_environment_mean_nothing_to_compose() {
+    let Some(_docker) = docker().await else { return };
+    let forge = Forge::with_arm();
+    let server = server(forge.path(), 1).env("PORT", "9").env("PROJECT", "/etc").env("BIND", "nobody").start().await;
+    let mut client = Client::start(&server, &arm()).await;
+    client.patiently("webots:", BUILT).await;
+    let webots = &of_service(&server, "webots")[0];
+    assert_eq!(ask(&["exec", webots, "cat", "/usr/local/webots-project/controllers/c/c.py"]), "print('original')");
+}
+
+#[actix_rt::test]
+async fn volumes_and_checks_that_an_image_declares_cost_the_machine_nothing() {
+    let Some(_docker) = docker().await else { return };
+    let declared = "VOLUME [\"/x/../unclean/\"]\nHEALTHCHECK --interval=1ms CMD true\n";
+    let forge = with(&format!("FROM {NAME}\nCOPY . /usr/local/webots-project\n{declared}"));
+    let server = server(forge.path(), 1).start().await;
+    let mut client = Client::start(&server, &arm()).await;
+    client.patiently("webots:", BUILT).await;
+    let webots = &of_service(&server, "webots")[0];
+    let mounts = ask(&["exec", webots, "cat", "/proc/mounts"]);
+    let kinds: Vec<_> = mounts.lines().filter(|line| line.contains(" /unclean ")).collect();
+    assert!(!kinds.is_empty() && kinds.iter().all(|line| line.starts_with("tmpfs ")), "{mounts}");
+    assert_eq!(ask(&["inspect", "--format", "{{json .State.Health}}", webots]), "null");
+}
+
+#[actix_rt::test]
+async fn a_volume_whose_name_is_read_in_more_than_one_way_is_refused() {
+    let Some(_docker) = docker().await else { return };
+    for name in ["/a:size=1", "hidden"] {
+        let forge = with(&format!("FROM {NAME}\nCOPY . /usr/local/webots-project\nVOLUME [\"{name}\"]\n"));
+        let server = server(forge.path(), 1).start().await;
+        let told = Client::start(&server, &arm()).await.patiently("loading: Error:", BUILT).await;
+        assert!(told.contains("has a VOLUME"), "{told}");
+    }
+}
+
+#[actix_rt::test]
+async fn a_build_has_no_more_memory_than_a_simulation() {
+    let Some(_docker) = docker().await else { return };
+    // It ends by itself, without having been stopped, at 200 MB.
+    let eats = "perl -e 'my @a; push @a, \"x\" x 1000000 for 1..200'";
+    let forge = with(&format!("FROM {NAME}\nCOPY . /usr/local/webots-project\nRUN {eats}\n"));
+    let server = server(forge.path(), 1).set("limits", json!({ "memory": 64 })).start().await;
+    let mut client = Client::start(&server, &arm()).await;
+    let told = client.patiently("loading: Error:", BUILT).await;
+    assert!(told.contains("can't be built") && told.contains("137"), "{told}");
+}
