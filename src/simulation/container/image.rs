@@ -89,7 +89,7 @@ impl Images {
         let _permit = self.permit(&news).await?;
         let told = |line: &str| drop(news.send(steps::pulling(image, line)));
         let words = ["pull", image].map(OsString::from).to_vec();
-        self.docker.follow(words, self.limit, told).await.map_err(|error| not_pulled(image, &error))
+        self.docker.follow(words, self.limit + SHORT, told).await.map_err(|error| not_pulled(image, &error))
     }
 
     /// Builds an image, unless it is there. Returns its name.
@@ -130,7 +130,7 @@ impl Images {
                 news.send(text).ok();
             }
         };
-        let done = self.docker.follow(words, self.limit, told).await;
+        let done = self.docker.follow(words, self.limit + SHORT, told).await;
         // Until here the folder that is copied from has to stay.
         drop(build.project);
         done.map_err(|error| not_built(&step, &error))
