@@ -111,7 +111,7 @@ fn bound_clients(config: &SimulationConfig) -> Result<usize, AppError> {
 /// When an actor that must live has stopped, or the system refuses what the server needs.
 pub async fn serve(assembly: Assembly) -> Result<(), AppError> {
     let Assembly { server, socket, mut signals, phase: phase_sender, mut asked } = assembly;
-    let owner = server.containers.as_ref().map(|containers| containers.owner().name());
+    let owner = server.containers.as_ref().map(|containers| containers.run().name());
     let _guardian = Guardian::start(server.run.path(), owner)?;
     let shared = web::Data::from(Arc::clone(&server));
     let threads = std::thread::available_parallelism().map_or(1, usize::from);

@@ -72,6 +72,25 @@ async fn what_an_earlier_run_has_left_is_removed_and_nothing_of_others() {
 }
 
 #[actix_rt::test]
+async fn a_server_that_is_started_again_at_once_keeps_what_it_starts() {
+    let Some(_docker) = docker().await else { return };
+    let (forge, folder) = (Forge::with_arm(), tempfile::tempdir().unwrap());
+    let mut first = server(forge.path(), 1).folder(folder.path()).start().await;
+    Client::start(&first, &arm()).await.patiently("webots:", Duration::from_secs(60)).await;
+    first.signal(Signal::SIGKILL);
+    first.ended().await;
+    // The guardian of the first is still looking for what that has left.
+    let second = server(forge.path(), 1).folder(folder.path()).start().await;
+    let mut client = Client::start(&second, &arm()).await;
+    client.patiently("webots:", Duration::from_secs(60)).await;
+    let begin = Instant::now();
+    while begin.elapsed() < Duration::from_secs(8) {
+        client.patiently(".", Duration::from_secs(20)).await;
+    }
+    assert_eq!(containers(&second).len(), 1);
+}
+
+#[actix_rt::test]
 async fn a_daemon_that_is_stopped_is_told_and_all_goes_on_when_it_is_back() {
     let Some(docker) = alone().await else { return };
     let forge = Forge::with_arm();

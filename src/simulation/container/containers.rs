@@ -17,18 +17,20 @@ use super::packet_filter;
 use super::places::{edited_folder, edited_in, project_folder, volume_of, world_in};
 use super::prepared::{Lease, Prepared};
 use super::recipe::{self, PROJECT_PATH, Recipe};
+use super::request::{Request, command};
 use super::steps;
 use super::templates::Templates;
 use super::tidy::{Live, keep_tidy};
 use super::webots_yml::Kind;
 use crate::simulation::checkout::Project;
-use crate::simulation::config::{ContainerDisplay, SimulationConfig};
+use crate::simulation::config::SimulationConfig;
 
 /// Makes the containers of simulations.
 #[derive(Debug)]
 pub struct Containers {
     docker: Docker,
     owner: Owner,
+    run: Owner,
     templates: Templates,
     images: Arc<Images>,
     live: Live,
@@ -40,28 +42,6 @@ pub struct Containers {
     _keeper: AbortOnDropHandle<()>,
 }
 
-/// Makes a command, given where the world is in the container.
-pub type Command = Box<dyn Fn(&str) -> Vec<String> + Send>;
-
-/// A simulation that is to run in containers.
-pub struct Request {
-    /// What was checked out.
-    pub project: Arc<Project>,
-    /// The port of Webots.
-    pub port: u16,
-    /// Webots and its arguments, given where its world is in the container.
-    pub command: Command,
-}
-
-impl std::fmt::Debug for Request {
-    fn fmt(&self, out: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        write!(out, "Request on port {}", self.port)
-    }
-}
-
-/// What runs a program on a virtual display: a part of the images of Webots.
-const VIRTUAL_DISPLAY: [&str; 2] = ["xvfb-run", "--auto-servernum"];
-
 impl Containers {
     /// Gets ready to make containers, on the thread whose runtime this is. `run` is the folder of this run of the server.
     /// Removes what an earlier run has left. Blocks for a moment.
@@ -72,6 +52,7 @@ impl Containers {
         let docker = Docker::find(run)?;
         let owner = Owner::of(&config.cache_dir.0);
         objects::sweep(&owner);
+        let this_run = owner.run();
         let shortcoming = packet_filter::missing();
         if let Some(why) = &shortcoming {
             log::warn!("{why}");
@@ -86,6 +67,7 @@ impl Containers {
         Ok(Self {
             docker,
             owner,
+            run: this_run,
             templates,
             images,
             live,
@@ -99,8 +81,8 @@ impl Containers {
 
     /// Whose containers these are, for a process that removes them after the server's end.
     #[must_use]
-    pub fn owner(&self) -> &Owner {
-        &self.owner
+    pub fn run(&self) -> &Owner {
+        &self.run
     }
 
     /// What containers may do on this machine that they should not, if so.
@@ -121,7 +103,7 @@ impl Containers {
         progress: &(impl Fn(String) + Send + Sync),
     ) -> Result<Prepared, String> {
         let recipe = self.recipe(&request).await?;
-        let lease = Lease::take(self.owner.project(request.port), &self.live);
+        let lease = Lease::take(self.run.project(request.port), &self.live);
         let network = self.config.container.network.name();
         network::join(&self.docker, network).await?;
         let version = &request.project.world.version;
@@ -282,15 +264,6 @@ impl Containers {
         let pairs = listed.lines().filter_map(|line| line.split_once(' '));
         Ok(pairs.map(|(service, container)| (service.to_owned(), container.to_owned())).collect())
     }
-}
-
-fn command(config: &SimulationConfig, request: &Request, world: &str) -> Vec<String> {
-    let webots = (request.command)(&format!("{PROJECT_PATH}/{world}"));
-    let display = match config.container.display {
-        ContainerDisplay::Virtual => &VIRTUAL_DISPLAY[..],
-        ContainerDisplay::Machine => &[],
-    };
-    display.iter().map(|word| (*word).to_owned()).chain(webots).collect()
 }
 
 /// Does file work on a thread that serves nobody.

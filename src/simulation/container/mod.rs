@@ -14,13 +14,15 @@ pub mod packet_filter;
 mod places;
 mod prepared;
 mod recipe;
+mod request;
 mod steps;
 mod templates;
 mod tidy;
 mod webots_yml;
 
 pub use check::{check, daemon_fault};
-pub use containers::{Containers, Request};
+pub use containers::Containers;
 pub use objects::{Owner, sweep};
 pub use prepared::Prepared;
+pub use request::Request;
 pub use webots_yml::{Kind, WebotsYml};

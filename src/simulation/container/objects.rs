@@ -15,7 +15,7 @@ use super::docker::{Docker, DockerError, SHORT};
 /// The label by which compose knows its projects.
 pub const PROJECT: &str = "com.docker.compose.project";
 
-/// The beginning of the names of one server's compose projects, and of the images that it builds.
+/// Whose compose projects and images some are: those of a server, or of one run of it. Their names begin alike.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Owner(String);
 
@@ -33,6 +33,12 @@ impl Owner {
     pub fn of(cache: &Path) -> Self {
         let cache = cache.canonicalize().unwrap_or_else(|_| cache.to_owned());
         Self(format!("{:012x}", digest(cache.as_os_str().as_encoded_bytes()) >> 80))
+    }
+
+    /// One run of this server: what the next one has is not its own.
+    #[must_use]
+    pub fn run(&self) -> Self {
+        Self(format!("{}-{:08x}", self.0, rand::random::<u32>()))
     }
 
     /// The name of an owner as [`Self::name`] gives it.

@@ -1,0 +1,40 @@
+//! A simulation that is to run in containers.
+
+use std::sync::Arc;
+
+use super::recipe::PROJECT_PATH;
+use crate::simulation::checkout::Project;
+use crate::simulation::config::{ContainerDisplay, SimulationConfig};
+
+/// Makes a command, given where the world is in the container.
+pub type Command = Box<dyn Fn(&str) -> Vec<String> + Send>;
+
+/// A simulation that is to run in containers.
+pub struct Request {
+    /// What was checked out.
+    pub project: Arc<Project>,
+    /// The port of Webots.
+    pub port: u16,
+    /// Webots and its arguments, given where its world is in the container.
+    pub command: Command,
+}
+
+impl std::fmt::Debug for Request {
+    fn fmt(&self, out: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(out, "Request on port {}", self.port)
+    }
+}
+
+/// What runs a program on a virtual display: a part of the images of Webots.
+const VIRTUAL_DISPLAY: [&str; 2] = ["xvfb-run", "--auto-servernum"];
+
+/// Webots and its arguments, as they are in the container.
+#[must_use]
+pub fn command(config: &SimulationConfig, request: &Request, world: &str) -> Vec<String> {
+    let webots = (request.command)(&format!("{PROJECT_PATH}/{world}"));
+    let display = match config.container.display {
+        ContainerDisplay::Virtual => &VIRTUAL_DISPLAY[..],
+        ContainerDisplay::Machine => &[],
+    };
+    display.iter().map(|word| (*word).to_owned()).chain(webots).collect()
+}
