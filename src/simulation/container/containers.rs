@@ -22,7 +22,6 @@ use super::steps;
 use super::templates::Templates;
 use super::tidy::{Live, keep_tidy};
 use super::webots_yml::Kind;
-use crate::simulation::checkout::Project;
 use crate::simulation::config::SimulationConfig;
 
 /// Makes the containers of simulations.
