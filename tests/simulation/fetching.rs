@@ -171,7 +171,7 @@ async fn a_git_that_is_stopped_is_ended_and_fails_nobody_who_goes_on_asking() {
         );
         let wrapper = GitWrapper::new(&stop);
         let builder = simulation_server(&webots.path(), forge.path(), 2).env("PATH", &wrapper.path());
-        let server = builder.set("timing.checkout", 16).start().await;
+        let server = builder.set("timing.checkout", 32).start().await;
         let ask = async || Client::start(&server, &world("lab/arm", "main", "worlds/a.wbt")).await;
         let mut first = ask().await;
         until("it is stopped", async || marks.path().join("stopped").exists()).await;
