@@ -36,11 +36,10 @@ fn main() -> ExitCode {
     if let Some(Part::Guard(arguments)) = &arguments.part {
         return ExitCode::from(guardian::guard(arguments));
     }
-    let mut loaded = match start::read::<SimulationConfig>(&arguments.config) {
+    let loaded = match start::read::<SimulationConfig>(&arguments.config) {
         Ok(loaded) => loaded,
         Err(code) => return code,
     };
-    loaded.config.file.clone_from(&arguments.config);
     if arguments.options.check {
         let code = start::check(&loaded);
         for finding in preflight::check(&loaded.config) {

@@ -112,14 +112,28 @@ async fn limits_that_a_machine_can_not_keep_are_told_at_the_start_and_by_a_check
 }
 
 #[actix_rt::test]
-async fn containers_are_refused_in_one_line() {
+async fn levels_and_folders_that_can_not_be_are_refused_in_one_line() {
     let (forge, webots) = (Forge::with_arm(), Webots::launcher());
     for (key, value, words) in [
         ("isolation", json!("container"), "isolation: \"container\" is not supported yet"),
         ("docker", json!(true), "docker: true is not supported"),
         ("isolation", json!("jail"), "isolation: unknown variant `jail`"),
+        ("isolation", json!(true), "isolation: true is no level; allowed are \"auto\", \"sandbox\", \"none\""),
+        ("sandbox", json!({"readable": "/"}), "sandbox.readable: \"/\" can't be taken from the system"),
+        (
+            "sandbox",
+            json!({"writable": ["/srv", "/proc/self/.."]}),
+            "sandbox.writable: \"/proc/self/..\" can't be taken",
+        ),
+        ("sandbox", json!({"writable": "CONFIG"}), "config.json, which only the server may change; allowed are"),
+        ("sandbox", json!({"writable": "FOLDER/.."}), "log, which only the server may change; allowed are"),
     ] {
-        let mut server = simulation_server(&webots.path(), forge.path(), 1).set(key, value).spawn();
+        let folder = tempfile::tempdir().unwrap();
+        let value = value.to_string().replace("FOLDER", folder.path().to_str().unwrap());
+        let value = value.replace("CONFIG", folder.path().join("config.json").to_str().unwrap());
+        let value: serde_json::Value = serde_json::from_str(&value).unwrap();
+        let builder = simulation_server(&webots.path(), forge.path(), 1).folder(folder.path());
+        let mut server = builder.set(key, value).spawn();
         assert_eq!(server.ended().await, Some(2));
         let log = server.log();
         assert!(log.lines().count() == 1 && log.contains(words), "{log}");

@@ -1,23 +1,20 @@
 //! The simulation server's configuration, `config/simulation/NAME.json`.
 
 use std::net::{IpAddr, Ipv6Addr};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
-use super::isolation::{Isolation, SandboxFolders, VariableName};
+use super::isolation::{Isolation, SandboxFolders, VariableName, level};
 use super::resources::Resources;
 use super::timing::Timing;
-use crate::shared::config::{Configuration, InvalidValue};
 use crate::shared::config::{
-    ExpandedPath, expanded, folder, local_address, object, one_or_many, optional_expanded, optional_whole, percent,
-    seconds, whole,
+    Configuration, ExpandedPath, InvalidValue, Secret, expanded, folder, local_address, object, one_or_many,
+    optional_expanded, optional_whole, percent, seconds, whole,
 };
-use crate::shared::domain::UrlPrefix;
-use crate::shared::domain::{ClientUrls, PublicAddress, PublicUrl, check_host};
-use crate::shared::http::Origin;
-use crate::shared::http::TrustedProxies;
+use crate::shared::domain::{ClientUrls, PublicAddress, PublicUrl, UrlPrefix, check_host};
+use crate::shared::http::{Origin, TrustedProxies};
 use crate::simulation::checkout::Mirrors;
 use crate::simulation::machine::display::DisplayName;
 
@@ -67,7 +64,7 @@ pub struct SimulationConfig {
     #[serde(default)]
     pub projects_dir: Option<ExpandedPath>,
     /// At which level of isolation simulations run. Default: `auto`.
-    #[serde(default)]
+    #[serde(default, deserialize_with = "level")]
     pub isolation: Isolation,
     /// What a sandbox has besides the system and Webots.
     #[serde(default, deserialize_with = "object")]
@@ -157,7 +154,7 @@ pub struct SimulationConfig {
     pub allowed_origins: Vec<Origin>,
     /// Password for actions such as `/drain`. Default: none, and actions are off.
     #[serde(default)]
-    pub admin_password: Option<crate::shared::config::Secret>,
+    pub admin_password: Option<Secret>,
     /// All other durations.
     #[serde(default, deserialize_with = "object")]
     pub timing: Timing,
@@ -187,6 +184,12 @@ impl SimulationConfig {
         PublicAddress::new(&self.server, port, self.port_rewrite)
     }
 
+    /// Returns the files that may hold secrets: this configuration's own, and those that it names.
+    pub fn secret_files(&self) -> impl Iterator<Item = &Path> {
+        let password = self.admin_password.as_ref().and_then(Secret::file);
+        [Some(self.file.as_path()), self.git_config.as_ref().map(|file| &*file.0), password].into_iter().flatten()
+    }
+
     /// Returns the ports that Webots may use.
     #[must_use]
     pub fn streaming_ports(&self) -> std::ops::RangeInclusive<u16> {
@@ -207,7 +210,8 @@ impl SimulationConfig {
 impl Configuration for SimulationConfig {
     const ALIASES: &'static [&'static str] = &["fullyQualifiedDomainName", "persistentDockerImages"];
 
-    fn complete(&mut self) -> Result<Vec<String>, InvalidValue> {
+    fn complete(&mut self, file: &Path) -> Result<Vec<String>, InvalidValue> {
+        file.clone_into(&mut self.file);
         let mut warnings = Vec::new();
         if self.server.is_empty() {
             warnings.push("server is not set: URLs will name localhost".to_owned());
@@ -218,6 +222,8 @@ impl Configuration for SimulationConfig {
             self.webots_home = std::env::var_os("WEBOTS_HOME").map(ExpandedPath::plain);
         }
         self.isolation.check(self.docker)?;
+        let own = [self.log_dir.0.as_path(), &self.cache_dir.0].into_iter().chain(self.secret_files());
+        self.sandbox.check(own)?;
         warnings.extend(self.sandbox.missing().map(|path| format!("sandbox: {} is not there", path.display())));
         if self.port.checked_add(self.max_connections).is_none() {
             let problem = format!("{} places above port {} leave the range of ports", self.max_connections, self.port);

@@ -3,6 +3,7 @@
 mod cgroup;
 mod environment;
 mod launcher;
+mod place;
 mod program;
 mod sandbox;
 mod unkept;
