@@ -17,6 +17,7 @@
 //! | [`simulation::machine`] | readings of the machine, the load |
 //! | [`simulation::checkout`] | worlds out of git |
 //! | `simulation::isolation` | how a simulation is launched: its level of isolation, environment and limits |
+//! | [`simulation::container`] | simulations in containers: what a project asks for, its image, its compose project |
 //! | [`simulation::webots`] | one running Webots |
 //! | [`simulation::client`] | one web client, the life of its simulation |
 //! | `simulation::web` | paths and pages of the simulation server |

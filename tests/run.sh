@@ -13,14 +13,14 @@ command -v cargo >/dev/null || {
 PATH=$PATH:/usr/sbin
 # The C compiler links the programs; python3 and openssl make counterparts for mail and TLS; xvfb gives a display,
 # bubblewrap sandboxes; the fleet is tested behind both web servers, by a real browser too, and its package and the guide
-# to it in a Debian that debootstrap makes; promtool reads the alerts, dnsmasq leads to simulation servers, and kubectl
+# to it in a Debian that debootstrap makes; nft loads the packet filter; promtool reads the alerts, dnsmasq leads to simulation servers, and kubectl
 # puts what is for Kubernetes together.
 tests/install.sh cc=gcc,libc6-dev git=git git-lfs=git-lfs flock=util-linux openssl=openssl python3=python3 python3-venv=python3-venv \
     Xvfb=xvfb bwrap=bubblewrap apache2=apache2-bin nginx=nginx setpriv=util-linux chromium=chromium \
     debootstrap=debootstrap dpkg-shlibdeps=dpkg-dev desktop-file-validate=desktop-file-utils xhost=x11-xserver-utils \
-    systemd-analyze=systemd ip=iproute2 promtool=prometheus dnsmasq=dnsmasq-base kubectl=kubernetes-client
+    systemd-analyze=systemd ip=iproute2 nft=nftables promtool=prometheus dnsmasq=dnsmasq-base kubectl=kubernetes-client
 # dockerd would begin to run on a machine that has not asked for it.
-[[ -z ${CI-} ]] || tests/install.sh dockerd=docker.io iptables=iptables
+[[ -z ${CI-} ]] || tests/install.sh dockerd=docker.io iptables=iptables docker-compose=docker-compose
 tests/python.sh >/dev/null
 
 start=$SECONDS

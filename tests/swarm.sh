@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # A fleet on a real Docker Swarm on this machine, by deploy/swarm/stack.yml and the images of deploy/docker: deploy, grow, shrink,
-# update, kill. Says what it measures.
+# update, edit, kill; what a visitor meets in Chromium. Says what it measures.
 #
 # dockerd runs in namespaces of its own, from which nothing can be reached. So the images that the Dockerfile begins with are
 # a Debian that debootstrap makes, kept in target/deploy, with an apt-get that has nothing to do and a cargo that copies what is built
@@ -23,15 +23,17 @@ skip() { # WHY
 }
 
 ((EUID == 0)) || skip 'dockerd needs root'
-for program in dockerd docker debootstrap unshare nsenter ip iptables python3; do
+for program in dockerd docker debootstrap unshare nsenter ip iptables python3 openssl "${CHROMIUM:-chromium}"; do
     command -v "$program" >/dev/null || skip "there is no $program"
 done
 # shellcheck disable=SC1091
 DISTRIBUTION=$(. /etc/os-release && echo "${VERSION_CODENAME-}")
 readonly DISTRIBUTION BIN=${FLEET_BIN:-$PWD/target/debug} ROOT=$PWD/target/deploy/swarm-$DISTRIBUTION
 readonly WORLD=https://github.com/webots-fleet/demo/blob/main/worlds/playground.wbt
-readonly DOOR=http://127.0.0.1:8080
+readonly DOOR=http://127.0.0.1:8080 VIEWER=http://localhost:8080/viewer
 [[ -x $BIN/session-server && -x $BIN/rehearse ]] || fail "there are no programs in $BIN: cargo build"
+PYTHON=$(tests/python.sh)
+readonly PYTHON
 WORK=$(mktemp -d)
 readonly WORK
 export DOCKER_HOST=unix://$WORK/docker.sock DOCKER_CONFIG=$WORK DOCKER_BUILDKIT=0
@@ -94,8 +96,9 @@ are() { # NUMBER STATE...
     found=$(servers "${@:2}") && [[ $(wc -w <<<"$found") == "$1" ]]
 }
 
-containers() { # SERVICE
-    docker ps --quiet --filter "label=com.docker.swarm.service.name=fleet_$1"
+containers() { # SERVICE...
+    local service
+    for service in "$@"; do docker ps --quiet --filter "label=com.docker.swarm.service.name=fleet_$service"; done
 }
 
 run_containers() { # NUMBER SERVICE
@@ -108,9 +111,24 @@ are_healthy() { # NUMBER SERVICE
 }
 
 # A class of clients that come and go; each has to be there to the end.
-class() { # CLIENTS OVER STAY
+class() { # CLIENTS OVER STAY ARGUMENT...
     in_machine "$BIN/rehearse" --yes --world "$WORLD" --clients "$1" --over "$2" --stay "$3" --real-time 0.01 --expect "$1" \
-        "$DOOR" >"$WORK/class" 2>&1 || fail "$(cat "$WORK/class")"
+        "${@:4}" "$DOOR" >"$WORK/class" 2>&1 || fail "$(cat "$WORK/class")"
+}
+
+# Somebody with Chromium; what is said is kept.
+visit() { # URL ARGUMENT...
+    in_machine "$PYTHON" tests/browser/through_swarm.py "$@" >"$WORK/visit" 2>"$WORK/visit-errors" ||
+        fail "$(cat "$WORK/visit" "$WORK/visit-errors")"
+}
+
+# When a visitor has said this.
+said() { # WHAT
+    sed --quiet "s/^$1 //p" "$WORK/visit"
+}
+
+has_said() { # WHAT
+    [[ -n $(said "$1") ]]
 }
 
 build() { # IMAGE ARGUMENT...
@@ -193,35 +211,40 @@ FROM debian:bookworm-slim
 COPY nginx.conf /etc/nginx/nginx.conf
 USER 101:101
 STOPSIGNAL SIGQUIT
+COPY default.conf /etc/nginx/conf.d/
 CMD ["nginx", "-g", "daemon off;"]
 END
+printf 'server {\n  listen 8080;\n  server_name localhost;\n  location / { return 418; }\n}\n' >"$WORK/nginx/default.conf"
 build nginxinc/nginx-unprivileged:1.28 "$WORK/nginx"
 
 # --- The fleet.
 
 cp --recursive deploy/swarm "$WORK/swarm"
-# This machine is busy with other tests, and its load says nothing.
-sed -i 's/"port": 1999,/"port": 1999,\n  "loadThreshold": 1000,/' "$WORK/swarm/session.json"
+# All report the load of this one machine, which is busy with much else: it closes no server, and the clients count for more.
+sed -i 's/"port": 1999,/"port": 1999,\n  "loadThreshold": 1000,\n  "clientCost": 30,/' "$WORK/swarm/session.json"
 begin=$(now)
-docker stack deploy --compose-file "$WORK/swarm/stack.yml" fleet >/dev/null 2>&1
-available() { [[ $(get /request) == 1 ]]; }
-within 60 available
-class 1 0s 1s
-told 'from docker stack deploy to the end of the first simulation' "$(($(now) - begin)) ms"
+"$WORK/swarm/deploy" fleet >/dev/null 2>&1
+visit "$VIEWER"
+told 'from docker stack deploy to a scene that moves in Chromium' "$(($(said moves) - begin)) ms"
 within 20 are 2 up
 
-# Four more while clients come and go.
-class 20 8s 8s &
+# Four more while clients come and go, so often that each new server can be used at once.
+class 20 2s 2s --soak 16s --json "$WORK/visits" &
 clients=$!
-sleep 1
+class_began=$(date +%s.%N)
+sleep 3
+mapfile -t old < <(containers simulation)
 begin=$(now)
 docker service scale --detach fleet_simulation=6 >/dev/null
 within 60 run_containers 6 simulation
 started=$(now)
-within 5 are 6 up
+within 8 are 6 up
 told 'from docker service scale 2 -> 6 until all six run' "$((started - begin)) ms"
 told 'from then until the session server offers all six' "$(($(now) - started)) ms"
 wait "$clients"
+# shellcheck disable=SC2046 # Each is a word.
+used=$(docker inspect $(containers simulation) | python3 tests/deploy/first_use.py "$WORK/visits" "$class_began" "${old[@]}") || fail "$used"
+told 'from the start of each new server to its first client' "$used"
 
 # Four fewer while simulations run: each of these goes on to its end.
 class 20 1s 10s &
@@ -229,7 +252,7 @@ clients=$!
 sleep 4
 begin=$(now)
 docker service scale --detach fleet_simulation=2 >/dev/null
-within 5 are 2 up
+within 8 are 2 up
 told 'from docker service scale 6 -> 2 until two are offered' "$(($(now) - begin)) ms"
 staying=$(servers up)
 for ((number = 0; number < 20; number++)); do
@@ -257,24 +280,44 @@ within 90 replaced
 within 10 are 2 up
 told 'clients during a rolling update, to the end' '20 of 20'
 
-# What is killed comes back.
-killed=$(containers simulation | head -n 1)
-begin=$(now)
-docker kill "$killed" >/dev/null
-available || fail 'the other server is there'
+# What is killed comes back; whoever looked on is told, and needs one click.
+visit "$VIEWER" --kill fleet_simulation &
+visitor=$!
+within 60 has_said kill
 whole() { are_healthy 2 simulation && are 2 up && are 0 down; }
+until [[ $(now) -gt $(($(said kill) + 500)) ]]; do sleep 0.1; done
 within 30 whole
-told 'from docker kill of a simulation server until two are offered' "$(($(now) - begin)) ms"
+told 'from docker kill of a simulation server until two are offered' "$(($(now) - $(said kill))) ms"
+wait "$visitor"
+told 'from docker kill until the page of its client tells it' "$(($(said told) - $(said kill))) ms"
+told 'from docker kill until the scene moves again, after a click' "$(($(said again) - $(said kill))) ms"
+(($(said told) - $(said kill) < 10000)) || fail 'its client was told too late'
+
 class 10 0s 10s &
 clients=$!
 sleep 2
+available() { [[ $(get /request) == 1 ]]; }
+longest=0
 for session in $(containers session); do
     docker kill "$session" >/dev/null
-    within 2 available
+    begin=$(now)
+    within 5 available
+    took=$(($(now) - begin))
+    ((took <= longest)) || longest=$took
     within 30 are_healthy 2 session
 done
 wait "$clients"
+told 'from docker kill of a session server until the door answers' "$longest ms at most"
 told 'clients while both session servers are killed in turn, to the end' '10 of 10'
+
+# What was edited is deployed again, and nothing else.
+before=$(containers simulation door)
+sed -i 's/"title": "Carousel"/"title": "Merry-go-round"/' "$WORK/swarm/session.json"
+"$WORK/swarm/deploy" fleet >/dev/null 2>"$WORK/deploy" || fail "$(cat "$WORK/deploy")"
+edited() { [[ $(get /viewer) == *Merry-go-round* && $(containers session | wc -l) == 2 ]]; }
+within 60 edited
+[[ $(containers simulation door) == "$before" ]] || fail 'servers whose configuration is the same were replaced'
+told 'an edited configuration, deployed again' 'is used'
 
 # The door leads to the fleet, and nowhere else.
 inside=$(servers up | cut -d ' ' -f 1)
@@ -286,5 +329,27 @@ for path in /127.0.0.1/2000/load /10.99.0.1/2000/load /localhost/2000/load /simu
     [[ $code == '404 Not Found' ]] || fail "the door leads to $path"
 done
 told 'paths to elsewhere that the door refuses' '10 of 10'
+
+# Another fleet: with https, and simulation servers on nodes with GPUs alone.
+docker stack rm fleet >/dev/null
+gone() { [[ -z $(docker ps --quiet) && -z $(docker network ls --quiet --filter name=fleet_fleet) ]]; }
+within 60 gone
+mkdir "$WORK/tls" "$WORK/x11"
+openssl req -x509 -newkey rsa:2048 -nodes -days 1 -subj /CN=localhost -addext subjectAltName=DNS:localhost \
+    -keyout "$WORK/tls/tls.key" -out "$WORK/tls/tls.crt" 2>/dev/null
+chown -R 101 "$WORK/tls"
+# They are of the demo here too.
+cp "$WORK/swarm/simulation.json" "$WORK/swarm/simulation-gpu.json"
+export DOOR_PORT=80 FLEET_DOOR=wss://localhost SIMULATION=webots-fleet/simulation-demo:0.1.0 DOOR_TLS=$WORK/tls X11=$WORK/x11
+docker stack deploy --compose-file "$WORK/swarm/stack.yml" --compose-file "$WORK/swarm/https.yml" \
+    --compose-file "$WORK/swarm/gpu.yml" fleet >/dev/null 2>&1
+pending() { docker service ps --no-trunc --format '{{.Error}}' fleet_simulation | grep 'scheduling constraints not satisfied'; }
+within 30 pending
+run_containers 0 simulation || fail 'a simulation server runs on a node without a GPU'
+docker node update --label-add webots-fleet.gpu=true "$(docker node ls --quiet)" >/dev/null
+visit https://localhost/viewer
+told 'a scene in Chromium by https, on a node with the label of a GPU' moves
+[[ $(in_machine curl --silent --output /dev/null --write-out '%{redirect_url}' http://localhost/viewer) == https://localhost/viewer ]] ||
+    fail 'http does not lead to https'
 docker stack rm fleet >/dev/null
 echo passed

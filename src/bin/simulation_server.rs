@@ -5,7 +5,8 @@ use std::process::ExitCode;
 
 use clap::Parser;
 use webots_fleet::shared::run::{LogTarget, start};
-use webots_fleet::simulation::config::SimulationConfig;
+use webots_fleet::simulation::config::{Isolation, SimulationConfig};
+use webots_fleet::simulation::container;
 use webots_fleet::simulation::process::guardian;
 use webots_fleet::simulation::{app, preflight};
 
@@ -29,12 +30,34 @@ enum Part {
     /// Used by the server itself: ends the simulations when the server is gone
     #[command(hide = true)]
     Guard(guardian::Arguments),
+    /// Used by the service manager: removes the containers that a server with this configuration has left
+    #[command(hide = true)]
+    Sweep {
+        /// Configuration file
+        config: PathBuf,
+    },
+}
+
+/// Removes the containers that a server with this configuration has left.
+fn sweep(config: &std::path::Path) -> ExitCode {
+    match start::read::<SimulationConfig>(config) {
+        Ok(loaded) if loaded.config.isolation == Isolation::Container => {
+            container::sweep(&container::Owner::of(&loaded.config.cache_dir.0));
+            ExitCode::SUCCESS
+        }
+        Ok(_) => ExitCode::SUCCESS,
+        Err(code) => code,
+    }
 }
 
 fn main() -> ExitCode {
     let arguments = Arguments::parse();
+    if let Some(Part::Sweep { config }) = &arguments.part {
+        return sweep(config);
+    }
     if let Some(Part::Guard(arguments)) = &arguments.part {
-        return ExitCode::from(guardian::guard(arguments));
+        let remove = || arguments.containers.iter().for_each(|owner| container::sweep(&container::Owner::named(owner)));
+        return ExitCode::from(guardian::guard(arguments, remove));
     }
     let loaded = match start::read::<SimulationConfig>(&arguments.config) {
         Ok(loaded) => loaded,

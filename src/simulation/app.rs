@@ -11,7 +11,7 @@ use tokio::sync::mpsc::Receiver;
 use tokio::sync::watch;
 
 use super::announcer::Announcer;
-use super::config::SimulationConfig;
+use super::config::{Isolation, SimulationConfig};
 use super::places::{GetSnapshot, Places};
 use super::readiness;
 use super::state::AppState;
@@ -21,6 +21,7 @@ use crate::shared::http::{BasicAuth, Connections, Live, Metrics};
 use crate::shared::run::{AppError, Phase, Request, Signals, notify, permanent, raise_open_files, start};
 use crate::simulation::checkout::{CacheDir, Checkouts, Limits};
 use crate::simulation::client::{outcome, quota};
+use crate::simulation::container::Containers;
 use crate::simulation::isolation::Launcher;
 use crate::simulation::machine::LoadMonitor;
 use crate::simulation::machine::UsageMonitor;
@@ -71,7 +72,7 @@ impl Assembly {
         let (phase_sender, phase) = watch::channel(Phase::Open);
         let (requests, asked) = tokio::sync::mpsc::channel(4);
         let socket = bind(&config)?;
-        let server = Arc::new(assemble(config, phase, requests)?);
+        let server = Arc::new(assemble(Arc::new(config), phase, requests)?);
         Ok(Self { server, socket, signals, phase: phase_sender, asked })
     }
 
@@ -110,7 +111,8 @@ fn bound_clients(config: &SimulationConfig) -> Result<usize, AppError> {
 /// When an actor that must live has stopped, or the system refuses what the server needs.
 pub async fn serve(assembly: Assembly) -> Result<(), AppError> {
     let Assembly { server, socket, mut signals, phase: phase_sender, mut asked } = assembly;
-    let _guardian = Guardian::start(server.run.path())?;
+    let owner = server.containers.as_ref().map(|containers| containers.owner().name());
+    let _guardian = Guardian::start(server.run.path(), owner)?;
     let shared = web::Data::from(Arc::clone(&server));
     let threads = std::thread::available_parallelism().map_or(1, usize::from);
     let options = Options {
@@ -187,7 +189,7 @@ fn max_tcp(config: &SimulationConfig) -> usize {
 
 /// Makes the server's state, and starts its actors.
 fn assemble(
-    config: SimulationConfig,
+    config: Arc<SimulationConfig>,
     phase: watch::Receiver<Phase>,
     requests: tokio::sync::mpsc::Sender<Request>,
 ) -> Result<AppState, AppError> {
@@ -200,6 +202,7 @@ fn assemble(
         log::warn!("removed what {runs} earlier runs had left, {processes} processes among it");
     }
     let launcher = Launcher::start(&config).map_err(|error| AppError::Unavailable(error.to_string()))?;
+    let containers = open_containers(&config, &run)?;
     let rules = Rules {
         allowed: config.allowed_repositories.clone(),
         blocked: config.blocked_repositories.clone(),
@@ -216,7 +219,6 @@ fn assemble(
     }
     let metrics = Metrics::new();
     let starts = outcome::counter(&metrics)?;
-    let config = Arc::new(config);
     let problem = readiness::watch(Arc::clone(&config), run.path().to_owned());
     Ok(AppState {
         rules,
@@ -226,6 +228,7 @@ fn assemble(
         readings,
         checkouts: Arc::new(checkouts),
         launcher: Arc::new(launcher),
+        containers,
         run: Arc::new(run),
         phase,
         requests,
@@ -240,6 +243,15 @@ fn assemble(
         started: Instant::now(),
         config,
     })
+}
+
+/// Gets ready to make containers, where simulations run in these.
+fn open_containers(config: &Arc<SimulationConfig>, run: &RunDir) -> Result<Option<Arc<Containers>>, AppError> {
+    if config.isolation != Isolation::Container {
+        return Ok(None);
+    }
+    let unavailable = |why| AppError::Unavailable(format!("isolation is \"container\", but {why}"));
+    Ok(Some(Arc::new(Containers::open(Arc::clone(config), run.path()).map_err(unavailable)?)))
 }
 
 /// Opens the cache of repositories with the bounds that the configuration sets.

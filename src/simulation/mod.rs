@@ -5,6 +5,7 @@ pub mod app;
 pub mod checkout;
 pub mod client;
 pub mod config;
+pub mod container;
 mod isolation;
 pub mod machine;
 pub mod places;

@@ -4,7 +4,8 @@ use std::process::Command;
 
 use which::which;
 
-use super::config::SimulationConfig;
+use super::config::{Isolation, SimulationConfig};
+use super::container;
 use crate::simulation::isolation::Launcher;
 use crate::simulation::machine::display;
 
@@ -29,24 +30,21 @@ impl std::fmt::Display for Finding {
 /// Checks everything. It runs programs and connects to the display, so it can take some seconds.
 #[must_use]
 pub fn check(config: &SimulationConfig) -> Vec<Finding> {
+    let (first, last) = if config.isolation == Isolation::Container {
+        (vec![Finding { topic: "docker", result: container::check(config) }], None)
+    } else {
+        let first = [("webots", webots(config)), ("display", display(config))];
+        let first = first.map(|(topic, result)| Finding { topic, result });
+        (first.into(), Some(Finding { topic: "Xvfb", result: xvfb(config) }))
+    };
+    let git = version(&["git", "--version"], "git is not there: no world can be checked out");
+    let lfs = version(&["git-lfs", "--version"], "git-lfs is not there: large files of Git LFS will be missing");
+    let always = [("git", git), ("git-lfs", lfs)].map(|(topic, result)| Finding { topic, result });
     let launcher = Launcher::new(config).map_err(|error| format!("the server does not start: {error}"));
     let unkept = launcher.as_ref().map(Launcher::unkept).unwrap_or_default();
-    let mut findings = vec![
-        Finding { topic: "webots", result: webots(config) },
-        Finding { topic: "display", result: display(config) },
-        Finding {
-            topic: "git",
-            result: version(&["git", "--version"], "git is not there: no world can be checked out"),
-        },
-        Finding {
-            topic: "git-lfs",
-            result: version(&["git-lfs", "--version"], "git-lfs is not there: large files of Git LFS will be missing"),
-        },
-        Finding { topic: "Xvfb", result: xvfb(config) },
-        Finding { topic: "isolation", result: launcher.and_then(|launcher| isolation(&launcher)) },
-    ];
-    findings.extend(unkept.into_iter().map(|line| Finding { topic: "limits", result: Err(line) }));
-    findings
+    let unkept = unkept.into_iter().map(|line| Finding { topic: "limits", result: Err(line) });
+    let isolation = Finding { topic: "isolation", result: launcher.and_then(|launcher| isolation(&launcher)) };
+    first.into_iter().chain(always).chain(last).chain([isolation]).chain(unkept).collect()
 }
 
 fn webots(config: &SimulationConfig) -> Result<String, String> {

@@ -9,6 +9,8 @@
 //! | to the client (text) | |
 //! |---|---|
 //! | `queue: N` | N clients are ahead in the waiting line |
+//! | `ide: enable` | the project has an editor, on Webots' port + 500 |
+//! | `type:TYPE` | what the project's `webots.yml` says of it |
 //! | `loading: TEXT` | progress |
 //! | `loading: Error: TEXT` | why the simulation failed; the connection is closed after it |
 //! | `shutdownTimeout: SECONDS` | the process was launched, and will be closed after so many seconds |
@@ -85,6 +87,13 @@ impl Request {
 
 /// The heartbeat that is passed on.
 pub const HEARTBEAT: &str = ".";
+
+/// A text that a project asks for: `ide: enable`, or its type, which ends its line as with the original.
+#[must_use]
+pub fn of_project(text: &str) -> String {
+    let end = if text.ends_with('\n') { "\n" } else { "" };
+    client_text(text.trim_end()) + end
+}
 
 /// Progress, in words.
 #[must_use]

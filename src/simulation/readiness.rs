@@ -8,7 +8,8 @@ use std::time::Duration;
 use tokio::sync::watch;
 use which::which;
 
-use super::config::SimulationConfig;
+use super::config::{Isolation, SimulationConfig};
+use crate::simulation::container::daemon_fault;
 use crate::simulation::machine::display;
 
 /// Time between two checks.
@@ -45,24 +46,30 @@ pub fn watch(config: Arc<SimulationConfig>, run: PathBuf) -> watch::Receiver<Opt
 
 /// Checks everything that each simulation needs. Blocks for two seconds at most.
 fn check(config: &SimulationConfig, run: &Path) -> Result<(), String> {
+    if config.isolation == Isolation::Container {
+        daemon_fault().map_or(Ok(()), Err)?;
+    }
     webots_program(config)?;
     which("git").map_err(|_| "This simulation server has no git".to_owned())?;
     let not_writable = |error| format!("This simulation server can't write in its cache: {error}");
     std::fs::create_dir_all(run).map_err(not_writable)?;
     tempfile::tempfile_in(run).map_err(not_writable)?;
     // Webots itself always needs a display. What stands in for it (`webots`) may not.
-    if config.webots.is_none() && !config.xvfb {
+    if config.webots.is_none() && !config.xvfb && config.isolation != Isolation::Container {
         let display = display::effective(config.display.as_ref());
         display::check(&display).map_err(|error| format!("Webots can't open its window: {error}"))?;
     }
     Ok(())
 }
 
-/// The program that is started for each client.
+/// The program that is started for each client; in a container, that of its image.
 ///
 /// # Errors
 /// What is missing, and how to set it, in words for the client.
 pub fn webots_program(config: &SimulationConfig) -> Result<PathBuf, String> {
+    if config.isolation == Isolation::Container {
+        return Ok(PathBuf::from(&config.container.webots));
+    }
     if config.xvfb && which("Xvfb").is_err() {
         return Err("This simulation server gives each Webots a display of its own (xvfb), but has no Xvfb. \
                     Its administrator can install it, or set xvfb: false and display"

@@ -19,6 +19,7 @@ use crate::shared::http::Live;
 use crate::shared::http::Metrics;
 use crate::shared::run::{Phase, Request};
 use crate::simulation::checkout::Checkouts;
+use crate::simulation::container::Containers;
 use crate::simulation::isolation::Launcher;
 use crate::simulation::machine::UsageMonitor;
 use crate::simulation::machine::{LoadMonitor, Readings};
@@ -38,6 +39,8 @@ pub struct AppState {
     pub readings: watch::Receiver<Arc<Readings>>,
     /// Launches simulations at a level of isolation.
     pub launcher: Arc<Launcher>,
+    /// Makes the containers in which simulations run, where they do.
+    pub containers: Option<Arc<Containers>>,
     /// Checks worlds out.
     pub checkouts: Arc<Checkouts>,
     /// The folder of this run, with the folders of simulations in it.
@@ -72,8 +75,13 @@ impl AppState {
     /// Returns the load to report: 100 % while the server is draining or can start no simulation.
     #[must_use]
     pub fn load(&self) -> Load {
-        let takes_nobody = self.is_draining() || self.problem.borrow().is_some();
-        if takes_nobody { Load::FULL } else { self.readings.borrow().load.unwrap_or(Load::ZERO) }
+        if self.takes_nobody() { Load::FULL } else { self.readings.borrow().load.unwrap_or(Load::ZERO) }
+    }
+
+    /// Whether no client can have a simulation here, whatever its world is.
+    #[must_use]
+    pub fn takes_nobody(&self) -> bool {
+        self.is_draining() || self.problem.borrow().is_some()
     }
 
     /// Whether new clients are refused.
@@ -90,7 +98,9 @@ impl AppState {
     pub fn admit(&self, url: &str) -> Result<ProjectUrl, String> {
         let world = ProjectUrl::parse(url).map_err(|wrong| wrong.to_string())?;
         if self.is_draining() {
-            return Err("This simulation server is about to end, and takes no new clients".to_owned());
+            let why = "This simulation server is about to end, and takes no new clients: connect again, and the session server \
+                       chooses another one";
+            return Err(why.to_owned());
         }
         if let Some(problem) = self.problem() {
             return Err(problem);

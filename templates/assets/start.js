@@ -3,6 +3,10 @@
 /** What comes before a step for the sake of the bar on Webots' page. */
 const STEP_FOR_WEBOTS = /^Step \d\/\d : /;
 const CHECKOUT_IS_OVER = /^webots\b/i;
+/** How a simulation server closes a connection whose client another one may take: going away, try again later. */
+const TRY_ANOTHER = [1001, 1013];
+/** How long the close of a connection may take after the reason for it was told, in milliseconds. */
+const CLOSING = 1000;
 
 /** What somebody can do about a failure, in words. */
 export function advice(text) {
@@ -20,6 +24,7 @@ export function advice(text) {
     [/may not connect to/, 'Load this page again: the fleet may have grown. Else the key server of that simulation server has to name the host that the session server lists in simulationServers.'],
     [/simulator could not be reached/, 'A firewall may be in the way: the ports above the simulation server’s own have to be open, or forwarded.'],
     [/places .* are taken/i, 'Connect again in a few minutes.'],
+    [/takes no new clients/i, 'Connect again in a moment: the session server chooses another simulation server as soon as there is one.'],
   ];
   const found = table.find(([pattern]) => pattern.test(text));
   return found ? found[1] : 'Connect again. If that fails too, tell the administrator what is written here.';
@@ -27,12 +32,14 @@ export function advice(text) {
 
 /**
  * One simulation. Events: `step` ({step, state, text}), `left` (seconds until it is closed), `ready` (the simulator's
- * address), `failed` (text), `over` (text).
+ * address), `failed` (text: it is over), `elsewhere` (text: this server can't take the client, another may).
  */
 export class Simulation extends EventTarget {
   #socket;
+  #granted = false;
   #launched = false;
   #ended = false;
+  #why;
 
   /** Asks a simulation server (a WebSocket address) for a world. */
   constructor(server, world) {
@@ -45,7 +52,7 @@ export class Simulation extends EventTarget {
       this.#socket.send(JSON.stringify({ start: { url: world } }));
     });
     this.#socket.addEventListener('message', ({ data }) => this.#understand(data));
-    this.#socket.addEventListener('close', () => this.#closed());
+    this.#socket.addEventListener('close', ({ code }) => this.#closed(code));
   }
 
   #tell(kind, detail) {
@@ -63,9 +70,9 @@ export class Simulation extends EventTarget {
       this.#step('launch', 'done', 'the simulator is ready');
       this.#tell('ready', rest('webots:'));
     } else if (text.startsWith('loading: Error:'))
-      this.#fail(rest('loading: Error:'));
+      this.#refused(rest('loading: Error:'));
     else if (text.startsWith('error:'))
-      this.#fail(rest('error:'));
+      this.#refused(rest('error:'));
     else if (text.startsWith('loading:'))
       this.#loading(rest('loading:'));
     else if (text.startsWith('queue:')) {
@@ -83,6 +90,7 @@ export class Simulation extends EventTarget {
     // `queue:` says the same, for programs.
     if (text.startsWith('waiting for a place'))
       return;
+    this.#granted = true;
     this.#step('place', 'done', 'taken');
     text = text.replace(STEP_FOR_WEBOTS, '');
     if (this.#launched)
@@ -94,18 +102,24 @@ export class Simulation extends EventTarget {
       this.#step('checkout', 'doing', text);
   }
 
-  #fail(text) {
-    this.#ended = true;
-    this.#tell('failed', text);
+  /** The reason is told first; how the connection is closed says whether another server may take the client. */
+  #refused(text) {
+    this.#why = text;
+    setTimeout(() => this.#closed(), CLOSING);
   }
 
-  #closed() {
+  #closed(code) {
     if (this.#ended)
       return;
     this.#ended = true;
-    this.#tell('failed', this.#launched
-      ? 'The connection to the simulation server broke: the simulation has ended.'
-      : 'The simulation server could not be reached, or has closed the connection.');
+    if (this.#why)
+      this.#tell(TRY_ANOTHER.includes(code) && !this.#launched ? 'elsewhere' : 'failed', this.#why);
+    else if (this.#launched)
+      this.#tell('failed', 'The connection to the simulation server broke: the simulation has ended.');
+    else if (this.#granted)
+      this.#tell('failed', 'The connection to the simulation server broke before the simulation ran.');
+    else
+      this.#tell('elsewhere', 'The simulation server could not be reached, or has closed the connection.');
   }
 
   /** Leaves: the simulation ends. */

@@ -12,6 +12,13 @@ let viewer;
 let countdown;
 let wanted;
 let patience;
+/** Until when another simulation server is asked for, once one could not take the client; and the timer for the next. */
+let askUntil;
+let asking;
+
+/** How long, and how often, another simulation server is asked for, in milliseconds. */
+const ASK_FOR = 15_000;
+const ASK_EVERY = 1000;
 
 /* the light */
 
@@ -95,9 +102,14 @@ function start(event) {
   clearSteps();
   clearStage('The simulation appears here.');
   find('problem').hidden = true;
-  wanted = find('url').value.trim();
+  askUntil = undefined;
+  ask(find('url').value.trim());
+}
+
+function ask(world) {
+  wanted = world;
   busy(true);
-  step({ step: 'session', state: 'doing', text: 'choosing a simulation server' });
+  step({ step: 'session', state: 'doing', text: askUntil ? 'choosing another simulation server' : 'choosing a simulation server' });
   if (door.readyState !== WebSocket.OPEN) {
     wanted = undefined;
     failed('The session server could not be reached.');
@@ -112,7 +124,11 @@ function chosen(answer) {
   const world = wanted;
   wanted = undefined;
   if (answer.startsWith('Error:')) {
-    failed(answer.slice('Error:'.length).trim());
+    const why = answer.slice('Error:'.length).trim();
+    if (askUntil)
+      askAgain(world, why);
+    else
+      failed(why);
     return;
   }
   step({ step: 'session', state: 'done', text: 'has chosen a simulation server' });
@@ -125,7 +141,22 @@ function chosen(answer) {
   on('step', step);
   on('left', countDown);
   on('failed', failed);
+  on('elsewhere', (why) => askAgain(world, why));
   on('ready', (address) => show(address, answer, current));
+}
+
+/** A simulation server is about to end, or gone: the session server hears of that within seconds, and chooses another. */
+function askAgain(world, why) {
+  askUntil ??= Date.now() + ASK_FOR;
+  if (Date.now() > askUntil) {
+    failed(why);
+    return;
+  }
+  leave();
+  clearSteps();
+  busy(true);
+  step({ step: 'session', state: 'doing', text: `another one is asked for: ${why}` });
+  asking = setTimeout(() => ask(world), ASK_EVERY);
 }
 
 function countDown(seconds) {
@@ -212,6 +243,7 @@ function busy(now) {
 function leave() {
   clearInterval(countdown);
   clearTimeout(patience);
+  clearTimeout(asking);
   if (wanted)
     stale += 1;
   find('left').hidden = true;

@@ -1,5 +1,7 @@
 //! An upgrade that costs nobody a simulation: the server takes no new clients, and ends when the last has gone.
 
+use std::time::{Duration, Instant};
+
 use nix::sys::signal::Signal;
 
 use crate::support::client::Client;
@@ -72,6 +74,36 @@ async fn a_server_that_drains_by_request_ends_with_its_last_simulation() {
         assert_eq!(post(server, "/drain", Some("open sesame")).await, 202);
     })
     .await;
+}
+
+#[actix_rt::test]
+async fn a_draining_server_is_offered_for_less_than_a_second_more() {
+    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
+    let server = simulation_server(&webots.path(), forge.path(), 40).start().await;
+    // As the fleets of deploy/swarm and deploy/kubernetes have it.
+    let config = std::fs::read(concat!(env!("CARGO_MANIFEST_DIR"), "/deploy/swarm/session.json")).unwrap();
+    let config: serde_json::Value = serde_json::from_slice(&config).unwrap();
+    let session = session_server(&[server.address()]).set("loadRefresh", config["loadRefresh"].clone());
+    // Neither other tests on this machine nor those who ask here close the server.
+    let session = session.set("loadThreshold", 1000).set("clientCost", 0.001).start().await;
+    let offered = async || http::get(&session.url("/session")).await.text().starts_with("ws://");
+    until("it is offered", offered).await;
+    let mut client = Client::start(&server, &arm()).await;
+    client.until("webots:").await;
+    assert!(offered().await);
+
+    server.signal(Signal::SIGUSR1);
+    let drains = Instant::now();
+    // Who asks here is held up as well where the machine does other things for a while.
+    let (mut asked, mut held_up) = (drains, Duration::ZERO);
+    while offered().await {
+        let last = asked;
+        assert!(last.elapsed() < SOON, "it is offered for ever");
+        assert!(last - drains < Duration::from_secs(1) + held_up, "offered to one who asked {:?} later", last - drains);
+        actix_rt::time::sleep(Duration::from_millis(50)).await;
+        asked = Instant::now();
+        held_up = held_up.max(asked - last - Duration::from_millis(50));
+    }
 }
 
 #[actix_rt::test]

@@ -59,6 +59,7 @@ fn the_units_expose_little() {
     for (unit, most) in [
         ("system/webots-session@.service", 1.5),
         ("system/webots-simulation@.service", 4.0),
+        ("system/webots-fleet-packet-filter.service", 2.5),
         ("user/webots-session@.service", 6.5),
         ("user/webots-simulation@.service", 8.0),
     ] {
@@ -74,7 +75,8 @@ fn the_units_expose_little() {
 
 #[test]
 fn the_units_and_the_script_start_the_same_programs_with_a_configuration_each() {
-    for unit in units().iter().filter(|unit| unit.extension().is_some_and(|kind| kind == "service")) {
+    let is_server = |unit: &&PathBuf| unit.to_str().unwrap().ends_with("@.service");
+    for unit in units().iter().filter(is_server) {
         let text = std::fs::read_to_string(unit).unwrap();
         let kind = if unit.to_str().unwrap().contains("webots-session@") { "session" } else { "simulation" };
         let command = text.lines().find_map(|line| line.strip_prefix("ExecStart=")).unwrap();

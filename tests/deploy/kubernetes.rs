@@ -181,9 +181,15 @@ fn nginx_finds_no_fault_in_the_doors_and_they_have_the_rules_of_the_example() {
     for (name, yaml) in all() {
         let objects = objects(&yaml);
         let door = settings(&objects, "door", "fleet.conf");
-        for rule in
-            ["rewrite ", "add_header ", "proxy_read_timeout ", "proxy_set_header ", "proxy_pass http://$", "map "]
-        {
+        for rule in [
+            "rewrite ",
+            "add_header ",
+            "proxy_read_timeout ",
+            "proxy_connect_timeout ",
+            "proxy_set_header ",
+            "proxy_pass http://$",
+            "map ",
+        ] {
             let rules = |conf: &str| -> Vec<String> {
                 conf.lines().map(str::trim).filter(|line| line.starts_with(rule)).map(str::to_owned).collect()
             };

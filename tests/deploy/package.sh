@@ -20,6 +20,11 @@ nothing_runs() {
     ! runs 'session-server|simulation-serv'
 }
 
+# Whether the packet filter of containers is loaded.
+filters() {
+    in_machine nft list table inet webots_fleet >/dev/null 2>&1
+}
+
 user_property() { # UNIT NAME
     as_lab systemctl --user show --property="$2" --value "$1"
 }
@@ -83,6 +88,18 @@ main() {
     eventually answers 1999 /status '"state":"\(up\|full\)"'
     in_machine test -s /var/log/webots-simulation/simulation/output.log || fail 'there is no log'
 
+    echo 'loads the packet filter of containers where there is nft'
+    [[ $(property webots-fleet-packet-filter ActiveState) == inactive ]] || fail 'it is loaded without nft'
+    ! in_machine systemctl is-failed --quiet webots-fleet-packet-filter || fail 'it fails without nft'
+    in_machine apt-get install --yes --quiet --no-install-recommends nftables >"$WORK/install.log" 2>&1 || fail "$(<"$WORK/install.log")"
+    in_machine systemctl enable --quiet --now nftables webots-fleet-packet-filter
+    filters || fail 'it is not loaded'
+    # Both begin with an empty set of rules.
+    in_machine systemctl reload nftables
+    eventually filters
+    in_machine systemctl restart nftables
+    eventually filters
+
     echo 'runs a simulation within the limits of the unit'
     simulate https://github.com/cyberbotics/demo/blob/main/worlds/a.wbt &
     eventually runs demo-simulator
@@ -124,6 +141,7 @@ main() {
     is_later "/proc/$(property webots-session@main MainPID)/exe" || fail 'the session server is the old one'
     ! is_later "/proc/$old/exe" || fail 'the packages do not differ'
     spared_by_needrestart_ends "$old"
+    filters || fail 'the packet filter is gone'
     runs demo-simulator || fail 'the simulation is gone'
     eventually hears_more "$(stat --format=%s "$WORK/client.log")"
 
@@ -231,6 +249,7 @@ main() {
     in_machine systemctl start webots-session@second
     in_machine apt-get remove --yes --quiet webots-fleet >"$WORK/remove.log" 2>&1 || fail "$(<"$WORK/remove.log")"
     nothing_runs || fail 'a server still runs'
+    ! filters || fail 'the packet filter is still there'
     ! as_lab systemctl --user cat webots-session@new.service >/dev/null 2>&1 || fail "a user's manager still knows the units"
     in_machine test -e /etc/webots-fleet/simulation/main.json || fail 'the configuration is gone'
 

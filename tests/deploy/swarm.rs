@@ -11,10 +11,17 @@ fn its_servers_and_its_door_are_those_of_the_demo_on_kubernetes() {
     for file in ["session.json", "simulation.json"] {
         assert_eq!(read(&format!("swarm/{file}")), read(&format!("kubernetes/overlays/demo/{file}")), "{file}");
     }
+    assert_eq!(read("swarm/simulation-gpu.json"), read("kubernetes/overlays/gpu/simulation.json"));
     let [swarm, kubernetes] = ["swarm/door.conf", "kubernetes/base/config/fleet.conf"].map(read);
-    for rule in
-        ["rewrite ", "add_header ", "location ", "if (", "proxy_read_timeout ", "proxy_pass http://$fleet_address"]
-    {
+    for rule in [
+        "rewrite ",
+        "add_header ",
+        "location ",
+        "if (",
+        "proxy_read_timeout ",
+        "proxy_connect_timeout ",
+        "proxy_pass http://$fleet_address",
+    ] {
         let rules = |conf: &str| -> Vec<String> {
             conf.lines().map(str::trim).filter(|line| line.starts_with(rule)).map(str::to_owned).collect()
         };
@@ -26,8 +33,28 @@ fn its_servers_and_its_door_are_those_of_the_demo_on_kubernetes() {
 #[test]
 fn its_images_are_those_that_the_dockerfile_makes() {
     let (stack, dockerfile) = (read("swarm/stack.yml"), read("docker/Dockerfile"));
-    for stage in ["session-server", "simulation-demo"] {
+    let stack = stack + &read("swarm/gpu.yml");
+    for stage in ["session-server", "simulation-demo", "simulation-server"] {
         assert!(stack.contains(&format!("webots-fleet/{stage}:{}", env!("CARGO_PKG_VERSION"))), "{stage}");
         assert!(dockerfile.contains(&format!(" AS {stage}\n")), "{stage}");
     }
+}
+
+#[test]
+fn every_file_that_swarm_keeps_has_its_hash_in_its_name() {
+    let (program, mut files) = (read("swarm/deploy"), 0);
+    for stack in ["stack.yml", "https.yml", "gpu.yml"] {
+        let stack = read(&format!("swarm/{stack}"));
+        let configs = stack.split("\nconfigs:\n").nth(1).unwrap();
+        for (name, file) in configs.lines().zip(configs.lines().skip(1)).filter(|(name, _)| name.contains(" name: ")) {
+            let variable = name.rsplit_once("${").unwrap().1.strip_suffix("_VERSION:-}").unwrap();
+            let file = file.trim().strip_prefix("file: ").unwrap();
+            assert!(
+                program.contains(&format!(" {variable}={file}")),
+                "{variable}={file} is not in deploy/swarm/deploy"
+            );
+            files += 1;
+        }
+    }
+    assert_eq!(files, 5);
 }

@@ -41,13 +41,23 @@ impl Drop for Full {
     }
 }
 
-/// A folder in whose place an empty one is found that can't be written.
+/// A folder that can't be written.
 pub struct ReadOnly(PathBuf);
 
 impl ReadOnly {
-    pub fn at(folder: &Path) -> Option<Self> {
+    /// An empty one is found in its place.
+    pub fn empty(folder: &Path) -> Option<Self> {
         mount(Some("nothing"), folder, Some("tmpfs"), MsFlags::MS_RDONLY, None::<&str>).ok()?;
         Some(Self(folder.to_owned()))
+    }
+
+    /// All that it holds can still be read.
+    pub fn at(folder: &Path) -> Option<Self> {
+        mount(Some(folder), folder, None::<&str>, MsFlags::MS_BIND, None::<&str>).ok()?;
+        let this = Self(folder.to_owned());
+        let flags = MsFlags::MS_BIND | MsFlags::MS_REMOUNT | MsFlags::MS_RDONLY;
+        mount(None::<&str>, folder, None::<&str>, flags, None::<&str>).ok()?;
+        Some(this)
     }
 }
 

@@ -1,9 +1,8 @@
-//! The faults, each with what heals it. Whatever is done to a fleet here is undone before the function returns, but for
-//! what the fleet has to mend itself.
+//! The faults, each with what heals it: here those of the fleet's processes. Whatever is done to a fleet is undone before the
+//! function returns, but for what the fleet has to mend itself.
 
 use std::collections::BTreeSet;
 use std::future::Future;
-use std::net::TcpListener;
 use std::pin::Pin;
 use std::time::{Duration, Instant};
 
@@ -13,11 +12,11 @@ use procfs::process::Process;
 use rand::RngExt;
 use rand::rngs::SmallRng;
 
-use crate::disk::{Full, ReadOnly};
-use crate::fleet::{Fleet, SERVERS, SMALL_DISK};
+use crate::fleet::{Fleet, SERVERS};
 use crate::relay::Mood;
 use crate::support::program::Server;
 use crate::support::webots::instances_below;
+use crate::surroundings::*;
 
 type Injected<'fleet> = Pin<Box<dyn Future<Output = bool> + 'fleet>>;
 
@@ -28,7 +27,7 @@ pub struct Fault {
 }
 
 /// How long something that stands still does so.
-const WHILE: Duration = Duration::from_secs(3);
+pub const WHILE: Duration = Duration::from_secs(3);
 /// How long what a killed server leaves may live.
 const AT_ONCE: Duration = Duration::from_secs(2);
 
@@ -49,15 +48,31 @@ pub fn all() -> Vec<Fault> {
         "a Webots stands still": async |fleet, random| signal(fleet, random, "demo-simulator", Signal::SIGSTOP).await;
         "a launcher is killed": async |fleet, random| signal(fleet, random, "/webots --batch", Signal::SIGKILL).await;
         "a guardian is killed": async |fleet, random| signal(fleet, random, " guard ", Signal::SIGKILL).await;
+        "a launcher stands still": async |fleet, random| signal(fleet, random, "/webots --batch", Signal::SIGSTOP).await;
+        "a guardian stands still for a while": stop_guardian;
         "a git is killed": async |fleet, random| signal(fleet, random, "git --literal-pathspecs", Signal::SIGKILL).await;
+        "a git stands still": async |fleet, random| signal(fleet, random, "git --literal-pathspecs", Signal::SIGSTOP).await;
         "the disk is full": fill_disk;
-        "the cached repositories can't be written": async |fleet, _| cover(fleet, "cache/git").await;
-        "the log can't be written": async |fleet, _| cover(fleet, "log").await;
+        "the cached repositories are gone": async |fleet, _| close_folder(fleet, "cache/git", true).await;
+        "the cached repositories can't be written": async |fleet, _| close_folder(fleet, "cache/git", false).await;
+        "the simulations' folders can't be written": async |fleet, _| close_folder(fleet, "cache/runs", false).await;
+        "the log and its folder are gone": async |fleet, _| close_folder(fleet, "log", true).await;
+        "the log and monitor.csv can't be written": async |fleet, _| close_folder(fleet, "log", false).await;
         "no more files can be opened": no_files;
+        "memory runs out": no_memory;
+        "clocks go forward an hour": async |fleet, _| step_clock(fleet, 3600).await;
+        "clocks go back an hour": async |fleet, _| step_clock(fleet, -3600).await;
+        "the name server hangs": async |fleet, _| break_names(fleet, Names::Hang).await;
+        "the name server does not know a name": async |fleet, _| break_names(fleet, Names::AreUnknown).await;
+        "the name server is gone": async |fleet, _| break_names(fleet, Names::HaveNoServer).await;
         "a port is taken": take_port;
-        "a link is cut": async |fleet, _| link(fleet, Mood::Cut).await;
-        "a link is slow": async |fleet, _| link(fleet, Mood::Slow(Duration::from_millis(300))).await;
-        "a link is silent": async |fleet, _| link(fleet, Mood::Silent).await;
+        "a server's own port is taken": take_own_port;
+        "a link is cut": async |fleet, _| change_link(fleet, Mood::Cut).await;
+        "a link is slow": async |fleet, _| change_link(fleet, Mood::Slow(Duration::from_millis(300))).await;
+        "a link is silent": async |fleet, _| change_link(fleet, Mood::Silent).await;
+        "a fifth of a server's packets are lost": async |fleet, random| lose_packets(fleet, random, 0.2).await;
+        "all of a server's packets are lost": async |fleet, random| lose_packets(fleet, random, 1.0).await;
+        "a client is gone and its server does not hear it": half_open;
     }
 }
 
@@ -78,14 +93,19 @@ async fn stop_session(fleet: &mut Fleet, _: &mut SmallRng) -> bool {
 async fn kill_server(fleet: &mut Fleet, random: &mut SmallRng) -> bool {
     let index = random.random_range(0..SERVERS);
     fleet.servers[index].signal(Signal::SIGKILL);
+    bury(fleet, index).await;
+    fleet.restart(index).await;
+    true
+}
+
+/// Waits until a server that was killed has ended, and nothing that it had started is left.
+pub async fn bury(fleet: &mut Fleet, index: usize) {
     fleet.servers[index].ended().await;
     let deadline = Instant::now() + AT_ONCE;
     while let rest @ [_, ..] = instances_below(&fleet.folder(index)).as_slice() {
         assert!(Instant::now() < deadline, "{AT_ONCE:?} after the server's end there is still {rest:?}");
         actix_rt::time::sleep(Duration::from_millis(10)).await;
     }
-    fleet.restart(index).await;
-    true
 }
 
 async fn stop_server(fleet: &mut Fleet, random: &mut SmallRng) -> bool {
@@ -111,6 +131,18 @@ async fn signal(fleet: &Fleet, random: &mut SmallRng, words: &str, signal: Signa
     false
 }
 
+/// A guardian stands still, but not for good: nothing would be left to end what a server that is killed leaves.
+async fn stop_guardian(fleet: &mut Fleet, random: &mut SmallRng) -> bool {
+    let all = descendants(fleet, " guard ");
+    if all.is_empty() {
+        return false;
+    }
+    let guardian = Pid::from_raw(all[random.random_range(0..all.len())]);
+    kill(guardian, Signal::SIGSTOP).unwrap();
+    actix_rt::time::sleep(WHILE).await;
+    kill(guardian, Signal::SIGCONT).is_ok()
+}
+
 /// The processes below the simulation servers whose command line has these words.
 fn descendants(fleet: &Fleet, words: &str) -> Vec<i32> {
     let all: Vec<(i32, i32, Process)> = procfs::process::all_processes()
@@ -134,69 +166,4 @@ fn descendants(fleet: &Fleet, words: &str) -> Vec<i32> {
         .filter(|(pid, _, process)| family.contains(pid) && !servers.contains(pid) && is_one(process))
         .map(|(pid, ..)| pid)
         .collect()
-}
-
-async fn fill_disk(fleet: &mut Fleet, _: &mut SmallRng) -> bool {
-    let folder = fleet.folder(SMALL_DISK);
-    let disk = nix::sys::statvfs::statvfs(&folder).unwrap();
-    if disk.blocks() * disk.fragment_size() > 64 << 20 {
-        return false;
-    }
-    let _full = Full::at(&folder);
-    actix_rt::time::sleep(WHILE).await;
-    true
-}
-
-async fn cover(fleet: &mut Fleet, name: &str) -> bool {
-    let Some(_covered) = ReadOnly::at(&fleet.folder(SMALL_DISK).join(name)) else {
-        return false;
-    };
-    actix_rt::time::sleep(WHILE).await;
-    true
-}
-
-async fn no_files(fleet: &mut Fleet, random: &mut SmallRng) -> bool {
-    let pid = fleet.servers[random.random_range(0..SERVERS)].pid();
-    let Ok(limits) = limit_files(pid, None) else {
-        return false;
-    };
-    let open = Process::new(pid).and_then(|process| process.fd_count()).unwrap();
-    limit_files(pid, Some((open as u64, limits.1))).unwrap();
-    actix_rt::time::sleep(WHILE).await;
-    limit_files(pid, Some(limits)).unwrap();
-    true
-}
-
-/// Sets how many files a process may open, as soft and hard limit; returns what was.
-fn limit_files(pid: i32, new: Option<(u64, u64)>) -> Result<(u64, u64), String> {
-    let mut command = std::process::Command::new("prlimit");
-    command.args(["--pid", &pid.to_string(), "--noheadings", "--raw", "--output", "SOFT,HARD"]);
-    match new {
-        Some((soft, hard)) => command.arg(format!("--nofile={soft}:{hard}")),
-        None => command.arg("--nofile"),
-    };
-    let output = command.output().map_err(|error| error.to_string())?;
-    let text = String::from_utf8_lossy(&output.stdout).into_owned();
-    let mut numbers = text.split_whitespace().filter_map(|number| number.parse().ok());
-    match (output.status.success(), numbers.next(), numbers.next()) {
-        (true, Some(soft), Some(hard)) => Ok((soft, hard)),
-        (true, ..) if new.is_some() => Ok(new.unwrap()),
-        _ => Err(String::from_utf8_lossy(&output.stderr).into_owned()),
-    }
-}
-
-async fn take_port(fleet: &mut Fleet, random: &mut SmallRng) -> bool {
-    let port = fleet.port(random.random_range(0..SERVERS), random.random_range(0..100));
-    let Ok(_taken) = TcpListener::bind(("127.0.0.1", port)) else {
-        return false;
-    };
-    actix_rt::time::sleep(WHILE).await;
-    true
-}
-
-async fn link(fleet: &mut Fleet, mood: Mood) -> bool {
-    fleet.relay.set(mood);
-    actix_rt::time::sleep(WHILE).await;
-    fleet.relay.set(Mood::Open);
-    true
 }

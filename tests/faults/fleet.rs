@@ -1,18 +1,21 @@
 //! The fleet that is tested, and what must hold of it.
 
-use std::path::PathBuf;
-use std::process::{Child, Command, Stdio};
+use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-use serde_json::{Value, json};
+use serde_json::json;
 
+use crate::class::Class;
 use crate::disk;
+use crate::machine::Clock;
+use crate::network::Network;
 use crate::relay::Relay;
 use crate::support::client::{Client, Heard};
-use crate::support::git::{Forge, world};
+use crate::support::git::{Forge, arm};
+use crate::support::name_server::NameServer;
 use crate::support::program::{Builder, Server, session_server, simulation_server};
 use crate::support::webots::{Webots, instances_below};
-use crate::support::{http, ports};
+use crate::support::{SOON, http, ports};
 
 /// How many simulation servers there are.
 pub const SERVERS: usize = 5;
@@ -20,18 +23,25 @@ pub const SERVERS: usize = 5;
 pub const SMALL_DISK: usize = 3;
 /// The one behind a link that can be cut.
 pub const LINKED: usize = 4;
+/// The one that a name leads to.
+const NAMED: usize = 0;
+/// That name.
+const NAME: &str = "fleet.test";
 /// How many simulations fit on each.
-const PLACES: u16 = 4;
-/// How many clients come and go.
-const CLIENTS: u32 = 8;
+pub const PLACES: u16 = 4;
 /// How long the fleet may take to be whole again.
-const BOUND: Duration = Duration::from_secs(30);
+pub const BOUND: Duration = Duration::from_secs(30);
 
 /// A session server and its simulation servers.
 pub struct Fleet {
     pub session: Server,
     pub servers: Vec<Server>,
     pub relay: Relay,
+    pub names: NameServer,
+    /// That of all servers, where it can be set.
+    pub clock: Option<Clock>,
+    /// Where packets can be lost.
+    pub network: Option<Network>,
     forge: Forge,
     webots: Webots,
     folder: tempfile::TempDir,
@@ -43,14 +53,9 @@ pub struct Fleet {
     memory: Vec<u64>,
 }
 
-/// A class that comes and goes: a rehearsal.
-pub struct Class {
-    child: Child,
-    file: PathBuf,
-}
-
 impl Fleet {
-    pub async fn start() -> Self {
+    pub async fn start(network: Option<Network>) -> Self {
+        let (names, clock) = (NameServer::start(&[]), Clock::new());
         let (forge, webots) = (Forge::with_arm(), Webots::launcher());
         let folder = tempfile::tempdir().unwrap();
         let ports: Vec<u16> = (0..SERVERS).map(|_| ports::block(PLACES + 12)).collect();
@@ -59,15 +64,37 @@ impl Fleet {
         for (index, port) in ports.iter().enumerate() {
             let name = folder.path().join(format!("server-{index}"));
             std::fs::create_dir_all(&name).unwrap();
-            servers.push(configure(&forge, &webots).folder(&name).port(*port).start().await);
+            servers.push(configure(&forge, &webots, clock.as_ref()).folder(&name).port(*port).start().await);
         }
         let relay = Relay::to(ports[LINKED]).await;
         let session_port = ports::block(1);
-        let addresses = addresses(&ports, &relay);
-        let session = session_builder(&addresses, session_port, folder.path()).start().await;
+        let session = session_builder(&ports, &relay, &names, session_port, folder.path());
+        let session = with(clock.as_ref(), session).start().await;
         let memory = servers.iter().map(|server| memory(server.pid())).collect();
         let began = Instant::now();
-        Self { session, servers, relay, forge, webots, folder, session_port, ports, began, checks: 0, memory }
+        let fleet = Self {
+            session,
+            servers,
+            relay,
+            names,
+            clock,
+            network,
+            forge,
+            webots,
+            folder,
+            session_port,
+            ports,
+            began,
+            checks: 0,
+            memory,
+        };
+        fleet.set_name();
+        fleet
+    }
+
+    /// Has the name server know the name.
+    pub fn set_name(&self) {
+        self.names.set(NAME, &[std::net::Ipv4Addr::LOCALHOST.into()]);
     }
 
     /// Where a server's files are.
@@ -80,35 +107,42 @@ impl Fleet {
         self.ports[index] + 1 + place % PLACES
     }
 
+    /// All ports of a server, as `FIRST:LAST`.
+    pub fn ports_of(&self, index: usize) -> String {
+        format!("{}:{}", self.ports[index], self.ports[index] + PLACES)
+    }
+
+    /// A simulation server at the place of another.
+    pub fn configured(&self, index: usize) -> Builder {
+        let builder = configure(&self.forge, &self.webots, self.clock.as_ref());
+        builder.folder(&self.folder(index)).port(self.ports[index])
+    }
+
     /// Starts a simulation server at the place of one that is gone, as a service manager does.
     pub async fn restart(&mut self, index: usize) {
-        let builder = configure(&self.forge, &self.webots).folder(&self.folder(index)).port(self.ports[index]);
-        self.servers[index] = builder.start().await;
+        self.servers[index] = self.configured(index).start().await;
     }
 
     /// Starts a session server at the place of the one that is gone.
     pub async fn restart_session(&mut self) {
-        let addresses = addresses(&self.ports, &self.relay);
-        self.session = session_builder(&addresses, self.session_port, self.folder.path()).start().await;
+        let session = session_builder(&self.ports, &self.relay, &self.names, self.session_port, self.folder.path());
+        self.session = with(self.clock.as_ref(), session).start().await;
     }
 
     /// Lets a class come again and again for so long.
     pub fn class(&self, time: Duration) -> Class {
-        let file = self.folder.path().join("class.json");
-        let url = format!("http://127.0.0.1:{}", self.session_port);
-        let mut command = Command::new(env!("CARGO_BIN_EXE_rehearse"));
-        command.args([&url, "--world", &world("lab/arm", "main", "worlds/a.wbt"), "--over", "1s", "--stay", "3s"]);
-        command.args(["--patience", "20s", "--misbehave", "reload=10,drop=10,sleep=5,vanish=5,hasty=15"]);
-        command.args(["--clients", &CLIENTS.to_string(), "--soak", &format!("{}s", time.as_secs())]);
-        let child = command.arg("--json").arg(&file).stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
-        Class { child, file }
+        Class::start(&format!("http://127.0.0.1:{}", self.session_port), self.folder.path(), time)
     }
 
     /// Waits until everything holds that must hold. Returns when that was so.
     pub async fn whole(&mut self, after: &str) -> Instant {
         let deadline = Instant::now() + BOUND;
         loop {
-            match self.look().await {
+            let mut seen = self.look().await;
+            if seen.is_ok() {
+                seen = self.try_client().await;
+            }
+            match seen {
                 Ok(()) => {
                     self.checks += 1;
                     return Instant::now();
@@ -124,12 +158,12 @@ impl Fleet {
         let status = http::try_get(&self.session.url("/status")).await?.json();
         let states: Vec<&str> =
             status["servers"].as_array().unwrap().iter().map(|s| s["state"].as_str().unwrap()).collect();
-        if states.iter().any(|state| !matches!(*state, "up" | "full")) {
+        if states.len() != SERVERS || states.iter().any(|state| !matches!(*state, "up" | "full")) {
             return Err(format!("the servers are {states:?}: {status}"));
         }
         // What clients are told is what is true.
-        let mut client = Client::connect(&self.session.websocket("/")).await;
-        let Heard::Text(told) = client.next().await else {
+        let mut client = Client::try_connect(&self.session.websocket("/")).await?;
+        let Some(Heard::Text(told)) = client.next_within(SOON).await else {
             return Err("availability is not told".to_owned());
         };
         let is_true = states.contains(&"up");
@@ -145,6 +179,23 @@ impl Fleet {
                 return Err(format!("server {index} knows {known} simulations and has {folders} folders"));
             }
         }
+        Ok(())
+    }
+
+    /// A client of its own gets a simulation.
+    async fn try_client(&self) -> Result<(), String> {
+        let given = http::try_get(&self.session.url("/session")).await?.text();
+        let mut client =
+            Client::try_connect(&format!("{given}/client")).await.map_err(|why| format!("{given}: {why}"))?;
+        client.try_send(&json!({"start": {"url": arm()}}).to_string()).await?;
+        loop {
+            match client.next_within(SOON).await {
+                Some(Heard::Text(text)) if text.starts_with("webots:") => break,
+                Some(Heard::Text(text)) if !text.starts_with("loading: Error") => {}
+                heard => return Err(format!("{given}: {heard:?} after {:?}", client.heard)),
+            }
+        }
+        client.leave().await;
         Ok(())
     }
 
@@ -199,43 +250,37 @@ impl Fleet {
     }
 }
 
-impl Class {
-    /// Waits until all clients have gone. Returns what they have met.
-    pub async fn end(mut self) -> Value {
-        let deadline = Instant::now() + Duration::from_secs(90);
-        while self.child.try_wait().unwrap().is_none() {
-            assert!(Instant::now() < deadline, "the class does not end");
-            actix_rt::time::sleep(Duration::from_millis(100)).await;
-        }
-        serde_json::from_str(&std::fs::read_to_string(&self.file).unwrap()).unwrap()
+fn configure(forge: &Forge, webots: &Webots, clock: Option<&Clock>) -> Builder {
+    let timing = json!({"grace": 1, "heartbeat": 0.5, "ping": 2, "silence": 6, "launch": 20, "checkout": 16});
+    let builder = simulation_server(&webots.path(), forge.path(), PLACES).set("hangLimit", 1).set("timing", timing);
+    with(clock, builder)
+}
+
+fn with(clock: Option<&Clock>, builder: Builder) -> Builder {
+    match clock {
+        Some(clock) => clock.of(builder),
+        None => builder,
     }
 }
 
-impl Drop for Class {
-    fn drop(&mut self) {
-        self.child.kill().ok();
-        self.child.wait().ok();
-    }
-}
-
-fn configure(forge: &Forge, webots: &Webots) -> Builder {
-    simulation_server(&webots.path(), forge.path(), PLACES)
-        .set("hangLimit", 1)
-        .set("timing", json!({"grace": 1, "heartbeat": 0.5, "ping": 2, "silence": 6, "launch": 20}))
-}
-
-fn session_builder(addresses: &[String], port: u16, folder: &std::path::Path) -> Builder {
+fn session_builder(ports: &[u16], relay: &Relay, names: &NameServer, port: u16, folder: &Path) -> Builder {
     let folder = folder.join("session");
     std::fs::create_dir_all(&folder).unwrap();
-    let builder = session_server(addresses).folder(&folder).port(port).set("timing", json!({"answer": 1}));
+    let builder =
+        session_server(&addresses(ports, relay)).folder(&folder).port(port).set("timing", json!({"answer": 1}));
+    let builder = builder.set("nameServers", json!([names.address()]));
     // What else runs on this machine must not close the fleet.
     builder.set("loadThreshold", 1000)
 }
 
 /// Where the session server finds each simulation server.
 fn addresses(ports: &[u16], relay: &Relay) -> Vec<String> {
-    let of = |(index, port)| if index == LINKED { relay.port } else { port };
-    ports.iter().copied().enumerate().map(of).map(|port| format!("127.0.0.1:{port}")).collect()
+    let of = |(index, port)| match index {
+        NAMED => format!("dns+{NAME}:{port}"),
+        LINKED => format!("127.0.0.1:{}", relay.port),
+        _ => format!("127.0.0.1:{port}"),
+    };
+    ports.iter().copied().enumerate().map(of).collect()
 }
 
 fn is_taken(port: u16) -> bool {

@@ -1,6 +1,7 @@
 //! Faults under load: five simulation servers, a session server and a small class that comes and goes, while servers are
-//! killed and stopped, disks are full, links are cut. After each fault the fleet must be whole again by itself, but for a
-//! server that was killed, which its service manager starts again: here, the test.
+//! killed and stopped, disks are full, memory runs out, clocks step, names hang, packets are lost. After each fault the
+//! fleet must be whole again by itself, but for a server that was killed, which its service manager starts again: here, the
+//! test. Some faults need root, others iptables: what is not possible is said.
 //!
 //! `FAULTS_FOR=1h FAULTS_SEED=7 cargo test --test faults -- --nocapture` plays it for longer, or again.
 
@@ -18,11 +19,15 @@
 #[path = "../support/mod.rs"]
 mod support;
 
+mod class;
 mod disk;
 mod fault;
 mod fleet;
+mod machine;
+mod network;
 mod relay;
 mod returning;
+mod surroundings;
 
 use std::time::{Duration, Instant};
 
@@ -31,6 +36,7 @@ use rand::{RngExt, SeedableRng};
 
 use fault::Fault;
 use fleet::Fleet;
+use network::Network;
 
 /// How long faults are injected where nothing else is asked for.
 const SHORT: Duration = Duration::from_secs(60);
@@ -41,8 +47,9 @@ async fn the_fleet_is_whole_again_after_each_fault() {
     let seed = std::env::var("FAULTS_SEED").map_or_else(|_| rand::random(), |text| text.parse::<u64>().unwrap());
     eprintln!("FAULTS_SEED={seed}");
     disk::hide_mounts_from_others();
+    let network = Network::hide_from_others();
     let mut random = SmallRng::seed_from_u64(seed);
-    let mut fleet = Fleet::start().await;
+    let mut fleet = Fleet::start(network).await;
     fleet.whole("the start").await;
     let end = Instant::now() + time;
     let class = fleet.class(time + Duration::from_secs(20));
@@ -66,14 +73,15 @@ async fn the_fleet_is_whole_again_after_each_fault() {
         eprintln!("{:>7.1} s  {}: whole after {:.1} s", fleet.age(), fault.name, (checked - began).as_secs_f64());
     }
     let report = class.end().await;
-    fleet.empty().await;
     eprintln!(
-        "{} simulations asked for, {} ran; {} faults of {} kinds; invariants checked {} times",
+        "{:.0} s: {} simulations asked for, {} ran; {} faults of {} kinds; invariants checked {} times",
+        fleet.age(),
         report["seats"]["asked"],
         report["seats"]["given"],
         injected.len(),
         injected.iter().collect::<std::collections::BTreeSet<_>>().len(),
         fleet.checks(),
     );
+    fleet.empty().await;
     assert!(report["seats"]["given"].as_u64().unwrap() > 0, "no simulation ran: {report}");
 }

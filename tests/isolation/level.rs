@@ -112,32 +112,44 @@ async fn limits_that_a_machine_can_not_keep_are_told_at_the_start_and_by_a_check
 }
 
 #[actix_rt::test]
-async fn levels_and_folders_that_can_not_be_are_refused_in_one_line() {
+async fn a_level_that_can_not_be_is_refused_in_one_line() {
     let (forge, webots) = (Forge::with_arm(), Webots::launcher());
-    for (key, value, words) in [
-        ("isolation", json!("container"), "isolation: \"container\" is not supported yet"),
-        ("docker", json!(true), "docker: true is not supported"),
-        ("isolation", json!("jail"), "isolation: unknown variant `jail`"),
-        ("isolation", json!(true), "isolation: true is no level; allowed are \"auto\", \"sandbox\", \"none\""),
-        ("sandbox", json!({"readable": "/"}), "sandbox.readable: \"/\" can't be taken from the system"),
+    let containers =
+        |places: u16| simulation_server(&webots.path(), forge.path(), places).set("isolation", "container");
+    let sandbox = |folders| simulation_server(&webots.path(), forge.path(), 1).set("sandbox", folders);
+    let docker = simulation_server(&webots.path(), forge.path(), 1).set("docker", true);
+    for (builder, words) in [
+        (docker.set("isolation", "sandbox"), "docker: true asks for containers, but isolation for another level"),
+        (containers(1).set("isolation", "jail"), "isolation: unknown variant `jail`"),
         (
-            "sandbox",
-            json!({"writable": ["/srv", "/proc/self/.."]}),
-            "sandbox.writable: \"/proc/self/..\" can't be taken",
+            containers(1).set("isolation", true),
+            "isolation: true is no level; allowed are \"auto\", \"sandbox\", \"none\"",
         ),
-        ("sandbox", json!({"writable": "CONFIG"}), "config.json, which only the server may change; allowed are"),
-        ("sandbox", json!({"writable": "FOLDER/.."}), "log, which only the server may change; allowed are"),
+        (sandbox(json!({"readable": "/"})), "sandbox.readable: \"/\" can't be shown"),
+        (sandbox(json!({"writable": ["/srv", "/proc/self/.."]})), "sandbox.writable: \"/proc/self/..\" can't be shown"),
+        (containers(1).set("maxConnections", 501), "allowed are up to 500 places"),
+        (containers(1).set("port", 64_990).set("maxConnections", 100), "editors up to port 65535"),
+        (containers(1).set("container", json!({ "network": "open" })), "unknown variant `open`"),
+        (containers(1).set("container", json!({ "netwrok": "closed" })), "netwrok"),
     ] {
-        let folder = tempfile::tempdir().unwrap();
-        let value = value.to_string().replace("FOLDER", folder.path().to_str().unwrap());
-        let value = value.replace("CONFIG", folder.path().join("config.json").to_str().unwrap());
-        let value: serde_json::Value = serde_json::from_str(&value).unwrap();
-        let builder = simulation_server(&webots.path(), forge.path(), 1).folder(folder.path());
-        let mut server = builder.set(key, value).spawn();
+        let mut server = builder.spawn();
         assert_eq!(server.ended().await, Some(2));
         let log = server.log();
         assert!(log.lines().count() == 1 && log.contains(words), "{log}");
     }
+}
+
+#[actix_rt::test]
+async fn containers_without_docker_refuse_the_start_in_one_line() {
+    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
+    let programs = programs(None);
+    let mut server = with(simulation_server(&webots.path(), forge.path(), 1), &programs, "container").spawn();
+    assert_eq!(server.ended().await, Some(1));
+    let log = server.log();
+    let told: Vec<&str> = log.lines().filter(|line| line.starts_with("error: ")).collect();
+    let words =
+        "error: isolation is \"container\", but docker is not there; on Debian and Ubuntu the package docker.io has it";
+    assert_eq!(told, [words], "{log}");
 }
 
 #[actix_rt::test]

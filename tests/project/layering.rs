@@ -20,7 +20,7 @@ const SESSION: [&str; 8] = [
     "session::web",
     "session::app",
 ];
-const SIMULATION: [&str; 16] = [
+const SIMULATION: [&str; 17] = [
     "simulation::snapshot",
     "simulation::places",
     "simulation::protocol",
@@ -29,6 +29,7 @@ const SIMULATION: [&str; 16] = [
     "simulation::checkout",
     "simulation::config",
     "simulation::isolation",
+    "simulation::container",
     "simulation::preflight",
     "simulation::announcer",
     "simulation::webots",

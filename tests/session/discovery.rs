@@ -6,9 +6,9 @@ use std::time::{Duration, Instant};
 use nix::sys::signal::Signal;
 use serde_json::{Value, json};
 
-use super::name_server::NameServer;
 use super::stand_in::{Manner, StandIn};
 use super::{times_logged, until_states};
+use crate::support::name_server::NameServer;
 use crate::support::program::{Builder, Server, session_server};
 use crate::support::smtp::Smtp;
 use crate::support::{http, ports, until};

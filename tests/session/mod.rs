@@ -1,6 +1,5 @@
 //! The session server, seen from outside: the built program, real sockets, stand-ins for simulation servers.
 
-mod name_server;
 mod stand_in;
 
 mod discovery;

@@ -158,3 +158,29 @@ async fn a_commit_by_several_names_is_fetched_once() {
     }
     assert_eq!(wrapper.calls().iter().filter(|call| call.contains(" fetch ")).count(), 1, "{:#?}", wrapper.calls());
 }
+
+#[actix_rt::test]
+async fn a_git_that_is_stopped_is_ended_and_fails_nobody_who_goes_on_asking() {
+    let forge = &forge(&["main"]);
+    // What each kind of command is for: to make the repository, to fetch, to list its files, to copy them.
+    let kinds = ["init", "fetch", "ls-tree", "checkout"].map(|command| async move {
+        let (webots, marks) = (reader(), tempfile::tempdir().unwrap());
+        let stop = format!(
+            "case \" $* \" in *\" {command} \"*) mkdir {}/stopped 2>/dev/null && kill -STOP $$;; esac",
+            marks.path().display()
+        );
+        let wrapper = GitWrapper::new(&stop);
+        let builder = simulation_server(&webots.path(), forge.path(), 2).env("PATH", &wrapper.path());
+        let server = builder.set("timing.checkout", 16).start().await;
+        let ask = async || Client::start(&server, &world("lab/arm", "main", "worlds/a.wbt")).await;
+        let mut first = ask().await;
+        until("it is stopped", async || marks.path().join("stopped").exists()).await;
+        let mut second = ask().await;
+        for client in [&mut first, &mut second] {
+            let told = client.until("loading: Error:").await;
+            assert!(told.contains("opened [main]"), "git {command}: {told}");
+        }
+        assert!(server.log().contains(" git starts anew"), "{command}: {}", server.log());
+    });
+    join_all(kinds).await;
+}

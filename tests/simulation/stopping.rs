@@ -37,7 +37,9 @@ async fn a_server_that_drains_keeps_its_clients_takes_no_others_and_ends_with_th
         until("it drains", async || http::get(&server.url("/load")).await.text() == "100").await;
         assert_eq!(http::get(&server.url("/status")).await.json()["draining"], true);
         let mut late = Client::start(&server, &arm()).await;
-        assert!(late.until("loading: Error:").await.contains("about to end, and takes no new clients"));
+        let told = late.until("loading: Error:").await;
+        assert!(told.contains("about to end, and takes no new clients: connect again"), "{told}");
+        assert_eq!(late.closed().await, Some(1013), "another server may take it");
         running.leave().await;
         waiting.until("webots:").await;
         assert_eq!(stages(&server).await, ["idle"], "who was in the line is served");

@@ -39,7 +39,7 @@ enum Part {
 fn main() {
     if std::env::args().nth(1).as_deref() == Some("guard") {
         let Part::Guard(arguments) = Arguments::parse().part;
-        std::process::exit(guardian::guard(&arguments).into());
+        std::process::exit(guardian::guard(&arguments, || ()).into());
     }
     run(
         "time::a_simulation_ends_at_its_time_limit_in_any_state",

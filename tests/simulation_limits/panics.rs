@@ -140,6 +140,7 @@ async fn launch(server: &AppState) -> (Addr<Webots>, UnboundedReceiver<Exit>) {
     let project = server.checkouts.start(world, server.run.instance().unwrap(), |_| ()).await.unwrap().unwrap();
     let spec = LaunchSpec {
         config: Arc::clone(&server.config),
+        containers: None,
         launcher: Arc::clone(&server.launcher),
         program: readiness::webots_program(&server.config).unwrap(),
         checkouts: Arc::clone(&server.checkouts),

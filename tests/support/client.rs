@@ -30,8 +30,14 @@ pub enum Heard {
 impl Client {
     /// Connects.
     pub async fn connect(url: &str) -> Self {
-        let (socket, _) = tokio_tungstenite::connect_async(url).await.unwrap_or_else(|error| panic!("{url}: {error}"));
-        Self::new(socket)
+        Self::try_connect(url).await.unwrap_or_else(|error| panic!("{url}: {error}"))
+    }
+
+    /// Connects to a server that may not be there.
+    pub async fn try_connect(url: &str) -> Result<Self, String> {
+        let connecting = actix_rt::time::timeout(SOON, tokio_tungstenite::connect_async(url)).await;
+        let connected = connecting.map_err(|error| error.to_string())?;
+        connected.map(|(socket, _)| Self::new(socket)).map_err(|error| error.to_string())
     }
 
     /// Takes over a connection.
@@ -61,9 +67,22 @@ impl Client {
         connected.map(|(socket, _)| Self::new(socket)).map_err(Box::new)
     }
 
+    /// The port of this end of the connection.
+    pub fn port(&self) -> u16 {
+        match self.socket.get_ref() {
+            MaybeTlsStream::Plain(socket) => socket.local_addr().unwrap().port(),
+            other => panic!("{other:?}"),
+        }
+    }
+
     /// Sends a text.
     pub async fn send(&mut self, text: &str) {
         self.socket.send(Message::text(text)).await.unwrap();
+    }
+
+    /// Sends a text over a connection that may be broken.
+    pub async fn try_send(&mut self, text: &str) -> Result<(), String> {
+        self.socket.send(Message::text(text)).await.map_err(|error| error.to_string())
     }
 
     /// Sends a text in so many frames.
@@ -90,6 +109,11 @@ impl Client {
         }
     }
 
+    /// The next text, or the end, if one comes within this time.
+    pub async fn next_within(&mut self, time: Duration) -> Option<Heard> {
+        actix_rt::time::timeout(time, self.read()).await.ok()
+    }
+
     async fn read(&mut self) -> Heard {
         loop {
             match self.socket.next().await {
@@ -113,6 +137,21 @@ impl Client {
                 Heard::Closed(frame) => panic!("closed ({frame:?}) before {beginning:?}; heard {:#?}", self.heard),
             }
         }
+    }
+
+    /// The next text that begins with this, which may take so long.
+    pub async fn patiently(&mut self, beginning: &str, time: Duration) -> String {
+        let heard = async {
+            loop {
+                match self.read().await {
+                    Heard::Text(text) if text.starts_with(beginning) => return text,
+                    Heard::Text(_) => {}
+                    Heard::Closed(frame) => panic!("closed ({frame:?}) before {beginning:?}; heard {:#?}", self.heard),
+                }
+            }
+        };
+        let heard = actix_rt::time::timeout(time, heard).await;
+        heard.unwrap_or_else(|_| panic!("{beginning:?} did not come"))
     }
 
     /// The close code that ends the connection; `None` where it just broke.

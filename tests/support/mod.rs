@@ -10,6 +10,7 @@ pub mod display;
 pub mod git;
 pub mod http;
 pub mod listener;
+pub mod name_server;
 pub mod ports;
 pub mod program;
 pub mod smtp;

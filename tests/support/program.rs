@@ -152,6 +152,16 @@ impl Builder {
 }
 
 impl Server {
+    /// The folder of its cache.
+    pub fn cache(&self) -> PathBuf {
+        self.folder.join("cache")
+    }
+
+    /// The folder of all that it writes.
+    pub fn folder(&self) -> &Path {
+        &self.folder
+    }
+
     /// `HOST:PORT`.
     pub fn address(&self) -> String {
         format!("127.0.0.1:{}", self.port)

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeSet;
 use std::net::IpAddr;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use hickory_resolver::TokioResolver;
 use hickory_resolver::config::{ConnectionConfig, NameServerConfig, ResolveHosts, ResolverConfig};
@@ -19,8 +19,6 @@ use crate::shared::domain::PublicAddress;
 pub struct Found {
     /// The simulation servers. There is at least one.
     pub servers: BTreeSet<PublicAddress>,
-    /// How long the answer holds.
-    pub valid_until: Instant,
 }
 
 /// Why a name leads to nothing.
@@ -60,11 +58,7 @@ pub async fn look_up(name: &DnsName, name_servers: &[NameServer]) -> Result<Foun
     }
     let data = answers.iter().flat_map(Lookup::answers).map(|record| &record.data);
     let servers: BTreeSet<PublicAddress> = data.filter_map(|data| server(name, data)).collect();
-    let valid_until = answers.iter().map(Lookup::valid_until).min();
-    match valid_until {
-        Some(valid_until) if !servers.is_empty() => Ok(Found { servers, valid_until }),
-        _ => Err(LookupError::Nothing),
-    }
+    if servers.is_empty() { Err(LookupError::Nothing) } else { Ok(Found { servers }) }
 }
 
 fn resolver(name_servers: &[NameServer]) -> Result<TokioResolver, NetError> {

@@ -1,10 +1,10 @@
 //! Actor: looks one name of `simulationServers` up, again and again.
 //!
-//! Created by the registry for each name. It asks DNS whenever the last answer has expired, but at least every two
-//! seconds: engines give their names minutes, and a new server shall be used within five seconds. The result goes to the registry, which
-//! judges it. The monitor ends when the registry says so; after a panic the registry starts a new one.
+//! Created by the registry for each name. It asks DNS every second, whatever time to live an answer has: engines give their
+//! names minutes, and a new server shall be used within five seconds of its start. The result goes to the registry, which judges it.
+//! The monitor ends when the registry says so; after a panic the registry starts a new one.
 
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use actix::prelude::*;
 
@@ -29,10 +29,8 @@ pub struct NameMonitor {
     results: Recipient<LookupResult>,
 }
 
-/// The least time between two lookups, for answers that expire at once.
-const SHORTEST: Duration = Duration::from_secs(1);
-/// The most time between two lookups.
-const LONGEST: Duration = Duration::from_secs(2);
+/// Between the end of a lookup and the next one.
+const PAUSE: Duration = Duration::from_secs(1);
 /// How long a lookup as a whole may take.
 const TIME_LIMIT: Duration = Duration::from_secs(5);
 
@@ -50,13 +48,10 @@ impl NameMonitor {
             .map(|answer, monitor, ctx| {
                 let late = LookupError::NoAnswer(format!("no answer within {} s", TIME_LIMIT.as_secs_f64()));
                 let answer = answer.unwrap_or(Err(late));
-                let valid = answer
-                    .as_ref()
-                    .map_or(LONGEST, |found| found.valid_until.saturating_duration_since(Instant::now()));
                 match monitor.results.try_send(LookupResult { name: monitor.name.clone(), answer }) {
                     // One that is lost is followed by another.
                     Ok(()) | Err(SendError::Full(_)) => {
-                        ctx.run_later(valid.clamp(SHORTEST, LONGEST), Self::look_up);
+                        ctx.run_later(PAUSE, Self::look_up);
                     }
                     // The registry is gone, and with it the server.
                     Err(SendError::Closed(_)) => ctx.stop(),

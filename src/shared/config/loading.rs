@@ -55,6 +55,7 @@ pub fn load<C: Configuration>(file: &Path) -> Result<LoadedConfig<C>, ConfigErro
         return Err(ConfigError::NotAnObject { file: file.to_owned() });
     }
     let mut unknown = Vec::new();
+    let mut seen = BTreeSet::new();
     let mut json = serde_json::Deserializer::from_str(text);
     let mut track = serde_path_to_error::Track::new();
     let tracked = serde_path_to_error::Deserializer::new(&mut json, &mut track);
@@ -64,6 +65,8 @@ pub fn load<C: Configuration>(file: &Path) -> Result<LoadedConfig<C>, ConfigErro
         let key = Some(one_line(&track.path().to_string())).filter(|key| key != "." && key != "?");
         ConfigError::Malformed { file: file.to_owned(), key, problem: one_line(&source.to_string()) }
     })?;
+    // One that comes again is told once.
+    unknown.retain(|key: &String| seen.insert(key.clone()));
     let known = known_keys(&config);
     let mut warnings: Vec<String> = unknown.iter().map(|key| unknown_key(file, key, &known)).collect();
     let more = config.complete(file).map_err(|InvalidValue { key, problem }| ConfigError::InvalidValue {
@@ -121,4 +124,36 @@ fn unknown_key(file: &Path, key: &str, known: &[String]) -> String {
         .max_by(|(one, _), (other, _)| one.total_cmp(other));
     let hint = nearest.map(|(_, candidate)| format!("; did you mean {candidate:?}?")).unwrap_or_default();
     format!("{}: unknown key {key:?} is ignored{hint}", file.display())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[derive(serde::Deserialize, Serialize)]
+    #[serde(rename_all = "camelCase")]
+    struct Small {
+        load_refresh: f64,
+    }
+
+    impl Configuration for Small {
+        const ALIASES: &'static [&'static str] = &[];
+
+        fn complete(&mut self, _: &Path) -> Result<Vec<String>, InvalidValue> {
+            Ok(Vec::new())
+        }
+    }
+
+    #[test]
+    fn an_unknown_key_is_told_once_with_the_most_similar_one() {
+        let file = tempfile::NamedTempFile::new().unwrap();
+        let again = r#""loadRefrsh": 1, "#.repeat(100);
+        std::fs::write(file.path(), format!(r#"{{"loadRefresh": 1, {again} "colour": 2}}"#)).unwrap();
+        let told = load::<Small>(file.path()).unwrap().warnings;
+        let expected = [
+            r#"unknown key "loadRefrsh" is ignored; did you mean "loadRefresh"?"#,
+            r#"unknown key "colour" is ignored"#,
+        ];
+        assert_eq!(told, expected.map(|words| format!("{}: {words}", file.path().display())));
+    }
 }

@@ -4,7 +4,7 @@
 //! project's folder. Both run on the server's main thread as tasks: whoever drops the handle no longer waits.
 
 use std::io;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::sync::Arc;
 use std::time::Instant;
 
@@ -15,19 +15,19 @@ use tokio_util::task::AbortOnDropHandle;
 
 use super::cache::Cache;
 use super::cache_dir::CacheDir;
-use super::copy::{Copied, What, copy_call, look, what};
-use super::disk::outgrown;
+use super::copy::{self, Copied, What, copy_call, look, what};
 use super::error::{CheckoutError, git_failed, machine, too_large, too_slow};
 use super::finder::{Finder, Found};
 use super::git::Git;
 use super::lfs::{self, Pointer};
 use super::limits::Limits;
 use super::mirrors::Mirrors;
+use super::project::Project;
 use super::redirect;
 use super::restored::{self, Restored};
 use super::revision::{ALL, Revision};
 use super::steps;
-use super::world_file::{NoWorld, WorldFile};
+use super::world_file::NoWorld;
 use crate::shared::domain::{ProjectUrl, Rules};
 use crate::simulation::process::InstanceDir;
 
@@ -47,24 +47,6 @@ pub struct Checkouts {
 #[derive(Message)]
 #[rtype(result = "()")]
 pub struct Progress(pub String);
-
-/// A project that was checked out for one client.
-#[derive(Debug)]
-pub struct Project {
-    /// The world to open.
-    pub world: WorldFile,
-    /// What the client should know.
-    pub warnings: Vec<String>,
-    /// Where it came from.
-    url: ProjectUrl,
-    revision: Revision,
-    /// The project's folder.
-    folder: PathBuf,
-    /// Where the project is that Webots sees, in its repository: elsewhere if the world is behind a link.
-    place: String,
-    /// Removed with the project.
-    pub instance: InstanceDir,
-}
 
 impl Checkouts {
     /// Prepares checkouts on the thread whose runtime this is. `run` is the folder of this run of the server; the
@@ -204,17 +186,12 @@ impl Checkouts {
                 progress(steps::checking_out(name, Some(line)));
             }
         };
-        let mut is_too_large = false;
-        let end = async {
-            outgrown(&project, self.limits.size).await;
-            is_too_large = true;
-        };
-        let copied = self.git.run_until(end, call, told).await;
-        if is_too_large {
+        match copy::write(&self.git, &call, instance, (&self.limits, &found.repository), told).await {
+            Ok(true) => Ok(()),
             // What is in the commit may be smaller than what git's attributes make of it.
-            return self.refuse(found, needed);
+            Ok(false) => self.refuse(found, needed),
+            Err(source) => Err(git_failed(world, source)),
         }
-        copied.map(drop).map_err(|source| git_failed(world, source))
     }
 
     /// Refuses what was copied of a commit: it is too large, and so it is for everybody else.
@@ -288,13 +265,5 @@ impl Checkouts {
         self.git.run(call, |_| ()).await.map_err(|source| git_failed(url, source))?;
         restored.place(instance.project(), path.to_owned()).await.map_err(failed)?;
         Ok(true)
-    }
-}
-
-impl Project {
-    /// The project's folder, with `worlds` and `controllers` inside.
-    #[must_use]
-    pub fn folder(&self) -> &Path {
-        &self.folder
     }
 }

@@ -3,11 +3,13 @@
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 
-use super::disk::size_of;
+use super::disk::{outgrown, size_of, stands_still};
 use super::error::{CheckoutError, machine};
 use super::finder::Found;
-use super::git::Call;
+use super::git::{Call, Git};
+use super::git_error::GitError;
 use super::lfs::{self, Pointer};
+use super::limits::Limits;
 use super::refused::Scope;
 use super::repository::Repository;
 use super::revision::{ALL, Revision};
@@ -91,6 +93,39 @@ pub fn copy_call<'call>(
     call.environment.push(("GIT_INDEX_FILE".into(), instance.path().join("index").into()));
     call.environment.push(("GIT_ATTR_SOURCE".into(), reference.into()));
     call
+}
+
+/// Has git write a copy, and tell its progress line by line. Where it stands still it starts anew, each time with twice the
+/// patience: only a few copies are made at a time. Returns whether what was written is small enough.
+///
+/// # Errors
+/// When git fails.
+pub async fn write(
+    git: &Git,
+    call: &Call<'_>,
+    instance: &InstanceDir,
+    (limits, repository): (&Limits, &Repository),
+    mut told: impl FnMut(&str),
+) -> Result<bool, GitError> {
+    let mut patience = limits.patience();
+    loop {
+        let (mut is_too_large, mut is_silent) = (false, false);
+        let project = instance.project();
+        let end = async {
+            tokio::select! {
+                () = outgrown(&project, limits.size) => is_too_large = true,
+                () = stands_still(&project, patience) => is_silent = true,
+            }
+        };
+        match git.run_until(end, call.clone(), &mut told).await {
+            _ if is_too_large => return Ok(false),
+            Err(_) if is_silent => repository.tell_silence(patience),
+            written => return written.map(|_| true),
+        }
+        patience *= 2;
+        // The one that was killed has left it.
+        tokio::fs::remove_file(instance.path().join("index.lock")).await.ok();
+    }
 }
 
 /// Looks at a copy.

@@ -3,7 +3,7 @@
 use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use crate::simulation::process::folder_size::{self, FolderSize};
 use crate::simulation::process::remove_tree;
@@ -82,9 +82,23 @@ pub async fn outgrown(folder: &Path, size: u64) {
     }
 }
 
-/// The bytes of all files below a folder. Where nobody can tell, it is more than anybody allows.
+/// Waits until the files below a folder have had the same size for so long.
+pub async fn stands_still(folder: &Path, limit: Duration) {
+    let (mut since, mut last) = (Instant::now(), None);
+    while since.elapsed() < limit {
+        let folder = folder.to_owned();
+        let now = blocking(move || Ok(size_of(&folder))).await.ok();
+        if now != last {
+            (since, last) = (Instant::now(), now);
+        }
+        actix_rt::time::sleep(BETWEEN_LOOKS).await;
+    }
+}
+
+/// The bytes of all files below a folder. What nobody can look into does not count.
 #[must_use]
 pub fn size_of(folder: &Path) -> u64 {
     let mut size = FolderSize::new(folder_size::length, u64::MAX);
-    size.add_folder(folder).map_or(u64::MAX, |()| size.total())
+    size.add_folder(folder).ok();
+    size.total()
 }

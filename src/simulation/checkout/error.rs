@@ -3,8 +3,7 @@
 use std::io;
 use std::time::Duration;
 
-use super::git_error::{Cause, GitError};
-use super::repository::FetchError;
+use super::git_error::{Cause, FetchError, GitError};
 use super::world_file::NoWorld;
 use crate::shared::domain::ProjectUrl;
 

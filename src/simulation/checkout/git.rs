@@ -27,7 +27,7 @@ pub struct Git {
 }
 
 /// One git command.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub struct Call<'call> {
     /// The bare repository it works on.
     pub repository: &'call Path,
@@ -119,7 +119,18 @@ impl Git {
         self.run_until(std::future::pending(), call, progress).await
     }
 
-    /// The same, but git is killed when `end` comes. Returns only when nothing of git is left.
+    /// The same, but a git that takes longer is killed, and nothing is returned: it was stopped, or its disk hangs.
+    pub async fn run_within(&self, time: Duration, call: Call<'_>) -> Option<Result<Vec<u8>, GitError>> {
+        let mut is_over = false;
+        let end = async {
+            actix_rt::time::sleep(time).await;
+            is_over = true;
+        };
+        let done = self.run_until(end, call, |_| ()).await;
+        (!is_over || done.is_ok()).then_some(done)
+    }
+
+    /// The same as [`Self::run`], but git is killed when `end` comes. Returns only when nothing of git is left.
     ///
     /// # Errors
     /// When git can't be started, fails or is killed.

@@ -1,5 +1,7 @@
 //! Why a git command failed. Pure.
 
+use std::io;
+
 use crate::simulation::process::ExitReason;
 
 /// A git command that failed.
@@ -21,6 +23,34 @@ pub enum GitError {
     /// It answered more than is read.
     #[error("the answer of git {0} is too long")]
     TooLong(String),
+}
+
+/// Why a fetch failed.
+#[derive(Debug, Clone, thiserror::Error)]
+pub enum FetchError {
+    /// git failed.
+    #[error(transparent)]
+    Git(#[from] GitError),
+    /// It has brought more than may come.
+    #[error("it is too large")]
+    TooLarge,
+    /// The machine failed.
+    #[error("{0}")]
+    Machine(String),
+}
+
+impl FetchError {
+    /// Those who wanted it have gone.
+    #[must_use]
+    pub fn unwanted() -> Self {
+        Self::Machine("nobody waits for it".to_owned())
+    }
+}
+
+impl From<io::Error> for FetchError {
+    fn from(error: io::Error) -> Self {
+        Self::Machine(error.to_string())
+    }
 }
 
 /// What a failure means for whoever wanted the command.

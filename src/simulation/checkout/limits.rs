@@ -19,8 +19,8 @@ const ENTRY: u64 = 4096;
 const FEW_ENTRIES: u64 = 10_000;
 
 impl Limits {
-    /// How long a remote may be silent before it is asked anew, for often only the connection has died. Packing a cached
-    /// repository holds a fetch up for no longer either.
+    /// How long a remote may be silent before it is asked anew, for often only the connection has died, and how long a
+    /// command on this machine may at first. Packing a cached repository holds a fetch up for no longer either.
     #[must_use]
     pub fn patience(&self) -> Duration {
         self.time / 4

@@ -16,6 +16,7 @@ mod lfs;
 mod limits;
 mod listing;
 mod mirrors;
+mod project;
 mod redirect;
 mod refused;
 mod repository;
@@ -28,7 +29,9 @@ mod steps;
 mod world_file;
 
 pub use cache_dir::CacheDir;
-pub use checkout::{Checkouts, Progress, Project};
+pub use checkout::{Checkouts, Progress};
 pub use error::CheckoutError;
 pub use limits::Limits;
 pub use mirrors::Mirrors;
+pub use project::Project;
+pub use single_flight::SingleFlight;

@@ -12,7 +12,7 @@ use tokio_util::sync::CancellationToken;
 
 use super::disk::{blocking, packed, received, remove_all, remove_leftovers};
 use super::git::{Call, Git, MOST_MEMORY};
-use super::git_error::GitError;
+use super::git_error::{FetchError, GitError};
 use super::growth::Growth;
 use super::limits::Limits;
 use super::mirrors::Remote;
@@ -38,26 +38,6 @@ pub struct Repository {
     fetches: SingleFlight<String, Result<(), FetchError>>,
     /// When it was made, if this server has made it since it came into use.
     made: Mutex<Option<Instant>>,
-}
-
-/// Why a fetch failed.
-#[derive(Debug, Clone, thiserror::Error)]
-pub enum FetchError {
-    /// git failed.
-    #[error(transparent)]
-    Git(#[from] GitError),
-    /// It has brought more than may come.
-    #[error("it is too large")]
-    TooLarge,
-    /// The machine failed.
-    #[error("{0}")]
-    Machine(String),
-}
-
-impl From<io::Error> for FetchError {
-    fn from(error: io::Error) -> Self {
-        Self::Machine(error.to_string())
-    }
 }
 
 /// Why a running fetch is ended.
@@ -108,7 +88,8 @@ impl Repository {
         }
     }
 
-    /// Runs a command that only reads the repository. Returns its answer.
+    /// Runs a command that only reads the repository. Returns its answer. Where none comes, git is run anew, each time with
+    /// twice the time: others wait for the same answer.
     ///
     /// # Errors
     /// When git fails.
@@ -117,7 +98,14 @@ impl Repository {
         // What is missing must not be asked for: the remote of a history would be.
         call.protocol = "none";
         call.environment.push(("GIT_NO_LAZY_FETCH".into(), "1".into()));
-        self.git.run(call, |_| ()).await
+        let mut patience = self.limits.patience();
+        loop {
+            if let Some(answer) = self.git.run_within(patience, call.clone()).await {
+                return answer;
+            }
+            self.tell_silence(patience);
+            patience *= 2;
+        }
     }
 
     /// Fetches what is wished for, together with everybody who requests for the same. It ends with the last of them.
@@ -150,9 +138,9 @@ impl Repository {
         let _grown = Grown(&self.growth);
         loop {
             let Some(guard) = cancelled.run_until_cancelled(self.lock(told)).await else {
-                return Err(FetchError::Machine("nobody waits for it".to_owned()));
+                return Err(FetchError::unwanted());
             };
-            self.make(request).await?;
+            self.make(request, cancelled).await?;
             let mut cut = None;
             let lines = AtomicUsize::new(0);
             let tell = |line: &str| {
@@ -171,7 +159,7 @@ impl Repository {
             let ended = self.git.run_until(end, call, tell).await;
             match cut {
                 Some(Cut::TooLarge) => return Err(FetchError::TooLarge),
-                Some(Cut::Silent) if ended.is_err() => self.tell_silence(),
+                Some(Cut::Silent) if ended.is_err() => self.tell_silence(self.limits.patience()),
                 _ => {
                     ended?;
                     self.collect_garbage(guard);
@@ -205,20 +193,31 @@ impl Repository {
     }
 
     /// Makes the bare repository unless it is there. Else removes what a git that was killed has left.
-    async fn make(&self, request: &FetchRequest) -> Result<(), FetchError> {
-        let (path, new) = (self.path.clone(), self.path.with_extension("new"));
-        let is_there = blocking(move || {
-            let is_there = path.join("HEAD").is_file();
-            let done = if is_there { remove_leftovers(&path) } else { remove_all(&[&path, &new]) };
-            done.map(|()| is_there)
-        });
-        if is_there.await? {
-            return Ok(());
-        }
+    async fn make(&self, request: &FetchRequest, cancelled: &CancellationToken) -> Result<(), FetchError> {
         // It takes its place when it is whole.
         let new = self.path.with_extension("new");
-        let call = Call { repository: &new, ..self.call(revision::init_arguments(request.is_sha256)) };
-        self.git.run(call, |_| ()).await?;
+        let mut patience = self.limits.patience();
+        loop {
+            let (path, new_path) = (self.path.clone(), new.clone());
+            let is_there = blocking(move || {
+                let is_there = path.join("HEAD").is_file();
+                let done = if is_there { remove_leftovers(&path) } else { remove_all(&[&path, &new_path]) };
+                done.map(|()| is_there)
+            });
+            if is_there.await? {
+                return Ok(());
+            }
+            let call = Call { repository: &new, ..self.call(revision::init_arguments(request.is_sha256)) };
+            if let Some(made) = self.git.run_within(patience, call).await {
+                made?;
+                break;
+            }
+            if cancelled.is_cancelled() {
+                return Err(FetchError::unwanted());
+            }
+            self.tell_silence(patience);
+            patience *= 2;
+        }
         tokio::fs::rename(&new, &self.path).await?;
         *self.made.lock().unwrap_or_else(PoisonError::into_inner) = Some(Instant::now());
         Ok(())
@@ -243,9 +242,9 @@ impl Repository {
         }
     }
 
-    /// Says that the remote is asked anew.
-    pub fn tell_silence(&self) {
-        let seconds = self.limits.patience().as_secs_f64();
+    /// Says that git starts anew after so long.
+    pub fn tell_silence(&self, patience: Duration) {
+        let seconds = patience.as_secs_f64();
         log::warn!("{}: nothing has come for {seconds} s, git starts anew", self.remote().location);
     }
 

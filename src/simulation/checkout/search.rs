@@ -132,7 +132,7 @@ impl Search<'_> {
             match actix_rt::time::timeout(self.limits.patience(), answer).await {
                 Ok(Ok(answer)) => return Ok(String::from_utf8_lossy(&answer).into_owned()),
                 Ok(Err(source)) => return Err(git_failed(self.world, source)),
-                Err(_) => self.repository.tell_silence(),
+                Err(_) => self.repository.tell_silence(self.limits.patience()),
             }
         }
     }

@@ -69,6 +69,13 @@ impl WebClient {
         self.fail(why, ctx);
     }
 
+    /// Refuses a client that another server may take: the close code says so to programs.
+    fn refer(&mut self, why: &str, ctx: &mut Context) {
+        self.start.resolve(Outcome::Refused);
+        log::info!("{}: {why}", self.name());
+        self.finish(&protocol::error(why), CloseCode::Again, ctx);
+    }
+
     fn finish(&mut self, last_words: &str, code: CloseCode, ctx: &mut Context) {
         self.state = State::Over;
         ctx.text(last_words.to_owned());
@@ -102,6 +109,7 @@ impl WebClient {
         }
         let world = match self.server.admit(url) {
             Ok(world) => world,
+            Err(why) if self.server.takes_nobody() => return self.refer(&why, ctx),
             Err(why) => return self.fail_start(Outcome::Refused, &why, ctx),
         };
         log::info!("{}: asks for {world}", self.name());
@@ -148,6 +156,7 @@ impl WebClient {
         ctx.text(protocol::loading("webots is starting"));
         let spec = LaunchSpec {
             config: Arc::clone(&self.server.config),
+            containers: self.server.containers.clone(),
             launcher: Arc::clone(&self.server.launcher),
             program,
             checkouts: Arc::clone(&self.server.checkouts),
@@ -158,7 +167,6 @@ impl WebClient {
         };
         let webots = Webots::start_in_arbiter(&self.server.main_thread, |_| Webots::new(spec));
         self.state = State::Launched(WebotsHandle(webots));
-        ctx.text(protocol::shutdown_timeout(self.server.config.timeout));
     }
 
     fn reset_controller(&mut self, file: String, ctx: &mut Context) {
@@ -271,6 +279,9 @@ impl Handler<WebotsEvent> for WebClient {
 
     fn handle(&mut self, event: WebotsEvent, ctx: &mut Self::Context) {
         match event {
+            WebotsEvent::Progress(text) => ctx.text(protocol::loading(&text)),
+            WebotsEvent::Text(text) => ctx.text(protocol::of_project(&text)),
+            WebotsEvent::Started => ctx.text(protocol::shutdown_timeout(self.server.config.timeout)),
             WebotsEvent::Listening(port) => {
                 self.start.resolve(Outcome::Ready);
                 ctx.text(protocol::webots(&self.server.config.websocket_url(port)));

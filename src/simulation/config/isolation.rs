@@ -8,9 +8,7 @@ use serde::{Deserialize, Deserializer, Serialize};
 use crate::shared::config::{ExpandedPath, InvalidValue, one_or_many};
 
 /// What each sandbox has by itself.
-const OF_EACH: [&str; 2] = ["/proc", "/dev"];
-/// What may stand in the key `sandbox`.
-const ALLOWED: &str = "allowed are files and folders besides those of the server";
+const OF_EACH: [&str; 3] = ["/", "/proc", "/dev"];
 
 /// The key `isolation`: at which level simulations are started.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -28,21 +26,19 @@ pub enum Isolation {
 }
 
 impl Isolation {
-    /// Refuses the level that is not there yet. `docker` is the original's key for it.
+    /// The level that both keys ask for: `docker` is the original's key for containers.
     ///
     /// # Errors
-    /// When containers are asked for.
-    pub fn check(self, docker: bool) -> Result<(), InvalidValue> {
-        let (key, problem) = if docker {
-            let problem = "true is not supported; allowed is false. Worlds would run without the container that was asked \
-                           for";
-            ("docker", problem)
-        } else if self == Self::Container {
-            ("isolation", "\"container\" is not supported yet; allowed are \"auto\", \"sandbox\" and \"none\"")
-        } else {
-            return Ok(());
-        };
-        Err(InvalidValue { key, problem: problem.to_owned() })
+    /// When they contradict each other.
+    pub fn with_docker(self, docker: bool) -> Result<Self, InvalidValue> {
+        match self {
+            Self::Auto if docker => Ok(Self::Container),
+            Self::None | Self::Sandbox if docker => {
+                let problem = "true asks for containers, but isolation for another level; remove one of them";
+                Err(InvalidValue { key: "docker", problem: problem.to_owned() })
+            }
+            level => Ok(level),
+        }
     }
 }
 
@@ -72,29 +68,23 @@ pub struct SandboxFolders {
 }
 
 impl SandboxFolders {
-    /// Refuses what would take the sandbox apart. `own` is what only the server may change.
+    /// Refuses what would take the sandbox apart, and warns of what opens it: `own` is what only the server should change.
     ///
     /// # Errors
-    /// When a folder is all of the system, or what is the server's own can be changed through it.
-    pub fn check<'own>(&self, own: impl Iterator<Item = &'own Path>) -> Result<(), InvalidValue> {
-        let own: Vec<PathBuf> = own.filter(|path| !path.as_os_str().is_empty()).map(real).collect();
-        let keys = [("sandbox.readable", &self.readable, false), ("sandbox.writable", &self.writable, true)];
-        for (key, paths, is_writable) in keys {
-            for path in paths {
-                let (shown, at) = (path.0.display(), real(&path.0));
-                if at.parent().is_none() || OF_EACH.iter().any(|one| at.starts_with(one)) {
-                    let problem =
-                        format!("\"{shown}\" can't be taken from the system: a sandbox has one of its own, {ALLOWED}");
-                    return Err(InvalidValue { key, problem });
-                }
-                if let Some(inside) = own.iter().find(|own| is_writable && own.starts_with(&at)) {
-                    let problem =
-                        format!("\"{shown}\" holds {}, which only the server may change; {ALLOWED}", inside.display());
-                    return Err(InvalidValue { key, problem });
-                }
+    /// When a folder is all of the system, or one that each sandbox has by itself.
+    pub fn check<'own>(&self, own: impl Iterator<Item = &'own Path>) -> Result<Vec<String>, InvalidValue> {
+        for (key, paths) in [("sandbox.readable", &self.readable), ("sandbox.writable", &self.writable)] {
+            if let Some(path) = paths.iter().find(|path| OF_EACH.iter().any(|one| real(&path.0) == Path::new(one))) {
+                let path = path.0.display();
+                let problem = format!("\"{path}\" can't be shown: each sandbox has its own; allowed is what is inside");
+                return Err(InvalidValue { key, problem });
             }
         }
-        Ok(())
+        let writable: Vec<PathBuf> = self.writable.iter().map(|path| real(&path.0)).collect();
+        let open = own.filter(|path| !path.as_os_str().is_empty()).map(real);
+        let open = open.filter(|path| writable.iter().any(|folder| path.starts_with(folder)));
+        let told = |path: PathBuf| format!("sandbox.writable lets worlds replace {}", path.display());
+        Ok(open.map(told).collect())
     }
 
     /// What is named, but not there.
@@ -146,6 +136,25 @@ impl TryFrom<String> for VariableName {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn what_is_the_servers_own_is_told_where_worlds_can_write_it() {
+        let folder = tempfile::tempdir().unwrap();
+        let at = folder.path().canonicalize().unwrap();
+        std::os::unix::fs::symlink(&at, at.join("link")).unwrap();
+        let own = [at.join("link/a/log"), at.join("b/config.json"), PathBuf::new()];
+        let check = |writable: &str, readable: &str| {
+            let paths = |path: &str| vec![ExpandedPath(path.into())];
+            let folders = SandboxFolders { readable: paths(readable), writable: paths(writable) };
+            folders.check(own.iter().map(PathBuf::as_path)).map_err(|error| error.key)
+        };
+        let told = |path: &str| format!("sandbox.writable lets worlds replace {}", at.join(path).display());
+        let text = |path: &str| at.join(path).to_str().unwrap().to_owned();
+        assert_eq!(check(&text("a"), &text("b")), Ok(vec![told("a/log")]));
+        assert_eq!(check(&text("link"), "/dev/shm"), Ok(vec![told("a/log"), told("b/config.json")]));
+        assert_eq!(check(&text("c"), "/proc/.."), Err("sandbox.readable"));
+        assert_eq!(check("/dev/../proc", "/srv"), Err("sandbox.writable"));
+    }
 
     #[test]
     fn a_name_covers_itself_or_what_begins_with_it() {

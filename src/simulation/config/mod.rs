@@ -1,10 +1,12 @@
 //! The simulation server's configuration: every key, its default, and the rules between keys.
 
+mod container;
 mod isolation;
 mod resources;
 mod simulation_config;
 mod timing;
 
+pub use container::{ContainerDisplay, ContainerNetwork, ContainerSettings, EDITOR_PORT};
 pub use isolation::{Isolation, SandboxFolders, VariableName};
 pub use resources::Resources;
 pub use simulation_config::SimulationConfig;

@@ -6,6 +6,7 @@ use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
+use super::container::{ContainerSettings, check_ports};
 use super::isolation::{Isolation, SandboxFolders, VariableName, level};
 use super::resources::Resources;
 use super::timing::Timing;
@@ -69,16 +70,19 @@ pub struct SimulationConfig {
     /// What a sandbox has besides the system and Webots.
     #[serde(default, deserialize_with = "object")]
     pub sandbox: SandboxFolders,
+    /// How simulations run in containers.
+    #[serde(default, deserialize_with = "object")]
+    pub container: ContainerSettings,
     /// Environment variables that simulations get besides those that Webots needs. Default: none.
     #[serde(default, deserialize_with = "one_or_many")]
     pub environment: Vec<VariableName>,
     /// What one simulation may take.
     #[serde(default, deserialize_with = "object")]
     pub limits: Resources,
-    /// Run Webots in containers. Only `false` is supported.
+    /// Run Webots in containers: the original's key for `isolation: "container"`. Default: false.
     #[serde(default)]
     pub docker: bool,
-    /// Images that pruning keeps. Accepted for existing files; not used without docker.
+    /// Images that are never removed. Only those that this server has built are ever.
     #[serde(default, alias = "persistentDockerImages", deserialize_with = "one_or_many")]
     pub persistant_docker_images: Vec<String>,
     /// Repositories whose worlds may run, as URL prefixes of whole path segments. Default: none.
@@ -221,9 +225,13 @@ impl Configuration for SimulationConfig {
         if self.webots_home.is_none() {
             self.webots_home = std::env::var_os("WEBOTS_HOME").map(ExpandedPath::plain);
         }
-        self.isolation.check(self.docker)?;
+        self.isolation = self.isolation.with_docker(self.docker)?;
+        self.docker = self.isolation == Isolation::Container;
+        check_ports(self.docker, self.port, self.max_connections)?;
         let own = [self.log_dir.0.as_path(), &self.cache_dir.0].into_iter().chain(self.secret_files());
-        self.sandbox.check(own)?;
+        if matches!(self.isolation, Isolation::Auto | Isolation::Sandbox) {
+            warnings.extend(self.sandbox.check(own)?);
+        }
         warnings.extend(self.sandbox.missing().map(|path| format!("sandbox: {} is not there", path.display())));
         if self.port.checked_add(self.max_connections).is_none() {
             let problem = format!("{} places above port {} leave the range of ports", self.max_connections, self.port);

@@ -13,6 +13,9 @@ pub struct Timing {
     /// How long a checkout may take. Default: 120.
     #[serde(with = "seconds")]
     pub checkout: Duration,
+    /// How long an image may take to be pulled and built. Default: 900.
+    #[serde(with = "seconds")]
+    pub build: Duration,
     /// How long Webots may take until it listens on its port. Default: 120.
     #[serde(with = "seconds")]
     pub launch: Duration,
@@ -40,6 +43,7 @@ impl Default for Timing {
     fn default() -> Self {
         Self {
             checkout: Duration::from_mins(2),
+            build: Duration::from_mins(15),
             launch: Duration::from_mins(2),
             heartbeat: Duration::from_secs(5),
             grace: Duration::from_secs(5),

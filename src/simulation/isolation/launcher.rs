@@ -27,6 +27,8 @@ pub enum Level {
     None,
     /// bubblewrap.
     Sandbox,
+    /// Docker.
+    Container,
 }
 
 /// `isolation` asks for a level that this machine does not have.
@@ -44,6 +46,8 @@ enum Method {
     Plain,
     /// In a sandbox.
     Sandbox(Sandbox),
+    /// In a container, which is not started here.
+    Container,
 }
 
 /// Launches simulations at one level.
@@ -67,8 +71,8 @@ impl Launcher {
         let sandbox = || Sandbox::new(config).and_then(Sandbox::tried);
         let (method, shortcoming) = match config.isolation {
             Isolation::None => (Method::Plain, None),
-            // The configuration refuses containers before.
-            Isolation::Sandbox | Isolation::Container => (Method::Sandbox(sandbox().map_err(IsolationError)?), None),
+            Isolation::Container => (Method::Container, None),
+            Isolation::Sandbox => (Method::Sandbox(sandbox().map_err(IsolationError)?), None),
             Isolation::Auto => match sandbox() {
                 Ok(sandbox) => (Method::Sandbox(sandbox), None),
                 Err(why) => (Method::Plain, Some(why)),
@@ -98,13 +102,19 @@ impl Launcher {
         for line in launcher.unkept() {
             log::warn!("{line}");
         }
-        launcher.cgroups = Cgroups::delegated(&launcher.limits, launcher.runners());
+        if launcher.level() != Level::Container {
+            launcher.cgroups = Cgroups::delegated(&launcher.limits, launcher.runners());
+        }
         Ok(launcher)
     }
 
     /// Which limits this machine can't keep, a line each. Before simulations have control groups.
     #[must_use]
     pub fn unkept(&self) -> Vec<String> {
+        if self.level() == Level::Container {
+            // Docker keeps them.
+            return Vec::new();
+        }
         let means = Means {
             has_prlimit: self.prlimit.is_some(),
             leaves_namespaces: matches!(&self.method, Method::Sandbox(sandbox) if !sandbox.ends_namespaces()),
@@ -119,6 +129,7 @@ impl Launcher {
         match self.method {
             Method::Plain => Level::None,
             Method::Sandbox(_) => Level::Sandbox,
+            Method::Container => Level::Container,
         }
     }
 
@@ -126,7 +137,7 @@ impl Launcher {
     #[must_use]
     pub fn runners(&self) -> u64 {
         match self.method {
-            Method::Plain => 0,
+            Method::Plain | Method::Container => 0,
             Method::Sandbox(_) => 2,
         }
     }
@@ -142,6 +153,10 @@ impl Launcher {
     pub fn remark(&self) -> &'static str {
         match self.level() {
             Level::None => "",
+            Level::Container => {
+                " It ran in a container, which has its image and its project only; the server's administrator can give it \
+                 more (container, limits)."
+            }
             Level::Sandbox => {
                 " It ran in a sandbox, which shows it the system and Webots only; the server's administrator can show it \
                  more (sandbox.readable, sandbox.writable), or run worlds without (isolation)."
@@ -214,6 +229,7 @@ impl fmt::Display for Level {
         out.write_str(match self {
             Self::None => "none",
             Self::Sandbox => "sandbox",
+            Self::Container => "container",
         })
     }
 }

@@ -1,6 +1,8 @@
 //! What a sandbox shows at which place, and what it hides of the server.
 
+use std::collections::BTreeSet;
 use std::ffi::OsString;
+use std::fs::DirEntry;
 use std::path::{Path, PathBuf};
 
 use crate::simulation::config::SimulationConfig;
@@ -29,8 +31,6 @@ pub enum Content {
 
 /// The administrator's folder, in which a package of this server has its configuration.
 const ETC: &str = "/etc/webots-fleet";
-/// Folders of the system, of which programs need whatever is there.
-const SYSTEM: [&str; 6] = ["/usr", "/lib", "/lib64", "/bin", "/sbin", "/sys"];
 
 impl Place {
     /// Shows this at a path.
@@ -57,14 +57,10 @@ impl Place {
 /// What only the server may see: its log, its cache with all simulations, its configuration and other secrets.
 pub fn hidden(config: &SimulationConfig, homes: &[PathBuf]) -> Vec<Place> {
     let folders = [&config.log_dir.0, &config.cache_dir.0].into_iter().filter_map(|folder| folder.canonicalize().ok());
-    let folders = folders.chain(std::iter::once(ETC.into()));
+    let folders = folders.chain(std::iter::once(ETC.into())).chain(folders_of_secrets(config, homes));
     let mut hidden: Vec<Place> = folders.map(Place::empty).collect();
     for file in config.secret_files() {
-        let Ok(real) = file.canonicalize() else { continue };
-        // A file that takes the place of another one is seen again, unless its folder is hidden.
-        let named = file.parent().and_then(|folder| folder.canonicalize().ok());
-        let folders = named.into_iter().chain(real.parent().map(Path::to_owned));
-        hidden.extend(folders.filter(|at| may_be_hidden(at, config, homes)).map(Place::empty));
+        let Some(real) = file.canonicalize().ok().filter(|file| file.is_file()) else { continue };
         // The other configurations are beside it: those of the session server are in a folder beside this one.
         let beside = ["session", "simulation"].map(|name| real.parent().unwrap_or(&real).with_file_name(name));
         if beside.iter().any(|one| real.parent() == Some(one)) {
@@ -75,14 +71,20 @@ pub fn hidden(config: &SimulationConfig, homes: &[PathBuf]) -> Vec<Place> {
     hidden
 }
 
-/// Whether a folder with a secret of the server holds nothing that programs need, as far as that can be told.
-fn may_be_hidden(folder: &Path, config: &SimulationConfig, homes: &[PathBuf]) -> bool {
-    let depth = folder.components().count();
-    let is_of_system =
-        depth < 3 || depth == 3 && folder.starts_with("/var") || SYSTEM.iter().any(|one| folder.starts_with(one));
+/// The folders that hold nothing but secrets of the server: a file that takes the place of another one is seen again unless
+/// its folder is hidden. Programs may need whatever else is in a folder.
+fn folders_of_secrets(config: &SimulationConfig, homes: &[PathBuf]) -> Vec<PathBuf> {
+    let named = config.secret_files().filter_map(|file| {
+        let folder = file.parent()?.canonicalize().ok()?;
+        Some(folder.join(file.file_name()?))
+    });
+    let secrets: BTreeSet<PathBuf> = named.flat_map(|file| file.canonicalize().into_iter().chain([file])).collect();
     let shown = config.sandbox.readable.iter().chain(&config.sandbox.writable).chain(&config.webots_home);
-    let shown = shown.map(|path| path.0.clone()).chain(homes.iter().cloned());
-    let is_shown = shown.filter_map(|path| path.canonicalize().ok()).any(|path| path == folder);
-    let holds_webots = config.webots.as_ref().and_then(|path| path.0.canonicalize().ok());
-    !is_of_system && !is_shown && !holds_webots.is_some_and(|program| program.starts_with(folder))
+    let shown = shown.map(|path| path.0.clone()).chain(homes.iter().cloned()).chain([std::env::temp_dir()]);
+    let shown: Vec<PathBuf> = shown.filter_map(|path| path.canonicalize().ok()).collect();
+    let is_secret = |entry: std::io::Result<DirEntry>| entry.is_ok_and(|entry| secrets.contains(&entry.path()));
+    let holds_only_secrets = |folder: &Path| folder.read_dir().is_ok_and(|mut entries| entries.all(is_secret));
+    let folders: BTreeSet<&Path> = secrets.iter().filter_map(|file| file.parent()).collect();
+    let hidden = folders.into_iter().filter(|at| !shown.iter().any(|one| one == at) && holds_only_secrets(at));
+    hidden.map(Path::to_owned).collect()
 }

@@ -218,7 +218,8 @@ fn homes() -> Vec<PathBuf> {
 fn temporary_folders() -> impl Iterator<Item = PathBuf> {
     let all = ["/tmp".into(), "/var/tmp".into(), std::env::temp_dir()];
     let real = all.into_iter().filter_map(|folder: PathBuf| folder.canonicalize().ok());
-    real.filter(|folder| folder.parent().is_some()).collect::<BTreeSet<_>>().into_iter()
+    // Each sandbox has its own shared memory.
+    real.filter(|folder| folder.parent().is_some() && !folder.starts_with("/dev")).collect::<BTreeSet<_>>().into_iter()
 }
 
 /// The graphics cards of this machine.

@@ -27,6 +27,9 @@ const LATECOMERS: Duration = Duration::from_millis(500);
 pub struct Arguments {
     /// Folder of the run
     folder: PathBuf,
+    /// Whose containers are removed
+    #[arg(long)]
+    pub containers: Option<String>,
 }
 
 /// A running guardian. It acts when this is dropped.
@@ -36,22 +39,24 @@ pub struct Guardian {
 }
 
 impl Guardian {
-    /// Starts a guardian for the run that has this folder.
+    /// Starts a guardian for the run that has this folder; `containers` is whose containers it removes too.
     ///
     /// # Errors
     /// When the system can start no more processes.
-    pub fn start(run: &Path) -> std::io::Result<Self> {
+    pub fn start(run: &Path, containers: Option<&str>) -> std::io::Result<Self> {
         let (reader, lifeline) = std::io::pipe()?;
         let mut command = tokio::process::Command::new("/proc/self/exe");
         command.arg0("simulation-server").arg("guard").arg(run);
+        command.args(containers.map(|owner| format!("--containers={owner}")));
         command.stdin(reader).stdout(Stdio::null()).stderr(Stdio::null()).spawn()?;
         Ok(Self { _lifeline: lifeline })
     }
 }
 
-/// What the guardian process does, from its start to its end. Returns its exit code.
+/// What the guardian process does, from its start to its end; `remove` removes what is not a process. Returns its exit
+/// code.
 #[must_use]
-pub fn guard(arguments: &Arguments) -> u8 {
+pub fn guard(arguments: &Arguments, remove: impl FnOnce()) -> u8 {
     // A signal to the server's group, or Ctrl-C in its terminal, must not end the guardian before the server.
     if let Err(error) = setsid().and_then(|_| block_signals()) {
         eprintln!("can't get out of the reach of the server's signals: {error}");
@@ -62,6 +67,7 @@ pub fn guard(arguments: &Arguments) -> u8 {
     while Instant::now() < end {
         process_tree::kill_marked(&arguments.folder);
     }
+    remove();
     remove_patiently(&arguments.folder);
     0
 }

@@ -36,7 +36,8 @@ struct Monitor<'server> {
     docker: bool,
     share_idle_time: f64,
     isolation: Level,
-    shortcoming: Option<&'server str>,
+    /// What worlds' programs may do that they should not, and why.
+    shortcoming: Option<(&'static str, &'server str)>,
     limit: String,
 }
 
@@ -121,7 +122,7 @@ pub fn monitor(server: &AppState, snapshot: &Snapshot, usages: &Usages) -> Resul
         docker: server.rules.docker,
         share_idle_time: server.rules.share_idle_time,
         isolation: server.launcher.level(),
-        shortcoming: server.launcher.shortcoming(),
+        shortcoming: shortcoming(server),
         limit: duration(server.config.timeout),
     };
     page.render()
@@ -221,6 +222,13 @@ fn duration(seconds: u64) -> String {
         (hours, 0) => format!("{hours} h"),
         (hours, minutes) => format!("{hours} h {minutes:02} min"),
     }
+}
+
+/// What worlds' programs may do that they should not, and why.
+fn shortcoming(server: &AppState) -> Option<(&'static str, &str)> {
+    let of_level = server.launcher.shortcoming().map(|why| ("worlds' programs may do whatever this server may.", why));
+    let of_containers = server.containers.as_ref().and_then(|containers| containers.shortcoming());
+    of_level.or_else(|| of_containers.map(|why| ("", why)))
 }
 
 #[cfg(test)]

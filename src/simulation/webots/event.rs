@@ -6,6 +6,12 @@ use actix::prelude::*;
 #[derive(Message, Debug, Clone, PartialEq, Eq)]
 #[rtype(result = "()")]
 pub enum WebotsEvent {
+    /// What has to be done before it starts is under way; in words.
+    Progress(String),
+    /// A text of the protocol that its project asks for, as it is.
+    Text(String),
+    /// Its process was started.
+    Started,
     /// It listens on this port.
     Listening(u16),
     /// It has sent a heartbeat.
@@ -42,7 +48,8 @@ impl ExitNotifier {
     pub fn tell(&mut self, event: WebotsEvent) {
         self.exit_told |= matches!(event, WebotsEvent::Exited(_));
         // A heartbeat may be lost where a client can't keep up; how to reach Webots and its end may not.
-        if matches!(event, WebotsEvent::Listening(_) | WebotsEvent::Exited(_)) {
+        let may_be_lost = matches!(event, WebotsEvent::Progress(_) | WebotsEvent::Heartbeat | WebotsEvent::Hanging(_));
+        if !may_be_lost {
             self.events.do_send(event);
         } else if let Err(lost) = self.events.try_send(event) {
             log::debug!("a client does not listen: {lost}");

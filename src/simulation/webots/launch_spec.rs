@@ -1,7 +1,7 @@
 //! The launch specification: everything that one Webots is started with.
 
 use std::ffi::OsString;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use actix::prelude::*;
@@ -10,6 +10,7 @@ use super::command::WebotsCommand;
 use super::event::WebotsEvent;
 use crate::simulation::checkout::{Checkouts, Project};
 use crate::simulation::config::SimulationConfig;
+use crate::simulation::container::{Containers, Request};
 use crate::simulation::isolation::{Cgroup, Launcher, Program, Watch};
 use crate::simulation::places::Ticket;
 use crate::simulation::process::SpawnSpec;
@@ -19,6 +20,8 @@ use crate::simulation::protocol::Mode;
 pub struct LaunchSpec {
     /// The server's configuration.
     pub config: Arc<SimulationConfig>,
+    /// Makes the containers in which it runs, where it does.
+    pub containers: Option<Arc<Containers>>,
     /// How simulations are launched.
     pub launcher: Arc<Launcher>,
     /// The program to start.
@@ -36,6 +39,19 @@ pub struct LaunchSpec {
 }
 
 impl LaunchSpec {
+    /// What its containers are made of.
+    #[must_use]
+    pub fn request(&self) -> Request {
+        let (config, mode, port) = (Arc::clone(&self.config), self.mode, self.place.1);
+        let command = move |world: &str| {
+            let program = Path::new(&config.container.webots);
+            let world = Path::new(world);
+            let command = WebotsCommand { program, mode, port, heartbeat: config.timing.heartbeat, world };
+            command.to_arguments().into_iter().map(|word| word.to_string_lossy().into_owned()).collect()
+        };
+        Request { project: Arc::clone(&self.project), port, command: Box::new(command) }
+    }
+
     /// How the process is started and ended, and its control group. `display` holds the environment variables that name
     /// its X display.
     ///

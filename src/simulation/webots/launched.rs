@@ -11,6 +11,7 @@ use actix::prelude::*;
 use super::launch_spec::LaunchSpec;
 use super::output::{self, OutputEvent, Tail};
 use super::paced_reader::PacedReader;
+use super::runtime::Runtime;
 use super::virtual_display::VirtualDisplay;
 use crate::shared::run::RotatedFile;
 use crate::simulation::machine::display;
@@ -42,13 +43,13 @@ const OLD_LOGS: usize = 1;
 /// How long the rest of an output may take to be read.
 const LAST_OUTPUT: Duration = Duration::from_secs(1);
 
-/// Starts a Webots, on a display of its own or the configured one. The future resolves when nothing of it is left.
+/// Starts a Webots on what was prepared for it. The future resolves when nothing of it is left.
 ///
 /// # Errors
 /// When a process, a thread or a folder can't be made.
 pub fn launch<A>(
     spec: &LaunchSpec,
-    display: Option<VirtualDisplay>,
+    runtime: Runtime,
     events: Addr<A>,
 ) -> std::io::Result<(Launched, impl Future<Output = End> + use<A>)>
 where
@@ -65,18 +66,18 @@ where
     let reader = PacedReader::new(reader, spec.config.limits.output << 10);
     let (tail, all_read) = output::follow(reader, file.ok(), events)?;
     let errors = output.try_clone()?;
-    let on_display = display.as_ref().map_or_else(
-        || vec![("DISPLAY".into(), display::effective(spec.config.display.as_ref()).into())],
-        VirtualDisplay::environment,
-    );
-    let (process, cgroup) = spec.spawn_spec(&on_display)?;
+    let (process, cgroup) = match &runtime {
+        Runtime::Containers(containers) => (containers.spawn_spec(spec.config.timing.grace), None),
+        Runtime::Machine(display) => spec.spawn_spec(&display.as_ref().map_or_else(
+            || vec![("DISPLAY".into(), display::effective(spec.config.display.as_ref()).into())],
+            VirtualDisplay::environment,
+        ))?,
+    };
     let (group, ended) = ProcessGroup::start(&process, output.into(), errors.into())?;
     let project = Arc::clone(&spec.project);
     let ended = async move {
         let reason = ended.await;
-        if let Some(display) = display {
-            display.stop().await;
-        }
+        let in_container = runtime.end().await;
         // Processes that have left the group are known by their control group or by their mark.
         let end_all = move || {
             let out_of_memory = cgroup.is_some_and(|cgroup| {
@@ -86,10 +87,10 @@ where
             project.instance.kill_processes();
             out_of_memory
         };
-        let out_of_memory = actix_rt::task::spawn_blocking(end_all).await.unwrap_or_default();
+        let on_machine = actix_rt::task::spawn_blocking(end_all).await.unwrap_or_default();
         // What was printed last tells why. A process that nobody can end may keep the pipe open.
         actix_rt::time::timeout(LAST_OUTPUT, all_read).await.ok();
-        End { reason, out_of_memory }
+        End { reason, out_of_memory: in_container || on_machine }
     };
     Ok((Launched { group, tail, log, begin }, ended))
 }

@@ -6,6 +6,7 @@ mod launch_spec;
 mod launched;
 mod output;
 mod paced_reader;
+mod runtime;
 mod virtual_display;
 mod webots;
 

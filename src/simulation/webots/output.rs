@@ -26,6 +26,8 @@ pub enum OutputEvent {
     Paused,
     /// `real-time`, `fast`, `step`: the simulation runs.
     Running,
+    /// `reset`: the simulation was set back to its beginning.
+    Reset,
 }
 
 /// The last lines of an output.
@@ -49,6 +51,7 @@ impl OutputEvent {
             "." => Some(Self::Heartbeat),
             "pause" => Some(Self::Paused),
             "real-time" | "fast" | "step" => Some(Self::Running),
+            "reset" => Some(Self::Reset),
             _ => None,
         }
     }

@@ -17,6 +17,7 @@ use tokio::net::unix::pipe::Receiver;
 use crate::simulation::process::{ExitReason, ProcessGroup, SpawnSpec};
 
 /// A running Xvfb. Dropping it kills it.
+#[derive(Debug)]
 pub struct VirtualDisplay {
     name: String,
     authority: PathBuf,

@@ -8,12 +8,13 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use actix::prelude::*;
+use tokio::sync::Notify;
 
 use super::event::{Exit, ExitNotifier, WebotsEvent};
 use super::launch_spec::LaunchSpec;
 use super::launched::{self, End, Launched};
 use super::output::{OutputEvent, Tail};
-use super::virtual_display::VirtualDisplay;
+use super::runtime::{Preparation, Runtime};
 use crate::shared::run::seconds_since_1970;
 use crate::simulation::checkout::CheckoutError;
 use crate::simulation::machine::display;
@@ -35,7 +36,11 @@ pub struct Webots {
     spec: LaunchSpec,
     port: u16,
     events: ExitNotifier,
+    /// What it runs on is being prepared.
+    preparing: Option<SpawnHandle>,
     group: Option<ProcessGroup>,
+    /// Asks to start the controller of a competition's participant anew.
+    restart: Option<Arc<Notify>>,
     tail: Tail,
     listening: bool,
     /// Whether the simulation is not paused.
@@ -59,7 +64,9 @@ impl Webots {
             port: spec.place.1,
             events: ExitNotifier::new(spec.events.clone()),
             spec,
+            preparing: None,
             group: None,
+            restart: None,
             tail: Tail::default(),
             listening: false,
             runs: false,
@@ -69,27 +76,27 @@ impl Webots {
         }
     }
 
-    /// Starts Webots' own display, then Webots.
-    fn launch_with_display(&mut self, ctx: &mut Context<Self>) {
-        let instance = self.spec.project.instance.path().to_owned();
-        let display = async move { VirtualDisplay::start(&instance).await };
-        display
-            .into_actor(self)
-            .map(|display, this, ctx| match display {
-                Ok(display) => this.launch(Some(display), ctx),
-                Err(error) => this.not_started(&format!("The virtual display (Xvfb) can't be started: {error}"), ctx),
-            })
-            .spawn(ctx);
+    /// Prepares what Webots runs on, then starts it.
+    fn prepare(&mut self, ctx: &mut Context<Self>) {
+        let client = self.spec.events.clone();
+        // Where a client can't keep up, it misses a line.
+        let progress = move |text| drop(client.try_send(WebotsEvent::Progress(text)));
+        let prepared = Preparation::of(&self.spec).run(progress).into_actor(self);
+        self.preparing = Some(ctx.spawn(prepared.map(|prepared, this, ctx| match prepared {
+            Ok(runtime) => this.launch(runtime, ctx),
+            Err(why) => this.not_started(&why, ctx),
+        })));
     }
 
-    fn launch(&mut self, display: Option<VirtualDisplay>, ctx: &mut Context<Self>) {
-        if let Some(why) = self.stopped_for.take() {
-            return self.not_started(&why, ctx);
-        }
-        if let Err(error) = self.spawn(display, ctx) {
+    fn launch(&mut self, runtime: Runtime, ctx: &mut Context<Self>) {
+        self.preparing = None;
+        self.restart = runtime.restart();
+        runtime.news().into_iter().for_each(|event| self.tell(event));
+        if let Err(error) = self.spawn(runtime, ctx) {
             log::error!("port {}: Webots can't be started: {error}", self.port);
             return self.not_started(&format!("Webots can't be started: {error}"), ctx);
         }
+        self.tell(WebotsEvent::Started);
         self.await_port(ctx);
         ctx.run_interval(self.spec.config.timing.heartbeat, Self::check_heartbeat);
         let limit = self.spec.config.timing.launch;
@@ -105,8 +112,8 @@ impl Webots {
     }
 
     /// Starts the process, and has [`Self::ended`] called when it has ended.
-    fn spawn(&mut self, display: Option<VirtualDisplay>, ctx: &mut Context<Self>) -> std::io::Result<()> {
-        let (Launched { group, tail, log, begin }, ended) = launched::launch(&self.spec, display, ctx.address())?;
+    fn spawn(&mut self, runtime: Runtime, ctx: &mut Context<Self>) -> std::io::Result<()> {
+        let (Launched { group, tail, log, begin }, ended) = launched::launch(&self.spec, runtime, ctx.address())?;
         let (program, world) = (self.spec.program.display(), self.spec.project.world.path.display());
         let (at, pid) = (seconds_since_1970(), group.leader());
         log::info!("port {}: started {program} for {world} (process {pid})", self.port);
@@ -121,7 +128,10 @@ impl Webots {
 
     /// Waits until a process of this instance listens on a port that Webots may have taken.
     fn await_port(&self, ctx: &mut Context<Self>) {
-        if let Some(root) = self.group.as_ref().map(ProcessGroup::leader) {
+        // A port of a container is there before Webots is.
+        if self.spec.containers.is_none()
+            && let Some(root) = self.group.as_ref().map(ProcessGroup::leader)
+        {
             let ports = self.port..=self.port.saturating_add(NEXT_PORTS);
             let listening = process_tree::until_listening(root, ports).into_actor(self);
             listening.map(|port, this, _| this.ready(port)).spawn(ctx);
@@ -245,11 +255,7 @@ impl Actor for Webots {
     type Context = Context<Self>;
 
     fn started(&mut self, ctx: &mut Self::Context) {
-        if self.spec.config.xvfb {
-            self.launch_with_display(ctx);
-        } else {
-            self.launch(None, ctx);
-        }
+        self.prepare(ctx);
     }
 }
 
@@ -261,7 +267,9 @@ impl Handler<OutputEvent> for Webots {
         self.hanging = false;
         match event {
             OutputEvent::Heartbeat if self.listening => self.tell(WebotsEvent::Heartbeat),
+            OutputEvent::Heartbeat if self.spec.containers.is_some() => self.ready(self.port),
             OutputEvent::Heartbeat => {}
+            OutputEvent::Reset => self.restart.iter().for_each(|controller| controller.notify_one()),
             OutputEvent::Paused | OutputEvent::Running => {
                 self.runs = event == OutputEvent::Running;
                 self.show_pace();
@@ -282,7 +290,11 @@ impl Handler<RestoreController> for Webots {
 impl Handler<Stop> for Webots {
     type Result = ();
 
-    fn handle(&mut self, _: Stop, _: &mut Self::Context) {
+    fn handle(&mut self, _: Stop, ctx: &mut Self::Context) {
         self.stop("Its client has gone");
+        if let Some(preparing) = self.preparing.take() {
+            ctx.cancel_future(preparing);
+            self.not_started("Its client has gone", ctx);
+        }
     }
 }

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 
-use crate::support::{SOON, needs, ports};
+use super::{SOON, needs, ports};
 
 /// The server. It ends with this value.
 pub struct NameServer {

@@ -1,0 +1,40 @@
+//! A project that was checked out for one client.
+
+use std::path::{Path, PathBuf};
+
+use super::revision::Revision;
+use super::world_file::WorldFile;
+use crate::shared::domain::ProjectUrl;
+use crate::simulation::process::InstanceDir;
+
+/// A project that was checked out for one client.
+#[derive(Debug)]
+pub struct Project {
+    /// The world to open.
+    pub world: WorldFile,
+    /// What the client should know.
+    pub warnings: Vec<String>,
+    /// Where it came from.
+    pub(super) url: ProjectUrl,
+    pub(super) revision: Revision,
+    /// The project's folder.
+    pub(super) folder: PathBuf,
+    /// Where the project is that Webots sees, in its repository: elsewhere if the world is behind a link.
+    pub(super) place: String,
+    /// Removed with the project.
+    pub instance: InstanceDir,
+}
+
+impl Project {
+    /// The project's folder, with `worlds` and `controllers` inside.
+    #[must_use]
+    pub fn folder(&self) -> &Path {
+        &self.folder
+    }
+
+    /// What tells this project from others: its repository, its commit, and its folder there.
+    #[must_use]
+    pub fn identity(&self) -> String {
+        format!("{} {} {}", self.url.repository(), self.revision.commit, self.revision.folder)
+    }
+}

@@ -1,0 +1,123 @@
+//! The key `container`: how simulations run in containers.
+
+use serde::{Deserialize, Serialize};
+
+use crate::shared::config::{ExpandedPath, InvalidValue, one_or_many, whole};
+
+/// How simulations run in containers.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(rename_all = "camelCase", default, deny_unknown_fields)]
+#[expect(clippy::struct_excessive_bools, reason = "they are keys of a file")]
+pub struct ContainerSettings {
+    /// Folder of templates; a file that is not in it is the one that comes with this server. Default: none.
+    pub templates: Option<ExpandedPath>,
+    /// The image of Webots for a world whose project has no Dockerfile. `{version}` is that of the world, such as R2023b,
+    /// `{ubuntu}` the Ubuntu that the image of that version has. Default: `cyberbotics/webots.cloud:{version}-ubuntu{ubuntu}`.
+    pub image: String,
+    /// The image of the editor that a project may ask for. Default: the one that the original names.
+    pub editor_image: String,
+    /// Webots' launcher in the image. Default: `webots`.
+    pub webots: String,
+    /// Whether the variants of the templates are taken that help to find a fault in a project. Default: false.
+    pub debug: bool,
+    /// Which display Webots has: a virtual one inside (`xvfb-run` of its image), or that of the machine. Default:
+    /// virtual.
+    pub display: ContainerDisplay,
+    /// What of the network containers reach. Default: internet.
+    pub network: ContainerNetwork,
+    /// Whether containers get the graphics cards of the machine, where there are some. Default: true.
+    pub gpu: bool,
+    /// Whether the files of the image can only be read. Default: true.
+    pub read_only: bool,
+    /// Whether programs may gain privileges, as `sudo` does. Default: false.
+    pub new_privileges: bool,
+    /// Linux capabilities that containers keep, such as `SYS_PTRACE`. Default: none.
+    #[serde(deserialize_with = "one_or_many")]
+    pub capabilities: Vec<String>,
+    /// Folders of the machine that containers see, as `FOLDER:PATH` or `FOLDER:PATH:ro`. Default: none.
+    #[serde(deserialize_with = "one_or_many")]
+    pub mounts: Vec<String>,
+    /// How many images are built at a time. Default: 3.
+    #[serde(deserialize_with = "whole::<1, 1000, _, _>")]
+    pub builds: usize,
+    /// How much the images that this server has built may take together, in MiB. Default: 20480.
+    #[serde(deserialize_with = "whole::<1, 100_000_000, _, _>")]
+    pub images_size: u64,
+    /// After how many days without use such an image is removed. Default: 14.
+    #[serde(deserialize_with = "whole::<1, 10_000, _, _>")]
+    pub images_age: u64,
+}
+
+/// Which display Webots has in its container.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum ContainerDisplay {
+    /// A virtual one.
+    #[default]
+    Virtual,
+    /// That of the machine, as the original has it: whoever shares it can watch, and type into, the windows of others.
+    Machine,
+}
+
+/// What of the network containers reach.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum ContainerNetwork {
+    /// The internet, without private addresses and the machine itself.
+    #[default]
+    Internet,
+    /// Nothing. Clients reach Webots all the same.
+    Closed,
+}
+
+/// How far above the port of its Webots the port of an editor is, as the original's page expects.
+pub const EDITOR_PORT: u16 = 500;
+
+/// Checks that no editor gets the port of another simulation, or one that does not exist.
+///
+/// # Errors
+/// When there are too many places for that.
+pub fn check_ports(in_containers: bool, port: u16, places: u16) -> Result<(), InvalidValue> {
+    let last = u32::from(port) + u32::from(places) + u32::from(EDITOR_PORT);
+    if !in_containers || (places <= EDITOR_PORT && u16::try_from(last).is_ok()) {
+        return Ok(());
+    }
+    let problem = format!(
+        "{places} places above port {port} don't go together with containers, whose editors have the port of their Webots \
+         + {EDITOR_PORT}; allowed are up to {EDITOR_PORT} places, and editors up to port 65535"
+    );
+    Err(InvalidValue { key: "maxConnections", problem })
+}
+
+impl Default for ContainerSettings {
+    fn default() -> Self {
+        Self {
+            templates: None,
+            image: "cyberbotics/webots.cloud:{version}-ubuntu{ubuntu}".to_owned(),
+            editor_image: "benjamindeleze/theia-test:test3".to_owned(),
+            webots: "webots".to_owned(),
+            debug: false,
+            display: ContainerDisplay::default(),
+            network: ContainerNetwork::default(),
+            gpu: true,
+            read_only: true,
+            new_privileges: false,
+            capabilities: Vec::new(),
+            mounts: Vec::new(),
+            builds: 3,
+            images_size: 20 * 1024,
+            images_age: 14,
+        }
+    }
+}
+
+impl ContainerNetwork {
+    /// The name of the Docker network, and of its interface. The packet filter knows it by that.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Internet => "webots-fleet",
+            Self::Closed => "webots-closed",
+        }
+    }
+}

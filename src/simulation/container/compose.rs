@@ -1,0 +1,216 @@
+//! The files of a compose project: the template, its variables, and what holds for each service whatever the template says.
+
+use std::collections::BTreeMap;
+use std::io;
+use std::path::{Path, PathBuf};
+
+use serde_json::{Value, json};
+
+use super::machine::Machine;
+use super::recipe::PROJECT_PATH;
+use super::templates::Template;
+use crate::simulation::config::{ContainerDisplay, EDITOR_PORT, SimulationConfig};
+use crate::simulation::machine::display;
+
+/// What the compose project of one simulation is made of.
+#[derive(Debug)]
+pub struct Parts<'parts> {
+    /// Its name.
+    pub name: &'parts str,
+    /// The folder of the instance, in which its files are.
+    pub instance: &'parts Path,
+    /// The folder of the project on the machine.
+    pub project: &'parts Path,
+    /// The folder that the editor shows.
+    pub edited: Option<PathBuf>,
+    /// What the project asked to be shown, as it is written.
+    pub volume: Option<&'parts str>,
+    /// The image of Webots.
+    pub image: &'parts str,
+    /// The image of a competition's controller.
+    pub controller: Option<&'parts str>,
+    /// Places where the image of a service keeps data: service and path.
+    pub volumes: Vec<(String, String)>,
+    /// Webots and its arguments, as they are in the container.
+    pub command: &'parts [String],
+    /// The port of Webots.
+    pub port: u16,
+    /// Whether there is a Makefile.
+    pub make: bool,
+    /// What Docker offers.
+    pub machine: &'parts Machine,
+}
+
+/// The template.
+const TEMPLATE: &str = "docker-compose.yml";
+/// What holds for each service.
+const OVERRIDE: &str = "override.json";
+/// Shared memory, as much as a browser's engine inside of Webots needs.
+const SHARED_MEMORY: &str = "256m";
+/// Where there is a display of the machine.
+const DISPLAYS: &str = "/tmp/.X11-unix";
+
+impl Parts<'_> {
+    /// Writes the files, and returns the options by which compose finds them.
+    ///
+    /// # Errors
+    /// When a file can't be written.
+    pub fn write(&self, template: &Template, config: &SimulationConfig) -> io::Result<Vec<String>> {
+        let folder = self.instance.join("compose");
+        std::fs::create_dir_all(&folder)?;
+        std::fs::create_dir_all(self.exchange())?;
+        std::fs::write(folder.join(TEMPLATE), template.text.as_bytes())?;
+        std::fs::write(folder.join(OVERRIDE), self.overridden(template, config).to_string())?;
+        std::fs::write(folder.join(".env"), self.variables(config))?;
+        let path = |name: &str| folder.join(name).to_string_lossy().into_owned();
+        let (name, folder) = (self.name.to_owned(), folder.to_string_lossy().into_owned());
+        let words = [
+            "--project-name",
+            &name,
+            "--project-directory",
+            &folder,
+            "--file",
+            &path(TEMPLATE),
+            "--file",
+            &path(OVERRIDE),
+        ];
+        Ok(words.map(str::to_owned).into())
+    }
+
+    /// The folder through which Webots and a controller in another container talk.
+    fn exchange(&self) -> PathBuf {
+        self.instance.join("ipc")
+    }
+
+    /// The variables of the template, one in each line.
+    fn variables(&self, config: &SimulationConfig) -> String {
+        let command = self.command.join(" ");
+        let plain = |letter: char| letter.is_alphanumeric() || " -_./=:+,".contains(letter);
+        // Compose reads quotes, dollars and backslashes in ways of its own.
+        let command = if command.chars().all(plain) { format!("\"{command}\"") } else { String::new() };
+        let bind = if config.bind.is_ipv4() { config.bind.to_string() } else { "0.0.0.0".to_owned() };
+        let path = |path: &Path| path.to_string_lossy().into_owned();
+        let edited = self.edited.as_ref().map_or_else(|| path(self.project), |folder| path(folder));
+        let pairs = [
+            ("IMAGE", self.image.to_owned()),
+            ("CONTROLLER_IMAGE", self.controller.unwrap_or_default().to_owned()),
+            ("PROJECT_PATH", PROJECT_PATH.to_owned()),
+            ("PROJECT", path(self.project)),
+            ("MAKE", u8::from(self.make).to_string()),
+            ("BIND", bind),
+            ("PORT", self.port.to_string()),
+            ("COMPOSE_PROJECT_NAME", self.name.to_owned()),
+            ("WEBOTS", command),
+            ("THEIA_IMAGE", config.container.editor_image.clone()),
+            ("THEIA_VOLUME", self.volume.unwrap_or_default().to_owned()),
+            ("THEIA_FOLDER", edited),
+            ("THEIA_PORT", (self.port + EDITOR_PORT).to_string()),
+            ("IPC", path(&self.exchange())),
+            ("DISPLAY", display_of(config).unwrap_or_default()),
+        ];
+        let lines: Vec<String> = pairs.iter().map(|(name, value)| format!("{name}={value}\n")).collect();
+        lines.concat()
+    }
+
+    /// What holds for each service.
+    fn overridden(&self, template: &Template, config: &SimulationConfig) -> Value {
+        let services: serde_json::Map<String, Value> = template
+            .services
+            .iter()
+            .map(|(name, has_command)| (name.clone(), self.service(name, *has_command, config)))
+            .collect();
+        let network = json!({ "default": { "external": true, "name": config.container.network.name() } });
+        json!({ "services": services, "networks": network })
+    }
+
+    fn service(&self, name: &str, has_command: bool, config: &SimulationConfig) -> Value {
+        let (settings, limits) = (&config.container, &config.limits);
+        let memory = format!("{}m", limits.memory.unwrap_or(DEFAULT_MEMORY));
+        let mut service = Service::from_iter([
+            ("restart", json!("no")),
+            ("privileged", json!(false)),
+            ("read_only", json!(settings.read_only)),
+            ("cap_drop", json!(["ALL"])),
+            ("cap_add", json!(settings.capabilities)),
+            ("security_opt", json!([format!("no-new-privileges:{}", !settings.new_privileges)])),
+            ("user", json!(format!("{}:{}", nix::unistd::getuid(), nix::unistd::getgid()))),
+            ("tmpfs", json!(self.memory_folders(name, limits.disk))),
+            ("shm_size", json!(SHARED_MEMORY)),
+            ("mem_limit", json!(memory)),
+            ("memswap_limit", json!(memory)),
+            ("pids_limit", json!(limits.processes)),
+            (
+                "ulimits",
+                json!({ "nofile": { "soft": limits.open_files.min(1024), "hard": limits.open_files }, "core": 0 }),
+            ),
+            ("logging", json!({ "driver": "none" })),
+            ("init", json!(self.machine.init)),
+        ]);
+        let image = match name {
+            "webots" => Some(self.image),
+            "controller" => self.controller,
+            "theia" => Some(settings.editor_image.as_str()),
+            _ => None,
+        };
+        service.extend(image.map(|image| ("image", json!(image))));
+        service.extend(limits.cores.map(|cores| ("cpus", json!(cores))));
+        let mut environment = ENVIRONMENT.map(|(name, value)| (name, value.to_owned())).to_vec();
+        if name == "webots" {
+            if !has_command {
+                let words: Vec<String> = self.command.iter().map(|word| word.replace('$', "$$")).collect();
+                service.insert("command", json!(words));
+            }
+            self.show(&mut service, &mut environment, config);
+        }
+        service.insert("environment", json!(BTreeMap::from_iter(environment)));
+        json!(service)
+    }
+
+    /// Folders that are memory, which is limited: those that programs need to write into, and those that an image declares.
+    fn memory_folders(&self, service: &str, size: u64) -> Vec<String> {
+        let own = [("/tmp", size), ("/var/tmp", size), ("/run", 16)].map(|(path, size)| (path.to_owned(), size));
+        let declared = self.volumes.iter().filter(|(of, _)| of == service).map(|(_, path)| (path.clone(), size));
+        let mode = "rw,exec,nosuid,nodev,mode=1777";
+        own.into_iter().chain(declared).map(|(path, size)| format!("{path}:{mode},size={size}m")).collect()
+    }
+
+    /// Gives Webots graphics cards, the display of the machine, and the administrator's folders.
+    fn show(&self, service: &mut Service, environment: &mut Vec<(&'static str, String)>, config: &SimulationConfig) {
+        let mut volumes: Vec<String> = config.container.mounts.clone();
+        if let Some(display) = display_of(config) {
+            environment.push(("DISPLAY", display));
+            volumes.push(format!("{DISPLAYS}:{DISPLAYS}"));
+            if let Some(authority) = std::env::var_os("XAUTHORITY") {
+                let authority = authority.to_string_lossy().into_owned();
+                volumes.push(format!("{authority}:{authority}:ro"));
+                environment.push(("XAUTHORITY", authority));
+            }
+        }
+        service.insert("volumes", json!(volumes));
+        if let Some(groups) = self.machine.graphics.as_ref().filter(|_| config.container.gpu) {
+            service.insert("devices", json!(["/dev/dri:/dev/dri"]));
+            service.insert("group_add", json!(groups.iter().map(u32::to_string).collect::<Vec<_>>()));
+        }
+        if self.machine.nvidia && config.container.gpu {
+            let all = json!([{ "driver": "nvidia", "count": "all", "capabilities": ["gpu"] }]);
+            service.insert("deploy", json!({ "resources": { "reservations": { "devices": all } } }));
+            environment.push(("NVIDIA_DRIVER_CAPABILITIES", "all".to_owned()));
+        }
+    }
+}
+
+/// The display of the machine, where that is asked for.
+fn display_of(config: &SimulationConfig) -> Option<String> {
+    let is_machine = config.container.display == ContainerDisplay::Machine;
+    is_machine.then(|| display::effective(config.display.as_ref()))
+}
+
+/// What compose is told of a service.
+type Service = BTreeMap<&'static str, Value>;
+
+/// Variables that all services have: with them programs write where they may, and find each other.
+const ENVIRONMENT: [(&str, &str); 4] =
+    [("HOME", "/tmp"), ("USER", "webots"), ("XDG_RUNTIME_DIR", "/tmp"), ("QT_X11_NO_MITSHM", "1")];
+
+/// How much memory a container may take where `limits.memory` does not say, in MiB.
+pub const DEFAULT_MEMORY: u64 = 4096;

@@ -1,0 +1,297 @@
+//! Makes the containers of simulations; one for the whole server.
+
+use std::path::Path;
+use std::sync::Arc;
+
+use tokio::sync::{OnceCell, Semaphore};
+use tokio_util::task::AbortOnDropHandle;
+
+use super::compose::Parts;
+use super::copy::Copy;
+use super::docker::{Docker, SHORT};
+use super::image::{Build, Images};
+use super::machine::Machine;
+use super::network;
+use super::objects::{self, Owner};
+use super::packet_filter;
+use super::places::{edited_folder, edited_in, volume_of, world_in};
+use super::prepared::{Lease, Prepared};
+use super::recipe::{self, PROJECT_PATH, Recipe};
+use super::steps;
+use super::templates::Templates;
+use super::tidy::{Live, keep_tidy};
+use super::webots_yml::Kind;
+use crate::simulation::checkout::Project;
+use crate::simulation::config::{ContainerDisplay, SimulationConfig};
+
+/// Makes the containers of simulations.
+#[derive(Debug)]
+pub struct Containers {
+    docker: Docker,
+    owner: Owner,
+    templates: Templates,
+    images: Arc<Images>,
+    live: Live,
+    machine: OnceCell<Machine>,
+    shortcoming: Option<String>,
+    /// Who may have compose make containers now.
+    turns: Semaphore,
+    config: Arc<SimulationConfig>,
+    _keeper: AbortOnDropHandle<()>,
+}
+
+/// Makes a command, given where the world is in the container.
+pub type Command = Box<dyn Fn(&str) -> Vec<String> + Send>;
+
+/// A simulation that is to run in containers.
+pub struct Request {
+    /// What was checked out.
+    pub project: Arc<Project>,
+    /// The port of Webots.
+    pub port: u16,
+    /// Webots and its arguments, given where its world is in the container.
+    pub command: Command,
+}
+
+impl std::fmt::Debug for Request {
+    fn fmt(&self, out: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(out, "Request on port {}", self.port)
+    }
+}
+
+/// What runs a program on a virtual display: a part of the images of Webots.
+const VIRTUAL_DISPLAY: [&str; 2] = ["xvfb-run", "--auto-servernum"];
+
+impl Containers {
+    /// Gets ready to make containers, on the thread whose runtime this is. `run` is the folder of this run of the server.
+    /// Removes what an earlier run has left. Blocks for a moment.
+    ///
+    /// # Errors
+    /// When Docker or compose is not installed, in words for an administrator.
+    pub fn open(config: Arc<SimulationConfig>, run: &Path) -> Result<Self, String> {
+        let docker = Docker::find(run)?;
+        let owner = Owner::of(&config.cache_dir.0);
+        objects::sweep(&owner);
+        let shortcoming = packet_filter::missing();
+        if let Some(why) = &shortcoming {
+            log::warn!("{why}");
+        }
+        let settings = &config.container;
+        let images = Images::new(docker.clone(), owner.clone(), settings.builds, config.timing.build);
+        let (images, live) = (Arc::new(images), Live::default());
+        let keeper = keep_tidy(docker.clone(), owner.clone(), live.clone(), Arc::clone(&images), Arc::clone(&config));
+        let templates =
+            Templates { folder: settings.templates.as_ref().map(|folder| folder.0.clone()), debug: settings.debug };
+        let keeper = AbortOnDropHandle::new(actix_rt::spawn(keeper));
+        Ok(Self {
+            docker,
+            owner,
+            templates,
+            images,
+            live,
+            machine: OnceCell::new(),
+            shortcoming,
+            turns: Semaphore::new(2 * std::thread::available_parallelism().map_or(2, usize::from)),
+            config,
+            _keeper: keeper,
+        })
+    }
+
+    /// Whose containers these are, for a process that removes them after the server's end.
+    #[must_use]
+    pub fn owner(&self) -> &Owner {
+        &self.owner
+    }
+
+    /// What containers may do on this machine that they should not, if so.
+    #[must_use]
+    pub fn shortcoming(&self) -> Option<&str> {
+        self.shortcoming.as_deref()
+    }
+
+    /// Makes the containers of a simulation, but starts none. `progress` hears each step in words.
+    ///
+    /// Dropping the future gives up whatever was made.
+    ///
+    /// # Errors
+    /// Why not, in words for the client.
+    pub async fn prepare(
+        &self,
+        request: Request,
+        progress: &(impl Fn(String) + Send + Sync),
+    ) -> Result<Prepared, String> {
+        let recipe = self.recipe(&request).await?;
+        let lease = Lease::take(self.owner.project(request.port), &self.live);
+        let network = self.config.container.network.name();
+        network::join(&self.docker, network).await?;
+        let version = &request.project.world.version;
+        let base = recipe::image_of(&self.config.container.image, version);
+        let mut image = base.clone();
+        match &recipe.dockerfile {
+            Some(text) => {
+                let build = self.build(&request, &base, text, "", recipe.make).await?;
+                image = self.images.build(Build { network, ..build }, progress).await?;
+                self.copy(&lease, &image, PROJECT_PATH.to_owned(), &request, request.project.folder()).await?;
+            }
+            None => self.images.pull(&base, progress).await?,
+        }
+        let controller = match &recipe.controller {
+            Some(text) => {
+                let build = self.build(&request, &base, text, "controllers", recipe.make).await?;
+                let image = self.images.build(Build { network, ..build }, progress).await?;
+                let folder = recipe.asks.kind.folder_in_project().unwrap_or_default();
+                let from = Path::new(PROJECT_PATH).join(folder).to_string_lossy().into_owned();
+                self.copy(&lease, &image, from, &request, &edited_in(&request.project)).await?;
+                Some(image)
+            }
+            None => None,
+        };
+        if recipe.asks.kind != Kind::Default {
+            self.images.pull(&self.config.container.editor_image, progress).await?;
+        }
+        self.make(request, recipe, lease, (image, controller), progress).await
+    }
+
+    async fn recipe(&self, request: &Request) -> Result<Recipe, String> {
+        let (folder, templates) = (request.project.folder().to_owned(), self.templates.clone());
+        let owner = self.owner.name().to_owned();
+        blocking(move || Recipe::read(&folder, &templates, &owner)).await
+    }
+
+    /// An image of a project, or of a folder of it.
+    async fn build(
+        &self,
+        request: &Request,
+        base: &str,
+        text: &str,
+        folder: &str,
+        make: bool,
+    ) -> Result<Build, String> {
+        let mut arguments = vec![
+            format!("WEBOTS_DEFAULT_IMAGE={base}"),
+            format!("PROJECT_PATH={PROJECT_PATH}"),
+            format!("MAKE={}", u8::from(make)),
+        ];
+        if !folder.is_empty() {
+            arguments
+                .extend(["WEBOTS_CONTROLLER_URL=participant", "DEFAULT_CONTROLLER=participant"].map(str::to_owned));
+        }
+        let identity = request.project.identity();
+        let parts = [identity.as_str(), folder, text].into_iter().chain(arguments.iter().map(String::as_str));
+        let key = format!("{:032x}", objects::digest(parts.collect::<Vec<_>>().join("\0").as_bytes()));
+        let name = format!("Dockerfile{folder}");
+        let (dockerfile, text) = (request.project.instance.path().join(name), text.to_owned());
+        let file = dockerfile.clone();
+        blocking(move || std::fs::write(file, text).map_err(|error| error.to_string())).await?;
+        let (context, project) = (request.project.folder().join(folder), Arc::clone(&request.project));
+        Ok(Build { key, dockerfile, context, arguments, network: "", project })
+    }
+
+    /// Copies a folder of an image into the instance's folder.
+    async fn copy(&self, lease: &Lease, image: &str, from: String, request: &Request, to: &Path) -> Result<(), String> {
+        let through = request.project.instance.path().join("copied");
+        let copy = Copy { name: &lease.name, image, from, through, to, size: self.config.project_size };
+        copy.run(&self.docker).await
+    }
+
+    /// Writes the compose project, and lets compose make the containers.
+    async fn make(
+        &self,
+        request: Request,
+        recipe: Recipe,
+        lease: Lease,
+        (image, controller): (String, Option<String>),
+        progress: &(impl Fn(String) + Send + Sync),
+    ) -> Result<Prepared, String> {
+        let machine =
+            self.machine.get_or_try_init(|| Machine::ask(&self.docker)).await.map_err(|error| error.to_string())?;
+        let volumes = self.volumes(&image, controller.as_deref(), &recipe).await?;
+        let (config, templates) = (Arc::clone(&self.config), self.templates.clone());
+        let (name, machine, asks) = (lease.name.clone(), machine.clone(), recipe.asks.clone());
+        let files = move || {
+            let world = world_in(&request.project)?;
+            if matches!(asks.kind, Kind::Competition { .. }) {
+                let opened = recipe::open_participant(&request.project.folder().join(&world));
+                opened.map_err(|error| format!("The world can't be changed: {error}"))?;
+            }
+            let edited = edited_folder(&asks.kind, &request.project)?;
+            let command = command(&config, &request, &world);
+            let project = request.project.folder().canonicalize().map_err(|error| error.to_string())?;
+            let parts = Parts {
+                name: &name,
+                instance: request.project.instance.path(),
+                project: &project,
+                edited,
+                volume: volume_of(&asks.kind),
+                image: &image,
+                controller: controller.as_deref(),
+                volumes,
+                command: &command,
+                port: request.port,
+                make: recipe.make,
+                machine: &machine,
+            };
+            let template = templates.compose(&asks.kind)?;
+            parts.write(&template, &config).map_err(|error| format!("The files for compose can't be written: {error}"))
+        };
+        let options = blocking(files).await?;
+        // More at a time would only be slower together.
+        let turn = self.turns.acquire().await.map_err(|error| error.to_string())?;
+        progress(steps::CREATING.to_owned());
+        let words = options.into_iter().chain(["up", "--no-start", "--no-build"].map(str::to_owned));
+        self.docker.compose(words.map(Into::into).collect(), SHORT).await.map_err(|error| error.to_string())?;
+        drop(turn);
+        let texts = match recipe.asks.kind {
+            Kind::Default => recipe.asks.project_type.into_iter().collect(),
+            _ => std::iter::once("ide: enable".to_owned()).chain(recipe.asks.project_type).collect(),
+        };
+        let containers = self.made(&lease.name).await?;
+        Ok(Prepared::new(self.docker.clone(), lease, containers, texts, recipe.warnings))
+    }
+
+    /// Where the images of the services keep data: such places would be on the machine's disk without a limit.
+    async fn volumes(
+        &self,
+        image: &str,
+        controller: Option<&str>,
+        recipe: &Recipe,
+    ) -> Result<Vec<(String, String)>, String> {
+        let editor = (recipe.asks.kind != Kind::Default).then_some(self.config.container.editor_image.as_str());
+        let mut all = Vec::new();
+        for (service, image) in [("webots", Some(image)), ("controller", controller), ("theia", editor)] {
+            let Some(image) = image else { continue };
+            for path in self.images.volumes(image).await? {
+                let (outer, inner) = (Path::new(&path), Path::new(PROJECT_PATH));
+                if outer.starts_with(inner) || inner.starts_with(outer) {
+                    return Err(format!("The image {image} has a VOLUME {path}, which would hide the project"));
+                }
+                all.push((service.to_owned(), path));
+            }
+        }
+        Ok(all)
+    }
+
+    /// The containers that compose has made: pairs of service and container.
+    async fn made(&self, name: &str) -> Result<Vec<(String, String)>, String> {
+        let filter = format!("label={}={name}", objects::PROJECT);
+        let format = "{{.Label \"com.docker.compose.service\"}} {{.ID}}";
+        let listed = self.docker.run(&["ps", "--all", "--filter", &filter, "--format", format], SHORT).await;
+        let listed = listed.map_err(|error| error.to_string())?;
+        let pairs = listed.lines().filter_map(|line| line.split_once(' '));
+        Ok(pairs.map(|(service, container)| (service.to_owned(), container.to_owned())).collect())
+    }
+}
+
+fn command(config: &SimulationConfig, request: &Request, world: &str) -> Vec<String> {
+    let webots = (request.command)(&format!("{PROJECT_PATH}/{world}"));
+    let display = match config.container.display {
+        ContainerDisplay::Virtual => &VIRTUAL_DISPLAY[..],
+        ContainerDisplay::Machine => &[],
+    };
+    display.iter().map(|word| (*word).to_owned()).chain(webots).collect()
+}
+
+/// Does file work on a thread that serves nobody.
+async fn blocking<T: Send + 'static>(work: impl FnOnce() -> Result<T, String> + Send + 'static) -> Result<T, String> {
+    actix_rt::task::spawn_blocking(work).await.map_err(|error| error.to_string())?
+}

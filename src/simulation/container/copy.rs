@@ -1,0 +1,80 @@
+//! Copies what is in an image onto the machine, where containers can change it: things were built there.
+
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use super::docker::{Docker, DockerError, SHORT};
+use super::objects;
+use crate::simulation::process::{folder_size, remove_tree};
+
+/// What is copied where.
+#[derive(Debug)]
+pub struct Copy<'copy> {
+    /// The compose project that it is for.
+    pub name: &'copy str,
+    /// The image.
+    pub image: &'copy str,
+    /// The folder in it.
+    pub from: String,
+    /// A folder that is not there yet.
+    pub through: PathBuf,
+    /// The folder that is made, or replaced.
+    pub to: &'copy Path,
+    /// How large it may be, in MiB.
+    pub size: u64,
+}
+
+/// How long it may take.
+const LIMIT: Duration = Duration::from_mins(2);
+/// How often it is looked how much was copied.
+const LOOK: Duration = Duration::from_millis(300);
+
+impl Copy<'_> {
+    /// Copies.
+    ///
+    /// # Errors
+    /// Why not, in words for the client.
+    pub async fn run(self, docker: &Docker) -> Result<(), String> {
+        let told = |error: DockerError| error.to_string();
+        let label = format!("{}={}", objects::PROJECT, self.name);
+        let create = ["create", "--label", &label, "--network", "none", self.image, "true"];
+        let container = docker.run(&create, SHORT).await.map_err(told)?;
+        let container = container.lines().last().unwrap_or_default();
+        let from = format!("{container}:{}/.", self.from);
+        let words = ["cp", &from, &self.through.to_string_lossy()].map(str::to_owned);
+        tokio::select! {
+            copied = docker.run(&words, LIMIT) => drop(copied.map_err(|error| not_copied(error, &self.from))?),
+            () = outgrown(&self.through, self.size << 20) => {
+                return Err(format!("The project in its image is larger than {} MiB (projectSize)", self.size));
+            }
+        }
+        docker.run(&["rm", "--force", "--volumes", container], SHORT).await.map_err(told)?;
+        let (through, to) = (self.through, self.to.to_owned());
+        let replace = move || remove_tree(&to).and_then(|()| std::fs::rename(&through, &to));
+        let replaced = actix_rt::task::spawn_blocking(replace).await.map_err(|error| error.to_string())?;
+        replaced.map_err(|error| format!("{} can't be copied out of the image: {error}", self.from))
+    }
+}
+
+fn not_copied(error: DockerError, from: &str) -> String {
+    match error {
+        DockerError::Failed { message, .. }
+            if message.contains("ould not find") || message.contains("o such container:path") =>
+        {
+            format!("The image of this project has no folder {from}: its Dockerfile has to COPY the project there")
+        }
+        error => error.to_string(),
+    }
+}
+
+/// Waits until a folder takes more of the disk than it may.
+async fn outgrown(folder: &Path, most: u64) {
+    loop {
+        actix_rt::time::sleep(LOOK).await;
+        let folder = folder.to_owned();
+        let size = actix_rt::task::spawn_blocking(move || folder_size::room_of(&folder)).await;
+        if size.is_ok_and(|size| size.is_none_or(|bytes| bytes > most)) {
+            return;
+        }
+    }
+}

@@ -1,0 +1,231 @@
+//! Runs the programs `docker` and `docker compose`: without a shell, within a time limit, and ended with whoever waits.
+
+use std::ffi::{OsStr, OsString};
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use futures_util::FutureExt;
+use tokio::io::{AsyncRead, AsyncReadExt};
+use tokio::net::unix::pipe::Receiver;
+use which::which;
+
+use crate::shared::text::one_line;
+use crate::simulation::process::{ExitReason, ProcessGroup, SpawnSpec};
+
+/// How Docker is called on this machine.
+#[derive(Debug, Clone)]
+pub struct Docker {
+    /// `docker compose`, or `docker-compose` where only that is there.
+    compose: Vec<OsString>,
+    /// The folder of this run of the server, whose mark all processes carry.
+    mark: PathBuf,
+}
+
+/// Why Docker has not done something. Its words are for the client.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum DockerError {
+    /// A program is not there, or the system can start no more.
+    #[error("Docker can't be started: {0}")]
+    NotStarted(String),
+    /// The daemon does not answer.
+    #[error("Docker does not answer on this simulation server: {0}")]
+    NoDaemon(String),
+    /// It took too long.
+    #[error("Docker did not end `{command}` within {} seconds", limit.as_secs())]
+    Slow {
+        /// What was done.
+        command: String,
+        /// How long it could take.
+        limit: Duration,
+    },
+    /// It failed.
+    #[error("`{command}` failed: {message}")]
+    Failed {
+        /// What was done.
+        command: String,
+        /// The line that says why.
+        message: String,
+    },
+}
+
+/// How long what only asks, or makes something small, may take.
+pub const SHORT: Duration = Duration::from_secs(30);
+/// How long it may take to find out how Docker is called.
+const FIND: Duration = Duration::from_secs(10);
+/// The most that is kept of an output, in bytes.
+const LONGEST_OUTPUT: usize = 1 << 20;
+/// The most that is kept of a line, in bytes.
+const LONGEST_LINE: usize = 1000;
+/// How much is read at once, in bytes, and how long is waited after it: a build that prints without end waits.
+const CHUNK: (usize, Duration) = (16 * 1024, Duration::from_millis(5));
+/// How a message begins that says that nobody listens.
+const NO_DAEMON: [&str; 4] = [
+    "cannot connect to the docker daemon",
+    "couldn't connect to docker daemon",
+    "error during connect",
+    "permission denied while trying to connect",
+];
+
+impl Docker {
+    /// Finds out how Docker is called here. Blocks for some seconds at most.
+    ///
+    /// # Errors
+    /// What is missing, in words for an administrator.
+    pub fn find(mark: &Path) -> Result<Self, String> {
+        which("docker")
+            .map_err(|_| "docker is not there; on Debian and Ubuntu the package docker.io has it".to_owned())?;
+        let mut plugin = std::process::Command::new("timeout");
+        plugin.arg(FIND.as_secs().to_string()).args(["docker", "compose", "version"]);
+        let is_plugin = plugin.stdin(std::process::Stdio::null()).output().is_ok_and(|output| output.status.success());
+        let compose: &[&str] = if is_plugin {
+            &["docker", "compose"]
+        } else if which("docker-compose").is_ok() {
+            &["docker-compose"]
+        } else {
+            return Err(
+                "docker compose is not there; the package docker-compose or docker-compose-plugin has it".to_owned()
+            );
+        };
+        Ok(Self { compose: compose.iter().map(OsString::from).collect(), mark: mark.to_owned() })
+    }
+
+    /// Runs `docker` with these arguments, and returns what it prints.
+    ///
+    /// # Errors
+    /// When it fails or takes longer than the limit.
+    pub async fn run<A: AsRef<OsStr>>(&self, arguments: &[A], limit: Duration) -> Result<String, DockerError> {
+        let arguments = arguments.iter().map(|word| word.as_ref().to_owned());
+        self.call(std::iter::once("docker".into()).chain(arguments).collect(), limit, |_| ()).await
+    }
+
+    /// The same, but `told` hears each line that it prints.
+    ///
+    /// # Errors
+    /// When it fails or takes longer than the limit.
+    pub async fn follow(
+        &self,
+        arguments: Vec<OsString>,
+        limit: Duration,
+        told: impl FnMut(&str),
+    ) -> Result<(), DockerError> {
+        self.call(std::iter::once("docker".into()).chain(arguments).collect(), limit, told).await.map(drop)
+    }
+
+    /// Runs `docker compose` with these arguments.
+    ///
+    /// # Errors
+    /// When it fails or takes longer than the limit.
+    pub async fn compose(&self, arguments: Vec<OsString>, limit: Duration) -> Result<(), DockerError> {
+        self.call(self.compose.iter().cloned().chain(arguments).collect(), limit, |_| ()).await.map(drop)
+    }
+
+    /// How a program is started that talks to the daemon. Dropping its process group ends only that program.
+    #[must_use]
+    pub fn spec(&self, command: Vec<OsString>, grace: Duration) -> SpawnSpec {
+        SpawnSpec {
+            command,
+            inherits: true,
+            // The builder of old prints its steps, and takes networks of its own.
+            environment: vec![("DOCKER_BUILDKIT".into(), "0".into()), ("COMPOSE_ANSI".into(), "never".into())],
+            in_sandbox: false,
+            folder: None,
+            mark: self.mark.clone(),
+            grace,
+        }
+    }
+
+    async fn call(
+        &self,
+        command: Vec<OsString>,
+        limit: Duration,
+        told: impl FnMut(&str),
+    ) -> Result<String, DockerError> {
+        let name: Vec<_> =
+            command.iter().take_while(|word| !word.as_encoded_bytes().starts_with(b"-")).take(3).collect();
+        let name = name.iter().map(|word| word.to_string_lossy()).collect::<Vec<_>>().join(" ");
+        let broken = |error: std::io::Error| DockerError::NotStarted(error.to_string());
+        let spec = self.spec(command, Duration::from_millis(500));
+        let (reader, output) = std::io::pipe().map_err(broken)?;
+        let errors = output.try_clone().map_err(broken)?;
+        let (group, ended) = ProcessGroup::start(&spec, output.into(), errors.into()).map_err(broken)?;
+        let reader = Receiver::from_owned_fd(reader.into()).map_err(broken)?;
+        let both = async { tokio::join!(read(reader, told), ended.boxed()) };
+        let done = actix_rt::time::timeout(limit, both).await;
+        drop(group);
+        match done {
+            Err(_) => Err(DockerError::Slow { command: name, limit }),
+            Ok((printed, ExitReason::Code(0))) => Ok(printed),
+            Ok((_, ExitReason::NotStarted)) => Err(DockerError::NotStarted(format!("there is no {name}"))),
+            Ok((printed, _)) => Err(failure(name, &printed)),
+        }
+    }
+}
+
+/// What a failed command has printed, as an error. Its last line says what was wrong.
+fn failure(command: String, printed: &str) -> DockerError {
+    let mut lines = printed.lines().rev().map(str::trim);
+    let message = lines.find(|line| !line.is_empty()).unwrap_or("it says nothing").to_owned();
+    let said = printed.to_lowercase();
+    if NO_DAEMON.iter().any(|words| said.contains(words)) {
+        return DockerError::NoDaemon(message);
+    }
+    DockerError::Failed { command, message }
+}
+
+/// Reads an output to its end. Returns its last part, each line made printable.
+async fn read(mut output: impl AsyncRead + Unpin, mut told: impl FnMut(&str)) -> String {
+    let (mut kept, mut line) = (String::new(), Vec::new());
+    let mut chunk = vec![0; CHUNK.0];
+    loop {
+        let length = output.read(&mut chunk).await.unwrap_or(0);
+        for byte in chunk.iter().take(length) {
+            match byte {
+                b'\r' | b'\n' => finish(&mut line, &mut kept, &mut told),
+                _ if line.len() < LONGEST_LINE => line.push(*byte),
+                _ => {}
+            }
+        }
+        if length == 0 {
+            break;
+        }
+        actix_rt::time::sleep(CHUNK.1).await;
+    }
+    finish(&mut line, &mut kept, &mut told);
+    kept
+}
+
+fn finish(line: &mut Vec<u8>, kept: &mut String, told: &mut impl FnMut(&str)) {
+    let text = one_line(String::from_utf8_lossy(line).trim_end());
+    line.clear();
+    if text.is_empty() {
+        return;
+    }
+    told(&text);
+    if kept.len() > LONGEST_OUTPUT {
+        kept.clear();
+    }
+    kept.push_str(&text);
+    kept.push('\n');
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[actix_rt::test]
+    async fn an_output_is_told_line_by_line() {
+        let mut lines = Vec::new();
+        let text: &[u8] = b"Step 1/2 : FROM a\r\n\x1b[31mred\n\nlast";
+        let kept = read(text, |line: &str| lines.push(line.to_owned())).await;
+        assert_eq!(lines, ["Step 1/2 : FROM a", " [31mred", "last"]);
+        assert_eq!(kept, "Step 1/2 : FROM a\n [31mred\nlast\n");
+    }
+
+    #[test]
+    fn a_daemon_that_is_not_there_is_told_apart() {
+        let words = "Cannot connect to the Docker daemon at unix:///x. Is the docker daemon running?\n";
+        assert!(matches!(failure("docker ps".to_owned(), words), DockerError::NoDaemon(_)));
+        let error = failure("docker build".to_owned(), "Step 1/2\nno space left on device\n");
+        assert_eq!(error.to_string(), "`docker build` failed: no space left on device");
+    }
+}

@@ -1,0 +1,22 @@
+//! The network of all containers: the packet filter knows it by the name of its interface.
+
+use super::docker::{Docker, SHORT};
+
+/// Makes the network of this name, which is also that of its interface, unless it is there.
+///
+/// # Errors
+/// When Docker fails, in words for the client.
+pub async fn join(docker: &Docker, name: &str) -> Result<(), String> {
+    if docker.run(&["network", "inspect", name], SHORT).await.is_ok() {
+        return Ok(());
+    }
+    // One network for all: the pools of Docker end at some thirty. Containers in it can't reach each other.
+    let interface = format!("com.docker.network.bridge.name={name}");
+    let options = ["--opt", &interface, "--opt", "com.docker.network.bridge.enable_icc=false"];
+    let words: Vec<&str> =
+        ["network", "create", "--driver", "bridge"].into_iter().chain(options).chain(std::iter::once(name)).collect();
+    let Err(error) = docker.run(&words, SHORT).await else { return Ok(()) };
+    // Another server, or another client of this one, may have been faster.
+    let is_there = docker.run(&["network", "inspect", name], SHORT).await.is_ok();
+    if is_there { Ok(()) } else { Err(error.to_string()) }
+}

@@ -1,0 +1,147 @@
+//! What a server has in Docker: the containers, networks and volumes of its simulations, found by the label that compose
+//! gives to all that it makes.
+//!
+//! The names of its compose projects begin alike, so that what a server that has crashed left is found again.
+
+use std::collections::HashSet;
+use std::ffi::OsString;
+use std::path::Path;
+use std::process::{Command, Stdio};
+
+use sha2::{Digest, Sha256};
+
+use super::docker::{Docker, DockerError, SHORT};
+
+/// The label by which compose knows its projects.
+pub const PROJECT: &str = "com.docker.compose.project";
+
+/// The beginning of the names of one server's compose projects, and of the images that it builds.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Owner(String);
+
+/// How long a sweep may take for each command, in seconds.
+const SWEEP: &str = "20";
+/// What a project consists of besides containers: how these are listed, and removed.
+const REST: [(&str, &[&str], &[&str]); 2] = [
+    ("volume", &["volume", "ls", "--quiet"], &["volume", "rm", "--force"]),
+    ("network", &["network", "ls", "--quiet"], &["network", "rm"]),
+];
+
+impl Owner {
+    /// The server that has this cache folder, which no other one has.
+    #[must_use]
+    pub fn of(cache: &Path) -> Self {
+        let cache = cache.canonicalize().unwrap_or_else(|_| cache.to_owned());
+        Self(format!("{:012x}", digest(cache.as_os_str().as_encoded_bytes()) >> 80))
+    }
+
+    /// The name of an owner as [`Self::name`] gives it.
+    #[must_use]
+    pub fn named(name: &str) -> Self {
+        Self(name.to_owned())
+    }
+
+    /// Its name.
+    #[must_use]
+    pub fn name(&self) -> &str {
+        &self.0
+    }
+
+    /// A name for the compose project of a simulation on this port.
+    #[must_use]
+    pub fn project(&self, port: u16) -> String {
+        format!("{}{port}-{:08x}", self.prefix(), rand::random::<u32>())
+    }
+
+    fn prefix(&self) -> String {
+        format!("webots-fleet-{}-", self.0)
+    }
+
+    /// The projects of this owner that have a container.
+    ///
+    /// # Errors
+    /// When Docker fails.
+    pub async fn projects(&self, docker: &Docker) -> Result<HashSet<String>, DockerError> {
+        let (filter, format) = (format!("label={PROJECT}"), format!("{{{{.Label \"{PROJECT}\"}}}}"));
+        let listed = docker.run(&["ps", "--all", "--filter", &filter, "--format", &format], SHORT).await?;
+        let prefix = self.prefix();
+        Ok(listed.lines().filter(|name| name.starts_with(&prefix)).map(str::to_owned).collect())
+    }
+}
+
+/// A number that tells one text from all others.
+#[must_use]
+pub fn digest(text: &[u8]) -> u128 {
+    Sha256::digest(text).iter().take(16).fold(0, |number: u128, byte| (number << 8) | u128::from(*byte))
+}
+
+/// Removes a project with all that belongs to it.
+///
+/// # Errors
+/// When Docker fails; then something may be left.
+pub async fn remove(docker: &Docker, project: &str) -> Result<(), DockerError> {
+    let filter = format!("label={PROJECT}={project}");
+    let listed = docker.run(&["ps", "--all", "--quiet", "--filter", &filter], SHORT).await?;
+    forced(docker, &["rm", "--force", "--volumes"], &listed).await?;
+    for (_, list, remove) in REST {
+        let list: Vec<&str> = list.iter().copied().chain(["--filter", &filter]).collect();
+        let listed = docker.run(&list, SHORT).await?;
+        forced(docker, remove, &listed).await?;
+    }
+    Ok(())
+}
+
+async fn forced(docker: &Docker, command: &[&str], listed: &str) -> Result<(), DockerError> {
+    let words: Vec<&str> = command.iter().copied().chain(listed.split_whitespace()).collect();
+    if words.len() == command.len() {
+        return Ok(());
+    }
+    match docker.run(&words, SHORT).await {
+        // Somebody else may have removed it meanwhile.
+        Err(DockerError::Failed { message, .. }) if message.to_lowercase().contains("no such") => Ok(()),
+        Err(DockerError::Failed { message, .. }) if message.contains("already in progress") => Ok(()),
+        done => done.map(drop),
+    }
+}
+
+/// Removes all that a server has in Docker but its images: for a process that watches over the server's end. Blocks.
+pub fn sweep(owner: &Owner) {
+    let prefix = owner.prefix();
+    let format = format!("{{{{.ID}}}} {{{{.Label \"{PROJECT}\"}}}}");
+    let filter = format!("label={PROJECT}");
+    let rest = REST.iter().map(|(kind, _, remove)| {
+        let name = if *kind == "volume" { "{{.Name}}" } else { "{{.ID}}" };
+        (vec![*kind, "ls"], *remove, format!("{name} {{{{.Label \"{PROJECT}\"}}}}"))
+    });
+    let containers = (vec!["ps", "--all"], &["rm", "--force", "--volumes"][..], format);
+    for (list, remove, format) in std::iter::once(containers).chain(rest) {
+        let list = list.into_iter().chain(["--filter", &filter, "--format", &format]);
+        let listed = quietly(list.map(OsString::from).collect());
+        let found = listed.lines().filter_map(|line| line.split_once(' '));
+        let found: Vec<&str> = found.filter(|(_, project)| project.starts_with(&prefix)).map(|(id, _)| id).collect();
+        if !found.is_empty() {
+            quietly(remove.iter().copied().chain(found).map(OsString::from).collect());
+        }
+    }
+}
+
+/// Runs docker within a time limit, and returns what it prints.
+fn quietly(arguments: Vec<OsString>) -> String {
+    let mut command = Command::new("timeout");
+    command.arg(SWEEP).arg("docker").args(arguments).stdin(Stdio::null()).stderr(Stdio::null());
+    command.output().map(|output| String::from_utf8_lossy(&output.stdout).into_owned()).unwrap_or_default()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_names_of_projects_tell_whose_they_are_and_suit_compose() {
+        let (ours, theirs) = (Owner::of(Path::new("/var/cache/a")), Owner::of(Path::new("/var/cache/b")));
+        let name = ours.project(2001);
+        assert!(name.starts_with(&ours.prefix()) && !name.starts_with(&theirs.prefix()), "{name}");
+        assert!(name.chars().all(|letter| letter.is_ascii_lowercase() || letter.is_ascii_digit() || letter == '-'));
+        assert_ne!(name, ours.project(2001));
+    }
+}

@@ -1,0 +1,71 @@
+//! Whether the packet filter is loaded that keeps containers off this machine and private addresses:
+//! `deploy/nftables/containers.nft`.
+
+use std::process::{Command, Stdio};
+use std::time::{Duration, Instant};
+
+/// The table of the filter.
+const TABLE: [&str; 5] = ["--terse", "list", "table", "inet", "webots_fleet"];
+/// The unit that loads it.
+const UNIT: [&str; 3] = ["is-active", "--quiet", "webots-fleet-packet-filter.service"];
+/// How long a program may take that is asked.
+const PATIENCE: Duration = Duration::from_secs(5);
+/// How often it is looked whether it has answered.
+const INTERVAL: Duration = Duration::from_millis(5);
+
+/// Returns nothing where the packet filter is loaded, else what that means and how it is loaded, in one line. Only root may
+/// look; others are told by systemd whether its unit has run.
+///
+/// It runs a program, for five seconds at most: not for a thread that serves others.
+#[must_use]
+pub fn missing() -> Option<String> {
+    let is_root = nix::unistd::geteuid().is_root();
+    let result =
+        if is_root { succeeds("/usr/sbin/nft", &TABLE, PATIENCE) } else { succeeds("systemctl", &UNIT, PATIENCE) };
+    let why = result.err()?;
+    Some(format!(
+        "containers may reach this machine and private addresses, for the packet filter is not loaded ({why}): install \
+         nftables and run 'systemctl enable --now webots-fleet-packet-filter'"
+    ))
+}
+
+/// Whether a program ends in order, or why not.
+fn succeeds(program: &str, arguments: &[&str], patience: Duration) -> Result<(), String> {
+    let name = || format!("{program} {}", arguments.join(" "));
+    let mut command = Command::new(program);
+    command.args(arguments).stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null());
+    let mut child = command.spawn().map_err(|error| format!("{program}: {error}"))?;
+    let deadline = Instant::now() + patience;
+    loop {
+        match child.try_wait() {
+            Ok(Some(status)) if status.success() => return Ok(()),
+            Ok(Some(_)) => return Err(format!("'{}' says no", name())),
+            Ok(None) if Instant::now() < deadline => std::thread::sleep(INTERVAL),
+            Ok(None) | Err(_) => {
+                // It may have ended by now.
+                child.kill().ok();
+                child.wait().ok();
+                return Err(format!("'{}' does not answer", name()));
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_filter_is_there_only_if_the_program_says_so() {
+        assert_eq!(succeeds("true", &[], PATIENCE), Ok(()));
+        assert_eq!(succeeds("false", &["x"], PATIENCE), Err("'false x' says no".to_owned()));
+        assert!(succeeds("/nowhere/nft", &[], PATIENCE).unwrap_err().contains("No such file"));
+    }
+
+    #[test]
+    fn a_program_that_hangs_is_ended() {
+        let (began, patience) = (Instant::now(), Duration::from_millis(50));
+        assert_eq!(succeeds("sleep", &["1000"], patience), Err("'sleep 1000' does not answer".to_owned()));
+        assert!(began.elapsed() >= patience, "{:?}", began.elapsed());
+    }
+}

@@ -1,0 +1,53 @@
+//! What Docker prints while it makes an image, in words for a client. Pure.
+//!
+//! Webots' page moves its bar by texts such as `Step 3/9 : ...`, in which each number has one digit, by `Creating network`,
+//! and by one that ends in `done`.
+
+/// The largest number of steps that the page understands.
+const STEPS: u64 = 9;
+
+/// The network is joined and the containers are made.
+pub const CREATING: &str = "Creating network and containers";
+
+/// An image is fetched, and Docker says this.
+#[must_use]
+pub fn pulling(image: &str, said: &str) -> String {
+    format!("Step 1/9 : fetching {image}: {said}")
+}
+
+/// Lines of a build that tell nobody anything.
+const NOISE: [&str; 3] = [" --->", "Removing intermediate container", "Sending build context"];
+
+/// An image is built, and Docker says this. Of its steps the page understands nine.
+#[must_use]
+pub fn building(said: &str) -> Option<String> {
+    if NOISE.iter().any(|beginning| said.starts_with(beginning)) {
+        return None;
+    }
+    let scaled = || {
+        let (numbers, instruction) = said.strip_prefix("Step ")?.split_once(" : ")?;
+        let (step, of) = numbers.split_once('/')?;
+        let (step, of): (u64, u64) = (step.parse().ok()?, of.parse().ok()?);
+        let step = if of > STEPS { (step.saturating_mul(STEPS) / of).max(1) } else { step };
+        Some(format!("Step {step}/{} : {instruction}", of.min(STEPS)))
+    };
+    Some(scaled().unwrap_or_else(|| said.to_owned()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn steps_have_one_digit() {
+        for (said, told) in [
+            ("Step 2/4 : RUN make", "Step 2/4 : RUN make"),
+            ("Step 10/20 : COPY . /x", "Step 4/9 : COPY . /x"),
+            ("Step 1/20 : FROM a", "Step 1/9 : FROM a"),
+            ("Step into the light", "Step into the light"),
+        ] {
+            assert_eq!(building(said).as_deref(), Some(told));
+        }
+        assert_eq!(building(" ---> Running in 0123"), None);
+    }
+}

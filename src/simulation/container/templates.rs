@@ -1,0 +1,110 @@
+//! The templates for compose and Dockerfiles: those that come with this server, and the administrator's in their place.
+
+use std::borrow::Cow;
+use std::collections::BTreeMap;
+use std::io;
+use std::path::PathBuf;
+
+use serde::Deserialize;
+use serde::de::IgnoredAny;
+
+use super::webots_yml::Kind;
+
+/// A file that comes with this server.
+macro_rules! shipped {
+    ($name:literal) => {
+        ($name, include_str!(concat!("../../../config/simulation/docker/", $name)))
+    };
+}
+
+/// Where templates are looked for.
+#[derive(Debug, Clone)]
+pub struct Templates {
+    /// The administrator's folder.
+    pub folder: Option<PathBuf>,
+    /// Whether the variants for those who look for a fault are taken.
+    pub debug: bool,
+}
+
+/// A template for compose.
+#[derive(Debug)]
+pub struct Template {
+    /// The file as it is.
+    pub text: Cow<'static, str>,
+    /// Its services, and whether each says what it runs.
+    pub services: BTreeMap<String, bool>,
+}
+
+/// The Dockerfile of a project that has none.
+pub const DOCKERFILE: &str = "Dockerfile.default";
+/// The Dockerfile of a competition's controllers that have none.
+pub const CONTROLLER: &str = "Dockerfile.controller";
+/// What runs a participant's controller.
+pub const LAUNCHER: &str = "remote_controller_launcher.py";
+
+/// The part of a compose file that this server reads.
+#[derive(Deserialize)]
+struct Document {
+    services: BTreeMap<String, Service>,
+}
+
+/// A service of it.
+#[derive(Deserialize)]
+struct Service {
+    command: Option<IgnoredAny>,
+}
+
+impl Templates {
+    /// The template for what a project asks for.
+    ///
+    /// # Errors
+    /// Why it can't be read, in words for the client.
+    pub fn compose(&self, kind: &Kind) -> Result<Template, String> {
+        let kind = match kind {
+            Kind::Default => "default",
+            Kind::Editor { .. } => "theia",
+            Kind::Competition { .. } => "competition",
+        };
+        let name = format!("docker-compose-{kind}{}.yml", if self.debug { "-debug" } else { "" });
+        let broken = |error: String| format!("The template {name} of this simulation server can't be used: {error}");
+        let text = self.text(&name).map_err(|error| broken(error.to_string()))?;
+        let document: Document = serde_saphyr::from_str(&text).map_err(|error| broken(error.to_string()))?;
+        let services: BTreeMap<String, bool> =
+            document.services.into_iter().map(|(name, service)| (name, service.command.is_some())).collect();
+        if !services.contains_key("webots") {
+            return Err(broken("it has no service \"webots\"".to_owned()));
+        }
+        Ok(Template { text, services })
+    }
+
+    /// Whether the administrator has a file of this name.
+    #[must_use]
+    pub fn has(&self, name: &str) -> bool {
+        self.folder.as_ref().is_some_and(|folder| folder.join(name).is_file())
+    }
+
+    /// The text of a template.
+    ///
+    /// # Errors
+    /// When the administrator's file can't be read.
+    pub fn text(&self, name: &str) -> io::Result<Cow<'static, str>> {
+        if let Some(folder) = self.folder.as_ref().filter(|_| self.has(name)) {
+            return std::fs::read_to_string(folder.join(name)).map(Cow::Owned);
+        }
+        let found = SHIPPED.iter().find(|(shipped, _)| *shipped == name);
+        found.map(|(_, text)| Cow::Borrowed(*text)).ok_or_else(|| io::ErrorKind::NotFound.into())
+    }
+}
+
+/// The files that come with this server.
+const SHIPPED: [(&str, &str); 9] = [
+    shipped!("docker-compose-default.yml"),
+    shipped!("docker-compose-default-debug.yml"),
+    shipped!("docker-compose-theia.yml"),
+    shipped!("docker-compose-theia-debug.yml"),
+    shipped!("docker-compose-competition.yml"),
+    shipped!("docker-compose-competition-debug.yml"),
+    shipped!("Dockerfile.default"),
+    shipped!("Dockerfile.controller"),
+    shipped!("remote_controller_launcher.py"),
+];

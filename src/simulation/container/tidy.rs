@@ -1,0 +1,73 @@
+//! Removes what simulations have left that nobody could remove when they ended, and images that nobody needs.
+
+use std::collections::HashSet;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
+
+use tokio::sync::Notify;
+
+use super::docker::{Docker, DockerError};
+use super::image::Images;
+use super::objects::{self, Owner};
+use crate::simulation::config::SimulationConfig;
+
+/// The compose projects that are in use.
+#[derive(Debug, Clone, Default)]
+pub struct Live(Arc<(Mutex<HashSet<String>>, Notify)>);
+
+/// How often it is looked for what nobody uses, at least.
+const PERIOD: Duration = Duration::from_mins(1);
+/// How often it is tried again to remove what could not be removed.
+const AGAIN: Duration = Duration::from_secs(2);
+/// How often images are looked at.
+const PRUNE: Duration = Duration::from_mins(30);
+
+impl Live {
+    /// Notes a name.
+    pub fn insert(&self, name: &str) {
+        self.names().insert(name.to_owned());
+    }
+
+    /// Forgets a name: what is left of it can be removed.
+    pub fn remove(&self, name: &str) {
+        self.names().remove(name);
+        self.0.1.notify_one();
+    }
+
+    fn names(&self) -> MutexGuard<'_, HashSet<String>> {
+        self.0.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// Removes what simulations have left that nobody could remove when they ended, and images that nobody needs.
+pub async fn keep_tidy(docker: Docker, owner: Owner, live: Live, images: Arc<Images>, config: Arc<SimulationConfig>) {
+    let age = Duration::from_hours(24 * config.container.images_age);
+    let mut pruned: Option<Instant> = None;
+    let mut pause = PERIOD;
+    loop {
+        actix_rt::time::timeout(pause, live.0.1.notified()).await.ok();
+        // Most has been removed by then.
+        actix_rt::time::sleep(AGAIN).await;
+        pause = match tidy(&docker, &owner, &live).await {
+            Ok(()) => PERIOD,
+            Err(error) => {
+                log::debug!("containers that nobody uses are not removed yet: {error}");
+                AGAIN
+            }
+        };
+        if pruned.is_none_or(|at| at.elapsed() > PRUNE) {
+            images.prune(age, config.container.images_size << 20, &config.persistant_docker_images).await;
+            pruned = Some(Instant::now());
+        }
+    }
+}
+
+async fn tidy(docker: &Docker, owner: &Owner, live: &Live) -> Result<(), DockerError> {
+    let found = owner.projects(docker).await?;
+    let left: Vec<String> = found.into_iter().filter(|name| !live.names().contains(name)).collect();
+    for name in left {
+        log::info!("{name} was left; it is removed");
+        objects::remove(docker, &name).await?;
+    }
+    Ok(())
+}

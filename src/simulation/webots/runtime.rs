@@ -1,0 +1,98 @@
+//! What a Webots runs on: the machine with one of its displays, or containers.
+
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use tokio::sync::Notify;
+
+use super::event::WebotsEvent;
+use super::launch_spec::LaunchSpec;
+use super::virtual_display::VirtualDisplay;
+use crate::simulation::container::{Containers, Prepared, Request};
+
+/// What a Webots runs on.
+#[derive(Debug)]
+pub enum Runtime {
+    /// The machine, with a display of Webots' own or the configured one.
+    Machine(Option<VirtualDisplay>),
+    /// Containers.
+    Containers(Box<Prepared>),
+}
+
+/// What has to be done before a Webots can start.
+#[derive(Debug)]
+pub enum Preparation {
+    /// Nothing.
+    None,
+    /// Its own display has to be started; it keeps its files in the instance's folder.
+    Display(PathBuf),
+    /// Containers have to be made.
+    Containers(Arc<Containers>, Request),
+}
+
+impl Preparation {
+    /// What has to be done for this Webots.
+    #[must_use]
+    pub fn of(spec: &LaunchSpec) -> Self {
+        match &spec.containers {
+            Some(containers) => Self::Containers(Arc::clone(containers), spec.request()),
+            None if spec.config.xvfb => Self::Display(spec.project.instance.path().to_owned()),
+            None => Self::None,
+        }
+    }
+
+    /// Does it. `progress` hears each step in words. Dropping the future gives up what was made.
+    ///
+    /// # Errors
+    /// Why not, in words for the client.
+    pub async fn run(self, progress: impl Fn(String) + Send + Sync) -> Result<Runtime, String> {
+        match self {
+            Self::None => Ok(Runtime::Machine(None)),
+            Self::Display(instance) => match VirtualDisplay::start(&instance).await {
+                Ok(display) => Ok(Runtime::Machine(Some(display))),
+                Err(error) => Err(format!("The virtual display (Xvfb) can't be started: {error}")),
+            },
+            Self::Containers(containers, request) => {
+                let mut prepared = containers.prepare(request, &progress).await?;
+                prepared.start_others().await.map_err(|error| error.to_string())?;
+                Ok(Runtime::Containers(Box::new(prepared)))
+            }
+        }
+    }
+}
+
+impl Runtime {
+    /// Asks to start the controller of a competition's participant anew, where there is one.
+    #[must_use]
+    pub fn restart(&self) -> Option<Arc<Notify>> {
+        match self {
+            Self::Machine(_) => None,
+            Self::Containers(containers) => containers.restart(),
+        }
+    }
+
+    /// What the client should know of it.
+    #[must_use]
+    pub fn news(&self) -> Vec<WebotsEvent> {
+        let Self::Containers(containers) = self else { return Vec::new() };
+        let warnings = containers.warnings.iter().cloned().map(WebotsEvent::Progress);
+        warnings.chain(containers.texts.iter().cloned().map(WebotsEvent::Text)).collect()
+    }
+
+    /// Ends what a Webots ran on, after its own end. Returns whether the kernel has ended something of it that took too much
+    /// memory.
+    pub async fn end(self) -> bool {
+        match self {
+            Self::Machine(None) => false,
+            Self::Machine(Some(display)) => {
+                display.stop().await;
+                false
+            }
+            Self::Containers(containers) => {
+                let out_of_memory = containers.has_run_out_of_memory().await;
+                containers.remove().await;
+                out_of_memory
+            }
+        }
+    }
+}

@@ -1,0 +1,184 @@
+//! Images that are built: a project's own Dockerfile, what it may not do, and what happens when a build fails.
+
+use std::time::Duration;
+
+use super::daemon::{ask, containers, docker, of_service, server};
+use super::image::NAME;
+use crate::support::client::Client;
+use crate::support::git::{Forge, WORLD, arm, world};
+use crate::support::until;
+
+/// How long a build may take on a busy machine.
+const BUILT: Duration = Duration::from_secs(90);
+
+fn with(dockerfile: &str) -> Forge {
+    let forge = Forge::with_arm();
+    forge.commit("lab/arm", "main", &[("Dockerfile", dockerfile)]);
+    forge
+}
+
+#[actix_rt::test]
+async fn a_projects_own_dockerfile_is_built_once_for_all_who_want_it_and_what_it_makes_is_there() {
+    let Some(_docker) = docker().await else { return };
+    let forge = with(&format!(
+        "FROM {NAME}\nARG PROJECT_PATH\nRUN mkdir -p $PROJECT_PATH\nCOPY . $PROJECT_PATH\nRUN sleep 2 && cp \
+         $PROJECT_PATH/controllers/c/c.py $PROJECT_PATH/controllers/c/built\n"
+    ));
+    forge.commit(
+        "lab/arm",
+        "main",
+        &[("docker-compose.yml", "services: {webots: {privileged: true}}\n"), (".env", "PORT=1\n")],
+    );
+    let server = server(forge.path(), 2).start().await;
+    let (mut one, mut two) = (Client::start(&server, &arm()).await, Client::start(&server, &arm()).await);
+    for client in [&mut one, &mut two] {
+        client.patiently("webots:", BUILT).await;
+        let heard = client.heard.join("\n");
+        for words in [
+            "loading: Step 5/6 : COPY . $PROJECT_PATH",
+            "loading: docker-compose.yml of the project is not used here",
+            "loading: .env of the project is not used here",
+        ] {
+            assert!(heard.contains(words), "{words:?} is not in {heard}");
+        }
+    }
+    let images = ask(&["image", "ls", "--format", "{{.Repository}}:{{.Tag}}"]);
+    let owner = webots_fleet::simulation::container::Owner::of(&server.cache());
+    let mine = |name: &&str| name.starts_with(&format!("webots-fleet/{}:", owner.name()));
+    assert_eq!(images.lines().filter(mine).count(), 1, "{images}");
+    for container in of_service(&server, "webots") {
+        let built = ask(&["exec", &container, "cat", "/usr/local/webots-project/controllers/c/built"]);
+        assert_eq!(built, "print('original')");
+        // It may change its project, and nothing else.
+        ask(&["exec", &container, "touch", "/usr/local/webots-project/new", "/tmp/new"]);
+    }
+    // The next one need not wait for a build.
+    one.leave().await;
+    until("one is gone", async || containers(&server).len() == 1).await;
+    let mut next = Client::start(&server, &arm()).await;
+    next.patiently("webots:", BUILT).await;
+    assert!(!next.heard.iter().any(|text| text.contains("COPY .")), "{:?}", next.heard);
+}
+
+#[actix_rt::test]
+async fn a_makefile_is_run_in_the_default_image() {
+    let Some(_docker) = docker().await else { return };
+    let forge = Forge::with_arm();
+    forge.commit("lab/arm", "main", &[("Makefile", "all:\n\tcp controllers/c/c.py made\n")]);
+    let server = server(forge.path(), 1).start().await;
+    let mut client = Client::start(&server, &arm()).await;
+    client.patiently("webots:", BUILT).await;
+    let made = ask(&["exec", &of_service(&server, "webots")[0], "cat", "/usr/local/webots-project/made"]);
+    assert_eq!(made, "print('original')");
+}
+
+#[actix_rt::test]
+async fn what_can_not_be_built_is_told_in_words_and_leaves_nothing() {
+    let Some(_docker) = docker().await else { return };
+    let table = [
+        (
+            format!("FROM {NAME}\nCOPY . /usr/local/webots-project\nRUN echo 'gcc: not found' && exit 3\n"),
+            "The image of this project can't be built: The command '/bin/sh -c echo 'gcc: not found' ‹?",
+        ),
+        ("FROM webots-fleet.test/nothing:1\n".to_owned(), "webots-fleet.test/nothing:1"),
+        (format!("FROM {NAME}\nADD http://127.0.0.1/secret /x\n"), "may ADD files of the project only"),
+        (format!("FROM {NAME}\n"), "The image of this project has no folder /usr/local/webots-project"),
+        (format!("FROM {NAME}\nCOPY . /usr/local/webots-project\nVOLUME /usr/local\n"), "which would hide the project"),
+        (
+            format!("FROM {NAME}\nCOPY . /usr/local/webots-project\nRUN rm -r /usr/local/webots-project/worlds\n"),
+            "has no worlds/a.wbt",
+        ),
+        ("no Dockerfile at all\n".to_owned(), "can't be built"),
+    ];
+    for (dockerfile, words) in table {
+        let forge = with(&dockerfile);
+        let server = server(forge.path(), 1).start().await;
+        let mut client = Client::start(&server, &arm()).await;
+        let told = client.patiently("loading: Error:", BUILT).await;
+        let words = words.trim_end_matches(" ‹?");
+        assert!(told.contains(words), "{told:?} does not have {words:?}; heard {:#?}", client.heard);
+        until("nothing is left", async || containers(&server).is_empty()).await;
+    }
+}
+
+#[actix_rt::test]
+async fn a_version_without_an_image_is_told_in_words() {
+    let Some(_docker) = docker().await else { return };
+    let forge = Forge::with_arm();
+    forge.commit("lab/old", "main", &[("worlds/a.wbt", &WORLD.replace("R2025a", "R2022b"))]);
+    // A registry that says at once that it is not there.
+    let server = server(forge.path(), 1)
+        .set("container", serde_json::json!({"image": "127.0.0.1:1/webots:{version}"}))
+        .start()
+        .await;
+    let told = Client::start(&server, &world("lab/old", "main", "worlds/a.wbt"))
+        .await
+        .patiently("loading: Error:", BUILT)
+        .await;
+    assert!(told.contains("127.0.0.1:1/webots:R2022b"), "{told}");
+}
+
+#[actix_rt::test]
+async fn a_client_that_leaves_in_the_middle_of_a_build_ends_it() {
+    let Some(_docker) = docker().await else { return };
+    let forge = with(&format!("FROM {NAME}\nLABEL test.long=yes\nRUN sleep 1000\n"));
+    let server = server(forge.path(), 1).start().await;
+    let mut client = Client::start(&server, &arm()).await;
+    client.patiently("loading: Step 4/4 : RUN sleep 1000", BUILT).await;
+    let builds = async || ask(&["ps", "--all", "--quiet", "--filter", "label=test.long=yes"]).lines().count();
+    until("it is built", async || builds().await == 1).await;
+    client.leave().await;
+    until("the build is gone", async || builds().await == 0).await;
+    // The place is free again.
+    forge.commit("lab/arm", "main", &[("Dockerfile", &format!("FROM {NAME}\nCOPY . /usr/local/webots-project\n"))]);
+    Client::start(&server, &arm()).await.patiently("webots:", BUILT).await;
+}
+
+#[actix_rt::test]
+async fn a_build_that_takes_too_long_is_ended_and_told() {
+    let Some(_docker) = docker().await else { return };
+    let forge = with(&format!("FROM {NAME}\nRUN sleep 1000\n"));
+    let server = server(forge.path(), 1).set("timing.build", 3).start().await;
+    let told = Client::start(&server, &arm()).await.patiently("loading: Error:", BUILT).await;
+    assert!(told.contains("timing.build"), "{told}");
+}
+
+#[actix_rt::test]
+async fn images_of_ours_that_are_too_many_are_removed_and_no_others() {
+    let Some(_docker) = docker().await else { return };
+    let folder = tempfile::tempdir().unwrap();
+    let large = format!("FROM {NAME}\nCOPY . /usr/local/webots-project\nRUN head -c 5000000 /dev/urandom >/large\n");
+    let forge = with(&large);
+    ask(&["tag", NAME, "postgres:15"]);
+    let build = server(forge.path(), 1).folder(folder.path()).start().await;
+    Client::start(&build, &arm()).await.patiently("webots:", BUILT).await;
+    let owner = webots_fleet::simulation::container::Owner::of(&build.cache());
+    let own = format!("webots-fleet/{}", owner.name());
+    let images = || ask(&["image", "ls", "--quiet", &own]).lines().count();
+    assert_eq!(images(), 1);
+    drop(build);
+    let settings = serde_json::json!({ "imagesSize": 1 });
+    let server = server(forge.path(), 1).folder(folder.path()).set("container", settings).start().await;
+    // An image is looked for what nobody needs when a simulation has ended.
+    forge.commit("lab/arm", "main", &[("Dockerfile", &format!("FROM {NAME}\nCOPY . /usr/local/webots-project\n"))]);
+    let mut client = Client::start(&server, &arm()).await;
+    client.patiently("webots:", BUILT).await;
+    client.leave().await;
+    until("the large one is gone", async || images() == 1).await;
+    assert_eq!(ask(&["image", "ls", "--quiet", "postgres:15"]).lines().count(), 1);
+    assert_eq!(ask(&["image", "ls", "--quiet", NAME]).lines().count(), 1);
+}
+
+#[actix_rt::test]
+async fn a_volume_of_an_image_is_memory_with_a_limit() {
+    let Some(_docker) = docker().await else { return };
+    let forge = with(&format!("FROM {NAME}\nCOPY . /usr/local/webots-project\nVOLUME /data\n"));
+    let server = server(forge.path(), 1).set("limits", serde_json::json!({ "disk": 10 })).start().await;
+    let mut client = Client::start(&server, &arm()).await;
+    client.patiently("webots:", BUILT).await;
+    let webots = &of_service(&server, "webots")[0];
+    assert_eq!(ask(&["inspect", "--format", "{{range .Mounts}}{{.Type}} {{end}}", webots]), "bind");
+    let fill = "dd if=/dev/zero of=/data/big bs=1M count=20 2>&1 || true";
+    let told = ask(&["exec", webots, "sh", "-c", fill]);
+    assert!(told.contains("No space left"), "{told}");
+}

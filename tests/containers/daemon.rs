@@ -1,0 +1,224 @@
+//! A Docker daemon of the tests' own, shared by all of them. It ends with the process of the tests, and all of its
+//! containers with it.
+
+use std::io::Write;
+use std::os::unix::process::CommandExt;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::sync::OnceLock;
+use std::time::{Duration, Instant};
+
+use tokio::sync::{RwLock, RwLockReadGuard, RwLockWriteGuard};
+
+use super::image;
+use crate::support::program::{Builder, simulation_server};
+
+/// The daemon, for a test that shares it with others.
+pub struct Docker {
+    _shared: RwLockReadGuard<'static, ()>,
+}
+
+/// The daemon, for a test that has it alone and may stop it.
+pub struct Alone {
+    _alone: RwLockWriteGuard<'static, ()>,
+}
+
+struct Daemon {
+    folder: PathBuf,
+}
+
+static USERS: RwLock<()> = RwLock::const_new(());
+static DAEMON: OnceLock<Option<Daemon>> = OnceLock::new();
+/// How long the daemon may take to begin.
+const START: Duration = Duration::from_secs(60);
+/// The interface of the servers' network. It stays when the daemon is killed.
+const INTERFACE: &str = "webots-fleet";
+
+/// The daemon, started by whoever asks first; nothing, and a word, where there can be none.
+pub async fn docker() -> Option<Docker> {
+    let shared = USERS.read().await;
+    started().then_some(Docker { _shared: shared })
+}
+
+/// The same, when nobody else uses it.
+pub async fn alone() -> Option<Alone> {
+    let alone = USERS.write().await;
+    started().then_some(Alone { _alone: alone })
+}
+
+fn started() -> bool {
+    DAEMON.get_or_init(start).is_some()
+}
+
+fn start() -> Option<Daemon> {
+    if let Some(why) = missing() {
+        assert!(std::env::var_os("CI").is_none(), "this has to be tested where CI is set, and can't: {why}");
+        // Not by a macro: what those print is shown for tests that fail only.
+        std::io::stderr().write_all(format!("SKIPPED, for {why}: the tests of containers\n").as_bytes()).unwrap();
+        return None;
+    }
+    // Paths of sockets have to be short.
+    let below = std::env::temp_dir().join("webots-fleet-docker");
+    remove_old(&below);
+    let folder = below.join(std::process::id().to_string());
+    std::fs::create_dir_all(&folder).unwrap();
+    // Unless another daemon of the machine uses it.
+    Command::new("ip").args(["link", "del", INTERFACE]).stderr(Stdio::null()).status().unwrap();
+    let daemon = Daemon { folder };
+    daemon.launch();
+    image::make(&daemon.folder);
+    Some(daemon)
+}
+
+/// Why there can be no daemon here.
+fn missing() -> Option<String> {
+    if !nix::unistd::getuid().is_root() {
+        return Some("dockerd needs root".to_owned());
+    }
+    let paths = std::env::var_os("PATH").unwrap();
+    let is_there = |program: &str| std::env::split_paths(&paths).any(|folder| folder.join(program).is_file());
+    let programs = ["dockerd", "docker", "docker-compose", "unshare", "setpriv", "ip"];
+    programs.into_iter().find(|program| !is_there(program)).map(|program| format!("there is no {program}"))
+}
+
+/// Removes what earlier runs have left.
+fn remove_old(folder: &Path) {
+    for entry in std::fs::read_dir(folder).into_iter().flatten().flatten() {
+        let name = entry.file_name().to_string_lossy().into_owned();
+        if !Path::new("/proc").join(&name).exists() {
+            std::fs::remove_dir_all(entry.path()).ok();
+        }
+    }
+}
+
+impl Daemon {
+    fn socket(&self) -> String {
+        format!("unix://{}/docker.sock", self.folder.display())
+    }
+
+    /// Starts the daemon as the first process of a namespace: with it everything inside ends.
+    fn launch(&self) {
+        let folder = self.folder.clone();
+        // What one that was killed has left.
+        std::fs::remove_file(folder.join("pid")).ok();
+        std::fs::remove_dir_all(folder.join("exec")).ok();
+        let (socket, log) = (self.socket(), std::fs::File::create(self.folder.join("log")).unwrap());
+        // The kernel ends it with the thread that has started it: one that lives as long as this process.
+        std::thread::spawn(move || {
+            let path = |name: &str| folder.join(name).display().to_string();
+            let mut command = Command::new("setpriv");
+            command.args([
+                "--pdeathsig",
+                "KILL",
+                "unshare",
+                "--pid",
+                "--fork",
+                "--kill-child=KILL",
+                "--mount",
+                "--mount-proc",
+            ]);
+            command.args(["dockerd", "--host", &socket, "--data-root", &path("data"), "--exec-root", &path("exec")]);
+            command.args([
+                "--pidfile",
+                &path("pid"),
+                "--bridge=none",
+                "--iptables=false",
+                "--ip6tables=false",
+                "--ip-masq=false",
+            ]);
+            let mut child: Child = command
+                .stdin(Stdio::null())
+                .stdout(log.try_clone().unwrap())
+                .stderr(log)
+                .process_group(0)
+                .spawn()
+                .unwrap();
+            std::fs::write(folder.join("keeper"), child.id().to_string()).unwrap();
+            child.wait().ok();
+            std::fs::remove_file(folder.join("keeper")).ok();
+        });
+        let deadline = Instant::now() + START;
+        while !self.command(&["version"]).output().unwrap().status.success() {
+            let log = std::fs::read_to_string(self.folder.join("log")).unwrap();
+            assert!(Instant::now() < deadline, "dockerd does not begin: {log}");
+            std::thread::sleep(Duration::from_millis(100));
+        }
+    }
+
+    fn command(&self, arguments: &[&str]) -> Command {
+        let mut command = Command::new("docker");
+        command.args(arguments).env("DOCKER_HOST", self.socket()).env("DOCKER_BUILDKIT", "0");
+        command
+    }
+}
+
+fn daemon() -> &'static Daemon {
+    DAEMON.get().unwrap().as_ref().unwrap()
+}
+
+/// Makes an image of an archive, in the daemon whose files are in this folder.
+pub fn import(folder: &Path, tar: &str, name: &str, options: &[&str]) {
+    let daemon = Daemon { folder: folder.to_owned() };
+    let made = daemon.command(&[&["import"], options, &[tar, name]].concat()).output().unwrap();
+    assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
+}
+
+/// What `docker` prints with these arguments.
+pub fn ask(arguments: &[&str]) -> String {
+    let output = daemon().command(arguments).output().unwrap();
+    assert!(output.status.success(), "docker {arguments:?}: {}", String::from_utf8_lossy(&output.stderr));
+    String::from_utf8_lossy(&output.stdout).trim().to_owned()
+}
+
+/// A simulation server with so many places that runs simulations in containers of the daemon.
+pub fn server(repositories: &Path, places: u16) -> Builder {
+    simulation_server(Path::new("/nowhere"), repositories, places)
+        .set("isolation", "container")
+        .set("webots", serde_json::Value::Null)
+        .set("timing", serde_json::json!({ "heartbeat": 0.5 }))
+        .env("DOCKER_HOST", &daemon().socket())
+        .env("DOCKER_CONFIG", &daemon().folder.display().to_string())
+}
+
+/// The containers of a server, those that have ended among them: the names of their projects.
+pub fn containers(server: &crate::support::program::Server) -> Vec<String> {
+    let format = "{{.Label \"com.docker.compose.project\"}}";
+    let prefix = prefix(server);
+    let all = ask(&["ps", "--all", "--filter", "label=com.docker.compose.project", "--format", format]);
+    all.lines().filter(|name| name.starts_with(&prefix)).map(str::to_owned).collect()
+}
+
+/// How the names of a server's projects begin.
+pub fn prefix(server: &crate::support::program::Server) -> String {
+    let owner = webots_fleet::simulation::container::Owner::of(&server.cache());
+    format!("webots-fleet-{}-", owner.name())
+}
+
+/// The containers of one service of a server.
+pub fn of_service(server: &crate::support::program::Server, service: &str) -> Vec<String> {
+    let prefix = prefix(server);
+    let filter = format!("label=com.docker.compose.service={service}");
+    let format = "{{.Label \"com.docker.compose.project\"}} {{.ID}}";
+    let all = ask(&["ps", "--filter", &filter, "--format", format]);
+    let found = all.lines().filter_map(|line| line.split_once(' ')).filter(|(name, _)| name.starts_with(&prefix));
+    found.map(|(_, id)| id.to_owned()).collect()
+}
+
+impl Alone {
+    /// Kills the daemon, and with it everything that it runs.
+    pub fn kill(&self) {
+        let keeper = daemon().folder.join("keeper");
+        let pid: i32 = std::fs::read_to_string(&keeper).unwrap().parse().unwrap();
+        nix::sys::signal::kill(nix::unistd::Pid::from_raw(pid), nix::sys::signal::Signal::SIGKILL).unwrap();
+        let deadline = Instant::now() + START;
+        while keeper.exists() {
+            assert!(Instant::now() < deadline, "the daemon is still there");
+            std::thread::sleep(Duration::from_millis(20));
+        }
+    }
+
+    /// Starts it again.
+    pub fn start(&self) {
+        daemon().launch();
+    }
+}

@@ -1,0 +1,128 @@
+//! What a world's program tries in a container: each row is also in docs/isolation.md.
+
+use std::time::{Duration, Instant};
+
+use serde_json::json;
+
+use super::daemon::{ask, containers, docker, of_service, server};
+use super::image::NAME;
+use crate::support::client::Client;
+use crate::support::git::{Forge, arm};
+use crate::support::program::{Builder, Server};
+use crate::support::until;
+
+/// How long a build may take on a busy machine.
+const BUILT: Duration = Duration::from_secs(90);
+
+/// A world whose Webots does this and then heartbeats.
+fn doing(script: &str) -> Forge {
+    let forge = Forge::with_arm();
+    let webots = format!("#!/bin/bash\n{script}\nwhile :; do echo .; sleep 0.2; done\n");
+    let dockerfile = format!(
+        "FROM {NAME}\nCOPY . /usr/local/webots-project\nRUN cp /usr/local/webots-project/fake /usr/bin/webots && chmod 755 \
+         /usr/bin/webots\n"
+    );
+    forge.commit("lab/arm", "main", &[("fake", &webots), ("Dockerfile", &dockerfile)]);
+    forge
+}
+
+async fn running(builder: Builder) -> (Server, Client) {
+    let server = builder.start().await;
+    let mut client = Client::start(&server, &arm()).await;
+    client.patiently("webots:", BUILT).await;
+    (server, client)
+}
+
+#[actix_rt::test]
+async fn a_program_sees_its_image_and_its_project_only() {
+    let Some(_docker) = docker().await else { return };
+    let forge = doing("");
+    let (server, _client) = running(server(forge.path(), 1).env("SECRET", "xyz")).await;
+    let webots = &of_service(&server, "webots")[0];
+    let inside = |command: &str| ask(&["exec", webots, "bash", "-c", &format!("({command}) 2>&1 || true")]);
+    assert!(!inside("env").contains("SECRET"));
+    // The machine's processes, folders and devices.
+    let processes = inside("cat /proc/[0-9]*/cmdline | tr '\\0' ' '; echo; ls -d /proc/[0-9]*");
+    assert!(!processes.contains("simulation-server"), "{processes}");
+    assert!(!inside("ls -R /usr/local /tmp /run").contains("config.json"));
+    for (command, words) in [
+        ("touch /usr/bin/new", "Read-only file system"),
+        ("touch /usr/local/new", "Read-only file system"),
+        ("mkdir /data", "Read-only file system"),
+        ("echo 1 >/proc/sys/vm/drop_caches", "Read-only file system"),
+        ("ls /var/run/docker.sock", "No such file"),
+        ("cat /proc/self/status | while read a b; do [ \"$a\" = CapEff: ] && echo $b; done", "0000000000000000"),
+    ] {
+        let answer = inside(command);
+        assert!(answer.contains(words), "{command}: {answer}");
+    }
+}
+
+#[actix_rt::test]
+async fn memory_without_end_is_told_and_ended() {
+    let Some(_docker) = docker().await else { return };
+    let forge = doing("sleep 1; perl -e 'my @a; push @a, \"x\" x 1000000 while 1' & wait $!; exit 137");
+    let server = server(forge.path(), 1).set("limits", json!({ "memory": 64 })).start().await;
+    let told = Client::start(&server, &arm()).await.patiently("loading: Error:", BUILT).await;
+    assert!(told.contains("limits.memory"), "{told}");
+    until("it is gone", async || containers(&server).is_empty()).await;
+}
+
+#[actix_rt::test]
+async fn forks_without_end_stay_few_and_end_with_the_client() {
+    let Some(_docker) = docker().await else { return };
+    let forge = doing("(while :; do sleep 1000 & done) 2>/dev/null &");
+    let (server, client) = running(server(forge.path(), 1).set("limits", json!({ "processes": 60 }))).await;
+    let webots = of_service(&server, "webots")[0].clone();
+    let count = || ask(&["top", &webots]).lines().count();
+    until("there are as many as there may be", async || count() >= 50).await;
+    assert!(count() <= 62, "{}", count());
+    client.leave().await;
+    until("all are gone", async || containers(&server).is_empty()).await;
+}
+
+#[actix_rt::test]
+async fn what_fills_the_project_is_told_and_ended() {
+    let Some(_docker) = docker().await else { return };
+    let forge = doing("(sleep 1; dd if=/dev/zero of=/usr/local/webots-project/big bs=1M count=50 2>/dev/null) &");
+    let server = server(forge.path(), 1).set("limits", json!({ "disk": 20 })).start().await;
+    let told = Client::start(&server, &arm()).await.patiently("loading: Error:", BUILT).await;
+    assert!(told.contains("limits.disk"), "{told}");
+}
+
+#[actix_rt::test]
+async fn prints_without_end_are_read_at_their_pace() {
+    let Some(_docker) = docker().await else { return };
+    let forge = doing("(while :; do echo xxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxx; done) &");
+    let (server, client) = running(server(forge.path(), 1).set("limits", json!({ "output": 64 }))).await;
+    let ticks = || {
+        let stat = procfs::process::Process::new(server.pid()).unwrap().stat().unwrap();
+        stat.utime + stat.stime
+    };
+    let (begin, before) = (Instant::now(), ticks());
+    actix_rt::time::sleep(Duration::from_secs(4)).await;
+    let share = (ticks() - before) as f64 / procfs::ticks_per_second() as f64 / begin.elapsed().as_secs_f64();
+    assert!(share < 0.25, "it costs {share} of a core, in a build without optimization");
+    client.leave().await;
+    until("it is gone", async || containers(&server).is_empty()).await;
+}
+
+#[actix_rt::test]
+async fn links_in_the_project_lead_no_other_container_astray() {
+    let Some(_docker) = docker().await else { return };
+    let forge = doing("");
+    let yml = "dockerCompose: \"competition:webots-project/controllers/c\"\n";
+    let controller = format!("FROM {NAME}\nCOPY . /usr/local/webots-project/controllers\nCMD [\"sleep\", \"1000\"]\n");
+    forge.commit("lab/arm", "main", &[("webots.yml", yml), ("controllers/Dockerfile", &controller)]);
+    // Webots replaces the participant's folder by a link to the machine's files, and is reset.
+    let webots = "#!/bin/bash\nrm -rf /usr/local/webots-project/controllers\nln -s /etc /usr/local/webots-project/controllers\nln -s \
+                  /etc /usr/local/webots-project/c\nwhile :; do echo .; echo reset; sleep 0.2; done\n";
+    forge.commit("lab/arm", "main", &[("fake", webots)]);
+    let (server, _client) = running(server(forge.path(), 1)).await;
+    let controller = of_service(&server, "controller")[0].clone();
+    let starts = || ask(&["inspect", "--format", "{{.State.StartedAt}}", &controller]);
+    let first = starts();
+    until("the controller was started anew", async || starts() != first).await;
+    let shown = ask(&["exec", &controller, "ls", "/usr/local/webots-project/controllers/c"]);
+    assert_eq!(shown, "c.py");
+}

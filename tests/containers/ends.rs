@@ -1,0 +1,90 @@
+//! What is left when things end that should not: the server, the daemon.
+
+use std::time::{Duration, Instant};
+
+use nix::sys::signal::Signal;
+
+use super::daemon::{alone, ask, containers, docker, prefix, server};
+use crate::support::client::Client;
+use crate::support::git::{Forge, arm};
+use crate::support::{http, until};
+
+/// All of a simulation has to be gone by then.
+const GONE: Duration = Duration::from_secs(10);
+
+fn left(prefix: &str) -> usize {
+    let format = "{{.Label \"com.docker.compose.project\"}}";
+    let all = ask(&["ps", "--all", "--filter", "label=com.docker.compose.project", "--format", format]);
+    all.lines().filter(|name| name.starts_with(prefix)).count()
+}
+
+#[actix_rt::test]
+async fn everything_is_gone_soon_after_the_server_was_killed() {
+    let Some(_docker) = docker().await else { return };
+    let forge = Forge::with_arm();
+    let mut server = server(forge.path(), 2).start().await;
+    let mut clients = vec![Client::start(&server, &arm()).await, Client::start(&server, &arm()).await];
+    for client in &mut clients {
+        client.patiently("webots:", Duration::from_secs(60)).await;
+    }
+    let prefix = prefix(&server);
+    server.signal(Signal::SIGKILL);
+    server.ended().await;
+    let begin = Instant::now();
+    until("the containers are gone", async || left(&prefix) == 0).await;
+    assert!(begin.elapsed() < GONE, "{:?}", begin.elapsed());
+}
+
+#[actix_rt::test]
+async fn a_server_that_stops_leaves_nothing() {
+    let Some(_docker) = docker().await else { return };
+    let forge = Forge::with_arm();
+    let mut server = server(forge.path(), 2).start().await;
+    let mut running = Client::start(&server, &arm()).await;
+    running.patiently("webots:", Duration::from_secs(60)).await;
+    let mut starting = Client::start(&server, &arm()).await;
+    starting.patiently("loading: Creating network", Duration::from_secs(60)).await;
+    let prefix = prefix(&server);
+    server.signal(Signal::SIGTERM);
+    assert_eq!(server.ended().await, Some(0));
+    until("the containers are gone", async || left(&prefix) == 0).await;
+}
+
+#[actix_rt::test]
+async fn what_an_earlier_run_has_left_is_removed_and_nothing_of_others() {
+    let Some(_docker) = docker().await else { return };
+    let (forge, folder) = (Forge::with_arm(), tempfile::tempdir().unwrap());
+    std::fs::create_dir(folder.path().join("cache")).unwrap();
+    let owner = webots_fleet::simulation::container::Owner::of(&folder.path().join("cache"));
+    let make = |project: &str| {
+        let label = format!("com.docker.compose.project={project}");
+        ask(&["create", "--label", &label, "--network", "none", super::image::NAME, "sleep", "1000"])
+    };
+    let (mine, other) = (owner.project(2001), "webots-fleet-000000000000-2001-0".to_owned());
+    let containers = [make(&mine), make(&other)];
+    let _server = server(forge.path(), 1).folder(folder.path()).start().await;
+    let is_there = |container: &str| {
+        !ask(&["ps", "--all", "--quiet", "--no-trunc", "--filter", &format!("id={container}")]).is_empty()
+    };
+    until("what it left is gone", async || !is_there(&containers[0])).await;
+    assert!(is_there(&containers[1]));
+    ask(&["rm", &containers[1]]);
+}
+
+#[actix_rt::test]
+async fn a_daemon_that_is_stopped_is_told_and_all_goes_on_when_it_is_back() {
+    let Some(docker) = alone().await else { return };
+    let forge = Forge::with_arm();
+    let server = server(forge.path(), 2).start().await;
+    let mut client = Client::start(&server, &arm()).await;
+    client.patiently("webots:", Duration::from_secs(60)).await;
+    docker.kill();
+    client.patiently("loading: Error:", Duration::from_secs(60)).await;
+    let told = Client::start(&server, &arm()).await.patiently("loading: Error:", Duration::from_secs(60)).await;
+    assert!(told.contains("Docker does not answer on this simulation server"), "{told}");
+    until("it says so", async || http::get(&server.url("/load")).await.text().trim() == "100").await;
+    docker.start();
+    until("it takes clients again", async || http::get(&server.url("/load")).await.text().trim() != "100").await;
+    Client::start(&server, &arm()).await.patiently("webots:", Duration::from_secs(60)).await;
+    until("what the daemon has kept is gone", async || containers(&server).len() <= 1).await;
+}

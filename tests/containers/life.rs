@@ -1,0 +1,131 @@
+//! The life of a simulation in a container.
+
+use std::time::{Duration, Instant};
+
+use serde_json::{Value, json};
+
+use super::daemon::{alone, ask, containers, docker, of_service, server};
+use crate::support::client::Client;
+use crate::support::git::{Forge, arm, world};
+use crate::support::{http, until};
+
+/// How long a start may take on a busy machine.
+const READY: Duration = Duration::from_secs(90);
+/// All of a simulation has to be gone by then.
+const GONE: Duration = Duration::from_secs(10);
+
+#[actix_rt::test]
+async fn a_world_runs_in_a_container_and_nothing_is_left_when_its_client_goes() {
+    let Some(_docker) = docker().await else { return };
+    let forge = Forge::with_arm();
+    let server = server(forge.path(), 2).start().await;
+    let mut client = Client::start(&server, &arm()).await;
+    let address = client.patiently("webots:", READY).await;
+    let steps = ["loading: Creating network", "shutdownTimeout: 7200", "webots:ws://localhost:"];
+    let order: Vec<_> = steps.iter().map(|step| client.heard.iter().position(|text| text.starts_with(step))).collect();
+    assert!(order.iter().all(Option::is_some) && order.is_sorted(), "{:?}", client.heard);
+    let mut viewer = Client::connect(&address.trim_start_matches("webots:").replace("localhost", "127.0.0.1")).await;
+    viewer.send("x3d").await;
+    viewer.until("model:").await;
+    viewer.send("real-time:-1").await;
+    viewer.until("application/json:").await;
+    assert_eq!(http::get(&server.url("/status")).await.json()["isolation"], "container");
+    assert_eq!(containers(&server).len(), 1);
+    drop(viewer);
+    client.leave().await;
+    let begin = Instant::now();
+    until("its container is gone", async || containers(&server).is_empty()).await;
+    assert!(begin.elapsed() < GONE, "{:?}", begin.elapsed());
+    until("its folder is gone", async || {
+        let runs = std::fs::read_dir(server.cache().join("runs")).unwrap().flatten();
+        runs.flat_map(|run| std::fs::read_dir(run.path()).unwrap().flatten())
+            .all(|file| !file.file_name().to_string_lossy().starts_with("instance-"))
+    })
+    .await;
+    // The port is free, and the next one gets it.
+    let mut next = Client::start(&server, &arm()).await;
+    assert_eq!(next.patiently("webots:", READY).await, address);
+}
+
+#[actix_rt::test]
+async fn a_container_has_no_more_than_it_needs() {
+    let Some(_docker) = docker().await else { return };
+    let forge = Forge::with_arm();
+    let server = server(forge.path(), 1)
+        .set("limits", json!({ "memory": 300, "cores": 1, "processes": 77, "openFiles": 2048 }))
+        .start()
+        .await;
+    let mut client = Client::start(&server, &arm()).await;
+    client.patiently("webots:", READY).await;
+    let about: Value = serde_json::from_str(&ask(&["inspect", &of_service(&server, "webots")[0]])).unwrap();
+    let (host, config) = (&about[0]["HostConfig"], &about[0]["Config"]);
+    for (key, value) in [
+        ("Privileged", json!(false)),
+        ("ReadonlyRootfs", json!(true)),
+        ("CapDrop", json!(["ALL"])),
+        ("SecurityOpt", json!(["no-new-privileges:true"])),
+        ("Memory", json!(300 << 20)),
+        ("MemorySwap", json!(300 << 20)),
+        ("NanoCpus", json!(1_000_000_000)),
+        ("PidsLimit", json!(77)),
+        ("NetworkMode", json!("webots-fleet")),
+    ] {
+        assert_eq!(host[key], value, "{key}");
+    }
+    assert_eq!(host["RestartPolicy"]["Name"], "no");
+    let mounts: Vec<_> =
+        about[0]["Mounts"].as_array().unwrap().iter().map(|mount| mount["Destination"].clone()).collect();
+    assert_eq!(mounts, [json!("/usr/local/webots-project")]);
+    assert_eq!(config["User"], format!("{}:{}", nix::unistd::getuid(), nix::unistd::getgid()));
+    let environment = config["Env"].to_string();
+    assert!(environment.contains("HOME=/tmp") && !environment.contains("DOCKER_HOST"), "{environment}");
+}
+
+#[actix_rt::test]
+async fn an_existing_configuration_with_docker_true_runs_every_world_in_a_container() {
+    let Some(_docker) = docker().await else { return };
+    let forge = Forge::with_arm();
+    forge.commit("other/world", "main", &[("worlds/a.wbt", crate::support::git::WORLD)]);
+    let server =
+        server(forge.path(), 3).set("isolation", "auto").set("docker", true).set("shareIdleTime", 100).start().await;
+    for world in [arm(), world("other/world", "main", "worlds/a.wbt")] {
+        let mut client = Client::start(&server, &world).await;
+        client.patiently("webots:", READY).await;
+        assert_eq!(containers(&server).len(), 1, "{world}");
+        client.leave().await;
+        until("it is gone", async || containers(&server).is_empty()).await;
+    }
+}
+
+#[actix_rt::test]
+async fn worlds_of_others_run_while_the_machine_is_idle_only() {
+    let Some(_docker) = docker().await else { return };
+    let forge = Forge::with_arm();
+    forge.commit("other/world", "main", &[("worlds/a.wbt", crate::support::git::WORLD)]);
+    let server = server(forge.path(), 2).set("shareIdleTime", 0).start().await;
+    let told =
+        Client::start(&server, &world("other/world", "main", "worlds/a.wbt")).await.until("loading: Error:").await;
+    assert!(told.contains("not configured to share idle time"), "{told}");
+}
+
+#[actix_rt::test]
+async fn more_simulations_run_than_docker_has_networks() {
+    let Some(_docker) = alone().await else { return };
+    let forge = Forge::with_arm();
+    let count = 34;
+    let server = server(forge.path(), count).set("maxPlacesPerAddress", count).set("timing.launch", 300).start().await;
+    let mut clients = Vec::new();
+    for _ in 0..count {
+        clients.push(Client::start(&server, &arm()).await);
+    }
+    for client in &mut clients {
+        client.patiently("webots:", Duration::from_secs(180)).await;
+    }
+    assert_eq!(containers(&server).len(), usize::from(count));
+    drop(clients);
+    let deadline = Instant::now() + Duration::from_secs(120);
+    while !containers(&server).is_empty() {
+        assert!(Instant::now() < deadline, "{:?} are left", containers(&server));
+        actix_rt::time::sleep(Duration::from_millis(200)).await;
+    }
+}

@@ -1,0 +1,24 @@
+//! Simulations in containers: the built simulation server on a real Docker daemon, which these tests start themselves, with
+//! images that are made here and have the names of the real ones. Needs root; skipped with a word without it.
+
+#![allow(
+    missing_docs,
+    unreachable_pub,
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::panic,
+    clippy::indexing_slicing,
+    reason = "tests fail by panics"
+)]
+#![allow(clippy::pedantic, reason = "tests are read one by one")]
+
+#[path = "../support/mod.rs"]
+mod support;
+
+mod builds;
+mod daemon;
+mod deeds;
+mod ends;
+mod image;
+mod kinds;
+mod life;

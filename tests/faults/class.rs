@@ -1,0 +1,48 @@
+//! The load under which faults are injected: a rehearsal.
+
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::time::{Duration, Instant};
+
+use serde_json::Value;
+
+use crate::support::git::arm;
+
+/// How many clients come and go.
+const CLIENTS: u32 = 8;
+
+/// A class that comes and goes. It is ended with this value.
+pub struct Class {
+    child: Child,
+    file: PathBuf,
+}
+
+impl Class {
+    /// Lets it come to a session server again and again for so long. What it has met is written into the folder.
+    pub fn start(url: &str, folder: &Path, time: Duration) -> Self {
+        let file = folder.join("class.json");
+        let mut command = Command::new(env!("CARGO_BIN_EXE_rehearse"));
+        command.args([url, "--world", &arm(), "--over", "1s", "--stay", "3s"]);
+        command.args(["--patience", "20s", "--misbehave", "reload=10,drop=10,sleep=5,vanish=5,hasty=15"]);
+        command.args(["--clients", &CLIENTS.to_string(), "--soak", &format!("{}s", time.as_secs())]);
+        let child = command.arg("--json").arg(&file).stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
+        Self { child, file }
+    }
+
+    /// Waits until all clients have gone. Returns what they have met.
+    pub async fn end(mut self) -> Value {
+        let deadline = Instant::now() + Duration::from_secs(90);
+        while self.child.try_wait().unwrap().is_none() {
+            assert!(Instant::now() < deadline, "the class does not end");
+            actix_rt::time::sleep(Duration::from_millis(100)).await;
+        }
+        serde_json::from_str(&std::fs::read_to_string(&self.file).unwrap()).unwrap()
+    }
+}
+
+impl Drop for Class {
+    fn drop(&mut self) {
+        self.child.kill().ok();
+        self.child.wait().ok();
+    }
+}

@@ -1,0 +1,207 @@
+//! Faults of what is around the servers: disks, memory, clocks, names, links and ports.
+
+use std::net::TcpListener;
+use std::time::{Duration, Instant};
+
+use nix::sys::signal::Signal;
+use procfs::net::TcpState;
+use procfs::process::Process;
+use rand::RngExt;
+use rand::rngs::SmallRng;
+
+use crate::disk::{Full, ReadOnly};
+use crate::fault::{WHILE, bury};
+use crate::fleet::{BOUND, Fleet, PLACES, SERVERS, SMALL_DISK};
+use crate::machine::LittleMemory;
+use crate::relay::Mood;
+use crate::support::client::Client;
+use crate::support::git::arm;
+use crate::support::http;
+
+/// What a server that runs out of memory may still take, with all that it starts, in bytes: less than one Webots.
+const LITTLE: u64 = 2 << 20;
+
+pub async fn fill_disk(fleet: &mut Fleet, _: &mut SmallRng) -> bool {
+    let folder = fleet.folder(SMALL_DISK);
+    let disk = nix::sys::statvfs::statvfs(&folder).unwrap();
+    if disk.blocks() * disk.fragment_size() > 62 << 20 {
+        return false;
+    }
+    let _full = Full::at(&folder);
+    actix_rt::time::sleep(WHILE).await;
+    true
+}
+
+/// A folder is replaced by one that can't be written, or can't be written any more.
+pub async fn close_folder(fleet: &mut Fleet, name: &str, is_empty: bool) -> bool {
+    let folder = fleet.folder(SMALL_DISK).join(name);
+    let closed = if is_empty { ReadOnly::empty(&folder) } else { ReadOnly::at(&folder) };
+    if closed.is_none() {
+        return false;
+    }
+    actix_rt::time::sleep(WHILE).await;
+    true
+}
+
+pub async fn no_files(fleet: &mut Fleet, random: &mut SmallRng) -> bool {
+    let pid = fleet.servers[random.random_range(0..SERVERS)].pid();
+    let Ok(limits) = limit_files(pid, None) else {
+        return false;
+    };
+    let open = Process::new(pid).and_then(|process| process.fd_count()).unwrap();
+    limit_files(pid, Some((open as u64, limits.1))).unwrap();
+    actix_rt::time::sleep(WHILE).await;
+    limit_files(pid, Some(limits)).unwrap();
+    true
+}
+
+/// Sets how many files a process may open, as soft and hard limit; returns what was.
+fn limit_files(pid: i32, new: Option<(u64, u64)>) -> Result<(u64, u64), String> {
+    let mut command = std::process::Command::new("prlimit");
+    command.args(["--pid", &pid.to_string(), "--noheadings", "--raw", "--output", "SOFT,HARD"]);
+    match new {
+        Some((soft, hard)) => command.arg(format!("--nofile={soft}:{hard}")),
+        None => command.arg("--nofile"),
+    };
+    let output = command.output().map_err(|error| error.to_string())?;
+    let text = String::from_utf8_lossy(&output.stdout).into_owned();
+    let mut numbers = text.split_whitespace().filter_map(|number| number.parse().ok());
+    match (output.status.success(), numbers.next(), numbers.next()) {
+        (true, Some(soft), Some(hard)) => Ok((soft, hard)),
+        (true, ..) if new.is_some() => Ok(new.unwrap()),
+        _ => Err(String::from_utf8_lossy(&output.stderr).into_owned()),
+    }
+}
+
+/// A server has no memory for another Webots. The system ends what takes the most: a simulation, or the server itself, which
+/// is then started again.
+pub async fn no_memory(fleet: &mut Fleet, random: &mut SmallRng) -> bool {
+    let index = random.random_range(0..SERVERS);
+    let Some(little) = LittleMemory::of(fleet.servers[index].pid(), LITTLE) else {
+        return false;
+    };
+    actix_rt::time::sleep(WHILE).await;
+    drop(little);
+    let deadline = Instant::now() + BOUND;
+    loop {
+        let state = Process::new(fleet.servers[index].pid()).and_then(|process| process.stat());
+        if state.map_or(true, |stat| stat.state == 'Z') {
+            bury(fleet, index).await;
+            fleet.restart(index).await;
+            return true;
+        }
+        if http::try_get(&fleet.servers[index].url("/health")).await.is_ok() {
+            return true;
+        }
+        assert!(Instant::now() < deadline, "server {index} has memory again, and neither answers nor ends");
+        actix_rt::time::sleep(Duration::from_millis(50)).await;
+    }
+}
+
+/// The time of day of all servers makes a step, and one back.
+pub async fn step_clock(fleet: &mut Fleet, seconds: i64) -> bool {
+    let Some(clock) = &fleet.clock else {
+        return false;
+    };
+    clock.set(seconds);
+    fleet.whole("the clock's step").await;
+    actix_rt::time::sleep(WHILE).await;
+    fleet.clock.as_ref().unwrap().set(0);
+    true
+}
+
+/// What becomes of the name server.
+#[derive(Clone, Copy)]
+pub enum Names {
+    Hang,
+    AreUnknown,
+    HaveNoServer,
+}
+
+/// Names fail, and the fleet is whole nevertheless.
+pub async fn break_names(fleet: &mut Fleet, how: Names) -> bool {
+    match how {
+        Names::Hang => fleet.names.signal(Signal::SIGSTOP),
+        Names::AreUnknown => fleet.names.set("another.test", &[]),
+        Names::HaveNoServer => fleet.names.end(),
+    }
+    // A name is looked up again every two seconds.
+    actix_rt::time::sleep(WHILE).await;
+    fleet.whole("names failed").await;
+    match how {
+        Names::Hang => fleet.names.signal(Signal::SIGCONT),
+        Names::AreUnknown => fleet.set_name(),
+        Names::HaveNoServer => fleet.names.start_again(),
+    }
+    true
+}
+
+pub async fn take_port(fleet: &mut Fleet, random: &mut SmallRng) -> bool {
+    let (index, first) = (random.random_range(0..SERVERS), random.random_range(0..PLACES));
+    let mut ports = (first..first + PLACES).map(|place| fleet.port(index, place));
+    let Some(_taken) = ports.find_map(|port| TcpListener::bind(("127.0.0.1", port)).ok()) else {
+        return false;
+    };
+    actix_rt::time::sleep(WHILE).await;
+    true
+}
+
+/// A server that is started again finds its port taken, and says so; then the port is free.
+pub async fn take_own_port(fleet: &mut Fleet, random: &mut SmallRng) -> bool {
+    let index = random.random_range(0..SERVERS);
+    fleet.servers[index].signal(Signal::SIGKILL);
+    bury(fleet, index).await;
+    {
+        let _taken = TcpListener::bind(("127.0.0.1", fleet.servers[index].port)).unwrap();
+        let mut refused = fleet.configured(index).spawn();
+        let code = refused.ended().await;
+        assert!(code.is_some_and(|code| code != 0), "{code:?}");
+    }
+    fleet.restart(index).await;
+    true
+}
+
+/// The session server and one simulation server see each other through a link that changes.
+pub async fn change_link(fleet: &mut Fleet, mood: Mood) -> bool {
+    fleet.relay.set(mood);
+    actix_rt::time::sleep(WHILE).await;
+    fleet.relay.set(Mood::Open);
+    true
+}
+
+/// Packets from and to a server are lost, for everybody.
+pub async fn lose_packets(fleet: &mut Fleet, random: &mut SmallRng, share: f64) -> bool {
+    let Some(network) = fleet.network else {
+        return false;
+    };
+    let lost = network.lose(share, &[fleet.ports_of(random.random_range(0..SERVERS))]);
+    actix_rt::time::sleep(WHILE).await;
+    drop(lost);
+    true
+}
+
+/// A client with a simulation is gone, and its server does not hear of it.
+pub async fn half_open(fleet: &mut Fleet, random: &mut SmallRng) -> bool {
+    let Some(network) = fleet.network else {
+        return false;
+    };
+    let server = &fleet.servers[random.random_range(0..SERVERS)];
+    let mut client = Client::start(server, &arm()).await;
+    client.until("webots:").await;
+    let port = client.port();
+    let _lost = network.lose(1.0, &[port.to_string()]);
+    drop(client);
+    let is_open = || {
+        let all = Process::new(server.pid()).and_then(|process| process.tcp()).unwrap();
+        let mut known =
+            all.iter().filter(|one| (one.local_address.port(), one.remote_address.port()) == (server.port, port));
+        known.any(|one| one.state == TcpState::Established)
+    };
+    assert!(is_open(), "the server has heard that its client is gone");
+    let deadline = Instant::now() + BOUND;
+    while is_open() {
+        assert!(Instant::now() < deadline, "{BOUND:?} after its end, a client is still believed in");
+        actix_rt::time::sleep(Duration::from_millis(50)).await;
+    }
+    true
+}
