@@ -188,12 +188,6 @@ impl SimulationConfig {
         PublicAddress::new(&self.server, port, self.port_rewrite)
     }
 
-    /// Returns the files that may hold secrets: this configuration's own, and those that it names.
-    pub fn secret_files(&self) -> impl Iterator<Item = &Path> {
-        let password = self.admin_password.as_ref().and_then(Secret::file);
-        [Some(self.file.as_path()), self.git_config.as_ref().map(|file| &*file.0), password].into_iter().flatten()
-    }
-
     /// Returns the ports that Webots may use.
     #[must_use]
     pub fn streaming_ports(&self) -> std::ops::RangeInclusive<u16> {
@@ -228,10 +222,7 @@ impl Configuration for SimulationConfig {
         self.isolation = self.isolation.with_docker(self.docker)?;
         self.docker = self.isolation == Isolation::Container;
         check_ports(self.docker, self.port, self.max_connections)?;
-        let own = [self.log_dir.0.as_path(), &self.cache_dir.0].into_iter().chain(self.secret_files());
-        if matches!(self.isolation, Isolation::Auto | Isolation::Sandbox) {
-            warnings.extend(self.sandbox.check(own)?);
-        }
+        warnings.extend(self.check_sandbox()?);
         warnings.extend(self.sandbox.missing().map(|path| format!("sandbox: {} is not there", path.display())));
         if self.port.checked_add(self.max_connections).is_none() {
             let problem = format!("{} places above port {} leave the range of ports", self.max_connections, self.port);
