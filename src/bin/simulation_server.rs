@@ -59,11 +59,10 @@ fn main() -> ExitCode {
         let remove = || arguments.containers.iter().for_each(|owner| container::sweep(&container::Owner::named(owner)));
         return ExitCode::from(guardian::guard(arguments, remove));
     }
-    let mut loaded = match start::read::<SimulationConfig>(&arguments.config) {
+    let loaded = match start::read::<SimulationConfig>(&arguments.config) {
         Ok(loaded) => loaded,
         Err(code) => return code,
     };
-    loaded.config.file.clone_from(&arguments.config);
     if arguments.options.check {
         let code = start::check(&loaded);
         for finding in preflight::check(&loaded.config) {

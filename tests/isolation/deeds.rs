@@ -8,7 +8,7 @@ use crate::support::client::Client;
 use crate::support::git::Forge;
 use crate::support::program::{Builder, Server, simulation_server};
 use crate::support::webots::Webots;
-use crate::support::{display, needs};
+use crate::support::{display, needs, until};
 
 /// Everything of a test: a server with things that are none of a world's business.
 struct Stage {
@@ -139,9 +139,79 @@ async fn a_sandbox_holds_for_an_ordinary_user_too() {
     let stage = Stage::new();
     std::fs::set_permissions(stage.forge.path(), std::fs::Permissions::from_mode(0o755)).unwrap();
     compare(&stage, |builder| builder.before(nobody), &[1]).await;
-    let processes = [("be bounded by the kernel", "test $(ulimit -u) = 70".to_owned())];
+    // One of them is bubblewrap.
+    let processes = [("be bounded by the kernel", "test $(ulimit -u) = 71".to_owned())];
     let done = stage.tried(&processes, "sandbox", |builder| builder.before(nobody).set("limits.processes", 70)).await;
     assert_eq!(done, ["be bounded by the kernel"]);
+}
+
+/// What a running simulation reads of a file that was replaced after its start.
+#[actix_rt::test]
+async fn secrets_that_are_written_anew_stay_hidden() {
+    let folder = || {
+        let folder = tempfile::tempdir_in(env!("CARGO_TARGET_TMPDIR")).unwrap();
+        std::fs::set_permissions(folder.path(), std::fs::Permissions::from_mode(0o755)).unwrap();
+        folder
+    };
+    let (stage, password, links) = (Stage::new(), folder(), folder());
+    let replace = |file: PathBuf| {
+        let new = file.with_extension("new");
+        std::fs::write(&new, "a secret").unwrap();
+        std::fs::rename(new, file).unwrap();
+    };
+    replace(password.path().join("password"));
+    std::os::unix::fs::symlink(password.path().join("password"), links.path().join("password")).unwrap();
+    let ready = stage.elsewhere.path().join("ready");
+    let read = |name, path: PathBuf| format!("grep -q secret {} && echo 'READ {name}'", path.display());
+    let webots = Webots::script(&format!(
+        "ls {} >/dev/null && echo waits\nuntil [ -e {} ]; do sleep 0.01; done\n{}\n{}\necho THE END; exit 1",
+        stage.elsewhere.path().display(),
+        ready.display(),
+        read("password", password.path().join("password")),
+        read("link", links.path().join("password")),
+    ));
+    for (level, count) in [("sandbox", 0), ("none", 2)] {
+        let builder = stage.builder(&webots, level);
+        let link = links.path().join("password");
+        let server = builder.set("adminPassword", serde_json::json!({ "file": link })).start().await;
+        let mut client = Client::start(&server, &arm()).await;
+        client.until("shutdownTimeout").await;
+        let log = server.folder.join(format!("log/simulation/instances/{}.log", server.port + 1));
+        until("it runs", async || std::fs::read_to_string(&log).is_ok_and(|text| text.contains("waits"))).await;
+        replace(password.path().join("password"));
+        std::fs::remove_file(&link).unwrap();
+        std::fs::write(&link, "another secret").unwrap();
+        std::fs::write(&ready, "").unwrap();
+        let told = client.until("loading: Error:").await;
+        assert!(told.contains("THE END"), "{told}");
+        assert_eq!(told.matches("READ").count(), count, "{level}: {told}");
+        nothing_left(&server, 2).await;
+        std::fs::remove_file(&ready).unwrap();
+        std::fs::remove_file(&log).unwrap();
+    }
+}
+
+#[actix_rt::test]
+async fn temporary_folders_are_the_simulations_own_wherever_they_are() {
+    let stage = Stage::new();
+    let folder = tempfile::tempdir_in(env!("CARGO_TARGET_TMPDIR")).unwrap();
+    std::fs::write(folder.path().join("secret"), "a secret").unwrap();
+    let there = shown(&folder);
+    let deeds = [
+        ("use it", format!("touch {there}/new.$$ && rm {there}/new.$$")),
+        ("use the usual ones", "touch /tmp/new.$$ /var/tmp/new.$$ && rm /tmp/new.$$".to_owned()),
+        ("read what others have there", format!("grep secret {there}/secret")),
+    ];
+    let done = stage.tried(&deeds, "sandbox", |builder| builder.env("TMPDIR", &there)).await;
+    assert_eq!(done, ["use it", "use the usual ones"]);
+    let mounts =
+        std::process::Command::new("unshare").args(["--mount", "mount", "-t", "tmpfs", "none", "/var"]).status();
+    if !mounts.is_ok_and(|status| status.success()) {
+        return eprintln!("skipped: only root can put a link in place of /var/tmp");
+    }
+    let linked = "exec unshare --mount bash -c 'mount -t tmpfs none /var && ln -s /tmp /var/tmp && exec \"$0\" \"$@\"' \"$0\" \"$@\"";
+    let done = stage.tried(&deeds[1..2], "sandbox", |builder| builder.before(linked)).await;
+    assert_eq!(done, ["use the usual ones"]);
 }
 
 #[actix_rt::test]
@@ -245,7 +315,7 @@ async fn a_world_can_kill_the_server_only_without_a_sandbox() {
     let (server, client) = attacked(&stage, "sandbox").await;
     let log: PathBuf = server.folder.join(format!("log/simulation/instances/{}.log", server.port + 1));
     let tried = async || std::fs::read_to_string(&log).is_ok_and(|text| text.contains("tried"));
-    crate::support::until("it has tried", tried).await;
+    until("it has tried", tried).await;
     client.leave().await;
     nothing_left(&server, 2).await;
 }

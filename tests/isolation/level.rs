@@ -116,10 +116,17 @@ async fn a_level_that_can_not_be_is_refused_in_one_line() {
     let (forge, webots) = (Forge::with_arm(), Webots::launcher());
     let containers =
         |places: u16| simulation_server(&webots.path(), forge.path(), places).set("isolation", "container");
+    let sandbox = |folders| simulation_server(&webots.path(), forge.path(), 1).set("sandbox", folders);
     let docker = simulation_server(&webots.path(), forge.path(), 1).set("docker", true);
     for (builder, words) in [
         (docker.set("isolation", "sandbox"), "docker: true asks for containers, but isolation for another level"),
         (containers(1).set("isolation", "jail"), "isolation: unknown variant `jail`"),
+        (
+            containers(1).set("isolation", true),
+            "isolation: true is no level; allowed are \"auto\", \"sandbox\", \"none\"",
+        ),
+        (sandbox(json!({"readable": "/"})), "sandbox.readable: \"/\" can't be shown"),
+        (sandbox(json!({"writable": ["/srv", "/proc/self/.."]})), "sandbox.writable: \"/proc/self/..\" can't be shown"),
         (containers(1).set("maxConnections", 501), "allowed are up to 500 places"),
         (containers(1).set("port", 64_990).set("maxConnections", 100), "editors up to port 65535"),
         (containers(1).set("container", json!({ "network": "open" })), "unknown variant `open`"),

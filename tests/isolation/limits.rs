@@ -7,7 +7,7 @@ use crate::support::client::Client;
 use crate::support::git::Forge;
 use crate::support::program::{Server, simulation_server};
 use crate::support::webots::Webots;
-use crate::support::{http, until};
+use crate::support::{SOON, http, until};
 
 const LEVELS: [&str; 2] = ["none", "sandbox"];
 
@@ -19,7 +19,9 @@ async fn told_for(deed: &str, level: &str, key: &str, value: u64) -> String {
     let server = builder.set(&format!("limits.{key}"), value).start().await;
     let mut client = Client::start(&server, &arm()).await;
     client.until("webots:").await;
-    let told = client.until("loading: Error:").await;
+    // Its heartbeats go on as long as it is not ended.
+    let told = actix_rt::time::timeout(2 * SOON, client.until("loading: Error:")).await;
+    let told = told.unwrap_or_else(|_| panic!("{level}, {deed}: it was not ended"));
     assert_eq!(client.closed().await, Some(1000));
     nothing_left(&server, 4).await;
     told
@@ -33,6 +35,12 @@ async fn who_fills_the_disk_is_told_and_ended() {
         assert!(told_for(many, level, "disk", 5).await.contains(words), "{level}");
         let small = "for n in $(seq 3000); do echo > small$n; done";
         assert!(told_for(small, level, "disk", 5).await.contains(words), "{level}");
+    }
+    // A file without a name takes room as long as it is open.
+    for level in LEVELS {
+        let nameless =
+            "exec 5> gone; rm gone; head -c 4000000 /dev/zero >&5; exec 6> too; rm too; head -c 4000000 /dev/zero >&6";
+        assert!(told_for(nameless, level, "disk", 5).await.contains(words), "{level}");
     }
     for folder in ["/tmp", "$HOME", "$XDG_RUNTIME_DIR"] {
         let many = format!("for n in $(seq 100); do head -c 500000 /dev/zero > {folder}/file$n; done");
@@ -111,6 +119,8 @@ async fn a_flood_of_output_costs_no_more_than_a_tenth_of_a_core() {
         ("yes .", "none"),
         ("tr '\\0' x < /dev/zero", "none"),
         ("while :; do echo pause; echo fast; done", "none"),
+        // A write for each byte, which is read before the next one comes.
+        ("python3 -c 'import os\nwhile True: os.write(1, b\"x\")'", "none"),
     ] {
         let forge = Forge::with_arm();
         let webots = Webots::script(&format!("{DEMO} \"$@\" >/dev/null &\n{flood} & wait"));

@@ -41,7 +41,7 @@ fn config(port: u16, more: &Value) -> SessionConfig {
         }
     }
     let mut config: SessionConfig = serde_json::from_value(keys).unwrap();
-    assert_eq!(config.complete().unwrap(), [""; 0]);
+    assert_eq!(config.complete(std::path::Path::new("main.json")).unwrap(), [""; 0]);
     config
 }
 

@@ -211,7 +211,7 @@ impl SessionConfig {
 impl Configuration for SessionConfig {
     const ALIASES: &'static [&'static str] = &[];
 
-    fn complete(&mut self) -> Result<Vec<String>, InvalidValue> {
+    fn complete(&mut self, _: &std::path::Path) -> Result<Vec<String>, InvalidValue> {
         let mut warnings = Vec::new();
         if self.server.is_empty() {
             warnings.push("server is not set: URLs will name localhost".to_owned());

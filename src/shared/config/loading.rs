@@ -18,11 +18,11 @@ pub trait Configuration: DeserializeOwned + Serialize {
     /// Other names of keys that are accepted.
     const ALIASES: &'static [&'static str];
 
-    /// Sets the defaults that depend on the machine, and checks the rules between values. Returns warnings.
+    /// Sets what depends on the machine and on the file that it was read from, and checks the rules between values. Returns warnings.
     ///
     /// # Errors
     /// When a value contradicts others.
-    fn complete(&mut self) -> Result<Vec<String>, InvalidValue>;
+    fn complete(&mut self, file: &Path) -> Result<Vec<String>, InvalidValue>;
 }
 
 /// A value that contradicts others.
@@ -69,7 +69,7 @@ pub fn load<C: Configuration>(file: &Path) -> Result<LoadedConfig<C>, ConfigErro
     unknown.retain(|key: &String| seen.insert(key.clone()));
     let known = known_keys(&config);
     let mut warnings: Vec<String> = unknown.iter().map(|key| unknown_key(file, key, &known)).collect();
-    let more = config.complete().map_err(|InvalidValue { key, problem }| ConfigError::InvalidValue {
+    let more = config.complete(file).map_err(|InvalidValue { key, problem }| ConfigError::InvalidValue {
         file: file.to_owned(),
         key,
         problem,
@@ -139,7 +139,7 @@ mod tests {
     impl Configuration for Small {
         const ALIASES: &'static [&'static str] = &[];
 
-        fn complete(&mut self) -> Result<Vec<String>, InvalidValue> {
+        fn complete(&mut self, _: &Path) -> Result<Vec<String>, InvalidValue> {
             Ok(Vec::new())
         }
     }

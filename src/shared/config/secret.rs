@@ -2,7 +2,7 @@
 
 use std::fmt;
 use std::io;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize, Serializer};
 
@@ -22,7 +22,10 @@ pub fn read_file(file: &Path) -> io::Result<String> {
 /// A text that is never printed or logged: `********` stands for it. It is written as it is, or is in a file.
 #[derive(Clone, Deserialize)]
 #[serde(try_from = "WireSecret")]
-pub struct Secret(String);
+pub struct Secret {
+    text: String,
+    file: Option<PathBuf>,
+}
 
 #[derive(Deserialize)]
 #[serde(untagged, deny_unknown_fields, expecting = "it is neither a text nor {\"file\": PATH}")]
@@ -36,11 +39,11 @@ impl TryFrom<WireSecret> for Secret {
 
     fn try_from(wire: WireSecret) -> Result<Self, String> {
         let ExpandedPath(file) = match wire {
-            WireSecret::Text(text) => return Ok(Self(text)),
+            WireSecret::Text(text) => return Ok(Self { text, file: None }),
             WireSecret::File { file } => file,
         };
         let text = read_file(&file).map_err(|error| format!("{}: can't be read: {error}", file.display()))?;
-        Ok(Self(text.trim_end_matches(['\r', '\n']).to_owned()))
+        Ok(Self { text: text.trim_end_matches(['\r', '\n']).to_owned(), file: Some(file) })
     }
 }
 
@@ -48,7 +51,13 @@ impl Secret {
     /// Returns the text.
     #[must_use]
     pub fn reveal(&self) -> &str {
-        &self.0
+        &self.text
+    }
+
+    /// The file that it was read from, if it was.
+    #[must_use]
+    pub fn file(&self) -> Option<&Path> {
+        self.file.as_deref()
     }
 }
 

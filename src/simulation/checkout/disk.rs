@@ -5,6 +5,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
+use crate::simulation::process::folder_size::{self, FolderSize};
 use crate::simulation::process::remove_tree;
 
 /// Time between two looks at how much was written.
@@ -94,19 +95,10 @@ pub async fn stands_still(folder: &Path, limit: Duration) {
     }
 }
 
-/// The bytes of all files below a folder.
+/// The bytes of all files below a folder. What nobody can look into does not count.
 #[must_use]
 pub fn size_of(folder: &Path) -> u64 {
-    let mut total = 0;
-    let mut open = vec![folder.to_owned()];
-    while let Some(folder) = open.pop() {
-        for entry in fs::read_dir(folder).into_iter().flatten().flatten() {
-            match entry.metadata() {
-                Ok(about) if about.is_dir() => open.push(entry.path()),
-                Ok(about) => total += about.len(),
-                Err(_) => {}
-            }
-        }
-    }
-    total
+    let mut size = FolderSize::new(folder_size::length, u64::MAX);
+    size.add_folder(folder).ok();
+    size.total()
 }

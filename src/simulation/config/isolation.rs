@@ -1,10 +1,14 @@
 //! The keys `isolation`, `sandbox` and `environment`: what a world's programs may see.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
-use serde::{Deserialize, Serialize};
+use serde::de::Error as _;
+use serde::{Deserialize, Deserializer, Serialize};
 
 use crate::shared::config::{ExpandedPath, InvalidValue, one_or_many};
+
+/// What each sandbox has by itself.
+const OF_EACH: [&str; 3] = ["/", "/proc", "/dev"];
 
 /// The key `isolation`: at which level simulations are started.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -38,6 +42,19 @@ impl Isolation {
     }
 }
 
+/// Reads the key `isolation`.
+///
+/// # Errors
+/// When the value is no level.
+pub fn level<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Isolation, D::Error> {
+    let value = serde_json::Value::deserialize(deserializer)?;
+    if !value.is_string() {
+        let allowed = "\"auto\", \"sandbox\", \"none\" and \"container\"";
+        return Err(D::Error::custom(format!("{value} is no level; allowed are {allowed}")));
+    }
+    Isolation::deserialize(value).map_err(D::Error::custom)
+}
+
 /// The key `sandbox`: what a sandbox has besides the system and Webots.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
@@ -51,10 +68,40 @@ pub struct SandboxFolders {
 }
 
 impl SandboxFolders {
+    /// Refuses what would take the sandbox apart, and warns of what opens it: `own` is what only the server should change.
+    ///
+    /// # Errors
+    /// When a folder is all of the system, or one that each sandbox has by itself.
+    pub fn check<'own>(&self, own: impl Iterator<Item = &'own Path>) -> Result<Vec<String>, InvalidValue> {
+        for (key, paths) in [("sandbox.readable", &self.readable), ("sandbox.writable", &self.writable)] {
+            if let Some(path) = paths.iter().find(|path| OF_EACH.iter().any(|one| real(&path.0) == Path::new(one))) {
+                let path = path.0.display();
+                let problem = format!("\"{path}\" can't be shown: each sandbox has its own; allowed is what is inside");
+                return Err(InvalidValue { key, problem });
+            }
+        }
+        let writable: Vec<PathBuf> = self.writable.iter().map(|path| real(&path.0)).collect();
+        let open = own.filter(|path| !path.as_os_str().is_empty()).map(real);
+        let open = open.filter(|path| writable.iter().any(|folder| path.starts_with(folder)));
+        let told = |path: PathBuf| format!("sandbox.writable lets worlds replace {}", path.display());
+        Ok(open.map(told).collect())
+    }
+
     /// What is named, but not there.
     pub fn missing(&self) -> impl Iterator<Item = &Path> {
         self.readable.iter().chain(&self.writable).map(|path| path.0.as_path()).filter(|path| !path.exists())
     }
+}
+
+/// A path without links, as far as it is there.
+fn real(path: &Path) -> PathBuf {
+    let absolute = std::path::absolute(path).unwrap_or_else(|_| path.to_owned());
+    let there =
+        absolute.ancestors().find_map(|part| Some((part.canonicalize().ok()?, absolute.strip_prefix(part).ok()?)));
+    there.map_or_else(
+        || absolute.clone(),
+        |(real, rest)| if rest.as_os_str().is_empty() { real } else { real.join(rest) },
+    )
 }
 
 /// The name of an environment variable, or with `*` at its end the beginning of such names.
@@ -89,6 +136,25 @@ impl TryFrom<String> for VariableName {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn what_is_the_servers_own_is_told_where_worlds_can_write_it() {
+        let folder = tempfile::tempdir().unwrap();
+        let at = folder.path().canonicalize().unwrap();
+        std::os::unix::fs::symlink(&at, at.join("link")).unwrap();
+        let own = [at.join("link/a/log"), at.join("b/config.json"), PathBuf::new()];
+        let check = |writable: &str, readable: &str| {
+            let paths = |path: &str| vec![ExpandedPath(path.into())];
+            let folders = SandboxFolders { readable: paths(readable), writable: paths(writable) };
+            folders.check(own.iter().map(PathBuf::as_path)).map_err(|error| error.key)
+        };
+        let told = |path: &str| format!("sandbox.writable lets worlds replace {}", at.join(path).display());
+        let text = |path: &str| at.join(path).to_str().unwrap().to_owned();
+        assert_eq!(check(&text("a"), &text("b")), Ok(vec![told("a/log")]));
+        assert_eq!(check(&text("link"), "/dev/shm"), Ok(vec![told("a/log"), told("b/config.json")]));
+        assert_eq!(check(&text("c"), "/proc/.."), Err("sandbox.readable"));
+        assert_eq!(check("/dev/../proc", "/srv"), Err("sandbox.writable"));
+    }
 
     #[test]
     fn a_name_covers_itself_or_what_begins_with_it() {

@@ -2,6 +2,7 @@
 
 mod container;
 mod isolation;
+mod own_files;
 mod resources;
 mod simulation_config;
 mod timing;

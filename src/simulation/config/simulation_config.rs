@@ -1,24 +1,21 @@
 //! The simulation server's configuration, `config/simulation/NAME.json`.
 
 use std::net::{IpAddr, Ipv6Addr};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
 use super::container::{ContainerSettings, check_ports};
-use super::isolation::{Isolation, SandboxFolders, VariableName};
+use super::isolation::{Isolation, SandboxFolders, VariableName, level};
 use super::resources::Resources;
 use super::timing::Timing;
-use crate::shared::config::{Configuration, InvalidValue};
 use crate::shared::config::{
-    ExpandedPath, expanded, folder, local_address, object, one_or_many, optional_expanded, optional_whole, percent,
-    seconds, whole,
+    Configuration, ExpandedPath, InvalidValue, Secret, expanded, folder, local_address, object, one_or_many,
+    optional_expanded, optional_whole, percent, seconds, whole,
 };
-use crate::shared::domain::UrlPrefix;
-use crate::shared::domain::{ClientUrls, PublicAddress, PublicUrl, check_host};
-use crate::shared::http::Origin;
-use crate::shared::http::TrustedProxies;
+use crate::shared::domain::{ClientUrls, PublicAddress, PublicUrl, UrlPrefix, check_host};
+use crate::shared::http::{Origin, TrustedProxies};
 use crate::simulation::checkout::Mirrors;
 use crate::simulation::machine::display::DisplayName;
 
@@ -68,7 +65,7 @@ pub struct SimulationConfig {
     #[serde(default)]
     pub projects_dir: Option<ExpandedPath>,
     /// At which level of isolation simulations run. Default: `auto`.
-    #[serde(default)]
+    #[serde(default, deserialize_with = "level")]
     pub isolation: Isolation,
     /// What a sandbox has besides the system and Webots.
     #[serde(default, deserialize_with = "object")]
@@ -161,7 +158,7 @@ pub struct SimulationConfig {
     pub allowed_origins: Vec<Origin>,
     /// Password for actions such as `/drain`. Default: none, and actions are off.
     #[serde(default)]
-    pub admin_password: Option<crate::shared::config::Secret>,
+    pub admin_password: Option<Secret>,
     /// All other durations.
     #[serde(default, deserialize_with = "object")]
     pub timing: Timing,
@@ -211,7 +208,8 @@ impl SimulationConfig {
 impl Configuration for SimulationConfig {
     const ALIASES: &'static [&'static str] = &["fullyQualifiedDomainName", "persistentDockerImages"];
 
-    fn complete(&mut self) -> Result<Vec<String>, InvalidValue> {
+    fn complete(&mut self, file: &Path) -> Result<Vec<String>, InvalidValue> {
+        file.clone_into(&mut self.file);
         let mut warnings = Vec::new();
         if self.server.is_empty() {
             warnings.push("server is not set: URLs will name localhost".to_owned());
@@ -224,6 +222,7 @@ impl Configuration for SimulationConfig {
         self.isolation = self.isolation.with_docker(self.docker)?;
         self.docker = self.isolation == Isolation::Container;
         check_ports(self.docker, self.port, self.max_connections)?;
+        warnings.extend(self.check_sandbox()?);
         warnings.extend(self.sandbox.missing().map(|path| format!("sandbox: {} is not there", path.display())));
         if self.port.checked_add(self.max_connections).is_none() {
             let problem = format!("{} places above port {} leave the range of ports", self.max_connections, self.port);

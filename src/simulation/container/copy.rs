@@ -5,8 +5,7 @@ use std::time::Duration;
 
 use super::docker::{Docker, DockerError, SHORT};
 use super::objects;
-use crate::simulation::isolation::folder_size;
-use crate::simulation::process::remove_tree;
+use crate::simulation::process::{folder_size, remove_tree};
 
 /// What is copied where.
 #[derive(Debug)]
@@ -79,7 +78,7 @@ async fn outgrown(folder: &Path, most: u64) {
     loop {
         actix_rt::time::sleep(LOOK).await;
         let folder = folder.to_owned();
-        let size = actix_rt::task::spawn_blocking(move || folder_size(&folder)).await;
+        let size = actix_rt::task::spawn_blocking(move || folder_size::room_of(&folder)).await;
         if size.is_ok_and(|size| size.is_none_or(|bytes| bytes > most)) {
             return;
         }

@@ -40,14 +40,14 @@ const VANISH: Duration = Duration::from_secs(2);
 const PAUSE: Duration = Duration::from_millis(5);
 
 impl Cgroups {
-    /// The control groups that are delegated to this server, if they are.
+    /// The control groups that are delegated to this server, if they are. So many processes of each are not its own.
     #[must_use]
-    pub fn delegated(limits: &Resources) -> Option<Self> {
+    pub fn delegated(limits: &Resources, runners: u64) -> Option<Self> {
         let folder = own_folder()?;
         match Self::divide(&folder) {
             Ok(()) => {
                 log::info!("each simulation gets a control group below {}", folder.display());
-                Some(Self { folder, settings: settings(limits) })
+                Some(Self { folder, settings: settings(limits, runners) })
             }
             Err(error) => {
                 log::info!("simulations get no control groups: {} can't be divided: {error}", folder.display());
@@ -145,8 +145,9 @@ fn offered(folder: &Path) -> io::Result<Controllers> {
 }
 
 /// The limits as the kernel has them. A simulation that runs out of memory ends as a whole.
-fn settings(limits: &Resources) -> Vec<(&'static str, String)> {
-    let mut settings = vec![("pids.max", limits.processes.to_string()), ("memory.oom.group", "1".to_owned())];
+fn settings(limits: &Resources, runners: u64) -> Vec<(&'static str, String)> {
+    let mut settings =
+        vec![("pids.max", (limits.processes + runners).to_string()), ("memory.oom.group", "1".to_owned())];
     settings.extend(limits.memory.map(|memory| ("memory.max", (memory << 20).to_string())));
     settings.extend(limits.cores.map(|cores| ("cpu.max", format!("{} {PERIOD}", cores * PERIOD))));
     settings

@@ -103,7 +103,7 @@ impl Launcher {
             log::warn!("{line}");
         }
         if launcher.level() != Level::Container {
-            launcher.cgroups = Cgroups::delegated(&launcher.limits);
+            launcher.cgroups = Cgroups::delegated(&launcher.limits, launcher.runners());
         }
         Ok(launcher)
     }
@@ -130,6 +130,15 @@ impl Launcher {
             Method::Plain => Level::None,
             Method::Sandbox(_) => Level::Sandbox,
             Method::Container => Level::Container,
+        }
+    }
+
+    /// How many processes of each simulation are what runs it: bubblewrap has one outside of the sandbox and one inside.
+    #[must_use]
+    pub fn runners(&self) -> u64 {
+        match self.method {
+            Method::Plain | Method::Container => 0,
+            Method::Sandbox(_) => 2,
         }
     }
 
@@ -196,9 +205,9 @@ impl Launcher {
         let size = at_most(Resource::RLIMIT_FSIZE, self.limits.disk << 20);
         let mut words = vec![format!("--nofile={}:{files}", files.min(USUAL_FILES)), format!("--fsize={size}")];
         words.push("--core=0".to_owned());
-        // The kernel counts all processes of a user, but in a user namespace only those in it.
+        // The kernel counts all processes of a user, but in a user namespace only those in it, one of which is bubblewrap.
         if self.level() == Level::Sandbox && !nix::unistd::getuid().is_root() && counts_by_namespace() {
-            words.push(format!("--nproc={}", at_most(Resource::RLIMIT_NPROC, self.limits.processes)));
+            words.push(format!("--nproc={}", at_most(Resource::RLIMIT_NPROC, self.limits.processes + 1)));
         }
         let words = std::iter::once(prlimit.into()).chain(words.into_iter().map(OsString::from));
         words.chain(std::iter::once("--".into())).collect()

@@ -3,6 +3,7 @@
 mod cgroup;
 mod environment;
 mod launcher;
+mod place;
 mod program;
 mod sandbox;
 mod unkept;
@@ -11,4 +12,4 @@ mod watch;
 pub use cgroup::Cgroup;
 pub use launcher::{Launcher, Level};
 pub use program::Program;
-pub use watch::{Watch, folder_size};
+pub use watch::Watch;

@@ -4,6 +4,7 @@
 //! Which folders are hidden and which are shown is one list, the outer folders before the inner ones: what is said of a
 //! folder holds for all that is inside, unless something else is said of that.
 
+use std::collections::BTreeSet;
 use std::ffi::OsString;
 use std::io::{self, Seek};
 use std::path::PathBuf;
@@ -12,6 +13,7 @@ use std::time::{Duration, Instant};
 
 use which::which;
 
+use super::place::{Content, Place, hidden};
 use super::program::Program;
 use crate::shared::text::one_line;
 use crate::simulation::config::SimulationConfig;
@@ -27,28 +29,6 @@ pub struct Sandbox {
     ends_namespaces: bool,
 }
 
-/// A file or folder of which a sandbox shows something else than the system has there.
-#[derive(Debug, Clone)]
-struct Place {
-    at: PathBuf,
-    content: Content,
-}
-
-/// What a sandbox shows at a place.
-#[derive(Debug, Clone)]
-enum Content {
-    /// An empty folder.
-    Empty,
-    /// An empty file.
-    EmptyFile,
-    /// What is there, only to be read.
-    Readable,
-    /// What is at another path, to be read and written.
-    Writable(PathBuf),
-}
-
-/// The administrator's folder, in which a package of this server has its configuration.
-const ETC: &str = "/etc/webots-fleet";
 /// What of `/run` programs need to find names, users and graphics cards. The rest are sockets of services, some of which
 /// start programs for whoever asks.
 const SYSTEM_RUN: [&str; 8] = [
@@ -80,16 +60,17 @@ impl Sandbox {
             "bubblewrap (bwrap) is not there; on Debian, Ubuntu and Fedora the package bubblewrap has it".to_owned()
         })?;
         let shown = |path: &PathBuf| path.canonicalize().ok();
-        let mut places: Vec<Place> = ["/run", ETC].map(|at| Place::new(at, Content::Empty)).into();
+        let mut places = vec![Place::new("/run", Content::Empty)];
         places.extend(SYSTEM_RUN.map(|at| Place::new(at, Content::Readable)));
         let readable = config.webots_home.iter().chain(&config.sandbox.readable).filter_map(|path| shown(&path.0));
         places.extend(readable.map(|at| Place { at, content: Content::Readable }));
         let writable = config.sandbox.writable.iter().filter_map(|path| shown(&path.0));
         places.extend(writable.map(|at| Place { at: at.clone(), content: Content::Writable(at) }));
         // Last, for nothing makes up for these.
-        places.extend(hidden_of(config));
+        let homes = homes();
+        places.extend(hidden(config, &homes));
         places.retain(|place| place.at.exists());
-        Ok(Self { bubblewrap, user: nix::unistd::getuid().as_raw(), homes: homes(), places, ends_namespaces: true })
+        Ok(Self { bubblewrap, user: nix::unistd::getuid().as_raw(), homes, places, ends_namespaces: true })
     }
 
     /// The command that runs a program in a sandbox of its own. Makes the folders that it needs in the instance's folder.
@@ -127,7 +108,8 @@ impl Sandbox {
             std::fs::create_dir_all(&folder).map(|()| folder)
         };
         let (home, run, tmp) = (inside("home")?, inside("run")?, inside("tmp")?);
-        let mut own: Vec<Place> = ["/tmp", "/var/tmp"].map(|at| Place::new(at, Content::Writable(tmp.clone()))).into();
+        let mut own: Vec<Place> = Vec::new();
+        own.extend(temporary_folders().map(|at| Place { at, content: Content::Writable(tmp.clone()) }));
         own.push(Place { at: self.runtime_folder(), content: Content::Writable(run) });
         own.extend(self.homes.iter().map(|at| Place { at: at.clone(), content: Content::Writable(home.clone()) }));
         own.push(Place { at: program.project.clone(), content: Content::Writable(program.project.clone()) });
@@ -218,38 +200,6 @@ impl Sandbox {
     }
 }
 
-impl Place {
-    fn new(at: &str, content: Content) -> Self {
-        Self { at: at.into(), content }
-    }
-
-    fn into_arguments(self) -> Vec<OsString> {
-        match self.content {
-            Content::Empty => vec!["--tmpfs".into(), self.at.into()],
-            Content::EmptyFile => vec!["--ro-bind".into(), "/dev/null".into(), self.at.into()],
-            Content::Readable => vec!["--ro-bind-try".into(), self.at.clone().into(), self.at.into()],
-            Content::Writable(content) => vec!["--bind".into(), content.into(), self.at.into()],
-        }
-    }
-}
-
-/// What only the server may see: its log, its cache with all simulations, its configuration.
-fn hidden_of(config: &SimulationConfig) -> Vec<Place> {
-    let folders = [&config.log_dir.0, &config.cache_dir.0].into_iter().filter_map(|folder| folder.canonicalize().ok());
-    let mut hidden: Vec<Place> = folders.map(|at| Place { at, content: Content::Empty }).collect();
-    let files = std::iter::once(&config.file).chain(config.git_config.as_ref().map(|file| &file.0));
-    for file in files.filter_map(|file| file.canonicalize().ok()) {
-        hidden.push(Place { at: file.clone(), content: Content::EmptyFile });
-        // The other configurations are beside it: those of the session server are in a folder beside this one.
-        let Some(folder) = file.parent() else { continue };
-        let beside = ["session", "simulation"].map(|name| folder.with_file_name(name));
-        if beside.iter().any(|one| one == folder) {
-            hidden.extend(beside.map(|at| Place { at, content: Content::Empty }));
-        }
-    }
-    hidden
-}
-
 /// The homes of the server's user: the one that the environment names, and the one that the system knows.
 fn homes() -> Vec<PathBuf> {
     let named = std::env::var_os("HOME").map(PathBuf::from);
@@ -262,6 +212,14 @@ fn homes() -> Vec<PathBuf> {
         .collect();
     homes.dedup();
     homes
+}
+
+/// The folders for temporary files of the system and of this server, without links.
+fn temporary_folders() -> impl Iterator<Item = PathBuf> {
+    let all = ["/tmp".into(), "/var/tmp".into(), std::env::temp_dir()];
+    let real = all.into_iter().filter_map(|folder: PathBuf| folder.canonicalize().ok());
+    // Each sandbox has its own shared memory.
+    real.filter(|folder| folder.parent().is_some() && !folder.starts_with("/dev")).collect::<BTreeSet<_>>().into_iter()
 }
 
 /// The graphics cards of this machine.

@@ -1,5 +1,6 @@
 //! What a simulation leaves in the system, and how it is removed: process trees and folders.
 
+pub mod folder_size;
 pub mod guardian;
 mod instance_dir;
 mod process_group;

@@ -80,6 +80,7 @@ impl LaunchSpec {
     pub fn watch(&self, root: i32) -> Watch {
         Watch {
             root,
+            runners: self.launcher.runners(),
             folder: self.project.instance.path().to_owned(),
             limits: self.config.limits.clone(),
             ports: self.config.streaming_ports(),

@@ -17,6 +17,8 @@ pub struct PacedReader {
 
 /// What a line costs beside its length, in bytes: it is looked at, kept and written by itself.
 const LINE: u64 = 200;
+/// What a read costs beside its length, in bytes: who writes byte by byte has each read by itself.
+const READ: u64 = 200;
 /// Bytes that are not waited for: ordinary output is read at once.
 const FREE: u64 = 1024;
 
@@ -37,7 +39,7 @@ impl Read for PacedReader {
         let count = self.output.read(buffer)?;
         let read = buffer.get(..count).unwrap_or_default();
         let lines = read.split(|byte| *byte == b'\n').skip(1).count();
-        self.debt += u64::try_from(count).unwrap_or_default() + LINE * u64::try_from(lines).unwrap_or_default();
+        self.debt += READ + u64::try_from(count).unwrap_or_default() + LINE * u64::try_from(lines).unwrap_or_default();
         Ok(count)
     }
 }

@@ -1,0 +1,26 @@
+//! The files and folders of the configuration that are only the server's.
+
+use std::path::Path;
+
+use super::{Isolation, SimulationConfig};
+use crate::shared::config::{InvalidValue, Secret};
+
+impl SimulationConfig {
+    /// Returns the files that may hold secrets: this configuration's own, and those that it names.
+    pub fn secret_files(&self) -> impl Iterator<Item = &Path> {
+        let password = self.admin_password.as_ref().and_then(Secret::file);
+        [Some(self.file.as_path()), self.git_config.as_ref().map(|file| &*file.0), password].into_iter().flatten()
+    }
+
+    /// Checks the key `sandbox`, where it counts. Returns warnings.
+    ///
+    /// # Errors
+    /// When it would take the sandbox apart.
+    pub(super) fn check_sandbox(&self) -> Result<Vec<String>, InvalidValue> {
+        if !matches!(self.isolation, Isolation::Auto | Isolation::Sandbox) {
+            return Ok(Vec::new());
+        }
+        let own = [self.log_dir.0.as_path(), &self.cache_dir.0].into_iter().chain(self.secret_files());
+        self.sandbox.check(own)
+    }
+}
