@@ -11,6 +11,7 @@ use std::time::{Duration, Instant};
 use tokio::sync::{RwLock, RwLockReadGuard, RwLockWriteGuard};
 
 use super::image;
+use crate::support::SOON;
 use crate::support::program::{Builder, simulation_server};
 
 /// The daemon, for a test that shares it with others.
@@ -194,14 +195,22 @@ pub fn prefix(server: &crate::support::program::Server) -> String {
     format!("webots-fleet-{}-", owner.name())
 }
 
-/// The containers of one service of a server.
+/// The containers of one service of a server, as soon as there is one. What a container prints may come before Docker counts
+/// it among those that run.
 pub fn of_service(server: &crate::support::program::Server, service: &str) -> Vec<String> {
-    let prefix = prefix(server);
+    let (prefix, deadline) = (prefix(server), Instant::now() + SOON);
     let filter = format!("label=com.docker.compose.service={service}");
     let format = "{{.Label \"com.docker.compose.project\"}} {{.ID}}";
-    let all = ask(&["ps", "--filter", &filter, "--format", format]);
-    let found = all.lines().filter_map(|line| line.split_once(' ')).filter(|(name, _)| name.starts_with(&prefix));
-    found.map(|(_, id)| id.to_owned()).collect()
+    loop {
+        let all = ask(&["ps", "--filter", &filter, "--format", format]);
+        let found = all.lines().filter_map(|line| line.split_once(' ')).filter(|(name, _)| name.starts_with(&prefix));
+        let found: Vec<String> = found.map(|(_, id)| id.to_owned()).collect();
+        assert!(Instant::now() < deadline, "there is no container of {service}");
+        if !found.is_empty() {
+            return found;
+        }
+        std::thread::sleep(Duration::from_millis(20));
+    }
 }
 
 impl Alone {
