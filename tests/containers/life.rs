@@ -113,7 +113,13 @@ async fn more_simulations_run_than_docker_has_networks() {
     let Some(_docker) = alone().await else { return };
     let forge = Forge::with_arm();
     let count = 34;
-    let server = server(forge.path(), count).set("maxPlacesPerAddress", count).set("timing.launch", 300).start().await;
+    let server = server(forge.path(), count)
+        .set("maxPlacesPerAddress", count)
+        .set("timing.launch", 300)
+        // They are read one after the other, and answer no ping until their turn has come.
+        .set("timing.silence", 600)
+        .start()
+        .await;
     let mut clients = Vec::new();
     for _ in 0..count {
         clients.push(Client::start(&server, &arm()).await);

@@ -134,7 +134,7 @@ impl Docker {
         SpawnSpec {
             command,
             inherits: true,
-            // The builder of old prints its steps, and takes networks of its own.
+            // The classic builder prints its steps, and builds on a network of ours; BuildKit has none of the kind.
             environment: vec![("DOCKER_BUILDKIT".into(), "0".into()), ("COMPOSE_ANSI".into(), "never".into())],
             in_sandbox: false,
             folder: None,

@@ -128,8 +128,7 @@ fn text_of(path: &Path) -> Result<Option<String>, String> {
 /// # Errors
 /// When the file can't be read or written.
 pub fn open_participant(world: &Path) -> io::Result<()> {
-    let text = std::fs::read(world)?;
-    let text = String::from_utf8_lossy(&text).replace("controller \"participant\"", "controller \"<extern>\"");
+    let text = std::fs::read_to_string(world)?.replace("controller \"participant\"", "controller \"<extern>\"");
     let flags = OFlag::O_NOFOLLOW.bits();
     OpenOptions::new().write(true).truncate(true).custom_flags(flags).open(world)?.write_all(text.as_bytes())
 }

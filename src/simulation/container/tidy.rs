@@ -65,9 +65,11 @@ pub async fn keep_tidy(docker: Docker, owner: Owner, live: Live, images: Arc<Ima
 async fn tidy(docker: &Docker, owner: &Owner, live: &Live) -> Result<(), DockerError> {
     let found = owner.projects(docker).await?;
     let left: Vec<String> = found.into_iter().filter(|name| !live.names().contains(name)).collect();
+    let mut done = Ok(());
     for name in left {
         log::info!("{name} was left; it is removed");
-        objects::remove(docker, &name).await?;
+        // One that can't be removed holds up no other.
+        done = objects::remove(docker, &name).await.and(done);
     }
-    Ok(())
+    done
 }
