@@ -37,6 +37,11 @@ impl Own {
         Self { fleet, start: Instant::now(), instances }
     }
 
+    /// Chooses among these servers only.
+    pub(crate) fn place_among(&mut self, now: f64, servers: &[usize]) -> Option<usize> {
+        self.fleet.place(self.at(now), |server| servers.contains(server))
+    }
+
     fn at(&self, now: f64) -> Instant {
         self.start + Duration::from_secs_f64(now)
     }

@@ -1,6 +1,7 @@
 //! What is known of one simulation server: its last report, and the clients that were sent to it since.
 
 use super::cost::{CostFit, Estimate, FULL, FleetCost, believable};
+use super::peers::Peers;
 use super::policy::Policy;
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
@@ -77,6 +78,10 @@ pub(super) struct Backend {
     in_flight: VecDeque<Placement>,
     /// How many of them take room.
     reserved: usize,
+    /// For how many clients each of them stands: itself, and those that other session servers send meanwhile.
+    clients_per_placement: f64,
+    /// The part of a placement of ours that the arrivals until now make up; the rest of a division.
+    arrived_part: f64,
     settling: VecDeque<Change>,
     /// What `settling` hid from the last report.
     unseen: Unseen,
@@ -97,6 +102,8 @@ impl Backend {
             last: None,
             in_flight: VecDeque::new(),
             reserved: 0,
+            clients_per_placement: 1.0,
+            arrived_part: 0.0,
             settling: VecDeque::new(),
             unseen: Unseen::default(),
             fit: CostFit::new(policy.client_cost),
@@ -107,7 +114,14 @@ impl Backend {
     }
 
     /// Takes in a report that came at `now`; one that is older than the last is passed over.
-    pub(super) fn report(&mut self, now: Instant, report: Report, policy: &Policy, fleet: &mut FleetCost) {
+    pub(super) fn report(
+        &mut self,
+        now: Instant,
+        report: Report,
+        policy: &Policy,
+        fleet: &mut FleetCost,
+        peers: &mut Peers,
+    ) {
         if !report.load.is_finite() || report.load < 0.0 {
             self.lose();
             return;
@@ -115,7 +129,7 @@ impl Backend {
         if self.last.is_some_and(|(at, _)| now < at) {
             return;
         }
-        self.note_changes(now, report.instances);
+        self.note_changes(now, report.instances, peers);
         self.settle(now, policy);
         self.learn(now, report);
         self.last = Some((now, report));
@@ -135,10 +149,12 @@ impl Backend {
     }
 
     /// Gives up the clients that should have come by now.
-    pub(super) fn expire(&mut self, now: Instant, policy: &Policy) {
+    pub(super) fn expire(&mut self, now: Instant, policy: &Policy, peers: &mut Peers) {
         let is_late = |placed: &Placement| now.saturating_duration_since(placed.at) >= policy.patience;
         let late = self.in_flight.partition_point(is_late);
-        self.reserved -= self.in_flight.drain(..late).filter(|placed| placed.takes_room).count();
+        let given_up = self.in_flight.drain(..late).filter(|placed| placed.takes_room).count();
+        self.reserved -= given_up;
+        peers.count(0.0, count(given_up));
     }
 
     /// When the oldest placement is given up, if its client does not come before.
@@ -152,8 +168,8 @@ impl Backend {
             return false;
         };
         let has_place = report.instances.is_none_or(|instances| {
-            let taken = (instances.present as usize).saturating_add(self.reserved);
-            instances.accepting && taken < instances.places as usize
+            let taken = f64::from(instances.present) + count(self.reserved) * self.clients_per_placement;
+            instances.accepting && taken < f64::from(instances.places)
         });
         has_place && self.effective_load().is_some_and(|load| load < self.limit(policy))
     }
@@ -179,8 +195,7 @@ impl Backend {
         let (_, Report { load, .. }) = self.last.filter(|_| self.up)?;
         // How far a full machine is over is not known, so those who left may not have made it less than full.
         let unseen = if load < FULL { unseen } else { unseen.max(0.0) };
-        #[expect(clippy::cast_precision_loss, reason = "nobody sends 2^52 clients to a server")]
-        let ahead = unseen + in_flight as f64;
+        let ahead = unseen + count(in_flight) * self.clients_per_placement;
         Some((load + self.cost * ahead).max(0.0))
     }
 
@@ -233,7 +248,7 @@ impl Backend {
     }
 
     /// Compares the report with the one before: who came, who left.
-    fn note_changes(&mut self, now: Instant, new: Option<Instances>) {
+    fn note_changes(&mut self, now: Instant, new: Option<Instances>, peers: &mut Peers) {
         let Some(new) = new else {
             // A load alone does not tell who came: every placement is taken to have come as it was made.
             let all = self.in_flight.drain(..);
@@ -249,7 +264,10 @@ impl Backend {
             self.fit.count_arrivals(f64::from(new.present));
             return;
         };
-        let came = usize::try_from(new.arrivals - old.arrivals).unwrap_or(usize::MAX).min(self.in_flight.len());
+        let arrivals = count(usize::try_from(new.arrivals - old.arrivals).unwrap_or(usize::MAX));
+        let came = self.own_part(arrivals);
+        peers.count(arrivals, count(came));
+        self.clients_per_placement = peers.clients_per_placement();
         // The latest placements are taken to be those that came. Nothing tells clients apart; were the oldest taken, then
         // a client that never comes would stay in flight as long as others follow it.
         for Placement { at, takes_room } in self.in_flight.drain(self.in_flight.len() - came..) {
@@ -257,7 +275,7 @@ impl Backend {
             self.reserved -= usize::from(takes_room);
         }
         // Those who left, less those who came without having been sent; some time since the last report.
-        let came = f64::from(u32::try_from(came).unwrap_or(u32::MAX));
+        let came = count(came);
         let others = f64::from(new.present) - f64::from(old.present) - came;
         self.fit.count_arrivals(came + others.max(0.0));
         if others != 0.0 {
@@ -265,18 +283,43 @@ impl Backend {
             self.settling.push_back(Change { at, clients: others, takes_room: true });
         }
     }
+
+    /// How many of so many arrivals are placements of ours; the others were sent by other session servers.
+    fn own_part(&mut self, arrivals: f64) -> usize {
+        let part = self.arrived_part + arrivals / self.clients_per_placement;
+        let whole = part.round();
+        if whole >= count(self.in_flight.len()) {
+            self.arrived_part = 0.0;
+            return self.in_flight.len();
+        }
+        self.arrived_part = part - whole;
+        #[expect(
+            clippy::cast_possible_truncation,
+            clippy::cast_sign_loss,
+            reason = "it is less than a length, and no part is under -1/2"
+        )]
+        let whole = whole as usize;
+        whole
+    }
+}
+
+/// A number of clients to reckon with.
+#[expect(clippy::cast_precision_loss, reason = "there are no 2^52 clients")]
+fn count(clients: usize) -> f64 {
+    clients as f64
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    /// One server, the time from which its seconds are counted, and what its fleet has learned.
-    struct Server(Backend, Instant, FleetCost);
+    /// One server, the time from which its seconds are counted, and what its fleet has learned of costs and of others.
+    struct Server(Backend, Instant, FleetCost, Peers);
 
     impl Server {
         fn new(load: f64, counts: Option<(u32, u64)>) -> Self {
-            let mut server = Self(Backend::new(&Policy::default(), 0), Instant::now(), FleetCost::default());
+            let mut server =
+                Self(Backend::new(&Policy::default(), 0), Instant::now(), FleetCost::default(), Peers::default());
             server.report(0.0, load, counts);
             server
         }
@@ -294,8 +337,8 @@ mod tests {
             let instances =
                 counts.map(|(present, arrivals)| Instances { present, places: 1000, arrivals, accepting: true });
             let at = self.at(seconds);
-            self.0.expire(at, &Policy::default());
-            self.0.report(at, Report { load, instances }, &Policy::default(), &mut self.2);
+            self.0.expire(at, &Policy::default(), &mut self.3);
+            self.0.report(at, Report { load, instances }, &Policy::default(), &mut self.2, &mut self.3);
         }
 
         fn assert_load(&self, expected: f64, tolerance: f64) {

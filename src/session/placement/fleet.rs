@@ -3,6 +3,7 @@
 use super::backend::{Backend, Report};
 use super::cost::{Estimate, FleetCost};
 use super::order::{Order, Rank};
+use super::peers::Peers;
 use super::policy::Policy;
 use std::collections::BTreeMap;
 use std::time::Instant;
@@ -28,6 +29,7 @@ pub struct Fleet<Id> {
     policy: Policy,
     servers: BTreeMap<Id, Backend>,
     cost: FleetCost,
+    peers: Peers,
     order: Order<Id>,
     turns: u64,
 }
@@ -36,7 +38,14 @@ impl<Id: Clone + Ord> Fleet<Id> {
     /// A fleet without servers.
     #[must_use]
     pub fn new(policy: Policy) -> Self {
-        Self { policy, servers: BTreeMap::new(), cost: FleetCost::default(), order: Order::new(), turns: 0 }
+        Self {
+            policy,
+            servers: BTreeMap::new(),
+            cost: FleetCost::default(),
+            peers: Peers::default(),
+            order: Order::new(),
+            turns: 0,
+        }
     }
 
     /// Changes the policy. What servers have learned until now stays.
@@ -64,8 +73,8 @@ impl<Id: Clone + Ord> Fleet<Id> {
     /// Takes in what a server answered at `now`. A server that is not in the fleet is passed over.
     pub fn report(&mut self, id: &Id, now: Instant, report: Report) {
         if let Some(server) = self.servers.get_mut(id) {
-            server.expire(now, &self.policy);
-            server.report(now, report, &self.policy, &mut self.cost);
+            server.expire(now, &self.policy, &mut self.peers);
+            server.report(now, report, &self.policy, &mut self.cost, &mut self.peers);
             self.update_order(id);
         }
     }
@@ -105,7 +114,7 @@ impl<Id: Clone + Ord> Fleet<Id> {
     fn expire(&mut self, now: Instant) {
         for id in self.order.expired(now).cloned().collect::<Vec<_>>() {
             if let Some(server) = self.servers.get_mut(&id) {
-                server.expire(now, &self.policy);
+                server.expire(now, &self.policy, &mut self.peers);
             }
             self.update_order(&id);
         }
@@ -289,6 +298,26 @@ mod tests {
         assert_eq!((fleet.effective_load(&0), fleet.in_flight(&0)), (Some(10.0), 1));
         fleet.report(&0, now, full_report(10.0, 1, 1));
         assert_eq!((fleet.effective_load(&0), fleet.in_flight(&0)), (Some(12.0), 0));
+    }
+
+    #[test]
+    fn session_servers_side_by_side_do_not_each_fill_the_fleet_alone() {
+        let now = Instant::now();
+        let report = |clients| {
+            let instances = Instances { present: clients, places: 500, arrivals: clients.into(), accepting: true };
+            Report { load: 1.0, instances: Some(instances) }
+        };
+        let mut beside = [(); 2].map(|()| fleet(0.25, now, [report(0)]));
+        for client in 0..300_u32 {
+            let at = now + Duration::from_secs(client.into());
+            beside[usize::from(client % 2 == 0)].place(at, |_| true);
+            for fleet in &mut beside {
+                fleet.report(&0, at, report(client + 1));
+            }
+        }
+        let at = now + Duration::from_secs(300);
+        let placed = beside.map(|mut fleet| std::iter::from_fn(|| fleet.place(at, |_| true)).count());
+        assert!(placed.iter().all(|placed| (95..=115).contains(placed)), "200 places are left: {placed:?}");
     }
 
     /// Sends so many clients at once; returns how many each server got.

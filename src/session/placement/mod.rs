@@ -7,7 +7,8 @@
 //! - `fleet`: the servers, and the choice between them; `policy`: what can be set;
 //! - `order`: the servers sorted by load, so that a large fleet is as fast as a small one;
 //! - `backend`: what is known of one server;
-//! - `cost`: what a client costs a server, learned from its reports.
+//! - `cost`: what a client costs a server, learned from its reports;
+//! - `peers`: how many clients other session servers send.
 //!
 //! Nothing here reads a clock or does any input or output: every call is told the time.
 //! `docs/placement.md` explains the policy, and `cargo bench --bench placement` measures it.
@@ -16,6 +17,7 @@ mod backend;
 mod cost;
 mod fleet;
 mod order;
+mod peers;
 mod policy;
 
 pub use backend::{Instances, Report};
