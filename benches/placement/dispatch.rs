@@ -37,9 +37,9 @@ impl Own {
         Self { fleet, start: Instant::now(), instances }
     }
 
-    /// Chooses among these servers only.
-    pub(crate) fn place_among(&mut self, now: f64, servers: &[usize]) -> Option<usize> {
-        self.fleet.place(self.at(now), |server| servers.contains(server))
+    /// Chooses among the servers that are eligible.
+    pub(crate) fn place_among(&mut self, now: f64, eligible: impl Fn(&usize) -> bool) -> Option<usize> {
+        self.fleet.place(self.at(now), eligible)
     }
 
     fn at(&self, now: f64) -> Instant {
@@ -55,7 +55,7 @@ impl Dispatcher for Own {
     }
 
     fn place(&mut self, now: f64) -> Option<usize> {
-        self.fleet.place(self.at(now), |_| true)
+        self.place_among(now, |_| true)
     }
 }
 

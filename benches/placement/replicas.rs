@@ -18,7 +18,7 @@ enum Among {
 
 /// So many of the project's own policies; each client asks any one of them.
 struct Replicas {
-    replicas: Vec<Own>,
+    policies: Vec<Own>,
     servers: usize,
     among: Among,
     random: StdRng,
@@ -26,17 +26,17 @@ struct Replicas {
 
 impl Dispatcher for Replicas {
     fn report(&mut self, server: usize, now: f64, seen: Seen) {
-        self.replicas.iter_mut().for_each(|replica| replica.report(server, now, seen));
+        self.policies.iter_mut().for_each(|replica| replica.report(server, now, seen));
     }
 
     fn place(&mut self, now: f64) -> Option<usize> {
-        let any = self.random.random_range(0..self.replicas.len());
-        let replica = &mut self.replicas[any];
+        let any = self.random.random_range(0..self.policies.len());
+        let replica = &mut self.policies[any];
         let of_two = match self.among {
             Among::All => None,
             Among::Two => {
                 let two = [(); 2].map(|()| self.random.random_range(0..self.servers));
-                replica.place_among(now, &two)
+                replica.place_among(now, |server| two.contains(server))
             }
         };
         of_two.or_else(|| replica.place(now))
@@ -45,9 +45,9 @@ impl Dispatcher for Replicas {
 
 fn outcome(scenario: &Scenario, count: usize, among: Among) -> Outcome {
     mean(scenario, |seed| {
-        let replicas = (0..count).map(|_| Own::new(scenario.servers, true)).collect();
+        let policies = (0..count).map(|_| Own::new(scenario.servers, true)).collect();
         let random = StdRng::seed_from_u64(seed);
-        run(scenario, seed, &mut Replicas { replicas, servers: scenario.servers, among, random })
+        run(scenario, seed, &mut Replicas { policies, servers: scenario.servers, among, random })
     })
 }
 

@@ -4,7 +4,6 @@ pub mod app;
 pub mod config;
 pub mod fleet;
 pub mod mail;
-mod mail_address;
 pub mod placement;
 mod state;
 pub mod web;

@@ -15,7 +15,7 @@ pub fn trusted_authority(test: &str) -> Option<String> {
         return std::env::var(key).ok();
     }
     let output = Command::new(std::env::current_exe().unwrap())
-        .args(["--exact", &format!("mail::{test}"), "--nocapture"])
+        .args(["--exact", &format!("mail::login::{test}"), "--nocapture"])
         .env(key, &file)
         .env("FLEET_TEST_OWN_PROCESS", test)
         .output()

@@ -5,8 +5,8 @@ use std::time::Duration;
 
 use nix::sys::signal::Signal;
 
-use super::checkout::{cached, noise, outcome, reader, size_of, world_text};
 use super::git_wrapper::GitWrapper;
+use super::opened::{cached, noise, outcome, reader, size_of, world_text};
 use super::scene::{arm, instance_folders};
 use crate::support::client::Client;
 use crate::support::git::{Forge, world};

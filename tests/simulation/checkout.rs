@@ -1,6 +1,6 @@
-//! Checkouts: what a URL names, the cache, limits, and what an evil repository can't do.
+//! Checkouts: what a URL names, what is cached, and what an evil repository can't do.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::time::{Duration, Instant};
 
 use futures_util::future::join_all;
@@ -8,56 +8,14 @@ use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 
 use super::git_wrapper::GitWrapper;
+use super::opened::{cached, noise, outcome, reader, size_of, world_text};
 use super::scene::{arm, instance_folders, nothing_left};
 use crate::support::client::Client;
 use crate::support::git::{Forge, WORLD, git, world};
 use crate::support::http;
-use crate::support::program::{Server, simulation_server};
+use crate::support::program::simulation_server;
+use crate::support::until;
 use crate::support::webots::{Webots, instances_below};
-use crate::support::{needs, until};
-
-/// A Webots that tells which world it was given, and ends: its client hears the world's second line.
-pub fn reader() -> Webots {
-    Webots::script("for last; do :; done\necho \"opened [$(sed -n 2p \"$last\")] $last\"\nexit 1")
-}
-
-pub fn world_text(mark: &str) -> String {
-    format!("#VRML_SIM R2025a utf8\n{mark}\n")
-}
-
-/// What a client that asks for a world is told in the end.
-pub async fn outcome(server: &Server, world: &str) -> String {
-    let mut client = Client::start(server, world).await;
-    let told = client.until("loading: Error:").await;
-    assert_eq!(client.closed().await, Some(1000));
-    told
-}
-
-pub fn size_of(folder: &Path) -> u64 {
-    let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
-    entries
-        .map(|entry| {
-            if entry.path().is_dir() { size_of(&entry.path()) } else { entry.metadata().map_or(0, |about| about.len()) }
-        })
-        .sum()
-}
-
-/// Bytes that can't be packed.
-pub fn noise(bytes: usize) -> Vec<u8> {
-    let mut state = 0x9e37_79b9_7f4a_7c15_u64 ^ (bytes as u64);
-    let mut next = || {
-        state ^= state << 13;
-        state ^= state >> 7;
-        state ^= state << 17;
-        state
-    };
-    (0..bytes.div_ceil(8)).flat_map(|_| next().to_le_bytes()).collect()
-}
-
-pub fn cached(server: &Server) -> Vec<PathBuf> {
-    let entries = std::fs::read_dir(server.folder.join("cache/git")).unwrap().flatten().map(|entry| entry.path());
-    entries.filter(|path| path.is_dir()).collect()
-}
 
 #[actix_rt::test]
 async fn every_kind_of_url_opens_its_world() {
@@ -259,46 +217,6 @@ async fn a_remote_that_hangs_costs_only_its_own_client() {
 }
 
 #[actix_rt::test]
-async fn sizes_are_limited() {
-    let (forge, webots) = (Forge::with_arm(), reader());
-    let work = forge.work_tree("lab/arm", "main");
-    std::fs::write(work.join("noise"), noise(6 << 20)).unwrap();
-    forge.commit_work_tree("lab/arm", "main");
-    forge.commit("lab/zeros", "main", &[("worlds/a.wbt", &world_text("zeros")), ("zeros", &"0".repeat(6 << 20))]);
-    // A project beside it is small, but all of its commit is fetched.
-    let server = simulation_server(&webots.path(), forge.path(), 2).set("projectSize", 1).start().await;
-    let told = outcome(&server, &arm()).await;
-    assert!(told.ends_with("is larger than 1 MiB"), "{told}");
-    let told = outcome(&server, &world("lab/zeros", "main", "worlds/a.wbt")).await;
-    assert_eq!(told, "loading: Error: The project is larger than 1 MiB", "it is small only as it is packed");
-    // Small files without end: a folder that holds ten times one that holds ten times...
-    let work = forge.work_tree("lab/bomb", "main");
-    std::fs::create_dir_all(work.join("worlds")).unwrap();
-    std::fs::write(work.join("worlds/a.wbt"), WORLD).unwrap();
-    forge.commit_work_tree("lab/bomb", "main");
-    let make_tree = |entries: String| {
-        let list = work.join(".git/list");
-        std::fs::write(&list, entries).unwrap();
-        let file = std::fs::File::open(list).unwrap();
-        let made = std::process::Command::new("git").current_dir(&work).arg("mktree").stdin(file).output().unwrap();
-        String::from_utf8(made.stdout).unwrap().trim().to_owned()
-    };
-    let worlds = git(&work, &["rev-parse", "HEAD:worlds"]);
-    for levels in [4, 7] {
-        let mut tree = worlds.trim().to_owned();
-        for _ in 0..levels {
-            tree = make_tree((0..10).map(|number| format!("040000 tree {tree}\td{number}\n")).collect());
-        }
-        let root = make_tree(format!("040000 tree {tree}\tbomb\n040000 tree {}\tworlds\n", worlds.trim()));
-        let commit = git(&work, &["commit-tree", "-m", "bomb", &root]);
-        git(&work, &["push", "--quiet", "--force", "origin", &format!("{}:refs/heads/main", commit.trim())]);
-        let told = outcome(&server, &world("lab/bomb", "main", "worlds/a.wbt")).await;
-        assert_eq!(told, "loading: Error: The project has more than 10000 files and folders");
-    }
-    nothing_left(&server, 2).await;
-}
-
-#[actix_rt::test]
 async fn equal_checkouts_are_done_once_and_a_cached_start_fetches_nothing() {
     let (forge, webots) = (Forge::with_arm(), reader());
     let wrapper = GitWrapper::new("case \"$*\" in *fetch*) sleep 0.7;; esac");
@@ -388,105 +306,6 @@ fn has_half_a_pack(repository: &Path) -> bool {
     std::fs::read_dir(repository).into_iter().flatten().flatten().map(|entry| entry.path()).any(|path| {
         path.file_name().unwrap().to_string_lossy().starts_with("tmp_") || (path.is_dir() && has_half_a_pack(&path))
     })
-}
-
-const POINTER: &str = "version https://git-lfs.github.com/spec/v1\noid sha256:0000000000000000000000000000000000000000000000000000000000000000\nsize 12345\n";
-
-#[actix_rt::test]
-async fn files_that_are_missing_from_git_lfs_are_told() {
-    let (forge, webots) = (Forge::with_arm(), reader());
-    forge.commit(
-        "lab/arm",
-        "main",
-        &[("meshes/a.dae", POINTER), (".gitattributes", "*.dae filter=lfs diff=lfs merge=lfs -text\n")],
-    );
-    let server = simulation_server(&webots.path(), forge.path(), 1).start().await;
-    let mut client = Client::start(&server, &arm()).await;
-    let told = client.until("loading: Warning:").await;
-    assert!(told.starts_with("loading: Warning: 1 files of this project are kept in Git LFS and c"), "{told}");
-    client.until("loading: Error: Webots ended with exit code 1").await;
-    // Without git-lfs it is told that this is what is missing.
-    let bin = tempfile::tempdir().unwrap();
-    for program in ["git", "bash", "sed", "env", "sh"] {
-        let found = std::env::split_paths(&std::env::var_os("PATH").unwrap())
-            .map(|folder| folder.join(program))
-            .find(|path| path.is_file());
-        std::os::unix::fs::symlink(found.unwrap(), bin.path().join(program)).unwrap();
-    }
-    let server =
-        simulation_server(&webots.path(), forge.path(), 1).env("PATH", bin.path().to_str().unwrap()).start().await;
-    let told = Client::start(&server, &arm()).await.until("loading: Warning:").await;
-    assert!(told.ends_with("can't be loaded: this server has no git-lfs"), "{told}");
-}
-
-#[actix_rt::test]
-async fn files_in_git_lfs_are_looked_for_where_the_world_is_and_nowhere_outside() {
-    let (forge, webots, outside) = (Forge::with_arm(), reader(), tempfile::tempdir().unwrap());
-    let strange = outside.path().join("meshes/a.dae");
-    std::fs::create_dir_all(strange.parent().unwrap()).unwrap();
-    std::fs::write(&strange, POINTER).unwrap();
-    let files = [("real/worlds/a.wbt", world_text("real")), ("real/meshes/a.dae", POINTER.to_owned())];
-    let work = forge.work_tree("lab/arm", "main");
-    for (name, target) in [("out", outside.path()), ("in/worlds", Path::new("../real/worlds"))] {
-        std::fs::create_dir_all(work.join(name).parent().unwrap()).unwrap();
-        std::os::unix::fs::symlink(target, work.join(name)).unwrap();
-    }
-    forge.commit("lab/arm", "main", &files.each_ref().map(|(path, text)| (*path, text.as_str())));
-    // A git-lfs that loads nothing.
-    let wrapper = GitWrapper::new("");
-    let lfs = wrapper.path().split(':').next().map(|folder| Path::new(folder).join("git-lfs")).unwrap();
-    std::os::unix::fs::symlink("/bin/false", lfs).unwrap();
-    let server = simulation_server(&webots.path(), forge.path(), 1).env("PATH", &wrapper.path()).start().await;
-    let told = outcome(&server, &world("lab/arm", "main", "out/worlds/a.wbt")).await;
-    assert_eq!(told, "loading: Error: a.wbt does not exist");
-    assert_eq!(std::fs::read_to_string(&strange).unwrap(), POINTER);
-    for folder in ["real", "in"] {
-        let url = world("lab/arm", "main", &format!("{folder}/worlds/a.wbt"));
-        let told = Client::start(&server, &url).await.until("loading: Warning:").await;
-        assert!(told.contains("1 files of this project are kept in Git LFS"), "{folder}: {told}");
-    }
-}
-
-#[actix_rt::test]
-async fn what_a_forge_sends_as_large_files_is_bounded_whatever_the_pointers_say() {
-    let (forge, webots) = (Forge::with_arm(), reader());
-    let attributes = "*.dae filter=lfs diff=lfs merge=lfs -text\n";
-    forge.commit("lab/arm", "main", &[("meshes/a.dae", POINTER), (".gitattributes", attributes)]);
-    // A git-lfs that loads more and more for 12345 bytes.
-    let wrapper = GitWrapper::new("");
-    let lfs = wrapper.path().split(':').next().map(|folder| Path::new(folder).join("git-lfs")).unwrap();
-    let script = "#!/bin/sh\nmkdir -p \"$GIT_DIR/lfs/tmp\"\nhead -c 5000000 /dev/zero >\"$GIT_DIR/lfs/tmp/a\"\nexec sleep 1000\n";
-    std::fs::write(&lfs, script).unwrap();
-    std::fs::set_permissions(&lfs, std::os::unix::fs::PermissionsExt::from_mode(0o755)).unwrap();
-    let server = simulation_server(&webots.path(), forge.path(), 1).set("projectSize", 1).env("PATH", &wrapper.path());
-    let told = outcome(&server.start().await, &arm()).await;
-    assert_eq!(told, "loading: Error: What the project keeps in Git LFS is larger than 1 MiB");
-}
-
-#[actix_rt::test]
-async fn files_in_git_lfs_are_loaded() {
-    needs("git-lfs", "git-lfs");
-    let forge = Forge::with_arm();
-    let webots = Webots::script(
-        "for last; do :; done\ncd \"$(dirname \"$last\")/..\"\necho \"mesh [$(head -c 20 meshes/a.dae)]\"\nexit 1",
-    );
-    let work = forge.work_tree("lab/arm", "main");
-    std::fs::create_dir(work.join("meshes")).unwrap();
-    std::fs::write(work.join("meshes/a.dae"), "the real mesh".repeat(200)).unwrap();
-    std::fs::write(work.join(".gitattributes"), "*.dae filter=lfs diff=lfs merge=lfs -text\n").unwrap();
-    git(&work, &["lfs", "install", "--local", "--force"]);
-    forge.commit_work_tree("lab/arm", "main");
-    git(&work, &["lfs", "push", "--all", "origin"]);
-    let server = simulation_server(&webots.path(), forge.path(), 1).start().await;
-    for _ in 0..2 {
-        let told = outcome(&server, &arm()).await;
-        assert!(told.contains("mesh [the real mesh"), "{told}\n{}", server.log());
-    }
-    let limited = simulation_server(&webots.path(), forge.path(), 1).set("projectSize", 1).start().await;
-    std::fs::write(work.join("meshes/a.dae"), "x".repeat(3 << 20)).unwrap();
-    forge.commit_work_tree("lab/arm", "main");
-    let told = outcome(&limited, &arm()).await;
-    assert_eq!(told, "loading: Error: What the project keeps in Git LFS is larger than 1 MiB");
 }
 
 #[actix_rt::test]
@@ -582,79 +401,4 @@ async fn the_files_of_the_folders_above_a_project_are_there_and_no_other_folders
     let server = simulation_server(&webots.path(), forge.path(), 1).set("projectSize", 1).start().await;
     let told = outcome(&server, &world("lab/arm", "main", "a/p%20q/worlds/a.wbt")).await;
     assert_eq!(told, "loading: Error: The project is larger than 1 MiB");
-}
-
-#[actix_rt::test]
-async fn git_is_bounded_in_memory_and_in_what_it_writes() {
-    let (forge, webots) = (Forge::with_arm(), reader());
-    // Small as it is listed, and four times as large as it is written.
-    let text = "0123456789\n".repeat(50_000);
-    let attributes = "*.txt working-tree-encoding=UTF-32LE\n";
-    let encoded: Vec<u8> = text.bytes().flat_map(|byte| [byte, 0, 0, 0]).collect();
-    let work = forge.work_tree("lab/arm", "main");
-    std::fs::write(work.join(".gitattributes"), attributes).unwrap();
-    std::fs::write(work.join("a.txt"), encoded).unwrap();
-    forge.commit_work_tree("lab/arm", "main");
-    let listed = git(&forge.path().join("lab/arm"), &["cat-file", "-s", "main:a.txt"]);
-    assert_eq!(listed.trim(), text.len().to_string());
-    let server = simulation_server(&webots.path(), forge.path(), 1).set("projectSize", 1).start().await;
-    assert_eq!(outcome(&server, &arm()).await, "loading: Error: The project is larger than 1 MiB");
-    let wrapper = GitWrapper::new("[ $(ulimit -d) -le 2097152 ] || { echo 'fatal: no limit' >&2; exit 128; }");
-    let server = simulation_server(&webots.path(), forge.path(), 1).env("PATH", &wrapper.path()).start().await;
-    let told = outcome(&server, &arm()).await;
-    assert!(told.contains("opened"), "{told}");
-}
-
-#[actix_rt::test]
-async fn what_is_too_much_costs_once_and_not_once_for_each_client() {
-    let (forge, webots) = (Forge::new(), reader());
-    let worlds: Vec<String> = (0..24).map(|number| format!("worlds/{number}.wbt")).collect();
-    let work = forge.work_tree("lab/many", "main");
-    std::fs::create_dir_all(work.join("worlds")).unwrap();
-    for path in worlds.iter().cloned().chain((0..10_001).map(|number| format!("worlds/{number}.txt"))) {
-        std::fs::write(work.join(path), "").unwrap();
-    }
-    forge.commit_work_tree("lab/many", "main");
-    // Small as it is listed, and four times as large as it is written.
-    let work = forge.work_tree("lab/grows", "main");
-    std::fs::create_dir_all(work.join("worlds")).unwrap();
-    for path in &worlds {
-        std::fs::write(work.join(path), world_text("grows")).unwrap();
-    }
-    std::fs::write(work.join("a.txt"), "0123456789\n".repeat(50_000)).unwrap();
-    forge.commit_work_tree("lab/grows", "main");
-    std::fs::write(work.join(".gitattributes"), "*.txt working-tree-encoding=UTF-32LE\n").unwrap();
-    git(&work, &["add", ".gitattributes"]);
-    git(&work, &["commit", "--quiet", "--message", "attributes"]);
-    git(&work, &["push", "--quiet", "origin", "main"]);
-    forge.commit("lab/branches", "main", &[("worlds/a.wbt", &world_text("branches"))]);
-    let wrapper = GitWrapper::new(
-        "case \"$*\" in *ls-remote*lab/branches*) echo 'fatal: Out of memory, malloc failed (tried to allocate 9 bytes)' >&2; exit 128;; esac",
-    );
-    let builder = simulation_server(&webots.path(), forge.path(), 24).env("PATH", &wrapper.path());
-    let server = builder.set("projectSize", 1).start().await;
-    let count = |what: &str| wrapper.calls().iter().filter(|call| call.split(' ').any(|word| word == what)).count();
-    let all = async |repository: &str| {
-        let ask = |path: &String| {
-            let url = world(repository, "main", path);
-            let server = &server;
-            async move { outcome(server, &url).await }
-        };
-        join_all(worlds.iter().map(ask)).await
-    };
-    let told = all("lab/many").await;
-    assert!(
-        told.iter().all(|told| told == "loading: Error: The project has more than 10000 files and folders"),
-        "{told:?}"
-    );
-    // Each asks whether it is there, and one is answered.
-    assert!(count("ls-tree") <= worlds.len() + 1, "it was listed {} times", count("ls-tree"));
-    let told = all("lab/grows").await;
-    assert!(told.iter().all(|told| told == "loading: Error: The project is larger than 1 MiB"), "{told:?}");
-    let at_once = 2 * std::thread::available_parallelism().unwrap().get();
-    assert!((1..=at_once).contains(&count("checkout")), "{} copies were made", count("checkout"));
-    let before = count("ls-remote");
-    let told = all("lab/branches").await;
-    assert!(told.iter().all(|told| told.contains("takes more memory than this simulation server allows")), "{told:?}");
-    assert!(count("ls-remote") - before <= 4, "{} times its forge was asked", count("ls-remote") - before);
 }

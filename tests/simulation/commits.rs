@@ -1,7 +1,7 @@
 //! Commits by their hash: those of branches and tags, and nothing that a forge has from elsewhere.
 
-use super::checkout::{cached, outcome, reader, world_text};
 use super::git_wrapper::GitWrapper;
+use super::opened::{cached, outcome, reader, world_text};
 use crate::support::git::{Forge, WORLD, git, world};
 use crate::support::program::simulation_server;
 use crate::support::until;
@@ -86,7 +86,7 @@ async fn a_history_that_is_too_large_is_told() {
     let (forge, webots) = (Forge::with_arm(), reader());
     let work = forge.work_tree("lab/arm", "main");
     let old = forge.commit("lab/arm", "main", &[("worlds/a.wbt", &world_text("old"))]);
-    std::fs::write(work.join("noise"), super::checkout::noise(6 << 20)).unwrap();
+    std::fs::write(work.join("noise"), super::opened::noise(6 << 20)).unwrap();
     forge.commit_work_tree("lab/arm", "main");
     let server = simulation_server(&webots.path(), forge.path(), 2).set("projectSize", 1).start().await;
     let told = outcome(&server, &world("lab/arm", &old, "worlds/a.wbt")).await;

@@ -2,8 +2,8 @@
 
 use futures_util::future::join_all;
 
-use super::checkout::{cached, outcome, reader, world_text};
 use super::git_wrapper::GitWrapper;
+use super::opened::{cached, outcome, reader, world_text};
 use super::scene::stages;
 use crate::support::client::Client;
 use crate::support::git::{Forge, git, world};

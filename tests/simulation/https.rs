@@ -9,7 +9,7 @@ use std::sync::Arc;
 use rustls::pki_types::PrivateKeyDer;
 use rustls::{ServerConfig, ServerConnection, StreamOwned};
 
-use super::checkout::{cached, outcome, reader, world_text};
+use super::opened::{cached, outcome, reader, world_text};
 use crate::support::git::{Forge, git, world};
 use crate::support::program::{Builder, simulation_server};
 use crate::support::webots::Webots;

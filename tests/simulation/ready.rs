@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 
-use super::checkout::{outcome, world_text};
+use super::opened::{outcome, world_text};
 use super::scene::{DEMO, arm, instance_folders_in, nothing_left, stages};
 use crate::support::client::Client;
 use crate::support::git::{Forge, world};

@@ -1,6 +1,7 @@
 //! The session server's configuration: every key, its default, and the rules between keys.
 
 mod example;
+mod mail_address;
 mod name_server;
 mod server_entry;
 mod session_config;

@@ -7,10 +7,10 @@ use lettre::message::Mailbox;
 use serde::{Deserialize, Serialize};
 
 use super::example::Example;
+use super::mail_address;
 use super::name_server::NameServer;
 use super::server_entry::ServerEntry;
 use super::timing::Timing;
-use crate::session::mail_address;
 use crate::session::placement::Policy;
 use crate::shared::config::{Configuration, InvalidValue, changed_keys};
 use crate::shared::config::{

@@ -11,8 +11,7 @@ use tokio::net::unix::pipe::Receiver;
 use which::which;
 
 use super::git_error::GitError;
-use crate::shared::text::one_line;
-use crate::simulation::process::{ExitReason, ProcessGroup, SpawnSpec};
+use crate::simulation::process::{ExitReason, Lines, ProcessGroup, SpawnSpec};
 
 /// How git is run by this server.
 #[derive(Debug)]
@@ -81,6 +80,8 @@ const SETTINGS: &str = "\
 pub const MOST_MEMORY: u64 = 2 << 30;
 /// The most that is read of a command's answer, in bytes.
 const LARGEST_ANSWER: usize = 64 * 1024 * 1024;
+/// The most that is kept of a line of what it says besides, in bytes.
+const LONGEST_LINE: usize = 500;
 
 impl Git {
     /// Prepares git for the server whose run has this folder. `config` is the administrator's file of settings.
@@ -210,33 +211,21 @@ async fn read_all(pipe: Receiver) -> Vec<u8> {
 /// Passes on each line that git prints, also those that it overwrites. Returns the one that names the cause of a failure.
 async fn follow(mut pipe: impl AsyncRead + Unpin, mut progress: impl FnMut(&str)) -> String {
     let mut cause = String::new();
-    let mut line = Vec::new();
-    let mut chunk = [0; 4096];
-    while let Ok(length @ 1..) = pipe.read(&mut chunk).await {
-        for byte in chunk.iter().take(length) {
-            match byte {
-                b'\r' | b'\n' => finish(&mut line, &mut cause, &mut progress),
-                _ if line.len() < 500 => line.push(*byte),
-                _ => {}
-            }
-        }
-    }
-    finish(&mut line, &mut cause, &mut progress);
-    cause
-}
-
-fn finish(line: &mut Vec<u8>, cause: &mut String, progress: &mut impl FnMut(&str)) {
-    let text = one_line(String::from_utf8_lossy(line).trim());
-    line.clear();
-    if text.is_empty() {
-        return;
-    }
-    progress(&text);
     // The first fatal line names the cause, else the first error; what follows only tells what came of it.
     let weight = |text: &str| if text.starts_with("fatal:") { 2 } else { u8::from(text.starts_with("error:")) };
-    if weight(&text) > weight(cause) || weight(cause) == 0 {
-        *cause = text;
+    let mut told = |line: String| {
+        progress(&line);
+        if weight(&line) > weight(&cause) || weight(&cause) == 0 {
+            cause = line;
+        }
+    };
+    let mut lines = Lines::new(LONGEST_LINE);
+    let mut chunk = [0; 4096];
+    while let Ok(length @ 1..) = pipe.read(&mut chunk).await {
+        lines.feed(chunk.get(..length).unwrap_or_default(), &mut told);
     }
+    lines.end(told);
+    cause
 }
 
 #[cfg(test)]

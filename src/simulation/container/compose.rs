@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 
 use serde_json::{Value, json};
 
-use super::machine::Machine;
+use super::engine::Engine;
 use super::recipe::PROJECT_PATH;
 use super::templates::Template;
 use crate::simulation::config::{ContainerDisplay, EDITOR_PORT, SimulationConfig};
@@ -38,7 +38,7 @@ pub struct Parts<'parts> {
     /// Whether there is a Makefile.
     pub make: bool,
     /// What Docker offers.
-    pub machine: &'parts Machine,
+    pub engine: &'parts Engine,
 }
 
 /// Variables: names and values.
@@ -156,7 +156,7 @@ impl Parts<'_> {
                 json!({ "nofile": { "soft": limits.open_files.min(1024), "hard": limits.open_files }, "core": 0 }),
             ),
             ("logging", json!({ "driver": "none" })),
-            ("init", json!(self.machine.init)),
+            ("init", json!(self.engine.init)),
             // The daemon would run it, as often as the image says.
             ("healthcheck", json!({ "disable": true })),
         ]);
@@ -201,11 +201,11 @@ impl Parts<'_> {
             }
         }
         service.insert("volumes", json!(volumes));
-        if let Some(groups) = self.machine.graphics.as_ref().filter(|_| config.container.gpu) {
+        if let Some(groups) = self.engine.graphics.as_ref().filter(|_| config.container.gpu) {
             service.insert("devices", json!(["/dev/dri:/dev/dri"]));
             service.insert("group_add", json!(groups.iter().map(u32::to_string).collect::<Vec<_>>()));
         }
-        if self.machine.nvidia && config.container.gpu {
+        if self.engine.nvidia && config.container.gpu {
             let all = json!([{ "driver": "nvidia", "count": "all", "capabilities": ["gpu"] }]);
             service.insert("deploy", json!({ "resources": { "reservations": { "devices": all } } }));
             environment.push(("NVIDIA_DRIVER_CAPABILITIES", "all".to_owned()));

@@ -9,8 +9,8 @@ use tokio_util::task::AbortOnDropHandle;
 use super::compose::Parts;
 use super::copy::Copy;
 use super::docker::{Docker, SHORT};
+use super::engine::Engine;
 use super::image::{Build, Images};
-use super::machine::Machine;
 use super::network;
 use super::objects::{self, Owner};
 use super::packet_filter;
@@ -33,7 +33,7 @@ pub struct Containers {
     templates: Templates,
     images: Arc<Images>,
     live: Live,
-    machine: OnceCell<Machine>,
+    engine: OnceCell<Engine>,
     shortcoming: Option<String>,
     /// Who may have compose make containers now.
     turns: Semaphore,
@@ -70,7 +70,7 @@ impl Containers {
             templates,
             images,
             live,
-            machine: OnceCell::new(),
+            engine: OnceCell::new(),
             shortcoming,
             turns: Semaphore::new(2 * std::thread::available_parallelism().map_or(2, usize::from)),
             config,
@@ -187,11 +187,11 @@ impl Containers {
         (image, controller): (String, Option<String>),
         progress: &(impl Fn(String) + Send + Sync),
     ) -> Result<Prepared, String> {
-        let machine =
-            self.machine.get_or_try_init(|| Machine::ask(&self.docker)).await.map_err(|error| error.to_string())?;
+        let engine =
+            self.engine.get_or_try_init(|| Engine::ask(&self.docker)).await.map_err(|error| error.to_string())?;
         let volumes = self.volumes(&image, controller.as_deref(), &recipe).await?;
         let (config, templates) = (Arc::clone(&self.config), self.templates.clone());
-        let (name, machine, asks) = (lease.name.clone(), machine.clone(), recipe.asks.clone());
+        let (name, engine, asks) = (lease.name.clone(), engine.clone(), recipe.asks.clone());
         let files = move || {
             let world = world_in(&request.project)?;
             if matches!(asks.kind, Kind::Competition { .. }) {
@@ -213,7 +213,7 @@ impl Containers {
                 command: &command,
                 port: request.port,
                 make: recipe.make,
-                machine: &machine,
+                engine: &engine,
             };
             let template = templates.compose(&asks.kind)?;
             parts.write(&template, &config).map_err(|error| format!("The files for compose can't be written: {error}"))

@@ -9,8 +9,7 @@ use tokio::io::{AsyncRead, AsyncReadExt};
 use tokio::net::unix::pipe::Receiver;
 use which::which;
 
-use crate::shared::text::one_line;
-use crate::simulation::process::{ExitReason, ProcessGroup, SpawnSpec};
+use crate::simulation::process::{ExitReason, Lines, ProcessGroup, SpawnSpec};
 
 /// How Docker is called on this machine.
 #[derive(Debug, Clone)]
@@ -59,7 +58,7 @@ const LONGEST_LINE: usize = 1000;
 /// How much is read at once, in bytes, and how long is waited after it: a build that prints without end waits.
 const CHUNK: (usize, Duration) = (16 * 1024, Duration::from_millis(5));
 /// For so many lines it is waited once more: each is looked at and told, however short it is.
-const LINES: usize = 50;
+const LINES: u32 = 50;
 /// How a message begins that says that nobody listens.
 const NO_DAEMON: [&str; 4] = [
     "cannot connect to the docker daemon",
@@ -185,40 +184,25 @@ fn failure(command: String, printed: &str) -> DockerError {
 
 /// Reads an output to its end. Returns its last part, each line made printable.
 async fn read(mut output: impl AsyncRead + Unpin, mut told: impl FnMut(&str)) -> String {
-    let (mut kept, mut line) = (String::new(), Vec::new());
-    let mut chunk = vec![0; CHUNK.0];
+    let (mut kept, mut lines, mut chunk) = (String::new(), Lines::new(LONGEST_LINE), vec![0; CHUNK.0]);
     loop {
-        let length = output.read(&mut chunk).await.unwrap_or(0);
-        for byte in chunk.iter().take(length) {
-            match byte {
-                b'\r' | b'\n' => finish(&mut line, &mut kept, &mut told),
-                _ if line.len() < LONGEST_LINE => line.push(*byte),
-                _ => {}
+        let mut number = 0;
+        let keep = |line: String| {
+            number += 1;
+            told(&line);
+            if kept.len() > LONGEST_OUTPUT {
+                kept.clear();
             }
-        }
-        if length == 0 {
-            break;
-        }
-        let lines = chunk.iter().take(length).filter(|byte| **byte == b'\n').count();
-        let turns = u32::try_from(1 + lines / LINES).unwrap_or(u32::MAX);
-        actix_rt::time::sleep(CHUNK.1.saturating_mul(turns)).await;
+            kept.push_str(&line);
+            kept.push('\n');
+        };
+        let Ok(length @ 1..) = output.read(&mut chunk).await else {
+            lines.end(keep);
+            return kept;
+        };
+        lines.feed(chunk.get(..length).unwrap_or_default(), keep);
+        actix_rt::time::sleep(CHUNK.1.saturating_mul(1 + number / LINES)).await;
     }
-    finish(&mut line, &mut kept, &mut told);
-    kept
-}
-
-fn finish(line: &mut Vec<u8>, kept: &mut String, told: &mut impl FnMut(&str)) {
-    let text = one_line(String::from_utf8_lossy(line).trim_end());
-    line.clear();
-    if text.is_empty() {
-        return;
-    }
-    told(&text);
-    if kept.len() > LONGEST_OUTPUT {
-        kept.clear();
-    }
-    kept.push_str(&text);
-    kept.push('\n');
 }
 
 #[cfg(test)]

@@ -7,7 +7,7 @@ use super::docker::{Docker, DockerError, SHORT};
 
 /// What this machine's Docker offers.
 #[derive(Debug, Clone, Default)]
-pub struct Machine {
+pub struct Engine {
     /// A first process that ends what is left behind, and hands on signals (`docker-init`).
     pub init: bool,
     /// Graphics cards of NVIDIA, with the runtime for containers.
@@ -21,7 +21,7 @@ const DRI: &str = "/dev/dri";
 /// One of NVIDIA.
 const NVIDIA: &str = "/dev/nvidiactl";
 
-impl Machine {
+impl Engine {
     /// Asks Docker.
     ///
     /// # Errors

@@ -1,0 +1,55 @@
+//! Splits what a program prints into lines.
+
+use crate::shared::text::one_line;
+
+/// The line that a program is printing.
+#[derive(Debug)]
+pub struct Lines {
+    line: Vec<u8>,
+    longest: usize,
+}
+
+impl Lines {
+    /// For an output of whose lines so many bytes are kept; the rest of a longer one is left out.
+    #[must_use]
+    pub fn new(longest: usize) -> Self {
+        Self { line: Vec::new(), longest }
+    }
+
+    /// Tells each line that ends in these bytes, made printable; also those that the program overwrites (`\r`). Empty ones
+    /// are left out.
+    pub fn feed(&mut self, bytes: &[u8], mut told: impl FnMut(String)) {
+        for byte in bytes {
+            match byte {
+                b'\r' | b'\n' => self.end(&mut told),
+                _ if self.line.len() < self.longest => self.line.push(*byte),
+                _ => {}
+            }
+        }
+    }
+
+    /// Tells the line that the output has ended in, if there is one.
+    pub fn end(&mut self, mut told: impl FnMut(String)) {
+        let text = one_line(String::from_utf8_lossy(&self.line).trim_end());
+        self.line.clear();
+        if !text.is_empty() {
+            told(text);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn lines_come_whole_whatever_the_parts_they_are_read_in() {
+        let text: &[u8] = b"Step 1/2 : FROM a\r\n\x1b[31mred\n\n10%\r20%\nlonger than it may be\nlast";
+        for size in 1..text.len() {
+            let (mut lines, mut told) = (Lines::new(17), Vec::new());
+            text.chunks(size).for_each(|chunk| lines.feed(chunk, |line| told.push(line)));
+            lines.end(|line| told.push(line));
+            assert_eq!(told, ["Step 1/2 : FROM a", " [31mred", "10%", "20%", "longer than it ma", "last"]);
+        }
+    }
+}

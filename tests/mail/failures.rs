@@ -1,0 +1,145 @@
+//! Mail servers that refuse, hang or are not there.
+
+use std::time::{Duration, Instant};
+
+use ::log::Level;
+use serde_json::json;
+use webots_fleet::session::mail::{Event, test_mail};
+
+use super::log::{logged, wait_for_log};
+use super::{config, nothing_unexpected, notice, start};
+use crate::support::SOON;
+use crate::support::ports::dead_port;
+use crate::support::smtp::Smtp;
+
+#[actix_rt::test]
+async fn what_a_server_refuses_is_named() {
+    for (options, words) in [
+        (&["--refuse", "recipient"], "refuses the recipient admin@example.org: 550 5.1.1 no such user here"),
+        (&["--refuse", "mail"], "refuses the mail: 451 4.3.0 try again later"),
+        (&["--login", "fleet:s3cret"], "refuses the sender fleet@example.org: 530 5.7.0 Authentication required"),
+    ] {
+        let smtp = Smtp::start(options).await;
+        let error = test_mail(&config(smtp.port, &json!({}))).await.unwrap_err().to_string();
+        assert_eq!(error, format!("127.0.0.1:{}: {words}", smtp.port));
+    }
+}
+
+#[actix_rt::test]
+async fn a_test_mail_says_how_it_went() {
+    let mut smtp = Smtp::start(&[]).await;
+    let said = test_mail(&config(smtp.port, &json!({}))).await.unwrap();
+    let port = smtp.port;
+    let words = format!("127.0.0.1:{port} (not encrypted) took a mail for admin@example.org: 2.0.0 OK: queued");
+    assert_eq!(said, words);
+    let mail = smtp.mail().await;
+    assert_eq!(mail.subject(), "Test of the session server's notifications");
+    assert!(mail.field("text").contains("Nothing has happened"), "{mail:?}");
+}
+
+#[actix_rt::test]
+async fn a_dead_host_is_named() {
+    let (_reserved, dead) = dead_port();
+    let error = test_mail(&config(dead, &json!({}))).await.unwrap_err().to_string();
+    assert!(error.starts_with(&format!("127.0.0.1:{dead}: can't connect: Connection refused")), "{error}");
+    // A label of 64 letters can't be in any name server, so that none is asked.
+    let nobody = format!("{}.example.org", "a".repeat(64));
+    let error = test_mail(&config(25, &json!({"mailServer": nobody}))).await.unwrap_err().to_string();
+    assert!(error.starts_with(&format!("{nobody}:25: the name can't be resolved: ")), "{error}");
+}
+
+#[actix_rt::test]
+async fn a_mail_arrives_once_the_server_is_there() {
+    let (reserved, port) = dead_port();
+    let mailer = start(port, &json!({}));
+    mailer.send(notice("a", Event::NotResponding)).await.unwrap();
+    let failures = wait_for_log(Level::Warn, port, 2).await;
+    assert!(failures[0].contains("Connection refused"), "{failures:?}");
+    mailer.send(notice("b", Event::NotResponding)).await.unwrap();
+    mailer.send(notice("a", Event::WorkingAgain)).await.unwrap();
+    wait_for_log(Level::Warn, port, 4).await;
+    drop(reserved);
+    let mut smtp = Smtp::start(&["--port", &port.to_string()]).await;
+    let mut text = smtp.mail().await.field("text").to_owned();
+    // The end of the first failure may become due with the others or after them.
+    while !text.contains("a:2000: working again") {
+        text.push_str(smtp.mail().await.field("text"));
+    }
+    assert_eq!(text.matches("b:2000: not responding").count(), 1, "{text}");
+    assert_eq!(logged(Level::Error, port), [""; 0]);
+}
+
+#[actix_rt::test]
+async fn a_mail_is_given_up_with_one_line() {
+    let (reserved, port) = dead_port();
+    let mailer = start(port, &json!({"timing": {"mailPatience": 0.5}}));
+    mailer.send(notice("lost", Event::NotResponding)).await.unwrap();
+    let lines = wait_for_log(Level::Error, port, 1).await;
+    assert!(lines[0].starts_with("mail given up after 0.5 s (lost:2000 not responding): "), "{lines:?}");
+    drop(reserved);
+    let mut smtp = Smtp::start(&["--port", &port.to_string()]).await;
+    mailer.send(notice("new", Event::NotResponding)).await.unwrap();
+    assert_eq!(smtp.mail().await.subject(), "Simulation server not responding: new:2000");
+    assert_eq!(logged(Level::Error, port).len(), 1);
+}
+
+#[actix_rt::test]
+async fn what_is_refused_for_good_is_tried_seldom_and_given_up() {
+    let mut smtp = Smtp::start(&["--refuse", "recipient"]).await;
+    let mailer = start(smtp.port, &json!({"timing": {"mailRetry": 0.01, "mailPatience": 1.2}}));
+    mailer.send(notice("sim", Event::NotResponding)).await.unwrap();
+    let lines = wait_for_log(Level::Error, smtp.port, 1).await;
+    assert!(lines[0].contains("refuses the recipient"), "{lines:?}");
+    let tries = smtp.count("opened");
+    assert!((2..=8).contains(&tries), "{tries} tries; every 0.2 s for 1.2 s was asked for");
+}
+
+#[actix_rt::test]
+async fn a_silent_server_holds_up_nobody_and_leaves_nothing_open() {
+    let mut smtp = Smtp::start(&["--hang", "greeting"]).await;
+    let mailer = start(smtp.port, &json!({"timing": {"mailAnswer": 1, "mailPatience": 1.5}}));
+    mailer.send(notice("sim", Event::NotResponding)).await.unwrap();
+    smtp.wait_for("opened").await;
+    let asked = Instant::now();
+    mailer.send(notice("other", Event::NotResponding)).await.unwrap();
+    assert!(asked.elapsed() < Duration::from_millis(500), "a notice was taken after {:?}", asked.elapsed());
+    let lines = wait_for_log(Level::Warn, smtp.port, 1).await;
+    assert!(lines[0].ends_with("no answer within 1 s"), "{lines:?}");
+    wait_for_log(Level::Error, smtp.port, 2).await;
+    let opened = smtp.count("opened");
+    smtp.wait_for_times("closed", opened).await;
+}
+
+#[actix_rt::test]
+async fn a_server_that_sends_a_line_without_an_end_is_cut_off() {
+    use tokio::io::AsyncWriteExt;
+    let listener = tokio::net::TcpListener::bind(("127.0.0.1", 0)).await.unwrap();
+    let port = listener.local_addr().unwrap().port();
+    let flood = actix_rt::spawn(async move {
+        let (mut connection, _) = listener.accept().await.unwrap();
+        let mut sent = 0;
+        while connection.write_all(&[b'2'; 64 * 1024]).await.is_ok() {
+            sent += 64 * 1024;
+        }
+        sent
+    });
+    let error = test_mail(&config(port, &json!({}))).await.unwrap_err().to_string();
+    let words = "the connection broke: it sends more than 1024 KiB";
+    assert_eq!(error, format!("127.0.0.1:{port}: {words}"));
+    let sent = tokio::time::timeout(SOON, flood).await.expect("the connection is closed").unwrap();
+    // What the system keeps of a connection comes on top.
+    assert!(sent < 32 * 1024 * 1024, "{sent} bytes were taken");
+}
+
+#[actix_rt::test]
+async fn a_server_that_is_silent_at_the_end_has_the_mail_once() {
+    let mut smtp = Smtp::start(&["--hang", "quit"]).await;
+    let mailer = start(smtp.port, &json!({"timing": {"mailAnswer": 0.5}}));
+    mailer.send(notice("sim", Event::NotResponding)).await.unwrap();
+    smtp.mail().await;
+    wait_for_log(Level::Info, smtp.port, 1).await;
+    smtp.wait_for("closed").await;
+    mailer.send(notice("other", Event::NotResponding)).await.unwrap();
+    assert_eq!(smtp.mail().await.subject(), "Simulation server not responding: other:2000");
+    nothing_unexpected(smtp.port);
+}

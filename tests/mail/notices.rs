@@ -1,0 +1,110 @@
+//! What is mailed: one mail for what belongs together, with its words in text and HTML.
+
+use std::time::{Duration, Instant};
+
+use ::log::Level;
+use serde_json::json;
+use webots_fleet::session::mail::Event;
+
+use super::log::wait_for_log;
+use super::{nothing_unexpected, notice, start};
+use crate::support::smtp::Smtp;
+
+#[actix_rt::test]
+async fn a_notice_becomes_a_mail_in_text_and_html() {
+    let mut smtp = Smtp::start(&[]).await;
+    let mailer = start(smtp.port, &json!({}));
+    mailer.send(notice("sim1.example.org", Event::NotResponding)).await.unwrap();
+    let mail = smtp.mail().await;
+    assert_eq!(mail.field("from"), "fleet@example.org");
+    assert_eq!(mail.recipients(), ["admin@example.org"]);
+    assert_eq!(mail.header("To"), ["Admin <admin@example.org>"]);
+    assert_eq!(mail.header("Auto-Submitted"), ["auto-generated"]);
+    assert_eq!((mail.header("Date").len(), mail.header("Message-ID").len()), (1, 1));
+    assert_eq!(mail.subject(), "Simulation server not responding: sim1.example.org:2000");
+    let year = jiff::Timestamp::now().strftime("%Y-").to_string();
+    for body in [mail.field("text"), mail.field("html")] {
+        let parts = ["sim1.example.org:2000", "not responding", "97.2%", "connection refused", year.as_str()];
+        for part in parts.into_iter().chain(["https://session.example.org/1999/monitor"]) {
+            assert!(body.contains(part), "no {part:?} in {body}");
+        }
+    }
+    wait_for_log(Level::Info, smtp.port, 1).await;
+    nothing_unexpected(smtp.port);
+}
+
+#[actix_rt::test]
+async fn each_event_has_its_subject() {
+    let mut smtp = Smtp::start(&[]).await;
+    let mailer = start(smtp.port, &json!({}));
+    for (host, event, subject) in [
+        ("a", Event::NotResponding, "Simulation server not responding: a:2000"),
+        ("b", Event::WorkingAgain, "Simulation server working again: b:2000"),
+        ("c", Event::MaximumLoad, "Simulation server reached maximum load: c:2000"),
+        ("d", Event::AvailableAgain, "Simulation server available again: d:2000"),
+        ("dns+e", Event::LookupFails, "Lookup of simulation servers failing: dns+e:2000"),
+        ("dns+f", Event::LookupWorks, "Lookup of simulation servers working again: dns+f:2000"),
+    ] {
+        mailer.send(notice(host, event)).await.unwrap();
+        assert_eq!(smtp.mail().await.subject(), subject);
+    }
+    nothing_unexpected(smtp.port);
+}
+
+#[actix_rt::test]
+async fn a_thousand_servers_that_fail_together_are_one_mail() {
+    let mut smtp = Smtp::start(&[]).await;
+    let mailer = start(smtp.port, &json!({"timing": {"gather": 3}}));
+    for number in 0..1_000 {
+        mailer.do_send(notice(&format!("sim{number}"), Event::NotResponding));
+    }
+    let mail = smtp.mail().await;
+    assert_eq!(mail.subject(), "1000 simulation servers not responding");
+    for server in ["sim0:2000", "sim500:2000", "sim999:2000"] {
+        assert!(mail.field("text").contains(server), "no {server}");
+    }
+    // The next mail is the next notice's: nothing else was on its way.
+    mailer.send(notice("other", Event::MaximumLoad)).await.unwrap();
+    assert_eq!(smtp.mail().await.subject(), "Simulation server reached maximum load: other:2000");
+    nothing_unexpected(smtp.port);
+}
+
+#[actix_rt::test]
+async fn a_flapping_server_is_one_mail_in_its_time_with_a_count() {
+    let mut smtp = Smtp::start(&[]).await;
+    let mailer = start(smtp.port, &json!({"timing": {"flapping": 2}}));
+    let first = Instant::now();
+    mailer.send(notice("sim", Event::NotResponding)).await.unwrap();
+    assert_eq!(smtp.mail().await.subject(), "Simulation server not responding: sim:2000");
+    for turn in 0..9 {
+        let event = if turn % 2 == 0 { Event::WorkingAgain } else { Event::NotResponding };
+        mailer.do_send(notice("sim", event));
+    }
+    let mail = smtp.mail().await;
+    assert!(first.elapsed() > Duration::from_secs(2), "the second mail came after {:?}", first.elapsed());
+    assert_eq!(mail.subject(), "Simulation server working again: sim:2000");
+    for body in [mail.field("text"), mail.field("html")] {
+        assert!(body.contains("8 earlier notices about this server were held back"), "{body}");
+        assert!(body.contains("connection refused"), "no last error in {body}");
+    }
+    assert_eq!(smtp.count("mail"), 2);
+    nothing_unexpected(smtp.port);
+}
+
+#[actix_rt::test]
+async fn nothing_from_outside_gets_into_the_headers_or_the_html() {
+    let mut smtp = Smtp::start(&[]).await;
+    let mailer = start(smtp.port, &json!({}));
+    let mut evil = notice("sim\r\nBcc: thief@example.com\r\n\r\nbody", Event::NotResponding);
+    evil.error = Some("<script>alert(1)</script>\r\n.\r\nRCPT TO:<thief@example.com>\u{1b}[2J".to_owned());
+    mailer.send(evil).await.unwrap();
+    let mail = smtp.mail().await;
+    assert_eq!(mail.recipients(), ["admin@example.org"]);
+    assert!(mail.header("Bcc").is_empty(), "{mail:?}");
+    assert_eq!(mail.subject(), "Simulation server not responding: sim  Bcc: thief@example.com    body:2000");
+    assert!(!mail.field("html").contains("<script>"), "{mail:?}");
+    assert!(!mail.field("text").contains('\u{1b}'), "{mail:?}");
+    wait_for_log(Level::Info, smtp.port, 1).await;
+    assert_eq!(smtp.commands(), ["EHLO", "MAIL", "RCPT", "DATA", "QUIT"]);
+    nothing_unexpected(smtp.port);
+}

@@ -1,0 +1,50 @@
+//! What the tests of checkouts share: a Webots that tells what it was given, and what is left on the disk.
+
+use std::path::{Path, PathBuf};
+
+use crate::support::client::Client;
+use crate::support::program::Server;
+use crate::support::webots::Webots;
+
+/// A Webots that tells which world it was given, and ends: its client hears the world's second line.
+pub fn reader() -> Webots {
+    Webots::script("for last; do :; done\necho \"opened [$(sed -n 2p \"$last\")] $last\"\nexit 1")
+}
+
+pub fn world_text(mark: &str) -> String {
+    format!("#VRML_SIM R2025a utf8\n{mark}\n")
+}
+
+/// What a client that asks for a world is told in the end.
+pub async fn outcome(server: &Server, world: &str) -> String {
+    let mut client = Client::start(server, world).await;
+    let told = client.until("loading: Error:").await;
+    assert_eq!(client.closed().await, Some(1000));
+    told
+}
+
+pub fn size_of(folder: &Path) -> u64 {
+    let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
+    entries
+        .map(|entry| {
+            if entry.path().is_dir() { size_of(&entry.path()) } else { entry.metadata().map_or(0, |about| about.len()) }
+        })
+        .sum()
+}
+
+/// Bytes that can't be packed.
+pub fn noise(bytes: usize) -> Vec<u8> {
+    let mut state = 0x9e37_79b9_7f4a_7c15_u64 ^ (bytes as u64);
+    let mut next = || {
+        state ^= state << 13;
+        state ^= state >> 7;
+        state ^= state << 17;
+        state
+    };
+    (0..bytes.div_ceil(8)).flat_map(|_| next().to_le_bytes()).collect()
+}
+
+pub fn cached(server: &Server) -> Vec<PathBuf> {
+    let entries = std::fs::read_dir(server.folder.join("cache/git")).unwrap().flatten().map(|entry| entry.path());
+    entries.filter(|path| path.is_dir()).collect()
+}
