@@ -4,8 +4,11 @@ use std::time::{Duration, Instant};
 
 use futures_util::StreamExt;
 
-use crate::support::client::{Client, Heard};
-use crate::support::program::session_server;
+use crate::support::client::Client;
+use crate::support::git::Forge;
+use crate::support::ports::dead_port;
+use crate::support::program::{session_server, simulation_server};
+use crate::support::webots::Webots;
 
 /// How many clients there are.
 const CLIENTS: usize = 5_000;
@@ -17,27 +20,33 @@ async fn five_thousand_clients_come_back_at_once_and_hear_the_truth() {
     let limits = nix::sys::resource::getrlimit(nix::sys::resource::Resource::RLIMIT_NOFILE).unwrap();
     nix::sys::resource::setrlimit(nix::sys::resource::Resource::RLIMIT_NOFILE, limits.1, limits.1).unwrap();
     let folder = tempfile::tempdir().unwrap();
-    let configure = || session_server(&["127.0.0.1:1".to_owned()]).set("maxClientsPerAddress", 2 * CLIENTS);
+    let (reserved, simulation_port) = dead_port();
+    let servers = [format!("127.0.0.1:{simulation_port}")];
+    // However busy this machine is, its simulation server is not full.
+    let configure =
+        || session_server(&servers).set("maxClientsPerAddress", 2 * CLIENTS).set("loadThreshold", 1_000_000);
     let mut session = configure().folder(folder.path()).start().await;
     let port = session.port;
     let url = session.websocket("/");
-    let clients = come(&url).await;
+    let clients = come(&url, "0").await;
     session.signal(nix::sys::signal::Signal::SIGKILL);
     session.ended().await;
-    drop(clients);
+    drop((clients, reserved));
+    let (forge, webots) = (Forge::new(), Webots::launcher());
+    let _simulation = simulation_server(&webots.path(), forge.path(), 1).port(simulation_port).start().await;
     let session = configure().folder(folder.path()).port(port).start().await;
     let began = Instant::now();
-    let clients = come(&url).await;
+    let clients = come(&url, "1").await;
     assert!(began.elapsed() < BOUND, "it took {:?}", began.elapsed());
     let status = crate::support::http::get(&session.url("/status")).await.json();
     assert_eq!(status["clients"], clients.len());
 }
 
-/// Lets all clients connect, and waits until each has heard that no server is available.
-async fn come(url: &str) -> Vec<Client> {
+/// Lets all clients connect, and waits until each has heard whether a server is available.
+async fn come(url: &str, truth: &str) -> Vec<Client> {
     let coming = futures_util::stream::iter(0..CLIENTS).map(|_| async {
         let mut client = Client::connect(url).await;
-        assert!(matches!(client.next().await, Heard::Text(text) if text == "0"));
+        client.until(truth).await;
         client
     });
     // As many at a time as this one program can play.

@@ -78,10 +78,10 @@ pub(super) struct Backend {
     in_flight: VecDeque<Placement>,
     /// How many of them take room.
     reserved: usize,
-    /// For how many clients each of them stands: itself, and those that other session servers send meanwhile.
+    /// How many of these have been placed since the last report.
+    fresh: usize,
+    /// How many clients come for each that is placed here, those of other session servers included.
     clients_per_placement: f64,
-    /// The part of a placement of ours that the arrivals until now make up; the rest of a division.
-    arrived_part: f64,
     settling: VecDeque<Change>,
     /// What `settling` hid from the last report.
     unseen: Unseen,
@@ -102,8 +102,8 @@ impl Backend {
             last: None,
             in_flight: VecDeque::new(),
             reserved: 0,
+            fresh: 0,
             clients_per_placement: 1.0,
-            arrived_part: 0.0,
             settling: VecDeque::new(),
             unseen: Unseen::default(),
             fit: CostFit::new(policy.client_cost),
@@ -130,6 +130,7 @@ impl Backend {
             return;
         }
         self.note_changes(now, report.instances, peers);
+        self.fresh = 0;
         self.settle(now, policy);
         self.learn(now, report);
         self.last = Some((now, report));
@@ -146,6 +147,7 @@ impl Backend {
     pub(super) fn place(&mut self, now: Instant, takes_room: bool) {
         self.in_flight.push_back(Placement { at: now, takes_room });
         self.reserved += usize::from(takes_room);
+        self.fresh += usize::from(takes_room);
     }
 
     /// Gives up the clients that should have come by now.
@@ -168,7 +170,7 @@ impl Backend {
             return false;
         };
         let has_place = report.instances.is_none_or(|instances| {
-            let taken = f64::from(instances.present) + count(self.reserved) * self.clients_per_placement;
+            let taken = f64::from(instances.present) + count(self.reserved) + self.sent_by_others();
             instances.accepting && taken < f64::from(instances.places)
         });
         has_place && self.effective_load().is_some_and(|load| load < self.limit(policy))
@@ -195,8 +197,13 @@ impl Backend {
         let (_, Report { load, .. }) = self.last.filter(|_| self.up)?;
         // How far a full machine is over is not known, so those who left may not have made it less than full.
         let unseen = if load < FULL { unseen } else { unseen.max(0.0) };
-        let ahead = unseen + count(in_flight) * self.clients_per_placement;
+        let ahead = unseen + count(in_flight) + self.sent_by_others();
         Some((load + self.cost * ahead).max(0.0))
+    }
+
+    /// How many clients other session servers have sent here since the last report, as far as can be known.
+    fn sent_by_others(&self) -> f64 {
+        count(self.fresh.min(self.reserved)) * (self.clients_per_placement - 1.0)
     }
 
     /// How many clients were sent here and have neither been seen nor given up.
@@ -264,9 +271,9 @@ impl Backend {
             self.fit.count_arrivals(f64::from(new.present));
             return;
         };
-        let arrivals = count(usize::try_from(new.arrivals - old.arrivals).unwrap_or(usize::MAX));
-        let came = self.own_part(arrivals);
-        peers.count(arrivals, count(came));
+        let arrivals = usize::try_from(new.arrivals - old.arrivals).unwrap_or(usize::MAX);
+        let came = arrivals.min(self.in_flight.len());
+        peers.count(count(arrivals), count(came));
         self.clients_per_placement = peers.clients_per_placement();
         // The latest placements are taken to be those that came. Nothing tells clients apart; were the oldest taken, then
         // a client that never comes would stay in flight as long as others follow it.
@@ -283,27 +290,8 @@ impl Backend {
             self.settling.push_back(Change { at, clients: others, takes_room: true });
         }
     }
-
-    /// How many of so many arrivals are placements of ours; the others were sent by other session servers.
-    fn own_part(&mut self, arrivals: f64) -> usize {
-        let part = self.arrived_part + arrivals / self.clients_per_placement;
-        let whole = part.round();
-        if whole >= count(self.in_flight.len()) {
-            self.arrived_part = 0.0;
-            return self.in_flight.len();
-        }
-        self.arrived_part = part - whole;
-        #[expect(
-            clippy::cast_possible_truncation,
-            clippy::cast_sign_loss,
-            reason = "it is less than a length, and no part is under -1/2"
-        )]
-        let whole = whole as usize;
-        whole
-    }
 }
 
-/// A number of clients to reckon with.
 #[expect(clippy::cast_precision_loss, reason = "there are no 2^52 clients")]
 fn count(clients: usize) -> f64 {
     clients as f64

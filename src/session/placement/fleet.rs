@@ -320,6 +320,25 @@ mod tests {
         assert!(placed.iter().all(|placed| (95..=115).contains(placed)), "200 places are left: {placed:?}");
     }
 
+    #[test]
+    fn a_session_server_that_is_alone_now_fills_the_fleet_all_the_same() {
+        let now = Instant::now();
+        let report = |present, arrivals| {
+            let instances = Instances { present, places: 20, arrivals, accepting: true };
+            Report { load: 1.0, instances: Some(instances) }
+        };
+        let mut fleet = fleet(0.25, now, [report(0, 0)]);
+        // All of them were sent by others.
+        fleet.report(&0, now + Duration::from_secs(1), report(0, 1_000));
+        let mut placed = 0;
+        for second in 2..15 {
+            let at = now + Duration::from_secs(second);
+            placed += std::iter::from_fn(|| fleet.place(at, |_| true)).count();
+            fleet.report(&0, at, report(0, 1_000));
+        }
+        assert_eq!(placed, 20, "of 20 clients that wait for 20 places");
+    }
+
     /// Sends so many clients at once; returns how many each server got.
     fn burst(fleet: &mut Fleet<u32>, now: Instant, clients: usize, servers: u32) -> Vec<usize> {
         for _ in 0..clients {

@@ -2,7 +2,7 @@
 //!
 //! Session servers share nothing, so none sees what the others have placed since the last reports. But each sees how many
 //! clients come and how many of them it has sent, so it knows for how many each of its placements stands: with three like
-//! it beside it, for four. Dispatchers that take the arrivals of all to be theirs times their number are known from
+//! it beside it, for four. What is learned counts from one report of a server to the next, so that a mistake is short. Dispatchers that take the arrivals of all to be theirs times their number are known from
 //! Goren, Vargaftik and Moses, "Stochastic Coordination in Heterogeneous Load Balancing Systems" (PODC 2021); here the number
 //! is learned instead of set.
 
@@ -10,8 +10,8 @@
 const MEMORY: f64 = 200.0;
 /// What is believed from the beginning, that nobody else sends clients, weighs as much as so many of them.
 const DOUBT: f64 = 20.0;
-/// The most that is believed: more session servers are not recommended, and one who starts simulations elsewhere only to be
-/// counted is not to close the fleet.
+/// The most that is believed: more session servers are not recommended, and somebody who starts simulations without asking
+/// for a server is not to close the fleet.
 const MOST: f64 = 4.0;
 
 /// The clients that came to the servers of a fleet, and how many of them were sent from here.
