@@ -23,8 +23,7 @@ async fn five_thousand_clients_come_back_at_once_and_hear_the_truth() {
     let (reserved, simulation_port) = dead_port();
     let servers = [format!("127.0.0.1:{simulation_port}")];
     // However busy this machine is, its simulation server is not full.
-    let configure =
-        || session_server(&servers).set("maxClientsPerAddress", 2 * CLIENTS).set("loadThreshold", 1_000_000);
+    let configure = || session_server(&servers).set("maxClientsPerAddress", 2 * CLIENTS).set("loadThreshold", 1_000);
     let mut session = configure().folder(folder.path()).start().await;
     let port = session.port;
     let url = session.websocket("/");

@@ -109,6 +109,6 @@ async fn a_host_with_a_quote_is_refused_in_one_line() {
     let told = refused(&project, &["start", "demo"], 2).await;
     assert_eq!(
         told,
-        "error: config/simulation/demo.json: server: \"a\\\"b\" is no host; allowed are names and addresses\n"
+        "error: config/simulation/demo.json: server: \"a\\\"b\" is no host; allowed are names and addresses, those of IPv6 in brackets\n"
     );
 }

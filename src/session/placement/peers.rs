@@ -2,9 +2,10 @@
 //!
 //! Session servers share nothing, so none sees what the others have placed since the last reports. But each sees how many
 //! clients come and how many of them it has sent, so it knows for how many each of its placements stands: with three like
-//! it beside it, for four. What is learned counts from one report of a server to the next, so that a mistake is short. Dispatchers that take the arrivals of all to be theirs times their number are known from
-//! Goren, Vargaftik and Moses, "Stochastic Coordination in Heterogeneous Load Balancing Systems" (PODC 2021); here the number
-//! is learned instead of set.
+//! it beside it, for four. That counts from one report of a server to the next, so that a mistake is short.
+//!
+//! Dispatchers that take the arrivals of all to be theirs times their number are known from Goren, Vargaftik and Moses,
+//! "Stochastic Coordination in Heterogeneous Load Balancing Systems" (PODC 2021); here the number is learned instead of set.
 
 /// After so many clients, what was seen before them weighs 1/e.
 const MEMORY: f64 = 200.0;

@@ -34,7 +34,11 @@ pub struct NoAddress {
 pub fn check_host(host: &str, rewritten: bool) -> Result<(), String> {
     let address = format!("{host}{}1", if rewritten { '/' } else { ':' });
     let plain = address.parse::<PublicAddress>().is_ok();
-    if plain { Ok(()) } else { Err(format!("{host:?} is no host; allowed are names and addresses")) }
+    if plain {
+        Ok(())
+    } else {
+        Err(format!("{host:?} is no host; allowed are names and addresses, those of IPv6 in brackets"))
+    }
 }
 
 impl PublicAddress {
