@@ -1,0 +1,81 @@
+//! Name servers that fail, or know less than others.
+
+use std::net::IpAddr;
+use std::time::{Duration, Instant};
+
+use futures_util::future::join_all;
+use serde_json::json;
+
+use super::stand_in::{Manner, StandIn};
+use super::{times_logged, until_states};
+use crate::support::name_server::NameServer;
+use crate::support::odd_name_server::{Kind, OddNameServer, Reply};
+use crate::support::program::session_server;
+use crate::support::{http, ports, until};
+
+fn loopback(last: &[u8]) -> Vec<IpAddr> {
+    last.iter().map(|last| [127, 0, 0, *last].into()).collect()
+}
+
+fn stand_ins(last: &[u8], port: u16) -> Vec<StandIn> {
+    let start = |address| StandIn::start_on((address, port).into(), Manner::idle(5.0, 1000));
+    loopback(last).into_iter().map(start).collect()
+}
+
+#[actix_rt::test]
+async fn one_name_server_that_knows_a_name_is_enough() {
+    let (good, port) = (NameServer::start(&[]), ports::block(1));
+    let _servers = stand_ins(&[2, 3, 4], port);
+    good.set("fleet.test", &loopback(&[2, 3]));
+    let name = format!("dns+fleet.test:{port}");
+    let replies = [Reply::Silence, Reply::Code(0), Reply::Code(2), Reply::Code(3), Reply::Code(5)];
+    let watched = join_all(replies.map(async |reply| {
+        let odd = OddNameServer::start(move |_| reply);
+        let session = session_server(std::slice::from_ref(&name))
+            .set("nameServers", json!([odd.address(), good.address()]))
+            .start()
+            .await;
+        until_states(&session, &["up"; 2]).await;
+        // Each lookup asks it twice at least.
+        until("several lookups are done", async || odd.asked() >= 12).await;
+        (session, odd)
+    }))
+    .await;
+    good.set("fleet.test", &loopback(&[2, 3, 4]));
+    let begin = Instant::now();
+    join_all(watched.iter().map(|(session, _)| until_states(session, &["up"; 3]))).await;
+    assert!(begin.elapsed() < Duration::from_secs(5), "used after {:?}", begin.elapsed());
+    for ((session, _), reply) in watched.iter().zip(replies) {
+        for told in ["down", "up"] {
+            let told = times_logged(session, &format!("{name}: {told}: "));
+            assert_eq!(told, 0, "beside one with {reply:?}: {}", session.log());
+        }
+        assert!(http::get(&session.url("/status")).await.json()["names"][0]["error"].is_null());
+    }
+}
+
+#[actix_rt::test]
+async fn a_name_is_unknown_only_where_no_name_server_knows_it() {
+    let odd = [Reply::Code(3), Reply::Code(0)].map(|reply| OddNameServer::start(move |_| reply));
+    let session = session_server(&["dns+fleet.test:2000".to_owned()])
+        .set("nameServers", json!(odd.each_ref().map(OddNameServer::address)))
+        .start()
+        .await;
+    until("it is told", async || times_logged(&session, "dns+fleet.test:2000: down: DNS has no such records") == 1)
+        .await;
+}
+
+#[actix_rt::test]
+async fn ipv4_addresses_are_enough_where_nothing_is_told_of_ipv6() {
+    let port = ports::block(1);
+    let _servers = stand_ins(&[2], port);
+    for reply in [Reply::Code(2), Reply::Silence] {
+        let half =
+            OddNameServer::start(move |kind| if kind == Kind::A { Reply::Address([127, 0, 0, 2]) } else { reply });
+        let session =
+            session_server(&[format!("dns+fleet.test:{port}")]).set("nameServers", json!(half.address())).start().await;
+        until_states(&session, &["up"]).await;
+        until("several lookups are done", async || half.asked() >= 8).await;
+        assert_eq!(times_logged(&session, "fleet.test"), 1, "what it leads to: {}", session.log());
+    }
+}
