@@ -1,11 +1,13 @@
 //! Name servers that fail, or know less than others.
 
+use std::io::Write;
 use std::net::IpAddr;
 use std::time::{Duration, Instant};
 
 use futures_util::future::join_all;
 use serde_json::json;
 
+use super::names::own_mounts;
 use super::stand_in::{Manner, StandIn};
 use super::{times_logged, until_states};
 use crate::support::name_server::NameServer;
@@ -63,6 +65,53 @@ async fn a_name_is_unknown_only_where_no_name_server_knows_it() {
         .await;
     until("it is told", async || times_logged(&session, "dns+fleet.test:2000: down: DNS has no such records") == 1)
         .await;
+}
+
+#[actix_rt::test]
+async fn targets_of_a_service_that_only_the_name_server_knows_stay_when_it_fails() {
+    let [target, fixed] = [(); 2].map(|()| StandIn::start(Manner::idle(5.0, 1000)));
+    let mut names = NameServer::start(&[format!("_webots._tcp.lab.test,node1.lab.test,{}", target.port())]);
+    names.set("node1.lab.test node2.lab.test", &loopback(&[1]));
+    let listed = format!("node2.lab.test:{}", fixed.port());
+    let session = session_server(&[listed, "dnssrv+_webots._tcp.lab.test".to_owned()])
+        .set("nameServers", json!(names.address()))
+        .start()
+        .await;
+    until_states(&session, &["up"; 2]).await;
+    names.end();
+    // Answers of the name server are used for ten seconds, which a look each 0.1 s does not reach before the 101st.
+    let asked = target.requests();
+    until("the answer is old", async || target.requests() > asked + 110).await;
+    let port = target.port();
+    drop(target);
+    until_states(&session, &["up", "down"]).await;
+    let _target = StandIn::start_at(port, Manner::idle(5.0, 1000));
+    until_states(&session, &["up"; 2]).await;
+}
+
+#[actix_rt::test]
+async fn names_of_servers_that_no_name_server_knows_are_asked_of_the_machine() {
+    let Some(unshare) = own_mounts() else {
+        let why = "SKIPPED, for unshare --mount is not allowed here: \
+                   names_of_servers_that_no_name_server_knows_are_asked_of_the_machine";
+        return writeln!(std::io::stderr(), "{why}").unwrap();
+    };
+    let (names, server) = (NameServer::start(&[]), StandIn::start(Manner::idle(5.0, 1000)));
+    let hosts = tempfile::NamedTempFile::new().unwrap();
+    std::fs::write(hosts.path(), "127.0.0.1 localhost node3.test\n").unwrap();
+    let mount = format!("mount --bind {} /etc/hosts && exec \"$0\" \"$@\"", hosts.path().display());
+    let silent = OddNameServer::start(|_| Reply::Silence);
+    for name_server in [names.address(), silent.address()] {
+        let session = session_server(&[format!("node3.test:{}", server.port())])
+            .set("nameServers", json!(name_server))
+            .set("timing", json!({"answer": 15}))
+            .before(&format!("exec {unshare} sh -c '{mount}' \"$0\" \"$@\""))
+            .start()
+            .await;
+        until_states(&session, &["up"]).await;
+        assert_eq!(times_logged(&session, ": down: "), 0, "{}", session.log());
+    }
+    assert!(silent.asked() > 0);
 }
 
 #[actix_rt::test]
