@@ -1,6 +1,6 @@
 //! A DNS server that answers as no real one would be told to: with errors, with nothing at all, or with half of what it knows.
 
-use std::net::UdpSocket;
+use std::net::{IpAddr, SocketAddr, UdpSocket};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::time::Duration;
@@ -12,8 +12,8 @@ pub enum Reply {
     Silence,
     /// No records, with this response code: 0 no error, 2 failure, 3 no such name, 5 refused.
     Code(u8),
-    /// One A record.
-    Address([u8; 4]),
+    /// One A or AAAA record.
+    Address(IpAddr),
 }
 
 /// Which records a question is about.
@@ -26,7 +26,7 @@ pub enum Kind {
 
 /// The server. It ends with this value.
 pub struct OddNameServer {
-    port: u16,
+    address: SocketAddr,
     asked: Arc<AtomicUsize>,
     end: Arc<AtomicBool>,
 }
@@ -34,11 +34,15 @@ pub struct OddNameServer {
 impl OddNameServer {
     /// Starts one that answers like this.
     pub fn start(reply: impl Fn(Kind) -> Reply + Send + 'static) -> Self {
-        let socket = UdpSocket::bind("127.0.0.1:0").unwrap();
+        Self::start_on(UdpSocket::bind("127.0.0.1:0").unwrap(), reply)
+    }
+
+    /// Starts one at a socket that there is.
+    pub fn start_on(socket: UdpSocket, reply: impl Fn(Kind) -> Reply + Send + 'static) -> Self {
         socket.set_read_timeout(Some(Duration::from_millis(50))).unwrap();
-        let port = socket.local_addr().unwrap().port();
+        let address = socket.local_addr().unwrap();
         let (asked, end) = (Arc::new(AtomicUsize::new(0)), Arc::new(AtomicBool::new(false)));
-        let server = Self { port, asked: asked.clone(), end: end.clone() };
+        let server = Self { address, asked: asked.clone(), end: end.clone() };
         std::thread::spawn(move || {
             let mut buffer = [0; 4096];
             while !end.load(Ordering::Relaxed) {
@@ -54,7 +58,7 @@ impl OddNameServer {
 
     /// `HOST:PORT`.
     pub fn address(&self) -> String {
-        format!("127.0.0.1:{}", self.port)
+        self.address.to_string()
     }
 
     /// How many questions have come.
@@ -88,9 +92,13 @@ fn answer(query: &[u8], reply: impl Fn(Kind) -> Reply) -> Option<Vec<u8>> {
     message.extend([0x85, 0x80 | code, 0, 1, 0, u8::from(address.is_some()), 0, 0, 0, 0]);
     message.extend(question);
     if let Some(address) = address {
-        // The name of the question, A, IN, for ten minutes, four bytes.
-        message.extend([0xc0, HEADER as u8, 0, 1, 0, 1, 0, 0, 2, 0x58, 0, 4]);
-        message.extend(address);
+        let (kind, bytes) = match address {
+            IpAddr::V4(address) => (1, address.octets().to_vec()),
+            IpAddr::V6(address) => (28, address.octets().to_vec()),
+        };
+        // The name of the question, the kind, IN, for ten minutes, the length.
+        message.extend([0xc0, HEADER as u8, 0, kind, 0, 1, 0, 0, 2, 0x58, 0, bytes.len() as u8]);
+        message.extend(bytes);
     }
     Some(message)
 }

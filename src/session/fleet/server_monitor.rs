@@ -22,9 +22,7 @@ use rustls::ClientConfig;
 use super::caching_resolver::CachingResolver;
 use super::probe_error::ProbeError;
 use crate::session::config::{NameServer, SessionConfig};
-use crate::shared::domain::Load;
-use crate::shared::domain::PublicAddress;
-use crate::shared::domain::ServerReport;
+use crate::shared::domain::{Load, PublicAddress, ServerReport};
 use crate::shared::http::tls;
 use crate::shared::text::excerpt;
 
