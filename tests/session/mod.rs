@@ -6,6 +6,7 @@ mod discovery;
 mod door;
 mod mail;
 mod memory;
+mod name_servers;
 mod names;
 mod placement;
 mod pushing;

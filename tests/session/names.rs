@@ -14,7 +14,7 @@ use crate::support::program::session_server;
 use crate::support::{http, until};
 
 /// How to get a view of the file system of one's own, if that is allowed here: for root, or with a user of one's own.
-fn own_mounts() -> Option<&'static str> {
+pub(super) fn own_mounts() -> Option<&'static str> {
     let works =
         |command: &&str| Command::new("sh").args(["-c", &format!("{command} true")]).output().unwrap().status.success();
     ["unshare --mount", "unshare --mount --map-root-user"].into_iter().find(works)

@@ -164,6 +164,8 @@ async fn a_fault_of_the_configuration_is_one_line_and_exit_code_2() {
         ("simulationServers", json!(["dns+a"]), ["simulationServers[0]", "dns+NAME:PORT"]),
         ("simulationServers", json!(["dnssrv+a.b", "dnssrv+A.b"]), ["simulationServers", "twice"]),
         ("nameServers", json!(["dns.example.org"]), ["nameServers", "is no DNS server"]),
+        ("nameServers", json!("127.0.0.1:0"), ["nameServers", "is no DNS server"]),
+        ("nameServers", json!(["[::1]:0"]), ["nameServers", "is no DNS server"]),
         ("drainedServers", json!(["a:1"]), ["drainedServers", "a:1"]),
         ("loadThreshold", json!(-1), ["loadThreshold", "-1"]),
         ("loadRefresh", json!(0), ["loadRefresh", "0"]),

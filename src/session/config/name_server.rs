@@ -17,8 +17,12 @@ impl TryFrom<String> for NameServer {
 
     fn try_from(text: String) -> Result<Self, String> {
         let alone = text.parse::<IpAddr>().map(|address| SocketAddr::new(address, PORT));
-        alone.or_else(|_| text.parse()).map(Self).map_err(|_| {
-            format!("{text:?} is no DNS server; allowed are addresses (10.0.0.53) and addresses with a port (127.0.0.1:8600)")
+        let address = alone.or_else(|_| text.parse()).ok().filter(|address| address.port() != 0);
+        address.map(Self).ok_or_else(|| {
+            format!(
+                "{text:?} is no DNS server; allowed are addresses (10.0.0.53) and addresses with a port from 1 on \
+                 (127.0.0.1:8600)"
+            )
         })
     }
 }

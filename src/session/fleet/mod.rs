@@ -6,6 +6,7 @@ mod fleet_status;
 mod lookup;
 mod monitors;
 mod name_monitor;
+mod name_servers;
 mod names;
 mod pick;
 mod probe_error;

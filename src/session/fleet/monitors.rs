@@ -35,9 +35,9 @@ impl Monitors {
     /// Starts the monitor of a simulation server.
     pub fn watch(&self, server: &PublicAddress, config: &SessionConfig, results: &Results) -> Addr<ServerMonitor> {
         let (server, tls, results) = (server.clone(), self.tls.clone(), results.probes.clone());
-        let settings = ProbeSettings::new(config);
+        let (settings, name_servers) = (ProbeSettings::new(config), config.name_servers.clone());
         ServerMonitor::start_in_arbiter(&self.thread.handle(), move |_| {
-            ServerMonitor::new(server, settings, tls, results)
+            ServerMonitor::new(server, settings, name_servers, tls, results)
         })
     }
 

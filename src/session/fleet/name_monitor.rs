@@ -8,7 +8,8 @@ use std::time::Duration;
 
 use actix::prelude::*;
 
-use super::lookup::{Found, LookupError, look_up};
+use super::lookup::{Found, look_up};
+use super::name_servers::LookupError;
 use super::server_monitor::Stop;
 use crate::session::config::{DnsName, NameServer};
 

@@ -84,8 +84,13 @@ impl Names {
         let failed = looked.error.is_some();
         let mut servers = false;
         let turn = match answer {
-            Ok(found) => {
+            Ok(mut found) => {
                 looked.error = None;
+                if !found.complete {
+                    // What is not told of has not gone.
+                    let by_ipv6 = |server: &&PublicAddress| server.host().starts_with('[');
+                    found.servers.extend(looked.servers.iter().filter(by_ipv6).cloned());
+                }
                 servers = found.servers != looked.servers;
                 looked.servers = found.servers;
                 failed.then_some(Turn::WorksAgain(looked.servers.len()))

@@ -21,10 +21,8 @@ use rustls::ClientConfig;
 
 use super::caching_resolver::CachingResolver;
 use super::probe_error::ProbeError;
-use crate::session::config::SessionConfig;
-use crate::shared::domain::Load;
-use crate::shared::domain::PublicAddress;
-use crate::shared::domain::ServerReport;
+use crate::session::config::{NameServer, SessionConfig};
+use crate::shared::domain::{Load, PublicAddress, ServerReport};
 use crate::shared::http::tls;
 use crate::shared::text::excerpt;
 
@@ -103,10 +101,10 @@ enum Answer {
 }
 
 /// An HTTP client that keeps one connection to the simulation server.
-fn client(interval: Duration, tls: Option<Arc<ClientConfig>>) -> awc::Client {
+fn client(interval: Duration, name_servers: Vec<NameServer>, tls: Option<Arc<ClientConfig>>) -> awc::Client {
     let idle = (interval * 3).max(Duration::from_secs(15));
     // A probe as a whole has a time limit, its parts have none.
-    let resolver = Resolver::custom(CachingResolver::default());
+    let resolver = Resolver::custom(CachingResolver::new(name_servers));
     let tcp = TcpConnector::new(resolver).service();
     let mut connector = awc::Connector::new().connector(tcp).conn_keep_alive(idle).timeout(NEVER);
     if let Some(config) = tls {
@@ -116,16 +114,17 @@ fn client(interval: Duration, tls: Option<Arc<ClientConfig>>) -> awc::Client {
 }
 
 impl ServerMonitor {
-    /// A monitor of one server. To be created in the thread in which it will run.
+    /// A monitor of one server, whose name these name servers are asked for. To be created in the thread in which it will run.
     #[must_use]
     pub fn new(
         server: PublicAddress,
         settings: ProbeSettings,
+        name_servers: Vec<NameServer>,
         tls: Option<Arc<ClientConfig>>,
         results: Recipient<ProbeResult>,
     ) -> Self {
         let timer = SpawnHandle::default();
-        let client = client(settings.interval, tls);
+        let client = client(settings.interval, name_servers, tls);
         Self { server, settings, client, results, probing: false, timer, load_only_until: None }
     }
 
