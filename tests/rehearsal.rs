@@ -4,10 +4,13 @@ use std::process::{Output, Stdio};
 use std::time::Duration;
 
 use serde_json::Value;
+use tokio::process::Command;
 
+use crate::support::authority::Authority;
 use crate::support::git::{Forge, arm};
 use crate::support::ports;
 use crate::support::program::{Server, session_server, simulation_server};
+use crate::support::stand_in::{Script, StandIn};
 use crate::support::webots::Webots;
 
 /// How long a rehearsal may take.
@@ -35,10 +38,21 @@ impl Fleet {
 }
 
 async fn rehearse(fleet: &str, arguments: &[&str]) -> Output {
-    let mut command = tokio::process::Command::new(env!("CARGO_BIN_EXE_rehearse"));
-    command.arg(fleet).args(["--world", &arm()]).args(arguments).stdin(Stdio::null()).kill_on_drop(true);
+    output(command(fleet, &arm()).args(arguments)).await
+}
+
+fn command(fleet: &str, world: &str) -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_rehearse"));
+    command.arg(fleet).args(["--world", world]).stdin(Stdio::null()).kill_on_drop(true);
+    command
+}
+
+async fn output(command: &mut Command) -> Output {
     actix_rt::time::timeout(BOUND, command.output()).await.expect("it ends").unwrap()
 }
+
+/// One client that stays for a second, whatever its pace is.
+const ONE: [&str; 8] = ["--clients", "1", "--over", "0s", "--stay", "1s", "--real-time", "0"];
 
 fn text(bytes: &[u8]) -> String {
     String::from_utf8_lossy(bytes).into_owned()
@@ -101,4 +115,24 @@ async fn a_fleet_that_is_not_there_and_one_elsewhere_are_refused_in_one_line() {
         (output.status.code(), said.as_str()),
         (Some(2), "error: nobody agreed to load http://192.0.2.1:1999/; --yes agrees\n")
     );
+}
+
+#[actix_rt::test]
+async fn a_fleet_behind_https_is_rehearsed_where_its_certificate_is_trusted() {
+    let (lab, other) = (Authority::new(), Authority::new());
+    let script = Script {
+        session: vec!["wss://{}"],
+        client: vec!["shutdownTimeout: 60", "webots:wss://{}/webots"],
+        ..Script::default()
+    };
+    let fleet = StandIn::start_behind_tls(script, &lab.issue(&["localhost"])).await;
+    let url = format!("https://{}", fleet.address);
+    let trusting = output(command(&url, &arm()).args(ONE).env("SSL_CERT_FILE", lab.file())).await;
+    let said = text(&trusting.stdout);
+    assert!(trusting.status.success() && said.contains("All 1 fit."), "{said}{}", text(&trusting.stderr));
+    assert!(said.contains("1 %"), "the load of the simulation server is seen: {said}");
+    let trusting_another = output(command(&url, &arm()).args(ONE).env("SSL_CERT_FILE", other.file())).await;
+    let said = text(&trusting_another.stderr);
+    assert_eq!(trusting_another.status.code(), Some(1), "{said}");
+    assert!(said.contains("its certificate is not trusted") && said.lines().count() == 1, "{said}");
 }

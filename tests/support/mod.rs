@@ -14,6 +14,7 @@ pub mod name_server;
 pub mod ports;
 pub mod program;
 pub mod smtp;
+pub mod stand_in;
 pub mod webots;
 
 use std::time::{Duration, Instant};

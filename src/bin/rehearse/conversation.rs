@@ -6,7 +6,9 @@ use futures_util::{SinkExt, StreamExt};
 use tokio::net::TcpStream;
 use tokio_tungstenite::tungstenite::protocol::WebSocketConfig;
 use tokio_tungstenite::tungstenite::{Error, Message};
-use tokio_tungstenite::{MaybeTlsStream, WebSocketStream, connect_async_with_config};
+use tokio_tungstenite::{Connector, MaybeTlsStream, WebSocketStream, connect_async_tls_with_config};
+
+use crate::session::encryption;
 
 /// How long a connection may take.
 const CONNECT: Duration = Duration::from_secs(20);
@@ -44,7 +46,7 @@ impl Conversation {
         let config =
             WebSocketConfig::default().max_message_size(Some(LARGEST_MESSAGE)).max_frame_size(Some(LARGEST_MESSAGE));
         let failed = |why: String| Ended::Unreachable(url.to_owned(), why);
-        let connecting = connect_async_with_config(url, Some(config), true);
+        let connecting = connect_async_tls_with_config(url, Some(config), true, encryption().map(Connector::Rustls));
         let connected =
             actix_rt::time::timeout(CONNECT, connecting).await.map_err(|_| failed("too slow".to_owned()))?;
         let (socket, _) = connected.map_err(|error| failed(error.to_string()))?;
