@@ -136,3 +136,28 @@ async fn a_fleet_behind_https_is_rehearsed_where_its_certificate_is_trusted() {
     assert_eq!(trusting_another.status.code(), Some(1), "{said}");
     assert!(said.contains("its certificate is not trusted") && said.lines().count() == 1, "{said}");
 }
+
+#[actix_rt::test]
+async fn who_was_too_late_for_a_place_waits_for_the_next_one_until_the_patience_ends() {
+    let full = "Error: no simulation server available at the moment.";
+    let session = vec![full, full, "ws://{}"];
+    let fleet = StandIn::start(Script { session, ..Script::default() }).await;
+    let output = rehearse(&format!("http://{}", fleet.address), &ONE).await;
+    let said = text(&output.stdout);
+    assert!(said.contains("All 1 fit."), "{said}{}", text(&output.stderr));
+    assert_eq!(fleet.asked("/session").len(), 3);
+    let fleet = StandIn::start(Script { session: vec![full], ..Script::default() }).await;
+    let output = rehearse(&format!("http://{}", fleet.address), &[&ONE[..], &["--patience", "4s"]].concat()).await;
+    let said = text(&output.stdout);
+    let verdict =
+        "None fits; 1 got none: no simulation within 4s: Error: no simulation server available at the moment.";
+    assert!(said.contains(verdict) && output.status.code() == Some(1), "{said}");
+    let asked = fleet.asked("/session").len();
+    assert!((2..=5).contains(&asked), "nobody asks without a pause: {asked} times");
+    // What won't change is no reason to wait.
+    let session = vec!["Error: no simulation server accepts https://github.com/lab/arm."];
+    let fleet = StandIn::start(Script { session, ..Script::default() }).await;
+    let output = rehearse(&format!("http://{}", fleet.address), &ONE).await;
+    assert!(text(&output.stdout).contains("1 got none: Error: no simulation server accepts"));
+    assert_eq!(fleet.asked("/session").len(), 1);
+}

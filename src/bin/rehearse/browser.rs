@@ -13,6 +13,9 @@ use crate::visit::{Outcome, Pace, Steps, Visit};
 
 /// How long simulated time is watched for one value of the pace.
 const PACE_PERIOD: Duration = Duration::from_secs(1);
+/// After others were faster, before the next look at the availability: at first, and doubled each time up to the longest.
+const FIRST_PAUSE: Duration = Duration::from_secs(1);
+const LONGEST_PAUSE: Duration = Duration::from_secs(8);
 
 /// A client and what it knows.
 pub(crate) struct Browser<'class> {
@@ -21,6 +24,8 @@ pub(crate) struct Browser<'class> {
     session: &'class Session,
     behaviour: Behaviour,
     visit: Visit,
+    /// What the session server said when it last had no place, although it was available just before.
+    full: Option<String>,
 }
 
 /// A simulation that runs: the connection that keeps it, and the one to its Webots.
@@ -69,7 +74,7 @@ impl<'class> Browser<'class> {
             pace: Vec::new(),
             ended: asked,
         };
-        Self { arguments, board, session, behaviour, visit }
+        Self { arguments, board, session, behaviour, visit, full: None }
     }
 
     /// Goes through all steps. `meet` hears which simulation server the client was sent to.
@@ -77,7 +82,10 @@ impl<'class> Browser<'class> {
         self.board.came();
         let patience = self.arguments.patience;
         let started = actix_rt::time::timeout(patience, self.start(meet)).await;
-        let started = started.unwrap_or_else(|_| Err(NoStart::Failed(format!("no simulation within {patience:?}"))));
+        let started = started.unwrap_or_else(|_| {
+            let why = self.full.as_ref().map(|full| format!(": {full}")).unwrap_or_default();
+            Err(NoStart::Failed(format!("no simulation within {patience:?}{why}")))
+        });
         self.visit.outcome = match started {
             Ok(running) => {
                 let _stage = self.board.enter(Stage::Running);
@@ -95,8 +103,7 @@ impl<'class> Browser<'class> {
     async fn start(&mut self, meet: impl Fn(&str)) -> Result<Running, NoStart> {
         let waiting = self.board.enter(Stage::Waiting);
         let asked = Instant::now();
-        self.session.until_available().await?;
-        let server = self.session.simulation_server(&self.arguments.world).await.map_err(NoStart::Refused)?;
+        let server = self.find_server().await?;
         meet(&server);
         self.visit.server = server.split_once("://").map(|(_, address)| address.to_owned());
         let mut lease = Conversation::open(&format!("{server}/client")).await?;
@@ -131,6 +138,22 @@ impl<'class> Browser<'class> {
         self.visit.steps.launch = Some(launched.elapsed().as_secs_f64());
         self.visit.steps.until_running = Some(asked.elapsed().as_secs_f64());
         Ok(Running { lease, stream })
+    }
+
+    /// Waits until the fleet is available and asks for a simulation server; again and again where others were faster.
+    async fn find_server(&mut self) -> Result<String, NoStart> {
+        let mut pause = FIRST_PAUSE;
+        loop {
+            self.session.until_available().await?;
+            match self.session.simulation_server(&self.arguments.world).await {
+                Ok(server) => return Ok(server),
+                Err(why) if is_of_no_place(&why) => self.full = Some(why),
+                Err(why) => return Err(NoStart::Refused(why)),
+            }
+            // Those who wait together don't ask together.
+            actix_rt::time::sleep(pause.mul_f64(rand::random_range(0.5..1.0))).await;
+            pause = (pause * 2).min(LONGEST_PAUSE);
+        }
     }
 
     /// The next text of the simulation server; a refusal is one whatever it begins with.
@@ -224,6 +247,11 @@ impl<'class> Browser<'class> {
 fn time(text: &str) -> Option<f64> {
     let update: Update = serde_json::from_str(text.strip_prefix("application/json:")?).ok()?;
     Some(update.time)
+}
+
+/// Whether an answer of the session server says that all simulation servers are full, which may change.
+fn is_of_no_place(answer: &str) -> bool {
+    answer.to_ascii_lowercase().contains("no simulation server available")
 }
 
 /// Whether a text says that there is no place yet.
