@@ -4,8 +4,10 @@ use std::process::{Output, Stdio};
 use std::time::Duration;
 
 use serde_json::Value;
+use tokio::io::{AsyncBufReadExt, BufReader};
 use tokio::process::Command;
 
+use crate::support::SOON;
 use crate::support::authority::Authority;
 use crate::support::git::{Forge, arm};
 use crate::support::ports;
@@ -160,4 +162,47 @@ async fn who_was_too_late_for_a_place_waits_for_the_next_one_until_the_patience_
     let output = rehearse(&format!("http://{}", fleet.address), &ONE).await;
     assert!(text(&output.stdout).contains("1 got none: Error: no simulation server accepts"));
     assert_eq!(fleet.asked("/session").len(), 1);
+}
+
+/// What the acceptance run prints of a fleet that speaks so.
+async fn explained(script: Script) -> String {
+    let fleet = StandIn::start(script).await;
+    let output = rehearse(&format!("http://{}", fleet.address), &["--explain", "--patience", "3s"]).await;
+    assert_eq!(output.status.code(), Some(1), "{}", text(&output.stderr));
+    text(&output.stdout)
+}
+
+#[actix_rt::test]
+async fn the_acceptance_run_ends_at_a_step_that_never_does_and_says_where() {
+    let (waiting, loading) = futures_util::future::join(
+        explained(Script { client: vec!["loading: wait"], ..Script::default() }),
+        explained(Script { webots: vec!["world:a"], ..Script::default() }),
+    )
+    .await;
+    let ready = waiting.lines().find(|line| line.starts_with("| Webots is ready |")).unwrap();
+    assert!(ready.contains("not within 3 s") && ready.ends_with("| **differs** |"), "{waiting}");
+    let scene = loading.lines().find(|line| line.starts_with("| scene |")).unwrap();
+    assert!(scene.contains("`world:`, ") && scene.contains("then not within 3 s"), "{loading}");
+    assert!(loading.contains("steps differ: "), "{loading}");
+}
+
+#[actix_rt::test]
+async fn the_acceptance_run_shows_an_error_of_webots() {
+    let started = explained(Script { client: vec!["error: no display"], ..Script::default() }).await;
+    let ready = started.lines().find(|line| line.starts_with("| Webots is ready |")).unwrap();
+    assert!(ready.contains("`error: no display`"), "{started}");
+    let loaded = explained(Script { webots: vec!["world:a", "error: no such world"], ..Script::default() }).await;
+    let scene = loaded.lines().find(|line| line.starts_with("| scene |")).unwrap();
+    assert!(scene.contains("`world:`, then `error: no such world`"), "{loaded}");
+}
+
+#[actix_rt::test]
+async fn the_acceptance_run_prints_each_step_as_it_is_known() {
+    let fleet = StandIn::start(Script { webots: vec!["world:a"], ..Script::default() }).await;
+    let mut command = command(&format!("http://{}", fleet.address), &arm());
+    let mut child = command.args(["--explain", "--patience", "50s"]).stdout(Stdio::piped()).spawn().unwrap();
+    let mut lines = BufReader::new(child.stdout.take().unwrap()).lines();
+    let reading = async { while !lines.next_line().await.unwrap().unwrap().starts_with("| stream |") {} };
+    actix_rt::time::timeout(SOON, reading).await.expect("the steps until the scene are printed");
+    assert!(child.try_wait().unwrap().is_none(), "it waits for the scene");
 }

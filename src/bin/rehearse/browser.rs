@@ -7,7 +7,7 @@ use serde::Deserialize;
 use crate::arguments::Arguments;
 use crate::behaviour::Behaviour;
 use crate::board::{Board, Stage};
-use crate::conversation::{Conversation, Ended};
+use crate::conversation::{Conversation, Ended, unless_error};
 use crate::session::Session;
 use crate::visit::{Outcome, Pace, Steps, Visit};
 
@@ -170,13 +170,13 @@ impl<'class> Browser<'class> {
     async fn open_stream(&self, url: &str) -> Result<Conversation, NoStart> {
         let mut stream = Conversation::open(&format!("{}/", url.trim_end_matches('/'))).await?;
         stream.say(&self.arguments.viewer).await?;
-        while !stream.hear().await?.starts_with("model:") {}
+        while !unless_error(stream.hear().await?)?.starts_with("model:") {}
         stream.say("pause").await?;
-        while stream.hear().await? != "paused by client" {}
+        while unless_error(stream.hear().await?)? != "paused by client" {}
         stream.say("real-time:-1").await?;
         let mut first = None;
         loop {
-            let time = time(&stream.hear().await?);
+            let time = time(&unless_error(stream.hear().await?)?);
             match (first, time) {
                 (Some(first), Some(time)) if time > first => return Ok(stream),
                 (None, Some(time)) => first = Some(time),

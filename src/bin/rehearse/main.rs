@@ -3,7 +3,8 @@
 //! It speaks the original's protocol alone, so that it measures a fleet of Python servers as well. `arguments` says what
 //! can be asked for; `class` lets the clients come, each of which is a `browser` that goes through the steps of Webots' web
 //! page and leaves a `visit` behind; `servers` watches the load meanwhile; `report` and `table` say what came of it.
-//! `explain` goes through the steps with one client and compares what comes with what is expected; `walk` keeps the steps.
+//! `explain` goes through the steps with one client and compares what comes with what is expected; `walk` prints the steps, `words`
+//! what came.
 
 mod arguments;
 mod behaviour;
@@ -19,6 +20,7 @@ mod session;
 mod table;
 mod visit;
 mod walk;
+mod words;
 
 use std::io::{BufRead, IsTerminal, Write};
 use std::process::ExitCode;
