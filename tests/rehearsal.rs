@@ -206,3 +206,17 @@ async fn the_acceptance_run_prints_each_step_as_it_is_known() {
     actix_rt::time::timeout(SOON, reading).await.expect("the steps until the scene are printed");
     assert!(child.try_wait().unwrap().is_none(), "it waits for the scene");
 }
+
+#[actix_rt::test]
+async fn simulation_servers_elsewhere_behind_a_session_server_here_are_not_loaded_unasked() {
+    let fleet = StandIn::start(Script { session: vec!["ws://192.0.2.1:2000"], ..Script::default() }).await;
+    let url = format!("http://{}", fleet.address);
+    let refusal =
+        format!("error: nobody agreed to load ws://192.0.2.1:2000, where {url}/ sends its clients; --yes agrees\n");
+    for arguments in [&["--clients", "3", "--over", "0s"][..], &["--explain"]] {
+        let output = rehearse(&url, arguments).await;
+        assert_eq!((output.status.code(), text(&output.stderr)), (Some(2), refusal.clone()), "{arguments:?}");
+        assert!(!text(&output.stdout).contains("as expected"), "nothing was measured");
+    }
+    assert_eq!(fleet.asked("/client"), [""; 0]);
+}

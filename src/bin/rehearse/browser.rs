@@ -77,8 +77,8 @@ impl<'class> Browser<'class> {
         Self { arguments, board, session, behaviour, visit, full: None }
     }
 
-    /// Goes through all steps. `meet` hears which simulation server the client was sent to.
-    pub(crate) async fn visit(mut self, meet: impl Fn(&str)) -> Visit {
+    /// Goes through all steps. `meet` hears which simulation server the client was sent to, and whether it may go there.
+    pub(crate) async fn visit(mut self, meet: impl Fn(&str) -> bool) -> Visit {
         self.board.came();
         let patience = self.arguments.patience;
         let started = actix_rt::time::timeout(patience, self.start(meet)).await;
@@ -100,11 +100,13 @@ impl<'class> Browser<'class> {
         self.visit
     }
 
-    async fn start(&mut self, meet: impl Fn(&str)) -> Result<Running, NoStart> {
+    async fn start(&mut self, meet: impl Fn(&str) -> bool) -> Result<Running, NoStart> {
         let waiting = self.board.enter(Stage::Waiting);
         let asked = Instant::now();
         let server = self.find_server().await?;
-        meet(&server);
+        if !meet(&server) {
+            return Err(NoStart::Left);
+        }
         self.visit.server = server.split_once("://").map(|(_, address)| address.to_owned());
         let mut lease = Conversation::open(&format!("{server}/client")).await?;
         let start = serde_json::json!({"start": {"url": self.arguments.world}});

@@ -3,7 +3,9 @@
 
 use std::time::{Duration, Instant};
 
+use crate::Fault;
 use crate::arguments::Arguments;
+use crate::consent::Consent;
 use crate::conversation::{Conversation, Deadline, unless_error};
 use crate::session::Session;
 use crate::walk::Walk;
@@ -29,14 +31,17 @@ struct Stuck;
 /// Walks through all steps and prints what came. Returns whether all of it was as expected.
 ///
 /// # Errors
-/// When the session server does not answer at all.
-pub(crate) async fn run(arguments: &Arguments) -> Result<bool, String> {
+/// When the session server does not answer at all, or nobody agreed to load what it names.
+pub(crate) async fn run(arguments: &Arguments, consent: &Consent<'_>) -> Result<bool, Fault> {
     let session = Session::new(&arguments.fleet);
     session.answers().await?;
     let mut walk = Walk::begin(arguments);
     // Where it got stuck is the last of the steps.
-    Box::pin(walk.go(arguments, &session)).await.ok();
-    Ok(walk.end())
+    Box::pin(walk.go(arguments, &session, consent)).await.ok();
+    match consent.refusal() {
+        Some(why) => Err(Fault::NotAgreed(why)),
+        None => Ok(walk.end()),
+    }
 }
 
 /// What came on the connection to the simulation server until Webots was ready, or could not be.
@@ -49,9 +54,9 @@ struct Start {
 }
 
 impl Walk {
-    async fn go(&mut self, arguments: &Arguments, session: &Session) -> Result<(), Stuck> {
+    async fn go(&mut self, arguments: &Arguments, session: &Session, consent: &Consent<'_>) -> Result<(), Stuck> {
         self.ask_for_availability(arguments, session).await?;
-        let (mut lease, webots) = self.start(arguments, session).await?;
+        let (mut lease, webots) = self.start(arguments, session, consent).await?;
         let address = format!("{}/", webots.trim_end_matches('/'));
         let opened = Conversation::open(&address).await;
         let came = opened.as_ref().map_or_else(ToString::to_string, |_| "a WebSocket".to_owned());
@@ -92,11 +97,16 @@ impl Walk {
     }
 
     /// Asks for a simulation server and starts the world there. Returns the connection and the URL of Webots.
-    async fn start(&mut self, arguments: &Arguments, session: &Session) -> Result<(Conversation, String), Stuck> {
+    async fn start(
+        &mut self,
+        arguments: &Arguments,
+        session: &Session,
+        consent: &Consent<'_>,
+    ) -> Result<(Conversation, String), Stuck> {
         let server = session.simulation_server(&arguments.world).await;
         let came = excerpt(server.as_ref().map_or_else(Clone::clone, Clone::clone).as_str());
         self.note("simulation server", "`ws://HOST:PORT` or `wss://HOST/PORT`", &came, server.is_ok());
-        let server = server.map_err(|_| Stuck)?;
+        let server = server.ok().filter(|server| consent.has_server(server)).ok_or(Stuck)?;
         let opened = Conversation::open(&format!("{server}/client")).await;
         let came = opened.as_ref().map_or_else(ToString::to_string, |_| "a WebSocket".to_owned());
         self.note("client", "a WebSocket at `/client`", &came, opened.is_ok());
