@@ -9,7 +9,7 @@ use tokio::process::Command;
 
 use crate::support::SOON;
 use crate::support::authority::Authority;
-use crate::support::git::{Forge, arm};
+use crate::support::git::{Forge, arm, world};
 use crate::support::ports;
 use crate::support::program::{Server, session_server, simulation_server};
 use crate::support::stand_in::{Script, StandIn};
@@ -219,4 +219,15 @@ async fn simulation_servers_elsewhere_behind_a_session_server_here_are_not_loade
         assert!(!text(&output.stdout).contains("as expected"), "nothing was measured");
     }
     assert_eq!(fleet.asked("/client"), [""; 0]);
+}
+
+#[actix_rt::test]
+async fn a_world_with_a_space_or_an_umlaut_is_asked_for_as_browsers_do() {
+    let fleet = StandIn::start(Script::default()).await;
+    let world = world("lab/arm", "main", "worlds/Wände und 50%.wbt");
+    let output = output(command(&format!("http://{}", fleet.address), &world).args(ONE)).await;
+    let said = text(&output.stdout);
+    assert!(said.contains("All 1 fit."), "{said}{}", text(&output.stderr));
+    let asked = "/session?url=https://github.com/lab/arm/blob/main/worlds/W%C3%A4nde%20und%2050%.wbt";
+    assert_eq!(fleet.asked("/session"), [asked]);
 }

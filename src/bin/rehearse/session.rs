@@ -63,8 +63,10 @@ impl Session {
     /// # Errors
     /// What was said in place of it.
     pub(crate) async fn simulation_server(&self, world: &str) -> Result<String, String> {
-        // As the page writes it: not percent-encoded.
-        let answer = get(&self.http, &format!("{}/session?url={world}", self.base())).await?;
+        // The page writes the world as it is, and its browser then encodes what no URL may have, such as spaces.
+        let url = format!("{}/session?url={world}", self.base());
+        let url = Url::parse(&url).map_err(|error| format!("{url} is no URL: {error}"))?;
+        let answer = get(&self.http, url.as_str()).await?;
         let answer = answer.trim();
         let is_one = answer.starts_with("ws://") || answer.starts_with("wss://");
         if is_one { Ok(answer.trim_end_matches('/').to_owned()) } else { Err(answer.to_owned()) }
