@@ -231,3 +231,15 @@ async fn a_world_with_a_space_or_an_umlaut_is_asked_for_as_browsers_do() {
     let asked = "/session?url=https://github.com/lab/arm/blob/main/worlds/W%C3%A4nde%20und%2050%.wbt";
     assert_eq!(fleet.asked("/session"), [asked]);
 }
+
+#[actix_rt::test]
+async fn a_simulation_whose_end_nobody_sees_does_not_fit() {
+    let fleet = StandIn::start(Script::default()).await;
+    for behaviour in ["sleep=100", "vanish=100"] {
+        let output =
+            rehearse(&format!("http://{}", fleet.address), &[&ONE[..], &["--misbehave", behaviour]].concat()).await;
+        let said = text(&output.stdout);
+        assert_eq!(output.status.code(), Some(1), "{said}");
+        assert!(said.contains("None was seen to its end.") && said.contains("| ran, their end unseen "), "{said}");
+    }
+}

@@ -96,7 +96,7 @@ impl<'class> Browser<'class> {
             Err(NoStart::Left) => Outcome::Left,
         };
         self.visit.ended = self.board.now();
-        self.board.gone(matches!(self.visit.outcome, Outcome::Ran | Outcome::Left));
+        self.board.gone(matches!(self.visit.outcome, Outcome::Ran | Outcome::Unseen | Outcome::Left));
         self.visit
     }
 
@@ -206,7 +206,11 @@ impl<'class> Browser<'class> {
             futures_util::future::join(running.stream.close(), running.lease.close()).await;
         }
         // Who vanishes or crashes says nothing: the connections are dropped.
-        Outcome::Ran
+        match self.behaviour {
+            // Its simulation may have ended long before.
+            Behaviour::Sleep | Behaviour::Vanish => Outcome::Unseen,
+            _ => Outcome::Ran,
+        }
     }
 
     /// Reads what comes and measures the pace, until the simulation ends. Returns why it ended.

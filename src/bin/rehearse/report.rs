@@ -46,7 +46,9 @@ pub(crate) struct Seats {
     pub(crate) refused: BTreeMap<String, u32>,
     /// Simulations that ended before their client left, by the reason.
     pub(crate) broke_off: BTreeMap<String, u32>,
-    /// Clients that left on purpose before their simulation ran.
+    /// Simulations that ran and whose end nobody saw: their client slept, vanished, or was interrupted.
+    pub(crate) unseen: u32,
+    /// Clients that left before their simulation ran.
     pub(crate) left: u32,
 }
 
@@ -160,6 +162,7 @@ fn seats(visits: &[Visit], real_time: f64) -> Seats {
             }
             Outcome::Refused(why) | Outcome::Failed(why) => *seats.refused.entry(why.clone()).or_default() += 1,
             Outcome::BrokeOff(why) => *seats.broke_off.entry(why.clone()).or_default() += 1,
+            Outcome::Unseen => seats.unseen += 1,
             Outcome::Left => seats.left += 1,
         }
     }
@@ -250,8 +253,9 @@ fn count(number: usize) -> u32 {
 }
 
 fn verdict(seats: &Seats, servers: &[Server]) -> String {
-    let all = seats.asked - seats.left;
+    let all = seats.asked - seats.left - seats.unseen;
     let mut sentence = match (seats.fit, all) {
+        (_, 0) => "None was seen to its end".to_owned(),
         (0, _) => "None fits".to_owned(),
         (fit, all) if fit == all => format!("All {all} fit"),
         (fit, all) => format!("{fit} of {all} fit"),
@@ -288,7 +292,7 @@ mod tests {
     use clap::Parser;
 
     fn visit(client: u32, server: &str, asked: f64, outcome: Outcome, factors: &[f64]) -> Visit {
-        let ran = matches!(outcome, Outcome::Ran | Outcome::BrokeOff(_)).then_some(1.0);
+        let ran = matches!(outcome, Outcome::Ran | Outcome::BrokeOff(_) | Outcome::Unseen).then_some(1.0);
         let pace = (0_u32..)
             .zip(factors)
             .map(|(second, factor)| Pace { at: asked + 3.0 + f64::from(second), factor: *factor });
@@ -324,17 +328,18 @@ mod tests {
             visit(4, "gpu-2:2000", 4.0, full.clone(), &[]),
             visit(5, "gpu-2:2000", 5.0, full, &[]),
             visit(6, "gpu-2:2000", 6.0, Outcome::Left, &[]),
+            visit(7, "gpu-1:2000", 20.0, Outcome::Unseen, &[1.0, 1.0]),
         ];
         let of_two = report(&["--expect", "2"], &visits);
         let seats = &of_two.seats;
-        assert_eq!((seats.asked, seats.given, seats.fit, seats.left), (7, 4, 2, 1));
+        assert_eq!((seats.asked, seats.given, seats.fit, seats.unseen, seats.left), (8, 5, 2, 1, 1));
         assert_eq!(seats.refused, BTreeMap::from([("Error: full.".to_owned(), 2)]));
         assert_eq!(seats.broke_off.values().sum::<u32>(), 1);
         assert!(of_two.is_as_expected() && !report(&["--expect", "3"], &visits).is_as_expected());
         assert_eq!(of_two.verdict, "2 of 6 fit; gpu-2:2000 was the first to run below real time, at 2 simulations.");
         let servers: Vec<_> =
             of_two.servers.iter().map(|server| (server.seats, server.most_at_once, server.peak_load)).collect();
-        assert_eq!(servers, [(2, 2, Some(60.0)), (2, 2, Some(99.0))]);
+        assert_eq!(servers, [(3, 2, Some(60.0)), (2, 2, Some(99.0))]);
         assert!(report(&["--real-time", "0.4"], &visits).is_as_expected());
     }
 
