@@ -3,17 +3,19 @@
 use std::process::{Output, Stdio};
 use std::time::Duration;
 
+use nix::sys::signal::{Signal, kill};
+use nix::unistd::Pid;
 use serde_json::Value;
 use tokio::io::{AsyncBufReadExt, BufReader};
 use tokio::process::Command;
 
-use crate::support::SOON;
 use crate::support::authority::Authority;
 use crate::support::git::{Forge, arm, world};
 use crate::support::ports;
 use crate::support::program::{Server, session_server, simulation_server};
 use crate::support::stand_in::{Script, StandIn};
 use crate::support::webots::Webots;
+use crate::support::{SOON, until};
 
 /// How long a rehearsal may take.
 const BOUND: Duration = Duration::from_secs(90);
@@ -242,4 +244,26 @@ async fn a_simulation_whose_end_nobody_sees_does_not_fit() {
         assert_eq!(output.status.code(), Some(1), "{said}");
         assert!(said.contains("None was seen to its end.") && said.contains("| ran, their end unseen "), "{said}");
     }
+}
+
+#[actix_rt::test]
+async fn an_interrupted_class_tells_what_was_seen_until_then() {
+    let fleet = StandIn::start(Script::default()).await;
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("class.json");
+    let mut command = command(&format!("http://{}", fleet.address), &arm());
+    command.args(["--clients", "2", "--over", "10m", "--stay", "10m", "--json"]).arg(&file);
+    let child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+    until("the first client connects to Webots", async || !fleet.asked("/webots").is_empty()).await;
+    // While the load is asked for each second, the simulation begins to run.
+    let before = fleet.asked("/load").len();
+    until("time passes", async || fleet.asked("/load").len() > before + 2).await;
+    kill(Pid::from_raw(i32::try_from(child.id().unwrap()).unwrap()), Signal::SIGINT).unwrap();
+    let output = actix_rt::time::timeout(SOON, child.wait_with_output()).await.expect("it ends").unwrap();
+    let said = text(&output.stdout);
+    assert_eq!(output.status.code(), Some(130), "{said}{}", text(&output.stderr));
+    assert!(said.contains(", interrupted\n") && said.contains("| ran, their end unseen "), "{said}");
+    let report: Value = serde_json::from_str(&std::fs::read_to_string(file).unwrap()).unwrap();
+    assert_eq!((&report["seats"]["asked"], &report["seats"]["unseen"]), (&1.into(), &1.into()), "{report}");
+    assert!(report["interrupted"] == true && !report["visits"][0]["pace"].as_array().unwrap().is_empty(), "{report}");
 }

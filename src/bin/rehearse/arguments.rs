@@ -11,7 +11,8 @@ use crate::behaviour::Mix;
 /// Plays a class of web clients against a fleet, and says how many fit.
 ///
 /// It speaks to a session server as Webots' web page does: availability, a simulation server, the start, the scene and its
-/// updates, run, leave. Exit code 0: as expected; 1: not, or nothing could be measured; 2: wrong arguments.
+/// updates, run, leave. Exit code 0: as expected; 1: not, or nothing could be measured; 2: wrong arguments, or nobody agreed;
+/// 130: Ctrl-C.
 #[derive(Parser, Debug, Clone)]
 #[command(version)]
 pub(crate) struct Arguments {

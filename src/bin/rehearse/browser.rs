@@ -1,5 +1,6 @@
 //! One client: the steps of Webots' web page from the wish for a simulation to its end.
 
+use std::cell::RefCell;
 use std::time::{Duration, Instant};
 
 use serde::Deserialize;
@@ -24,6 +25,8 @@ pub(crate) struct Browser<'class> {
     session: &'class Session,
     behaviour: Behaviour,
     visit: Visit,
+    /// Where the visit is kept in the end.
+    visits: &'class RefCell<Vec<Visit>>,
     /// What the session server said when it last had no place, although it was available just before.
     full: Option<String>,
 }
@@ -55,13 +58,13 @@ impl From<Ended> for NoStart {
 }
 
 impl<'class> Browser<'class> {
-    /// A client that asks now.
+    /// A client that asks now. What it has met comes to `visits` once it is dropped, also where that interrupts it.
     pub(crate) fn new(
         arguments: &'class Arguments,
         board: &'class Board,
         session: &'class Session,
-        client: u32,
-        behaviour: Behaviour,
+        visits: &'class RefCell<Vec<Visit>>,
+        (client, behaviour): (u32, Behaviour),
     ) -> Self {
         let asked = board.now();
         let visit = Visit {
@@ -74,11 +77,11 @@ impl<'class> Browser<'class> {
             pace: Vec::new(),
             ended: asked,
         };
-        Self { arguments, board, session, behaviour, visit, full: None }
+        Self { arguments, board, session, behaviour, visit, visits, full: None }
     }
 
     /// Goes through all steps. `meet` hears which simulation server the client was sent to, and whether it may go there.
-    pub(crate) async fn visit(mut self, meet: impl Fn(&str) -> bool) -> Visit {
+    pub(crate) async fn visit(mut self, meet: impl Fn(&str) -> bool) {
         self.board.came();
         let patience = self.arguments.patience;
         let started = actix_rt::time::timeout(patience, self.start(meet)).await;
@@ -88,6 +91,8 @@ impl<'class> Browser<'class> {
         });
         self.visit.outcome = match started {
             Ok(running) => {
+                // As long as nothing else is known.
+                self.visit.outcome = Outcome::Unseen;
                 let _stage = self.board.enter(Stage::Running);
                 self.watch(running).await
             }
@@ -95,9 +100,7 @@ impl<'class> Browser<'class> {
             Err(NoStart::Failed(why)) => Outcome::Failed(why),
             Err(NoStart::Left) => Outcome::Left,
         };
-        self.visit.ended = self.board.now();
         self.board.gone(matches!(self.visit.outcome, Outcome::Ran | Outcome::Unseen | Outcome::Left));
-        self.visit
     }
 
     async fn start(&mut self, meet: impl Fn(&str) -> bool) -> Result<Running, NoStart> {
@@ -246,6 +249,13 @@ impl<'class> Browser<'class> {
                 }
             }
         }
+    }
+}
+
+impl Drop for Browser<'_> {
+    fn drop(&mut self) {
+        self.visit.ended = self.board.now();
+        self.visits.borrow_mut().push(self.visit.clone());
     }
 }
 

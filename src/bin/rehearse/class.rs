@@ -19,9 +19,18 @@ use crate::visit::Visit;
 /// Between two visits of a client that comes again and again.
 const PAUSE: Duration = Duration::from_millis(500);
 
-/// Plays the whole class. Returns what each client has met, and the highest load of each server. Ends at once where nobody
-/// agrees to load a server that a client is sent to.
-pub(crate) async fn play(arguments: &Arguments, consent: &Consent<'_>) -> (Vec<Visit>, BTreeMap<String, Option<f64>>) {
+/// What came of a class.
+pub(crate) struct Played {
+    /// What each client has met.
+    pub(crate) visits: Vec<Visit>,
+    /// The highest load of each server.
+    pub(crate) peaks: BTreeMap<String, Option<f64>>,
+    /// Whether Ctrl-C has ended it.
+    pub(crate) interrupted: bool,
+}
+
+/// Plays the whole class, or until Ctrl-C. Ends at once where nobody agrees to load a server that a client is sent to.
+pub(crate) async fn play(arguments: &Arguments, consent: &Consent<'_>) -> Played {
     let class = Class {
         arguments,
         consent,
@@ -34,13 +43,16 @@ pub(crate) async fn play(arguments: &Arguments, consent: &Consent<'_>) -> (Vec<V
     };
     let clients = join_all((0..arguments.clients).map(|client| class.come(client)));
     let aside = futures_util::future::join(class.board.show(), class.servers.watch());
+    let mut interrupted = false;
+    // Clients that are dropped leave behind what they have met until then.
     tokio::select! {
         _ = clients => {}
         _ = aside => {}
         () = class.refused.notified() => {}
+        Ok(()) = tokio::signal::ctrl_c() => interrupted = true,
     }
     class.board.clear();
-    (class.visits.take(), class.servers.peaks())
+    Played { visits: class.visits.take(), peaks: class.servers.peaks(), interrupted }
 }
 
 /// What all clients share.
@@ -87,8 +99,8 @@ impl Class<'_> {
     }
 
     async fn visit(&self, client: u32, behaviour: Behaviour) {
-        let browser = Browser::new(self.arguments, &self.board, &self.session, client, behaviour);
-        let visit = browser.visit(|server| self.meet(server)).await;
-        self.visits.borrow_mut().push(visit);
+        let who = (client, behaviour);
+        let browser = Browser::new(self.arguments, &self.board, &self.session, &self.visits, who);
+        browser.visit(|server| self.meet(server)).await;
     }
 }

@@ -29,10 +29,13 @@ use std::process::ExitCode;
 use clap::Parser;
 
 use crate::arguments::Arguments;
+use crate::class::Played;
 use crate::consent::Consent;
 
 /// The class did not fit as `--expect` demands, or nothing could be measured.
 const NOT_AS_EXPECTED: u8 = 1;
+/// Ctrl-C has ended it, as shells tell that.
+const INTERRUPTED: u8 = 130;
 /// The arguments can't be used.
 const WRONG_ARGUMENTS: u8 = 2;
 
@@ -41,19 +44,18 @@ fn main() -> ExitCode {
     // Only the first call can set it, and this is the first.
     rustls::crypto::ring::default_provider().install_default().ok();
     let consent = Consent::new(&arguments);
-    let agreed = actix_rt::System::new().block_on(async {
+    let ended = actix_rt::System::new().block_on(async {
         if !consent.has_fleet() {
             return Err(refused(&consent));
         }
         if arguments.explain {
-            Box::pin(explain::run(&arguments, &consent)).await
+            Box::pin(explain::run(&arguments, &consent)).await.map(code)
         } else {
             rehearse(&arguments, &consent).await
         }
     });
-    match agreed {
-        Ok(true) => ExitCode::SUCCESS,
-        Ok(false) => ExitCode::from(NOT_AS_EXPECTED),
+    match ended {
+        Ok(code) => ExitCode::from(code),
         Err(fault) => {
             let (code, why) = match fault {
                 Fault::NotAgreed(why) => (WRONG_ARGUMENTS, why),
@@ -63,6 +65,10 @@ fn main() -> ExitCode {
             ExitCode::from(code)
         }
     }
+}
+
+fn code(is_as_expected: bool) -> u8 {
+    if is_as_expected { 0 } else { NOT_AS_EXPECTED }
 }
 
 fn refused(consent: &Consent<'_>) -> Fault {
@@ -83,21 +89,24 @@ impl From<String> for Fault {
     }
 }
 
-/// Plays the class and prints what came of it. Returns whether that is what was expected.
+/// Plays the class and prints what came of it. Returns the exit code.
 ///
 /// # Errors
 /// When the fleet does not answer at all or nobody agreed to load all of it, or the file for machines can't be written.
-async fn rehearse(arguments: &Arguments, consent: &Consent<'_>) -> Result<bool, Fault> {
+async fn rehearse(arguments: &Arguments, consent: &Consent<'_>) -> Result<u8, Fault> {
     session::Session::new(&arguments.fleet).answers().await?;
-    let (visits, servers) = class::play(arguments, consent).await;
+    let Played { visits, peaks, interrupted } = class::play(arguments, consent).await;
     if consent.refusal().is_some() {
         return Err(refused(consent));
     }
-    let report = report::Report::new(arguments, &visits, &servers);
+    let mut report = report::Report::new(arguments, &visits, &peaks);
+    if interrupted {
+        report.interrupt();
+    }
     // Nobody may be listening any more.
     writeln!(std::io::stdout(), "{}", table::text(&report)).ok();
     if let Some(file) = &arguments.json {
         report.write(&visits, file).map_err(|error| format!("{} can't be written: {error}", file.display()))?;
     }
-    Ok(report.is_as_expected())
+    Ok(if interrupted { INTERRUPTED } else { code(report.is_as_expected()) })
 }

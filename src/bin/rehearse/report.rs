@@ -30,6 +30,8 @@ pub(crate) struct Report {
     pub(crate) verdict: String,
     /// How many had to fit.
     pub(crate) expected: Option<u32>,
+    /// Whether it was interrupted, so that only a part was played.
+    pub(crate) interrupted: bool,
 }
 
 /// Seats that were asked for, and what came of them.
@@ -130,9 +132,16 @@ impl Report {
             pace: factors(visits.iter().flat_map(factors_of)),
             verdict: verdict(&seats, &servers),
             expected: arguments.expect,
+            interrupted: false,
             seats,
             servers,
         }
+    }
+
+    /// Notes that only a part of it was played.
+    pub(crate) fn interrupt(&mut self) {
+        self.interrupted = true;
+        self.played += ", interrupted";
     }
 
     /// Whether as many fit as were expected; without an expectation, whether any did.
