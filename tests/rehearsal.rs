@@ -267,3 +267,16 @@ async fn an_interrupted_class_tells_what_was_seen_until_then() {
     assert_eq!((&report["seats"]["asked"], &report["seats"]["unseen"]), (&1.into(), &1.into()), "{report}");
     assert!(report["interrupted"] == true && !report["visits"][0]["pace"].as_array().unwrap().is_empty(), "{report}");
 }
+
+#[actix_rt::test]
+async fn a_time_that_is_too_long_is_refused() {
+    let fleet = StandIn::start(Script::default()).await;
+    for name in ["--over", "--stay", "--patience", "--soak"] {
+        for time in ["500000000000y", "31d"] {
+            let output = rehearse(&format!("http://{}", fleet.address), &[name, time]).await;
+            let said = text(&output.stderr);
+            assert_eq!(output.status.code(), Some(2), "{said}");
+            assert!(said.contains(name) && said.contains("allowed is up to 30d"), "{said}");
+        }
+    }
+}
