@@ -24,7 +24,7 @@ pub struct Script {
     pub client: Vec<&'static str>,
     /// The texts on `/webots`; then time passes.
     pub webots: Vec<&'static str>,
-    /// Whether `/webots` closes once its texts are said.
+    /// Whether `/webots` closes once its texts are said and it was asked to run.
     pub ends: bool,
 }
 
@@ -147,6 +147,8 @@ impl Part {
             socket.send(Message::text(self.fill(text))).await.ok()?;
         }
         if is_webots && self.script.ends {
+            // Who still speaks would find the connection broken.
+            while socket.next().await?.ok()? != Message::text("real-time:-1") {}
             return socket.close(None).await.ok();
         }
         let mut time = 0;

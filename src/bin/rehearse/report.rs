@@ -274,8 +274,13 @@ fn verdict(seats: &Seats, servers: &[Server]) -> String {
         let what =
             format!("{} was the first to run below real time, at {} simulations", server.address, slow.simulations);
         sentence = format!("{sentence}; {what}");
-    } else if let Some((why, number)) = seats.refused.iter().max_by_key(|(_, number)| **number) {
-        sentence = format!("{sentence}; {number} got none: {}", why.trim_end_matches('.'));
+    } else {
+        let reasons = [("got none", &seats.refused), ("broke off", &seats.broke_off)];
+        let reasons =
+            reasons.into_iter().flat_map(|(what, all)| all.iter().map(move |(why, number)| (number, what, why)));
+        if let Some((number, what, why)) = reasons.max_by_key(|(number, ..)| **number) {
+            sentence = format!("{sentence}; {number} {what}: {}", why.trim_end_matches('.'));
+        }
     }
     sentence + "."
 }
@@ -366,6 +371,17 @@ mod tests {
         assert_eq!((row.step, row.median, row.p95, row.worst), ("all", 50.0, 95.0, 100.0));
         assert_eq!(all.verdict, "All 100 fit.");
         assert_eq!(all.pace, Some(Factors { p5: 1.0, median: 1.0 }));
+    }
+
+    #[test]
+    fn the_most_frequent_reason_is_told() {
+        let (full, killed) = (Outcome::Refused("full".to_owned()), Outcome::BrokeOff("Webots was killed.".to_owned()));
+        let all = |outcomes: &[&Outcome]| {
+            let visits = (0..).zip(outcomes).map(|(client, one)| visit(client, "gpu-1:2000", 0.0, (*one).clone(), &[]));
+            report(&[], &visits.collect::<Vec<_>>()).verdict
+        };
+        assert_eq!(all(&[&killed, &full, &killed]), "None fits; 2 broke off: Webots was killed.");
+        assert_eq!(all(&[&Outcome::Ran, &full, &full, &killed]), "1 of 4 fit; 2 got none: full.");
     }
 
     #[test]
