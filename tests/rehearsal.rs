@@ -3,12 +3,19 @@
 use std::process::{Output, Stdio};
 use std::time::Duration;
 
+use nix::sys::signal::{Signal, kill};
+use nix::unistd::Pid;
 use serde_json::Value;
+use tokio::io::{AsyncBufReadExt, BufReader};
+use tokio::process::Command;
 
-use crate::support::git::{Forge, arm};
+use crate::support::authority::Authority;
+use crate::support::git::{Forge, arm, world};
 use crate::support::ports;
 use crate::support::program::{Server, session_server, simulation_server};
+use crate::support::stand_in::{Script, StandIn};
 use crate::support::webots::Webots;
+use crate::support::{SOON, until};
 
 /// How long a rehearsal may take.
 const BOUND: Duration = Duration::from_secs(90);
@@ -35,10 +42,21 @@ impl Fleet {
 }
 
 async fn rehearse(fleet: &str, arguments: &[&str]) -> Output {
-    let mut command = tokio::process::Command::new(env!("CARGO_BIN_EXE_rehearse"));
-    command.arg(fleet).args(["--world", &arm()]).args(arguments).stdin(Stdio::null()).kill_on_drop(true);
+    output(command(fleet, &arm()).args(arguments)).await
+}
+
+fn command(fleet: &str, world: &str) -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_rehearse"));
+    command.arg(fleet).args(["--world", world]).stdin(Stdio::null()).kill_on_drop(true);
+    command
+}
+
+async fn output(command: &mut Command) -> Output {
     actix_rt::time::timeout(BOUND, command.output()).await.expect("it ends").unwrap()
 }
+
+/// One client that stays for a second, whatever its pace is.
+const ONE: [&str; 8] = ["--clients", "1", "--over", "0s", "--stay", "1s", "--real-time", "0"];
 
 fn text(bytes: &[u8]) -> String {
     String::from_utf8_lossy(bytes).into_owned()
@@ -101,4 +119,177 @@ async fn a_fleet_that_is_not_there_and_one_elsewhere_are_refused_in_one_line() {
         (output.status.code(), said.as_str()),
         (Some(2), "error: nobody agreed to load http://192.0.2.1:1999/; --yes agrees\n")
     );
+}
+
+#[actix_rt::test]
+async fn a_fleet_behind_https_is_rehearsed_where_its_certificate_is_trusted() {
+    let (lab, other) = (Authority::new(), Authority::new());
+    let script = Script {
+        session: vec!["wss://{}"],
+        client: vec!["shutdownTimeout: 60", "webots:wss://{}/webots"],
+        ..Script::default()
+    };
+    let fleet = StandIn::start_behind_tls(script, &lab.issue(&["localhost"])).await;
+    let url = format!("https://{}", fleet.address);
+    // Long enough for a look at the load, which comes each second.
+    let class = ["--clients", "1", "--over", "0s", "--stay", "5s", "--real-time", "0"];
+    let trusting = output(command(&url, &arm()).args(class).env("SSL_CERT_FILE", lab.file())).await;
+    let said = text(&trusting.stdout);
+    assert!(trusting.status.success() && said.contains("All 1 fit."), "{said}{}", text(&trusting.stderr));
+    assert!(said.contains(" 1 % "), "the load of the simulation server is seen: {said}");
+    let trusting_another = output(command(&url, &arm()).args(ONE).env("SSL_CERT_FILE", other.file())).await;
+    let said = text(&trusting_another.stderr);
+    assert_eq!(trusting_another.status.code(), Some(1), "{said}");
+    assert!(said.contains("its certificate is not trusted") && said.lines().count() == 1, "{said}");
+}
+
+#[actix_rt::test]
+async fn who_was_too_late_for_a_place_waits_for_the_next_one_until_the_patience_ends() {
+    let full = "Error: no simulation server available at the moment.";
+    let session = vec![full, full, "ws://{}"];
+    let fleet = StandIn::start(Script { session, ..Script::default() }).await;
+    let output = rehearse(&format!("http://{}", fleet.address), &ONE).await;
+    let said = text(&output.stdout);
+    assert!(said.contains("All 1 fit."), "{said}{}", text(&output.stderr));
+    assert_eq!(fleet.asked("/session").len(), 3);
+    let fleet = StandIn::start(Script { session: vec![full], ..Script::default() }).await;
+    let output = rehearse(&format!("http://{}", fleet.address), &[&ONE[..], &["--patience", "4s"]].concat()).await;
+    let said = text(&output.stdout);
+    let verdict =
+        "None fits; 1 got none: no simulation within 4s: Error: no simulation server available at the moment.";
+    assert!(said.contains(verdict) && output.status.code() == Some(1), "{said}");
+    let asked = fleet.asked("/session").len();
+    assert!((2..=5).contains(&asked), "nobody asks without a pause: {asked} times");
+    // What won't change is no reason to wait.
+    let session = vec!["Error: no simulation server accepts https://github.com/lab/arm."];
+    let fleet = StandIn::start(Script { session, ..Script::default() }).await;
+    let output = rehearse(&format!("http://{}", fleet.address), &ONE).await;
+    assert!(text(&output.stdout).contains("1 got none: Error: no simulation server accepts"));
+    assert_eq!(fleet.asked("/session").len(), 1);
+}
+
+/// What the acceptance run prints of a fleet that speaks so.
+async fn explained(script: Script) -> String {
+    let fleet = StandIn::start(script).await;
+    let output = rehearse(&format!("http://{}", fleet.address), &["--explain", "--patience", "6s"]).await;
+    assert_eq!(output.status.code(), Some(1), "{}", text(&output.stderr));
+    text(&output.stdout)
+}
+
+#[actix_rt::test]
+async fn the_acceptance_run_ends_at_a_step_that_never_does_and_says_where() {
+    let (waiting, loading) = futures_util::future::join(
+        explained(Script { client: vec!["loading: wait"], ..Script::default() }),
+        explained(Script { webots: vec!["world:a"], ..Script::default() }),
+    )
+    .await;
+    let ready = waiting.lines().find(|line| line.starts_with("| Webots is ready |")).unwrap();
+    assert!(ready.contains("not within 6 s") && ready.ends_with("| **differs** |"), "{waiting}");
+    let scene = loading.lines().find(|line| line.starts_with("| scene |")).unwrap();
+    assert!(scene.contains("`world:`, ") && scene.contains("then not within 6 s"), "{loading}");
+    assert!(loading.contains("steps differ: "), "{loading}");
+}
+
+#[actix_rt::test]
+async fn the_acceptance_run_shows_an_error_of_webots() {
+    let started = explained(Script { client: vec!["error: no display"], ..Script::default() }).await;
+    let ready = started.lines().find(|line| line.starts_with("| Webots is ready |")).unwrap();
+    assert!(ready.contains("`error: no display`"), "{started}");
+    let loaded = explained(Script { webots: vec!["world:a", "error: no such world"], ..Script::default() }).await;
+    let scene = loaded.lines().find(|line| line.starts_with("| scene |")).unwrap();
+    assert!(scene.contains("`world:`, then `error: no such world`"), "{loaded}");
+}
+
+#[actix_rt::test]
+async fn the_acceptance_run_prints_each_step_as_it_is_known() {
+    let fleet = StandIn::start(Script { webots: vec!["world:a"], ..Script::default() }).await;
+    let mut command = command(&format!("http://{}", fleet.address), &arm());
+    let mut child = command.args(["--explain", "--patience", "50s"]).stdout(Stdio::piped()).spawn().unwrap();
+    let mut lines = BufReader::new(child.stdout.take().unwrap()).lines();
+    let reading = async { while !lines.next_line().await.unwrap().unwrap().starts_with("| stream |") {} };
+    actix_rt::time::timeout(SOON, reading).await.expect("the steps until the scene are printed");
+    assert!(child.try_wait().unwrap().is_none(), "it waits for the scene");
+}
+
+#[actix_rt::test]
+async fn simulation_servers_elsewhere_behind_a_session_server_here_are_not_loaded_unasked() {
+    let fleet = StandIn::start(Script { session: vec!["ws://192.0.2.1:2000"], ..Script::default() }).await;
+    let url = format!("http://{}", fleet.address);
+    let refusal =
+        format!("error: nobody agreed to load ws://192.0.2.1:2000, where {url}/ sends its clients; --yes agrees\n");
+    for arguments in [&["--clients", "3", "--over", "0s"][..], &["--explain"]] {
+        let output = rehearse(&url, arguments).await;
+        assert_eq!((output.status.code(), text(&output.stderr)), (Some(2), refusal.clone()), "{arguments:?}");
+        assert!(!text(&output.stdout).contains("as expected"), "nothing was measured");
+    }
+    assert_eq!(fleet.asked("/client"), [""; 0]);
+}
+
+#[actix_rt::test]
+async fn a_world_with_a_space_or_an_umlaut_is_asked_for_as_browsers_do() {
+    let fleet = StandIn::start(Script::default()).await;
+    let world = world("lab/arm", "main", "worlds/Wände und 50%.wbt");
+    let output = output(command(&format!("http://{}", fleet.address), &world).args(ONE)).await;
+    let said = text(&output.stdout);
+    assert!(said.contains("All 1 fit."), "{said}{}", text(&output.stderr));
+    let asked = "/session?url=https://github.com/lab/arm/blob/main/worlds/W%C3%A4nde%20und%2050%.wbt";
+    assert_eq!(fleet.asked("/session"), [asked]);
+}
+
+#[actix_rt::test]
+async fn a_simulation_whose_end_nobody_sees_does_not_fit() {
+    let fleet = StandIn::start(Script::default()).await;
+    for behaviour in ["sleep=100", "vanish=100"] {
+        let output =
+            rehearse(&format!("http://{}", fleet.address), &[&ONE[..], &["--misbehave", behaviour]].concat()).await;
+        let said = text(&output.stdout);
+        assert_eq!(output.status.code(), Some(1), "{said}");
+        assert!(said.contains("None was seen to its end.") && said.contains("| ran, their end unseen "), "{said}");
+    }
+}
+
+#[actix_rt::test]
+async fn an_interrupted_class_tells_what_was_seen_until_then() {
+    let fleet = StandIn::start(Script::default()).await;
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("class.json");
+    let mut command = command(&format!("http://{}", fleet.address), &arm());
+    command.args(["--clients", "2", "--over", "10m", "--stay", "10m", "--json"]).arg(&file);
+    let child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+    until("the first client connects to Webots", async || !fleet.asked("/webots").is_empty()).await;
+    // While the load is asked for each second, the simulation begins to run.
+    let before = fleet.asked("/load").len();
+    until("time passes", async || fleet.asked("/load").len() > before + 2).await;
+    kill(Pid::from_raw(i32::try_from(child.id().unwrap()).unwrap()), Signal::SIGINT).unwrap();
+    let output = actix_rt::time::timeout(SOON, child.wait_with_output()).await.expect("it ends").unwrap();
+    let said = text(&output.stdout);
+    assert_eq!(output.status.code(), Some(130), "{said}{}", text(&output.stderr));
+    assert!(said.contains(", interrupted\n") && said.contains("| ran, their end unseen "), "{said}");
+    let report: Value = serde_json::from_str(&std::fs::read_to_string(file).unwrap()).unwrap();
+    assert_eq!((&report["seats"]["asked"], &report["seats"]["unseen"]), (&1.into(), &1.into()), "{report}");
+    assert!(report["interrupted"] == true && !report["visits"][0]["pace"].as_array().unwrap().is_empty(), "{report}");
+}
+
+#[actix_rt::test]
+async fn a_time_that_is_too_long_is_refused() {
+    let fleet = StandIn::start(Script::default()).await;
+    for name in ["--over", "--stay", "--patience", "--soak"] {
+        for time in ["500000000000y", "31d"] {
+            let output = rehearse(&format!("http://{}", fleet.address), &[name, time]).await;
+            let said = text(&output.stderr);
+            assert_eq!(output.status.code(), Some(2), "{said}");
+            assert!(said.contains(name) && said.contains("allowed is up to 30d"), "{said}");
+        }
+    }
+}
+
+#[actix_rt::test]
+async fn the_verdict_says_why_simulations_broke_off() {
+    let webots =
+        vec!["model:<Scene/>", "paused by client", "application/json:{\"time\":1}", "application/json:{\"time\":2}"];
+    let fleet = StandIn::start(Script { webots, ends: true, ..Script::default() }).await;
+    let output = rehearse(&format!("http://{}", fleet.address), &ONE).await;
+    let said = text(&output.stdout);
+    assert_eq!(output.status.code(), Some(1), "{said}");
+    assert!(said.contains("None fits; 1 broke off: the connection to Webots: closed with "), "{said}");
 }

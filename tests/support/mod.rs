@@ -15,6 +15,7 @@ pub mod odd_name_server;
 pub mod ports;
 pub mod program;
 pub mod smtp;
+pub mod stand_in;
 pub mod webots;
 
 use std::time::{Duration, Instant};

@@ -8,10 +8,14 @@ use url::Url;
 
 use crate::behaviour::Mix;
 
+/// No time that can be asked for is longer: 30 days.
+const LONGEST: Duration = Duration::from_hours(30 * 24);
+
 /// Plays a class of web clients against a fleet, and says how many fit.
 ///
 /// It speaks to a session server as Webots' web page does: availability, a simulation server, the start, the scene and its
-/// updates, run, leave. Exit code 0: as expected; 1: not, or nothing could be measured; 2: wrong arguments.
+/// updates, run, leave. Exit code 0: as expected; 1: not, or nothing could be measured; 2: wrong arguments, or nobody agreed;
+/// 130: Ctrl-C.
 #[derive(Parser, Debug, Clone)]
 #[command(version)]
 pub(crate) struct Arguments {
@@ -25,20 +29,20 @@ pub(crate) struct Arguments {
     #[arg(long, default_value_t = 20, value_parser = clap::value_parser!(u32).range(1..=10_000))]
     pub(crate) clients: u32,
     /// Within what time they come, evenly: 0s for all at once
-    #[arg(long, default_value = "60s", value_parser = humantime::parse_duration)]
+    #[arg(long, default_value = "60s", value_parser = time)]
     pub(crate) over: Duration,
     /// How long each stays once its simulation runs
-    #[arg(long, default_value = "2m", value_parser = humantime::parse_duration)]
+    #[arg(long, default_value = "2m", value_parser = time)]
     pub(crate) stay: Duration,
     /// How long a client waits for its simulation before it gives up
-    #[arg(long, default_value = "5m", value_parser = humantime::parse_duration)]
+    #[arg(long, default_value = "5m", value_parser = time)]
     pub(crate) patience: Duration,
     /// Shares of clients that misbehave, in percent: reload, drop (leave without closing), sleep (a tab that reads nothing),
     /// vanish (a network that is gone), hasty (start and go at once). Example: reload=10,vanish=5
     #[arg(long, default_value = "", value_parser = str::parse::<Mix>)]
     pub(crate) misbehave: Mix,
     /// Clients come again and again for this time, in place of once
-    #[arg(long, value_parser = humantime::parse_duration)]
+    #[arg(long, value_parser = time)]
     pub(crate) soak: Option<Duration>,
     /// A simulation below this share of real time does not count as one that fits
     #[arg(long, default_value_t = 0.9, value_parser = share)]
@@ -69,9 +73,9 @@ impl Arguments {
         if self.explain {
             return "one client".to_owned();
         }
-        let time = |time| humantime::format_duration(time).to_string();
-        let how_long = self.soak.map(|soak| format!(", again and again for {}", time(soak))).unwrap_or_default();
-        format!("{} clients within {}, each for {}{how_long}", self.clients, time(self.over), time(self.stay))
+        let words = |time| humantime::format_duration(time).to_string();
+        let how_long = self.soak.map(|soak| format!(", again and again for {}", words(soak))).unwrap_or_default();
+        format!("{} clients within {}, each for {}{how_long}", self.clients, words(self.over), words(self.stay))
     }
 }
 
@@ -79,6 +83,11 @@ fn fleet(text: &str) -> Result<Url, String> {
     let url = Url::parse(text).map_err(|error| error.to_string())?;
     let is_usable = matches!(url.scheme(), "http" | "https") && url.has_host();
     if is_usable { Ok(url) } else { Err("allowed is http://HOST:PORT or https://HOST".to_owned()) }
+}
+
+fn time(text: &str) -> Result<Duration, String> {
+    let time = humantime::parse_duration(text).map_err(|error| error.to_string())?;
+    if time <= LONGEST { Ok(time) } else { Err("allowed is up to 30d".to_owned()) }
 }
 
 fn share(text: &str) -> Result<f64, String> {

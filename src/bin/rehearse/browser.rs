@@ -1,5 +1,6 @@
 //! One client: the steps of Webots' web page from the wish for a simulation to its end.
 
+use std::cell::RefCell;
 use std::time::{Duration, Instant};
 
 use serde::Deserialize;
@@ -7,12 +8,15 @@ use serde::Deserialize;
 use crate::arguments::Arguments;
 use crate::behaviour::Behaviour;
 use crate::board::{Board, Stage};
-use crate::conversation::{Conversation, Ended};
+use crate::conversation::{Conversation, Ended, unless_error};
 use crate::session::Session;
 use crate::visit::{Outcome, Pace, Steps, Visit};
 
 /// How long simulated time is watched for one value of the pace.
 const PACE_PERIOD: Duration = Duration::from_secs(1);
+/// After others were faster, before the next look at the availability: at first, and doubled each time up to the longest.
+const FIRST_PAUSE: Duration = Duration::from_secs(1);
+const LONGEST_PAUSE: Duration = Duration::from_secs(8);
 
 /// A client and what it knows.
 pub(crate) struct Browser<'class> {
@@ -21,6 +25,10 @@ pub(crate) struct Browser<'class> {
     session: &'class Session,
     behaviour: Behaviour,
     visit: Visit,
+    /// Where the visit is kept in the end.
+    visits: &'class RefCell<Vec<Visit>>,
+    /// What the session server said when it last had no place, although it was available just before.
+    full: Option<String>,
 }
 
 /// A simulation that runs: the connection that keeps it, and the one to its Webots.
@@ -50,13 +58,13 @@ impl From<Ended> for NoStart {
 }
 
 impl<'class> Browser<'class> {
-    /// A client that asks now.
+    /// A client that asks now. What it has met comes to `visits` once it is dropped, also where that interrupts it.
     pub(crate) fn new(
         arguments: &'class Arguments,
         board: &'class Board,
         session: &'class Session,
-        client: u32,
-        behaviour: Behaviour,
+        visits: &'class RefCell<Vec<Visit>>,
+        (client, behaviour): (u32, Behaviour),
     ) -> Self {
         let asked = board.now();
         let visit = Visit {
@@ -69,17 +77,22 @@ impl<'class> Browser<'class> {
             pace: Vec::new(),
             ended: asked,
         };
-        Self { arguments, board, session, behaviour, visit }
+        Self { arguments, board, session, behaviour, visit, visits, full: None }
     }
 
-    /// Goes through all steps. `meet` hears which simulation server the client was sent to.
-    pub(crate) async fn visit(mut self, meet: impl Fn(&str)) -> Visit {
+    /// Goes through all steps. `meet` hears which simulation server the client was sent to, and whether it may go there.
+    pub(crate) async fn visit(mut self, meet: impl Fn(&str) -> bool) {
         self.board.came();
         let patience = self.arguments.patience;
         let started = actix_rt::time::timeout(patience, self.start(meet)).await;
-        let started = started.unwrap_or_else(|_| Err(NoStart::Failed(format!("no simulation within {patience:?}"))));
+        let started = started.unwrap_or_else(|_| {
+            let why = self.full.as_ref().map(|full| format!(": {full}")).unwrap_or_default();
+            Err(NoStart::Failed(format!("no simulation within {patience:?}{why}")))
+        });
         self.visit.outcome = match started {
             Ok(running) => {
+                // As long as nothing else is known.
+                self.visit.outcome = Outcome::Unseen;
                 let _stage = self.board.enter(Stage::Running);
                 self.watch(running).await
             }
@@ -87,17 +100,16 @@ impl<'class> Browser<'class> {
             Err(NoStart::Failed(why)) => Outcome::Failed(why),
             Err(NoStart::Left) => Outcome::Left,
         };
-        self.visit.ended = self.board.now();
-        self.board.gone(matches!(self.visit.outcome, Outcome::Ran | Outcome::Left));
-        self.visit
+        self.board.gone(matches!(self.visit.outcome, Outcome::Ran | Outcome::Unseen | Outcome::Left));
     }
 
-    async fn start(&mut self, meet: impl Fn(&str)) -> Result<Running, NoStart> {
+    async fn start(&mut self, meet: impl Fn(&str) -> bool) -> Result<Running, NoStart> {
         let waiting = self.board.enter(Stage::Waiting);
         let asked = Instant::now();
-        self.session.until_available().await?;
-        let server = self.session.simulation_server(&self.arguments.world).await.map_err(NoStart::Refused)?;
-        meet(&server);
+        let server = self.find_server().await?;
+        if !meet(&server) {
+            return Err(NoStart::Left);
+        }
         self.visit.server = server.split_once("://").map(|(_, address)| address.to_owned());
         let mut lease = Conversation::open(&format!("{server}/client")).await?;
         let start = serde_json::json!({"start": {"url": self.arguments.world}});
@@ -133,6 +145,22 @@ impl<'class> Browser<'class> {
         Ok(Running { lease, stream })
     }
 
+    /// Waits until the fleet is available and asks for a simulation server; again and again where others were faster.
+    async fn find_server(&mut self) -> Result<String, NoStart> {
+        let mut pause = FIRST_PAUSE;
+        loop {
+            self.session.until_available().await?;
+            match self.session.simulation_server(&self.arguments.world).await {
+                Ok(server) => return Ok(server),
+                Err(why) if is_of_no_place(&why) => self.full = Some(why),
+                Err(why) => return Err(NoStart::Refused(why)),
+            }
+            // Those who wait together don't ask together.
+            actix_rt::time::sleep(pause.mul_f64(rand::random_range(0.5..1.0))).await;
+            pause = (pause * 2).min(LONGEST_PAUSE);
+        }
+    }
+
     /// The next text of the simulation server; a refusal is one whatever it begins with.
     async fn hear_of_start(&self, lease: &mut Conversation) -> Result<String, NoStart> {
         let text = lease.hear().await?;
@@ -147,13 +175,13 @@ impl<'class> Browser<'class> {
     async fn open_stream(&self, url: &str) -> Result<Conversation, NoStart> {
         let mut stream = Conversation::open(&format!("{}/", url.trim_end_matches('/'))).await?;
         stream.say(&self.arguments.viewer).await?;
-        while !stream.hear().await?.starts_with("model:") {}
+        while !unless_error(stream.hear().await?)?.starts_with("model:") {}
         stream.say("pause").await?;
-        while stream.hear().await? != "paused by client" {}
+        while unless_error(stream.hear().await?)? != "paused by client" {}
         stream.say("real-time:-1").await?;
         let mut first = None;
         loop {
-            let time = time(&stream.hear().await?);
+            let time = time(&unless_error(stream.hear().await?)?);
             match (first, time) {
                 (Some(first), Some(time)) if time > first => return Ok(stream),
                 (None, Some(time)) => first = Some(time),
@@ -181,7 +209,11 @@ impl<'class> Browser<'class> {
             futures_util::future::join(running.stream.close(), running.lease.close()).await;
         }
         // Who vanishes or crashes says nothing: the connections are dropped.
-        Outcome::Ran
+        match self.behaviour {
+            // Its simulation may have ended long before.
+            Behaviour::Sleep | Behaviour::Vanish => Outcome::Unseen,
+            _ => Outcome::Ran,
+        }
     }
 
     /// Reads what comes and measures the pace, until the simulation ends. Returns why it ended.
@@ -220,10 +252,22 @@ impl<'class> Browser<'class> {
     }
 }
 
+impl Drop for Browser<'_> {
+    fn drop(&mut self) {
+        self.visit.ended = self.board.now();
+        self.visits.borrow_mut().push(self.visit.clone());
+    }
+}
+
 /// The simulated time of an update, in milliseconds.
 fn time(text: &str) -> Option<f64> {
     let update: Update = serde_json::from_str(text.strip_prefix("application/json:")?).ok()?;
     Some(update.time)
+}
+
+/// Whether an answer of the session server says that all simulation servers are full, which may change.
+fn is_of_no_place(answer: &str) -> bool {
+    answer.to_ascii_lowercase().contains("no simulation server available")
 }
 
 /// Whether a text says that there is no place yet.

@@ -5,11 +5,13 @@ use std::collections::BTreeMap;
 use std::time::Duration;
 
 use futures_util::future::join_all;
+use tokio::sync::Notify;
 
 use crate::arguments::Arguments;
 use crate::behaviour::{Behaviour, Draw};
 use crate::board::Board;
 use crate::browser::Browser;
+use crate::consent::Consent;
 use crate::servers::Servers;
 use crate::session::Session;
 use crate::visit::Visit;
@@ -17,10 +19,22 @@ use crate::visit::Visit;
 /// Between two visits of a client that comes again and again.
 const PAUSE: Duration = Duration::from_millis(500);
 
-/// Plays the whole class. Returns what each client has met, and the highest load of each server.
-pub(crate) async fn play(arguments: &Arguments) -> (Vec<Visit>, BTreeMap<String, Option<f64>>) {
+/// What came of a class.
+pub(crate) struct Played {
+    /// What each client has met.
+    pub(crate) visits: Vec<Visit>,
+    /// The highest load of each server.
+    pub(crate) peaks: BTreeMap<String, Option<f64>>,
+    /// Whether Ctrl-C has ended it.
+    pub(crate) interrupted: bool,
+}
+
+/// Plays the whole class, or until Ctrl-C. Ends at once where nobody agrees to load a server that a client is sent to.
+pub(crate) async fn play(arguments: &Arguments, consent: &Consent<'_>) -> Played {
     let class = Class {
         arguments,
+        consent,
+        refused: Notify::new(),
         board: Board::new(),
         session: Session::new(&arguments.fleet),
         servers: Servers::default(),
@@ -29,17 +43,24 @@ pub(crate) async fn play(arguments: &Arguments) -> (Vec<Visit>, BTreeMap<String,
     };
     let clients = join_all((0..arguments.clients).map(|client| class.come(client)));
     let aside = futures_util::future::join(class.board.show(), class.servers.watch());
+    let mut interrupted = false;
+    // Clients that are dropped leave behind what they have met until then.
     tokio::select! {
         _ = clients => {}
         _ = aside => {}
+        () = class.refused.notified() => {}
+        Ok(()) = tokio::signal::ctrl_c() => interrupted = true,
     }
     class.board.clear();
-    (class.visits.take(), class.servers.peaks())
+    Played { visits: class.visits.take(), peaks: class.servers.peaks(), interrupted }
 }
 
 /// What all clients share.
 struct Class<'arguments> {
     arguments: &'arguments Arguments,
+    consent: &'arguments Consent<'arguments>,
+    /// Nobody agreed to load a server that a client was sent to.
+    refused: Notify,
     board: Board,
     session: Session,
     servers: Servers,
@@ -66,9 +87,20 @@ impl Class<'_> {
         }
     }
 
+    /// Whether a client may go on to the server that it was sent to.
+    fn meet(&self, server: &str) -> bool {
+        let may_load = self.consent.has_server(server);
+        if may_load {
+            self.servers.met(server);
+        } else {
+            self.refused.notify_one();
+        }
+        may_load
+    }
+
     async fn visit(&self, client: u32, behaviour: Behaviour) {
-        let browser = Browser::new(self.arguments, &self.board, &self.session, client, behaviour);
-        let visit = browser.visit(|server| self.servers.met(server)).await;
-        self.visits.borrow_mut().push(visit);
+        let who = (client, behaviour);
+        let browser = Browser::new(self.arguments, &self.board, &self.session, &self.visits, who);
+        browser.visit(|server| self.meet(server)).await;
     }
 }

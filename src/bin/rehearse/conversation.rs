@@ -1,14 +1,16 @@
 //! A WebSocket as a browser's page sees it: texts that come and go, each wait with a limit.
 
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use futures_util::{SinkExt, StreamExt};
 use tokio::net::TcpStream;
 use tokio_tungstenite::tungstenite::protocol::WebSocketConfig;
 use tokio_tungstenite::tungstenite::{Error, Message};
-use tokio_tungstenite::{MaybeTlsStream, WebSocketStream, connect_async_with_config};
+use tokio_tungstenite::{Connector, MaybeTlsStream, WebSocketStream, connect_async_tls_with_config};
 
-/// How long a connection may take.
+use crate::session::encryption;
+
+/// How long a connection may take, or a text to be sent.
 const CONNECT: Duration = Duration::from_secs(20);
 /// The scene of a large world comes in one message.
 const LARGEST_MESSAGE: usize = 512 << 20;
@@ -30,9 +32,34 @@ pub(crate) enum Ended {
     /// It broke.
     #[error("broken: {0}")]
     Broken(String),
-    /// Nothing came in time.
-    #[error("nothing came for {} s", .0.as_secs())]
-    Silent(Duration),
+    /// What was waited for did not come in time, whatever else came.
+    #[error("not within {} s", .0.as_secs())]
+    Late(Duration),
+    /// The other side has said that it can't go on.
+    #[error("{0}")]
+    Fault(String),
+}
+
+/// Until when all of a step has to be done.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Deadline {
+    end: Instant,
+    limit: Duration,
+}
+
+impl Deadline {
+    /// So long from now.
+    pub(crate) fn within(limit: Duration) -> Self {
+        Self { end: Instant::now() + limit, limit }
+    }
+}
+
+/// A text of Webots, or its end: after `error: ...` nothing else comes.
+///
+/// # Errors
+/// When the text is such an end.
+pub(crate) fn unless_error(text: String) -> Result<String, Ended> {
+    if text.starts_with("error:") { Err(Ended::Fault(text)) } else { Ok(text) }
 }
 
 impl Conversation {
@@ -44,7 +71,7 @@ impl Conversation {
         let config =
             WebSocketConfig::default().max_message_size(Some(LARGEST_MESSAGE)).max_frame_size(Some(LARGEST_MESSAGE));
         let failed = |why: String| Ended::Unreachable(url.to_owned(), why);
-        let connecting = connect_async_with_config(url, Some(config), true);
+        let connecting = connect_async_tls_with_config(url, Some(config), true, encryption().map(Connector::Rustls));
         let connected =
             actix_rt::time::timeout(CONNECT, connecting).await.map_err(|_| failed("too slow".to_owned()))?;
         let (socket, _) = connected.map_err(|error| failed(error.to_string()))?;
@@ -54,9 +81,11 @@ impl Conversation {
     /// Sends a text.
     ///
     /// # Errors
-    /// When the connection is broken.
+    /// When the connection is broken, or nobody reads.
     pub(crate) async fn say(&mut self, text: &str) -> Result<(), Ended> {
-        self.socket.send(Message::text(text)).await.map_err(|error| Ended::Broken(error.to_string()))
+        let sending = actix_rt::time::timeout(CONNECT, self.socket.send(Message::text(text)));
+        let sent = sending.await.map_err(|_| Ended::Late(CONNECT))?;
+        sent.map_err(|error| Ended::Broken(error.to_string()))
     }
 
     /// The next text.
@@ -80,12 +109,16 @@ impl Conversation {
         }
     }
 
-    /// The next text, if it comes in time.
+    /// The next text, if it comes before the deadline. Where texts come all the time, none comes after it.
     ///
     /// # Errors
-    /// When the connection is over, or nothing comes.
-    pub(crate) async fn hear_within(&mut self, limit: Duration) -> Result<String, Ended> {
-        actix_rt::time::timeout(limit, self.hear()).await.unwrap_or(Err(Ended::Silent(limit)))
+    /// When the connection is over, or the time is.
+    pub(crate) async fn hear_by(&mut self, deadline: Deadline) -> Result<String, Ended> {
+        let late = Ended::Late(deadline.limit);
+        if Instant::now() >= deadline.end {
+            return Err(late);
+        }
+        tokio::time::timeout_at(deadline.end.into(), self.hear()).await.unwrap_or(Err(late))
     }
 
     /// Closes the connection as a page does that is left, and does not wait for long.

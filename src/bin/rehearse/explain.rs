@@ -1,24 +1,26 @@
 //! The acceptance run: one client goes through all steps, and each is compared with what a fleet and Webots are expected
 //! to do (`docs/protocol.md`). What is printed is Markdown that can be pasted into an issue.
 
-use std::io::Write;
 use std::time::{Duration, Instant};
 
+use crate::Fault;
 use crate::arguments::Arguments;
-use crate::conversation::{Conversation, Ended};
+use crate::consent::Consent;
+use crate::conversation::{Conversation, Deadline, unless_error};
 use crate::session::Session;
 use crate::walk::Walk;
+use crate::words::{add, excerpt, over, told};
 
-/// How long one text may take to come, once Webots runs.
+/// How long an answer may take, whatever else comes before it.
 const ANSWER: Duration = Duration::from_secs(20);
+/// How long the scene may take.
+const SCENE: Duration = Duration::from_mins(1);
 /// Two heartbeats come within this time.
 const TWO_HEARTBEATS: Duration = Duration::from_secs(13);
 /// How long updates are watched.
 const WATCH: Duration = Duration::from_secs(3);
 /// How long Webots may take to be gone once its client has left.
 const GONE: Duration = Duration::from_secs(15);
-/// What is told of one text, in characters.
-const EXCERPT: usize = 90;
 /// How the texts begin that Webots' page knows on the connection to the simulation server.
 const KNOWN: [&str; 9] =
     ["loading:", "queue:", "shutdownTimeout:", "webots:", "ide: ", "type:", "error:", "reset controller:", "."];
@@ -29,34 +31,45 @@ struct Stuck;
 /// Walks through all steps and prints what came. Returns whether all of it was as expected.
 ///
 /// # Errors
-/// When the session server does not answer at all.
-pub(crate) async fn run(arguments: &Arguments) -> Result<bool, String> {
+/// When the session server does not answer at all, or nobody agreed to load what it names.
+pub(crate) async fn run(arguments: &Arguments, consent: &Consent<'_>) -> Result<bool, Fault> {
     let session = Session::new(&arguments.fleet);
     session.answers().await?;
-    let mut walk = Walk::new();
+    let mut walk = Walk::begin(arguments);
     // Where it got stuck is the last of the steps.
-    Box::pin(walk.go(arguments, &session)).await.ok();
-    // Nobody may be listening any more.
-    writeln!(std::io::stdout(), "{}", walk.text(arguments)).ok();
-    Ok(walk.agrees())
+    Box::pin(walk.go(arguments, &session, consent)).await.ok();
+    match consent.refusal() {
+        Some(why) => Err(Fault::NotAgreed(why)),
+        None => Ok(walk.end()),
+    }
+}
+
+/// What came on the connection to the simulation server until Webots was ready, or could not be.
+struct Start {
+    texts: u32,
+    unknown: Vec<String>,
+    limit: Option<String>,
+    /// `webots:...`, or why it never came.
+    end: String,
 }
 
 impl Walk {
-    async fn go(&mut self, arguments: &Arguments, session: &Session) -> Result<(), Stuck> {
+    async fn go(&mut self, arguments: &Arguments, session: &Session, consent: &Consent<'_>) -> Result<(), Stuck> {
         self.ask_for_availability(arguments, session).await?;
-        let (mut lease, webots) = self.start(arguments, session).await?;
+        let (mut lease, webots) = self.start(arguments, session, consent).await?;
         let address = format!("{}/", webots.trim_end_matches('/'));
         let opened = Conversation::open(&address).await;
         let came = opened.as_ref().map_or_else(ToString::to_string, |_| "a WebSocket".to_owned());
-        self.note("stream", "Webots takes a WebSocket at `/`", came, opened.is_ok());
+        self.note("stream", "Webots takes a WebSocket at `/`", &came, opened.is_ok());
         let mut stream = opened.map_err(|_| Stuck)?;
         self.see_the_scene(arguments, &mut stream).await?;
-        self.command(&mut stream, "pause", "pause", "`paused by client`", "paused by client").await?;
-        self.run(&mut stream).await?;
+        self.command(arguments, &mut stream, "pause", "pause", "`paused by client`", "paused by client").await?;
+        self.run(arguments, &mut stream).await?;
         self.hear_heartbeats(&mut lease).await?;
-        self.command(&mut stream, "pause again", "pause", "`paused by client`", "paused by client").await?;
-        self.command(&mut stream, "step", "step", "an update, then `paused by client`", "paused by client").await?;
-        self.command(&mut stream, "reset", "reset", "`reset finished`", "reset finished").await?;
+        self.command(arguments, &mut stream, "pause again", "pause", "`paused by client`", "paused by client").await?;
+        self.command(arguments, &mut stream, "step", "step", "an update, then `paused by client`", "paused by client")
+            .await?;
+        self.command(arguments, &mut stream, "reset", "reset", "`reset finished`", "reset finished").await?;
         stream.close().await;
         lease.close().await;
         self.see_it_gone(&address).await;
@@ -66,76 +79,62 @@ impl Walk {
     async fn ask_for_availability(&mut self, arguments: &Arguments, session: &Session) -> Result<(), Stuck> {
         let expected = "`1` or `0` as the first text of the WebSocket `/`";
         let first = match Conversation::open(&session.availability_url()).await {
-            Ok(mut availability) => availability.hear_within(ANSWER).await,
+            Ok(mut availability) => availability.hear_by(limit(ANSWER, arguments)).await,
             Err(ended) => Err(ended),
         };
         let agrees = matches!(first.as_deref(), Ok("0" | "1"));
-        self.note("availability", expected, told(&first), agrees);
+        self.note("availability", expected, &told(&first), agrees);
         first.map_err(|_| Stuck)?;
         let available = actix_rt::time::timeout(arguments.patience, session.until_available()).await;
         let came = match &available {
             Ok(Ok(())) => "`1`".to_owned(),
-            Ok(Err(ended)) => format!("the connection was {ended}"),
+            Ok(Err(ended)) => over(ended),
             Err(_) => "`0` all the time".to_owned(),
         };
         let agrees = matches!(available, Ok(Ok(())));
-        self.note("a free server", "`1` before the patience ends: some server can take a client", came, agrees);
+        self.note("a free server", "`1` before the patience ends: some server can take a client", &came, agrees);
         if agrees { Ok(()) } else { Err(Stuck) }
     }
 
     /// Asks for a simulation server and starts the world there. Returns the connection and the URL of Webots.
-    async fn start(&mut self, arguments: &Arguments, session: &Session) -> Result<(Conversation, String), Stuck> {
+    async fn start(
+        &mut self,
+        arguments: &Arguments,
+        session: &Session,
+        consent: &Consent<'_>,
+    ) -> Result<(Conversation, String), Stuck> {
         let server = session.simulation_server(&arguments.world).await;
         let came = excerpt(server.as_ref().map_or_else(Clone::clone, Clone::clone).as_str());
-        self.note("simulation server", "`ws://HOST:PORT` or `wss://HOST/PORT`", came, server.is_ok());
-        let server = server.map_err(|_| Stuck)?;
+        self.note("simulation server", "`ws://HOST:PORT` or `wss://HOST/PORT`", &came, server.is_ok());
+        let server = server.ok().filter(|server| consent.has_server(server)).ok_or(Stuck)?;
         let opened = Conversation::open(&format!("{server}/client")).await;
         let came = opened.as_ref().map_or_else(ToString::to_string, |_| "a WebSocket".to_owned());
-        self.note("client", "a WebSocket at `/client`", came, opened.is_ok());
+        self.note("client", "a WebSocket at `/client`", &came, opened.is_ok());
         let mut lease = opened.map_err(|_| Stuck)?;
-        let start = serde_json::json!({"start": {"url": arguments.world}}).to_string();
-        let (mut unknown, mut limit, mut texts) = (Vec::new(), None, 0);
-        let end = if lease.say(&start).await.is_ok() {
-            loop {
-                match lease.hear_within(arguments.patience).await {
-                    Ok(text) => {
-                        texts += 1;
-                        if !KNOWN.iter().any(|known| text.starts_with(known)) {
-                            unknown.push(excerpt(&text));
-                        }
-                        limit = text.strip_prefix("shutdownTimeout:").map(|limit| limit.trim().to_owned()).or(limit);
-                        if text.starts_with("webots:") || text.starts_with("loading: Error:") {
-                            break text;
-                        }
-                    }
-                    Err(ended) => break format!("the connection was {ended}"),
-                }
-            }
-        } else {
-            "the connection was broken".to_owned()
-        };
+        let Start { texts, unknown, limit, end } = follow(&mut lease, arguments).await;
         let came = if unknown.is_empty() { format!("{texts} texts, all known") } else { unknown.join(" ") };
-        self.note("progress", "only texts that Webots' page knows", came, unknown.is_empty());
+        self.note("progress", "only texts that Webots' page knows", &came, unknown.is_empty());
         let is_limit = limit.as_ref().is_some_and(|limit| limit.parse::<u64>().is_ok());
         let came = limit.unwrap_or_else(|| "none".to_owned());
-        self.note("time limit", "`shutdownTimeout: SECONDS` before Webots is ready", came, is_limit);
+        self.note("time limit", "`shutdownTimeout: SECONDS` before Webots is ready", &came, is_limit);
         let url = end.strip_prefix("webots:").filter(|url| url.starts_with("ws") && !url.ends_with('/'));
-        self.note("Webots is ready", "`webots:ws...`, without a slash at the end", excerpt(&end), url.is_some());
+        self.note("Webots is ready", "`webots:ws...`, without a slash at the end", &excerpt(&end), url.is_some());
         url.map(|url| (lease, url.to_owned())).ok_or(Stuck)
     }
 
     async fn see_the_scene(&mut self, arguments: &Arguments, stream: &mut Conversation) -> Result<(), Stuck> {
         let expected = "`world:`, `model:`, `application/json:`, `scene load completed`, the state, in this order";
         let (mut order, mut model) = (Vec::new(), String::new());
+        let deadline = limit(SCENE, arguments);
         let mut ended = stream.say(&arguments.viewer).await.err();
         let is_state = |text: &str| text.starts_with("pause:") || text == "real-time" || text == "fast";
         while ended.is_none() {
-            match stream.hear_within(ANSWER).await {
+            match stream.hear_by(deadline).await.and_then(unless_error) {
                 Ok(text) => {
                     let begin = text.split_inclusive(':').next().unwrap_or_default();
                     let begin = if begin.starts_with("model:") { "model:" } else { begin };
                     if !matches!(begin, "loading:" | "robot window:" | "stdout:" | "stderr:") {
-                        order.push(excerpt(begin));
+                        add(&mut order, begin);
                     }
                     if let Some(xml) = text.strip_prefix("model:") {
                         xml.clone_into(&mut model);
@@ -150,44 +149,46 @@ impl Walk {
         let known = ["`world:`", "`model:`", "`application/json:`", "`scene load completed`"];
         let agrees =
             ended.is_none() && order.iter().take(known.len()).eq(known.iter()) && order.len() == known.len() + 1;
-        let failed = ended.as_ref().map(|ended| format!(", then {ended}")).unwrap_or_default();
-        self.note("scene", expected, format!("{}{failed}", order.join(", ")), agrees);
+        let failed = ended.as_ref().map(|ended| format!(", then {}", over(ended))).unwrap_or_default();
+        self.note("scene", expected, &format!("{}{failed}", order.join(", ")), agrees);
         let is_model = model.contains("<Scene") && model.contains("<Viewpoint");
         let came = format!("{} bytes: {}", model.len(), excerpt(&model));
-        self.note("model", "XML with a `Scene` and a `Viewpoint`", came, is_model);
+        self.note("model", "XML with a `Scene` and a `Viewpoint`", &came, is_model);
         ended.map_or(Ok(()), |_| Err(Stuck))
     }
 
     /// Sends a command and waits for its answer; updates may come before.
     async fn command(
         &mut self,
+        arguments: &Arguments,
         stream: &mut Conversation,
         name: &'static str,
         command: &str,
         expected: &'static str,
         answer: &str,
     ) -> Result<(), Stuck> {
+        let deadline = limit(ANSWER, arguments);
         let mut came = stream.say(command).await.map(|()| String::new());
         let (mut others, mut updates) = (Vec::new(), 0);
         while came.as_ref().is_ok_and(|text| text != answer) {
-            came = stream.hear_within(ANSWER).await;
+            came = stream.hear_by(deadline).await.and_then(unless_error);
             match &came {
                 Ok(text) if text.starts_with("application/json:") => updates += 1,
                 Ok(text) if text == answer => {}
                 Ok(text) if ["visibility:", "stdout:", "stderr:"].iter().any(|one| text.starts_with(one)) => {}
-                Ok(text) => others.push(excerpt(text)),
+                Ok(text) => add(&mut others, text),
                 Err(_) => {}
             }
         }
         let before = if others.is_empty() { String::new() } else { format!("{}, then ", others.join(", ")) };
         let before = if updates == 0 { before } else { format!("{updates} updates, {before}") };
         let agrees = came.is_ok() && others.is_empty() && (command != "step" || updates == 1);
-        self.note(name, expected, format!("{before}{}", told(&came)), agrees);
+        self.note(name, expected, &format!("{before}{}", told(&came)), agrees);
         came.map(drop).map_err(|_| Stuck)
     }
 
-    async fn run(&mut self, stream: &mut Conversation) -> Result<(), Stuck> {
-        self.command(stream, "run", "real-time:-1", "`real-time`", "real-time").await?;
+    async fn run(&mut self, arguments: &Arguments, stream: &mut Conversation) -> Result<(), Stuck> {
+        self.command(arguments, stream, "run", "real-time:-1", "`real-time`", "real-time").await?;
         let mut times = Vec::new();
         let began = Instant::now();
         let reading = async {
@@ -203,9 +204,9 @@ impl Walk {
         let per_second = f64::from(u32::try_from(times.len()).unwrap_or(u32::MAX)) / wall;
         let factor = times.first().zip(times.last()).map_or(0.0, |(first, last)| (last - first) / 1000.0 / wall);
         let came = format!("{per_second:.0} in a second");
-        self.note("updates", "with growing `time`, at most some 60 in a second", came, grows && per_second < 90.0);
+        self.note("updates", "with growing `time`, at most some 60 in a second", &came, grows && per_second < 90.0);
         let came = format!("{factor:.2} of real time");
-        self.note("pace", "0.9 of real time or more", came, (0.9..1.2).contains(&factor));
+        self.note("pace", "0.9 of real time or more", &came, (0.9..1.2).contains(&factor));
         if times.is_empty() { Err(Stuck) } else { Ok(()) }
     }
 
@@ -224,12 +225,12 @@ impl Walk {
         let ended = actix_rt::time::timeout(TWO_HEARTBEATS, listening).await;
         let between = beats.windows(2).next().and_then(|pair| Some(*pair.get(1)? - *pair.first()?));
         let came = match (&ended, between) {
-            (Ok(Some(ended)), _) => format!("the connection was {ended}"),
+            (Ok(Some(ended)), _) => over(ended),
             (_, Some(between)) => format!("{:.1} s between two", between.as_secs_f64()),
             (_, None) => format!("{} in {} s", beats.len(), TWO_HEARTBEATS.as_secs()),
         };
         let agrees = between.is_some_and(|between| (4.0..6.5).contains(&between.as_secs_f64()));
-        self.note("signs of life", "`.` on `/client` every 5 s", came, agrees);
+        self.note("signs of life", "`.` on `/client` every 5 s", &came, agrees);
         if matches!(ended, Ok(Some(_))) { Err(Stuck) } else { Ok(()) }
     }
 
@@ -237,23 +238,48 @@ impl Walk {
         let deadline = Instant::now() + GONE;
         let mut is_gone = false;
         while !is_gone && Instant::now() < deadline {
-            is_gone = Conversation::open(address).await.is_err();
+            // Who takes no connection in time is not gone.
+            let opened = tokio::time::timeout_at(deadline.into(), Conversation::open(address)).await;
+            is_gone = opened.is_ok_and(|opened| opened.is_err());
             actix_rt::time::sleep(Duration::from_millis(100)).await;
         }
         let came = if is_gone { "nobody there" } else { "Webots still answers" };
-        self.note("leave", "Webots has ended once its client has left", came.to_owned(), is_gone);
+        self.note("leave", "Webots has ended once its client has left", came, is_gone);
     }
 }
 
-/// What came, or why nothing did.
-fn told(came: &Result<String, Ended>) -> String {
-    came.as_ref().map_or_else(ToString::to_string, |text| excerpt(text))
+/// Starts the world, and follows what is said until Webots is ready, or can't be.
+async fn follow(lease: &mut Conversation, arguments: &Arguments) -> Start {
+    let deadline = Deadline::within(arguments.patience);
+    let mut start = Start { texts: 0, unknown: Vec::new(), limit: None, end: String::new() };
+    let wish = serde_json::json!({"start": {"url": arguments.world}}).to_string();
+    let mut heard = lease.say(&wish).await.map(|()| String::new());
+    loop {
+        if heard.is_ok() {
+            heard = lease.hear_by(deadline).await;
+        }
+        let text = match heard.as_ref() {
+            Ok(text) => text,
+            Err(ended) => {
+                start.end = over(ended);
+                return start;
+            }
+        };
+        start.texts += 1;
+        if !KNOWN.iter().any(|known| text.starts_with(known)) {
+            add(&mut start.unknown, text);
+        }
+        if let Some(limit) = text.strip_prefix("shutdownTimeout:") {
+            start.limit = Some(limit.trim().to_owned());
+        }
+        if ["webots:", "error:", "loading: Error:"].iter().any(|end| text.starts_with(end)) {
+            text.clone_into(&mut start.end);
+            return start;
+        }
+    }
 }
 
-/// The beginning of a text, on one line, as code.
-fn excerpt(text: &str) -> String {
-    let short: String =
-        text.chars().take(EXCERPT).map(|letter| if letter.is_control() { ' ' } else { letter }).collect();
-    let more = if text.chars().nth(EXCERPT).is_some() { "..." } else { "" };
-    format!("`{}{more}`", short.replace('`', "'"))
+/// The deadline of a step that begins now: nobody waits for longer than the patience.
+fn limit(step: Duration, arguments: &Arguments) -> Deadline {
+    Deadline::within(step.min(arguments.patience))
 }

@@ -1,6 +1,6 @@
 //! Whether a fleet is on this machine.
 
-use std::net::{TcpListener, ToSocketAddrs};
+use std::net::{SocketAddr, TcpListener, ToSocketAddrs};
 
 use url::Url;
 
@@ -13,9 +13,13 @@ pub(crate) fn is_this_machine(url: &Url) -> bool {
     let Ok(addresses) = (host, 0).to_socket_addrs() else {
         return false;
     };
-    // Only an own address can be listened on.
     let mut addresses = addresses.peekable();
-    addresses.peek().is_some() && addresses.all(|address| TcpListener::bind(address).is_ok())
+    addresses.peek().is_some() && addresses.all(is_own)
+}
+
+/// Only an own address can be listened on; and the loopback is one, also where IPv6 is off and /etc/hosts still has `::1`.
+fn is_own(address: SocketAddr) -> bool {
+    address.ip().to_canonical().is_loopback() || TcpListener::bind(address).is_ok()
 }
 
 #[cfg(test)]
@@ -26,6 +30,8 @@ mod tests {
     fn only_own_addresses_are_this_machine() {
         let is_here = |url: &str| is_this_machine(&Url::parse(url).unwrap());
         assert!(is_here("http://127.0.0.1:1999") && is_here("http://localhost:1999"));
+        // Without IPv6 too.
+        assert!(is_here("http://[::1]:1999") && is_here("http://[::ffff:127.0.0.1]:1999"));
         assert!(!is_here("http://192.0.2.1:1999") && !is_here("http://fleet.invalid"));
     }
 }

@@ -30,6 +30,8 @@ pub(crate) struct Report {
     pub(crate) verdict: String,
     /// How many had to fit.
     pub(crate) expected: Option<u32>,
+    /// Whether it was interrupted, so that only a part was played.
+    pub(crate) interrupted: bool,
 }
 
 /// Seats that were asked for, and what came of them.
@@ -46,7 +48,9 @@ pub(crate) struct Seats {
     pub(crate) refused: BTreeMap<String, u32>,
     /// Simulations that ended before their client left, by the reason.
     pub(crate) broke_off: BTreeMap<String, u32>,
-    /// Clients that left on purpose before their simulation ran.
+    /// Simulations that ran and whose end nobody saw: their client slept, vanished, or was interrupted.
+    pub(crate) unseen: u32,
+    /// Clients that left before their simulation ran.
     pub(crate) left: u32,
 }
 
@@ -128,9 +132,16 @@ impl Report {
             pace: factors(visits.iter().flat_map(factors_of)),
             verdict: verdict(&seats, &servers),
             expected: arguments.expect,
+            interrupted: false,
             seats,
             servers,
         }
+    }
+
+    /// Notes that only a part of it was played.
+    pub(crate) fn interrupt(&mut self) {
+        self.interrupted = true;
+        self.played += ", interrupted";
     }
 
     /// Whether as many fit as were expected; without an expectation, whether any did.
@@ -160,6 +171,7 @@ fn seats(visits: &[Visit], real_time: f64) -> Seats {
             }
             Outcome::Refused(why) | Outcome::Failed(why) => *seats.refused.entry(why.clone()).or_default() += 1,
             Outcome::BrokeOff(why) => *seats.broke_off.entry(why.clone()).or_default() += 1,
+            Outcome::Unseen => seats.unseen += 1,
             Outcome::Left => seats.left += 1,
         }
     }
@@ -250,8 +262,9 @@ fn count(number: usize) -> u32 {
 }
 
 fn verdict(seats: &Seats, servers: &[Server]) -> String {
-    let all = seats.asked - seats.left;
+    let all = seats.asked - seats.left - seats.unseen;
     let mut sentence = match (seats.fit, all) {
+        (_, 0) => "None was seen to its end".to_owned(),
         (0, _) => "None fits".to_owned(),
         (fit, all) if fit == all => format!("All {all} fit"),
         (fit, all) => format!("{fit} of {all} fit"),
@@ -261,8 +274,13 @@ fn verdict(seats: &Seats, servers: &[Server]) -> String {
         let what =
             format!("{} was the first to run below real time, at {} simulations", server.address, slow.simulations);
         sentence = format!("{sentence}; {what}");
-    } else if let Some((why, number)) = seats.refused.iter().max_by_key(|(_, number)| **number) {
-        sentence = format!("{sentence}; {number} got none: {}", why.trim_end_matches('.'));
+    } else {
+        let reasons = [("got none", &seats.refused), ("broke off", &seats.broke_off)];
+        let reasons =
+            reasons.into_iter().flat_map(|(what, all)| all.iter().map(move |(why, number)| (number, what, why)));
+        if let Some((number, what, why)) = reasons.max_by_key(|(number, ..)| **number) {
+            sentence = format!("{sentence}; {number} {what}: {}", why.trim_end_matches('.'));
+        }
     }
     sentence + "."
 }
@@ -288,7 +306,7 @@ mod tests {
     use clap::Parser;
 
     fn visit(client: u32, server: &str, asked: f64, outcome: Outcome, factors: &[f64]) -> Visit {
-        let ran = matches!(outcome, Outcome::Ran | Outcome::BrokeOff(_)).then_some(1.0);
+        let ran = matches!(outcome, Outcome::Ran | Outcome::BrokeOff(_) | Outcome::Unseen).then_some(1.0);
         let pace = (0_u32..)
             .zip(factors)
             .map(|(second, factor)| Pace { at: asked + 3.0 + f64::from(second), factor: *factor });
@@ -324,17 +342,18 @@ mod tests {
             visit(4, "gpu-2:2000", 4.0, full.clone(), &[]),
             visit(5, "gpu-2:2000", 5.0, full, &[]),
             visit(6, "gpu-2:2000", 6.0, Outcome::Left, &[]),
+            visit(7, "gpu-1:2000", 20.0, Outcome::Unseen, &[1.0, 1.0]),
         ];
         let of_two = report(&["--expect", "2"], &visits);
         let seats = &of_two.seats;
-        assert_eq!((seats.asked, seats.given, seats.fit, seats.left), (7, 4, 2, 1));
+        assert_eq!((seats.asked, seats.given, seats.fit, seats.unseen, seats.left), (8, 5, 2, 1, 1));
         assert_eq!(seats.refused, BTreeMap::from([("Error: full.".to_owned(), 2)]));
         assert_eq!(seats.broke_off.values().sum::<u32>(), 1);
         assert!(of_two.is_as_expected() && !report(&["--expect", "3"], &visits).is_as_expected());
         assert_eq!(of_two.verdict, "2 of 6 fit; gpu-2:2000 was the first to run below real time, at 2 simulations.");
         let servers: Vec<_> =
             of_two.servers.iter().map(|server| (server.seats, server.most_at_once, server.peak_load)).collect();
-        assert_eq!(servers, [(2, 2, Some(60.0)), (2, 2, Some(99.0))]);
+        assert_eq!(servers, [(3, 2, Some(60.0)), (2, 2, Some(99.0))]);
         assert!(report(&["--real-time", "0.4"], &visits).is_as_expected());
     }
 
@@ -352,6 +371,17 @@ mod tests {
         assert_eq!((row.step, row.median, row.p95, row.worst), ("all", 50.0, 95.0, 100.0));
         assert_eq!(all.verdict, "All 100 fit.");
         assert_eq!(all.pace, Some(Factors { p5: 1.0, median: 1.0 }));
+    }
+
+    #[test]
+    fn the_most_frequent_reason_is_told() {
+        let (full, killed) = (Outcome::Refused("full".to_owned()), Outcome::BrokeOff("Webots was killed.".to_owned()));
+        let all = |outcomes: &[&Outcome]| {
+            let visits = (0..).zip(outcomes).map(|(client, one)| visit(client, "gpu-1:2000", 0.0, (*one).clone(), &[]));
+            report(&[], &visits.collect::<Vec<_>>()).verdict
+        };
+        assert_eq!(all(&[&killed, &full, &killed]), "None fits; 2 broke off: Webots was killed.");
+        assert_eq!(all(&[&Outcome::Ran, &full, &full, &killed]), "1 of 4 fit; 2 got none: full.");
     }
 
     #[test]

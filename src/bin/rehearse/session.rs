@@ -1,9 +1,13 @@
 //! The session server as a web page meets it.
 
+use std::sync::{Arc, LazyLock};
 use std::time::Duration;
 
 use awc::Client;
+use awc::error::SendRequestError;
+use rustls::ClientConfig;
 use url::Url;
+use webots_fleet::shared::http::tls;
 
 use crate::conversation::{Conversation, Ended};
 
@@ -11,6 +15,8 @@ use crate::conversation::{Conversation, Ended};
 const ANSWER: Duration = Duration::from_secs(20);
 /// No answer is longer, in bytes.
 const LONGEST_ANSWER: usize = 64 << 10;
+/// How requests and WebSockets are encrypted: the trust store is read once. Nothing where encryption can't be set up.
+static TLS: LazyLock<Option<Arc<ClientConfig>>> = LazyLock::new(tls::client_config);
 
 /// A session server.
 #[derive(Clone)]
@@ -57,8 +63,10 @@ impl Session {
     /// # Errors
     /// What was said in place of it.
     pub(crate) async fn simulation_server(&self, world: &str) -> Result<String, String> {
-        // As the page writes it: not percent-encoded.
-        let answer = get(&self.http, &format!("{}/session?url={world}", self.base())).await?;
+        // The page writes the world as it is, and its browser then encodes what no URL may have, such as spaces.
+        let url = format!("{}/session?url={world}", self.base());
+        let url = Url::parse(&url).map_err(|error| format!("{url} is no URL: {error}"))?;
+        let answer = get(&self.http, url.as_str()).await?;
         let answer = answer.trim();
         let is_one = answer.starts_with("ws://") || answer.starts_with("wss://");
         if is_one { Ok(answer.trim_end_matches('/').to_owned()) } else { Err(answer.to_owned()) }
@@ -69,9 +77,19 @@ impl Session {
     }
 }
 
-/// A client for short answers.
+/// How what goes to `https://` and `wss://` is encrypted.
+pub(crate) fn encryption() -> Option<Arc<ClientConfig>> {
+    TLS.clone()
+}
+
+/// A client for short answers, of `https://` servers too.
 pub(crate) fn client() -> Client {
-    Client::builder().timeout(ANSWER).finish()
+    let connector = awc::Connector::new();
+    let connector = match encryption() {
+        Some(config) => connector.rustls_0_23(config),
+        None => connector,
+    };
+    Client::builder().connector(connector).timeout(ANSWER).finish()
 }
 
 /// The body of an answer, whatever its status is: the page reads no more of it either.
@@ -79,7 +97,11 @@ pub(crate) fn client() -> Client {
 /// # Errors
 /// Why there is none.
 pub(crate) async fn get(http: &Client, url: &str) -> Result<String, String> {
-    let mut answer = http.get(url).send().await.map_err(|error| format!("{url} can't be reached: {error}"))?;
+    let unreachable = |error: SendRequestError| {
+        let why = tls::reason(&error).unwrap_or_else(|| error.to_string());
+        format!("{url} can't be reached: {why}")
+    };
+    let mut answer = http.get(url).send().await.map_err(unreachable)?;
     let body = answer.body().limit(LONGEST_ANSWER).await.map_err(|error| format!("{url} can't be read: {error}"))?;
     Ok(String::from_utf8_lossy(&body).into_owned())
 }

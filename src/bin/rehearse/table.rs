@@ -44,8 +44,11 @@ fn seats(report: &Report) -> String {
     for (why, number) in reasons(&seats.broke_off) {
         add(&format!("broke off: {why}"), *number);
     }
+    if seats.unseen > 0 {
+        add("ran, their end unseen", seats.unseen);
+    }
     if seats.left > 0 {
-        add("left on purpose before it ran", seats.left);
+        add("left before it ran", seats.left);
     }
     right(&mut table, 1);
     table.to_string()

@@ -34,6 +34,8 @@ pub(crate) enum Outcome {
     Ran,
     /// Its simulation ran, and ended before it left.
     BrokeOff(String),
+    /// Its simulation ran, and nobody looked on until the end: it slept, vanished, or the rehearsal was interrupted.
+    Unseen,
     /// It was told why it gets none.
     Refused(String),
     /// It got none, and no reason.
@@ -68,6 +70,6 @@ pub(crate) struct Pace {
 impl Visit {
     /// Whether a simulation ran for this client.
     pub(crate) fn has_run(&self) -> bool {
-        matches!(self.outcome, Outcome::Ran | Outcome::BrokeOff(_))
+        matches!(self.outcome, Outcome::Ran | Outcome::BrokeOff(_) | Outcome::Unseen)
     }
 }

@@ -1,6 +1,7 @@
-//! The steps of an acceptance run, and how they are told.
+//! The steps of an acceptance run, and how they are told: each as soon as it is known.
 
-use std::time::{Duration, Instant};
+use std::io::Write;
+use std::time::Instant;
 
 use crate::arguments::Arguments;
 
@@ -8,65 +9,49 @@ use crate::arguments::Arguments;
 pub(crate) struct Walk {
     began: Instant,
     last: Instant,
-    steps: Vec<Step>,
-}
-
-/// One step, and what came of it.
-struct Step {
-    name: &'static str,
-    /// When it ended, since the beginning.
-    at: Duration,
-    took: Duration,
-    expected: &'static str,
-    came: String,
-    agrees: bool,
+    /// How many steps were made.
+    steps: usize,
+    /// Those of them that are not as expected.
+    differing: Vec<&'static str>,
 }
 
 impl Walk {
-    /// Begins now.
-    pub(crate) fn new() -> Self {
+    /// Begins now, and prints what comes above the steps.
+    pub(crate) fn begin(arguments: &Arguments) -> Self {
+        let (name, version) = (env!("CARGO_PKG_NAME"), env!("CARGO_PKG_VERSION"));
+        print(&format!("`rehearse {} --explain`, {name} {version}", arguments.fleet));
+        print(&format!("World: {}\n", arguments.world));
+        print("| step | at | took | expected | came | |\n|---|---|---|---|---|---|");
         let now = Instant::now();
-        Self { began: now, last: now, steps: Vec::new() }
+        Self { began: now, last: now, steps: 0, differing: Vec::new() }
     }
 
-    /// Notes what came at a step, and begins the next.
-    pub(crate) fn note(&mut self, name: &'static str, expected: &'static str, came: String, agrees: bool) {
-        let took = self.last.elapsed();
+    /// Prints what came at a step, and begins the next.
+    pub(crate) fn note(&mut self, name: &'static str, expected: &'static str, came: &str, agrees: bool) {
+        let (at, took) = (self.began.elapsed().as_secs_f64(), self.last.elapsed().as_secs_f64());
         self.last = Instant::now();
-        self.steps.push(Step { name, at: self.began.elapsed(), took, expected, came, agrees });
+        self.steps += 1;
+        if !agrees {
+            self.differing.push(name);
+        }
+        let verdict = if agrees { "ok" } else { "**differs**" };
+        let came = came.replace('|', "\\|");
+        print(&format!("| {name} | {at:.2} s | {took:.2} s | {expected} | {came} | {verdict} |"));
     }
 
-    /// Whether all of it was as expected.
-    pub(crate) fn agrees(&self) -> bool {
-        self.steps.iter().all(|step| step.agrees)
-    }
-
-    /// All steps as a table in Markdown, and which of them differ.
-    pub(crate) fn text(&self, arguments: &Arguments) -> String {
-        let mut lines = vec![
-            format!(
-                "`rehearse {} --explain`, {} {}",
-                arguments.fleet,
-                env!("CARGO_PKG_NAME"),
-                env!("CARGO_PKG_VERSION")
-            ),
-            format!("World: {}", arguments.world),
-            String::new(),
-            "| step | at | took | expected | came | |".to_owned(),
-            "|---|---|---|---|---|---|".to_owned(),
-        ];
-        lines.extend(self.steps.iter().map(|step| {
-            let (at, took) = (step.at.as_secs_f64(), step.took.as_secs_f64());
-            let verdict = if step.agrees { "ok" } else { "**differs**" };
-            let came = step.came.replace('|', "\\|");
-            format!("| {} | {at:.2} s | {took:.2} s | {} | {came} | {verdict} |", step.name, step.expected)
-        }));
-        let differing: Vec<&str> = self.steps.iter().filter(|step| !step.agrees).map(|step| step.name).collect();
-        let verdict = match differing.as_slice() {
+    /// Prints which steps differ. Returns whether none does.
+    pub(crate) fn end(self) -> bool {
+        let verdict = match self.differing.as_slice() {
             [] => "All steps are as expected.".to_owned(),
-            names => format!("{} of {} steps differ: {}.", names.len(), self.steps.len(), names.join(", ")),
+            names => format!("{} of {} steps differ: {}.", names.len(), self.steps, names.join(", ")),
         };
-        lines.extend([String::new(), verdict]);
-        lines.join("\n")
+        print(&format!("\n{verdict}"));
+        self.differing.is_empty()
     }
+}
+
+/// Nobody may be listening any more.
+fn print(line: &str) {
+    let mut out = std::io::stdout();
+    writeln!(out, "{line}").and_then(|()| out.flush()).ok();
 }

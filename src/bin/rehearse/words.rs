@@ -1,0 +1,39 @@
+//! What came, in words that fit into one line. Pure.
+
+use crate::conversation::Ended;
+
+/// What is told of one text, in characters.
+const EXCERPT: usize = 90;
+/// So many texts are told of those that are out of place.
+const LONGEST_LIST: usize = 8;
+
+/// What came, or why nothing did.
+pub(crate) fn told(came: &Result<String, Ended>) -> String {
+    came.as_ref().map_or_else(over, |text| excerpt(text))
+}
+
+/// Why a conversation is over, in words.
+pub(crate) fn over(ended: &Ended) -> String {
+    match ended {
+        Ended::Closed(_) | Ended::Broken(_) => format!("the connection was {ended}"),
+        Ended::Unreachable(..) | Ended::Late(_) => ended.to_string(),
+        Ended::Fault(text) => excerpt(text),
+    }
+}
+
+/// Adds a text to a list that is told, as long as that is short.
+pub(crate) fn add(list: &mut Vec<String>, text: &str) {
+    match list.len() {
+        0..LONGEST_LIST => list.push(excerpt(text)),
+        LONGEST_LIST => list.push("and more".to_owned()),
+        _ => {}
+    }
+}
+
+/// The beginning of a text, on one line, as code.
+pub(crate) fn excerpt(text: &str) -> String {
+    let short: String =
+        text.chars().take(EXCERPT).map(|letter| if letter.is_control() { ' ' } else { letter }).collect();
+    let more = if text.chars().nth(EXCERPT).is_some() { "..." } else { "" };
+    format!("`{}{more}`", short.replace('`', "'"))
+}
