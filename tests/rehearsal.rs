@@ -293,3 +293,30 @@ async fn the_verdict_says_why_simulations_broke_off() {
     assert_eq!(output.status.code(), Some(1), "{said}");
     assert!(said.contains("None fits; 1 broke off: the connection to Webots: closed with "), "{said}");
 }
+
+#[actix_rt::test]
+async fn what_can_not_be_done_is_told_before_anything_is_begun() {
+    let told = async |command: &mut Command| {
+        let output = output(command).await;
+        assert_eq!(output.status.code(), Some(2), "{output:?}");
+        String::from_utf8(output.stderr).unwrap()
+    };
+    // Nobody is there: whoever began would say so.
+    let fleet = "http://127.0.0.1:1";
+    let error = told(command(fleet, &arm()).args(["--json", "/nowhere/a.json"])).await;
+    assert!(error.starts_with("error: /nowhere/a.json can't be written: "), "{error}");
+    let error = told(command(fleet, &arm()).args(["--explain", "--expect", "3"])).await;
+    assert!(error.contains("'--explain' cannot be used with '--expect <CLIENTS>'"), "{error}");
+    let mut limited = Command::new("sh");
+    limited.args([
+        "-c",
+        "ulimit -n 100 && exec \"$@\"",
+        "sh",
+        env!("CARGO_BIN_EXE_rehearse"),
+        fleet,
+        "--world",
+        &arm(),
+    ]);
+    let error = told(limited.args(["--clients", "50"])).await;
+    assert_eq!(error, "error: 50 clients need 264 open files, and the system allows 100 (ulimit -Hn)\n");
+}

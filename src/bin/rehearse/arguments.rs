@@ -5,11 +5,14 @@ use std::time::Duration;
 
 use clap::Parser;
 use url::Url;
+use webots_fleet::shared::run::raise_open_files;
 
 use crate::behaviour::Mix;
 
 /// No time that can be asked for is longer: 30 days.
 const LONGEST: Duration = Duration::from_hours(30 * 24);
+/// The open files that one client needs (its connections), and those that the program needs besides.
+const FILES: (u64, u64) = (4, 64);
 
 /// Plays a class of web clients against a fleet, and says how many fit.
 ///
@@ -57,7 +60,7 @@ pub(crate) struct Arguments {
     #[arg(long, default_value = "w3d", value_parser = ["w3d", "x3d"])]
     pub(crate) viewer: String,
     /// Walk through all steps with one client, and compare what comes with what is expected of a fleet and of Webots
-    #[arg(long)]
+    #[arg(long, conflicts_with_all = ["clients", "over", "misbehave", "soak", "expect", "json"])]
     pub(crate) explain: bool,
     /// Draw the clients that misbehave from this number; the same number draws the same
     #[arg(long, default_value_t = 1)]
@@ -68,6 +71,24 @@ pub(crate) struct Arguments {
 }
 
 impl Arguments {
+    /// Whether this machine can do what is asked for, before anything is begun.
+    ///
+    /// # Errors
+    /// What can't be done, in words.
+    pub(crate) fn prepare(&self) -> Result<(), String> {
+        let clients = if self.explain { 1 } else { self.clients };
+        let needed = u64::from(clients) * FILES.0 + FILES.1;
+        let allowed = raise_open_files(needed);
+        if allowed < needed {
+            return Err(format!(
+                "{clients} clients need {needed} open files, and the system allows {allowed} (ulimit -Hn)"
+            ));
+        }
+        let Some(file) = &self.json else { return Ok(()) };
+        let opened = std::fs::OpenOptions::new().create(true).append(true).open(file);
+        opened.map(drop).map_err(|error| format!("{} can't be written: {error}", file.display()))
+    }
+
     /// What is going to happen, in words: `200 clients within 1m, each for 10m`.
     pub(crate) fn summary(&self) -> String {
         if self.explain {

@@ -41,6 +41,10 @@ const WRONG_ARGUMENTS: u8 = 2;
 
 fn main() -> ExitCode {
     let arguments = Arguments::parse();
+    if let Err(why) = arguments.prepare() {
+        eprintln!("error: {why}");
+        return ExitCode::from(WRONG_ARGUMENTS);
+    }
     // Only the first call can set it, and this is the first.
     rustls::crypto::ring::default_provider().install_default().ok();
     let consent = Consent::new(&arguments);
