@@ -250,7 +250,7 @@ async fn equal_checkouts_are_done_once_and_a_cached_start_fetches_nothing() {
 async fn progress_moves_in_percent() {
     let (forge, webots) = (Forge::with_arm(), reader());
     let wrapper = GitWrapper::new(
-        "case \"$*\" in *fetch*) for n in 10 35 60 85; do printf 'Receiving objects: %s%% (1/2)\\r' $n >&2; sleep 0.15; done;; esac",
+        "case \"$*\" in *fetch*) for n in 10 35 60 85; do printf 'Receiving objects: %s%% (1/2)\\r' $n >&2; sleep 0.5; done;; esac",
     );
     let server = simulation_server(&webots.path(), forge.path(), 1).env("PATH", &wrapper.path()).start().await;
     let mut client = Client::start(&server, &arm()).await;
@@ -274,9 +274,11 @@ async fn a_kill_in_the_middle_of_a_fetch_harms_no_later_start() {
     forge.commit_work_tree("lab/arm", "main");
     let folder = tempfile::tempdir().unwrap();
     let start = || simulation_server(&webots.path(), forge.path(), 2).folder(folder.path());
-    // Half a pack, then nothing more.
+    // Half a pack, then nothing more. It is said again and again: of what comes close together clients hear the newest only,
+    // and what git has started may still say something.
     let slow = GitWrapper::new(
-        "case \"$*\" in *fetch*) \"$REAL\" \"$@\" & sleep 0.03; kill -STOP $!; echo 'halted: 50%' >&2; sleep 1000;; esac",
+        "case \"$*\" in *fetch*) \"$REAL\" \"$@\" & sleep 0.03; kill -STOP $!; \
+         while echo 'halted: 50%' >&2; do sleep 0.2; done; exit;; esac",
     );
     for victim in ["git", "server"] {
         let mut server = start().env("PATH", &slow.path()).start().await;
