@@ -4,7 +4,7 @@
 //! A server that no name leads to any more gets no clients. It is watched for as long as it answers, for it may be listed
 //! again, and its clients are to be seen until they are gone.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::{BTreeSet, HashMap};
 
 use actix::prelude::*;
 
@@ -23,7 +23,7 @@ pub struct Servers {
     names: Names,
     /// In the order of the configuration.
     listed: Vec<PublicAddress>,
-    watched: BTreeMap<PublicAddress, Watched>,
+    watched: HashMap<PublicAddress, Watched>,
 }
 
 /// One simulation server and its monitor.
@@ -47,7 +47,7 @@ impl Servers {
     /// No servers yet.
     #[must_use]
     pub fn new() -> Self {
-        Self { monitors: Monitors::new(), names: Names::default(), listed: Vec::new(), watched: BTreeMap::new() }
+        Self { monitors: Monitors::new(), names: Names::default(), listed: Vec::new(), watched: HashMap::new() }
     }
 
     /// Follows a configuration: what it no longer lists is forgotten.
@@ -137,7 +137,8 @@ impl Servers {
     /// All servers in the order of the configuration; last those that are listed no longer.
     pub fn in_order(&self) -> impl Iterator<Item = &PublicAddress> {
         let unlisted = self.watched.iter().filter(|(_, watched)| watched.record.unlisted);
-        self.listed.iter().chain(unlisted.map(|(server, _)| server))
+        let unlisted: BTreeSet<_> = unlisted.map(|(server, _)| server).collect();
+        self.listed.iter().chain(unlisted)
     }
 
     /// What is known of each name.

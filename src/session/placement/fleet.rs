@@ -2,10 +2,13 @@
 
 use super::backend::{Backend, Report};
 use super::cost::{Estimate, FleetCost};
-use super::order::{Order, Rank};
+use super::order::{Order, Rank, Standing};
 use super::peers::Peers;
 use super::policy::Policy;
-use std::collections::BTreeMap;
+use slab::Slab;
+use std::collections::HashMap;
+use std::collections::hash_map::Entry;
+use std::hash::Hash;
 use std::time::Instant;
 
 /// The simulation servers, what is known of each, and the choice between them. `Id` is whatever the owner knows a server
@@ -27,23 +30,34 @@ use std::time::Instant;
 #[derive(Debug)]
 pub struct Fleet<Id> {
     policy: Policy,
-    servers: BTreeMap<Id, Backend>,
+    /// By their numbers, so that a choice has to compare and hash no `Id`: among a thousand servers each is somewhere else in
+    /// memory.
+    servers: Slab<Server<Id>>,
+    numbers: HashMap<Id, usize>,
     cost: FleetCost,
     peers: Peers,
-    order: Order<Id>,
+    order: Order,
     turns: u64,
 }
 
-impl<Id: Clone + Ord> Fleet<Id> {
+#[derive(Debug)]
+struct Server<Id> {
+    id: Id,
+    backend: Backend,
+    standing: Standing,
+}
+
+impl<Id: Clone + Eq + Hash> Fleet<Id> {
     /// A fleet without servers.
     #[must_use]
     pub fn new(policy: Policy) -> Self {
         Self {
             policy,
-            servers: BTreeMap::new(),
+            servers: Slab::new(),
+            numbers: HashMap::new(),
             cost: FleetCost::default(),
             peers: Peers::default(),
-            order: Order::new(),
+            order: Order::default(),
             turns: 0,
         }
     }
@@ -51,40 +65,42 @@ impl<Id: Clone + Ord> Fleet<Id> {
     /// Changes the policy. What servers have learned until now stays.
     pub fn set_policy(&mut self, policy: Policy) {
         self.policy = policy;
-        for id in self.servers.keys().cloned().collect::<Vec<_>>() {
-            self.update_order(&id);
+        for (number, server) in &mut self.servers {
+            server.sort_in(number, &self.policy, &mut self.order);
         }
     }
 
     /// Adds a server, which is down until its first report. One that is there already stays as it is.
     pub fn add(&mut self, id: Id) {
         self.turns += 1;
-        self.servers.entry(id).or_insert_with(|| Backend::new(&self.policy, self.turns));
+        if let Entry::Vacant(entry) = self.numbers.entry(id) {
+            let (id, backend) = (entry.key().clone(), Backend::new(&self.policy, self.turns));
+            entry.insert(self.servers.insert(Server { id, backend, standing: Standing::default() }));
+        }
     }
 
     /// Removes a server and all that was known of it.
     pub fn remove(&mut self, id: &Id) {
-        if let Some(server) = self.servers.remove(id) {
-            self.cost.replace(server.estimate(), Estimate::default());
-            self.order.remove(id);
+        let Some(number) = self.numbers.remove(id) else { return };
+        if let Some(server) = self.servers.try_remove(number) {
+            self.cost.replace(server.backend.estimate(), Estimate::default());
+            self.order.put(number, server.standing, Standing::default());
         }
     }
 
     /// Takes in what a server answered at `now`. A server that is not in the fleet is passed over.
     pub fn report(&mut self, id: &Id, now: Instant, report: Report) {
-        if let Some(server) = self.servers.get_mut(id) {
-            server.expire(now, &self.policy, &mut self.peers);
-            server.report(now, report, &self.policy, &mut self.cost, &mut self.peers);
-            self.update_order(id);
-        }
+        let Some((number, server)) = find(&self.numbers, &mut self.servers, id) else { return };
+        server.backend.expire(now, &self.policy, &mut self.peers);
+        server.backend.report(now, report, &self.policy, &mut self.cost, &mut self.peers);
+        server.sort_in(number, &self.policy, &mut self.order);
     }
 
     /// A server does not answer: it gets no clients until its next report.
     pub fn lose(&mut self, id: &Id) {
-        if let Some(server) = self.servers.get_mut(id) {
-            server.lose();
-            self.update_order(id);
-        }
+        let Some((number, server)) = find(&self.numbers, &mut self.servers, id) else { return };
+        server.backend.lose();
+        server.sort_in(number, &self.policy, &mut self.order);
     }
 
     /// Returns the server of least load among those that have room and are `eligible`, and counts the client as sent
@@ -101,31 +117,23 @@ impl<Id: Clone + Ord> Fleet<Id> {
 
     fn send(&mut self, now: Instant, takes_room: bool, eligible: impl Fn(&Id) -> bool) -> Option<Id> {
         self.expire(now);
-        let id = self.order.servers().find(|id| eligible(id))?.clone();
+        let is_eligible = |number: &usize| self.servers.get(*number).is_some_and(|server| eligible(&server.id));
+        let number = self.order.servers().find(is_eligible)?;
         self.turns += 1;
-        let server = self.servers.get_mut(&id)?;
-        server.turn = self.turns;
-        server.place(now, takes_room);
-        self.update_order(&id);
-        Some(id)
+        let server = self.servers.get_mut(number)?;
+        server.backend.turn = self.turns;
+        server.backend.place(now, takes_room);
+        server.sort_in(number, &self.policy, &mut self.order);
+        Some(server.id.clone())
     }
 
     /// Gives up the placements whose clients should have come by now.
     fn expire(&mut self, now: Instant) {
-        for id in self.order.expired(now).cloned().collect::<Vec<_>>() {
-            if let Some(server) = self.servers.get_mut(&id) {
-                server.expire(now, &self.policy, &mut self.peers);
+        for number in self.order.expired(now).collect::<Vec<_>>() {
+            if let Some(server) = self.servers.get_mut(number) {
+                server.backend.expire(now, &self.policy, &mut self.peers);
+                server.sort_in(number, &self.policy, &mut self.order);
             }
-            self.update_order(&id);
-        }
-    }
-
-    /// Sorts a server in anew after something happened to it.
-    fn update_order(&mut self, id: &Id) {
-        if let Some(server) = self.servers.get(id) {
-            let load = server.rank_load().filter(|_| server.has_room(&self.policy));
-            let rank = load.map(|load| Rank { load, turn: server.turn });
-            self.order.put(id, rank, server.next_expiry(&self.policy));
         }
     }
 
@@ -138,25 +146,48 @@ impl<Id: Clone + Ord> Fleet<Id> {
     /// The load, in percent, that is expected once all clients show that take room on a server; `None` if it is down.
     #[must_use]
     pub fn effective_load(&self, id: &Id) -> Option<f64> {
-        self.servers.get(id)?.effective_load()
+        self.backend(id)?.effective_load()
     }
 
     /// The load, in percent, from which on a server takes no client; `None` if it is not in the fleet.
     #[must_use]
     pub fn limit(&self, id: &Id) -> Option<f64> {
-        self.servers.get(id).map(|server| server.limit(&self.policy))
+        self.backend(id).map(|server| server.limit(&self.policy))
     }
 
     /// How many clients were sent to a server and have neither been seen there nor given up.
     #[must_use]
     pub fn in_flight(&self, id: &Id) -> usize {
-        self.servers.get(id).map_or(0, Backend::in_flight)
+        self.backend(id).map_or(0, Backend::in_flight)
     }
 
     /// What a client is expected to cost a server, in percent of load; `None` if it is not in the fleet.
     #[must_use]
     pub fn client_cost(&self, id: &Id) -> Option<f64> {
-        self.servers.get(id).map(Backend::cost)
+        self.backend(id).map(Backend::cost)
+    }
+
+    fn backend(&self, id: &Id) -> Option<&Backend> {
+        self.servers.get(*self.numbers.get(id)?).map(|server| &server.backend)
+    }
+}
+
+fn find<'servers, Id: Eq + Hash>(
+    numbers: &HashMap<Id, usize>,
+    servers: &'servers mut Slab<Server<Id>>,
+    id: &Id,
+) -> Option<(usize, &'servers mut Server<Id>)> {
+    let number = *numbers.get(id)?;
+    Some((number, servers.get_mut(number)?))
+}
+
+impl<Id> Server<Id> {
+    /// Sorts a server in anew after something happened to it.
+    fn sort_in(&mut self, number: usize, policy: &Policy, order: &mut Order) {
+        let load = self.backend.rank_load().filter(|_| self.backend.has_room(policy));
+        let rank = load.map(|load| Rank { load, turn: self.backend.turn });
+        let standing = Standing { rank, expiry: self.backend.next_expiry(policy) };
+        order.put(number, std::mem::replace(&mut self.standing, standing), standing);
     }
 }
 

@@ -4,7 +4,7 @@
 //! order after each of these; `expired` tells which servers have placements to give up.
 
 use std::cmp::Ordering;
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 use std::time::Instant;
 
 /// What servers are sorted by: the least load goes first, and of equal loads the server that was chosen longest ago.
@@ -28,50 +28,42 @@ impl PartialOrd for Rank {
     }
 }
 
-/// The order of a fleet.
-#[derive(Debug)]
-pub(super) struct Order<Id> {
-    /// The current entries of each server: its rank if it has room, and its next expiry.
-    entries: BTreeMap<Id, (Option<Rank>, Option<Instant>)>,
-    ranked: BTreeSet<(Rank, Id)>,
-    expiries: BTreeSet<(Instant, Id)>,
+/// Where a server stands in the order.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub(super) struct Standing {
+    /// `None` if the server has no room.
+    pub(super) rank: Option<Rank>,
+    /// When the oldest of its placements is given up.
+    pub(super) expiry: Option<Instant>,
 }
 
-impl<Id: Clone + Ord> Order<Id> {
-    pub(super) fn new() -> Self {
-        Self { entries: BTreeMap::new(), ranked: BTreeSet::new(), expiries: BTreeSet::new() }
-    }
+/// The order of a fleet, whose servers it knows by their numbers.
+#[derive(Debug, Default)]
+pub(super) struct Order {
+    ranked: BTreeSet<(Rank, usize)>,
+    expiries: BTreeSet<(Instant, usize)>,
+}
 
-    /// Sets the rank of a server, `None` if it has no room, and when its next placement is given up.
-    pub(super) fn put(&mut self, id: &Id, rank: Option<Rank>, expiry: Option<Instant>) {
-        let before = self.entries.get(id).copied().unwrap_or_default();
-        if before == (rank, expiry) {
-            return;
+impl Order {
+    /// Puts a server that stood somewhere else.
+    pub(super) fn put(&mut self, server: usize, before: Standing, now: Standing) {
+        if before.rank != now.rank {
+            before.rank.map(|rank| self.ranked.remove(&(rank, server)));
+            now.rank.map(|rank| self.ranked.insert((rank, server)));
         }
-        if before.0 != rank {
-            before.0.map(|rank| self.ranked.remove(&(rank, id.clone())));
-            rank.map(|rank| self.ranked.insert((rank, id.clone())));
+        if before.expiry != now.expiry {
+            before.expiry.map(|at| self.expiries.remove(&(at, server)));
+            now.expiry.map(|at| self.expiries.insert((at, server)));
         }
-        if before.1 != expiry {
-            before.1.map(|at| self.expiries.remove(&(at, id.clone())));
-            expiry.map(|at| self.expiries.insert((at, id.clone())));
-        }
-        self.entries.insert(id.clone(), (rank, expiry));
-    }
-
-    /// Forgets a server.
-    pub(super) fn remove(&mut self, id: &Id) {
-        self.put(id, None, None);
-        self.entries.remove(id);
     }
 
     /// The servers with room, the least loaded first.
-    pub(super) fn servers(&self) -> impl Iterator<Item = &Id> {
-        self.ranked.iter().map(|(_, id)| id)
+    pub(super) fn servers(&self) -> impl Iterator<Item = usize> {
+        self.ranked.iter().map(|(_, server)| *server)
     }
 
     /// The servers that have placements to give up.
-    pub(super) fn expired(&self, now: Instant) -> impl Iterator<Item = &Id> {
-        self.expiries.iter().take_while(move |(at, _)| *at <= now).map(|(_, id)| id)
+    pub(super) fn expired(&self, now: Instant) -> impl Iterator<Item = usize> {
+        self.expiries.iter().take_while(move |(at, _)| *at <= now).map(|(_, server)| *server)
     }
 }
