@@ -4,6 +4,10 @@
 set -eu
 cd "$(dirname "$0")/.."
 venv=target/test-venv
+mkdir -p target
+# Several tests may want it first.
+exec 9>target/test-venv.lock
+flock 9
 if ! cmp -s tests/requirements.txt "$venv/requirements.txt"; then
     rm -rf "$venv"
     python3 -m venv "$venv"
