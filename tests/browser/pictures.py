@@ -23,7 +23,7 @@ HISTORY = 600
 WIDTH = 1200
 REHEARSAL = [
     "--world", "https://github.com/webots-fleet/demo/blob/main/worlds/playground.wbt",
-    "--clients", "10", "--over", "5s", "--stay", "12s"]
+    "--clients", "30", "--over", "5s", "--stay", "20s", "--patience", "12s"]
 TERMINAL = """
     <!doctype html><meta charset="utf-8">
     <style>body { margin: 0; background: #16202a } pre { margin: 24px; color: #e8eef2; font: 15px/1.4 monospace }</style>
