@@ -3,9 +3,12 @@
 //! It starts the built program with stand-ins for simulation servers in this process, and measures
 //! 1. how long `/session` takes with 10 servers, with one of ten hung, and with 1,000 servers, in turns;
 //! 2. how much processor time the server needs to watch 10 and 1,000 servers each second;
-//! 3. how long it takes until 10,000 connected clients know of a change.
+//! 3. how long it takes until 10,000 connected clients know of a change;
+//! 4. how many requests it answers under 64 connections, beside a bare handler of actix, in turns (by `wrk`);
+//! 5. how much memory an idle WebSocket client costs, beside one actor for each client and nothing else.
 //!
-//! `cargo bench --bench fleet -- door`, `watch` or `push` measures one of them. It fails if a bound is not kept.
+//! `cargo bench --bench fleet -- door`, `watch`, `push`, `storm` or `idle` measures one of them. It fails if a bound is not
+//! kept; a goal that is missed is only told.
 //! What else runs on the machine counts too: each part prints a yardstick that was measured beside it.
 
 #![expect(
@@ -17,10 +20,13 @@
     reason = "a measurement that can't go on ends"
 )]
 
+mod bare;
 mod door;
+mod idle;
 mod push;
 mod server;
 mod stand_ins;
+mod storm;
 mod watch;
 
 use std::process::ExitCode;
@@ -39,8 +45,17 @@ impl Verdict {
     }
 }
 
+/// Tells whether what was aimed at is reached.
+fn goal(what: &str, is_reached: bool, found: &str) {
+    println!("  {} {what}: {found}", if is_reached { "reached" } else { "MISSED " });
+}
+
 fn main() -> ExitCode {
     let wanted: Vec<String> = std::env::args().skip(1).filter(|argument| !argument.starts_with('-')).collect();
+    if wanted.iter().any(|name| name == bare::ARGUMENT) {
+        bare::serve().expect("a port of the loopback is free");
+        return ExitCode::SUCCESS;
+    }
     let is_wanted = |part: &str| wanted.is_empty() || wanted.iter().any(|name| name == part);
     server::raise_file_limit();
     let mut verdict = Verdict::default();
@@ -52,6 +67,12 @@ fn main() -> ExitCode {
     }
     if is_wanted("push") {
         push::measure(&mut verdict);
+    }
+    if is_wanted("storm") {
+        storm::measure();
+    }
+    if is_wanted("idle") {
+        idle::measure();
     }
     if verdict.failed { ExitCode::FAILURE } else { ExitCode::SUCCESS }
 }

@@ -24,7 +24,7 @@ const HANDSHAKE: &[u8] = b"GET /session HTTP/1.1\r\nHost: localhost\r\nConnectio
 const TEXT: [u8; 2] = [0x81, 1];
 
 /// A client that was told the first value.
-fn connect(port: u16) -> TcpStream {
+pub(crate) fn connect(port: u16) -> TcpStream {
     let mut stream = TcpStream::connect(("127.0.0.1", port)).expect("a client connects");
     stream.write_all(HANDSHAKE).expect("a client asks");
     let (mut heard, mut piece) = (Vec::new(), [0; 512]);

@@ -66,7 +66,11 @@ impl Server {
     }
 
     fn id(&self) -> Pid {
-        Pid::from_raw(i32::try_from(self.child.id()).expect("a process id"))
+        Pid::from_raw(i32::try_from(self.process()).expect("a process id"))
+    }
+
+    pub(crate) fn process(&self) -> u32 {
+        self.child.id()
     }
 
     /// What it has logged.
