@@ -20,7 +20,7 @@ import urllib.request
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 BIN = pathlib.Path(os.environ.get("FLEET_BIN", ROOT / "target/debug")).resolve()
 # How long anything may take that should happen soon. Far more than it needs: the machine may be busy.
-SOON = 30.0
+SOON = 60.0
 WORLD = "https://github.com/demo/worlds/blob/main/worlds/{}.wbt"
 
 # Who is ended by tests/run.sh ends what it has started, as at Ctrl-C.

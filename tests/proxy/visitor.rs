@@ -35,7 +35,7 @@ async fn a_visitor_gets_a_simulation(rules: Rules) {
         .kill_on_drop(true)
         .output();
     let visit =
-        actix_rt::time::timeout(3 * crate::support::SOON, visit).await.expect("the visit does not end").unwrap();
+        actix_rt::time::timeout(6 * crate::support::SOON, visit).await.expect("the visit does not end").unwrap();
     assert!(
         visit.status.success(),
         "{}{}",
