@@ -31,8 +31,8 @@ pub struct Fault {
 
 /// How long something that stands still does so.
 pub const WHILE: Duration = Duration::from_secs(3);
-/// How long what a killed server leaves may live on a busy machine: its guardian looks for so long.
-const AT_ONCE: Duration = Duration::from_secs(5);
+/// How long what a killed server leaves may live on a busy machine: its guardian looks for half of that.
+const AT_ONCE: Duration = Duration::from_secs(10);
 
 macro_rules! faults {
     ($($name:literal: $function:expr;)*) => {

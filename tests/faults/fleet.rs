@@ -193,17 +193,7 @@ impl Fleet {
     /// A client of its own gets a simulation.
     async fn try_client(&self) -> Result<(), String> {
         let given = http::try_get(&self.session.url("/session")).await?.text();
-        let mut client =
-            Client::try_connect(&format!("{given}/client")).await.map_err(|why| format!("{given}: {why}"))?;
-        client.try_send(&json!({"start": {"url": arm()}}).to_string()).await?;
-        loop {
-            match client.next_within(SOON).await {
-                Some(Heard::Text(text)) if text.starts_with("webots:") => break,
-                Some(Heard::Text(text)) if !text.starts_with("loading: Error") => {}
-                heard => return Err(format!("{given}: {heard:?} after {:?}", client.heard)),
-            }
-        }
-        client.leave().await;
+        try_start(&given).await?.leave().await;
         Ok(())
     }
 
@@ -299,4 +289,18 @@ fn is_taken(port: u16) -> bool {
 fn memory(pid: i32) -> u64 {
     let pages = procfs::process::Process::new(pid).and_then(|process| process.statm()).unwrap().resident;
     pages * 4096
+}
+
+/// A client whose simulation runs on this server.
+pub async fn try_start(server: &str) -> Result<Client, String> {
+    let client = Client::try_connect(&format!("{server}/client")).await;
+    let mut client = client.map_err(|why| format!("{server}: {why}"))?;
+    client.try_send(&json!({"start": {"url": arm()}}).to_string()).await?;
+    loop {
+        match client.next_within(SOON).await {
+            Some(Heard::Text(text)) if text.starts_with("webots:") => return Ok(client),
+            Some(Heard::Text(text)) if !text.starts_with("loading: Error") => {}
+            heard => return Err(format!("{server}: {heard:?} after {:?}", client.heard)),
+        }
+    }
 }

@@ -12,7 +12,8 @@ use crate::support::webots::Webots;
 async fn a_client_is_led_to_the_simulation_server_that_is_there() {
     let (forge, webots) = (Forge::with_arm(), Webots::launcher());
     let simulation = simulation_server(&webots.path(), forge.path(), 9).start().await;
-    let session = session_server(&[simulation.address()]).start().await;
+    // Whatever else keeps this machine busy closes no server.
+    let session = session_server(&[simulation.address()]).set("loadThreshold", 1000).start().await;
     let mut client = Client::connect(&session.websocket("/session")).await;
     client.until("1").await;
     let address = format!("ws://{}", simulation.address());

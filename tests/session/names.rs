@@ -42,11 +42,11 @@ async fn a_name_whose_lookup_hangs_holds_up_only_its_own_server() {
     let [well, named] = [(); 2].map(|()| StandIn::start(Manner::idle(5.0, 1000)));
     let mut servers: Vec<String> = (0..HANGING).map(|number| format!("{number}.test:{}", named.port())).collect();
     servers.push(well.address());
-    let builder = session_server(&servers).set("timing", serde_json::json!({"answer": 0.2})).set("clientCost", 0.001);
+    let builder = session_server(&servers).set("timing", serde_json::json!({"answer": 1})).set("clientCost", 0.001);
     let mut session = builder.before(&hanging_names(unshare, folder.path())).start().await;
     let states = |hanging| [vec![hanging; HANGING], vec!["up"]].concat();
     until_states(&session, &states("down")).await;
-    let said = format!("0.test:{}: down: no answer within 0.2 s", named.port());
+    let said = format!("0.test:{}: down: no answer within 1 s", named.port());
     assert!(session.log().contains(&said));
     // Some looks later, nothing has piled up, and the others are asked as ever.
     let threads = || procfs::process::Process::new(session.pid()).unwrap().stat().unwrap().num_threads;
@@ -58,7 +58,7 @@ async fn a_name_whose_lookup_hangs_holds_up_only_its_own_server() {
     for _ in 0..20 {
         let begin = Instant::now();
         assert_eq!(http::get(&session.url("/session")).await.text(), well.url());
-        assert!(begin.elapsed() < Duration::from_secs(1), "an answer took {:?}", begin.elapsed());
+        assert!(begin.elapsed() < Duration::from_secs(3), "an answer took {:?}", begin.elapsed());
     }
     // Nobody waits for them at the end either.
     let begin = Instant::now();

@@ -69,7 +69,7 @@ async fn a_burst_over_unequal_servers_ends_level() {
 #[actix_rt::test]
 async fn availability_ends_when_placements_use_up_the_room_and_comes_back_when_they_expire() {
     let servers = [StandIn::start(Manner::idle(90.0, 100))];
-    let session = between_reports(&servers, 2.0).set("timing", serde_json::json!({"placement": 1.5})).start().await;
+    let session = between_reports(&servers, 2.0).set("timing", serde_json::json!({"placement": 6})).start().await;
     let mut client = Client::connect(&session.websocket("/")).await;
     client.until("1").await;
     for _ in 0..3 {

@@ -69,14 +69,14 @@ async fn no_value_comes_twice_however_a_server_flaps() {
 
 #[actix_rt::test]
 async fn a_client_that_does_not_read_is_sent_away_and_one_that_reads_stays() {
-    let session = session_server(&[]).set("timing", serde_json::json!({"ping": 0.2, "silence": 1})).start().await;
+    let session = session_server(&[]).set("timing", serde_json::json!({"ping": 0.2, "silence": 5})).start().await;
     let mut reader = Client::connect(&session.websocket("/session")).await;
     let mut deaf = deaf(&session).await;
     until("both are there", async || clients_of(&session).await == 2).await;
     let closed = until("the deaf one is gone", async || clients_of(&session).await == 1);
     // Reading is what answers pings.
     reader.until("0").await;
-    let reads = reader.is_silent(Duration::from_secs(3));
+    let reads = reader.is_silent(Duration::from_secs(8));
     let ((), silent) = futures_util::future::join(closed, reads).await;
     assert!(silent, "{:?}", reader.heard);
     let mut rest = Vec::new();
@@ -197,17 +197,17 @@ async fn a_client_that_reads_no_page_is_sent_away_and_holds_up_no_stop() {
 
 #[actix_rt::test]
 async fn a_silent_client_is_gone_when_its_time_is_up() {
-    // The pings come at 2 and at 4 seconds.
-    let timing = serde_json::json!({"ping": 2, "silence": 2.5});
+    // The pings come at 4 and at 8 seconds.
+    let timing = serde_json::json!({"ping": 4, "silence": 5});
     let session = session_server(&[]).set("timing", timing).start().await;
-    let mut silent = deaf(&session).await;
     let begin = std::time::Instant::now();
+    let mut silent = deaf(&session).await;
     let mut rest = Vec::new();
     // It takes everything in, and answers no ping.
-    let end = actix_rt::time::timeout(Duration::from_secs(10), silent.read_to_end(&mut rest)).await;
+    let end = actix_rt::time::timeout(Duration::from_secs(15), silent.read_to_end(&mut rest)).await;
     assert!(end.is_ok(), "its connection is still open");
     let took = begin.elapsed().as_secs_f64();
-    assert!((2.4..3.8).contains(&took), "closed after {took} s; the silence is 2.5 s");
+    assert!((5.0..7.9).contains(&took), "closed after {took} s; the silence is 5 s");
 }
 
 /// A connection over which a request was answered, and that stays open.

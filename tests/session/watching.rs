@@ -63,7 +63,7 @@ fn bad_manners() -> Vec<Manner> {
 async fn no_bad_answer_is_taken_for_a_good_one_and_each_server_recovers() {
     let bad = bad_manners();
     let servers: Vec<StandIn> = bad.iter().map(|_| StandIn::start(good())).collect();
-    let session = session_server(&addresses(&servers)).set("timing", serde_json::json!({"answer": 1})).start().await;
+    let session = session_server(&addresses(&servers)).set("timing", serde_json::json!({"answer": 3})).start().await;
     let mut client = Client::connect(&session.websocket("/session")).await;
     client.until("1").await;
     until_states(&session, &vec!["up"; bad.len()]).await;
@@ -123,7 +123,7 @@ async fn a_crashed_server_is_noticed_within_one_refresh_and_costs_nothing_while_
     until_states(&session, &["up", "up"]).await;
     let (crash, left) = (Instant::now(), servers.remove(0).address());
     until_states(&session, &["down", "up"]).await;
-    assert!(crash.elapsed() < Duration::from_millis(1500), "noticed after {:?}", crash.elapsed());
+    assert!(crash.elapsed() < Duration::from_secs(3), "noticed after {:?}", crash.elapsed());
     for _ in 0..5 {
         assert_eq!(http::get(&session.url("/session")).await.text(), servers[0].url());
     }
@@ -139,7 +139,7 @@ async fn a_crashed_server_is_noticed_within_one_refresh_and_costs_nothing_while_
 #[actix_rt::test]
 async fn a_hung_server_is_noticed_within_the_time_limit_and_holds_up_nobody() {
     let servers = [(); 10].map(|()| StandIn::start(Manner::idle(5.0, 1000)));
-    let timing = serde_json::json!({"answer": 2, "placement": 0.2});
+    let timing = serde_json::json!({"answer": 4, "placement": 0.2});
     // However many requests this machine can send, they don't use up the room.
     let builder = session_server(&addresses(&servers)).set("timing", timing).set("clientCost", 0.001);
     let session = builder.start().await;
@@ -147,11 +147,11 @@ async fn a_hung_server_is_noticed_within_the_time_limit_and_holds_up_nobody() {
     let hung = Instant::now();
     servers[0].set(Manner::Hang);
     let states = ["down", "up", "up", "up", "up", "up", "up", "up", "up", "up"];
-    while session.log().matches(&format!("{}: down: no answer within 2 s", servers[0].address())).count() == 0 {
+    while session.log().matches(&format!("{}: down: no answer within 4 s", servers[0].address())).count() == 0 {
         let begin = Instant::now();
         assert_eq!(http::get(&session.url("/session")).await.status, 200);
-        assert!(begin.elapsed() < Duration::from_secs(1), "an answer took {:?}", begin.elapsed());
-        assert!(hung.elapsed() < Duration::from_secs(4), "not noticed after {:?}", hung.elapsed());
+        assert!(begin.elapsed() < Duration::from_secs(3), "an answer took {:?}", begin.elapsed());
+        assert!(hung.elapsed() < Duration::from_secs(8), "not noticed after {:?}", hung.elapsed());
     }
     let others: Vec<usize> = servers.iter().map(StandIn::requests).collect();
     until_states(&session, &states).await;

@@ -34,7 +34,7 @@ async fn a_fetch_that_hangs_holds_up_nobody_who_needs_no_fetch_and_others_only_f
         marks.path().display()
     ));
     let builder = simulation_server(&webots.path(), forge.path(), 5).env("PATH", &wrapper.path());
-    let server = builder.set("timing.checkout", 20).start().await;
+    let server = builder.set("timing.checkout", 40).start().await;
     let ask = async |name: &str, text: &str| {
         let told = outcome(&server, &world("lab/arm", name, "worlds/a.wbt")).await;
         assert!(told.contains(&format!("opened [{text}]")), "{name}: {told}");
@@ -89,15 +89,16 @@ async fn many_commits_that_are_wanted_at_once_all_come() {
 async fn a_slow_fetch_goes_on_for_who_came_later_for_another_world_of_the_same_commit() {
     let (forge, webots) = (forge(&["main"]), reader());
     let wrapper = GitWrapper::new(
-        "case \"$*\" in *fetch*) for n in $(seq 22); do echo \"Receiving objects: $n%\" >&2; sleep 0.5; done;; esac",
+        "case \"$*\" in *fetch*) for n in $(seq 34); do echo \"Receiving objects: $n%\" >&2; sleep 0.4; done;; esac",
     );
     let builder = simulation_server(&webots.path(), forge.path(), 2).env("PATH", &wrapper.path());
-    let server = builder.set("timing.checkout", 8).start().await;
+    let server = builder.set("timing.checkout", 12).start().await;
     let mut first = Client::start(&server, &world("lab/arm", "main", "worlds/a.wbt")).await;
-    first.until("loading: Step 2/9 : fetching https://github.com/lab/arm: Receiving objects: 11%").await;
+    // A fifth is there.
+    first.until("loading: Step 3/9 : fetching https://github.com/lab/arm: Receiving objects: ").await;
     let mut second = Client::start(&server, &world("lab/arm", "main", "worlds/b.wbt")).await;
-    second.until("loading: Step 2/9 : fetching https://github.com/lab/arm: Receiving objects: 1").await;
-    assert!(first.until("loading: Error:").await.contains("took longer than 8 seconds"));
+    second.until("loading: Step 3/9 : fetching https://github.com/lab/arm: Receiving objects: ").await;
+    assert!(first.until("loading: Error:").await.contains("took longer than 12 seconds"));
     let told = second.until("loading: Error:").await;
     assert!(told.contains("opened [main]"), "{told}");
     assert_eq!(wrapper.calls().iter().filter(|call| call.contains(" fetch ")).count(), 1, "{:#?}", wrapper.calls());
@@ -111,14 +112,14 @@ async fn what_stands_still_is_begun_anew_and_what_moves_is_not() {
     // Each kind of command hangs once; the fetch of another branch takes its time, but moves.
     let wrapper = GitWrapper::new(&format!(
         "case \"$*\" in *ls-remote*) mkdir {0}/asked 2>/dev/null && exec sleep 1000;; *fetch*+{main}:*) mkdir {0}/fetched 2>/dev/null && exec sleep 1000;; \
-         *fetch*+{slow}:*) for n in 1 2 3 4 5 6 7 8 9; do echo \"Receiving objects: $n%\" >&2; sleep 0.5; done;; esac",
+         *fetch*+{slow}:*) for n in $(seq 16); do echo \"Receiving objects: $n%\" >&2; sleep 0.5; done;; esac",
         marks.path().display()
     ));
     let builder = simulation_server(&webots.path(), forge.path(), 1).env("PATH", &wrapper.path());
-    let server = builder.set("timing.checkout", 12).start().await;
+    let server = builder.set("timing.checkout", 24).start().await;
     let told = outcome(&server, &world("lab/arm", "main", "worlds/a.wbt")).await;
     assert!(told.contains("opened [main]"), "{told}");
-    assert_eq!(server.log().matches("nothing has come for 3 s, git starts anew").count(), 2, "{}", server.log());
+    assert_eq!(server.log().matches("nothing has come for 6 s, git starts anew").count(), 2, "{}", server.log());
     assert!(marks.path().join("asked").exists() && marks.path().join("fetched").exists());
     let told = outcome(&server, &world("lab/arm", "slow", "worlds/a.wbt")).await;
     assert!(told.contains("opened [slow]"), "{told}");
@@ -137,12 +138,12 @@ async fn a_commit_by_several_names_is_fetched_once() {
     git(&bare, &["tag", "v1", "main"]);
     let hash = git(&bare, &["rev-parse", "main"]);
     let wrapper = GitWrapper::new(
-        "case \"$*\" in *fetch*) for n in $(seq 12); do echo \"Receiving objects: $n%\" >&2; sleep 0.5; done;; esac",
+        "case \"$*\" in *fetch*) for n in $(seq 24); do echo \"Receiving objects: $n%\" >&2; sleep 0.5; done;; esac",
     );
     let builder = simulation_server(&webots.path(), forge.path(), 3).env("PATH", &wrapper.path());
-    let server = builder.set("timing.checkout", 9).start().await;
+    let server = builder.set("timing.checkout", 30).start().await;
     let mut first = Client::start(&server, &world("lab/arm", "main", "worlds/a.wbt")).await;
-    first.until("loading: Step 2/9 : fetching https://github.com/lab/arm: Receiving objects: 1%").await;
+    first.until("loading: Step 2/9 : fetching https://github.com/lab/arm: Receiving objects: ").await;
     let mut others = [
         Client::start(&server, &world("lab/arm", "v1", "worlds/a.wbt")).await,
         Client::start(&server, &world("lab/arm", hash.trim(), "worlds/b.wbt")).await,
@@ -150,7 +151,7 @@ async fn a_commit_by_several_names_is_fetched_once() {
     for other in &mut others {
         other.until("loading: Step 2/9 : fetching https://github.com/lab/arm: Receiving objects: ").await;
     }
-    first.until("loading: Step 2/9 : fetching https://github.com/lab/arm: Receiving objects: 8%").await;
+    first.until("loading: Step 3/9 : fetching https://github.com/lab/arm: Receiving objects: ").await;
     first.send("nothing that is known").await;
     for other in &mut others {
         let told = other.until("loading: Error:").await;

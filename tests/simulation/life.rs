@@ -120,7 +120,8 @@ async fn a_server_that_stops_tells_its_clients_and_leaves_nothing_in_any_state()
 #[actix_rt::test]
 async fn a_server_that_is_killed_leaves_nothing_in_any_state() {
     for state in ALL {
-        let mut scene = Scene::new(state, quick).await;
+        // The simulation that is being stopped is seen so in time.
+        let mut scene = Scene::new(state, |builder| quick(builder).set("timing.grace", 2.0)).await;
         scene.server.signal(Signal::SIGKILL);
         scene.server.ended().await;
         until("all processes are gone", async || instances_below(scene.folder.path()).is_empty()).await;

@@ -9,20 +9,20 @@ use crate::inside::Inside;
 pub async fn a_simulation_ends_at_its_time_limit_in_any_state() {
     for stage in [Stage::Launching, Stage::Idle, Stage::Running, Stage::Stopping] {
         let inside = Inside::new(stage, |config| {
-            config.timeout = 2;
+            config.timeout = 5;
             config.timing.grace = Duration::from_millis(500);
         })
         .await;
         let mut client = inside.client().await;
         let begin = Instant::now();
-        assert_eq!(client.until("shutdownTimeout").await, "shutdownTimeout: 2");
+        assert_eq!(client.until("shutdownTimeout").await, "shutdownTimeout: 5");
         if stage != Stage::Stopping {
             inside.until(stage).await;
         }
         let told = client.until("loading: Error:").await;
-        assert!(told.starts_with("loading: Error: The time limit of 2 seconds was reached"), "{stage:?}: {told}");
+        assert!(told.starts_with("loading: Error: The time limit of 5 seconds was reached"), "{stage:?}: {told}");
         assert_eq!(client.closed().await, Some(1000));
-        assert!(begin.elapsed() >= Duration::from_secs(2), "{stage:?}: it came too early");
+        assert!(begin.elapsed() >= Duration::from_secs(5), "{stage:?}: it came too early");
         inside.until_nothing_is_left().await;
         inside.stop().await;
     }
@@ -43,12 +43,12 @@ pub async fn who_waits_or_checks_out_has_no_such_limit() {
     inside.until_nothing_is_left().await;
     inside.stop().await;
 
-    let inside = Inside::new(Stage::Idle, |config| config.timeout = 2).await;
+    let inside = Inside::new(Stage::Idle, |config| config.timeout = 5).await;
     let mut first = inside.client().await;
     first.until("webots:").await;
     let mut second = inside.client().await;
     assert_eq!(second.until("").await, "queue: 0");
-    first.until("loading: Error: The time limit of 2 seconds was reached").await;
+    first.until("loading: Error: The time limit of 5 seconds was reached").await;
     second.until("webots:").await;
     second.leave().await;
     inside.until_nothing_is_left().await;
