@@ -59,6 +59,25 @@ async fn one_name_server_that_knows_a_name_is_enough() {
 }
 
 #[actix_rt::test]
+async fn of_name_servers_that_know_different_records_the_first_counts() {
+    let (other, port) = (NameServer::start(&[]), ports::block(1));
+    let _servers = stand_ins(&[2, 3], port);
+    other.set("fleet.test", &loopback(&[3]));
+    let odd = OddNameServer::start(|kind| match kind {
+        Kind::A => Reply::Address([127, 0, 0, 2].into()),
+        _ => Reply::Code(0),
+    });
+    for (list, counts) in [([odd.address(), other.address()], 2), ([other.address(), odd.address()], 3)] {
+        let session = session_server(&[format!("dns+fleet.test:{port}")]).set("nameServers", json!(list)).start().await;
+        until_states(&session, &["up"]).await;
+        let asked = odd.asked();
+        until("ten lookups are done", async || odd.asked() >= asked + 20).await;
+        assert_eq!(times_logged(&session, "leads to other servers: "), 1, "{}", session.log());
+        assert_eq!(http::get(&session.url("/session")).await.text(), format!("ws://127.0.0.{counts}:{port}"));
+    }
+}
+
+#[actix_rt::test]
 async fn a_name_is_unknown_only_where_no_name_server_knows_it() {
     let odd = [Reply::Code(3), Reply::Code(0)].map(|reply| OddNameServer::start(move |_| reply));
     let session = session_server(&["dns+fleet.test:2000".to_owned()])
@@ -71,7 +90,9 @@ async fn a_name_is_unknown_only_where_no_name_server_knows_it() {
 
 #[actix_rt::test]
 async fn targets_of_a_service_that_only_the_name_server_knows_stay_when_it_fails() {
-    let [target, fixed] = [(); 2].map(|()| StandIn::start(Manner::idle(5.0, 1000)));
+    // One comes back to its port, which the system gives to nobody meanwhile.
+    let port = ports::block(1);
+    let [target, fixed] = [port, 0].map(|port| StandIn::start_at(port, Manner::idle(5.0, 1000)));
     let mut names = NameServer::start(&[format!("_webots._tcp.lab.test,node1.lab.test,{}", target.port())]);
     names.set("node1.lab.test node2.lab.test", &loopback(&[1]));
     let listed = format!("node2.lab.test:{}", fixed.port());
@@ -84,7 +105,6 @@ async fn targets_of_a_service_that_only_the_name_server_knows_stay_when_it_fails
     // What it has told is used for ten seconds.
     let begin = Instant::now();
     until("the answer is old", async || begin.elapsed() > Duration::from_secs(11)).await;
-    let port = target.port();
     drop(target);
     until_states(&session, &["up", "down"]).await;
     let _target = StandIn::start_at(port, Manner::idle(5.0, 1000));

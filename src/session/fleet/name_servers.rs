@@ -1,8 +1,9 @@
-//! Asks name servers, each by itself: the first that has records is enough.
+//! Asks name servers, each by itself: one that has records is enough, and of several the first in the list counts.
 //!
 //! The resolver's own pool takes the first answer of several servers, also where that is an error. One server of two that
-//! fails, or knows less than the other, would make each name come and go.
+//! fails, or knows others than the other while a change is on its way to it, would make each name come and go.
 
+use std::collections::BTreeSet;
 use std::pin::pin;
 use std::time::Duration;
 
@@ -15,6 +16,7 @@ use hickory_resolver::net::NetError;
 use hickory_resolver::net::runtime::TokioRuntimeProvider;
 use hickory_resolver::proto::rr::{RData, RecordType};
 use hickory_resolver::system_conf::read_system_conf;
+use tokio::time::{Instant, timeout_at};
 
 use crate::session::config::NameServer;
 
@@ -51,6 +53,8 @@ pub enum LookupError {
 const ANSWER: Duration = Duration::from_secs(2);
 /// How long IPv6 addresses may take when there are others.
 const IPV6: Duration = Duration::from_millis(500);
+/// How long those earlier in the list may take when another has answered.
+const EARLIER: Duration = Duration::from_millis(500);
 
 /// Asks these name servers, or those of the machine where there are none.
 ///
@@ -60,17 +64,29 @@ const IPV6: Duration = Duration::from_millis(500);
 /// When no name server has such records: [`LookupError::Nothing`] where all say so.
 pub async fn ask(question: Question<'_>, name_servers: &[NameServer]) -> Result<Answer, LookupError> {
     let resolvers = resolvers(name_servers).map_err(no_answer)?;
-    let mut answers: FuturesUnordered<_> = resolvers.iter().map(|resolver| ask_one(question, resolver)).collect();
-    let mut fault = LookupError::Nothing;
-    while let Some(answer) = answers.next().await {
+    let ask = async |(place, resolver)| (place, ask_one(question, resolver).await);
+    let mut answers: FuturesUnordered<_> = resolvers.iter().enumerate().map(ask).collect();
+    let mut waiting: BTreeSet<usize> = (0..resolvers.len()).collect();
+    let (mut best, mut fault): (Option<(usize, Answer)>, _) = (None, LookupError::Nothing);
+    let mut until = Instant::now();
+    loop {
+        let next = match &best {
+            Some((place, _)) if waiting.range(..place).next().is_none() => break,
+            Some(_) => timeout_at(until, answers.next()).await.ok().flatten(),
+            None => answers.next().await,
+        };
+        let Some((place, answer)) = next else { break };
+        waiting.remove(&place);
         match answer {
-            Ok(answer) => return Ok(answer),
+            Ok(answer) if best.as_ref().is_none_or(|(best, _)| place < *best) => {
+                best.replace((place, answer)).is_none().then(|| until = Instant::now() + EARLIER);
+            }
             // One that fails may know the name.
             Err(error) if fault == LookupError::Nothing => fault = error,
-            Err(_) => {}
+            _ => {}
         }
     }
-    Err(fault)
+    best.map(|(_, answer)| answer).ok_or(fault)
 }
 
 async fn ask_one(question: Question<'_>, resolver: &TokioResolver) -> Result<Answer, LookupError> {
