@@ -350,17 +350,20 @@ for path in /127.0.0.1/2000/load /10.99.0.1/2000/load /localhost/2000/load /simu
 done
 told 'paths to elsewhere that the door refuses' '10 of 10'
 
-# Another fleet: with https, and simulation servers on nodes with GPUs alone.
+# Another fleet: with https, an image by another name, and simulation servers on nodes with GPUs alone.
 docker stack rm fleet >/dev/null
 gone() { [[ -z $(docker ps --quiet) && -z $(docker network ls --quiet --filter name=fleet_fleet) ]]; }
 within 60 gone
 mkdir "$WORK/tls" "$WORK/x11"
 openssl req -x509 -newkey rsa:2048 -nodes -days 1 -subj /CN=localhost -addext subjectAltName=DNS:localhost \
     -keyout "$WORK/tls/tls.key" -out "$WORK/tls/tls.crt" 2>/dev/null
+mkdir -p "$WORK/tls/.well-known/acme-challenge"
+echo answer >"$WORK/tls/.well-known/acme-challenge/question"
 chown -R 101 "$WORK/tls"
 # They are of the demo here too.
 cp "$WORK/swarm/simulation.json" "$WORK/swarm/simulation-gpu.json"
-export DOOR_PORT=80 FLEET_DOOR=wss://localhost SIMULATION=webots-fleet/simulation-demo:0.1.0 DOOR_TLS=$WORK/tls X11=$WORK/x11
+docker tag webots-fleet/session-server:0.1.0 lab/session-server:1
+export DOOR_PORT=80 FLEET_DOOR=wss://localhost SESSION=lab/session-server:1 SIMULATION=webots-fleet/simulation-demo:0.1.0 DOOR_TLS=$WORK/tls X11=$WORK/x11
 deploy docker stack deploy --compose-file "$WORK/swarm/stack.yml" --compose-file "$WORK/swarm/https.yml" \
     --compose-file "$WORK/swarm/gpu.yml" fleet
 pending() { docker service ps --no-trunc --format '{{.Error}}' fleet_simulation | grep 'scheduling constraints not satisfied'; }
@@ -371,5 +374,7 @@ visit https://localhost/viewer
 told 'a scene in Chromium by https, on a node with the label of a GPU' moves
 [[ $(in_machine curl --silent --output /dev/null --write-out '%{redirect_url}' http://localhost/viewer) == https://localhost/viewer ]] ||
     fail 'http does not lead to https'
+[[ $(in_machine curl --silent http://localhost/.well-known/acme-challenge/question) == answer ]] ||
+    fail 'a certificate could not be renewed: the question of its authority is not answered'
 docker stack rm fleet >/dev/null
 echo passed
