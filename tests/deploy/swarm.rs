@@ -38,6 +38,10 @@ fn its_images_are_those_that_the_dockerfile_makes() {
         assert!(stack.contains(&format!("webots-fleet/{stage}:{}", env!("CARGO_PKG_VERSION"))), "{stage}");
         assert!(dockerfile.contains(&format!(" AS {stage}\n")), "{stage}");
     }
+    // Nodes of a fleet of several machines get them from a registry, which is in their names.
+    for image in stack.lines().filter_map(|line| line.trim().strip_prefix("image: ")) {
+        assert!(image.starts_with("${") || !image.contains("webots-fleet/"), "{image} can't be named otherwise");
+    }
 }
 
 #[test]
