@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
+use procfs::net::TcpState;
 use procfs::process::Process;
 use serde_json::json;
 
@@ -186,6 +187,11 @@ impl Fleet {
             if folders > known {
                 return Err(format!("server {index} knows {known} simulations and has {folders} folders"));
             }
+            let places = self.port(index, 0)..=self.port(index, PLACES - 1);
+            let taken = listening().filter(|port| places.contains(port)).count();
+            if taken > known {
+                return Err(format!("server {index} knows {known} simulations, and {taken} of its ports are taken"));
+            }
         }
         Ok(())
     }
@@ -279,6 +285,12 @@ fn addresses(ports: &[u16], relay: &Relay) -> Vec<String> {
         _ => format!("127.0.0.1:{port}"),
     };
     ports.iter().copied().enumerate().map(of).collect()
+}
+
+/// The ports at which somebody listens. To try to take one would be in the way of a server that tries the same.
+fn listening() -> impl Iterator<Item = u16> {
+    let all = Process::myself().and_then(|this| this.tcp()).unwrap();
+    all.into_iter().filter(|one| one.state == TcpState::Listen).map(|one| one.local_address.port())
 }
 
 fn is_taken(port: u16) -> bool {
