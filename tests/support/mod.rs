@@ -36,7 +36,7 @@ pub fn needs(program: &str, package: &str) {
 /// Says that a test, or a part of it, is left out here, and why. Not by a macro: what those print is shown for tests that fail
 /// only.
 pub fn skip(test: &str, why: &str) {
-    writeln!(std::io::stderr(), "SKIPPED, for {why}: {test}").unwrap();
+    std::io::stderr().write_all(format!("SKIPPED, for {why}: {test}\n").as_bytes()).unwrap();
 }
 
 /// Whether a condition comes to hold before long.

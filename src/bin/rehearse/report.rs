@@ -395,7 +395,7 @@ mod tests {
         };
         assert_eq!(seen(&["gpu-1:2000"; 2]), told("gpu-1:2000", 2));
         assert_eq!(seen(&["gpu-1:2000", "gpu-2:2000"]), told("gpu-1:2000, gpu-2:2000", 2));
-        assert_eq!(seen(&["a", "b", "c", "d", "a"]), told("4 simulation servers", 5));
+        assert_eq!(seen(&["gpu-1:1", "gpu-2:1", "gpu-3:1", "gpu-4:1", "gpu-1:1"]), told("4 simulation servers", 5));
     }
 
     #[test]
