@@ -7,7 +7,7 @@ use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 use serde_json::Value;
 use tokio::io::{AsyncBufReadExt, BufReader};
-use tokio::process::Command;
+use tokio::process::{Child, Command};
 
 use crate::support::authority::Authority;
 use crate::support::git::{Forge, arm, world};
@@ -23,7 +23,7 @@ const BOUND: Duration = Duration::from_secs(90);
 /// A fleet of one simulation server.
 struct Fleet {
     session: Server,
-    _simulation: Server,
+    simulation: Server,
     _stand_ins: (Forge, Webots),
 }
 
@@ -33,7 +33,7 @@ impl Fleet {
         let simulation = simulation_server(&webots.path(), forge.path(), places).start().await;
         // What else runs on this machine must not close the fleet.
         let session = session_server(&[simulation.address()]).set("loadThreshold", 1000).start().await;
-        Self { session, _simulation: simulation, _stand_ins: (forge, webots) }
+        Self { session, simulation, _stand_ins: (forge, webots) }
     }
 
     async fn rehearse(&self, arguments: &[&str]) -> Output {
@@ -67,14 +67,16 @@ async fn a_class_that_fits_is_told_so() {
     let fleet = Fleet::with_places(3).await;
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("class.json");
-    let class = ["--clients", "3", "--over", "0s", "--stay", "3s", "--real-time", "0.1", "--expect", "3", "--json"];
+    let class = ["--clients", "3", "--over", "0s", "--stay", "5s", "--real-time", "0.1", "--expect", "3", "--json"];
     let output = fleet.rehearse(&[&class[..], &[file.to_str().unwrap()]].concat()).await;
     let said = text(&output.stdout);
     assert!(output.status.success(), "{said}{}", text(&output.stderr));
-    assert!(said.contains("All 3 fit."), "{said}");
+    assert!(said.contains("All 3 fit.") && said.contains(": 3 clients at once, each for 5s"), "{said}");
     let report: Value = serde_json::from_str(&std::fs::read_to_string(file).unwrap()).unwrap();
     assert_eq!((&report["seats"]["given"], &report["seats"]["fit"]), (&3.into(), &3.into()), "{report}");
-    assert_eq!(report["visits"].as_array().unwrap().len(), 3);
+    let visits = report["visits"].as_array().unwrap();
+    let has_pace = |visit: &Value| ["p5", "median"].iter().all(|name| visit["realTime"][name].is_f64());
+    assert!(visits.len() == 3 && visits.iter().all(has_pace), "{report}");
 }
 
 #[actix_rt::test]
@@ -83,14 +85,15 @@ async fn a_class_that_does_not_fit_is_told_why_and_time_in_the_line_counts_as_wa
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("class.json");
     let class =
-        ["--clients", "2", "--over", "1s", "--stay", "3s", "--real-time", "0.1", "--json", file.to_str().unwrap()];
+        ["--clients", "2", "--over", "1s", "--stay", "5s", "--real-time", "0.1", "--json", file.to_str().unwrap()];
     let output = fleet.rehearse(&class).await;
     let report: Value = serde_json::from_str(&std::fs::read_to_string(&file).unwrap()).unwrap();
     assert!(output.status.success(), "{report}");
     let waiting = report["times"].as_array().unwrap().iter().find(|row| row["step"] == "waiting").unwrap();
     assert!(waiting["worst"].as_f64().unwrap() > 1.5, "one waited until the other had left: {report}");
     // Nobody leaves soon enough for the second one.
-    let output = fleet.rehearse(&[&class[..4], &["--stay", "8s", "--patience", "3s", "--expect", "2"]].concat()).await;
+    let stays = ["--stay", "20s", "--real-time", "0", "--patience", "10s", "--expect", "2"];
+    let output = fleet.rehearse(&[&class[..4], &stays].concat()).await;
     let said = text(&output.stdout);
     assert_eq!(output.status.code(), Some(1), "{said}");
     assert!(said.contains("1 of 2"), "{said}");
@@ -99,7 +102,7 @@ async fn a_class_that_does_not_fit_is_told_why_and_time_in_the_line_counts_as_wa
 #[actix_rt::test]
 async fn the_acceptance_run_finds_the_demo_as_expected() {
     let fleet = Fleet::with_places(1).await;
-    let output = fleet.rehearse(&["--explain", "--stay", "2s"]).await;
+    let output = fleet.rehearse(&["--explain"]).await;
     let said = text(&output.stdout);
     assert!(output.status.success(), "{said}{}", text(&output.stderr));
     assert!(said.contains("| step | at | took | expected | came | |"), "{said}");
@@ -119,6 +122,38 @@ async fn a_fleet_that_is_not_there_and_one_elsewhere_are_refused_in_one_line() {
         (output.status.code(), said.as_str()),
         (Some(2), "error: nobody agreed to load http://192.0.2.1:1999/; --yes agrees\n")
     );
+}
+
+#[actix_rt::test]
+async fn who_names_a_simulation_server_in_place_of_a_session_server_is_told_so() {
+    let fleet = Fleet::with_places(1).await;
+    for arguments in [&ONE[..], &["--explain"]] {
+        let output = rehearse(&fleet.simulation.url(""), arguments).await;
+        let said = text(&output.stderr);
+        assert_eq!(output.status.code(), Some(1), "{said}");
+        assert!(said.starts_with("error: ws://") && said.lines().count() == 1, "{said}");
+        assert!(said.ends_with(": no session server, maybe a simulation server\n"), "{said}");
+    }
+}
+
+#[actix_rt::test]
+async fn a_simulation_server_that_misbehaves_is_named() {
+    let fleet = StandIn::start(Script { client: vec!["loading: wait"], ..Script::default() }).await;
+    let output = rehearse(&format!("http://{}", fleet.address), &[&ONE[..], &["--patience", "4s"]].concat()).await;
+    let said = text(&output.stdout);
+    let verdict = format!("None fits; 1 got none: no simulation within 4s at {}.", fleet.address);
+    assert!(said.contains(&verdict) && output.status.code() == Some(1), "{said}");
+}
+
+#[actix_rt::test]
+async fn who_stays_too_briefly_for_a_pace_does_not_fit() {
+    let fleet = StandIn::start(Script::default()).await;
+    let class = ["--clients", "1", "--over", "0s", "--stay", "1s"];
+    let output = rehearse(&format!("http://{}", fleet.address), &class).await;
+    let said = text(&output.stdout);
+    assert_eq!(output.status.code(), Some(1), "{said}");
+    assert!(said.contains("None stayed long enough to tell its pace."), "{said}");
+    assert!(said.contains("| ran, too briefly to tell their pace "), "{said}");
 }
 
 #[actix_rt::test]
@@ -209,6 +244,10 @@ async fn the_acceptance_run_prints_each_step_as_it_is_known() {
     let reading = async { while !lines.next_line().await.unwrap().unwrap().starts_with("| stream |") {} };
     actix_rt::time::timeout(SOON, reading).await.expect("the steps until the scene are printed");
     assert!(child.try_wait().unwrap().is_none(), "it waits for the scene");
+    signal(&child, Signal::SIGTERM);
+    let reading = async { while !lines.next_line().await.unwrap().unwrap().starts_with("Interrupted: ") {} };
+    actix_rt::time::timeout(SOON, reading).await.expect("that it ends early is said");
+    assert_eq!(child.wait().await.unwrap().code(), Some(130));
 }
 
 #[actix_rt::test]
@@ -248,8 +287,16 @@ async fn a_simulation_whose_end_nobody_sees_does_not_fit() {
     }
 }
 
+fn signal(child: &Child, signal: Signal) {
+    kill(Pid::from_raw(i32::try_from(child.id().unwrap()).unwrap()), signal).unwrap();
+}
+
 #[actix_rt::test]
 async fn an_interrupted_class_tells_what_was_seen_until_then() {
+    futures_util::future::join(interrupt(Signal::SIGINT), interrupt(Signal::SIGTERM)).await;
+}
+
+async fn interrupt(by: Signal) {
     let fleet = StandIn::start(Script::default()).await;
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("class.json");
@@ -260,7 +307,7 @@ async fn an_interrupted_class_tells_what_was_seen_until_then() {
     // While the load is asked for each second, the simulation begins to run.
     let before = fleet.asked("/load").len();
     until("time passes", async || fleet.asked("/load").len() > before + 2).await;
-    kill(Pid::from_raw(i32::try_from(child.id().unwrap()).unwrap()), Signal::SIGINT).unwrap();
+    signal(&child, by);
     let output = actix_rt::time::timeout(SOON, child.wait_with_output()).await.expect("it ends").unwrap();
     let said = text(&output.stdout);
     assert_eq!(output.status.code(), Some(130), "{said}{}", text(&output.stderr));
@@ -307,6 +354,12 @@ async fn what_can_not_be_done_is_told_before_anything_is_begun() {
     assert!(error.starts_with("error: /nowhere/a.json can't be written: "), "{error}");
     let error = told(command(fleet, &arm()).args(["--explain", "--expect", "3"])).await;
     assert!(error.contains("'--explain' cannot be used with '--expect <CLIENTS>'"), "{error}");
+    for (name, value) in [("--stay", "2s"), ("--real-time", "0.5")] {
+        let error = told(command(fleet, &arm()).args(["--explain", name, value])).await;
+        assert!(error.contains(&format!("'--explain' cannot be used with '{name} ")), "{error}");
+    }
+    let error = told(&mut command("http://me:secret@127.0.0.1:1", &arm())).await;
+    assert!(error.contains("a user name or a password") && !error.contains("secret"), "{error}");
     let mut limited = Command::new("sh");
     limited.args([
         "-c",

@@ -74,8 +74,8 @@ async fn a_client_that_does_not_answer_delays_the_end_by_a_second_only() {
     let project = small_project();
     let mut simulator = Start::paused(&project.path().join("worlds/a.wbt")).listening().await;
     let silent = simulator.spectator().await;
-    simulator.signal(Signal::SIGTERM);
     let signalled = Instant::now();
+    simulator.signal(Signal::SIGTERM);
     assert_eq!(simulator.end().await.code(), Some(0));
     assert!(signalled.elapsed() >= Duration::from_secs(1), "the client had no time to answer");
     drop(silent);

@@ -8,7 +8,7 @@ use crate::support::client::Client;
 use crate::support::git::Forge;
 use crate::support::program::{Builder, Server, simulation_server};
 use crate::support::webots::Webots;
-use crate::support::{display, needs, until};
+use crate::support::{display, needs, skip, until};
 
 /// Everything of a test: a server with things that are none of a world's business.
 struct Stage {
@@ -127,7 +127,7 @@ fn as_nobody() -> Option<&'static str> {
     let program = Path::new(env!("CARGO_BIN_EXE_simulation-server"));
     let may_be_run = |folder: &Path| folder.metadata().unwrap().permissions().mode() & 1 == 1;
     if !nix::unistd::getuid().is_root() || !program.ancestors().all(may_be_run) {
-        eprintln!("skipped: only root can become somebody else, who may run what was built");
+        skip("a sandbox of an ordinary user", "only root can become somebody else, who may run what was built");
         return None;
     }
     Some("exec setpriv --reuid=65534 --regid=65534 --clear-groups \"$0\" \"$@\"")
@@ -207,7 +207,7 @@ async fn temporary_folders_are_the_simulations_own_wherever_they_are() {
     let mounts =
         std::process::Command::new("unshare").args(["--mount", "mount", "-t", "tmpfs", "none", "/var"]).status();
     if !mounts.is_ok_and(|status| status.success()) {
-        return eprintln!("skipped: only root can put a link in place of /var/tmp");
+        return skip("a link in place of /var/tmp", "only root can put it there");
     }
     let linked = "exec unshare --mount bash -c 'mount -t tmpfs none /var && ln -s /tmp /var/tmp && exec \"$0\" \"$@\"' \"$0\" \"$@\"";
     let done = stage.tried(&deeds[1..2], "sandbox", |builder| builder.before(linked)).await;
@@ -218,7 +218,10 @@ async fn temporary_folders_are_the_simulations_own_wherever_they_are() {
 async fn a_sandbox_makes_no_user_namespaces_and_sets_nothing_of_the_kernel() {
     let help = std::process::Command::new("bwrap").arg("--help").output().unwrap();
     if !String::from_utf8_lossy(&help.stdout).contains("--disable-userns") {
-        return eprintln!("skipped: bubblewrap before 0.8 can't keep programs from making user namespaces");
+        return skip(
+            "a_sandbox_makes_no_user_namespaces_and_sets_nothing_of_the_kernel",
+            "bubblewrap before 0.8 can't keep programs from making them",
+        );
     }
     let set = |file: &str| format!("value=$(cat {file}) && echo $value > {file}");
     let deeds = [

@@ -7,7 +7,7 @@ use crate::support::client::Client;
 use crate::support::git::Forge;
 use crate::support::program::{Server, simulation_server};
 use crate::support::webots::Webots;
-use crate::support::{SOON, http, until};
+use crate::support::{SOON, http, skip, until};
 
 const LEVELS: [&str; 2] = ["none", "sandbox"];
 
@@ -169,7 +169,10 @@ impl Drop for Delegated {
 #[actix_rt::test]
 async fn a_simulation_has_a_control_group_of_its_own_where_they_are_delegated() {
     let Some(delegated) = Delegated::new() else {
-        return eprintln!("skipped: there is no cgroup v2 in which this user may make groups");
+        return skip(
+            "a_simulation_has_a_control_group_of_its_own_where_they_are_delegated",
+            "there is no cgroup v2 in which this user may make groups",
+        );
     };
     for level in LEVELS {
         let forge = Forge::with_arm();

@@ -1,9 +1,11 @@
 //! What ends with a simulation at each level, and how.
 
+use std::time::{Duration, Instant};
+
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 
-use crate::simulation::scene::{DEMO, arm, nothing_left};
+use crate::simulation::scene::{DEMO, arm, gone_within, nothing_left};
 use crate::support::client::Client;
 use crate::support::git::Forge;
 use crate::support::program::simulation_server;
@@ -76,7 +78,9 @@ async fn a_simulation_that_takes_no_notice_is_killed_after_its_grace_time() {
         let server = builder.set("timing.grace", 0.5).start().await;
         let mut client = Client::start(&server, &arm()).await;
         client.until("webots:").await;
+        let left = Instant::now();
         client.leave().await;
-        nothing_left(&server, 1).await;
+        let took = gone_within(0.5, left, &server).await;
+        assert!(took >= Duration::from_millis(500), "{level}: it was killed after {took:?}");
     }
 }

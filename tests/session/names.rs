@@ -1,6 +1,5 @@
 //! Names of simulation servers whose lookup hangs.
 
-use std::io::Write;
 use std::path::Path;
 use std::process::Command;
 use std::time::{Duration, Instant};
@@ -11,7 +10,7 @@ use nix::sys::stat::Mode;
 use super::stand_in::{Manner, StandIn};
 use super::until_states;
 use crate::support::program::session_server;
-use crate::support::{http, until};
+use crate::support::{http, skip, until};
 
 /// How to get a view of the file system of one's own, if that is allowed here: for root, or with a user of one's own.
 pub(super) fn own_mounts() -> Option<&'static str> {
@@ -33,10 +32,7 @@ fn hanging_names(unshare: &str, folder: &Path) -> String {
 async fn a_name_whose_lookup_hangs_holds_up_only_its_own_server() {
     const HANGING: usize = 20;
     let Some(unshare) = own_mounts() else {
-        // Not by a macro: what those print is shown for tests that fail only.
-        let why =
-            "SKIPPED, for unshare --mount is not allowed here: a_name_whose_lookup_hangs_holds_up_only_its_own_server";
-        return writeln!(std::io::stderr(), "{why}").unwrap();
+        return skip("a_name_whose_lookup_hangs_holds_up_only_its_own_server", "unshare --mount is not allowed here");
     };
     let folder = tempfile::tempdir().unwrap();
     let [well, named] = [(); 2].map(|()| StandIn::start(Manner::idle(5.0, 1000)));

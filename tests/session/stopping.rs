@@ -116,12 +116,19 @@ async fn thresholds_and_refresh_are_read_again() {
 
 #[actix_rt::test]
 async fn a_configuration_that_can_not_be_used_changes_nothing() {
-    let servers = [StandIn::start(Manner::idle(1.0, 10))];
-    let session = session_server(&addresses(&servers)).start().await;
+    let servers = [StandIn::start(Manner::idle(50.0, 10))];
+    let session = session_server(&addresses(&servers)).set("clientCost", 0.001).start().await;
     until_states(&session, &["up"]).await;
-    session.rewrite_config(|config| config["simulationServers"] = "none".into());
+    // What is right beside what is wrong is not taken either.
+    session.rewrite_config(|config| {
+        config["loadThreshold"] = 40.into();
+        config["simulationServers"] = "none".into();
+    });
     session.signal(Signal::SIGHUP);
     until("it says so", async || session.log().contains("the configuration stays as it was")).await;
+    let asked = servers[0].requests();
+    until("it is judged anew", async || servers[0].requests() >= asked + 3).await;
+    until_states(&session, &["up"]).await;
     assert_eq!(http::get(&session.url("/session")).await.text(), servers[0].url());
 }
 

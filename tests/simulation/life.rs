@@ -22,15 +22,18 @@ use std::time::{Duration, Instant};
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 
-use super::scene::{ALL, DEMO, Scene, State, arm, instance_folders, nothing_left, stages};
+use super::scene::{ALL, DEMO, Scene, State, arm, gone_within, instance_folders, nothing_left, stages};
 use crate::support::client::Client;
 use crate::support::git::Forge;
 use crate::support::program::{Builder, Server, simulation_server};
 use crate::support::until;
 use crate::support::webots::{Webots, instances_below};
 
+/// The grace time of most tests here, in seconds.
+const GRACE: f64 = 0.3;
+
 pub fn quick(builder: Builder) -> Builder {
-    builder.set("timing.grace", 0.3).set("timing.heartbeat", 0.2)
+    builder.set("timing.grace", GRACE).set("timing.heartbeat", 0.2)
 }
 
 const WITH_CLIENT: [State; 6] =
@@ -58,12 +61,14 @@ async fn a_simulation_runs_from_the_first_message_to_the_last_trace() {
 async fn a_client_that_closes_leaves_nothing_in_any_state() {
     for state in WITH_CLIENT {
         let mut scene = Scene::new(state, quick).await;
+        let mut left = Instant::now();
         scene.client.take().unwrap().leave().await;
         if let Some(other) = scene.other.take() {
             until("the line is empty", async || stages(&scene.server).await == ["idle"]).await;
+            left = Instant::now();
             other.leave().await;
         }
-        nothing_left(&scene.server, 1).await;
+        gone_within(GRACE, left, &scene.server).await;
     }
 }
 
@@ -72,8 +77,9 @@ async fn a_connection_that_breaks_leaves_nothing_in_any_state() {
     for state in WITH_CLIENT {
         let mut scene = Scene::new(state, quick).await;
         // Dropped without a word.
+        let left = Instant::now();
         drop((scene.client.take(), scene.other.take()));
-        nothing_left(&scene.server, 1).await;
+        gone_within(GRACE, left, &scene.server).await;
         assert!(!scene.server.log().contains("Wrong message"), "every closed laptop does that");
     }
 }
@@ -94,9 +100,10 @@ async fn a_half_open_connection_is_found_by_ping_in_any_state() {
 #[actix_rt::test]
 async fn a_simulator_that_ignores_sigterm_and_hides_ends_after_the_grace_time() {
     // The script ignores SIGTERM, and has a child in a session of its own.
-    let scene = Scene::new(State::Stopping, |builder| quick(builder).set("timing.grace", 1.0)).await;
+    let scene = Scene::new(State::Stopping, |builder| quick(builder).set("timing.grace", 2.0)).await;
     assert!(instances_below(&scene.server.folder).iter().any(|one| one.1 == "sleep 1000"));
-    nothing_left(&scene.server, 1).await;
+    let took = gone_within(2.0, scene.left.unwrap(), &scene.server).await;
+    assert!(took >= Duration::from_secs(2), "it was killed after {took:?}");
 }
 
 #[actix_rt::test]

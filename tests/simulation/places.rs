@@ -1,5 +1,7 @@
 //! Places and the waiting line.
 
+use std::cell::{Cell, RefCell};
+use std::collections::BTreeSet;
 use std::net::TcpListener;
 use std::time::Duration;
 
@@ -149,12 +151,18 @@ async fn a_port_that_somebody_else_has_is_not_lent() {
 }
 
 #[actix_rt::test]
-async fn a_crowd_is_served_to_the_last_one() {
+async fn a_crowd_is_served_to_the_last_one_and_no_two_share_a_place() {
     let (forge, webots) = (Forge::with_arm(), Webots::launcher());
     let server = simulation_server(&webots.path(), forge.path(), 3).start().await;
+    let (held, were_all_held) = (RefCell::new(BTreeSet::new()), Cell::new(false));
     let visits = (0..12).map(|_| async {
         let mut client = Client::start(&server, &arm()).await;
         let url = client.until("webots:").await;
+        assert!(held.borrow_mut().insert(url.clone()), "{url} is another's");
+        were_all_held.set(were_all_held.get() || held.borrow().len() == 3);
+        until("all places are taken at once", async || were_all_held.get()).await;
+        // Before it leaves: the place is free then.
+        held.borrow_mut().remove(&url);
         client.leave().await;
         url
     });

@@ -2,13 +2,13 @@
 
 use tokio_tungstenite::tungstenite::client::IntoClientRequest;
 
-use super::scene::arm;
+use super::scene::{arm, stages};
 use crate::support::client::Client;
 use crate::support::git::{Forge, world};
 use crate::support::http;
 use crate::support::program::{Server, simulation_server};
 use crate::support::until;
-use crate::support::webots::Webots;
+use crate::support::webots::{Webots, instances_below};
 
 async fn server() -> (Server, Forge, Webots) {
     let (forge, webots) = (Forge::with_arm(), Webots::launcher());
@@ -18,6 +18,7 @@ async fn server() -> (Server, Forge, Webots) {
 #[actix_rt::test]
 async fn a_message_that_is_none_is_answered_in_words() {
     let (server, _forge, _webots) = server().await;
+    let (_running, mut viewer, processes) = running(&server).await;
     let start = |url: &str| serde_json::json!({"start": {"url": url}}).to_string();
     let table = [
         ("garbage".to_owned(), "Wrong message"),
@@ -33,7 +34,31 @@ async fn a_message_that_is_none_is_answered_in_words() {
         assert!(told.starts_with("loading: Error: ") && told.contains(words), "{text}: {told}");
         assert_eq!(client.closed().await, Some(1000));
     }
-    assert!(http::get(&server.url("/health")).await.status.is_success());
+    goes_on(&server, &mut viewer, &processes).await;
+}
+
+/// A client whose simulation runs, a viewer of it, and its processes.
+async fn running(server: &Server) -> (Client, Client, Vec<i32>) {
+    let mut client = Client::start(server, &arm()).await;
+    let url = client.until("webots:").await;
+    let mut viewer = Client::connect(&format!("{}/", url.strip_prefix("webots:").unwrap())).await;
+    viewer.send("x3d").await;
+    viewer.until("scene load completed").await;
+    let processes = processes(server);
+    assert!(processes.len() >= 2, "launcher and simulator");
+    (client, viewer, processes)
+}
+
+fn processes(server: &Server) -> Vec<i32> {
+    instances_below(&server.folder).into_iter().map(|(pid, _)| pid).collect()
+}
+
+/// Whether that simulation is the only one and has its processes, and whether its viewer is answered.
+async fn goes_on(server: &Server, viewer: &mut Client, before: &[i32]) {
+    until("the others are gone", async || stages(server).await.len() == 1).await;
+    assert_eq!(processes(server), before);
+    viewer.send("pause").await;
+    viewer.until("paused by client").await;
 }
 
 #[actix_rt::test]

@@ -2,6 +2,7 @@
 
 use std::net::TcpListener;
 use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
 
 use crate::support::client::Client;
 use crate::support::git::Forge;
@@ -39,6 +40,8 @@ pub struct Scene {
     pub server: Server,
     /// The client in that state; it has left where the state is `Stopping`.
     pub client: Option<Client>,
+    /// When it began to leave, if it has.
+    pub left: Option<Instant>,
     /// The one that holds the only place, where the state is `Waiting`.
     pub other: Option<Client>,
     pub folder: tempfile::TempDir,
@@ -72,7 +75,7 @@ impl Scene {
         }
         let client = Client::connect(&server.websocket("/client")).await;
         let _parts = (forge, webots, hanging);
-        let mut scene = Self { server, client: Some(client), other, folder, _parts };
+        let mut scene = Self { server, client: Some(client), left: None, other, folder, _parts };
         scene.come_to(state).await;
         scene
     }
@@ -94,6 +97,7 @@ impl Scene {
             State::Idle | State::Running | State::Stopping => drop(client.until("webots:").await),
         }
         if state == State::Stopping {
+            self.left = Some(Instant::now());
             self.client.take().unwrap().leave().await;
         }
         let shown = match state {
@@ -125,6 +129,15 @@ pub async fn nothing_left(server: &Server, places: u16) {
             && (server.port + 1..=server.port + places).all(|port| TcpListener::bind(("0.0.0.0", port)).is_ok())
     })
     .await;
+}
+
+/// Waits until nothing of a simulation is left on a server with one place, which is to be so soon after its grace time, in
+/// seconds, since its client has left. Returns how long it took.
+pub async fn gone_within(grace: f64, left: Instant, server: &Server) -> Duration {
+    nothing_left(server, 1).await;
+    let took = left.elapsed();
+    assert!(took < Duration::from_secs_f64(grace + 5.0), "it took {took:?}, and the grace time is {grace} s");
+    took
 }
 
 /// The folders of simulations below a server's folder.

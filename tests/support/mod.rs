@@ -18,6 +18,7 @@ pub mod smtp;
 pub mod stand_in;
 pub mod webots;
 
+use std::io::Write;
 use std::time::{Duration, Instant};
 
 use nix::sys::resource::{Resource, getrlimit, setrlimit};
@@ -30,6 +31,12 @@ pub fn needs(program: &str, package: &str) {
     let paths = std::env::var_os("PATH").unwrap();
     let is_there = std::env::split_paths(&paths).any(|folder| folder.join(program).is_file());
     assert!(is_there, "this test needs {program}: apt install {package}");
+}
+
+/// Says that a test, or a part of it, is left out here, and why. Not by a macro: what those print is shown for tests that fail
+/// only.
+pub fn skip(test: &str, why: &str) {
+    std::io::stderr().write_all(format!("SKIPPED, for {why}: {test}\n").as_bytes()).unwrap();
 }
 
 /// Whether a condition comes to hold before long.

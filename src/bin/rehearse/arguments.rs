@@ -18,7 +18,7 @@ const FILES: (u64, u64) = (4, 64);
 ///
 /// It speaks to a session server as Webots' web page does: availability, a simulation server, the start, the scene and its
 /// updates, run, leave. Exit code 0: as expected; 1: not, or nothing could be measured; 2: wrong arguments, or nobody agreed;
-/// 130: Ctrl-C.
+/// 130: Ctrl-C or SIGTERM.
 #[derive(Parser, Debug, Clone)]
 #[command(version)]
 pub(crate) struct Arguments {
@@ -60,7 +60,7 @@ pub(crate) struct Arguments {
     #[arg(long, default_value = "w3d", value_parser = ["w3d", "x3d"])]
     pub(crate) viewer: String,
     /// Walk through all steps with one client, and compare what comes with what is expected of a fleet and of Webots
-    #[arg(long, conflicts_with_all = ["clients", "over", "misbehave", "soak", "expect", "json"])]
+    #[arg(long, conflicts_with_all = ["clients", "over", "stay", "real_time", "misbehave", "soak", "expect", "json"])]
     pub(crate) explain: bool,
     /// Draw the clients that misbehave from this number; the same number draws the same
     #[arg(long, default_value_t = 1)]
@@ -76,6 +76,9 @@ impl Arguments {
     /// # Errors
     /// What can't be done, in words.
     pub(crate) fn prepare(&self) -> Result<(), String> {
+        if !self.fleet.username().is_empty() || self.fleet.password().is_some() {
+            return Err("the session server's URL has a user name or a password, which nobody would be sent".to_owned());
+        }
         let clients = if self.explain { 1 } else { self.clients };
         let needed = u64::from(clients) * FILES.0 + FILES.1;
         let allowed = raise_open_files(needed);
@@ -96,7 +99,8 @@ impl Arguments {
         }
         let words = |time| humantime::format_duration(time).to_string();
         let how_long = self.soak.map(|soak| format!(", again and again for {}", words(soak))).unwrap_or_default();
-        format!("{} clients within {}, each for {}{how_long}", self.clients, words(self.over), words(self.stay))
+        let over = if self.over.is_zero() { "at once".to_owned() } else { format!("within {}", words(self.over)) };
+        format!("{} clients {over}, each for {}{how_long}", self.clients, words(self.stay))
     }
 }
 

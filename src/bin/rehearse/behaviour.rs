@@ -48,6 +48,10 @@ impl FromStr for Mix {
             Ok((*behaviour, percent.parse().map_err(|_| wrong(part))?))
         });
         let mix = Self(shares.collect::<Result<_, String>>()?);
+        let mut before = mix.0.iter().enumerate().map(|(number, (one, _))| (one, mix.0.iter().take(number)));
+        if let Some((twice, _)) = before.find(|(one, before)| before.clone().any(|(other, _)| other == *one)) {
+            return Err(format!("{twice} is given twice"));
+        }
         let sum = mix.0.iter().fold(0_u32, |sum, (_, percent)| sum.saturating_add(*percent));
         if sum <= 100 { Ok(mix) } else { Err(format!("the shares are {sum} percent; allowed is up to 100")) }
     }
@@ -106,7 +110,7 @@ mod tests {
 
     #[test]
     fn what_is_no_share_is_told() {
-        for wrong in ["reload", "reload=x", "dance=5", "reload=60,drop=41", "reload=-1"] {
+        for wrong in ["reload", "reload=x", "dance=5", "reload=60,drop=41", "reload=-1", "drop=1,reload=5,reload=6"] {
             assert!(wrong.parse::<Mix>().is_err(), "{wrong}");
         }
         assert_eq!("".parse::<Mix>(), Ok(Mix::default()));

@@ -87,7 +87,7 @@ impl<'class> Browser<'class> {
         let started = actix_rt::time::timeout(patience, self.start(meet)).await;
         let started = started.unwrap_or_else(|_| {
             let why = self.full.as_ref().map(|full| format!(": {full}")).unwrap_or_default();
-            Err(NoStart::Failed(format!("no simulation within {patience:?}{why}")))
+            Err(NoStart::Failed(format!("no simulation within {}{why}", humantime::format_duration(patience))))
         });
         self.visit.outcome = match started {
             Ok(running) => {
@@ -151,7 +151,10 @@ impl<'class> Browser<'class> {
         loop {
             self.session.until_available().await?;
             match self.session.simulation_server(&self.arguments.world).await {
-                Ok(server) => return Ok(server),
+                Ok(server) => {
+                    self.full = None;
+                    return Ok(server);
+                }
                 Err(why) if is_of_no_place(&why) => self.full = Some(why),
                 Err(why) => return Err(NoStart::Refused(why)),
             }

@@ -12,6 +12,7 @@ use crate::behaviour::{Behaviour, Draw};
 use crate::board::Board;
 use crate::browser::Browser;
 use crate::consent::Consent;
+use crate::interruption::interruption;
 use crate::servers::Servers;
 use crate::session::Session;
 use crate::visit::Visit;
@@ -25,11 +26,11 @@ pub(crate) struct Played {
     pub(crate) visits: Vec<Visit>,
     /// The highest load of each server.
     pub(crate) peaks: BTreeMap<String, Option<f64>>,
-    /// Whether Ctrl-C has ended it.
+    /// Whether Ctrl-C or SIGTERM has ended it.
     pub(crate) interrupted: bool,
 }
 
-/// Plays the whole class, or until Ctrl-C. Ends at once where nobody agrees to load a server that a client is sent to.
+/// Plays the whole class, or until Ctrl-C or SIGTERM. Ends at once where nobody agrees to load a server that a client is sent to.
 pub(crate) async fn play(arguments: &Arguments, consent: &Consent<'_>) -> Played {
     let class = Class {
         arguments,
@@ -49,7 +50,7 @@ pub(crate) async fn play(arguments: &Arguments, consent: &Consent<'_>) -> Played
         _ = clients => {}
         _ = aside => {}
         () = class.refused.notified() => {}
-        Ok(()) = tokio::signal::ctrl_c() => interrupted = true,
+        () = interruption() => interrupted = true,
     }
     class.board.clear();
     Played { visits: class.visits.take(), peaks: class.servers.peaks(), interrupted }

@@ -3,7 +3,7 @@
 //! It speaks the original's protocol alone, so that it measures a fleet of Python servers as well. `arguments` says what
 //! can be asked for; `consent` asks before another machine is loaded; `class` lets the clients come, each of which is a
 //! `browser` that goes through the steps of Webots' web page and leaves a `visit` behind; `servers` watches the load
-//! meanwhile; `report` and `table` say what came of it. `explain` goes through the steps with one client and compares what
+//! meanwhile; `report` and `table` say what came of it, with `factors` and `reasons`. `explain` goes through the steps with one client and compares what
 //! comes with what is expected; `walk` prints the steps, `words` what came.
 
 mod arguments;
@@ -14,7 +14,10 @@ mod class;
 mod consent;
 mod conversation;
 mod explain;
+mod factors;
+mod interruption;
 mod place;
+mod reasons;
 mod report;
 mod servers;
 mod session;
@@ -31,10 +34,11 @@ use clap::Parser;
 use crate::arguments::Arguments;
 use crate::class::Played;
 use crate::consent::Consent;
+use crate::interruption::interruption;
 
 /// The class did not fit as `--expect` demands, or nothing could be measured.
 const NOT_AS_EXPECTED: u8 = 1;
-/// Ctrl-C has ended it, as shells tell that.
+/// Ctrl-C or SIGTERM has ended it, as shells tell the first.
 const INTERRUPTED: u8 = 130;
 /// The arguments can't be used.
 const WRONG_ARGUMENTS: u8 = 2;
@@ -52,11 +56,7 @@ fn main() -> ExitCode {
         if !consent.has_fleet() {
             return Err(refused(&consent));
         }
-        if arguments.explain {
-            Box::pin(explain::run(&arguments, &consent)).await.map(code)
-        } else {
-            rehearse(&arguments, &consent).await
-        }
+        if arguments.explain { explain(&arguments, &consent).await } else { rehearse(&arguments, &consent).await }
     });
     match ended {
         Ok(code) => ExitCode::from(code),
@@ -90,6 +90,20 @@ enum Fault {
 impl From<String> for Fault {
     fn from(why: String) -> Self {
         Self::Failed(why)
+    }
+}
+
+/// Walks through the steps of an acceptance run, which are printed as they are known. Returns the exit code.
+///
+/// # Errors
+/// When the fleet does not answer at all, or nobody agreed to load all of it.
+async fn explain(arguments: &Arguments, consent: &Consent<'_>) -> Result<u8, Fault> {
+    tokio::select! {
+        walked = Box::pin(explain::run(arguments, consent)) => walked.map(code),
+        () = interruption() => {
+            writeln!(std::io::stdout(), "\nInterrupted: other steps were not made.").ok();
+            Ok(INTERRUPTED)
+        }
     }
 }
 

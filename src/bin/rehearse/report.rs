@@ -6,6 +6,8 @@ use std::path::Path;
 use serde::Serialize;
 
 use crate::arguments::Arguments;
+use crate::factors::{Factors, factors, factors_of, quantile, sorted};
+use crate::reasons::Reasons;
 use crate::visit::{Outcome, Steps, Visit};
 
 /// The numbers of a rehearsal.
@@ -44,12 +46,14 @@ pub(crate) struct Seats {
     pub(crate) given: u32,
     /// Those of them that ran to their client's end, not below the share of real time that was asked for.
     pub(crate) fit: u32,
-    /// Clients that were told why they get none, or got none, by the reason.
+    /// Clients that were told why they get none, or got none, by the reason and the simulation server that it came from.
     pub(crate) refused: BTreeMap<String, u32>,
-    /// Simulations that ended before their client left, by the reason.
+    /// Simulations that ended before their client left, by the reason and the simulation server.
     pub(crate) broke_off: BTreeMap<String, u32>,
     /// Simulations that ran and whose end nobody saw: their client slept, vanished, or was interrupted.
     pub(crate) unseen: u32,
+    /// Simulations that ran to their client's end, which came too soon to tell their pace.
+    pub(crate) unmeasured: u32,
     /// Clients that left before their simulation ran.
     pub(crate) left: u32,
 }
@@ -65,15 +69,6 @@ pub(crate) struct Row {
     pub(crate) p95: f64,
     /// The slowest.
     pub(crate) worst: f64,
-}
-
-/// How fast simulated time passed; 1 is real time.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
-pub(crate) struct Factors {
-    /// In 5 % of the seconds it was this or less.
-    pub(crate) p5: f64,
-    /// In half of the seconds.
-    pub(crate) median: f64,
 }
 
 /// One simulation server.
@@ -109,7 +104,16 @@ pub(crate) struct Slow {
 struct File<'report> {
     #[serde(flatten)]
     report: &'report Report,
-    visits: &'report [Visit],
+    visits: Vec<OneVisit<'report>>,
+}
+
+/// A visit, and how fast simulated time passed in it.
+#[derive(Serialize)]
+#[serde(rename_all = "camelCase")]
+struct OneVisit<'report> {
+    #[serde(flatten)]
+    visit: &'report Visit,
+    real_time: Option<Factors>,
 }
 
 impl Report {
@@ -154,6 +158,7 @@ impl Report {
     /// # Errors
     /// When the file can't be written.
     pub(crate) fn write(&self, visits: &[Visit], file: &Path) -> std::io::Result<()> {
+        let visits = visits.iter().map(|visit| OneVisit { visit, real_time: factors(factors_of(visit)) }).collect();
         let text = serde_json::to_string_pretty(&File { report: self, visits })?;
         std::fs::write(file, text + "\n")
     }
@@ -161,21 +166,24 @@ impl Report {
 
 fn seats(visits: &[Visit], real_time: f64) -> Seats {
     let mut seats = Seats::default();
+    let (mut refused, mut broke_off) = (Reasons::default(), Reasons::default());
     for visit in visits {
         seats.asked += 1;
         seats.given += u32::from(visit.has_run());
         match &visit.outcome {
-            Outcome::Ran => {
-                let is_fast = factors(factors_of(visit)).is_none_or(|pace| pace.median >= real_time);
-                seats.fit += u32::from(is_fast);
-            }
-            Outcome::Refused(why) | Outcome::Failed(why) => *seats.refused.entry(why.clone()).or_default() += 1,
-            Outcome::BrokeOff(why) => *seats.broke_off.entry(why.clone()).or_default() += 1,
+            Outcome::Ran => match factors(factors_of(visit)) {
+                Some(pace) => seats.fit += u32::from(pace.median >= real_time),
+                // Where any pace will do, none has to be known.
+                None if real_time > 0.0 => seats.unmeasured += 1,
+                None => seats.fit += 1,
+            },
+            Outcome::Refused(why) | Outcome::Failed(why) => refused.add(why, visit),
+            Outcome::BrokeOff(why) => broke_off.add(why, visit),
             Outcome::Unseen => seats.unseen += 1,
             Outcome::Left => seats.left += 1,
         }
     }
-    seats
+    Seats { refused: refused.told(), broke_off: broke_off.told(), ..seats }
 }
 
 fn times(visits: &[Visit]) -> Vec<Row> {
@@ -192,16 +200,6 @@ fn times(visits: &[Visit]) -> Vec<Row> {
         Some(Row { step, median: at(0.5)?, p95: at(0.95)?, worst: *times.last()? })
     };
     steps.into_iter().filter_map(row).collect()
-}
-
-/// The paces of a simulation, but for its first second, in which it gets going.
-fn factors_of(visit: &Visit) -> impl Iterator<Item = f64> {
-    visit.pace.iter().skip(1).map(|pace| pace.factor)
-}
-
-fn factors(values: impl Iterator<Item = f64>) -> Option<Factors> {
-    let values = sorted(values);
-    Some(Factors { p5: quantile(&values, 0.05)?, median: quantile(&values, 0.5)? })
 }
 
 fn server(address: &str, peak_load: Option<f64>, here: &[&Visit], real_time: f64) -> Server {
@@ -262,8 +260,9 @@ fn count(number: usize) -> u32 {
 }
 
 fn verdict(seats: &Seats, servers: &[Server]) -> String {
-    let all = seats.asked - seats.left - seats.unseen;
+    let all = seats.asked - seats.left - seats.unseen - seats.unmeasured;
     let mut sentence = match (seats.fit, all) {
+        (_, 0) if seats.unmeasured > 0 => "None stayed long enough to tell its pace".to_owned(),
         (_, 0) => "None was seen to its end".to_owned(),
         (0, _) => "None fits".to_owned(),
         (fit, all) if fit == all => format!("All {all} fit"),
@@ -279,23 +278,10 @@ fn verdict(seats: &Seats, servers: &[Server]) -> String {
         let reasons =
             reasons.into_iter().flat_map(|(what, all)| all.iter().map(move |(why, number)| (number, what, why)));
         if let Some((number, what, why)) = reasons.max_by_key(|(number, ..)| **number) {
-            sentence = format!("{sentence}; {number} {what}: {}", why.trim_end_matches('.'));
+            sentence = format!("{sentence}; {number} {what}: {why}");
         }
     }
     sentence + "."
-}
-
-fn sorted(values: impl Iterator<Item = f64>) -> Vec<f64> {
-    let mut values: Vec<f64> = values.collect();
-    values.sort_by(f64::total_cmp);
-    values
-}
-
-/// The value that a share of the sorted ones does not exceed (nearest rank).
-fn quantile(sorted: &[f64], share: f64) -> Option<f64> {
-    #[expect(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a rank")]
-    let rank = (share * sorted.len() as f64).ceil() as usize;
-    sorted.get(rank.saturating_sub(1)).copied()
 }
 
 #[cfg(test)]
@@ -336,25 +322,30 @@ mod tests {
         let full = Outcome::Refused("Error: full.".to_owned());
         let visits = [
             visit(0, "gpu-1:2000", 0.0, Outcome::Ran, &[0.1, 1.0, 1.0]),
-            visit(1, "gpu-1:2000", 1.0, Outcome::Ran, &[]),
+            visit(1, "gpu-1:2000", 1.0, Outcome::Ran, &[1.0, 1.0]),
             visit(2, "gpu-2:2000", 2.0, Outcome::Ran, &[1.0, 0.5, 0.5]),
             visit(3, "gpu-2:2000", 3.0, Outcome::BrokeOff("Webots was killed".to_owned()), &[1.0, 1.0]),
             visit(4, "gpu-2:2000", 4.0, full.clone(), &[]),
             visit(5, "gpu-2:2000", 5.0, full, &[]),
             visit(6, "gpu-2:2000", 6.0, Outcome::Left, &[]),
             visit(7, "gpu-1:2000", 20.0, Outcome::Unseen, &[1.0, 1.0]),
+            visit(8, "gpu-1:2000", 40.0, Outcome::Ran, &[1.0]),
         ];
         let of_two = report(&["--expect", "2"], &visits);
         let seats = &of_two.seats;
-        assert_eq!((seats.asked, seats.given, seats.fit, seats.unseen, seats.left), (8, 5, 2, 1, 1));
-        assert_eq!(seats.refused, BTreeMap::from([("Error: full.".to_owned(), 2)]));
+        assert_eq!((seats.asked, seats.given, seats.fit), (9, 6, 2));
+        assert_eq!((seats.unseen, seats.unmeasured, seats.left), (1, 1, 1));
+        assert_eq!(seats.refused, BTreeMap::from([("Error: full at gpu-2:2000".to_owned(), 2)]));
         assert_eq!(seats.broke_off.values().sum::<u32>(), 1);
         assert!(of_two.is_as_expected() && !report(&["--expect", "3"], &visits).is_as_expected());
         assert_eq!(of_two.verdict, "2 of 6 fit; gpu-2:2000 was the first to run below real time, at 2 simulations.");
         let servers: Vec<_> =
             of_two.servers.iter().map(|server| (server.seats, server.most_at_once, server.peak_load)).collect();
-        assert_eq!(servers, [(3, 2, Some(60.0)), (2, 2, Some(99.0))]);
+        assert_eq!(servers, [(4, 2, Some(60.0)), (2, 2, Some(99.0))]);
         assert!(report(&["--real-time", "0.4"], &visits).is_as_expected());
+        let short = report(&[], &visits[8..]);
+        assert_eq!(short.verdict, "None stayed long enough to tell its pace.");
+        assert!(!short.is_as_expected() && report(&["--real-time", "0"], &visits[8..]).is_as_expected());
     }
 
     #[test]
@@ -377,17 +368,40 @@ mod tests {
     fn the_most_frequent_reason_is_told() {
         let (full, killed) = (Outcome::Refused("full".to_owned()), Outcome::BrokeOff("Webots was killed.".to_owned()));
         let all = |outcomes: &[&Outcome]| {
-            let visits = (0..).zip(outcomes).map(|(client, one)| visit(client, "gpu-1:2000", 0.0, (*one).clone(), &[]));
+            let visits =
+                (0..).zip(outcomes).map(|(client, one)| visit(client, "gpu-1:2000", 0.0, (*one).clone(), &[1.0; 2]));
             report(&[], &visits.collect::<Vec<_>>()).verdict
         };
-        assert_eq!(all(&[&killed, &full, &killed]), "None fits; 2 broke off: Webots was killed.");
-        assert_eq!(all(&[&Outcome::Ran, &full, &full, &killed]), "1 of 4 fit; 2 got none: full.");
+        assert_eq!(all(&[&killed, &full, &killed]), "None fits; 2 broke off: Webots was killed at gpu-1:2000.");
+        assert_eq!(all(&[&Outcome::Ran, &full, &full, &killed]), "1 of 4 fit; 2 got none: full at gpu-1:2000.");
+    }
+
+    #[test]
+    fn a_reason_names_the_servers_that_it_came_from() {
+        let late = Outcome::Failed("no simulation within 10s".to_owned());
+        let named = Outcome::Failed("ws://gpu-1:2000/client can't be reached: refused".to_owned());
+        let mut nowhere = visit(0, "", 0.0, late.clone(), &[]);
+        nowhere.server = None;
+        let seen = |servers: &[&str]| {
+            let all = (1..).zip(servers).map(|(client, server)| visit(client, server, 0.0, late.clone(), &[]));
+            let all = all.chain([nowhere.clone(), visit(9, "gpu-1:2000", 0.0, named.clone(), &[])]);
+            report(&[], &all.collect::<Vec<_>>()).seats.refused.into_iter().collect::<Vec<_>>()
+        };
+        let told = |place: &str, count| {
+            let mut all = vec![("no simulation within 10s".to_owned(), 1)];
+            all.push((format!("no simulation within 10s at {place}"), count));
+            all.push(("ws://gpu-1:2000/client can't be reached: refused".to_owned(), 1));
+            all
+        };
+        assert_eq!(seen(&["gpu-1:2000"; 2]), told("gpu-1:2000", 2));
+        assert_eq!(seen(&["gpu-1:2000", "gpu-2:2000"]), told("gpu-1:2000, gpu-2:2000", 2));
+        assert_eq!(seen(&["gpu-1:1", "gpu-2:1", "gpu-3:1", "gpu-4:1", "gpu-1:1"]), told("4 simulation servers", 5));
     }
 
     #[test]
     fn a_fleet_that_gives_nothing_is_told() {
         let nothing = report(&[], &[visit(0, "gpu-1:2000", 0.0, Outcome::Failed("closed".to_owned()), &[])]);
-        assert_eq!(nothing.verdict, "None fits; 1 got none: closed.");
+        assert_eq!(nothing.verdict, "None fits; 1 got none: closed at gpu-1:2000.");
         assert!(!nothing.is_as_expected() && nothing.times.is_empty() && nothing.pace.is_none());
     }
 }

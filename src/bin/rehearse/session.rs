@@ -34,11 +34,24 @@ impl Session {
     /// Looks whether there is a session server at all.
     ///
     /// # Errors
-    /// What came in place of a load.
+    /// What came in place of a load and of the availability.
     pub(crate) async fn answers(&self) -> Result<(), String> {
         let url = format!("{}/load", self.base());
         let text = get(&self.http, &url).await?;
-        text.trim().parse::<f64>().map(drop).map_err(|_| format!("{url} is no load but {text:.80?}: no session server"))
+        let load = text.trim().parse::<f64>();
+        load.map_err(|_| format!("{url} is no load but {text:.80?}: no session server"))?;
+        // Simulation servers have a load too, but nothing at `/`.
+        match Conversation::open(&self.availability_url()).await {
+            Ok(availability) => availability.close().await,
+            Err(Ended::Unreachable(url, why)) if why.contains("404") => {
+                return Err(format!(
+                    "{url} tells no availability ({why}): no session server, maybe a simulation server"
+                ));
+            }
+            // Whoever goes on meets it.
+            Err(_) => {}
+        }
+        Ok(())
     }
 
     /// Waits until the session server says that a simulation server can take a client. Its WebSocket tells that at once,

@@ -5,7 +5,8 @@ use std::collections::BTreeMap;
 use comfy_table::presets::ASCII_MARKDOWN;
 use comfy_table::{CellAlignment, ContentArrangement, Table};
 
-use crate::report::{Factors, Report};
+use crate::factors::Factors;
+use crate::report::Report;
 
 /// As wide as a terminal is, at least.
 const WIDTH: u16 = 100;
@@ -46,6 +47,9 @@ fn seats(report: &Report) -> String {
     }
     if seats.unseen > 0 {
         add("ran, their end unseen", seats.unseen);
+    }
+    if seats.unmeasured > 0 {
+        add("ran, too briefly to tell their pace", seats.unmeasured);
     }
     if seats.left > 0 {
         add("left before it ran", seats.left);
