@@ -8,6 +8,8 @@ use icu_properties::props::{BinaryProperty, DefaultIgnorableCodePoint};
 #[must_use]
 pub fn one_line(text: &str) -> String {
     let visible = |letter: char| match letter {
+        // Most are of this kind, and need no look into Unicode's tables.
+        ' '..='~' => letter,
         '\u{2028}' | '\u{2029}' => ' ',
         letter if letter.is_control() => ' ',
         letter if DefaultIgnorableCodePoint::for_char(letter) => char::REPLACEMENT_CHARACTER,

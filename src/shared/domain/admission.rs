@@ -17,20 +17,22 @@ pub struct Rules<Prefixes = Vec<UrlPrefix>> {
     pub share_idle_time: f64,
 }
 
-/// Why a world may not run. Its words are for the client.
+/// Why a world may not run. Its words are for the client; they are made only where somebody asks for them, for a session
+/// server asks the rules of each server.
 #[derive(Debug, PartialEq, thiserror::Error)]
-pub enum Refusal {
+pub enum Refusal<'world> {
     /// Its repository is blocked.
-    #[error("Cannot run simulation from blocked repository: {0}")]
-    Blocked(String),
+    #[error("Cannot run simulation from blocked repository: {}", .0.repository())]
+    Blocked(&'world ProjectUrl),
     /// Its repository is not allowed, and the server has no containers.
     #[error(
-        "Docker not enabled: cannot host simulations from repositories outside of those that this simulation server allows, and {0} is not one of them"
+        "Docker not enabled: cannot host simulations from repositories outside of those that this simulation server allows, and {} is not one of them",
+        .0.repository()
     )]
-    NotAllowed(String),
+    NotAllowed(&'world ProjectUrl),
     /// Its repository is not allowed, and the server shares no idle time.
-    #[error("This simulation server is not configured to share idle time: it does not allow {0}")]
-    NotShared(String),
+    #[error("This simulation server is not configured to share idle time: it does not allow {}", .0.repository())]
+    NotShared(&'world ProjectUrl),
     /// Its repository is allowed only while the server is less busy.
     #[error(
         "Cannot share idle time when current load is above threshold: {load:.0} % are more than {threshold} %. Try again later"
@@ -49,18 +51,18 @@ impl<Prefixes: AsRef<[UrlPrefix]>> Rules<Prefixes> {
     ///
     /// # Errors
     /// Why it may not.
-    pub fn admit(&self, world: &ProjectUrl, load: Load) -> Result<(), Refusal> {
+    pub fn admit<'world>(&self, world: &'world ProjectUrl, load: Load) -> Result<(), Refusal<'world>> {
         if any_may_cover(self.blocked.as_ref(), world) {
-            return Err(Refusal::Blocked(world.repository()));
+            return Err(Refusal::Blocked(world));
         }
         if any_covers(self.allowed.as_ref(), world) {
             return Ok(());
         }
         if !self.docker {
-            return Err(Refusal::NotAllowed(world.repository()));
+            return Err(Refusal::NotAllowed(world));
         }
         if self.share_idle_time <= 0.0 {
-            return Err(Refusal::NotShared(world.repository()));
+            return Err(Refusal::NotShared(world));
         }
         if load.percent() > self.share_idle_time {
             return Err(Refusal::Busy { load: load.percent(), threshold: self.share_idle_time });
