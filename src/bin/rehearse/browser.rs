@@ -149,6 +149,7 @@ impl<'class> Browser<'class> {
     async fn find_server(&mut self) -> Result<String, NoStart> {
         let mut pause = FIRST_PAUSE;
         loop {
+            self.full.get_or_insert_with(|| "no simulation server was available".to_owned());
             self.session.until_available().await?;
             match self.session.simulation_server(&self.arguments.world).await {
                 Ok(server) => {
