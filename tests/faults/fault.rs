@@ -15,6 +15,7 @@ use rand::rngs::SmallRng;
 use crate::fleet::{Fleet, SERVERS};
 use crate::relay::Mood;
 use crate::support::program::Server;
+use crate::support::stopwatch::Stopwatch;
 use crate::support::webots::instances_below;
 use crate::surroundings::*;
 
@@ -31,8 +32,8 @@ pub struct Fault {
 
 /// How long something that stands still does so.
 pub const WHILE: Duration = Duration::from_secs(3);
-/// How long what a killed server leaves may live on a busy machine: its guardian looks for half of that.
-const AT_ONCE: Duration = Duration::from_secs(10);
+/// How long what a killed server leaves may live: its guardian looks for so long.
+const AT_ONCE: Duration = Duration::from_secs(5);
 
 macro_rules! faults {
     ($($name:literal: $function:expr;)*) => {
@@ -104,9 +105,10 @@ async fn kill_server(fleet: &mut Fleet, random: &mut SmallRng) -> bool {
 /// Waits until a server that was killed has ended, and nothing that it had started is left.
 pub async fn bury(fleet: &mut Fleet, index: usize) {
     fleet.servers[index].ended().await;
-    let deadline = Instant::now() + AT_ONCE;
+    let stopwatch = Stopwatch::start();
+    let ended = stopwatch.lap();
     while let rest @ [_, ..] = instances_below(&fleet.folder(index)).as_slice() {
-        assert!(Instant::now() < deadline, "{AT_ONCE:?} after the server's end there is still {rest:?}");
+        assert!(ended.elapsed() < AT_ONCE, "{AT_ONCE:?} after the server's end there is still {rest:?}");
         actix_rt::time::sleep(Duration::from_millis(10)).await;
     }
 }

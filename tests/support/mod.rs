@@ -16,6 +16,7 @@ pub mod ports;
 pub mod program;
 pub mod smtp;
 pub mod stand_in;
+pub mod stopwatch;
 pub mod webots;
 
 use std::io::Write;
