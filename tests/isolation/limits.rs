@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use crate::simulation::scene::{DEMO, arm, nothing_left};
+use crate::simulation::scene::{DEMO, arm, instance_folders, nothing_left};
 use crate::support::client::Client;
 use crate::support::git::Forge;
 use crate::support::program::{Server, simulation_server};
@@ -11,14 +11,16 @@ use crate::support::{SOON, http, skip, until};
 
 const LEVELS: [&str; 2] = ["none", "sandbox"];
 
-/// What the client of a simulation is told that does this, and is ended for it.
+/// What the client of a simulation is told that does this once it is ready, and is ended for it.
 async fn told_for(deed: &str, level: &str, key: &str, value: u64) -> String {
     let forge = Forge::with_arm();
-    let webots = Webots::script(&format!("{DEMO} \"$@\" &\nsleep 0.5\n{deed}\nwait"));
+    let webots = Webots::script(&format!("{DEMO} \"$@\" &\nuntil [ -e go ]; do sleep 0.05; done\n{deed}\nwait"));
     let builder = simulation_server(&webots.path(), forge.path(), 4).set("isolation", level);
     let server = builder.set(&format!("limits.{key}"), value).start().await;
     let mut client = Client::start(&server, &arm()).await;
-    // Its heartbeats go on as long as it is not ended. On a busy machine it may be ended before it is ready.
+    client.until("webots:").await;
+    std::fs::write(instance_folders(&server.folder)[0].join("project/go"), "").unwrap();
+    // Its heartbeats go on as long as it is not ended.
     let told = actix_rt::time::timeout(2 * SOON, client.until("loading: Error:")).await;
     let told = told.unwrap_or_else(|_| panic!("{level}, {deed}: it was not ended"));
     assert_eq!(client.closed().await, Some(1000));
