@@ -70,6 +70,7 @@ pub async fn ask(question: Question<'_>, name_servers: &[NameServer]) -> Result<
     let (mut best, mut fault): (Option<(usize, Answer)>, _) = (None, LookupError::Nothing);
     let mut until = Instant::now();
     loop {
+        // Nobody is waited for who comes after it in the list, and those before it only so long.
         let next = match &best {
             Some((place, _)) if waiting.range(..place).next().is_none() => break,
             Some(_) => timeout_at(until, answers.next()).await.ok().flatten(),
@@ -79,7 +80,10 @@ pub async fn ask(question: Question<'_>, name_servers: &[NameServer]) -> Result<
         waiting.remove(&place);
         match answer {
             Ok(answer) if best.as_ref().is_none_or(|(best, _)| place < *best) => {
-                best.replace((place, answer)).is_none().then(|| until = Instant::now() + EARLIER);
+                if best.is_none() {
+                    until = Instant::now() + EARLIER;
+                }
+                best = Some((place, answer));
             }
             // One that fails may know the name.
             Err(error) if fault == LookupError::Nothing => fault = error,
