@@ -1,7 +1,6 @@
 //! The simulation server as a whole: its parts, its start and its end.
 
 use std::net::{SocketAddr, TcpListener};
-use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -22,10 +21,10 @@ use crate::shared::run::{AppError, Phase, Request, Signals, notify, permanent, r
 use crate::simulation::checkout::{CacheDir, Checkouts, Limits};
 use crate::simulation::client::{outcome, quota};
 use crate::simulation::container::Containers;
-use crate::simulation::isolation::Launcher;
+use crate::simulation::isolation::{Launcher, Watcher};
 use crate::simulation::machine::LoadMonitor;
 use crate::simulation::machine::UsageMonitor;
-use crate::simulation::process::{Guardian, Leftovers, RunDir, process_tree};
+use crate::simulation::process::{Guardian, Leftovers, PortFinder, RunDir};
 use crate::simulation::web::configure;
 
 /// How often it is checked whether all simulations have ended.
@@ -40,9 +39,6 @@ const CONNECTIONS_PER_CLIENT: usize = 2;
 /// How many open files a simulation needs at most, besides its client's connection: pipes and processes of git and Webots,
 /// its log.
 const FILES_PER_SIMULATION: usize = 8;
-
-/// How long it may take to kill what has not ended in time.
-const KILL_TIMEOUT: Duration = Duration::from_millis(500);
 
 /// Runs the server until it is asked to stop.
 ///
@@ -142,7 +138,7 @@ pub async fn serve(assembly: Assembly) -> Result<(), AppError> {
     notify::stopping(why);
     phase_sender.send_replace(Phase::Closing);
     if actix_rt::time::timeout(server.config.timing.stop, empty(&places)).await.is_err() {
-        kill_all(server.run.path().to_owned()).await;
+        log::error!("some simulations have not ended in time: they are killed");
     }
     handle.stop(true).await;
     drop(serving);
@@ -217,6 +213,11 @@ fn assemble(
     if !config.notify.is_empty() {
         Announcer::new(&config).start();
     }
+    let usage = UsageMonitor::default();
+    let system = |source| AppError::Unavailable(format!("the system can't start a thread: {source}"));
+    let watcher = Watcher::start(run.path().to_owned(), config.streaming_ports(), usage.clone()).map_err(system)?;
+    let (first, last) = config.streaming_ports().into_inner();
+    let port_finder = PortFinder::start(first..=*SimulationConfig::ports_from(last).end()).map_err(system)?;
     let metrics = Metrics::new();
     let starts = outcome::counter(&metrics)?;
     let problem = readiness::watch(Arc::clone(&config), run.path().to_owned());
@@ -237,9 +238,11 @@ fn assemble(
         connections: Connections::new(max_tcp(&config), config.max_clients, config.max_clients_per_address),
         metrics,
         starts,
-        start_quota: quota::starts(),
+        start_quota: quota::starts(config.max_connections),
         live: Live::new(),
-        usage: UsageMonitor::default(),
+        usage,
+        watcher,
+        port_finder,
         started: Instant::now(),
         config,
     })
@@ -281,13 +284,4 @@ async fn empty(places: &Addr<Places>) {
     while places.send(GetSnapshot).await.is_ok_and(|snapshot| !snapshot.simulations.is_empty()) {
         actix_rt::time::sleep(POLL_INTERVAL).await;
     }
-}
-
-/// Kills the processes of all simulations.
-async fn kill_all(run: PathBuf) {
-    let end = move || {
-        let count = process_tree::kill_marked(&run);
-        log::error!("ended {count} processes that had not ended in time");
-    };
-    actix_rt::time::timeout(KILL_TIMEOUT, actix_rt::task::spawn_blocking(end)).await.ok();
 }

@@ -20,6 +20,8 @@ pub enum Change {
         at: u64,
         /// The process from which all of it descends.
         pid: i32,
+        /// The folder of its control group, if it has one.
+        cgroup: Option<PathBuf>,
         /// The port that was granted.
         port: u16,
         /// The file.
@@ -74,6 +76,9 @@ pub struct Simulation {
     pub launched: Option<u64>,
     /// The process from which all of it descends, once it is launched.
     pub pid: Option<i32>,
+    /// The folder of its control group, if it has one.
+    #[serde(skip)]
+    pub cgroup: Option<PathBuf>,
     /// The streaming port, once there is one.
     pub port: Option<u16>,
     /// The version of Webots that the world was made for.
@@ -92,7 +97,8 @@ impl Simulation {
             Change::Stage(stage) => self.stage = stage,
             Change::Version(version) => self.version = Some(version),
             Change::Port(port) => self.port = Some(port),
-            Change::Launched { at, pid, port, log, begin } => {
+            Change::Launched { at, pid, cgroup, port, log, begin } => {
+                self.cgroup = cgroup;
                 self.log_begin = begin;
                 self.launched = Some(at);
                 self.pid = Some(pid);

@@ -20,10 +20,10 @@ use crate::shared::http::Metrics;
 use crate::shared::run::{Phase, Request};
 use crate::simulation::checkout::Checkouts;
 use crate::simulation::container::Containers;
-use crate::simulation::isolation::Launcher;
+use crate::simulation::isolation::{Launcher, Watcher};
 use crate::simulation::machine::UsageMonitor;
 use crate::simulation::machine::{LoadMonitor, Readings};
-use crate::simulation::process::RunDir;
+use crate::simulation::process::{PortFinder, RunDir};
 
 /// The shared state.
 pub struct AppState {
@@ -39,6 +39,10 @@ pub struct AppState {
     pub readings: watch::Receiver<Arc<Readings>>,
     /// Launches simulations at a level of isolation.
     pub launcher: Arc<Launcher>,
+    /// Watches over what simulations take.
+    pub watcher: Watcher,
+    /// Finds the ports on which they listen.
+    pub port_finder: PortFinder,
     /// Makes the containers in which simulations run, where they do.
     pub containers: Option<Arc<Containers>>,
     /// Checks worlds out.

@@ -63,7 +63,8 @@ async fn git_is_bounded_in_memory_and_in_what_it_writes() {
     assert_eq!(listed.trim(), text.len().to_string());
     let server = simulation_server(&webots.path(), forge.path(), 1).set("projectSize", 1).start().await;
     assert_eq!(outcome(&server, &arm()).await, "loading: Error: The project is larger than 1 MiB");
-    let wrapper = GitWrapper::new("[ $(ulimit -d) -le 2097152 ] || { echo 'fatal: no limit' >&2; exit 128; }");
+    // The server sets it once git has been started.
+    let wrapper = GitWrapper::new("until [ \"$(ulimit -d)\" -le 2097152 ] 2>/dev/null; do sleep 0.01; done");
     let server = simulation_server(&webots.path(), forge.path(), 1).env("PATH", &wrapper.path()).start().await;
     let told = outcome(&server, &arm()).await;
     assert!(told.contains("opened"), "{told}");

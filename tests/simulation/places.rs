@@ -57,7 +57,8 @@ async fn the_waiting_line_is_served_in_order_and_forgets_who_leaves() {
 #[actix_rt::test]
 async fn one_address_leaves_places_and_a_part_of_the_line_to_others() {
     let (forge, webots) = (Forge::with_arm(), Webots::launcher());
-    let server = simulation_server(&webots.path(), forge.path(), 4).set("waitingLine", 4).start().await;
+    let builder = simulation_server(&webots.path(), forge.path(), 4).set("waitingLine", 4);
+    let server = builder.set("maxPlacesPerAddress", 3).start().await;
     let (greedy, other, third) = ("203.0.113.9", "203.0.113.10", "203.0.113.11");
     let mut inside = Vec::new();
     for _ in 0..3 {
@@ -91,20 +92,22 @@ async fn one_address_leaves_places_and_a_part_of_the_line_to_others() {
 }
 
 #[actix_rt::test]
-async fn one_address_leaves_a_part_of_the_line_where_one_place_is_all() {
+async fn a_class_behind_one_address_gets_every_free_place_and_the_whole_line() {
     let (forge, webots) = (Forge::with_arm(), Webots::launcher());
-    let server = simulation_server(&webots.path(), forge.path(), 1).set("waitingLine", 4).start().await;
-    let (greedy, other) = ("203.0.113.9", "203.0.113.10");
-    let mut all = vec![Client::start_from(&server, greedy, &arm()).await];
-    all[0].until("webots:").await;
-    for ahead in 0..3 {
-        let mut client = Client::start_from(&server, greedy, &arm()).await;
+    let server = simulation_server(&webots.path(), forge.path(), 4).set("waitingLine", 2).start().await;
+    let mut all = Vec::new();
+    for _ in 0..4 {
+        let mut client = Client::start_from(&server, "203.0.113.9", &arm()).await;
+        client.until("webots:").await;
+        all.push(client);
+    }
+    for ahead in 0..2 {
+        let mut client = Client::start_from(&server, "203.0.113.9", &arm()).await;
         assert_eq!(client.until("").await, format!("queue: {ahead}"));
         all.push(client);
     }
-    let told = Client::start_from(&server, greedy, &arm()).await.until("").await;
-    assert!(told.starts_with("loading: Error: Clients of your address have 1 places"), "{told}");
-    assert_eq!(Client::start_from(&server, other, &arm()).await.until("").await, "queue: 3");
+    let told = Client::start_from(&server, "203.0.113.9", &arm()).await.until("").await;
+    assert!(told.starts_with("loading: Error: All 4 places of this simulation server are taken"), "{told}");
 }
 
 #[actix_rt::test]

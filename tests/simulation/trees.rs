@@ -1,4 +1,4 @@
-//! What ends with a simulation: without a sandbox its process group, and all that carries its mark.
+//! What ends with a simulation: without a sandbox its process group; what has left that ends with the server.
 
 use std::path::Path;
 use std::time::{Duration, Instant};
@@ -17,26 +17,33 @@ use crate::support::until;
 use crate::support::webots::{Webots, instances_below};
 
 #[actix_rt::test]
-async fn the_group_and_all_that_carries_the_mark_end_for_whatever_reason() {
+async fn without_a_sandbox_the_group_ends_with_its_client_and_the_rest_with_the_server() {
     for reason in ["client", "stop", "kill"] {
         let (forge, folder) = (Forge::with_arm(), tempfile::tempdir().unwrap());
         let pids = folder.path().join("pids");
         // One leaves the group and its parent, and keeps its environment. The other drops its environment and stays.
-        let tell = format!("echo $$ >> {}; exec sleep 1000", pids.display());
-        let webots =
-            Webots::script(&format!("(setsid bash -c '{tell}' &)\n(env -i bash -c '{tell}' &)\n{DEMO} \"$@\" & wait"));
+        let tell = |name: &str| format!("echo {name} $$ >> {}; exec sleep 1000", pids.display());
+        let (left, stayed) = (tell("left"), tell("stayed"));
+        let webots = Webots::script(&format!(
+            "(setsid bash -c '{left}' &)\n(env -i bash -c '{stayed}' &)\n{DEMO} \"$@\" & wait"
+        ));
         let builder = quick(simulation_server(&webots.path(), forge.path(), 1)).set("isolation", "none");
         let mut server = builder.folder(folder.path()).start().await;
         let mut client = Client::start(&server, &arm()).await;
         client.until("webots:").await;
         let told = || std::fs::read_to_string(&pids).unwrap_or_default();
         until("both are there", async || told().lines().count() == 2).await;
-        let both: Vec<i32> = told().lines().map(|line| line.parse().unwrap()).collect();
-        assert!(both.iter().all(|pid| is_there(*pid)), "{reason}");
+        let pid = |name| told().lines().find_map(|line| line.strip_prefix(name)?.trim().parse().ok()).unwrap();
+        let (left, stayed): (i32, i32) = (pid("left"), pid("stayed"));
+        assert!(is_there(left) && is_there(stayed), "{reason}");
         match reason {
             "client" => {
                 client.leave().await;
-                nothing_left(&server, 1).await;
+                until("its group has ended", async || !is_there(stayed)).await;
+                until("its folder is gone", async || instance_folders(folder.path()).is_empty()).await;
+                assert!(is_there(left), "what has left the group ends with the server");
+                server.signal(Signal::SIGTERM);
+                assert_eq!(server.ended().await, Some(0));
             }
             "stop" => {
                 server.signal(Signal::SIGTERM);
@@ -47,7 +54,7 @@ async fn the_group_and_all_that_carries_the_mark_end_for_whatever_reason() {
                 server.ended().await;
             }
         }
-        until(&format!("both have ended: {reason}"), async || !both.iter().any(|pid| is_there(*pid))).await;
+        until(&format!("both have ended: {reason}"), async || !is_there(left) && !is_there(stayed)).await;
         until("its folder is gone", async || instance_folders(folder.path()).is_empty()).await;
     }
 }

@@ -142,6 +142,8 @@ async fn launch(server: &AppState) -> (Addr<Webots>, UnboundedReceiver<Exit>) {
         config: Arc::clone(&server.config),
         containers: None,
         launcher: Arc::clone(&server.launcher),
+        watcher: server.watcher.clone(),
+        port_finder: server.port_finder.clone(),
         program: readiness::webots_program(&server.config).unwrap(),
         checkouts: Arc::clone(&server.checkouts),
         project: Arc::new(project),

@@ -74,11 +74,11 @@ fn length(file: &Path) -> u64 {
 /// Waits until the files below a folder have more bytes than this.
 pub async fn outgrown(folder: &Path, size: u64) {
     loop {
+        actix_rt::time::sleep(BETWEEN_LOOKS).await;
         let folder = folder.to_owned();
         if blocking(move || Ok(size_of(&folder))).await.is_ok_and(|found| found > size) {
             return;
         }
-        actix_rt::time::sleep(BETWEEN_LOOKS).await;
     }
 }
 
@@ -86,12 +86,12 @@ pub async fn outgrown(folder: &Path, size: u64) {
 pub async fn stands_still(folder: &Path, limit: Duration) {
     let (mut since, mut last) = (Instant::now(), None);
     while since.elapsed() < limit {
+        actix_rt::time::sleep(BETWEEN_LOOKS).await;
         let folder = folder.to_owned();
         let now = blocking(move || Ok(size_of(&folder))).await.ok();
         if now != last {
             (since, last) = (Instant::now(), now);
         }
-        actix_rt::time::sleep(BETWEEN_LOOKS).await;
     }
 }
 

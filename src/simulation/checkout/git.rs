@@ -6,9 +6,9 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use futures_util::FutureExt;
+use rustix::process::{Pid, Resource, Rlimit, prlimit, setpriority_process};
 use tokio::io::{AsyncRead, AsyncReadExt};
 use tokio::net::unix::pipe::Receiver;
-use which::which;
 
 use super::git_error::GitError;
 use crate::simulation::process::{ExitReason, Lines, ProcessGroup, SpawnSpec};
@@ -19,10 +19,6 @@ pub struct Git {
     /// The file with its settings, and what belongs into it.
     settings: (PathBuf, String),
     mark: PathBuf,
-    /// Whether there is a program that starts it with less priority.
-    has_nice: bool,
-    /// Whether there is one that starts it within a limit of memory.
-    has_prlimit: bool,
 }
 
 /// One git command.
@@ -78,6 +74,10 @@ const SETTINGS: &str = "\
 
 /// How much memory a git process may take at most.
 pub const MOST_MEMORY: u64 = 2 << 30;
+/// The commands that may keep all cores busy for long: simulations that run already come before them.
+const HEAVY: [&str; 2] = ["fetch", "gc"];
+/// How much less priority these have, as `nice` has it.
+const NICENESS: i32 = 10;
 /// The most that is read of a command's answer, in bytes.
 const LARGEST_ANSWER: usize = 64 * 1024 * 1024;
 /// The most that is kept of a line of what it says besides, in bytes.
@@ -91,8 +91,7 @@ impl Git {
         let quoted = |file: PathBuf| file.to_string_lossy().replace('\\', "\\\\").replace('"', "\\\"");
         let include = config.map(|file| format!("[include]\n\tpath = \"{}\"\n", quoted(file)));
         let settings = (run.join("gitconfig"), include.unwrap_or_default() + SETTINGS);
-        let has = |name| which(name).is_ok();
-        Self { settings, mark: run.to_owned(), has_nice: has("nice"), has_prlimit: has("prlimit") }
+        Self { settings, mark: run.to_owned() }
     }
 
     /// Writes the settings, unless they are there as they should be.
@@ -147,7 +146,9 @@ impl Git {
         self.write_settings().await.map_err(broken)?;
         let (answer, output) = std::io::pipe().map_err(broken)?;
         let (complaints, errors) = std::io::pipe().map_err(broken)?;
+        let memory = call.memory;
         let (group, ended) = ProcessGroup::start(&self.spec(call), output.into(), errors.into()).map_err(broken)?;
+        bound(group.leader(), memory, HEAVY.contains(&command.as_str()));
         let mut ended = ended.boxed();
         let answer = asynchronous(answer).map_err(broken)?;
         let complaints = asynchronous(complaints).map_err(broken)?;
@@ -168,11 +169,7 @@ impl Git {
     }
 
     fn spec(&self, call: Call<'_>) -> SpawnSpec {
-        // Whoever watches over the servers, and whoever runs a simulation already, comes before a checkout.
-        let nice = self.has_nice.then(|| "nice".into());
-        let prlimit = self.has_prlimit.then(|| ["prlimit".into(), format!("--data={}", call.memory).into()]);
-        let mut command: Vec<OsString> = nice.into_iter().chain(prlimit.into_iter().flatten()).collect();
-        command.extend(["git", "--literal-pathspecs", "--git-dir"].map(OsString::from));
+        let mut command: Vec<OsString> = ["git", "--literal-pathspecs", "--git-dir"].map(OsString::from).into();
         command.push(call.repository.into());
         command.extend(call.settings.into_iter().flat_map(|setting| ["-c".into(), setting.into()]));
         command.extend(call.arguments);
@@ -194,6 +191,17 @@ impl Git {
             mark: self.mark.clone(),
             grace: Duration::from_millis(100),
         }
+    }
+}
+
+/// Bounds the memory of a git that has just been started, and gives it less priority if its work is heavy. What it starts
+/// inherits both.
+fn bound(leader: i32, memory: u64, is_heavy: bool) {
+    let pid = Pid::from_raw(leader);
+    let limit = Rlimit { current: Some(memory), maximum: Some(memory) };
+    let nice = if is_heavy { setpriority_process(pid, NICENESS) } else { Ok(()) };
+    if let Err(error) = nice.and(prlimit(pid, Resource::Data, limit).map(drop)) {
+        log::warn!("git runs without its limits: {error}");
     }
 }
 

@@ -158,6 +158,8 @@ impl WebClient {
             config: Arc::clone(&self.server.config),
             containers: self.server.containers.clone(),
             launcher: Arc::clone(&self.server.launcher),
+            watcher: self.server.watcher.clone(),
+            port_finder: self.server.port_finder.clone(),
             program,
             checkouts: Arc::clone(&self.server.checkouts),
             project: Arc::new(project),

@@ -19,6 +19,9 @@ use crate::shared::http::{Origin, TrustedProxies};
 use crate::simulation::checkout::Mirrors;
 use crate::simulation::machine::display::DisplayName;
 
+/// If its port is taken, Webots silently takes one of this many that follow.
+const NEXT_PORTS: u16 = 10;
+
 /// Every key of the simulation server. The original's keys keep their meaning.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(rename_all = "camelCase")]
@@ -110,8 +113,8 @@ pub struct SimulationConfig {
     /// one address.
     #[serde(default, deserialize_with = "optional_whole::<1, 1_000_000, _, _>")]
     pub max_clients_per_address: Option<usize>,
-    /// How many of the places one client address may have, and the same share of the waiting line. Default: three
-    /// quarters.
+    /// How many of the places one client address may have, and the same share of the waiting line. Default: all, for a
+    /// class sits behind one address.
     #[serde(default, deserialize_with = "optional_whole::<1, 10_000, _, _>")]
     pub max_places_per_address: Option<usize>,
     /// Web servers, as addresses or networks, whose headers `X-Forwarded-For` and `Forwarded` are believed.
@@ -192,6 +195,12 @@ impl SimulationConfig {
     #[must_use]
     pub fn streaming_ports(&self) -> std::ops::RangeInclusive<u16> {
         self.port + 1..=self.port.saturating_add(self.max_connections)
+    }
+
+    /// Returns the ports on which a Webots may come to listen that was given this one.
+    #[must_use]
+    pub fn ports_from(port: u16) -> std::ops::RangeInclusive<u16> {
+        port..=port.saturating_add(NEXT_PORTS)
     }
 
     /// Returns the program that is started for each client; `None` where neither `webots` nor `webotsHome` says.

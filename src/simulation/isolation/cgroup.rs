@@ -75,6 +75,12 @@ impl Cgroups {
         own_folder().and_then(|folder| offered(&folder).ok()).unwrap_or_default()
     }
 
+    /// Whether the kernel counts the processes of each simulation, and refuses more than are allowed.
+    pub fn limit_processes(&self) -> bool {
+        std::fs::read_to_string(self.folder.join("cgroup.subtree_control"))
+            .is_ok_and(|controllers| controllers.split_whitespace().any(|one| one == "pids"))
+    }
+
     /// Makes a group for a simulation. Where that fails, it runs without.
     pub fn make(&self) -> Option<Cgroup> {
         let made = tempfile::Builder::new().prefix("simulation-").tempdir_in(&self.folder);
@@ -94,6 +100,11 @@ impl Cgroups {
 }
 
 impl Cgroup {
+    /// Its folder.
+    pub fn path(&self) -> &Path {
+        &self.folder
+    }
+
     /// The words that run a program in this group.
     pub fn joining(&self) -> Vec<OsString> {
         let words = ["/bin/sh", "-c", "echo 0 >\"$0\" && exec \"$@\""].map(OsString::from);

@@ -16,6 +16,7 @@ use super::environment;
 use super::program::Program;
 use super::sandbox::Sandbox;
 use super::unkept::{Means, unkept};
+use super::watcher::MostProcesses;
 use crate::simulation::config::{Isolation, Resources, SimulationConfig, VariableName};
 use crate::simulation::process::SpawnSpec;
 
@@ -196,6 +197,21 @@ impl Launcher {
         Ok((spec, cgroup))
     }
 
+    /// Whether the kernel counts the processes of each sandbox by itself.
+    fn limits_by_namespace(&self) -> bool {
+        let is_ordinary = !nix::unistd::getuid().is_root();
+        self.level() == Level::Sandbox && is_ordinary && self.prlimit.is_some() && counts_by_namespace()
+    }
+
+    /// How many processes a simulation may have; `None` if the kernel or Docker refuses more.
+    #[must_use]
+    pub fn most_processes(&self) -> Option<MostProcesses> {
+        let is_kept = self.level() == Level::Container
+            || self.limits_by_namespace()
+            || self.cgroups.as_ref().is_some_and(Cgroups::limit_processes);
+        (!is_kept).then(|| MostProcesses { limit: self.limits.processes, runners: self.runners() })
+    }
+
     /// The words that run a program within the kernel's limits for processes.
     fn limited(&self) -> Vec<OsString> {
         let Some(prlimit) = &self.prlimit else {
@@ -206,7 +222,7 @@ impl Launcher {
         let mut words = vec![format!("--nofile={}:{files}", files.min(USUAL_FILES)), format!("--fsize={size}")];
         words.push("--core=0".to_owned());
         // The kernel counts all processes of a user, but in a user namespace only those in it, one of which is bubblewrap.
-        if self.level() == Level::Sandbox && !nix::unistd::getuid().is_root() && counts_by_namespace() {
+        if self.limits_by_namespace() {
             words.push(format!("--nproc={}", at_most(Resource::RLIMIT_NPROC, self.limits.processes + 1)));
         }
         let words = std::iter::once(prlimit.into()).chain(words.into_iter().map(OsString::from));

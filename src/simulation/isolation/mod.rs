@@ -7,9 +7,9 @@ mod place;
 mod program;
 mod sandbox;
 mod unkept;
-mod watch;
+mod watcher;
 
 pub use cgroup::Cgroup;
 pub use launcher::{Launcher, Level};
 pub use program::Program;
-pub use watch::Watch;
+pub use watcher::{Watch, Watcher};

@@ -6,4 +6,4 @@ pub mod sensors;
 mod usage;
 
 pub use load_monitor::{LoadMonitor, Readings, Sample};
-pub use usage::{Usage, UsageMonitor, Usages, count_threads};
+pub use usage::{Tree, Usage, UsageMonitor, Usages};

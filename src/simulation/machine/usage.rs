@@ -1,20 +1,33 @@
-//! CPU and memory of each simulation's process tree. Linux: `/proc`.
+//! CPU and memory of each simulation: from its control group, otherwise from its process tree.
 //!
-//! One pass over all processes serves all simulations, at most once in 1.8 s, and only when somebody asks.
+//! One pass over `/proc` serves all simulations and all that ask, at most once in 1.8 s, and only when somebody asks.
 
 use std::collections::{BTreeMap, HashMap, HashSet};
+use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use procfs::process::{Stat, all_processes};
 
-/// CPU and memory of a process tree.
+/// The processes of a simulation.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Tree {
+    /// The process from which all of them descend.
+    pub root: i32,
+    /// The folder of their control group, if they have one.
+    pub cgroup: Option<PathBuf>,
+}
+
+/// What the processes of a simulation take.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Usage {
-    /// Percent of one core, the mean since the reading before; nothing at the first.
+    /// Percent of one core, the mean since the reading before; `None` at the first.
     pub cpu: Option<f64>,
-    /// Resident memory, in bytes; what processes share counts for each.
+    /// Memory in bytes: what their control group is charged for, or what is resident, where what processes share counts
+    /// for each.
     pub memory: u64,
+    /// How many processes and threads there are.
+    pub threads: u64,
 }
 
 /// Readings of process trees, by the process at the root.
@@ -27,52 +40,76 @@ pub struct UsageMonitor(Arc<Mutex<Readings>>);
 #[derive(Debug, Default)]
 struct Readings {
     read: Option<Instant>,
-    ticks: HashMap<i32, u64>,
+    /// The processor time of each tree.
+    times: HashMap<i32, Duration>,
     usages: Usages,
+}
+
+/// What a tree has taken until now.
+#[derive(Debug, Default, Clone, Copy)]
+struct Sum {
+    time: Duration,
+    memory: u64,
+    threads: u64,
 }
 
 /// How long a reading is cached.
 const AGE: Duration = Duration::from_millis(1800);
 
+impl Tree {
+    /// A tree without a control group.
+    #[must_use]
+    pub fn of(root: i32) -> Self {
+        Self { root, cgroup: None }
+    }
+}
+
 impl UsageMonitor {
-    /// The usage of each of these trees, never much older than two seconds.
-    pub async fn read(&self, roots: Vec<i32>) -> Usages {
-        if roots.is_empty() {
+    /// The usage of each of these trees, never much older than two seconds. Blocks for some milliseconds.
+    #[must_use]
+    pub fn read(&self, trees: &[Tree]) -> Usages {
+        if trees.is_empty() {
             return Usages::new();
         }
-        let readings = Arc::clone(&self.0);
-        let read = actix_rt::task::spawn_blocking(move || {
-            let mut readings = readings.lock().unwrap_or_else(PoisonError::into_inner);
-            readings.renew(&roots);
-            readings.usages.clone()
-        });
-        read.await.unwrap_or_default()
+        let mut readings = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        readings.renew(trees);
+        readings.usages.clone()
     }
 }
 
 impl Readings {
-    fn renew(&mut self, roots: &[i32]) {
+    fn renew(&mut self, trees: &[Tree]) {
         let passed = self.read.map(|read| read.elapsed());
-        let known = roots.iter().all(|root| self.usages.contains_key(root));
+        let known = trees.iter().all(|tree| self.usages.contains_key(&tree.root));
         if known && passed.is_some_and(|passed| passed < AGE) {
             return;
         }
         self.read = Some(Instant::now());
-        let processes = processes();
-        let before = std::mem::take(&mut self.ticks);
+        let before = std::mem::take(&mut self.times);
         self.usages.clear();
-        for root in roots {
-            let (ticks, pages) = tree_sum(*root, &processes);
+        let mut processes = None;
+        for Tree { root, cgroup } in trees {
+            let sum = cgroup.as_deref().and_then(cgroup_sum);
+            let sum = sum.unwrap_or_else(|| tree_sum(*root, processes.get_or_insert_with(all_by_parent)));
             let measured = before.get(root).zip(passed).filter(|(_, passed)| !passed.is_zero());
-            let cpu = measured.map(|(before, passed)| cpu_percent(ticks.saturating_sub(*before), passed));
-            self.ticks.insert(*root, ticks);
-            self.usages.insert(*root, Usage { cpu, memory: pages * procfs::page_size() });
+            let cpu = measured
+                .map(|(before, passed)| 100.0 * sum.time.saturating_sub(*before).as_secs_f64() / passed.as_secs_f64());
+            self.times.insert(*root, sum.time);
+            self.usages.insert(*root, Usage { cpu, memory: sum.memory, threads: sum.threads });
         }
     }
 }
 
+/// What a control group has taken; `None` if the kernel does not count all of it there.
+fn cgroup_sum(folder: &Path) -> Option<Sum> {
+    let number = |file: &str| std::fs::read_to_string(folder.join(file)).ok()?.trim().parse().ok();
+    let times = std::fs::read_to_string(folder.join("cpu.stat")).ok()?;
+    let time = times.lines().find_map(|line| line.strip_prefix("usage_usec "))?.parse().ok()?;
+    Some(Sum { time: Duration::from_micros(time), memory: number("memory.current")?, threads: number("pids.current")? })
+}
+
 /// All processes, each below its parent and below the leader of its group.
-fn processes() -> HashMap<i32, Vec<Stat>> {
+fn all_by_parent() -> HashMap<i32, Vec<Stat>> {
     let mut below: HashMap<i32, Vec<Stat>> = HashMap::new();
     let all = all_processes().into_iter().flatten().flatten();
     for stat in all.filter_map(|process| process.stat().ok()) {
@@ -84,53 +121,54 @@ fn processes() -> HashMap<i32, Vec<Stat>> {
     below
 }
 
-/// How many processes and threads there are in the group of a process and among all that descends from it. Blocks.
-#[must_use]
-pub fn count_threads(root: i32) -> u64 {
-    let below = processes();
-    tree(root, &below).map(|stat| u64::try_from(stat.num_threads).unwrap_or_default()).sum()
-}
-
-/// CPU ticks and pages of memory of a process, of its group and of all that descends from it.
-fn tree_sum(root: i32, below: &HashMap<i32, Vec<Stat>>) -> (u64, u64) {
-    tree(root, below).fold((0, 0), |(ticks, pages), stat| (ticks + stat.utime + stat.stime, pages + stat.rss))
-}
-
-/// A process, its group and all that descends from it.
-fn tree(root: i32, below: &HashMap<i32, Vec<Stat>>) -> impl Iterator<Item = &Stat> {
-    let (mut seen, mut open, mut found) = (HashSet::new(), vec![root], Vec::new());
+/// What a process, its group and all that descends from it have taken.
+fn tree_sum(root: i32, below: &HashMap<i32, Vec<Stat>>) -> Sum {
+    let (mut seen, mut open, mut sum) = (HashSet::new(), vec![root], Sum::default());
     while let Some(pid) = open.pop() {
         for stat in below.get(&pid).into_iter().flatten().filter(|stat| seen.insert(stat.pid)) {
-            found.push(stat);
+            sum.time += Duration::from_secs(stat.utime + stat.stime) / ticks_per_second();
+            sum.memory += stat.rss * procfs::page_size();
+            sum.threads += u64::try_from(stat.num_threads).unwrap_or_default();
             open.push(stat.pid);
         }
     }
-    found.into_iter()
+    sum
 }
 
-#[expect(clippy::cast_precision_loss, reason = "a percentage needs no more digits than f64 has")]
-fn cpu_percent(ticks: u64, passed: Duration) -> f64 {
-    100.0 * ticks as f64 / procfs::ticks_per_second() as f64 / passed.as_secs_f64()
+fn ticks_per_second() -> u32 {
+    u32::try_from(procfs::ticks_per_second()).unwrap_or(100)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    #[actix_rt::test]
-    async fn a_busy_child_is_seen() {
+    #[test]
+    fn a_busy_child_is_seen() {
         let mut child = std::process::Command::new("sh").args(["-c", "while :; do :; done"]).spawn().unwrap();
         let me = i32::try_from(std::process::id()).unwrap();
         let monitor = UsageMonitor::default();
-        let first = monitor.read(vec![me]).await;
+        let first = monitor.read(&[Tree::of(me)]);
         assert_eq!(first[&me].cpu, None, "nothing to compare with");
-        assert!(first[&me].memory > 10_000);
+        assert!(first[&me].memory > 10_000 && first[&me].threads >= 1, "{first:?}");
         let deadline = Instant::now() + Duration::from_secs(20);
-        while monitor.read(vec![me]).await[&me].cpu.is_none_or(|cpu| cpu < 5.0) {
+        while monitor.read(&[Tree::of(me)])[&me].cpu.is_none_or(|cpu| cpu < 5.0) {
             assert!(Instant::now() < deadline, "it takes nothing");
-            actix_rt::time::sleep(Duration::from_millis(100)).await;
+            std::thread::sleep(Duration::from_millis(100));
         }
         child.kill().unwrap();
         child.wait().unwrap();
+    }
+
+    #[test]
+    fn a_control_group_is_read_where_it_counts_everything() {
+        let group = tempfile::tempdir().unwrap();
+        let me = i32::try_from(std::process::id()).unwrap();
+        let read = || UsageMonitor::default().read(&[Tree { root: me, cgroup: Some(group.path().to_owned()) }])[&me];
+        std::fs::write(group.path().join("cpu.stat"), "usage_usec 5000000\nuser_usec 1\n").unwrap();
+        std::fs::write(group.path().join("pids.current"), "7777\n").unwrap();
+        assert_ne!(read().threads, 7777, "there is no memory.current");
+        std::fs::write(group.path().join("memory.current"), "123\n").unwrap();
+        assert_eq!(read(), Usage { cpu: None, memory: 123, threads: 7777 });
     }
 }

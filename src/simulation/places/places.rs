@@ -4,7 +4,7 @@
 //! [`Ticket`] and then hears how many are ahead, until a port is granted. Dropping the ticket leaves the line or frees
 //! the port, so that neither is lost in any state or by any panic.
 
-use std::collections::{BTreeMap, HashMap, VecDeque};
+use std::collections::{BTreeMap, HashMap, HashSet, VecDeque};
 use std::io::ErrorKind;
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, TcpListener};
 use std::ops::RangeInclusive;
@@ -15,7 +15,6 @@ use actix::prelude::*;
 
 use super::no_place::NoPlace;
 use crate::shared::domain::Instances;
-use crate::shared::http::share;
 use crate::shared::run::seconds_since_1970;
 use crate::simulation::snapshot::{Change, Simulation, Snapshot, Stage};
 
@@ -69,8 +68,8 @@ struct Release(u64);
 pub struct Places {
     ports: RangeInclusive<u16>,
     longest_line: usize,
-    /// How many places an address may have, and how many clients of it may wait.
-    per_address: (usize, usize),
+    /// How many places an address may have, and how many clients of it may wait; `None` for as many as there are.
+    per_address: Option<(usize, usize)>,
     /// How many tickets there were, also of clients that were refused.
     arrivals: u64,
     present: BTreeMap<u64, Present>,
@@ -96,24 +95,24 @@ const RECHECK: Duration = Duration::from_secs(1);
 
 impl Places {
     /// Lends these ports; `longest_line` clients may wait. One address may have `per_address` places, and the same part of
-    /// the line; where that is not said, a share of each.
+    /// the line; without it, all of both.
     #[must_use]
     pub fn new(ports: RangeInclusive<u16>, longest_line: usize, per_address: Option<usize>) -> Self {
-        let all = ports.len();
-        let places = per_address.unwrap_or_else(|| share(all)).min(all);
-        let waiting =
-            if per_address.is_some() { (longest_line * places).div_ceil(all.max(1)) } else { share(longest_line) };
-        let per_address = (places, waiting);
+        let all = ports.len().max(1);
+        let per_address = per_address.map(|places| (places, (longest_line * places.min(all)).div_ceil(all)));
         Self { ports, longest_line, per_address, arrivals: 0, present: BTreeMap::new(), line: VecDeque::new() }
     }
 
     /// The first in the line whose address may have another place.
     fn next_in_line(&self) -> Option<usize> {
+        let Some((most, _)) = self.per_address else {
+            return (!self.line.is_empty()).then_some(0);
+        };
         let mut lent: HashMap<IpAddr, usize> = HashMap::new();
         for address in self.present.values().filter(|one| one.lent.is_some()).filter_map(|one| one.address) {
             *lent.entry(address).or_default() += 1;
         }
-        let has_room = |address: &IpAddr| lent.get(address).is_none_or(|count| *count < self.per_address.0);
+        let has_room = |address: &IpAddr| lent.get(address).is_none_or(|count| *count < most);
         self.line.iter().position(|waiting| waiting.address.as_ref().is_none_or(has_room))
     }
 
@@ -126,13 +125,15 @@ impl Places {
 
     /// Why another client of this address gets no place and may not wait, if so.
     fn refusal(&self, address: Option<IpAddr>) -> Option<NoPlace> {
-        let (places, waiting) = address.map_or((0, 0), |address| self.of_address(address));
-        let (most_places, most_waiting) = self.per_address;
-        let may_have_one = places < most_places;
+        let share = self.per_address.zip(address).map(|(most, address)| (most, self.of_address(address)));
+        let may_have_one = share.is_none_or(|((most, _), (places, _))| places < most);
         if may_have_one && self.next_in_line().is_none() && self.free_port().is_some() {
             return None;
         }
-        if waiting >= most_waiting && (!may_have_one || waiting > 0) {
+        if let Some(((_, most), (places, waiting))) = share
+            && waiting >= most
+            && (!may_have_one || waiting > 0)
+        {
             return Some(NoPlace::Share { places, waiting });
         }
         let (places, waiting) = (self.ports.len(), self.line.len());
@@ -173,8 +174,8 @@ impl Places {
 
     /// The lowest port that is neither lent nor used by anybody else.
     fn free_port(&self) -> Option<u16> {
-        let taken = |port: u16| self.present.values().any(|one| one.lent == Some(port) || one.shown.port == Some(port));
-        self.ports.clone().filter(|port| !taken(*port)).find(|port| is_free(*port))
+        let taken: HashSet<u16> = self.present.values().flat_map(|one| [one.lent, one.shown.port]).flatten().collect();
+        self.ports.clone().filter(|port| !taken.contains(port)).find(|port| is_free(*port))
     }
 
     fn instances(&self) -> Instances {
@@ -223,6 +224,7 @@ impl Handler<Acquire> for Places {
             since: seconds_since_1970(),
             launched: None,
             pid: None,
+            cgroup: None,
             port: None,
             version: None,
             log: None,

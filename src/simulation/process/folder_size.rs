@@ -6,8 +6,6 @@ use std::io::ErrorKind;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
-use super::process_tree;
-
 /// Adds up files. One that has several names, or is met again because it was moved meanwhile, counts once if it is large.
 #[derive(Debug)]
 pub struct FolderSize {
@@ -27,8 +25,6 @@ pub struct Unknown;
 pub const SMALLEST: u64 = 4096;
 /// Files from this size on, in bytes, are remembered.
 const LARGE: u64 = 64 * 1024;
-/// How the kernel shows that a file has no name.
-const NAMELESS: &[u8] = b" (deleted)";
 /// How many folders may be in each other: a look at each takes time for all above it.
 const DEEPEST: usize = 200;
 
@@ -96,27 +92,6 @@ impl FolderSize {
         all
     }
 
-    /// Adds the files without a name that a process, or one that descends from it, has open on the disk of a folder: they
-    /// take room until they are closed. Each counts once. `within` is where they were, as this server sees it. Files of
-    /// processes that nobody may look into are not found.
-    pub fn add_nameless(&mut self, root: i32, folder: &Path, within: &Path) {
-        let Ok(disk) = folder.metadata().map(|about| about.dev()) else { return };
-        for pid in process_tree::tree(root) {
-            let open = std::fs::read_dir(format!("/proc/{pid}/fd")).into_iter().flatten().flatten();
-            // The links are read first: a look at a file of a network may take long.
-            let nameless = open.map(|entry| entry.path()).filter(|link| {
-                let file = std::fs::read_link(link).unwrap_or_default();
-                file.starts_with(within) && file.as_os_str().as_encoded_bytes().ends_with(NAMELESS)
-            });
-            let files = nameless.filter_map(|link| std::fs::metadata(link).ok());
-            for about in files.filter(|about| about.is_file() && about.nlink() == 0 && about.dev() == disk) {
-                if self.met.insert((about.dev(), about.ino())) {
-                    self.total = self.total.saturating_add((self.measure)(&about));
-                }
-            }
-        }
-    }
-
     fn add(&mut self, about: &Metadata) {
         let size = (self.measure)(about);
         let is_new = size < LARGE || self.met.insert((about.dev(), about.ino()));
@@ -181,26 +156,5 @@ mod tests {
             let flags = nix::fcntl::OFlag::O_DIRECTORY;
             deepest = nix::fcntl::openat(&deepest, "nested", flags, nix::sys::stat::Mode::empty()).unwrap().into();
         }
-    }
-
-    #[test]
-    fn files_without_a_name_count_once_as_long_as_somebody_has_them_open() {
-        let folder = tempfile::tempdir().unwrap();
-        let me = i32::try_from(std::process::id()).unwrap();
-        let count = |within: &Path| {
-            let mut size = FolderSize::new(room, u64::MAX);
-            size.add_nameless(me, folder.path(), within);
-            size.total()
-        };
-        let real = folder.path().canonicalize().unwrap();
-        let path = folder.path().join("gone");
-        std::fs::write(&path, vec![1; 50_000_000]).unwrap();
-        let open = [std::fs::File::open(&path).unwrap(), std::fs::File::open(&path).unwrap()];
-        std::fs::remove_file(&path).unwrap();
-        assert!((50_000_000..60_000_000).contains(&count(&real)), "{}", count(&real));
-        assert!(count(Path::new("/")) >= 50_000_000, "{}", count(Path::new("/")));
-        assert_eq!(count(&real.join("elsewhere")), 0);
-        drop(open);
-        assert_eq!(count(&real), 0);
     }
 }

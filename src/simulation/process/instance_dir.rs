@@ -2,7 +2,6 @@
 
 use std::io;
 use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use super::process_tree;
@@ -14,12 +13,10 @@ pub struct RunDir {
     folder: PathBuf,
 }
 
-/// The folder of one simulation. Dropping it kills what carries its mark, and removes it with everything inside.
+/// The folder of one simulation. Dropping it removes it with everything inside.
 #[derive(Debug)]
 pub struct InstanceDir {
     folder: PathBuf,
-    /// Whether what carries its mark was killed already, so that it need not be looked for again.
-    is_cleared: AtomicBool,
 }
 
 /// What earlier runs had left.
@@ -64,7 +61,7 @@ impl RunDir {
         // Somebody may have removed the folder of the run.
         std::fs::create_dir_all(&self.folder)?;
         let folder = tempfile::Builder::new().prefix("instance-").tempdir_in(&self.folder)?.keep();
-        let instance = InstanceDir { folder, is_cleared: AtomicBool::new(false) };
+        let instance = InstanceDir { folder };
         std::fs::create_dir(instance.project())?;
         Ok(instance)
     }
@@ -100,13 +97,6 @@ impl InstanceDir {
     pub fn project(&self) -> PathBuf {
         self.folder.join("project")
     }
-
-    /// Kills every process that carries the mark of this folder. For the end of the simulation: what is started later is
-    /// not found. Blocks for a moment.
-    pub fn kill_processes(&self) {
-        process_tree::kill_marked(&self.folder);
-        self.is_cleared.store(true, Ordering::Relaxed);
-    }
 }
 
 impl Drop for InstanceDir {
@@ -114,14 +104,7 @@ impl Drop for InstanceDir {
         // A project may hold many files, and this may run on a thread that serves others.
         let folder = std::mem::take(&mut self.folder);
         let spare = folder.clone();
-        let is_cleared = self.is_cleared.load(Ordering::Relaxed);
-        let remove_all = move || {
-            if !is_cleared {
-                process_tree::kill_marked(&folder);
-            }
-            remove_patiently(&folder);
-        };
-        if std::thread::Builder::new().spawn(remove_all).is_err() {
+        if std::thread::Builder::new().spawn(move || remove_patiently(&folder)).is_err() {
             remove(&spare);
         }
     }

@@ -1,15 +1,16 @@
-//! The processes of a simulation: how they are found and ended, and which port they listen on. Linux: `/proc`.
+//! The processes of a simulation: how they are found, and how those are ended that a server has left. Linux: `/proc`.
 
 use std::collections::HashSet;
 use std::ffi::OsStr;
-use std::ops::RangeInclusive;
-use std::path::Path;
+use std::fs::File;
+use std::io::Read;
+use std::os::unix::ffi::OsStrExt;
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use nix::sys::signal::{Signal, kill, killpg};
 use nix::unistd::{Pid, getpgid};
-use procfs::net::TcpState;
-use procfs::process::{FDTarget, Process, all_processes};
+use procfs::process::{Process, all_processes};
 
 /// The environment variable that marks every process of a simulation: its value is the instance's folder. Children
 /// inherit it, so that also those are found that have left their process group and lost their parent. One that has
@@ -31,11 +32,9 @@ pub fn tree(root: i32) -> Vec<i32> {
 /// The children of a process. One that has ended has none.
 #[must_use]
 pub fn children(pid: i32) -> Vec<i32> {
-    let Ok(tasks) = Process::new(pid).and_then(|process| process.tasks()) else {
-        return Vec::new();
-    };
-    let of_task = |task: procfs::process::Task| task.children().unwrap_or_default();
-    tasks.flatten().flat_map(of_task).filter_map(|child| i32::try_from(child).ok()).collect()
+    let threads = std::fs::read_dir(format!("/proc/{pid}/task")).into_iter().flatten().flatten();
+    let children = threads.filter_map(|thread| std::fs::read_to_string(thread.path().join("children")).ok());
+    children.flat_map(|ids| ids.split_whitespace().filter_map(|id| id.parse().ok()).collect::<Vec<_>>()).collect()
 }
 
 /// Kills every process that carries the mark of an instance below `folder`, and the groups that such processes lead.
@@ -72,69 +71,30 @@ pub fn kill_marked(folder: &Path) -> usize {
 const MOST_SCANS: usize = 200;
 /// Time between two scans: killed processes need a moment to vanish.
 const BETWEEN_SCANS: Duration = Duration::from_millis(5);
-/// Time between the first two checks whether a process listens.
-const FIRST_POLL: Duration = Duration::from_millis(10);
-/// Time between two of these checks, at most.
-const SLOWEST_POLL: Duration = Duration::from_millis(200);
+/// How much is read of a process's environment: a process can make its own any size.
+const ENVIRONMENT: u64 = 128 * 1024;
 
 fn marked(folder: &Path) -> Vec<Process> {
-    let carries_mark = |process: &Process| {
-        // A process that has ended, and was not yet waited for, has no environment.
-        let mark = process.environ().ok().and_then(|mut environment| environment.remove(OsStr::new(MARK)));
-        mark.is_some_and(|mark| Path::new(&mark).starts_with(folder))
-    };
+    let carries_mark = |process: &Process| mark(process.pid()).is_some_and(|mark| mark.starts_with(folder));
     all_processes().into_iter().flatten().flatten().filter(carries_mark).collect()
 }
 
-/// The sockets that listen on ports of a range, as (port, inode).
-fn listeners(ports: &RangeInclusive<u16>) -> Vec<(u16, u64)> {
-    let four = procfs::net::tcp().unwrap_or_default();
-    let six = procfs::net::tcp6().unwrap_or_default();
-    let listening = four.into_iter().chain(six).filter(|entry| entry.state == TcpState::Listen);
-    listening.map(|entry| (entry.local_address.port(), entry.inode)).filter(|(port, _)| ports.contains(port)).collect()
+/// The mark of a process. One that has ended, and was not yet waited for, has no environment.
+fn mark(pid: i32) -> Option<PathBuf> {
+    let mut environment = Vec::new();
+    File::open(format!("/proc/{pid}/environ")).ok()?.take(ENVIRONMENT).read_to_end(&mut environment).ok()?;
+    let mut variables = environment.split(|byte| *byte == 0);
+    variables
+        .find_map(|one| one.strip_prefix(MARK.as_bytes())?.strip_prefix(b"="))
+        .map(|mark| OsStr::from_bytes(mark).into())
 }
 
-/// The ports of a range on which `root` or a descendant of it listens, the lowest first; a listener of somebody else
-/// never counts.
+/// The inodes of the sockets that a process has open.
 #[must_use]
-pub fn listening_ports(root: i32, ports: &RangeInclusive<u16>) -> Vec<u16> {
-    let mut listeners = listeners(ports);
-    if listeners.is_empty() {
-        return Vec::new();
-    }
-    listeners.sort_unstable();
-    let own: HashSet<u64> = tree(root).into_iter().flat_map(sockets).collect();
-    let mut found: Vec<u16> =
-        listeners.into_iter().filter(|(_, inode)| own.contains(inode)).map(|(port, _)| port).collect();
-    // A socket for each of IPv4 and IPv6 may have the same port.
-    found.dedup();
-    found
-}
-
-/// Waits until a descendant of `root` listens on a port of a range, and returns that port. It takes as long as that takes.
-pub async fn until_listening(root: i32, ports: RangeInclusive<u16>) -> u16 {
-    let mut pause = FIRST_POLL;
-    loop {
-        actix_rt::time::sleep(pause).await;
-        let ports = ports.clone();
-        let found = actix_rt::task::spawn_blocking(move || listening_ports(root, &ports)).await;
-        if let Some(port) = found.ok().and_then(|ports| ports.first().copied()) {
-            return port;
-        }
-        pause = (pause * 3 / 2).min(SLOWEST_POLL);
-    }
-}
-
-/// The inodes of a process's sockets.
-fn sockets(pid: i32) -> Vec<u64> {
-    let Ok(files) = Process::new(pid).and_then(|process| process.fd()) else {
-        return Vec::new();
-    };
-    let socket = |file: procfs::process::FDInfo| match file.target {
-        FDTarget::Socket(inode) => Some(inode),
-        _ => None,
-    };
-    files.flatten().filter_map(socket).collect()
+pub fn sockets(pid: i32) -> Vec<u64> {
+    let descriptors = std::fs::read_dir(format!("/proc/{pid}/fd")).into_iter().flatten().flatten();
+    let targets = descriptors.filter_map(|descriptor| std::fs::read_link(descriptor.path()).ok());
+    targets.filter_map(|target| target.to_str()?.strip_prefix("socket:[")?.strip_suffix(']')?.parse().ok()).collect()
 }
 
 #[cfg(test)]
@@ -170,21 +130,23 @@ mod tests {
     }
 
     #[test]
-    fn a_listener_of_somebody_else_does_not_count() {
-        let socket = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
-        let port = socket.local_addr().unwrap().port();
-        let sleeper = Command::new("sleep").arg("100").spawn().unwrap();
-        let sleeper = Ended(sleeper);
-        assert_eq!(listeners(&(port..=port)).len(), 1);
-        assert!(listening_ports(i32::try_from(sleeper.0.id()).unwrap(), &(port..=port)).is_empty());
-    }
-
-    struct Ended(std::process::Child);
-
-    impl Drop for Ended {
-        fn drop(&mut self) {
-            self.0.kill().ok();
-            self.0.wait().ok();
-        }
+    fn no_more_is_read_of_an_environment_than_is_allowed() {
+        let folder = tempfile::tempdir().unwrap();
+        let mark = folder.path().join("instance");
+        let found = |size: usize| {
+            let mut sleep = Command::new("sleep");
+            // Variables are in the order of their names.
+            sleep.arg("100").env_clear().env("PATH", "/usr/bin:/bin").env(MARK, &mark);
+            for name in ["A", "B", "C"] {
+                sleep.env(name, "x".repeat(size));
+            }
+            let mut sleep = sleep.spawn().unwrap();
+            let found = marked(folder.path()).len();
+            sleep.kill().unwrap();
+            sleep.wait().unwrap();
+            found
+        };
+        assert_eq!(found(1000), 1);
+        assert_eq!(found(50_000), 0, "the mark comes after 128 KiB");
     }
 }

@@ -15,8 +15,8 @@ use crate::asset;
 use crate::shared::http::assets::{self, Asset};
 use crate::shared::http::paths::{GET, READ, path};
 use crate::shared::http::{Kind, Policy, html};
-use crate::simulation::machine::Usages;
-use crate::simulation::snapshot::Snapshot;
+use crate::simulation::machine::{Tree, Usages};
+use crate::simulation::snapshot::{Simulation, Snapshot};
 use crate::simulation::state::AppState;
 
 /// Assets of this server's page, besides those of all pages.
@@ -44,7 +44,13 @@ async fn monitor(server: web::Data<AppState>) -> HttpResponse {
 }
 
 async fn usages(server: &AppState, snapshot: &Snapshot) -> Usages {
-    server.usage.read(snapshot.simulations.iter().filter_map(|one| one.pid).collect()).await
+    let tree = |one: &Simulation| Some(Tree { root: one.pid?, cgroup: one.cgroup.clone() });
+    let trees: Vec<Tree> = snapshot.simulations.iter().filter_map(tree).collect();
+    if trees.is_empty() {
+        return Usages::new();
+    }
+    let usage = server.usage.clone();
+    actix_rt::task::spawn_blocking(move || usage.read(&trees)).await.unwrap_or_default()
 }
 
 async fn events(request: HttpRequest, server: web::Data<AppState>) -> HttpResponse {

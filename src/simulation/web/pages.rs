@@ -254,6 +254,7 @@ mod tests {
             since: 0,
             launched: Some(1),
             pid: None,
+            cgroup: None,
             port: Some(2001),
             version: None,
             log: None,

@@ -11,9 +11,9 @@ use super::event::WebotsEvent;
 use crate::simulation::checkout::{Checkouts, Project};
 use crate::simulation::config::SimulationConfig;
 use crate::simulation::container::{Containers, Request};
-use crate::simulation::isolation::{Cgroup, Launcher, Program, Watch};
+use crate::simulation::isolation::{Cgroup, Launcher, Program, Watch, Watcher};
 use crate::simulation::places::Ticket;
-use crate::simulation::process::SpawnSpec;
+use crate::simulation::process::{PortFinder, SpawnSpec};
 use crate::simulation::protocol::Mode;
 
 /// Everything that one Webots is started with.
@@ -24,6 +24,10 @@ pub struct LaunchSpec {
     pub containers: Option<Arc<Containers>>,
     /// How simulations are launched.
     pub launcher: Arc<Launcher>,
+    /// Watches over what it takes.
+    pub watcher: Watcher,
+    /// Finds the port on which it listens.
+    pub port_finder: PortFinder,
     /// The program to start.
     pub program: PathBuf,
     /// Where controllers are restored from.
@@ -80,10 +84,10 @@ impl LaunchSpec {
     pub fn watch(&self, root: i32) -> Watch {
         Watch {
             root,
-            runners: self.launcher.runners(),
             folder: self.project.instance.path().to_owned(),
-            limits: self.config.limits.clone(),
-            ports: self.config.streaming_ports(),
+            disk: self.config.limits.disk,
+            processes: self.launcher.most_processes(),
+            port: self.containers.is_none().then_some(self.place.1),
         }
     }
 }

@@ -2,7 +2,6 @@
 
 use std::future::Future;
 use std::path::PathBuf;
-use std::sync::Arc;
 use std::time::Duration;
 
 use actix::dev::ToEnvelope;
@@ -14,6 +13,7 @@ use super::paced_reader::PacedReader;
 use super::runtime::Runtime;
 use super::virtual_display::VirtualDisplay;
 use crate::shared::run::RotatedFile;
+use crate::simulation::isolation::Cgroup;
 use crate::simulation::machine::display;
 use crate::simulation::process::{ExitReason, ProcessGroup};
 
@@ -21,6 +21,8 @@ use crate::simulation::process::{ExitReason, ProcessGroup};
 pub struct Launched {
     /// Its processes.
     pub group: ProcessGroup,
+    /// The folder of its control group, if it has one.
+    pub cgroup: Option<PathBuf>,
     /// The last lines of its output.
     pub tail: Tail,
     /// The file that its output is kept in.
@@ -74,23 +76,23 @@ where
         ))?,
     };
     let (group, ended) = ProcessGroup::start(&process, output.into(), errors.into())?;
-    let project = Arc::clone(&spec.project);
+    let folder = cgroup.as_ref().map(|cgroup| cgroup.path().to_owned());
     let ended = async move {
         let reason = ended.await;
         let in_container = runtime.end().await;
-        // Processes that have left the group are known by their control group or by their mark.
-        let end_all = move || {
-            let out_of_memory = cgroup.is_some_and(|cgroup| {
-                cgroup.kill();
-                cgroup.has_run_out_of_memory()
-            });
-            project.instance.kill_processes();
-            out_of_memory
+        let on_machine = match cgroup {
+            Some(cgroup) => actix_rt::task::spawn_blocking(move || end_all(&cgroup)).await.unwrap_or_default(),
+            None => false,
         };
-        let on_machine = actix_rt::task::spawn_blocking(end_all).await.unwrap_or_default();
         // What was printed last tells why. A process that nobody can end may keep the pipe open.
         actix_rt::time::timeout(LAST_OUTPUT, all_read).await.ok();
         End { reason, out_of_memory: in_container || on_machine }
     };
-    Ok((Launched { group, tail, log, begin }, ended))
+    Ok((Launched { group, cgroup: folder, tail, log, begin }, ended))
+}
+
+/// Ends what has left the process group. Returns whether the kernel has ended something because it took too much memory.
+fn end_all(cgroup: &Cgroup) -> bool {
+    cgroup.kill();
+    cgroup.has_run_out_of_memory()
 }

@@ -17,8 +17,9 @@ use super::output::{OutputEvent, Tail};
 use super::runtime::{Preparation, Runtime};
 use crate::shared::run::seconds_since_1970;
 use crate::simulation::checkout::CheckoutError;
+use crate::simulation::config::SimulationConfig;
 use crate::simulation::machine::display;
-use crate::simulation::process::{ExitReason, ProcessGroup, process_tree};
+use crate::simulation::process::{ExitReason, ProcessGroup};
 use crate::simulation::snapshot::{Change, Stage};
 
 /// Asks Webots to end.
@@ -53,8 +54,6 @@ pub struct Webots {
 
 /// So many heartbeats may be missed before Webots counts as hanging.
 const MISSED_HEARTBEATS: u32 = 6;
-/// If its port is taken, Webots silently takes one of so many that follow.
-const NEXT_PORTS: u16 = 10;
 
 impl Webots {
     /// Prepares a Webots; it starts with the actor.
@@ -113,16 +112,18 @@ impl Webots {
 
     /// Starts the process, and has [`Self::ended`] called when it has ended.
     fn spawn(&mut self, runtime: Runtime, ctx: &mut Context<Self>) -> std::io::Result<()> {
-        let (Launched { group, tail, log, begin }, ended) = launched::launch(&self.spec, runtime, ctx.address())?;
+        let (Launched { group, cgroup, tail, log, begin }, ended) =
+            launched::launch(&self.spec, runtime, ctx.address())?;
         let (program, world) = (self.spec.program.display(), self.spec.project.world.path.display());
         let (at, pid) = (seconds_since_1970(), group.leader());
         log::info!("port {}: started {program} for {world} (process {pid})", self.port);
-        self.spec.place.0.update(Change::Launched { at, pid, port: self.port, log, begin });
+        self.spec.place.0.update(Change::Launched { at, pid, cgroup, port: self.port, log, begin });
         self.tail = tail;
         self.group = Some(group);
         ended.into_actor(self).map(|end, this, ctx| this.ended(&end, ctx)).spawn(ctx);
-        let excess = self.spec.watch(pid).until_too_much().into_actor(self);
-        excess.map(|why, this, _| this.end_at_once(&why)).spawn(ctx);
+        let (watcher, watch) = (self.spec.watcher.clone(), self.spec.watch(pid));
+        let excess = async move { watcher.until_too_much(watch).await };
+        excess.into_actor(self).map(|why, this, _| this.end_at_once(&why)).spawn(ctx);
         Ok(())
     }
 
@@ -132,9 +133,10 @@ impl Webots {
         if self.spec.containers.is_none()
             && let Some(root) = self.group.as_ref().map(ProcessGroup::leader)
         {
-            let ports = self.port..=self.port.saturating_add(NEXT_PORTS);
-            let listening = process_tree::until_listening(root, ports).into_actor(self);
-            listening.map(|port, this, _| this.ready(port)).spawn(ctx);
+            let ports = SimulationConfig::ports_from(self.port);
+            let finder = self.spec.port_finder.clone();
+            let listening = async move { finder.find(root, ports).await };
+            listening.into_actor(self).map(|port, this, _| this.ready(port)).spawn(ctx);
         }
     }
 

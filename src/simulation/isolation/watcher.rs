@@ -1,0 +1,257 @@
+//! Watches over what simulations take that the kernel does not limit: room on the disk, ports, and on some machines
+//! processes. One thread looks for all of them, in ticks.
+//!
+//! The ticks take 1 % of one core at most: as they take longer, the pause between them grows. Readings that serve all
+//! simulations are made once for all: one query for listeners, one pass over `/proc`, one look at the free room of the disk.
+//! Folders, which have to be walked one by one, are walked only when the disk has lost as much room as the simulation has
+//! left, and every half a minute.
+
+use std::collections::{BTreeSet, HashMap, HashSet};
+use std::io;
+use std::ops::RangeInclusive;
+use std::path::{Path, PathBuf};
+use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
+use std::time::{Duration, Instant};
+
+use nix::sys::statvfs::statvfs;
+use tokio::sync::oneshot;
+
+use crate::simulation::machine::{Tree, UsageMonitor};
+use crate::simulation::process::folder_size::{FolderSize, room};
+use crate::simulation::process::listeners::{Listener, listeners};
+use crate::simulation::process::process_tree::{sockets, tree};
+
+/// Watches over simulations. The thread ends when the last clone is dropped.
+#[derive(Debug, Clone)]
+pub struct Watcher(Sender<Watched>);
+
+/// What is watched of one simulation.
+#[derive(Debug)]
+pub struct Watch {
+    /// The process from which all of it descends.
+    pub root: i32,
+    /// The folder of the instance.
+    pub folder: PathBuf,
+    /// How much it may write into that folder, in MiB.
+    pub disk: u64,
+    /// How many processes and threads it may have; `None` if the kernel refuses more.
+    pub processes: Option<MostProcesses>,
+    /// The port that it was given; `None` if it has a network of its own.
+    pub port: Option<u16>,
+}
+
+/// A limit of processes that the kernel does not keep.
+#[derive(Debug, Clone, Copy)]
+pub struct MostProcesses {
+    /// The limit.
+    pub limit: u64,
+    /// How many of the tree's processes run the simulation and are none of its own.
+    pub runners: u64,
+}
+
+/// A simulation that is watched, and what is known of it.
+#[derive(Debug)]
+struct Watched {
+    watch: Watch,
+    /// Who waits to hear that it takes too much.
+    excess: oneshot::Sender<String>,
+    /// How much the folder may take, in bytes: what it took at first counts besides the limit. `None` before the first look.
+    allowed: Option<u64>,
+    /// At the last look: what it may still write, and how much room the disk had lost, in bytes.
+    left: u64,
+    lost: u64,
+    looked: Instant,
+}
+
+/// The shortest time between two ticks.
+const SHORTEST: Duration = Duration::from_secs(1);
+/// The longest: a simulation that makes ticks slow gains no more than this.
+const LONGEST: Duration = Duration::from_secs(10);
+/// The pause after a tick is this many times as long as the tick: 1 % of one core.
+const PAUSE: u32 = 99;
+/// A folder is walked this often although the disk has lost little room: others may have made as much in the same tick.
+const WALK_AGAIN: Duration = Duration::from_secs(30);
+
+impl Watcher {
+    /// Starts the thread. `run` is the folder with the folders of all instances, `ports` are those of all simulations.
+    ///
+    /// # Errors
+    /// When the system can't start a thread.
+    pub fn start(run: PathBuf, ports: RangeInclusive<u16>, usage: UsageMonitor) -> io::Result<Self> {
+        let (sender, receiver) = channel();
+        let disk = Disk { free: free(&run), folder: run, lost: 0 };
+        let mut table = Table { disk, ports, usage, all: Vec::new(), owners: HashMap::new() };
+        std::thread::Builder::new().name("watcher".to_owned()).spawn(move || table.run(&receiver))?;
+        Ok(Self(sender))
+    }
+
+    /// Waits until a simulation takes more than it may, and returns what, in words for its client. Dropping the future ends
+    /// the watch.
+    pub async fn until_too_much(&self, watch: Watch) -> String {
+        let (excess, told) = oneshot::channel();
+        let (allowed, left, lost, looked) = (None, 0, 0, Instant::now());
+        // The thread lives as long as this.
+        self.0.send(Watched { watch, excess, allowed, left, lost, looked }).ok();
+        match told.await {
+            Ok(why) => why,
+            Err(_) => std::future::pending().await,
+        }
+    }
+}
+
+/// All simulations that are watched.
+struct Table {
+    disk: Disk,
+    ports: RangeInclusive<u16>,
+    usage: UsageMonitor,
+    all: Vec<Watched>,
+    /// Whose each listener is: the root of a simulation's tree, `None` for somebody else's.
+    owners: HashMap<u64, Option<i32>>,
+}
+
+impl Table {
+    fn run(&mut self, watches: &Receiver<Watched>) {
+        let mut pause = SHORTEST;
+        loop {
+            let next = Instant::now() + pause;
+            // What comes between two ticks is taken at once: the first look says how much its folder took at first.
+            loop {
+                let left = next.saturating_duration_since(Instant::now());
+                match if self.all.is_empty() { watches.recv().map_err(Into::into) } else { watches.recv_timeout(left) }
+                {
+                    Ok(mut new) => {
+                        new.walk(self.disk.lost);
+                        self.all.push(new);
+                    }
+                    Err(RecvTimeoutError::Timeout) => break,
+                    Err(RecvTimeoutError::Disconnected) => return,
+                }
+            }
+            let begin = Instant::now();
+            self.look();
+            pause = pause_after(begin.elapsed());
+        }
+    }
+
+    /// One tick.
+    fn look(&mut self) {
+        self.all.retain(|one| !one.excess.is_closed());
+        let mut excesses = self.look_at_disk();
+        excesses.extend(self.count_processes());
+        // Where the system does not tell, no simulation becomes ready, which is logged there.
+        excesses.extend(listeners(&self.ports).map(|all| self.look_at_ports(&all)).unwrap_or_default());
+        for (root, why) in excesses {
+            if let Some(place) = self.all.iter().position(|one| one.watch.root == root) {
+                // Who asked may be gone.
+                self.all.swap_remove(place).excess.send(why).ok();
+            }
+        }
+    }
+
+    fn look_at_disk(&mut self) -> Vec<(i32, String)> {
+        let lost = self.disk.look();
+        let due = self.all.iter_mut().filter(|one| one.is_due(lost));
+        due.filter_map(|one| one.walk(lost).map(|why| (one.watch.root, why))).collect()
+    }
+
+    fn count_processes(&self) -> Vec<(i32, String)> {
+        let counted: Vec<_> = self.all.iter().filter_map(|one| Some((one.watch.root, one.watch.processes?))).collect();
+        let usages = self.usage.read(&counted.iter().map(|(root, _)| Tree::of(*root)).collect::<Vec<_>>());
+        let too_many = counted.into_iter().filter(|(root, most)| {
+            usages.get(root).is_some_and(|usage| usage.threads > most.limit.saturating_add(most.runners))
+        });
+        too_many
+            .map(|(root, MostProcesses { limit, .. })| {
+                let why = format!(
+                    "The simulation has more than {limit} processes and threads, the limit of this server (limits.processes)"
+                );
+                (root, why)
+            })
+            .collect()
+    }
+
+    /// Finds simulations that listen on more than one of the ports of simulations.
+    fn look_at_ports(&mut self, all: &[Listener]) -> Vec<(i32, String)> {
+        self.find_owners(all);
+        let mut taken: HashMap<i32, BTreeSet<u16>> = HashMap::new();
+        for one in all {
+            if let Some(Some(root)) = self.owners.get(&one.inode) {
+                taken.entry(*root).or_default().insert(one.port);
+            }
+        }
+        let too_many = taken.into_iter().filter(|(_, ports)| ports.len() > 1);
+        let told = |ports: BTreeSet<u16>| {
+            let ports: Vec<String> = ports.iter().map(u16::to_string).collect();
+            format!("The simulation listens on the ports {}, of which only one is its own", ports.join(", "))
+        };
+        too_many.map(|(root, ports)| (root, told(ports))).collect()
+    }
+
+    /// Finds out whose the listeners are that were not there before: mostly of the simulation that was given the port.
+    fn find_owners(&mut self, all: &[Listener]) {
+        let there: HashSet<u64> = all.iter().map(|one| one.inode).collect();
+        self.owners.retain(|inode, _| there.contains(inode));
+        let mut new: Vec<&Listener> = all.iter().filter(|one| !self.owners.contains_key(&one.inode)).collect();
+        for exact in [true, false] {
+            for one in self.all.iter().filter(|one| one.watch.port.is_some()) {
+                let is_wanted = |listener: &&Listener| !exact || Some(listener.port) == one.watch.port;
+                if !new.iter().any(is_wanted) {
+                    continue;
+                }
+                let own: HashSet<u64> = tree(one.watch.root).into_iter().flat_map(sockets).collect();
+                for listener in new.extract_if(.., |listener| own.contains(&listener.inode)) {
+                    self.owners.insert(listener.inode, Some(one.watch.root));
+                }
+            }
+        }
+        self.owners.extend(new.into_iter().map(|listener| (listener.inode, None)));
+    }
+}
+
+impl Watched {
+    /// Whether its folder may have grown beyond its limit since the last look.
+    fn is_due(&self, lost: u64) -> bool {
+        lost.saturating_sub(self.lost) >= self.left || self.looked.elapsed() >= WALK_AGAIN
+    }
+
+    /// Looks how much its folder takes. `lost` is how much room the disk has lost until now.
+    fn walk(&mut self, lost: u64) -> Option<String> {
+        let disk = self.watch.disk;
+        let mut size = FolderSize::new(room, self.allowed.unwrap_or(u64::MAX));
+        let is_known = size.add_folder(&self.watch.folder).is_ok();
+        let allowed = *self.allowed.get_or_insert(size.total().saturating_add(disk << 20));
+        (self.left, self.lost, self.looked) = (allowed.saturating_sub(size.total()), lost, Instant::now());
+        if !is_known {
+            return Some("The simulation has folders that nobody can look into, too deep or closed".to_owned());
+        }
+        (size.total() > allowed)
+            .then(|| format!("The simulation has written more than {disk} MiB, the limit of this server (limits.disk)"))
+    }
+}
+
+/// The disk that the folders of all instances are on.
+struct Disk {
+    folder: PathBuf,
+    free: u64,
+    /// How much room it has lost since the start, in bytes: what becomes free again is not taken off.
+    lost: u64,
+}
+
+impl Disk {
+    fn look(&mut self) -> u64 {
+        let free = free(&self.folder);
+        self.lost = self.lost.saturating_add(self.free.saturating_sub(free));
+        self.free = free;
+        self.lost
+    }
+}
+
+/// The free room of the disk that a folder is on, in bytes.
+fn free(folder: &Path) -> u64 {
+    statvfs(folder).map_or(0, |disk| disk.blocks_free().saturating_mul(disk.fragment_size()))
+}
+
+/// How long to wait after a tick that took so long.
+fn pause_after(tick: Duration) -> Duration {
+    (tick * PAUSE).clamp(SHORTEST, LONGEST)
+}

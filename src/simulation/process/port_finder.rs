@@ -1,0 +1,167 @@
+//! Finds the ports on which starting simulations listen: one thread, and one query of the kernel for all of them.
+//!
+//! The thread sleeps while nothing starts.
+
+use std::collections::HashSet;
+use std::io;
+use std::ops::RangeInclusive;
+use std::sync::mpsc::{Receiver, Sender, channel};
+use std::time::{Duration, Instant};
+
+use tokio::sync::oneshot;
+
+use super::listeners::{Listener, listeners};
+use super::process_tree::{sockets, tree};
+
+/// Finds ports. The thread ends when the last clone is dropped.
+#[derive(Debug, Clone)]
+pub struct PortFinder(Sender<Search>);
+
+/// A process whose port is looked for.
+#[derive(Debug)]
+struct Search {
+    root: i32,
+    ports: RangeInclusive<u16>,
+    since: Instant,
+    /// The listeners that were not its own when its tree was walked, and when that was.
+    foreign: HashSet<u64>,
+    walked: Instant,
+    found: Option<oneshot::Sender<u16>>,
+}
+
+/// The pause between two queries is this part of the time for which the youngest search has been running.
+const PART: u32 = 16;
+/// The shortest pause: what a start loses by it, on average, is half of it.
+const SHORTEST: Duration = Duration::from_millis(4);
+/// The pause is at least this many times as long as a query took, so that a class that starts leaves the cores to Webots.
+const QUERIES: u32 = 15;
+/// The longest pause.
+const LONGEST: Duration = Duration::from_millis(200);
+/// A tree is walked this often although no listener is new: `/proc` may leave out a child while others come and go.
+const WALK_AGAIN: Duration = Duration::from_secs(1);
+
+impl PortFinder {
+    /// Starts the thread. `ports` are all that may be asked for.
+    ///
+    /// # Errors
+    /// When the system can't start a thread.
+    pub fn start(ports: RangeInclusive<u16>) -> io::Result<Self> {
+        let (sender, receiver) = channel();
+        std::thread::Builder::new().name("ports".to_owned()).spawn(move || run(&receiver, &ports))?;
+        Ok(Self(sender))
+    }
+
+    /// Waits until a process that descends from `root` listens on a port of a range, and returns the port. A listener of
+    /// another process does not count. Never returns if there is none: the caller has the time limit.
+    pub async fn find(&self, root: i32, ports: RangeInclusive<u16>) -> u16 {
+        let (sender, found) = oneshot::channel();
+        let now = Instant::now();
+        let search = Search { root, ports, since: now, foreign: HashSet::new(), walked: now, found: Some(sender) };
+        // The thread lives as long as this.
+        self.0.send(search).ok();
+        match found.await {
+            Ok(port) => port,
+            Err(_) => std::future::pending().await,
+        }
+    }
+}
+
+/// Serves searches until nobody can ask for another one.
+fn run(searches: &Receiver<Search>, ports: &RangeInclusive<u16>) {
+    let mut open: Vec<Search> = Vec::new();
+    let mut owned = HashSet::new();
+    let mut is_reported = false;
+    loop {
+        if open.is_empty() {
+            let Ok(search) = searches.recv() else { return };
+            open.push(search);
+        }
+        open.extend(searches.try_iter());
+        let begin = Instant::now();
+        if let Err(error) = look(&mut open, &mut owned, ports)
+            && !std::mem::replace(&mut is_reported, true)
+        {
+            log::error!(
+                "the system does not tell which ports are listened on, so no simulation becomes ready: {error}"
+            );
+        }
+        open.retain(|search| search.found.as_ref().is_some_and(|found| !found.is_closed()));
+        if let Some(age) = open.iter().map(|search| search.since.elapsed()).min() {
+            std::thread::sleep((age / PART).max(begin.elapsed() * QUERIES).clamp(SHORTEST, LONGEST));
+        }
+    }
+}
+
+/// Looks once for all searches. `owned` are the listeners that were found until now.
+fn look(open: &mut [Search], owned: &mut HashSet<u64>, ports: &RangeInclusive<u16>) -> io::Result<()> {
+    let all = listeners(ports)?;
+    let there: HashSet<u64> = all.iter().map(|one| one.inode).collect();
+    owned.retain(|inode| there.contains(inode));
+    // First the port that each was given, so that of those who start side by side none takes another's listener for new.
+    for is_first in [true, false] {
+        for search in open.iter_mut() {
+            let (first, last) = (*search.ports.start(), *search.ports.end());
+            let listeners = listeners_in(&all, first..=if is_first { first } else { last });
+            let candidates: Vec<Listener> = listeners.filter(|one| !owned.contains(&one.inode)).copied().collect();
+            if let Some(Listener { port, inode }) = search.own(&candidates)
+                && let Some(found) = search.found.take()
+            {
+                owned.insert(inode);
+                // Who asked may be gone.
+                found.send(port).ok();
+            }
+        }
+    }
+    Ok(())
+}
+
+/// Those of a list, which is in the order of ports, that are in a range.
+fn listeners_in(all: &[Listener], ports: RangeInclusive<u16>) -> impl Iterator<Item = &Listener> {
+    let begin = all.partition_point(|one| one.port < *ports.start());
+    all.get(begin..).unwrap_or_default().iter().take_while(move |one| ports.contains(&one.port))
+}
+
+impl Search {
+    /// The first of these listeners that belongs to a process of the tree. The tree is walked only if a listener is new.
+    fn own(&mut self, candidates: &[Listener]) -> Option<Listener> {
+        let is_foreign = candidates.iter().all(|one| self.foreign.contains(&one.inode));
+        if self.found.is_none() || candidates.is_empty() || (is_foreign && self.walked.elapsed() < WALK_AGAIN) {
+            return None;
+        }
+        let own: HashSet<u64> = tree(self.root).into_iter().flat_map(sockets).collect();
+        self.walked = Instant::now();
+        self.foreign.extend(candidates.iter().map(|one| one.inode));
+        candidates.iter().find(|one| own.contains(&one.inode)).copied()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::net::TcpListener;
+    use std::process::{Child, Command, Stdio};
+
+    use super::*;
+
+    struct Ended(Child);
+
+    impl Drop for Ended {
+        fn drop(&mut self) {
+            self.0.kill().ok();
+            self.0.wait().ok();
+        }
+    }
+
+    #[actix_rt::test]
+    async fn a_listener_counts_for_the_tree_that_it_belongs_to() {
+        let finder = PortFinder::start(1..=u16::MAX).unwrap();
+        let ours = TcpListener::bind("127.0.0.1:0").unwrap();
+        let port = ours.local_addr().unwrap().port();
+        let sleeper = Command::new("sleep").arg("100").stdin(Stdio::null()).spawn().unwrap();
+        let sleeper = Ended(sleeper);
+        let other = finder.find(i32::try_from(sleeper.0.id()).unwrap(), port..=port);
+        let found = actix_rt::time::timeout(Duration::from_millis(300), other).await;
+        assert!(found.is_err(), "a listener of another process counts: {found:?}");
+        let me = i32::try_from(std::process::id()).unwrap();
+        assert_eq!(finder.find(me, port..=port).await, port);
+    }
+}
