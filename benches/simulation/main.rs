@@ -2,6 +2,8 @@
 //!
 //! It starts the built program, with a stand-in for the forge and the demo simulator for Webots:
 //! - `load`: how fast `/load` answers while ten checkouts run, one remote hangs, and a simulator floods its output;
+//! - `class`: how long 1, 10, 100 and 200 clients take that start at once, in turns with a bare loop that does the same;
+//! - `idle`: what simulations that stand idle cost the server;
 //! - `start`: what a cached start costs over the git commands that it runs, and what a sandbox adds to it;
 //! - `soak`: whether a thousand starts and stops in a row leave anything: processes, file descriptors, ports, folders,
 //!   threads, memory.
@@ -19,6 +21,8 @@
     reason = "a measurement that fails ends with a panic"
 )]
 
+mod class;
+mod idle;
 mod load;
 #[path = "../../tests/simulation/soak.rs"]
 mod soak;
@@ -45,6 +49,18 @@ struct Arguments {
     /// Cached starts for `start`.
     #[arg(long, default_value_t = 100)]
     cached: usize,
+    /// How many start at once in `class`, in place of 1, 10, 100 and 200.
+    #[arg(long)]
+    size: Vec<u16>,
+    /// Levels of isolation for `class` and `idle`, in place of `none` and `sandbox`.
+    #[arg(long)]
+    level: Vec<String>,
+    /// Rounds of each row of `class`.
+    #[arg(long, default_value_t = 5)]
+    rounds: usize,
+    /// Seconds of each row of `idle`.
+    #[arg(long, default_value_t = 20)]
+    seconds: u64,
     /// cargo adds this.
     #[arg(long, hide = true)]
     bench: bool,
@@ -52,6 +68,8 @@ struct Arguments {
 
 #[derive(Clone, Copy, PartialEq, Eq, ValueEnum)]
 enum Part {
+    Class,
+    Idle,
     Load,
     Start,
     Soak,
@@ -69,6 +87,12 @@ impl Verdict {
         self.failed |= !kept;
         println!("  {} {what}: {value:.3?}, bound {most:?}", if kept { "kept  " } else { "BROKEN" });
     }
+
+    fn ratio(&mut self, what: &str, value: f64, most: f64) {
+        let kept = value <= most;
+        self.failed |= !kept;
+        println!("  {} {what}: {value:.2}, bound {most}", if kept { "kept  " } else { "BROKEN" });
+    }
 }
 
 #[actix_rt::main]
@@ -76,12 +100,21 @@ async fn main() -> ExitCode {
     let arguments = Arguments::parse();
     let is_wanted = |part| arguments.parts.is_empty() || arguments.parts.contains(&part);
     let mut verdict = Verdict::default();
+    let all = || ["none", "sandbox"].map(str::to_owned).to_vec();
+    let levels = if arguments.level.is_empty() { all() } else { arguments.level };
     if is_wanted(Part::Load) {
         load::measure(&mut verdict, arguments.requests).await;
     }
     if is_wanted(Part::Start) {
         start::measure(&mut verdict, arguments.cached).await;
         start::compare_levels(&mut verdict, arguments.cached).await;
+    }
+    if is_wanted(Part::Class) {
+        let sizes = if arguments.size.is_empty() { vec![1, 10, 100, 200] } else { arguments.size };
+        class::measure(&mut verdict, &levels, &sizes, arguments.rounds).await;
+    }
+    if is_wanted(Part::Idle) {
+        idle::measure(&mut verdict, &levels, Duration::from_secs(arguments.seconds)).await;
     }
     if is_wanted(Part::Soak) {
         soak_and_tell(&mut verdict, arguments.starts).await;

@@ -1,0 +1,228 @@
+//! How long a class takes that starts at once, beside a bare loop that does the same without a server.
+//!
+//! The bare loop runs what the server has run for one simulation: `git checkout` of the cached commit, then the command line of
+//! that simulation (bubblewrap and the demo simulator) in folders of its own, until it listens on its port. Beside a single
+//! start it also runs the two commands of git that find the commit, which a class runs once for all.
+
+use std::ffi::{OsStr, OsString};
+use std::net::TcpStream;
+use std::os::unix::ffi::{OsStrExt, OsStringExt};
+use std::path::PathBuf;
+use std::process::{Child, Command, Stdio};
+use std::time::{Duration, Instant};
+
+use procfs::process::Process;
+
+use crate::Verdict;
+use crate::support::client::Client;
+use crate::support::git::{Forge, arm};
+use crate::support::program::{Server, simulation_server};
+use crate::support::{SOON, http, until};
+
+/// How many times as long as the bare loop a class of 200 may take.
+const MOST: f64 = 1.5;
+/// How much longer than the bare loop one start may take.
+const ONE: Duration = Duration::from_millis(8);
+/// Time between two looks whether a port is open.
+const BETWEEN_LOOKS: Duration = Duration::from_millis(1);
+
+/// Prints how long classes take, in turns with the bare loop.
+pub async fn measure(verdict: &mut Verdict, levels: &[String], sizes: &[u16], rounds: usize) {
+    println!("clients at once, until the last one is ready (medians):");
+    for level in levels {
+        let forge = Forge::with_arm();
+        let server = server(&forge, level).await;
+        let bare = Bare::observe(&server, forge.path().join("lab/arm")).await;
+        for &size in sizes {
+            let rounds = if size == 1 { 10 * rounds } else { rounds };
+            let (mut ours, mut theirs) = (Vec::new(), Vec::new());
+            for _ in 0..rounds {
+                ours.push(class(&server, size).await);
+                theirs.push(bare.class(size));
+            }
+            let (ours, theirs) = (median(ours), median(theirs));
+            let ratio = ours.as_secs_f64() / theirs.as_secs_f64();
+            println!("  {level:<8}{size:>5}: {ours:>9.3?}, bare loop {theirs:>9.3?}, ratio {ratio:.2}");
+            match size {
+                1 => verdict.bound("one start beside the bare loop", ours.saturating_sub(theirs), ONE),
+                200 => verdict.ratio("200 at once", ratio, MOST),
+                _ => {}
+            }
+        }
+    }
+}
+
+/// A server with 200 places at a level.
+pub async fn server(forge: &Forge, level: &str) -> Server {
+    let demo = std::path::Path::new(env!("CARGO_BIN_EXE_demo-simulator"));
+    simulation_server(demo, forge.path(), 200).set("isolation", level).start().await
+}
+
+/// So many clients that are ready.
+pub async fn ready(server: &Server, size: u16) -> Vec<Client> {
+    let one = async |_| {
+        let mut client = Client::start(server, &arm()).await;
+        client.until("webots:").await;
+        client
+    };
+    futures_util::future::join_all((0..size).map(one)).await
+}
+
+/// Has clients leave, and waits until nothing is left of their simulations.
+pub async fn leave(server: &Server, clients: Vec<Client>) {
+    futures_util::future::join_all(clients.into_iter().map(Client::leave)).await;
+    until("all are gone", async || {
+        http::get(&server.url("/status")).await.json()["simulations"].as_array().unwrap().is_empty()
+    })
+    .await;
+}
+
+async fn class(server: &Server, size: u16) -> Duration {
+    let begin = Instant::now();
+    let clients = ready(server, size).await;
+    let time = begin.elapsed();
+    leave(server, clients).await;
+    time
+}
+
+/// What the server has run for one simulation.
+struct Bare {
+    command: Vec<OsString>,
+    environment: Vec<(OsString, OsString)>,
+    /// The folder of that simulation, and its port.
+    instance: PathBuf,
+    port: u16,
+    /// The repository of the forge, the cached one, and the reference of the commit in it.
+    remote: PathBuf,
+    repository: PathBuf,
+    reference: String,
+}
+
+impl Bare {
+    /// Starts a simulation, and reads what it runs.
+    async fn observe(server: &Server, remote: PathBuf) -> Self {
+        let clients = ready(server, 1).await;
+        let shown = http::get(&server.url("/status")).await.json()["simulations"][0].clone();
+        let process = Process::new(shown["pid"].as_i64().unwrap().try_into().unwrap()).unwrap();
+        let environment: Vec<_> = process.environ().unwrap().into_iter().collect();
+        let mark = environment.iter().find(|(name, _)| name == "WEBOTS_FLEET_INSTANCE").unwrap().1.clone();
+        let line = std::fs::read(format!("/proc/{}/cmdline", process.pid())).unwrap();
+        let words = line.strip_suffix(b"\0").unwrap().split(|byte| *byte == 0);
+        let repositories = std::fs::read_dir(server.cache().join("git")).unwrap().flatten();
+        let repository = repositories.map(|entry| entry.path()).find(|path| path.is_dir()).unwrap();
+        let commit = std::fs::read_dir(repository.join("refs/fleet")).unwrap().flatten().next().unwrap().file_name();
+        let bare = Self {
+            command: words.map(|word| OsStr::from_bytes(word).to_owned()).collect(),
+            environment,
+            instance: mark.into(),
+            port: shown["port"].as_u64().unwrap().try_into().unwrap(),
+            remote,
+            repository,
+            reference: format!("refs/fleet/{}", commit.to_str().unwrap()),
+        };
+        leave(server, clients).await;
+        bare
+    }
+
+    /// How long so many take at once.
+    fn class(&self, size: u16) -> Duration {
+        let (sender, started) = std::sync::mpsc::channel();
+        let end = std::sync::Barrier::new(usize::from(size) + 1);
+        std::thread::scope(|scope| {
+            let begin = Instant::now();
+            for number in 0..size {
+                let (sender, end) = (sender.clone(), &end);
+                scope.spawn(move || {
+                    if size == 1 {
+                        self.find();
+                    }
+                    let mut child = self.start(number);
+                    sender.send(number).unwrap();
+                    // bubblewrap ends with the thread that has started it.
+                    end.wait();
+                    child.kill().unwrap();
+                    child.wait().unwrap();
+                    std::fs::remove_dir_all(self.folder(number)).unwrap();
+                });
+            }
+            for number in started.iter().take(usize::from(size)) {
+                let deadline = begin + SOON;
+                while TcpStream::connect(("127.0.0.1", self.port + number)).is_err() {
+                    assert!(Instant::now() < deadline, "simulation {number} does not listen");
+                    std::thread::sleep(BETWEEN_LOOKS);
+                }
+            }
+            let time = begin.elapsed();
+            end.wait();
+            time
+        })
+    }
+
+    /// Finds the commit of the branch, and the world in it.
+    fn find(&self) {
+        self.git(&["ls-remote", "--quiet", "--", self.remote.to_str().unwrap(), "refs/heads/main", "refs/tags/main"]);
+        self.git(&["ls-tree", "-r", "-l", "-z", "--full-tree", &self.reference]);
+    }
+
+    fn git(&self, arguments: &[&str]) {
+        let mut git = Command::new("git");
+        git.arg("--git-dir").arg(&self.repository).args(arguments).env("GIT_CONFIG_GLOBAL", "/dev/null");
+        assert!(git.stdout(Stdio::null()).stderr(Stdio::null()).status().unwrap().success(), "{arguments:?}");
+    }
+
+    fn folder(&self, number: u16) -> PathBuf {
+        let mut name = self.instance.clone().into_os_string();
+        name.push(format!("-{number}"));
+        name.into()
+    }
+
+    /// Does for one simulation what the server does.
+    fn start(&self, number: u16) -> Child {
+        let folder = self.folder(number);
+        for name in ["project", "home", "run", "tmp"] {
+            std::fs::create_dir_all(folder.join(name)).unwrap();
+        }
+        let mut work_tree = OsString::from("--work-tree=");
+        work_tree.push(folder.join("project"));
+        let git = Command::new("git")
+            .arg("--git-dir")
+            .arg(&self.repository)
+            .arg(work_tree)
+            .args(["checkout", "--force", "--progress", &self.reference, "--", "."])
+            .env("GIT_INDEX_FILE", folder.join("index"))
+            .env("GIT_CONFIG_GLOBAL", "/dev/null")
+            .stdout(Stdio::null())
+            .stderr(Stdio::null())
+            .status();
+        assert!(git.unwrap().success());
+        let port = (format!("--port={}", self.port), format!("--port={}", self.port + number));
+        let own = |word: &OsString| {
+            let instance = self.instance.as_os_str().as_bytes();
+            let word = replaced(word.as_bytes(), instance, folder.as_os_str().as_bytes());
+            OsString::from_vec(replaced(&word, port.0.as_bytes(), port.1.as_bytes()))
+        };
+        let command: Vec<OsString> = self.command.iter().map(own).collect();
+        Command::new(&command[0])
+            .args(&command[1..])
+            .env_clear()
+            .envs(self.environment.iter().map(|(name, value)| (name, own(value))))
+            .current_dir(folder.join("project"))
+            .stdin(Stdio::null())
+            .stdout(Stdio::null())
+            .stderr(Stdio::null())
+            .spawn()
+            .unwrap()
+    }
+}
+
+fn replaced(text: &[u8], old: &[u8], new: &[u8]) -> Vec<u8> {
+    match text.windows(old.len()).position(|part| part == old) {
+        Some(at) => [&text[..at], new, &text[at + old.len()..]].concat(),
+        None => text.to_vec(),
+    }
+}
+
+fn median(mut times: Vec<Duration>) -> Duration {
+    times.sort();
+    times[times.len() / 2]
+}
