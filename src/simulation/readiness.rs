@@ -1,10 +1,13 @@
-//! Whether the server can start simulations at all. Checked every five seconds: Webots may be installed anew, a disk or a
-//! display may go and come back.
+//! Whether the server can start simulations at all. Checked every five seconds: Webots may be installed again, a disk or a
+//! display may go and come back. The check does what a start does: it writes to the disk and starts a process.
 
+use std::io::Write;
 use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant, SystemTime};
 
+use nix::sys::statvfs::statvfs;
 use tokio::sync::watch;
 use which::which;
 
@@ -14,6 +17,12 @@ use crate::simulation::machine::display;
 
 /// Time between two checks.
 const PERIOD: Duration = Duration::from_secs(5);
+/// How much each check writes to the disk, in bytes. An empty file can be made on a full disk.
+const WRITTEN: usize = 1 << 20;
+/// The least step of the machine's clock that is logged.
+const CLOCK_STEP: Duration = Duration::from_mins(1);
+/// The least share of the disk's inodes that must be free: one in so many.
+const FREE_INODES: u64 = 50;
 
 /// Starts the checks. The channel holds why the server can start no simulation, in words for clients and administrators.
 /// `run` is the folder of this run.
@@ -22,8 +31,10 @@ pub fn watch(config: Arc<SimulationConfig>, run: PathBuf) -> watch::Receiver<Opt
     let (sender, problem) = watch::channel(None);
     actix_rt::spawn(async move {
         let mut period = actix_rt::time::interval(PERIOD);
+        let mut clocks = (Instant::now(), SystemTime::now());
         while !sender.is_closed() {
             period.tick().await;
+            clocks = log_clock_step(clocks);
             let (config, run) = (Arc::clone(&config), run.clone());
             let checked = actix_rt::task::spawn_blocking(move || check(&config, &run).err()).await;
             let Ok(found) = checked else {
@@ -44,22 +55,69 @@ pub fn watch(config: Arc<SimulationConfig>, run: PathBuf) -> watch::Receiver<Opt
     problem
 }
 
-/// Checks everything that each simulation needs. Blocks for two seconds at most.
+/// Logs a step of the machine's clock since these times. It stops no simulation and no start, but git may take
+/// certificates of forges for expired. Returns the present times.
+fn log_clock_step((instant, time): (Instant, SystemTime)) -> (Instant, SystemTime) {
+    let (now, expected) = (SystemTime::now(), time + instant.elapsed());
+    let (by, direction) =
+        now.duration_since(expected).map_or_else(|error| (error.duration(), "back"), |by| (by, "ahead"));
+    if by >= CLOCK_STEP {
+        log::warn!("the machine's clock was set {direction} by {} s", by.as_secs());
+    }
+    (Instant::now(), now)
+}
+
+/// Checks everything that each simulation needs. Blocks for two seconds, and for as long as the disk does.
 fn check(config: &SimulationConfig, run: &Path) -> Result<(), String> {
     if config.isolation == Isolation::Container {
         daemon_fault().map_or(Ok(()), Err)?;
     }
     webots_program(config)?;
     which("git").map_err(|_| "This simulation server has no git".to_owned())?;
-    let not_writable = |error| format!("This simulation server can't write in its cache: {error}");
-    std::fs::create_dir_all(run).map_err(not_writable)?;
-    tempfile::tempfile_in(run).map_err(not_writable)?;
+    start_process().map_err(|error| format!("This simulation server can't start processes: {error}"))?;
+    std::fs::create_dir_all(run).map_err(|error| not_writable(&error))?;
+    check_room(run, config.disk_reserve)?;
+    write(run)?;
     // Webots itself always needs a display. What stands in for it (`webots`) may not.
     if config.webots.is_none() && !config.xvfb && config.isolation != Isolation::Container {
         let display = display::effective(config.display.as_ref());
         display::check(&display).map_err(|error| format!("Webots can't open its window: {error}"))?;
     }
     Ok(())
+}
+
+/// Starts a process and waits for its end. It needs file handles for its input and output, too.
+fn start_process() -> std::io::Result<()> {
+    let mut command = Command::new("true");
+    command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null()).status().map(drop)
+}
+
+/// Checks that the disk of a folder has `reserve` MiB and some inodes left for users.
+fn check_room(folder: &Path, reserve: u64) -> Result<(), String> {
+    let disk = statvfs(folder).map_err(|error| not_writable(&error.into()))?;
+    let free = disk.blocks_available().saturating_mul(disk.fragment_size()) >> 20;
+    if free < reserve {
+        return Err(format!(
+            "This simulation server's disk is full: {free} MiB are left, diskReserve is {reserve} MiB"
+        ));
+    }
+    // Some file systems make inodes as they need them, and report none.
+    let (inodes, free) = (disk.files(), disk.files_available());
+    if free < inodes / FREE_INODES {
+        return Err(format!("This simulation server's disk is full: {free} of {inodes} inodes are left"));
+    }
+    Ok(())
+}
+
+/// Writes a file that has no name, and waits until the disk has it.
+fn write(folder: &Path) -> Result<(), String> {
+    // The error of `tempfile` names the folder; its kind is enough.
+    let mut file = tempfile::tempfile_in(folder).map_err(|error| not_writable(&error.kind().into()))?;
+    file.write_all(&vec![0; WRITTEN]).and_then(|()| file.sync_all()).map_err(|error| not_writable(&error))
+}
+
+fn not_writable(error: &std::io::Error) -> String {
+    format!("This simulation server can't write in its cache: {error}")
 }
 
 /// The program that is started for each client; in a container, that of its image.
