@@ -219,10 +219,12 @@ fn assemble(
     }
     let metrics = Metrics::new();
     let starts = outcome::counter(&metrics)?;
-    let problem = readiness::watch(Arc::clone(&config), run.path().to_owned());
+    let failed_starts = Arc::default();
+    let problem = readiness::watch(Arc::clone(&config), run.path().to_owned(), Arc::clone(&failed_starts));
     Ok(AppState {
         rules,
         problem,
+        failed_starts,
         places,
         load_monitor,
         readings,

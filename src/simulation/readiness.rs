@@ -12,6 +12,7 @@ use tokio::sync::watch;
 use which::which;
 
 use super::config::{Isolation, SimulationConfig};
+use super::failed_starts::FailedStarts;
 use crate::simulation::container::daemon_fault;
 use crate::simulation::machine::display;
 
@@ -25,9 +26,13 @@ const CLOCK_STEP: Duration = Duration::from_mins(1);
 const FREE_INODES: u64 = 50;
 
 /// Starts the checks. The channel holds why the server can start no simulation, in words for clients and administrators.
-/// `run` is the folder of this run.
+/// `run` is the folder of this run. Starts that failed before the server was ready again no longer count.
 #[must_use]
-pub fn watch(config: Arc<SimulationConfig>, run: PathBuf) -> watch::Receiver<Option<String>> {
+pub fn watch(
+    config: Arc<SimulationConfig>,
+    run: PathBuf,
+    failed_starts: Arc<FailedStarts>,
+) -> watch::Receiver<Option<String>> {
     let (sender, problem) = watch::channel(None);
     actix_rt::spawn(async move {
         let mut period = actix_rt::time::interval(PERIOD);
@@ -44,7 +49,10 @@ pub fn watch(config: Arc<SimulationConfig>, run: PathBuf) -> watch::Receiver<Opt
                 let is_new = *problem != found;
                 match &found {
                     Some(why) if is_new => log::error!("no simulation can be started: {why}"),
-                    None if is_new => log::info!("simulations can be started again"),
+                    None if is_new => {
+                        failed_starts.reset();
+                        log::info!("simulations can be started again");
+                    }
                     _ => {}
                 }
                 *problem = found;

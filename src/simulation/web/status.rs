@@ -49,6 +49,7 @@ impl StatusPage {
             share_idle_time: rules.share_idle_time,
             docker: Some(rules.docker),
             draining: server.is_draining(),
+            failed_starts: server.failed_starts.count(),
             problem: server.problem(),
         };
         Self {
@@ -81,10 +82,16 @@ pub fn gauges<'text>(server: &AppState, snapshot: &Snapshot) -> Vec<Gauge<'text>
         numbered.map(|(index, gpu)| (vec![index.to_string(), gpu.name.clone()], value(gpu))).collect()
     };
     let ready = f64::from(u8::from(server.problem().is_none()));
+    let failed_starts = f64::from(server.failed_starts.count());
     let draining = f64::from(u8::from(server.is_draining()));
     vec![
         Gauge::plain("webots_simulation_load_percent", "Load as /load tells it", server.load().percent()),
         Gauge::plain("webots_simulation_ready", "0 while no simulation can be started", ready),
+        Gauge::plain(
+            "webots_simulation_failed_starts",
+            "Starts in a row that failed for a reason of this server's own",
+            failed_starts,
+        ),
         Gauge::plain("webots_simulation_draining", "1 while no new clients are taken", draining),
         Gauge::plain("webots_simulation_places", "Simulations that fit", f64::from(instances.places)),
         Gauge {

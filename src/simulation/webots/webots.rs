@@ -209,9 +209,9 @@ impl Webots {
         let out_of_memory =
             out_of_memory.then(|| "The simulation has taken more memory than it may (limits.memory)".to_owned());
         let mut exit = match self.stopped_for.take().or(out_of_memory) {
-            Some(why) => Exit { clean: false, why: self.with_output(&why) },
-            None if *reason == ExitReason::Code(0) => Exit { clean: true, why: "Webots has ended".to_owned() },
-            None => Exit { clean: false, why: self.with_output(&format!("Webots {reason}")) },
+            Some(why) => self.failure(&why),
+            None if *reason == ExitReason::Code(0) => Exit::clean(),
+            None => self.failure(&format!("Webots {reason}")),
         };
         if exit.clean || self.listening {
             return self.exited(exit, ctx);
@@ -226,13 +226,13 @@ impl Webots {
             .into_actor(self)
             .map(move |hint, this, ctx| {
                 let hint = hint.ok().flatten().map(|hint| format!(" Note: {hint}.")).unwrap_or_default();
-                this.exited(Exit { clean: false, why: exit.why.clone() + &hint }, ctx);
+                this.exited(Exit { why: format!("{}{hint}", exit.why), ..exit }, ctx);
             })
             .spawn(ctx);
     }
 
     fn not_started(&mut self, why: &str, ctx: &mut Context<Self>) {
-        self.exited(Exit { clean: false, why: why.to_owned() }, ctx);
+        self.exited(self.failure(why), ctx);
     }
 
     fn exited(&mut self, exit: Exit, ctx: &mut Context<Self>) {
@@ -240,10 +240,10 @@ impl Webots {
         ctx.stop();
     }
 
-    /// Adds the last lines of the output, in which Webots mostly says what is wrong.
-    fn with_output(&self, why: &str) -> String {
-        let lines = self.tail.lines();
-        if lines.is_empty() { format!("{why}.") } else { format!("{why}. Its last output: {}", lines.join(" | ")) }
+    /// An end that is not in order. What containers run is made by their project.
+    fn failure(&self, why: &str) -> Exit {
+        let why = format!("{why}{}", self.tail.last_words(&self.spec.project.instance.project()));
+        Exit { clean: false, own: !self.listening && self.spec.containers.is_none(), why }
     }
 
     fn tell(&mut self, event: WebotsEvent) {
