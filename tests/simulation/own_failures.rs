@@ -9,9 +9,9 @@ use serde_json::Value;
 use super::scene::{DEMO, arm};
 use crate::support::client::Client;
 use crate::support::git::{Forge, world};
-use crate::support::program::{Server, simulation_server};
+use crate::support::program::{Server, session_server, simulation_server};
 use crate::support::webots::Webots;
-use crate::support::http;
+use crate::support::{http, until};
 
 async fn failed_starts(server: &Server) -> u64 {
     let page: Value = http::get(&server.url("/status")).await.json();
@@ -41,6 +41,52 @@ async fn a_client_whose_start_fails_for_the_servers_reason_is_sent_elsewhere_and
     std::fs::write(&repaired, "").unwrap();
     Client::start(&server, &arm()).await.until("webots:").await;
     assert_eq!(failed_starts(&server).await, 0);
+}
+
+#[actix_rt::test]
+async fn a_black_hole_takes_a_handful_of_clients_and_not_a_class() {
+    let (forge, folder) = (Forge::with_arm(), tempfile::tempdir().unwrap());
+    let repaired = folder.path().join("repaired");
+    let broken = Webots::script(&format!("[ -e {} ] || exit 3\n{DEMO} \"$@\" & wait", repaired.display()));
+    let webots = Webots::launcher();
+    let healthy = simulation_server(&webots.path(), forge.path(), 12).start().await;
+    let hole = simulation_server(&broken.path(), forge.path(), 12).set("isolation", "none").start().await;
+    // What else runs on this machine must not close the fleet.
+    let servers = [healthy.address(), hole.address()];
+    let session = session_server(&servers).set("loadThreshold", 1000).start().await;
+    let status = async || -> Value { http::get(&session.url("/status")).await.json() };
+    let state = |page: &Value, one: usize| page["servers"][one]["state"].as_str().unwrap().to_owned();
+    until("both work", async || {
+        let page = status().await;
+        state(&page, 0) == "up" && state(&page, 1) == "up"
+    })
+    .await;
+    let (mut running, mut failures) = (Vec::new(), 0);
+    while running.len() < 10 {
+        let given = http::get(&session.url("/session")).await.text();
+        let mut client = Client::connect(&format!("{given}/client")).await;
+        client.send(&serde_json::json!({"start": {"url": arm()}}).to_string()).await;
+        loop {
+            let text = client.until("").await;
+            if text.starts_with("webots:") {
+                running.push(client);
+                break;
+            } else if text.starts_with("loading: Error:") {
+                failures += 1;
+                assert_eq!(client.closed().await, Some(1013), "{text}");
+                break;
+            }
+        }
+        assert!(failures < 6, "{}", status().await);
+    }
+    assert!(failures >= 3, "the black hole got nobody: {failures}");
+    let page = status().await;
+    assert!(page["servers"][1]["error"].as_str().is_some_and(|why| why.contains("others are preferred")), "{page}");
+    assert!(session.log().contains("failed for a reason of its own; others are preferred"), "{}", session.log());
+    // Who comes by itself shows that it works again.
+    std::fs::write(&repaired, "").unwrap();
+    Client::start(&hole, &arm()).await.until("webots:").await;
+    until("it is as good as others", async || status().await["servers"][1]["error"].is_null()).await;
 }
 
 /// What a client hears of a start that fails.
