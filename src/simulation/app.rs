@@ -220,7 +220,8 @@ fn assemble(
     let metrics = Metrics::new();
     let starts = outcome::counter(&metrics)?;
     let failed_starts = Arc::default();
-    let problem = readiness::watch(Arc::clone(&config), run.path().to_owned(), Arc::clone(&failed_starts));
+    let problem =
+        readiness::watch(Arc::clone(&config), run.path().to_owned(), readings.clone(), Arc::clone(&failed_starts));
     Ok(AppState {
         rules,
         problem,

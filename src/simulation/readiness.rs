@@ -14,7 +14,7 @@ use which::which;
 use super::config::{Isolation, SimulationConfig};
 use super::failed_starts::FailedStarts;
 use crate::simulation::container::daemon_fault;
-use crate::simulation::machine::display;
+use crate::simulation::machine::{Readings, display};
 
 /// Time between two checks.
 const PERIOD: Duration = Duration::from_secs(5);
@@ -31,6 +31,7 @@ const FREE_INODES: u64 = 50;
 pub fn watch(
     config: Arc<SimulationConfig>,
     run: PathBuf,
+    readings: watch::Receiver<Arc<Readings>>,
     failed_starts: Arc<FailedStarts>,
 ) -> watch::Receiver<Option<String>> {
     let (sender, problem) = watch::channel(None);
@@ -40,8 +41,9 @@ pub fn watch(
         while !sender.is_closed() {
             period.tick().await;
             clocks = log_clock_step(clocks);
+            let gpus = check_gpus(&config, &readings.borrow());
             let (config, run) = (Arc::clone(&config), run.clone());
-            let checked = actix_rt::task::spawn_blocking(move || check(&config, &run).err()).await;
+            let checked = actix_rt::task::spawn_blocking(move || check(&config, &run).and(gpus).err()).await;
             let Ok(found) = checked else {
                 continue;
             };
@@ -90,6 +92,20 @@ fn check(config: &SimulationConfig, run: &Path) -> Result<(), String> {
     if config.webots.is_none() && !config.xvfb && config.isolation != Isolation::Container {
         let display = display::effective(config.display.as_ref());
         display::check(&display).map_err(|error| format!("Webots can't open its window: {error}"))?;
+    }
+    Ok(())
+}
+
+/// Checks that there are GPUs and none is lost, where they are required.
+fn check_gpus(config: &SimulationConfig, readings: &Readings) -> Result<(), String> {
+    if !config.require_gpu {
+        return Ok(());
+    }
+    if let Some(problem) = &readings.gpu_problem {
+        return Err(format!("This simulation server requires its GPUs (requireGpu), but {problem}"));
+    }
+    if readings.gpus.is_empty() {
+        return Err("This simulation server requires a GPU (requireGpu), but sees none".to_owned());
     }
     Ok(())
 }

@@ -147,6 +147,9 @@ pub struct SimulationConfig {
     /// How much room the disk of `cacheDir` must have left for new simulations, in MiB; 0: any. Default: 512.
     #[serde(default = "default_disk_reserve", deserialize_with = "whole::<0, 100_000_000, _, _>")]
     pub disk_reserve: u64,
+    /// Whether the server is ready only while it sees GPUs and none is lost. Default: false.
+    #[serde(default)]
+    pub require_gpu: bool,
     /// The display that Webots opens its window on. Default: the environment variable `DISPLAY`, else `:0`.
     #[serde(default)]
     pub display: Option<DisplayName>,

@@ -27,6 +27,9 @@ pub struct StatusPage {
     pub machine: Machine,
     /// The newest readings of its GPUs.
     pub gpus: Vec<Gpu>,
+    /// What is wrong with the GPUs, if some have answered and don't any more.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub gpu_problem: Option<String>,
     /// Where Webots' own viewer can be had from this server.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub viewer: Option<&'static str>,
@@ -59,6 +62,7 @@ impl StatusPage {
             host: readings.host.clone(),
             machine: readings.machine,
             gpus: readings.gpus.clone(),
+            gpu_problem: readings.gpu_problem.clone(),
             viewer: webots_viewer::folder(&server.config).map(|_| webots_viewer::PATH),
             simulations: snapshot.simulations,
         }
@@ -104,6 +108,11 @@ pub fn gauges<'text>(server: &AppState, snapshot: &Snapshot) -> Vec<Gauge<'text>
         Gauge::plain("webots_machine_memory_percent", "Memory in use", machine.memory),
         Gauge::plain("webots_machine_swap_percent", "Swap in use", machine.swap),
         Gauge::plain("webots_machine_disk_percent", "Disk in use where the cache is", machine.disk),
+        Gauge::plain(
+            "webots_machine_gpu_lost",
+            "1 while GPUs have answered and some or all don't any more",
+            f64::from(u8::from(readings.gpu_problem.is_some())),
+        ),
         Gauge {
             name: "webots_machine_gpu_compute_percent",
             help: "GPU: time in which a kernel ran",
