@@ -28,6 +28,8 @@ pub fn excerpt(text: &str, most: usize) -> String {
     excerpt
 }
 
+/// What a path in a text may be between.
+const QUOTES: [char; 3] = ['\'', '"', '`'];
 /// What ends a path in a text, besides white space.
 const PATH_ENDS: &str = "'\"`,;:<>|";
 
@@ -55,7 +57,10 @@ pub fn without_paths(text: &str) -> String {
     let mut rest = text;
     while let Some(at) = rest.find('/') {
         let (before, from) = rest.split_at(at);
-        let end = from.find(|letter: char| letter.is_whitespace() || PATH_ENDS.contains(letter)).unwrap_or(from.len());
+        // In quotes, a path may have spaces.
+        let quote = before.chars().next_back().filter(|letter| QUOTES.contains(letter));
+        let ends = |letter: char| letter.is_whitespace() || PATH_ENDS.contains(letter);
+        let end = quote.and_then(|quote| from.find(quote)).or_else(|| from.find(ends)).unwrap_or(from.len());
         let (path, after) = from.split_at(end);
         shown.push_str(before);
         let is_url = path.starts_with("//") && before.ends_with(':') && !before.ends_with("file:");
@@ -96,6 +101,7 @@ mod tests {
         for (text, shown) in [
             ("can't write /var/cache/run/instance-a1: full", "can't write instance-a1: full"),
             ("fatal: '/srv/git/arm.git' is none.", "fatal: 'arm.git' is none."),
+            ("at \"/home/a b/c d/webots\". Set", "at \"webots\". Set"),
             ("file:/srv/git/arm.git and file:///srv/git/leg.git", "file:arm.git and file:leg.git"),
             ("at /opt/webots/. Its --log=/a/b.", "at webots. Its --log=b."),
             ("PATH=/usr/bin:/bin", "PATH=bin:bin"),

@@ -18,6 +18,8 @@ use crate::simulation::machine::{Readings, display};
 
 /// Time between two checks.
 const PERIOD: Duration = Duration::from_secs(5);
+/// The same while the server is not ready.
+const PERIOD_WHILE_NOT_READY: Duration = Duration::from_secs(1);
 /// How much each check writes to the disk, in bytes. An empty file can be made on a full disk.
 const WRITTEN: usize = 1 << 20;
 /// The least step of the machine's clock that is logged.
@@ -34,35 +36,42 @@ pub fn watch(
     readings: watch::Receiver<Arc<Readings>>,
     failed_starts: Arc<FailedStarts>,
 ) -> watch::Receiver<Option<String>> {
+    // The first check comes before the first client.
+    let first = check_gpus(&config, &readings.borrow()).and_then(|()| check(&config, &run)).err();
     let (sender, problem) = watch::channel(None);
+    publish(&sender, first, &failed_starts);
     actix_rt::spawn(async move {
-        let mut period = actix_rt::time::interval(PERIOD);
         let mut clocks = (Instant::now(), SystemTime::now());
         while !sender.is_closed() {
-            period.tick().await;
+            let pause = if sender.borrow().is_some() { PERIOD_WHILE_NOT_READY } else { PERIOD };
+            actix_rt::time::sleep(pause).await;
             clocks = log_clock_step(clocks);
             let gpus = check_gpus(&config, &readings.borrow());
             let (config, run) = (Arc::clone(&config), run.clone());
-            let checked = actix_rt::task::spawn_blocking(move || check(&config, &run).and(gpus).err()).await;
-            let Ok(found) = checked else {
-                continue;
-            };
-            sender.send_if_modified(|problem| {
-                let is_new = *problem != found;
-                match &found {
-                    Some(why) if is_new => log::error!("no simulation can be started: {why}"),
-                    None if is_new => {
-                        failed_starts.reset();
-                        log::info!("simulations can be started again");
-                    }
-                    _ => {}
-                }
-                *problem = found;
-                is_new
-            });
+            let checked = actix_rt::task::spawn_blocking(move || gpus.and_then(|()| check(&config, &run)).err()).await;
+            if let Ok(found) = checked {
+                publish(&sender, found, &failed_starts);
+            }
         }
     });
     problem
+}
+
+/// Publishes what a check has found, and logs it if it is new.
+fn publish(sender: &watch::Sender<Option<String>>, found: Option<String>, failed_starts: &FailedStarts) {
+    sender.send_if_modified(|problem| {
+        let is_new = *problem != found;
+        match &found {
+            Some(why) if is_new => log::error!("no simulation can be started: {why}"),
+            None if is_new => {
+                failed_starts.reset();
+                log::info!("simulations can be started again");
+            }
+            _ => {}
+        }
+        *problem = found;
+        is_new
+    });
 }
 
 /// Logs a step of the machine's clock since these times. It stops no simulation and no start, but git may take
@@ -120,15 +129,13 @@ fn start_process() -> std::io::Result<()> {
 fn check_room(folder: &Path, reserve: u64) -> Result<(), String> {
     let disk = statvfs(folder).map_err(|error| not_writable(&error.into()))?;
     let free = disk.blocks_available().saturating_mul(disk.fragment_size()) >> 20;
+    // Without the numbers that change with each check, the reason is logged once.
     if free < reserve {
-        return Err(format!(
-            "This simulation server's disk is full: {free} MiB are left, diskReserve is {reserve} MiB"
-        ));
+        return Err(format!("This simulation server's disk is full: less than {reserve} MiB are left (diskReserve)"));
     }
     // Some file systems make inodes as they need them, and report none.
-    let (inodes, free) = (disk.files(), disk.files_available());
-    if free < inodes / FREE_INODES {
-        return Err(format!("This simulation server's disk is full: {free} of {inodes} inodes are left"));
+    if disk.files_available() < disk.files() / FREE_INODES {
+        return Err("This simulation server's disk is full: less than 2 % of its inodes are left".to_owned());
     }
     Ok(())
 }
@@ -163,6 +170,7 @@ pub fn webots_program(config: &SimulationConfig) -> Result<PathBuf, String> {
         return Err(format!("This simulation server does not know where Webots is installed. {how}."));
     };
     let program = std::path::absolute(&program).unwrap_or(program);
-    which(&program)
-        .map_err(|_| format!("This simulation server has no Webots that it can run at {}. {how}.", program.display()))
+    which(&program).map_err(|_| {
+        format!("This simulation server has no Webots that it can run at \"{}\". {how}.", program.display())
+    })
 }

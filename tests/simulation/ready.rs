@@ -188,7 +188,7 @@ async fn a_missing_webots_or_xvfb_is_told_with_what_to_do() {
     let forge = Forge::with_arm();
     let server = simulation_server(Path::new("/nowhere/webots"), forge.path(), 1).start().await;
     let told = Client::start(&server, &arm()).await.until("loading: Error:").await;
-    assert!(told.contains("has no Webots that it can run at webots") && told.contains("webotsHome"), "{told}");
+    assert!(told.contains("has no Webots that it can run at \"webots\"") && told.contains("webotsHome"), "{told}");
     let webots = Webots::launcher();
     let git = tempfile::tempdir().unwrap();
     for program in ["git", "bash", "env", "sh"] {
