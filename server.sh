@@ -9,7 +9,7 @@ set -u
 
 readonly USAGE='usage: ./server.sh start|stop|restart|status [NAME]
 
-  start    builds the programs if needed, starts the servers of NAME and waits until they answer
+  start    builds the programs if needed, starts the servers of NAME that do not run and waits until they answer
   stop     ends the servers of NAME; without NAME, all that run
   restart  stops and starts the servers of NAME; without NAME, all that run
   status   tells what runs, and where: exit code 0 if it does, 3 if not
@@ -96,24 +96,31 @@ launch() { # SERVER
 }
 
 start() { # NAME
-    local server pid others
+    local server pid others missing=() started=()
     for server in $(servers "$1"); do
-        pid=$(pid_of "$server") &&
-            fail 1 "the ${server%/*} server of $1 already runs (process $pid); './server.sh restart $1' starts it anew"
+        if pid=$(pid_of "$server"); then
+            others+="the ${server%/*} server of $1 already runs (process $pid)"$'\n'
+        else
+            missing+=("$server")
+        fi
     done
+    ((${#missing[@]} > 0)) || fail 1 "${others%$'\n'}; './server.sh restart $1' starts it anew"
+    printf %s "${others-}"
     publish "$1" || fail 1 "no git repository could be made of config/$1"
-    for server in $(servers "$1"); do
+    for server in "${missing[@]}"; do
+        started=("$server" "${started[@]}")
         launch "$server" && continue
-        stop "$1" >/dev/null
+        stop "$1" "${started[@]}" >/dev/null
         others=$(running)
         [[ -z $others ]] || echo "Of this project, this runs already: ${others//$'\n'/, }" >&2
         exit 1
     done
 }
 
-stop() { # NAME
+stop() { # NAME [SERVER...]; without SERVER, all of NAME
     local server pid limit outcome nothing=true
-    for server in "session/$1" "simulation/$1"; do
+    (($# > 1)) || set -- "$1" "session/$1" "simulation/$1"
+    for server in "${@:2}"; do
         if pid=$(pid_of "$server"); then
             limit=$(setting "$server" stop) outcome=stopped nothing=false
             kill -TERM "$pid"

@@ -24,7 +24,7 @@
 //!
 //! Each server also has a folder `config` (every key), its `app` (start and end) and its `state` (what its paths share). Files
 //! of `simulation` are the wire [`protocol`](simulation::protocol), the [`places`](simulation::places) that clients wait for,
-//! the `snapshot` of them, the `announcer` (key `notify`), `preflight` (`--check`) and `readiness` (`/health`).
+//! the `snapshot` of them, the `failed_starts`, the `announcer` (key `notify`), `preflight` (`--check`) and `readiness` (`/health`).
 //! The programs are in `src/bin`.
 //! Imports point down only, in the order that `tests/project/layering.rs` lists. `session` and `simulation` never see each
 //! other. A child never names its parent: it is given a `Recipient` of its events, which are defined in the child's file.

@@ -10,6 +10,14 @@ mod scenario;
 mod world;
 
 #[test]
+fn a_black_hole_takes_few_clients() {
+    for scenario in compare::hole_scenarios(&[5]) {
+        let [with, without] = compare::share_that_fails(&scenario);
+        assert!(with < without / 2.0, "{scenario:?}: {with:.1} % fail with ejection, {without:.1} % without");
+    }
+}
+
+#[test]
 fn no_rival_is_better_in_a_small_fleet() {
     for scenario in compare::scenarios(&[5], &[3.0]).into_iter().chain(compare::foreign_scenarios(&[5])) {
         let row = compare::compare(&scenario);

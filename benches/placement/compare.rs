@@ -27,7 +27,15 @@ pub(crate) fn scenarios(fleets: &[usize], refreshes: &[f64]) -> Vec<Scenario> {
             for arrivals in Arrivals::ALL {
                 for sessions in [Sessions::Exponential, Sessions::Heavy] {
                     for &refresh in refreshes {
-                        all.push(Scenario { arrivals, refresh, servers, sizes, sessions, foreign: Foreign::None });
+                        all.push(Scenario {
+                            arrivals,
+                            refresh,
+                            servers,
+                            sizes,
+                            sessions,
+                            foreign: Foreign::None,
+                            hole: false,
+                        });
                     }
                 }
             }
@@ -46,6 +54,24 @@ pub(crate) fn foreign_scenarios(fleets: &[usize]) -> Vec<Scenario> {
     all
 }
 
+/// Scenarios in which one server is a black hole: each start fails there at once.
+pub(crate) fn hole_scenarios(fleets: &[usize]) -> Vec<Scenario> {
+    let mut all = scenarios(fleets, &[1.0]);
+    all.retain(|scenario| scenario.sessions == Sessions::Exponential && scenario.sizes == Sizes::Equal);
+    for scenario in &mut all {
+        scenario.hole = true;
+    }
+    all
+}
+
+/// The shares of clients whose starts fail in a black hole, in percent: with ejection and without it.
+pub(crate) fn share_that_fails(scenario: &Scenario) -> [f64; 2] {
+    let servers = scenario.servers;
+    let with = mean(scenario, |seed| run(scenario, seed, &mut Own::new(servers, true)));
+    let without = mean(scenario, |seed| run(scenario, seed, &mut Own::without_ejection(servers)));
+    [with.failed, without.failed]
+}
+
 /// The mean outcome of a scenario over its seeds; a small fleet is left more to chance and needs more of them.
 pub(crate) fn mean(scenario: &Scenario, run: impl Fn(u64) -> Outcome) -> Outcome {
     let seeds = match scenario.servers {
@@ -58,6 +84,7 @@ pub(crate) fn mean(scenario: &Scenario, run: impl Fn(u64) -> Outcome) -> Outcome
         mean.highest += outcome.highest / seeds as f64;
         mean.overload += outcome.overload / seeds as f64;
         mean.refused += outcome.refused / seeds as f64;
+        mean.failed += outcome.failed / seeds as f64;
     }
     mean
 }

@@ -12,6 +12,7 @@ pub(crate) struct Seen {
     pub(crate) load: f64,
     pub(crate) present: u32,
     pub(crate) arrivals: u64,
+    pub(crate) failed_starts: u32,
 }
 
 /// A policy at work.
@@ -28,13 +29,20 @@ pub(crate) struct Own {
     start: Instant,
     /// Whether the servers tell of their instances, or of their load only.
     instances: bool,
+    /// Whether it is told of failed starts.
+    hears_of_failures: bool,
 }
 
 impl Own {
     pub(crate) fn new(servers: usize, instances: bool) -> Self {
         let mut fleet = Fleet::new(Policy::default());
         (0..servers).for_each(|server| fleet.add(server));
-        Self { fleet, start: Instant::now(), instances }
+        Self { fleet, start: Instant::now(), instances, hears_of_failures: true }
+    }
+
+    /// The same without the ejection of servers whose starts fail.
+    pub(crate) fn without_ejection(servers: usize) -> Self {
+        Self { hears_of_failures: false, ..Self::new(servers, true) }
     }
 
     /// Chooses among the servers that are eligible.
@@ -52,6 +60,9 @@ impl Dispatcher for Own {
         let instances = Instances { present: seen.present, places: 100_000, arrivals: seen.arrivals, accepting: true };
         let report = Report { load: seen.load, instances: self.instances.then_some(instances) };
         self.fleet.report(&server, self.at(now), report);
+        if self.hears_of_failures {
+            self.fleet.note_failures(&server, self.at(now), seen.failed_starts);
+        }
     }
 
     fn place(&mut self, now: f64) -> Option<usize> {

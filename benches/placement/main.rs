@@ -19,7 +19,8 @@ mod scenario;
 mod world;
 
 use compare::{
-    HIGHEST_TIE, OVERLOAD_TIE, POLICIES, REFUSED_TIE, Row, better_rivals, compare, foreign_scenarios, scenarios,
+    HIGHEST_TIE, OVERLOAD_TIE, POLICIES, REFUSED_TIE, Row, better_rivals, compare, foreign_scenarios, hole_scenarios,
+    scenarios, share_that_fails,
 };
 use scenario::{Arrivals, Outcome, Scenario, Sizes};
 use std::hint::black_box;
@@ -49,6 +50,7 @@ fn main() -> ExitCode {
     println!("\nThe same where other programs use the machines too, which does not decide whether this fails:\n");
     measure(&foreign);
     replicas::measure(if quick { &[5] } else { &[5, 50] }, if quick { &[1.0] } else { &[1.0, 3.0] });
+    black_hole(if quick { &[5] } else { &[5, 50] });
     speed();
     println!("\n{} scenarios in {:.0} s", plain.len() + foreign.len(), begin.elapsed().as_secs_f64());
     if lost == 0 { ExitCode::SUCCESS } else { ExitCode::FAILURE }
@@ -67,6 +69,16 @@ fn measure(scenarios: &[Scenario]) -> usize {
     }
     summary(scenarios, &rows);
     verdict(scenarios, &rows)
+}
+
+/// Prints which share of the clients fails where one server is a black hole.
+fn black_hole(fleets: &[usize]) {
+    println!("\nOne server fails each start after half a second. Clients whose starts fail, in %:\n");
+    println!("| servers | arrivals | with ejection | without |\n|---|---|---|---|");
+    for scenario in hole_scenarios(fleets) {
+        let [with, without] = share_that_fails(&scenario);
+        println!("| {} | {:?} | {with:.1} | {without:.1} |", scenario.servers, scenario.arrivals);
+    }
 }
 
 /// Spreads the scenarios over the cores; each is the same wherever it runs.

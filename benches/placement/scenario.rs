@@ -69,6 +69,8 @@ pub(crate) struct Scenario {
     pub(crate) sizes: Sizes,
     pub(crate) sessions: Sessions,
     pub(crate) foreign: Foreign,
+    /// Whether the first server is a black hole: each start fails there at once.
+    pub(crate) hole: bool,
 }
 
 /// What came of a run.
@@ -80,6 +82,8 @@ pub(crate) struct Outcome {
     pub(crate) overload: f64,
     /// The share of requests that were refused, in percent.
     pub(crate) refused: f64,
+    /// The share of requests whose starts failed in a black hole, in percent.
+    pub(crate) failed: f64,
 }
 
 /// One client, drawn before the run, so that every policy meets the same ones.

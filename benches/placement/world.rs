@@ -11,6 +11,8 @@ use std::collections::{BinaryHeap, VecDeque};
 const UNIT_COST: f64 = 2.0;
 /// Seconds until a new simulation needs all that it is going to need.
 const RAMP: f64 = 3.0;
+/// Seconds until a start in a black hole fails.
+const FAILS_AFTER: f64 = 0.5;
 
 /// One machine.
 struct Machine {
@@ -26,6 +28,9 @@ struct Machine {
     samples: VecDeque<f64>,
     /// The load of other programs.
     foreign: f64,
+    /// Whether each start fails here, and how many have in a row.
+    is_hole: bool,
+    failed_starts: u32,
 }
 
 impl Machine {
@@ -63,6 +68,7 @@ impl Machine {
             load: self.samples.iter().sum::<f64>() / self.samples.len() as f64,
             present: self.present,
             arrivals: self.arrivals,
+            failed_starts: self.failed_starts,
         }
     }
 }
@@ -72,6 +78,7 @@ impl Machine {
 enum Step {
     Comes,
     Leaves,
+    Fails,
 }
 
 /// Microseconds, so that events have an order.
@@ -84,7 +91,8 @@ pub(crate) fn run(scenario: &Scenario, seed: u64, dispatcher: &mut impl Dispatch
     let mut random = StdRng::seed_from_u64(seed);
     let mut machines = machines(scenario, &mut random);
     let room = |machine: &Machine| (THRESHOLD - machine.base) / machine.client_cost;
-    let clients = clients(scenario, machines.iter().map(room).sum(), &mut random);
+    let capacity = machines.iter().filter(|machine| !machine.is_hole).map(room).sum();
+    let clients = clients(scenario, capacity, &mut random);
     // The servers are asked in turn, each once per refresh.
     let mut asked = 0_usize;
     let mut order: Vec<usize> = (0..machines.len()).collect();
@@ -98,7 +106,7 @@ pub(crate) fn run(scenario: &Scenario, seed: u64, dispatcher: &mut impl Dispatch
     let mut events: BinaryHeap<Reverse<(u64, Step, usize, usize)>> = BinaryHeap::new();
     let mut next_client = 0;
     let mut next_sample = 1.0;
-    let mut refused = 0_u32;
+    let (mut refused, mut failed) = (0_u32, 0_u32);
     let mut highest = 0.0_f64;
     loop {
         let next_report = scenario.refresh * (asked + 1) as f64 / machines.len() as f64;
@@ -115,7 +123,15 @@ pub(crate) fn run(scenario: &Scenario, seed: u64, dispatcher: &mut impl Dispatch
             let (Client { weight, session, .. }, machine): (&Client, &mut Machine) =
                 (&clients[client], &mut machines[server]);
             let cost = weight * machine.client_cost;
-            if step == Step::Comes {
+            if step == Step::Comes && machine.is_hole {
+                machine.present += 1;
+                machine.arrivals += 1;
+                events.push(Reverse((micros(now + FAILS_AFTER), Step::Fails, client, server)));
+            } else if step == Step::Fails {
+                machine.present -= 1;
+                machine.failed_starts += 1;
+                failed += 1;
+            } else if step == Step::Comes {
                 machine.change(now, cost);
                 machine.present += 1;
                 machine.arrivals += 1;
@@ -158,6 +174,7 @@ pub(crate) fn run(scenario: &Scenario, seed: u64, dispatcher: &mut impl Dispatch
         highest,
         overload: 100.0 * overload / (HORIZON * machines.len() as f64),
         refused: 100.0 * f64::from(refused) / clients.len() as f64,
+        failed: 100.0 * f64::from(failed) / clients.len() as f64,
     }
 }
 
@@ -179,6 +196,8 @@ fn machines(scenario: &Scenario, random: &mut StdRng) -> Vec<Machine> {
                 starting: VecDeque::new(),
                 samples: VecDeque::new(),
                 foreign: 0.0,
+                is_hole: scenario.hole && i == 0,
+                failed_starts: 0,
             }
         })
         .collect()

@@ -64,8 +64,7 @@ pub async fn measure(verdict: &mut Verdict, levels: &[String], time: Duration) {
 
 /// Opens the monitor page's events, and reads them.
 async fn watch(server: &Server) -> actix_rt::task::JoinHandle<()> {
-    let answer =
-        awc::Client::builder().timeout(Duration::from_secs(10)).finish().get(server.url("/events")).send();
+    let answer = awc::Client::builder().timeout(Duration::from_secs(10)).finish().get(server.url("/events")).send();
     let mut answer = answer.await.unwrap();
     assert!(answer.status().is_success());
     answer.next().await.unwrap().unwrap();

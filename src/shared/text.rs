@@ -28,6 +28,11 @@ pub fn excerpt(text: &str, most: usize) -> String {
     excerpt
 }
 
+/// What a path in a text may be between.
+const QUOTES: [char; 3] = ['\'', '"', '`'];
+/// What ends a path in a text, besides white space.
+const PATH_ENDS: &str = "'\"`,;:<>|";
+
 /// Returns a text for a web client in one line, in which nothing begins a tag or a character reference of HTML.
 ///
 /// Webots' page puts such texts into `innerHTML`. Other clients show them as they are, so that the characters are replaced
@@ -43,8 +48,38 @@ pub fn client_text(text: &str) -> String {
     one_line(text).chars().map(harmless).collect()
 }
 
+/// Returns a text in which each absolute path is cut to its last name. URLs and relative paths stay as they are.
+///
+/// Texts for web clients pass through this: the paths of a machine are of no use to them.
+#[must_use]
+pub fn without_paths(text: &str) -> String {
+    let mut shown = String::with_capacity(text.len());
+    let mut rest = text;
+    while let Some(at) = rest.find('/') {
+        let (before, from) = rest.split_at(at);
+        // In quotes, a path may have spaces.
+        let quote = before.chars().next_back().filter(|letter| QUOTES.contains(letter));
+        let ends = |letter: char| letter.is_whitespace() || PATH_ENDS.contains(letter);
+        let end = quote.and_then(|quote| from.find(quote)).or_else(|| from.find(ends)).unwrap_or(from.len());
+        let (path, after) = from.split_at(end);
+        shown.push_str(before);
+        let is_url = path.starts_with("//") && before.ends_with(':') && !before.ends_with("file:");
+        let is_relative = before.ends_with(|letter: char| letter.is_alphanumeric() || ".-_~".contains(letter));
+        if is_url || is_relative || path == "/" {
+            shown.push_str(path);
+        } else {
+            shown.push_str(path.trim_end_matches(['/', '.']).rsplit('/').next().unwrap_or_default());
+            shown.push_str(path.get(path.trim_end_matches('.').len()..).unwrap_or_default());
+        }
+        rest = after;
+    }
+    shown + rest
+}
+
 #[cfg(test)]
 mod tests {
+    use proptest::prelude::*;
+
     use super::*;
 
     #[test]
@@ -59,6 +94,33 @@ mod tests {
         assert_eq!(excerpt("a\r\nBcc: x\u{7}\u{85}y", 500), "a  Bcc: x  y");
         let long = excerpt(&"\u{e9}".repeat(600), 500);
         assert_eq!((long.chars().count(), long.ends_with("\u{e9}...")), (503, true));
+    }
+
+    #[test]
+    fn paths_of_the_machine_are_cut_and_urls_are_not() {
+        for (text, shown) in [
+            ("can't write /var/cache/run/instance-a1: full", "can't write instance-a1: full"),
+            ("fatal: '/srv/git/arm.git' is none.", "fatal: 'arm.git' is none."),
+            ("at \"/home/a b/c d/webots\". Set", "at \"webots\". Set"),
+            ("file:/srv/git/arm.git and file:///srv/git/leg.git", "file:arm.git and file:leg.git"),
+            ("at /opt/webots/. Its --log=/a/b.", "at webots. Its --log=b."),
+            ("PATH=/usr/bin:/bin", "PATH=bin:bin"),
+            ("https://github.com/lab/arm/blob/main/worlds/a.wbt", "https://github.com/lab/arm/blob/main/worlds/a.wbt"),
+            ("ws://localhost:2000/client, worlds/a.wbt", "ws://localhost:2000/client, worlds/a.wbt"),
+            ("controllers/arm/arm.py, ./a/b ../c and/or 3 / 4", "controllers/arm/arm.py, ./a/b ../c and/or 3 / 4"),
+            ("Step 3/9 : fetching", "Step 3/9 : fetching"),
+        ] {
+            assert_eq!(without_paths(text), shown, "{text:?}");
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn no_folder_of_a_path_is_shown(before in "[a-z '(=]{0,9}[ '(=]", folders in "(/[a-z0-9.]{1,9}){1,5}", after in "[ a-z.]{0,9}") {
+            let path = format!("/secret{folders}/name");
+            let shown = without_paths(&format!("{before}{path}{after}"));
+            prop_assert!(!shown.contains("secret") && shown.contains("name"), "{}", shown);
+        }
     }
 
     #[test]

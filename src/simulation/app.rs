@@ -24,7 +24,7 @@ use crate::simulation::container::Containers;
 use crate::simulation::isolation::{Launcher, Watcher};
 use crate::simulation::machine::LoadMonitor;
 use crate::simulation::machine::UsageMonitor;
-use crate::simulation::process::{Guardian, Leftovers, PortFinder, RunDir};
+use crate::simulation::process::{Guardian, Leftovers, RunDir};
 use crate::simulation::web::configure;
 
 /// How often it is checked whether all simulations have ended.
@@ -215,15 +215,16 @@ fn assemble(
     }
     let usage = UsageMonitor::default();
     let system = |source| AppError::Unavailable(format!("the system can't start a thread: {source}"));
-    let watcher = Watcher::start(run.path().to_owned(), config.streaming_ports(), usage.clone()).map_err(system)?;
-    let (first, last) = config.streaming_ports().into_inner();
-    let port_finder = PortFinder::start(first..=*SimulationConfig::ports_from(last).end()).map_err(system)?;
+    let watcher = Watcher::start(run.path().to_owned(), &config, usage.clone()).map_err(system)?;
     let metrics = Metrics::new();
     let starts = outcome::counter(&metrics)?;
-    let problem = readiness::watch(Arc::clone(&config), run.path().to_owned());
+    let failed_starts = Arc::default();
+    let problem =
+        readiness::watch(Arc::clone(&config), run.path().to_owned(), readings.clone(), Arc::clone(&failed_starts));
     Ok(AppState {
         rules,
         problem,
+        failed_starts,
         places,
         load_monitor,
         readings,
@@ -242,7 +243,6 @@ fn assemble(
         live: Live::new(),
         usage,
         watcher,
-        port_finder,
         started: Instant::now(),
         config,
     })

@@ -6,6 +6,7 @@ pub mod checkout;
 pub mod client;
 pub mod config;
 pub mod container;
+pub mod failed_starts;
 mod isolation;
 pub mod machine;
 pub mod places;

@@ -18,11 +18,12 @@
 //! | `.` | Webots is alive |
 //! | `reset controller: NAME/FILE` | done |
 //!
-//! Webots' page puts every TEXT into `innerHTML`: it passes through [`client_text`] here, and nowhere else.
+//! Webots' page puts every TEXT into `innerHTML`: it passes through [`client_text`] here, and nowhere else,
+//! and through [`without_paths`].
 
 use serde_json::Value;
 
-use crate::shared::text::client_text;
+use crate::shared::text::{client_text, without_paths};
 
 /// A request of a client.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -98,13 +99,20 @@ pub fn of_project(text: &str) -> String {
 /// Progress, in words.
 #[must_use]
 pub fn loading(text: &str) -> String {
-    format!("loading: {}", client_text(text))
+    format!("loading: {}", client_text(&without_paths(text)))
 }
 
 /// Why a simulation failed.
 #[must_use]
 pub fn error(text: &str) -> String {
-    format!("loading: Error: {}", client_text(text))
+    loading(&format!("Error: {text}"))
+}
+
+/// Why a simulation can't start here, where another server may take its client.
+#[must_use]
+pub fn elsewhere(why: &str) -> String {
+    let why = why.trim_end_matches('.');
+    error(&format!("{why}. Connect again: the session server chooses another simulation server"))
 }
 
 /// How many clients are ahead in the waiting line: once for programs, and once in words, since Webots' page shows only

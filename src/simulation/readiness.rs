@@ -1,65 +1,158 @@
-//! Whether the server can start simulations at all. Checked every five seconds: Webots may be installed anew, a disk or a
-//! display may go and come back.
+//! Whether the server can start simulations at all. Checked every five seconds: Webots may be installed again, a disk or a
+//! display may go and come back. The check does what a start does: it writes to the disk and starts a process.
 
+use std::io::Write;
 use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant, SystemTime};
 
+use nix::sys::statvfs::statvfs;
 use tokio::sync::watch;
 use which::which;
 
 use super::config::{Isolation, SimulationConfig};
+use super::failed_starts::FailedStarts;
 use crate::simulation::container::daemon_fault;
-use crate::simulation::machine::display;
+use crate::simulation::machine::{Readings, display};
 
 /// Time between two checks.
 const PERIOD: Duration = Duration::from_secs(5);
+/// The same while the server is not ready.
+const PERIOD_WHILE_NOT_READY: Duration = Duration::from_secs(1);
+/// How much each check writes to the disk, in bytes. An empty file can be made on a full disk.
+const WRITTEN: usize = 1 << 20;
+/// The least step of the machine's clock that is logged.
+const CLOCK_STEP: Duration = Duration::from_mins(1);
+/// The least share of the disk's inodes that must be free: one in so many.
+const FREE_INODES: u64 = 50;
 
 /// Starts the checks. The channel holds why the server can start no simulation, in words for clients and administrators.
-/// `run` is the folder of this run.
+/// `run` is the folder of this run. Starts that failed before the server was ready again no longer count.
 #[must_use]
-pub fn watch(config: Arc<SimulationConfig>, run: PathBuf) -> watch::Receiver<Option<String>> {
+pub fn watch(
+    config: Arc<SimulationConfig>,
+    run: PathBuf,
+    readings: watch::Receiver<Arc<Readings>>,
+    failed_starts: Arc<FailedStarts>,
+) -> watch::Receiver<Option<String>> {
+    // The first check comes before the first client.
+    let first = check_gpus(&config, &readings.borrow()).and_then(|()| check(&config, &run)).err();
     let (sender, problem) = watch::channel(None);
+    publish(&sender, first, &failed_starts);
     actix_rt::spawn(async move {
-        let mut period = actix_rt::time::interval(PERIOD);
+        let mut clocks = (Instant::now(), SystemTime::now());
         while !sender.is_closed() {
-            period.tick().await;
+            let pause = if sender.borrow().is_some() { PERIOD_WHILE_NOT_READY } else { PERIOD };
+            actix_rt::time::sleep(pause).await;
+            clocks = log_clock_step(clocks);
+            let gpus = check_gpus(&config, &readings.borrow());
             let (config, run) = (Arc::clone(&config), run.clone());
-            let checked = actix_rt::task::spawn_blocking(move || check(&config, &run).err()).await;
-            let Ok(found) = checked else {
-                continue;
-            };
-            sender.send_if_modified(|problem| {
-                let is_new = *problem != found;
-                match &found {
-                    Some(why) if is_new => log::error!("no simulation can be started: {why}"),
-                    None if is_new => log::info!("simulations can be started again"),
-                    _ => {}
-                }
-                *problem = found;
-                is_new
-            });
+            let checked = actix_rt::task::spawn_blocking(move || gpus.and_then(|()| check(&config, &run)).err()).await;
+            if let Ok(found) = checked {
+                publish(&sender, found, &failed_starts);
+            }
         }
     });
     problem
 }
 
-/// Checks everything that each simulation needs. Blocks for two seconds at most.
+/// Publishes what a check has found, and logs it if it is new.
+fn publish(sender: &watch::Sender<Option<String>>, found: Option<String>, failed_starts: &FailedStarts) {
+    sender.send_if_modified(|problem| {
+        let is_new = *problem != found;
+        match &found {
+            Some(why) if is_new => log::error!("no simulation can be started: {why}"),
+            None if is_new => {
+                failed_starts.reset();
+                log::info!("simulations can be started again");
+            }
+            _ => {}
+        }
+        *problem = found;
+        is_new
+    });
+}
+
+/// Logs a step of the machine's clock since these times. It stops no simulation and no start, but git may take
+/// certificates of forges for expired. Returns the present times.
+fn log_clock_step((instant, time): (Instant, SystemTime)) -> (Instant, SystemTime) {
+    let (now, expected) = (SystemTime::now(), time + instant.elapsed());
+    let (by, direction) =
+        now.duration_since(expected).map_or_else(|error| (error.duration(), "back"), |by| (by, "ahead"));
+    if by >= CLOCK_STEP {
+        log::warn!("the machine's clock was set {direction} by {} s", by.as_secs());
+    }
+    (Instant::now(), now)
+}
+
+/// Checks everything that each simulation needs. Blocks for two seconds, and for as long as the disk does.
 fn check(config: &SimulationConfig, run: &Path) -> Result<(), String> {
     if config.isolation == Isolation::Container {
         daemon_fault().map_or(Ok(()), Err)?;
     }
     webots_program(config)?;
     which("git").map_err(|_| "This simulation server has no git".to_owned())?;
-    let not_writable = |error| format!("This simulation server can't write in its cache: {error}");
-    std::fs::create_dir_all(run).map_err(not_writable)?;
-    tempfile::tempfile_in(run).map_err(not_writable)?;
+    start_process().map_err(|error| format!("This simulation server can't start processes: {error}"))?;
+    std::fs::create_dir_all(run).map_err(|error| not_writable(&error))?;
+    check_room(run, config.disk_reserve)?;
+    write(run)?;
     // Webots itself always needs a display. What stands in for it (`webots`) may not.
     if config.webots.is_none() && !config.xvfb && config.isolation != Isolation::Container {
         let display = display::effective(config.display.as_ref());
         display::check(&display).map_err(|error| format!("Webots can't open its window: {error}"))?;
     }
     Ok(())
+}
+
+/// Checks that there are GPUs and none is lost, where they are required.
+fn check_gpus(config: &SimulationConfig, readings: &Readings) -> Result<(), String> {
+    if !config.require_gpu {
+        return Ok(());
+    }
+    if let Some(problem) = &readings.gpu_problem {
+        return Err(format!("This simulation server requires its GPUs (requireGpu), but {problem}"));
+    }
+    if readings.gpus.is_empty() {
+        return Err("This simulation server requires a GPU (requireGpu), but sees none".to_owned());
+    }
+    Ok(())
+}
+
+/// Starts a process and waits for its end. It needs file handles for its input and output, too.
+fn start_process() -> std::io::Result<()> {
+    let mut command = Command::new("true");
+    match command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null()).status() {
+        // It was the new process that did not find the program.
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(()),
+        status => status.map(drop),
+    }
+}
+
+/// Checks that the disk of a folder has `reserve` MiB and some inodes left for users.
+fn check_room(folder: &Path, reserve: u64) -> Result<(), String> {
+    let disk = statvfs(folder).map_err(|error| not_writable(&error.into()))?;
+    let free = disk.blocks_available().saturating_mul(disk.fragment_size()) >> 20;
+    // Without the numbers that change with each check, the reason is logged once.
+    if free < reserve {
+        return Err(format!("This simulation server's disk is full: less than {reserve} MiB are left (diskReserve)"));
+    }
+    // Some file systems make inodes as they need them, and report none.
+    if disk.files_available() < disk.files() / FREE_INODES {
+        return Err("This simulation server's disk is full: less than 2 % of its inodes are left".to_owned());
+    }
+    Ok(())
+}
+
+/// Writes a file that has no name, and waits until the disk has it.
+fn write(folder: &Path) -> Result<(), String> {
+    // The error of `tempfile` names the folder; its kind is enough.
+    let mut file = tempfile::tempfile_in(folder).map_err(|error| not_writable(&error.kind().into()))?;
+    file.write_all(&vec![0; WRITTEN]).and_then(|()| file.sync_all()).map_err(|error| not_writable(&error))
+}
+
+fn not_writable(error: &std::io::Error) -> String {
+    format!("This simulation server can't write in its cache: {error}")
 }
 
 /// The program that is started for each client; in a container, that of its image.
@@ -81,6 +174,7 @@ pub fn webots_program(config: &SimulationConfig) -> Result<PathBuf, String> {
         return Err(format!("This simulation server does not know where Webots is installed. {how}."));
     };
     let program = std::path::absolute(&program).unwrap_or(program);
-    which(&program)
-        .map_err(|_| format!("This simulation server has no Webots that it can run at {}. {how}.", program.display()))
+    which(&program).map_err(|_| {
+        format!("This simulation server has no Webots that it can run at \"{}\". {how}.", program.display())
+    })
 }

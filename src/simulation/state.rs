@@ -7,8 +7,8 @@ use actix::prelude::*;
 use tokio::sync::watch;
 
 use super::config::SimulationConfig;
+use super::failed_starts::FailedStarts;
 use super::places::Places;
-use super::readiness;
 use crate::shared::domain::Load;
 use crate::shared::domain::ProjectUrl;
 use crate::shared::domain::Rules;
@@ -23,7 +23,7 @@ use crate::simulation::container::Containers;
 use crate::simulation::isolation::{Launcher, Watcher};
 use crate::simulation::machine::UsageMonitor;
 use crate::simulation::machine::{LoadMonitor, Readings};
-use crate::simulation::process::{PortFinder, RunDir};
+use crate::simulation::process::RunDir;
 
 /// The shared state.
 pub struct AppState {
@@ -39,10 +39,8 @@ pub struct AppState {
     pub readings: watch::Receiver<Arc<Readings>>,
     /// Launches simulations at a level of isolation.
     pub launcher: Arc<Launcher>,
-    /// Watches over what simulations take.
+    /// Watches over simulations: what they take, and where they listen.
     pub watcher: Watcher,
-    /// Finds the ports on which they listen.
-    pub port_finder: PortFinder,
     /// Makes the containers in which simulations run, where they do.
     pub containers: Option<Arc<Containers>>,
     /// Checks worlds out.
@@ -53,6 +51,8 @@ pub struct AppState {
     pub phase: watch::Receiver<Phase>,
     /// Why the server can start no simulation, if so.
     pub problem: watch::Receiver<Option<String>>,
+    /// The last starts that failed for a reason of this server's own.
+    pub failed_starts: Arc<FailedStarts>,
     /// Takes requests to drain.
     pub requests: tokio::sync::mpsc::Sender<Request>,
     /// The thread on which the actors of Webots run.
@@ -94,23 +94,19 @@ impl AppState {
         *self.phase.borrow() != Phase::Open
     }
 
-    /// Checks whether a world may run here now: its URL, the rules, and that Webots is there, so that nobody waits for a
-    /// checkout in vain.
+    /// Checks whether a world may run here now: its URL, the rules, and that the server takes clients.
     ///
     /// # Errors
     /// The reason why not, in words for the client.
     pub fn admit(&self, url: &str) -> Result<ProjectUrl, String> {
         let world = ProjectUrl::parse(url).map_err(|wrong| wrong.to_string())?;
         if self.is_draining() {
-            let why = "This simulation server is about to end, and takes no new clients: connect again, and the session server \
-                       chooses another one";
-            return Err(why.to_owned());
+            return Err("This simulation server is about to end, and takes no new clients".to_owned());
         }
         if let Some(problem) = self.problem() {
             return Err(problem);
         }
         self.rules.admit(&world, self.load()).map_err(|refusal| refusal.to_string())?;
-        readiness::webots_program(&self.config)?;
         Ok(world)
     }
 

@@ -12,13 +12,13 @@ let viewer;
 let countdown;
 let wanted;
 let patience;
-/** Until when another simulation server is asked for, once one could not take the client; and the timer for the next. */
-let askUntil;
+/** How often another simulation server was asked for since the form was sent; and the timer for the next time. */
+let askedAgain = 0;
 let asking;
 
-/** How long, and how often, another simulation server is asked for, in milliseconds. */
-const ASK_FOR = 15_000;
-const ASK_EVERY = 1000;
+/** How often another simulation server is asked for at most; and before the first time, in milliseconds, doubled each time. */
+const ASK_AGAIN = 3;
+const FIRST_PAUSE = 1000;
 
 /* the light */
 
@@ -102,14 +102,14 @@ function start(event) {
   clearSteps();
   clearStage('The simulation appears here.');
   find('problem').hidden = true;
-  askUntil = undefined;
+  askedAgain = 0;
   ask(find('url').value.trim());
 }
 
 function ask(world) {
   wanted = world;
   busy(true);
-  step({ step: 'session', state: 'doing', text: askUntil ? 'choosing another simulation server' : 'choosing a simulation server' });
+  step({ step: 'session', state: 'doing', text: askedAgain ? 'choosing another simulation server' : 'choosing a simulation server' });
   if (door.readyState !== WebSocket.OPEN) {
     wanted = undefined;
     failed('The session server could not be reached.');
@@ -125,7 +125,7 @@ function chosen(answer) {
   wanted = undefined;
   if (answer.startsWith('Error:')) {
     const why = answer.slice('Error:'.length).trim();
-    if (askUntil)
+    if (askedAgain)
       askAgain(world, why);
     else
       failed(why);
@@ -145,18 +145,21 @@ function chosen(answer) {
   on('ready', (address) => show(address, answer, current));
 }
 
-/** A simulation server is about to end, or gone: the session server hears of that within seconds, and chooses another. */
+/**
+ * A simulation server is about to end, or gone, or can't start the simulation: the session server hears of that within
+ * seconds, and chooses another.
+ */
 function askAgain(world, why) {
-  askUntil ??= Date.now() + ASK_FOR;
-  if (Date.now() > askUntil) {
+  if (askedAgain === ASK_AGAIN) {
     failed(why);
     return;
   }
+  askedAgain += 1;
   leave();
   clearSteps();
   busy(true);
   step({ step: 'session', state: 'doing', text: `another one is asked for: ${why}` });
-  asking = setTimeout(() => ask(world), ASK_EVERY);
+  asking = setTimeout(() => ask(world), FIRST_PAUSE * 2 ** (askedAgain - 1));
 }
 
 function countDown(seconds) {

@@ -1,12 +1,16 @@
-"""The viewer, where the simulation server that was chosen is about to end, or is gone: another one is asked for."""
+"""The viewer, where the simulation server that was chosen is about to end, is gone, or can't start anything: another one is
+asked for."""
 
+import pathlib
+import shutil
 import signal
+import tempfile
 import unittest
 
 from playwright.sync_api import expect
 
 from case import BrowserTest
-from fleet import until
+from fleet import BIN, Fleet, until
 
 
 class LeavingServers(BrowserTest):
@@ -56,6 +60,37 @@ class Killed(LeavingServers):
         expect(page.tab.locator("#problem-text")).to_contain_text("the simulation has ended")
         self.connect(page)
         self.is_led_to_the_other(page)
+
+
+class Failing(LeavingServers):
+    session = {}
+
+    @classmethod
+    def make_fleet(cls):
+        folder = pathlib.Path(tempfile.mkdtemp(prefix="fleet-webots-"))
+        cls.addClassCleanup(shutil.rmtree, folder)
+        cls.repaired = folder / "repaired"
+        webots = folder / "webots"
+        webots.write_text(f"#!/bin/sh\n[ -e {cls.repaired} ] || exit 3\nexec {BIN / 'demo-simulator'} \"$@\"\n")
+        webots.chmod(0o755)
+        return Fleet(simulation={"webots": str(webots), "isolation": "none"})
+
+    def failures(self):
+        servers = (self.fleet.simulation, self.fleet.other)
+        return sum(server.log.read_text().count("a start has failed for a reason of this server") for server in servers)
+
+    def test_another_one_is_asked_for_three_times_at_most(self):
+        page = self.open(self.fleet.session.url("viewer"))
+        self.connect(page)
+        expect(page.tab.locator("[data-step=session]")).to_contain_text("another one is asked for")
+        expect(page.tab.locator("#problem-text")).to_contain_text("Webots ended with exit code 3")
+        self.assertEqual(self.failures(), 4)
+        # The next time counts from the beginning, and what works again is found.
+        self.connect(page)
+        expect(page.tab.locator("[data-step=session]")).to_contain_text("another one is asked for")
+        self.repaired.touch()
+        expect(page.tab.locator("[data-step=simulation].done")).to_be_visible()
+        expect(page.tab.locator("#problem")).to_be_hidden()
 
 
 if __name__ == "__main__":

@@ -257,7 +257,8 @@ impl Fleet {
 fn configure(forge: &Forge, webots: &Webots, clock: Option<&Clock>) -> Builder {
     let timing = json!({"grace": 1, "heartbeat": 0.5, "ping": 2, "silence": 6, "launch": 20, "checkout": 40});
     let builder = simulation_server(&webots.path(), forge.path(), PLACES).set("hangLimit", 1).set("timing", timing);
-    with(clock, builder)
+    // The small disk has less room than the default.
+    with(clock, builder.set("diskReserve", 8))
 }
 
 fn with(clock: Option<&Clock>, builder: Builder) -> Builder {

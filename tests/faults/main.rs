@@ -23,6 +23,7 @@ mod class;
 mod disk;
 mod fault;
 mod fleet;
+mod full_disk;
 mod machine;
 mod network;
 mod relay;

@@ -20,8 +20,9 @@ const SESSION: [&str; 8] = [
     "session::web",
     "session::app",
 ];
-const SIMULATION: [&str; 17] = [
+const SIMULATION: [&str; 18] = [
     "simulation::snapshot",
+    "simulation::failed_starts",
     "simulation::places",
     "simulation::protocol",
     "simulation::process",

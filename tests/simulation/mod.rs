@@ -12,6 +12,7 @@ mod life;
 mod limits;
 mod opened;
 mod output;
+mod own_failures;
 mod places;
 mod protocol;
 mod readiness;

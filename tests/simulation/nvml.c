@@ -7,16 +7,19 @@ typedef struct { unsigned gpu, memory; } rates;
 typedef struct { unsigned version; unsigned long long total, reserved, free, used; } memory;
 
 static const char *at(const char *name) { const char *value = getenv(name); return value ? value : ""; }
+/* Whether the file that a variable names is there. */
+static int marked(const char *name) { return *at(name) && !access(at(name), F_OK); }
 static void hang(const char *where) { if (!strcmp(at("NVML_HANG"), where)) for (;;) pause(); }
 
 int nvmlInit_v2(void) { hang("init"); return strcmp(at("NVML_HANG"), "no driver") ? 0 : 9; }
 int nvmlInitWithFlags(unsigned flags) { (void)flags; return nvmlInit_v2(); }
 int nvmlShutdown(void) { return 0; }
 int nvmlSystemGetDriverVersion(char *text, unsigned length) { strncpy(text, "550.54.15", length); return 0; }
-int nvmlDeviceGetCount_v2(unsigned *count) { *count = 2; return 0; }
+int nvmlDeviceGetCount_v2(unsigned *count) { *count = marked("NVML_GONE") ? 0 : 2; return 0; }
 int nvmlDeviceGetHandleByIndex_v2(unsigned index, void **device) { *device = (void *)(unsigned long)(index + 1); return 0; }
 int nvmlDeviceGetUtilizationRates(void *device, rates *out) {
   hang("read");
+  if (device == (void *)1 && marked("NVML_LOST")) return 15;
   out->gpu = atoi(at(device == (void *)1 ? "NVML_COMPUTE_0" : "NVML_COMPUTE_1"));
   out->memory = 7;
   return 0;

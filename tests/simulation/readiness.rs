@@ -61,6 +61,42 @@ async fn a_display_that_is_missing_is_a_problem_for_webots_itself() {
 }
 
 #[actix_rt::test]
+async fn a_server_below_its_reserve_of_disk_refuses_clients_and_says_so() {
+    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
+    let server = simulation_server(&webots.path(), forge.path(), 1).set("diskReserve", 100_000_000).start().await;
+    until("it is told", async || health(&server).await.0 == 503).await;
+    let (_, text) = health(&server).await;
+    assert!(text.contains("disk is full: less than 100000000 MiB are left (diskReserve)"), "{text}");
+    let mut client = Client::start(&server, &arm()).await;
+    let told = client.until("loading: Error:").await;
+    assert!(told.contains("disk is full"), "{told}");
+    assert_eq!(client.closed().await, Some(1013), "another server may take it");
+}
+
+#[actix_rt::test]
+async fn a_server_that_can_open_no_file_is_not_ready_until_it_can() {
+    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
+    let server = simulation_server(&webots.path(), forge.path(), 1).start().await;
+    let session = session_server(&[server.address()]).start().await;
+    until("it works", async || works(&session).await).await;
+    let limits = |soft: &str| {
+        let mut command = std::process::Command::new("prlimit");
+        let limit = command.args(["--pid", &server.pid().to_string(), &format!("--nofile={soft}:")]);
+        assert!(limit.status().unwrap().success());
+    };
+    let process = procfs::process::Process::new(server.pid()).unwrap();
+    let procfs::process::LimitValue::Value(before) = process.limits().unwrap().max_open_files.soft_limit else {
+        panic!("no limit")
+    };
+    // What it has open stays open; the session server's connection as well.
+    limits("3");
+    until("it knows", async || server.log().contains("no simulation can be started: ")).await;
+    until("the session server knows", async || !works(&session).await).await;
+    limits(&before.to_string());
+    until("it works again", async || works(&session).await).await;
+}
+
+#[actix_rt::test]
 async fn the_folder_of_the_run_is_made_anew_where_somebody_removes_it() {
     let (forge, webots) = (Forge::with_arm(), Webots::launcher());
     let server = simulation_server(&webots.path(), forge.path(), 1).start().await;

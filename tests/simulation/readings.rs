@@ -4,11 +4,12 @@ use std::path::Path;
 use std::process::Command;
 
 use nix::sys::signal::Signal;
+use serde_json::Value;
 
 use super::scene::arm;
 use crate::support::client::Client;
 use crate::support::git::Forge;
-use crate::support::program::{Builder, simulation_server};
+use crate::support::program::{Builder, Server, simulation_server};
 use crate::support::webots::Webots;
 use crate::support::{http, needs, until};
 
@@ -48,6 +49,59 @@ async fn gpus_are_read_and_the_least_busy_one_counts() {
     until("the mean is that of the less busy GPU", counts).await;
     let metrics = metrics().await;
     assert!(metrics.contains("webots_machine_gpu_compute_percent{gpu=\"0\",name=\"Stand-in A\"} 100"), "{metrics}");
+}
+
+/// The state of a server's GPUs: what is wrong with them.
+async fn gpu_problem(server: &Server) -> Option<String> {
+    let page: Value = http::get(&server.url("/status")).await.json();
+    page["gpuProblem"].as_str().map(str::to_owned)
+}
+
+#[actix_rt::test]
+async fn gpus_that_are_lost_are_told_and_come_back() {
+    let library = gpu_driver();
+    let mark = library.path().join("mark");
+    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
+    for (variable, words, left) in [
+        ("NVML_LOST", "NVIDIA's driver has lost 1 of 2 GPUs", 1),
+        ("NVML_GONE", "no GPU answers any more, of 2 that did", 0),
+    ] {
+        let server = with(library.path(), &forge, &webots).env(variable, mark.to_str().unwrap()).start().await;
+        let gpus = async || http::get(&server.url("/status")).await.json()["gpus"].as_array().unwrap().len();
+        until("GPUs are told", async || gpus().await == 2).await;
+        assert_eq!(gpu_problem(&server).await, None);
+        std::fs::write(&mark, "").unwrap();
+        until("they are lost", async || gpu_problem(&server).await.is_some_and(|why| why.contains(words))).await;
+        assert_eq!(gpus().await, left);
+        assert!(server.log().contains(words), "{}", server.log());
+        assert!(http::get(&server.url("/metrics")).await.text().contains("\nwebots_machine_gpu_lost 1\n"));
+        // The page has another letter in place of the quote.
+        let words = words.trim_start_matches("NVIDIA's ");
+        assert!(http::get(&server.url("/monitor")).await.text().contains(words));
+        assert_eq!(http::get(&server.url("/health")).await.text(), "ok", "they are not required");
+        std::fs::remove_file(&mark).unwrap();
+        until("they are back", async || gpu_problem(&server).await.is_none()).await;
+        assert!(server.log().contains("the GPUs answer again"), "{}", server.log());
+    }
+}
+
+#[actix_rt::test]
+async fn a_server_that_requires_gpus_is_ready_only_with_them() {
+    let library = gpu_driver();
+    let mark = library.path().join("mark");
+    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
+    let builder = with(library.path(), &forge, &webots).set("requireGpu", true);
+    let server = builder.env("NVML_LOST", mark.to_str().unwrap()).start().await;
+    let health = async |server: &Server| http::try_get(&server.url("/health")).await.unwrap();
+    until("it is ready", async || health(&server).await.text() == "ok").await;
+    std::fs::write(&mark, "").unwrap();
+    until("it is not ready", async || health(&server).await.status.as_u16() == 503).await;
+    let told = health(&server).await.text();
+    assert!(told.contains("(requireGpu), but NVIDIA's driver has lost 1 of 2 GPUs"), "{told}");
+    std::fs::remove_file(&mark).unwrap();
+    until("it is ready again", async || health(&server).await.text() == "ok").await;
+    let server = simulation_server(&webots.path(), forge.path(), 1).set("requireGpu", true).start().await;
+    until("it is not ready", async || health(&server).await.text().contains("but sees none")).await;
 }
 
 #[actix_rt::test]

@@ -52,7 +52,7 @@ async fn a_port_outside_of_the_servers_range_fails_the_start() {
     let (first, next) = (server.port + 1, server.port + 2);
     let words = format!("Webots listens on port {next}, outside of this server's ports {first} to {first}");
     assert!(told.contains(&words), "{told}");
-    assert_eq!(client.closed().await, Some(1000));
+    assert_eq!(client.closed().await, Some(1013));
     nothing_left(&server, 2).await;
 }
 
@@ -130,15 +130,15 @@ async fn webots_is_given_the_documented_command_line() {
     let port = server.port + 1;
     let rest = format!("--port={port} --heartbeat=5000");
     let table = [
-        ("x3d", format!("args: --batch --mode=pause --minimize --no-rendering {rest} --stream /")),
-        ("w3d", format!("args: --batch --mode=pause --minimize --no-rendering {rest} --stream /")),
-        ("mjpeg", format!("args: --batch --mode=pause {rest} --stream=mjpeg /")),
+        ("x3d", format!("args: --batch --mode=pause --minimize --no-rendering {rest} --stream worlds/a.wbt")),
+        ("w3d", format!("args: --batch --mode=pause --minimize --no-rendering {rest} --stream worlds/a.wbt")),
+        ("mjpeg", format!("args: --batch --mode=pause {rest} --stream=mjpeg worlds/a.wbt")),
     ];
     for (mode, words) in table {
         let mut client = Client::connect(&server.websocket("/client")).await;
         client.send(&serde_json::json!({"start": {"url": arm(), "mode": mode}}).to_string()).await;
         let told = client.until("loading: Error:").await;
-        assert!(told.contains(&words) && told.contains("/project/worlds/a.wbt"), "{told}");
+        assert!(told.contains(&words), "{told}");
         nothing_left(&server, 1).await;
     }
 }
@@ -174,9 +174,9 @@ async fn paths_may_have_spaces_and_quotes() {
         let builder = simulation_server(&program, forge.path(), 1).set("cacheDir", at("the cache's")).set("xvfb", xvfb);
         let server = builder.set("logDir", at("the log's")).start().await;
         let told = outcome(&server, &world("lab/arm", "main", "p%20q's/worlds/b%20%20%22c%22.wbt")).await;
-        assert!(told.contains("/project/p q's [opened] /"), "{told}");
         assert!(!xvfb || told.contains("with a display | "), "{told}");
-        assert!(told.contains("/the cache's/") && told.contains("/p q's/worlds/b  \"c\".wbt"), "{told}");
+        assert!(told.contains(" p q's [opened] p q's/worlds/b  \"c\".wbt"), "{told}");
+        assert!(!told.contains("the cache's"), "{told}");
         let log = format!("{}/simulation/instances/{}.log", at("the log's"), server.port + 1);
         assert!(std::fs::read_to_string(log).unwrap().contains("[opened]"));
         until("its folder is gone", async || instance_folders_in(Path::new(&at("the cache's"))).is_empty()).await;
@@ -188,7 +188,7 @@ async fn a_missing_webots_or_xvfb_is_told_with_what_to_do() {
     let forge = Forge::with_arm();
     let server = simulation_server(Path::new("/nowhere/webots"), forge.path(), 1).start().await;
     let told = Client::start(&server, &arm()).await.until("loading: Error:").await;
-    assert!(told.contains("has no Webots that it can run at /nowhere/webots") && told.contains("webotsHome"), "{told}");
+    assert!(told.contains("has no Webots that it can run at \"webots\"") && told.contains("webotsHome"), "{told}");
     let webots = Webots::launcher();
     let git = tempfile::tempdir().unwrap();
     for program in ["git", "bash", "env", "sh"] {

@@ -38,7 +38,7 @@ async fn a_server_that_drains_keeps_its_clients_takes_no_others_and_ends_with_th
         assert_eq!(http::get(&server.url("/status")).await.json()["draining"], true);
         let mut late = Client::start(&server, &arm()).await;
         let told = late.until("loading: Error:").await;
-        assert!(told.contains("about to end, and takes no new clients: connect again"), "{told}");
+        assert!(told.contains("about to end, and takes no new clients. Connect again"), "{told}");
         assert_eq!(late.closed().await, Some(1013), "another server may take it");
         running.leave().await;
         waiting.until("webots:").await;

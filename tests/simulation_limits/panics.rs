@@ -143,7 +143,6 @@ async fn launch(server: &AppState) -> (Addr<Webots>, UnboundedReceiver<Exit>) {
         containers: None,
         launcher: Arc::clone(&server.launcher),
         watcher: server.watcher.clone(),
-        port_finder: server.port_finder.clone(),
         program: readiness::webots_program(&server.config).unwrap(),
         checkouts: Arc::clone(&server.checkouts),
         project: Arc::new(project),

@@ -48,7 +48,7 @@ pub struct ServerStatus {
     pub since: SystemTime,
     /// Its last report.
     pub report: Option<Arc<ServerReport>>,
-    /// Why the last probe failed, if it did.
+    /// Why the last probe failed, if it did, or why others are preferred to it, if they are.
     pub error: Option<String>,
     /// The reported load and that of the clients it does not show yet, in percent.
     pub effective_load: Option<f64>,

@@ -131,6 +131,7 @@ impl Registry {
             self.fleet.remove(server);
             return;
         }
+        let failed_starts = answer.as_ref().ok().map(|report| report.failed_starts);
         let change = match answer {
             Ok(report) => record.succeeded(report, at, self.fleet.limit(server).unwrap_or(self.config.load_threshold)),
             Err(error) => record.failed(error),
@@ -138,6 +139,13 @@ impl Registry {
         match record.for_placement() {
             Some(report) => self.fleet.report(server, at, report),
             None => self.fleet.lose(server),
+        }
+        if let Some(failed) = failed_starts {
+            let was_ejected = self.fleet.is_ejected(server);
+            self.fleet.note_failures(server, at, failed);
+            if self.fleet.is_ejected(server) && !was_ejected {
+                log::warn!("{server}: {}", ejected(failed));
+            }
         }
         if let Some(change) = change {
             self.changes.add(server, record, change);
@@ -160,13 +168,20 @@ impl Registry {
 
     fn status_of(&self, address: &PublicAddress) -> Option<ServerStatus> {
         let status = self.servers.get(address)?.status(address);
+        let failed = status.report.as_ref().map_or(0, |report| report.failed_starts);
         Some(ServerStatus {
+            error: status.error.or_else(|| self.fleet.is_ejected(address).then(|| ejected(failed))),
             effective_load: self.fleet.effective_load(address),
             in_flight: self.fleet.in_flight(address),
             client_cost: self.fleet.client_cost(address),
             ..status
         })
     }
+}
+
+/// Why others are preferred to a server.
+fn ejected(failed: u32) -> String {
+    format!("its last {failed} starts failed for a reason of its own; others are preferred for a while")
 }
 
 /// Who hears what the monitors find: the registry.

@@ -2,6 +2,7 @@
 
 use super::backend::{Backend, Report};
 use super::cost::{Estimate, FleetCost};
+use super::ejection::Ejection;
 use super::order::{Order, Rank, Standing};
 use super::peers::Peers;
 use super::policy::Policy;
@@ -44,6 +45,7 @@ pub struct Fleet<Id> {
 struct Server<Id> {
     id: Id,
     backend: Backend,
+    ejection: Ejection,
     standing: Standing,
 }
 
@@ -75,7 +77,8 @@ impl<Id: Clone + Eq + Hash> Fleet<Id> {
         self.turns += 1;
         if let Entry::Vacant(entry) = self.numbers.entry(id) {
             let (id, backend) = (entry.key().clone(), Backend::new(&self.policy, self.turns));
-            entry.insert(self.servers.insert(Server { id, backend, standing: Standing::default() }));
+            let (ejection, standing) = (Ejection::default(), Standing::default());
+            entry.insert(self.servers.insert(Server { id, backend, ejection, standing }));
         }
     }
 
@@ -96,6 +99,21 @@ impl<Id: Clone + Eq + Hash> Fleet<Id> {
         server.sort_in(number, &self.policy, &mut self.order);
     }
 
+    /// A server reports how many of its last starts in a row have failed for a reason of its own. After some, others are
+    /// preferred for a while.
+    pub fn note_failures(&mut self, id: &Id, now: Instant, failed: u32) {
+        let Some((number, server)) = find(&self.numbers, &mut self.servers, id) else { return };
+        server.ejection.expire(now);
+        server.ejection.report(now, failed);
+        server.sort_in(number, &self.policy, &mut self.order);
+    }
+
+    /// Whether others are preferred to a server, because its last starts have failed.
+    #[must_use]
+    pub fn is_ejected(&self, id: &Id) -> bool {
+        self.server(id).is_some_and(|server| server.ejection.until().is_some())
+    }
+
     /// A server does not answer: it gets no clients until its next report.
     pub fn lose(&mut self, id: &Id) {
         let Some((number, server)) = find(&self.numbers, &mut self.servers, id) else { return };
@@ -104,7 +122,7 @@ impl<Id: Clone + Eq + Hash> Fleet<Id> {
     }
 
     /// Returns the server of least load among those that have room and are `eligible`, and counts the client as sent
-    /// there. Of servers with equal loads it is the one that was chosen longest ago.
+    /// there. Of servers with equal loads it is the one that was chosen longest ago; one that is ejected comes last.
     pub fn place(&mut self, now: Instant, eligible: impl Fn(&Id) -> bool) -> Option<Id> {
         self.send(now, true, eligible)
     }
@@ -123,14 +141,16 @@ impl<Id: Clone + Eq + Hash> Fleet<Id> {
         let server = self.servers.get_mut(number)?;
         server.backend.turn = self.turns;
         server.backend.place(now, takes_room);
+        server.ejection.place(now);
         server.sort_in(number, &self.policy, &mut self.order);
         Some(server.id.clone())
     }
 
-    /// Gives up the placements whose clients should have come by now.
+    /// Gives up the placements whose clients should have come by now, and ends ejections.
     fn expire(&mut self, now: Instant) {
         for number in self.order.expired(now).collect::<Vec<_>>() {
             if let Some(server) = self.servers.get_mut(number) {
+                server.ejection.expire(now);
                 server.backend.expire(now, &self.policy, &mut self.peers);
                 server.sort_in(number, &self.policy, &mut self.order);
             }
@@ -168,7 +188,11 @@ impl<Id: Clone + Eq + Hash> Fleet<Id> {
     }
 
     fn backend(&self, id: &Id) -> Option<&Backend> {
-        self.servers.get(*self.numbers.get(id)?).map(|server| &server.backend)
+        self.server(id).map(|server| &server.backend)
+    }
+
+    fn server(&self, id: &Id) -> Option<&Server<Id>> {
+        self.servers.get(*self.numbers.get(id)?)
     }
 }
 
@@ -185,8 +209,10 @@ impl<Id> Server<Id> {
     /// Sorts a server in anew after something happened to it.
     fn sort_in(&mut self, number: usize, policy: &Policy, order: &mut Order) {
         let load = self.backend.rank_load().filter(|_| self.backend.has_room(policy));
-        let rank = load.map(|load| Rank { load, turn: self.backend.turn });
-        let standing = Standing { rank, expiry: self.backend.next_expiry(policy) };
+        let until = self.ejection.until();
+        let rank = load.map(|load| Rank { is_ejected: until.is_some(), load, turn: self.backend.turn });
+        let expiry = self.backend.next_expiry(policy).into_iter().chain(until).min();
+        let standing = Standing { rank, expiry };
         order.put(number, std::mem::replace(&mut self.standing, standing), standing);
     }
 }
@@ -329,6 +355,41 @@ mod tests {
         assert_eq!((fleet.effective_load(&0), fleet.in_flight(&0)), (Some(10.0), 1));
         fleet.report(&0, now, full_report(10.0, 1, 1));
         assert_eq!((fleet.effective_load(&0), fleet.in_flight(&0)), (Some(12.0), 0));
+    }
+
+    #[test]
+    fn a_server_whose_starts_fail_comes_last_and_is_tried_by_one_client_after_a_while() {
+        let now = Instant::now();
+        let at = |seconds| now + Duration::from_secs(seconds);
+        let mut fleet = fleet(2.0, now, [full_report(1.0, 0, 0), full_report(50.0, 0, 0)]);
+        let place = |fleet: &mut Fleet<u32>, seconds, clients| -> Vec<u32> {
+            fleet.report(&0, at(seconds), full_report(1.0, 0, 0));
+            fleet.report(&1, at(seconds), full_report(50.0, 0, 0));
+            (0..clients).filter_map(|_| fleet.place(at(seconds), |_| true)).collect()
+        };
+        assert_eq!(place(&mut fleet, 0, 2), [0, 0]);
+        fleet.note_failures(&0, at(1), 2);
+        assert_eq!(place(&mut fleet, 1, 1), [0], "two may be chance");
+        fleet.note_failures(&0, at(2), 3);
+        assert!(fleet.is_ejected(&0));
+        assert_eq!(place(&mut fleet, 2, 3), [1, 1, 1]);
+        assert_eq!(place(&mut fleet, 31, 1), [1]);
+        assert_eq!(place(&mut fleet, 32, 3), [0, 1, 1], "one tries it");
+        fleet.note_failures(&0, at(33), 4);
+        assert_eq!(place(&mut fleet, 92, 1), [1], "its time has doubled");
+        assert_eq!(place(&mut fleet, 93, 2), [0, 1]);
+        fleet.note_failures(&0, at(94), 0);
+        assert_eq!(place(&mut fleet, 94, 2), [0, 0]);
+    }
+
+    #[test]
+    fn servers_that_all_fail_alike_are_used_as_if_none_did() {
+        let now = Instant::now();
+        let mut fleet = fleet(2.0, now, [load_only(10.0), load_only(20.0)]);
+        (0..2).for_each(|id| fleet.note_failures(&id, now, 5));
+        assert!(fleet.available(now));
+        assert_eq!(fleet.place(now, |_| true), Some(0));
+        assert_eq!(fleet.place(now, |id| *id == 1), Some(1));
     }
 
     #[test]

@@ -8,6 +8,7 @@
 //! - `order`: the servers sorted by load, so that a large fleet is as fast as a small one;
 //! - `backend`: what is known of one server;
 //! - `cost`: what a client costs a server, learned from its reports;
+//! - `ejection`: which servers come last, because starts fail there;
 //! - `peers`: how many clients other session servers send.
 //!
 //! Nothing here reads a clock or does any input or output: every call is told the time.
@@ -15,6 +16,7 @@
 
 mod backend;
 mod cost;
+mod ejection;
 mod fleet;
 mod order;
 mod peers;

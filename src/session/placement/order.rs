@@ -7,9 +7,11 @@ use std::cmp::Ordering;
 use std::collections::BTreeSet;
 use std::time::Instant;
 
-/// What servers are sorted by: the least load goes first, and of equal loads the server that was chosen longest ago.
+/// What servers are sorted by: those that are ejected go last, then the least load goes first, and of equal loads the
+/// server that was chosen longest ago.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Rank {
+    pub(super) is_ejected: bool,
     pub(super) load: f64,
     pub(super) turn: u64,
 }
@@ -18,7 +20,8 @@ impl Eq for Rank {}
 
 impl Ord for Rank {
     fn cmp(&self, other: &Self) -> Ordering {
-        self.load.total_cmp(&other.load).then(self.turn.cmp(&other.turn))
+        let ejected = self.is_ejected.cmp(&other.is_ejected);
+        ejected.then(self.load.total_cmp(&other.load)).then(self.turn.cmp(&other.turn))
     }
 }
 
@@ -33,7 +36,7 @@ impl PartialOrd for Rank {
 pub(super) struct Standing {
     /// `None` if the server has no room.
     pub(super) rank: Option<Rank>,
-    /// When the oldest of its placements is given up.
+    /// When the oldest of its placements is given up, or its ejection ends.
     pub(super) expiry: Option<Instant>,
 }
 
@@ -57,12 +60,12 @@ impl Order {
         }
     }
 
-    /// The servers with room, the least loaded first.
+    /// The servers with room, in the order of their ranks.
     pub(super) fn servers(&self) -> impl Iterator<Item = usize> {
         self.ranked.iter().map(|(_, server)| *server)
     }
 
-    /// The servers that have placements to give up.
+    /// The servers that have placements to give up, or an ejection that ends.
     pub(super) fn expired(&self, now: Instant) -> impl Iterator<Item = usize> {
         self.expiries.iter().take_while(move |(at, _)| *at <= now).map(|(_, server)| *server)
     }

@@ -39,6 +39,9 @@ pub struct ServerReport {
     /// Whether the server takes no new clients because it is about to stop.
     #[serde(default)]
     pub draining: bool,
+    /// How many of the last starts in a row failed for a reason of the server's own.
+    #[serde(default)]
+    pub failed_starts: u32,
     /// Why the server can start no simulation at all, if so.
     #[serde(default, skip_serializing_if = "Option::is_none", deserialize_with = "optional_line")]
     pub problem: Option<String>,
@@ -102,6 +105,7 @@ impl ServerReport {
             share_idle_time: 0.0,
             docker: None,
             draining: false,
+            failed_starts: 0,
             problem: None,
         }
     }

@@ -95,6 +95,12 @@ pub enum CheckoutError {
 }
 
 impl CheckoutError {
+    /// Whether it is this server's fault, so that another server may do better: its disk, its network, its processes.
+    #[must_use]
+    pub fn is_own(&self) -> bool {
+        matches!(self, Self::Machine(..))
+    }
+
     /// Whether it is because of a size, which is the same for everybody who wants the same.
     #[must_use]
     pub fn is_of_size(&self) -> bool {
@@ -119,6 +125,7 @@ pub fn git_failed(world: &ProjectUrl, source: GitError) -> CheckoutError {
         Cause::Moved => CheckoutError::Moved(repository, "again and again".to_owned()),
         Cause::TooMuch => CheckoutError::TooMuch { repository, source },
         Cause::Damaged => CheckoutError::Damaged { repository, source },
+        Cause::Machine => CheckoutError::Machine(repository, source.to_string()),
         Cause::Other => CheckoutError::Git { repository, source },
     }
 }

@@ -66,7 +66,9 @@ pub enum Cause {
     TooMuch,
     /// The cached repository is broken.
     Damaged,
-    /// Something else: the network, the remote, the machine.
+    /// The machine or its network fails.
+    Machine,
+    /// Something else: most of all the remote.
     Other,
 }
 
@@ -74,6 +76,17 @@ pub enum Cause {
 /// that reads them. The first that is found counts. git asks for a user's name where a forge says 'not found': forges
 /// don't tell private from missing.
 const MESSAGES: &[(&str, Cause)] = &[
+    ("No space left on device", Cause::Machine),
+    ("Disk quota exceeded", Cause::Machine),
+    ("Read-only file system", Cause::Machine),
+    ("Input/output error", Cause::Machine),
+    ("Too many open files", Cause::Machine),
+    ("Cannot allocate memory", Cause::Machine),
+    ("Resource temporarily unavailable", Cause::Machine),
+    ("Could not resolve host", Cause::Machine),
+    ("Failed to connect to", Cause::Machine),
+    ("Couldn't connect to", Cause::Machine),
+    ("certificate", Cause::Machine),
     ("returned error: 301", Cause::Moved),
     ("returned error: 302", Cause::Moved),
     ("returned error: 303", Cause::Moved),
@@ -113,7 +126,8 @@ impl GitError {
         let message = match self {
             Self::Failed { ending: ExitReason::Code(_), message, .. } => message,
             Self::TooLong(_) => return Cause::TooMuch,
-            _ => return Cause::Other,
+            Self::NotStarted(_) => return Cause::Machine,
+            Self::Failed { .. } => return Cause::Other,
         };
         MESSAGES.iter().find(|(words, _)| message.contains(words)).map_or(Cause::Other, |(_, cause)| *cause)
     }
@@ -134,7 +148,8 @@ mod tests {
             ("fatal: remote error: upload-pack: not our ref 0123", Cause::NoCommit),
             ("fatal: packed object 9ed5 (stored in pack-1115.pack) is corrupt", Cause::Damaged),
             ("error: cannot lock ref 'refs/fleet/01': Unable to create '01.lock': File exists.", Cause::Damaged),
-            ("error: unable to create file a: No space left on device", Cause::Other),
+            ("error: unable to create file a: No space left on device", Cause::Machine),
+            ("fatal: unable to access 'https://a.forge/': Could not resolve host: a.forge", Cause::Machine),
             ("fatal: Out of memory, malloc failed (tried to allocate 9 bytes)", Cause::TooMuch),
             ("fatal: early EOF", Cause::Other),
         ] {

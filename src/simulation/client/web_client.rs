@@ -57,23 +57,24 @@ impl WebClient {
         format!("client {}", self.peer)
     }
 
-    /// Tells the client why its simulation failed, and closes the connection.
-    fn fail(&mut self, why: &str, ctx: &mut Context) {
+    /// Counts the failed start, sends the client the reason, and closes the connection.
+    fn fail_start(&mut self, outcome: Outcome, why: &str, ctx: &mut Context) {
+        self.start.resolve(outcome);
         log::info!("{}: {why}", self.name());
         self.finish(&protocol::error(why), CloseCode::Normal, ctx);
     }
 
-    /// Counts the failed start, tells the client why, and closes the connection.
-    fn fail_start(&mut self, outcome: Outcome, why: &str, ctx: &mut Context) {
+    /// The same for a client that another server may take: the close code says so to programs.
+    fn refer(&mut self, outcome: Outcome, why: &str, ctx: &mut Context) {
         self.start.resolve(outcome);
-        self.fail(why, ctx);
+        log::info!("{}: {why}", self.name());
+        self.finish(&protocol::elsewhere(why), CloseCode::Again, ctx);
     }
 
-    /// Refuses a client that another server may take: the close code says so to programs.
-    fn refer(&mut self, why: &str, ctx: &mut Context) {
-        self.start.resolve(Outcome::Refused);
-        log::info!("{}: {why}", self.name());
-        self.finish(&protocol::error(why), CloseCode::Again, ctx);
+    /// The same for a start that fails for a reason of this server's own, which is reported to session servers.
+    fn fail_own(&mut self, outcome: Outcome, why: &str, ctx: &mut Context) {
+        self.server.failed_starts.add(why);
+        self.refer(outcome, why, ctx);
     }
 
     fn finish(&mut self, last_words: &str, code: CloseCode, ctx: &mut Context) {
@@ -89,7 +90,6 @@ impl WebClient {
             Ok(Some(Request::ResetController(file))) => self.reset_controller(file, ctx),
             Ok(None) => log::debug!("{}: a message that asks for nothing is ignored", self.name()),
             Err(wrong) => {
-                // Not by `fail`: floods of these must not crowd out, in the log, why simulations have failed.
                 log::info!("{}: {wrong}", self.name());
                 self.finish(&protocol::error(&wrong.to_string()), CloseCode::Normal, ctx);
             }
@@ -109,7 +109,7 @@ impl WebClient {
         }
         let world = match self.server.admit(url) {
             Ok(world) => world,
-            Err(why) if self.server.takes_nobody() => return self.refer(&why, ctx),
+            Err(why) if self.server.takes_nobody() => return self.refer(Outcome::Refused, &why, ctx),
             Err(why) => return self.fail_start(Outcome::Refused, &why, ctx),
         };
         log::info!("{}: asks for {world}", self.name());
@@ -120,10 +120,7 @@ impl WebClient {
     fn check_out(&mut self, StartRequest { world, mode }: StartRequest, ticket: Ticket, port: u16, ctx: &mut Context) {
         let instance = match self.server.run.instance() {
             Ok(instance) => instance,
-            Err(error) => {
-                let why = format!("This simulation server has no room for a project: {error}");
-                return self.fail_start(Outcome::NoCheckout, &why, ctx);
-            }
+            Err(error) => return self.fail_own(Outcome::NoCheckout, &format!("No room for a project: {error}"), ctx),
         };
         self.state = State::CheckingOut { mode, place: (ticket, port) };
         let me = ctx.address();
@@ -133,8 +130,9 @@ impl WebClient {
         job.into_actor(self)
             .map(|result, this, ctx| match result {
                 Ok(Ok(project)) => this.launch(project, ctx),
+                Ok(Err(error)) if error.is_own() => this.fail_own(Outcome::NoCheckout, &error.to_string(), ctx),
                 Ok(Err(error)) => this.fail_start(Outcome::NoCheckout, &error.to_string(), ctx),
-                Err(error) => this.fail_start(Outcome::NoCheckout, &format!("The checkout broke off: {error}"), ctx),
+                Err(error) => this.fail_own(Outcome::NoCheckout, &format!("The checkout broke off: {error}"), ctx),
             })
             .spawn(ctx);
     }
@@ -146,7 +144,7 @@ impl WebClient {
         };
         let program = match readiness::webots_program(&self.server.config) {
             Ok(program) => program,
-            Err(why) => return self.fail_start(Outcome::NoWebots, &why, ctx),
+            Err(why) => return self.fail_own(Outcome::NoWebots, &why, ctx),
         };
         log::info!("{}: {} is for Webots {}", self.name(), project.world.path.display(), project.world.version);
         place.0.update(Change::Version(project.world.version.clone()));
@@ -159,7 +157,6 @@ impl WebClient {
             containers: self.server.containers.clone(),
             launcher: Arc::clone(&self.server.launcher),
             watcher: self.server.watcher.clone(),
-            port_finder: self.server.port_finder.clone(),
             program,
             checkouts: Arc::clone(&self.server.checkouts),
             project: Arc::new(project),
@@ -193,8 +190,12 @@ impl WebClient {
             .spawn(ctx);
     }
 
-    fn exited(&mut self, Exit { clean, why }: &Exit, ctx: &mut Context) {
-        let words = if *clean { protocol::loading(why) } else { protocol::error(why) };
+    fn exited(&mut self, Exit { clean, own, why }: &Exit, ctx: &mut Context) {
+        let words = match (clean, own) {
+            (_, true) => return self.fail_own(Outcome::NoWebots, why, ctx),
+            (true, _) => protocol::loading(why),
+            (false, _) => protocol::error(why),
+        };
         self.start.resolve(Outcome::NoWebots);
         self.finish(&words, CloseCode::Normal, ctx);
     }
@@ -286,6 +287,7 @@ impl Handler<WebotsEvent> for WebClient {
             WebotsEvent::Started => ctx.text(protocol::shutdown_timeout(self.server.config.timeout)),
             WebotsEvent::Listening(port) => {
                 self.start.resolve(Outcome::Ready);
+                self.server.failed_starts.reset();
                 ctx.text(protocol::webots(&self.server.config.websocket_url(port)));
             }
             WebotsEvent::Heartbeat => ctx.text(protocol::HEARTBEAT),

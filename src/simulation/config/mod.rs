@@ -6,6 +6,7 @@ mod own_files;
 mod resources;
 mod simulation_config;
 mod timing;
+mod urls;
 
 pub use container::{ContainerDisplay, ContainerNetwork, ContainerSettings, EDITOR_PORT};
 pub use isolation::{Isolation, SandboxFolders, VariableName};

@@ -14,13 +14,10 @@ use crate::shared::config::{
     Configuration, ExpandedPath, InvalidValue, Secret, expanded, folder, local_address, object, one_or_many,
     optional_expanded, optional_whole, percent, seconds, whole,
 };
-use crate::shared::domain::{ClientUrls, PublicAddress, PublicUrl, UrlPrefix, check_host};
+use crate::shared::domain::{PublicUrl, UrlPrefix, check_host};
 use crate::shared::http::{Origin, TrustedProxies};
 use crate::simulation::checkout::Mirrors;
 use crate::simulation::machine::display::DisplayName;
-
-/// If its port is taken, Webots silently takes one of this many that follow.
-const NEXT_PORTS: u16 = 10;
 
 /// Every key of the simulation server. The original's keys keep their meaning.
 #[derive(Debug, Clone, Serialize, Deserialize)]
@@ -147,6 +144,12 @@ pub struct SimulationConfig {
     /// Size limit of a project, in MiB; for what is fetched and for what is checked out. Default: 1024.
     #[serde(default = "default_project_size", deserialize_with = "whole::<1, 100_000_000, _, _>")]
     pub project_size: u64,
+    /// How much room the disk of `cacheDir` must have left for new simulations, in MiB; 0: any. Default: 512.
+    #[serde(default = "default_disk_reserve", deserialize_with = "whole::<0, 100_000_000, _, _>")]
+    pub disk_reserve: u64,
+    /// Whether the server is ready only while it sees GPUs and none is lost. Default: false.
+    #[serde(default)]
+    pub require_gpu: bool,
     /// The display that Webots opens its window on. Default: the environment variable `DISPLAY`, else `:0`.
     #[serde(default)]
     pub display: Option<DisplayName>,
@@ -171,38 +174,6 @@ pub struct SimulationConfig {
 }
 
 impl SimulationConfig {
-    /// Returns the HTTP URL under which clients reach this server.
-    #[must_use]
-    pub fn http_url(&self) -> String {
-        self.client_urls().http_url(&self.address(self.port))
-    }
-
-    /// Returns the WebSocket URL under which clients reach a port of this server: its own, or that of a Webots.
-    #[must_use]
-    pub fn websocket_url(&self, port: u16) -> String {
-        self.client_urls().websocket_url(&self.address(port))
-    }
-
-    fn client_urls(&self) -> ClientUrls {
-        ClientUrls { ssl: self.ssl, public: self.public_url.clone() }
-    }
-
-    fn address(&self, port: u16) -> PublicAddress {
-        PublicAddress::new(&self.server, port, self.port_rewrite)
-    }
-
-    /// Returns the ports that Webots may use.
-    #[must_use]
-    pub fn streaming_ports(&self) -> std::ops::RangeInclusive<u16> {
-        self.port + 1..=self.port.saturating_add(self.max_connections)
-    }
-
-    /// Returns the ports on which a Webots may come to listen that was given this one.
-    #[must_use]
-    pub fn ports_from(port: u16) -> std::ops::RangeInclusive<u16> {
-        port..=port.saturating_add(NEXT_PORTS)
-    }
-
     /// Returns the program that is started for each client; `None` where neither `webots` nor `webotsHome` says.
     #[must_use]
     pub fn webots_program(&self) -> Option<PathBuf> {
@@ -301,6 +272,10 @@ fn default_cache_size() -> u64 {
 
 fn default_project_size() -> u64 {
     1024
+}
+
+fn default_disk_reserve() -> u64 {
+    512
 }
 
 fn default_hang_limit() -> Duration {

@@ -1,5 +1,5 @@
 //! Watches over what simulations take that the kernel does not limit: room on the disk, ports, and on some machines
-//! processes. One thread looks for all of them, in ticks.
+//! processes. One thread looks for all of them, in ticks; another one finds the ports of those that start.
 //!
 //! The ticks take 1 % of one core at most: as they take longer, the pause between them grows. Readings that serve all
 //! simulations are made once for all: one query for listeners, one pass over `/proc`, one look at the free room of the disk.
@@ -16,14 +16,19 @@ use std::time::{Duration, Instant};
 use nix::sys::statvfs::statvfs;
 use tokio::sync::oneshot;
 
+use crate::simulation::config::SimulationConfig;
 use crate::simulation::machine::{Tree, UsageMonitor};
+use crate::simulation::process::PortFinder;
 use crate::simulation::process::folder_size::{FolderSize, room};
 use crate::simulation::process::listeners::{Listener, listeners};
 use crate::simulation::process::process_tree::{sockets, tree};
 
-/// Watches over simulations. The thread ends when the last clone is dropped.
+/// Watches over simulations. Its threads end when the last clone is dropped.
 #[derive(Debug, Clone)]
-pub struct Watcher(Sender<Watched>);
+pub struct Watcher {
+    watches: Sender<Watched>,
+    ports: PortFinder,
+}
 
 /// What is watched of one simulation.
 #[derive(Debug)]
@@ -73,16 +78,25 @@ const PAUSE: u32 = 99;
 const WALK_AGAIN: Duration = Duration::from_secs(30);
 
 impl Watcher {
-    /// Starts the thread. `run` is the folder with the folders of all instances, `ports` are those of all simulations.
+    /// Starts the threads. `run` is the folder with the folders of all instances.
     ///
     /// # Errors
     /// When the system can't start a thread.
-    pub fn start(run: PathBuf, ports: RangeInclusive<u16>, usage: UsageMonitor) -> io::Result<Self> {
-        let (sender, receiver) = channel();
+    pub fn start(run: PathBuf, config: &SimulationConfig, usage: UsageMonitor) -> io::Result<Self> {
+        let (watches, receiver) = channel();
+        let ports = config.streaming_ports();
+        let last = *SimulationConfig::ports_from(*ports.end()).end();
+        let finder = PortFinder::start(*ports.start()..=last)?;
         let disk = Disk { free: free(&run), folder: run, lost: 0 };
         let mut table = Table { disk, ports, usage, all: Vec::new(), owners: HashMap::new() };
         std::thread::Builder::new().name("watcher".to_owned()).spawn(move || table.run(&receiver))?;
-        Ok(Self(sender))
+        Ok(Self { watches, ports: finder })
+    }
+
+    /// Waits until a process that descends from `root` listens on the port that it was given, or on one that Webots takes in
+    /// its place, and returns the port. Never returns if there is none.
+    pub async fn listening_port(&self, root: i32, given: u16) -> u16 {
+        self.ports.find(root, SimulationConfig::ports_from(given)).await
     }
 
     /// Waits until a simulation takes more than it may, and returns what, in words for its client. Dropping the future ends
@@ -91,7 +105,7 @@ impl Watcher {
         let (excess, told) = oneshot::channel();
         let (allowed, left, lost, looked) = (None, 0, 0, Instant::now());
         // The thread lives as long as this.
-        self.0.send(Watched { watch, excess, allowed, left, lost, looked }).ok();
+        self.watches.send(Watched { watch, excess, allowed, left, lost, looked }).ok();
         match told.await {
             Ok(why) => why,
             Err(_) => std::future::pending().await,

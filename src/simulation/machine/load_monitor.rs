@@ -13,7 +13,8 @@ use std::time::{Duration, Instant, SystemTime};
 use actix::prelude::*;
 use tokio::sync::watch;
 
-use super::sensors::{self, Gpu, GpuSensor, Host, Machine, MachineSensor};
+use super::gpus::Gpus;
+use super::sensors::{self, Gpu, GpuReading, GpuSensor, Host, Machine, MachineSensor};
 use crate::shared::domain::Load;
 use crate::simulation::places::{GetSnapshot, Places};
 
@@ -23,8 +24,6 @@ const PERIOD: Duration = Duration::from_secs(1);
 const MEAN_OF: usize = 5;
 /// How many samples are kept: ten minutes.
 const KEPT: usize = 600;
-/// How long a reading of the GPUs is used.
-const GPU_AGE: Duration = Duration::from_secs(10);
 /// Lines of `monitor.csv` until it is renamed to `monitor.csv.1`: a day.
 const CSV_LINES: usize = 86_400;
 /// A column of `monitor.csv`: its heading, and its value in a sample.
@@ -57,6 +56,8 @@ pub struct Readings {
     pub machine: Machine,
     /// The newest reading; empty without GPUs.
     pub gpus: Vec<Gpu>,
+    /// What is wrong with the GPUs, if some have answered and don't any more.
+    pub gpu_problem: Option<String>,
     /// The last ten minutes, the oldest first.
     pub history: VecDeque<Sample>,
 }
@@ -88,7 +89,7 @@ struct MachineRead(Machine);
 
 #[derive(Message)]
 #[rtype(result = "()")]
-struct GpusRead(Vec<Gpu>);
+struct GpusRead(GpuReading);
 
 /// The actor.
 pub struct LoadMonitor {
@@ -98,7 +99,7 @@ pub struct LoadMonitor {
     csv_lines: usize,
     disk: PathBuf,
     machine: Machine,
-    gpus: Option<(Instant, Vec<Gpu>)>,
+    gpus: Gpus,
 }
 
 impl LoadMonitor {
@@ -107,7 +108,7 @@ impl LoadMonitor {
     pub fn new(places: Addr<Places>, disk: &Path, csv: Option<PathBuf>) -> (Self, watch::Receiver<Arc<Readings>>) {
         let (published, readings) = watch::channel(Arc::default());
         let (machine, disk) = (Machine::default(), disk.to_owned());
-        (Self { places, published, csv, csv_lines: 0, disk, machine, gpus: None }, readings)
+        (Self { places, published, csv, csv_lines: 0, disk, machine, gpus: Gpus::default() }, readings)
     }
 
     fn sample(&mut self, ctx: &mut Context<Self>) {
@@ -122,11 +123,7 @@ impl LoadMonitor {
     }
 
     fn publish(&mut self, running: u32, idle: u32) {
-        if self.gpus.as_ref().is_some_and(|(read, _)| read.elapsed() > GPU_AGE) {
-            log::error!("the GPUs' driver no longer answers: they don't count for the load");
-            self.gpus = None;
-        }
-        let gpus = self.gpus.as_ref().map(|(_, gpus)| gpus.clone()).unwrap_or_default();
+        let (gpus, gpu_problem) = self.gpus.current(Instant::now());
         let least = sensors::least_busy(&self.machine, &gpus).cloned().unwrap_or_default();
         let sample = Sample {
             timestamp: SystemTime::UNIX_EPOCH.elapsed().map_or(0, |age| age.as_secs()),
@@ -143,6 +140,7 @@ impl LoadMonitor {
             let readings = Arc::make_mut(readings);
             readings.machine = self.machine;
             readings.gpus = gpus;
+            readings.gpu_problem = gpu_problem;
             if readings.history.len() == KEPT {
                 readings.history.pop_front();
             }
@@ -249,12 +247,8 @@ impl Handler<MachineRead> for LoadMonitor {
 impl Handler<GpusRead> for LoadMonitor {
     type Result = ();
 
-    fn handle(&mut self, GpusRead(gpus): GpusRead, _: &mut Self::Context) {
-        if self.gpus.is_none() {
-            let names: Vec<&str> = gpus.iter().map(|gpu| gpu.name.as_str()).collect();
-            log::info!("GPUs: {}", names.join(", "));
-        }
-        self.gpus = Some((Instant::now(), gpus));
+    fn handle(&mut self, GpusRead(reading): GpusRead, _: &mut Self::Context) {
+        self.gpus.read(Instant::now(), reading);
     }
 }
 
@@ -290,14 +284,16 @@ mod tests {
         let places = Places::new(2001..=2001, 1, None).start();
         let (mut monitor, readings) = LoadMonitor::new(places, Path::new("/"), None);
         let gpu = Gpu { compute: 90.0, ..Gpu::default() };
-        let before = |age: Duration| Instant::now().checked_sub(age).unwrap();
-        monitor.gpus = Some((before(GPU_AGE / 2), vec![gpu.clone()]));
+        let before = |age| Instant::now().checked_sub(Duration::from_secs(age)).unwrap();
+        let reading = GpuReading { gpus: vec![gpu], lost: 0 };
+        monitor.gpus.read(before(5), reading.clone());
         monitor.publish(0, 0);
         assert_eq!(readings.borrow().gpus.len(), 1);
         assert_eq!(readings.borrow().load.map(Load::percent), Some(90.0));
-        monitor.gpus = Some((before(GPU_AGE * 2), vec![gpu]));
+        monitor.gpus.read(before(20), reading);
         monitor.publish(0, 0);
         assert_eq!(readings.borrow().gpus, []);
+        assert!(readings.borrow().gpu_problem.is_some());
         assert_eq!(readings.borrow().load.map(Load::percent), Some(45.0));
     }
 }

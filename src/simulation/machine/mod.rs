@@ -1,6 +1,7 @@
 //! The machine: CPU, memory, disk, network, GPUs and display, and the load that is made of them.
 
 pub mod display;
+mod gpus;
 mod load_monitor;
 pub mod sensors;
 mod usage;

@@ -45,6 +45,15 @@ pub struct Gpu {
     pub memory_total: u64,
 }
 
+/// A reading of all GPUs.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct GpuReading {
+    /// Those that answer.
+    pub gpus: Vec<Gpu>,
+    /// How many the driver has lost: they have fallen off their bus.
+    pub lost: usize,
+}
+
 /// The load of a machine: `max(CPU, (swap + memory + GPU memory) / 3, GPU compute)`, all in percent, as the original
 /// has it. With several GPUs the least busy one counts, for that is the one a new client could use.
 #[must_use]
@@ -196,24 +205,41 @@ impl GpuSensor {
         Ok(Self { nvml: versioned.or_else(|_| Nvml::init())? })
     }
 
-    /// Reads all GPUs. A value that a GPU does not report is 0: some report no utilisation.
+    /// Reads all GPUs.
     #[must_use]
-    pub fn read(&self) -> Vec<Gpu> {
+    pub fn read(&self) -> GpuReading {
         let count = self.nvml.device_count().unwrap_or(0);
-        let devices = (0..count).filter_map(|index| self.nvml.device_by_index(index).ok());
-        devices
-            .map(|device| {
-                let utilisation = device.utilization_rates().ok();
-                let memory = device.memory_info().ok();
-                Gpu {
-                    name: device.name().unwrap_or_else(|_| "NVIDIA GPU".to_owned()),
-                    compute: utilisation.as_ref().map_or(0.0, |rates| f64::from(rates.gpu)),
-                    memory_traffic: utilisation.as_ref().map_or(0.0, |rates| f64::from(rates.memory)),
-                    memory: memory.as_ref().map_or(0.0, |memory| percent(memory.used, memory.total)),
-                    memory_total: memory.map_or(0, |memory| memory.total),
-                }
-            })
-            .collect()
+        let mut reading = GpuReading::default();
+        for index in 0..count {
+            match self.read_one(index) {
+                Ok(gpu) => reading.gpus.push(gpu),
+                Err(NvmlError::GpuLost) => reading.lost += 1,
+                Err(_) => {}
+            }
+        }
+        reading
+    }
+
+    /// Reads one GPU. A value that it does not report is 0: some report no utilisation.
+    fn read_one(&self, index: u32) -> Result<Gpu, NvmlError> {
+        let device = self.nvml.device_by_index(index)?;
+        let utilisation = unless_lost(device.utilization_rates())?;
+        let memory = unless_lost(device.memory_info())?;
+        Ok(Gpu {
+            name: device.name().unwrap_or_else(|_| "NVIDIA GPU".to_owned()),
+            compute: utilisation.as_ref().map_or(0.0, |rates| f64::from(rates.gpu)),
+            memory_traffic: utilisation.as_ref().map_or(0.0, |rates| f64::from(rates.memory)),
+            memory: memory.as_ref().map_or(0.0, |memory| percent(memory.used, memory.total)),
+            memory_total: memory.map_or(0, |memory| memory.total),
+        })
+    }
+}
+
+/// A value that a GPU may not report, unless the GPU is lost.
+fn unless_lost<T>(value: Result<T, NvmlError>) -> Result<Option<T>, NvmlError> {
+    match value {
+        Err(NvmlError::GpuLost) => Err(NvmlError::GpuLost),
+        value => Ok(value.ok()),
     }
 }
 

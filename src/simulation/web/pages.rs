@@ -53,6 +53,8 @@ struct Glance<'readings> {
     machine: Machine,
     memory: String,
     gpus: Vec<(&'readings Gpu, String)>,
+    /// What is wrong with the GPUs, if something is.
+    gpu_problem: Option<&'readings str>,
     running: u32,
     idle: u32,
     starting: u32,
@@ -146,6 +148,7 @@ impl<'readings> Glance<'readings> {
             machine: readings.machine,
             memory: bytes(readings.host.memory),
             gpus: with_sizes(&readings.gpus),
+            gpu_problem: readings.gpu_problem.as_deref(),
             running: instances.running,
             idle: instances.idle,
             starting: instances.starting,

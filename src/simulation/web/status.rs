@@ -27,6 +27,9 @@ pub struct StatusPage {
     pub machine: Machine,
     /// The newest readings of its GPUs.
     pub gpus: Vec<Gpu>,
+    /// What is wrong with the GPUs, if some have answered and don't any more.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub gpu_problem: Option<String>,
     /// Where Webots' own viewer can be had from this server.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub viewer: Option<&'static str>,
@@ -49,6 +52,7 @@ impl StatusPage {
             share_idle_time: rules.share_idle_time,
             docker: Some(rules.docker),
             draining: server.is_draining(),
+            failed_starts: server.failed_starts.count(),
             problem: server.problem(),
         };
         Self {
@@ -58,6 +62,7 @@ impl StatusPage {
             host: readings.host.clone(),
             machine: readings.machine,
             gpus: readings.gpus.clone(),
+            gpu_problem: readings.gpu_problem.clone(),
             viewer: webots_viewer::folder(&server.config).map(|_| webots_viewer::PATH),
             simulations: snapshot.simulations,
         }
@@ -81,10 +86,16 @@ pub fn gauges<'text>(server: &AppState, snapshot: &Snapshot) -> Vec<Gauge<'text>
         numbered.map(|(index, gpu)| (vec![index.to_string(), gpu.name.clone()], value(gpu))).collect()
     };
     let ready = f64::from(u8::from(server.problem().is_none()));
+    let failed_starts = f64::from(server.failed_starts.count());
     let draining = f64::from(u8::from(server.is_draining()));
     vec![
         Gauge::plain("webots_simulation_load_percent", "Load as /load tells it", server.load().percent()),
         Gauge::plain("webots_simulation_ready", "0 while no simulation can be started", ready),
+        Gauge::plain(
+            "webots_simulation_failed_starts",
+            "Starts in a row that failed for a reason of this server's own",
+            failed_starts,
+        ),
         Gauge::plain("webots_simulation_draining", "1 while no new clients are taken", draining),
         Gauge::plain("webots_simulation_places", "Simulations that fit", f64::from(instances.places)),
         Gauge {
@@ -97,6 +108,11 @@ pub fn gauges<'text>(server: &AppState, snapshot: &Snapshot) -> Vec<Gauge<'text>
         Gauge::plain("webots_machine_memory_percent", "Memory in use", machine.memory),
         Gauge::plain("webots_machine_swap_percent", "Swap in use", machine.swap),
         Gauge::plain("webots_machine_disk_percent", "Disk in use where the cache is", machine.disk),
+        Gauge::plain(
+            "webots_machine_gpu_lost",
+            "1 while GPUs have answered and some or all don't any more",
+            f64::from(u8::from(readings.gpu_problem.is_some())),
+        ),
         Gauge {
             name: "webots_machine_gpu_compute_percent",
             help: "GPU: time in which a kernel ran",

@@ -27,8 +27,18 @@ pub enum WebotsEvent {
 pub struct Exit {
     /// Whether it ended by itself and in order.
     pub clean: bool,
+    /// Whether it is this server's fault: Webots listens before it loads its world, so one that ends before has not seen it.
+    pub own: bool,
     /// In words, for the client.
     pub why: String,
+}
+
+impl Exit {
+    /// The end of a Webots that has ended by itself and in order.
+    #[must_use]
+    pub fn clean() -> Self {
+        Self { clean: true, own: false, why: "Webots has ended".to_owned() }
+    }
 }
 
 /// Sends a client the events of its Webots. The exit is sent in any case, also where the actor panics and is dropped.
@@ -61,7 +71,7 @@ impl Drop for ExitNotifier {
     fn drop(&mut self) {
         if !self.exit_told {
             let why = "The simulation was lost by a fault of this server".to_owned();
-            self.tell(WebotsEvent::Exited(Exit { clean: false, why }));
+            self.tell(WebotsEvent::Exited(Exit { clean: false, own: false, why }));
         }
     }
 }

@@ -13,7 +13,7 @@ use crate::simulation::config::SimulationConfig;
 use crate::simulation::container::{Containers, Request};
 use crate::simulation::isolation::{Cgroup, Launcher, Program, Watch, Watcher};
 use crate::simulation::places::Ticket;
-use crate::simulation::process::{PortFinder, SpawnSpec};
+use crate::simulation::process::SpawnSpec;
 use crate::simulation::protocol::Mode;
 
 /// Everything that one Webots is started with.
@@ -26,8 +26,6 @@ pub struct LaunchSpec {
     pub launcher: Arc<Launcher>,
     /// Watches over what it takes.
     pub watcher: Watcher,
-    /// Finds the port on which it listens.
-    pub port_finder: PortFinder,
     /// The program to start.
     pub program: PathBuf,
     /// Where controllers are restored from.
@@ -79,15 +77,23 @@ impl LaunchSpec {
         })
     }
 
-    /// What is watched of the simulation whose processes descend from this one.
-    #[must_use]
-    pub fn watch(&self, root: i32) -> Watch {
-        Watch {
+    /// Waits until the simulation whose processes descend from this one takes more than it may, and returns what, in words
+    /// for its client.
+    pub fn until_too_much(&self, root: i32) -> impl Future<Output = String> + use<> {
+        let watch = Watch {
             root,
             folder: self.project.instance.path().to_owned(),
             disk: self.config.limits.disk,
             processes: self.launcher.most_processes(),
             port: self.containers.is_none().then_some(self.place.1),
-        }
+        };
+        let watcher = self.watcher.clone();
+        async move { watcher.until_too_much(watch).await }
+    }
+
+    /// Waits until one of these processes listens on a port that Webots may have taken, and returns the port.
+    pub fn listening_port(&self, root: i32) -> impl Future<Output = u16> + use<> {
+        let (watcher, port) = (self.watcher.clone(), self.place.1);
+        async move { watcher.listening_port(root, port).await }
     }
 }

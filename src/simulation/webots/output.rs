@@ -5,6 +5,7 @@
 
 use std::collections::VecDeque;
 use std::io::{BufRead, BufReader, Write};
+use std::path::Path;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
@@ -58,10 +59,16 @@ impl OutputEvent {
 }
 
 impl Tail {
-    /// The lines, the oldest first.
+    /// The lines as the end of a sentence, for the client: Webots mostly says there what is wrong. Paths inside of the
+    /// project are those of its repository.
     #[must_use]
-    pub fn lines(&self) -> Vec<String> {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner).iter().cloned().collect()
+    pub fn last_words(&self, project: &Path) -> String {
+        let lines = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        if lines.is_empty() {
+            return ".".to_owned();
+        }
+        let lines: Vec<&str> = lines.iter().map(String::as_str).collect();
+        format!(". Its last output: {}", lines.join(" | ").replace(&format!("{}/", project.display()), ""))
     }
 
     fn push(&self, line: String) {

@@ -17,7 +17,6 @@ use super::output::{OutputEvent, Tail};
 use super::runtime::{Preparation, Runtime};
 use crate::shared::run::seconds_since_1970;
 use crate::simulation::checkout::CheckoutError;
-use crate::simulation::config::SimulationConfig;
 use crate::simulation::machine::display;
 use crate::simulation::process::{ExitReason, ProcessGroup};
 use crate::simulation::snapshot::{Change, Stage};
@@ -121,9 +120,8 @@ impl Webots {
         self.tail = tail;
         self.group = Some(group);
         ended.into_actor(self).map(|end, this, ctx| this.ended(&end, ctx)).spawn(ctx);
-        let (watcher, watch) = (self.spec.watcher.clone(), self.spec.watch(pid));
-        let excess = async move { watcher.until_too_much(watch).await };
-        excess.into_actor(self).map(|why, this, _| this.end_at_once(&why)).spawn(ctx);
+        let excess = self.spec.until_too_much(pid).into_actor(self);
+        excess.map(|why, this, _| this.end_at_once(&why)).spawn(ctx);
         Ok(())
     }
 
@@ -133,10 +131,8 @@ impl Webots {
         if self.spec.containers.is_none()
             && let Some(root) = self.group.as_ref().map(ProcessGroup::leader)
         {
-            let ports = SimulationConfig::ports_from(self.port);
-            let finder = self.spec.port_finder.clone();
-            let listening = async move { finder.find(root, ports).await };
-            listening.into_actor(self).map(|port, this, _| this.ready(port)).spawn(ctx);
+            let listening = self.spec.listening_port(root).into_actor(self);
+            listening.map(|port, this, _| this.ready(port)).spawn(ctx);
         }
     }
 
@@ -211,9 +207,9 @@ impl Webots {
         let out_of_memory =
             out_of_memory.then(|| "The simulation has taken more memory than it may (limits.memory)".to_owned());
         let mut exit = match self.stopped_for.take().or(out_of_memory) {
-            Some(why) => Exit { clean: false, why: self.with_output(&why) },
-            None if *reason == ExitReason::Code(0) => Exit { clean: true, why: "Webots has ended".to_owned() },
-            None => Exit { clean: false, why: self.with_output(&format!("Webots {reason}")) },
+            Some(why) => self.failure(&why),
+            None if *reason == ExitReason::Code(0) => Exit::clean(),
+            None => self.failure(&format!("Webots {reason}")),
         };
         if exit.clean || self.listening {
             return self.exited(exit, ctx);
@@ -228,13 +224,13 @@ impl Webots {
             .into_actor(self)
             .map(move |hint, this, ctx| {
                 let hint = hint.ok().flatten().map(|hint| format!(" Note: {hint}.")).unwrap_or_default();
-                this.exited(Exit { clean: false, why: exit.why.clone() + &hint }, ctx);
+                this.exited(Exit { why: format!("{}{hint}", exit.why), ..exit }, ctx);
             })
             .spawn(ctx);
     }
 
     fn not_started(&mut self, why: &str, ctx: &mut Context<Self>) {
-        self.exited(Exit { clean: false, why: why.to_owned() }, ctx);
+        self.exited(self.failure(why), ctx);
     }
 
     fn exited(&mut self, exit: Exit, ctx: &mut Context<Self>) {
@@ -242,10 +238,10 @@ impl Webots {
         ctx.stop();
     }
 
-    /// Adds the last lines of the output, in which Webots mostly says what is wrong.
-    fn with_output(&self, why: &str) -> String {
-        let lines = self.tail.lines();
-        if lines.is_empty() { format!("{why}.") } else { format!("{why}. Its last output: {}", lines.join(" | ")) }
+    /// An end that is not in order. What containers run is made by their project.
+    fn failure(&self, why: &str) -> Exit {
+        let why = format!("{why}{}", self.tail.last_words(&self.spec.project.instance.project()));
+        Exit { clean: false, own: !self.listening && self.spec.containers.is_none(), why }
     }
 
     fn tell(&mut self, event: WebotsEvent) {

@@ -1,0 +1,102 @@
+//! The GPUs of the machine: those that answer, and whether some are lost. Pure; the time is passed in.
+
+use std::time::{Duration, Instant};
+
+use super::sensors::{Gpu, GpuReading};
+
+/// How long a reading is used, and how long the GPUs may be silent.
+const SILENCE: Duration = Duration::from_secs(10);
+
+/// What is known of the GPUs.
+#[derive(Debug, Default)]
+pub(super) struct Gpus {
+    reading: GpuReading,
+    /// When that was read.
+    read: Option<Instant>,
+    /// When some GPU answered last, and how many did.
+    answered: Option<(Instant, usize)>,
+    problem: Option<String>,
+}
+
+impl Gpus {
+    /// Takes in a reading.
+    pub(super) fn read(&mut self, now: Instant, reading: GpuReading) {
+        if !reading.gpus.is_empty() {
+            if self.answered.is_none() {
+                let names: Vec<&str> = reading.gpus.iter().map(|gpu| gpu.name.as_str()).collect();
+                log::info!("GPUs: {}", names.join(", "));
+            }
+            self.answered = Some((now, reading.gpus.len()));
+        }
+        self.read = Some(now);
+        self.reading = reading;
+    }
+
+    /// Returns the GPUs that answer, and what is wrong if some did and don't any more. Logs what has changed.
+    pub(super) fn current(&mut self, now: Instant) -> (Vec<Gpu>, Option<String>) {
+        let is_recent = |at: Instant| now.saturating_duration_since(at) <= SILENCE;
+        if !self.read.is_some_and(is_recent) {
+            self.reading = GpuReading::default();
+        }
+        let GpuReading { gpus, lost } = self.reading.clone();
+        let problem = match self.answered {
+            _ if lost > 0 => Some(format!(
+                "NVIDIA's driver has lost {lost} of {} GPUs (see Xid in the kernel's log)",
+                lost + gpus.len()
+            )),
+            Some((at, count)) if !is_recent(at) => Some(format!("no GPU answers any more, of {count} that did")),
+            _ => None,
+        };
+        match &problem {
+            Some(why) if self.problem.is_none() => {
+                log::error!("{why}; those that don't answer don't count for the load");
+            }
+            None if self.problem.is_some() => log::info!("the GPUs answer again"),
+            _ => {}
+        }
+        self.problem.clone_from(&problem);
+        (gpus, problem)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn reading(gpus: usize, lost: usize) -> GpuReading {
+        GpuReading { gpus: vec![Gpu::default(); gpus], lost }
+    }
+
+    #[test]
+    fn gpus_that_were_seen_and_are_gone_are_told() {
+        let begin = Instant::now();
+        let at = |second| begin + Duration::from_secs(second);
+        let mut gpus = Gpus::default();
+        assert_eq!(gpus.current(at(100)), (vec![], None), "a machine without GPUs has lost none");
+        gpus.read(at(0), reading(2, 0));
+        assert_eq!((gpus.current(at(10)).0.len(), gpus.current(at(10)).1), (2, None));
+        for second in 11..=20 {
+            gpus.read(at(second), reading(0, 0));
+        }
+        let (left, why) = gpus.current(at(20));
+        assert_eq!((left.len(), why.as_deref()), (0, Some("no GPU answers any more, of 2 that did")));
+        gpus.read(at(21), reading(2, 0));
+        assert_eq!(gpus.current(at(21)).1, None);
+        // The driver hangs.
+        assert_eq!(gpus.current(at(31)).0.len(), 2);
+        let (left, why) = gpus.current(at(32));
+        assert!(left.is_empty() && why.is_some());
+    }
+
+    #[test]
+    fn a_card_that_is_lost_is_told_at_once_and_the_others_count() {
+        let now = Instant::now();
+        let mut gpus = Gpus::default();
+        gpus.read(now, reading(1, 1));
+        let (left, why) = gpus.current(now);
+        assert!(left.len() == 1 && why.unwrap().contains("has lost 1 of 2 GPUs"));
+        gpus.read(now, reading(0, 2));
+        let (left, why) = gpus.current(now);
+        assert!(left.is_empty() && why.unwrap().contains("has lost 2 of 2 GPUs"));
+    }
+}

@@ -1,0 +1,82 @@
+//! Two servers, the disk of one of them full, and a class of 16: all of them run. The disk fills while a class runs, and
+//! empties again.
+
+use std::path::Path;
+
+use serde_json::Value;
+
+use crate::disk::{self, Full};
+use crate::fleet::try_start;
+use crate::support::client::Client;
+use crate::support::git::Forge;
+use crate::support::program::{Builder, Server, session_server, simulation_server};
+use crate::support::webots::Webots;
+use crate::support::{http, skip, until};
+
+/// How many come.
+const CLASS: u16 = 16;
+
+fn server(forge: &Forge, webots: &Webots, folder: &Path) -> Builder {
+    std::fs::create_dir_all(folder).unwrap();
+    // The small disk has 64 MiB.
+    simulation_server(&webots.path(), forge.path(), CLASS).folder(folder).set("diskReserve", 8)
+}
+
+/// The state of the second simulation server, and the last error that was met there.
+async fn second(session: &Server) -> (String, String) {
+    let page: Value = http::get(&session.url("/status")).await.json();
+    let text = |key: &str| page["servers"][1][key].as_str().unwrap_or_default().to_owned();
+    (text("state"), text("error"))
+}
+
+/// A class that comes one by one, each after the other has its simulation.
+async fn class(session: &Server, clients: u16) -> Vec<Client> {
+    let mut class = Vec::new();
+    for number in 1..=clients {
+        let given = http::get(&session.url("/session")).await.text();
+        let client = try_start(&given).await;
+        class.push(client.unwrap_or_else(|why| panic!("client {number} of {clients}: {why}")));
+    }
+    class
+}
+
+#[actix_rt::test]
+async fn a_server_with_a_full_disk_takes_nobody_and_the_whole_class_runs_elsewhere() {
+    disk::hide_mounts_from_others();
+    let folder = tempfile::tempdir().unwrap();
+    let small = folder.path().join("small");
+    if !disk::small_disk(&small) {
+        return skip("a full disk", "only root may mount one");
+    }
+    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
+    let healthy = server(&forge, &webots, &folder.path().join("healthy")).start().await;
+    let full = server(&forge, &webots, &small).start().await;
+    let session = session_server(&[healthy.address(), full.address()]).set("loadThreshold", 1000).start().await;
+    until("both work", async || second(&session).await.0 == "up").await;
+
+    // It fills while it has a simulation.
+    let mut running = try_start(&format!("ws://{}", full.address())).await.unwrap();
+    let filler = Full::at(&small);
+    until("the full one is not offered", async || second(&session).await.0 == "down").await;
+    let (_, why) = second(&session).await;
+    assert!(why.contains("disk is full: less than 8 MiB are left (diskReserve)"), "{why}");
+    let health = http::try_get(&full.url("/health")).await.unwrap();
+    assert!(health.status.as_u16() == 503 && health.text().contains("disk is full"), "{}", health.text());
+    let page = http::get(&full.url("/monitor")).await.text();
+    assert!(page.contains("Not ready") && page.contains("disk is full"), "{page}");
+    let all = class(&session, CLASS).await;
+    assert_eq!(all.len(), usize::from(CLASS));
+    let known: Value = http::get(&healthy.url("/status")).await.json();
+    assert_eq!(known["simulations"].as_array().unwrap().len(), usize::from(CLASS));
+    running.until(".").await;
+
+    // It empties.
+    drop(filler);
+    until("it is offered again", async || second(&session).await.0 == "up").await;
+    assert_eq!(http::try_get(&full.url("/health")).await.unwrap().status.as_u16(), 200);
+    for client in all {
+        client.leave().await;
+    }
+    running.leave().await;
+    class(&session, 4).await;
+}

@@ -1,0 +1,147 @@
+//! Starts that fail for a reason of the server's own: their clients are sent elsewhere, session servers prefer others, and
+//! no text for a client tells where something is on the machine.
+
+use std::os::unix::fs::PermissionsExt;
+use std::path::Path;
+
+use serde_json::Value;
+
+use super::scene::{DEMO, arm};
+use crate::support::client::Client;
+use crate::support::git::{Forge, world};
+use crate::support::program::{Server, session_server, simulation_server};
+use crate::support::webots::Webots;
+use crate::support::{http, until};
+
+async fn failed_starts(server: &Server) -> u64 {
+    let page: Value = http::get(&server.url("/status")).await.json();
+    page["failedStarts"].as_u64().unwrap()
+}
+
+#[actix_rt::test]
+async fn a_client_whose_start_fails_for_the_servers_reason_is_sent_elsewhere_and_the_server_tells_so() {
+    let (forge, folder) = (Forge::with_arm(), tempfile::tempdir().unwrap());
+    let repaired = folder.path().join("repaired");
+    let webots = Webots::script(&format!("[ -e {} ] || exit 3\n{DEMO} \"$@\" & wait", repaired.display()));
+    let server = simulation_server(&webots.path(), forge.path(), 2).set("isolation", "none").start().await;
+    for count in 1..=3 {
+        let mut client = Client::start(&server, &arm()).await;
+        let told = client.until("loading: Error:").await;
+        let words = "Connect again: the session server chooses another simulation server";
+        assert!(told.contains("Webots ended with exit code 3.") && told.ends_with(words), "{told}");
+        assert_eq!(client.closed().await, Some(1013));
+        assert_eq!(failed_starts(&server).await, count);
+    }
+    // A world that is not there is not the server's fault.
+    let mut client = Client::start(&server, &world("lab/arm", "main", "worlds/none.wbt")).await;
+    client.until("loading: Error:").await;
+    assert_eq!((client.closed().await, failed_starts(&server).await), (Some(1000), 3));
+    let metrics = http::get(&server.url("/metrics")).await.text();
+    assert!(metrics.contains("\nwebots_simulation_failed_starts 3\n"), "{metrics}");
+    std::fs::write(&repaired, "").unwrap();
+    Client::start(&server, &arm()).await.until("webots:").await;
+    assert_eq!(failed_starts(&server).await, 0);
+}
+
+#[actix_rt::test]
+async fn a_black_hole_takes_a_handful_of_clients_and_not_a_class() {
+    let (forge, folder) = (Forge::with_arm(), tempfile::tempdir().unwrap());
+    let repaired = folder.path().join("repaired");
+    let broken = Webots::script(&format!("[ -e {} ] || exit 3\n{DEMO} \"$@\" & wait", repaired.display()));
+    let webots = Webots::launcher();
+    let healthy = simulation_server(&webots.path(), forge.path(), 12).start().await;
+    let hole = simulation_server(&broken.path(), forge.path(), 12).set("isolation", "none").start().await;
+    // What else runs on this machine must not close the fleet.
+    let servers = [healthy.address(), hole.address()];
+    let session = session_server(&servers).set("loadThreshold", 1000).start().await;
+    let status = async || -> Value { http::get(&session.url("/status")).await.json() };
+    let state = |page: &Value, one: usize| page["servers"][one]["state"].as_str().unwrap().to_owned();
+    until("both work", async || {
+        let page = status().await;
+        state(&page, 0) == "up" && state(&page, 1) == "up"
+    })
+    .await;
+    let (mut running, mut failures) = (Vec::new(), 0);
+    while running.len() < 10 {
+        let given = http::get(&session.url("/session")).await.text();
+        let mut client = Client::connect(&format!("{given}/client")).await;
+        client.send(&serde_json::json!({"start": {"url": arm()}}).to_string()).await;
+        loop {
+            let text = client.until("").await;
+            if text.starts_with("webots:") {
+                running.push(client);
+                break;
+            } else if text.starts_with("loading: Error:") {
+                failures += 1;
+                assert_eq!(client.closed().await, Some(1013), "{text}");
+                break;
+            }
+        }
+        assert!(failures < 6, "{}", status().await);
+    }
+    assert!(failures >= 3, "the black hole got nobody: {failures}");
+    let page = status().await;
+    assert!(page["servers"][1]["error"].as_str().is_some_and(|why| why.contains("others are preferred")), "{page}");
+    assert!(session.log().contains("failed for a reason of its own; others are preferred"), "{}", session.log());
+    // Who comes by itself shows that it works again.
+    std::fs::write(&repaired, "").unwrap();
+    Client::start(&hole, &arm()).await.until("webots:").await;
+    until("it is as good as others", async || status().await["servers"][1]["error"].is_null()).await;
+}
+
+/// What a client hears of a start that fails.
+async fn heard(server: &Server, world: &str) -> Vec<String> {
+    let mut client = Client::start(server, world).await;
+    client.until("loading: Error:").await;
+    client.heard
+}
+
+fn allow(path: &Path, mode: u32) {
+    std::fs::set_permissions(path, std::fs::Permissions::from_mode(mode)).unwrap();
+}
+
+#[actix_rt::test]
+async fn no_text_for_a_client_holds_a_path_of_the_machine() {
+    let forge = Forge::with_arm();
+    let end =
+        "for last; do :; done\necho \"can't open $last\"; echo \"File '$PWD/controllers/arm/arm.py', $0\" >&2; exit 1";
+    let webots = Webots::script(end);
+    let server = simulation_server(&webots.path(), forge.path(), 2).start().await;
+    let mut all = heard(&server, &arm()).await;
+    assert!(all.iter().any(|text| text.contains("can't open worlds/a.wbt")), "{all:?}");
+    for (repository, place) in [("lab/none", "main"), ("lab/arm", "none"), ("lab/arm", "main")] {
+        all.extend(heard(&server, &world(repository, place, "worlds/none.wbt")).await);
+    }
+    all.extend(heard(&server, "https://github.com/../etc/passwd").await);
+    // The repositories can't be read any more.
+    let away = forge.path().with_extension("away");
+    std::fs::rename(forge.path(), &away).unwrap();
+    std::fs::write(forge.path(), "no folder").unwrap();
+    all.extend(heard(&server, &world("lab/arm", "other", "worlds/arm.wbt")).await);
+    std::fs::remove_file(forge.path()).unwrap();
+    std::fs::rename(&away, forge.path()).unwrap();
+    // What was fetched is no repository any more.
+    let cached = std::fs::read_dir(server.folder.join("cache/git")).unwrap().flatten().map(|entry| entry.path());
+    for repository in cached.filter(|path| path.is_dir()) {
+        std::fs::write(repository.join("config"), "[nonsense").unwrap();
+    }
+    all.extend(heard(&server, &arm()).await);
+    // Webots can't be run, and is gone.
+    allow(&webots.path(), 0o644);
+    all.extend(heard(&server, &arm()).await);
+    std::fs::remove_file(webots.path()).unwrap();
+    all.extend(heard(&server, &arm()).await);
+    // The folder of the run is none.
+    let other = simulation_server(&Webots::launcher().path(), forge.path(), 1).start().await;
+    let run = std::fs::read_dir(other.folder.join("cache/runs")).unwrap().next().unwrap().unwrap().path();
+    std::fs::remove_dir_all(&run).unwrap();
+    std::fs::write(&run, "no folder").unwrap();
+    all.extend(heard(&other, &arm()).await);
+    let temporary = std::env::temp_dir().to_str().unwrap().to_owned();
+    for text in &all {
+        for path in [&temporary, "cache/", "runs/", env!("CARGO_MANIFEST_DIR"), "/bin/", "/git/"] {
+            assert!(!text.contains(path), "{path}: {text}");
+        }
+    }
+    assert!(all.iter().filter(|text| text.starts_with("loading: Error:")).count() >= 9, "{all:#?}");
+}
