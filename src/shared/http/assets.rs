@@ -91,7 +91,7 @@ mod tests {
 
     #[test]
     fn nothing_else_is_sent() {
-        for name in ["", "../style.css", "style.css/", "mail.html"] {
+        for name in ["", "../style.css", "style.css/", "mail.txt"] {
             assert_eq!(ask(name, None).status(), 404, "{name:?}");
         }
     }
