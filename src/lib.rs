@@ -41,7 +41,7 @@
 //!     |  '- Update -- Broadcaster <-- Update, Subscribe -'  '-- ProbeResult --> Registry
 //!     '--- SubscribeClient --^  one per worker thread
 //!
-//!   NameMonitor -- A, AAAA, SRV --> DNS server; -- LookupResult --> Registry (one per name in simulationServers)
+//!   NameMonitor -- A, AAAA --> DNS server; -- LookupResult --> Registry (one per name in simulationServers)
 //!
 //!   The monitors share a thread of their own, so that clients never wait for them.
 //!

@@ -11,7 +11,7 @@ use tokio::sync::watch;
 
 use super::config::SessionConfig;
 use super::state::AppState;
-use crate::session::fleet::{IsAvailable, Reconfigure, Registry};
+use crate::session::fleet::{IsAvailable, Reconfigure, Registry, resolver};
 use crate::session::mail;
 use crate::session::web::{LocalBroadcaster, configure};
 use crate::shared::config;
@@ -146,7 +146,7 @@ fn assemble(
     let (timing, client_urls) = (config.timing.clone(), config.client_urls());
     let trusted_proxies = config.trusted_proxies.clone();
     let (examples, viewer_script) = (config.examples.clone(), config.viewer_script.clone());
-    let registry = Registry::new(Arc::new(config), mailer, latencies).start();
+    let registry = Registry::new(Arc::new(config), mailer, latencies, resolver()?).start();
     let (started, started_at) = (Instant::now(), SystemTime::now());
     Ok(AppState {
         registry,

@@ -8,7 +8,6 @@ use serde::{Deserialize, Serialize};
 
 use super::example::Example;
 use super::mail_address;
-use super::name_server::NameServer;
 use super::server_entry::ServerEntry;
 use super::timing::Timing;
 use crate::session::placement::Policy;
@@ -43,12 +42,8 @@ pub struct SessionConfig {
     /// Default: none, and each is reached under its own address.
     #[serde(default, deserialize_with = "optional_expanded")]
     pub public_url: Option<PublicUrl>,
-    /// The simulation servers: HOST:PORT, HOST/PORT, `dns+NAME:PORT` for all addresses of a name, or `dnssrv+NAME` for all
-    /// targets of an SRV record.
+    /// The simulation servers: HOST:PORT, HOST/PORT, or `dns+NAME:PORT` for all addresses of a name.
     pub simulation_servers: Vec<ServerEntry>,
-    /// DNS servers that are asked for these names. Default: none, and those of the machine are asked.
-    #[serde(default, deserialize_with = "one_or_many")]
-    pub name_servers: Vec<NameServer>,
     /// Those of `simulationServers` that get no new clients. They are still watched. Default: none.
     #[serde(default)]
     pub drained_servers: Vec<PublicAddress>,
@@ -210,6 +205,8 @@ impl SessionConfig {
 
 impl Configuration for SessionConfig {
     const ALIASES: &'static [&'static str] = &[];
+    const REMOVED: &'static [(&'static str, &'static str)] =
+        &[("nameServers", "was removed: names are looked up as /etc/resolv.conf and /etc/hosts of the machine say")];
 
     fn complete(&mut self, _: &std::path::Path) -> Result<Vec<String>, InvalidValue> {
         let mut warnings = Vec::new();

@@ -3,6 +3,7 @@
 use std::sync::Arc;
 
 use actix::prelude::*;
+use hickory_resolver::TokioResolver;
 use rustls::ClientConfig;
 
 use super::name_monitor::{LookupResult, NameMonitor};
@@ -15,6 +16,7 @@ use crate::shared::http::tls;
 pub struct Monitors {
     thread: Arbiter,
     tls: Option<Arc<ClientConfig>>,
+    resolver: TokioResolver,
 }
 
 /// Who hears what the monitors find.
@@ -27,23 +29,22 @@ pub struct Results {
 
 impl Monitors {
     /// A thread without monitors.
-    #[must_use]
-    pub fn new() -> Self {
-        Self { thread: Arbiter::new(), tls: tls::client_config() }
+    pub fn new(resolver: TokioResolver) -> Self {
+        Self { thread: Arbiter::new(), tls: tls::client_config(), resolver }
     }
 
     /// Starts the monitor of a simulation server.
     pub fn watch(&self, server: &PublicAddress, config: &SessionConfig, results: &Results) -> Addr<ServerMonitor> {
         let (server, tls, results) = (server.clone(), self.tls.clone(), results.probes.clone());
-        let (settings, name_servers) = (ProbeSettings::new(config), config.name_servers.clone());
+        let (settings, resolver) = (ProbeSettings::new(config), self.resolver.clone());
         ServerMonitor::start_in_arbiter(&self.thread.handle(), move |_| {
-            ServerMonitor::new(server, settings, name_servers, tls, results)
+            ServerMonitor::new(server, settings, resolver, tls, results)
         })
     }
 
     /// Starts the monitor of a name.
-    pub fn look_up(&self, name: &DnsName, config: &SessionConfig, results: &Results) -> Addr<NameMonitor> {
-        let (name, servers, results) = (name.clone(), config.name_servers.clone(), results.lookups.clone());
-        NameMonitor::start_in_arbiter(&self.thread.handle(), move |_| NameMonitor::new(name, servers, results))
+    pub fn look_up(&self, name: &DnsName, results: &Results) -> Addr<NameMonitor> {
+        let (name, results) = (name.clone(), results.lookups.clone());
+        NameMonitor::start_in_arbiter(&self.thread.handle(), move |_| NameMonitor::new(name, results))
     }
 }

@@ -84,19 +84,14 @@ impl Names {
         let failed = looked.error.is_some();
         let mut servers = false;
         let turn = match answer {
-            Ok(mut found) => {
+            Ok(found) => {
                 looked.error = None;
-                if !found.complete {
-                    // What is not told of has not gone.
-                    let by_ipv6 = |server: &&PublicAddress| server.host().starts_with('[');
-                    found.servers.extend(looked.servers.iter().filter(by_ipv6).cloned());
-                }
-                servers = found.servers != looked.servers;
-                looked.servers = found.servers;
+                servers = found != looked.servers;
+                looked.servers = found;
                 failed.then_some(Turn::WorksAgain(looked.servers.len()))
             }
             Err(error) => {
-                let error: String = one_line(&error.to_string()).chars().take(LONGEST_ERROR).collect();
+                let error: String = one_line(&error).chars().take(LONGEST_ERROR).collect();
                 looked.error = Some(error.clone());
                 (!failed).then_some(Turn::Fails(error))
             }

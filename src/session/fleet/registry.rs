@@ -9,6 +9,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use actix::prelude::*;
+use hickory_resolver::TokioResolver;
 
 use super::changes::Changes;
 use super::fleet_status::{FleetStatus, ServerStatus};
@@ -69,13 +70,18 @@ const TICK: Duration = Duration::from_millis(250);
 impl Registry {
     /// A registry whose monitors are started with it.
     #[must_use]
-    pub fn new(config: Arc<SessionConfig>, mailer: Option<Addr<Mailer>>, latencies: prometheus::Histogram) -> Self {
+    pub fn new(
+        config: Arc<SessionConfig>,
+        mailer: Option<Addr<Mailer>>,
+        latencies: prometheus::Histogram,
+        resolver: TokioResolver,
+    ) -> Self {
         Self {
             fleet: Fleet::new(config.policy()),
             quota: quota::placements(),
             config,
             latencies,
-            servers: Servers::new(),
+            servers: Servers::new(resolver),
             subscribers: Subscribers::default(),
             available: false,
             changes: Changes::new(mailer),

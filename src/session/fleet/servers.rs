@@ -7,6 +7,7 @@
 use std::collections::{BTreeSet, HashMap};
 
 use actix::prelude::*;
+use hickory_resolver::TokioResolver;
 
 use super::fleet_status::NameStatus;
 use super::monitors::{Monitors, Results};
@@ -46,13 +47,13 @@ pub struct ListChange {
 impl Servers {
     /// No servers yet.
     #[must_use]
-    pub fn new() -> Self {
-        Self { monitors: Monitors::new(), names: Names::default(), listed: Vec::new(), watched: HashMap::new() }
+    pub fn new(resolver: TokioResolver) -> Self {
+        Self { monitors: Monitors::new(resolver), names: Names::default(), listed: Vec::new(), watched: HashMap::new() }
     }
 
     /// Follows a configuration: what it no longer lists is forgotten.
     pub fn apply(&mut self, config: &SessionConfig, results: &Results) -> ListChange {
-        self.names.apply(&config.simulation_servers, |name| self.monitors.look_up(name, config, results));
+        self.names.apply(&config.simulation_servers, |name| self.monitors.look_up(name, results));
         self.list(config, results, true)
     }
 
@@ -108,7 +109,7 @@ impl Servers {
             log::error!("{server}: its monitor is gone, a new one is started");
             watched.monitor = self.monitors.watch(server, config, results);
         }
-        self.names.restart_gone(|name| self.monitors.look_up(name, config, results));
+        self.names.restart_gone(|name| self.monitors.look_up(name, results));
     }
 
     /// Changes how servers are probed.
