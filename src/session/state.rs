@@ -20,6 +20,8 @@ use crate::shared::text::client_text;
 pub struct AppState {
     /// The registry of simulation servers.
     pub registry: Addr<Registry>,
+    /// Whether a simulation server can take a client; the registry publishes it.
+    pub available: watch::Receiver<bool>,
     /// `timing` of the configuration.
     pub timing: Timing,
     /// How the URLs of simulation servers are formed for clients.

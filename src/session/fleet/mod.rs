@@ -13,10 +13,8 @@ mod resolver;
 mod server_monitor;
 mod server_record;
 mod servers;
-mod subscribers;
 
 pub use fleet_status::{FleetStatus, NameStatus, ServerStatus, State, StateChange, displayed_mean_load};
 pub use pick::{NoServer, Pick};
-pub use registry::{GetStatus, IsAvailable, Reconfigure, Registry, Subscribe};
+pub use registry::{GetStatus, Ping, Reconfigure, Registry};
 pub use resolver::resolver;
-pub use subscribers::{Subscribers, Update};

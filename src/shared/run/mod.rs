@@ -10,6 +10,7 @@ mod pid_file;
 mod rotated_file;
 mod shutdown;
 pub mod start;
+mod supervisor;
 mod timestamp;
 
 pub use app_error::AppError;
@@ -17,4 +18,5 @@ pub use logging::LogTarget;
 pub use open_files::raise_open_files;
 pub use rotated_file::RotatedFile;
 pub use shutdown::{Phase, Request, Signals, closing};
+pub use supervisor::{Supervisor, TooManyPanics};
 pub use timestamp::{seconds_since_1970, timestamp};
