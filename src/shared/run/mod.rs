@@ -1,7 +1,6 @@
 //! How a server starts, says that it is ready, writes its log, and handles signals.
 
 mod app_error;
-mod log_limit;
 mod logging;
 pub mod notify;
 mod open_files;
