@@ -155,7 +155,7 @@ fn assemble(
         trusted_proxies,
         metrics,
         picks,
-        live: Live::new(),
+        live: Live::default(),
         examples,
         viewer_script,
         started,

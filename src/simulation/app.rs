@@ -238,7 +238,7 @@ fn assemble(
         metrics,
         starts,
         start_quota: quota::starts(),
-        live: Live::new(),
+        live: Live::default(),
         usage: UsageMonitor::default(),
         started: Instant::now(),
         config,
