@@ -84,8 +84,6 @@
 //! 5. An actor whose WebSocket's peer does not read is not polled once the buffers are full: whoever must be closed
 //!    for that reason has to be closed before, see [`shared::http::liveness`].
 
-#![warn(clippy::missing_docs_in_private_items)]
-
 pub mod session;
 pub mod shared;
 pub mod simulation;

@@ -61,7 +61,6 @@ const PICK_TIMEOUT: Duration = Duration::from_secs(2);
 
 impl AppState {
     /// Returns how many web clients are connected.
-    #[must_use]
     pub fn clients(&self) -> usize {
         self.connections.count(Kind::Client)
     }

@@ -127,7 +127,6 @@ const RELOADED: [&str; 7] = [
 impl SessionConfig {
     /// Returns the configuration to go on with when `new` was read while the server runs with this one. Changes that need
     /// a restart are logged.
-    #[must_use]
     pub fn reload(&self, new: &Self) -> Self {
         let takes_effect = |key: &&String| RELOADED.contains(&key.as_str()) || (*key == "port" && new.port == 0);
         for key in changed_keys(self, new).iter().filter(|key| !takes_effect(key)) {
@@ -137,7 +136,6 @@ impl SessionConfig {
     }
 
     /// The parameters of placement.
-    #[must_use]
     pub fn policy(&self) -> Policy {
         Policy {
             threshold: self.load_threshold,
@@ -148,26 +146,22 @@ impl SessionConfig {
     }
 
     /// Returns the address of this server.
-    #[must_use]
     pub fn address(&self) -> PublicAddress {
         PublicAddress::new(&self.server, self.port, self.port_rewrite)
     }
 
     /// Returns the HTTP URL under which clients reach this server. With a public URL, it is that of the web server.
-    #[must_use]
     pub fn http_url(&self) -> String {
         self.public_url.as_ref().map_or_else(|| self.address().http_url(self.ssl), PublicUrl::http_door)
     }
 
     /// Returns the WebSocket URL under which clients reach this server.
-    #[must_use]
     pub fn websocket_url(&self) -> String {
         let door = self.public_url.as_ref().map(PublicUrl::websocket_door);
         format!("{}/session", door.unwrap_or_else(|| self.address().websocket_url(self.ssl)))
     }
 
     /// Returns how the URLs of simulation servers are formed for clients.
-    #[must_use]
     pub fn client_urls(&self) -> ClientUrls {
         ClientUrls { ssl: self.ssl, public: self.public_url.clone() }
     }

@@ -90,7 +90,6 @@ impl Names {
     }
 
     /// The servers that these entries stand for, in their order, each once.
-    #[must_use]
     pub fn servers(&self, entries: &[ServerEntry]) -> Vec<PublicAddress> {
         let mut seen = BTreeSet::new();
         let mut servers = Vec::new();
@@ -102,7 +101,6 @@ impl Names {
     }
 
     /// What is known of each name.
-    #[must_use]
     pub fn status(&self) -> Vec<NameStatus> {
         let status = |(name, looked): (&DnsName, &Looked)| NameStatus {
             name: name.clone(),

@@ -53,7 +53,6 @@ pub struct ProbeSettings {
 
 impl ProbeSettings {
     /// As the configuration has it.
-    #[must_use]
     pub fn new(config: &SessionConfig) -> Self {
         Self { interval: config.load_refresh, timeout: config.timing.answer, ssl: config.ssl }
     }
@@ -115,7 +114,6 @@ fn client(interval: Duration, resolver: TokioResolver, tls: Option<Arc<ClientCon
 
 impl ServerMonitor {
     /// A monitor of one server, whose host this resolver looks up. To be created in the thread in which it will run.
-    #[must_use]
     pub fn new(
         server: PublicAddress,
         settings: ProbeSettings,

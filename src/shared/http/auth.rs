@@ -43,7 +43,6 @@ pub enum AuthError {
 
 impl BasicAuth {
     /// Creates an authenticator for this password.
-    #[must_use]
     pub fn new(password: Secret) -> Self {
         Self { password, attempts: RateLimiter::hashmap(Quota::per_minute(PER_MINUTE).allow_burst(BURST)) }
     }
@@ -78,7 +77,6 @@ impl BasicAuth {
 
 impl AuthError {
     /// The response to a request that is refused.
-    #[must_use]
     pub fn answer(self) -> HttpResponse {
         match self {
             Self::NoPassword => HttpResponse::Unauthorized()

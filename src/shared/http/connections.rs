@@ -68,14 +68,12 @@ pub enum TooManyConnections {
 impl Connections {
     /// Allows `max_tcp` TCP connections and `max_clients` web clients, of which one address may have `per_address`, or a
     /// share where that is not said.
-    #[must_use]
     pub fn new(max_tcp: usize, max_clients: usize, per_address: Option<usize>) -> Self {
         let per_address = per_address.unwrap_or_else(|| share(max_clients).min(MOST_CLIENTS));
         Self { max_tcp, max_clients, per_address, open: Arc::default() }
     }
 
     /// How many connections of a kind are open.
-    #[must_use]
     pub fn count(&self, kind: Kind) -> usize {
         self.open.lock().all.get(&kind).copied().unwrap_or_default()
     }
@@ -134,7 +132,6 @@ impl Drop for ConnectionPermit {
 
 impl TooManyConnections {
     /// Returns the response to a client that is refused.
-    #[must_use]
     pub fn answer(self) -> HttpResponse {
         let status = match self {
             Self::InAll => StatusCode::SERVICE_UNAVAILABLE,

@@ -38,7 +38,6 @@ pub enum Peer {
 impl Peer {
     /// The key by which rate limits count a client, if its address is known. An IPv6 client has a whole /64 of addresses,
     /// which count as one.
-    #[must_use]
     pub fn rate_limit_key(self) -> Option<IpAddr> {
         match self {
             Self::Client(IpAddr::V6(address)) => Some(Ipv6Addr::from_bits(address.to_bits() >> 64 << 64).into()),
@@ -50,7 +49,6 @@ impl Peer {
 
 impl TrustedProxies {
     /// The other end of a request.
-    #[must_use]
     pub fn peer(&self, request: &HttpRequest) -> Peer {
         match request.peer_addr() {
             Some(address) => self.resolve(address.ip().to_canonical(), request.headers()),
@@ -59,7 +57,6 @@ impl TrustedProxies {
     }
 
     /// The other end of a connection on which nothing was said yet.
-    #[must_use]
     pub fn of_connection(&self, address: IpAddr) -> Peer {
         let address = address.to_canonical();
         if self.trusts(address) { Peer::Proxy(address) } else { Peer::Client(address) }

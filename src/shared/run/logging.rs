@@ -23,7 +23,6 @@ pub enum LogTarget<'path> {
 
 impl<'path> LogTarget<'path> {
     /// Standard output where `debug` is set, else this file.
-    #[must_use]
     pub fn new(debug: bool, file: &'path Path) -> Self {
         if debug { Self::Stdout } else { Self::File(file) }
     }
