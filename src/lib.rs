@@ -38,10 +38,9 @@
 //!     | one per WebSocket                             ^  |  | one per simulation server
 //!   WebClient ---------- Pick ------------------------'  |  v
 //!     |  ^                                               | ServerMonitor -- GET /status, /load --> simulation server
-//!     |  '- Update -- Broadcaster <-- Update, Subscribe -'  '-- ProbeResult --> Registry
-//!     '--- SubscribeClient --^  one per worker thread
+//!     |  '- availability (watch channel) -- Registry     '-- ProbeResult --> Registry
 //!
-//!   NameMonitor -- A, AAAA, SRV --> DNS server; -- LookupResult --> Registry (one per name in simulationServers)
+//!   NameMonitor -- A, AAAA --> DNS server; -- LookupResult --> Registry (one per name in simulationServers)
 //!
 //!   The monitors share a thread of their own, so that clients never wait for them.
 //!
@@ -66,13 +65,15 @@
 //! | actor | ends by itself | after a panic |
 //! |---|---|---|
 //! | Registry, Places, `LoadMonitor` | never | the server logs it and ends with exit code 1: the service manager starts it again |
-//! | `ServerMonitor` | when its server leaves the configuration, or has left its name and does not answer | the registry makes a new one |
-//! | `NameMonitor` | when its name leaves the configuration | the registry makes a new one |
-//! | Mailer | never | the registry makes a new one |
-//! | Broadcaster | never | its clients' connections close with 1011; who connects next gets a new one |
+//! | `ServerMonitor` | when its server leaves the configuration, or has left its name and does not answer | its supervisor makes a new one |
+//! | `NameMonitor` | when its name leaves the configuration | its supervisor makes a new one |
+//! | Mailer | never | its supervisor makes a new one; what it had not sent is lost |
 //! | Announcer | when all are told or given up | it is not started again: announcing is a courtesy |
 //! | `WebClient` | with its connection | its connection closes; what it leased is freed |
 //! | Webots | with its process tree; it is never restarted, its client is told | its process tree is killed at once, its folder removed, its place freed |
+//!
+//! The registry looks after the supervisors ([`shared::run::Supervisor`], one for each kind). More than five panics of a kind
+//! within a minute end the server with exit code 1, too.
 //!
 //! # Facts about actix 0.13 that this rests on
 //!
@@ -82,8 +83,6 @@
 //! 4. tokio's `kill_on_drop` reaches the direct child only; Webots' launcher has a child of its own.
 //! 5. An actor whose WebSocket's peer does not read is not polled once the buffers are full: whoever must be closed
 //!    for that reason has to be closed before, see [`shared::http::liveness`].
-
-#![warn(clippy::missing_docs_in_private_items)]
 
 pub mod session;
 pub mod shared;

@@ -11,9 +11,9 @@ use tokio::sync::watch;
 
 use super::config::SessionConfig;
 use super::state::AppState;
-use crate::session::fleet::{IsAvailable, Reconfigure, Registry};
+use crate::session::fleet::{Ping, Reconfigure, Registry, resolver};
 use crate::session::mail;
-use crate::session::web::{LocalBroadcaster, configure};
+use crate::session::web::configure;
 use crate::shared::config;
 use crate::shared::http::Connections;
 use crate::shared::http::Live;
@@ -53,17 +53,13 @@ pub async fn run(mut config: SessionConfig, file: PathBuf) -> Result<(), AppErro
     let (http_url, websocket_url) = (config.http_url(), config.websocket_url());
     let server = Arc::new(assemble(config, connections, phase)?);
     let shared = web::Data::from(Arc::clone(&server));
-    // Called once in each thread that serves connections.
-    let app = move || {
-        let broadcaster = web::Data::new(LocalBroadcaster::start(Arc::clone(&shared)));
-        App::new().app_data(shared.clone()).app_data(broadcaster).configure(configure)
-    };
+    let app = move || App::new().app_data(shared.clone()).configure(configure);
     let http = server::serve(socket, server.connections.clone(), options, app)?;
     let handle = http.handle();
     let serving = actix_rt::spawn(http);
     start::announce("session server", &http_url, &websocket_url, port);
     let registry = server.registry.clone();
-    actix_rt::spawn(notify::feed_watchdog(async move || registry.send(IsAvailable).await.is_ok()));
+    actix_rt::spawn(notify::feed_watchdog(async move || registry.send(Ping).await.is_ok()));
     tokio::select! {
         () = obey(&mut signals, &file, &server.registry, port) => {}
         fault = permanent::stopped("Registry", server.registry.clone()) => return Err(AppError::ActorStopped(fault)),
@@ -146,10 +142,12 @@ fn assemble(
     let (timing, client_urls) = (config.timing.clone(), config.client_urls());
     let trusted_proxies = config.trusted_proxies.clone();
     let (examples, viewer_script) = (config.examples.clone(), config.viewer_script.clone());
-    let registry = Registry::new(Arc::new(config), mailer, latencies).start();
+    let (available_sender, available) = watch::channel(false);
+    let registry = Registry::new(Arc::new(config), mailer, latencies, (resolver()?, available_sender)).start();
     let (started, started_at) = (Instant::now(), SystemTime::now());
     Ok(AppState {
         registry,
+        available,
         timing,
         client_urls,
         phase,
@@ -157,7 +155,7 @@ fn assemble(
         trusted_proxies,
         metrics,
         picks,
-        live: Live::new(),
+        live: Live::default(),
         examples,
         viewer_script,
         started,
@@ -177,61 +175,5 @@ fn reload(file: &Path, registry: &Addr<Registry>) {
             registry.do_send(Reconfigure(Arc::new(loaded.config)));
         }
         Err(error) => log::error!("the configuration stays as it was: {error}"),
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use actix_web::HttpServer;
-    use futures_util::StreamExt;
-    use tokio_tungstenite::tungstenite::Message as Frame;
-
-    use super::*;
-    use crate::session::web::Broadcaster;
-
-    #[derive(Message)]
-    #[rtype(result = "()")]
-    struct Panic;
-
-    impl Handler<Panic> for Broadcaster {
-        type Result = ();
-
-        fn handle(&mut self, _: Panic, _: &mut Self::Context) {
-            panic!("a test asks for it");
-        }
-    }
-
-    #[actix_rt::test]
-    async fn clients_whose_broadcaster_panics_are_sent_away_and_find_another_one() {
-        let config = serde_json::from_str(r#"{"port": 0, "simulationServers": []}"#).unwrap();
-        let (phase_sender, phase) = watch::channel(Phase::Open);
-        let server = web::Data::new(assemble(config, Connections::new(10, 10, None), phase).unwrap());
-        let (broadcasters, started) = std::sync::mpsc::channel();
-        let app = move || {
-            let broadcaster = web::Data::new(LocalBroadcaster::start(Arc::clone(&server)));
-            broadcasters.send(broadcaster.get()).unwrap();
-            App::new().app_data(server.clone()).app_data(broadcaster).configure(configure)
-        };
-        let http = HttpServer::new(app).workers(1).disable_signals().bind(("127.0.0.1", 0)).unwrap();
-        let url = format!("ws://{}/session", http.addrs()[0]);
-        let http = http.run();
-        let handle = http.handle();
-        actix_rt::spawn(http);
-        let connect = async || tokio_tungstenite::connect_async(&url).await.unwrap().0;
-        let soon = std::time::Duration::from_secs(20);
-
-        let mut client = connect().await;
-        assert_eq!(client.next().await.unwrap().unwrap(), Frame::text("0"));
-        started.try_recv().unwrap().do_send(Panic);
-        let end = actix_rt::time::timeout(soon, client.next()).await.unwrap().unwrap().unwrap();
-        assert!(matches!(&end, Frame::Close(Some(reason)) if u16::from(reason.code) == 1011), "{end:?}");
-
-        let mut client = connect().await;
-        assert_eq!(actix_rt::time::timeout(soon, client.next()).await.unwrap().unwrap().unwrap(), Frame::text("0"));
-        phase_sender.send_replace(Phase::Closing);
-        let end = actix_rt::time::timeout(soon, client.next()).await.unwrap().unwrap().unwrap();
-        assert!(matches!(&end, Frame::Close(Some(reason)) if u16::from(reason.code) == 1001), "{end:?}");
-        drop(client);
-        handle.stop(false).await;
     }
 }

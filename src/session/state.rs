@@ -20,6 +20,8 @@ use crate::shared::text::client_text;
 pub struct AppState {
     /// The registry of simulation servers.
     pub registry: Addr<Registry>,
+    /// Whether a simulation server can take a client; the registry publishes it.
+    pub available: watch::Receiver<bool>,
     /// `timing` of the configuration.
     pub timing: Timing,
     /// How the URLs of simulation servers are formed for clients.
@@ -59,7 +61,6 @@ const PICK_TIMEOUT: Duration = Duration::from_secs(2);
 
 impl AppState {
     /// Returns how many web clients are connected.
-    #[must_use]
     pub fn clients(&self) -> usize {
         self.connections.count(Kind::Client)
     }

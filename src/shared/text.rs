@@ -5,7 +5,6 @@ use icu_properties::props::{BinaryProperty, DefaultIgnorableCodePoint};
 /// Returns a text in which nothing begins a new line, steers a terminal, changes the direction of writing, or is invisible.
 ///
 /// Control characters become spaces; invisible characters, which those for the direction are among, become U+FFFD.
-#[must_use]
 pub fn one_line(text: &str) -> String {
     let visible = |letter: char| match letter {
         // Most are of this kind, and need no look into Unicode's tables.
@@ -19,7 +18,6 @@ pub fn one_line(text: &str) -> String {
 }
 
 /// Returns a text as one line of at most so many letters, with `...` where it was cut.
-#[must_use]
 pub fn excerpt(text: &str, most: usize) -> String {
     let mut excerpt: String = one_line(text).chars().take(most).collect();
     if text.chars().nth(most).is_some() {
@@ -37,7 +35,6 @@ const PATH_ENDS: &str = "'\"`,;:<>|";
 ///
 /// Webots' page puts such texts into `innerHTML`. Other clients show them as they are, so that the characters are replaced
 /// by similar ones instead of being escaped.
-#[must_use]
 pub fn client_text(text: &str) -> String {
     let harmless = |letter: char| match letter {
         '<' => '\u{2039}',

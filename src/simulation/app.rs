@@ -240,7 +240,7 @@ fn assemble(
         metrics,
         starts,
         start_quota: quota::starts(config.max_connections),
-        live: Live::new(),
+        live: Live::default(),
         usage,
         watcher,
         started: Instant::now(),

@@ -1,17 +1,22 @@
 // Keeps a monitor page true: takes the server's events and puts what has changed into the page.
-// An event names parts (the contents of elements) and tables (rows by their keys); all of it is HTML that the server
-// has made from the same templates as the page, so that nothing is written twice.
+// An event has parts (the contents of elements) and tables (their rows); all of it is HTML that the server has made from
+// the same templates as the page, so that nothing is written twice.
 
 import { showTimes } from './times.js';
 
 const listeners = [];
 const lamp = document.getElementById('live');
+/** The HTML that each part and each row of a table was last filled with, and the cells of rows. */
+const known = new WeakMap();
 const cells = new WeakMap();
 /** Compares as people do: 2 comes before 10. */
 const alphabet = new Intl.Collator(undefined, { numeric: true });
 let source;
 /** When the server was heard last; it says something every 15 seconds. */
 let heard;
+/** Whether events may have been missed before the next one. */
+let fresh;
+let lastSample;
 const SILENCE = 40_000;
 
 /** Calls a function with the numbers of each event that has some; `fresh` tells that events may have been missed. */
@@ -33,11 +38,14 @@ function parsed(html) {
 
 /** Fills a row. Replaces only the cells that differ, so that a focused link stays focused and an opened list open. */
 function fill(row, html) {
-  const known = cells.get(row) ?? [];
-  const fresh = parsed(html);
-  cells.set(row, fresh.map((cell) => cell.outerHTML));
-  fresh.forEach((cell, column) => {
-    if (known[column] === cell.outerHTML)
+  if (known.get(row) === html)
+    return;
+  known.set(row, html);
+  const before = cells.get(row) ?? [];
+  const after = parsed(html);
+  cells.set(row, after.map((cell) => cell.outerHTML));
+  after.forEach((cell, column) => {
+    if (before[column] === cell.outerHTML)
       return;
     showTimes(cell);
     const old = row.children[column];
@@ -48,30 +56,30 @@ function fill(row, html) {
   });
 }
 
-function changeTable(body, { order, rows }) {
+function fillTable(body, rows) {
   const present = new Map([...body.rows].map((row) => [row.dataset.key, row]));
-  for (const [key, html] of Object.entries(rows)) {
-    if (!present.has(key)) {
-      const row = document.createElement('tr');
+  rows.forEach(({ key, html }, place) => {
+    let row = present.get(key);
+    present.delete(key);
+    if (!row) {
+      row = document.createElement('tr');
       row.setAttribute('role', 'row');
       row.dataset.key = key;
-      present.set(key, row);
+      body.append(row);
     }
-    fill(present.get(key), html);
-  }
-  if (order) {
-    const listed = new Set(order);
-    for (const [key, row] of present) {
-      if (!listed.has(key))
-        row.remove();
-    }
-    order.forEach((key, place) => { present.get(key).dataset.place = place; });
-    for (const key of order) {
-      if (!present.get(key).isConnected)
-        body.append(present.get(key));
-    }
-  }
+    row.dataset.place = place;
+    fill(row, html);
+  });
+  present.forEach((row) => row.remove());
   sort(body);
+}
+
+function fillPart(part, html) {
+  if (known.get(part) === html)
+    return;
+  known.set(part, html);
+  part.innerHTML = html;
+  showTimes(part);
 }
 
 function cellValue(row, column, kind) {
@@ -124,20 +132,20 @@ function makeSortable(table) {
 
 function take(event) {
   heard = Date.now();
-  const { version, parts = {}, tables = {}, sample } = JSON.parse(event.data);
+  const { version, parts = {}, tables = {}, sample = [] } = JSON.parse(event.data);
   if (version && version !== document.documentElement.dataset.version) {
     location.reload();
     return;
   }
-  for (const [id, html] of Object.entries(parts)) {
-    const part = document.getElementById(id);
-    part.innerHTML = html;
-    showTimes(part);
+  for (const [id, html] of Object.entries(parts))
+    fillPart(document.getElementById(id), html);
+  for (const [id, rows] of Object.entries(tables))
+    fillTable(document.getElementById(id), rows);
+  if (sample.length && sample.join() !== lastSample) {
+    lastSample = sample.join();
+    listeners.forEach((listener) => listener(sample.map(Number), fresh));
+    fresh = false;
   }
-  for (const [id, change] of Object.entries(tables))
-    changeTable(document.getElementById(id), change);
-  if (sample)
-    listeners.forEach((listener) => listener(sample.map(Number), Boolean(version)));
 }
 
 /** A tab that nobody sees doesn't listen: browsers allow few connections to one server. */
@@ -148,6 +156,7 @@ function listen() {
   source = new EventSource('events');
   source.addEventListener('open', () => {
     heard = Date.now();
+    fresh = true;
     say('Live', false);
   });
   source.addEventListener('message', take);

@@ -9,7 +9,6 @@ use serde_json::Value;
 
 use crate::simulation::readings;
 use crate::support::git::Forge;
-use crate::support::ports::dead_port;
 use crate::support::program::{session_server, simulation_server};
 use crate::support::webots::Webots;
 use crate::support::{http, needs, until};
@@ -84,11 +83,7 @@ async fn alerts_dashboard_and_docs_name_the_metrics_that_the_servers_export() {
         .env("LD_LIBRARY_PATH", driver.path().to_str().unwrap())
         .start()
         .await;
-    let (_held, nobody) = dead_port();
-    let session = session_server(&[simulation.address(), "dns+fleet.test:2000".to_owned()])
-        .set("nameServers", format!("127.0.0.1:{nobody}"))
-        .start()
-        .await;
+    let session = session_server(&[simulation.address(), "dns+fleet.test:2000".to_owned()]).start().await;
     let metrics = async |url: String| exported(&http::get(&url).await.text());
     let all = async || {
         let mut all = metrics(session.url("/metrics")).await;

@@ -40,7 +40,8 @@ pub struct Fleet {
     pub session: Server,
     pub servers: Vec<Server>,
     pub relay: Relay,
-    pub names: NameServer,
+    /// Where there can be one.
+    pub names: Option<NameServer>,
     /// That of all servers, where it can be set.
     pub clock: Option<Clock>,
     /// Where packets can be lost.
@@ -58,7 +59,7 @@ pub struct Fleet {
 
 impl Fleet {
     pub async fn start(network: Option<Network>) -> Self {
-        let (names, clock) = (NameServer::start(&[]), Clock::new());
+        let (names, clock) = (NameServer::start("a server by a name, and faults of names"), Clock::new());
         let (forge, webots) = (Forge::with_arm(), Webots::launcher());
         let folder = tempfile::tempdir().unwrap();
         let ports: Vec<u16> = (0..SERVERS).map(|_| ports::block(PLACES + 12)).collect();
@@ -71,7 +72,7 @@ impl Fleet {
         }
         let relay = Relay::to(ports[LINKED]).await;
         let session_port = ports::block(1);
-        let session = session_builder(&ports, &relay, &names, session_port, folder.path());
+        let session = session_builder(&ports, &relay, names.as_ref(), session_port, folder.path());
         let session = with(clock.as_ref(), session).start().await;
         let memory = servers.iter().map(|server| memory(server.pid())).collect();
         let began = Instant::now();
@@ -97,7 +98,9 @@ impl Fleet {
 
     /// Has the name server know the name.
     pub fn set_name(&self) {
-        self.names.set(NAME, &[std::net::Ipv4Addr::LOCALHOST.into()]);
+        if let Some(names) = &self.names {
+            names.set(NAME, &[std::net::Ipv4Addr::LOCALHOST.into()]);
+        }
     }
 
     /// Where a server's files are.
@@ -128,7 +131,8 @@ impl Fleet {
 
     /// Starts a session server at the place of the one that is gone.
     pub async fn restart_session(&mut self) {
-        let session = session_builder(&self.ports, &self.relay, &self.names, self.session_port, self.folder.path());
+        let session =
+            session_builder(&self.ports, &self.relay, self.names.as_ref(), self.session_port, self.folder.path());
         self.session = with(self.clock.as_ref(), session).start().await;
     }
 
@@ -268,20 +272,23 @@ fn with(clock: Option<&Clock>, builder: Builder) -> Builder {
     }
 }
 
-fn session_builder(ports: &[u16], relay: &Relay, names: &NameServer, port: u16, folder: &Path) -> Builder {
+fn session_builder(ports: &[u16], relay: &Relay, names: Option<&NameServer>, port: u16, folder: &Path) -> Builder {
     let folder = folder.join("session");
     std::fs::create_dir_all(&folder).unwrap();
     let builder =
-        session_server(&addresses(ports, relay)).folder(&folder).port(port).set("timing", json!({"answer": 1}));
-    let builder = builder.set("nameServers", json!([names.address()]));
+        session_server(&addresses(ports, relay, names)).folder(&folder).port(port).set("timing", json!({"answer": 1}));
+    let builder = match names {
+        Some(names) => builder.before(&names.asked()),
+        None => builder,
+    };
     // What else runs on this machine must not close the fleet.
     builder.set("loadThreshold", 1000)
 }
 
 /// Where the session server finds each simulation server.
-fn addresses(ports: &[u16], relay: &Relay) -> Vec<String> {
+fn addresses(ports: &[u16], relay: &Relay, names: Option<&NameServer>) -> Vec<String> {
     let of = |(index, port)| match index {
-        NAMED => format!("dns+{NAME}:{port}"),
+        NAMED if names.is_some() => format!("dns+{NAME}:{port}"),
         LINKED => format!("127.0.0.1:{}", relay.port),
         _ => format!("127.0.0.1:{port}"),
     };

@@ -118,18 +118,21 @@ pub enum Names {
 
 /// Names fail, and the fleet is whole nevertheless.
 pub async fn break_names(fleet: &mut Fleet, how: Names) -> bool {
+    let Some(names) = &mut fleet.names else {
+        return false;
+    };
     match how {
-        Names::Hang => fleet.names.signal(Signal::SIGSTOP),
-        Names::AreUnknown => fleet.names.set("another.test", &[]),
-        Names::HaveNoServer => fleet.names.end(),
+        Names::Hang => names.signal(Signal::SIGSTOP),
+        Names::AreUnknown => names.set("another.test", &[]),
+        Names::HaveNoServer => names.end(),
     }
     // A name is looked up again every two seconds.
     actix_rt::time::sleep(WHILE).await;
     fleet.whole("names failed").await;
-    match how {
-        Names::Hang => fleet.names.signal(Signal::SIGCONT),
-        Names::AreUnknown => fleet.set_name(),
-        Names::HaveNoServer => fleet.names.start_again(),
+    match (how, &mut fleet.names) {
+        (Names::Hang, Some(names)) => names.signal(Signal::SIGCONT),
+        (Names::HaveNoServer, Some(names)) => names.start_again(),
+        _ => fleet.set_name(),
     }
     true
 }

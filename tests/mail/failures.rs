@@ -7,8 +7,7 @@ use serde_json::json;
 use webots_fleet::session::mail::{Event, test_mail};
 
 use super::log::{logged, wait_for_log};
-use super::{config, nothing_unexpected, notice, start};
-use crate::support::SOON;
+use super::{config, notice, start};
 use crate::support::ports::dead_port;
 use crate::support::smtp::Smtp;
 use crate::support::stopwatch::Stopwatch;
@@ -16,9 +15,9 @@ use crate::support::stopwatch::Stopwatch;
 #[actix_rt::test]
 async fn what_a_server_refuses_is_named() {
     for (options, words) in [
-        (&["--refuse", "recipient"], "refuses the recipient admin@example.org: 550 5.1.1 no such user here"),
-        (&["--refuse", "mail"], "refuses the mail: 451 4.3.0 try again later"),
-        (&["--login", "fleet:s3cret"], "refuses the sender fleet@example.org: 530 5.7.0 Authentication required"),
+        (&["--refuse", "recipient"], "550 5.1.1 no such user here"),
+        (&["--refuse", "mail"], "451 4.3.0 try again later"),
+        (&["--login", "fleet:s3cret"], "530 5.7.0 Authentication required"),
     ] {
         let smtp = Smtp::start(options).await;
         let error = test_mail(&config(smtp.port, &json!({}))).await.unwrap_err().to_string();
@@ -42,11 +41,11 @@ async fn a_test_mail_says_how_it_went() {
 async fn a_dead_host_is_named() {
     let (_reserved, dead) = dead_port();
     let error = test_mail(&config(dead, &json!({}))).await.unwrap_err().to_string();
-    assert!(error.starts_with(&format!("127.0.0.1:{dead}: can't connect: Connection refused")), "{error}");
+    assert!(error.starts_with(&format!("127.0.0.1:{dead}: Connection refused")), "{error}");
     // A label of 64 letters can't be in any name server, so that none is asked.
     let nobody = format!("{}.example.org", "a".repeat(64));
     let error = test_mail(&config(25, &json!({"mailServer": nobody}))).await.unwrap_err().to_string();
-    assert!(error.starts_with(&format!("{nobody}:25: the name can't be resolved: ")), "{error}");
+    assert!(error.starts_with(&format!("{nobody}:25: failed to lookup address information")), "{error}");
 }
 
 #[actix_rt::test]
@@ -90,7 +89,7 @@ async fn what_is_refused_for_good_is_tried_seldom_and_given_up() {
     let mailer = start(smtp.port, &json!({"timing": {"mailRetry": 0.01, "mailPatience": 1.2}}));
     mailer.send(notice("sim", Event::NotResponding)).await.unwrap();
     let lines = wait_for_log(Level::Error, smtp.port, 1).await;
-    assert!(lines[0].contains("refuses the recipient"), "{lines:?}");
+    assert!(lines[0].contains("550 5.1.1 no such user here"), "{lines:?}");
     let tries = smtp.count("opened");
     assert!((2..=8).contains(&tries), "{tries} tries; every 0.2 s for 1.2 s was asked for");
 }
@@ -110,38 +109,4 @@ async fn a_silent_server_holds_up_nobody_and_leaves_nothing_open() {
     wait_for_log(Level::Error, smtp.port, 2).await;
     let opened = smtp.count("opened");
     smtp.wait_for_times("closed", opened).await;
-}
-
-#[actix_rt::test]
-async fn a_server_that_sends_a_line_without_an_end_is_cut_off() {
-    use tokio::io::AsyncWriteExt;
-    let listener = tokio::net::TcpListener::bind(("127.0.0.1", 0)).await.unwrap();
-    let port = listener.local_addr().unwrap().port();
-    let flood = actix_rt::spawn(async move {
-        let (mut connection, _) = listener.accept().await.unwrap();
-        let mut sent = 0;
-        while connection.write_all(&[b'2'; 64 * 1024]).await.is_ok() {
-            sent += 64 * 1024;
-        }
-        sent
-    });
-    let error = test_mail(&config(port, &json!({}))).await.unwrap_err().to_string();
-    let words = "the connection broke: it sends more than 1024 KiB";
-    assert_eq!(error, format!("127.0.0.1:{port}: {words}"));
-    let sent = tokio::time::timeout(SOON, flood).await.expect("the connection is closed").unwrap();
-    // What the system keeps of a connection comes on top.
-    assert!(sent < 32 * 1024 * 1024, "{sent} bytes were taken");
-}
-
-#[actix_rt::test]
-async fn a_server_that_is_silent_at_the_end_has_the_mail_once() {
-    let mut smtp = Smtp::start(&["--hang", "quit"]).await;
-    let mailer = start(smtp.port, &json!({"timing": {"mailAnswer": 0.5}}));
-    mailer.send(notice("sim", Event::NotResponding)).await.unwrap();
-    smtp.mail().await;
-    wait_for_log(Level::Info, smtp.port, 1).await;
-    smtp.wait_for("closed").await;
-    mailer.send(notice("other", Event::NotResponding)).await.unwrap();
-    assert_eq!(smtp.mail().await.subject(), "Simulation server not responding: other:2000");
-    nothing_unexpected(smtp.port);
 }

@@ -1,4 +1,4 @@
-//! What is mailed: one mail for what belongs together, with its words in text and HTML.
+//! What is mailed: one mail for what belongs together, with its words in plain text.
 
 use std::time::{Duration, Instant};
 
@@ -11,7 +11,7 @@ use super::{nothing_unexpected, notice, start};
 use crate::support::smtp::Smtp;
 
 #[actix_rt::test]
-async fn a_notice_becomes_a_mail_in_text_and_html() {
+async fn a_notice_becomes_a_mail_in_plain_text() {
     let mut smtp = Smtp::start(&[]).await;
     let mailer = start(smtp.port, &json!({}));
     mailer.send(notice("sim1.example.org", Event::NotResponding)).await.unwrap();
@@ -23,12 +23,11 @@ async fn a_notice_becomes_a_mail_in_text_and_html() {
     assert_eq!((mail.header("Date").len(), mail.header("Message-ID").len()), (1, 1));
     assert_eq!(mail.subject(), "Simulation server not responding: sim1.example.org:2000");
     let year = jiff::Timestamp::now().strftime("%Y-").to_string();
-    for body in [mail.field("text"), mail.field("html")] {
-        let parts = ["sim1.example.org:2000", "not responding", "97.2%", "connection refused", year.as_str()];
-        for part in parts.into_iter().chain(["https://session.example.org/1999/monitor"]) {
-            assert!(body.contains(part), "no {part:?} in {body}");
-        }
+    let parts = ["sim1.example.org:2000", "not responding", "97.2%", "connection refused", year.as_str()];
+    for part in parts.into_iter().chain(["https://session.example.org/1999/monitor"]) {
+        assert!(mail.field("text").contains(part), "no {part:?} in {mail:?}");
     }
+    assert!(mail.header("Content-Type")[0].starts_with("text/plain"), "{mail:?}");
     wait_for_log(Level::Info, smtp.port, 1).await;
     nothing_unexpected(smtp.port);
 }
@@ -83,16 +82,15 @@ async fn a_flapping_server_is_one_mail_in_its_time_with_a_count() {
     let mail = smtp.mail().await;
     assert!(first.elapsed() > Duration::from_secs(2), "the second mail came after {:?}", first.elapsed());
     assert_eq!(mail.subject(), "Simulation server working again: sim:2000");
-    for body in [mail.field("text"), mail.field("html")] {
-        assert!(body.contains("8 earlier notices about this server were held back"), "{body}");
-        assert!(body.contains("connection refused"), "no last error in {body}");
-    }
+    let body = mail.field("text");
+    assert!(body.contains("8 earlier notices about this server were held back"), "{body}");
+    assert!(body.contains("connection refused"), "no last error in {body}");
     assert_eq!(smtp.count("mail"), 2);
     nothing_unexpected(smtp.port);
 }
 
 #[actix_rt::test]
-async fn nothing_from_outside_gets_into_the_headers_or_the_html() {
+async fn nothing_from_outside_gets_into_the_headers_or_begins_a_line() {
     let mut smtp = Smtp::start(&[]).await;
     let mailer = start(smtp.port, &json!({}));
     let mut evil = notice("sim\r\nBcc: thief@example.com\r\n\r\nbody", Event::NotResponding);
@@ -102,7 +100,7 @@ async fn nothing_from_outside_gets_into_the_headers_or_the_html() {
     assert_eq!(mail.recipients(), ["admin@example.org"]);
     assert!(mail.header("Bcc").is_empty(), "{mail:?}");
     assert_eq!(mail.subject(), "Simulation server not responding: sim  Bcc: thief@example.com    body:2000");
-    assert!(!mail.field("html").contains("<script>"), "{mail:?}");
+    assert!(!mail.field("text").contains("\nRCPT TO"), "{mail:?}");
     assert!(!mail.field("text").contains('\u{1b}'), "{mail:?}");
     wait_for_log(Level::Info, smtp.port, 1).await;
     assert_eq!(smtp.commands(), ["EHLO", "MAIL", "RCPT", "DATA", "QUIT"]);

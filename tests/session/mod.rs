@@ -6,7 +6,6 @@ mod discovery;
 mod door;
 mod mail;
 mod memory;
-mod name_servers;
 mod names;
 mod placement;
 mod pushing;

@@ -207,21 +207,6 @@ async fn connections_are_bounded() {
 }
 
 #[actix_rt::test]
-async fn a_flood_of_connections_leaves_the_log() {
-    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
-    let server = simulation_server(&webots.path(), forge.path(), 1).set("debug", false).start().await;
-    let come_and_go = async |_| {
-        for _ in 0..75 {
-            Client::connect(&server.websocket("/client")).await.leave().await;
-        }
-    };
-    futures_util::future::join_all((0..20).map(come_and_go)).await;
-    let log = std::fs::read_to_string(server.folder.join("log/simulation/output.log")).unwrap();
-    let count = log.matches(": connected").count();
-    assert!((1000..1100).contains(&count), "{count} lines of 1500 connections");
-}
-
-#[actix_rt::test]
 async fn pages_tell_what_they_should() {
     let (server, _forge, _webots) = server().await;
     let load = http::get(&server.url("/load")).await;

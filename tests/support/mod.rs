@@ -11,7 +11,6 @@ pub mod git;
 pub mod http;
 pub mod listener;
 pub mod name_server;
-pub mod odd_name_server;
 pub mod ports;
 pub mod program;
 pub mod smtp;

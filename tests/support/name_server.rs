@@ -1,55 +1,84 @@
-//! A real DNS server, dnsmasq, on a port of its own. It knows what a test says, and asks nobody.
+//! A real DNS server, dnsmasq, on an address of its own. It knows what a test says, and asks nobody.
 
-use std::net::{IpAddr, TcpStream};
+use std::net::{IpAddr, Ipv4Addr, TcpStream, UdpSocket};
 use std::process::{Child, Command, Stdio};
+use std::sync::atomic::{AtomicU8, Ordering};
 use std::time::{Duration, Instant};
 
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 
-use super::{SOON, needs, ports};
+use super::{SOON, needs, skip};
+
+/// The port of name servers in `/etc/resolv.conf`.
+const PORT: u16 = 53;
 
 /// The server. It ends with this value.
 pub struct NameServer {
     child: Option<Child>,
     folder: tempfile::TempDir,
-    port: u16,
-    services: Vec<String>,
+    address: Ipv4Addr,
+}
+
+/// How to get a view of the file system of one's own, if that is allowed here: for root, or with a user of one's own.
+fn own_mounts() -> Option<&'static str> {
+    let works =
+        |command: &&str| Command::new("sh").args(["-c", &format!("{command} true")]).output().unwrap().status.success();
+    ["unshare --mount", "unshare --mount --map-root-user"].into_iter().find(works)
+}
+
+/// An address of the loopback for a name server of this process alone; `None` where it can't have the port.
+pub fn free_address() -> Option<Ipv4Addr> {
+    static LAST: AtomicU8 = AtomicU8::new(0);
+    let process = u8::try_from(std::process::id() % 250).unwrap();
+    let address = Ipv4Addr::new(127, 53, process, LAST.fetch_add(1, Ordering::Relaxed) + 1);
+    UdpSocket::bind((address, PORT)).is_ok().then_some(address)
+}
+
+/// A shell script after which a server finds its name server at this address, `None` where that can't be.
+pub fn asking(address: Ipv4Addr, folder: &std::path::Path) -> Option<String> {
+    let file = folder.join("resolv.conf");
+    std::fs::write(&file, format!("nameserver {address}\noptions timeout:1 attempts:1\n")).unwrap();
+    let mount = format!("mount --bind {} /etc/resolv.conf && exec \"$0\" \"$@\"", file.display());
+    Some(format!("exec {} sh -c '{mount}' \"$0\" \"$@\"", own_mounts()?))
 }
 
 impl NameServer {
-    /// Starts one that knows no name but those of these services, `NAME,TARGET,PORT`.
-    pub fn start(services: &[String]) -> Self {
+    /// Starts one that knows no name; `None` where this machine does not allow it, which it says.
+    pub fn start(test: &str) -> Option<Self> {
         needs("dnsmasq", "dnsmasq-base");
+        let Some(address) = free_address().filter(|_| own_mounts().is_some()) else {
+            skip(test, "unshare --mount or port 53 is not allowed here");
+            return None;
+        };
         let folder = tempfile::tempdir().unwrap();
         std::fs::write(folder.path().join("hosts"), "").unwrap();
-        let mut server = Self { child: None, folder, port: ports::block(1), services: services.to_vec() };
+        let mut server = Self { child: None, folder, address };
         server.start_again();
-        server
+        Some(server)
     }
 
-    /// Starts it at its port, after it was ended.
+    /// Starts it at its address, after it was ended.
     pub fn start_again(&mut self) {
         let user = nix::unistd::User::from_uid(nix::unistd::getuid()).unwrap().unwrap();
         let mut command = Command::new("dnsmasq");
         // What its answers say of themselves: that they hold for ten minutes, as those of Docker Swarm do.
         command.args(["--keep-in-foreground", "--conf-file=/dev/null", "--no-resolv", "--no-hosts", "--local-ttl=600"]);
-        command.args(["--listen-address=127.0.0.1", "--bind-interfaces", "--local=/test/", "--pid-file="]);
-        command.arg(format!("--port={}", self.port)).arg(format!("--user={}", user.name));
+        command.args(["--bind-interfaces", "--local=/test/", "--pid-file="]);
+        command.arg(format!("--listen-address={}", self.address)).arg(format!("--user={}", user.name));
         command.arg(format!("--addn-hosts={}", self.folder.path().join("hosts").display()));
-        command.args(self.services.iter().map(|service| format!("--srv-host={service}")));
         self.child = Some(command.stdin(Stdio::null()).spawn().unwrap());
         // Before it is there, a signal would end it.
         let deadline = Instant::now() + SOON;
-        while TcpStream::connect(self.address()).is_err() {
+        while TcpStream::connect((self.address, PORT)).is_err() {
             assert!(Instant::now() < deadline, "dnsmasq does not listen");
             std::thread::sleep(Duration::from_millis(5));
         }
     }
 
-    /// `HOST:PORT`.
-    pub fn address(&self) -> String {
-        format!("127.0.0.1:{}", self.port)
+    /// A shell script for [`Builder::before`](super::program::Builder::before), after which a server asks this one.
+    pub fn asked(&self) -> String {
+        asking(self.address, self.folder.path()).unwrap()
     }
 
     /// Has a name lead to these addresses, and knows no other.

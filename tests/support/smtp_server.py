@@ -3,7 +3,7 @@
 {"port": 40001}                                          it listens
 {"opened": true}, {"closed": true}                       a connection
 {"command": "AUTH", "encrypted": false}                  each command
-{"mail": {"from", "to", "headers", "text", "html", "encrypted", "raw"}}
+{"mail": {"from", "to", "headers", "text", "encrypted", "raw"}}
 
 It ends when its standard input does.
 """
@@ -79,7 +79,6 @@ class Handler:
                 "to": envelope.rcpt_tos,
                 "headers": [[name, str(value)] for name, value in message.items()],
                 "text": parts.get("text/plain"),
-                "html": parts.get("text/html"),
                 "encrypted": server.transport.get_extra_info("sslcontext") is not None,
                 "raw": envelope.content.decode("utf-8", "replace"),
             }

@@ -23,7 +23,6 @@ pub fn optional<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Option<Mai
 }
 
 /// Whether a text can be the name or the IP address of an SMTP server, without a port.
-#[must_use]
 pub fn is_host(text: &str) -> bool {
     text.parse::<IpAddr>().is_ok() || (!text.contains(['[', '%']) && url::Host::parse(text).is_ok())
 }

@@ -2,13 +2,11 @@
 
 mod example;
 mod mail_address;
-mod name_server;
 mod server_entry;
 mod session_config;
 mod timing;
 
 pub use example::Example;
-pub use name_server::NameServer;
 pub use server_entry::{DnsName, ServerEntry};
 pub use session_config::SessionConfig;
 pub use timing::Timing;

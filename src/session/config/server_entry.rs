@@ -17,36 +17,35 @@ pub enum ServerEntry {
     Name(DnsName),
 }
 
-/// A name that DNS is asked for again and again. A final dot makes it absolute, as everywhere in DNS.
+/// `dns+HOST:PORT`: all addresses of a host (A and AAAA), each with this port. A final dot makes the host absolute, as
+/// everywhere in DNS.
 ///
 /// It is written as Thanos, Loki and Mimir write theirs. A URL `dns://...` would look alike, but is something else: its
 /// host is the name server (RFC 4501), and so has gRPC it.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord)]
-pub enum DnsName {
-    /// `dns+HOST:PORT`: all addresses of a host (A and AAAA), each with this port.
-    Addresses {
-        /// The host.
-        host: String,
-        /// The port.
-        port: u16,
-    },
-    /// `dnssrv+NAME`: all targets of a service (SRV), with their ports.
-    Service(String),
+pub struct DnsName {
+    /// The host.
+    pub host: String,
+    /// The port.
+    pub port: u16,
 }
 
 /// A text that is no entry of `simulationServers`.
 #[derive(Debug, thiserror::Error)]
-#[error(
-    "{found:?} is no simulation server; allowed is HOST:PORT, or HOST/PORT where a web server rewrites ports, \
-     dns+NAME:PORT for all addresses of a name, and dnssrv+NAME for all targets of an SRV record"
-)]
-pub struct NoEntry {
-    found: String,
+pub enum EntryError {
+    /// A form that there was.
+    #[error("{0:?}: dnssrv+ was removed; dns+NAME:PORT stands for all addresses of a name")]
+    Service(String),
+    /// Anything else.
+    #[error(
+        "{0:?} is no simulation server; allowed is HOST:PORT, or HOST/PORT where a web server rewrites ports, and \
+         dns+NAME:PORT for all addresses of a name"
+    )]
+    Other(String),
 }
 
 impl ServerEntry {
     /// The address of the simulation server, unless this is a name.
-    #[must_use]
     pub fn server(&self) -> Option<&PublicAddress> {
         match self {
             Self::Server(address) => Some(address),
@@ -55,7 +54,6 @@ impl ServerEntry {
     }
 
     /// The name to be looked up, if this is one.
-    #[must_use]
     pub fn name(&self) -> Option<&DnsName> {
         match self {
             Self::Name(name) => Some(name),
@@ -65,17 +63,17 @@ impl ServerEntry {
 }
 
 impl TryFrom<String> for ServerEntry {
-    type Error = NoEntry;
+    type Error = EntryError;
 
-    fn try_from(text: String) -> Result<Self, NoEntry> {
-        let entry = if let Some(name) = text.strip_prefix("dnssrv+") {
-            plain_name(name).map(|name| Self::Name(DnsName::Service(name)))
-        } else if let Some(name) = text.strip_prefix("dns+") {
-            addresses(name).map(Self::Name)
-        } else {
-            text.parse().ok().map(Self::Server)
+    fn try_from(text: String) -> Result<Self, EntryError> {
+        if text.starts_with("dnssrv+") {
+            return Err(EntryError::Service(text));
+        }
+        let entry = match text.strip_prefix("dns+") {
+            Some(name) => dns_name(name).map(Self::Name),
+            None => text.parse().ok().map(Self::Server),
         };
-        entry.ok_or(NoEntry { found: text })
+        entry.ok_or(EntryError::Other(text))
     }
 }
 
@@ -96,17 +94,14 @@ impl fmt::Display for ServerEntry {
 
 impl fmt::Display for DnsName {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::Addresses { host, port } => write!(out, "dns+{host}:{port}"),
-            Self::Service(name) => write!(out, "dnssrv+{name}"),
-        }
+        write!(out, "dns+{}:{}", self.host, self.port)
     }
 }
 
-fn addresses(text: &str) -> Option<DnsName> {
+fn dns_name(text: &str) -> Option<DnsName> {
     let (host, port) = text.rsplit_once(':')?;
     let port = format!("host:{port}").parse::<PublicAddress>().ok().filter(|address| !address.is_rewritten())?.port();
-    plain_name(host).map(|host| DnsName::Addresses { host, port })
+    plain_name(host).map(|host| DnsName { host, port })
 }
 
 /// A name as DNS is asked for it, none for what is no name. A final dot stays.
@@ -123,20 +118,16 @@ fn plain_name(text: &str) -> Option<String> {
 mod tests {
     use super::*;
 
-    fn read(text: &str) -> Result<ServerEntry, NoEntry> {
+    fn read(text: &str) -> Result<ServerEntry, EntryError> {
         text.to_owned().try_into()
     }
 
     #[test]
     fn addresses_and_names_stand_side_by_side() {
-        for text in ["localhost:2000", "lab.org/2000", "dns+tasks.simulation:2000", "dnssrv+_webots._tcp.example.org"] {
+        for text in ["localhost:2000", "lab.org/2000", "dns+tasks.simulation:2000"] {
             assert_eq!(read(text).unwrap().to_string(), text);
         }
-        for (text, plain) in
-            [("dns+Tasks.Simulation.:02000", "dns+tasks.simulation.:2000"), ("dnssrv+_W._TCP.a", "dnssrv+_w._tcp.a")]
-        {
-            assert_eq!(read(text).unwrap().to_string(), plain);
-        }
+        assert_eq!(read("dns+Tasks.Simulation.:02000").unwrap().to_string(), "dns+tasks.simulation.:2000");
     }
 
     #[test]
@@ -153,8 +144,7 @@ mod tests {
             "dns+a b:2000",
             "dns+a..:2000",
             "dnssrv+",
-            "dnssrv+name:2000",
-            "dnssrv+.",
+            "dnssrv+_webots._tcp.example.org",
             "dns://tasks.simulation:2000",
             "DNS+host:2000",
         ] {

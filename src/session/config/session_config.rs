@@ -8,7 +8,6 @@ use serde::{Deserialize, Serialize};
 
 use super::example::Example;
 use super::mail_address;
-use super::name_server::NameServer;
 use super::server_entry::ServerEntry;
 use super::timing::Timing;
 use crate::session::placement::Policy;
@@ -43,12 +42,8 @@ pub struct SessionConfig {
     /// Default: none, and each is reached under its own address.
     #[serde(default, deserialize_with = "optional_expanded")]
     pub public_url: Option<PublicUrl>,
-    /// The simulation servers: HOST:PORT, HOST/PORT, `dns+NAME:PORT` for all addresses of a name, or `dnssrv+NAME` for all
-    /// targets of an SRV record.
+    /// The simulation servers: HOST:PORT, HOST/PORT, or `dns+NAME:PORT` for all addresses of a name.
     pub simulation_servers: Vec<ServerEntry>,
-    /// DNS servers that are asked for these names. Default: none, and those of the machine are asked.
-    #[serde(default, deserialize_with = "one_or_many")]
-    pub name_servers: Vec<NameServer>,
     /// Those of `simulationServers` that get no new clients. They are still watched. Default: none.
     #[serde(default)]
     pub drained_servers: Vec<PublicAddress>,
@@ -97,7 +92,7 @@ pub struct SessionConfig {
     /// one address.
     #[serde(default, deserialize_with = "optional_whole::<1, 1_000_000, _, _>")]
     pub max_clients_per_address: Option<usize>,
-    /// Web servers, as addresses or networks, whose headers `X-Forwarded-For` and `Forwarded` are believed.
+    /// Web servers, as addresses or networks, whose header `X-Forwarded-For` is believed.
     /// Default: `["127.0.0.0/8", "::1/128"]`.
     #[serde(default)]
     pub trusted_proxies: TrustedProxies,
@@ -132,7 +127,6 @@ const RELOADED: [&str; 7] = [
 impl SessionConfig {
     /// Returns the configuration to go on with when `new` was read while the server runs with this one. Changes that need
     /// a restart are logged.
-    #[must_use]
     pub fn reload(&self, new: &Self) -> Self {
         let takes_effect = |key: &&String| RELOADED.contains(&key.as_str()) || (*key == "port" && new.port == 0);
         for key in changed_keys(self, new).iter().filter(|key| !takes_effect(key)) {
@@ -142,7 +136,6 @@ impl SessionConfig {
     }
 
     /// The parameters of placement.
-    #[must_use]
     pub fn policy(&self) -> Policy {
         Policy {
             threshold: self.load_threshold,
@@ -153,26 +146,22 @@ impl SessionConfig {
     }
 
     /// Returns the address of this server.
-    #[must_use]
     pub fn address(&self) -> PublicAddress {
         PublicAddress::new(&self.server, self.port, self.port_rewrite)
     }
 
     /// Returns the HTTP URL under which clients reach this server. With a public URL, it is that of the web server.
-    #[must_use]
     pub fn http_url(&self) -> String {
         self.public_url.as_ref().map_or_else(|| self.address().http_url(self.ssl), PublicUrl::http_door)
     }
 
     /// Returns the WebSocket URL under which clients reach this server.
-    #[must_use]
     pub fn websocket_url(&self) -> String {
         let door = self.public_url.as_ref().map(PublicUrl::websocket_door);
         format!("{}/session", door.unwrap_or_else(|| self.address().websocket_url(self.ssl)))
     }
 
     /// Returns how the URLs of simulation servers are formed for clients.
-    #[must_use]
     pub fn client_urls(&self) -> ClientUrls {
         ClientUrls { ssl: self.ssl, public: self.public_url.clone() }
     }
@@ -210,6 +199,8 @@ impl SessionConfig {
 
 impl Configuration for SessionConfig {
     const ALIASES: &'static [&'static str] = &[];
+    const REMOVED: &'static [(&'static str, &'static str)] =
+        &[("nameServers", "was removed: names are looked up as /etc/resolv.conf and /etc/hosts of the machine say")];
 
     fn complete(&mut self, _: &std::path::Path) -> Result<Vec<String>, InvalidValue> {
         let mut warnings = Vec::new();

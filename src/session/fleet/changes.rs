@@ -12,33 +12,39 @@ use super::server_record::{Change, ServerRecord};
 use crate::session::config::{DnsName, SessionConfig};
 use crate::session::mail::{self, Event, Mailer, Notice, Topic};
 use crate::shared::domain::PublicAddress;
+use crate::shared::run::{Supervisor, TooManyPanics};
 
 /// The last changes, and the mailer that tells the administrator.
 pub struct Changes {
     recent: VecDeque<StateChange>,
-    mailer: Option<Addr<Mailer>>,
+    /// One, or none where mails are off.
+    mailers: Supervisor<&'static str, Mailer>,
 }
 
+/// What the mailer is for.
+const MAILS: &str = "notices";
 /// How many changes are kept.
 const KEPT: usize = 50;
 
 impl Changes {
     /// No changes yet; notices go to this actor.
-    #[must_use]
     pub fn new(mailer: Option<Addr<Mailer>>) -> Self {
-        Self { recent: VecDeque::new(), mailer }
+        let mut mailers = Supervisor::new("mailer of");
+        if let Some(mailer) = mailer {
+            mailers.add(MAILS, mailer);
+        }
+        Self { recent: VecDeque::new(), mailers }
     }
 
-    /// Starts another mailer if the last one has panicked: actix does not restart an actor that has.
-    pub fn restart_mailer_if_gone(&mut self, config: &SessionConfig) {
-        if self.mailer.as_ref().is_some_and(|mailer| !mailer.connected()) {
-            log::error!("the mailer is gone, a new one is started; what it had not sent is lost");
-            self.mailer = mail::start(config);
-        }
+    /// Starts another mailer if the last one has panicked. What it had not sent is lost.
+    ///
+    /// # Errors
+    /// When there were too many panics.
+    pub fn restart_gone(&mut self, config: &SessionConfig) -> Result<(), TooManyPanics> {
+        self.mailers.restart_gone(|_| mail::start(config))
     }
 
     /// Returns the last changes, the newest first.
-    #[must_use]
     pub fn recent(&self) -> &VecDeque<StateChange> {
         &self.recent
     }
@@ -81,7 +87,7 @@ impl Changes {
     }
 
     fn notify(&self, notice: Notice) {
-        let Some(mailer) = &self.mailer else {
+        let Some(mailer) = self.mailers.get(&MAILS) else {
             return;
         };
         let server = notice.server.clone();

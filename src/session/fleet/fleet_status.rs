@@ -92,7 +92,6 @@ pub struct StateChange {
 
 impl State {
     /// The name of the state, as pages and metrics have it.
-    #[must_use]
     pub fn word(self) -> &'static str {
         match self {
             Self::Unknown => "unknown",
@@ -105,7 +104,6 @@ impl State {
 }
 
 /// Returns the mean load as `/load` shows it, in percent: -1 where no server answers.
-#[must_use]
 pub fn displayed_mean_load(mean_load: Option<f64>) -> f64 {
     mean_load.and_then(|mean| Load::try_from(mean).ok()).map_or(-1.0, Load::percent)
 }

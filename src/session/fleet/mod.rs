@@ -1,23 +1,20 @@
 //! The simulation servers: who is there, what each last told, and which one gets the next client.
 
-mod caching_resolver;
 mod changes;
 mod fleet_status;
-mod lookup;
 mod monitors;
 mod name_monitor;
-mod name_servers;
 mod names;
 mod pick;
 mod probe_error;
 mod quota;
 mod registry;
+mod resolver;
 mod server_monitor;
 mod server_record;
 mod servers;
-mod subscribers;
 
 pub use fleet_status::{FleetStatus, NameStatus, ServerStatus, State, StateChange, displayed_mean_load};
 pub use pick::{NoServer, Pick};
-pub use registry::{GetStatus, IsAvailable, Reconfigure, Registry, Subscribe};
-pub use subscribers::{Subscribers, Update};
+pub use registry::{GetStatus, Ping, Reconfigure, Registry};
+pub use resolver::resolver;

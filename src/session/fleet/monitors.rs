@@ -1,49 +1,101 @@
-//! The thread in which all monitors run, so that requests of clients do not wait for them. Part of the registry.
+//! The monitors of simulation servers and of names, in a thread of their own, so that requests of clients do not wait for
+//! them. Part of the registry.
 
 use std::sync::Arc;
 
 use actix::prelude::*;
+use hickory_resolver::TokioResolver;
 use rustls::ClientConfig;
 
 use super::name_monitor::{LookupResult, NameMonitor};
-use super::server_monitor::{ProbeResult, ProbeSettings, ServerMonitor};
+use super::server_monitor::{ProbeResult, ProbeSettings, ServerMonitor, Stop};
 use crate::session::config::{DnsName, SessionConfig};
 use crate::shared::domain::PublicAddress;
 use crate::shared::http::tls;
+use crate::shared::run::{Supervisor, TooManyPanics};
 
-/// Starts monitors.
+/// All monitors.
 pub struct Monitors {
-    thread: Arbiter,
-    tls: Option<Arc<ClientConfig>>,
+    makers: Makers,
+    servers: Supervisor<PublicAddress, ServerMonitor>,
+    names: Supervisor<DnsName, NameMonitor>,
 }
 
-/// Who hears what the monitors find.
+/// What makes monitors.
+struct Makers {
+    thread: Arbiter,
+    tls: Option<Arc<ClientConfig>>,
+    resolver: TokioResolver,
+}
+
+/// Who gets what the monitors find.
 pub struct Results {
-    /// For each look at a simulation server.
+    /// For each probe of a simulation server.
     pub probes: Recipient<ProbeResult>,
     /// For each lookup of a name.
     pub lookups: Recipient<LookupResult>,
 }
 
-impl Monitors {
-    /// A thread without monitors.
-    #[must_use]
-    pub fn new() -> Self {
-        Self { thread: Arbiter::new(), tls: tls::client_config() }
-    }
-
-    /// Starts the monitor of a simulation server.
-    pub fn watch(&self, server: &PublicAddress, config: &SessionConfig, results: &Results) -> Addr<ServerMonitor> {
+impl Makers {
+    fn server(&self, server: &PublicAddress, settings: ProbeSettings, results: &Results) -> Addr<ServerMonitor> {
         let (server, tls, results) = (server.clone(), self.tls.clone(), results.probes.clone());
-        let (settings, name_servers) = (ProbeSettings::new(config), config.name_servers.clone());
+        let resolver = self.resolver.clone();
         ServerMonitor::start_in_arbiter(&self.thread.handle(), move |_| {
-            ServerMonitor::new(server, settings, name_servers, tls, results)
+            ServerMonitor::new(server, settings, resolver, tls, results)
         })
     }
 
+    fn name(&self, name: &DnsName, results: &Results) -> Addr<NameMonitor> {
+        let (name, results) = (name.clone(), results.lookups.clone());
+        NameMonitor::start_in_arbiter(&self.thread.handle(), move |_| NameMonitor::new(name, results))
+    }
+}
+
+impl Monitors {
+    /// A thread without monitors.
+    pub fn new(resolver: TokioResolver) -> Self {
+        let makers = Makers { thread: Arbiter::new(), tls: tls::client_config(), resolver };
+        Self { makers, servers: Supervisor::new("monitor of server"), names: Supervisor::new("monitor of name") }
+    }
+
+    /// Starts the monitor of a simulation server.
+    pub fn watch(&mut self, server: &PublicAddress, config: &SessionConfig, results: &Results) {
+        self.servers.add(server.clone(), self.makers.server(server, ProbeSettings::new(config), results));
+    }
+
+    /// Ends the monitor of a simulation server.
+    pub fn unwatch(&mut self, server: &PublicAddress) {
+        if let Some(monitor) = self.servers.remove(server) {
+            monitor.do_send(Stop);
+        }
+    }
+
     /// Starts the monitor of a name.
-    pub fn look_up(&self, name: &DnsName, config: &SessionConfig, results: &Results) -> Addr<NameMonitor> {
-        let (name, servers, results) = (name.clone(), config.name_servers.clone(), results.lookups.clone());
-        NameMonitor::start_in_arbiter(&self.thread.handle(), move |_| NameMonitor::new(name, servers, results))
+    pub fn look_up(&mut self, name: &DnsName, results: &Results) {
+        self.names.add(name.clone(), self.makers.name(name, results));
+    }
+
+    /// Ends the monitor of a name.
+    pub fn stop_looking_up(&mut self, name: &DnsName) {
+        if let Some(monitor) = self.names.remove(name) {
+            monitor.do_send(Stop);
+        }
+    }
+
+    /// Starts monitors in place of those that have panicked.
+    ///
+    /// # Errors
+    /// When there were too many panics.
+    pub fn restart_gone(&mut self, config: &SessionConfig, results: &Results) -> Result<(), TooManyPanics> {
+        let Self { makers, servers, names } = self;
+        servers.restart_gone(|server| Some(makers.server(server, ProbeSettings::new(config), results)))?;
+        names.restart_gone(|name| Some(makers.name(name, results)))
+    }
+
+    /// Changes how servers are probed.
+    pub fn set_probes(&self, settings: ProbeSettings) {
+        for monitor in self.servers.all() {
+            monitor.do_send(settings);
+        }
     }
 }

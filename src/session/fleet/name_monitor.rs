@@ -1,17 +1,17 @@
 //! Actor: looks one name of `simulationServers` up, again and again.
 //!
-//! Created by the registry for each name. It asks DNS every second, whatever time to live an answer has: engines give their
-//! names minutes, and a new server shall be used within five seconds of its start. The result goes to the registry, which judges it.
-//! The monitor ends when the registry says so; after a panic the registry starts a new one.
+//! Created by the registry for each name. Every second it asks DNS, whatever time to live an answer has. The result goes to the
+//! registry, which judges it. The monitor ends when the registry says so; after a panic the registry starts a new one.
 
+use std::collections::BTreeSet;
 use std::time::Duration;
 
 use actix::prelude::*;
 
-use super::lookup::{Found, look_up};
-use super::name_servers::LookupError;
+use super::resolver::look_up;
 use super::server_monitor::Stop;
-use crate::session::config::{DnsName, NameServer};
+use crate::session::config::DnsName;
+use crate::shared::domain::PublicAddress;
 
 /// What looking a name up brought.
 #[derive(Message, Debug)]
@@ -19,36 +19,29 @@ use crate::session::config::{DnsName, NameServer};
 pub struct LookupResult {
     /// The name.
     pub name: DnsName,
-    /// What it leads to, or why that is not known.
-    pub answer: Result<Found, LookupError>,
+    /// The simulation servers that it leads to, at least one; or why they are not known.
+    pub answer: Result<BTreeSet<PublicAddress>, String>,
 }
 
 /// The actor.
 pub struct NameMonitor {
     name: DnsName,
-    name_servers: Vec<NameServer>,
     results: Recipient<LookupResult>,
 }
 
 /// Between the end of a lookup and the next one.
 const PAUSE: Duration = Duration::from_secs(1);
-/// How long a lookup as a whole may take.
-const TIME_LIMIT: Duration = Duration::from_secs(5);
 
 impl NameMonitor {
-    /// A monitor of one name, which asks these name servers, or those of the machine where there are none.
-    #[must_use]
-    pub fn new(name: DnsName, name_servers: Vec<NameServer>, results: Recipient<LookupResult>) -> Self {
-        Self { name, name_servers, results }
+    /// A monitor of one name.
+    pub fn new(name: DnsName, results: Recipient<LookupResult>) -> Self {
+        Self { name, results }
     }
 
     fn look_up(&mut self, ctx: &mut Context<Self>) {
-        let (name, name_servers) = (self.name.clone(), self.name_servers.clone());
-        async move { actix_rt::time::timeout(TIME_LIMIT, look_up(&name, &name_servers)).await }
+        servers(self.name.clone())
             .into_actor(self)
             .map(|answer, monitor, ctx| {
-                let late = LookupError::NoAnswer(format!("no answer within {} s", TIME_LIMIT.as_secs_f64()));
-                let answer = answer.unwrap_or(Err(late));
                 match monitor.results.try_send(LookupResult { name: monitor.name.clone(), answer }) {
                     // One that is lost is followed by another.
                     Ok(()) | Err(SendError::Full(_)) => {
@@ -60,6 +53,13 @@ impl NameMonitor {
             })
             .spawn(ctx);
     }
+}
+
+/// The simulation servers that a name leads to.
+async fn servers(name: DnsName) -> Result<BTreeSet<PublicAddress>, String> {
+    let addresses = look_up(&name.host).await?;
+    let host = |address: std::net::IpAddr| if address.is_ipv6() { format!("[{address}]") } else { address.to_string() };
+    Ok(addresses.into_iter().map(|address| PublicAddress::new(&host(address), name.port, false)).collect())
 }
 
 impl Actor for NameMonitor {

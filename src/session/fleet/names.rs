@@ -5,11 +5,9 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::SystemTime;
 
-use actix::prelude::*;
-
 use super::fleet_status::NameStatus;
-use super::name_monitor::{LookupResult, NameMonitor};
-use super::server_monitor::Stop;
+use super::monitors::{Monitors, Results};
+use super::name_monitor::LookupResult;
 use crate::session::config::{DnsName, ServerEntry};
 use crate::shared::domain::PublicAddress;
 use crate::shared::text::one_line;
@@ -18,9 +16,8 @@ use crate::shared::text::one_line;
 #[derive(Default)]
 pub struct Names(BTreeMap<DnsName, Looked>);
 
-/// One name and its monitor.
+/// One name.
 struct Looked {
-    monitor: Addr<NameMonitor>,
     servers: BTreeSet<PublicAddress>,
     /// Why the last lookup failed, if it did.
     error: Option<String>,
@@ -51,30 +48,20 @@ pub enum Turn {
 
 impl Names {
     /// Looks up the names among these entries, and no others.
-    pub fn apply(&mut self, entries: &[ServerEntry], start: impl Fn(&DnsName) -> Addr<NameMonitor>) {
+    pub fn apply(&mut self, entries: &[ServerEntry], monitors: &mut Monitors, results: &Results) {
         let wanted: BTreeSet<&DnsName> = entries.iter().filter_map(ServerEntry::name).collect();
-        self.0.retain(|name, looked| {
+        self.0.retain(|name, _| {
             let stays = wanted.contains(name);
             if !stays {
-                looked.monitor.do_send(Stop);
+                monitors.stop_looking_up(name);
             }
             stays
         });
         for name in wanted {
-            self.0.entry(name.clone()).or_insert_with(|| Looked {
-                monitor: start(name),
-                servers: BTreeSet::new(),
-                error: None,
-                since: SystemTime::now(),
+            self.0.entry(name.clone()).or_insert_with(|| {
+                monitors.look_up(name, results);
+                Looked { servers: BTreeSet::new(), error: None, since: SystemTime::now() }
             });
-        }
-    }
-
-    /// Starts monitors in place of those that have panicked.
-    pub fn restart_gone(&mut self, start: impl Fn(&DnsName) -> Addr<NameMonitor>) {
-        for (name, looked) in self.0.iter_mut().filter(|(_, looked)| !looked.monitor.connected()) {
-            log::error!("{name}: its monitor is gone, a new one is started");
-            looked.monitor = start(name);
         }
     }
 
@@ -84,19 +71,14 @@ impl Names {
         let failed = looked.error.is_some();
         let mut servers = false;
         let turn = match answer {
-            Ok(mut found) => {
+            Ok(found) => {
                 looked.error = None;
-                if !found.complete {
-                    // What is not told of has not gone.
-                    let by_ipv6 = |server: &&PublicAddress| server.host().starts_with('[');
-                    found.servers.extend(looked.servers.iter().filter(by_ipv6).cloned());
-                }
-                servers = found.servers != looked.servers;
-                looked.servers = found.servers;
+                servers = found != looked.servers;
+                looked.servers = found;
                 failed.then_some(Turn::WorksAgain(looked.servers.len()))
             }
             Err(error) => {
-                let error: String = one_line(&error.to_string()).chars().take(LONGEST_ERROR).collect();
+                let error: String = one_line(&error).chars().take(LONGEST_ERROR).collect();
                 looked.error = Some(error.clone());
                 (!failed).then_some(Turn::Fails(error))
             }
@@ -108,7 +90,6 @@ impl Names {
     }
 
     /// The servers that these entries stand for, in their order, each once.
-    #[must_use]
     pub fn servers(&self, entries: &[ServerEntry]) -> Vec<PublicAddress> {
         let mut seen = BTreeSet::new();
         let mut servers = Vec::new();
@@ -120,7 +101,6 @@ impl Names {
     }
 
     /// What is known of each name.
-    #[must_use]
     pub fn status(&self) -> Vec<NameStatus> {
         let status = |(name, looked): (&DnsName, &Looked)| NameStatus {
             name: name.clone(),

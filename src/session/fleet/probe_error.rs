@@ -21,7 +21,6 @@ pub enum ProbeError {
 
 impl ProbeError {
     /// Whether both are the same variant, whatever their details.
-    #[must_use]
     pub fn is_same_kind(&self, other: &Self) -> bool {
         std::mem::discriminant(self) == std::mem::discriminant(other)
     }

@@ -14,7 +14,6 @@ const BURST: NonZeroU32 = NonZeroU32::MIN.saturating_add(199);
 const PER_MINUTE: NonZeroU32 = NonZeroU32::MIN.saturating_add(11);
 
 /// The quota of placements that take room.
-#[must_use]
 pub fn placements() -> AddressQuota {
     AddressQuota::new(BURST, PER_MINUTE)
 }

@@ -1,4 +1,4 @@
-//! Actor: owns the state of the fleet and the subscribers; answers picks; sends updates.
+//! Actor: owns the state of the fleet; answers picks; publishes whether a server can take a client.
 //!
 //! One for the whole server, created at start; it never ends. It alone decides availability: it gets every report and
 //! every pick, so that a pick counts at once. It starts a monitor for each simulation server and for each name that leads
@@ -9,6 +9,8 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use actix::prelude::*;
+use hickory_resolver::TokioResolver;
+use tokio::sync::watch;
 
 use super::changes::Changes;
 use super::fleet_status::{FleetStatus, ServerStatus};
@@ -21,7 +23,6 @@ use super::quota;
 use super::server_monitor::{ProbeResult, ProbeSettings};
 use super::server_record::{ServerRecord, is_refused};
 use super::servers::{ListChange, Servers};
-use super::subscribers::{Subscribers, Update};
 use crate::session::config::SessionConfig;
 use crate::session::mail::Mailer;
 use crate::session::placement::Fleet;
@@ -31,20 +32,15 @@ use crate::shared::domain::PublicAddress;
 use crate::shared::domain::ServerReport;
 use crate::shared::http::AddressQuota;
 
-/// Asks for an update now, and for another one whenever availability changes.
-#[derive(Message)]
-#[rtype(result = "()")]
-pub struct Subscribe(pub Recipient<Update>);
-
 /// Asks for everything that is known of the fleet.
 #[derive(Message)]
 #[rtype(result = "Arc<FleetStatus>")]
 pub struct GetStatus;
 
-/// Asks whether some simulation server can take a client.
+/// Asks whether the registry still answers.
 #[derive(Message)]
-#[rtype(result = "bool")]
-pub struct IsAvailable;
+#[rtype(result = "()")]
+pub struct Ping;
 
 /// Replaces the configuration; see [`SessionConfig::reload`] for what counts at once.
 #[derive(Message)]
@@ -58,8 +54,8 @@ pub struct Registry {
     fleet: Fleet<PublicAddress>,
     quota: AddressQuota,
     servers: Servers,
-    subscribers: Subscribers,
-    available: bool,
+    /// Whether a simulation server can take a client, for all web clients.
+    available: watch::Sender<bool>,
     changes: Changes,
 }
 
@@ -68,16 +64,19 @@ const TICK: Duration = Duration::from_millis(250);
 
 impl Registry {
     /// A registry whose monitors are started with it.
-    #[must_use]
-    pub fn new(config: Arc<SessionConfig>, mailer: Option<Addr<Mailer>>, latencies: prometheus::Histogram) -> Self {
+    pub fn new(
+        config: Arc<SessionConfig>,
+        mailer: Option<Addr<Mailer>>,
+        latencies: prometheus::Histogram,
+        (resolver, available): (TokioResolver, watch::Sender<bool>),
+    ) -> Self {
         Self {
             fleet: Fleet::new(config.policy()),
             quota: quota::placements(),
             config,
             latencies,
-            servers: Servers::new(),
-            subscribers: Subscribers::default(),
-            available: false,
+            servers: Servers::new(resolver),
+            available,
             changes: Changes::new(mailer),
         }
     }
@@ -104,21 +103,22 @@ impl Registry {
     }
 
     fn tick(&mut self, ctx: &mut Context<Self>) {
-        self.servers.restart_gone(&self.config, &results(ctx));
-        self.changes.restart_mailer_if_gone(&self.config);
+        let restarted = self.servers.monitors().restart_gone(&self.config, &results(ctx));
+        if let Err(too_many) = restarted.and_then(|()| self.changes.restart_gone(&self.config)) {
+            // The app ends the server when the registry is gone.
+            log::error!("{too_many}");
+            ctx.stop();
+        }
         self.publish();
-        self.subscribers.retry(Update::Availability(self.available));
     }
 
-    /// Sends an update to the subscribers if availability has changed.
+    /// Publishes a change of availability.
     fn publish(&mut self) {
         let available = self.fleet.available(Instant::now());
-        if available == self.available {
-            return;
+        if *self.available.borrow() != available {
+            log::info!("{} simulation server is available", if available { "a" } else { "no" });
+            self.available.send_replace(available);
         }
-        self.available = available;
-        log::info!("{} simulation server is available", if available { "a" } else { "no" });
-        self.subscribers.send(Update::Availability(self.available));
     }
 
     /// Records what a probe of a server brought at this time.
@@ -245,20 +245,10 @@ impl Handler<Pick> for Registry {
     }
 }
 
-impl Handler<Subscribe> for Registry {
+impl Handler<Ping> for Registry {
     type Result = ();
 
-    fn handle(&mut self, Subscribe(recipient): Subscribe, _: &mut Self::Context) {
-        self.subscribers.add(recipient, Some(Update::Availability(self.available)));
-    }
-}
-
-impl Handler<IsAvailable> for Registry {
-    type Result = bool;
-
-    fn handle(&mut self, _: IsAvailable, _: &mut Self::Context) -> bool {
-        self.available
-    }
+    fn handle(&mut self, _: Ping, _: &mut Self::Context) {}
 }
 
 impl Handler<GetStatus> for Registry {
@@ -267,7 +257,7 @@ impl Handler<GetStatus> for Registry {
     fn handle(&mut self, _: GetStatus, _: &mut Self::Context) -> Self::Result {
         let servers = self.servers.in_order().filter_map(|address| self.status_of(address));
         MessageResult(Arc::new(FleetStatus {
-            available: self.available,
+            available: *self.available.borrow(),
             mean_load: Load::mean(self.servers.records().filter_map(ServerRecord::load)).map(Load::percent),
             servers: servers.collect(),
             names: self.servers.names(),
@@ -288,7 +278,7 @@ impl Handler<Reconfigure> for Registry {
         self.follow(change);
         let settings = ProbeSettings::new(&self.config);
         if settings != before {
-            self.servers.set_probes(settings);
+            self.servers.monitors().set_probes(settings);
         }
         let all = self.servers.in_order().cloned().collect();
         self.reevaluate(all);

@@ -17,11 +17,12 @@ use actix_web::web::Bytes;
 use awc::error::{ConnectError, SendRequestError};
 use awc::http::StatusCode;
 use awc::http::header::CONTENT_LENGTH;
+use hickory_resolver::TokioResolver;
 use rustls::ClientConfig;
 
-use super::caching_resolver::CachingResolver;
 use super::probe_error::ProbeError;
-use crate::session::config::{NameServer, SessionConfig};
+use super::resolver::HostResolver;
+use crate::session::config::SessionConfig;
 use crate::shared::domain::{Load, PublicAddress, ServerReport};
 use crate::shared::http::tls;
 use crate::shared::text::excerpt;
@@ -52,7 +53,6 @@ pub struct ProbeSettings {
 
 impl ProbeSettings {
     /// As the configuration has it.
-    #[must_use]
     pub fn new(config: &SessionConfig) -> Self {
         Self { interval: config.load_refresh, timeout: config.timing.answer, ssl: config.ssl }
     }
@@ -101,11 +101,10 @@ enum Answer {
 }
 
 /// An HTTP client that keeps one connection to the simulation server.
-fn client(interval: Duration, name_servers: Vec<NameServer>, tls: Option<Arc<ClientConfig>>) -> awc::Client {
+fn client(interval: Duration, resolver: TokioResolver, tls: Option<Arc<ClientConfig>>) -> awc::Client {
     let idle = (interval * 3).max(Duration::from_secs(15));
     // A probe as a whole has a time limit, its parts have none.
-    let resolver = Resolver::custom(CachingResolver::new(name_servers));
-    let tcp = TcpConnector::new(resolver).service();
+    let tcp = TcpConnector::new(Resolver::custom(HostResolver::new(resolver))).service();
     let mut connector = awc::Connector::new().connector(tcp).conn_keep_alive(idle).timeout(NEVER);
     if let Some(config) = tls {
         connector = connector.rustls_0_23(config);
@@ -114,17 +113,16 @@ fn client(interval: Duration, name_servers: Vec<NameServer>, tls: Option<Arc<Cli
 }
 
 impl ServerMonitor {
-    /// A monitor of one server, whose name these name servers are asked for. To be created in the thread in which it will run.
-    #[must_use]
+    /// A monitor of one server, whose host this resolver looks up. To be created in the thread in which it will run.
     pub fn new(
         server: PublicAddress,
         settings: ProbeSettings,
-        name_servers: Vec<NameServer>,
+        resolver: TokioResolver,
         tls: Option<Arc<ClientConfig>>,
         results: Recipient<ProbeResult>,
     ) -> Self {
         let timer = SpawnHandle::default();
-        let client = client(settings.interval, name_servers, tls);
+        let client = client(settings.interval, resolver, tls);
         Self { server, settings, client, results, probing: false, timer, load_only_until: None }
     }
 

@@ -54,7 +54,6 @@ pub struct Change {
 
 impl ServerRecord {
     /// A server that was not probed yet.
-    #[must_use]
     pub fn new(drained: bool) -> Self {
         Self {
             drained,
@@ -94,20 +93,17 @@ impl ServerRecord {
     }
 
     /// The last report, if it still holds.
-    #[must_use]
     pub fn current(&self) -> Option<&ServerReport> {
         self.report.as_deref().filter(|_| self.state != State::Down)
     }
 
     /// Whether the server runs a world, by its last report; `None` if it never answered.
-    #[must_use]
     pub fn accepts(&self, world: &ProjectUrl) -> Option<bool> {
         self.report.as_ref().map(|report| report.accepts(world))
     }
 
     /// The last report in the terms of the placement policy; `None` for a server that must not get clients and does not
     /// count its instances, for which only being down keeps clients away.
-    #[must_use]
     pub fn for_placement(&self) -> Option<placement::Report> {
         let report = self.current()?;
         let accepting = self.state != State::Draining;
@@ -121,7 +117,6 @@ impl ServerRecord {
     }
 
     /// The status of the server, without what only the placement knows.
-    #[must_use]
     pub fn status(&self, address: &PublicAddress) -> ServerStatus {
         ServerStatus {
             address: address.clone(),
@@ -138,7 +133,6 @@ impl ServerRecord {
     }
 
     /// The last load, if the server is not down.
-    #[must_use]
     pub fn load(&self) -> Option<Load> {
         self.current().map(|report| report.load)
     }
@@ -193,7 +187,6 @@ impl ServerRecord {
 
 /// Whether some server refuses a world, and no other accepts it or has yet to be asked for the first time. A server that
 /// has never answered may never do so: it does not count.
-#[must_use]
 pub fn is_refused<'a>(servers: impl Iterator<Item = &'a ServerRecord>, world: &ProjectUrl) -> bool {
     let mut refused = false;
     for server in servers {

@@ -6,13 +6,12 @@
 
 use std::collections::{BTreeSet, HashMap};
 
-use actix::prelude::*;
+use hickory_resolver::TokioResolver;
 
 use super::fleet_status::NameStatus;
 use super::monitors::{Monitors, Results};
 use super::name_monitor::LookupResult;
 use super::names::{NameChange, Names};
-use super::server_monitor::{ProbeSettings, ServerMonitor, Stop};
 use super::server_record::ServerRecord;
 use crate::session::config::SessionConfig;
 use crate::shared::domain::PublicAddress;
@@ -23,13 +22,7 @@ pub struct Servers {
     names: Names,
     /// In the order of the configuration.
     listed: Vec<PublicAddress>,
-    watched: HashMap<PublicAddress, Watched>,
-}
-
-/// One simulation server and its monitor.
-struct Watched {
-    monitor: Addr<ServerMonitor>,
-    record: ServerRecord,
+    watched: HashMap<PublicAddress, ServerRecord>,
 }
 
 /// How another list of servers differs from the one before.
@@ -45,14 +38,13 @@ pub struct ListChange {
 
 impl Servers {
     /// No servers yet.
-    #[must_use]
-    pub fn new() -> Self {
-        Self { monitors: Monitors::new(), names: Names::default(), listed: Vec::new(), watched: HashMap::new() }
+    pub fn new(resolver: TokioResolver) -> Self {
+        Self { monitors: Monitors::new(resolver), names: Names::default(), listed: Vec::new(), watched: HashMap::new() }
     }
 
     /// Follows a configuration: what it no longer lists is forgotten.
     pub fn apply(&mut self, config: &SessionConfig, results: &Results) -> ListChange {
-        self.names.apply(&config.simulation_servers, |name| self.monitors.look_up(name, config, results));
+        self.names.apply(&config.simulation_servers, &mut self.monitors, results);
         self.list(config, results, true)
     }
 
@@ -65,7 +57,7 @@ impl Servers {
         let mut change = ListChange::default();
         self.listed = self.names.servers(&config.simulation_servers);
         let listed: BTreeSet<&PublicAddress> = self.listed.iter().collect();
-        for (server, Watched { record, .. }) in &mut self.watched {
+        for (server, record) in &mut self.watched {
             let unlisted = !listed.contains(server);
             let turned = std::mem::replace(&mut record.unlisted, unlisted) != unlisted;
             record.drained = config.drained_servers.contains(server);
@@ -82,18 +74,17 @@ impl Servers {
             self.forget(server);
         }
         for server in &change.added {
-            let monitor = self.monitors.watch(server, config, results);
-            let record = ServerRecord::new(config.drained_servers.contains(server));
-            self.watched.insert(server.clone(), Watched { monitor, record });
+            self.monitors.watch(server, config, results);
+            self.watched.insert(server.clone(), ServerRecord::new(config.drained_servers.contains(server)));
         }
         change
     }
 
     /// Ends the watch on a server.
     pub fn forget(&mut self, server: &PublicAddress) {
-        if let Some(watched) = self.watched.remove(server) {
+        if self.watched.remove(server).is_some() {
             log::info!("{server}: no longer watched");
-            watched.monitor.do_send(Stop);
+            self.monitors.unwatch(server);
         }
     }
 
@@ -102,47 +93,34 @@ impl Servers {
         self.names.record(result)
     }
 
-    /// Starts monitors in place of those that have panicked.
-    pub fn restart_gone(&mut self, config: &SessionConfig, results: &Results) {
-        for (server, watched) in self.watched.iter_mut().filter(|(_, watched)| !watched.monitor.connected()) {
-            log::error!("{server}: its monitor is gone, a new one is started");
-            watched.monitor = self.monitors.watch(server, config, results);
-        }
-        self.names.restart_gone(|name| self.monitors.look_up(name, config, results));
-    }
-
-    /// Changes how servers are probed.
-    pub fn set_probes(&self, settings: ProbeSettings) {
-        for watched in self.watched.values() {
-            watched.monitor.do_send(settings);
-        }
+    /// The monitors of servers and names.
+    pub fn monitors(&mut self) -> &mut Monitors {
+        &mut self.monitors
     }
 
     /// What is known of a server.
-    #[must_use]
     pub fn get(&self, server: &PublicAddress) -> Option<&ServerRecord> {
-        self.watched.get(server).map(|watched| &watched.record)
+        self.watched.get(server)
     }
 
     /// The same, to be changed.
     pub fn get_mut(&mut self, server: &PublicAddress) -> Option<&mut ServerRecord> {
-        self.watched.get_mut(server).map(|watched| &mut watched.record)
+        self.watched.get_mut(server)
     }
 
     /// What is known of all servers.
     pub fn records(&self) -> impl Iterator<Item = &ServerRecord> {
-        self.watched.values().map(|watched| &watched.record)
+        self.watched.values()
     }
 
     /// All servers in the order of the configuration; last those that are listed no longer.
     pub fn in_order(&self) -> impl Iterator<Item = &PublicAddress> {
-        let unlisted = self.watched.iter().filter(|(_, watched)| watched.record.unlisted);
+        let unlisted = self.watched.iter().filter(|(_, record)| record.unlisted);
         let unlisted: BTreeSet<_> = unlisted.map(|(server, _)| server).collect();
         self.listed.iter().chain(unlisted)
     }
 
     /// What is known of each name.
-    #[must_use]
     pub fn names(&self) -> Vec<NameStatus> {
         self.names.status()
     }

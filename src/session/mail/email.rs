@@ -1,16 +1,16 @@
-//! Composes e-mails: subject, text and HTML out of two templates, and headers.
+//! Composes e-mails: a subject, and plain text out of a template.
 //!
-//! Text from outside, such as a server's error, never has a line break in a header, and is escaped in the HTML.
-
-use std::time::SystemTime;
+//! Text from outside, such as a server's error, becomes one line without control characters, in the text and in headers.
 
 use askama::Template;
 use lettre::Message;
-use lettre::message::header::{Header, HeaderName, HeaderValue};
-use lettre::message::{Mailbox, MultiPart};
+use lettre::message::Mailbox;
+use lettre::message::header::{ContentType, HeaderName, HeaderValue};
 
-use super::notices::{Entry, Event};
+use super::outbox::{Entry, Event};
+use super::smtp::MailError;
 use crate::session::config::SessionConfig;
+use crate::shared::run::timestamp;
 use crate::shared::text::excerpt;
 
 /// How many letters of a text from outside are shown.
@@ -25,27 +25,9 @@ pub struct EmailComposer {
     monitor: String,
 }
 
-/// Why an e-mail can't be composed.
-#[derive(Debug, thiserror::Error)]
-pub enum EmailError {
-    /// A template failed.
-    #[error("the mail can't be written: {0}")]
-    Template(#[from] askama::Error),
-    /// A header or an address is wrong.
-    #[error("the mail can't be written: {0}")]
-    Message(#[from] lettre::error::Error),
-}
-
 #[derive(Template)]
 #[template(path = "mail.txt")]
-struct Text<'mail>(&'mail Content<'mail>);
-
-#[derive(Template)]
-#[template(path = "mail.html")]
-struct Html<'mail>(&'mail Content<'mail>);
-
-/// What both templates show.
-struct Content<'mail> {
+struct Text<'mail> {
     summary: &'mail str,
     lines: Vec<Line>,
     composer: &'mail EmailComposer,
@@ -62,19 +44,20 @@ struct Line {
 }
 
 impl EmailComposer {
-    /// Composes e-mails as the configuration says; nothing if it names no administrator or sender.
-    #[must_use]
-    pub fn new(config: &SessionConfig) -> Option<Self> {
-        Some(Self {
-            from: config.mail_sender.clone()?,
-            to: config.administrator.clone()?,
+    /// Composes e-mails as the configuration says.
+    ///
+    /// # Errors
+    /// When it names no administrator or sender.
+    pub fn new(config: &SessionConfig) -> Result<Self, MailError> {
+        Ok(Self {
+            from: config.mail_sender.clone().ok_or(MailError::Off("mailSender"))?,
+            to: config.administrator.clone().ok_or(MailError::Off("administrator"))?,
             session_server: excerpt(&config.address().to_string(), MAX_LETTERS),
             monitor: format!("{}/monitor", excerpt(&config.http_url(), MAX_LETTERS)),
         })
     }
 
     /// The address of the administrator.
-    #[must_use]
     pub fn recipient(&self) -> &str {
         self.to.email.as_ref()
     }
@@ -82,15 +65,10 @@ impl EmailComposer {
     /// The e-mail about these entries.
     ///
     /// # Errors
-    /// When a template or a header can't be written.
-    pub fn compose<'entries>(&self, entries: impl Iterator<Item = &'entries Entry>) -> Result<Message, EmailError> {
-        let mut events = Vec::new();
-        let lines: Vec<Line> = entries
-            .map(|entry| {
-                events.push(entry.notice.event);
-                Line::new(entry)
-            })
-            .collect();
+    /// When it can't be written.
+    pub fn compose(&self, entries: &[Entry]) -> Result<Message, MailError> {
+        let events: Vec<Event> = entries.iter().map(|entry| entry.notice.event).collect();
+        let lines: Vec<Line> = entries.iter().map(Line::new).collect();
         let mut subject = summary(&events);
         if let [only] = lines.as_slice() {
             subject = format!("{subject}: {}", only.server);
@@ -101,21 +79,18 @@ impl EmailComposer {
     /// The e-mail of `--test-mail`.
     ///
     /// # Errors
-    /// When a template or a header can't be written.
-    pub fn test(&self) -> Result<Message, EmailError> {
+    /// When it can't be written.
+    pub fn test(&self) -> Result<Message, MailError> {
         self.message("Test of the session server's notifications", Vec::new())
     }
 
-    fn message(&self, subject: &str, lines: Vec<Line>) -> Result<Message, EmailError> {
-        let content = Content { summary: subject, lines, composer: self };
-        let (text, html) = (Text(&content).render()?, Html(&content).render()?);
-        let message = Message::builder()
-            .from(self.from.clone())
-            .to(self.to.clone())
-            .subject(subject)
-            .message_id(None)
-            .header(AutoSubmitted)
-            .multipart(MultiPart::alternative_plain_html(text, html))?;
+    fn message(&self, subject: &str, lines: Vec<Line>) -> Result<Message, MailError> {
+        let text = Text { summary: subject, lines, composer: self }.render()?;
+        let builder = Message::builder().from(self.from.clone()).to(self.to.clone()).subject(subject).message_id(None);
+        let mut message = builder.header(ContentType::TEXT_PLAIN).body(text)?;
+        // Automatic responders shall not answer (RFC 3834).
+        let name = HeaderName::new_from_ascii_str("Auto-Submitted");
+        message.headers_mut().insert_raw(HeaderValue::new(name, "auto-generated".to_owned()));
         Ok(message)
     }
 }
@@ -126,29 +101,11 @@ impl Line {
         Self {
             server: excerpt(&notice.server, MAX_LETTERS),
             event: notice.event.words(),
-            at: time(notice.at),
+            at: timestamp(notice.at),
             load: notice.load.map(|load| format!("{:.1}%", load.percent())),
             error: notice.error.as_deref().map(|error| excerpt(error, MAX_LETTERS)),
             held_back: entry.held_back,
         }
-    }
-}
-
-/// Tells automatic responders not to answer (RFC 3834).
-#[derive(Clone)]
-struct AutoSubmitted;
-
-impl Header for AutoSubmitted {
-    fn name() -> HeaderName {
-        HeaderName::new_from_ascii_str("Auto-Submitted")
-    }
-
-    fn parse(_: &str) -> Result<Self, Box<dyn std::error::Error + Send + Sync>> {
-        Ok(Self)
-    }
-
-    fn display(&self) -> HeaderValue {
-        HeaderValue::new(Self::name(), "auto-generated".to_owned())
     }
 }
 
@@ -161,26 +118,20 @@ fn summary(events: &[Event]) -> String {
         return format!("{}{rest} {}", first.to_uppercase(), only.words());
     }
     let all = [NotResponding, WorkingAgain, MaximumLoad, AvailableAgain, LookupFails, LookupWorks];
-    let counts = all.map(|event| (events.iter().filter(|other| **other == event).count(), event));
     let mut parts: Vec<String> = Vec::new();
     let mut before = None;
-    for (count, event) in counts.into_iter().filter(|(count, _)| *count > 0) {
+    for event in all {
         let nouns = event.nouns();
         let [one, many] = nouns;
-        parts.push(match count {
-            _ if before == Some(nouns) => format!("{count} {}", event.words()),
-            1 => format!("1 {one} {}", event.words()),
-            _ => format!("{count} {many} {}", event.words()),
-        });
+        match events.iter().filter(|other| **other == event).count() {
+            0 => continue,
+            count if before == Some(nouns) => parts.push(format!("{count} {}", event.words())),
+            1 => parts.push(format!("1 {one} {}", event.words())),
+            count => parts.push(format!("{count} {many} {}", event.words())),
+        }
         before = Some(nouns);
     }
     parts.join(", ")
-}
-
-/// A time for people, to the second: `2026-03-01 14:05:09 UTC`.
-fn time(at: SystemTime) -> String {
-    jiff::Timestamp::try_from(at)
-        .map_or_else(|_| "unknown".to_owned(), |time| time.strftime("%Y-%m-%d %H:%M:%S UTC").to_string())
 }
 
 #[cfg(test)]
@@ -209,11 +160,5 @@ mod tests {
         ] {
             assert_eq!(summary(&events), subject);
         }
-    }
-
-    #[test]
-    fn the_time_is_in_utc() {
-        let at = SystemTime::UNIX_EPOCH + std::time::Duration::from_secs(1_772_373_909);
-        assert_eq!(time(at), "2026-03-01 14:05:09 UTC");
     }
 }

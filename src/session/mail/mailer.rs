@@ -1,38 +1,29 @@
 //! Actor: mails notices to the administrator.
 //!
 //! Created by the app, and again by the registry if it has panicked; only if the configuration is for e-mails. It accepts
-//! [`Notice`]s. [`Notices`] decides what is mailed, [`Outbox`] when. One e-mail is sent at a time; nobody waits for it.
+//! [`Notice`]s. [`Outbox`] decides what is mailed, and when. One e-mail is sent at a time; nothing waits for it.
 
 use std::time::{Duration, Instant};
 
 use actix::prelude::*;
 
 use super::email::EmailComposer;
-use super::mail_error::MailError;
-use super::notices::{Entry, Notice, Notices};
-use super::outbox::{Batch, Failure, Outbox, RetryPolicy};
-use super::smtp::Relay;
+use super::outbox::{Entry, Notice, Outbox};
+use super::smtp::{MailError, Relay};
 use crate::session::config::SessionConfig;
-
-/// How many entries may wait: both topics of every server of the largest fleet.
-const MAX_WAITING: usize = 2_000;
-
-/// How many notices may be sent to the mailer at once: all servers of the largest fleet.
-const MAILBOX_CAPACITY: usize = 4_096;
 
 /// The actor.
 pub struct Mailer {
     relay: Relay,
     composer: EmailComposer,
-    notices: Notices,
     outbox: Outbox,
-    give_up_after: Duration,
+    patience: Duration,
     sending: bool,
-    timer: Option<(Instant, SpawnHandle)>,
+    /// The timer of the next e-mail.
+    timer: SpawnHandle,
 }
 
 /// Starts the mailer; none if the configuration is not for e-mails.
-#[must_use]
 pub fn start(config: &SessionConfig) -> Option<Addr<Mailer>> {
     let mailer = Mailer::new(config).inspect_err(|why| log::info!("{why}")).ok()?;
     Some(mailer.start())
@@ -43,99 +34,65 @@ pub fn start(config: &SessionConfig) -> Option<Addr<Mailer>> {
 /// # Errors
 /// When the configuration is not for e-mails, or the SMTP server did not take it.
 pub async fn test_mail(config: &SessionConfig) -> Result<String, MailError> {
-    let relay = Relay::new(config)?;
-    let composer = composer(config)?;
-    let answer = relay.deliver(&composer.test()?).await?;
+    let Mailer { relay, composer, .. } = Mailer::new(config)?;
+    let answer = relay.deliver(composer.test()?).await?;
     Ok(format!("{} ({}) took a mail for {}: {answer}", relay.name(), relay.privacy(), composer.recipient()))
-}
-
-fn composer(config: &SessionConfig) -> Result<EmailComposer, MailError> {
-    EmailComposer::new(config).ok_or(MailError::Off("administrator or mailSender"))
 }
 
 impl Mailer {
     fn new(config: &SessionConfig) -> Result<Self, MailError> {
-        let timing = &config.timing;
-        let give_up_after = timing.mail_patience;
-        let policy = RetryPolicy { first_delay: timing.mail_retry, give_up_after, max_waiting: MAX_WAITING };
         Ok(Self {
+            composer: EmailComposer::new(config)?,
             relay: Relay::new(config)?,
-            composer: composer(config)?,
-            notices: Notices::new(timing.gather, timing.flapping),
-            outbox: Outbox::new(policy),
-            give_up_after,
+            outbox: Outbox::new(&config.timing),
+            patience: config.timing.mail_patience,
             sending: false,
-            timer: None,
+            timer: SpawnHandle::default(),
         })
     }
 
-    /// Sends what is due, and sets the timer for what is due later.
-    fn send_due(&mut self, ctx: &mut Context<Self>) {
-        let now = Instant::now();
-        let dropped = self.outbox.put(self.notices.take(now));
-        if dropped > 0 {
-            log::warn!("{dropped} notices dropped: {MAX_WAITING} others wait for {}", self.relay.name());
+    /// Waits until the next e-mail is due, which a new notice or the end of the last e-mail may change.
+    fn wait(&mut self, ctx: &mut Context<Self>) {
+        ctx.cancel_future(self.timer);
+        if let (false, Some(due)) = (self.sending, self.outbox.due()) {
+            self.timer = ctx.run_later(due.saturating_duration_since(Instant::now()), Self::send);
         }
-        if !self.sending
-            && let Some(batch) = self.outbox.take(now)
-        {
-            self.send(batch, ctx);
-        }
-        // While an e-mail is being sent, its end is the next time to look at the outbox.
-        let retry = if self.sending { None } else { self.outbox.due(now) };
-        self.set_timer(self.notices.due().into_iter().chain(retry).min(), now, ctx);
     }
 
-    fn set_timer(&mut self, due: Option<Instant>, now: Instant, ctx: &mut Context<Self>) {
-        if self.timer.map(|(when, _)| when) == due {
-            return;
+    fn send(&mut self, ctx: &mut Context<Self>) {
+        let batch = self.outbox.take(Instant::now());
+        if batch.is_empty() {
+            return self.wait(ctx);
         }
-        if let Some((_, handle)) = self.timer.take() {
-            ctx.cancel_future(handle);
-        }
-        self.timer = due.map(|due| {
-            let handle = ctx.run_later(due.saturating_duration_since(now), |mailer, ctx| {
-                mailer.timer = None;
-                mailer.send_due(ctx);
-            });
-            (due, handle)
-        });
-    }
-
-    fn send(&mut self, batch: Batch, ctx: &mut Context<Self>) {
         self.sending = true;
-        let message = self.composer.compose(batch.entries());
+        let message = self.composer.compose(&batch);
         let relay = self.relay.clone();
-        async move { relay.deliver(&message?).await }
+        async move { relay.deliver(message?).await }
             .into_actor(self)
             .map(move |sent, mailer, ctx| {
                 mailer.sending = false;
                 mailer.handle_outcome(batch, sent);
-                mailer.send_due(ctx);
+                mailer.wait(ctx);
             })
             .spawn(ctx);
     }
 
     /// Reports to the outbox and the log how sending a batch went.
-    fn handle_outcome(&mut self, batch: Batch, sent: Result<String, MailError>) {
-        let subject = in_words(batch.entries());
+    fn handle_outcome(&mut self, batch: Vec<Entry>, sent: Result<String, MailError>) {
+        let (now, subject, count) = (Instant::now(), in_words(&batch), batch.len());
         let error = match sent {
             Ok(answer) => {
                 log::info!("mail sent by {} ({subject}): {answer}", self.relay.name());
-                return self.outbox.succeeded();
+                return self.outbox.succeeded(&batch, now);
             }
             Err(error) => error,
         };
-        let failure = if error.is_permanent() { Failure::Permanent } else { Failure::Transient };
-        let now = Instant::now();
-        let count = batch.entries().count();
-        let lost = self.outbox.failed(batch, failure, now);
+        let lost = self.outbox.failed(batch, error.is_permanent(), now);
         if !lost.is_empty() {
-            let seconds = self.give_up_after.as_secs_f64();
-            log::error!("mail given up after {seconds} s ({}): {error}", in_words(lost.iter()));
+            log::error!("mail given up after {} s ({}): {error}", self.patience.as_secs_f64(), in_words(&lost));
         }
         if lost.len() < count
-            && let Some(next) = self.outbox.due(now)
+            && let Some(next) = self.outbox.due()
         {
             let wait = next.saturating_duration_since(now).as_secs_f64();
             log::warn!("mail not sent, next try in {wait:.0} s ({subject}): {error}");
@@ -144,29 +101,23 @@ impl Mailer {
 }
 
 /// The first few entries, for a log line.
-fn in_words<'entries>(entries: impl Iterator<Item = &'entries Entry>) -> String {
-    let mut entries = entries.map(|entry| format!("{} {}", entry.notice.server, entry.notice.event.words()));
-    let words = entries.by_ref().take(3).collect::<Vec<_>>().join(", ");
-    let more = entries.count();
-    if more > 0 {
-        return format!("{words} and {more} more");
-    }
-    words
+fn in_words(entries: &[Entry]) -> String {
+    let (shown, others) = entries.split_at(entries.len().min(3));
+    let shown: Vec<_> =
+        shown.iter().map(|Entry { notice, .. }| format!("{} {}", notice.server, notice.event.words())).collect();
+    let more = if others.is_empty() { String::new() } else { format!(" and {} more", others.len()) };
+    format!("{}{more}", shown.join(", "))
 }
 
 impl Actor for Mailer {
     type Context = Context<Self>;
-
-    fn started(&mut self, ctx: &mut Self::Context) {
-        ctx.set_mailbox_capacity(MAILBOX_CAPACITY);
-    }
 }
 
 impl Handler<Notice> for Mailer {
     type Result = ();
 
     fn handle(&mut self, notice: Notice, ctx: &mut Self::Context) {
-        self.notices.add(notice, Instant::now());
-        self.send_due(ctx);
+        self.outbox.add(notice, Instant::now());
+        self.wait(ctx);
     }
 }

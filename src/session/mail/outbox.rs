@@ -1,219 +1,431 @@
-//! Entries that wait to be mailed: when a failed e-mail is sent again, and when it is given up. Pure; time is passed in.
+//! Notices that wait to be mailed: gathered, held back while a server flaps, and tried again after a failure. Pure; time
+//! is passed in.
 //!
-//! All entries that wait go into the next e-mail. A newer entry of the same server and topic replaces the older one.
+//! There are two topics about a simulation server: whether it responds, and whether it has room. Of each the newest
+//! notice waits, and counts those that it has replaced.
+//!
+//! 1. The first notice waits for `gather`, so that servers that fail together are reported in one e-mail.
+//! 2. For `flapping` after an e-mail about a server, its notices are held back. After that time the next e-mail has one
+//!    entry for each topic.
+//! 3. One notice is not held back: that a server does not respond, if the last e-mail was only about its load.
+//! 4. After a failure all entries are tried again, with a delay that doubles. An entry is given up after `mailPatience`.
 
-use std::time::{Duration, Instant};
+use std::collections::{BTreeMap, HashMap};
+use std::time::{Duration, Instant, SystemTime};
 
-use super::notices::Entry;
+use actix::Message;
 
-/// When a failed e-mail is sent again, and when it is given up.
-#[derive(Debug, Clone, Copy)]
-pub struct RetryPolicy {
-    /// The delay after the first failure; it doubles with each.
-    pub first_delay: Duration,
-    /// How long an entry is tried before it is given up.
-    pub give_up_after: Duration,
-    /// How many entries may wait; the oldest are dropped for newer ones.
-    pub max_waiting: usize,
+use crate::session::config::Timing;
+use crate::shared::domain::Load;
+
+/// A change of a simulation server that the administrator should know of.
+#[derive(Message, Debug, Clone, PartialEq)]
+#[rtype(result = "()")]
+pub struct Notice {
+    /// The simulation server's address, or the name that leads to some.
+    pub server: String,
+    /// What happened.
+    pub event: Event,
+    /// Its load, if known.
+    pub load: Option<Load>,
+    /// The last error, if any. It may hold any text.
+    pub error: Option<String>,
+    /// When it happened.
+    pub at: SystemTime,
 }
 
-impl RetryPolicy {
-    /// The longest delay between two tries.
-    fn longest_delay(self) -> Duration {
-        self.first_delay.max(self.give_up_after / 6)
+/// What happened to a simulation server or to a name, in the order of the lines in an e-mail.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum Event {
+    /// It gives no usable answer.
+    NotResponding,
+    /// It gives good answers again.
+    WorkingAgain,
+    /// Its load reached the threshold.
+    MaximumLoad,
+    /// Its load is below the threshold again.
+    AvailableAgain,
+    /// A name can't be looked up.
+    LookupFails,
+    /// It can be again.
+    LookupWorks,
+}
+
+/// What an event is about.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum Topic {
+    /// Whether a server responds, or a name.
+    Health,
+    /// Whether a server has room for clients.
+    Capacity,
+}
+
+impl Event {
+    /// What it happens to, one and many.
+    pub fn nouns(self) -> [&'static str; 2] {
+        match self {
+            Self::LookupFails | Self::LookupWorks => ["lookup of simulation servers", "lookups of simulation servers"],
+            _ => ["simulation server", "simulation servers"],
+        }
+    }
+
+    /// The event in words that follow those of [`Event::nouns`].
+    pub fn words(self) -> &'static str {
+        match self {
+            Self::LookupFails => "failing",
+            Self::NotResponding => "not responding",
+            Self::WorkingAgain | Self::LookupWorks => "working again",
+            Self::MaximumLoad => "reached maximum load",
+            Self::AvailableAgain => "available again",
+        }
+    }
+
+    /// The topic of the event.
+    pub fn topic(self) -> Topic {
+        match self {
+            Self::NotResponding | Self::WorkingAgain | Self::LookupFails | Self::LookupWorks => Topic::Health,
+            Self::MaximumLoad | Self::AvailableAgain => Topic::Capacity,
+        }
     }
 }
 
-/// The entries that wait to be mailed.
-#[derive(Debug)]
-pub struct Outbox {
-    policy: RetryPolicy,
-    waiting: Vec<Waiting>,
-    /// The delay after the next failure.
-    delay: Duration,
-    not_before: Option<Instant>,
-}
-
-/// An entry that waits.
-#[derive(Debug, Clone)]
-struct Waiting {
-    entry: Entry,
+/// One entry of an e-mail: the newest notice about a server and topic, and how many it stands for.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Entry {
+    /// The newest notice, with the last error that is known.
+    pub notice: Notice,
+    /// How many earlier notices it has replaced.
+    pub held_back: usize,
+    /// When the first of them came.
+    since: Instant,
+    /// When sending the newest was first tried.
     first_try: Option<Instant>,
 }
 
-/// The entries of one e-mail.
-#[derive(Debug, Clone)]
-pub struct Batch(Vec<Waiting>);
-
-impl Batch {
-    /// The entries in the order of the e-mail: by event, then by server.
-    pub fn entries(&self) -> impl Iterator<Item = &Entry> {
-        let mut entries: Vec<&Entry> = self.0.iter().map(|waiting| &waiting.entry).collect();
-        entries.sort_by_key(|entry| (entry.notice.event, entry.notice.server.clone()));
-        entries.into_iter()
-    }
+/// The notices that wait, and when the next e-mail is due.
+#[derive(Debug)]
+pub struct Outbox {
+    timing: Timing,
+    servers: HashMap<String, Server>,
+    /// The delay after the next failure.
+    delay: Duration,
+    /// After a failure: nothing is sent before.
+    retry_at: Option<Instant>,
 }
 
-/// Whether another try can succeed (RFC 5321, section 4.2.1).
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Failure {
-    /// It may, as after a refused connection.
-    Transient,
-    /// Not before somebody changes something, such as a wrong password. It is tried again too, since only an e-mail can
-    /// tell the administrator, and such things are often corrected within the hour; but with the longest delay from the
-    /// start, so that no account is locked for too many wrong logins.
-    Permanent,
+/// What the outbox knows of one server.
+#[derive(Debug, Default)]
+struct Server {
+    waiting: BTreeMap<Topic, Entry>,
+    cooldown: Option<Cooldown>,
+}
+
+/// The time after an e-mail about a server in which its notices are held back.
+#[derive(Debug, Clone, Copy)]
+struct Cooldown {
+    end: Instant,
+    /// Whether that e-mail had an entry about the server's health.
+    about_health: bool,
+}
+
+impl Entry {
+    /// Takes in an older entry about the same.
+    fn replace(&mut self, older: Self) {
+        self.held_back += older.held_back + 1;
+        self.since = older.since;
+        self.notice.error = self.notice.error.take().or(older.notice.error);
+    }
 }
 
 impl Outbox {
     /// An empty outbox.
-    #[must_use]
-    pub fn new(policy: RetryPolicy) -> Self {
-        Self { policy, waiting: Vec::new(), delay: policy.first_delay, not_before: None }
+    pub fn new(timing: &Timing) -> Self {
+        Self { timing: timing.clone(), servers: HashMap::new(), delay: timing.mail_retry, retry_at: None }
     }
 
-    /// Adds entries. Returns how many of the oldest were dropped.
-    pub fn put(&mut self, entries: Vec<Entry>) -> usize {
-        for entry in entries {
-            self.join(entry);
+    /// Adds a notice.
+    pub fn add(&mut self, notice: Notice, now: Instant) {
+        let server = self.servers.entry(notice.server.clone()).or_default();
+        server.cooldown.take_if(|cooldown| cooldown.end <= now);
+        let topic = notice.event.topic();
+        let mut entry = Entry { notice, held_back: 0, since: now, first_try: None };
+        if let Some(older) = server.waiting.remove(&topic) {
+            entry.replace(older);
         }
-        let surplus = self.waiting.len().saturating_sub(self.policy.max_waiting);
-        self.waiting.drain(..surplus).count()
+        server.waiting.insert(topic, entry);
     }
 
-    /// When the next try is due; nothing if no entry waits.
-    #[must_use]
-    pub fn due(&self, now: Instant) -> Option<Instant> {
-        (!self.waiting.is_empty()).then(|| self.not_before.unwrap_or(now))
+    /// When the next e-mail is due, if no other notice comes.
+    pub fn due(&self) -> Option<Instant> {
+        let due = self.servers.values().filter_map(|server| server.due(self.timing.gather)).min()?;
+        Some(self.retry_at.map_or(due, |retry_at| due.max(retry_at)))
     }
 
-    /// Takes out what is to be mailed now. How it went is to be reported by [`Self::succeeded`] or [`Self::failed`].
-    pub fn take(&mut self, now: Instant) -> Option<Batch> {
-        self.due(now).filter(|due| *due <= now)?;
-        let mut batch = std::mem::take(&mut self.waiting);
-        for waiting in &mut batch {
-            waiting.first_try.get_or_insert(now);
+    /// Takes out what is to be mailed now, by event, then by server. The outcome is to be reported by
+    /// [`Self::succeeded`] or [`Self::failed`].
+    pub fn take(&mut self, now: Instant) -> Vec<Entry> {
+        self.servers.retain(|_, server| {
+            !server.waiting.is_empty() || server.cooldown.is_some_and(|cooldown| cooldown.end > now)
+        });
+        if self.due().is_none_or(|due| due > now) {
+            return Vec::new();
         }
-        Some(Batch(batch))
-    }
-
-    /// The last batch was sent.
-    pub fn succeeded(&mut self) {
-        self.delay = self.policy.first_delay;
-        self.not_before = None;
-    }
-
-    /// A batch was not sent. Returns the entries that are given up.
-    pub fn failed(&mut self, batch: Batch, failure: Failure, now: Instant) -> Vec<Entry> {
-        let give_up_after = self.policy.give_up_after;
-        let end = |waiting: &Waiting| waiting.first_try.unwrap_or(now) + give_up_after;
-        let (given_up, kept): (Vec<_>, Vec<_>) = batch.0.into_iter().partition(|waiting| end(waiting) <= now);
-        let newer = std::mem::replace(&mut self.waiting, kept);
-        for waiting in newer {
-            self.join(waiting.entry);
+        // An e-mail that is sent anyway includes what would else wait for `gather` only.
+        let ready = self.servers.values_mut().filter(|server| server.held_until().is_none_or(|end| end <= now));
+        let mut batch: Vec<Entry> =
+            ready.flat_map(|server| std::mem::take(&mut server.waiting).into_values()).collect();
+        for entry in &mut batch {
+            entry.first_try.get_or_insert(now);
         }
-        if failure == Failure::Permanent {
-            self.delay = self.policy.longest_delay();
+        batch.sort_by(|one, other| {
+            (one.notice.event, &one.notice.server).cmp(&(other.notice.event, &other.notice.server))
+        });
+        batch
+    }
+
+    /// A batch was sent.
+    pub fn succeeded(&mut self, batch: &[Entry], now: Instant) {
+        (self.delay, self.retry_at) = (self.timing.mail_retry, None);
+        let end = now + self.timing.flapping;
+        for Entry { notice, .. } in batch {
+            let cooldown = &mut self.servers.entry(notice.server.clone()).or_default().cooldown;
+            let before = cooldown.is_some_and(|cooldown| cooldown.end == end && cooldown.about_health);
+            *cooldown = Some(Cooldown { end, about_health: before || notice.event.topic() == Topic::Health });
+        }
+    }
+
+    /// A batch was not sent. Returns the entries that are given up; the others wait for the next try.
+    ///
+    /// A permanent failure is tried again too, since only an e-mail can tell the administrator of it; but with the longest
+    /// delay from the start, so that no account is locked for too many wrong logins.
+    pub fn failed(&mut self, batch: Vec<Entry>, permanent: bool, now: Instant) -> Vec<Entry> {
+        let patience = self.timing.mail_patience;
+        let longest = self.timing.mail_retry.max(patience / 6);
+        let end = |entry: &Entry| entry.first_try.unwrap_or(now) + patience;
+        let (given_up, kept): (Vec<_>, Vec<_>) = batch.into_iter().partition(|entry| end(entry) <= now);
+        if permanent {
+            self.delay = longest;
         }
         // The last try of an entry is at the end of its time, not some time before.
-        let last = self.waiting.iter().filter(|waiting| waiting.first_try.is_some()).map(end).min();
+        let last = kept.iter().map(end).min();
+        for entry in kept {
+            let waiting = &mut self.servers.entry(entry.notice.server.clone()).or_default().waiting;
+            match waiting.get_mut(&entry.notice.event.topic()) {
+                Some(newer) => newer.replace(entry),
+                None => drop(waiting.insert(entry.notice.event.topic(), entry)),
+            }
+        }
         let next = now + self.delay;
-        self.not_before = Some(last.map_or(next, |last| next.min(last)));
-        self.delay = (self.delay * 2).min(self.policy.longest_delay());
-        given_up.into_iter().map(|waiting| waiting.entry).collect()
+        self.retry_at = Some(last.map_or(next, |last| next.min(last)));
+        self.delay = (self.delay * 2).min(longest);
+        given_up
+    }
+}
+
+impl Server {
+    /// Until when the waiting entries are held back, if they are.
+    fn held_until(&self) -> Option<Instant> {
+        let cooldown = self.cooldown?;
+        let fails = |entry: &Entry| matches!(entry.notice.event, Event::NotResponding | Event::LookupFails);
+        let fails_now = !cooldown.about_health && self.waiting.get(&Topic::Health).is_some_and(fails);
+        (!fails_now).then_some(cooldown.end)
     }
 
-    /// Adds an entry. It replaces an older one about the same, at its place, and may be tried for the whole time again.
-    fn join(&mut self, entry: Entry) {
-        match self.waiting.iter_mut().find(|waiting| waiting.entry.is_about_the_same(&entry)) {
-            Some(waiting) => {
-                waiting.entry.replace(entry);
-                waiting.first_try = None;
-            }
-            None => self.waiting.push(Waiting { entry, first_try: None }),
-        }
+    /// When the waiting entries may be mailed.
+    fn due(&self, gather: Duration) -> Option<Instant> {
+        let first = self.waiting.values().map(|entry| entry.since).min()?;
+        Some(self.held_until().unwrap_or(first + gather))
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use std::time::SystemTime;
-
     use super::*;
-    use crate::session::mail::{Event, Notice};
 
-    fn entry(port: u16, event: Event) -> Entry {
-        let server = format!("host:{port}");
-        Entry { notice: Notice { server, event, load: None, error: None, at: SystemTime::UNIX_EPOCH }, held_back: 0 }
+    use Event::{AvailableAgain, MaximumLoad, NotResponding, WorkingAgain};
+
+    /// When (second), and what (port, event, held back).
+    type Mail = (u64, Vec<(u16, Event, usize)>);
+
+    fn notice(port: u16, event: Event) -> Notice {
+        Notice { server: format!("host:{port}"), event, load: None, error: None, at: SystemTime::UNIX_EPOCH }
     }
 
-    fn outbox(max_waiting: usize) -> Outbox {
-        let (first_delay, give_up_after) = (Duration::from_secs(10), Duration::from_hours(1));
-        Outbox::new(RetryPolicy { first_delay, give_up_after, max_waiting })
+    /// With a gathering of 10 s, a flapping limit of 600 s, and an hour in which an e-mail is tried.
+    fn outbox() -> Outbox {
+        Outbox::new(&Timing::default())
     }
 
-    /// The seconds of all tries until a mail is given up.
-    fn tries(failure: Failure) -> Vec<u64> {
+    /// Plays notices (second, port, event).
+    fn play(notices: &[(u64, u16, Event)]) -> Vec<Mail> {
         let start = Instant::now();
-        let mut outbox = outbox(9);
-        outbox.put(vec![entry(1, Event::NotResponding)]);
+        let mut state = outbox();
+        let mut mails = Vec::new();
+        for second in 0..5_000 {
+            let now = start + Duration::from_secs(second);
+            for (_, port, event) in notices.iter().filter(|(when, ..)| *when == second) {
+                state.add(notice(*port, *event), now);
+            }
+            let batch = state.take(now);
+            state.succeeded(&batch, now);
+            let mut mail: Vec<_> = batch
+                .into_iter()
+                .map(|entry| {
+                    let server = entry.notice.server;
+                    (server.rsplit_once(':').unwrap().1.parse().unwrap(), entry.notice.event, entry.held_back)
+                })
+                .collect();
+            mail.sort_unstable();
+            if !mail.is_empty() {
+                mails.push((second, mail));
+            }
+        }
+        assert!(state.servers.is_empty(), "something is kept for good: {state:?}");
+        mails
+    }
+
+    #[test]
+    fn servers_that_fail_together_are_one_mail() {
+        let notices = [(0, 1, NotResponding), (3, 2, NotResponding), (9, 3, MaximumLoad), (11, 4, NotResponding)];
+        let first = vec![(1, NotResponding, 0), (2, NotResponding, 0), (3, MaximumLoad, 0)];
+        assert_eq!(play(&notices), [(10, first), (21, vec![(4, NotResponding, 0)])]);
+    }
+
+    #[test]
+    fn the_end_of_a_failure_is_told_once_the_time_of_flapping_is_over() {
+        let mails = play(&[(0, 1, NotResponding), (100, 1, WorkingAgain)]);
+        assert_eq!(mails, [(10, vec![(1, NotResponding, 0)]), (610, vec![(1, WorkingAgain, 0)])]);
+        let mails = play(&[(0, 1, MaximumLoad), (590, 1, AvailableAgain)]);
+        assert_eq!(mails, [(10, vec![(1, MaximumLoad, 0)]), (610, vec![(1, AvailableAgain, 0)])]);
+    }
+
+    #[test]
+    fn a_flapping_server_is_one_mail_in_ten_minutes_with_a_count() {
+        let turns = |step: u64, until: u64| -> Vec<_> {
+            (0..until / step)
+                .map(|turn| (turn * step, 1, if turn % 2 == 0 { NotResponding } else { WorkingAgain }))
+                .collect()
+        };
+        let entry = |event, held_back| vec![(1, event, held_back)];
+        let each_second = play(&turns(1, 1_000));
+        assert_eq!(each_second.iter().map(|(when, _)| *when).collect::<Vec<_>>(), [10, 610, 1_210]);
+        assert_eq!(each_second[0].1, entry(NotResponding, 10));
+        assert_eq!(each_second[1].1, entry(NotResponding, 599));
+        assert_eq!(each_second[2].1, entry(WorkingAgain, 388));
+        let each_half_minute = play(&turns(30, 600));
+        assert_eq!(each_half_minute, [(10, entry(NotResponding, 0)), (610, entry(WorkingAgain, 18))]);
+    }
+
+    #[test]
+    fn a_second_failure_soon_after_the_first_waits() {
+        let notices = [(0, 1, NotResponding), (100, 1, WorkingAgain), (200, 1, NotResponding)];
+        assert_eq!(play(&notices), [(10, vec![(1, NotResponding, 0)]), (610, vec![(1, NotResponding, 1)])]);
+    }
+
+    #[test]
+    fn a_failure_is_told_though_the_same_server_was_at_maximum_load_before() {
+        let mails = play(&[(0, 1, MaximumLoad), (60, 1, NotResponding)]);
+        assert_eq!(mails, [(10, vec![(1, MaximumLoad, 0)]), (70, vec![(1, NotResponding, 0)])]);
+    }
+
+    #[test]
+    fn a_server_that_is_full_and_fails_again_and_again_is_one_mail_in_ten_minutes_after_the_first_two() {
+        let notices: Vec<_> = (0..300)
+            .flat_map(|turn| {
+                [
+                    (turn * 4, MaximumLoad),
+                    (turn * 4 + 1, NotResponding),
+                    (turn * 4 + 2, WorkingAgain),
+                    (turn * 4 + 3, AvailableAgain),
+                ]
+            })
+            .map(|(second, event)| (second, 1, event))
+            .collect();
+        let mails: Vec<u64> = play(&notices).into_iter().map(|(when, _)| when).collect();
+        assert_eq!(mails, [10, 610, 1_210]);
+        let full_then_flapping: Vec<_> = std::iter::once((0, 1, MaximumLoad))
+            .chain((20..500).map(|second| (second, 1, if second % 2 == 0 { NotResponding } else { WorkingAgain })))
+            .collect();
+        let mails: Vec<u64> = play(&full_then_flapping).into_iter().map(|(when, _)| when).collect();
+        assert_eq!(mails, [10, 30, 630]);
+    }
+
+    #[test]
+    fn one_flapping_server_does_not_hold_up_the_others() {
+        let notices = [(0, 1, NotResponding), (20, 1, WorkingAgain), (21, 1, NotResponding), (30, 2, NotResponding)];
+        let expected =
+            [(10, vec![(1, NotResponding, 0)]), (40, vec![(2, NotResponding, 0)]), (610, vec![(1, NotResponding, 1)])];
+        assert_eq!(play(&notices), expected);
+    }
+
+    #[test]
+    fn the_last_error_outlives_the_recovery() {
+        let now = Instant::now();
+        let mut outbox = outbox();
+        outbox.add(Notice { error: Some("connection refused".to_owned()), ..notice(1, NotResponding) }, now);
+        outbox.add(notice(1, WorkingAgain), now);
+        let batch = outbox.take(now + Duration::from_secs(10));
+        assert_eq!(batch.len(), 1);
+        assert_eq!(batch[0].notice.error.as_deref(), Some("connection refused"));
+        assert_eq!((batch[0].notice.event, batch[0].held_back), (WorkingAgain, 1));
+    }
+
+    /// The seconds of all tries until an e-mail is given up.
+    fn tries(permanent: bool) -> Vec<u64> {
+        let start = Instant::now();
+        let mut outbox = outbox();
+        outbox.add(notice(1, NotResponding), start);
+        let first = outbox.due().unwrap();
         let mut tries = Vec::new();
-        let mut now = start;
-        while let Some(due) = outbox.due(now) {
-            now = due;
-            tries.push((now - start).as_secs());
-            let batch = outbox.take(now).unwrap();
-            outbox.failed(batch, failure, now);
+        while let Some(due) = outbox.due() {
+            tries.push((due - first).as_secs());
+            let batch = outbox.take(due);
+            let last = outbox.failed(batch, permanent, due);
+            assert_eq!(last.len(), usize::from(outbox.due().is_none()));
         }
         tries
     }
 
     #[test]
     fn delays_grow_for_an_hour_then_the_mail_is_given_up() {
-        assert_eq!(tries(Failure::Transient), [0, 10, 30, 70, 150, 310, 630, 1_230, 1_830, 2_430, 3_030, 3_600]);
+        assert_eq!(tries(false), [0, 10, 30, 70, 150, 310, 630, 1_230, 1_830, 2_430, 3_030, 3_600]);
     }
 
     #[test]
-    fn what_will_hardly_pass_is_tried_seldom() {
-        assert_eq!(tries(Failure::Permanent), [0, 600, 1_200, 1_800, 2_400, 3_000, 3_600]);
+    fn a_permanent_failure_is_tried_seldom() {
+        assert_eq!(tries(true), [0, 600, 1_200, 1_800, 2_400, 3_000, 3_600]);
     }
 
     #[test]
-    fn success_forgets_the_delays() {
-        let now = Instant::now();
-        let mut outbox = outbox(9);
-        outbox.put(vec![entry(1, Event::NotResponding)]);
-        let batch = outbox.take(now).unwrap();
-        outbox.failed(batch, Failure::Permanent, now);
-        let later = outbox.due(now).unwrap();
-        assert!(outbox.take(now).is_none(), "tried before it was due");
-        assert!(outbox.take(later).is_some());
-        outbox.succeeded();
-        assert_eq!(outbox.due(later), None);
-        outbox.put(vec![entry(1, Event::WorkingAgain)]);
-        assert_eq!(outbox.due(later), Some(later));
+    fn success_resets_the_delays() {
+        let mut outbox = outbox();
+        outbox.add(notice(1, NotResponding), Instant::now());
+        let due = outbox.due().unwrap();
+        let batch = outbox.take(due);
+        outbox.failed(batch, true, due);
+        let later = outbox.due().unwrap();
+        assert!(outbox.take(due).is_empty(), "tried before it was due");
+        let batch = outbox.take(later);
+        outbox.succeeded(&batch, later);
+        assert_eq!(outbox.due(), None);
+        outbox.add(notice(2, WorkingAgain), later);
+        assert_eq!(outbox.due(), Some(later + Duration::from_secs(10)));
     }
 
     #[test]
-    fn what_comes_meanwhile_joins_the_next_try() {
-        let now = Instant::now();
-        let mut outbox = outbox(9);
-        outbox.put(vec![entry(1, Event::NotResponding), entry(2, Event::NotResponding)]);
-        let batch = outbox.take(now).unwrap();
-        outbox.put(vec![entry(3, Event::MaximumLoad), entry(1, Event::WorkingAgain)]);
-        outbox.failed(batch, Failure::Transient, now);
-        let later = outbox.due(now).unwrap();
+    fn what_comes_while_an_e_mail_is_sent_joins_the_next_try() {
+        let mut outbox = outbox();
+        let start = Instant::now();
+        outbox.add(notice(1, NotResponding), start);
+        outbox.add(notice(2, NotResponding), start);
+        let due = outbox.due().unwrap();
+        let batch = outbox.take(due);
+        outbox.add(notice(3, MaximumLoad), due);
+        outbox.add(notice(1, WorkingAgain), due);
+        outbox.failed(batch, false, due);
+        let later = outbox.due().unwrap();
         let entries: Vec<_> =
-            outbox.take(later).unwrap().entries().map(|entry| (entry.notice.event, entry.held_back)).collect();
-        assert_eq!(entries, [(Event::NotResponding, 0), (Event::WorkingAgain, 1), (Event::MaximumLoad, 0)]);
-    }
-
-    #[test]
-    fn the_oldest_make_room() {
-        let mut outbox = outbox(2);
-        assert_eq!(outbox.put((1..=5).map(|port| entry(port, Event::NotResponding)).collect()), 3);
-        let batch = outbox.take(Instant::now()).unwrap();
-        let servers: Vec<_> = batch.entries().map(|entry| entry.notice.server.clone()).collect();
-        assert_eq!(servers, ["host:4", "host:5"]);
+            outbox.take(later).into_iter().map(|entry| (entry.notice.event, entry.held_back)).collect();
+        assert_eq!(entries, [(NotResponding, 0), (WorkingAgain, 1), (MaximumLoad, 0)]);
     }
 }

@@ -1,35 +1,56 @@
-//! Delivers e-mails to the SMTP server with lettre's connection, one step at a time, so that an error names its step.
+//! Delivers e-mails to the SMTP server by lettre's transport.
 //!
-//! With a password the connection is encrypted before anything else is sent: from the first byte (implicit TLS), or by
-//! STARTTLS. Which authorities are trusted is read from the system for each e-mail.
+//! With a password the connection is encrypted before the login: from the first byte (implicit TLS), or by STARTTLS. The
+//! trusted authorities are read from the system for each e-mail, so that a renewed file needs no restart.
 
 use std::error::Error;
-use std::fmt::Display;
-use std::net::SocketAddr;
 use std::time::Duration;
 
-use lettre::Message;
 use lettre::transport::smtp::Error as SmtpError;
-use lettre::transport::smtp::authentication::{Credentials, DEFAULT_MECHANISMS};
-use lettre::transport::smtp::client::{AsyncSmtpConnection, TlsParameters};
-use lettre::transport::smtp::commands::{Data, Mail, Rcpt};
-use lettre::transport::smtp::extension::ClientId;
-use rustls::pki_types::ServerName;
-use tokio::net::{TcpStream, lookup_host};
-use tokio::time::{Instant, timeout_at};
-use tokio_rustls::TlsConnector;
+use lettre::transport::smtp::authentication::Credentials;
+use lettre::transport::smtp::client::{Tls, TlsParameters};
+use lettre::{AsyncSmtpTransport, AsyncTransport, Message, Tokio1Executor};
+use tokio::time::timeout;
 
-use super::bounded_stream::BoundedStream;
-use super::mail_error::MailError;
 use crate::session::config::SessionConfig;
 use crate::shared::config::Secret;
-use crate::shared::http::tls;
 use crate::shared::text::one_line;
 
 /// The port on which connections are usually encrypted from the first byte.
 const IMPLICIT_TLS_PORT: u16 = 465;
 const DEFAULT_PORT: u16 = 25;
 const DEFAULT_PORT_WITH_PASSWORD: u16 = 587;
+
+/// Why an e-mail was not sent, in one line.
+#[derive(Debug, thiserror::Error)]
+pub enum MailError {
+    /// A key without which no e-mail is sent is not set.
+    #[error("notifications are off: {0} is not set")]
+    Off(&'static str),
+    /// The text can't be rendered.
+    #[error("the mail can't be written: {0}")]
+    Template(#[from] askama::Error),
+    /// A header or an address is wrong.
+    #[error("the mail can't be written: {0}")]
+    Message(#[from] lettre::error::Error),
+    /// The SMTP server did not take it.
+    #[error("{server}: {problem}")]
+    Delivery {
+        /// `HOST:PORT` of the SMTP server.
+        server: String,
+        /// The reason in the words of the SMTP server or of the system.
+        problem: String,
+        /// Whether the configuration or the SMTP server must change before another try can succeed (RFC 5321, 4.2.1).
+        permanent: bool,
+    },
+}
+
+impl MailError {
+    /// Whether the configuration or the SMTP server must change before another try can succeed.
+    pub fn is_permanent(&self) -> bool {
+        !matches!(self, Self::Delivery { permanent: false, .. })
+    }
+}
 
 /// The SMTP server that takes the e-mails.
 #[derive(Debug, Clone)]
@@ -47,9 +68,6 @@ impl Relay {
     /// # Errors
     /// When a key without which no e-mail is sent is not set.
     pub fn new(config: &SessionConfig) -> Result<Self, MailError> {
-        if config.administrator.is_none() {
-            return Err(MailError::Off("administrator"));
-        }
         let sender = config.mail_sender.as_ref().ok_or(MailError::Off("mailSender"))?;
         let host = config.mail_server.clone().ok_or(MailError::Off("mailServer"))?;
         let password = config.mail_sender_password.clone().filter(|password| !password.reveal().is_empty());
@@ -61,155 +79,61 @@ impl Relay {
         Ok(Self { host, port, implicit_tls, login, time_limit: config.timing.mail_answer })
     }
 
+    fn is_encrypted(&self) -> bool {
+        self.login.is_some() || self.implicit_tls
+    }
+
     /// `encrypted` or `not encrypted`.
-    #[must_use]
     pub fn privacy(&self) -> &'static str {
-        if self.login.is_some() || self.implicit_tls { "encrypted" } else { "not encrypted" }
+        if self.is_encrypted() { "encrypted" } else { "not encrypted" }
     }
 
     /// `HOST:PORT`.
-    #[must_use]
     pub fn name(&self) -> String {
         format!("{}:{}", self.host, self.port)
     }
 
-    /// Delivers an e-mail and returns the SMTP server's answer, within `timing.mailAnswer`.
+    /// Delivers an e-mail within `timing.mailAnswer`. Returns the SMTP server's answer.
     ///
     /// # Errors
     /// When the SMTP server does not take it, or does not say so in time.
-    pub async fn deliver(&self, message: &Message) -> Result<String, MailError> {
-        let deadline = Instant::now() + self.time_limit;
-        let late = || self.transient(&format!("no answer within {} s", self.time_limit.as_secs_f64()));
-        let mut connection = timeout_at(deadline, self.connect()).await.map_err(|_| late())??;
-        let sent = timeout_at(deadline, self.send(&mut connection, message)).await;
-        // The SMTP server has the e-mail or not, whatever it answers to QUIT.
-        if timeout_at(deadline, connection.abort()).await.is_err() {
-            log::debug!("{}: no answer to QUIT", self.name());
+    pub async fn deliver(&self, message: Message) -> Result<String, MailError> {
+        // lettre limits the time of connecting only. Its pool would hand a connection that was given up to the next e-mail.
+        let delivered = timeout(self.time_limit, async { self.transport()?.send(message).await }).await;
+        match delivered {
+            Ok(Ok(answer)) => Ok(one_line(answer.first_line().unwrap_or_default())),
+            Ok(Err(error)) => Err(self.failure(&error)),
+            Err(_) => Err(self.delivery(&format!("no answer within {} s", self.time_limit.as_secs_f64()), false)),
         }
-        sent.map_err(|_| late())?
     }
 
-    async fn connect(&self) -> Result<AsyncSmtpConnection, MailError> {
-        let unresolved = |error| self.transient(&format!("the name can't be resolved: {error}"));
-        let unreachable = |error| self.transient(&format!("can't connect: {error}"));
-        let addresses = lookup_host((self.host.as_str(), self.port)).await.map_err(unresolved)?;
-        let stream = TcpStream::connect(addresses.collect::<Vec<_>>().as_slice()).await.map_err(unreachable)?;
-        let peer = stream.peer_addr().map_err(unreachable)?;
-        let me = ClientId::default();
-        if self.implicit_tls {
-            return self.connect_with_tls(stream, peer, &me).await;
+    fn transport(&self) -> Result<AsyncSmtpTransport<Tokio1Executor>, SmtpError> {
+        let mut builder = AsyncSmtpTransport::<Tokio1Executor>::builder_dangerous(self.host.as_str()).port(self.port);
+        if self.is_encrypted() {
+            let parameters = TlsParameters::new(self.host.clone())?;
+            builder = builder.tls(if self.implicit_tls { Tls::Wrapper(parameters) } else { Tls::Required(parameters) });
         }
-        let stream = Box::new(BoundedStream::new(stream, peer));
-        let connected = AsyncSmtpConnection::connect_with_transport(stream, &me).await;
-        let mut connection = connected.map_err(|error| self.refused("the connection", &error))?;
-        if self.login.is_some() {
-            if !connection.can_starttls() {
-                connection.abort().await;
-                let reason = "the server offers no STARTTLS, and a password is never sent over plain text";
-                return Err(self.not_encrypted(reason));
-            }
-            let parameters = self.read_trusted(TlsParameters::new).await?.map_err(|error| self.not_encrypted(error))?;
-            let encrypted = connection.starttls(parameters, &me).await;
-            encrypted.map_err(|error| match error.status() {
-                Some(_) => self.refused("STARTTLS", &error),
-                None => self.no_tls(&error),
-            })?;
-        }
-        Ok(connection)
-    }
-
-    async fn connect_with_tls(
-        &self,
-        stream: TcpStream,
-        peer: SocketAddr,
-        me: &ClientId,
-    ) -> Result<AsyncSmtpConnection, MailError> {
-        let config = self.read_trusted(|_| tls::client_config()).await?;
-        let connector = TlsConnector::from(config.ok_or_else(|| self.not_encrypted("TLS is off"))?);
-        let name = ServerName::try_from(self.host.clone()).map_err(|error| self.not_encrypted(error))?;
-        let stream = connector.connect(name, stream).await.map_err(|error| self.no_tls(&error))?;
-        let stream = Box::new(BoundedStream::new(stream, peer));
-        let connected = AsyncSmtpConnection::connect_with_transport(stream, me).await;
-        connected.map_err(|error| self.refused("the connection", &error))
-    }
-
-    /// Reads the trusted authorities from the disk, in a thread of its own.
-    async fn read_trusted<T: Send + 'static>(&self, read: fn(String) -> T) -> Result<T, MailError> {
-        let host = self.host.clone();
-        actix_rt::task::spawn_blocking(move || read(host)).await.map_err(|error| self.not_encrypted(error))
-    }
-
-    async fn send(&self, connection: &mut AsyncSmtpConnection, message: &Message) -> Result<String, MailError> {
         if let Some((user, password)) = &self.login {
-            let credentials = Credentials::new(user.clone(), password.reveal().to_owned());
-            let login = connection.auth(DEFAULT_MECHANISMS, &credentials).await;
-            login.map_err(|error| self.login_failed(user, &error))?;
+            builder = builder.credentials(Credentials::new(user.clone(), password.reveal().to_owned()));
         }
-        let sender = message.envelope().from();
-        let sent = connection.command(Mail::new(sender.cloned(), Vec::new())).await;
-        sent.map_err(|error| {
-            self.refused(sender.map(|sender| format!("the sender {sender}")).unwrap_or_default(), &error)
-        })?;
-        for recipient in message.envelope().to() {
-            let sent = connection.command(Rcpt::new(recipient.clone(), Vec::new())).await;
-            sent.map_err(|error| self.refused(format!("the recipient {recipient}"), &error))?;
-        }
-        connection.command(Data).await.map_err(|error| self.refused("the mail", &error))?;
-        let sent = connection.message(&message.formatted()).await;
-        let answer = sent.map_err(|error| self.refused("the mail", &error))?;
-        Ok(one_line(answer.first_line().unwrap_or_default()))
+        Ok(builder.build())
     }
 
-    fn login_failed(&self, user: &str, error: &SmtpError) -> MailError {
-        if error.is_permanent() {
-            self.permanent(&format!("wrong user or password, logging in as {user}: {}", answer(error)))
-        } else if error.is_client() {
-            self.permanent(&format!("refuses any login: {}", root(error)))
-        } else {
-            self.refused(format!("the login of {user}"), error)
-        }
-    }
-
-    /// The SMTP server refused a step, or the connection broke in it.
-    fn refused(&self, what: impl Display, error: &SmtpError) -> MailError {
-        match error.status() {
-            Some(_) => self.delivery(&format!("refuses {what}: {}", answer(error)), error.is_permanent()),
-            None => self.transient(&format!("the connection broke: {}", root(error))),
-        }
-    }
-
-    fn no_tls(&self, error: &(dyn Error + 'static)) -> MailError {
+    fn failure(&self, error: &SmtpError) -> MailError {
         let reason = root(error);
-        match tls_error(error) {
-            Some(rustls::Error::InvalidCertificate(_)) => self.permanent(&format!(
-                "its certificate is not trusted: {reason} (SSL_CERT_FILE may name another authority)"
-            )),
-            Some(_) => self.not_encrypted(reason),
-            None => self.transient(&format!("the connection broke: {reason}")),
+        if let Some(code) = error.status() {
+            self.delivery(&format!("{code} {reason}"), error.is_permanent())
+        } else if let Some(rustls::Error::InvalidCertificate(_)) = tls_error(error) {
+            let advice = "SSL_CERT_FILE may name another authority";
+            self.delivery(&format!("its certificate is not trusted: {reason} ({advice})"), true)
+        } else {
+            self.delivery(&reason, error.is_client())
         }
-    }
-
-    fn not_encrypted(&self, reason: impl Display) -> MailError {
-        self.permanent(&format!("no encrypted connection: {reason}"))
-    }
-
-    fn permanent(&self, problem: &str) -> MailError {
-        self.delivery(problem, true)
-    }
-
-    fn transient(&self, problem: &str) -> MailError {
-        self.delivery(problem, false)
     }
 
     fn delivery(&self, problem: &str, permanent: bool) -> MailError {
         MailError::Delivery { server: self.name(), problem: one_line(problem), permanent }
     }
-}
-
-/// The SMTP server's answer: its code and its words.
-fn answer(error: &SmtpError) -> String {
-    let code = error.status().map(|code| format!("{code} ")).unwrap_or_default();
-    format!("{code}{}", root(error))
 }
 
 /// An error and its causes.

@@ -51,7 +51,6 @@ struct Server<Id> {
 
 impl<Id: Clone + Eq + Hash> Fleet<Id> {
     /// A fleet without servers.
-    #[must_use]
     pub fn new(policy: Policy) -> Self {
         Self {
             policy,
@@ -164,25 +163,21 @@ impl<Id: Clone + Eq + Hash> Fleet<Id> {
     }
 
     /// The load, in percent, that is expected once all clients show that take room on a server; `None` if it is down.
-    #[must_use]
     pub fn effective_load(&self, id: &Id) -> Option<f64> {
         self.backend(id)?.effective_load()
     }
 
     /// The load, in percent, from which on a server takes no client; `None` if it is not in the fleet.
-    #[must_use]
     pub fn limit(&self, id: &Id) -> Option<f64> {
         self.backend(id).map(|server| server.limit(&self.policy))
     }
 
     /// How many clients were sent to a server and have neither been seen there nor given up.
-    #[must_use]
     pub fn in_flight(&self, id: &Id) -> usize {
         self.backend(id).map_or(0, Backend::in_flight)
     }
 
     /// What a client is expected to cost a server, in percent of load; `None` if it is not in the fleet.
-    #[must_use]
     pub fn client_cost(&self, id: &Id) -> Option<f64> {
         self.backend(id).map(Backend::cost)
     }

@@ -7,13 +7,12 @@ use actix_web::http::{StatusCode, header};
 use actix_web::{HttpRequest, HttpResponse, web};
 use percent_encoding::percent_decode_str;
 
-use super::broadcaster::LocalBroadcaster;
 use super::page_routes;
 use super::queries::{ask, with_status};
 use super::status::{self, StatusPage};
 use super::web_client::WebClient;
+use crate::session::fleet::GetStatus;
 use crate::session::fleet::displayed_mean_load;
-use crate::session::fleet::{GetStatus, IsAvailable};
 use crate::session::fleet::{NoServer, Pick};
 use crate::session::state::AppState;
 use crate::shared::http::paths::{self, GET, READ, path, retry_after};
@@ -41,27 +40,13 @@ fn wants_websocket(request: &HttpRequest) -> bool {
     upgrade.is_some_and(|value| value.eq_ignore_ascii_case("websocket"))
 }
 
-async fn root(
-    request: HttpRequest,
-    stream: web::Payload,
-    server: web::Data<AppState>,
-    broadcaster: web::Data<LocalBroadcaster>,
-) -> HttpResponse {
-    if wants_websocket(&request) {
-        open_websocket(&request, stream, &server, &broadcaster)
-    } else {
-        availability(server).await
-    }
+async fn root(request: HttpRequest, stream: web::Payload, server: web::Data<AppState>) -> HttpResponse {
+    if wants_websocket(&request) { open_websocket(&request, stream, &server) } else { availability(server).await }
 }
 
-async fn session(
-    request: HttpRequest,
-    stream: web::Payload,
-    server: web::Data<AppState>,
-    broadcaster: web::Data<LocalBroadcaster>,
-) -> HttpResponse {
+async fn session(request: HttpRequest, stream: web::Payload, server: web::Data<AppState>) -> HttpResponse {
     if wants_websocket(&request) {
-        return open_websocket(&request, stream, &server, &broadcaster);
+        return open_websocket(&request, stream, &server);
     }
     let from = server.trusted_proxies.peer(&request).rate_limit_key();
     let world = wanted_world(request.query_string());
@@ -93,23 +78,18 @@ fn wanted_world(query: &str) -> Option<Cow<'_, str>> {
     Some(percent_decode_str(whole).decode_utf8_lossy())
 }
 
-fn open_websocket(
-    request: &HttpRequest,
-    stream: web::Payload,
-    server: &web::Data<AppState>,
-    broadcaster: &LocalBroadcaster,
-) -> HttpResponse {
+fn open_websocket(request: &HttpRequest, stream: web::Payload, server: &web::Data<AppState>) -> HttpResponse {
     let peer = server.trusted_proxies.peer(request);
     let permit = match server.connections.admit(Kind::Client, peer) {
         Ok(permit) => permit,
         Err(refused) => return refused.answer(),
     };
-    let (server, broadcaster) = (Arc::clone(server), broadcaster.get());
-    websocket::open(request, stream, |reader| WebClient::new(server, broadcaster, peer, (permit, reader)))
+    let server = Arc::clone(server);
+    websocket::open(request, stream, |reader| WebClient::new(server, peer, (permit, reader)))
 }
 
 async fn availability(server: web::Data<AppState>) -> HttpResponse {
-    let available = ask(&server, IsAvailable).await.unwrap_or(false);
+    let available = *server.available.borrow();
     HttpResponse::Ok().content_type("text/plain").body(if available { "1" } else { "0" })
 }
 

@@ -67,7 +67,6 @@ struct ChangePage {
 
 impl StatusPage {
     /// The state of the fleet.
-    #[must_use]
     pub fn new(server: &AppState, status: &FleetStatus) -> Self {
         let changes = status.changes.iter().map(|change| ChangePage {
             at: timestamp(change.at),
@@ -119,7 +118,6 @@ impl ServerPage {
 }
 
 /// The gauges of `/metrics`.
-#[must_use]
 pub fn gauges<'text>(clients: usize, status: &FleetStatus) -> Vec<Gauge<'text>> {
     let mut gauges = fleet_gauges(clients, status);
     gauges.extend(server_gauges(&status.servers));

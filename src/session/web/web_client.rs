@@ -1,21 +1,23 @@
 //! Actor: the WebSocket of one web client, which is told whether some simulation server can take a client, and which.
 //!
-//! Created by the route for each connection; ends with it. It subscribes to the broadcaster of its thread, and never sends
-//! the same value twice in a row. A text from the client asks for a simulation server.
+//! Created by the route for each connection; ends with it. It follows the registry's availability, of which only the latest
+//! value counts, and never sends the same value twice in a row. A text from the client asks for a simulation server.
 
 use std::sync::Arc;
 
 use actix::prelude::*;
 use actix_web_actors::ws::{CloseCode, CloseReason, Message, ProtocolError, WebsocketContext};
+use futures_util::stream::{self, Stream};
 use serde::Deserialize;
+use tokio::sync::watch;
 
-use super::broadcaster::{Broadcaster, SubscribeClient, Subscription};
-use crate::session::fleet::{Pick, Update};
+use crate::session::fleet::Pick;
 use crate::session::state::AppState;
 use crate::shared::http::ConnectionPermit;
 use crate::shared::http::Peer;
 use crate::shared::http::liveness::{self, Liveness};
 use crate::shared::http::websocket::{ClientMessage, MessageReader};
+use crate::shared::run::{Phase, closing};
 
 /// The actor.
 pub struct WebClient {
@@ -23,8 +25,6 @@ pub struct WebClient {
     peer: Peer,
     liveness: Liveness,
     sent: Option<bool>,
-    broadcaster: Addr<Broadcaster>,
-    subscription: Option<Subscription>,
     reader: MessageReader,
     _permit: ConnectionPermit,
 }
@@ -33,23 +33,8 @@ type Context = WebsocketContext<WebClient>;
 
 impl WebClient {
     /// A client that has just connected; `permit` counts it, `reader` reads its messages.
-    #[must_use]
-    pub fn new(
-        server: Arc<AppState>,
-        broadcaster: Addr<Broadcaster>,
-        peer: Peer,
-        (permit, reader): (ConnectionPermit, MessageReader),
-    ) -> Self {
-        Self {
-            server,
-            peer,
-            liveness: Liveness::new(),
-            sent: None,
-            broadcaster,
-            subscription: None,
-            reader,
-            _permit: permit,
-        }
+    pub fn new(server: Arc<AppState>, peer: Peer, (permit, reader): (ConnectionPermit, MessageReader)) -> Self {
+        Self { server, peer, liveness: Liveness::new(), sent: None, reader, _permit: permit }
     }
 
     fn close(code: CloseCode, ctx: &mut Context) {
@@ -85,26 +70,42 @@ impl Actor for WebClient {
     fn started(&mut self, ctx: &mut Self::Context) {
         let timing = &self.server.timing;
         liveness::watch(ctx, timing.ping, timing.silence, |client| &mut client.liveness);
-        let subscribed = self.broadcaster.send(SubscribeClient(ctx.address().recipient())).into_actor(self);
-        subscribed
-            .map(|answer, client, ctx| match answer {
-                Ok(subscription) => client.subscription = Some(subscription),
-                Err(error) => {
-                    log::error!("a client can't be told of changes: {error}");
-                    Self::close(CloseCode::Error, ctx);
-                }
-            })
-            .spawn(ctx);
+        ctx.add_stream(updates(self.server.available.clone(), self.server.phase.clone()));
     }
 }
 
-impl Handler<Update> for WebClient {
-    type Result = ();
+/// What a web client is sent without asking.
+enum Update {
+    /// Whether some simulation server can take a client.
+    Availability(bool),
+    /// The server stops.
+    Closing,
+}
 
-    fn handle(&mut self, update: Update, ctx: &mut Self::Context) {
+/// The availability now, and whenever it changes; the end of the server, after which nothing follows.
+fn updates(mut available: watch::Receiver<bool>, phase: watch::Receiver<Phase>) -> impl Stream<Item = Update> {
+    available.mark_changed();
+    stream::unfold((available, Box::pin(closing(phase)), false), async |(mut available, mut closing, is_closed)| {
+        if is_closed {
+            return None;
+        }
+        let update = tokio::select! {
+            biased;
+            () = &mut closing => Update::Closing,
+            changed = available.changed() => {
+                changed.ok()?;
+                Update::Availability(*available.borrow_and_update())
+            }
+        };
+        let is_closed = matches!(update, Update::Closing);
+        Some((update, (available, closing, is_closed)))
+    })
+}
+
+impl StreamHandler<Update> for WebClient {
+    fn handle(&mut self, update: Update, ctx: &mut Context) {
         match update {
             Update::Closing => Self::close(CloseCode::Away, ctx),
-            Update::Lost => Self::close(CloseCode::Error, ctx),
             Update::Availability(available) if self.sent.replace(available) != Some(available) => {
                 ctx.text(if available { "1" } else { "0" });
             }

@@ -17,6 +17,8 @@ use crate::shared::text::one_line;
 pub trait Configuration: DeserializeOwned + Serialize {
     /// Other names of keys that are accepted.
     const ALIASES: &'static [&'static str];
+    /// Keys that there were, and what to do instead.
+    const REMOVED: &'static [(&'static str, &'static str)] = &[];
 
     /// Sets what depends on the machine and on the file that it was read from, and checks the rules between values. Returns warnings.
     ///
@@ -67,6 +69,10 @@ pub fn load<C: Configuration>(file: &Path) -> Result<LoadedConfig<C>, ConfigErro
     })?;
     // One that comes again is told once.
     unknown.retain(|key: &String| seen.insert(key.clone()));
+    if let Some((key, advice)) = C::REMOVED.iter().find(|(key, _)| seen.contains(*key)) {
+        let (file, problem) = (file.to_owned(), (*advice).to_owned());
+        return Err(ConfigError::InvalidValue { file, key, problem });
+    }
     let known = known_keys(&config);
     let mut warnings: Vec<String> = unknown.iter().map(|key| unknown_key(file, key, &known)).collect();
     let more = config.complete(file).map_err(|InvalidValue { key, problem }| ConfigError::InvalidValue {

@@ -49,13 +49,11 @@ impl TryFrom<WireSecret> for Secret {
 
 impl Secret {
     /// Returns the text.
-    #[must_use]
     pub fn reveal(&self) -> &str {
         &self.text
     }
 
     /// The file that it was read from, if it was.
-    #[must_use]
     pub fn file(&self) -> Option<&Path> {
         self.file.as_deref()
     }

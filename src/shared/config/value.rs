@@ -18,7 +18,6 @@ pub struct ExpandedPath(pub PathBuf);
 
 impl ExpandedPath {
     /// Takes a path as it is.
-    #[must_use]
     pub fn plain(path: impl Into<PathBuf>) -> Self {
         Self(path.into())
     }

@@ -43,25 +43,21 @@ pub fn check_host(host: &str, rewritten: bool) -> Result<(), String> {
 
 impl PublicAddress {
     /// The address of `port` on `host`; `rewritten` tells whether a web server in front rewrites ports.
-    #[must_use]
     pub fn new(host: &str, port: u16, rewritten: bool) -> Self {
         Self { host: host.into(), port, rewritten }
     }
 
     /// The host alone.
-    #[must_use]
     pub fn host(&self) -> &str {
         &self.host
     }
 
     /// The port alone.
-    #[must_use]
     pub fn port(&self) -> u16 {
         self.port
     }
 
     /// The same address without the port of the web server in front, if that is the usual one.
-    #[must_use]
     pub fn without_usual_web_port(self, ssl: bool) -> Self {
         let usual = if ssl { ":443" } else { ":80" };
         match self.host.strip_suffix(usual).filter(|_| self.rewritten) {
@@ -71,19 +67,16 @@ impl PublicAddress {
     }
 
     /// Whether a web server in front rewrites ports.
-    #[must_use]
     pub fn is_rewritten(&self) -> bool {
         self.rewritten
     }
 
     /// The WebSocket URL, without a slash at its end: `ws://HOST:PORT` or `wss://HOST/PORT`.
-    #[must_use]
     pub fn websocket_url(&self, ssl: bool) -> String {
         format!("{}://{self}", if ssl { "wss" } else { "ws" })
     }
 
     /// The HTTP URL, without a slash at its end: `http://HOST:PORT` or `https://HOST/PORT`.
-    #[must_use]
     pub fn http_url(&self, ssl: bool) -> String {
         format!("{}://{self}", if ssl { "https" } else { "http" })
     }

@@ -24,25 +24,21 @@ pub struct NotAPublicUrl {
 
 impl PublicUrl {
     /// Returns the WebSocket URL of a server, without a slash at its end.
-    #[must_use]
     pub fn websocket_url(&self, address: &PublicAddress) -> String {
         format!("{}{}", self.websocket_door(), self.path_of(address))
     }
 
     /// Returns the HTTP URL of a server, without a slash at its end.
-    #[must_use]
     pub fn http_url(&self, address: &PublicAddress) -> String {
         format!("{}{}", self.http_door(), self.path_of(address))
     }
 
     /// Returns the WebSocket URL of the web server itself, without a slash at its end.
-    #[must_use]
     pub fn websocket_door(&self) -> String {
         format!("{}://{}", if self.ssl { "wss" } else { "ws" }, self.door)
     }
 
     /// Returns the HTTP URL of the web server itself, without a slash at its end.
-    #[must_use]
     pub fn http_door(&self) -> String {
         format!("{}://{}", if self.ssl { "https" } else { "http" }, self.door)
     }
@@ -92,13 +88,11 @@ pub struct ClientUrls {
 
 impl ClientUrls {
     /// Returns the WebSocket URL of a server, without a slash at its end.
-    #[must_use]
     pub fn websocket_url(&self, address: &PublicAddress) -> String {
         self.public.as_ref().map_or_else(|| address.websocket_url(self.ssl), |public| public.websocket_url(address))
     }
 
     /// Returns the HTTP URL of a server, without a slash at its end.
-    #[must_use]
     pub fn http_url(&self, address: &PublicAddress) -> String {
         self.public.as_ref().map_or_else(|| address.http_url(self.ssl), |public| public.http_url(address))
     }

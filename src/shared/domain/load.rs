@@ -21,13 +21,11 @@ impl Load {
     pub const FULL: Self = Self(100.0);
 
     /// The load as a number of percent.
-    #[must_use]
     pub fn percent(self) -> f64 {
         self.0
     }
 
     /// The mean of loads; nothing where there are none.
-    #[must_use]
     pub fn mean(loads: impl Iterator<Item = Self>) -> Option<Self> {
         let (sum, count) = loads.fold((0.0, 0_u32), |(sum, count), load| (sum + load.0, count + 1));
         (count > 0).then(|| Self(sum / f64::from(count)))

@@ -114,25 +114,21 @@ impl ProjectUrl {
     }
 
     /// The forge, in small letters, with its port where that is not 443.
-    #[must_use]
     pub fn host(&self) -> &str {
         &self.host
     }
 
     /// All path segments of the URL, percent-decoded.
-    #[must_use]
     pub fn segments(&self) -> &[String] {
         &self.segments
     }
 
     /// The path segments that name the repository, such as user and name.
-    #[must_use]
     pub fn repository_segments(&self) -> &[String] {
         self.segments.get(..self.repository).unwrap_or_default()
     }
 
     /// The repository's URL, such as `https://github.com/lab/arm`.
-    #[must_use]
     pub fn repository(&self) -> String {
         format!("https://{}/{}", self.host, self.repository_segments().join("/"))
     }
@@ -148,19 +144,16 @@ impl ProjectUrl {
     }
 
     /// What the URL says of its reference.
-    #[must_use]
     pub fn kind(&self) -> RefKind {
         self.kind
     }
 
     /// The world file's name, such as `arena.wbt`.
-    #[must_use]
     pub fn world(&self) -> &str {
         self.segments.last().map_or("", String::as_str)
     }
 
     /// The possible readings, that with the shortest reference first.
-    #[must_use]
     pub fn candidates(&self) -> Vec<Reading> {
         let inside = self.inside();
         let before_worlds = inside.len().saturating_sub(2);

@@ -75,7 +75,6 @@ fn optional_line<'de, D: serde::Deserializer<'de>>(deserializer: D) -> Result<Op
 
 impl Instances {
     /// Clients that hold a place or wait for one.
-    #[must_use]
     pub fn present(&self) -> u32 {
         // Another server's numbers may be anything.
         [self.starting, self.idle, self.running].into_iter().fold(self.queued, u32::saturating_add)
@@ -94,7 +93,6 @@ impl ServerReport {
     }
 
     /// The report of a server that has only `/load`.
-    #[must_use]
     pub fn load_only(load: Load) -> Self {
         Self {
             load,
@@ -114,7 +112,6 @@ impl ServerReport {
     ///
     /// A report without `docker` comes from a Python server: it is expected to run every world that it does not rule
     /// out, as the Python session server expects it.
-    #[must_use]
     pub fn accepts(&self, world: &ProjectUrl) -> bool {
         let Some(docker) = self.docker else {
             let blocked = any_may_cover(&self.blocked_repositories, world);

@@ -41,7 +41,6 @@ impl UrlPrefix {
     /// Hosts, owners and repositories are compared without regard to case, for the forges do so too; what follows
     /// them lies inside the repository, where git tells cases apart. Of that the reference and the folder count, not
     /// the words by which the forges tell that they follow: `tree`, `blob`, `-/blob` and `src/branch` name the same.
-    #[must_use]
     pub fn covers(&self, world: &ProjectUrl) -> bool {
         self.may_be_of(world)
             && self.host == world.host()
@@ -49,7 +48,6 @@ impl UrlPrefix {
     }
 
     /// Whether a world's URL may mean something that this prefix covers: `blob/v1` may mean the tag of `src/tag/v1`.
-    #[must_use]
     pub fn may_cover(&self, world: &ProjectUrl) -> bool {
         self.may_be_of(world) && (self.covers(world) || (self.host == world.host() && self.covers_inside(world, true)))
     }
@@ -79,19 +77,16 @@ impl UrlPrefix {
     }
 
     /// How many path segments this prefix has: the longer of two prefixes is the more exact one.
-    #[must_use]
     pub fn depth(&self) -> usize {
         self.segments.len()
     }
 
     /// The path segments of a covered world's repository that come after this prefix.
-    #[must_use]
     pub fn rest_of_repository<'world>(&self, world: &'world ProjectUrl) -> &'world [String] {
         world.repository_segments().get(self.segments.len()..).unwrap_or_default()
     }
 
     /// The prefix as it was written.
-    #[must_use]
     pub fn as_str(&self) -> &str {
         &self.text
     }
@@ -123,13 +118,11 @@ impl From<UrlPrefix> for String {
 }
 
 /// Whether any of these prefixes covers a world's URL.
-#[must_use]
 pub fn any_covers(prefixes: &[UrlPrefix], world: &ProjectUrl) -> bool {
     prefixes.iter().any(|prefix| prefix.covers(world))
 }
 
 /// Whether a world's URL may mean something that any of these prefixes covers.
-#[must_use]
 pub fn any_may_cover(prefixes: &[UrlPrefix], world: &ProjectUrl) -> bool {
     prefixes.iter().any(|prefix| prefix.may_cover(world))
 }

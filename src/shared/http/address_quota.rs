@@ -10,7 +10,6 @@ const MOST_ADDRESSES: usize = 10_000;
 
 /// How much of so many places, connections or the like one address may have where the configuration does not say it: three
 /// quarters. A class often sits behind one address, and so may somebody who takes all that there is.
-#[must_use]
 pub fn share(all: usize) -> usize {
     all - all / 4
 }
@@ -21,7 +20,6 @@ pub struct AddressQuota(DefaultKeyedRateLimiter<IpAddr>);
 
 impl AddressQuota {
     /// A quota that nobody has used yet: `burst` times at once, and `per_minute` times in each minute after that.
-    #[must_use]
     pub fn new(burst: NonZeroU32, per_minute: NonZeroU32) -> Self {
         Self(RateLimiter::keyed(Quota::per_minute(per_minute).allow_burst(burst)))
     }

@@ -46,7 +46,6 @@ impl Asset {
 }
 
 /// Answers a request for one of these files. A browser keeps it, and asks each time whether it is still the same.
-#[must_use]
 pub fn answer(request: &HttpRequest, assets: &[Asset]) -> HttpResponse {
     let name = request.match_info().get("name").unwrap_or_default();
     let Some(asset) = assets.iter().chain(COMMON).find(|asset| asset.name == name) else {
@@ -91,7 +90,7 @@ mod tests {
 
     #[test]
     fn nothing_else_is_sent() {
-        for name in ["", "../style.css", "style.css/", "mail.html"] {
+        for name in ["", "../style.css", "style.css/", "mail.txt"] {
             assert_eq!(ask(name, None).status(), 404, "{name:?}");
         }
     }

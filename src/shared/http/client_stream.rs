@@ -48,7 +48,6 @@ pub struct ClientStream {
 
 impl ClientStream {
     /// A connection that `permit` counts, of a server that stops when `stopping` is cancelled.
-    #[must_use]
     pub fn new(tcp: TcpStream, permit: ConnectionPermit, stopping: CancellationToken) -> Self {
         Self {
             tcp,

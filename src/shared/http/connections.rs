@@ -2,10 +2,11 @@
 
 use std::collections::HashMap;
 use std::net::IpAddr;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::Arc;
 
 use actix_web::HttpResponse;
 use actix_web::http::StatusCode;
+use parking_lot::Mutex;
 
 use super::address_quota::share;
 use super::paths::retry_after;
@@ -67,16 +68,14 @@ pub enum TooManyConnections {
 impl Connections {
     /// Allows `max_tcp` TCP connections and `max_clients` web clients, of which one address may have `per_address`, or a
     /// share where that is not said.
-    #[must_use]
     pub fn new(max_tcp: usize, max_clients: usize, per_address: Option<usize>) -> Self {
         let per_address = per_address.unwrap_or_else(|| share(max_clients).min(MOST_CLIENTS));
         Self { max_tcp, max_clients, per_address, open: Arc::default() }
     }
 
     /// How many connections of a kind are open.
-    #[must_use]
     pub fn count(&self, kind: Kind) -> usize {
-        lock(&self.open).all.get(&kind).copied().unwrap_or_default()
+        self.open.lock().all.get(&kind).copied().unwrap_or_default()
     }
 
     /// Counts a connection. A proxy that does not tell its clients' addresses stands for many clients, so that only the
@@ -94,7 +93,7 @@ impl Connections {
             Kind::Page => (MAX_PAGES, self.per_address.min(share(MAX_PAGES))),
         };
         let address = peer.rate_limit_key();
-        let mut open = lock(&self.open);
+        let mut open = self.open.lock();
         let Open { all, by_address } = &mut *open;
         let all = all.entry(kind).or_default();
         if *all >= max {
@@ -115,7 +114,7 @@ impl Connections {
 
 impl Drop for ConnectionPermit {
     fn drop(&mut self) {
-        let mut open = lock(&self.open);
+        let mut open = self.open.lock();
         if let Some(all) = open.all.get_mut(&self.kind) {
             *all -= 1;
         }
@@ -133,7 +132,6 @@ impl Drop for ConnectionPermit {
 
 impl TooManyConnections {
     /// Returns the response to a client that is refused.
-    #[must_use]
     pub fn answer(self) -> HttpResponse {
         let status = match self {
             Self::InAll => StatusCode::SERVICE_UNAVAILABLE,
@@ -141,11 +139,6 @@ impl TooManyConnections {
         };
         HttpResponse::build(status).insert_header(retry_after()).body(self.to_string())
     }
-}
-
-/// The counts are right even if a thread panicked while it held them.
-fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 #[cfg(test)]
@@ -195,9 +188,9 @@ mod tests {
         let permit = admit("2001:db8::1").unwrap();
         assert_eq!(admit("2001:db8::2").unwrap_err(), TooManyConnections::FromAddress, "the same /64");
         let _neighbour = admit("2001:db8:0:1::1").unwrap();
-        assert_eq!(lock(&connections.open).by_address.len(), 2);
+        assert_eq!(connections.open.lock().by_address.len(), 2);
         drop(permit);
-        assert_eq!(lock(&connections.open).by_address.len(), 1);
+        assert_eq!(connections.open.lock().by_address.len(), 1);
         assert_eq!(connections.count(Kind::Client), 1);
     }
 }

@@ -22,7 +22,6 @@ const ANSWERS: u32 = 100;
 
 impl Liveness {
     /// Starts with a connection that was just opened.
-    #[must_use]
     pub fn new() -> Self {
         Self { alive: Instant::now(), asked: rand::random(), answers: 0 }
     }
@@ -42,7 +41,6 @@ impl Liveness {
     }
 
     /// Counts an answer. Returns whether it may be sent.
-    #[must_use]
     pub fn may_answer(&mut self) -> bool {
         self.answers += 1;
         self.answers <= ANSWERS

@@ -28,7 +28,6 @@ pub struct Gauge<'text> {
 
 impl<'text> Gauge<'text> {
     /// A gauge without labels.
-    #[must_use]
     pub fn plain(name: &'text str, help: &'text str, value: f64) -> Self {
         Self { name, help, labels: &[], values: vec![(Vec::new(), value)] }
     }
@@ -36,7 +35,6 @@ impl<'text> Gauge<'text> {
 
 impl Metrics {
     /// Creates an empty registry.
-    #[must_use]
     pub fn new() -> Self {
         Self { counters: Registry::new() }
     }

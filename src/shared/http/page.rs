@@ -22,7 +22,6 @@ const MOST_HOSTS: usize = 40;
 
 impl Policy {
     /// A page that loads nothing but what its own server has, and no script or style that stands in the page itself.
-    #[must_use]
     pub fn own() -> Self {
         let own = || vec!["'self'".to_owned()];
         Self {
@@ -38,7 +37,6 @@ impl Policy {
 
     /// Lets a page open WebSockets to the server that it comes from: older browsers don't take them for its own. Only
     /// `Host` tells which that is: `X-Forwarded-Host` and `Forwarded` may be anybody's word.
-    #[must_use]
     pub fn own_websocket(mut self, request: &HttpRequest) -> Self {
         let host = request.headers().get(header::HOST).and_then(|host| host.to_str().ok()).unwrap_or_default();
         if !host.is_empty() && host.chars().all(|one| one.is_ascii_alphanumeric() || ".:-".contains(one)) {
@@ -48,14 +46,12 @@ impl Policy {
     }
 
     /// Lets a page connect to these sources.
-    #[must_use]
     pub fn connect(mut self, sources: &[String]) -> Self {
         self.connections.extend_from_slice(sources);
         self
     }
 
     /// Lets a page run scripts of these sources, which may be WebAssembly, with their styles and pictures.
-    #[must_use]
     pub fn run(mut self, sources: &[String]) -> Self {
         let files = || sources.iter().filter(|source| !source.starts_with("ws")).cloned();
         for list in [&mut self.scripts, &mut self.styles, &mut self.pictures] {
@@ -67,7 +63,6 @@ impl Policy {
     }
 
     /// Lets a page show pictures and fetch data that a world names, wherever they are.
-    #[must_use]
     pub fn any_picture(mut self) -> Self {
         self.pictures.extend(["data:".to_owned(), "blob:".to_owned(), "https:".to_owned()]);
         self.connections.extend(["data:".to_owned(), "blob:".to_owned(), "https:".to_owned()]);
@@ -75,14 +70,12 @@ impl Policy {
     }
 
     /// Lets a page embed pages of its own server (`frame-src`).
-    #[must_use]
     pub fn frames(mut self) -> Self {
         self.frames = true;
         self
     }
 
     /// Lets pages of the same server embed this one (`frame-ancestors`).
-    #[must_use]
     pub fn framed(mut self) -> Self {
         self.framed = true;
         self
@@ -90,14 +83,12 @@ impl Policy {
 
     /// Gives a page an origin of its own (`sandbox`): its scripts can't use the password or the storage of the server's
     /// other pages.
-    #[must_use]
     pub fn foreign(mut self) -> Self {
         self.foreign = true;
         self
     }
 
     /// Returns the header's value.
-    #[must_use]
     pub fn text(&self) -> String {
         let own_or_none = |allowed| if allowed { "'self'" } else { "'none'" };
         format!(
@@ -117,7 +108,6 @@ impl Policy {
 /// The sources from which a fleet is reached: its hosts, with any port where ports are not rewritten, since each
 /// simulation has a port of its own. Any host, where one of them can't be named in a policy: it knows letters of ASCII
 /// and no IPv6 addresses (CSP Level 3, section 2.3.1).
-#[must_use]
 pub fn fleet_sources<'address>(addresses: impl Iterator<Item = &'address PublicAddress>, ssl: bool) -> Vec<String> {
     let mut hosts: Vec<String> = addresses
         .map(|address| format!("{}{}", address.host(), if address.is_rewritten() { "" } else { ":*" }))
@@ -133,7 +123,6 @@ pub fn fleet_sources<'address>(addresses: impl Iterator<Item = &'address PublicA
 }
 
 /// The sources from which a fleet is reached whose hosts are not known yet: any host.
-#[must_use]
 pub fn any_host(ssl: bool) -> Vec<String> {
     let (http, websocket) = schemes(ssl);
     vec![format!("{http}:"), format!("{websocket}:")]
@@ -144,7 +133,6 @@ fn schemes(ssl: bool) -> (&'static str, &'static str) {
 }
 
 /// The CSS class of a bar that shows so many percent.
-#[must_use]
 pub fn heat(percent: &f64) -> &'static str {
     match *percent {
         ..70.0 => "cool",
@@ -154,13 +142,11 @@ pub fn heat(percent: &f64) -> &'static str {
 }
 
 /// The CSS class that sets the length of a bar that shows so many percent.
-#[must_use]
 pub fn width(percent: &f64) -> String {
     format!("{:.1}", percent.clamp(0.0, 100.0))
 }
 
 /// Answers with a page.
-#[must_use]
 pub fn html(page: Result<String, askama::Error>, policy: &Policy) -> HttpResponse {
     match page {
         Ok(page) => HttpResponse::Ok()

@@ -39,7 +39,6 @@ fn wrong_method(methods: &[Method]) -> HttpResponse {
 /// Refuses a request that a page of another site made (CSRF): the browser would add the password that it remembers.
 ///
 /// Browsers tell where a request comes from in `Sec-Fetch-Site`, older ones in `Origin`; other programs send neither.
-#[must_use]
 pub fn refuse_other_sites(request: &HttpRequest) -> Option<HttpResponse> {
     let header = |name: HeaderName| request.headers().get(name).map(|value| value.to_str().unwrap_or_default());
     let same_site =
@@ -54,7 +53,6 @@ pub fn refuse_other_sites(request: &HttpRequest) -> Option<HttpResponse> {
 }
 
 /// The value of `Retry-After`, in seconds. Random, so that a class that was refused together does not come back together.
-#[must_use]
 pub fn retry_after() -> (HeaderName, HeaderValue) {
     (header::RETRY_AFTER, HeaderValue::from(rand::rng().random_range(RETRY_AFTER)))
 }

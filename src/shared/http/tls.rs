@@ -18,7 +18,6 @@ use rustls::{
 /// Returns how requests are encrypted; `None` where rustls can't be set up.
 ///
 /// Parts of the trust store that can't be read are logged. Only servers that need them are not trusted.
-#[must_use]
 pub fn client_config() -> Option<Arc<ClientConfig>> {
     let found = rustls_native_certs::load_native_certs();
     for problem in &found.errors {
@@ -113,7 +112,6 @@ fn is_of_authority(error: &CertificateError) -> bool {
 }
 
 /// Says why a request failed, where encryption is the cause.
-#[must_use]
 pub fn reason(error: &SendRequestError) -> Option<String> {
     let SendRequestError::Connect(ConnectError::Io(error)) = error else {
         return None;

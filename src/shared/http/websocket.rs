@@ -66,7 +66,6 @@ pub enum MessageError {
 
 impl MessageError {
     /// The code to close the WebSocket with.
-    #[must_use]
     pub fn code(&self) -> CloseCode {
         match self {
             Self::TooLarge => CloseCode::Size,

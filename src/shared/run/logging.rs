@@ -5,9 +5,7 @@ use std::io::Write;
 use std::path::Path;
 
 use env_logger::{Builder, Env, Target};
-use log::Log;
 
-use super::log_limit::LimitedLog;
 use super::rotated_file::RotatedFile;
 use crate::shared::text::one_line;
 
@@ -25,7 +23,6 @@ pub enum LogTarget<'path> {
 
 impl<'path> LogTarget<'path> {
     /// Standard output where `debug` is set, else this file.
-    #[must_use]
     pub fn new(debug: bool, file: &'path Path) -> Self {
         if debug { Self::Stdout } else { Self::File(file) }
     }
@@ -73,11 +70,7 @@ pub fn start(target: LogTarget<'_>) -> std::io::Result<()> {
     });
     let logger = builder.build();
     log::set_max_level(logger.filter());
-    let logger: Box<dyn Log> = match target {
-        LogTarget::Stdout => Box::new(logger),
-        LogTarget::File(_) => Box::new(LimitedLog::new(logger)),
-    };
-    log::set_boxed_logger(logger).map_err(std::io::Error::other)
+    log::set_boxed_logger(Box::new(logger)).map_err(std::io::Error::other)
 }
 
 /// A module's path without the name of the crate.

@@ -1,7 +1,6 @@
 //! How a server starts, says that it is ready, writes its log, and handles signals.
 
 mod app_error;
-mod log_limit;
 mod logging;
 pub mod notify;
 mod open_files;
@@ -10,6 +9,7 @@ mod pid_file;
 mod rotated_file;
 mod shutdown;
 pub mod start;
+mod supervisor;
 mod timestamp;
 
 pub use app_error::AppError;
@@ -17,4 +17,5 @@ pub use logging::LogTarget;
 pub use open_files::raise_open_files;
 pub use rotated_file::RotatedFile;
 pub use shutdown::{Phase, Request, Signals, closing};
+pub use supervisor::{Supervisor, TooManyPanics};
 pub use timestamp::{seconds_since_1970, timestamp};

@@ -7,7 +7,6 @@ const USUAL: u64 = 1024;
 
 /// Raises the limit of open files to `wanted`, or as near to it as the system allows. A limit that is higher already stays.
 /// Returns the limit.
-#[must_use]
 pub fn raise_open_files(wanted: u64) -> u64 {
     let limits = getrlimit(Resource::RLIMIT_NOFILE);
     let raised = limits.and_then(|(now, most)| {

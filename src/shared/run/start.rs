@@ -39,7 +39,6 @@ pub fn read<C: Configuration>(file: &Path) -> Result<LoadedConfig<C>, ExitCode> 
 }
 
 /// Prints the effective configuration to standard output, and warnings to the error output.
-#[must_use]
 pub fn check<C: Configuration>(loaded: &LoadedConfig<C>) -> ExitCode {
     for warning in &loaded.warnings {
         eprintln!("warning: {}", one_line(warning));

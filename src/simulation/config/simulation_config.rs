@@ -114,7 +114,7 @@ pub struct SimulationConfig {
     /// class sits behind one address.
     #[serde(default, deserialize_with = "optional_whole::<1, 10_000, _, _>")]
     pub max_places_per_address: Option<usize>,
-    /// Web servers, as addresses or networks, whose headers `X-Forwarded-For` and `Forwarded` are believed.
+    /// Web servers, as addresses or networks, whose header `X-Forwarded-For` is believed.
     /// Default: `["127.0.0.0/8", "::1/128"]`.
     #[serde(default)]
     pub trusted_proxies: TrustedProxies,

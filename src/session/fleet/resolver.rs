@@ -1,0 +1,91 @@
+//! Resolves the names and hosts of simulation servers as the machine is set up: `/etc/hosts` and `/etc/resolv.conf`.
+//!
+//! The system's own `getaddrinfo` blocks a thread for each lookup, which can't be cancelled: a name server that hangs would
+//! use up all threads.
+
+use std::cell::RefCell;
+use std::error::Error;
+use std::net::{IpAddr, SocketAddr};
+use std::time::Duration;
+
+use actix_tls::connect::Resolve;
+use futures_util::future::LocalBoxFuture;
+use hickory_resolver::TokioResolver;
+use hickory_resolver::config::{LookupIpStrategy, ResolverConfig, ResolverOpts};
+use hickory_resolver::net::NetError;
+use hickory_resolver::net::runtime::TokioRuntimeProvider;
+use hickory_resolver::system_conf::read_system_conf;
+
+/// How long a lookup may take before the last answer is used in its place.
+const SLOW: Duration = Duration::from_millis(500);
+
+/// The resolver of all hosts. Clones share its connections and its cache.
+///
+/// # Errors
+/// When no resolver can be made.
+pub fn resolver() -> std::io::Result<TokioResolver> {
+    let (config, options) = read_system_conf().unwrap_or_else(|error| {
+        log::warn!("/etc/resolv.conf can't be used, only /etc/hosts is: {error}");
+        (ResolverConfig::from_name_servers(Vec::new()), ResolverOpts::default())
+    });
+    build(config, options).map_err(std::io::Error::other)
+}
+
+fn build(config: ResolverConfig, mut options: ResolverOpts) -> Result<TokioResolver, NetError> {
+    options.ip_strategy = LookupIpStrategy::Ipv4AndIpv6;
+    TokioResolver::builder_with_config(config, TokioRuntimeProvider::default()).with_options(options).build()
+}
+
+/// All addresses that a name has now; there is at least one.
+///
+/// The resolver is made for this lookup: engines give their names a time to live of minutes, and dnsmasq answers on a
+/// connection that is kept what it knew when that began.
+///
+/// # Errors
+/// In words, when there is no answer or nothing in it.
+pub async fn look_up(name: &str) -> Result<Vec<IpAddr>, String> {
+    let resolver = read_system_conf().and_then(|(config, options)| build(config, options));
+    look_up_by(&resolver.map_err(|error| error.to_string())?, name).await
+}
+
+async fn look_up_by(resolver: &TokioResolver, name: &str) -> Result<Vec<IpAddr>, String> {
+    match resolver.lookup_ip(name).await {
+        Ok(found) => Ok(found.iter().map(|address| address.to_canonical()).collect()),
+        Err(error) if error.is_no_records_found() => Err("DNS has no such records".to_owned()),
+        Err(error) => Err(error.to_string()),
+    }
+}
+
+/// Resolves the host of one simulation server. The last answer holds while a lookup fails or takes long.
+pub struct HostResolver {
+    resolver: TokioResolver,
+    last: RefCell<Vec<IpAddr>>,
+}
+
+impl HostResolver {
+    /// Resolves by this resolver.
+    pub fn new(resolver: TokioResolver) -> Self {
+        Self { resolver, last: RefCell::default() }
+    }
+
+    async fn addresses(&self, host: &str) -> Result<Vec<IpAddr>, String> {
+        let last = self.last.borrow().clone();
+        let lookup = look_up_by(&self.resolver, host.trim_matches(['[', ']']));
+        let found = if last.is_empty() {
+            lookup.await?
+        } else {
+            actix_rt::time::timeout(SLOW, lookup).await.ok().and_then(Result::ok).unwrap_or(last)
+        };
+        self.last.replace(found.clone());
+        Ok(found)
+    }
+}
+
+impl Resolve for HostResolver {
+    fn lookup<'a>(&'a self, host: &'a str, port: u16) -> LocalBoxFuture<'a, Result<Vec<SocketAddr>, Box<dyn Error>>> {
+        Box::pin(async move {
+            let found = self.addresses(host).await?;
+            Ok(found.into_iter().map(|address| SocketAddr::new(address, port)).collect())
+        })
+    }
+}

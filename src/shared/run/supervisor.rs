@@ -1,0 +1,109 @@
+//! Starts actors again that have panicked, and gives up when that happens too often.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::fmt::Display;
+use std::time::{Duration, Instant};
+
+use actix::prelude::*;
+
+/// How many panics of one kind of actor there may be within [`WINDOW`].
+const MOST_PANICS: usize = 5;
+const WINDOW: Duration = Duration::from_mins(1);
+
+/// All actors of one kind, by what each is for. actix does not restart an actor that has panicked.
+pub struct Supervisor<K, A: Actor> {
+    kind: &'static str,
+    actors: BTreeMap<K, Addr<A>>,
+    panics: VecDeque<Instant>,
+}
+
+/// Actors of one kind panic again and again: the server is to end, and to be started anew.
+#[derive(Debug, PartialEq, Eq, thiserror::Error)]
+#[error("more than {MOST_PANICS} panics of one kind of actor ({kind}) within {} s", WINDOW.as_secs())]
+pub struct TooManyPanics {
+    kind: &'static str,
+}
+
+impl<K: Ord + Display, A: Actor> Supervisor<K, A> {
+    /// No actors yet.
+    pub fn new(kind: &'static str) -> Self {
+        Self { kind, actors: BTreeMap::new(), panics: VecDeque::new() }
+    }
+
+    /// Adds an actor that was started.
+    pub fn add(&mut self, key: K, actor: Addr<A>) {
+        self.actors.insert(key, actor);
+    }
+
+    /// Forgets an actor, and returns it.
+    pub fn remove(&mut self, key: &K) -> Option<Addr<A>> {
+        self.actors.remove(key)
+    }
+
+    /// Returns an actor.
+    pub fn get(&self, key: &K) -> Option<&Addr<A>> {
+        self.actors.get(key)
+    }
+
+    /// Returns all actors.
+    pub fn all(&self) -> impl Iterator<Item = &Addr<A>> {
+        self.actors.values()
+    }
+
+    /// Starts actors in place of those that have panicked.
+    ///
+    /// # Errors
+    /// When there were too many panics.
+    pub fn restart_gone(&mut self, start: impl Fn(&K) -> Option<Addr<A>>) -> Result<(), TooManyPanics> {
+        let now = Instant::now();
+        self.actors.retain(|key, actor| {
+            if actor.connected() {
+                return true;
+            }
+            log::error!("{} {key} has panicked, a new one is started", self.kind);
+            self.panics.push_back(now);
+            start(key).inspect(|new| *actor = new.clone()).is_some()
+        });
+        while self.panics.pop_front_if(|at| now.duration_since(*at) > WINDOW).is_some() {}
+        if self.panics.len() > MOST_PANICS { Err(TooManyPanics { kind: self.kind }) } else { Ok(()) }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    struct Fragile;
+
+    #[derive(Message)]
+    #[rtype(result = "()")]
+    struct Panic;
+
+    impl Actor for Fragile {
+        type Context = Context<Self>;
+    }
+
+    impl Handler<Panic> for Fragile {
+        type Result = ();
+
+        fn handle(&mut self, _: Panic, _: &mut Self::Context) {
+            panic!("a test asks for it");
+        }
+    }
+
+    #[actix_rt::test]
+    async fn an_actor_that_panics_is_started_again_until_it_happens_too_often() {
+        let mut supervisor = Supervisor::new("the actor");
+        supervisor.add("one", Fragile.start());
+        supervisor.add("other", Fragile.start());
+        let other = supervisor.get(&"other").unwrap().clone();
+        for panics in 1..=MOST_PANICS + 1 {
+            let actor = supervisor.get(&"one").unwrap().clone();
+            actor.send(Panic).await.unwrap_err();
+            let enough = supervisor.restart_gone(|_| Some(Fragile.start()));
+            assert_eq!(enough.is_err(), panics > MOST_PANICS, "after {panics}");
+            assert_ne!(supervisor.get(&"one").unwrap(), &actor);
+        }
+        assert_eq!(supervisor.get(&"other").unwrap(), &other, "one that has not panicked was replaced");
+    }
+}
