@@ -9,7 +9,7 @@ use tokio::sync::watch;
 use which::which;
 
 use super::config::{Isolation, SimulationConfig};
-use crate::simulation::container::daemon_fault;
+use crate::simulation::container::{daemon_fault, init_fault};
 use crate::simulation::machine::display;
 
 /// Time between two checks.
@@ -22,13 +22,18 @@ pub fn watch(config: Arc<SimulationConfig>, run: PathBuf) -> watch::Receiver<Opt
     let (sender, problem) = watch::channel(None);
     actix_rt::spawn(async move {
         let mut period = actix_rt::time::interval(PERIOD);
+        let mut has_init = false;
         while !sender.is_closed() {
             period.tick().await;
             let (config, run) = (Arc::clone(&config), run.clone());
-            let checked = actix_rt::task::spawn_blocking(move || check(&config, &run).err()).await;
-            let Ok(found) = checked else {
+            let checked = move || {
+                let found = check(&config, &run).and_then(|()| check_init(&config, has_init));
+                (found.is_ok(), found.err())
+            };
+            let Ok((works, found)) = actix_rt::task::spawn_blocking(checked).await else {
                 continue;
             };
+            has_init |= works;
             sender.send_if_modified(|problem| {
                 let is_new = *problem != found;
                 match &found {
@@ -60,6 +65,14 @@ fn check(config: &SimulationConfig, run: &Path) -> Result<(), String> {
         display::check(&display).map_err(|error| format!("Webots can't open its window: {error}"))?;
     }
     Ok(())
+}
+
+/// Checks that containers can have an init process. One that was found is not looked for again: it takes a container.
+fn check_init(config: &SimulationConfig, has_init: bool) -> Result<(), String> {
+    if has_init || config.isolation != Isolation::Container {
+        return Ok(());
+    }
+    init_fault().map_or(Ok(()), Err)
 }
 
 /// The program that is started for each client; in a container, that of its image.

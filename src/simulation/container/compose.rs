@@ -156,7 +156,8 @@ impl Parts<'_> {
                 json!({ "nofile": { "soft": limits.open_files.min(1024), "hard": limits.open_files }, "core": 0 }),
             ),
             ("logging", json!({ "driver": "none" })),
-            ("init", json!(self.engine.init)),
+            // Reaps orphans and forwards signals. That Docker has one is found at the server's start.
+            ("init", json!(true)),
             // The daemon would run it, as often as the image says.
             ("healthcheck", json!({ "disable": true })),
         ]);
@@ -176,6 +177,9 @@ impl Parts<'_> {
             }
             self.show(&mut service, &mut environment, config);
         }
+        // The images of these two have a program that makes it.
+        let home = if ["webots", "controller"].contains(&name) { "/tmp/home" } else { "/tmp" };
+        environment.push(("HOME", home.to_owned()));
         service.insert("environment", json!(BTreeMap::from_iter(environment)));
         json!(service)
     }
@@ -223,8 +227,7 @@ fn display_of(config: &SimulationConfig) -> Option<String> {
 type Service = BTreeMap<&'static str, Value>;
 
 /// Variables that all services have: with them programs write where they may, and find each other.
-const ENVIRONMENT: [(&str, &str); 4] =
-    [("HOME", "/tmp"), ("USER", "webots"), ("XDG_RUNTIME_DIR", "/tmp"), ("QT_X11_NO_MITSHM", "1")];
+const ENVIRONMENT: [(&str, &str); 3] = [("USER", "webots"), ("XDG_RUNTIME_DIR", "/tmp"), ("QT_X11_NO_MITSHM", "1")];
 
 /// How much memory a container may take where `limits.memory` does not say, in MiB.
 pub const DEFAULT_MEMORY: u64 = 4096;

@@ -1,5 +1,6 @@
 //! Simulations in containers of Docker: what a project asks for, its image, and a compose project for each simulation.
 
+mod blocking;
 mod check;
 mod compose;
 mod containers;
@@ -10,9 +11,12 @@ mod engine;
 mod image;
 mod network;
 mod objects;
+mod opened;
 pub mod packet_filter;
 mod places;
 mod prepared;
+mod project_images;
+mod prune;
 mod recipe;
 mod request;
 mod steps;
@@ -20,7 +24,7 @@ mod templates;
 mod tidy;
 mod webots_yml;
 
-pub use check::{check, daemon_fault};
+pub use check::{check, daemon_fault, init_fault};
 pub use containers::Containers;
 pub use objects::{Owner, sweep};
 pub use prepared::Prepared;
