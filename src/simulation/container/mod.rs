@@ -1,5 +1,6 @@
 //! Simulations in containers of Docker: what a project asks for, its image, and a compose project for each simulation.
 
+mod answer;
 mod blocking;
 mod check;
 mod compose;
@@ -24,6 +25,7 @@ mod templates;
 mod tidy;
 mod webots_yml;
 
+pub use answer::until_answering;
 pub use check::{check, daemon_fault, init_fault};
 pub use containers::Containers;
 pub use objects::{Owner, sweep};

@@ -1,8 +1,7 @@
 //! Actor: one running Webots. Owns its process group, its folder and its place; ends with all three.
 //!
-//! Created by a web client once its project is checked out. It starts Webots, finds the port on which it listens,
-//! watches its heartbeat and the time limit, and tells its client with [`WebotsEvent`]s. It ends when nothing of
-//! Webots' process tree is left, and is never restarted.
+//! Created by a web client once its project is checked out. Starts Webots, waits until it listens, watches its heartbeat
+//! and the time limit, sends [`WebotsEvent`]s, and ends when nothing of Webots' process tree is left. Never restarted.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -17,6 +16,7 @@ use super::output::{OutputEvent, Tail};
 use super::runtime::{Preparation, Runtime};
 use crate::shared::run::seconds_since_1970;
 use crate::simulation::checkout::CheckoutError;
+use crate::simulation::container::until_answering;
 use crate::simulation::machine::display;
 use crate::simulation::process::{ExitReason, ProcessGroup, process_tree};
 use crate::simulation::snapshot::{Change, Stage};
@@ -126,12 +126,12 @@ impl Webots {
         Ok(())
     }
 
-    /// Waits until a process of this instance listens on a port that Webots may have taken.
+    /// Waits until its container answers, or a process of this instance listens on a port that Webots may have taken.
     fn await_port(&self, ctx: &mut Context<Self>) {
-        // A port of a container is there before Webots is.
-        if self.spec.containers.is_none()
-            && let Some(root) = self.group.as_ref().map(ProcessGroup::leader)
-        {
+        if self.spec.containers.is_some() {
+            let answering = until_answering(self.spec.config.bind, self.port).into_actor(self);
+            answering.map(|(), this, _| this.ready(this.port)).spawn(ctx);
+        } else if let Some(root) = self.group.as_ref().map(ProcessGroup::leader) {
             let ports = self.port..=self.port.saturating_add(NEXT_PORTS);
             let listening = process_tree::until_listening(root, ports).into_actor(self);
             listening.map(|port, this, _| this.ready(port)).spawn(ctx);
@@ -139,7 +139,7 @@ impl Webots {
     }
 
     fn ready(&mut self, port: u16) {
-        if self.stopped_for.is_some() {
+        if self.stopped_for.is_some() || self.listening {
             return;
         }
         let allowed = self.spec.config.streaming_ports();
@@ -217,7 +217,7 @@ impl Webots {
             return self.exited(exit, ctx);
         }
         exit.why += self.spec.launcher.remark();
-        if self.spec.config.xvfb {
+        if self.spec.config.xvfb || self.spec.containers.is_some() {
             return self.exited(exit, ctx);
         }
         let display = display::effective(self.spec.config.display.as_ref());

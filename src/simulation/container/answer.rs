@@ -1,0 +1,51 @@
+//! Whether Webots in a container answers on its published port.
+//!
+//! Docker's proxy listens on it from the container's start on, and accepts connections that nothing inside takes. So only
+//! the answer to a request tells.
+
+use std::net::{IpAddr, Ipv4Addr};
+use std::time::Duration;
+
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::net::TcpStream;
+
+/// A file that Webots does not have. A request for `/` would begin a WebSocket.
+const REQUEST: &[u8] = b"GET /robots.txt HTTP/1.0\r\nHost: localhost\r\n\r\n";
+/// Pause between two requests.
+const PAUSE: Duration = Duration::from_millis(25);
+/// Timeout of a request: Webots answers none while it reads a world.
+const TIMEOUT: Duration = Duration::from_secs(2);
+
+/// Waits until there is an answer on this port of an address that the server binds to.
+pub async fn until_answering(bind: IpAddr, port: u16) {
+    // Containers listen on IPv4, see the variable BIND of their templates.
+    let address = if bind.is_ipv4() && !bind.is_unspecified() { bind } else { Ipv4Addr::LOCALHOST.into() };
+    while !matches!(actix_rt::time::timeout(TIMEOUT, answers((address, port).into())).await, Ok(Ok(true))) {
+        actix_rt::time::sleep(PAUSE).await;
+    }
+}
+
+async fn answers(address: std::net::SocketAddr) -> std::io::Result<bool> {
+    let mut stream = TcpStream::connect(address).await?;
+    stream.write_all(REQUEST).await?;
+    let mut answer = [0; 5];
+    stream.read_exact(&mut answer).await?;
+    Ok(answer == *b"HTTP/")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[actix_rt::test]
+    async fn a_proxy_that_accepts_for_nobody_is_no_answer() {
+        let listener = tokio::net::TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).await.unwrap();
+        let address = listener.local_addr().unwrap();
+        let waiting = actix_rt::spawn(until_answering(Ipv4Addr::UNSPECIFIED.into(), address.port()));
+        drop(listener.accept().await.unwrap());
+        let (mut stream, _) = listener.accept().await.unwrap();
+        assert!(!waiting.is_finished());
+        stream.write_all(b"HTTP/1.1 404 Not Found\r\n\r\n").await.unwrap();
+        waiting.await.unwrap();
+    }
+}
