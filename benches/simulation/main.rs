@@ -3,6 +3,8 @@
 //! It starts the built program, with a stand-in for the forge and the demo simulator for Webots:
 //! - `load`: how fast `/load` answers while ten checkouts run, one remote hangs, and a simulator floods its output;
 //! - `start`: what a cached start costs over the git commands that it runs, and what a sandbox adds to it;
+//! - `containers`: what a start in containers takes beside `docker compose up` by hand, one and thirty at once; needs root
+//!   and dockerd;
 //! - `soak`: whether a thousand starts and stops in a row leave anything: processes, file descriptors, ports, folders,
 //!   threads, memory.
 //!
@@ -19,6 +21,7 @@
     reason = "a measurement that fails ends with a panic"
 )]
 
+mod containers;
 mod load;
 #[path = "../../tests/simulation/soak.rs"]
 mod soak;
@@ -54,6 +57,7 @@ struct Arguments {
 enum Part {
     Load,
     Start,
+    Containers,
     Soak,
 }
 
@@ -82,6 +86,9 @@ async fn main() -> ExitCode {
     if is_wanted(Part::Start) {
         start::measure(&mut verdict, arguments.cached).await;
         start::compare_levels(&mut verdict, arguments.cached).await;
+    }
+    if is_wanted(Part::Containers) {
+        containers::measure(&mut verdict).await;
     }
     if is_wanted(Part::Soak) {
         soak_and_tell(&mut verdict, arguments.starts).await;

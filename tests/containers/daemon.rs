@@ -175,6 +175,11 @@ fn made(folder: &Path, arguments: &[&str]) {
     assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
 }
 
+/// How programs reach the daemon.
+pub fn host() -> String {
+    daemon().socket()
+}
+
 /// What `docker` prints with these arguments.
 pub fn ask(arguments: &[&str]) -> String {
     let output = daemon().command(arguments).output().unwrap();
@@ -188,14 +193,14 @@ pub fn server(repositories: &Path, places: u16) -> Builder {
         .set("isolation", "container")
         .set("webots", serde_json::Value::Null)
         .set("timing", serde_json::json!({ "heartbeat": 0.5 }))
-        .env("DOCKER_HOST", &daemon().socket())
+        .env("DOCKER_HOST", &host())
         .env("DOCKER_CONFIG", &daemon().folder.display().to_string())
 }
 
 /// What `--check` prints for a server's configuration.
 pub fn check(server: &crate::support::program::Server) -> String {
     let mut command = Command::new(env!("CARGO_BIN_EXE_simulation-server"));
-    command.arg("--check").arg(server.folder().join("config.json")).env("DOCKER_HOST", daemon().socket());
+    command.arg("--check").arg(server.folder().join("config.json")).env("DOCKER_HOST", host());
     let output = command.output().unwrap();
     format!("{}{}", String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr))
 }

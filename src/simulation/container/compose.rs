@@ -139,6 +139,7 @@ impl Parts<'_> {
         let (settings, limits) = (&config.container, &config.limits);
         let memory = format!("{}m", limits.memory.unwrap_or(DEFAULT_MEMORY));
         let mut service = Service::from_iter([
+            ("container_name", json!(container_of(self.name, name))),
             ("restart", json!("no")),
             ("privileged", json!(false)),
             ("read_only", json!(settings.read_only)),
@@ -215,6 +216,12 @@ impl Parts<'_> {
             environment.push(("NVIDIA_DRIVER_CAPABILITIES", "all".to_owned()));
         }
     }
+}
+
+/// The name of the container of a service of a compose project.
+#[must_use]
+pub fn container_of(project: &str, service: &str) -> String {
+    format!("{project}-{service}")
 }
 
 /// The display of the machine, where that is asked for.

@@ -7,7 +7,7 @@ use tokio::sync::{OnceCell, Semaphore};
 use tokio_util::task::AbortOnDropHandle;
 
 use super::blocking::blocking;
-use super::compose::Parts;
+use super::compose::{Parts, container_of};
 use super::copy::Copy;
 use super::docker::{Docker, SHORT};
 use super::engine::Engine;
@@ -106,18 +106,19 @@ impl Containers {
         let recipe = self.recipe(&request).await?;
         let lease = Lease::take(self.run.project(request.port), &self.live);
         let network = self.config.container.network.name();
-        network::join(&self.docker, network).await?;
+        let joined = network::join(&self.docker, network);
         let version = &request.project.world.version;
         let base = recipe::image_of(&self.config.container.image, version);
         let part =
             |text, folder| Part { project: &request.project, base: &base, text, folder, make: recipe.make, network };
         let image = if let Some(text) = &recipe.dockerfile {
+            joined.await?;
             let image = self.images.of_project(part(text, ""), progress).await?;
             self.copy(&lease, &image, PROJECT_PATH.to_owned(), &request, request.project.folder()).await?;
             image
         } else {
-            self.images.pull(&base, progress).await?;
-            self.images.open(&base, &request.project, progress).await?
+            let ((), id) = tokio::try_join!(joined, self.images.pull(&base, progress))?;
+            self.images.open(id, &request.project, progress).await?
         };
         let controller = match &recipe.controller {
             Some(text) => {
@@ -186,9 +187,12 @@ impl Containers {
                 engine: &engine,
             };
             let template = templates.compose(&asks.kind)?;
-            parts.write(&template, &config).map_err(|error| format!("The files for compose can't be written: {error}"))
+            let written = parts.write(&template, &config);
+            let (options, variables) =
+                written.map_err(|error| format!("The files for compose can't be written: {error}"))?;
+            Ok((options, variables, template.services.into_keys()))
         };
-        let (options, variables) = blocking(files).await?;
+        let (options, variables, services) = blocking(files).await?;
         // More at a time would only be slower together.
         let turn = self.turns.acquire().await.map_err(|error| error.to_string())?;
         progress(steps::CREATING.to_owned());
@@ -198,7 +202,11 @@ impl Containers {
         drop(turn);
         let editor = (recipe.asks.kind != Kind::Default).then(|| "ide: enable".to_owned());
         let texts = editor.into_iter().chain(recipe.asks.project_type).collect();
-        let containers = self.made(&lease.name).await?;
+        let containers = services.map(|service| {
+            let container = container_of(&lease.name, &service);
+            (service, container)
+        });
+        let containers = containers.collect();
         Ok(Prepared::new(self.docker.clone(), lease, containers, texts, recipe.warnings))
     }
 
@@ -222,15 +230,5 @@ impl Containers {
             }
         }
         Ok(all)
-    }
-
-    /// The containers that compose has made: pairs of service and container.
-    async fn made(&self, name: &str) -> Result<Vec<(String, String)>, String> {
-        let filter = format!("label={}={name}", objects::PROJECT);
-        let format = "{{.Label \"com.docker.compose.service\"}} {{.ID}}";
-        let listed = self.docker.run(&["ps", "--all", "--filter", &filter, "--format", format], SHORT).await;
-        let listed = listed.map_err(|error| error.to_string())?;
-        let pairs = listed.lines().filter_map(|line| line.split_once(' '));
-        Ok(pairs.map(|(service, container)| (service.to_owned(), container.to_owned())).collect())
     }
 }

@@ -1,9 +1,10 @@
 //! The images of simulations: pulled, and built once for all who want the same.
 
+use std::collections::HashMap;
 use std::ffi::OsString;
 use std::fmt;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use tokio::sync::{Semaphore, watch};
@@ -28,6 +29,8 @@ pub struct Images {
     /// As many images are built at a time.
     builds: Semaphore,
     jobs: SingleFlight<String, Result<(), String>>,
+    /// The places of data that images of this server declare, by their names, which never mean another image.
+    volumes: Mutex<HashMap<String, Vec<String>>>,
 }
 
 /// An image to be built.
@@ -53,7 +56,7 @@ impl Images {
     pub fn new(docker: Docker, owner: Owner, config: &SimulationConfig) -> Self {
         let (builds, limit) = (Semaphore::new(config.container.builds), config.timing.build);
         let memory = config.limits.memory.unwrap_or(DEFAULT_MEMORY);
-        Self { docker, owner, limit, memory, builds, jobs: SingleFlight::default() }
+        Self { docker, owner, limit, memory, builds, jobs: SingleFlight::default(), volumes: Mutex::default() }
     }
 
     /// The name under which this server keeps its images. No other image has it.
@@ -61,17 +64,22 @@ impl Images {
         format!("webots-fleet/{}", self.owner.name())
     }
 
-    /// Makes sure that an image is there that somebody publishes.
+    /// Makes sure that a published image is there. Returns its id, by which it is told from later ones of the same name.
     ///
     /// # Errors
-    /// Why it can't be had, in words for the client.
-    pub async fn pull(self: &Arc<Self>, image: &str, progress: &(impl Fn(String) + Send + Sync)) -> Result<(), String> {
-        if self.is_there(image).await? {
-            return Ok(());
+    /// Why it can't be pulled, in words for the client.
+    pub async fn pull(
+        self: &Arc<Self>,
+        image: &str,
+        progress: &(impl Fn(String) + Send + Sync),
+    ) -> Result<String, String> {
+        if let Some(id) = self.id(image).await? {
+            return Ok(id);
         }
         let (this, name) = (Arc::clone(self), image.to_owned());
         let start = move |news| async move { this.limited(this.pull_now(&name, news)).await };
-        self.jobs.join(image.to_owned(), progress, start).await
+        self.jobs.join(image.to_owned(), progress, start).await?;
+        self.id(image).await?.ok_or_else(|| format!("The image {image} was removed meanwhile"))
     }
 
     async fn pull_now(&self, image: &str, news: watch::Sender<String>) -> Result<(), String> {
@@ -143,11 +151,10 @@ impl Images {
     /// Why it can't be made, in words for the client.
     pub async fn open(
         self: &Arc<Self>,
-        image: &str,
+        id: String,
         project: &Arc<Project>,
         progress: &(impl Fn(String) + Send + Sync),
     ) -> Result<String, String> {
-        let id = self.id(image).await?.unwrap_or_default();
         let name = format!("{}:{}", self.repository(), opened::key(std::iter::once(id.as_str())));
         let (this, made, project) = (Arc::clone(self), name.clone(), Arc::clone(project));
         self.once(name, progress, move |_| async move { this.open_now(&id, &made, &project).await }).await
@@ -160,10 +167,11 @@ impl Images {
         progress: &(impl Fn(String) + Send + Sync),
         job: impl FnOnce(watch::Sender<String>) -> F,
     ) -> Result<String, String> {
-        if self.is_there(&name).await? {
-            // So it counts as used just now.
-            self.docker.run(&["tag", &name, &name], SHORT).await.map_err(|error| error.to_string())?;
-            return Ok(name);
+        // One that is there counts as used just now.
+        match self.docker.run(&["tag", &name, &name], SHORT).await {
+            Ok(_) => return Ok(name),
+            Err(DockerError::Failed { .. }) => {}
+            Err(error) => return Err(error.to_string()),
         }
         let this = Arc::clone(self);
         let start = move |news| {
@@ -187,15 +195,11 @@ impl Images {
         actix_rt::time::timeout(self.limit, job).await.unwrap_or_else(|_| Err(slow()))
     }
 
-    async fn is_there(&self, image: &str) -> Result<bool, String> {
-        Ok(self.id(image).await?.is_some())
-    }
-
     /// What tells an image from later ones of the same name; `None` if it is not there.
     ///
     /// # Errors
     /// When Docker fails.
-    pub async fn id(&self, image: &str) -> Result<Option<String>, String> {
+    async fn id(&self, image: &str) -> Result<Option<String>, String> {
         match self.docker.run(&["image", "inspect", "--format", "{{.Id}}", image], SHORT).await {
             Ok(id) => Ok(Some(id.lines().last().unwrap_or_default().to_owned())),
             Err(DockerError::Failed { .. }) => Ok(None),
@@ -219,12 +223,21 @@ impl Images {
     /// # Errors
     /// When Docker fails, or such a place has a name that only its own author understands.
     pub async fn volumes(&self, image: &str) -> Result<Vec<String>, String> {
+        let known = || self.volumes.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(found) = known().get(image).cloned() {
+            return Ok(found);
+        }
         let format = "{{range $path, $_ := .Config.Volumes}}{{printf \"%+q\" $path}}{{println}}{{end}}";
         let listed = self.docker.run(&["image", "inspect", "--format", format, image], SHORT).await;
         let listed = listed.map_err(|error| error.to_string())?;
         let strange =
             |path: &str| format!("The image {image} has a VOLUME {path}, which can't be given to a container here");
-        listed.lines().map(|path| place_of(path).ok_or_else(|| strange(path))).collect()
+        let found = listed.lines().map(|path| place_of(path).ok_or_else(|| strange(path)));
+        let found: Vec<String> = found.collect::<Result<_, String>>()?;
+        if image.starts_with(&self.repository()) {
+            known().insert(image.to_owned(), found.clone());
+        }
+        Ok(found)
     }
 }
 

@@ -49,8 +49,7 @@ impl Images {
         // The name of an image stays when what it names is updated.
         let mut bases = Vec::new();
         for image in dockerfile::bases(text, &arguments) {
-            self.pull(&image, progress).await?;
-            bases.extend(self.id(&image).await?);
+            bases.push(self.pull(&image, progress).await?);
         }
         let identity = project.identity();
         let parts =
