@@ -98,7 +98,10 @@ async fn a_daemon_that_is_stopped_is_told_and_all_goes_on_when_it_is_back() {
     let mut client = Client::start(&server, &arm()).await;
     client.patiently("webots:", Duration::from_secs(60)).await;
     docker.kill();
-    client.patiently("loading: Error:", Duration::from_secs(60)).await;
+    let lost = client.patiently("loading: Error:", Duration::from_secs(60)).await;
+    assert!(lost.contains("Docker has stopped on this simulation server"), "{lost}");
+    // Another server may take it.
+    assert_eq!(client.closed().await, Some(1013));
     let told = Client::start(&server, &arm()).await.patiently("loading: Error:", Duration::from_secs(60)).await;
     assert!(told.contains("Docker does not answer on this simulation server"), "{told}");
     until("it says so", async || http::get(&server.url("/load")).await.text().trim() == "100").await;

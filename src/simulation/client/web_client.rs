@@ -191,10 +191,10 @@ impl WebClient {
             .spawn(ctx);
     }
 
-    fn exited(&mut self, Exit { clean, why }: &Exit, ctx: &mut Context) {
+    fn exited(&mut self, Exit { clean, lost, why }: &Exit, ctx: &mut Context) {
         let words = if *clean { protocol::loading(why) } else { protocol::error(why) };
         self.start.resolve(Outcome::NoWebots);
-        self.finish(&words, CloseCode::Normal, ctx);
+        self.finish(&words, if *lost { CloseCode::Again } else { CloseCode::Normal }, ctx);
     }
 }
 

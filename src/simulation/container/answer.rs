@@ -4,24 +4,34 @@
 //! the answer to a request tells.
 
 use std::net::{IpAddr, Ipv4Addr};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
 
 /// A file that Webots does not have. A request for `/` would begin a WebSocket.
 const REQUEST: &[u8] = b"GET /robots.txt HTTP/1.0\r\nHost: localhost\r\n\r\n";
-/// Pause between two requests.
-const PAUSE: Duration = Duration::from_millis(25);
-/// Timeout of a request: Webots answers none while it reads a world.
+/// Bounds of the pause between two requests.
+const PAUSE: (Duration, Duration) = (Duration::from_millis(25), Duration::from_millis(500));
+/// The pause is such a part of the time since the start, so that many that start on a busy machine don't ask it all the time.
+const PART: u32 = 20;
+/// Timeout of the first request. One that is sent before the container has its address would take a second, until the kernel
+/// repeats its first packet.
+const FIRST_TIMEOUT: Duration = Duration::from_millis(100);
+/// Timeout that later ones approach: Webots answers none while it reads a world.
 const TIMEOUT: Duration = Duration::from_secs(2);
 
 /// Waits until there is an answer on this port of an address that the server binds to.
 pub async fn until_answering(bind: IpAddr, port: u16) {
     // Containers listen on IPv4, see the variable BIND of their templates.
     let address = if bind.is_ipv4() && !bind.is_unspecified() { bind } else { Ipv4Addr::LOCALHOST.into() };
-    while !matches!(actix_rt::time::timeout(TIMEOUT, answers((address, port).into())).await, Ok(Ok(true))) {
-        actix_rt::time::sleep(PAUSE).await;
+    let (begin, mut timeout) = (Instant::now(), FIRST_TIMEOUT);
+    loop {
+        match actix_rt::time::timeout(timeout, answers((address, port).into())).await {
+            Ok(Ok(true)) => return,
+            Ok(_) => actix_rt::time::sleep((begin.elapsed() / PART).clamp(PAUSE.0, PAUSE.1)).await,
+            Err(_) => timeout = TIMEOUT.min(timeout * 2),
+        }
     }
 }
 

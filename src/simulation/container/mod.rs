@@ -29,6 +29,6 @@ pub use answer::until_answering;
 pub use check::{check, daemon_fault, init_fault};
 pub use containers::Containers;
 pub use objects::{Owner, sweep};
-pub use prepared::Prepared;
+pub use prepared::{Cause, Prepared};
 pub use request::Request;
 pub use webots_yml::{Kind, WebotsYml};

@@ -2,6 +2,8 @@
 
 use actix::prelude::*;
 
+use crate::simulation::container::Cause;
+
 /// An event of a running Webots.
 #[derive(Message, Debug, Clone, PartialEq, Eq)]
 #[rtype(result = "()")]
@@ -27,8 +29,19 @@ pub enum WebotsEvent {
 pub struct Exit {
     /// Whether it ended by itself and in order.
     pub clean: bool,
+    /// Whether what it ran on was lost: another server may take its client.
+    pub lost: bool,
     /// In words, for the client.
     pub why: String,
+}
+
+/// What has ended a container, in words for the client.
+#[must_use]
+pub fn words(cause: Cause) -> &'static str {
+    match cause {
+        Cause::OutOfMemory => "The simulation has taken more memory than it may (limits.memory)",
+        Cause::Docker => "Docker has stopped on this simulation server, and all simulations in it have ended",
+    }
 }
 
 /// Sends a client the events of its Webots. The exit is sent in any case, also where the actor panics and is dropped.
@@ -61,7 +74,7 @@ impl Drop for ExitNotifier {
     fn drop(&mut self) {
         if !self.exit_told {
             let why = "The simulation was lost by a fault of this server".to_owned();
-            self.tell(WebotsEvent::Exited(Exit { clean: false, why }));
+            self.tell(WebotsEvent::Exited(Exit { clean: false, lost: false, why }));
         }
     }
 }

@@ -9,14 +9,14 @@ use std::time::{Duration, Instant};
 use actix::prelude::*;
 use tokio::sync::Notify;
 
-use super::event::{Exit, ExitNotifier, WebotsEvent};
+use super::event::{self, Exit, ExitNotifier, WebotsEvent};
 use super::launch_spec::LaunchSpec;
 use super::launched::{self, End, Launched};
 use super::output::{OutputEvent, Tail};
 use super::runtime::{Preparation, Runtime};
 use crate::shared::run::seconds_since_1970;
 use crate::simulation::checkout::CheckoutError;
-use crate::simulation::container::until_answering;
+use crate::simulation::container::{Cause, until_answering};
 use crate::simulation::machine::display;
 use crate::simulation::process::{ExitReason, ProcessGroup, process_tree};
 use crate::simulation::snapshot::{Change, Stage};
@@ -204,16 +204,15 @@ impl Webots {
         }
     }
 
-    fn ended(&mut self, End { reason, out_of_memory }: &End, ctx: &mut Context<Self>) {
+    fn ended(&mut self, End { reason, cause }: &End, ctx: &mut Context<Self>) {
         log::info!("port {}: Webots {reason}", self.port);
-        let out_of_memory =
-            out_of_memory.then(|| "The simulation has taken more memory than it may (limits.memory)".to_owned());
-        let mut exit = match self.stopped_for.take().or(out_of_memory) {
-            Some(why) => Exit { clean: false, why: self.with_output(&why) },
-            None if *reason == ExitReason::Code(0) => Exit { clean: true, why: "Webots has ended".to_owned() },
-            None => Exit { clean: false, why: self.with_output(&format!("Webots {reason}")) },
+        let lost = self.stopped_for.is_none() && *cause == Some(Cause::Docker);
+        let mut exit = match self.stopped_for.take().or(cause.map(event::words).map(str::to_owned)) {
+            Some(why) => Exit { clean: false, lost, why: self.with_output(&why) },
+            None if *reason == ExitReason::Code(0) => Exit { clean: true, lost, why: "Webots has ended".to_owned() },
+            None => Exit { clean: false, lost, why: self.with_output(&format!("Webots {reason}")) },
         };
-        if exit.clean || self.listening {
+        if exit.clean || exit.lost || self.listening {
             return self.exited(exit, ctx);
         }
         exit.why += self.spec.launcher.remark();
@@ -226,13 +225,13 @@ impl Webots {
             .into_actor(self)
             .map(move |hint, this, ctx| {
                 let hint = hint.ok().flatten().map(|hint| format!(" Note: {hint}.")).unwrap_or_default();
-                this.exited(Exit { clean: false, why: exit.why.clone() + &hint }, ctx);
+                this.exited(Exit { clean: false, lost, why: exit.why.clone() + &hint }, ctx);
             })
             .spawn(ctx);
     }
 
     fn not_started(&mut self, why: &str, ctx: &mut Context<Self>) {
-        self.exited(Exit { clean: false, why: why.to_owned() }, ctx);
+        self.exited(Exit { clean: false, lost: false, why: why.to_owned() }, ctx);
     }
 
     fn exited(&mut self, exit: Exit, ctx: &mut Context<Self>) {
