@@ -1,8 +1,9 @@
 //! What a project may ask for in its webots.yml: an editor, a competition; and the administrator's templates.
 
+use std::process::Command;
 use std::time::Duration;
 
-use super::daemon::{ask, containers, docker, of_service, server};
+use super::daemon::{ask, containers, docker, of_service, open_socket, server};
 use super::image::NAME;
 use crate::support::client::Client;
 use crate::support::git::{Forge, WORLD, arm};
@@ -117,21 +118,35 @@ async fn a_participant_connects_to_webots_and_what_the_editor_changes_counts_aft
     until("all three are gone", async || containers(&server).is_empty()).await;
 }
 
+/// A user of the machine who is not root, by number.
+const ORDINARY: u32 = 12345;
+
 #[actix_rt::test]
 async fn what_an_image_keeps_at_home_is_found_and_can_be_changed() {
     let Some(_docker) = docker().await else { return };
-    let forge = Forge::with_arm();
-    let server = server(forge.path(), 1).start().await;
+    let (forge, folder) = (Forge::with_arm(), tempfile::tempdir().unwrap());
+    open_socket();
+    for path in [forge.path(), folder.path()] {
+        let owner = format!("{ORDINARY}:{ORDINARY}");
+        assert!(Command::new("chown").arg("-R").arg(owner).arg(path).status().unwrap().success());
+    }
+    let user = format!("exec setpriv --reuid {ORDINARY} --regid {ORDINARY} --clear-groups \"$0\" \"$@\"");
+    let server = server(forge.path(), 1).folder(folder.path()).before(&user).start().await;
     let mut client = Client::start(&server, &arm()).await;
     client.patiently("webots:", BUILT).await;
     let webots = of_service(&server, "webots")[0].clone();
     let inside = |command: &str| ask(&["exec", &webots, "sh", "-c", command]);
+    assert_eq!(inside("id -u"), ORDINARY.to_string());
     assert_eq!(inside("cat ~/.cache/Cyberbotics/Webots/assets/*"), "an asset of the image");
     assert!(inside("cat ~/.config/Cyberbotics/Webots-R2025a.conf").contains("cacheSize=1024"));
     inside("echo x >~/.cache/Cyberbotics/Webots/assets/new && echo y >>~/.config/Cyberbotics/Webots-R2025a.conf");
     // The image itself stays as it is, for others.
-    assert!(inside("touch /root/new 2>&1 || true").contains("Read-only file system"));
+    assert!(inside("touch /usr/local/new 2>&1 || true").contains("Read-only file system"));
     assert_eq!(inside("cat /proc/1/comm"), "docker-init");
+    // What it writes is the server's to remove.
+    inside("mkdir -p /usr/local/webots-project/deep && touch /usr/local/webots-project/deep/new");
+    client.leave().await;
+    until("all is gone", async || containers(&server).is_empty()).await;
 }
 
 #[actix_rt::test]
