@@ -5,6 +5,8 @@
 //! - `class`: how long 1, 10, 100 and 200 clients take that start at once, in turns with a bare loop that does the same;
 //! - `idle`: what simulations that stand idle cost the server;
 //! - `start`: what a cached start costs over the git commands that it runs, and what a sandbox adds to it;
+//! - `containers`: what a start in containers takes beside `docker compose up` by hand, one and thirty at once; needs root
+//!   and dockerd;
 //! - `soak`: whether a thousand starts and stops in a row leave anything: processes, file descriptors, ports, folders,
 //!   threads, memory.
 //!
@@ -22,6 +24,7 @@
 )]
 
 mod class;
+mod containers;
 mod idle;
 mod load;
 #[path = "../../tests/simulation/soak.rs"]
@@ -72,6 +75,7 @@ enum Part {
     Idle,
     Load,
     Start,
+    Containers,
     Soak,
 }
 
@@ -115,6 +119,9 @@ async fn main() -> ExitCode {
     }
     if is_wanted(Part::Idle) {
         idle::measure(&mut verdict, &levels, Duration::from_secs(arguments.seconds)).await;
+    }
+    if is_wanted(Part::Containers) {
+        containers::measure(&mut verdict).await;
     }
     if is_wanted(Part::Soak) {
         soak_and_tell(&mut verdict, arguments.starts).await;

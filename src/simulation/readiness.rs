@@ -13,7 +13,7 @@ use which::which;
 
 use super::config::{Isolation, SimulationConfig};
 use super::failed_starts::FailedStarts;
-use crate::simulation::container::daemon_fault;
+use crate::simulation::container::{daemon_fault, init_fault};
 use crate::simulation::machine::{Readings, display};
 
 /// Time between two checks.
@@ -37,19 +37,23 @@ pub fn watch(
     failed_starts: Arc<FailedStarts>,
 ) -> watch::Receiver<Option<String>> {
     // The first check comes before the first client.
-    let first = check_gpus(&config, &readings.borrow()).and_then(|()| check(&config, &run)).err();
+    let first = check_gpus(&config, &readings.borrow()).and_then(|()| check(&config, &run));
+    let first = first.and_then(|()| check_init(&config, false)).err();
     let (sender, problem) = watch::channel(None);
     publish(&sender, first, &failed_starts);
     actix_rt::spawn(async move {
         let mut clocks = (Instant::now(), SystemTime::now());
+        let mut has_init = sender.borrow().is_none();
         while !sender.is_closed() {
             let pause = if sender.borrow().is_some() { PERIOD_WHILE_NOT_READY } else { PERIOD };
             actix_rt::time::sleep(pause).await;
             clocks = log_clock_step(clocks);
             let gpus = check_gpus(&config, &readings.borrow());
             let (config, run) = (Arc::clone(&config), run.clone());
-            let checked = actix_rt::task::spawn_blocking(move || gpus.and_then(|()| check(&config, &run)).err()).await;
-            if let Ok(found) = checked {
+            let all =
+                move || gpus.and_then(|()| check(&config, &run)).and_then(|()| check_init(&config, has_init)).err();
+            if let Ok(found) = actix_rt::task::spawn_blocking(all).await {
+                has_init |= found.is_none();
                 publish(&sender, found, &failed_starts);
             }
         }
@@ -153,6 +157,14 @@ fn write(folder: &Path) -> Result<(), String> {
 
 fn not_writable(error: &std::io::Error) -> String {
     format!("This simulation server can't write in its cache: {error}")
+}
+
+/// Checks that containers can have an init process. One that was found is not looked for again: it takes a container.
+fn check_init(config: &SimulationConfig, has_init: bool) -> Result<(), String> {
+    if has_init || config.isolation != Isolation::Container {
+        return Ok(());
+    }
+    init_fault().map_or(Ok(()), Err)
 }
 
 /// The program that is started for each client; in a container, that of its image.

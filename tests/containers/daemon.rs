@@ -66,7 +66,7 @@ fn start() -> Option<Daemon> {
     // Unless another daemon of the machine uses it.
     Command::new("ip").args(["link", "del", INTERFACE]).stderr(Stdio::null()).status().unwrap();
     let daemon = Daemon { folder };
-    daemon.launch();
+    daemon.launch(&[]);
     image::make(&daemon.folder);
     Some(daemon)
 }
@@ -78,8 +78,10 @@ fn missing() -> Option<String> {
     }
     let paths = std::env::var_os("PATH").unwrap();
     let is_there = |program: &str| std::env::split_paths(&paths).any(|folder| folder.join(program).is_file());
-    let programs = ["dockerd", "docker", "docker-compose", "unshare", "setpriv", "ip"];
-    programs.into_iter().find(|program| !is_there(program)).map(|program| format!("there is no {program}"))
+    let programs = ["dockerd", "docker", "docker-compose", "docker-init", "unshare", "setpriv", "ip"];
+    let absent =
+        programs.into_iter().find(|program| !is_there(program)).map(|program| format!("there is no {program}"));
+    absent.or_else(|| image::prepare().err())
 }
 
 /// Removes what earlier runs have left.
@@ -98,7 +100,7 @@ impl Daemon {
     }
 
     /// Starts the daemon as the first process of a namespace: with it everything inside ends.
-    fn launch(&self) {
+    fn launch(&self, options: &'static [&str]) {
         let folder = self.folder.clone();
         // What one that was killed has left.
         std::fs::remove_file(folder.join("pid")).ok();
@@ -127,6 +129,7 @@ impl Daemon {
                 "--ip6tables=false",
                 "--ip-masq=false",
             ]);
+            command.args(options);
             let mut child: Child = command
                 .stdin(Stdio::null())
                 .stdout(log.try_clone().unwrap())
@@ -157,11 +160,30 @@ fn daemon() -> &'static Daemon {
     DAEMON.get().unwrap().as_ref().unwrap()
 }
 
+/// Lets all users of the machine use the daemon, as those in the group `docker` may use that of the machine.
+pub fn open_socket() {
+    let socket = daemon().folder.join("docker.sock");
+    std::fs::set_permissions(socket, std::os::unix::fs::PermissionsExt::from_mode(0o666)).unwrap();
+}
+
 /// Makes an image of an archive, in the daemon whose files are in this folder.
-pub fn import(folder: &Path, tar: &str, name: &str, options: &[&str]) {
-    let daemon = Daemon { folder: folder.to_owned() };
-    let made = daemon.command(&[&["import"], options, &[tar, name]].concat()).output().unwrap();
+pub fn import(folder: &Path, tar: &str, name: &str) {
+    made(folder, &["import", tar, name]);
+}
+
+/// Makes an image of a folder with a Dockerfile, in the daemon whose files are in this folder.
+pub fn build(folder: &Path, context: &Path, name: &str) {
+    made(folder, &["build", "--network", "none", "--tag", name, context.to_str().unwrap()]);
+}
+
+fn made(folder: &Path, arguments: &[&str]) {
+    let made = Daemon { folder: folder.to_owned() }.command(arguments).output().unwrap();
     assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
+}
+
+/// How programs reach the daemon.
+pub fn host() -> String {
+    daemon().socket()
 }
 
 /// What `docker` prints with these arguments.
@@ -177,8 +199,16 @@ pub fn server(repositories: &Path, places: u16) -> Builder {
         .set("isolation", "container")
         .set("webots", serde_json::Value::Null)
         .set("timing", serde_json::json!({ "heartbeat": 0.5 }))
-        .env("DOCKER_HOST", &daemon().socket())
+        .env("DOCKER_HOST", &host())
         .env("DOCKER_CONFIG", &daemon().folder.display().to_string())
+}
+
+/// What `--check` prints for a server's configuration.
+pub fn check(server: &crate::support::program::Server) -> String {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_simulation-server"));
+    command.arg("--check").arg(server.folder().join("config.json")).env("DOCKER_HOST", host());
+    let output = command.output().unwrap();
+    format!("{}{}", String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr))
 }
 
 /// The containers of a server, those that have ended among them: the names of their projects.
@@ -226,8 +256,8 @@ impl Alone {
         }
     }
 
-    /// Starts it again.
-    pub fn start(&self) {
-        daemon().launch();
+    /// Starts it again, with more options.
+    pub fn start(&self, options: &'static [&str]) {
+        daemon().launch(options);
     }
 }

@@ -19,8 +19,8 @@ fn doing(script: &str) -> Forge {
     let forge = Forge::with_arm();
     let webots = format!("#!/bin/bash\n{script}\nwhile :; do echo .; sleep 0.2; done\n");
     let dockerfile = format!(
-        "FROM {NAME}\nCOPY . /usr/local/webots-project\nRUN cp /usr/local/webots-project/fake /usr/bin/webots && chmod 755 \
-         /usr/bin/webots\n"
+        "FROM {NAME}\nCOPY . /usr/local/webots-project\nRUN cp /usr/local/webots-project/fake /usr/local/webots/webots && chmod 755 \
+         /usr/local/webots/webots\n"
     );
     forge.commit("lab/arm", "main", &[("fake", &webots), ("Dockerfile", &dockerfile)]);
     forge

@@ -4,7 +4,7 @@ use std::time::{Duration, Instant};
 
 use nix::sys::signal::Signal;
 
-use super::daemon::{alone, ask, containers, docker, prefix, server};
+use super::daemon::{alone, ask, check, containers, docker, prefix, server};
 use crate::support::client::Client;
 use crate::support::git::{Forge, arm};
 use crate::support::{http, until};
@@ -98,12 +98,33 @@ async fn a_daemon_that_is_stopped_is_told_and_all_goes_on_when_it_is_back() {
     let mut client = Client::start(&server, &arm()).await;
     client.patiently("webots:", Duration::from_secs(60)).await;
     docker.kill();
-    client.patiently("loading: Error:", Duration::from_secs(60)).await;
+    let lost = client.patiently("loading: Error:", Duration::from_secs(60)).await;
+    assert!(lost.contains("Docker has stopped on this simulation server"), "{lost}");
+    // Another server may take it.
+    assert_eq!(client.closed().await, Some(1013));
     let told = Client::start(&server, &arm()).await.patiently("loading: Error:", Duration::from_secs(60)).await;
     assert!(told.contains("Docker does not answer on this simulation server"), "{told}");
     until("it says so", async || http::get(&server.url("/load")).await.text().trim() == "100").await;
-    docker.start();
+    docker.start(&[]);
     until("it takes clients again", async || http::get(&server.url("/load")).await.text().trim() != "100").await;
     Client::start(&server, &arm()).await.patiently("webots:", Duration::from_secs(60)).await;
     until("what the daemon has kept is gone", async || containers(&server).len() <= 1).await;
+}
+
+#[actix_rt::test]
+async fn a_docker_without_an_init_process_is_told_with_what_to_install() {
+    let Some(docker) = alone().await else { return };
+    docker.kill();
+    docker.start(&["--init-path", "/nowhere/docker-init"]);
+    let forge = Forge::with_arm();
+    let server = server(forge.path(), 1).start().await;
+    until("it takes no client", async || http::get(&server.url("/load")).await.text().trim() == "100").await;
+    let told = Client::start(&server, &arm()).await.patiently("loading: Error:", Duration::from_secs(60)).await;
+    assert!(told.contains("docker-init: on Debian and Ubuntu the packages docker.io and tini"), "{told}");
+    let checked = check(&server);
+    assert!(checked.contains("can't give containers an init process"), "{checked}");
+    docker.kill();
+    docker.start(&[]);
+    until("it takes clients again", async || http::get(&server.url("/load")).await.text().trim() != "100").await;
+    Client::start(&server, &arm()).await.patiently("webots:", Duration::from_secs(60)).await;
 }

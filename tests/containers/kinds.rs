@@ -1,8 +1,9 @@
 //! What a project may ask for in its webots.yml: an editor, a competition; and the administrator's templates.
 
+use std::process::Command;
 use std::time::Duration;
 
-use super::daemon::{ask, containers, docker, of_service, server};
+use super::daemon::{ask, containers, docker, of_service, open_socket, server};
 use super::image::NAME;
 use crate::support::client::Client;
 use crate::support::git::{Forge, WORLD, arm};
@@ -50,51 +51,102 @@ async fn a_folder_that_leads_out_of_the_project_is_not_shown_to_an_editor() {
     assert!(told.contains("The project has no folder controllers/out"), "{told}");
 }
 
+/// The layout of the Dockerfiles of real competitions: a default port that their server replaces, and an entry point that
+/// a shell reads.
+const COMPETITION: [(&str, &str); 4] = [
+    ("Dockerfile", "FROM {NAME}\nRUN mkdir -p /usr/local/webots-project\nCOPY . /usr/local/webots-project\n"),
+    (
+        "controllers/Dockerfile",
+        "FROM {NAME}\nCOPY . /usr/local/webots-project/controllers\nENV PORT=1234\nARG WEBOTS_CONTROLLER_URL\nENV \
+         WEBOTS_CONTROLLER_URL=${WEBOTS_CONTROLLER_URL}\nWORKDIR /usr/local/webots-project/controllers/participant\nENTRYPOINT \
+         /usr/local/webots/webots-controller --robot-name=\"${WEBOTS_CONTROLLER_URL}\" --port=\"${PORT}\" participant.py\n",
+    ),
+    ("controllers/participant/participant.py", "print(1)\n"),
+    (
+        "webots.yml",
+        "publish: true\ntype: competition\ndockerCompose: competition:webots-project/controllers/participant/\n",
+    ),
+];
+
 #[actix_rt::test]
-async fn a_competition_runs_the_participants_controller_beside_and_starts_it_anew_at_a_reset() {
+async fn a_participant_connects_to_webots_and_what_the_editor_changes_counts_after_a_reset() {
     let Some(_docker) = docker().await else { return };
     let forge = Forge::with_arm();
-    // It says each start, and when it was.
-    let controller = format!(
-        "FROM {NAME}\nARG PROJECT_PATH\nARG WEBOTS_CONTROLLER_URL\nENV URL=$WEBOTS_CONTROLLER_URL\nCOPY . \
-         $PROJECT_PATH/controllers\nCMD [\"sh\", \"-c\", \"echo $URL >>/tmp/webots/starts; exec sleep 1000\"]\n"
-    );
-    // A Webots that is reset by a file.
-    let webots = "#!/bin/sh\nwhile :; do echo .; if [ -e /tmp/webots/reset ]; then rm /tmp/webots/reset; echo reset; fi; \
-                  sleep 0.2; done\n";
-    forge.commit(
-        "lab/arm",
-        "main",
-        &[
-            ("worlds/a.wbt", &format!("{WORLD}Robot {{ controller \"participant\" }}\n")),
-            ("controllers/participant/participant.py", "print(1)\n"),
-            ("controllers/Dockerfile", &controller),
-            ("fake", webots),
-            ("Dockerfile", &format!("FROM {NAME}\nCOPY . /usr/local/webots-project\nRUN cp /usr/local/webots-project/fake /usr/bin/webots && chmod 755 /usr/bin/webots\n")),
-            ("webots.yaml", "type: competition\ndockerCompose:competition:webots-project/controllers/participant\n"),
-        ],
-    );
+    let files = COMPETITION.map(|(path, text)| (path, text.replace("{NAME}", NAME)));
+    let world = format!("{WORLD}Robot {{ name \"participant\" controller \"participant\" }}\n");
+    let files = files.iter().map(|(path, text)| (*path, text.as_str())).chain([("worlds/a.wbt", world.as_str())]);
+    forge.commit("lab/arm", "main", &files.collect::<Vec<_>>());
     let server = server(forge.path(), 1).start().await;
+    let mut client = Client::start(&server, &arm()).await;
+    let address = client.patiently("webots:", BUILT).await;
+    let port = port_of(&address);
+    let webots = of_service(&server, "webots")[0].clone();
+    let connected = || -> Vec<serde_json::Value> {
+        let folder = format!("/tmp/webots/webots/{port}/ipc/participant");
+        let told = ask(&["exec", &webots, "sh", "-c", &format!("cat {folder}/connected 2>/dev/null || true")]);
+        told.lines().map(|line| serde_json::from_str(line).unwrap()).collect()
+    };
+    until("the participant is connected", async || connected().len() == 1).await;
+    let seen = connected().remove(0);
+    for (key, value) in [
+        ("arguments", serde_json::json!(["--robot-name=participant", format!("--port={port}"), "participant.py"])),
+        ("PORT", port.to_string().into()),
+        ("WEBOTS_STDOUT_REDIRECT", "1".into()),
+        ("WEBOTS_STDERR_REDIRECT", "1".into()),
+        ("WEBOTS_CONTROLLER_URL", "participant".into()),
+        ("folder", "/usr/local/webots-project/controllers/participant".into()),
+        ("uid", nix::unistd::getuid().as_raw().into()),
+        ("USER", "webots".into()),
+        ("HOME", "/tmp/home".into()),
+        ("terminal", true.into()),
+        ("source", "print(1)\n".into()),
+    ] {
+        assert_eq!(seen[key], value, "{key}");
+    }
+    // The editor changes the program, and the client resets the simulation.
+    let theia = &of_service(&server, "theia")[0];
+    ask(&["exec", theia, "sh", "-c", "echo 'print(2)' >/home/project/webots-project/participant.py"]);
+    let mut viewer = Client::connect(&address.trim_start_matches("webots:").replace("localhost", "127.0.0.1")).await;
+    viewer.send("x3d").await;
+    viewer.until("model:").await;
+    viewer.send("reset").await;
+    until("it is connected again", async || connected().len() == 2).await;
+    assert_eq!(connected().remove(1)["source"], "print(2)\n");
+    assert_eq!(of_service(&server, "webots")[0], webots);
+    drop(viewer);
+    client.leave().await;
+    until("all three are gone", async || containers(&server).is_empty()).await;
+}
+
+/// A user of the machine who is not root, by number.
+const ORDINARY: u32 = 12345;
+
+#[actix_rt::test]
+async fn what_an_image_keeps_at_home_is_found_and_can_be_changed() {
+    let Some(_docker) = docker().await else { return };
+    let (forge, folder) = (Forge::with_arm(), tempfile::tempdir().unwrap());
+    open_socket();
+    for path in [forge.path(), folder.path()] {
+        let owner = format!("{ORDINARY}:{ORDINARY}");
+        assert!(Command::new("chown").arg("-R").arg(owner).arg(path).status().unwrap().success());
+    }
+    let user = format!("exec setpriv --reuid {ORDINARY} --regid {ORDINARY} --clear-groups \"$0\" \"$@\"");
+    let server = server(forge.path(), 1).folder(folder.path()).before(&user).start().await;
     let mut client = Client::start(&server, &arm()).await;
     client.patiently("webots:", BUILT).await;
     let webots = of_service(&server, "webots")[0].clone();
     let inside = |command: &str| ask(&["exec", &webots, "sh", "-c", command]);
-    assert!(inside("cat /usr/local/webots-project/worlds/a.wbt").contains("controller \"<extern>\""));
-    assert!(
-        inside("ls /usr/local/webots-project /usr/local/webots-project/controllers")
-            .matches("remote_controller_launcher.py")
-            .count()
-            == 2
-    );
-    until("the controller has started", async || inside("cat /tmp/webots/starts 2>/dev/null || true") == "participant")
-        .await;
-    let theia = &of_service(&server, "theia")[0];
-    assert_eq!(ask(&["exec", theia, "cat", "/home/project/webots-project/participant.py"]), "print(1)");
-    inside("touch /tmp/webots/reset");
-    until("it has started again", async || inside("cat /tmp/webots/starts") == "participant\nparticipant").await;
-    assert_eq!(of_service(&server, "webots")[0], webots);
+    assert_eq!(inside("id -u"), ORDINARY.to_string());
+    assert_eq!(inside("cat ~/.cache/Cyberbotics/Webots/assets/*"), "an asset of the image");
+    assert!(inside("cat ~/.config/Cyberbotics/Webots-R2025a.conf").contains("cacheSize=1024"));
+    inside("echo x >~/.cache/Cyberbotics/Webots/assets/new && echo y >>~/.config/Cyberbotics/Webots-R2025a.conf");
+    // The image itself stays as it is, for others.
+    assert!(inside("touch /usr/local/new 2>&1 || true").contains("Read-only file system"));
+    assert_eq!(inside("cat /proc/1/comm"), "docker-init");
+    // What it writes is the server's to remove.
+    inside("mkdir -p /usr/local/webots-project/deep && touch /usr/local/webots-project/deep/new");
     client.leave().await;
-    until("all three are gone", async || containers(&server).is_empty()).await;
+    until("all is gone", async || containers(&server).is_empty()).await;
 }
 
 #[actix_rt::test]
@@ -112,7 +164,7 @@ async fn resets_without_end_start_a_controller_once_a_second_at_most() {
             ("controllers/participant/participant.py", "print(1)\n"),
             ("controllers/Dockerfile", &controller),
             ("fake", webots),
-            ("Dockerfile", &format!("FROM {NAME}\nCOPY . /usr/local/webots-project\nRUN cp /usr/local/webots-project/fake /usr/bin/webots && chmod 755 /usr/bin/webots\n")),
+            ("Dockerfile", &format!("FROM {NAME}\nCOPY . /usr/local/webots-project\nRUN cp /usr/local/webots-project/fake /usr/local/webots/webots && chmod 755 /usr/local/webots/webots\n")),
             ("webots.yml", "dockerCompose: \"competition:webots-project/controllers/participant\"\n"),
         ],
     );

@@ -10,6 +10,8 @@ set -Eeuo pipefail
 
 SCRIPT=$(readlink -f "$0")
 cd "$(dirname "$(readlink -f "${BASH_SOURCE[0]}")")/../.."
+# shellcheck source=tests/debian.sh
+. tests/debian.sh
 # shellcheck disable=SC1091
 readonly DISTRIBUTION=${FLEET_DISTRIBUTION:-$(. /etc/os-release && echo "${VERSION_CODENAME-}")}
 # Shared by all scripts, and this one's own.
@@ -140,14 +142,11 @@ boot() { # NAME
 # --- What a machine is made of.
 
 make_root() {
-    local mirror=${FLEET_MIRROR-} script=/usr/share/debootstrap/scripts/$DISTRIBUTION made="$PACKAGES ${LATER[*]}"
+    local mirror script made="$PACKAGES ${LATER[*]}"
     [[ ! -e $ROOT/.complete || $(<"$ROOT/.complete") != "$made" ]] || return 0
-    [[ -n $mirror ]] || mirror=$(sed -nE 's/^URIs: *([^ ]+).*/\1/p; s/^deb (\[[^]]*\] )?([^ ]+).*/\2/p' \
-        /etc/apt/sources.list /etc/apt/sources.list.d/*.{sources,list} 2>/dev/null || true)
-    mirror=${mirror%%$'\n'*}
+    mirror=$(debian_mirror)
     [[ -n $mirror ]] || skip 'this is no Debian or Ubuntu with a package mirror'
-    # A system that is newer than debootstrap is made as the others of its family.
-    [[ -e $script || $mirror != *ubuntu* ]] || script=/usr/share/debootstrap/scripts/gutsy
+    script=$(debootstrap_script "$DISTRIBUTION" "$mirror")
     rm -rf "$ROOT"
     echo "makes a clean $DISTRIBUTION, once"
     debootstrap --variant=minbase --include="$PACKAGES" "$DISTRIBUTION" "$ROOT" "$mirror" "$script" \

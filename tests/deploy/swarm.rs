@@ -38,6 +38,9 @@ fn its_images_are_those_that_the_dockerfile_makes() {
         assert!(stack.contains(&format!("webots-fleet/{stage}:{}", env!("CARGO_PKG_VERSION"))), "{stage}");
         assert!(dockerfile.contains(&format!(" AS {stage}\n")), "{stage}");
     }
+    // The classic builder makes all stages up to the target: that of Webots needs its image.
+    let begin = |stage: &str| dockerfile.find(stage).unwrap();
+    assert!(begin(" AS simulation-demo\n") < begin("FROM ${WEBOTS_IMAGE}"));
     // Nodes of a fleet of several machines get them from a registry, which is in their names.
     for image in stack.lines().filter_map(|line| line.trim().strip_prefix("image: ")) {
         assert!(image.starts_with("${") || !image.contains("webots-fleet/"), "{image} can't be named otherwise");

@@ -91,6 +91,30 @@ async fn the_documents_rules_for_a_machine_reach_every_port_of_the_machine() {
     every_port_is_reached(Rules::DocumentsMachine).await;
 }
 
+async fn an_editor_is_at_the_port_of_its_webots_and_500_more(rules: Rules) {
+    let fleet = Fleet::start(rules).await;
+    let editor = fleet.here.port + 1 + 500;
+    listen(TcpListener::bind(("127.0.0.1", editor)).unwrap(), |request| {
+        Some(if request.path() == "/a%20b?c" { (200, "editor") } else { (404, "") })
+    });
+    let answer = fleet.browser.get(&format!("/{editor}/a%20b?c")).await;
+    assert_eq!((answer.status.as_u16(), answer.text().as_str()), (200, "editor"));
+    // What a participant's programs make of it can't act as the administrator's pages.
+    assert_eq!(answer.header("content-security-policy"), Some("sandbox allow-scripts"));
+    // The simulation server itself has no editor.
+    assert_eq!(fleet.browser.get(&format!("/{}/", editor - 1)).await.status, 404);
+}
+
+#[actix_rt::test]
+async fn an_editor_is_reached_through_apache() {
+    an_editor_is_at_the_port_of_its_webots_and_500_more(Rules::Apache).await;
+}
+
+#[actix_rt::test]
+async fn an_editor_is_reached_through_nginx() {
+    an_editor_is_at_the_port_of_its_webots_and_500_more(Rules::Nginx).await;
+}
+
 async fn pages_are_sent_on_to_https_and_the_bare_name(rules: Rules) {
     let fleet = Fleet::start(rules).await;
     let browser = &fleet.browser;

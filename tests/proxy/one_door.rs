@@ -103,7 +103,7 @@ impl Fleet {
             &door.site(&certificate, (http, https), &session.address()),
             &[
                 ("(?<fleet_port>2000)", &format!("(?<fleet_port>{port})")),
-                ("200[1-9]|201[0-9]|2020)/ {", &format!("{})/ {{", places.join("|"))),
+                ("200[1-9]|201[0-9]|2020", &places.join("|")),
             ],
         );
         let web = WebServer::start(Kind::Nginx, (http, https), &site, IDLE).await;

@@ -45,6 +45,7 @@ impl Rules {
     pub fn text(self, place: &Place) -> String {
         let Place { http, https, session, here, there, chain, key } = place;
         let pattern = |ports: &[u16]| ports.iter().map(u16::to_string).collect::<Vec<_>>().join("|");
+        let editors = |ports: &[u16]| pattern(&ports[1..].iter().map(|port| port + 500).collect::<Vec<_>>());
         let any_address = |port: &str| format!("listen [::]:{port};\n");
         match self {
             Self::Apache => adapt(
@@ -61,6 +62,8 @@ impl Rules {
                     ("|2000|3000)/)", &format!("|{}|{})/)", here[0], there[0])),
                     ("20[01][0-9]|2020", &pattern(here)),
                     ("30[01][0-9]|3020", &pattern(there)),
+                    ("250[1-9]|251[0-9]|2520", &editors(here)),
+                    ("350[1-9]|351[0-9]|3520", &editors(there)),
                     ("192.0.2.3", "127.0.0.2"),
                 ],
             ),
@@ -83,6 +86,8 @@ impl Rules {
                     ("  3000    \"\";", &format!("  {} \"\";", there[0])),
                     ("20[01][0-9]|2020", &pattern(here)),
                     ("30[01][0-9]|3020", &pattern(there)),
+                    ("250[1-9]|251[0-9]|2520", &editors(here)),
+                    ("350[1-9]|351[0-9]|3520", &editors(there)),
                     ("192.0.2.3", "127.0.0.2"),
                 ],
             ),

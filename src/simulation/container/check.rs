@@ -8,13 +8,23 @@ use super::packet_filter;
 use crate::shared::text::one_line;
 use crate::simulation::config::SimulationConfig;
 
-/// Looks whether simulations can run in containers. Blocks for some seconds at most.
+/// Timeout of a command that starts a container, in seconds.
+const START: &str = "30";
+/// Where Docker puts its init process into a container. The program is static: it runs in an empty image.
+const INIT: &str = "/sbin/docker-init";
+/// The empty image, shared by all servers of a machine.
+const EMPTY_IMAGE: &str = "webots-fleet/init";
+/// An empty archive in the format of tar: two blocks of zeros.
+const EMPTY_TAR: [u8; 1024] = [0; 1024];
+
+/// Checks whether simulations can run in containers. Blocks for some seconds at most.
 ///
 /// # Errors
 /// What is missing, in words for an administrator.
 pub fn check(config: &SimulationConfig) -> Result<String, String> {
     Docker::find(Path::new("/"))?;
     daemon_fault().map_or(Ok(()), Err)?;
+    init_fault().map_or(Ok(()), Err)?;
     packet_filter::missing().map_or(Ok(()), Err)?;
     Ok(format!("it answers; worlds run in {}, or the image of their project's Dockerfile", config.container.image))
 }
@@ -22,13 +32,44 @@ pub fn check(config: &SimulationConfig) -> Result<String, String> {
 /// Why the daemon can't be used now, in words for clients and administrators. Blocks for five seconds at most.
 #[must_use]
 pub fn daemon_fault() -> Option<String> {
+    let why = failure("5", &["version", "--format", "{{.Server.Version}}"])?;
+    Some(format!("Docker does not answer on this simulation server: {why}"))
+}
+
+/// Why containers can't have an init process, in words for clients and administrators; `None` if they can.
+///
+/// Without one, `xvfb-run` of the images is process 1, to which Xvfb sends no signal, so that it waits forever. What
+/// `docker info` prints does not tell: the version of Debian's docker-init is empty there. So a container runs it.
+/// Blocks for a second, for a minute at most.
+#[must_use]
+pub fn init_fault() -> Option<String> {
+    let import = || {
+        let tar = tempfile::NamedTempFile::new().and_then(|tar| std::fs::write(tar.path(), EMPTY_TAR).map(|()| tar));
+        match tar {
+            Ok(tar) => failure(START, &["import", &tar.path().to_string_lossy(), EMPTY_IMAGE]),
+            Err(error) => Some(error.to_string()),
+        }
+    };
+    let is_missing = failure(START, &["image", "inspect", EMPTY_IMAGE]);
+    let why = is_missing
+        .and_then(|_| import())
+        .or_else(|| failure(START, &["run", "--rm", "--init", "--network", "none", EMPTY_IMAGE, INIT, "--version"]));
+    Some(format!(
+        "Docker of this simulation server can't give containers an init process (docker run --init): {}. Its administrator \
+         can install docker-init: on Debian and Ubuntu the packages docker.io and tini have it, or docker-ce",
+        why?
+    ))
+}
+
+/// Runs docker within a timeout in seconds. Returns the last line that it prints if it fails.
+fn failure(timeout: &str, arguments: &[&str]) -> Option<String> {
     let mut command = Command::new("timeout");
-    command.args(["5", "docker", "version", "--format", "{{.Server.Version}}"]).stdin(Stdio::null());
+    command.arg(timeout).arg("docker").args(arguments).stdin(Stdio::null());
     let output = match command.output() {
         Ok(output) if output.status.success() => return None,
         Ok(output) => String::from_utf8_lossy(&output.stderr).trim().to_owned(),
         Err(error) => error.to_string(),
     };
-    let line = output.lines().last().unwrap_or("it gives no answer within 5 seconds");
-    Some(format!("Docker does not answer on this simulation server: {}", one_line(line)))
+    let why = output.lines().find(|line| line.contains("rror")).or_else(|| output.lines().last());
+    Some(why.map_or_else(|| format!("it gives no answer within {timeout} seconds"), one_line))
 }

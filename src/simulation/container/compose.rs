@@ -139,6 +139,7 @@ impl Parts<'_> {
         let (settings, limits) = (&config.container, &config.limits);
         let memory = format!("{}m", limits.memory.unwrap_or(DEFAULT_MEMORY));
         let mut service = Service::from_iter([
+            ("container_name", json!(container_of(self.name, name))),
             ("restart", json!("no")),
             ("privileged", json!(false)),
             ("read_only", json!(settings.read_only)),
@@ -156,7 +157,8 @@ impl Parts<'_> {
                 json!({ "nofile": { "soft": limits.open_files.min(1024), "hard": limits.open_files }, "core": 0 }),
             ),
             ("logging", json!({ "driver": "none" })),
-            ("init", json!(self.engine.init)),
+            // Reaps orphans and forwards signals. That Docker has one is found at the server's start.
+            ("init", json!(true)),
             // The daemon would run it, as often as the image says.
             ("healthcheck", json!({ "disable": true })),
         ]);
@@ -176,6 +178,9 @@ impl Parts<'_> {
             }
             self.show(&mut service, &mut environment, config);
         }
+        // The images of these two have a program that makes it.
+        let home = if ["webots", "controller"].contains(&name) { "/tmp/home" } else { "/tmp" };
+        environment.push(("HOME", home.to_owned()));
         service.insert("environment", json!(BTreeMap::from_iter(environment)));
         json!(service)
     }
@@ -213,6 +218,12 @@ impl Parts<'_> {
     }
 }
 
+/// The name of the container of a service of a compose project.
+#[must_use]
+pub fn container_of(project: &str, service: &str) -> String {
+    format!("{project}-{service}")
+}
+
 /// The display of the machine, where that is asked for.
 fn display_of(config: &SimulationConfig) -> Option<String> {
     let is_machine = config.container.display == ContainerDisplay::Machine;
@@ -223,8 +234,7 @@ fn display_of(config: &SimulationConfig) -> Option<String> {
 type Service = BTreeMap<&'static str, Value>;
 
 /// Variables that all services have: with them programs write where they may, and find each other.
-const ENVIRONMENT: [(&str, &str); 4] =
-    [("HOME", "/tmp"), ("USER", "webots"), ("XDG_RUNTIME_DIR", "/tmp"), ("QT_X11_NO_MITSHM", "1")];
+const ENVIRONMENT: [(&str, &str); 3] = [("USER", "webots"), ("XDG_RUNTIME_DIR", "/tmp"), ("QT_X11_NO_MITSHM", "1")];
 
 /// How much memory a container may take where `limits.memory` does not say, in MiB.
 pub const DEFAULT_MEMORY: u64 = 4096;

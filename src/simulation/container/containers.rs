@@ -6,16 +6,18 @@ use std::sync::Arc;
 use tokio::sync::{OnceCell, Semaphore};
 use tokio_util::task::AbortOnDropHandle;
 
-use super::compose::Parts;
+use super::blocking::blocking;
+use super::compose::{Parts, container_of};
 use super::copy::Copy;
 use super::docker::{Docker, SHORT};
 use super::engine::Engine;
-use super::image::{Build, Images};
+use super::image::Images;
 use super::network;
 use super::objects::{self, Owner};
 use super::packet_filter;
 use super::places::{edited_folder, edited_in, project_folder, volume_of, world_in};
 use super::prepared::{Lease, Prepared};
+use super::project_images::Part;
 use super::recipe::{self, PROJECT_PATH, Recipe};
 use super::request::{Request, command};
 use super::steps;
@@ -104,22 +106,23 @@ impl Containers {
         let recipe = self.recipe(&request).await?;
         let lease = Lease::take(self.run.project(request.port), &self.live);
         let network = self.config.container.network.name();
-        network::join(&self.docker, network).await?;
+        let joined = network::join(&self.docker, network);
         let version = &request.project.world.version;
         let base = recipe::image_of(&self.config.container.image, version);
-        let mut image = base.clone();
-        match &recipe.dockerfile {
-            Some(text) => {
-                let build = self.build(&request, &base, text, "", recipe.make).await?;
-                image = self.images.build(Build { network, ..build }, progress).await?;
-                self.copy(&lease, &image, PROJECT_PATH.to_owned(), &request, request.project.folder()).await?;
-            }
-            None => self.images.pull(&base, progress).await?,
-        }
+        let part =
+            |text, folder| Part { project: &request.project, base: &base, text, folder, make: recipe.make, network };
+        let image = if let Some(text) = &recipe.dockerfile {
+            joined.await?;
+            let image = self.images.of_project(part(text, ""), progress).await?;
+            self.copy(&lease, &image, PROJECT_PATH.to_owned(), &request, request.project.folder()).await?;
+            image
+        } else {
+            let ((), id) = tokio::try_join!(joined, self.images.pull(&base, progress))?;
+            self.images.open(id, &request.project, progress).await?
+        };
         let controller = match &recipe.controller {
             Some(text) => {
-                let build = self.build(&request, &base, text, "controllers", recipe.make).await?;
-                let image = self.images.build(Build { network, ..build }, progress).await?;
+                let image = self.images.of_project(part(text, "controllers"), progress).await?;
                 let folder = recipe.asks.kind.folder_in_project().unwrap_or_default();
                 let from = Path::new(PROJECT_PATH).join(folder).to_string_lossy().into_owned();
                 self.copy(&lease, &image, from, &request, &edited_in(&request.project)).await?;
@@ -137,38 +140,6 @@ impl Containers {
         let (folder, templates) = (request.project.folder().to_owned(), self.templates.clone());
         let owner = self.owner.name().to_owned();
         blocking(move || Recipe::read(&folder, &templates, &owner)).await
-    }
-
-    /// An image of a project, or of a folder of it.
-    async fn build(
-        &self,
-        request: &Request,
-        base: &str,
-        text: &str,
-        folder: &str,
-        make: bool,
-    ) -> Result<Build, String> {
-        let mut arguments = vec![
-            format!("WEBOTS_DEFAULT_IMAGE={base}"),
-            format!("PROJECT_PATH={PROJECT_PATH}"),
-            format!("MAKE={}", u8::from(make)),
-        ];
-        if !folder.is_empty() {
-            arguments
-                .extend(["WEBOTS_CONTROLLER_URL=participant", "DEFAULT_CONTROLLER=participant"].map(str::to_owned));
-        }
-        let identity = request.project.identity();
-        let parts = [identity.as_str(), folder, text].into_iter().chain(arguments.iter().map(String::as_str));
-        let key = format!("{:032x}", objects::digest(parts.collect::<Vec<_>>().join("\0").as_bytes()));
-        let name = format!("Dockerfile{folder}");
-        let (dockerfile, text) = (request.project.instance.path().join(name), text.to_owned());
-        let file = dockerfile.clone();
-        blocking(move || std::fs::write(file, text).map_err(|error| error.to_string())).await?;
-        let project = Arc::clone(&request.project);
-        let (root, folder) = (project.folder().to_owned(), folder.to_owned());
-        // What was copied out of an image may have put a link to anywhere in its place.
-        let context = blocking(move || recipe::inside(&root, &folder)).await?;
-        Ok(Build { key, dockerfile, context, arguments, network: "", project })
     }
 
     /// Copies a folder of an image into the instance's folder.
@@ -216,9 +187,12 @@ impl Containers {
                 engine: &engine,
             };
             let template = templates.compose(&asks.kind)?;
-            parts.write(&template, &config).map_err(|error| format!("The files for compose can't be written: {error}"))
+            let written = parts.write(&template, &config);
+            let (options, variables) =
+                written.map_err(|error| format!("The files for compose can't be written: {error}"))?;
+            Ok((options, variables, template.services.into_keys()))
         };
-        let (options, variables) = blocking(files).await?;
+        let (options, variables, services) = blocking(files).await?;
         // More at a time would only be slower together.
         let turn = self.turns.acquire().await.map_err(|error| error.to_string())?;
         progress(steps::CREATING.to_owned());
@@ -228,7 +202,11 @@ impl Containers {
         drop(turn);
         let editor = (recipe.asks.kind != Kind::Default).then(|| "ide: enable".to_owned());
         let texts = editor.into_iter().chain(recipe.asks.project_type).collect();
-        let containers = self.made(&lease.name).await?;
+        let containers = services.map(|service| {
+            let container = container_of(&lease.name, &service);
+            (service, container)
+        });
+        let containers = containers.collect();
         Ok(Prepared::new(self.docker.clone(), lease, containers, texts, recipe.warnings))
     }
 
@@ -253,19 +231,4 @@ impl Containers {
         }
         Ok(all)
     }
-
-    /// The containers that compose has made: pairs of service and container.
-    async fn made(&self, name: &str) -> Result<Vec<(String, String)>, String> {
-        let filter = format!("label={}={name}", objects::PROJECT);
-        let format = "{{.Label \"com.docker.compose.service\"}} {{.ID}}";
-        let listed = self.docker.run(&["ps", "--all", "--filter", &filter, "--format", format], SHORT).await;
-        let listed = listed.map_err(|error| error.to_string())?;
-        let pairs = listed.lines().filter_map(|line| line.split_once(' '));
-        Ok(pairs.map(|(service, container)| (service.to_owned(), container.to_owned())).collect())
-    }
-}
-
-/// Does file work on a thread that serves nobody.
-async fn blocking<T: Send + 'static>(work: impl FnOnce() -> Result<T, String> + Send + 'static) -> Result<T, String> {
-    actix_rt::task::spawn_blocking(work).await.map_err(|error| error.to_string())?
 }

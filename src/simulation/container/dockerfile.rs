@@ -1,5 +1,6 @@
 //! What this server changes in a Dockerfile, and what it refuses. Pure.
 
+use std::collections::HashMap;
 use std::fmt::Write as _;
 
 use crate::shared::text::excerpt;
@@ -66,6 +67,47 @@ fn continued(line: &str) -> Result<Option<&str>, String> {
     Ok(Some(before))
 }
 
+/// The images that the stages of a Dockerfile begin with, given its arguments as `NAME=value`. One that depends on what
+/// can't be read here is left out.
+#[must_use]
+pub fn bases(text: &str, arguments: &[String]) -> Vec<String> {
+    let given = arguments.iter().filter_map(|argument| argument.split_once('='));
+    let given: HashMap<&str, &str> = given.collect();
+    let (mut variables, mut stages, mut bases) = (HashMap::new(), vec!["scratch".to_owned()], Vec::new());
+    let text = text.replace("\\\n", " ");
+    for line in text.lines() {
+        let words: Vec<&str> = line.split_whitespace().collect();
+        match (keyword(line).as_str(), words.get(1..).unwrap_or_default()) {
+            ("ARG", declared) if stages.len() == 1 => variables.extend(declared.iter().map(|variable| {
+                let (name, default) = variable.split_once('=').unwrap_or((variable, ""));
+                (name, *given.get(name).unwrap_or(&default.trim_matches('"')))
+            })),
+            ("FROM", rest) => {
+                let mut rest = rest.iter().filter(|word| !word.starts_with("--"));
+                let image = rest.next().map(|image| resolved(image, &variables)).unwrap_or_default();
+                let is_known = stages.contains(&image.to_lowercase()) || bases.contains(&image);
+                // Each stage has a name, or at least a number, which no image has.
+                stages.push(rest.nth(1).map(|name| name.to_lowercase()).unwrap_or_default());
+                if !is_known && !image.is_empty() && !image.contains('$') {
+                    bases.push(image);
+                }
+            }
+            _ => {}
+        }
+    }
+    bases
+}
+
+/// A word of a Dockerfile with the values of variables, as `$NAME` or `${NAME}`.
+fn resolved(word: &str, variables: &HashMap<&str, &str>) -> String {
+    let mut names: Vec<_> = variables.iter().collect();
+    // Of two names that begin alike the longer one is meant.
+    names.sort_by_key(|(name, _)| std::cmp::Reverse(name.len()));
+    names.into_iter().fold(word.to_owned(), |word, (name, value)| {
+        word.replace(&format!("${{{name}}}"), value).replace(&format!("${name}"), value)
+    })
+}
+
 fn keyword(instruction: &str) -> String {
     instruction.split_whitespace().next().unwrap_or_default().to_uppercase()
 }
@@ -101,6 +143,21 @@ mod tests {
         let expected = "# a comment\nARG IMAGE\nfrom $IMAGE \\\n  as base\nLABEL webots-fleet.owner=x\nRUN a \\\n  # inside\n  \
                         FROM b\nFROM scratch\nLABEL webots-fleet.owner=x\n";
         assert_eq!(labelled(text, "x").unwrap(), expected);
+    }
+
+    #[test]
+    fn the_images_that_a_dockerfile_begins_with_are_known() {
+        let arguments = ["WEBOTS_DEFAULT_IMAGE=webots:1".to_owned(), "MAKE=1".to_owned()];
+        for (text, expected) in [
+            ("FROM a:1\nRUN x\n", &["a:1"][..]),
+            ("ARG WEBOTS_DEFAULT_IMAGE\nfrom \\\n  ${WEBOTS_DEFAULT_IMAGE} AS Base\nFROM base\n", &["webots:1"]),
+            ("ARG TAG=\"2\"\nFROM --platform=linux/amd64 b:$TAG as x\nFROM scratch\nFROM c\nFROM c\n", &["b:2", "c"]),
+            ("FROM a\nARG IMAGE=b\nFROM $IMAGE\n", &["a"]),
+            ("ARG WEBOTS_DEFAULT_IMAGE=x\nFROM $WEBOTS_DEFAULT_IMAGE\n", &["webots:1"]),
+            ("no Dockerfile\n", &[]),
+        ] {
+            assert_eq!(bases(text, &arguments), expected, "{text}");
+        }
     }
 
     #[test]

@@ -8,8 +8,6 @@ use super::docker::{Docker, DockerError, SHORT};
 /// What this machine's Docker offers.
 #[derive(Debug, Clone, Default)]
 pub struct Engine {
-    /// A first process that ends what is left behind, and hands on signals (`docker-init`).
-    pub init: bool,
     /// Graphics cards of NVIDIA, with the runtime for containers.
     pub nvidia: bool,
     /// The groups that may use other graphics cards, where there are some.
@@ -27,13 +25,12 @@ impl Engine {
     /// # Errors
     /// When Docker fails.
     pub async fn ask(docker: &Docker) -> Result<Self, DockerError> {
-        let format = "{{.InitCommit.ID}} {{range $name, $_ := .Runtimes}}{{$name}} {{end}}";
+        let format = "{{range $name, $_ := .Runtimes}}{{$name}} {{end}}";
         let told = docker.run(&["info", "--format", format], SHORT).await?;
         // The newest line is the answer; warnings come before it.
         let answer = told.lines().last().unwrap_or_default();
-        let init = !answer.starts_with(' ') && !answer.is_empty();
         let nvidia = answer.split_whitespace().any(|name| name == "nvidia") && Path::new(NVIDIA).exists();
-        Ok(Self { init, nvidia, graphics: graphics() })
+        Ok(Self { nvidia, graphics: graphics() })
     }
 }
 

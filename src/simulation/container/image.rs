@@ -1,28 +1,27 @@
-//! The images of simulations: pulled, built once for all who want the same, and removed when nobody has used them for long.
+//! The images of simulations: pulled, and built once for all who want the same.
 
 use std::collections::HashMap;
 use std::ffi::OsString;
 use std::fmt;
-use std::path::PathBuf;
-use std::sync::Arc;
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
-use bytesize::ByteSize;
-use jiff::Timestamp;
 use tokio::sync::{Semaphore, watch};
 
+use super::blocking::blocking;
 use super::compose::DEFAULT_MEMORY;
 use super::docker::{Docker, DockerError, SHORT};
-use super::dockerfile::LABEL;
 use super::objects::Owner;
+use super::opened::{self, About};
 use super::steps;
 use crate::simulation::checkout::{Project, SingleFlight};
 use crate::simulation::config::SimulationConfig;
 
 /// The images of this server.
 pub struct Images {
-    docker: Docker,
-    owner: Owner,
+    pub(super) docker: Docker,
+    pub(super) owner: Owner,
     /// How long an image may take.
     limit: Duration,
     /// How much memory a step of a build may take, in MiB.
@@ -30,6 +29,8 @@ pub struct Images {
     /// As many images are built at a time.
     builds: Semaphore,
     jobs: SingleFlight<String, Result<(), String>>,
+    /// The places of data that images of this server declare, by their names, which never mean another image.
+    volumes: Mutex<HashMap<String, Vec<String>>>,
 }
 
 /// An image to be built.
@@ -49,40 +50,36 @@ pub struct Build {
     pub project: Arc<Project>,
 }
 
-/// An image that this server has built.
-#[derive(Debug)]
-struct Own {
-    name: String,
-    /// Bytes.
-    size: u64,
-    used: Timestamp,
-}
-
 impl Images {
     /// The images of this owner.
     #[must_use]
     pub fn new(docker: Docker, owner: Owner, config: &SimulationConfig) -> Self {
         let (builds, limit) = (Semaphore::new(config.container.builds), config.timing.build);
         let memory = config.limits.memory.unwrap_or(DEFAULT_MEMORY);
-        Self { docker, owner, limit, memory, builds, jobs: SingleFlight::default() }
+        Self { docker, owner, limit, memory, builds, jobs: SingleFlight::default(), volumes: Mutex::default() }
     }
 
     /// The name under which this server keeps its images. No other image has it.
-    fn repository(&self) -> String {
+    pub(super) fn repository(&self) -> String {
         format!("webots-fleet/{}", self.owner.name())
     }
 
-    /// Makes sure that an image is there that somebody publishes.
+    /// Makes sure that a published image is there. Returns its id, by which it is told from later ones of the same name.
     ///
     /// # Errors
-    /// Why it can't be had, in words for the client.
-    pub async fn pull(self: &Arc<Self>, image: &str, progress: &(impl Fn(String) + Send + Sync)) -> Result<(), String> {
-        if self.is_there(image).await? {
-            return Ok(());
+    /// Why it can't be pulled, in words for the client.
+    pub async fn pull(
+        self: &Arc<Self>,
+        image: &str,
+        progress: &(impl Fn(String) + Send + Sync),
+    ) -> Result<String, String> {
+        if let Some(id) = self.id(image).await? {
+            return Ok(id);
         }
         let (this, name) = (Arc::clone(self), image.to_owned());
         let start = move |news| async move { this.limited(this.pull_now(&name, news)).await };
-        self.jobs.join(image.to_owned(), progress, start).await
+        self.jobs.join(image.to_owned(), progress, start).await?;
+        self.id(image).await?.ok_or_else(|| format!("The image {image} was removed meanwhile"))
     }
 
     async fn pull_now(&self, image: &str, news: watch::Sender<String>) -> Result<(), String> {
@@ -102,25 +99,16 @@ impl Images {
         progress: &(impl Fn(String) + Send + Sync),
     ) -> Result<String, String> {
         let name = format!("{}:{}", self.repository(), build.key);
-        if self.is_there(&name).await? {
-            // So it counts as used just now.
-            self.docker.run(&["tag", &name, &name], SHORT).await.map_err(|error| error.to_string())?;
-            return Ok(name);
-        }
-        let (this, image) = (Arc::clone(self), name.clone());
-        let start = move |news| async move { this.limited(this.build_now(&image, build, news)).await };
-        self.jobs.join(name.clone(), progress, start).await.map(|()| name)
+        let (this, made) = (Arc::clone(self), name.clone());
+        self.once(name, progress, move |news| async move { this.build_now(&made, build, news).await }).await
     }
 
     async fn build_now(&self, name: &str, build: Build, news: watch::Sender<String>) -> Result<(), String> {
         let _permit = self.permit(&news).await?;
-        let memory = format!("{}m", self.memory);
-        let limits = ["--memory", &memory, "--memory-swap", &memory];
-        let words = ["build", "--force-rm", "--network", build.network, "--tag", name].into_iter().chain(limits);
-        let mut words: Vec<OsString> = words.chain(["--file"]).map(OsString::from).collect();
-        words.push(build.dockerfile.clone().into());
+        let id = build.dockerfile.with_extension("id");
+        let mut words: Vec<OsString> = ["--network", build.network, "--iidfile"].map(OsString::from).to_vec();
+        words.push(id.clone().into());
         words.extend(build.arguments.iter().flat_map(|argument| ["--build-arg".into(), argument.into()]));
-        words.push(build.context.clone().into());
         let mut step = String::new();
         let told = |line: &str| {
             if line.starts_with("Step ") {
@@ -130,10 +118,67 @@ impl Images {
                 news.send(text).ok();
             }
         };
-        let done = self.docker.follow(words, self.limit + SHORT, told).await;
-        // Until here the folder that is copied from has to stay.
-        drop(build.project);
-        done.map_err(|error| not_built(&step, &error))
+        let done = self.run_build(words, &build.dockerfile, &build.context, told).await;
+        done.map_err(|error| not_built(&step, &error))?;
+        // It has no name of its own: what it takes of the disk counts for the image on top.
+        let id = blocking(move || std::fs::read_to_string(id).map_err(|error| error.to_string())).await?;
+        self.open_now(&id, name, &build.project).await
+        // Until here the folder that was copied from has to stay.
+    }
+
+    /// Runs `docker build` with these options. `told` receives each line that it prints.
+    ///
+    /// # Errors
+    /// When it fails.
+    pub async fn run_build(
+        &self,
+        options: Vec<OsString>,
+        dockerfile: &Path,
+        context: &Path,
+        told: impl FnMut(&str),
+    ) -> Result<(), DockerError> {
+        let memory = format!("{}m", self.memory);
+        let always = ["build", "--force-rm", "--memory", &memory, "--memory-swap", &memory, "--file"];
+        let words = always.map(OsString::from).into_iter().chain(std::iter::once(dockerfile.into()));
+        let words = words.chain(options).chain(std::iter::once(context.into())).collect();
+        self.docker.follow(words, self.limit + SHORT, told).await
+    }
+
+    /// Makes the image in which the server's user finds what the image's own user has at home, unless it is there. Returns
+    /// its name.
+    ///
+    /// # Errors
+    /// Why it can't be made, in words for the client.
+    pub async fn open(
+        self: &Arc<Self>,
+        id: String,
+        project: &Arc<Project>,
+        progress: &(impl Fn(String) + Send + Sync),
+    ) -> Result<String, String> {
+        let name = format!("{}:{}", self.repository(), opened::key(std::iter::once(id.as_str())));
+        let (this, made, project) = (Arc::clone(self), name.clone(), Arc::clone(project));
+        self.once(name, progress, move |_| async move { this.open_now(&id, &made, &project).await }).await
+    }
+
+    /// Has a job make an image, unless it is there. Joins one that is doing so.
+    async fn once<F: Future<Output = Result<(), String>> + Send + 'static>(
+        self: &Arc<Self>,
+        name: String,
+        progress: &(impl Fn(String) + Send + Sync),
+        job: impl FnOnce(watch::Sender<String>) -> F,
+    ) -> Result<String, String> {
+        // One that is there counts as used just now.
+        match self.docker.run(&["tag", &name, &name], SHORT).await {
+            Ok(_) => return Ok(name),
+            Err(DockerError::Failed { .. }) => {}
+            Err(error) => return Err(error.to_string()),
+        }
+        let this = Arc::clone(self);
+        let start = move |news| {
+            let job = job(news);
+            async move { this.limited(job).await }
+        };
+        self.jobs.join(name.clone(), progress, start).await.map(|()| name)
     }
 
     async fn permit(&self, news: &watch::Sender<String>) -> Result<tokio::sync::SemaphorePermit<'_>, String> {
@@ -150,12 +195,27 @@ impl Images {
         actix_rt::time::timeout(self.limit, job).await.unwrap_or_else(|_| Err(slow()))
     }
 
-    async fn is_there(&self, image: &str) -> Result<bool, String> {
+    /// What tells an image from later ones of the same name; `None` if it is not there.
+    ///
+    /// # Errors
+    /// When Docker fails.
+    async fn id(&self, image: &str) -> Result<Option<String>, String> {
         match self.docker.run(&["image", "inspect", "--format", "{{.Id}}", image], SHORT).await {
-            Ok(_) => Ok(true),
-            Err(DockerError::Failed { .. }) => Ok(false),
+            Ok(id) => Ok(Some(id.lines().last().unwrap_or_default().to_owned())),
+            Err(DockerError::Failed { .. }) => Ok(None),
             Err(error) => Err(error.to_string()),
         }
+    }
+
+    /// What an image says of the programs that run in it.
+    ///
+    /// # Errors
+    /// When Docker fails, or a word of them is too long.
+    pub async fn about(&self, image: &str) -> Result<About, String> {
+        let answer = self.docker.run(&["image", "inspect", "--format", opened::FORMAT, image], SHORT).await;
+        let answer = answer.map_err(|error| error.to_string())?;
+        About::read(&answer)
+            .ok_or_else(|| format!("The image {image} has an ENTRYPOINT or CMD that can't be read here"))
     }
 
     /// Where an image wants to keep data: such places would be on the disk of the machine, without any limit.
@@ -163,58 +223,21 @@ impl Images {
     /// # Errors
     /// When Docker fails, or such a place has a name that only its own author understands.
     pub async fn volumes(&self, image: &str) -> Result<Vec<String>, String> {
+        let known = || self.volumes.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(found) = known().get(image).cloned() {
+            return Ok(found);
+        }
         let format = "{{range $path, $_ := .Config.Volumes}}{{printf \"%+q\" $path}}{{println}}{{end}}";
         let listed = self.docker.run(&["image", "inspect", "--format", format, image], SHORT).await;
         let listed = listed.map_err(|error| error.to_string())?;
         let strange =
             |path: &str| format!("The image {image} has a VOLUME {path}, which can't be given to a container here");
-        listed.lines().map(|path| place_of(path).ok_or_else(|| strange(path))).collect()
-    }
-
-    /// Removes the images that this server has built and that nobody has used for so long, or that are too many for this
-    /// many bytes; and what builds that failed have left. Those in `kept` stay.
-    pub async fn prune(&self, age: Duration, size: u64, kept: &[String]) {
-        if let Err(error) = self.prune_now(age, size, kept).await {
-            log::warn!("images that nobody needs are not removed: {error}");
+        let found = listed.lines().map(|path| place_of(path).ok_or_else(|| strange(path)));
+        let found: Vec<String> = found.collect::<Result<_, String>>()?;
+        if image.starts_with(&self.repository()) {
+            known().insert(image.to_owned(), found.clone());
         }
-    }
-
-    async fn prune_now(&self, age: Duration, size: u64, kept: &[String]) -> Result<(), DockerError> {
-        // What a build that is under way makes is younger.
-        let (mine, left) = (format!("label={LABEL}={}", self.owner.name()), "until=1h");
-        self.docker.run(&["image", "prune", "--force", "--filter", &mine, "--filter", left], SHORT).await?;
-        for name in removable(self.own().await?, kept, age, size) {
-            log::info!("the image {name} is removed: nobody needs it");
-            // One that a container uses stays.
-            if let Err(error) = self.docker.run(&["image", "rm", &name], SHORT).await {
-                log::debug!("{error}");
-            }
-        }
-        Ok(())
-    }
-
-    /// The images that this server has built. What they share with others does not count for their size.
-    async fn own(&self) -> Result<Vec<Own>, DockerError> {
-        let repository = self.repository();
-        let names =
-            self.docker.run(&["image", "ls", "--format", "{{.Repository}}:{{.Tag}}", &repository], SHORT).await?;
-        let names: Vec<&str> = names.lines().collect();
-        if names.is_empty() {
-            return Ok(Vec::new());
-        }
-        let format = "{{range .Images}}{{.Repository}}:{{.Tag}} {{.UniqueSize}}{{println}}{{end}}";
-        let sizes = self.docker.run(&["system", "df", "--verbose", "--format", format], SHORT).await?;
-        let sizes: HashMap<&str, &str> = sizes.lines().filter_map(|line| line.trim().split_once(' ')).collect();
-        let mut own = Vec::new();
-        for name in names {
-            let format = "{{json .Metadata.LastTagTime}}";
-            let used = self.docker.run(&["image", "inspect", "--format", format, name], SHORT).await?;
-            let used: Option<Timestamp> = used.trim().trim_matches('"').parse().ok();
-            let size: Option<ByteSize> = sizes.get(name).and_then(|size| size.parse().ok());
-            let size = size.map_or(0, |size| size.as_u64());
-            own.push(Own { name: name.to_owned(), size, used: used.unwrap_or_else(Timestamp::now) });
-        }
-        Ok(own)
+        Ok(found)
     }
 }
 
@@ -231,21 +254,6 @@ fn place_of(quoted: &str) -> Option<String> {
         }
     }
     (name.starts_with('/') && name.chars().all(is_plain)).then(|| format!("/{}", place.join("/")))
-}
-
-/// Those images that can go, the longest unused first.
-fn removable(mut own: Vec<Own>, kept: &[String], age: Duration, most: u64) -> Vec<String> {
-    own.retain(|image| !kept.contains(&image.name));
-    own.sort_by_key(|image| std::cmp::Reverse(image.used));
-    let oldest = Timestamp::now().checked_sub(age).unwrap_or(Timestamp::MIN);
-    let mut total = 0_u64;
-    let too_many = own.into_iter().filter(|image| {
-        total = total.saturating_add(image.size);
-        image.used < oldest || total > most
-    });
-    let mut names: Vec<String> = too_many.map(|image| image.name).collect();
-    names.reverse();
-    names
 }
 
 /// Why an image is not there, in words for the client.
@@ -304,18 +312,6 @@ mod tests {
         ] {
             assert_eq!(place_of(name).as_deref(), place, "{name}");
         }
-    }
-
-    #[test]
-    fn the_longest_unused_images_go_first_and_those_that_are_to_be_kept_stay() {
-        let hours = |hours| Timestamp::now().checked_sub(Duration::from_hours(hours)).unwrap();
-        let own = |name: &str, size, used| Own { name: name.to_owned(), size, used: hours(used) };
-        let all = || vec![own("old", 1, 100), own("new", 5, 1), own("middle", 5, 2), own("kept", 50, 200)];
-        let kept = ["kept".to_owned()];
-        let days = Duration::from_hours(48);
-        assert_eq!(removable(all(), &kept, days, 100), ["old"]);
-        assert_eq!(removable(all(), &kept, days, 9), ["old", "middle"]);
-        assert!(removable(all(), &kept, Duration::from_hours(1000), 100).is_empty());
     }
 
     #[test]

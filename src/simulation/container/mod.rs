@@ -1,5 +1,7 @@
 //! Simulations in containers of Docker: what a project asks for, its image, and a compose project for each simulation.
 
+mod answer;
+mod blocking;
 mod check;
 mod compose;
 mod containers;
@@ -10,9 +12,12 @@ mod engine;
 mod image;
 mod network;
 mod objects;
+mod opened;
 pub mod packet_filter;
 mod places;
 mod prepared;
+mod project_images;
+mod prune;
 mod recipe;
 mod request;
 mod steps;
@@ -20,9 +25,10 @@ mod templates;
 mod tidy;
 mod webots_yml;
 
-pub use check::{check, daemon_fault};
+pub use answer::until_answering;
+pub use check::{check, daemon_fault, init_fault};
 pub use containers::Containers;
 pub use objects::{Owner, sweep};
-pub use prepared::Prepared;
+pub use prepared::{Cause, Prepared};
 pub use request::Request;
 pub use webots_yml::{Kind, WebotsYml};

@@ -34,6 +34,17 @@ pub struct Lease {
     live: Live,
 }
 
+/// What has ended a container.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Cause {
+    /// The kernel, because it took more memory than it may.
+    OutOfMemory,
+    /// Docker, which was stopped or has crashed.
+    Docker,
+}
+
+/// The exit code of a program that was asked to end, as Docker asks all when it is stopped.
+const TERMINATED: i32 = 143;
 /// The time between two starts of a participant's controller, at least.
 const BETWEEN_RESTARTS: Duration = Duration::from_secs(1);
 /// The service of a participant's controller.
@@ -106,11 +117,16 @@ impl Prepared {
         self.restart.as_ref().map(|(asked, _)| Arc::clone(asked))
     }
 
-    /// Whether the kernel has ended something in Webots' container because it took more memory than it may.
-    pub async fn has_run_out_of_memory(&self) -> bool {
-        let Some(webots) = self.of(WEBOTS) else { return false };
-        let told = self.docker.run(&["inspect", "--format", "{{.State.OOMKilled}}", webots], SHORT).await;
-        told.is_ok_and(|told| told.trim() == "true")
+    /// Why Webots' container has ended with this exit code, if Docker knows more than that.
+    pub async fn cause(&self, code: Option<i32>) -> Option<Cause> {
+        let webots = self.of(WEBOTS)?;
+        match self.docker.run(&["inspect", "--format", "{{.State.OOMKilled}}", webots], SHORT).await {
+            Ok(answer) if answer.trim() == "true" => Some(Cause::OutOfMemory),
+            // The container may be known to it while it stops.
+            Ok(_) if code != Some(TERMINATED) => None,
+            Ok(_) | Err(DockerError::NoDaemon(_)) => Some(Cause::Docker),
+            Err(_) => None,
+        }
     }
 
     /// Removes everything of this simulation.

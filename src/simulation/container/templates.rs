@@ -74,6 +74,9 @@ impl Templates {
         if !services.contains_key("webots") {
             return Err(broken("it has no service \"webots\"".to_owned()));
         }
+        if let Some(line) = unsuitable(&text) {
+            return Err(broken(line));
+        }
         Ok(Template { text, services })
     }
 
@@ -96,6 +99,28 @@ impl Templates {
     }
 }
 
+/// What a template of the original has that can't work here, by the beginning of its line, and what to write there.
+const UNSUITABLE: [(&str, &str); 3] = [
+    (
+        "volumes:",
+        "a volume belongs to root, and programs run as the server's user: mount ${PROJECT} or ${THEIA_FOLDER} instead",
+    ),
+    ("network_mode:", "all services are in the network of container.network: leave it out"),
+    ("reservations:", "container.gpu gives graphics cards where there are some: leave it out"),
+];
+
+/// The first line of a template that can't work here, and what to write there.
+fn unsuitable(text: &str) -> Option<String> {
+    text.lines().enumerate().find_map(|(index, line)| {
+        // Services mount folders below the same word.
+        let (_, advice) = UNSUITABLE.iter().find(|(key, _)| match *key {
+            "volumes:" => line.starts_with(key),
+            key => line.trim_start().starts_with(key),
+        })?;
+        Some(format!("line {}, `{}`: {advice}", index + 1, line.trim()))
+    })
+}
+
 /// The files that come with this server.
 const SHIPPED: [(&str, &str); 9] = [
     shipped!("docker-compose-default.yml"),
@@ -108,3 +133,32 @@ const SHIPPED: [(&str, &str); 9] = [
     shipped!("Dockerfile.controller"),
     shipped!("remote_controller_launcher.py"),
 ];
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_only_the_original_could_run_is_refused_with_its_line() {
+        let folder = tempfile::tempdir().unwrap();
+        let templates = Templates { folder: Some(folder.path().to_owned()), debug: false };
+        for (text, words) in [
+            ("volumes:\n  data:\nservices:\n  webots: {}\n", "line 1, `volumes:`"),
+            ("services:\n  webots:\n    network_mode: host\n", "line 3, `network_mode: host`"),
+            (
+                "services:\n  webots:\n    deploy:\n      resources:\n        reservations:\n          devices: []\n",
+                "line 5",
+            ),
+            ("services: {}\n", "no service \"webots\""),
+        ] {
+            std::fs::write(folder.path().join("docker-compose-default.yml"), text).unwrap();
+            let wrong = templates.compose(&Kind::Default).unwrap_err();
+            assert!(wrong.starts_with("The template docker-compose-default.yml") && wrong.contains(words), "{wrong}");
+        }
+        for kind in [Kind::Editor { folder: String::new() }, Kind::Competition { folder: String::new() }] {
+            for debug in [false, true] {
+                assert!(Templates { folder: None, debug }.compose(&kind).is_ok());
+            }
+        }
+    }
+}

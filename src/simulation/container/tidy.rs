@@ -49,7 +49,9 @@ pub async fn keep_tidy(docker: Docker, owner: Owner, live: Live, images: Arc<Ima
         // Most has been removed by then.
         actix_rt::time::sleep(AGAIN).await;
         pause = match tidy(&docker, &owner, &live).await {
-            Ok(()) => PERIOD,
+            Ok(0) => PERIOD,
+            // What Docker was about to end when it was stopped appears one after the other.
+            Ok(_) => AGAIN,
             Err(error) => {
                 log::debug!("containers that nobody uses are not removed yet: {error}");
                 AGAIN
@@ -62,10 +64,11 @@ pub async fn keep_tidy(docker: Docker, owner: Owner, live: Live, images: Arc<Ima
     }
 }
 
-async fn tidy(docker: &Docker, owner: &Owner, live: &Live) -> Result<(), DockerError> {
+/// Removes what is left. Returns how many projects it has found.
+async fn tidy(docker: &Docker, owner: &Owner, live: &Live) -> Result<usize, DockerError> {
     let found = owner.projects(docker).await?;
     let left: Vec<String> = found.into_iter().filter(|name| !live.names().contains(name)).collect();
-    let mut done = Ok(());
+    let mut done = Ok(left.len());
     for name in left {
         log::info!("{name} was left; it is removed");
         // One that can't be removed holds up no other.

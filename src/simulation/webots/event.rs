@@ -2,6 +2,8 @@
 
 use actix::prelude::*;
 
+use crate::simulation::container::Cause;
+
 /// An event of a running Webots.
 #[derive(Message, Debug, Clone, PartialEq, Eq)]
 #[rtype(result = "()")]
@@ -27,7 +29,8 @@ pub enum WebotsEvent {
 pub struct Exit {
     /// Whether it ended by itself and in order.
     pub clean: bool,
-    /// Whether it is this server's fault: Webots listens before it loads its world, so one that ends before has not seen it.
+    /// Whether it is this server's fault, so that another one may take the client: Docker has stopped, or Webots has ended
+    /// before it listened, which it does before it loads its world.
     pub own: bool,
     /// In words, for the client.
     pub why: String,
@@ -38,6 +41,15 @@ impl Exit {
     #[must_use]
     pub fn clean() -> Self {
         Self { clean: true, own: false, why: "Webots has ended".to_owned() }
+    }
+}
+
+/// What has ended a container, in words for the client.
+#[must_use]
+pub fn words(cause: Cause) -> &'static str {
+    match cause {
+        Cause::OutOfMemory => "The simulation has taken more memory than it may (limits.memory)",
+        Cause::Docker => "Docker has stopped on this simulation server, and all simulations in it have ended",
     }
 }
 

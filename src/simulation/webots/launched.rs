@@ -13,6 +13,7 @@ use super::paced_reader::PacedReader;
 use super::runtime::Runtime;
 use super::virtual_display::VirtualDisplay;
 use crate::shared::run::RotatedFile;
+use crate::simulation::container::Cause;
 use crate::simulation::isolation::Cgroup;
 use crate::simulation::machine::display;
 use crate::simulation::process::{ExitReason, ProcessGroup};
@@ -36,8 +37,8 @@ pub struct Launched {
 pub struct End {
     /// As its process tells.
     pub reason: ExitReason,
-    /// Whether the kernel has ended something of it that took too much memory.
-    pub out_of_memory: bool,
+    /// What else is known of it, if anything.
+    pub cause: Option<Cause>,
 }
 
 /// How many older files of its output are kept beside the newest.
@@ -79,14 +80,15 @@ where
     let folder = cgroup.as_ref().map(|cgroup| cgroup.path().to_owned());
     let ended = async move {
         let reason = ended.await;
-        let in_container = runtime.end().await;
+        let code = if let ExitReason::Code(code) = reason { Some(code.into()) } else { None };
+        let in_container = runtime.end(code).await;
         let on_machine = match cgroup {
             Some(cgroup) => actix_rt::task::spawn_blocking(move || end_all(&cgroup)).await.unwrap_or_default(),
             None => false,
         };
         // What was printed last tells why. A process that nobody can end may keep the pipe open.
         actix_rt::time::timeout(LAST_OUTPUT, all_read).await.ok();
-        End { reason, out_of_memory: in_container || on_machine }
+        End { reason, cause: in_container.or(on_machine.then_some(Cause::OutOfMemory)) }
     };
     Ok((Launched { group, cgroup: folder, tail, log, begin }, ended))
 }

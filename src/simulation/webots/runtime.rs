@@ -8,7 +8,7 @@ use tokio::sync::Notify;
 use super::event::WebotsEvent;
 use super::launch_spec::LaunchSpec;
 use super::virtual_display::VirtualDisplay;
-use crate::simulation::container::{Containers, Prepared, Request};
+use crate::simulation::container::{Cause, Containers, Prepared, Request};
 
 /// What a Webots runs on.
 #[derive(Debug)]
@@ -79,19 +79,18 @@ impl Runtime {
         warnings.chain(containers.texts.iter().cloned().map(WebotsEvent::Text)).collect()
     }
 
-    /// Ends what a Webots ran on, after its own end. Returns whether the kernel has ended something of it that took too much
-    /// memory.
-    pub async fn end(self) -> bool {
+    /// Ends what a Webots ran on, after its own end with this exit code. Returns what has ended it, if Docker knows.
+    pub async fn end(self, code: Option<i32>) -> Option<Cause> {
         match self {
-            Self::Machine(None) => false,
+            Self::Machine(None) => None,
             Self::Machine(Some(display)) => {
                 display.stop().await;
-                false
+                None
             }
             Self::Containers(containers) => {
-                let out_of_memory = containers.has_run_out_of_memory().await;
+                let cause = containers.cause(code).await;
                 containers.remove().await;
-                out_of_memory
+                cause
             }
         }
     }

@@ -1,8 +1,7 @@
 //! Actor: one running Webots. Owns its process group, its folder and its place; ends with all three.
 //!
-//! Created by a web client once its project is checked out. It starts Webots, finds the port on which it listens,
-//! watches its heartbeat and the time limit, and tells its client with [`WebotsEvent`]s. It ends when nothing of
-//! Webots' process tree is left, and is never restarted.
+//! Created by a web client once its project is checked out. Starts Webots, waits until it listens, watches its heartbeat
+//! and the time limit, sends [`WebotsEvent`]s, and ends when nothing of Webots' process tree is left. Never restarted.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -10,13 +9,14 @@ use std::time::{Duration, Instant};
 use actix::prelude::*;
 use tokio::sync::Notify;
 
-use super::event::{Exit, ExitNotifier, WebotsEvent};
+use super::event::{self, Exit, ExitNotifier, WebotsEvent};
 use super::launch_spec::LaunchSpec;
 use super::launched::{self, End, Launched};
 use super::output::{OutputEvent, Tail};
 use super::runtime::{Preparation, Runtime};
 use crate::shared::run::seconds_since_1970;
 use crate::simulation::checkout::CheckoutError;
+use crate::simulation::container::{Cause, until_answering};
 use crate::simulation::machine::display;
 use crate::simulation::process::{ExitReason, ProcessGroup};
 use crate::simulation::snapshot::{Change, Stage};
@@ -125,19 +125,19 @@ impl Webots {
         Ok(())
     }
 
-    /// Waits until a process of this instance listens on a port that Webots may have taken.
+    /// Waits until its container answers, or a process of this instance listens on a port that Webots may have taken.
     fn await_port(&self, ctx: &mut Context<Self>) {
-        // A port of a container is there before Webots is.
-        if self.spec.containers.is_none()
-            && let Some(root) = self.group.as_ref().map(ProcessGroup::leader)
-        {
+        if self.spec.containers.is_some() {
+            let answering = until_answering(self.spec.config.bind, self.port).into_actor(self);
+            answering.map(|(), this, _| this.ready(this.port)).spawn(ctx);
+        } else if let Some(root) = self.group.as_ref().map(ProcessGroup::leader) {
             let listening = self.spec.listening_port(root).into_actor(self);
             listening.map(|port, this, _| this.ready(port)).spawn(ctx);
         }
     }
 
     fn ready(&mut self, port: u16) {
-        if self.stopped_for.is_some() {
+        if self.stopped_for.is_some() || self.listening {
             return;
         }
         let allowed = self.spec.config.streaming_ports();
@@ -202,20 +202,20 @@ impl Webots {
         }
     }
 
-    fn ended(&mut self, End { reason, out_of_memory }: &End, ctx: &mut Context<Self>) {
+    fn ended(&mut self, End { reason, cause }: &End, ctx: &mut Context<Self>) {
         log::info!("port {}: Webots {reason}", self.port);
-        let out_of_memory =
-            out_of_memory.then(|| "The simulation has taken more memory than it may (limits.memory)".to_owned());
-        let mut exit = match self.stopped_for.take().or(out_of_memory) {
+        let is_lost = self.stopped_for.is_none() && *cause == Some(Cause::Docker);
+        let mut exit = match self.stopped_for.take().or(cause.map(event::words).map(str::to_owned)) {
+            Some(why) if is_lost => Exit { own: true, ..self.failure(&why) },
             Some(why) => self.failure(&why),
             None if *reason == ExitReason::Code(0) => Exit::clean(),
             None => self.failure(&format!("Webots {reason}")),
         };
-        if exit.clean || self.listening {
+        if exit.clean || is_lost || self.listening {
             return self.exited(exit, ctx);
         }
         exit.why += self.spec.launcher.remark();
-        if self.spec.config.xvfb {
+        if self.spec.config.xvfb || self.spec.containers.is_some() {
             return self.exited(exit, ctx);
         }
         let display = display::effective(self.spec.config.display.as_ref());

@@ -1,0 +1,181 @@
+//! What a start in containers takes beside `docker compose up` of the same project, done by hand: one, and thirty at once.
+
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+use std::time::{Duration, Instant};
+
+use crate::Verdict;
+use crate::support::client::Client;
+use crate::support::git::{Forge, arm};
+use crate::support::program::Server;
+
+#[path = "../../tests/containers/daemon.rs"]
+#[expect(dead_code, reason = "tests use the rest")]
+mod daemon;
+#[path = "../../tests/containers/image.rs"]
+mod image;
+
+/// So many simulations start at once.
+const MANY: u16 = 30;
+/// A start may take this share of what it takes by hand.
+const SHARE: f64 = 1.2;
+/// Starts one after the other, of which the median counts.
+const ROUNDS: usize = 7;
+/// How long a start may take at most.
+const PATIENCE: Duration = Duration::from_secs(300);
+
+pub async fn measure(verdict: &mut Verdict) {
+    let Some(_docker) = daemon::docker().await else { return };
+    let forge = Forge::with_arm();
+    let server = daemon::server(forge.path(), MANY)
+        .set("maxPlacesPerAddress", MANY)
+        .set("timing", serde_json::json!({ "launch": 300, "silence": 600 }))
+        .start()
+        .await;
+    let mut first = Client::start(&server, &arm()).await;
+    first.patiently("webots:", PATIENCE).await;
+    let project = ByHand::of(&server);
+    first.leave().await;
+    gone(&server).await;
+    let (mut ours, mut by_hand) = (Vec::new(), Vec::new());
+    for _ in 0..ROUNDS {
+        by_hand.push(project.up(1));
+        ours.push(started(&server, 1).await);
+    }
+    let (ours, by_hand) = (median(ours), median(by_hand));
+    compare(verdict, "one start", ours, by_hand);
+    let by_hand = project.up(MANY);
+    let ours = started(&server, MANY).await;
+    compare(verdict, "thirty at once, until the last", ours, by_hand);
+}
+
+fn compare(verdict: &mut Verdict, what: &str, ours: Duration, by_hand: Duration) {
+    println!(
+        "{what}: {ours:.2?}, by hand {by_hand:.2?}, {:.2} times as long",
+        ours.as_secs_f64() / by_hand.as_secs_f64()
+    );
+    verdict.bound(what, ours, by_hand.mul_f64(SHARE));
+}
+
+/// Starts simulations at once, and ends them. Returns the time until the last client has the address of its Webots.
+async fn started(server: &Server, count: u16) -> Duration {
+    let mut clients = Vec::new();
+    for _ in 0..count {
+        clients.push(Client::connect(&server.websocket("/client")).await);
+    }
+    let begin = Instant::now();
+    for client in &mut clients {
+        client.send(&serde_json::json!({ "start": { "url": arm() } }).to_string()).await;
+    }
+    for client in &mut clients {
+        client.patiently("webots:", PATIENCE).await;
+    }
+    let time = begin.elapsed();
+    drop(clients);
+    gone(server).await;
+    time
+}
+
+async fn gone(server: &Server) {
+    let deadline = Instant::now() + PATIENCE;
+    while !daemon::containers(server).is_empty() {
+        assert!(Instant::now() < deadline, "{:?} are left", daemon::containers(server));
+        actix_rt::time::sleep(Duration::from_millis(100)).await;
+    }
+}
+
+/// The compose project of a simulation, copied from what the server has written.
+struct ByHand {
+    folder: tempfile::TempDir,
+    ports: Vec<u16>,
+}
+
+impl ByHand {
+    /// That of the one simulation which runs.
+    fn of(server: &Server) -> Self {
+        let runs = std::fs::read_dir(server.cache().join("runs")).unwrap().flatten().map(|run| run.path());
+        let instances = runs.flat_map(|run| std::fs::read_dir(run).unwrap().flatten().map(|file| file.path()));
+        let instance = instances.into_iter().find(|folder| folder.join("compose").is_dir()).unwrap();
+        let folder = tempfile::tempdir().unwrap();
+        let copied = Command::new("cp").arg("-R").arg(instance).arg(folder.path().join("instance")).status().unwrap();
+        assert!(copied.success());
+        let first = crate::support::ports::block(MANY);
+        Self { folder, ports: (first..first + MANY).collect() }
+    }
+
+    fn instance(&self) -> PathBuf {
+        self.folder.path().join("instance")
+    }
+
+    /// Starts so many, each on a port of its own, and removes them. Returns the time until the last of them answers.
+    fn up(&self, count: u16) -> Duration {
+        let begin = Instant::now();
+        let ports = self.ports.iter().take(count.into());
+        let children: Vec<_> =
+            ports.clone().map(|port| self.compose(*port, &["up", "--detach"]).spawn().unwrap()).collect();
+        for mut child in children {
+            assert!(child.wait().unwrap().success());
+        }
+        for port in ports.clone() {
+            while !answers(*port) {
+                assert!(begin.elapsed() < PATIENCE, "port {port} does not answer");
+                std::thread::sleep(Duration::from_millis(10));
+            }
+        }
+        let time = begin.elapsed();
+        let children = ports.map(|port| self.compose(*port, &["down", "--timeout", "0"]).spawn().unwrap());
+        for mut child in children.collect::<Vec<_>>() {
+            assert!(child.wait().unwrap().success());
+        }
+        time
+    }
+
+    fn compose(&self, port: u16, words: &[&str]) -> Command {
+        let (instance, folder) = (self.instance(), self.instance().join("compose"));
+        let project = std::fs::read_dir(&instance).unwrap().flatten().map(|file| file.path());
+        let project = project.into_iter().find(|path| path.join("worlds").is_dir()).unwrap();
+        let mut command = compose();
+        command.args(["--project-name", &format!("by-hand-{port}"), "--project-directory"]).arg(&folder);
+        // The server's own file has the port in the command.
+        let own = self.folder.path().join(format!("{port}.json"));
+        std::fs::write(&own, override_for(&folder, port)).unwrap();
+        command.arg("--file").arg(folder.join("docker-compose.yml")).arg("--file").arg(own).args(words);
+        command.env("PORT", port.to_string()).env("PROJECT", project).stdin(Stdio::null());
+        command.stdout(Stdio::null()).stderr(Stdio::null());
+        command
+    }
+}
+
+/// `docker compose` or `docker-compose`, whichever the server takes, for the daemon.
+fn compose() -> Command {
+    let plugin = Command::new("docker").args(["compose", "version"]).output().unwrap().status.success();
+    let mut command = Command::new(if plugin { "docker" } else { "docker-compose" });
+    command.args(plugin.then_some("compose")).env("DOCKER_HOST", daemon::host());
+    command
+}
+
+fn override_for(folder: &Path, port: u16) -> String {
+    let text = std::fs::read_to_string(folder.join("override.json")).unwrap();
+    let mut file: serde_json::Value = serde_json::from_str(&text).unwrap();
+    file["services"]["webots"]["container_name"] = format!("by-hand-{port}").into();
+    for word in file["services"]["webots"]["command"].as_array_mut().unwrap() {
+        if word.as_str().unwrap().starts_with("--port=") {
+            *word = format!("--port={port}").into();
+        }
+    }
+    file.to_string()
+}
+
+fn answers(port: u16) -> bool {
+    use std::io::{Read, Write};
+    let Ok(mut stream) = std::net::TcpStream::connect(("127.0.0.1", port)) else { return false };
+    stream.set_read_timeout(Some(Duration::from_secs(2))).unwrap();
+    let mut answer = [0; 5];
+    stream.write_all(b"GET /robots.txt HTTP/1.0\r\nHost: localhost\r\n\r\n").is_ok()
+        && stream.read_exact(&mut answer).is_ok()
+}
+
+fn median(mut times: Vec<Duration>) -> Duration {
+    times.sort();
+    times[times.len() / 2]
+}

@@ -1,0 +1,61 @@
+//! Whether Webots in a container answers on its published port.
+//!
+//! Docker's proxy listens on it from the container's start on, and accepts connections that nothing inside takes. So only
+//! the answer to a request tells.
+
+use std::net::{IpAddr, Ipv4Addr};
+use std::time::{Duration, Instant};
+
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::net::TcpStream;
+
+/// A file that Webots does not have. A request for `/` would begin a WebSocket.
+const REQUEST: &[u8] = b"GET /robots.txt HTTP/1.0\r\nHost: localhost\r\n\r\n";
+/// Bounds of the pause between two requests.
+const PAUSE: (Duration, Duration) = (Duration::from_millis(25), Duration::from_millis(500));
+/// The pause is such a part of the time since the start, so that many that start on a busy machine don't ask it all the time.
+const PART: u32 = 20;
+/// Timeout of the first request. One that is sent before the container has its address would take a second, until the kernel
+/// repeats its first packet.
+const FIRST_TIMEOUT: Duration = Duration::from_millis(100);
+/// Timeout that later ones approach: Webots answers none while it reads a world.
+const TIMEOUT: Duration = Duration::from_secs(2);
+
+/// Waits until there is an answer on this port of an address that the server binds to.
+pub async fn until_answering(bind: IpAddr, port: u16) {
+    // Containers listen on IPv4, see the variable BIND of their templates.
+    let address = if bind.is_ipv4() && !bind.is_unspecified() { bind } else { Ipv4Addr::LOCALHOST.into() };
+    let (begin, mut timeout) = (Instant::now(), FIRST_TIMEOUT);
+    loop {
+        match actix_rt::time::timeout(timeout, answers((address, port).into())).await {
+            Ok(Ok(true)) => return,
+            Ok(_) => actix_rt::time::sleep((begin.elapsed() / PART).clamp(PAUSE.0, PAUSE.1)).await,
+            Err(_) => timeout = TIMEOUT.min(timeout * 2),
+        }
+    }
+}
+
+async fn answers(address: std::net::SocketAddr) -> std::io::Result<bool> {
+    let mut stream = TcpStream::connect(address).await?;
+    stream.write_all(REQUEST).await?;
+    let mut answer = [0; 5];
+    stream.read_exact(&mut answer).await?;
+    Ok(answer == *b"HTTP/")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[actix_rt::test]
+    async fn a_proxy_that_accepts_for_nobody_is_no_answer() {
+        let listener = tokio::net::TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).await.unwrap();
+        let address = listener.local_addr().unwrap();
+        let waiting = actix_rt::spawn(until_answering(Ipv4Addr::UNSPECIFIED.into(), address.port()));
+        drop(listener.accept().await.unwrap());
+        let (mut stream, _) = listener.accept().await.unwrap();
+        assert!(!waiting.is_finished());
+        stream.write_all(b"HTTP/1.1 404 Not Found\r\n\r\n").await.unwrap();
+        waiting.await.unwrap();
+    }
+}

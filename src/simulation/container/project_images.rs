@@ -1,0 +1,83 @@
+//! The images of a project: built from its Dockerfiles, and opened for the server's user.
+
+use std::sync::Arc;
+
+use super::blocking::blocking;
+use super::dockerfile;
+use super::image::{Build, Images};
+use super::opened;
+use super::recipe::{self, PROJECT_PATH};
+use crate::simulation::checkout::Project;
+
+/// An image that is made from a project, or from a folder of it.
+#[derive(Debug)]
+pub struct Part<'part> {
+    /// The project.
+    pub project: &'part Arc<Project>,
+    /// The image of its version of Webots.
+    pub base: &'part str,
+    /// The Dockerfile.
+    pub text: &'part str,
+    /// The folder that it copies from, empty for the whole project.
+    pub folder: &'part str,
+    /// Whether the project has a Makefile.
+    pub make: bool,
+    /// The Docker network that it may use.
+    pub network: &'static str,
+}
+
+impl Images {
+    /// Builds an image of a project, unless it is there. Returns its name.
+    ///
+    /// # Errors
+    /// Why it can't be built, in words for the client.
+    pub async fn of_project(
+        self: &Arc<Self>,
+        part: Part<'_>,
+        progress: &(impl Fn(String) + Send + Sync),
+    ) -> Result<String, String> {
+        let Part { project, base, text, folder, make, network } = part;
+        let mut arguments = vec![
+            format!("WEBOTS_DEFAULT_IMAGE={base}"),
+            format!("PROJECT_PATH={PROJECT_PATH}"),
+            format!("MAKE={}", u8::from(make)),
+        ];
+        if !folder.is_empty() {
+            arguments
+                .extend(["WEBOTS_CONTROLLER_URL=participant", "DEFAULT_CONTROLLER=participant"].map(str::to_owned));
+        }
+        // The name of an image stays when what it names is updated.
+        let mut bases = Vec::new();
+        for image in dockerfile::bases(text, &arguments) {
+            bases.push(self.pull(&image, progress).await?);
+        }
+        let identity = project.identity();
+        let parts =
+            [identity.as_str(), folder, text].into_iter().chain(arguments.iter().chain(&bases).map(String::as_str));
+        let key = opened::key(parts);
+        let dockerfile = project.instance.path().join(format!("Dockerfile{folder}"));
+        let (file, text) = (dockerfile.clone(), text.to_owned());
+        blocking(move || std::fs::write(file, text).map_err(|error| error.to_string())).await?;
+        let (root, folder) = (project.folder().to_owned(), folder.to_owned());
+        // What was copied out of an image may have put a link to anywhere in its place.
+        let context = blocking(move || recipe::inside(&root, &folder)).await?;
+        let project = Arc::clone(project);
+        self.build(Build { key, dockerfile, context, arguments, network, project }, progress).await
+    }
+
+    /// Makes the image in which the server's user finds what the image's own user has at home.
+    ///
+    /// # Errors
+    /// Why it can't be made, in words for the client.
+    pub async fn open_now(&self, image: &str, name: &str, project: &Project) -> Result<(), String> {
+        let text = self.about(image).await?.dockerfile(self.owner.name());
+        let context = project.instance.path().join(format!("opened-{}", opened::key(std::iter::once(name))));
+        let (dockerfile, folder) = (context.with_extension("Dockerfile"), context.clone());
+        let file = dockerfile.clone();
+        let write = move || std::fs::write(file, text).and_then(|()| opened::write_programs(&folder));
+        blocking(move || write().map_err(|error| error.to_string())).await?;
+        let options = ["--network", "none", "--tag", name].map(Into::into).to_vec();
+        let done = self.run_build(options, &dockerfile, &context, |_| ()).await;
+        done.map_err(|error| format!("The image can't be prepared for this server's user: {error}"))
+    }
+}
