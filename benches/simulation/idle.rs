@@ -8,6 +8,7 @@ use procfs::process::Process;
 use crate::Verdict;
 use crate::class::{leave, ready, server};
 use crate::support::git::Forge;
+use crate::support::http;
 use crate::support::program::Server;
 
 /// How many stand idle.
@@ -47,6 +48,7 @@ pub async fn measure(verdict: &mut Verdict, levels: &[String], time: Duration) {
             let page = watch(&server).await;
             let watched = processor(&server, time).await;
             page.abort();
+            assert_eq!(standing(&server).await, usize::from(size), "simulations have ended");
             println!(
                 "  {level:<8}{size:>5}: {alone:>5.2} % of a core, with the monitor open {watched:>5.2} %, {each:>6.1} KiB each"
             );
@@ -60,6 +62,11 @@ pub async fn measure(verdict: &mut Verdict, levels: &[String], time: Duration) {
             leave(&server, Vec::new()).await;
         }
     }
+}
+
+/// How many simulations there are.
+async fn standing(server: &Server) -> usize {
+    http::get(&server.url("/status")).await.json()["simulations"].as_array().unwrap().len()
 }
 
 /// Opens the monitor page's events, and reads them.

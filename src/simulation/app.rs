@@ -214,7 +214,9 @@ fn assemble(
         Announcer::new(&config).start();
     }
     let usage = UsageMonitor::default();
-    let system = |source| AppError::Unavailable(format!("the system can't start a thread: {source}"));
+    let system = |source| {
+        AppError::Unavailable(format!("simulations can't be watched (threads, or netlink with sock_diag): {source}"))
+    };
     let watcher = Watcher::start(run.path().to_owned(), &config, usage.clone()).map_err(system)?;
     let metrics = Metrics::new();
     let starts = outcome::counter(&metrics)?;

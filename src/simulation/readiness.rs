@@ -20,6 +20,8 @@ use crate::simulation::machine::{Readings, display};
 const PERIOD: Duration = Duration::from_secs(5);
 /// The same while the server is not ready.
 const PERIOD_WHILE_NOT_READY: Duration = Duration::from_secs(1);
+/// A check that takes longer hangs: a disk that does not answer holds up whoever writes. No other one is begun before it ends.
+const HUNG: Duration = Duration::from_mins(1);
 /// How much each check writes to the disk, in bytes. An empty file can be made on a full disk.
 const WRITTEN: usize = 1 << 20;
 /// The least step of the machine's clock that is logged.
@@ -36,9 +38,8 @@ pub fn watch(
     readings: watch::Receiver<Arc<Readings>>,
     failed_starts: Arc<FailedStarts>,
 ) -> watch::Receiver<Option<String>> {
-    // The first check comes before the first client.
-    let first = check_gpus(&config, &readings.borrow()).and_then(|()| check(&config, &run));
-    let first = first.and_then(|()| check_init(&config, false)).err();
+    // The first check comes before the first client; GPUs are not read yet.
+    let first = check(&config, &run).and_then(|()| check_init(&config, false)).err();
     let (sender, problem) = watch::channel(None);
     publish(&sender, first, &failed_starts);
     actix_rt::spawn(async move {
@@ -52,7 +53,15 @@ pub fn watch(
             let (config, run) = (Arc::clone(&config), run.clone());
             let all =
                 move || gpus.and_then(|()| check(&config, &run)).and_then(|()| check_init(&config, has_init)).err();
-            if let Ok(found) = actix_rt::task::spawn_blocking(all).await {
+            let mut checked = actix_rt::task::spawn_blocking(all);
+            let found = if let Ok(found) = actix_rt::time::timeout(HUNG, &mut checked).await {
+                found
+            } else {
+                let hangs = "This simulation server's disk or Docker does not answer".to_owned();
+                publish(&sender, Some(hangs), &failed_starts);
+                checked.await
+            };
+            if let Ok(found) = found {
                 has_init |= found.is_none();
                 publish(&sender, found, &failed_starts);
             }

@@ -31,8 +31,15 @@ fn own_mounts() -> Option<&'static str> {
 pub fn free_address() -> Option<Ipv4Addr> {
     static LAST: AtomicU8 = AtomicU8::new(0);
     let process = u8::try_from(std::process::id() % 250).unwrap();
-    let address = Ipv4Addr::new(127, 53, process, LAST.fetch_add(1, Ordering::Relaxed) + 1);
-    UdpSocket::bind((address, PORT)).is_ok().then_some(address)
+    loop {
+        let address = Ipv4Addr::new(127, 53, process, LAST.fetch_add(1, Ordering::Relaxed) + 1);
+        match UdpSocket::bind((address, PORT)) {
+            Ok(_) => return Some(address),
+            // Another process of the same number modulo 250 has it.
+            Err(error) if error.kind() == std::io::ErrorKind::AddrInUse => {}
+            Err(_) => return None,
+        }
+    }
 }
 
 /// A shell script after which a server finds its name server at this address, `None` where that can't be.

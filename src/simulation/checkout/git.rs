@@ -146,10 +146,16 @@ impl Git {
         self.write_settings().await.map_err(broken)?;
         let (answer, output) = std::io::pipe().map_err(broken)?;
         let (complaints, errors) = std::io::pipe().map_err(broken)?;
-        let memory = call.memory;
-        let (group, ended) = ProcessGroup::start(&self.spec(call), output.into(), errors.into()).map_err(broken)?;
-        bound(group.leader(), memory, HEAVY.contains(&command.as_str()));
-        let mut ended = ended.boxed();
+        let (memory, is_heavy, spec) = (call.memory, HEAVY.contains(&command.as_str()), self.spec(call));
+        // A thread that starts a process waits until it runs its program, which takes long on a busy machine.
+        let start = move || {
+            let (group, ended) = ProcessGroup::start(&spec, output.into(), errors.into())?;
+            bound(group.leader(), memory, is_heavy);
+            Ok((group, ended.boxed()))
+        };
+        let started: std::io::Result<_> =
+            actix_rt::task::spawn_blocking(start).await.map_err(|error| broken(error.into()))?;
+        let (group, mut ended) = started.map_err(broken)?;
         let answer = asynchronous(answer).map_err(broken)?;
         let complaints = asynchronous(complaints).map_err(broken)?;
         let ended = async move {

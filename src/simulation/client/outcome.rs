@@ -70,6 +70,12 @@ impl Pending {
         Self(Some(counter.clone()))
     }
 
+    /// Whether the outcome is not known yet.
+    #[must_use]
+    pub fn is_open(&self) -> bool {
+        self.0.is_some()
+    }
+
     /// Counts the outcome. Only the first one counts.
     pub fn resolve(&mut self, outcome: Outcome) {
         if let Some(counter) = self.0.take() {

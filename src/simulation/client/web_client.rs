@@ -191,11 +191,12 @@ impl WebClient {
     }
 
     fn exited(&mut self, Exit { clean, own, why }: &Exit, ctx: &mut Context) {
-        let words = match (clean, own) {
-            (_, true) => return self.fail_own(Outcome::NoWebots, why, ctx),
-            (true, _) => protocol::loading(why),
-            (false, _) => protocol::error(why),
-        };
+        if *own && self.start.is_open() {
+            return self.fail_own(Outcome::NoWebots, why, ctx);
+        } else if *own {
+            return self.refer(Outcome::NoWebots, why, ctx);
+        }
+        let words = if *clean { protocol::loading(why) } else { protocol::error(why) };
         self.start.resolve(Outcome::NoWebots);
         self.finish(&words, CloseCode::Normal, ctx);
     }

@@ -9,7 +9,7 @@ use crate::shared::text::one_line;
 use crate::simulation::config::SimulationConfig;
 
 /// Timeout of a command that starts a container, in seconds.
-const START: &str = "30";
+const START: &str = "15";
 /// Where Docker puts its init process into a container. The program is static: it runs in an empty image.
 const INIT: &str = "/sbin/docker-init";
 /// The empty image, shared by all servers of a machine.
@@ -40,7 +40,7 @@ pub fn daemon_fault() -> Option<String> {
 ///
 /// Without one, `xvfb-run` of the images is process 1, to which Xvfb sends no signal, so that it waits forever. What
 /// `docker info` prints does not tell: the version of Debian's docker-init is empty there. So a container runs it.
-/// Blocks for a second, for a minute at most.
+/// Blocks for a second, for 45 at most.
 #[must_use]
 pub fn init_fault() -> Option<String> {
     let import = || {

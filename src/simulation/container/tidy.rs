@@ -70,9 +70,11 @@ async fn tidy(docker: &Docker, owner: &Owner, live: &Live) -> Result<usize, Dock
     let left: Vec<String> = found.into_iter().filter(|name| !live.names().contains(name)).collect();
     let mut done = Ok(left.len());
     for name in left {
-        log::info!("{name} was left; it is removed");
         // One that can't be removed holds up no other.
-        done = objects::remove(docker, &name).await.and(done);
+        match objects::remove(docker, &name).await {
+            Ok(()) => log::info!("{name} was left: removed"),
+            Err(error) => done = Err(error),
+        }
     }
     done
 }

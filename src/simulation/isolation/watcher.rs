@@ -86,9 +86,12 @@ impl Watcher {
         let (watches, receiver) = channel();
         let ports = config.streaming_ports();
         let last = *SimulationConfig::ports_from(*ports.end()).end();
+        // Where the system does not tell, no simulation would become ready.
+        listeners(&ports)?;
         let finder = PortFinder::start(*ports.start()..=last)?;
         let disk = Disk { free: free(&run), folder: run, lost: 0 };
-        let mut table = Table { disk, ports, usage, all: Vec::new(), owners: HashMap::new() };
+        let mut table =
+            Table { disk, ports, usage, all: Vec::new(), owners: HashMap::new(), forgotten: Instant::now() };
         std::thread::Builder::new().name("watcher".to_owned()).spawn(move || table.run(&receiver))?;
         Ok(Self { watches, ports: finder })
     }
@@ -121,6 +124,8 @@ struct Table {
     all: Vec<Watched>,
     /// Whose each listener is: the root of a simulation's tree, `None` for somebody else's.
     owners: HashMap<u64, Option<i32>>,
+    /// When those of somebody else were forgotten last.
+    forgotten: Instant,
 }
 
 impl Table {
@@ -152,8 +157,10 @@ impl Table {
         self.all.retain(|one| !one.excess.is_closed());
         let mut excesses = self.look_at_disk();
         excesses.extend(self.count_processes());
-        // Where the system does not tell, no simulation becomes ready, which is logged there.
-        excesses.extend(listeners(&self.ports).map(|all| self.look_at_ports(&all)).unwrap_or_default());
+        if self.all.iter().any(|one| one.watch.port.is_some()) {
+            // An error is logged by those who start.
+            excesses.extend(listeners(&self.ports).map(|all| self.look_at_ports(&all)).unwrap_or_default());
+        }
         for (root, why) in excesses {
             if let Some(place) = self.all.iter().position(|one| one.watch.root == root) {
                 // Who asked may be gone.
@@ -204,7 +211,10 @@ impl Table {
     /// Finds out whose the listeners are that were not there before: mostly of the simulation that was given the port.
     fn find_owners(&mut self, all: &[Listener]) {
         let there: HashSet<u64> = all.iter().map(|one| one.inode).collect();
-        self.owners.retain(|inode, _| there.contains(inode));
+        // `/proc` may leave out a child while others come and go: its listener would be taken for somebody else's for good.
+        let forget = self.forgotten.elapsed() >= WALK_AGAIN;
+        self.owners.retain(|inode, owner| there.contains(inode) && (owner.is_some() || !forget));
+        self.forgotten = if forget { Instant::now() } else { self.forgotten };
         let mut new: Vec<&Listener> = all.iter().filter(|one| !self.owners.contains_key(&one.inode)).collect();
         for exact in [true, false] {
             for one in self.all.iter().filter(|one| one.watch.port.is_some()) {

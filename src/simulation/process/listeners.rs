@@ -89,7 +89,9 @@ mod tests {
         assert_eq!(found.len(), 1 + usize::from(six.is_some()), "{found:?}");
         assert!(found.iter().all(|one| one.port == port && one.inode > 0), "{found:?}");
         drop((four, six));
-        assert_eq!(listeners(&(port..=port)).unwrap(), []);
+        // Another socket may have the port by now.
+        let left = listeners(&(port..=port)).unwrap();
+        assert!(left.iter().all(|one| !found.contains(one)), "{left:?}");
     }
 
     #[test]

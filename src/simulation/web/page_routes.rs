@@ -45,7 +45,9 @@ async fn monitor(server: web::Data<AppState>) -> HttpResponse {
 
 async fn usages(server: &AppState, snapshot: &Snapshot) -> Usages {
     let tree = |one: &Simulation| Some(Tree { root: one.pid?, cgroup: one.cgroup.clone() });
-    let trees: Vec<Tree> = snapshot.simulations.iter().filter_map(tree).collect();
+    // In containers the process is that of docker, which waits for them.
+    let is_own = server.containers.is_none();
+    let trees: Vec<Tree> = snapshot.simulations.iter().filter(|_| is_own).filter_map(tree).collect();
     if trees.is_empty() {
         return Usages::new();
     }

@@ -83,7 +83,7 @@ impl Drop for ExitNotifier {
     fn drop(&mut self) {
         if !self.exit_told {
             let why = "The simulation was lost by a fault of this server".to_owned();
-            self.tell(WebotsEvent::Exited(Exit { clean: false, own: false, why }));
+            self.tell(WebotsEvent::Exited(Exit { clean: false, own: true, why }));
         }
     }
 }
