@@ -191,10 +191,9 @@ impl WebClient {
     }
 
     fn exited(&mut self, Exit { clean, own, why }: &Exit, ctx: &mut Context) {
-        if *own && self.start.is_open() {
-            return self.fail_own(Outcome::NoWebots, why, ctx);
-        } else if *own {
-            return self.refer(Outcome::NoWebots, why, ctx);
+        if *own {
+            let fail = if self.start.is_open() { Self::fail_own } else { Self::refer };
+            return fail(self, Outcome::NoWebots, why, ctx);
         }
         let words = if *clean { protocol::loading(why) } else { protocol::error(why) };
         self.start.resolve(Outcome::NoWebots);
