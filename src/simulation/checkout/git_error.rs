@@ -83,6 +83,10 @@ const MESSAGES: &[(&str, Cause)] = &[
     ("Too many open files", Cause::Machine),
     ("Cannot allocate memory", Cause::Machine),
     ("Resource temporarily unavailable", Cause::Machine),
+    // Hosts are those of the configuration: a URL with another one does not come so far.
+    ("Could not resolve host", Cause::Machine),
+    ("Failed to connect to", Cause::Machine),
+    ("Couldn't connect to", Cause::Machine),
     ("SSL certificate", Cause::Machine),
     ("certificate verification failed", Cause::Machine),
     ("returned error: 301", Cause::Moved),
@@ -142,6 +146,11 @@ mod tests {
         };
         for (message, expected) in [
             ("fatal: repository 'https://github.com/lab/none.git/' not found", Cause::NoRepository),
+            ("fatal: repository 'https://github.com/lab/certificates.git/' not found", Cause::NoRepository),
+            (
+                "fatal: unable to access 'https://a.forge/': SSL certificate problem: self-signed certificate",
+                Cause::Machine,
+            ),
             ("fatal: could not read Username for 'https://github.com': terminal prompts disabled", Cause::NoRepository),
             ("fatal: remote error: upload-pack: not our ref 0123", Cause::NoCommit),
             ("fatal: packed object 9ed5 (stored in pack-1115.pack) is corrupt", Cause::Damaged),
