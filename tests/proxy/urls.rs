@@ -51,11 +51,10 @@ async fn urls_lead_through_the_web_server(rules: Rules) {
             break mail;
         }
     };
-    for body in [mail.field("text"), mail.field("html")] {
-        assert!(body.contains(&format!("{door}/monitor")), "{body}");
-    }
-    let link = first_url(mail.field("text"));
-    assert_eq!(browser.ask(link, &[]).await.status, 200, "{link} in {}", mail.field("text"));
+    let body = mail.field("text");
+    assert!(body.contains(&format!("{door}/monitor")), "{body}");
+    let link = first_url(body);
+    assert_eq!(browser.ask(link, &[]).await.status, 200, "{link} in {body}");
     assert_eq!(http::get(&session.url("/health")).await.status, 200);
 }
 

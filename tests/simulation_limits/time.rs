@@ -21,7 +21,8 @@ pub async fn a_simulation_ends_at_its_time_limit_in_any_state() {
         }
         let told = client.until("loading: Error:").await;
         assert!(told.starts_with("loading: Error: The time limit of 5 seconds was reached"), "{stage:?}: {told}");
-        assert_eq!(client.closed().await, Some(1000));
+        // One that does not even become ready fails for a reason of the server's own: another one may take its client.
+        assert_eq!(client.closed().await, Some(if stage == Stage::Launching { 1013 } else { 1000 }), "{stage:?}");
         assert!(begin.elapsed() >= Duration::from_secs(5), "{stage:?}: it came too early");
         inside.until_nothing_is_left().await;
         inside.stop().await;

@@ -18,16 +18,20 @@ use hickory_resolver::system_conf::read_system_conf;
 
 /// How long a lookup may take before the last answer is used in its place.
 const SLOW: Duration = Duration::from_millis(500);
+/// How long a name server has for an answer about a host, at most.
+const TIMEOUT: Duration = Duration::from_secs(1);
 
 /// The resolver of all hosts. Clones share its connections and its cache.
 ///
 /// # Errors
 /// When no resolver can be made.
 pub fn resolver() -> std::io::Result<TokioResolver> {
-    let (config, options) = read_system_conf().unwrap_or_else(|error| {
+    let (config, mut options) = read_system_conf().unwrap_or_else(|error| {
         log::warn!("/etc/resolv.conf can't be used, only /etc/hosts is: {error}");
         (ResolverConfig::from_name_servers(Vec::new()), ResolverOpts::default())
     });
+    // Two attempts fit into the time that a simulation server has for its answer (`timing.answer`).
+    options.timeout = options.timeout.min(TIMEOUT);
     build(config, options).map_err(std::io::Error::other)
 }
 
