@@ -236,7 +236,7 @@ fn assemble(
         run: Arc::new(run),
         phase,
         requests,
-        main_thread: Arbiter::current(),
+        webots_threads: std::array::from_fn(|_| Arbiter::new().handle()),
         admin_auth: config.admin_password.clone().map(BasicAuth::new),
         connections: Connections::new(max_tcp(&config), config.max_clients, config.max_clients_per_address),
         metrics,

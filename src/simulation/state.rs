@@ -25,6 +25,10 @@ use crate::simulation::machine::UsageMonitor;
 use crate::simulation::machine::{LoadMonitor, Readings};
 use crate::simulation::process::RunDir;
 
+/// How many threads start Webots. One that starts a process waits until it runs its program, which takes long on a busy
+/// machine. They live as long as the server: bubblewrap ends with the thread that has started it.
+pub const WEBOTS_THREADS: usize = 4;
+
 /// The shared state.
 pub struct AppState {
     /// The effective configuration.
@@ -55,8 +59,8 @@ pub struct AppState {
     pub failed_starts: Arc<FailedStarts>,
     /// Takes requests to drain.
     pub requests: tokio::sync::mpsc::Sender<Request>,
-    /// The thread on which the actors of Webots run.
-    pub main_thread: ArbiterHandle,
+    /// The threads on which the actors of Webots run.
+    pub webots_threads: [ArbiterHandle; WEBOTS_THREADS],
     /// Checks the administrator's password, where one is configured.
     pub admin_auth: Option<BasicAuth>,
     /// Limits and counts connections.
@@ -76,6 +80,18 @@ pub struct AppState {
 }
 
 impl AppState {
+    /// Returns the thread for the Webots that was given this port.
+    #[must_use]
+    pub fn webots_thread(&self, port: u16) -> &ArbiterHandle {
+        let [first, second, third, fourth] = &self.webots_threads;
+        match port % 4 {
+            0 => first,
+            1 => second,
+            2 => third,
+            _ => fourth,
+        }
+    }
+
     /// Returns the load to report: 100 % while the server is draining or can start no simulation.
     #[must_use]
     pub fn load(&self) -> Load {

@@ -38,10 +38,15 @@ pub struct Checkouts {
     finder: Arc<Finder>,
     limits: Limits,
     runtime: Handle,
-    /// How many copies are made at a time: more would only be slower together.
+    /// How many MiB of projects are copied at a time. git may hold files in memory as it writes them.
     copies: Semaphore,
     _keeps_within_budget: AbortOnDropHandle<()>,
 }
+
+/// How many MiB of projects are copied at a time: many small ones, of which a class may start at once, or a few large ones.
+const COPIED: u32 = 2048;
+/// What a project counts at least, in MiB: git itself.
+const SMALLEST: u32 = 32;
 
 /// A step of a checkout, in words.
 #[derive(Message)]
@@ -68,8 +73,7 @@ impl Checkouts {
         let cache = Arc::new(Cache::open(dir, budget, Arc::clone(&git), limits)?);
         let finder = Arc::new(Finder::new(Arc::clone(&git), Arc::clone(&cache), (mirrors, rules), limits));
         let keeper = AbortOnDropHandle::new(runtime.spawn(Arc::clone(&cache).keep_within_budget()));
-        let cores = std::thread::available_parallelism().map_or(2, usize::from);
-        let copies = Semaphore::new(2 * cores);
+        let copies = Semaphore::new(usize::try_from(COPIED).unwrap_or(usize::MAX));
         Ok(Self { git, cache, finder, limits, runtime, copies, _keeps_within_budget: keeper })
     }
 
@@ -175,7 +179,9 @@ impl Checkouts {
         instance: &InstanceDir,
         progress: &(impl Fn(String) + Send + Sync),
     ) -> Result<(), CheckoutError> {
-        let _turn = self.copies.acquire().await.map_err(|error| machine(world, &io::Error::other(error)))?;
+        let weight = u32::try_from(found.size >> 20).unwrap_or(u32::MAX).clamp(SMALLEST, COPIED);
+        let turn = self.copies.acquire_many(weight).await;
+        let _turn = turn.map_err(|error| machine(world, &io::Error::other(error)))?;
         self.finder.refused().check(&needed.scope(found))?;
         let name = &found.revision.name;
         progress(steps::checking_out(name, None));

@@ -51,6 +51,8 @@ pub struct Found {
     pub revision: Revision,
     /// The files of the folders above the project's, each path ended by a zero byte: worlds may refer to them.
     pub above: Vec<u8>,
+    /// How many bytes its files have.
+    pub size: u64,
 }
 
 /// What git says of a commit in the cache.
@@ -125,7 +127,7 @@ impl Finder {
             self.check(&repository, &revision, &listing)?;
             // Where a link leads is seen in the checkout.
             if listing.has_world || listing.has_link {
-                return Ok(Found { repository, revision, above });
+                return Ok(Found { repository, revision, above, size: listing.size });
             }
             missing = Some(NoWorld::Missing(format!("{} in {}", revision.world_path(world), revision.name)));
         }
@@ -143,8 +145,7 @@ impl Finder {
     }
 
     async fn repository(&self, world: &ProjectUrl) -> Result<Arc<Repository>, CheckoutError> {
-        let remote = self.remote(world)?;
-        self.cache.commits(&remote).await.map_err(|error| machine(world, &error))
+        self.cache.commits(&self.remote(world)?).await.map_err(|error| machine(world, &error))
     }
 
     fn remote(&self, world: &ProjectUrl) -> Result<Remote, CheckoutError> {
@@ -251,7 +252,6 @@ impl Finder {
     ) -> Result<Answer, CheckoutError> {
         let scope = Scope::folder(&repository.remote(), revision, revision.needed());
         let answer = {
-            // Each answer may be long: few are read at a time.
             let _listing = repository.may_list().await;
             let _turn = self.answers.acquire().await.map_err(|error| machine(world, &std::io::Error::other(error)))?;
             self.refused.check(&scope)?;
@@ -279,9 +279,9 @@ impl Finder {
     async fn fetch(&self, search: Search<'_>, revision: &Revision) -> Result<(), CheckoutError> {
         let Search { world, repository, progress, .. } = search;
         let tell = |said: String| progress(steps::fetching(&world.repository(), &said));
-        let fetched = repository.fetch(&revision.request(&repository.remote().location), &tell).await;
-        let what = || format!("{} (at depth 1)", world.repository());
-        let fetched = fetched.map_err(|error| fetch_failed(world, what, self.limits.size, error));
+        let failed =
+            |error| fetch_failed(world, || format!("{} (at depth 1)", world.repository()), self.limits.size, error);
+        let fetched = repository.fetch(&revision.request(&repository.remote().location), &tell).await.map_err(failed);
         self.refused.note(Scope::commit(&repository.remote(), revision), fetched)
     }
 

@@ -164,7 +164,7 @@ impl WebClient {
             place,
             events: ctx.address().recipient(),
         };
-        let webots = Webots::start_in_arbiter(&self.server.main_thread, |_| Webots::new(spec));
+        let webots = Webots::start_in_arbiter(self.server.webots_thread(spec.place.1), |_| Webots::new(spec));
         self.state = State::Launched(WebotsHandle(webots));
     }
 
