@@ -4,6 +4,7 @@
 //! - `load`: how fast `/load` answers while ten checkouts run, one remote hangs, and a simulator floods its output;
 //! - `class`: how long 1, 10, 100 and 200 clients take that start at once, in turns with a bare loop that does the same;
 //! - `idle`: what simulations that stand idle cost the server;
+//! - `late`: how long it takes until a limit is noticed that the server keeps itself;
 //! - `start`: what a cached start costs over the git commands that it runs, and what a sandbox adds to it;
 //! - `containers`: what a start in containers takes beside `docker compose up` by hand, one and thirty at once; needs root
 //!   and dockerd;
@@ -26,6 +27,7 @@
 mod class;
 mod containers;
 mod idle;
+mod late;
 mod load;
 #[path = "../../tests/simulation/soak.rs"]
 mod soak;
@@ -52,10 +54,10 @@ struct Arguments {
     /// Cached starts for `start`.
     #[arg(long, default_value_t = 100)]
     cached: usize,
-    /// How many start at once in `class`, in place of 1, 10, 100 and 200.
+    /// How many start at once in `class`, in place of 1, 10, 100 and 200, or run in `late`, in place of 10 and 100.
     #[arg(long)]
     size: Vec<u16>,
-    /// Levels of isolation for `class` and `idle`, in place of `none` and `sandbox`.
+    /// Levels of isolation for `class`, `idle` and `late`, in place of `none` and `sandbox`.
     #[arg(long)]
     level: Vec<String>,
     /// Rounds of each row of `class`.
@@ -73,6 +75,7 @@ struct Arguments {
 enum Part {
     Class,
     Idle,
+    Late,
     Load,
     Start,
     Containers,
@@ -114,11 +117,14 @@ async fn main() -> ExitCode {
         start::compare_levels(&mut verdict, arguments.cached).await;
     }
     if is_wanted(Part::Class) {
-        let sizes = if arguments.size.is_empty() { vec![1, 10, 100, 200] } else { arguments.size };
+        let sizes = if arguments.size.is_empty() { vec![1, 10, 100, 200] } else { arguments.size.clone() };
         class::measure(&mut verdict, &levels, &sizes, arguments.rounds).await;
     }
     if is_wanted(Part::Idle) {
         idle::measure(&mut verdict, &levels, Duration::from_secs(arguments.seconds)).await;
+    }
+    if is_wanted(Part::Late) {
+        late::measure(&levels, &arguments.size).await;
     }
     if is_wanted(Part::Containers) {
         containers::measure(&mut verdict).await;

@@ -14,6 +14,7 @@ use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
 use std::time::{Duration, Instant};
 
 use nix::sys::statvfs::statvfs;
+use nix::time::{ClockId, clock_gettime};
 use tokio::sync::oneshot;
 
 use crate::simulation::config::SimulationConfig;
@@ -72,7 +73,7 @@ struct Watched {
 const SHORTEST: Duration = Duration::from_secs(1);
 /// The longest: a simulation that makes ticks slow gains no more than this.
 const LONGEST: Duration = Duration::from_secs(10);
-/// The pause after a tick is this many times as long as the tick: 1 % of one core.
+/// The pause after a tick is this many times as long as the processor time of the tick: 1 % of one core.
 const PAUSE: u32 = 99;
 /// A folder is walked this often although the disk has lost little room: others may have made as much in the same tick.
 const WALK_AGAIN: Duration = Duration::from_secs(30);
@@ -146,9 +147,9 @@ impl Table {
                     Err(RecvTimeoutError::Disconnected) => return,
                 }
             }
-            let begin = Instant::now();
+            let begin = processor_time();
             self.look();
-            pause = pause_after(begin.elapsed());
+            pause = pause_after(processor_time().saturating_sub(begin));
         }
     }
 
@@ -275,7 +276,12 @@ fn free(folder: &Path) -> u64 {
     statvfs(folder).map_or(0, |disk| disk.blocks_free().saturating_mul(disk.fragment_size()))
 }
 
-/// How long to wait after a tick that took so long.
+/// How much processor time this thread has taken. What a tick waits for a busy machine or its disk costs nobody anything.
+fn processor_time() -> Duration {
+    clock_gettime(ClockId::CLOCK_THREAD_CPUTIME_ID).map(Duration::from).unwrap_or_default()
+}
+
+/// How long to wait after a tick that took so much processor time.
 fn pause_after(tick: Duration) -> Duration {
     (tick * PAUSE).clamp(SHORTEST, LONGEST)
 }
