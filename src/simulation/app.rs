@@ -11,6 +11,7 @@ use tokio::sync::watch;
 
 use super::announcer::Announcer;
 use super::config::{Isolation, SimulationConfig};
+use super::ends::Ends;
 use super::places::{GetSnapshot, Places};
 use super::readiness;
 use super::state::AppState;
@@ -22,8 +23,7 @@ use crate::simulation::checkout::{CacheDir, Checkouts, Limits};
 use crate::simulation::client::{outcome, quota};
 use crate::simulation::container::Containers;
 use crate::simulation::isolation::{Launcher, Watcher};
-use crate::simulation::machine::LoadMonitor;
-use crate::simulation::machine::UsageMonitor;
+use crate::simulation::machine::{LoadMonitor, UsageMonitor};
 use crate::simulation::process::{Guardian, Leftovers, RunDir};
 use crate::simulation::web::configure;
 
@@ -140,6 +140,7 @@ pub async fn serve(assembly: Assembly) -> Result<(), AppError> {
     if actix_rt::time::timeout(server.config.timing.stop, empty(&places)).await.is_err() {
         log::error!("some simulations have not ended in time: they are killed");
     }
+    server.ends.flush().await;
     handle.stop(true).await;
     drop(serving);
     server.run.remove();
@@ -206,7 +207,12 @@ fn assemble(
         share_idle_time: config.share_idle_time,
     };
     let checkouts = open_checkouts(&config, cache_dir, &run, &rules).map_err(cache_fault)?;
-    let places = Places::new(config.streaming_ports(), config.waiting_line, config.max_places_per_address).start();
+    let metrics = Metrics::new();
+    let logs = config.log_dir.0.join("simulation");
+    let ends = Ends::start(logs, launcher.level().to_string(), &metrics);
+    let ends = ends.map_err(|why| AppError::Unavailable(format!("ends of simulations can't be recorded: {why}")))?;
+    let places = Places::new(config.streaming_ports(), config.waiting_line, config.max_places_per_address);
+    let places = places.with_ends(ends.clone()).start();
     let csv = config.monitor_log_enabled.then(|| config.log_dir.0.join("simulation/monitor.csv"));
     let (load_monitor, readings) = LoadMonitor::new(places.clone(), run.path(), csv);
     let load_monitor = load_monitor.start();
@@ -218,7 +224,6 @@ fn assemble(
         AppError::Unavailable(format!("simulations can't be watched (threads, or netlink with sock_diag): {source}"))
     };
     let watcher = Watcher::start(run.path().to_owned(), &config, usage.clone()).map_err(system)?;
-    let metrics = Metrics::new();
     let starts = outcome::counter(&metrics)?;
     let failed_starts = Arc::default();
     let problem =
@@ -227,6 +232,7 @@ fn assemble(
         rules,
         problem,
         failed_starts,
+        ends,
         places,
         load_monitor,
         readings,

@@ -8,6 +8,7 @@
 //!
 //! | to the client (text) | |
 //! |---|---|
+//! | `session: ID` | the id of the simulation, by which the administrator finds it |
 //! | `queue: N` | N clients are ahead in the waiting line |
 //! | `ide: enable` | the project has an editor, on Webots' port + 500 |
 //! | `type:TYPE` | what the project's `webots.yml` says of it |
@@ -115,6 +116,12 @@ pub fn elsewhere(why: &str) -> String {
     error(&format!("{why}. Connect again: the session server chooses another simulation server"))
 }
 
+/// The id of a simulation.
+#[must_use]
+pub fn session(id: impl std::fmt::Display) -> String {
+    format!("session: {id}")
+}
+
 /// How many clients are ahead in the waiting line: once for programs, and once in words, since Webots' page shows only
 /// those.
 #[must_use]
@@ -137,6 +144,12 @@ pub fn shutdown_timeout(seconds: u64) -> String {
 #[must_use]
 pub fn webots(url: &str) -> String {
     format!("webots:{url}")
+}
+
+/// Webots has been silent for so many seconds.
+#[must_use]
+pub fn hanging(seconds: u64) -> String {
+    loading(&format!("Webots has given no sign of life for {seconds} seconds"))
 }
 
 /// A controller's file was restored.

@@ -13,7 +13,7 @@ use which::which;
 
 use super::config::{Isolation, SimulationConfig};
 use super::failed_starts::FailedStarts;
-use crate::simulation::container::{daemon_fault, init_fault};
+use crate::simulation::container::{daemon_fault, data_folder, init_fault};
 use crate::simulation::machine::{Readings, display};
 
 /// Time between two checks.
@@ -108,8 +108,13 @@ fn check(config: &SimulationConfig, run: &Path) -> Result<(), String> {
     which("git").map_err(|_| "This simulation server has no git".to_owned())?;
     start_process().map_err(|error| format!("This simulation server can't start processes: {error}"))?;
     std::fs::create_dir_all(run).map_err(|error| not_writable(&error))?;
-    check_room(run, config.disk_reserve)?;
+    check_room(run, "disk", config.disk_reserve)?;
     write(run)?;
+    if config.isolation == Isolation::Container
+        && let Some(folder) = data_folder()
+    {
+        check_room(&folder, "disk of Docker", config.disk_reserve)?;
+    }
     // Webots itself always needs a display. What stands in for it (`webots`) may not.
     if config.webots.is_none() && !config.xvfb && config.isolation != Isolation::Container {
         let display = display::effective(config.display.as_ref());
@@ -142,17 +147,18 @@ fn start_process() -> std::io::Result<()> {
     }
 }
 
-/// Checks that the disk of a folder has `reserve` MiB and some inodes left for users.
-fn check_room(folder: &Path, reserve: u64) -> Result<(), String> {
-    let disk = statvfs(folder).map_err(|error| not_writable(&error.into()))?;
-    let free = disk.blocks_available().saturating_mul(disk.fragment_size()) >> 20;
+/// Checks that the disk of a folder has `reserve` MiB and some inodes left for users. `disk` names it.
+fn check_room(folder: &Path, disk: &str, reserve: u64) -> Result<(), String> {
+    let full = |left: String| Err(format!("This simulation server's {disk} is full: less than {left}"));
+    let about = statvfs(folder).map_err(|error| not_writable(&error.into()))?;
+    let free = about.blocks_available().saturating_mul(about.fragment_size()) >> 20;
     // Without the numbers that change with each check, the reason is logged once.
     if free < reserve {
-        return Err(format!("This simulation server's disk is full: less than {reserve} MiB are left (diskReserve)"));
+        return full(format!("{reserve} MiB are left (diskReserve)"));
     }
     // Some file systems make inodes as they need them, and report none.
-    if disk.files_available() < disk.files() / FREE_INODES {
-        return Err("This simulation server's disk is full: less than 2 % of its inodes are left".to_owned());
+    if about.files_available() < about.files() / FREE_INODES {
+        return full("2 % of its inodes are left".to_owned());
     }
     Ok(())
 }

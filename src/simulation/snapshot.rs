@@ -6,6 +6,7 @@ use actix::prelude::*;
 use serde::Serialize;
 
 use crate::shared::domain::Instances;
+use crate::simulation::simulation_id::SimulationId;
 
 /// What has changed in a simulation.
 #[derive(Debug)]
@@ -26,8 +27,6 @@ pub enum Change {
         port: u16,
         /// The file.
         log: Option<PathBuf>,
-        /// How long the file was before: what earlier simulations on this port have printed.
-        begin: u64,
     },
     /// It streams on this port.
     Port(u16),
@@ -64,8 +63,8 @@ pub struct Snapshot {
 #[derive(Debug, Clone, Serialize)]
 #[serde(rename_all = "camelCase")]
 pub struct Simulation {
-    /// Its number.
-    pub id: u64,
+    /// Its id.
+    pub id: SimulationId,
     /// The world's URL.
     pub world: String,
     /// Its state.
@@ -85,9 +84,6 @@ pub struct Simulation {
     pub version: Option<String>,
     /// The file that its output is kept in.
     pub log: Option<PathBuf>,
-    /// Where in that file its output begins.
-    #[serde(skip)]
-    pub log_begin: u64,
 }
 
 impl Simulation {
@@ -97,9 +93,8 @@ impl Simulation {
             Change::Stage(stage) => self.stage = stage,
             Change::Version(version) => self.version = Some(version),
             Change::Port(port) => self.port = Some(port),
-            Change::Launched { at, pid, cgroup, port, log, begin } => {
+            Change::Launched { at, pid, cgroup, port, log } => {
                 self.cgroup = cgroup;
-                self.log_begin = begin;
                 self.launched = Some(at);
                 self.pid = Some(pid);
                 self.port = Some(port);

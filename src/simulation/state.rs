@@ -7,6 +7,7 @@ use actix::prelude::*;
 use tokio::sync::watch;
 
 use super::config::SimulationConfig;
+use super::ends::Ends;
 use super::failed_starts::FailedStarts;
 use super::places::Places;
 use crate::shared::domain::Load;
@@ -57,6 +58,8 @@ pub struct AppState {
     pub problem: watch::Receiver<Option<String>>,
     /// The last starts that failed for a reason of this server's own.
     pub failed_starts: Arc<FailedStarts>,
+    /// How simulations have ended.
+    pub ends: Ends,
     /// Takes requests to drain.
     pub requests: tokio::sync::mpsc::Sender<Request>,
     /// The threads on which the actors of Webots run.

@@ -176,7 +176,7 @@ async fn secrets_that_are_written_anew_stay_hidden() {
         let server = builder.set("adminPassword", serde_json::json!({ "file": link })).start().await;
         let mut client = Client::start(&server, &arm()).await;
         client.until("shutdownTimeout").await;
-        let log = server.folder.join(format!("log/simulation/instances/{}.log", server.port + 1));
+        let log = server.output_file(&client);
         until("it runs", async || std::fs::read_to_string(&log).is_ok_and(|text| text.contains("waits"))).await;
         replace(password.path().join("password"));
         std::fs::remove_file(&link).unwrap();
@@ -187,7 +187,6 @@ async fn secrets_that_are_written_anew_stay_hidden() {
         assert_eq!(told.matches("READ").count(), count, "{level}: {told}");
         nothing_left(&server, 2).await;
         std::fs::remove_file(&ready).unwrap();
-        std::fs::remove_file(&log).unwrap();
     }
 }
 
@@ -316,7 +315,7 @@ async fn a_world_can_kill_the_server_only_without_a_sandbox() {
     assert_eq!(server.ended().await, None, "it was killed");
     let stage = Stage::new();
     let (server, client) = attacked(&stage, "sandbox").await;
-    let log: PathBuf = server.folder.join(format!("log/simulation/instances/{}.log", server.port + 1));
+    let log = server.output_file(&client);
     let tried = async || std::fs::read_to_string(&log).is_ok_and(|text| text.contains("tried"));
     until("it has tried", tried).await;
     client.leave().await;

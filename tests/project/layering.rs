@@ -20,7 +20,9 @@ const SESSION: [&str; 8] = [
     "session::web",
     "session::app",
 ];
-const SIMULATION: [&str; 18] = [
+const SIMULATION: [&str; 20] = [
+    "simulation::simulation_id",
+    "simulation::ends",
     "simulation::snapshot",
     "simulation::failed_starts",
     "simulation::places",

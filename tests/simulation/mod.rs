@@ -4,6 +4,7 @@ mod admission;
 mod cache;
 mod checkout;
 mod commits;
+mod ends;
 mod fetching;
 mod git_wrapper;
 mod https;

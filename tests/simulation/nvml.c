@@ -11,11 +11,19 @@ static const char *at(const char *name) { const char *value = getenv(name); retu
 static int marked(const char *name) { return *at(name) && !access(at(name), F_OK); }
 static void hang(const char *where) { if (!strcmp(at("NVML_HANG"), where)) for (;;) pause(); }
 
-int nvmlInit_v2(void) { hang("init"); return strcmp(at("NVML_HANG"), "no driver") ? 0 : 9; }
+/* Once the driver was unloaded, nothing answers before the library is opened again. */
+static int unloaded = 0;
+
+int nvmlInit_v2(void) {
+  hang("init");
+  if (!strcmp(at("NVML_HANG"), "no driver") || marked("NVML_UNLOADED")) return 9;
+  unloaded = 0;
+  return 0;
+}
 int nvmlInitWithFlags(unsigned flags) { (void)flags; return nvmlInit_v2(); }
 int nvmlShutdown(void) { return 0; }
 int nvmlSystemGetDriverVersion(char *text, unsigned length) { strncpy(text, "550.54.15", length); return 0; }
-int nvmlDeviceGetCount_v2(unsigned *count) { *count = marked("NVML_GONE") ? 0 : 2; return 0; }
+int nvmlDeviceGetCount_v2(unsigned *count) { unloaded |= marked("NVML_UNLOADED"); *count = unloaded || marked("NVML_GONE") ? 0 : marked("NVML_ONE") ? 1 : 2; return 0; }
 int nvmlDeviceGetHandleByIndex_v2(unsigned index, void **device) { *device = (void *)(unsigned long)(index + 1); return 0; }
 int nvmlDeviceGetUtilizationRates(void *device, rates *out) {
   hang("read");

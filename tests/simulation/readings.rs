@@ -65,6 +65,7 @@ async fn gpus_that_are_lost_are_told_and_come_back() {
     for (variable, words, left) in [
         ("NVML_LOST", "NVIDIA's driver has lost 1 of 2 GPUs", 1),
         ("NVML_GONE", "no GPU answers any more, of 2 that did", 0),
+        ("NVML_ONE", "1 of 2 GPUs don't answer any more", 1),
     ] {
         let server = with(library.path(), &forge, &webots).env(variable, mark.to_str().unwrap()).start().await;
         let gpus = async || http::get(&server.url("/status")).await.json()["gpus"].as_array().unwrap().len();
@@ -75,14 +76,32 @@ async fn gpus_that_are_lost_are_told_and_come_back() {
         assert_eq!(gpus().await, left);
         assert!(server.log().contains(words), "{}", server.log());
         assert!(http::get(&server.url("/metrics")).await.text().contains("\nwebots_machine_gpu_lost 1\n"));
-        // The page has another letter in place of the quote.
-        let words = words.trim_start_matches("NVIDIA's ");
-        assert!(http::get(&server.url("/monitor")).await.text().contains(words));
+        let page = http::get(&server.url("/monitor")).await.text().replace("&#39;", "'");
+        assert!(page.contains(words), "{page}");
         assert_eq!(http::get(&server.url("/health")).await.text(), "ok", "they are not required");
         std::fs::remove_file(&mark).unwrap();
         until("they are back", async || gpu_problem(&server).await.is_none()).await;
         assert!(server.log().contains("the GPUs answer again"), "{}", server.log());
     }
+}
+
+#[actix_rt::test]
+async fn a_driver_that_is_loaded_later_or_anew_is_found() {
+    let library = gpu_driver();
+    let mark = library.path().join("mark");
+    std::fs::write(&mark, "").unwrap();
+    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
+    let builder = with(library.path(), &forge, &webots).env("NVML_UNLOADED", mark.to_str().unwrap());
+    let server = builder.start().await;
+    let gpus = async || http::get(&server.url("/status")).await.json()["gpus"].as_array().unwrap().len();
+    until("the driver is missed", async || server.log().contains("no NVIDIA GPU is read")).await;
+    std::fs::remove_file(&mark).unwrap();
+    until("its GPUs are read", async || gpus().await == 2).await;
+    assert_eq!(gpu_problem(&server).await, None);
+    std::fs::write(&mark, "").unwrap();
+    until("it is unloaded", async || gpu_problem(&server).await.is_some()).await;
+    std::fs::remove_file(&mark).unwrap();
+    until("its GPUs are read again", async || gpus().await == 2 && gpu_problem(&server).await.is_none()).await;
 }
 
 #[actix_rt::test]

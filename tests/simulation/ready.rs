@@ -177,8 +177,10 @@ async fn paths_may_have_spaces_and_quotes() {
         assert!(!xvfb || told.contains("with a display | "), "{told}");
         assert!(told.contains(" p q's [opened] p q's/worlds/b  \"c\".wbt"), "{told}");
         assert!(!told.contains("the cache's"), "{told}");
-        let log = format!("{}/simulation/instances/{}.log", at("the log's"), server.port + 1);
-        assert!(std::fs::read_to_string(log).unwrap().contains("[opened]"));
+        let failed = PathBuf::from(at("the log's")).join("simulation/failed");
+        let kept = || std::fs::read_dir(&failed).into_iter().flatten().flatten().map(|file| file.path());
+        let has_it = |log: &PathBuf| std::fs::read_to_string(log).is_ok_and(|text| text.contains("[opened]"));
+        until("its output is kept", async || kept().filter(has_it).count() == 1 + usize::from(xvfb)).await;
         until("its folder is gone", async || instance_folders_in(Path::new(&at("the cache's"))).is_empty()).await;
     }
 }
@@ -214,12 +216,11 @@ async fn each_webots_gets_a_virtual_display_of_its_own() {
     let server = simulation_server(&webots.path(), forge.path(), 2).set("xvfb", true).start().await;
     let mut clients = Vec::new();
     let mut displays = Vec::new();
-    for place in 1..=2 {
+    for _ in 1..=2 {
         let mut client = Client::start(&server, &arm()).await;
         client.until("webots:").await;
+        let text = std::fs::read_to_string(server.output_file(&client)).unwrap();
         clients.push(client);
-        let log = server.folder.join(format!("log/simulation/instances/{}.log", server.port + place));
-        let text = std::fs::read_to_string(log).unwrap();
         displays.push(text.lines().find_map(|line| line.strip_prefix("display ")).unwrap().to_owned());
     }
     assert_ne!(displays[0], displays[1]);
@@ -241,8 +242,7 @@ async fn the_number_of_a_virtual_display_that_was_killed_is_used_again() {
     for _ in 0..12 {
         let mut client = Client::start(&server, &arm()).await;
         client.until("webots:").await;
-        let log = server.folder.join(format!("log/simulation/instances/{}.log", server.port + 1));
-        let text = std::fs::read_to_string(log).unwrap();
+        let text = std::fs::read_to_string(server.output_file(&client)).unwrap();
         numbers.insert(text.lines().filter_map(|line| line.strip_prefix("display :")).next_back().unwrap().to_owned());
         let xvfb = instances_below(&server.folder).into_iter().find(|one| one.1.starts_with("Xvfb")).unwrap().0;
         kill(Pid::from_raw(xvfb), Signal::SIGKILL).unwrap();

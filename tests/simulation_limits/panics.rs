@@ -8,9 +8,10 @@ use actix_web::{App, HttpRequest, HttpResponse, HttpServer, web};
 use actix_web_actors::ws::WsResponseBuilder;
 use tokio::sync::mpsc::{UnboundedReceiver, UnboundedSender, unbounded_channel};
 use webots_fleet::shared::domain::ProjectUrl;
-use webots_fleet::shared::http::Kind;
 use webots_fleet::shared::http::websocket::MessageReader;
+use webots_fleet::shared::http::{Kind, Peer};
 use webots_fleet::simulation::client::WebClient;
+use webots_fleet::simulation::ends::EndReason;
 use webots_fleet::simulation::machine::LoadMonitor;
 use webots_fleet::simulation::places::{PlaceEvent, Places, Ticket};
 use webots_fleet::simulation::protocol::Mode;
@@ -134,9 +135,9 @@ async fn launch(server: &AppState) -> (Addr<Webots>, UnboundedReceiver<Exit>) {
     let (places, mut granted) = unbounded_channel();
     let (exits, ended) = unbounded_channel();
     let listener = Listener { places, exits }.start();
-    let ticket = Ticket::new(&server.places, listener.clone().recipient(), arm(), None);
-    let port = granted.recv().await.unwrap();
     let world = ProjectUrl::parse(&arm()).unwrap();
+    let ticket = Ticket::new(&server.places, listener.clone().recipient(), &world, Peer::Unknown);
+    let port = granted.recv().await.unwrap();
     let project = server.checkouts.start(world, server.run.instance().unwrap(), |_| ()).await.unwrap().unwrap();
     let spec = LaunchSpec {
         config: Arc::clone(&server.config),
@@ -159,7 +160,7 @@ pub async fn a_webots_leaves_nothing_in_any_state() {
         let (webots, mut ended) = launch(&inside.server).await;
         if stage == Stage::Stopping {
             inside.until(Stage::Idle).await;
-            webots.do_send(Stop);
+            webots.do_send(Stop(EndReason::Left));
         }
         inside.until(stage).await;
         let begin = std::time::Instant::now();

@@ -67,6 +67,12 @@ impl Client {
         connected.map(|(socket, _)| Self::new(socket)).map_err(Box::new)
     }
 
+    /// The id of its simulation, once it was told.
+    pub fn id(&self) -> &str {
+        let told = self.heard.iter().find_map(|text| text.strip_prefix("session: "));
+        told.unwrap_or_else(|| panic!("no id in {:#?}", self.heard))
+    }
+
     /// The port of this end of the connection.
     pub fn port(&self) -> u16 {
         match self.socket.get_ref() {

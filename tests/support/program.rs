@@ -209,6 +209,11 @@ impl Server {
         std::fs::read_to_string(self.folder.join("output.txt")).unwrap_or_default()
     }
 
+    /// The file with the output of a simulation that runs.
+    pub fn output_file(&self, client: &super::client::Client) -> PathBuf {
+        self.folder.join(format!("log/simulation/instances/{}.log", client.id()))
+    }
+
     /// Writes another configuration into the server's file, for SIGHUP.
     pub fn rewrite_config(&self, change: impl FnOnce(&mut Value)) {
         let file = self.folder.join("config.json");

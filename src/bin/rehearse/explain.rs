@@ -24,8 +24,18 @@ const WATCH: Duration = Duration::from_secs(3);
 /// How long Webots may take to be gone once its client has left.
 const GONE: Duration = Duration::from_secs(15);
 /// How the texts begin that Webots' page knows on the connection to the simulation server.
-const KNOWN: [&str; 9] =
-    ["loading:", "queue:", "shutdownTimeout:", "webots:", "ide: ", "type:", "error:", "reset controller:", "."];
+const KNOWN: [&str; 10] = [
+    "session:",
+    "loading:",
+    "queue:",
+    "shutdownTimeout:",
+    "webots:",
+    "ide: ",
+    "type:",
+    "error:",
+    "reset controller:",
+    ".",
+];
 
 /// The walk can't go on.
 struct Stuck;

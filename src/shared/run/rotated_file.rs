@@ -18,6 +18,8 @@ pub struct RotatedFile {
     old_files: usize,
     file: File,
     size: u64,
+    /// The first line of each file.
+    heading: &'static str,
 }
 
 impl RotatedFile {
@@ -31,7 +33,13 @@ impl RotatedFile {
         }
         let file = File::options().create(true).append(true).open(path)?;
         let size = file.metadata()?.len();
-        Ok(Self { path: path.to_owned(), old_files, file, size })
+        Ok(Self { path: path.to_owned(), old_files, file, size, heading: "" })
+    }
+
+    /// The same with a first line for each file.
+    #[must_use]
+    pub fn with_heading(self, heading: &'static str) -> Self {
+        Self { heading, ..self }
     }
 
     fn rotate(&mut self) -> io::Result<()> {
@@ -64,6 +72,10 @@ impl Write for RotatedFile {
                 self.file.set_len(0)?;
             }
             self.size = 0;
+        }
+        if self.size == 0 {
+            self.file.write_all(self.heading.as_bytes())?;
+            self.size = self.heading.len() as u64;
         }
         let written = self.file.write(lines)?;
         self.size += written as u64;

@@ -3,6 +3,7 @@
 use prometheus::IntCounterVec;
 
 use crate::shared::http::Metrics;
+use crate::simulation::ends::EndReason;
 
 /// The outcome of a request to start a simulation.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -34,6 +35,17 @@ const ALL: [Outcome; 7] = [
 ];
 
 impl Outcome {
+    /// How a simulation ends whose start has this outcome.
+    #[must_use]
+    pub fn end(self) -> EndReason {
+        match self {
+            Self::NoCheckout => EndReason::NoCheckout,
+            Self::NoWebots => EndReason::NoWebots,
+            Self::Stopped => EndReason::Stopped,
+            Self::Refused | Self::Full | Self::Left | Self::Ready => EndReason::Left,
+        }
+    }
+
     fn label(self) -> &'static str {
         match self {
             Self::Refused => "refused",

@@ -3,6 +3,7 @@
 use actix::prelude::*;
 
 use crate::shared::domain::ProjectUrl;
+use crate::simulation::ends::{EndReason, Taken};
 use crate::simulation::places::Ticket;
 use crate::simulation::protocol::Mode;
 use crate::simulation::webots::{Stop, Webots};
@@ -31,6 +32,19 @@ pub enum State {
     Over,
 }
 
+impl State {
+    /// Tells how the simulation ends, before the state is dropped. What Webots has told of its own end comes first.
+    pub fn end(&self, reason: EndReason, why: &str) {
+        match self {
+            Self::Waiting { ticket, .. } | Self::CheckingOut { place: (ticket, _), .. } => {
+                ticket.end(reason, why, Taken::default());
+            }
+            Self::Launched(WebotsHandle(webots)) => webots.do_send(Stop(reason)),
+            Self::Connected | Self::Over => {}
+        }
+    }
+}
+
 /// The simulation that a client has asked for.
 pub struct StartRequest {
     /// Where the world is.
@@ -44,6 +58,6 @@ pub struct WebotsHandle(pub Addr<Webots>);
 
 impl Drop for WebotsHandle {
     fn drop(&mut self) {
-        self.0.do_send(Stop);
+        self.0.do_send(Stop(EndReason::Left));
     }
 }

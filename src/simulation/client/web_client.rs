@@ -10,12 +10,12 @@ use actix_web_actors::ws::{CloseCode, CloseReason, Message, ProtocolError, Webso
 
 use super::outcome::{Outcome, Pending};
 use super::state::{StartRequest, State, WebotsHandle};
-use crate::shared::http::ConnectionPermit;
-use crate::shared::http::Peer;
 use crate::shared::http::liveness::{self, Liveness};
 use crate::shared::http::websocket::{ClientMessage, MessageReader};
+use crate::shared::http::{ConnectionPermit, Peer};
 use crate::shared::run::closing;
 use crate::simulation::checkout::{Progress, Project};
+use crate::simulation::ends::EndReason;
 use crate::simulation::places::{PlaceEvent, Ticket};
 use crate::simulation::protocol::{self, Mode, Request};
 use crate::simulation::readiness;
@@ -27,6 +27,7 @@ use crate::simulation::webots::{Exit, LaunchSpec, RestoreController, Webots, Web
 pub struct WebClient {
     server: Arc<AppState>,
     peer: Peer,
+    id: String,
     state: State,
     liveness: Liveness,
     restoring: bool,
@@ -44,6 +45,7 @@ impl WebClient {
         Self {
             server,
             peer,
+            id: String::new(),
             state: State::Connected,
             liveness: Liveness::new(),
             restoring: false,
@@ -54,12 +56,13 @@ impl WebClient {
     }
 
     fn name(&self) -> String {
-        format!("client {}", self.peer)
+        format!("{}client {}", self.id, self.peer)
     }
 
     /// Counts the failed start, sends the client the reason, and closes the connection.
     fn fail_start(&mut self, outcome: Outcome, why: &str, ctx: &mut Context) {
         self.start.resolve(outcome);
+        self.state.end(outcome.end(), why);
         log::info!("{}: {why}", self.name());
         self.finish(&protocol::error(why), CloseCode::Normal, ctx);
     }
@@ -73,7 +76,8 @@ impl WebClient {
 
     /// The same for a start that fails for a reason of this server's own, which is reported to session servers.
     fn fail_own(&mut self, outcome: Outcome, why: &str, ctx: &mut Context) {
-        self.server.failed_starts.add(why);
+        self.server.failed_starts.add(&format!("{}: {why}", self.name()));
+        self.state.end(EndReason::Fault, why);
         self.refer(outcome, why, ctx);
     }
 
@@ -102,8 +106,7 @@ impl WebClient {
             return;
         }
         self.start = Pending::new(&self.server.starts);
-        let address = self.peer.rate_limit_key();
-        if !self.server.start_quota.take(address) {
+        if !self.server.start_quota.take(self.peer.rate_limit_key()) {
             let why = "Too many simulations were asked for from your address. Try again in a minute";
             return self.fail_start(Outcome::Refused, why, ctx);
         }
@@ -112,40 +115,38 @@ impl WebClient {
             Err(why) if self.server.takes_nobody() => return self.refer(Outcome::Refused, &why, ctx),
             Err(why) => return self.fail_start(Outcome::Refused, &why, ctx),
         };
+        let ticket = Ticket::new(&self.server.places, ctx.address().recipient(), &world, self.peer);
+        self.id = format!("{}: ", ticket.id());
+        ctx.text(protocol::session(ticket.id()));
         log::info!("{}: asks for {world}", self.name());
-        let ticket = Ticket::new(&self.server.places, ctx.address().recipient(), world.to_string(), address);
         self.state = State::Waiting { request: StartRequest { world, mode }, ticket };
     }
 
     fn check_out(&mut self, StartRequest { world, mode }: StartRequest, ticket: Ticket, port: u16, ctx: &mut Context) {
+        self.state = State::CheckingOut { mode, place: (ticket, port) };
         let instance = match self.server.run.instance() {
             Ok(instance) => instance,
             Err(error) => return self.fail_own(Outcome::NoCheckout, &format!("No room for a project: {error}"), ctx),
         };
-        self.state = State::CheckingOut { mode, place: (ticket, port) };
         let me = ctx.address();
         // Where the mailbox is full, the client misses one line of progress.
         let progress = move |text: String| drop(me.try_send(Progress(text)));
-        let job = self.server.checkouts.start(world, instance, progress);
-        job.into_actor(self)
-            .map(|result, this, ctx| match result {
-                Ok(Ok(project)) => this.launch(project, ctx),
-                Ok(Err(error)) if error.is_own() => this.fail_own(Outcome::NoCheckout, &error.to_string(), ctx),
-                Ok(Err(error)) => this.fail_start(Outcome::NoCheckout, &error.to_string(), ctx),
-                Err(error) => this.fail_own(Outcome::NoCheckout, &format!("The checkout broke off: {error}"), ctx),
-            })
-            .spawn(ctx);
+        let job = self.server.checkouts.start(world, instance, progress).into_actor(self);
+        job.map(|result, this, ctx| match result {
+            Ok(Ok(project)) => this.launch(project, ctx),
+            Ok(Err(error)) if error.is_own() => this.fail_own(Outcome::NoCheckout, &error.to_string(), ctx),
+            Ok(Err(error)) => this.fail_start(Outcome::NoCheckout, &error.to_string(), ctx),
+            Err(error) => this.fail_own(Outcome::NoCheckout, &format!("The checkout broke off: {error}"), ctx),
+        })
+        .spawn(ctx);
     }
 
     fn launch(&mut self, project: Project, ctx: &mut Context) {
-        let (mode, place) = match std::mem::replace(&mut self.state, State::Over) {
-            State::CheckingOut { mode, place } => (mode, place),
-            other => return self.state = other,
-        };
         let program = match readiness::webots_program(&self.server.config) {
             Ok(program) => program,
             Err(why) => return self.fail_own(Outcome::NoWebots, &why, ctx),
         };
+        let State::CheckingOut { mode, place } = std::mem::replace(&mut self.state, State::Over) else { return };
         log::info!("{}: {} is for Webots {}", self.name(), project.world.path.display(), project.world.version);
         place.0.update(Change::Version(project.world.version.clone()));
         for warning in &project.warnings {
@@ -176,8 +177,9 @@ impl WebClient {
             log::warn!("{}: asks to reset a controller while another is being reset; ignored", self.name());
             return;
         }
-        let restored = webots.send(RestoreController(file.clone())).into_actor(self);
-        restored
+        webots
+            .send(RestoreController(file.clone()))
+            .into_actor(self)
             .map(move |answer, this, ctx| {
                 this.restoring = false;
                 match answer {
@@ -212,6 +214,7 @@ impl Actor for WebClient {
             .into_actor(self)
             .map(|(), this, ctx| {
                 this.start.resolve(Outcome::Stopped);
+                this.state.end(EndReason::Stopped, "The server was stopped");
                 this.finish(&protocol::error("This simulation server is stopping"), CloseCode::Away, ctx);
             })
             .spawn(ctx);
@@ -291,9 +294,7 @@ impl Handler<WebotsEvent> for WebClient {
                 ctx.text(protocol::webots(&self.server.config.websocket_url(port)));
             }
             WebotsEvent::Heartbeat => ctx.text(protocol::HEARTBEAT),
-            WebotsEvent::Hanging(seconds) => {
-                ctx.text(protocol::loading(&format!("Webots has given no sign of life for {seconds} seconds")));
-            }
+            WebotsEvent::Hanging(seconds) => ctx.text(protocol::hanging(seconds)),
             WebotsEvent::Exited(exit) => self.exited(&exit, ctx),
         }
     }

@@ -1,7 +1,8 @@
 //! Whether this machine can run simulations in containers, now.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
+use std::sync::OnceLock;
 
 use super::docker::Docker;
 use super::packet_filter;
@@ -36,6 +37,24 @@ pub fn daemon_fault() -> Option<String> {
     Some(format!("Docker does not answer on this simulation server: {why}"))
 }
 
+/// The folder in which Docker keeps images and containers, where it runs on this machine. Asked once; blocks for five seconds
+/// at most.
+#[must_use]
+pub fn data_folder() -> Option<PathBuf> {
+    static FOLDER: OnceLock<PathBuf> = OnceLock::new();
+    if std::env::var("DOCKER_HOST").is_ok_and(|host| !host.starts_with("unix:")) {
+        return None;
+    }
+    if FOLDER.get().is_none() {
+        let output = docker("5", &["info", "--format", "{{.DockerRootDir}}"]).output().ok()?;
+        let told = String::from_utf8(output.stdout).ok()?;
+        let folder = told.lines().last().map(Path::new).filter(|folder| folder.is_absolute() && folder.exists())?;
+        // Another check may have been as fast.
+        FOLDER.set(folder.to_owned()).ok();
+    }
+    FOLDER.get().cloned()
+}
+
 /// Why containers can't have an init process, in words for clients and administrators; `None` if they can.
 ///
 /// Without one, `xvfb-run` of the images is process 1, to which Xvfb sends no signal, so that it waits forever. What
@@ -61,11 +80,16 @@ pub fn init_fault() -> Option<String> {
     ))
 }
 
-/// Runs docker within a timeout in seconds. Returns the last line that it prints if it fails.
-fn failure(timeout: &str, arguments: &[&str]) -> Option<String> {
+/// The command that runs docker within a timeout in seconds.
+fn docker(timeout: &str, arguments: &[&str]) -> Command {
     let mut command = Command::new("timeout");
     command.arg(timeout).arg("docker").args(arguments).stdin(Stdio::null());
-    let output = match command.output() {
+    command
+}
+
+/// Runs docker within a timeout in seconds. Returns the last line that it prints if it fails.
+fn failure(timeout: &str, arguments: &[&str]) -> Option<String> {
+    let output = match docker(timeout, arguments).output() {
         Ok(output) if output.status.success() => return None,
         Ok(output) => String::from_utf8_lossy(&output.stderr).trim().to_owned(),
         Err(error) => error.to_string(),

@@ -26,7 +26,7 @@ mod tidy;
 mod webots_yml;
 
 pub use answer::until_answering;
-pub use check::{check, daemon_fault, init_fault};
+pub use check::{check, daemon_fault, data_folder, init_fault};
 pub use containers::Containers;
 pub use objects::{Owner, sweep};
 pub use prepared::{Cause, Prepared};

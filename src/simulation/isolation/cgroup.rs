@@ -11,6 +11,7 @@ use std::time::{Duration, Instant};
 use procfs::process::Process;
 
 use crate::simulation::config::Resources;
+use crate::simulation::ends::Taken;
 
 /// The control groups below this server's own.
 #[derive(Debug)]
@@ -116,6 +117,16 @@ impl Cgroup {
     pub fn has_run_out_of_memory(&self) -> bool {
         let events = std::fs::read_to_string(self.folder.join("memory.events")).unwrap_or_default();
         events.lines().any(|line| line.strip_prefix("oom_kill ").is_some_and(|count| count.trim() != "0"))
+    }
+
+    /// What has been taken in it, as far as the kernel counts it. It knows the peak of memory since Linux 5.19.
+    #[must_use]
+    pub fn taken(&self) -> Taken {
+        let read = |file| std::fs::read_to_string(self.folder.join(file)).ok();
+        let time = read("cpu.stat")
+            .and_then(|times| times.lines().find_map(|line| line.strip_prefix("usage_usec ")?.trim().parse().ok()));
+        let memory = read("memory.peak").and_then(|bytes| bytes.trim().parse().ok());
+        Taken { memory, time: time.map(Duration::from_micros) }
     }
 
     /// Ends all that is inside. Blocks until it has ended, for two seconds at most.

@@ -3,6 +3,7 @@
 mod cgroup;
 mod environment;
 mod launcher;
+mod peak;
 mod place;
 mod program;
 mod sandbox;
@@ -11,5 +12,6 @@ mod watcher;
 
 pub use cgroup::Cgroup;
 pub use launcher::{Launcher, Level};
+pub use peak::Peak;
 pub use program::Program;
 pub use watcher::{Watch, Watcher};

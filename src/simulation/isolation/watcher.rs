@@ -10,6 +10,7 @@ use std::collections::{BTreeSet, HashMap, HashSet};
 use std::io;
 use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
 use std::time::{Duration, Instant};
 
@@ -17,6 +18,7 @@ use nix::sys::statvfs::statvfs;
 use nix::time::{ClockId, clock_gettime};
 use tokio::sync::oneshot;
 
+use super::peak::Peak;
 use crate::simulation::config::SimulationConfig;
 use crate::simulation::machine::{Tree, UsageMonitor};
 use crate::simulation::process::PortFinder;
@@ -44,6 +46,8 @@ pub struct Watch {
     pub processes: Option<MostProcesses>,
     /// The port that it was given; `None` if it has a network of its own.
     pub port: Option<u16>,
+    /// Hears what it has taken; `None` if its control group or Docker knows.
+    pub peak: Option<Arc<Peak>>,
 }
 
 /// A limit of processes that the kernel does not keep.
@@ -177,9 +181,14 @@ impl Table {
     }
 
     fn count_processes(&self) -> Vec<(i32, String)> {
-        let counted: Vec<_> = self.all.iter().filter_map(|one| Some((one.watch.root, one.watch.processes?))).collect();
-        let usages = self.usage.read(&counted.iter().map(|(root, _)| Tree::of(*root)).collect::<Vec<_>>());
-        let too_many = counted.into_iter().filter(|(root, most)| {
+        let is_counted = |watch: &Watch| watch.processes.is_some() || watch.peak.is_some();
+        let trees = self.all.iter().filter(|one| is_counted(&one.watch)).map(|one| Tree::of(one.watch.root));
+        let usages = self.usage.read(&trees.collect::<Vec<_>>());
+        for Watch { root, peak, .. } in self.all.iter().map(|one| &one.watch) {
+            peak.iter().zip(usages.get(root)).for_each(|(peak, usage)| peak.add(usage));
+        }
+        let counted = self.all.iter().filter_map(|one| Some((one.watch.root, one.watch.processes?)));
+        let too_many = counted.filter(|(root, most)| {
             usages.get(root).is_some_and(|usage| usage.threads > most.limit.saturating_add(most.runners))
         });
         too_many

@@ -13,7 +13,7 @@ pub(super) struct Gpus {
     reading: GpuReading,
     /// When that was read.
     read: Option<Instant>,
-    /// When some GPU answered last, and how many did.
+    /// How many have answered at once, at most, and when so many did last.
     answered: Option<(Instant, usize)>,
     problem: Option<String>,
 }
@@ -26,7 +26,10 @@ impl Gpus {
                 let names: Vec<&str> = reading.gpus.iter().map(|gpu| gpu.name.as_str()).collect();
                 log::info!("GPUs: {}", names.join(", "));
             }
-            self.answered = Some((now, reading.gpus.len()));
+            let most = self.answered.map_or(0, |(_, most)| most);
+            if reading.gpus.len() >= most {
+                self.answered = Some((now, reading.gpus.len()));
+            }
         }
         self.read = Some(now);
         self.reading = reading;
@@ -44,7 +47,12 @@ impl Gpus {
                 "NVIDIA's driver has lost {lost} of {} GPUs (see Xid in the kernel's log)",
                 lost + gpus.len()
             )),
-            Some((at, count)) if !is_recent(at) => Some(format!("no GPU answers any more, of {count} that did")),
+            Some((at, count)) if !is_recent(at) && gpus.is_empty() => {
+                Some(format!("no GPU answers any more, of {count} that did"))
+            }
+            Some((at, count)) if !is_recent(at) => {
+                Some(format!("{} of {count} GPUs don't answer any more", count.saturating_sub(gpus.len())))
+            }
             _ => None,
         };
         match &problem {
@@ -86,6 +94,22 @@ mod tests {
         assert_eq!(gpus.current(at(31)).0.len(), 2);
         let (left, why) = gpus.current(at(32));
         assert!(left.is_empty() && why.is_some());
+    }
+
+    #[test]
+    fn one_of_several_that_is_gone_is_told_and_the_others_count() {
+        let begin = Instant::now();
+        let at = |second| begin + Duration::from_secs(second);
+        let mut gpus = Gpus::default();
+        gpus.read(at(0), reading(3, 0));
+        for second in 1..=11 {
+            gpus.read(at(second), reading(1, 0));
+            let (left, why) = gpus.current(at(second));
+            let told = (second > 10).then_some("2 of 3 GPUs don't answer any more");
+            assert_eq!((left.len(), why.as_deref()), (1, told), "after {second} s");
+        }
+        gpus.read(at(12), reading(3, 0));
+        assert_eq!(gpus.current(at(12)).1, None);
     }
 
     #[test]

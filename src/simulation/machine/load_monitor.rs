@@ -24,6 +24,8 @@ const PERIOD: Duration = Duration::from_secs(1);
 const MEAN_OF: usize = 5;
 /// How many samples are kept: ten minutes.
 const KEPT: usize = 600;
+/// How long GPUs may be missing before the driver is opened again.
+const OPEN_AGAIN: Duration = Duration::from_secs(10);
 /// Lines of `monitor.csv` until it is renamed to `monitor.csv.1`: a day.
 const CSV_LINES: usize = 86_400;
 /// A column of `monitor.csv`: its heading, and its value in a sample.
@@ -206,14 +208,40 @@ impl Actor for LoadMonitor {
     }
 }
 
-/// Opens the driver and reads the GPUs, on a thread that the runtime does not wait for: both may hang.
+/// Opens the driver and reads the GPUs, on a thread that the runtime does not wait for: both may hang. A driver that is not
+/// there, or has lost a GPU, is opened again after a while: it may have been loaded since then.
 fn read_gpus(actor: Recipient<GpusRead>) {
-    let opening = std::thread::Builder::new().name("gpus".to_owned()).spawn(move || match GpuSensor::open() {
-        Ok(sensor) => read_each_period(actor, move || GpusRead(sensor.read())),
-        Err(error) => log::info!("no NVIDIA GPU is read: {error}"),
+    let reading = std::thread::Builder::new().name("gpus".to_owned()).spawn(move || {
+        let (mut most, mut told) = (1, false);
+        while actor.connected() {
+            match GpuSensor::open() {
+                Ok(sensor) => read_until_missing(&actor, &sensor, &mut most),
+                Err(error) => {
+                    if !std::mem::replace(&mut told, true) {
+                        log::info!("no NVIDIA GPU is read: {error}");
+                    }
+                    std::thread::sleep(OPEN_AGAIN);
+                }
+            }
+        }
     });
-    if let Err(error) = opening {
+    if let Err(error) = reading {
         log::error!("no thread can be started to read the GPUs: {error}");
+    }
+}
+
+/// Reads the GPUs each second until fewer than the most that have answered do so for a while, or the actor is gone.
+fn read_until_missing(actor: &Recipient<GpusRead>, sensor: &GpuSensor, most: &mut usize) {
+    let mut complete = Instant::now();
+    while complete.elapsed() < OPEN_AGAIN {
+        let reading = sensor.read();
+        *most = reading.gpus.len().max(*most);
+        complete = if reading.lost == 0 && reading.gpus.len() == *most { Instant::now() } else { complete };
+        // A full mailbox costs one reading.
+        if let Err(SendError::Closed(_)) = actor.try_send(GpusRead(reading)) {
+            return;
+        }
+        std::thread::sleep(PERIOD);
     }
 }
 

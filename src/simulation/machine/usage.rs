@@ -28,6 +28,8 @@ pub struct Usage {
     pub memory: u64,
     /// How many processes and threads there are.
     pub threads: u64,
+    /// Processor time until now, that of processes which were waited for included.
+    pub time: Duration,
 }
 
 /// Readings of process trees, by the process at the root.
@@ -95,7 +97,7 @@ impl Readings {
             let cpu = measured
                 .map(|(before, passed)| 100.0 * sum.time.saturating_sub(*before).as_secs_f64() / passed.as_secs_f64());
             self.times.insert(*root, sum.time);
-            self.usages.insert(*root, Usage { cpu, memory: sum.memory, threads: sum.threads });
+            self.usages.insert(*root, Usage { cpu, memory: sum.memory, threads: sum.threads, time: sum.time });
         }
     }
 }
@@ -126,7 +128,9 @@ fn tree_sum(root: i32, below: &HashMap<i32, Vec<Stat>>) -> Sum {
     let (mut seen, mut open, mut sum) = (HashSet::new(), vec![root], Sum::default());
     while let Some(pid) = open.pop() {
         for stat in below.get(&pid).into_iter().flatten().filter(|stat| seen.insert(stat.pid)) {
-            sum.time += Duration::from_secs(stat.utime + stat.stime) / ticks_per_second();
+            // Children that were waited for count for their parent: a program that starts others one by one is busy, too.
+            let waited = u64::try_from(stat.cutime.saturating_add(stat.cstime)).unwrap_or_default();
+            sum.time += Duration::from_secs(stat.utime + stat.stime + waited) / ticks_per_second();
             sum.memory += stat.rss * procfs::page_size();
             sum.threads += u64::try_from(stat.num_threads).unwrap_or_default();
             open.push(stat.pid);
@@ -173,6 +177,6 @@ mod tests {
         std::fs::write(group.path().join("pids.current"), "7777\n").unwrap();
         assert_ne!(read().threads, 7777, "there is no memory.current");
         std::fs::write(group.path().join("memory.current"), "123\n").unwrap();
-        assert_eq!(read(), Usage { cpu: None, memory: 123, threads: 7777 });
+        assert_eq!(read(), Usage { cpu: None, memory: 123, threads: 7777, time: Duration::from_secs(5) });
     }
 }

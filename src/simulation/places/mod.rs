@@ -2,5 +2,6 @@
 
 mod no_place;
 mod places;
+mod present;
 
 pub use places::{GetSnapshot, PlaceEvent, Places, Ticket};

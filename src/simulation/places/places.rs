@@ -8,24 +8,24 @@ use std::collections::{BTreeMap, HashMap, HashSet, VecDeque};
 use std::io::ErrorKind;
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, TcpListener};
 use std::ops::RangeInclusive;
-use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
 use actix::prelude::*;
 
 use super::no_place::NoPlace;
-use crate::shared::domain::Instances;
-use crate::shared::run::seconds_since_1970;
-use crate::simulation::snapshot::{Change, Simulation, Snapshot, Stage};
+use super::present::{Present, Report};
+use crate::shared::domain::{Instances, ProjectUrl};
+use crate::shared::http::Peer;
+use crate::simulation::ends::{End, EndReason, Ends, Taken};
+use crate::simulation::simulation_id::SimulationId;
+use crate::simulation::snapshot::{Change, Snapshot, Stage};
 
 /// Asks for a place, in the name of a ticket.
 #[derive(Message)]
 #[rtype(result = "()")]
 struct Acquire {
-    id: u64,
     client: Recipient<PlaceEvent>,
-    world: String,
-    address: Option<IpAddr>,
+    present: Box<Present>,
 }
 
 /// What the holder of a ticket hears.
@@ -43,17 +43,14 @@ pub enum PlaceEvent {
 /// A place, or a place in the line for one. Dropping it gives it back.
 #[derive(Debug)]
 pub struct Ticket {
-    id: u64,
+    id: SimulationId,
     places: Addr<Places>,
 }
 
-/// Tells what has changed in a simulation.
+/// What the holder of a ticket reports of its simulation.
 #[derive(Message)]
 #[rtype(result = "()")]
-struct Update {
-    id: u64,
-    change: Change,
-}
+struct Update(SimulationId, Report);
 
 /// Asks for a snapshot of all simulations.
 #[derive(Message)]
@@ -62,7 +59,7 @@ pub struct GetSnapshot;
 
 #[derive(Message)]
 #[rtype(result = "()")]
-struct Release(u64);
+struct Release(SimulationId);
 
 /// The actor.
 pub struct Places {
@@ -72,19 +69,14 @@ pub struct Places {
     per_address: Option<(usize, usize)>,
     /// How many tickets there were, also of clients that were refused.
     arrivals: u64,
-    present: BTreeMap<u64, Present>,
+    present: BTreeMap<SimulationId, Present>,
     line: VecDeque<Waiting>,
-}
-
-struct Present {
-    /// The port that is lent, which is not always the one that Webots took.
-    lent: Option<u16>,
-    address: Option<IpAddr>,
-    shown: Simulation,
+    /// Hears of each end.
+    ends: Option<Ends>,
 }
 
 struct Waiting {
-    id: u64,
+    id: SimulationId,
     address: Option<IpAddr>,
     client: Recipient<PlaceEvent>,
     told: Option<usize>,
@@ -100,7 +92,14 @@ impl Places {
     pub fn new(ports: RangeInclusive<u16>, longest_line: usize, per_address: Option<usize>) -> Self {
         let all = ports.len().max(1);
         let per_address = per_address.map(|places| (places, (longest_line * places.min(all)).div_ceil(all)));
-        Self { ports, longest_line, per_address, arrivals: 0, present: BTreeMap::new(), line: VecDeque::new() }
+        let (present, line) = (BTreeMap::new(), VecDeque::new());
+        Self { ports, longest_line, per_address, arrivals: 0, present, line, ends: None }
+    }
+
+    /// Has each end recorded.
+    #[must_use]
+    pub fn with_ends(self, ends: Ends) -> Self {
+        Self { ends: Some(ends), ..self }
     }
 
     /// The first in the line whose address may have another place.
@@ -164,11 +163,9 @@ impl Places {
         }
     }
 
-    fn lend(&mut self, id: u64, port: u16) {
+    fn lend(&mut self, id: SimulationId, port: u16) {
         if let Some(present) = self.present.get_mut(&id) {
-            present.lent = Some(port);
-            present.shown.port = Some(port);
-            present.shown.stage = Stage::CheckingOut;
+            present.lend(port);
         }
     }
 
@@ -212,25 +209,13 @@ impl Actor for Places {
 impl Handler<Acquire> for Places {
     type Result = ();
 
-    fn handle(&mut self, Acquire { id, client, world, address }: Acquire, _: &mut Self::Context) {
+    fn handle(&mut self, Acquire { client, present }: Acquire, _: &mut Self::Context) {
         self.arrivals += 1;
+        let (id, address) = (present.shown.id, present.address);
         if let Some(refusal) = self.refusal(address) {
             return client.do_send(PlaceEvent::Refused(refusal));
         }
-        let shown = Simulation {
-            id,
-            world,
-            stage: Stage::Queued,
-            since: seconds_since_1970(),
-            launched: None,
-            pid: None,
-            cgroup: None,
-            port: None,
-            version: None,
-            log: None,
-            log_begin: 0,
-        };
-        self.present.insert(id, Present { lent: None, address, shown });
+        self.present.insert(id, *present);
         self.line.push_back(Waiting { id, address, client, told: None });
         self.serve();
     }
@@ -240,7 +225,9 @@ impl Handler<Release> for Places {
     type Result = ();
 
     fn handle(&mut self, Release(id): Release, _: &mut Self::Context) {
-        self.present.remove(&id);
+        if let Some((present, ends)) = self.present.remove(&id).zip(self.ends.as_ref()) {
+            ends.record(present.ended());
+        }
         self.line.retain(|waiting| waiting.id != id);
         self.serve();
     }
@@ -249,11 +236,10 @@ impl Handler<Release> for Places {
 impl Handler<Update> for Places {
     type Result = ();
 
-    fn handle(&mut self, Update { id, change }: Update, _: &mut Self::Context) {
-        let Some(Present { shown, .. }) = self.present.get_mut(&id) else {
-            return;
-        };
-        shown.apply(change);
+    fn handle(&mut self, Update(id, report): Update, _: &mut Self::Context) {
+        if let Some(present) = self.present.get_mut(&id) {
+            present.take(report);
+        }
     }
 }
 
@@ -266,23 +252,40 @@ impl Handler<GetSnapshot> for Places {
     }
 }
 
-/// The number of the next ticket.
-static NEXT: AtomicU64 = AtomicU64::new(1);
-
 impl Ticket {
-    /// Gets into the line for a place. `client` hears what comes of it, `world` is the URL that is shown, `address` the
-    /// client's, where it is known.
+    /// Gets into the line for a place. `listener` hears what comes of it, `world` is shown, and `client` counts.
     #[must_use]
-    pub fn new(places: &Addr<Places>, client: Recipient<PlaceEvent>, world: String, address: Option<IpAddr>) -> Self {
-        let id = NEXT.fetch_add(1, Ordering::Relaxed);
-        places.do_send(Acquire { id, client, world, address });
+    pub fn new(places: &Addr<Places>, listener: Recipient<PlaceEvent>, world: &ProjectUrl, client: Peer) -> Self {
+        let id = SimulationId::next();
+        places.do_send(Acquire { client: listener, present: Box::new(Present::new(id, world, client)) });
         Self { id, places: places.clone() }
+    }
+
+    /// The id of the simulation.
+    #[must_use]
+    pub fn id(&self) -> SimulationId {
+        self.id
     }
 
     /// Tells what has changed in the simulation.
     pub fn update(&self, change: Change) {
+        self.report(Report::Change(change));
+    }
+
+    /// Logs an event of the simulation under its id, and keeps it.
+    pub fn log(&self, level: log::Level, event: String) {
+        log::log!(target: "simulation", level, "{}: {event}", self.id);
+        self.report(Report::Event(event));
+    }
+
+    /// Tells how the simulation ends, before the ticket is dropped. What comes first counts.
+    pub fn end(&self, reason: EndReason, why: &str, taken: Taken) {
+        self.report(Report::End(End { reason, why: why.to_owned(), taken }));
+    }
+
+    fn report(&self, report: Report) {
         // The actor lives as long as the server; without it there is nothing to show.
-        self.places.do_send(Update { id: self.id, change });
+        self.places.do_send(Update(self.id, report));
     }
 }
 

@@ -15,6 +15,7 @@ use crate::asset;
 use crate::shared::http::assets::{self, Asset};
 use crate::shared::http::paths::{GET, READ, path};
 use crate::shared::http::{Kind, Policy, html};
+use crate::simulation::ends::output_file;
 use crate::simulation::machine::{Tree, Usages};
 use crate::simulation::snapshot::{Simulation, Snapshot};
 use crate::simulation::state::AppState;
@@ -22,8 +23,8 @@ use crate::simulation::state::AppState;
 /// Assets of this server's page, besides those of all pages.
 const ASSETS: &[Asset] =
     &[asset!("charts.css"), asset!("charts.js"), asset!("chart.js"), asset!("simulation_monitor.js")];
-/// How much of an output's end is shown, in bytes.
-const LARGEST_TAIL: u64 = 32 * 1024;
+/// How much of an output's end is shown, in bytes: all that is kept of one that has ended, with its events.
+const LARGEST_TAIL: u64 = 96 * 1024;
 
 /// Adds the paths to an app.
 pub fn configure(app: &mut web::ServiceConfig) {
@@ -84,10 +85,10 @@ async fn asset(request: HttpRequest) -> HttpResponse {
 
 #[derive(Deserialize)]
 struct Which {
-    id: u64,
+    id: String,
 }
 
-/// The last lines that a simulation has printed. They may be private, so the administrator's password protects them if one
+/// The last lines that a simulation has printed, also one that has ended. They may be private, so the administrator's password protects them if one
 /// is configured.
 async fn output(request: HttpRequest, which: web::Query<Which>, server: web::Data<AppState>) -> HttpResponse {
     if let Some(auth) = &server.admin_auth
@@ -95,34 +96,27 @@ async fn output(request: HttpRequest, which: web::Query<Which>, server: web::Dat
     {
         return refused.answer();
     }
-    let Some(snapshot) = snapshot(&server).await else {
-        return too_busy();
+    let logs = server.config.log_dir.0.join("simulation");
+    let tail = web::block(move || output_file(&logs, &which.id).and_then(|file| tail(&file).ok())).await;
+    let Ok(Some(tail)) = tail else {
+        return HttpResponse::NotFound().body("Error: nothing is kept of this simulation.");
     };
-    let one = snapshot.simulations.into_iter().find(|one| one.id == which.id);
-    let log = one.and_then(|one| Some((one.log?, one.log_begin)));
-    let Some((log, begin)) = log else {
-        return HttpResponse::NotFound().body("Error: this simulation has ended.");
-    };
-    let tail = web::block(move || tail(&log, begin)).await.map(Result::unwrap_or_default);
     HttpResponse::Ok()
         .insert_header((header::X_CONTENT_TYPE_OPTIONS, "nosniff"))
         .insert_header((header::CONTENT_SECURITY_POLICY, "default-src 'none'; frame-ancestors 'none'"))
         .content_type("text/plain; charset=utf-8")
-        .body(tail.unwrap_or_default())
+        .body(tail)
 }
 
-/// The last whole lines of a file, none that lie before `begin`: those are of somebody else. A file that was put aside
-/// since then begins anew.
-fn tail(path: &Path, begin: u64) -> std::io::Result<String> {
+/// The last whole lines of a file.
+fn tail(path: &Path) -> std::io::Result<String> {
     let mut file = std::fs::File::open(path)?;
-    let size = file.metadata()?.len();
-    let begin = if begin > size { 0 } else { begin };
-    let skipped = size.saturating_sub(LARGEST_TAIL).max(begin);
+    let skipped = file.metadata()?.len().saturating_sub(LARGEST_TAIL);
     file.seek(SeekFrom::Start(skipped))?;
     let mut bytes = Vec::new();
     file.take(LARGEST_TAIL).read_to_end(&mut bytes)?;
     let text = String::from_utf8_lossy(&bytes);
-    let whole = if skipped > begin { text.split_once('\n').map_or("", |(_, rest)| rest) } else { &text };
+    let whole = if skipped > 0 { text.split_once('\n').map_or("", |(_, rest)| rest) } else { &text };
     Ok(whole.to_owned())
 }
 
@@ -152,11 +146,9 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("1.log");
         fs::write(&path, "a short one\n").unwrap();
-        assert_eq!(tail(&path, 0).unwrap(), "a short one\n");
-        assert_eq!(tail(&path, 2).unwrap(), "short one\n");
-        assert_eq!(tail(&path, 100).unwrap(), "a short one\n");
+        assert_eq!(tail(&path).unwrap(), "a short one\n");
         fs::write(&path, "a line of the flood\n".repeat(10_000)).unwrap();
-        let end = tail(&path, 7).unwrap();
+        let end = tail(&path).unwrap();
         assert!(end.len() as u64 <= LARGEST_TAIL && end.starts_with("a line"), "{}", end.len());
     }
 }

@@ -7,7 +7,8 @@ use askama::Template;
 use crate::shared::domain::UrlPrefix;
 use crate::shared::http::{Row, View};
 use crate::shared::run::{seconds_since_1970, timestamp};
-use crate::shared::text::one_line;
+use crate::shared::text::{one_line, without_paths};
+use crate::simulation::ends::Ended;
 use crate::simulation::isolation::Level;
 use crate::simulation::machine::sensors::{self, Gpu, Host, Machine};
 use crate::simulation::machine::{Readings, Sample};
@@ -27,6 +28,7 @@ struct Monitor<'server> {
     /// The columns of the charts' numbers.
     columns: String,
     rows: &'server [Row],
+    ends: &'server [Row],
     host: &'server Host,
     gpus: Vec<(&'server Gpu, String)>,
     memory: String,
@@ -95,9 +97,12 @@ pub fn view(server: &AppState, snapshot: &Snapshot, usages: &Usages) -> Result<V
         Ok(Row { key: one.id.to_string(), html })
     });
     let rows = rows.collect::<Result<Vec<Row>, askama::Error>>()?;
+    let ends = server.ends.latest();
+    let ends = ends.iter().map(|one| Ok(Row { key: one.id.to_string(), html: EndRow::new(one).render()? }));
+    let ends = ends.collect::<Result<Vec<Row>, askama::Error>>()?;
     let glance = Glance::new(server, snapshot, &readings).render()?;
     let sample = readings.history.back().map(Sample::columns).unwrap_or_default();
-    Ok(View { parts: [("glance", glance)].into(), tables: [("simulations", rows)].into(), sample })
+    Ok(View { parts: [("glance", glance)].into(), tables: [("simulations", rows), ("ends", ends)].into(), sample })
 }
 
 /// The whole of `/monitor`.
@@ -115,6 +120,7 @@ pub fn monitor(server: &AppState, snapshot: &Snapshot, usages: &Usages) -> Resul
         glance: view.parts.get("glance").map(String::as_str).unwrap_or_default(),
         columns: Sample::headings(),
         rows: view.tables.get("simulations").map(Vec::as_slice).unwrap_or_default(),
+        ends: view.tables.get("ends").map(Vec::as_slice).unwrap_or_default(),
         host: &readings.host,
         gpus: with_sizes(&readings.gpus),
         memory: bytes(readings.host.memory),
@@ -164,23 +170,56 @@ fn with_sizes(gpus: &[Gpu]) -> Vec<(&Gpu, String)> {
     gpus.iter().map(|gpu| (gpu, bytes(gpu.memory_total))).collect()
 }
 
+/// The cells of one simulation that has ended.
+#[derive(Template)]
+#[template(path = "simulation/end.html")]
+struct EndRow<'one> {
+    one: &'one Ended,
+    world: String,
+    repository: String,
+    ended: String,
+    after: String,
+    reason: &'static str,
+    abnormal: bool,
+    why: String,
+}
+
+impl<'one> EndRow<'one> {
+    fn new(one: &'one Ended) -> Self {
+        let (repository, world) = names(&one.world);
+        let (ended, after) = (text_of(one.end), duration(one.end.saturating_sub(one.begin)));
+        let (reason, why) = (one.how.reason, without_paths(&one.how.why));
+        Self { one, world, repository, ended, after, reason: reason.words(), abnormal: reason.is_abnormal(), why }
+    }
+}
+
+fn text_of(seconds_since_1970: u64) -> String {
+    timestamp(SystemTime::UNIX_EPOCH + Duration::from_secs(seconds_since_1970))
+}
+
 /// What forges put between a repository and a path in it.
 const SEPARATORS: [&str; 4] = ["/-/", "/blob/", "/tree/", "/src/"];
+
+/// The repository of a world, and the name of its file, from its URL.
+fn names(url: &str) -> (String, String) {
+    let path = url.split_once("://").map_or(url, |(_, path)| path);
+    let (repository, file) = SEPARATORS.iter().find_map(|word| path.split_once(word)).unwrap_or((path, path));
+    (one_line(repository), one_line(file.rsplit('/').next().unwrap_or(file)))
+}
 
 impl<'one> SimulationRow<'one> {
     fn new(one: &'one Simulation, usage: Option<Usage>, limit: u64) -> Self {
         let (stage, class) = words(one.stage);
         let ends = one.launched.map_or(0, |launched| launched + limit);
         let now = seconds_since_1970();
-        let path = one.world.split_once("://").map_or(one.world.as_str(), |(_, path)| path);
-        let (repository, file) = SEPARATORS.iter().find_map(|word| path.split_once(word)).unwrap_or((path, path));
+        let (repository, world) = names(&one.world);
         Self {
             one,
-            world: one_line(file.rsplit('/').next().unwrap_or(file)),
-            repository: one_line(repository),
+            world,
+            repository,
             stage,
             class,
-            since: timestamp(SystemTime::UNIX_EPOCH + Duration::from_secs(one.since)),
+            since: text_of(one.since),
             ends,
             left: duration(ends.saturating_sub(now)),
             cpu: usage.and_then(|usage| usage.cpu).map(|cpu| format!("{cpu:.0} %")).unwrap_or_default(),
@@ -237,6 +276,7 @@ fn shortcoming(server: &AppState) -> Option<(&'static str, &str)> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::simulation::simulation_id::SimulationId;
 
     #[test]
     fn sizes_and_times_are_short() {
@@ -251,7 +291,7 @@ mod tests {
 
     fn simulation(world: &str) -> Simulation {
         Simulation {
-            id: 1,
+            id: SimulationId::next(),
             world: world.to_owned(),
             stage: Stage::Idle,
             since: 0,
@@ -261,7 +301,6 @@ mod tests {
             port: Some(2001),
             version: None,
             log: None,
-            log_begin: 0,
         }
     }
 

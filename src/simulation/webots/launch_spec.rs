@@ -11,7 +11,9 @@ use super::event::WebotsEvent;
 use crate::simulation::checkout::{Checkouts, Project};
 use crate::simulation::config::SimulationConfig;
 use crate::simulation::container::{Containers, Request};
-use crate::simulation::isolation::{Cgroup, Launcher, Program, Watch, Watcher};
+use crate::simulation::ends::FOLDER_OF_RUNNING;
+use crate::simulation::isolation::{Cgroup, Launcher, Peak, Program, Watch, Watcher};
+use crate::simulation::machine::display;
 use crate::simulation::places::Ticket;
 use crate::simulation::process::SpawnSpec;
 use crate::simulation::protocol::Mode;
@@ -41,6 +43,13 @@ pub struct LaunchSpec {
 }
 
 impl LaunchSpec {
+    /// The file that its output is kept in while it runs.
+    #[must_use]
+    pub fn log_file(&self) -> PathBuf {
+        let folder = self.config.log_dir.0.join("simulation").join(FOLDER_OF_RUNNING);
+        folder.join(format!("{}.log", self.place.0.id()))
+    }
+
     /// What its containers are made of.
     #[must_use]
     pub fn request(&self) -> Request {
@@ -78,17 +87,32 @@ impl LaunchSpec {
     }
 
     /// Waits until the simulation whose processes descend from this one takes more than it may, and returns what, in words
-    /// for its client.
-    pub fn until_too_much(&self, root: i32) -> impl Future<Output = String> + use<> {
+    /// for its client. `peak` hears what it takes.
+    pub fn until_too_much(&self, root: i32, peak: Option<Arc<Peak>>) -> impl Future<Output = String> + use<> {
         let watch = Watch {
             root,
             folder: self.project.instance.path().to_owned(),
             disk: self.config.limits.disk,
             processes: self.launcher.most_processes(),
             port: self.containers.is_none().then_some(self.place.1),
+            peak,
         };
         let watcher = self.watcher.clone();
         async move { watcher.until_too_much(watch).await }
+    }
+
+    /// What the client of a Webots that did not become ready should know besides: of its isolation, and of its display.
+    pub fn hint(&self) -> impl Future<Output = String> + use<> {
+        let remark = self.launcher.remark();
+        let has_own_display = self.config.xvfb || self.containers.is_some();
+        let display = display::effective(self.config.display.as_ref());
+        async move {
+            if has_own_display {
+                return remark.to_owned();
+            }
+            let fault = actix_rt::task::spawn_blocking(move || display::check(&display).err()).await;
+            fault.ok().flatten().map_or_else(|| remark.to_owned(), |fault| format!("{remark} Note: {fault}."))
+        }
     }
 
     /// Waits until one of these processes listens on a port that Webots may have taken, and returns the port.

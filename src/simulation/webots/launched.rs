@@ -2,6 +2,7 @@
 
 use std::future::Future;
 use std::path::PathBuf;
+use std::sync::Arc;
 use std::time::Duration;
 
 use actix::dev::ToEnvelope;
@@ -14,7 +15,8 @@ use super::runtime::Runtime;
 use super::virtual_display::VirtualDisplay;
 use crate::shared::run::RotatedFile;
 use crate::simulation::container::Cause;
-use crate::simulation::isolation::Cgroup;
+use crate::simulation::ends::Taken;
+use crate::simulation::isolation::{Cgroup, Peak};
 use crate::simulation::machine::display;
 use crate::simulation::process::{ExitReason, ProcessGroup};
 
@@ -28,8 +30,8 @@ pub struct Launched {
     pub tail: Tail,
     /// The file that its output is kept in.
     pub log: Option<PathBuf>,
-    /// How long that file was before, in bytes.
-    pub begin: u64,
+    /// Hears what it takes, where its control group or Docker does not know.
+    pub peak: Option<Arc<Peak>>,
 }
 
 /// How a Webots has ended.
@@ -39,6 +41,8 @@ pub struct End {
     pub reason: ExitReason,
     /// What else is known of it, if anything.
     pub cause: Option<Cause>,
+    /// What it has taken.
+    pub taken: Taken,
 }
 
 /// How many older files of its output are kept beside the newest.
@@ -58,11 +62,10 @@ pub fn launch<A>(
 where
     A: Actor<Context: ToEnvelope<A, OutputEvent>> + Handler<OutputEvent>,
 {
-    let port = spec.place.1;
-    let log = spec.config.log_dir.0.join("simulation/instances").join(format!("{port}.log"));
-    let begin = std::fs::metadata(&log).map_or(0, |file| file.len());
+    let log = spec.log_file();
     let file = RotatedFile::open(&log, OLD_LOGS).inspect_err(|error| {
-        log::warn!("port {port}: what Webots prints is not kept: {} can't be written: {error}", log.display());
+        let why = format!("what Webots prints is not kept: {} can't be written: {error}", log.display());
+        spec.place.0.log(log::Level::Warn, why);
     });
     let log = file.is_ok().then_some(log);
     let (reader, output) = std::io::pipe()?;
@@ -78,23 +81,26 @@ where
     };
     let (group, ended) = ProcessGroup::start(&process, output.into(), errors.into())?;
     let folder = cgroup.as_ref().map(|cgroup| cgroup.path().to_owned());
+    let peak = (cgroup.is_none() && spec.containers.is_none()).then(Arc::<Peak>::default);
+    let seen = peak.clone();
     let ended = async move {
         let reason = ended.await;
         let code = if let ExitReason::Code(code) = reason { Some(code.into()) } else { None };
         let in_container = runtime.end(code).await;
-        let on_machine = match cgroup {
+        let (on_machine, taken) = match cgroup {
             Some(cgroup) => actix_rt::task::spawn_blocking(move || end_all(&cgroup)).await.unwrap_or_default(),
-            None => false,
+            None => (false, seen.map(|peak| peak.taken()).unwrap_or_default()),
         };
         // What was printed last tells why. A process that nobody can end may keep the pipe open.
         actix_rt::time::timeout(LAST_OUTPUT, all_read).await.ok();
-        End { reason, cause: in_container.or(on_machine.then_some(Cause::OutOfMemory)) }
+        End { reason, cause: in_container.or(on_machine.then_some(Cause::OutOfMemory)), taken }
     };
-    Ok((Launched { group, cgroup: folder, tail, log, begin }, ended))
+    Ok((Launched { group, cgroup: folder, tail, log, peak }, ended))
 }
 
-/// Ends what has left the process group. Returns whether the kernel has ended something because it took too much memory.
-fn end_all(cgroup: &Cgroup) -> bool {
+/// Ends what has left the process group. Returns whether the kernel has ended something because it took too much memory,
+/// and what all has taken.
+fn end_all(cgroup: &Cgroup) -> (bool, Taken) {
     cgroup.kill();
-    cgroup.has_run_out_of_memory()
+    (cgroup.has_run_out_of_memory(), cgroup.taken())
 }

@@ -7,6 +7,7 @@ mod launched;
 mod output;
 mod paced_reader;
 mod runtime;
+mod verdict;
 mod virtual_display;
 mod webots;
 

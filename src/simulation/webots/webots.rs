@@ -7,24 +7,26 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use actix::prelude::*;
+use log::Level;
 use tokio::sync::Notify;
 
-use super::event::{self, Exit, ExitNotifier, WebotsEvent};
+use super::event::{Exit, ExitNotifier, WebotsEvent};
 use super::launch_spec::LaunchSpec;
 use super::launched::{self, End, Launched};
 use super::output::{OutputEvent, Tail};
 use super::runtime::{Preparation, Runtime};
+use super::verdict::verdict;
 use crate::shared::run::seconds_since_1970;
 use crate::simulation::checkout::CheckoutError;
-use crate::simulation::container::{Cause, until_answering};
-use crate::simulation::machine::display;
-use crate::simulation::process::{ExitReason, ProcessGroup};
+use crate::simulation::container::until_answering;
+use crate::simulation::ends::{EndReason, Taken};
+use crate::simulation::process::ProcessGroup;
 use crate::simulation::snapshot::{Change, Stage};
 
-/// Asks Webots to end.
+/// Asks Webots to end, because its client has gone or for another reason.
 #[derive(Message)]
 #[rtype(result = "()")]
-pub struct Stop;
+pub struct Stop(pub EndReason);
 
 /// Asks to restore a file below the project's `controllers` folder to the state of the checkout.
 #[derive(Message)]
@@ -48,7 +50,7 @@ pub struct Webots {
     last_heartbeat: Instant,
     hanging: bool,
     /// Why it was asked to end, if it was.
-    stopped_for: Option<String>,
+    stopped_for: Option<(EndReason, String)>,
 }
 
 /// So many heartbeats may be missed before Webots counts as hanging.
@@ -82,7 +84,7 @@ impl Webots {
         let prepared = Preparation::of(&self.spec).run(progress).into_actor(self);
         self.preparing = Some(ctx.spawn(prepared.map(|prepared, this, ctx| match prepared {
             Ok(runtime) => this.launch(runtime, ctx),
-            Err(why) => this.not_started(&why, ctx),
+            Err(why) => this.not_started(EndReason::NoWebots, &why, ctx),
         })));
     }
 
@@ -91,8 +93,9 @@ impl Webots {
         self.restart = runtime.restart();
         runtime.news().into_iter().for_each(|event| self.tell(event));
         if let Err(error) = self.spawn(runtime, ctx) {
-            log::error!("port {}: Webots can't be started: {error}", self.port);
-            return self.not_started(&format!("Webots can't be started: {error}"), ctx);
+            let why = format!("Webots can't be started: {error}");
+            self.log(Level::Error, &why);
+            return self.not_started(EndReason::NoWebots, &why, ctx);
         }
         self.tell(WebotsEvent::Started);
         self.await_port(ctx);
@@ -100,27 +103,27 @@ impl Webots {
         let limit = self.spec.config.timing.launch;
         ctx.run_later(limit, move |this, _| {
             if !this.listening {
-                this.stop(&format!("Webots did not become ready within {} seconds", limit.as_secs()));
+                let why = format!("Webots did not become ready within {} seconds", limit.as_secs());
+                this.stop(EndReason::NoWebots, &why);
             }
         });
         let limit = self.spec.config.timeout;
         ctx.run_later(Duration::from_secs(limit), move |this, _| {
-            this.stop(&format!("The time limit of {limit} seconds was reached"));
+            this.stop(EndReason::TimeLimit, &format!("The time limit of {limit} seconds was reached"));
         });
     }
 
     /// Starts the process, and has [`Self::ended`] called when it has ended.
     fn spawn(&mut self, runtime: Runtime, ctx: &mut Context<Self>) -> std::io::Result<()> {
-        let (Launched { group, cgroup, tail, log, begin }, ended) =
+        let (Launched { group, cgroup, tail, log, peak }, ended) =
             launched::launch(&self.spec, runtime, ctx.address())?;
         let (program, world) = (self.spec.program.display(), self.spec.project.world.path.display());
         let (at, pid) = (seconds_since_1970(), group.leader());
-        log::info!("port {}: started {program} for {world} (process {pid})", self.port);
-        self.spec.place.0.update(Change::Launched { at, pid, cgroup, port: self.port, log, begin });
-        self.tail = tail;
-        self.group = Some(group);
+        self.log(Level::Info, &format!("started {program} for {world} (process {pid})"));
+        self.spec.place.0.update(Change::Launched { at, pid, cgroup, port: self.port, log });
+        (self.tail, self.group) = (tail, Some(group));
         ended.into_actor(self).map(|end, this, ctx| this.ended(&end, ctx)).spawn(ctx);
-        let excess = self.spec.until_too_much(pid).into_actor(self);
+        let excess = self.spec.until_too_much(pid, peak).into_actor(self);
         excess.map(|why, this, _| this.end_at_once(&why)).spawn(ctx);
         Ok(())
     }
@@ -143,13 +146,13 @@ impl Webots {
         let allowed = self.spec.config.streaming_ports();
         if !allowed.contains(&port) {
             let (first, last) = (allowed.start(), allowed.end());
-            return self
-                .stop(&format!("Webots listens on port {port}, outside of this server's ports {first} to {last}"));
+            let why = format!("Webots listens on port {port}, outside of this server's ports {first} to {last}");
+            return self.stop(EndReason::NoWebots, &why);
         }
         if port != self.port {
-            log::warn!("port {}: it was taken, Webots listens on {port}", self.port);
+            self.log(Level::Warn, &format!("it was taken, Webots listens on {port}"));
         }
-        log::info!("port {port}: ready");
+        self.spec.place.0.log(Level::Info, format!("port {port}: ready"));
         self.listening = true;
         self.last_heartbeat = Instant::now();
         self.spec.place.0.update(Change::Port(port));
@@ -172,19 +175,19 @@ impl Webots {
         let silence = self.last_heartbeat.elapsed();
         let hangs_after = self.spec.config.timing.heartbeat * MISSED_HEARTBEATS;
         if silence > hangs_after + self.spec.config.hang_limit {
-            self.stop(&format!("Webots gave no sign of life for {} seconds", silence.as_secs()));
+            self.stop(EndReason::Hung, &format!("Webots gave no sign of life for {} seconds", silence.as_secs()));
         } else if silence > hangs_after && !self.hanging {
             self.hanging = true;
-            log::warn!("port {}: no sign of life for {} s", self.port, silence.as_secs());
+            self.log(Level::Warn, &format!("no sign of life for {} s", silence.as_secs()));
             self.tell(WebotsEvent::Hanging(silence.as_secs()));
         }
     }
 
     /// Asks for an orderly end. The first reason is the one that is told.
-    fn stop(&mut self, why: &str) {
+    fn stop(&mut self, kind: EndReason, why: &str) {
         if self.stopped_for.is_none() {
-            log::info!("port {}: ending: {why}", self.port);
-            self.stopped_for = Some(why.to_owned());
+            self.log(Level::Info, &format!("ending: {why}"));
+            self.stopped_for = Some((kind, why.to_owned()));
             self.spec.place.0.update(Change::Stage(Stage::Stopping));
             if let Some(group) = &mut self.group {
                 group.terminate();
@@ -195,41 +198,35 @@ impl Webots {
     /// Ends Webots without a grace time, in which it could take even more.
     fn end_at_once(&mut self, why: &str) {
         if self.stopped_for.is_none() {
-            log::warn!("port {}: ended: {why}", self.port);
-            self.stopped_for = Some(why.to_owned());
+            self.log(Level::Warn, &format!("ended: {why}"));
+            self.stopped_for = Some((EndReason::Limit, why.to_owned()));
             self.spec.place.0.update(Change::Stage(Stage::Stopping));
             self.group = None;
         }
     }
 
-    fn ended(&mut self, End { reason, cause }: &End, ctx: &mut Context<Self>) {
-        log::info!("port {}: Webots {reason}", self.port);
-        let is_lost = self.stopped_for.is_none() && *cause == Some(Cause::Docker);
-        let mut exit = match self.stopped_for.take().or(cause.map(event::words).map(str::to_owned)) {
-            Some(why) if is_lost => Exit { own: true, ..self.failure(&why) },
-            Some(why) => self.failure(&why),
-            None if *reason == ExitReason::Code(0) => Exit::clean(),
-            None => self.failure(&format!("Webots {reason}")),
+    fn ended(&mut self, end: &End, ctx: &mut Context<Self>) {
+        self.log(Level::Info, &format!("Webots {}", end.reason));
+        let (kind, why) = verdict(self.stopped_for.take(), end, self.listening);
+        self.spec.place.0.end(kind, &why, end.taken);
+        let mut exit = match kind {
+            EndReason::Finished => Exit::clean(),
+            EndReason::Fault => Exit { own: true, ..self.failure(&why) },
+            _ => self.failure(&why),
         };
-        if exit.clean || is_lost || self.listening {
+        if self.listening || matches!(kind, EndReason::Finished | EndReason::Fault) {
             return self.exited(exit, ctx);
         }
-        exit.why += self.spec.launcher.remark();
-        if self.spec.config.xvfb || self.spec.containers.is_some() {
-            return self.exited(exit, ctx);
-        }
-        let display = display::effective(self.spec.config.display.as_ref());
-        let check = actix_rt::task::spawn_blocking(move || display::check(&display).err());
-        check
-            .into_actor(self)
-            .map(move |hint, this, ctx| {
-                let hint = hint.ok().flatten().map(|hint| format!(" Note: {hint}.")).unwrap_or_default();
-                this.exited(Exit { why: format!("{}{hint}", exit.why), ..exit }, ctx);
-            })
-            .spawn(ctx);
+        let hint = self.spec.hint().into_actor(self);
+        hint.map(move |hint, this, ctx| {
+            exit.why += &hint;
+            this.exited(exit, ctx);
+        })
+        .spawn(ctx);
     }
 
-    fn not_started(&mut self, why: &str, ctx: &mut Context<Self>) {
+    fn not_started(&mut self, kind: EndReason, why: &str, ctx: &mut Context<Self>) {
+        self.spec.place.0.end(kind, why, Taken::default());
         self.exited(self.failure(why), ctx);
     }
 
@@ -246,6 +243,10 @@ impl Webots {
 
     fn tell(&mut self, event: WebotsEvent) {
         self.events.tell(event);
+    }
+
+    fn log(&self, level: Level, event: &str) {
+        self.spec.place.0.log(level, format!("port {}: {event}", self.port));
     }
 }
 
@@ -288,11 +289,12 @@ impl Handler<RestoreController> for Webots {
 impl Handler<Stop> for Webots {
     type Result = ();
 
-    fn handle(&mut self, _: Stop, ctx: &mut Self::Context) {
-        self.stop("Its client has gone");
+    fn handle(&mut self, Stop(kind): Stop, ctx: &mut Self::Context) {
+        let why = if kind == EndReason::Stopped { "The server was stopped" } else { "Its client has gone" };
+        self.stop(kind, why);
         if let Some(preparing) = self.preparing.take() {
             ctx.cancel_future(preparing);
-            self.not_started("Its client has gone", ctx);
+            self.not_started(kind, why, ctx);
         }
     }
 }

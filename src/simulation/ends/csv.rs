@@ -1,0 +1,72 @@
+//! `simulations.csv`: a line for each simulation that has ended (RFC 4180).
+
+use std::io::{self, Write};
+use std::path::Path;
+use std::time::{Duration, SystemTime};
+
+use super::ended::Ended;
+use crate::shared::run::{RotatedFile, timestamp};
+use crate::shared::text::one_line;
+
+/// The first line.
+const HEADING: &str = "id,begin,end,client,repository,world,port,level,peak memory (bytes),processor time (s),reason\n";
+/// How many older files are kept beside the newest.
+const OLD_FILES: usize = 10;
+
+/// Adds a line to the file at this path.
+///
+/// # Errors
+/// When it can't be written.
+pub(super) fn append(path: &Path, level: &str, ended: &Ended) -> io::Result<()> {
+    RotatedFile::open(path, OLD_FILES)?.with_heading(HEADING).write_all(line(level, ended).as_bytes())
+}
+
+fn line(level: &str, ended: &Ended) -> String {
+    let time = |seconds| timestamp(SystemTime::UNIX_EPOCH + Duration::from_secs(seconds));
+    let taken = ended.how.taken;
+    let fields = [
+        ended.id.to_string(),
+        time(ended.begin),
+        time(ended.end),
+        ended.client.clone(),
+        ended.repository.clone(),
+        ended.world.clone(),
+        ended.port.map(|port| port.to_string()).unwrap_or_default(),
+        level.to_owned(),
+        taken.memory.map(|bytes| bytes.to_string()).unwrap_or_default(),
+        taken.time.map(|time| format!("{:.1}", time.as_secs_f64())).unwrap_or_default(),
+        ended.how.reason.label().to_owned(),
+    ];
+    fields.map(|text| field(&text)).join(",") + "\n"
+}
+
+/// A field. Where a program for tables would take it for a formula, it begins with an apostrophe.
+fn field(text: &str) -> String {
+    let formula = text.starts_with(['=', '+', '-', '@', '\t', '\r', '\n']);
+    let text = if formula { format!("'{}", one_line(text)) } else { one_line(text) };
+    if text.contains([',', '"']) { format!("\"{}\"", text.replace('"', "\"\"")) } else { text }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_field_stays_one_field_and_is_no_formula() {
+        for (text, written) in [
+            ("192.0.2.7", "192.0.2.7"),
+            ("2001:db8::7", "2001:db8::7"),
+            ("a,b", "\"a,b\""),
+            ("say \"hi\"", "\"say \"\"hi\"\"\""),
+            ("one\r\ntwo", "one  two"),
+            ("=HYPERLINK(\"x\",1)", "\"'=HYPERLINK(\"\"x\"\",1)\""),
+            ("+1", "'+1"),
+            ("-1", "'-1"),
+            ("@SUM(1)", "'@SUM(1)"),
+            ("\t=1", "' =1"),
+            ("", ""),
+        ] {
+            assert_eq!(field(text), written, "{text:?}");
+        }
+    }
+}

@@ -1,0 +1,82 @@
+//! Why simulations end: a small fixed set, for counters and tables.
+
+/// Why a simulation has ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum EndReason {
+    /// Its client has gone, or was sent away.
+    Left,
+    /// Webots has ended by itself and in order.
+    Finished,
+    /// It has reached the time limit.
+    TimeLimit,
+    /// The server was stopped.
+    Stopped,
+    /// Its world could not be checked out.
+    NoCheckout,
+    /// Webots did not become ready.
+    NoWebots,
+    /// Webots was ready, and has ended with an error.
+    Crashed,
+    /// Webots gave no sign of life.
+    Hung,
+    /// It has exceeded a limit of memory, disk, processes or ports.
+    Limit,
+    /// A fault of this server, its machine or its Docker.
+    Fault,
+}
+
+impl EndReason {
+    /// All of them.
+    pub const ALL: [Self; 10] = [
+        Self::Left,
+        Self::Finished,
+        Self::TimeLimit,
+        Self::Stopped,
+        Self::NoCheckout,
+        Self::NoWebots,
+        Self::Crashed,
+        Self::Hung,
+        Self::Limit,
+        Self::Fault,
+    ];
+
+    /// Its name in `/metrics` and in `simulations.csv`.
+    #[must_use]
+    pub fn label(self) -> &'static str {
+        match self {
+            Self::Left => "left",
+            Self::Finished => "finished",
+            Self::TimeLimit => "time_limit",
+            Self::Stopped => "stopped",
+            Self::NoCheckout => "no_checkout",
+            Self::NoWebots => "no_webots",
+            Self::Crashed => "crashed",
+            Self::Hung => "hung",
+            Self::Limit => "limit",
+            Self::Fault => "fault",
+        }
+    }
+
+    /// What the monitor says of it.
+    #[must_use]
+    pub fn words(self) -> &'static str {
+        match self {
+            Self::Left => "client gone",
+            Self::Finished => "finished",
+            Self::TimeLimit => "time limit",
+            Self::Stopped => "server stopped",
+            Self::NoCheckout => "no checkout",
+            Self::NoWebots => "no start",
+            Self::Crashed => "crashed",
+            Self::Hung => "hung",
+            Self::Limit => "limit exceeded",
+            Self::Fault => "fault of this server",
+        }
+    }
+
+    /// Whether somebody will ask why: its output is kept for longer. A world that can't be checked out has none.
+    #[must_use]
+    pub fn is_abnormal(self) -> bool {
+        matches!(self, Self::NoWebots | Self::Crashed | Self::Hung | Self::Limit | Self::Fault)
+    }
+}

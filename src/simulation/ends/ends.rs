@@ -1,0 +1,107 @@
+//! Records how simulations end. A thread of its own writes the files, so that a slow disk holds up nobody.
+
+use std::collections::VecDeque;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
+use std::time::Duration;
+
+use parking_lot::Mutex;
+use prometheus::IntCounterVec;
+use tokio::sync::oneshot;
+
+use super::end_reason::EndReason;
+use super::ended::Ended;
+use super::{csv, kept_output};
+use crate::shared::http::Metrics;
+
+/// Records how simulations end. All clones are one.
+#[derive(Debug, Clone)]
+pub struct Ends {
+    counter: IntCounterVec,
+    latest: Arc<Mutex<VecDeque<Arc<Ended>>>>,
+    writer: Sender<Job>,
+}
+
+/// What the thread is asked to do.
+enum Job {
+    Write(Arc<Ended>),
+    /// To say when it has come so far.
+    Flush(oneshot::Sender<()>),
+}
+
+/// How many ends the monitor lists.
+const LISTED: usize = 20;
+/// How often it is looked for files that are too old, at least.
+const BETWEEN_LOOKS: Duration = Duration::from_hours(1);
+/// How long the server waits at its end for what is to be written.
+const FLUSH: Duration = Duration::from_secs(1);
+
+impl Ends {
+    /// Starts the thread. `logs` is the folder of the server's log, `level` that at which simulations run.
+    ///
+    /// # Errors
+    /// When a thread can't be started, or a counter `webots_simulation_ends_total` exists.
+    pub fn start(logs: PathBuf, level: String, metrics: &Metrics) -> std::io::Result<Self> {
+        let counter = metrics
+            .counter("webots_simulation_ends_total", "Simulations that have ended", "reason")
+            .map_err(std::io::Error::other)?;
+        for reason in EndReason::ALL {
+            counter.with_label_values(&[reason.label()]);
+        }
+        let (writer, jobs) = channel();
+        std::thread::Builder::new().name("ends".to_owned()).spawn(move || write_all(&logs, &level, &jobs))?;
+        Ok(Self { counter, latest: Arc::default(), writer })
+    }
+
+    /// Records an end.
+    pub fn record(&self, ended: Ended) {
+        self.counter.with_label_values(&[ended.how.reason.label()]).inc();
+        let ended = Arc::new(ended);
+        let mut latest = self.latest.lock();
+        if latest.len() == LISTED {
+            latest.pop_back();
+        }
+        latest.push_front(Arc::clone(&ended));
+        // The thread lives as long as this.
+        self.writer.send(Job::Write(ended)).ok();
+    }
+
+    /// The last ends since the start of the server, the newest first.
+    #[must_use]
+    pub fn latest(&self) -> Vec<Arc<Ended>> {
+        self.latest.lock().iter().cloned().collect()
+    }
+
+    /// Waits until everything is written, for a second at most.
+    pub async fn flush(&self) {
+        let (done, written) = oneshot::channel();
+        self.writer.send(Job::Flush(done)).ok();
+        if actix_rt::time::timeout(FLUSH, written).await.is_err() {
+            log::warn!("not all ends of simulations are written: the disk of logDir is slow");
+        }
+    }
+}
+
+fn write_all(logs: &Path, level: &str, jobs: &Receiver<Job>) {
+    kept_output::prune(logs);
+    loop {
+        match jobs.recv_timeout(BETWEEN_LOOKS) {
+            Ok(Job::Write(ended)) => write(logs, level, &ended),
+            // Who waits may be gone.
+            Ok(Job::Flush(done)) => drop(done.send(())),
+            Err(RecvTimeoutError::Timeout) => kept_output::prune(logs),
+            Err(RecvTimeoutError::Disconnected) => return,
+        }
+    }
+}
+
+fn write(logs: &Path, level: &str, ended: &Ended) {
+    if let Err(error) = csv::append(&logs.join("simulations.csv"), level, ended) {
+        log::warn!("{}: its end is not in simulations.csv: {error}", ended.id);
+    }
+    if let Err(error) = kept_output::keep(logs, ended) {
+        log::warn!("{}: its output is not kept: {error}", ended.id);
+    }
+    kept_output::prune(logs);
+}

@@ -1,0 +1,188 @@
+//! The output of simulations that have ended: its last 64 KiB, with what happened to the simulation, in a file for each.
+//!
+//! Files are kept of the newest hundred abnormal ends and of the newest twenty others, for two weeks at most.
+
+use std::fs;
+use std::io::{self, Read, Seek, SeekFrom};
+use std::path::{Path, PathBuf};
+use std::time::{Duration, SystemTime};
+
+use super::ended::Ended;
+use crate::simulation::simulation_id::SimulationId;
+
+/// The folder with the output of simulations that run.
+pub const FOLDER_OF_RUNNING: &str = "instances";
+/// The folder for ends in order.
+const ENDED: &str = "ended";
+/// The folder for abnormal ends.
+const FAILED: &str = "failed";
+/// Of how many simulations files are kept, by folder.
+const KEPT: [(&str, usize); 2] = [(ENDED, 20), (FAILED, 100)];
+/// How long a file is kept. One of a simulation that was never told to have ended, because the server was killed, too.
+const AGE: Duration = Duration::from_hours(14 * 24);
+/// How much of an output is kept, in bytes.
+const OUTPUT: usize = 64 * 1024;
+
+/// Returns the file with the output of the simulation with this id, whether it runs or has ended.
+#[must_use]
+pub fn output_file(logs: &Path, id: &str) -> Option<PathBuf> {
+    if !SimulationId::is_like(id) {
+        return None;
+    }
+    let files = [FOLDER_OF_RUNNING, ENDED, FAILED].map(|folder| logs.join(folder).join(format!("{id}.log")));
+    files.into_iter().find(|file| file.is_file())
+}
+
+/// Keeps the end of an output, and removes the file that it was written to.
+///
+/// # Errors
+/// When the file can't be made. What was written while the simulation ran is gone nevertheless: a disk that is full needs
+/// the room.
+pub(super) fn keep(logs: &Path, ended: &Ended) -> io::Result<()> {
+    let output = ended.log.as_deref().map(last_output).unwrap_or_default();
+    for file in ended.log.iter().flat_map(|log| [log.clone(), older(log)]) {
+        fs::remove_file(file).ok();
+    }
+    if !ended.has_output() {
+        return Ok(());
+    }
+    let folder = logs.join(if ended.how.reason.is_abnormal() { FAILED } else { ENDED });
+    fs::create_dir_all(&folder)?;
+    let events: String = ended.events.iter().map(|event| format!("{event}\n")).collect();
+    let text = format!("{events}\nThe last lines that it has printed:\n\n{output}");
+    fs::write(folder.join(format!("{}.log", ended.id)), text)
+}
+
+/// Removes files that are too many or too old.
+pub(super) fn prune(logs: &Path) {
+    for (folder, most) in KEPT {
+        let mut all = files(&logs.join(folder));
+        all.sort();
+        let surplus = all.len().saturating_sub(most);
+        for (_, file) in all.drain(..surplus) {
+            remove(&file);
+        }
+    }
+    for folder in [FOLDER_OF_RUNNING, ENDED, FAILED] {
+        for (_, file) in files(&logs.join(folder)).into_iter().filter(|(written, _)| is_old(*written)) {
+            remove(&file);
+        }
+    }
+}
+
+fn is_old(written: SystemTime) -> bool {
+    SystemTime::now().duration_since(written).is_ok_and(|age| age > AGE)
+}
+
+fn remove(file: &Path) {
+    if let Err(error) = fs::remove_file(file) {
+        log::warn!("{} can't be removed: {error}", file.display());
+    }
+}
+
+/// The files of a folder, with the time when each was written. None where there is no folder.
+fn files(folder: &Path) -> Vec<(SystemTime, PathBuf)> {
+    let entries = fs::read_dir(folder).into_iter().flatten().flatten();
+    let about = entries.filter_map(|entry| Some((entry.metadata().ok()?, entry.path())));
+    about.filter_map(|(about, path)| Some((about.is_file().then(|| about.modified().ok())??, path))).collect()
+}
+
+/// The file that an output was rotated to.
+fn older(log: &Path) -> PathBuf {
+    let mut name = log.as_os_str().to_owned();
+    name.push(".1");
+    name.into()
+}
+
+/// The last whole lines of an output.
+fn last_output(log: &Path) -> String {
+    let mut bytes = end_of(&older(log)).unwrap_or_default();
+    bytes.extend(end_of(log).unwrap_or_default());
+    let surplus = bytes.len().saturating_sub(OUTPUT);
+    let text = String::from_utf8_lossy(bytes.get(surplus..).unwrap_or_default());
+    // What was cut begins in the middle of a line.
+    if surplus > 0 { text.split_once('\n').map_or("", |(_, rest)| rest).to_owned() } else { text.into_owned() }
+}
+
+/// The end of a file: a byte more than is kept, so that it is seen whether something was cut.
+fn end_of(file: &Path) -> io::Result<Vec<u8>> {
+    let mut file = fs::File::open(file)?;
+    let most = OUTPUT as u64 + 1;
+    file.seek(SeekFrom::Start(file.metadata()?.len().saturating_sub(most)))?;
+    let mut bytes = Vec::new();
+    file.take(most).read_to_end(&mut bytes)?;
+    Ok(bytes)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::end_reason::EndReason;
+    use super::super::ended::{End, Taken};
+    use super::*;
+
+    fn ended(logs: &Path, reason: EndReason) -> Ended {
+        let id = SimulationId::next();
+        let log = logs.join(FOLDER_OF_RUNNING).join(format!("{id}.log"));
+        Ended {
+            id,
+            begin: 0,
+            end: 0,
+            client: String::new(),
+            repository: String::new(),
+            world: String::new(),
+            port: None,
+            log: Some(log),
+            events: vec!["12:00:00 it began".to_owned()],
+            how: End { reason, why: String::new(), taken: Taken::default() },
+        }
+    }
+
+    #[test]
+    fn only_the_end_of_an_output_is_kept_with_the_events() {
+        let folder = tempfile::tempdir().unwrap();
+        let one = ended(folder.path(), EndReason::Crashed);
+        let log = one.log.clone().unwrap();
+        fs::create_dir_all(log.parent().unwrap()).unwrap();
+        fs::write(older(&log), "before the rotation\n".repeat(10_000)).unwrap();
+        fs::write(&log, "last words\n").unwrap();
+        keep(folder.path(), &one).unwrap();
+        let kept = output_file(folder.path(), &one.id.to_string()).unwrap();
+        let text = fs::read_to_string(&kept).unwrap();
+        assert!(text.starts_with("12:00:00 it began\n\nThe last"), "{text}");
+        assert!(text.ends_with("\nbefore the rotation\nlast words\n") && text.contains(":\n\nbefore"), "{text}");
+        assert!((60_000..OUTPUT + 200).contains(&text.len()), "{}", text.len());
+        assert!(!log.exists() && !older(&log).exists());
+    }
+
+    #[test]
+    fn files_are_bounded_by_number_and_age() {
+        let folder = tempfile::tempdir().unwrap();
+        let count = |name| files(&folder.path().join(name)).len();
+        for _ in 0..30 {
+            keep(folder.path(), &ended(folder.path(), EndReason::Left)).unwrap();
+        }
+        for _ in 0..110 {
+            keep(folder.path(), &ended(folder.path(), EndReason::Hung)).unwrap();
+        }
+        prune(folder.path());
+        assert_eq!((count(ENDED), count(FAILED)), (20, 100));
+        let long_ago = SystemTime::now().checked_sub(AGE + Duration::from_mins(1)).unwrap();
+        for (_, file) in files(&folder.path().join(FAILED)).into_iter().take(70) {
+            fs::File::options().write(true).open(file).unwrap().set_modified(long_ago).unwrap();
+        }
+        prune(folder.path());
+        assert_eq!((count(ENDED), count(FAILED)), (20, 30));
+    }
+
+    #[test]
+    fn an_output_is_found_by_its_id_alone() {
+        let folder = tempfile::tempdir().unwrap();
+        fs::write(folder.path().join("secret.log"), "").unwrap();
+        fs::create_dir(folder.path().join(ENDED)).unwrap();
+        fs::write(folder.path().join(ENDED).join("1-1.log"), "").unwrap();
+        assert!(output_file(folder.path(), "1-1").is_some());
+        for id in ["../secret", "1-2", "", "/etc/passwd"] {
+            assert_eq!(output_file(folder.path(), id), None, "{id}");
+        }
+    }
+}

@@ -1,0 +1,111 @@
+//! A simulation that has a place or waits for one, and what becomes of it.
+
+use std::net::IpAddr;
+use std::time::SystemTime;
+
+use crate::shared::domain::ProjectUrl;
+use crate::shared::http::Peer;
+use crate::shared::run::{seconds_since_1970, timestamp};
+use crate::shared::text::excerpt;
+use crate::simulation::ends::{End, EndReason, Ended, Taken};
+use crate::simulation::simulation_id::SimulationId;
+use crate::simulation::snapshot::{Change, Simulation, Stage};
+
+/// What its owner reports of a simulation.
+#[derive(Debug)]
+pub(super) enum Report {
+    /// Something that is shown.
+    Change(Change),
+    /// An event, in words.
+    Event(String),
+    /// How it ends. The first one counts.
+    End(End),
+}
+
+/// A simulation of this server.
+pub(super) struct Present {
+    /// The port that is lent, which is not always the one that Webots took.
+    pub lent: Option<u16>,
+    /// The address by which its client counts.
+    pub address: Option<IpAddr>,
+    /// As pages show it.
+    pub shown: Simulation,
+    client: Peer,
+    repository: String,
+    events: Vec<String>,
+    how: Option<End>,
+}
+
+/// How many events are kept of a simulation.
+const MAX_EVENTS: usize = 60;
+/// How many letters are kept of an event.
+const EVENT_LENGTH: usize = 500;
+
+impl Present {
+    /// A simulation that a client has just asked for.
+    pub(super) fn new(id: SimulationId, world: &ProjectUrl, client: Peer) -> Self {
+        let shown = Simulation {
+            id,
+            world: world.to_string(),
+            stage: Stage::Queued,
+            since: seconds_since_1970(),
+            launched: None,
+            pid: None,
+            cgroup: None,
+            port: None,
+            version: None,
+            log: None,
+        };
+        let (address, repository) = (client.rate_limit_key(), world.repository());
+        let mut present = Self { lent: None, address, shown, client, repository, events: Vec::new(), how: None };
+        present.note(&format!("client {client} asks for {world}"));
+        present
+    }
+
+    /// Lends it a port.
+    pub(super) fn lend(&mut self, port: u16) {
+        self.lent = Some(port);
+        self.shown.port = Some(port);
+        self.shown.stage = Stage::CheckingOut;
+        self.note(&format!("it is given port {port}, its world is checked out"));
+    }
+
+    /// Takes in what its owner reports.
+    pub(super) fn take(&mut self, report: Report) {
+        match report {
+            Report::Change(change) => self.shown.apply(change),
+            Report::Event(event) => self.note(&event),
+            Report::End(end) => drop(self.how.get_or_insert(end)),
+        }
+    }
+
+    fn note(&mut self, event: &str) {
+        if self.events.len() < MAX_EVENTS {
+            self.events.push(format!("{} {}", timestamp(SystemTime::now()), excerpt(event, EVENT_LENGTH)));
+        }
+    }
+
+    /// What it leaves when its owner is gone. One that says nothing has lost its client, or panicked while Webots ran.
+    pub(super) fn ended(mut self) -> Ended {
+        let how = self.how.take().unwrap_or_else(|| {
+            let (reason, why) = match self.shown.launched {
+                None => (EndReason::Left, "Its client has gone"),
+                Some(_) => (EndReason::Fault, "The simulation was lost by a fault of this server"),
+            };
+            End { reason, why: why.to_owned(), taken: Taken::default() }
+        });
+        self.note(&format!("ended ({}): {}", how.reason.label(), how.why));
+        Ended {
+            id: self.shown.id,
+            begin: self.shown.since,
+            end: seconds_since_1970(),
+            client: self.client.to_string(),
+            repository: self.repository,
+            world: self.shown.world,
+            port: self.shown.port,
+            log: self.shown.log,
+            events: self.events,
+            how,
+        }
+    }
+}

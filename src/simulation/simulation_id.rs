@@ -1,0 +1,65 @@
+//! The id of a simulation, by which its log lines, its output and its line in `simulations.csv` are found.
+
+use std::fmt;
+use std::sync::atomic::{AtomicU64, Ordering};
+
+use serde::{Serialize, Serializer};
+
+use crate::shared::run::seconds_since_1970;
+
+/// The time at which a simulation was asked for, and its number since the server's start: `20261122T220517-17`.
+///
+/// Ids are ordered by their numbers, whatever the clock does.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct SimulationId {
+    number: u64,
+    asked: u64,
+}
+
+static NEXT: AtomicU64 = AtomicU64::new(1);
+
+impl SimulationId {
+    /// Returns an id that no other simulation of this server has.
+    #[must_use]
+    pub fn next() -> Self {
+        Self { number: NEXT.fetch_add(1, Ordering::Relaxed), asked: seconds_since_1970() }
+    }
+
+    /// Whether a text has the letters of an id, so that it can stand in the name of a file.
+    #[must_use]
+    pub fn is_like(text: &str) -> bool {
+        text.starts_with(|letter: char| letter.is_ascii_digit())
+            && text.len() <= 40
+            && text.chars().all(|letter| letter.is_ascii_digit() || letter == 'T' || letter == '-')
+    }
+}
+
+impl fmt::Display for SimulationId {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let asked = i64::try_from(self.asked).ok().and_then(|seconds| jiff::Timestamp::from_second(seconds).ok());
+        let asked = asked.unwrap_or(jiff::Timestamp::UNIX_EPOCH);
+        write!(out, "{}-{}", asked.strftime("%Y%m%dT%H%M%S"), self.number)
+    }
+}
+
+impl Serialize for SimulationId {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.collect_str(self)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_id_tells_when_and_is_the_name_of_a_file() {
+        let id = SimulationId { number: 17, asked: 1_795_385_117 };
+        assert_eq!(id.to_string(), "20261122T220517-17");
+        assert!(SimulationId::is_like(&id.to_string()));
+        assert!(SimulationId::next() < SimulationId::next());
+        for other in ["", "..", "../x", "1/2", "T1", "-1", "20261122T220517-17.log", "1\0", &"1".repeat(41)] {
+            assert!(!SimulationId::is_like(other), "{other:?}");
+        }
+    }
+}

@@ -1,0 +1,187 @@
+//! How simulations end: under one id in the messages, the log, `simulations.csv`, the counters, the monitor and the output.
+
+use std::path::Path;
+
+use nix::sys::signal::Signal;
+use serde_json::Value;
+
+use super::scene::{DEMO, arm};
+use crate::support::client::Client;
+use crate::support::git::{Forge, world};
+use crate::support::program::{Server, simulation_server};
+use crate::support::webots::Webots;
+use crate::support::{http, until};
+
+/// A simulator that ends as a file says: its exit code, at once or once the file is there.
+fn ending(at_once: bool, file: &Path) -> Webots {
+    let (begin, file) = (if at_once { "" } else { "echo begun\n" }, file.display());
+    let demo = if at_once { String::new() } else { format!("{DEMO} \"$@\" &\n") };
+    Webots::script(&format!(
+        "{begin}{demo}until [ -e {file} ]; do sleep 0.02; done\necho last words\nkill %1 2>/dev/null\nexit $(cat {file})"
+    ))
+}
+
+/// The lines of `simulations.csv`, without the first.
+fn lines(server: &Server) -> Vec<Vec<String>> {
+    let text = std::fs::read_to_string(server.folder.join("log/simulation/simulations.csv")).unwrap_or_default();
+    text.lines().skip(1).map(|line| line.split(',').map(str::to_owned).collect()).collect()
+}
+
+/// Waits for the line of a simulation, and returns its columns.
+async fn line(server: &Server, id: &str) -> Vec<String> {
+    let find = || lines(server).into_iter().find(|line| line[0] == id);
+    until("its end is in simulations.csv", async || find().is_some()).await;
+    find().unwrap()
+}
+
+async fn ends(server: &Server, reason: &str) -> f64 {
+    let metrics = http::get(&server.url("/metrics")).await.text();
+    let begin = format!("webots_simulation_ends_total{{reason=\"{reason}\"}} ");
+    metrics.lines().find_map(|line| line.strip_prefix(&begin)).unwrap_or_else(|| panic!("{metrics}")).parse().unwrap()
+}
+
+#[actix_rt::test]
+async fn a_simulation_has_one_id_from_its_first_message_to_its_last_trace() {
+    let (forge, folder) = (Forge::with_arm(), tempfile::tempdir().unwrap());
+    let file = folder.path().join("code");
+    let webots = ending(false, &file);
+    let server = simulation_server(&webots.path(), forge.path(), 1).set("isolation", "none").start().await;
+    let mut client = Client::start(&server, &arm()).await;
+    client.until("webots:").await;
+    assert!(client.heard[0].starts_with("session: "), "{:?}", client.heard);
+    let id = client.id().to_owned();
+    let status: Value = http::get(&server.url("/status")).await.json();
+    assert_eq!(status["simulations"][0]["id"], id.as_str());
+    assert!(http::get(&server.url("/monitor")).await.text().contains(&id));
+    let url = server.url(&format!("/output?id={id}"));
+    assert_eq!(http::get(&url).await.text(), "begun\n");
+    std::fs::write(&file, "3").unwrap();
+    let told = client.until("loading: Error:").await;
+    assert!(told.contains("Webots ended with exit code 3"), "{told}");
+    let port = (server.port + 1).to_string();
+    let line = line(&server, &id).await;
+    let world = arm();
+    let expected = ["127.0.0.1", "https://github.com/lab/arm", &world, &port, "none"];
+    assert_eq!(line[3..8], expected, "{line:?}");
+    assert!(line[1] <= line[2] && line[1].ends_with('Z') && line[10] == "crashed", "{line:?}");
+    assert_eq!((ends(&server, "crashed").await, ends(&server, "left").await), (1.0, 0.0));
+    let kept = async || http::get(&url).await.text();
+    until("the output is kept with the events", async || kept().await.contains("ended (crashed)")).await;
+    let kept = kept().await;
+    for words in
+        ["asks for https://github.com/lab/arm", ": ready\n", "Webots ended with exit code 3", "begun\nlast words\n"]
+    {
+        assert!(kept.contains(words), "{words:?}: {kept}");
+    }
+    let page = http::get(&server.url("/monitor")).await.text();
+    assert!(page.contains("crashed") && page.contains(&format!("output?id={id}")), "{page}");
+    assert!(!page.contains("last words"), "who may see the page may not see the output");
+    let log = server.log();
+    for words in ["asks for https", "is for Webots", "started ", ": ready", "Webots ended with exit code 3", "gone"] {
+        assert!(log.lines().any(|line| line.contains(&id) && line.contains(words)), "{words:?}: {log}");
+    }
+}
+
+#[actix_rt::test]
+async fn each_kind_of_end_is_told_as_such() {
+    let (forge, folder) = (Forge::with_arm(), tempfile::tempdir().unwrap());
+    let file = folder.path().join("code");
+    let webots = ending(false, &file);
+    let mut server = simulation_server(&webots.path(), forge.path(), 1).set("isolation", "none").start().await;
+    let start = async || {
+        let mut client = Client::start(&server, &arm()).await;
+        client.until("webots:").await;
+        client
+    };
+    // It ends in order.
+    let mut finished = start().await;
+    std::fs::write(&file, "0").unwrap();
+    finished.until("loading: Webots has ended").await;
+    assert_eq!(line(&server, finished.id()).await[10], "finished");
+    std::fs::remove_file(&file).unwrap();
+    // Its client goes.
+    let gone = start().await;
+    let id = gone.id().to_owned();
+    gone.leave().await;
+    assert_eq!(line(&server, &id).await[10], "left");
+    // Its world is not there: nothing is kept of it.
+    let mut nowhere = Client::start(&server, &world("lab/arm", "main", "worlds/none.wbt")).await;
+    nowhere.until("loading: Error:").await;
+    let line_of_it = line(&server, nowhere.id()).await;
+    assert_eq!(line_of_it[8..], ["", "", "no_checkout"], "{line_of_it:?}");
+    let output = server.url(&format!("/output?id={}", nowhere.id()));
+    assert_eq!(http::get(&output).await.status.as_u16(), 404);
+    // A client that waits, and one that runs, while the server is stopped.
+    let (running, mut waiting) = (start().await, Client::start(&server, &arm()).await);
+    waiting.until("queue:").await;
+    server.signal(Signal::SIGTERM);
+    assert_eq!(server.ended().await, Some(0));
+    let last = lines(&server);
+    for client in [&running, &waiting] {
+        let line = last.iter().find(|line| line[0] == client.id()).unwrap_or_else(|| panic!("{last:?}"));
+        assert_eq!(line[10], "stopped", "{line:?}");
+    }
+    assert_eq!(last.len(), 5, "{last:?}");
+}
+
+#[actix_rt::test]
+async fn a_webots_that_does_not_start_and_one_whose_time_is_up_are_told_as_such() {
+    let (forge, folder) = (Forge::with_arm(), tempfile::tempdir().unwrap());
+    let file = folder.path().join("code");
+    std::fs::write(&file, "7").unwrap();
+    let broken = ending(true, &file);
+    let server = simulation_server(&broken.path(), forge.path(), 1).set("isolation", "none").start().await;
+    let mut client = Client::start(&server, &arm()).await;
+    client.until("loading: Error:").await;
+    assert_eq!(line(&server, client.id()).await[10], "no_webots");
+    let webots = Webots::launcher();
+    let server = simulation_server(&webots.path(), forge.path(), 1).set("timeout", 2).start().await;
+    let mut client = Client::start(&server, &arm()).await;
+    client.until("loading: Error: The time limit").await;
+    assert_eq!(line(&server, client.id()).await[10], "time_limit");
+}
+
+#[actix_rt::test]
+async fn what_a_simulation_has_taken_is_told() {
+    let forge = Forge::with_arm();
+    let webots = Webots::script(&format!("{DEMO} \"$@\" &\nwhile :; do :; done & wait"));
+    let server = simulation_server(&webots.path(), forge.path(), 1)
+        .set("isolation", "none")
+        .set("timing.heartbeat", 1)
+        .set("timing.grace", 0.2)
+        .start()
+        .await;
+    let mut client = Client::start(&server, &arm()).await;
+    client.until("webots:").await;
+    // The pauses between two readings are ten seconds at most.
+    for _ in 0..13 {
+        client.heard.clear();
+        client.until(".").await;
+    }
+    let simulations = http::get(&server.url("/status")).await.json()["simulations"].clone();
+    client.leave().await;
+    let line = line(&server, simulations[0]["id"].as_str().unwrap()).await;
+    let (memory, time): (u64, f64) = (line[8].parse().unwrap(), line[9].parse().unwrap());
+    assert!((1 << 20..1 << 32).contains(&memory) && (0.2..100.0).contains(&time), "{line:?}");
+}
+
+#[actix_rt::test]
+async fn what_is_kept_needs_the_password_where_there_is_one() {
+    let (forge, folder) = (Forge::with_arm(), tempfile::tempdir().unwrap());
+    let file = folder.path().join("code");
+    std::fs::write(&file, "7").unwrap();
+    let broken = ending(true, &file);
+    let builder = simulation_server(&broken.path(), forge.path(), 1).set("isolation", "none");
+    let server = builder.set("adminPassword", "open sesame").start().await;
+    let mut client = Client::start(&server, &arm()).await;
+    client.until("loading: Error:").await;
+    line(&server, client.id()).await;
+    let url = server.url(&format!("/output?id={}", client.id()));
+    assert_eq!(http::get(&url).await.status.as_u16(), 401);
+    let ask = |url: &str| awc::Client::default().get(url).basic_auth("admin", "open sesame").send();
+    until("it is kept", async || ask(&url).await.is_ok_and(|answer| answer.status() == 200)).await;
+    for id in ["..%2F..%2Fconfig", "%2Fetc%2Fpasswd", "1-1", ""] {
+        let url = server.url(&format!("/output?id={id}"));
+        assert_eq!(ask(&url).await.unwrap().status(), 404, "{id}");
+    }
+}
