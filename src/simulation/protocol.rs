@@ -108,6 +108,18 @@ pub fn error(text: &str) -> String {
     loading(&format!("Error: {text}"))
 }
 
+/// Why everything ends here.
+#[must_use]
+pub fn stopping() -> String {
+    error("This simulation server is stopping")
+}
+
+/// The answer to a request for a controller where there is none.
+#[must_use]
+pub fn nothing_to_reset() -> String {
+    error("A controller can be reset only while a simulation runs")
+}
+
 /// Why a simulation can't start here, where another server may take its client.
 #[must_use]
 pub fn elsewhere(why: &str) -> String {

@@ -1,8 +1,11 @@
-//! A web client: the life of one simulation from its start message to the end of its connection.
+//! A web client, and the session of its simulation from the request for it to its end.
 
+mod attachment;
 pub mod outcome;
 pub mod quota;
+mod session;
 mod state;
 mod web_client;
 
+pub use session::Session;
 pub use web_client::WebClient;
