@@ -228,6 +228,7 @@ fn assemble(
         problem,
         failed_starts,
         places,
+        sessions: Arc::default(),
         load_monitor,
         readings,
         checkouts: Arc::new(checkouts),

@@ -14,6 +14,7 @@ pub mod preflight;
 pub mod process;
 pub mod protocol;
 pub mod readiness;
+pub mod sessions;
 pub mod snapshot;
 pub mod state;
 mod web;

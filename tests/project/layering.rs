@@ -20,10 +20,11 @@ const SESSION: [&str; 8] = [
     "session::web",
     "session::app",
 ];
-const SIMULATION: [&str; 18] = [
+const SIMULATION: [&str; 19] = [
     "simulation::snapshot",
     "simulation::failed_starts",
     "simulation::places",
+    "simulation::sessions",
     "simulation::protocol",
     "simulation::process",
     "simulation::machine",

@@ -18,6 +18,7 @@ mod protocol;
 mod readiness;
 pub mod readings;
 mod ready;
+mod resuming;
 pub mod scene;
 mod soak;
 mod stopping;

@@ -1,9 +1,11 @@
 //! A web client, and the session of its simulation from the request for it to its end.
 
-mod attachment;
+mod comeback;
 pub mod outcome;
 pub mod quota;
+mod resume;
 mod session;
+mod start;
 mod state;
 mod web_client;
 

@@ -1,36 +1,40 @@
 //! Actor: the session of one simulation, from the request for it to its end, as one state machine.
 //!
 //! Created by a web client that asks for a simulation. Whatever it holds in any state (a place in the line, a checkout
-//! under way, a running Webots) is given back when it is dropped. It ends with its client.
+//! under way, a running Webots) is given back when it is dropped. It ends with its client, or some time after the
+//! connection of one that may come back.
 
 use std::sync::Arc;
 
 use actix::prelude::*;
 use actix_web_actors::ws::CloseCode;
 
-use super::attachment::{Attachment, FromClient, Said, ToClient};
+use super::comeback::Comeback;
 use super::outcome::{Outcome, Pending};
-use super::state::{StartRequest, State, WebotsHandle};
+use super::state::{State, WebotsHandle};
 use crate::shared::http::Peer;
 use crate::shared::run::closing;
-use crate::simulation::checkout::{Progress, Project};
-use crate::simulation::places::{PlaceEvent, Ticket};
+use crate::simulation::checkout::Progress;
+use crate::simulation::places::PlaceEvent;
 use crate::simulation::protocol::{self, Mode};
-use crate::simulation::readiness;
-use crate::simulation::snapshot::Change;
+use crate::simulation::sessions::{Attachment, FromClient, Said, ToClient};
 use crate::simulation::state::AppState;
-use crate::simulation::webots::{Exit, LaunchSpec, RestoreController, Webots, WebotsEvent};
+use crate::simulation::webots::{Exit, RestoreController, WebotsEvent};
 
 /// The actor.
 pub struct Session {
-    server: Arc<AppState>,
-    peer: Peer,
+    pub(super) server: Arc<AppState>,
+    pub(super) peer: Peer,
     /// The connection of its client, until it has ended.
-    client: Option<Recipient<ToClient>>,
-    attachment: u64,
-    state: State,
+    pub(super) client: Option<Recipient<ToClient>>,
+    pub(super) attachment: u64,
+    pub(super) state: State,
     restoring: bool,
-    start: Pending,
+    pub(super) start: Pending,
+    /// Whether its client has asked to be able to come back.
+    pub(super) resumable: bool,
+    /// What it keeps so that its client can.
+    pub(super) comeback: Option<Comeback>,
 }
 
 impl Session {
@@ -40,7 +44,7 @@ impl Session {
         server: Arc<AppState>,
         peer: Peer,
         client: Recipient<ToClient>,
-        (url, mode): (String, Mode),
+        (url, mode, resumable): (String, Mode, bool),
     ) -> Attachment {
         let start = Pending::new(&server.starts);
         let session = Self {
@@ -51,17 +55,19 @@ impl Session {
             state: State::Asked { url, mode },
             restoring: false,
             start,
+            resumable,
+            comeback: None,
         };
         let attachment = session.attachment;
         Attachment::new(session.start().recipient(), attachment)
     }
 
-    fn name(&self) -> String {
+    pub(super) fn name(&self) -> String {
         format!("client {}", self.peer)
     }
 
     /// Sends the client a text that it must not miss.
-    fn text(&self, text: String) {
+    pub(super) fn text(&self, text: String) {
         if let Some(client) = &self.client {
             client.do_send(ToClient::Text(text));
         }
@@ -76,99 +82,16 @@ impl Session {
         }
     }
 
-    /// Counts the failed start, sends the client the reason, and ends.
-    fn fail_start(&mut self, outcome: Outcome, why: &str, ctx: &mut Context<Self>) {
-        self.start.resolve(outcome);
-        log::info!("{}: {why}", self.name());
-        self.finish(protocol::error(why), CloseCode::Normal, ctx);
-    }
-
-    /// The same for a client that another server may take: the close code says so to programs.
-    fn refer(&mut self, outcome: Outcome, why: &str, ctx: &mut Context<Self>) {
-        self.start.resolve(outcome);
-        log::info!("{}: {why}", self.name());
-        self.finish(protocol::elsewhere(why), CloseCode::Again, ctx);
-    }
-
-    /// The same for a start that fails for a reason of this server's own, which is reported to session servers.
-    fn fail_own(&mut self, outcome: Outcome, why: &str, ctx: &mut Context<Self>) {
-        self.server.failed_starts.add(why);
-        self.refer(outcome, why, ctx);
-    }
-
-    fn finish(&mut self, last_words: String, code: CloseCode, ctx: &mut Context<Self>) {
+    /// Gives everything back, and sends its client the last words. One that has not heard them can come back for `why`.
+    pub(super) fn finish(&mut self, last_words: String, why: &str, code: CloseCode, ctx: &mut Context<Self>) {
         self.state = State::Over;
         if let Some(client) = self.client.take() {
             client.do_send(ToClient::End(last_words, code));
         }
-        ctx.stop();
-    }
-
-    fn ask(&mut self, url: &str, mode: Mode, ctx: &mut Context<Self>) {
-        let address = self.peer.rate_limit_key();
-        if !self.server.start_quota.take(address) {
-            let why = "Too many simulations were asked for from your address. Try again in a minute";
-            return self.fail_start(Outcome::Refused, why, ctx);
+        if let Some(comeback) = &mut self.comeback {
+            comeback.end(why);
         }
-        let world = match self.server.admit(url) {
-            Ok(world) => world,
-            Err(why) if self.server.takes_nobody() => return self.refer(Outcome::Refused, &why, ctx),
-            Err(why) => return self.fail_start(Outcome::Refused, &why, ctx),
-        };
-        log::info!("{}: asks for {world}", self.name());
-        let ticket = Ticket::new(&self.server.places, ctx.address().recipient(), world.to_string(), address);
-        self.state = State::Waiting { request: StartRequest { world, mode }, ticket };
-    }
-
-    fn check_out(&mut self, StartRequest { world, mode }: StartRequest, place: (Ticket, u16), ctx: &mut Context<Self>) {
-        let instance = match self.server.run.instance() {
-            Ok(instance) => instance,
-            Err(error) => return self.fail_own(Outcome::NoCheckout, &format!("No room for a project: {error}"), ctx),
-        };
-        self.state = State::CheckingOut { mode, place };
-        let me = ctx.address();
-        // Where the mailbox is full, the client misses one line of progress.
-        let progress = move |text: String| drop(me.try_send(Progress(text)));
-        let job = self.server.checkouts.start(world, instance, progress);
-        job.into_actor(self)
-            .map(|result, this, ctx| match result {
-                Ok(Ok(project)) => this.launch(project, ctx),
-                Ok(Err(error)) if error.is_own() => this.fail_own(Outcome::NoCheckout, &error.to_string(), ctx),
-                Ok(Err(error)) => this.fail_start(Outcome::NoCheckout, &error.to_string(), ctx),
-                Err(error) => this.fail_own(Outcome::NoCheckout, &format!("The checkout broke off: {error}"), ctx),
-            })
-            .spawn(ctx);
-    }
-
-    fn launch(&mut self, project: Project, ctx: &mut Context<Self>) {
-        let (mode, place) = match std::mem::replace(&mut self.state, State::Over) {
-            State::CheckingOut { mode, place } => (mode, place),
-            other => return self.state = other,
-        };
-        let program = match readiness::webots_program(&self.server.config) {
-            Ok(program) => program,
-            Err(why) => return self.fail_own(Outcome::NoWebots, &why, ctx),
-        };
-        log::info!("{}: {} is for Webots {}", self.name(), project.world.path.display(), project.world.version);
-        place.0.update(Change::Version(project.world.version.clone()));
-        for warning in &project.warnings {
-            self.text(protocol::loading(warning));
-        }
-        self.text(protocol::loading("webots is starting"));
-        let spec = LaunchSpec {
-            config: Arc::clone(&self.server.config),
-            containers: self.server.containers.clone(),
-            launcher: Arc::clone(&self.server.launcher),
-            watcher: self.server.watcher.clone(),
-            program,
-            checkouts: Arc::clone(&self.server.checkouts),
-            project: Arc::new(project),
-            mode,
-            place,
-            events: ctx.address().recipient(),
-        };
-        let webots = Webots::start_in_arbiter(self.server.webots_thread(spec.place.1), |_| Webots::new(spec));
-        self.state = State::Launched(WebotsHandle(webots));
+        self.await_client(ctx);
     }
 
     fn reset_controller(&mut self, file: String, ctx: &mut Context<Self>) {
@@ -200,7 +123,7 @@ impl Session {
         }
         let words = if *clean { protocol::loading(why) } else { protocol::error(why) };
         self.start.resolve(Outcome::NoWebots);
-        self.finish(words, CloseCode::Normal, ctx);
+        self.finish(words, why, CloseCode::Normal, ctx);
     }
 }
 
@@ -212,7 +135,8 @@ impl Actor for Session {
             .into_actor(self)
             .map(|(), this, ctx| {
                 this.start.resolve(Outcome::Stopped);
-                this.finish(protocol::stopping(), CloseCode::Away, ctx);
+                this.comeback = None;
+                this.finish(protocol::stopping(), "", CloseCode::Away, ctx);
             })
             .spawn(ctx);
         if let State::Asked { url, mode } = std::mem::replace(&mut self.state, State::Over) {
@@ -240,9 +164,13 @@ impl Handler<FromClient> for Session {
         }
         match what {
             Said::ResetController(file) => self.reset_controller(file, ctx),
-            Said::Gone => {
+            Said::Left => {
                 self.client = None;
                 ctx.stop();
+            }
+            Said::Gone => {
+                self.client = None;
+                self.await_client(ctx);
             }
         }
     }
@@ -265,6 +193,11 @@ impl Handler<PlaceEvent> for Session {
                     self.text(text);
                 }
             }
+            (PlaceEvent::AwayTooLong, State::Launched(_)) => {
+                let why = "Too many simulations waited for their clients, and this one had waited longest";
+                log::info!("{}: {why}", self.name());
+                self.finish(protocol::error(why), why, CloseCode::Normal, ctx);
+            }
             (_, state) => self.state = state,
         }
     }
@@ -286,12 +219,27 @@ impl Handler<WebotsEvent> for Session {
     fn handle(&mut self, event: WebotsEvent, ctx: &mut Self::Context) {
         match event {
             WebotsEvent::Progress(text) => self.hint(protocol::loading(&text)),
-            WebotsEvent::Text(text) => self.text(protocol::of_project(&text)),
-            WebotsEvent::Started => self.text(protocol::shutdown_timeout(self.server.config.timeout)),
+            WebotsEvent::Text(text) => {
+                let text = protocol::of_project(&text);
+                if let Some(comeback) = &mut self.comeback {
+                    comeback.keep(text.clone());
+                }
+                self.text(text);
+            }
+            WebotsEvent::Started => {
+                if let Some(comeback) = &mut self.comeback {
+                    comeback.launched();
+                }
+                self.text(protocol::shutdown_timeout(self.server.config.timeout));
+            }
             WebotsEvent::Listening(port) => {
                 self.start.resolve(Outcome::Ready);
                 self.server.failed_starts.reset();
-                self.text(protocol::webots(&self.server.config.websocket_url(port)));
+                let url = self.server.config.websocket_url(port);
+                self.text(protocol::webots(&url));
+                let absence = self.server.config.timing.absence;
+                let offer = self.comeback.as_mut().map(|comeback| comeback.ready(url, absence));
+                offer.into_iter().flatten().for_each(|text| self.text(text));
             }
             WebotsEvent::Heartbeat => self.hint(protocol::HEARTBEAT.to_owned()),
             WebotsEvent::Hanging(seconds) => {

@@ -8,7 +8,6 @@ use std::sync::Arc;
 use actix::prelude::*;
 use actix_web_actors::ws::{CloseCode, CloseReason, Message, ProtocolError, WebsocketContext};
 
-use super::attachment::{Attachment, Said, ToClient};
 use super::session::Session;
 use crate::shared::http::ConnectionPermit;
 use crate::shared::http::Peer;
@@ -16,6 +15,7 @@ use crate::shared::http::liveness::{self, Liveness};
 use crate::shared::http::websocket::{ClientMessage, MessageReader};
 use crate::shared::run::closing;
 use crate::simulation::protocol::{self, Request};
+use crate::simulation::sessions::{Attachment, Resume, Said, ToClient, Token};
 use crate::simulation::state::AppState;
 
 /// The actor.
@@ -32,6 +32,8 @@ pub struct WebClient {
 enum Attached {
     /// It has asked for nothing yet.
     No,
+    /// It has asked to go on with one.
+    Coming,
     /// It has one.
     To(Attachment),
     /// It was told the end.
@@ -57,24 +59,58 @@ impl WebClient {
         ctx.stop();
     }
 
+    /// Ends the simulation of a client that leaves in order, or that breaks the rules.
+    fn give_up(&self) {
+        if let Attached::To(session) = &self.session {
+            session.say(Said::Left);
+        }
+    }
+
+    /// Asks the session that a token names to go on with this connection.
+    fn resume(&mut self, token: Option<Token>, ctx: &mut Context) {
+        let found = token.and_then(|token| Some((token, self.server.sessions.find(&token)?)));
+        let Some((token, session)) = found else {
+            log::info!("client {}: comes back to a simulation that has ended", self.peer);
+            return self.finish(protocol::ended(None), CloseCode::Normal, ctx);
+        };
+        self.session = Attached::Coming;
+        let resumed = session.send(Resume { token, client: ctx.address().recipient(), peer: self.peer });
+        resumed
+            .into_actor(self)
+            .map(|answer, this, ctx| match answer {
+                Ok(Ok(attachment)) if matches!(this.session, Attached::Coming) => {
+                    this.session = Attached::To(attachment);
+                }
+                // It was told the end meanwhile.
+                Ok(Ok(_)) => {}
+                Ok(Err(refusal)) => {
+                    log::info!("client {}: does not come back: {refusal}", this.peer);
+                    this.finish(refusal, CloseCode::Normal, ctx);
+                }
+                Err(_) => this.finish(protocol::ended(None), CloseCode::Normal, ctx),
+            })
+            .spawn(ctx);
+    }
+
     fn understand(&mut self, text: &str, ctx: &mut Context) {
         match Request::parse(text) {
-            Ok(Some(Request::Start { url, mode })) => {
-                if !matches!(self.session, Attached::No) {
-                    log::warn!("client {}: asks for a second simulation on one connection; ignored", self.peer);
-                    return;
-                }
+            Ok(Some(Request::Start { .. } | Request::Resume(_))) if !matches!(self.session, Attached::No) => {
+                log::warn!("client {}: asks for a second simulation on one connection; ignored", self.peer);
+            }
+            Ok(Some(Request::Start { url, mode, resumable })) => {
                 let server = Arc::clone(&self.server);
                 let client = ctx.address().recipient();
-                self.session = Attached::To(Session::open(server, self.peer, client, (url, mode)));
+                self.session = Attached::To(Session::open(server, self.peer, client, (url, mode, resumable)));
             }
+            Ok(Some(Request::Resume(token))) => self.resume(token, ctx),
             Ok(Some(Request::ResetController(file))) => match &self.session {
                 Attached::To(session) => session.say(Said::ResetController(file)),
-                Attached::No | Attached::Over => ctx.text(protocol::nothing_to_reset()),
+                Attached::No | Attached::Coming | Attached::Over => ctx.text(protocol::nothing_to_reset()),
             },
             Ok(None) => log::debug!("client {}: a message that asks for nothing is ignored", self.peer),
             Err(wrong) => {
                 log::info!("client {}: {wrong}", self.peer);
+                self.give_up();
                 self.finish(protocol::error(&wrong.to_string()), CloseCode::Normal, ctx);
             }
         }
@@ -93,7 +129,7 @@ impl Actor for WebClient {
             .into_actor(self)
             .map(|(), this, ctx| {
                 // Its session tells a client that has one.
-                if matches!(this.session, Attached::No) {
+                if matches!(this.session, Attached::No | Attached::Coming) {
                     this.finish(protocol::stopping(), CloseCode::Away, ctx);
                 }
             })
@@ -112,16 +148,22 @@ impl StreamHandler<Result<Message, ProtocolError>> for WebClient {
             Ok(Some(ClientMessage::Ping(data))) if self.liveness.may_answer() => ctx.pong(&data),
             Ok(Some(ClientMessage::Pong(content))) => self.liveness.pong(&content),
             Ok(Some(ClientMessage::Close(reason))) => {
+                // Whatever else comes, or nothing: the client may come back.
+                if reason.as_ref().is_some_and(|reason| reason.code == CloseCode::Normal) {
+                    self.give_up();
+                }
                 ctx.close(reason);
                 ctx.stop();
             }
             Ok(None) => {}
             Ok(Some(ClientMessage::Text(_) | ClientMessage::Ping(_))) => {
                 log::warn!("client {}: asks too much between two pings", self.peer);
+                self.give_up();
                 self.finish(protocol::error("Too many requests on one connection"), CloseCode::Policy, ctx);
             }
             Err(error) => {
                 log::info!("client {}: {error}", self.peer);
+                self.give_up();
                 self.finish(protocol::error(&error.to_string()), error.code(), ctx);
             }
         }

@@ -1,6 +1,9 @@
 //! The places that clients wait for: who has one, who is next, and how many one address may have.
 
+mod messages;
 mod no_place;
 mod places;
 
-pub use places::{GetSnapshot, PlaceEvent, Places, Ticket};
+pub use messages::{GetSnapshot, Move, PlaceEvent, Update};
+pub use no_place::NoPlace;
+pub use places::{Places, Ticket};

@@ -13,32 +13,11 @@ use std::time::Duration;
 
 use actix::prelude::*;
 
+use super::messages::{Acquire, GetSnapshot, Move, PlaceEvent, Release, Update};
 use super::no_place::NoPlace;
 use crate::shared::domain::Instances;
 use crate::shared::run::seconds_since_1970;
 use crate::simulation::snapshot::{Change, Simulation, Snapshot, Stage};
-
-/// Asks for a place, in the name of a ticket.
-#[derive(Message)]
-#[rtype(result = "()")]
-struct Acquire {
-    id: u64,
-    client: Recipient<PlaceEvent>,
-    world: String,
-    address: Option<IpAddr>,
-}
-
-/// What the holder of a ticket hears.
-#[derive(Message, Debug, Clone, Copy, PartialEq, Eq)]
-#[rtype(result = "()")]
-pub enum PlaceEvent {
-    /// So many clients are ahead in the waiting line.
-    Ahead(usize),
-    /// This port may be used as long as the ticket lives.
-    Granted(u16),
-    /// There is no room in the waiting line either.
-    Refused(NoPlace),
-}
 
 /// A place, or a place in the line for one. Dropping it gives it back.
 #[derive(Debug)]
@@ -46,23 +25,6 @@ pub struct Ticket {
     id: u64,
     places: Addr<Places>,
 }
-
-/// Tells what has changed in a simulation.
-#[derive(Message)]
-#[rtype(result = "()")]
-struct Update {
-    id: u64,
-    change: Change,
-}
-
-/// Asks for a snapshot of all simulations.
-#[derive(Message)]
-#[rtype(result = "Snapshot")]
-pub struct GetSnapshot;
-
-#[derive(Message)]
-#[rtype(result = "()")]
-struct Release(u64);
 
 /// The actor.
 pub struct Places {
@@ -80,6 +42,7 @@ struct Present {
     /// The port that is lent, which is not always the one that Webots took.
     lent: Option<u16>,
     address: Option<IpAddr>,
+    client: Recipient<PlaceEvent>,
     shown: Simulation,
 }
 
@@ -164,6 +127,19 @@ impl Places {
         }
     }
 
+    /// Simulations whose clients are away hold half of the places at most, or one where there is only one.
+    fn end_longest_away(&mut self) {
+        let most = (self.ports.len() / 2).max(1);
+        let away = || self.present.values().filter(|one| one.shown.away_until.is_some());
+        if away().count() > most
+            && let Some(id) = away().min_by_key(|one| one.shown.away_until).map(|one| one.shown.id)
+            && let Some(longest) = self.present.get_mut(&id)
+        {
+            longest.shown.away_until = None;
+            longest.client.do_send(PlaceEvent::AwayTooLong);
+        }
+    }
+
     fn lend(&mut self, id: u64, port: u16) {
         if let Some(present) = self.present.get_mut(&id) {
             present.lent = Some(port);
@@ -226,11 +202,12 @@ impl Handler<Acquire> for Places {
             pid: None,
             cgroup: None,
             port: None,
+            away_until: None,
             version: None,
             log: None,
             log_begin: 0,
         };
-        self.present.insert(id, Present { lent: None, address, shown });
+        self.present.insert(id, Present { lent: None, address, client: client.clone(), shown });
         self.line.push_back(Waiting { id, address, client, told: None });
         self.serve();
     }
@@ -253,7 +230,30 @@ impl Handler<Update> for Places {
         let Some(Present { shown, .. }) = self.present.get_mut(&id) else {
             return;
         };
+        let is_away = matches!(change, Change::Away(Some(_)));
         shown.apply(change);
+        if is_away {
+            self.end_longest_away();
+        }
+    }
+}
+
+impl Handler<Move> for Places {
+    type Result = Result<(), NoPlace>;
+
+    fn handle(&mut self, Move { id, address }: Move, _: &mut Self::Context) -> Self::Result {
+        let is_there = self.present.get(&id).is_none_or(|one| one.address == address);
+        let share = self.per_address.zip(address).filter(|_| !is_there);
+        if let Some(((most, _), address)) = share
+            && let (places, waiting) = self.of_address(address)
+            && places >= most
+        {
+            return Err(NoPlace::Share { places, waiting });
+        }
+        if let Some(present) = self.present.get_mut(&id) {
+            present.address = address;
+        }
+        Ok(())
     }
 }
 
@@ -283,6 +283,12 @@ impl Ticket {
     pub fn update(&self, change: Change) {
         // The actor lives as long as the server; without it there is nothing to show.
         self.places.do_send(Update { id: self.id, change });
+    }
+
+    /// The number by which the actor knows it.
+    #[must_use]
+    pub fn id(&self) -> u64 {
+        self.id
     }
 }
 

@@ -28,6 +28,8 @@ pub struct FromClient {
 pub enum Said {
     /// Restore this file below `controllers/`.
     ResetController(String),
+    /// It needs its simulation no longer.
+    Left,
     /// Its connection has ended.
     Gone,
 }
