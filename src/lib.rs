@@ -19,7 +19,7 @@
 //! | `simulation::isolation` | how a simulation is launched: its level of isolation, environment and limits |
 //! | [`simulation::container`] | simulations in containers: what a project asks for, its image, its compose project |
 //! | [`simulation::webots`] | one running Webots |
-//! | [`simulation::client`] | one web client, the life of its simulation |
+//! | [`simulation::client`] | one web client, the session of its simulation |
 //! | `simulation::web` | paths and pages of the simulation server |
 //!
 //! Each server also has a folder `config` (every key), its `app` (start and end) and its `state` (what its paths share). Files
@@ -48,7 +48,9 @@
 //!
 //!   routes - GetSnapshot -> Places <- GetSnapshot - LoadMonitor --> monitor.csv
 //!     | one per WebSocket   ^  |                      '-- Readings (watch channel) --> routes
-//!   WebClient - Ticket -----'  |
+//!   WebClient               |  |
+//!     | one per simulation  |  |
+//!   Session --- Ticket -----'  |
 //!     ^  ^------- PlaceEvent --'
 //!     |  |--- checkout (a task on the main thread, shared by all who want the same world) --> git
 //!     |  '--- starts ---> Webots (one per simulation) --> Webots' process group, in a sandbox
@@ -70,7 +72,8 @@
 //! | `NameMonitor` | when its name leaves the configuration | its supervisor makes a new one |
 //! | Mailer | never | its supervisor makes a new one; what it had not sent is lost |
 //! | Announcer | when all are told or given up | it is not started again: announcing is a courtesy |
-//! | `WebClient` | with its connection | its connection closes; what it leased is freed |
+//! | `WebClient` | with its connection | its connection closes, and its session hears of it |
+//! | `Session` | with its simulation, or its client | what it leased is freed, and its client is told |
 //! | Webots | with its process tree; it is never restarted, its client is told | its process tree is killed at once, its folder removed, its place freed |
 //!
 //! The registry looks after the supervisors ([`shared::run::Supervisor`], one for each kind). More than five panics of a kind

@@ -15,7 +15,7 @@ use crate::support::ports;
 use crate::support::program::{Server, session_server, simulation_server};
 use crate::support::stand_in::{Script, StandIn};
 use crate::support::webots::Webots;
-use crate::support::{SOON, until};
+use crate::support::{SOON, http, until};
 
 /// How long a rehearsal may take.
 const BOUND: Duration = Duration::from_secs(90);
@@ -97,6 +97,18 @@ async fn a_class_that_does_not_fit_is_told_why_and_time_in_the_line_counts_as_wa
     let said = text(&output.stdout);
     assert_eq!(output.status.code(), Some(1), "{said}");
     assert!(said.contains("1 of 2"), "{said}");
+}
+
+#[actix_rt::test]
+async fn a_class_that_reloads_comes_back_to_its_simulations() {
+    let fleet = Fleet::with_places(4).await;
+    let arguments = ["--clients", "2", "--over", "0s", "--stay", "8s", "--reload", "100", "--expect", "2"];
+    let told = fleet.rehearse(&[&arguments[..], &["--real-time", "0"]].concat()).await;
+    assert!(told.status.success(), "{}", text(&told.stdout));
+    let status = http::get(&fleet.simulation.url("/status")).await.json();
+    assert_eq!(status["instances"]["arrivals"], 2, "they began anew: {}", text(&told.stdout));
+    let refused = fleet.rehearse(&["--reload", "60", "--misbehave", "drop=41"]).await;
+    assert!(text(&refused.stderr).contains("the shares are 101 percent"), "{}", text(&refused.stderr));
 }
 
 #[actix_rt::test]

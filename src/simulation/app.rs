@@ -234,6 +234,7 @@ fn assemble(
         failed_starts,
         ends,
         places,
+        sessions: Arc::default(),
         load_monitor,
         readings,
         checkouts: Arc::new(checkouts),

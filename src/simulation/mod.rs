@@ -15,6 +15,7 @@ pub mod preflight;
 pub mod process;
 pub mod protocol;
 pub mod readiness;
+pub mod sessions;
 pub mod simulation_id;
 pub mod snapshot;
 pub mod state;

@@ -2,7 +2,8 @@
 //!
 //! | from the client (JSON) | |
 //! |---|---|
-//! | `{"start": {"url": WORLD, "mode": "x3d" \| "w3d" \| "mjpeg"}}` | start a simulation |
+//! | `{"start": {"url": WORLD, "mode": "x3d" \| "w3d" \| "mjpeg", "resumable": true}}` | start a simulation; to a resumable one its client can come back |
+//! | `{"resume": TOKEN}` | come back to a simulation |
 //! | `{"reset controller": "NAME/FILE"}` | restore a file below `controllers/` |
 //! | any other JSON | ignored, as the Python server does: old pages send it |
 //!
@@ -16,6 +17,8 @@
 //! | `loading: Error: TEXT` | why the simulation failed; the connection is closed after it |
 //! | `shutdownTimeout: SECONDS` | the process was launched, and will be closed after so many seconds |
 //! | `webots:URL` | Webots is ready there |
+//! | `absence: SECONDS` | how long the simulation waits for its client once the connection is broken |
+//! | `resume: TOKEN` | what to come back with |
 //! | `.` | Webots is alive |
 //! | `reset controller: NAME/FILE` | done |
 //!
@@ -25,6 +28,7 @@
 use serde_json::Value;
 
 use crate::shared::text::{client_text, without_paths};
+use crate::simulation::sessions::Token;
 
 /// A request of a client.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -35,7 +39,11 @@ pub enum Request {
         url: String,
         /// How the simulation is shown.
         mode: Mode,
+        /// Whether its client may come back after its connection has broken.
+        resumable: bool,
     },
+    /// Come back to the simulation of this token; none is a text that can't be one.
+    Resume(Option<Token>),
     /// Restore this file below `controllers/`.
     ResetController(String),
 }
@@ -71,6 +79,10 @@ impl Request {
             let file = file.as_str().ok_or_else(|| wrong("\"reset controller\" is no text"))?;
             return Ok(Some(Self::ResetController(file.to_owned())));
         }
+        if let Some(token) = message.get("resume") {
+            let token = token.as_str().ok_or_else(|| wrong("\"resume\" is no text"))?;
+            return Ok(Some(Self::Resume(Token::parse(token))));
+        }
         let Some(start) = message.get("start") else {
             return Ok(None);
         };
@@ -83,7 +95,11 @@ impl Request {
             Some((_, Some("mjpeg"))) => Mode::Mjpeg,
             Some((other, _)) => return Err(WrongMessage(format!("there is no \"mode\" {other}"))),
         };
-        Ok(Some(Self::Start { url: url.to_owned(), mode }))
+        let resumable = match start.get("resumable") {
+            None | Some(Value::Null) => false,
+            Some(value) => value.as_bool().ok_or_else(|| wrong("\"resumable\" is neither true nor false"))?,
+        };
+        Ok(Some(Self::Start { url: url.to_owned(), mode, resumable }))
     }
 }
 
@@ -107,6 +123,18 @@ pub fn loading(text: &str) -> String {
 #[must_use]
 pub fn error(text: &str) -> String {
     loading(&format!("Error: {text}"))
+}
+
+/// Why everything ends here.
+#[must_use]
+pub fn stopping() -> String {
+    error("This simulation server is stopping")
+}
+
+/// The answer to a request for a controller where there is none.
+#[must_use]
+pub fn nothing_to_reset() -> String {
+    error("A controller can be reset only while a simulation runs")
 }
 
 /// Why a simulation can't start here, where another server may take its client.
@@ -140,6 +168,30 @@ pub fn shutdown_timeout(seconds: u64) -> String {
     format!("shutdownTimeout: {seconds}")
 }
 
+/// How long the simulation waits for its client once the connection is broken.
+#[must_use]
+pub fn absence(seconds: u64) -> String {
+    format!("absence: {seconds}")
+}
+
+/// What its client can come back with.
+#[must_use]
+pub fn resume(token: &Token) -> String {
+    format!("resume: {}", token.reveal())
+}
+
+/// Why nobody can come back to a simulation; where it is known, why it has ended.
+#[must_use]
+pub fn ended(why: Option<&str>) -> String {
+    error(&why.map_or("this simulation has ended".to_owned(), |why| format!("this simulation has ended: {why}")))
+}
+
+/// Why a connection ends whose token another one has used.
+#[must_use]
+pub fn taken_over() -> String {
+    error("this simulation was taken over elsewhere")
+}
+
 /// Where Webots is ready.
 #[must_use]
 pub fn webots(url: &str) -> String {
@@ -164,11 +216,17 @@ mod tests {
 
     #[test]
     fn requests_are_read() {
-        let start = |mode| Request::Start { url: "https://x".to_owned(), mode };
+        let ask = |mode, resumable| Request::Start { url: "https://x".to_owned(), mode, resumable };
+        let start = |mode| ask(mode, false);
+        let token = Token::new(5);
+        let resume = format!(r#"{{"resume": "{}"}}"#, token.reveal());
         let table = [
             (r#"{"start":{"url":"https://x"}}"#, start(Mode::X3d)),
             (r#"{"start":{"url":"https://x","mode":"mjpeg","more":1}}"#, start(Mode::Mjpeg)),
             (r#"{"start":{"url":"https://x","mode":"w3d"}}"#, start(Mode::W3d)),
+            (r#"{"start":{"url":"https://x","resumable":true}}"#, ask(Mode::X3d, true)),
+            (&resume, Request::Resume(Some(token))),
+            (r#"{"resume":"what is no token"}"#, Request::Resume(None)),
             (r#"{ "reset controller" : "a/a.py" }"#, Request::ResetController("a/a.py".to_owned())),
         ];
         for (text, request) in table {
@@ -192,6 +250,8 @@ mod tests {
             (r#"{"start":5}"#, "\"start\" has no \"url\""),
             (r#"{"start":{"url":"x","mode":"vr"}}"#, "there is no \"mode\" \"vr\""),
             (r#"{"start":{"url":5}}"#, "\"start\" has no \"url\""),
+            (r#"{"start":{"url":"x","resumable":1}}"#, "\"resumable\" is neither"),
+            (r#"{"resume":5}"#, "\"resume\" is no text"),
             (r#"{"reset controller":5}"#, "\"reset controller\" is no text"),
         ];
         for (text, words) in table {

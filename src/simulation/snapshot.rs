@@ -30,6 +30,8 @@ pub enum Change {
     },
     /// It streams on this port.
     Port(u16),
+    /// Its client is away, and it waits until so many seconds since 1970; or its client is there again.
+    Away(Option<u64>),
 }
 
 /// The states of a simulation, as pages and programs see them.
@@ -80,6 +82,9 @@ pub struct Simulation {
     pub cgroup: Option<PathBuf>,
     /// The streaming port, once there is one.
     pub port: Option<u16>,
+    /// Until when it waits for its client, which is away, in seconds since 1970.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub away_until: Option<u64>,
     /// The version of Webots that the world was made for.
     pub version: Option<String>,
     /// The file that its output is kept in.
@@ -93,6 +98,7 @@ impl Simulation {
             Change::Stage(stage) => self.stage = stage,
             Change::Version(version) => self.version = Some(version),
             Change::Port(port) => self.port = Some(port),
+            Change::Away(until) => self.away_until = until,
             Change::Launched { at, pid, cgroup, port, log } => {
                 self.cgroup = cgroup;
                 self.launched = Some(at);

@@ -10,6 +10,7 @@ use super::config::SimulationConfig;
 use super::ends::Ends;
 use super::failed_starts::FailedStarts;
 use super::places::Places;
+use super::sessions::Sessions;
 use crate::shared::domain::Load;
 use crate::shared::domain::ProjectUrl;
 use crate::shared::domain::Rules;
@@ -38,6 +39,8 @@ pub struct AppState {
     pub rules: Rules,
     /// Lends places.
     pub places: Addr<Places>,
+    /// The sessions that their clients may come back to.
+    pub sessions: Arc<Sessions>,
     /// Reads the machine.
     pub load_monitor: Addr<LoadMonitor>,
     /// The newest readings of the machine.

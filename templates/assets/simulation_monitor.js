@@ -27,6 +27,8 @@ setInterval(() => {
     element.textContent = duration(left);
     element.classList.toggle('bad', left < 300);
   }
+  for (const element of document.querySelectorAll('[data-away]'))
+    element.textContent = `away, ${duration(Number(element.dataset.away) - Date.now() / 1000)} left`;
 }, 1000);
 
 async function showOutput(link) {

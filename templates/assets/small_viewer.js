@@ -28,19 +28,25 @@ export class SmallViewer extends EventTarget {
   #parts;
   #watch = new ResizeObserver(() => this.#redraw());
 
-  /** Shows the simulation at an address in an element. Events: `ready`, `loading` (text), `lost`. */
-  constructor(stage, url) {
+  /**
+   * Shows the simulation at an address in an element; for who comes back, its time goes on. Events: `ready`, `loading`
+   * (text), `heard`, `lost`.
+   */
+  constructor(stage, url, isBack = false) {
     super();
     this.#parts = this.#build();
     stage.replaceChildren(...this.#parts.all);
     this.#drawing = new Drawing(this.#parts.canvas);
     this.#camera = new Camera(this.#parts.canvas, () => this.#redraw());
     this.#watch.observe(this.#parts.canvas);
-    this.#stream = new Stream(url);
+    this.#stream = new Stream(url, isBack);
     const hear = (kind, handler) => this.#stream.addEventListener(kind, ({ detail }) => handler(detail));
     hear('loading', (text) => this.#tell('loading', text));
     hear('model', (xml) => this.#show(xml));
-    hear('update', (update) => this.#update(update));
+    hear('update', (update) => {
+      this.#update(update);
+      this.#tell('heard');
+    });
     hear('mode', (mode) => this.#enter(mode));
     hear('time', (time) => this.#setTime(time));
     hear('reset', () => this.#afterReset());
@@ -116,6 +122,11 @@ export class SmallViewer extends EventTarget {
     this.#mode = mode;
     this.#parts.play.textContent = mode === 'pause' ? 'Play' : 'Pause';
     this.#parts.mode.textContent = mode === 'pause' ? 'paused' : mode.replace('-', ' ');
+  }
+
+  /** What is shown is old. */
+  stale() {
+    this.#parts.mode.textContent = 'no connection';
   }
 
   #toggle() {

@@ -11,7 +11,6 @@ const CLOSING = 1000;
 /** What somebody can do about a failure, in words. */
 export function advice(text) {
   const table = [
-    [/no simulation server available/i, 'All simulation servers are busy or do not answer. Connect again when the light above is on.'],
     [/Docker not enabled|not one of the repositories|no simulation server accepts|blocked repository|does not allow/i,
       'Only worlds of allowed repositories run here: the monitor page of each simulation server lists them.'],
     [/idle time/i, 'Worlds of others run here only while the servers have little to do. Try again later.'],
@@ -20,10 +19,11 @@ export function advice(text) {
       'Look whether the repository, the branch and the file exist, and whether everybody may read them.'],
     [/larger than|longer than/i, 'Try a smaller project, or ask the administrator for a higher limit.'],
     [/Webots is installed|no Webots at/, 'The administrator of this simulation server has to set where Webots is.'],
+    [/taken over/i, 'Another tab, or another window, shows it now. Connect here for a simulation of this tab’s own.'],
+    [/waited longest|did not come back/i, 'Connect again for another simulation.'],
     [/time limit/i, 'Connect again for another simulation.'],
     [/may not connect to/, 'Load this page again: the fleet may have grown. Else the key server of that simulation server has to name the host that the session server lists in simulationServers.'],
     [/simulator could not be reached/, 'A firewall may be in the way: the ports above the simulation server’s own have to be open, or forwarded.'],
-    [/places .* are taken/i, 'Connect again in a few minutes.'],
     [/takes no new clients/i, 'Connect again in a moment: the session server chooses another simulation server as soon as there is one.'],
   ];
   const found = table.find(([pattern]) => pattern.test(text));
@@ -31,8 +31,9 @@ export function advice(text) {
 }
 
 /**
- * One simulation. Events: `step` ({step, state, text}), `left` (seconds until it is closed), `ready` (the simulator's
- * address), `failed` (text: it is over), `elsewhere` (text: this server can't take the client, another may).
+ * The connection of one simulation. Events: `step` ({step, state, text}), `left` (seconds until it is closed), `ready` (the
+ * simulator's address), `token` (one can come back with it within `absence` seconds), `heard` (a sign of life), `failed`
+ * (text: it is over), `elsewhere` (text: this server can't take the client, another may), `broken` (one may come back).
  */
 export class Simulation extends EventTarget {
   #socket;
@@ -40,18 +41,28 @@ export class Simulation extends EventTarget {
   #launched = false;
   #ended = false;
   #why;
+  /** What one can come back with, once there is something. */
+  #token;
+  /** How long the simulation waits then, in seconds. */
+  absence = 0;
 
-  /** Asks a simulation server (a WebSocket address) for a world. */
-  constructor(server, world) {
+  /** Asks a simulation server (a WebSocket address) for a world, or for the simulation of a token. */
+  constructor(server, { world, token }) {
     super();
+    this.#token = token;
     this.#step('server', 'doing', `connecting to ${server}`);
     this.#socket = new WebSocket(`${server}/client`);
     this.#socket.addEventListener('open', () => {
       this.#step('server', 'done', server);
-      this.#step('place', 'doing', 'asking for one');
-      this.#socket.send(JSON.stringify({ start: { url: world } }));
+      this.#step('place', 'doing', token ? 'asking for the one that was left' : 'asking for one');
+      this.#socket.send(JSON.stringify(token ? { resume: token } : { start: { url: world, resumable: true } }));
     });
-    this.#socket.addEventListener('message', ({ data }) => this.#understand(data));
+    this.#socket.addEventListener('message', ({ data }) => {
+      if (this.#ended)
+        return;
+      this.#tell('heard');
+      this.#understand(data);
+    });
     this.#socket.addEventListener('close', ({ code }) => this.#closed(code));
   }
 
@@ -69,6 +80,11 @@ export class Simulation extends EventTarget {
       this.#launched = true;
       this.#step('launch', 'done', 'the simulator is ready');
       this.#tell('ready', rest('webots:'));
+    } else if (text.startsWith('absence:'))
+      this.absence = Number(rest('absence:'));
+    else if (text.startsWith('resume:')) {
+      this.#token = rest('resume:');
+      this.#tell('token', this.#token);
     } else if (text.startsWith('loading: Error:'))
       this.#refused(rest('loading: Error:'));
     else if (text.startsWith('error:'))
@@ -114,12 +130,20 @@ export class Simulation extends EventTarget {
     this.#ended = true;
     if (this.#why)
       this.#tell(TRY_ANOTHER.includes(code) && !this.#launched ? 'elsewhere' : 'failed', this.#why);
+    else if (this.#token)
+      this.#tell('broken');
     else if (this.#launched)
       this.#tell('failed', 'The connection to the simulation server broke: the simulation has ended.');
     else if (this.#granted)
       this.#tell('failed', 'The connection to the simulation server broke before the simulation ran.');
     else
       this.#tell('elsewhere', 'The simulation server could not be reached, or has closed the connection.');
+  }
+
+  /** Hears nothing more, and lets the simulation wait if it can. */
+  detach() {
+    this.#ended = true;
+    this.#socket.close();
   }
 
   /** Leaves: the simulation ends. */

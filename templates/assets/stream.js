@@ -14,7 +14,7 @@ export class Stream extends EventTarget {
   #timer;
   #heard = false;
 
-  /** Opens the connection; who only looks on changes nothing. */
+  /** Opens the connection; for an onlooker, and for who comes back, time goes on: any other makes the simulator pause. */
   constructor(url, onlooker = false) {
     super();
     this.#socket = new WebSocket(`${url}/`);

@@ -1,5 +1,7 @@
 // The viewer page: the availability light, the form, the steps, and the simulation.
 
+import { forget, keep, kept } from './kept.js';
+import { Lifeline } from './lifeline.js';
 import { Simulation, advice } from './start.js';
 import { SmallViewer } from './small_viewer.js';
 import { isDemonstration } from './stream.js';
@@ -9,6 +11,8 @@ const find = (id) => document.getElementById(id);
 const form = find('start');
 let simulation;
 let viewer;
+/** Watches the connection of a simulation that one can come back to. */
+let lifeline;
 let countdown;
 let wanted;
 let patience;
@@ -20,14 +24,28 @@ let asking;
 const ASK_AGAIN = 3;
 const FIRST_PAUSE = 1000;
 
+/** Who is told so is not out of luck: somebody leaves. */
+const BUSY = /no simulation server available|places .* are taken|Clients of your address have/i;
+/** Before a server is asked for again although one is free, doubled each time up to the longest, in milliseconds. */
+const FIRST_WAIT = 2000;
+const LONGEST_WAIT = 30_000;
+/** After a server has become free; not all who wait ask at once. In milliseconds. */
+const JITTER = 3000;
+/** The world that waits for a server, and the timer of its next try. */
+let waiting;
+let wait = FIRST_WAIT;
+
 /* the light */
 
 let door;
 /** How many answers nobody waits for any more are still to come. */
 let stale = 0;
+/** The last word on whether a server is free. */
+let word;
 
 function openDoor() {
   stale = 0;
+  word = undefined;
   const url = new URL('session', location.href);
   url.protocol = url.protocol === 'https:' ? 'wss:' : 'ws:';
   door = new WebSocket(url);
@@ -49,14 +67,32 @@ function light(state, word, text) {
 }
 
 function hear(text) {
-  if (text === '1')
-    light('on', 'Available', 'A simulation server can take you.');
-  else if (text === '0')
-    light('off', 'Not available', 'All simulation servers are busy or do not answer.');
-  else if (stale > 0)
+  if (text === '1' || text === '0') {
+    word = text;
+    showWord();
+    // What could not be reached is reached.
+    if (/session server/.test(find('problem-text').textContent))
+      find('problem').hidden = true;
+    if (waiting && text === '1')
+      tryAgain(JITTER * Math.random());
+  } else if (stale > 0)
     stale -= 1;
   else if (wanted)
     chosen(text);
+}
+
+function showWord() {
+  if (word === '1')
+    light('on', 'Available', 'A simulation server can take you.');
+  else if (word === '0')
+    light('off', 'Not available', 'All simulation servers are busy or do not answer.');
+}
+
+/** Something that is so for a while; nothing takes it away. */
+function notice(text, more) {
+  find('notice-text').textContent = text ?? '';
+  find('notice-advice').textContent = more ?? '';
+  find('notice').hidden = !text;
 }
 
 /* the steps */
@@ -103,12 +139,40 @@ function start(event) {
   clearStage('The simulation appears here.');
   find('problem').hidden = true;
   askedAgain = 0;
-  ask(find('url').value.trim());
+  wait = FIRST_WAIT;
+  const world = find('url').value.trim();
+  // A link that starts the same world.
+  history.replaceState(null, '', `?${new URLSearchParams({ url: world })}`);
+  ask(world);
+}
+
+/** All servers are busy: it is tried again as soon as one is free. */
+function waitForServer(world) {
+  leave();
+  clearSteps();
+  waiting = { world };
+  busy(true, 'Stop waiting');
+  step({ step: 'session', state: 'doing', text: 'all are busy' });
+  notice('All servers are busy.', 'It starts by itself when one is free.');
+  find('spoken').textContent = 'All servers are busy. It starts by itself when one is free.';
+  if (word === '1')
+    tryAgain(wait * (0.5 + Math.random()));
+  wait = Math.min(LONGEST_WAIT, 2 * wait);
+}
+
+function tryAgain(pause) {
+  clearTimeout(waiting.timer);
+  waiting.timer = setTimeout(() => {
+    const { world } = waiting;
+    waiting = undefined;
+    askedAgain = 0;
+    ask(world);
+  }, pause);
 }
 
 function ask(world) {
   wanted = world;
-  busy(true);
+  busy(true, find('notice').hidden ? 'Disconnect' : 'Stop waiting');
   step({ step: 'session', state: 'doing', text: askedAgain ? 'choosing another simulation server' : 'choosing a simulation server' });
   if (door.readyState !== WebSocket.OPEN) {
     wanted = undefined;
@@ -128,11 +192,24 @@ function chosen(answer) {
     if (askedAgain)
       askAgain(world, why);
     else
-      failed(why);
+      refused(world, why);
     return;
   }
+  notice();
+  busy(true);
   step({ step: 'session', state: 'done', text: 'has chosen a simulation server' });
-  const current = new Simulation(answer, world);
+  follow(new Simulation(answer, { world }), answer, world);
+}
+
+function refused(world, why) {
+  if (BUSY.test(why))
+    waitForServer(world);
+  else
+    failed(why);
+}
+
+/** Follows a simulation; who is back finds the steps done, and the time as it went on. */
+function follow(current, server, world, isBack = false) {
   simulation = current;
   const on = (kind, handler) => current.addEventListener(kind, ({ detail }) => {
     if (simulation === current)
@@ -140,9 +217,91 @@ function chosen(answer) {
   });
   on('step', step);
   on('left', countDown);
-  on('failed', failed);
-  on('elsewhere', (why) => askAgain(world, why));
-  on('ready', (address) => show(address, answer, current));
+  on('failed', (why) => (isBack ? failed(why) : refused(world, why)));
+  on('elsewhere', (why) => (isBack ? failed(why) : askAgain(world, why)));
+  on('ready', (address) => show(address, server, current, isBack));
+  on('heard', () => lifeline?.alive());
+  on('token', (token) => {
+    keep({ server, world, token, absence: current.absence });
+    lifeline ??= watch(current.absence);
+    headerLinks(true);
+  });
+  on('broken', () => lifeline?.broken());
+}
+
+/* coming back */
+
+/** Tells that there is no connection while that is so, and comes back. */
+function watch(absence) {
+  const watched = new Lifeline(absence);
+  const on = (kind, handler) => watched.addEventListener(kind, ({ detail }) => handler(detail));
+  let isTold = false;
+  on('lost', ({ since, left }) => {
+    const waits = left > 0 ? `Your simulation waits another ${duration(left)}.` : 'Your simulation may have ended.';
+    notice(`No connection since ${duration(since)}.`, waits);
+    light('', 'No connection', 'It is tried again and again.');
+    viewer?.stale?.();
+    if (!isTold)
+      find('spoken').textContent = `No connection. ${waits}`;
+    isTold = true;
+  });
+  on('found', () => {
+    notice();
+    showWord();
+    if (isTold)
+      find('spoken').textContent = 'The connection is there again.';
+    isTold = false;
+  });
+  on('try', comeBack);
+  on('over', (since) => failed(`There was no connection for ${duration(since)}: the simulation has ended.`));
+  return watched;
+}
+
+function comeBack() {
+  const left = kept();
+  if (!left)
+    return;
+  simulation?.detach();
+  follow(new Simulation(left.server, { token: left.token }), left.server, left.world, true);
+}
+
+/** A page that is loaded again, or that one has come back to, goes on with the simulation of its tab. */
+function goOn() {
+  const left = kept();
+  const named = new URLSearchParams(location.search).get('url');
+  if (!left || (named !== null && named !== left.world)) {
+    forget();
+    return;
+  }
+  find('url').value = left.world;
+  clearSteps();
+  busy(true);
+  step({ step: 'session', state: 'done', text: 'is not asked again' });
+  lifeline = watch(left.absence);
+  headerLinks(true);
+  lifeline.broken();
+}
+
+/** The page is left, perhaps for a moment only: a simulation that can wait does so. */
+function pause() {
+  if (!kept()) {
+    leave();
+    return;
+  }
+  lifeline?.close();
+  lifeline = undefined;
+  const [oldViewer, oldSimulation] = [viewer, simulation];
+  viewer = simulation = undefined;
+  oldViewer?.close();
+  oldSimulation?.detach();
+}
+
+/** While a simulation runs, a link must not end it. */
+function headerLinks(stay) {
+  for (const link of document.querySelectorAll('header a')) {
+    link.target = stay ? '_blank' : '';
+    link.rel = stay ? 'noopener' : '';
+  }
 }
 
 /**
@@ -151,7 +310,7 @@ function chosen(answer) {
  */
 function askAgain(world, why) {
   if (askedAgain === ASK_AGAIN) {
-    failed(why);
+    refused(world, why);
     return;
   }
   askedAgain += 1;
@@ -163,6 +322,7 @@ function askAgain(world, why) {
 }
 
 function countDown(seconds) {
+  clearInterval(countdown);
   const end = Date.now() + 1000 * seconds;
   const tick = () => { find('left').textContent = `It will be closed in ${duration((end - Date.now()) / 1000)}.`; };
   tick();
@@ -183,24 +343,25 @@ async function webotsViewer(server) {
   return form.dataset.script;
 }
 
-async function show(address, server, current) {
+async function show(address, server, current, isBack) {
   step({ step: 'simulation', state: 'doing', text: 'connecting to the simulator' });
   const kind = find('kind').value;
   const script = kind === 'small' ? undefined : await webotsViewer(server);
   const small = !script || (kind === 'automatic' && await isDemonstration(address));
   if (simulation !== current)
     return;
+  viewer?.close();
   if (small)
-    showSmall(address);
+    showSmall(address, isBack);
   else
     showWebots(address, script);
   if (kind === 'webots' && small)
     find('spoken').textContent = 'Webots’ own viewer is not to be had here; the small viewer shows the simulation.';
 }
 
-function showSmall(address) {
+function showSmall(address, isBack) {
   try {
-    viewer = new SmallViewer(find('stage'), address);
+    viewer = new SmallViewer(find('stage'), address, isBack);
   } catch (error) {
     failed(`The scene can’t be shown: ${error.message}.`);
     return;
@@ -214,16 +375,26 @@ function showSmall(address) {
     // On a phone the scene would lie below the steps.
     find('stage').scrollIntoView({ block: 'nearest' });
   });
+  viewer.addEventListener('heard', () => lifeline?.alive());
   viewer.addEventListener('lost', ({ detail }) => {
     if (viewer !== shown || !simulation)
       return;
     if (detail)
       failed(`The scene can’t be shown: ${detail}.`);
     else if (seen)
-      step({ step: 'simulation', state: 'failed', text: 'the simulator has closed its connection' });
+      rejoin(shown);
     else
       failed(`The simulator could not be reached at ${address}.`);
   });
+}
+
+/** The simulator has ended, of which the simulation server tells in a moment, or the connection to it alone is lost. */
+function rejoin(lost) {
+  step({ step: 'simulation', state: 'failed', text: 'the simulator has closed its connection' });
+  setTimeout(() => {
+    if (viewer === lost && simulation)
+      lifeline?.broken();
+  }, 2000);
 }
 
 function showWebots(address, script) {
@@ -238,15 +409,24 @@ function showWebots(address, script) {
 
 /* leaving */
 
-function busy(now) {
+function busy(now, leaving = 'Disconnect') {
   find('connect').disabled = now;
   find('disconnect').disabled = !now;
+  find('disconnect').textContent = leaving;
 }
 
 function leave() {
   clearInterval(countdown);
   clearTimeout(patience);
   clearTimeout(asking);
+  clearTimeout(waiting?.timer);
+  waiting = undefined;
+  lifeline?.close();
+  lifeline = undefined;
+  forget();
+  notice();
+  showWord();
+  headerLinks(false);
   if (wanted)
     stale += 1;
   find('left').hidden = true;
@@ -263,9 +443,9 @@ function clearStage(text) {
 }
 
 function disconnect() {
+  const text = simulation ? 'You have left the simulation; it has ended.' : 'You wait no longer.';
   leave();
   clearSteps();
-  const text = 'You have left the simulation; it has ended.';
   clearStage(text);
   find('spoken').textContent = text;
   find('connect').focus();
@@ -287,5 +467,8 @@ for (const example of form.querySelectorAll('[data-url]')) {
   });
 }
 find('url').value = new URLSearchParams(location.search).get('url') ?? '';
-addEventListener('pagehide', leave);
+addEventListener('pagehide', pause);
+// One that the browser had put aside as it was.
+addEventListener('pageshow', ({ persisted }) => persisted && goOn());
 openDoor();
+goOn();

@@ -49,6 +49,8 @@ class Draining(LeavingServers):
 
 
 class Killed(LeavingServers):
+    simulation = {"timing": {"absence": 3}}
+
     def test_the_client_of_a_killed_server_is_told_and_led_to_another(self):
         self.knows_only(self.fleet.simulation)
         page = self.browser.page()
@@ -57,6 +59,7 @@ class Killed(LeavingServers):
         self.connect(page)
         expect(page.tab.locator("[data-step=simulation].done")).to_be_visible()
         self.fleet.simulation.kill()
+        expect(page.tab.locator("#notice-text")).to_contain_text("No connection since")
         expect(page.tab.locator("#problem-text")).to_contain_text("the simulation has ended")
         self.connect(page)
         self.is_led_to_the_other(page)

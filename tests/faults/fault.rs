@@ -13,8 +13,8 @@ use rand::RngExt;
 use rand::rngs::SmallRng;
 
 use crate::fleet::{Fleet, SERVERS};
-use crate::relay::Mood;
 use crate::support::program::Server;
+use crate::support::relay::Mood;
 use crate::support::stopwatch::Stopwatch;
 use crate::support::webots::instances_below;
 use crate::surroundings::*;

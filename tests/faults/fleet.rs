@@ -12,11 +12,11 @@ use crate::disk;
 use crate::fault::GUARDIAN;
 use crate::machine::Clock;
 use crate::network::Network;
-use crate::relay::Relay;
 use crate::support::client::{Client, Heard};
 use crate::support::git::{Forge, arm};
 use crate::support::name_server::NameServer;
 use crate::support::program::{Builder, Server, session_server, simulation_server};
+use crate::support::relay::Relay;
 use crate::support::webots::{Webots, instances_below};
 use crate::support::{SOON, http, ports};
 

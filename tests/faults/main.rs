@@ -26,7 +26,6 @@ mod fleet;
 mod full_disk;
 mod machine;
 mod network;
-mod relay;
 mod returning;
 mod surroundings;
 

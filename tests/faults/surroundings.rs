@@ -13,8 +13,8 @@ use crate::disk::{Full, ReadOnly};
 use crate::fault::{WHILE, bury};
 use crate::fleet::{BOUND, Fleet, PLACES, SERVERS, SMALL_DISK, try_start};
 use crate::machine::LittleMemory;
-use crate::relay::Mood;
 use crate::support::http;
+use crate::support::relay::Mood;
 
 /// What a server that runs out of memory may still take, with all that it starts, in bytes: less than one Webots.
 const LITTLE: u64 = 2 << 20;

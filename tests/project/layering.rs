@@ -20,12 +20,13 @@ const SESSION: [&str; 8] = [
     "session::web",
     "session::app",
 ];
-const SIMULATION: [&str; 20] = [
+const SIMULATION: [&str; 21] = [
     "simulation::simulation_id",
     "simulation::ends",
     "simulation::snapshot",
     "simulation::failed_starts",
     "simulation::places",
+    "simulation::sessions",
     "simulation::protocol",
     "simulation::process",
     "simulation::machine",

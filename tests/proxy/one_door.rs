@@ -178,6 +178,44 @@ async fn goes_everywhere(fleet: &Fleet) {
 }
 
 #[actix_rt::test]
+async fn who_is_lost_comes_back_through_the_door() {
+    let fleet = Fleet::start(Door::Example).await;
+    let client = |machine: &str| format!("/{machine}/{}/client", fleet.port());
+    let mut tokens = Vec::new();
+    for machine in MACHINES {
+        let mut lost = fleet.browser.connect(&client(machine)).await;
+        lost.send(&serde_json::json!({"start": {"url": arm(), "resumable": true}}).to_string()).await;
+        lost.until("webots:").await;
+        tokens.push(lost.until("resume: ").await["resume: ".len()..].to_owned());
+        drop(lost);
+    }
+    // Each at its own machine only, and from another address.
+    let browser = fleet.browser.at("127.0.0.9");
+    for (number, machine) in MACHINES.into_iter().enumerate() {
+        let mut stranger = browser.connect(&client(machine)).await;
+        stranger.send(&serde_json::json!({"resume": tokens[1 - number]}).to_string()).await;
+        assert_eq!(stranger.until("").await, "loading: Error: this simulation has ended");
+        assert_eq!(stranger.closed().await, Some(1000));
+        let mut back = browser.connect(&client(machine)).await;
+        back.send(&serde_json::json!({"resume": tokens[number]}).to_string()).await;
+        let stream = format!("wss://{}/{machine}/{}", browser.host, fleet.port() + 1);
+        assert_eq!(back.until("webots:").await, format!("webots:{stream}"));
+        let mut viewer = browser.open(&format!("{stream}/")).await;
+        viewer.send("x3d;broadcast").await;
+        viewer.until("scene load completed").await;
+        // It counts once, here and for the session server.
+        until("both servers say so", async || {
+            let own = browser.get(&format!("/{machine}/{}/status", fleet.port())).await.json();
+            let known = browser.get("/status").await.json()["servers"][number]["instances"].clone();
+            own["instances"]["arrivals"] == 1 && own["simulations"].as_array().unwrap().len() == 1 && known["idle"] == 1
+        })
+        .await;
+        back.close_with(1000).await;
+        until("Webots has ended", async || TcpStream::connect((machine, fleet.port() + 1)).await.is_err()).await;
+    }
+}
+
+#[actix_rt::test]
 async fn the_door_leads_to_the_fleet_and_nowhere_else() {
     for door in DOORS {
         leads_nowhere_else(&Fleet::start(door).await).await;

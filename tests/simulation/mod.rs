@@ -19,6 +19,7 @@ mod protocol;
 mod readiness;
 pub mod readings;
 mod ready;
+mod resuming;
 pub mod scene;
 mod soak;
 mod stopping;

@@ -7,7 +7,7 @@ use tokio::net::TcpStream;
 use tokio_tungstenite::tungstenite::client::IntoClientRequest;
 use tokio_tungstenite::tungstenite::protocol::CloseFrame;
 use tokio_tungstenite::tungstenite::protocol::frame::Frame;
-use tokio_tungstenite::tungstenite::protocol::frame::coding::{Data, OpCode};
+use tokio_tungstenite::tungstenite::protocol::frame::coding::{CloseCode, Data, OpCode};
 use tokio_tungstenite::tungstenite::{Error, Message};
 use tokio_tungstenite::{MaybeTlsStream, WebSocketStream};
 
@@ -172,6 +172,11 @@ impl Client {
     /// Whether nothing comes for so long.
     pub async fn is_silent(&mut self, time: Duration) -> bool {
         actix_rt::time::timeout(time, self.read()).await.is_err()
+    }
+
+    /// Closes with this code.
+    pub async fn close_with(mut self, code: u16) {
+        self.socket.close(Some(CloseFrame { code: CloseCode::from(code), reason: "".into() })).await.ok();
     }
 
     /// Leaves in order.

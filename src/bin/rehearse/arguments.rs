@@ -7,7 +7,7 @@ use clap::Parser;
 use url::Url;
 use webots_fleet::shared::run::raise_open_files;
 
-use crate::behaviour::Mix;
+use crate::behaviour::{Behaviour, Mix};
 
 /// No time that can be asked for is longer: 30 days.
 const LONGEST: Duration = Duration::from_hours(30 * 24);
@@ -40,10 +40,13 @@ pub(crate) struct Arguments {
     /// How long a client waits for its simulation before it gives up
     #[arg(long, default_value = "5m", value_parser = time)]
     pub(crate) patience: Duration,
-    /// Shares of clients that misbehave, in percent: reload, drop (leave without closing), sleep (a tab that reads nothing),
+    /// Shares of clients that misbehave, in percent: reload, return (reload and come back), drop (leave without closing), sleep (a tab that reads nothing),
     /// vanish (a network that is gone), hasty (start and go at once). Example: reload=10,vanish=5
     #[arg(long, default_value = "", value_parser = str::parse::<Mix>)]
     pub(crate) misbehave: Mix,
+    /// How many percent of the clients reload their page in the middle, and come back to their simulation
+    #[arg(long, value_name = "PERCENT", default_value_t = 0, value_parser = clap::value_parser!(u32).range(0..=100))]
+    pub(crate) reload: u32,
     /// Clients come again and again for this time, in place of once
     #[arg(long, value_parser = time)]
     pub(crate) soak: Option<Duration>,
@@ -60,7 +63,7 @@ pub(crate) struct Arguments {
     #[arg(long, default_value = "w3d", value_parser = ["w3d", "x3d"])]
     pub(crate) viewer: String,
     /// Walk through all steps with one client, and compare what comes with what is expected of a fleet and of Webots
-    #[arg(long, conflicts_with_all = ["clients", "over", "stay", "real_time", "misbehave", "soak", "expect", "json"])]
+    #[arg(long, conflicts_with_all = ["clients", "over", "stay", "real_time", "misbehave", "reload", "soak", "expect", "json"])]
     pub(crate) explain: bool,
     /// Draw the clients that misbehave from this number; the same number draws the same
     #[arg(long, default_value_t = 1)]
@@ -79,6 +82,7 @@ impl Arguments {
         if !self.fleet.username().is_empty() || self.fleet.password().is_some() {
             return Err("the session server's URL has a user name or a password, which nobody would be sent".to_owned());
         }
+        self.mix()?;
         let clients = if self.explain { 1 } else { self.clients };
         let needed = u64::from(clients) * FILES.0 + FILES.1;
         let allowed = raise_open_files(needed);
@@ -90,6 +94,14 @@ impl Arguments {
         let Some(file) = &self.json else { return Ok(()) };
         let opened = std::fs::OpenOptions::new().create(true).append(true).open(file);
         opened.map(drop).map_err(|error| format!("{} can't be written: {error}", file.display()))
+    }
+
+    /// How the clients behave.
+    ///
+    /// # Errors
+    /// When the shares are more than all, in words.
+    pub(crate) fn mix(&self) -> Result<Mix, String> {
+        self.misbehave.clone().with(Behaviour::Return, self.reload)
     }
 
     /// What is going to happen, in words: `200 clients within 1m, each for 10m`.

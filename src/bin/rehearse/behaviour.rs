@@ -15,6 +15,8 @@ pub(crate) enum Behaviour {
     Ordinary,
     /// Reloads its page in the middle, and so begins anew.
     Reload,
+    /// Reloads its page in the middle, and comes back to its simulation.
+    Return,
     /// Leaves without closing its connections: a browser that crashes.
     Drop,
     /// Reads nothing for the second half: a tab that sleeps.
@@ -29,13 +31,30 @@ pub(crate) enum Behaviour {
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub(crate) struct Mix(Vec<(Behaviour, u32)>);
 
-const NAMES: [(&str, Behaviour); 5] = [
+const NAMES: [(&str, Behaviour); 6] = [
     ("reload", Behaviour::Reload),
+    ("return", Behaviour::Return),
     ("drop", Behaviour::Drop),
     ("sleep", Behaviour::Sleep),
     ("vanish", Behaviour::Vanish),
     ("hasty", Behaviour::Hasty),
 ];
+
+impl Mix {
+    /// The same, and so many percent of another behaviour.
+    ///
+    /// # Errors
+    /// When the sum is more than 100 percent.
+    pub(crate) fn with(mut self, behaviour: Behaviour, percent: u32) -> Result<Self, String> {
+        self.0.push((behaviour, percent));
+        self.bounded()
+    }
+
+    fn bounded(self) -> Result<Self, String> {
+        let sum = self.0.iter().fold(0_u32, |sum, (_, percent)| sum.saturating_add(*percent));
+        if sum <= 100 { Ok(self) } else { Err(format!("the shares are {sum} percent; allowed is up to 100")) }
+    }
+}
 
 impl FromStr for Mix {
     type Err = String;
@@ -52,8 +71,7 @@ impl FromStr for Mix {
         if let Some((twice, _)) = before.find(|(one, before)| before.clone().any(|(other, _)| other == *one)) {
             return Err(format!("{twice} is given twice"));
         }
-        let sum = mix.0.iter().fold(0_u32, |sum, (_, percent)| sum.saturating_add(*percent));
-        if sum <= 100 { Ok(mix) } else { Err(format!("the shares are {sum} percent; allowed is up to 100")) }
+        mix.bounded()
     }
 }
 
@@ -114,5 +132,6 @@ mod tests {
             assert!(wrong.parse::<Mix>().is_err(), "{wrong}");
         }
         assert_eq!("".parse::<Mix>(), Ok(Mix::default()));
+        assert!("drop=70".parse::<Mix>().unwrap().with(Behaviour::Return, 31).is_err());
     }
 }

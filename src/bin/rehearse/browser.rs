@@ -3,12 +3,11 @@
 use std::cell::RefCell;
 use std::time::{Duration, Instant};
 
-use serde::Deserialize;
-
 use crate::arguments::Arguments;
 use crate::behaviour::Behaviour;
 use crate::board::{Board, Stage};
-use crate::conversation::{Conversation, Ended, unless_error};
+use crate::conversation::{Conversation, Ended, simulated_time, unless_error};
+use crate::returning::WayBack;
 use crate::session::Session;
 use crate::visit::{Outcome, Pace, Steps, Visit};
 
@@ -35,13 +34,8 @@ pub(crate) struct Browser<'class> {
 struct Running {
     lease: Conversation,
     stream: Conversation,
-}
-
-/// An update of the scene; only its time counts here.
-#[derive(Deserialize)]
-struct Update {
-    /// Simulated time, in milliseconds.
-    time: f64,
+    /// For one that comes back.
+    way_back: Option<WayBack>,
 }
 
 /// Why a start came to nothing.
@@ -112,7 +106,10 @@ impl<'class> Browser<'class> {
         }
         self.visit.server = server.split_once("://").map(|(_, address)| address.to_owned());
         let mut lease = Conversation::open(&format!("{server}/client")).await?;
-        let start = serde_json::json!({"start": {"url": self.arguments.world}});
+        let mut start = serde_json::json!({"start": {"url": self.arguments.world}});
+        if self.behaviour == Behaviour::Return {
+            start["start"]["resumable"] = true.into();
+        }
         lease.say(&start.to_string()).await?;
         if self.behaviour == Behaviour::Hasty {
             lease.close().await;
@@ -142,7 +139,11 @@ impl<'class> Browser<'class> {
         let stream = self.open_stream(&webots).await?;
         self.visit.steps.launch = Some(launched.elapsed().as_secs_f64());
         self.visit.steps.until_running = Some(asked.elapsed().as_secs_f64());
-        Ok(Running { lease, stream })
+        let way_back = match self.behaviour {
+            Behaviour::Return => Some(WayBack::find(&mut lease, &server, &webots).await?),
+            _ => None,
+        };
+        Ok(Running { lease, stream, way_back })
     }
 
     /// Waits until the fleet is available and asks for a simulation server; again and again where others were faster.
@@ -185,7 +186,7 @@ impl<'class> Browser<'class> {
         stream.say("real-time:-1").await?;
         let mut first = None;
         loop {
-            let time = time(&unless_error(stream.hear().await?)?);
+            let time = simulated_time(&unless_error(stream.hear().await?)?);
             match (first, time) {
                 (Some(first), Some(time)) if time > first => return Ok(stream),
                 (None, Some(time)) => first = Some(time),
@@ -199,16 +200,26 @@ impl<'class> Browser<'class> {
         let stay = self.arguments.stay;
         let attentive = match self.behaviour {
             Behaviour::Ordinary | Behaviour::Drop | Behaviour::Hasty => stay,
-            Behaviour::Reload | Behaviour::Sleep | Behaviour::Vanish => stay / 2,
+            Behaviour::Reload | Behaviour::Return | Behaviour::Sleep | Behaviour::Vanish => stay / 2,
         };
         let watched = actix_rt::time::timeout(attentive, self.look_on(&mut running)).await;
         if let Ok(why) = watched {
             return Outcome::BrokeOff(why);
         }
-        if attentive < stay && self.behaviour != Behaviour::Reload {
+        if let Some(way_back) = running.way_back.take() {
+            // The page is loaded again: both connections are gone.
+            drop(running);
+            running = match way_back.go(&self.arguments.viewer).await {
+                Ok((lease, stream)) => Running { lease, stream, way_back: None },
+                Err(ended) => return Outcome::BrokeOff(format!("coming back: {ended}")),
+            };
+            if let Ok(why) = actix_rt::time::timeout(stay / 2, self.look_on(&mut running)).await {
+                return Outcome::BrokeOff(why);
+            }
+        } else if attentive < stay && self.behaviour != Behaviour::Reload {
             actix_rt::time::sleep(stay.saturating_sub(attentive)).await;
         }
-        if matches!(self.behaviour, Behaviour::Ordinary | Behaviour::Reload | Behaviour::Sleep) {
+        if matches!(self.behaviour, Behaviour::Ordinary | Behaviour::Reload | Behaviour::Return | Behaviour::Sleep) {
             // The page closes both at once.
             futures_util::future::join(running.stream.close(), running.lease.close()).await;
         }
@@ -227,7 +238,7 @@ impl<'class> Browser<'class> {
         loop {
             tokio::select! {
                 text = running.stream.hear() => match text {
-                    Ok(text) => if let Some(time) = time(&text) {
+                    Ok(text) => if let Some(time) = simulated_time(&text) {
                         first.get_or_insert(time);
                         last = Some(time);
                     },
@@ -263,12 +274,6 @@ impl Drop for Browser<'_> {
     }
 }
 
-/// The simulated time of an update, in milliseconds.
-fn time(text: &str) -> Option<f64> {
-    let update: Update = serde_json::from_str(text.strip_prefix("application/json:")?).ok()?;
-    Some(update.time)
-}
-
 /// Whether an answer of the session server says that all simulation servers are full, which may change.
 fn is_of_no_place(answer: &str) -> bool {
     answer.to_ascii_lowercase().contains("no simulation server available")
@@ -277,16 +282,4 @@ fn is_of_no_place(answer: &str) -> bool {
 /// Whether a text says that there is no place yet.
 fn is_of_waiting(text: &str) -> bool {
     text.starts_with("queue:") || text.to_ascii_lowercase().starts_with("loading: waiting for a place")
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn the_time_of_updates_alone_is_read() {
-        assert_eq!(time(r#"application/json:{"time":1.024e+06,"updates":[{"id":1}]}"#), Some(1_024_000.0));
-        assert_eq!(time("application/json:{}"), None);
-        assert_eq!(time("pause: 12"), None);
-    }
 }

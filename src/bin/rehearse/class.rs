@@ -39,7 +39,7 @@ pub(crate) async fn play(arguments: &Arguments, consent: &Consent<'_>) -> Played
         board: Board::new(),
         session: Session::new(&arguments.fleet),
         servers: Servers::default(),
-        draw: RefCell::new(Draw::new(arguments.misbehave.clone(), arguments.seed)),
+        draw: RefCell::new(Draw::new(arguments.mix().unwrap_or_default(), arguments.seed)),
         visits: RefCell::default(),
     };
     let clients = join_all((0..arguments.clients).map(|client| class.come(client)));

@@ -3,6 +3,7 @@
 use std::time::{Duration, Instant};
 
 use futures_util::{SinkExt, StreamExt};
+use serde::Deserialize;
 use tokio::net::TcpStream;
 use tokio_tungstenite::tungstenite::protocol::WebSocketConfig;
 use tokio_tungstenite::tungstenite::{Error, Message};
@@ -60,6 +61,19 @@ impl Deadline {
 /// When the text is such an end.
 pub(crate) fn unless_error(text: String) -> Result<String, Ended> {
     if text.starts_with("error:") { Err(Ended::Fault(text)) } else { Ok(text) }
+}
+
+/// An update of the scene; only its time counts here.
+#[derive(Deserialize)]
+struct Update {
+    /// Simulated time, in milliseconds.
+    time: f64,
+}
+
+/// The simulated time of an update, in milliseconds.
+pub(crate) fn simulated_time(text: &str) -> Option<f64> {
+    let update: Update = serde_json::from_str(text.strip_prefix("application/json:")?).ok()?;
+    Some(update.time)
 }
 
 impl Conversation {
@@ -130,5 +144,17 @@ impl Conversation {
         };
         // Who does not answer is left all the same.
         actix_rt::time::timeout(Duration::from_secs(2), closing).await.ok();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_time_of_updates_alone_is_read() {
+        assert_eq!(simulated_time(r#"application/json:{"time":1.024e+06,"updates":[{"id":1}]}"#), Some(1_024_000.0));
+        assert_eq!(simulated_time("application/json:{}"), None);
+        assert_eq!(simulated_time("pause: 12"), None);
     }
 }

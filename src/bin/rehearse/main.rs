@@ -19,6 +19,7 @@ mod interruption;
 mod place;
 mod reasons;
 mod report;
+mod returning;
 mod servers;
 mod session;
 mod table;

@@ -18,6 +18,8 @@ const ASSETS: &[Asset] = &[
     asset!("viewer.css"),
     asset!("viewer.js"),
     asset!("start.js"),
+    asset!("kept.js"),
+    asset!("lifeline.js"),
     asset!("stream.js"),
     asset!("small_viewer.js"),
     asset!("scene.js"),

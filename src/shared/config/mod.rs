@@ -10,5 +10,5 @@ pub use loading::{Configuration, InvalidValue, LoadedConfig, changed_keys, load}
 pub use secret::Secret;
 pub use value::{
     ExpandedPath, expanded, folder, local_address, object, one_or_many, optional_expanded, optional_object,
-    optional_whole, percent, seconds, threshold, whole,
+    optional_whole, percent, seconds, seconds_or_zero, threshold, whole,
 };

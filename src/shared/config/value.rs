@@ -166,6 +166,22 @@ pub mod seconds {
     }
 }
 
+/// A duration in seconds, or 0 for none.
+pub mod seconds_or_zero {
+    pub use super::seconds::serialize;
+    use super::{Between, Deserializer, Duration};
+
+    /// Reads a number of seconds from 0 to a day.
+    ///
+    /// # Errors
+    /// When the value is something else.
+    pub fn deserialize<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Duration, D::Error> {
+        let number =
+            deserializer.deserialize_any(Between { least: 0.0, most: 86_400.0, what: "a number of seconds" })?;
+        Ok(Duration::from_secs_f64(number))
+    }
+}
+
 /// A number between two others, both included.
 struct Between {
     least: f64,

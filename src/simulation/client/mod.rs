@@ -1,8 +1,13 @@
-//! A web client: the life of one simulation from its start message to the end of its connection.
+//! A web client, and the session of its simulation from the request for it to its end.
 
+mod comeback;
 pub mod outcome;
 pub mod quota;
+mod resume;
+mod session;
+mod start;
 mod state;
 mod web_client;
 
+pub use session::Session;
 pub use web_client::WebClient;

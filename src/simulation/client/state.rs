@@ -1,4 +1,4 @@
-//! The states of a web client, and what it holds in each. Dropping a state gives everything back.
+//! The states of a session, and what it holds in each. Dropping a state gives everything back.
 
 use actix::prelude::*;
 
@@ -8,10 +8,15 @@ use crate::simulation::places::Ticket;
 use crate::simulation::protocol::Mode;
 use crate::simulation::webots::{Stop, Webots};
 
-/// The life of a simulation, as its client's actor knows it.
+/// The life of a simulation, as its session knows it.
 pub enum State {
-    /// Nothing was asked for yet.
-    Connected,
+    /// Its client has asked for it.
+    Asked {
+        /// The URL as the client wrote it.
+        url: String,
+        /// How it is shown.
+        mode: Mode,
+    },
     /// Waiting for a place.
     Waiting {
         /// What was asked for.
@@ -40,7 +45,7 @@ impl State {
                 ticket.end(reason, why, Taken::default());
             }
             Self::Launched(WebotsHandle(webots)) => webots.do_send(Stop(reason)),
-            Self::Connected | Self::Over => {}
+            Self::Asked { .. } | Self::Over => {}
         }
     }
 }

@@ -1,40 +1,47 @@
-//! Actor: one WebSocket on `/client`. Its life is the life of one simulation, as one state machine.
+//! Actor: one WebSocket on `/client`. It reads what its client says, and sends what the session of its simulation has for it.
 //!
-//! Created by the route for each connection; ends with it. The connection is the lease: whatever this actor holds in
-//! any state (a place in the line, a checkout under way, a running Webots) is given back when it is dropped.
+//! Created by the route for each connection; ends with it. The connection is the lease: the [`Session`] that it is
+//! attached to hears of its end, also by a panic.
 
 use std::sync::Arc;
 
 use actix::prelude::*;
 use actix_web_actors::ws::{CloseCode, CloseReason, Message, ProtocolError, WebsocketContext};
 
-use super::outcome::{Outcome, Pending};
-use super::state::{StartRequest, State, WebotsHandle};
+use super::session::Session;
+use crate::shared::http::ConnectionPermit;
+use crate::shared::http::Peer;
 use crate::shared::http::liveness::{self, Liveness};
 use crate::shared::http::websocket::{ClientMessage, MessageReader};
-use crate::shared::http::{ConnectionPermit, Peer};
 use crate::shared::run::closing;
-use crate::simulation::checkout::{Progress, Project};
-use crate::simulation::ends::EndReason;
-use crate::simulation::places::{PlaceEvent, Ticket};
-use crate::simulation::protocol::{self, Mode, Request};
-use crate::simulation::readiness;
-use crate::simulation::snapshot::Change;
+use crate::simulation::protocol::{self, Request};
+use crate::simulation::sessions::{Attachment, Resume, Said, ToClient, Token};
 use crate::simulation::state::AppState;
-use crate::simulation::webots::{Exit, LaunchSpec, RestoreController, Webots, WebotsEvent};
 
 /// The actor.
 pub struct WebClient {
     server: Arc<AppState>,
     peer: Peer,
-    id: String,
-    state: State,
+    session: Attached,
     liveness: Liveness,
-    restoring: bool,
-    start: Pending,
     reader: MessageReader,
     _permit: ConnectionPermit,
 }
+
+/// Whether the client has a session.
+enum Attached {
+    /// It has asked for nothing yet.
+    No,
+    /// It has asked to go on with one.
+    Coming,
+    /// It has one.
+    To(Attachment),
+    /// It was told the end.
+    Over,
+}
+
+/// How many texts may wait for a client that reads slowly, before those that may be lost are.
+const MAILBOX: usize = 64;
 
 type Context = WebsocketContext<WebClient>;
 
@@ -42,164 +49,71 @@ impl WebClient {
     /// A client that has just connected; `permit` counts it, `reader` reads its messages.
     #[must_use]
     pub fn new(server: Arc<AppState>, peer: Peer, (permit, reader): (ConnectionPermit, MessageReader)) -> Self {
-        Self {
-            server,
-            peer,
-            id: String::new(),
-            state: State::Connected,
-            liveness: Liveness::new(),
-            restoring: false,
-            start: Pending::default(),
-            reader,
-            _permit: permit,
-        }
+        Self { server, peer, session: Attached::No, liveness: Liveness::new(), reader, _permit: permit }
     }
 
-    fn name(&self) -> String {
-        format!("{}client {}", self.id, self.peer)
-    }
-
-    /// Counts the failed start, sends the client the reason, and closes the connection.
-    fn fail_start(&mut self, outcome: Outcome, why: &str, ctx: &mut Context) {
-        self.start.resolve(outcome);
-        self.state.end(outcome.end(), why);
-        log::info!("{}: {why}", self.name());
-        self.finish(&protocol::error(why), CloseCode::Normal, ctx);
-    }
-
-    /// The same for a client that another server may take: the close code says so to programs.
-    fn refer(&mut self, outcome: Outcome, why: &str, ctx: &mut Context) {
-        self.start.resolve(outcome);
-        log::info!("{}: {why}", self.name());
-        self.finish(&protocol::elsewhere(why), CloseCode::Again, ctx);
-    }
-
-    /// The same for a start that fails for a reason of this server's own, which is reported to session servers.
-    fn fail_own(&mut self, outcome: Outcome, why: &str, ctx: &mut Context) {
-        self.server.failed_starts.add(&format!("{}: {why}", self.name()));
-        self.state.end(EndReason::Fault, why);
-        self.refer(outcome, why, ctx);
-    }
-
-    fn finish(&mut self, last_words: &str, code: CloseCode, ctx: &mut Context) {
-        self.state = State::Over;
-        ctx.text(last_words.to_owned());
+    fn finish(&mut self, last_words: String, code: CloseCode, ctx: &mut Context) {
+        self.session = Attached::Over;
+        ctx.text(last_words);
         ctx.close(Some(CloseReason { code, description: None }));
         ctx.stop();
     }
 
-    fn understand(&mut self, text: &str, ctx: &mut Context) {
-        match Request::parse(text) {
-            Ok(Some(Request::Start { url, mode })) => self.start(&url, mode, ctx),
-            Ok(Some(Request::ResetController(file))) => self.reset_controller(file, ctx),
-            Ok(None) => log::debug!("{}: a message that asks for nothing is ignored", self.name()),
-            Err(wrong) => {
-                log::info!("{}: {wrong}", self.name());
-                self.finish(&protocol::error(&wrong.to_string()), CloseCode::Normal, ctx);
-            }
+    /// Ends the simulation of a client that leaves in order, or that breaks the rules.
+    fn give_up(&self) {
+        if let Attached::To(session) = &self.session {
+            session.say(Said::Left);
         }
     }
 
-    fn start(&mut self, url: &str, mode: Mode, ctx: &mut Context) {
-        if !matches!(self.state, State::Connected) {
-            log::warn!("{}: asks for a second simulation on one connection; ignored", self.name());
-            return;
-        }
-        self.start = Pending::new(&self.server.starts);
-        if !self.server.start_quota.take(self.peer.rate_limit_key()) {
-            let why = "Too many simulations were asked for from your address. Try again in a minute";
-            return self.fail_start(Outcome::Refused, why, ctx);
-        }
-        let world = match self.server.admit(url) {
-            Ok(world) => world,
-            Err(why) if self.server.takes_nobody() => return self.refer(Outcome::Refused, &why, ctx),
-            Err(why) => return self.fail_start(Outcome::Refused, &why, ctx),
+    /// Asks the session that a token names to go on with this connection.
+    fn resume(&mut self, token: Option<Token>, ctx: &mut Context) {
+        let found = token.and_then(|token| Some((token, self.server.sessions.find(&token)?)));
+        let Some((token, session)) = found else {
+            log::info!("client {}: comes back to a simulation that has ended", self.peer);
+            return self.finish(protocol::ended(None), CloseCode::Normal, ctx);
         };
-        let ticket = Ticket::new(&self.server.places, ctx.address().recipient(), &world, self.peer);
-        self.id = format!("{}: ", ticket.id());
-        ctx.text(protocol::session(ticket.id()));
-        log::info!("{}: asks for {world}", self.name());
-        self.state = State::Waiting { request: StartRequest { world, mode }, ticket };
-    }
-
-    fn check_out(&mut self, StartRequest { world, mode }: StartRequest, ticket: Ticket, port: u16, ctx: &mut Context) {
-        self.state = State::CheckingOut { mode, place: (ticket, port) };
-        let instance = match self.server.run.instance() {
-            Ok(instance) => instance,
-            Err(error) => return self.fail_own(Outcome::NoCheckout, &format!("No room for a project: {error}"), ctx),
-        };
-        let me = ctx.address();
-        // Where the mailbox is full, the client misses one line of progress.
-        let progress = move |text: String| drop(me.try_send(Progress(text)));
-        let job = self.server.checkouts.start(world, instance, progress).into_actor(self);
-        job.map(|result, this, ctx| match result {
-            Ok(Ok(project)) => this.launch(project, ctx),
-            Ok(Err(error)) if error.is_own() => this.fail_own(Outcome::NoCheckout, &error.to_string(), ctx),
-            Ok(Err(error)) => this.fail_start(Outcome::NoCheckout, &error.to_string(), ctx),
-            Err(error) => this.fail_own(Outcome::NoCheckout, &format!("The checkout broke off: {error}"), ctx),
-        })
-        .spawn(ctx);
-    }
-
-    fn launch(&mut self, project: Project, ctx: &mut Context) {
-        let program = match readiness::webots_program(&self.server.config) {
-            Ok(program) => program,
-            Err(why) => return self.fail_own(Outcome::NoWebots, &why, ctx),
-        };
-        let State::CheckingOut { mode, place } = std::mem::replace(&mut self.state, State::Over) else { return };
-        log::info!("{}: {} is for Webots {}", self.name(), project.world.path.display(), project.world.version);
-        place.0.update(Change::Version(project.world.version.clone()));
-        for warning in &project.warnings {
-            ctx.text(protocol::loading(warning));
-        }
-        ctx.text(protocol::loading("webots is starting"));
-        let spec = LaunchSpec {
-            config: Arc::clone(&self.server.config),
-            containers: self.server.containers.clone(),
-            launcher: Arc::clone(&self.server.launcher),
-            watcher: self.server.watcher.clone(),
-            program,
-            checkouts: Arc::clone(&self.server.checkouts),
-            project: Arc::new(project),
-            mode,
-            place,
-            events: ctx.address().recipient(),
-        };
-        let webots = Webots::start_in_arbiter(self.server.webots_thread(spec.place.1), |_| Webots::new(spec));
-        self.state = State::Launched(WebotsHandle(webots));
-    }
-
-    fn reset_controller(&mut self, file: String, ctx: &mut Context) {
-        let State::Launched(WebotsHandle(webots)) = &self.state else {
-            return ctx.text(protocol::error("A controller can be reset only while a simulation runs"));
-        };
-        if std::mem::replace(&mut self.restoring, true) {
-            log::warn!("{}: asks to reset a controller while another is being reset; ignored", self.name());
-            return;
-        }
-        webots
-            .send(RestoreController(file.clone()))
+        self.session = Attached::Coming;
+        let resumed = session.send(Resume { token, client: ctx.address().recipient(), peer: self.peer });
+        resumed
             .into_actor(self)
-            .map(move |answer, this, ctx| {
-                this.restoring = false;
-                match answer {
-                    Ok(Ok(())) => ctx.text(protocol::reset_controller(&file)),
-                    // That does not end the simulation.
-                    Ok(Err(error)) => ctx.text(protocol::error(&error.to_string())),
-                    Err(error) => log::warn!("{}: no controller was reset: {error}", this.name()),
+            .map(|answer, this, ctx| match answer {
+                Ok(Ok(attachment)) if matches!(this.session, Attached::Coming) => {
+                    this.session = Attached::To(attachment);
                 }
+                // It was told the end meanwhile.
+                Ok(Ok(_)) => {}
+                Ok(Err(refusal)) => {
+                    log::info!("client {}: does not come back: {refusal}", this.peer);
+                    this.finish(refusal, CloseCode::Normal, ctx);
+                }
+                Err(_) => this.finish(protocol::ended(None), CloseCode::Normal, ctx),
             })
             .spawn(ctx);
     }
 
-    fn exited(&mut self, Exit { clean, own, why }: &Exit, ctx: &mut Context) {
-        if *own {
-            let fail = if self.start.is_open() { Self::fail_own } else { Self::refer };
-            return fail(self, Outcome::NoWebots, why, ctx);
+    fn understand(&mut self, text: &str, ctx: &mut Context) {
+        match Request::parse(text) {
+            Ok(Some(Request::Start { .. } | Request::Resume(_))) if !matches!(self.session, Attached::No) => {
+                log::warn!("client {}: asks for a second simulation on one connection; ignored", self.peer);
+            }
+            Ok(Some(Request::Start { url, mode, resumable })) => {
+                let server = Arc::clone(&self.server);
+                let client = ctx.address().recipient();
+                self.session = Attached::To(Session::open(server, self.peer, client, (url, mode, resumable)));
+            }
+            Ok(Some(Request::Resume(token))) => self.resume(token, ctx),
+            Ok(Some(Request::ResetController(file))) => match &self.session {
+                Attached::To(session) => session.say(Said::ResetController(file)),
+                Attached::No | Attached::Coming | Attached::Over => ctx.text(protocol::nothing_to_reset()),
+            },
+            Ok(None) => log::debug!("client {}: a message that asks for nothing is ignored", self.peer),
+            Err(wrong) => {
+                log::info!("client {}: {wrong}", self.peer);
+                self.give_up();
+                self.finish(protocol::error(&wrong.to_string()), CloseCode::Normal, ctx);
+            }
         }
-        let words = if *clean { protocol::loading(why) } else { protocol::error(why) };
-        self.start.resolve(Outcome::NoWebots);
-        self.finish(&words, CloseCode::Normal, ctx);
     }
 }
 
@@ -207,21 +121,23 @@ impl Actor for WebClient {
     type Context = Context;
 
     fn started(&mut self, ctx: &mut Self::Context) {
-        log::info!("{}: connected", self.name());
+        log::info!("client {}: connected", self.peer);
+        ctx.set_mailbox_capacity(MAILBOX);
         let timing = &self.server.config.timing;
         liveness::watch(ctx, timing.ping, timing.silence, |client| &mut client.liveness);
         closing(self.server.phase.clone())
             .into_actor(self)
             .map(|(), this, ctx| {
-                this.start.resolve(Outcome::Stopped);
-                this.state.end(EndReason::Stopped, "The server was stopped");
-                this.finish(&protocol::error("This simulation server is stopping"), CloseCode::Away, ctx);
+                // Its session tells a client that has one.
+                if matches!(this.session, Attached::No | Attached::Coming) {
+                    this.finish(protocol::stopping(), CloseCode::Away, ctx);
+                }
             })
             .spawn(ctx);
     }
 
     fn stopped(&mut self, _: &mut Self::Context) {
-        log::info!("{}: gone", self.name());
+        log::info!("client {}: gone", self.peer);
     }
 }
 
@@ -232,70 +148,35 @@ impl StreamHandler<Result<Message, ProtocolError>> for WebClient {
             Ok(Some(ClientMessage::Ping(data))) if self.liveness.may_answer() => ctx.pong(&data),
             Ok(Some(ClientMessage::Pong(content))) => self.liveness.pong(&content),
             Ok(Some(ClientMessage::Close(reason))) => {
+                // Whatever else comes, or nothing: the client may come back.
+                if reason.as_ref().is_some_and(|reason| reason.code == CloseCode::Normal) {
+                    self.give_up();
+                }
                 ctx.close(reason);
                 ctx.stop();
             }
             Ok(None) => {}
             Ok(Some(ClientMessage::Text(_) | ClientMessage::Ping(_))) => {
-                log::warn!("{}: asks too much between two pings", self.name());
-                self.finish(&protocol::error("Too many requests on one connection"), CloseCode::Policy, ctx);
+                log::warn!("client {}: asks too much between two pings", self.peer);
+                self.give_up();
+                self.finish(protocol::error("Too many requests on one connection"), CloseCode::Policy, ctx);
             }
             Err(error) => {
-                log::info!("{}: {error}", self.name());
-                self.finish(&protocol::error(&error.to_string()), error.code(), ctx);
+                log::info!("client {}: {error}", self.peer);
+                self.give_up();
+                self.finish(protocol::error(&error.to_string()), error.code(), ctx);
             }
         }
     }
 }
 
-impl Handler<PlaceEvent> for WebClient {
+impl Handler<ToClient> for WebClient {
     type Result = ();
 
-    fn handle(&mut self, event: PlaceEvent, ctx: &mut Self::Context) {
-        match (event, std::mem::replace(&mut self.state, State::Over)) {
-            (PlaceEvent::Granted(port), State::Waiting { request, ticket }) => {
-                self.check_out(request, ticket, port, ctx);
-            }
-            (PlaceEvent::Refused(full), State::Waiting { .. }) => {
-                self.fail_start(Outcome::Full, &full.to_string(), ctx);
-            }
-            (PlaceEvent::Ahead(ahead), state @ State::Waiting { .. }) => {
-                self.state = state;
-                for text in protocol::queue(ahead) {
-                    ctx.text(text);
-                }
-            }
-            (_, state) => self.state = state,
-        }
-    }
-}
-
-impl Handler<Progress> for WebClient {
-    type Result = ();
-
-    fn handle(&mut self, Progress(text): Progress, ctx: &mut Self::Context) {
-        if matches!(self.state, State::CheckingOut { .. }) {
-            ctx.text(protocol::loading(&text));
-        }
-    }
-}
-
-impl Handler<WebotsEvent> for WebClient {
-    type Result = ();
-
-    fn handle(&mut self, event: WebotsEvent, ctx: &mut Self::Context) {
-        match event {
-            WebotsEvent::Progress(text) => ctx.text(protocol::loading(&text)),
-            WebotsEvent::Text(text) => ctx.text(protocol::of_project(&text)),
-            WebotsEvent::Started => ctx.text(protocol::shutdown_timeout(self.server.config.timeout)),
-            WebotsEvent::Listening(port) => {
-                self.start.resolve(Outcome::Ready);
-                self.server.failed_starts.reset();
-                ctx.text(protocol::webots(&self.server.config.websocket_url(port)));
-            }
-            WebotsEvent::Heartbeat => ctx.text(protocol::HEARTBEAT),
-            WebotsEvent::Hanging(seconds) => ctx.text(protocol::hanging(seconds)),
-            WebotsEvent::Exited(exit) => self.exited(&exit, ctx),
+    fn handle(&mut self, message: ToClient, ctx: &mut Self::Context) {
+        match message {
+            ToClient::Text(text) => ctx.text(text),
+            ToClient::End(last_words, code) => self.finish(last_words, code, ctx),
         }
     }
 }

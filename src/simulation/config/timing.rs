@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
-use crate::shared::config::seconds;
+use crate::shared::config::{seconds, seconds_or_zero};
 
 /// Durations, in seconds.
 #[derive(Debug, Clone, Serialize, Deserialize)]
@@ -31,6 +31,9 @@ pub struct Timing {
     /// A client that has answered no ping for so long is disconnected, and its simulation ends. Default: 60.
     #[serde(with = "seconds")]
     pub silence: Duration,
+    /// How long a simulation waits for a client that may come back; 0: not at all. Default: 60.
+    #[serde(with = "seconds_or_zero")]
+    pub absence: Duration,
     /// How long open connections and simulations may take to end when the server stops. Default: 9.
     #[serde(with = "seconds")]
     pub stop: Duration,
@@ -49,6 +52,7 @@ impl Default for Timing {
             grace: Duration::from_secs(5),
             ping: Duration::from_secs(20),
             silence: Duration::from_mins(1),
+            absence: Duration::from_mins(1),
             stop: Duration::from_secs(9),
             announce: Duration::from_secs(5),
         }

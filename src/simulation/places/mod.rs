@@ -1,7 +1,11 @@
 //! The places that clients wait for: who has one, who is next, and how many one address may have.
 
+mod messages;
 mod no_place;
 mod places;
 mod present;
 
-pub use places::{GetSnapshot, PlaceEvent, Places, Ticket};
+pub use messages::{GetSnapshot, Move, PlaceEvent, Update};
+pub use no_place::NoPlace;
+pub use places::{Places, Ticket};
+pub use present::Report;

@@ -12,6 +12,7 @@ use std::time::Duration;
 
 use actix::prelude::*;
 
+use super::messages::{Acquire, GetSnapshot, Move, PlaceEvent, Release, Update};
 use super::no_place::NoPlace;
 use super::present::{Present, Report};
 use crate::shared::domain::{Instances, ProjectUrl};
@@ -20,46 +21,12 @@ use crate::simulation::ends::{End, EndReason, Ends, Taken};
 use crate::simulation::simulation_id::SimulationId;
 use crate::simulation::snapshot::{Change, Snapshot, Stage};
 
-/// Asks for a place, in the name of a ticket.
-#[derive(Message)]
-#[rtype(result = "()")]
-struct Acquire {
-    client: Recipient<PlaceEvent>,
-    present: Box<Present>,
-}
-
-/// What the holder of a ticket hears.
-#[derive(Message, Debug, Clone, Copy, PartialEq, Eq)]
-#[rtype(result = "()")]
-pub enum PlaceEvent {
-    /// So many clients are ahead in the waiting line.
-    Ahead(usize),
-    /// This port may be used as long as the ticket lives.
-    Granted(u16),
-    /// There is no room in the waiting line either.
-    Refused(NoPlace),
-}
-
 /// A place, or a place in the line for one. Dropping it gives it back.
 #[derive(Debug)]
 pub struct Ticket {
     id: SimulationId,
     places: Addr<Places>,
 }
-
-/// What the holder of a ticket reports of its simulation.
-#[derive(Message)]
-#[rtype(result = "()")]
-struct Update(SimulationId, Report);
-
-/// Asks for a snapshot of all simulations.
-#[derive(Message)]
-#[rtype(result = "Snapshot")]
-pub struct GetSnapshot;
-
-#[derive(Message)]
-#[rtype(result = "()")]
-struct Release(SimulationId);
 
 /// The actor.
 pub struct Places {
@@ -163,6 +130,19 @@ impl Places {
         }
     }
 
+    /// Simulations whose clients are away hold half of the places at most, or one where there is only one.
+    fn end_longest_away(&mut self) {
+        let most = (self.ports.len() / 2).max(1);
+        let away = || self.present.values().filter(|one| one.shown.away_until.is_some());
+        if away().count() > most
+            && let Some(id) = away().min_by_key(|one| one.shown.away_until).map(|one| one.shown.id)
+            && let Some(longest) = self.present.get_mut(&id)
+        {
+            longest.shown.away_until = None;
+            longest.listener.do_send(PlaceEvent::AwayTooLong);
+        }
+    }
+
     fn lend(&mut self, id: SimulationId, port: u16) {
         if let Some(present) = self.present.get_mut(&id) {
             present.lend(port);
@@ -209,9 +189,9 @@ impl Actor for Places {
 impl Handler<Acquire> for Places {
     type Result = ();
 
-    fn handle(&mut self, Acquire { client, present }: Acquire, _: &mut Self::Context) {
+    fn handle(&mut self, Acquire(present): Acquire, _: &mut Self::Context) {
         self.arrivals += 1;
-        let (id, address) = (present.shown.id, present.address);
+        let (id, address, client) = (present.shown.id, present.address, present.listener.clone());
         if let Some(refusal) = self.refusal(address) {
             return client.do_send(PlaceEvent::Refused(refusal));
         }
@@ -237,9 +217,32 @@ impl Handler<Update> for Places {
     type Result = ();
 
     fn handle(&mut self, Update(id, report): Update, _: &mut Self::Context) {
+        let is_away = matches!(report, Report::Change(Change::Away(Some(_))));
         if let Some(present) = self.present.get_mut(&id) {
             present.take(report);
         }
+        if is_away {
+            self.end_longest_away();
+        }
+    }
+}
+
+impl Handler<Move> for Places {
+    type Result = Result<(), NoPlace>;
+
+    fn handle(&mut self, Move { id, address }: Move, _: &mut Self::Context) -> Self::Result {
+        let is_there = self.present.get(&id).is_none_or(|one| one.address == address);
+        let share = self.per_address.zip(address).filter(|_| !is_there);
+        if let Some(((most, _), address)) = share
+            && let (places, waiting) = self.of_address(address)
+            && places >= most
+        {
+            return Err(NoPlace::Share { places, waiting });
+        }
+        if let Some(present) = self.present.get_mut(&id) {
+            present.address = address;
+        }
+        Ok(())
     }
 }
 
@@ -257,7 +260,7 @@ impl Ticket {
     #[must_use]
     pub fn new(places: &Addr<Places>, listener: Recipient<PlaceEvent>, world: &ProjectUrl, client: Peer) -> Self {
         let id = SimulationId::next();
-        places.do_send(Acquire { client: listener, present: Box::new(Present::new(id, world, client)) });
+        places.do_send(Acquire(Box::new(Present::new(id, world, client, listener))));
         Self { id, places: places.clone() }
     }
 

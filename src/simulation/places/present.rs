@@ -3,6 +3,9 @@
 use std::net::IpAddr;
 use std::time::SystemTime;
 
+use actix::Recipient;
+
+use super::messages::PlaceEvent;
 use crate::shared::domain::ProjectUrl;
 use crate::shared::http::Peer;
 use crate::shared::run::{seconds_since_1970, timestamp};
@@ -13,7 +16,7 @@ use crate::simulation::snapshot::{Change, Simulation, Stage};
 
 /// What its owner reports of a simulation.
 #[derive(Debug)]
-pub(super) enum Report {
+pub enum Report {
     /// Something that is shown.
     Change(Change),
     /// An event, in words.
@@ -28,6 +31,8 @@ pub(super) struct Present {
     pub lent: Option<u16>,
     /// The address by which its client counts.
     pub address: Option<IpAddr>,
+    /// Hears what becomes of it.
+    pub listener: Recipient<PlaceEvent>,
     /// As pages show it.
     pub shown: Simulation,
     client: Peer,
@@ -43,7 +48,7 @@ const EVENT_LENGTH: usize = 500;
 
 impl Present {
     /// A simulation that a client has just asked for.
-    pub(super) fn new(id: SimulationId, world: &ProjectUrl, client: Peer) -> Self {
+    pub(super) fn new(id: SimulationId, world: &ProjectUrl, client: Peer, listener: Recipient<PlaceEvent>) -> Self {
         let shown = Simulation {
             id,
             world: world.to_string(),
@@ -53,11 +58,13 @@ impl Present {
             pid: None,
             cgroup: None,
             port: None,
+            away_until: None,
             version: None,
             log: None,
         };
         let (address, repository) = (client.rate_limit_key(), world.repository());
-        let mut present = Self { lent: None, address, shown, client, repository, events: Vec::new(), how: None };
+        let mut present =
+            Self { lent: None, address, listener, shown, client, repository, events: Vec::new(), how: None };
         present.note(&format!("client {client} asks for {world}"));
         present
     }

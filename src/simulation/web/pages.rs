@@ -299,6 +299,7 @@ mod tests {
             pid: None,
             cgroup: None,
             port: Some(2001),
+            away_until: None,
             version: None,
             log: None,
         }

@@ -87,6 +87,8 @@ pub fn gauges<'text>(server: &AppState, snapshot: &Snapshot) -> Vec<Gauge<'text>
     };
     let ready = f64::from(u8::from(server.problem().is_none()));
     let failed_starts = f64::from(server.failed_starts.count());
+    let away = snapshot.simulations.iter().filter(|one| one.away_until.is_some()).count();
+    let away = u32::try_from(away).unwrap_or(u32::MAX);
     let draining = f64::from(u8::from(server.is_draining()));
     vec![
         Gauge::plain("webots_simulation_load_percent", "Load as /load tells it", server.load().percent()),
@@ -97,6 +99,7 @@ pub fn gauges<'text>(server: &AppState, snapshot: &Snapshot) -> Vec<Gauge<'text>
             failed_starts,
         ),
         Gauge::plain("webots_simulation_draining", "1 while no new clients are taken", draining),
+        Gauge::plain("webots_simulation_away", "Simulations that wait for their clients", f64::from(away)),
         Gauge::plain("webots_simulation_places", "Simulations that fit", f64::from(instances.places)),
         Gauge {
             name: "webots_simulation_instances",

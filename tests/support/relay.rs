@@ -1,4 +1,4 @@
-//! A link between the session server and a simulation server that can be cut, slowed down or silenced.
+//! A link to a server that can be cut, slowed down or silenced.
 
 use std::sync::Arc;
 use std::time::Duration;

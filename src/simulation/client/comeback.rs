@@ -1,0 +1,124 @@
+//! What a session keeps so that its client can come back: its token, what the client hears then, and until when it waits.
+
+use std::net::IpAddr;
+use std::time::{Duration, Instant};
+
+use actix::prelude::*;
+
+use crate::shared::run::seconds_since_1970;
+use crate::simulation::places::{Move, NoPlace, Places, Report, Ticket, Update};
+use crate::simulation::protocol;
+use crate::simulation::sessions::{Kept, Token};
+use crate::simulation::simulation_id::SimulationId;
+use crate::simulation::snapshot::Change;
+
+/// How a client comes back.
+pub struct Comeback {
+    kept: Kept,
+    /// The one that the client was given last; none before it could come back.
+    token: Option<Token>,
+    ticket: SimulationId,
+    places: Addr<Places>,
+    launched: Instant,
+    /// The texts that its project asks for.
+    texts: Vec<String>,
+    url: String,
+    deadline: Option<SpawnHandle>,
+    /// Why the simulation has ended, if it has.
+    ended: Option<String>,
+}
+
+impl Comeback {
+    /// For a session that can be found, and holds this ticket.
+    #[must_use]
+    pub fn new(kept: Kept, ticket: &Ticket, places: Addr<Places>) -> Self {
+        Self {
+            kept,
+            token: None,
+            ticket: ticket.id(),
+            places,
+            launched: Instant::now(),
+            texts: Vec::new(),
+            url: String::new(),
+            deadline: None,
+            ended: None,
+        }
+    }
+
+    /// Webots was started: its time is counted.
+    pub fn launched(&mut self) {
+        self.launched = Instant::now();
+    }
+
+    /// Keeps a text for a client that comes back.
+    pub fn keep(&mut self, text: String) {
+        self.texts.push(text);
+    }
+
+    /// Webots is ready at this URL: from now on the client may come back. Returns what it hears of that.
+    pub fn ready(&mut self, url: String, absence: Duration) -> [String; 2] {
+        self.url = url;
+        self.offer(absence)
+    }
+
+    fn offer(&mut self, absence: Duration) -> [String; 2] {
+        let token = self.token.insert(self.kept.token());
+        [protocol::absence(absence.as_secs()), protocol::resume(token)]
+    }
+
+    /// Whether the client may come back.
+    #[must_use]
+    pub fn is_ready(&self) -> bool {
+        self.token.is_some()
+    }
+
+    /// Why a client with this token may not come back, if so, in words for it.
+    #[must_use]
+    pub fn refusal(&self, token: &Token) -> Option<String> {
+        if self.token.as_ref() != Some(token) {
+            return Some(protocol::taken_over());
+        }
+        self.ended.as_ref().map(|why| protocol::ended(Some(why)))
+    }
+
+    /// Asks whether the client may have its place at this address.
+    pub fn move_to(
+        &self,
+        address: Option<IpAddr>,
+    ) -> impl Future<Output = Result<Result<(), NoPlace>, MailboxError>> + use<> {
+        self.places.send(Move { id: self.ticket, address })
+    }
+
+    /// The simulation has ended, and its client may ask why.
+    pub fn end(&mut self, why: &str) {
+        self.ended = Some(why.to_owned());
+    }
+
+    /// The client has gone, and the simulation waits for so long, unless it has ended. Returns whether it waits.
+    pub fn away(&self, absence: Duration) -> bool {
+        if self.ended.is_none() {
+            self.show(Some(seconds_since_1970() + absence.as_secs()));
+        }
+        self.ended.is_none()
+    }
+
+    /// The client is back. Returns what it hears: what it has heard before, and a new token.
+    pub fn back(&mut self, timeout: u64, absence: Duration) -> Vec<String> {
+        self.show(None);
+        let left = timeout.saturating_sub(self.launched.elapsed().as_secs());
+        let mut texts = vec![protocol::session(self.ticket), protocol::shutdown_timeout(left)];
+        texts.extend(self.texts.iter().cloned());
+        texts.push(protocol::webots(&self.url));
+        texts.extend(self.offer(absence));
+        texts
+    }
+
+    /// What ends the wait, if there is one.
+    pub fn deadline(&mut self) -> &mut Option<SpawnHandle> {
+        &mut self.deadline
+    }
+
+    fn show(&self, until: Option<u64>) {
+        self.places.do_send(Update(self.ticket, Report::Change(Change::Away(until))));
+    }
+}

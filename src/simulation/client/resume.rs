@@ -1,0 +1,77 @@
+//! How a session waits for its client, and goes on with another connection of it.
+
+use actix::prelude::*;
+use actix_web_actors::ws::CloseCode;
+
+use super::session::Session;
+use crate::shared::http::Peer;
+use crate::simulation::protocol;
+use crate::simulation::sessions::{Attachment, Resume, ToClient};
+
+impl Session {
+    /// Waits for a client that may come back, and ends where none may.
+    pub(super) fn await_client(&mut self, ctx: &mut Context<Self>) {
+        let absence = self.server.config.timing.absence;
+        let name = self.name();
+        let Some(comeback) = self.comeback.as_mut().filter(|comeback| comeback.is_ready()) else {
+            return ctx.stop();
+        };
+        if comeback.deadline().is_some() {
+            return;
+        }
+        if comeback.away(absence) {
+            log::info!("{name}: away; it may come back within {} s", absence.as_secs());
+        }
+        *comeback.deadline() = Some(ctx.run_later(absence, move |this, ctx| {
+            log::info!("{}: has not come back within {} s", this.name(), absence.as_secs());
+            ctx.stop();
+        }));
+    }
+
+    /// Goes on with another connection of its client, and tells the one before.
+    fn go_on(&mut self, client: Recipient<ToClient>, peer: Peer, ctx: &mut Context<Self>) -> Attachment {
+        log::info!("{}: goes on as client {peer}", self.name());
+        self.peer = peer;
+        self.attachment += 1;
+        if let Some(before) = self.client.replace(client) {
+            before.do_send(ToClient::End(protocol::taken_over(), CloseCode::Normal));
+        }
+        let (timeout, absence) = (self.server.config.timeout, self.server.config.timing.absence);
+        let mut texts = Vec::new();
+        if let Some(comeback) = &mut self.comeback {
+            if let Some(deadline) = comeback.deadline().take() {
+                ctx.cancel_future(deadline);
+            }
+            texts = comeback.back(timeout, absence);
+        }
+        for text in texts {
+            self.text(text);
+        }
+        Attachment::new(ctx.address().recipient(), self.attachment)
+    }
+}
+
+impl Handler<Resume> for Session {
+    type Result = ResponseActFuture<Self, Result<Attachment, String>>;
+
+    fn handle(&mut self, Resume { token, client, peer }: Resume, _: &mut Self::Context) -> Self::Result {
+        let refused = |refusal| Box::pin(actix::fut::err(refusal));
+        let Some(comeback) = &self.comeback else {
+            return refused(protocol::ended(None));
+        };
+        if let Some(refusal) = comeback.refusal(&token) {
+            return refused(refusal);
+        }
+        let moved = comeback.move_to(peer.rate_limit_key()).into_actor(self);
+        Box::pin(moved.map(move |moved, this, ctx| {
+            if let Ok(Err(no_place)) = moved {
+                return Err(protocol::error(&no_place.to_string()));
+            }
+            // Another connection may have come with the same token meanwhile.
+            match this.comeback.as_ref().and_then(|comeback| comeback.refusal(&token)) {
+                Some(refusal) => Err(refusal),
+                None => Ok(this.go_on(client, peer, ctx)),
+            }
+        }))
+    }
+}

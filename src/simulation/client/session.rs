@@ -1,0 +1,255 @@
+//! Actor: the session of one simulation, from the request for it to its end, as one state machine.
+//!
+//! Created by a web client that asks for a simulation. Whatever it holds in any state (a place in the line, a checkout
+//! under way, a running Webots) is given back when it is dropped. It ends with its client, or some time after the
+//! connection of one that may come back.
+
+use std::sync::Arc;
+
+use actix::prelude::*;
+use actix_web_actors::ws::CloseCode;
+
+use super::comeback::Comeback;
+use super::outcome::{Outcome, Pending};
+use super::state::{State, WebotsHandle};
+use crate::shared::http::Peer;
+use crate::shared::run::closing;
+use crate::simulation::checkout::Progress;
+use crate::simulation::ends::EndReason;
+use crate::simulation::places::PlaceEvent;
+use crate::simulation::protocol::{self, Mode};
+use crate::simulation::sessions::{Attachment, FromClient, Said, ToClient};
+use crate::simulation::state::AppState;
+use crate::simulation::webots::{Exit, RestoreController, WebotsEvent};
+
+/// The actor.
+pub struct Session {
+    pub(super) server: Arc<AppState>,
+    pub(super) peer: Peer,
+    /// The id of the simulation with what separates it from what follows; empty before there is one.
+    pub(super) id: String,
+    /// The connection of its client, until it has ended.
+    pub(super) client: Option<Recipient<ToClient>>,
+    pub(super) attachment: u64,
+    pub(super) state: State,
+    restoring: bool,
+    pub(super) start: Pending,
+    /// Whether its client has asked to be able to come back.
+    pub(super) resumable: bool,
+    /// What it keeps so that its client can.
+    pub(super) comeback: Option<Comeback>,
+}
+
+impl Session {
+    /// Opens the session of a client that asks for the world at this URL.
+    #[must_use]
+    pub fn open(
+        server: Arc<AppState>,
+        peer: Peer,
+        client: Recipient<ToClient>,
+        (url, mode, resumable): (String, Mode, bool),
+    ) -> Attachment {
+        let start = Pending::new(&server.starts);
+        let session = Self {
+            server,
+            peer,
+            id: String::new(),
+            client: Some(client),
+            attachment: 0,
+            state: State::Asked { url, mode },
+            restoring: false,
+            start,
+            resumable,
+            comeback: None,
+        };
+        let attachment = session.attachment;
+        Attachment::new(session.start().recipient(), attachment)
+    }
+
+    pub(super) fn name(&self) -> String {
+        format!("{}client {}", self.id, self.peer)
+    }
+
+    /// Sends the client a text that it must not miss.
+    pub(super) fn text(&self, text: String) {
+        if let Some(client) = &self.client {
+            client.do_send(ToClient::Text(text));
+        }
+    }
+
+    /// Sends the client a text that it misses where it can't keep up.
+    fn hint(&self, text: String) {
+        if let Some(client) = &self.client
+            && let Err(lost) = client.try_send(ToClient::Text(text))
+        {
+            log::debug!("{}: does not listen: {lost}", self.name());
+        }
+    }
+
+    /// Gives everything back, and sends its client the last words. One that has not heard them can come back for `why`.
+    pub(super) fn finish(&mut self, last_words: String, why: &str, code: CloseCode, ctx: &mut Context<Self>) {
+        self.state = State::Over;
+        if let Some(client) = self.client.take() {
+            client.do_send(ToClient::End(last_words, code));
+        }
+        if let Some(comeback) = &mut self.comeback {
+            comeback.end(why);
+        }
+        self.await_client(ctx);
+    }
+
+    fn reset_controller(&mut self, file: String, ctx: &mut Context<Self>) {
+        let State::Launched(WebotsHandle(webots)) = &self.state else {
+            return self.text(protocol::nothing_to_reset());
+        };
+        if std::mem::replace(&mut self.restoring, true) {
+            log::warn!("{}: asks to reset a controller while another is being reset; ignored", self.name());
+            return;
+        }
+        let restored = webots.send(RestoreController(file.clone())).into_actor(self);
+        restored
+            .map(move |answer, this, _| {
+                this.restoring = false;
+                match answer {
+                    Ok(Ok(())) => this.text(protocol::reset_controller(&file)),
+                    // That does not end the simulation.
+                    Ok(Err(error)) => this.text(protocol::error(&error.to_string())),
+                    Err(error) => log::warn!("{}: no controller was reset: {error}", this.name()),
+                }
+            })
+            .spawn(ctx);
+    }
+
+    fn exited(&mut self, Exit { clean, own, why }: &Exit, ctx: &mut Context<Self>) {
+        if *own {
+            let fail = if self.start.is_open() { Self::fail_own } else { Self::refer };
+            return fail(self, Outcome::NoWebots, why, ctx);
+        }
+        let words = if *clean { protocol::loading(why) } else { protocol::error(why) };
+        self.start.resolve(Outcome::NoWebots);
+        self.finish(words, why, CloseCode::Normal, ctx);
+    }
+}
+
+impl Actor for Session {
+    type Context = Context<Self>;
+
+    fn started(&mut self, ctx: &mut Self::Context) {
+        closing(self.server.phase.clone())
+            .into_actor(self)
+            .map(|(), this, ctx| {
+                this.start.resolve(Outcome::Stopped);
+                this.state.end(EndReason::Stopped, "The server was stopped");
+                this.comeback = None;
+                this.finish(protocol::stopping(), "", CloseCode::Away, ctx);
+            })
+            .spawn(ctx);
+        if let State::Asked { url, mode } = std::mem::replace(&mut self.state, State::Over) {
+            self.ask(&url, mode, ctx);
+        }
+    }
+}
+
+impl Drop for Session {
+    /// A client that still waits for something has lost it: its session has panicked.
+    fn drop(&mut self) {
+        if let Some(client) = self.client.take() {
+            let why = protocol::error("The simulation was lost by a fault of this server");
+            client.do_send(ToClient::End(why, CloseCode::Error));
+        }
+    }
+}
+
+impl Handler<FromClient> for Session {
+    type Result = ();
+
+    fn handle(&mut self, FromClient { attachment, what }: FromClient, ctx: &mut Self::Context) {
+        if attachment != self.attachment {
+            return;
+        }
+        match what {
+            Said::ResetController(file) => self.reset_controller(file, ctx),
+            Said::Left => {
+                self.client = None;
+                ctx.stop();
+            }
+            Said::Gone => {
+                self.client = None;
+                self.await_client(ctx);
+            }
+        }
+    }
+}
+
+impl Handler<PlaceEvent> for Session {
+    type Result = ();
+
+    fn handle(&mut self, event: PlaceEvent, ctx: &mut Self::Context) {
+        match (event, std::mem::replace(&mut self.state, State::Over)) {
+            (PlaceEvent::Granted(port), State::Waiting { request, ticket }) => {
+                self.check_out(request, (ticket, port), ctx);
+            }
+            (PlaceEvent::Refused(full), State::Waiting { .. }) => {
+                self.fail_start(Outcome::Full, &full.to_string(), ctx);
+            }
+            (PlaceEvent::Ahead(ahead), state @ State::Waiting { .. }) => {
+                self.state = state;
+                for text in protocol::queue(ahead) {
+                    self.text(text);
+                }
+            }
+            (PlaceEvent::AwayTooLong, state @ State::Launched(_)) => {
+                let why = "Too many simulations waited for their clients, and this one had waited longest";
+                log::info!("{}: {why}", self.name());
+                state.end(EndReason::Left, why);
+                self.finish(protocol::error(why), why, CloseCode::Normal, ctx);
+            }
+            (_, state) => self.state = state,
+        }
+    }
+}
+
+impl Handler<Progress> for Session {
+    type Result = ();
+
+    fn handle(&mut self, Progress(text): Progress, _: &mut Self::Context) {
+        if matches!(self.state, State::CheckingOut { .. }) {
+            self.hint(protocol::loading(&text));
+        }
+    }
+}
+
+impl Handler<WebotsEvent> for Session {
+    type Result = ();
+
+    fn handle(&mut self, event: WebotsEvent, ctx: &mut Self::Context) {
+        match event {
+            WebotsEvent::Progress(text) => self.hint(protocol::loading(&text)),
+            WebotsEvent::Text(text) => {
+                let text = protocol::of_project(&text);
+                if let Some(comeback) = &mut self.comeback {
+                    comeback.keep(text.clone());
+                }
+                self.text(text);
+            }
+            WebotsEvent::Started => {
+                if let Some(comeback) = &mut self.comeback {
+                    comeback.launched();
+                }
+                self.text(protocol::shutdown_timeout(self.server.config.timeout));
+            }
+            WebotsEvent::Listening(port) => {
+                self.start.resolve(Outcome::Ready);
+                self.server.failed_starts.reset();
+                let url = self.server.config.websocket_url(port);
+                self.text(protocol::webots(&url));
+                let absence = self.server.config.timing.absence;
+                let offer = self.comeback.as_mut().map(|comeback| comeback.ready(url, absence));
+                offer.into_iter().flatten().for_each(|text| self.text(text));
+            }
+            WebotsEvent::Heartbeat => self.hint(protocol::HEARTBEAT.to_owned()),
+            WebotsEvent::Hanging(seconds) => self.hint(protocol::hanging(seconds)),
+            WebotsEvent::Exited(exit) => self.exited(&exit, ctx),
+        }
+    }
+}

@@ -1,0 +1,116 @@
+//! How a session starts its simulation: a place, the checkout, Webots; and the ends of a start that fails.
+
+use std::sync::Arc;
+
+use actix::prelude::*;
+use actix_web_actors::ws::CloseCode;
+
+use super::comeback::Comeback;
+use super::outcome::Outcome;
+use super::session::Session;
+use super::state::{StartRequest, State, WebotsHandle};
+use crate::simulation::checkout::{Progress, Project};
+use crate::simulation::ends::EndReason;
+use crate::simulation::places::Ticket;
+use crate::simulation::protocol::{self, Mode};
+use crate::simulation::readiness;
+use crate::simulation::snapshot::Change;
+use crate::simulation::webots::{LaunchSpec, Webots};
+
+impl Session {
+    /// Counts the failed start, sends the client the reason, and ends.
+    pub(super) fn fail_start(&mut self, outcome: Outcome, why: &str, ctx: &mut Context<Self>) {
+        self.start.resolve(outcome);
+        self.state.end(outcome.end(), why);
+        log::info!("{}: {why}", self.name());
+        self.finish(protocol::error(why), why, CloseCode::Normal, ctx);
+    }
+
+    /// The same for a client that another server may take: the close code says so to programs.
+    pub(super) fn refer(&mut self, outcome: Outcome, why: &str, ctx: &mut Context<Self>) {
+        self.start.resolve(outcome);
+        log::info!("{}: {why}", self.name());
+        self.finish(protocol::elsewhere(why), why, CloseCode::Again, ctx);
+    }
+
+    /// The same for a start that fails for a reason of this server's own, which is reported to session servers.
+    pub(super) fn fail_own(&mut self, outcome: Outcome, why: &str, ctx: &mut Context<Self>) {
+        self.server.failed_starts.add(&format!("{}: {why}", self.name()));
+        self.state.end(EndReason::Fault, why);
+        self.refer(outcome, why, ctx);
+    }
+
+    pub(super) fn ask(&mut self, url: &str, mode: Mode, ctx: &mut Context<Self>) {
+        if !self.server.start_quota.take(self.peer.rate_limit_key()) {
+            let why = "Too many simulations were asked for from your address. Try again in a minute";
+            return self.fail_start(Outcome::Refused, why, ctx);
+        }
+        let world = match self.server.admit(url) {
+            Ok(world) => world,
+            Err(why) if self.server.takes_nobody() => return self.refer(Outcome::Refused, &why, ctx),
+            Err(why) => return self.fail_start(Outcome::Refused, &why, ctx),
+        };
+        let ticket = Ticket::new(&self.server.places, ctx.address().recipient(), &world, self.peer);
+        self.id = format!("{}: ", ticket.id());
+        self.text(protocol::session(ticket.id()));
+        log::info!("{}: asks for {world}", self.name());
+        self.state = State::Waiting { request: StartRequest { world, mode }, ticket };
+    }
+
+    pub(super) fn check_out(
+        &mut self,
+        StartRequest { world, mode }: StartRequest,
+        place: (Ticket, u16),
+        ctx: &mut Context<Self>,
+    ) {
+        self.state = State::CheckingOut { mode, place };
+        let instance = match self.server.run.instance() {
+            Ok(instance) => instance,
+            Err(error) => return self.fail_own(Outcome::NoCheckout, &format!("No room for a project: {error}"), ctx),
+        };
+        let me = ctx.address();
+        // Where the mailbox is full, the client misses one line of progress.
+        let progress = move |text: String| drop(me.try_send(Progress(text)));
+        let job = self.server.checkouts.start(world, instance, progress);
+        job.into_actor(self)
+            .map(|result, this, ctx| match result {
+                Ok(Ok(project)) => this.launch(project, ctx),
+                Ok(Err(error)) if error.is_own() => this.fail_own(Outcome::NoCheckout, &error.to_string(), ctx),
+                Ok(Err(error)) => this.fail_start(Outcome::NoCheckout, &error.to_string(), ctx),
+                Err(error) => this.fail_own(Outcome::NoCheckout, &format!("The checkout broke off: {error}"), ctx),
+            })
+            .spawn(ctx);
+    }
+
+    pub(super) fn launch(&mut self, project: Project, ctx: &mut Context<Self>) {
+        let program = match readiness::webots_program(&self.server.config) {
+            Ok(program) => program,
+            Err(why) => return self.fail_own(Outcome::NoWebots, &why, ctx),
+        };
+        let State::CheckingOut { mode, place } = std::mem::replace(&mut self.state, State::Over) else { return };
+        log::info!("{}: {} is for Webots {}", self.name(), project.world.path.display(), project.world.version);
+        place.0.update(Change::Version(project.world.version.clone()));
+        for warning in &project.warnings {
+            self.text(protocol::loading(warning));
+        }
+        self.text(protocol::loading("webots is starting"));
+        if self.resumable && !self.server.config.timing.absence.is_zero() {
+            let kept = self.server.sessions.keep(ctx.address().recipient());
+            self.comeback = Some(Comeback::new(kept, &place.0, self.server.places.clone()));
+        }
+        let spec = LaunchSpec {
+            config: Arc::clone(&self.server.config),
+            containers: self.server.containers.clone(),
+            launcher: Arc::clone(&self.server.launcher),
+            watcher: self.server.watcher.clone(),
+            program,
+            checkouts: Arc::clone(&self.server.checkouts),
+            project: Arc::new(project),
+            mode,
+            place,
+            events: ctx.address().recipient(),
+        };
+        let webots = Webots::start_in_arbiter(self.server.webots_thread(spec.place.1), |_| Webots::new(spec));
+        self.state = State::Launched(WebotsHandle(webots));
+    }
+}

@@ -1,0 +1,54 @@
+//! What is said to the actor of places, and what it says.
+
+use std::net::IpAddr;
+
+use actix::prelude::*;
+
+use super::no_place::NoPlace;
+use super::present::{Present, Report};
+use crate::simulation::simulation_id::SimulationId;
+use crate::simulation::snapshot::Snapshot;
+
+/// Asks for a place, in the name of a ticket.
+#[derive(Message)]
+#[rtype(result = "()")]
+pub(super) struct Acquire(pub Box<Present>);
+
+/// What the holder of a ticket hears.
+#[derive(Message, Debug, Clone, Copy, PartialEq, Eq)]
+#[rtype(result = "()")]
+pub enum PlaceEvent {
+    /// So many clients are ahead in the waiting line.
+    Ahead(usize),
+    /// This port may be used as long as the ticket lives.
+    Granted(u16),
+    /// There is no room in the waiting line either.
+    Refused(NoPlace),
+    /// Too many simulations wait for clients that are away, and this one has waited longest: it has to end.
+    AwayTooLong,
+}
+
+/// What the holder of a ticket reports of its simulation.
+#[derive(Message)]
+#[rtype(result = "()")]
+pub struct Update(pub SimulationId, pub Report);
+
+/// Asks for a snapshot of all simulations.
+#[derive(Message)]
+#[rtype(result = "Snapshot")]
+pub struct GetSnapshot;
+
+/// Gives a place, or one in the line, back.
+#[derive(Message)]
+#[rtype(result = "()")]
+pub struct Release(pub SimulationId);
+
+/// Says that the client of a ticket has another address now; the answer is why that may not be.
+#[derive(Message)]
+#[rtype(result = "Result<(), NoPlace>")]
+pub struct Move {
+    /// The id of the simulation.
+    pub id: SimulationId,
+    /// Where the client is now, if that is known.
+    pub address: Option<IpAddr>,
+}

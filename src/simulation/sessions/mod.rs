@@ -1,0 +1,9 @@
+//! How a connection is attached to the session of its simulation, and how a client finds its session again.
+
+mod attachment;
+mod sessions;
+mod token;
+
+pub use attachment::{Attachment, FromClient, Said, ToClient};
+pub use sessions::{Kept, Resume, Sessions};
+pub use token::Token;

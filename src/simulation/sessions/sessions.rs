@@ -1,0 +1,67 @@
+//! The sessions that their clients may come back to.
+
+use std::collections::HashMap;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+use actix::prelude::*;
+
+use super::attachment::{Attachment, ToClient};
+use super::token::Token;
+use crate::shared::http::Peer;
+
+/// Asks a session to go on with another connection. The answer is why not, in words for the client.
+#[derive(Message)]
+#[rtype(result = "Result<Attachment, String>")]
+pub struct Resume {
+    /// What the client proves with that the session is its own.
+    pub token: Token,
+    /// The connection.
+    pub client: Recipient<ToClient>,
+    /// Where the client is now.
+    pub peer: Peer,
+}
+
+/// Where sessions are found again.
+#[derive(Default)]
+pub struct Sessions(Mutex<HashMap<u64, Recipient<Resume>>>);
+
+/// A session that can be found. Dropping it ends that.
+pub struct Kept {
+    number: u64,
+    sessions: Arc<Sessions>,
+}
+
+impl Sessions {
+    /// Keeps a session.
+    #[must_use]
+    pub fn keep(self: &Arc<Self>, session: Recipient<Resume>) -> Kept {
+        // Not one that an earlier run of the server has used.
+        let number = rand::random();
+        self.lock().insert(number, session);
+        Kept { number, sessions: Arc::clone(self) }
+    }
+
+    /// The session that a token names, if it has not ended.
+    #[must_use]
+    pub fn find(&self, token: &Token) -> Option<Recipient<Resume>> {
+        self.lock().get(&token.number()).cloned()
+    }
+
+    fn lock(&self) -> MutexGuard<'_, HashMap<u64, Recipient<Resume>>> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl Kept {
+    /// A new token for it.
+    #[must_use]
+    pub fn token(&self) -> Token {
+        Token::new(self.number)
+    }
+}
+
+impl Drop for Kept {
+    fn drop(&mut self) {
+        self.sessions.lock().remove(&self.number);
+    }
+}

@@ -1,0 +1,75 @@
+//! The token by which a client comes back to its simulation.
+
+use std::fmt;
+
+use constant_time_eq::constant_time_eq_16;
+
+/// Names a session, and proves that the client is its own. It never comes into a log, a page or a URL.
+#[derive(Clone, Copy)]
+pub struct Token {
+    number: u64,
+    secret: [u8; 16],
+}
+
+/// How many hexadecimal digits name the session.
+const DIGITS: usize = 16;
+
+impl Token {
+    /// A new token for the session with this number.
+    #[must_use]
+    pub fn new(number: u64) -> Self {
+        Self { number, secret: rand::random() }
+    }
+
+    /// Reads a token of a client; nothing where it is none.
+    #[must_use]
+    pub fn parse(text: &str) -> Option<Self> {
+        let is_hex = text.len() == 3 * DIGITS && text.bytes().all(|byte| byte.is_ascii_hexdigit());
+        let (number, secret) = text.split_at_checked(DIGITS).filter(|_| is_hex)?;
+        let secret = u128::from_str_radix(secret, 16).ok()?.to_be_bytes();
+        Some(Self { number: u64::from_str_radix(number, 16).ok()?, secret })
+    }
+
+    /// The number of the session.
+    #[must_use]
+    pub fn number(&self) -> u64 {
+        self.number
+    }
+
+    /// The token as its client gets it, and nobody else.
+    #[must_use]
+    pub fn reveal(&self) -> String {
+        format!("{:016x}{:032x}", self.number, u128::from_be_bytes(self.secret))
+    }
+}
+
+impl PartialEq for Token {
+    /// Takes a time that does not depend on the secrets.
+    fn eq(&self, other: &Self) -> bool {
+        self.number == other.number && constant_time_eq_16(&self.secret, &other.secret)
+    }
+}
+
+impl Eq for Token {}
+
+impl fmt::Debug for Token {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        out.write_str("Token")
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_token_is_read_as_it_was_written_and_nothing_else_is() {
+        let token = Token::new(7);
+        assert_eq!(Token::parse(&token.reveal()), Some(token));
+        assert_ne!(Token::new(7), token);
+        for wrong in ["", "x", &token.reveal().repeat(2), &"0".repeat(47), &"g".repeat(48), &"+".repeat(48)] {
+            assert_eq!(Token::parse(wrong), None, "{wrong}");
+        }
+        assert_eq!(format!("{token:?}"), "Token");
+    }
+}

@@ -1,0 +1,83 @@
+// Watches the connection to a simulation that waits for its client, and says when to try to come back.
+
+/** No sign of life for so long means that the connection is lost, in milliseconds; Webots gives one every five seconds. */
+const SILENCE = 8000;
+/** A shorter one is not worth a word. */
+const WORTH_A_WORD = 2000;
+/** How long a try may take: a second one would take its token away. In milliseconds. */
+const TRY = 15_000;
+/** Before the second try, doubled each time up to the longest, in milliseconds. */
+const FIRST_PAUSE = 1000;
+const LONGEST_PAUSE = 10_000;
+
+/**
+ * Events: `lost` ({ since, left }, in seconds; each second while there is no connection), `try` (come back now), `found`
+ * (there is a sign of life again), `over` (nobody can still be waiting).
+ */
+export class Lifeline extends EventTarget {
+  #heard = Date.now();
+  #isLost = false;
+  #tries = 0;
+  #next = 0;
+  #timer;
+  #online = () => {
+    this.#next = 0;
+  };
+
+  /** The simulation waits for so many seconds once its server has noticed that its client is away. */
+  constructor(absence) {
+    super();
+    this.absence = absence;
+    this.#timer = setInterval(() => this.#look(), 1000);
+    addEventListener('online', this.#online);
+  }
+
+  #tell(kind, detail) {
+    this.dispatchEvent(new CustomEvent(kind, { detail }));
+  }
+
+  /** There was a sign of life. */
+  alive() {
+    this.#heard = Date.now();
+    this.#tries = 0;
+    this.#next = 0;
+    if (this.#isLost) {
+      this.#isLost = false;
+      this.#tell('found');
+    }
+  }
+
+  /** The connection has closed. */
+  broken() {
+    this.#isLost = true;
+    if (this.#tries > 0) {
+      // Those who were lost together don't come back together.
+      const pause = Math.min(LONGEST_PAUSE, FIRST_PAUSE * 2 ** (this.#tries - 1)) * (0.5 + Math.random());
+      this.#next = Math.min(this.#next, Date.now() + pause);
+    }
+    this.#look();
+  }
+
+  #look() {
+    const since = Date.now() - this.#heard;
+    if (!this.#isLost && since < SILENCE)
+      return;
+    this.#isLost = true;
+    if (since >= WORTH_A_WORD)
+      this.#tell('lost', { since: since / 1000, left: this.absence - since / 1000 });
+    // The server may notice it later, by as long as it takes a connection to be silent.
+    if (this.#tries > 0 && since > 2000 * this.absence) {
+      this.close();
+      this.#tell('over', since / 1000);
+    } else if (Date.now() >= this.#next) {
+      this.#tries += 1;
+      this.#next = Date.now() + TRY;
+      this.#tell('try');
+    }
+  }
+
+  close() {
+    clearInterval(this.#timer);
+    removeEventListener('online', this.#online);
+  }
+}

@@ -1,0 +1,215 @@
+"""The viewer comes back: after a reload, Back, a lost connection; and says what is true meanwhile."""
+
+import json
+import re
+import unittest
+
+from playwright.sync_api import expect
+
+from case import BrowserTest
+from fleet import ROOT, WORLD, until
+
+
+def seconds(page):
+    """Simulated time, as the page shows it."""
+    minutes, rest = page.tab.locator("#clock").inner_text().split(":")
+    return 60 * int(minutes) + float(rest)
+
+
+class Running(BrowserTest):
+    def running(self, **options):
+        """A page whose simulation runs in real time."""
+        page, server = self.start_world(**options)
+        page.tab.get_by_role("button", name="Play", exact=True).click()
+        expect(page.tab.locator("#mode")).to_have_text("real time")
+        until("time passes", lambda: seconds(page) > 0.2)
+        return page, server
+
+    def pid(self, server):
+        simulations = server.status()["simulations"]
+        self.assertEqual(len(simulations), 1, simulations)
+        return simulations[0]["pid"]
+
+    def goes_on(self, page, server, pid, before):
+        expect(page.tab.locator("[data-step=simulation].done")).to_be_visible()
+        expect(page.tab.locator("#mode")).to_have_text("real time")
+        until("the clock goes on", lambda: seconds(page) > before)
+        self.assertEqual(self.pid(server), pid)
+        expect(page.tab.locator("#problem")).to_be_hidden()
+        expect(page.tab.locator("#notice")).to_be_hidden()
+
+    def leaves_nothing(self, page, server):
+        page.tab.get_by_role("button", name="Disconnect").click()
+        until("the simulation is gone", lambda: not server.status()["simulations"])
+
+
+class ComingBack(Running):
+    def test_after_a_reload_and_back_the_clock_goes_on(self):
+        page, server = self.running()
+        pid, before = self.pid(server), seconds(page)
+        self.assertIn("viewer?url=https%3A%2F%2Fgithub.com%2Fdemo", page.tab.url)
+        page.tab.reload()
+        self.goes_on(page, server, pid, before)
+        before = seconds(page)
+        page.tab.goto(self.fleet.session.url("monitor"))
+        page.tab.go_back()
+        self.goes_on(page, server, pid, before)
+        token = page.tab.evaluate("JSON.parse(sessionStorage.getItem('simulation')).token")
+        self.assertRegex(token, "^[0-9a-f]{48}$")
+        self.assertFalse([url for url in page.asked if token in url], "a token in a URL")
+        self.assertNotIn(token, server.log.read_text())
+        self.assertEqual(page.faults(), [])
+        self.leaves_nothing(page, server)
+        # What has ended is not asked for again.
+        page.tab.reload()
+        expect(page.tab.locator("#light.on")).to_be_visible()
+        expect(page.tab.get_by_role("button", name="Connect", exact=True)).to_be_enabled()
+
+    def test_links_of_the_header_open_another_tab_while_a_simulation_runs(self):
+        page, server = self.running()
+        with page.context.expect_page() as opened:
+            page.tab.get_by_role("link", name="Monitor").click()
+        opened.value.close()
+        self.assertEqual(len(server.status()["simulations"]), 1)
+        self.leaves_nothing(page, server)
+        page.tab.get_by_role("link", name="Monitor").click()
+        expect(page.tab).to_have_url(re.compile("/monitor$"))
+
+    def test_two_tabs_with_one_token_are_one_simulation_and_the_first_is_told(self):
+        page, server = self.running()
+        pid = self.pid(server)
+        kept = page.tab.evaluate("sessionStorage.getItem('simulation')")
+        other = self.browser.page()
+        self.addCleanup(other.close)
+        # As a tab that the browser has duplicated.
+        other.tab.add_init_script(f"sessionStorage.getItem('simulation') ?? sessionStorage.setItem('simulation', {json.dumps(kept)})")
+        other.tab.goto(self.fleet.session.url("viewer"))
+        self.goes_on(other, server, pid, 0)
+        expect(page.tab.locator("#problem-text")).to_contain_text("taken over elsewhere")
+        expect(page.tab.locator("#problem-advice")).to_contain_text("Another tab")
+        other.tab.get_by_role("button", name="Disconnect").click()
+        until("the simulation is gone", lambda: not server.status()["simulations"])
+
+    def test_two_tabs_are_two_simulations(self):
+        first, _ = self.running()
+        second, _ = self.running()
+        servers = (self.fleet.simulation, self.fleet.other)
+        self.assertEqual(sum(len(server.status()["simulations"]) for server in servers), 2)
+        expect(first.tab.locator("footer")).to_contain_text("two tabs are two simulations")
+        for page in (first, second):
+            page.tab.get_by_role("button", name="Disconnect").click()
+        until("both are gone", lambda: not any(server.status()["simulations"] for server in servers))
+
+    def test_a_server_that_hangs_is_told_and_the_simulation_is_found_again(self):
+        page, server = self.running()
+        pid, before = self.pid(server), seconds(page)
+        # The stream is silent too: it is of the same network in life.
+        page.tab.get_by_role("button", name="Pause", exact=True).click()
+        expect(page.tab.locator("#mode")).to_have_text("paused")
+        with server.hanging():
+            expect(page.tab.locator("#notice-text")).to_contain_text("No connection since", timeout=30_000)
+            expect(page.tab.locator("#notice-advice")).to_contain_text("Your simulation waits another")
+            expect(page.tab.locator("#light")).to_contain_text("No connection")
+            expect(page.tab.locator("#mode")).to_have_text("no connection")
+            self.assertEqual(page.faults(), [])
+        expect(page.tab.locator("#notice")).to_be_hidden(timeout=30_000)
+        expect(page.tab.locator("#light.on")).to_be_visible()
+        expect(page.tab.locator("#mode")).to_have_text("paused")
+        self.assertGreaterEqual(seconds(page), before)
+        self.assertEqual(self.pid(server), pid)
+        self.leaves_nothing(page, server)
+
+
+class Offline(Running):
+    def keeps_to_the_rules(self, page):
+        """The browser itself complains of what it can't reach."""
+        self.assertEqual(page.hosts(), {self.host}, "who was asked")
+
+    def test_after_20_seconds_offline_it_is_found_again_by_itself(self):
+        page, server = self.running()
+        pid, before = self.pid(server), seconds(page)
+        page.context.set_offline(True)
+        expect(page.tab.locator("#notice-text")).to_contain_text("No connection since 20 s", timeout=40_000)
+        expect(page.tab.locator("#notice-advice")).to_have_text("Your simulation waits another 40 s.")
+        page.context.set_offline(False)
+        self.goes_on(page, server, pid, before + 10)
+        self.leaves_nothing(page, server)
+
+
+class Gone(Running):
+    simulation = {"timing": {"absence": 2}}
+
+    def test_of_a_tab_that_was_closed_nothing_is_left(self):
+        page, server = self.running()
+        page.tab.close()
+        until("the simulation is gone", lambda: not server.status()["simulations"])
+
+    def test_who_comes_back_too_late_is_told(self):
+        page, server = self.running()
+        page.tab.goto("about:blank")
+        until("the simulation is gone", lambda: not server.status()["simulations"])
+        page.tab.go_back()
+        expect(page.tab.locator("#problem-text")).to_contain_text("This simulation has ended")
+        expect(page.tab.get_by_role("button", name="Connect", exact=True)).to_be_enabled()
+        self.assertEqual(page.tab.get_by_label("URL of a world").input_value(), WORLD.format("playground"))
+
+
+class Busy(Running):
+    session = {"loadThreshold": 1000}
+    simulation = {"maxConnections": 1, "waitingLine": 0}
+
+    def test_who_finds_all_servers_busy_waits_and_starts_by_itself_or_stops_waiting(self):
+        first, one = self.running()
+        second, other = self.running()
+        third = self.open(self.fleet.session.url("viewer"))
+        expect(third.tab.locator("#light")).not_to_contain_text("Connecting")
+        third.tab.get_by_role("button", name="Playground").click()
+        third.tab.get_by_role("button", name="Connect", exact=True).click()
+        expect(third.tab.locator("#notice-text")).to_have_text("All servers are busy.")
+        expect(third.tab.locator("#notice-advice")).to_have_text("It starts by itself when one is free.")
+        expect(third.tab.locator("#problem")).to_be_hidden()
+        self.assertEqual(third.faults(), [])
+        third.tab.get_by_role("button", name="Stop waiting").click()
+        expect(third.tab.locator("#notice")).to_be_hidden()
+        third.tab.get_by_role("button", name="Connect", exact=True).click()
+        expect(third.tab.locator("#notice-text")).to_have_text("All servers are busy.")
+        first.tab.get_by_role("button", name="Disconnect").click()
+        expect(third.tab.locator("[data-step=simulation].done")).to_be_visible()
+        expect(third.tab.locator("#notice")).to_be_hidden()
+        for page in (second, third):
+            page.tab.get_by_role("button", name="Disconnect").click()
+
+
+class Example(Running):
+    def test_the_example_of_the_protocol_starts_comes_back_and_leaves(self):
+        page = (ROOT / "docs/protocol.md").read_text()
+        example = page.split("```js\n")[1].split("```")[0]
+        # A page without a policy of its own, and without a script.
+        tab = self.open(self.fleet.session.url("load")).tab
+        begin = """([example, fleet, world]) => {
+            window.heard = [];
+            const simulate = new Function(`return ${example}`)();
+            simulate(fleet, world, (kind, more) => window.heard.push([kind, more]));
+        }"""
+        arguments = [example.strip(), self.fleet.session.url("").rstrip("/"), WORLD.format("playground")]
+        heard = lambda: [one[0] for one in tab.evaluate("window.heard.map(([kind]) => [kind])")]
+        tab.evaluate(begin, arguments)
+        until("Webots is ready", lambda: "webots" in heard())
+        until("it is kept", lambda: tab.evaluate("JSON.parse(sessionStorage.getItem('simulation'))?.token"))
+        servers = (self.fleet.simulation, self.fleet.other)
+        (server,) = [one for one in servers if one.status()["simulations"]]
+        pid = self.pid(server)
+        tab.reload()
+        tab.evaluate(begin, arguments)
+        until("it is back", lambda: "webots" in heard())
+        self.assertEqual(self.pid(server), pid)
+        tab.evaluate("window.heard.find(([kind]) => kind === 'leave')[1]()")
+        until("the simulation is gone", lambda: not server.status()["simulations"])
+        until("it is told", lambda: "error" in heard())
+        self.assertIsNone(tab.evaluate("sessionStorage.getItem('simulation')"))
+        tab.evaluate(begin, [*arguments[:2], "https://github.com/stranger/worlds/blob/main/worlds/a.wbt"])
+        until("it is refused", lambda: tab.evaluate("window.heard.some(([kind, more]) => kind === 'error' && /accepts/.test(more))"))
+
+
+if __name__ == "__main__":
+    unittest.main()
