@@ -160,24 +160,12 @@ make_root() {
     echo "$made" >"$ROOT/.complete"
 }
 
-make_cargo_deb() {
-    ! command -v cargo-deb >/dev/null && [[ ! -x target/tools/bin/cargo-deb ]] || return 0
-    echo 'builds cargo-deb, once'
-    CARGO_PROFILE_DEV_DEBUG=0 cargo install --quiet --locked --debug --root target/tools cargo-deb
-}
-
 # Two packages: what is built here, and a later version in which every program, an example and a configuration differ.
 make_packages() {
-    local file options=(--quiet --fast --compress-type gz --compress-system --deb-revision 1 --output "$WORK/packages/1.deb")
+    local file
     rm -rf "$WORK/packages" "$WORK/unpacked"
     mkdir -p "$WORK/packages"
-    if [[ -n ${FLEET_BIN-} ]]; then
-        mkdir -p "$WORK/built"
-        ln -sfn "$FLEET_BIN" "$WORK/built/release"
-        CARGO_TARGET_DIR=$WORK/built deploy/build-deb --no-build "${options[@]}" >/dev/null
-    else
-        deploy/build-deb "${options[@]}" >/dev/null
-    fi
+    deploy/build-deb "$WORK/packages/1.deb" -Zgzip -z1 >/dev/null
     dpkg-deb --raw-extract "$WORK/packages/1.deb" "$WORK/unpacked"
     sed -i 's/^Version: .*-1$/Version: 999.0.0-2/' "$WORK/unpacked/DEBIAN/control"
     # What follows a program in its file does not change what it does.
@@ -201,7 +189,6 @@ prepare_all() {
     exec {lock}>"$DEPLOY/.lock"
     flock "$lock"
     make_root
-    make_cargo_deb
     exec {lock}>&-
 }
 
