@@ -163,9 +163,12 @@ make_root() {
 # Two packages: what is built here, and a later version in which every program, an example and a configuration differ.
 make_packages() {
     local file
-    rm -rf "$WORK/packages" "$WORK/unpacked"
+    rm -rf "$WORK/packages" "$WORK/unpacked" "$WORK/release"
     mkdir -p "$WORK/packages"
-    deploy/build-deb "$WORK/packages/1.deb" -Zgzip -z1 >/dev/null
+    deploy/build-release "$WORK/release" -Zgzip -z1 >/dev/null
+    (cd "$WORK/release" && sha256sum --check --quiet SHA256SUMS) || fail 'the checksums of the release are wrong'
+    mv "$WORK"/release/*.deb "$WORK/packages/1.deb"
+    mv "$WORK"/release/*.tar.gz "$WORK/packages/release.tar.gz"
     dpkg-deb --raw-extract "$WORK/packages/1.deb" "$WORK/unpacked"
     sed -i 's/^Version: .*-1$/Version: 999.0.0-2/' "$WORK/unpacked/DEBIAN/control"
     # What follows a program in its file does not change what it does.

@@ -80,7 +80,10 @@ fn apart() -> Option<&'static str> {
         .collect();
     [env!("CARGO_TARGET_TMPDIR"), "/srv", "/var/lib", "/opt"].into_iter().find(|folder| {
         let Ok(real) = Path::new(folder).canonicalize() else { return false };
-        !hidden.iter().any(|place| real.starts_with(place)) && tempfile::tempdir_in(real).is_ok()
+        // It is written into lines for a shell.
+        !folder.contains(' ')
+            && !hidden.iter().any(|place| real.starts_with(place))
+            && tempfile::tempdir_in(real).is_ok()
     })
 }
 
