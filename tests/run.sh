@@ -91,7 +91,7 @@ for command in "${beside[@]}"; do
     # shellcheck disable=SC2086 # None of its words has a space.
     start $command
     # shellcheck disable=SC2086
-    ((memory > 6000)) || finish $command
+    ((memory > 10000)) || finish $command
 done
 "${CARGO[@]}" --lib --bins --test integration --test simulation_limits || failed+=('cargo test')
 for command in "${beside[@]}"; do
