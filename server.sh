@@ -4,7 +4,7 @@
 # It needs Linux, bash, coreutils, util-linux (flock, setsid), git, and cargo where the programs are to be built.
 # A server KIND/NAME has config/KIND/NAME.json, log/KIND/NAME.pid, which it keeps locked while it runs, and
 # log/KIND/NAME.out with what it prints.
-# FLEET_BIN, an absolute path, names a folder with programs to use in place of building them.
+# FLEET_BIN, an absolute path, names a folder with programs to use in place of building them. A release has them in bin.
 set -u
 
 readonly USAGE='usage: ./server.sh start|stop|restart|status [NAME]
@@ -51,11 +51,35 @@ setting() { # SERVER KEY
     "$BIN/${1%/*}-server" --check "config/$1.json" 2>/dev/null | sed -n "s/^ *\"$2\": \"\{0,1\}\([^\",]*\).*/\1/p"
 }
 
+# Whether a program was built after all that it is built from was changed; cargo takes longer to tell.
+is_current() { # PROGRAM
+    [[ -x $BIN/$1 && -e $BIN/.$1.began ]] &&
+        [[ -z $(find src templates config/simulation/docker Cargo.toml Cargo.lock rust-toolchain.toml -newer "$BIN/.$1.began" -print -quit) ]]
+}
+
+# Builds the programs that NAME needs.
+build() { # NAME
+    local server program programs=() options=() current=true missing=false
+    for server in $(servers "$1"); do programs+=("${server%/*}-server"); done
+    ! grep --quiet --no-messages demo-simulator "config/simulation/$1.json" || programs+=(demo-simulator)
+    for program in "${programs[@]}"; do
+        options+=(--bin "$program")
+        is_current "$program" || current=false
+        [[ -x $BIN/$program ]] || missing=true
+    done
+    ! $current || return 0
+    ! $missing || echo 'builds the programs first, which takes about three minutes on two cores'
+    mkdir -p "$BIN" || fail 1 "the programs can't be built in $BIN"
+    touch "$BIN/.began"
+    PATH=$PATH:${CARGO_HOME:-$HOME/.cargo}/bin cargo build --release --locked "${options[@]}" --target-dir target ||
+        fail 1 'building the programs needs cargo (https://rustup.rs) and a C compiler'
+    for program in "${programs[@]}"; do touch --reference="$BIN/.began" "$BIN/.$program.began"; done
+}
+
 # Builds the programs, and finds what is wrong with a configuration before anything is started or stopped.
 prepare() { # NAME
     local server remarks
-    [[ -n ${FLEET_BIN-} ]] || PATH=$PATH:${CARGO_HOME:-$HOME/.cargo}/bin cargo build --release --locked --bins \
-        --target-dir target || fail 1 'building the programs needs cargo (https://rustup.rs) and a C compiler'
+    [[ -n ${FLEET_BIN-} ]] || build "$1"
     for server in $(servers "$1"); do
         remarks=$("$BIN/${server%/*}-server" --check "config/$server.json" 2>&1 >/dev/null) || fail 2 "${remarks#error: }"
         # The demo simulator needs no display.
@@ -162,6 +186,7 @@ if (($# < 1 || $# > 2)) || [[ $1 != @(start|stop|restart|status) ]]; then
     fail 2 "$USAGE"
 fi
 cd "$(dirname "$(readlink -f "${BASH_SOURCE[0]}")")" || exit 1
+[[ ! -x bin/session-server ]] || FLEET_BIN=${FLEET_BIN:-$PWD/bin}
 readonly BIN=${FLEET_BIN:-$PWD/target/release}
 if (($# == 2)); then
     check "$2"

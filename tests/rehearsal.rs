@@ -92,7 +92,7 @@ async fn a_class_that_does_not_fit_is_told_why_and_time_in_the_line_counts_as_wa
     let waiting = report["times"].as_array().unwrap().iter().find(|row| row["step"] == "waiting").unwrap();
     assert!(waiting["worst"].as_f64().unwrap() > 1.5, "one waited until the other had left: {report}");
     // Nobody leaves soon enough for the second one.
-    let stays = ["--stay", "20s", "--real-time", "0", "--patience", "10s", "--expect", "2"];
+    let stays = ["--stay", "10s", "--real-time", "0", "--patience", "5s", "--expect", "2"];
     let output = fleet.rehearse(&[&class[..4], &stays].concat()).await;
     let said = text(&output.stdout);
     assert_eq!(output.status.code(), Some(1), "{said}");

@@ -1,5 +1,6 @@
 #!/usr/bin/env bash
-# Runs all tests: tests/run.sh [ARGUMENTS FOR cargo test]
+# Runs all tests: tests/run.sh
+# Or those whose name has these words, in seconds once they are built: tests/run.sh ARGUMENT FOR cargo test...
 # Installs through apt what they need and the machine lacks, and says so.
 set -eu
 cd "$(dirname "$(readlink -f "${BASH_SOURCE[0]}")")/.."
@@ -21,60 +22,86 @@ tests/install.sh cc=gcc,libc6-dev git=git git-lfs=git-lfs flock=util-linux opens
     systemd-analyze=systemd ip=iproute2 nft=nftables promtool=prometheus dnsmasq=dnsmasq-base kubectl=kubernetes-client
 # dockerd would begin to run on a machine that has not asked for it.
 [[ -z ${CI-} ]] || tests/install.sh dockerd=docker.io iptables=iptables docker-compose=docker-compose
-tests/python.sh >/dev/null
+# Most tests wait most of the time, for servers and timers.
+export RUST_TEST_THREADS=${RUST_TEST_THREADS:-$((3 * $(nproc)))}
+readonly CARGO=(cargo test --locked --no-fail-fast)
+if (($# > 0)); then
+    tests/python.sh >/dev/null
+    exec "${CARGO[@]}" "$@"
+fi
 
 start=$SECONDS
-code=0
-skipped=()
+skipped=() failed=()
 logs=$(mktemp -d)
-declare -A scripts=()
+declare -A jobs=()
 # shellcheck disable=SC2317 # The trap calls it.
 end_all() {
-    for script in "${!scripts[@]}"; do kill -- "-${scripts[$script]}" 2>/dev/null || true; done
+    for job in "${!jobs[@]}"; do kill -- "-${jobs[$job]}" 2>/dev/null || true; done
     wait
     rm -rf "$logs"
 }
 trap end_all EXIT
 trap 'exit 130' INT TERM HUP
 
-# Starts a script beside whatever else runs, in a process group of its own.
-start() { # SCRIPT
+# Starts a command beside whatever else runs, in a process group of its own.
+start() { # COMMAND...
     set -m
-    FLEET_BIN=${FLEET_BIN:-$PWD/target/debug} "$1" >"$logs/${1//\//-}" 2>&1 </dev/null &
+    FLEET_BIN=$PWD/target/debug "$@" >"$logs/${*//\//-}" 2>&1 </dev/null &
     set +m
-    scripts[$1]=$!
+    jobs[$*]=$!
 }
 
-# Waits for a script of tests, and shows what it said. One that can't be run on this machine has said why, and ends with 77.
-finish() { # SCRIPT
+# Waits for a command, and shows what it said. One that can't be run on this machine has said why, and ends with 77.
+finish() { # COMMAND...
     local result=0
-    wait "${scripts[$1]}" || result=$?
-    unset "scripts[$1]"
-    printf '\n--- %s\n' "$1"
-    cat "$logs/${1//\//-}"
+    wait "${jobs[$*]}" || result=$?
+    unset "jobs[$*]"
+    printf '\n--- %s\n' "$*"
+    cat "$logs/${*//\//-}"
     case $result in
         0) ;;
-        77) skipped+=("$1") ;;
-        *) code=$result ;;
+        77) skipped+=("$*") ;;
+        *) failed+=("$*") ;;
     esac
 }
 
-# With arguments, only some tests are wanted.
-(($# > 0)) || start tests/deploy/prepare.sh
-# Most tests wait most of the time, for servers and timers.
-RUST_TEST_THREADS=${RUST_TEST_THREADS:-$((2 * $(nproc)))} cargo test --locked --no-fail-fast "$@" || code=$?
-if (($# == 0)); then
-    # Where it has failed, the scripts that need it say why.
-    wait "${scripts[tests/deploy/prepare.sh]}" || true
-    unset 'scripts[tests/deploy/prepare.sh]'
-    all=(tests/browser/run tests/deploy/package.sh tests/deploy/guide.sh)
-    echo "runs side by side, and tells when each has ended: ${all[*]}"
-    for script in "${all[@]}"; do start "$script"; done
-    for script in "${all[@]}"; do finish "$script"; done
-    # It measures times.
-    start tests/swarm.sh
-    finish tests/swarm.sh
-fi
-echo "tests: $(((SECONDS - start) / 60)) min $(((SECONDS - start) % 60)) s, build included"
+elapsed() {
+    echo "$(((SECONDS - start) / 60)) min $(((SECONDS - start) % 60)) s"
+}
+
+# Everything is built once. What makes the next build faster only costs time here.
+export CARGO_INCREMENTAL=0
+start tests/deploy/prepare.sh
+start tests/python.sh
+mkdir -p target/tmp
+! command -v dockerd >/dev/null || start tests/containers/root.sh target/tmp/containers.tar
+! command -v dockerd >/dev/null || start tests/swarm.sh prepare
+cargo test --locked --no-run
+# Where these have failed, those who need them say why.
+wait "${jobs[@]}" || true
+jobs=()
+echo "built: $(elapsed)"
+
+# All of these wait most of the time, and run side by side. What needs a machine of its own, or a daemon with images, is in
+# memory: where there is little of it, these run one after another.
+beside=('tests/browser/run' 'tests/deploy/package.sh' 'tests/deploy/guide.sh' "${CARGO[*]} --test containers" "${CARGO[*]} --test faults")
+memory=$(awk '$1 == "MemAvailable:" { print int($2 / 1024) }' /proc/meminfo)
+echo "runs side by side, and tells when each has ended: ${beside[*]@Q}"
+for command in "${beside[@]}"; do
+    # shellcheck disable=SC2086 # None of its words has a space.
+    start $command
+    # shellcheck disable=SC2086
+    ((memory > 10000)) || finish $command
+done
+"${CARGO[@]}" --lib --bins --test integration --test simulation_limits || failed+=('cargo test')
+for command in "${beside[@]}"; do
+    # shellcheck disable=SC2086
+    [[ -z ${jobs[$command]-} ]] || finish $command
+done
+# It measures times: nothing runs beside it.
+start tests/swarm.sh
+finish tests/swarm.sh
+
+echo "tests: $(elapsed), build included"
 ((${#skipped[@]} == 0)) || echo "SKIPPED, not passed: ${skipped[*]}" >&2
-exit "$code"
+((${#failed[@]} == 0)) || { printf 'FAILED: %s\n' "${failed[@]}" >&2; exit 1; }

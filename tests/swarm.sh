@@ -4,7 +4,7 @@
 #
 # dockerd runs in namespaces of its own, from which nothing can be reached. So the images that the Dockerfile begins with are
 # a Debian that debootstrap makes, kept in target/deploy, with an apt-get that has nothing to do and a cargo that copies what is built
-# already: FLEET_BIN, an absolute path, names its folder.
+# already: FLEET_BIN, an absolute path, names its folder. `tests/swarm.sh prepare` makes that Debian alone.
 set -Eeuo pipefail
 cd "$(dirname "$(readlink -f "${BASH_SOURCE[0]}")")/.."
 PATH=$PATH:/usr/sbin:/sbin
@@ -31,7 +31,7 @@ DISTRIBUTION=$(. /etc/os-release && echo "${VERSION_CODENAME-}")
 readonly DISTRIBUTION BIN=${FLEET_BIN:-$PWD/target/debug} ROOT=$PWD/target/deploy/swarm-$DISTRIBUTION
 readonly WORLD=https://github.com/webots-fleet/demo/blob/main/worlds/playground.wbt
 readonly DOOR=http://127.0.0.1:8080 VIEWER=http://localhost:8080/viewer
-[[ -x $BIN/session-server && -x $BIN/rehearse ]] || fail "there are no programs in $BIN: cargo build"
+[[ ${1-} == prepare || -x $BIN/session-server && -x $BIN/rehearse ]] || fail "there are no programs in $BIN: cargo build"
 PYTHON=$(tests/python.sh)
 readonly PYTHON
 WORK=$(mktemp -d)
@@ -177,6 +177,8 @@ if [[ ! -e $ROOT/.complete ]]; then
     rm -rf "$ROOT/var/cache/apt/archives"
     touch "$ROOT/.complete"
 fi
+# Nothing else that takes long can be made without the programs.
+[[ ${1-} != prepare ]] || exit 0
 
 # --- A machine with dockerd, which ends with this script.
 
@@ -205,7 +207,7 @@ docker node update --label-add webots-fleet.door=true "$(docker node ls --quiet)
 
 mkdir "$WORK/base"
 printf '#!/bin/sh\n' >"$WORK/base/apt-get"
-printf '#!/bin/sh\nmkdir -p target/release\ncp /programs/* target/release/\n' >"$WORK/base/cargo"
+printf '#!/bin/sh\nmkdir -p target/dist\ncp /programs/* target/dist/\n' >"$WORK/base/cargo"
 cp "$BIN"/{session-server,simulation-server,demo-simulator} "$WORK/base"
 strip "$WORK"/base/*-server "$WORK/base/demo-simulator" 2>/dev/null || true
 chmod +x "$WORK"/base/*

@@ -67,7 +67,7 @@ fn decision(server: &Server) -> Duration {
     let log = server.log();
     let line = log.lines().rfind(|line| line.contains("simulation server is available")).expect("a decision");
     let at = line.split(' ').next().expect("a line begins with its time");
-    let at: SystemTime = at.parse::<jiff::Timestamp>().expect("a time").into();
+    let at = webots_fleet::shared::run::read_timestamp(at).expect("a time");
     at.duration_since(SystemTime::UNIX_EPOCH).expect("it is later than 1970")
 }
 

@@ -137,7 +137,7 @@ async fn main() -> ExitCode {
 
 async fn soak_and_tell(verdict: &mut Verdict, starts: usize) {
     let begin = Instant::now();
-    let (before, after) = soak::soak(starts).await;
+    let (before, after) = soak::soak(starts, 1).await;
     println!("{starts} starts and stops in {:.0?}", begin.elapsed());
     println!("{:<24}{:>10}{:>10}", "", "before", "after");
     for ((name, before), (_, after)) in before.rows().iter().zip(after.rows()) {

@@ -2,10 +2,11 @@
 
 use std::fmt;
 use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::{Duration, SystemTime};
 
 use serde::{Serialize, Serializer};
 
-use crate::shared::run::seconds_since_1970;
+use crate::shared::run::{seconds_since_1970, timestamp};
 
 /// The time at which a simulation was asked for, and its number since the server's start: `20261122T220517-17`.
 ///
@@ -36,9 +37,9 @@ impl SimulationId {
 
 impl fmt::Display for SimulationId {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let asked = i64::try_from(self.asked).ok().and_then(|seconds| jiff::Timestamp::from_second(seconds).ok());
-        let asked = asked.unwrap_or(jiff::Timestamp::UNIX_EPOCH);
-        write!(out, "{}-{}", asked.strftime("%Y%m%dT%H%M%S"), self.number)
+        let asked = timestamp(SystemTime::UNIX_EPOCH + Duration::from_secs(self.asked));
+        let asked: String = asked.chars().filter(|letter| letter.is_ascii_digit() || *letter == 'T').collect();
+        write!(out, "{asked}-{}", self.number)
     }
 }
 

@@ -4,7 +4,6 @@ use std::net::TcpListener;
 use std::time::{Duration, Instant};
 
 use futures_util::StreamExt as _;
-use futures_util::future::join_all;
 use nix::sys::signal::Signal;
 use nix::sys::stat::Mode;
 use nix::unistd::mkfifo;
@@ -24,15 +23,6 @@ async fn it_listens_at_once_and_beats_first_after_one_period() {
     assert!(started.elapsed() >= Duration::from_millis(500));
     simulator.prints(&[".", "."]).await;
     assert!(started.elapsed() >= Duration::from_millis(1500));
-}
-
-#[tokio::test]
-async fn without_stdout_only_status_lines_are_printed() {
-    let project = small_project();
-    let start = Start::with(&["--batch", "--stream", "--heartbeat=20", "--port=21234"]);
-    let mut simulator = start.world(&project.path().join("worlds/a.wbt")).spawn();
-    simulator.prints(&[".", "."]).await;
-    assert!(!simulator.printed().contains(|character| character != '.' && character != '\n'));
 }
 
 #[tokio::test]
@@ -79,34 +69,6 @@ async fn a_client_that_does_not_answer_delays_the_end_by_a_second_only() {
     assert_eq!(simulator.end().await.code(), Some(0));
     assert!(signalled.elapsed() >= Duration::from_secs(1), "the client had no time to answer");
     drop(silent);
-}
-
-#[tokio::test]
-async fn it_ends_quietly_however_many_clients_there_are() {
-    let project = small_project();
-    for _ in 0..20 {
-        let world = project.path().join("worlds/a.wbt");
-        let mut simulator = Start::paused(&world).argument("--heartbeat=1").listening().await;
-        let mut viewers = Vec::new();
-        for _ in 0..50 {
-            viewers.push(simulator.spectator().await);
-        }
-        simulator.signal(Signal::SIGTERM);
-        let closing = viewers.into_iter().map(async |mut viewer| while let Some(Ok(_)) = viewer.socket.next().await {});
-        timeout(DEADLINE, join_all(closing)).await.expect("the connections did not end in time");
-        assert_eq!(simulator.end().await.code(), Some(0));
-        assert!(!simulator.printed().contains("stderr: "));
-    }
-}
-
-#[tokio::test]
-async fn a_signal_ends_it_even_while_it_reads_the_world() {
-    let project = project(&[]);
-    let world = project.path().join("worlds/slow.wbt");
-    mkfifo(&world, Mode::S_IRWXU).unwrap();
-    let mut simulator = Start::paused(&world).listening().await;
-    simulator.signal(Signal::SIGTERM);
-    assert_eq!(simulator.end().await.code(), Some(0));
 }
 
 #[tokio::test]

@@ -3,9 +3,6 @@
 //! Each simulator listens on a loopback address of its own, so that tests can run side by side with fixed
 //! ports. Whatever is waited for has a deadline; what a simulator printed is shown when its test fails.
 
-mod command_line;
-mod crowd;
-mod files;
 mod life;
 mod simulator;
 mod viewer;

@@ -9,8 +9,7 @@ use std::time::Duration;
 
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
-use tokio::io::{AsyncBufReadExt as _, AsyncRead, AsyncReadExt as _, AsyncWriteExt as _, BufReader};
-use tokio::net::TcpStream;
+use tokio::io::{AsyncBufReadExt as _, AsyncRead, BufReader};
 use tokio::process::{Child, Command};
 use tokio::sync::mpsc;
 use tokio::time::timeout;
@@ -78,14 +77,6 @@ pub(crate) fn project(files: &[(&str, &str)]) -> tempfile::TempDir {
 /// A project with the small world `a.wbt`.
 pub(crate) fn small_project() -> tempfile::TempDir {
     project(&[("a.wbt", WORLD), ("a.x3d", MODEL), ("a.motion.json", MOTION)])
-}
-
-/// A project with the world `a.wbt`, in which so many robots move.
-pub(crate) fn crowded_project(robots: usize) -> tempfile::TempDir {
-    let robot = serde_json::json!({"id": 6, "start": [1, 2, 0], "heading": 0, "radius": 0.4, "speed": 0.25});
-    let robots: serde_json::Map<_, _> = (0..robots).map(|number| (number.to_string(), robot.clone())).collect();
-    let motion = serde_json::json!({"basicTimeStep": 10, "FPS": 50, "robots": robots});
-    project(&[("a.wbt", WORLD), ("a.x3d", MODEL), ("a.motion.json", &motion.to_string())])
 }
 
 impl Start {
@@ -229,18 +220,6 @@ impl Simulator {
         viewer.say("w3d;broadcast").await;
         viewer.hears_scene().await;
         viewer
-    }
-
-    /// Sends a request line for a path just as it is; the status, the headers in lower case, and the body.
-    pub(crate) async fn get(&self, path: &str, header: &str) -> (u16, String, String) {
-        let mut stream = TcpStream::connect(self.address).await.unwrap();
-        let request = format!("GET {path} HTTP/1.1\r\nHost: test\r\nConnection: close\r\n{header}\r\n");
-        stream.write_all(request.as_bytes()).await.unwrap();
-        let mut answer = String::new();
-        timeout(DEADLINE, stream.read_to_string(&mut answer)).await.expect("no answer in time").unwrap();
-        let (head, body) = answer.split_once("\r\n\r\n").unwrap();
-        let status = head.split(' ').nth(1).unwrap().parse().unwrap();
-        (status, head.to_ascii_lowercase(), body.to_owned())
     }
 }
 

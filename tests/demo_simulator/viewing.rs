@@ -1,6 +1,6 @@
 //! Each message of a viewer, and what it hears.
 
-use super::simulator::{MODEL, MOTION, Simulator, Start, WORLD, project, small_project};
+use super::simulator::{MODEL, MOTION, Simulator, Start, WORLD, project};
 use super::viewer::time_of;
 
 async fn paused() -> (tempfile::TempDir, Simulator) {
@@ -89,36 +89,6 @@ async fn real_time_and_fast_run_until_paused_and_later_viewers_hear_which() {
 }
 
 #[tokio::test]
-async fn a_run_with_a_timeout_pauses_by_itself_and_tells_all() {
-    let (_project, mut simulator) = paused().await;
-    let (mut one, mut other) = (simulator.spectator().await, simulator.spectator().await);
-    for (command, mode, state) in [("real-time:95", "real-time", "pause: 100"), ("fast:500", "fast", "pause: 600")] {
-        one.say(command).await;
-        one.hears(&[mode]).await;
-        let updates = one.hears_after_updates(state).await;
-        assert_eq!(updates.last().map(|update| format!("pause: {}", time_of(update))), Some(state.to_owned()));
-        other.hears_after_updates(state).await;
-        simulator.prints(&[mode, "pause"]).await;
-    }
-}
-
-#[tokio::test]
-async fn a_timeout_changes_when_a_run_pauses() {
-    let (_project, mut simulator) = paused().await;
-    let mut viewer = simulator.spectator().await;
-    viewer.say("real-time:-1").await;
-    viewer.hears(&["real-time", "application/json:"]).await;
-    viewer.say("timeout:0").await;
-    loop {
-        let heard = viewer.hear().await;
-        if heard.starts_with("pause: ") {
-            break;
-        }
-    }
-    simulator.prints(&["real-time", "pause"]).await;
-}
-
-#[tokio::test]
 async fn a_viewer_that_does_not_only_look_on_pauses_a_simulation_that_runs_by_itself() {
     let (_project, mut simulator) = started_with(&["--mode=realtime"]).await;
     let mut spectator = simulator.spectator().await;
@@ -152,17 +122,6 @@ async fn a_reset_goes_back_to_the_start_for_all() {
 }
 
 #[tokio::test]
-async fn a_reset_forgets_the_timeout_and_keeps_the_mode() {
-    let (_project, simulator) = paused().await;
-    let mut viewer = simulator.spectator().await;
-    viewer.say("real-time:60000").await;
-    viewer.hears(&["real-time", "application/json:"]).await;
-    viewer.say("reset").await;
-    while viewer.hear().await != "reset finished" {}
-    viewer.hears(&["application/json:", "application/json:"]).await;
-}
-
-#[tokio::test]
 async fn reload_and_load_show_a_world_again_without_the_state() {
     let (project, mut simulator) = paused().await;
     let (mut one, mut other) = (simulator.spectator().await, simulator.spectator().await);
@@ -189,42 +148,4 @@ async fn reload_and_load_show_a_world_again_without_the_state() {
         }
     }
     simulator.prints(&["step", "pause"]).await;
-}
-
-#[tokio::test]
-async fn what_makes_no_sense_is_ignored_and_logged() {
-    let (_project, mut simulator) = started_with(&["--stderr"]).await;
-    let mut viewer = simulator.spectator().await;
-    for (text, complaint) in [
-        ("dance", "Unsupported message: \"dance\"."),
-        ("", "Unsupported message: \"\"."),
-        ("pause ", "Unsupported message: \"pause \"."),
-        ("fast:NaN", "Unsupported message: \"fast:NaN\"."),
-        ("real-time:", "Unsupported message: \"real-time:\"."),
-        ("real-time:soon", "Unsupported message: \"real-time:soon\"."),
-        ("load:missing.wbt", "there is no world \"missing.wbt\"."),
-        ("load:../../etc/passwd", "there is no world \"../../etc/passwd\"."),
-        ("load:a.x3d", "there is no world \"a.x3d\"."),
-        ("load:..", "there is no world \"..\"."),
-        ("mjpeg: 800x600", "this simulator renders no pictures."),
-    ] {
-        viewer.say(text).await;
-        simulator.has_printed(&format!("stderr: ERROR: Streaming server: {complaint}")).await;
-    }
-    viewer.say("robot:{\"name\":\"mover\",\"message\":\"hello\"}").await;
-    viewer.say("pause").await;
-    viewer.hears(&["paused by client"]).await;
-    simulator.prints(&["pause"]).await;
-    assert!(!simulator.printed().contains("hello"));
-}
-
-#[tokio::test]
-async fn without_stream_clients_are_accepted_and_ignored() {
-    let project = small_project();
-    let start = Start::with(&["--batch", "--mode=pause", "--stdout", "--port=21234"]);
-    let simulator = start.world(&project.path().join("worlds/a.wbt")).listening().await;
-    let mut viewer = simulator.viewer().await;
-    viewer.say("w3d").await;
-    viewer.say("pause").await;
-    viewer.hears_nothing().await;
 }

@@ -160,24 +160,15 @@ make_root() {
     echo "$made" >"$ROOT/.complete"
 }
 
-make_cargo_deb() {
-    ! command -v cargo-deb >/dev/null && [[ ! -x target/tools/bin/cargo-deb ]] || return 0
-    echo 'builds cargo-deb, once'
-    CARGO_PROFILE_DEV_DEBUG=0 cargo install --quiet --locked --debug --root target/tools cargo-deb
-}
-
 # Two packages: what is built here, and a later version in which every program, an example and a configuration differ.
 make_packages() {
-    local file options=(--quiet --fast --compress-type gz --compress-system --deb-revision 1 --output "$WORK/packages/1.deb")
-    rm -rf "$WORK/packages" "$WORK/unpacked"
+    local file
+    rm -rf "$WORK/packages" "$WORK/unpacked" "$WORK/release"
     mkdir -p "$WORK/packages"
-    if [[ -n ${FLEET_BIN-} ]]; then
-        mkdir -p "$WORK/built"
-        ln -sfn "$FLEET_BIN" "$WORK/built/release"
-        CARGO_TARGET_DIR=$WORK/built deploy/build-deb --no-build "${options[@]}" >/dev/null
-    else
-        deploy/build-deb "${options[@]}" >/dev/null
-    fi
+    deploy/build-release "$WORK/release" -Zgzip -z1 >/dev/null
+    (cd "$WORK/release" && sha256sum --check --quiet SHA256SUMS) || fail 'the checksums of the release are wrong'
+    mv "$WORK"/release/*.deb "$WORK/packages/1.deb"
+    mv "$WORK"/release/*.tar.gz "$WORK/packages/release.tar.gz"
     dpkg-deb --raw-extract "$WORK/packages/1.deb" "$WORK/unpacked"
     sed -i 's/^Version: .*-1$/Version: 999.0.0-2/' "$WORK/unpacked/DEBIAN/control"
     # What follows a program in its file does not change what it does.
@@ -201,7 +192,6 @@ prepare_all() {
     exec {lock}>"$DEPLOY/.lock"
     flock "$lock"
     make_root
-    make_cargo_deb
     exec {lock}>&-
 }
 

@@ -260,6 +260,14 @@ main() {
     in_machine dpkg --purge webots-fleet >"$WORK/purge.log" 2>&1 || fail "$(<"$WORK/purge.log")"
     in_machine rm /etc/systemd/user/desktop.target
     [[ -z $(traces) ]] || fail "this is left: $(traces)"
+
+    echo "starts the demo from a release's archive, where nothing can be built"
+    in_machine mkdir '/srv/a release'
+    in_machine tar --extract --file=/mnt/packages/release.tar.gz --directory='/srv/a release' --strip-components=1
+    in_machine '/srv/a release/server.sh' start demo >"$WORK/demo.log" 2>&1 || fail "$(<"$WORK/demo.log")"
+    eventually answers 1999 /status '"state":"\(up\|full\)"'
+    in_machine '/srv/a release/server.sh' stop >"$WORK/demo.log" 2>&1 || fail "$(<"$WORK/demo.log")"
+    nothing_runs || fail 'a server of the demo still runs'
     echo 'ok'
 }
 

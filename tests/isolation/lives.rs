@@ -57,7 +57,7 @@ async fn a_simulation_has_its_grace_time_at_each_level() {
         let (forge, folder) = (Forge::with_arm(), tempfile::tempdir_in(env!("CARGO_TARGET_TMPDIR")).unwrap());
         let written = folder.path().join("written");
         // As Webots' launcher does: it hands SIGTERM on, and waits.
-        let work = format!("sleep 0.3; echo saved > {}", written.display());
+        let work = format!("sleep 0.3; echo saved > \"{}\"", written.display());
         let webots = Webots::script(&format!("trap '{work}; exit 0' TERM\n{DEMO} \"$@\" & wait"));
         let builder = simulation_server(&webots.path(), forge.path(), 1).set("isolation", level);
         let server = builder.set("sandbox.writable", folder.path().to_str().unwrap()).start().await;

@@ -41,8 +41,8 @@ async fn a_reset_replaces_links_and_does_not_follow_them() {
             let victim = outside.path().join("victim");
             std::fs::write(&victim, "untouched").unwrap();
             std::fs::create_dir(outside.path().join("c")).unwrap();
-            let deed = deed.replace("VICTIM", victim.to_str().unwrap());
-            let deed = deed.replace("OUTSIDE", outside.path().to_str().unwrap());
+            let deed = deed.replace("VICTIM", &format!("'{}'", victim.display()));
+            let deed = deed.replace("OUTSIDE", &format!("'{}'", outside.path().display()));
             // What a project's folder says of files and repositories is not for the server's git.
             let git = "echo '*.py working-tree-encoding=UTF-16' > .gitattributes; echo 'gitdir: /tmp' > .git";
             let webots = Webots::script(&format!("{deed}\n{git}\n{DEMO} \"$@\" & wait"));
@@ -82,7 +82,7 @@ const EXCHANGE: &str = "import ctypes, os, sys\n\
 async fn who_exchanges_folders_and_links_during_a_reset_leads_nothing_out_of_the_project() {
     let (forge, outside) = (Forge::with_arm(), tempfile::tempdir_in(env!("CARGO_TARGET_TMPDIR")).unwrap());
     let outside_shown = outside.path().display();
-    let webots = Webots::script(&format!("python3 -c \"{EXCHANGE}\" {outside_shown} &\n{DEMO} \"$@\" & wait"));
+    let webots = Webots::script(&format!("python3 -c \"{EXCHANGE}\" '{outside_shown}' &\n{DEMO} \"$@\" & wait"));
     let server = simulation_server(&webots.path(), forge.path(), 1).set("isolation", "sandbox");
     // A client may ask for so much between two pings.
     let server = server.set("timing.ping", 0.2).start().await;

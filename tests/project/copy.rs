@@ -157,7 +157,7 @@ impl Drop for Project {
 }
 
 /// The folder of the programs under test.
-fn programs() -> &'static Path {
+pub fn programs() -> &'static Path {
     Path::new(env!("CARGO_BIN_EXE_session-server")).parent().unwrap()
 }
 

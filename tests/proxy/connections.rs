@@ -68,32 +68,6 @@ async fn the_documents_rules_keep_what_is_pinged_and_cut_what_is_silent() {
     a_door_still_answers(&mut door).await;
 }
 
-/// Far more connections than a web server's defaults have room for.
-const CLASS: usize = 200;
-
-async fn a_class_has_room(rules: Rules) {
-    let fleet = Fleet::start(rules).await;
-    let doors = futures_util::stream::iter(0..CLASS).map(|_| fleet.browser.connect("/session"));
-    let mut doors: Vec<Client> = doors.buffer_unordered(8).collect().await;
-    for door in &mut doors {
-        door.until("").await;
-    }
-    for door in &mut doors {
-        a_door_still_answers(door).await;
-    }
-    fleet.both_up().await;
-}
-
-#[actix_rt::test]
-async fn a_class_has_room_behind_apache() {
-    a_class_has_room(Rules::Apache).await;
-}
-
-#[actix_rt::test]
-async fn a_class_has_room_behind_nginx() {
-    a_class_has_room(Rules::Nginx).await;
-}
-
 /// What a live page is told, or the pictures of a Webots that streams a video.
 async fn what_is_sent_in_pieces_comes_in_pieces(rules: Rules) {
     let fleet = Fleet::start(rules).await;
@@ -131,11 +105,6 @@ async fn what_is_sent_in_pieces_comes_in_pieces_through_apache() {
 #[actix_rt::test]
 async fn what_is_sent_in_pieces_comes_in_pieces_through_nginx() {
     what_is_sent_in_pieces_comes_in_pieces(Rules::Nginx).await;
-}
-
-#[actix_rt::test]
-async fn what_is_sent_in_pieces_comes_in_pieces_with_the_documents_rules() {
-    what_is_sent_in_pieces_comes_in_pieces(Rules::DocumentsMachine).await;
 }
 
 async fn a_restart_costs_only_connections_of_its_own(rules: Rules) {

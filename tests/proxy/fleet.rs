@@ -32,7 +32,7 @@ pub struct Fleet {
 /// How many simulations fit on each simulation server.
 const PLACES: u16 = 3;
 /// A web server's default, shortened: connections on which nothing is sent for so long are closed.
-pub const IDLE: Duration = Duration::from_secs(2);
+pub const IDLE: Duration = Duration::from_secs(4);
 
 impl Fleet {
     pub async fn start(rules: Rules) -> Self {

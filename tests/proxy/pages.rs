@@ -88,12 +88,3 @@ async fn pages_behind_apache_are_complete_and_live() {
 async fn pages_behind_nginx_are_complete_and_live() {
     pages_are_complete_and_live(Rules::Nginx).await;
 }
-
-#[actix_rt::test]
-async fn pages_behind_the_documents_rules_are_complete() {
-    let fleet = Fleet::start(Rules::DocumentsMachine).await;
-    for page in ["/monitor", "/viewer"] {
-        has_all_that_it_loads(&fleet.browser, &format!("/{}{page}", fleet.session.port)).await;
-    }
-    has_all_that_it_loads(&fleet.browser, &format!("/{}/monitor", fleet.there.port)).await;
-}

@@ -67,13 +67,3 @@ async fn urls_lead_through_apache() {
 async fn urls_lead_through_nginx() {
     urls_lead_through_the_web_server(Rules::Nginx).await;
 }
-
-#[actix_rt::test]
-async fn urls_lead_through_apache_with_the_documents_rule_for_ports() {
-    urls_lead_through_the_web_server(Rules::DocumentsPorts).await;
-}
-
-#[actix_rt::test]
-async fn urls_lead_through_apache_with_the_documents_rules_for_a_machine() {
-    urls_lead_through_the_web_server(Rules::DocumentsMachine).await;
-}

@@ -1,4 +1,5 @@
-//! A visitor with a real browser: from the first click on the viewer page to the end of the simulation.
+//! A visitor with a real browser: from the first click on the viewer page to the end of the simulation. With our rules, tests/deploy/guide.sh
+//! does the same.
 
 use std::path::{Path, PathBuf};
 use std::process::Stdio;
@@ -19,7 +20,9 @@ fn program(variable: &str, default: &str, how: &str) -> PathBuf {
     program
 }
 
-async fn a_visitor_gets_a_simulation(rules: Rules) {
+#[actix_rt::test]
+async fn a_visitor_gets_a_simulation_with_the_documents_rules() {
+    let rules = Rules::DocumentsMachine;
     let root = Path::new(env!("CARGO_MANIFEST_DIR"));
     let python = root.join("target/test-venv/bin/python");
     let python = program("FLEET_TEST_PYTHON", python.to_str().unwrap(), "tests/python.sh makes it");
@@ -29,7 +32,6 @@ async fn a_visitor_gets_a_simulation(rules: Rules) {
     let visit = Command::new(python)
         .arg(root.join("tests/browser/through_web_server.py"))
         .arg(page)
-        .args((rules != Rules::DocumentsMachine).then_some("--own-origin"))
         .env("PYTHONDONTWRITEBYTECODE", "1")
         .stdin(Stdio::null())
         .kill_on_drop(true)
@@ -49,19 +51,4 @@ async fn a_visitor_gets_a_simulation(rules: Rules) {
         })
         .await;
     }
-}
-
-#[actix_rt::test]
-async fn a_visitor_gets_a_simulation_through_apache() {
-    a_visitor_gets_a_simulation(Rules::Apache).await;
-}
-
-#[actix_rt::test]
-async fn a_visitor_gets_a_simulation_through_nginx() {
-    a_visitor_gets_a_simulation(Rules::Nginx).await;
-}
-
-#[actix_rt::test]
-async fn a_visitor_gets_a_simulation_with_the_documents_rules() {
-    a_visitor_gets_a_simulation(Rules::DocumentsMachine).await;
 }

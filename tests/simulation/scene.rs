@@ -11,7 +11,7 @@ use crate::support::program::{Builder, Server, simulation_server};
 use crate::support::webots::{Webots, instances_below};
 use crate::support::{http, until};
 
-pub const DEMO: &str = env!("CARGO_BIN_EXE_demo-simulator");
+pub const DEMO: &str = concat!("'", env!("CARGO_BIN_EXE_demo-simulator"), "'");
 
 /// The states of a simulation.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -32,7 +32,7 @@ pub struct Inside {
 }
 
 const DEMO: &str =
-    concat!("export DEMO_SIMULATOR_BIND=127.0.0.1; ", env!("CARGO_BIN_EXE_demo-simulator"), " \"$@\" &\n");
+    concat!("export DEMO_SIMULATOR_BIND=127.0.0.1; '", env!("CARGO_BIN_EXE_demo-simulator"), "' \"$@\" &\n");
 
 /// The text of a Webots whose simulation comes to a certain state, and stays there. One that is to be stopping ignores
 /// SIGTERM and has a child that hides.

@@ -21,7 +21,7 @@ impl Webots {
     /// The launcher of the real Webots: it starts the simulator as its child, hands SIGTERM on, and waits.
     pub fn launcher() -> Self {
         Self::script(&format!(
-            "trap 'kill -TERM $child' TERM INT\n{} \"$@\" &\nchild=$!\nwait $child\ncode=$?\ntrap - TERM INT\nwait $child 2>/dev/null\nexit $code",
+            "trap 'kill -TERM $child' TERM INT\n'{}' \"$@\" &\nchild=$!\nwait $child\ncode=$?\ntrap - TERM INT\nwait $child 2>/dev/null\nexit $code",
             env!("CARGO_BIN_EXE_demo-simulator")
         ))
     }

@@ -1,10 +1,8 @@
 //! What is shown while a rehearsal runs: how many clients are where.
 
 use std::cell::{Cell, RefCell};
-use std::io::IsTerminal;
+use std::io::{IsTerminal, Write};
 use std::time::{Duration, Instant};
-
-use indicatif::{ProgressBar, ProgressStyle};
 
 /// Where a client is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -19,7 +17,6 @@ pub(crate) enum Stage {
 
 /// Counts clients by stage, and shows that on the terminal.
 pub(crate) struct Board {
-    bar: ProgressBar,
     start: Instant,
     counts: [Cell<u32>; 3],
     asked: Cell<u32>,
@@ -34,13 +31,7 @@ const BETWEEN_LINES: Duration = Duration::from_secs(10);
 impl Board {
     /// An empty board whose clock starts now.
     pub(crate) fn new() -> Self {
-        let bar = ProgressBar::new_spinner();
-        // A template that can't be read costs the looks alone.
-        if let Ok(style) = ProgressStyle::with_template("{spinner} {msg}") {
-            bar.set_style(style);
-        }
         Self {
-            bar,
             start: Instant::now(),
             counts: Default::default(),
             asked: Cell::default(),
@@ -91,8 +82,7 @@ impl Board {
             actix_rt::time::sleep(Duration::from_secs(1)).await;
             let line = self.line();
             if std::io::stderr().is_terminal() {
-                self.bar.set_message(line);
-                self.bar.tick();
+                rewrite_line(&line);
             } else if told.elapsed() >= BETWEEN_LINES {
                 told = Instant::now();
                 eprintln!("{line}");
@@ -102,7 +92,9 @@ impl Board {
 
     /// Removes what was shown.
     pub(crate) fn clear(&self) {
-        self.bar.finish_and_clear();
+        if std::io::stderr().is_terminal() {
+            rewrite_line("");
+        }
     }
 
     fn line(&self) -> String {
@@ -122,6 +114,14 @@ impl Board {
             self.done.get()
         )
     }
+}
+
+/// Writes a text over the terminal's last line, which it cuts where the terminal ends.
+fn rewrite_line(text: &str) {
+    // To the begin of the line, without wrapping; what was there is erased.
+    let written = write!(std::io::stderr(), "\r\x1b[?7l\x1b[2K{text}\x1b[?7h");
+    // The reader may have gone.
+    written.and_then(|()| std::io::stderr().flush()).ok();
 }
 
 /// Counts a client at its stage.

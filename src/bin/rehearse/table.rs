@@ -1,15 +1,10 @@
 //! The numbers of a rehearsal as a text that a teacher reads. Pure.
 
 use std::collections::BTreeMap;
-
-use comfy_table::presets::ASCII_MARKDOWN;
-use comfy_table::{CellAlignment, ContentArrangement, Table};
+use std::fmt;
 
 use crate::factors::Factors;
 use crate::report::Report;
-
-/// As wide as a terminal is, at least.
-const WIDTH: u16 = 100;
 
 /// All tables, and the verdict below them.
 pub(crate) fn text(report: &Report) -> String {
@@ -32,10 +27,8 @@ pub(crate) fn text(report: &Report) -> String {
 
 fn seats(report: &Report) -> String {
     let seats = &report.seats;
-    let mut table = table(&["Seats", ""]);
-    let mut add = |what: &str, number: u32| {
-        table.add_row(vec![what.to_owned(), number.to_string()]);
-    };
+    let mut table = Table::new(&["Seats", ""]);
+    let mut add = |what: &str, number: u32| table.add(vec![what.to_owned(), number.to_string()]);
     add("asked for", seats.asked);
     add("given", seats.given);
     add("of these fit: to the end, in real time", seats.fit);
@@ -54,7 +47,6 @@ fn seats(report: &Report) -> String {
     if seats.left > 0 {
         add("left before it ran", seats.left);
     }
-    right(&mut table, 1);
     table.to_string()
 }
 
@@ -65,21 +57,20 @@ fn reasons(reasons: &BTreeMap<String, u32>) -> impl Iterator<Item = (&String, &u
 }
 
 fn times(report: &Report) -> String {
-    let mut table = table(&["Until it runs", "median", "95 %", "worst"]);
+    let mut table = Table::new(&["Until it runs", "median", "95 %", "worst"]);
     for row in &report.times {
         let seconds = [row.median, row.p95, row.worst].map(|time| format!("{time:.1} s"));
-        table.add_row(std::iter::once(row.step.to_owned()).chain(seconds).collect::<Vec<_>>());
+        table.add(std::iter::once(row.step.to_owned()).chain(seconds).collect::<Vec<_>>());
     }
-    (1..=3).for_each(|column| right(&mut table, column));
     table.to_string()
 }
 
 fn servers(report: &Report) -> String {
-    let mut table = table(&["Simulation server", "seats", "at once", "peak load", "real time, 5 %", "median"]);
+    let mut table = Table::new(&["Simulation server", "seats", "at once", "peak load", "real time, 5 %", "median"]);
     for server in &report.servers {
         let load = server.peak_load.map_or_else(|| "-".to_owned(), |load| format!("{load:.0} %"));
         let [p5, median] = pace(server.pace);
-        table.add_row(vec![
+        table.add(vec![
             server.address.clone(),
             server.seats.to_string(),
             server.most_at_once.to_string(),
@@ -91,9 +82,8 @@ fn servers(report: &Report) -> String {
     if report.servers.len() > 1 {
         let [p5, median] = pace(report.pace);
         let given = report.seats.given.to_string();
-        table.add_row(vec!["all".to_owned(), given, String::new(), String::new(), p5, median]);
+        table.add(vec!["all".to_owned(), given, String::new(), String::new(), p5, median]);
     }
-    (1..=5).for_each(|column| right(&mut table, column));
     table.to_string()
 }
 
@@ -101,15 +91,40 @@ fn pace(factors: Option<Factors>) -> [String; 2] {
     factors.map_or_else(|| ["-".to_owned(), "-".to_owned()], |all| [all.p5, all.median].map(|one| format!("{one:.2}")))
 }
 
-fn table(header: &[&str]) -> Table {
-    let mut table = Table::new();
-    table.load_style(ASCII_MARKDOWN).set_content_arrangement(ContentArrangement::Dynamic).set_width(WIDTH);
-    table.set_header(header.to_vec());
-    table
+/// A table in Markdown whose columns are aligned: texts in the first, numbers in the others.
+struct Table {
+    header: Vec<String>,
+    rows: Vec<Vec<String>>,
 }
 
-fn right(table: &mut Table, column: usize) {
-    if let Some(column) = table.column_mut(column) {
-        column.set_cell_alignment(CellAlignment::Right);
+impl Table {
+    fn new(header: &[&str]) -> Self {
+        Self { header: header.iter().map(|title| (*title).to_owned()).collect(), rows: Vec::new() }
+    }
+
+    fn add(&mut self, row: Vec<String>) {
+        self.rows.push(row);
+    }
+}
+
+impl fmt::Display for Table {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let all = || std::iter::once(&self.header).chain(&self.rows);
+        let width =
+            |column: usize| all().filter_map(|row| row.get(column)).map(|cell: &String| cell.chars().count()).max();
+        let widths: Vec<usize> = (0..self.header.len()).map(|column| width(column).unwrap_or(0)).collect();
+        for (number, row) in all().enumerate() {
+            if number > 0 {
+                writeln!(out)?;
+            }
+            for (column, (cell, width)) in row.iter().zip(&widths).enumerate() {
+                if column == 0 { write!(out, "| {cell:<width$} |")? } else { write!(out, " {cell:>width$} |")? }
+            }
+            if number == 0 {
+                let line: String = widths.iter().map(|width| format!("{:-<1$}|", "", width + 2)).collect();
+                write!(out, "\n|{line}")?;
+            }
+        }
+        Ok(())
     }
 }

@@ -4,13 +4,14 @@
 use std::net::IpAddr;
 use std::num::NonZeroU32;
 
-use actix_web::http::header::{self, Header};
+use actix_web::http::header;
 use actix_web::{HttpRequest, HttpResponse};
-use actix_web_httpauth::headers::authorization::{Authorization, Basic};
-use constant_time_eq::constant_time_eq;
+use base64::Engine;
+use base64::prelude::BASE64_STANDARD;
 use governor::clock::DefaultClock;
 use governor::state::keyed::HashMapStateStore;
 use governor::{Quota, RateLimiter};
+use subtle::ConstantTimeEq;
 
 use super::paths::retry_after;
 use super::peer::Peer;
@@ -53,14 +54,12 @@ impl BasicAuth {
     /// # Errors
     /// When the password is missing or wrong, or `peer` has sent too many.
     pub fn check(&self, request: &HttpRequest, peer: Peer) -> Result<(), AuthError> {
-        let given = Authorization::<Basic>::parse(request).map(Authorization::into_scheme);
-        let given = given.map_err(|_| AuthError::NoPassword)?;
-        let given = given.password().ok_or(AuthError::NoPassword)?;
+        let given = password_of(request).ok_or(AuthError::NoPassword)?;
         // A proxy that says nothing of its clients stands for all of them.
         if !self.may_try(peer) {
             return Err(AuthError::TooMany);
         }
-        if constant_time_eq(given.as_bytes(), self.password.reveal().as_bytes()) {
+        if given.as_bytes().ct_eq(self.password.reveal().as_bytes()).into() {
             return Ok(());
         }
         log::warn!("client {peer}: a wrong administrator password");
@@ -73,6 +72,16 @@ impl BasicAuth {
         }
         self.attempts.len() < MAX_ADDRESSES && self.attempts.check_key(&peer.rate_limit_key()).is_ok()
     }
+}
+
+/// The password that a request brings, with whatever user name.
+fn password_of(request: &HttpRequest) -> Option<String> {
+    let (scheme, credentials) = request.headers().get(header::AUTHORIZATION)?.to_str().ok()?.split_once(' ')?;
+    if !scheme.eq_ignore_ascii_case("basic") {
+        return None;
+    }
+    let text = String::from_utf8(BASE64_STANDARD.decode(credentials.trim()).ok()?).ok()?;
+    text.split_once(':').map(|(_, password)| password.to_owned())
 }
 
 impl AuthError {

@@ -4,6 +4,7 @@
 //! environment variables `SSL_CERT_FILE` and `SSL_CERT_DIR` is set, it is that file or folder alone.
 
 use std::sync::Arc;
+use std::time::{Duration, SystemTime};
 
 use awc::error::{ConnectError, SendRequestError};
 use rustls::client::danger::{HandshakeSignatureValid, ServerCertVerified, ServerCertVerifier};
@@ -14,6 +15,8 @@ use rustls::server::ParsedCertificate;
 use rustls::{
     CertificateError, ClientConfig, DigitallySignedStruct, Error, OtherError, RootCertStore, SignatureScheme,
 };
+
+use crate::shared::run::timestamp;
 
 /// Returns how requests are encrypted; `None` where rustls can't be set up.
 ///
@@ -158,6 +161,6 @@ fn bare(name: &str) -> &str {
 }
 
 fn date(seconds: u64) -> String {
-    let time = i64::try_from(seconds).ok().and_then(|seconds| jiff::Timestamp::from_second(seconds).ok());
-    time.map_or_else(|| "a day that is none".to_owned(), |time| format!("{time:.0}"))
+    let time = SystemTime::UNIX_EPOCH.checked_add(Duration::from_secs(seconds)).map(timestamp).unwrap_or_default();
+    if time.is_empty() { "a day that is none".to_owned() } else { time }
 }

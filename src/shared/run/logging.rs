@@ -7,6 +7,7 @@ use std::path::Path;
 use env_logger::{Builder, Env, Target};
 
 use super::rotated_file::RotatedFile;
+use super::timestamp::timestamp_in_milliseconds;
 use crate::shared::text::one_line;
 
 /// How many old files are kept beside the newest. The Python servers keep as many.
@@ -59,7 +60,7 @@ pub fn start(target: LogTarget<'_>) -> std::io::Result<()> {
         LogTarget::File(path) => Target::Pipe(Box::new(RotatedFile::open(path, OLD_FILES)?)),
     });
     builder.format(|out, record| {
-        let time = timestamp(std::time::SystemTime::now());
+        let time = timestamp_in_milliseconds(std::time::SystemTime::now());
         writeln!(
             out,
             "{time} [{:<5}] {}: {}",
@@ -76,8 +77,4 @@ pub fn start(target: LogTarget<'_>) -> std::io::Result<()> {
 /// A module's path without the name of the crate.
 fn short(target: &str) -> &str {
     target.strip_prefix("webots_fleet::").unwrap_or(target)
-}
-
-fn timestamp(now: std::time::SystemTime) -> impl fmt::Display {
-    jiff::Timestamp::try_from(now).map_or_else(|_| String::from("-"), |time| format!("{time:.3}"))
 }

@@ -1,14 +1,14 @@
 //! Removes images of this server that were not used for long, or are too many.
 
 use std::collections::HashMap;
-use std::time::Duration;
+use std::time::{Duration, SystemTime};
 
 use bytesize::ByteSize;
-use jiff::Timestamp;
 
 use super::docker::{DockerError, SHORT};
 use super::dockerfile::LABEL;
 use super::image::Images;
+use crate::shared::run::read_timestamp;
 
 /// An image that this server has built.
 #[derive(Debug)]
@@ -16,7 +16,7 @@ struct Own {
     name: String,
     /// Bytes.
     size: u64,
-    used: Timestamp,
+    used: SystemTime,
 }
 
 impl Images {
@@ -58,10 +58,10 @@ impl Images {
         for name in names {
             let format = "{{json .Metadata.LastTagTime}}";
             let used = self.docker.run(&["image", "inspect", "--format", format, name], SHORT).await?;
-            let used: Option<Timestamp> = used.trim().trim_matches('"').parse().ok();
+            let used = read_timestamp(used.trim().trim_matches('"'));
             let size: Option<ByteSize> = sizes.get(name).and_then(|size| size.parse().ok());
             let size = size.map_or(0, |size| size.as_u64());
-            own.push(Own { name: name.to_owned(), size, used: used.unwrap_or_else(Timestamp::now) });
+            own.push(Own { name: name.to_owned(), size, used: used.unwrap_or_else(SystemTime::now) });
         }
         Ok(own)
     }
@@ -71,7 +71,7 @@ impl Images {
 fn removable(mut own: Vec<Own>, kept: &[String], age: Duration, most: u64) -> Vec<String> {
     own.retain(|image| !kept.contains(&image.name));
     own.sort_by_key(|image| std::cmp::Reverse(image.used));
-    let oldest = Timestamp::now().checked_sub(age).unwrap_or(Timestamp::MIN);
+    let oldest = SystemTime::now().checked_sub(age).unwrap_or(SystemTime::UNIX_EPOCH);
     let mut total = 0_u64;
     let too_many = own.into_iter().filter(|image| {
         total = total.saturating_add(image.size);
@@ -88,7 +88,7 @@ mod tests {
 
     #[test]
     fn the_longest_unused_images_go_first_and_those_that_are_to_be_kept_stay() {
-        let hours = |hours| Timestamp::now().checked_sub(Duration::from_hours(hours)).unwrap();
+        let hours = |hours| SystemTime::now().checked_sub(Duration::from_hours(hours)).unwrap();
         let own = |name: &str, size, used| Own { name: name.to_owned(), size, used: hours(used) };
         let all = || vec![own("old", 1, 100), own("new", 5, 1), own("middle", 5, 2), own("kept", 50, 200)];
         let kept = ["kept".to_owned()];

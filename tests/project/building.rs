@@ -1,0 +1,59 @@
+//! What `server.sh` builds, with a cargo that only notes what it is asked for and hands out the programs under test.
+
+use std::os::unix::fs::PermissionsExt;
+use std::process::Command;
+
+use super::copy::{Project, programs};
+
+const CARGO: &str = r#"#!/bin/sh
+echo "$@" >>calls
+mkdir -p target/release
+cp "$PROGRAMS"/session-server "$PROGRAMS"/simulation-server "$PROGRAMS"/demo-simulator target/release
+"#;
+
+/// What a start prints, and what it asks cargo for. The servers are stopped again.
+fn start(project: &Project, name: &str) -> (String, String) {
+    let server_sh = |arguments: &[&str]| {
+        let path = format!("{}:{}", project.path("bin-of-cargo").display(), std::env::var("PATH").unwrap());
+        let mut command = Command::new(project.path("server.sh"));
+        let output = command
+            .args(arguments)
+            .env("PATH", path)
+            .env("PROGRAMS", programs())
+            .env_remove("FLEET_BIN")
+            .output()
+            .unwrap();
+        let said = String::from_utf8_lossy(&output.stdout).into_owned();
+        assert!(output.status.success(), "{said}{}", String::from_utf8_lossy(&output.stderr));
+        said
+    };
+    let said = server_sh(&["start", name]);
+    server_sh(&["stop", name]);
+    let calls = std::fs::read_to_string(project.path("calls")).unwrap_or_default();
+    std::fs::write(project.path("calls"), "").unwrap();
+    (said, calls)
+}
+
+#[test]
+fn a_start_builds_the_programs_that_it_starts_when_their_source_has_changed() {
+    let project = Project::copy();
+    for folder in ["src", "templates", "bin-of-cargo"] {
+        std::fs::create_dir(project.path(folder)).unwrap();
+    }
+    for file in ["Cargo.toml", "Cargo.lock", "rust-toolchain.toml", "src/lib.rs"] {
+        std::fs::write(project.path(file), "").unwrap();
+    }
+    std::fs::write(project.path("bin-of-cargo/cargo"), CARGO).unwrap();
+    std::fs::set_permissions(project.path("bin-of-cargo/cargo"), PermissionsExt::from_mode(0o755)).unwrap();
+    let servers = "build --release --locked --bin simulation-server --bin session-server";
+
+    let (said, asked) = start(&project, "demo");
+    assert!(said.starts_with("builds the programs first, which takes about three minutes on two cores"), "{said}");
+    assert_eq!(asked, format!("{servers} --bin demo-simulator --target-dir target\n"));
+    assert_eq!(start(&project, "demo").1, "", "nothing has changed");
+    std::fs::write(project.path("src/lib.rs"), "// changed").unwrap();
+    let (said, asked) = start(&project, "local");
+    assert!(!said.contains("three minutes"), "{said}");
+    assert_eq!(asked, format!("{servers} --target-dir target\n"));
+    assert_eq!(start(&project, "demo").1, format!("{servers} --bin demo-simulator --target-dir target\n"));
+}
