@@ -16,7 +16,7 @@ use super::output::{OutputEvent, Tail};
 use super::runtime::{Preparation, Runtime};
 use crate::shared::run::seconds_since_1970;
 use crate::simulation::checkout::CheckoutError;
-use crate::simulation::container::{Cause, until_answering};
+use crate::simulation::container::{Cause, StartError};
 use crate::simulation::machine::display;
 use crate::simulation::process::{ExitReason, ProcessGroup};
 use crate::simulation::snapshot::{Change, Stage};
@@ -41,6 +41,8 @@ pub struct Webots {
     group: Option<ProcessGroup>,
     /// Asks to start the controller of a competition's participant anew.
     restart: Option<Arc<Notify>>,
+    /// The wait until it listens.
+    awaiting: Option<SpawnHandle>,
     tail: Tail,
     listening: bool,
     /// Whether the simulation is not paused.
@@ -65,6 +67,7 @@ impl Webots {
             preparing: None,
             group: None,
             restart: None,
+            awaiting: None,
             tail: Tail::default(),
             listening: false,
             runs: false,
@@ -82,7 +85,8 @@ impl Webots {
         let prepared = Preparation::of(&self.spec).run(progress).into_actor(self);
         self.preparing = Some(ctx.spawn(prepared.map(|prepared, this, ctx| match prepared {
             Ok(runtime) => this.launch(runtime, ctx),
-            Err(why) => this.not_started(&why, ctx),
+            Err(StartError::Project(why)) => this.exited(Exit { own: false, ..this.failure(&why) }, ctx),
+            Err(StartError::Server(why)) => this.not_started(&why, ctx),
         })));
     }
 
@@ -95,7 +99,8 @@ impl Webots {
             return self.not_started(&format!("Webots can't be started: {error}"), ctx);
         }
         self.tell(WebotsEvent::Started);
-        self.await_port(ctx);
+        // A container says itself when it runs.
+        self.spec.containers.is_none().then(|| self.await_port(ctx));
         ctx.run_interval(self.spec.config.timing.heartbeat, Self::check_heartbeat);
         let limit = self.spec.config.timing.launch;
         ctx.run_later(limit, move |this, _| {
@@ -125,18 +130,16 @@ impl Webots {
         Ok(())
     }
 
-    /// Waits until its container answers, or a process of this instance listens on a port that Webots may have taken.
-    fn await_port(&self, ctx: &mut Context<Self>) {
-        if self.spec.containers.is_some() {
-            let answering = until_answering(self.spec.config.bind, self.port).into_actor(self);
-            answering.map(|(), this, _| this.ready(this.port)).spawn(ctx);
-        } else if let Some(root) = self.group.as_ref().map(ProcessGroup::leader) {
-            let listening = self.spec.listening_port(root).into_actor(self);
-            listening.map(|port, this, _| this.ready(port)).spawn(ctx);
+    /// Waits until it listens, unless it does or is waited for.
+    fn await_port(&mut self, ctx: &mut Context<Self>) {
+        if let (Some(group), None, false) = (&self.group, self.awaiting, self.listening) {
+            let listening = self.spec.listening_port(group.leader()).into_actor(self);
+            self.awaiting = Some(ctx.spawn(listening.map(|port, this, ctx| this.ready(port, ctx))));
         }
     }
 
-    fn ready(&mut self, port: u16) {
+    fn ready(&mut self, port: u16, ctx: &mut Context<Self>) {
+        self.awaiting.take().map(|awaiting| ctx.cancel_future(awaiting));
         if self.stopped_for.is_some() || self.listening {
             return;
         }
@@ -186,9 +189,7 @@ impl Webots {
             log::info!("port {}: ending: {why}", self.port);
             self.stopped_for = Some(why.to_owned());
             self.spec.place.0.update(Change::Stage(Stage::Stopping));
-            if let Some(group) = &mut self.group {
-                group.terminate();
-            }
+            self.group.iter_mut().for_each(ProcessGroup::terminate);
         }
     }
 
@@ -204,7 +205,7 @@ impl Webots {
 
     fn ended(&mut self, End { reason, cause }: &End, ctx: &mut Context<Self>) {
         log::info!("port {}: Webots {reason}", self.port);
-        let is_lost = self.stopped_for.is_none() && *cause == Some(Cause::Docker);
+        let is_lost = self.stopped_for.is_none() && cause.is_some_and(Cause::is_own);
         let mut exit = match self.stopped_for.take().or(cause.map(event::words).map(str::to_owned)) {
             Some(why) if is_lost => Exit { own: true, ..self.failure(&why) },
             Some(why) => self.failure(&why),
@@ -230,7 +231,7 @@ impl Webots {
     }
 
     fn not_started(&mut self, why: &str, ctx: &mut Context<Self>) {
-        self.exited(self.failure(why), ctx);
+        self.exited(Exit { own: true, ..self.failure(why) }, ctx);
     }
 
     fn exited(&mut self, exit: Exit, ctx: &mut Context<Self>) {
@@ -260,13 +261,14 @@ impl Actor for Webots {
 impl Handler<OutputEvent> for Webots {
     type Result = ();
 
-    fn handle(&mut self, event: OutputEvent, _: &mut Self::Context) {
+    fn handle(&mut self, event: OutputEvent, ctx: &mut Self::Context) {
         self.last_heartbeat = Instant::now();
         self.hanging = false;
         match event {
             OutputEvent::Heartbeat if self.listening => self.tell(WebotsEvent::Heartbeat),
-            OutputEvent::Heartbeat if self.spec.containers.is_some() => self.ready(self.port),
+            OutputEvent::Heartbeat if self.spec.containers.is_some() => self.ready(self.port, ctx),
             OutputEvent::Heartbeat => {}
+            OutputEvent::ContainerRuns => self.await_port(ctx),
             OutputEvent::Reset => self.restart.iter().for_each(|controller| controller.notify_one()),
             OutputEvent::Paused | OutputEvent::Running => {
                 self.runs = event == OutputEvent::Running;
