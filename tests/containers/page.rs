@@ -59,6 +59,11 @@ async fn the_commands_of_the_page_on_containers_lead_to_a_server_that_can_start(
         std::fs::create_dir_all(folder.path().join(part)).unwrap();
     }
     std::fs::write(folder.path().join(configuration).join("main.json"), &blocks("json")[0]).unwrap();
+    // The images of the tests are those of one version.
+    let commands = blocks("sh").concat();
+    for image in commands.lines().filter_map(|line| line.strip_prefix("docker pull cyberbotics/webots.cloud:")) {
+        ask(&["tag", NAME, &format!("cyberbotics/webots.cloud:{image}")]);
+    }
     script(&bin, "apt-get", "");
     script(&bin, "systemctl", "");
     script(
@@ -75,7 +80,7 @@ async fn the_commands_of_the_page_on_containers_lead_to_a_server_that_can_start(
     let output = Command::new("unshare")
         .args(["--mount", "--net", "--propagation", "private", "bash", "-c", machine])
         .arg(folder.path())
-        .arg(blocks("sh").concat())
+        .arg(&commands)
         .current_dir(env!("CARGO_MANIFEST_DIR"))
         .env("PATH", format!("{}:{}", bin.display(), std::env::var("PATH").unwrap()))
         .env("DOCKER_HOST", host())
@@ -103,7 +108,8 @@ async fn the_dockerfile_of_the_page_on_containers_is_built_and_runs() {
     let files = [("Dockerfile", blocks("dockerfile").concat()), ("controllers/mine/Makefile", makefile.to_owned())];
     forge.commit("lab/arm", "main", &files.each_ref().map(|(path, text)| (*path, text.as_str())));
     let server = server(forge.path(), 1).set("container", serde_json::json!({ "image": image })).start().await;
-    Client::start(&server, &arm()).await.patiently("webots:", BUILT).await;
+    let mut client = Client::start(&server, &arm()).await;
+    client.patiently("webots:", BUILT).await;
     let made = "/usr/local/webots-project/controllers/mine/made";
     ask(&["exec", &of_service(&server, "webots")[0], "ls", made]);
 }

@@ -1,6 +1,6 @@
 //! What the containers of simulations take: from their control groups, else from `docker stats`, once for all.
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use super::objects::{Owner, PROJECT, quietly};
@@ -15,7 +15,7 @@ fn cgroups(container: &str) -> [PathBuf; 2] {
 /// Measures the simulations of an owner: those on these ports, whose processes are named for each. Blocks for some
 /// milliseconds; for two seconds where control groups can't be read.
 #[must_use]
-pub fn measure(owner: &Owner, roots: &HashMap<u16, i32>) -> Vec<(i32, Measured)> {
+pub fn measure(owner: &Owner, roots: &BTreeMap<u16, i32>) -> Vec<(i32, Measured)> {
     let (filter, format) = (format!("label={PROJECT}"), format!("{{{{.ID}}}} {{{{.Label \"{PROJECT}\"}}}}"));
     let listed = quietly(&["ps", "--no-trunc", "--filter", &filter, "--format", &format]);
     let found = listed.lines().filter_map(|line| line.split_once(' '));

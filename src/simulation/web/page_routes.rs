@@ -1,6 +1,6 @@
 //! The paths of the simulation server's page, with what it loads and listens to, and of Webots' own viewer.
 
-use std::collections::HashMap;
+use std::collections::BTreeMap;
 use std::io::{Read, Seek, SeekFrom};
 use std::path::Path;
 
@@ -49,7 +49,7 @@ async fn usages(server: &AppState, snapshot: &Snapshot) -> Usages {
     let (usage, simulations) = (server.usage.clone(), snapshot.simulations.iter());
     let read = if let Some(containers) = &server.containers {
         // The process is that of docker, which waits for them.
-        let roots: HashMap<u16, i32> = simulations.filter_map(|one| Some((one.port?, one.pid?))).collect();
+        let roots: BTreeMap<u16, i32> = simulations.filter_map(|one| Some((one.port?, one.pid?))).collect();
         let owner = containers.run().clone();
         let read =
             move || usage.read_by(&roots.values().copied().collect::<Vec<_>>(), || container::measure(&owner, &roots));
