@@ -162,6 +162,22 @@ deploy() { # COMMAND...
     "$@" >/dev/null 2>"$WORK/deploy" || fail "$(cat "$WORK/deploy")"
 }
 
+# A command of docs/scaling.md as it stands there: the one of this number below a heading, of those that are indented.
+page() { # HEADING NUMBER
+    local found
+    found=$(awk -v heading="## $1" -v number="$2" '
+        /^```/ { inside = !inside }
+        /^#/ && !inside { wanted = $0 == heading }
+        wanted && !inside && /^    / && ++count == number { print substr($0, 5) }' docs/scaling.md)
+    [[ -n $found ]] || fail "docs/scaling.md has no command $2 below '$1'"
+    printf '%s\n' "$found"
+}
+
+# Runs a command of the page in a folder.
+follow() { # FOLDER COMMAND
+    (cd "$1" && bash -euo pipefail -c "$2") >"$WORK/page" 2>&1 || fail "$2: $(tail -n 20 "$WORK/page")"
+}
+
 told() {
     printf '%-64s %s\n' "$1" "$2"
 }
@@ -200,8 +216,7 @@ for ((tries = 0; tries < 150; tries++)); do
     sleep 0.2
 done
 docker info >/dev/null 2>&1 || skip "dockerd does not run here: $(tail -n 1 "$WORK/dockerd")"
-docker swarm init --advertise-addr 10.99.0.1 >/dev/null
-docker node update --label-add webots-fleet.door=true "$(docker node ls --quiet)" >/dev/null
+follow . "$(page 'Docker Swarm' 1)"
 
 # --- The images.
 
@@ -219,9 +234,9 @@ COPY *-server demo-simulator /programs/
 END
 build fleet-base "$WORK/base"
 for image in debian:bookworm-slim rust:1.95-bullseye cyberbotics/webots:R2025a-ubuntu22.04; do docker tag fleet-base "$image"; done
-for image in session-server simulation-demo simulation-server; do
-    build "webots-fleet/$image:0.1.0" --file deploy/docker/Dockerfile --target "$image" .
-done
+follow . "$(page 'Docker Swarm' 2)"
+# The image of Webots, for a fleet of one's own.
+follow . "$(page 'Docker Swarm' 6)"
 # nginx as its unprivileged image has it.
 mkdir "$WORK/nginx"
 cat >"$WORK/nginx/nginx.conf" <<'END'
@@ -248,11 +263,13 @@ build nginxinc/nginx-unprivileged:1.28 "$WORK/nginx"
 
 # --- The fleet.
 
-cp --recursive deploy/swarm "$WORK/swarm"
+mkdir -p "$WORK/project/deploy"
+cp --recursive deploy/swarm "$WORK/project/deploy"
+ln -s project/deploy/swarm "$WORK/swarm"
 # All report the load of this one machine, which is busy with much else: it closes no server, and the clients count for more.
 sed -i 's/"port": 1999,/"port": 1999,\n  "loadThreshold": 1000,\n  "clientCost": 30,/' "$WORK/swarm/session.json"
 begin=$(now)
-deploy "$WORK/swarm/deploy" fleet
+follow "$WORK/project" "$(page 'Docker Swarm' 3)"
 visit "$VIEWER"
 told 'from docker stack deploy to a scene that moves in Chromium' "$(($(said moves) - begin)) ms"
 within 20 are 2 up

@@ -31,11 +31,12 @@ impl std::fmt::Display for Finding {
 #[must_use]
 pub fn check(config: &SimulationConfig) -> Vec<Finding> {
     let (first, last) = if config.isolation == Isolation::Container {
-        (vec![Finding { topic: "docker", result: container::check(config) }], None)
+        let checks = [("docker", container::check(config)), ("templates", container::check_templates(config))];
+        (checks.map(|(topic, result)| Finding { topic, result }).to_vec(), None)
     } else {
         let first = [("webots", webots(config)), ("display", display(config))];
         let first = first.map(|(topic, result)| Finding { topic, result });
-        (first.into(), Some(Finding { topic: "Xvfb", result: xvfb(config) }))
+        (first.to_vec(), Some(Finding { topic: "Xvfb", result: xvfb(config) }))
     };
     let git = version(&["git", "--version"], "git is not there: no world can be checked out");
     let lfs = version(&["git-lfs", "--version"], "git-lfs is not there: large files of Git LFS will be missing");

@@ -81,15 +81,20 @@ async fn what_can_not_be_built_is_told_in_words_and_leaves_nothing() {
             "The image of this project can't be built: The command 'sh -c echo 'gcc: not found' ‹?",
         ),
         ("FROM webots-fleet.test/nothing:1\n".to_owned(), "webots-fleet.test/nothing:1"),
-        (format!("FROM {NAME}\nADD http://127.0.0.1/secret /x\n"), "may ADD files of the project only"),
+        (format!("FROM {NAME}\nADD http://127.0.0.1/secret /x\n"), "line 2, `ADD http://127.0.0.1/secret x`: ADD may"),
         (format!("FROM {NAME}\n"), "The image of this project has no folder webots-project"),
-        (format!("FROM {NAME}\nCOPY . /usr/local/webots-project\nVOLUME /usr/local\n"), "which would hide the project"),
+        (format!("FROM {NAME}\nCOPY . /usr/local/webots-project\nVOLUME /data\n"), "line 3, `VOLUME data`: a volume"),
+        (
+            "FROM webots-fleet.test/volume\nCOPY . /usr/local/webots-project\n".to_owned(),
+            "The image that it begins with has `VOLUME",
+        ),
         (
             format!("FROM {NAME}\nCOPY . /usr/local/webots-project\nRUN rm -r /usr/local/webots-project/worlds\n"),
             "has no worlds/a.wbt",
         ),
         ("no Dockerfile at all\n".to_owned(), "can't be built"),
     ];
+    super::daemon::build_from(&format!("FROM {NAME}\nVOLUME [\"/a:b\"]\n"), "webots-fleet.test/volume");
     for (dockerfile, words) in table {
         let forge = with(&dockerfile);
         let server = server(forge.path(), 1).start().await;
@@ -144,41 +149,46 @@ async fn a_build_that_takes_too_long_is_ended_and_told() {
 }
 
 #[actix_rt::test]
-async fn images_of_ours_that_are_too_many_are_removed_and_no_others() {
+async fn images_of_ours_that_are_old_are_removed_and_no_others() {
     let Some(_docker) = docker().await else { return };
-    let folder = tempfile::tempdir().unwrap();
-    let large = format!("FROM {NAME}\nCOPY . /usr/local/webots-project\nRUN head -c 5000000 /dev/urandom >/large\n");
-    let forge = with(&large);
-    ask(&["tag", NAME, "postgres:15"]);
-    let build = server(forge.path(), 1).folder(folder.path()).start().await;
-    Client::start(&build, &arm()).await.patiently("webots:", BUILT).await;
-    let owner = webots_fleet::simulation::container::Owner::of(&build.cache());
-    let own = format!("webots-fleet/{}", owner.name());
-    let images = || ask(&["image", "ls", "--quiet", &own]).lines().count();
-    assert_eq!(images(), 1);
-    drop(build);
-    let settings = serde_json::json!({ "imagesSize": 1 });
-    let server = server(forge.path(), 1).folder(folder.path()).set("container", settings).start().await;
-    // An image is looked for what nobody needs when a simulation has ended.
-    forge.commit("lab/arm", "main", &[("Dockerfile", &format!("FROM {NAME}\nCOPY . /usr/local/webots-project\n"))]);
+    let (forge, folder) = (Forge::with_arm(), tempfile::tempdir().unwrap());
+    std::fs::create_dir(folder.path().join("cache")).unwrap();
+    let owner = webots_fleet::simulation::container::Owner::of(&folder.path().join("cache"));
+    let names = [("old", owner.name()), ("others", "000000000000"), ("running", owner.name())];
+    for (tag, owner) in names {
+        load_old(folder.path(), &format!("webots-fleet.test/{tag}:1"), owner);
+    }
+    let label = "com.docker.compose.project=webots-fleet.test";
+    let running = ask(&["create", "--label", label, "--network", "none", "webots-fleet.test/running:1", "true"]);
+    let is_there = |tag: &str| !ask(&["image", "ls", "--quiet", &format!("webots-fleet.test/{tag}:1")]).is_empty();
+    assert!(names.iter().all(|(tag, _)| is_there(tag)));
+    let server = server(forge.path(), 1).folder(folder.path()).start().await;
     let mut client = Client::start(&server, &arm()).await;
     client.patiently("webots:", BUILT).await;
+    // It is looked for what nobody needs when a simulation has ended.
     client.leave().await;
-    until("the large one is gone", async || images() == 1).await;
-    assert_eq!(ask(&["image", "ls", "--quiet", "postgres:15"]).lines().count(), 1);
-    assert_eq!(ask(&["image", "ls", "--quiet", NAME]).lines().count(), 1);
+    until("the old one is gone", async || !is_there("old")).await;
+    assert!(is_there("others") && is_there("running"));
+    assert_eq!(ask(&["image", "ls", "--quiet", &format!("webots-fleet/{}", owner.name())]).lines().count(), 1);
+    ask(&["rm", &running]);
 }
 
-#[actix_rt::test]
-async fn a_volume_of_an_image_is_memory_with_a_limit() {
-    let Some(_docker) = docker().await else { return };
-    let forge = with(&format!("FROM {NAME}\nCOPY . /usr/local/webots-project\nVOLUME /data\n"));
-    let server = server(forge.path(), 1).set("limits", serde_json::json!({ "disk": 10 })).start().await;
-    let mut client = Client::start(&server, &arm()).await;
-    client.patiently("webots:", BUILT).await;
-    let webots = &of_service(&server, "webots")[0];
-    assert_eq!(ask(&["inspect", "--format", "{{range .Mounts}}{{.Type}} {{end}}", webots]), "bind");
-    let fill = "dd if=/dev/zero of=/data/big bs=1M count=20 2>&1 || true";
-    let told = ask(&["exec", webots, "sh", "-c", fill]);
-    assert!(told.contains("No space left"), "{told}");
+/// Gives the daemon an image that a server has built long ago.
+fn load_old(folder: &std::path::Path, name: &str, owner: &str) {
+    let files = folder.join("image");
+    std::fs::create_dir_all(&files).unwrap();
+    std::fs::write(files.join("layer.tar"), [0; 1024]).unwrap();
+    // The digest of the layer, two blocks of zeros.
+    let layer = "sha256:5f70bf18a086007016e948b04aed3b82103a36bea41755b6cddfaf10ace3c6ef";
+    let config = serde_json::json!({
+        "architecture": "amd64", "os": "linux", "created": "2020-01-01T00:00:00Z", "author": name,
+        "config": {"Labels": {"webots-fleet.owner": owner}}, "rootfs": {"type": "layers", "diff_ids": [layer]},
+    });
+    std::fs::write(files.join("config.json"), config.to_string()).unwrap();
+    let manifest = serde_json::json!([{"Config": "config.json", "RepoTags": [name], "Layers": ["layer.tar"]}]);
+    std::fs::write(files.join("manifest.json"), manifest.to_string()).unwrap();
+    let (tar, archive) = (folder.join("image.tar"), ["manifest.json", "config.json", "layer.tar"]);
+    let made = std::process::Command::new("tar").arg("-C").arg(&files).arg("-cf").arg(&tar).args(archive).status();
+    assert!(made.unwrap().success());
+    ask(&["load", "--input", tar.to_str().unwrap()]);
 }

@@ -176,6 +176,13 @@ pub fn build(folder: &Path, context: &Path, name: &str) {
     made(folder, &["build", "--network", "none", "--tag", name, context.to_str().unwrap()]);
 }
 
+/// Makes an image of a Dockerfile that copies nothing.
+pub fn build_from(dockerfile: &str, name: &str) {
+    let context = tempfile::tempdir().unwrap();
+    std::fs::write(context.path().join("Dockerfile"), dockerfile).unwrap();
+    build(&daemon().folder, context.path(), name);
+}
+
 fn made(folder: &Path, arguments: &[&str]) {
     let made = Daemon { folder: folder.to_owned() }.command(arguments).output().unwrap();
     assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));

@@ -102,6 +102,11 @@ async fn a_daemon_that_is_stopped_is_told_and_all_goes_on_when_it_is_back() {
     assert!(lost.contains("Docker has stopped on this simulation server"), "{lost}");
     // Another server may take it.
     assert_eq!(client.closed().await, Some(1013));
+    // The first after that comes before the server has looked.
+    let mut next = Client::start(&server, &arm()).await;
+    let told = next.patiently("loading: Error:", Duration::from_secs(60)).await;
+    assert!(told.contains("Docker does not answer on this simulation server"), "{told}");
+    assert_eq!(next.closed().await, Some(1013));
     let told = Client::start(&server, &arm()).await.patiently("loading: Error:", Duration::from_secs(60)).await;
     assert!(told.contains("Docker does not answer on this simulation server"), "{told}");
     until("it says so", async || http::get(&server.url("/load")).await.text().trim() == "100").await;
@@ -127,4 +132,56 @@ async fn a_docker_without_an_init_process_is_told_with_what_to_install() {
     docker.start(&[]);
     until("it takes clients again", async || http::get(&server.url("/load")).await.text().trim() != "100").await;
     Client::start(&server, &arm()).await.patiently("webots:", Duration::from_secs(60)).await;
+}
+
+/// A world whose Webots ends as if Docker had been stopped, after this line of a shell.
+fn with_webots(line: &str) -> Forge {
+    let forge = Forge::with_arm();
+    let dockerfile = format!(
+        "FROM {}\nCOPY . /usr/local/webots-project\nRUN cp /usr/local/webots-project/fake /usr/local/webots/webots && chmod \
+         755 /usr/local/webots/webots\n",
+        super::image::NAME
+    );
+    forge.commit("lab/arm", "main", &[("Dockerfile", &dockerfile), ("fake", &format!("#!/bin/sh\n{line}\n"))]);
+    forge
+}
+
+#[actix_rt::test]
+async fn a_world_that_ends_like_one_of_a_stopped_docker_is_not_taken_for_that() {
+    let Some(_docker) = docker().await else { return };
+    for (line, words) in [("exit 143", "exit code 143"), ("kill -KILL $$", "exit code 137")] {
+        let forge = with_webots(line);
+        let server = server(forge.path(), 1).start().await;
+        let mut client = Client::start(&server, &arm()).await;
+        let told = client.patiently("loading: Error:", Duration::from_secs(90)).await;
+        assert!(told.contains(words) && !told.contains("Docker"), "{told}");
+        assert_eq!(client.closed().await, Some(1000));
+        assert_eq!(http::get(&server.url("/status")).await.json()["failedStarts"], 0);
+    }
+}
+
+#[actix_rt::test]
+async fn a_container_that_docker_is_told_to_stop_is_not_the_worlds_fault() {
+    let Some(_docker) = docker().await else { return };
+    let forge = Forge::with_arm();
+    let server = server(forge.path(), 1).start().await;
+    let mut client = Client::start(&server, &arm()).await;
+    client.patiently("webots:", Duration::from_secs(60)).await;
+    ask(&["stop", &super::daemon::of_service(&server, "webots")[0]]);
+    let told = client.patiently("loading: Error:", Duration::from_secs(60)).await;
+    assert!(told.contains("Docker has stopped"), "{told}");
+    assert_eq!(client.closed().await, Some(1013));
+}
+
+#[actix_rt::test]
+async fn a_start_that_docker_refuses_counts_against_the_server_and_not_the_world() {
+    let Some(_docker) = docker().await else { return };
+    let forge = Forge::with_arm();
+    let server = server(forge.path(), 1).set("container", serde_json::json!({ "mounts": ["/nowhere/x:relative"] }));
+    let server = server.start().await;
+    let mut client = Client::start(&server, &arm()).await;
+    let told = client.patiently("loading: Error:", Duration::from_secs(60)).await;
+    assert!(told.contains("failed:"), "{told}");
+    assert_eq!(client.closed().await, Some(1013));
+    assert_eq!(http::get(&server.url("/status")).await.json()["failedStarts"], 1);
 }

@@ -3,7 +3,7 @@
 use std::process::Command;
 use std::time::Duration;
 
-use super::daemon::{ask, containers, docker, of_service, open_socket, server};
+use super::daemon::{ask, check, containers, docker, of_service, open_socket, server};
 use super::image::NAME;
 use crate::support::client::Client;
 use crate::support::git::{Forge, WORLD, arm};
@@ -202,4 +202,21 @@ async fn an_administrators_template_counts_and_what_protects_stays() {
     let format =
         "{{.HostConfig.Privileged}} {{.HostConfig.ReadonlyRootfs}} {{.HostConfig.CapAdd}} {{.HostConfig.SecurityOpt}}";
     assert_eq!(ask(&["inspect", "--format", format, webots]), "false true [SYS_PTRACE] [no-new-privileges:false]");
+}
+
+#[actix_rt::test]
+async fn a_template_that_can_not_work_here_is_told_when_the_server_starts_and_by_check() {
+    let Some(_docker) = docker().await else { return };
+    let (forge, templates) = (Forge::with_arm(), tempfile::tempdir().unwrap());
+    let template = "services:\n  webots:\n    image: ${IMAGE}\n    network_mode: host\n";
+    std::fs::write(templates.path().join("docker-compose-theia.yml"), template).unwrap();
+    let server =
+        server(forge.path(), 1).set("container", serde_json::json!({ "templates": templates.path() })).start().await;
+    let fault =
+        "The template docker-compose-theia.yml of this simulation server can't be used: line 4, `network_mode: host`";
+    assert!(server.log().contains(fault), "{}", server.log());
+    let checked = check(&server);
+    assert!(checked.contains(&format!("warning: templates: {fault}")), "{checked}");
+    // Worlds that want no editor run.
+    Client::start(&server, &arm()).await.patiently("webots:", BUILT).await;
 }

@@ -31,6 +31,16 @@ async fn a_world_runs_in_a_container_and_nothing_is_left_when_its_client_goes() 
     viewer.until("application/json:").await;
     assert_eq!(http::get(&server.url("/status")).await.json()["isolation"], "container");
     assert_eq!(containers(&server).len(), 1);
+    // What it takes is shown to whoever looks.
+    until("the monitor shows its processor time and memory", async || {
+        let page = http::get(&server.url("/monitor")).await.text();
+        let value = |label: &str| {
+            let (_, cell) = page.split_once(&format!("data-label=\"{label}\""))?;
+            cell.split_once("data-value=\"")?.1.split_once('"')?.0.parse::<f64>().ok()
+        };
+        value("CPU").is_some_and(|percent| percent > 0.0) && value("Memory").is_some_and(|bytes| bytes > 1e6)
+    })
+    .await;
     drop(viewer);
     client.leave().await;
     let begin = Instant::now();

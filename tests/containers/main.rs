@@ -23,3 +23,4 @@ mod hostile;
 mod image;
 mod kinds;
 mod life;
+mod page;

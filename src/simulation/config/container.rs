@@ -40,10 +40,7 @@ pub struct ContainerSettings {
     /// How many images are built at a time. Default: 3.
     #[serde(deserialize_with = "whole::<1, 1000, _, _>")]
     pub builds: usize,
-    /// How much the images that this server has built may take together, in MiB. Default: 20480.
-    #[serde(deserialize_with = "whole::<1, 100_000_000, _, _>")]
-    pub images_size: u64,
-    /// After how many days without use such an image is removed. Default: 14.
+    /// After how many days an image that this server has built is removed, unless a container uses it. Default: 14.
     #[serde(deserialize_with = "whole::<1, 10_000, _, _>")]
     pub images_age: u64,
 }
@@ -105,7 +102,6 @@ impl Default for ContainerSettings {
             capabilities: Vec::new(),
             mounts: Vec::new(),
             builds: 3,
-            images_size: 20 * 1024,
             images_age: 14,
         }
     }

@@ -82,7 +82,7 @@ pub struct SimulationConfig {
     /// Run Webots in containers: the original's key for `isolation: "container"`. Default: false.
     #[serde(default)]
     pub docker: bool,
-    /// Images that are never removed. Only those that this server has built are ever.
+    /// A key of the original, without effect: only images that this server has built are ever removed.
     #[serde(default, alias = "persistentDockerImages", deserialize_with = "one_or_many")]
     pub persistant_docker_images: Vec<String>,
     /// Repositories whose worlds may run, as URL prefixes of whole path segments. Default: none.

@@ -15,13 +15,13 @@ const REQUEST: &[u8] = b"GET /robots.txt HTTP/1.0\r\nHost: localhost\r\n\r\n";
 const PAUSE: (Duration, Duration) = (Duration::from_millis(25), Duration::from_millis(500));
 /// The pause is such a part of the time since the start, so that many that start on a busy machine don't ask it all the time.
 const PART: u32 = 20;
-/// Timeout of the first request. One that is sent before the container has its address would take a second, until the kernel
-/// repeats its first packet.
+/// Timeout of the first request: the proxy may accept it before anything inside listens.
 const FIRST_TIMEOUT: Duration = Duration::from_millis(100);
 /// Timeout that later ones approach: Webots answers none while it reads a world.
 const TIMEOUT: Duration = Duration::from_secs(2);
 
-/// Waits until there is an answer on this port of an address that the server binds to.
+/// Waits until there is an answer on this port of an address that the server binds to. The container has to run: a request
+/// before it has its address holds all others up for a second, until the kernel asks for that address again.
 pub async fn until_answering(bind: IpAddr, port: u16) {
     // Containers listen on IPv4, see the variable BIND of their templates.
     let address = if bind.is_ipv4() && !bind.is_unspecified() { bind } else { Ipv4Addr::LOCALHOST.into() };

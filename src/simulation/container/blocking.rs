@@ -1,11 +1,16 @@
 //! File work of the preparation of containers.
 
+use super::start_error::StartError;
+
 /// Runs blocking file I/O on the blocking thread pool.
 ///
 /// # Errors
 /// Those of the work.
-pub async fn blocking<T: Send + 'static>(
-    work: impl FnOnce() -> Result<T, String> + Send + 'static,
-) -> Result<T, String> {
-    actix_rt::task::spawn_blocking(work).await.map_err(|error| error.to_string())?
+pub async fn blocking<T, E>(work: impl FnOnce() -> Result<T, E> + Send + 'static) -> Result<T, StartError>
+where
+    T: Send + 'static,
+    E: Into<StartError> + Send + 'static,
+{
+    let done = actix_rt::task::spawn_blocking(work).await;
+    done.map_err(|error| StartError::Server(error.to_string()))?.map_err(Into::into)
 }

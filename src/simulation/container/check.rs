@@ -6,6 +6,7 @@ use std::sync::OnceLock;
 
 use super::docker::Docker;
 use super::packet_filter;
+use super::templates::Templates;
 use crate::shared::text::one_line;
 use crate::simulation::config::SimulationConfig;
 
@@ -28,6 +29,19 @@ pub fn check(config: &SimulationConfig) -> Result<String, String> {
     init_fault().map_or(Ok(()), Err)?;
     packet_filter::missing().map_or(Ok(()), Err)?;
     Ok(format!("it answers; worlds run in {}, or the image of their project's Dockerfile", config.container.image))
+}
+
+/// Checks the administrator's templates.
+///
+/// # Errors
+/// What is wrong with them, in words for an administrator.
+pub fn check_templates(config: &SimulationConfig) -> Result<String, String> {
+    let faults = Templates::of(&config.container).faults();
+    let found = match &config.container.templates {
+        Some(folder) => format!("those in {}, else those of this server", folder.0.display()),
+        None => "those of this server".to_owned(),
+    };
+    if faults.is_empty() { Ok(found) } else { Err(faults.join("; ")) }
 }
 
 /// Why the daemon can't be used now, in words for clients and administrators. Blocks for five seconds at most.

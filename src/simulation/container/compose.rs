@@ -29,8 +29,6 @@ pub struct Parts<'parts> {
     pub image: &'parts str,
     /// The image of a competition's controller.
     pub controller: Option<&'parts str>,
-    /// Places where the image of a service keeps data: service and path.
-    pub volumes: Vec<(String, String)>,
     /// Webots and its arguments, as they are in the container.
     pub command: &'parts [String],
     /// The port of Webots.
@@ -147,7 +145,7 @@ impl Parts<'_> {
             ("cap_add", json!(settings.capabilities)),
             ("security_opt", json!([format!("no-new-privileges:{}", !settings.new_privileges)])),
             ("user", json!(format!("{}:{}", nix::unistd::getuid(), nix::unistd::getgid()))),
-            ("tmpfs", json!(self.memory_folders(name, limits.disk))),
+            ("tmpfs", json!(memory_folders(limits.disk))),
             ("shm_size", json!(SHARED_MEMORY)),
             ("mem_limit", json!(memory)),
             ("memswap_limit", json!(memory)),
@@ -185,14 +183,6 @@ impl Parts<'_> {
         json!(service)
     }
 
-    /// Folders that are memory, which is limited: those that programs need to write into, and those that an image declares.
-    fn memory_folders(&self, service: &str, size: u64) -> Vec<String> {
-        let own = [("/tmp", size), ("/var/tmp", size), ("/run", 16)].map(|(path, size)| (path.to_owned(), size));
-        let declared = self.volumes.iter().filter(|(of, _)| of == service).map(|(_, path)| (path.clone(), size));
-        let mode = "rw,exec,nosuid,nodev,mode=1777";
-        own.into_iter().chain(declared).map(|(path, size)| format!("{path}:{mode},size={size}m")).collect()
-    }
-
     /// Gives Webots graphics cards, the display of the machine, and the administrator's folders.
     fn show(&self, service: &mut Service, environment: &mut Vec<(&'static str, String)>, config: &SimulationConfig) {
         let mut volumes: Vec<String> = config.container.mounts.clone();
@@ -216,6 +206,12 @@ impl Parts<'_> {
             environment.push(("NVIDIA_DRIVER_CAPABILITIES", "all".to_owned()));
         }
     }
+}
+
+/// Folders that are memory, which is limited: those that programs need to write into.
+fn memory_folders(size: u64) -> [String; 3] {
+    [("/tmp", size), ("/var/tmp", size), ("/run", 16)]
+        .map(|(path, size)| format!("{path}:rw,exec,nosuid,nodev,mode=1777,size={size}m"))
 }
 
 /// The name of the container of a service of a compose project.

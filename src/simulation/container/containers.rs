@@ -20,6 +20,7 @@ use super::prepared::{Lease, Prepared};
 use super::project_images::Part;
 use super::recipe::{self, PROJECT_PATH, Recipe};
 use super::request::{Request, command};
+use super::start_error::StartError;
 use super::steps;
 use super::templates::Templates;
 use super::tidy::{Live, keep_tidy};
@@ -58,12 +59,11 @@ impl Containers {
         if let Some(why) = &shortcoming {
             log::warn!("{why}");
         }
-        let settings = &config.container;
+        let templates = Templates::of(&config.container);
+        templates.faults().iter().for_each(|fault| log::error!("{fault}"));
         let images = Images::new(docker.clone(), owner.clone(), &config);
         let (images, live) = (Arc::new(images), Live::default());
         let keeper = keep_tidy(docker.clone(), owner.clone(), live.clone(), Arc::clone(&images), Arc::clone(&config));
-        let templates =
-            Templates { folder: settings.templates.as_ref().map(|folder| folder.0.clone()), debug: settings.debug };
         let keeper = AbortOnDropHandle::new(actix_rt::spawn(keeper));
         Ok(Self {
             docker,
@@ -97,12 +97,12 @@ impl Containers {
     /// Dropping the future gives up whatever was made.
     ///
     /// # Errors
-    /// Why not, in words for the client.
+    /// Whose fault it is that they can't be made.
     pub async fn prepare(
         &self,
         request: Request,
         progress: &(impl Fn(String) + Send + Sync),
-    ) -> Result<Prepared, String> {
+    ) -> Result<Prepared, StartError> {
         let recipe = self.recipe(&request).await?;
         let lease = Lease::take(self.run.project(request.port), &self.live);
         let network = self.config.container.network.name();
@@ -136,14 +136,21 @@ impl Containers {
         self.make(request, recipe, lease, (image, controller), progress).await
     }
 
-    async fn recipe(&self, request: &Request) -> Result<Recipe, String> {
+    async fn recipe(&self, request: &Request) -> Result<Recipe, StartError> {
         let (folder, templates) = (request.project.folder().to_owned(), self.templates.clone());
         let owner = self.owner.name().to_owned();
         blocking(move || Recipe::read(&folder, &templates, &owner)).await
     }
 
     /// Copies a folder of an image into the instance's folder.
-    async fn copy(&self, lease: &Lease, image: &str, from: String, request: &Request, to: &Path) -> Result<(), String> {
+    async fn copy(
+        &self,
+        lease: &Lease,
+        image: &str,
+        from: String,
+        request: &Request,
+        to: &Path,
+    ) -> Result<(), StartError> {
         let through = request.project.instance.path().join("copied");
         let copy = Copy { name: &lease.name, image, from, through, to, size: self.config.project_size };
         copy.run(&self.docker).await
@@ -157,10 +164,8 @@ impl Containers {
         lease: Lease,
         (image, controller): (String, Option<String>),
         progress: &(impl Fn(String) + Send + Sync),
-    ) -> Result<Prepared, String> {
-        let engine =
-            self.engine.get_or_try_init(|| Engine::ask(&self.docker)).await.map_err(|error| error.to_string())?;
-        let volumes = self.volumes(&image, controller.as_deref(), &recipe).await?;
+    ) -> Result<Prepared, StartError> {
+        let engine = self.engine.get_or_try_init(|| Engine::ask(&self.docker)).await?;
         let (config, templates) = (Arc::clone(&self.config), self.templates.clone());
         let (name, engine, asks) = (lease.name.clone(), engine.clone(), recipe.asks.clone());
         let files = move || {
@@ -180,25 +185,22 @@ impl Containers {
                 volume: volume_of(&asks.kind),
                 image: &image,
                 controller: controller.as_deref(),
-                volumes,
                 command: &command,
                 port: request.port,
                 make: recipe.make,
                 engine: &engine,
             };
-            let template = templates.compose(&asks.kind)?;
-            let written = parts.write(&template, &config);
-            let (options, variables) =
-                written.map_err(|error| format!("The files for compose can't be written: {error}"))?;
-            Ok((options, variables, template.services.into_keys()))
+            let template = templates.compose(&asks.kind).map_err(StartError::Server)?;
+            let (options, variables) = parts.write(&template, &config)?;
+            Ok::<_, StartError>((options, variables, template.services.into_keys()))
         };
         let (options, variables, services) = blocking(files).await?;
         // More at a time would only be slower together.
-        let turn = self.turns.acquire().await.map_err(|error| error.to_string())?;
+        let turn = self.turns.acquire().await.map_err(|error| StartError::Server(error.to_string()))?;
         progress(steps::CREATING.to_owned());
         let up = ["up", "--no-start", "--no-build"].map(str::to_owned);
         let words = options.into_iter().chain(up).map(Into::into).collect();
-        self.docker.compose(words, variables, SHORT).await.map_err(|error| error.to_string())?;
+        self.docker.compose(words, variables, SHORT).await?;
         drop(turn);
         let editor = (recipe.asks.kind != Kind::Default).then(|| "ide: enable".to_owned());
         let texts = editor.into_iter().chain(recipe.asks.project_type).collect();
@@ -208,27 +210,5 @@ impl Containers {
         });
         let containers = containers.collect();
         Ok(Prepared::new(self.docker.clone(), lease, containers, texts, recipe.warnings))
-    }
-
-    /// Where the images of the services keep data: such places would be on the machine's disk without a limit.
-    async fn volumes(
-        &self,
-        image: &str,
-        controller: Option<&str>,
-        recipe: &Recipe,
-    ) -> Result<Vec<(String, String)>, String> {
-        let editor = (recipe.asks.kind != Kind::Default).then_some(self.config.container.editor_image.as_str());
-        let mut all = Vec::new();
-        for (service, image) in [("webots", Some(image)), ("controller", controller), ("theia", editor)] {
-            let Some(image) = image else { continue };
-            for path in self.images.volumes(image).await? {
-                let (outer, inner) = (Path::new(&path), Path::new(PROJECT_PATH));
-                if outer.starts_with(inner) || inner.starts_with(outer) {
-                    return Err(format!("The image {image} has a VOLUME {path}, which would hide the project"));
-                }
-                all.push((service.to_owned(), path));
-            }
-        }
-        Ok(all)
     }
 }

@@ -3,8 +3,10 @@
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use super::blocking::blocking;
 use super::docker::{Docker, DockerError, SHORT};
 use super::objects;
+use super::start_error::StartError;
 use crate::simulation::process::{folder_size, remove_tree};
 
 /// What is copied where.
@@ -34,42 +36,40 @@ impl Copy<'_> {
     ///
     /// # Errors
     /// Why not, in words for the client.
-    pub async fn run(self, docker: &Docker) -> Result<(), String> {
-        let told = |error: DockerError| error.to_string();
+    pub async fn run(self, docker: &Docker) -> Result<(), StartError> {
         let label = format!("{}={}", objects::PROJECT, self.name);
         let create = ["create", "--label", &label, "--network", "none", self.image, "true"];
-        let container = docker.run(&create, SHORT).await.map_err(told)?;
+        let container = docker.run(&create, SHORT).await?;
         let container = container.lines().last().unwrap_or_default();
         let from = format!("{container}:{}/.", self.from);
         let words = ["cp", &from, &self.through.to_string_lossy()].map(str::to_owned);
         tokio::select! {
             copied = docker.run(&words, LIMIT) => drop(copied.map_err(|error| not_copied(error, &self.from))?),
             () = outgrown(&self.through, self.size << 20) => {
-                return Err(format!("The project in its image is larger than {} MiB (projectSize)", self.size));
+                return Err(format!("The project in its image is larger than {} MiB (projectSize)", self.size).into());
             }
         }
-        docker.run(&["rm", "--force", "--volumes", container], SHORT).await.map_err(told)?;
+        docker.run(&["rm", "--force", "--volumes", container], SHORT).await?;
         let (through, to) = (self.through, self.to.to_owned());
         let replace = move || remove_tree(&to).and_then(|()| std::fs::rename(&through, &to));
-        let replaced = actix_rt::task::spawn_blocking(replace).await.map_err(|error| error.to_string())?;
-        replaced.map_err(|error| format!("{} can't be copied out of the image: {error}", self.from))
+        blocking(replace).await
     }
 }
 
-fn not_copied(error: DockerError, from: &str) -> String {
+fn not_copied(error: DockerError, from: &str) -> StartError {
     match error {
         DockerError::Failed { message, .. }
             if message.contains("ould not find") || message.contains("o such container:path") =>
         {
             format!("The image of this project has no folder {from}: its Dockerfile has to COPY the project there")
+                .into()
         }
         DockerError::Failed { message, .. } if message.contains("invalid symlink") => {
             let target = message.split_once(" -> ").map_or("elsewhere", |(_, target)| target);
-            format!(
-                "{from} in the image of this project has a link to {target}, which leads out of it: `docker cp` refuses that"
-            )
+            let what = format!("{from} in the image of this project has a link to {target}");
+            format!("{what}, which leads out of it: `docker cp` refuses that").into()
         }
-        error => error.to_string(),
+        error => error.into(),
     }
 }
 
@@ -94,6 +94,7 @@ mod tests {
         let message = "invalid symlink \"/var/cache/x/copied/link\" -> \"../../outside\"".to_owned();
         let told =
             not_copied(DockerError::Failed { command: "docker cp".to_owned(), message }, "/usr/local/webots-project");
+        let told = told.to_string();
         assert!(told.contains("a link to \"../../outside\"") && !told.contains("/var/cache"), "{told}");
     }
 }

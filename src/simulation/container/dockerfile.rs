@@ -7,17 +7,20 @@ use crate::shared::text::excerpt;
 
 /// The label of all that this server has built, also of what a build that failed has left.
 pub const LABEL: &str = "webots-fleet.owner";
+/// Why a Dockerfile has no volume, as the end of a sentence.
+pub const NO_VOLUME: &str = "a volume would take the machine's disk without a limit; what a program writes has its place in the \
+    project or in /tmp";
 /// What is shown of a line in an error, in letters.
 const SHOWN: usize = 100;
 
 /// Labels every stage of a Dockerfile with its owner.
 ///
 /// # Errors
-/// When it asks the daemon to fetch something, which would be done from the machine's own network; or when it may be read
-/// in more than one way. In words for the client.
+/// When it asks the daemon to fetch something, which would be done from the machine's own network; when it has a volume; or
+/// when it may be read in more than one way. In words for the client, with the line.
 pub fn labelled(text: &str, owner: &str) -> Result<String, String> {
-    let (mut labelled, mut instruction) = (String::new(), String::new());
-    for line in text.trim_start_matches('\u{feff}').lines() {
+    let (mut labelled, mut instruction, mut first) = (String::new(), String::new(), 1);
+    for (number, line) in (1..).zip(text.trim_start_matches('\u{feff}').lines()) {
         labelled.push_str(line);
         labelled.push('\n');
         let words = line.trim();
@@ -25,19 +28,26 @@ pub fn labelled(text: &str, owner: &str) -> Result<String, String> {
             check_directive(words)?;
             continue;
         }
-        let continued = continued(line)?;
+        if instruction.is_empty() {
+            first = number;
+        }
+        let continued = continued(line).map_err(|why| wrong(number, line, why))?;
         instruction.push_str(continued.unwrap_or(line));
         if continued.is_some() {
             continue;
         }
-        check(&instruction)?;
+        check(&instruction).map_err(|why| wrong(first, &instruction, why))?;
         if keyword(&instruction) == "FROM" {
             // Writing to a text can't fail.
             writeln!(labelled, "LABEL {LABEL}={owner}").ok();
         }
         instruction.clear();
     }
-    check(&instruction).map(|()| labelled)
+    check(&instruction).map_err(|why| wrong(first, &instruction, why)).map(|()| labelled)
+}
+
+fn wrong(number: usize, line: &str, why: &str) -> String {
+    format!("The Dockerfile of this project can't be used, line {number}, `{}`: {why}", excerpt(line.trim(), SHOWN))
 }
 
 /// Refuses a comment that changes how the lines below are read.
@@ -54,15 +64,12 @@ fn check_directive(comment: &str) -> Result<(), String> {
 }
 
 /// What a line has before the backslash with which it goes on in the next one.
-fn continued(line: &str) -> Result<Option<&str>, String> {
+fn continued(line: &str) -> Result<Option<&str>, &'static str> {
     let Some(before) = line.trim_end().strip_suffix('\\') else { return Ok(None) };
     let after = line.get(before.len() + 1..).unwrap_or_default();
     // For some versions of Docker such a line goes on, for others it does not.
     if before.ends_with('\\') || after.contains(|letter: char| !" \t".contains(letter)) {
-        let line = excerpt(line.trim(), SHOWN);
-        return Err(format!(
-            "A line of the Dockerfile of this project must not end as `{line}` does: with one backslash or none"
-        ));
+        return Err("a line ends with one backslash or none");
     }
     Ok(Some(before))
 }
@@ -112,11 +119,13 @@ fn keyword(instruction: &str) -> String {
     instruction.split_whitespace().next().unwrap_or_default().to_uppercase()
 }
 
-fn check(instruction: &str) -> Result<(), String> {
+fn check(instruction: &str) -> Result<(), &'static str> {
     let words = instruction.split_whitespace();
     let mut words = words.skip_while(|word| word.to_uppercase() == "ONBUILD");
-    if words.next().is_none_or(|word| word.to_uppercase() != "ADD") {
-        return Ok(());
+    match words.next().map(str::to_uppercase).as_deref() {
+        Some("VOLUME") => return Err(NO_VOLUME),
+        Some("ADD") => {}
+        _ => return Ok(()),
     }
     let mut words: Vec<&str> = words.skip_while(|word| word.starts_with("--")).collect();
     if !words.first().is_some_and(|word| word.starts_with('[')) {
@@ -125,10 +134,7 @@ fn check(instruction: &str) -> Result<(), String> {
     }
     // An address has a colon, which a variable or a backslash may stand for.
     if words.iter().any(|word| word.contains([':', '$', '\\'])) {
-        return Err(format!(
-            "The Dockerfile of this project has `{}`, but may ADD files of the project only; RUN can fetch others",
-            excerpt(instruction.trim(), SHOWN)
-        ));
+        return Err("ADD may copy files of the project only, named without variables; RUN can fetch others");
     }
     Ok(())
 }
@@ -161,7 +167,9 @@ mod tests {
     }
 
     #[test]
-    fn what_the_daemon_would_fetch_is_refused() {
+    fn what_the_daemon_would_fetch_or_keep_is_refused_with_its_line() {
+        let told = labelled("FROM a\n# VOLUME /x\n\nRUN b \\\n c\nADD \\\n http://a /x\n", "x").unwrap_err();
+        assert!(told.contains("line 6, `ADD") && told.contains("`: ADD may copy files of the project only"), "{told}");
         for line in [
             "ADD http://169.254.169.254/latest /x",
             "add \\\n https://a/b /x",
@@ -177,6 +185,9 @@ mod tests {
             r#"ADD ["http\u003a//a", "/x"]"#,
             "RUN a \\\\\nADD http://a /x",
             "RUN a \\\u{a0}\nADD http://a /x",
+            "VOLUME /data",
+            "volume \\\n /data",
+            "ONBUILD VOLUME /data",
         ] {
             assert!(labelled(&format!("FROM a\n{line}\n"), "x").is_err(), "{line}");
         }

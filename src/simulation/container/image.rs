@@ -1,10 +1,9 @@
 //! The images of simulations: pulled, and built once for all who want the same.
 
-use std::collections::HashMap;
 use std::ffi::OsString;
 use std::fmt;
 use std::path::{Path, PathBuf};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::Arc;
 use std::time::Duration;
 
 use tokio::sync::{Semaphore, watch};
@@ -14,6 +13,7 @@ use super::compose::DEFAULT_MEMORY;
 use super::docker::{Docker, DockerError, SHORT};
 use super::objects::Owner;
 use super::opened::{self, About};
+use super::start_error::StartError;
 use super::steps;
 use crate::simulation::checkout::{Project, SingleFlight};
 use crate::simulation::config::SimulationConfig;
@@ -28,9 +28,7 @@ pub struct Images {
     memory: u64,
     /// As many images are built at a time.
     builds: Semaphore,
-    jobs: SingleFlight<String, Result<(), String>>,
-    /// The places of data that images of this server declare, by their names, which never mean another image.
-    volumes: Mutex<HashMap<String, Vec<String>>>,
+    jobs: SingleFlight<String, Result<(), StartError>>,
 }
 
 /// An image to be built.
@@ -56,7 +54,7 @@ impl Images {
     pub fn new(docker: Docker, owner: Owner, config: &SimulationConfig) -> Self {
         let (builds, limit) = (Semaphore::new(config.container.builds), config.timing.build);
         let memory = config.limits.memory.unwrap_or(DEFAULT_MEMORY);
-        Self { docker, owner, limit, memory, builds, jobs: SingleFlight::default(), volumes: Mutex::default() }
+        Self { docker, owner, limit, memory, builds, jobs: SingleFlight::default() }
     }
 
     /// The name under which this server keeps its images. No other image has it.
@@ -72,21 +70,21 @@ impl Images {
         self: &Arc<Self>,
         image: &str,
         progress: &(impl Fn(String) + Send + Sync),
-    ) -> Result<String, String> {
+    ) -> Result<String, StartError> {
         if let Some(id) = self.id(image).await? {
             return Ok(id);
         }
         let (this, name) = (Arc::clone(self), image.to_owned());
         let start = move |news| async move { this.limited(this.pull_now(&name, news)).await };
         self.jobs.join(image.to_owned(), progress, start).await?;
-        self.id(image).await?.ok_or_else(|| format!("The image {image} was removed meanwhile"))
+        self.id(image).await?.ok_or_else(|| StartError::Server(format!("The image {image} was removed meanwhile")))
     }
 
-    async fn pull_now(&self, image: &str, news: watch::Sender<String>) -> Result<(), String> {
+    async fn pull_now(&self, image: &str, news: watch::Sender<String>) -> Result<(), StartError> {
         let _permit = self.permit(&news).await?;
         let told = |line: &str| drop(news.send(steps::pulling(image, line)));
         let words = ["pull", image].map(OsString::from).to_vec();
-        self.docker.follow(words, self.limit + SHORT, told).await.map_err(|error| not_pulled(image, &error))
+        self.docker.follow(words, self.limit + SHORT, told).await.map_err(|error| not_pulled(image, error))
     }
 
     /// Builds an image, unless it is there. Returns its name.
@@ -97,13 +95,13 @@ impl Images {
         self: &Arc<Self>,
         build: Build,
         progress: &(impl Fn(String) + Send + Sync),
-    ) -> Result<String, String> {
+    ) -> Result<String, StartError> {
         let name = format!("{}:{}", self.repository(), build.key);
         let (this, made) = (Arc::clone(self), name.clone());
         self.once(name, progress, move |news| async move { this.build_now(&made, build, news).await }).await
     }
 
-    async fn build_now(&self, name: &str, build: Build, news: watch::Sender<String>) -> Result<(), String> {
+    async fn build_now(&self, name: &str, build: Build, news: watch::Sender<String>) -> Result<(), StartError> {
         let _permit = self.permit(&news).await?;
         let id = build.dockerfile.with_extension("id");
         let mut words: Vec<OsString> = ["--network", build.network, "--iidfile"].map(OsString::from).to_vec();
@@ -119,9 +117,9 @@ impl Images {
             }
         };
         let done = self.run_build(words, &build.dockerfile, &build.context, told).await;
-        done.map_err(|error| not_built(&step, &error))?;
-        // It has no name of its own: what it takes of the disk counts for the image on top.
-        let id = blocking(move || std::fs::read_to_string(id).map_err(|error| error.to_string())).await?;
+        done.map_err(|error| not_built(&step, error))?;
+        // It has no name of its own: it goes with the image on top.
+        let id = blocking(move || std::fs::read_to_string(id)).await?;
         self.open_now(&id, name, &build.project).await
         // Until here the folder that was copied from has to stay.
     }
@@ -154,24 +152,21 @@ impl Images {
         id: String,
         project: &Arc<Project>,
         progress: &(impl Fn(String) + Send + Sync),
-    ) -> Result<String, String> {
+    ) -> Result<String, StartError> {
         let name = format!("{}:{}", self.repository(), opened::key(std::iter::once(id.as_str())));
         let (this, made, project) = (Arc::clone(self), name.clone(), Arc::clone(project));
         self.once(name, progress, move |_| async move { this.open_now(&id, &made, &project).await }).await
     }
 
     /// Has a job make an image, unless it is there. Joins one that is doing so.
-    async fn once<F: Future<Output = Result<(), String>> + Send + 'static>(
+    async fn once<F: Future<Output = Result<(), StartError>> + Send + 'static>(
         self: &Arc<Self>,
         name: String,
         progress: &(impl Fn(String) + Send + Sync),
         job: impl FnOnce(watch::Sender<String>) -> F,
-    ) -> Result<String, String> {
-        // One that is there counts as used just now.
-        match self.docker.run(&["tag", &name, &name], SHORT).await {
-            Ok(_) => return Ok(name),
-            Err(DockerError::Failed { .. }) => {}
-            Err(error) => return Err(error.to_string()),
+    ) -> Result<String, StartError> {
+        if self.id(&name).await?.is_some() {
+            return Ok(name);
         }
         let this = Arc::clone(self);
         let start = move |news| {
@@ -181,102 +176,65 @@ impl Images {
         self.jobs.join(name.clone(), progress, start).await.map(|()| name)
     }
 
-    async fn permit(&self, news: &watch::Sender<String>) -> Result<tokio::sync::SemaphorePermit<'_>, String> {
+    async fn permit(&self, news: &watch::Sender<String>) -> Result<tokio::sync::SemaphorePermit<'_>, StartError> {
         if let Ok(permit) = self.builds.try_acquire() {
             return Ok(permit);
         }
         news.send("waiting for images of others to be built".to_owned()).ok();
-        self.builds.acquire().await.map_err(|error| error.to_string())
+        self.builds.acquire().await.map_err(|error| StartError::Server(error.to_string()))
     }
 
     /// Each job has a limit of time, in which it may also wait for others.
-    async fn limited(&self, job: impl Future<Output = Result<(), String>>) -> Result<(), String> {
+    async fn limited(&self, job: impl Future<Output = Result<(), StartError>>) -> Result<(), StartError> {
         let slow = || format!("Its image was not ready within {} seconds (timing.build)", self.limit.as_secs());
-        actix_rt::time::timeout(self.limit, job).await.unwrap_or_else(|_| Err(slow()))
+        actix_rt::time::timeout(self.limit, job).await.unwrap_or_else(|_| Err(slow().into()))
     }
 
     /// What tells an image from later ones of the same name; `None` if it is not there.
     ///
     /// # Errors
     /// When Docker fails.
-    async fn id(&self, image: &str) -> Result<Option<String>, String> {
+    async fn id(&self, image: &str) -> Result<Option<String>, StartError> {
         match self.docker.run(&["image", "inspect", "--format", "{{.Id}}", image], SHORT).await {
             Ok(id) => Ok(Some(id.lines().last().unwrap_or_default().to_owned())),
             Err(DockerError::Failed { .. }) => Ok(None),
-            Err(error) => Err(error.to_string()),
+            Err(error) => Err(error.into()),
         }
     }
 
     /// What an image says of the programs that run in it.
     ///
     /// # Errors
-    /// When Docker fails, or a word of them is too long.
-    pub async fn about(&self, image: &str) -> Result<About, String> {
-        let answer = self.docker.run(&["image", "inspect", "--format", opened::FORMAT, image], SHORT).await;
-        let answer = answer.map_err(|error| error.to_string())?;
-        About::read(&answer)
-            .ok_or_else(|| format!("The image {image} has an ENTRYPOINT or CMD that can't be read here"))
+    /// When Docker fails, a word of them is too long, or the image keeps data in a place of its own.
+    pub async fn about(&self, image: &str) -> Result<About, StartError> {
+        let answer = self.docker.run(&["image", "inspect", "--format", opened::FORMAT, image], SHORT).await?;
+        Ok(About::read(&answer)?)
     }
-
-    /// Where an image wants to keep data: such places would be on the disk of the machine, without any limit.
-    ///
-    /// # Errors
-    /// When Docker fails, or such a place has a name that only its own author understands.
-    pub async fn volumes(&self, image: &str) -> Result<Vec<String>, String> {
-        let known = || self.volumes.lock().unwrap_or_else(PoisonError::into_inner);
-        if let Some(found) = known().get(image).cloned() {
-            return Ok(found);
-        }
-        let format = "{{range $path, $_ := .Config.Volumes}}{{printf \"%+q\" $path}}{{println}}{{end}}";
-        let listed = self.docker.run(&["image", "inspect", "--format", format, image], SHORT).await;
-        let listed = listed.map_err(|error| error.to_string())?;
-        let strange =
-            |path: &str| format!("The image {image} has a VOLUME {path}, which can't be given to a container here");
-        let found = listed.lines().map(|path| place_of(path).ok_or_else(|| strange(path)));
-        let found: Vec<String> = found.collect::<Result<_, String>>()?;
-        if image.starts_with(&self.repository()) {
-            known().insert(image.to_owned(), found.clone());
-        }
-        Ok(found)
-    }
-}
-
-/// The place of a volume, from its quoted name: from the root on and without detours, as Docker reads it.
-fn place_of(quoted: &str) -> Option<String> {
-    let name = quoted.strip_prefix('"')?.strip_suffix('"')?;
-    let is_plain = |letter: char| letter.is_ascii_alphanumeric() || "/._-+@".contains(letter);
-    let mut place = Vec::new();
-    for part in name.split('/') {
-        match part {
-            "" | "." => {}
-            ".." => drop(place.pop()),
-            part => place.push(part),
-        }
-    }
-    (name.starts_with('/') && name.chars().all(is_plain)).then(|| format!("/{}", place.join("/")))
 }
 
 /// Why an image is not there, in words for the client.
-fn not_pulled(image: &str, error: &DockerError) -> String {
+fn not_pulled(image: &str, error: DockerError) -> StartError {
     match error {
-        DockerError::Failed { message, .. } if is_unknown(message) => format!(
+        DockerError::Failed { message, .. } if is_unknown(&message) => StartError::Project(format!(
             "There is no image {image} for this version of Webots where this simulation server looks for images. Another \
              version of the world, or a Dockerfile in its project that begins with an image that there is, helps"
-        ),
-        DockerError::Failed { message, .. } => format!("The image {image} can't be fetched: {message}"),
-        other => other.to_string(),
+        )),
+        DockerError::Failed { message, .. } => {
+            StartError::Project(format!("The image {image} can't be fetched: {message}"))
+        }
+        other => other.into(),
     }
 }
 
 /// Why an image was not built, in words for the client. Only a step that begins with an image can miss it.
-fn not_built(step: &str, error: &DockerError) -> String {
+fn not_built(step: &str, error: DockerError) -> StartError {
     let from = step.split_once(" : ").and_then(|(_, instruction)| instruction.strip_prefix("FROM "));
     match (from, error) {
         (Some(image), error) => not_pulled(image.split(' ').next().unwrap_or_default(), error),
         (None, DockerError::Failed { message, .. }) => {
-            format!("The image of this project can't be built: {message} ({step})")
+            StartError::Project(format!("The image of this project can't be built: {message} ({step})"))
         }
-        (None, other) => other.to_string(),
+        (None, other) => other.into(),
     }
 }
 
@@ -298,33 +256,20 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_volume_is_known_by_the_place_where_docker_puts_it() {
-        for (name, place) in [
-            ("\"/data\"", Some("/data")),
-            ("\"data\"", None),
-            ("\"/x/..//./data/\"", Some("/data")),
-            ("\"/\"", Some("/")),
-            ("\"\"", None),
-            ("\"/a:size=1\"", None),
-            ("\"/a\\n/b\"", None),
-            ("\"/a,b\"", None),
-            ("\"/aaaa", None),
-        ] {
-            assert_eq!(place_of(name).as_deref(), place, "{name}");
-        }
-    }
-
-    #[test]
     fn an_image_that_is_not_there_is_told_in_words_and_only_where_a_stage_begins() {
         let failed =
             |message: &str| DockerError::Failed { command: "docker build".to_owned(), message: message.to_owned() };
         let told =
-            not_built("Step 1/4 : FROM cyberbotics/webots.cloud:R1-ubuntu22.04 AS a", &failed("manifest unknown"));
+            not_built("Step 1/4 : FROM cyberbotics/webots.cloud:R1-ubuntu22.04 AS a", failed("manifest unknown"));
+        let told = told.to_string();
         assert!(
             told.starts_with("There is no image cyberbotics/webots.cloud:R1-ubuntu22.04 for this version"),
             "{told}"
         );
-        let told = not_built("Step 2/4 : RUN make", &failed("make: not found"));
-        assert_eq!(told, "The image of this project can't be built: make: not found (Step 2/4 : RUN make)");
+        let told = not_built("Step 2/4 : RUN make", failed("make: not found"));
+        let words = "The image of this project can't be built: make: not found (Step 2/4 : RUN make)";
+        assert_eq!(told, StartError::Project(words.to_owned()));
+        let gone = not_built("Step 2/4 : RUN make", DockerError::NoDaemon("refused".to_owned()));
+        assert!(matches!(gone, StartError::Server(_)), "{gone:?}");
     }
 }

@@ -1,12 +1,13 @@
 //! The network of all containers: the packet filter knows it by the name of its interface.
 
 use super::docker::{Docker, SHORT};
+use super::start_error::StartError;
 
 /// Makes the network of this name, which is also that of its interface, unless it is there.
 ///
 /// # Errors
-/// When Docker fails, in words for the client.
-pub async fn join(docker: &Docker, name: &str) -> Result<(), String> {
+/// When Docker fails.
+pub async fn join(docker: &Docker, name: &str) -> Result<(), StartError> {
     if docker.run(&["network", "inspect", name], SHORT).await.is_ok() {
         return Ok(());
     }
@@ -18,5 +19,5 @@ pub async fn join(docker: &Docker, name: &str) -> Result<(), String> {
     let Err(error) = docker.run(&words, SHORT).await else { return Ok(()) };
     // Another server, or another client of this one, may have been faster.
     let is_there = docker.run(&["network", "inspect", name], SHORT).await.is_ok();
-    if is_there { Ok(()) } else { Err(error.to_string()) }
+    if is_there { Ok(()) } else { Err(error.into()) }
 }

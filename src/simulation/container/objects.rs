@@ -4,7 +4,6 @@
 //! The names of its compose projects begin alike, so that what a server that has crashed left is found again.
 
 use std::collections::HashSet;
-use std::ffi::OsString;
 use std::path::Path;
 use std::process::{Command, Stdio};
 
@@ -57,6 +56,12 @@ impl Owner {
     #[must_use]
     pub fn project(&self, port: u16) -> String {
         format!("{}{port}-{:08x}", self.prefix(), rand::random::<u32>())
+    }
+
+    /// The port of the simulation whose compose project has this name, if it is one of this owner.
+    #[must_use]
+    pub fn port_of(&self, project: &str) -> Option<u16> {
+        project.strip_prefix(&self.prefix())?.split('-').next()?.parse().ok()
     }
 
     fn prefix(&self) -> String {
@@ -122,17 +127,17 @@ pub fn sweep(owner: &Owner) {
     let containers = (vec!["ps", "--all"], &["rm", "--force", "--volumes"][..], format);
     for (list, remove, format) in std::iter::once(containers).chain(rest) {
         let list = list.into_iter().chain(["--filter", &filter, "--format", &format]);
-        let listed = quietly(list.map(OsString::from).collect());
+        let listed = quietly(&list.collect::<Vec<_>>());
         let found = listed.lines().filter_map(|line| line.split_once(' '));
         let found: Vec<&str> = found.filter(|(_, project)| project.starts_with(&prefix)).map(|(id, _)| id).collect();
         if !found.is_empty() {
-            quietly(remove.iter().copied().chain(found).map(OsString::from).collect());
+            quietly(&remove.iter().copied().chain(found).collect::<Vec<_>>());
         }
     }
 }
 
-/// Runs docker within a time limit, and returns what it prints.
-fn quietly(arguments: Vec<OsString>) -> String {
+/// Runs docker within a time limit, and returns what it prints. Blocks.
+pub fn quietly(arguments: &[&str]) -> String {
     let mut command = Command::new("timeout");
     command.arg(SWEEP).arg("docker").args(arguments).stdin(Stdio::null()).stderr(Stdio::null());
     command.output().map(|output| String::from_utf8_lossy(&output.stdout).into_owned()).unwrap_or_default()
@@ -149,5 +154,6 @@ mod tests {
         assert!(name.starts_with(&ours.prefix()) && !name.starts_with(&theirs.prefix()), "{name}");
         assert!(name.chars().all(|letter| letter.is_ascii_lowercase() || letter.is_ascii_digit() || letter == '-'));
         assert_ne!(name, ours.project(2001));
+        assert_eq!((ours.port_of(&name), theirs.port_of(&name)), (Some(2001), None));
     }
 }

@@ -8,8 +8,9 @@ use std::io;
 use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 
-use super::dockerfile::LABEL;
+use super::dockerfile::{LABEL, NO_VOLUME};
 use super::objects::digest;
+use crate::shared::text::one_line;
 
 /// How programs run in an image.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
@@ -27,7 +28,10 @@ pub struct About {
 /// How Docker is asked: a line each for the id, the user, and the words of the entry point and of the command.
 pub const FORMAT: &str = "id {{json .Id}}{{println}}user {{json .Config.User}}{{println}}\
     {{range .Config.Entrypoint}}entrypoint {{json .}}{{println}}{{end}}\
-    {{range .Config.Cmd}}command {{json .}}{{println}}{{end}}";
+    {{range .Config.Cmd}}command {{json .}}{{println}}{{end}}\
+    {{range $path, $_ := .Config.Volumes}}volume {{json $path}}{{println}}{{end}}";
+/// What the first program of a container prints when it runs: from then on its network has an address.
+pub const RUNS: &str = "webots-fleet: the container runs";
 /// Programs that the image gets: names and texts.
 const PROGRAMS: [(&str, &str); 2] = [
     ("open-home", include_str!("../../../config/simulation/docker/open-home")),
@@ -37,22 +41,28 @@ const PROGRAMS: [(&str, &str); 2] = [
 const FOLDER: &str = "/usr/local/share/webots-fleet";
 
 impl About {
-    /// Reads what Docker answers. A word that is too long for a line of it can't be read.
-    #[must_use]
-    pub fn read(answer: &str) -> Option<Self> {
+    /// Reads what Docker answers.
+    ///
+    /// # Errors
+    /// When a word is too long for a line of the answer, or the image has a volume; in words for the client.
+    pub fn read(answer: &str) -> Result<Self, String> {
+        let unreadable = || "The image has an ENTRYPOINT, CMD or VOLUME that can't be read here".to_owned();
         let mut about = Self::default();
         for line in answer.lines() {
-            let (name, word) = line.split_once(' ')?;
-            let word = serde_json::from_str(word).ok()?;
+            let (name, word) = line.split_once(' ').ok_or_else(unreadable)?;
+            let word: String = serde_json::from_str(word).map_err(|_| unreadable())?;
             match name {
                 "id" => about.id = word,
                 "user" => about.user = word,
                 "entrypoint" => about.entrypoint.push(word),
                 "command" => about.command.push(word),
-                _ => return None,
+                "volume" => {
+                    return Err(format!("The image that it begins with has `VOLUME {}`: {NO_VOLUME}", one_line(&word)));
+                }
+                _ => return Err(unreadable()),
             }
         }
-        (!about.id.is_empty()).then_some(about)
+        if about.id.is_empty() { Err(unreadable()) } else { Ok(about) }
     }
 
     /// The Dockerfile of the image on top.
@@ -118,9 +128,16 @@ mod tests {
         let plain = About::read("id \"sha256:2\"\nuser \"\"\n").unwrap();
         assert!(plain.dockerfile("me").ends_with("ENTRYPOINT [\"/usr/local/share/webots-fleet/start-at-home\"]\n"));
     }
+
     #[test]
     fn an_answer_that_was_cut_is_not_read() {
-        assert_eq!(About::read("id \"sha256:1\"\nuser \"\"\nentrypoint \"aaaa\n"), None);
-        assert_eq!(About::read(""), None);
+        assert!(About::read("id \"sha256:1\"\nuser \"\"\nentrypoint \"aaaa\n").is_err());
+        assert!(About::read("").is_err());
+    }
+
+    #[test]
+    fn an_image_that_keeps_data_is_refused() {
+        let wrong = About::read("id \"sha256:1\"\nuser \"\"\nvolume \"/data\"\n").unwrap_err();
+        assert!(wrong.contains("`VOLUME /data`"), "{wrong}");
     }
 }

@@ -1,7 +1,7 @@
 //! The containers of one simulation: made, and ready to be started. Whoever drops them gives them up to be removed.
 
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use tokio::sync::Notify;
 use tokio_util::task::AbortOnDropHandle;
@@ -41,16 +41,28 @@ pub enum Cause {
     OutOfMemory,
     /// Docker, which was stopped or has crashed.
     Docker,
+    /// Docker again, which could not start it.
+    NotStarted,
 }
 
-/// The exit code of a program that was asked to end, as Docker asks all when it is stopped.
-const TERMINATED: i32 = 143;
+/// The exit codes of a program that was ended by SIGTERM or SIGKILL, as Docker ends all when it is stopped.
+const ENDED_BY_SIGNAL: [i32; 2] = [128 + 15, 128 + 9];
+/// How long before now Docker is asked for the end of a container, and after now: it answers when that has passed.
+const EVENTS: (Duration, Duration) = (Duration::from_mins(1), Duration::from_millis(100));
 /// The time between two starts of a participant's controller, at least.
 const BETWEEN_RESTARTS: Duration = Duration::from_secs(1);
 /// The service of a participant's controller.
 const CONTROLLER: &str = "controller";
 /// The service of Webots.
 const WEBOTS: &str = "webots";
+
+impl Cause {
+    /// Whether it is this server's fault, so that another one may take the client.
+    #[must_use]
+    pub fn is_own(self) -> bool {
+        self != Self::OutOfMemory
+    }
+}
 
 impl Lease {
     /// Takes a name.
@@ -117,16 +129,35 @@ impl Prepared {
         self.restart.as_ref().map(|(asked, _)| Arc::clone(asked))
     }
 
-    /// Why Webots' container has ended with this exit code, if Docker knows more than that.
+    /// Why Webots' container has ended, given the exit code of the program `docker`; nothing if Docker knows no more.
     pub async fn cause(&self, code: Option<i32>) -> Option<Cause> {
-        let webots = self.of(WEBOTS)?;
-        match self.docker.run(&["inspect", "--format", "{{.State.OOMKilled}}", webots], SHORT).await {
-            Ok(answer) if answer.trim() == "true" => Some(Cause::OutOfMemory),
-            // The container may be known to it while it stops.
-            Ok(_) if code != Some(TERMINATED) => None,
-            Ok(_) | Err(DockerError::NoDaemon(_)) => Some(Cause::Docker),
-            Err(_) => None,
+        let (webots, code) = (self.of(WEBOTS)?, code?);
+        let format = "{{.State.OOMKilled}} {{.State.Status}} {{.State.ExitCode}}";
+        let state = match self.docker.run(&["inspect", "--format", format, webots], SHORT).await {
+            Ok(state) => state,
+            Err(DockerError::Failed { .. }) => return None,
+            Err(_) => return Some(Cause::Docker),
+        };
+        match state.split_whitespace().collect::<Vec<_>>().as_slice() {
+            ["true", ..] => Some(Cause::OutOfMemory),
+            [_, "created", _] => Some(Cause::NotStarted),
+            // The program has lost its daemon.
+            [_, _, ended] if *ended != code.to_string() => Some(Cause::Docker),
+            _ if ENDED_BY_SIGNAL.contains(&code) => self.was_stopped(webots).await.then_some(Cause::Docker),
+            _ => None,
         }
+    }
+
+    /// Whether Docker has ended a container, or has been started anew since its end. A daemon that has seen a container end
+    /// by itself tells of that end alone.
+    async fn was_stopped(&self, container: &str) -> bool {
+        let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+        let [since, until] = [now.saturating_sub(EVENTS.0), now + EVENTS.1]
+            .map(|time| format!("{}.{:09}", time.as_secs(), time.subsec_nanos()));
+        let container = format!("container={container}");
+        let words = ["events", "--since", &since, "--until", &until, "--filter", &container, "--format", "{{.Action}}"];
+        let seen = self.docker.run(&words, SHORT).await;
+        seen.map_or(true, |seen| !seen.lines().any(|line| line == "die") || seen.lines().any(|line| line == "kill"))
     }
 
     /// Removes everything of this simulation.

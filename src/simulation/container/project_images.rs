@@ -3,10 +3,12 @@
 use std::sync::Arc;
 
 use super::blocking::blocking;
+use super::docker::DockerError;
 use super::dockerfile;
 use super::image::{Build, Images};
 use super::opened;
 use super::recipe::{self, PROJECT_PATH};
+use super::start_error::StartError;
 use crate::simulation::checkout::Project;
 
 /// An image that is made from a project, or from a folder of it.
@@ -35,7 +37,7 @@ impl Images {
         self: &Arc<Self>,
         part: Part<'_>,
         progress: &(impl Fn(String) + Send + Sync),
-    ) -> Result<String, String> {
+    ) -> Result<String, StartError> {
         let Part { project, base, text, folder, make, network } = part;
         let mut arguments = vec![
             format!("WEBOTS_DEFAULT_IMAGE={base}"),
@@ -57,7 +59,7 @@ impl Images {
         let key = opened::key(parts);
         let dockerfile = project.instance.path().join(format!("Dockerfile{folder}"));
         let (file, text) = (dockerfile.clone(), text.to_owned());
-        blocking(move || std::fs::write(file, text).map_err(|error| error.to_string())).await?;
+        blocking(move || std::fs::write(file, text)).await?;
         let (root, folder) = (project.folder().to_owned(), folder.to_owned());
         // What was copied out of an image may have put a link to anywhere in its place.
         let context = blocking(move || recipe::inside(&root, &folder)).await?;
@@ -69,15 +71,20 @@ impl Images {
     ///
     /// # Errors
     /// Why it can't be made, in words for the client.
-    pub async fn open_now(&self, image: &str, name: &str, project: &Project) -> Result<(), String> {
+    pub async fn open_now(&self, image: &str, name: &str, project: &Project) -> Result<(), StartError> {
         let text = self.about(image).await?.dockerfile(self.owner.name());
         let context = project.instance.path().join(format!("opened-{}", opened::key(std::iter::once(name))));
         let (dockerfile, folder) = (context.with_extension("Dockerfile"), context.clone());
         let file = dockerfile.clone();
         let write = move || std::fs::write(file, text).and_then(|()| opened::write_programs(&folder));
-        blocking(move || write().map_err(|error| error.to_string())).await?;
+        blocking(write).await?;
         let options = ["--network", "none", "--tag", name].map(Into::into).to_vec();
         let done = self.run_build(options, &dockerfile, &context, |_| ()).await;
-        done.map_err(|error| format!("The image can't be prepared for this server's user: {error}"))
+        done.map_err(|error| match error {
+            DockerError::Failed { message, .. } => {
+                StartError::Project(format!("The image can't be prepared for this server's user: {message}"))
+            }
+            error => error.into(),
+        })
     }
 }

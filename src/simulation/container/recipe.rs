@@ -1,13 +1,14 @@
 //! What is made of a project that was checked out: its Dockerfiles, and the files that they need.
 
-use std::fs::{File, OpenOptions};
-use std::io::{self, Read, Write};
+use std::fs::OpenOptions;
+use std::io::{self, Write};
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 
 use nix::fcntl::OFlag;
 
 use super::dockerfile;
+use super::project_file::text_of;
 use super::templates::{CONTROLLER, DOCKERFILE, LAUNCHER, Templates};
 use super::webots_yml::{Kind, WebotsYml};
 
@@ -29,8 +30,6 @@ pub struct Recipe {
     pub warnings: Vec<String>,
 }
 
-/// What a Dockerfile may have at most, in bytes.
-const LARGEST: u64 = 256 * 1024;
 /// Files with which a project would say itself how its containers run.
 const IGNORED: [&str; 3] = ["docker-compose.yml", "docker-compose.yaml", ".env"];
 
@@ -41,7 +40,7 @@ impl Recipe {
     /// # Errors
     /// What is wrong, in words for the client.
     pub fn read(project: &Path, templates: &Templates, owner: &str) -> Result<Self, String> {
-        let asks = WebotsYml::read(project).map_err(|error| format!("Its webots.yml can't be read: {error}"))?;
+        let asks = WebotsYml::read(project);
         let mut warnings = asks.warnings.clone();
         let ignored = IGNORED.iter().filter(|name| project.join(name).symlink_metadata().is_ok());
         warnings.extend(ignored.map(|name| format!("{name} of the project is not used here")));
@@ -94,31 +93,6 @@ fn place(path: &Path, text: &str) -> io::Result<()> {
         Ok(mut file) => file.write_all(text.as_bytes()),
         Err(error) if error.kind() == io::ErrorKind::AlreadyExists => Ok(()),
         Err(error) => Err(error),
-    }
-}
-
-/// The text of a file, nothing where there is none. What is no plain file is refused: a link could lead anywhere.
-fn text_of(path: &Path) -> Result<Option<String>, String> {
-    let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
-    let flags = (OFlag::O_NOFOLLOW | OFlag::O_NONBLOCK).bits();
-    let file = match OpenOptions::new().read(true).custom_flags(flags).open(path) {
-        Ok(file) => file,
-        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
-        Err(error) => return Err(format!("{name} of the project can't be read: {error}")),
-    };
-    let read = |file: File| -> io::Result<Option<String>> {
-        let about = file.metadata()?;
-        if !about.is_file() || about.len() > LARGEST {
-            return Ok(None);
-        }
-        let mut text = String::new();
-        file.take(LARGEST).read_to_string(&mut text)?;
-        Ok(Some(text))
-    };
-    match read(file) {
-        Ok(Some(text)) => Ok(Some(text)),
-        Ok(None) => Err(format!("{name} of the project is no plain file of at most {} KiB", LARGEST / 1024)),
-        Err(error) => Err(format!("{name} of the project can't be read: {error}")),
     }
 }
 

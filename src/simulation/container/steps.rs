@@ -16,7 +16,14 @@ pub fn pulling(image: &str, said: &str) -> String {
 }
 
 /// Lines of a build that tell nobody anything.
-const NOISE: [&str; 3] = [" --->", "Removing intermediate container", "Sending build context"];
+const NOISE: [&str; 6] = [
+    " --->",
+    "Removing intermediate container",
+    "Sending build context",
+    "DEPRECATED: The legacy builder",
+    "            BuildKit is currently disabled",
+    "            environment-variable",
+];
 
 /// An image is built, and Docker says this. Of its steps the page understands nine.
 #[must_use]

@@ -9,6 +9,7 @@ use serde::Deserialize;
 use serde::de::IgnoredAny;
 
 use super::webots_yml::Kind;
+use crate::simulation::config::ContainerSettings;
 
 /// A file that comes with this server.
 macro_rules! shipped {
@@ -55,6 +56,27 @@ struct Service {
 }
 
 impl Templates {
+    /// Those of a configuration.
+    #[must_use]
+    pub fn of(settings: &ContainerSettings) -> Self {
+        Self { folder: settings.templates.as_ref().map(|folder| folder.0.clone()), debug: settings.debug }
+    }
+
+    /// What is wrong with the administrator's files, with the line and what to write there.
+    #[must_use]
+    pub fn faults(&self) -> Vec<String> {
+        let Some(folder) = &self.folder else { return Vec::new() };
+        if let Err(error) = std::fs::read_dir(folder) {
+            return vec![format!("container.templates, {}: {error}", folder.display())];
+        }
+        let edited = || String::new();
+        let kinds = [Kind::Default, Kind::Editor { folder: edited() }, Kind::Competition { folder: edited() }];
+        let files = [DOCKERFILE, CONTROLLER, LAUNCHER];
+        let unreadable = |name: &&str| Some(format!("{name} of container.templates: {}", self.text(name).err()?));
+        let faults = kinds.iter().filter_map(|kind| self.compose(kind).err());
+        faults.chain(files.iter().filter_map(unreadable)).collect()
+    }
+
     /// The template for what a project asks for.
     ///
     /// # Errors
@@ -100,10 +122,14 @@ impl Templates {
 }
 
 /// What a template of the original has that can't work here, by the beginning of its line, and what to write there.
-const UNSUITABLE: [(&str, &str); 3] = [
+const UNSUITABLE: [(&str, &str); 4] = [
     (
         "volumes:",
         "a volume belongs to root, and programs run as the server's user: mount ${PROJECT} or ${THEIA_FOLDER} instead",
+    ),
+    (
+        "build:",
+        "images are built before, once for all who want the same: write `image: ${IMAGE}`, or ${CONTROLLER_IMAGE}",
     ),
     ("network_mode:", "all services are in the network of container.network: leave it out"),
     ("reservations:", "container.gpu gives graphics cards where there are some: leave it out"),
@@ -144,6 +170,7 @@ mod tests {
         let templates = Templates { folder: Some(folder.path().to_owned()), debug: false };
         for (text, words) in [
             ("volumes:\n  data:\nservices:\n  webots: {}\n", "line 1, `volumes:`"),
+            ("services:\n  webots:\n    build:\n      context: .\n", "line 3, `build:`"),
             ("services:\n  webots:\n    network_mode: host\n", "line 3, `network_mode: host`"),
             (
                 "services:\n  webots:\n    deploy:\n      resources:\n        reservations:\n          devices: []\n",
@@ -154,6 +181,7 @@ mod tests {
             std::fs::write(folder.path().join("docker-compose-default.yml"), text).unwrap();
             let wrong = templates.compose(&Kind::Default).unwrap_err();
             assert!(wrong.starts_with("The template docker-compose-default.yml") && wrong.contains(words), "{wrong}");
+            assert_eq!(templates.faults(), [wrong]);
         }
         for kind in [Kind::Editor { folder: String::new() }, Kind::Competition { folder: String::new() }] {
             for debug in [false, true] {

@@ -41,7 +41,6 @@ impl Live {
 
 /// Removes what simulations have left that nobody could remove when they ended, and images that nobody needs.
 pub async fn keep_tidy(docker: Docker, owner: Owner, live: Live, images: Arc<Images>, config: Arc<SimulationConfig>) {
-    let age = Duration::from_hours(24 * config.container.images_age);
     let mut pruned: Option<Instant> = None;
     let mut pause = PERIOD;
     loop {
@@ -58,7 +57,9 @@ pub async fn keep_tidy(docker: Docker, owner: Owner, live: Live, images: Arc<Ima
             }
         };
         if pruned.is_none_or(|at| at.elapsed() > PRUNE) {
-            images.prune(age, config.container.images_size << 20, &config.persistant_docker_images).await;
+            if let Err(error) = images.prune(config.container.images_age).await {
+                log::warn!("images that nobody needs are not removed: {error}");
+            }
             pruned = Some(Instant::now());
         }
     }

@@ -7,4 +7,4 @@ pub mod sensors;
 mod usage;
 
 pub use load_monitor::{LoadMonitor, Readings, Sample};
-pub use usage::{Tree, Usage, UsageMonitor, Usages};
+pub use usage::{Measured, Sum, Tree, Usage, UsageMonitor, Usages, cgroup_sum};

@@ -1,4 +1,5 @@
-//! CPU and memory of each simulation: from its control group, otherwise from its process tree.
+//! CPU and memory of each simulation: from its control group, otherwise from its process tree, or from what only its level of
+//! isolation knows.
 //!
 //! One pass over `/proc` serves all simulations and all that ask, at most once in 1.8 s, and only when somebody asks.
 
@@ -28,7 +29,7 @@ pub struct Usage {
     pub memory: u64,
     /// How many processes and threads there are.
     pub threads: u64,
-    /// Processor time until now, that of processes which were waited for included.
+    /// Processor time until now, that of processes which were waited for included; zero where Docker tells of it.
     pub time: Duration,
 }
 
@@ -47,12 +48,24 @@ struct Readings {
     usages: Usages,
 }
 
-/// What a tree has taken until now.
-#[derive(Debug, Default, Clone, Copy)]
-struct Sum {
-    time: Duration,
-    memory: u64,
-    threads: u64,
+/// What processes have taken until now.
+#[derive(Debug, Default, Clone, Copy, PartialEq, Eq)]
+pub struct Sum {
+    /// Processor time.
+    pub time: Duration,
+    /// Memory in bytes.
+    pub memory: u64,
+    /// Processes and threads.
+    pub threads: u64,
+}
+
+/// A reading of a simulation.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Measured {
+    /// What it has taken until now.
+    Sum(Sum),
+    /// What it takes, of which another program has taken the mean.
+    Usage(Usage),
 }
 
 /// How long a reading is cached.
@@ -70,40 +83,61 @@ impl UsageMonitor {
     /// The usage of each of these trees, never much older than two seconds. Blocks for some milliseconds.
     #[must_use]
     pub fn read(&self, trees: &[Tree]) -> Usages {
-        if trees.is_empty() {
+        self.read_by(&trees.iter().map(|tree| tree.root).collect::<Vec<_>>(), || sums_of(trees))
+    }
+
+    /// The same for simulations whose processes only `measure` finds. It is called when the last reading is too old.
+    #[must_use]
+    pub fn read_by(&self, roots: &[i32], measure: impl FnOnce() -> Vec<(i32, Measured)>) -> Usages {
+        if roots.is_empty() {
             return Usages::new();
         }
         let mut readings = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        readings.renew(trees);
+        readings.renew(roots, measure);
         readings.usages.clone()
     }
 }
 
 impl Readings {
-    fn renew(&mut self, trees: &[Tree]) {
+    fn renew(&mut self, roots: &[i32], measure: impl FnOnce() -> Vec<(i32, Measured)>) {
         let passed = self.read.map(|read| read.elapsed());
-        let known = trees.iter().all(|tree| self.usages.contains_key(&tree.root));
+        let known = roots.iter().all(|root| self.usages.contains_key(root));
         if known && passed.is_some_and(|passed| passed < AGE) {
             return;
         }
         self.read = Some(Instant::now());
         let before = std::mem::take(&mut self.times);
         self.usages.clear();
-        let mut processes = None;
-        for Tree { root, cgroup } in trees {
-            let sum = cgroup.as_deref().and_then(cgroup_sum);
-            let sum = sum.unwrap_or_else(|| tree_sum(*root, processes.get_or_insert_with(all_by_parent)));
-            let measured = before.get(root).zip(passed).filter(|(_, passed)| !passed.is_zero());
-            let cpu = measured
-                .map(|(before, passed)| 100.0 * sum.time.saturating_sub(*before).as_secs_f64() / passed.as_secs_f64());
-            self.times.insert(*root, sum.time);
-            self.usages.insert(*root, Usage { cpu, memory: sum.memory, threads: sum.threads, time: sum.time });
+        for (root, measured) in measure() {
+            let usage = match measured {
+                Measured::Usage(usage) => usage,
+                Measured::Sum(Sum { time, memory, threads }) => {
+                    let known = before.get(&root).zip(passed).filter(|(_, passed)| !passed.is_zero());
+                    let cpu = known.map(|(before, passed)| {
+                        100.0 * time.saturating_sub(*before).as_secs_f64() / passed.as_secs_f64()
+                    });
+                    self.times.insert(root, time);
+                    Usage { cpu, memory, threads, time }
+                }
+            };
+            self.usages.insert(root, usage);
         }
     }
 }
 
-/// What a control group has taken; `None` if the kernel does not count all of it there.
-fn cgroup_sum(folder: &Path) -> Option<Sum> {
+fn sums_of(trees: &[Tree]) -> Vec<(i32, Measured)> {
+    let mut processes = None;
+    let sums = trees.iter().map(|Tree { root, cgroup }| {
+        let sum = cgroup.as_deref().and_then(cgroup_sum);
+        let sum = sum.unwrap_or_else(|| tree_sum(*root, processes.get_or_insert_with(all_by_parent)));
+        (*root, Measured::Sum(sum))
+    });
+    sums.collect()
+}
+
+/// What a control group of version 2 has taken; `None` if the kernel does not count all of it there.
+#[must_use]
+pub fn cgroup_sum(folder: &Path) -> Option<Sum> {
     let number = |file: &str| std::fs::read_to_string(folder.join(file)).ok()?.trim().parse().ok();
     let times = std::fs::read_to_string(folder.join("cpu.stat")).ok()?;
     let time = times.lines().find_map(|line| line.strip_prefix("usage_usec "))?.parse().ok()?;

@@ -2,7 +2,7 @@
 
 use std::fmt;
 
-use constant_time_eq::constant_time_eq_16;
+use subtle::ConstantTimeEq;
 
 /// Names a session, and proves that the client is its own. It never comes into a log, a page or a URL.
 #[derive(Clone, Copy)]
@@ -46,7 +46,7 @@ impl Token {
 impl PartialEq for Token {
     /// Takes a time that does not depend on the secrets.
     fn eq(&self, other: &Self) -> bool {
-        self.number == other.number && constant_time_eq_16(&self.secret, &other.secret)
+        self.number == other.number && self.secret.ct_eq(&other.secret).into()
     }
 }
 

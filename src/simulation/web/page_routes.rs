@@ -1,5 +1,6 @@
 //! The paths of the simulation server's page, with what it loads and listens to, and of Webots' own viewer.
 
+use std::collections::BTreeMap;
 use std::io::{Read, Seek, SeekFrom};
 use std::path::Path;
 
@@ -15,6 +16,7 @@ use crate::asset;
 use crate::shared::http::assets::{self, Asset};
 use crate::shared::http::paths::{GET, READ, path};
 use crate::shared::http::{Kind, Policy, html};
+use crate::simulation::container;
 use crate::simulation::ends::output_file;
 use crate::simulation::machine::{Tree, Usages};
 use crate::simulation::snapshot::{Simulation, Snapshot};
@@ -45,15 +47,20 @@ async fn monitor(server: web::Data<AppState>) -> HttpResponse {
 }
 
 async fn usages(server: &AppState, snapshot: &Snapshot) -> Usages {
-    let tree = |one: &Simulation| Some(Tree { root: one.pid?, cgroup: one.cgroup.clone() });
-    // In containers the process is that of docker, which waits for them.
-    let is_own = server.containers.is_none();
-    let trees: Vec<Tree> = snapshot.simulations.iter().filter(|_| is_own).filter_map(tree).collect();
-    if trees.is_empty() {
-        return Usages::new();
-    }
-    let usage = server.usage.clone();
-    actix_rt::task::spawn_blocking(move || usage.read(&trees)).await.unwrap_or_default()
+    let (usage, simulations) = (server.usage.clone(), snapshot.simulations.iter());
+    let read = if let Some(containers) = &server.containers {
+        // The process is that of docker, which waits for them.
+        let roots: BTreeMap<u16, i32> = simulations.filter_map(|one| Some((one.port?, one.pid?))).collect();
+        let owner = containers.run().clone();
+        let read =
+            move || usage.read_by(&roots.values().copied().collect::<Vec<_>>(), || container::measure(&owner, &roots));
+        actix_rt::task::spawn_blocking(read)
+    } else {
+        let tree = |one: &Simulation| Some(Tree { root: one.pid?, cgroup: one.cgroup.clone() });
+        let trees: Vec<Tree> = simulations.filter_map(tree).collect();
+        actix_rt::task::spawn_blocking(move || usage.read(&trees))
+    };
+    read.await.unwrap_or_default()
 }
 
 async fn events(request: HttpRequest, server: web::Data<AppState>) -> HttpResponse {

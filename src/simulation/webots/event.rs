@@ -29,8 +29,8 @@ pub enum WebotsEvent {
 pub struct Exit {
     /// Whether it ended by itself and in order.
     pub clean: bool,
-    /// Whether it is this server's fault, so that another one may take the client: Docker has stopped, or Webots has ended
-    /// before it listened, which it does before it loads its world.
+    /// Whether it is this server's fault, so that another one may take the client: Docker has failed or stopped, or Webots
+    /// has ended before it listened, which it does before it loads its world.
     pub own: bool,
     /// In words, for the client.
     pub why: String,
@@ -49,6 +49,7 @@ impl Exit {
 pub fn words(cause: Cause) -> &'static str {
     match cause {
         Cause::OutOfMemory => "The simulation has taken more memory than it may (limits.memory)",
+        Cause::NotStarted => "Docker can't start the simulation's container on this simulation server",
         Cause::Docker => "Docker has stopped on this simulation server, and all simulations in it have ended",
     }
 }

@@ -5,12 +5,14 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use actix::prelude::*;
+use futures_util::FutureExt;
+use futures_util::future::LocalBoxFuture;
 
 use super::command::WebotsCommand;
 use super::event::WebotsEvent;
 use crate::simulation::checkout::{Checkouts, Project};
 use crate::simulation::config::SimulationConfig;
-use crate::simulation::container::{Containers, Request};
+use crate::simulation::container::{Containers, Request, until_answering};
 use crate::simulation::ends::FOLDER_OF_RUNNING;
 use crate::simulation::isolation::{Cgroup, Launcher, Peak, Program, Watch, Watcher};
 use crate::simulation::machine::display;
@@ -115,9 +117,13 @@ impl LaunchSpec {
         }
     }
 
-    /// Waits until one of these processes listens on a port that Webots may have taken, and returns the port.
-    pub fn listening_port(&self, root: i32) -> impl Future<Output = u16> + use<> {
-        let (watcher, port) = (self.watcher.clone(), self.place.1);
-        async move { watcher.listening_port(root, port).await }
+    /// Waits until its container answers, or one of these processes listens on a port that Webots may have taken, and returns
+    /// the port.
+    pub fn listening_port(&self, root: i32) -> LocalBoxFuture<'static, u16> {
+        let (watcher, bind, port) = (self.watcher.clone(), self.config.bind, self.place.1);
+        match &self.containers {
+            Some(_) => until_answering(bind, port).map(move |()| port).boxed_local(),
+            None => async move { watcher.listening_port(root, port).await }.boxed_local(),
+        }
     }
 }

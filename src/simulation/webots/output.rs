@@ -16,11 +16,14 @@ use tokio::sync::oneshot;
 use super::paced_reader::PacedReader;
 use crate::shared::run::RotatedFile;
 use crate::shared::text::one_line;
+use crate::simulation::container::RUNS;
 
 /// What a line of Webots' output tells of its state.
 #[derive(Message, Debug, Clone, Copy, PartialEq, Eq)]
 #[rtype(result = "()")]
 pub enum OutputEvent {
+    /// [`RUNS`]: its container runs.
+    ContainerRuns,
     /// `.`: the heartbeat.
     Heartbeat,
     /// `pause`: the simulation is paused.
@@ -49,6 +52,7 @@ impl OutputEvent {
     #[must_use]
     pub fn parse(line: &str) -> Option<Self> {
         match line {
+            RUNS => Some(Self::ContainerRuns),
             "." => Some(Self::Heartbeat),
             "pause" => Some(Self::Paused),
             "real-time" | "fast" | "step" => Some(Self::Running),

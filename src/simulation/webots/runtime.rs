@@ -8,7 +8,7 @@ use tokio::sync::Notify;
 use super::event::WebotsEvent;
 use super::launch_spec::LaunchSpec;
 use super::virtual_display::VirtualDisplay;
-use crate::simulation::container::{Cause, Containers, Prepared, Request};
+use crate::simulation::container::{Cause, Containers, Prepared, Request, StartError};
 
 /// What a Webots runs on.
 #[derive(Debug)]
@@ -44,17 +44,17 @@ impl Preparation {
     /// Does it. `progress` hears each step in words. Dropping the future gives up what was made.
     ///
     /// # Errors
-    /// Why not, in words for the client.
-    pub async fn run(self, progress: impl Fn(String) + Send + Sync) -> Result<Runtime, String> {
+    /// Whose fault it is that it can't be done.
+    pub async fn run(self, progress: impl Fn(String) + Send + Sync) -> Result<Runtime, StartError> {
         match self {
             Self::None => Ok(Runtime::Machine(None)),
             Self::Display(instance) => match VirtualDisplay::start(&instance).await {
                 Ok(display) => Ok(Runtime::Machine(Some(display))),
-                Err(error) => Err(format!("The virtual display (Xvfb) can't be started: {error}")),
+                Err(error) => Err(StartError::Server(format!("The virtual display (Xvfb) can't be started: {error}"))),
             },
             Self::Containers(containers, request) => {
                 let mut prepared = containers.prepare(request, &progress).await?;
-                prepared.start_others().await.map_err(|error| error.to_string())?;
+                prepared.start_others().await?;
                 Ok(Runtime::Containers(Box::new(prepared)))
             }
         }

@@ -2,7 +2,6 @@
 
 use super::event;
 use super::launched::End;
-use crate::simulation::container::Cause;
 use crate::simulation::ends::EndReason;
 use crate::simulation::process::ExitReason;
 
@@ -12,8 +11,8 @@ pub fn verdict(stopped: Option<(EndReason, String)>, end: &End, was_ready: bool)
         return stopped;
     }
     let kind = match (end.cause, end.reason) {
-        (Some(Cause::Docker), _) => EndReason::Fault,
-        (Some(Cause::OutOfMemory), _) => EndReason::Limit,
+        (Some(cause), _) if cause.is_own() => EndReason::Fault,
+        (Some(_), _) => EndReason::Limit,
         (None, ExitReason::Code(0)) => EndReason::Finished,
         (None, _) if was_ready => EndReason::Crashed,
         (None, _) => EndReason::NoWebots,
@@ -29,6 +28,7 @@ pub fn verdict(stopped: Option<(EndReason, String)>, end: &End, was_ready: bool)
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::simulation::container::Cause;
     use crate::simulation::ends::Taken;
 
     #[test]

@@ -18,7 +18,7 @@ use super::runtime::{Preparation, Runtime};
 use super::verdict::verdict;
 use crate::shared::run::seconds_since_1970;
 use crate::simulation::checkout::CheckoutError;
-use crate::simulation::container::until_answering;
+use crate::simulation::container::StartError;
 use crate::simulation::ends::{EndReason, Taken};
 use crate::simulation::process::ProcessGroup;
 use crate::simulation::snapshot::{Change, Stage};
@@ -43,6 +43,8 @@ pub struct Webots {
     group: Option<ProcessGroup>,
     /// Asks to start the controller of a competition's participant anew.
     restart: Option<Arc<Notify>>,
+    /// The wait until it listens.
+    awaiting: Option<SpawnHandle>,
     tail: Tail,
     listening: bool,
     /// Whether the simulation is not paused.
@@ -67,6 +69,7 @@ impl Webots {
             preparing: None,
             group: None,
             restart: None,
+            awaiting: None,
             tail: Tail::default(),
             listening: false,
             runs: false,
@@ -84,7 +87,8 @@ impl Webots {
         let prepared = Preparation::of(&self.spec).run(progress).into_actor(self);
         self.preparing = Some(ctx.spawn(prepared.map(|prepared, this, ctx| match prepared {
             Ok(runtime) => this.launch(runtime, ctx),
-            Err(why) => this.not_started(EndReason::NoWebots, &why, ctx),
+            Err(StartError::Project(why)) => this.not_started(EndReason::NoWebots, &why, ctx),
+            Err(StartError::Server(why)) => this.not_started(EndReason::Fault, &why, ctx),
         })));
     }
 
@@ -93,12 +97,11 @@ impl Webots {
         self.restart = runtime.restart();
         runtime.news().into_iter().for_each(|event| self.tell(event));
         if let Err(error) = self.spawn(runtime, ctx) {
-            let why = format!("Webots can't be started: {error}");
-            self.log(Level::Error, &why);
-            return self.not_started(EndReason::NoWebots, &why, ctx);
+            return self.not_started(EndReason::Fault, &format!("Webots can't be started: {error}"), ctx);
         }
         self.tell(WebotsEvent::Started);
-        self.await_port(ctx);
+        // A container says itself when it runs.
+        self.spec.containers.is_none().then(|| self.await_port(ctx));
         ctx.run_interval(self.spec.config.timing.heartbeat, Self::check_heartbeat);
         let limit = self.spec.config.timing.launch;
         ctx.run_later(limit, move |this, _| {
@@ -128,18 +131,16 @@ impl Webots {
         Ok(())
     }
 
-    /// Waits until its container answers, or a process of this instance listens on a port that Webots may have taken.
-    fn await_port(&self, ctx: &mut Context<Self>) {
-        if self.spec.containers.is_some() {
-            let answering = until_answering(self.spec.config.bind, self.port).into_actor(self);
-            answering.map(|(), this, _| this.ready(this.port)).spawn(ctx);
-        } else if let Some(root) = self.group.as_ref().map(ProcessGroup::leader) {
-            let listening = self.spec.listening_port(root).into_actor(self);
-            listening.map(|port, this, _| this.ready(port)).spawn(ctx);
+    /// Waits until it listens, unless it does or is waited for.
+    fn await_port(&mut self, ctx: &mut Context<Self>) {
+        if let (Some(group), None, false) = (&self.group, self.awaiting, self.listening) {
+            let listening = self.spec.listening_port(group.leader()).into_actor(self);
+            self.awaiting = Some(ctx.spawn(listening.map(|port, this, ctx| this.ready(port, ctx))));
         }
     }
 
-    fn ready(&mut self, port: u16) {
+    fn ready(&mut self, port: u16, ctx: &mut Context<Self>) {
+        self.awaiting.take().map(|awaiting| ctx.cancel_future(awaiting));
         if self.stopped_for.is_some() || self.listening {
             return;
         }
@@ -189,9 +190,7 @@ impl Webots {
             self.log(Level::Info, &format!("ending: {why}"));
             self.stopped_for = Some((kind, why.to_owned()));
             self.spec.place.0.update(Change::Stage(Stage::Stopping));
-            if let Some(group) = &mut self.group {
-                group.terminate();
-            }
+            self.group.iter_mut().for_each(ProcessGroup::terminate);
         }
     }
 
@@ -227,7 +226,7 @@ impl Webots {
 
     fn not_started(&mut self, kind: EndReason, why: &str, ctx: &mut Context<Self>) {
         self.spec.place.0.end(kind, why, Taken::default());
-        self.exited(self.failure(why), ctx);
+        self.exited(Exit { own: kind == EndReason::Fault, ..self.failure(why) }, ctx);
     }
 
     fn exited(&mut self, exit: Exit, ctx: &mut Context<Self>) {
@@ -261,13 +260,14 @@ impl Actor for Webots {
 impl Handler<OutputEvent> for Webots {
     type Result = ();
 
-    fn handle(&mut self, event: OutputEvent, _: &mut Self::Context) {
+    fn handle(&mut self, event: OutputEvent, ctx: &mut Self::Context) {
         self.last_heartbeat = Instant::now();
         self.hanging = false;
         match event {
             OutputEvent::Heartbeat if self.listening => self.tell(WebotsEvent::Heartbeat),
-            OutputEvent::Heartbeat if self.spec.containers.is_some() => self.ready(self.port),
+            OutputEvent::Heartbeat if self.spec.containers.is_some() => self.ready(self.port, ctx),
             OutputEvent::Heartbeat => {}
+            OutputEvent::ContainerRuns => self.await_port(ctx),
             OutputEvent::Reset => self.restart.iter().for_each(|controller| controller.notify_one()),
             OutputEvent::Paused | OutputEvent::Running => {
                 self.runs = event == OutputEvent::Running;
