@@ -149,9 +149,7 @@ impl WebClient {
         let State::CheckingOut { mode, place } = std::mem::replace(&mut self.state, State::Over) else { return };
         log::info!("{}: {} is for Webots {}", self.name(), project.world.path.display(), project.world.version);
         place.0.update(Change::Version(project.world.version.clone()));
-        for warning in &project.warnings {
-            ctx.text(protocol::loading(warning));
-        }
+        project.warnings.iter().for_each(|warning| ctx.text(protocol::loading(warning)));
         ctx.text(protocol::loading("webots is starting"));
         let spec = LaunchSpec {
             config: Arc::clone(&self.server.config),
