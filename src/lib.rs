@@ -18,13 +18,14 @@
 //! | [`simulation::checkout`] | worlds out of git |
 //! | `simulation::isolation` | how a simulation is launched: its level of isolation, environment and limits |
 //! | [`simulation::container`] | simulations in containers: what a project asks for, its image, its compose project |
+//! | [`simulation::ends`] | how simulations have ended: counter, table, kept output |
 //! | [`simulation::webots`] | one running Webots |
 //! | [`simulation::client`] | one web client, the session of its simulation |
 //! | `simulation::web` | paths and pages of the simulation server |
 //!
 //! Each server also has a folder `config` (every key), its `app` (start and end) and its `state` (what its paths share). Files
 //! of `simulation` are the wire [`protocol`](simulation::protocol), the [`places`](simulation::places) that clients wait for,
-//! the `snapshot` of them, the `failed_starts`, the `announcer` (key `notify`), `preflight` (`--check`) and `readiness` (`/health`).
+//! the `snapshot` of them, the `simulation_id`, the `failed_starts`, the `announcer` (key `notify`), `preflight` (`--check`) and `readiness` (`/health`).
 //! The programs are in `src/bin`.
 //! Imports point down only, in the order that `tests/project/layering.rs` lists. `session` and `simulation` never see each
 //! other. A child never names its parent: it is given a `Recipient` of its events, which are defined in the child's file.

@@ -4,11 +4,17 @@ use serde_json::json;
 
 use super::stand_in::{Manner, StandIn};
 use super::{addresses, until_states};
-use crate::support::program::{Builder, session_server};
+use crate::support::git::Forge;
+use crate::support::program::{Builder, session_server, simulation_server};
 use crate::support::smtp::Smtp;
+use crate::support::webots::Webots;
 
 fn with_mails(servers: &[StandIn], smtp: &Smtp) -> Builder {
-    session_server(&addresses(servers))
+    of_addresses(&addresses(servers), smtp)
+}
+
+fn of_addresses(servers: &[String], smtp: &Smtp) -> Builder {
+    session_server(servers)
         .set("administrator", "admin@example.org")
         .set("mailSender", "fleet@example.org")
         .set("mailServer", "127.0.0.1")
@@ -57,6 +63,24 @@ async fn every_kind_of_failure_is_mailed_and_so_is_its_end() {
         let entry = text.split(&told).nth(1).unwrap().split("working again").next().unwrap();
         assert!(entry.contains(words), "the last error of {manner:?}: {entry}");
     }
+}
+
+#[actix_rt::test]
+async fn a_simulation_server_that_is_not_ready_is_mailed_with_its_reason_and_so_is_its_end() {
+    let mut smtp = Smtp::start(&[]).await;
+    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
+    let server = simulation_server(&webots.path(), forge.path(), 1).start().await;
+    let session = of_addresses(&[server.address()], &smtp).set("loadThreshold", 1000).start().await;
+    until_states(&session, &["up"]).await;
+    let away = webots.path().with_extension("away");
+    std::fs::rename(webots.path(), &away).unwrap();
+    let mail = smtp.mail().await;
+    assert_eq!(mail.subject(), format!("Simulation server not responding: {}", server.address()));
+    let text = mail.field("text");
+    assert!(text.contains("This simulation server has no Webots that it can run"), "{text}");
+    std::fs::rename(&away, webots.path()).unwrap();
+    let mail = smtp.mail().await;
+    assert_eq!(mail.subject(), format!("Simulation server working again: {}", server.address()));
 }
 
 #[actix_rt::test]

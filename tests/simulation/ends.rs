@@ -125,7 +125,7 @@ async fn each_kind_of_end_is_told_as_such() {
 }
 
 #[actix_rt::test]
-async fn a_webots_that_does_not_start_and_one_whose_time_is_up_are_told_as_such() {
+async fn a_webots_that_does_not_start_or_hangs_is_told_as_such() {
     let (forge, folder) = (Forge::with_arm(), tempfile::tempdir().unwrap());
     let file = folder.path().join("code");
     std::fs::write(&file, "7").unwrap();
@@ -134,11 +134,14 @@ async fn a_webots_that_does_not_start_and_one_whose_time_is_up_are_told_as_such(
     let mut client = Client::start(&server, &arm()).await;
     client.until("loading: Error:").await;
     assert_eq!(line(&server, client.id()).await[10], "no_webots");
-    let webots = Webots::launcher();
-    let server = simulation_server(&webots.path(), forge.path(), 1).set("timeout", 2).start().await;
+    // It listens, then stands still.
+    let webots = Webots::script(&format!("{DEMO} \"$@\" | {{ head --lines 1; sleep 1000; }} & wait"));
+    let builder = simulation_server(&webots.path(), forge.path(), 1).set("isolation", "none");
+    let builder = builder.set("timing.heartbeat", 0.1).set("hangLimit", 1).set("timing.grace", 0.2);
+    let server = builder.start().await;
     let mut client = Client::start(&server, &arm()).await;
-    client.until("loading: Error: The time limit").await;
-    assert_eq!(line(&server, client.id()).await[10], "time_limit");
+    client.until("loading: Error: Webots gave no sign of life").await;
+    assert_eq!(line(&server, client.id()).await[10], "hung");
 }
 
 #[actix_rt::test]

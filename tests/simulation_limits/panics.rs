@@ -169,6 +169,7 @@ pub async fn a_webots_leaves_nothing_in_any_state() {
         assert!(!exit.clean && !exit.why.is_empty(), "{stage:?}: {exit:?}");
         inside.until_nothing_is_left().await;
         assert!(begin.elapsed().as_secs() < 4, "{stage:?}: the grace time was waited for, in which all may go wrong");
+        assert_eq!(inside.server.ends.latest()[0].how.reason, EndReason::Fault, "{stage:?}");
         inside.stop().await;
     }
 }

@@ -2,6 +2,7 @@
 
 use std::time::{Duration, Instant};
 
+use webots_fleet::simulation::ends::EndReason;
 use webots_fleet::simulation::snapshot::Stage;
 
 use crate::inside::Inside;
@@ -25,6 +26,7 @@ pub async fn a_simulation_ends_at_its_time_limit_in_any_state() {
         assert_eq!(client.closed().await, Some(if stage == Stage::Launching { 1013 } else { 1000 }), "{stage:?}");
         assert!(begin.elapsed() >= Duration::from_secs(5), "{stage:?}: it came too early");
         inside.until_nothing_is_left().await;
+        assert_eq!(inside.server.ends.latest()[0].how.reason, EndReason::TimeLimit, "{stage:?}");
         inside.stop().await;
     }
 }
@@ -48,7 +50,7 @@ pub async fn who_waits_or_checks_out_has_no_such_limit() {
     let mut first = inside.client().await;
     first.until("webots:").await;
     let mut second = inside.client().await;
-    assert_eq!(second.until("").await, "queue: 0");
+    assert_eq!(second.until("queue").await, "queue: 0");
     first.until("loading: Error: The time limit of 5 seconds was reached").await;
     second.until("webots:").await;
     second.leave().await;

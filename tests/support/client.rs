@@ -134,11 +134,13 @@ impl Client {
         }
     }
 
-    /// The next text that begins with this; what comes before it is passed over.
+    /// The next text that begins with this; what comes before it is passed over. The id of a simulation is no answer: it
+    /// comes before them.
     pub async fn until(&mut self, beginning: &str) -> String {
+        let is_id = |text: &str| beginning.is_empty() && text.starts_with("session: ");
         loop {
             match self.next().await {
-                Heard::Text(text) if text.starts_with(beginning) => return text,
+                Heard::Text(text) if text.starts_with(beginning) && !is_id(&text) => return text,
                 Heard::Text(_) => {}
                 Heard::Closed(frame) => panic!("closed ({frame:?}) before {beginning:?}; heard {:#?}", self.heard),
             }

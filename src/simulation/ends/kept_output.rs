@@ -48,8 +48,8 @@ pub(super) fn keep(logs: &Path, ended: &Ended) -> io::Result<()> {
     }
     let folder = logs.join(if ended.how.reason.is_abnormal() { FAILED } else { ENDED });
     fs::create_dir_all(&folder)?;
-    let events: String = ended.events.iter().map(|event| format!("{event}\n")).collect();
-    let text = format!("{events}\nThe last lines that it has printed:\n\n{output}");
+    let events = ended.events.join("\n");
+    let text = format!("{events}\n\nThe last lines that it has printed:\n\n{output}");
     fs::write(folder.join(format!("{}.log", ended.id)), text)
 }
 

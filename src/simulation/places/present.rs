@@ -101,6 +101,7 @@ impl Present {
             };
             End { reason, why: why.to_owned(), taken: Taken::default() }
         });
+        self.events.truncate(MAX_EVENTS - 1);
         self.note(&format!("ended ({}): {}", how.reason.label(), how.why));
         Ended {
             id: self.shown.id,
