@@ -24,6 +24,7 @@ export class SmallViewer extends EventTarget {
   #running;
   #time = 0;
   #drawn = false;
+  #isFrozen = false;
   #lines = [];
   #parts;
   #watch = new ResizeObserver(() => this.#redraw());
@@ -51,7 +52,7 @@ export class SmallViewer extends EventTarget {
     hear('time', (time) => this.#setTime(time));
     hear('reset', () => this.#afterReset());
     hear('console', (text) => this.#print(text));
-    hear('closed', () => this.#tell('lost'));
+    hear('closed', () => this.#isFrozen || this.#tell('lost'));
   }
 
   #build() {
@@ -127,6 +128,13 @@ export class SmallViewer extends EventTarget {
   /** What is shown is old. */
   stale() {
     this.#parts.mode.textContent = 'no connection';
+  }
+
+  /** What is shown stays, and nothing more is heard. */
+  freeze() {
+    this.#isFrozen = true;
+    this.stale();
+    this.close();
   }
 
   #toggle() {

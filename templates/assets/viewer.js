@@ -262,6 +262,8 @@ function comeBack() {
   if (!left)
     return;
   simulation?.detach();
+  // What its stream still says is no sign of life of this simulation's server.
+  viewer?.freeze?.();
   follow(new Simulation(left.server, { token: left.token }), left.server, left.world, true);
 }
 

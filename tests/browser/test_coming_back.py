@@ -7,7 +7,7 @@ import unittest
 from playwright.sync_api import expect
 
 from case import BrowserTest
-from fleet import ROOT, WORLD, until
+from fleet import ROOT, WORLD, free_ports, until
 
 
 def seconds(page):
@@ -155,7 +155,8 @@ class Gone(Running):
 
 
 class Busy(Running):
-    session = {"loadThreshold": 1000}
+    # Else the session server would take the port of the only place.
+    session = {"port": free_ports(64) + 63}
     simulation = {"maxConnections": 1, "waitingLine": 0}
 
     def test_who_finds_all_servers_busy_waits_and_starts_by_itself_or_stops_waiting(self):
@@ -182,10 +183,13 @@ class Busy(Running):
 
 class Example(Running):
     def test_the_example_of_the_protocol_starts_comes_back_and_leaves(self):
-        page = (ROOT / "docs/protocol.md").read_text()
-        example = page.split("```js\n")[1].split("```")[0]
+        text = (ROOT / "docs/protocol.md").read_text()
+        example = text.split("```js\n")[1].split("```")[0]
         # A page without a policy of its own, and without a script.
-        tab = self.open(self.fleet.session.url("load")).tab
+        page = self.browser.page()
+        self.addCleanup(page.close)
+        tab = page.tab
+        tab.goto(self.fleet.session.url("load"))
         begin = """([example, fleet, world]) => {
             window.heard = [];
             const simulate = new Function(`return ${example}`)();

@@ -97,7 +97,7 @@ fn imports_are_found_at_all() {
     for (from, to) in [
         ("session::app", "session::web"),
         ("session::web::routes", "session::fleet"),
-        ("simulation::client::web_client", "simulation::webots"),
+        ("simulation::client::start", "simulation::webots"),
         ("simulation::webots::webots", "simulation::webots::output"),
         ("simulation::config::simulation_config", "shared::config"),
     ] {

@@ -185,20 +185,20 @@ async fn who_is_lost_comes_back_through_the_door() {
     for machine in MACHINES {
         let mut lost = fleet.browser.connect(&client(machine)).await;
         lost.send(&serde_json::json!({"start": {"url": arm(), "resumable": true}}).to_string()).await;
-        lost.until("webots:").await;
-        tokens.push(lost.until("resume: ").await["resume: ".len()..].to_owned());
+        let stream = lost.until("webots:").await["webots:".len()..].to_owned();
+        tokens.push((lost.until("resume: ").await["resume: ".len()..].to_owned(), stream));
         drop(lost);
     }
     // Each at its own machine only, and from another address.
     let browser = fleet.browser.at("127.0.0.9");
     for (number, machine) in MACHINES.into_iter().enumerate() {
         let mut stranger = browser.connect(&client(machine)).await;
-        stranger.send(&serde_json::json!({"resume": tokens[1 - number]}).to_string()).await;
+        stranger.send(&serde_json::json!({"resume": tokens[1 - number].0}).to_string()).await;
         assert_eq!(stranger.until("").await, "loading: Error: this simulation has ended");
         assert_eq!(stranger.closed().await, Some(1000));
         let mut back = browser.connect(&client(machine)).await;
-        back.send(&serde_json::json!({"resume": tokens[number]}).to_string()).await;
-        let stream = format!("wss://{}/{machine}/{}", browser.host, fleet.port() + 1);
+        let (token, stream) = &tokens[number];
+        back.send(&serde_json::json!({ "resume": token }).to_string()).await;
         assert_eq!(back.until("webots:").await, format!("webots:{stream}"));
         let mut viewer = browser.open(&format!("{stream}/")).await;
         viewer.send("x3d;broadcast").await;
@@ -211,7 +211,7 @@ async fn who_is_lost_comes_back_through_the_door() {
         })
         .await;
         back.close_with(1000).await;
-        until("Webots has ended", async || TcpStream::connect((machine, fleet.port() + 1)).await.is_err()).await;
+        viewer.closed().await;
     }
 }
 

@@ -176,9 +176,16 @@ impl Client {
         actix_rt::time::timeout(time, self.read()).await.is_err()
     }
 
-    /// Closes with this code.
+    /// Closes with this code, and waits for the answer as browsers do: a connection that is dropped before with something
+    /// unread is reset, and the server may not see the code.
     pub async fn close_with(mut self, code: u16) {
-        self.socket.close(Some(CloseFrame { code: CloseCode::from(code), reason: "".into() })).await.ok();
+        let frame = CloseFrame { code: CloseCode::from(code), reason: "".into() };
+        let closing = async {
+            if self.socket.close(Some(frame)).await.is_ok() {
+                while let Some(Ok(_)) = self.socket.next().await {}
+            }
+        };
+        actix_rt::time::timeout(SOON, closing).await.expect("the closing handshake");
     }
 
     /// Leaves in order.

@@ -106,10 +106,10 @@ impl<'class> Browser<'class> {
         }
         self.visit.server = server.split_once("://").map(|(_, address)| address.to_owned());
         let mut lease = Conversation::open(&format!("{server}/client")).await?;
-        let mut start = serde_json::json!({"start": {"url": self.arguments.world}});
-        if self.behaviour == Behaviour::Return {
-            start["start"]["resumable"] = true.into();
-        }
+        let start = match self.behaviour {
+            Behaviour::Return => serde_json::json!({"start": {"url": self.arguments.world, "resumable": true}}),
+            _ => serde_json::json!({"start": {"url": self.arguments.world}}),
+        };
         lease.say(&start.to_string()).await?;
         if self.behaviour == Behaviour::Hasty {
             lease.close().await;
@@ -140,7 +140,7 @@ impl<'class> Browser<'class> {
         self.visit.steps.launch = Some(launched.elapsed().as_secs_f64());
         self.visit.steps.until_running = Some(asked.elapsed().as_secs_f64());
         let way_back = match self.behaviour {
-            Behaviour::Return => Some(WayBack::find(&mut lease, &server, &webots).await?),
+            Behaviour::Return => Some(Box::pin(WayBack::find(&mut lease, &server, &webots)).await?),
             _ => None,
         };
         Ok(Running { lease, stream, way_back })
@@ -209,11 +209,12 @@ impl<'class> Browser<'class> {
         if let Some(way_back) = running.way_back.take() {
             // The page is loaded again: both connections are gone.
             drop(running);
-            running = match way_back.go(&self.arguments.viewer).await {
+            running = match Box::pin(way_back.go(&self.arguments.viewer)).await {
                 Ok((lease, stream)) => Running { lease, stream, way_back: None },
                 Err(ended) => return Outcome::BrokeOff(format!("coming back: {ended}")),
             };
-            if let Ok(why) = actix_rt::time::timeout(stay / 2, self.look_on(&mut running)).await {
+            let watched = Box::pin(actix_rt::time::timeout(stay / 2, self.look_on(&mut running)));
+            if let Ok(why) = watched.await {
                 return Outcome::BrokeOff(why);
             }
         } else if attentive < stay && self.behaviour != Behaviour::Reload {

@@ -89,9 +89,9 @@ impl Comeback {
         self.places.send(Move { id: self.ticket, address })
     }
 
-    /// The simulation has ended, and its client may ask why.
+    /// The simulation has ended, and its client may ask why. The first reason counts.
     pub fn end(&mut self, why: &str) {
-        self.ended = Some(why.to_owned());
+        self.ended.get_or_insert_with(|| why.to_owned());
     }
 
     /// The client has gone, and the simulation waits for so long, unless it has ended. Returns whether it waits.

@@ -29,10 +29,11 @@ impl Session {
     }
 
     /// Goes on with another connection of its client, and tells the one before.
-    fn go_on(&mut self, client: Recipient<ToClient>, peer: Peer, ctx: &mut Context<Self>) -> Attachment {
+    fn go_on(&mut self, client: Recipient<ToClient>, peer: Peer, ctx: &mut Context<Self>) {
         log::info!("{}: goes on as client {peer}", self.name());
         self.peer = peer;
         self.attachment += 1;
+        client.do_send(ToClient::Attached(Attachment::new(ctx.address().recipient(), self.attachment)));
         if let Some(before) = self.client.replace(client) {
             before.do_send(ToClient::End(protocol::taken_over(), CloseCode::Normal));
         }
@@ -47,12 +48,11 @@ impl Session {
         for text in texts {
             self.text(text);
         }
-        Attachment::new(ctx.address().recipient(), self.attachment)
     }
 }
 
 impl Handler<Resume> for Session {
-    type Result = ResponseActFuture<Self, Result<Attachment, String>>;
+    type Result = ResponseActFuture<Self, Result<(), String>>;
 
     fn handle(&mut self, Resume { token, client, peer }: Resume, _: &mut Self::Context) -> Self::Result {
         let refused = |refusal| Box::pin(actix::fut::err(refusal));
@@ -68,10 +68,11 @@ impl Handler<Resume> for Session {
                 return Err(protocol::error(&no_place.to_string()));
             }
             // Another connection may have come with the same token meanwhile.
-            match this.comeback.as_ref().and_then(|comeback| comeback.refusal(&token)) {
-                Some(refusal) => Err(refusal),
-                None => Ok(this.go_on(client, peer, ctx)),
+            if let Some(refusal) = this.comeback.as_ref().and_then(|comeback| comeback.refusal(&token)) {
+                return Err(refusal);
             }
+            this.go_on(client, peer, ctx);
+            Ok(())
         }))
     }
 }

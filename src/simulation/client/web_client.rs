@@ -78,11 +78,7 @@ impl WebClient {
         resumed
             .into_actor(self)
             .map(|answer, this, ctx| match answer {
-                Ok(Ok(attachment)) if matches!(this.session, Attached::Coming) => {
-                    this.session = Attached::To(attachment);
-                }
-                // It was told the end meanwhile.
-                Ok(Ok(_)) => {}
+                Ok(Ok(())) => {}
                 Ok(Err(refusal)) => {
                     log::info!("client {}: does not come back: {refusal}", this.peer);
                     this.finish(refusal, CloseCode::Normal, ctx);
@@ -175,6 +171,7 @@ impl Handler<ToClient> for WebClient {
 
     fn handle(&mut self, message: ToClient, ctx: &mut Self::Context) {
         match message {
+            ToClient::Attached(session) => self.session = Attached::To(session),
             ToClient::Text(text) => ctx.text(text),
             ToClient::End(last_words, code) => self.finish(last_words, code, ctx),
         }

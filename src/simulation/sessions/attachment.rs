@@ -4,9 +4,11 @@ use actix::prelude::*;
 use actix_web_actors::ws::CloseCode;
 
 /// What a session has for its client.
-#[derive(Message, Debug, Clone, PartialEq, Eq)]
+#[derive(Message)]
 #[rtype(result = "()")]
 pub enum ToClient {
+    /// The connection is attached to this session from now on.
+    Attached(Attachment),
     /// A text of the protocol.
     Text(String),
     /// The last text of the protocol, and how the connection closes after it.

@@ -5,13 +5,14 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use actix::prelude::*;
 
-use super::attachment::{Attachment, ToClient};
+use super::attachment::ToClient;
 use super::token::Token;
 use crate::shared::http::Peer;
 
-/// Asks a session to go on with another connection. The answer is why not, in words for the client.
+/// Asks a session to go on with another connection, which is then attached to it. The answer is why not, in words for the
+/// client.
 #[derive(Message)]
-#[rtype(result = "Result<Attachment, String>")]
+#[rtype(result = "Result<(), String>")]
 pub struct Resume {
     /// What the client proves with that the session is its own.
     pub token: Token,
