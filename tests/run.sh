@@ -84,7 +84,8 @@ echo "built: $(elapsed)"
 
 # All of these wait most of the time, and run side by side. What needs a machine of its own, or a daemon with images, is in
 # memory: where there is little of it, these run one after another.
-beside=('tests/browser/run' 'tests/deploy/package.sh' 'tests/deploy/guide.sh' "${CARGO[*]} --test containers" "${CARGO[*]} --test faults")
+beside=('tests/browser/run' 'tests/deploy/package.sh' 'tests/deploy/guide.sh' "${CARGO[*]} --test containers" "${CARGO[*]} --test faults"
+    "${CARGO[*]} --test simulation_limits")
 memory=$(awk '$1 == "MemAvailable:" { print int($2 / 1024) }' /proc/meminfo)
 echo "runs side by side, and tells when each has ended: ${beside[*]@Q}"
 for command in "${beside[@]}"; do
@@ -93,7 +94,7 @@ for command in "${beside[@]}"; do
     # shellcheck disable=SC2086
     ((memory > 10000)) || finish $command
 done
-"${CARGO[@]}" --lib --bins --test integration --test simulation_limits || failed+=('cargo test')
+"${CARGO[@]}" --lib --bins --test integration || failed+=('cargo test')
 for command in "${beside[@]}"; do
     # shellcheck disable=SC2086
     [[ -z ${jobs[$command]-} ]] || finish $command

@@ -8,7 +8,7 @@ use super::copy::{Project, programs};
 const CARGO: &str = r#"#!/bin/sh
 echo "$@" >>calls
 mkdir -p target/release
-cp "$PROGRAMS"/session-server "$PROGRAMS"/simulation-server "$PROGRAMS"/demo-simulator target/release
+cp --remove-destination "$PROGRAMS"/session-server "$PROGRAMS"/simulation-server "$PROGRAMS"/demo-simulator target/release
 "#;
 
 /// What a start prints, and what it asks cargo for. The servers are stopped again.

@@ -19,15 +19,15 @@ fn of_addresses(servers: &[String], smtp: &Smtp) -> Builder {
         .set("mailSender", "fleet@example.org")
         .set("mailServer", "127.0.0.1")
         .set("mailServerPort", smtp.port)
-        .set("timing", json!({"answer": 2, "gather": 0.5, "flapping": 0.5}))
+        .set("timing", json!({"answer": 4, "gather": 0.5, "flapping": 0.5}))
 }
 
 #[actix_rt::test]
 async fn every_kind_of_failure_is_mailed_and_so_is_its_end() {
     let failures = [
         (Manner::Reset, "no connection"),
-        (Manner::Hang, "no answer within 2 s"),
-        (Manner::Drip, "no answer within 2 s"),
+        (Manner::Hang, "no answer within 4 s"),
+        (Manner::Drip, "no answer within 4 s"),
         (Manner::Body(500, Vec::new()), "status 500"),
         (Manner::Load("NaN".to_owned()), "NaN"),
         (Manner::Status(json!({"load": 100, "problem": "no display answers at :0"})), "no display answers at :0"),
