@@ -43,9 +43,6 @@ pub enum CheckoutError {
         /// The hash.
         commit: String,
     },
-    /// It has too many files.
-    #[error("The project has more than {0} files and folders")]
-    TooMany(u64),
     /// It took too long.
     #[error("Fetching {repository} took longer than {seconds} seconds")]
     TooSlow {
@@ -99,12 +96,6 @@ impl CheckoutError {
     #[must_use]
     pub fn is_own(&self) -> bool {
         matches!(self, Self::Machine(..))
-    }
-
-    /// Whether it is because of a size, which is the same for everybody who wants the same.
-    #[must_use]
-    pub fn is_of_size(&self) -> bool {
-        matches!(self, Self::TooMany(_) | Self::TooLarge { .. } | Self::TooMuch { .. })
     }
 }
 

@@ -50,6 +50,7 @@ const SETTINGS: &str = "\
 	fsmonitor = false
 	packedGitLimit = 512m
 	packedGitWindowSize = 32m
+	bigFileThreshold = 16m
 [http]
 	followRedirects = false
 [filter \"lfs\"]

@@ -7,7 +7,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
-use tokio::sync::{AcquireError, MutexGuard, OwnedMutexGuard, Semaphore, SemaphorePermit, watch};
+use tokio::sync::{AcquireError, OwnedMutexGuard, Semaphore, SemaphorePermit, watch};
 use tokio_util::sync::CancellationToken;
 
 use super::disk::{blocking, packed, received, remove_all, remove_leftovers};
@@ -32,8 +32,6 @@ pub struct Repository {
     lock: Arc<tokio::sync::Mutex<()>>,
     /// Held by whoever asks the remote what it has.
     asking: Semaphore,
-    /// Held by whoever reads what lies in a commit.
-    listing: tokio::sync::Mutex<()>,
     /// The fetches that are wanted, by the name of the request.
     fetches: SingleFlight<String, Result<(), FetchError>>,
     /// When it was made, if this server has made it since it came into use.
@@ -60,8 +58,8 @@ impl Repository {
     #[must_use]
     pub fn new(path: PathBuf, remote: Remote, git: Arc<Git>, limits: Limits, growth: Arc<Growth>) -> Self {
         let (lock, fetches, made) = (Arc::default(), SingleFlight::default(), Mutex::default());
-        let (asking, listing) = (Semaphore::new(QUESTIONS), tokio::sync::Mutex::default());
-        Self { path, remote: Mutex::new(Arc::new(remote)), git, limits, growth, lock, asking, listing, fetches, made }
+        let asking = Semaphore::new(QUESTIONS);
+        Self { path, remote: Mutex::new(Arc::new(remote)), git, limits, growth, lock, asking, fetches, made }
     }
 
     /// Where it is fetched from.
@@ -175,11 +173,6 @@ impl Repository {
     /// Never: nobody closes the semaphore.
     pub async fn may_ask(&self) -> Result<SemaphorePermit<'_>, AcquireError> {
         self.asking.acquire().await
-    }
-
-    /// Waits until nobody else reads what lies in a commit: if that is too much, those who wait then know.
-    pub async fn may_list(&self) -> MutexGuard<'_, ()> {
-        self.listing.lock().await
     }
 
     /// Waits until nobody else changes the repository.
