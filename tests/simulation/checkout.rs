@@ -166,7 +166,6 @@ async fn a_remote_that_hangs_costs_only_its_own_client() {
     let all = join_all((0..10).map(|_| async { outcome(&server, &arm()).await })).await;
     assert!(all.iter().all(|told| told.contains("opened [WorldInfo")), "{all:?}");
     assert!(http::get(&server.url("/load")).await.text().parse::<f64>().is_ok());
-    // A git from which nothing comes is ended now and then, and begun anew.
     let asks = async || instances_below(&server.folder).iter().any(|one| one.1.contains("ls-remote"));
     until("it still hangs", asks).await;
     let told = stuck.until("loading: Error:").await;

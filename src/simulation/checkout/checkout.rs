@@ -67,7 +67,7 @@ impl Checkouts {
         limits: Limits,
         runtime: Handle,
     ) -> io::Result<Self> {
-        let git = Arc::new(Git::new(run, config));
+        let git = Arc::new(Git::new(run, config, limits.patience()));
         let cache = Arc::new(Cache::open(dir, budget, Arc::clone(&git), limits)?);
         let finder = Arc::new(Finder::new(Arc::clone(&git), Arc::clone(&cache), (mirrors, rules), limits));
         let keeper = AbortOnDropHandle::new(runtime.spawn(Arc::clone(&cache).keep_within_budget()));

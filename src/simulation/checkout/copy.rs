@@ -7,7 +7,7 @@ use std::path::Path;
 use super::disk::{self, Growing};
 use super::error::{CheckoutError, machine};
 use super::finder::Found;
-use super::git::{Call, Git};
+use super::git::{Call, Git, LITTLE_MEMORY};
 use super::git_error::GitError;
 use super::lfs;
 use super::limits::Limits;
@@ -48,7 +48,7 @@ pub async fn copy_call<'call>(
     let mut arguments = vec![with("--work-tree=", into)];
     arguments.extend(["checkout", "--force", "--progress", "--pathspec-file-nul"].map(OsString::from));
     arguments.extend([with("--pathspec-from-file=", &list), revision.reference().into()]);
-    let mut call = repository.call(arguments);
+    let mut call = Call { memory: LITTLE_MEMORY, ..repository.call(arguments) };
     call.environment.push(("GIT_INDEX_FILE".into(), scratch.join("index").into()));
     call.environment.push(("GIT_ATTR_SOURCE".into(), revision.reference().into()));
     Ok(call)
@@ -66,11 +66,10 @@ pub async fn write(
     (limits, has_lfs): (&Limits, bool),
     told: impl FnMut(&str),
 ) -> Result<bool, GitError> {
-    let broken = |error: io::Error| GitError::NotStarted(error.to_string());
     let paths = [found.revision.needed().as_bytes(), b"\0", &found.above].concat();
     let project = instance.project();
-    let call = copy_call(&found.repository, &found.revision, &paths, (instance.path(), &project)).await;
-    let mut call = call.map_err(broken)?;
+    let call = copy_call(&found.repository, &found.revision, &paths, (instance.path(), &project));
+    let mut call = call.await?;
     let mut growing = vec![Growing::new(project, limits.size)];
     if has_lfs {
         call.settings = lfs::settings(&found.repository.remote());
@@ -80,16 +79,13 @@ pub async fn write(
             let kept = kept.clone();
             move || Ok(disk::room_of(&kept))
         });
-        let before = before.await.map_err(broken)?;
+        let before = before.await?;
         growing.push(Growing::new(kept, before.saturating_add(limits.size.saturating_mul(2))));
     }
-    let mut is_too_large = false;
-    let end = async {
-        disk::outgrown(growing).await;
-        is_too_large = true;
-    };
-    let written = git.run_until(end, call, told).await;
-    if is_too_large { Ok(false) } else { written.map(|_| true) }
+    tokio::select! {
+        written = git.run(call, told) => written.map(|_| true),
+        () = disk::outgrown(growing) => Ok(false),
+    }
 }
 
 /// Looks at a copy.

@@ -187,7 +187,9 @@ impl Finder {
     ) -> Result<Answer, CheckoutError> {
         match repository.read(revision.list_arguments(path)).await {
             Ok(text) => Ok(Answer::Text(text)),
-            Err(error @ (GitError::NotStarted(_) | GitError::TooLong(_))) => Err(git_failed(world, error)),
+            Err(error @ (GitError::Machine(_) | GitError::TooLong(_) | GitError::Slow(_))) => {
+                Err(git_failed(world, error))
+            }
             Err(error) if repository.read(revision.exists_arguments()).await.is_err() => {
                 log::debug!("{} is not in the cache: {error}", revision.commit);
                 Ok(Answer::Absent)

@@ -14,8 +14,7 @@ pub struct Limits {
 }
 
 impl Limits {
-    /// How long a remote may be silent before it is asked anew, for often only the connection has died, and how long a
-    /// command on this machine may at first. Packing a cached repository holds a fetch up for no longer either.
+    /// How long a remote may be silent, and packing a cached repository hold a fetch up.
     #[must_use]
     pub fn patience(&self) -> Duration {
         self.time / 4

@@ -5,15 +5,12 @@ use std::sync::Arc;
 
 use super::cache::Cache;
 use super::error::{CheckoutError, fetch_failed, git_failed, machine, no_reference, too_large};
-use super::git::{Call, Git};
+use super::git::{Call, Git, LITTLE_MEMORY};
 use super::limits::Limits;
 use super::repository::Repository;
 use super::revision::{self, Revision};
 use super::steps;
 use crate::shared::domain::ProjectUrl;
-
-/// How much memory git may take for an answer of a remote, in bytes: enough for a million branches.
-const ANSWER_MEMORY: u64 = 512 << 20;
 
 /// What a world is looked for with.
 #[derive(Clone, Copy)]
@@ -96,16 +93,10 @@ impl Search<'_> {
     }
 
     async fn answer(self, arguments: Vec<OsString>) -> Result<String, CheckoutError> {
-        loop {
-            let turn = self.repository.may_ask().await;
-            let _turn = turn.map_err(|error| machine(self.world, &std::io::Error::other(error)))?;
-            let call = Call { memory: ANSWER_MEMORY, ..self.repository.call(arguments.clone()) };
-            let answer = self.git.run(call, |_| ());
-            match actix_rt::time::timeout(self.limits.patience(), answer).await {
-                Ok(Ok(answer)) => return Ok(String::from_utf8_lossy(&answer).into_owned()),
-                Ok(Err(source)) => return Err(git_failed(self.world, source)),
-                Err(_) => self.repository.tell_silence(self.limits.patience()),
-            }
-        }
+        let turn = self.repository.may_ask().await;
+        let _turn = turn.map_err(|error| machine(self.world, &std::io::Error::other(error)))?;
+        let call = Call { memory: LITTLE_MEMORY, ..self.repository.call(arguments) };
+        let answer = self.git.run(call, |_| ()).await.map_err(|source| git_failed(self.world, source))?;
+        Ok(String::from_utf8_lossy(&answer).into_owned())
     }
 }
