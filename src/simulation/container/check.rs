@@ -1,15 +1,17 @@
 //! Whether this machine can run simulations in containers, now.
 
 use std::path::Path;
-use std::process::{Command, Stdio};
+use std::time::Duration;
 
 use super::docker::Docker;
 use super::packet_filter;
-use crate::shared::text::one_line;
 use crate::simulation::config::SimulationConfig;
+use crate::simulation::process::{ExitReason, Ran, Run, RunError};
 
-/// Timeout of a command that starts a container, in seconds.
-const START: &str = "15";
+/// How long a command that starts a container may take.
+const START: Duration = Duration::from_secs(15);
+/// How long a daemon may take to answer.
+const ANSWER: Duration = Duration::from_secs(5);
 /// Where Docker puts its init process into a container. The program is static: it runs in an empty image.
 const INIT: &str = "/sbin/docker-init";
 /// The empty image, shared by all servers of a machine.
@@ -32,7 +34,7 @@ pub fn check(config: &SimulationConfig) -> Result<String, String> {
 /// Why the daemon can't be used now, in words for clients and administrators. Blocks for five seconds at most.
 #[must_use]
 pub fn daemon_fault() -> Option<String> {
-    let why = failure("5", &["version", "--format", "{{.Server.Version}}"])?;
+    let why = failure(ANSWER, &["version", "--format", "{{.Server.Version}}"])?;
     Some(format!("Docker does not answer on this simulation server: {why}"))
 }
 
@@ -61,15 +63,16 @@ pub fn init_fault() -> Option<String> {
     ))
 }
 
-/// Runs docker within a timeout in seconds. Returns the last line that it prints if it fails.
-fn failure(timeout: &str, arguments: &[&str]) -> Option<String> {
-    let mut command = Command::new("timeout");
-    command.arg(timeout).arg("docker").args(arguments).stdin(Stdio::null());
-    let output = match command.output() {
-        Ok(output) if output.status.success() => return None,
-        Ok(output) => String::from_utf8_lossy(&output.stderr).trim().to_owned(),
-        Err(error) => error.to_string(),
-    };
-    let why = output.lines().find(|line| line.contains("rror")).or_else(|| output.lines().last());
-    Some(why.map_or_else(|| format!("it gives no answer within {timeout} seconds"), one_line))
+/// Runs docker within a time limit. Returns the line that says why it fails, if it does.
+fn failure(limit: Duration, arguments: &[&str]) -> Option<String> {
+    let command = std::iter::once("docker").chain(arguments.iter().copied());
+    let mut said: Vec<String> = Vec::new();
+    match Run::new(command, Path::new("/"), limit).blocking(|line| said.push(line)) {
+        Ok(Ran { ending: ExitReason::Code(0), .. }) => return None,
+        Ok(_) => {}
+        Err(RunError::Slow(_)) => said.clear(),
+        Err(error) => return Some(format!("docker {error}")),
+    }
+    let why = said.iter().find(|line| line.contains("rror")).or_else(|| said.last());
+    Some(why.cloned().unwrap_or_else(|| format!("it gives no answer within {} seconds", limit.as_secs())))
 }

@@ -4,9 +4,10 @@ use std::collections::HashMap;
 use std::ffi::OsString;
 use std::fmt;
 use std::path::{Path, PathBuf};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::Arc;
 use std::time::Duration;
 
+use parking_lot::Mutex;
 use tokio::sync::{Semaphore, watch};
 
 use super::blocking::blocking;
@@ -223,7 +224,7 @@ impl Images {
     /// # Errors
     /// When Docker fails, or such a place has a name that only its own author understands.
     pub async fn volumes(&self, image: &str) -> Result<Vec<String>, String> {
-        let known = || self.volumes.lock().unwrap_or_else(PoisonError::into_inner);
+        let known = || self.volumes.lock();
         if let Some(found) = known().get(image).cloned() {
             return Ok(found);
         }
