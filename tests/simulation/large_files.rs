@@ -28,7 +28,7 @@ async fn files_that_are_missing_from_git_lfs_are_told() {
     client.until("loading: Error: Webots ended with exit code 1").await;
     // Without git-lfs it is told that this is what is missing.
     let bin = tempfile::tempdir().unwrap();
-    for program in ["git", "bash", "sed", "env", "sh"] {
+    for program in ["git", "bash", "sed", "env", "sh", "rm"] {
         let found = std::env::split_paths(&std::env::var_os("PATH").unwrap())
             .map(|folder| folder.join(program))
             .find(|path| path.is_file());

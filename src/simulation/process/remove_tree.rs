@@ -17,6 +17,9 @@ const LIMIT: Duration = Duration::from_mins(10);
 /// # Errors
 /// When something in it can't be removed, or after ten minutes.
 pub fn remove_tree(folder: &Path) -> io::Result<()> {
+    if folder.symlink_metadata().is_err_and(|error| error.kind() == io::ErrorKind::NotFound) {
+        return Ok(());
+    }
     run(&["rm", "-rf", "--"], folder).or_else(|_| {
         // A world's program may have taken the right to change its own folders.
         run(&["chmod", "-R", "u+rwX", "--"], folder).ok();
@@ -28,7 +31,8 @@ fn run(words: &[&str], folder: &Path) -> io::Result<()> {
     let command = words.iter().map(OsString::from).chain([folder.into()]);
     let mut complaint = String::new();
     // Its mark is no run's: whoever ends a run does not end it.
-    let ran = Run::new(command, Path::new("/"), LIMIT).blocking(|line| complaint = line).map_err(io::Error::other)?;
+    let ran = Run::new(command, Path::new("/"), LIMIT).blocking(|line| complaint = line);
+    let ran = ran.map_err(|error| io::Error::other(format!("{} {error}", words.join(" "))))?;
     if ran.ending == ExitReason::Code(0) { Ok(()) } else { Err(io::Error::other(complaint)) }
 }
 
