@@ -61,7 +61,7 @@
 //! The [`session::fleet::Registry`] alone decides availability: it hears of every report and of every pick.
 //! A [`simulation::webots::Webots`] owns its process group, its folder and its place through guards, so that leaving in any
 //! state, even by a panic, frees all three. One [`simulation::process::guardian`] process ends everything that the
-//! simulation server has started when the server is gone in whatever way; one that ends before is replaced.
+//! simulation server has started when the server is gone in whatever way.
 //! One `simulation::isolation::Watcher` looks at all simulations: what they take, and where those that start listen.
 //!
 //! # What ends, and what is started again

@@ -79,7 +79,7 @@ async fn a_server_that_is_started_again_at_once_keeps_what_it_starts() {
     Client::start(&first, &arm()).await.patiently("webots:", Duration::from_secs(60)).await;
     first.signal(Signal::SIGKILL);
     first.ended().await;
-    // The guardian of the first is still looking for what that has left.
+    // The guardian of the first may still be removing what that has left.
     let second = server(forge.path(), 1).folder(folder.path()).start().await;
     let mut client = Client::start(&second, &arm()).await;
     client.patiently("webots:", Duration::from_secs(60)).await;

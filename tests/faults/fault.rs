@@ -20,7 +20,7 @@ use crate::support::webots::instances_below;
 use crate::surroundings::*;
 
 /// What the command line of a guardian has.
-pub const GUARDIAN: &str = " guard ";
+const GUARDIAN: &str = " guard ";
 
 type Injected<'fleet> = Pin<Box<dyn Future<Output = bool> + 'fleet>>;
 
@@ -32,7 +32,7 @@ pub struct Fault {
 
 /// How long something that stands still does so.
 pub const WHILE: Duration = Duration::from_secs(3);
-/// How long what a killed server leaves may live: its guardian looks for so long.
+/// How long what a killed server leaves may live.
 const AT_ONCE: Duration = Duration::from_secs(5);
 
 macro_rules! faults {
@@ -51,7 +51,6 @@ pub fn all() -> Vec<Fault> {
         "a Webots is killed": async |fleet, random| signal(fleet, random, "demo-simulator", Signal::SIGKILL).await;
         "a Webots stands still": async |fleet, random| signal(fleet, random, "demo-simulator", Signal::SIGSTOP).await;
         "a launcher is killed": async |fleet, random| signal(fleet, random, "/webots --batch", Signal::SIGKILL).await;
-        "a guardian is killed": async |fleet, random| signal(fleet, random, GUARDIAN, Signal::SIGKILL).await;
         "a launcher stands still": async |fleet, random| signal(fleet, random, "/webots --batch", Signal::SIGSTOP).await;
         "a guardian stands still for a while": stop_guardian;
         "a git is killed": async |fleet, random| signal(fleet, random, "git --literal-pathspecs", Signal::SIGKILL).await;

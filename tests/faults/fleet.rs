@@ -9,7 +9,6 @@ use serde_json::json;
 
 use crate::class::Class;
 use crate::disk;
-use crate::fault::GUARDIAN;
 use crate::machine::Clock;
 use crate::network::Network;
 use crate::support::client::{Client, Heard};
@@ -181,12 +180,6 @@ impl Fleet {
         for (index, server) in self.servers.iter().enumerate() {
             let known = http::try_get(&server.url("/status")).await?.json();
             let known = known["simulations"].as_array().unwrap().len();
-            let family = procfs::process::all_processes().unwrap().flatten();
-            let is_guardian = |one: &Process| one.cmdline().is_ok_and(|line| line.join(" ").contains(GUARDIAN));
-            let mut children = family.filter(|one| one.stat().is_ok_and(|stat| stat.ppid == server.pid()));
-            if !children.any(|child| is_guardian(&child)) {
-                return Err(format!("server {index} has no guardian"));
-            }
             let folders = self.instance_folders(index);
             if folders > known {
                 return Err(format!("server {index} knows {known} simulations and has {folders} folders"));

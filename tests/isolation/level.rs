@@ -12,7 +12,7 @@ use crate::support::webots::Webots;
 /// A folder with git and a shell, and with a bubblewrap that fails if one is wanted.
 fn programs(bubblewrap: Option<&str>) -> tempfile::TempDir {
     let folder = tempfile::tempdir().unwrap();
-    for program in ["git", "bash", "env", "sh", "sleep"] {
+    for program in ["git", "bash", "env", "sh", "sleep", "rm"] {
         let paths = std::env::var_os("PATH").unwrap();
         let real = std::env::split_paths(&paths).map(|folder| folder.join(program)).find(|path| path.is_file());
         std::os::unix::fs::symlink(real.unwrap(), folder.path().join(program)).unwrap();

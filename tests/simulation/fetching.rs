@@ -1,4 +1,4 @@
-//! Fetches into one cached repository: one at a time, each commit once, and begun anew where they stand still.
+//! Fetches into one cached repository: one at a time, each commit once, and for no longer than a checkout may take.
 
 use futures_util::future::join_all;
 
@@ -27,14 +27,13 @@ fn commit(forge: &Forge, branch: &str) -> String {
 
 #[actix_rt::test]
 async fn a_fetch_that_hangs_holds_up_nobody_who_needs_no_fetch_and_others_only_for_a_while() {
-    let (forge, webots, marks) = (forge(&["main", "slow", "one"]), reader(), tempfile::tempdir().unwrap());
+    let (forge, webots) = (forge(&["main", "slow", "one"]), reader());
     let (main, slow) = (commit(&forge, "main"), commit(&forge, "slow"));
     let wrapper = GitWrapper::new(&format!(
-        "case \"$*\" in *fetch*+{slow}:*) [ -e {}/go ] || exec sleep 1000;; esac",
-        marks.path().display()
+        "case \"$*\" in *fetch*+{slow}:*) while echo 'halted: 50%' >&2; do sleep 0.2; done;; esac"
     ));
     let builder = simulation_server(&webots.path(), forge.path(), 5).env("PATH", &wrapper.path());
-    let server = builder.set("timing.checkout", 40).start().await;
+    let server = builder.set("timing.checkout", 15).start().await;
     let ask = async |name: &str, text: &str| {
         let told = outcome(&server, &world("lab/arm", name, "worlds/a.wbt")).await;
         assert!(told.contains(&format!("opened [{text}]")), "{name}: {told}");
@@ -47,19 +46,18 @@ async fn a_fetch_that_hangs_holds_up_nobody_who_needs_no_fetch_and_others_only_f
     ask(&main, "main").await;
     // The same commit is fetched once, for whatever world, also when the first has left.
     let mut heir = Client::start(&server, &world("lab/arm", "slow", "worlds/b.wbt")).await;
-    heir.until("loading: Step 1/9 : looking for").await;
+    heir.until("loading: Step 2/9 : fetching https://github.com/lab/arm: halted").await;
+    stuck.send("nothing that is known").await;
+    stuck.until("loading: Error:").await;
+    until("it has gone", async || stages(&server).await.len() == 1).await;
     let mut next = Client::start(&server, &world("lab/arm", "one", "worlds/a.wbt")).await;
     next.until("loading: Step 2/9 : fetching https://github.com/lab/arm: waiting for another fetch").await;
     assert_eq!(fetches(&slow), 1);
-    stuck.send("nothing that is known").await;
-    stuck.until("loading: Error:").await;
-    until("it has gone", async || stages(&server).await.len() == 2).await;
-    // What stands still is begun anew, after who waited for it.
+    // It ends with its time limit, for all who wait for it.
+    let told = heir.until("loading: Error:").await;
+    assert!(told.ends_with("Fetching https://github.com/lab/arm took longer than 15 seconds"), "{told}");
     let told = next.until("loading: Error:").await;
     assert!(told.contains("opened [one]"), "{told}");
-    std::fs::write(marks.path().join("go"), "").unwrap();
-    let told = heir.until("loading: Error:").await;
-    assert!(told.contains("opened [slow]"), "{told}");
     git(&cached(&server)[0], &["fsck", "--full"]);
 }
 
@@ -83,52 +81,6 @@ async fn many_commits_that_are_wanted_at_once_all_come() {
     }
     assert_eq!(cached(&server).len(), 1, "one repository for one remote");
     git(&cached(&server)[0], &["fsck", "--full"]);
-}
-
-#[actix_rt::test]
-async fn a_slow_fetch_goes_on_for_who_came_later_for_another_world_of_the_same_commit() {
-    let (forge, webots) = (forge(&["main"]), reader());
-    let wrapper = GitWrapper::new(
-        "case \"$*\" in *fetch*) for n in $(seq 34); do echo \"Receiving objects: $n%\" >&2; sleep 0.4; done;; esac",
-    );
-    let builder = simulation_server(&webots.path(), forge.path(), 2).env("PATH", &wrapper.path());
-    let server = builder.set("timing.checkout", 12).start().await;
-    let mut first = Client::start(&server, &world("lab/arm", "main", "worlds/a.wbt")).await;
-    // A fifth is there.
-    first.until("loading: Step 3/9 : fetching https://github.com/lab/arm: Receiving objects: ").await;
-    let mut second = Client::start(&server, &world("lab/arm", "main", "worlds/b.wbt")).await;
-    second.until("loading: Step 3/9 : fetching https://github.com/lab/arm: Receiving objects: ").await;
-    assert!(first.until("loading: Error:").await.contains("took longer than 12 seconds"));
-    let told = second.until("loading: Error:").await;
-    assert!(told.contains("opened [main]"), "{told}");
-    assert_eq!(wrapper.calls().iter().filter(|call| call.contains(" fetch ")).count(), 1, "{:#?}", wrapper.calls());
-}
-
-#[actix_rt::test]
-async fn what_stands_still_is_begun_anew_and_what_moves_is_not() {
-    let (forge, webots) = (forge(&["main", "slow"]), reader());
-    let (main, slow) = (commit(&forge, "main"), commit(&forge, "slow"));
-    let marks = tempfile::tempdir().unwrap();
-    // Each kind of command hangs once; the fetch of another branch takes its time, but moves.
-    let wrapper = GitWrapper::new(&format!(
-        "case \"$*\" in *ls-remote*) mkdir {0}/asked 2>/dev/null && exec sleep 1000;; *fetch*+{main}:*) mkdir {0}/fetched 2>/dev/null && exec sleep 1000;; \
-         *fetch*+{slow}:*) for n in $(seq 16); do echo \"Receiving objects: $n%\" >&2; sleep 0.5; done;; esac",
-        marks.path().display()
-    ));
-    let builder = simulation_server(&webots.path(), forge.path(), 1).env("PATH", &wrapper.path());
-    let server = builder.set("timing.checkout", 24).start().await;
-    let told = outcome(&server, &world("lab/arm", "main", "worlds/a.wbt")).await;
-    assert!(told.contains("opened [main]"), "{told}");
-    assert_eq!(server.log().matches("nothing has come for 6 s, git starts anew").count(), 2, "{}", server.log());
-    assert!(marks.path().join("asked").exists() && marks.path().join("fetched").exists());
-    let told = outcome(&server, &world("lab/arm", "slow", "worlds/a.wbt")).await;
-    assert!(told.contains("opened [slow]"), "{told}");
-    assert_eq!(
-        wrapper.calls().iter().filter(|call| call.contains(&format!("+{slow}:"))).count(),
-        1,
-        "{:#?}",
-        wrapper.calls()
-    );
 }
 
 #[actix_rt::test]
@@ -161,10 +113,10 @@ async fn a_commit_by_several_names_is_fetched_once() {
 }
 
 #[actix_rt::test]
-async fn a_git_that_is_stopped_is_ended_and_fails_nobody_who_goes_on_asking() {
+async fn a_git_that_is_stopped_fails_once() {
     let forge = &forge(&["main"]);
-    // What each kind of command is for: to make the repository, to fetch, to list its files, to copy them.
-    let kinds = ["init", "fetch", "ls-tree", "checkout"].map(|command| async move {
+    // What each kind of command is for: to ask, to make the repository, to fetch, to list its files, to copy them.
+    let kinds = ["ls-remote", "init", "fetch", "ls-tree", "checkout"].map(|command| async move {
         let (webots, marks) = (reader(), tempfile::tempdir().unwrap());
         let stop = format!(
             "case \" $* \" in *\" {command} \"*) mkdir {}/stopped 2>/dev/null && kill -STOP $$;; esac",
@@ -172,16 +124,14 @@ async fn a_git_that_is_stopped_is_ended_and_fails_nobody_who_goes_on_asking() {
         );
         let wrapper = GitWrapper::new(&stop);
         let builder = simulation_server(&webots.path(), forge.path(), 2).env("PATH", &wrapper.path());
-        let server = builder.set("timing.checkout", 32).start().await;
+        let server = builder.set("timing.checkout", 10).start().await;
         let ask = async || Client::start(&server, &world("lab/arm", "main", "worlds/a.wbt")).await;
         let mut first = ask().await;
         until("it is stopped", async || marks.path().join("stopped").exists()).await;
-        let mut second = ask().await;
-        for client in [&mut first, &mut second] {
-            let told = client.until("loading: Error:").await;
-            assert!(told.contains("opened [main]"), "git {command}: {told}");
-        }
-        assert!(server.log().contains(" git starts anew"), "{command}: {}", server.log());
+        let told = first.until("loading: Error:").await;
+        assert!(told.ends_with("took longer than 10 seconds"), "git {command}: {told}");
+        let told = ask().await.until("loading: Error:").await;
+        assert!(told.contains("opened [main]"), "git {command}: {told}");
     });
     join_all(kinds).await;
 }

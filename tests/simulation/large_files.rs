@@ -3,10 +3,10 @@
 use std::path::Path;
 
 use super::git_wrapper::GitWrapper;
-use super::opened::{outcome, reader, world_text};
+use super::opened::{outcome, reader};
 use super::scene::arm;
 use crate::support::client::Client;
-use crate::support::git::{Forge, git, world};
+use crate::support::git::{Forge, git};
 use crate::support::needs;
 use crate::support::program::simulation_server;
 use crate::support::webots::Webots;
@@ -28,7 +28,7 @@ async fn files_that_are_missing_from_git_lfs_are_told() {
     client.until("loading: Error: Webots ended with exit code 1").await;
     // Without git-lfs it is told that this is what is missing.
     let bin = tempfile::tempdir().unwrap();
-    for program in ["git", "bash", "sed", "env", "sh"] {
+    for program in ["git", "bash", "sed", "env", "sh", "rm"] {
         let found = std::env::split_paths(&std::env::var_os("PATH").unwrap())
             .map(|folder| folder.join(program))
             .find(|path| path.is_file());
@@ -38,34 +38,6 @@ async fn files_that_are_missing_from_git_lfs_are_told() {
         simulation_server(&webots.path(), forge.path(), 1).env("PATH", bin.path().to_str().unwrap()).start().await;
     let told = Client::start(&server, &arm()).await.until("loading: Warning:").await;
     assert!(told.ends_with("can't be loaded: this server has no git-lfs"), "{told}");
-}
-
-#[actix_rt::test]
-async fn files_in_git_lfs_are_looked_for_where_the_world_is_and_nowhere_outside() {
-    let (forge, webots, outside) = (Forge::with_arm(), reader(), tempfile::tempdir().unwrap());
-    let strange = outside.path().join("meshes/a.dae");
-    std::fs::create_dir_all(strange.parent().unwrap()).unwrap();
-    std::fs::write(&strange, POINTER).unwrap();
-    let files = [("real/worlds/a.wbt", world_text("real")), ("real/meshes/a.dae", POINTER.to_owned())];
-    let work = forge.work_tree("lab/arm", "main");
-    for (name, target) in [("out", outside.path()), ("in/worlds", Path::new("../real/worlds"))] {
-        std::fs::create_dir_all(work.join(name).parent().unwrap()).unwrap();
-        std::os::unix::fs::symlink(target, work.join(name)).unwrap();
-    }
-    forge.commit("lab/arm", "main", &files.each_ref().map(|(path, text)| (*path, text.as_str())));
-    // A git-lfs that loads nothing.
-    let wrapper = GitWrapper::new("");
-    let lfs = wrapper.path().split(':').next().map(|folder| Path::new(folder).join("git-lfs")).unwrap();
-    std::os::unix::fs::symlink("/bin/false", lfs).unwrap();
-    let server = simulation_server(&webots.path(), forge.path(), 1).env("PATH", &wrapper.path()).start().await;
-    let told = outcome(&server, &world("lab/arm", "main", "out/worlds/a.wbt")).await;
-    assert_eq!(told, "loading: Error: a.wbt does not exist");
-    assert_eq!(std::fs::read_to_string(&strange).unwrap(), POINTER);
-    for folder in ["real", "in"] {
-        let url = world("lab/arm", "main", &format!("{folder}/worlds/a.wbt"));
-        let told = Client::start(&server, &url).await.until("loading: Warning:").await;
-        assert!(told.contains("1 files of this project are kept in Git LFS"), "{folder}: {told}");
-    }
 }
 
 #[actix_rt::test]
@@ -81,7 +53,7 @@ async fn what_a_forge_sends_as_large_files_is_bounded_whatever_the_pointers_say(
     std::fs::set_permissions(&lfs, std::os::unix::fs::PermissionsExt::from_mode(0o755)).unwrap();
     let server = simulation_server(&webots.path(), forge.path(), 1).set("projectSize", 1).env("PATH", &wrapper.path());
     let told = outcome(&server.start().await, &arm()).await;
-    assert_eq!(told, "loading: Error: What the project keeps in Git LFS is larger than 1 MiB");
+    assert_eq!(told, "loading: Error: The project is larger than 1 MiB");
 }
 
 #[actix_rt::test]
@@ -107,5 +79,5 @@ async fn files_in_git_lfs_are_loaded() {
     std::fs::write(work.join("meshes/a.dae"), "x".repeat(3 << 20)).unwrap();
     forge.commit_work_tree("lab/arm", "main");
     let told = outcome(&limited, &arm()).await;
-    assert_eq!(told, "loading: Error: What the project keeps in Git LFS is larger than 1 MiB");
+    assert_eq!(told, "loading: Error: The project is larger than 1 MiB");
 }

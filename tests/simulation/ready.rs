@@ -193,7 +193,7 @@ async fn a_missing_webots_or_xvfb_is_told_with_what_to_do() {
     assert!(told.contains("has no Webots that it can run at \"webots\"") && told.contains("webotsHome"), "{told}");
     let webots = Webots::launcher();
     let git = tempfile::tempdir().unwrap();
-    for program in ["git", "bash", "env", "sh"] {
+    for program in ["git", "bash", "env", "sh", "rm"] {
         let paths = std::env::var_os("PATH").unwrap();
         let real =
             std::env::split_paths(&paths).map(|folder| folder.join(program)).find(|path| path.is_file()).unwrap();

@@ -1,130 +1,90 @@
 //! A client's own copy of a project: how git writes it, and what is in it.
 
 use std::ffi::OsString;
-use std::path::{Path, PathBuf};
+use std::io;
+use std::path::Path;
 
-use super::disk::{outgrown, size_of, stands_still};
+use super::disk::{self, Growing};
 use super::error::{CheckoutError, machine};
 use super::finder::Found;
-use super::git::{Call, Git};
+use super::git::{Call, Git, LITTLE_MEMORY};
 use super::git_error::GitError;
-use super::lfs::{self, Pointer};
+use super::lfs;
 use super::limits::Limits;
-use super::refused::Scope;
 use super::repository::Repository;
-use super::revision::{ALL, Revision};
-use super::world_file::{self, NoWorld, WorldFile};
+use super::revision::Revision;
+use super::world_file::{NoWorld, WorldFile};
 use crate::shared::domain::ProjectUrl;
 use crate::simulation::process::InstanceDir;
 
 /// What is in a copy.
 #[derive(Debug)]
 pub struct Copied {
-    /// How many bytes there are.
+    /// How many bytes it takes.
     pub size: u64,
-    /// Files that only point to larger ones.
-    pub pointers: Vec<Pointer>,
-    /// Whether Git LFS is installed; not looked for where there are no such files.
-    pub has_lfs: bool,
+    /// How many files only point to larger ones, which could not be loaded.
+    pub pointers: usize,
     /// The world.
     pub world: Result<WorldFile, NoWorld>,
-    /// Where the project is that Webots sees, in its repository.
-    pub place: Option<String>,
 }
 
-/// What to copy of a commit.
-#[derive(Debug, Clone)]
-pub enum What<'path> {
-    /// The file or folder at this path of the repository.
-    Path(&'path str),
-    /// The paths in this file, each ended by a zero byte.
-    Listed(PathBuf),
-}
-
-impl What<'_> {
-    /// What a refusal of this is of.
-    #[must_use]
-    pub fn scope(&self, found: &Found) -> Scope {
-        let folder = match self {
-            Self::Path(path) => *path,
-            Self::Listed(_) => found.revision.needed(),
-        };
-        Scope::folder(&found.repository.remote(), &found.revision, folder)
-    }
-}
-
-/// Says what is copied of a commit for a client: the project's folder, and the files of the folders above it.
+/// Has git write these paths of a commit, each ended by a zero byte, into a folder. What it needs besides is in `scratch`.
 ///
 /// # Errors
-/// When the list of these files can't be written.
-pub async fn what<'found>(found: &'found Found, instance: &InstanceDir) -> std::io::Result<What<'found>> {
-    let needed = found.revision.needed();
-    if found.above.is_empty() || needed == ALL {
-        return Ok(What::Path(needed));
-    }
-    let file = instance.path().join("paths");
-    let list = [needed.as_bytes(), b"\0", &found.above].concat();
-    tokio::fs::write(&file, list).await?;
-    Ok(What::Listed(file))
-}
-
-/// Writes a part of a commit into the project's folder, or into another one. A client's copy has an index of its own.
-#[must_use]
-pub fn copy_call<'call>(
+/// When the list of paths can't be written.
+pub async fn copy_call<'call>(
     repository: &'call Repository,
     revision: &Revision,
-    (instance, into): (&InstanceDir, &Path),
-    what: &What<'_>,
-) -> Call<'call> {
-    let mut work_tree = OsString::from("--work-tree=");
-    work_tree.push(into);
-    let reference = revision.reference();
-    let mut arguments = vec![work_tree];
-    arguments.extend(["checkout", "--force", "--progress"].map(OsString::from));
-    match what {
-        What::Path(path) => arguments.extend([&reference, "--", path].map(OsString::from)),
-        What::Listed(file) => {
-            let mut list = OsString::from("--pathspec-from-file=");
-            list.push(file);
-            arguments.extend([list, "--pathspec-file-nul".into(), reference.clone().into()]);
-        }
-    }
-    let mut call = repository.call(arguments);
-    call.environment.push(("GIT_INDEX_FILE".into(), instance.path().join("index").into()));
-    call.environment.push(("GIT_ATTR_SOURCE".into(), reference.into()));
-    call
+    paths: &[u8],
+    (scratch, into): (&Path, &Path),
+) -> io::Result<Call<'call>> {
+    let list = scratch.join("paths");
+    tokio::fs::write(&list, paths).await?;
+    let with = |option: &str, path: &Path| {
+        let mut argument = OsString::from(option);
+        argument.push(path);
+        argument
+    };
+    let mut arguments = vec![with("--work-tree=", into)];
+    arguments.extend(["checkout", "--force", "--progress", "--pathspec-file-nul"].map(OsString::from));
+    arguments.extend([with("--pathspec-from-file=", &list), revision.reference().into()]);
+    let mut call = Call { memory: LITTLE_MEMORY, ..repository.call(arguments) };
+    call.environment.push(("GIT_INDEX_FILE".into(), scratch.join("index").into()));
+    call.environment.push(("GIT_ATTR_SOURCE".into(), revision.reference().into()));
+    Ok(call)
 }
 
-/// Has git write a copy, and tell its progress line by line. Where it stands still it starts anew, each time with twice the
-/// patience: only a few copies are made at a time. Returns whether what was written is small enough.
+/// Has git write a project, with its large files, and tell its progress line by line. Returns whether it is small enough:
+/// what is in the commit may be smaller than what git's attributes make of it, and a forge may send more than it should.
 ///
 /// # Errors
 /// When git fails.
 pub async fn write(
     git: &Git,
-    call: &Call<'_>,
+    found: &Found,
     instance: &InstanceDir,
-    (limits, repository): (&Limits, &Repository),
-    mut told: impl FnMut(&str),
+    (limits, has_lfs): (&Limits, bool),
+    told: impl FnMut(&str),
 ) -> Result<bool, GitError> {
-    let mut patience = limits.patience();
-    loop {
-        let (mut is_too_large, mut is_silent) = (false, false);
-        let project = instance.project();
-        let end = async {
-            tokio::select! {
-                () = outgrown(&project, limits.size) => is_too_large = true,
-                () = stands_still(&project, patience) => is_silent = true,
-            }
-        };
-        match git.run_until(end, call.clone(), &mut told).await {
-            _ if is_too_large => return Ok(false),
-            Err(_) if is_silent => repository.tell_silence(patience),
-            written => return written.map(|_| true),
-        }
-        patience *= 2;
-        // The one that was killed has left it.
-        tokio::fs::remove_file(instance.path().join("index.lock")).await.ok();
+    let paths = [found.revision.needed().as_bytes(), b"\0", &found.above].concat();
+    let project = instance.project();
+    let call = copy_call(&found.repository, &found.revision, &paths, (instance.path(), &project));
+    let mut call = call.await?;
+    let mut growing = vec![Growing::new(project, limits.size)];
+    if has_lfs {
+        call.settings = lfs::settings(&found.repository.remote());
+        // git-lfs keeps what it loads here, into which others may load meanwhile, and copies it into the project.
+        let kept = call.repository.join("lfs");
+        let before = disk::blocking({
+            let kept = kept.clone();
+            move || Ok(disk::room_of(&kept))
+        });
+        let before = before.await?;
+        growing.push(Growing::new(kept, before.saturating_add(limits.size.saturating_mul(2))));
+    }
+    tokio::select! {
+        written = git.run(call, told) => written.map(|_| true),
+        () = disk::outgrown(growing) => Ok(false),
     }
 }
 
@@ -134,18 +94,10 @@ pub async fn write(
 /// When the machine fails.
 pub async fn look(world: &ProjectUrl, instance: &InstanceDir, revision: &Revision) -> Result<Copied, CheckoutError> {
     let root = instance.project();
-    let path = root.join(revision.world_path(world));
-    let seen = actix_rt::task::spawn_blocking(move || {
-        let size = size_of(&root);
-        let project = world_file::project_of(&root, &path).map(|project| lfs::pointers(&project));
-        let pointers = project.unwrap_or_default();
-        let has_lfs = !pointers.is_empty() && lfs::is_installed();
-        let world = WorldFile::open(&root, &path);
-        let place = world.as_ref().ok().and_then(|world| {
-            let project = world.path.ancestors().nth(2)?;
-            Some(project.strip_prefix(root.canonicalize().ok()?).ok()?.to_str()?.to_owned())
-        });
-        Copied { size, pointers, has_lfs, world, place }
+    let (folder, path) = (root.join(&revision.folder), root.join(revision.world_path(world)));
+    let seen = disk::blocking(move || {
+        let (size, pointers) = (disk::room_of(&root), lfs::pointers(&folder));
+        Ok(Copied { size, pointers, world: WorldFile::open(&root, &path) })
     });
-    seen.await.map_err(|error| machine(world, &error.into()))
+    seen.await.map_err(|error| machine(world, &error))
 }

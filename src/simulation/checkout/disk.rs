@@ -3,7 +3,7 @@
 use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use crate::simulation::process::folder_size::{self, FolderSize};
 use crate::simulation::process::remove_tree;
@@ -71,34 +71,48 @@ fn length(file: &Path) -> u64 {
     file.metadata().map_or(0, |about| about.len())
 }
 
-/// Waits until the files below a folder have more bytes than this.
-pub async fn outgrown(folder: &Path, size: u64) {
+/// A folder, and how much it may take.
+#[derive(Debug, Clone)]
+pub struct Growing {
+    folder: PathBuf,
+    most: u64,
+}
+
+impl Growing {
+    /// This folder may take so many bytes.
+    #[must_use]
+    pub fn new(folder: PathBuf, most: u64) -> Self {
+        Self { folder, most }
+    }
+}
+
+/// Waits until one of the folders takes more than it may.
+pub async fn outgrown(folders: Vec<Growing>) {
     loop {
         actix_rt::time::sleep(BETWEEN_LOOKS).await;
-        let folder = folder.to_owned();
-        if blocking(move || Ok(size_of(&folder))).await.is_ok_and(|found| found > size) {
+        let looked_at = folders.clone();
+        let is_one = move || Ok(looked_at.iter().any(|one| room_of(&one.folder) > one.most));
+        if blocking(is_one).await.is_ok_and(|is_one| is_one) {
             return;
         }
     }
 }
 
-/// Waits until the files below a folder have had the same size for so long.
-pub async fn stands_still(folder: &Path, limit: Duration) {
-    let (mut since, mut last) = (Instant::now(), None);
-    while since.elapsed() < limit {
-        actix_rt::time::sleep(BETWEEN_LOOKS).await;
-        let folder = folder.to_owned();
-        let now = blocking(move || Ok(size_of(&folder))).await.ok();
-        if now != last {
-            (since, last) = (Instant::now(), now);
-        }
-    }
+/// What everything below a folder takes, each file and folder at least what a name takes of a disk. What nobody can look
+/// into does not count.
+#[must_use]
+pub fn room_of(folder: &Path) -> u64 {
+    sum(folder, |about| folder_size::length(about).max(folder_size::SMALLEST))
 }
 
-/// The bytes of all files below a folder. What nobody can look into does not count.
+/// The bytes of all files below a folder.
 #[must_use]
 pub fn size_of(folder: &Path) -> u64 {
-    let mut size = FolderSize::new(folder_size::length, u64::MAX);
+    sum(folder, folder_size::length)
+}
+
+fn sum(folder: &Path, measure: fn(&fs::Metadata) -> u64) -> u64 {
+    let mut size = FolderSize::new(measure, u64::MAX);
     size.add_folder(folder).ok();
     size.total()
 }

@@ -3,7 +3,7 @@
 use std::io;
 use std::time::Duration;
 
-use super::git_error::{Cause, FetchError, GitError};
+use super::git_error::{Cause, GitError};
 use super::world_file::NoWorld;
 use crate::shared::domain::ProjectUrl;
 
@@ -43,9 +43,6 @@ pub enum CheckoutError {
         /// The hash.
         commit: String,
     },
-    /// It has too many files.
-    #[error("The project has more than {0} files and folders")]
-    TooMany(u64),
     /// It took too long.
     #[error("Fetching {repository} took longer than {seconds} seconds")]
     TooSlow {
@@ -100,12 +97,6 @@ impl CheckoutError {
     pub fn is_own(&self) -> bool {
         matches!(self, Self::Machine(..))
     }
-
-    /// Whether it is because of a size, which is the same for everybody who wants the same.
-    #[must_use]
-    pub fn is_of_size(&self) -> bool {
-        matches!(self, Self::TooMany(_) | Self::TooLarge { .. } | Self::TooMuch { .. })
-    }
 }
 
 /// The world's URL names nothing that is there.
@@ -119,6 +110,9 @@ pub fn no_reference(world: &ProjectUrl) -> CheckoutError {
 #[must_use]
 pub fn git_failed(world: &ProjectUrl, source: GitError) -> CheckoutError {
     let repository = world.repository();
+    if let GitError::Slow(limit) = source {
+        return too_slow(world, limit);
+    }
     match source.cause() {
         Cause::NoRepository => CheckoutError::NoRepository(repository),
         Cause::NoCommit => no_reference(world),
@@ -132,11 +126,10 @@ pub fn git_failed(world: &ProjectUrl, source: GitError) -> CheckoutError {
 
 /// A fetch has failed; `what` was fetched.
 #[must_use]
-pub fn fetch_failed(world: &ProjectUrl, what: impl FnOnce() -> String, limit: u64, error: FetchError) -> CheckoutError {
+pub fn fetch_failed(world: &ProjectUrl, what: impl FnOnce() -> String, limit: u64, error: GitError) -> CheckoutError {
     match error {
-        FetchError::Git(source) => git_failed(world, source),
-        FetchError::TooLarge => too_large(what(), limit),
-        FetchError::Machine(why) => CheckoutError::Machine(world.repository(), why),
+        GitError::TooLarge => too_large(what(), limit),
+        source => git_failed(world, source),
     }
 }
 

@@ -1,20 +1,17 @@
 //! Finds the commit that a world's URL names, and brings it into the cache: once for all who want it at the same time.
 
-use std::ffi::OsString;
 use std::sync::Arc;
 use std::time::Instant;
 
-use tokio::sync::{Semaphore, watch};
+use tokio::sync::watch;
 
 use super::cache::Cache;
-use super::error::{CheckoutError, fetch_failed, git_failed, machine, no_reference, too_large};
+use super::error::{CheckoutError, fetch_failed, git_failed, machine, no_reference};
 use super::git::Git;
 use super::git_error::GitError;
 use super::limits::Limits;
-use super::listing::Listing;
 use super::mirrors::{Mirrors, Remote};
 use super::redirect;
-use super::refused::{Refused, Scope};
 use super::repository::Repository;
 use super::revision::{self, Revision, TrustSource};
 use super::search::Search;
@@ -32,15 +29,9 @@ pub struct Finder {
     mirrors: Mirrors,
     rules: Rules,
     limits: Limits,
-    /// How many answers are read at a time.
-    answers: Semaphore,
     searches: SingleFlight<ProjectUrl, Result<Arc<Found>, CheckoutError>>,
-    refused: Refused,
     spellings: Spellings,
 }
-
-/// How many answers of git about commits are read at a time.
-const ANSWERS: usize = 4;
 
 /// A world's commit in the cache.
 #[derive(Debug)]
@@ -51,8 +42,6 @@ pub struct Found {
     pub revision: Revision,
     /// The files of the folders above the project's, each path ended by a zero byte: worlds may refer to them.
     pub above: Vec<u8>,
-    /// How many bytes its files have.
-    pub size: u64,
 }
 
 /// What git says of a commit in the cache.
@@ -69,8 +58,8 @@ impl Finder {
     /// Finds commits by `git`, and keeps them in `cache`.
     #[must_use]
     pub fn new(git: Arc<Git>, cache: Arc<Cache>, (mirrors, rules): (Mirrors, Rules), limits: Limits) -> Self {
-        let (answers, searches, refused) = (Semaphore::new(ANSWERS), SingleFlight::default(), Refused::default());
-        Self { git, cache, mirrors, rules, limits, answers, searches, refused, spellings: Spellings::default() }
+        let (searches, spellings) = (SingleFlight::default(), Spellings::default());
+        Self { git, cache, mirrors, rules, limits, searches, spellings }
     }
 
     /// Waits for a world's commit to be in the cache, together with everybody who waits for the same.
@@ -105,31 +94,15 @@ impl Finder {
         let repository = self.repository(world).await?;
         let search = self.with(world, &repository, &progress);
         let mut missing = None;
-        for mut revision in self.revisions(search).await? {
-            let Some(mut listing) = self.list(search, &revision).await? else {
+        for revision in self.revisions(search).await? {
+            let path = revision.world_path(world);
+            let Some(answer) = self.read(search, &revision, &path).await? else {
                 continue;
             };
-            if listing.has_world {
-                self.check(&repository, &revision, &listing)?;
+            if let Some(above) = revision.files_above(&answer, &path) {
+                return Ok(Found { repository, revision, above });
             }
-            if !listing.has_world && (listing.has_link || listing.entries == 0) {
-                match self.list(search, &revision.whole()).await {
-                    Ok(Some(all)) if all.has_link => (revision, listing) = (revision.whole(), all),
-                    Err(error) if listing.has_link => return Err(error),
-                    _ => {}
-                }
-            }
-            let mut above = Vec::new();
-            if revision.needed() != revision::ALL {
-                let answer = self.read(search, &revision, revision.above_arguments()).await?;
-                above = listing.add_files(&answer.unwrap_or_default());
-            }
-            self.check(&repository, &revision, &listing)?;
-            // Where a link leads is seen in the checkout.
-            if listing.has_world || listing.has_link {
-                return Ok(Found { repository, revision, above, size: listing.size });
-            }
-            missing = Some(NoWorld::Missing(format!("{} in {}", revision.world_path(world), revision.name)));
+            missing = Some(NoWorld::Missing(format!("{path} in {}", revision.name)));
         }
         Err(missing.map_or_else(|| no_reference(world), CheckoutError::World))
     }
@@ -140,8 +113,8 @@ impl Finder {
         repository: &'job Arc<Repository>,
         progress: &'job (dyn Fn(String) + Send + Sync),
     ) -> Search<'job> {
-        let (git, cache, limits, refused) = (&*self.git, &*self.cache, &self.limits, &self.refused);
-        Search { git, cache, limits, world, repository, refused, progress }
+        let (git, cache, limits) = (&*self.git, &*self.cache, &self.limits);
+        Search { git, cache, limits, world, repository, progress }
     }
 
     async fn repository(&self, world: &ProjectUrl) -> Result<Arc<Repository>, CheckoutError> {
@@ -159,46 +132,7 @@ impl Finder {
             return Ok(vec![commit]);
         }
         let answer = search.ask().await?;
-        let found = revision::found(search.world, &answer);
-        match revision::short_hash_of(search.world) {
-            Some(short) if found.is_empty() => search.commits(&short).await,
-            _ => Ok(found),
-        }
-    }
-
-    /// The files of the project, or of the repository if that is needed; nothing where the revision is no folder.
-    async fn list(&self, search: Search<'_>, revision: &Revision) -> Result<Option<Listing>, CheckoutError> {
-        let answer = self.read(search, revision, revision.list_arguments()).await?;
-        Ok(answer.map(|answer| Listing::parse(&answer, &revision.world_path(search.world))))
-    }
-
-    /// Whether all of a commit may be checked out, not its project's folder alone.
-    ///
-    /// # Errors
-    /// When it is too large for that.
-    pub async fn check_whole(&self, world: &ProjectUrl, found: &Found) -> Result<(), CheckoutError> {
-        let search = self.with(world, &found.repository, &drop);
-        let whole = found.revision.whole();
-        let listing = self.list(search, &whole).await?;
-        self.check(&found.repository, &whole, &listing.unwrap_or_default())
-    }
-
-    /// Whether what is listed of a revision may be checked out.
-    fn check(&self, repository: &Repository, revision: &Revision, listing: &Listing) -> Result<(), CheckoutError> {
-        let scope = Scope::folder(&repository.remote(), revision, revision.needed());
-        if listing.entries > self.limits.entries() {
-            return self.refused.note(scope, Err(CheckoutError::TooMany(self.limits.entries())));
-        }
-        if listing.size > self.limits.size {
-            return self.refused.note(scope, Err(too_large("The project".to_owned(), self.limits.size)));
-        }
-        Ok(())
-    }
-
-    /// What was refused before.
-    #[must_use]
-    pub fn refused(&self) -> &Refused {
-        &self.refused
+        Ok(revision::found(search.world, &answer))
     }
 
     /// Whether there is a file at a path of a commit that was found before. It is fetched again if it has left the cache
@@ -214,26 +148,27 @@ impl Finder {
     ) -> Result<Option<Arc<Repository>>, CheckoutError> {
         let repository = self.repository(world).await?;
         let search = self.with(world, &repository, &drop);
-        let answer = self.read(search, revision, revision.entry_arguments(path)).await?;
-        let is_file = answer.is_some_and(|entry| entry.starts_with(b"100") || entry.starts_with(b"120"));
+        let answer = self.read(search, revision, path).await?;
+        let is_file = answer.is_some_and(|answer| revision.files_above(&answer, path).is_some());
         Ok(is_file.then_some(repository))
     }
 
-    /// Has git read a commit, which is fetched before if it is not in the cache. Nothing where the revision is no folder.
+    /// Has git list a path of a commit, which is fetched before if it is not in the cache. Nothing where the revision is no
+    /// folder.
     async fn read(
         &self,
         search: Search<'_>,
         revision: &Revision,
-        arguments: Vec<OsString>,
+        path: &str,
     ) -> Result<Option<Vec<u8>>, CheckoutError> {
-        let mut answer = self.answer(search, revision, arguments.clone()).await?;
+        let mut answer = self.answer(search, revision, path).await?;
         if matches!(answer, Answer::Absent) {
             if revision.trust == TrustSource::Url && !search.is_accepted(revision).await? {
                 let (repository, commit) = (search.world.repository(), revision.name.clone());
                 return Err(CheckoutError::NotReachable { repository, commit });
             }
             self.fetch(search, revision).await?;
-            answer = self.answer(search, revision, arguments).await?;
+            answer = self.answer(search, revision, path).await?;
         }
         match answer {
             Answer::Text(text) => Ok(Some(text)),
@@ -248,23 +183,13 @@ impl Finder {
         &self,
         Search { world, repository, .. }: Search<'_>,
         revision: &Revision,
-        arguments: Vec<OsString>,
+        path: &str,
     ) -> Result<Answer, CheckoutError> {
-        let scope = Scope::folder(&repository.remote(), revision, revision.needed());
-        let answer = {
-            let _listing = repository.may_list().await;
-            let _turn = self.answers.acquire().await.map_err(|error| machine(world, &std::io::Error::other(error)))?;
-            self.refused.check(&scope)?;
-            match repository.read(arguments).await {
-                Err(GitError::TooLong(_)) => {
-                    return self.refused.note(scope, Err(CheckoutError::TooMany(self.limits.entries())));
-                }
-                answer => answer,
-            }
-        };
-        match answer {
+        match repository.read(revision.list_arguments(path)).await {
             Ok(text) => Ok(Answer::Text(text)),
-            Err(error @ GitError::NotStarted(_)) => Err(git_failed(world, error)),
+            Err(error @ (GitError::Machine(_) | GitError::TooLong(_) | GitError::Slow(_))) => {
+                Err(git_failed(world, error))
+            }
             Err(error) if repository.read(revision.exists_arguments()).await.is_err() => {
                 log::debug!("{} is not in the cache: {error}", revision.commit);
                 Ok(Answer::Absent)
@@ -281,8 +206,7 @@ impl Finder {
         let tell = |said: String| progress(steps::fetching(&world.repository(), &said));
         let failed =
             |error| fetch_failed(world, || format!("{} (at depth 1)", world.repository()), self.limits.size, error);
-        let fetched = repository.fetch(&revision.request(&repository.remote().location), &tell).await.map_err(failed);
-        self.refused.note(Scope::commit(&repository.remote(), revision), fetched)
+        repository.fetch(&revision.request(&repository.remote().location), &tell).await.map_err(failed)
     }
 
     /// Throws away what is cached of a world's repository, unless it was made after `since`.

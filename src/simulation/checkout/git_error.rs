@@ -1,6 +1,7 @@
 //! Why a git command failed. Pure.
 
 use std::io;
+use std::time::Duration;
 
 use crate::simulation::process::ExitReason;
 
@@ -8,8 +9,8 @@ use crate::simulation::process::ExitReason;
 #[derive(Debug, Clone, thiserror::Error)]
 pub enum GitError {
     /// The machine can't run git.
-    #[error("git can't be started: {0}")]
-    NotStarted(String),
+    #[error("{0}")]
+    Machine(String),
     /// It ended with another exit code than 0, or by a signal.
     #[error("git {command} {ending}: {message}")]
     Failed {
@@ -23,31 +24,15 @@ pub enum GitError {
     /// It answered more than is read.
     #[error("the answer of git {0} is too long")]
     TooLong(String),
-}
-
-/// Why a fetch failed.
-#[derive(Debug, Clone, thiserror::Error)]
-pub enum FetchError {
-    /// git failed.
-    #[error(transparent)]
-    Git(#[from] GitError),
     /// It has brought more than may come.
     #[error("it is too large")]
     TooLarge,
-    /// The machine failed.
-    #[error("{0}")]
-    Machine(String),
+    /// It took too long.
+    #[error("git did not end within {} seconds", .0.as_secs())]
+    Slow(Duration),
 }
 
-impl FetchError {
-    /// Those who wanted it have gone.
-    #[must_use]
-    pub fn unwanted() -> Self {
-        Self::Machine("nobody waits for it".to_owned())
-    }
-}
-
-impl From<io::Error> for FetchError {
+impl From<io::Error> for GitError {
     fn from(error: io::Error) -> Self {
         Self::Machine(error.to_string())
     }
@@ -128,8 +113,8 @@ impl GitError {
         let message = match self {
             Self::Failed { ending: ExitReason::Code(_), message, .. } => message,
             Self::TooLong(_) => return Cause::TooMuch,
-            Self::NotStarted(_) => return Cause::Machine,
-            Self::Failed { .. } => return Cause::Other,
+            Self::Machine(_) => return Cause::Machine,
+            Self::Failed { .. } | Self::TooLarge | Self::Slow(_) => return Cause::Other,
         };
         MESSAGES.iter().find(|(words, _)| message.contains(words)).map_or(Cause::Other, |(_, cause)| *cause)
     }

@@ -7,28 +7,16 @@ use std::time::Duration;
 pub struct Limits {
     /// Time limit of a whole checkout: the fetch, the copy and large files.
     pub time: Duration,
-    /// In bytes: what is fetched, and what is checked out.
+    /// In bytes: what is fetched, and what is checked out. Each file and folder counts at least what it takes of a disk.
     pub size: u64,
     /// Whether any commit may be fetched by its hash, not only those of branches and tags.
     pub any_commit: bool,
 }
 
-/// How many bytes of a project's size allow for one file or folder: each takes about that much of a disk.
-const ENTRY: u64 = 4096;
-/// How many files and folders any project may have.
-const FEW_ENTRIES: u64 = 10_000;
-
 impl Limits {
-    /// How long a remote may be silent before it is asked anew, for often only the connection has died, and how long a
-    /// command on this machine may at first. Packing a cached repository holds a fetch up for no longer either.
+    /// How long a remote may be silent, and packing a cached repository hold a fetch up.
     #[must_use]
     pub fn patience(&self) -> Duration {
         self.time / 4
-    }
-
-    /// How many files and folders may be checked out.
-    #[must_use]
-    pub fn entries(&self) -> u64 {
-        (self.size / ENTRY).max(FEW_ENTRIES)
     }
 }

@@ -19,8 +19,6 @@ pub struct Project {
     pub(super) revision: Revision,
     /// The project's folder.
     pub(super) folder: PathBuf,
-    /// Where the project is that Webots sees, in its repository: elsewhere if the world is behind a link.
-    pub(super) place: String,
     /// Removed with the project.
     pub instance: InstanceDir,
 }

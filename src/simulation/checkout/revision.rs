@@ -15,8 +15,6 @@ pub struct Revision {
     pub folder: String,
     /// Why the commit is trusted to be the repository's own.
     pub trust: TrustSource,
-    /// Whether more than that folder is needed: a link on the way to the world may lead anywhere in the repository.
-    pub is_whole: bool,
 }
 
 /// Why a commit is trusted to be the repository's own. Forges hand out by their hash also commits of forks and of
@@ -44,8 +42,6 @@ pub struct FetchRequest {
     pub is_sha256: bool,
 }
 
-/// All of a repository, as git wants it named.
-pub const ALL: &str = ".";
 /// How many readings of a URL are looked for: no real branch has more slashes in its name.
 const MOST_READINGS: usize = 12;
 
@@ -58,30 +54,7 @@ pub fn commit_of(world: &ProjectUrl, allow_any: bool) -> Option<Revision> {
     let kind = matches!(world.kind(), RefKind::Any | RefKind::Commit);
     let commit = reference.to_ascii_lowercase();
     let trust = if allow_any { TrustSource::AnyCommit } else { TrustSource::Url };
-    (is_hash && kind).then_some(Revision { commit, name: reference, folder, trust, is_whole: false })
-}
-
-/// The beginning of a hash that a URL may name a commit by.
-#[must_use]
-pub fn short_hash_of(world: &ProjectUrl) -> Option<String> {
-    let Reading { reference, .. } = world.candidates().into_iter().next()?;
-    let is_hash = (7..40).contains(&reference.len()) && reference.bytes().all(|byte| byte.is_ascii_hexdigit());
-    let kind = matches!(world.kind(), RefKind::Any | RefKind::Commit);
-    (is_hash && kind).then(|| reference.to_ascii_lowercase())
-}
-
-/// Asks for the hash of the only commit that begins like this.
-#[must_use]
-pub fn expand_arguments(short: &str) -> Vec<OsString> {
-    ["rev-parse", "--quiet", "--verify", &format!("{short}^{{commit}}")].map(OsString::from).to_vec()
-}
-
-/// The commit of this hash, which a URL names by its beginning.
-#[must_use]
-pub fn expanded(world: &ProjectUrl, commit: String) -> Option<Revision> {
-    let Reading { reference, folder } = world.candidates().into_iter().next()?;
-    let is_it = commit.starts_with(&reference.to_ascii_lowercase());
-    is_it.then_some(Revision { commit, name: reference, folder, trust: TrustSource::Url, is_whole: false })
+    (is_hash && kind).then_some(Revision { commit, name: reference, folder, trust })
 }
 
 /// Makes a bare repository. git before 2.29 knows only the older kind of hashes, and no name for it.
@@ -174,7 +147,6 @@ pub fn found(world: &ProjectUrl, answer: &str) -> Vec<Revision> {
                 name: reading.reference,
                 folder: reading.folder,
                 trust: TrustSource::Tip,
-                is_whole: false,
             })
         })
         .collect()
@@ -198,38 +170,35 @@ impl Revision {
         FetchRequest { name: self.reference(), settings: Vec::new(), arguments, is_sha256: is_sha256(&self.commit) }
     }
 
-    /// The same with all of the repository.
-    #[must_use]
-    pub fn whole(&self) -> Self {
-        Self { is_whole: true, ..self.clone() }
-    }
-
     /// The folder to check out, as git wants it named.
     #[must_use]
     pub fn needed(&self) -> &str {
-        if self.is_whole || self.folder.is_empty() { ALL } else { &self.folder }
+        if self.folder.is_empty() { "." } else { &self.folder }
     }
 
-    /// Says what the entry at a path of the repository is.
+    /// Asks for an entry of the repository, and for all that is directly in the folders above the project's.
     #[must_use]
-    pub fn entry_arguments(&self, path: &str) -> Vec<OsString> {
-        ["ls-tree", "-z", "--full-tree", &self.reference(), "--", path].map(OsString::from).to_vec()
-    }
-
-    /// Lists what is directly in the folders above the project's.
-    #[must_use]
-    pub fn above_arguments(&self) -> Vec<OsString> {
+    pub fn list_arguments(&self, path: &str) -> Vec<OsString> {
+        let root = (!self.folder.is_empty()).then_some(".".to_owned());
         let above = self.folder.match_indices('/').filter_map(|(end, _)| Some(format!("{}/", self.folder.get(..end)?)));
-        let fixed = ["ls-tree", "-l", "-z", "--full-tree", &self.reference(), "--", "."].map(OsString::from);
-        fixed.into_iter().chain(above.map(OsString::from)).collect()
+        let fixed = ["ls-tree", "-z", "--full-tree", &self.reference(), "--", path].map(OsString::from);
+        fixed.into_iter().chain(root.into_iter().chain(above).map(OsString::from)).collect()
     }
 
-    /// Lists the files of the project, or of the repository.
+    /// Reads the answer: the files directly in the folders above the project's, each path ended by a zero byte, if there is
+    /// a file at `path`.
     #[must_use]
-    pub fn list_arguments(&self) -> Vec<OsString> {
-        let fixed = ["ls-tree", "-r", "-l", "-z", "--full-tree", &self.reference(), "--"].map(OsString::from);
-        let folder = (self.needed() != ALL).then(|| OsString::from(format!("{}/", self.folder)));
-        fixed.into_iter().chain(folder).collect()
+    pub fn files_above(&self, answer: &[u8], path: &str) -> Option<Vec<u8>> {
+        let is_file = |entry: &&[u8]| entry.starts_with(b"100") || entry.starts_with(b"120");
+        let files = answer.split(|byte| *byte == 0).filter(is_file);
+        let mut paths: Vec<&[u8]> = files.filter_map(|entry| entry.splitn(2, |byte| *byte == b'\t').nth(1)).collect();
+        let is_there = paths.contains(&path.as_bytes());
+        let folder = self.folder.as_bytes();
+        paths.retain(|path| match path.iter().rposition(|byte| *byte == b'/') {
+            Some(end) => path.get(..=end).is_some_and(|above| folder.starts_with(above)),
+            None => !folder.is_empty(),
+        });
+        is_there.then(|| paths.into_iter().flat_map(|path| path.iter().chain(&[0])).copied().collect())
     }
 
     /// Asks whether the name is there.
@@ -300,6 +269,16 @@ mod tests {
         let answer = format!("{A}\trefs/heads/main\n");
         assert!(is_of_other_length(&answer, &"a".repeat(64)) && !is_of_other_length(&answer, B));
         assert!(!is_of_other_length("", B), "nothing is known of an empty repository");
+    }
+
+    #[test]
+    fn only_files_above_the_project_are_taken_with_it() {
+        let commit = commit_of(&world(&format!("tree/{A}/p/q/worlds/a.wbt")), false).unwrap();
+        let answer = b"100644 blob a\ttop.proto\x00040000 tree b\tother\x00120000 blob c\tp/mid link\x00100644 blob d\tp/q/no.proto\x00\
+            160000 commit e\tmodule\x00100644 blob f\tp/q/worlds/a.wbt\x00";
+        assert_eq!(commit.files_above(answer, "p/q/worlds/a.wbt").unwrap(), b"top.proto\0p/mid link\0");
+        assert_eq!(commit.files_above(answer, "p/q/worlds/b.wbt"), None);
+        assert_eq!(commit.files_above(answer, "other"), None, "it is a folder");
     }
 
     #[test]

@@ -5,16 +5,12 @@ use std::sync::Arc;
 
 use super::cache::Cache;
 use super::error::{CheckoutError, fetch_failed, git_failed, machine, no_reference, too_large};
-use super::git::{Call, Git};
+use super::git::{Call, Git, LITTLE_MEMORY};
 use super::limits::Limits;
-use super::refused::{Refused, Scope};
 use super::repository::Repository;
 use super::revision::{self, Revision};
 use super::steps;
 use crate::shared::domain::ProjectUrl;
-
-/// How much memory git may take for an answer of a remote, in bytes: enough for a million branches.
-const ANSWER_MEMORY: u64 = 512 << 20;
 
 /// What a world is looked for with.
 #[derive(Clone, Copy)]
@@ -29,31 +25,11 @@ pub struct Search<'job> {
     pub world: &'job ProjectUrl,
     /// Where its commits are kept.
     pub repository: &'job Arc<Repository>,
-    /// What was refused before.
-    pub refused: &'job Refused,
     /// Hears each step in words.
     pub progress: &'job (dyn Fn(String) + Send + Sync),
 }
 
 impl Search<'_> {
-    /// The commit of a branch or tag whose hash begins like this, unless several do.
-    ///
-    /// # Errors
-    /// Why the history can't be had.
-    pub async fn commits(self, short: &str) -> Result<Vec<Revision>, CheckoutError> {
-        let history = self.history().await?;
-        let arguments = revision::expand_arguments(short);
-        let mut hash = history.read(arguments.clone()).await;
-        if hash.is_err() {
-            let tips = self.tips().await?;
-            let tip = tips.split('\t').next().unwrap_or_default();
-            self.fetch_history(&history, tip).await?;
-            hash = history.read(arguments).await;
-        }
-        let hash = hash.map(|hash| String::from_utf8_lossy(&hash).trim().to_owned());
-        Ok(hash.ok().and_then(|hash| revision::expanded(self.world, hash)).into_iter().collect())
-    }
-
     async fn history(self) -> Result<Arc<Repository>, CheckoutError> {
         let history = self.cache.history(&self.repository.remote()).await;
         history.map_err(|error| machine(self.world, &error))
@@ -61,15 +37,15 @@ impl Search<'_> {
 
     /// Fetches the commits of all branches and tags; `commit` tells which kind of hashes there are.
     async fn fetch_history(self, history: &Arc<Repository>, commit: &str) -> Result<(), CheckoutError> {
-        let Search { world, progress, refused, .. } = self;
-        let scope = Scope::history(&history.remote());
-        refused.check(&scope)?;
+        let Search { world, progress, .. } = self;
         let what = || format!("The history of {}", world.repository());
         let tell = |said: String| progress(steps::fetching(&format!("the history of {}", world.repository()), &said));
         let fetched = history.fetch(&revision::history(&history.remote().location, commit), &tell).await;
-        let fetched = fetched.map_err(|error| fetch_failed(world, what, self.limits.size, error));
-        let is_too_large = fetched.is_ok() && history.packed().await > self.limits.size;
-        refused.note(scope, if is_too_large { Err(too_large(what(), self.limits.size)) } else { fetched })
+        fetched.map_err(|error| fetch_failed(world, what, self.limits.size, error))?;
+        if history.packed().await > self.limits.size {
+            return Err(too_large(what(), self.limits.size));
+        }
+        Ok(())
     }
 
     /// Whether a commit that is named by its hash is in a branch or tag.
@@ -105,11 +81,7 @@ impl Search<'_> {
 
     /// All branches and tags of the remote.
     async fn tips(self) -> Result<String, CheckoutError> {
-        let remote = self.repository.remote();
-        let scope = Scope::history(&remote);
-        self.refused.check(&scope)?;
-        self.refused.check(&Scope::repository(&remote))?;
-        self.refused.note(scope, self.answer(revision::tips_arguments(&remote.location)).await)
+        self.answer(revision::tips_arguments(&self.repository.remote().location)).await
     }
 
     /// Asks the remote for the branches and tags that the world's URL may mean.
@@ -117,23 +89,14 @@ impl Search<'_> {
     /// # Errors
     /// When it can't answer.
     pub async fn ask(self) -> Result<String, CheckoutError> {
-        let remote = self.repository.remote();
-        let arguments = revision::search_arguments(self.world, &remote.location);
-        self.refused.note(Scope::repository(&remote), self.answer(arguments).await)
+        self.answer(revision::search_arguments(self.world, &self.repository.remote().location)).await
     }
 
     async fn answer(self, arguments: Vec<OsString>) -> Result<String, CheckoutError> {
-        loop {
-            let turn = self.repository.may_ask().await;
-            let _turn = turn.map_err(|error| machine(self.world, &std::io::Error::other(error)))?;
-            self.refused.check(&Scope::repository(&self.repository.remote()))?;
-            let call = Call { memory: ANSWER_MEMORY, ..self.repository.call(arguments.clone()) };
-            let answer = self.git.run(call, |_| ());
-            match actix_rt::time::timeout(self.limits.patience(), answer).await {
-                Ok(Ok(answer)) => return Ok(String::from_utf8_lossy(&answer).into_owned()),
-                Ok(Err(source)) => return Err(git_failed(self.world, source)),
-                Err(_) => self.repository.tell_silence(self.limits.patience()),
-            }
-        }
+        let turn = self.repository.may_ask().await;
+        let _turn = turn.map_err(|error| machine(self.world, &std::io::Error::other(error)))?;
+        let call = Call { memory: LITTLE_MEMORY, ..self.repository.call(arguments) };
+        let answer = self.git.run(call, |_| ()).await.map_err(|source| git_failed(self.world, source))?;
+        Ok(String::from_utf8_lossy(&answer).into_owned())
     }
 }

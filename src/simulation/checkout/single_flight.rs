@@ -7,11 +7,11 @@ use std::collections::HashMap;
 use std::fmt;
 use std::future::Future;
 use std::hash::Hash;
-use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use futures_util::FutureExt;
 use futures_util::future::{BoxFuture, Shared, WeakShared};
+use parking_lot::Mutex;
 use tokio::sync::watch;
 
 /// The jobs of one kind that are under way, by what is wanted.
@@ -63,7 +63,7 @@ impl<K: Eq + Hash, T: Clone + Send + Sync + 'static> SingleFlight<K, T> {
     where
         F: Future<Output = T> + Send + 'static,
     {
-        let mut jobs = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut jobs = self.0.lock();
         jobs.retain(|_, job| job.result.upgrade().is_some_and(|result| result.peek().is_none()));
         if let Some(job) = jobs.get(&key)
             && let Some(result) = job.result.upgrade()

@@ -1,7 +1,8 @@
 //! How forges spell their repositories: GitLab sends to `REPOSITORY.git` who asks without the ending.
 
 use std::collections::HashMap;
-use std::sync::{Mutex, PoisonError};
+
+use parking_lot::Mutex;
 
 use super::mirrors::Remote;
 
@@ -15,7 +16,7 @@ const MOST: usize = 1000;
 impl Spellings {
     /// Remembers how a forge spells a remote.
     pub fn insert(&self, remote: Remote) {
-        let mut known = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut known = self.0.lock();
         if known.len() >= MOST {
             known.clear();
         }
@@ -25,7 +26,7 @@ impl Spellings {
     /// Returns the remote as its forge spells it.
     #[must_use]
     pub fn of(&self, remote: Remote) -> Remote {
-        let known = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        let known = self.0.lock();
         known.get(&remote.key()).cloned().unwrap_or(remote)
     }
 }

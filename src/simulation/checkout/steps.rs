@@ -40,12 +40,6 @@ pub fn checking_out(name: &str, said: Option<&str>) -> String {
     step(8, &format!("checking {name} out{said}"))
 }
 
-/// Large files are loaded.
-#[must_use]
-pub fn loading_large(count: usize) -> String {
-    step(9, &format!("loading {count} files from Git LFS"))
-}
-
 fn percent(text: &str) -> u64 {
     let percent = text.split_once('%').and_then(|(percent, _)| percent.trim().parse().ok());
     percent.unwrap_or(0).min(100)
@@ -75,8 +69,7 @@ mod tests {
         ];
         let fetch = git.map(|said| fetching("https://github.com/lab/arm", said));
         let all = [looking_for("https://github.com/lab/arm")].into_iter().chain(fetch);
-        let all: Vec<_> =
-            all.chain([checking_out("main", None), checking_out("main", Some("50%")), loading_large(2)]).collect();
+        let all: Vec<_> = all.chain([checking_out("main", None), checking_out("main", Some("50%"))]).collect();
         let bars: Vec<_> = all.iter().map(|text| bar(text).unwrap()).collect();
         assert!(bars.is_sorted(), "{all:#?}");
         assert_eq!(

@@ -12,9 +12,6 @@ pub enum NoWorld {
     /// It is a link to a file outside of the checkout.
     #[error("{0} leads out of its repository")]
     Outside(String),
-    /// It is a link, or behind one, that leads nowhere.
-    #[error("{0} is a link, or behind one, that leads to nothing in its repository")]
-    Dangling(String),
     /// It does not begin as worlds do.
     #[error("{name} is no world file: its first line is {found:?}, not like \"#VRML_SIM R2025a utf8\"")]
     Header {
@@ -43,11 +40,7 @@ impl WorldFile {
         let name = || path.file_name().unwrap_or_default().to_string_lossy().into_owned();
         let missing = |_| NoWorld::Missing(name());
         let root = root.canonicalize().map_err(missing)?;
-        let is_link = |path: &Path| path.symlink_metadata().is_ok_and(|about| about.is_symlink());
-        let path = path.canonicalize().map_err(|error| {
-            let dangling = path.ancestors().any(|part| is_link(part) && !part.exists());
-            if dangling { NoWorld::Dangling(name()) } else { missing(error) }
-        })?;
+        let path = path.canonicalize().map_err(missing)?;
         if !path.starts_with(&root) {
             return Err(NoWorld::Outside(name()));
         }
@@ -63,16 +56,6 @@ impl WorldFile {
             _ => Err(NoWorld::Header { name: name(), found: line }),
         }
     }
-}
-
-/// The project that a world of the checkout `root` belongs to, without links: the folder above that of its file, and the
-/// one that the URL names where the file lies elsewhere. Nothing where that is not inside: a link may lead anywhere.
-#[must_use]
-pub fn project_of(root: &Path, path: &Path) -> Option<PathBuf> {
-    let root = root.canonicalize().ok()?;
-    let above = |file: &Path| file.ancestors().nth(2).and_then(|project| project.canonicalize().ok());
-    let project = path.canonicalize().ok().and_then(|file| above(&file));
-    [project, above(path)].into_iter().flatten().find(|project| project.starts_with(&root))
 }
 
 #[cfg(test)]
@@ -94,8 +77,7 @@ mod tests {
             ("../outside.wbt", "out.wbt"),
             ("/etc/passwd", "passwd.wbt"),
             ("good.wbt", "in.wbt"),
-            ("nothing", "none"),
-            ("loop", "loop"),
+            ("nothing", "none.wbt"),
         ] {
             std::os::unix::fs::symlink(target, inside.join(link)).unwrap();
         }
@@ -106,9 +88,7 @@ mod tests {
         assert_eq!(open("out.wbt"), Err(NoWorld::Outside("out.wbt".to_owned())));
         assert_eq!(open("passwd.wbt"), Err(NoWorld::Outside("passwd.wbt".to_owned())));
         assert_eq!(open("missing.wbt"), Err(NoWorld::Missing("missing.wbt".to_owned())));
-        assert_eq!(open("none"), Err(NoWorld::Dangling("none".to_owned())));
-        assert_eq!(open("none/a.wbt"), Err(NoWorld::Dangling("a.wbt".to_owned())));
-        assert_eq!(open("loop/a.wbt"), Err(NoWorld::Dangling("a.wbt".to_owned())));
+        assert_eq!(open("none.wbt"), Err(NoWorld::Missing("none.wbt".to_owned())));
         assert!(matches!(open("bad.wbt"), Err(NoWorld::Header { .. })));
         assert!(matches!(open("empty.wbt"), Err(NoWorld::Header { .. })));
     }

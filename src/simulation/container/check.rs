@@ -1,17 +1,19 @@
 //! Whether this machine can run simulations in containers, now.
 
 use std::path::{Path, PathBuf};
-use std::process::{Command, Stdio};
 use std::sync::OnceLock;
+use std::time::Duration;
 
 use super::docker::Docker;
 use super::packet_filter;
 use super::templates::Templates;
-use crate::shared::text::one_line;
 use crate::simulation::config::SimulationConfig;
+use crate::simulation::process::{ExitReason, Ran, Run, RunError};
 
-/// Timeout of a command that starts a container, in seconds.
-const START: &str = "15";
+/// How long a command that starts a container may take.
+const START: Duration = Duration::from_secs(15);
+/// How long a daemon may take to answer.
+const ANSWER: Duration = Duration::from_secs(5);
 /// Where Docker puts its init process into a container. The program is static: it runs in an empty image.
 const INIT: &str = "/sbin/docker-init";
 /// The empty image, shared by all servers of a machine.
@@ -47,7 +49,7 @@ pub fn check_templates(config: &SimulationConfig) -> Result<String, String> {
 /// Why the daemon can't be used now, in words for clients and administrators. Blocks for five seconds at most.
 #[must_use]
 pub fn daemon_fault() -> Option<String> {
-    let why = failure("5", &["version", "--format", "{{.Server.Version}}"])?;
+    let why = failure(ANSWER, &["version", "--format", "{{.Server.Version}}"])?;
     Some(format!("Docker does not answer on this simulation server: {why}"))
 }
 
@@ -60,8 +62,8 @@ pub fn data_folder() -> Option<PathBuf> {
         return None;
     }
     if FOLDER.get().is_none() {
-        let output = docker("5", &["info", "--format", "{{.DockerRootDir}}"]).output().ok()?;
-        let told = String::from_utf8(output.stdout).ok()?;
+        let ran = docker(ANSWER, &["info", "--format", "{{.DockerRootDir}}"]).blocking(drop).ok()?;
+        let told = String::from_utf8(ran.answer).ok()?;
         let folder = told.lines().last().map(Path::new).filter(|folder| folder.is_absolute() && folder.exists())?;
         // Another check may have been as fast.
         FOLDER.set(folder.to_owned()).ok();
@@ -94,20 +96,20 @@ pub fn init_fault() -> Option<String> {
     ))
 }
 
-/// The command that runs docker within a timeout in seconds.
-fn docker(timeout: &str, arguments: &[&str]) -> Command {
-    let mut command = Command::new("timeout");
-    command.arg(timeout).arg("docker").args(arguments).stdin(Stdio::null());
-    command
+/// Docker with these arguments, within a time limit.
+fn docker(limit: Duration, arguments: &[&str]) -> Run {
+    Run::new(std::iter::once("docker").chain(arguments.iter().copied()), Path::new("/"), limit)
 }
 
-/// Runs docker within a timeout in seconds. Returns the last line that it prints if it fails.
-fn failure(timeout: &str, arguments: &[&str]) -> Option<String> {
-    let output = match docker(timeout, arguments).output() {
-        Ok(output) if output.status.success() => return None,
-        Ok(output) => String::from_utf8_lossy(&output.stderr).trim().to_owned(),
-        Err(error) => error.to_string(),
-    };
-    let why = output.lines().find(|line| line.contains("rror")).or_else(|| output.lines().last());
-    Some(why.map_or_else(|| format!("it gives no answer within {timeout} seconds"), one_line))
+/// Runs docker within a time limit. Returns the line that says why it fails, if it does.
+fn failure(limit: Duration, arguments: &[&str]) -> Option<String> {
+    let mut said: Vec<String> = Vec::new();
+    match docker(limit, arguments).blocking(|line| said.push(line)) {
+        Ok(Ran { ending: ExitReason::Code(0), .. }) => return None,
+        Ok(_) => {}
+        Err(RunError::Slow(_)) => said.clear(),
+        Err(error) => return Some(format!("docker {error}")),
+    }
+    let why = said.iter().find(|line| line.contains("rror")).or_else(|| said.last());
+    Some(why.cloned().unwrap_or_else(|| format!("it gives no answer within {} seconds", limit.as_secs())))
 }

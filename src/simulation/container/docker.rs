@@ -4,12 +4,9 @@ use std::ffi::{OsStr, OsString};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use futures_util::FutureExt;
-use tokio::io::{AsyncRead, AsyncReadExt};
-use tokio::net::unix::pipe::Receiver;
 use which::which;
 
-use crate::simulation::process::{ExitReason, Lines, ProcessGroup, SpawnSpec};
+use crate::simulation::process::{ExitReason, Run, RunError, SpawnSpec};
 
 /// How Docker is called on this machine.
 #[derive(Debug, Clone)]
@@ -53,12 +50,6 @@ pub const SHORT: Duration = Duration::from_secs(30);
 const FIND: Duration = Duration::from_secs(10);
 /// The most that is kept of an output, in bytes.
 const LONGEST_OUTPUT: usize = 1 << 20;
-/// The most that is kept of a line, in bytes.
-const LONGEST_LINE: usize = 1000;
-/// How much is read at once, in bytes, and how long is waited after it: a build that prints without end waits.
-const CHUNK: (usize, Duration) = (16 * 1024, Duration::from_millis(5));
-/// For so many lines it is waited once more: each is looked at and told, however short it is.
-const LINES: u32 = 50;
 /// How a message begins that says that nobody listens.
 const NO_DAEMON: [&str; 4] = [
     "cannot connect to the docker daemon",
@@ -75,9 +66,8 @@ impl Docker {
     pub fn find(mark: &Path) -> Result<Self, String> {
         which("docker")
             .map_err(|_| "docker is not there; on Debian and Ubuntu the package docker.io has it".to_owned())?;
-        let mut plugin = std::process::Command::new("timeout");
-        plugin.arg(FIND.as_secs().to_string()).args(["docker", "compose", "version"]);
-        let is_plugin = plugin.stdin(std::process::Stdio::null()).output().is_ok_and(|output| output.status.success());
+        let plugin = Run::new(["docker", "compose", "version"], mark, FIND).blocking(drop);
+        let is_plugin = plugin.is_ok_and(|ran| ran.ending == ExitReason::Code(0));
         let compose: &[&str] = if is_plugin {
             &["docker", "compose"]
         } else if which("docker-compose").is_ok() {
@@ -130,16 +120,9 @@ impl Docker {
     /// How a program is started that talks to the daemon. Dropping its process group ends only that program.
     #[must_use]
     pub fn spec(&self, command: Vec<OsString>, grace: Duration) -> SpawnSpec {
-        SpawnSpec {
-            command,
-            inherits: true,
-            // The classic builder prints its steps, and builds on a network of ours; BuildKit has none of the kind.
-            environment: vec![("DOCKER_BUILDKIT".into(), "0".into()), ("COMPOSE_ANSI".into(), "never".into())],
-            in_sandbox: false,
-            folder: None,
-            mark: self.mark.clone(),
-            grace,
-        }
+        // The classic builder prints its steps, and builds on a network of ours; BuildKit has none of the kind.
+        let environment = vec![("DOCKER_BUILDKIT".into(), "0".into()), ("COMPOSE_ANSI".into(), "never".into())];
+        SpawnSpec { environment, grace, ..SpawnSpec::new(command, &self.mark) }
     }
 
     async fn call(
@@ -147,26 +130,29 @@ impl Docker {
         command: Vec<OsString>,
         variables: Vec<(&'static str, String)>,
         limit: Duration,
-        told: impl FnMut(&str),
+        mut told: impl FnMut(&str),
     ) -> Result<String, DockerError> {
         let name: Vec<_> =
             command.iter().take_while(|word| !word.as_encoded_bytes().starts_with(b"-")).take(3).collect();
         let name = name.iter().map(|word| word.to_string_lossy()).collect::<Vec<_>>().join(" ");
-        let broken = |error: std::io::Error| DockerError::NotStarted(error.to_string());
-        let mut spec = self.spec(command, Duration::from_millis(500));
-        spec.environment.extend(variables.into_iter().map(|(name, value)| (name.into(), value.into())));
-        let (reader, output) = std::io::pipe().map_err(broken)?;
-        let errors = output.try_clone().map_err(broken)?;
-        let (group, ended) = ProcessGroup::start(&spec, output.into(), errors.into()).map_err(broken)?;
-        let reader = Receiver::from_owned_fd(reader.into()).map_err(broken)?;
-        let both = async { tokio::join!(read(reader, told), ended.boxed()) };
-        let done = actix_rt::time::timeout(limit, both).await;
-        drop(group);
-        match done {
-            Err(_) => Err(DockerError::Slow { command: name, limit }),
-            Ok((printed, ExitReason::Code(0))) => Ok(printed),
-            Ok((_, ExitReason::NotStarted)) => Err(DockerError::NotStarted(format!("there is no {name}"))),
-            Ok((printed, _)) => Err(failure(name, &printed)),
+        let mut run = Run::new([""], &self.mark, limit);
+        run.spec = self.spec(command, Duration::ZERO);
+        run.spec.environment.extend(variables.into_iter().map(|(name, value)| (name.into(), value.into())));
+        let mut printed = String::new();
+        let keep = |line: String| {
+            told(&line);
+            if printed.len() > LONGEST_OUTPUT {
+                printed.clear();
+            }
+            printed.push_str(&line);
+            printed.push('\n');
+        };
+        match run.follow(keep).await {
+            Ok(ExitReason::Code(0)) => Ok(printed),
+            Ok(ExitReason::NotStarted) => Err(DockerError::NotStarted(format!("there is no {name}"))),
+            Ok(_) => Err(failure(name, &printed)),
+            Err(RunError::Slow(_)) => Err(DockerError::Slow { command: name, limit }),
+            Err(error) => Err(DockerError::NotStarted(error.to_string())),
         }
     }
 }
@@ -182,48 +168,9 @@ fn failure(command: String, printed: &str) -> DockerError {
     DockerError::Failed { command, message }
 }
 
-/// Reads an output to its end. Returns its last part, each line made printable.
-async fn read(mut output: impl AsyncRead + Unpin, mut told: impl FnMut(&str)) -> String {
-    let (mut kept, mut lines, mut chunk) = (String::new(), Lines::new(LONGEST_LINE), vec![0; CHUNK.0]);
-    loop {
-        let mut number = 0;
-        let keep = |line: String| {
-            number += 1;
-            told(&line);
-            if kept.len() > LONGEST_OUTPUT {
-                kept.clear();
-            }
-            kept.push_str(&line);
-            kept.push('\n');
-        };
-        let Ok(length @ 1..) = output.read(&mut chunk).await else {
-            lines.end(keep);
-            return kept;
-        };
-        lines.feed(chunk.get(..length).unwrap_or_default(), keep);
-        actix_rt::time::sleep(CHUNK.1.saturating_mul(1 + number / LINES)).await;
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[actix_rt::test]
-    async fn an_output_is_told_line_by_line() {
-        let mut lines = Vec::new();
-        let text: &[u8] = b"Step 1/2 : FROM a\r\n\x1b[31mred\n\nlast";
-        let kept = read(text, |line: &str| lines.push(line.to_owned())).await;
-        assert_eq!(lines, ["Step 1/2 : FROM a", " [31mred", "last"]);
-        assert_eq!(kept, "Step 1/2 : FROM a\n [31mred\nlast\n");
-    }
-
-    #[actix_rt::test]
-    async fn short_lines_without_end_are_read_at_their_pace() {
-        let begin = std::time::Instant::now();
-        read("x\n".repeat(10_000).as_bytes(), |_: &str| ()).await;
-        assert!(begin.elapsed() > Duration::from_millis(500), "{:?}", begin.elapsed());
-    }
 
     #[test]
     fn a_daemon_that_is_not_there_is_told_apart() {

@@ -5,11 +5,12 @@
 
 use std::collections::HashSet;
 use std::path::Path;
-use std::process::{Command, Stdio};
+use std::time::Duration;
 
 use sha2::{Digest, Sha256};
 
 use super::docker::{Docker, DockerError, SHORT};
+use crate::simulation::process::Run;
 
 /// The label by which compose knows its projects.
 pub const PROJECT: &str = "com.docker.compose.project";
@@ -18,8 +19,8 @@ pub const PROJECT: &str = "com.docker.compose.project";
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Owner(String);
 
-/// How long a sweep may take for each command, in seconds.
-const SWEEP: &str = "20";
+/// How long a sweep may take for each command.
+const SWEEP: Duration = Duration::from_secs(20);
 /// What a project consists of besides containers: how these are listed, and removed.
 const REST: [(&str, &[&str], &[&str]); 2] = [
     ("volume", &["volume", "ls", "--quiet"], &["volume", "rm", "--force"]),
@@ -138,9 +139,8 @@ pub fn sweep(owner: &Owner) {
 
 /// Runs docker within a time limit, and returns what it prints. Blocks.
 pub fn quietly(arguments: &[&str]) -> String {
-    let mut command = Command::new("timeout");
-    command.arg(SWEEP).arg("docker").args(arguments).stdin(Stdio::null()).stderr(Stdio::null());
-    command.output().map(|output| String::from_utf8_lossy(&output.stdout).into_owned()).unwrap_or_default()
+    let run = Run::new(std::iter::once("docker").chain(arguments.iter().copied()), Path::new("/"), SWEEP);
+    run.blocking(drop).map(|ran| String::from_utf8_lossy(&ran.answer).into_owned()).unwrap_or_default()
 }
 
 #[cfg(test)]

@@ -1,8 +1,10 @@
 //! Whether the packet filter is loaded that keeps containers off this machine and private addresses:
 //! `deploy/nftables/containers.nft`.
 
-use std::process::{Command, Stdio};
-use std::time::{Duration, Instant};
+use std::path::Path;
+use std::time::Duration;
+
+use crate::simulation::process::{ExitReason, Ran, Run, RunError};
 
 /// The table of the filter.
 const TABLE: [&str; 5] = ["--terse", "list", "table", "inet", "webots_fleet"];
@@ -10,8 +12,6 @@ const TABLE: [&str; 5] = ["--terse", "list", "table", "inet", "webots_fleet"];
 const UNIT: [&str; 3] = ["is-active", "--quiet", "webots-fleet-packet-filter.service"];
 /// How long a program may take that is asked.
 const PATIENCE: Duration = Duration::from_secs(5);
-/// How often it is looked whether it has answered.
-const INTERVAL: Duration = Duration::from_millis(5);
 
 /// Returns nothing where the packet filter is loaded, else what that means and how it is loaded, in one line. Only root may
 /// look; others are told by systemd whether its unit has run.
@@ -31,28 +31,20 @@ pub fn missing() -> Option<String> {
 
 /// Whether a program ends in order, or why not.
 fn succeeds(program: &str, arguments: &[&str], patience: Duration) -> Result<(), String> {
-    let name = || format!("{program} {}", arguments.join(" "));
-    let mut command = Command::new(program);
-    command.args(arguments).stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null());
-    let mut child = command.spawn().map_err(|error| format!("{program}: {error}"))?;
-    let deadline = Instant::now() + patience;
-    loop {
-        match child.try_wait() {
-            Ok(Some(status)) if status.success() => return Ok(()),
-            Ok(Some(_)) => return Err(format!("'{}' says no", name())),
-            Ok(None) if Instant::now() < deadline => std::thread::sleep(INTERVAL),
-            Ok(None) | Err(_) => {
-                // It may have ended by now.
-                child.kill().ok();
-                child.wait().ok();
-                return Err(format!("'{}' does not answer", name()));
-            }
-        }
+    let name = || format!("'{program} {}'", arguments.join(" "));
+    let command = std::iter::once(program).chain(arguments.iter().copied());
+    match Run::new(command, Path::new("/"), patience).blocking(drop) {
+        Ok(Ran { ending: ExitReason::Code(0), .. }) => Ok(()),
+        Ok(_) => Err(format!("{} says no", name())),
+        Err(error @ RunError::NotStarted(_)) => Err(format!("{program} {error}")),
+        Err(_) => Err(format!("{} does not answer", name())),
     }
 }
 
 #[cfg(test)]
 mod tests {
+    use std::time::Instant;
+
     use super::*;
 
     #[test]

@@ -1,9 +1,10 @@
 //! Removes what simulations have left that nobody could remove when they ended, and images that nobody needs.
 
 use std::collections::HashSet;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use parking_lot::{Mutex, MutexGuard};
 use tokio::sync::Notify;
 
 use super::docker::{Docker, DockerError};
@@ -35,7 +36,7 @@ impl Live {
     }
 
     fn names(&self) -> MutexGuard<'_, HashSet<String>> {
-        self.0.0.lock().unwrap_or_else(PoisonError::into_inner)
+        self.0.0.lock()
     }
 }
 

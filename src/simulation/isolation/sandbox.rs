@@ -6,10 +6,9 @@
 
 use std::collections::BTreeSet;
 use std::ffi::OsString;
-use std::io::{self, Seek};
+use std::io;
 use std::path::PathBuf;
-use std::process::{Command, Stdio};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use which::which;
 
@@ -17,6 +16,7 @@ use super::place::{Content, Place, hidden};
 use super::program::Program;
 use crate::shared::text::one_line;
 use crate::simulation::config::SimulationConfig;
+use crate::simulation::process::{ExitReason, Ran, Run, RunError};
 
 /// What every sandbox of this server has in common.
 #[derive(Debug)]
@@ -178,25 +178,14 @@ impl Sandbox {
             display: &[],
             grace: TRIAL,
         })?;
-        let (bubblewrap, arguments) = words.split_first().ok_or(io::ErrorKind::InvalidInput)?;
-        let mut complaints = tempfile::tempfile()?;
-        let mut trial = Command::new(bubblewrap);
-        trial.args(arguments).arg("true").stdin(Stdio::null()).stdout(Stdio::null()).stderr(complaints.try_clone()?);
-        let mut trial = trial.spawn()?;
-        let deadline = Instant::now() + TRIAL;
-        while trial.try_wait()?.is_none() {
-            if Instant::now() >= deadline {
-                trial.kill()?;
-                trial.wait()?;
-                return Err(io::Error::new(io::ErrorKind::TimedOut, "it does not end"));
-            }
-            std::thread::sleep(Duration::from_millis(1));
+        let command = words.into_iter().chain(["true".into()]);
+        let mut complaint = String::new();
+        match Run::new(command, instance.path(), TRIAL).blocking(|line| complaint = line) {
+            Ok(Ran { ending: ExitReason::Code(0), .. }) => Ok(()),
+            Ok(_) => Err(io::Error::other(complaint)),
+            Err(RunError::Slow(_)) => Err(io::Error::new(io::ErrorKind::TimedOut, "it does not end")),
+            Err(error) => Err(io::Error::other(error)),
         }
-        if trial.wait()?.success() {
-            return Ok(());
-        }
-        complaints.rewind()?;
-        Err(io::Error::other(io::read_to_string(complaints)?))
     }
 }
 

@@ -5,9 +5,10 @@
 
 use std::collections::{BTreeMap, HashMap, HashSet};
 use std::path::{Path, PathBuf};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use parking_lot::Mutex;
 use procfs::process::{Stat, all_processes};
 
 /// The processes of a simulation.
@@ -92,7 +93,7 @@ impl UsageMonitor {
         if roots.is_empty() {
             return Usages::new();
         }
-        let mut readings = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut readings = self.0.lock();
         readings.renew(roots, measure);
         readings.usages.clone()
     }

@@ -2,29 +2,22 @@
 //!
 //! The server starts its own program once more, as `simulation-server guard FOLDER` with the folder of this run. The
 //! guardian reads its standard input, a pipe whose other end only the server holds. The kernel closes that end when the
-//! server has ended, also after SIGKILL. Then the guardian kills every process that carries the mark of this run (see
-//! [`process_tree::MARK`]), and removes the folder. After an orderly stop it finds nothing left to do.
+//! server has ended, also after SIGKILL. Then the guardian does at once what the next start of the server would do: it kills
+//! every process that carries the mark of this run (see [`process_tree::MARK`]), and removes the folder. After an orderly
+//! stop it finds nothing left to do.
 //!
-//! A guardian that ends while the server lives is replaced. If both are killed together, the next start of the server does
-//! the same.
+//! A process that the server was just starting holds that end as well, until it executes its program and so has the mark:
+//! one look is enough. Nobody looks after the guardian: where it has ended before the server, the next start does its work.
 
 use std::io::PipeWriter;
 use std::path::{Path, PathBuf};
-use std::process::Stdio;
-use std::time::{Duration, Instant};
-
-use tokio::process::Child;
-use tokio_util::task::AbortOnDropHandle;
+use std::process::{Child, Command, Stdio};
 
 use nix::sys::signal::{SigSet, Signal};
 use nix::unistd::setsid;
 
-use super::instance_dir::remove_patiently;
+use super::instance_dir;
 use super::process_tree;
-
-/// How long the guardian looks for processes that the server was starting as it ended: a process has the mark only once
-/// it executes its program (`execve`), which takes a while on a busy machine.
-const LATECOMERS: Duration = Duration::from_millis(500);
 
 /// The command line of a guardian.
 #[derive(Debug, clap::Args)]
@@ -36,17 +29,11 @@ pub struct Arguments {
     pub containers: Option<String>,
 }
 
-/// For how long it goes on after that, less often.
-const STRAGGLERS: Duration = Duration::from_secs(5);
-/// Time between two looks for those.
-const BETWEEN_LOOKS: Duration = Duration::from_millis(100);
-/// Time until another guardian is started where one has ended, or can't be started.
-const REPLACEMENT: Duration = Duration::from_millis(100);
-
 /// A running guardian. It acts when this is dropped.
 #[derive(Debug)]
 pub struct Guardian {
-    _kept: AbortOnDropHandle<()>,
+    _child: Child,
+    _lifeline: PipeWriter,
 }
 
 impl Guardian {
@@ -55,36 +42,12 @@ impl Guardian {
     /// # Errors
     /// When the system can start no more processes.
     pub fn start(run: &Path, containers: Option<&str>) -> std::io::Result<Self> {
-        let containers = containers.map(|owner| format!("--containers={owner}"));
-        let first = spawn(run, containers.as_deref())?;
-        let kept = keep(run.to_owned(), containers, first);
-        Ok(Self { _kept: AbortOnDropHandle::new(actix_rt::spawn(kept)) })
-    }
-}
-
-/// Starts a guardian. It acts when what is returned beside it is dropped.
-fn spawn(run: &Path, containers: Option<&str>) -> std::io::Result<(Child, PipeWriter)> {
-    let (reader, lifeline) = std::io::pipe()?;
-    let mut command = tokio::process::Command::new("/proc/self/exe");
-    command.arg0("simulation-server").arg("guard").arg(run).args(containers);
-    let child = command.stdin(reader).stdout(Stdio::null()).stderr(Stdio::null()).spawn()?;
-    Ok((child, lifeline))
-}
-
-/// Replaces a guardian that has ended, without end.
-async fn keep(run: PathBuf, containers: Option<String>, mut guardian: (Child, PipeWriter)) {
-    loop {
-        match guardian.0.wait().await {
-            Ok(status) => log::warn!("the guardian has ended ({status}), another one is started"),
-            Err(error) => log::error!("the guardian can't be watched: {error}"),
-        }
-        guardian = loop {
-            actix_rt::time::sleep(REPLACEMENT).await;
-            match spawn(&run, containers.as_deref()) {
-                Ok(next) => break next,
-                Err(error) => log::error!("no guardian can be started: {error}"),
-            }
-        };
+        let (reader, lifeline) = std::io::pipe()?;
+        let mut command = Command::new("/proc/self/exe");
+        std::os::unix::process::CommandExt::arg0(&mut command, "simulation-server").arg("guard").arg(run);
+        command.args(containers.map(|owner| format!("--containers={owner}")));
+        let child = command.stdin(reader).stdout(Stdio::null()).stderr(Stdio::null()).spawn()?;
+        Ok(Self { _child: child, _lifeline: lifeline })
     }
 }
 
@@ -98,15 +61,9 @@ pub fn guard(arguments: &Arguments, remove: impl Fn()) -> u8 {
         return 1;
     }
     std::io::copy(&mut std::io::stdin().lock(), &mut std::io::sink()).ok();
-    for (time, pause) in [(LATECOMERS, Duration::ZERO), (STRAGGLERS, BETWEEN_LOOKS)] {
-        let end = Instant::now() + time;
-        while Instant::now() < end {
-            process_tree::kill_marked(&arguments.folder);
-            std::thread::sleep(pause);
-        }
-        remove();
-        remove_patiently(&arguments.folder);
-    }
+    process_tree::kill_marked(&arguments.folder);
+    remove();
+    instance_dir::remove(&arguments.folder);
     0
 }
 

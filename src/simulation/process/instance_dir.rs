@@ -2,7 +2,6 @@
 
 use std::io;
 use std::path::{Path, PathBuf};
-use std::time::Duration;
 
 use super::process_tree;
 use super::remove_tree::remove_tree;
@@ -27,10 +26,6 @@ pub struct Leftovers {
     /// Processes of theirs that were still alive.
     pub processes: usize,
 }
-
-/// The pauses between tries to remove a folder.
-const PAUSES: [Duration; 4] =
-    [Duration::from_millis(20), Duration::from_millis(200), Duration::from_secs(1), Duration::from_secs(4)];
 
 impl RunDir {
     /// Makes the folder of this run below `cache`, and removes what earlier runs have left there. Only for the server
@@ -104,40 +99,22 @@ impl Drop for InstanceDir {
         // A project may hold many files, and this may run on a thread that serves others.
         let folder = std::mem::take(&mut self.folder);
         let spare = folder.clone();
-        if std::thread::Builder::new().spawn(move || remove_patiently(&folder)).is_err() {
+        if std::thread::Builder::new().spawn(move || remove(&folder)).is_err() {
             remove(&spare);
         }
     }
 }
 
-/// Removes a folder. Tries twice, and logs where it fails.
-fn remove(folder: &Path) {
-    // A process that is just ending may still write: what it adds is removed by the second try.
-    if remove_tree(folder).is_err()
-        && let Err(error) = remove_tree(folder)
-    {
+/// Removes a folder. What can't be removed is logged, and left to the next start. Blocks.
+pub fn remove(folder: &Path) {
+    if let Err(error) = remove_tree(folder) {
         log::error!("{} can't be removed: {error}", folder.display());
     }
-}
-
-/// Removes a folder, and tries again for some seconds where it can't; what is left then is removed at the next start.
-/// Blocks: only for threads of their own.
-pub fn remove_patiently(folder: &Path) {
-    for pause in PAUSES {
-        match remove_tree(folder) {
-            Ok(()) => return,
-            Err(error) => log::warn!("{} can't be removed yet: {error}", folder.display()),
-        }
-        std::thread::sleep(pause);
-    }
-    remove(folder);
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use std::fs::Permissions;
-    use std::os::unix::fs::PermissionsExt;
 
     #[test]
     fn an_earlier_run_is_removed_with_its_processes() {
@@ -150,37 +127,6 @@ mod tests {
         assert_eq!(leftovers, Leftovers { runs: 1, processes: 1 });
         assert!(!orphan.wait().unwrap().success());
         assert!(run.path().exists() && !dead.exists());
-    }
-
-    #[test]
-    fn what_can_not_be_removed_at_once_is_removed_later() {
-        let cache = tempfile::tempdir().unwrap();
-        let (run, _) = RunDir::open(cache.path()).unwrap();
-        let instance = run.instance().unwrap();
-        let folder = instance.path().to_owned();
-        let locked = folder.join("locked");
-        std::fs::create_dir_all(locked.join("inside")).unwrap();
-        std::fs::set_permissions(&locked, Permissions::from_mode(0o500)).unwrap();
-        // Somebody who makes files faster than they can be removed, for a while.
-        let busy = folder.join("busy");
-        std::fs::create_dir(&busy).unwrap();
-        let writer = std::thread::spawn(move || {
-            let end = std::time::Instant::now() + Duration::from_millis(150);
-            for number in 0.. {
-                std::fs::create_dir(busy.join(format!("{number}"))).ok();
-                if std::time::Instant::now() > end {
-                    return;
-                }
-            }
-        });
-        std::thread::sleep(Duration::from_millis(20));
-        drop(instance);
-        writer.join().unwrap();
-        let end = std::time::Instant::now() + Duration::from_secs(20);
-        while folder.exists() {
-            assert!(std::time::Instant::now() < end, "it is still there");
-            std::thread::sleep(Duration::from_millis(10));
-        }
     }
 
     #[test]

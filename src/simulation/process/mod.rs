@@ -9,6 +9,7 @@ mod port_finder;
 mod process_group;
 pub mod process_tree;
 mod remove_tree;
+mod runner;
 
 pub use guardian::Guardian;
 pub use instance_dir::{InstanceDir, Leftovers, RunDir};
@@ -16,3 +17,4 @@ pub use lines::Lines;
 pub use port_finder::PortFinder;
 pub use process_group::{ExitReason, ProcessGroup, SpawnSpec};
 pub use remove_tree::remove_tree;
+pub use runner::{Ran, Run, RunError};

@@ -7,7 +7,7 @@ use std::ffi::OsString;
 use std::fmt;
 use std::future::Future;
 use std::os::unix::process::ExitStatusExt;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::{ExitStatus, Stdio};
 use std::time::Duration;
 
@@ -39,6 +39,22 @@ pub struct SpawnSpec {
     pub grace: Duration,
 }
 
+impl SpawnSpec {
+    /// A program of the server's own, in its environment and folder, that needs no grace time.
+    #[must_use]
+    pub fn new(command: Vec<OsString>, mark: &Path) -> Self {
+        Self {
+            command,
+            inherits: true,
+            environment: Vec::new(),
+            in_sandbox: false,
+            folder: None,
+            mark: mark.to_owned(),
+            grace: Duration::ZERO,
+        }
+    }
+}
+
 /// A running process group. Dropping it kills the group.
 #[derive(Debug)]
 pub struct ProcessGroup {
@@ -55,6 +71,8 @@ pub enum ExitReason {
     Signal(u8),
     /// It could not be started: a launcher did not find it.
     NotStarted,
+    /// The system does not tell.
+    Unknown,
 }
 
 /// Exit code of a launcher (a shell, `env`, `nice`) that does not find its program.
@@ -133,7 +151,7 @@ async fn wait(mut group: KillOnDrop, mut child: Child, asked: oneshot::Receiver<
     actix_rt::time::timeout(VANISH, group.emptied()).await.ok();
     // The number of an empty group may be given to another one.
     group.leader = None;
-    status.map_or(ExitReason::NotStarted, |status| ExitReason::of(status, group.in_sandbox))
+    status.map_or(ExitReason::Unknown, |status| ExitReason::of(status, group.in_sandbox))
 }
 
 /// Kills a process group when it is dropped.
@@ -196,6 +214,7 @@ impl fmt::Display for ExitReason {
             Self::Code(0) => out.write_str("ended"),
             Self::Code(code) => write!(out, "ended with exit code {code}"),
             Self::NotStarted => out.write_str("could not be started"),
+            Self::Unknown => out.write_str("has ended, the system does not tell how"),
             Self::Signal(number) => match Signal::try_from(i32::from(*number)) {
                 Ok(signal) => write!(out, "was ended by the signal {signal}"),
                 Err(_) => write!(out, "was ended by signal {number}"),
@@ -218,15 +237,8 @@ mod tests {
     }
 
     fn shell(script: &str) -> SpawnSpec {
-        SpawnSpec {
-            command: ["bash", "-c", script].map(OsString::from).to_vec(),
-            inherits: true,
-            environment: Vec::new(),
-            in_sandbox: false,
-            folder: None,
-            mark: "/nowhere".into(),
-            grace: Duration::from_secs(20),
-        }
+        let command = ["bash", "-c", script].map(OsString::from).to_vec();
+        SpawnSpec { grace: Duration::from_secs(20), ..SpawnSpec::new(command, Path::new("/nowhere")) }
     }
 
     fn is_empty(group: i32) -> bool {

@@ -1,9 +1,10 @@
 //! The sessions that their clients may come back to.
 
 use std::collections::HashMap;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::Arc;
 
 use actix::prelude::*;
+use parking_lot::Mutex;
 
 use super::attachment::ToClient;
 use super::token::Token;
@@ -38,18 +39,14 @@ impl Sessions {
     pub fn keep(self: &Arc<Self>, session: Recipient<Resume>) -> Kept {
         // Not one that an earlier run of the server has used.
         let number = rand::random();
-        self.lock().insert(number, session);
+        self.0.lock().insert(number, session);
         Kept { number, sessions: Arc::clone(self) }
     }
 
     /// The session that a token names, if it has not ended.
     #[must_use]
     pub fn find(&self, token: &Token) -> Option<Recipient<Resume>> {
-        self.lock().get(&token.number()).cloned()
-    }
-
-    fn lock(&self) -> MutexGuard<'_, HashMap<u64, Recipient<Resume>>> {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+        self.0.lock().get(&token.number()).cloned()
     }
 }
 
@@ -63,6 +60,6 @@ impl Kept {
 
 impl Drop for Kept {
     fn drop(&mut self) {
-        self.sessions.lock().remove(&self.number);
+        self.sessions.0.lock().remove(&self.number);
     }
 }

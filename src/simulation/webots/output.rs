@@ -6,11 +6,12 @@
 use std::collections::VecDeque;
 use std::io::{BufRead, BufReader, Write};
 use std::path::Path;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use actix::dev::ToEnvelope;
 use actix::prelude::*;
+use parking_lot::Mutex;
 use tokio::sync::oneshot;
 
 use super::paced_reader::PacedReader;
@@ -67,7 +68,7 @@ impl Tail {
     /// project are those of its repository.
     #[must_use]
     pub fn last_words(&self, project: &Path) -> String {
-        let lines = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        let lines = self.0.lock();
         if lines.is_empty() {
             return ".".to_owned();
         }
@@ -76,7 +77,7 @@ impl Tail {
     }
 
     fn push(&self, line: String) {
-        let mut lines = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut lines = self.0.lock();
         if lines.len() == LINES {
             lines.pop_front();
         }

@@ -48,16 +48,7 @@ impl VirtualDisplay {
         let mut command: Vec<OsString> =
             ["Xvfb", "-displayfd", "1", "-screen", "0", SCREEN, "-nolisten", "tcp", "-auth"].map(OsString::from).into();
         command.push(authority.clone().into());
-        let mark = instance.to_owned();
-        let spec = SpawnSpec {
-            command,
-            inherits: true,
-            environment: Vec::new(),
-            in_sandbox: false,
-            folder: None,
-            mark,
-            grace: GRACE,
-        };
+        let spec = SpawnSpec { grace: GRACE, ..SpawnSpec::new(command, instance) };
         let (group, ended) = ProcessGroup::start(&spec, output.into(), File::create(&log)?.into())?;
         let ended = actix_rt::spawn(ended);
         let mut line = String::new();

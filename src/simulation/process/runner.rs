@@ -1,0 +1,215 @@
+//! Runs a program to its end: without a shell, within limits, and ended with whoever waits for it.
+
+use std::ffi::OsString;
+use std::io;
+use std::path::Path;
+use std::time::Duration;
+
+use futures_util::FutureExt;
+use rustix::process::{Pid, Resource, Rlimit, prlimit, setpriority_process};
+use tokio::io::{AsyncRead, AsyncReadExt};
+use tokio::net::unix::pipe::Receiver;
+
+use super::lines::Lines;
+use super::process_group::{ExitReason, ProcessGroup, SpawnSpec};
+
+/// A program to run to its end, and what it may take.
+#[derive(Debug)]
+pub struct Run {
+    /// How it is started.
+    pub spec: SpawnSpec,
+    /// How long it may take; then it is killed.
+    pub time: Duration,
+    /// How much of its answer is read, in bytes.
+    pub answer: u64,
+    /// How much is kept of a line of what it says, in bytes.
+    pub line: usize,
+    /// What the system lets it and its children have. It holds a moment after the start.
+    pub limits: Vec<(Resource, u64)>,
+    /// How much less priority it has, as `nice` has it.
+    pub niceness: i32,
+}
+
+/// How a program ended.
+#[derive(Debug)]
+pub struct Ran {
+    /// How.
+    pub ending: ExitReason,
+    /// What it printed on its standard output.
+    pub answer: Vec<u8>,
+}
+
+/// Why a program has not ended by itself. Its words follow those that name the program.
+#[derive(Debug, thiserror::Error)]
+pub enum RunError {
+    /// It is not there, or the system can start no more.
+    #[error("can't be started: {0}")]
+    NotStarted(#[from] io::Error),
+    /// It took too long.
+    #[error("did not end within {} seconds", .0.as_secs_f64())]
+    Slow(Duration),
+    /// It answered more than is read.
+    #[error("has answered too much")]
+    TooLong,
+}
+
+/// How much is read at once, in bytes, and how long is waited after it if that was all of it: a program that prints without
+/// end waits.
+const CHUNK: (usize, Duration) = (16 * 1024, Duration::from_millis(5));
+/// For so many lines at once it is waited once more: each is looked at and told, however short it is.
+const LINES: u32 = 50;
+
+impl Run {
+    /// A program of the server's own with its arguments, in the server's environment and with this mark.
+    #[must_use]
+    pub fn new<A: Into<OsString>>(command: impl IntoIterator<Item = A>, mark: &Path, time: Duration) -> Self {
+        let spec = SpawnSpec::new(command.into_iter().map(Into::into).collect(), mark);
+        Self { spec, time, answer: 1 << 20, line: 1000, limits: Vec::new(), niceness: 0 }
+    }
+
+    /// Runs it. `told` hears each line that it prints on its standard error. Dropping the future kills it and all that it
+    /// has started.
+    ///
+    /// # Errors
+    /// When it can't be started, or is killed since it takes too much.
+    pub async fn run(self, told: impl FnMut(String)) -> Result<Ran, RunError> {
+        let (output, answer) = io::pipe()?;
+        self.finish(Some(output), answer.into(), told).await
+    }
+
+    /// The same, but `told` hears what it prints on its standard output as well, and there is no answer.
+    ///
+    /// # Errors
+    /// When it can't be started, or is killed since it takes too long.
+    pub async fn follow(self, told: impl FnMut(String)) -> Result<ExitReason, RunError> {
+        let ran = self.finish(None, None, told).await;
+        ran.map(|ran| ran.ending)
+    }
+
+    /// The same as [`Self::run`], for a thread that serves nobody.
+    ///
+    /// # Errors
+    /// Those of `run`.
+    pub fn blocking(self, told: impl FnMut(String) + Send) -> Result<Ran, RunError> {
+        let run = || {
+            let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
+            runtime.block_on(self.run(told))
+        };
+        // The thread that calls may have a runtime already.
+        let ran = std::thread::scope(|scope| scope.spawn(run).join());
+        ran.unwrap_or_else(|_| Err(io::Error::other("its thread has panicked").into()))
+    }
+
+    async fn finish(
+        self,
+        output: Option<io::PipeReader>,
+        answer: Option<io::PipeWriter>,
+        told: impl FnMut(String),
+    ) -> Result<Ran, RunError> {
+        let Self { spec, time, answer: most, line, limits, niceness } = self;
+        let (said, errors) = io::pipe()?;
+        let answer = answer.map_or_else(|| errors.try_clone(), Ok)?;
+        // A thread that starts a process waits until it runs its program, which takes long on a busy machine.
+        let start = move || {
+            let (group, ended) = ProcessGroup::start(&spec, answer.into(), errors.into())?;
+            bound(group.leader(), &limits, niceness);
+            io::Result::Ok((group, ended.boxed()))
+        };
+        let (_group, ended) = actix_rt::task::spawn_blocking(start).await.map_err(io::Error::other)??;
+        let said = Receiver::from_owned_fd(said.into())?;
+        let output = output.map(|output| Receiver::from_owned_fd(output.into())).transpose()?;
+        let all = async { tokio::join!(read(output, most), tell(said, line, told), ended) };
+        let Ok((answer, (), ending)) = actix_rt::time::timeout(time, all).await else {
+            return Err(RunError::Slow(time));
+        };
+        if answer.len() as u64 > most { Err(RunError::TooLong) } else { Ok(Ran { ending, answer }) }
+    }
+}
+
+/// Bounds a program that has just been started. What it starts inherits that.
+fn bound(leader: i32, limits: &[(Resource, u64)], niceness: i32) {
+    let pid = Pid::from_raw(leader);
+    let limit = |(resource, most): &(Resource, u64)| {
+        prlimit(pid, *resource, Rlimit { current: Some(*most), maximum: Some(*most) }).map(drop)
+    };
+    let nice = if niceness == 0 { Ok(()) } else { setpriority_process(pid, niceness) };
+    if let Err(error) = nice.and(limits.iter().try_for_each(limit)) {
+        log::warn!("process {leader} runs without its limits: {error}");
+    }
+}
+
+async fn read(output: Option<Receiver>, most: u64) -> Vec<u8> {
+    let mut answer = Vec::new();
+    if let Some(output) = output {
+        // A broken pipe is the end of the answer; whether that is right is told by how the program ended.
+        output.take(most + 1).read_to_end(&mut answer).await.ok();
+    }
+    answer
+}
+
+/// Tells each line, made printable; also those that the program overwrites.
+async fn tell(mut said: impl AsyncRead + Unpin, longest: usize, mut told: impl FnMut(String)) {
+    let (mut lines, mut chunk) = (Lines::new(longest), vec![0; CHUNK.0]);
+    while let Ok(length @ 1..) = said.read(&mut chunk).await {
+        let mut pauses = u32::from(length == CHUNK.0) * LINES;
+        lines.feed(chunk.get(..length).unwrap_or_default(), |line| {
+            pauses += 1;
+            told(line);
+        });
+        if pauses >= LINES {
+            actix_rt::time::sleep(CHUNK.1.saturating_mul(pauses / LINES)).await;
+        }
+    }
+    lines.end(told);
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::Instant;
+
+    use super::*;
+
+    fn shell(script: &str, time: Duration) -> Run {
+        Run::new(["bash", "-c", script], Path::new("/nowhere"), time)
+    }
+
+    const LONG: Duration = Duration::from_secs(20);
+
+    #[actix_rt::test]
+    async fn an_answer_and_lines_are_told_apart_or_together() {
+        let script = "echo answer; printf 'one\\rtwo\\n' >&2; exit 3";
+        let mut lines = Vec::new();
+        let ran = shell(script, LONG).run(|line| lines.push(line)).await.unwrap();
+        assert_eq!((ran.ending, ran.answer.as_slice()), (ExitReason::Code(3), &b"answer\n"[..]));
+        assert_eq!(lines, ["one", "two"]);
+        lines.clear();
+        assert_eq!(shell(script, LONG).follow(|line| lines.push(line)).await.unwrap(), ExitReason::Code(3));
+        assert_eq!(lines, ["answer", "one", "two"]);
+        let ran = std::thread::spawn(move || shell(script, LONG).blocking(drop)).join().unwrap();
+        assert_eq!(ran.unwrap().answer, b"answer\n");
+        assert!(shell(script, LONG).blocking(drop).is_ok(), "also where there is a runtime");
+    }
+
+    #[actix_rt::test]
+    async fn who_takes_too_much_is_ended() {
+        let begin = Instant::now();
+        let slow = shell("sleep 1000 & sleep 1000", Duration::from_millis(100)).run(drop).await.unwrap_err();
+        assert!(matches!(slow, RunError::Slow(_)) && begin.elapsed() < LONG, "{slow}");
+        let long = Run { answer: 3, ..shell("echo long", LONG) }.run(drop).await.unwrap_err();
+        assert!(matches!(long, RunError::TooLong), "{long}");
+        let none = Run::new(["/nowhere/program"], Path::new("/"), LONG).run(drop).await.unwrap_err();
+        assert!(matches!(none, RunError::NotStarted(_)), "{none}");
+        let script = "until [ \"$(ulimit -f)\" -le 8 ] 2>/dev/null; do sleep 0.01; done; echo bounded";
+        let bounded = Run { limits: vec![(Resource::Fsize, 8192)], ..shell(script, LONG) }.run(drop).await.unwrap();
+        assert_eq!(bounded.answer, b"bounded\n");
+    }
+
+    #[actix_rt::test]
+    async fn short_lines_without_end_are_read_at_their_pace() {
+        let begin = Instant::now();
+        let mut number = 0;
+        tell("x\n".repeat(10_000).as_bytes(), 10, |_| number += 1).await;
+        assert_eq!(number, 10_000);
+        assert!(begin.elapsed() > Duration::from_millis(500), "{:?}", begin.elapsed());
+    }
+}
