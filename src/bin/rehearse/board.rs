@@ -91,7 +91,7 @@ impl Board {
     }
 
     /// Removes what was shown.
-    pub(crate) fn clear(&self) {
+    pub(crate) fn clear() {
         if std::io::stderr().is_terminal() {
             rewrite_line("");
         }

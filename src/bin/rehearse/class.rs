@@ -52,7 +52,7 @@ pub(crate) async fn play(arguments: &Arguments, consent: &Consent<'_>) -> Played
         () = class.refused.notified() => {}
         () = interruption() => interrupted = true,
     }
-    class.board.clear();
+    Board::clear();
     Played { visits: class.visits.take(), peaks: class.servers.peaks(), interrupted }
 }
 

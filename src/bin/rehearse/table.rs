@@ -121,8 +121,8 @@ impl fmt::Display for Table {
                 if column == 0 { write!(out, "| {cell:<width$} |")? } else { write!(out, " {cell:>width$} |")? }
             }
             if number == 0 {
-                let line: String = widths.iter().map(|width| format!("{:-<1$}|", "", width + 2)).collect();
-                write!(out, "\n|{line}")?;
+                let lines: Vec<String> = widths.iter().map(|width| "-".repeat(width + 2)).collect();
+                write!(out, "\n|{}|", lines.join("|"))?;
             }
         }
         Ok(())
