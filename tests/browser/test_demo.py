@@ -44,8 +44,9 @@ class TheDemo(BrowserTest):
         for one in [fleet_monitor, machine_monitor, page]:
             self.assertEqual(one.faults(), [])
 
-        page.close()
+        page.tab.get_by_role("button", name="Disconnect").click()
         expect(rows).to_have_count(0)
+        page.close()
         expect(fleet_monitor.tab.locator("#glance")).to_contain_text("0 of 10 places")
         # It is killed: what its page complains of then is no fault.
         machine_monitor.close()

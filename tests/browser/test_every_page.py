@@ -39,7 +39,8 @@ class EveryPage(BrowserTest):
                 expect(monitor.tab.locator("#simulations tr")).to_be_visible()
                 self.assertEqual(monitor.faults(), [])
                 self.assertLessEqual(monitor.overflow(), 0)
-                page.close()
+                page.tab.get_by_role("button", name="Disconnect").click()
+                expect(monitor.tab.locator("#simulations tr")).to_have_count(0)
 
     def test_pages_may_run_only_what_their_server_sends(self):
         for url, _ in self.pages():

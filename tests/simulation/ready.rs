@@ -12,7 +12,7 @@ use super::opened::{outcome, world_text};
 use super::scene::{DEMO, arm, instance_folders_in, nothing_left, stages};
 use crate::support::client::Client;
 use crate::support::git::{Forge, world};
-use crate::support::program::simulation_server;
+use crate::support::program::{Server, simulation_server};
 use crate::support::stopwatch::Stopwatch;
 use crate::support::webots::{Webots, instances_below};
 use crate::support::{display, until};
@@ -219,15 +219,24 @@ async fn each_webots_gets_a_virtual_display_of_its_own() {
     for _ in 1..=2 {
         let mut client = Client::start(&server, &arm()).await;
         client.until("webots:").await;
-        let text = std::fs::read_to_string(server.output_file(&client)).unwrap();
+        displays.push(display_of(&server, &client).await);
         clients.push(client);
-        displays.push(text.lines().find_map(|line| line.strip_prefix("display ")).unwrap().to_owned());
     }
     assert_ne!(displays[0], displays[1]);
     for client in clients {
         client.leave().await;
     }
     nothing_left(&server, 2).await;
+}
+
+/// The display that a simulator has printed.
+async fn display_of(server: &Server, client: &Client) -> String {
+    let printed = || {
+        let text = std::fs::read_to_string(server.output_file(client)).unwrap_or_default();
+        text.split_inclusive('\n').find_map(|line| Some(line.strip_prefix("display ")?.strip_suffix('\n')?.to_owned()))
+    };
+    until("the display is printed", async || printed().is_some()).await;
+    printed().unwrap()
 }
 
 #[actix_rt::test]
@@ -242,8 +251,7 @@ async fn the_number_of_a_virtual_display_that_was_killed_is_used_again() {
     for _ in 0..12 {
         let mut client = Client::start(&server, &arm()).await;
         client.until("webots:").await;
-        let text = std::fs::read_to_string(server.output_file(&client)).unwrap();
-        numbers.insert(text.lines().filter_map(|line| line.strip_prefix("display :")).next_back().unwrap().to_owned());
+        numbers.insert(display_of(&server, &client).await);
         let xvfb = instances_below(&server.folder).into_iter().find(|one| one.1.starts_with("Xvfb")).unwrap().0;
         kill(Pid::from_raw(xvfb), Signal::SIGKILL).unwrap();
         client.leave().await;
@@ -252,7 +260,7 @@ async fn the_number_of_a_virtual_display_that_was_killed_is_used_again() {
     // Another program of the machine may take and free numbers meanwhile.
     assert!(numbers.len() < 12, "{numbers:?}");
     for number in numbers {
-        assert!(!PathBuf::from(format!("/tmp/.X{number}-lock")).exists());
+        assert!(!PathBuf::from(format!("/tmp/.X{}-lock", number.trim_start_matches(':'))).exists());
     }
 }
 

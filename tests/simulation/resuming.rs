@@ -106,9 +106,10 @@ async fn who_comes_back_finds_the_simulation_as_it_runs_at_each_level() {
         let mut client = stage.resume(&first).await;
         let second = token(&mut client).await;
         let heard: Vec<_> = client.heard.iter().filter(|text| *text != ".").map(String::as_str).collect();
-        assert_eq!(heard[1..3], [&format!("webots:ws://localhost:{}", stage.server.port + 1), "absence: 60"]);
-        let rest: u64 = heard[0]["shutdownTimeout: ".len()..].parse().unwrap();
-        assert!((7000..=7200).contains(&rest) && heard.len() == 4, "{heard:?}");
+        assert_eq!(heard[0], format!("session: {}", stage.simulations().await[0]["id"].as_str().unwrap()));
+        assert_eq!(heard[2..4], [&format!("webots:ws://localhost:{}", stage.server.port + 1), "absence: 60"]);
+        let rest: u64 = heard[1]["shutdownTimeout: ".len()..].parse().unwrap();
+        assert!((7000..=7200).contains(&rest) && heard.len() == 5, "{heard:?}");
         assert_ne!(first, second);
         let mut viewer = Client::connect(&stream).await;
         viewer.send("x3d;broadcast").await;

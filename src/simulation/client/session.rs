@@ -148,6 +148,10 @@ impl Actor for Session {
             self.ask(&url, mode, ctx);
         }
     }
+
+    fn stopped(&mut self, _: &mut Self::Context) {
+        log::info!("{}: gone", self.name());
+    }
 }
 
 impl Drop for Session {

@@ -133,7 +133,7 @@ impl Actor for WebClient {
     }
 
     fn stopped(&mut self, _: &mut Self::Context) {
-        log::info!("client {}: gone", self.peer);
+        log::info!("client {}: disconnected", self.peer);
     }
 }
 

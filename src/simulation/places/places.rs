@@ -12,8 +12,9 @@ use std::time::Duration;
 
 use actix::prelude::*;
 
-use super::messages::{Acquire, GetSnapshot, Move, PlaceEvent, Release, Update};
+use super::messages::{Acquire, GetSnapshot, Move, Release, Update};
 use super::no_place::NoPlace;
+use super::place_event::PlaceEvent;
 use super::present::{Present, Report};
 use crate::shared::domain::{Instances, ProjectUrl};
 use crate::shared::http::Peer;

@@ -5,7 +5,7 @@ use std::time::SystemTime;
 
 use actix::Recipient;
 
-use super::messages::PlaceEvent;
+use super::place_event::PlaceEvent;
 use crate::shared::domain::ProjectUrl;
 use crate::shared::http::Peer;
 use crate::shared::run::{seconds_since_1970, timestamp};

@@ -2,6 +2,7 @@
 
 use std::io;
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 use super::process_tree;
 use super::remove_tree::remove_tree;
@@ -26,6 +27,10 @@ pub struct Leftovers {
     /// Processes of theirs that were still alive.
     pub processes: usize,
 }
+
+/// How often it is tried to remove a folder before that is left to the next start, and the pause between two tries.
+const TRIES: u32 = 60;
+const PAUSE: Duration = Duration::from_secs(1);
 
 impl RunDir {
     /// Makes the folder of this run below `cache`, and removes what earlier runs have left there. Only for the server
@@ -99,10 +104,23 @@ impl Drop for InstanceDir {
         // A project may hold many files, and this may run on a thread that serves others.
         let folder = std::mem::take(&mut self.folder);
         let spare = folder.clone();
-        if std::thread::Builder::new().spawn(move || remove(&folder)).is_err() {
+        if std::thread::Builder::new().spawn(move || remove_patiently(&folder)).is_err() {
             remove(&spare);
         }
     }
+}
+
+/// Removes a folder, and tries again each second for a minute: a machine that has no file or process left for `rm` has
+/// them again. Blocks: only for threads of their own.
+fn remove_patiently(folder: &Path) {
+    for _ in 0..TRIES {
+        match remove_tree(folder) {
+            Ok(()) => return,
+            Err(error) => log::warn!("{} can't be removed yet: {error}", folder.display()),
+        }
+        std::thread::sleep(PAUSE);
+    }
+    remove(folder);
 }
 
 /// Removes a folder. What can't be removed is logged, and left to the next start. Blocks.

@@ -1,0 +1,19 @@
+//! What the holder of a place, or of one in the line, hears.
+
+use actix::prelude::*;
+
+use super::no_place::NoPlace;
+
+/// What the holder of a ticket hears.
+#[derive(Message, Debug, Clone, Copy, PartialEq, Eq)]
+#[rtype(result = "()")]
+pub enum PlaceEvent {
+    /// So many clients are ahead in the waiting line.
+    Ahead(usize),
+    /// This port may be used as long as the ticket lives.
+    Granted(u16),
+    /// There is no room in the waiting line either.
+    Refused(NoPlace),
+    /// Too many simulations wait for clients that are away, and this one has waited longest: it has to end.
+    AwayTooLong,
+}
