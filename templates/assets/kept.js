@@ -2,18 +2,21 @@
 // ends with the tab, and no other page gets it.
 
 const NAME = 'simulation';
+/** What the page itself keeps, where the browser keeps nothing. */
+let own;
 
 /** The simulation of this tab, if it has one: server, world, token, absence. */
 export function kept() {
   try {
-    return JSON.parse(sessionStorage.getItem(NAME)) ?? undefined;
+    return JSON.parse(sessionStorage.getItem(NAME)) ?? own;
   } catch {
-    return undefined;
+    return own;
   }
 }
 
 /** Keeps the simulation of this tab. A browser that keeps nothing can't come back to it after a reload. */
 export function keep(simulation) {
+  own = simulation;
   try {
     sessionStorage.setItem(NAME, JSON.stringify(simulation));
   } catch {
@@ -23,6 +26,7 @@ export function keep(simulation) {
 
 /** The simulation has ended, or is somebody else's. */
 export function forget() {
+  own = undefined;
   try {
     sessionStorage.removeItem(NAME);
   } catch {

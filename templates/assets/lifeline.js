@@ -6,19 +6,22 @@ const SILENCE = 8000;
 const WORTH_A_WORD = 2000;
 /** How long a try may take: a second one would take its token away. In milliseconds. */
 const TRY = 15_000;
+/** A server that refuses all tries for so long, while the session server answers, is gone with its simulations; in milliseconds. */
+const GONE = 10_000;
 /** Before the second try, doubled each time up to the longest, in milliseconds. */
 const FIRST_PAUSE = 1000;
 const LONGEST_PAUSE = 10_000;
 
 /**
- * Events: `lost` ({ since, left }, in seconds; each second while there is no connection), `try` (come back now), `found`
- * (there is a sign of life again), `over` (nobody can still be waiting).
+ * Events: `lost` ({ since, left }, in seconds; each second while there is no connection), `try` (come back now), `refused` (a
+ * try has failed), `found` (there is a sign of life again), `over` (nobody can still be waiting).
  */
 export class Lifeline extends EventTarget {
   #heard = Date.now();
   #isLost = false;
   #tries = 0;
   #next = 0;
+  #refused;
   #timer;
   #online = () => {
     this.#next = 0;
@@ -41,21 +44,31 @@ export class Lifeline extends EventTarget {
     this.#heard = Date.now();
     this.#tries = 0;
     this.#next = 0;
+    this.#refused = undefined;
     if (this.#isLost) {
       this.#isLost = false;
       this.#tell('found');
     }
   }
 
-  /** The connection has closed. */
-  broken() {
+  /** The connection has closed, perhaps after an answer that asks for patience. */
+  broken(isAnswered = false) {
     this.#isLost = true;
     if (this.#tries > 0) {
       // Those who were lost together don't come back together.
       const pause = Math.min(LONGEST_PAUSE, FIRST_PAUSE * 2 ** (this.#tries - 1)) * (0.5 + Math.random());
       this.#next = Math.min(this.#next, Date.now() + pause);
+      if (!isAnswered)
+        this.#tell('refused');
     }
     this.#look();
+  }
+
+  /** A try has failed although this page's own server answers: the network is there. */
+  refused() {
+    this.#refused ??= Date.now();
+    if (this.#isLost && Date.now() - this.#refused >= GONE)
+      this.#end();
   }
 
   #look() {
@@ -67,13 +80,17 @@ export class Lifeline extends EventTarget {
       this.#tell('lost', { since: since / 1000, left: this.absence - since / 1000 });
     // The server may notice it later, by as long as it takes a connection to be silent.
     if (this.#tries > 0 && since > 2000 * this.absence) {
-      this.close();
-      this.#tell('over', since / 1000);
+      this.#end();
     } else if (Date.now() >= this.#next) {
       this.#tries += 1;
       this.#next = Date.now() + TRY;
       this.#tell('try');
     }
+  }
+
+  #end() {
+    this.close();
+    this.#tell('over', (Date.now() - this.#heard) / 1000);
   }
 
   close() {

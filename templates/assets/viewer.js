@@ -25,6 +25,7 @@ const ASK_AGAIN = 3;
 const FIRST_PAUSE = 1000;
 
 /** Who is told so is not out of luck: somebody leaves. */
+const SHARE = /Clients of your address have/;
 const BUSY = /no simulation server available|places .* are taken|Clients of your address have/i;
 /** Before a server is asked for again although one is free, doubled each time up to the longest, in milliseconds. */
 const FIRST_WAIT = 2000;
@@ -217,7 +218,14 @@ function follow(current, server, world, isBack = false) {
   });
   on('step', step);
   on('left', countDown);
-  on('failed', (why) => (isBack ? failed(why) : refused(world, why)));
+  on('failed', (why) => {
+    if (isBack && SHARE.test(why))
+      lifeline?.broken(true);
+    else if (isBack)
+      failed(why);
+    else
+      refused(world, why);
+  });
   on('elsewhere', (why) => (isBack ? failed(why) : askAgain(world, why)));
   on('ready', (address) => show(address, server, current, isBack));
   on('heard', () => lifeline?.alive());
@@ -253,6 +261,11 @@ function watch(absence) {
     isTold = false;
   });
   on('try', comeBack);
+  on('refused', async () => {
+    const answer = await fetch('load', { cache: 'no-store', signal: AbortSignal.timeout(3000) }).catch(() => undefined);
+    if (answer?.ok && lifeline === watched)
+      watched.refused();
+  });
   on('over', (since) => failed(`There was no connection for ${duration(since)}: the simulation has ended.`));
   return watched;
 }

@@ -49,8 +49,6 @@ class Draining(LeavingServers):
 
 
 class Killed(LeavingServers):
-    simulation = {"timing": {"absence": 3}}
-
     def test_the_client_of_a_killed_server_is_told_and_led_to_another(self):
         self.knows_only(self.fleet.simulation)
         page = self.browser.page()

@@ -54,6 +54,13 @@ impl RotatedFile {
         Ok(())
     }
 
+    /// Adds all of this, or nothing: a line that is cut off would spoil the next one.
+    fn add(&mut self, bytes: &[u8]) -> io::Result<()> {
+        self.file.write_all(bytes).inspect_err(|_| drop(self.file.set_len(self.size)))?;
+        self.size += bytes.len() as u64;
+        Ok(())
+    }
+
     fn older(&self, age: usize) -> PathBuf {
         let mut name = OsString::from(&self.path);
         if age > 0 {
@@ -74,12 +81,10 @@ impl Write for RotatedFile {
             self.size = 0;
         }
         if self.size == 0 {
-            self.file.write_all(self.heading.as_bytes())?;
-            self.size = self.heading.len() as u64;
+            self.add(self.heading.as_bytes())?;
         }
-        let written = self.file.write(lines)?;
-        self.size += written as u64;
-        Ok(written)
+        self.add(lines)?;
+        Ok(lines.len())
     }
 
     fn flush(&mut self) -> io::Result<()> {

@@ -146,16 +146,18 @@ impl Cache {
                 return false;
             }
         }
-        remove(&removed);
-        true
+        remove(&removed)
     }
 }
 
-fn remove(folder: &Path) {
+/// Removes a folder; what can't be removed is tried again by the next pass. Returns whether it is gone.
+fn remove(folder: &Path) -> bool {
     // A branch's name may have a thousand levels of folders.
-    if let Err(error) = remove_tree(folder) {
+    let removed = remove_tree(folder);
+    if let Err(error) = &removed {
         log::warn!("{} can't be removed: {error}", folder.display());
     }
+    removed.is_ok()
 }
 
 /// A readable name, made unique by a hash: `https---github-com-lab-arm-git-0123456789abcdef`.

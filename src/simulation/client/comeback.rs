@@ -89,6 +89,11 @@ impl Comeback {
         self.places.send(Move { id: self.ticket, address })
     }
 
+    /// Has its place count for this address again.
+    pub fn stay_at(&self, address: Option<IpAddr>) {
+        self.places.do_send(Move { id: self.ticket, address });
+    }
+
     /// The simulation has ended, and its client may ask why. The first reason counts.
     pub fn end(&mut self, why: &str) {
         self.ended.get_or_insert_with(|| why.to_owned());

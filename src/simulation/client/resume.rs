@@ -68,7 +68,10 @@ impl Handler<Resume> for Session {
                 return Err(protocol::error(&no_place.to_string()));
             }
             // Another connection may have come with the same token meanwhile.
-            if let Some(refusal) = this.comeback.as_ref().and_then(|comeback| comeback.refusal(&token)) {
+            if let Some((comeback, refusal)) = this.comeback.as_ref().and_then(|one| Some((one, one.refusal(&token)?)))
+            {
+                // The place counts for the address of that one.
+                comeback.stay_at(this.peer.rate_limit_key());
                 return Err(refusal);
             }
             this.go_on(client, peer, ctx);

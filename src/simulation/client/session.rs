@@ -5,6 +5,7 @@
 //! connection of one that may come back.
 
 use std::sync::Arc;
+use std::time::Duration;
 
 use actix::prelude::*;
 use actix_web_actors::ws::CloseCode;
@@ -39,6 +40,9 @@ pub struct Session {
     /// What it keeps so that its client can.
     pub(super) comeback: Option<Comeback>,
 }
+
+/// How often a client that may come back gets a sign of life.
+const SIGN_OF_LIFE: Duration = Duration::from_secs(4);
 
 impl Session {
     /// Opens the session of a client that asks for the world at this URL.
@@ -158,8 +162,9 @@ impl Drop for Session {
     /// A client that still waits for something has lost it: its session has panicked.
     fn drop(&mut self) {
         if let Some(client) = self.client.take() {
-            let why = protocol::error("The simulation was lost by a fault of this server");
-            client.do_send(ToClient::End(why, CloseCode::Error));
+            let why = "The simulation was lost by a fault of this server";
+            self.state.end(EndReason::Fault, why);
+            client.do_send(ToClient::End(protocol::error(why), CloseCode::Error));
         }
     }
 }
@@ -202,7 +207,7 @@ impl Handler<PlaceEvent> for Session {
                     self.text(text);
                 }
             }
-            (PlaceEvent::AwayTooLong, state @ State::Launched(_)) => {
+            (PlaceEvent::AwayTooLong, state @ State::Launched(_)) if self.client.is_none() => {
                 let why = "Too many simulations waited for their clients, and this one had waited longest";
                 log::info!("{}: {why}", self.name());
                 state.end(EndReason::Left, why);
@@ -249,7 +254,13 @@ impl Handler<WebotsEvent> for Session {
                 self.text(protocol::webots(&url));
                 let absence = self.server.config.timing.absence;
                 let offer = self.comeback.as_mut().map(|comeback| comeback.ready(url, absence));
-                offer.into_iter().flatten().for_each(|text| self.text(text));
+                if let Some(offer) = offer {
+                    for text in offer {
+                        self.text(text);
+                    }
+                    // A Webots that is busy says nothing for a while, which its client would take for a lost connection.
+                    ctx.run_interval(SIGN_OF_LIFE, move |this, _| this.hint(protocol::absence(absence.as_secs())));
+                }
             }
             WebotsEvent::Heartbeat => self.hint(protocol::HEARTBEAT.to_owned()),
             WebotsEvent::Hanging(seconds) => self.hint(protocol::hanging(seconds)),

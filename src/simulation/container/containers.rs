@@ -1,5 +1,6 @@
 //! Makes the containers of simulations; one for the whole server.
 
+use std::io;
 use std::path::Path;
 use std::sync::Arc;
 
@@ -20,7 +21,7 @@ use super::prepared::{Lease, Prepared};
 use super::project_images::Part;
 use super::recipe::{self, PROJECT_PATH, Recipe};
 use super::request::{Request, command};
-use super::start_error::StartError;
+use super::start_error::{StartError, blame};
 use super::steps;
 use super::templates::Templates;
 use super::tidy::{Live, keep_tidy};
@@ -165,6 +166,7 @@ impl Containers {
         (image, controller): (String, Option<String>),
         progress: &(impl Fn(String) + Send + Sync),
     ) -> Result<Prepared, StartError> {
+        let is_projects = recipe.dockerfile.is_some() || controller.is_some();
         let engine = self.engine.get_or_try_init(|| Engine::ask(&self.docker)).await?;
         let (config, templates) = (Arc::clone(&self.config), self.templates.clone());
         let (name, engine, asks) = (lease.name.clone(), engine.clone(), recipe.asks.clone());
@@ -172,7 +174,7 @@ impl Containers {
             let world = world_in(&request.project)?;
             if matches!(asks.kind, Kind::Competition { .. }) {
                 let opened = recipe::open_participant(&request.project.folder().join(&world));
-                opened.map_err(|error| format!("The world can't be changed: {error}"))?;
+                opened.map_err(|error| not_changed(&error))?;
             }
             let edited = edited_folder(&asks.kind, &request.project)?;
             let command = command(&config, &request, &world);
@@ -200,7 +202,8 @@ impl Containers {
         progress(steps::CREATING.to_owned());
         let up = ["up", "--no-start", "--no-build"].map(str::to_owned);
         let words = options.into_iter().chain(up).map(Into::into).collect();
-        self.docker.compose(words, variables, SHORT).await?;
+        let made = self.docker.compose(words, variables, SHORT).await;
+        made.map_err(|error| blame(is_projects, error))?;
         drop(turn);
         let editor = (recipe.asks.kind != Kind::Default).then(|| "ide: enable".to_owned());
         let texts = editor.into_iter().chain(recipe.asks.project_type).collect();
@@ -209,6 +212,15 @@ impl Containers {
             (service, container)
         });
         let containers = containers.collect();
-        Ok(Prepared::new(self.docker.clone(), lease, containers, texts, recipe.warnings))
+        Ok(Prepared::new(self.docker.clone(), lease, containers, is_projects, texts, recipe.warnings))
+    }
+}
+
+/// Why a competition's world can't be changed. An image may bring one that is no text, or with any mode.
+fn not_changed(error: &io::Error) -> StartError {
+    let why = format!("The world can't be changed: {error}");
+    match error.kind() {
+        io::ErrorKind::InvalidData | io::ErrorKind::PermissionDenied => StartError::Project(why),
+        _ => StartError::Server(why),
     }
 }

@@ -39,7 +39,7 @@ impl Copy<'_> {
     pub async fn run(self, docker: &Docker) -> Result<(), StartError> {
         let label = format!("{}={}", objects::PROJECT, self.name);
         let create = ["create", "--label", &label, "--network", "none", self.image, "true"];
-        let container = docker.run(&create, SHORT).await?;
+        let container = docker.run(&create, SHORT).await.map_err(StartError::of_project)?;
         let container = container.lines().last().unwrap_or_default();
         let from = format!("{container}:{}/.", self.from);
         let words = ["cp", &from, &self.through.to_string_lossy()].map(str::to_owned);
@@ -69,7 +69,7 @@ fn not_copied(error: DockerError, from: &str) -> StartError {
             let what = format!("{from} in the image of this project has a link to {target}");
             format!("{what}, which leads out of it: `docker cp` refuses that").into()
         }
-        error => error.into(),
+        error => StartError::of_project(error),
     }
 }
 
@@ -95,6 +95,9 @@ mod tests {
         let told =
             not_copied(DockerError::Failed { command: "docker cp".to_owned(), message }, "/usr/local/webots-project");
         let told = told.to_string();
+        let device = "operation not permitted".to_owned();
+        let told_device = not_copied(DockerError::Failed { command: "docker cp".to_owned(), message: device }, "/x");
+        assert!(matches!(told_device, StartError::Project(_)), "{told_device:?}");
         assert!(told.contains("a link to \"../../outside\"") && !told.contains("/var/cache"), "{told}");
     }
 }

@@ -10,6 +10,8 @@ pub const LABEL: &str = "webots-fleet.owner";
 /// Why a Dockerfile has no volume, as the end of a sentence.
 pub const NO_VOLUME: &str = "a volume would take the machine's disk without a limit; what a program writes has its place in the \
     project or in /tmp";
+/// Why a Dockerfile has no here-document, as the end of a sentence.
+const NO_HERE_DOCUMENT: &str = "RUN, ADD and COPY can't have `<<`: the builder used here knows no here-documents";
 /// What is shown of a line in an error, in letters.
 const SHOWN: usize = 100;
 
@@ -123,6 +125,8 @@ fn check(instruction: &str) -> Result<(), &'static str> {
     let words = instruction.split_whitespace();
     let mut words = words.skip_while(|word| word.to_uppercase() == "ONBUILD");
     match words.next().map(str::to_uppercase).as_deref() {
+        // The parser knows them, though, and takes other lines than these for the instructions that follow.
+        Some("RUN" | "ADD" | "COPY") if instruction.contains("<<") => return Err(NO_HERE_DOCUMENT),
         Some("VOLUME") => return Err(NO_VOLUME),
         Some("ADD") => {}
         _ => return Ok(()),
@@ -170,7 +174,13 @@ mod tests {
     fn what_the_daemon_would_fetch_or_keep_is_refused_with_its_line() {
         let told = labelled("FROM a\n# VOLUME /x\n\nRUN b \\\n c\nADD \\\n http://a /x\n", "x").unwrap_err();
         assert!(told.contains("line 6, `ADD") && told.contains("`: ADD may copy files of the project only"), "{told}");
+        let hidden = "FROM debian\nRUN <<'#x'\ny \\\n#x\nADD http://169.254.169.254/latest/ /leak\n";
+        let told = labelled(hidden, "x").unwrap_err();
+        assert!(told.contains("line 2, `RUN <<'#x'`: RUN, ADD and COPY can't have `<<`"), "{told}");
         for line in [
+            "COPY <<a <<b /x",
+            "ADD --chown=1 <<-a /x",
+            "onbuild run a \\\n <\\\n<a",
             "ADD http://169.254.169.254/latest /x",
             "add \\\n https://a/b /x",
             "ADD git@forge:lab/arm.git /x",

@@ -13,7 +13,7 @@ use super::compose::DEFAULT_MEMORY;
 use super::docker::{Docker, DockerError, SHORT};
 use super::objects::Owner;
 use super::opened::{self, About};
-use super::start_error::StartError;
+use super::start_error::{StartError, is_disk_full};
 use super::steps;
 use crate::simulation::checkout::{Project, SingleFlight};
 use crate::simulation::config::SimulationConfig;
@@ -22,6 +22,8 @@ use crate::simulation::config::SimulationConfig;
 pub struct Images {
     pub(super) docker: Docker,
     pub(super) owner: Owner,
+    /// The registries of the images that this server is configured to use, and Docker Hub's.
+    registries: [String; 3],
     /// How long an image may take.
     limit: Duration,
     /// How much memory a step of a build may take, in MiB.
@@ -48,13 +50,18 @@ pub struct Build {
     pub project: Arc<Project>,
 }
 
+/// The kind of a fault, by who is at fault.
+type Whose = fn(String) -> StartError;
+
 impl Images {
     /// The images of this owner.
     #[must_use]
     pub fn new(docker: Docker, owner: Owner, config: &SimulationConfig) -> Self {
         let (builds, limit) = (Semaphore::new(config.container.builds), config.timing.build);
         let memory = config.limits.memory.unwrap_or(DEFAULT_MEMORY);
-        Self { docker, owner, limit, memory, builds, jobs: SingleFlight::default() }
+        let registries = ["", &config.container.image, &config.container.editor_image];
+        let registries = registries.map(|image| registry(image).to_owned());
+        Self { docker, owner, registries, limit, memory, builds, jobs: SingleFlight::default() }
     }
 
     /// The name under which this server keeps its images. No other image has it.
@@ -75,7 +82,7 @@ impl Images {
             return Ok(id);
         }
         let (this, name) = (Arc::clone(self), image.to_owned());
-        let start = move |news| async move { this.limited(this.pull_now(&name, news)).await };
+        let start = move |news| async move { this.pull_now(&name, news).await };
         self.jobs.join(image.to_owned(), progress, start).await?;
         self.id(image).await?.ok_or_else(|| StartError::Server(format!("The image {image} was removed meanwhile")))
     }
@@ -84,7 +91,12 @@ impl Images {
         let _permit = self.permit(&news).await?;
         let told = |line: &str| drop(news.send(steps::pulling(image, line)));
         let words = ["pull", image].map(OsString::from).to_vec();
-        self.docker.follow(words, self.limit + SHORT, told).await.map_err(|error| not_pulled(image, error))
+        let whose = self.whose(image);
+        let pull = async {
+            let pulled = self.docker.follow(words, self.limit + SHORT, told).await;
+            pulled.map_err(|error| not_pulled(image, error, whose))
+        };
+        self.limited(pull, whose).await
     }
 
     /// Builds an image, unless it is there. Returns its name.
@@ -98,11 +110,14 @@ impl Images {
     ) -> Result<String, StartError> {
         let name = format!("{}:{}", self.repository(), build.key);
         let (this, made) = (Arc::clone(self), name.clone());
-        self.once(name, progress, move |news| async move { this.build_now(&made, build, news).await }).await
+        let job = move |news| async move {
+            let _permit = this.permit(&news).await?;
+            this.limited(this.build_now(&made, build, news), StartError::Project).await
+        };
+        self.once(name, progress, job).await
     }
 
     async fn build_now(&self, name: &str, build: Build, news: watch::Sender<String>) -> Result<(), StartError> {
-        let _permit = self.permit(&news).await?;
         let id = build.dockerfile.with_extension("id");
         let mut words: Vec<OsString> = ["--network", build.network, "--iidfile"].map(OsString::from).to_vec();
         words.push(id.clone().into());
@@ -117,7 +132,7 @@ impl Images {
             }
         };
         let done = self.run_build(words, &build.dockerfile, &build.context, told).await;
-        done.map_err(|error| not_built(&step, error))?;
+        done.map_err(|error| not_built(&step, error, |image| self.whose(image)))?;
         // It has no name of its own: it goes with the image on top.
         let id = blocking(move || std::fs::read_to_string(id)).await?;
         self.open_now(&id, name, &build.project).await
@@ -155,7 +170,10 @@ impl Images {
     ) -> Result<String, StartError> {
         let name = format!("{}:{}", self.repository(), opened::key(std::iter::once(id.as_str())));
         let (this, made, project) = (Arc::clone(self), name.clone(), Arc::clone(project));
-        self.once(name, progress, move |_| async move { this.open_now(&id, &made, &project).await }).await
+        let job = move |_| async move {
+            this.limited(this.open_now(&id, &made, &project), StartError::Server).await
+        };
+        self.once(name, progress, job).await
     }
 
     /// Has a job make an image, unless it is there. Joins one that is doing so.
@@ -168,12 +186,7 @@ impl Images {
         if self.id(&name).await?.is_some() {
             return Ok(name);
         }
-        let this = Arc::clone(self);
-        let start = move |news| {
-            let job = job(news);
-            async move { this.limited(job).await }
-        };
-        self.jobs.join(name.clone(), progress, start).await.map(|()| name)
+        self.jobs.join(name.clone(), progress, job).await.map(|()| name)
     }
 
     async fn permit(&self, news: &watch::Sender<String>) -> Result<tokio::sync::SemaphorePermit<'_>, StartError> {
@@ -181,13 +194,27 @@ impl Images {
             return Ok(permit);
         }
         news.send("waiting for images of others to be built".to_owned()).ok();
-        self.builds.acquire().await.map_err(|error| StartError::Server(error.to_string()))
+        let busy = || format!("Images of others were being built for {} seconds (timing.build)", self.limit.as_secs());
+        let permit = actix_rt::time::timeout(self.limit, self.builds.acquire()).await;
+        permit
+            .map_err(|_| StartError::Server(busy()))?
+            .map_err(|error| StartError::Server(error.to_string()))
     }
 
-    /// Each job has a limit of time, in which it may also wait for others.
-    async fn limited(&self, job: impl Future<Output = Result<(), StartError>>) -> Result<(), StartError> {
+    /// Each job has a limit of time, for which it need not wait for others. `whose` names who is at fault after that.
+    async fn limited(
+        &self,
+        job: impl Future<Output = Result<(), StartError>>,
+        whose: Whose,
+    ) -> Result<(), StartError> {
         let slow = || format!("Its image was not ready within {} seconds (timing.build)", self.limit.as_secs());
-        actix_rt::time::timeout(self.limit, job).await.unwrap_or_else(|_| Err(slow().into()))
+        actix_rt::time::timeout(self.limit, job).await.unwrap_or_else(|_| Err(whose(slow())))
+    }
+
+    /// Who is at fault when the registry of an image does not answer: a project may name any.
+    fn whose(&self, image: &str) -> Whose {
+        let is_ours = self.registries.iter().any(|ours| ours == registry(image));
+        if is_ours { StartError::Server } else { StartError::Project }
     }
 
     /// What tells an image from later ones of the same name; `None` if it is not there.
@@ -212,27 +239,42 @@ impl Images {
     }
 }
 
-/// Why an image is not there, in words for the client.
-fn not_pulled(image: &str, error: DockerError) -> StartError {
+/// The registry of an image; empty for Docker Hub, which has no name there.
+fn registry(image: &str) -> &str {
+    let (first, _) = image.split_once('/').unwrap_or_default();
+    if first.contains(['.', ':']) || first == "localhost" { first } else { "" }
+}
+
+/// Why an image is not there, in words for the client. `whose` names who is at fault when its registry does not answer.
+fn not_pulled(image: &str, error: DockerError, whose: Whose) -> StartError {
     match error {
         DockerError::Failed { message, .. } if is_unknown(&message) => StartError::Project(format!(
             "There is no image {image} for this version of Webots where this simulation server looks for images. Another \
              version of the world, or a Dockerfile in its project that begins with an image that there is, helps"
         )),
         DockerError::Failed { message, .. } => {
-            StartError::Project(format!("The image {image} can't be fetched: {message}"))
+            let kind = match message.as_str() {
+                message if is_disk_full(message) => StartError::Server,
+                message if is_silent(message) => whose,
+                _ => StartError::Project,
+            };
+            kind(format!("The image {image} can't be fetched: {message}"))
         }
         other => other.into(),
     }
 }
 
 /// Why an image was not built, in words for the client. Only a step that begins with an image can miss it.
-fn not_built(step: &str, error: DockerError) -> StartError {
+fn not_built(step: &str, error: DockerError, whose: impl FnOnce(&str) -> Whose) -> StartError {
     let from = step.split_once(" : ").and_then(|(_, instruction)| instruction.strip_prefix("FROM "));
     match (from, error) {
-        (Some(image), error) => not_pulled(image.split(' ').next().unwrap_or_default(), error),
+        (Some(image), error) => {
+            let image = image.split(' ').next().unwrap_or_default();
+            not_pulled(image, error, whose(image))
+        }
         (None, DockerError::Failed { message, .. }) => {
-            StartError::Project(format!("The image of this project can't be built: {message} ({step})"))
+            let kind = if is_disk_full(&message) { StartError::Server } else { StartError::Project };
+            kind(format!("The image of this project can't be built: {message} ({step})"))
         }
         (None, other) => other.into(),
     }
@@ -243,6 +285,13 @@ fn is_unknown(message: &str) -> bool {
     ["not found", "pull access denied", "manifest unknown", "repository does not exist"]
         .iter()
         .any(|words| message.contains(words))
+}
+
+/// Whether a registry does not answer, or not now. An image's name has no space.
+fn is_silent(message: &str) -> bool {
+    let message = message.to_lowercase();
+    let words = ["toomanyrequests: ", "i/o timeout", "handshake timeout", "timeout exceeded", "deadline exceeded"];
+    words.iter().any(|words| message.contains(words))
 }
 
 impl fmt::Debug for Images {
@@ -259,17 +308,35 @@ mod tests {
     fn an_image_that_is_not_there_is_told_in_words_and_only_where_a_stage_begins() {
         let failed =
             |message: &str| DockerError::Failed { command: "docker build".to_owned(), message: message.to_owned() };
+        let built = |step: &str, error| not_built(step, error, |_| StartError::Server);
         let told =
-            not_built("Step 1/4 : FROM cyberbotics/webots.cloud:R1-ubuntu22.04 AS a", failed("manifest unknown"));
+            built("Step 1/4 : FROM cyberbotics/webots.cloud:R1-ubuntu22.04 AS a", failed("manifest unknown"));
         let told = told.to_string();
         assert!(
             told.starts_with("There is no image cyberbotics/webots.cloud:R1-ubuntu22.04 for this version"),
             "{told}"
         );
-        let told = not_built("Step 2/4 : RUN make", failed("make: not found"));
+        let told = built("Step 2/4 : RUN make", failed("make: not found"));
         let words = "The image of this project can't be built: make: not found (Step 2/4 : RUN make)";
         assert_eq!(told, StartError::Project(words.to_owned()));
-        let gone = not_built("Step 2/4 : RUN make", DockerError::NoDaemon("refused".to_owned()));
+        let gone = built("Step 2/4 : RUN make", DockerError::NoDaemon("refused".to_owned()));
         assert!(matches!(gone, StartError::Server(_)), "{gone:?}");
+        let full = built("Step 3/4 : COPY . /x", failed("write /x: no space left on device"));
+        assert!(matches!(full, StartError::Server(_)), "{full:?}");
+    }
+
+    #[test]
+    fn a_registry_that_does_not_answer_is_the_fault_of_who_has_named_it() {
+        let failed = |message: &str| DockerError::Failed { command: "docker pull".to_owned(), message: message.to_owned() };
+        let limited = || failed("toomanyrequests: You have reached your pull rate limit");
+        assert!(matches!(not_pulled("a", limited(), StartError::Server), StartError::Server(_)));
+        assert!(matches!(not_pulled("a", limited(), StartError::Project), StartError::Project(_)));
+        let full = failed("failed to register layer: write /x: no space left on device");
+        assert!(matches!(not_pulled("a", full, StartError::Project), StartError::Server(_)));
+        for (image, expected) in
+            [("debian", ""), ("lab/a:1", ""), ("b.c/a", "b.c"), ("localhost/a", "localhost"), ("b:5000/a:1", "b:5000")]
+        {
+            assert_eq!(registry(image), expected, "{image}");
+        }
     }
 }

@@ -8,6 +8,7 @@ use tokio_util::task::AbortOnDropHandle;
 
 use super::docker::{Docker, DockerError, SHORT};
 use super::objects;
+use super::start_error::{StartError, blame};
 use super::tidy::Live;
 use crate::simulation::process::SpawnSpec;
 
@@ -18,6 +19,8 @@ pub struct Prepared {
     lease: Lease,
     /// The container of each service.
     containers: Vec<(String, String)>,
+    /// Whether the project has made an image of theirs, which may be why Docker can't start one.
+    is_projects: bool,
     /// Texts that its client gets as they are.
     pub texts: Vec<String>,
     /// What its client should know.
@@ -41,7 +44,7 @@ pub enum Cause {
     OutOfMemory,
     /// Docker, which was stopped or has crashed.
     Docker,
-    /// Docker again, which could not start it.
+    /// Docker again, which could not start it, though no image is the project's.
     NotStarted,
 }
 
@@ -80,16 +83,18 @@ impl Drop for Lease {
 }
 
 impl Prepared {
-    /// The containers of a project that was made: pairs of service and container.
+    /// The containers of a project that was made: pairs of service and container. `is_projects` says whether the project has
+    /// made an image of theirs.
     #[must_use]
     pub fn new(
         docker: Docker,
         lease: Lease,
         containers: Vec<(String, String)>,
+        is_projects: bool,
         texts: Vec<String>,
         warnings: Vec<String>,
     ) -> Self {
-        Self { docker, lease, containers, texts, warnings, restart: None }
+        Self { docker, lease, containers, is_projects, texts, warnings, restart: None }
     }
 
     fn of(&self, service: &str) -> Option<&str> {
@@ -107,13 +112,13 @@ impl Prepared {
     /// lead these astray.
     ///
     /// # Errors
-    /// When Docker fails.
-    pub async fn start_others(&mut self) -> Result<(), DockerError> {
+    /// When Docker fails, and whose fault it is.
+    pub async fn start_others(&mut self) -> Result<(), StartError> {
         let others =
             self.containers.iter().filter(|(service, _)| service != WEBOTS).map(|(_, container)| container.as_str());
         let words: Vec<&str> = std::iter::once("start").chain(others).collect();
         if words.len() > 1 {
-            self.docker.run(&words, SHORT).await?;
+            self.docker.run(&words, SHORT).await.map_err(|error| blame(self.is_projects, error))?;
         }
         if let Some(controller) = self.of(CONTROLLER) {
             let asked = Arc::new(Notify::new());
@@ -140,7 +145,7 @@ impl Prepared {
         };
         match state.split_whitespace().collect::<Vec<_>>().as_slice() {
             ["true", ..] => Some(Cause::OutOfMemory),
-            [_, "created", _] => Some(Cause::NotStarted),
+            [_, "created", _] => (!self.is_projects).then_some(Cause::NotStarted),
             // The program has lost its daemon.
             [_, _, ended] if *ended != code.to_string() => Some(Cause::Docker),
             _ if ENDED_BY_SIGNAL.contains(&code) => self.was_stopped(webots).await.then_some(Cause::Docker),

@@ -8,7 +8,7 @@ use super::dockerfile;
 use super::image::{Build, Images};
 use super::opened;
 use super::recipe::{self, PROJECT_PATH};
-use super::start_error::StartError;
+use super::start_error::{StartError, is_disk_full};
 use crate::simulation::checkout::Project;
 
 /// An image that is made from a project, or from a folder of it.
@@ -82,7 +82,8 @@ impl Images {
         let done = self.run_build(options, &dockerfile, &context, |_| ()).await;
         done.map_err(|error| match error {
             DockerError::Failed { message, .. } => {
-                StartError::Project(format!("The image can't be prepared for this server's user: {message}"))
+                let kind = if is_disk_full(&message) { StartError::Server } else { StartError::Project };
+                kind(format!("The image can't be prepared for this server's user: {message}"))
             }
             error => error.into(),
         })

@@ -13,6 +13,28 @@ pub enum StartError {
     Server(String),
 }
 
+impl StartError {
+    /// What Docker answers about an image that the project has made: it is at fault, unless the disk is full.
+    #[must_use]
+    pub fn of_project(error: DockerError) -> Self {
+        match &error {
+            DockerError::Failed { message, .. } if !is_disk_full(message) => Self::Project(error.to_string()),
+            _ => error.into(),
+        }
+    }
+}
+
+/// Whose fault it is that Docker fails with the containers of a simulation. `is_projects` says whether the project has made
+/// an image of theirs.
+pub fn blame(is_projects: bool, error: DockerError) -> StartError {
+    if is_projects { StartError::of_project(error) } else { error.into() }
+}
+
+/// Whether Docker says that the disk is full. Only the end of its words counts: a project's names may be in them.
+pub fn is_disk_full(message: &str) -> bool {
+    message.ends_with("no space left on device")
+}
+
 impl From<String> for StartError {
     fn from(why: String) -> Self {
         Self::Project(why)
@@ -28,5 +50,21 @@ impl From<DockerError> for StartError {
 impl From<std::io::Error> for StartError {
     fn from(error: std::io::Error) -> Self {
         Self::Server(format!("This simulation server can't write in its cache: {error}"))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_docker_answers_about_a_projects_image_is_the_projects_fault() {
+        let failed = |message: &str| DockerError::Failed { command: "docker cp".to_owned(), message: message.to_owned() };
+        let is_own = |error| matches!(StartError::of_project(error), StartError::Server(_));
+        assert!(!is_own(failed("mknod /x: operation not permitted")));
+        assert!(!is_own(failed("no space left on device: no such file")));
+        assert!(is_own(failed("write /x: no space left on device")));
+        assert!(is_own(DockerError::NoDaemon("refused".to_owned())));
+        assert!(is_own(DockerError::NotStarted("there is no docker".to_owned())));
     }
 }

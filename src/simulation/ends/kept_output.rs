@@ -29,7 +29,8 @@ pub fn output_file(logs: &Path, id: &str) -> Option<PathBuf> {
     if !SimulationId::is_like(id) {
         return None;
     }
-    let files = [FOLDER_OF_RUNNING, ENDED, FAILED].map(|folder| logs.join(folder).join(format!("{id}.log")));
+    // What is kept comes first: a process that outlives its simulation may write another file.
+    let files = [FAILED, ENDED, FOLDER_OF_RUNNING].map(|folder| logs.join(folder).join(format!("{id}.log")));
     files.into_iter().find(|file| file.is_file())
 }
 
@@ -39,8 +40,9 @@ pub fn output_file(logs: &Path, id: &str) -> Option<PathBuf> {
 /// When the file can't be made. What was written while the simulation ran is gone nevertheless: a disk that is full needs
 /// the room.
 pub(super) fn keep(logs: &Path, ended: &Ended) -> io::Result<()> {
-    let output = ended.log.as_deref().map(last_output).unwrap_or_default();
-    for file in ended.log.iter().flat_map(|log| [log.clone(), older(log)]) {
+    let log = logs.join(FOLDER_OF_RUNNING).join(format!("{}.log", ended.id));
+    let output = last_output(&log);
+    for file in [older(&log), log] {
         fs::remove_file(file).ok();
     }
     if !ended.has_output() {

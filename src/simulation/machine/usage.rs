@@ -3,7 +3,7 @@
 //!
 //! One pass over `/proc` serves all simulations and all that ask, at most once in 1.8 s, and only when somebody asks.
 
-use std::collections::{BTreeMap, HashMap, HashSet};
+use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -44,6 +44,8 @@ pub struct UsageMonitor(Arc<Mutex<Readings>>);
 #[derive(Debug, Default)]
 struct Readings {
     read: Option<Instant>,
+    /// The trees that were asked for then. Some may have no reading.
+    roots: BTreeSet<i32>,
     /// The processor time of each tree.
     times: HashMap<i32, Duration>,
     usages: Usages,
@@ -102,11 +104,11 @@ impl UsageMonitor {
 impl Readings {
     fn renew(&mut self, roots: &[i32], measure: impl FnOnce() -> Vec<(i32, Measured)>) {
         let passed = self.read.map(|read| read.elapsed());
-        let known = roots.iter().all(|root| self.usages.contains_key(root));
+        let known = roots.iter().all(|root| self.roots.contains(root));
         if known && passed.is_some_and(|passed| passed < AGE) {
             return;
         }
-        self.read = Some(Instant::now());
+        self.roots = roots.iter().copied().collect();
         let before = std::mem::take(&mut self.times);
         self.usages.clear();
         for (root, measured) in measure() {
@@ -123,6 +125,8 @@ impl Readings {
             };
             self.usages.insert(root, usage);
         }
+        // Where Docker hangs, a reading takes longer than it is cached.
+        self.read = Some(Instant::now());
     }
 }
 

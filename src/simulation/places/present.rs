@@ -9,7 +9,7 @@ use super::place_event::PlaceEvent;
 use crate::shared::domain::ProjectUrl;
 use crate::shared::http::Peer;
 use crate::shared::run::{seconds_since_1970, timestamp};
-use crate::shared::text::excerpt;
+use crate::shared::text::{excerpt, without_paths};
 use crate::simulation::ends::{End, EndReason, Ended, Taken};
 use crate::simulation::simulation_id::SimulationId;
 use crate::simulation::snapshot::{Change, Simulation, Stage};
@@ -65,7 +65,7 @@ impl Present {
         let (address, repository) = (client.rate_limit_key(), world.repository());
         let mut present =
             Self { lent: None, address, listener, shown, client, repository, events: Vec::new(), how: None };
-        present.note(&format!("client {client} asks for {world}"));
+        present.note(&format!("its client asks for {world}"));
         present
     }
 
@@ -86,9 +86,14 @@ impl Present {
         }
     }
 
+    /// Who may read the output may read this, so it holds no address and no path of the machine.
     fn note(&mut self, event: &str) {
         if self.events.len() < MAX_EVENTS {
-            self.events.push(format!("{} {}", timestamp(SystemTime::now()), excerpt(event, EVENT_LENGTH)));
+            self.events.push(format!(
+                "{} {}",
+                timestamp(SystemTime::now()),
+                excerpt(&without_paths(event), EVENT_LENGTH)
+            ));
         }
     }
 

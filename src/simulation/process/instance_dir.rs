@@ -103,9 +103,9 @@ impl Drop for InstanceDir {
     fn drop(&mut self) {
         // A project may hold many files, and this may run on a thread that serves others.
         let folder = std::mem::take(&mut self.folder);
-        let spare = folder.clone();
-        if std::thread::Builder::new().spawn(move || remove_patiently(&folder)).is_err() {
-            remove(&spare);
+        let shown = folder.display().to_string();
+        if let Err(error) = std::thread::Builder::new().spawn(move || remove_patiently(&folder)) {
+            log::error!("{shown} is left to the next start: no thread for its removal: {error}");
         }
     }
 }
@@ -114,9 +114,8 @@ impl Drop for InstanceDir {
 /// them again. Blocks: only for threads of their own.
 fn remove_patiently(folder: &Path) {
     for _ in 0..TRIES {
-        match remove_tree(folder) {
-            Ok(()) => return,
-            Err(error) => log::warn!("{} can't be removed yet: {error}", folder.display()),
+        if remove_tree(folder).is_ok() {
+            return;
         }
         std::thread::sleep(PAUSE);
     }

@@ -96,8 +96,10 @@ impl Run {
             runtime.block_on(self.run(told))
         };
         // The thread that calls may have a runtime already.
-        let ran = std::thread::scope(|scope| scope.spawn(run).join());
-        ran.unwrap_or_else(|_| Err(io::Error::other("its thread has panicked").into()))
+        std::thread::scope(|scope| {
+            let ran = std::thread::Builder::new().spawn_scoped(scope, run)?.join();
+            ran.unwrap_or_else(|_| Err(io::Error::other("its thread has panicked").into()))
+        })
     }
 
     async fn finish(
