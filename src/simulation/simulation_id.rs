@@ -6,15 +6,15 @@ use std::time::{Duration, SystemTime};
 
 use serde::{Serialize, Serializer};
 
-use crate::shared::run::{seconds_since_1970, timestamp};
+use crate::shared::run::timestamp_in_milliseconds;
 
-/// The time at which a simulation was asked for, and its number since the server's start: `20261122T220517-17`.
+/// The time at which a simulation was asked for, and its number since the server's start: `20261122T220517042-17`, to the millisecond.
 ///
 /// Ids are ordered by their numbers, whatever the clock does.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct SimulationId {
     number: u64,
-    asked: u64,
+    asked: Duration,
 }
 
 static NEXT: AtomicU64 = AtomicU64::new(1);
@@ -23,7 +23,8 @@ impl SimulationId {
     /// Returns an id that no other simulation of this server has.
     #[must_use]
     pub fn next() -> Self {
-        Self { number: NEXT.fetch_add(1, Ordering::Relaxed), asked: seconds_since_1970() }
+        let asked = SystemTime::UNIX_EPOCH.elapsed().unwrap_or_default();
+        Self { number: NEXT.fetch_add(1, Ordering::Relaxed), asked }
     }
 
     /// Whether a text has the letters of an id, so that it can stand in the name of a file.
@@ -37,7 +38,7 @@ impl SimulationId {
 
 impl fmt::Display for SimulationId {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let asked = timestamp(SystemTime::UNIX_EPOCH + Duration::from_secs(self.asked));
+        let asked = timestamp_in_milliseconds(SystemTime::UNIX_EPOCH + self.asked);
         let asked: String = asked.chars().filter(|letter| letter.is_ascii_digit() || *letter == 'T').collect();
         write!(out, "{asked}-{}", self.number)
     }
@@ -55,8 +56,8 @@ mod tests {
 
     #[test]
     fn an_id_tells_when_and_is_the_name_of_a_file() {
-        let id = SimulationId { number: 17, asked: 1_795_385_117 };
-        assert_eq!(id.to_string(), "20261122T220517-17");
+        let id = SimulationId { number: 17, asked: Duration::from_millis(1_795_385_117_042) };
+        assert_eq!(id.to_string(), "20261122T220517042-17");
         assert!(SimulationId::is_like(&id.to_string()));
         assert!(SimulationId::next() < SimulationId::next());
         for other in ["", "..", "../x", "1/2", "T1", "-1", "20261122T220517-17.log", "1\0", &"1".repeat(41)] {

@@ -170,9 +170,7 @@ impl Images {
     ) -> Result<String, StartError> {
         let name = format!("{}:{}", self.repository(), opened::key(std::iter::once(id.as_str())));
         let (this, made, project) = (Arc::clone(self), name.clone(), Arc::clone(project));
-        let job = move |_| async move {
-            this.limited(this.open_now(&id, &made, &project), StartError::Server).await
-        };
+        let job = move |_| async move { this.limited(this.open_now(&id, &made, &project), StartError::Server).await };
         self.once(name, progress, job).await
     }
 
@@ -196,17 +194,11 @@ impl Images {
         news.send("waiting for images of others to be built".to_owned()).ok();
         let busy = || format!("Images of others were being built for {} seconds (timing.build)", self.limit.as_secs());
         let permit = actix_rt::time::timeout(self.limit, self.builds.acquire()).await;
-        permit
-            .map_err(|_| StartError::Server(busy()))?
-            .map_err(|error| StartError::Server(error.to_string()))
+        permit.map_err(|_| StartError::Server(busy()))?.map_err(|error| StartError::Server(error.to_string()))
     }
 
     /// Each job has a limit of time, for which it need not wait for others. `whose` names who is at fault after that.
-    async fn limited(
-        &self,
-        job: impl Future<Output = Result<(), StartError>>,
-        whose: Whose,
-    ) -> Result<(), StartError> {
+    async fn limited(&self, job: impl Future<Output = Result<(), StartError>>, whose: Whose) -> Result<(), StartError> {
         let slow = || format!("Its image was not ready within {} seconds (timing.build)", self.limit.as_secs());
         actix_rt::time::timeout(self.limit, job).await.unwrap_or_else(|_| Err(whose(slow())))
     }
@@ -309,8 +301,7 @@ mod tests {
         let failed =
             |message: &str| DockerError::Failed { command: "docker build".to_owned(), message: message.to_owned() };
         let built = |step: &str, error| not_built(step, error, |_| StartError::Server);
-        let told =
-            built("Step 1/4 : FROM cyberbotics/webots.cloud:R1-ubuntu22.04 AS a", failed("manifest unknown"));
+        let told = built("Step 1/4 : FROM cyberbotics/webots.cloud:R1-ubuntu22.04 AS a", failed("manifest unknown"));
         let told = told.to_string();
         assert!(
             told.starts_with("There is no image cyberbotics/webots.cloud:R1-ubuntu22.04 for this version"),
@@ -327,7 +318,8 @@ mod tests {
 
     #[test]
     fn a_registry_that_does_not_answer_is_the_fault_of_who_has_named_it() {
-        let failed = |message: &str| DockerError::Failed { command: "docker pull".to_owned(), message: message.to_owned() };
+        let failed =
+            |message: &str| DockerError::Failed { command: "docker pull".to_owned(), message: message.to_owned() };
         let limited = || failed("toomanyrequests: You have reached your pull rate limit");
         assert!(matches!(not_pulled("a", limited(), StartError::Server), StartError::Server(_)));
         assert!(matches!(not_pulled("a", limited(), StartError::Project), StartError::Project(_)));

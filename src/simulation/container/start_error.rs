@@ -26,11 +26,13 @@ impl StartError {
 
 /// Whose fault it is that Docker fails with the containers of a simulation. `is_projects` says whether the project has made
 /// an image of theirs.
+#[must_use]
 pub fn blame(is_projects: bool, error: DockerError) -> StartError {
     if is_projects { StartError::of_project(error) } else { error.into() }
 }
 
 /// Whether Docker says that the disk is full. Only the end of its words counts: a project's names may be in them.
+#[must_use]
 pub fn is_disk_full(message: &str) -> bool {
     message.ends_with("no space left on device")
 }
@@ -59,7 +61,8 @@ mod tests {
 
     #[test]
     fn what_docker_answers_about_a_projects_image_is_the_projects_fault() {
-        let failed = |message: &str| DockerError::Failed { command: "docker cp".to_owned(), message: message.to_owned() };
+        let failed =
+            |message: &str| DockerError::Failed { command: "docker cp".to_owned(), message: message.to_owned() };
         let is_own = |error| matches!(StartError::of_project(error), StartError::Server(_));
         assert!(!is_own(failed("mknod /x: operation not permitted")));
         assert!(!is_own(failed("no space left on device: no such file")));

@@ -103,15 +103,18 @@ impl UsageMonitor {
 
 impl Readings {
     fn renew(&mut self, roots: &[i32], measure: impl FnOnce() -> Vec<(i32, Measured)>) {
-        let passed = self.read.map(|read| read.elapsed());
         let known = roots.iter().all(|root| self.roots.contains(root));
-        if known && passed.is_some_and(|passed| passed < AGE) {
+        if known && self.read.is_some_and(|read| read.elapsed() < AGE) {
             return;
         }
         self.roots = roots.iter().copied().collect();
         let before = std::mem::take(&mut self.times);
         self.usages.clear();
-        for (root, measured) in measure() {
+        let all = measure();
+        // It may have taken longer than its result is kept, where Docker hangs.
+        let passed = self.read.map(|read| read.elapsed());
+        self.read = Some(Instant::now());
+        for (root, measured) in all {
             let usage = match measured {
                 Measured::Usage(usage) => usage,
                 Measured::Sum(Sum { time, memory, threads }) => {
@@ -125,8 +128,6 @@ impl Readings {
             };
             self.usages.insert(root, usage);
         }
-        // Where Docker hangs, a reading takes longer than it is cached.
-        self.read = Some(Instant::now());
     }
 }
 
@@ -205,6 +206,24 @@ mod tests {
         }
         leader.kill().unwrap();
         leader.wait().unwrap();
+    }
+
+    #[test]
+    fn a_simulation_without_a_reading_is_not_asked_for_again_at_once() {
+        let (monitor, mut asked) = (UsageMonitor::default(), 0);
+        let mut read = |roots: &[i32]| {
+            let usages = monitor.read_by(roots, || {
+                asked += 1;
+                vec![(1, Measured::Usage(Usage::default()))]
+            });
+            (usages.into_keys().collect::<Vec<_>>(), asked)
+        };
+        let begin = Instant::now();
+        assert_eq!(read(&[1, 2]), (vec![1], 1));
+        let again = read(&[1, 2]);
+        // A machine may stand still for longer than a reading is kept.
+        assert!(again == (vec![1], 1) || begin.elapsed() >= AGE, "{again:?}");
+        assert_eq!(read(&[1, 2, 3]).1, again.1 + 1, "a new simulation is read at once");
     }
 
     #[test]

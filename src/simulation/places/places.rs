@@ -4,7 +4,6 @@
 //! [`Ticket`] and then hears how many are ahead, until a port is granted. Dropping the ticket leaves the line or frees
 //! the port, so that neither is lost in any state or by any panic.
 
-use std::cmp::Reverse;
 use std::collections::{BTreeMap, HashMap, HashSet, VecDeque};
 use std::io::ErrorKind;
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, TcpListener};
@@ -16,7 +15,7 @@ use actix::prelude::*;
 use super::messages::{Acquire, GetSnapshot, Move, Release, Update};
 use super::no_place::NoPlace;
 use super::place_event::PlaceEvent;
-use super::present::{Present, Report};
+use super::present::{Present, Report, longest_away};
 use crate::shared::domain::{Instances, ProjectUrl};
 use crate::shared::http::Peer;
 use crate::simulation::ends::{End, EndReason, Ends, Taken};
@@ -132,15 +131,9 @@ impl Places {
         }
     }
 
-    /// Simulations whose clients are away hold half of the places at most, or one where there is only one. Beyond that the
-    /// one ends that has been away longest, of the address that has most of them: who comes and goes harms himself only.
+    /// Simulations whose clients are away hold half of the places at most, or one where there is only one.
     fn end_longest_away(&mut self) {
-        let most = (self.ports.len() / 2).max(1);
-        let away = || self.present.values().filter(|one| one.shown.away_until.is_some());
-        let of_address = |address| away().filter(|one| one.address == address).count();
-        let longest = |one: &&Present| (Reverse(of_address(one.address)), one.shown.away_until);
-        if away().count() > most
-            && let Some(id) = away().min_by_key(longest).map(|one| one.shown.id)
+        if let Some(id) = longest_away(&self.present, (self.ports.len() / 2).max(1))
             && let Some(longest) = self.present.get_mut(&id)
         {
             longest.shown.away_until = None;

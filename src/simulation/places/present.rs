@@ -1,5 +1,7 @@
 //! A simulation that has a place or waits for one, and what becomes of it.
 
+use std::cmp::Reverse;
+use std::collections::BTreeMap;
 use std::net::IpAddr;
 use std::time::SystemTime;
 
@@ -45,6 +47,16 @@ pub(super) struct Present {
 const MAX_EVENTS: usize = 60;
 /// How many letters are kept of an event.
 const EVENT_LENGTH: usize = 500;
+
+/// Where more simulations than this wait for clients that are away: the one that has to end. It has been away longest, of
+/// the address that has most of them, so that who comes and goes harms himself only.
+pub(super) fn longest_away(all: &BTreeMap<SimulationId, Present>, most: usize) -> Option<SimulationId> {
+    let away = || all.values().filter(|one| one.shown.away_until.is_some());
+    let of_address = |address| away().filter(|one| one.address == address).count();
+    let longest = |one: &&Present| (Reverse(of_address(one.address)), one.shown.away_until);
+    let too_many = away().count() > most;
+    away().min_by_key(longest).filter(|_| too_many).map(|one| one.shown.id)
+}
 
 impl Present {
     /// A simulation that a client has just asked for.
