@@ -82,10 +82,10 @@ wait "${jobs[@]}" || true
 jobs=()
 echo "built: $(elapsed)"
 
+"${CARGO[@]}" --lib --bins --test integration || failed+=('cargo test')
 # All of these wait most of the time, and run side by side. What needs a machine of its own, or a daemon with images, is in
 # memory: where there is little of it, these run one after another.
-beside=('tests/browser/run' 'tests/deploy/package.sh' 'tests/deploy/guide.sh' "${CARGO[*]} --test containers" "${CARGO[*]} --test faults"
-    "${CARGO[*]} --test simulation_limits")
+beside=('tests/browser/run' 'tests/deploy/package.sh' 'tests/deploy/guide.sh' "${CARGO[*]} --test containers" "${CARGO[*]} --test simulation_limits")
 memory=$(awk '$1 == "MemAvailable:" { print int($2 / 1024) }' /proc/meminfo)
 echo "runs side by side, and tells when each has ended: ${beside[*]@Q}"
 for command in "${beside[@]}"; do
@@ -94,14 +94,17 @@ for command in "${beside[@]}"; do
     # shellcheck disable=SC2086
     ((memory > 10000)) || finish $command
 done
-"${CARGO[@]}" --lib --bins --test integration || failed+=('cargo test')
 for command in "${beside[@]}"; do
     # shellcheck disable=SC2086
     [[ -z ${jobs[$command]-} ]] || finish $command
 done
-# It measures times: nothing runs beside it.
-start tests/swarm.sh
-finish tests/swarm.sh
+# These measure times: nothing runs beside them.
+for command in "${CARGO[*]} --test faults" tests/swarm.sh; do
+    # shellcheck disable=SC2086
+    start $command
+    # shellcheck disable=SC2086
+    finish $command
+done
 
 echo "tests: $(elapsed), build included"
 ((${#skipped[@]} == 0)) || echo "SKIPPED, not passed: ${skipped[*]}" >&2
