@@ -70,6 +70,9 @@ def visit(browser, url, service):
     origin = urllib.parse.urlsplit(url)
     ways = {(one.scheme, one.netloc) for one in map(urllib.parse.urlsplit, page.asked) if one.scheme not in ("data", "blob", "about")}
     assert ways == {(origin.scheme, origin.netloc), (origin.scheme.replace("http", "ws"), origin.netloc)}, ways
+    # A page that is merely closed leaves its simulation waiting.
+    tab.get_by_role("button", name="Disconnect").click()
+    expect(tab.get_by_role("button", name="Connect", exact=True)).to_be_enabled()
     page.close()
 
 
