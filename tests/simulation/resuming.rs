@@ -305,6 +305,31 @@ async fn those_who_are_away_hold_half_of_the_places() {
 }
 
 #[actix_rt::test]
+async fn who_goes_away_more_often_ends_no_simulation_of_others() {
+    let stage = Stage::new(4, |builder| builder.set("trustedProxies", json!(["127.0.0.1"]))).await;
+    let at = async |address| Client::try_from_address(&stage.server, address).await.unwrap();
+    let mut tokens = Vec::new();
+    for (away, address) in [(1, "192.0.2.1"), (2, "192.0.2.2"), (2, "192.0.2.2")] {
+        let (client, token) = start(at(address).await).await;
+        drop(client);
+        stage.until_away(away).await;
+        tokens.push(token);
+    }
+    until("one has ended", async || stage.simulations().await.len() == 2).await;
+    let mut client = resume(at("192.0.2.1").await, &tokens[0]).await;
+    token(&mut client).await;
+    let told = resume(at("192.0.2.2").await, &tokens[1]).await.until("loading: Error:").await;
+    assert!(told.contains("Too many simulations waited for their clients"), "{told}");
+}
+
+#[actix_rt::test]
+async fn a_webots_that_says_nothing_is_no_lost_connection() {
+    let stage = Stage::new(1, |builder| builder.set("timing.heartbeat", 3600)).await;
+    let (mut client, _) = stage.start().await;
+    client.until("absence: ").await;
+}
+
+#[actix_rt::test]
 async fn who_comes_back_keeps_to_the_limits_of_its_address_and_to_allowed_origins() {
     let change = |builder: Builder| {
         let builder = builder.set("trustedProxies", json!(["127.0.0.1"])).set("maxPlacesPerAddress", 1);

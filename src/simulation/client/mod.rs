@@ -1,9 +1,9 @@
 //! A web client, and the session of its simulation from the request for it to its end.
 
-mod comeback;
 pub mod outcome;
 pub mod quota;
 mod resume;
+mod resumption;
 mod session;
 mod start;
 mod state;

@@ -13,16 +13,16 @@ impl Session {
     pub(super) fn await_client(&mut self, ctx: &mut Context<Self>) {
         let absence = self.server.config.timing.absence;
         let name = self.name();
-        let Some(comeback) = self.comeback.as_mut().filter(|comeback| comeback.is_ready()) else {
+        let Some(resumption) = self.resumption.as_mut().filter(|resumption| resumption.is_ready()) else {
             return ctx.stop();
         };
-        if comeback.deadline().is_some() {
+        if resumption.deadline().is_some() {
             return;
         }
-        if comeback.away(absence) {
+        if resumption.away(absence) {
             log::info!("{name}: away; it may come back within {} s", absence.as_secs());
         }
-        *comeback.deadline() = Some(ctx.run_later(absence, move |this, ctx| {
+        *resumption.deadline() = Some(ctx.run_later(absence, move |this, ctx| {
             log::info!("{}: has not come back within {} s", this.name(), absence.as_secs());
             ctx.stop();
         }));
@@ -39,11 +39,11 @@ impl Session {
         }
         let (timeout, absence) = (self.server.config.timeout, self.server.config.timing.absence);
         let mut texts = Vec::new();
-        if let Some(comeback) = &mut self.comeback {
-            if let Some(deadline) = comeback.deadline().take() {
+        if let Some(resumption) = &mut self.resumption {
+            if let Some(deadline) = resumption.deadline().take() {
                 ctx.cancel_future(deadline);
             }
-            texts = comeback.back(timeout, absence);
+            texts = resumption.back(timeout, absence);
         }
         for text in texts {
             self.text(text);
@@ -56,22 +56,23 @@ impl Handler<Resume> for Session {
 
     fn handle(&mut self, Resume { token, client, peer }: Resume, _: &mut Self::Context) -> Self::Result {
         let refused = |refusal| Box::pin(actix::fut::err(refusal));
-        let Some(comeback) = &self.comeback else {
+        let Some(resumption) = &self.resumption else {
             return refused(protocol::ended(None));
         };
-        if let Some(refusal) = comeback.refusal(&token) {
+        if let Some(refusal) = resumption.refusal(&token) {
             return refused(refusal);
         }
-        let moved = comeback.move_to(peer.rate_limit_key()).into_actor(self);
+        let moved = resumption.move_to(peer.rate_limit_key()).into_actor(self);
         Box::pin(moved.map(move |moved, this, ctx| {
             if let Ok(Err(no_place)) = moved {
                 return Err(protocol::error(&no_place.to_string()));
             }
             // Another connection may have come with the same token meanwhile.
-            if let Some((comeback, refusal)) = this.comeback.as_ref().and_then(|one| Some((one, one.refusal(&token)?)))
+            if let Some((resumption, refusal)) =
+                this.resumption.as_ref().and_then(|one| Some((one, one.refusal(&token)?)))
             {
                 // The place counts for the address of that one.
-                comeback.stay_at(this.peer.rate_limit_key());
+                resumption.stay_at(this.peer.rate_limit_key());
                 return Err(refusal);
             }
             this.go_on(client, peer, ctx);

@@ -10,8 +10,8 @@ use std::time::Duration;
 use actix::prelude::*;
 use actix_web_actors::ws::CloseCode;
 
-use super::comeback::Comeback;
 use super::outcome::{Outcome, Pending};
+use super::resumption::Resumption;
 use super::state::{State, WebotsHandle};
 use crate::shared::http::Peer;
 use crate::shared::run::closing;
@@ -38,7 +38,7 @@ pub struct Session {
     /// Whether its client has asked to be able to come back.
     pub(super) resumable: bool,
     /// What it keeps so that its client can.
-    pub(super) comeback: Option<Comeback>,
+    pub(super) resumption: Option<Resumption>,
 }
 
 /// How often a client that may come back gets a sign of life.
@@ -64,7 +64,7 @@ impl Session {
             restoring: false,
             start,
             resumable,
-            comeback: None,
+            resumption: None,
         };
         let attachment = session.attachment;
         Attachment::new(session.start().recipient(), attachment)
@@ -96,8 +96,8 @@ impl Session {
         if let Some(client) = self.client.take() {
             client.do_send(ToClient::End(last_words, code));
         }
-        if let Some(comeback) = &mut self.comeback {
-            comeback.end(why);
+        if let Some(resumption) = &mut self.resumption {
+            resumption.end(why);
         }
         self.await_client(ctx);
     }
@@ -144,7 +144,7 @@ impl Actor for Session {
             .map(|(), this, ctx| {
                 this.start.resolve(Outcome::Stopped);
                 this.state.end(EndReason::Stopped, "The server was stopped");
-                this.comeback = None;
+                this.resumption = None;
                 this.finish(protocol::stopping(), "", CloseCode::Away, ctx);
             })
             .spawn(ctx);
@@ -236,14 +236,14 @@ impl Handler<WebotsEvent> for Session {
             WebotsEvent::Progress(text) => self.hint(protocol::loading(&text)),
             WebotsEvent::Text(text) => {
                 let text = protocol::of_project(&text);
-                if let Some(comeback) = &mut self.comeback {
-                    comeback.keep(text.clone());
+                if let Some(resumption) = &mut self.resumption {
+                    resumption.keep(text.clone());
                 }
                 self.text(text);
             }
             WebotsEvent::Started => {
-                if let Some(comeback) = &mut self.comeback {
-                    comeback.launched();
+                if let Some(resumption) = &mut self.resumption {
+                    resumption.launched();
                 }
                 self.text(protocol::shutdown_timeout(self.server.config.timeout));
             }
@@ -253,7 +253,7 @@ impl Handler<WebotsEvent> for Session {
                 let url = self.server.config.websocket_url(port);
                 self.text(protocol::webots(&url));
                 let absence = self.server.config.timing.absence;
-                let offer = self.comeback.as_mut().map(|comeback| comeback.ready(url, absence));
+                let offer = self.resumption.as_mut().map(|resumption| resumption.ready(url, absence));
                 if let Some(offer) = offer {
                     for text in offer {
                         self.text(text);

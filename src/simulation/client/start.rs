@@ -5,8 +5,8 @@ use std::sync::Arc;
 use actix::prelude::*;
 use actix_web_actors::ws::CloseCode;
 
-use super::comeback::Comeback;
 use super::outcome::Outcome;
+use super::resumption::Resumption;
 use super::session::Session;
 use super::state::{StartRequest, State, WebotsHandle};
 use crate::simulation::checkout::{Progress, Project};
@@ -95,8 +95,8 @@ impl Session {
         }
         self.text(protocol::loading("webots is starting"));
         if self.resumable && !self.server.config.timing.absence.is_zero() {
-            let kept = self.server.sessions.keep(ctx.address().recipient());
-            self.comeback = Some(Comeback::new(kept, &place.0, self.server.places.clone()));
+            let registration = self.server.sessions.register(ctx.address().recipient());
+            self.resumption = Some(Resumption::new(registration, &place.0, self.server.places.clone()));
         }
         let spec = LaunchSpec {
             config: Arc::clone(&self.server.config),

@@ -84,14 +84,20 @@ impl Ends {
 }
 
 fn write_all(logs: &Path, level: &str, jobs: &Receiver<Job>) {
-    kept_output::prune(logs);
     loop {
-        match jobs.recv_timeout(BETWEEN_LOOKS) {
-            Ok(Job::Write(ended)) => write(logs, level, &ended),
-            // Who waits may be gone.
-            Ok(Job::Flush(done)) => drop(done.send(())),
-            Err(RecvTimeoutError::Timeout) => kept_output::prune(logs),
+        // Once for all that have ended at the same time.
+        kept_output::prune(logs);
+        let first = match jobs.recv_timeout(BETWEEN_LOOKS) {
+            Ok(job) => job,
+            Err(RecvTimeoutError::Timeout) => continue,
             Err(RecvTimeoutError::Disconnected) => return,
+        };
+        for job in std::iter::once(first).chain(jobs.try_iter()) {
+            match job {
+                Job::Write(ended) => write(logs, level, &ended),
+                // Who waits may be gone.
+                Job::Flush(done) => drop(done.send(())),
+            }
         }
     }
 }
@@ -103,5 +109,4 @@ fn write(logs: &Path, level: &str, ended: &Ended) {
     if let Err(error) = kept_output::keep(logs, ended) {
         log::warn!("{}: its output is not kept: {error}", ended.id);
     }
-    kept_output::prune(logs);
 }

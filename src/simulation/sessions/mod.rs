@@ -5,5 +5,5 @@ mod sessions;
 mod token;
 
 pub use attachment::{Attachment, FromClient, Said, ToClient};
-pub use sessions::{Kept, Resume, Sessions};
+pub use sessions::{Registration, Resume, Sessions};
 pub use token::Token;

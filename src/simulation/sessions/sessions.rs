@@ -28,19 +28,19 @@ pub struct Resume {
 pub struct Sessions(Mutex<HashMap<u64, Recipient<Resume>>>);
 
 /// A session that can be found. Dropping it ends that.
-pub struct Kept {
+pub struct Registration {
     number: u64,
     sessions: Arc<Sessions>,
 }
 
 impl Sessions {
-    /// Keeps a session.
+    /// Registers a session.
     #[must_use]
-    pub fn keep(self: &Arc<Self>, session: Recipient<Resume>) -> Kept {
+    pub fn register(self: &Arc<Self>, session: Recipient<Resume>) -> Registration {
         // Not one that an earlier run of the server has used.
         let number = rand::random();
         self.0.lock().insert(number, session);
-        Kept { number, sessions: Arc::clone(self) }
+        Registration { number, sessions: Arc::clone(self) }
     }
 
     /// The session that a token names, if it has not ended.
@@ -50,7 +50,7 @@ impl Sessions {
     }
 }
 
-impl Kept {
+impl Registration {
     /// A new token for it.
     #[must_use]
     pub fn token(&self) -> Token {
@@ -58,7 +58,7 @@ impl Kept {
     }
 }
 
-impl Drop for Kept {
+impl Drop for Registration {
     fn drop(&mut self) {
         self.sessions.0.lock().remove(&self.number);
     }

@@ -8,13 +8,13 @@ use actix::prelude::*;
 use crate::shared::run::seconds_since_1970;
 use crate::simulation::places::{Move, NoPlace, Places, Report, Ticket, Update};
 use crate::simulation::protocol;
-use crate::simulation::sessions::{Kept, Token};
+use crate::simulation::sessions::{Registration, Token};
 use crate::simulation::simulation_id::SimulationId;
 use crate::simulation::snapshot::Change;
 
 /// How a client comes back.
-pub struct Comeback {
-    kept: Kept,
+pub struct Resumption {
+    registration: Registration,
     /// The one that the client was given last; none before it could come back.
     token: Option<Token>,
     ticket: SimulationId,
@@ -28,12 +28,12 @@ pub struct Comeback {
     ended: Option<String>,
 }
 
-impl Comeback {
+impl Resumption {
     /// For a session that can be found, and holds this ticket.
     #[must_use]
-    pub fn new(kept: Kept, ticket: &Ticket, places: Addr<Places>) -> Self {
+    pub fn new(registration: Registration, ticket: &Ticket, places: Addr<Places>) -> Self {
         Self {
-            kept,
+            registration,
             token: None,
             ticket: ticket.id(),
             places,
@@ -62,7 +62,7 @@ impl Comeback {
     }
 
     fn offer(&mut self, absence: Duration) -> [String; 2] {
-        let token = self.token.insert(self.kept.token());
+        let token = self.token.insert(self.registration.token());
         [protocol::absence(absence.as_secs()), protocol::resume(token)]
     }
 
