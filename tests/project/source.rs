@@ -12,8 +12,6 @@ pub struct Source {
     pub text: String,
     /// Without comments and inline tests.
     pub shipped: String,
-    /// How many lines it has without inline tests.
-    pub lines: usize,
 }
 
 /// All files below `src`.
@@ -24,8 +22,8 @@ pub fn sources() -> Vec<Source> {
             let text = std::fs::read_to_string(&file).unwrap();
             let path = file.strip_prefix(root()).unwrap().to_str().unwrap().to_owned();
             let without_tests = without_tests(&text);
-            let (lines, shipped) = (without_tests.lines().count(), without_comments(&without_tests));
-            Source { path, text, shipped, lines }
+            let shipped = without_comments(&without_tests);
+            Source { path, text, shipped }
         })
         .collect()
 }
