@@ -1,0 +1,267 @@
+//! The built demo simulator, as viewers and a simulation server meet it. Other tests use it in place of Webots, and show the
+//! rest of what it does.
+
+use std::fs::File;
+use std::net::{Ipv4Addr, TcpListener};
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command};
+use std::sync::atomic::{AtomicU8, Ordering};
+
+use nix::sys::signal::{Signal, kill};
+use nix::unistd::Pid;
+use regex::Regex;
+use serde_json::Value;
+
+use crate::support::client::Client;
+use crate::support::until;
+
+/// The port that it is asked to use, below those that systems deal out.
+const PORT: u16 = 21_234;
+const WORLD: &str = "#VRML_SIM R2025a utf8\nWorldInfo { }\nViewpoint { }\n";
+/// A model with one robot that moves and one box that does not.
+const MODEL: &str = r#"<?xml version="1.0" encoding="UTF-8"?>
+<X3D>
+  <head><meta name="simulator" content="demo"/></head>
+  <Scene>
+    <Solid id="n3" name="box"><Shape id="n4"><Box id="n5"/></Shape></Solid>
+    <Robot id="n6" name="mover" translation="1 2 0" rotation="0 0 1 0"/>
+  </Scene>
+</X3D>
+"#;
+/// How that robot moves; steps are 10 ms long.
+const MOTION: &str = r#"{
+    "basicTimeStep": 10,
+    "FPS": 50,
+    "robots": {"mover": {"id": 6, "start": [1, 2, 0], "heading": 0, "radius": 0.4, "speed": 0.25}}
+}"#;
+/// Where the robot is in the beginning.
+const START: &str = r#"application/json:{"time":0,"updates":[{"id":6,"translation":"1 2 0","rotation":"0 0 1 0"}]}"#;
+
+/// A simulator with a project of two worlds. It is killed with the test.
+struct Simulator {
+    child: Child,
+    address: Ipv4Addr,
+    project: tempfile::TempDir,
+}
+
+impl Simulator {
+    /// A paused one.
+    fn start() -> Self {
+        Self::start_with(own_address(), "a.wbt", "--mode=pause")
+    }
+
+    fn start_with(address: Ipv4Addr, world: &str, mode: &str) -> Self {
+        let project = tempfile::tempdir().unwrap();
+        let worlds = project.path().join("worlds");
+        std::fs::create_dir(&worlds).unwrap();
+        for (name, robot) in [("a", "mover"), ("b", "other mover")] {
+            std::fs::write(worlds.join(name).with_extension("wbt"), WORLD).unwrap();
+            std::fs::write(worlds.join(name).with_extension("x3d"), MODEL.replace("mover", robot)).unwrap();
+            std::fs::write(worlds.join(name).with_extension("motion.json"), MOTION).unwrap();
+        }
+        let output = File::create(project.path().join("output")).unwrap();
+        let mut command = Command::new(env!("CARGO_BIN_EXE_demo-simulator"));
+        command.args(["--batch", mode, "--stream", "--stdout", "--stderr", &format!("--port={PORT}")]);
+        command.arg(worlds.join(world)).env("DEMO_SIMULATOR_BIND", address.to_string());
+        let child = command.stdout(output.try_clone().unwrap()).stderr(output).spawn().unwrap();
+        Self { child, address, project }
+    }
+
+    async fn has_printed(&self, text: &str) {
+        let output = self.project.path().join("output");
+        until(text, async || std::fs::read_to_string(&output).unwrap().contains(text)).await;
+    }
+
+    /// A connection, once it listens on the port that is so many after its own.
+    async fn connect(&self, after: u16) -> Client {
+        let port = PORT + after;
+        self.has_printed(&format!("INFO: Streaming server listening on port {port}.")).await;
+        Client::connect(&format!("ws://{}:{port}/", self.address)).await
+    }
+
+    /// A viewer that only looks on and has seen the scene.
+    async fn spectator(&self) -> Client {
+        let mut viewer = self.connect(0).await;
+        viewer.send("w3d;broadcast").await;
+        viewer.until("scene load completed").await;
+        viewer.next().await;
+        viewer.heard.clear();
+        viewer
+    }
+
+    async fn ends_with(&mut self, code: i32) {
+        until("it has ended", async || self.child.try_wait().unwrap().is_some()).await;
+        assert_eq!(self.child.wait().unwrap().code(), Some(code));
+    }
+}
+
+impl Drop for Simulator {
+    fn drop(&mut self) {
+        self.child.kill().ok();
+        self.child.wait().ok();
+    }
+}
+
+/// A loopback address that no other simulator of any test run here has.
+fn own_address() -> Ipv4Addr {
+    static NEXT: AtomicU8 = AtomicU8::new(1);
+    let [.., high, low] = std::process::id().to_be_bytes();
+    Ipv4Addr::new(127, high, low, NEXT.fetch_add(1, Ordering::Relaxed))
+}
+
+#[actix_rt::test]
+async fn a_viewer_hears_the_whole_scene_first() {
+    let simulator = Simulator::start();
+    for first in ["x3d", "w3d", "x3d;broadcast", "w3d;broadcast"] {
+        let mut viewer = simulator.connect(0).await;
+        viewer.send(first).await;
+        viewer.until("pause: 0").await;
+        let scene = viewer.heard.iter().position(|text| text.starts_with("world:")).unwrap();
+        let [world, model, rest @ ..] = &viewer.heard[scene..] else { panic!("{:?}", viewer.heard) };
+        assert_eq!(world, "world:worlds/a.wbt:worlds/a.wbt;worlds/b.wbt");
+        assert!(model.starts_with("model:<?xml version=\"1.0\" encoding=\"UTF-8\"?><X3D>"), "{model}");
+        assert!(model.contains(r#"<Robot id="n6" name="mover" translation="1 2 0" rotation="0 0 1 0"/>"#), "{model}");
+        assert_eq!(rest, [START, "scene load completed", "pause: 0"]);
+    }
+}
+
+#[actix_rt::test]
+async fn what_one_asks_for_moves_the_world_of_all_and_is_answered_to_the_one() {
+    let simulator = Simulator::start();
+    let (mut one, mut other) = (simulator.spectator().await, simulator.spectator().await);
+    one.send("pause").await;
+    one.until("paused by client").await;
+    for time in ["10", "20"] {
+        one.send("step").await;
+        one.until("paused by client").await;
+        other.until(&format!("application/json:{{\"time\":{time},\"updates\":[{{\"id\":6,")).await;
+    }
+    one.send("reset").await;
+    one.until("reset finished").await;
+    other.until("reset finished").await;
+    assert_eq!(other.heard.len(), 4, "{:?}", other.heard);
+    assert_eq!(other.heard[2..], [START, "reset finished"]);
+    assert_eq!(one.heard.iter().filter(|text| !other.heard.contains(text)).count(), 3, "{:?}", one.heard);
+    let renamed = MODEL.replace("mover", "changed mover");
+    std::fs::write(simulator.project.path().join("worlds/a.x3d"), renamed).unwrap();
+    for (command, world, robot) in [
+        ("reload", "worlds/a.wbt", "changed mover"),
+        ("revert", "worlds/a.wbt", "changed mover"),
+        ("load:b.wbt", "worlds/b.wbt", "other mover"),
+        ("load:../worlds/a.wbt", "worlds/a.wbt", "changed mover"),
+    ] {
+        one.send(command).await;
+        for viewer in [&mut one, &mut other] {
+            viewer.until("delete world").await;
+            viewer.until(&format!("world:{world}:")).await;
+            let model = viewer.until("model:").await;
+            assert!(model.contains(&format!("name=\"{robot}\"")), "{command}: {model}");
+            viewer.until("scene load completed").await;
+        }
+    }
+}
+
+#[actix_rt::test]
+async fn real_time_and_fast_run_until_paused_and_later_viewers_hear_which() {
+    for mode in ["real-time", "fast"] {
+        let simulator = Simulator::start();
+        let mut viewer = simulator.spectator().await;
+        viewer.send(&format!("{mode}:-1")).await;
+        viewer.until(mode).await;
+        let mut late = simulator.connect(0).await;
+        late.send("w3d;broadcast").await;
+        late.until(mode).await;
+        viewer.until("application/json:").await;
+        viewer.send("pause").await;
+        viewer.until("paused by client").await;
+        let updates = viewer.heard.iter().filter_map(|text| text.strip_prefix("application/json:"));
+        let updates = updates.map(|json| serde_json::from_str::<Value>(json).unwrap()["time"].as_f64().unwrap());
+        assert!(updates.is_sorted_by(|earlier, later| earlier < later), "{:?}", viewer.heard);
+    }
+}
+
+#[actix_rt::test]
+async fn a_viewer_that_does_not_only_look_on_pauses_a_simulation_that_runs_by_itself() {
+    let simulator = Simulator::start_with(own_address(), "a.wbt", "--mode=realtime");
+    let mut spectator = simulator.spectator().await;
+    spectator.until("application/json:").await;
+    simulator.connect(0).await.send("w3d").await;
+    spectator.until("pause: ").await;
+}
+
+#[actix_rt::test]
+async fn a_signal_ends_it_with_0_after_the_closing_handshake() {
+    for signal in [Signal::SIGTERM, Signal::SIGINT] {
+        let mut simulator = Simulator::start();
+        let mut viewer = simulator.spectator().await;
+        let _silent = simulator.spectator().await;
+        kill(Pid::from_raw(simulator.child.id().cast_signed()), signal).unwrap();
+        // With any other code Webots' page shows a dialog.
+        assert_eq!(viewer.closed().await, Some(1000));
+        simulator.ends_with(0).await;
+    }
+}
+
+#[actix_rt::test]
+async fn a_taken_port_is_passed_over_and_after_ten_more_it_gives_up() {
+    let address = own_address();
+    let taken: Vec<_> = (PORT..=PORT + 9).map(|port| TcpListener::bind((address, port)).unwrap()).collect();
+    let last = Simulator::start_with(address, "a.wbt", "--mode=pause");
+    last.connect(10).await;
+    last.has_printed("WARNING: Could not listen to port").await;
+    let mut none = Simulator::start_with(address, "a.wbt", "--mode=pause");
+    none.ends_with(1).await;
+    none.has_printed("webots: failed to open TCP server in the port range [21234-21244]").await;
+    drop(taken);
+}
+
+#[actix_rt::test]
+async fn a_world_that_cannot_be_read_ends_it_with_a_failure() {
+    for name in ["missing.wbt", "a.x3d"] {
+        let mut simulator = Simulator::start_with(own_address(), name, "--mode=pause");
+        simulator.ends_with(1).await;
+        simulator.has_printed("webots: could not open file: '").await;
+    }
+}
+
+fn demo_worlds() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("config/demo/worlds")
+}
+
+/// The robots of a model: name, number of the node, translation, angle about the vertical axis.
+fn robots_of_model(model: &str) -> Vec<(String, u64, Vec<f64>, f64)> {
+    let numbers = |text: &str| text.split(' ').map(|number| number.parse().unwrap()).collect::<Vec<f64>>();
+    let robots = Regex::new("<Robot [^>]*>").unwrap();
+    let robot = |tag: &str| {
+        let attribute =
+            |name: &str| tag.split_once(&format!(" {name}=\"")).unwrap().1.split('"').next().unwrap().to_owned();
+        let rotation = numbers(&attribute("rotation"));
+        assert_eq!(rotation[..3], [0.0, 0.0, 1.0], "robots turn about the vertical axis");
+        let id = attribute("id").trim_start_matches('n').parse().unwrap();
+        (attribute("name"), id, numbers(&attribute("translation")), rotation[3])
+    };
+    robots.find_iter(model).map(|found| robot(found.as_str())).collect()
+}
+
+#[test]
+fn world_model_and_motion_of_the_demo_agree() {
+    for name in ["playground", "carousel"] {
+        let read =
+            |extension: &str| std::fs::read_to_string(demo_worlds().join(name).with_extension(extension)).unwrap();
+        let (world, model) = (read("wbt"), read("x3d"));
+        let motion: Value = serde_json::from_str(&read("motion.json")).unwrap();
+        let robots = robots_of_model(&model);
+        assert_eq!(robots.len(), motion["robots"].as_object().unwrap().len(), "{name}");
+        for (robot, id, translation, angle) in robots {
+            let moves = &motion["robots"][&robot];
+            assert_eq!(moves["id"], id, "{robot}");
+            assert_eq!(serde_json::from_value::<Vec<f64>>(moves["start"].clone()).unwrap(), translation, "{robot}");
+            assert_eq!(moves["heading"].as_f64(), Some(angle), "{robot}");
+            assert!(world.contains(&format!("Robot {{\n  name \"{robot}\"")), "{robot}");
+        }
+        for setting in ["basicTimeStep", "FPS"] {
+            assert!(world.contains(&format!("{setting} {}\n", motion[setting])), "{name}: {setting}");
+            assert!(model.contains(&format!("{setting}=\"{}\"", motion[setting])), "{name}: {setting}");
+        }
+    }
+}
