@@ -48,7 +48,6 @@ pub fn client_text(text: &str) -> String {
 /// Returns a text in which each absolute path is cut to its last name. URLs and relative paths stay as they are.
 ///
 /// Texts for web clients pass through this: the paths of a machine are of no use to them.
-#[must_use]
 pub fn without_paths(text: &str) -> String {
     let mut shown = String::with_capacity(text.len());
     let mut rest = text;

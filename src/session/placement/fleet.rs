@@ -108,7 +108,6 @@ impl<Id: Clone + Eq + Hash> Fleet<Id> {
     }
 
     /// Whether others are preferred to a server, because its last starts have failed.
-    #[must_use]
     pub fn is_ejected(&self, id: &Id) -> bool {
         self.server(id).is_some_and(|server| server.ejection.until().is_some())
     }

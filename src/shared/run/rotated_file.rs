@@ -37,7 +37,6 @@ impl RotatedFile {
     }
 
     /// The same with a first line for each file.
-    #[must_use]
     pub fn with_heading(self, heading: &'static str) -> Self {
         Self { heading, ..self }
     }

@@ -44,7 +44,6 @@ impl CacheDir {
     }
 
     /// The folder itself, without links.
-    #[must_use]
     pub fn path(&self) -> &Path {
         &self.folder
     }

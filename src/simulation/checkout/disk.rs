@@ -45,13 +45,11 @@ fn absent(result: io::Result<()>) -> io::Result<()> {
 }
 
 /// How many bytes the packs of a repository have.
-#[must_use]
 pub fn packed(repository: &Path) -> u64 {
     files(&repository.join("objects/pack")).map(|path| length(&path)).sum()
 }
 
 /// How many bytes a running fetch has received.
-#[must_use]
 pub fn received(repository: &Path) -> u64 {
     unfinished(repository).map(|path| length(&path)).sum()
 }
@@ -80,7 +78,6 @@ pub struct Growing {
 
 impl Growing {
     /// This folder may take so many bytes.
-    #[must_use]
     pub fn new(folder: PathBuf, most: u64) -> Self {
         Self { folder, most }
     }
@@ -100,13 +97,11 @@ pub async fn outgrown(folders: Vec<Growing>) {
 
 /// What everything below a folder takes, each file and folder at least what a name takes of a disk. What nobody can look
 /// into does not count.
-#[must_use]
 pub fn room_of(folder: &Path) -> u64 {
     sum(folder, |about| folder_size::length(about).max(folder_size::SMALLEST))
 }
 
 /// The bytes of all files below a folder.
-#[must_use]
 pub fn size_of(folder: &Path) -> u64 {
     sum(folder, folder_size::length)
 }

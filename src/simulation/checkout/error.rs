@@ -93,21 +93,18 @@ pub enum CheckoutError {
 
 impl CheckoutError {
     /// Whether it is this server's fault, so that another server may do better: its disk, its network, its processes.
-    #[must_use]
     pub fn is_own(&self) -> bool {
         matches!(self, Self::Machine(..))
     }
 }
 
 /// The world's URL names nothing that is there.
-#[must_use]
 pub fn no_reference(world: &ProjectUrl) -> CheckoutError {
     let reference = world.candidates().into_iter().next().map(|reading| reading.reference).unwrap_or_default();
     CheckoutError::NoReference { repository: world.repository(), reference }
 }
 
 /// A git command that works on a cached repository, or asks a remote, has failed.
-#[must_use]
 pub fn git_failed(world: &ProjectUrl, source: GitError) -> CheckoutError {
     let repository = world.repository();
     if let GitError::Slow(limit) = source {
@@ -125,7 +122,6 @@ pub fn git_failed(world: &ProjectUrl, source: GitError) -> CheckoutError {
 }
 
 /// A fetch has failed; `what` was fetched.
-#[must_use]
 pub fn fetch_failed(world: &ProjectUrl, what: impl FnOnce() -> String, limit: u64, error: GitError) -> CheckoutError {
     match error {
         GitError::TooLarge => too_large(what(), limit),
@@ -134,19 +130,16 @@ pub fn fetch_failed(world: &ProjectUrl, what: impl FnOnce() -> String, limit: u6
 }
 
 /// The time limit has passed.
-#[must_use]
 pub fn too_slow(world: &ProjectUrl, limit: Duration) -> CheckoutError {
     CheckoutError::TooSlow { repository: world.repository(), seconds: limit.as_secs() }
 }
 
 /// The size limit, in bytes, has passed.
-#[must_use]
 pub fn too_large(what: String, limit: u64) -> CheckoutError {
     CheckoutError::TooLarge { what, limit: limit >> 20 }
 }
 
 /// The machine has failed.
-#[must_use]
 pub fn machine(world: &ProjectUrl, error: &io::Error) -> CheckoutError {
     CheckoutError::Machine(world.repository(), error.to_string())
 }

@@ -56,7 +56,6 @@ enum Answer {
 
 impl Finder {
     /// Finds commits by `git`, and keeps them in `cache`.
-    #[must_use]
     pub fn new(git: Arc<Git>, cache: Arc<Cache>, (mirrors, rules): (Mirrors, Rules), limits: Limits) -> Self {
         let (searches, spellings) = (SingleFlight::default(), Spellings::default());
         Self { git, cache, mirrors, rules, limits, searches, spellings }

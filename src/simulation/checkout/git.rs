@@ -90,7 +90,6 @@ const LONGEST_LINE: usize = 500;
 impl Git {
     /// Prepares git for the server whose run has this folder. `config` is the administrator's file of settings; a remote may
     /// be silent for so long.
-    #[must_use]
     pub fn new(run: &Path, config: Option<&Path>, silence: Duration) -> Self {
         let config = config.map(|file| std::path::absolute(file).unwrap_or_else(|_| file.to_owned()));
         let quoted = |file: PathBuf| file.to_string_lossy().replace('\\', "\\\\").replace('"', "\\\"");

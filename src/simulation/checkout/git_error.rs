@@ -108,7 +108,6 @@ const MESSAGES: &[(&str, Cause)] = &[
 
 impl GitError {
     /// What the failure means.
-    #[must_use]
     pub fn cause(&self) -> Cause {
         let message = match self {
             Self::Failed { ending: ExitReason::Code(_), message, .. } => message,

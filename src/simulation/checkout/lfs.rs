@@ -12,7 +12,6 @@ const BEGINNING: &[u8] = b"version https://git-lfs.github.com/spec/";
 const LARGEST: u64 = 1024;
 
 /// How many pointers there are below a folder. Reads from disk: not for a thread that serves others.
-#[must_use]
 pub fn pointers(folder: &Path) -> usize {
     let is_pointer = |path: &Path| std::fs::read(path).is_ok_and(|text| text.starts_with(BEGINNING));
     let (mut found, mut open) = (0, vec![folder.to_owned()]);
@@ -31,13 +30,11 @@ pub fn pointers(folder: &Path) -> usize {
 }
 
 /// Whether git finds its part for LFS. Looks on disk: not for a thread that serves others.
-#[must_use]
 pub fn is_installed() -> bool {
     which("git-lfs").is_ok()
 }
 
 /// Settings with which a checkout loads large files from where the repository is, whatever the repository says.
-#[must_use]
 pub fn settings(remote: &Remote) -> Vec<String> {
     let location = &remote.location;
     let url = match remote.protocol {
@@ -59,7 +56,6 @@ pub fn settings(remote: &Remote) -> Vec<String> {
 }
 
 /// What a client is told of pointers that are left.
-#[must_use]
 pub fn warning(count: usize, is_installed: bool) -> String {
     let why = if is_installed { "could not be loaded" } else { "can't be loaded: this server has no git-lfs" };
     format!("Warning: {count} files of this project are kept in Git LFS and {why}")

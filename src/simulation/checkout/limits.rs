@@ -15,7 +15,6 @@ pub struct Limits {
 
 impl Limits {
     /// How long a remote may be silent, and packing a cached repository hold a fetch up.
-    #[must_use]
     pub fn patience(&self) -> Duration {
         self.time / 4
     }

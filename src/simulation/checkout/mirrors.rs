@@ -31,7 +31,6 @@ pub struct Remote {
 
 impl Remote {
     /// What is the same for every spelling of the repository: forges ignore case, and git's ending.
-    #[must_use]
     pub fn key(&self) -> String {
         if self.protocol == "file" {
             return self.location.clone();
@@ -54,7 +53,6 @@ impl Mirrors {
     }
 
     /// The same world where its repository is cloned from this URL; nothing where none would be, from the same forge.
-    #[must_use]
     pub fn moved(&self, world: &ProjectUrl, location: &str) -> Option<ProjectUrl> {
         let mirror = self.mirror(world).map(|mirror| (mirror.prefix.as_str(), mirror.replacement.as_str()));
         let (prefix, base) = mirror.unwrap_or((GITHUB, GITHUB));
@@ -66,7 +64,6 @@ impl Mirrors {
     }
 
     /// Where the repository of a world is cloned from; nothing for a forge that is neither GitHub nor in a mirror.
-    #[must_use]
     pub fn remote(&self, world: &ProjectUrl) -> Option<Remote> {
         let Some(Mirror { prefix, replacement }) = self.mirror(world) else {
             let location = format!("{GITHUB}/{}.git", escaped(world.repository_segments()));

@@ -25,13 +25,11 @@ pub struct Project {
 
 impl Project {
     /// The project's folder, with `worlds` and `controllers` inside.
-    #[must_use]
     pub fn folder(&self) -> &Path {
         &self.folder
     }
 
     /// What tells this project from others: its repository, its commit, and its folder there.
-    #[must_use]
     pub fn identity(&self) -> String {
         format!("{} {} {}", self.url.repository(), self.revision.commit, self.revision.folder)
     }

@@ -42,7 +42,6 @@ const QUESTIONS: usize = 4;
 
 impl Repository {
     /// The repository at `path`, which need not exist yet, for commits of `remote`.
-    #[must_use]
     pub fn new(path: PathBuf, remote: Remote, git: Arc<Git>, limits: Limits, growth: Arc<Growth>) -> Self {
         let (lock, fetches, made) = (Arc::default(), SingleFlight::default(), Mutex::default());
         let asking = Semaphore::new(QUESTIONS);
@@ -50,7 +49,6 @@ impl Repository {
     }
 
     /// Where it is fetched from.
-    #[must_use]
     pub fn remote(&self) -> Arc<Remote> {
         Arc::clone(&self.remote.lock())
     }
@@ -61,7 +59,6 @@ impl Repository {
     }
 
     /// A git command on this repository.
-    #[must_use]
     pub fn call(&self, arguments: Vec<OsString>) -> Call<'_> {
         Call {
             repository: &self.path,

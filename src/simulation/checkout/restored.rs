@@ -21,7 +21,6 @@ pub struct Restored {
 
 /// The path in its repository of a file below the `controllers` folder of the project at `place`; nothing where its name
 /// leads elsewhere.
-#[must_use]
 pub fn controller(place: &str, file: &str) -> Option<String> {
     let plain = |segment: &str| !segment.is_empty() && segment != "." && segment != ".." && !segment.contains('\0');
     let slash = if place.is_empty() { "" } else { "/" };

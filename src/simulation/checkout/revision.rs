@@ -47,7 +47,6 @@ const MOST_READINGS: usize = 12;
 
 /// The commit that a URL names by its full hash: then nobody need be asked what it is. `allow_any` tells whether any will
 /// do, or only one that is in a branch or tag.
-#[must_use]
 pub fn commit_of(world: &ProjectUrl, allow_any: bool) -> Option<Revision> {
     let Reading { reference, folder } = world.candidates().into_iter().next()?;
     let is_hash = [40, 64].contains(&reference.len()) && reference.bytes().all(|byte| byte.is_ascii_hexdigit());
@@ -58,20 +57,17 @@ pub fn commit_of(world: &ProjectUrl, allow_any: bool) -> Option<Revision> {
 }
 
 /// Makes a bare repository. git before 2.29 knows only the older kind of hashes, and no name for it.
-#[must_use]
 pub fn init_arguments(is_sha256: bool) -> Vec<OsString> {
     let kind = is_sha256.then_some("--object-format=sha256");
     ["init", "--quiet", "--bare"].into_iter().chain(kind).map(OsString::from).collect()
 }
 
 /// Asks the remote for all its branches and tags.
-#[must_use]
 pub fn tips_arguments(location: &str) -> Vec<OsString> {
     ["ls-remote", "--quiet", "--heads", "--tags", "--", location].map(OsString::from).to_vec()
 }
 
 /// Whether a commit is the newest of a branch or tag in such an answer.
-#[must_use]
 pub fn is_tip(answer: &str, commit: &str) -> bool {
     let tips = answer.lines().filter_map(|line| line.split_once('\t'));
     let accepted = |name: &str| name.starts_with("refs/heads/") || name.starts_with("refs/tags/");
@@ -79,7 +75,6 @@ pub fn is_tip(answer: &str, commit: &str) -> bool {
 }
 
 /// Whether the remote's hashes have another length than this one: then it can't have that commit.
-#[must_use]
 pub fn is_of_other_length(answer: &str, commit: &str) -> bool {
     let mut tips = answer.lines().filter_map(|line| line.split_once('\t')).peekable();
     tips.peek().is_some() && tips.all(|(tip, _)| tip.len() != commit.len())
@@ -87,7 +82,6 @@ pub fn is_of_other_length(answer: &str, commit: &str) -> bool {
 
 /// Fetches all branches and tags: only their commits where the remote can do that, else everything. git keeps note of
 /// that only for remotes that have a name.
-#[must_use]
 pub fn history(location: &str, commit: &str) -> FetchRequest {
     let settings = vec![format!("remote.origin.url={location}")];
     let options = ["fetch", "--filter=tree:0", "--prune", "--no-tags", "--no-write-fetch-head", "--progress", "--"];
@@ -101,20 +95,17 @@ fn is_sha256(hash: &str) -> bool {
 }
 
 /// Asks whether a commit is in a repository.
-#[must_use]
 pub fn known_arguments(commit: &str) -> Vec<OsString> {
     ["cat-file", "-e", commit].map(OsString::from).to_vec()
 }
 
 /// Names a branch or tag of a fetched history in which a commit is.
-#[must_use]
 pub fn reachable_arguments(commit: &str) -> Vec<OsString> {
     let fixed = ["for-each-ref", "--count=1", "--contains", commit, "refs/heads", "refs/tags"];
     fixed.map(OsString::from).to_vec()
 }
 
 /// Asks the remote for all branches and tags that a URL may mean.
-#[must_use]
 pub fn search_arguments(world: &ProjectUrl, location: &str) -> Vec<OsString> {
     let names = world.candidates().into_iter().take(MOST_READINGS).flat_map(|reading| full_names(world, &reading));
     let fixed = ["ls-remote", "--quiet", "--", location].map(OsString::from);
@@ -133,7 +124,6 @@ fn full_names(world: &ProjectUrl, reading: &Reading) -> Vec<String> {
 }
 
 /// What the remote has of what was asked for: the longest names first, branches before tags.
-#[must_use]
 pub fn found(world: &ProjectUrl, answer: &str) -> Vec<Revision> {
     let known: Vec<(&str, &str)> = answer.lines().filter_map(|line| line.split_once('\t')).collect();
     let readings = world.candidates().into_iter().take(MOST_READINGS).rev();
@@ -155,14 +145,12 @@ pub fn found(world: &ProjectUrl, answer: &str) -> Vec<Revision> {
 impl Revision {
     /// Its reference in the cached repository. A commit that was fetched only because `anyCommit` is set has a name apart, so that it does not
     /// run once that is off.
-    #[must_use]
     pub fn reference(&self) -> String {
         let kind = if self.trust == TrustSource::AnyCommit { "any" } else { "fleet" };
         format!("refs/{kind}/{}", self.commit)
     }
 
     /// Fetches this commit alone.
-    #[must_use]
     pub fn request(&self, location: &str) -> FetchRequest {
         let refspec = format!("+{}:{}", self.commit, self.reference());
         let options = ["fetch", "--depth=1", "--no-tags", "--no-write-fetch-head", "--progress", "--"];
@@ -171,13 +159,11 @@ impl Revision {
     }
 
     /// The folder to check out, as git wants it named.
-    #[must_use]
     pub fn needed(&self) -> &str {
         if self.folder.is_empty() { "." } else { &self.folder }
     }
 
     /// Asks for an entry of the repository, and for all that is directly in the folders above the project's.
-    #[must_use]
     pub fn list_arguments(&self, path: &str) -> Vec<OsString> {
         let root = (!self.folder.is_empty()).then_some(".".to_owned());
         let above = self.folder.match_indices('/').filter_map(|(end, _)| Some(format!("{}/", self.folder.get(..end)?)));
@@ -187,7 +173,6 @@ impl Revision {
 
     /// Reads the answer: the files directly in the folders above the project's, each path ended by a zero byte, if there is
     /// a file at `path`.
-    #[must_use]
     pub fn files_above(&self, answer: &[u8], path: &str) -> Option<Vec<u8>> {
         let is_file = |entry: &&[u8]| entry.starts_with(b"100") || entry.starts_with(b"120");
         let files = answer.split(|byte| *byte == 0).filter(is_file);
@@ -202,19 +187,16 @@ impl Revision {
     }
 
     /// Asks whether the name is there.
-    #[must_use]
     pub fn exists_arguments(&self) -> Vec<OsString> {
         ["rev-parse", "--quiet", "--verify", &self.reference()].map(OsString::from).to_vec()
     }
 
     /// Asks what kind of object stands behind the name.
-    #[must_use]
     pub fn kind_arguments(&self) -> Vec<OsString> {
         ["cat-file", "-t", &format!("{}^{{}}", self.reference())].map(OsString::from).to_vec()
     }
 
     /// Where the world lies in the repository.
-    #[must_use]
     pub fn world_path(&self, world: &ProjectUrl) -> String {
         let slash = if self.folder.is_empty() { "" } else { "/" };
         format!("{}{slash}worlds/{}", self.folder, world.world())

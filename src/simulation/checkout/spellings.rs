@@ -24,7 +24,6 @@ impl Spellings {
     }
 
     /// Returns the remote as its forge spells it.
-    #[must_use]
     pub fn of(&self, remote: Remote) -> Remote {
         let known = self.0.lock();
         known.get(&remote.key()).cloned().unwrap_or(remote)

@@ -16,13 +16,11 @@ fn step(number: u64, what: &str) -> String {
 }
 
 /// The remote is asked what it has.
-#[must_use]
 pub fn looking_for(repository: &str) -> String {
     step(1, &format!("looking for {repository}"))
 }
 
 /// git fetches, and says this.
-#[must_use]
 pub fn fetching(what: &str, said: &str) -> String {
     let (first, last) = FETCH;
     let number = match said.split_once(':') {
@@ -34,7 +32,6 @@ pub fn fetching(what: &str, said: &str) -> String {
 }
 
 /// git writes the files of a branch, tag or commit, and says this.
-#[must_use]
 pub fn checking_out(name: &str, said: Option<&str>) -> String {
     let said = said.map_or_else(String::new, |said| format!(": {said}"));
     step(8, &format!("checking {name} out{said}"))

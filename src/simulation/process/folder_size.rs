@@ -29,33 +29,28 @@ const LARGE: u64 = 64 * 1024;
 const DEEPEST: usize = 200;
 
 /// What a file or folder takes of the disk. Holes take nothing.
-#[must_use]
 pub fn room(about: &Metadata) -> u64 {
     (about.blocks() * 512).max(SMALLEST)
 }
 
 /// What a folder takes of the disk; nothing where nobody can tell, since folders in it are closed or too deep.
-#[must_use]
 pub fn room_of(folder: &Path) -> Option<u64> {
     let mut size = FolderSize::new(room, u64::MAX);
     size.add_folder(folder).ok().map(|()| size.total())
 }
 
 /// What is in a file.
-#[must_use]
 pub fn length(about: &Metadata) -> u64 {
     if about.is_dir() { 0 } else { about.len() }
 }
 
 impl FolderSize {
     /// Adds up by this measure, to no more than `enough`.
-    #[must_use]
     pub fn new(measure: fn(&Metadata) -> u64, enough: u64) -> Self {
         Self { measure, enough, total: 0, met: HashSet::new() }
     }
 
     /// What was added up until now.
-    #[must_use]
     pub fn total(&self) -> u64 {
         self.total
     }

@@ -53,7 +53,6 @@ impl Guardian {
 
 /// What the guardian process does, from its start to its end; `remove` removes what is not a process. Returns its exit
 /// code.
-#[must_use]
 pub fn guard(arguments: &Arguments, remove: impl Fn()) -> u8 {
     // A signal to the server's group, or Ctrl-C in its terminal, must not end the guardian before the server.
     if let Err(error) = setsid().and_then(|_| block_signals()) {

@@ -67,7 +67,6 @@ impl RunDir {
     }
 
     /// The folder itself.
-    #[must_use]
     pub fn path(&self) -> &Path {
         &self.folder
     }
@@ -86,14 +85,12 @@ impl Drop for RunDir {
 
 impl InstanceDir {
     /// The folder itself.
-    #[must_use]
     pub fn path(&self) -> &Path {
         &self.folder
     }
 
     /// The folder of the project. It is there as long as the instance is: whoever made it later could make it again after
     /// the instance was removed.
-    #[must_use]
     pub fn project(&self) -> PathBuf {
         self.folder.join("project")
     }

@@ -11,7 +11,6 @@ pub struct Lines {
 
 impl Lines {
     /// For an output of whose lines so many bytes are kept; the rest of a longer one is left out.
-    #[must_use]
     pub fn new(longest: usize) -> Self {
         Self { line: Vec::new(), longest }
     }

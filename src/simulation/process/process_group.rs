@@ -41,7 +41,6 @@ pub struct SpawnSpec {
 
 impl SpawnSpec {
     /// A program of the server's own, in its environment and folder, that needs no grace time.
-    #[must_use]
     pub fn new(command: Vec<OsString>, mark: &Path) -> Self {
         Self {
             command,
@@ -114,7 +113,6 @@ impl ProcessGroup {
     }
 
     /// The process id of the program, which is the number of the group.
-    #[must_use]
     pub fn leader(&self) -> i32 {
         self.leader
     }

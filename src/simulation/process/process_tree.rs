@@ -18,7 +18,6 @@ use procfs::process::{Process, all_processes};
 pub const MARK: &str = "WEBOTS_FLEET_INSTANCE";
 
 /// A process and all that descends from it at this moment.
-#[must_use]
 pub fn tree(root: i32) -> Vec<i32> {
     let mut found = vec![root];
     let mut next = 0;
@@ -30,7 +29,6 @@ pub fn tree(root: i32) -> Vec<i32> {
 }
 
 /// The children of a process. One that has ended has none.
-#[must_use]
 pub fn children(pid: i32) -> Vec<i32> {
     let threads = std::fs::read_dir(format!("/proc/{pid}/task")).into_iter().flatten().flatten();
     let children = threads.filter_map(|thread| std::fs::read_to_string(thread.path().join("children")).ok());
@@ -90,7 +88,6 @@ fn mark(pid: i32) -> Option<PathBuf> {
 }
 
 /// The inodes of the sockets that a process has open.
-#[must_use]
 pub fn sockets(pid: i32) -> Vec<u64> {
     let descriptors = std::fs::read_dir(format!("/proc/{pid}/fd")).into_iter().flatten().flatten();
     let targets = descriptors.filter_map(|descriptor| std::fs::read_link(descriptor.path()).ok());

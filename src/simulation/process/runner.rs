@@ -61,7 +61,6 @@ const LINES: u32 = 50;
 
 impl Run {
     /// A program of the server's own with its arguments, in the server's environment and with this mark.
-    #[must_use]
     pub fn new<A: Into<OsString>>(command: impl IntoIterator<Item = A>, mark: &Path, time: Duration) -> Self {
         let spec = SpawnSpec::new(command.into_iter().map(Into::into).collect(), mark);
         Self { spec, time, answer: 1 << 20, line: 1000, limits: Vec::new(), niceness: 0 }
