@@ -45,19 +45,11 @@ async fn a_door_still_answers(door: &mut Client) {
     }
 }
 
-#[actix_rt::test]
-async fn quiet_connections_through_apache_last() {
-    quiet_connections_last(Rules::Apache).await;
-}
-
-#[actix_rt::test]
-async fn quiet_connections_through_nginx_last() {
-    quiet_connections_last(Rules::Nginx).await;
-}
+through_both!(quiet_connections_last);
 
 #[actix_rt::test]
 async fn the_documents_rules_keep_what_is_pinged_and_cut_what_is_silent() {
-    let fleet = Fleet::start(Rules::DocumentsMachine).await;
+    let fleet = Fleet::start(Rules::Documents).await;
     let mut door = fleet.browser.connect(&format!("/{}/session", fleet.session.port)).await;
     let (mut client, stream) = fleet.simulate(&fleet.browser, &fleet.here).await;
     let mut viewer = fleet.browser.open(&format!("{stream}/")).await;
@@ -97,15 +89,7 @@ async fn what_is_sent_in_pieces_comes_in_pieces(rules: Rules) {
     sender.join().unwrap();
 }
 
-#[actix_rt::test]
-async fn what_is_sent_in_pieces_comes_in_pieces_through_apache() {
-    what_is_sent_in_pieces_comes_in_pieces(Rules::Apache).await;
-}
-
-#[actix_rt::test]
-async fn what_is_sent_in_pieces_comes_in_pieces_through_nginx() {
-    what_is_sent_in_pieces_comes_in_pieces(Rules::Nginx).await;
-}
+through_both!(what_is_sent_in_pieces_comes_in_pieces);
 
 async fn a_restart_costs_only_connections_of_its_own(rules: Rules) {
     let mut fleet = Fleet::start(rules).await;
@@ -136,12 +120,4 @@ async fn a_restart_costs_only_connections_of_its_own(rules: Rules) {
     assert!(!passing_by.is_finished(), "a connection past the web server was closed: {:?}", passing_by.await);
 }
 
-#[actix_rt::test]
-async fn a_restart_of_apache_costs_only_connections_of_its_own() {
-    a_restart_costs_only_connections_of_its_own(Rules::Apache).await;
-}
-
-#[actix_rt::test]
-async fn a_restart_of_nginx_costs_only_connections_of_its_own() {
-    a_restart_costs_only_connections_of_its_own(Rules::Nginx).await;
-}
+through_both!(a_restart_costs_only_connections_of_its_own);

@@ -54,12 +54,4 @@ async fn paths_arrive(rules: Rules) {
     }
 }
 
-#[actix_rt::test]
-async fn paths_arrive_through_apache_as_they_were_meant() {
-    paths_arrive(Rules::Apache).await;
-}
-
-#[actix_rt::test]
-async fn paths_arrive_through_nginx_as_they_were_meant() {
-    paths_arrive(Rules::Nginx).await;
-}
+through_both!(paths_arrive);

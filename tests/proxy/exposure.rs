@@ -58,38 +58,7 @@ async fn only_the_fleet_is_reachable(rules: Rules) {
     }
 }
 
-#[actix_rt::test]
-async fn only_the_fleet_is_reachable_through_apache() {
-    only_the_fleet_is_reachable(Rules::Apache).await;
-}
-
-#[actix_rt::test]
-async fn only_the_fleet_is_reachable_through_nginx() {
-    only_the_fleet_is_reachable(Rules::Nginx).await;
-}
-
-async fn every_port_is_reached(rules: Rules) {
-    let fleet = Fleet::start(rules).await;
-    let private = private_service();
-    assert_eq!(fleet.browser.get(&format!("/{private}/")).await.text(), "secret");
-    for port in ["22", "5432", "1"] {
-        let answer = fleet.browser.get(&format!("/{port}/")).await;
-        assert_ne!(answer.status, 404, "port {port} was tried, whether somebody listens there or not");
-        // Where nobody listens, Apache tells of its attempt; else it tells how it was answered.
-        let tried = fleet.web.log().contains(&format!("127.0.0.1:{port} ")) || answer.status == 502;
-        assert!(tried || answer.status.is_success(), "{port}: {} {}", answer.status, fleet.web.log());
-    }
-}
-
-#[actix_rt::test]
-async fn the_documents_rule_for_ports_reaches_every_port_of_the_machine() {
-    every_port_is_reached(Rules::DocumentsPorts).await;
-}
-
-#[actix_rt::test]
-async fn the_documents_rules_for_a_machine_reach_every_port_of_the_machine() {
-    every_port_is_reached(Rules::DocumentsMachine).await;
-}
+through_both!(only_the_fleet_is_reachable);
 
 async fn an_editor_is_at_the_port_of_its_webots_and_500_more(rules: Rules) {
     let fleet = Fleet::start(rules).await;
@@ -105,15 +74,7 @@ async fn an_editor_is_at_the_port_of_its_webots_and_500_more(rules: Rules) {
     assert_eq!(fleet.browser.get(&format!("/{}/", editor - 1)).await.status, 404);
 }
 
-#[actix_rt::test]
-async fn an_editor_is_reached_through_apache() {
-    an_editor_is_at_the_port_of_its_webots_and_500_more(Rules::Apache).await;
-}
-
-#[actix_rt::test]
-async fn an_editor_is_reached_through_nginx() {
-    an_editor_is_at_the_port_of_its_webots_and_500_more(Rules::Nginx).await;
-}
+through_both!(an_editor_is_at_the_port_of_its_webots_and_500_more);
 
 async fn pages_are_sent_on_to_https_and_the_bare_name(rules: Rules) {
     let fleet = Fleet::start(rules).await;
@@ -150,27 +111,7 @@ async fn pages_are_sent_on_to_https_and_the_bare_name(rules: Rules) {
     assert_eq!(browser.ask(&question, &[]).await.status, 404, "certbot's questions are answered here");
 }
 
-#[actix_rt::test]
-async fn apache_sends_pages_on_to_https_and_the_bare_name() {
-    pages_are_sent_on_to_https_and_the_bare_name(Rules::Apache).await;
-}
-
-#[actix_rt::test]
-async fn nginx_sends_pages_on_to_https_and_the_bare_name() {
-    pages_are_sent_on_to_https_and_the_bare_name(Rules::Nginx).await;
-}
-
-#[actix_rt::test]
-async fn of_the_documents_redirects_one_works_and_the_other_never_applies() {
-    let table =
-        [(Rules::DocumentsMachine, 302, Some("https://localhost/2000/monitor")), (Rules::DocumentsPorts, 404, None)];
-    for (rules, status, location) in table {
-        let fleet = Fleet::start(rules).await;
-        let plain = format!("http://localhost:{}/2000/monitor", fleet.browser.plain);
-        let answer = fleet.browser.ask(&plain, &[]).await;
-        assert_eq!((answer.status.as_u16(), answer.header("location")), (status, location), "{rules:?}");
-    }
-}
+through_both!(pages_are_sent_on_to_https_and_the_bare_name);
 
 #[actix_rt::test]
 async fn nginx_takes_names_of_any_length() {

@@ -1,6 +1,23 @@
 //! The fleet behind real web servers: Debian's apache2 and nginx, started here on free ports of the loopback, with our
 //! rules (`deploy/`) and with those of the original documents.
 
+/// Two tests of a function that is given rules: through Apache and through nginx, with ours.
+macro_rules! through_both {
+    ($test:ident) => {
+        mod $test {
+            #[actix_rt::test]
+            async fn apache() {
+                super::$test(crate::proxy::rules::Rules::Apache).await;
+            }
+
+            #[actix_rt::test]
+            async fn nginx() {
+                super::$test(crate::proxy::rules::Rules::Nginx).await;
+            }
+        }
+    };
+}
+
 mod browser;
 mod fleet;
 mod rules;
@@ -14,5 +31,4 @@ mod one_door;
 mod pages;
 mod trust;
 mod urls;
-mod visitor;
 mod whole_way;

@@ -37,8 +37,7 @@ async fn is_told_what_happens(browser: &Browser, path: &str) {
     }
 }
 
-async fn what_webots_sends_has_an_origin_of_its_own(rules: Rules) {
-    let fleet = Fleet::start(rules).await;
+async fn what_webots_sends_has_an_origin_of_its_own(fleet: &Fleet, rules: Rules) {
     let policy = async |path: String| {
         let url = format!("https://{}{path}", fleet.browser.host);
         let answer = fleet.browser.ask(&url, &[]).await;
@@ -56,18 +55,9 @@ async fn what_webots_sends_has_an_origin_of_its_own(rules: Rules) {
     assert!(door.starts_with("default-src 'none'") && !door.contains("sandbox"), "{door}");
 }
 
-#[actix_rt::test]
-async fn what_webots_sends_through_apache_has_an_origin_of_its_own() {
-    what_webots_sends_has_an_origin_of_its_own(Rules::Apache).await;
-}
-
-#[actix_rt::test]
-async fn what_webots_sends_through_nginx_has_an_origin_of_its_own() {
-    what_webots_sends_has_an_origin_of_its_own(Rules::Nginx).await;
-}
-
 async fn pages_are_complete_and_live(rules: Rules) {
     let fleet = Fleet::start(rules).await;
+    what_webots_sends_has_an_origin_of_its_own(&fleet, rules).await;
     let browser = &fleet.browser;
     let machine = |page: &str| format!("/{}{page}", fleet.here.port);
     for page in ["/monitor", "/viewer"] {
@@ -79,12 +69,4 @@ async fn pages_are_complete_and_live(rules: Rules) {
     futures_util::join!(is_told_what_happens(browser, &here), is_told_what_happens(browser, &door));
 }
 
-#[actix_rt::test]
-async fn pages_behind_apache_are_complete_and_live() {
-    pages_are_complete_and_live(Rules::Apache).await;
-}
-
-#[actix_rt::test]
-async fn pages_behind_nginx_are_complete_and_live() {
-    pages_are_complete_and_live(Rules::Nginx).await;
-}
+through_both!(pages_are_complete_and_live);

@@ -9,10 +9,8 @@ pub enum Rules {
     Apache,
     /// `deploy/nginx.conf`
     Nginx,
-    /// The documents' page on port rewrite: every port, of the host that was asked for.
-    DocumentsPorts,
     /// The documents' page on a machine with a session server: every port of the machine, and three pages.
-    DocumentsMachine,
+    Documents,
 }
 
 /// What is particular to a machine.
@@ -38,7 +36,7 @@ impl Rules {
     pub fn session_path(self, session: u16, path: &str) -> String {
         match self {
             Self::Apache | Self::Nginx => path.to_owned(),
-            Self::DocumentsPorts | Self::DocumentsMachine => format!("/{session}{path}"),
+            Self::Documents => format!("/{session}{path}"),
         }
     }
 
@@ -91,16 +89,11 @@ impl Rules {
                     ("192.0.2.3", "127.0.0.2"),
                 ],
             ),
-            Self::DocumentsPorts | Self::DocumentsMachine => {
-                let (redirect, rules) = if self == Self::DocumentsPorts {
-                    (PORTS_HTTP, PORTS_HTTPS)
-                } else {
-                    (MACHINE_HTTP, MACHINE_HTTPS)
-                };
-                let rules = rules.replace("1999", &session.to_string()).replace("webserver.com", "localhost");
+            Self::Documents => {
+                let rules = DOCUMENTS_HTTPS.replace("1999", &session.to_string());
                 let there = pattern(there);
                 format!(
-                    "<VirtualHost 127.0.0.1:{http}>\nServerName localhost\nServerAlias www.localhost\n{redirect}</VirtualHost>\n\
+                    "<VirtualHost 127.0.0.1:{http}>\nServerName localhost\nServerAlias www.localhost\n{DOCUMENTS_HTTP}</VirtualHost>\n\
                      <VirtualHost 127.0.0.1:{https}>\nServerName localhost\nServerAlias www.localhost\n\
                      SSLEngine on\nSSLCertificateFile {chain}\nSSLCertificateKeyFile {key}\n\
                      RewriteEngine on\n\
@@ -123,27 +116,11 @@ pub fn adapt(text: &str, changes: &[(&str, &str)]) -> String {
     })
 }
 
-const PORTS_HTTP: &str = r"
-  RewriteEngine on
-  RewriteCond %{SERVER_NAME} =%{SERVER_NAME} [OR]
-  RewriteCond %{SERVER_NAME} =www.%{SERVER_NAME}
-  RewriteRule ^ https://%{SERVER_NAME}%{REQUEST_URI} [END,NE,R=permanent]
-";
-
-const PORTS_HTTPS: &str = r#"
-  RewriteCond %{SERVER_NAME} =www.webserver.com
-  RewriteRule ^ https://webserver.com%{REQUEST_URI} [END,NE,R=permanent]
-  RewriteCond %{HTTP:Upgrade} websocket [NC]
-  RewriteCond %{HTTP:Connection} upgrade [NC]
-  RewriteRule ^/(\d*)/(.*)$ "ws://%{SERVER_NAME}:$1/$2" [P,L]
-  RewriteRule ^/(\d*)/(.*)$ "http://%{SERVER_NAME}:$1/$2" [P,L]
-"#;
-
-const MACHINE_HTTP: &str = r#"
+const DOCUMENTS_HTTP: &str = r#"
   Redirect "/" "https://localhost/"
 "#;
 
-const MACHINE_HTTPS: &str = r#"
+const DOCUMENTS_HTTPS: &str = r#"
   RewriteCond %{HTTP:Upgrade} websocket [NC]
   RewriteCond %{HTTP:Connection} upgrade [NC]
   RewriteRule ^/(\d*)/(.*)$ "ws://localhost:$1/$2" [P,L]

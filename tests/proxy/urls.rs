@@ -58,12 +58,4 @@ async fn urls_lead_through_the_web_server(rules: Rules) {
     assert_eq!(http::get(&session.url("/health")).await.status, 200);
 }
 
-#[actix_rt::test]
-async fn urls_lead_through_apache() {
-    urls_lead_through_the_web_server(Rules::Apache).await;
-}
-
-#[actix_rt::test]
-async fn urls_lead_through_nginx() {
-    urls_lead_through_the_web_server(Rules::Nginx).await;
-}
+through_both!(urls_lead_through_the_web_server);

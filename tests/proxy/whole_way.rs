@@ -22,11 +22,6 @@ async fn the_whole_way(rules: Rules) {
     }
     assert_eq!(browser.get(&at_the_door("/status")).await.json()["servers"].as_array().unwrap().len(), 2);
     until("the door is open", async || browser.get(&at_the_door("/request")).await.text() == "1").await;
-    if rules == Rules::DocumentsMachine {
-        for path in ["/monitor", "/session", "/load"] {
-            assert_ne!(browser.get(path).await.status, 404, "{path}");
-        }
-    }
 
     // The door.
     let mut door = browser.connect(&at_the_door("/")).await;
@@ -58,22 +53,9 @@ async fn the_whole_way(rules: Rules) {
     door.leave().await;
 }
 
-#[actix_rt::test]
-async fn through_apache_with_our_rules() {
-    the_whole_way(Rules::Apache).await;
-}
+through_both!(the_whole_way);
 
 #[actix_rt::test]
-async fn through_nginx_with_our_rules() {
-    the_whole_way(Rules::Nginx).await;
-}
-
-#[actix_rt::test]
-async fn through_apache_with_the_documents_rule_for_ports() {
-    the_whole_way(Rules::DocumentsPorts).await;
-}
-
-#[actix_rt::test]
-async fn through_apache_with_the_documents_rules_for_a_machine() {
-    the_whole_way(Rules::DocumentsMachine).await;
+async fn through_apache_with_the_documents_rules() {
+    the_whole_way(Rules::Documents).await;
 }
