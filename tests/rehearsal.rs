@@ -10,7 +10,7 @@ use tokio::io::{AsyncBufReadExt, BufReader};
 use tokio::process::{Child, Command};
 
 use crate::support::authority::Authority;
-use crate::support::git::{Forge, arm, world};
+use crate::support::git::{Forge, arm};
 use crate::support::ports;
 use crate::support::program::{Server, session_server, simulation_server};
 use crate::support::stand_in::{Script, StandIn};
@@ -149,23 +149,38 @@ async fn who_names_a_simulation_server_in_place_of_a_session_server_is_told_so()
 }
 
 #[actix_rt::test]
-async fn a_simulation_server_that_misbehaves_is_named() {
-    let fleet = StandIn::start(Script { client: vec!["loading: wait"], ..Script::default() }).await;
-    let output = rehearse(&format!("http://{}", fleet.address), &[&ONE[..], &["--patience", "4s"]].concat()).await;
-    let said = text(&output.stdout);
-    let verdict = format!("None fits; 1 got none: no simulation within 4s at {}.", fleet.address);
-    assert!(said.contains(&verdict) && output.status.code() == Some(1), "{said}");
-}
-
-#[actix_rt::test]
-async fn who_stays_too_briefly_for_a_pace_does_not_fit() {
-    let fleet = StandIn::start(Script::default()).await;
-    let class = ["--clients", "1", "--over", "0s", "--stay", "1s"];
-    let output = rehearse(&format!("http://{}", fleet.address), &class).await;
-    let said = text(&output.stdout);
-    assert_eq!(output.status.code(), Some(1), "{said}");
-    assert!(said.contains("None stayed long enough to tell its pace."), "{said}");
-    assert!(said.contains("| ran, too briefly to tell their pace "), "{said}");
+async fn the_verdict_says_why_a_class_does_not_fit() {
+    let waits = Script { client: vec!["loading: wait"], ..Script::default() };
+    let webots =
+        vec!["model:<Scene/>", "paused by client", "application/json:{\"time\":1}", "application/json:{\"time\":2}"];
+    let breaks_off = Script { webots, ends: true, ..Script::default() };
+    let brief = ["--clients", "1", "--over", "0s", "--stay", "1s"];
+    let unseen = ["None was seen to its end.", "| ran, their end unseen "];
+    for (script, arguments, words) in [
+        (
+            waits,
+            [&ONE[..], &["--patience", "4s"]].concat(),
+            ["None fits; 1 got none: no simulation within 4s at {}."; 2],
+        ),
+        (
+            breaks_off,
+            ONE.to_vec(),
+            ["None fits; 1 broke off: the connection to Webots: closed with ", "None fits; 1 broke off"],
+        ),
+        (
+            Script::default(),
+            brief.to_vec(),
+            ["None stayed long enough to tell its pace.", "| ran, too briefly to tell their pace "],
+        ),
+        (Script::default(), [&ONE[..], &["--misbehave", "sleep=100"]].concat(), unseen),
+        (Script::default(), [&ONE[..], &["--misbehave", "vanish=100"]].concat(), unseen),
+    ] {
+        let fleet = StandIn::start(script).await;
+        let output = rehearse(&format!("http://{}", fleet.address), &arguments).await;
+        let said = text(&output.stdout);
+        assert_eq!(output.status.code(), Some(1), "{said}");
+        assert!(words.iter().all(|words| said.contains(&words.replace("{}", &fleet.address))), "{words:?}: {said}");
+    }
 }
 
 #[actix_rt::test]
@@ -276,29 +291,6 @@ async fn simulation_servers_elsewhere_behind_a_session_server_here_are_not_loade
     assert_eq!(fleet.asked("/client"), [""; 0]);
 }
 
-#[actix_rt::test]
-async fn a_world_with_a_space_or_an_umlaut_is_asked_for_as_browsers_do() {
-    let fleet = StandIn::start(Script::default()).await;
-    let world = world("lab/arm", "main", "worlds/Wände und 50%.wbt");
-    let output = output(command(&format!("http://{}", fleet.address), &world).args(ONE)).await;
-    let said = text(&output.stdout);
-    assert!(said.contains("All 1 fit."), "{said}{}", text(&output.stderr));
-    let asked = "/session?url=https://github.com/lab/arm/blob/main/worlds/W%C3%A4nde%20und%2050%.wbt";
-    assert_eq!(fleet.asked("/session"), [asked]);
-}
-
-#[actix_rt::test]
-async fn a_simulation_whose_end_nobody_sees_does_not_fit() {
-    let fleet = StandIn::start(Script::default()).await;
-    for behaviour in ["sleep=100", "vanish=100"] {
-        let output =
-            rehearse(&format!("http://{}", fleet.address), &[&ONE[..], &["--misbehave", behaviour]].concat()).await;
-        let said = text(&output.stdout);
-        assert_eq!(output.status.code(), Some(1), "{said}");
-        assert!(said.contains("None was seen to its end.") && said.contains("| ran, their end unseen "), "{said}");
-    }
-}
-
 fn signal(child: &Child, signal: Signal) {
     kill(Pid::from_raw(i32::try_from(child.id().unwrap()).unwrap()), signal).unwrap();
 }
@@ -340,17 +332,6 @@ async fn a_time_that_is_too_long_is_refused() {
             assert!(said.contains(name) && said.contains("allowed is up to 30d"), "{said}");
         }
     }
-}
-
-#[actix_rt::test]
-async fn the_verdict_says_why_simulations_broke_off() {
-    let webots =
-        vec!["model:<Scene/>", "paused by client", "application/json:{\"time\":1}", "application/json:{\"time\":2}"];
-    let fleet = StandIn::start(Script { webots, ends: true, ..Script::default() }).await;
-    let output = rehearse(&format!("http://{}", fleet.address), &ONE).await;
-    let said = text(&output.stdout);
-    assert_eq!(output.status.code(), Some(1), "{said}");
-    assert!(said.contains("None fits; 1 broke off: the connection to Webots: closed with "), "{said}");
 }
 
 #[actix_rt::test]

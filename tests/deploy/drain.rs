@@ -6,13 +6,9 @@ use nix::sys::signal::Signal;
 
 use crate::support::client::Client;
 use crate::support::git::{Forge, arm};
-use crate::support::program::{Server, session_server, simulation_server};
+use crate::support::program::{session_server, simulation_server};
 use crate::support::webots::Webots;
 use crate::support::{SOON, http, until};
-
-async fn post(server: &Server, path: &str, password: Option<&str>) -> u16 {
-    ask(awc::Client::builder().timeout(SOON).finish().post(server.url(path)), password).await
-}
 
 async fn ask(request: awc::ClientRequest, password: Option<&str>) -> u16 {
     let request = match password {
@@ -20,62 +16,6 @@ async fn ask(request: awc::ClientRequest, password: Option<&str>) -> u16 {
         None => request,
     };
     request.send().await.unwrap().status().as_u16()
-}
-
-/// Has a client whose simulation runs, drains the server in some way, and looks at everything until its end.
-async fn drain(how: impl AsyncFnOnce(&Server)) {
-    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
-    // As engines give passwords.
-    let secret = tempfile::NamedTempFile::new().unwrap();
-    std::fs::write(secret.path(), "open sesame\n").unwrap();
-    let builder = simulation_server(&webots.path(), forge.path(), 2);
-    let builder = builder.set("adminPassword", serde_json::json!({"file": secret.path()}));
-    // No sign of life breaks the silence that is listened for below.
-    let mut server = builder.set("timing.heartbeat", 60).start().await;
-    let session = session_server(&[server.address()]).set("loadThreshold", 1000).start().await;
-    until("it is available", async || http::get(&session.url("/request")).await.text() == "1").await;
-    let arm = arm();
-    let mut client = Client::start(&server, &arm).await;
-    client.until("webots:").await;
-    let viewer = format!("ws://127.0.0.1:{}/", server.port + 1);
-    let mut first = Client::connect(&viewer).await;
-    first.send("x3d").await;
-    first.until("scene load completed").await;
-
-    how(&server).await;
-
-    until("it is not offered any more", async || http::get(&session.url("/request")).await.text() == "0").await;
-    assert_eq!(http::get(&server.url("/load")).await.text(), "100");
-    let mut late = Client::start(&server, &arm).await;
-    late.until("loading: Error:").await;
-    late.closed().await;
-    // The simulation goes on as if nothing had happened, for its client and for those who look on.
-    assert!(client.is_silent(std::time::Duration::from_millis(500)).await, "{:#?}", client.heard);
-    first.send("real-time:-1").await;
-    first.until("application/json:").await;
-    let mut second = Client::connect(&viewer).await;
-    second.send("x3d").await;
-    second.until("scene load completed").await;
-
-    client.leave().await;
-    assert_eq!(server.ended().await, Some(0));
-    assert!(std::net::TcpListener::bind(("127.0.0.1", server.port)).is_ok(), "its successor can have the port");
-}
-
-#[actix_rt::test]
-async fn a_server_that_drains_by_signal_ends_with_its_last_simulation() {
-    drain(async |server| server.signal(Signal::SIGUSR1)).await;
-}
-
-#[actix_rt::test]
-async fn a_server_that_drains_by_request_ends_with_its_last_simulation() {
-    drain(async |server| {
-        assert_eq!(post(server, "/drain", None).await, 401);
-        assert_eq!(post(server, "/drain", Some("guess")).await, 401);
-        assert_eq!(http::get(&server.url("/status")).await.json()["draining"], false);
-        assert_eq!(post(server, "/drain", Some("open sesame")).await, 202);
-    })
-    .await;
 }
 
 #[actix_rt::test]

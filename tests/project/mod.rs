@@ -8,4 +8,3 @@ mod demo;
 mod layering;
 mod pages;
 mod refusals;
-mod source;

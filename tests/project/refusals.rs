@@ -121,24 +121,3 @@ async fn a_stale_pid_file_neither_hinders_a_start_nor_ends_another_process() {
     std::fs::write(&file, format!("{}\n", std::process::id())).unwrap();
     project.done(&["start", "demo"]).await;
 }
-
-#[actix_rt::test]
-async fn two_servers_on_one_port_are_no_start() {
-    let project = Project::copy();
-    project.configure("session/demo", |config| config["port"] = project.simulation.into());
-    let told = refused(&project, &["start", "demo"], 1).await;
-    assert!(told.contains("the session server of demo has not started"), "{told}");
-    assert!(told.contains(&format!("can't listen on 127.0.0.1:{}", project.simulation)), "{told}");
-    nothing_is_left(&project).await;
-}
-
-#[actix_rt::test]
-async fn a_host_with_a_quote_is_refused_in_one_line() {
-    let project = Project::copy();
-    project.configure("simulation/demo", |config| config["server"] = "a\"b".into());
-    let told = refused(&project, &["start", "demo"], 2).await;
-    assert_eq!(
-        told,
-        "error: config/simulation/demo.json: server: \"a\\\"b\" is no host; allowed are names and addresses, those of IPv6 in brackets\n"
-    );
-}

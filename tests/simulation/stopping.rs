@@ -16,12 +16,15 @@ use crate::support::{http, until};
 
 #[actix_rt::test]
 async fn a_server_that_drains_keeps_its_clients_takes_no_others_and_ends_with_the_last() {
+    // As engines give passwords.
+    let secret = tempfile::NamedTempFile::new().unwrap();
+    std::fs::write(secret.path(), "secret\n").unwrap();
     for by in ["signal", "page"] {
         let (forge, webots) = (Forge::with_arm(), Webots::launcher());
         let builder = simulation_server(&webots.path(), forge.path(), 1);
-        let mut server = builder.set("adminPassword", "secret").start().await;
+        let mut server = builder.set("adminPassword", json!({"file": secret.path()})).start().await;
         let mut running = Client::start(&server, &arm()).await;
-        running.until("webots:").await;
+        let stream = running.until("webots:").await["webots:".len()..].to_owned();
         let mut waiting = Client::start(&server, &arm()).await;
         waiting.until("queue: 0").await;
         let drain =
@@ -40,6 +43,10 @@ async fn a_server_that_drains_keeps_its_clients_takes_no_others_and_ends_with_th
         let told = late.until("loading: Error:").await;
         assert!(told.contains("about to end, and takes no new clients. Connect again"), "{told}");
         assert_eq!(late.closed().await, Some(1013), "another server may take it");
+        // The simulation goes on, also for those who come to look on.
+        let mut viewer = Client::connect(&format!("{stream}/")).await;
+        viewer.send("x3d").await;
+        viewer.until("scene load completed").await;
         running.leave().await;
         waiting.until("webots:").await;
         assert_eq!(stages(&server).await, ["idle"], "who was in the line is served");
@@ -96,15 +103,6 @@ async fn a_fault_of_the_configuration_is_one_line_and_exit_code_2() {
         assert!(said.starts_with("error: ") && said.contains("config.json: "), "{said}");
         assert!(words.iter().all(|word| said.contains(word)), "{key}: {value} gives {said}");
     }
-}
-
-#[actix_rt::test]
-async fn a_port_that_is_taken_ends_the_program_with_1() {
-    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
-    let first = simulation_server(&webots.path(), forge.path(), 1).start().await;
-    let mut second = simulation_server(&webots.path(), forge.path(), 1).set("port", first.port).spawn();
-    assert_eq!(second.ended().await, Some(1));
-    assert!(second.log().contains("can't listen on"), "{}", second.log());
 }
 
 /// Answers each request with the next of these codes and contents; returns the requests.
