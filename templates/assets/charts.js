@@ -1,15 +1,12 @@
-// The three charts of a simulation server: eleven series over ten minutes, with a legend that switches them.
+// The three charts of a simulation server: its readings over ten minutes, with a legend that switches them.
 
 import { Chart } from './chart.js';
 
-/** The series of each chart, by the headings of their columns; each has a colour of its own in its chart. */
+/** The charts: each has the columns whose headings begin with its word, the first one those that are left. */
 const GROUPS = [
-  {
-    title: 'Load and memory', unit: '%', most: 100,
-    series: ['CPU load', 'CPU memory', 'GPU load compute', 'GPU load memory', 'GPU memory', 'Swap', 'Disk'],
-  },
-  { title: 'Simulations', unit: '', whole: true, least: 4, series: ['Webots running', 'Webots idle'] },
-  { title: 'Network', unit: 'MB/s', least: 0.1, series: ['Network sent', 'Network received'] },
+  { title: 'Load and memory', unit: '%', most: 100 },
+  { title: 'Simulations', begin: 'Webots ', unit: '', whole: true, least: 4 },
+  { title: 'Network', begin: 'Network ', unit: 'MB/s', least: 0.1 },
 ];
 const KEPT = 600;
 const STORE = 'hidden-series';
@@ -29,10 +26,12 @@ export class Charts {
 
   /** Puts the charts into an element that names the columns of a sample. */
   constructor(root) {
-    const columns = root.dataset.columns.split(', ');
-    for (const { series, ...group } of GROUPS) {
-      group.series = series.map((name) => [name, columns.indexOf(name)]);
-      this.#charts.push(new Chart(root, group, this.#hidden, () => this.#switched(), (time) => this.#point(time)));
+    const all = root.dataset.columns.split(', ').map((name, index) => [name, index]);
+    const groupOf = (name) => GROUPS.find(({ begin }) => begin && name.startsWith(begin)) ?? GROUPS[0];
+    for (const group of GROUPS) {
+      // The first column is the time.
+      const series = all.slice(1).filter(([name]) => groupOf(name) === group);
+      this.#charts.push(new Chart(root, { ...group, series }, this.#hidden, () => this.#switched(), (time) => this.#point(time)));
     }
   }
 

@@ -70,20 +70,3 @@ async fn passwords_can_not_be_guessed_at_without_end() {
     assert_eq!(drain("203.0.113.10", Some("open sesame")).await, 202);
     assert_eq!(server.ended().await, Some(0));
 }
-
-#[actix_rt::test]
-async fn a_drained_server_is_followed_by_a_new_one_at_the_same_place() {
-    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
-    let folder = tempfile::tempdir().unwrap();
-    let builder = || simulation_server(&webots.path(), forge.path(), 1).folder(folder.path());
-    let mut old = builder().start().await;
-    let session = session_server(&[old.address()]).set("loadThreshold", 1000).start().await;
-    until("the old one is available", async || http::get(&session.url("/request")).await.text() == "1").await;
-    old.signal(Signal::SIGUSR1);
-    assert_eq!(old.ended().await, Some(0));
-    until("nothing is available", async || http::get(&session.url("/request")).await.text() == "0").await;
-    let new = builder().port(old.port).start().await;
-    until("the new one is available", async || http::get(&session.url("/request")).await.text() == "1").await;
-    let mut client = Client::start(&new, &arm()).await;
-    client.until("webots:").await;
-}

@@ -106,11 +106,3 @@ async fn a_watchdog_is_fed_until_the_server_hangs() {
         assert_eq!(server.ended().await, Some(0));
     }
 }
-
-#[actix_rt::test]
-async fn a_server_without_a_watchdog_tells_nothing_more() {
-    let manager = Manager::new();
-    let _server = manager.start(session_server(&[]));
-    manager.expect("READY=1\n").await;
-    assert_eq!(manager.hear(Duration::from_millis(500)).await, None);
-}

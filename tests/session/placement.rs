@@ -45,28 +45,6 @@ async fn a_burst_between_two_reports_is_spread_evenly() {
 }
 
 #[actix_rt::test]
-async fn a_burst_over_servers_that_report_only_their_load_is_spread_evenly() {
-    let servers = [(); 5].map(|()| StandIn::start(Manner::Load("3.0".to_owned())));
-    let session = between_reports(&servers, 0.05).start().await;
-    until_states(&session, &["up"; 5]).await;
-    let got = requests(&session, 1000).await;
-    assert_eq!(got, servers.iter().map(|server| (server.url(), 200)).collect());
-}
-
-#[actix_rt::test]
-async fn a_burst_over_unequal_servers_ends_level() {
-    let loads = [0.0, 10.0, 20.0, 30.0, 40.0];
-    let servers = loads.map(|load| StandIn::start(Manner::idle(load, 1000)));
-    let session = between_reports(&servers, 0.25).start().await;
-    until_states(&session, &["up"; 5]).await;
-    let got = requests(&session, 1000).await;
-    for (server, load) in servers.iter().zip(loads) {
-        let ends_at = load + 0.25 * got.get(&server.url()).copied().unwrap_or_default() as f64;
-        assert!((69.75..=70.25).contains(&ends_at), "one server ends at {ends_at} %: {got:?}");
-    }
-}
-
-#[actix_rt::test]
 async fn availability_ends_when_placements_use_up_the_room_and_comes_back_when_they_expire() {
     let servers = [StandIn::start(Manner::idle(90.0, 100))];
     let session = between_reports(&servers, 2.0).set("timing", serde_json::json!({"placement": 6})).start().await;

@@ -5,7 +5,6 @@ use std::time::Duration;
 use super::stand_in::{Manner, StandIn};
 use super::{addresses, times_logged, until_states};
 use crate::support::client::Client;
-use crate::support::listener::listen;
 use crate::support::program::session_server;
 use crate::support::stopwatch::Stopwatch;
 use crate::support::{http, ports, until};
@@ -105,15 +104,6 @@ async fn absurd_numbers_do_no_harm() {
     assert_eq!(http::get(&session.url("/session")).await.text(), servers[1].url());
     assert_eq!(http::get(&session.url("/monitor")).await.status, 200);
     assert!(!session.log().contains("overflow"));
-}
-
-#[actix_rt::test]
-async fn a_server_may_be_named_by_an_ipv6_address() {
-    let socket = std::net::TcpListener::bind("[::1]:0").unwrap();
-    let address = socket.local_addr().unwrap().to_string();
-    listen(socket, |_| Some((200, "{\"load\": 5}")));
-    let session = session_server(&[address]).start().await;
-    until_states(&session, &["up"]).await;
 }
 
 #[actix_rt::test]

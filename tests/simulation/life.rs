@@ -8,7 +8,7 @@
 //! | the connection breaks | the same | `a_connection_that_breaks_leaves_nothing_in_any_state` |
 //! | the connection is half open | the same | `a_half_open_connection_is_found_by_ping_in_any_state` |
 //! | Webots ends, in three ways | launching, idle, running: in others there is none | `a_client_is_told_how_webots_ended` |
-//! | Webots does not end when asked | stopping | `a_simulator_that_ignores_sigterm_and_hides_ends_after_the_grace_time` |
+//! | Webots does not end when asked | stopping | `isolation::lives::a_simulation_that_takes_no_notice_is_killed_after_its_grace_time` |
 //! | git is killed, or hangs | checking out | `checkout::a_kill_in_the_middle_of_a_fetch...`, `checkout::a_remote_that_hangs...` |
 //! | the time limit | launching, idle, running, stopping: it counts from the start of Webots | `simulation_limits` (`time`) |
 //! | the limits of a checkout and of a launch | checking out, launching | `simulation_limits` (`time`), `ready::a_launch_that_never_listens...` |
@@ -95,15 +95,6 @@ async fn a_half_open_connection_is_found_by_ping_in_any_state() {
         }
         nothing_left(&scene.server, 1).await;
     }
-}
-
-#[actix_rt::test]
-async fn a_simulator_that_ignores_sigterm_and_hides_ends_after_the_grace_time() {
-    // The script ignores SIGTERM, and has a child in a session of its own.
-    let scene = Scene::new(State::Stopping, |builder| quick(builder).set("timing.grace", 2.0)).await;
-    assert!(instances_below(&scene.server.folder).iter().any(|one| one.1 == "sleep 1000"));
-    let took = gone_within(2.0, scene.left.unwrap(), &scene.server).await;
-    assert!(took >= Duration::from_secs(2), "it was killed after {took:?}");
 }
 
 #[actix_rt::test]

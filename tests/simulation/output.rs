@@ -6,7 +6,7 @@ use super::scene::{DEMO, arm, nothing_left};
 use crate::support::client::Client;
 use crate::support::git::Forge;
 use crate::support::program::{Server, simulation_server};
-use crate::support::webots::{Webots, instances_below};
+use crate::support::webots::Webots;
 use crate::support::{http, until};
 
 /// The file of a simulation's output, as the server tells.
@@ -40,33 +40,6 @@ async fn a_flood_of_output_harms_nobody_and_its_file_is_bounded() {
         client.leave().await;
         nothing_left(&server, 2).await;
     }
-}
-
-#[actix_rt::test]
-async fn a_simulator_that_forks_and_hides_and_ignores_signals_leaves_nothing() {
-    let forge = Forge::with_arm();
-    // Children of children, in sessions of their own, without parents, deaf to SIGTERM.
-    let hide = "for n in $(seq 40); do (trap '' TERM HUP; setsid bash -c 'trap \"\" TERM; sleep 1000 & wait' &) ; done";
-    let webots = Webots::script(&format!("{hide}\n{DEMO} \"$@\" & wait"));
-    let server = simulation_server(&webots.path(), forge.path(), 1).set("timing.grace", 0.3).start().await;
-    let mut client = Client::start(&server, &arm()).await;
-    client.until("webots:").await;
-    assert!(instances_below(&server.folder).len() > 40);
-    client.leave().await;
-    nothing_left(&server, 1).await;
-}
-
-#[actix_rt::test]
-async fn a_simulator_that_forks_without_end_is_ended() {
-    let forge = Forge::with_arm();
-    let webots = Webots::script(&format!(
-        "{DEMO} \"$@\" &\ntrap '' TERM\nwhile true; do (sleep 0.05; sleep 1000) & sleep 0.02; done"
-    ));
-    let server = simulation_server(&webots.path(), forge.path(), 1).set("timing.grace", 0.3).start().await;
-    let mut client = Client::start(&server, &arm()).await;
-    client.until("webots:").await;
-    client.leave().await;
-    nothing_left(&server, 1).await;
 }
 
 #[actix_rt::test]

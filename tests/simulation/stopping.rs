@@ -152,11 +152,3 @@ async fn the_server_announces_itself_and_waits_for_nobody() {
     let mut client = Client::start(&server, &arm()).await;
     client.until("webots:").await;
 }
-
-#[actix_rt::test]
-async fn many_may_come_at_once() {
-    let (forge, webots) = (Forge::new(), Webots::launcher());
-    let server = simulation_server(&webots.path(), forge.path(), 1).start().await;
-    server.crowd(1000);
-    until("it answers", async || http::try_get(&server.url("/health")).await.is_ok()).await;
-}
