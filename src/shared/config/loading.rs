@@ -50,11 +50,12 @@ pub struct LoadedConfig<C> {
 /// # Errors
 /// When the file can't be read, or a value is not allowed.
 pub fn load<C: Configuration>(file: &Path) -> Result<LoadedConfig<C>, ConfigError> {
-    let text = read_file(file).map_err(|source| ConfigError::Unreadable { file: file.to_owned(), source })?;
+    let wrong = |problem| ConfigError { file: file.to_owned(), problem };
+    let text = read_file(file).map_err(|error| wrong(format!("can't be read: {error}")))?;
     // Some editors begin a file with a byte order mark.
     let text = text.strip_prefix('\u{feff}').unwrap_or(&text);
     if !text.trim_start().starts_with('{') {
-        return Err(ConfigError::NotAnObject { file: file.to_owned() });
+        return Err(wrong("it is not a JSON object; allowed is {\"KEY\": VALUE, ...}".to_owned()));
     }
     let mut unknown = Vec::new();
     let mut seen = BTreeSet::new();
@@ -64,22 +65,18 @@ pub fn load<C: Configuration>(file: &Path) -> Result<LoadedConfig<C>, ConfigErro
     let parsed = serde_ignored::deserialize(tracked, |path| unknown.push(path.to_string()))
         .and_then(|config| json.end().map(|()| config));
     let mut config: C = parsed.map_err(|source| {
-        let key = Some(one_line(&track.path().to_string())).filter(|key| key != "." && key != "?");
-        ConfigError::Malformed { file: file.to_owned(), key, problem: one_line(&source.to_string()) }
+        let key = one_line(&track.path().to_string());
+        let problem = one_line(&source.to_string());
+        wrong(if key == "." || key == "?" { problem } else { format!("{key}: {problem}") })
     })?;
     // One that comes again is told once.
     unknown.retain(|key: &String| seen.insert(key.clone()));
     if let Some((key, advice)) = C::REMOVED.iter().find(|(key, _)| seen.contains(*key)) {
-        let (file, problem) = (file.to_owned(), (*advice).to_owned());
-        return Err(ConfigError::InvalidValue { file, key, problem });
+        return Err(wrong(format!("{key}: {advice}")));
     }
     let known = known_keys(&config);
     let mut warnings: Vec<String> = unknown.iter().map(|key| unknown_key(file, key, &known)).collect();
-    let more = config.complete(file).map_err(|InvalidValue { key, problem }| ConfigError::InvalidValue {
-        file: file.to_owned(),
-        key,
-        problem,
-    })?;
+    let more = config.complete(file).map_err(|InvalidValue { key, problem }| wrong(format!("{key}: {problem}")))?;
     warnings.extend(more.iter().map(|warning| format!("{}: {warning}", file.display())));
     Ok(LoadedConfig { config, warnings })
 }
@@ -106,19 +103,12 @@ fn flat_values<C: Serialize>(config: &C) -> BTreeMap<String, serde_json::Value> 
     flat
 }
 
-/// Returns every key of a configuration; the keys of its parts as `part.key`.
+/// Returns every key of a configuration, and those of its parts as `part.key`.
 fn known_keys<C: Configuration>(config: &C) -> Vec<String> {
-    let mut keys: Vec<String> = C::ALIASES.iter().map(|&alias| alias.to_owned()).collect();
-    let Ok(serde_json::Value::Object(values)) = serde_json::to_value(config) else {
-        return keys;
-    };
-    for (key, value) in values {
-        if let serde_json::Value::Object(part) = value {
-            keys.extend(part.keys().map(|inner| format!("{key}.{inner}")));
-        }
-        keys.push(key);
-    }
-    keys
+    let parts = serde_json::to_value(config).unwrap_or_default();
+    let parts = parts.as_object().into_iter().flat_map(|values| values.keys().cloned().collect::<Vec<_>>());
+    let aliases = C::ALIASES.iter().map(|&alias| alias.to_owned());
+    aliases.chain(flat_values(config).into_keys()).chain(parts).collect()
 }
 
 /// A warning about an unknown key, with the most similar known one.

@@ -20,13 +20,6 @@ pub struct PublicAddress {
     rewritten: bool,
 }
 
-/// A text that is not a public address.
-#[derive(Debug, thiserror::Error)]
-#[error("{found:?} is no address; allowed is HOST:PORT, or HOST/PORT where a web server rewrites ports")]
-pub struct NoAddress {
-    found: String,
-}
-
 /// Checks that a text is a host name or an IP address.
 ///
 /// # Errors
@@ -95,18 +88,19 @@ impl From<PublicAddress> for String {
 }
 
 impl TryFrom<String> for PublicAddress {
-    type Error = NoAddress;
+    type Error = String;
 
-    fn try_from(text: String) -> Result<Self, NoAddress> {
+    fn try_from(text: String) -> Result<Self, String> {
         text.parse()
     }
 }
 
 impl FromStr for PublicAddress {
-    type Err = NoAddress;
+    type Err = String;
 
-    fn from_str(text: &str) -> Result<Self, NoAddress> {
-        let no_address = || NoAddress { found: text.to_owned() };
+    fn from_str(text: &str) -> Result<Self, String> {
+        let no_address =
+            || format!("{text:?} is no address; allowed is HOST:PORT, or HOST/PORT where a web server rewrites ports");
         let (host, port, rewritten) = match text.split_once('/') {
             Some((host, port)) => (host, port, true),
             None => text.rsplit_once(':').map(|(host, port)| (host, port, false)).ok_or_else(no_address)?,
@@ -196,7 +190,7 @@ mod tests {
                     "a;b:1",
                 ])
         {
-            let error = text.parse::<PublicAddress>().unwrap_err().to_string();
+            let error = text.parse::<PublicAddress>().unwrap_err();
             assert!(error.contains(&format!("{text:?}")), "{error}");
         }
     }

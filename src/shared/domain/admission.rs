@@ -2,7 +2,7 @@
 
 use super::load::Load;
 use super::project_url::ProjectUrl;
-use super::repositories::{UrlPrefix, any_covers, any_may_cover};
+use super::repositories::UrlPrefix;
 
 /// The rules of a server.
 #[derive(Debug, Clone)]
@@ -52,10 +52,10 @@ impl<Prefixes: AsRef<[UrlPrefix]>> Rules<Prefixes> {
     /// # Errors
     /// Why it may not.
     pub fn admit<'world>(&self, world: &'world ProjectUrl, load: Load) -> Result<(), Refusal<'world>> {
-        if any_may_cover(self.blocked.as_ref(), world) {
+        if self.blocked.as_ref().iter().any(|prefix| prefix.may_cover(world)) {
             return Err(Refusal::Blocked(world));
         }
-        if any_covers(self.allowed.as_ref(), world) {
+        if self.allowed.as_ref().iter().any(|prefix| prefix.covers(world)) {
             return Ok(());
         }
         if !self.docker {

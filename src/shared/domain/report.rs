@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 use super::admission::Rules;
 use super::load::Load;
 use super::project_url::ProjectUrl;
-use super::repositories::{UrlPrefix, any_covers, any_may_cover};
+use super::repositories::UrlPrefix;
 use crate::shared::config::{object, optional_object};
 use crate::shared::text::one_line;
 
@@ -114,9 +114,9 @@ impl ServerReport {
     /// out, as the Python session server expects it.
     pub fn accepts(&self, world: &ProjectUrl) -> bool {
         let Some(docker) = self.docker else {
-            let blocked = any_may_cover(&self.blocked_repositories, world);
+            let blocked = self.blocked_repositories.iter().any(|prefix| prefix.may_cover(world));
             let open = self.allowed_repositories.is_empty() || self.share_idle_time > 0.0;
-            return !blocked && (open || any_covers(&self.allowed_repositories, world));
+            return !blocked && (open || self.allowed_repositories.iter().any(|prefix| prefix.covers(world)));
         };
         let rules = Rules {
             allowed: self.allowed_repositories.as_slice(),

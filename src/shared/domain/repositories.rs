@@ -117,16 +117,6 @@ impl From<UrlPrefix> for String {
     }
 }
 
-/// Whether any of these prefixes covers a world's URL.
-pub fn any_covers(prefixes: &[UrlPrefix], world: &ProjectUrl) -> bool {
-    prefixes.iter().any(|prefix| prefix.covers(world))
-}
-
-/// Whether a world's URL may mean something that any of these prefixes covers.
-pub fn any_may_cover(prefixes: &[UrlPrefix], world: &ProjectUrl) -> bool {
-    prefixes.iter().any(|prefix| prefix.may_cover(world))
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;

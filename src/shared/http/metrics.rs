@@ -5,7 +5,7 @@ use prometheus::{Encoder, GaugeVec, Histogram, HistogramOpts, IntCounterVec, Opt
 /// The metrics of one server.
 ///
 /// Counters live as long as the server; gauges are set from its state whenever somebody asks.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Default)]
 pub struct Metrics {
     counters: Registry,
 }
@@ -36,7 +36,7 @@ impl<'text> Gauge<'text> {
 impl Metrics {
     /// Creates an empty registry.
     pub fn new() -> Self {
-        Self { counters: Registry::new() }
+        Self::default()
     }
 
     /// Adds a counter with one label.
@@ -79,11 +79,5 @@ impl Metrics {
         let mut text = Vec::new();
         TextEncoder::new().encode(&families, &mut text)?;
         Ok(text)
-    }
-}
-
-impl Default for Metrics {
-    fn default() -> Self {
-        Self::new()
     }
 }

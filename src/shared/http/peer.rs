@@ -17,13 +17,6 @@ use serde::{Deserialize, Serialize};
 #[serde(try_from = "Vec<String>", into = "Vec<String>")]
 pub struct TrustedProxies(Vec<IpNet>);
 
-/// A text that is not a network.
-#[derive(Debug, PartialEq, Eq, thiserror::Error)]
-#[error("{found:?} is no network; allowed are addresses (10.0.0.1, fd00::1) and networks (10.0.0.0/8, fd00::/8)")]
-pub struct NoNetwork {
-    found: String,
-}
-
 /// The client at the other end of a connection.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Peer {
@@ -111,12 +104,14 @@ impl Default for TrustedProxies {
 }
 
 impl TryFrom<Vec<String>> for TrustedProxies {
-    type Error = NoNetwork;
+    type Error = String;
 
-    fn try_from(texts: Vec<String>) -> Result<Self, NoNetwork> {
+    fn try_from(texts: Vec<String>) -> Result<Self, String> {
         let network = |text: String| {
             let alone = text.parse::<IpAddr>().map(IpNet::from);
-            alone.or_else(|_| text.parse::<IpNet>()).map_err(|_| NoNetwork { found: text })
+            alone.or_else(|_| text.parse::<IpNet>()).map_err(|_| {
+                format!("{text:?} is no network; allowed are addresses (10.0.0.1, fd00::1) and networks (10.0.0.0/8, fd00::/8)")
+            })
         };
         texts.into_iter().map(network).collect::<Result<_, _>>().map(Self)
     }

@@ -48,7 +48,7 @@ pub async fn copy_call<'call>(
     let mut arguments = vec![with("--work-tree=", into)];
     arguments.extend(["checkout", "--force", "--progress", "--pathspec-file-nul"].map(OsString::from));
     arguments.extend([with("--pathspec-from-file=", &list), revision.reference().into()]);
-    let mut call = Call { memory: LITTLE_MEMORY, ..repository.call(arguments) };
+    let mut call = Call { memory: LITTLE_MEMORY, ..repository.call(&arguments) };
     call.environment.push(("GIT_INDEX_FILE".into(), scratch.join("index").into()));
     call.environment.push(("GIT_ATTR_SOURCE".into(), revision.reference().into()));
     Ok(call)

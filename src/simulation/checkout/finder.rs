@@ -184,19 +184,23 @@ impl Finder {
         revision: &Revision,
         path: &str,
     ) -> Result<Answer, CheckoutError> {
-        match repository.read(revision.list_arguments(path)).await {
+        match repository.read(&revision.list_arguments(path)).await {
             Ok(text) => Ok(Answer::Text(text)),
             Err(error @ (GitError::Machine(_) | GitError::TooLong(_) | GitError::Slow(_))) => {
                 Err(git_failed(world, error))
             }
-            Err(error) if repository.read(revision.exists_arguments()).await.is_err() => {
+            Err(error)
+                if repository.read(&["rev-parse", "--quiet", "--verify", &revision.reference()]).await.is_err() =>
+            {
                 log::debug!("{} is not in the cache: {error}", revision.commit);
                 Ok(Answer::Absent)
             }
-            Err(source) => match repository.read(revision.kind_arguments()).await {
-                Ok(kind) if kind.starts_with(b"blob") => Ok(Answer::File),
-                _ => Err(CheckoutError::Damaged { repository: world.repository(), source }),
-            },
+            Err(source) => {
+                match repository.read(&["cat-file", "-t", &format!("{}^{{}}", revision.reference())]).await {
+                    Ok(kind) if kind.starts_with(b"blob") => Ok(Answer::File),
+                    _ => Err(CheckoutError::Damaged { repository: world.repository(), source }),
+                }
+            }
         }
     }
 

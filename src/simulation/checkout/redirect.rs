@@ -5,8 +5,6 @@
 //! answered, and the world is looked for there: so the lists, and git's settings for proxies, certificates and passwords, hold
 //! for each step.
 
-use std::ffi::OsString;
-
 use url::Url;
 
 use super::error::CheckoutError;
@@ -42,7 +40,6 @@ pub async fn follow(
 
 /// Where a forge sends to who asks for a repository, as it says it.
 async fn location(git: &Git, repository: &Repository) -> Option<String> {
-    let arguments = ["ls-remote", "--quiet", "--", &repository.remote().location, "HEAD"].map(OsString::from).to_vec();
     let trace = [("GIT_TRACE_CURL", "1"), ("GIT_TRACE_CURL_NO_DATA", "1")];
     let environment = trace.map(|(name, value)| (name.into(), value.into())).to_vec();
     let mut location = None;
@@ -55,7 +52,12 @@ async fn location(git: &Git, repository: &Repository) -> Option<String> {
         }
     };
     // It fails again, since the forge sends it elsewhere.
-    git.run(Call { environment, ..repository.call(arguments) }, look).await.ok();
+    git.run(
+        Call { environment, ..repository.call(&["ls-remote", "--quiet", "--", &repository.remote().location, "HEAD"]) },
+        look,
+    )
+    .await
+    .ok();
     location
 }
 

@@ -1,6 +1,6 @@
 //! One cached repository: an ordinary bare one, into which git fetches commits of one remote, one fetch at a time.
 
-use std::ffi::OsString;
+use std::ffi::OsStr;
 use std::io;
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -59,11 +59,11 @@ impl Repository {
     }
 
     /// A git command on this repository.
-    pub fn call(&self, arguments: Vec<OsString>) -> Call<'_> {
+    pub fn call(&self, arguments: &[impl AsRef<OsStr>]) -> Call<'_> {
         Call {
             repository: &self.path,
             settings: Vec::new(),
-            arguments,
+            arguments: arguments.iter().map(Into::into).collect(),
             protocol: self.remote().protocol,
             memory: MOST_MEMORY,
             file_size: None,
@@ -76,7 +76,7 @@ impl Repository {
     ///
     /// # Errors
     /// When git fails.
-    pub async fn read(&self, arguments: Vec<OsString>) -> Result<Vec<u8>, GitError> {
+    pub async fn read(&self, arguments: &[impl AsRef<OsStr>]) -> Result<Vec<u8>, GitError> {
         let mut call = self.call(arguments);
         // What is missing must not be asked for: the remote of a history would be.
         call.protocol = "none";
@@ -113,7 +113,7 @@ impl Repository {
             }
         };
         let file_size = Some(self.limits.size);
-        let call = Call { settings: request.settings.clone(), file_size, ..self.call(request.arguments.clone()) };
+        let call = Call { settings: request.settings.clone(), file_size, ..self.call(&request.arguments) };
         if let Err(error) = self.git.run(call, tell).await {
             let path = self.path.clone();
             let received = blocking(move || Ok(received(&path))).await?;
@@ -154,7 +154,7 @@ impl Repository {
         if is_there.await? {
             return Ok(());
         }
-        let call = Call { repository: &new, ..self.call(revision::init_arguments(request.is_sha256)) };
+        let call = Call { repository: &new, ..self.call(&revision::init_arguments(request.is_sha256)) };
         self.git.run(call, |_| ()).await?;
         tokio::fs::rename(&new, &self.path).await?;
         *self.made.lock() = Some(Instant::now());
@@ -166,8 +166,7 @@ impl Repository {
         let this = Arc::clone(self);
         tokio::spawn(async move {
             let _guard = guard;
-            let arguments = ["gc", "--auto", "--quiet"].map(OsString::from).to_vec();
-            let call = Call { time: this.limits.patience(), ..this.call(arguments) };
+            let call = Call { time: this.limits.patience(), ..this.call(&["gc", "--auto", "--quiet"]) };
             if let Err(error) = this.git.run(call, |_| ()).await {
                 log::warn!("{} can't be packed: {error}", this.path.display());
             }

@@ -1,7 +1,5 @@
 //! Which commit a world's URL means, and what lies in it: arguments for git and the reading of its answers. Pure.
 
-use std::ffi::OsString;
-
 use crate::shared::domain::{ProjectUrl, Reading, RefKind};
 
 /// One commit that a world's URL may mean.
@@ -37,7 +35,7 @@ pub struct FetchRequest {
     /// Settings that git needs for it, each as `name=value`.
     pub settings: Vec<String>,
     /// What git is to do.
-    pub arguments: Vec<OsString>,
+    pub arguments: Vec<String>,
     /// Whether the repository's hashes are of SHA-256.
     pub is_sha256: bool,
 }
@@ -57,14 +55,9 @@ pub fn commit_of(world: &ProjectUrl, allow_any: bool) -> Option<Revision> {
 }
 
 /// Makes a bare repository. git before 2.29 knows only the older kind of hashes, and no name for it.
-pub fn init_arguments(is_sha256: bool) -> Vec<OsString> {
+pub fn init_arguments(is_sha256: bool) -> Vec<&'static str> {
     let kind = is_sha256.then_some("--object-format=sha256");
-    ["init", "--quiet", "--bare"].into_iter().chain(kind).map(OsString::from).collect()
-}
-
-/// Asks the remote for all its branches and tags.
-pub fn tips_arguments(location: &str) -> Vec<OsString> {
-    ["ls-remote", "--quiet", "--heads", "--tags", "--", location].map(OsString::from).to_vec()
+    ["init", "--quiet", "--bare"].into_iter().chain(kind).collect()
 }
 
 /// Whether a commit is the newest of a branch or tag in such an answer.
@@ -86,7 +79,7 @@ pub fn history(location: &str, commit: &str) -> FetchRequest {
     let settings = vec![format!("remote.origin.url={location}")];
     let options = ["fetch", "--filter=tree:0", "--prune", "--no-tags", "--no-write-fetch-head", "--progress", "--"];
     let all = ["origin", "+refs/heads/*:refs/heads/*", "+refs/tags/*:refs/tags/*"];
-    let arguments = options.into_iter().chain(all).map(OsString::from).collect();
+    let arguments = options.into_iter().chain(all).map(str::to_owned).collect();
     FetchRequest { name: "history".to_owned(), settings, arguments, is_sha256: is_sha256(commit) }
 }
 
@@ -94,22 +87,10 @@ fn is_sha256(hash: &str) -> bool {
     hash.len() == 64
 }
 
-/// Asks whether a commit is in a repository.
-pub fn known_arguments(commit: &str) -> Vec<OsString> {
-    ["cat-file", "-e", commit].map(OsString::from).to_vec()
-}
-
-/// Names a branch or tag of a fetched history in which a commit is.
-pub fn reachable_arguments(commit: &str) -> Vec<OsString> {
-    let fixed = ["for-each-ref", "--count=1", "--contains", commit, "refs/heads", "refs/tags"];
-    fixed.map(OsString::from).to_vec()
-}
-
 /// Asks the remote for all branches and tags that a URL may mean.
-pub fn search_arguments(world: &ProjectUrl, location: &str) -> Vec<OsString> {
+pub fn search_arguments(world: &ProjectUrl, location: &str) -> Vec<String> {
     let names = world.candidates().into_iter().take(MOST_READINGS).flat_map(|reading| full_names(world, &reading));
-    let fixed = ["ls-remote", "--quiet", "--", location].map(OsString::from);
-    fixed.into_iter().chain(names.map(OsString::from)).collect()
+    ["ls-remote", "--quiet", "--", location].map(str::to_owned).into_iter().chain(names).collect()
 }
 
 fn full_names(world: &ProjectUrl, reading: &Reading) -> Vec<String> {
@@ -154,7 +135,7 @@ impl Revision {
     pub fn request(&self, location: &str) -> FetchRequest {
         let refspec = format!("+{}:{}", self.commit, self.reference());
         let options = ["fetch", "--depth=1", "--no-tags", "--no-write-fetch-head", "--progress", "--"];
-        let arguments = options.into_iter().chain([location, &refspec]).map(OsString::from).collect();
+        let arguments = options.into_iter().chain([location, &refspec]).map(str::to_owned).collect();
         FetchRequest { name: self.reference(), settings: Vec::new(), arguments, is_sha256: is_sha256(&self.commit) }
     }
 
@@ -164,11 +145,11 @@ impl Revision {
     }
 
     /// Asks for an entry of the repository, and for all that is directly in the folders above the project's.
-    pub fn list_arguments(&self, path: &str) -> Vec<OsString> {
+    pub fn list_arguments(&self, path: &str) -> Vec<String> {
         let root = (!self.folder.is_empty()).then_some(".".to_owned());
         let above = self.folder.match_indices('/').filter_map(|(end, _)| Some(format!("{}/", self.folder.get(..end)?)));
-        let fixed = ["ls-tree", "-z", "--full-tree", &self.reference(), "--", path].map(OsString::from);
-        fixed.into_iter().chain(root.into_iter().chain(above).map(OsString::from)).collect()
+        let fixed = ["ls-tree", "-z", "--full-tree", &self.reference(), "--", path].map(str::to_owned);
+        fixed.into_iter().chain(root).chain(above).collect()
     }
 
     /// Reads the answer: the files directly in the folders above the project's, each path ended by a zero byte, if there is
@@ -184,16 +165,6 @@ impl Revision {
             None => !folder.is_empty(),
         });
         is_there.then(|| paths.into_iter().flat_map(|path| path.iter().chain(&[0])).copied().collect())
-    }
-
-    /// Asks whether the name is there.
-    pub fn exists_arguments(&self) -> Vec<OsString> {
-        ["rev-parse", "--quiet", "--verify", &self.reference()].map(OsString::from).to_vec()
-    }
-
-    /// Asks what kind of object stands behind the name.
-    pub fn kind_arguments(&self) -> Vec<OsString> {
-        ["cat-file", "-t", &format!("{}^{{}}", self.reference())].map(OsString::from).to_vec()
     }
 
     /// Where the world lies in the repository.

@@ -1,6 +1,6 @@
 //! What a search for a commit asks the remote, and the history of its branches and tags.
 
-use std::ffi::OsString;
+use std::ffi::OsStr;
 use std::sync::Arc;
 
 use super::cache::Cache;
@@ -72,16 +72,18 @@ impl Search<'_> {
     }
 
     async fn is_reachable(self, history: &Repository, commit: &str) -> Result<bool, CheckoutError> {
-        if history.read(revision::known_arguments(commit)).await.is_err() {
+        if history.read(&["cat-file", "-e", commit]).await.is_err() {
             return Ok(false);
         }
-        let branches = history.read(revision::reachable_arguments(commit)).await;
+        let branches = ["for-each-ref", "--count=1", "--contains", commit, "refs/heads", "refs/tags"];
+        let branches = history.read(&branches).await;
         branches.map(|answer| !answer.is_empty()).map_err(|error| git_failed(self.world, error))
     }
 
     /// All branches and tags of the remote.
     async fn tips(self) -> Result<String, CheckoutError> {
-        self.answer(revision::tips_arguments(&self.repository.remote().location)).await
+        let location = &self.repository.remote().location;
+        self.answer(&["ls-remote", "--quiet", "--heads", "--tags", "--", location]).await
     }
 
     /// Asks the remote for the branches and tags that the world's URL may mean.
@@ -89,10 +91,10 @@ impl Search<'_> {
     /// # Errors
     /// When it can't answer.
     pub async fn ask(self) -> Result<String, CheckoutError> {
-        self.answer(revision::search_arguments(self.world, &self.repository.remote().location)).await
+        self.answer(&revision::search_arguments(self.world, &self.repository.remote().location)).await
     }
 
-    async fn answer(self, arguments: Vec<OsString>) -> Result<String, CheckoutError> {
+    async fn answer(self, arguments: &[impl AsRef<OsStr>]) -> Result<String, CheckoutError> {
         let turn = self.repository.may_ask().await;
         let _turn = turn.map_err(|error| machine(self.world, &std::io::Error::other(error)))?;
         let call = Call { memory: LITTLE_MEMORY, ..self.repository.call(arguments) };
