@@ -14,6 +14,8 @@ let viewer;
 /** Watches the connection of a simulation that one can come back to. */
 let lifeline;
 let countdown;
+/** Counts the time that a simulation has left which is paused. */
+let idling;
 let wanted;
 let patience;
 /** How often another simulation server was asked for since the form was sent; and the timer for the next time. */
@@ -218,6 +220,7 @@ function follow(current, server, world, isBack = false) {
   });
   on('step', step);
   on('left', countDown);
+  on('idle', (seconds) => tellIdle(seconds, current));
   on('failed', (why) => {
     if (isBack && SHARE.test(why))
       lifeline?.broken(true);
@@ -275,6 +278,8 @@ function comeBack() {
   if (!left)
     return;
   simulation?.detach();
+  // Who is back is told again.
+  tellIdle();
   // What its stream still says is no sign of life of this simulation's server.
   viewer?.freeze?.();
   follow(new Simulation(left.server, { token: left.token }), left.server, left.world, true);
@@ -343,6 +348,26 @@ function countDown(seconds) {
   tick();
   find('left').hidden = false;
   countdown = setInterval(tick, 1000);
+}
+
+/** A simulation that is paused ends, unless somebody keeps it. */
+function tellIdle(seconds, current) {
+  clearInterval(idling);
+  find('idle').hidden = seconds === undefined;
+  if (seconds === undefined)
+    return;
+  const end = Date.now() + 1000 * seconds;
+  const tick = () => {
+    const left = duration((end - Date.now()) / 1000);
+    find('idle-text').textContent = `The simulation is paused, and ends in ${left}.`;
+    // One that a controller has started is paused only for its server.
+    if (viewer?.runs)
+      current.keep();
+  };
+  tick();
+  find('keep').onclick = () => current.keep();
+  find('spoken').textContent = find('idle-text').textContent;
+  idling = setInterval(tick, 1000);
 }
 
 /** Where Webots' own viewer can be had: from the simulation server, or from the configured address. */
@@ -432,6 +457,7 @@ function busy(now, leaving = 'Disconnect') {
 
 function leave() {
   clearInterval(countdown);
+  tellIdle();
   clearTimeout(patience);
   clearTimeout(asking);
   clearTimeout(waiting?.timer);
