@@ -33,7 +33,7 @@ export function advice(text) {
 /**
  * The connection of one simulation. Events: `step` ({step, state, text}), `left` (seconds until it is closed), `ready` (the
  * simulator's address), `token` (one can come back with it within `absence` seconds), `idle` (seconds until it
- * ends because it is paused, or nothing: it does not), `heard` (a sign of life), `failed` (text: it is over), `elsewhere` (text:
+ * ends because it is paused, or null: it does not), `heard` (a sign of life), `failed` (text: it is over), `elsewhere` (text:
  * this server can't take the client, another may), `broken` (one may come back).
  */
 export class Simulation extends EventTarget {
@@ -61,7 +61,9 @@ export class Simulation extends EventTarget {
     this.#socket.addEventListener('message', ({ data }) => {
       if (this.#ended)
         return;
-      this.#tell('heard');
+      // Who is refused has found nothing.
+      if (!/^(loading: Error|error):/.test(data))
+        this.#tell('heard');
       this.#understand(data);
     });
     this.#socket.addEventListener('close', ({ code }) => this.#closed(code));
@@ -98,7 +100,7 @@ export class Simulation extends EventTarget {
       this.#step('place', 'doing', ahead === 0 ? 'you are next' : `${clients} ahead of you`);
     } else if (text.startsWith('idle:')) {
       const seconds = Number(rest('idle:'));
-      this.#tell('idle', Number.isNaN(seconds) ? undefined : seconds);
+      this.#tell('idle', Number.isNaN(seconds) ? null : seconds);
     } else if (text.startsWith('shutdownTimeout:')) {
       this.#step('place', 'done', 'taken');
       this.#step('checkout', 'done', '');

@@ -13,6 +13,8 @@ let simulation;
 let viewer;
 /** Watches the connection of a simulation that one can come back to. */
 let lifeline;
+/** Why it may not come back yet. */
+let refusal;
 let countdown;
 /** Counts the time that a simulation has left which is paused. */
 let idling;
@@ -222,10 +224,11 @@ function follow(current, server, world, isBack = false) {
   on('left', countDown);
   on('idle', (seconds) => tellIdle(seconds, current));
   on('failed', (why) => {
-    if (isBack && SHARE.test(why))
+    if (isBack && SHARE.test(why)) {
+      refusal = why;
       lifeline?.broken(true);
-    else if (isBack)
-      failed(why);
+    } else if (isBack)
+      failed(ended(why));
     else
       refused(world, why);
   });
@@ -237,7 +240,16 @@ function follow(current, server, world, isBack = false) {
     lifeline ??= watch(current.absence);
     headerLinks(true);
   });
-  on('broken', () => lifeline?.broken());
+  on('broken', () => {
+    refusal = undefined;
+    lifeline?.broken();
+  });
+}
+
+/** Who comes back to what has ended hears why, unless nobody came back in time. */
+function ended(why) {
+  const silence = lifeline?.silence ?? 0;
+  return silence > lifeline?.absence && /has ended$/.test(why) ? `${why}: there was no connection for ${duration(silence)}` : why;
 }
 
 /* coming back */
@@ -249,14 +261,16 @@ function watch(absence) {
   let isTold = false;
   on('lost', ({ since, left }) => {
     const waits = left > 0 ? `Your simulation waits another ${duration(left)}.` : 'Your simulation may have ended.';
-    notice(`No connection since ${duration(since)}.`, waits);
-    light('', 'No connection', 'It is tried again and again.');
+    notice(refusal ? `${refusal}.` : `No connection since ${duration(since)}.`, waits);
+    if (!refusal)
+      light('', 'No connection', 'It is tried again and again.');
     viewer?.stale?.();
     if (!isTold)
       find('spoken').textContent = `No connection. ${waits}`;
     isTold = true;
   });
   on('found', () => {
+    refusal = undefined;
     notice();
     showWord();
     if (isTold)
@@ -351,10 +365,10 @@ function countDown(seconds) {
 }
 
 /** A simulation that is paused ends, unless somebody keeps it. */
-function tellIdle(seconds, current) {
+function tellIdle(seconds = null, current = undefined) {
   clearInterval(idling);
-  find('idle').hidden = seconds === undefined;
-  if (seconds === undefined)
+  find('idle').hidden = seconds === null;
+  if (seconds === null)
     return;
   const end = Date.now() + 1000 * seconds;
   const tick = () => {
@@ -463,7 +477,7 @@ function leave() {
   clearTimeout(waiting?.timer);
   waiting = undefined;
   lifeline?.close();
-  lifeline = undefined;
+  lifeline = refusal = undefined;
   forget();
   notice();
   showWord();

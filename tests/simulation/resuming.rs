@@ -8,7 +8,7 @@ use nix::unistd::Pid;
 use serde_json::{Value, json};
 
 use super::life::quick;
-use super::scene::{arm, nothing_left};
+use super::scene::{DEMO, arm, instance_folders, nothing_left};
 use crate::support::client::Client;
 use crate::support::git::Forge;
 use crate::support::program::{Builder, Server, simulation_server};
@@ -245,6 +245,21 @@ async fn who_comes_back_too_late_hears_why_it_has_ended() {
     crash().await;
     let told = stage.refused(&token).await;
     assert!(told.starts_with(&format!("{ENDED}: Webots ")), "{told}");
+    nothing_left(&stage.server, 1).await;
+}
+
+#[actix_rt::test]
+async fn who_is_away_while_its_simulation_fills_the_disk_hears_it() {
+    let fill = "for n in $(seq 100); do head -c 500000 /dev/zero > file$n; done";
+    let script = Webots::script(&format!("{DEMO} \"$@\" &\nuntil [ -e go ]; do sleep 0.05; done\n{fill}\nwait"));
+    let stage = Stage::new(1, |builder| builder.set("webots", script.path().to_str()).set("limits.disk", 5)).await;
+    let (client, token) = stage.start().await;
+    drop(client);
+    stage.until_away(1).await;
+    std::fs::write(instance_folders(&stage.server.folder)[0].join("project/go"), "").unwrap();
+    until("it has ended", async || stage.simulations().await.is_empty()).await;
+    let told = stage.refused(&token).await;
+    assert!(told.starts_with(&format!("{ENDED}: The simulation has written more than 5 MiB")), "{told}");
     nothing_left(&stage.server, 1).await;
 }
 
