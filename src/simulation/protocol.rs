@@ -4,6 +4,7 @@
 //! |---|---|
 //! | `{"start": {"url": WORLD, "mode": "x3d" \| "w3d" \| "mjpeg", "resumable": true}}` | start a simulation; to a resumable one its client can come back |
 //! | `{"resume": TOKEN}` | come back to a simulation |
+//! | `{"keep": true}` | do not end a simulation because it is paused; that time begins again |
 //! | `{"reset controller": "NAME/FILE"}` | restore a file below `controllers/` |
 //! | any other JSON | ignored, as the Python server does: old pages send it |
 //!
@@ -19,6 +20,7 @@
 //! | `webots:URL` | Webots is ready there |
 //! | `absence: SECONDS` | how long the simulation waits for its client once the connection is broken |
 //! | `resume: TOKEN` | what to come back with |
+//! | `idle: SECONDS`, `idle: never` | when the simulation ends unless it runs or is kept; that it does not any more |
 //! | `.` | Webots is alive |
 //! | `reset controller: NAME/FILE` | done |
 //!
@@ -44,6 +46,8 @@ pub enum Request {
     },
     /// Come back to the simulation of this token; none is a text that can't be one.
     Resume(Option<Token>),
+    /// Keep a simulation that is to end because it is paused.
+    Keep,
     /// Restore this file below `controllers/`.
     ResetController(String),
 }
@@ -82,6 +86,9 @@ impl Request {
         if let Some(token) = message.get("resume") {
             let token = token.as_str().ok_or_else(|| wrong("\"resume\" is no text"))?;
             return Ok(Some(Self::Resume(Token::parse(token))));
+        }
+        if let Some(keep) = message.get("keep") {
+            return if keep == true { Ok(Some(Self::Keep)) } else { Err(wrong("\"keep\" is not true")) };
         }
         let Some(start) = message.get("start") else {
             return Ok(None);
@@ -180,6 +187,12 @@ pub fn resume(token: &Token) -> String {
     format!("resume: {}", token.reveal())
 }
 
+/// After how many seconds the simulation ends because it is paused, or that it does not any more.
+#[must_use]
+pub fn idle(seconds: Option<u64>) -> String {
+    seconds.map_or("idle: never".to_owned(), |seconds| format!("idle: {seconds}"))
+}
+
 /// Why nobody can come back to a simulation; where it is known, why it has ended.
 #[must_use]
 pub fn ended(why: Option<&str>) -> String {
@@ -227,6 +240,7 @@ mod tests {
             (r#"{"start":{"url":"https://x","resumable":true}}"#, ask(Mode::X3d, true)),
             (&resume, Request::Resume(Some(token))),
             (r#"{"resume":"what is no token"}"#, Request::Resume(None)),
+            (r#"{"keep":true}"#, Request::Keep),
             (r#"{ "reset controller" : "a/a.py" }"#, Request::ResetController("a/a.py".to_owned())),
         ];
         for (text, request) in table {
@@ -252,6 +266,7 @@ mod tests {
             (r#"{"start":{"url":5}}"#, "\"start\" has no \"url\""),
             (r#"{"start":{"url":"x","resumable":1}}"#, "\"resumable\" is neither"),
             (r#"{"resume":5}"#, "\"resume\" is no text"),
+            (r#"{"keep":false}"#, "\"keep\" is not true"),
             (r#"{"reset controller":5}"#, "\"reset controller\" is no text"),
         ];
         for (text, words) in table {

@@ -1,9 +1,9 @@
 // Watches the connection to a simulation that waits for its client, and says when to try to come back.
 
-/** No sign of life for so long means that the connection is lost, in milliseconds; Webots gives one every five seconds. */
-const SILENCE = 8000;
+/** No sign of life for so long means that the connection is lost, in seconds; Webots gives one every five. */
+const SILENCE = 8;
 /** A shorter one is not worth a word. */
-const WORTH_A_WORD = 2000;
+const WORTH_A_WORD = 2;
 /** How long a try may take: a second one would take its token away. In milliseconds. */
 const TRY = 15_000;
 /** A server that refuses all tries for so long, while the session server answers, is gone with its simulations; in milliseconds. */
@@ -33,6 +33,11 @@ export class Lifeline extends EventTarget {
     this.absence = absence;
     this.#timer = setInterval(() => this.#look(), 1000);
     addEventListener('online', this.#online);
+  }
+
+  /** For how long there has been no sign of life, in seconds. */
+  get silence() {
+    return (Date.now() - this.#heard) / 1000;
   }
 
   #tell(kind, detail) {
@@ -72,14 +77,14 @@ export class Lifeline extends EventTarget {
   }
 
   #look() {
-    const since = Date.now() - this.#heard;
+    const since = this.silence;
     if (!this.#isLost && since < SILENCE)
       return;
     this.#isLost = true;
     if (since >= WORTH_A_WORD)
-      this.#tell('lost', { since: since / 1000, left: this.absence - since / 1000 });
+      this.#tell('lost', { since, left: this.absence - since });
     // The server may notice it later, by as long as it takes a connection to be silent.
-    if (this.#tries > 0 && since > 2000 * this.absence) {
+    if (this.#tries > 0 && since > 2 * this.absence) {
       this.#end();
     } else if (Date.now() >= this.#next) {
       this.#tries += 1;
@@ -90,7 +95,7 @@ export class Lifeline extends EventTarget {
 
   #end() {
     this.close();
-    this.#tell('over', (Date.now() - this.#heard) / 1000);
+    this.#tell('over', this.silence);
   }
 
   close() {

@@ -125,6 +125,11 @@ export class SmallViewer extends EventTarget {
     this.#parts.mode.textContent = mode === 'pause' ? 'paused' : mode.replace('-', ' ');
   }
 
+  /** Whether the time of the simulation goes on, whoever lets it. */
+  get runs() {
+    return !this.#isFrozen && this.#mode !== 'pause';
+  }
+
   /** What is shown is old. */
   stale() {
     this.#parts.mode.textContent = 'no connection';

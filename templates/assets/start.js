@@ -21,7 +21,7 @@ export function advice(text) {
     [/Webots is installed|no Webots at/, 'The administrator of this simulation server has to set where Webots is.'],
     [/taken over/i, 'Another tab, or another window, shows it now. Connect here for a simulation of this tab’s own.'],
     [/waited longest|did not come back/i, 'Connect again for another simulation.'],
-    [/time limit/i, 'Connect again for another simulation.'],
+    [/time limit|was paused for/i, 'Connect again for another simulation.'],
     [/may not connect to/, 'Load this page again: the fleet may have grown. Else the key server of that simulation server has to name the host that the session server lists in simulationServers.'],
     [/simulator could not be reached/, 'A firewall may be in the way: the ports above the simulation server’s own have to be open, or forwarded.'],
     [/takes no new clients/i, 'Connect again in a moment: the session server chooses another simulation server as soon as there is one.'],
@@ -32,8 +32,9 @@ export function advice(text) {
 
 /**
  * The connection of one simulation. Events: `step` ({step, state, text}), `left` (seconds until it is closed), `ready` (the
- * simulator's address), `token` (one can come back with it within `absence` seconds), `heard` (a sign of life), `failed`
- * (text: it is over), `elsewhere` (text: this server can't take the client, another may), `broken` (one may come back).
+ * simulator's address), `token` (one can come back with it within `absence` seconds), `idle` (seconds until it
+ * ends because it is paused, or null: it does not), `heard` (a sign of life), `failed` (text: it is over), `elsewhere` (text:
+ * this server can't take the client, another may), `broken` (one may come back).
  */
 export class Simulation extends EventTarget {
   #socket;
@@ -60,7 +61,9 @@ export class Simulation extends EventTarget {
     this.#socket.addEventListener('message', ({ data }) => {
       if (this.#ended)
         return;
-      this.#tell('heard');
+      // Who is refused has found nothing.
+      if (!/^(loading: Error|error):/.test(data))
+        this.#tell('heard');
       this.#understand(data);
     });
     this.#socket.addEventListener('close', ({ code }) => this.#closed(code));
@@ -95,6 +98,9 @@ export class Simulation extends EventTarget {
       const ahead = Number(rest('queue:'));
       const clients = ahead === 1 ? 'one client is' : `${ahead} clients are`;
       this.#step('place', 'doing', ahead === 0 ? 'you are next' : `${clients} ahead of you`);
+    } else if (text.startsWith('idle:')) {
+      const seconds = Number(rest('idle:'));
+      this.#tell('idle', Number.isNaN(seconds) ? null : seconds);
     } else if (text.startsWith('shutdownTimeout:')) {
       this.#step('place', 'done', 'taken');
       this.#step('checkout', 'done', '');
@@ -138,6 +144,11 @@ export class Simulation extends EventTarget {
       this.#tell('failed', 'The connection to the simulation server broke before the simulation ran.');
     else
       this.#tell('elsewhere', 'The simulation server could not be reached, or has closed the connection.');
+  }
+
+  /** It is not to end because it is paused. */
+  keep() {
+    this.#socket.send(JSON.stringify({ keep: true }));
   }
 
   /** Hears nothing more, and lets the simulation wait if it can. */

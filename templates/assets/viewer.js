@@ -13,7 +13,11 @@ let simulation;
 let viewer;
 /** Watches the connection of a simulation that one can come back to. */
 let lifeline;
+/** Why it may not come back yet. */
+let refusal;
 let countdown;
+/** Counts the time that a simulation has left which is paused. */
+let idling;
 let wanted;
 let patience;
 /** How often another simulation server was asked for since the form was sent; and the timer for the next time. */
@@ -218,11 +222,13 @@ function follow(current, server, world, isBack = false) {
   });
   on('step', step);
   on('left', countDown);
+  on('idle', (seconds) => tellIdle(seconds, current));
   on('failed', (why) => {
-    if (isBack && SHARE.test(why))
+    if (isBack && SHARE.test(why)) {
+      refusal = why;
       lifeline?.broken(true);
-    else if (isBack)
-      failed(why);
+    } else if (isBack)
+      failed(ended(why));
     else
       refused(world, why);
   });
@@ -234,7 +240,16 @@ function follow(current, server, world, isBack = false) {
     lifeline ??= watch(current.absence);
     headerLinks(true);
   });
-  on('broken', () => lifeline?.broken());
+  on('broken', () => {
+    refusal = undefined;
+    lifeline?.broken();
+  });
+}
+
+/** Who comes back to what has ended hears why, unless nobody came back in time. */
+function ended(why) {
+  const silence = lifeline?.silence ?? 0;
+  return silence > lifeline?.absence && /has ended$/.test(why) ? `${why}: there was no connection for ${duration(silence)}` : why;
 }
 
 /* coming back */
@@ -246,14 +261,16 @@ function watch(absence) {
   let isTold = false;
   on('lost', ({ since, left }) => {
     const waits = left > 0 ? `Your simulation waits another ${duration(left)}.` : 'Your simulation may have ended.';
-    notice(`No connection since ${duration(since)}.`, waits);
-    light('', 'No connection', 'It is tried again and again.');
+    notice(refusal ? `${refusal}.` : `No connection since ${duration(since)}.`, waits);
+    if (!refusal)
+      light('', 'No connection', 'It is tried again and again.');
     viewer?.stale?.();
     if (!isTold)
       find('spoken').textContent = `No connection. ${waits}`;
     isTold = true;
   });
   on('found', () => {
+    refusal = undefined;
     notice();
     showWord();
     if (isTold)
@@ -275,6 +292,8 @@ function comeBack() {
   if (!left)
     return;
   simulation?.detach();
+  // Who is back is told again.
+  tellIdle();
   // What its stream still says is no sign of life of this simulation's server.
   viewer?.freeze?.();
   follow(new Simulation(left.server, { token: left.token }), left.server, left.world, true);
@@ -343,6 +362,26 @@ function countDown(seconds) {
   tick();
   find('left').hidden = false;
   countdown = setInterval(tick, 1000);
+}
+
+/** A simulation that is paused ends, unless somebody keeps it. */
+function tellIdle(seconds = null, current = undefined) {
+  clearInterval(idling);
+  find('idle').hidden = seconds === null;
+  if (seconds === null)
+    return;
+  const end = Date.now() + 1000 * seconds;
+  const tick = () => {
+    const left = duration((end - Date.now()) / 1000);
+    find('idle-text').textContent = `The simulation is paused, and ends in ${left}.`;
+    // One that a controller has started is paused only for its server.
+    if (viewer?.runs)
+      current.keep();
+  };
+  tick();
+  find('keep').onclick = () => current.keep();
+  find('spoken').textContent = find('idle-text').textContent;
+  idling = setInterval(tick, 1000);
 }
 
 /** Where Webots' own viewer can be had: from the simulation server, or from the configured address. */
@@ -432,12 +471,13 @@ function busy(now, leaving = 'Disconnect') {
 
 function leave() {
   clearInterval(countdown);
+  tellIdle();
   clearTimeout(patience);
   clearTimeout(asking);
   clearTimeout(waiting?.timer);
   waiting = undefined;
   lifeline?.close();
-  lifeline = undefined;
+  lifeline = refusal = undefined;
   forget();
   notice();
   showWord();

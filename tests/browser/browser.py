@@ -56,6 +56,10 @@ class Page:
         if message.type in ("error", "warning"):
             self.complaints.append(f"{message.type}: {message.text}")
 
+    def from_address(self, address):
+        """From now on all that it asks for seems to come through a web server, from this address."""
+        self.context.set_extra_http_headers({"X-Forwarded-For": address})
+
     def hosts(self):
         parts = (urllib.parse.urlsplit(url) for url in self.asked)
         return {part.hostname for part in parts if part.scheme not in ("data", "blob", "about")}

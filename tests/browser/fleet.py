@@ -127,6 +127,25 @@ class Server:
                 self.kill()
 
 
+class Client:
+    """A web client of a simulation server, at this address, that sends a message and reads nothing."""
+
+    def __init__(self, server, address, message):
+        self.socket = socket.create_connection(("127.0.0.1", server.port))
+        self.socket.sendall((
+            f"GET /client HTTP/1.1\r\nHost: {server.address}\r\nX-Forwarded-For: {address}\r\nUpgrade: websocket\r\n"
+            "Connection: Upgrade\r\nSec-WebSocket-Version: 13\r\nSec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n"
+        ).encode())
+        if b" 101 " not in self.socket.recv(4096):
+            raise AssertionError("it is no WebSocket")
+        text = json.dumps(message).encode()
+        # A text with a mask of zeros, as a client has to send it.
+        self.socket.sendall(bytes([0x81, 0x80 | 126]) + len(text).to_bytes(2, "big") + bytes(4) + text)
+
+    def close(self):
+        self.socket.close()
+
+
 class Fleet:
     """The whole: use it with `with`."""
 

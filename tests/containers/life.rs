@@ -14,6 +14,12 @@ const READY: Duration = Duration::from_secs(90);
 /// All of a simulation has to be gone by then.
 const GONE: Duration = Duration::from_secs(10);
 
+/// The next simulated time that a viewer is told, in milliseconds.
+async fn simulated(viewer: &mut Client) -> f64 {
+    let update = viewer.until("application/json:").await;
+    serde_json::from_str::<Value>(&update["application/json:".len()..]).unwrap()["time"].as_f64().unwrap()
+}
+
 #[actix_rt::test]
 async fn a_world_runs_in_a_container_and_nothing_is_left_when_its_client_goes() {
     let Some(_docker) = docker().await else { return };
@@ -41,6 +47,9 @@ async fn a_world_runs_in_a_container_and_nothing_is_left_when_its_client_goes() 
         value("CPU").is_some_and(|percent| percent > 0.0) && value("Memory").is_some_and(|bytes| bytes > 1e6)
     })
     .await;
+    let now = simulated(&mut viewer).await;
+    // Long enough for a look at what it takes.
+    while simulated(&mut viewer).await < now + 4000.0 {}
     drop(viewer);
     client.leave().await;
     let begin = Instant::now();
@@ -52,9 +61,50 @@ async fn a_world_runs_in_a_container_and_nothing_is_left_when_its_client_goes() 
             .all(|file| !file.file_name().to_string_lossy().starts_with("instance-"))
     })
     .await;
+    let read = || std::fs::read_to_string(server.folder.join("log/simulation/simulations.csv")).unwrap_or_default();
+    until("its end is in simulations.csv", async || read().lines().count() == 2).await;
+    let table = read();
+    let line: Vec<_> = table.lines().nth(1).unwrap().split(',').collect();
+    let (memory, time): (u64, f64) = (line[8].parse().unwrap(), line[9].parse().unwrap());
+    assert!((1 << 20..1 << 32).contains(&memory) && (0.05..100.0).contains(&time), "{table}");
     // The port is free, and the next one gets it.
     let mut next = Client::start(&server, &arm()).await;
     assert_eq!(next.patiently("webots:", READY).await, address);
+}
+
+#[actix_rt::test]
+async fn who_comes_back_finds_its_container_as_it_runs() {
+    let Some(_docker) = docker().await else { return };
+    let forge = Forge::with_arm();
+    let server = server(forge.path(), 1).start().await;
+    let mut client = Client::connect(&server.websocket("/client")).await;
+    client.send(&json!({"start": {"url": arm(), "resumable": true}}).to_string()).await;
+    let address = client.patiently("webots:", READY).await;
+    let stream = address.trim_start_matches("webots:").replace("localhost", "127.0.0.1");
+    let token = client.until("resume: ").await["resume: ".len()..].to_owned();
+    let mut viewer = Client::connect(&stream).await;
+    viewer.send("x3d").await;
+    viewer.until("scene load completed").await;
+    viewer.send("real-time:-1").await;
+    let left = simulated(&mut viewer).await;
+    let before = of_service(&server, "webots");
+    drop((client, viewer));
+    let away = async || http::get(&server.url("/status")).await.json()["simulations"][0]["awayUntil"].is_u64();
+    until("it is away", away).await;
+
+    let mut client = Client::connect(&server.websocket("/client")).await;
+    client.send(&json!({ "resume": token }).to_string()).await;
+    assert_eq!(client.until("webots:").await, address);
+    client.until("resume: ").await;
+    let mut viewer = Client::connect(&stream).await;
+    viewer.send("x3d;broadcast").await;
+    viewer.until("real-time").await;
+    let back = simulated(&mut viewer).await;
+    assert!(back > left, "it began anew: {left} {back}");
+    assert_eq!(of_service(&server, "webots"), before);
+    drop(viewer);
+    client.close_with(1000).await;
+    until("its container is gone", async || containers(&server).is_empty()).await;
 }
 
 #[actix_rt::test]

@@ -8,7 +8,7 @@ fn a_client_is_answered_in_the_form_of_the_protocol_whatever_it_sends() {
         let text = String::from_utf8_lossy(input);
         match Request::parse(&text) {
             Ok(Some(Request::Start { url, .. })) => assert!(url.len() <= text.len()),
-            Ok(Some(Request::Resume(_))) => {}
+            Ok(Some(Request::Resume(_) | Request::Keep)) => {}
             Ok(Some(Request::ResetController(file))) => assert!(file.len() <= text.len()),
             Ok(None) => assert!(serde_json::from_str::<serde_json::Value>(&text).is_ok()),
             Err(wrong) => {

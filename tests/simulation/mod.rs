@@ -8,6 +8,7 @@ mod ends;
 mod fetching;
 mod git_wrapper;
 mod https;
+mod idleness;
 mod large_files;
 mod life;
 mod limits;

@@ -8,7 +8,7 @@ use nix::unistd::Pid;
 use serde_json::{Value, json};
 
 use super::life::quick;
-use super::scene::{arm, nothing_left};
+use super::scene::{DEMO, arm, instance_folders, nothing_left};
 use crate::support::client::Client;
 use crate::support::git::Forge;
 use crate::support::program::{Builder, Server, simulation_server};
@@ -16,44 +16,44 @@ use crate::support::relay::{Mood, Relay};
 use crate::support::webots::{Webots, instances_below};
 use crate::support::{http, until};
 
-const ENDED: &str = "loading: Error: this simulation has ended";
+pub(super) const ENDED: &str = "loading: Error: this simulation has ended";
 const TAKEN_OVER: &str = "loading: Error: this simulation was taken over elsewhere";
 
 /// A server, and what it needs.
-struct Stage {
-    server: Server,
+pub(super) struct Stage {
+    pub(super) server: Server,
     _parts: (Forge, Webots),
 }
 
 impl Stage {
-    async fn new(places: u16, change: impl FnOnce(Builder) -> Builder) -> Self {
+    pub(super) async fn new(places: u16, change: impl FnOnce(Builder) -> Builder) -> Self {
         let (forge, webots) = (Forge::with_arm(), Webots::launcher());
         let builder = quick(simulation_server(&webots.path(), forge.path(), places));
         Self { server: change(builder).start().await, _parts: (forge, webots) }
     }
 
-    async fn simulations(&self) -> Vec<Value> {
+    pub(super) async fn simulations(&self) -> Vec<Value> {
         http::get(&self.server.url("/status")).await.json()["simulations"].as_array().unwrap().clone()
     }
 
     /// Waits until so many simulations wait for their clients.
-    async fn until_away(&self, count: usize) {
+    pub(super) async fn until_away(&self, count: usize) {
         until(&format!("{count} are away"), async || {
             self.simulations().await.iter().filter(|one| one["awayUntil"].is_u64()).count() == count
         })
         .await;
     }
 
-    async fn start(&self) -> (Client, String) {
+    pub(super) async fn start(&self) -> (Client, String) {
         start(Client::connect(&self.server.websocket("/client")).await).await
     }
 
-    async fn resume(&self, token: &str) -> Client {
+    pub(super) async fn resume(&self, token: &str) -> Client {
         resume(Client::connect(&self.server.websocket("/client")).await, token).await
     }
 
     /// What somebody with this token is told who can't come back.
-    async fn refused(&self, token: &str) -> String {
+    pub(super) async fn refused(&self, token: &str) -> String {
         let mut client = self.resume(token).await;
         let told = client.until("").await;
         assert_eq!(client.closed().await, Some(1000), "{told}");
@@ -70,7 +70,7 @@ async fn start(mut client: Client) -> (Client, String) {
     (client, token)
 }
 
-async fn token(client: &mut Client) -> String {
+pub(super) async fn token(client: &mut Client) -> String {
     client.until("resume: ").await["resume: ".len()..].to_owned()
 }
 
@@ -80,7 +80,7 @@ async fn resume(mut client: Client, token: &str) -> Client {
 }
 
 /// The next simulated time that a viewer is told.
-async fn time(viewer: &mut Client) -> f64 {
+pub(super) async fn time(viewer: &mut Client) -> f64 {
     let update = viewer.until("application/json:").await;
     serde_json::from_str::<Value>(&update["application/json:".len()..]).unwrap()["time"].as_f64().unwrap()
 }
@@ -245,6 +245,21 @@ async fn who_comes_back_too_late_hears_why_it_has_ended() {
     crash().await;
     let told = stage.refused(&token).await;
     assert!(told.starts_with(&format!("{ENDED}: Webots ")), "{told}");
+    nothing_left(&stage.server, 1).await;
+}
+
+#[actix_rt::test]
+async fn who_is_away_while_its_simulation_fills_the_disk_hears_it() {
+    let fill = "for n in $(seq 100); do head -c 500000 /dev/zero > file$n; done";
+    let script = Webots::script(&format!("{DEMO} \"$@\" &\nuntil [ -e go ]; do sleep 0.05; done\n{fill}\nwait"));
+    let stage = Stage::new(1, |builder| builder.set("webots", script.path().to_str()).set("limits.disk", 5)).await;
+    let (client, token) = stage.start().await;
+    drop(client);
+    stage.until_away(1).await;
+    std::fs::write(instance_folders(&stage.server.folder)[0].join("project/go"), "").unwrap();
+    until("it has ended", async || stage.simulations().await.is_empty()).await;
+    let told = stage.refused(&token).await;
+    assert!(told.starts_with(&format!("{ENDED}: The simulation has written more than 5 MiB")), "{told}");
     nothing_left(&stage.server, 1).await;
 }
 

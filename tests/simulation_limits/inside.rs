@@ -80,9 +80,14 @@ impl Inside {
 
     /// A client that has asked for the world.
     pub async fn client(&self) -> Client {
-        let mut client = Client::connect(&format!("ws://127.0.0.1:{}/client", self.port)).await;
+        let mut client = self.connect().await;
         ask(&mut client).await;
         client
+    }
+
+    /// A client that has asked for nothing.
+    pub async fn connect(&self) -> Client {
+        Client::connect(&format!("ws://127.0.0.1:{}/client", self.port)).await
     }
 
     /// Waits until a simulation is in this state.

@@ -5,7 +5,10 @@ use std::time::{Duration, Instant};
 use webots_fleet::simulation::ends::EndReason;
 use webots_fleet::simulation::snapshot::Stage;
 
-use crate::inside::Inside;
+use serde_json::json;
+
+use crate::inside::{Inside, arm};
+use crate::support::until;
 
 pub async fn a_simulation_ends_at_its_time_limit_in_any_state() {
     for stage in [Stage::Launching, Stage::Idle, Stage::Running, Stage::Stopping] {
@@ -29,6 +32,27 @@ pub async fn a_simulation_ends_at_its_time_limit_in_any_state() {
         assert_eq!(inside.server.ends.latest()[0].how.reason, EndReason::TimeLimit, "{stage:?}");
         inside.stop().await;
     }
+}
+
+/// Nobody can hold a place for ever by coming back: the limit counts from the first start.
+pub async fn who_is_away_at_the_time_limit_hears_it() {
+    let inside = Inside::new(Stage::Idle, |config| config.timeout = 5).await;
+    let mut client = inside.connect().await;
+    client.send(&json!({"start": {"url": arm(), "resumable": true}}).to_string()).await;
+    let begin = Instant::now();
+    let token = client.until("resume: ").await["resume: ".len()..].to_owned();
+    drop(client);
+    until("it has ended", async || inside.stages().await.is_empty()).await;
+    assert!(begin.elapsed() >= Duration::from_secs(5), "{:?}", begin.elapsed());
+    let mut client = inside.connect().await;
+    client.send(&json!({ "resume": token }).to_string()).await;
+    let told = client.until("loading: Error:").await;
+    let words = "loading: Error: this simulation has ended: The time limit of 5 seconds was reached";
+    assert!(told.starts_with(words), "{told}");
+    assert_eq!(client.closed().await, Some(1000));
+    inside.until_nothing_is_left().await;
+    assert_eq!(inside.server.ends.latest()[0].how.reason, EndReason::TimeLimit);
+    inside.stop().await;
 }
 
 /// A checkout has a limit of its own (`timing.checkout`). In the line there is none: it moves, for those ahead have one.

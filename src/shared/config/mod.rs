@@ -9,6 +9,6 @@ pub use error::ConfigError;
 pub use loading::{Configuration, InvalidValue, LoadedConfig, changed_keys, load};
 pub use secret::Secret;
 pub use value::{
-    ExpandedPath, expanded, folder, local_address, object, one_or_many, optional_expanded, optional_object,
-    optional_whole, percent, seconds, seconds_or_zero, threshold, whole,
+    ExpandedPath, expanded, folder, local_address, minutes_or_zero, object, one_or_many, optional_expanded,
+    optional_object, optional_whole, percent, seconds, seconds_or_zero, threshold, whole,
 };

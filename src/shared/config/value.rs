@@ -182,6 +182,28 @@ pub mod seconds_or_zero {
     }
 }
 
+/// A duration in minutes, or 0 for none.
+pub mod minutes_or_zero {
+    use super::{Between, Deserializer, Duration, Serializer};
+
+    /// Reads a number of minutes from 0 to a day.
+    ///
+    /// # Errors
+    /// When the value is something else.
+    pub fn deserialize<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Duration, D::Error> {
+        let number = deserializer.deserialize_any(Between { least: 0.0, most: 1440.0, what: "a number of minutes" })?;
+        Ok(Duration::from_secs_f64(60.0 * number))
+    }
+
+    /// Writes the minutes.
+    ///
+    /// # Errors
+    /// When the output fails.
+    pub fn serialize<S: Serializer>(duration: &Duration, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.serialize_f64(duration.as_secs_f64() / 60.0)
+    }
+}
+
 /// A number between two others, both included.
 struct Between {
     least: f64,

@@ -23,9 +23,17 @@ pub struct Resumption {
     /// The texts that its project asks for.
     texts: Vec<String>,
     url: String,
+    /// When the simulation ends because it is paused.
+    idle_end: Option<Instant>,
     deadline: Option<SpawnHandle>,
     /// Why the simulation has ended, if it has.
     ended: Option<String>,
+}
+
+/// How many seconds are left until then, rounded up.
+#[must_use]
+pub fn seconds_until(then: Instant) -> u64 {
+    (then.saturating_duration_since(Instant::now()) + Duration::from_millis(999)).as_secs()
 }
 
 impl Resumption {
@@ -40,6 +48,7 @@ impl Resumption {
             launched: Instant::now(),
             texts: Vec::new(),
             url: String::new(),
+            idle_end: None,
             deadline: None,
             ended: None,
         }
@@ -53,6 +62,11 @@ impl Resumption {
     /// Keeps a text for a client that comes back.
     pub fn keep(&mut self, text: String) {
         self.texts.push(text);
+    }
+
+    /// When the simulation ends because it is paused, if it does.
+    pub fn idle_end(&mut self, end: Option<Instant>) {
+        self.idle_end = end;
     }
 
     /// Webots is ready at this URL: from now on the client may come back. Returns what it hears of that.
@@ -115,6 +129,7 @@ impl Resumption {
         texts.extend(self.texts.iter().cloned());
         texts.push(protocol::webots(&self.url));
         texts.extend(self.offer(absence));
+        texts.extend(self.idle_end.map(|end| protocol::idle(Some(seconds_until(end)))));
         texts
     }
 

@@ -11,7 +11,7 @@ use actix::prelude::*;
 use actix_web_actors::ws::CloseCode;
 
 use super::outcome::{Outcome, Pending};
-use super::resumption::Resumption;
+use super::resumption::{Resumption, seconds_until};
 use super::state::{State, WebotsHandle};
 use crate::shared::http::Peer;
 use crate::shared::run::closing;
@@ -21,7 +21,7 @@ use crate::simulation::places::PlaceEvent;
 use crate::simulation::protocol::{self, Mode};
 use crate::simulation::sessions::{Attachment, FromClient, Said, ToClient};
 use crate::simulation::state::AppState;
-use crate::simulation::webots::{Exit, RestoreController, WebotsEvent};
+use crate::simulation::webots::{Exit, Keep, RestoreController, WebotsEvent};
 
 /// The actor.
 pub struct Session {
@@ -178,6 +178,11 @@ impl Handler<FromClient> for Session {
         }
         match what {
             Said::ResetController(file) => self.reset_controller(file, ctx),
+            Said::Keep => {
+                if let State::Launched(WebotsHandle(webots)) = &self.state {
+                    webots.do_send(Keep);
+                }
+            }
             Said::Left => {
                 self.client = None;
                 ctx.stop();
@@ -264,6 +269,12 @@ impl Handler<WebotsEvent> for Session {
             }
             WebotsEvent::Heartbeat => self.hint(protocol::HEARTBEAT.to_owned()),
             WebotsEvent::Hanging(seconds) => self.hint(protocol::hanging(seconds)),
+            WebotsEvent::IdleEnd(end) => {
+                if let Some(resumption) = &mut self.resumption {
+                    resumption.idle_end(end);
+                }
+                self.text(protocol::idle(end.map(seconds_until)));
+            }
             WebotsEvent::Exited(exit) => self.exited(&exit, ctx),
         }
     }

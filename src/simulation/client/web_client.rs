@@ -99,6 +99,11 @@ impl WebClient {
                 self.session = Attached::To(Session::open(server, self.peer, client, (url, mode, resumable)));
             }
             Ok(Some(Request::Resume(token))) => self.resume(token, ctx),
+            Ok(Some(Request::Keep)) => {
+                if let Attached::To(session) = &self.session {
+                    session.say(Said::Keep);
+                }
+            }
             Ok(Some(Request::ResetController(file))) => match &self.session {
                 Attached::To(session) => session.say(Said::ResetController(file)),
                 Attached::No | Attached::Coming | Attached::Over => ctx.text(protocol::nothing_to_reset()),

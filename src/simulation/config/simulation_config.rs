@@ -11,8 +11,8 @@ use super::isolation::{Isolation, SandboxFolders, VariableName, level};
 use super::resources::Resources;
 use super::timing::Timing;
 use crate::shared::config::{
-    Configuration, ExpandedPath, InvalidValue, Secret, expanded, folder, local_address, object, one_or_many,
-    optional_expanded, optional_whole, percent, seconds, whole,
+    Configuration, ExpandedPath, InvalidValue, Secret, expanded, folder, local_address, minutes_or_zero, object,
+    one_or_many, optional_expanded, optional_whole, percent, seconds, whole,
 };
 use crate::shared::domain::{PublicUrl, UrlPrefix, check_host};
 use crate::shared::http::{Origin, TrustedProxies};
@@ -121,6 +121,9 @@ pub struct SimulationConfig {
     /// Seconds after which a simulation is closed, at least 360. Default: 7200.
     #[serde(default = "default_timeout", deserialize_with = "whole::<360, 31_536_000, _, _>")]
     pub timeout: u64,
+    /// Minutes after which a simulation that is paused is closed; 0: never. Default: 0.
+    #[serde(default, with = "minutes_or_zero")]
+    pub idle_timeout: Duration,
     /// Write `simulation/monitor.csv`. Default: true.
     #[serde(default = "default_true")]
     pub monitor_log_enabled: bool,

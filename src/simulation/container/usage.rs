@@ -1,17 +1,11 @@
 //! What the containers of simulations take: from their control groups, else from `docker stats`, once for all.
 
 use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use super::objects::{Owner, PROJECT, quietly};
+use crate::simulation::isolation::docker_cgroups;
 use crate::simulation::machine::{Measured, Sum, Usage, cgroup_sum};
-
-/// Where Docker keeps the control group of a container, with systemd and without.
-fn cgroups(container: &str) -> [PathBuf; 2] {
-    let name = format!("docker-{container}.scope");
-    [Path::new("/sys/fs/cgroup/system.slice").join(name), Path::new("/sys/fs/cgroup/docker").join(container)]
-}
 
 /// Measures the simulations of an owner: those on these ports, whose processes are named for each. Blocks for some
 /// milliseconds; for two seconds where control groups can't be read.
@@ -24,7 +18,7 @@ pub fn measure(owner: &Owner, roots: &BTreeMap<u16, i32>) -> Vec<(i32, Measured)
         found.filter_map(|(id, project)| Some((id, *roots.get(&owner.port_of(project)?)?))).collect();
     let sums: Option<Vec<(i32, Sum)>> = containers
         .iter()
-        .map(|(id, root)| Some((*root, cgroups(id).iter().find_map(|cgroup| cgroup_sum(cgroup))?)))
+        .map(|(id, root)| Some((*root, docker_cgroups(id).iter().find_map(|cgroup| cgroup_sum(cgroup))?)))
         .collect();
     match sums {
         Some(sums) => together(sums, add_sum).map(|(root, sum)| (root, Measured::Sum(sum))).collect(),

@@ -9,6 +9,8 @@ pub enum EndReason {
     Finished,
     /// It has reached the time limit.
     TimeLimit,
+    /// It was paused for too long.
+    Idle,
     /// The server was stopped.
     Stopped,
     /// Its world could not be checked out.
@@ -27,10 +29,11 @@ pub enum EndReason {
 
 impl EndReason {
     /// All of them.
-    pub const ALL: [Self; 10] = [
+    pub const ALL: [Self; 11] = [
         Self::Left,
         Self::Finished,
         Self::TimeLimit,
+        Self::Idle,
         Self::Stopped,
         Self::NoCheckout,
         Self::NoWebots,
@@ -47,6 +50,7 @@ impl EndReason {
             Self::Left => "left",
             Self::Finished => "finished",
             Self::TimeLimit => "time_limit",
+            Self::Idle => "idle",
             Self::Stopped => "stopped",
             Self::NoCheckout => "no_checkout",
             Self::NoWebots => "no_webots",
@@ -64,6 +68,7 @@ impl EndReason {
             Self::Left => "client gone",
             Self::Finished => "finished",
             Self::TimeLimit => "time limit",
+            Self::Idle => "paused for too long",
             Self::Stopped => "server stopped",
             Self::NoCheckout => "no checkout",
             Self::NoWebots => "no start",

@@ -1,6 +1,7 @@
 //! How a simulation is launched: at which level of isolation, with which environment and limits, and what ends with it.
 
 mod cgroup;
+mod docker_cgroup;
 mod environment;
 mod launcher;
 mod peak;
@@ -11,6 +12,7 @@ mod unkept;
 mod watcher;
 
 pub use cgroup::Cgroup;
+pub use docker_cgroup::docker_cgroups;
 pub use launcher::{Launcher, Level};
 pub use peak::Peak;
 pub use program::Program;

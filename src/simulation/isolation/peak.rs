@@ -1,14 +1,18 @@
-//! What a simulation without a control group has taken, from the readings that are made for all of them.
+//! What a simulation without a control group of its own has taken, from the readings that are made for all of them.
 
+use std::sync::OnceLock;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
+use super::docker_cgroup::taken_by_container;
 use crate::simulation::ends::Taken;
 use crate::simulation::machine::Usage;
 
 /// What a simulation has taken at most, as far as ticks have seen it.
 #[derive(Debug, Default)]
 pub struct Peak {
+    /// Its containers, where it runs in some: what its processes here take is nothing then.
+    containers: Option<OnceLock<Vec<String>>>,
     /// In bytes; 0 before the first tick.
     memory: AtomicU64,
     /// Processor time, in milliseconds.
@@ -16,16 +20,50 @@ pub struct Peak {
 }
 
 impl Peak {
-    /// Takes in a reading.
-    pub fn add(&self, usage: &Usage) {
-        self.memory.fetch_max(usage.memory, Ordering::Relaxed);
-        self.time.fetch_max(u64::try_from(usage.time.as_millis()).unwrap_or(u64::MAX), Ordering::Relaxed);
+    /// For a simulation that runs in containers.
+    #[must_use]
+    pub fn of_containers() -> Self {
+        Self { containers: Some(OnceLock::new()), ..Self::default() }
+    }
+
+    /// Names the containers, by their ids.
+    pub fn name_containers(&self, ids: Vec<String>) {
+        if let Some(containers) = &self.containers {
+            // They are named once.
+            containers.set(ids).ok();
+        }
+    }
+
+    /// Whether what its process tree takes is what it takes.
+    #[must_use]
+    pub fn is_of_tree(&self) -> bool {
+        self.containers.is_none()
+    }
+
+    /// Takes in a reading: that of the process tree, or what the kernel has counted for its containers.
+    pub fn look(&self, tree: Option<&Usage>) {
+        match &self.containers {
+            Some(containers) => {
+                let taken = containers.get().into_iter().flatten().map(|id| taken_by_container(id));
+                let (memory, time) = taken.fold((0, Duration::ZERO), |(memory, time), taken| {
+                    (memory + taken.memory.unwrap_or_default(), time + taken.time.unwrap_or_default())
+                });
+                self.add(memory, time);
+            }
+            None => tree.iter().for_each(|usage| self.add(usage.memory, usage.time)),
+        }
+    }
+
+    fn add(&self, memory: u64, time: Duration) {
+        self.memory.fetch_max(memory, Ordering::Relaxed);
+        self.time.fetch_max(u64::try_from(time.as_millis()).unwrap_or(u64::MAX), Ordering::Relaxed);
     }
 
     /// What it has taken; nothing is known of one that ended before the first tick.
     #[must_use]
     pub fn taken(&self) -> Taken {
-        let memory = Some(self.memory.load(Ordering::Relaxed)).filter(|memory| *memory > 0);
-        Taken { memory, time: memory.map(|_| Duration::from_millis(self.time.load(Ordering::Relaxed))) }
+        let (memory, time) = (self.memory.load(Ordering::Relaxed), self.time.load(Ordering::Relaxed));
+        let is_known = memory > 0 || time > 0;
+        Taken { memory: Some(memory).filter(|memory| *memory > 0), time: is_known.then(|| Duration::from_millis(time)) }
     }
 }

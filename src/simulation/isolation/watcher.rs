@@ -46,7 +46,7 @@ pub struct Watch {
     pub processes: Option<MostProcesses>,
     /// The port that it was given; `None` if it has a network of its own.
     pub port: Option<u16>,
-    /// Hears what it has taken; `None` if its control group or Docker knows.
+    /// Hears what it has taken; `None` if its control group knows.
     pub peak: Option<Arc<Peak>>,
 }
 
@@ -181,11 +181,12 @@ impl Table {
     }
 
     fn count_processes(&self) -> Vec<(i32, String)> {
-        let is_counted = |watch: &Watch| watch.processes.is_some() || watch.peak.is_some();
+        let is_counted =
+            |watch: &Watch| watch.processes.is_some() || watch.peak.as_ref().is_some_and(|peak| peak.is_of_tree());
         let trees = self.all.iter().filter(|one| is_counted(&one.watch)).map(|one| Tree::of(one.watch.root));
         let usages = self.usage.read(&trees.collect::<Vec<_>>());
         for Watch { root, peak, .. } in self.all.iter().map(|one| &one.watch) {
-            peak.iter().zip(usages.get(root)).for_each(|(peak, usage)| peak.add(usage));
+            peak.iter().for_each(|peak| peak.look(usages.get(root)));
         }
         let counted = self.all.iter().filter_map(|one| Some((one.watch.root, one.watch.processes?)));
         let too_many = counted.filter(|(root, most)| {

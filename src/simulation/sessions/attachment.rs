@@ -30,6 +30,8 @@ pub struct FromClient {
 pub enum Said {
     /// Restore this file below `controllers/`.
     ResetController(String),
+    /// Its simulation, which is paused, is to stay.
+    Keep,
     /// It needs its simulation no longer.
     Left,
     /// Its connection has ended.

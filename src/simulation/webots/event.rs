@@ -1,5 +1,7 @@
 //! The events of a running Webots, for the actor of its web client.
 
+use std::time::Instant;
+
 use actix::prelude::*;
 
 use crate::simulation::container::Cause;
@@ -20,6 +22,8 @@ pub enum WebotsEvent {
     Heartbeat,
     /// It has sent no heartbeat for so many seconds.
     Hanging(u64),
+    /// It is paused, and ends then for that; or it does not end for that any more.
+    IdleEnd(Option<Instant>),
     /// It has ended, and why.
     Exited(Exit),
 }

@@ -30,7 +30,7 @@ pub struct Launched {
     pub tail: Tail,
     /// The file that its output is kept in.
     pub log: Option<PathBuf>,
-    /// Hears what it takes, where its control group or Docker does not know.
+    /// Hears what it takes, where it has no control group of its own.
     pub peak: Option<Arc<Peak>>,
 }
 
@@ -81,7 +81,7 @@ where
     };
     let (group, ended) = ProcessGroup::start(&process, output.into(), errors.into())?;
     let folder = cgroup.as_ref().map(|cgroup| cgroup.path().to_owned());
-    let peak = (cgroup.is_none() && spec.containers.is_none()).then(Arc::<Peak>::default);
+    let peak = cgroup.is_none().then(|| peak_of(&runtime));
     let seen = peak.clone();
     let ended = async move {
         let reason = ended.await;
@@ -96,6 +96,16 @@ where
         End { reason, cause: in_container.or(on_machine.then_some(Cause::OutOfMemory)), taken }
     };
     Ok((Launched { group, cgroup: folder, tail, log, peak }, ended))
+}
+
+/// Hears what a Webots takes that runs on this.
+fn peak_of(runtime: &Runtime) -> Arc<Peak> {
+    let Runtime::Containers(containers) = runtime else { return Arc::default() };
+    let (ids, peak) = (containers.ids(), Arc::new(Peak::of_containers()));
+    let named = Arc::clone(&peak);
+    // Its start does not wait for that.
+    actix_rt::spawn(async move { named.name_containers(ids.await) });
+    peak
 }
 
 /// Ends what has left the process group. Returns whether the kernel has ended something because it took too much memory,

@@ -2,6 +2,7 @@
 
 mod command;
 mod event;
+mod idleness;
 mod launch_spec;
 mod launched;
 mod output;
@@ -12,5 +13,6 @@ mod virtual_display;
 mod webots;
 
 pub use event::{Exit, WebotsEvent};
+pub use idleness::Keep;
 pub use launch_spec::LaunchSpec;
 pub use webots::{RestoreController, Stop, Webots};

@@ -35,7 +35,7 @@ pub struct RestoreController(pub String);
 
 /// The actor.
 pub struct Webots {
-    spec: LaunchSpec,
+    pub(super) spec: LaunchSpec,
     port: u16,
     events: ExitNotifier,
     /// What it runs on is being prepared.
@@ -46,9 +46,12 @@ pub struct Webots {
     /// The wait until it listens.
     awaiting: Option<SpawnHandle>,
     tail: Tail,
-    listening: bool,
+    pub(super) listening: bool,
     /// Whether the simulation is not paused.
-    runs: bool,
+    pub(super) runs: bool,
+    /// The wait until one that is paused ends, and whether its client was told of that end.
+    pub(super) idle_end: Option<SpawnHandle>,
+    pub(super) idle_end_told: bool,
     last_heartbeat: Instant,
     hanging: bool,
     /// Why it was asked to end, if it was.
@@ -73,6 +76,8 @@ impl Webots {
             tail: Tail::default(),
             listening: false,
             runs: false,
+            idle_end: None,
+            idle_end_told: false,
             last_heartbeat: Instant::now(),
             hanging: false,
             stopped_for: None,
@@ -159,6 +164,7 @@ impl Webots {
         self.spec.place.0.update(Change::Port(port));
         self.show_pace();
         self.tell(WebotsEvent::Listening(port));
+        self.used(ctx);
     }
 
     /// Shows whether the simulation runs, unless Webots is starting or ending.
@@ -185,7 +191,7 @@ impl Webots {
     }
 
     /// Asks for an orderly end. The first reason is the one that is told.
-    fn stop(&mut self, kind: EndReason, why: &str) {
+    pub(super) fn stop(&mut self, kind: EndReason, why: &str) {
         if self.stopped_for.is_none() {
             self.log(Level::Info, &format!("ending: {why}"));
             self.stopped_for = Some((kind, why.to_owned()));
@@ -240,7 +246,7 @@ impl Webots {
         Exit { clean: false, own: !self.listening && self.spec.containers.is_none(), why }
     }
 
-    fn tell(&mut self, event: WebotsEvent) {
+    pub(super) fn tell(&mut self, event: WebotsEvent) {
         self.events.tell(event);
     }
 
@@ -268,10 +274,14 @@ impl Handler<OutputEvent> for Webots {
             OutputEvent::Heartbeat if self.spec.containers.is_some() => self.ready(self.port, ctx),
             OutputEvent::Heartbeat => {}
             OutputEvent::ContainerRuns => self.await_port(ctx),
-            OutputEvent::Reset => self.restart.iter().for_each(|controller| controller.notify_one()),
+            OutputEvent::Reset => {
+                self.restart.iter().for_each(|controller| controller.notify_one());
+                self.used(ctx);
+            }
             OutputEvent::Paused | OutputEvent::Running => {
                 self.runs = event == OutputEvent::Running;
                 self.show_pace();
+                self.used(ctx);
             }
         }
     }
