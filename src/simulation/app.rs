@@ -23,7 +23,7 @@ use crate::simulation::checkout::{CacheDir, Checkouts, Limits};
 use crate::simulation::client::{outcome, quota};
 use crate::simulation::container::Containers;
 use crate::simulation::isolation::{Launcher, Watcher};
-use crate::simulation::machine::{LoadMonitor, UsageMonitor};
+use crate::simulation::machine::{LoadMonitor, Spread, UsageMonitor};
 use crate::simulation::process::{Guardian, Leftovers, RunDir};
 use crate::simulation::web::configure;
 
@@ -214,7 +214,8 @@ fn assemble(
     let places = Places::new(config.streaming_ports(), config.waiting_line, config.max_places_per_address);
     let places = places.with_ends(ends.clone()).start();
     let csv = config.monitor_log_enabled.then(|| config.log_dir.0.join("simulation/monitor.csv"));
-    let (load_monitor, readings) = LoadMonitor::new(places.clone(), run.path(), csv);
+    let spread = config.spreads().then(|| Arc::new(Spread::over(config.displays_of_gpus().len())));
+    let (load_monitor, readings) = LoadMonitor::new(places.clone(), run.path(), csv, spread.clone());
     let load_monitor = load_monitor.start();
     if !config.notify.is_empty() {
         Announcer::new(&config).start();
@@ -237,6 +238,7 @@ fn assemble(
         sessions: Arc::default(),
         load_monitor,
         readings,
+        spread,
         checkouts: Arc::new(checkouts),
         launcher: Arc::new(launcher),
         containers,

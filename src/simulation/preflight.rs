@@ -8,6 +8,7 @@ use super::config::{Isolation, SimulationConfig};
 use super::container;
 use crate::simulation::isolation::Launcher;
 use crate::simulation::machine::display;
+use crate::simulation::machine::sensors::{GpuReading, GpuSensor};
 
 /// The result of one check.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -45,7 +46,8 @@ pub fn check(config: &SimulationConfig) -> Vec<Finding> {
     let unkept = launcher.as_ref().map(Launcher::unkept).unwrap_or_default();
     let unkept = unkept.into_iter().map(|line| Finding { topic: "limits", result: Err(line) });
     let isolation = Finding { topic: "isolation", result: launcher.and_then(|launcher| isolation(&launcher)) };
-    first.into_iter().chain(always).chain(last).chain([isolation]).chain(unkept).collect()
+    let gpus = config.spreads().then(|| Finding { topic: "GPUs", result: gpus(config) });
+    first.into_iter().chain(gpus).chain(always).chain(last).chain([isolation]).chain(unkept).collect()
 }
 
 fn webots(config: &SimulationConfig) -> Result<String, String> {
@@ -66,16 +68,43 @@ fn display(config: &SimulationConfig) -> Result<String, String> {
     if config.xvfb {
         return Ok("each Webots gets a virtual display of its own (xvfb), without the graphics card".to_owned());
     }
-    let display = display::effective(config.display.as_ref());
     let source = match (&config.display, display::of_environment()) {
+        _ if !config.displays_of_gpus().is_empty() => "displays names it",
         (Some(_), _) => "the configuration names it",
         (None, Some(_)) => "the environment variable DISPLAY names it",
         (None, None) => "DISPLAY is not set, and the configuration names no display",
     };
-    match display::check(&display) {
-        Ok(()) => Ok(format!("{display} answers ({source})")),
-        Err(trouble) => Err(format!("{trouble} ({source})")),
+    let count = u32::try_from(config.displays_of_gpus().len()).unwrap_or(u32::MAX).max(1);
+    let displays: Vec<String> = (0..count).map(|gpu| config.display_on(Some(gpu))).collect();
+    match displays.iter().find_map(|display| display::check(display).err()) {
+        None => Ok(format!("{} answers ({source})", displays.join(", "))),
+        Some(trouble) => Err(format!("{trouble} ({source})")),
     }
+}
+
+/// The GPUs over which simulations are spread.
+fn gpus(config: &SimulationConfig) -> Result<String, String> {
+    let unread = |why: &str| format!("gpus is \"spread\", but no NVIDIA GPU is read, so none is chosen: {why}");
+    let GpuReading { gpus, lost } = GpuSensor::read_once().map_err(|why| unread(&why))?;
+    let (count, displays) = (gpus.len() + lost, config.displays_of_gpus().len());
+    match (count, displays) {
+        (0, _) => return Err(unread("NVIDIA's driver knows none")),
+        (_, 0) => {}
+        _ if displays < count => {
+            return Err(format!(
+                "displays names {displays} of {count} GPUs' X screens: the other GPUs get no simulation"
+            ));
+        }
+        _ if displays > count => {
+            return Err(format!("displays names {displays} X screens, but there are {count} GPUs"));
+        }
+        _ => {}
+    }
+    if lost > 0 {
+        return Err(format!("{lost} of {count} are lost, and get no simulation (see Xid in the kernel's log)"));
+    }
+    let names: Vec<&str> = gpus.iter().map(|gpu| gpu.name.as_str()).collect();
+    Ok(format!("simulations are spread over {}", names.join(", ")))
 }
 
 fn xvfb(config: &SimulationConfig) -> Result<String, String> {

@@ -1,6 +1,7 @@
 //! Whether the server can start simulations at all. Checked every five seconds: Webots may be installed again, a disk or a
 //! display may go and come back. The check does what a start does: it writes to the disk and starts a process.
 
+use std::collections::BTreeSet;
 use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
@@ -39,7 +40,7 @@ pub fn watch(
     failed_starts: Arc<FailedStarts>,
 ) -> watch::Receiver<Option<String>> {
     // The first check comes before the first client; GPUs are not read yet.
-    let first = check(&config, &run).and_then(|()| check_init(&config, false)).err();
+    let first = check(&config, &run, &[]).and_then(|()| check_init(&config, false)).err();
     let (sender, problem) = watch::channel(None);
     publish(&sender, first, &failed_starts);
     actix_rt::spawn(async move {
@@ -50,9 +51,11 @@ pub fn watch(
             actix_rt::time::sleep(pause).await;
             clocks = log_clock_step(clocks);
             let gpus = check_gpus(&config, &readings.borrow());
+            let indexes: Vec<u32> = readings.borrow().gpus.iter().map(|gpu| gpu.index).collect();
             let (config, run) = (Arc::clone(&config), run.clone());
-            let all =
-                move || gpus.and_then(|()| check(&config, &run)).and_then(|()| check_init(&config, has_init)).err();
+            let all = move || {
+                gpus.and_then(|()| check(&config, &run, &indexes)).and_then(|()| check_init(&config, has_init)).err()
+            };
             let mut checked = actix_rt::task::spawn_blocking(all);
             let found = if let Ok(found) = actix_rt::time::timeout(HUNG, &mut checked).await {
                 found
@@ -99,8 +102,9 @@ fn log_clock_step((instant, time): (Instant, SystemTime)) -> (Instant, SystemTim
     (Instant::now(), now)
 }
 
-/// Checks everything that each simulation needs. Blocks for two seconds, and for as long as the disk does.
-fn check(config: &SimulationConfig, run: &Path) -> Result<(), String> {
+/// Checks everything that each simulation needs; `gpus` are the numbers of those that answer. Blocks for two seconds for
+/// each display, and for as long as the disk does.
+fn check(config: &SimulationConfig, run: &Path, gpus: &[u32]) -> Result<(), String> {
     if config.isolation == Isolation::Container {
         daemon_fault().map_or(Ok(()), Err)?;
     }
@@ -117,10 +121,18 @@ fn check(config: &SimulationConfig, run: &Path) -> Result<(), String> {
     }
     // Webots itself always needs a display. What stands in for it (`webots`) may not.
     if config.webots.is_none() && !config.xvfb && config.isolation != Isolation::Container {
-        let display = display::effective(config.display.as_ref());
-        display::check(&display).map_err(|error| format!("Webots can't open its window: {error}"))?;
+        for display in displays(config, gpus) {
+            display::check(&display).map_err(|error| format!("Webots can't open its window: {error}"))?;
+        }
     }
     Ok(())
+}
+
+/// The displays that simulations may be given: those of GPUs that answer, where each has its own.
+fn displays(config: &SimulationConfig, gpus: &[u32]) -> BTreeSet<String> {
+    let with_display = gpus.iter().filter(|index| (**index as usize) < config.displays_of_gpus().len());
+    let displays: BTreeSet<String> = with_display.map(|index| config.display_on(Some(*index))).collect();
+    if displays.is_empty() { [config.display_on(None)].into() } else { displays }
 }
 
 /// Checks that there are GPUs and none is lost, where they are required.

@@ -28,6 +28,8 @@ pub enum Change {
         /// The file.
         log: Option<PathBuf>,
     },
+    /// It was given the GPU with this number.
+    Gpu(u32),
     /// It streams on this port.
     Port(u16),
     /// Its client is away, and it waits until so many seconds since 1970; or its client is there again.
@@ -82,6 +84,9 @@ pub struct Simulation {
     pub cgroup: Option<PathBuf>,
     /// The streaming port, once there is one.
     pub port: Option<u16>,
+    /// The number of its GPU, where simulations are spread over several.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub gpu: Option<u32>,
     /// Until when it waits for its client, which is away, in seconds since 1970.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub away_until: Option<u64>,
@@ -97,6 +102,7 @@ impl Simulation {
         match change {
             Change::Stage(stage) => self.stage = stage,
             Change::Version(version) => self.version = Some(version),
+            Change::Gpu(index) => self.gpu = Some(index),
             Change::Port(port) => self.port = Some(port),
             Change::Away(until) => self.away_until = until,
             Change::Launched { at, pid, cgroup, port, log } => {

@@ -24,7 +24,7 @@ use crate::simulation::checkout::Checkouts;
 use crate::simulation::container::Containers;
 use crate::simulation::isolation::{Launcher, Watcher};
 use crate::simulation::machine::UsageMonitor;
-use crate::simulation::machine::{LoadMonitor, Readings};
+use crate::simulation::machine::{LoadMonitor, Readings, Spread};
 use crate::simulation::process::RunDir;
 
 /// How many threads start Webots. One that starts a process waits until it runs its program, which takes long on a busy
@@ -45,6 +45,8 @@ pub struct AppState {
     pub load_monitor: Addr<LoadMonitor>,
     /// The newest readings of the machine.
     pub readings: watch::Receiver<Arc<Readings>>,
+    /// Chooses the GPU of each simulation, where they are spread over several.
+    pub spread: Option<Arc<Spread>>,
     /// Launches simulations at a level of isolation.
     pub launcher: Arc<Launcher>,
     /// Watches over simulations: what they take, and where they listen.

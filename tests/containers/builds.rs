@@ -156,7 +156,7 @@ async fn images_of_ours_that_are_old_are_removed_and_no_others() {
     let owner = webots_fleet::simulation::container::Owner::of(&folder.path().join("cache"));
     let names = [("old", owner.name()), ("others", "000000000000"), ("running", owner.name())];
     for (tag, owner) in names {
-        load_old(folder.path(), &format!("webots-fleet.test/{tag}:1"), owner);
+        load(folder.path(), &format!("webots-fleet.test/{tag}:1"), owner, "2020-01-01T00:00:00Z");
     }
     let label = "com.docker.compose.project=webots-fleet.test";
     let running = ask(&["create", "--label", label, "--network", "none", "webots-fleet.test/running:1", "true"]);
@@ -173,15 +173,44 @@ async fn images_of_ours_that_are_old_are_removed_and_no_others() {
     ask(&["rm", &running]);
 }
 
-/// Gives the daemon an image that a server has built long ago.
-fn load_old(folder: &std::path::Path, name: &str, owner: &str) {
+#[actix_rt::test]
+async fn a_full_disk_is_freed_of_images_that_no_container_uses() {
+    let Some(_docker) = docker().await else { return };
+    let (forge, folder) = (Forge::with_arm(), tempfile::tempdir().unwrap());
+    std::fs::create_dir(folder.path().join("cache")).unwrap();
+    let owner = webots_fleet::simulation::container::Owner::of(&folder.path().join("cache"));
+    let names = [("unused", owner.name()), ("of-others", "000000000000"), ("used", owner.name())];
+    let hours = |count: i64| format!("-{count} hours");
+    for (tag, owner) in names {
+        load(folder.path(), &format!("webots-fleet.test/{tag}:1"), owner, &created(&hours(2)));
+    }
+    load(folder.path(), "webots-fleet.test/new:1", owner.name(), &created(&hours(0)));
+    let label = "com.docker.compose.project=webots-fleet.test";
+    let used = ask(&["create", "--label", label, "--network", "none", "webots-fleet.test/used:1", "true"]);
+    let is_there = |tag: &str| !ask(&["image", "ls", "--quiet", &format!("webots-fleet.test/{tag}:1")]).is_empty();
+    // No disk has so much room.
+    let full = server(forge.path(), 1).folder(folder.path()).set("diskReserve", 100_000_000);
+    let _server = full.start().await;
+    until("the one that nobody uses is gone", async || !is_there("unused")).await;
+    assert!(["of-others", "used", "new"].iter().all(|tag| is_there(tag)));
+    ask(&["rm", &used]);
+}
+
+/// A time as images have it, as `date` reads it.
+fn created(when: &str) -> String {
+    let output = std::process::Command::new("date").args(["--utc", "+%FT%TZ", "--date", when]).output().unwrap();
+    String::from_utf8(output.stdout).unwrap().trim().to_owned()
+}
+
+/// Gives the daemon an image that a server has built at this time.
+fn load(folder: &std::path::Path, name: &str, owner: &str, created: &str) {
     let files = folder.join("image");
     std::fs::create_dir_all(&files).unwrap();
     std::fs::write(files.join("layer.tar"), [0; 1024]).unwrap();
     // The digest of the layer, two blocks of zeros.
     let layer = "sha256:5f70bf18a086007016e948b04aed3b82103a36bea41755b6cddfaf10ace3c6ef";
     let config = serde_json::json!({
-        "architecture": "amd64", "os": "linux", "created": "2020-01-01T00:00:00Z", "author": name,
+        "architecture": "amd64", "os": "linux", "created": created, "author": name,
         "config": {"Labels": {"webots-fleet.owner": owner}}, "rootfs": {"type": "layers", "diff_ids": [layer]},
     });
     std::fs::write(files.join("config.json"), config.to_string()).unwrap();

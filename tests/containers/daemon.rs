@@ -166,6 +166,20 @@ pub fn open_socket() {
     std::fs::set_permissions(socket, std::os::unix::fs::PermissionsExt::from_mode(0o666)).unwrap();
 }
 
+/// A user of the machine who is not root, by number.
+pub const ORDINARY: u32 = 12345;
+
+/// Has a server, whose files are in this folder, run as an ordinary user.
+pub fn as_ordinary(server: Builder, repositories: &Path, folder: &Path) -> Builder {
+    open_socket();
+    let owner = format!("{ORDINARY}:{ORDINARY}");
+    for path in [repositories, folder] {
+        assert!(Command::new("chown").arg("-R").arg(&owner).arg(path).status().unwrap().success());
+    }
+    let user = format!("exec setpriv --reuid {ORDINARY} --regid {ORDINARY} --clear-groups \"$0\" \"$@\"");
+    server.folder(folder).before(&user)
+}
+
 /// Makes an image of an archive, in the daemon whose files are in this folder.
 pub fn import(folder: &Path, tar: &str, name: &str) {
     made(folder, &["import", tar, name]);

@@ -4,10 +4,11 @@ use std::time::Duration;
 
 use serde_json::json;
 
-use super::daemon::{ask, docker, of_service, server};
+use super::daemon::{as_ordinary, ask, docker, of_service, server};
 use super::image::NAME;
 use crate::support::client::Client;
 use crate::support::git::{Forge, arm};
+use crate::support::http;
 
 /// How long a build may take on a busy machine.
 const BUILT: Duration = Duration::from_secs(90);
@@ -88,4 +89,47 @@ async fn a_build_has_no_more_memory_than_a_simulation() {
     let mut client = Client::start(&server, &arm()).await;
     let told = client.patiently("loading: Error:", BUILT).await;
     assert!(told.contains("can't be built") && told.contains("137"), "{told}");
+}
+
+/// Starts a world whose Dockerfile ends so, and checks that the server does not take its failure for its own.
+async fn fails_by_itself(line: &str) -> String {
+    let forge = with(&format!("FROM {NAME}\nCOPY . /usr/local/webots-project\n{line}\n"));
+    let folder = tempfile::tempdir().unwrap();
+    let server = as_ordinary(server(forge.path(), 1), forge.path(), folder.path()).start().await;
+    let mut client = Client::start(&server, &arm()).await;
+    let told = client.patiently("loading: Error:", BUILT).await;
+    assert_eq!(client.closed().await, Some(1000), "{line}: {told}");
+    let status = http::get(&server.url("/status")).await.json();
+    assert_eq!(status["failedStarts"], 0, "{line}: {told}");
+    assert!(!told.contains(server.folder().to_str().unwrap()), "{line}: {told}");
+    told
+}
+
+#[actix_rt::test]
+async fn an_image_without_the_folders_that_containers_get_is_its_projects_fault() {
+    let Some(_docker) = docker().await else { return };
+    for folder in ["/tmp", "/run", "/var/tmp"] {
+        fails_by_itself(&format!("RUN rm -rf {folder} && touch {folder}")).await;
+    }
+}
+
+#[actix_rt::test]
+async fn a_device_that_a_dockerfile_makes_in_the_project_opens_nothing() {
+    let Some(_docker) = docker().await else { return };
+    // An ordinary user can't even copy one out of the image.
+    let told = fails_by_itself("RUN mknod /usr/local/webots-project/zero c 1 5").await;
+    assert!(told.contains("not permitted"), "{told}");
+    // The memory of the machine, and a disk that there may be.
+    let devices = "cd /usr/local/webots-project && mknod mem c 1 1 && mknod disk b 254 0 && mknod controllers/zero c 1 5 \
+                   && chmod 666 mem disk controllers/zero";
+    let forge = with(&format!("FROM {NAME}\nCOPY . /usr/local/webots-project\nRUN {devices}\n"));
+    let server = server(forge.path(), 1).start().await;
+    let mut client = Client::start(&server, &arm()).await;
+    client.patiently("webots:", BUILT).await;
+    let webots = &of_service(&server, "webots")[0];
+    for device in ["mem", "disk"] {
+        let read = format!("head -c 1 /usr/local/webots-project/{device} 2>&1 || true");
+        let told = ask(&["exec", webots, "sh", "-c", &read]);
+        assert!(told.contains("not permitted") || told.contains("denied"), "{device}: {told}");
+    }
 }

@@ -1,9 +1,8 @@
 //! What a project may ask for in its webots.yml: an editor, a competition; and the administrator's templates.
 
-use std::process::Command;
 use std::time::Duration;
 
-use super::daemon::{ask, check, containers, docker, of_service, open_socket, server};
+use super::daemon::{ORDINARY, as_ordinary, ask, check, containers, docker, of_service, server};
 use super::image::NAME;
 use crate::support::client::Client;
 use crate::support::git::{Forge, WORLD, arm};
@@ -119,20 +118,11 @@ async fn a_participant_connects_to_webots_and_what_the_editor_changes_counts_aft
     until("all three are gone", async || containers(&server).is_empty()).await;
 }
 
-/// A user of the machine who is not root, by number.
-const ORDINARY: u32 = 12345;
-
 #[actix_rt::test]
 async fn what_an_image_keeps_at_home_is_found_and_can_be_changed() {
     let Some(_docker) = docker().await else { return };
     let (forge, folder) = (Forge::with_arm(), tempfile::tempdir().unwrap());
-    open_socket();
-    for path in [forge.path(), folder.path()] {
-        let owner = format!("{ORDINARY}:{ORDINARY}");
-        assert!(Command::new("chown").arg("-R").arg(owner).arg(path).status().unwrap().success());
-    }
-    let user = format!("exec setpriv --reuid {ORDINARY} --regid {ORDINARY} --clear-groups \"$0\" \"$@\"");
-    let server = server(forge.path(), 1).folder(folder.path()).before(&user).start().await;
+    let server = as_ordinary(server(forge.path(), 1), forge.path(), folder.path()).start().await;
     let mut client = Client::start(&server, &arm()).await;
     client.patiently("webots:", BUILT).await;
     let webots = of_service(&server, "webots")[0].clone();

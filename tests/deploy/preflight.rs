@@ -88,3 +88,32 @@ fn what_is_missing_is_warned_about() {
         assert!(told.contains(words), "{words} is not in\n{told}");
     }
 }
+
+#[test]
+fn displays_that_do_not_fit_the_gpus_are_warned_about() {
+    let library = crate::simulation::readings::gpu_driver();
+    let webots = Webots::script("exit 0");
+    let table = [
+        (json!([]), "4", "GPUs: simulations are spread over Stand-in A, Stand-in B, Stand-in C, Stand-in D\n"),
+        (
+            json!([":90.0", ":90.1"]),
+            "4",
+            "warning: GPUs: displays names 2 of 4 GPUs' X screens: the other GPUs get no simulation\n",
+        ),
+        (json!([":90.0", ":90.1"]), "1", "warning: GPUs: displays names 2 X screens, but there are 1 GPUs\n"),
+        (
+            json!([]),
+            "0",
+            "warning: GPUs: gpus is \"spread\", but no NVIDIA GPU is read, so none is chosen: NVIDIA's driver knows none\n",
+        ),
+    ];
+    for (displays, count, words) in table {
+        let keys = json!({"webots": webots.path(), "gpus": "spread", "displays": displays});
+        let (_, told) = check(&keys, |command| {
+            command.env("LD_LIBRARY_PATH", library.path()).env("NVML_COUNT", count);
+        });
+        assert!(told.contains(words), "{words} is not in\n{told}");
+    }
+    let (_, told) = check(&json!({"displays": [":90.0"]}), |_| ());
+    assert!(told.contains("displays has no effect") && !told.contains("GPUs: "), "{told}");
+}

@@ -163,3 +163,84 @@ async fn samples_are_written_with_the_columns_of_the_original() {
     until("it has read", async || http::get(&quiet.url("/load")).await.text() != "0").await;
     assert!(!quiet.folder.join("log/simulation/monitor.csv").exists());
 }
+
+/// What of the GPU each simulation of a server with four is told: its number on `/status`, and its variables.
+async fn given(server: &Server) -> Vec<(Option<u64>, String, String)> {
+    let status = http::get(&server.url("/status")).await.json();
+    let simulations = status["simulations"].as_array().unwrap().clone();
+    let told = simulations.iter().map(|one| {
+        let pid = i32::try_from(one["pid"].as_i64().unwrap()).unwrap();
+        let environment = procfs::process::Process::new(pid).unwrap().environ().unwrap();
+        let variable = |name: &str| {
+            let value = environment.get(std::ffi::OsStr::new(name));
+            value.map(|value| value.to_str().unwrap().to_owned()).unwrap_or_default()
+        };
+        (one["gpu"].as_u64(), variable("CUDA_VISIBLE_DEVICES"), variable("DISPLAY"))
+    });
+    told.collect()
+}
+
+#[actix_rt::test]
+async fn simulations_are_spread_over_gpus_and_a_lost_one_gets_none() {
+    let library = gpu_driver();
+    let mark = library.path().join("mark");
+    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
+    let displays = [":90.0", ":90.1", ":90.2", ":90.3"];
+    let four = simulation_server(&webots.path(), forge.path(), 12)
+        .env("LD_LIBRARY_PATH", library.path().to_str().unwrap())
+        .env("NVML_COUNT", "4")
+        .env("NVML_COMPUTE_2", "95")
+        .env("NVML_LOST", mark.to_str().unwrap())
+        .env("NVML_LOST_INDEX", "1")
+        .env("CUDA_VISIBLE_DEVICES", "0")
+        .set("gpus", "spread")
+        .set("displays", serde_json::json!(displays));
+    let server = four.start().await;
+    until("GPUs are read", async || http::get(&server.url("/status")).await.json()["gpus"][3].is_object()).await;
+    // The first has the most memory in use, the third computes.
+    let mut clients = Vec::new();
+    for _ in 0..4 {
+        clients.push(Client::start(&server, &arm()).await);
+    }
+    for client in &mut clients {
+        client.until("webots:").await;
+    }
+    let expected = |gpus: &[usize]| {
+        let one = |gpu: &usize| (Some(*gpu as u64), format!("GPU-{gpu}"), displays[*gpu].to_owned());
+        gpus.iter().map(one).collect::<Vec<_>>()
+    };
+    let mut told = given(&server).await;
+    told.sort();
+    assert_eq!(told, expected(&[1, 1, 3, 3]));
+    let page = http::get(&server.url("/monitor")).await.text();
+    assert!(page.contains("<small>GPU 3</small>") && page.contains("GPU 2: Stand-in C"), "{page}");
+    assert!(server.log().contains("it gets GPU 1, Stand-in B"), "{}", server.log());
+    std::fs::write(&mark, "").unwrap();
+    until("one is lost", async || gpu_problem(&server).await.is_some()).await;
+    drop(clients);
+    let simulations = async || http::get(&server.url("/status")).await.json()["simulations"].clone();
+    until("all are gone", async || simulations().await == serde_json::json!([])).await;
+    let mut clients = Vec::new();
+    for _ in 0..3 {
+        clients.push(Client::start(&server, &arm()).await);
+        clients.last_mut().unwrap().until("webots:").await;
+    }
+    assert!(given(&server).await.iter().all(|(gpu, ..)| *gpu == Some(3)), "{:?}", given(&server).await);
+    let metrics = http::get(&server.url("/metrics")).await.text();
+    assert!(metrics.contains("webots_machine_gpu_compute_percent{gpu=\"2\",name=\"Stand-in C\"} 95"), "{metrics}");
+}
+
+#[actix_rt::test]
+async fn without_being_told_simulations_are_not_spread() {
+    let library = gpu_driver();
+    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
+    let builder = with(library.path(), &forge, &webots).set("displays", serde_json::json!([":90.0", ":90.1"]));
+    let server = builder.set("display", ":91").start().await;
+    until("GPUs are read", async || http::get(&server.url("/status")).await.json()["gpus"][1].is_object()).await;
+    Client::start(&server, &arm()).await.until("webots:").await;
+    let mut client = Client::start(&server, &arm()).await;
+    client.until("webots:").await;
+    let told = given(&server).await;
+    assert!(told.iter().all(|one| *one == (None, String::new(), ":91".to_owned())), "{told:?}");
+    assert!(server.log().contains("displays has no effect"), "{}", server.log());
+}

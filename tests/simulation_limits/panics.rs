@@ -149,6 +149,7 @@ async fn launch(server: &AppState) -> (Addr<Webots>, UnboundedReceiver<Exit>) {
         project: Arc::new(project),
         mode: Mode::X3d,
         place: (ticket, port),
+        gpu: None,
         events: listener.recipient(),
     };
     (Webots::new(spec).start(), ended)

@@ -1,6 +1,7 @@
 //! How a session starts its simulation: a place, the checkout, Webots; and the ends of a start that fails.
 
 use std::sync::Arc;
+use std::time::Instant;
 
 use actix::prelude::*;
 use actix_web_actors::ws::CloseCode;
@@ -11,6 +12,7 @@ use super::session::Session;
 use super::state::{StartRequest, State, WebotsHandle};
 use crate::simulation::checkout::{Progress, Project};
 use crate::simulation::ends::EndReason;
+use crate::simulation::machine::sensors::Gpu;
 use crate::simulation::places::Ticket;
 use crate::simulation::protocol::{self, Mode};
 use crate::simulation::readiness;
@@ -98,6 +100,7 @@ impl Session {
             let registration = self.server.sessions.register(ctx.address().recipient());
             self.resumption = Some(Resumption::new(registration, &place.0, self.server.places.clone()));
         }
+        let gpu = self.take_gpu(&place.0);
         let spec = LaunchSpec {
             config: Arc::clone(&self.server.config),
             containers: self.server.containers.clone(),
@@ -107,10 +110,20 @@ impl Session {
             checkouts: Arc::clone(&self.server.checkouts),
             project: Arc::new(project),
             mode,
+            gpu,
             place,
             events: ctx.address().recipient(),
         };
         let webots = Webots::start_in_arbiter(self.server.webots_thread(spec.place.1), |_| Webots::new(spec));
         self.state = State::Launched(WebotsHandle(webots));
+    }
+
+    /// Takes a GPU for a simulation, where they are spread over several and one answers.
+    fn take_gpu(&self, ticket: &Ticket) -> Option<Gpu> {
+        let spread = self.server.spread.as_ref()?;
+        let gpu = spread.take(&self.server.readings.borrow().gpus, Instant::now())?;
+        ticket.update(Change::Gpu(gpu.index));
+        ticket.log(log::Level::Info, format!("it gets GPU {}, {}", gpu.index, gpu.name));
+        Some(gpu)
     }
 }

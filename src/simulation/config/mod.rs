@@ -1,6 +1,7 @@
 //! The simulation server's configuration: every key, its default, and the rules between keys.
 
 mod container;
+mod gpus;
 mod isolation;
 mod own_files;
 mod resources;
@@ -9,6 +10,7 @@ mod timing;
 mod urls;
 
 pub use container::{ContainerDisplay, ContainerNetwork, ContainerSettings, EDITOR_PORT};
+pub use gpus::GpuUse;
 pub use isolation::{Isolation, SandboxFolders, VariableName};
 pub use resources::Resources;
 pub use simulation_config::SimulationConfig;

@@ -6,7 +6,8 @@ use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
-use super::container::{ContainerSettings, check_ports};
+use super::container::{ContainerDisplay, ContainerSettings, check_ports};
+use super::gpus::GpuUse;
 use super::isolation::{Isolation, SandboxFolders, VariableName, level};
 use super::resources::Resources;
 use super::timing::Timing;
@@ -17,7 +18,7 @@ use crate::shared::config::{
 use crate::shared::domain::{PublicUrl, UrlPrefix, check_host};
 use crate::shared::http::{Origin, TrustedProxies};
 use crate::simulation::checkout::Mirrors;
-use crate::simulation::machine::display::DisplayName;
+use crate::simulation::machine::display::{self, DisplayName};
 
 /// Every key of the simulation server. The original's keys keep their meaning.
 #[derive(Debug, Clone, Serialize, Deserialize)]
@@ -153,6 +154,12 @@ pub struct SimulationConfig {
     /// Whether the server is ready only while it sees GPUs and none is lost. Default: false.
     #[serde(default)]
     pub require_gpu: bool,
+    /// Which GPU a simulation gets, of several. Default: the first.
+    #[serde(default)]
+    pub gpus: GpuUse,
+    /// The X screen that each GPU drives, in the order of `nvidia-smi`; with `gpus: "spread"`. Default: none.
+    #[serde(default, deserialize_with = "one_or_many")]
+    pub displays: Vec<DisplayName>,
     /// The display that Webots opens its window on. Default: the environment variable `DISPLAY`, else `:0`.
     #[serde(default)]
     pub display: Option<DisplayName>,
@@ -185,6 +192,29 @@ impl SimulationConfig {
         }
         let inside = if cfg!(target_os = "macos") { "Contents/MacOS/webots" } else { "webots" };
         self.webots_home.as_ref().map(|home| home.0.join(inside))
+    }
+
+    /// Whether simulations are spread over the GPUs of the machine.
+    #[must_use]
+    pub fn spreads(&self) -> bool {
+        self.gpus == GpuUse::Spread && (self.container.gpu || self.isolation != Isolation::Container)
+    }
+
+    /// The displays of the GPUs, where Webots opens its windows on them.
+    #[must_use]
+    pub fn displays_of_gpus(&self) -> &[DisplayName] {
+        let is_virtual = match self.isolation {
+            Isolation::Container => self.container.display == ContainerDisplay::Virtual,
+            _ => self.xvfb,
+        };
+        if self.spreads() && !is_virtual { &self.displays } else { &[] }
+    }
+
+    /// The display on which a Webots opens its window that has this GPU, if it has one.
+    #[must_use]
+    pub fn display_on(&self, gpu: Option<u32>) -> String {
+        let own = self.displays_of_gpus().get(gpu.unwrap_or_default() as usize);
+        display::effective(own.or(self.display.as_ref()))
     }
 }
 
@@ -221,6 +251,11 @@ impl Configuration for SimulationConfig {
                 let problem = format!("{address:?} is no URL; allowed are http and https URLs");
                 return Err(InvalidValue { key: "notify", problem });
             }
+        }
+        if !self.displays.is_empty() && self.displays_of_gpus().is_empty() {
+            let why =
+                "they count with gpus: \"spread\" only, and not where each Webots has a virtual display of its own";
+            warnings.push(format!("displays has no effect: {why}"));
         }
         if self.allowed_repositories.is_empty() {
             warnings.push("allowedRepositories is not set: no world will run here".to_owned());

@@ -10,7 +10,7 @@ use super::engine::Engine;
 use super::recipe::PROJECT_PATH;
 use super::templates::Template;
 use crate::simulation::config::{ContainerDisplay, EDITOR_PORT, SimulationConfig};
-use crate::simulation::machine::display;
+use crate::simulation::machine::sensors::Gpu;
 
 /// What the compose project of one simulation is made of.
 #[derive(Debug)]
@@ -33,6 +33,8 @@ pub struct Parts<'parts> {
     pub command: &'parts [String],
     /// The port of Webots.
     pub port: u16,
+    /// The GPU that it was given.
+    pub gpu: Option<&'parts Gpu>,
     /// Whether there is a Makefile.
     pub make: bool,
     /// What Docker offers.
@@ -108,8 +110,14 @@ impl Parts<'_> {
             ("THEIA_FOLDER", edited),
             ("THEIA_PORT", (self.port + EDITOR_PORT).to_string()),
             ("IPC", path(&self.exchange())),
-            ("DISPLAY", display_of(config).unwrap_or_default()),
+            ("DISPLAY", self.display(config).unwrap_or_default()),
         ]
+    }
+
+    /// The display of the machine, where that is asked for.
+    fn display(&self, config: &SimulationConfig) -> Option<String> {
+        let is_machine = config.container.display == ContainerDisplay::Machine;
+        is_machine.then(|| config.display_on(self.gpu.map(|gpu| gpu.index)))
     }
 
     /// The same for who looks at the files, one in each line.
@@ -186,7 +194,7 @@ impl Parts<'_> {
     /// Gives Webots graphics cards, the display of the machine, and the administrator's folders.
     fn show(&self, service: &mut Service, environment: &mut Vec<(&'static str, String)>, config: &SimulationConfig) {
         let mut volumes: Vec<String> = config.container.mounts.clone();
-        if let Some(display) = display_of(config) {
+        if let Some(display) = self.display(config) {
             environment.push(("DISPLAY", display));
             volumes.push(format!("{DISPLAYS}:{DISPLAYS}"));
             if let Some(authority) = std::env::var_os("XAUTHORITY") {
@@ -201,8 +209,11 @@ impl Parts<'_> {
             service.insert("group_add", json!(groups.iter().map(u32::to_string).collect::<Vec<_>>()));
         }
         if self.engine.nvidia && config.container.gpu {
-            let all = json!([{ "driver": "nvidia", "count": "all", "capabilities": ["gpu"] }]);
-            service.insert("deploy", json!({ "resources": { "reservations": { "devices": all } } }));
+            // An image or a template may ask for all by this variable.
+            environment.extend(self.gpu.map(|gpu| ("NVIDIA_VISIBLE_DEVICES", gpu.id.clone())));
+            let (key, value) = self.gpu.map_or(("count", json!("all")), |gpu| ("device_ids", json!([gpu.id])));
+            let devices = json!({ "driver": "nvidia", key: value, "capabilities": ["gpu"] });
+            service.insert("deploy", json!({ "resources": { "reservations": { "devices": [devices] } } }));
             environment.push(("NVIDIA_DRIVER_CAPABILITIES", "all".to_owned()));
         }
     }
@@ -220,12 +231,6 @@ pub fn container_of(project: &str, service: &str) -> String {
     format!("{project}-{service}")
 }
 
-/// The display of the machine, where that is asked for.
-fn display_of(config: &SimulationConfig) -> Option<String> {
-    let is_machine = config.container.display == ContainerDisplay::Machine;
-    is_machine.then(|| display::effective(config.display.as_ref()))
-}
-
 /// What compose is told of a service.
 type Service = BTreeMap<&'static str, Value>;
 
@@ -234,3 +239,51 @@ const ENVIRONMENT: [(&str, &str); 3] = [("USER", "webots"), ("XDG_RUNTIME_DIR", 
 
 /// How much memory a container may take where `limits.memory` does not say, in MiB.
 pub const DEFAULT_MEMORY: u64 = 4096;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::simulation::config::ContainerSettings;
+
+    #[test]
+    fn a_container_gets_the_gpu_that_was_chosen_and_its_display_or_all_gpus() {
+        let keys = json!({ "isolation": "container", "gpus": "spread", "displays": [":0.0", ":0.1"], "display": ":7" });
+        let mut config: SimulationConfig = serde_json::from_value(keys).unwrap();
+        config.container = ContainerSettings { display: ContainerDisplay::Machine, ..ContainerSettings::default() };
+        let engine = Engine { nvidia: true, graphics: None };
+        let gpu = Gpu { index: 1, id: "GPU-b".to_owned(), ..Gpu::default() };
+        let service = |gpu: Option<&Gpu>, name: &str| {
+            let (folder, command) = (Path::new("/srv/one"), ["webots".to_owned()]);
+            let parts = Parts {
+                name: "one",
+                instance: folder,
+                project: folder,
+                edited: None,
+                volume: None,
+                image: "image",
+                controller: None,
+                command: &command,
+                port: 2001,
+                gpu,
+                make: false,
+                engine: &engine,
+            };
+            parts.service(name, false, &config)
+        };
+        let devices = |service: &Value| service["deploy"]["resources"]["reservations"]["devices"].clone();
+        let one = service(Some(&gpu), "webots");
+        let expected = json!([{ "driver": "nvidia", "device_ids": ["GPU-b"], "capabilities": ["gpu"] }]);
+        assert_eq!(devices(&one), expected);
+        assert_eq!(
+            (&one["environment"]["DISPLAY"], &one["environment"]["NVIDIA_VISIBLE_DEVICES"]),
+            (&json!(":0.1"), &json!("GPU-b"))
+        );
+        let all = service(None, "webots");
+        assert_eq!(devices(&all), json!([{ "driver": "nvidia", "count": "all", "capabilities": ["gpu"] }]));
+        assert_eq!(
+            (&all["environment"]["DISPLAY"], &all["environment"]["NVIDIA_VISIBLE_DEVICES"]),
+            (&json!(":0.0"), &Value::Null)
+        );
+        assert_eq!(devices(&service(Some(&gpu), "theia")), Value::Null);
+    }
+}

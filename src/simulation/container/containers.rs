@@ -189,6 +189,7 @@ impl Containers {
                 controller: controller.as_deref(),
                 command: &command,
                 port: request.port,
+                gpu: request.gpu.as_ref(),
                 make: recipe.make,
                 engine: &engine,
             };

@@ -5,6 +5,7 @@ use std::sync::Arc;
 use super::recipe::PROJECT_PATH;
 use crate::simulation::checkout::Project;
 use crate::simulation::config::{ContainerDisplay, SimulationConfig};
+use crate::simulation::machine::sensors::Gpu;
 
 /// Makes a command, given where the world is in the container.
 pub type Command = Box<dyn Fn(&str) -> Vec<String> + Send>;
@@ -15,6 +16,8 @@ pub struct Request {
     pub project: Arc<Project>,
     /// The port of Webots.
     pub port: u16,
+    /// The GPU that it was given; without one, it gets all.
+    pub gpu: Option<Gpu>,
     /// Webots and its arguments, given where its world is in the container.
     pub command: Command,
 }

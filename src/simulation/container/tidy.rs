@@ -4,9 +4,11 @@ use std::collections::HashSet;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use nix::sys::statvfs::statvfs;
 use parking_lot::{Mutex, MutexGuard};
 use tokio::sync::Notify;
 
+use super::check::data_folder;
 use super::docker::{Docker, DockerError};
 use super::image::Images;
 use super::objects::{self, Owner};
@@ -22,6 +24,9 @@ const PERIOD: Duration = Duration::from_mins(1);
 const AGAIN: Duration = Duration::from_secs(2);
 /// How often images are looked at.
 const PRUNE: Duration = Duration::from_mins(30);
+/// How old an image is at least that is removed because the disk is full, in hours: one that was just built has no container
+/// yet.
+const YOUNGEST: u64 = 1;
 
 impl Live {
     /// Notes a name.
@@ -43,7 +48,8 @@ impl Live {
 /// Removes what simulations have left that nobody could remove when they ended, and images that nobody needs.
 pub async fn keep_tidy(docker: Docker, owner: Owner, live: Live, images: Arc<Images>, config: Arc<SimulationConfig>) {
     let mut pruned: Option<Instant> = None;
-    let mut pause = PERIOD;
+    // What an earlier run has left may have filled the disk.
+    let mut pause = Duration::ZERO;
     loop {
         actix_rt::time::timeout(pause, live.0.1.notified()).await.ok();
         // Most has been removed by then.
@@ -57,13 +63,22 @@ pub async fn keep_tidy(docker: Docker, owner: Owner, live: Live, images: Arc<Ima
                 AGAIN
             }
         };
-        if pruned.is_none_or(|at| at.elapsed() > PRUNE) {
-            if let Err(error) = images.prune(config.container.images_age).await {
+        let reserve = config.disk_reserve;
+        let is_full = actix_rt::task::spawn_blocking(move || is_disk_full(reserve)).await.unwrap_or_default();
+        if is_full || pruned.is_none_or(|at| at.elapsed() > PRUNE) {
+            let hours = if is_full { YOUNGEST } else { 24 * config.container.images_age };
+            if let Err(error) = images.prune(hours).await {
                 log::warn!("images that nobody needs are not removed: {error}");
             }
             pruned = Some(Instant::now());
         }
     }
+}
+
+/// Whether the disk of Docker's images has less room than new simulations need, in MiB.
+fn is_disk_full(reserve: u64) -> bool {
+    let about = data_folder().and_then(|folder| statvfs(&folder).ok());
+    about.is_some_and(|disk| disk.blocks_available().saturating_mul(disk.fragment_size()) >> 20 < reserve)
 }
 
 /// Removes what is left. Returns how many projects it has found.

@@ -15,8 +15,8 @@ pub struct Program<'start> {
     pub project: PathBuf,
     /// The working folder.
     pub folder: &'start Path,
-    /// The variables that name its display.
-    pub display: &'start [(OsString, OsString)],
+    /// Variables of its own: those that name its display and its GPU.
+    pub variables: &'start [(OsString, OsString)],
     /// Time between SIGTERM and SIGKILL.
     pub grace: Duration,
 }

@@ -123,7 +123,8 @@ impl Sandbox {
 
     /// The socket of the display, and the file that authorizes its users.
     fn display_files(&self, program: &Program<'_>) -> Vec<PathBuf> {
-        let variable = |name: &str| program.display.iter().find(|(one, _)| one == name).map(|(_, value)| value.clone());
+        let variable =
+            |name: &str| program.variables.iter().find(|(one, _)| one == name).map(|(_, value)| value.clone());
         let socket = variable("DISPLAY").and_then(|display| socket_of(&display.to_string_lossy()));
         let authority = variable("XAUTHORITY").or_else(|| std::env::var_os("XAUTHORITY")).map(PathBuf::from);
         let usual = || self.homes.first().map(|home| home.join(".Xauthority"));
@@ -175,7 +176,7 @@ impl Sandbox {
             instance: instance.path(),
             folder: &project,
             project: project.clone(),
-            display: &[],
+            variables: &[],
             grace: TRIAL,
         })?;
         let command = words.into_iter().chain(["true".into()]);

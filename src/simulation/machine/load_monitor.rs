@@ -15,6 +15,7 @@ use tokio::sync::watch;
 
 use super::gpus::Gpus;
 use super::sensors::{self, Gpu, GpuReading, GpuSensor, Host, Machine, MachineSensor};
+use super::spread::Spread;
 use crate::shared::domain::Load;
 use crate::simulation::places::{GetSnapshot, Places};
 
@@ -58,6 +59,8 @@ pub struct Readings {
     pub machine: Machine,
     /// The newest reading; empty without GPUs.
     pub gpus: Vec<Gpu>,
+    /// The GPU that counts for the load: the one that the next simulation gets.
+    pub next_gpu: Option<Gpu>,
     /// What is wrong with the GPUs, if some have answered and don't any more.
     pub gpu_problem: Option<String>,
     /// The last ten minutes, the oldest first.
@@ -75,7 +78,7 @@ pub struct Sample {
     pub idle: u32,
     /// The machine.
     pub machine: Machine,
-    /// Compute load of the least busy GPU, in percent.
+    /// Compute load of the GPU that counts, in percent.
     pub gpu_compute: f64,
     /// Memory traffic of that GPU, in percent of the time.
     pub gpu_memory_traffic: f64,
@@ -102,15 +105,22 @@ pub struct LoadMonitor {
     disk: PathBuf,
     machine: Machine,
     gpus: Gpus,
+    spread: Option<Arc<Spread>>,
 }
 
 impl LoadMonitor {
-    /// Creates the actor. `disk` is a folder on the disk that is watched, `csv` the file that samples are written to.
+    /// Creates the actor. `disk` is a folder on the disk that is watched, `csv` the file that samples are written to,
+    /// `spread` chooses the GPU of the next simulation; without it the least busy one counts for the load.
     #[must_use]
-    pub fn new(places: Addr<Places>, disk: &Path, csv: Option<PathBuf>) -> (Self, watch::Receiver<Arc<Readings>>) {
+    pub fn new(
+        places: Addr<Places>,
+        disk: &Path,
+        csv: Option<PathBuf>,
+        spread: Option<Arc<Spread>>,
+    ) -> (Self, watch::Receiver<Arc<Readings>>) {
         let (published, readings) = watch::channel(Arc::default());
-        let (machine, disk) = (Machine::default(), disk.to_owned());
-        (Self { places, published, csv, csv_lines: 0, disk, machine, gpus: Gpus::default() }, readings)
+        let (machine, disk, gpus) = (Machine::default(), disk.to_owned(), Gpus::default());
+        (Self { places, published, csv, csv_lines: 0, disk, machine, gpus, spread }, readings)
     }
 
     fn sample(&mut self, ctx: &mut Context<Self>) {
@@ -125,23 +135,30 @@ impl LoadMonitor {
     }
 
     fn publish(&mut self, running: u32, idle: u32) {
-        let (gpus, gpu_problem) = self.gpus.current(Instant::now());
-        let least = sensors::least_busy(&self.machine, &gpus).cloned().unwrap_or_default();
+        let now = Instant::now();
+        let (gpus, gpu_problem) = self.gpus.current(now);
+        let next_gpu = match &self.spread {
+            Some(spread) => spread.next(&gpus, now),
+            None => sensors::least_busy(&self.machine, &gpus),
+        };
+        let next_gpu = next_gpu.cloned();
+        let gpu = next_gpu.clone().unwrap_or_default();
         let sample = Sample {
             timestamp: SystemTime::UNIX_EPOCH.elapsed().map_or(0, |age| age.as_secs()),
             running,
             idle,
             machine: self.machine,
-            gpu_compute: least.compute,
-            gpu_memory_traffic: least.memory_traffic,
-            gpu_memory: least.memory,
-            load: sensors::load(&self.machine, &gpus),
+            gpu_compute: gpu.compute,
+            gpu_memory_traffic: gpu.memory_traffic,
+            gpu_memory: gpu.memory,
+            load: sensors::load(&self.machine, next_gpu.as_ref()),
         };
         self.write(sample);
         self.published.send_modify(|readings| {
             let readings = Arc::make_mut(readings);
             readings.machine = self.machine;
             readings.gpus = gpus;
+            readings.next_gpu = next_gpu;
             readings.gpu_problem = gpu_problem;
             if readings.history.len() == KEPT {
                 readings.history.pop_front();
@@ -287,7 +304,7 @@ mod tests {
     #[actix_rt::test]
     async fn the_load_is_the_mean_of_five_seconds_and_the_history_is_ten_minutes_long() {
         let places = Places::new(2001..=2001, 1, None).start();
-        let (mut monitor, readings) = LoadMonitor::new(places, Path::new("/"), None);
+        let (mut monitor, readings) = LoadMonitor::new(places, Path::new("/"), None, None);
         let load = || readings.borrow().load.map(Load::percent);
         assert_eq!(load(), None);
         let mut read = |cpu: f64| {
@@ -308,9 +325,22 @@ mod tests {
     }
 
     #[actix_rt::test]
+    async fn the_gpu_of_the_next_simulation_counts_for_the_load() {
+        let gpu = |index, compute| Gpu { index, compute, ..Gpu::default() };
+        let gpus = [gpu(0, 90.0), gpu(1, 60.0), gpu(2, 10.0)];
+        for (spread, load) in [(None, 10.0), (Some(Spread::over(0)), 10.0), (Some(Spread::over(2)), 60.0)] {
+            let places = Places::new(2001..=2001, 1, None).start();
+            let (mut monitor, readings) = LoadMonitor::new(places, Path::new("/"), None, spread.map(Arc::new));
+            monitor.gpus.read(Instant::now(), GpuReading { gpus: gpus.to_vec(), lost: 0 });
+            monitor.publish(0, 0);
+            assert_eq!(readings.borrow().load.map(Load::percent), Some(load));
+        }
+    }
+
+    #[actix_rt::test]
     async fn gpus_that_are_no_longer_read_do_not_count() {
         let places = Places::new(2001..=2001, 1, None).start();
-        let (mut monitor, readings) = LoadMonitor::new(places, Path::new("/"), None);
+        let (mut monitor, readings) = LoadMonitor::new(places, Path::new("/"), None, None);
         let gpu = Gpu { compute: 90.0, ..Gpu::default() };
         let before = |age| Instant::now().checked_sub(Duration::from_secs(age)).unwrap();
         let reading = GpuReading { gpus: vec![gpu], lost: 0 };

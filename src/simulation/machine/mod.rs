@@ -4,7 +4,9 @@ pub mod display;
 mod gpus;
 mod load_monitor;
 pub mod sensors;
+mod spread;
 mod usage;
 
 pub use load_monitor::{LoadMonitor, Readings, Sample};
+pub use spread::Spread;
 pub use usage::{Measured, Sum, Tree, Usage, UsageMonitor, Usages, cgroup_sum};

@@ -1,7 +1,8 @@
 //! Readings of the machine (sysinfo) and of its NVIDIA GPUs (NVML).
 
 use std::path::{Path, PathBuf};
-use std::time::Instant;
+use std::sync::mpsc;
+use std::time::{Duration, Instant};
 
 use nix::sys::statvfs::statvfs;
 use nvml_wrapper::Nvml;
@@ -10,6 +11,9 @@ use serde::Serialize;
 use sysinfo::{CpuRefreshKind, MemoryRefreshKind, Networks, RefreshKind, System};
 
 use crate::shared::domain::Load;
+
+/// How long NVIDIA's driver may take to answer a check.
+const ANSWER: Duration = Duration::from_secs(5);
 
 /// A reading of the machine.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
@@ -33,6 +37,11 @@ pub struct Machine {
 #[derive(Debug, Clone, Default, PartialEq, Serialize)]
 #[serde(rename_all = "camelCase")]
 pub struct Gpu {
+    /// Its number, as NVIDIA's tools count it: by its place on the bus, from 0. Others that are lost leave a gap.
+    pub index: u32,
+    /// What programs and Docker know it by, whatever they count by: its UUID, such as `GPU-1fa4...`.
+    #[serde(skip)]
+    pub id: String,
     /// Its name.
     pub name: String,
     /// Percent of the time in which a kernel ran.
@@ -54,13 +63,20 @@ pub struct GpuReading {
     pub lost: usize,
 }
 
+impl Gpu {
+    /// How busy it is, in percent.
+    #[must_use]
+    pub fn load(&self) -> f64 {
+        self.compute.max(self.memory)
+    }
+}
+
 /// The load of a machine: `max(CPU, (swap + memory + GPU memory) / 3, GPU compute)`, all in percent, as the original
-/// has it. With several GPUs the least busy one counts, for that is the one a new client could use.
+/// has it. Of several GPUs that one counts which a new client could use.
 #[must_use]
-pub fn load(machine: &Machine, gpus: &[Gpu]) -> Load {
-    let least =
-        least_busy(machine, gpus).map_or_else(|| load_with(machine, &Gpu::default()), |gpu| load_with(machine, gpu));
-    Load::try_from(least).unwrap_or(Load::ZERO)
+pub fn load(machine: &Machine, gpu: Option<&Gpu>) -> Load {
+    let percent = gpu.map_or_else(|| load_with(machine, &Gpu::default()), |gpu| load_with(machine, gpu));
+    Load::try_from(percent).unwrap_or(Load::ZERO)
 }
 
 /// The load that a machine would have with this GPU alone, in percent.
@@ -76,14 +92,14 @@ pub fn least_busy<'gpus>(machine: &Machine, gpus: &'gpus [Gpu]) -> Option<&'gpus
 
 /// Which reading the load comes from, in words.
 #[must_use]
-pub fn busiest(machine: &Machine, gpus: &[Gpu]) -> &'static str {
-    let total = load(machine, gpus).percent();
+pub fn busiest(machine: &Machine, gpu: Option<&Gpu>) -> &'static str {
+    let total = load(machine, gpu).percent();
     let close = |value: f64| (value - total).abs() < 1e-9;
     if close(machine.cpu) {
         "the CPU"
-    } else if gpus.iter().any(|gpu| close(gpu.compute)) {
+    } else if gpu.is_some_and(|gpu| close(gpu.compute)) {
         "the GPU"
-    } else if gpus.is_empty() {
+    } else if gpu.is_none() {
         "a third of memory and swap"
     } else {
         "a third of memory, swap and GPU memory"
@@ -205,6 +221,19 @@ impl GpuSensor {
         Ok(Self { nvml: versioned.or_else(|_| Nvml::init())? })
     }
 
+    /// Opens the library and reads all GPUs once.
+    ///
+    /// # Errors
+    /// Why there are none to read, in words. A driver that hangs is given up after some seconds.
+    pub fn read_once() -> Result<GpuReading, String> {
+        let (sender, answer) = mpsc::channel();
+        std::thread::spawn(move || sender.send(Self::open().map(|sensor| sensor.read())));
+        match answer.recv_timeout(ANSWER) {
+            Ok(read) => read.map_err(|error| error.to_string()),
+            Err(_) => Err(format!("NVIDIA's driver is silent for {} s", ANSWER.as_secs())),
+        }
+    }
+
     /// Reads all GPUs.
     #[must_use]
     pub fn read(&self) -> GpuReading {
@@ -226,6 +255,8 @@ impl GpuSensor {
         let utilisation = unless_lost(device.utilization_rates())?;
         let memory = unless_lost(device.memory_info())?;
         Ok(Gpu {
+            index,
+            id: device.uuid().unwrap_or_else(|_| index.to_string()),
             name: device.name().unwrap_or_else(|_| "NVIDIA GPU".to_owned()),
             compute: utilisation.as_ref().map_or(0.0, |rates| f64::from(rates.gpu)),
             memory_traffic: utilisation.as_ref().map_or(0.0, |rates| f64::from(rates.memory)),
@@ -270,7 +301,8 @@ mod tests {
             (machine(5.0, 30.0, 0.0), vec![gpu(0.0, 99.0), gpu(15.0, 0.0)], 15.0, "the first GPU's memory is full"),
         ];
         for (machine, gpus, expected, why) in table {
-            assert!((load(&machine, &gpus).percent() - expected).abs() < 1e-9, "{why}: {}", load(&machine, &gpus));
+            let load = load(&machine, least_busy(&machine, &gpus));
+            assert!((load.percent() - expected).abs() < 1e-9, "{why}: {load}");
         }
     }
 

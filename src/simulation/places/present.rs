@@ -70,6 +70,7 @@ impl Present {
             pid: None,
             cgroup: None,
             port: None,
+            gpu: None,
             away_until: None,
             version: None,
             log: None,

@@ -82,8 +82,8 @@ pub fn gauges<'text>(server: &AppState, snapshot: &Snapshot) -> Vec<Gauge<'text>
         ("running", instances.running),
     ];
     let gpu = |value: fn(&Gpu) -> f64| {
-        let numbered = readings.gpus.iter().enumerate();
-        numbered.map(|(index, gpu)| (vec![index.to_string(), gpu.name.clone()], value(gpu))).collect()
+        let labels = |gpu: &Gpu| vec![gpu.index.to_string(), gpu.name.clone()];
+        readings.gpus.iter().map(|gpu| (labels(gpu), value(gpu))).collect()
     };
     let ready = f64::from(u8::from(server.problem().is_none()));
     let failed_starts = f64::from(server.failed_starts.count());

@@ -10,12 +10,14 @@ use futures_util::future::LocalBoxFuture;
 
 use super::command::WebotsCommand;
 use super::event::WebotsEvent;
+use super::virtual_display::VirtualDisplay;
 use crate::simulation::checkout::{Checkouts, Project};
 use crate::simulation::config::SimulationConfig;
 use crate::simulation::container::{Containers, Request, until_answering};
 use crate::simulation::ends::FOLDER_OF_RUNNING;
 use crate::simulation::isolation::{Cgroup, Launcher, Peak, Program, Watch, Watcher};
 use crate::simulation::machine::display;
+use crate::simulation::machine::sensors::Gpu;
 use crate::simulation::places::Ticket;
 use crate::simulation::process::SpawnSpec;
 use crate::simulation::protocol::Mode;
@@ -38,6 +40,8 @@ pub struct LaunchSpec {
     pub project: Arc<Project>,
     /// How it is shown.
     pub mode: Mode,
+    /// The GPU that it was given, if one was.
+    pub gpu: Option<Gpu>,
     /// The place, and its port.
     pub place: (Ticket, u16),
     /// Who gets the events.
@@ -62,15 +66,27 @@ impl LaunchSpec {
             let command = WebotsCommand { program, mode, port, heartbeat: config.timing.heartbeat, world };
             command.to_arguments().into_iter().map(|word| word.to_string_lossy().into_owned()).collect()
         };
-        Request { project: Arc::clone(&self.project), port, command: Box::new(command) }
+        Request { project: Arc::clone(&self.project), port, gpu: self.gpu.clone(), command: Box::new(command) }
     }
 
-    /// How the process is started and ended, and its control group. `display` holds the environment variables that name
-    /// its X display.
+    /// The display of the machine on which it opens its window.
+    fn display(&self) -> String {
+        self.config.display_on(self.gpu.as_ref().map(|gpu| gpu.index))
+    }
+
+    /// The environment variables that name its X display and its GPU.
+    fn variables(&self, display: Option<&VirtualDisplay>) -> Vec<(OsString, OsString)> {
+        let of_machine = || vec![("DISPLAY".into(), self.display().into())];
+        let mut variables = display.map_or_else(of_machine, VirtualDisplay::environment);
+        variables.extend(self.gpu.iter().map(|gpu| ("CUDA_VISIBLE_DEVICES".into(), gpu.id.clone().into())));
+        variables
+    }
+
+    /// How the process is started and ended, and its control group. `display` is one of its own, if it has one.
     ///
     /// # Errors
     /// When a folder that it needs can't be made.
-    pub fn spawn_spec(&self, display: &[(OsString, OsString)]) -> std::io::Result<(SpawnSpec, Option<Cgroup>)> {
+    pub fn spawn_spec(&self, display: Option<&VirtualDisplay>) -> std::io::Result<(SpawnSpec, Option<Cgroup>)> {
         let command = WebotsCommand {
             program: &self.program,
             mode: self.mode,
@@ -83,7 +99,7 @@ impl LaunchSpec {
             instance: self.project.instance.path(),
             project: self.project.instance.project(),
             folder: self.project.folder(),
-            display,
+            variables: &self.variables(display),
             grace: self.config.timing.grace,
         })
     }
@@ -107,7 +123,7 @@ impl LaunchSpec {
     pub fn hint(&self) -> impl Future<Output = String> + use<> {
         let remark = self.launcher.remark();
         let has_own_display = self.config.xvfb || self.containers.is_some();
-        let display = display::effective(self.config.display.as_ref());
+        let display = self.display();
         async move {
             if has_own_display {
                 return remark.to_owned();

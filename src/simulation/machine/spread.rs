@@ -1,0 +1,121 @@
+//! Which GPU the next simulation gets, where simulations are spread over all of them.
+
+use std::collections::HashMap;
+use std::time::{Duration, Instant};
+
+use parking_lot::Mutex;
+
+use super::sensors::Gpu;
+
+/// For so long a simulation that was started may not be seen in the readings of its GPU: Webots loads its world first.
+const UNSEEN: Duration = Duration::from_secs(10);
+/// As much counts for each of those, in percent.
+const EXPECTED: f64 = 10.0;
+
+/// Spreads simulations over GPUs: the one with the least load gets the next. A simulation that was given to a GPU in the last
+/// ten seconds counts as 10 % of load there; of several that are equal, the one that was chosen longest ago comes first.
+#[derive(Debug, Default)]
+pub struct Spread {
+    /// How many GPUs, the first ones, have a display; `None` where no simulation needs one.
+    displays: Option<usize>,
+    /// When simulations were given to each GPU: the last time, and those that may not be seen yet.
+    given: Mutex<HashMap<u32, Vec<Instant>>>,
+}
+
+impl Spread {
+    /// Spreads over the GPUs that have one of these displays; over all, where there is none.
+    #[must_use]
+    pub fn over(displays: usize) -> Self {
+        Self { displays: (displays > 0).then_some(displays), ..Self::default() }
+    }
+
+    /// The GPU that the next simulation would get.
+    #[must_use]
+    pub fn next<'gpus>(&self, gpus: &'gpus [Gpu], now: Instant) -> Option<&'gpus Gpu> {
+        self.choose(&self.given.lock(), gpus, now)
+    }
+
+    /// Gives a simulation to a GPU, of those that answer; `None` where none does.
+    #[must_use]
+    pub fn take(&self, gpus: &[Gpu], now: Instant) -> Option<Gpu> {
+        let mut given = self.given.lock();
+        let chosen = self.choose(&given, gpus, now)?;
+        let times = given.entry(chosen.index).or_default();
+        times.retain(|at| is_unseen(*at, now));
+        times.push(now);
+        Some(chosen.clone())
+    }
+
+    fn choose<'gpus>(
+        &self,
+        given: &HashMap<u32, Vec<Instant>>,
+        gpus: &'gpus [Gpu],
+        now: Instant,
+    ) -> Option<&'gpus Gpu> {
+        let times = |gpu: &Gpu| given.get(&gpu.index).map(Vec::as_slice).unwrap_or_default();
+        let expected = |gpu: &Gpu| times(gpu).iter().filter(|at| is_unseen(**at, now)).map(|_| EXPECTED).sum::<f64>();
+        let load = |gpu: &Gpu| gpu.load() + expected(gpu);
+        let has_display = |gpu: &&Gpu| self.displays.is_none_or(|count| (gpu.index as usize) < count);
+        let order = |one: &&Gpu, other: &&Gpu| {
+            load(one).total_cmp(&load(other)).then_with(|| times(one).last().cmp(&times(other).last()))
+        };
+        gpus.iter().filter(has_display).min_by(order)
+    }
+}
+
+fn is_unseen(at: Instant, now: Instant) -> bool {
+    now.saturating_duration_since(at) < UNSEEN
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn gpus(loads: &[f64]) -> Vec<Gpu> {
+        (0..).zip(loads).map(|(index, compute)| Gpu { index, compute: *compute, ..Gpu::default() }).collect()
+    }
+
+    /// Which GPUs so many simulations get at once.
+    fn taken(spread: &Spread, gpus: &[Gpu], count: usize, now: Instant) -> Vec<u32> {
+        (0..count).map(|_| spread.take(gpus, now).unwrap().index).collect()
+    }
+
+    #[test]
+    fn the_least_load_counts_and_starts_that_are_not_seen_yet() {
+        let now = Instant::now();
+        let spread = Spread::default();
+        assert_eq!(spread.take(&[], now), None);
+        assert_eq!(taken(&spread, &gpus(&[50.0, 30.0, 95.0, 30.0]), 6, now), [1, 3, 1, 3, 0, 1]);
+        let later = now + UNSEEN;
+        assert_eq!(spread.next(&gpus(&[50.0, 30.0, 20.0, 30.0]), later).unwrap().index, 2);
+        let full = Gpu { memory: 90.0, ..Gpu::default() };
+        assert_eq!(spread.next(&[full, gpus(&[0.0, 60.0]).remove(1)], later).unwrap().index, 1);
+    }
+
+    #[test]
+    fn equal_gpus_take_turns_however_slowly_simulations_start() {
+        let mut now = Instant::now();
+        let (spread, four) = (Spread::default(), gpus(&[0.0; 4]));
+        let mut counts = [0; 4];
+        for index in taken(&spread, &four, 30, now) {
+            counts[index as usize] += 1;
+        }
+        assert_eq!(counts, [8, 8, 7, 7]);
+        let mut slowly = Vec::new();
+        for _ in 0..4 {
+            now += UNSEEN * 2;
+            slowly.extend(taken(&spread, &four, 1, now));
+        }
+        slowly.sort_unstable();
+        assert_eq!(slowly, [0, 1, 2, 3]);
+    }
+
+    #[test]
+    fn a_gpu_that_is_lost_or_has_no_display_gets_nothing() {
+        let now = Instant::now();
+        let mut three = gpus(&[0.0; 4]);
+        three.remove(1);
+        assert_eq!(taken(&Spread::default(), &three, 6, now), [0, 2, 3, 0, 2, 3]);
+        assert_eq!(taken(&Spread::over(3), &three, 4, now), [0, 2, 0, 2]);
+    }
+}
