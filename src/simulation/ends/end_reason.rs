@@ -11,6 +11,8 @@ pub enum EndReason {
     TimeLimit,
     /// The server was stopped.
     Stopped,
+    /// The administrator has stopped it.
+    Administrator,
     /// Its world could not be checked out.
     NoCheckout,
     /// Webots did not become ready.
@@ -27,11 +29,12 @@ pub enum EndReason {
 
 impl EndReason {
     /// All of them.
-    pub const ALL: [Self; 10] = [
+    pub const ALL: [Self; 11] = [
         Self::Left,
         Self::Finished,
         Self::TimeLimit,
         Self::Stopped,
+        Self::Administrator,
         Self::NoCheckout,
         Self::NoWebots,
         Self::Crashed,
@@ -48,6 +51,7 @@ impl EndReason {
             Self::Finished => "finished",
             Self::TimeLimit => "time_limit",
             Self::Stopped => "stopped",
+            Self::Administrator => "administrator",
             Self::NoCheckout => "no_checkout",
             Self::NoWebots => "no_webots",
             Self::Crashed => "crashed",
@@ -65,6 +69,7 @@ impl EndReason {
             Self::Finished => "finished",
             Self::TimeLimit => "time limit",
             Self::Stopped => "server stopped",
+            Self::Administrator => "stopped by the administrator",
             Self::NoCheckout => "no checkout",
             Self::NoWebots => "no start",
             Self::Crashed => "crashed",
