@@ -212,7 +212,7 @@ fn assemble(
     let ends = Ends::start(logs, launcher.level().to_string(), &metrics);
     let ends = ends.map_err(|why| AppError::Unavailable(format!("ends of simulations can't be recorded: {why}")))?;
     let places = Places::new(config.streaming_ports(), config.waiting_line, config.max_places_per_address);
-    let places = places.with_ends(ends.clone()).start();
+    let places = places.with_share_of_users(config.max_places_per_user).with_ends(ends.clone()).start();
     let csv = config.monitor_log_enabled.then(|| config.log_dir.0.join("simulation/monitor.csv"));
     let spread = config.spreads().then(|| Arc::new(Spread::over(config.displays_of_gpus().len())));
     let (load_monitor, readings) = LoadMonitor::new(places.clone(), run.path(), csv, spread.clone());
@@ -252,6 +252,7 @@ fn assemble(
         starts,
         start_quota: quota::starts(config.max_connections),
         live: Live::default(),
+        administrators: Live::default(),
         usage,
         watcher,
         started: Instant::now(),

@@ -21,3 +21,4 @@ pub mod snapshot;
 pub mod state;
 mod web;
 pub mod webots;
+pub mod who;

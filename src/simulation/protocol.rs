@@ -2,7 +2,7 @@
 //!
 //! | from the client (JSON) | |
 //! |---|---|
-//! | `{"start": {"url": WORLD, "mode": "x3d" \| "w3d" \| "mjpeg", "resumable": true}}` | start a simulation; to a resumable one its client can come back |
+//! | `{"start": {"url": WORLD, "mode": "x3d" \| "w3d" \| "mjpeg", "resumable": true, "name": NAME}}` | start a simulation; to a resumable one its client can come back; who the client calls itself |
 //! | `{"resume": TOKEN}` | come back to a simulation |
 //! | `{"keep": true}` | do not end a simulation because it is paused; that time begins again |
 //! | `{"reset controller": "NAME/FILE"}` | restore a file below `controllers/` |
@@ -43,6 +43,8 @@ pub enum Request {
         mode: Mode,
         /// Whether its client may come back after its connection has broken.
         resumable: bool,
+        /// What its client calls itself.
+        name: Option<String>,
     },
     /// Come back to the simulation of this token; none is a text that can't be one.
     Resume(Option<Token>),
@@ -106,7 +108,11 @@ impl Request {
             None | Some(Value::Null) => false,
             Some(value) => value.as_bool().ok_or_else(|| wrong("\"resumable\" is neither true nor false"))?,
         };
-        Ok(Some(Self::Start { url: url.to_owned(), mode, resumable }))
+        let name = match start.get("name") {
+            None | Some(Value::Null) => None,
+            Some(name) => Some(name.as_str().ok_or_else(|| wrong("\"name\" is no text"))?.to_owned()),
+        };
+        Ok(Some(Self::Start { url: url.to_owned(), mode, resumable, name }))
     }
 }
 
@@ -149,6 +155,13 @@ pub fn nothing_to_reset() -> String {
 pub fn elsewhere(why: &str) -> String {
     let why = why.trim_end_matches('.');
     error(&format!("{why}. Connect again: the session server chooses another simulation server"))
+}
+
+/// Why an administrator has stopped a simulation, without what makes it an error.
+#[must_use]
+pub fn stopped_by_teacher(reason: &str) -> String {
+    let words = "Your teacher has stopped this simulation";
+    if reason.is_empty() { words.to_owned() } else { format!("{words}: {reason}") }
 }
 
 /// The id of a simulation.
@@ -229,7 +242,13 @@ mod tests {
 
     #[test]
     fn requests_are_read() {
-        let ask = |mode, resumable| Request::Start { url: "https://x".to_owned(), mode, resumable };
+        let named = |mode, resumable, name: Option<&str>| Request::Start {
+            url: "https://x".to_owned(),
+            mode,
+            resumable,
+            name: name.map(str::to_owned),
+        };
+        let ask = |mode, resumable| named(mode, resumable, None);
         let start = |mode| ask(mode, false);
         let token = Token::new(5);
         let resume = format!(r#"{{"resume": "{}"}}"#, token.reveal());
@@ -238,6 +257,7 @@ mod tests {
             (r#"{"start":{"url":"https://x","mode":"mjpeg","more":1}}"#, start(Mode::Mjpeg)),
             (r#"{"start":{"url":"https://x","mode":"w3d"}}"#, start(Mode::W3d)),
             (r#"{"start":{"url":"https://x","resumable":true}}"#, ask(Mode::X3d, true)),
+            (r#"{"start":{"url":"https://x","name":"Anna"}}"#, named(Mode::X3d, false, Some("Anna"))),
             (&resume, Request::Resume(Some(token))),
             (r#"{"resume":"what is no token"}"#, Request::Resume(None)),
             (r#"{"keep":true}"#, Request::Keep),
@@ -265,6 +285,7 @@ mod tests {
             (r#"{"start":{"url":"x","mode":"vr"}}"#, "there is no \"mode\" \"vr\""),
             (r#"{"start":{"url":5}}"#, "\"start\" has no \"url\""),
             (r#"{"start":{"url":"x","resumable":1}}"#, "\"resumable\" is neither"),
+            (r#"{"start":{"url":"x","name":{}}}"#, "\"name\" is no text"),
             (r#"{"resume":5}"#, "\"resume\" is no text"),
             (r#"{"keep":false}"#, "\"keep\" is not true"),
             (r#"{"reset controller":5}"#, "\"reset controller\" is no text"),

@@ -7,6 +7,7 @@ use serde::Serialize;
 
 use crate::shared::domain::Instances;
 use crate::simulation::simulation_id::SimulationId;
+use crate::simulation::who::Who;
 
 /// What has changed in a simulation.
 #[derive(Debug)]
@@ -71,6 +72,9 @@ pub struct Simulation {
     pub id: SimulationId,
     /// The world's URL.
     pub world: String,
+    /// Who its client is; for administrators alone.
+    #[serde(skip)]
+    pub who: Who,
     /// Its state.
     pub stage: Stage,
     /// When its client asked for it, in seconds since 1970.

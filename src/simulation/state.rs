@@ -81,6 +81,8 @@ pub struct AppState {
     pub starts: prometheus::IntCounterVec,
     /// The open monitor pages.
     pub live: Live,
+    /// Those of administrators, which show more.
+    pub administrators: Live,
     /// CPU and memory of each simulation.
     pub usage: UsageMonitor,
     /// When the server was started.

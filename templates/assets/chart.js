@@ -138,8 +138,15 @@ export class Chart {
   }
 
   #area = [0, 0];
+  /** What the axes were drawn for. */
+  #drawn;
 
+  /** The axes stay as they are while nothing about them changes: the newest sample is always at their end. */
   #drawAxes(width, most, y) {
+    const drawn = `${width} ${most}`;
+    if (this.#drawn === drawn)
+      return;
+    this.#drawn = drawn;
     const { left, right, height, bottom } = BOX;
     const parts = [];
     for (let step = 0; step <= 4; ++step) {
@@ -169,7 +176,9 @@ export class Chart {
     const found = time === undefined ? undefined : this.#nearest(time);
     const sample = found ?? this.#samples.at(-1);
     this.#pointed = found?.[0];
-    this.#moment.textContent = found ? `at ${timeOfDay(found[0])}` : 'now';
+    const moment = found ? `at ${timeOfDay(found[0])}` : 'now';
+    if (this.#moment.textContent !== moment)
+      this.#moment.textContent = moment;
     this.#cross.setAttribute('visibility', found ? 'visible' : 'hidden');
     if (!sample)
       return;

@@ -72,6 +72,7 @@ function fillTable(body, rows) {
   });
   present.forEach((row) => row.remove());
   sort(body);
+  filter(body);
 }
 
 function fillPart(part, html) {
@@ -106,6 +107,24 @@ function sort(body) {
     if (body.rows[place] !== row)
       body.insertBefore(row, body.rows[place] ?? null);
   });
+}
+
+/** Shows the rows that have all the words of the table's filter, if it has one. */
+function filter(body) {
+  const field = document.querySelector(`[data-filter="${body.id}"]`);
+  if (!field)
+    return;
+  const words = field.value.toLowerCase().split(/\s+/).filter(Boolean);
+  const rows = [...body.rows];
+  for (const row of rows) {
+    const text = words.length > 0 ? row.textContent.toLowerCase() : '';
+    row.hidden = !words.every((word) => text.includes(word));
+  }
+  const shown = rows.filter((row) => !row.hidden).length;
+  const said = words.length > 0 ? `${shown} of ${rows.length}` : '';
+  const place = field.parentElement.querySelector('[role=status]');
+  if (place.textContent !== said)
+    place.textContent = said;
 }
 
 function makeSortable(table) {
@@ -190,6 +209,8 @@ function rest() {
 }
 
 document.querySelectorAll('table:has(th[data-sort])').forEach(makeSortable);
+for (const field of document.querySelectorAll('[data-filter]'))
+  field.addEventListener('input', () => filter(document.getElementById(field.dataset.filter)));
 showTimes(document);
 document.addEventListener('visibilitychange', () => (document.hidden ? rest() : listen()));
 addEventListener('pagehide', rest);

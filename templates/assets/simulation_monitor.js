@@ -1,4 +1,5 @@
-// What the simulation server's page has beside its live tables: charts, the time left, the output on demand.
+// What the simulation server's page has beside its live tables: charts, the time left, the output on demand, and for
+// administrators a way to stop a simulation.
 
 import { Charts } from './charts.js';
 import { onSample } from './live.js';
@@ -43,6 +44,38 @@ async function showOutput(link) {
   }
   text.scrollTop = text.scrollHeight;
 }
+
+/* Only administrators have this. */
+const stopping = document.getElementById('stop');
+const problem = document.getElementById('stop-problem');
+const reason = document.getElementById('stop-reason');
+let chosen;
+
+function askToStop({ dataset: { stop, world, who } }) {
+  chosen = stop;
+  document.getElementById('stop-what').textContent = who ? `${world} of ${who} (${stop})` : `${world} (${stop})`;
+  problem.textContent = reason.value = '';
+  stopping.showModal();
+  reason.focus();
+}
+
+async function stopNow(event) {
+  event.preventDefault();
+  const order = { method: 'POST', headers: { 'Content-Type': 'application/json' }, body: JSON.stringify({ reason: reason.value }) };
+  const answer = await fetch(`simulations/${chosen}/stop`, order).catch(() => undefined);
+  if (answer?.ok)
+    stopping.close();
+  else
+    problem.textContent = answer ? await answer.text() : 'The server does not answer.';
+}
+
+document.getElementById('stop-form')?.addEventListener('submit', stopNow);
+document.getElementById('stop-cancel')?.addEventListener('click', () => stopping.close());
+document.addEventListener('click', (event) => {
+  const button = event.target.closest('button[data-stop]');
+  if (button)
+    askToStop(button);
+});
 
 document.addEventListener('click', (event) => {
   const link = event.target.closest('a[data-output]');

@@ -20,6 +20,7 @@ export function advice(text) {
     [/larger than|longer than/i, 'Try a smaller project, or ask the administrator for a higher limit.'],
     [/Webots is installed|no Webots at/, 'The administrator of this simulation server has to set where Webots is.'],
     [/taken over/i, 'Another tab, or another window, shows it now. Connect here for a simulation of this tab’s own.'],
+    [/teacher has stopped/i, 'Ask your teacher before you connect again.'],
     [/waited longest|did not come back/i, 'Connect again for another simulation.'],
     [/time limit|was paused for/i, 'Connect again for another simulation.'],
     [/may not connect to/, 'Load this page again: the fleet may have grown. Else the key server of that simulation server has to name the host that the session server lists in simulationServers.'],
@@ -47,8 +48,8 @@ export class Simulation extends EventTarget {
   /** How long the simulation waits then, in seconds. */
   absence = 0;
 
-  /** Asks a simulation server (a WebSocket address) for a world, or for the simulation of a token. */
-  constructor(server, { world, token }) {
+  /** Asks a simulation server (a WebSocket address) for a world in some name, or for the simulation of a token. */
+  constructor(server, { world, name, token }) {
     super();
     this.#token = token;
     this.#step('server', 'doing', `connecting to ${server}`);
@@ -56,7 +57,7 @@ export class Simulation extends EventTarget {
     this.#socket.addEventListener('open', () => {
       this.#step('server', 'done', server);
       this.#step('place', 'doing', token ? 'asking for the one that was left' : 'asking for one');
-      this.#socket.send(JSON.stringify(token ? { resume: token } : { start: { url: world, resumable: true } }));
+      this.#socket.send(JSON.stringify(token ? { resume: token } : { start: { url: world, resumable: true, name } }));
     });
     this.#socket.addEventListener('message', ({ data }) => {
       if (this.#ended)

@@ -18,6 +18,8 @@ let refusal;
 let countdown;
 /** Counts the time that a simulation has left which is paused. */
 let idling;
+/** What its visitor is called, as the link to this page says. */
+const visitor = new URLSearchParams(location.search).get('name')?.trim() || undefined;
 let wanted;
 let patience;
 /** How often another simulation server was asked for since the form was sent; and the timer for the next time. */
@@ -28,9 +30,11 @@ let asking;
 const ASK_AGAIN = 3;
 const FIRST_PAUSE = 1000;
 
+const ANNOUNCEMENT = 'announcement:';
+
 /** Who is told so is not out of luck: somebody leaves. */
-const SHARE = /Clients of your address have/;
-const BUSY = /no simulation server available|places .* are taken|Clients of your address have/i;
+const SHARE = /Clients of your address have|You have \d+ places/;
+const BUSY = /no simulation server available|places .* are taken|Clients of your address have|You have \d+ places/i;
 /** Before a server is asked for again although one is free, doubled each time up to the longest, in milliseconds. */
 const FIRST_WAIT = 2000;
 const LONGEST_WAIT = 30_000;
@@ -51,9 +55,10 @@ let word;
 function openDoor() {
   stale = 0;
   word = undefined;
-  const url = new URL('session', location.href);
+  const url = new URL('session?announcements=1', location.href);
   url.protocol = url.protocol === 'https:' ? 'wss:' : 'ws:';
   door = new WebSocket(url);
+  door.addEventListener('open', () => announce(''));
   door.addEventListener('message', ({ data }) => hear(data));
   door.addEventListener('close', () => {
     light('', 'No connection', 'to the session server. Trying again …');
@@ -71,7 +76,17 @@ function light(state, word, text) {
   find('light-text').textContent = text;
 }
 
+/** What the administrator tells everybody; nothing once it is over. */
+function announce(text) {
+  find('announcement').textContent = text;
+  find('announcement').hidden = !text;
+}
+
 function hear(text) {
+  if (text.startsWith(ANNOUNCEMENT)) {
+    announce(text.slice(ANNOUNCEMENT.length).trim());
+    return;
+  }
   if (text === '1' || text === '0') {
     word = text;
     showWord();
@@ -147,7 +162,7 @@ function start(event) {
   wait = FIRST_WAIT;
   const world = find('url').value.trim();
   // A link that starts the same world.
-  history.replaceState(null, '', `?${new URLSearchParams({ url: world })}`);
+  history.replaceState(null, '', `?${new URLSearchParams({ url: world, ...(visitor && { name: visitor }) })}`);
   ask(world);
 }
 
@@ -203,7 +218,7 @@ function chosen(answer) {
   notice();
   busy(true);
   step({ step: 'session', state: 'done', text: 'has chosen a simulation server' });
-  follow(new Simulation(answer, { world }), answer, world);
+  follow(new Simulation(answer, { world, name: visitor }), answer, world);
 }
 
 function refused(world, why) {
@@ -522,6 +537,10 @@ for (const example of form.querySelectorAll('[data-url]')) {
   });
 }
 find('url').value = new URLSearchParams(location.search).get('url') ?? '';
+if (visitor) {
+  find('visitor').textContent = `The administrator sees you as ${visitor}.`;
+  find('visitor').hidden = false;
+}
 addEventListener('pagehide', pause);
 // One that the browser had put aside as it was.
 addEventListener('pageshow', ({ persisted }) => persisted && goOn());

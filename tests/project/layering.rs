@@ -19,7 +19,8 @@ const SESSION: [&str; 8] = [
     "session::web",
     "session::app",
 ];
-const SIMULATION: [&str; 21] = [
+const SIMULATION: [&str; 22] = [
+    "simulation::who",
     "simulation::simulation_id",
     "simulation::ends",
     "simulation::snapshot",

@@ -24,4 +24,6 @@ mod resuming;
 pub mod scene;
 mod soak;
 mod stopping;
+mod stopping_one;
 mod trees;
+mod who;

@@ -19,6 +19,7 @@ use webots_fleet::simulation::readiness;
 use webots_fleet::simulation::snapshot::Stage;
 use webots_fleet::simulation::state::AppState;
 use webots_fleet::simulation::webots::{Exit, LaunchSpec, Stop, Webots, WebotsEvent};
+use webots_fleet::simulation::who::Who;
 
 use crate::inside::{Inside, arm, ask};
 use crate::support::SOON;
@@ -54,7 +55,7 @@ async fn gate(
 ) -> HttpResponse {
     let peer = server.config.trusted_proxies.peer(&request);
     let connection = server.connections.admit(Kind::Client, peer).unwrap();
-    let client = WebClient::new(Arc::clone(&server), peer, (connection, MessageReader::default()));
+    let client = WebClient::new(Arc::clone(&server), (peer, None), (connection, MessageReader::default()));
     let (address, response) = WsResponseBuilder::new(client, &request, stream).start_with_addr().unwrap();
     clients.send(address).unwrap();
     response
@@ -136,7 +137,7 @@ async fn launch(server: &AppState) -> (Addr<Webots>, UnboundedReceiver<Exit>) {
     let (exits, ended) = unbounded_channel();
     let listener = Listener { places, exits }.start();
     let world = ProjectUrl::parse(&arm()).unwrap();
-    let ticket = Ticket::new(&server.places, listener.clone().recipient(), &world, Peer::Unknown);
+    let ticket = Ticket::new(&server.places, listener.clone().recipient(), &world, (Peer::Unknown, Who::default()));
     let port = granted.recv().await.unwrap();
     let project = server.checkouts.start(world, server.run.instance().unwrap(), |_| ()).await.unwrap().unwrap();
     let spec = LaunchSpec {

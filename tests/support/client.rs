@@ -67,6 +67,15 @@ impl Client {
         connected.map(|(socket, _)| Self::new(socket)).map_err(Box::new)
     }
 
+    /// Connects to a simulation server with these headers.
+    pub async fn with_headers(server: &super::program::Server, headers: &[(&'static str, &str)]) -> Self {
+        let mut request = server.websocket("/client").into_client_request().unwrap();
+        for (name, value) in headers {
+            request.headers_mut().append(*name, value.parse().unwrap());
+        }
+        Self::new(tokio_tungstenite::connect_async(request).await.unwrap().0)
+    }
+
     /// The id of its simulation, once it was told.
     pub fn id(&self) -> &str {
         let told = self.heard.iter().find_map(|text| text.strip_prefix("session: "));

@@ -28,6 +28,24 @@ impl Answer {
     }
 }
 
+/// The password of administrators in tests.
+pub const PASSWORD: &str = "open sesame";
+
+/// Asks for a page with the password.
+pub async fn get_as_administrator(url: &str) -> Answer {
+    read(client().get(url).basic_auth("admin", PASSWORD)).await.unwrap()
+}
+
+/// Posts a body, with a password where there is one. Returns the status.
+pub async fn post(url: &str, password: Option<&str>, body: &str) -> u16 {
+    let request = client().post(url);
+    let request = match password {
+        Some(password) => request.basic_auth("admin", password),
+        None => request,
+    };
+    request.send_body(body.to_owned()).await.unwrap().status().as_u16()
+}
+
 /// Asks for a page.
 pub async fn get(url: &str) -> Answer {
     try_get(url).await.unwrap_or_else(|error| panic!("{url}: {error}"))
@@ -35,14 +53,15 @@ pub async fn get(url: &str) -> Answer {
 
 /// Asks for a page of a server that may not be there.
 pub async fn try_get(url: &str) -> Result<Answer, String> {
-    let mut answer = awc::Client::builder()
-        .timeout(SOON)
-        .disable_redirects()
-        .finish()
-        .get(url)
-        .send()
-        .await
-        .map_err(|error| error.to_string())?;
+    read(client().get(url)).await
+}
+
+fn client() -> awc::Client {
+    awc::Client::builder().timeout(SOON).disable_redirects().finish()
+}
+
+async fn read(request: awc::ClientRequest) -> Result<Answer, String> {
+    let mut answer = request.send().await.map_err(|error| error.to_string())?;
     let body = answer.body().limit(64 << 20).await.map_err(|error| error.to_string())?;
     Ok(Answer { status: answer.status(), headers: answer.headers().clone(), body })
 }

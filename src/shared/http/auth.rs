@@ -13,7 +13,7 @@ use governor::state::keyed::HashMapStateStore;
 use governor::{Quota, RateLimiter};
 use subtle::ConstantTimeEq;
 
-use super::paths::retry_after;
+use super::paths::{refuse_other_sites, retry_after};
 use super::peer::Peer;
 use crate::shared::config::Secret;
 
@@ -74,6 +74,24 @@ impl BasicAuth {
     }
 }
 
+/// Refuses a request for an action unless it brings the password and no page of another site has made it. Without a
+/// password in the configuration there are no actions.
+pub fn refuse_action(auth: Option<&BasicAuth>, request: &HttpRequest, peer: Peer) -> Option<HttpResponse> {
+    if let Some(refusal) = refuse_other_sites(request) {
+        return Some(refusal);
+    }
+    let Some(auth) = auth else {
+        return Some(HttpResponse::Forbidden().body("Error: actions are off; adminPassword is not set."));
+    };
+    auth.check(request, peer).err().map(AuthError::answer)
+}
+
+/// Whether a page shows what only administrators may see: the request brings the password. With another one, which may be
+/// meant for a web server in front, the page is as everybody sees it.
+pub fn is_administrator(auth: Option<&BasicAuth>, request: &HttpRequest, peer: Peer) -> bool {
+    auth.is_some_and(|auth| auth.check(request, peer).is_ok())
+}
+
 /// The password that a request brings, with whatever user name.
 fn password_of(request: &HttpRequest) -> Option<String> {
     let (scheme, credentials) = request.headers().get(header::AUTHORIZATION)?.to_str().ok()?.split_once(' ')?;
@@ -89,7 +107,7 @@ impl AuthError {
     pub fn answer(self) -> HttpResponse {
         match self {
             Self::NoPassword => HttpResponse::Unauthorized()
-                .insert_header((header::WWW_AUTHENTICATE, "Basic realm=\"simulation server\""))
+                .insert_header((header::WWW_AUTHENTICATE, "Basic realm=\"administrator\""))
                 .body(self.to_string()),
             Self::TooMany => HttpResponse::TooManyRequests().insert_header(retry_after()).body(self.to_string()),
         }

@@ -18,12 +18,18 @@ use super::connections::ConnectionPermit;
 const READ_AT_ONCE: usize = 4 * 1024;
 /// How the answer begins that makes a connection a WebSocket.
 const SWITCHING_PROTOCOLS: &[u8] = b"HTTP/1.1 101 ";
+/// How many bytes of a line are looked at, which is enough for the length of a body.
+const LINE: usize = 40;
+/// The largest body that is handed over, in bytes. What has a larger one, or one in chunks, gets its answer without it.
+pub const LARGEST_BODY: usize = 8 * 1024;
 
 /// What the connection is used for at the moment.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum State {
     /// The head of a request is read.
     Request,
+    /// So many bytes of a request's body are still to come; its answer may have begun.
+    Body(usize, bool),
     /// A request was handed over, and nothing of its answer was written yet.
     Answer,
     /// Messages go in both directions.
@@ -36,8 +42,12 @@ pub struct ClientStream {
     tcp: TcpStream,
     /// What was taken from the system and not yet handed over.
     unread: Vec<u8>,
+    /// The beginning of the line that is read, without line breaks.
+    line: Vec<u8>,
     /// Whether the byte before was the end of a line.
     line_ended: bool,
+    /// The length of the body that the head tells.
+    body: usize,
     /// Whether the system takes no more of an answer, since the client does not read.
     is_blocked: bool,
     state: State,
@@ -52,7 +62,9 @@ impl ClientStream {
         Self {
             tcp,
             unread: Vec::new(),
+            line: Vec::new(),
             line_ended: false,
+            body: 0,
             is_blocked: false,
             state: State::Request,
             stopping: Some(Box::pin(stopping.cancelled_owned())),
@@ -64,6 +76,7 @@ impl ClientStream {
     fn release(&mut self) {
         if self.state == State::WebSocket {
             self.stopping = None;
+            self.line = Vec::new();
             if self.unread.is_empty() {
                 self.unread = Vec::new();
             }
@@ -76,21 +89,51 @@ impl ClientStream {
         if self.state == State::WebSocket {
             return room;
         }
+        if let State::Body(left, is_answered) = self.state {
+            let count = room.min(left);
+            self.state = after(left - count, is_answered);
+            return count;
+        }
         for (index, byte) in self.unread.iter().take(room).enumerate() {
             match byte {
                 // An empty line ends the head of a request.
                 b'\n' if self.line_ended => {
                     self.line_ended = false;
-                    self.state = State::Answer;
+                    self.state = after(std::mem::take(&mut self.body), false);
                     return index + 1;
                 }
-                b'\n' => self.line_ended = true,
+                b'\n' => {
+                    self.line_ended = true;
+                    self.body = content_length(&self.line).unwrap_or(self.body);
+                    self.line.clear();
+                }
                 b'\r' => {}
-                _ => self.line_ended = false,
+                other => {
+                    self.line_ended = false;
+                    if self.line.len() < LINE {
+                        self.line.push(*other);
+                    }
+                }
             }
         }
         room
     }
+}
+
+/// The state once so many bytes of a body are left.
+fn after(left: usize, is_answered: bool) -> State {
+    match (left, is_answered) {
+        (0, true) => State::Request,
+        (0, false) => State::Answer,
+        (left, _) => State::Body(left, is_answered),
+    }
+}
+
+/// The length of a body, where this line of a head tells it and it is not too large.
+fn content_length(line: &[u8]) -> Option<usize> {
+    let (name, value) = std::str::from_utf8(line).ok()?.split_once(':')?;
+    let length = value.trim().parse().ok().filter(|length| *length <= LARGEST_BODY)?;
+    name.eq_ignore_ascii_case("content-length").then_some(length)
 }
 
 impl AsyncRead for ClientStream {
@@ -129,6 +172,9 @@ impl AsyncWrite for ClientStream {
     fn poll_write(mut self: Pin<&mut Self>, context: &mut Context<'_>, bytes: &[u8]) -> Poll<io::Result<usize>> {
         let written = Pin::new(&mut self.tcp).poll_write(context, bytes);
         self.is_blocked = written.is_pending();
+        if let State::Body(left, _) = self.state {
+            self.state = State::Body(left, true);
+        }
         if self.state == State::Answer && written.is_ready() {
             self.state = if bytes.starts_with(SWITCHING_PROTOCOLS) { State::WebSocket } else { State::Request };
             self.release();

@@ -3,6 +3,7 @@
 mod address_quota;
 pub mod assets;
 mod auth;
+pub mod body;
 mod client_stream;
 mod connections;
 mod live;
@@ -17,10 +18,10 @@ pub mod tls;
 pub mod websocket;
 
 pub use address_quota::{AddressQuota, share};
-pub use auth::BasicAuth;
+pub use auth::{BasicAuth, is_administrator, refuse_action};
 pub use connections::{ConnectionPermit, Connections, Kind};
 pub use live::{Live, Row, View};
 pub use metrics::{CONTENT_TYPE, Gauge, Metrics};
 pub use origin::Origin;
 pub use page::{Policy, any_host, fleet_sources, heat, html, width};
-pub use peer::{Peer, TrustedProxies};
+pub use peer::{Peer, TrustedProxies, UserHeader};

@@ -8,7 +8,7 @@ use std::fmt;
 use std::net::{IpAddr, Ipv6Addr, SocketAddr};
 
 use actix_web::HttpRequest;
-use actix_web::http::header::HeaderMap;
+use actix_web::http::header::{HeaderMap, HeaderName};
 use ipnet::IpNet;
 use serde::{Deserialize, Serialize};
 
@@ -16,6 +16,11 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(try_from = "Vec<String>", into = "Vec<String>")]
 pub struct TrustedProxies(Vec<IpNet>);
+
+/// The name of a header in which a web server tells who its client is.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(try_from = "String", into = "String")]
+pub struct UserHeader(HeaderName);
 
 /// The client at the other end of a connection.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -53,6 +58,17 @@ impl TrustedProxies {
     pub fn of_connection(&self, address: IpAddr) -> Peer {
         let address = address.to_canonical();
         if self.trusts(address) { Peer::Proxy(address) } else { Peer::Client(address) }
+    }
+
+    /// What a trusted proxy tells in this header, if one is at the other end. A header that is there twice is believed in
+    /// neither form: one of them may be the client's own word.
+    pub fn told(&self, request: &HttpRequest, header: &UserHeader) -> Option<String> {
+        let is_trusted = request.peer_addr().is_some_and(|address| self.trusts(address.ip().to_canonical()));
+        let mut lines = request.headers().get_all(&header.0).filter(|_| is_trusted);
+        match (lines.next(), lines.next()) {
+            (Some(line), None) => String::from_utf8(line.as_bytes().to_vec()).ok(),
+            _ => None,
+        }
     }
 
     fn resolve(&self, connected: IpAddr, headers: &HeaderMap) -> Peer {
@@ -96,6 +112,21 @@ fn address(text: &str) -> Option<IpAddr> {
     address.as_ref().map(IpAddr::to_canonical)
 }
 
+impl TryFrom<String> for UserHeader {
+    type Error = String;
+
+    fn try_from(text: String) -> Result<Self, String> {
+        let name = HeaderName::try_from(&text);
+        name.map(Self).map_err(|_| format!("{text:?} is no name of a header, such as X-Forwarded-User"))
+    }
+}
+
+impl From<UserHeader> for String {
+    fn from(UserHeader(name): UserHeader) -> Self {
+        name.to_string()
+    }
+}
+
 impl Default for TrustedProxies {
     fn default() -> Self {
         let loopback = ["127.0.0.0/8", "::1/128"];
@@ -136,7 +167,7 @@ impl fmt::Display for Peer {
 mod tests {
     use super::*;
 
-    use actix_web::http::header::{HeaderName, HeaderValue};
+    use actix_web::http::header::HeaderValue;
 
     fn resolve(trusted: &[&str], connected: &str, headers: Headers<'_>) -> Peer {
         let trusted: Vec<String> = trusted.iter().map(|&text| text.to_owned()).collect();

@@ -22,11 +22,14 @@ use crate::simulation::protocol::{self, Mode};
 use crate::simulation::sessions::{Attachment, FromClient, Said, ToClient};
 use crate::simulation::state::AppState;
 use crate::simulation::webots::{Exit, Keep, RestoreController, WebotsEvent};
+use crate::simulation::who::Who;
 
 /// The actor.
 pub struct Session {
     pub(super) server: Arc<AppState>,
     pub(super) peer: Peer,
+    /// Who has asked for it.
+    pub(super) who: Who,
     /// The id of the simulation with what separates it from what follows; empty before there is one.
     pub(super) id: String,
     /// The connection of its client, until it has ended.
@@ -49,7 +52,7 @@ impl Session {
     #[must_use]
     pub fn open(
         server: Arc<AppState>,
-        peer: Peer,
+        (peer, who): (Peer, Who),
         client: Recipient<ToClient>,
         (url, mode, resumable): (String, Mode, bool),
     ) -> Attachment {
@@ -57,6 +60,7 @@ impl Session {
         let session = Self {
             server,
             peer,
+            who,
             id: String::new(),
             client: Some(client),
             attachment: 0,
@@ -217,6 +221,11 @@ impl Handler<PlaceEvent> for Session {
                 log::info!("{}: {why}", self.name());
                 state.end(EndReason::Left, why);
                 self.finish(protocol::error(why), why, CloseCode::Normal, ctx);
+            }
+            (PlaceEvent::Stopped(_), State::Over) => {}
+            (PlaceEvent::Stopped(why), state) => {
+                state.end(EndReason::Administrator, "The administrator has stopped it");
+                self.finish(protocol::error(&why), &why, CloseCode::Normal, ctx);
             }
             (_, state) => self.state = state,
         }

@@ -52,10 +52,10 @@ impl Session {
             Err(why) if self.server.takes_nobody() => return self.refer(Outcome::Refused, &why, ctx),
             Err(why) => return self.fail_start(Outcome::Refused, &why, ctx),
         };
-        let ticket = Ticket::new(&self.server.places, ctx.address().recipient(), &world, self.peer);
+        let ticket = Ticket::new(&self.server.places, ctx.address().recipient(), &world, (self.peer, self.who.clone()));
         self.id = format!("{}: ", ticket.id());
         self.text(protocol::session(ticket.id()));
-        log::info!("{}: asks for {world}", self.name());
+        log::info!("{}: asks for {world}{}", self.name(), self.who);
         self.state = State::Waiting { request: StartRequest { world, mode }, ticket };
     }
 

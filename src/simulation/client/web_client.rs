@@ -17,11 +17,14 @@ use crate::shared::run::closing;
 use crate::simulation::protocol::{self, Request};
 use crate::simulation::sessions::{Attachment, Resume, Said, ToClient, Token};
 use crate::simulation::state::AppState;
+use crate::simulation::who::Who;
 
 /// The actor.
 pub struct WebClient {
     server: Arc<AppState>,
     peer: Peer,
+    /// The user whom a trusted web server names.
+    user: Option<String>,
     session: Attached,
     liveness: Liveness,
     reader: MessageReader,
@@ -48,8 +51,12 @@ type Context = WebsocketContext<WebClient>;
 impl WebClient {
     /// A client that has just connected; `permit` counts it, `reader` reads its messages.
     #[must_use]
-    pub fn new(server: Arc<AppState>, peer: Peer, (permit, reader): (ConnectionPermit, MessageReader)) -> Self {
-        Self { server, peer, session: Attached::No, liveness: Liveness::new(), reader, _permit: permit }
+    pub fn new(
+        server: Arc<AppState>,
+        (peer, user): (Peer, Option<String>),
+        (permit, reader): (ConnectionPermit, MessageReader),
+    ) -> Self {
+        Self { server, peer, user, session: Attached::No, liveness: Liveness::new(), reader, _permit: permit }
     }
 
     fn finish(&mut self, last_words: String, code: CloseCode, ctx: &mut Context) {
@@ -93,10 +100,11 @@ impl WebClient {
             Ok(Some(Request::Start { .. } | Request::Resume(_))) if !matches!(self.session, Attached::No) => {
                 log::warn!("client {}: asks for a second simulation on one connection; ignored", self.peer);
             }
-            Ok(Some(Request::Start { url, mode, resumable })) => {
+            Ok(Some(Request::Start { url, mode, resumable, name })) => {
                 let server = Arc::clone(&self.server);
                 let client = ctx.address().recipient();
-                self.session = Attached::To(Session::open(server, self.peer, client, (url, mode, resumable)));
+                let who = Who::new(self.user.as_deref(), name.as_deref());
+                self.session = Attached::To(Session::open(server, (self.peer, who), client, (url, mode, resumable)));
             }
             Ok(Some(Request::Resume(token))) => self.resume(token, ctx),
             Ok(Some(Request::Keep)) => {

@@ -16,7 +16,7 @@ use crate::shared::config::{
     one_or_many, optional_expanded, optional_whole, percent, seconds, whole,
 };
 use crate::shared::domain::{PublicUrl, UrlPrefix, check_host};
-use crate::shared::http::{Origin, TrustedProxies};
+use crate::shared::http::{Origin, TrustedProxies, UserHeader};
 use crate::simulation::checkout::Mirrors;
 use crate::simulation::machine::display::{self, DisplayName};
 
@@ -115,6 +115,13 @@ pub struct SimulationConfig {
     /// class sits behind one address.
     #[serde(default, deserialize_with = "optional_whole::<1, 10_000, _, _>")]
     pub max_places_per_address: Option<usize>,
+    /// How many of the places one user may have (`userHeader`), and the same share of the waiting line. Default: all.
+    #[serde(default, deserialize_with = "optional_whole::<1, 10_000, _, _>")]
+    pub max_places_per_user: Option<usize>,
+    /// The header in which a web server of `trustedProxies` tells the name of the user, such as `X-Forwarded-User`.
+    /// Default: none.
+    #[serde(default)]
+    pub user_header: Option<UserHeader>,
     /// Web servers, as addresses or networks, whose header `X-Forwarded-For` is believed.
     /// Default: `["127.0.0.0/8", "::1/128"]`.
     #[serde(default)]

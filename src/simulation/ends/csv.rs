@@ -9,7 +9,7 @@ use crate::shared::run::{RotatedFile, timestamp};
 use crate::shared::text::one_line;
 
 /// The first line.
-const HEADING: &str = "id,begin,end,client,repository,world,port,level,peak memory (bytes),processor time (s),reason\n";
+const HEADING: &str = "id,begin,end,client,repository,world,port,level,peak memory (bytes),processor time (s),reason,user,label (unverified)\n";
 /// How many older files are kept beside the newest.
 const OLD_FILES: usize = 10;
 
@@ -36,6 +36,8 @@ fn line(level: &str, ended: &Ended) -> String {
         taken.memory.map(|bytes| bytes.to_string()).unwrap_or_default(),
         taken.time.map(|time| format!("{:.1}", time.as_secs_f64())).unwrap_or_default(),
         ended.how.reason.label().to_owned(),
+        ended.who.user.clone().unwrap_or_default(),
+        ended.who.label.clone().unwrap_or_default(),
     ];
     fields.map(|text| field(&text)).join(",") + "\n"
 }

@@ -13,6 +13,8 @@ pub enum EndReason {
     Idle,
     /// The server was stopped.
     Stopped,
+    /// The administrator has stopped it.
+    Administrator,
     /// Its world could not be checked out.
     NoCheckout,
     /// Webots did not become ready.
@@ -29,12 +31,13 @@ pub enum EndReason {
 
 impl EndReason {
     /// All of them.
-    pub const ALL: [Self; 11] = [
+    pub const ALL: [Self; 12] = [
         Self::Left,
         Self::Finished,
         Self::TimeLimit,
         Self::Idle,
         Self::Stopped,
+        Self::Administrator,
         Self::NoCheckout,
         Self::NoWebots,
         Self::Crashed,
@@ -52,6 +55,7 @@ impl EndReason {
             Self::TimeLimit => "time_limit",
             Self::Idle => "idle",
             Self::Stopped => "stopped",
+            Self::Administrator => "administrator",
             Self::NoCheckout => "no_checkout",
             Self::NoWebots => "no_webots",
             Self::Crashed => "crashed",
@@ -70,6 +74,7 @@ impl EndReason {
             Self::TimeLimit => "time limit",
             Self::Idle => "paused for too long",
             Self::Stopped => "server stopped",
+            Self::Administrator => "stopped by the administrator",
             Self::NoCheckout => "no checkout",
             Self::NoWebots => "no start",
             Self::Crashed => "crashed",

@@ -5,6 +5,7 @@ use std::time::Duration;
 
 use super::end_reason::EndReason;
 use crate::simulation::simulation_id::SimulationId;
+use crate::simulation::who::Who;
 
 /// What a simulation has taken, as far as it is known.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
@@ -37,6 +38,8 @@ pub struct Ended {
     pub end: u64,
     /// The address of its client.
     pub client: String,
+    /// Who it is; for administrators alone.
+    pub who: Who,
     /// The URL of the repository.
     pub repository: String,
     /// The URL of the world.

@@ -121,6 +121,7 @@ mod tests {
     use super::super::end_reason::EndReason;
     use super::super::ended::{End, Taken};
     use super::*;
+    use crate::simulation::who::Who;
 
     fn ended(logs: &Path, reason: EndReason) -> Ended {
         let id = SimulationId::next();
@@ -130,6 +131,7 @@ mod tests {
             begin: 0,
             end: 0,
             client: String::new(),
+            who: Who::default(),
             repository: String::new(),
             world: String::new(),
             port: None,

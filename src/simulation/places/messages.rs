@@ -29,6 +29,16 @@ pub struct GetSnapshot;
 #[rtype(result = "()")]
 pub struct Release(pub SimulationId);
 
+/// Stops the simulation that has this id now, and no other one; the answer is whether there is one.
+#[derive(Message)]
+#[rtype(result = "bool")]
+pub struct StopOne {
+    /// The id as it is written.
+    pub id: String,
+    /// Why, in words for its client.
+    pub why: String,
+}
+
 /// Says that the client of a ticket has another address now; the answer is why that may not be.
 #[derive(Message)]
 #[rtype(result = "Result<(), NoPlace>")]

@@ -2,11 +2,12 @@
 
 mod messages;
 mod no_place;
+mod party;
 mod place_event;
 mod places;
 mod present;
 
-pub use messages::{GetSnapshot, Move, Update};
+pub use messages::{GetSnapshot, Move, StopOne, Update};
 pub use no_place::NoPlace;
 pub use place_event::PlaceEvent;
 pub use places::{Places, Ticket};

@@ -24,4 +24,15 @@ pub enum NoPlace {
         /// Clients of the address that wait.
         waiting: usize,
     },
+    /// The client's user has its share.
+    #[error(
+        "You have {places} places of this simulation server, and {waiting} more clients of yours are waiting. The rest is \
+         kept for others. Try again later"
+    )]
+    ShareOfUser {
+        /// Places that the user has.
+        places: usize,
+        /// Clients of the user that wait.
+        waiting: usize,
+    },
 }

@@ -5,7 +5,7 @@ use actix::prelude::*;
 use super::no_place::NoPlace;
 
 /// What the holder of a ticket hears.
-#[derive(Message, Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Message, Debug, Clone, PartialEq, Eq)]
 #[rtype(result = "()")]
 pub enum PlaceEvent {
     /// So many clients are ahead in the waiting line.
@@ -16,4 +16,6 @@ pub enum PlaceEvent {
     Refused(NoPlace),
     /// Too many simulations wait for clients that are away, and this one has waited longest: it has to end.
     AwayTooLong,
+    /// The administrator stops the simulation; the words are for its client.
+    Stopped(String),
 }

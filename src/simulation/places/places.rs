@@ -6,14 +6,15 @@
 
 use std::collections::{BTreeMap, HashMap, HashSet, VecDeque};
 use std::io::ErrorKind;
-use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, TcpListener};
+use std::net::{Ipv4Addr, Ipv6Addr, TcpListener};
 use std::ops::RangeInclusive;
 use std::time::Duration;
 
 use actix::prelude::*;
 
-use super::messages::{Acquire, GetSnapshot, Move, Release, Update};
+use super::messages::{Acquire, GetSnapshot, Move, Release, StopOne, Update};
 use super::no_place::NoPlace;
+use super::party::{Party, Shares};
 use super::place_event::PlaceEvent;
 use super::present::{Present, Report, longest_away};
 use crate::shared::domain::{Instances, ProjectUrl};
@@ -21,6 +22,7 @@ use crate::shared::http::Peer;
 use crate::simulation::ends::{End, EndReason, Ends, Taken};
 use crate::simulation::simulation_id::SimulationId;
 use crate::simulation::snapshot::{Change, Snapshot, Stage};
+use crate::simulation::who::Who;
 
 /// A place, or a place in the line for one. Dropping it gives it back.
 #[derive(Debug)]
@@ -33,8 +35,7 @@ pub struct Ticket {
 pub struct Places {
     ports: RangeInclusive<u16>,
     longest_line: usize,
-    /// How many places an address may have, and how many clients of it may wait; `None` for as many as there are.
-    per_address: Option<(usize, usize)>,
+    shares: Shares,
     /// How many tickets there were, also of clients that were refused.
     arrivals: u64,
     present: BTreeMap<SimulationId, Present>,
@@ -45,7 +46,7 @@ pub struct Places {
 
 struct Waiting {
     id: SimulationId,
-    address: Option<IpAddr>,
+    parties: Vec<Party>,
     client: Recipient<PlaceEvent>,
     told: Option<usize>,
 }
@@ -58,10 +59,16 @@ impl Places {
     /// the line; without it, all of both.
     #[must_use]
     pub fn new(ports: RangeInclusive<u16>, longest_line: usize, per_address: Option<usize>) -> Self {
-        let all = ports.len().max(1);
-        let per_address = per_address.map(|places| (places, (longest_line * places.min(all)).div_ceil(all)));
+        let shares = Shares { address: share(&ports, longest_line, per_address), user: None };
         let (present, line) = (BTreeMap::new(), VecDeque::new());
-        Self { ports, longest_line, per_address, arrivals: 0, present, line, ends: None }
+        Self { ports, longest_line, shares, arrivals: 0, present, line, ends: None }
+    }
+
+    /// One user may have so many places, and the same part of the line; without a number, all of both.
+    #[must_use]
+    pub fn with_share_of_users(mut self, per_user: Option<usize>) -> Self {
+        self.shares.user = share(&self.ports, self.longest_line, per_user);
+        self
     }
 
     /// Has each end recorded.
@@ -70,38 +77,42 @@ impl Places {
         Self { ends: Some(ends), ..self }
     }
 
-    /// The first in the line whose address may have another place.
+    /// The first in the line whose address and user may have another place.
     fn next_in_line(&self) -> Option<usize> {
-        let Some((most, _)) = self.per_address else {
+        if self.shares.are_none() {
             return (!self.line.is_empty()).then_some(0);
-        };
-        let mut lent: HashMap<IpAddr, usize> = HashMap::new();
-        for address in self.present.values().filter(|one| one.lent.is_some()).filter_map(|one| one.address) {
-            *lent.entry(address).or_default() += 1;
         }
-        let has_room = |address: &IpAddr| lent.get(address).is_none_or(|count| *count < most);
-        self.line.iter().position(|waiting| waiting.address.as_ref().is_none_or(has_room))
+        let mut lent: HashMap<Party, usize> = HashMap::new();
+        for party in self.present.values().filter(|one| one.lent.is_some()).flat_map(Present::parties) {
+            *lent.entry(party).or_default() += 1;
+        }
+        let has_room = |party: &Party| {
+            let most = self.shares.of(party).map(|(most, _)| most);
+            most.is_none_or(|most| lent.get(party).is_none_or(|count| *count < most))
+        };
+        self.line.iter().position(|waiting| waiting.parties.iter().all(has_room))
     }
 
-    /// How many places the clients of an address have, and how many of them wait.
-    fn of_address(&self, address: IpAddr) -> (usize, usize) {
-        let present = self.present.values().filter(|one| one.address == Some(address));
+    /// How many places the clients of a party have, and how many of them wait.
+    fn of_party(&self, party: &Party) -> (usize, usize) {
+        let present = self.present.values().filter(|one| one.parties().contains(party));
         let (lent, waiting): (Vec<_>, Vec<_>) = present.partition(|one| one.lent.is_some());
         (lent.len(), waiting.len())
     }
 
-    /// Why another client of this address gets no place and may not wait, if so.
-    fn refusal(&self, address: Option<IpAddr>) -> Option<NoPlace> {
-        let share = self.per_address.zip(address).map(|(most, address)| (most, self.of_address(address)));
-        let may_have_one = share.is_none_or(|((most, _), (places, _))| places < most);
+    /// Why another client of these parties gets no place and may not wait, if so.
+    fn refusal(&self, parties: &[Party]) -> Option<NoPlace> {
+        let shares = parties.iter().filter_map(|party| Some((party, self.shares.of(party)?, self.of_party(party))));
+        let shares: Vec<_> = shares.collect();
+        let may_have_one = shares.iter().all(|(_, (most, _), (places, _))| places < most);
         if may_have_one && self.next_in_line().is_none() && self.free_port().is_some() {
             return None;
         }
-        if let Some(((_, most), (places, waiting))) = share
-            && waiting >= most
-            && (!may_have_one || waiting > 0)
-        {
-            return Some(NoPlace::Share { places, waiting });
+        let has_its_share = |((most_places, most_waiting), (places, waiting)): ((usize, usize), (usize, usize))| {
+            waiting >= most_waiting && (places >= most_places || waiting > 0)
+        };
+        if let Some((party, _, has)) = shares.into_iter().find(|(_, may, has)| has_its_share((*may, *has))) {
+            return Some(party.refusal(has));
         }
         let (places, waiting) = (self.ports.len(), self.line.len());
         (waiting >= self.longest_line).then_some(NoPlace::Full { places, waiting })
@@ -169,6 +180,12 @@ impl Places {
     }
 }
 
+/// What a party may have that may have so many places: these, and the same part of the line.
+fn share(ports: &RangeInclusive<u16>, longest_line: usize, places: Option<usize>) -> Option<(usize, usize)> {
+    let all = ports.len().max(1);
+    places.map(|places| (places, (longest_line * places.min(all)).div_ceil(all)))
+}
+
 /// Whether nobody listens on a port, by either version of IP; a machine may have but one of them.
 fn is_free(port: u16) -> bool {
     let is_taken = |error: std::io::Error| error.kind() == ErrorKind::AddrInUse;
@@ -189,12 +206,12 @@ impl Handler<Acquire> for Places {
 
     fn handle(&mut self, Acquire(present): Acquire, _: &mut Self::Context) {
         self.arrivals += 1;
-        let (id, address, client) = (present.shown.id, present.address, present.listener.clone());
-        if let Some(refusal) = self.refusal(address) {
+        let (id, parties, client) = (present.shown.id, present.parties(), present.listener.clone());
+        if let Some(refusal) = self.refusal(&parties) {
             return client.do_send(PlaceEvent::Refused(refusal));
         }
         self.present.insert(id, *present);
-        self.line.push_back(Waiting { id, address, client, told: None });
+        self.line.push_back(Waiting { id, parties, client, told: None });
         self.serve();
     }
 }
@@ -230,17 +247,27 @@ impl Handler<Move> for Places {
 
     fn handle(&mut self, Move { id, address }: Move, _: &mut Self::Context) -> Self::Result {
         let is_there = self.present.get(&id).is_none_or(|one| one.address == address);
-        let share = self.per_address.zip(address).filter(|_| !is_there);
+        let share = self.shares.address.zip(address).filter(|_| !is_there);
         if let Some(((most, _), address)) = share
-            && let (places, waiting) = self.of_address(address)
-            && places >= most
+            && let party = Party::Address(address)
+            && let has = self.of_party(&party)
+            && has.0 >= most
         {
-            return Err(NoPlace::Share { places, waiting });
+            return Err(party.refusal(has));
         }
         if let Some(present) = self.present.get_mut(&id) {
             present.address = address;
         }
         Ok(())
+    }
+}
+
+impl Handler<StopOne> for Places {
+    type Result = bool;
+
+    fn handle(&mut self, StopOne { id, why }: StopOne, _: &mut Self::Context) -> bool {
+        let found = self.present.values().find(|one| one.shown.id.to_string() == id);
+        found.inspect(|one| one.listener.do_send(PlaceEvent::Stopped(why))).is_some()
     }
 }
 
@@ -254,11 +281,17 @@ impl Handler<GetSnapshot> for Places {
 }
 
 impl Ticket {
-    /// Gets into the line for a place. `listener` hears what comes of it, `world` is shown, and `client` counts.
+    /// Gets into the line for a place. `listener` hears what comes of it, `world` is shown, and the client counts by its
+    /// address and its user.
     #[must_use]
-    pub fn new(places: &Addr<Places>, listener: Recipient<PlaceEvent>, world: &ProjectUrl, client: Peer) -> Self {
+    pub fn new(
+        places: &Addr<Places>,
+        listener: Recipient<PlaceEvent>,
+        world: &ProjectUrl,
+        (client, who): (Peer, Who),
+    ) -> Self {
         let id = SimulationId::next();
-        places.do_send(Acquire(Box::new(Present::new(id, world, client, listener))));
+        places.do_send(Acquire(Box::new(Present::new(id, world, (client, who), listener))));
         Self { id, places: places.clone() }
     }
 

@@ -7,6 +7,7 @@ use std::time::SystemTime;
 
 use actix::Recipient;
 
+use super::party::Party;
 use super::place_event::PlaceEvent;
 use crate::shared::domain::ProjectUrl;
 use crate::shared::http::Peer;
@@ -15,6 +16,7 @@ use crate::shared::text::{excerpt, without_paths};
 use crate::simulation::ends::{End, EndReason, Ended, Taken};
 use crate::simulation::simulation_id::SimulationId;
 use crate::simulation::snapshot::{Change, Simulation, Stage};
+use crate::simulation::who::Who;
 
 /// What its owner reports of a simulation.
 #[derive(Debug)]
@@ -60,10 +62,16 @@ pub(super) fn longest_away(all: &BTreeMap<SimulationId, Present>, most: usize) -
 
 impl Present {
     /// A simulation that a client has just asked for.
-    pub(super) fn new(id: SimulationId, world: &ProjectUrl, client: Peer, listener: Recipient<PlaceEvent>) -> Self {
+    pub(super) fn new(
+        id: SimulationId,
+        world: &ProjectUrl,
+        (client, who): (Peer, Who),
+        listener: Recipient<PlaceEvent>,
+    ) -> Self {
         let shown = Simulation {
             id,
             world: world.to_string(),
+            who,
             stage: Stage::Queued,
             since: seconds_since_1970(),
             launched: None,
@@ -80,6 +88,12 @@ impl Present {
             Self { lent: None, address, listener, shown, client, repository, events: Vec::new(), how: None };
         present.note(&format!("its client asks for {world}"));
         present
+    }
+
+    /// By what its client shares the places.
+    pub(super) fn parties(&self) -> Vec<Party> {
+        let user = self.shown.who.user.clone().map(Party::User);
+        self.address.map(Party::Address).into_iter().chain(user).collect()
     }
 
     /// Lends it a port.
@@ -126,6 +140,7 @@ impl Present {
             begin: self.shown.since,
             end: seconds_since_1970(),
             client: self.client.to_string(),
+            who: self.shown.who,
             repository: self.repository,
             world: self.shown.world,
             port: self.shown.port,

@@ -1,5 +1,6 @@
 //! What browsers and programs meet: paths, pages, `/status` and `/metrics`.
 
+mod actions;
 mod page_routes;
 mod pages;
 mod queries;

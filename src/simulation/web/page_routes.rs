@@ -9,13 +9,13 @@ use actix_web::http::header::{self, HeaderValue};
 use actix_web::{HttpRequest, HttpResponse, web};
 use serde::Deserialize;
 
-use super::pages;
+use super::pages::{self, Reader};
 use super::queries::{snapshot, too_busy};
 use super::webots_viewer;
 use crate::asset;
 use crate::shared::http::assets::{self, Asset};
 use crate::shared::http::paths::{GET, READ, path};
-use crate::shared::http::{Kind, Policy, html};
+use crate::shared::http::{Kind, Policy, html, is_administrator};
 use crate::simulation::container;
 use crate::simulation::ends::output_file;
 use crate::simulation::machine::{Tree, Usages};
@@ -38,12 +38,22 @@ pub fn configure(app: &mut web::ServiceConfig) {
         .service(path("/wwi/{path:.*}", GET, wwi));
 }
 
-async fn monitor(server: web::Data<AppState>) -> HttpResponse {
+/// Who sees a page, as far as the password tells.
+fn reader(request: &HttpRequest, server: &AppState) -> Reader {
+    let peer = server.config.trusted_proxies.peer(request);
+    match &server.admin_auth {
+        None => Reader::Anybody,
+        auth if is_administrator(auth.as_ref(), request, peer) => Reader::Administrator,
+        Some(_) => Reader::Stranger,
+    }
+}
+
+async fn monitor(request: HttpRequest, server: web::Data<AppState>) -> HttpResponse {
     let Some(snapshot) = snapshot(&server).await else {
         return too_busy();
     };
     let usages = usages(&server, &snapshot).await;
-    html(pages::monitor(&server, &snapshot, &usages), &Policy::own())
+    html(pages::monitor(&server, &snapshot, &usages, reader(&request, &server)), &Policy::own())
 }
 
 async fn usages(server: &AppState, snapshot: &Snapshot) -> Usages {
@@ -68,17 +78,19 @@ async fn events(request: HttpRequest, server: web::Data<AppState>) -> HttpRespon
         Ok(permit) => permit,
         Err(refused) => return refused.answer(),
     };
+    let seen_by = reader(&request, &server);
     let shown = server.clone();
     let render = move || {
         let server = shown.clone();
         async move {
             let snapshot = snapshot(&server).await?;
             let usages = usages(&server, &snapshot).await;
-            let view = pages::view(&server, &snapshot, &usages);
+            let view = pages::view(&server, &snapshot, &usages, seen_by);
             view.inspect_err(|error| log::error!("the monitor page can't be rendered: {error}")).ok()
         }
     };
-    server.live.listen(permit, server.phase.clone(), render)
+    let live = if seen_by == Reader::Administrator { &server.administrators } else { &server.live };
+    live.listen(permit, server.phase.clone(), render)
 }
 
 async fn history(server: web::Data<AppState>) -> HttpResponse {

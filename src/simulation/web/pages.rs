@@ -16,10 +16,22 @@ use crate::simulation::machine::{Usage, Usages};
 use crate::simulation::snapshot::{Simulation, Snapshot, Stage};
 use crate::simulation::state::AppState;
 
+/// Who sees the page.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Reader {
+    /// Somebody, where no password is configured.
+    Anybody,
+    /// Somebody who has not sent the password.
+    Stranger,
+    /// Somebody who has.
+    Administrator,
+}
+
 /// The whole page `/monitor`.
 #[derive(Template)]
 #[template(path = "simulation/monitor.html")]
 struct Monitor<'server> {
+    reader: Reader,
     version: &'static str,
     started: String,
     title: &'server str,
@@ -69,6 +81,7 @@ struct Glance<'readings> {
 #[derive(Template)]
 #[template(path = "simulation/row.html")]
 struct SimulationRow<'one> {
+    reader: Reader,
     one: &'one Simulation,
     world: String,
     repository: String,
@@ -89,16 +102,16 @@ struct SimulationRow<'one> {
 ///
 /// # Errors
 /// When a template can't be rendered.
-pub fn view(server: &AppState, snapshot: &Snapshot, usages: &Usages) -> Result<View, askama::Error> {
+pub fn view(server: &AppState, snapshot: &Snapshot, usages: &Usages, reader: Reader) -> Result<View, askama::Error> {
     let readings = server.readings.borrow().clone();
     let rows = snapshot.simulations.iter().map(|one| {
         let usage = one.pid.and_then(|pid| usages.get(&pid)).copied();
-        let html = SimulationRow::new(one, usage, server.config.timeout).render()?;
+        let html = SimulationRow::new(one, usage, server.config.timeout, reader).render()?;
         Ok(Row { key: one.id.to_string(), html })
     });
     let rows = rows.collect::<Result<Vec<Row>, askama::Error>>()?;
     let ends = server.ends.latest();
-    let ends = ends.iter().map(|one| Ok(Row { key: one.id.to_string(), html: EndRow::new(one).render()? }));
+    let ends = ends.iter().map(|one| Ok(Row { key: one.id.to_string(), html: EndRow::new(one, reader).render()? }));
     let ends = ends.collect::<Result<Vec<Row>, askama::Error>>()?;
     let glance = Glance::new(server, snapshot, &readings).render()?;
     let sample = readings.history.back().map(Sample::columns).unwrap_or_default();
@@ -109,10 +122,16 @@ pub fn view(server: &AppState, snapshot: &Snapshot, usages: &Usages) -> Result<V
 ///
 /// # Errors
 /// When a template can't be rendered.
-pub fn monitor(server: &AppState, snapshot: &Snapshot, usages: &Usages) -> Result<String, askama::Error> {
-    let view = view(server, snapshot, usages)?;
+pub fn monitor(
+    server: &AppState,
+    snapshot: &Snapshot,
+    usages: &Usages,
+    reader: Reader,
+) -> Result<String, askama::Error> {
+    let view = view(server, snapshot, usages, reader)?;
     let readings = server.readings.borrow().clone();
     let page = Monitor {
+        reader,
         version: env!("CARGO_PKG_VERSION"),
         started: timestamp(SystemTime::now() - server.started.elapsed()),
         title: server.config.title.as_deref().unwrap_or("Webots simulation server"),
@@ -174,6 +193,7 @@ fn with_sizes(gpus: &[Gpu]) -> Vec<(&Gpu, String)> {
 #[derive(Template)]
 #[template(path = "simulation/end.html")]
 struct EndRow<'one> {
+    reader: Reader,
     one: &'one Ended,
     world: String,
     repository: String,
@@ -185,11 +205,12 @@ struct EndRow<'one> {
 }
 
 impl<'one> EndRow<'one> {
-    fn new(one: &'one Ended) -> Self {
+    fn new(one: &'one Ended, reader: Reader) -> Self {
         let (repository, world) = names(&one.world);
         let (ended, after) = (text_of(one.end), duration(one.end.saturating_sub(one.begin)));
         let (reason, why) = (one.how.reason, without_paths(&one.how.why));
-        Self { one, world, repository, ended, after, reason: reason.words(), abnormal: reason.is_abnormal(), why }
+        let abnormal = reason.is_abnormal();
+        Self { reader, one, world, repository, ended, after, reason: reason.words(), abnormal, why }
     }
 }
 
@@ -208,12 +229,13 @@ fn names(url: &str) -> (String, String) {
 }
 
 impl<'one> SimulationRow<'one> {
-    fn new(one: &'one Simulation, usage: Option<Usage>, limit: u64) -> Self {
+    fn new(one: &'one Simulation, usage: Option<Usage>, limit: u64, reader: Reader) -> Self {
         let (stage, class) = words(one.stage);
         let ends = one.launched.map_or(0, |launched| launched + limit);
         let now = seconds_since_1970();
         let (repository, world) = names(&one.world);
         Self {
+            reader,
             one,
             world,
             repository,
@@ -277,6 +299,7 @@ fn shortcoming(server: &AppState) -> Option<(&'static str, &str)> {
 mod tests {
     use super::*;
     use crate::simulation::simulation_id::SimulationId;
+    use crate::simulation::who::Who;
 
     #[test]
     fn sizes_and_times_are_short() {
@@ -293,6 +316,7 @@ mod tests {
         Simulation {
             id: SimulationId::next(),
             world: world.to_owned(),
+            who: Who::new(Some("<b>root</b>"), Some("<script>'\"&")),
             stage: Stage::Idle,
             since: 0,
             launched: Some(1),
@@ -314,14 +338,18 @@ mod tests {
             ("https://gitlab.com/g/s/r/-/blob/main/worlds/a.wbt", "gitlab.com/g/s/r"),
             ("https://codeberg.org/u/r/src/branch/main/worlds/a.wbt", "codeberg.org/u/r"),
         ] {
-            assert_eq!(SimulationRow::new(&simulation(world), None, 7200).repository, name);
+            assert_eq!(SimulationRow::new(&simulation(world), None, 7200, Reader::Anybody).repository, name);
         }
     }
 
     #[test]
     fn what_a_client_names_is_only_text() {
         let one = simulation("https://github.com/u/<b>\"'&/blob/main/worlds/<script>.wbt");
-        let html = SimulationRow::new(&one, None, 7200).render().unwrap();
-        assert!(!html.contains("<script>") && !html.contains("<b>"), "{html}");
+        for (reader, has_names) in [(Reader::Anybody, false), (Reader::Stranger, false), (Reader::Administrator, true)]
+        {
+            let html = SimulationRow::new(&one, None, 7200, reader).render().unwrap();
+            assert!(!html.contains("<script>") && !html.contains("<b>"), "{html}");
+            assert_eq!(html.contains("root"), has_names, "{html}");
+        }
     }
 }

@@ -5,13 +5,13 @@ use std::sync::Arc;
 use actix_web::http::header;
 use actix_web::{HttpRequest, HttpResponse, web};
 
+use super::actions;
 use super::page_routes;
 use super::queries::{snapshot, too_busy};
 use super::status::{self, StatusPage};
-use crate::shared::http::paths::{self, GET, POST, READ, path};
+use crate::shared::http::paths::{self, GET, READ, path};
 use crate::shared::http::websocket;
 use crate::shared::http::{CONTENT_TYPE, Kind};
-use crate::shared::run::Request;
 use crate::simulation::client::WebClient;
 use crate::simulation::state::AppState;
 
@@ -27,7 +27,7 @@ fn add(app: &mut web::ServiceConfig) {
         .service(path("/status", READ, status_json))
         .service(path("/metrics", READ, metrics))
         .service(path("/health", READ, health))
-        .service(path("/drain", POST, drain));
+        .configure(actions::configure);
 }
 
 async fn client(request: HttpRequest, stream: web::Payload, server: web::Data<AppState>) -> HttpResponse {
@@ -39,8 +39,9 @@ async fn client(request: HttpRequest, stream: web::Payload, server: web::Data<Ap
         Ok(permit) => permit,
         Err(refused) => return refused.answer(),
     };
+    let user = server.config.user_header.as_ref().and_then(|name| server.config.trusted_proxies.told(&request, name));
     let server = Arc::clone(&server);
-    websocket::open(&request, stream, |reader| WebClient::new(server, peer, (permit, reader)))
+    websocket::open(&request, stream, |reader| WebClient::new(server, (peer, user), (permit, reader)))
 }
 
 /// A page of another origin may use visitors' browsers to start simulations, unless origins are listed.
@@ -80,21 +81,5 @@ async fn health(server: web::Data<AppState>) -> HttpResponse {
         Some(problem) => {
             HttpResponse::ServiceUnavailable().content_type("text/plain").body(format!("Error: {problem}"))
         }
-    }
-}
-
-async fn drain(request: HttpRequest, server: web::Data<AppState>) -> HttpResponse {
-    if let Some(refusal) = paths::refuse_other_sites(&request) {
-        return refusal;
-    }
-    let Some(auth) = &server.admin_auth else {
-        return HttpResponse::Forbidden().body("Error: actions are off; adminPassword is not set.");
-    };
-    if let Err(refused) = auth.check(&request, server.config.trusted_proxies.peer(&request)) {
-        return refused.answer();
-    }
-    match server.requests.try_send(Request::Drain) {
-        Ok(()) => HttpResponse::Accepted().body("draining"),
-        Err(error) => HttpResponse::ServiceUnavailable().body(format!("Error: {error}.")),
     }
 }

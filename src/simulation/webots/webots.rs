@@ -300,7 +300,11 @@ impl Handler<Stop> for Webots {
     type Result = ();
 
     fn handle(&mut self, Stop(kind): Stop, ctx: &mut Self::Context) {
-        let why = if kind == EndReason::Stopped { "The server was stopped" } else { "Its client has gone" };
+        let why = match kind {
+            EndReason::Stopped => "The server was stopped",
+            EndReason::Administrator => "The administrator has stopped it",
+            _ => "Its client has gone",
+        };
         self.stop(kind, why);
         if let Some(preparing) = self.preparing.take() {
             ctx.cancel_future(preparing);

@@ -1,0 +1,40 @@
+//! The body of a request for an action: small, of a length that is told, and in time.
+
+use std::time::Duration;
+
+use actix_web::http::header;
+use actix_web::web::Payload;
+use actix_web::{HttpRequest, HttpResponse};
+use serde::de::DeserializeOwned;
+
+use super::client_stream::LARGEST_BODY;
+
+/// How long a body may take.
+const PATIENCE: Duration = Duration::from_secs(5);
+
+/// Reads the JSON of a body; an empty one is the default. `form` tells how it has to be.
+///
+/// # Errors
+/// The answer to a request whose body can't be read.
+pub async fn json<T: DeserializeOwned + Default>(
+    request: &HttpRequest,
+    payload: Payload,
+    form: &str,
+) -> Result<T, HttpResponse> {
+    if request.headers().contains_key(header::TRANSFER_ENCODING) {
+        return Err(HttpResponse::LengthRequired().body("Error: a body needs Content-Length."));
+    }
+    let length = request.headers().get(header::CONTENT_LENGTH).and_then(|length| length.to_str().ok());
+    if length.and_then(|length| length.parse().ok()).is_some_and(|length: usize| length > LARGEST_BODY) {
+        let words = format!("Error: the body is larger than {LARGEST_BODY} bytes.");
+        return Err(HttpResponse::PayloadTooLarge().force_close().body(words));
+    }
+    let wrong = || HttpResponse::BadRequest().body(format!("Error: the body is not {form}."));
+    let read = actix_web::rt::time::timeout(PATIENCE, payload.to_bytes_limited(LARGEST_BODY)).await;
+    match read {
+        Ok(Ok(Ok(body))) if body.is_empty() => Ok(T::default()),
+        Ok(Ok(Ok(body))) => serde_json::from_slice(&body).map_err(|_| wrong()),
+        Ok(_) => Err(wrong()),
+        Err(_) => Err(HttpResponse::RequestTimeout().force_close().body("Error: the body did not come in time.")),
+    }
+}

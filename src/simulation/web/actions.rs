@@ -1,0 +1,83 @@
+//! What administrators do: each action needs their password.
+
+use actix_web::http::header;
+use actix_web::{HttpRequest, HttpResponse, web};
+use serde::Deserialize;
+
+use super::queries::{stop_simulation, too_busy};
+use crate::shared::http::paths::{GET, POST, path};
+use crate::shared::http::{body, refuse_action};
+use crate::shared::run::Request;
+use crate::shared::text::excerpt;
+use crate::simulation::protocol;
+use crate::simulation::state::AppState;
+
+/// How many letters of a reason are told.
+const REASON_LENGTH: usize = 300;
+
+/// Adds the paths to an app.
+pub fn configure(app: &mut web::ServiceConfig) {
+    app.service(path("/drain", POST, drain))
+        .service(path("/simulations/{id}/stop", POST, stop))
+        .service(path("/sign-in", GET, sign_in));
+}
+
+/// What the body of a stop has, if it has one.
+#[derive(Default, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Order {
+    #[serde(default)]
+    reason: String,
+}
+
+fn refusal(request: &HttpRequest, server: &AppState) -> Option<HttpResponse> {
+    refuse_action(server.admin_auth.as_ref(), request, server.config.trusted_proxies.peer(request))
+}
+
+async fn drain(request: HttpRequest, server: web::Data<AppState>) -> HttpResponse {
+    if let Some(refusal) = refusal(&request, &server) {
+        return refusal;
+    }
+    match server.requests.try_send(Request::Drain) {
+        Ok(()) => HttpResponse::Accepted().body("draining"),
+        Err(error) => HttpResponse::ServiceUnavailable().body(format!("Error: {error}.")),
+    }
+}
+
+/// Stops one simulation, and no other one that comes in its place: an id is never used again.
+async fn stop(
+    request: HttpRequest,
+    id: web::Path<String>,
+    body: web::Payload,
+    server: web::Data<AppState>,
+) -> HttpResponse {
+    if let Some(refusal) = refusal(&request, &server) {
+        return refusal;
+    }
+    let Order { reason } = match body::json(&request, body, "{\"reason\": TEXT}").await {
+        Ok(order) => order,
+        Err(refusal) => return refusal,
+    };
+    let (id, reason) = (id.into_inner(), excerpt(reason.trim(), REASON_LENGTH));
+    match stop_simulation(&server, id.clone(), protocol::stopped_by_teacher(&reason)).await {
+        Some(true) => {
+            let peer = server.config.trusted_proxies.peer(&request);
+            log::info!("{id}: client {peer} stops it, reason: {}", if reason.is_empty() { "none" } else { &reason });
+            HttpResponse::Accepted().body("stopping")
+        }
+        Some(false) => HttpResponse::NotFound().body("Error: there is no such simulation; it may have ended."),
+        None => too_busy(),
+    }
+}
+
+/// Has the browser ask for the password, which it then sends to the monitor page too.
+async fn sign_in(request: HttpRequest, server: web::Data<AppState>) -> HttpResponse {
+    let peer = server.config.trusted_proxies.peer(&request);
+    match &server.admin_auth {
+        None => HttpResponse::NotFound().body("Error: adminPassword is not set."),
+        Some(auth) => match auth.check(&request, peer) {
+            Ok(()) => HttpResponse::SeeOther().insert_header((header::LOCATION, "monitor")).finish(),
+            Err(refused) => refused.answer(),
+        },
+    }
+}

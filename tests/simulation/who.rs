@@ -1,0 +1,131 @@
+//! Who has which simulation: the user whom a trusted web server names, and what a client calls itself.
+
+use serde_json::json;
+
+use super::scene::arm;
+use crate::support::client::Client;
+use crate::support::git::Forge;
+use crate::support::http::{self, PASSWORD, get_as_administrator};
+use crate::support::program::{Builder, Server, simulation_server};
+use crate::support::until;
+use crate::support::webots::Webots;
+
+fn with_users(webots: &Webots, forge: &Forge, places: u16) -> Builder {
+    let builder = simulation_server(&webots.path(), forge.path(), places).set("adminPassword", PASSWORD);
+    builder.set("userHeader", "X-Forwarded-User")
+}
+
+/// A client that a web server names so, and that calls itself so.
+async fn start(server: &Server, headers: &[(&'static str, &str)], name: Option<&str>) -> Client {
+    let mut client = Client::with_headers(server, headers).await;
+    client.send(&json!({"start": {"url": arm(), "name": name}}).to_string()).await;
+    client
+}
+
+async fn page(server: &Server) -> String {
+    get_as_administrator(&server.url("/monitor")).await.text()
+}
+
+/// What the live page is sent first, with the password.
+async fn event(server: &Server) -> String {
+    let request = awc::Client::default().get(server.url("/events")).basic_auth("admin", PASSWORD);
+    let mut answer = request.send().await.unwrap();
+    let mut text = String::new();
+    while !text.contains("simulations") || !text.ends_with("\n\n") {
+        use futures_util::StreamExt;
+        text.push_str(&String::from_utf8_lossy(&answer.next().await.unwrap().unwrap()));
+    }
+    text
+}
+
+#[actix_rt::test]
+async fn a_name_is_for_administrators_alone_and_never_markup() {
+    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
+    let server = with_users(&webots, &forge, 2).start().await;
+    let (user, label) = ("<b>anna@lab</b>", "\"<script>alert(1)</script>\u{202e}\n=1+1,x");
+    let mut client = start(&server, &[("x-forwarded-user", user)], Some(label)).await;
+    client.until("webots:").await;
+    let id = client.id().to_owned();
+    for text in [page(&server).await, event(&server).await] {
+        assert!(text.contains("anna@lab") && text.contains("alert(1)") && text.contains("unverified"), "{text}");
+        assert!(!text.contains("<b>anna") && !text.contains("<script>alert"), "{text}");
+    }
+    let output = server.url(&format!("/output?id={id}"));
+    client.leave().await;
+    let csv = || std::fs::read_to_string(server.folder.join("log/simulation/simulations.csv")).unwrap_or_default();
+    until("it is in simulations.csv", async || csv().contains(&id)).await;
+    let line = csv().lines().find(|line| line.starts_with(&id)).unwrap().to_owned();
+    let written = "<b>anna@lab</b>,\"\"\"<script>alert(1)</script>\u{fffd} =1+1,x\"";
+    assert!(line.ends_with(written), "{line}");
+    assert!(csv().lines().next().unwrap().ends_with(",reason,user,label (unverified)"));
+    let log = server.log();
+    assert!(log.lines().any(|line| line.contains(&id) && line.contains("user \"<b>anna@lab</b>\"")), "{log}");
+    assert!(page(&server).await.contains("anna@lab"), "the simulations that ended have a name, too");
+    // What others read.
+    for path in ["/monitor", "/status", "/metrics", "/load"] {
+        let text = http::get(&server.url(path)).await.text();
+        assert!(!text.contains("anna") && !text.contains("alert(1)"), "{path}: {text}");
+    }
+    until("the output is kept", async || get_as_administrator(&output).await.status == 200).await;
+    let kept = get_as_administrator(&output).await.text();
+    assert!(kept.contains("asks for") && !kept.contains("anna") && !kept.contains("alert(1)"), "{kept}");
+    // Where there is no password, nobody sees who is there.
+    let server = simulation_server(&webots.path(), forge.path(), 1).set("userHeader", "X-Forwarded-User").start().await;
+    let mut client = start(&server, &[("x-forwarded-user", user)], Some(label)).await;
+    client.until("webots:").await;
+    assert!(!page(&server).await.contains("anna"));
+}
+
+#[actix_rt::test]
+async fn a_user_is_believed_from_a_trusted_web_server_only() {
+    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
+    let anna = ("x-forwarded-user", "anna");
+    for (trusted, header, headers, known) in [
+        (json!(["127.0.0.1"]), "X-Forwarded-User", vec![anna], true),
+        (json!([]), "X-Forwarded-User", vec![anna], false),
+        (json!(["203.0.113.0/24"]), "X-Forwarded-User", vec![anna], false),
+        (json!(["127.0.0.1"]), "X-Auth-Name", vec![anna], false),
+        (json!(["127.0.0.1"]), "X-Forwarded-User", vec![anna, ("x-forwarded-user", "ben")], false),
+    ] {
+        let builder = with_users(&webots, &forge, 1).set("trustedProxies", trusted.clone());
+        let server = builder.set("userHeader", header).start().await;
+        let mut client = start(&server, &headers, None).await;
+        client.until("webots:").await;
+        assert_eq!(page(&server).await.contains("<b>anna</b>"), known, "{trusted} {header} {headers:?}");
+        assert_eq!(server.log().contains("user \"anna\""), known, "{trusted} {header} {headers:?}");
+    }
+}
+
+#[actix_rt::test]
+async fn one_user_has_a_share_of_the_places_wherever_it_is() {
+    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
+    let builder = with_users(&webots, &forge, 4).set("waitingLine", 4).set("maxPlacesPerUser", 1);
+    let server = builder.start().await;
+    let from = async |user: &str, address: &str| {
+        start(&server, &[("x-forwarded-user", user), ("x-forwarded-for", address)], None).await
+    };
+    let mut first = from("anna", "203.0.113.1").await;
+    first.until("webots:").await;
+    let mut waits = from("anna", "203.0.113.2").await;
+    assert_eq!(waits.until("").await, "queue: 0");
+    let told = from("anna", "203.0.113.3").await.until("").await;
+    let words = "loading: Error: You have 1 places of this simulation server, and 1 more clients of yours are waiting";
+    assert!(told.starts_with(words), "{told}");
+    // Another user of the same address, and somebody without a name, pass the one who waits.
+    let mut other = from("ben", "203.0.113.1").await;
+    other.until("webots:").await;
+    let mut nameless = start(&server, &[("x-forwarded-for", "203.0.113.1")], Some("anna")).await;
+    nameless.until("webots:").await;
+    first.leave().await;
+    waits.until("webots:").await;
+}
+
+#[actix_rt::test]
+async fn a_name_that_is_none_is_refused_in_words() {
+    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
+    let server = with_users(&webots, &forge, 1).start().await;
+    let mut client = Client::connect(&server.websocket("/client")).await;
+    client.send(&json!({"start": {"url": arm(), "name": ["anna"]}}).to_string()).await;
+    let told = client.until("loading: Error:").await;
+    assert!(told.contains("\"name\" is no text"), "{told}");
+}
