@@ -1,9 +1,10 @@
-//! docs/containers.md by doing: its commands and its files as they stand.
+//! docs/containers.md by doing: its commands and its files as they stand; and of docs/scaling.md what needs root.
 //!
 //! | stands in | for | because |
 //! |---|---|---|
 //! | a script that does nothing | `apt-get`, `systemctl` | the machine of the tests stays as it is |
 //! | `docker image inspect` | `docker pull` | no registry can be reached: what is pulled has to be there by that name |
+//! | scripts | `certbot`, `docker` | no certificate authority and no Swarm are here |
 //! | `setpriv` | `sudo` | the user of the package is not on this machine: another one who is not root |
 
 use std::os::unix::fs::{PermissionsExt, symlink};
@@ -15,31 +16,14 @@ use super::daemon::{ask, build_from, docker, host, of_service, open_socket, serv
 use super::image::NAME;
 use crate::support::client::Client;
 use crate::support::git::{Forge, arm};
+use crate::support::page;
 
 /// How long a build may take on a busy machine.
 const BUILT: Duration = Duration::from_secs(90);
 
-/// The blocks of the page in this language, without the indentation of the list that they are in.
+/// The blocks of the page in this language.
 fn blocks(language: &str) -> Vec<String> {
-    let page = Path::new(env!("CARGO_MANIFEST_DIR")).join("docs/containers.md");
-    let page = std::fs::read_to_string(page).unwrap();
-    let (mut blocks, mut inside) = (Vec::new(), None);
-    for line in page.lines() {
-        let text = line.trim_start();
-        inside = match (inside, text.strip_prefix("```")) {
-            (None, Some(found)) => Some((found == language, line.len() - text.len(), String::new())),
-            (Some((is_wanted, _, block)), Some(_)) => {
-                blocks.extend(is_wanted.then_some(block));
-                None
-            }
-            (Some((is_wanted, indentation, block)), None) => {
-                Some((is_wanted, indentation, block + line.get(indentation..).unwrap_or_default() + "\n"))
-            }
-            (None, None) => None,
-        };
-    }
-    assert!(!blocks.is_empty(), "the page has no {language}");
-    blocks
+    page::blocks(&page::page("containers.md"), language)
 }
 
 fn script(folder: &Path, name: &str, text: &str) {
@@ -112,4 +96,40 @@ async fn the_dockerfile_of_the_page_on_containers_is_built_and_runs() {
     client.patiently("webots:", BUILT).await;
     let made = "/usr/local/webots-project/controllers/mine/made";
     ask(&["exec", &of_service(&server, "webots")[0], "ls", made]);
+}
+
+#[actix_rt::test]
+async fn the_certificate_of_the_page_on_scaling_is_made_and_renewed() {
+    let Some(_docker) = docker().await else { return };
+    let folder = tempfile::tempdir().unwrap();
+    for part in ["bin", "work", "etc", "renewed"] {
+        std::fs::create_dir_all(folder.path().join(part)).unwrap();
+    }
+    for (name, text) in [("fullchain.pem", "a new chain"), ("privkey.pem", "a new key")] {
+        std::fs::write(folder.path().join("renewed").join(name), text).unwrap();
+    }
+    let (bin, folder) = (folder.path().join("bin"), folder.path());
+    // It asks its authority, and then runs what it was given for that.
+    script(&bin, "certbot", "export RENEWED_LINEAGE=$FOLDER/renewed\nexec sh -ec \"${!#}\"");
+    script(&bin, "docker", "[ $1 = kill ] || { echo door; exit; }\necho \"$*\" >$FOLDER/kill");
+    let commands = page::blocks(&page::page("scaling.md"), "sh").concat();
+    let shown = "openssl x509 -in $PWD/tls.crt -noout -subject; stat -c '%u %a' tls.key; ls -la";
+    // Before certbot is asked, the door has a certificate of its own making that its user may read.
+    let (before, after) = commands.split_once("# After it:").unwrap();
+    let machine = "mount -t overlay overlay -o lowerdir=/etc,upperdir=$0/etc,workdir=$0/work /etc && bash -euo pipefail -c \"$1\"";
+    let output = Command::new("unshare")
+        .args(["--mount", "--propagation", "private", "bash", "-c", machine])
+        .arg(folder)
+        .arg(format!("{before}\n{shown}\n{after}\ncat tls.crt tls.key; stat -c '%u %a' tls.key"))
+        .env("PATH", format!("{}:{}", bin.display(), std::env::var("PATH").unwrap()))
+        .env("FOLDER", folder)
+        .output()
+        .unwrap();
+    let told = format!("{}{}", String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
+    assert!(output.status.success(), "{told}");
+    for words in ["fleet.example.org", "a new chain", "a new key"] {
+        assert!(told.contains(words), "{words} is not in {told}");
+    }
+    assert_eq!(told.matches("101 600").count(), 2, "{told}");
+    assert_eq!(std::fs::read_to_string(folder.join("kill")).unwrap(), "kill --signal HUP door\n");
 }

@@ -11,4 +11,5 @@ mod packet_filter;
 mod ports;
 mod preflight;
 mod prometheus;
+mod scaling;
 mod swarm;

@@ -11,6 +11,7 @@ pub mod git;
 pub mod http;
 pub mod listener;
 pub mod name_server;
+pub mod page;
 pub mod ports;
 pub mod program;
 pub mod relay;

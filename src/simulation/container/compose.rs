@@ -54,8 +54,8 @@ const SHARED_MEMORY: &str = "256m";
 const DISPLAYS: &str = "/tmp/.X11-unix";
 
 impl Parts<'_> {
-    /// Writes the files, and returns the options by which compose finds them, and the variables that it has to have. It
-    /// reads a file of variables in ways of its own, and those of this server's environment count for more.
+    /// Writes the files, and returns the options by which compose finds them, and the variables that it has to have: those of
+    /// this server's environment would count for more than a file of them.
     ///
     /// # Errors
     /// When a file can't be written.
@@ -65,7 +65,6 @@ impl Parts<'_> {
         std::fs::create_dir_all(self.exchange())?;
         std::fs::write(folder.join(TEMPLATE), template.text.as_bytes())?;
         std::fs::write(folder.join(OVERRIDE), self.overridden(template, config).to_string())?;
-        std::fs::write(folder.join(".env"), self.lines(config))?;
         let path = |name: &str| folder.join(name).to_string_lossy().into_owned();
         let (name, folder) = (self.name.to_owned(), folder.to_string_lossy().into_owned());
         let words = [
@@ -118,16 +117,6 @@ impl Parts<'_> {
     fn display(&self, config: &SimulationConfig) -> Option<String> {
         let is_machine = config.container.display == ContainerDisplay::Machine;
         is_machine.then(|| config.display_on(self.gpu.map(|gpu| gpu.index)))
-    }
-
-    /// The same for who looks at the files, one in each line.
-    fn lines(&self, config: &SimulationConfig) -> String {
-        let quote = |name: &str| if name == "WEBOTS" { "\"" } else { "" };
-        let line = |(name, value): &(&str, String)| {
-            let quote = quote(name);
-            format!("{name}={quote}{value}{quote}\n")
-        };
-        self.variables(config).iter().map(line).collect::<Vec<String>>().concat()
     }
 
     /// What holds for each service.

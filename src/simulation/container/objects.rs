@@ -1,5 +1,5 @@
-//! What a server has in Docker: the containers, networks and volumes of its simulations, found by the label that compose
-//! gives to all that it makes.
+//! What a server has in Docker: the containers of its simulations, found by the label that compose gives to all that it
+//! makes. There are no networks and no named volumes of theirs: templates that have some are refused.
 //!
 //! The names of its compose projects begin alike, so that what a server that has crashed left is found again.
 
@@ -19,13 +19,10 @@ pub const PROJECT: &str = "com.docker.compose.project";
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Owner(String);
 
-/// How long a sweep may take for each command.
+/// How long each command of a sweep may take.
 const SWEEP: Duration = Duration::from_secs(20);
-/// What a project consists of besides containers: how these are listed, and removed.
-const REST: [(&str, &[&str], &[&str]); 2] = [
-    ("volume", &["volume", "ls", "--quiet"], &["volume", "rm", "--force"]),
-    ("network", &["network", "ls", "--quiet"], &["network", "rm"]),
-];
+/// How containers are removed, whatever they do.
+const REMOVE: [&str; 3] = ["rm", "--force", "--volumes"];
 
 impl Owner {
     /// The server that has this cache folder, which no other one has.
@@ -87,25 +84,15 @@ pub fn digest(text: &[u8]) -> u128 {
     Sha256::digest(text).iter().take(16).fold(0, |number: u128, byte| (number << 8) | u128::from(*byte))
 }
 
-/// Removes a project with all that belongs to it.
+/// Removes the containers of a project.
 ///
 /// # Errors
 /// When Docker fails; then something may be left.
 pub async fn remove(docker: &Docker, project: &str) -> Result<(), DockerError> {
     let filter = format!("label={PROJECT}={project}");
     let listed = docker.run(&["ps", "--all", "--quiet", "--filter", &filter], SHORT).await?;
-    forced(docker, &["rm", "--force", "--volumes"], &listed).await?;
-    for (_, list, remove) in REST {
-        let list: Vec<&str> = list.iter().copied().chain(["--filter", &filter]).collect();
-        let listed = docker.run(&list, SHORT).await?;
-        forced(docker, remove, &listed).await?;
-    }
-    Ok(())
-}
-
-async fn forced(docker: &Docker, command: &[&str], listed: &str) -> Result<(), DockerError> {
-    let words: Vec<&str> = command.iter().copied().chain(listed.split_whitespace()).collect();
-    if words.len() == command.len() {
+    let words: Vec<&str> = REMOVE.into_iter().chain(listed.split_whitespace()).collect();
+    if words.len() == REMOVE.len() {
         return Ok(());
     }
     match docker.run(&words, SHORT).await {
@@ -116,24 +103,16 @@ async fn forced(docker: &Docker, command: &[&str], listed: &str) -> Result<(), D
     }
 }
 
-/// Removes all that a server has in Docker but its images: for a process that watches over the server's end. Blocks.
+/// Removes the containers of a server: for a process that watches over the server's end. Blocks.
 pub fn sweep(owner: &Owner) {
     let prefix = owner.prefix();
     let format = format!("{{{{.ID}}}} {{{{.Label \"{PROJECT}\"}}}}");
     let filter = format!("label={PROJECT}");
-    let rest = REST.iter().map(|(kind, _, remove)| {
-        let name = if *kind == "volume" { "{{.Name}}" } else { "{{.ID}}" };
-        (vec![*kind, "ls"], *remove, format!("{name} {{{{.Label \"{PROJECT}\"}}}}"))
-    });
-    let containers = (vec!["ps", "--all"], &["rm", "--force", "--volumes"][..], format);
-    for (list, remove, format) in std::iter::once(containers).chain(rest) {
-        let list = list.into_iter().chain(["--filter", &filter, "--format", &format]);
-        let listed = quietly(&list.collect::<Vec<_>>());
-        let found = listed.lines().filter_map(|line| line.split_once(' '));
-        let found: Vec<&str> = found.filter(|(_, project)| project.starts_with(&prefix)).map(|(id, _)| id).collect();
-        if !found.is_empty() {
-            quietly(&remove.iter().copied().chain(found).collect::<Vec<_>>());
-        }
+    let listed = quietly(&["ps", "--all", "--filter", &filter, "--format", &format]);
+    let found = listed.lines().filter_map(|line| line.split_once(' '));
+    let found: Vec<&str> = found.filter(|(_, project)| project.starts_with(&prefix)).map(|(id, _)| id).collect();
+    if !found.is_empty() {
+        quietly(&REMOVE.into_iter().chain(found).collect::<Vec<_>>());
     }
 }
 

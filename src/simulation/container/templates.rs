@@ -122,7 +122,8 @@ impl Templates {
 }
 
 /// What a template of the original has that can't work here, by the beginning of its line, and what to write there.
-const UNSUITABLE: [(&str, &str); 4] = [
+const UNSUITABLE: [(&str, &str); 5] = [
+    ("networks:", "all services are in the network of container.network: leave it out"),
     (
         "volumes:",
         "a volume belongs to root, and programs run as the server's user: mount ${PROJECT} or ${THEIA_FOLDER} instead",
@@ -140,7 +141,7 @@ fn unsuitable(text: &str) -> Option<String> {
     text.lines().enumerate().find_map(|(index, line)| {
         // Services mount folders below the same word.
         let (_, advice) = UNSUITABLE.iter().find(|(key, _)| match *key {
-            "volumes:" => line.starts_with(key),
+            "volumes:" | "networks:" => line.starts_with(key),
             key => line.trim_start().starts_with(key),
         })?;
         Some(format!("line {}, `{}`: {advice}", index + 1, line.trim()))
@@ -176,6 +177,7 @@ mod tests {
                 "services:\n  webots:\n    deploy:\n      resources:\n        reservations:\n          devices: []\n",
                 "line 5",
             ),
+            ("networks:\n  own: {}\nservices:\n  webots: {}\n", "line 1, `networks:`"),
             ("services: {}\n", "no service \"webots\""),
         ] {
             std::fs::write(folder.path().join("docker-compose-default.yml"), text).unwrap();
