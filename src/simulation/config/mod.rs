@@ -9,7 +9,7 @@ mod timing;
 mod urls;
 
 pub use container::{ContainerDisplay, ContainerNetwork, ContainerSettings, EDITOR_PORT};
-pub use isolation::{Isolation, SandboxFolders, VariableName};
+pub use isolation::{Isolation, SandboxFolders, SandboxNetwork, VariableName};
 pub use resources::Resources;
 pub use simulation_config::SimulationConfig;
 pub use timing::Timing;

@@ -3,6 +3,7 @@
 mod cgroup;
 mod environment;
 mod launcher;
+mod network;
 mod peak;
 mod place;
 mod program;
@@ -11,7 +12,7 @@ mod unkept;
 mod watcher;
 
 pub use cgroup::Cgroup;
-pub use launcher::{Launcher, Level};
+pub use launcher::{Launcher, Level, Network};
 pub use peak::Peak;
 pub use program::Program;
 pub use watcher::{Watch, Watcher};
