@@ -2,6 +2,7 @@
 
 mod cgroup;
 mod environment;
+mod keyrings;
 mod launcher;
 mod network;
 mod peak;

@@ -13,6 +13,7 @@ use std::time::Duration;
 
 use which::which;
 
+use super::keyrings;
 use super::network::{CHECK, OwnNetwork};
 use super::place::{Content, Place, hidden};
 use super::program::Program;
@@ -83,7 +84,10 @@ impl Sandbox {
     /// When a folder can't be made.
     pub fn command(&self, program: &Program<'_>) -> io::Result<Vec<OsString>> {
         let mut command = self.network.as_ref().map_or_else(|| Ok(Vec::new()), |network| network.command(program))?;
-        command.push(self.bubblewrap.clone().into());
+        let filter = program.instance.join("system-calls");
+        std::fs::write(&filter, keyrings::filter())?;
+        command.extend(["/bin/sh", "-c", "exec \"$@\" 3<\"$0\""].map(Into::into));
+        command.extend([filter.into(), self.bubblewrap.clone().into(), "--seccomp".into(), "3".into()]);
         command.extend(
             ["--die-with-parent", "--new-session", "--unshare-pid", "--unshare-ipc", "--cap-drop", "ALL"]
                 .map(Into::into),
