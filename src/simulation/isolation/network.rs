@@ -22,6 +22,7 @@ use crate::simulation::config::{SandboxNetwork, SimulationConfig};
 pub struct OwnNetwork {
     pasta: PathBuf,
     setpriv: PathBuf,
+    unshare: PathBuf,
     /// What loads the packet filter; `None` where that can't be had.
     nft: Option<PathBuf>,
     closed: bool,
@@ -54,13 +55,14 @@ impl OwnNetwork {
             format!("{program} is not there; on Debian, Ubuntu and Fedora the package {package} has it")
         };
         let pasta = which("pasta").map_err(|_| missing("pasta", "passt"))?;
-        let setpriv = which("setpriv").map_err(|_| missing("setpriv", "util-linux"))?;
+        let util = |program| which(program).map_err(|_| missing(program, "util-linux"));
+        let (setpriv, unshare) = (util("setpriv")?, util("unshare")?);
         let closed = config.sandbox.network == SandboxNetwork::Closed;
         let nft = which("nft").ok().or_else(|| Some(PathBuf::from(NFT)).filter(|nft| nft.is_file()));
         if closed && nft.is_none() {
             return Err(missing("nft", "nftables"));
         }
-        Ok(Self { pasta, setpriv, nft, closed, forwarded: forwarded(config.bind) })
+        Ok(Self { pasta, setpriv, unshare, nft, closed, forwarded: forwarded(config.bind) })
     }
 
     /// Whether programs reach nothing at all.
@@ -117,6 +119,8 @@ impl OwnNetwork {
             command.push(format!("{CLOSE}; exec \"$@\"").into());
             command.push("sh".into());
         }
+        // bubblewrap finds its own processes in `/proc`, and pasta has begun to count them anew.
+        command.extend([self.unshare.clone().into(), "--mount-proc".into(), "--".into()]);
         Ok(command)
     }
 
