@@ -6,7 +6,7 @@ use which::which;
 
 use super::config::{Isolation, SimulationConfig};
 use super::container;
-use crate::simulation::isolation::Launcher;
+use crate::simulation::isolation::{Launcher, Level};
 use crate::simulation::machine::display;
 use crate::simulation::machine::sensors::{GpuReading, GpuSensor};
 
@@ -45,9 +45,10 @@ pub fn check(config: &SimulationConfig) -> Vec<Finding> {
     let launcher = Launcher::new(config).map_err(|error| format!("the server does not start: {error}"));
     let unkept = launcher.as_ref().map(Launcher::unkept).unwrap_or_default();
     let unkept = unkept.into_iter().map(|line| Finding { topic: "limits", result: Err(line) });
+    let network = launcher.as_ref().ok().and_then(network);
     let isolation = Finding { topic: "isolation", result: launcher.and_then(|launcher| isolation(&launcher)) };
     let gpus = config.spreads().then(|| Finding { topic: "GPUs", result: gpus(config) });
-    first.into_iter().chain(gpus).chain(always).chain(last).chain([isolation]).chain(unkept).collect()
+    first.into_iter().chain(gpus).chain(always).chain(last).chain([isolation]).chain(network).chain(unkept).collect()
 }
 
 fn webots(config: &SimulationConfig) -> Result<String, String> {
@@ -124,6 +125,13 @@ fn isolation(launcher: &Launcher) -> Result<String, String> {
         Some(why) => Err(format!("none, worlds' programs may do whatever this user may: {why}")),
         None => Ok(launcher.level().to_string()),
     }
+}
+
+/// The network of sandboxes.
+fn network(launcher: &Launcher) -> Option<Finding> {
+    let words = launcher.network_in_words().filter(|_| launcher.level() == Level::Sandbox)?;
+    let is_less = launcher.why_shared().is_some() || launcher.reaches_private_addresses();
+    Some(Finding { topic: "network", result: if is_less { Err(words) } else { Ok(words) } })
 }
 
 /// Returns the first line that a program prints.

@@ -11,21 +11,21 @@ use crate::support::webots::Webots;
 use crate::support::{display, needs, skip, until};
 
 /// Everything of a test: a server with things that are none of a world's business.
-struct Stage {
+pub struct Stage {
     /// Holds the configuration, the log and the cache.
-    folder: tempfile::TempDir,
+    pub folder: tempfile::TempDir,
     /// The home of the server's user.
     home: tempfile::TempDir,
     /// Somewhere that is neither in `/tmp` nor in a home.
-    elsewhere: tempfile::TempDir,
-    forge: Forge,
+    pub elsewhere: tempfile::TempDir,
+    pub forge: Forge,
 }
 
 /// The levels in the order of the tables.
 const LEVELS: [&str; 2] = ["none", "sandbox"];
 
 impl Stage {
-    fn new() -> Self {
+    pub fn new() -> Self {
         let everybody = |folder: tempfile::TempDir| {
             std::fs::set_permissions(folder.path(), std::fs::Permissions::from_mode(0o777)).unwrap();
             folder
@@ -41,14 +41,14 @@ impl Stage {
         stage
     }
 
-    fn builder(&self, webots: &Webots, level: &str) -> Builder {
+    pub fn builder(&self, webots: &Webots, level: &str) -> Builder {
         let builder = simulation_server(&webots.path(), self.forge.path(), 2).folder(self.folder.path());
         let builder = builder.set("isolation", level).set("adminPassword", "a secret").set("timing.grace", 0.5);
         builder.env("HOME", self.home.path().to_str().unwrap()).env("SECRET_OF_THE_SERVER", "a secret")
     }
 
     /// What a program of a world can do of these deeds, each a name and a line for a shell.
-    async fn tried(
+    pub async fn tried(
         &self,
         deeds: &[(&str, String)],
         level: &str,
@@ -159,7 +159,7 @@ async fn a_world_sees_and_changes_what_its_level_allows() {
 }
 
 /// What runs a server as an ordinary user; nothing where that can't be.
-fn as_nobody() -> Option<&'static str> {
+pub fn as_nobody() -> Option<&'static str> {
     let program = Path::new(env!("CARGO_BIN_EXE_simulation-server"));
     let may_be_run = |folder: &Path| folder.metadata().unwrap().permissions().mode() & 1 == 1;
     if !nix::unistd::getuid().is_root() || !program.ancestors().all(may_be_run) {
@@ -279,6 +279,19 @@ async fn a_sandbox_makes_no_user_namespaces_and_sets_nothing_of_the_kernel() {
         let done = stage.tried(&deeds, "sandbox", |builder| builder.before(user)).await;
         assert_eq!(done, ["read the settings of the kernel"], "{user}");
     }
+}
+
+#[actix_rt::test]
+async fn a_sandbox_has_no_keyring_of_the_servers_session() {
+    let number = if cfg!(target_arch = "aarch64") { 219 } else { 250 };
+    let script = format!("import ctypes; assert ctypes.CDLL(None).syscall({number}, 0, -3, 1) > 0");
+    let deeds = [("use a keyring", format!("python3 -c '{script}'"))];
+    assert_eq!(Stage::new().tried(&deeds, "sandbox", |builder| builder).await, [""; 0]);
+    let own = std::process::Command::new("python3").args(["-c", &script]).status().unwrap();
+    if !own.success() {
+        return skip("a keyring without a sandbox", "programs are kept from keyrings here");
+    }
+    assert_eq!(Stage::new().tried(&deeds, "none", |builder| builder).await, ["use a keyring"]);
 }
 
 #[actix_rt::test]

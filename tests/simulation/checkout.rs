@@ -151,6 +151,21 @@ async fn a_repository_can_run_nothing() {
 }
 
 #[actix_rt::test]
+async fn attributes_in_a_home_change_no_checkout() {
+    let (forge, webots, home) = (Forge::with_arm(), Webots::launcher(), tempfile::tempdir().unwrap());
+    let settings = home.path().join(".config/git");
+    std::fs::create_dir_all(&settings).unwrap();
+    // A program at level `none` could write this.
+    std::fs::write(settings.join("attributes"), "*.py text eol=crlf\n").unwrap();
+    let server = simulation_server(&webots.path(), forge.path(), 1).env("HOME", home.path().to_str().unwrap());
+    let server = server.env("XDG_CONFIG_HOME", home.path().join(".config").to_str().unwrap()).start().await;
+    let mut client = Client::start(&server, &world("lab/arm", "main", "worlds/a.wbt")).await;
+    client.until("webots:").await;
+    let file = instance_folders(&server.folder)[0].join("project/controllers/c/c.py");
+    assert_eq!(std::fs::read_to_string(file).unwrap(), "print('original')\n");
+}
+
+#[actix_rt::test]
 async fn a_remote_that_hangs_costs_only_its_own_client() {
     let (forge, webots) = (Forge::with_arm(), reader());
     let hanging = std::net::TcpListener::bind("127.0.0.1:0").unwrap();

@@ -48,6 +48,8 @@ const SETTINGS: &str = "\
 	directory = *
 [core]
 	hooksPath = /dev/null
+	attributesFile = /dev/null
+	excludesFile = /dev/null
 	fsmonitor = false
 	packedGitLimit = 512m
 	packedGitWindowSize = 32m

@@ -55,6 +55,29 @@ pub fn level<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Isolation, D:
     Isolation::deserialize(value).map_err(D::Error::custom)
 }
 
+/// The key `sandbox.network`: which network the programs in a sandbox have.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum SandboxNetwork {
+    /// One of each simulation's own, or the server does not start.
+    Own,
+    /// The machine's.
+    Shared,
+    /// One of each simulation's own where pasta works, otherwise the machine's.
+    #[default]
+    Auto,
+    /// One of each simulation's own, without the internet. Clients reach Webots all the same.
+    Closed,
+}
+
+impl SandboxNetwork {
+    /// Whether the administrator relies on it.
+    #[must_use]
+    pub fn is_demanded(self) -> bool {
+        matches!(self, Self::Own | Self::Closed)
+    }
+}
+
 /// The key `sandbox`: what a sandbox has besides the system and Webots.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
@@ -65,6 +88,8 @@ pub struct SandboxFolders {
     /// Files and folders that can also be written. Default: none.
     #[serde(deserialize_with = "one_or_many")]
     pub writable: Vec<ExpandedPath>,
+    /// Which network it has. Default: auto.
+    pub network: SandboxNetwork,
 }
 
 impl SandboxFolders {
@@ -145,7 +170,8 @@ mod tests {
         let own = [at.join("link/a/log"), at.join("b/config.json"), PathBuf::new()];
         let check = |writable: &str, readable: &str| {
             let paths = |path: &str| vec![ExpandedPath(path.into())];
-            let folders = SandboxFolders { readable: paths(readable), writable: paths(writable) };
+            let folders =
+                SandboxFolders { readable: paths(readable), writable: paths(writable), ..SandboxFolders::default() };
             folders.check(own.iter().map(PathBuf::as_path)).map_err(|error| error.key)
         };
         let told = |path: &str| format!("sandbox.writable lets worlds replace {}", at.join(path).display());

@@ -11,7 +11,7 @@ mod urls;
 
 pub use container::{ContainerDisplay, ContainerNetwork, ContainerSettings, EDITOR_PORT};
 pub use gpus::GpuUse;
-pub use isolation::{Isolation, SandboxFolders, VariableName};
+pub use isolation::{Isolation, SandboxFolders, SandboxNetwork, VariableName};
 pub use resources::Resources;
 pub use simulation_config::SimulationConfig;
 pub use timing::Timing;

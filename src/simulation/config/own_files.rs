@@ -18,6 +18,11 @@ impl SimulationConfig {
     /// When it would take the sandbox apart.
     pub(super) fn check_sandbox(&self) -> Result<Vec<String>, InvalidValue> {
         if !matches!(self.isolation, Isolation::Auto | Isolation::Sandbox) {
+            if self.sandbox.network.is_demanded() {
+                let problem =
+                    "networks of simulations' own are for sandboxes, and isolation is neither \"sandbox\" nor \"auto\"";
+                return Err(InvalidValue { key: "sandbox.network", problem: problem.to_owned() });
+            }
             return Ok(Vec::new());
         }
         let own = [self.log_dir.0.as_path(), &self.cache_dir.0].into_iter().chain(self.secret_files());

@@ -1,6 +1,5 @@
 //! Simulations in containers of Docker: what a project asks for, its image, and a compose project for each simulation.
 
-mod answer;
 mod blocking;
 mod check;
 mod compose;
@@ -28,7 +27,6 @@ mod tidy;
 mod usage;
 mod webots_yml;
 
-pub use answer::until_answering;
 pub use check::{check, check_templates, daemon_fault, data_folder, init_fault};
 pub use containers::Containers;
 pub use objects::{Owner, sweep};

@@ -5,6 +5,7 @@
 use std::ffi::OsString;
 use std::fmt;
 use std::io;
+use std::net::IpAddr;
 use std::path::{Path, PathBuf};
 
 use nix::sys::resource::{Resource, getrlimit};
@@ -13,11 +14,12 @@ use which::which;
 
 use super::cgroup::{Cgroup, Cgroups};
 use super::environment;
+use super::network::OwnNetwork;
 use super::program::Program;
 use super::sandbox::Sandbox;
 use super::unkept::{Means, unkept};
 use super::watcher::MostProcesses;
-use crate::simulation::config::{Isolation, Resources, SimulationConfig, VariableName};
+use crate::simulation::config::{Isolation, Resources, SandboxNetwork, SimulationConfig, VariableName};
 use crate::simulation::process::SpawnSpec;
 
 /// The levels of isolation that this server can keep.
@@ -32,10 +34,28 @@ pub enum Level {
     Container,
 }
 
-/// `isolation` asks for a level that this machine does not have.
+/// The configuration asks for what this machine does not have.
 #[derive(Debug, thiserror::Error)]
-#[error("isolation is \"sandbox\", but {0}; \"none\" runs worlds without it")]
-pub struct IsolationError(String);
+pub enum IsolationError {
+    /// A level.
+    #[error("isolation is \"sandbox\", but {0}; \"none\" runs worlds without it")]
+    Level(String),
+    /// A network of simulations' own.
+    #[error("sandbox.network is \"own\" or \"closed\", but {0}; \"shared\" runs worlds in the machine's network")]
+    Network(String),
+}
+
+/// Which network the programs of worlds have.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Network {
+    /// The machine's.
+    Shared,
+    /// One of each simulation's own.
+    Own,
+    /// The same, and nothing can be reached from it.
+    Closed,
+}
 
 /// How many open files programs expect to be allowed; one that uses `select` can't stand more.
 const USUAL_FILES: u64 = 1024;
@@ -57,6 +77,8 @@ pub struct Launcher {
     method: Method,
     /// Why it is not a sandbox, where the configuration leaves it to the machine.
     shortcoming: Option<String>,
+    /// Why it has no network of its own, where the configuration leaves it to the machine.
+    why_shared: Option<String>,
     cgroups: Option<Cgroups>,
     prlimit: Option<PathBuf>,
     variables: Vec<VariableName>,
@@ -73,20 +95,40 @@ impl Launcher {
         let (method, shortcoming) = match config.isolation {
             Isolation::None => (Method::Plain, None),
             Isolation::Container => (Method::Container, None),
-            Isolation::Sandbox => (Method::Sandbox(sandbox().map_err(IsolationError)?), None),
+            Isolation::Sandbox => (Method::Sandbox(sandbox().map_err(IsolationError::Level)?), None),
             Isolation::Auto => match sandbox() {
                 Ok(sandbox) => (Method::Sandbox(sandbox), None),
                 Err(why) => (Method::Plain, Some(why)),
             },
         };
-        Ok(Self {
+        let mut launcher = Self {
             method,
             shortcoming,
+            why_shared: None,
             cgroups: None,
             prlimit: which("prlimit").ok(),
             variables: config.environment.clone(),
             limits: config.limits.clone(),
-        })
+        };
+        launcher.join_network(config)?;
+        Ok(launcher)
+    }
+
+    /// Gives simulations networks of their own, if the configuration wants that and they can be had.
+    fn join_network(&mut self, config: &SimulationConfig) -> Result<(), IsolationError> {
+        let wanted = config.sandbox.network;
+        let joined = match &mut self.method {
+            Method::Sandbox(_) if wanted == SandboxNetwork::Shared => return Ok(()),
+            Method::Sandbox(sandbox) => OwnNetwork::new(config).and_then(|network| sandbox.join(network)),
+            Method::Plain | Method::Container => Err(self.shortcoming.clone().unwrap_or_default()),
+        };
+        match joined {
+            Err(why) if wanted.is_demanded() => Err(IsolationError::Network(why)),
+            joined => {
+                self.why_shared = joined.err().filter(|_| self.level() == Level::Sandbox);
+                Ok(())
+            }
+        }
     }
 
     /// The same for a server that is starting: it logs the level, and each simulation gets a control group of its own
@@ -99,6 +141,9 @@ impl Launcher {
         match &launcher.shortcoming {
             Some(why) => log::warn!("worlds' programs may do whatever this user may (isolation: none): {why}"),
             None => log::info!("isolation: {}", launcher.level()),
+        }
+        if let Some(network) = launcher.network_in_words() {
+            log::info!("network of simulations: {network}");
         }
         for line in launcher.unkept() {
             log::warn!("{line}");
@@ -134,13 +179,62 @@ impl Launcher {
         }
     }
 
-    /// How many processes of each simulation are what runs it: bubblewrap has one outside of the sandbox and one inside.
+    /// How many processes of each simulation are what runs it: bubblewrap has one outside of the sandbox and one inside, and
+    /// pasta is one.
     #[must_use]
     pub fn runners(&self) -> u64 {
-        match self.method {
+        match &self.method {
             Method::Plain | Method::Container => 0,
-            Method::Sandbox(_) => 2,
+            Method::Sandbox(sandbox) => 2 + u64::from(sandbox.network().is_some()),
         }
+    }
+
+    /// Which network the programs of worlds have; at level `container` that is Docker's.
+    #[must_use]
+    pub fn network(&self) -> Option<Network> {
+        match &self.method {
+            Method::Plain => Some(Network::Shared),
+            Method::Sandbox(sandbox) => Some(match sandbox.network() {
+                None => Network::Shared,
+                Some(network) if network.is_closed() => Network::Closed,
+                Some(_) => Network::Own,
+            }),
+            Method::Container => None,
+        }
+    }
+
+    /// The same for an administrator: what can be reached, and why no less.
+    #[must_use]
+    pub fn network_in_words(&self) -> Option<String> {
+        Some(match (self.network()?, &self.why_shared) {
+            (Network::Shared, None) => "shared with this machine".to_owned(),
+            (Network::Shared, Some(why)) => format!("shared with this machine: {why}"),
+            (Network::Closed, _) => "closed, nothing can be reached".to_owned(),
+            (Network::Own, _) if self.reaches_private_addresses() => {
+                "own, with the internet and private addresses, for nft can't be used; the package nftables has it"
+                    .to_owned()
+            }
+            (Network::Own, _) => "own, with the internet, without this machine and private addresses".to_owned(),
+        })
+    }
+
+    /// Whether simulations reach private addresses from networks of their own, since no packet filter can be loaded there.
+    #[must_use]
+    pub fn reaches_private_addresses(&self) -> bool {
+        matches!(&self.method, Method::Sandbox(sandbox) if sandbox.network().is_some_and(|one| !one.is_filtered()))
+    }
+
+    /// Why simulations share the network of the machine although the configuration does not say so, if they do.
+    #[must_use]
+    pub fn why_shared(&self) -> Option<&str> {
+        self.why_shared.as_deref()
+    }
+
+    /// The address of the machine on which the port of each simulation is forwarded, if each has a network of its own.
+    #[must_use]
+    pub fn forwarded(&self) -> Option<IpAddr> {
+        let Method::Sandbox(sandbox) = &self.method else { return None };
+        sandbox.network().map(OwnNetwork::forwarded)
     }
 
     /// Why simulations run at level `none` although the configuration does not say so, if they do.
@@ -189,7 +283,10 @@ impl Launcher {
             command: command.into_iter().chain(program.command).collect(),
             inherits: false,
             environment,
-            in_sandbox: self.level() == Level::Sandbox,
+            wrappers: match &self.method {
+                Method::Sandbox(sandbox) => 1 + usize::from(sandbox.network().is_some()),
+                Method::Plain | Method::Container => 0,
+            },
             folder: Some(program.folder.to_owned()),
             mark: program.instance.to_owned(),
             grace: program.grace,

@@ -3,7 +3,9 @@
 mod cgroup;
 mod docker_cgroup;
 mod environment;
+mod keyrings;
 mod launcher;
+mod network;
 mod peak;
 mod place;
 mod program;
@@ -13,7 +15,7 @@ mod watcher;
 
 pub use cgroup::Cgroup;
 pub use docker_cgroup::docker_cgroups;
-pub use launcher::{Launcher, Level};
+pub use launcher::{Launcher, Level, Network};
 pub use peak::Peak;
 pub use program::Program;
 pub use watcher::{Watch, Watcher};

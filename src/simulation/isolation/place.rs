@@ -25,6 +25,8 @@ pub enum Content {
     EmptyFile,
     /// What is there, only to be read.
     Readable,
+    /// A file at another path, only to be read.
+    ReadableFile(PathBuf),
     /// What is at another path, to be read and written.
     Writable(PathBuf),
 }
@@ -49,6 +51,7 @@ impl Place {
             Content::Empty => vec!["--tmpfs".into(), self.at.into()],
             Content::EmptyFile => vec!["--ro-bind".into(), "/dev/null".into(), self.at.into()],
             Content::Readable => vec!["--ro-bind-try".into(), self.at.clone().into(), self.at.into()],
+            Content::ReadableFile(content) => vec!["--ro-bind".into(), content.into(), self.at.into()],
             Content::Writable(content) => vec!["--bind".into(), content.into(), self.at.into()],
         }
     }

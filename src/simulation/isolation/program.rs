@@ -15,6 +15,8 @@ pub struct Program<'start> {
     pub project: PathBuf,
     /// The working folder.
     pub folder: &'start Path,
+    /// The port that it is to stream on.
+    pub port: u16,
     /// Variables of its own: those that name its display and its GPU.
     pub variables: &'start [(OsString, OsString)],
     /// Time between SIGTERM and SIGKILL.

@@ -7,15 +7,18 @@
 use std::collections::BTreeSet;
 use std::ffi::OsString;
 use std::io;
+use std::net::{Ipv4Addr, TcpListener};
 use std::path::PathBuf;
 use std::time::Duration;
 
 use which::which;
 
+use super::keyrings;
+use super::network::{CHECK, OwnNetwork};
 use super::place::{Content, Place, hidden};
 use super::program::Program;
 use crate::shared::text::one_line;
-use crate::simulation::config::SimulationConfig;
+use crate::simulation::config::{SandboxNetwork, SimulationConfig};
 use crate::simulation::process::{ExitReason, Ran, Run, RunError};
 
 /// What every sandbox of this server has in common.
@@ -27,20 +30,16 @@ pub struct Sandbox {
     places: Vec<Place>,
     /// Whether programs inside can be kept from making user namespaces, which bubblewrap can from 0.8 on.
     ends_namespaces: bool,
+    /// What gives it a network of its own, if it has one.
+    network: Option<OwnNetwork>,
 }
 
-/// What of `/run` programs need to find names, users and graphics cards. The rest are sockets of services, some of which
-/// start programs for whoever asks.
-const SYSTEM_RUN: [&str; 8] = [
-    "/run/systemd/resolve",
-    "/run/resolvconf",
-    "/run/NetworkManager/resolv.conf",
-    "/run/nscd",
-    "/run/udev",
-    "/run/nvidia-persistenced",
-    "/run/opengl-driver",
-    "/run/current-system",
-];
+/// What of `/run` programs need to find names. Services answer there that ask the internet.
+const NAMES_RUN: [&str; 4] =
+    ["/run/systemd/resolve", "/run/resolvconf", "/run/NetworkManager/resolv.conf", "/run/nscd"];
+/// What of `/run` programs need to find users and graphics cards. The rest are sockets of services, some of which start
+/// programs for whoever asks.
+const SYSTEM_RUN: [&str; 4] = ["/run/udev", "/run/nvidia-persistenced", "/run/opengl-driver", "/run/current-system"];
 /// Graphics cards; also all in `/dev` that begins with `nvidia`.
 const DEVICES: [&str; 2] = ["/dev/dri", "/dev/kfd"];
 /// How long it may take to try whether a sandbox can be made.
@@ -49,6 +48,10 @@ const TRIAL: Duration = Duration::from_secs(5);
 const REMEDY: &str = "user namespaces must be allowed (sysctl user.max_user_namespaces, \
                       kernel.unprivileged_userns_clone, kernel.apparmor_restrict_unprivileged_userns), and /proc not be \
                       covered as in a container";
+
+/// Where nothing of pasta works: what may be done about it.
+const NETWORK_REMEDY: &str = "ordinary users must be allowed to open /dev/net/tun (mode 0666, as udev has it), and the \
+                              machine must have a default route";
 
 impl Sandbox {
     /// Prepares sandboxes for a server with this configuration.
@@ -61,7 +64,8 @@ impl Sandbox {
         })?;
         let shown = |path: &PathBuf| path.canonicalize().ok();
         let mut places = vec![Place::new("/run", Content::Empty)];
-        places.extend(SYSTEM_RUN.map(|at| Place::new(at, Content::Readable)));
+        let names = NAMES_RUN.into_iter().filter(|_| config.sandbox.network != SandboxNetwork::Closed);
+        places.extend(names.chain(SYSTEM_RUN).map(|at| Place::new(at, Content::Readable)));
         let readable = config.webots_home.iter().chain(&config.sandbox.readable).filter_map(|path| shown(&path.0));
         places.extend(readable.map(|at| Place { at, content: Content::Readable }));
         let writable = config.sandbox.writable.iter().filter_map(|path| shown(&path.0));
@@ -70,7 +74,8 @@ impl Sandbox {
         let homes = homes();
         places.extend(hidden(config, &homes));
         places.retain(|place| place.at.exists());
-        Ok(Self { bubblewrap, user: nix::unistd::getuid().as_raw(), homes, places, ends_namespaces: true })
+        let user = nix::unistd::getuid().as_raw();
+        Ok(Self { bubblewrap, user, homes, places, ends_namespaces: true, network: None })
     }
 
     /// The command that runs a program in a sandbox of its own. Makes the folders that it needs in the instance's folder.
@@ -78,13 +83,25 @@ impl Sandbox {
     /// # Errors
     /// When a folder can't be made.
     pub fn command(&self, program: &Program<'_>) -> io::Result<Vec<OsString>> {
-        let mut command: Vec<OsString> = vec![self.bubblewrap.clone().into()];
+        let mut command = self.network.as_ref().map_or_else(|| Ok(Vec::new()), |network| network.command(program))?;
+        let filter = program.instance.join("system-calls");
+        std::fs::write(&filter, keyrings::filter())?;
+        command.extend(["/bin/sh", "-c", "exec \"$@\" 3<\"$0\""].map(Into::into));
+        command.extend([filter.into(), self.bubblewrap.clone().into(), "--seccomp".into(), "3".into()]);
         command.extend(
             ["--die-with-parent", "--new-session", "--unshare-pid", "--unshare-ipc", "--cap-drop", "ALL"]
                 .map(Into::into),
         );
+        if self.ends_namespaces || self.network.is_some() {
+            command.push("--unshare-user".into());
+        }
         if self.ends_namespaces {
-            command.extend(["--unshare-user", "--disable-userns"].map(Into::into));
+            command.push("--disable-userns".into());
+        }
+        if self.network.is_some() {
+            // In pasta's namespace it is root.
+            let (user, group) = (self.user.to_string(), nix::unistd::getgid().to_string());
+            command.extend(["--uid".into(), user.into(), "--gid".into(), group.into()]);
         }
         command.extend(["--ro-bind", "/", "/", "--dev", "/dev", "--proc", "/proc"].map(Into::into));
         // The kernel lets root write there without any capability.
@@ -117,6 +134,7 @@ impl Sandbox {
         let files = program.command.first().map(PathBuf::from).into_iter().chain(self.display_files(program));
         let files = files.filter_map(|file| file.canonicalize().ok());
         own.extend(files.map(|at| Place { at, content: Content::Readable }));
+        own.extend(self.network.as_ref().and_then(|network| network.places(program.instance)));
         own.retain(|place| place.at.exists() || place.at == self.runtime_folder());
         Ok(own)
     }
@@ -161,6 +179,27 @@ impl Sandbox {
         tried.map(|()| self).map_err(|error| format!("bubblewrap makes no sandbox here ({}): {REMEDY}", told(error)))
     }
 
+    /// Gives each sandbox a network of its own, if that works here. Blocks for ten seconds at most.
+    ///
+    /// # Errors
+    /// Why it does not, in words for an administrator.
+    pub fn join(&mut self, network: OwnNetwork) -> Result<(), String> {
+        self.network = Some(network);
+        let mut tried = self.trial();
+        if tried.is_err() && self.network.as_mut().is_some_and(OwnNetwork::give_up_filter) {
+            tried = self.trial();
+        }
+        tried.map_err(|error| {
+            self.network = None;
+            format!("pasta makes no network here ({}): {NETWORK_REMEDY}", one_line(error.to_string().trim()))
+        })
+    }
+
+    /// What gives it a network of its own, if it has one.
+    pub fn network(&self) -> Option<&OwnNetwork> {
+        self.network.as_ref()
+    }
+
     /// Whether programs inside can't make user namespaces.
     pub fn ends_namespaces(&self) -> bool {
         self.ends_namespaces
@@ -176,10 +215,13 @@ impl Sandbox {
             instance: instance.path(),
             folder: &project,
             project: project.clone(),
+            // One that was free a moment ago.
+            port: TcpListener::bind((Ipv4Addr::LOCALHOST, 0))?.local_addr()?.port(),
             variables: &[],
             grace: TRIAL,
         })?;
-        let command = words.into_iter().chain(["true".into()]);
+        let check = if self.network.is_some() { CHECK } else { "true" };
+        let command = words.into_iter().chain(["/bin/sh", "-c", check].map(Into::into));
         let mut complaint = String::new();
         match Run::new(command, instance.path(), TRIAL).blocking(|line| complaint = line) {
             Ok(Ran { ending: ExitReason::Code(0), .. }) => Ok(()),

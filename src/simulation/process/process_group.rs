@@ -28,9 +28,9 @@ pub struct SpawnSpec {
     pub inherits: bool,
     /// Variables of its environment, in place of the server's own or besides them.
     pub environment: Vec<(OsString, OsString)>,
-    /// Whether the program is bubblewrap, which waits outside of a PID namespace: what it has started inside leads a group
-    /// of its own, and all of that ends with bubblewrap.
-    pub in_sandbox: bool,
+    /// How many programs wait outside of what is really run, each the parent of the next one: bubblewrap, and pasta before
+    /// it. What bubblewrap has started leads a group of its own, and all of that ends with each of them.
+    pub wrappers: usize,
     /// Working folder; the server's own where absent.
     pub folder: Option<PathBuf>,
     /// The folder by which all processes of the tree are found again, see [`process_tree::MARK`].
@@ -46,7 +46,7 @@ impl SpawnSpec {
             command,
             inherits: true,
             environment: Vec::new(),
-            in_sandbox: false,
+            wrappers: 0,
             folder: None,
             mark: mark.to_owned(),
             grace: Duration::ZERO,
@@ -107,7 +107,7 @@ impl ProcessGroup {
         let child = command.stdin(Stdio::null()).stdout(output).stderr(errors).spawn()?;
         let leader = child.id().and_then(|id| i32::try_from(id).ok()).ok_or(std::io::ErrorKind::Other)?;
         let (terminate, asked) = oneshot::channel();
-        let group = KillOnDrop { leader: Some(Pid::from_raw(leader)), in_sandbox: spec.in_sandbox };
+        let group = KillOnDrop { leader: Some(Pid::from_raw(leader)), wrappers: spec.wrappers };
         let ended = wait(group, child, asked, spec.grace);
         Ok((Self { leader, terminate: Some(terminate) }, ended))
     }
@@ -149,13 +149,13 @@ async fn wait(mut group: KillOnDrop, mut child: Child, asked: oneshot::Receiver<
     actix_rt::time::timeout(VANISH, group.emptied()).await.ok();
     // The number of an empty group may be given to another one.
     group.leader = None;
-    status.map_or(ExitReason::Unknown, |status| ExitReason::of(status, group.in_sandbox))
+    status.map_or(ExitReason::Unknown, |status| ExitReason::of(status, group.wrappers > 0))
 }
 
 /// Kills a process group when it is dropped.
 struct KillOnDrop {
     leader: Option<Pid>,
-    in_sandbox: bool,
+    wrappers: usize,
 }
 
 impl KillOnDrop {
@@ -166,12 +166,16 @@ impl KillOnDrop {
         }
     }
 
-    /// Sends SIGTERM to what was started. bubblewrap must not get it: it would end at once, and all that is inside with it.
+    /// Sends SIGTERM to what is really run. Its wrappers must not get it: they would end at once, and all that is inside with
+    /// them.
     fn ask_to_end(&self) {
-        let Some(leader) = self.leader.filter(|_| self.in_sandbox) else {
+        let Some(leader) = self.leader.filter(|_| self.wrappers > 0) else {
             return self.signal(Signal::SIGTERM);
         };
-        let inside = process_tree::children(leader.as_raw());
+        let mut inside = vec![leader.as_raw()];
+        for _ in 0..self.wrappers {
+            inside = inside.into_iter().flat_map(process_tree::children).collect();
+        }
         let is_asked = inside.into_iter().any(|child| killpg(Pid::from_raw(child), Signal::SIGTERM).is_ok());
         if !is_asked {
             // It has not come so far as to start anything.

@@ -50,6 +50,7 @@ struct Monitor<'server> {
     docker: bool,
     share_idle_time: f64,
     isolation: Level,
+    network: Option<String>,
     /// What worlds' programs may do that they should not, and why.
     shortcoming: Option<(&'static str, &'server str)>,
     limit: String,
@@ -149,6 +150,7 @@ pub fn monitor(
         docker: server.rules.docker,
         share_idle_time: server.rules.share_idle_time,
         isolation: server.launcher.level(),
+        network: server.launcher.network_in_words(),
         shortcoming: shortcoming(server),
         limit: duration(server.config.timeout),
     };

@@ -5,7 +5,7 @@ use serde::Serialize;
 use super::webots_viewer;
 use crate::shared::domain::ServerReport;
 use crate::shared::http::Gauge;
-use crate::simulation::isolation::Level;
+use crate::simulation::isolation::{Level, Network};
 use crate::simulation::machine::sensors::{Gpu, Host, Machine};
 use crate::simulation::snapshot::{Simulation, Snapshot};
 use crate::simulation::state::AppState;
@@ -19,6 +19,9 @@ pub struct StatusPage {
     pub report: ServerReport,
     /// At which level of isolation simulations run.
     pub isolation: Level,
+    /// Which network their programs have, where that is not Docker's.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub network: Option<Network>,
     /// Time since the start, in seconds.
     pub uptime: u64,
     /// Name, system and hardware of the machine.
@@ -58,6 +61,7 @@ impl StatusPage {
         Self {
             report,
             isolation: server.launcher.level(),
+            network: server.launcher.network(),
             uptime: server.started.elapsed().as_secs(),
             host: readings.host.clone(),
             machine: readings.machine,

@@ -1,6 +1,7 @@
 //! The launch specification: everything that one Webots is started with.
 
 use std::ffi::OsString;
+use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -13,13 +14,13 @@ use super::event::WebotsEvent;
 use super::virtual_display::VirtualDisplay;
 use crate::simulation::checkout::{Checkouts, Project};
 use crate::simulation::config::SimulationConfig;
-use crate::simulation::container::{Containers, Request, until_answering};
+use crate::simulation::container::{Containers, Request};
 use crate::simulation::ends::FOLDER_OF_RUNNING;
 use crate::simulation::isolation::{Cgroup, Launcher, Peak, Program, Watch, Watcher};
 use crate::simulation::machine::display;
 use crate::simulation::machine::sensors::Gpu;
 use crate::simulation::places::Ticket;
-use crate::simulation::process::SpawnSpec;
+use crate::simulation::process::{SpawnSpec, until_answering};
 use crate::simulation::protocol::Mode;
 
 /// Everything that one Webots is started with.
@@ -99,6 +100,7 @@ impl LaunchSpec {
             instance: self.project.instance.path(),
             project: self.project.instance.project(),
             folder: self.project.folder(),
+            port: self.place.1,
             variables: &self.variables(display),
             grace: self.config.timing.grace,
         })
@@ -112,7 +114,7 @@ impl LaunchSpec {
             folder: self.project.instance.path().to_owned(),
             disk: self.config.limits.disk,
             processes: self.launcher.most_processes(),
-            port: self.containers.is_none().then_some(self.place.1),
+            port: self.forwarded().is_none().then_some(self.place.1),
             peak,
         };
         let watcher = self.watcher.clone();
@@ -133,13 +135,27 @@ impl LaunchSpec {
         }
     }
 
-    /// Waits until its container answers, or one of these processes listens on a port that Webots may have taken, and returns
-    /// the port.
+    /// Where this server reaches the port that is forwarded to it, if it has a network of its own.
+    fn forwarded(&self) -> Option<SocketAddr> {
+        let bind = self.config.bind;
+        // Containers listen on IPv4, see the variable BIND of their templates.
+        let published = if bind.is_ipv4() { reached(bind) } else { Ipv4Addr::LOCALHOST.into() };
+        let address = self.containers.as_ref().map(|_| published).or_else(|| self.launcher.forwarded().map(reached));
+        address.map(|address| (address, self.place.1).into())
+    }
+
+    /// Waits until it answers on the port that is forwarded to it, or one of these processes listens on a port that Webots
+    /// may have taken, and returns the port.
     pub fn listening_port(&self, root: i32) -> LocalBoxFuture<'static, u16> {
-        let (watcher, bind, port) = (self.watcher.clone(), self.config.bind, self.place.1);
-        match &self.containers {
-            Some(_) => until_answering(bind, port).map(move |()| port).boxed_local(),
+        let (watcher, port) = (self.watcher.clone(), self.place.1);
+        match self.forwarded() {
+            Some(address) => until_answering(address).map(move |()| port).boxed_local(),
             None => async move { watcher.listening_port(root, port).await }.boxed_local(),
         }
     }
+}
+
+/// Where this machine itself reaches what listens on an address.
+fn reached(address: IpAddr) -> IpAddr {
+    if address.is_unspecified() { Ipv4Addr::LOCALHOST.into() } else { address }
 }

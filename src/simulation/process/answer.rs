@@ -1,9 +1,9 @@
-//! Whether Webots in a container answers on its published port.
+//! Whether Webots in a network of its own answers on the port that is forwarded to it.
 //!
-//! Docker's proxy listens on it from the container's start on, and accepts connections that nothing inside takes. So only
-//! the answer to a request tells.
+//! Docker's proxy and pasta listen on it from the start on, and accept connections that nothing inside takes. So only the
+//! answer to a request tells.
 
-use std::net::{IpAddr, Ipv4Addr};
+use std::net::SocketAddr;
 use std::time::{Duration, Instant};
 
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
@@ -20,14 +20,12 @@ const FIRST_TIMEOUT: Duration = Duration::from_millis(100);
 /// Timeout that later ones approach: Webots answers none while it reads a world.
 const TIMEOUT: Duration = Duration::from_secs(2);
 
-/// Waits until there is an answer on this port of an address that the server binds to. The container has to run: a request
-/// before it has its address holds all others up for a second, until the kernel asks for that address again.
-pub async fn until_answering(bind: IpAddr, port: u16) {
-    // Containers listen on IPv4, see the variable BIND of their templates.
-    let address = if bind.is_ipv4() && !bind.is_unspecified() { bind } else { Ipv4Addr::LOCALHOST.into() };
+/// Waits until there is an answer at this address. A container has to run: a request before it has its address holds all
+/// others up for a second, until the kernel asks for that address again.
+pub async fn until_answering(address: SocketAddr) {
     let (begin, mut timeout) = (Instant::now(), FIRST_TIMEOUT);
     loop {
-        match actix_rt::time::timeout(timeout, answers((address, port).into())).await {
+        match actix_rt::time::timeout(timeout, answers(address)).await {
             Ok(Ok(true)) => return,
             Ok(_) => actix_rt::time::sleep((begin.elapsed() / PART).clamp(PAUSE.0, PAUSE.1)).await,
             Err(_) => timeout = TIMEOUT.min(timeout * 2),
@@ -35,7 +33,7 @@ pub async fn until_answering(bind: IpAddr, port: u16) {
     }
 }
 
-async fn answers(address: std::net::SocketAddr) -> std::io::Result<bool> {
+async fn answers(address: SocketAddr) -> std::io::Result<bool> {
     let mut stream = TcpStream::connect(address).await?;
     stream.write_all(REQUEST).await?;
     let mut answer = [0; 5];
@@ -45,13 +43,15 @@ async fn answers(address: std::net::SocketAddr) -> std::io::Result<bool> {
 
 #[cfg(test)]
 mod tests {
+    use std::net::Ipv4Addr;
+
     use super::*;
 
     #[actix_rt::test]
     async fn a_proxy_that_accepts_for_nobody_is_no_answer() {
         let listener = tokio::net::TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).await.unwrap();
         let address = listener.local_addr().unwrap();
-        let waiting = actix_rt::spawn(until_answering(Ipv4Addr::UNSPECIFIED.into(), address.port()));
+        let waiting = actix_rt::spawn(until_answering(address));
         drop(listener.accept().await.unwrap());
         let (mut stream, _) = listener.accept().await.unwrap();
         assert!(!waiting.is_finished());

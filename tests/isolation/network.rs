@@ -1,0 +1,311 @@
+//! What a network of its own keeps a world's program from, and what it leaves. Each wall is tried without it too.
+//!
+//! pasta gives none to root: a test of root has another user run the server.
+
+use std::os::linux::net::SocketAddrExt;
+use std::os::unix::fs::PermissionsExt;
+use std::os::unix::net::{SocketAddr, UnixListener};
+use std::path::Path;
+
+use nix::sys::signal::{Signal, kill};
+use nix::unistd::Pid;
+
+use super::deeds::{Stage, as_nobody};
+use crate::simulation::scene::{DEMO, arm, gone_within, nothing_left};
+use crate::support::client::{Client, Heard};
+use crate::support::program::{Builder, Server};
+use crate::support::webots::{Webots, instances_below};
+use crate::support::{display, http, needs, skip, until};
+
+/// What runs a server as an ordinary user who can have networks; nothing, and a word, where there is none.
+fn ordinary(test: &str) -> Option<&'static str> {
+    needs("pasta", "passt");
+    let mode = |device: &Path| device.metadata().map_or(0, |data| data.permissions().mode());
+    if mode(Path::new("/dev/net/tun")) & 0o006 != 0o006 {
+        skip(test, "an ordinary user can't open /dev/net/tun here");
+        return None;
+    }
+    if nix::unistd::getuid().is_root() { as_nobody() } else { Some("true") }
+}
+
+fn stage() -> Stage {
+    let stage = Stage::new();
+    std::fs::set_permissions(stage.forge.path(), std::fs::Permissions::from_mode(0o755)).unwrap();
+    stage
+}
+
+/// A program that others may run.
+fn webots(script: &str) -> Webots {
+    let webots = Webots::script(script);
+    std::fs::set_permissions(webots.path().parent().unwrap(), std::fs::Permissions::from_mode(0o755)).unwrap();
+    webots
+}
+
+/// A server of an ordinary user in whose sandboxes this network is.
+fn server(stage: &Stage, webots: &Webots, user: &str, network: &str) -> Builder {
+    stage.builder(webots, "sandbox").before(user).set("sandbox.network", network)
+}
+
+/// Has a shell know the port that its program was given.
+const PORT: &str = "for one; do case $one in --port=*) port=${one#--port=};; esac; done";
+
+/// A deed for a shell: a line of Python. `s` is the module `socket`.
+fn python(line: &str) -> String {
+    format!("python3 -c \"import os, socket as s, errno; {line}\"")
+}
+
+#[actix_rt::test]
+async fn a_world_in_its_own_network_reaches_nothing_of_the_machine() {
+    let Some(user) = ordinary("a_world_in_its_own_network_reaches_nothing_of_the_machine") else { return };
+    let stage = stage();
+    let name = format!("fleet-test-{}", rand::random::<u64>());
+    let _abstract = UnixListener::bind_addr(&SocketAddr::from_abstract_name(&name).unwrap()).unwrap();
+    let four = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+    let six = std::net::TcpListener::bind("[::1]:0");
+    let port = four.local_addr().unwrap().port();
+    let mut deeds = vec![
+        ("reach a port of the machine", python(&format!("s.create_connection(('127.0.0.1', {port}), 5)"))),
+        ("reach an abstract socket", python(&format!("s.socket(s.AF_UNIX).connect('\\\\0{name}')"))),
+        ("pass for a trusted proxy", {
+            // The server's own port is before that of the first place.
+            let request = "GET /load HTTP/1.1\\r\\nHost: x\\r\\nX-Forwarded-For: 192.0.2.7\\r\\n\\r\\n";
+            let ask = format!("c = s.create_connection(('127.0.0.1', $port - 1), 5); c.send(b'{request}')");
+            format!("{PORT}\n{}", python(&format!("{ask}; assert b'200 OK' in c.recv(99)")))
+        }),
+        (
+            "use its own loopback",
+            python("l = s.create_server(('127.0.0.1', 0)); s.create_connection(l.getsockname(), 5)"),
+        ),
+        (
+            "hold a socket of the machine",
+            python(
+                "assert any('socket:' in os.readlink('/proc/self/fd/' + n) for n in os.listdir('/proc/self/fd') if os.path.islink('/proc/self/fd/' + n))",
+            ),
+        ),
+        (
+            "be kept from private addresses",
+            python("c = s.socket(); c.settimeout(5); assert c.connect_ex(('10.255.255.254', 9)) == errno.ECONNREFUSED"),
+        ),
+        (
+            "be kept from the internet",
+            python("c = s.socket(); c.settimeout(5); assert c.connect_ex(('203.0.113.7', 9)) == errno.ECONNREFUSED"),
+        ),
+    ];
+    if let Ok(six) = &six {
+        let port = six.local_addr().unwrap().port();
+        deeds
+            .push(("reach a port of the machine by IPv6", python(&format!("s.create_connection(('::1', {port}), 5)"))));
+    }
+    let tried = async |network: &str| -> Vec<String> {
+        let change = |builder: Builder| builder.before(user).set("sandbox.network", network);
+        stage.tried(&deeds, "sandbox", |builder| change(builder).set("limits.output", 10_000)).await
+    };
+    let own = tried("own").await;
+    let free = |name: &String| name != "be kept from the internet";
+    assert_eq!(
+        own.into_iter().filter(free).collect::<Vec<_>>(),
+        ["use its own loopback", "be kept from private addresses"]
+    );
+    let all = ["use its own loopback", "be kept from private addresses", "be kept from the internet"];
+    assert_eq!(tried("closed").await, all);
+    let shared = tried("shared").await;
+    let mut reached = vec!["reach a port of the machine", "reach an abstract socket", "pass for a trusted proxy"];
+    reached.extend(six.is_ok().then_some("reach a port of the machine by IPv6"));
+    for deed in reached {
+        assert!(shared.iter().any(|one| one == deed), "{deed}: {shared:?}");
+    }
+}
+
+/// Listens on the streaming ports after its own, and hides its descriptors from a server of an ordinary user.
+const TAKES_ALL: &str = "python3 -c \"import ctypes, socket, time; ctypes.CDLL(None).prctl(4, 0); \
+    s = [socket.create_server(('0.0.0.0', p)) for p in range($port + 1, $port + 3)]; print('TAKEN'); time.sleep(1000)\" &";
+
+#[actix_rt::test]
+async fn who_takes_all_ports_in_its_own_network_keeps_nobody_out() {
+    let Some(user) = ordinary("who_takes_all_ports_in_its_own_network_keeps_nobody_out") else { return };
+    for network in ["own", "shared"] {
+        let stage = stage();
+        let webots = webots(&format!("export PYTHONUNBUFFERED=1\n{PORT}\n{TAKES_ALL}\n{DEMO} \"$@\" & wait"));
+        let server = server(&stage, &webots, user, network).set("maxConnections", 3).start().await;
+        let mut first = Client::start(&server, &arm()).await;
+        first.until("webots:").await;
+        let log = server.output_file(&first);
+        until("all are taken", async || std::fs::read_to_string(&log).is_ok_and(|text| text.contains("TAKEN"))).await;
+        let mut second = Client::start(&server, &arm()).await;
+        let outcome = loop {
+            match second.next().await {
+                Heard::Text(text) if text.starts_with("webots:") => break "own",
+                Heard::Text(text) if text.starts_with("queue:") => break "shared",
+                Heard::Text(_) => {}
+                Heard::Closed(frame) => panic!("closed: {frame:?}"),
+            }
+        };
+        assert_eq!(outcome, network, "own: it runs, shared: it waits");
+        first.leave().await;
+        second.leave().await;
+        nothing_left(&server, 3).await;
+    }
+}
+
+#[actix_rt::test]
+async fn a_simulation_in_its_own_network_does_not_reach_its_neighbour() {
+    let Some(user) = ordinary("a_simulation_in_its_own_network_does_not_reach_its_neighbour") else { return };
+    for (network, is_reached) in [("own", false), ("shared", true)] {
+        let stage = stage();
+        // The second one looks for the first, at the port before its own.
+        let look = python("s.create_connection(('127.0.0.1', $port - 1), 5); print('REACHED')");
+        let webots = webots(&format!("{PORT}\n{look}; echo LOOKED\n{DEMO} \"$@\" & wait"));
+        let server = server(&stage, &webots, user, network).start().await;
+        let mut first = Client::start(&server, &arm()).await;
+        first.until("webots:").await;
+        // Clients reach it all the same.
+        http::get(&format!("http://127.0.0.1:{}/index.html", server.port + 1)).await;
+        let mut second = Client::start(&server, &arm()).await;
+        second.until("webots:").await;
+        let told = std::fs::read_to_string(server.output_file(&second)).unwrap();
+        assert_eq!(told.contains("REACHED"), is_reached, "{network}: {told}");
+        assert!(told.contains("LOOKED"), "{told}");
+    }
+}
+
+#[actix_rt::test]
+async fn a_display_is_within_reach_of_its_own_network() {
+    let Some(user) = ordinary("a_display_is_within_reach_of_its_own_network") else { return };
+    let _alone = display::alone().await;
+    needs("xhost", "x11-xserver-utils");
+    let deeds = [("use the display", "xhost".to_owned())];
+    let change = |builder: Builder| builder.before(user).set("sandbox.network", "own").set("xvfb", true);
+    assert_eq!(stage().tried(&deeds, "sandbox", change).await, ["use the display"]);
+}
+
+#[actix_rt::test]
+async fn limits_and_grace_time_hold_in_its_own_network() {
+    let Some(user) = ordinary("limits_and_grace_time_hold_in_its_own_network") else { return };
+    let stage = stage();
+    let (open, written) = (stage.elsewhere.path().to_str().unwrap(), stage.elsewhere.path().join("written"));
+    let work = format!("sleep 0.3; echo saved $(ulimit -u) > '{}'", written.display());
+    let webots = webots(&format!("trap \"{work}; exit 0\" TERM\n{DEMO} \"$@\" & wait"));
+    let server = server(&stage, &webots, user, "own").set("sandbox.writable", open).set("limits.processes", 70);
+    // As the units for systemd have it, which hides pasta from its own server.
+    let hides =
+        "exec unshare --mount bash -c 'mount -t proc -o hidepid=2 proc /proc; exec \"$0\" \"$@\"' \"$0\" \"$@\"";
+    let hides = if nix::unistd::getuid().is_root() {
+        hides.replace("exec \"$0\" \"$@\"'", &format!("{user}'"))
+    } else {
+        user.to_owned()
+    };
+    let server = server.before(&hides).set("timing.grace", 10).start().await;
+    let mut client = Client::start(&server, &arm()).await;
+    client.until("webots:").await;
+    client.leave().await;
+    nothing_left(&server, 2).await;
+    // One of the processes is bubblewrap.
+    assert_eq!(std::fs::read_to_string(&written).unwrap_or_default(), "saved 71\n");
+}
+
+/// The processes of a server's simulations that are none of its own.
+fn all_of(server: &Server) -> Vec<(i32, String)> {
+    instances_below(&server.folder).into_iter().filter(|(pid, _)| *pid != server.pid()).collect()
+}
+
+#[actix_rt::test]
+async fn pasta_ends_with_its_simulation_and_with_the_server() {
+    let Some(user) = ordinary("pasta_ends_with_its_simulation_and_with_the_server") else { return };
+    for end in ["client", "ignores", "pasta", "server"] {
+        let stage = stage();
+        let trap = if end == "ignores" { "trap '' TERM" } else { "" };
+        let webots = webots(&format!(
+            "{trap}\n(env -i setsid sleep 1000 &)\n{DEMO} \"$@\" &\nwhile true; do wait; sleep 0.1; done"
+        ));
+        let mut server = server(&stage, &webots, user, "own").set("maxConnections", 1).start().await;
+        let mut client = Client::start(&server, &arm()).await;
+        client.until("webots:").await;
+        let parent = server.pid();
+        let is_pasta = |one: &procfs::process::Process| {
+            one.stat().is_ok_and(|stat| stat.ppid == parent && stat.comm.starts_with("pas"))
+        };
+        let all = || procfs::process::all_processes().unwrap().flatten();
+        let pasta = all().find(is_pasta).unwrap().pid();
+        let inside = procfs::process::Process::new(pasta).unwrap().task_main_thread().unwrap().children().unwrap();
+        match end {
+            "pasta" => {
+                kill(Pid::from_raw(pasta), Signal::SIGKILL).unwrap();
+                let told = client.until("loading: Error:").await;
+                assert!(told.contains("Webots was ended by the signal SIGKILL"), "{told}");
+                nothing_left(&server, 1).await;
+            }
+            "server" => {
+                server.signal(Signal::SIGKILL);
+                server.ended().await;
+            }
+            _ => {
+                let left = std::time::Instant::now();
+                client.leave().await;
+                gone_within(0.5, left, &server).await;
+            }
+        }
+        until("nothing runs", async || all_of(&server).is_empty() && !all().any(|one| is_pasta(&one))).await;
+        let lives =
+            |pid: &u32| procfs::process::Process::new(i32::try_from(*pid).unwrap()).is_ok_and(|one| one.is_alive());
+        until("bubblewrap has ended", async || !inside.iter().any(lives)).await;
+    }
+}
+
+#[actix_rt::test]
+async fn how_a_program_has_ended_is_told_from_its_own_network() {
+    let Some(user) = ordinary("how_a_program_has_ended_is_told_from_its_own_network") else { return };
+    let stage = stage();
+    for (script, words) in [
+        ("echo LAST; exit 7", "Webots ended with exit code 7. Its last output: LAST"),
+        ("kill -SEGV $$", "Webots was ended by the signal SIGSEGV"),
+    ] {
+        let webots = webots(script);
+        let server = server(&stage, &webots, user, "own").start().await;
+        let told = Client::start(&server, &arm()).await.until("loading: Error:").await;
+        assert!(told.contains(words), "{told}");
+    }
+}
+
+#[actix_rt::test]
+async fn which_network_simulations_have_is_told() {
+    let Some(user) = ordinary("which_network_simulations_have_is_told") else { return };
+    let without = |program: &str| {
+        let folder = tempfile::tempdir().unwrap();
+        std::fs::set_permissions(folder.path(), std::fs::Permissions::from_mode(0o755)).unwrap();
+        for one in ["git", "bash", "env", "sh", "setpriv", "bwrap", "prlimit", "unshare", "pasta"]
+            .into_iter()
+            .filter(|one| *one != program)
+        {
+            let paths = std::env::var_os("PATH").unwrap();
+            let real = std::env::split_paths(&paths).map(|folder| folder.join(one)).find(|path| path.is_file());
+            std::os::unix::fs::symlink(real.unwrap(), folder.path().join(one)).unwrap();
+        }
+        folder
+    };
+    let (all, none) = (without("nothing"), without("pasta"));
+    let path = |folder: &tempfile::TempDir| folder.path().to_str().unwrap().to_owned();
+    for (network, path, shown, words) in [
+        ("auto", path(&all), "own", "own, with the internet, without this machine and private addresses"),
+        ("closed", path(&all), "closed", "closed, nothing can be reached"),
+        ("shared", path(&all), "shared", "shared with this machine"),
+        ("auto", path(&none), "shared", "shared with this machine: pasta is not there; on Debian"),
+    ] {
+        let stage = stage();
+        let webots = webots("exit 1");
+        let setpriv = user.replace("setpriv", "/usr/bin/setpriv");
+        let server = server(&stage, &webots, &setpriv, network).env("PATH", &path).start().await;
+        assert_eq!(http::get(&server.url("/status")).await.json()["network"], shown);
+        let page = http::get(&server.url("/monitor")).await.text();
+        assert!(page.contains(&format!("<dd>{words}")), "{page}");
+        assert!(server.log().contains(&format!("network of simulations: {words}")), "{}", server.log());
+    }
+    for network in ["own", "closed"] {
+        let (stage, webots) = (stage(), webots("exit 1"));
+        let setpriv = user.replace("setpriv", "/usr/bin/setpriv");
+        let mut server = server(&stage, &webots, &setpriv, network).env("PATH", &path(&none)).spawn();
+        assert_eq!(server.ended().await, Some(1));
+        let log = server.log();
+        let told: Vec<&str> = log.lines().filter(|line| line.starts_with("error: ")).collect();
+        assert!(told.len() == 1 && told[0].contains("but pasta is not there"), "{log}");
+    }
+}
