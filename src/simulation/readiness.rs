@@ -7,7 +7,6 @@ use std::process::{Command, Stdio};
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
-use nix::sys::statvfs::statvfs;
 use tokio::sync::watch;
 use which::which;
 
@@ -15,6 +14,7 @@ use super::config::{Isolation, SimulationConfig};
 use super::failed_starts::FailedStarts;
 use crate::simulation::container::{daemon_fault, data_folder, init_fault};
 use crate::simulation::machine::{Readings, display};
+use crate::simulation::process::DiskRoom;
 
 /// Time between two checks.
 const PERIOD: Duration = Duration::from_secs(5);
@@ -26,8 +26,6 @@ const HUNG: Duration = Duration::from_mins(1);
 const WRITTEN: usize = 1 << 20;
 /// The least step of the machine's clock that is logged.
 const CLOCK_STEP: Duration = Duration::from_mins(1);
-/// The least share of the disk's inodes that must be free: one in so many.
-const FREE_INODES: u64 = 50;
 
 /// Starts the checks. The channel holds why the server can start no simulation, in words for clients and administrators.
 /// `run` is the folder of this run. Starts that failed before the server was ready again no longer count.
@@ -149,18 +147,9 @@ fn start_process() -> std::io::Result<()> {
 
 /// Checks that the disk of a folder has `reserve` MiB and some inodes left for users. `disk` names it.
 fn check_room(folder: &Path, disk: &str, reserve: u64) -> Result<(), String> {
-    let full = |left: String| Err(format!("This simulation server's {disk} is full: less than {left}"));
-    let about = statvfs(folder).map_err(|error| not_writable(&error.into()))?;
-    let free = about.blocks_available().saturating_mul(about.fragment_size()) >> 20;
-    // Without the numbers that change with each check, the reason is logged once.
-    if free < reserve {
-        return full(format!("{reserve} MiB are left (diskReserve)"));
-    }
-    // Some file systems make inodes as they need them, and report none.
-    if about.files_available() < about.files() / FREE_INODES {
-        return full("2 % of its inodes are left".to_owned());
-    }
-    Ok(())
+    let room = DiskRoom::of(folder).map_err(|error| not_writable(&error))?;
+    let full = |left| Err(format!("This simulation server's {disk} is full: less than {left}"));
+    room.shortage(reserve).map_or(Ok(()), full)
 }
 
 /// Writes a file that has no name, and waits until the disk has it.

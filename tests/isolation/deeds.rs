@@ -159,7 +159,7 @@ async fn a_world_sees_and_changes_what_its_level_allows() {
 }
 
 /// What runs a server as an ordinary user; nothing where that can't be.
-fn as_nobody() -> Option<&'static str> {
+pub fn as_nobody() -> Option<&'static str> {
     let program = Path::new(env!("CARGO_BIN_EXE_simulation-server"));
     let may_be_run = |folder: &Path| folder.metadata().unwrap().permissions().mode() & 1 == 1;
     if !nix::unistd::getuid().is_root() || !program.ancestors().all(may_be_run) {

@@ -4,4 +4,5 @@ mod deeds;
 mod level;
 mod limits;
 mod lives;
+mod reserve;
 mod resets;

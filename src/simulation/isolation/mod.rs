@@ -1,6 +1,8 @@
 //! How a simulation is launched: at which level of isolation, with which environment and limits, and what ends with it.
 
 mod cgroup;
+mod disk;
+mod disk_use;
 mod environment;
 mod launcher;
 mod peak;

@@ -1,5 +1,6 @@
 //! What a simulation leaves in the system, and how it is removed: process trees and folders.
 
+mod disk_room;
 pub mod folder_size;
 pub mod guardian;
 mod instance_dir;
@@ -11,6 +12,7 @@ pub mod process_tree;
 mod remove_tree;
 mod runner;
 
+pub use disk_room::DiskRoom;
 pub use guardian::Guardian;
 pub use instance_dir::{InstanceDir, Leftovers, RunDir};
 pub use lines::Lines;
