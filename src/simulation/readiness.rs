@@ -13,7 +13,8 @@ use which::which;
 use super::config::{Isolation, SimulationConfig};
 use super::failed_starts::FailedStarts;
 use crate::simulation::container::{daemon_fault, data_folder, init_fault};
-use crate::simulation::machine::{Readings, display};
+use crate::simulation::machine::Readings;
+use crate::simulation::machine::display::{self, KeptConnection};
 use crate::simulation::process::DiskRoom;
 
 /// Time between two checks.
@@ -37,7 +38,8 @@ pub fn watch(
     failed_starts: Arc<FailedStarts>,
 ) -> watch::Receiver<Option<String>> {
     // The first check comes before the first client; GPUs are not read yet.
-    let first = check(&config, &run).and_then(|()| check_init(&config, false)).err();
+    let mut display = KeptConnection::default();
+    let first = check(&config, &run, &mut display).and_then(|()| check_init(&config, false)).err();
     let (sender, problem) = watch::channel(None);
     publish(&sender, first, &failed_starts);
     actix_rt::spawn(async move {
@@ -49,8 +51,11 @@ pub fn watch(
             clocks = log_clock_step(clocks);
             let gpus = check_gpus(&config, &readings.borrow());
             let (config, run) = (Arc::clone(&config), run.clone());
-            let all =
-                move || gpus.and_then(|()| check(&config, &run)).and_then(|()| check_init(&config, has_init)).err();
+            let mut kept = std::mem::take(&mut display);
+            let all = move || {
+                let found = gpus.and_then(|()| check(&config, &run, &mut kept));
+                (found.and_then(|()| check_init(&config, has_init)).err(), kept)
+            };
             let mut checked = actix_rt::task::spawn_blocking(all);
             let found = if let Ok(found) = actix_rt::time::timeout(HUNG, &mut checked).await {
                 found
@@ -59,7 +64,8 @@ pub fn watch(
                 publish(&sender, Some(hangs), &failed_starts);
                 checked.await
             };
-            if let Ok(found) = found {
+            if let Ok((found, kept)) = found {
+                display = kept;
                 has_init |= found.is_none();
                 publish(&sender, found, &failed_starts);
             }
@@ -97,8 +103,8 @@ fn log_clock_step((instant, time): (Instant, SystemTime)) -> (Instant, SystemTim
     (Instant::now(), now)
 }
 
-/// Checks everything that each simulation needs. Blocks for two seconds, and for as long as the disk does.
-fn check(config: &SimulationConfig, run: &Path) -> Result<(), String> {
+/// Checks everything that each simulation needs. Blocks for four seconds, and for as long as the disk does.
+fn check(config: &SimulationConfig, run: &Path, kept: &mut KeptConnection) -> Result<(), String> {
     if config.isolation == Isolation::Container {
         daemon_fault().map_or(Ok(()), Err)?;
     }
@@ -116,7 +122,7 @@ fn check(config: &SimulationConfig, run: &Path) -> Result<(), String> {
     // Webots itself always needs a display. What stands in for it (`webots`) may not.
     if config.webots.is_none() && !config.xvfb && config.isolation != Isolation::Container {
         let display = display::effective(config.display.as_ref());
-        display::check(&display).map_err(|error| format!("Webots can't open its window: {error}"))?;
+        kept.check(&display).map_err(|error| format!("Webots can't open its window: {error}"))?;
     }
     Ok(())
 }

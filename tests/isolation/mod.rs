@@ -1,6 +1,7 @@
 //! What a world's program may do at each level of isolation.
 
 mod deeds;
+mod display;
 mod level;
 mod limits;
 mod lives;

@@ -173,7 +173,7 @@ impl Launcher {
         let cgroup = self.cgroups.as_ref().and_then(Cgroups::make);
         let mut command = cgroup.as_ref().map(Cgroup::joining).unwrap_or_default();
         let mut environment = environment::allowed(&self.variables);
-        environment.extend(program.display.iter().cloned());
+        environment.extend(program.display.variables());
         if let Method::Sandbox(sandbox) = &self.method {
             // Links are not followed out of a sandbox.
             if let Some(file) = program.command.first_mut()
@@ -185,6 +185,7 @@ impl Launcher {
             environment.extend(sandbox.environment());
         }
         command.extend(self.limited());
+        command.extend(program.display.launcher());
         let spec = SpawnSpec {
             command: command.into_iter().chain(program.command).collect(),
             inherits: false,

@@ -3,6 +3,7 @@
 mod cgroup;
 mod disk;
 mod disk_use;
+mod display;
 mod environment;
 mod launcher;
 mod peak;
@@ -13,6 +14,7 @@ mod unkept;
 mod watcher;
 
 pub use cgroup::Cgroup;
+pub use display::{Display, SCREEN};
 pub use launcher::{Launcher, Level};
 pub use peak::Peak;
 pub use program::Program;

@@ -4,6 +4,8 @@ use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use super::display::Display;
+
 /// A program that is to be launched for a simulation.
 #[derive(Debug)]
 pub struct Program<'start> {
@@ -15,8 +17,8 @@ pub struct Program<'start> {
     pub project: PathBuf,
     /// The working folder.
     pub folder: &'start Path,
-    /// The variables that name its display.
-    pub display: &'start [(OsString, OsString)],
+    /// Its display.
+    pub display: &'start Display,
     /// Time between SIGTERM and SIGKILL.
     pub grace: Duration,
 }

@@ -3,6 +3,7 @@
 use std::time::{Duration, SystemTime};
 
 use askama::Template;
+use url::Url;
 
 use crate::shared::domain::UrlPrefix;
 use crate::shared::http::{Row, View};
@@ -70,6 +71,7 @@ struct Glance<'readings> {
 #[template(path = "simulation/row.html")]
 struct SimulationRow<'one> {
     one: &'one Simulation,
+    link: String,
     world: String,
     repository: String,
     stage: &'static str,
@@ -175,6 +177,7 @@ fn with_sizes(gpus: &[Gpu]) -> Vec<(&Gpu, String)> {
 #[template(path = "simulation/end.html")]
 struct EndRow<'one> {
     one: &'one Ended,
+    link: String,
     world: String,
     repository: String,
     ended: String,
@@ -189,7 +192,8 @@ impl<'one> EndRow<'one> {
         let (repository, world) = names(&one.world);
         let (ended, after) = (text_of(one.end), duration(one.end.saturating_sub(one.begin)));
         let (reason, why) = (one.how.reason, without_paths(&one.how.why));
-        Self { one, world, repository, ended, after, reason: reason.words(), abnormal: reason.is_abnormal(), why }
+        let link = link(&one.world);
+        Self { one, link, world, repository, ended, after, reason: reason.words(), abnormal: reason.is_abnormal(), why }
     }
 }
 
@@ -199,6 +203,11 @@ fn text_of(seconds_since_1970: u64) -> String {
 
 /// What forges put between a repository and a path in it.
 const SEPARATORS: [&str; 4] = ["/-/", "/blob/", "/tree/", "/src/"];
+
+/// The URL of a world as a link, in which nothing is invisible or turns letters around.
+fn link(url: &str) -> String {
+    Url::parse(url).map_or_else(|_| one_line(url), String::from)
+}
 
 /// The repository of a world, and the name of its file, from its URL.
 fn names(url: &str) -> (String, String) {
@@ -215,6 +224,7 @@ impl<'one> SimulationRow<'one> {
         let (repository, world) = names(&one.world);
         Self {
             one,
+            link: link(&one.world),
             world,
             repository,
             stage,

@@ -1,6 +1,5 @@
 //! The launch specification: everything that one Webots is started with.
 
-use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -14,7 +13,7 @@ use crate::simulation::checkout::{Checkouts, Project};
 use crate::simulation::config::SimulationConfig;
 use crate::simulation::container::{Containers, Request, until_answering};
 use crate::simulation::ends::FOLDER_OF_RUNNING;
-use crate::simulation::isolation::{Cgroup, Launcher, Peak, Program, Watch, Watcher};
+use crate::simulation::isolation::{Cgroup, Display, Launcher, Peak, Program, Watch, Watcher};
 use crate::simulation::machine::display;
 use crate::simulation::places::Ticket;
 use crate::simulation::process::SpawnSpec;
@@ -65,12 +64,11 @@ impl LaunchSpec {
         Request { project: Arc::clone(&self.project), port, command: Box::new(command) }
     }
 
-    /// How the process is started and ended, and its control group. `display` holds the environment variables that name
-    /// its X display.
+    /// How the process is started and ended, and its control group.
     ///
     /// # Errors
     /// When a folder that it needs can't be made.
-    pub fn spawn_spec(&self, display: &[(OsString, OsString)]) -> std::io::Result<(SpawnSpec, Option<Cgroup>)> {
+    pub fn spawn_spec(&self, display: &Display) -> std::io::Result<(SpawnSpec, Option<Cgroup>)> {
         let command = WebotsCommand {
             program: &self.program,
             mode: self.mode,
