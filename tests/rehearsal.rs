@@ -366,3 +366,31 @@ async fn what_can_not_be_done_is_told_before_anything_is_begun() {
     let error = told(limited.args(["--clients", "50"])).await;
     assert_eq!(error, "error: 50 clients need 264 open files, and the system allows 100 (ulimit -Hn)\n");
 }
+
+#[actix_rt::test]
+async fn no_text_of_a_server_steers_the_terminal_or_fills_it() {
+    const STEERING: &str = "loading: Error: \u{1b}]0;owned\u{7}\u{1b}[31m one\r\nAll 3 fit.\u{202e}two";
+    let long: &'static str = Box::leak(format!("loading: Error: {}", "x".repeat(500_000)).into_boxed_str());
+    let larger: &'static str = Box::leak("x".repeat(2 << 20).into_boxed_str());
+    let session = |text| Script { session: vec![text], ..Script::default() };
+    let client = |text| Script { client: vec![text], ..Script::default() };
+    let webots = |text| Script { webots: vec![text], ..Script::default() };
+    for script in [
+        session("no \u{1b}[31mred\r\n\u{202e}"),
+        session("ws://{}/\u{1b}[31mred\u{202e}"),
+        client(STEERING),
+        client(long),
+        client(larger),
+        webots("error: \u{1b}[31mred\r\n\u{202e}"),
+    ] {
+        let stand_in = StandIn::start(script).await;
+        let fleet = format!("http://{}", stand_in.address);
+        for more in [&ONE[..], &["--explain"]] {
+            let output = rehearse(&fleet, &[more, &["--patience", "5s"]].concat()).await;
+            let said = text(&output.stdout) + &text(&output.stderr);
+            assert!(!said.contains(['\u{1b}', '\u{7}', '\r', '\u{202e}']), "{said:?}");
+            assert!(!said.contains("\nAll 3 fit."), "{said}");
+            assert!(said.len() < 20_000, "{} bytes", said.len());
+        }
+    }
+}

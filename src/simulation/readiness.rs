@@ -1,21 +1,25 @@
 //! Whether the server can start simulations at all. Checked every five seconds: Webots may be installed again, a disk or a
 //! display may go and come back. The check does what a start does: it writes to the disk and starts a process.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
-use nix::sys::statvfs::statvfs;
 use tokio::sync::watch;
 use which::which;
 
 use super::config::{Isolation, SimulationConfig};
 use super::failed_starts::FailedStarts;
 use crate::simulation::container::{daemon_fault, data_folder, init_fault};
-use crate::simulation::machine::{Readings, display};
+use crate::simulation::machine::Readings;
+use crate::simulation::machine::display::KeptConnection;
+use crate::simulation::process::DiskRoom;
+
+/// A connection to each display that simulations are given.
+type KeptConnections = BTreeMap<String, KeptConnection>;
 
 /// Time between two checks.
 const PERIOD: Duration = Duration::from_secs(5);
@@ -27,8 +31,6 @@ const HUNG: Duration = Duration::from_mins(1);
 const WRITTEN: usize = 1 << 20;
 /// The least step of the machine's clock that is logged.
 const CLOCK_STEP: Duration = Duration::from_mins(1);
-/// The least share of the disk's inodes that must be free: one in so many.
-const FREE_INODES: u64 = 50;
 
 /// Starts the checks. The channel holds why the server can start no simulation, in words for clients and administrators.
 /// `run` is the folder of this run. Starts that failed before the server was ready again no longer count.
@@ -40,7 +42,8 @@ pub fn watch(
     failed_starts: Arc<FailedStarts>,
 ) -> watch::Receiver<Option<String>> {
     // The first check comes before the first client; GPUs are not read yet.
-    let first = check(&config, &run, &[]).and_then(|()| check_init(&config, false)).err();
+    let mut display = KeptConnections::new();
+    let first = check(&config, &run, &[], &mut display).and_then(|()| check_init(&config, false)).err();
     let (sender, problem) = watch::channel(None);
     publish(&sender, first, &failed_starts);
     actix_rt::spawn(async move {
@@ -53,8 +56,10 @@ pub fn watch(
             let gpus = check_gpus(&config, &readings.borrow());
             let indexes: Vec<u32> = readings.borrow().gpus.iter().map(|gpu| gpu.index).collect();
             let (config, run) = (Arc::clone(&config), run.clone());
+            let mut kept = std::mem::take(&mut display);
             let all = move || {
-                gpus.and_then(|()| check(&config, &run, &indexes)).and_then(|()| check_init(&config, has_init)).err()
+                let found = gpus.and_then(|()| check(&config, &run, &indexes, &mut kept));
+                (found.and_then(|()| check_init(&config, has_init)).err(), kept)
             };
             let mut checked = actix_rt::task::spawn_blocking(all);
             let found = if let Ok(found) = actix_rt::time::timeout(HUNG, &mut checked).await {
@@ -64,7 +69,8 @@ pub fn watch(
                 publish(&sender, Some(hangs), &failed_starts);
                 checked.await
             };
-            if let Ok(found) = found {
+            if let Ok((found, kept)) = found {
+                display = kept;
                 has_init |= found.is_none();
                 publish(&sender, found, &failed_starts);
             }
@@ -104,7 +110,7 @@ fn log_clock_step((instant, time): (Instant, SystemTime)) -> (Instant, SystemTim
 
 /// Checks everything that each simulation needs; `gpus` are the numbers of those that answer. Blocks for two seconds for
 /// each display, and for as long as the disk does.
-fn check(config: &SimulationConfig, run: &Path, gpus: &[u32]) -> Result<(), String> {
+fn check(config: &SimulationConfig, run: &Path, gpus: &[u32], kept: &mut KeptConnections) -> Result<(), String> {
     if config.isolation == Isolation::Container {
         daemon_fault().map_or(Ok(()), Err)?;
     }
@@ -122,7 +128,8 @@ fn check(config: &SimulationConfig, run: &Path, gpus: &[u32]) -> Result<(), Stri
     // Webots itself always needs a display. What stands in for it (`webots`) may not.
     if config.webots.is_none() && !config.xvfb && config.isolation != Isolation::Container {
         for display in displays(config, gpus) {
-            display::check(&display).map_err(|error| format!("Webots can't open its window: {error}"))?;
+            let checked = kept.entry(display.clone()).or_default().check(&display);
+            checked.map_err(|error| format!("Webots can't open its window: {error}"))?;
         }
     }
     Ok(())
@@ -161,18 +168,9 @@ fn start_process() -> std::io::Result<()> {
 
 /// Checks that the disk of a folder has `reserve` MiB and some inodes left for users. `disk` names it.
 fn check_room(folder: &Path, disk: &str, reserve: u64) -> Result<(), String> {
-    let full = |left: String| Err(format!("This simulation server's {disk} is full: less than {left}"));
-    let about = statvfs(folder).map_err(|error| not_writable(&error.into()))?;
-    let free = about.blocks_available().saturating_mul(about.fragment_size()) >> 20;
-    // Without the numbers that change with each check, the reason is logged once.
-    if free < reserve {
-        return full(format!("{reserve} MiB are left (diskReserve)"));
-    }
-    // Some file systems make inodes as they need them, and report none.
-    if about.files_available() < about.files() / FREE_INODES {
-        return full("2 % of its inodes are left".to_owned());
-    }
-    Ok(())
+    let room = DiskRoom::of(folder).map_err(|error| not_writable(&error))?;
+    let full = |left| Err(format!("This simulation server's {disk} is full: less than {left}"));
+    room.shortage(reserve).map_or(Ok(()), full)
 }
 
 /// Writes a file that has no name, and waits until the disk has it.

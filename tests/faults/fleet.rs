@@ -8,10 +8,10 @@ use procfs::process::Process;
 use serde_json::json;
 
 use crate::class::Class;
-use crate::disk;
 use crate::machine::Clock;
 use crate::network::Network;
 use crate::support::client::{Client, Heard};
+use crate::support::disk;
 use crate::support::git::{Forge, arm};
 use crate::support::name_server::NameServer;
 use crate::support::program::{Builder, Server, session_server, simulation_server};
@@ -62,7 +62,7 @@ impl Fleet {
         let (forge, webots) = (Forge::with_arm(), Webots::launcher());
         let folder = tempfile::tempdir().unwrap();
         let ports: Vec<u16> = (0..SERVERS).map(|_| ports::block(PLACES + 12)).collect();
-        disk::small_disk(&folder.path().join(format!("server-{SMALL_DISK}")));
+        disk::small_disk(&folder.path().join(format!("server-{SMALL_DISK}")), 64);
         let mut servers = Vec::new();
         for (index, port) in ports.iter().enumerate() {
             let name = folder.path().join(format!("server-{index}"));

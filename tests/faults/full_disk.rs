@@ -5,9 +5,9 @@ use std::path::Path;
 
 use serde_json::Value;
 
-use crate::disk::{self, Full};
 use crate::fleet::try_start;
 use crate::support::client::Client;
+use crate::support::disk::{self, Full};
 use crate::support::git::Forge;
 use crate::support::program::{Builder, Server, session_server, simulation_server};
 use crate::support::webots::Webots;
@@ -45,7 +45,7 @@ async fn a_server_with_a_full_disk_takes_nobody_and_the_whole_class_runs_elsewhe
     disk::hide_mounts_from_others();
     let folder = tempfile::tempdir().unwrap();
     let small = folder.path().join("small");
-    if !disk::small_disk(&small) {
+    if !disk::small_disk(&small, 64) {
         return skip("a full disk", "only root may mount one");
     }
     let (forge, webots) = (Forge::with_arm(), Webots::launcher());

@@ -20,7 +20,6 @@
 mod support;
 
 mod class;
-mod disk;
 mod fault;
 mod fleet;
 mod full_disk;
@@ -46,7 +45,7 @@ async fn the_fleet_is_whole_again_after_each_fault() {
     let time = std::env::var("FAULTS_FOR").map_or(SHORT, |text| humantime::parse_duration(&text).unwrap());
     let seed = std::env::var("FAULTS_SEED").map_or_else(|_| rand::random(), |text| text.parse::<u64>().unwrap());
     eprintln!("FAULTS_SEED={seed}");
-    disk::hide_mounts_from_others();
+    support::disk::hide_mounts_from_others();
     let network = Network::hide_from_others();
     let mut random = SmallRng::seed_from_u64(seed);
     let mut fleet = Fleet::start(network).await;

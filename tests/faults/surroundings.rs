@@ -9,10 +9,10 @@ use procfs::process::Process;
 use rand::RngExt;
 use rand::rngs::SmallRng;
 
-use crate::disk::{Full, ReadOnly};
 use crate::fault::{WHILE, bury};
 use crate::fleet::{BOUND, Fleet, PLACES, SERVERS, SMALL_DISK, try_start};
 use crate::machine::LittleMemory;
+use crate::support::disk::{Full, ReadOnly};
 use crate::support::http;
 use crate::support::relay::Mood;
 

@@ -1,8 +1,10 @@
 //! What a world's program may do at each level of isolation.
 
 mod deeds;
+mod display;
 mod level;
 mod limits;
 mod lives;
 mod network;
+mod reserve;
 mod resets;

@@ -213,7 +213,9 @@ async fn each_webots_gets_a_virtual_display_of_its_own() {
     let webots = Webots::script(&format!(
         "test -S /tmp/.X11-unix/X${{DISPLAY#:}} || exit 9\necho \"display $DISPLAY\"\n{DEMO} \"$@\" & wait"
     ));
-    let server = simulation_server(&webots.path(), forge.path(), 2).set("xvfb", true).start().await;
+    let builder = simulation_server(&webots.path(), forge.path(), 2).set("xvfb", true);
+    // In a sandbox each has the same number.
+    let server = builder.set("isolation", "none").start().await;
     let mut clients = Vec::new();
     let mut displays = Vec::new();
     for _ in 1..=2 {
@@ -246,7 +248,8 @@ async fn the_number_of_a_virtual_display_that_was_killed_is_used_again() {
     let webots = Webots::script(&format!(
         "test -S /tmp/.X11-unix/X${{DISPLAY#:}} || exit 9\necho \"display $DISPLAY\"\n{DEMO} \"$@\" & wait"
     ));
-    let server = simulation_server(&webots.path(), forge.path(), 1).set("xvfb", true).start().await;
+    let builder = simulation_server(&webots.path(), forge.path(), 1).set("xvfb", true);
+    let server = builder.set("isolation", "none").start().await;
     let mut numbers = BTreeSet::new();
     for _ in 0..12 {
         let mut client = Client::start(&server, &arm()).await;
@@ -271,8 +274,11 @@ async fn a_virtual_display_that_does_not_start_is_told() {
     let xvfb = Webots::script("echo 'first words' >&2; echo 'no screens found' >&2; exit 1");
     std::os::unix::fs::symlink(xvfb.path(), programs.path().join("Xvfb")).unwrap();
     let path = format!("{}:{}", programs.path().display(), std::env::var("PATH").unwrap());
-    let server = simulation_server(&webots.path(), forge.path(), 1).set("xvfb", true).env("PATH", &path).start().await;
-    let told = outcome(&server, &arm()).await;
-    assert!(told.contains("The virtual display (Xvfb) can't be started: no screens found"), "{told}");
-    nothing_left(&server, 1).await;
+    for level in ["none", "sandbox"] {
+        let builder = simulation_server(&webots.path(), forge.path(), 1).set("xvfb", true).set("isolation", level);
+        let server = builder.env("PATH", &path).start().await;
+        let told = outcome(&server, &arm()).await;
+        assert!(told.contains("The virtual display (Xvfb) can't be started: no screens found"), "{level}: {told}");
+        nothing_left(&server, 1).await;
+    }
 }

@@ -6,6 +6,7 @@
 
 pub mod authority;
 pub mod client;
+pub mod disk;
 pub mod display;
 pub mod git;
 pub mod http;

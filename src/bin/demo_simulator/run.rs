@@ -34,13 +34,16 @@ const CLOSE_TIMEOUT: Duration = Duration::from_secs(1);
 /// two threads at once.
 pub(crate) fn run(args: Args) -> i32 {
     let (sender, code) = mpsc::channel();
-    thread::spawn(move || {
+    let thread = thread::Builder::new().spawn(move || {
         System::new().block_on(async {
             let code = simulate(&args).await.map_or_else(fail, |()| 0);
             sender.send(code).ok();
             future::pending::<()>().await;
         });
     });
+    if let Err(error) = thread {
+        return fail(format!("no thread can be started: {error}").into());
+    }
     code.recv().unwrap_or(1)
 }
 

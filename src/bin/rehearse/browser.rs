@@ -10,6 +10,7 @@ use crate::conversation::{Conversation, Ended, simulated_time, unless_error};
 use crate::returning::WayBack;
 use crate::session::Session;
 use crate::visit::{Outcome, Pace, Steps, Visit};
+use crate::words::line;
 
 /// How long simulated time is watched for one value of the pace.
 const PACE_PERIOD: Duration = Duration::from_secs(1);
@@ -178,7 +179,7 @@ impl<'class> Browser<'class> {
 
     /// Connects to Webots as its viewer does, waits for the scene, and lets time pass.
     async fn open_stream(&self, url: &str) -> Result<Conversation, NoStart> {
-        let mut stream = Conversation::open(&format!("{}/", url.trim_end_matches('/'))).await?;
+        let mut stream = Conversation::open_scene(&format!("{}/", url.trim_end_matches('/'))).await?;
         stream.say(&self.arguments.viewer).await?;
         while !unless_error(stream.hear().await?)?.starts_with("model:") {}
         stream.say("pause").await?;
@@ -271,6 +272,9 @@ impl<'class> Browser<'class> {
 impl Drop for Browser<'_> {
     fn drop(&mut self) {
         self.visit.ended = self.board.now();
+        if let Outcome::BrokeOff(why) | Outcome::Refused(why) | Outcome::Failed(why) = &mut self.visit.outcome {
+            *why = line(why);
+        }
         self.visits.borrow_mut().push(self.visit.clone());
     }
 }

@@ -13,8 +13,10 @@ use crate::session::encryption;
 
 /// How long a connection may take, or a text to be sent.
 const CONNECT: Duration = Duration::from_secs(20);
-/// The scene of a large world comes in one message.
-const LARGEST_MESSAGE: usize = 512 << 20;
+/// The largest message of a server, in bytes.
+const LARGEST_MESSAGE: usize = 1 << 20;
+/// The same of Webots: the scene of a large world comes in one message.
+const LARGEST_SCENE: usize = 64 << 20;
 
 /// An open WebSocket.
 pub(crate) struct Conversation {
@@ -77,13 +79,24 @@ pub(crate) fn simulated_time(text: &str) -> Option<f64> {
 }
 
 impl Conversation {
-    /// Connects to a WebSocket URL.
+    /// Connects to a WebSocket URL of a server.
     ///
     /// # Errors
     /// When nobody takes the connection in time.
     pub(crate) async fn open(url: &str) -> Result<Self, Ended> {
-        let config =
-            WebSocketConfig::default().max_message_size(Some(LARGEST_MESSAGE)).max_frame_size(Some(LARGEST_MESSAGE));
+        Self::open_for(url, LARGEST_MESSAGE).await
+    }
+
+    /// Connects to a WebSocket URL of a Webots.
+    ///
+    /// # Errors
+    /// When nobody takes the connection in time.
+    pub(crate) async fn open_scene(url: &str) -> Result<Self, Ended> {
+        Self::open_for(url, LARGEST_SCENE).await
+    }
+
+    async fn open_for(url: &str, largest: usize) -> Result<Self, Ended> {
+        let config = WebSocketConfig::default().max_message_size(Some(largest)).max_frame_size(Some(largest));
         let failed = |why: String| Ended::Unreachable(url.to_owned(), why);
         let connecting = connect_async_tls_with_config(url, Some(config), true, encryption().map(Connector::Rustls));
         let connected =

@@ -70,7 +70,7 @@ impl Walk {
         self.ask_for_availability(arguments, session).await?;
         let (mut lease, webots) = self.start(arguments, session, consent).await?;
         let address = format!("{}/", webots.trim_end_matches('/'));
-        let opened = Conversation::open(&address).await;
+        let opened = Conversation::open_scene(&address).await;
         let came = opened.as_ref().map_or_else(ToString::to_string, |_| "a WebSocket".to_owned());
         self.note("stream", "Webots takes a WebSocket at `/`", &came, opened.is_ok());
         let mut stream = opened.map_err(|_| Stuck)?;

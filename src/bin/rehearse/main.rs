@@ -66,7 +66,7 @@ fn main() -> ExitCode {
                 Fault::NotAgreed(why) => (WRONG_ARGUMENTS, why),
                 Fault::Failed(why) => (NOT_AS_EXPECTED, why),
             };
-            eprintln!("error: {why}");
+            eprintln!("error: {}", words::line(&why));
             ExitCode::from(code)
         }
     }

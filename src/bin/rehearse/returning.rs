@@ -45,7 +45,7 @@ impl WayBack {
                 break;
             }
         }
-        let mut stream = Conversation::open(&format!("{}/", self.webots.trim_end_matches('/'))).await?;
+        let mut stream = Conversation::open_scene(&format!("{}/", self.webots.trim_end_matches('/'))).await?;
         // Any other first word would make it pause.
         stream.say(&format!("{viewer};broadcast")).await?;
         let mut first = None;

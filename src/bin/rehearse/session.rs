@@ -10,6 +10,7 @@ use url::Url;
 use webots_fleet::shared::http::tls;
 
 use crate::conversation::{Conversation, Ended};
+use crate::words::{excerpt, line};
 
 /// How long an answer may take.
 const ANSWER: Duration = Duration::from_secs(20);
@@ -39,7 +40,7 @@ impl Session {
         let url = format!("{}/load", self.base());
         let text = get(&self.http, &url).await?;
         let load = text.trim().parse::<f64>();
-        load.map_err(|_| format!("{url} is no load but {text:.80?}: no session server"))?;
+        load.map_err(|_| format!("{url} is no load but {}: no session server", excerpt(&text)))?;
         // Simulation servers have a load too, but nothing at `/`.
         match Conversation::open(&self.availability_url()).await {
             Ok(availability) => availability.close().await,
@@ -80,9 +81,9 @@ impl Session {
         let url = format!("{}/session?url={world}", self.base());
         let url = Url::parse(&url).map_err(|error| format!("{url} is no URL: {error}"))?;
         let answer = get(&self.http, url.as_str()).await?;
-        let answer = answer.trim();
+        let answer = line(answer.trim());
         let is_one = answer.starts_with("ws://") || answer.starts_with("wss://");
-        if is_one { Ok(answer.trim_end_matches('/').to_owned()) } else { Err(answer.to_owned()) }
+        if is_one { Ok(answer.trim_end_matches('/').to_owned()) } else { Err(answer) }
     }
 
     fn base(&self) -> String {

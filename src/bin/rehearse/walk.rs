@@ -4,6 +4,7 @@ use std::io::Write;
 use std::time::Instant;
 
 use crate::arguments::Arguments;
+use crate::words::line;
 
 /// The walk through the steps.
 pub(crate) struct Walk {
@@ -35,7 +36,7 @@ impl Walk {
             self.differing.push(name);
         }
         let verdict = if agrees { "ok" } else { "**differs**" };
-        let came = came.replace('|', "\\|");
+        let came = line(came).replace('|', "\\|");
         print(&format!("| {name} | {at:.2} s | {took:.2} s | {expected} | {came} | {verdict} |"));
     }
 

@@ -1,9 +1,13 @@
 //! What came, in words that fit into one line. Pure.
 
+use webots_fleet::shared::text;
+
 use crate::conversation::Ended;
 
 /// What is told of one text, in characters.
 const EXCERPT: usize = 90;
+/// The longest line that a server's text is shown in, in characters: a simulation's last output is part of a reason.
+const LONGEST_LINE: usize = 2000;
 /// So many texts are told of those that are out of place.
 const LONGEST_LIST: usize = 8;
 
@@ -32,8 +36,10 @@ pub(crate) fn add(list: &mut Vec<String>, text: &str) {
 
 /// The beginning of a text, on one line, as code.
 pub(crate) fn excerpt(text: &str) -> String {
-    let short: String =
-        text.chars().take(EXCERPT).map(|letter| if letter.is_control() { ' ' } else { letter }).collect();
-    let more = if text.chars().nth(EXCERPT).is_some() { "..." } else { "" };
-    format!("`{}{more}`", short.replace('`', "'"))
+    format!("`{}`", text::excerpt(text, EXCERPT).replace('`', "'"))
+}
+
+/// What a server said, on one line that is not too long.
+pub(crate) fn line(text: &str) -> String {
+    text::excerpt(text, LONGEST_LINE)
 }

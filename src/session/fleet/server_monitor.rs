@@ -208,31 +208,19 @@ impl Handler<Stop> for ServerMonitor {
 
 async fn probe(client: &awc::Client, url: &str, load_only: bool) -> Result<Answer, ProbeError> {
     if !load_only && let Some(body) = get(client, &format!("{url}/status")).await? {
-        // JSON shows itself whether it is complete.
-        return parse_status(&body.bytes).map(Answer::Status);
+        return parse_status(&body).map(Answer::Status);
     }
     let body = get(client, &format!("{url}/load")).await?;
-    let body = body.ok_or_else(|| ProbeError::BadAnswer("it has neither /status nor /load".to_owned()))?;
-    let Body { bytes, length_known: true } = body else {
-        // Without its end, 95.5 may be 9.
-        return Err(ProbeError::BadAnswer("a load without Content-Length".to_owned()));
-    };
+    let bytes = body.ok_or_else(|| ProbeError::BadAnswer("it has neither /status nor /load".to_owned()))?;
     let load = Load::parse(&bytes).map_err(|error| ProbeError::BadAnswer(shortened(&error.to_string())))?;
     plausible(load).map(Answer::Load)
-}
-
-/// The body of a page.
-struct Body {
-    bytes: Bytes,
-    /// Whether the server told the length; awc takes the end of the connection for the end of the body.
-    length_known: bool,
 }
 
 /// Returns the body of a page, `None` if the server has no such page.
 ///
 /// # Errors
 /// When there is no answer, or one that is neither.
-async fn get(client: &awc::Client, url: &str) -> Result<Option<Body>, ProbeError> {
+async fn get(client: &awc::Client, url: &str) -> Result<Option<Bytes>, ProbeError> {
     let answer = match client.get(url).send().await {
         // A kept connection may have been closed meanwhile, which is no fault of the server.
         Err(error) if is_broken(&error) => client.get(url).send().await,
@@ -253,7 +241,9 @@ async fn get(client: &awc::Client, url: &str) -> Result<Option<Body>, ProbeError
         Some(length) if bytes.len() < length => {
             Err(ProbeError::BadAnswer(format!("{} of {length} bytes", bytes.len())))
         }
-        length => Ok(Some(Body { bytes, length_known: length.is_some() })),
+        Some(_) => Ok(Some(bytes)),
+        // awc takes the end of the connection for the end of the body: 95.5 may be 9.
+        None => Err(ProbeError::BadAnswer("an answer without Content-Length".to_owned())),
     }
 }
 

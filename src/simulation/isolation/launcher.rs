@@ -267,6 +267,7 @@ impl Launcher {
         let cgroup = self.cgroups.as_ref().and_then(Cgroups::make);
         let mut command = cgroup.as_ref().map(Cgroup::joining).unwrap_or_default();
         let mut environment = environment::allowed(&self.variables);
+        environment.extend(program.display.variables());
         environment.extend(program.variables.iter().cloned());
         if let Method::Sandbox(sandbox) = &self.method {
             // Links are not followed out of a sandbox.
@@ -279,6 +280,7 @@ impl Launcher {
             environment.extend(sandbox.environment());
         }
         command.extend(self.limited());
+        command.extend(program.display.launcher());
         let spec = SpawnSpec {
             command: command.into_iter().chain(program.command).collect(),
             inherits: false,

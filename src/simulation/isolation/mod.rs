@@ -1,6 +1,9 @@
 //! How a simulation is launched: at which level of isolation, with which environment and limits, and what ends with it.
 
 mod cgroup;
+mod disk;
+mod disk_use;
+mod display;
 mod docker_cgroup;
 mod environment;
 mod keyrings;
@@ -14,6 +17,7 @@ mod unkept;
 mod watcher;
 
 pub use cgroup::Cgroup;
+pub use display::{Display, SCREEN};
 pub use docker_cgroup::docker_cgroups;
 pub use launcher::{Launcher, Level, Network};
 pub use peak::Peak;

@@ -4,6 +4,8 @@ use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use super::display::Display;
+
 /// A program that is to be launched for a simulation.
 #[derive(Debug)]
 pub struct Program<'start> {
@@ -17,7 +19,9 @@ pub struct Program<'start> {
     pub folder: &'start Path,
     /// The port that it is to stream on.
     pub port: u16,
-    /// Variables of its own: those that name its display and its GPU.
+    /// Its display.
+    pub display: &'start Display,
+    /// Variables of its own: the one that names its GPU.
     pub variables: &'start [(OsString, OsString)],
     /// Time between SIGTERM and SIGKILL.
     pub grace: Duration,

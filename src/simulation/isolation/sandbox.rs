@@ -13,6 +13,7 @@ use std::time::Duration;
 
 use which::which;
 
+use super::display::Display;
 use super::keyrings;
 use super::network::{CHECK, OwnNetwork};
 use super::place::{Content, Place, hidden};
@@ -32,6 +33,8 @@ pub struct Sandbox {
     ends_namespaces: bool,
     /// What gives it a network of its own, if it has one.
     network: Option<OwnNetwork>,
+    /// How much its shared memory may hold, in bytes.
+    shared_memory: u64,
 }
 
 /// What of `/run` programs need to find names. Services answer there that ask the internet.
@@ -74,8 +77,8 @@ impl Sandbox {
         let homes = homes();
         places.extend(hidden(config, &homes));
         places.retain(|place| place.at.exists());
-        let user = nix::unistd::getuid().as_raw();
-        Ok(Self { bubblewrap, user, homes, places, ends_namespaces: true, network: None })
+        let (user, shared_memory) = (nix::unistd::getuid().as_raw(), config.limits.disk << 20);
+        Ok(Self { bubblewrap, user, homes, places, ends_namespaces: true, network: None, shared_memory })
     }
 
     /// The command that runs a program in a sandbox of its own. Makes the folders that it needs in the instance's folder.
@@ -113,9 +116,20 @@ impl Sandbox {
         places.extend(self.places.iter().cloned());
         // Sorting keeps the order of equals: of two at the same place the last one counts.
         places.sort_by_key(|place| place.at.components().count());
+        // What is empty is memory, and stays empty; so does the rest of `/dev`.
+        let closed = empty(&places);
         command.extend(places.into_iter().flat_map(Place::into_arguments));
+        command.extend(self.shared_memory());
+        command.extend(closed.into_iter().flat_map(|at| ["--remount-ro".into(), at.into()]));
         command.extend(["--chdir".into(), program.folder.into(), "--".into()]);
         Ok(command)
+    }
+
+    /// Shared memory within its limit, which bubblewrap can set since 0.7.
+    fn shared_memory(&self) -> Vec<OsString> {
+        let size = ["--size".to_owned(), self.shared_memory.to_string()];
+        let size = size.into_iter().filter(|_| self.ends_namespaces);
+        size.chain(["--tmpfs", "/dev/shm"].map(str::to_owned)).map(Into::into).collect()
     }
 
     /// What is different from one simulation to another.
@@ -125,6 +139,7 @@ impl Sandbox {
             std::fs::create_dir_all(&folder).map(|()| folder)
         };
         let (home, run, tmp) = (inside("home")?, inside("run")?, inside("tmp")?);
+        program.display.prepare(&tmp)?;
         let mut own: Vec<Place> = Vec::new();
         own.extend(temporary_folders().map(|at| Place { at, content: Content::Writable(tmp.clone()) }));
         own.push(Place { at: self.runtime_folder(), content: Content::Writable(run) });
@@ -139,10 +154,13 @@ impl Sandbox {
         Ok(own)
     }
 
-    /// The socket of the display, and the file that authorizes its users.
+    /// The socket of the display, and the file that authorizes its users; or the program of one that is started inside.
     fn display_files(&self, program: &Program<'_>) -> Vec<PathBuf> {
-        let variable =
-            |name: &str| program.variables.iter().find(|(one, _)| one == name).map(|(_, value)| value.clone());
+        let variables = match program.display {
+            Display::Outside(variables) => variables,
+            Display::Inside { xvfb, authority } => return vec![xvfb.clone(), authority.clone()],
+        };
+        let variable = |name: &str| variables.iter().find(|(one, _)| one == name).map(|(_, value)| value.clone());
         let socket = variable("DISPLAY").and_then(|display| socket_of(&display.to_string_lossy()));
         let authority = variable("XAUTHORITY").or_else(|| std::env::var_os("XAUTHORITY")).map(PathBuf::from);
         let usual = || self.homes.first().map(|home| home.join(".Xauthority"));
@@ -218,6 +236,7 @@ impl Sandbox {
             // One that was free a moment ago.
             port: TcpListener::bind((Ipv4Addr::LOCALHOST, 0))?.local_addr()?.port(),
             variables: &[],
+            display: &Display::Outside(Vec::new()),
             grace: TRIAL,
         })?;
         let check = if self.network.is_some() { CHECK } else { "true" };
@@ -252,6 +271,14 @@ fn temporary_folders() -> impl Iterator<Item = PathBuf> {
     let real = all.into_iter().filter_map(|folder: PathBuf| folder.canonicalize().ok());
     // Each sandbox has its own shared memory.
     real.filter(|folder| folder.parent().is_some() && !folder.starts_with("/dev")).collect::<BTreeSet<_>>().into_iter()
+}
+
+/// Where an empty folder is shown and nothing else in its place, and `/dev`.
+fn empty(places: &[Place]) -> Vec<PathBuf> {
+    let is_last = |number: usize, place: &Place| !places.iter().skip(number + 1).any(|other| other.at == place.at);
+    let empty = places.iter().enumerate().filter(|(_, place)| matches!(place.content, Content::Empty));
+    let last = empty.filter(|(number, place)| is_last(*number, place)).map(|(_, place)| place.at.clone());
+    last.chain(["/dev".into()]).collect()
 }
 
 /// The graphics cards of this machine.

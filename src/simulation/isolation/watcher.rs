@@ -1,28 +1,31 @@
 //! Watches over what simulations take that the kernel does not limit: room on the disk, ports, and on some machines
-//! processes. One thread looks for all of them, in ticks; another one finds the ports of those that start.
+//! processes. One thread looks for all of them; another one finds the ports of those that start.
 //!
-//! The ticks take 1 % of one core at most: as they take longer, the pause between them grows. Readings that serve all
-//! simulations are made once for all: one query for listeners, one pass over `/proc`, one look at the free room of the disk.
-//! Folders, which have to be walked one by one, are walked only when the disk has lost as much room as the simulation has
-//! left, and every half a minute.
+//! The free room of the disk is looked at each second, and more often as it comes close to the reserve (`diskReserve`). At the
+//! reserve the simulation ends that has grown most, then the next.
+//!
+//! All else is done in ticks that take 1 % of one core at most: as they take longer, the pause between them grows. Readings that
+//! serve all simulations are made once for all: one query for listeners, one pass over `/proc`. Folders, which have to be
+//! counted one by one, are counted only when the disk has lost as much room as the simulation may still write, and every ten
+//! seconds at most.
 
 use std::collections::{BTreeSet, HashMap, HashSet};
 use std::io;
 use std::ops::RangeInclusive;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
 use std::time::{Duration, Instant};
 
-use nix::sys::statvfs::statvfs;
 use nix::time::{ClockId, clock_gettime};
 use tokio::sync::oneshot;
 
+use super::disk::Disk;
+use super::disk_use::{DiskUse, words};
 use super::peak::Peak;
 use crate::simulation::config::SimulationConfig;
 use crate::simulation::machine::{Tree, UsageMonitor};
 use crate::simulation::process::PortFinder;
-use crate::simulation::process::folder_size::{FolderSize, room};
 use crate::simulation::process::listeners::{Listener, listeners};
 use crate::simulation::process::process_tree::{sockets, tree};
 
@@ -65,12 +68,7 @@ struct Watched {
     watch: Watch,
     /// Who waits to hear that it takes too much.
     excess: oneshot::Sender<String>,
-    /// How much the folder may take, in bytes: what it took at first counts besides the limit. `None` before the first look.
-    allowed: Option<u64>,
-    /// At the last look: what it may still write, and how much room the disk had lost, in bytes.
-    left: u64,
-    lost: u64,
-    looked: Instant,
+    disk: DiskUse,
 }
 
 /// The shortest time between two ticks.
@@ -79,8 +77,15 @@ const SHORTEST: Duration = Duration::from_secs(1);
 const LONGEST: Duration = Duration::from_secs(10);
 /// The pause after a tick is this many times as long as the processor time of the tick: 1 % of one core.
 const PAUSE: u32 = 99;
-/// A folder is walked this often although the disk has lost little room: others may have made as much in the same tick.
-const WALK_AGAIN: Duration = Duration::from_secs(30);
+/// How much processor time a tick may take for folders. What is left is counted in the next one.
+const FOLDERS: Duration = Duration::from_millis(100);
+/// How long it may take to count a folder for `limits.disk`; while others wait for the look at the reserve, and in all
+/// for that look.
+const COUNT: Duration = Duration::from_secs(1);
+const COUNT_AT_RESERVE: Duration = Duration::from_millis(100);
+const COUNTS_AT_RESERVE: Duration = Duration::from_millis(300);
+/// Listeners of somebody else are forgotten after this time.
+const FORGET: Duration = Duration::from_secs(30);
 
 impl Watcher {
     /// Starts the threads. `run` is the folder with the folders of all instances.
@@ -94,7 +99,7 @@ impl Watcher {
         // Where the system does not tell, no simulation would become ready.
         listeners(&ports)?;
         let finder = PortFinder::start(*ports.start()..=last)?;
-        let disk = Disk { free: free(&run), folder: run, lost: 0 };
+        let disk = Disk::new(run, config.disk_reserve);
         let mut table =
             Table { disk, ports, usage, all: Vec::new(), owners: HashMap::new(), forgotten: Instant::now() };
         std::thread::Builder::new().name("watcher".to_owned()).spawn(move || table.run(&receiver))?;
@@ -111,9 +116,9 @@ impl Watcher {
     /// the watch.
     pub async fn until_too_much(&self, watch: Watch) -> String {
         let (excess, told) = oneshot::channel();
-        let (allowed, left, lost, looked) = (None, 0, 0, Instant::now());
+        let disk = DiskUse::new(watch.root, watch.folder.clone(), watch.disk);
         // The thread lives as long as this.
-        self.watches.send(Watched { watch, excess, allowed, left, lost, looked }).ok();
+        self.watches.send(Watched { watch, excess, disk }).ok();
         match told.await {
             Ok(why) => why,
             Err(_) => std::future::pending().await,
@@ -135,37 +140,72 @@ struct Table {
 
 impl Table {
     fn run(&mut self, watches: &Receiver<Watched>) {
-        let mut pause = SHORTEST;
+        let mut tick = Instant::now() + SHORTEST;
         loop {
-            let next = Instant::now() + pause;
-            // What comes between two ticks is taken at once: the first look says how much its folder took at first.
+            let next = tick.min(Instant::now() + self.disk.pause());
+            // What comes meanwhile is taken at once: the first count says how much its folder took at first.
             loop {
                 let left = next.saturating_duration_since(Instant::now());
                 match if self.all.is_empty() { watches.recv().map_err(Into::into) } else { watches.recv_timeout(left) }
                 {
                     Ok(mut new) => {
-                        new.walk(self.disk.lost);
+                        new.disk.count(self.disk.lost(), COUNT);
                         self.all.push(new);
                     }
                     Err(RecvTimeoutError::Timeout) => break,
                     Err(RecvTimeoutError::Disconnected) => return,
                 }
             }
-            let begin = processor_time();
-            self.look();
-            pause = pause_after(processor_time().saturating_sub(begin));
+            self.all.retain(|one| !one.excess.is_closed());
+            self.disk.look();
+            if self.disk.is_short() {
+                let excess = self.find_grown_most();
+                self.end(excess);
+            }
+            if Instant::now() >= tick {
+                let begin = processor_time();
+                self.look(begin);
+                tick = Instant::now() + pause_after(processor_time().saturating_sub(begin));
+            }
         }
     }
 
-    /// One tick.
-    fn look(&mut self) {
-        self.all.retain(|one| !one.excess.is_closed());
-        let mut excesses = self.look_at_disk();
+    /// Which simulation has grown most; none if none has grown: then another program fills the disk.
+    fn find_grown_most(&mut self) -> Option<(i32, String)> {
+        let until = Instant::now() + COUNTS_AT_RESERVE;
+        let lost = self.disk.lost();
+        // Also if none is found: the next try waits, too.
+        self.disk.relieve();
+        // The one that had grown most is counted first, then those that were not counted for the longest time.
+        self.all.sort_by_key(|one| one.disk.counted());
+        let most = self.all.iter().enumerate().max_by_key(|(_, one)| one.disk.growth()).map(|(place, _)| place);
+        most.inspect(|place| self.all.swap(0, *place));
+        for one in &mut self.all {
+            if Instant::now() >= until {
+                break;
+            }
+            if let Some(why) = one.disk.count(lost, COUNT_AT_RESERVE) {
+                return Some((one.watch.root, why));
+            }
+        }
+        let grown = self.all.iter().filter_map(|one| Some((one.watch.root, one.disk.growth()?)));
+        let (root, growth) = grown.max_by_key(|(_, growth)| *growth)?;
+        Some((root, words(growth)))
+    }
+
+    /// One tick, which began at this processor time.
+    fn look(&mut self, begin: Duration) {
+        let mut excesses = self.count_folders(begin);
         excesses.extend(self.count_processes());
         if self.all.iter().any(|one| one.watch.port.is_some()) {
             // An error is logged by those who start.
             excesses.extend(listeners(&self.ports).map(|all| self.look_at_ports(&all)).unwrap_or_default());
         }
+        self.end(excesses);
+    }
+
+    /// Tells those who asked, and watches these simulations no longer.
+    fn end(&mut self, excesses: impl IntoIterator<Item = (i32, String)>) {
         for (root, why) in excesses {
             if let Some(place) = self.all.iter().position(|one| one.watch.root == root) {
                 // Who asked may be gone.
@@ -174,10 +214,18 @@ impl Table {
         }
     }
 
-    fn look_at_disk(&mut self) -> Vec<(i32, String)> {
-        let lost = self.disk.look();
-        let due = self.all.iter_mut().filter(|one| one.is_due(lost));
-        due.filter_map(|one| one.walk(lost).map(|why| (one.watch.root, why))).collect()
+    fn count_folders(&mut self, begin: Duration) -> Vec<(i32, String)> {
+        let (lost, time) = (self.disk.lost(), self.disk.pause().min(COUNT));
+        let mut due: Vec<&mut Watched> = self.all.iter_mut().filter(|one| one.disk.is_due(lost)).collect();
+        due.sort_by_key(|one| one.disk.counted());
+        let mut excesses = Vec::new();
+        for one in due {
+            if processor_time().saturating_sub(begin) >= FOLDERS {
+                break;
+            }
+            excesses.extend(one.disk.count(lost, time).map(|why| (one.watch.root, why)));
+        }
+        excesses
     }
 
     fn count_processes(&self) -> Vec<(i32, String)> {
@@ -223,7 +271,7 @@ impl Table {
     fn find_owners(&mut self, all: &[Listener]) {
         let there: HashSet<u64> = all.iter().map(|one| one.inode).collect();
         // `/proc` may leave out a child while others come and go: its listener would be taken for somebody else's for good.
-        let forget = self.forgotten.elapsed() >= WALK_AGAIN;
+        let forget = self.forgotten.elapsed() >= FORGET;
         self.owners.retain(|inode, owner| there.contains(inode) && (owner.is_some() || !forget));
         self.forgotten = if forget { Instant::now() } else { self.forgotten };
         let mut new: Vec<&Listener> = all.iter().filter(|one| !self.owners.contains_key(&one.inode)).collect();
@@ -241,49 +289,6 @@ impl Table {
         }
         self.owners.extend(new.into_iter().map(|listener| (listener.inode, None)));
     }
-}
-
-impl Watched {
-    /// Whether its folder may have grown beyond its limit since the last look.
-    fn is_due(&self, lost: u64) -> bool {
-        lost.saturating_sub(self.lost) >= self.left || self.looked.elapsed() >= WALK_AGAIN
-    }
-
-    /// Looks how much its folder takes. `lost` is how much room the disk has lost until now.
-    fn walk(&mut self, lost: u64) -> Option<String> {
-        let disk = self.watch.disk;
-        let mut size = FolderSize::new(room, self.allowed.unwrap_or(u64::MAX));
-        let is_known = size.add_folder(&self.watch.folder).is_ok();
-        let allowed = *self.allowed.get_or_insert(size.total().saturating_add(disk << 20));
-        (self.left, self.lost, self.looked) = (allowed.saturating_sub(size.total()), lost, Instant::now());
-        if !is_known {
-            return Some("The simulation has folders that nobody can look into, too deep or closed".to_owned());
-        }
-        (size.total() > allowed)
-            .then(|| format!("The simulation has written more than {disk} MiB, the limit of this server (limits.disk)"))
-    }
-}
-
-/// The disk that the folders of all instances are on.
-struct Disk {
-    folder: PathBuf,
-    free: u64,
-    /// How much room it has lost since the start, in bytes: what becomes free again is not taken off.
-    lost: u64,
-}
-
-impl Disk {
-    fn look(&mut self) -> u64 {
-        let free = free(&self.folder);
-        self.lost = self.lost.saturating_add(self.free.saturating_sub(free));
-        self.free = free;
-        self.lost
-    }
-}
-
-/// The free room of the disk that a folder is on, in bytes.
-fn free(folder: &Path) -> u64 {
-    statvfs(folder).map_or(0, |disk| disk.blocks_free().saturating_mul(disk.fragment_size()))
 }
 
 /// How much processor time this thread has taken. What a tick waits for a busy machine or its disk costs nobody anything.

@@ -5,6 +5,7 @@ use std::fs::Metadata;
 use std::io::ErrorKind;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
 
 /// Adds up files. One that has several names, or is met again because it was moved meanwhile, counts once if it is large.
 #[derive(Debug)]
@@ -12,14 +13,21 @@ pub struct FolderSize {
     measure: fn(&Metadata) -> u64,
     /// Nobody wants to know how much more it is.
     enough: u64,
+    /// When to stop counting.
+    until: Option<Instant>,
     total: u64,
     /// Device and inode of large files.
     met: HashSet<(u64, u64)>,
 }
 
-/// Folders are closed to this server, or nested so deep that nobody would do that but on purpose.
+/// Why what is below a folder is not all counted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Unknown;
+pub enum Unknown {
+    /// Folders are closed to this server, or nested so deep that nobody would do that but on purpose.
+    Hidden,
+    /// There was no time for more.
+    Late,
+}
 
 /// The least that a name takes of the disk, in bytes.
 pub const SMALLEST: u64 = 4096;
@@ -27,6 +35,8 @@ pub const SMALLEST: u64 = 4096;
 const LARGE: u64 = 64 * 1024;
 /// How many folders may be in each other: a look at each takes time for all above it.
 const DEEPEST: usize = 200;
+/// How many entries of a folder are counted between two looks at the clock.
+const BETWEEN_CLOCKS: usize = 64;
 
 /// What a file or folder takes of the disk. Holes take nothing.
 pub fn room(about: &Metadata) -> u64 {
@@ -47,7 +57,14 @@ pub fn length(about: &Metadata) -> u64 {
 impl FolderSize {
     /// Adds up by this measure, to no more than `enough`.
     pub fn new(measure: fn(&Metadata) -> u64, enough: u64) -> Self {
-        Self { measure, enough, total: 0, met: HashSet::new() }
+        Self { measure, enough, until: None, total: 0, met: HashSet::new() }
+    }
+
+    /// Stops counting after this time.
+    #[must_use]
+    pub fn within(mut self, time: Duration) -> Self {
+        self.until = Some(Instant::now() + time);
+        self
     }
 
     /// What was added up until now.
@@ -58,33 +75,50 @@ impl FolderSize {
     /// Adds everything below a folder. Links are not followed.
     ///
     /// # Errors
-    /// When there is more than anybody can tell; the rest is added.
+    /// When there is more than anybody can tell; the rest is added. When the time is over.
     pub fn add_folder(&mut self, folder: &Path) -> Result<(), Unknown> {
         let mut open: Vec<(PathBuf, usize)> = vec![(folder.to_owned(), 0)];
         let mut all = Ok(());
         while let Some((folder, depth)) = open.pop() {
+            if self.is_late() {
+                return Err(Unknown::Late);
+            }
             let entries = match std::fs::read_dir(&folder) {
                 Ok(entries) => entries,
                 // It was removed meanwhile.
                 Err(error) if matches!(error.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory) => continue,
                 Err(_) => {
-                    all = Err(Unknown);
+                    all = Err(Unknown::Hidden);
                     continue;
                 }
             };
-            for entry in entries.flatten() {
+            for (number, entry) in entries.flatten().enumerate() {
+                if number % BETWEEN_CLOCKS == BETWEEN_CLOCKS - 1 && self.is_late() {
+                    return Err(Unknown::Late);
+                }
                 let Ok(about) = entry.metadata() else { continue };
                 self.add(&about);
                 if self.total > self.enough {
                     return Ok(());
                 }
                 if about.is_dir() {
-                    all = if depth < DEEPEST { all } else { Err(Unknown) };
+                    all = if depth < DEEPEST { all } else { Err(Unknown::Hidden) };
                     open.push((entry.path(), depth + 1));
                 }
             }
         }
         all
+    }
+
+    /// Adds a file that has lost its names while a process has it open.
+    pub fn add_nameless(&mut self, about: &Metadata) {
+        if self.met.insert((about.dev(), about.ino())) {
+            self.total = self.total.saturating_add((self.measure)(about));
+        }
+    }
+
+    fn is_late(&self) -> bool {
+        self.until.is_some_and(|until| Instant::now() >= until)
     }
 
     fn add(&mut self, about: &Metadata) {

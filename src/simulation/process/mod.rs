@@ -1,6 +1,7 @@
 //! What a simulation leaves in the system, and how it is removed: process trees and folders.
 
 mod answer;
+mod disk_room;
 pub mod folder_size;
 pub mod guardian;
 mod instance_dir;
@@ -13,6 +14,7 @@ mod remove_tree;
 mod runner;
 
 pub use answer::until_answering;
+pub use disk_room::DiskRoom;
 pub use guardian::Guardian;
 pub use instance_dir::{InstanceDir, Leftovers, RunDir};
 pub use lines::Lines;

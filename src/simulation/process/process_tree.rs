@@ -2,9 +2,10 @@
 
 use std::collections::HashSet;
 use std::ffi::OsStr;
-use std::fs::File;
-use std::io::Read;
+use std::fs::{File, Metadata};
+use std::io::{ErrorKind, Read};
 use std::os::unix::ffi::OsStrExt;
+use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
@@ -97,6 +98,28 @@ pub fn sockets(pid: i32) -> Vec<u64> {
     let descriptors = std::fs::read_dir(format!("/proc/{pid}/fd")).into_iter().flatten().flatten();
     let targets = descriptors.filter_map(|descriptor| std::fs::read_link(descriptor.path()).ok());
     targets.filter_map(|target| target.to_str()?.strip_prefix("socket:[")?.strip_suffix(']')?.parse().ok()).collect()
+}
+
+/// The files that a process has open and that have lost their names. `None` if it hides what it has open.
+#[must_use]
+pub fn nameless_files(pid: i32) -> Option<Vec<Metadata>> {
+    let descriptors = match std::fs::read_dir(format!("/proc/{pid}/fd")) {
+        Ok(descriptors) => descriptors,
+        Err(error) if error.kind() == ErrorKind::PermissionDenied && is_running(pid) => return None,
+        // It has ended.
+        Err(_) => return Some(Vec::new()),
+    };
+    let is_nameless = |path: &Path| {
+        std::fs::read_link(path).is_ok_and(|target| target.as_os_str().as_encoded_bytes().ends_with(b" (deleted)"))
+    };
+    let paths = descriptors.flatten().map(|descriptor| descriptor.path()).filter(|path| is_nameless(path));
+    let files = paths.filter_map(|path| path.metadata().ok());
+    Some(files.filter(|about| about.is_file() && about.nlink() == 0).collect())
+}
+
+/// Whether a process has not ended. One that has, and was not waited for, shows its files to nobody.
+fn is_running(pid: i32) -> bool {
+    Process::new(pid).and_then(|process| process.stat()).is_ok_and(|stat| !matches!(stat.state, 'Z' | 'X'))
 }
 
 #[cfg(test)]

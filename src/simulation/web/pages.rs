@@ -3,6 +3,7 @@
 use std::time::{Duration, SystemTime};
 
 use askama::Template;
+use url::Url;
 
 use crate::shared::domain::UrlPrefix;
 use crate::shared::http::{Row, View};
@@ -84,6 +85,7 @@ struct Glance<'readings> {
 struct SimulationRow<'one> {
     reader: Reader,
     one: &'one Simulation,
+    link: String,
     world: String,
     repository: String,
     stage: &'static str,
@@ -197,6 +199,7 @@ fn with_sizes(gpus: &[Gpu]) -> Vec<(&Gpu, String)> {
 struct EndRow<'one> {
     reader: Reader,
     one: &'one Ended,
+    link: String,
     world: String,
     repository: String,
     ended: String,
@@ -211,8 +214,9 @@ impl<'one> EndRow<'one> {
         let (repository, world) = names(&one.world);
         let (ended, after) = (text_of(one.end), duration(one.end.saturating_sub(one.begin)));
         let (reason, why) = (one.how.reason, without_paths(&one.how.why));
+        let link = link(&one.world);
         let abnormal = reason.is_abnormal();
-        Self { reader, one, world, repository, ended, after, reason: reason.words(), abnormal, why }
+        Self { reader, one, link, world, repository, ended, after, reason: reason.words(), abnormal, why }
     }
 }
 
@@ -222,6 +226,11 @@ fn text_of(seconds_since_1970: u64) -> String {
 
 /// What forges put between a repository and a path in it.
 const SEPARATORS: [&str; 4] = ["/-/", "/blob/", "/tree/", "/src/"];
+
+/// The URL of a world as a link, in which nothing is invisible or turns letters around.
+fn link(url: &str) -> String {
+    Url::parse(url).map_or_else(|_| one_line(url), String::from)
+}
 
 /// The repository of a world, and the name of its file, from its URL.
 fn names(url: &str) -> (String, String) {
@@ -239,6 +248,7 @@ impl<'one> SimulationRow<'one> {
         Self {
             reader,
             one,
+            link: link(&one.world),
             world,
             repository,
             stage,

@@ -11,12 +11,11 @@ use futures_util::future::LocalBoxFuture;
 
 use super::command::WebotsCommand;
 use super::event::WebotsEvent;
-use super::virtual_display::VirtualDisplay;
 use crate::simulation::checkout::{Checkouts, Project};
 use crate::simulation::config::SimulationConfig;
 use crate::simulation::container::{Containers, Request};
 use crate::simulation::ends::FOLDER_OF_RUNNING;
-use crate::simulation::isolation::{Cgroup, Launcher, Peak, Program, Watch, Watcher};
+use crate::simulation::isolation::{Cgroup, Display, Launcher, Peak, Program, Watch, Watcher};
 use crate::simulation::machine::display;
 use crate::simulation::machine::sensors::Gpu;
 use crate::simulation::places::Ticket;
@@ -71,23 +70,21 @@ impl LaunchSpec {
     }
 
     /// The display of the machine on which it opens its window.
-    fn display(&self) -> String {
+    #[must_use]
+    pub fn display(&self) -> String {
         self.config.display_on(self.gpu.as_ref().map(|gpu| gpu.index))
     }
 
-    /// The environment variables that name its X display and its GPU.
-    fn variables(&self, display: Option<&VirtualDisplay>) -> Vec<(OsString, OsString)> {
-        let of_machine = || vec![("DISPLAY".into(), self.display().into())];
-        let mut variables = display.map_or_else(of_machine, VirtualDisplay::environment);
-        variables.extend(self.gpu.iter().map(|gpu| ("CUDA_VISIBLE_DEVICES".into(), gpu.id.clone().into())));
-        variables
+    /// The environment variable that names its GPU, if it was given one.
+    fn variables(&self) -> Vec<(OsString, OsString)> {
+        self.gpu.iter().map(|gpu| ("CUDA_VISIBLE_DEVICES".into(), gpu.id.clone().into())).collect()
     }
 
-    /// How the process is started and ended, and its control group. `display` is one of its own, if it has one.
+    /// How the process is started and ended, and its control group.
     ///
     /// # Errors
     /// When a folder that it needs can't be made.
-    pub fn spawn_spec(&self, display: Option<&VirtualDisplay>) -> std::io::Result<(SpawnSpec, Option<Cgroup>)> {
+    pub fn spawn_spec(&self, display: &Display) -> std::io::Result<(SpawnSpec, Option<Cgroup>)> {
         let command = WebotsCommand {
             program: &self.program,
             mode: self.mode,
@@ -101,7 +98,8 @@ impl LaunchSpec {
             project: self.project.instance.project(),
             folder: self.project.folder(),
             port: self.place.1,
-            variables: &self.variables(display),
+            display,
+            variables: &self.variables(),
             grace: self.config.timing.grace,
         })
     }

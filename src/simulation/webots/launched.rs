@@ -15,7 +15,7 @@ use super::runtime::Runtime;
 use crate::shared::run::RotatedFile;
 use crate::simulation::container::Cause;
 use crate::simulation::ends::Taken;
-use crate::simulation::isolation::{Cgroup, Peak};
+use crate::simulation::isolation::{Cgroup, Display, Peak};
 use crate::simulation::process::{ExitReason, ProcessGroup};
 
 /// A Webots that was started.
@@ -72,7 +72,8 @@ where
     let errors = output.try_clone()?;
     let (process, cgroup) = match &runtime {
         Runtime::Containers(containers) => (containers.spawn_spec(spec.config.timing.grace), None),
-        Runtime::Machine(display) => spec.spawn_spec(display.as_ref())?,
+        Runtime::Machine(display) => spec.spawn_spec(display)?,
+        Runtime::BesideDisplay(display) => spec.spawn_spec(&Display::Outside(display.environment()))?,
     };
     let (group, ended) = ProcessGroup::start(&process, output.into(), errors.into())?;
     let folder = cgroup.as_ref().map(|cgroup| cgroup.path().to_owned());

@@ -7,14 +7,17 @@ use tokio::sync::Notify;
 
 use super::event::WebotsEvent;
 use super::launch_spec::LaunchSpec;
-use super::virtual_display::VirtualDisplay;
+use super::virtual_display::{VirtualDisplay, write_authority};
 use crate::simulation::container::{Cause, Containers, Prepared, Request, StartError};
+use crate::simulation::isolation::{Display, Level};
 
 /// What a Webots runs on.
 #[derive(Debug)]
 pub enum Runtime {
-    /// The machine, with a display of Webots' own or the configured one.
-    Machine(Option<VirtualDisplay>),
+    /// The machine, with a display of Webots' own in its sandbox or the configured one.
+    Machine(Display),
+    /// The machine, with a display of Webots' own beside it.
+    BesideDisplay(VirtualDisplay),
     /// Containers.
     Containers(Box<Prepared>),
 }
@@ -22,10 +25,10 @@ pub enum Runtime {
 /// What has to be done before a Webots can start.
 #[derive(Debug)]
 pub enum Preparation {
-    /// Nothing.
-    None,
-    /// Its own display has to be started; it keeps its files in the instance's folder.
-    Display(PathBuf),
+    /// Nothing: it has the display with this name.
+    None(String),
+    /// Its own display has to be started, in its sandbox or beside it; it keeps its files in the instance's folder.
+    Display(PathBuf, Level),
     /// Containers have to be made.
     Containers(Arc<Containers>, Request),
 }
@@ -36,8 +39,8 @@ impl Preparation {
     pub fn of(spec: &LaunchSpec) -> Self {
         match &spec.containers {
             Some(containers) => Self::Containers(Arc::clone(containers), spec.request()),
-            None if spec.config.xvfb => Self::Display(spec.project.instance.path().to_owned()),
-            None => Self::None,
+            None if spec.config.xvfb => Self::Display(spec.project.instance.path().to_owned(), spec.launcher.level()),
+            None => Self::None(spec.display()),
         }
     }
 
@@ -47,11 +50,17 @@ impl Preparation {
     /// Whose fault it is that it can't be done.
     pub async fn run(self, progress: impl Fn(String) + Send + Sync) -> Result<Runtime, StartError> {
         match self {
-            Self::None => Ok(Runtime::Machine(None)),
-            Self::Display(instance) => match VirtualDisplay::start(&instance).await {
-                Ok(display) => Ok(Runtime::Machine(Some(display))),
-                Err(error) => Err(StartError::Server(format!("The virtual display (Xvfb) can't be started: {error}"))),
-            },
+            Self::None(name) => Ok(Runtime::Machine(Display::Outside(vec![("DISPLAY".into(), name.into())]))),
+            Self::Display(instance, level) => {
+                let started = if level == Level::Sandbox {
+                    write_authority(&instance).and_then(Display::inside).map(Runtime::Machine)
+                } else {
+                    VirtualDisplay::start(&instance).await.map(Runtime::BesideDisplay)
+                };
+                let failed =
+                    |error| StartError::Server(format!("The virtual display (Xvfb) can't be started: {error}"));
+                started.map_err(failed)
+            }
             Self::Containers(containers, request) => {
                 let mut prepared = containers.prepare(request, &progress).await?;
                 prepared.start_others().await?;
@@ -66,7 +75,7 @@ impl Runtime {
     #[must_use]
     pub fn restart(&self) -> Option<Arc<Notify>> {
         match self {
-            Self::Machine(_) => None,
+            Self::Machine(_) | Self::BesideDisplay(_) => None,
             Self::Containers(containers) => containers.restart(),
         }
     }
@@ -82,8 +91,8 @@ impl Runtime {
     /// Ends what a Webots ran on, after its own end with this exit code. Returns what has ended it, if Docker knows.
     pub async fn end(self, code: Option<i32>) -> Option<Cause> {
         match self {
-            Self::Machine(None) => None,
-            Self::Machine(Some(display)) => {
+            Self::Machine(_) => None,
+            Self::BesideDisplay(display) => {
                 display.stop().await;
                 None
             }

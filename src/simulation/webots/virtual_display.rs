@@ -1,4 +1,4 @@
-//! A virtual display (Xvfb) for one Webots.
+//! A virtual display (Xvfb) for one Webots that has no sandbox.
 //!
 //! Xvfb chooses a free display number by itself and prints it (`-displayfd`). Started so, it writes no lock file, and
 //! takes over the socket that a killed one has left in `/tmp/.X11-unix`: nothing has to be removed after it.
@@ -14,6 +14,7 @@ use actix_rt::task::JoinHandle;
 use tokio::io::{AsyncBufReadExt, BufReader};
 use tokio::net::unix::pipe::Receiver;
 
+use crate::simulation::isolation::SCREEN;
 use crate::simulation::process::{ExitReason, ProcessGroup, SpawnSpec};
 
 /// A running Xvfb. Dropping it kills it.
@@ -29,8 +30,6 @@ pub struct VirtualDisplay {
 const START: Duration = Duration::from_secs(10);
 /// How long Xvfb may take to end after SIGTERM.
 const GRACE: Duration = Duration::from_secs(1);
-/// Its only screen: width, height and bits of a pixel, as `xvfb-run` has it.
-const SCREEN: &str = "1280x1024x24";
 /// In an authority file: the entry counts for every host. `FamilyWild` of X11/Xauth.h.
 const EVERY_HOST: u16 = 0xffff;
 /// The only kind of authorization that all clients know.
@@ -42,8 +41,7 @@ impl VirtualDisplay {
     /// # Errors
     /// When Xvfb can't be started, ends, or names no display within ten seconds.
     pub async fn start(instance: &Path) -> std::io::Result<Self> {
-        let (authority, log) = (instance.join("Xauthority"), instance.join("xvfb.log"));
-        write_authority(&authority)?;
+        let (authority, log) = (write_authority(instance)?, instance.join("xvfb.log"));
         let (reader, output) = std::io::pipe()?;
         let mut command: Vec<OsString> =
             ["Xvfb", "-displayfd", "1", "-screen", "0", SCREEN, "-nolisten", "tcp", "-auth"].map(OsString::from).into();
@@ -77,8 +75,9 @@ impl VirtualDisplay {
     }
 }
 
-/// Writes an authority file with one random cookie.
-fn write_authority(path: &Path) -> std::io::Result<()> {
+/// Writes an authority file with one random cookie into the instance's folder, and returns its path.
+pub fn write_authority(instance: &Path) -> std::io::Result<PathBuf> {
+    let path = instance.join("Xauthority");
     let cookie: [u8; 16] = rand::random();
     let mut entry = EVERY_HOST.to_be_bytes().to_vec();
     // No address and no display number: the entry counts for all.
@@ -86,5 +85,6 @@ fn write_authority(path: &Path) -> std::io::Result<()> {
         entry.extend(u16::try_from(field.len()).unwrap_or_default().to_be_bytes());
         entry.extend(field);
     }
-    File::options().create(true).truncate(true).write(true).mode(0o600).open(path)?.write_all(&entry)
+    File::options().create(true).truncate(true).write(true).mode(0o600).open(&path)?.write_all(&entry)?;
+    Ok(path)
 }

@@ -15,10 +15,10 @@ pub fn hide_mounts_from_others() {
     }
 }
 
-/// A disk of 64 MiB at a folder.
-pub fn small_disk(folder: &Path) -> bool {
+/// A disk of so many MiB at a folder.
+pub fn small_disk(folder: &Path, size: u32) -> bool {
     std::fs::create_dir_all(folder).unwrap();
-    mount(Some("small"), folder, Some("tmpfs"), MsFlags::empty(), Some("size=64m")).is_ok()
+    mount(Some("small"), folder, Some("tmpfs"), MsFlags::empty(), Some(&*format!("size={size}m"))).is_ok()
 }
 
 /// A file that takes all room of a disk.

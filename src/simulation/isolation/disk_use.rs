@@ -1,0 +1,106 @@
+//! How much of the disk one simulation has taken: its folder, and files without a name that its processes have open.
+
+use std::os::unix::fs::MetadataExt;
+use std::path::PathBuf;
+use std::time::{Duration, Instant};
+
+use crate::simulation::process::folder_size::{FolderSize, Unknown, room};
+use crate::simulation::process::process_tree::{nameless_files, tree};
+
+/// What one simulation has taken, as it was last counted.
+#[derive(Debug)]
+pub struct DiskUse {
+    /// The process from which all of it descends.
+    root: i32,
+    /// The folder of the instance.
+    folder: PathBuf,
+    /// How much it may write, in MiB.
+    limit: u64,
+    /// What it took at first, in bytes. `None` until all of it was counted once.
+    first: Option<u64>,
+    /// What it takes at least, in bytes.
+    taken: u64,
+    /// Whether its processes hide which files they have open.
+    hides: bool,
+    /// How much room the disk had lost when it was counted.
+    lost: u64,
+    counted: Instant,
+}
+
+/// Time between two counts for `limits.disk`.
+const COUNT_AGAIN: Duration = Duration::from_secs(10);
+/// Who has grown less, in bytes, does not end for the reserve: its end would free nothing.
+const LEAST_GROWTH: u64 = 1 << 20;
+
+impl DiskUse {
+    /// A simulation that was not counted yet.
+    pub fn new(root: i32, folder: PathBuf, limit: u64) -> Self {
+        Self { root, folder, limit, first: None, taken: 0, hides: false, lost: 0, counted: Instant::now() }
+    }
+
+    /// When it was counted last.
+    pub fn counted(&self) -> Instant {
+        self.counted
+    }
+
+    /// Whether it may have exceeded its limit since it was counted: the disk has lost as much as it may still write.
+    /// `lost` is how much room the disk has lost until now.
+    pub fn is_due(&self, lost: u64) -> bool {
+        let left = self.allowed().unwrap_or_default().saturating_sub(self.taken);
+        lost.saturating_sub(self.lost) >= left && self.counted.elapsed() >= COUNT_AGAIN
+    }
+
+    /// Counts what it takes, within this time. Returns what is wrong, in words for its client.
+    pub fn count(&mut self, lost: u64, time: Duration) -> Option<String> {
+        let mut size = FolderSize::new(room, self.allowed().unwrap_or(u64::MAX)).within(time);
+        let counted = size.add_folder(&self.folder);
+        self.add_nameless(&mut size, time);
+        (self.taken, self.lost, self.counted) = (size.total(), lost, Instant::now());
+        if counted == Ok(()) {
+            self.first.get_or_insert(size.total());
+        }
+        if counted == Err(Unknown::Hidden) {
+            return Some("The simulation has folders that nobody can look into, too deep or closed".to_owned());
+        }
+        let limit = self.limit;
+        self.allowed().is_some_and(|allowed| self.taken > allowed).then(|| {
+            format!("The simulation has written more than {limit} MiB, the limit of this server (limits.disk)")
+        })
+    }
+
+    fn add_nameless(&mut self, size: &mut FolderSize, time: Duration) {
+        let (until, device) = (Instant::now() + time, self.folder.metadata().map(|about| about.dev()).ok());
+        self.hides = false;
+        for process in tree(self.root) {
+            if Instant::now() >= until {
+                return;
+            }
+            match nameless_files(process) {
+                Some(files) => {
+                    files.iter().filter(|file| Some(file.dev()) == device).for_each(|file| size.add_nameless(file));
+                }
+                None => self.hides = true,
+            }
+        }
+    }
+
+    /// What it may take, in bytes: what it took at first counts besides the limit.
+    fn allowed(&self) -> Option<u64> {
+        self.first.map(|first| first.saturating_add(self.limit << 20))
+    }
+
+    /// How much it has grown, in bytes, if that is worth its end. Who hides what it has open comes before all others.
+    pub fn growth(&self) -> Option<u64> {
+        let grown = self.taken.saturating_sub(self.first.unwrap_or_default());
+        if self.hides { Some(u64::MAX) } else { Some(grown).filter(|grown| *grown >= LEAST_GROWTH) }
+    }
+}
+
+/// Why a simulation ends for the reserve, in words for its client.
+pub fn words(growth: u64) -> String {
+    let what = match growth {
+        u64::MAX => "hides which files it has open".to_owned(),
+        bytes => format!("has written most there, {} MiB", bytes >> 20),
+    };
+    format!("The disk of this simulation server is almost full (diskReserve), and the simulation {what}")
+}

@@ -1,0 +1,122 @@
+//! A virtual display of a simulation's own, in its sandbox; and a display for all that one of them takes up.
+
+use std::os::unix::fs::PermissionsExt;
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+use procfs::process::{FDTarget, Process};
+use serde_json::Value;
+use tokio::io::{AsyncBufReadExt, BufReader};
+use tokio::process::Command;
+
+use super::deeds::as_nobody;
+use crate::simulation::scene::{DEMO, arm, nothing_left};
+use crate::support::client::Client;
+use crate::support::git::Forge;
+use crate::support::program::{Server, simulation_server};
+use crate::support::webots::{Webots, instances_below};
+use crate::support::{display, http, needs, until};
+
+/// The inodes of the sockets that a process has open.
+fn sockets(pid: i32) -> Vec<u64> {
+    let files = Process::new(pid).unwrap().fd().unwrap().flatten();
+    files.filter_map(|file| if let FDTarget::Socket(inode) = file.target { Some(inode) } else { None }).collect()
+}
+
+fn xvfb(server: &Server) -> i32 {
+    instances_below(&server.folder).into_iter().find(|(_, words)| words.contains("Xvfb :")).unwrap().0
+}
+
+fn namespace(pid: &str, name: &str) -> PathBuf {
+    std::fs::read_link(format!("/proc/{pid}/ns/{name}")).unwrap()
+}
+
+#[actix_rt::test]
+async fn a_virtual_display_is_inside_of_the_sandbox() {
+    needs("Xvfb", "xvfb");
+    needs("xset", "x11-xserver-utils");
+    let mut users = vec![("root", "true")];
+    users.extend(as_nobody().map(|nobody| ("nobody", nobody)));
+    for (user, before) in users {
+        let (forge, folder) = (Forge::with_arm(), tempfile::tempdir().unwrap());
+        for folder in [folder.path(), forge.path()] {
+            std::fs::set_permissions(folder, std::fs::Permissions::from_mode(0o777)).unwrap();
+        }
+        // The cache is hidden from simulations.
+        let fonts = folder.path().join("cache/fonts");
+        let webots = Webots::script(&format!(
+            "test -S /tmp/.X11-unix/X${{DISPLAY#:}} && echo 'DONE socket'\nxset q >/dev/null && echo 'DONE use it'\n\
+             xset fp= {} && echo 'DONE read hidden fonts'\nXAUTHORITY=/dev/null xset q || echo 'DONE refuse others'\n\
+             {DEMO} \"$@\" & wait",
+            fonts.display()
+        ));
+        std::fs::set_permissions(webots.path().parent().unwrap(), std::fs::Permissions::from_mode(0o755)).unwrap();
+        let builder = simulation_server(&webots.path(), forge.path(), 1).set("xvfb", true).set("isolation", "sandbox");
+        let server = builder.folder(folder.path()).before(before).start().await;
+        std::fs::create_dir_all(&fonts).unwrap();
+        std::fs::write(fonts.join("fonts.dir"), "0\n").unwrap();
+        let mut client = Client::start(&server, &arm()).await;
+        client.until("webots:").await;
+        let printed = std::fs::read_to_string(server.output_file(&client)).unwrap();
+        let done: Vec<&str> = printed.lines().filter_map(|line| line.strip_prefix("DONE ")).collect();
+        assert_eq!(done, ["socket", "use it", "refuse others"], "{user}: {printed}");
+        let pid = xvfb(&server);
+        for name in ["pid", "mnt", "ipc"] {
+            assert_ne!(namespace(&pid.to_string(), name), namespace("self", name), "{user}: {name}");
+        }
+        let own = sockets(pid);
+        let unix = std::fs::read_to_string(format!("/proc/{pid}/net/unix")).unwrap();
+        let is_own = |line: &&str| own.iter().any(|inode| line.split(' ').any(|word| word == inode.to_string()));
+        let own_unix: Vec<&str> = unix.lines().filter(is_own).collect();
+        assert!(own_unix.iter().any(|line| line.ends_with(" /tmp/.X11-unix/X99")), "{user}: {own_unix:?}");
+        assert!(!own_unix.iter().any(|line| line.contains('@')), "{user}: {own_unix:?}");
+        let listens = |one: &procfs::net::TcpNetEntry| own.contains(&one.inode);
+        let process = Process::new(pid).unwrap();
+        let tcp: Vec<_> = process.tcp().unwrap().into_iter().chain(process.tcp6().unwrap()).collect();
+        assert!(!tcp.iter().any(listens), "{user}");
+        client.leave().await;
+        nothing_left(&server, 1).await;
+        assert!(Process::new(pid).is_err() || Process::new(pid).unwrap().stat().is_ok_and(|stat| stat.state == 'Z'));
+    }
+}
+
+/// The X server of a machine, for few clients.
+async fn x_server() -> (tokio::process::Child, String) {
+    let mut command = Command::new("Xvfb");
+    command.args(["-displayfd", "1", "-nolisten", "tcp", "-maxclients", "64"]).kill_on_drop(true);
+    let mut child = command.stdout(std::process::Stdio::piped()).stderr(std::process::Stdio::null()).spawn().unwrap();
+    let mut line = String::new();
+    BufReader::new(child.stdout.take().unwrap()).read_line(&mut line).await.unwrap();
+    (child, format!(":{}", line.trim()))
+}
+
+async fn health(server: &Server) -> (u16, String) {
+    let answer = http::try_get(&server.url("/health")).await.unwrap();
+    (answer.status.as_u16(), answer.text())
+}
+
+#[actix_rt::test]
+async fn a_simulation_that_takes_all_connections_of_a_display_makes_no_server_ill() {
+    let _alone = display::alone().await;
+    let (mut child, name) = x_server().await;
+    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
+    let home: &Path = &webots.path();
+    let builder = simulation_server(home, forge.path(), 1).set("webots", Value::Null).set("display", name.as_str());
+    let server = builder.set("webotsHome", home.parent().unwrap().to_str().unwrap()).start().await;
+    assert_eq!(health(&server).await, (200, "ok".to_owned()));
+    let connect = || x11rb::rust_connection::RustConnection::connect(Some(&name)).ok();
+    let all: Vec<_> = std::iter::from_fn(connect).collect();
+    assert!(all.len() > 50 && connect().is_none(), "{}", all.len());
+    let begin = Instant::now();
+    // Checks are five seconds apart.
+    until("it was checked twice", async || {
+        assert_eq!(health(&server).await, (200, "ok".to_owned()));
+        begin.elapsed() > Duration::from_secs(11)
+    })
+    .await;
+    // One that is gone is noticed all the same.
+    child.kill().await.unwrap();
+    until("it is told", async || health(&server).await.0 == 503).await;
+    let (_, why) = health(&server).await;
+    assert!(why.contains("no display answers at"), "{why}");
+}

@@ -1,0 +1,178 @@
+//! The reserve of the disk: whatever simulations write, it is not used up.
+
+use std::os::unix::fs::PermissionsExt;
+use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::time::Duration;
+
+use nix::sys::statvfs::statvfs;
+
+use super::deeds::as_nobody;
+use crate::simulation::scene::{DEMO, arm, instance_folders, nothing_left};
+use crate::support::client::Client;
+use crate::support::disk::{self, Full};
+use crate::support::git::Forge;
+use crate::support::program::{Builder, Server, simulation_server};
+use crate::support::webots::Webots;
+use crate::support::{http, skip, until};
+
+/// The size of the disk, in MiB; `diskReserve` is as it is by itself.
+const SIZE: u32 = 1024;
+
+/// Many processes with many files each.
+const MANY: &str = "import os, itertools\n\
+                    for one in range(8):\n\
+                    \x20   if os.fork() == 0:\n\
+                    \x20       for number in itertools.count():\n\
+                    \x20           folder = f'{one}-{number // 100}'\n\
+                    \x20           os.makedirs(folder, exist_ok=True)\n\
+                    \x20           with open(f'{folder}/{number}', 'wb') as file: file.write(bytes(65536))\n\
+                    os.wait()";
+
+/// Files without a name, which processes have open; they let nobody see that.
+const NAMELESS: &str = "import ctypes, os, sys\n\
+                        for one in range(8):\n\
+                        \x20   if os.fork() == 0:\n\
+                        \x20       if sys.argv[1:]: ctypes.CDLL(None).prctl(4, 0)\n\
+                        \x20       files = []\n\
+                        \x20       while True:\n\
+                        \x20           files.append(os.open('.', os.O_TMPFILE | os.O_RDWR))\n\
+                        \x20           for piece in range(64): os.write(files[-1], bytes(65536))\n\
+                        os.wait()";
+
+/// The free room of a disk, in bytes.
+fn free(folder: &Path) -> u64 {
+    let disk = statvfs(folder).unwrap();
+    disk.blocks_available() * disk.fragment_size()
+}
+
+/// Notes the least room that a disk has.
+struct Least {
+    bytes: Arc<AtomicU64>,
+    is_over: Arc<AtomicBool>,
+}
+
+impl Least {
+    fn of(folder: &Path) -> Self {
+        let least = Self { bytes: Arc::new(AtomicU64::new(free(folder))), is_over: Arc::default() };
+        let (folder, bytes, is_over) = (folder.to_owned(), Arc::clone(&least.bytes), Arc::clone(&least.is_over));
+        std::thread::spawn(move || {
+            while !is_over.load(Ordering::Relaxed) {
+                bytes.fetch_min(free(&folder), Ordering::Relaxed);
+                std::thread::sleep(Duration::from_millis(1));
+            }
+        });
+        least
+    }
+
+    fn mib(&self) -> u64 {
+        self.bytes.load(Ordering::Relaxed) >> 20
+    }
+}
+
+impl Drop for Least {
+    fn drop(&mut self) {
+        self.is_over.store(true, Ordering::Relaxed);
+    }
+}
+
+/// A server on a disk of its own, whose simulations do what `go` in their project says.
+async fn server(forge: &Forge, webots: &Webots, folder: &Path, change: impl FnOnce(Builder) -> Builder) -> Server {
+    for folder in [forge.path(), webots.path().parent().unwrap()] {
+        std::fs::set_permissions(folder, std::fs::Permissions::from_mode(0o755)).unwrap();
+    }
+    std::fs::set_permissions(folder, std::fs::Permissions::from_mode(0o777)).unwrap();
+    let builder = simulation_server(&webots.path(), forge.path(), 2).folder(folder).set("timing.heartbeat", 0.5);
+    change(builder.set("isolation", "sandbox").set("limits.disk", 1_000_000)).start().await
+}
+
+fn webots() -> Webots {
+    Webots::script(&format!(
+        "{DEMO} \"$@\" &\nuntil [ -e go ]; do sleep 0.05; done\nhead -c 2000000 /dev/zero > own; sh go & wait"
+    ))
+}
+
+/// Starts a simulation, which does this once it is ready. Returns its client.
+async fn doing(server: &Server, deed: &str) -> Client {
+    let before = instance_folders(&server.folder);
+    let mut client = Client::start(server, &arm()).await;
+    client.until("webots:").await;
+    let new = instance_folders(&server.folder).into_iter().find(|folder| !before.contains(folder)).unwrap();
+    std::fs::write(new.join("project/deed"), deed).unwrap();
+    client
+}
+
+/// Lets the deed of the simulation begin that waits for that.
+fn go(server: &Server, line: &str) {
+    for folder in instance_folders(&server.folder) {
+        let go = folder.join("project/go");
+        if !go.exists() {
+            std::fs::write(folder.join("project/new"), line).unwrap();
+            std::fs::rename(folder.join("project/new"), go).unwrap();
+        }
+    }
+}
+
+#[actix_rt::test]
+async fn simulations_never_use_up_the_reserve_of_the_disk() {
+    disk::hide_mounts_from_others();
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::set_permissions(folder.path(), std::fs::Permissions::from_mode(0o755)).unwrap();
+    let small = folder.path().join("small");
+    if !disk::small_disk(&small, SIZE) {
+        return skip("simulations_never_use_up_the_reserve_of_the_disk", "only root may mount a small disk");
+    }
+    let (forge, webots) = (Forge::with_arm(), webots());
+    let mut users = vec![("root", "true")];
+    users.extend(as_nobody().map(|nobody| ("nobody", nobody)));
+    for (user, before) in users {
+        let own = small.join(user);
+        std::fs::create_dir(&own).unwrap();
+        let server = server(&forge, &webots, &own, |builder| builder.before(before)).await;
+        let mut innocent = doing(&server, "").await;
+        go(&server, "true");
+        let mut deeds = vec![("many", MANY, ""), ("nameless", NAMELESS, "")];
+        // Root sees what hides, too.
+        deeds.push(("hidden", NAMELESS, "hidden"));
+        for (name, deed, argument) in deeds {
+            let what = format!("{user}, {name}");
+            let mut client = doing(&server, deed).await;
+            let least = Least::of(&small);
+            go(&server, &format!("python3 deed {argument}"));
+            let told = client.until("loading: Error:").await;
+            assert!(told.contains("is almost full (diskReserve), and the simulation "), "{what}: {told}");
+            let hides = user == "nobody" && name == "hidden";
+            assert_eq!(told.contains("hides which files"), hides, "{what}: {told}");
+            assert_eq!(client.closed().await, Some(1000), "{what}");
+            eprintln!("{what}: {} MiB were left, {told}", least.mib());
+            assert!(least.mib() > 0, "{what}: the reserve was used up");
+            until("there is room again", async || free(&small) >> 20 > 512).await;
+            let is_ready = async || http::get(&server.url("/health")).await.status.as_u16() == 200;
+            until("it is ready again", is_ready).await;
+            innocent.until(".").await;
+        }
+        innocent.leave().await;
+        nothing_left(&server, 2).await;
+    }
+}
+
+#[actix_rt::test]
+async fn no_simulation_ends_where_another_program_fills_the_disk() {
+    disk::hide_mounts_from_others();
+    let folder = tempfile::tempdir().unwrap();
+    if !disk::small_disk(folder.path(), 64) {
+        return skip("no_simulation_ends_where_another_program_fills_the_disk", "only root may mount a small disk");
+    }
+    let (forge, webots) = (Forge::with_arm(), Webots::script(&format!("{DEMO} \"$@\" & wait")));
+    let server = server(&forge, &webots, folder.path(), |builder| builder.set("diskReserve", 8)).await;
+    let mut client = Client::start(&server, &arm()).await;
+    client.until("webots:").await;
+    let _filler = Full::at(folder.path());
+    until("it is full", async || http::try_get(&server.url("/health")).await.unwrap().status.as_u16() == 503).await;
+    // Longer than an end needs to show an effect.
+    for _ in 0..12 {
+        client.until(".").await;
+    }
+    assert!(!server.log().contains("almost full"), "{}", server.log());
+}
