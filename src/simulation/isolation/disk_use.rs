@@ -79,7 +79,8 @@ impl DiskUse {
                 Some(files) => {
                     files.iter().filter(|file| Some(file.dev()) == device).for_each(|file| size.add_nameless(file));
                 }
-                None => self.hides = true,
+                // What runs a sandbox hides, and writes nothing.
+                None => self.hides |= process != self.root,
             }
         }
     }
