@@ -185,7 +185,8 @@ async fn a_viewer_that_does_not_only_look_on_pauses_a_simulation_that_runs_by_it
     let simulator = Simulator::start_with(own_address(), "a.wbt", "--mode=realtime");
     let mut spectator = simulator.spectator().await;
     spectator.until("application/json:").await;
-    simulator.connect(0).await.send("w3d").await;
+    let mut viewer = simulator.connect(0).await;
+    viewer.send("w3d").await;
     spectator.until("pause: ").await;
 }
 

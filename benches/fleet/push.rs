@@ -9,8 +9,6 @@ use std::os::fd::AsRawFd;
 use std::time::{Duration, SystemTime};
 
 use nix::sys::socket::{ControlMessageOwned, MsgFlags, recvmsg, setsockopt, sockopt};
-use time::OffsetDateTime;
-use time::format_description::well_known::Rfc3339;
 
 use super::Verdict;
 use super::server::Server;
@@ -69,7 +67,7 @@ fn decision(server: &Server) -> Duration {
     let log = server.log();
     let line = log.lines().rfind(|line| line.contains("simulation server is available")).expect("a decision");
     let at = line.split(' ').next().expect("a line begins with its time");
-    let at = SystemTime::from(OffsetDateTime::parse(at, &Rfc3339).expect("a time"));
+    let at = humantime::parse_rfc3339(at).expect("a time");
     at.duration_since(SystemTime::UNIX_EPOCH).expect("it is later than 1970")
 }
 

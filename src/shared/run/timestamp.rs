@@ -1,25 +1,20 @@
 //! The time of day, as text and as a number.
 
-use std::num::NonZeroU8;
 use std::time::SystemTime;
 
-use time::OffsetDateTime;
-use time::format_description::well_known::Iso8601;
-use time::format_description::well_known::iso8601::{Config, EncodedConfig, TimePrecision};
+use humantime::{Rfc3339Timestamp, format_rfc3339_millis, format_rfc3339_seconds};
 
-const TO_THE_SECOND: EncodedConfig =
-    Config::DEFAULT.set_time_precision(TimePrecision::Second { decimal_digits: None }).encode();
-const TO_THE_MILLISECOND: EncodedConfig =
-    Config::DEFAULT.set_time_precision(TimePrecision::Second { decimal_digits: NonZeroU8::new(3) }).encode();
+/// The end of the year 9999, in seconds since 1970.
+const END: u64 = 253_402_300_800;
 
-/// Formats a time as RFC 3339 in UTC, to the second. Empty for a time out of the calendar's range.
+/// Formats a time as RFC 3339 in UTC, to the second. Empty for a time before 1970 or after 9999.
 pub fn timestamp(time: SystemTime) -> String {
-    text::<TO_THE_SECOND>(time).unwrap_or_default()
+    text(time, format_rfc3339_seconds)
 }
 
-/// Formats a time as RFC 3339 in UTC, to the millisecond. Empty for a time out of the calendar's range.
+/// Formats a time as RFC 3339 in UTC, to the millisecond. Empty for a time before 1970 or after 9999.
 pub fn timestamp_in_milliseconds(time: SystemTime) -> String {
-    text::<TO_THE_MILLISECOND>(time).unwrap_or_default()
+    text(time, format_rfc3339_millis)
 }
 
 /// Returns the current time in seconds since 1970-01-01 UTC.
@@ -27,10 +22,10 @@ pub fn seconds_since_1970() -> u64 {
     SystemTime::UNIX_EPOCH.elapsed().map_or(0, |age| age.as_secs())
 }
 
-fn text<const CONFIG: EncodedConfig>(time: SystemTime) -> Option<String> {
-    let since_1970 = time.duration_since(SystemTime::UNIX_EPOCH).ok()?;
-    let nanoseconds = i128::try_from(since_1970.as_nanos()).ok()?;
-    OffsetDateTime::from_unix_timestamp_nanos(nanoseconds).ok()?.format(&Iso8601::<CONFIG>).ok()
+fn text(time: SystemTime, format: fn(SystemTime) -> Rfc3339Timestamp) -> String {
+    // humantime panics outside of these.
+    let has_text = time.duration_since(SystemTime::UNIX_EPOCH).is_ok_and(|since| since.as_secs() < END);
+    if has_text { format(time).to_string() } else { String::new() }
 }
 
 #[cfg(test)]
@@ -50,5 +45,8 @@ mod tests {
     fn times_out_of_the_calendar_are_nothing() {
         assert_eq!(timestamp(SystemTime::UNIX_EPOCH + Duration::from_secs(1 << 50)), "");
         assert_eq!(timestamp(SystemTime::UNIX_EPOCH - Duration::from_secs(1)), "");
+        let end = SystemTime::UNIX_EPOCH + Duration::from_secs(END);
+        assert_eq!(timestamp(end), "");
+        assert_eq!(timestamp_in_milliseconds(end - Duration::from_nanos(1)), "9999-12-31T23:59:59.999Z");
     }
 }

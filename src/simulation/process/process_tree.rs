@@ -46,7 +46,6 @@ pub fn children(pid: i32) -> Vec<i32> {
 ///
 /// It looks until it has found none twice in a row: a process may have forked meanwhile, and one that is just executing
 /// another program has no environment for a moment. Blocks for 5 ms at least, for some seconds at most.
-#[expect(clippy::must_use_candidate, reason = "most callers want what it does, not how many there were")]
 pub fn kill_marked(folder: &Path) -> usize {
     let mut known = HashSet::new();
     let mut found_none = false;
