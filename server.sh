@@ -85,6 +85,8 @@ prepare() { # NAME
         # The demo simulator needs no display.
         [[ $(setting "$server" webots) != */demo-simulator ]] || remarks=$(grep -v '^warning: display: ' <<<"$remarks")
         grep '^warning: ' <<<"$remarks" >&2 || true
+        # What worlds may do here, which depends on the packages of the machine.
+        grep -E '^(isolation|network): ' <<<"$remarks" || true
     done
 }
 

@@ -13,13 +13,19 @@ command -v cargo >/dev/null || {
 # Debian has web servers where only root looks for programs.
 PATH=$PATH:/usr/sbin
 # The C compiler links the programs; python3 and openssl make counterparts for mail and TLS; xvfb gives a display,
-# bubblewrap sandboxes; the fleet is tested behind both web servers, by a real browser too, and its package and the guide
+# bubblewrap sandboxes, pasta networks for them; the fleet is tested behind both web servers, by a real browser too, and its package and the guide
 # to it in a Debian that debootstrap makes; nft loads the packet filter; promtool reads the alerts, dnsmasq leads to simulation servers, and kubectl
 # puts what is for Kubernetes together.
 tests/install.sh cc=gcc,libc6-dev git=git git-lfs=git-lfs flock=util-linux openssl=openssl python3=python3 python3-venv=python3-venv \
-    Xvfb=xvfb bwrap=bubblewrap apache2=apache2-bin nginx=nginx setpriv=util-linux chromium=chromium \
+    Xvfb=xvfb bwrap=bubblewrap pasta=passt apache2=apache2-bin nginx=nginx setpriv=util-linux chromium=chromium \
     debootstrap=debootstrap dpkg-shlibdeps=dpkg-dev desktop-file-validate=desktop-file-utils xhost=x11-xserver-utils \
     systemd-analyze=systemd ip=iproute2 nft=nftables promtool=prometheus dnsmasq=dnsmasq-base kubectl=kubernetes-client
+# udev makes it so; a machine without udev may have it for root alone, or not at all.
+if ((EUID == 0)) && [[ ! -c /dev/net/tun || $(stat --format=%a /dev/net/tun) != 666 ]]; then
+    echo 'lets everybody open /dev/net/tun, as udev does'
+    mkdir -p /dev/net
+    { [[ -c /dev/net/tun ]] || mknod /dev/net/tun c 10 200; } && chmod 666 /dev/net/tun || echo 'that failed' >&2
+fi
 # dockerd would begin to run on a machine that has not asked for it.
 [[ -z ${CI-} ]] || tests/install.sh dockerd=docker.io iptables=iptables docker-compose=docker-compose
 # Most tests wait most of the time, for servers and timers.

@@ -1,10 +1,12 @@
 //! How long a class takes that starts at once, beside a bare loop that does the same without a server.
 //!
 //! The bare loop runs what the server has run for one simulation: `git checkout` of the cached commit, then the command line of
-//! that simulation (bubblewrap and the demo simulator) in folders of its own, until it listens on its port. Beside a single
+//! that simulation (pasta, bubblewrap and the demo simulator) in folders of its own, until it listens on its port, or answers
+//! there where pasta forwards it. Beside a single
 //! start it also runs the two commands of git that find the commit, which a class runs once for all.
 
 use std::ffi::{OsStr, OsString};
+use std::io::{Read, Write};
 use std::net::TcpStream;
 use std::os::unix::ffi::{OsStrExt, OsStringExt};
 use std::path::PathBuf;
@@ -16,7 +18,7 @@ use procfs::process::Process;
 use crate::Verdict;
 use crate::support::client::Client;
 use crate::support::git::{Forge, arm};
-use crate::support::program::{Server, simulation_server};
+use crate::support::program::{Builder, Server, simulation_server};
 use crate::support::{SOON, http, until};
 
 /// How many times as long as the bare loop a class of 200 may take.
@@ -52,10 +54,19 @@ pub async fn measure(verdict: &mut Verdict, levels: &[String], sizes: &[u16], ro
     }
 }
 
-/// A server with 200 places at a level.
+/// A server with 200 places at a level; `own` is a sandbox with a network of its own.
 pub async fn server(forge: &Forge, level: &str) -> Server {
     let demo = std::path::Path::new(env!("CARGO_BIN_EXE_demo-simulator"));
-    simulation_server(demo, forge.path(), 200).set("isolation", level).start().await
+    at_level(simulation_server(demo, forge.path(), 200), level).start().await
+}
+
+/// A server at a level.
+pub fn at_level(builder: Builder, level: &str) -> Builder {
+    match level {
+        "own" => builder.set("isolation", "sandbox").set("sandbox.network", "own"),
+        "sandbox" => builder.set("isolation", "sandbox").set("sandbox.network", "shared"),
+        level => builder.set("isolation", level),
+    }
 }
 
 /// So many clients that are ready.
@@ -92,6 +103,8 @@ struct Bare {
     /// The folder of that simulation, and its port.
     instance: PathBuf,
     port: u16,
+    /// The files in that folder: a packet filter, a filter of system calls, and so on.
+    files: Vec<(OsString, Vec<u8>)>,
     /// The repository of the forge, the cached one, and the reference of the commit in it.
     remote: PathBuf,
     repository: PathBuf,
@@ -104,17 +117,30 @@ impl Bare {
         let clients = ready(server, 1).await;
         let shown = http::get(&server.url("/status")).await.json()["simulations"][0].clone();
         let process = Process::new(shown["pid"].as_i64().unwrap().try_into().unwrap()).unwrap();
-        let environment: Vec<_> = process.environ().unwrap().into_iter().collect();
+        // pasta hides its environment, which is that of its children.
+        let environment = tree(process.pid()).into_iter().find_map(|pid| Process::new(pid).ok()?.environ().ok());
+        let environment: Vec<_> = environment.unwrap().into_iter().collect();
         let mark = environment.iter().find(|(name, _)| name == "WEBOTS_FLEET_INSTANCE").unwrap().1.clone();
         let line = std::fs::read(format!("/proc/{}/cmdline", process.pid())).unwrap();
         let words = line.strip_suffix(b"\0").unwrap().split(|byte| *byte == 0);
         let repositories = std::fs::read_dir(server.cache().join("git")).unwrap().flatten();
         let repository = repositories.map(|entry| entry.path()).find(|path| path.is_dir()).unwrap();
         let commit = std::fs::read_dir(repository.join("refs/fleet")).unwrap().flatten().next().unwrap().file_name();
+        let mut command: Vec<OsString> = words.map(|word| OsStr::from_bytes(word).to_owned()).collect();
+        let instance = PathBuf::from(mark);
+        if command[0].to_string_lossy().ends_with("/bwrap") {
+            // The shell that has opened this file has become bubblewrap.
+            let filter = instance.join("system-calls").into();
+            let words = ["/bin/sh", "-c", "exec \"$@\" 3<\"$0\""].map(OsString::from);
+            command = words.into_iter().chain([filter]).chain(command).collect();
+        }
+        let plain = std::fs::read_dir(&instance).unwrap().flatten().filter(|one| one.file_type().unwrap().is_file());
+        let files = plain.map(|one| (one.file_name(), std::fs::read(one.path()).unwrap())).collect();
         let bare = Self {
-            command: words.map(|word| OsStr::from_bytes(word).to_owned()).collect(),
+            command,
             environment,
-            instance: mark.into(),
+            instance,
+            files,
             port: shown["port"].as_u64().unwrap().try_into().unwrap(),
             remote,
             repository,
@@ -147,7 +173,7 @@ impl Bare {
             }
             for number in started.iter().take(usize::from(size)) {
                 let deadline = begin + SOON;
-                while TcpStream::connect(("127.0.0.1", self.port + number)).is_err() {
+                while !self.is_ready(self.port + number) {
                     assert!(Instant::now() < deadline, "simulation {number} does not listen");
                     std::thread::sleep(BETWEEN_LOOKS);
                 }
@@ -156,6 +182,14 @@ impl Bare {
             end.wait();
             time
         })
+    }
+
+    /// pasta accepts connections before anything listens inside.
+    fn is_ready(&self, port: u16) -> bool {
+        let Ok(mut stream) = TcpStream::connect(("127.0.0.1", port)) else { return false };
+        let mut answer = [0; 5];
+        !self.command[0].to_string_lossy().ends_with("/pasta")
+            || stream.write_all(b"GET /robots.txt HTTP/1.0\r\n\r\n").is_ok() && stream.read_exact(&mut answer).is_ok()
     }
 
     /// Finds the commit of the branch, and the world in it.
@@ -181,6 +215,9 @@ impl Bare {
         let folder = self.folder(number);
         for name in ["project", "home", "run", "tmp"] {
             std::fs::create_dir_all(folder.join(name)).unwrap();
+        }
+        for (name, content) in &self.files {
+            std::fs::write(folder.join(name), content).unwrap();
         }
         let mut work_tree = OsString::from("--work-tree=");
         work_tree.push(folder.join("project"));
@@ -213,6 +250,18 @@ impl Bare {
             .spawn()
             .unwrap()
     }
+}
+
+/// A process and all that descends from it.
+fn tree(root: i32) -> Vec<i32> {
+    let children = |pid: i32| std::fs::read_to_string(format!("/proc/{pid}/task/{pid}/children")).unwrap_or_default();
+    let mut found = vec![root];
+    let mut next = 0;
+    while let Some(pid) = found.get(next).copied() {
+        found.extend(children(pid).split_whitespace().map(|child| child.parse::<i32>().unwrap()));
+        next += 1;
+    }
+    found
 }
 
 fn replaced(text: &[u8], old: &[u8], new: &[u8]) -> Vec<u8> {

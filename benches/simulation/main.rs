@@ -6,6 +6,8 @@
 //! - `idle`: what simulations that stand idle cost the server;
 //! - `late`: how long it takes until a limit is noticed that the server keeps itself;
 //! - `start`: what a cached start costs over the git commands that it runs, and what a sandbox adds to it;
+//! - `stream`: how fast a stream is through a network of its own, beside the machine's, one and a hundred at once, and what
+//!   memory pasta takes; needs an ordinary user, as level `own` does anywhere;
 //! - `containers`: what a start in containers takes beside `docker compose up` by hand, one and thirty at once; needs root
 //!   and dockerd;
 //! - `soak`: whether a thousand starts and stops in a row leave anything: processes, file descriptors, ports, folders,
@@ -32,6 +34,7 @@ mod load;
 #[path = "../../tests/simulation/soak.rs"]
 mod soak;
 mod start;
+mod stream;
 #[path = "../../tests/support/mod.rs"]
 mod support;
 
@@ -54,16 +57,18 @@ struct Arguments {
     /// Cached starts for `start`.
     #[arg(long, default_value_t = 100)]
     cached: usize,
-    /// How many start at once in `class`, in place of 1, 10, 100 and 200, or run in `late`, in place of 10 and 100.
+    /// How many start at once in `class`, in place of 1, 10, 100 and 200, or run in `late`, in place of 10 and 100, or in
+    /// `stream`, in place of 1 and 100.
     #[arg(long)]
     size: Vec<u16>,
-    /// Levels of isolation for `class`, `idle` and `late`, in place of `none` and `sandbox`.
+    /// Levels of isolation for `class`, `idle` and `late`, in place of `none` and `sandbox`. `own` is a sandbox with a network
+    /// of its own.
     #[arg(long)]
     level: Vec<String>,
     /// Rounds of each row of `class`.
     #[arg(long, default_value_t = 5)]
     rounds: usize,
-    /// Seconds of each row of `idle`.
+    /// Seconds of each row of `idle` and `stream`.
     #[arg(long, default_value_t = 20)]
     seconds: u64,
     /// cargo adds this.
@@ -78,6 +83,7 @@ enum Part {
     Late,
     Load,
     Start,
+    Stream,
     Containers,
     Soak,
 }
@@ -125,6 +131,9 @@ async fn main() -> ExitCode {
     }
     if is_wanted(Part::Late) {
         late::measure(&levels, &arguments.size).await;
+    }
+    if is_wanted(Part::Stream) {
+        stream::measure(&arguments.size, Duration::from_secs(arguments.seconds)).await;
     }
     if is_wanted(Part::Containers) {
         containers::measure(&mut verdict).await;

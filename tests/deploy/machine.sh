@@ -21,7 +21,7 @@ WORK=${SCRIPT##*/}
 readonly WORK=$DEPLOY/${WORK%.sh}
 readonly PACKAGES=systemd,systemd-sysv,libpam-systemd,dbus,dbus-user-session,sudo,adduser,ca-certificates,openssl,curl
 # What is installed later, in machines that can't reach the internet.
-readonly LATER=(git git-lfs bubblewrap xvfb ufw nginx apache2 certbot needrestart nftables)
+readonly LATER=(git git-lfs bubblewrap xvfb ufw nginx apache2 certbot needrestart nftables passt)
 
 fail() {
     printf 'error: %s\n' "$*" >&2

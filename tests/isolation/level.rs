@@ -54,6 +54,30 @@ async fn a_sandbox_that_is_demanded_and_can_not_be_had_refuses_the_start_in_one_
 }
 
 #[actix_rt::test]
+async fn a_network_that_is_demanded_and_can_not_be_had_refuses_the_start_in_one_line() {
+    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
+    let (none, failing) = (programs(None), programs(Some("exit 1")));
+    let server = || simulation_server(&webots.path(), forge.path(), 1).set("sandbox.network", "closed");
+    let mut table = vec![
+        (with(server(), &none, "auto"), "closed\", but bubblewrap (bwrap) is not there"),
+        (with(server(), &failing, "auto"), "closed\", but bubblewrap makes no sandbox here"),
+    ];
+    if nix::unistd::getuid().is_root() {
+        table.push((
+            server(),
+            "closed\", but pasta gives none to root, run the server as a user of its own; \"shared\"",
+        ));
+    }
+    for (builder, words) in table {
+        let mut server = builder.spawn();
+        assert_eq!(server.ended().await, Some(1));
+        let log = server.log();
+        let told: Vec<&str> = log.lines().filter(|line| line.starts_with("error: ")).collect();
+        assert!(told.len() == 1 && told[0].contains(words), "{log}");
+    }
+}
+
+#[actix_rt::test]
 async fn where_no_sandbox_can_be_had_auto_falls_back_with_a_warning_on_log_and_monitor_page() {
     let (forge, webots) = (Forge::with_arm(), Webots::launcher());
     let programs = programs(Some("echo 'bwrap: No permissions' >&2; exit 1"));
@@ -127,6 +151,12 @@ async fn a_level_that_can_not_be_is_refused_in_one_line() {
         ),
         (sandbox(json!({"readable": "/"})), "sandbox.readable: \"/\" can't be shown"),
         (sandbox(json!({"writable": ["/srv", "/proc/self/.."]})), "sandbox.writable: \"/proc/self/..\" can't be shown"),
+        (sandbox(json!({"network": "open"})), "unknown variant `open`"),
+        (
+            sandbox(json!({"network": "closed"})).set("isolation", "none"),
+            "sandbox.network: networks of simulations' own",
+        ),
+        (containers(1).set("sandbox", json!({"network": "own"})), "sandbox.network: networks of simulations' own"),
         (containers(1).set("maxConnections", 501), "allowed are up to 500 places"),
         (containers(1).set("port", 64_990).set("maxConnections", 100), "editors up to port 65535"),
         (containers(1).set("container", json!({ "network": "open" })), "unknown variant `open`"),

@@ -219,15 +219,8 @@ impl Launcher {
     }
 
     /// Whether simulations reach private addresses from networks of their own, since no packet filter can be loaded there.
-    #[must_use]
-    pub fn reaches_private_addresses(&self) -> bool {
+    fn reaches_private_addresses(&self) -> bool {
         matches!(&self.method, Method::Sandbox(sandbox) if sandbox.network().is_some_and(|one| !one.is_filtered()))
-    }
-
-    /// Why simulations share the network of the machine although the configuration does not say so, if they do.
-    #[must_use]
-    pub fn why_shared(&self) -> Option<&str> {
-        self.why_shared.as_deref()
     }
 
     /// The address of the machine on which the port of each simulation is forwarded, if each has a network of its own.
