@@ -13,6 +13,7 @@ pub mod listener;
 pub mod name_server;
 pub mod ports;
 pub mod program;
+pub mod receiver;
 pub mod relay;
 pub mod smtp;
 pub mod stand_in;

@@ -1,11 +1,11 @@
 //! The time of day, as text and as a number.
 
 use std::num::NonZeroU8;
-use std::time::SystemTime;
+use std::time::{Duration, SystemTime};
 
 use time::OffsetDateTime;
-use time::format_description::well_known::Iso8601;
 use time::format_description::well_known::iso8601::{Config, EncodedConfig, TimePrecision};
+use time::format_description::well_known::{Iso8601, Rfc3339};
 
 const TO_THE_SECOND: EncodedConfig =
     Config::DEFAULT.set_time_precision(TimePrecision::Second { decimal_digits: None }).encode();
@@ -20,6 +20,12 @@ pub fn timestamp(time: SystemTime) -> String {
 /// Formats a time as RFC 3339 in UTC, to the millisecond. Empty for a time out of the calendar's range.
 pub fn timestamp_in_milliseconds(time: SystemTime) -> String {
     text::<TO_THE_MILLISECOND>(time).unwrap_or_default()
+}
+
+/// Reads a time as RFC 3339: `2026-12-31T12:00:00Z`, or with an offset, `2026-12-31T13:00:00+01:00`.
+pub fn read_timestamp(text: &str) -> Option<SystemTime> {
+    let nanoseconds = OffsetDateTime::parse(text, &Rfc3339).ok()?.unix_timestamp_nanos();
+    SystemTime::UNIX_EPOCH.checked_add(Duration::from_nanos(u64::try_from(nanoseconds).ok()?))
 }
 
 /// Returns the current time in seconds since 1970-01-01 UTC.
