@@ -14,5 +14,6 @@ mod one_door;
 mod pages;
 mod trust;
 mod urls;
+mod users;
 mod visitor;
 mod whole_way;
