@@ -50,11 +50,11 @@ fn main() {
 
 fn rendering() {
     let (fleet, urls) = (fleet(), ClientUrls { ssl: false, public: None });
-    let page = pages::monitor(&fleet, 1000, &urls, SystemTime::now()).unwrap();
+    let page = pages::monitor(&fleet, 1000, &urls, SystemTime::now(), (None, true)).unwrap();
     let mut times: Vec<Duration> = (0..50)
         .map(|_| {
             let begun = Instant::now();
-            std::hint::black_box(pages::monitor(&fleet, 1000, &urls, SystemTime::now()).unwrap());
+            std::hint::black_box(pages::monitor(&fleet, 1000, &urls, SystemTime::now(), (None, true)).unwrap());
             begun.elapsed()
         })
         .collect();

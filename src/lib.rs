@@ -10,7 +10,8 @@
 //! | [`shared::run`] | start, readiness, log, stop |
 //! | [`shared::http`] | pages, live updates, WebSockets, limits, certificates, metrics |
 //! | [`session::placement`] | which server gets the next client |
-//! | [`session::mail`] | mail to the administrator |
+//! | `session::announcements` | what the administrator tells everybody |
+//! | [`session::mail`] | notices to the administrator, by mail and by webhook |
 //! | [`session::fleet`] | the registry and the monitors of simulation servers |
 //! | [`session::web`] | paths, pages and the WebSocket of the session server |
 //! | [`simulation::process`] | process trees and folders of simulations |
@@ -25,7 +26,7 @@
 //!
 //! Each server also has a folder `config` (every key), its `app` (start and end) and its `state` (what its paths share). Files
 //! of `simulation` are the wire [`protocol`](simulation::protocol), the [`places`](simulation::places) that clients wait for,
-//! the `snapshot` of them, the `simulation_id`, the `failed_starts`, the `announcer` (key `notify`), `preflight` (`--check`) and `readiness` (`/health`).
+//! the `snapshot` of them, the `simulation_id`, `who` a client is, the `failed_starts`, the `announcer` (key `notify`), `preflight` (`--check`) and `readiness` (`/health`).
 //! The programs are in `src/bin`.
 //! Imports point down only, in the order that `tests/project/layering.rs` lists. `session` and `simulation` never see each
 //! other. A child never names its parent: it is given a `Recipient` of its events, which are defined in the child's file.

@@ -19,7 +19,7 @@ struct Arguments {
     config: PathBuf,
     #[command(flatten)]
     options: start::Options,
-    /// Send one mail to the administrator, say how it went, and end
+    /// Send one mail to the administrator, and a test to the webhook if there is one, say how it went, and end
     #[arg(long, conflicts_with = "check")]
     test_mail: bool,
 }
@@ -42,17 +42,22 @@ fn main() -> ExitCode {
     start::serve(target, &arguments.options, &loaded.warnings, server)
 }
 
-/// Sends one mail to the administrator and says how that went.
+/// Sends one mail to the administrator, and a test to the webhook if there is one, and says how that went.
 fn test_mail(config: &SessionConfig) -> ExitCode {
-    match actix_rt::System::new().block_on(mail::test_mail(config)) {
-        Ok(how) => {
+    let system = actix_rt::System::new();
+    let webhook = config.webhook.is_some().then(|| system.block_on(mail::test_webhook(config)));
+    let has_mail = config.administrator.is_some() || webhook.is_none();
+    let mail = has_mail.then(|| system.block_on(mail::test_mail(config)));
+    let mut code = ExitCode::SUCCESS;
+    for result in [mail, webhook].into_iter().flatten() {
+        match result {
             // The reader may have gone.
-            writeln!(std::io::stdout(), "{how}").ok();
-            ExitCode::SUCCESS
-        }
-        Err(error) => {
-            eprintln!("error: {error}");
-            ExitCode::from(start::FAILED)
+            Ok(how) => drop(writeln!(std::io::stdout(), "{how}")),
+            Err(error) => {
+                eprintln!("error: {error}");
+                code = ExitCode::from(start::FAILED);
+            }
         }
     }
+    code
 }

@@ -9,12 +9,14 @@ use actix::prelude::*;
 use actix_web::{App, web};
 use tokio::sync::watch;
 
+use super::announcements::Announcements;
 use super::config::SessionConfig;
 use super::state::AppState;
 use crate::session::fleet::{Ping, Reconfigure, Registry, resolver};
-use crate::session::mail;
+use crate::session::mail::{self, Way};
 use crate::session::web::configure;
 use crate::shared::config;
+use crate::shared::http::BasicAuth;
 use crate::shared::http::Connections;
 use crate::shared::http::Live;
 use crate::shared::http::Metrics;
@@ -61,7 +63,7 @@ pub async fn run(mut config: SessionConfig, file: PathBuf) -> Result<(), AppErro
     let registry = server.registry.clone();
     actix_rt::spawn(notify::feed_watchdog(async move || registry.send(Ping).await.is_ok()));
     tokio::select! {
-        () = obey(&mut signals, &file, &server.registry, port) => {}
+        () = obey(&mut signals, &file, &server, port) => {}
         fault = permanent::stopped("Registry", server.registry.clone()) => return Err(AppError::ActorStopped(fault)),
     }
     log::info!("stopping");
@@ -75,13 +77,13 @@ pub async fn run(mut config: SessionConfig, file: PathBuf) -> Result<(), AppErro
 }
 
 /// Does what signals ask for, until one asks for the end.
-async fn obey(signals: &mut Signals, file: &Path, registry: &Addr<Registry>, port: u16) {
+async fn obey(signals: &mut Signals, file: &Path, server: &AppState, port: u16) {
     loop {
         match signals.next().await {
             Request::Stop => return,
             Request::Reload => {
                 notify::reloading();
-                reload(file, registry);
+                reload(file, server);
                 notify::ready(port);
             }
             Request::Drain => log::info!("SIGUSR1 changes nothing here: simulation servers are drained"),
@@ -138,12 +140,14 @@ fn assemble(
     for outcome in OUTCOMES {
         picks.with_label_values(&[outcome]).reset();
     }
-    let mailer = mail::start(&config);
+    let mailers = Way::ALL.into_iter().filter_map(|way| Some((way, mail::start(&config, way)?))).collect();
     let (timing, client_urls) = (config.timing.clone(), config.client_urls());
     let trusted_proxies = config.trusted_proxies.clone();
     let (examples, viewer_script) = (config.examples.clone(), config.viewer_script.clone());
+    let announcements = Arc::new(Announcements::start(config.announcement.clone()));
+    let admin_auth = config.admin_password.clone().map(BasicAuth::new);
     let (available_sender, available) = watch::channel(false);
-    let registry = Registry::new(Arc::new(config), mailer, latencies, (resolver()?, available_sender)).start();
+    let registry = Registry::new(Arc::new(config), mailers, latencies, (resolver()?, available_sender)).start();
     let (started, started_at) = (Instant::now(), SystemTime::now());
     Ok(AppState {
         registry,
@@ -156,6 +160,8 @@ fn assemble(
         metrics,
         picks,
         live: Live::default(),
+        announcements,
+        admin_auth,
         examples,
         viewer_script,
         started,
@@ -164,7 +170,7 @@ fn assemble(
 }
 
 /// Reads the configuration file again. One that can't be used changes nothing.
-fn reload(file: &Path, registry: &Addr<Registry>) {
+fn reload(file: &Path, server: &AppState) {
     match config::load::<SessionConfig>(file) {
         Ok(loaded) => {
             for warning in &loaded.warnings {
@@ -172,7 +178,8 @@ fn reload(file: &Path, registry: &Addr<Registry>) {
             }
             let entries = loaded.config.simulation_servers.len();
             log::info!("read {} again: {entries} entries in simulationServers", file.display());
-            registry.do_send(Reconfigure(Arc::new(loaded.config)));
+            server.announcements.reconfigure(loaded.config.announcement.clone());
+            server.registry.do_send(Reconfigure(Arc::new(loaded.config)));
         }
         Err(error) => log::error!("the configuration stays as it was: {error}"),
     }

@@ -1,5 +1,6 @@
 //! The session server: the one door to a fleet of simulation servers.
 
+mod announcements;
 pub mod app;
 pub mod config;
 pub mod fleet;

@@ -1,14 +1,17 @@
 //! The state that the routes, the pages and the web clients of a session server share. `app` makes it.
 
+use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
 use actix::prelude::*;
 use tokio::sync::watch;
 
+use super::announcements::Announcements;
 use super::config::{Example, Timing};
 use crate::session::fleet::Registry;
 use crate::session::fleet::{NoServer, Pick};
 use crate::shared::domain::ClientUrls;
+use crate::shared::http::BasicAuth;
 use crate::shared::http::Live;
 use crate::shared::http::Metrics;
 use crate::shared::http::TrustedProxies;
@@ -38,6 +41,10 @@ pub struct AppState {
     pub picks: prometheus::IntCounterVec,
     /// The open monitor pages.
     pub live: Live,
+    /// What the administrator tells everybody.
+    pub announcements: Arc<Announcements>,
+    /// Checks the administrator's password, where one is configured.
+    pub admin_auth: Option<BasicAuth>,
     /// The examples on the page `/viewer`.
     pub examples: Vec<Example>,
     /// URL of Webots' own viewer.

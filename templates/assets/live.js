@@ -209,8 +209,15 @@ function rest() {
 }
 
 document.querySelectorAll('table:has(th[data-sort])').forEach(makeSortable);
-for (const field of document.querySelectorAll('[data-filter]'))
-  field.addEventListener('input', () => filter(document.getElementById(field.dataset.filter)));
+for (const field of document.querySelectorAll('[data-filter]')) {
+  field.addEventListener('input', () => {
+    filter(document.getElementById(field.dataset.filter));
+    // A list that has become short would end above what is seen.
+    const section = field.closest('section');
+    if (section.getBoundingClientRect().top < 0)
+      section.scrollIntoView();
+  });
+}
 showTimes(document);
 document.addEventListener('visibilitychange', () => (document.hidden ? rest() : listen()));
 addEventListener('pagehide', rest);

@@ -31,4 +31,5 @@ mod one_door;
 mod pages;
 mod trust;
 mod urls;
+mod users;
 mod whole_way;

@@ -9,6 +9,8 @@ pub enum Rules {
     Apache,
     /// `deploy/nginx.conf`
     Nginx,
+    /// The same with `deploy/nginx-users.conf`, and oauth2-proxy on this port.
+    NginxWithUsers(u16),
     /// The documents' page on a machine with a session server: every port of the machine, and three pages.
     Documents,
 }
@@ -29,13 +31,13 @@ pub struct Place<'a> {
 
 impl Rules {
     pub fn kind(self) -> Kind {
-        if self == Self::Nginx { Kind::Nginx } else { Kind::Apache }
+        if matches!(self, Self::Nginx | Self::NginxWithUsers(_)) { Kind::Nginx } else { Kind::Apache }
     }
 
     /// Where a client finds the session server's door.
     pub fn session_path(self, session: u16, path: &str) -> String {
         match self {
-            Self::Apache | Self::Nginx => path.to_owned(),
+            Self::Apache | Self::Nginx | Self::NginxWithUsers(_) => path.to_owned(),
             Self::Documents => format!("/{session}{path}"),
         }
     }
@@ -65,6 +67,12 @@ impl Rules {
                     ("192.0.2.3", "127.0.0.2"),
                 ],
             ),
+            Self::NginxWithUsers(port) => {
+                let own = "4180";
+                let users = adapt(include_str!("../../deploy/nginx-users.conf"), &[(own, &port.to_string())]);
+                let last = "  proxy_set_header Forwarded \"\";\n";
+                adapt(&Self::Nginx.text(place), &[(last, &format!("{last}{users}"))])
+            }
             Self::Nginx => adapt(
                 include_str!("../../deploy/nginx.conf"),
                 &[

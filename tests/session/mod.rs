@@ -2,6 +2,7 @@
 
 mod stand_in;
 
+mod announcing;
 mod discovery;
 mod door;
 mod mail;
@@ -12,6 +13,7 @@ mod pushing;
 mod seeing;
 mod stopping;
 mod watching;
+mod webhook;
 
 use crate::support::program::Server;
 use crate::support::{http, until};

@@ -15,6 +15,7 @@ pub mod name_server;
 pub mod page;
 pub mod ports;
 pub mod program;
+pub mod receiver;
 pub mod relay;
 pub mod smtp;
 pub mod stand_in;

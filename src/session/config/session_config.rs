@@ -6,6 +6,7 @@ use std::time::Duration;
 use lettre::message::Mailbox;
 use serde::{Deserialize, Serialize};
 
+use super::announcement::Announcement;
 use super::example::Example;
 use super::mail_address;
 use super::server_entry::ServerEntry;
@@ -68,6 +69,15 @@ pub struct SessionConfig {
     /// Password for SMTP. With a password the connection is always encrypted. Default: none.
     #[serde(default)]
     pub mail_sender_password: Option<Secret>,
+    /// URL to which each mail's notices are posted as JSON, `{"text": ...}`, as Slack and Matrix take them. Default: none.
+    #[serde(default)]
+    pub webhook: Option<Secret>,
+    /// What open viewers and the monitor tell everybody: `{"text": ..., "until": ...}`. Default: none.
+    #[serde(default)]
+    pub announcement: Option<Announcement>,
+    /// Password for actions such as `/announcement`. Default: none, and actions are off.
+    #[serde(default)]
+    pub admin_password: Option<Secret>,
     /// Folder of `session/output.log`. Default: `log`.
     #[serde(default = "default_log_dir", deserialize_with = "folder")]
     pub log_dir: ExpandedPath,
@@ -114,7 +124,10 @@ const LONGEST_STOP: Duration = Duration::from_millis(4500);
 const SETTLING: Duration = Duration::from_secs(8);
 
 /// The keys that take effect when the configuration is read again.
-const RELOADED: [&str; 7] = [
+const RELOADED: [&str; 10] = [
+    "announcement",
+    "announcement.text",
+    "announcement.until",
     "simulationServers",
     "drainedServers",
     "loadThreshold",
@@ -224,6 +237,16 @@ impl Configuration for SessionConfig {
         {
             let problem = format!("{script} is no URL of a web server; allowed are http and https");
             return Err(InvalidValue { key: "viewerScript", problem });
+        }
+        self.webhook = self.webhook.take().filter(|url| !url.reveal().is_empty());
+        let is_web = |url: &url::Url| url.has_host() && matches!(url.scheme(), "http" | "https");
+        if self.webhook.as_ref().is_some_and(|url| !url::Url::parse(url.reveal()).is_ok_and(|url| is_web(&url))) {
+            // The text itself is a secret.
+            let problem = "it is no URL of a web server; allowed are http and https".to_owned();
+            return Err(InvalidValue { key: "webhook", problem });
+        }
+        if self.announcement.as_ref().is_some_and(Announcement::is_over) {
+            warnings.push("announcement is over: it is not shown".to_owned());
         }
         self.mail_server = self.mail_server.take().filter(|host| !host.is_empty());
         if let Some(host) = self.mail_server.as_deref().filter(|host| !mail_address::is_host(host)) {

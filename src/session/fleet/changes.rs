@@ -10,28 +10,26 @@ use super::fleet_status::{State, StateChange};
 use super::names::Turn;
 use super::server_record::{Change, ServerRecord};
 use crate::session::config::{DnsName, SessionConfig};
-use crate::session::mail::{self, Event, Mailer, Notice, Topic};
+use crate::session::mail::{self, Event, Mailer, Notice, Topic, Way};
 use crate::shared::domain::PublicAddress;
 use crate::shared::run::{Supervisor, TooManyPanics};
 
 /// The last changes, and the mailer that tells the administrator.
 pub struct Changes {
     recent: VecDeque<StateChange>,
-    /// One, or none where mails are off.
-    mailers: Supervisor<&'static str, Mailer>,
+    /// One for each way on which notices go.
+    mailers: Supervisor<Way, Mailer>,
 }
 
-/// What the mailer is for.
-const MAILS: &str = "notices";
 /// How many changes are kept.
 const KEPT: usize = 50;
 
 impl Changes {
-    /// No changes yet; notices go to this actor.
-    pub fn new(mailer: Option<Addr<Mailer>>) -> Self {
-        let mut mailers = Supervisor::new("mailer of");
-        if let Some(mailer) = mailer {
-            mailers.add(MAILS, mailer);
+    /// No changes yet; notices go to these actors.
+    pub fn new(all: Vec<(Way, Addr<Mailer>)>) -> Self {
+        let mut mailers = Supervisor::new("mailer of notices by");
+        for (way, mailer) in all {
+            mailers.add(way, mailer);
         }
         Self { recent: VecDeque::new(), mailers }
     }
@@ -41,7 +39,7 @@ impl Changes {
     /// # Errors
     /// When there were too many panics.
     pub fn restart_gone(&mut self, config: &SessionConfig) -> Result<(), TooManyPanics> {
-        self.mailers.restart_gone(|_| mail::start(config))
+        self.mailers.restart_gone(|way| mail::start(config, *way))
     }
 
     /// Returns the last changes, the newest first.
@@ -58,7 +56,7 @@ impl Changes {
         let load = record.report.as_ref().map(|report| report.load);
         for event in events {
             let error = record.last_error.as_ref().filter(|_| event.topic() == Topic::Health).map(ToString::to_string);
-            self.notify(Notice { server: server.to_string(), event, load, error, at });
+            self.notify(&Notice { server: server.to_string(), event, load, error, at });
         }
     }
 
@@ -75,7 +73,7 @@ impl Changes {
             }
         };
         self.list("", StateChange { at, server: server.clone(), state, why });
-        self.notify(Notice { server, event, load: None, error, at });
+        self.notify(&Notice { server, event, load: None, error, at });
     }
 
     fn list(&mut self, words: &str, change: StateChange) {
@@ -86,13 +84,11 @@ impl Changes {
         self.recent.push_front(change);
     }
 
-    fn notify(&self, notice: Notice) {
-        let Some(mailer) = self.mailers.get(&MAILS) else {
-            return;
-        };
-        let server = notice.server.clone();
-        if let Err(lost) = mailer.try_send(notice) {
-            log::error!("{server}: no notice is sent: {lost}");
+    fn notify(&self, notice: &Notice) {
+        for mailer in self.mailers.all() {
+            if let Err(lost) = mailer.try_send(notice.clone()) {
+                log::error!("{}: no notice is sent: {lost}", notice.server);
+            }
         }
     }
 }

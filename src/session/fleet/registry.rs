@@ -24,7 +24,7 @@ use super::server_monitor::{ProbeResult, ProbeSettings};
 use super::server_record::{ServerRecord, is_refused};
 use super::servers::{ListChange, Servers};
 use crate::session::config::SessionConfig;
-use crate::session::mail::Mailer;
+use crate::session::mail::{Mailer, Way};
 use crate::session::placement::Fleet;
 use crate::shared::domain::Load;
 use crate::shared::domain::ProjectUrl;
@@ -66,7 +66,7 @@ impl Registry {
     /// A registry whose monitors are started with it.
     pub fn new(
         config: Arc<SessionConfig>,
-        mailer: Option<Addr<Mailer>>,
+        mailers: Vec<(Way, Addr<Mailer>)>,
         latencies: prometheus::Histogram,
         (resolver, available): (TokioResolver, watch::Sender<bool>),
     ) -> Self {
@@ -77,7 +77,7 @@ impl Registry {
             latencies,
             servers: Servers::new(resolver),
             available,
-            changes: Changes::new(mailer),
+            changes: Changes::new(mailers),
         }
     }
 

@@ -16,13 +16,19 @@ use crate::shared::text::excerpt;
 /// How many letters of a text from outside are shown.
 const MAX_LETTERS: usize = 500;
 
+/// Composes the texts of one session server.
+#[derive(Debug, Clone)]
+pub struct Composer {
+    session_server: String,
+    monitor: String,
+}
+
 /// Composes the e-mails of one session server.
 #[derive(Debug, Clone)]
 pub struct EmailComposer {
     from: Mailbox,
     to: Mailbox,
-    session_server: String,
-    monitor: String,
+    texts: Composer,
 }
 
 #[derive(Template)]
@@ -30,7 +36,7 @@ pub struct EmailComposer {
 struct Text<'mail> {
     summary: &'mail str,
     lines: Vec<Line>,
-    composer: &'mail EmailComposer,
+    composer: &'mail Composer,
 }
 
 /// What an e-mail says about one server.
@@ -43,6 +49,43 @@ struct Line {
     held_back: usize,
 }
 
+impl Composer {
+    /// Composes texts that tell where they come from.
+    pub fn new(config: &SessionConfig) -> Self {
+        Self {
+            session_server: excerpt(&config.address().to_string(), MAX_LETTERS),
+            monitor: format!("{}/monitor", excerpt(&config.http_url(), MAX_LETTERS)),
+        }
+    }
+
+    /// The subject and the text about these entries.
+    ///
+    /// # Errors
+    /// When the template can't be rendered.
+    pub fn compose(&self, entries: &[Entry]) -> Result<(String, String), MailError> {
+        let events: Vec<Event> = entries.iter().map(|entry| entry.notice.event).collect();
+        let lines: Vec<Line> = entries.iter().map(Line::new).collect();
+        let mut subject = summary(&events);
+        if let [only] = lines.as_slice() {
+            subject = format!("{subject}: {}", only.server);
+        }
+        self.text(subject, lines)
+    }
+
+    /// The subject and the text of `--test-mail`.
+    ///
+    /// # Errors
+    /// When the template can't be rendered.
+    pub fn test(&self) -> Result<(String, String), MailError> {
+        self.text("Test of the session server's notifications".to_owned(), Vec::new())
+    }
+
+    fn text(&self, subject: String, lines: Vec<Line>) -> Result<(String, String), MailError> {
+        let text = Text { summary: &subject, lines, composer: self }.render()?;
+        Ok((subject, text))
+    }
+}
+
 impl EmailComposer {
     /// Composes e-mails as the configuration says.
     ///
@@ -52,8 +95,7 @@ impl EmailComposer {
         Ok(Self {
             from: config.mail_sender.clone().ok_or(MailError::Off("mailSender"))?,
             to: config.administrator.clone().ok_or(MailError::Off("administrator"))?,
-            session_server: excerpt(&config.address().to_string(), MAX_LETTERS),
-            monitor: format!("{}/monitor", excerpt(&config.http_url(), MAX_LETTERS)),
+            texts: Composer::new(config),
         })
     }
 
@@ -67,13 +109,7 @@ impl EmailComposer {
     /// # Errors
     /// When it can't be written.
     pub fn compose(&self, entries: &[Entry]) -> Result<Message, MailError> {
-        let events: Vec<Event> = entries.iter().map(|entry| entry.notice.event).collect();
-        let lines: Vec<Line> = entries.iter().map(Line::new).collect();
-        let mut subject = summary(&events);
-        if let [only] = lines.as_slice() {
-            subject = format!("{subject}: {}", only.server);
-        }
-        self.message(&subject, lines)
+        self.message(self.texts.compose(entries)?)
     }
 
     /// The e-mail of `--test-mail`.
@@ -81,11 +117,10 @@ impl EmailComposer {
     /// # Errors
     /// When it can't be written.
     pub fn test(&self) -> Result<Message, MailError> {
-        self.message("Test of the session server's notifications", Vec::new())
+        self.message(self.texts.test()?)
     }
 
-    fn message(&self, subject: &str, lines: Vec<Line>) -> Result<Message, MailError> {
-        let text = Text { summary: subject, lines, composer: self }.render()?;
+    fn message(&self, (subject, text): (String, String)) -> Result<Message, MailError> {
         let builder = Message::builder().from(self.from.clone()).to(self.to.clone()).subject(subject).message_id(None);
         let mut message = builder.header(ContentType::TEXT_PLAIN).body(text)?;
         // Automatic responders shall not answer (RFC 3834).

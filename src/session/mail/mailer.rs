@@ -1,7 +1,7 @@
-//! Actor: mails notices to the administrator.
+//! Actor: sends notices to the administrator on one way, by mail or by webhook.
 //!
-//! Created by the app, and again by the registry if it has panicked; only if the configuration is for e-mails. It accepts
-//! [`Notice`]s. [`Outbox`] decides what is mailed, and when. One e-mail is sent at a time; nothing waits for it.
+//! Created by the app, and again by the registry if it has panicked; only if the configuration is for this way. It accepts
+//! [`Notice`]s. [`Outbox`] decides what is sent, and when. One batch is sent at a time; nothing waits for it.
 
 use std::time::{Duration, Instant};
 
@@ -10,23 +10,29 @@ use actix::prelude::*;
 use super::email::EmailComposer;
 use super::outbox::{Entry, Notice, Outbox};
 use super::smtp::{MailError, Relay};
+use super::way::{Carrier, Way};
+use super::webhook::Webhook;
 use crate::session::config::SessionConfig;
 
 /// The actor.
 pub struct Mailer {
-    relay: Relay,
-    composer: EmailComposer,
+    way: Way,
+    carrier: Carrier,
     outbox: Outbox,
     patience: Duration,
     sending: bool,
-    /// The timer of the next e-mail.
+    /// The timer of the next batch.
     timer: SpawnHandle,
 }
 
-/// Starts the mailer; none if the configuration is not for e-mails.
-pub fn start(config: &SessionConfig) -> Option<Addr<Mailer>> {
-    let mailer = Mailer::new(config).inspect_err(|why| log::info!("{why}")).ok()?;
-    Some(mailer.start())
+/// Starts the mailer of a way; none if the configuration is not for it.
+pub fn start(config: &SessionConfig, way: Way) -> Option<Addr<Mailer>> {
+    let mailer = Mailer::new(config, way).inspect_err(|why| {
+        if way == Way::Mail {
+            log::info!("{why}");
+        }
+    });
+    Some(mailer.ok()?.start())
 }
 
 /// Sends a test e-mail now. Returns what the SMTP server answered.
@@ -34,16 +40,26 @@ pub fn start(config: &SessionConfig) -> Option<Addr<Mailer>> {
 /// # Errors
 /// When the configuration is not for e-mails, or the SMTP server did not take it.
 pub async fn test_mail(config: &SessionConfig) -> Result<String, MailError> {
-    let Mailer { relay, composer, .. } = Mailer::new(config)?;
+    let (relay, composer) = (Relay::new(config)?, EmailComposer::new(config)?);
     let answer = relay.deliver(composer.test()?).await?;
     Ok(format!("{} ({}) took a mail for {}: {answer}", relay.name(), relay.privacy(), composer.recipient()))
 }
 
+/// Posts a test to the webhook now. Returns what was answered.
+///
+/// # Errors
+/// When the configuration has no webhook, or it did not take it.
+pub async fn test_webhook(config: &SessionConfig) -> Result<String, MailError> {
+    let webhook = Webhook::new(config)?;
+    let answer = webhook.deliver(&[]).await?;
+    Ok(format!("the webhook at {} took a test: {answer}", webhook.name()))
+}
+
 impl Mailer {
-    fn new(config: &SessionConfig) -> Result<Self, MailError> {
+    fn new(config: &SessionConfig, way: Way) -> Result<Self, MailError> {
         Ok(Self {
-            composer: EmailComposer::new(config)?,
-            relay: Relay::new(config)?,
+            way,
+            carrier: Carrier::new(config, way)?,
             outbox: Outbox::new(&config.timing),
             patience: config.timing.mail_patience,
             sending: false,
@@ -65,11 +81,10 @@ impl Mailer {
             return self.wait(ctx);
         }
         self.sending = true;
-        let message = self.composer.compose(&batch);
-        let relay = self.relay.clone();
-        async move { relay.deliver(message?).await }
+        let carrier = self.carrier.clone();
+        async move { (carrier.carry(&batch).await, batch) }
             .into_actor(self)
-            .map(move |sent, mailer, ctx| {
+            .map(|(sent, batch), mailer, ctx| {
                 mailer.sending = false;
                 mailer.handle_outcome(batch, sent);
                 mailer.wait(ctx);
@@ -80,22 +95,23 @@ impl Mailer {
     /// Reports to the outbox and the log how sending a batch went.
     fn handle_outcome(&mut self, batch: Vec<Entry>, sent: Result<String, MailError>) {
         let (now, subject, count) = (Instant::now(), in_words(&batch), batch.len());
+        let way = self.way;
         let error = match sent {
             Ok(answer) => {
-                log::info!("mail sent by {} ({subject}): {answer}", self.relay.name());
+                log::info!("{way} sent by {} ({subject}): {answer}", self.carrier.name());
                 return self.outbox.succeeded(&batch, now);
             }
             Err(error) => error,
         };
         let lost = self.outbox.failed(batch, error.is_permanent(), now);
         if !lost.is_empty() {
-            log::error!("mail given up after {} s ({}): {error}", self.patience.as_secs_f64(), in_words(&lost));
+            log::error!("{way} given up after {} s ({}): {error}", self.patience.as_secs_f64(), in_words(&lost));
         }
         if lost.len() < count
             && let Some(next) = self.outbox.due()
         {
             let wait = next.saturating_duration_since(now).as_secs_f64();
-            log::warn!("mail not sent, next try in {wait:.0} s ({subject}): {error}");
+            log::warn!("{way} not sent, next try in {wait:.0} s ({subject}): {error}");
         }
     }
 }

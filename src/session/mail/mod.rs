@@ -1,10 +1,13 @@
-//! Mail to the administrator: what is worth an e-mail, how it is worded, and how it is sent.
+//! Notices to the administrator, by mail and by webhook: what is worth one, how it is worded, and how it is sent.
 
 mod email;
 mod mailer;
 mod outbox;
 mod smtp;
+mod way;
+mod webhook;
 
-pub use mailer::{Mailer, start, test_mail};
+pub use mailer::{Mailer, start, test_mail, test_webhook};
 pub use outbox::{Event, Notice, Topic};
 pub use smtp::MailError;
+pub use way::Way;

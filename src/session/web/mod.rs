@@ -1,5 +1,6 @@
 //! What browsers and programs meet: paths, pages, and the WebSocket of a web client.
 
+mod actions;
 mod page_routes;
 pub mod pages;
 mod queries;

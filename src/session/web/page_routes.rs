@@ -27,6 +27,7 @@ const ASSETS: &[Asset] = &[
     asset!("matrix.js"),
     asset!("camera.js"),
     asset!("draw.js"),
+    asset!("session_monitor.js"),
     asset!("webots_viewer.css"),
     asset!("webots_viewer.js"),
 ];
@@ -42,8 +43,12 @@ pub fn configure(app: &mut web::ServiceConfig) {
 
 async fn monitor(server: web::Data<AppState>) -> HttpResponse {
     let (clients, started) = (server.clients(), server.started_at);
-    with_status(&server, |status| html(pages::monitor(status, clients, &server.client_urls, started), &Policy::own()))
-        .await
+    let announcement = server.announcements.current();
+    let more = (announcement.as_deref(), server.admin_auth.is_some());
+    with_status(&server, |status| {
+        html(pages::monitor(status, clients, &server.client_urls, started, more), &Policy::own())
+    })
+    .await
 }
 
 async fn events(request: HttpRequest, server: web::Data<AppState>) -> HttpResponse {
@@ -56,7 +61,8 @@ async fn events(request: HttpRequest, server: web::Data<AppState>) -> HttpRespon
         let server = shown.clone();
         async move {
             let status = ask(&server, GetStatus).await?;
-            let view = pages::view(&status, server.clients(), &server.client_urls);
+            let announcement = server.announcements.current();
+            let view = pages::view(&status, server.clients(), &server.client_urls, announcement.as_deref());
             view.inspect_err(|error| log::error!("the monitor page can't be rendered: {error}")).ok()
         }
     };

@@ -5,7 +5,7 @@ use std::time::{Duration, SystemTime};
 
 use askama::Template;
 
-use crate::session::config::Example;
+use crate::session::config::{Announcement, Example};
 use crate::session::fleet::{FleetStatus, NameStatus, ServerStatus, State, StateChange};
 use crate::shared::domain::ClientUrls;
 use crate::shared::domain::Instances;
@@ -19,6 +19,9 @@ use crate::shared::text::one_line;
 struct Monitor<'view> {
     version: &'static str,
     started: String,
+    announcement: &'view str,
+    /// Whether administrators can do something here.
+    has_actions: bool,
     glance: &'view str,
     changes: &'view str,
     rows: &'view [Row],
@@ -64,6 +67,14 @@ struct ServerRow<'server> {
     since: String,
 }
 
+/// What the administrator tells everybody.
+#[derive(Template)]
+#[template(path = "session/announcement.html")]
+struct Announced<'one> {
+    text: &'one str,
+    until: Option<String>,
+}
+
 /// The last changes of state.
 #[derive(Template)]
 #[template(path = "session/changes.html")]
@@ -95,13 +106,20 @@ pub struct WebotsViewer {
 ///
 /// # Errors
 /// When a template can't be rendered.
-pub fn view(status: &FleetStatus, clients: usize, urls: &ClientUrls) -> Result<View, askama::Error> {
+pub fn view(
+    status: &FleetStatus,
+    clients: usize,
+    urls: &ClientUrls,
+    announcement: Option<&Announcement>,
+) -> Result<View, askama::Error> {
     let rows = status.servers.iter().map(|server| {
         let html = ServerRow::new(server, urls).render()?;
         Ok(Row { key: server.address.to_string(), html })
     });
     let rows = rows.collect::<Result<Vec<Row>, askama::Error>>()?;
+    let announced = announcement.map(|one| Announced { text: &one.text, until: one.until.map(timestamp) }.render());
     let parts = [
+        ("announcement", announced.transpose()?.unwrap_or_default()),
         ("glance", Glance::new(status, clients).render()?),
         ("changes", Changes { changes: &status.changes }.render()?),
     ];
@@ -117,12 +135,15 @@ pub fn monitor(
     clients: usize,
     urls: &ClientUrls,
     started: SystemTime,
+    (announcement, has_actions): (Option<&Announcement>, bool),
 ) -> Result<String, askama::Error> {
-    let view = view(status, clients, urls)?;
+    let view = view(status, clients, urls, announcement)?;
     let part = |id| view.parts.get(id).map(String::as_str).unwrap_or_default();
     let page = Monitor {
         version: env!("CARGO_PKG_VERSION"),
         started: timestamp(started),
+        announcement: part("announcement"),
+        has_actions,
         glance: part("glance"),
         changes: part("changes"),
         rows: view.tables.get("servers").map(Vec::as_slice).unwrap_or_default(),

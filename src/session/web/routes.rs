@@ -7,6 +7,7 @@ use actix_web::http::{StatusCode, header};
 use actix_web::{HttpRequest, HttpResponse, web};
 use percent_encoding::percent_decode_str;
 
+use super::actions;
 use super::page_routes;
 use super::queries::{ask, with_status};
 use super::status::{self, StatusPage};
@@ -32,7 +33,8 @@ fn add(app: &mut web::ServiceConfig) {
         .configure(page_routes::configure)
         .service(path("/status", READ, status_json))
         .service(path("/metrics", READ, metrics))
-        .service(path("/health", READ, health));
+        .service(path("/health", READ, health))
+        .configure(actions::configure);
 }
 
 fn wants_websocket(request: &HttpRequest) -> bool {
@@ -85,7 +87,9 @@ fn open_websocket(request: &HttpRequest, stream: web::Payload, server: &web::Dat
         Err(refused) => return refused.answer(),
     };
     let server = Arc::clone(server);
-    websocket::open(request, stream, |reader| WebClient::new(server, peer, (permit, reader)))
+    // Pages that don't ask for them would not understand them.
+    let wants_announcements = request.query_string().split('&').any(|one| one == "announcements=1");
+    websocket::open(request, stream, |reader| WebClient::new(server, peer, wants_announcements, (permit, reader)))
 }
 
 async fn availability(server: web::Data<AppState>) -> HttpResponse {

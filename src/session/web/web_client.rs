@@ -11,6 +11,7 @@ use futures_util::stream::{self, Stream};
 use serde::Deserialize;
 use tokio::sync::watch;
 
+use crate::session::config::Announcement;
 use crate::session::fleet::Pick;
 use crate::session::state::AppState;
 use crate::shared::http::ConnectionPermit;
@@ -18,6 +19,7 @@ use crate::shared::http::Peer;
 use crate::shared::http::liveness::{self, Liveness};
 use crate::shared::http::websocket::{ClientMessage, MessageReader};
 use crate::shared::run::{Phase, closing};
+use crate::shared::text::client_text;
 
 /// The actor.
 pub struct WebClient {
@@ -25,6 +27,8 @@ pub struct WebClient {
     peer: Peer,
     liveness: Liveness,
     sent: Option<bool>,
+    /// Whether it has asked to be told announcements.
+    wants_announcements: bool,
     reader: MessageReader,
     _permit: ConnectionPermit,
 }
@@ -33,8 +37,13 @@ type Context = WebsocketContext<WebClient>;
 
 impl WebClient {
     /// A client that has just connected; `permit` counts it, `reader` reads its messages.
-    pub fn new(server: Arc<AppState>, peer: Peer, (permit, reader): (ConnectionPermit, MessageReader)) -> Self {
-        Self { server, peer, liveness: Liveness::new(), sent: None, reader, _permit: permit }
+    pub fn new(
+        server: Arc<AppState>,
+        peer: Peer,
+        wants_announcements: bool,
+        (permit, reader): (ConnectionPermit, MessageReader),
+    ) -> Self {
+        Self { server, peer, liveness: Liveness::new(), sent: None, wants_announcements, reader, _permit: permit }
     }
 
     fn close(code: CloseCode, ctx: &mut Context) {
@@ -71,6 +80,9 @@ impl Actor for WebClient {
         let timing = &self.server.timing;
         liveness::watch(ctx, timing.ping, timing.silence, |client| &mut client.liveness);
         ctx.add_stream(updates(self.server.available.clone(), self.server.phase.clone()));
+        if self.wants_announcements {
+            ctx.add_message_stream(announcements(self.server.announcements.subscribe()));
+        }
     }
 }
 
@@ -100,6 +112,31 @@ fn updates(mut available: watch::Receiver<bool>, phase: watch::Receiver<Phase>) 
         let is_closed = matches!(update, Update::Closing);
         Some((update, (available, closing, is_closed)))
     })
+}
+
+/// Text of the announcement for a client; empty once it is over.
+#[derive(Message)]
+#[rtype(result = "()")]
+struct Announced(String);
+
+/// The announcement that counts now, if there is one, and each change.
+fn announcements(mut all: watch::Receiver<Option<Arc<Announcement>>>) -> impl Stream<Item = Announced> {
+    if all.borrow().is_some() {
+        all.mark_changed();
+    }
+    stream::unfold(all, async |mut all| {
+        all.changed().await.ok()?;
+        let text = all.borrow_and_update().as_ref().map(|one| client_text(&one.text)).unwrap_or_default();
+        Some((Announced(text), all))
+    })
+}
+
+impl Handler<Announced> for WebClient {
+    type Result = ();
+
+    fn handle(&mut self, Announced(text): Announced, ctx: &mut Context) {
+        ctx.text(format!("announcement: {text}").trim_end().to_owned());
+    }
 }
 
 impl StreamHandler<Update> for WebClient {

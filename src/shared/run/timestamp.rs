@@ -17,6 +17,11 @@ pub fn timestamp_in_milliseconds(time: SystemTime) -> String {
     text(time, format_rfc3339_millis)
 }
 
+/// Reads a time as RFC 3339 in UTC: `2026-12-31T12:00:00Z`.
+pub fn read_timestamp(text: &str) -> Option<SystemTime> {
+    humantime::parse_rfc3339(text).ok()
+}
+
 /// Returns the current time in seconds since 1970-01-01 UTC.
 pub fn seconds_since_1970() -> u64 {
     SystemTime::UNIX_EPOCH.elapsed().map_or(0, |age| age.as_secs())

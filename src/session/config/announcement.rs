@@ -1,0 +1,66 @@
+//! The key `announcement`: what the administrator tells everybody.
+
+use std::time::SystemTime;
+
+use serde::{Deserialize, Serialize};
+
+use crate::shared::run::{read_timestamp, timestamp};
+use crate::shared::text::one_line;
+
+/// What the administrator tells everybody.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(try_from = "WireAnnouncement", into = "WireAnnouncement")]
+pub struct Announcement {
+    /// One line of text, never markup.
+    pub text: String,
+    /// When it is over, if that is said.
+    pub until: Option<SystemTime>,
+}
+
+#[derive(Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct WireAnnouncement {
+    text: String,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    until: Option<String>,
+}
+
+/// How many letters an announcement may have.
+const LENGTH: usize = 300;
+
+impl Announcement {
+    /// Makes an announcement; `until` is a time of RFC 3339.
+    ///
+    /// # Errors
+    /// What is wrong with it, in words.
+    pub fn new(text: &str, until: Option<&str>) -> Result<Self, String> {
+        let text = one_line(text.trim());
+        if text.is_empty() || text.chars().count() > LENGTH {
+            return Err(format!("the text of an announcement has 1 to {LENGTH} letters"));
+        }
+        let until = until.map(|until| {
+            read_timestamp(until)
+                .ok_or_else(|| format!("until is {until:?}; allowed are times in UTC such as 2026-12-31T12:00:00Z"))
+        });
+        Ok(Self { text, until: until.transpose()? })
+    }
+
+    /// Whether it is over.
+    pub fn is_over(&self) -> bool {
+        self.until.is_some_and(|until| until <= SystemTime::now())
+    }
+}
+
+impl TryFrom<WireAnnouncement> for Announcement {
+    type Error = String;
+
+    fn try_from(WireAnnouncement { text, until }: WireAnnouncement) -> Result<Self, String> {
+        Self::new(&text, until.as_deref())
+    }
+}
+
+impl From<Announcement> for WireAnnouncement {
+    fn from(Announcement { text, until }: Announcement) -> Self {
+        Self { text, until: until.map(timestamp) }
+    }
+}

@@ -1,0 +1,27 @@
+// What the session server's page has beside its live tables: an announcement for everybody, which needs the password.
+
+import './live.js';
+
+const form = document.getElementById('announce');
+const text = document.getElementById('announce-text');
+const until = document.getElementById('announce-until');
+const problem = document.getElementById('announce-problem');
+
+async function announce(order) {
+  const request = { method: 'POST', headers: { 'Content-Type': 'application/json' }, body: JSON.stringify(order) };
+  // The browser asks for the password.
+  const answer = await fetch('announcement', request).catch(() => undefined);
+  if (answer?.ok)
+    problem.textContent = '';
+  else
+    problem.textContent = answer ? await answer.text() : 'The server does not answer.';
+}
+
+form?.addEventListener('submit', (event) => {
+  event.preventDefault();
+  const order = { text: text.value };
+  if (until.value)
+    order.until = new Date(until.value).toISOString();
+  announce(order);
+});
+document.getElementById('announce-end')?.addEventListener('click', () => announce({}));

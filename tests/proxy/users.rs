@@ -1,0 +1,78 @@
+//! Users who sign in at the web server: a stand-in for oauth2-proxy, the real nginx, and what a simulation server makes of it.
+
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::net::TcpListener;
+
+use super::fleet::{Fleet, arm};
+use super::rules::Rules;
+use crate::support::client::Client;
+use crate::support::http::PASSWORD;
+
+/// A stand-in for oauth2-proxy: whose cookie is a name has signed in with it.
+async fn oauth2_proxy() -> u16 {
+    let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let port = listener.local_addr().unwrap().port();
+    actix_rt::spawn(async move {
+        while let Ok((mut socket, _)) = listener.accept().await {
+            actix_rt::spawn(async move {
+                let mut head = Vec::new();
+                while !head.ends_with(b"\r\n\r\n") {
+                    if socket.read_buf(&mut head).await.unwrap_or(0) == 0 {
+                        return;
+                    }
+                }
+                let head = String::from_utf8_lossy(&head).into_owned();
+                let name = head.lines().find_map(|line| line.strip_prefix("cookie: _oauth2_proxy="));
+                let answer = match (head.starts_with("GET /oauth2/auth "), name) {
+                    (true, Some(name)) => format!("202 Accepted\r\nX-Auth-Request-Email: {name}@lab.example"),
+                    (true, None) => "401 Unauthorized".to_owned(),
+                    (false, _) => "200 OK".to_owned(),
+                };
+                let answer = format!("HTTP/1.1 {answer}\r\nContent-Length: 0\r\nConnection: close\r\n\r\n");
+                socket.write_all(answer.as_bytes()).await.ok();
+            });
+        }
+    });
+    port
+}
+
+#[actix_rt::test]
+async fn who_signs_in_at_the_web_server_is_known_to_the_administrator() {
+    let rules = Rules::NginxWithUsers(oauth2_proxy().await);
+    let keys = |builder: crate::support::program::Builder| builder.set("adminPassword", PASSWORD);
+    // The session server, which signs in nowhere, knows its servers all the same.
+    let fleet = Fleet::start_with(rules, |builder| keys(builder).set("userHeader", "X-Forwarded-User")).await;
+    let visitor = fleet.browser.at("127.0.0.9");
+    let client = format!("{}/client", fleet.wss(&fleet.here));
+    let page = visitor.get("/viewer").await;
+    assert_eq!(page.status.as_u16(), 302);
+    assert!(page.header("location").unwrap().ends_with("/oauth2/sign_in?rd=/viewer"), "{page:?}");
+    assert!(visitor.try_open(&client, &[]).await.is_err());
+    assert_eq!(visitor.get("/oauth2/sign_in").await.status.as_u16(), 200);
+    assert_eq!(visitor.get("/oauth2/auth").await.status.as_u16(), 404, "nobody asks for others");
+
+    let anna = [("cookie", "_oauth2_proxy=anna")];
+    assert_eq!(visitor.ask(&format!("https://{}/viewer", visitor.host), &anna).await.status.as_u16(), 200);
+    let mut running: Vec<Client> = Vec::new();
+    // What a visitor writes there himself is nobody's name.
+    for headers in [vec![anna[0]], vec![("cookie", "_oauth2_proxy=ben"), ("x-forwarded-user", "root")]] {
+        let mut client = visitor.try_open(&client, &headers).await.unwrap();
+        client.send(&serde_json::json!({"start": {"url": arm(), "name": "somebody"}}).to_string()).await;
+        client.until("webots:").await;
+        running.push(client);
+    }
+    let monitor = format!("https://{}/{}/monitor", visitor.host, fleet.here.port);
+    let page = visitor.ask(&monitor, &anna).await.text();
+    assert!(!page.contains("lab.example") && !page.contains("somebody"), "{page}");
+    let password = ("authorization", "Basic YWRtaW46b3BlbiBzZXNhbWU=");
+    let page = visitor.ask(&monitor, &[anna[0], password]).await.text();
+    for name in ["<b>anna@lab.example</b>", "<b>ben@lab.example</b>", "somebody"] {
+        assert!(page.contains(name), "{name}: {page}");
+    }
+    assert!(!page.contains("root"), "{page}");
+    // The administrator's password is asked for by the simulation server itself.
+    let sign_in = format!("https://{}/{}/sign-in", visitor.host, fleet.here.port);
+    let answer = visitor.ask(&sign_in, &anna).await;
+    assert_eq!((answer.status.as_u16(), answer.header("www-authenticate").is_some()), (401, true));
+    assert_eq!(visitor.ask(&sign_in, &[anna[0], password]).await.status.as_u16(), 303);
+}

@@ -1,0 +1,117 @@
+//! What the administrator tells everybody: who hears it, when it is over, and who does not notice.
+
+use std::time::{Duration, Instant, SystemTime};
+
+use nix::sys::signal::Signal;
+use serde_json::{Value, json};
+
+use crate::support::client::Client;
+use crate::support::http::{self, PASSWORD, post};
+use crate::support::program::{Server, session_server};
+use crate::support::until;
+
+const ASKS: &str = "/session?announcements=1";
+
+async fn announce(session: &Server, order: &Value) -> u16 {
+    post(&session.url("/announcement"), Some(PASSWORD), &order.to_string()).await
+}
+
+async fn page(session: &Server) -> String {
+    http::get(&session.url("/monitor")).await.text()
+}
+
+/// A time so many milliseconds from now.
+fn later(milliseconds: u64) -> String {
+    humantime::format_rfc3339_millis(SystemTime::now() + Duration::from_millis(milliseconds)).to_string()
+}
+
+#[actix_rt::test]
+async fn an_announcement_reaches_who_asks_for_it_in_time_and_ends_in_time() {
+    let session = session_server(&[]).set("adminPassword", PASSWORD).start().await;
+    let (mut viewer, mut old) = (Client::connect(&session.websocket(ASKS)).await, Vec::new());
+    for path in ["/", "/session", "/session?announcements=0"] {
+        old.push(Client::connect(&session.websocket(path)).await);
+    }
+    viewer.until("0").await;
+    let (text, asked) = ("<b>Maintenance</b> & more\nat noon", Instant::now());
+    assert_eq!(announce(&session, &json!({"text": text, "until": later(3000)})).await, 200);
+    let told = viewer.until("announcement:").await;
+    assert_eq!(told, "announcement: \u{2039}b\u{203a}Maintenance\u{2039}/b\u{203a} \u{ff06} more at noon");
+    let shown = "Maintenance&#60;/b&#62; &#38; more at noon";
+    assert!(
+        page(&session).await.contains(shown) && !page(&session).await.contains("<b>Maint"),
+        "{}",
+        page(&session).await
+    );
+    assert!(asked.elapsed() < Duration::from_secs(2), "{:?}", asked.elapsed());
+    // Who comes later hears it too.
+    Client::connect(&session.websocket(ASKS)).await.until("announcement: ").await;
+    assert_eq!(viewer.until("announcement:").await, "announcement:");
+    assert!(asked.elapsed() > Duration::from_millis(2900), "{:?}", asked.elapsed());
+    assert!(!page(&session).await.contains("Maintenance"));
+    // Another one, without an end, and its end.
+    assert_eq!(announce(&session, &json!({"text": "R&D"})).await, 200);
+    assert_eq!(viewer.until("announcement:").await, "announcement: R\u{ff06}D");
+    assert_eq!(post(&session.url("/announcement"), Some(PASSWORD), "").await, 200);
+    assert_eq!(viewer.until("announcement:").await, "announcement:");
+    let mut late = Client::connect(&session.websocket(ASKS)).await;
+    late.until("0").await;
+    late.send("").await;
+    late.until("Error:").await;
+    assert_eq!(late.heard.len(), 2, "{:?}", late.heard);
+    // Pages that know nothing of announcements have noticed nothing.
+    for client in &mut old {
+        client.send("").await;
+        client.until("Error:").await;
+        assert_eq!(client.heard[0], "0");
+        assert_eq!(client.heard.len(), 2, "{:?}", client.heard);
+    }
+}
+
+#[actix_rt::test]
+async fn an_announcement_in_the_configuration_is_read_again() {
+    let session = session_server(&[]).set("adminPassword", PASSWORD).set("announcement", json!({"text": "One"}));
+    let session = session.start().await;
+    let mut viewer = Client::connect(&session.websocket(ASKS)).await;
+    assert_eq!(viewer.until("announcement:").await, "announcement: One");
+    session.rewrite_config(|config| config["announcement"] = json!({"text": "Two", "until": later(60_000)}));
+    session.signal(Signal::SIGHUP);
+    assert_eq!(viewer.until("announcement:").await, "announcement: Two");
+    // A file that says the same changes nothing of what was posted since.
+    assert_eq!(announce(&session, &json!({"text": "Three"})).await, 200);
+    assert_eq!(viewer.until("announcement:").await, "announcement: Three");
+    session.rewrite_config(|config| config["loadRefresh"] = json!(0.2));
+    session.signal(Signal::SIGHUP);
+    until("it was read", async || session.log().matches("read ").count() > 1).await;
+    session.rewrite_config(|config| drop(config.as_object_mut().unwrap().remove("announcement")));
+    session.signal(Signal::SIGHUP);
+    assert_eq!(viewer.until("announcement:").await, "announcement:");
+    assert!(!session.log().contains("takes effect with a restart"), "{}", session.log());
+    // A wrong one changes nothing.
+    session.rewrite_config(|config| config["announcement"] = json!({"text": "Four", "until": "noon"}));
+    session.signal(Signal::SIGHUP);
+    until("it is told", async || session.log().contains("until is \"noon\"")).await;
+}
+
+#[actix_rt::test]
+async fn only_the_password_announces_something() {
+    let session = session_server(&[]).set("adminPassword", PASSWORD).start().await;
+    let (url, order) = (session.url("/announcement"), r#"{"text": "hello"}"#);
+    assert_eq!(post(&url, None, order).await, 401);
+    assert_eq!(post(&url, Some("guess"), order).await, 401);
+    let foreign = awc::Client::default().post(&url).basic_auth("admin", PASSWORD);
+    let answer = foreign.insert_header(("Sec-Fetch-Site", "cross-site")).send_body(order).await.unwrap();
+    assert_eq!(answer.status(), 403);
+    for wrong in [
+        json!({"text": 5}),
+        json!({"text": "x", "more": 1}),
+        json!({"text": "x", "until": "noon"}),
+        json!({"text": "x", "until": "2020-01-01T00:00:00Z"}),
+        json!({"text": "x".repeat(301)}),
+    ] {
+        assert_eq!(announce(&session, &wrong).await, 400, "{wrong}");
+    }
+    assert!(!page(&session).await.contains("class=\"announcement\""));
+    let session = session_server(&[]).start().await;
+    assert_eq!(post(&session.url("/announcement"), Some(PASSWORD), order).await, 403);
+}

@@ -1,0 +1,173 @@
+//! From a failure to a message in a messenger: the built program, a stand-in that fails, a real web server that is posted to.
+
+use std::process::Command;
+use std::time::Duration;
+
+use serde_json::json;
+
+use super::stand_in::{Manner, StandIn};
+use super::{addresses, until_states};
+use crate::support::authority::Authority;
+use crate::support::http;
+use crate::support::ports::dead_port;
+use crate::support::program::{Builder, Server, session_server};
+use crate::support::receiver::Receiver;
+use crate::support::smtp::Smtp;
+use crate::support::until;
+
+/// What nobody may read who does not write the configuration.
+const SECRET: &str = "T0PSECRET";
+
+fn with_webhook(servers: &[StandIn], scheme: &str, port: u16) -> Builder {
+    let url = format!("{scheme}://localhost:{port}/services/{SECRET}?key={SECRET}");
+    let timing = json!({"answer": 4, "gather": 0.5, "flapping": 0.5, "mailRetry": 0.2, "mailAnswer": 5});
+    session_server(&addresses(servers)).set("webhook", url).set("timing", timing)
+}
+
+/// Three servers that work, which the session server knows.
+async fn fleet() -> Vec<StandIn> {
+    let mut servers = Vec::new();
+    for _ in 0..3 {
+        servers.push(StandIn::start(Manner::idle(7.0, 10)));
+    }
+    servers
+}
+
+async fn fail(session: &Server, servers: &[StandIn]) {
+    until_states(session, &["up"; 3]).await;
+    for server in servers {
+        server.set(Manner::Reset);
+    }
+}
+
+fn says_nothing_secret(session: &Server) {
+    assert!(!session.log().contains(SECRET), "{}", session.log());
+}
+
+#[actix_rt::test]
+async fn the_notices_of_a_mail_are_one_message_and_need_no_mail() {
+    let (servers, receiver) = (fleet().await, Receiver::start(None).await);
+    let session = with_webhook(&servers, "http", receiver.port).start().await;
+    fail(&session, &servers).await;
+    let text = receiver.texts(1).await.remove(0);
+    assert!(text.starts_with("3 simulation servers not responding\n"), "{text}");
+    for server in addresses(&servers) {
+        assert!(text.contains(&format!("{server}: not responding")), "{text}");
+    }
+    assert!(text.contains(&format!("http://localhost:{}/monitor", session.port)), "{text}");
+    let posted = receiver.posted().remove(0);
+    assert_eq!(posted.line, format!("POST /services/{SECRET}?key={SECRET} HTTP/1.1"));
+    assert_eq!(posted.body.as_object().unwrap().len(), 1);
+    // What a server says of itself is no call, no link and no second line in a messenger.
+    servers[0].set(Manner::idle(7.0, 10));
+    until_states(&session, &["up", "down", "down"]).await;
+    servers[0].set(Manner::Status(json!({"load": 100, "problem": "<!channel> & <https://evil.example|x>\nhello"})));
+    until("its words are told", async || receiver.posted().iter().any(|one| one.body.to_string().contains("channel")))
+        .await;
+    for text in receiver.texts(2).await {
+        assert!(!text.contains(['<', '>', '&']) && !text.contains("\nhello"), "{text}");
+    }
+    says_nothing_secret(&session);
+    for path in ["/status", "/monitor", "/metrics"] {
+        assert!(!http::get(&session.url(path)).await.text().contains(SECRET), "{path}");
+    }
+    until("it is logged", async || session.log().contains("webhook sent by localhost:")).await;
+}
+
+#[actix_rt::test]
+async fn a_message_that_is_not_taken_is_tried_again_and_so_is_a_mail_for_itself() {
+    let (servers, receiver) = (fleet().await, Receiver::start(None).await);
+    receiver.answer("503 Busy");
+    let mut smtp = Smtp::start(&[]).await;
+    let builder = with_webhook(&servers, "http", receiver.port);
+    let builder = builder.set("administrator", "admin@example.org").set("mailSender", "fleet@example.org");
+    let session = builder.set("mailServer", "127.0.0.1").set("mailServerPort", smtp.port).start().await;
+    fail(&session, &servers).await;
+    // The mail does not wait for the messenger.
+    assert_eq!(smtp.mail().await.subject(), "3 simulation servers not responding");
+    receiver.texts(3).await;
+    until("it is logged", async || session.log().contains("webhook not sent, next try in")).await;
+    assert!(session.log().contains("503 Service Unavailable"), "{}", session.log());
+    receiver.answer("204 Taken");
+    until("it is sent", async || session.log().contains("webhook sent by")).await;
+    assert!(receiver.texts(4).await.last().unwrap().starts_with("3 simulation servers not responding"));
+    drop(session);
+
+    // And the messenger not for the mail.
+    let (_reserved, dead) = dead_port();
+    for server in &servers {
+        server.set(Manner::idle(7.0, 10));
+    }
+    let before = receiver.posted().len();
+    let builder = with_webhook(&servers, "http", receiver.port);
+    let builder = builder.set("administrator", "admin@example.org").set("mailSender", "fleet@example.org");
+    let session = builder.set("mailServer", "127.0.0.1").set("mailServerPort", dead).start().await;
+    fail(&session, &servers).await;
+    receiver.texts(before + 1).await;
+    until("the mail is tried", async || session.log().contains("mail not sent, next try in")).await;
+    says_nothing_secret(&session);
+}
+
+#[actix_rt::test]
+async fn a_messenger_whose_certificate_is_not_trusted_is_told_nothing() {
+    let (lab, other) = (Authority::new(), Authority::new());
+    let receiver = Receiver::start(Some(&lab.issue(&["localhost"]))).await;
+    for (authority, trusted) in [(&other, false), (&lab, true)] {
+        let servers = fleet().await;
+        let builder = with_webhook(&servers, "https", receiver.port);
+        let session = builder.env("SSL_CERT_FILE", authority.file().to_str().unwrap()).start().await;
+        fail(&session, &servers).await;
+        if trusted {
+            receiver.texts(1).await;
+        } else {
+            let words = "its certificate is not trusted";
+            until("it is logged", async || session.log().contains(words)).await;
+            assert!(receiver.posted().is_empty());
+        }
+        says_nothing_secret(&session);
+    }
+}
+
+#[actix_rt::test]
+async fn a_redirect_leads_notices_to_nobody_else() {
+    let (servers, receiver, other) = (fleet().await, Receiver::start(None).await, Receiver::start(None).await);
+    receiver.answer(&format!("307 Elsewhere\r\nLocation: http://127.0.0.1:{}/", other.port));
+    let session = with_webhook(&servers, "http", receiver.port).start().await;
+    fail(&session, &servers).await;
+    receiver.texts(1).await;
+    until("it is logged", async || session.log().contains("307 Temporary Redirect")).await;
+    actix_rt::time::sleep(Duration::from_millis(200)).await;
+    assert!(other.posted().is_empty());
+    says_nothing_secret(&session);
+}
+
+#[actix_rt::test]
+async fn the_webhook_can_be_tried_and_a_wrong_one_is_refused_without_showing_it() {
+    let receiver = Receiver::start(None).await;
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("webhook.json");
+    let run = async |webhook: String, option: &'static str| {
+        let config =
+            json!({"port": 1, "ssl": false, "simulationServers": [], "server": "localhost", "webhook": webhook});
+        std::fs::write(&file, config.to_string()).unwrap();
+        let mut command = Command::new(env!("CARGO_BIN_EXE_session-server"));
+        command.arg(&file).arg(option);
+        let output = actix_rt::task::spawn_blocking(move || command.output().unwrap()).await.unwrap();
+        let said = [output.stdout, output.stderr].concat();
+        (output.status.code(), String::from_utf8(said).unwrap())
+    };
+    let url = format!("http://127.0.0.1:{}/{SECRET}", receiver.port);
+    let (code, said) = run(url.clone(), "--test-mail").await;
+    assert_eq!((code, said), (Some(0), format!("the webhook at 127.0.0.1:{} took a test: 200 OK\n", receiver.port)));
+    assert!(receiver.texts(1).await[0].contains("Nothing has happened"));
+    receiver.answer("404 Gone");
+    let (code, said) = run(url.clone(), "--test-mail").await;
+    assert!(code == Some(1) && said.contains("404 Not Found") && !said.contains(SECRET), "{said}");
+    let (code, said) = run(url, "--check").await;
+    assert!(code == Some(0) && said.contains("\"webhook\": \"********\"") && !said.contains(SECRET), "{said}");
+    for wrong in [SECRET.to_owned(), format!("ftp://x/{SECRET}"), format!("https:///{SECRET} x")] {
+        let (code, said) = run(wrong.clone(), "--check").await;
+        let is_told = said.contains("webhook: it is no URL of a web server");
+        assert!(code == Some(2) && is_told && !said.contains(SECRET), "{wrong}: {code:?} {said}");
+    }
+}
