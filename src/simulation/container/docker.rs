@@ -50,6 +50,8 @@ pub const SHORT: Duration = Duration::from_secs(30);
 const FIND: Duration = Duration::from_secs(10);
 /// The most that is kept of an output, in bytes.
 const LONGEST_OUTPUT: usize = 1 << 20;
+/// How a line begins that says of which containers the lines before it are.
+const LIST: &str = "Error: failed to start containers";
 /// How a message begins that says that nobody listens.
 const NO_DAEMON: [&str; 4] = [
     "cannot connect to the docker daemon",
@@ -157,10 +159,12 @@ impl Docker {
     }
 }
 
-/// What a failed command has printed, as an error. Its last line says what was wrong.
+/// What a failed command has printed, as an error. Its last line says what was wrong, but for the one in which `docker start`
+/// lists the containers.
 fn failure(command: String, printed: &str) -> DockerError {
     let mut lines = printed.lines().rev().map(str::trim);
-    let message = lines.find(|line| !line.is_empty()).unwrap_or("it says nothing").to_owned();
+    let message =
+        lines.find(|line| !line.is_empty() && !line.starts_with(LIST)).unwrap_or("it says nothing").to_owned();
     let said = printed.to_lowercase();
     if NO_DAEMON.iter().any(|words| said.contains(words)) {
         return DockerError::NoDaemon(message);
@@ -178,5 +182,12 @@ mod tests {
         assert!(matches!(failure("docker ps".to_owned(), words), DockerError::NoDaemon(_)));
         let error = failure("docker build".to_owned(), "Step 1/2\nno space left on device\n");
         assert_eq!(error.to_string(), "`docker build` failed: no space left on device");
+        let words =
+            "Error response from daemon: port is already allocated\nError: failed to start containers: one, two\n";
+        let error = failure("docker start one".to_owned(), words);
+        assert!(
+            error.to_string().ends_with("failed: Error response from daemon: port is already allocated"),
+            "{error}"
+        );
     }
 }
