@@ -382,3 +382,41 @@ async fn a_world_can_kill_the_server_only_without_a_sandbox() {
     client.leave().await;
     nothing_left(&server, 2).await;
 }
+
+#[actix_rt::test]
+async fn what_is_empty_in_a_sandbox_stays_so_and_its_shared_memory_is_bounded() {
+    let help = std::process::Command::new("bwrap").arg("--help").output().unwrap();
+    if !String::from_utf8_lossy(&help.stdout).contains("--disable-userns") {
+        return skip("what_is_empty_in_a_sandbox_stays_so", "bubblewrap is older than 0.8");
+    }
+    let stage = Stage::new();
+    std::fs::set_permissions(stage.forge.path(), std::fs::Permissions::from_mode(0o755)).unwrap();
+    // Hidden folders must be there when the server starts.
+    for name in ["log", "cache"] {
+        let folder = stage.folder.path().join(name);
+        std::fs::create_dir(&folder).unwrap();
+        std::fs::set_permissions(folder, std::fs::Permissions::from_mode(0o777)).unwrap();
+    }
+    let hidden = |name| format!("ls {0} && touch {0}/new", shown(stage.folder.path().join(name)));
+    let deeds = [
+        ("fill /dev", "touch /dev/new".to_owned()),
+        ("fill /run", "touch /run/new".to_owned()),
+        ("fill the log", hidden("log")),
+        ("fill the cache", hidden("cache")),
+        ("use devices", "head -c 1 /dev/urandom > /dev/null".to_owned()),
+        ("use the runtime folder", "touch $XDG_RUNTIME_DIR/new".to_owned()),
+        ("use shared memory", "head -c 4000000 /dev/zero > /dev/shm/one".to_owned()),
+        ("fill it", "head -c 4000000 /dev/zero > /dev/shm/other".to_owned()),
+    ];
+    for before in ["true"].into_iter().chain(as_nobody()) {
+        let done = stage.tried(&deeds, "sandbox", |builder| builder.before(before).set("limits.disk", 5)).await;
+        assert_eq!(done, ["use devices", "use the runtime folder", "use shared memory"], "{before}");
+        // The next one is another user's.
+        for name in ["log", "cache"] {
+            std::fs::remove_dir_all(stage.folder.path().join(name)).unwrap();
+            let folder = stage.folder.path().join(name);
+            std::fs::create_dir(&folder).unwrap();
+            std::fs::set_permissions(folder, std::fs::Permissions::from_mode(0o777)).unwrap();
+        }
+    }
+}

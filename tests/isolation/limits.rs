@@ -198,3 +198,32 @@ async fn a_simulation_has_a_control_group_of_its_own_where_they_are_delegated() 
         assert_eq!(hiding.count(), 0, "{level}: what hides ends too");
     }
 }
+
+/// What a program says that may start no thread and no process, as a user who has no other.
+fn said_without_threads(program: &str, arguments: &[&str]) -> String {
+    let mut command = std::process::Command::new("prlimit");
+    if nix::unistd::getuid().is_root() {
+        let user = rand::random_range(100_000..1_000_000_000).to_string();
+        command = std::process::Command::new("setpriv");
+        command.args(["--reuid", &user, "--regid", &user, "--clear-groups", "prlimit"]);
+    }
+    let output = command.args(["--nproc=1", program]).args(arguments).output().unwrap();
+    String::from_utf8_lossy(&output.stderr).into_owned() + &String::from_utf8_lossy(&output.stdout)
+}
+
+#[test]
+fn programs_that_may_start_no_thread_say_so_and_do_not_panic() {
+    if super::deeds::as_nobody().is_none() && nix::unistd::getuid().is_root() {
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::set_permissions(folder.path(), std::os::unix::fs::PermissionsExt::from_mode(0o755)).unwrap();
+    let (world, config) = (folder.path().join("a.wbt"), folder.path().join("config.json"));
+    std::fs::write(&world, "#VRML_SIM R2025a utf8\n").unwrap();
+    std::fs::write(&config, "{\"display\": \":59\", \"isolation\": \"none\"}").unwrap();
+    let said = said_without_threads(env!("CARGO_BIN_EXE_demo-simulator"), &["--stream", world.to_str().unwrap()]);
+    assert!(said.contains("no thread can be started") && !said.contains("panicked"), "{said}");
+    let check = ["--check", config.to_str().unwrap()];
+    let said = said_without_threads(env!("CARGO_BIN_EXE_simulation-server"), &check);
+    assert!(said.contains("no thread can be started to ask it") && !said.contains("panicked"), "{said}");
+}

@@ -15,7 +15,7 @@ use crate::support::disk::{self, Full};
 use crate::support::git::Forge;
 use crate::support::program::{Builder, Server, simulation_server};
 use crate::support::webots::Webots;
-use crate::support::{http, skip, until};
+use crate::support::{SOON, http, skip, until};
 
 /// The size of the disk, in MiB; `diskReserve` is as it is by itself.
 const SIZE: u32 = 1024;
@@ -140,7 +140,8 @@ async fn simulations_never_use_up_the_reserve_of_the_disk() {
             let mut client = doing(&server, deed).await;
             let least = Least::of(&small);
             go(&server, &format!("python3 deed {argument}"));
-            let told = client.until("loading: Error:").await;
+            let told = actix_rt::time::timeout(SOON, client.until("loading: Error:")).await;
+            let told = told.unwrap_or_else(|_| panic!("{what}: it was not ended, {} MiB were left", least.mib()));
             assert!(told.contains("is almost full (diskReserve), and the simulation "), "{what}: {told}");
             let hides = user == "nobody" && name == "hidden";
             assert_eq!(told.contains("hides which files"), hides, "{what}: {told}");

@@ -188,3 +188,31 @@ async fn what_is_kept_needs_the_password_where_there_is_one() {
         assert_eq!(ask(&url).await.unwrap().status(), 404, "{id}");
     }
 }
+
+#[actix_rt::test]
+async fn what_hides_or_turns_letters_around_in_a_worlds_name_is_shown_as_such() {
+    let forge = Forge::new();
+    let text = "#VRML_SIM R2025a utf8\n";
+    let (file, encoded) = ("a\u{202e}b\u{2028}\u{200b}.wbt", "c%E2%80%AEd%E2%80%A8.wbt");
+    let decoded = "worlds/c\u{202e}d\u{2028}.wbt";
+    forge.commit("lab/arm", "main", &[(&format!("worlds/{file}"), text), (decoded, text)]);
+    let webots = Webots::script(&format!("{DEMO} \"$@\" & wait"));
+    let server = simulation_server(&webots.path(), forge.path(), 2).start().await;
+    let mut clients = Vec::new();
+    for name in [file, encoded] {
+        let mut client = Client::start(&server, &world("lab/arm", "main", &format!("worlds/{name}"))).await;
+        client.until("webots:").await;
+        clients.push(client);
+    }
+    let hides = |text: &str| text.contains(['\u{202e}', '\u{2028}', '\u{200b}']);
+    let page = http::get(&server.url("/monitor")).await.text();
+    assert!(page.contains("a\u{fffd}b \u{fffd}.wbt") && page.contains("%E2%80%AEb"), "{page}");
+    assert!(!hides(&page), "{page}");
+    for client in clients {
+        client.leave().await;
+    }
+    let page = async || http::get(&server.url("/monitor")).await.text();
+    until("their ends are shown", async || page().await.matches("data-label=\"After\"").count() == 2).await;
+    let page = page().await;
+    assert!(!hides(&page) && !hides(&server.log()), "{page}");
+}

@@ -99,7 +99,7 @@ impl KeptConnection {
     /// Why Webots can't open its window there, and what to do about it.
     pub fn check(&mut self, display: &str) -> Result<(), DisplayError> {
         if let Some(connection) = self.0.take() {
-            self.0 = within_time(move || answers(&connection).then_some(connection)).flatten();
+            self.0 = within_time(move || answers(&connection).then_some(connection)).ok().flatten();
         }
         if self.0.is_none() {
             self.0 = Some(connect(display)?);
@@ -119,21 +119,21 @@ fn connect(display: &str) -> Result<RustConnection, DisplayError> {
     DisplayName::try_from(display.to_owned())?;
     let name = display.to_owned();
     match within_time(move || RustConnection::connect(Some(&name))) {
-        Some(Ok((connection, _))) => Ok(connection),
-        Some(Err(error)) => Err(explain(display, error)),
-        None => {
-            let reason = format!("it is silent for {} s", ANSWER.as_secs());
-            Err(DisplayError::Strange { display: display.to_owned(), reason })
-        }
+        Ok(Ok((connection, _))) => Ok(connection),
+        Ok(Err(error)) => Err(explain(display, error)),
+        Err(reason) => Err(DisplayError::Strange { display: display.to_owned(), reason }),
     }
 }
 
-/// What this returns, if it does in time: a connection has no time limit of its own. Nothing if no thread can be started.
-fn within_time<T: Send + 'static>(ask: impl FnOnce() -> T + Send + 'static) -> Option<T> {
+/// What this returns, if it does in time: a connection has no time limit of its own.
+///
+/// # Errors
+/// Why not, in words.
+fn within_time<T: Send + 'static>(ask: impl FnOnce() -> T + Send + 'static) -> Result<T, String> {
     let (sender, answer) = mpsc::channel();
     let thread = std::thread::Builder::new().name("display".to_owned());
-    thread.spawn(move || sender.send(ask())).ok()?;
-    answer.recv_timeout(ANSWER).ok()
+    thread.spawn(move || sender.send(ask())).map_err(|error| format!("no thread can be started to ask it: {error}"))?;
+    answer.recv_timeout(ANSWER).map_err(|_| format!("it is silent for {} s", ANSWER.as_secs()))
 }
 
 fn explain(display: &str, error: ConnectError) -> DisplayError {
