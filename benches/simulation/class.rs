@@ -232,11 +232,15 @@ impl Bare {
             .stderr(Stdio::null())
             .status();
         assert!(git.unwrap().success());
-        let port = (format!("--port={}", self.port), format!("--port={}", self.port + number));
+        // Of the program, and of pasta.
+        let ports = ["--port=", "127.0.0.1/"]
+            .map(|word| (format!("{word}{}", self.port), format!("{word}{}", self.port + number)));
         let own = |word: &OsString| {
             let instance = self.instance.as_os_str().as_bytes();
             let word = replaced(word.as_bytes(), instance, folder.as_os_str().as_bytes());
-            OsString::from_vec(replaced(&word, port.0.as_bytes(), port.1.as_bytes()))
+            let of_port =
+                |word: Vec<u8>, (old, new): &(String, String)| replaced(&word, old.as_bytes(), new.as_bytes());
+            OsString::from_vec(ports.iter().fold(word, of_port))
         };
         let command: Vec<OsString> = self.command.iter().map(own).collect();
         Command::new(&command[0])

@@ -21,8 +21,9 @@ MOST, EACH = 3, 24
 class Demo:
     """The running demo: use it with `with`."""
 
-    def __init__(self, session=None, simulation=None):
-        """Starts it; the arguments are further keys of its configuration."""
+    def __init__(self, session=None, simulation=None, user=None):
+        """Starts it, as a user of this number; the other arguments are further keys of its configuration."""
+        self.become = ["setpriv", f"--reuid={user}", f"--regid={user}", "--clear-groups"] if user else []
         self.temporary = pathlib.Path(tempfile.mkdtemp(prefix="fleet-demo-"))
         self.folder = self.temporary / "webots-fleet"
         self.folder.mkdir()
@@ -40,8 +41,10 @@ class Demo:
         self.configure("session", "demo", {
             "port": port, "simulationServers": [self.simulation], "loadThreshold": 1000, **(session or {})})
         self.configure("simulation", "demo", {"port": port + 1, **(simulation or {})})
+        if user:
+            subprocess.run(["chown", "--recursive", f"{user}:{user}", self.temporary], check=True)
         try:
-            self.server_sh("start", "demo")
+            self.started = self.server_sh("start", "demo")
         except BaseException:
             self.close()
             raise
@@ -65,7 +68,7 @@ class Demo:
     def server_sh(self, *arguments):
         """Runs server.sh, which has to succeed; gives back what it prints."""
         done = subprocess.run(
-            [self.folder / "server.sh", *arguments], env={**os.environ, "FLEET_BIN": str(BIN)}, timeout=LIMIT,
+            [*self.become, self.folder / "server.sh", *arguments], env={**os.environ, "FLEET_BIN": str(BIN)}, timeout=LIMIT,
             stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
         if done.returncode != 0:
             raise AssertionError(f"server.sh {arguments}: {done.returncode}\n{done.stdout}{done.stderr}{self.logs()}")

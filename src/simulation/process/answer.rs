@@ -12,7 +12,7 @@ use tokio::net::TcpStream;
 /// A file that Webots does not have. A request for `/` would begin a WebSocket.
 const REQUEST: &[u8] = b"GET /robots.txt HTTP/1.0\r\nHost: localhost\r\n\r\n";
 /// Bounds of the pause between two requests.
-const PAUSE: (Duration, Duration) = (Duration::from_millis(25), Duration::from_millis(500));
+const PAUSE: (Duration, Duration) = (Duration::from_millis(5), Duration::from_millis(500));
 /// The pause is such a part of the time since the start, so that many that start on a busy machine don't ask it all the time.
 const PART: u32 = 20;
 /// Timeout of the first request: the proxy may accept it before anything inside listens.
