@@ -70,7 +70,7 @@ fn display(config: &SimulationConfig) -> Result<String, String> {
         return Ok("each Webots gets a virtual display of its own (xvfb), without the graphics card".to_owned());
     }
     let source = match (&config.display, display::of_environment()) {
-        _ if !config.displays_of_gpus().is_empty() => "displays names it",
+        _ if !config.displays_of_gpus().is_empty() => "displays names them",
         (Some(_), _) => "the configuration names it",
         (None, Some(_)) => "the environment variable DISPLAY names it",
         (None, None) => "DISPLAY is not set, and the configuration names no display",
@@ -78,7 +78,10 @@ fn display(config: &SimulationConfig) -> Result<String, String> {
     let count = u32::try_from(config.displays_of_gpus().len()).unwrap_or(u32::MAX).max(1);
     let displays: Vec<String> = (0..count).map(|gpu| config.display_on(Some(gpu))).collect();
     match displays.iter().find_map(|display| display::check(display).err()) {
-        None => Ok(format!("{} answers ({source})", displays.join(", "))),
+        None => {
+            let verb = if displays.len() > 1 { "answer" } else { "answers" };
+            Ok(format!("{} {verb} ({source})", displays.join(", ")))
+        }
         Some(trouble) => Err(format!("{trouble} ({source})")),
     }
 }

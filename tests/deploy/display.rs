@@ -14,10 +14,22 @@ struct Xvfb {
 }
 
 impl Xvfb {
-    /// Starts one; with an authority file, it takes only those who know a cookie in it.
+    /// Starts one with two screens; with an authority file, it takes only those who know a cookie in it.
     fn start(authority: Option<&Path>) -> Self {
         let mut command = Command::new("Xvfb");
-        command.args(["-displayfd", "1", "-screen", "0", "64x64x24", "-nolisten", "tcp", "-noreset"]);
+        command.args([
+            "-displayfd",
+            "1",
+            "-screen",
+            "0",
+            "64x64x24",
+            "-screen",
+            "1",
+            "64x64x24",
+            "-nolisten",
+            "tcp",
+            "-noreset",
+        ]);
         if let Some(file) = authority {
             command.arg("-auth").arg(file);
         }
@@ -88,6 +100,25 @@ async fn a_display_that_refuses_is_opened_by_what_is_told() {
     let output = xhost.output().unwrap();
     assert!(output.status.success(), "{told}: {}", String::from_utf8_lossy(&output.stderr));
     assert_eq!(check(&locked.display), Ok(()));
+}
+
+#[actix_rt::test]
+async fn the_screen_of_each_gpu_is_checked() {
+    let _alone = display::alone().await;
+    let library = crate::simulation::readings::gpu_driver();
+    let server = Xvfb::start(None);
+    let [first, second, missing] = [0, 1, 2].map(|screen| format!("{}.{screen}", server.display));
+    for (displays, words) in [
+        ([&first, &second], format!("display: {first}, {second} answer (displays names them)\n")),
+        ([&first, &missing], format!("warning: display: what is at {missing} does not answer as a display does: ")),
+    ] {
+        let keys = serde_json::json!({"gpus": "spread", "displays": displays, "display": ":59000"});
+        let (_, told) = super::preflight::check(&keys, |command| {
+            command.env("LD_LIBRARY_PATH", library.path());
+        });
+        assert!(told.contains(&words), "{words} is not in\n{told}");
+        assert!(told.contains("\nGPUs: simulations are spread over Stand-in A, Stand-in B\n"), "{told}");
+    }
 }
 
 #[actix_rt::test]

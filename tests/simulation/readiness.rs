@@ -61,6 +61,26 @@ async fn a_display_that_is_missing_is_a_problem_for_webots_itself() {
 }
 
 #[actix_rt::test]
+async fn the_display_of_each_gpu_that_answers_is_needed() {
+    let library = super::readings::gpu_driver();
+    let mark = library.path().join("mark");
+    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
+    let server = simulation_server(&webots.path(), forge.path(), 1)
+        .env("LD_LIBRARY_PATH", library.path().to_str().unwrap())
+        .env("NVML_LOST", mark.to_str().unwrap())
+        .set("webots", Value::Null)
+        .set("webotsHome", webots.path().parent().unwrap().to_str().unwrap())
+        .set("gpus", "spread")
+        .set("displays", serde_json::json!([":59000", ":59001"]))
+        .start()
+        .await;
+    until("the first is missing", async || health(&server).await.1.contains("no display answers at :59000")).await;
+    std::fs::write(&mark, "").unwrap();
+    let second = "no display answers at :59001";
+    until("that of a lost one is not needed", async || health(&server).await.1.contains(second)).await;
+}
+
+#[actix_rt::test]
 async fn a_server_below_its_reserve_of_disk_refuses_clients_and_says_so() {
     let (forge, webots) = (Forge::with_arm(), Webots::launcher());
     let server = simulation_server(&webots.path(), forge.path(), 1).set("diskReserve", 100_000_000).start().await;
