@@ -1,7 +1,7 @@
 //! The reserve of the disk: whatever simulations write, it is not used up.
 
 use std::os::unix::fs::PermissionsExt;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::Duration;
@@ -93,25 +93,20 @@ fn webots() -> Webots {
     ))
 }
 
-/// Starts a simulation, which does this once it is ready. Returns its client.
-async fn doing(server: &Server, deed: &str) -> Client {
+/// Starts a simulation, which does this once it is ready. Returns its client and the folder of its instance.
+async fn doing(server: &Server, deed: &str) -> (Client, PathBuf) {
     let before = instance_folders(&server.folder);
     let mut client = Client::start(server, &arm()).await;
     client.until("webots:").await;
     let new = instance_folders(&server.folder).into_iter().find(|folder| !before.contains(folder)).unwrap();
     std::fs::write(new.join("project/deed"), deed).unwrap();
-    client
+    (client, new)
 }
 
-/// Lets the deed of the simulation begin that waits for that.
-fn go(server: &Server, line: &str) {
-    for folder in instance_folders(&server.folder) {
-        let go = folder.join("project/go");
-        if !go.exists() {
-            std::fs::write(folder.join("project/new"), line).unwrap();
-            std::fs::rename(folder.join("project/new"), go).unwrap();
-        }
-    }
+/// Lets the deed of a simulation begin, whose instance has this folder.
+fn go(folder: &Path, line: &str) {
+    std::fs::write(folder.join("project/new"), line).unwrap();
+    std::fs::rename(folder.join("project/new"), folder.join("project/go")).unwrap();
 }
 
 #[actix_rt::test]
@@ -130,16 +125,16 @@ async fn simulations_never_use_up_the_reserve_of_the_disk() {
         let own = small.join(user);
         std::fs::create_dir(&own).unwrap();
         let server = server(&forge, &webots, &own, |builder| builder.before(before)).await;
-        let mut innocent = doing(&server, "").await;
-        go(&server, "true");
+        let (mut innocent, folder) = doing(&server, "").await;
+        go(&folder, "true");
         let mut deeds = vec![("many", MANY, ""), ("nameless", NAMELESS, "")];
         // Root sees what hides, too.
         deeds.push(("hidden", NAMELESS, "hidden"));
         for (name, deed, argument) in deeds {
             let what = format!("{user}, {name}");
-            let mut client = doing(&server, deed).await;
+            let (mut client, folder) = doing(&server, deed).await;
             let least = Least::of(&small);
-            go(&server, &format!("python3 deed {argument}"));
+            go(&folder, &format!("python3 deed {argument}"));
             let told = actix_rt::time::timeout(SOON, client.until("loading: Error:")).await;
             let told = told.unwrap_or_else(|_| panic!("{what}: it was not ended, {} MiB were left", least.mib()));
             assert!(told.contains("is almost full (diskReserve), and the simulation "), "{what}: {told}");
