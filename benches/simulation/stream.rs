@@ -48,7 +48,7 @@ pub async fn measure(sizes: &[u16], time: Duration) {
             let all = status["simulations"].as_array().unwrap();
             let ports: Vec<u16> = all.iter().map(|one| one["port"].as_u64().unwrap().try_into().unwrap()).collect();
             let root = Process::new(all[0]["pid"].as_i64().unwrap().try_into().unwrap()).unwrap();
-            let resident = root.stat().unwrap().rss * procfs::page_size() >> 10;
+            let resident = (root.stat().unwrap().rss * procfs::page_size()) >> 10;
             let first = ports[0];
             let (mut times, rate) = actix_rt::task::spawn_blocking(move || {
                 let threads: Vec<_> =
