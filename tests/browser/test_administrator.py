@@ -128,14 +128,16 @@ class Phone(BrowserTest):
                 f'<td role="cell" data-label="CPU" data-value="{number}">{number} %</td><td role="cell" data-label="Memory" data-value="1">90 MiB</td>'
                 f'<td role="cell" data-label="Port" data-value="{number}">{number}</td><td role="cell" data-label="Output">Last lines</td>')}
 
-        def event(state):
-            return "data: " + json.dumps({"tables": {"simulations": [row(number, state) for number in range(200)]}}) + "\n\n"
+        more = []
+
+        def event():
+            state = "running" if more else "idle"
+            rows = [row(number, state) for number in range(200 + len(more))]
+            return "retry: 500\n\ndata: " + json.dumps({"tables": {"simulations": rows}}) + "\n\n"
 
         page = self.browser.page(width=390, height=844)
         self.addCleanup(page.close)
-        states = iter(["idle", "running"])
-        page.tab.route("**/events", lambda route: route.fulfill(
-            content_type="text/event-stream", body="retry: 500\n\n" + event(next(states, "running"))))
+        page.tab.route("**/events", lambda route: route.fulfill(content_type="text/event-stream", body=event()))
         page.tab.goto(self.fleet.simulation.url("monitor"))
         rows = page.tab.locator("#simulations tr")
         expect(rows).to_have_count(200)
@@ -151,14 +153,16 @@ class Phone(BrowserTest):
         field.fill("student04")
         expect(page.tab.locator("#filtered")).to_have_text("10 of 200")
         expect(page.tab.locator("#simulations tr:visible")).to_have_count(10)
-        # Another event has come: sort order and filter are what they were.
+        # Another event comes, with another row: sort order and filter are what they were.
+        more.append(200)
+        expect(page.tab.locator("#filtered")).to_have_text("10 of 201")
         expect(page.tab.locator("#simulations tr:visible .state").first).to_have_text("running")
         expect(page.tab.locator("#simulations tr:visible").first).to_contain_text("student049")
         expect(page.tab.locator("#simulations tr:visible")).to_have_count(10)
         field.fill("student123")
         expect(page.tab.locator("#simulations tr:visible")).to_be_in_viewport()
         field.fill("")
-        expect(page.tab.locator("#simulations tr:visible")).to_have_count(200)
+        expect(page.tab.locator("#simulations tr:visible")).to_have_count(201)
         self.assertLess(rows.nth(0).bounding_box()["height"], 260)
         self.assertEqual(page.faults(), [])
 

@@ -328,7 +328,7 @@ mod tests {
         Simulation {
             id: SimulationId::next(),
             world: world.to_owned(),
-            who: Who::new(Some("<b>root</b>"), Some("<script>'\"&")),
+            who: Who::new(Some("<i>root</i>"), Some("<script>'\"&")),
             stage: Stage::Idle,
             since: 0,
             launched: Some(1),
@@ -356,11 +356,11 @@ mod tests {
 
     #[test]
     fn what_a_client_names_is_only_text() {
-        let one = simulation("https://github.com/u/<b>\"'&/blob/main/worlds/<script>.wbt");
+        let one = simulation("https://github.com/u/<i>\"'&/blob/main/worlds/<script>.wbt");
         for (reader, has_names) in [(Reader::Anybody, false), (Reader::Stranger, false), (Reader::Administrator, true)]
         {
             let html = SimulationRow::new(&one, None, 7200, reader).render().unwrap();
-            assert!(!html.contains("<script>") && !html.contains("<b>"), "{html}");
+            assert!(!html.contains("<script>") && !html.contains("<i>"), "{html}");
             assert_eq!(html.contains("root"), has_names, "{html}");
         }
     }
