@@ -17,7 +17,7 @@ const GONE: Duration = Duration::from_secs(10);
 /// The next simulated time that a viewer is told, in milliseconds.
 async fn simulated(viewer: &mut Client) -> f64 {
     let update = viewer.until("application/json:").await;
-    serde_json::from_str::<Value>(&update["application/json:".len()..]).unwrap()["time"].as_f64().unwrap()
+    serde_json::from_str::<Value>(update.trim_start_matches("application/json:")).unwrap()["time"].as_f64().unwrap()
 }
 
 #[actix_rt::test]
@@ -81,7 +81,7 @@ async fn who_comes_back_finds_its_container_as_it_runs() {
     client.send(&json!({"start": {"url": arm(), "resumable": true}}).to_string()).await;
     let address = client.patiently("webots:", READY).await;
     let stream = address.trim_start_matches("webots:").replace("localhost", "127.0.0.1");
-    let token = client.until("resume: ").await["resume: ".len()..].to_owned();
+    let token = client.until("resume: ").await.trim_start_matches("resume: ").to_owned();
     let mut viewer = Client::connect(&stream).await;
     viewer.send("x3d").await;
     viewer.until("scene load completed").await;

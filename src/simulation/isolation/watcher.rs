@@ -234,7 +234,9 @@ impl Table {
         let trees = self.all.iter().filter(|one| is_counted(&one.watch)).map(|one| Tree::of(one.watch.root));
         let usages = self.usage.read(&trees.collect::<Vec<_>>());
         for Watch { root, peak, .. } in self.all.iter().map(|one| &one.watch) {
-            peak.iter().for_each(|peak| peak.look(usages.get(root)));
+            if let Some(peak) = peak {
+                peak.look(usages.get(root));
+            }
         }
         let counted = self.all.iter().filter_map(|one| Some((one.watch.root, one.watch.processes?)));
         let too_many = counted.filter(|(root, most)| {

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use actix::prelude::*;
 
 use super::event::WebotsEvent;
-use super::webots::Webots;
+use super::webots::{IdleEnd, Webots};
 use crate::simulation::ends::EndReason;
 
 /// So long before its end the client is told; where `idleTimeout` is shorter than twice that, half of it before.
@@ -21,23 +21,26 @@ pub struct Keep;
 impl Webots {
     /// Somebody has done something with the simulation: if it is paused now, its `idleTimeout` begins.
     pub(super) fn used(&mut self, ctx: &mut Context<Self>) {
-        self.idle_end.take().map(|timer| ctx.cancel_future(timer));
-        if std::mem::take(&mut self.idle_end_told) {
-            self.tell(WebotsEvent::IdleEnd(None));
+        if let Some(IdleEnd { timer, is_told }) = self.idle_end.take() {
+            ctx.cancel_future(timer);
+            if is_told {
+                self.tell(WebotsEvent::IdleEnd(None));
+            }
         }
         let limit = self.spec.config.idle_timeout;
         if limit.is_zero() || self.runs || !self.listening {
             return;
         }
         let notice = NOTICE.min(limit / 2);
-        self.idle_end = Some(ctx.run_later(limit - notice, move |this, ctx| {
-            this.idle_end_told = true;
+        let timer = ctx.run_later(limit.saturating_sub(notice), move |this, ctx| {
             this.tell(WebotsEvent::IdleEnd(Some(Instant::now() + notice)));
-            this.idle_end = Some(ctx.run_later(notice, move |this, _| {
+            let timer = ctx.run_later(notice, move |this, _| {
                 let minutes = limit.as_secs_f64() / 60.0;
                 this.stop(EndReason::Idle, &format!("The simulation was paused for {minutes} minutes"));
-            }));
-        }));
+            });
+            this.idle_end = Some(IdleEnd { timer, is_told: true });
+        });
+        self.idle_end = Some(IdleEnd { timer, is_told: false });
     }
 }
 

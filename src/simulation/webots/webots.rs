@@ -49,13 +49,19 @@ pub struct Webots {
     pub(super) listening: bool,
     /// Whether the simulation is not paused.
     pub(super) runs: bool,
-    /// The wait until one that is paused ends, and whether its client was told of that end.
-    pub(super) idle_end: Option<SpawnHandle>,
-    pub(super) idle_end_told: bool,
+    /// The wait until one that is paused ends.
+    pub(super) idle_end: Option<IdleEnd>,
     last_heartbeat: Instant,
     hanging: bool,
     /// Why it was asked to end, if it was.
     stopped_for: Option<(EndReason, String)>,
+}
+
+/// The wait until a simulation that is paused ends.
+pub(super) struct IdleEnd {
+    pub(super) timer: SpawnHandle,
+    /// Whether its client was told of that end.
+    pub(super) is_told: bool,
 }
 
 /// So many heartbeats may be missed before Webots counts as hanging.
@@ -77,7 +83,6 @@ impl Webots {
             listening: false,
             runs: false,
             idle_end: None,
-            idle_end_told: false,
             last_heartbeat: Instant::now(),
             hanging: false,
             stopped_for: None,
