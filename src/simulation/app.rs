@@ -25,6 +25,7 @@ use crate::simulation::container::Containers;
 use crate::simulation::isolation::{Launcher, Watcher};
 use crate::simulation::machine::{LoadMonitor, UsageMonitor};
 use crate::simulation::process::{Guardian, Leftovers, RunDir};
+use crate::simulation::relay::Upstream;
 use crate::simulation::web::configure;
 
 /// How often it is checked whether all simulations have ended.
@@ -118,7 +119,8 @@ pub async fn serve(assembly: Assembly) -> Result<(), AppError> {
         stop: Duration::from_secs(1),
         trusted_proxies: server.config.trusted_proxies.clone(),
     };
-    let app = move || App::new().app_data(shared.clone()).configure(configure);
+    let simulations = server.config.address_of_simulations();
+    let app = move || App::new().app_data(shared.clone()).app_data(Upstream::new(simulations)).configure(configure);
     let http = server::serve(socket, server.connections.clone(), options, app)?;
     let handle = http.handle();
     let serving = actix_rt::spawn(http);
@@ -235,6 +237,7 @@ fn assemble(
         ends,
         places,
         sessions: Arc::default(),
+        streams: Arc::default(),
         load_monitor,
         readings,
         checkouts: Arc::new(checkouts),

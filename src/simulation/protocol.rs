@@ -20,6 +20,7 @@
 //! | `absence: SECONDS` | how long the simulation waits for its client once the connection is broken |
 //! | `resume: TOKEN` | what to come back with |
 //! | `.` | Webots is alive |
+//! | `watched: 1` or `watched: 0` | an administrator watches the simulation from now on, or no longer |
 //! | `reset controller: NAME/FILE` | done |
 //!
 //! Webots' page puts every TEXT into `innerHTML`: it passes through [`client_text`] here, and nowhere else,
@@ -172,6 +173,12 @@ pub fn shutdown_timeout(seconds: u64) -> String {
 #[must_use]
 pub fn absence(seconds: u64) -> String {
     format!("absence: {seconds}")
+}
+
+/// Whether an administrator watches the simulation.
+#[must_use]
+pub fn watched(is_watched: bool) -> String {
+    format!("watched: {}", u8::from(is_watched))
 }
 
 /// What its client can come back with.

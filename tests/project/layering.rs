@@ -17,13 +17,15 @@ const SESSION: [&str; 8] = [
     "session::web",
     "session::app",
 ];
-const SIMULATION: [&str; 21] = [
+const SIMULATION: [&str; 23] = [
     "simulation::simulation_id",
     "simulation::ends",
     "simulation::snapshot",
     "simulation::failed_starts",
     "simulation::places",
     "simulation::sessions",
+    "simulation::streams",
+    "simulation::relay",
     "simulation::protocol",
     "simulation::process",
     "simulation::machine",

@@ -19,6 +19,7 @@ mod protocol;
 mod readiness;
 pub mod readings;
 mod ready;
+mod relay;
 mod resuming;
 pub mod scene;
 mod soak;

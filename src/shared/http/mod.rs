@@ -22,5 +22,5 @@ pub use connections::{ConnectionPermit, Connections, Kind};
 pub use live::{Live, Row, View};
 pub use metrics::{CONTENT_TYPE, Gauge, Metrics};
 pub use origin::Origin;
-pub use page::{Policy, any_host, fleet_sources, heat, html, width};
+pub use page::{Policy, any_host, fleet_sources, heat, html, own_sources, width};
 pub use peer::{Peer, TrustedProxies};

@@ -5,6 +5,7 @@ mod isolation;
 mod own_files;
 mod resources;
 mod simulation_config;
+mod streaming;
 mod timing;
 mod urls;
 
@@ -12,4 +13,5 @@ pub use container::{ContainerDisplay, ContainerNetwork, ContainerSettings, EDITO
 pub use isolation::{Isolation, SandboxFolders, VariableName};
 pub use resources::Resources;
 pub use simulation_config::SimulationConfig;
+pub use streaming::Streaming;
 pub use timing::Timing;

@@ -3,7 +3,7 @@
 //! Docker's proxy listens on it from the container's start on, and accepts connections that nothing inside takes. So only
 //! the answer to a request tells.
 
-use std::net::{IpAddr, Ipv4Addr};
+use std::net::Ipv4Addr;
 use std::time::{Duration, Instant};
 
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
@@ -20,11 +20,9 @@ const FIRST_TIMEOUT: Duration = Duration::from_millis(100);
 /// Timeout that later ones approach: Webots answers none while it reads a world.
 const TIMEOUT: Duration = Duration::from_secs(2);
 
-/// Waits until there is an answer on this port of an address that the server binds to. The container has to run: a request
+/// Waits until there is an answer on this port of this address. The container has to run: a request
 /// before it has its address holds all others up for a second, until the kernel asks for that address again.
-pub async fn until_answering(bind: IpAddr, port: u16) {
-    // Containers listen on IPv4, see the variable BIND of their templates.
-    let address = if bind.is_ipv4() && !bind.is_unspecified() { bind } else { Ipv4Addr::LOCALHOST.into() };
+pub async fn until_answering(address: Ipv4Addr, port: u16) {
     let (begin, mut timeout) = (Instant::now(), FIRST_TIMEOUT);
     loop {
         match actix_rt::time::timeout(timeout, answers((address, port).into())).await {
@@ -51,7 +49,7 @@ mod tests {
     async fn a_proxy_that_accepts_for_nobody_is_no_answer() {
         let listener = tokio::net::TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).await.unwrap();
         let address = listener.local_addr().unwrap();
-        let waiting = actix_rt::spawn(until_answering(Ipv4Addr::UNSPECIFIED.into(), address.port()));
+        let waiting = actix_rt::spawn(until_answering(Ipv4Addr::LOCALHOST, address.port()));
         drop(listener.accept().await.unwrap());
         let (mut stream, _) = listener.accept().await.unwrap();
         assert!(!waiting.is_finished());

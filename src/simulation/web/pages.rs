@@ -4,6 +4,7 @@ use std::time::{Duration, SystemTime};
 
 use askama::Template;
 
+use super::administrator::shows_ports;
 use crate::shared::domain::UrlPrefix;
 use crate::shared::http::{Row, View};
 use crate::shared::run::{seconds_since_1970, timestamp};
@@ -38,6 +39,8 @@ struct Monitor<'server> {
     docker: bool,
     share_idle_time: f64,
     isolation: Level,
+    shows_ports: bool,
+    has_password: bool,
     /// What worlds' programs may do that they should not, and why.
     shortcoming: Option<(&'static str, &'server str)>,
     limit: String,
@@ -82,7 +85,10 @@ struct SimulationRow<'one> {
     cpu_value: f64,
     memory: String,
     memory_value: u64,
-    port: u16,
+    /// The port, where everybody may see it.
+    port: Option<u16>,
+    has_password: bool,
+    can_be_watched: bool,
 }
 
 /// The parts of `/monitor` that change.
@@ -93,7 +99,8 @@ pub fn view(server: &AppState, snapshot: &Snapshot, usages: &Usages) -> Result<V
     let readings = server.readings.borrow().clone();
     let rows = snapshot.simulations.iter().map(|one| {
         let usage = one.pid.and_then(|pid| usages.get(&pid)).copied();
-        let html = SimulationRow::new(one, usage, server.config.timeout).render()?;
+        let row = SimulationRow::new(one, usage, server.config.timeout);
+        let html = row.shown_by(server).render()?;
         Ok(Row { key: one.id.to_string(), html })
     });
     let rows = rows.collect::<Result<Vec<Row>, askama::Error>>()?;
@@ -130,6 +137,8 @@ pub fn monitor(server: &AppState, snapshot: &Snapshot, usages: &Usages) -> Resul
         docker: server.rules.docker,
         share_idle_time: server.rules.share_idle_time,
         isolation: server.launcher.level(),
+        shows_ports: shows_ports(server),
+        has_password: server.admin_auth.is_some(),
         shortcoming: shortcoming(server),
         limit: duration(server.config.timeout),
     };
@@ -226,8 +235,19 @@ impl<'one> SimulationRow<'one> {
             cpu_value: usage.and_then(|usage| usage.cpu).unwrap_or(-1.0),
             memory: usage.map(|usage| bytes(usage.memory)).unwrap_or_default(),
             memory_value: usage.map_or(0, |usage| usage.memory),
-            port: one.port.unwrap_or_default(),
+            port: None,
+            has_password: false,
+            can_be_watched: false,
         }
+    }
+
+    /// The same with what depends on who may do what on this server.
+    fn shown_by(mut self, server: &AppState) -> Self {
+        let streams = matches!(self.one.stage, Stage::Idle | Stage::Running);
+        self.port = shows_ports(server).then(|| self.one.port.unwrap_or_default());
+        self.has_password = server.admin_auth.is_some();
+        self.can_be_watched = streams && self.has_password;
+        self
     }
 }
 

@@ -19,6 +19,7 @@ use crate::simulation::machine::display;
 use crate::simulation::places::Ticket;
 use crate::simulation::process::SpawnSpec;
 use crate::simulation::protocol::Mode;
+use crate::simulation::streams::{Registration, Streams, Watched};
 
 /// Everything that one Webots is started with.
 pub struct LaunchSpec {
@@ -40,6 +41,10 @@ pub struct LaunchSpec {
     pub mode: Mode,
     /// The place, and its port.
     pub place: (Ticket, u16),
+    /// Where its stream is found while it runs.
+    pub streams: Arc<Streams>,
+    /// Who hears whether it is watched.
+    pub watched: Recipient<Watched>,
     /// Who gets the events.
     pub events: Recipient<WebotsEvent>,
 }
@@ -50,6 +55,12 @@ impl LaunchSpec {
     pub fn log_file(&self) -> PathBuf {
         let folder = self.config.log_dir.0.join("simulation").join(FOLDER_OF_RUNNING);
         folder.join(format!("{}.log", self.place.0.id()))
+    }
+
+    /// Has the stream found that this port has.
+    #[must_use]
+    pub fn register(&self, port: u16) -> Registration {
+        self.streams.register(self.place.0.id(), port, self.watched.clone())
     }
 
     /// What its containers are made of.
@@ -120,9 +131,10 @@ impl LaunchSpec {
     /// Waits until its container answers, or one of these processes listens on a port that Webots may have taken, and returns
     /// the port.
     pub fn listening_port(&self, root: i32) -> LocalBoxFuture<'static, u16> {
-        let (watcher, bind, port) = (self.watcher.clone(), self.config.bind, self.place.1);
+        let (watcher, port) = (self.watcher.clone(), self.place.1);
+        let address = self.config.address_of_simulations();
         match &self.containers {
-            Some(_) => until_answering(bind, port).map(move |()| port).boxed_local(),
+            Some(_) => until_answering(address, port).map(move |()| port).boxed_local(),
             None => async move { watcher.listening_port(root, port).await }.boxed_local(),
         }
     }
