@@ -18,8 +18,8 @@ pub async fn fetch(upstream: &Upstream, url: &str, request: &HttpRequest, held: 
         asked = asked.insert_header((header::IF_NONE_MATCH, tag));
     }
     let answer = match actix_rt::time::timeout(ANSWER, asked.send()).await {
-        Ok(Ok(answer)) => answer,
-        Ok(Err(_)) => return HttpResponse::BadGateway().body("Error: the simulation does not answer."),
+        Ok(Ok(answer)) if !answer.status().is_informational() => answer,
+        Ok(_) => return HttpResponse::BadGateway().body("Error: the simulation does not answer."),
         Err(_) => return HttpResponse::GatewayTimeout().body("Error: the simulation does not answer."),
     };
     let mut response = HttpResponse::build(answer.status());
