@@ -17,7 +17,7 @@ pub mod tls;
 pub mod websocket;
 
 pub use address_quota::{AddressQuota, share};
-pub use auth::BasicAuth;
+pub use auth::{AuthError, BasicAuth};
 pub use connections::{ConnectionPermit, Connections, Kind};
 pub use live::{Live, Row, View};
 pub use metrics::{CONTENT_TYPE, Gauge, Metrics};

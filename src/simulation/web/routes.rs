@@ -55,7 +55,7 @@ async fn load(server: web::Data<AppState>) -> HttpResponse {
 async fn status_json(request: HttpRequest, server: web::Data<AppState>) -> HttpResponse {
     let with_ports = match may_see_ports(&request, &server) {
         Ok(with_ports) => with_ports,
-        Err(refusal) => return refusal,
+        Err(refused) => return refused.answer(),
     };
     let Some(mut snapshot) = snapshot(&server).await else {
         return too_busy();
