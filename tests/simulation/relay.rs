@@ -311,7 +311,7 @@ async fn a_webots_that_does_not_answer_costs_its_client_an_error() {
         let webots = async {
             let (mut socket, _) = played.listener.accept().await.unwrap();
             let mut head = [0; 4096];
-            socket.read(&mut head).await.unwrap();
+            assert!(socket.read(&mut head).await.unwrap() > 0);
             socket.write_all(nonsense.as_bytes()).await.unwrap();
         };
         let (answer, ()) = tokio::join!(http::get(&url), webots);
@@ -319,7 +319,7 @@ async fn a_webots_that_does_not_answer_costs_its_client_an_error() {
         let webots = async {
             let (mut socket, _) = played.listener.accept().await.unwrap();
             let mut head = [0; 4096];
-            socket.read(&mut head).await.unwrap();
+            assert!(socket.read(&mut head).await.unwrap() > 0);
             socket.write_all(nonsense.as_bytes()).await.unwrap();
         };
         let (status, ()) = tokio::join!(played.stage.refused(&path), webots);
