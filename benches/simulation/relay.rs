@@ -114,14 +114,16 @@ pub async fn measure(verdict: &mut Verdict, time: Duration, rounds: usize) {
 async fn one(url: &str, process: i32, time: Duration) -> Taken {
     let connecting = (0..STREAMS).map(|_| tokio_tungstenite::connect_async(url));
     let sockets: Vec<_> = join_all(connecting).await.into_iter().map(|one| one.unwrap().0).collect();
-    actix_rt::time::sleep(Duration::from_secs(1)).await;
-    let before = processor(process);
+    let (before, begin) = (processor(process), now());
     let reading = sockets.into_iter().map(|mut socket| async move {
         let mut latencies = Vec::new();
         let reading = async {
             while let Some(Ok(message)) = socket.next().await {
                 let sent = u64::from_be_bytes(message.into_data()[..8].try_into().unwrap());
-                latencies.push(now().saturating_sub(sent));
+                // What waited while the others were connecting does not count.
+                if sent > begin {
+                    latencies.push(now().saturating_sub(sent));
+                }
             }
         };
         actix_rt::time::timeout(time, reading).await.expect_err("a stream has ended");
