@@ -85,10 +85,12 @@ impl Assembly {
 fn bound_clients(config: &SimulationConfig) -> Result<usize, AppError> {
     let places = config.max_connections;
     let needed = OWN_FILES + FILES_PER_SIMULATION * usize::from(places);
-    let wanted = config.max_clients.saturating_mul(CONNECTIONS_PER_CLIENT).saturating_add(needed);
+    // What is relayed has a connection on either side.
+    let each = if config.ports_are_public() { CONNECTIONS_PER_CLIENT } else { 2 * CONNECTIONS_PER_CLIENT };
+    let wanted = config.max_clients.saturating_mul(each).saturating_add(needed);
     let files = raise_open_files(u64::try_from(wanted).unwrap_or(u64::MAX));
     let rest = usize::try_from(files).unwrap_or(usize::MAX).saturating_sub(needed);
-    let clients = (rest / CONNECTIONS_PER_CLIENT).min(config.max_clients);
+    let clients = (rest / each).min(config.max_clients);
     if clients == 0 {
         return Err(AppError::NoClients { files, needed: format!("{places} places and one client") });
     }
