@@ -10,6 +10,7 @@
 //!   memory pasta takes; needs an ordinary user, as level `own` does anywhere;
 //! - `containers`: what a start in containers takes beside `docker compose up` by hand, one and thirty at once; needs root
 //!   and dockerd;
+//! - `relay`: what 100 streams of 50 messages a second take through the server, through nginx, and without both; needs nginx;
 //! - `soak`: whether a thousand starts and stops in a row leave anything: processes, file descriptors, ports, folders,
 //!   threads, memory.
 //!
@@ -31,12 +32,16 @@ mod containers;
 mod idle;
 mod late;
 mod load;
+mod relay;
 #[path = "../../tests/simulation/soak.rs"]
 mod soak;
 mod start;
 mod stream;
 #[path = "../../tests/support/mod.rs"]
 mod support;
+#[allow(dead_code, reason = "tests use more of it")]
+#[path = "../../tests/proxy/web_server.rs"]
+mod web_server;
 
 use std::process::ExitCode;
 use std::time::{Duration, Instant};
@@ -85,6 +90,7 @@ enum Part {
     Start,
     Stream,
     Containers,
+    Relay,
     Soak,
 }
 
@@ -110,6 +116,9 @@ impl Verdict {
 
 #[actix_rt::main]
 async fn main() -> ExitCode {
+    if relay::is_sender() {
+        relay::send().await;
+    }
     let arguments = Arguments::parse();
     let is_wanted = |part| arguments.parts.is_empty() || arguments.parts.contains(&part);
     let mut verdict = Verdict::default();
@@ -137,6 +146,9 @@ async fn main() -> ExitCode {
     }
     if is_wanted(Part::Containers) {
         containers::measure(&mut verdict).await;
+    }
+    if is_wanted(Part::Relay) {
+        relay::measure(&mut verdict, Duration::from_secs(arguments.seconds), arguments.rounds).await;
     }
     if is_wanted(Part::Soak) {
         soak_and_tell(&mut verdict, arguments.starts).await;

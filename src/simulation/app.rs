@@ -25,6 +25,7 @@ use crate::simulation::container::Containers;
 use crate::simulation::isolation::{Launcher, Watcher};
 use crate::simulation::machine::{LoadMonitor, Spread, UsageMonitor};
 use crate::simulation::process::{Guardian, Leftovers, RunDir};
+use crate::simulation::relay::Upstream;
 use crate::simulation::web::configure;
 
 /// How often it is checked whether all simulations have ended.
@@ -84,10 +85,12 @@ impl Assembly {
 fn bound_clients(config: &SimulationConfig) -> Result<usize, AppError> {
     let places = config.max_connections;
     let needed = OWN_FILES + FILES_PER_SIMULATION * usize::from(places);
-    let wanted = config.max_clients.saturating_mul(CONNECTIONS_PER_CLIENT).saturating_add(needed);
+    // What is relayed has a connection on either side.
+    let each = if config.ports_are_public() { CONNECTIONS_PER_CLIENT } else { 2 * CONNECTIONS_PER_CLIENT };
+    let wanted = config.max_clients.saturating_mul(each).saturating_add(needed);
     let files = raise_open_files(u64::try_from(wanted).unwrap_or(u64::MAX));
     let rest = usize::try_from(files).unwrap_or(usize::MAX).saturating_sub(needed);
-    let clients = (rest / CONNECTIONS_PER_CLIENT).min(config.max_clients);
+    let clients = (rest / each).min(config.max_clients);
     if clients == 0 {
         return Err(AppError::NoClients { files, needed: format!("{places} places and one client") });
     }
@@ -118,7 +121,8 @@ pub async fn serve(assembly: Assembly) -> Result<(), AppError> {
         stop: Duration::from_secs(1),
         trusted_proxies: server.config.trusted_proxies.clone(),
     };
-    let app = move || App::new().app_data(shared.clone()).configure(configure);
+    let simulations = server.launcher.reached().unwrap_or_else(|| server.config.address_of_simulations().into());
+    let app = move || App::new().app_data(shared.clone()).app_data(Upstream::new(simulations)).configure(configure);
     let http = server::serve(socket, server.connections.clone(), options, app)?;
     let handle = http.handle();
     let serving = actix_rt::spawn(http);
@@ -236,6 +240,7 @@ fn assemble(
         ends,
         places,
         sessions: Arc::default(),
+        streams: Arc::default(),
         load_monitor,
         readings,
         spread,

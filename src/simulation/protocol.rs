@@ -22,6 +22,7 @@
 //! | `resume: TOKEN` | what to come back with |
 //! | `idle: SECONDS`, `idle: never` | when the simulation ends unless it runs or is kept; that it does not any more |
 //! | `.` | Webots is alive |
+//! | `watched: 1` or `watched: 0` | an administrator watches the simulation from now on, or no longer |
 //! | `reset controller: NAME/FILE` | done |
 //!
 //! Webots' page puts every TEXT into `innerHTML`: it passes through [`client_text`] here, and nowhere else,
@@ -192,6 +193,12 @@ pub fn shutdown_timeout(seconds: u64) -> String {
 #[must_use]
 pub fn absence(seconds: u64) -> String {
     format!("absence: {seconds}")
+}
+
+/// Whether an administrator watches the simulation.
+#[must_use]
+pub fn watched(is_watched: bool) -> String {
+    format!("watched: {}", u8::from(is_watched))
 }
 
 /// What its client can come back with.

@@ -11,6 +11,7 @@ use super::ends::Ends;
 use super::failed_starts::FailedStarts;
 use super::places::Places;
 use super::sessions::Sessions;
+use super::streams::Streams;
 use crate::shared::domain::Load;
 use crate::shared::domain::ProjectUrl;
 use crate::shared::domain::Rules;
@@ -41,6 +42,8 @@ pub struct AppState {
     pub places: Addr<Places>,
     /// The sessions that their clients may come back to.
     pub sessions: Arc<Sessions>,
+    /// The streams of running simulations.
+    pub streams: Arc<Streams>,
     /// Reads the machine.
     pub load_monitor: Addr<LoadMonitor>,
     /// The newest readings of the machine.

@@ -29,18 +29,23 @@ export class SmallViewer extends EventTarget {
   #parts;
   #watch = new ResizeObserver(() => this.#redraw());
 
+  /** Whether its user only looks on. */
+  #watches;
+
   /**
-   * Shows the simulation at an address in an element; for who comes back, its time goes on. Events: `ready`, `loading`
+   * Shows the simulation at an address in an element. For who comes back (`true`), and for who only looks on (`'watches'`),
+   * its time goes on. Events: `ready`, `loading`
    * (text), `heard`, `lost`.
    */
   constructor(stage, url, isBack = false) {
     super();
+    this.#watches = isBack === 'watches';
     this.#parts = this.#build();
     stage.replaceChildren(...this.#parts.all);
     this.#drawing = new Drawing(this.#parts.canvas);
     this.#camera = new Camera(this.#parts.canvas, () => this.#redraw());
     this.#watch.observe(this.#parts.canvas);
-    this.#stream = new Stream(url, isBack);
+    this.#stream = new Stream(url, Boolean(isBack));
     const hear = (kind, handler) => this.#stream.addEventListener(kind, ({ detail }) => handler(detail));
     hear('loading', (text) => this.#tell('loading', text));
     hear('model', (xml) => this.#show(xml));
@@ -70,6 +75,8 @@ export class SmallViewer extends EventTarget {
     clock.setAttribute('aria-label', 'Simulation time');
     const mode = make('span', { className: 'mode', id: 'mode', textContent: 'loading' });
     const tools = make('div', { className: 'tools' }, play, step, reset, view, mode, clock);
+    for (const one of [play, step, reset])
+      one.hidden = this.#watches;
     tools.setAttribute('role', 'toolbar');
     tools.setAttribute('aria-label', 'Simulation');
     const title = make('p', { className: 'title' });

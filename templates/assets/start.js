@@ -84,7 +84,9 @@ export class Simulation extends EventTarget {
       this.#launched = true;
       this.#step('launch', 'done', 'the simulator is ready');
       this.#tell('ready', rest('webots:'));
-    } else if (text.startsWith('absence:'))
+    } else if (text.startsWith('watched:'))
+      this.#tell('watched', rest('watched:') === '1');
+    else if (text.startsWith('absence:'))
       this.absence = Number(rest('absence:'));
     else if (text.startsWith('resume:')) {
       this.#token = rest('resume:');

@@ -238,6 +238,9 @@ function follow(current, server, world, isBack = false) {
   on('step', step);
   on('left', countDown);
   on('idle', (seconds) => tellIdle(seconds, current));
+  on('watched', (now) => { find('watched').hidden = !now; });
+  // Who comes back hears it again, if it is still so.
+  find('watched').hidden = true;
   on('failed', (why) => {
     if (isBack && SHARE.test(why)) {
       refusal = why;
@@ -500,6 +503,7 @@ function leave() {
   if (wanted)
     stale += 1;
   find('left').hidden = true;
+  find('watched').hidden = true;
   wanted = undefined;
   const [oldViewer, oldSimulation] = [viewer, simulation];
   viewer = simulation = undefined;

@@ -51,7 +51,7 @@ try {
   const view = document.createElement('webots-view');
   document.getElementById('main').append(view);
   // The kind of stream is left to the component: its name has changed over the versions of Webots.
-  view.connect(wanted.get('stream'), undefined, false, matchMedia('(pointer: coarse)').matches, -1);
+  view.connect(wanted.get('stream'), undefined, wanted.has('watch'), matchMedia('(pointer: coarse)').matches, -1);
 } catch (error) {
   problem(`Webots’ viewer can’t be loaded: ${error.message}. Choose the small viewer and connect again.`);
 }

@@ -33,9 +33,10 @@ class Browser:
         self.playwright.stop()
         self.profile.cleanup()
 
-    def page(self, scheme="light", width=1280, height=900, javascript=True):
+    def page(self, scheme="light", width=1280, height=900, javascript=True, http_credentials=None):
         context = self.chromium.new_context(
-            color_scheme=scheme, viewport={"width": width, "height": height}, java_script_enabled=javascript)
+            color_scheme=scheme, viewport={"width": width, "height": height}, java_script_enabled=javascript,
+            http_credentials=http_credentials)
         context.set_default_timeout(1000 * SOON)
         return Page(context)
 

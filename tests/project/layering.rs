@@ -20,7 +20,7 @@ const SESSION: [&str; 9] = [
     "session::web",
     "session::app",
 ];
-const SIMULATION: [&str; 22] = [
+const SIMULATION: [&str; 24] = [
     "simulation::who",
     "simulation::simulation_id",
     "simulation::ends",
@@ -28,6 +28,8 @@ const SIMULATION: [&str; 22] = [
     "simulation::failed_starts",
     "simulation::places",
     "simulation::sessions",
+    "simulation::streams",
+    "simulation::relay",
     "simulation::protocol",
     "simulation::process",
     "simulation::machine",

@@ -29,6 +29,7 @@ mod encoded;
 mod exposure;
 mod one_door;
 mod pages;
+mod relayed;
 mod trust;
 mod urls;
 mod users;

@@ -41,6 +41,8 @@ impl WebServer {
     /// Starts a web server with a site's rules. `idle` is its default for connections on which nothing is sent.
     pub async fn start(kind: Kind, ports: (u16, u16), site: &str, idle: Duration) -> Self {
         let folder = tempfile::tempdir().unwrap();
+        let here = folder.path().to_str().unwrap();
+        let site = site.replace("/var/log/nginx", here).replace("${APACHE_LOG_DIR}", here);
         std::fs::write(folder.path().join("site.conf"), site).unwrap();
         let main = match kind {
             Kind::Apache => apache_conf(folder.path(), ports, idle),
@@ -114,12 +116,17 @@ impl WebServer {
         }
     }
 
-    fn pid(&self) -> Pid {
+    pub fn pid(&self) -> Pid {
         Pid::from_raw(i32::try_from(self.child.as_ref().unwrap().id()).unwrap())
     }
 
     fn error_log(&self) -> PathBuf {
         self.folder.path().join("error.log")
+    }
+
+    /// The requests that it has logged.
+    pub fn access_log(&self) -> String {
+        std::fs::read_to_string(self.folder.path().join("access.log")).unwrap_or_default()
     }
 
     /// What it had to say.
@@ -147,7 +154,7 @@ fn apache_conf(folder: &Path, (http, https): (u16, u16), idle: Duration) -> Stri
     let user = if Uid::effective().is_root() { "User www-data\nGroup www-data\n" } else { "" };
     format!(
         "{modules}ServerRoot {folder}\nDefaultRuntimeDir {folder}\nPidFile {folder}/pid\nErrorLog {folder}/error.log\n\
-         LogLevel warn\nServerName localhost\n{user}\
+         LogLevel warn\nLogFormat \"%r\" combined\nServerName localhost\n{user}\
          StartServers 1\nServerLimit 4\nThreadsPerChild 25\nMaxRequestWorkers 100\n\
          Timeout {idle}\nRequestReadTimeout header=1,MinRate=500 body=1,MinRate=500\n\
          Listen 127.0.0.1:{http}\nListen 127.0.0.1:{https}\nInclude {folder}/site.conf\n"

@@ -18,6 +18,7 @@ use webots_fleet::simulation::protocol::Mode;
 use webots_fleet::simulation::readiness;
 use webots_fleet::simulation::snapshot::Stage;
 use webots_fleet::simulation::state::AppState;
+use webots_fleet::simulation::streams::Watched;
 use webots_fleet::simulation::webots::{Exit, LaunchSpec, Stop, Webots, WebotsEvent};
 use webots_fleet::simulation::who::Who;
 
@@ -131,6 +132,12 @@ impl Handler<WebotsEvent> for Listener {
     }
 }
 
+impl Handler<Watched> for Listener {
+    type Result = ();
+
+    fn handle(&mut self, _: Watched, _: &mut Self::Context) {}
+}
+
 /// Starts a Webots as a web client does.
 async fn launch(server: &AppState) -> (Addr<Webots>, UnboundedReceiver<Exit>) {
     let (places, mut granted) = unbounded_channel();
@@ -151,6 +158,8 @@ async fn launch(server: &AppState) -> (Addr<Webots>, UnboundedReceiver<Exit>) {
         mode: Mode::X3d,
         place: (ticket, port),
         gpu: None,
+        streams: Arc::clone(&server.streams),
+        watched: listener.clone().recipient(),
         events: listener.recipient(),
     };
     (Webots::new(spec).start(), ended)

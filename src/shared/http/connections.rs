@@ -21,10 +21,14 @@ pub enum Kind {
     Client,
     /// A page that listens to `/events`.
     Page,
+    /// What is relayed from a simulation: its stream, or a file.
+    Stream,
 }
 
 /// How many TCP connections an address may have for each client that it may have: browsers open several.
 const TCP_PER_CLIENT: usize = 2;
+/// How much may be relayed at once for each client that there may be: a stream, and the files of a scene.
+const STREAMS_PER_CLIENT: usize = 2;
 /// How many web clients an address may have at most where the configuration does not say it.
 const MOST_CLIENTS: usize = 1000;
 /// How many pages may listen to `/events`.
@@ -90,6 +94,7 @@ impl Connections {
                 (self.max_tcp, wanted.min(share(self.max_tcp)).max(self.per_address))
             }
             Kind::Client => (self.max_clients, self.per_address),
+            Kind::Stream => (self.max_clients * STREAMS_PER_CLIENT, self.per_address * STREAMS_PER_CLIENT),
             Kind::Page => (MAX_PAGES, self.per_address.min(share(MAX_PAGES))),
         };
         let address = peer.rate_limit_key();

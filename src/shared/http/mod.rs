@@ -18,10 +18,10 @@ pub mod tls;
 pub mod websocket;
 
 pub use address_quota::{AddressQuota, share};
-pub use auth::{BasicAuth, is_administrator, refuse_action};
+pub use auth::{AuthError, BasicAuth, is_administrator, refuse_action};
 pub use connections::{ConnectionPermit, Connections, Kind};
 pub use live::{Live, Row, View};
 pub use metrics::{CONTENT_TYPE, Gauge, Metrics};
 pub use origin::Origin;
-pub use page::{Policy, any_host, fleet_sources, heat, html, width};
+pub use page::{Policy, any_host, fleet_sources, heat, html, own_sources, width};
 pub use peer::{Peer, TrustedProxies, UserHeader};

@@ -38,10 +38,7 @@ impl Policy {
     /// Lets a page open WebSockets to the server that it comes from: older browsers don't take them for its own. Only
     /// `Host` tells which that is: `X-Forwarded-Host` and `Forwarded` may be anybody's word.
     pub fn own_websocket(mut self, request: &HttpRequest) -> Self {
-        let host = request.headers().get(header::HOST).and_then(|host| host.to_str().ok()).unwrap_or_default();
-        if !host.is_empty() && host.chars().all(|one| one.is_ascii_alphanumeric() || ".:-".contains(one)) {
-            self.connections.push(format!("ws://{host} wss://{host}"));
-        }
+        self.connections.extend(own_sources(request).into_iter().filter(|source| source.starts_with("ws")));
         self
     }
 
@@ -103,6 +100,15 @@ impl Policy {
             if self.foreign { "; sandbox allow-scripts allow-modals allow-pointer-lock" } else { "" },
         )
     }
+}
+
+/// The server that a request was sent to, by each scheme. Nothing where its name can't stand in a policy.
+pub fn own_sources(request: &HttpRequest) -> Vec<String> {
+    let host = request.headers().get(header::HOST).and_then(|host| host.to_str().ok()).unwrap_or_default();
+    if host.is_empty() || !host.chars().all(|one| one.is_ascii_alphanumeric() || ".:-".contains(one)) {
+        return Vec::new();
+    }
+    ["ws", "wss", "http", "https"].map(|scheme| format!("{scheme}://{host}")).to_vec()
 }
 
 /// The sources from which a fleet is reached: its hosts, with any port where ports are not rewritten, since each

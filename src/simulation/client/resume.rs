@@ -45,6 +45,9 @@ impl Session {
             }
             texts = resumption.back(timeout, absence);
         }
+        if self.is_watched {
+            texts.push(protocol::watched(true));
+        }
         for text in texts {
             self.text(text);
         }

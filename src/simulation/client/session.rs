@@ -21,6 +21,7 @@ use crate::simulation::places::PlaceEvent;
 use crate::simulation::protocol::{self, Mode};
 use crate::simulation::sessions::{Attachment, FromClient, Said, ToClient};
 use crate::simulation::state::AppState;
+use crate::simulation::streams::Watched;
 use crate::simulation::webots::{Exit, Keep, RestoreController, WebotsEvent};
 use crate::simulation::who::Who;
 
@@ -42,6 +43,7 @@ pub struct Session {
     pub(super) resumable: bool,
     /// What it keeps so that its client can.
     pub(super) resumption: Option<Resumption>,
+    pub(super) is_watched: bool,
 }
 
 /// How often a client that may come back gets a sign of life.
@@ -69,6 +71,7 @@ impl Session {
             start,
             resumable,
             resumption: None,
+            is_watched: false,
         };
         let attachment = session.attachment;
         Attachment::new(session.start().recipient(), attachment)
@@ -242,6 +245,15 @@ impl Handler<Progress> for Session {
     }
 }
 
+impl Handler<Watched> for Session {
+    type Result = ();
+
+    fn handle(&mut self, Watched(is_watched): Watched, _: &mut Self::Context) {
+        self.is_watched = is_watched;
+        self.text(protocol::watched(is_watched));
+    }
+}
+
 impl Handler<WebotsEvent> for Session {
     type Result = ();
 
@@ -261,10 +273,10 @@ impl Handler<WebotsEvent> for Session {
                 }
                 self.text(protocol::shutdown_timeout(self.server.config.timeout));
             }
-            WebotsEvent::Listening(port) => {
+            WebotsEvent::Listening(port, stream) => {
                 self.start.resolve(Outcome::Ready);
                 self.server.failed_starts.reset();
-                let url = self.server.config.websocket_url(port);
+                let url = self.server.config.stream_url(port, &stream.reveal());
                 self.text(protocol::webots(&url));
                 let absence = self.server.config.timing.absence;
                 let offer = self.resumption.as_mut().map(|resumption| resumption.ready(url, absence));

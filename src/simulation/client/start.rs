@@ -112,6 +112,8 @@ impl Session {
             mode,
             gpu,
             place,
+            streams: Arc::clone(&self.server.streams),
+            watched: ctx.address().recipient(),
             events: ctx.address().recipient(),
         };
         let webots = Webots::start_in_arbiter(self.server.webots_thread(spec.place.1), |_| Webots::new(spec));

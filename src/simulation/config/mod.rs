@@ -6,6 +6,7 @@ mod isolation;
 mod own_files;
 mod resources;
 mod simulation_config;
+mod streaming;
 mod timing;
 mod urls;
 
@@ -14,4 +15,5 @@ pub use gpus::GpuUse;
 pub use isolation::{Isolation, SandboxFolders, SandboxNetwork, VariableName};
 pub use resources::Resources;
 pub use simulation_config::SimulationConfig;
+pub use streaming::Streaming;
 pub use timing::Timing;

@@ -10,6 +10,7 @@ use super::container::{ContainerDisplay, ContainerSettings, check_ports};
 use super::gpus::GpuUse;
 use super::isolation::{Isolation, SandboxFolders, VariableName, level};
 use super::resources::Resources;
+use super::streaming::{Streaming, streaming};
 use super::timing::Timing;
 use crate::shared::config::{
     Configuration, ExpandedPath, InvalidValue, Secret, expanded, folder, local_address, minutes_or_zero, object,
@@ -44,6 +45,9 @@ pub struct SimulationConfig {
     /// (that is `server`) and `{port}`. Default: none, and they are reached under their own addresses.
     #[serde(default, deserialize_with = "optional_expanded")]
     pub public_url: Option<PublicUrl>,
+    /// How clients reach the streams of simulations: at the ports of their Webots, or through this server. Default: `direct`.
+    #[serde(default, deserialize_with = "streaming")]
+    pub streaming: Streaming,
     /// Folder of `simulation/output.log`, `simulation/monitor.csv` and the instances' output. Default: `log`.
     #[serde(default = "default_log_dir", deserialize_with = "folder")]
     pub log_dir: ExpandedPath,

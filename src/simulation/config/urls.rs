@@ -1,8 +1,9 @@
 //! Under which URLs and ports clients reach this server and its simulations.
 
+use std::net::{IpAddr, Ipv4Addr};
 use std::ops::RangeInclusive;
 
-use super::SimulationConfig;
+use super::{SimulationConfig, Streaming};
 use crate::shared::domain::{ClientUrls, PublicAddress};
 
 /// If its port is taken, Webots silently takes one of this many that follow.
@@ -19,6 +20,39 @@ impl SimulationConfig {
     #[must_use]
     pub fn websocket_url(&self, port: u16) -> String {
         self.client_urls().websocket_url(&self.address(port))
+    }
+
+    /// Returns the URL under which a client reaches the stream of its simulation, which has this port and this token.
+    #[must_use]
+    pub fn stream_url(&self, port: u16, token: &str) -> String {
+        match self.streaming {
+            Streaming::Direct => self.websocket_url(port),
+            Streaming::Relay => format!("{}/stream/{token}", self.websocket_url(self.port)),
+        }
+    }
+
+    /// Whether clients reach simulations at their own ports, which must then be reachable from outside. Otherwise this
+    /// server alone reaches them, on the machine itself.
+    #[must_use]
+    pub fn ports_are_public(&self) -> bool {
+        self.streaming == Streaming::Direct
+    }
+
+    /// Returns the address to which the ports of containers are bound.
+    #[must_use]
+    pub fn bind_of_containers(&self) -> Ipv4Addr {
+        match self.bind {
+            _ if !self.ports_are_public() => Ipv4Addr::LOCALHOST,
+            IpAddr::V4(bind) => bind,
+            IpAddr::V6(_) => Ipv4Addr::UNSPECIFIED,
+        }
+    }
+
+    /// Returns the address at which this server itself reaches simulations.
+    #[must_use]
+    pub fn address_of_simulations(&self) -> Ipv4Addr {
+        let bind = self.bind_of_containers();
+        if self.docker && !bind.is_unspecified() { bind } else { Ipv4Addr::LOCALHOST }
     }
 
     fn client_urls(&self) -> ClientUrls {

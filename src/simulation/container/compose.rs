@@ -91,7 +91,6 @@ impl Parts<'_> {
         let plain = |letter: char| letter.is_alphanumeric() || " -_./=:+,".contains(letter);
         // A template may hand it to a shell, which reads quotes, dollars and backslashes in ways of its own.
         let command = if command.chars().all(plain) { command } else { String::new() };
-        let bind = if config.bind.is_ipv4() { config.bind.to_string() } else { "0.0.0.0".to_owned() };
         let path = |path: &Path| path.to_string_lossy().into_owned();
         let edited = self.edited.as_ref().map_or_else(|| path(self.project), |folder| path(folder));
         vec![
@@ -100,7 +99,7 @@ impl Parts<'_> {
             ("PROJECT_PATH", PROJECT_PATH.to_owned()),
             ("PROJECT", path(self.project)),
             ("MAKE", u8::from(self.make).to_string()),
-            ("BIND", bind),
+            ("BIND", config.bind_of_containers().to_string()),
             ("PORT", self.port.to_string()),
             ("COMPOSE_PROJECT_NAME", self.name.to_owned()),
             ("WEBOTS", command),

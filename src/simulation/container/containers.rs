@@ -206,7 +206,9 @@ impl Containers {
         let made = self.docker.compose(words, variables, SHORT).await;
         made.map_err(|error| blame(is_projects, error))?;
         drop(turn);
-        let editor = (recipe.asks.kind != Kind::Default).then(|| "ide: enable".to_owned());
+        // An editor has a port of its own, which the relay of streams does not reach.
+        let has_editor = recipe.asks.kind != Kind::Default && self.config.ports_are_public();
+        let editor = has_editor.then(|| "ide: enable".to_owned());
         let texts = editor.into_iter().chain(recipe.asks.project_type).collect();
         let containers = services.map(|service| {
             let container = container_of(&lease.name, &service);

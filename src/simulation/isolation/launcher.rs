@@ -5,7 +5,7 @@
 use std::ffi::OsString;
 use std::fmt;
 use std::io;
-use std::net::IpAddr;
+use std::net::{IpAddr, Ipv4Addr};
 use std::path::{Path, PathBuf};
 
 use nix::sys::resource::{Resource, getrlimit};
@@ -223,11 +223,12 @@ impl Launcher {
         matches!(&self.method, Method::Sandbox(sandbox) if sandbox.network().is_some_and(|one| !one.is_filtered()))
     }
 
-    /// The address of the machine on which the port of each simulation is forwarded, if each has a network of its own.
+    /// The address at which this server reaches the forwarded ports of simulations, if each has a network of its own.
     #[must_use]
-    pub fn forwarded(&self) -> Option<IpAddr> {
+    pub fn reached(&self) -> Option<IpAddr> {
         let Method::Sandbox(sandbox) = &self.method else { return None };
-        sandbox.network().map(OwnNetwork::forwarded)
+        let address = sandbox.network().map(OwnNetwork::forwarded)?;
+        Some(if address.is_unspecified() { Ipv4Addr::LOCALHOST.into() } else { address })
     }
 
     /// Why simulations run at level `none` although the configuration does not say so, if they do.

@@ -8,7 +8,7 @@
 
 use std::ffi::OsString;
 use std::io;
-use std::net::{IpAddr, Ipv6Addr};
+use std::net::{IpAddr, Ipv4Addr, Ipv6Addr};
 use std::path::{Path, PathBuf};
 
 use which::which;
@@ -62,7 +62,7 @@ impl OwnNetwork {
         if closed && nft.is_none() {
             return Err(missing("nft", "nftables"));
         }
-        Ok(Self { pasta, setpriv, unshare, nft, closed, forwarded: forwarded(config.bind) })
+        Ok(Self { pasta, setpriv, unshare, nft, closed, forwarded: forwarded(config) })
     }
 
     /// Whether programs reach nothing at all.
@@ -135,8 +135,8 @@ fn resolv_conf(instance: &Path) -> PathBuf {
     instance.join("resolv.conf")
 }
 
-/// The address of the machine on which the port of each simulation is forwarded, by that on which the server listens.
-/// Nothing else decides it.
-fn forwarded(bind: IpAddr) -> IpAddr {
-    bind
+/// The address of the machine on which the port of each simulation is forwarded: the one on which the server listens, or
+/// the loopback where only this server is to reach simulations. Nothing else decides it.
+fn forwarded(config: &SimulationConfig) -> IpAddr {
+    if config.ports_are_public() { config.bind } else { Ipv4Addr::LOCALHOST.into() }
 }

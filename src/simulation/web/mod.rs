@@ -1,11 +1,15 @@
 //! What browsers and programs meet: paths, pages, `/status` and `/metrics`.
 
 mod actions;
+mod administrator;
+mod origins;
 mod page_routes;
 mod pages;
 mod queries;
 mod routes;
 mod status;
+mod stream_routes;
+mod watch_routes;
 mod webots_viewer;
 
 pub use routes::configure;

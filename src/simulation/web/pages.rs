@@ -9,6 +9,7 @@ use crate::shared::domain::UrlPrefix;
 use crate::shared::http::{Row, View};
 use crate::shared::run::{seconds_since_1970, timestamp};
 use crate::shared::text::{one_line, without_paths};
+use crate::simulation::config::SimulationConfig;
 use crate::simulation::ends::Ended;
 use crate::simulation::isolation::Level;
 use crate::simulation::machine::sensors::{self, Gpu, Host, Machine};
@@ -26,6 +27,18 @@ pub enum Reader {
     Stranger,
     /// Somebody who has.
     Administrator,
+}
+
+impl Reader {
+    /// Whether it shows the ports of simulations: whoever reaches one steers its simulation. Without a password and where
+    /// clients need the ports everybody sees them, as on the original's page.
+    fn sees_ports(self, config: &SimulationConfig) -> bool {
+        match self {
+            Self::Administrator => true,
+            Self::Stranger => false,
+            Self::Anybody => config.ports_are_public(),
+        }
+    }
 }
 
 /// The whole page `/monitor`.
@@ -52,6 +65,7 @@ struct Monitor<'server> {
     share_idle_time: f64,
     isolation: Level,
     network: Option<String>,
+    shows_ports: bool,
     /// What worlds' programs may do that they should not, and why.
     shortcoming: Option<(&'static str, &'server str)>,
     limit: String,
@@ -98,7 +112,9 @@ struct SimulationRow<'one> {
     cpu_value: f64,
     memory: String,
     memory_value: u64,
-    port: u16,
+    /// The port, where everybody may see it.
+    port: Option<u16>,
+    can_be_watched: bool,
 }
 
 /// The parts of `/monitor` that change.
@@ -107,9 +123,10 @@ struct SimulationRow<'one> {
 /// When a template can't be rendered.
 pub fn view(server: &AppState, snapshot: &Snapshot, usages: &Usages, reader: Reader) -> Result<View, askama::Error> {
     let readings = server.readings.borrow().clone();
+    let shows_port = reader.sees_ports(&server.config);
     let rows = snapshot.simulations.iter().map(|one| {
         let usage = one.pid.and_then(|pid| usages.get(&pid)).copied();
-        let html = SimulationRow::new(one, usage, server.config.timeout, reader).render()?;
+        let html = SimulationRow::new(one, usage, server.config.timeout, (reader, shows_port)).render()?;
         Ok(Row { key: one.id.to_string(), html })
     });
     let rows = rows.collect::<Result<Vec<Row>, askama::Error>>()?;
@@ -153,6 +170,7 @@ pub fn monitor(
         share_idle_time: server.rules.share_idle_time,
         isolation: server.launcher.level(),
         network: server.launcher.network_in_words(),
+        shows_ports: reader.sees_ports(&server.config),
         shortcoming: shortcoming(server),
         limit: duration(server.config.timeout),
     };
@@ -240,7 +258,7 @@ fn names(url: &str) -> (String, String) {
 }
 
 impl<'one> SimulationRow<'one> {
-    fn new(one: &'one Simulation, usage: Option<Usage>, limit: u64, reader: Reader) -> Self {
+    fn new(one: &'one Simulation, usage: Option<Usage>, limit: u64, (reader, shows_port): (Reader, bool)) -> Self {
         let (stage, class) = words(one.stage);
         let ends = one.launched.map_or(0, |launched| launched + limit);
         let now = seconds_since_1970();
@@ -260,7 +278,8 @@ impl<'one> SimulationRow<'one> {
             cpu_value: usage.and_then(|usage| usage.cpu).unwrap_or(-1.0),
             memory: usage.map(|usage| bytes(usage.memory)).unwrap_or_default(),
             memory_value: usage.map_or(0, |usage| usage.memory),
-            port: one.port.unwrap_or_default(),
+            port: shows_port.then(|| one.port.unwrap_or_default()),
+            can_be_watched: matches!(one.stage, Stage::Idle | Stage::Running),
         }
     }
 }
@@ -350,7 +369,7 @@ mod tests {
             ("https://gitlab.com/g/s/r/-/blob/main/worlds/a.wbt", "gitlab.com/g/s/r"),
             ("https://codeberg.org/u/r/src/branch/main/worlds/a.wbt", "codeberg.org/u/r"),
         ] {
-            assert_eq!(SimulationRow::new(&simulation(world), None, 7200, Reader::Anybody).repository, name);
+            assert_eq!(SimulationRow::new(&simulation(world), None, 7200, (Reader::Anybody, true)).repository, name);
         }
     }
 
@@ -359,7 +378,7 @@ mod tests {
         let one = simulation("https://github.com/u/<i>\"'&/blob/main/worlds/<script>.wbt");
         for (reader, has_names) in [(Reader::Anybody, false), (Reader::Stranger, false), (Reader::Administrator, true)]
         {
-            let html = SimulationRow::new(&one, None, 7200, reader).render().unwrap();
+            let html = SimulationRow::new(&one, None, 7200, (reader, true)).render().unwrap();
             assert!(!html.contains("<script>") && !html.contains("<i>"), "{html}");
             assert_eq!(html.contains("root"), has_names, "{html}");
         }

@@ -2,13 +2,16 @@
 
 use std::sync::Arc;
 
-use actix_web::http::header;
 use actix_web::{HttpRequest, HttpResponse, web};
 
 use super::actions;
+use super::administrator::may_see_ports;
+use super::origins::refuse_origin;
 use super::page_routes;
 use super::queries::{snapshot, too_busy};
 use super::status::{self, StatusPage};
+use super::stream_routes;
+use super::watch_routes;
 use crate::shared::http::paths::{self, GET, READ, path};
 use crate::shared::http::websocket;
 use crate::shared::http::{CONTENT_TYPE, Kind};
@@ -24,6 +27,8 @@ fn add(app: &mut web::ServiceConfig) {
     app.service(path("/client", GET, client))
         .service(path("/load", READ, load))
         .configure(page_routes::configure)
+        .configure(stream_routes::configure)
+        .configure(watch_routes::configure)
         .service(path("/status", READ, status_json))
         .service(path("/metrics", READ, metrics))
         .service(path("/health", READ, health))
@@ -31,7 +36,7 @@ fn add(app: &mut web::ServiceConfig) {
 }
 
 async fn client(request: HttpRequest, stream: web::Payload, server: web::Data<AppState>) -> HttpResponse {
-    if let Some(refusal) = refuse_origin(&request, &server) {
+    if let Some(refusal) = refuse_origin(&request, &server.config.allowed_origins) {
         return refusal;
     }
     let peer = server.config.trusted_proxies.peer(&request);
@@ -44,25 +49,22 @@ async fn client(request: HttpRequest, stream: web::Payload, server: web::Data<Ap
     websocket::open(&request, stream, |reader| WebClient::new(server, (peer, user), (permit, reader)))
 }
 
-/// A page of another origin may use visitors' browsers to start simulations, unless origins are listed.
-fn refuse_origin(request: &HttpRequest, server: &AppState) -> Option<HttpResponse> {
-    let allowed = &server.config.allowed_origins;
-    let origin = request.headers().get(header::ORIGIN)?.to_str().unwrap_or_default();
-    if allowed.is_empty() || allowed.iter().any(|one| one.matches(origin)) {
-        return None;
-    }
-    Some(HttpResponse::Forbidden().body("Error: this page is not one of those that may start simulations here."))
-}
-
 async fn load(server: web::Data<AppState>) -> HttpResponse {
     HttpResponse::Ok().content_type("text/plain").body(server.load().to_string())
 }
 
-async fn status_json(server: web::Data<AppState>) -> HttpResponse {
-    match snapshot(&server).await {
-        Some(snapshot) => HttpResponse::Ok().json(StatusPage::new(&server, snapshot)),
-        None => too_busy(),
+async fn status_json(request: HttpRequest, server: web::Data<AppState>) -> HttpResponse {
+    let with_ports = match may_see_ports(&request, &server) {
+        Ok(with_ports) => with_ports,
+        Err(refused) => return refused.answer(),
+    };
+    let Some(mut snapshot) = snapshot(&server).await else {
+        return too_busy();
+    };
+    if !with_ports {
+        snapshot.simulations.iter_mut().for_each(|one| one.port = None);
     }
+    HttpResponse::Ok().json(StatusPage::new(&server, snapshot))
 }
 
 async fn metrics(server: web::Data<AppState>) -> HttpResponse {

@@ -5,6 +5,7 @@ use std::time::Instant;
 use actix::prelude::*;
 
 use crate::simulation::container::Cause;
+use crate::simulation::sessions::Token;
 
 /// An event of a running Webots.
 #[derive(Message, Debug, Clone, PartialEq, Eq)]
@@ -16,8 +17,8 @@ pub enum WebotsEvent {
     Text(String),
     /// Its process was started.
     Started,
-    /// It listens on this port.
-    Listening(u16),
+    /// It listens on this port, and this token leads to its stream.
+    Listening(u16, Token),
     /// It has sent a heartbeat.
     Heartbeat,
     /// It has sent no heartbeat for so many seconds.

@@ -1,7 +1,7 @@
 //! The launch specification: everything that one Webots is started with.
 
 use std::ffi::OsString;
-use std::net::{IpAddr, Ipv4Addr, SocketAddr};
+use std::net::{IpAddr, SocketAddr};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -21,6 +21,7 @@ use crate::simulation::machine::sensors::Gpu;
 use crate::simulation::places::Ticket;
 use crate::simulation::process::{SpawnSpec, until_answering};
 use crate::simulation::protocol::Mode;
+use crate::simulation::streams::{Registration, Streams, Watched};
 
 /// Everything that one Webots is started with.
 pub struct LaunchSpec {
@@ -44,6 +45,10 @@ pub struct LaunchSpec {
     pub gpu: Option<Gpu>,
     /// The place, and its port.
     pub place: (Ticket, u16),
+    /// Where its stream is found while it runs.
+    pub streams: Arc<Streams>,
+    /// Who hears whether it is watched.
+    pub watched: Recipient<Watched>,
     /// Who gets the events.
     pub events: Recipient<WebotsEvent>,
 }
@@ -54,6 +59,12 @@ impl LaunchSpec {
     pub fn log_file(&self) -> PathBuf {
         let folder = self.config.log_dir.0.join("simulation").join(FOLDER_OF_RUNNING);
         folder.join(format!("{}.log", self.place.0.id()))
+    }
+
+    /// Has the stream found that this port has.
+    #[must_use]
+    pub fn register(&self, port: u16) -> Registration {
+        self.streams.register(self.place.0.id(), port, self.watched.clone())
     }
 
     /// What its containers are made of.
@@ -135,10 +146,8 @@ impl LaunchSpec {
 
     /// Where this server reaches the port that is forwarded to it, if it has a network of its own.
     fn forwarded(&self) -> Option<SocketAddr> {
-        let bind = self.config.bind;
-        // Containers listen on IPv4, see the variable BIND of their templates.
-        let published = if bind.is_ipv4() { reached(bind) } else { Ipv4Addr::LOCALHOST.into() };
-        let address = self.containers.as_ref().map(|_| published).or_else(|| self.launcher.forwarded().map(reached));
+        let of_container = self.containers.as_ref().map(|_| IpAddr::from(self.config.address_of_simulations()));
+        let address = of_container.or_else(|| self.launcher.reached());
         address.map(|address| (address, self.place.1).into())
     }
 
@@ -151,9 +160,4 @@ impl LaunchSpec {
             None => async move { watcher.listening_port(root, port).await }.boxed_local(),
         }
     }
-}
-
-/// Where this machine itself reaches what listens on an address.
-fn reached(address: IpAddr) -> IpAddr {
-    if address.is_unspecified() { Ipv4Addr::LOCALHOST.into() } else { address }
 }

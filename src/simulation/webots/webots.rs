@@ -22,6 +22,7 @@ use crate::simulation::container::StartError;
 use crate::simulation::ends::{EndReason, Taken};
 use crate::simulation::process::ProcessGroup;
 use crate::simulation::snapshot::{Change, Stage};
+use crate::simulation::streams::Registration;
 
 /// Asks Webots to end, because its client has gone or for another reason.
 #[derive(Message)]
@@ -35,6 +36,8 @@ pub struct RestoreController(pub String);
 
 /// The actor.
 pub struct Webots {
+    /// Its stream, which is not found any more before another simulation may have its port.
+    stream: Option<Registration>,
     pub(super) spec: LaunchSpec,
     port: u16,
     events: ExitNotifier,
@@ -72,6 +75,7 @@ impl Webots {
     #[must_use]
     pub fn new(spec: LaunchSpec) -> Self {
         Self {
+            stream: None,
             port: spec.place.1,
             events: ExitNotifier::new(spec.events.clone()),
             spec,
@@ -168,7 +172,8 @@ impl Webots {
         self.last_heartbeat = Instant::now();
         self.spec.place.0.update(Change::Port(port));
         self.show_pace();
-        self.tell(WebotsEvent::Listening(port));
+        let stream = self.stream.insert(self.spec.register(port)).token();
+        self.tell(WebotsEvent::Listening(port, stream));
         self.used(ctx);
     }
 
@@ -216,6 +221,7 @@ impl Webots {
     }
 
     fn ended(&mut self, end: &End, ctx: &mut Context<Self>) {
+        self.stream = None;
         self.log(Level::Info, &format!("Webots {}", end.reason));
         let (kind, why) = verdict(self.stopped_for.take(), end, self.listening);
         self.spec.place.0.end(kind, &why, end.taken);

@@ -1,0 +1,43 @@
+//! A file that Webots serves, or its video.
+
+use actix_web::http::header::{self, HeaderName};
+use actix_web::{HttpRequest, HttpResponse};
+use futures_util::StreamExt;
+
+use super::upstream::{ANSWER, Upstream};
+
+/// What Webots says of a file, and its client hears.
+const PASSED_ON: [HeaderName; 4] = [header::CONTENT_TYPE, header::ETAG, header::CACHE_CONTROL, header::LAST_MODIFIED];
+
+/// Asks Webots for what is at this URL, and passes its answer on as fast as the client takes it. `held` is dropped with the
+/// answer.
+pub async fn fetch(upstream: &Upstream, url: &str, request: &HttpRequest, held: impl std::any::Any) -> HttpResponse {
+    // A connection that is kept could lead to another simulation on the same port later.
+    let mut asked = upstream.client().get(url).no_decompress().force_close();
+    if let Some(tag) = request.headers().get(header::IF_NONE_MATCH) {
+        asked = asked.insert_header((header::IF_NONE_MATCH, tag));
+    }
+    let answer = match actix_rt::time::timeout(ANSWER, asked.send()).await {
+        Ok(Ok(answer)) if !answer.status().is_informational() => answer,
+        Ok(_) => return HttpResponse::BadGateway().body("Error: the simulation does not answer."),
+        Err(_) => return HttpResponse::GatewayTimeout().body("Error: the simulation does not answer."),
+    };
+    let mut response = HttpResponse::build(answer.status());
+    for name in PASSED_ON {
+        if let Some(value) = answer.headers().get(&name) {
+            response.insert_header((name, value));
+        }
+    }
+    // Worlds make what is sent: their pages get an origin of their own, so that they can't act as the pages of this server,
+    // and don't tell their address, which has the token.
+    response.insert_header((header::CONTENT_SECURITY_POLICY, "sandbox allow-scripts"));
+    response.insert_header((header::REFERRER_POLICY, "no-referrer"));
+    let length = answer.headers().get(header::CONTENT_LENGTH).and_then(|length| length.to_str().ok()?.parse().ok());
+    if let Some(length) = length {
+        response.no_chunking(length);
+    }
+    response.streaming(answer.map(move |part| {
+        let _ = &held;
+        part
+    }))
+}

@@ -1,0 +1,73 @@
+//! The path of a stream, `/stream/TOKEN/...`: what of it Webots gets. Pure.
+
+use percent_encoding::percent_decode_str;
+
+use crate::simulation::sessions::Token;
+
+/// What the path of each stream begins with.
+const BEGINNING: &str = "/stream/";
+
+/// The token in a path, as the client has sent it, and what follows for Webots. Nothing where one of them is missing or
+/// would lead out of a folder.
+#[must_use]
+pub fn split(path: &str) -> Option<(Token, &str)> {
+    let rest = path.strip_prefix(BEGINNING)?;
+    let (token, path) = rest.split_at(rest.find('/').unwrap_or(rest.len()));
+    let token = Token::parse(token)?;
+    match path.strip_prefix('/') {
+        None | Some("") => Some((token, "/")),
+        Some(inside) => inside.split('/').all(is_name).then_some((token, path)),
+    }
+}
+
+/// Whether a part of a path names a file or folder, also for who decodes it twice.
+fn is_name(part: &str) -> bool {
+    let Ok(once) = percent_decode_str(part).decode_utf8() else { return false };
+    let Ok(twice) = percent_decode_str(&once).decode_utf8() else { return false };
+    [once.as_ref(), twice.as_ref()].into_iter().all(|name| {
+        let is_plain = !name.chars().any(|letter| letter.is_control() || letter == '/' || letter == '\\');
+        is_plain && !matches!(name, "" | "." | "..")
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_what_is_below_the_token_is_passed_on() {
+        let token = Token::new(7);
+        let path = |rest: &str| format!("/stream/{}{rest}", token.reveal());
+        for (rest, passed) in [
+            ("", Some("/")),
+            ("/", Some("/")),
+            ("/worlds/textures/a.png", Some("/worlds/textures/a.png")),
+            ("/~WEBOTS_HOME/a%20b.js", Some("/~WEBOTS_HOME/a%20b.js")),
+            ("/100%25.png", Some("/100%25.png")),
+            ("/a/../b", None),
+            ("/..", None),
+            ("/./a", None),
+            ("/a//b", None),
+            ("//evil.example/", None),
+            ("/a/", None),
+            ("/%2e%2e/b", None),
+            ("/.%2E/b", None),
+            ("/%252e%252e/b", None),
+            ("/a%2fb", None),
+            ("/a%252fb", None),
+            ("/a%5cb", None),
+            ("/a\\b", None),
+            ("/a%00", None),
+            ("/a%0d%0aHost:x", None),
+            ("/%ff", None),
+        ] {
+            let path = path(rest);
+            assert_eq!(split(&path), passed.map(|passed| (token, passed)), "{rest}");
+        }
+        for path in
+            ["/stream/", "/stream//a", "/stream/x/a", "/streams/x", "/", &path("x/a"), &format!("/x{}", path("/a"))]
+        {
+            assert_eq!(split(path), None, "{path}");
+        }
+    }
+}

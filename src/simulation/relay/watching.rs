@@ -1,0 +1,74 @@
+//! What a client that only watches may say to Webots: how it wants to watch, until Webots has answered that.
+
+use std::cell::Cell;
+
+use actix_http::ws::{Codec, Frame, Message};
+use actix_web::web::{BytesMut, Payload};
+use futures_util::StreamExt;
+use tokio::io::{AsyncWrite, AsyncWriteExt};
+use tokio_util::codec::{Decoder, Encoder};
+
+/// The largest message of who watches, in bytes.
+const MAX_MESSAGE: usize = 8 * 1024;
+
+/// Passes on how a client wants to watch, and drops all else. Returns when the client closes or breaks the rules.
+pub async fn introduce(mut payload: Payload, mut to_webots: impl AsyncWrite + Unpin, heard: &Cell<bool>) {
+    let (mut from_client, mut codec) = (Codec::new().max_size(MAX_MESSAGE), Codec::new().client_mode());
+    let mut bytes = BytesMut::new();
+    while let Some(Ok(part)) = payload.next().await {
+        bytes.extend_from_slice(&part);
+        loop {
+            let text = match from_client.decode(&mut bytes) {
+                Ok(Some(Frame::Text(text))) if !heard.get() => String::from_utf8_lossy(&text).into_owned(),
+                Ok(Some(Frame::Close(_))) | Err(_) => return,
+                Ok(Some(_)) => continue,
+                Ok(None) => break,
+            };
+            let mut frame = BytesMut::new();
+            let written = is_introduction(&text) && codec.encode(Message::Text(text.into()), &mut frame).is_ok();
+            if written && to_webots.write_all(&frame).await.is_err() {
+                return;
+            }
+        }
+    }
+}
+
+/// Whether a text says how its sender wants to watch, and changes nothing for others.
+fn is_introduction(text: &str) -> bool {
+    let is_size = |size: &str| {
+        size.split_once('x').is_some_and(|(width, height)| {
+            [width, height]
+                .iter()
+                .all(|one| (1..5).contains(&one.len()) && one.bytes().all(|byte| byte.is_ascii_digit()))
+        })
+    };
+    match text.strip_suffix(";broadcast") {
+        Some("x3d" | "w3d") => true,
+        Some(other) => other.strip_prefix("mjpeg: ").is_some_and(is_size),
+        None => false,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn nothing_else_is_an_introduction() {
+        for text in ["x3d;broadcast", "w3d;broadcast", "mjpeg: 800x600;broadcast"] {
+            assert!(is_introduction(text), "{text}");
+        }
+        for text in [
+            "x3d",
+            "pause",
+            "pause;broadcast",
+            "robot:a:b;broadcast",
+            "mjpeg: 800x600",
+            "mjpeg: 800x;broadcast",
+            "mjpeg: 8x6\npause;broadcast",
+            ";broadcast",
+        ] {
+            assert!(!is_introduction(text), "{text}");
+        }
+    }
+}

@@ -1,0 +1,68 @@
+//! The page on which an administrator watches a simulation, and what it loads.
+
+use actix_web::{HttpRequest, HttpResponse, web};
+use askama::Template;
+use serde::Deserialize;
+
+use super::administrator::refuse_others;
+use super::webots_viewer;
+use crate::shared::http::paths::{GET, READ, path};
+use crate::shared::http::{Policy, html, own_sources};
+use crate::simulation::state::AppState;
+
+/// The page `/watch`.
+#[derive(Template)]
+#[template(path = "simulation/watch.html")]
+struct Watch<'id> {
+    version: &'static str,
+    id: &'id str,
+    /// The path of the stream, with a token for one connection.
+    stream: String,
+    /// Webots' own viewer, where this server has it.
+    script: Option<&'static str>,
+}
+
+/// The page that holds Webots' own viewer.
+#[derive(Template)]
+#[template(path = "session/webots_viewer.html")]
+struct WebotsViewer {
+    version: &'static str,
+}
+
+/// Which simulation, and by which viewer.
+#[derive(Deserialize)]
+struct Which {
+    id: String,
+    #[serde(default)]
+    viewer: String,
+}
+
+/// Adds the paths to an app.
+pub fn configure(app: &mut web::ServiceConfig) {
+    app.service(path("/watch", GET, watch)).service(path("/webots-viewer", READ, viewer));
+}
+
+/// The token that the page gets is new each time, so that its address, which may be kept or sent to others, leads nobody
+/// without the password to the stream.
+async fn watch(request: HttpRequest, which: web::Query<Which>, server: web::Data<AppState>) -> HttpResponse {
+    if let Some(refusal) = refuse_others(&request, &server) {
+        return refusal;
+    }
+    let Some(token) = server.streams.watch(&which.id) else {
+        return HttpResponse::NotFound().body("Error: this simulation does not stream, or too many watch.");
+    };
+    let installed = webots_viewer::folder(&server.config).map(|_| webots_viewer::PATH);
+    let page = Watch {
+        version: env!("CARGO_PKG_VERSION"),
+        id: &which.id,
+        stream: format!("stream/{}", token.reveal()),
+        script: installed.filter(|_| which.viewer != "small"),
+    };
+    html(page.render(), &Policy::own().own_websocket(&request).frames())
+}
+
+/// Webots' own viewer shows what worlds bring: it runs in an embedded page with an origin of its own.
+async fn viewer(request: HttpRequest) -> HttpResponse {
+    let page = WebotsViewer { version: env!("CARGO_PKG_VERSION") };
+    html(page.render(), &Policy::own().run(&own_sources(&request)).any_picture().framed().foreign())
+}

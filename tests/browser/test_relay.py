@@ -1,0 +1,51 @@
+"""Streams through the simulation server, and an administrator who watches."""
+
+import re
+import unittest
+
+from playwright.sync_api import expect
+
+from case import BrowserTest, picture
+from fleet import until
+
+
+class Relayed(BrowserTest):
+    simulation = {"streaming": "relay", "adminPassword": "secret"}
+
+    def test_a_simulation_is_steered_through_the_server_and_watched(self):
+        student, server = self.start_world()
+        streams = [url for url in student.asked if "/stream/" in url]
+        self.assertTrue(all(url.startswith(f"ws://{server.address}/stream/") for url in streams) and streams, student.asked)
+        student.tab.get_by_role("button", name="Play", exact=True).click()
+        expect(student.tab.locator("#mode")).to_have_text("real time")
+        expect(student.tab.locator("#watched")).to_be_hidden()
+
+        monitor = self.open(server.url("monitor"), http_credentials={"username": "admin", "password": "secret"})
+        row = monitor.tab.locator("#simulations tr")
+        self.assertNotIn("Port", monitor.tab.locator("#simulations").locator("..").inner_text())
+        link = row.get_by_role("link", name="Watch")
+        address = link.get_attribute("href")
+        self.assertRegex(address, r"^watch\?id=[0-9T-]+$")
+        teacher = self.open(server.url(address), http_credentials={"username": "admin", "password": "secret"})
+        expect(teacher.tab.locator("#state")).to_have_text("Watching")
+        expect(student.tab.locator("#watched")).to_have_text("Your teacher is watching.")
+        expect(teacher.tab.get_by_role("button", name="Home view")).to_be_visible()
+        for name in ["Play", "Pause", "Step", "Reset"]:
+            expect(teacher.tab.get_by_role("button", name=name, exact=True)).to_be_hidden()
+        clock = teacher.tab.locator("#clock")
+        before = clock.inner_text()
+        until("the teacher sees time pass", lambda: clock.inner_text() != before)
+        shown = picture(teacher)
+        until("the teacher sees it move", lambda: picture(teacher) != shown)
+        expect(student.tab.locator("#mode")).to_have_text("real time")
+        teacher.close()
+        expect(student.tab.locator("#watched")).to_be_hidden()
+
+        again = self.open(server.url(address), http_credentials={"username": "admin", "password": "secret"})
+        expect(again.tab.locator("#state")).to_have_text("Watching")
+        student.tab.get_by_role("button", name="Disconnect").click()
+        expect(again.tab.locator("#state")).to_have_text(re.compile("It is over"))
+
+
+if __name__ == "__main__":
+    unittest.main()

@@ -1,0 +1,535 @@
+//! Streams through the server (`"streaming": "relay"`): its client has all of what Webots sends, and nobody else any of it.
+
+use std::time::Duration;
+
+use futures_util::{SinkExt, StreamExt};
+use nix::sys::signal::Signal;
+use serde_json::{Value, json};
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::net::{TcpListener, TcpStream};
+use tokio_tungstenite::tungstenite::client::IntoClientRequest;
+use tokio_tungstenite::tungstenite::protocol::frame::coding::CloseCode;
+use tokio_tungstenite::tungstenite::protocol::{CloseFrame, WebSocketConfig};
+use tokio_tungstenite::tungstenite::{Error, Message};
+use tokio_tungstenite::{MaybeTlsStream, WebSocketStream};
+
+use super::life::quick;
+use super::scene::{arm, nothing_left};
+use crate::support::client::{Client, Heard};
+use crate::support::git::Forge;
+use crate::support::program::{Builder, Server, simulation_server};
+use crate::support::webots::Webots;
+use crate::support::{SOON, http, until};
+
+/// A server, and what it needs.
+struct Stage {
+    server: Server,
+    _parts: (Forge, Webots),
+}
+
+impl Stage {
+    async fn new(change: impl FnOnce(Builder) -> Builder) -> Self {
+        Self::with(Webots::launcher(), change).await
+    }
+
+    async fn with(webots: Webots, change: impl FnOnce(Builder) -> Builder) -> Self {
+        let forge = Forge::with_arm();
+        forge.commit("lab/arm", "main", &[("worlds/textures/a.png", "a picture"), ("plugins/a.html", "<p>a page</p>")]);
+        let builder = quick(simulation_server(&webots.path(), forge.path(), 2)).set("streaming", "relay");
+        Self { server: change(builder).start().await, _parts: (forge, webots) }
+    }
+
+    /// A simulation, and the path of its stream.
+    async fn start(&self) -> (Client, String) {
+        let mut client = Client::connect(&self.server.websocket("/client")).await;
+        client.send(&json!({"start": {"url": arm(), "resumable": true}}).to_string()).await;
+        let path = self.path(&mut client).await;
+        (client, path)
+    }
+
+    async fn path(&self, client: &mut Client) -> String {
+        let told = client.until("webots:").await;
+        let beginning = format!("webots:ws://localhost:{}", self.server.port);
+        told.strip_prefix(&beginning).unwrap_or_else(|| panic!("{told}")).to_owned()
+    }
+
+    async fn viewer(&self, path: &str) -> Client {
+        Client::connect(&self.server.websocket(path)).await
+    }
+
+    /// The status code that somebody gets who asks for a WebSocket.
+    async fn refused(&self, path: &str) -> u16 {
+        match tokio_tungstenite::connect_async(self.server.websocket(path)).await {
+            Err(Error::Http(answer)) => answer.status().as_u16(),
+            Ok(_) => 101,
+            Err(error) => panic!("{path}: {error}"),
+        }
+    }
+
+    /// Sends these bytes, and returns what comes until the connection ends.
+    async fn raw(&self, bytes: &str) -> String {
+        let mut socket = TcpStream::connect(("127.0.0.1", self.server.port)).await.unwrap();
+        socket.write_all(bytes.as_bytes()).await.unwrap();
+        let mut answer = Vec::new();
+        actix_rt::time::timeout(SOON, socket.read_to_end(&mut answer)).await.expect("the connection ends").ok();
+        String::from_utf8_lossy(&answer).into_owned()
+    }
+
+    async fn simulations(&self) -> Vec<Value> {
+        http::get(&self.server.url("/status")).await.json()["simulations"].as_array().unwrap().clone()
+    }
+}
+
+type Socket<S> = WebSocketStream<S>;
+
+/// A Webots that this test plays, on a server that relays to it.
+struct Played {
+    stage: Stage,
+    listener: TcpListener,
+}
+
+impl Played {
+    async fn new(change: impl FnOnce(Builder) -> Builder) -> Self {
+        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let script = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/support/stream.py");
+        let port = listener.local_addr().unwrap().port();
+        let webots = Webots::script(&format!("exec python3 '{script}' \"$@\" {port}"));
+        let change = |builder: Builder| change(builder.set("isolation", "none"));
+        Self { stage: Stage::with(webots, change).await, listener }
+    }
+
+    /// A WebSocket, and Webots' end of it.
+    async fn connect(&self, path: &str) -> (Socket<MaybeTlsStream<TcpStream>>, Socket<TcpStream>) {
+        let config = WebSocketConfig::default().max_frame_size(Some(64 << 20));
+        let url = self.stage.server.websocket(path);
+        let client = tokio_tungstenite::connect_async_with_config(url, Some(config), true);
+        let webots = async {
+            let (socket, _) = self.listener.accept().await.unwrap();
+            tokio_tungstenite::accept_async_with_config(socket, Some(config)).await.unwrap()
+        };
+        let both = actix_rt::time::timeout(SOON, async { tokio::join!(client, webots) }).await.expect("a connection");
+        (both.0.unwrap().0, both.1)
+    }
+}
+
+async fn next<S>(socket: &mut Socket<S>) -> Option<Message>
+where
+    S: tokio::io::AsyncRead + tokio::io::AsyncWrite + Unpin,
+{
+    let next = actix_rt::time::timeout(SOON, socket.next()).await.expect("something comes");
+    next.and_then(Result::ok)
+}
+
+#[actix_rt::test]
+async fn a_simulation_is_steered_and_its_files_are_had_through_the_server_alone() {
+    for level in ["none", "sandbox"] {
+        let stage = Stage::new(|builder| builder.set("isolation", level)).await;
+        let (client, path) = stage.start().await;
+        let mut viewer = stage.viewer(&path).await;
+        viewer.send("x3d").await;
+        viewer.until("scene load completed").await;
+        viewer.send("real-time:-1").await;
+        viewer.until("real-time").await;
+        viewer.until("application/json:").await;
+        // As Webots' page and as ours write it.
+        stage.viewer(&format!("{path}/")).await.send("x3d;broadcast").await;
+
+        let picture = http::get(&stage.server.url(&format!("{path}/worlds/textures/a.png"))).await;
+        assert_eq!((picture.status.as_u16(), picture.text().as_str()), (200, "a picture"));
+        let common = [("access-control-allow-origin", "*"), ("referrer-policy", "no-referrer")];
+        let own = [("content-type", "image/png"), ("cache-control", "public, max-age=3600"), ("content-length", "9")];
+        for (name, value) in common.into_iter().chain(own).chain([("content-security-policy", "sandbox allow-scripts")])
+        {
+            assert_eq!(picture.header(name), Some(value), "{name}: {:?}", picture.headers);
+        }
+        let url = stage.server.url(&format!("{path}/worlds/textures/a.png?now"));
+        let again = awc::Client::new().get(url).insert_header(("if-none-match", picture.header("etag").unwrap()));
+        assert_eq!(again.send().await.unwrap().status(), 304);
+        let page = http::get(&stage.server.url(&format!("{path}/plugins/a.html"))).await;
+        assert_eq!(page.header("content-security-policy"), Some("sandbox allow-scripts"));
+        assert_eq!(http::get(&stage.server.url(&format!("{path}/worlds/none.png"))).await.status, 404);
+        client.close_with(1000).await;
+        nothing_left(&stage.server, 2).await;
+    }
+}
+
+#[actix_rt::test]
+async fn all_frames_and_close_codes_pass_in_both_directions() {
+    let played = Played::new(|builder| builder).await;
+    let (_client, path) = played.stage.start().await;
+    let (mut viewer, mut webots) = played.connect(&path).await;
+    let picture = vec![7; 4 << 20];
+    for message in [Message::text("a text"), Message::binary(vec![0, 255]), Message::binary(picture), Message::text("")]
+    {
+        webots.send(message.clone()).await.unwrap();
+        assert!(next(&mut viewer).await == Some(message.clone()), "{} bytes to the client", message.len());
+        viewer.send(message.clone()).await.unwrap();
+        assert!(next(&mut webots).await == Some(message.clone()), "{} bytes to Webots", message.len());
+    }
+    viewer.send(Message::Ping(vec![1].into())).await.unwrap();
+    assert_eq!(next(&mut webots).await, Some(Message::Ping(vec![1].into())));
+    webots.flush().await.unwrap();
+    assert_eq!(next(&mut viewer).await, Some(Message::Pong(vec![1].into())));
+    let frame = |code, reason: &str| CloseFrame { code: CloseCode::from(code), reason: reason.into() };
+    webots.send(Message::Close(Some(frame(4321, "enough")))).await.unwrap();
+    assert_eq!(next(&mut viewer).await, Some(Message::Close(Some(frame(4321, "enough")))));
+
+    let (mut viewer, mut webots) = played.connect(&path).await;
+    viewer.send(Message::Close(Some(frame(3000, "")))).await.unwrap();
+    assert_eq!(next(&mut webots).await, Some(Message::Close(Some(frame(3000, "")))));
+
+    // One that just breaks is broken on the other side.
+    let (viewer, mut webots) = played.connect(&path).await;
+    drop(viewer);
+    assert_eq!(next(&mut webots).await, None);
+    let (mut viewer, webots) = played.connect(&path).await;
+    drop(webots);
+    assert_eq!(next(&mut viewer).await, None);
+}
+
+#[actix_rt::test]
+async fn a_viewer_that_does_not_read_holds_up_nobody_and_fills_no_memory() {
+    let played = Played::new(|builder| builder.set("timing.silence", 3600)).await;
+    let (_client, path) = played.stage.start().await;
+    let memory = || {
+        let process = procfs::process::Process::new(played.stage.server.pid()).unwrap();
+        process.stat().unwrap().rss * procfs::page_size()
+    };
+    let (mut lazy, mut flood) = played.connect(&path).await;
+    let (mut viewer, mut webots) = played.connect(&path).await;
+    let before = memory();
+    let frame = Message::binary(vec![0; 4 << 20]);
+    let mut taken = 0;
+    while let Ok(sent) = actix_rt::time::timeout(Duration::from_secs(2), flood.send(frame.clone())).await {
+        sent.unwrap();
+        taken += 4;
+        assert!(taken < 100, "{taken} MiB wait for somebody who does not read");
+        webots.send(Message::text("another")).await.unwrap();
+        assert_eq!(next(&mut viewer).await, Some(Message::text("another")));
+    }
+    assert!(memory() < before + (16 << 20), "{} MiB more", (memory() - before) >> 20);
+    // The other way round.
+    let (mut flood, webots) = played.connect(&path).await;
+    while let Ok(sent) = actix_rt::time::timeout(Duration::from_secs(2), flood.send(frame.clone())).await {
+        sent.unwrap();
+        taken += 4;
+        assert!(taken < 200, "{taken} MiB wait for a Webots that does not read");
+    }
+    assert!(memory() < before + (16 << 20), "{} MiB more", (memory() - before) >> 20);
+    drop(webots);
+    // And it has all of it, once it reads.
+    assert_eq!(next(&mut lazy).await, Some(frame));
+}
+
+#[actix_rt::test]
+async fn no_trick_leads_anywhere_else() {
+    let played = Played::new(|builder| builder).await;
+    let stage = &played.stage;
+    let (_client, path) = stage.start().await;
+    let headers = "Host: localhost\r\nConnection: close\r\n";
+    let upgrade = "Host: localhost\r\nConnection: upgrade\r\nUpgrade: websocket\r\nSec-WebSocket-Version: 13\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n";
+    let other = TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let elsewhere = other.local_addr().unwrap();
+    let token = path.rsplit('/').next().unwrap();
+    let wrong = format!("{}{}", &token[..47], if token.ends_with('0') { '1' } else { '0' });
+    for (path, status) in [
+        (format!("{path}/../status"), 404),
+        (format!("{path}/%2e%2e/a.png"), 404),
+        (format!("{path}/%252e%252e/a.png"), 404),
+        (format!("{path}/a%2f..%2fb"), 404),
+        (format!("{path}/a%5c..%5cb"), 404),
+        (format!("{path}//{elsewhere}/"), 404),
+        (format!("{path}@{elsewhere}/"), 404),
+        (format!("{path}:80/a.png"), 404),
+        (format!("{path}/a%0d%0aHost:%20{elsewhere}"), 404),
+        (format!("/%73tream/{token}/a.png"), 404),
+        (format!("/stream/{wrong}/a.png"), 404),
+        (format!("/stream/{}/a.png", &token[..47]), 404),
+        (format!("/stream/{}/a.png", token.replace(|one: char| one.is_ascii_digit(), "%30")), 404),
+        ("/stream/".to_owned(), 404),
+        ("/stream".to_owned(), 404),
+    ] {
+        for headers in [headers, upgrade] {
+            let answer = stage.raw(&format!("GET {path} HTTP/1.1\r\n{headers}\r\n")).await;
+            assert!(answer.starts_with(&format!("HTTP/1.1 {status} ")), "{path}: {answer}");
+            assert!(!answer.contains(&token[16..]), "{answer}");
+        }
+    }
+    for (request, status) in [
+        (format!("POST {path}/a.png HTTP/1.1\r\n{headers}Content-Length: 1\r\n\r\nx"), 405),
+        (format!("PUT {path}/a.png HTTP/1.1\r\n{headers}\r\n"), 405),
+        (format!("CONNECT {elsewhere} HTTP/1.1\r\n{headers}\r\n"), 404),
+        (format!("GET {path}/a.png HTTP/1.1\r\n{headers}Content-Length: 1\r\n\r\nx"), 400),
+        (format!("GET {path}/a.png HTTP/1.1\r\n{headers}Transfer-Encoding: chunked\r\n\r\n0\r\n\r\n"), 400),
+        (format!("GET {path} HTTP/1.1\r\n{upgrade}Content-Length: 1\r\n\r\nx"), 400),
+        (format!("GET {path} HTTP/1.1\r\n{upgrade}Transfer-Encoding: chunked\r\n\r\n1\r\nx\r\n0\r\n\r\n"), 400),
+        (format!("GET {path} HTTP/1.1\r\nHost: localhost\r\nConnection: upgrade, close\r\nUpgrade: h2c\r\n\r\n"), 400),
+        (format!("GET {path}/{} HTTP/1.1\r\n{headers}\r\n", "x".repeat(200_000)), 431),
+    ] {
+        let answer = stage.raw(&request).await;
+        let shown: String = request.chars().take(300).collect();
+        assert!(answer.starts_with(&format!("HTTP/1.1 {status} ")), "{shown}: {answer}");
+    }
+    // None of all that has reached Webots, nor what was named.
+    let reached = actix_rt::time::timeout(Duration::from_millis(200), async {
+        tokio::select! { one = played.listener.accept() => one, one = other.accept() => one }
+    });
+    assert!(reached.await.is_err());
+
+    // The absolute form is that of a proxy's client; it leads to Webots, and so does what is hidden behind the first request.
+    let absolute =
+        format!("GET http://{elsewhere}{path}/a.png?x=1 HTTP/1.1\r\n{headers}X-Secret: y\r\nAuthorization: z\r\n\r\n");
+    let second = format!("GET {path}/second.png HTTP/1.1\r\n{headers}\r\n");
+    let webots = async {
+        let (mut socket, _) = played.listener.accept().await.unwrap();
+        let mut head = [0; 4096];
+        let length = socket.read(&mut head).await.unwrap();
+        socket
+            .write_all(b"HTTP/1.1 302 Found\r\nLocation: http://127.0.0.1:1/\r\nContent-Length: 2\r\n\r\nok")
+            .await
+            .unwrap();
+        String::from_utf8_lossy(&head[..length]).into_owned()
+    };
+    let both = format!("{absolute}{second}");
+    let (answer, head) = tokio::join!(stage.raw(&both), webots);
+    let port = stage.server.port + 1;
+    assert!(head.starts_with("GET /a.png?x=1 HTTP/1.1\r\n"), "{head}");
+    assert!(head.contains(&format!("\r\nhost: 127.0.0.1:{port}\r\n")), "{head}");
+    let names: Vec<&str> = head.lines().skip(1).filter_map(|line| Some(line.split_once(':')?.0)).collect();
+    assert_eq!(names, ["content-length", "connection", "host", "date"], "{head}");
+    assert!(answer.starts_with("HTTP/1.1 302 Found\r\n") && !answer.contains("ocation:"), "{answer}");
+    assert_eq!(answer.matches("HTTP/1.1 ").count(), 1, "{answer}");
+    assert!(!stage.server.log().contains(&token[16..]));
+}
+
+#[actix_rt::test]
+async fn a_webots_that_does_not_answer_costs_its_client_an_error() {
+    let played = Played::new(|builder| builder).await;
+    let (_client, path) = played.stage.start().await;
+    let url = played.stage.server.url(&format!("{path}/a.png"));
+    for nonsense in ["", "nonsense\r\n\r\n", "HTTP/1.1 101 Switching Protocols\r\n\r\n"] {
+        let webots = async {
+            let (mut socket, _) = played.listener.accept().await.unwrap();
+            let mut head = [0; 4096];
+            assert!(socket.read(&mut head).await.unwrap() > 0);
+            socket.write_all(nonsense.as_bytes()).await.unwrap();
+        };
+        let (answer, ()) = tokio::join!(http::get(&url), webots);
+        assert_eq!(answer.status, 502, "{nonsense}");
+        let webots = async {
+            let (mut socket, _) = played.listener.accept().await.unwrap();
+            let mut head = [0; 4096];
+            assert!(socket.read(&mut head).await.unwrap() > 0);
+            socket.write_all(nonsense.as_bytes()).await.unwrap();
+        };
+        let (status, ()) = tokio::join!(played.stage.refused(&path), webots);
+        assert_eq!(status, 502, "{nonsense}");
+    }
+}
+
+#[actix_rt::test]
+async fn the_token_stays_for_who_comes_back_and_dies_with_the_simulation() {
+    let stage = Stage::new(|builder| builder).await;
+    let (mut client, path) = stage.start().await;
+    let resume = client.until("resume: ").await["resume: ".len()..].to_owned();
+    drop(client);
+    until("it is away", async || stage.simulations().await[0]["awayUntil"].is_u64()).await;
+    let mut client = stage.viewer("/client").await;
+    client.send(&json!({ "resume": resume }).to_string()).await;
+    assert_eq!(stage.path(&mut client).await, path);
+    let mut viewer = stage.viewer(&path).await;
+    viewer.send("x3d").await;
+    viewer.until("scene load completed").await;
+
+    let (other, others) = stage.start().await;
+    assert_ne!(path, others);
+    client.close_with(1000).await;
+    viewer.closed().await;
+    until("the token is gone", async || stage.refused(&path).await == 404).await;
+    assert_eq!(http::get(&stage.server.url(&format!("{path}/worlds/textures/a.png"))).await.status, 404);
+    assert_eq!(http::get(&stage.server.url(&format!("{others}/worlds/textures/a.png"))).await.status, 200);
+    // Also where the next simulation has the same port.
+    let (_next, third) = stage.start().await;
+    assert_eq!(stage.refused(&path).await, 404);
+    assert_ne!(third, path);
+    drop(other);
+    let mut told = stage.server.log();
+    for page in ["/status", "/monitor", "/metrics"] {
+        told += &http::get(&stage.server.url(page)).await.text();
+    }
+    for path in [path, others, third] {
+        assert!(!told.contains(&path["/stream/".len() + 16..]), "{told}");
+    }
+}
+
+#[actix_rt::test]
+async fn a_stranger_sees_no_port_and_steers_nobody() {
+    let password = |builder: Builder| builder.set("adminPassword", "open sesame");
+    for (mode, has_password) in [("direct", false), ("direct", true), ("relay", false), ("relay", true)] {
+        let stage = Stage::new(|builder| {
+            let builder = builder.set("streaming", mode);
+            if has_password { password(builder) } else { builder }
+        })
+        .await;
+        let mut client = Client::start(&stage.server, &arm()).await;
+        client.until("webots:").await;
+        let port = stage.server.port + 1;
+        let is_shown = (mode, has_password) == ("direct", false);
+        let simulation = stage.simulations().await.remove(0);
+        assert_eq!(simulation["port"], if is_shown { json!(port) } else { Value::Null }, "{mode} {has_password}");
+        let page = http::get(&stage.server.url("/monitor")).await.text();
+        assert_eq!(page.contains(&format!(">{port}<")), is_shown, "{mode} {has_password}");
+        let ask = async |password: &str| {
+            let asked = awc::Client::new().get(stage.server.url("/status")).basic_auth("admin", password);
+            let mut answer = asked.send().await.unwrap();
+            (answer.status().as_u16(), answer.body().limit(1 << 20).await.unwrap())
+        };
+        if has_password {
+            assert_eq!(ask("wrong").await.0, 401);
+            let (status, body) = ask("open sesame").await;
+            assert_eq!(status, 200);
+            let told: Value = serde_json::from_slice(&body).unwrap();
+            assert_eq!(told["simulations"][0]["port"], port);
+        }
+    }
+
+    // The prank, over the relay: with all that a stranger can learn, also one with a simulation of his own.
+    let stage = Stage::new(|builder| builder).await;
+    let (_victim, path) = stage.start().await;
+    let (_stranger, own) = stage.start().await;
+    let mut victim = stage.viewer(&path).await;
+    victim.send("x3d").await;
+    victim.until("pause: ").await;
+    victim.send("real-time:-1").await;
+    victim.until("real-time").await;
+    let (number, secret) = (&path["/stream/".len()..][..16], &own["/stream/".len() + 16..]);
+    for guess in [format!("/stream/{number}{secret}"), format!("{own}/../{number}{secret}"), "/stream/2001".to_owned()]
+    {
+        assert_eq!(stage.refused(&guess).await, 404, "{guess}");
+    }
+    let mut stranger = stage.viewer(&own).await;
+    stranger.send("x3d").await;
+    stranger.until("pause: ").await;
+    stranger.send("pause").await;
+    stranger.until("paused by client").await;
+    for _ in 0..20 {
+        assert!(victim.until("").await.starts_with("application/json:"), "{:?}", victim.heard.last());
+    }
+}
+
+#[actix_rt::test]
+async fn pages_of_other_origins_get_no_stream() {
+    let stage = Stage::new(|builder| builder.set("allowedOrigins", json!(["https://lab.org"]))).await;
+    let (_client, path) = stage.start().await;
+    // Webots' own viewer runs in a frame without an origin.
+    for (origin, allowed) in [("https://lab.org", true), ("null", true), ("https://evil.org", false)] {
+        let mut request = stage.server.websocket(&path).into_client_request().unwrap();
+        request.headers_mut().insert("origin", origin.parse().unwrap());
+        assert_eq!(tokio_tungstenite::connect_async(request).await.is_ok(), allowed, "{origin}");
+        let file = stage.server.url(&format!("{path}/worlds/textures/a.png"));
+        let answer = awc::Client::new().get(file).insert_header(("origin", origin)).send().await.unwrap();
+        assert_eq!(answer.status(), if allowed { 200 } else { 403 }, "{origin}");
+    }
+}
+
+/// Opens the page on which an administrator watches the simulation of a client, and returns the path of its stream.
+async fn watched_by(stage: &Stage, client: &Client) -> String {
+    let url = stage.server.url(&format!("/watch?id={}", client.id()));
+    let asked = awc::Client::new().get(url).basic_auth("admin", "open sesame");
+    let mut answer = asked.send().await.unwrap();
+    assert_eq!(answer.status(), 200);
+    assert_eq!(answer.headers().get("referrer-policy").unwrap(), "no-referrer");
+    let page = String::from_utf8(answer.body().await.unwrap().to_vec()).unwrap();
+    let (_, rest) = page.split_once("data-stream=\"").unwrap();
+    format!("/{}", rest.split_once('"').unwrap().0)
+}
+
+#[actix_rt::test]
+async fn an_administrator_watches_and_changes_nothing() {
+    for mode in ["direct", "relay"] {
+        let change = |builder: Builder| builder.set("adminPassword", "open sesame").set("streaming", mode);
+        let stage = Stage::new(change).await;
+        let mut client = Client::start(&stage.server, &arm()).await;
+        let address = client.until("webots:").await["webots:".len()..].to_owned();
+        let mut student = Client::connect(&address).await;
+        student.send("x3d").await;
+        student.until("pause: ").await;
+        student.send("real-time:-1").await;
+        student.until("real-time").await;
+
+        let path = watched_by(&stage, &client).await;
+        let mut watcher = stage.viewer(&path).await;
+        assert_eq!(client.until("watched").await, "watched: 1");
+        // Before it has said that it only watches, nothing of it is heard either.
+        for text in ["pause", "x3d", "robot:a:b;broadcast"] {
+            watcher.send(text).await;
+        }
+        assert!(watcher.is_silent(Duration::from_millis(300)).await);
+        watcher.send("x3d;broadcast").await;
+        watcher.until("scene load completed").await;
+        for text in ["pause", "reset", "x3d", "step", "load:worlds/a.wbt"] {
+            watcher.send(text).await;
+        }
+        watcher.send_binary(b"pause").await;
+        for _ in 0..20 {
+            assert!(student.until("").await.starts_with("application/json:"), "{:?}", student.heard.last());
+        }
+        watcher.until("application/json:").await;
+        let files = stage.server.url(&format!("{path}/worlds/textures/a.png"));
+        assert_eq!(http::get(&files).await.status, 200);
+        // The token is for one connection, and leads nowhere after it.
+        assert_eq!(stage.refused(&path).await, 404);
+        let mut second = stage.viewer(&watched_by(&stage, &client).await).await;
+        second.send("x3d;broadcast").await;
+        second.until("scene load completed").await;
+        drop(second);
+        watcher.close_with(1000).await;
+        assert_eq!(client.until("watched").await, "watched: 0");
+        assert_eq!(http::get(&files).await.status, 404);
+
+        assert!(stage.server.log().contains("watches"));
+        assert!(!stage.server.log().contains(&path["/stream/".len() + 16..]));
+        client.leave().await;
+        nothing_left(&stage.server, 2).await;
+    }
+}
+
+#[actix_rt::test]
+async fn who_comes_back_hears_that_somebody_watches() {
+    let stage = Stage::new(|builder| builder.set("adminPassword", "open sesame")).await;
+    let (mut client, _) = stage.start().await;
+    let resume = client.until("resume: ").await["resume: ".len()..].to_owned();
+    let mut watcher = stage.viewer(&watched_by(&stage, &client).await).await;
+    client.until("watched: 1").await;
+    drop(client);
+    until("it is away", async || stage.simulations().await[0]["awayUntil"].is_u64()).await;
+    let mut client = stage.viewer("/client").await;
+    client.send(&json!({ "resume": resume }).to_string()).await;
+    client.until("watched: 1").await;
+    stage.server.signal(Signal::SIGTERM);
+    while let Heard::Text(_) = watcher.next().await {}
+}
+
+#[actix_rt::test]
+async fn nobody_watches_without_the_password() {
+    let stage = Stage::new(|builder| builder).await;
+    let (client, _) = stage.start().await;
+    let watch = format!("/watch?id={}", client.id());
+    assert_eq!(http::get(&stage.server.url(&watch)).await.status, 403, "there is no password");
+    assert!(!http::get(&stage.server.url("/monitor")).await.text().contains("watch?"));
+
+    let stage = Stage::new(|builder| builder.set("adminPassword", "open sesame")).await;
+    let (client, _) = stage.start().await;
+    let watch = format!("/watch?id={}", client.id());
+    assert_eq!(http::get(&stage.server.url(&watch)).await.status, 401);
+    let page = http::get(&stage.server.url("/monitor")).await.text();
+    assert!(page.contains(&format!("href=\"{}\"", &watch[1..])), "{page}");
+    let ask = async |id: &str, password: &str| {
+        let asked = awc::Client::new().get(stage.server.url(&format!("/watch?id={id}")));
+        asked.basic_auth("admin", password).send().await.unwrap().status().as_u16()
+    };
+    assert_eq!(ask(client.id(), "wrong").await, 401);
+    for id in ["", "x", "20261122T220517042-17", "%3Cscript%3E"] {
+        assert_eq!(ask(id, "open sesame").await, 404, "{id}");
+    }
+}

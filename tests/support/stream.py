@@ -1,0 +1,28 @@
+"""Hands connections on from the port that Webots is given to another one: --port=N, and the other port last."""
+
+import socket
+import sys
+import threading
+
+
+def copy(source, target):
+    try:
+        while data := source.recv(65536):
+            target.sendall(data)
+    except OSError:
+        pass
+    for one in (source, target):
+        try:
+            one.shutdown(socket.SHUT_RDWR)
+        except OSError:
+            pass
+
+
+port = next(int(word.split("=")[1]) for word in sys.argv if word.startswith("--port="))
+other = int(sys.argv[-1])
+listener = socket.create_server(("127.0.0.1", port), backlog=128)
+while True:
+    near, _ = listener.accept()
+    far = socket.create_connection(("127.0.0.1", other))
+    for pair in ((near, far), (far, near)):
+        threading.Thread(target=copy, args=pair, daemon=True).start()
