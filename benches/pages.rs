@@ -29,7 +29,7 @@ use support::git::{Forge, world};
 use support::program::{Server, session_server, simulation_server};
 use support::webots::Webots;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
-use webots_fleet::session::fleet::{FleetStatus, ServerStatus, State, StateChange};
+use webots_fleet::session::fleet::{FleetStatus, ServerState, ServerStatus, StateChange};
 use webots_fleet::session::web::pages;
 use webots_fleet::shared::domain::ClientUrls;
 
@@ -76,7 +76,7 @@ fn fleet() -> FleetStatus {
     let address = |number: u16| format!("simulation{number}.example.org:{}", 2000 + number).parse().unwrap();
     let servers = (0..SERVERS).map(|number| ServerStatus {
         address: address(number),
-        state: if number % 10 == 0 { State::Full } else { State::Up },
+        state: if number % 10 == 0 { ServerState::Full } else { ServerState::Up },
         since: SystemTime::now(),
         report: Some(Arc::new(serde_json::from_value(report.clone()).unwrap())),
         error: None,
@@ -89,7 +89,7 @@ fn fleet() -> FleetStatus {
     let change = |number| StateChange {
         at: SystemTime::now(),
         server: address(number).to_string(),
-        state: State::Down,
+        state: ServerState::Down,
         why: "no answer within 3 s".to_owned(),
     };
     let changes: VecDeque<StateChange> = (0..50).map(change).collect();

@@ -25,7 +25,7 @@
 //! | `simulation::web` | paths and pages of the simulation server |
 //!
 //! Each server also has a folder `config` (every key), its `app` (start and end) and its `state` (what its paths share). Files
-//! of `simulation` are the wire [`protocol`](simulation::protocol), the [`places`](simulation::places) that clients wait for,
+//! of `simulation` are the wire [`protocol`](simulation::protocol), the [`slots`](simulation::slots) that clients wait for,
 //! the `snapshot` of them, the `simulation_id`, `who` a client is, the `failed_starts`, the `announcer` (key `notify`), `preflight` (`--check`) and `readiness` (`/health`).
 //! The programs are in `src/bin`.
 //! Imports point down only, in the order that `tests/project/layering.rs` lists. `session` and `simulation` never see each
@@ -48,12 +48,12 @@
 //!
 //! simulation server
 //!
-//!   routes - GetSnapshot -> Places <- GetSnapshot - LoadMonitor --> monitor.csv
+//!   routes - GetSnapshot -> SlotPool <- GetSnapshot - LoadMonitor --> monitor.csv
 //!     | one per WebSocket   ^  |                      '-- Readings (watch channel) --> routes
 //!   WebClient               |  |
 //!     | one per simulation  |  |
-//!   Session --- Ticket -----'  |
-//!     ^  ^------- PlaceEvent --'
+//!   Session --- SlotLease -----'  |
+//!     ^  ^------- SlotEvent --'
 //!     |  |--- checkout (a task on the main thread, shared by all who want the same world) --> git
 //!     |  '--- starts ---> Webots (one per simulation) --> Webots' process group, in a sandbox
 //!     '------ WebotsEvent ---'
@@ -69,7 +69,7 @@
 //!
 //! | actor | ends by itself | after a panic |
 //! |---|---|---|
-//! | Registry, Places, `LoadMonitor` | never | the server logs it and ends with exit code 1: the service manager starts it again |
+//! | Registry, `SlotPool`, `LoadMonitor` | never | the server logs it and ends with exit code 1: the service manager starts it again |
 //! | `ServerMonitor` | when its server leaves the configuration, or has left its name and does not answer | its supervisor makes a new one |
 //! | `NameMonitor` | when its name leaves the configuration | its supervisor makes a new one |
 //! | Mailer | never | its supervisor makes a new one; what it had not sent is lost |

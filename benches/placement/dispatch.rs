@@ -4,7 +4,7 @@ use super::scenario::THRESHOLD;
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
 use std::time::{Duration, Instant};
-use webots_fleet::session::placement::{Fleet, Instances, Policy, Report};
+use webots_fleet::session::placement::{ClientCounts, LoadBalancer, LoadReport, PlacementPolicy};
 
 /// What a server reports.
 #[derive(Debug, Clone, Copy)]
@@ -25,7 +25,7 @@ pub(crate) trait Dispatcher {
 
 /// The project's own policy: the real code, on a clock that starts at some moment.
 pub(crate) struct Own {
-    fleet: Fleet<usize>,
+    fleet: LoadBalancer<usize>,
     start: Instant,
     /// Whether the servers tell of their instances, or of their load only.
     instances: bool,
@@ -35,7 +35,7 @@ pub(crate) struct Own {
 
 impl Own {
     pub(crate) fn new(servers: usize, instances: bool) -> Self {
-        let mut fleet = Fleet::new(Policy::default());
+        let mut fleet = LoadBalancer::new(PlacementPolicy::default());
         (0..servers).for_each(|server| fleet.add(server));
         Self { fleet, start: Instant::now(), instances, hears_of_failures: true }
     }
@@ -57,8 +57,9 @@ impl Own {
 
 impl Dispatcher for Own {
     fn report(&mut self, server: usize, now: f64, seen: Seen) {
-        let instances = Instances { present: seen.present, places: 100_000, arrivals: seen.arrivals, accepting: true };
-        let report = Report { load: seen.load, instances: self.instances.then_some(instances) };
+        let instances =
+            ClientCounts { present: seen.present, places: 100_000, arrivals: seen.arrivals, accepting: true };
+        let report = LoadReport { load: seen.load, instances: self.instances.then_some(instances) };
         self.fleet.report(&server, self.at(now), report);
         if self.hears_of_failures {
             self.fleet.note_failures(&server, self.at(now), seen.failed_starts);

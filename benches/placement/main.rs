@@ -26,7 +26,7 @@ use scenario::{Arrivals, Outcome, Scenario, Sizes};
 use std::hint::black_box;
 use std::process::ExitCode;
 use std::time::{Duration, Instant};
-use webots_fleet::session::placement::{Fleet, Instances, Policy, Report};
+use webots_fleet::session::placement::{ClientCounts, LoadBalancer, LoadReport, PlacementPolicy};
 
 fn main() -> ExitCode {
     let begin = Instant::now();
@@ -142,11 +142,11 @@ fn speed() {
     const SERVERS: u32 = 1000;
     const ROUNDS: u32 = 2000;
     let start = Instant::now();
-    let mut fleet = Fleet::new(Policy::default());
+    let mut fleet = LoadBalancer::new(PlacementPolicy::default());
     (0..SERVERS).for_each(|id| fleet.add(id));
-    let report = |round: u32| Report {
+    let report = |round: u32| LoadReport {
         load: 30.0,
-        instances: Some(Instances { present: 10, places: 100, arrivals: 10 + u64::from(round), accepting: true }),
+        instances: Some(ClientCounts { present: 10, places: 100, arrivals: 10 + u64::from(round), accepting: true }),
     };
     (0..SERVERS).for_each(|id| fleet.report(&id, start, report(0)));
     let begin = Instant::now();

@@ -18,7 +18,7 @@ struct Arguments {
     #[arg(default_value = "config/session/local.json")]
     config: PathBuf,
     #[command(flatten)]
-    options: start::Options,
+    options: start::CommonArgs,
     /// Send one mail to the administrator, and a test to the webhook if there is one, say how it went, and end
     #[arg(long, conflicts_with = "check")]
     test_mail: bool,

@@ -5,7 +5,7 @@ use std::process::ExitCode;
 
 use clap::Parser;
 use webots_fleet::shared::run::{LogTarget, start};
-use webots_fleet::simulation::config::{Isolation, SimulationConfig};
+use webots_fleet::simulation::config::{IsolationSetting, SimulationConfig};
 use webots_fleet::simulation::container;
 use webots_fleet::simulation::process::guardian;
 use webots_fleet::simulation::{app, preflight};
@@ -18,7 +18,7 @@ struct Arguments {
     #[arg(default_value = "config/simulation/local.json")]
     config: PathBuf,
     #[command(flatten)]
-    options: start::Options,
+    options: start::CommonArgs,
     /// The server itself, or a part of it.
     #[command(subcommand)]
     part: Option<Part>,
@@ -41,8 +41,8 @@ enum Part {
 /// Removes the containers that a server with this configuration has left.
 fn sweep(config: &std::path::Path) -> ExitCode {
     match start::read::<SimulationConfig>(config) {
-        Ok(loaded) if loaded.config.isolation == Isolation::Container => {
-            container::sweep(&container::Owner::of(&loaded.config.cache_dir.0));
+        Ok(loaded) if loaded.config.isolation == IsolationSetting::Container => {
+            container::sweep(&container::ResourceOwner::of(&loaded.config.cache_dir.0));
             ExitCode::SUCCESS
         }
         Ok(_) => ExitCode::SUCCESS,
@@ -56,7 +56,8 @@ fn main() -> ExitCode {
         return sweep(config);
     }
     if let Some(Part::Guard(arguments)) = &arguments.part {
-        let remove = || arguments.containers.iter().for_each(|owner| container::sweep(&container::Owner::named(owner)));
+        let remove =
+            || arguments.containers.iter().for_each(|owner| container::sweep(&container::ResourceOwner::named(owner)));
         return ExitCode::from(guardian::guard(arguments, remove));
     }
     let loaded = match start::read::<SimulationConfig>(&arguments.config) {

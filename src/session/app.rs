@@ -17,11 +17,13 @@ use crate::session::mail::{self, Way};
 use crate::session::web::configure;
 use crate::shared::config;
 use crate::shared::http::BasicAuth;
-use crate::shared::http::Connections;
-use crate::shared::http::Live;
+use crate::shared::http::ConnectionLimiter;
+use crate::shared::http::LiveUpdates;
 use crate::shared::http::Metrics;
-use crate::shared::http::server::{self, Options};
-use crate::shared::run::{AppError, Phase, Request, Signals, notify, permanent, raise_open_files, start};
+use crate::shared::http::server::{self, HttpServerOptions};
+use crate::shared::run::{
+    AppError, Phase, ServerCommand, Signals, permanent, raise_open_files, service_manager, start,
+};
 
 /// How many open files the server needs for itself: logs, threads, mail.
 const OWN_FILES: usize = 128;
@@ -45,7 +47,7 @@ pub async fn run(mut config: SessionConfig, file: PathBuf) -> Result<(), AppErro
         return Err(AppError::NoClients { files, needed: "one client".to_owned() });
     }
     let options = options(&config, connections);
-    let connections = Connections::new(connections, clients, config.max_clients_per_address);
+    let connections = ConnectionLimiter::new(connections, clients, config.max_clients_per_address);
     let (phase_sender, phase) = watch::channel(Phase::Open);
     let address = SocketAddr::new(config.bind, config.port);
     let socket = server::listen(address).map_err(|source| AppError::Bind { address, source })?;
@@ -61,13 +63,13 @@ pub async fn run(mut config: SessionConfig, file: PathBuf) -> Result<(), AppErro
     let serving = actix_rt::spawn(http);
     start::announce("session server", &http_url, &websocket_url, port);
     let registry = server.registry.clone();
-    actix_rt::spawn(notify::feed_watchdog(async move || registry.send(Ping).await.is_ok()));
+    actix_rt::spawn(service_manager::feed_watchdog(async move || registry.send(Ping).await.is_ok()));
     tokio::select! {
         () = obey(&mut signals, &file, &server, port) => {}
         fault = permanent::stopped("Registry", server.registry.clone()) => return Err(AppError::ActorStopped(fault)),
     }
     log::info!("stopping");
-    notify::stopping("stopping");
+    service_manager::stopping("stopping");
     phase_sender.send_replace(Phase::Closing);
     // Connections that don't end in time are cut.
     actix_rt::time::timeout(stop, handle.stop(true)).await.ok();
@@ -80,20 +82,20 @@ pub async fn run(mut config: SessionConfig, file: PathBuf) -> Result<(), AppErro
 async fn obey(signals: &mut Signals, file: &Path, server: &AppState, port: u16) {
     loop {
         match signals.next().await {
-            Request::Stop => return,
-            Request::Reload => {
-                notify::reloading();
+            ServerCommand::Stop => return,
+            ServerCommand::Reload => {
+                service_manager::reloading();
                 reload(file, server);
-                notify::ready(port);
+                service_manager::ready(port);
             }
-            Request::Drain => log::info!("SIGUSR1 changes nothing here: simulation servers are drained"),
+            ServerCommand::Drain => log::info!("SIGUSR1 changes nothing here: simulation servers are drained"),
         }
     }
 }
 
 /// How the HTTP server serves so many connections.
-fn options(config: &SessionConfig, connections: usize) -> Options {
-    Options {
+fn options(config: &SessionConfig, connections: usize) -> HttpServerOptions {
+    HttpServerOptions {
         workers: threads(),
         max_per_worker: (connections / threads()).max(1),
         silence: config.timing.silence,
@@ -131,7 +133,7 @@ fn threads() -> usize {
 /// Makes the server's state, and starts its actors.
 fn assemble(
     config: SessionConfig,
-    connections: Connections,
+    connections: ConnectionLimiter,
     phase: watch::Receiver<Phase>,
 ) -> Result<AppState, AppError> {
     let metrics = Metrics::new();
@@ -159,7 +161,7 @@ fn assemble(
         trusted_proxies,
         metrics,
         picks,
-        live: Live::default(),
+        live: LiveUpdates::default(),
         announcements,
         admin_auth,
         examples,

@@ -9,13 +9,13 @@ use tokio::sync::watch;
 use super::announcements::Announcements;
 use super::config::{Example, Timing};
 use crate::session::fleet::Registry;
-use crate::session::fleet::{NoServer, Pick};
+use crate::session::fleet::{Pick, PickError};
 use crate::shared::domain::ClientUrls;
 use crate::shared::http::BasicAuth;
-use crate::shared::http::Live;
+use crate::shared::http::LiveUpdates;
 use crate::shared::http::Metrics;
 use crate::shared::http::TrustedProxies;
-use crate::shared::http::{Connections, Kind};
+use crate::shared::http::{ConnectionKind, ConnectionLimiter};
 use crate::shared::run::Phase;
 use crate::shared::text::client_text;
 
@@ -32,7 +32,7 @@ pub struct AppState {
     /// Whether clients are taken.
     pub phase: watch::Receiver<Phase>,
     /// Limits and counts connections.
-    pub connections: Connections,
+    pub connections: ConnectionLimiter,
     /// Web servers whose headers are believed.
     pub trusted_proxies: TrustedProxies,
     /// The metrics.
@@ -40,7 +40,7 @@ pub struct AppState {
     /// Counts requests for a simulation server, by outcome.
     pub picks: prometheus::IntCounterVec,
     /// The open monitor pages.
-    pub live: Live,
+    pub live: LiveUpdates,
     /// What the administrator tells everybody.
     pub announcements: Arc<Announcements>,
     /// Checks the administrator's password, where one is configured.
@@ -56,11 +56,11 @@ pub struct AppState {
 }
 
 /// The answer to a request for a simulation server.
-pub struct Answer {
+pub struct PickResponse {
     /// A URL, or `Error: ...`.
     pub text: String,
     /// Why there is no URL.
-    pub refusal: Option<NoServer>,
+    pub refusal: Option<PickError>,
 }
 
 /// How long the registry may take to pick a server.
@@ -69,32 +69,32 @@ const PICK_TIMEOUT: Duration = Duration::from_secs(2);
 impl AppState {
     /// Returns how many web clients are connected.
     pub fn clients(&self) -> usize {
-        self.connections.count(Kind::Client)
+        self.connections.count(ConnectionKind::Client)
     }
 
     /// Asks the registry for a simulation server. A registry that does not answer in time counts as unavailable.
-    pub async fn pick(&self, wanted: Result<Pick, NoServer>) -> Answer {
+    pub async fn pick(&self, wanted: Result<Pick, PickError>) -> PickResponse {
         let picked = match wanted {
             Ok(pick) => {
                 let picked = actix_rt::time::timeout(PICK_TIMEOUT, self.registry.send(pick)).await;
-                picked.ok().and_then(Result::ok).unwrap_or(Err(NoServer::Unavailable))
+                picked.ok().and_then(Result::ok).unwrap_or(Err(PickError::Unavailable))
             }
             Err(wrong) => Err(wrong),
         };
         let outcome = match &picked {
             Ok(_) => "placed",
-            Err(NoServer::Unavailable) => "unavailable",
-            Err(NoServer::NotAccepted(_)) => "not_accepted",
-            Err(NoServer::NoWorld(_)) => "wrong_url",
+            Err(PickError::Unavailable) => "unavailable",
+            Err(PickError::NotAccepted(_)) => "not_accepted",
+            Err(PickError::InvalidWorld(_)) => "wrong_url",
         };
         self.picks.with_label_values(&[outcome]).inc();
         match picked {
-            Ok(address) => Answer { text: self.client_urls.websocket_url(&address), refusal: None },
+            Ok(address) => PickResponse { text: self.client_urls.websocket_url(&address), refusal: None },
             // These words hold nothing from outside.
-            Err(NoServer::Unavailable) => {
-                Answer { text: NoServer::Unavailable.to_string(), refusal: Some(NoServer::Unavailable) }
+            Err(PickError::Unavailable) => {
+                PickResponse { text: PickError::Unavailable.to_string(), refusal: Some(PickError::Unavailable) }
             }
-            Err(refusal) => Answer { text: client_text(&refusal.to_string()), refusal: Some(refusal) },
+            Err(refusal) => PickResponse { text: client_text(&refusal.to_string()), refusal: Some(refusal) },
         }
     }
 }

@@ -10,18 +10,20 @@ use tokio::sync::mpsc::Receiver;
 use tokio::sync::watch;
 
 use super::announcer::Announcer;
-use super::config::{Isolation, SimulationConfig};
+use super::config::{IsolationSetting, SimulationConfig};
 use super::ends::Ends;
-use super::places::{GetSnapshot, Places};
 use super::readiness;
+use super::slots::{GetSnapshot, SlotPool};
 use super::state::AppState;
-use crate::shared::domain::Rules;
-use crate::shared::http::server::{self, Options};
-use crate::shared::http::{BasicAuth, Connections, Live, Metrics};
-use crate::shared::run::{AppError, Phase, Request, Signals, notify, permanent, raise_open_files, start};
-use crate::simulation::checkout::{CacheDir, Checkouts, Limits};
+use crate::shared::domain::AdmissionRules;
+use crate::shared::http::server::{self, HttpServerOptions};
+use crate::shared::http::{BasicAuth, ConnectionLimiter, LiveUpdates, Metrics};
+use crate::shared::run::{
+    AppError, Phase, ServerCommand, Signals, permanent, raise_open_files, service_manager, start,
+};
+use crate::simulation::checkout::{CacheDir, CheckoutLimits, CheckoutService};
 use crate::simulation::client::{outcome, quota};
-use crate::simulation::container::Containers;
+use crate::simulation::container::ContainerService;
 use crate::simulation::isolation::{Launcher, Watcher};
 use crate::simulation::machine::{LoadMonitor, Spread, UsageMonitor};
 use crate::simulation::process::{Guardian, Leftovers, RunDir};
@@ -46,19 +48,19 @@ const FILES_PER_SIMULATION: usize = 8;
 /// # Errors
 /// When the server can't start, or an actor that must live has stopped.
 pub async fn run(config: SimulationConfig) -> Result<(), AppError> {
-    serve(Assembly::new(config)?).await
+    serve(Application::new(config)?).await
 }
 
 /// A server before it serves: it holds its port, and its actors run.
-pub struct Assembly {
+pub struct Application {
     server: Arc<AppState>,
     socket: TcpListener,
     signals: Signals,
     phase: watch::Sender<Phase>,
-    asked: Receiver<Request>,
+    asked: Receiver<ServerCommand>,
 }
 
-impl Assembly {
+impl Application {
     /// Takes the port, starts the actors, and removes what earlier runs left.
     ///
     /// # Errors
@@ -108,13 +110,13 @@ fn bound_clients(config: &SimulationConfig) -> Result<usize, AppError> {
 ///
 /// # Errors
 /// When an actor that must live has stopped, or the system refuses what the server needs.
-pub async fn serve(assembly: Assembly) -> Result<(), AppError> {
-    let Assembly { server, socket, mut signals, phase: phase_sender, mut asked } = assembly;
+pub async fn serve(assembly: Application) -> Result<(), AppError> {
+    let Application { server, socket, mut signals, phase: phase_sender, mut asked } = assembly;
     let owner = server.containers.as_ref().map(|containers| containers.run().name());
     let _guardian = Guardian::start(server.run.path(), owner)?;
     let shared = web::Data::from(Arc::clone(&server));
     let threads = std::thread::available_parallelism().map_or(1, usize::from);
-    let options = Options {
+    let options = HttpServerOptions {
         workers: threads,
         max_per_worker: (max_tcp(&server.config) / threads).max(1),
         silence: server.config.timing.silence,
@@ -128,20 +130,20 @@ pub async fn serve(assembly: Assembly) -> Result<(), AppError> {
     let serving = actix_rt::spawn(http);
     let (config, port) = (&server.config, server.config.port);
     start::announce("simulation server", &config.http_url(), &format!("{}/client", config.websocket_url(port)), port);
-    let places = server.places.clone();
-    let watched = places.clone();
-    actix_rt::spawn(notify::feed_watchdog(async move || watched.send(GetSnapshot).await.is_ok()));
+    let slots = server.slots.clone();
+    let watched = slots.clone();
+    actix_rt::spawn(service_manager::feed_watchdog(async move || watched.send(GetSnapshot).await.is_ok()));
     let why = tokio::select! {
         why = obey(&mut signals, &mut asked, &server, &phase_sender) => why,
-        fault = permanent::stopped("Places", places.clone()) => return Err(AppError::ActorStopped(fault)),
+        fault = permanent::stopped("SlotPool", slots.clone()) => return Err(AppError::ActorStopped(fault)),
         fault = permanent::stopped("LoadMonitor", server.load_monitor.clone()) => {
             return Err(AppError::ActorStopped(fault));
         }
     };
     log::info!("stopping");
-    notify::stopping(why);
+    service_manager::stopping(why);
     phase_sender.send_replace(Phase::Closing);
-    if actix_rt::time::timeout(server.config.timing.stop, empty(&places)).await.is_err() {
+    if actix_rt::time::timeout(server.config.timing.stop, empty(&slots)).await.is_err() {
         log::error!("some simulations have not ended in time: they are killed");
     }
     server.ends.flush().await;
@@ -156,7 +158,7 @@ pub async fn serve(assembly: Assembly) -> Result<(), AppError> {
 /// this text whether a server was drained or stopped.
 async fn obey(
     signals: &mut Signals,
-    asked: &mut Receiver<Request>,
+    asked: &mut Receiver<ServerCommand>,
     server: &AppState,
     phase: &watch::Sender<Phase>,
 ) -> &'static str {
@@ -167,13 +169,13 @@ async fn obey(
             () = drained(server) => return "drained: its last simulation has ended",
         };
         match request {
-            Request::Stop => return "stopping",
-            Request::Drain => {
+            ServerCommand::Stop => return "stopping",
+            ServerCommand::Drain => {
                 log::info!("draining: no new clients, the server ends when the last has gone");
                 phase.send_replace(Phase::Draining);
-                notify::status("draining: it ends when the last simulation has ended");
+                service_manager::status("draining: it ends when the last simulation has ended");
             }
-            Request::Reload => log::info!("SIGHUP changes nothing here: the configuration is read at start"),
+            ServerCommand::Reload => log::info!("SIGHUP changes nothing here: the configuration is read at start"),
         }
     }
 }
@@ -192,7 +194,7 @@ fn max_tcp(config: &SimulationConfig) -> usize {
 fn assemble(
     config: Arc<SimulationConfig>,
     phase: watch::Receiver<Phase>,
-    requests: tokio::sync::mpsc::Sender<Request>,
+    requests: tokio::sync::mpsc::Sender<ServerCommand>,
 ) -> Result<AppState, AppError> {
     let folder = config.cache_dir.0.clone();
     let cache_fault = |source| AppError::Folder { key: "cacheDir", folder: folder.clone(), source };
@@ -204,7 +206,7 @@ fn assemble(
     }
     let launcher = Launcher::start(&config).map_err(|error| AppError::Unavailable(error.to_string()))?;
     let containers = open_containers(&config, &run)?;
-    let rules = Rules {
+    let rules = AdmissionRules {
         allowed: config.allowed_repositories.clone(),
         blocked: config.blocked_repositories.clone(),
         docker: config.docker,
@@ -215,11 +217,11 @@ fn assemble(
     let logs = config.log_dir.0.join("simulation");
     let ends = Ends::start(logs, launcher.level().to_string(), &metrics);
     let ends = ends.map_err(|why| AppError::Unavailable(format!("ends of simulations can't be recorded: {why}")))?;
-    let places = Places::new(config.streaming_ports(), config.waiting_line, config.max_places_per_address);
-    let places = places.with_share_of_users(config.max_places_per_user).with_ends(ends.clone()).start();
+    let slots = SlotPool::new(config.streaming_ports(), config.waiting_line, config.max_places_per_address);
+    let slots = slots.with_share_of_users(config.max_places_per_user).with_ends(ends.clone()).start();
     let csv = config.monitor_log_enabled.then(|| config.log_dir.0.join("simulation/monitor.csv"));
     let spread = config.spreads().then(|| Arc::new(Spread::over(config.displays_of_gpus().len())));
-    let (load_monitor, readings) = LoadMonitor::new(places.clone(), run.path(), csv, spread.clone());
+    let (load_monitor, readings) = LoadMonitor::new(slots.clone(), run.path(), csv, spread.clone());
     let load_monitor = load_monitor.start();
     if !config.notify.is_empty() {
         Announcer::new(&config).start();
@@ -238,7 +240,7 @@ fn assemble(
         problem,
         failed_starts,
         ends,
-        places,
+        slots,
         sessions: Arc::default(),
         streams: Arc::default(),
         load_monitor,
@@ -252,12 +254,12 @@ fn assemble(
         requests,
         webots_threads: std::array::from_fn(|_| Arbiter::new().handle()),
         admin_auth: config.admin_password.clone().map(BasicAuth::new),
-        connections: Connections::new(max_tcp(&config), config.max_clients, config.max_clients_per_address),
+        connections: ConnectionLimiter::new(max_tcp(&config), config.max_clients, config.max_clients_per_address),
         metrics,
         starts,
         start_quota: quota::starts(config.max_connections),
-        live: Live::default(),
-        administrators: Live::default(),
+        live: LiveUpdates::default(),
+        administrators: LiveUpdates::default(),
         usage,
         watcher,
         started: Instant::now(),
@@ -266,12 +268,12 @@ fn assemble(
 }
 
 /// Gets ready to make containers, where simulations run in these.
-fn open_containers(config: &Arc<SimulationConfig>, run: &RunDir) -> Result<Option<Arc<Containers>>, AppError> {
-    if config.isolation != Isolation::Container {
+fn open_containers(config: &Arc<SimulationConfig>, run: &RunDir) -> Result<Option<Arc<ContainerService>>, AppError> {
+    if config.isolation != IsolationSetting::Container {
         return Ok(None);
     }
     let unavailable = |why| AppError::Unavailable(format!("isolation is \"container\", but {why}"));
-    Ok(Some(Arc::new(Containers::open(Arc::clone(config), run.path()).map_err(unavailable)?)))
+    Ok(Some(Arc::new(ContainerService::open(Arc::clone(config), run.path()).map_err(unavailable)?)))
 }
 
 /// Opens the cache of repositories with the bounds that the configuration sets.
@@ -279,26 +281,26 @@ fn open_checkouts(
     config: &SimulationConfig,
     cache_dir: CacheDir,
     run: &RunDir,
-    rules: &Rules,
-) -> std::io::Result<Checkouts> {
+    rules: &AdmissionRules,
+) -> std::io::Result<CheckoutService> {
     let (time, size) = (config.timing.checkout, config.project_size << 20);
-    let limits = Limits { time, size, any_commit: config.any_commit };
+    let limits = CheckoutLimits { time, size, any_commit: config.any_commit };
     let (budget, mirrors) = (config.cache_size << 20, config.git_mirrors.clone());
     let git = (mirrors, config.git_config.as_ref().map(|file| file.0.as_path()));
     let runtime = tokio::runtime::Handle::current();
-    Checkouts::open(cache_dir, run.path(), budget, git, rules.clone(), limits, runtime)
+    CheckoutService::open(cache_dir, run.path(), budget, git, rules.clone(), limits, runtime)
 }
 
 /// Waits until the server is draining and has no client any more.
 async fn drained(server: &AppState) {
     let mut phase = server.phase.clone();
     phase.wait_for(|phase| *phase == Phase::Draining).await.ok();
-    empty(&server.places).await;
+    empty(&server.slots).await;
 }
 
 /// Waits until there is no simulation, and nobody waits for one.
-async fn empty(places: &Addr<Places>) {
-    while places.send(GetSnapshot).await.is_ok_and(|snapshot| !snapshot.simulations.is_empty()) {
+async fn empty(slots: &Addr<SlotPool>) {
+    while slots.send(GetSnapshot).await.is_ok_and(|snapshot| !snapshot.simulations.is_empty()) {
         actix_rt::time::sleep(POLL_INTERVAL).await;
     }
 }

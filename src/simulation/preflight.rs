@@ -4,9 +4,9 @@ use std::process::Command;
 
 use which::which;
 
-use super::config::{Isolation, SimulationConfig};
+use super::config::{IsolationSetting, SimulationConfig};
 use super::container;
-use crate::simulation::isolation::{Launcher, Level};
+use crate::simulation::isolation::{IsolationLevel, Launcher};
 use crate::simulation::machine::display;
 use crate::simulation::machine::sensors::{GpuReading, GpuSensor};
 
@@ -31,7 +31,7 @@ impl std::fmt::Display for Finding {
 /// Checks everything. It runs programs and connects to the display, so it can take some seconds.
 #[must_use]
 pub fn check(config: &SimulationConfig) -> Vec<Finding> {
-    let (first, last) = if config.isolation == Isolation::Container {
+    let (first, last) = if config.isolation == IsolationSetting::Container {
         let checks = [("docker", container::check(config)), ("templates", container::check_templates(config))];
         (checks.map(|(topic, result)| Finding { topic, result }).to_vec(), None)
     } else {
@@ -43,12 +43,20 @@ pub fn check(config: &SimulationConfig) -> Vec<Finding> {
     let lfs = version(&["git-lfs", "--version"], "git-lfs is not there: large files of Git LFS will be missing");
     let always = [("git", git), ("git-lfs", lfs)].map(|(topic, result)| Finding { topic, result });
     let launcher = Launcher::new(config).map_err(|error| format!("the server does not start: {error}"));
-    let unkept = launcher.as_ref().map(Launcher::unkept).unwrap_or_default();
-    let unkept = unkept.into_iter().map(|line| Finding { topic: "limits", result: Err(line) });
+    let unenforced_limits = launcher.as_ref().map(Launcher::unenforced_limits).unwrap_or_default();
+    let unenforced_limits = unenforced_limits.into_iter().map(|line| Finding { topic: "limits", result: Err(line) });
     let network = launcher.as_ref().ok().and_then(network);
     let isolation = Finding { topic: "isolation", result: launcher.and_then(|launcher| isolation(&launcher)) };
     let gpus = config.spreads().then(|| Finding { topic: "GPUs", result: gpus(config) });
-    first.into_iter().chain(gpus).chain(always).chain(last).chain([isolation]).chain(network).chain(unkept).collect()
+    first
+        .into_iter()
+        .chain(gpus)
+        .chain(always)
+        .chain(last)
+        .chain([isolation])
+        .chain(network)
+        .chain(unenforced_limits)
+        .collect()
 }
 
 fn webots(config: &SimulationConfig) -> Result<String, String> {
@@ -132,7 +140,7 @@ fn isolation(launcher: &Launcher) -> Result<String, String> {
 
 /// The network of sandboxes.
 fn network(launcher: &Launcher) -> Option<Finding> {
-    let words = launcher.network_in_words().filter(|_| launcher.level() == Level::Sandbox)?;
+    let words = launcher.network_in_words().filter(|_| launcher.level() == IsolationLevel::Sandbox)?;
     Some(Finding { topic: "network", result: Ok(words) })
 }
 

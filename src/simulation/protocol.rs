@@ -35,7 +35,7 @@ use crate::simulation::sessions::Token;
 
 /// A request of a client.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Request {
+pub enum ClientRequest {
     /// Start a simulation of the world at this URL.
     Start {
         /// The URL as the client wrote it.
@@ -72,15 +72,15 @@ pub enum Mode {
 #[error(
     "Wrong message: {0}. Allowed are {{\"start\": {{\"url\": ..., \"mode\": \"x3d\", \"w3d\" or \"mjpeg\"}}}} and {{\"reset controller\": \"NAME/FILE\"}}."
 )]
-pub struct WrongMessage(String);
+pub struct ClientRequestError(String);
 
-impl Request {
+impl ClientRequest {
     /// Reads a message of a client; nothing if it is JSON that asks for nothing.
     ///
     /// # Errors
     /// When the message is no JSON, or its request has a wrong form.
-    pub fn parse(text: &str) -> Result<Option<Self>, WrongMessage> {
-        let wrong = |problem: &str| WrongMessage(problem.to_owned());
+    pub fn parse(text: &str) -> Result<Option<Self>, ClientRequestError> {
+        let wrong = |problem: &str| ClientRequestError(problem.to_owned());
         let message: Value = serde_json::from_str(text).map_err(|_| wrong("it is no JSON"))?;
         if let Some(file) = message.get("reset controller") {
             let file = file.as_str().ok_or_else(|| wrong("\"reset controller\" is no text"))?;
@@ -103,7 +103,7 @@ impl Request {
             Some((_, Some("x3d"))) => Mode::X3d,
             Some((_, Some("w3d"))) => Mode::W3d,
             Some((_, Some("mjpeg"))) => Mode::Mjpeg,
-            Some((other, _)) => return Err(WrongMessage(format!("there is no \"mode\" {other}"))),
+            Some((other, _)) => return Err(ClientRequestError(format!("there is no \"mode\" {other}"))),
         };
         let resumable = match start.get("resumable") {
             None | Some(Value::Null) => false,
@@ -249,7 +249,7 @@ mod tests {
 
     #[test]
     fn requests_are_read() {
-        let named = |mode, resumable, name: Option<&str>| Request::Start {
+        let named = |mode, resumable, name: Option<&str>| ClientRequest::Start {
             url: "https://x".to_owned(),
             mode,
             resumable,
@@ -265,20 +265,20 @@ mod tests {
             (r#"{"start":{"url":"https://x","mode":"w3d"}}"#, start(Mode::W3d)),
             (r#"{"start":{"url":"https://x","resumable":true}}"#, ask(Mode::X3d, true)),
             (r#"{"start":{"url":"https://x","name":"Anna"}}"#, named(Mode::X3d, false, Some("Anna"))),
-            (&resume, Request::Resume(Some(token))),
-            (r#"{"resume":"what is no token"}"#, Request::Resume(None)),
-            (r#"{"keep":true}"#, Request::Keep),
-            (r#"{ "reset controller" : "a/a.py" }"#, Request::ResetController("a/a.py".to_owned())),
+            (&resume, ClientRequest::Resume(Some(token))),
+            (r#"{"resume":"what is no token"}"#, ClientRequest::Resume(None)),
+            (r#"{"keep":true}"#, ClientRequest::Keep),
+            (r#"{ "reset controller" : "a/a.py" }"#, ClientRequest::ResetController("a/a.py".to_owned())),
         ];
         for (text, request) in table {
-            assert_eq!(Request::parse(text), Ok(Some(request)), "{text}");
+            assert_eq!(ClientRequest::parse(text), Ok(Some(request)), "{text}");
         }
     }
 
     #[test]
     fn other_json_is_ignored() {
         for text in ["{}", "[1]", "5", "null", r#"{"init":["host","project"]}"#, r#""start""#] {
-            assert_eq!(Request::parse(text), Ok(None), "{text}");
+            assert_eq!(ClientRequest::parse(text), Ok(None), "{text}");
         }
     }
 
@@ -298,7 +298,7 @@ mod tests {
             (r#"{"reset controller":5}"#, "\"reset controller\" is no text"),
         ];
         for (text, words) in table {
-            let error = Request::parse(text).unwrap_err().to_string();
+            let error = ClientRequest::parse(text).unwrap_err().to_string();
             assert!(error.contains(words), "{text}: {error}");
         }
     }

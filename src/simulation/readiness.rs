@@ -11,7 +11,7 @@ use std::time::{Duration, Instant, SystemTime};
 use tokio::sync::watch;
 use which::which;
 
-use super::config::{Isolation, SimulationConfig};
+use super::config::{IsolationSetting, SimulationConfig};
 use super::failed_starts::FailedStarts;
 use crate::simulation::container::{daemon_fault, data_folder, init_fault};
 use crate::simulation::machine::Readings;
@@ -111,7 +111,7 @@ fn log_clock_step((instant, time): (Instant, SystemTime)) -> (Instant, SystemTim
 /// Checks everything that each simulation needs; `gpus` are the numbers of those that answer. Blocks for two seconds for
 /// each display, and for as long as the disk does.
 fn check(config: &SimulationConfig, run: &Path, gpus: &[u32], kept: &mut KeptConnections) -> Result<(), String> {
-    if config.isolation == Isolation::Container {
+    if config.isolation == IsolationSetting::Container {
         daemon_fault().map_or(Ok(()), Err)?;
     }
     webots_program(config)?;
@@ -120,13 +120,13 @@ fn check(config: &SimulationConfig, run: &Path, gpus: &[u32], kept: &mut KeptCon
     std::fs::create_dir_all(run).map_err(|error| not_writable(&error))?;
     check_room(run, "disk", config.disk_reserve)?;
     write(run)?;
-    if config.isolation == Isolation::Container
+    if config.isolation == IsolationSetting::Container
         && let Some(folder) = data_folder()
     {
         check_room(&folder, "disk of Docker", config.disk_reserve)?;
     }
     // Webots itself always needs a display. What stands in for it (`webots`) may not.
-    if config.webots.is_none() && !config.xvfb && config.isolation != Isolation::Container {
+    if config.webots.is_none() && !config.xvfb && config.isolation != IsolationSetting::Container {
         for display in displays(config, gpus) {
             let checked = kept.entry(display.clone()).or_default().check(&display);
             checked.map_err(|error| format!("Webots can't open its window: {error}"))?;
@@ -186,7 +186,7 @@ fn not_writable(error: &std::io::Error) -> String {
 
 /// Checks that containers can have an init process. One that was found is not looked for again: it takes a container.
 fn check_init(config: &SimulationConfig, has_init: bool) -> Result<(), String> {
-    if has_init || config.isolation != Isolation::Container {
+    if has_init || config.isolation != IsolationSetting::Container {
         return Ok(());
     }
     init_fault().map_or(Ok(()), Err)
@@ -197,7 +197,7 @@ fn check_init(config: &SimulationConfig, has_init: bool) -> Result<(), String> {
 /// # Errors
 /// What is missing, and how to set it, in words for the client.
 pub fn webots_program(config: &SimulationConfig) -> Result<PathBuf, String> {
-    if config.isolation == Isolation::Container {
+    if config.isolation == IsolationSetting::Container {
         return Ok(PathBuf::from(&config.container.program));
     }
     if config.xvfb && which("Xvfb").is_err() {

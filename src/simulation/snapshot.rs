@@ -11,7 +11,7 @@ use crate::simulation::who::Who;
 
 /// What has changed in a simulation.
 #[derive(Debug)]
-pub enum Change {
+pub enum SimulationChange {
     /// It is in another state.
     Stage(Stage),
     /// Its world was made for this version of Webots.
@@ -102,14 +102,14 @@ pub struct Simulation {
 
 impl Simulation {
     /// Applies a change.
-    pub fn apply(&mut self, change: Change) {
+    pub fn apply(&mut self, change: SimulationChange) {
         match change {
-            Change::Stage(stage) => self.stage = stage,
-            Change::Version(version) => self.version = Some(version),
-            Change::Gpu(index) => self.gpu = Some(index),
-            Change::Port(port) => self.port = Some(port),
-            Change::Away(until) => self.away_until = until,
-            Change::Launched { at, pid, cgroup, port, log } => {
+            SimulationChange::Stage(stage) => self.stage = stage,
+            SimulationChange::Version(version) => self.version = Some(version),
+            SimulationChange::Gpu(index) => self.gpu = Some(index),
+            SimulationChange::Port(port) => self.port = Some(port),
+            SimulationChange::Away(until) => self.away_until = until,
+            SimulationChange::Launched { at, pid, cgroup, port, log } => {
                 self.cgroup = cgroup;
                 self.launched = Some(at);
                 self.pid = Some(pid);

@@ -9,20 +9,20 @@ use tokio::sync::watch;
 use super::config::SimulationConfig;
 use super::ends::Ends;
 use super::failed_starts::FailedStarts;
-use super::places::Places;
 use super::sessions::Sessions;
+use super::slots::SlotPool;
 use super::streams::Streams;
+use crate::shared::domain::AdmissionRules;
 use crate::shared::domain::Load;
 use crate::shared::domain::ProjectUrl;
-use crate::shared::domain::Rules;
 use crate::shared::http::AddressQuota;
 use crate::shared::http::BasicAuth;
-use crate::shared::http::Connections;
-use crate::shared::http::Live;
+use crate::shared::http::ConnectionLimiter;
+use crate::shared::http::LiveUpdates;
 use crate::shared::http::Metrics;
-use crate::shared::run::{Phase, Request};
-use crate::simulation::checkout::Checkouts;
-use crate::simulation::container::Containers;
+use crate::shared::run::{Phase, ServerCommand};
+use crate::simulation::checkout::CheckoutService;
+use crate::simulation::container::ContainerService;
 use crate::simulation::isolation::{Launcher, Watcher};
 use crate::simulation::machine::UsageMonitor;
 use crate::simulation::machine::{LoadMonitor, Readings, Spread};
@@ -37,9 +37,9 @@ pub struct AppState {
     /// The effective configuration.
     pub config: Arc<SimulationConfig>,
     /// Which worlds may run.
-    pub rules: Rules,
+    pub rules: AdmissionRules,
     /// Lends places.
-    pub places: Addr<Places>,
+    pub slots: Addr<SlotPool>,
     /// The sessions that their clients may come back to.
     pub sessions: Arc<Sessions>,
     /// The streams of running simulations.
@@ -55,9 +55,9 @@ pub struct AppState {
     /// Watches over simulations: what they take, and where they listen.
     pub watcher: Watcher,
     /// Makes the containers in which simulations run, where they do.
-    pub containers: Option<Arc<Containers>>,
+    pub containers: Option<Arc<ContainerService>>,
     /// Checks worlds out.
-    pub checkouts: Arc<Checkouts>,
+    pub checkouts: Arc<CheckoutService>,
     /// The folder of this run, with the folders of simulations in it.
     pub run: Arc<RunDir>,
     /// Whether clients are taken.
@@ -69,13 +69,13 @@ pub struct AppState {
     /// How simulations have ended.
     pub ends: Ends,
     /// Takes requests to drain.
-    pub requests: tokio::sync::mpsc::Sender<Request>,
+    pub requests: tokio::sync::mpsc::Sender<ServerCommand>,
     /// The threads on which the actors of Webots run.
     pub webots_threads: [ArbiterHandle; WEBOTS_THREADS],
     /// Checks the administrator's password, where one is configured.
     pub admin_auth: Option<BasicAuth>,
     /// Limits and counts connections.
-    pub connections: Connections,
+    pub connections: ConnectionLimiter,
     /// How often one address may ask for a simulation.
     pub start_quota: AddressQuota,
     /// The metrics.
@@ -83,9 +83,9 @@ pub struct AppState {
     /// Counts clients that asked for a simulation, by outcome.
     pub starts: prometheus::IntCounterVec,
     /// The open monitor pages.
-    pub live: Live,
+    pub live: LiveUpdates,
     /// Those of administrators, which show more.
-    pub administrators: Live,
+    pub administrators: LiveUpdates,
     /// CPU and memory of each simulation.
     pub usage: UsageMonitor,
     /// When the server was started.

@@ -43,7 +43,7 @@ async fn a_projects_own_dockerfile_is_built_once_for_all_who_want_it_and_what_it
         }
     }
     let images = ask(&["image", "ls", "--format", "{{.Repository}}:{{.Tag}}"]);
-    let owner = webots_fleet::simulation::container::Owner::of(&server.cache());
+    let owner = webots_fleet::simulation::container::ResourceOwner::of(&server.cache());
     let mine = |name: &&str| name.starts_with(&format!("webots-fleet/{}:", owner.name()));
     assert_eq!(images.lines().filter(mine).count(), 1, "{images}");
     for container in of_service(&server, "webots") {
@@ -153,7 +153,7 @@ async fn images_of_ours_that_are_old_are_removed_and_no_others() {
     let Some(_docker) = docker().await else { return };
     let (forge, folder) = (Forge::with_arm(), tempfile::tempdir().unwrap());
     std::fs::create_dir(folder.path().join("cache")).unwrap();
-    let owner = webots_fleet::simulation::container::Owner::of(&folder.path().join("cache"));
+    let owner = webots_fleet::simulation::container::ResourceOwner::of(&folder.path().join("cache"));
     let names = [("old", owner.name()), ("others", "000000000000"), ("running", owner.name())];
     for (tag, owner) in names {
         load(folder.path(), &format!("webots-fleet.test/{tag}:1"), owner, "2020-01-01T00:00:00Z");
@@ -178,7 +178,7 @@ async fn a_full_disk_is_freed_of_images_that_no_container_uses() {
     let Some(_docker) = docker().await else { return };
     let (forge, folder) = (Forge::with_arm(), tempfile::tempdir().unwrap());
     std::fs::create_dir(folder.path().join("cache")).unwrap();
-    let owner = webots_fleet::simulation::container::Owner::of(&folder.path().join("cache"));
+    let owner = webots_fleet::simulation::container::ResourceOwner::of(&folder.path().join("cache"));
     let names = [("unused", owner.name()), ("of-others", "000000000000"), ("used", owner.name())];
     let hours = |count: i64| format!("-{count} hours");
     for (tag, owner) in names {

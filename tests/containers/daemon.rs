@@ -242,7 +242,7 @@ pub fn containers(server: &crate::support::program::Server) -> Vec<String> {
 
 /// How the names of a server's projects begin.
 pub fn prefix(server: &crate::support::program::Server) -> String {
-    let owner = webots_fleet::simulation::container::Owner::of(&server.cache());
+    let owner = webots_fleet::simulation::container::ResourceOwner::of(&server.cache());
     format!("webots-fleet-{}-", owner.name())
 }
 

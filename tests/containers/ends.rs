@@ -55,7 +55,7 @@ async fn what_an_earlier_run_has_left_is_removed_and_nothing_of_others() {
     let Some(_docker) = docker().await else { return };
     let (forge, folder) = (Forge::with_arm(), tempfile::tempdir().unwrap());
     std::fs::create_dir(folder.path().join("cache")).unwrap();
-    let owner = webots_fleet::simulation::container::Owner::of(&folder.path().join("cache"));
+    let owner = webots_fleet::simulation::container::ResourceOwner::of(&folder.path().join("cache"));
     let make = |project: &str| {
         let label = format!("com.docker.compose.project={project}");
         ask(&["create", "--label", &label, "--network", "none", super::image::NAME, "sleep", "1000"])

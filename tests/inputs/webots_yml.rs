@@ -2,7 +2,7 @@
 
 use std::path::Component;
 
-use webots_fleet::simulation::container::{Kind, WebotsYml};
+use webots_fleet::simulation::container::{ProjectKind, WebotsYml};
 
 #[test]
 fn a_project_asks_for_nothing_outside_of_itself_whatever_is_in_its_webots_yml() {
@@ -15,7 +15,7 @@ fn a_project_asks_for_nothing_outside_of_itself_whatever_is_in_its_webots_yml() 
             let line = message.strip_suffix('\n').unwrap();
             assert!(super::is_one_line(line) && line.starts_with("type:") && line.len() <= 200, "{message:?}");
         }
-        if let Kind::Editor { folder } | Kind::Competition { folder } = &found.kind {
+        if let ProjectKind::Editor { folder } | ProjectKind::Competition { folder } = &found.kind {
             assert!(folder.starts_with("webots-project") && super::is_one_line(folder), "{folder:?}");
             assert!(!folder.contains([':', '$', '\\', '"', '\'', '`', '#']), "{folder:?}");
             let inside = found.kind.folder_in_project().unwrap();

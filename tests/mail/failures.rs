@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use ::log::Level;
 use serde_json::json;
-use webots_fleet::session::mail::{Event, test_mail};
+use webots_fleet::session::mail::{NoticeKind, test_mail};
 
 use super::log::{logged, wait_for_log};
 use super::{config, notice, start};
@@ -52,11 +52,11 @@ async fn a_dead_host_is_named() {
 async fn a_mail_arrives_once_the_server_is_there() {
     let (reserved, port) = dead_port();
     let mailer = start(port, &json!({}));
-    mailer.send(notice("a", Event::NotResponding)).await.unwrap();
+    mailer.send(notice("a", NoticeKind::NotResponding)).await.unwrap();
     let failures = wait_for_log(Level::Warn, port, 2).await;
     assert!(failures[0].contains("Connection refused"), "{failures:?}");
-    mailer.send(notice("b", Event::NotResponding)).await.unwrap();
-    mailer.send(notice("a", Event::WorkingAgain)).await.unwrap();
+    mailer.send(notice("b", NoticeKind::NotResponding)).await.unwrap();
+    mailer.send(notice("a", NoticeKind::WorkingAgain)).await.unwrap();
     wait_for_log(Level::Warn, port, 4).await;
     drop(reserved);
     let mut smtp = Smtp::start(&["--port", &port.to_string()]).await;
@@ -73,12 +73,12 @@ async fn a_mail_arrives_once_the_server_is_there() {
 async fn a_mail_is_given_up_with_one_line() {
     let (reserved, port) = dead_port();
     let mailer = start(port, &json!({"timing": {"mailPatience": 0.5}}));
-    mailer.send(notice("lost", Event::NotResponding)).await.unwrap();
+    mailer.send(notice("lost", NoticeKind::NotResponding)).await.unwrap();
     let lines = wait_for_log(Level::Error, port, 1).await;
     assert!(lines[0].starts_with("mail given up after 0.5 s (lost:2000 not responding): "), "{lines:?}");
     drop(reserved);
     let mut smtp = Smtp::start(&["--port", &port.to_string()]).await;
-    mailer.send(notice("new", Event::NotResponding)).await.unwrap();
+    mailer.send(notice("new", NoticeKind::NotResponding)).await.unwrap();
     assert_eq!(smtp.mail().await.subject(), "Simulation server not responding: new:2000");
     assert_eq!(logged(Level::Error, port).len(), 1);
 }
@@ -87,7 +87,7 @@ async fn a_mail_is_given_up_with_one_line() {
 async fn what_is_refused_for_good_is_tried_seldom_and_given_up() {
     let mut smtp = Smtp::start(&["--refuse", "recipient"]).await;
     let mailer = start(smtp.port, &json!({"timing": {"mailRetry": 0.01, "mailPatience": 1.2}}));
-    mailer.send(notice("sim", Event::NotResponding)).await.unwrap();
+    mailer.send(notice("sim", NoticeKind::NotResponding)).await.unwrap();
     let lines = wait_for_log(Level::Error, smtp.port, 1).await;
     assert!(lines[0].contains("550 5.1.1 no such user here"), "{lines:?}");
     let tries = smtp.count("opened");
@@ -98,11 +98,11 @@ async fn what_is_refused_for_good_is_tried_seldom_and_given_up() {
 async fn a_silent_server_holds_up_nobody_and_leaves_nothing_open() {
     let mut smtp = Smtp::start(&["--hang", "greeting"]).await;
     let mailer = start(smtp.port, &json!({"timing": {"mailAnswer": 3, "mailPatience": 4}}));
-    mailer.send(notice("sim", Event::NotResponding)).await.unwrap();
+    mailer.send(notice("sim", NoticeKind::NotResponding)).await.unwrap();
     smtp.wait_for("opened").await;
     let stopwatch = Stopwatch::start();
     let asked = stopwatch.lap();
-    mailer.send(notice("other", Event::NotResponding)).await.unwrap();
+    mailer.send(notice("other", NoticeKind::NotResponding)).await.unwrap();
     assert!(asked.elapsed() < Duration::from_millis(500), "a notice was taken after {:?}", asked.elapsed());
     let lines = wait_for_log(Level::Warn, smtp.port, 1).await;
     assert!(lines[0].ends_with("no answer within 3 s"), "{lines:?}");

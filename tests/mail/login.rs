@@ -1,7 +1,7 @@
 //! Passwords and encryption: a password goes to the right server only.
 
 use serde_json::json;
-use webots_fleet::session::mail::{Event, test_mail};
+use webots_fleet::session::mail::{NoticeKind, test_mail};
 
 use super::own_process::trusted_authority;
 use super::{LOGIN, config, nothing_unexpected, notice, start, with, with_password};
@@ -14,7 +14,7 @@ async fn with_a_password_starttls_comes_before_the_login() {
     let mut smtp = Smtp::start(&options).await;
     for host in ["127.0.0.1", "localhost"] {
         let mailer = start(smtp.port, &with(&with_password("s3cret"), &json!({"mailServer": host})));
-        mailer.send(notice("sim", Event::NotResponding)).await.unwrap();
+        mailer.send(notice("sim", NoticeKind::NotResponding)).await.unwrap();
         assert!(smtp.mail().await.is_encrypted());
         smtp.wait_for("closed").await;
         assert_eq!(smtp.commands(), ["EHLO", "STARTTLS", "EHLO*", "AUTH*", "MAIL*", "RCPT*", "DATA*", "QUIT*"]);
@@ -29,7 +29,7 @@ async fn a_server_may_encrypt_from_the_first_byte() {
     let options = [LOGIN, &["--tls", "implicit", "--authority", &authority]].concat();
     let mut smtp = Smtp::start(&options).await;
     let keys = with(&with_password("s3cret"), &json!({"mailServerImplicitTls": true}));
-    start(smtp.port, &keys).send(notice("sim", Event::NotResponding)).await.unwrap();
+    start(smtp.port, &keys).send(notice("sim", NoticeKind::NotResponding)).await.unwrap();
     assert!(smtp.mail().await.is_encrypted());
     smtp.wait_for("closed").await;
     assert_eq!(smtp.commands(), ["EHLO*", "AUTH*", "MAIL*", "RCPT*", "DATA*", "QUIT*"]);

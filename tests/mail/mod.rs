@@ -13,7 +13,7 @@ use ::log::Level;
 use actix::Addr;
 use serde_json::{Value, json};
 use webots_fleet::session::config::SessionConfig;
-use webots_fleet::session::mail::{self, Event, Mailer, Notice, Way};
+use webots_fleet::session::mail::{self, Mailer, Notice, NoticeKind, Way};
 use webots_fleet::shared::config::Configuration;
 use webots_fleet::shared::domain::Load;
 
@@ -60,9 +60,9 @@ fn start(port: u16, more: &Value) -> Addr<Mailer> {
     mail::start(&config(port, more), Way::Mail).expect("mails are on")
 }
 
-fn notice(host: &str, event: Event) -> Notice {
+fn notice(host: &str, event: NoticeKind) -> Notice {
     let server = format!("{host}:2000");
-    let error = (event == Event::NotResponding).then(|| "connection refused".to_owned());
+    let error = (event == NoticeKind::NotResponding).then(|| "connection refused".to_owned());
     Notice { server, event, load: Load::try_from(97.25).ok(), error, at: SystemTime::now() }
 }
 

@@ -4,7 +4,7 @@ use std::time::{Duration, Instant};
 
 use ::log::Level;
 use serde_json::json;
-use webots_fleet::session::mail::Event;
+use webots_fleet::session::mail::NoticeKind;
 
 use super::log::wait_for_log;
 use super::{nothing_unexpected, notice, start};
@@ -14,7 +14,7 @@ use crate::support::smtp::Smtp;
 async fn a_notice_becomes_a_mail_in_plain_text() {
     let mut smtp = Smtp::start(&[]).await;
     let mailer = start(smtp.port, &json!({}));
-    mailer.send(notice("sim1.example.org", Event::NotResponding)).await.unwrap();
+    mailer.send(notice("sim1.example.org", NoticeKind::NotResponding)).await.unwrap();
     let mail = smtp.mail().await;
     assert_eq!(mail.field("from"), "fleet@example.org");
     assert_eq!(mail.recipients(), ["admin@example.org"]);
@@ -38,12 +38,12 @@ async fn each_event_has_its_subject() {
     let mut smtp = Smtp::start(&[]).await;
     let mailer = start(smtp.port, &json!({}));
     for (host, event, subject) in [
-        ("a", Event::NotResponding, "Simulation server not responding: a:2000"),
-        ("b", Event::WorkingAgain, "Simulation server working again: b:2000"),
-        ("c", Event::MaximumLoad, "Simulation server reached maximum load: c:2000"),
-        ("d", Event::AvailableAgain, "Simulation server available again: d:2000"),
-        ("dns+e", Event::LookupFails, "Lookup of simulation servers failing: dns+e:2000"),
-        ("dns+f", Event::LookupWorks, "Lookup of simulation servers working again: dns+f:2000"),
+        ("a", NoticeKind::NotResponding, "Simulation server not responding: a:2000"),
+        ("b", NoticeKind::WorkingAgain, "Simulation server working again: b:2000"),
+        ("c", NoticeKind::MaximumLoad, "Simulation server reached maximum load: c:2000"),
+        ("d", NoticeKind::AvailableAgain, "Simulation server available again: d:2000"),
+        ("dns+e", NoticeKind::LookupFails, "Lookup of simulation servers failing: dns+e:2000"),
+        ("dns+f", NoticeKind::LookupWorks, "Lookup of simulation servers working again: dns+f:2000"),
     ] {
         mailer.send(notice(host, event)).await.unwrap();
         assert_eq!(smtp.mail().await.subject(), subject);
@@ -56,7 +56,7 @@ async fn a_thousand_servers_that_fail_together_are_one_mail() {
     let mut smtp = Smtp::start(&[]).await;
     let mailer = start(smtp.port, &json!({"timing": {"gather": 3}}));
     for number in 0..1_000 {
-        mailer.do_send(notice(&format!("sim{number}"), Event::NotResponding));
+        mailer.do_send(notice(&format!("sim{number}"), NoticeKind::NotResponding));
     }
     let mail = smtp.mail().await;
     assert_eq!(mail.subject(), "1000 simulation servers not responding");
@@ -64,7 +64,7 @@ async fn a_thousand_servers_that_fail_together_are_one_mail() {
         assert!(mail.field("text").contains(server), "no {server}");
     }
     // The next mail is the next notice's: nothing else was on its way.
-    mailer.send(notice("other", Event::MaximumLoad)).await.unwrap();
+    mailer.send(notice("other", NoticeKind::MaximumLoad)).await.unwrap();
     assert_eq!(smtp.mail().await.subject(), "Simulation server reached maximum load: other:2000");
     nothing_unexpected(smtp.port);
 }
@@ -74,10 +74,10 @@ async fn a_flapping_server_is_one_mail_in_its_time_with_a_count() {
     let mut smtp = Smtp::start(&[]).await;
     let mailer = start(smtp.port, &json!({"timing": {"flapping": 2}}));
     let first = Instant::now();
-    mailer.send(notice("sim", Event::NotResponding)).await.unwrap();
+    mailer.send(notice("sim", NoticeKind::NotResponding)).await.unwrap();
     assert_eq!(smtp.mail().await.subject(), "Simulation server not responding: sim:2000");
     for turn in 0..9 {
-        let event = if turn % 2 == 0 { Event::WorkingAgain } else { Event::NotResponding };
+        let event = if turn % 2 == 0 { NoticeKind::WorkingAgain } else { NoticeKind::NotResponding };
         mailer.do_send(notice("sim", event));
     }
     let mail = smtp.mail().await;
@@ -94,7 +94,7 @@ async fn a_flapping_server_is_one_mail_in_its_time_with_a_count() {
 async fn nothing_from_outside_gets_into_the_headers_or_begins_a_line() {
     let mut smtp = Smtp::start(&[]).await;
     let mailer = start(smtp.port, &json!({}));
-    let mut evil = notice("sim\r\nBcc: thief@example.com\r\n\r\nbody", Event::NotResponding);
+    let mut evil = notice("sim\r\nBcc: thief@example.com\r\n\r\nbody", NoticeKind::NotResponding);
     evil.error = Some("<script>alert(1)</script>\r\n.\r\nRCPT TO:<thief@example.com>\u{1b}[2J".to_owned());
     mailer.send(evil).await.unwrap();
     let mail = smtp.mail().await;

@@ -26,7 +26,7 @@ const SIMULATION: [&str; 24] = [
     "simulation::ends",
     "simulation::snapshot",
     "simulation::failed_starts",
-    "simulation::places",
+    "simulation::slots",
     "simulation::sessions",
     "simulation::streams",
     "simulation::relay",

@@ -3,7 +3,7 @@
 use std::net::TcpListener;
 
 use super::fleet::Fleet;
-use super::rules::{Place, Rules};
+use super::rules::{AdmissionRules, Place};
 use super::web_server::{Kind, WebServer};
 use crate::support::listener::listen;
 use crate::support::ports;
@@ -17,7 +17,7 @@ pub fn private_service() -> u16 {
     port
 }
 
-async fn only_the_fleet_is_reachable(rules: Rules) {
+async fn only_the_fleet_is_reachable(rules: AdmissionRules) {
     let fleet = Fleet::start(rules).await;
     let private = private_service();
     let here = fleet.here.port;
@@ -60,7 +60,7 @@ async fn only_the_fleet_is_reachable(rules: Rules) {
 
 through_both!(only_the_fleet_is_reachable);
 
-async fn an_editor_is_at_the_port_of_its_webots_and_500_more(rules: Rules) {
+async fn an_editor_is_at_the_port_of_its_webots_and_500_more(rules: AdmissionRules) {
     let fleet = Fleet::start(rules).await;
     let editor = fleet.here.port + 1 + 500;
     listen(TcpListener::bind(("127.0.0.1", editor)).unwrap(), |request| {
@@ -76,7 +76,7 @@ async fn an_editor_is_at_the_port_of_its_webots_and_500_more(rules: Rules) {
 
 through_both!(an_editor_is_at_the_port_of_its_webots_and_500_more);
 
-async fn pages_are_sent_on_to_https_and_the_bare_name(rules: Rules) {
+async fn pages_are_sent_on_to_https_and_the_bare_name(rules: AdmissionRules) {
     let fleet = Fleet::start(rules).await;
     let browser = &fleet.browser;
     let plain = format!("http://localhost:{}", browser.plain);
@@ -120,7 +120,8 @@ async fn nginx_takes_names_of_any_length() {
     let (http, https) = (ports::block(1), ports::block(1));
     let chain = certificate.chain.to_str().unwrap();
     let key = certificate.key.to_str().unwrap();
-    let text = Rules::Nginx.text(&Place { http, https, session: 1999, here: &[2000], there: &[3000], chain, key });
+    let text =
+        AdmissionRules::Nginx.text(&Place { http, https, session: 1999, here: &[2000], there: &[3000], chain, key });
     // With its www. as long as a name may be: 253 characters.
     let name = ["a".repeat(63), "b".repeat(63), "c".repeat(63), "d".repeat(57)].join(".");
     let text = text.replace("localhost", &name);

@@ -1,10 +1,10 @@
 //! Streams through the simulation servers, behind each web server with our rules: one port of each machine is enough.
 
 use super::fleet::Fleet;
-use super::rules::Rules;
+use super::rules::AdmissionRules;
 use crate::support::until;
 
-async fn relayed(rules: Rules) {
+async fn relayed(rules: AdmissionRules) {
     // The relay reaches Webots on the loopback of its machine.
     let relay = |server: crate::support::program::Builder| {
         server.set("streaming", "relay").env("DEMO_SIMULATOR_BIND", "127.0.0.1")
@@ -42,10 +42,10 @@ async fn relayed(rules: Rules) {
 
 #[actix_rt::test]
 async fn streams_come_through_nginx_and_the_simulation_server() {
-    relayed(Rules::Nginx).await;
+    relayed(AdmissionRules::Nginx).await;
 }
 
 #[actix_rt::test]
 async fn streams_come_through_apache_and_the_simulation_server() {
-    relayed(Rules::Apache).await;
+    relayed(AdmissionRules::Apache).await;
 }

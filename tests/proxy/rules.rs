@@ -4,7 +4,7 @@ use super::web_server::Kind;
 
 /// A set of rules, which is made to fit the machine of a test.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Rules {
+pub enum AdmissionRules {
     /// `deploy/apache.conf`
     Apache,
     /// `deploy/nginx.conf`
@@ -29,7 +29,7 @@ pub struct Place<'a> {
     pub key: &'a str,
 }
 
-impl Rules {
+impl AdmissionRules {
     pub fn kind(self) -> Kind {
         if matches!(self, Self::Nginx | Self::NginxWithUsers(_)) { Kind::Nginx } else { Kind::Apache }
     }

@@ -8,11 +8,11 @@ use actix_rt::task::JoinHandle;
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 use webots_fleet::shared::config;
-use webots_fleet::shared::http::Kind;
+use webots_fleet::shared::http::ConnectionKind;
 use webots_fleet::shared::run::AppError;
-use webots_fleet::simulation::app::{self, Assembly};
+use webots_fleet::simulation::app::{self, Application};
 use webots_fleet::simulation::config::SimulationConfig;
-use webots_fleet::simulation::places::GetSnapshot;
+use webots_fleet::simulation::slots::GetSnapshot;
 use webots_fleet::simulation::snapshot::Stage;
 use webots_fleet::simulation::state::AppState;
 
@@ -67,7 +67,7 @@ impl Inside {
         std::fs::write(&file, text.to_string()).unwrap();
         let mut config = config::load::<SimulationConfig>(&file).unwrap().config;
         change(&mut config);
-        let assembly = Assembly::new(config).unwrap();
+        let assembly = Application::new(config).unwrap();
         let server = Arc::clone(assembly.server());
         let running = actix_rt::spawn(app::serve(assembly));
         until("the server listens", async || std::net::TcpStream::connect(("127.0.0.1", port)).is_ok()).await;
@@ -97,7 +97,7 @@ impl Inside {
     }
 
     pub async fn stages(&self) -> Vec<Stage> {
-        let snapshot = self.server.places.send(GetSnapshot).await.unwrap();
+        let snapshot = self.server.slots.send(GetSnapshot).await.unwrap();
         snapshot.simulations.iter().map(|one| one.stage).collect()
     }
 
@@ -107,7 +107,7 @@ impl Inside {
         let folders = || std::fs::read_dir(self.server.run.path()).unwrap().flatten();
         until("nothing is left", async || {
             self.stages().await.is_empty()
-                && self.server.connections.count(Kind::Client) == 0
+                && self.server.connections.count(ConnectionKind::Client) == 0
                 && instances_below(&runs).is_empty()
                 && !folders().any(|entry| entry.file_name().to_string_lossy().starts_with("instance-"))
                 && TcpListener::bind(("0.0.0.0", self.port + 1)).is_ok()

@@ -9,17 +9,17 @@ use actix_web_actors::ws::WsResponseBuilder;
 use tokio::sync::mpsc::{UnboundedReceiver, UnboundedSender, unbounded_channel};
 use webots_fleet::shared::domain::ProjectUrl;
 use webots_fleet::shared::http::websocket::MessageReader;
-use webots_fleet::shared::http::{Kind, Peer};
+use webots_fleet::shared::http::{ConnectionKind, Peer};
 use webots_fleet::simulation::client::WebClient;
 use webots_fleet::simulation::ends::EndReason;
 use webots_fleet::simulation::machine::LoadMonitor;
-use webots_fleet::simulation::places::{PlaceEvent, Places, Ticket};
 use webots_fleet::simulation::protocol::Mode;
 use webots_fleet::simulation::readiness;
+use webots_fleet::simulation::slots::{Slot, SlotEvent, SlotLease, SlotPool};
 use webots_fleet::simulation::snapshot::Stage;
 use webots_fleet::simulation::state::AppState;
 use webots_fleet::simulation::streams::Watched;
-use webots_fleet::simulation::webots::{Exit, LaunchSpec, Stop, Webots, WebotsEvent};
+use webots_fleet::simulation::webots::{LaunchSpec, Stop, Webots, WebotsEvent, WebotsExit};
 use webots_fleet::simulation::who::Who;
 
 use crate::inside::{Inside, arm, ask};
@@ -45,7 +45,7 @@ macro_rules! panics {
     };
 }
 
-panics!(WebClient, Webots, Places, LoadMonitor);
+panics!(WebClient, Webots, SlotPool, LoadMonitor);
 
 /// Opens a WebSocket as the server does, and gives away its actor's address.
 async fn gate(
@@ -55,7 +55,7 @@ async fn gate(
     clients: web::Data<UnboundedSender<Addr<WebClient>>>,
 ) -> HttpResponse {
     let peer = server.config.trusted_proxies.peer(&request);
-    let connection = server.connections.admit(Kind::Client, peer).unwrap();
+    let connection = server.connections.admit(ConnectionKind::Client, peer).unwrap();
     let client = WebClient::new(Arc::clone(&server), (peer, None), (connection, MessageReader::default()));
     let (address, response) = WsResponseBuilder::new(client, &request, stream).start_with_addr().unwrap();
     clients.send(address).unwrap();
@@ -105,18 +105,18 @@ pub async fn a_client_leaves_nothing_in_any_state() {
 /// Hears what a web client would.
 struct Listener {
     places: UnboundedSender<u16>,
-    exits: UnboundedSender<Exit>,
+    exits: UnboundedSender<WebotsExit>,
 }
 
 impl Actor for Listener {
     type Context = Context<Self>;
 }
 
-impl Handler<PlaceEvent> for Listener {
+impl Handler<SlotEvent> for Listener {
     type Result = ();
 
-    fn handle(&mut self, event: PlaceEvent, _: &mut Self::Context) {
-        if let PlaceEvent::Granted(port) = event {
+    fn handle(&mut self, event: SlotEvent, _: &mut Self::Context) {
+        if let SlotEvent::Granted(port) = event {
             self.places.send(port).unwrap();
         }
     }
@@ -139,12 +139,12 @@ impl Handler<Watched> for Listener {
 }
 
 /// Starts a Webots as a web client does.
-async fn launch(server: &AppState) -> (Addr<Webots>, UnboundedReceiver<Exit>) {
+async fn launch(server: &AppState) -> (Addr<Webots>, UnboundedReceiver<WebotsExit>) {
     let (places, mut granted) = unbounded_channel();
     let (exits, ended) = unbounded_channel();
     let listener = Listener { places, exits }.start();
     let world = ProjectUrl::parse(&arm()).unwrap();
-    let ticket = Ticket::new(&server.places, listener.clone().recipient(), &world, (Peer::Unknown, Who::default()));
+    let lease = SlotLease::new(&server.slots, listener.clone().recipient(), &world, (Peer::Unknown, Who::default()));
     let port = granted.recv().await.unwrap();
     let project = server.checkouts.start(world, server.run.instance().unwrap(), |_| ()).await.unwrap().unwrap();
     let spec = LaunchSpec {
@@ -156,7 +156,7 @@ async fn launch(server: &AppState) -> (Addr<Webots>, UnboundedReceiver<Exit>) {
         checkouts: Arc::clone(&server.checkouts),
         project: Arc::new(project),
         mode: Mode::X3d,
-        place: (ticket, port),
+        slot: Slot { lease, port },
         gpu: None,
         streams: Arc::clone(&server.streams),
         watched: listener.clone().recipient(),
@@ -186,10 +186,10 @@ pub async fn a_webots_leaves_nothing_in_any_state() {
 }
 
 pub async fn an_actor_that_must_live_ends_the_server() {
-    for name in ["Places", "LoadMonitor"] {
+    for name in ["SlotPool", "LoadMonitor"] {
         let inside = Inside::new(Stage::Idle, |_| ()).await;
         match name {
-            "Places" => inside.server.places.do_send(Panic),
+            "SlotPool" => inside.server.slots.do_send(Panic),
             _ => inside.server.load_monitor.do_send(Panic),
         }
         // The program ends with exit code 1 for whatever is told here.

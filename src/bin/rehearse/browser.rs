@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use crate::arguments::Arguments;
 use crate::behaviour::Behaviour;
 use crate::board::{Board, Stage};
-use crate::conversation::{Conversation, Ended, simulated_time, unless_error};
+use crate::connection::{Connection, Ended, simulated_time, unless_error};
 use crate::returning::WayBack;
 use crate::session::Session;
 use crate::visit::{Outcome, Pace, Steps, Visit};
@@ -33,20 +33,20 @@ pub(crate) struct Browser<'class> {
 
 /// A simulation that runs: the connection that keeps it, and the one to its Webots.
 struct Running {
-    lease: Conversation,
-    stream: Conversation,
+    lease: Connection,
+    stream: Connection,
     /// For one that comes back.
     way_back: Option<WayBack>,
 }
 
 /// Why a start came to nothing.
-enum NoStart {
+enum StartError {
     Refused(String),
     Failed(String),
     Left,
 }
 
-impl From<Ended> for NoStart {
+impl From<Ended> for StartError {
     fn from(ended: Ended) -> Self {
         Self::Failed(ended.to_string())
     }
@@ -82,7 +82,7 @@ impl<'class> Browser<'class> {
         let started = actix_rt::time::timeout(patience, self.start(meet)).await;
         let started = started.unwrap_or_else(|_| {
             let why = self.full.as_ref().map(|full| format!(": {full}")).unwrap_or_default();
-            Err(NoStart::Failed(format!("no simulation within {}{why}", humantime::format_duration(patience))))
+            Err(StartError::Failed(format!("no simulation within {}{why}", humantime::format_duration(patience))))
         });
         self.visit.outcome = match started {
             Ok(running) => {
@@ -91,22 +91,22 @@ impl<'class> Browser<'class> {
                 let _stage = self.board.enter(Stage::Running);
                 self.watch(running).await
             }
-            Err(NoStart::Refused(why)) => Outcome::Refused(why),
-            Err(NoStart::Failed(why)) => Outcome::Failed(why),
-            Err(NoStart::Left) => Outcome::Left,
+            Err(StartError::Refused(why)) => Outcome::Refused(why),
+            Err(StartError::Failed(why)) => Outcome::Failed(why),
+            Err(StartError::Left) => Outcome::Left,
         };
         self.board.gone(matches!(self.visit.outcome, Outcome::Ran | Outcome::Unseen | Outcome::Left));
     }
 
-    async fn start(&mut self, meet: impl Fn(&str) -> bool) -> Result<Running, NoStart> {
+    async fn start(&mut self, meet: impl Fn(&str) -> bool) -> Result<Running, StartError> {
         let waiting = self.board.enter(Stage::Waiting);
         let asked = Instant::now();
         let server = self.find_server().await?;
         if !meet(&server) {
-            return Err(NoStart::Left);
+            return Err(StartError::Left);
         }
         self.visit.server = server.split_once("://").map(|(_, address)| address.to_owned());
-        let mut lease = Conversation::open(&format!("{server}/client")).await?;
+        let mut lease = Connection::open(&format!("{server}/client")).await?;
         let start = match self.behaviour {
             Behaviour::Return => serde_json::json!({"start": {"url": self.arguments.world, "resumable": true}}),
             _ => serde_json::json!({"start": {"url": self.arguments.world}}),
@@ -114,7 +114,7 @@ impl<'class> Browser<'class> {
         lease.say(&start.to_string()).await?;
         if self.behaviour == Behaviour::Hasty {
             lease.close().await;
-            return Err(NoStart::Left);
+            return Err(StartError::Left);
         }
         let mut first = self.hear_of_start(&mut lease).await?;
         while is_of_waiting(&first) {
@@ -148,7 +148,7 @@ impl<'class> Browser<'class> {
     }
 
     /// Waits until the fleet is available and asks for a simulation server; again and again where others were faster.
-    async fn find_server(&mut self) -> Result<String, NoStart> {
+    async fn find_server(&mut self) -> Result<String, StartError> {
         let mut pause = FIRST_PAUSE;
         loop {
             self.full.get_or_insert_with(|| "no simulation server was available".to_owned());
@@ -159,7 +159,7 @@ impl<'class> Browser<'class> {
                     return Ok(server);
                 }
                 Err(why) if is_of_no_place(&why) => self.full = Some(why),
-                Err(why) => return Err(NoStart::Refused(why)),
+                Err(why) => return Err(StartError::Refused(why)),
             }
             // Those who wait together don't ask together.
             actix_rt::time::sleep(pause.mul_f64(rand::random_range(0.5..1.0))).await;
@@ -168,26 +168,26 @@ impl<'class> Browser<'class> {
     }
 
     /// The next text of the simulation server; a refusal is one whatever it begins with.
-    async fn hear_of_start(&self, lease: &mut Conversation) -> Result<String, NoStart> {
-        let text = lease.hear().await?;
+    async fn hear_of_start(&self, lease: &mut Connection) -> Result<String, StartError> {
+        let text = lease.receive().await?;
         let refusal = ["loading: Error: ", "error:", "Error: "].iter().find_map(|begin| text.strip_prefix(begin));
         match refusal {
-            Some(why) => Err(NoStart::Refused(why.trim().to_owned())),
+            Some(why) => Err(StartError::Refused(why.trim().to_owned())),
             None => Ok(text),
         }
     }
 
     /// Connects to Webots as its viewer does, waits for the scene, and lets time pass.
-    async fn open_stream(&self, url: &str) -> Result<Conversation, NoStart> {
-        let mut stream = Conversation::open_scene(&format!("{}/", url.trim_end_matches('/'))).await?;
+    async fn open_stream(&self, url: &str) -> Result<Connection, StartError> {
+        let mut stream = Connection::open_scene(&format!("{}/", url.trim_end_matches('/'))).await?;
         stream.say(&self.arguments.viewer).await?;
-        while !unless_error(stream.hear().await?)?.starts_with("model:") {}
+        while !unless_error(stream.receive().await?)?.starts_with("model:") {}
         stream.say("pause").await?;
-        while unless_error(stream.hear().await?)? != "paused by client" {}
+        while unless_error(stream.receive().await?)? != "paused by client" {}
         stream.say("real-time:-1").await?;
         let mut first = None;
         loop {
-            let time = simulated_time(&unless_error(stream.hear().await?)?);
+            let time = simulated_time(&unless_error(stream.receive().await?)?);
             match (first, time) {
                 (Some(first), Some(time)) if time > first => return Ok(stream),
                 (None, Some(time)) => first = Some(time),
@@ -239,14 +239,14 @@ impl<'class> Browser<'class> {
         let mut period = actix_rt::time::interval(PACE_PERIOD);
         loop {
             tokio::select! {
-                text = running.stream.hear() => match text {
+                text = running.stream.receive() => match text {
                     Ok(text) => if let Some(time) = simulated_time(&text) {
                         first.get_or_insert(time);
                         last = Some(time);
                     },
                     Err(ended) => return format!("the connection to Webots: {ended}"),
                 },
-                text = running.lease.hear() => match text {
+                text = running.lease.receive() => match text {
                     Ok(text) => if let Some(why) = text.strip_prefix("loading: ") {
                         return why.to_owned();
                     },

@@ -7,7 +7,7 @@ use std::io::{BufRead, IsTerminal, Write};
 use url::Url;
 
 use crate::arguments::Arguments;
-use crate::place::is_this_machine;
+use crate::localhost::is_localhost;
 
 /// Whom this program may load: this machine, and everybody once somebody has agreed.
 pub(crate) struct Consent<'arguments> {
@@ -27,7 +27,7 @@ impl<'arguments> Consent<'arguments> {
     /// Whether the session server may be loaded; asks where it is not on this machine.
     pub(crate) fn has_fleet(&self) -> bool {
         let fleet = &self.arguments.fleet;
-        self.everywhere.get() || is_this_machine(fleet) || self.agrees(fleet.as_str(), "")
+        self.everywhere.get() || is_localhost(fleet) || self.agrees(fleet.as_str(), "")
     }
 
     /// Whether the simulation server may be loaded to which the session server sends a client.
@@ -35,7 +35,7 @@ impl<'arguments> Consent<'arguments> {
         if self.everywhere.get() || self.here.borrow().contains(server) {
             return true;
         }
-        if Url::parse(server).is_ok_and(|url| is_this_machine(&url)) {
+        if Url::parse(server).is_ok_and(|url| is_localhost(&url)) {
             return self.here.borrow_mut().insert(server.to_owned());
         }
         self.agrees(server, &format!(", where {} sends its clients", self.arguments.fleet))

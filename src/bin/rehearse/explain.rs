@@ -5,10 +5,10 @@ use std::time::{Duration, Instant};
 
 use crate::Fault;
 use crate::arguments::Arguments;
+use crate::connection::{Connection, Deadline, Ended, unless_error};
 use crate::consent::Consent;
-use crate::conversation::{Conversation, Deadline, Ended, unless_error};
 use crate::session::Session;
-use crate::walk::Walk;
+use crate::step_log::StepLog;
 use crate::words::{add, excerpt, over, told};
 
 /// How long an answer may take, whatever else comes before it.
@@ -38,7 +38,7 @@ const KNOWN: [&str; 10] = [
 ];
 
 /// The walk can't go on.
-struct Stuck;
+struct StepError;
 
 /// Walks through all steps and prints what came. Returns whether all of it was as expected.
 ///
@@ -47,7 +47,7 @@ struct Stuck;
 pub(crate) async fn run(arguments: &Arguments, consent: &Consent<'_>) -> Result<bool, Fault> {
     let session = Session::new(&arguments.fleet);
     session.answers().await?;
-    let mut walk = Walk::begin(arguments);
+    let mut walk = StepLog::begin(arguments);
     // Where it got stuck is the last of the steps.
     Box::pin(walk.go(arguments, &session, consent)).await.ok();
     match consent.refusal() {
@@ -65,15 +65,15 @@ struct Start {
     end: String,
 }
 
-impl Walk {
-    async fn go(&mut self, arguments: &Arguments, session: &Session, consent: &Consent<'_>) -> Result<(), Stuck> {
+impl StepLog {
+    async fn go(&mut self, arguments: &Arguments, session: &Session, consent: &Consent<'_>) -> Result<(), StepError> {
         self.ask_for_availability(arguments, session).await?;
         let (mut lease, webots) = self.start(arguments, session, consent).await?;
         let address = format!("{}/", webots.trim_end_matches('/'));
-        let opened = Conversation::open_scene(&address).await;
+        let opened = Connection::open_scene(&address).await;
         let came = opened.as_ref().map_or_else(ToString::to_string, |_| "a WebSocket".to_owned());
         self.note("stream", "Webots takes a WebSocket at `/`", &came, opened.is_ok());
-        let mut stream = opened.map_err(|_| Stuck)?;
+        let mut stream = opened.map_err(|_| StepError)?;
         self.see_the_scene(arguments, &mut stream).await?;
         self.command(arguments, &mut stream, "pause", "pause", "`paused by client`", "paused by client").await?;
         self.run(arguments, &mut stream).await?;
@@ -88,15 +88,15 @@ impl Walk {
         Ok(())
     }
 
-    async fn ask_for_availability(&mut self, arguments: &Arguments, session: &Session) -> Result<(), Stuck> {
+    async fn ask_for_availability(&mut self, arguments: &Arguments, session: &Session) -> Result<(), StepError> {
         let expected = "`1` or `0` as the first text of the WebSocket `/`";
-        let first = match Conversation::open(&session.availability_url()).await {
-            Ok(mut availability) => availability.hear_by(limit(ANSWER, arguments)).await,
+        let first = match Connection::open(&session.availability_url()).await {
+            Ok(mut availability) => availability.receive_by(limit(ANSWER, arguments)).await,
             Err(ended) => Err(ended),
         };
         let agrees = matches!(first.as_deref(), Ok("0" | "1"));
         self.note("availability", expected, &told(&first), agrees);
-        first.map_err(|_| Stuck)?;
+        first.map_err(|_| StepError)?;
         let available = actix_rt::time::timeout(arguments.patience, session.until_available()).await;
         let came = match &available {
             Ok(Ok(())) => "`1`".to_owned(),
@@ -105,7 +105,7 @@ impl Walk {
         };
         let agrees = matches!(available, Ok(Ok(())));
         self.note("a free server", "`1` before the patience ends: some server can take a client", &came, agrees);
-        if agrees { Ok(()) } else { Err(Stuck) }
+        if agrees { Ok(()) } else { Err(StepError) }
     }
 
     /// Asks for a simulation server and starts the world there. Returns the connection and the URL of Webots.
@@ -114,15 +114,15 @@ impl Walk {
         arguments: &Arguments,
         session: &Session,
         consent: &Consent<'_>,
-    ) -> Result<(Conversation, String), Stuck> {
+    ) -> Result<(Connection, String), StepError> {
         let server = session.simulation_server(&arguments.world).await;
         let came = excerpt(server.as_ref().map_or_else(Clone::clone, Clone::clone).as_str());
         self.note("simulation server", "`ws://HOST:PORT` or `wss://HOST/PORT`", &came, server.is_ok());
-        let server = server.ok().filter(|server| consent.has_server(server)).ok_or(Stuck)?;
-        let opened = Conversation::open(&format!("{server}/client")).await;
+        let server = server.ok().filter(|server| consent.has_server(server)).ok_or(StepError)?;
+        let opened = Connection::open(&format!("{server}/client")).await;
         let came = opened.as_ref().map_or_else(ToString::to_string, |_| "a WebSocket".to_owned());
         self.note("client", "a WebSocket at `/client`", &came, opened.is_ok());
-        let mut lease = opened.map_err(|_| Stuck)?;
+        let mut lease = opened.map_err(|_| StepError)?;
         let Start { texts, unknown, limit, end } = follow(&mut lease, arguments).await;
         let came = if unknown.is_empty() { format!("{texts} texts, all known") } else { unknown.join(" ") };
         self.note("progress", "only texts that Webots' page knows", &came, unknown.is_empty());
@@ -131,17 +131,17 @@ impl Walk {
         self.note("time limit", "`shutdownTimeout: SECONDS` before Webots is ready", &came, is_limit);
         let url = end.strip_prefix("webots:").filter(|url| url.starts_with("ws") && !url.ends_with('/'));
         self.note("Webots is ready", "`webots:ws...`, without a slash at the end", &excerpt(&end), url.is_some());
-        url.map(|url| (lease, url.to_owned())).ok_or(Stuck)
+        url.map(|url| (lease, url.to_owned())).ok_or(StepError)
     }
 
-    async fn see_the_scene(&mut self, arguments: &Arguments, stream: &mut Conversation) -> Result<(), Stuck> {
+    async fn see_the_scene(&mut self, arguments: &Arguments, stream: &mut Connection) -> Result<(), StepError> {
         let expected = "`world:`, `model:`, `application/json:`, `scene load completed`, the state, in this order";
         let (mut order, mut model) = (Vec::new(), String::new());
         let deadline = limit(SCENE, arguments);
         let mut ended = stream.say(&arguments.viewer).await.err();
         let is_state = |text: &str| text.starts_with("pause:") || text == "real-time" || text == "fast";
         while ended.is_none() {
-            match stream.hear_by(deadline).await.and_then(unless_error) {
+            match stream.receive_by(deadline).await.and_then(unless_error) {
                 Ok(text) => {
                     let begin = text.split_inclusive(':').next().unwrap_or_default();
                     let begin = if begin.starts_with("model:") { "model:" } else { begin };
@@ -166,24 +166,24 @@ impl Walk {
         let is_model = model.contains("<Scene") && model.contains("<Viewpoint");
         let came = format!("{} bytes: {}", model.len(), excerpt(&model));
         self.note("model", "XML with a `Scene` and a `Viewpoint`", &came, is_model);
-        ended.map_or(Ok(()), |_| Err(Stuck))
+        ended.map_or(Ok(()), |_| Err(StepError))
     }
 
     /// Sends a command and waits for its answer; updates may come before.
     async fn command(
         &mut self,
         arguments: &Arguments,
-        stream: &mut Conversation,
+        stream: &mut Connection,
         name: &'static str,
         command: &str,
         expected: &'static str,
         answer: &str,
-    ) -> Result<(), Stuck> {
+    ) -> Result<(), StepError> {
         let deadline = limit(ANSWER, arguments);
         let mut came = stream.say(command).await.map(|()| String::new());
         let (mut others, mut updates) = (Vec::new(), 0);
         while came.as_ref().is_ok_and(|text| text != answer) {
-            came = stream.hear_by(deadline).await.and_then(unless_error);
+            came = stream.receive_by(deadline).await.and_then(unless_error);
             match &came {
                 Ok(text) if text.starts_with("application/json:") => updates += 1,
                 Ok(text) if text == answer => {}
@@ -196,14 +196,14 @@ impl Walk {
         let before = if updates == 0 { before } else { format!("{updates} updates, {before}") };
         let agrees = came.is_ok() && others.is_empty() && (command != "step" || updates == 1);
         self.note(name, expected, &format!("{before}{}", told(&came)), agrees);
-        came.map(drop).map_err(|_| Stuck)
+        came.map(drop).map_err(|_| StepError)
     }
 
-    async fn run(&mut self, arguments: &Arguments, stream: &mut Conversation) -> Result<(), Stuck> {
+    async fn run(&mut self, arguments: &Arguments, stream: &mut Connection) -> Result<(), StepError> {
         self.command(arguments, stream, "run", "real-time:-1", "`real-time`", "real-time").await?;
         let mut updates: Vec<(Instant, f64)> = Vec::new();
         let mut deadline = limit(ANSWER, arguments);
-        while let Ok(text) = stream.hear_by(deadline).await {
+        while let Ok(text) = stream.receive_by(deadline).await {
             let json = text.strip_prefix("application/json:");
             let json = json.and_then(|json| serde_json::from_str::<serde_json::Value>(json).ok());
             if let Some(time) = json.and_then(|json| json.get("time")?.as_f64()) {
@@ -220,24 +220,24 @@ impl Walk {
         self.note("updates", "with growing `time`, at most some 60 in a second", &came, agrees);
         let came = format!("{factor:.2} of real time");
         self.note("pace", "0.9 of real time or more", &came, (0.9..1.2).contains(&factor));
-        if updates.is_empty() { Err(Stuck) } else { Ok(()) }
+        if updates.is_empty() { Err(StepError) } else { Ok(()) }
     }
 
-    async fn hear_heartbeats(&mut self, arguments: &Arguments, lease: &mut Conversation) -> Result<(), Stuck> {
+    async fn hear_heartbeats(&mut self, arguments: &Arguments, lease: &mut Connection) -> Result<(), StepError> {
         // What came while nobody listened says nothing of when.
         let buffered = Deadline::within(BUFFERED);
-        while lease.hear_by(buffered).await.is_ok() {}
+        while lease.receive_by(buffered).await.is_ok() {}
         let (began, deadline) = (Instant::now(), limit(HEARTBEAT, arguments));
-        let mut last = lease.hear_by(deadline).await;
+        let mut last = lease.receive_by(deadline).await;
         while last.as_ref().is_ok_and(|text| text != ".") {
-            last = lease.hear_by(deadline).await;
+            last = lease.receive_by(deadline).await;
         }
         let came = match &last {
             Ok(_) => format!("one after {:.1} s", began.elapsed().as_secs_f64()),
             Err(ended) => over(ended),
         };
         self.note("signs of life", "`.` on `/client` every 5 s", &came, last.is_ok());
-        if matches!(last, Ok(_) | Err(Ended::Late(_))) { Ok(()) } else { Err(Stuck) }
+        if matches!(last, Ok(_) | Err(Ended::Late(_))) { Ok(()) } else { Err(StepError) }
     }
 
     async fn see_it_gone(&mut self, address: &str) {
@@ -245,7 +245,7 @@ impl Walk {
         let mut is_gone = false;
         while !is_gone && Instant::now() < deadline {
             // Who takes no connection in time is not gone.
-            let opened = tokio::time::timeout_at(deadline.into(), Conversation::open(address)).await;
+            let opened = tokio::time::timeout_at(deadline.into(), Connection::open(address)).await;
             is_gone = opened.is_ok_and(|opened| opened.is_err());
             actix_rt::time::sleep(Duration::from_millis(100)).await;
         }
@@ -255,14 +255,14 @@ impl Walk {
 }
 
 /// Starts the world, and follows what is said until Webots is ready, or can't be.
-async fn follow(lease: &mut Conversation, arguments: &Arguments) -> Start {
+async fn follow(lease: &mut Connection, arguments: &Arguments) -> Start {
     let deadline = Deadline::within(arguments.patience);
     let mut start = Start { texts: 0, unknown: Vec::new(), limit: None, end: String::new() };
     let wish = serde_json::json!({"start": {"url": arguments.world}}).to_string();
     let mut heard = lease.say(&wish).await.map(|()| String::new());
     loop {
         if heard.is_ok() {
-            heard = lease.hear_by(deadline).await;
+            heard = lease.receive_by(deadline).await;
         }
         let text = match heard.as_ref() {
             Ok(text) => text,

@@ -6,7 +6,7 @@ use std::path::Path;
 use serde::Serialize;
 
 use crate::arguments::Arguments;
-use crate::factors::{Factors, factors, factors_of, quantile, sorted};
+use crate::real_time_factors::{RealTimeFactors, factors, factors_of, quantile, sorted};
 use crate::reasons::Reasons;
 use crate::visit::{Outcome, Steps, Visit};
 
@@ -25,7 +25,7 @@ pub(crate) struct Report {
     /// How long it took until a simulation ran, in seconds.
     pub(crate) times: Vec<Row>,
     /// How fast simulated time passed; 1 is real time. Nothing if no simulation ran for long enough.
-    pub(crate) pace: Option<Factors>,
+    pub(crate) pace: Option<RealTimeFactors>,
     /// Each simulation server.
     pub(crate) servers: Vec<Server>,
     /// The result in one sentence.
@@ -84,7 +84,7 @@ pub(crate) struct Server {
     /// The highest load that it told, in percent.
     pub(crate) peak_load: Option<f64>,
     /// How fast simulated time passed there.
-    pub(crate) pace: Option<Factors>,
+    pub(crate) pace: Option<RealTimeFactors>,
     /// The first second in which its simulations ran below real time on the average.
     pub(crate) slow: Option<Slow>,
 }
@@ -113,7 +113,7 @@ struct File<'report> {
 struct OneVisit<'report> {
     #[serde(flatten)]
     visit: &'report Visit,
-    real_time: Option<Factors>,
+    real_time: Option<RealTimeFactors>,
 }
 
 impl Report {
@@ -361,7 +361,7 @@ mod tests {
         let row = all.times.last().unwrap();
         assert_eq!((row.step, row.median, row.p95, row.worst), ("all", 50.0, 95.0, 100.0));
         assert_eq!(all.verdict, "All 100 fit.");
-        assert_eq!(all.pace, Some(Factors { p5: 1.0, median: 1.0 }));
+        assert_eq!(all.pace, Some(RealTimeFactors { p5: 1.0, median: 1.0 }));
     }
 
     #[test]

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use crate::conversation::{Conversation, Deadline, Ended, simulated_time, unless_error};
+use crate::connection::{Connection, Deadline, Ended, simulated_time, unless_error};
 
 /// How long each step may take.
 const STEP: Duration = Duration::from_secs(20);
@@ -19,10 +19,10 @@ impl WayBack {
     ///
     /// # Errors
     /// When none comes: the server knows nothing of coming back, or it is turned off there.
-    pub(crate) async fn find(lease: &mut Conversation, server: &str, webots: &str) -> Result<Self, Ended> {
+    pub(crate) async fn find(lease: &mut Connection, server: &str, webots: &str) -> Result<Self, Ended> {
         let deadline = Deadline::within(STEP);
         loop {
-            if let Some(token) = lease.hear_by(deadline).await?.strip_prefix("resume: ") {
+            if let Some(token) = lease.receive_by(deadline).await?.strip_prefix("resume: ") {
                 return Ok(Self { server: server.to_owned(), webots: webots.to_owned(), token: token.to_owned() });
             }
         }
@@ -32,12 +32,12 @@ impl WayBack {
     ///
     /// # Errors
     /// Why the simulation was not found again.
-    pub(crate) async fn go(self, viewer: &str) -> Result<(Conversation, Conversation), Ended> {
+    pub(crate) async fn go(self, viewer: &str) -> Result<(Connection, Connection), Ended> {
         let deadline = Deadline::within(STEP);
-        let mut lease = Conversation::open(&format!("{}/client", self.server)).await?;
+        let mut lease = Connection::open(&format!("{}/client", self.server)).await?;
         lease.say(&serde_json::json!({ "resume": self.token }).to_string()).await?;
         loop {
-            let text = lease.hear_by(deadline).await?;
+            let text = lease.receive_by(deadline).await?;
             if let Some(why) = text.strip_prefix("loading: Error: ") {
                 return Err(Ended::Fault(why.to_owned()));
             }
@@ -45,12 +45,12 @@ impl WayBack {
                 break;
             }
         }
-        let mut stream = Conversation::open_scene(&format!("{}/", self.webots.trim_end_matches('/'))).await?;
+        let mut stream = Connection::open_scene(&format!("{}/", self.webots.trim_end_matches('/'))).await?;
         // Any other first word would make it pause.
         stream.say(&format!("{viewer};broadcast")).await?;
         let mut first = None;
         loop {
-            match (first, simulated_time(&unless_error(stream.hear_by(deadline).await?)?)) {
+            match (first, simulated_time(&unless_error(stream.receive_by(deadline).await?)?)) {
                 (Some(first), Some(time)) if time > first => return Ok((lease, stream)),
                 (None, Some(time)) => first = Some(time),
                 _ => {}

@@ -9,7 +9,7 @@ use rustls::ClientConfig;
 use url::Url;
 use webots_fleet::shared::http::tls;
 
-use crate::conversation::{Conversation, Ended};
+use crate::connection::{Connection, Ended};
 use crate::words::{excerpt, line};
 
 /// How long an answer may take.
@@ -42,7 +42,7 @@ impl Session {
         let load = text.trim().parse::<f64>();
         load.map_err(|_| format!("{url} is no load but {}: no session server", excerpt(&text)))?;
         // Simulation servers have a load too, but nothing at `/`.
-        match Conversation::open(&self.availability_url()).await {
+        match Connection::open(&self.availability_url()).await {
             Ok(availability) => availability.close().await,
             Err(Ended::Unreachable(url, why)) if why.contains("404") => {
                 return Err(format!(
@@ -61,8 +61,8 @@ impl Session {
     /// # Errors
     /// When the connection is over.
     pub(crate) async fn until_available(&self) -> Result<(), Ended> {
-        let mut availability = Conversation::open(&self.availability_url()).await?;
-        while availability.hear().await? != "1" {}
+        let mut availability = Connection::open(&self.availability_url()).await?;
+        while availability.receive().await? != "1" {}
         availability.close().await;
         Ok(())
     }

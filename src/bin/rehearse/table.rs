@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::fmt;
 
-use crate::factors::Factors;
+use crate::real_time_factors::RealTimeFactors;
 use crate::report::Report;
 
 /// All tables, and the verdict below them.
@@ -87,7 +87,7 @@ fn servers(report: &Report) -> String {
     table.to_string()
 }
 
-fn pace(factors: Option<Factors>) -> [String; 2] {
+fn pace(factors: Option<RealTimeFactors>) -> [String; 2] {
     factors.map_or_else(|| ["-".to_owned(), "-".to_owned()], |all| [all.p5, all.median].map(|one| format!("{one:.2}")))
 }
 

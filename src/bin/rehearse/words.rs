@@ -2,7 +2,7 @@
 
 use webots_fleet::shared::text;
 
-use crate::conversation::Ended;
+use crate::connection::Ended;
 
 /// What is told of one text, in characters.
 const EXCERPT: usize = 90;

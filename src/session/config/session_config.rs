@@ -11,8 +11,8 @@ use super::example::Example;
 use super::mail_address;
 use super::server_entry::ServerEntry;
 use super::timing::Timing;
-use crate::session::placement::Policy;
-use crate::shared::config::{Configuration, InvalidValue, changed_keys};
+use crate::session::placement::PlacementPolicy;
+use crate::shared::config::{Configuration, InvalidValueError, changed_keys};
 use crate::shared::config::{
     ExpandedPath, Secret, expanded, folder, local_address, object, one_or_many, optional_expanded, optional_whole,
     percent, seconds, threshold, whole,
@@ -149,8 +149,8 @@ impl SessionConfig {
     }
 
     /// The parameters of placement.
-    pub fn policy(&self) -> Policy {
-        Policy {
+    pub fn policy(&self) -> PlacementPolicy {
+        PlacementPolicy {
             threshold: self.load_threshold,
             client_cost: self.client_cost,
             patience: self.timing.placement,
@@ -182,7 +182,7 @@ impl SessionConfig {
 
 impl SessionConfig {
     /// Writes the addresses of simulation servers in the usual way, and checks that each is there once.
-    fn check_servers(&mut self) -> Result<(), InvalidValue> {
+    fn check_servers(&mut self) -> Result<(), InvalidValueError> {
         let listed = self.simulation_servers.iter_mut().filter_map(|entry| match entry {
             ServerEntry::Server(address) => Some(address),
             ServerEntry::Name(_) => None,
@@ -194,7 +194,7 @@ impl SessionConfig {
         for entry in &self.simulation_servers {
             if !seen.insert(entry) {
                 let problem = format!("{entry} is listed twice; each simulation server is listed once");
-                return Err(InvalidValue { key: "simulationServers", problem });
+                return Err(InvalidValueError { key: "simulationServers", problem });
             }
         }
         // A name may lead to any server.
@@ -203,7 +203,7 @@ impl SessionConfig {
         match self.drained_servers.iter().find(|address| !has_names && !is_listed(address)) {
             Some(address) => {
                 let problem = format!("{address} is not one of simulationServers");
-                Err(InvalidValue { key: "drainedServers", problem })
+                Err(InvalidValueError { key: "drainedServers", problem })
             }
             None => Ok(()),
         }
@@ -215,35 +215,35 @@ impl Configuration for SessionConfig {
     const REMOVED: &'static [(&'static str, &'static str)] =
         &[("nameServers", "was removed: names are looked up as /etc/resolv.conf and /etc/hosts of the machine say")];
 
-    fn complete(&mut self, _: &std::path::Path) -> Result<Vec<String>, InvalidValue> {
+    fn complete(&mut self, _: &std::path::Path) -> Result<Vec<String>, InvalidValueError> {
         let mut warnings = Vec::new();
         if self.server.is_empty() {
             warnings.push("server is not set: URLs will name localhost".to_owned());
             "localhost".clone_into(&mut self.server);
         }
-        check_host(&self.server, self.port_rewrite).map_err(|problem| InvalidValue { key: "server", problem })?;
+        check_host(&self.server, self.port_rewrite).map_err(|problem| InvalidValueError { key: "server", problem })?;
         self.check_servers()?;
         if self.timing.silence <= self.timing.ping {
             let problem = format!("{} s is not more than timing.ping", self.timing.silence.as_secs_f64());
-            return Err(InvalidValue { key: "timing.silence", problem });
+            return Err(InvalidValueError { key: "timing.silence", problem });
         }
         if self.timing.stop > LONGEST_STOP {
             let (stop, most) = (self.timing.stop.as_secs_f64(), LONGEST_STOP.as_secs_f64());
             let problem = format!("{stop} s is too long; allowed is at most {most} s, for the server ends within 5 s");
-            return Err(InvalidValue { key: "timing.stop", problem });
+            return Err(InvalidValueError { key: "timing.stop", problem });
         }
         if let Some(script) =
             self.viewer_script.as_ref().filter(|script| !script.has_host() || !script.scheme().starts_with("http"))
         {
             let problem = format!("{script} is no URL of a web server; allowed are http and https");
-            return Err(InvalidValue { key: "viewerScript", problem });
+            return Err(InvalidValueError { key: "viewerScript", problem });
         }
         self.webhook = self.webhook.take().filter(|url| !url.reveal().is_empty());
         let is_web = |url: &url::Url| url.has_host() && matches!(url.scheme(), "http" | "https");
         if self.webhook.as_ref().is_some_and(|url| !url::Url::parse(url.reveal()).is_ok_and(|url| is_web(&url))) {
             // The text itself is a secret.
             let problem = "it is no URL of a web server; allowed are http and https".to_owned();
-            return Err(InvalidValue { key: "webhook", problem });
+            return Err(InvalidValueError { key: "webhook", problem });
         }
         if self.announcement.as_ref().is_some_and(Announcement::is_over) {
             warnings.push("announcement is over: it is not shown".to_owned());
@@ -252,7 +252,7 @@ impl Configuration for SessionConfig {
         if let Some(host) = self.mail_server.as_deref().filter(|host| !mail_address::is_host(host)) {
             let problem =
                 format!("{host:?} is no host; allowed is a name or an IP address (mailServerPort has the port)");
-            return Err(InvalidValue { key: "mailServer", problem });
+            return Err(InvalidValueError { key: "mailServer", problem });
         }
         if self.administrator.is_some() && self.mail_server.is_none() {
             warnings.push("mailServer is not set: notifications are off".to_owned());

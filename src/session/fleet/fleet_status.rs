@@ -43,7 +43,7 @@ pub struct ServerStatus {
     /// Its address.
     pub address: PublicAddress,
     /// Its state.
-    pub state: State,
+    pub state: ServerState,
     /// Since when it has been in that state.
     pub since: SystemTime,
     /// Its last report.
@@ -64,7 +64,7 @@ pub struct ServerStatus {
 
 /// The state of a simulation server.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum State {
+pub enum ServerState {
     /// It was not probed yet.
     Unknown,
     /// It takes clients.
@@ -85,12 +85,12 @@ pub struct StateChange {
     /// The simulation server's address, or the name.
     pub server: String,
     /// Its new state.
-    pub state: State,
+    pub state: ServerState,
     /// Why, in words.
     pub why: String,
 }
 
-impl State {
+impl ServerState {
     /// The name of the state, as pages and metrics have it.
     pub fn word(self) -> &'static str {
         match self {

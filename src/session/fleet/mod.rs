@@ -1,10 +1,9 @@
 //! The simulation servers: who is there, what each last told, and which one gets the next client.
 
-mod changes;
 mod fleet_status;
 mod monitors;
 mod name_monitor;
-mod names;
+mod name_table;
 mod pick;
 mod probe_error;
 mod quota;
@@ -12,9 +11,10 @@ mod registry;
 mod resolver;
 mod server_monitor;
 mod server_record;
-mod servers;
+mod server_table;
+mod state_history;
 
-pub use fleet_status::{FleetStatus, NameStatus, ServerStatus, State, StateChange, displayed_mean_load};
-pub use pick::{NoServer, Pick};
+pub use fleet_status::{FleetStatus, NameStatus, ServerState, ServerStatus, StateChange, displayed_mean_load};
+pub use pick::{Pick, PickError};
 pub use registry::{GetStatus, Ping, Reconfigure, Registry};
 pub use resolver::resolver;

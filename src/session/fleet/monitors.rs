@@ -29,7 +29,7 @@ struct Makers {
 }
 
 /// Who gets what the monitors find.
-pub struct Results {
+pub struct MonitorRecipients {
     /// For each probe of a simulation server.
     pub probes: Recipient<ProbeResult>,
     /// For each lookup of a name.
@@ -37,7 +37,12 @@ pub struct Results {
 }
 
 impl Makers {
-    fn server(&self, server: &PublicAddress, settings: ProbeSettings, results: &Results) -> Addr<ServerMonitor> {
+    fn server(
+        &self,
+        server: &PublicAddress,
+        settings: ProbeSettings,
+        results: &MonitorRecipients,
+    ) -> Addr<ServerMonitor> {
         let (server, tls, results) = (server.clone(), self.tls.clone(), results.probes.clone());
         let resolver = self.resolver.clone();
         ServerMonitor::start_in_arbiter(&self.thread.handle(), move |_| {
@@ -45,7 +50,7 @@ impl Makers {
         })
     }
 
-    fn name(&self, name: &DnsName, results: &Results) -> Addr<NameMonitor> {
+    fn name(&self, name: &DnsName, results: &MonitorRecipients) -> Addr<NameMonitor> {
         let (name, results) = (name.clone(), results.lookups.clone());
         NameMonitor::start_in_arbiter(&self.thread.handle(), move |_| NameMonitor::new(name, results))
     }
@@ -59,7 +64,7 @@ impl Monitors {
     }
 
     /// Starts the monitor of a simulation server.
-    pub fn watch(&mut self, server: &PublicAddress, config: &SessionConfig, results: &Results) {
+    pub fn watch(&mut self, server: &PublicAddress, config: &SessionConfig, results: &MonitorRecipients) {
         self.servers.add(server.clone(), self.makers.server(server, ProbeSettings::new(config), results));
     }
 
@@ -71,7 +76,7 @@ impl Monitors {
     }
 
     /// Starts the monitor of a name.
-    pub fn look_up(&mut self, name: &DnsName, results: &Results) {
+    pub fn look_up(&mut self, name: &DnsName, results: &MonitorRecipients) {
         self.names.add(name.clone(), self.makers.name(name, results));
     }
 
@@ -86,7 +91,7 @@ impl Monitors {
     ///
     /// # Errors
     /// When there were too many panics.
-    pub fn restart_gone(&mut self, config: &SessionConfig, results: &Results) -> Result<(), TooManyPanics> {
+    pub fn restart_gone(&mut self, config: &SessionConfig, results: &MonitorRecipients) -> Result<(), TooManyPanics> {
         let Self { makers, servers, names } = self;
         servers.restart_gone(|server| Some(makers.server(server, ProbeSettings::new(config), results)))?;
         names.restart_gone(|name| Some(makers.name(name, results)))

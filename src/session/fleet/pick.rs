@@ -5,11 +5,11 @@ use std::net::IpAddr;
 use actix::prelude::*;
 
 use crate::shared::domain::PublicAddress;
-use crate::shared::domain::{NoProject, ProjectUrl};
+use crate::shared::domain::{ProjectUrl, ProjectUrlError};
 
 /// Asks for the least loaded simulation server that will run this world.
 #[derive(Message, Debug)]
-#[rtype(result = "Result<PublicAddress, NoServer>")]
+#[rtype(result = "Result<PublicAddress, PickError>")]
 pub struct Pick {
     /// The world, if the client named one.
     pub world: Option<ProjectUrl>,
@@ -19,7 +19,7 @@ pub struct Pick {
 
 /// Why no simulation server is given. The texts are those of the protocol.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub enum NoServer {
+pub enum PickError {
     /// No server has room.
     #[error("Error: no simulation server available at the moment.")]
     Unavailable,
@@ -28,7 +28,7 @@ pub enum NoServer {
     NotAccepted(String),
     /// The URL does not name a world.
     #[error("Error: {0}")]
-    NoWorld(NoProject),
+    InvalidWorld(ProjectUrlError),
 }
 
 impl Pick {
@@ -36,8 +36,8 @@ impl Pick {
     ///
     /// # Errors
     /// When the URL does not name a world.
-    pub fn parse(world: Option<&str>, from: Option<IpAddr>) -> Result<Self, NoServer> {
+    pub fn parse(world: Option<&str>, from: Option<IpAddr>) -> Result<Self, PickError> {
         let world = world.filter(|text| !text.is_empty()).map(ProjectUrl::parse).transpose();
-        world.map(|world| Self { world, from }).map_err(NoServer::NoWorld)
+        world.map(|world| Self { world, from }).map_err(PickError::InvalidWorld)
     }
 }

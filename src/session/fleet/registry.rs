@@ -12,20 +12,20 @@ use actix::prelude::*;
 use hickory_resolver::TokioResolver;
 use tokio::sync::watch;
 
-use super::changes::Changes;
 use super::fleet_status::{FleetStatus, ServerStatus};
-use super::monitors::Results;
+use super::monitors::MonitorRecipients;
 use super::name_monitor::LookupResult;
-use super::names::NameChange;
-use super::pick::{NoServer, Pick};
+use super::name_table::NameChange;
+use super::pick::{Pick, PickError};
 use super::probe_error::ProbeError;
 use super::quota;
 use super::server_monitor::{ProbeResult, ProbeSettings};
 use super::server_record::{ServerRecord, is_refused};
-use super::servers::{ListChange, Servers};
+use super::server_table::{ListChange, ServerTable};
+use super::state_history::StateHistory;
 use crate::session::config::SessionConfig;
 use crate::session::mail::{Mailer, Way};
-use crate::session::placement::Fleet;
+use crate::session::placement::LoadBalancer;
 use crate::shared::domain::Load;
 use crate::shared::domain::ProjectUrl;
 use crate::shared::domain::PublicAddress;
@@ -51,12 +51,12 @@ pub struct Reconfigure(pub Arc<SessionConfig>);
 pub struct Registry {
     config: Arc<SessionConfig>,
     latencies: prometheus::Histogram,
-    fleet: Fleet<PublicAddress>,
+    fleet: LoadBalancer<PublicAddress>,
     quota: AddressQuota,
-    servers: Servers,
+    servers: ServerTable,
     /// Whether a simulation server can take a client, for all web clients.
     available: watch::Sender<bool>,
-    changes: Changes,
+    changes: StateHistory,
 }
 
 /// Time between two checks of what changes without a report: placements that expire, monitors that have panicked.
@@ -71,13 +71,13 @@ impl Registry {
         (resolver, available): (TokioResolver, watch::Sender<bool>),
     ) -> Self {
         Self {
-            fleet: Fleet::new(config.policy()),
+            fleet: LoadBalancer::new(config.policy()),
             quota: quota::placements(),
             config,
             latencies,
-            servers: Servers::new(resolver),
+            servers: ServerTable::new(resolver),
             available,
-            changes: Changes::new(mailers),
+            changes: StateHistory::new(mailers),
         }
     }
 
@@ -153,16 +153,16 @@ impl Registry {
     }
 
     /// Chooses a server for a client of this address.
-    fn pick(&mut self, world: Option<&ProjectUrl>, from: Option<IpAddr>) -> Result<PublicAddress, NoServer> {
+    fn pick(&mut self, world: Option<&ProjectUrl>, from: Option<IpAddr>) -> Result<PublicAddress, PickError> {
         let Self { fleet, servers, .. } = self;
         let accepts = |address: &PublicAddress, world| servers.get(address)?.accepts(world);
         let eligible = |address: &PublicAddress| world.is_none_or(|world| accepts(address, world) == Some(true));
         let now = Instant::now();
         let picked =
-            if self.quota.take(from) { fleet.place(now, eligible) } else { fleet.place_without_room(now, eligible) };
+            if self.quota.take(from) { fleet.place(now, eligible) } else { fleet.pick_unreserved(now, eligible) };
         picked.ok_or_else(|| match world {
-            Some(world) if is_refused(servers.records(), world) => NoServer::NotAccepted(world.repository()),
-            _ => NoServer::Unavailable,
+            Some(world) if is_refused(servers.records(), world) => PickError::NotAccepted(world.repository()),
+            _ => PickError::Unavailable,
         })
     }
 
@@ -185,8 +185,8 @@ fn ejected(failed: u32) -> String {
 }
 
 /// Who hears what the monitors find: the registry.
-fn results(ctx: &Context<Registry>) -> Results {
-    Results { probes: ctx.address().recipient(), lookups: ctx.address().recipient() }
+fn results(ctx: &Context<Registry>) -> MonitorRecipients {
+    MonitorRecipients { probes: ctx.address().recipient(), lookups: ctx.address().recipient() }
 }
 
 impl Actor for Registry {
@@ -236,7 +236,7 @@ impl Handler<LookupResult> for Registry {
 }
 
 impl Handler<Pick> for Registry {
-    type Result = Result<PublicAddress, NoServer>;
+    type Result = Result<PublicAddress, PickError>;
 
     fn handle(&mut self, Pick { world, from }: Pick, _: &mut Self::Context) -> Self::Result {
         let answer = self.pick(world.as_ref(), from);

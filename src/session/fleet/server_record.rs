@@ -3,9 +3,9 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
-use super::fleet_status::{ServerStatus, State};
+use super::fleet_status::{ServerState, ServerStatus};
 use super::probe_error::ProbeError;
-use crate::session::mail::Event;
+use crate::session::mail::NoticeKind;
 use crate::session::placement;
 use crate::shared::domain::Load;
 use crate::shared::domain::ProjectUrl;
@@ -20,7 +20,7 @@ pub struct ServerRecord {
     /// Whether no name leads to it any more.
     pub unlisted: bool,
     /// Its state.
-    pub state: State,
+    pub state: ServerState,
     /// Since when.
     pub since: SystemTime,
     /// Its last report; kept when it is down.
@@ -39,9 +39,9 @@ pub struct ServerRecord {
 
 /// A server has changed its state, or is down for another reason than before.
 #[derive(Debug, PartialEq)]
-pub struct Change {
+pub struct ServerChange {
     /// Its new state.
-    pub state: State,
+    pub state: ServerState,
     /// Whether it was in that state before, for another reason.
     pub still: bool,
     /// When.
@@ -49,7 +49,7 @@ pub struct Change {
     /// Why, in words.
     pub why: String,
     /// What the administrator is told of it.
-    pub events: Vec<Event>,
+    pub events: Vec<NoticeKind>,
 }
 
 impl ServerRecord {
@@ -58,7 +58,7 @@ impl ServerRecord {
         Self {
             drained,
             unlisted: false,
-            state: State::Unknown,
+            state: ServerState::Unknown,
             since: SystemTime::now(),
             report: None,
             error: None,
@@ -71,7 +71,7 @@ impl ServerRecord {
 
     /// Records a report that came at this time; the server counts as full from the load `limit` on, in percent. Returns
     /// what has changed.
-    pub fn succeeded(&mut self, report: ServerReport, at: Instant, limit: f64) -> Option<Change> {
+    pub fn succeeded(&mut self, report: ServerReport, at: Instant, limit: f64) -> Option<ServerChange> {
         let (state, why) = self.judge(&report, limit);
         self.report = Some(Arc::new(report));
         self.error = None;
@@ -80,21 +80,27 @@ impl ServerRecord {
     }
 
     /// Records that a probe has failed. Returns what has changed.
-    pub fn failed(&mut self, error: ProbeError) -> Option<Change> {
+    pub fn failed(&mut self, error: ProbeError) -> Option<ServerChange> {
         let why = error.to_string();
         let another = self.error.as_ref().is_some_and(|before| !before.is_same_kind(&error));
         self.error = Some(error.clone());
         self.last_error = Some(error);
-        let change = self.enter(State::Down, || why.clone());
+        let change = self.enter(ServerState::Down, || why.clone());
         // It is down as before, but for another reason, which whoever repairs it should know.
         change.or_else(|| {
-            another.then(|| Change { state: State::Down, still: true, at: SystemTime::now(), why, events: Vec::new() })
+            another.then(|| ServerChange {
+                state: ServerState::Down,
+                still: true,
+                at: SystemTime::now(),
+                why,
+                events: Vec::new(),
+            })
         })
     }
 
     /// The last report, if it still holds.
     pub fn current(&self) -> Option<&ServerReport> {
-        self.report.as_deref().filter(|_| self.state != State::Down)
+        self.report.as_deref().filter(|_| self.state != ServerState::Down)
     }
 
     /// Whether the server runs a world, by its last report; `None` if it never answered.
@@ -104,16 +110,16 @@ impl ServerRecord {
 
     /// The last report in the terms of the placement policy; `None` for a server that must not get clients and does not
     /// count its instances, for which only being down keeps clients away.
-    pub fn for_placement(&self) -> Option<placement::Report> {
+    pub fn for_placement(&self) -> Option<placement::LoadReport> {
         let report = self.current()?;
-        let accepting = self.state != State::Draining;
-        let instances = report.instances.map(|instances| placement::Instances {
+        let accepting = self.state != ServerState::Draining;
+        let instances = report.instances.map(|instances| placement::ClientCounts {
             present: instances.present(),
             places: instances.places,
             arrivals: instances.arrivals,
             accepting,
         });
-        (accepting || instances.is_some()).then(|| placement::Report { load: report.load.percent(), instances })
+        (accepting || instances.is_some()).then(|| placement::LoadReport { load: report.load.percent(), instances })
     }
 
     /// The status of the server, without what only the placement knows.
@@ -137,49 +143,49 @@ impl ServerRecord {
         self.current().map(|report| report.load)
     }
 
-    fn judge(&self, report: &ServerReport, limit: f64) -> (State, impl FnOnce() -> String + use<>) {
+    fn judge(&self, report: &ServerReport, limit: f64) -> (ServerState, impl FnOnce() -> String + use<>) {
         let load = report.load.percent();
         let no_place = report.instances.filter(|instances| instances.present() >= instances.places);
         let state = if self.drained || self.unlisted || report.draining {
-            State::Draining
+            ServerState::Draining
         } else if load >= limit || no_place.is_some() {
-            State::Full
+            ServerState::Full
         } else {
-            State::Up
+            ServerState::Up
         };
         let reason = match (state, no_place) {
-            (State::Draining, _) if self.drained => " (drained by drainedServers)".to_owned(),
-            (State::Draining, _) if self.unlisted => " (no name leads to it any more)".to_owned(),
-            (State::Draining, _) => " (it drains itself)".to_owned(),
-            (State::Full, Some(full)) => format!(", {} clients in {} places", full.present(), full.places),
-            (State::Full, None) => format!(" of {limit:.1} %"),
+            (ServerState::Draining, _) if self.drained => " (drained by drainedServers)".to_owned(),
+            (ServerState::Draining, _) if self.unlisted => " (no name leads to it any more)".to_owned(),
+            (ServerState::Draining, _) => " (it drains itself)".to_owned(),
+            (ServerState::Full, Some(full)) => format!(", {} clients in {} places", full.present(), full.places),
+            (ServerState::Full, None) => format!(" of {limit:.1} %"),
             _ => String::new(),
         };
         (state, move || format!("load {load:.1} %{reason}"))
     }
 
-    fn enter(&mut self, state: State, why: impl FnOnce() -> String) -> Option<Change> {
+    fn enter(&mut self, state: ServerState, why: impl FnOnce() -> String) -> Option<ServerChange> {
         let before = std::mem::replace(&mut self.state, state);
         if before == state {
             return None;
         }
         self.since = SystemTime::now();
-        Some(Change { state, still: false, at: self.since, why: why(), events: self.events(before) })
+        Some(ServerChange { state, still: false, at: self.since, why: why(), events: self.events(before) })
     }
 
     /// The four events of the original. A server that was full, then down, then up is both working again and available
     /// again.
-    fn events(&mut self, before: State) -> Vec<Event> {
+    fn events(&mut self, before: ServerState) -> Vec<NoticeKind> {
         let mut events = Vec::new();
         match (before, self.state) {
-            (_, State::Down) => events.push(Event::NotResponding),
-            (State::Down, _) => events.push(Event::WorkingAgain),
+            (_, ServerState::Down) => events.push(NoticeKind::NotResponding),
+            (ServerState::Down, _) => events.push(NoticeKind::WorkingAgain),
             _ => {}
         }
-        if self.state == State::Full && !std::mem::replace(&mut self.told_full, true) {
-            events.push(Event::MaximumLoad);
-        } else if self.state == State::Up && std::mem::replace(&mut self.told_full, false) {
-            events.push(Event::AvailableAgain);
+        if self.state == ServerState::Full && !std::mem::replace(&mut self.told_full, true) {
+            events.push(NoticeKind::MaximumLoad);
+        } else if self.state == ServerState::Up && std::mem::replace(&mut self.told_full, false) {
+            events.push(NoticeKind::AvailableAgain);
         }
         events
     }
@@ -193,7 +199,7 @@ pub fn is_refused<'a>(servers: impl Iterator<Item = &'a ServerRecord>, world: &P
         match server.accepts(world) {
             Some(true) => return false,
             Some(false) => refused = true,
-            None if server.state == State::Unknown => return false,
+            None if server.state == ServerState::Unknown => return false,
             None => {}
         }
     }
@@ -209,7 +215,7 @@ mod tests {
     }
 
     /// The events of each step: a load, or nothing for a failure.
-    fn events(steps: &[Option<f64>]) -> Vec<Vec<Event>> {
+    fn events(steps: &[Option<f64>]) -> Vec<Vec<NoticeKind>> {
         let mut record = ServerRecord::new(false);
         let change = |step: &Option<f64>| match step {
             Some(load) => record.succeeded(report(*load), Instant::now(), 95.0),
@@ -220,7 +226,7 @@ mod tests {
 
     #[test]
     fn the_administrator_hears_of_four_events() {
-        use Event::{AvailableAgain, MaximumLoad, NotResponding, WorkingAgain};
+        use NoticeKind::{AvailableAgain, MaximumLoad, NotResponding, WorkingAgain};
         assert_eq!(events(&[Some(1.0), Some(2.0)]), [vec![], vec![]], "a server that is well is no news");
         assert_eq!(events(&[None, None, Some(1.0)]), [vec![NotResponding], vec![], vec![WorkingAgain]]);
         assert_eq!(events(&[Some(95.0), Some(99.0), Some(94.9)]), [vec![MaximumLoad], vec![], vec![AvailableAgain]]);
@@ -245,7 +251,10 @@ mod tests {
         assert_eq!(record.failed(refused("other words")), None);
         let slow = ProbeError::Timeout(Duration::from_secs(3));
         let change = record.failed(slow.clone()).unwrap();
-        assert_eq!((change.state, change.why, change.events), (State::Down, "no answer within 3 s".to_owned(), vec![]));
+        assert_eq!(
+            (change.state, change.why, change.events),
+            (ServerState::Down, "no answer within 3 s".to_owned(), vec![])
+        );
         assert_eq!(record.failed(slow), None);
     }
 
@@ -253,7 +262,10 @@ mod tests {
     fn a_drained_server_is_for_nobody_whether_it_counts_or_not() {
         let mut record = ServerRecord::new(true);
         let change = record.succeeded(report(1.0), Instant::now(), 95.0).unwrap();
-        assert_eq!((change.state, change.why.as_str()), (State::Draining, "load 1.0 % (drained by drainedServers)"));
+        assert_eq!(
+            (change.state, change.why.as_str()),
+            (ServerState::Draining, "load 1.0 % (drained by drainedServers)")
+        );
         assert_eq!(record.for_placement(), None);
         record.drained = false;
         record.succeeded(report(1.0), Instant::now(), 95.0);

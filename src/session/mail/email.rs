@@ -7,7 +7,7 @@ use lettre::Message;
 use lettre::message::Mailbox;
 use lettre::message::header::{ContentType, HeaderName, HeaderValue};
 
-use super::outbox::{Entry, Event};
+use super::outbox::{MailEntry, NoticeKind};
 use super::smtp::MailError;
 use crate::session::config::SessionConfig;
 use crate::shared::run::timestamp;
@@ -62,8 +62,8 @@ impl Composer {
     ///
     /// # Errors
     /// When the template can't be rendered.
-    pub fn compose(&self, entries: &[Entry]) -> Result<(String, String), MailError> {
-        let events: Vec<Event> = entries.iter().map(|entry| entry.notice.event).collect();
+    pub fn compose(&self, entries: &[MailEntry]) -> Result<(String, String), MailError> {
+        let events: Vec<NoticeKind> = entries.iter().map(|entry| entry.notice.event).collect();
         let lines: Vec<Line> = entries.iter().map(Line::new).collect();
         let mut subject = summary(&events);
         if let [only] = lines.as_slice() {
@@ -108,7 +108,7 @@ impl EmailComposer {
     ///
     /// # Errors
     /// When it can't be written.
-    pub fn compose(&self, entries: &[Entry]) -> Result<Message, MailError> {
+    pub fn compose(&self, entries: &[MailEntry]) -> Result<Message, MailError> {
         self.message(self.texts.compose(entries)?)
     }
 
@@ -131,7 +131,7 @@ impl EmailComposer {
 }
 
 impl Line {
-    fn new(entry: &Entry) -> Self {
+    fn new(entry: &MailEntry) -> Self {
         let notice = &entry.notice;
         Self {
             server: excerpt(&notice.server, MAX_LETTERS),
@@ -145,8 +145,8 @@ impl Line {
 }
 
 /// The subject: `Simulation server not responding`, or `3 simulation servers not responding, 1 working again`.
-fn summary(events: &[Event]) -> String {
-    use Event::{AvailableAgain, LookupFails, LookupWorks, MaximumLoad, NotResponding, WorkingAgain};
+fn summary(events: &[NoticeKind]) -> String {
+    use NoticeKind::{AvailableAgain, LookupFails, LookupWorks, MaximumLoad, NotResponding, WorkingAgain};
     if let [only] = events {
         let [noun, _] = only.nouns();
         let (first, rest) = noun.split_at_checked(1).unwrap_or_default();
@@ -175,7 +175,7 @@ mod tests {
 
     #[test]
     fn subjects_count_what_happened() {
-        use Event::{AvailableAgain, LookupFails, LookupWorks, MaximumLoad, NotResponding, WorkingAgain};
+        use NoticeKind::{AvailableAgain, LookupFails, LookupWorks, MaximumLoad, NotResponding, WorkingAgain};
         for (events, subject) in [
             (vec![NotResponding], "Simulation server not responding"),
             (vec![WorkingAgain], "Simulation server working again"),

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use actix::prelude::*;
 
 use super::email::EmailComposer;
-use super::outbox::{Entry, Notice, Outbox};
+use super::outbox::{MailEntry, Notice, Outbox};
 use super::smtp::{MailError, Relay};
 use super::way::{Carrier, Way};
 use super::webhook::Webhook;
@@ -93,7 +93,7 @@ impl Mailer {
     }
 
     /// Reports to the outbox and the log how sending a batch went.
-    fn handle_outcome(&mut self, batch: Vec<Entry>, sent: Result<String, MailError>) {
+    fn handle_outcome(&mut self, batch: Vec<MailEntry>, sent: Result<String, MailError>) {
         let (now, subject, count) = (Instant::now(), in_words(&batch), batch.len());
         let way = self.way;
         let error = match sent {
@@ -117,10 +117,10 @@ impl Mailer {
 }
 
 /// The first few entries, for a log line.
-fn in_words(entries: &[Entry]) -> String {
+fn in_words(entries: &[MailEntry]) -> String {
     let (shown, others) = entries.split_at(entries.len().min(3));
     let shown: Vec<_> =
-        shown.iter().map(|Entry { notice, .. }| format!("{} {}", notice.server, notice.event.words())).collect();
+        shown.iter().map(|MailEntry { notice, .. }| format!("{} {}", notice.server, notice.event.words())).collect();
     let more = if others.is_empty() { String::new() } else { format!(" and {} more", others.len()) };
     format!("{}{more}", shown.join(", "))
 }

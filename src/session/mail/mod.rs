@@ -8,6 +8,6 @@ mod way;
 mod webhook;
 
 pub use mailer::{Mailer, start, test_mail, test_webhook};
-pub use outbox::{Event, Notice, Topic};
+pub use outbox::{Notice, NoticeKind, Topic};
 pub use smtp::MailError;
 pub use way::Way;

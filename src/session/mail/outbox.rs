@@ -25,7 +25,7 @@ pub struct Notice {
     /// The simulation server's address, or the name that leads to some.
     pub server: String,
     /// What happened.
-    pub event: Event,
+    pub event: NoticeKind,
     /// Its load, if known.
     pub load: Option<Load>,
     /// The last error, if any. It may hold any text.
@@ -36,7 +36,7 @@ pub struct Notice {
 
 /// What happened to a simulation server or to a name, in the order of the lines in an e-mail.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
-pub enum Event {
+pub enum NoticeKind {
     /// It gives no usable answer.
     NotResponding,
     /// It gives good answers again.
@@ -60,7 +60,7 @@ pub enum Topic {
     Capacity,
 }
 
-impl Event {
+impl NoticeKind {
     /// What it happens to, one and many.
     pub fn nouns(self) -> [&'static str; 2] {
         match self {
@@ -69,7 +69,7 @@ impl Event {
         }
     }
 
-    /// The event in words that follow those of [`Event::nouns`].
+    /// The event in words that follow those of [`NoticeKind::nouns`].
     pub fn words(self) -> &'static str {
         match self {
             Self::LookupFails => "failing",
@@ -91,7 +91,7 @@ impl Event {
 
 /// One entry of an e-mail: the newest notice about a server and topic, and how many it stands for.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Entry {
+pub struct MailEntry {
     /// The newest notice, with the last error that is known.
     pub notice: Notice,
     /// How many earlier notices it has replaced.
@@ -116,7 +116,7 @@ pub struct Outbox {
 /// What the outbox knows of one server.
 #[derive(Debug, Default)]
 struct Server {
-    waiting: BTreeMap<Topic, Entry>,
+    waiting: BTreeMap<Topic, MailEntry>,
     cooldown: Option<Cooldown>,
 }
 
@@ -128,7 +128,7 @@ struct Cooldown {
     about_health: bool,
 }
 
-impl Entry {
+impl MailEntry {
     /// Takes in an older entry about the same.
     fn replace(&mut self, older: Self) {
         self.held_back += older.held_back + 1;
@@ -148,7 +148,7 @@ impl Outbox {
         let server = self.servers.entry(notice.server.clone()).or_default();
         server.cooldown.take_if(|cooldown| cooldown.end <= now);
         let topic = notice.event.topic();
-        let mut entry = Entry { notice, held_back: 0, since: now, first_try: None };
+        let mut entry = MailEntry { notice, held_back: 0, since: now, first_try: None };
         if let Some(older) = server.waiting.remove(&topic) {
             entry.replace(older);
         }
@@ -163,7 +163,7 @@ impl Outbox {
 
     /// Takes out what is to be mailed now, by event, then by server. The outcome is to be reported by
     /// [`Self::succeeded`] or [`Self::failed`].
-    pub fn take(&mut self, now: Instant) -> Vec<Entry> {
+    pub fn take(&mut self, now: Instant) -> Vec<MailEntry> {
         self.servers.retain(|_, server| {
             !server.waiting.is_empty() || server.cooldown.is_some_and(|cooldown| cooldown.end > now)
         });
@@ -172,7 +172,7 @@ impl Outbox {
         }
         // An e-mail that is sent anyway includes what would else wait for `gather` only.
         let ready = self.servers.values_mut().filter(|server| server.held_until().is_none_or(|end| end <= now));
-        let mut batch: Vec<Entry> =
+        let mut batch: Vec<MailEntry> =
             ready.flat_map(|server| std::mem::take(&mut server.waiting).into_values()).collect();
         for entry in &mut batch {
             entry.first_try.get_or_insert(now);
@@ -184,10 +184,10 @@ impl Outbox {
     }
 
     /// A batch was sent.
-    pub fn succeeded(&mut self, batch: &[Entry], now: Instant) {
+    pub fn succeeded(&mut self, batch: &[MailEntry], now: Instant) {
         (self.delay, self.retry_at) = (self.timing.mail_retry, None);
         let end = now + self.timing.flapping;
-        for Entry { notice, .. } in batch {
+        for MailEntry { notice, .. } in batch {
             let cooldown = &mut self.servers.entry(notice.server.clone()).or_default().cooldown;
             let before = cooldown.is_some_and(|cooldown| cooldown.end == end && cooldown.about_health);
             *cooldown = Some(Cooldown { end, about_health: before || notice.event.topic() == Topic::Health });
@@ -198,10 +198,10 @@ impl Outbox {
     ///
     /// A permanent failure is tried again too, since only an e-mail can tell the administrator of it; but with the longest
     /// delay from the start, so that no account is locked for too many wrong logins.
-    pub fn failed(&mut self, batch: Vec<Entry>, permanent: bool, now: Instant) -> Vec<Entry> {
+    pub fn failed(&mut self, batch: Vec<MailEntry>, permanent: bool, now: Instant) -> Vec<MailEntry> {
         let patience = self.timing.mail_patience;
         let longest = self.timing.mail_retry.max(patience / 6);
-        let end = |entry: &Entry| entry.first_try.unwrap_or(now) + patience;
+        let end = |entry: &MailEntry| entry.first_try.unwrap_or(now) + patience;
         let (given_up, kept): (Vec<_>, Vec<_>) = batch.into_iter().partition(|entry| end(entry) <= now);
         if permanent {
             self.delay = longest;
@@ -226,7 +226,8 @@ impl Server {
     /// Until when the waiting entries are held back, if they are.
     fn held_until(&self) -> Option<Instant> {
         let cooldown = self.cooldown?;
-        let fails = |entry: &Entry| matches!(entry.notice.event, Event::NotResponding | Event::LookupFails);
+        let fails =
+            |entry: &MailEntry| matches!(entry.notice.event, NoticeKind::NotResponding | NoticeKind::LookupFails);
         let fails_now = !cooldown.about_health && self.waiting.get(&Topic::Health).is_some_and(fails);
         (!fails_now).then_some(cooldown.end)
     }
@@ -242,12 +243,12 @@ impl Server {
 mod tests {
     use super::*;
 
-    use Event::{AvailableAgain, MaximumLoad, NotResponding, WorkingAgain};
+    use NoticeKind::{AvailableAgain, MaximumLoad, NotResponding, WorkingAgain};
 
     /// When (second), and what (port, event, held back).
-    type Mail = (u64, Vec<(u16, Event, usize)>);
+    type Mail = (u64, Vec<(u16, NoticeKind, usize)>);
 
-    fn notice(port: u16, event: Event) -> Notice {
+    fn notice(port: u16, event: NoticeKind) -> Notice {
         Notice { server: format!("host:{port}"), event, load: None, error: None, at: SystemTime::UNIX_EPOCH }
     }
 
@@ -257,7 +258,7 @@ mod tests {
     }
 
     /// Plays notices (second, port, event).
-    fn play(notices: &[(u64, u16, Event)]) -> Vec<Mail> {
+    fn play(notices: &[(u64, u16, NoticeKind)]) -> Vec<Mail> {
         let start = Instant::now();
         let mut state = outbox();
         let mut mails = Vec::new();

@@ -3,7 +3,7 @@
 use std::fmt;
 
 use super::email::EmailComposer;
-use super::outbox::Entry;
+use super::outbox::MailEntry;
 use super::smtp::{MailError, Relay};
 use super::webhook::Webhook;
 use crate::session::config::SessionConfig;
@@ -62,7 +62,7 @@ impl Carrier {
     ///
     /// # Errors
     /// When they were not taken.
-    pub(super) async fn carry(&self, entries: &[Entry]) -> Result<String, MailError> {
+    pub(super) async fn carry(&self, entries: &[MailEntry]) -> Result<String, MailError> {
         match self {
             Self::Mail(relay, composer) => relay.deliver(composer.compose(entries)?).await,
             Self::Webhook(webhook) => webhook.deliver(entries).await,

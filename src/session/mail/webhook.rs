@@ -8,7 +8,7 @@ use awc::http::StatusCode;
 use serde_json::json;
 
 use super::email::Composer;
-use super::outbox::Entry;
+use super::outbox::MailEntry;
 use super::smtp::MailError;
 use crate::session::config::SessionConfig;
 use crate::shared::config::Secret;
@@ -46,7 +46,7 @@ impl Webhook {
     ///
     /// # Errors
     /// When it is not taken, or that is not said within `timing.mailAnswer`.
-    pub(super) async fn deliver(&self, entries: &[Entry]) -> Result<String, MailError> {
+    pub(super) async fn deliver(&self, entries: &[MailEntry]) -> Result<String, MailError> {
         let text = if entries.is_empty() { self.composer.test()? } else { self.composer.compose(entries)? }.1;
         // Messengers take what is in angle brackets for links and calls.
         let text: Vec<String> = text.lines().map(client_text).collect();

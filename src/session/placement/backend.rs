@@ -1,8 +1,8 @@
 //! What is known of one simulation server: its last report, and the clients that were sent to it since.
 
 use super::cost::{CostFit, Estimate, FULL, FleetCost, believable};
-use super::peers::Peers;
-use super::policy::Policy;
+use super::policy::PlacementPolicy;
+use super::replicas::Replicas;
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 
@@ -11,16 +11,16 @@ const MEAN_WINDOW: Duration = Duration::from_secs(5);
 
 /// What a simulation server answered when it was asked for its status.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Report {
+pub struct LoadReport {
     /// The mean load of the last five seconds, in percent. A server that reports no finite number from 0 on is taken as lost.
     pub load: f64,
     /// Its simulations; `None` for a server that reports only a load.
-    pub instances: Option<Instances>,
+    pub instances: Option<ClientCounts>,
 }
 
 /// The part of a report that tells of the server's simulations.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Instances {
+pub struct ClientCounts {
     /// The simulations that are there: queued, starting, idle and running.
     pub present: u32,
     /// How many the server can hold.
@@ -35,19 +35,19 @@ pub struct Instances {
 #[derive(Debug, Clone, Copy)]
 struct Placement {
     at: Instant,
-    /// Whether it takes room, see [`super::Fleet::place_without_room`].
+    /// Whether it takes room, see [`super::LoadBalancer::pick_unreserved`].
     takes_room: bool,
 }
 
 /// Clients that came (positive) or left (negative) and that the mean load does not fully show yet.
 #[derive(Debug, Clone, Copy)]
-struct Change {
+struct ClientDelta {
     at: Instant,
     clients: f64,
     takes_room: bool,
 }
 
-impl Change {
+impl ClientDelta {
     /// The clients of this change that a mean load taken at `now` does not show.
     fn unseen(&self, now: Instant, settling: Duration) -> f64 {
         let span = if self.clients > 0.0 { settling } else { MEAN_WINDOW };
@@ -73,7 +73,7 @@ struct Unseen {
 pub(super) struct Backend {
     up: bool,
     /// The last good report and when it came; kept while the server is down, to know what is new when it comes back.
-    last: Option<(Instant, Report)>,
+    last: Option<(Instant, LoadReport)>,
     /// The placements whose clients have not been seen yet, oldest first.
     in_flight: VecDeque<Placement>,
     /// How many of them take room.
@@ -82,7 +82,7 @@ pub(super) struct Backend {
     fresh: usize,
     /// How many clients come for each that is placed here, those of other session servers included.
     clients_per_placement: f64,
-    settling: VecDeque<Change>,
+    settling: VecDeque<ClientDelta>,
     /// What `settling` hid from the last report.
     unseen: Unseen,
     fit: CostFit,
@@ -96,7 +96,7 @@ pub(super) struct Backend {
 
 impl Backend {
     /// A server that nothing is known of: down until its first report.
-    pub(super) fn new(policy: &Policy, turn: u64) -> Self {
+    pub(super) fn new(policy: &PlacementPolicy, turn: u64) -> Self {
         Self {
             up: false,
             last: None,
@@ -117,10 +117,10 @@ impl Backend {
     pub(super) fn report(
         &mut self,
         now: Instant,
-        report: Report,
-        policy: &Policy,
+        report: LoadReport,
+        policy: &PlacementPolicy,
         fleet: &mut FleetCost,
-        peers: &mut Peers,
+        peers: &mut Replicas,
     ) {
         if !report.load.is_finite() || report.load < 0.0 {
             self.lose();
@@ -151,7 +151,7 @@ impl Backend {
     }
 
     /// Gives up the clients that should have come by now.
-    pub(super) fn expire(&mut self, now: Instant, policy: &Policy, peers: &mut Peers) {
+    pub(super) fn expire(&mut self, now: Instant, policy: &PlacementPolicy, peers: &mut Replicas) {
         let is_late = |placed: &Placement| now.saturating_duration_since(placed.at) >= policy.patience;
         let late = self.in_flight.partition_point(is_late);
         let given_up = self.in_flight.drain(..late).filter(|placed| placed.takes_room).count();
@@ -160,12 +160,12 @@ impl Backend {
     }
 
     /// When the oldest placement is given up, if its client does not come before.
-    pub(super) fn next_expiry(&self, policy: &Policy) -> Option<Instant> {
+    pub(super) fn next_expiry(&self, policy: &PlacementPolicy) -> Option<Instant> {
         self.in_flight.front().and_then(|placed| placed.at.checked_add(policy.patience))
     }
 
     /// Whether a client can be sent here.
-    pub(super) fn has_room(&self, policy: &Policy) -> bool {
+    pub(super) fn has_room(&self, policy: &PlacementPolicy) -> bool {
         let Some((_, report)) = self.last.filter(|_| self.up) else {
             return false;
         };
@@ -177,7 +177,7 @@ impl Backend {
     }
 
     /// The load, in percent, from which on this server takes no client.
-    pub(super) fn limit(&self, policy: &Policy) -> f64 {
+    pub(super) fn limit(&self, policy: &PlacementPolicy) -> f64 {
         // A client that costs much is turned away earlier, because it would take more than the machine has.
         // A threshold that no load reaches says that the load is to close no server.
         if policy.threshold > 100.0 { policy.threshold } else { policy.threshold.min(100.0 - self.cost) }
@@ -194,7 +194,7 @@ impl Backend {
     }
 
     fn load_with(&self, unseen: f64, in_flight: usize) -> Option<f64> {
-        let (_, Report { load, .. }) = self.last.filter(|_| self.up)?;
+        let (_, LoadReport { load, .. }) = self.last.filter(|_| self.up)?;
         // How far a full machine is over is not known, so those who left may not have made it less than full.
         let unseen = if load < FULL { unseen } else { unseen.max(0.0) };
         let ahead = unseen + count(in_flight) + self.sent_by_others();
@@ -223,7 +223,7 @@ impl Backend {
 
     /// Tells the fleet what has been learned here, and takes over what follows from all servers. A server that reports
     /// only its load teaches nothing, because it does not tell which part of that are clients: its cost is the fixed one.
-    fn update_cost(&mut self, fleet: &mut FleetCost, policy: &Policy) {
+    fn update_cost(&mut self, fleet: &mut FleetCost, policy: &PlacementPolicy) {
         let counts = self.last.is_some_and(|(_, report)| report.instances.is_some());
         let estimate = if counts { self.fit.estimate(self.cost) } else { Estimate::default() };
         fleet.replace(self.estimate, estimate);
@@ -231,7 +231,7 @@ impl Backend {
         self.cost = if counts { fleet.cost(estimate, policy.client_cost) } else { believable(policy.client_cost) };
     }
 
-    fn learn(&mut self, now: Instant, report: Report) {
+    fn learn(&mut self, now: Instant, report: LoadReport) {
         let Some(((before, _), instances)) = self.last.zip(report.instances) else {
             return;
         };
@@ -245,7 +245,7 @@ impl Backend {
     }
 
     /// Forgets the changes that the load shows by now, and sums up the others.
-    fn settle(&mut self, now: Instant, policy: &Policy) {
+    fn settle(&mut self, now: Instant, policy: &PlacementPolicy) {
         self.settling.retain(|change| change.unseen(now, policy.settling) != 0.0);
         self.unseen = Unseen::default();
         for change in &self.settling {
@@ -255,11 +255,11 @@ impl Backend {
     }
 
     /// Compares the report with the one before: who came, who left.
-    fn note_changes(&mut self, now: Instant, new: Option<Instances>, peers: &mut Peers) {
+    fn note_changes(&mut self, now: Instant, new: Option<ClientCounts>, peers: &mut Replicas) {
         let Some(new) = new else {
             // A load alone does not tell who came: every placement is taken to have come as it was made.
             let all = self.in_flight.drain(..);
-            self.settling.extend(all.map(|Placement { at, takes_room }| Change { at, clients: 1.0, takes_room }));
+            self.settling.extend(all.map(|Placement { at, takes_room }| ClientDelta { at, clients: 1.0, takes_room }));
             self.reserved = 0;
             return;
         };
@@ -278,7 +278,7 @@ impl Backend {
         // The latest placements are taken to be those that came. Nothing tells clients apart; were the oldest taken, then
         // a client that never comes would stay in flight as long as others follow it.
         for Placement { at, takes_room } in self.in_flight.drain(self.in_flight.len() - came..) {
-            self.settling.push_back(Change { at, clients: 1.0, takes_room: true });
+            self.settling.push_back(ClientDelta { at, clients: 1.0, takes_room: true });
             self.reserved -= usize::from(takes_room);
         }
         // Those who left, less those who came without having been sent; some time since the last report.
@@ -287,7 +287,7 @@ impl Backend {
         self.fit.count_arrivals(came + others.max(0.0));
         if others != 0.0 {
             let at = before + now.saturating_duration_since(before) / 2;
-            self.settling.push_back(Change { at, clients: others, takes_room: true });
+            self.settling.push_back(ClientDelta { at, clients: others, takes_room: true });
         }
     }
 }
@@ -302,12 +302,16 @@ mod tests {
     use super::*;
 
     /// One server, the time from which its seconds are counted, and what its fleet has learned of costs and of others.
-    struct Server(Backend, Instant, FleetCost, Peers);
+    struct Server(Backend, Instant, FleetCost, Replicas);
 
     impl Server {
         fn new(load: f64, counts: Option<(u32, u64)>) -> Self {
-            let mut server =
-                Self(Backend::new(&Policy::default(), 0), Instant::now(), FleetCost::default(), Peers::default());
+            let mut server = Self(
+                Backend::new(&PlacementPolicy::default(), 0),
+                Instant::now(),
+                FleetCost::default(),
+                Replicas::default(),
+            );
             server.report(0.0, load, counts);
             server
         }
@@ -323,10 +327,10 @@ mod tests {
         /// A report with a load and, of the server's clients, those present and the arrivals.
         fn report(&mut self, seconds: f64, load: f64, counts: Option<(u32, u64)>) {
             let instances =
-                counts.map(|(present, arrivals)| Instances { present, places: 1000, arrivals, accepting: true });
+                counts.map(|(present, arrivals)| ClientCounts { present, places: 1000, arrivals, accepting: true });
             let at = self.at(seconds);
-            self.0.expire(at, &Policy::default(), &mut self.3);
-            self.0.report(at, Report { load, instances }, &Policy::default(), &mut self.2, &mut self.3);
+            self.0.expire(at, &PlacementPolicy::default(), &mut self.3);
+            self.0.report(at, LoadReport { load, instances }, &PlacementPolicy::default(), &mut self.2, &mut self.3);
         }
 
         fn assert_load(&self, expected: f64, tolerance: f64) {

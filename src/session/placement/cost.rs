@@ -211,19 +211,19 @@ impl FleetCost {
 
 #[cfg(test)]
 mod tests {
-    use crate::session::placement::{Fleet, Instances, Policy, Report};
+    use crate::session::placement::{ClientCounts, LoadBalancer, LoadReport, PlacementPolicy};
     use std::time::{Duration, Instant};
 
     /// A fleet of so many servers, and when it began.
-    fn fleet(client_cost: f64, servers: u32) -> (Fleet<u32>, Instant) {
-        let mut fleet = Fleet::new(Policy { client_cost, ..Policy::default() });
+    fn fleet(client_cost: f64, servers: u32) -> (LoadBalancer<u32>, Instant) {
+        let mut fleet = LoadBalancer::new(PlacementPolicy { client_cost, ..PlacementPolicy::default() });
         (0..servers).for_each(|id| fleet.add(id));
         (fleet, Instant::now())
     }
 
-    fn report(load: f64, present: u32, arrivals: u32) -> Report {
-        let instances = Instances { present, places: 1000, arrivals: arrivals.into(), accepting: true };
-        Report { load, instances: Some(instances) }
+    fn report(load: f64, present: u32, arrivals: u32) -> LoadReport {
+        let instances = ClientCounts { present, places: 1000, arrivals: arrivals.into(), accepting: true };
+        LoadReport { load, instances: Some(instances) }
     }
 
     fn assert_near(value: Option<f64>, expected: f64, tolerance: f64) {
@@ -231,7 +231,7 @@ mod tests {
     }
 
     /// Reports once a second for ten minutes, while the number of clients moves between 0 and 10.
-    fn teach(fleet: &mut Fleet<u32>, id: u32, start: Instant, cost: f64) {
+    fn teach(fleet: &mut LoadBalancer<u32>, id: u32, start: Instant, cost: f64) {
         for second in 0..600_u32 {
             // Each client stays long enough for the mean load to show it.
             let step = second / 20;
@@ -287,7 +287,7 @@ mod tests {
     }
 
     /// One server, whose reports of so many seconds have these loads and clients.
-    fn taught(reports: &[(u32, f64, u32)]) -> (Fleet<u32>, Instant) {
+    fn taught(reports: &[(u32, f64, u32)]) -> (LoadBalancer<u32>, Instant) {
         let (mut fleet, start) = fleet(2.0, 1);
         let (mut second, mut arrivals, mut before) = (0, 0, 0);
         for (seconds, load, present) in reports {

@@ -1,7 +1,7 @@
 //! Which server gets the next client: the pure placement policy.
 //!
 //! A report of a simulation server is always old. Whoever goes by the reports alone sends a whole class to the one server
-//! that looked best a moment ago. The [`Fleet`] therefore counts each of its own placements as load at once, until the
+//! that looked best a moment ago. The [`LoadBalancer`] therefore counts each of its own placements as load at once, until the
 //! reports show it.
 //!
 //! - `fleet`: the servers, and the choice between them; `policy`: what can be set;
@@ -17,11 +17,11 @@
 mod backend;
 mod cost;
 mod ejection;
-mod fleet;
-mod order;
-mod peers;
+mod load_balancer;
 mod policy;
+mod ranking;
+mod replicas;
 
-pub use backend::{Instances, Report};
-pub use fleet::Fleet;
-pub use policy::Policy;
+pub use backend::{ClientCounts, LoadReport};
+pub use load_balancer::LoadBalancer;
+pub use policy::PlacementPolicy;

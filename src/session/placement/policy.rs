@@ -4,7 +4,7 @@ use std::time::Duration;
 
 /// What the owner of a fleet can set.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Policy {
+pub struct PlacementPolicy {
     /// A server takes clients while its effective load is under this, in percent. Default: 95.
     pub threshold: f64,
     /// What a client costs a server that reports only its load, in percent; the others start from this and learn. Default: 2.
@@ -16,7 +16,7 @@ pub struct Policy {
     pub settling: Duration,
 }
 
-impl Default for Policy {
+impl Default for PlacementPolicy {
     fn default() -> Self {
         Self { threshold: 95.0, client_cost: 2.0, patience: Duration::from_secs(15), settling: Duration::from_secs(8) }
     }

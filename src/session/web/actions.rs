@@ -5,7 +5,7 @@ use serde::Deserialize;
 
 use crate::session::config::Announcement;
 use crate::session::state::AppState;
-use crate::shared::http::paths::{POST, path};
+use crate::shared::http::routing::{POST, path};
 use crate::shared::http::{body, refuse_action};
 
 /// Adds the paths to an app.

@@ -10,8 +10,8 @@ use crate::session::fleet::FleetStatus;
 use crate::session::fleet::GetStatus;
 use crate::session::state::AppState;
 use crate::shared::http::assets::{self, Asset};
-use crate::shared::http::paths::{GET, READ, path};
-use crate::shared::http::{Kind, Policy, any_host, fleet_sources, html};
+use crate::shared::http::routing::{GET, READ, path};
+use crate::shared::http::{ConnectionKind, ContentSecurityPolicy, any_host, fleet_sources, html};
 
 /// Assets of this server's pages, besides those of all pages.
 const ASSETS: &[Asset] = &[
@@ -46,13 +46,13 @@ async fn monitor(server: web::Data<AppState>) -> HttpResponse {
     let announcement = server.announcements.current();
     let more = (announcement.as_deref(), server.admin_auth.is_some());
     with_status(&server, |status| {
-        html(pages::monitor(status, clients, &server.client_urls, started, more), &Policy::own())
+        html(pages::monitor(status, clients, &server.client_urls, started, more), &ContentSecurityPolicy::own())
     })
     .await
 }
 
 async fn events(request: HttpRequest, server: web::Data<AppState>) -> HttpResponse {
-    let permit = match server.connections.admit(Kind::Page, server.trusted_proxies.peer(&request)) {
+    let permit = match server.connections.admit(ConnectionKind::Page, server.trusted_proxies.peer(&request)) {
         Ok(permit) => permit,
         Err(refused) => return refused.answer(),
     };
@@ -73,7 +73,7 @@ async fn viewer(request: HttpRequest, server: web::Data<AppState>) -> HttpRespon
     with_status(&server, |status| {
         let script = server.viewer_script.as_ref().map(url::Url::as_str);
         let page = Viewer { version: env!("CARGO_PKG_VERSION"), examples: &server.examples, script };
-        let policy = Policy::own().own_websocket(&request).connect(&fleet(&server, status)).frames();
+        let policy = ContentSecurityPolicy::own().own_websocket(&request).connect(&fleet(&server, status)).frames();
         html(page.render(), &policy)
     })
     .await
@@ -86,7 +86,7 @@ async fn webots_viewer(server: web::Data<AppState>) -> HttpResponse {
         let mut sources = fleet(&server, status);
         sources.extend(server.viewer_script.as_ref().map(|script| script.origin().ascii_serialization()));
         let page = WebotsViewer { version: env!("CARGO_PKG_VERSION") };
-        html(page.render(), &Policy::own().run(&sources).any_picture().framed().foreign())
+        html(page.render(), &ContentSecurityPolicy::own().run(&sources).any_picture().framed().foreign())
     })
     .await
 }

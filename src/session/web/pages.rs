@@ -6,10 +6,10 @@ use std::time::{Duration, SystemTime};
 use askama::Template;
 
 use crate::session::config::{Announcement, Example};
-use crate::session::fleet::{FleetStatus, NameStatus, ServerStatus, State, StateChange};
+use crate::session::fleet::{FleetStatus, NameStatus, ServerState, ServerStatus, StateChange};
 use crate::shared::domain::ClientUrls;
 use crate::shared::domain::Instances;
-use crate::shared::http::{Row, View};
+use crate::shared::http::{PageView, TableRow};
 use crate::shared::run::timestamp;
 use crate::shared::text::one_line;
 
@@ -24,7 +24,7 @@ struct Monitor<'view> {
     has_actions: bool,
     glance: &'view str,
     changes: &'view str,
-    rows: &'view [Row],
+    rows: &'view [TableRow],
 }
 
 /// The summary of the fleet.
@@ -111,19 +111,19 @@ pub fn view(
     clients: usize,
     urls: &ClientUrls,
     announcement: Option<&Announcement>,
-) -> Result<View, askama::Error> {
+) -> Result<PageView, askama::Error> {
     let rows = status.servers.iter().map(|server| {
         let html = ServerRow::new(server, urls).render()?;
-        Ok(Row { key: server.address.to_string(), html })
+        Ok(TableRow { key: server.address.to_string(), html })
     });
-    let rows = rows.collect::<Result<Vec<Row>, askama::Error>>()?;
+    let rows = rows.collect::<Result<Vec<TableRow>, askama::Error>>()?;
     let announced = announcement.map(|one| Announced { text: &one.text, until: one.until.map(timestamp) }.render());
     let parts = [
         ("announcement", announced.transpose()?.unwrap_or_default()),
         ("glance", Glance::new(status, clients).render()?),
         ("changes", Changes { changes: &status.changes }.render()?),
     ];
-    Ok(View { parts: parts.into(), tables: [("servers", rows)].into(), sample: Vec::new() })
+    Ok(PageView { parts: parts.into(), tables: [("servers", rows)].into(), sample: Vec::new() })
 }
 
 /// The whole of `/monitor`.
@@ -153,7 +153,8 @@ pub fn monitor(
 
 impl<'status> Glance<'status> {
     fn new(status: &'status FleetStatus, clients: usize) -> Self {
-        let count = |wanted: &[State]| status.servers.iter().filter(|server| wanted.contains(&server.state)).count();
+        let count =
+            |wanted: &[ServerState]| status.servers.iter().filter(|server| wanted.contains(&server.state)).count();
         let instances = || status.servers.iter().filter_map(known_instances);
         // Another server's numbers may be anything.
         let sum = |part: fn(Instances) -> u32| instances().map(|one| u64::from(part(one))).sum::<u64>();
@@ -163,9 +164,9 @@ impl<'status> Glance<'status> {
             clients,
             mean_load: status.mean_load,
             servers: status.servers.len(),
-            answering: count(&[State::Up, State::Full, State::Draining]),
-            taking: count(&[State::Up]),
-            down: count(&[State::Down]),
+            answering: count(&[ServerState::Up, ServerState::Full, ServerState::Draining]),
+            taking: count(&[ServerState::Up]),
+            down: count(&[ServerState::Down]),
             running: sum(|one| one.running),
             idle: sum(|one| one.idle),
             starting: sum(|one| one.starting),
@@ -177,7 +178,7 @@ impl<'status> Glance<'status> {
 
 impl<'server> ServerRow<'server> {
     fn new(server: &'server ServerStatus, urls: &ClientUrls) -> Self {
-        let report = server.report.as_ref().filter(|_| server.state != State::Down);
+        let report = server.report.as_ref().filter(|_| server.state != ServerState::Down);
         let load = report.map(|report| report.load.percent());
         let repositories = report.map(|report| report.allowed_repositories.as_slice()).unwrap_or_default();
         let accepted = match report {
@@ -189,7 +190,7 @@ impl<'server> ServerRow<'server> {
             server,
             monitor: format!("{}/monitor", urls.http_url(&server.address)),
             rank: rank(server.state),
-            error: server.error.as_deref().filter(|_| server.state == State::Down),
+            error: server.error.as_deref().filter(|_| server.state == ServerState::Down),
             load,
             load_value: sort_value(load),
             effective: server.effective_load,
@@ -212,17 +213,17 @@ impl Changes<'_> {
 }
 
 fn known_instances(server: &ServerStatus) -> Option<Instances> {
-    server.report.as_ref().filter(|_| server.state != State::Down)?.instances
+    server.report.as_ref().filter(|_| server.state != ServerState::Down)?.instances
 }
 
 /// The rank of a state in sorting: what needs attention comes first.
-fn rank(state: State) -> u8 {
+fn rank(state: ServerState) -> u8 {
     match state {
-        State::Down => 0,
-        State::Unknown => 1,
-        State::Draining => 2,
-        State::Full => 3,
-        State::Up => 4,
+        ServerState::Down => 0,
+        ServerState::Unknown => 1,
+        ServerState::Draining => 2,
+        ServerState::Full => 3,
+        ServerState::Up => 4,
     }
 }
 

@@ -10,19 +10,19 @@ use percent_encoding::percent_decode_str;
 use super::actions;
 use super::page_routes;
 use super::queries::{ask, with_status};
-use super::status::{self, StatusPage};
+use super::status::{self, StatusResponse};
 use super::web_client::WebClient;
 use crate::session::fleet::GetStatus;
 use crate::session::fleet::displayed_mean_load;
-use crate::session::fleet::{NoServer, Pick};
+use crate::session::fleet::{Pick, PickError};
 use crate::session::state::AppState;
-use crate::shared::http::paths::{self, GET, READ, path, retry_after};
+use crate::shared::http::routing::{self, GET, READ, path, retry_after};
 use crate::shared::http::websocket;
-use crate::shared::http::{CONTENT_TYPE, Kind};
+use crate::shared::http::{CONTENT_TYPE, ConnectionKind};
 
 /// Adds all paths to an app.
 pub fn configure(app: &mut web::ServiceConfig) {
-    app.service(paths::all(add, "/session, /monitor, /viewer, /status, /load, /metrics or /health"));
+    app.service(routing::all(add, "/session, /monitor, /viewer, /status, /load, /metrics or /health"));
 }
 
 fn add(app: &mut web::ServiceConfig) {
@@ -57,9 +57,9 @@ async fn session(request: HttpRequest, stream: web::Payload, server: web::Data<A
         None => StatusCode::OK,
         // As the Python server answers: clients such as PHP's `file_get_contents` read no body with another status.
         Some(_) if world.is_none() => StatusCode::OK,
-        Some(NoServer::Unavailable) => StatusCode::SERVICE_UNAVAILABLE,
-        Some(NoServer::NotAccepted(_)) => StatusCode::FORBIDDEN,
-        Some(NoServer::NoWorld(_)) => StatusCode::BAD_REQUEST,
+        Some(PickError::Unavailable) => StatusCode::SERVICE_UNAVAILABLE,
+        Some(PickError::NotAccepted(_)) => StatusCode::FORBIDDEN,
+        Some(PickError::InvalidWorld(_)) => StatusCode::BAD_REQUEST,
     };
     let mut response = HttpResponse::build(status);
     if status == StatusCode::SERVICE_UNAVAILABLE {
@@ -82,7 +82,7 @@ fn wanted_world(query: &str) -> Option<Cow<'_, str>> {
 
 fn open_websocket(request: &HttpRequest, stream: web::Payload, server: &web::Data<AppState>) -> HttpResponse {
     let peer = server.trusted_proxies.peer(request);
-    let permit = match server.connections.admit(Kind::Client, peer) {
+    let permit = match server.connections.admit(ConnectionKind::Client, peer) {
         Ok(permit) => permit,
         Err(refused) => return refused.answer(),
     };
@@ -103,7 +103,7 @@ async fn load(server: web::Data<AppState>) -> HttpResponse {
 }
 
 async fn status_json(server: web::Data<AppState>) -> HttpResponse {
-    with_status(&server, |status| HttpResponse::Ok().json(StatusPage::new(&server, status))).await
+    with_status(&server, |status| HttpResponse::Ok().json(StatusResponse::new(&server, status))).await
 }
 
 async fn metrics(server: web::Data<AppState>) -> HttpResponse {

@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use serde::Serialize;
 
-use crate::session::fleet::{FleetStatus, NameStatus, ServerStatus, State, displayed_mean_load};
+use crate::session::fleet::{FleetStatus, NameStatus, ServerState, ServerStatus, displayed_mean_load};
 use crate::session::state::AppState;
 use crate::shared::domain::ClientUrls;
 use crate::shared::domain::Instances;
@@ -15,7 +15,7 @@ use crate::shared::run::timestamp;
 /// The page `/status`.
 #[derive(Debug, Serialize)]
 #[serde(rename_all = "camelCase")]
-pub struct StatusPage {
+pub struct StatusResponse {
     version: &'static str,
     /// In seconds.
     uptime: u64,
@@ -23,14 +23,14 @@ pub struct StatusPage {
     clients: usize,
     /// Percent; absent where no server answers.
     load: Option<f64>,
-    servers: Vec<ServerPage>,
-    names: Vec<NamePage>,
-    changes: Vec<ChangePage>,
+    servers: Vec<ServerStatusJson>,
+    names: Vec<NameStatusJson>,
+    changes: Vec<StateChangeJson>,
 }
 
 #[derive(Debug, Serialize)]
 #[serde(rename_all = "camelCase")]
-struct ServerPage {
+struct ServerStatusJson {
     address: String,
     monitor: String,
     state: &'static str,
@@ -50,7 +50,7 @@ struct ServerPage {
 }
 
 #[derive(Debug, Serialize)]
-struct NamePage {
+struct NameStatusJson {
     name: String,
     servers: usize,
     since: String,
@@ -58,23 +58,23 @@ struct NamePage {
 }
 
 #[derive(Debug, Serialize)]
-struct ChangePage {
+struct StateChangeJson {
     at: String,
     server: String,
     state: &'static str,
     why: String,
 }
 
-impl StatusPage {
+impl StatusResponse {
     /// The state of the fleet.
     pub fn new(server: &AppState, status: &FleetStatus) -> Self {
-        let changes = status.changes.iter().map(|change| ChangePage {
+        let changes = status.changes.iter().map(|change| StateChangeJson {
             at: timestamp(change.at),
             server: change.server.clone(),
             state: change.state.word(),
             why: change.why.clone(),
         });
-        let names = status.names.iter().map(|name| NamePage {
+        let names = status.names.iter().map(|name| NameStatusJson {
             name: name.name.to_string(),
             servers: name.servers,
             since: timestamp(name.since),
@@ -86,16 +86,16 @@ impl StatusPage {
             available: status.available,
             clients: server.clients(),
             load: status.mean_load,
-            servers: status.servers.iter().map(|one| ServerPage::new(one, &server.client_urls)).collect(),
+            servers: status.servers.iter().map(|one| ServerStatusJson::new(one, &server.client_urls)).collect(),
             names: names.collect(),
             changes: changes.collect(),
         }
     }
 }
 
-impl ServerPage {
+impl ServerStatusJson {
     fn new(server: &ServerStatus, urls: &ClientUrls) -> Self {
-        let known = server.report.as_ref().filter(|_| server.state != State::Down);
+        let known = server.report.as_ref().filter(|_| server.state != ServerState::Down);
         let allowed =
             known.map(|report| report.allowed_repositories.iter().map(|prefix| prefix.as_str().to_owned()).collect());
         Self {
@@ -127,8 +127,8 @@ pub fn gauges<'text>(clients: usize, status: &FleetStatus) -> Vec<Gauge<'text>> 
 
 /// The gauges of the fleet as a whole.
 fn fleet_gauges<'text>(clients: usize, status: &FleetStatus) -> Vec<Gauge<'text>> {
-    let count = |wanted: State| status.servers.iter().filter(move |server| server.state == wanted).count();
-    let every = [State::Unknown, State::Up, State::Full, State::Draining, State::Down];
+    let count = |wanted: ServerState| status.servers.iter().filter(move |server| server.state == wanted).count();
+    let every = [ServerState::Unknown, ServerState::Up, ServerState::Full, ServerState::Draining, ServerState::Down];
     vec![
         Gauge::plain(
             "webots_session_available",
@@ -161,14 +161,16 @@ fn server_gauges<'text>(servers: &[ServerStatus]) -> Vec<Gauge<'text>> {
             name: "webots_session_server_up",
             help: "1 while a simulation server gives good answers",
             labels,
-            values: of_each(&|server| Some(f64::from(u8::from(!matches!(server.state, State::Down | State::Unknown))))),
+            values: of_each(&|server| {
+                Some(f64::from(u8::from(!matches!(server.state, ServerState::Down | ServerState::Unknown))))
+            }),
         },
         Gauge {
             name: "webots_session_server_load_percent",
             help: "Load that a simulation server reported last",
             labels,
             values: of_each(&|server| {
-                server.report.as_ref().filter(|_| server.state != State::Down).map(|report| report.load.percent())
+                server.report.as_ref().filter(|_| server.state != ServerState::Down).map(|report| report.load.percent())
             }),
         },
         Gauge {

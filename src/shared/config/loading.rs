@@ -24,12 +24,12 @@ pub trait Configuration: DeserializeOwned + Serialize {
     ///
     /// # Errors
     /// When a value contradicts others.
-    fn complete(&mut self, file: &Path) -> Result<Vec<String>, InvalidValue>;
+    fn complete(&mut self, file: &Path) -> Result<Vec<String>, InvalidValueError>;
 }
 
 /// A value that contradicts others.
 #[derive(Debug)]
-pub struct InvalidValue {
+pub struct InvalidValueError {
     /// The key of the value.
     pub key: &'static str,
     /// What was found, and what is allowed.
@@ -76,7 +76,8 @@ pub fn load<C: Configuration>(file: &Path) -> Result<LoadedConfig<C>, ConfigErro
     }
     let known = known_keys(&config);
     let mut warnings: Vec<String> = unknown.iter().map(|key| unknown_key(file, key, &known)).collect();
-    let more = config.complete(file).map_err(|InvalidValue { key, problem }| wrong(format!("{key}: {problem}")))?;
+    let more =
+        config.complete(file).map_err(|InvalidValueError { key, problem }| wrong(format!("{key}: {problem}")))?;
     warnings.extend(more.iter().map(|warning| format!("{}: {warning}", file.display())));
     Ok(LoadedConfig { config, warnings })
 }
@@ -135,7 +136,7 @@ mod tests {
     impl Configuration for Small {
         const ALIASES: &'static [&'static str] = &[];
 
-        fn complete(&mut self, _: &Path) -> Result<Vec<String>, InvalidValue> {
+        fn complete(&mut self, _: &Path) -> Result<Vec<String>, InvalidValueError> {
             Ok(Vec::new())
         }
     }

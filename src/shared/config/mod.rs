@@ -6,7 +6,7 @@ mod secret;
 mod value;
 
 pub use error::ConfigError;
-pub use loading::{Configuration, InvalidValue, LoadedConfig, changed_keys, load};
+pub use loading::{Configuration, InvalidValueError, LoadedConfig, changed_keys, load};
 pub use secret::Secret;
 pub use value::{
     ExpandedPath, expanded, folder, local_address, minutes_or_zero, object, one_or_many, optional_expanded,

@@ -2,11 +2,11 @@
 
 use super::load::Load;
 use super::project_url::ProjectUrl;
-use super::repositories::UrlPrefix;
+use super::url_prefix::UrlPrefix;
 
 /// The rules of a server.
 #[derive(Debug, Clone)]
-pub struct Rules<Prefixes = Vec<UrlPrefix>> {
+pub struct AdmissionRules<Prefixes = Vec<UrlPrefix>> {
     /// Repositories whose worlds run at any load.
     pub allowed: Prefixes,
     /// Repositories whose worlds never run.
@@ -20,7 +20,7 @@ pub struct Rules<Prefixes = Vec<UrlPrefix>> {
 /// Why a world may not run. Its words are for the client; they are made only where somebody asks for them, for a session
 /// server asks the rules of each server.
 #[derive(Debug, PartialEq, thiserror::Error)]
-pub enum Refusal<'world> {
+pub enum AdmissionError<'world> {
     /// Its repository is blocked.
     #[error("Cannot run simulation from blocked repository: {}", .0.repository())]
     Blocked(&'world ProjectUrl),
@@ -45,27 +45,27 @@ pub enum Refusal<'world> {
     },
 }
 
-impl<Prefixes: AsRef<[UrlPrefix]>> Rules<Prefixes> {
+impl<Prefixes: AsRef<[UrlPrefix]>> AdmissionRules<Prefixes> {
     /// Whether a world may run at this load. A blocked repository never may; the original asks that only of worlds
     /// that are not allowed.
     ///
     /// # Errors
     /// Why it may not.
-    pub fn admit<'world>(&self, world: &'world ProjectUrl, load: Load) -> Result<(), Refusal<'world>> {
+    pub fn admit<'world>(&self, world: &'world ProjectUrl, load: Load) -> Result<(), AdmissionError<'world>> {
         if self.blocked.as_ref().iter().any(|prefix| prefix.may_cover(world)) {
-            return Err(Refusal::Blocked(world));
+            return Err(AdmissionError::Blocked(world));
         }
         if self.allowed.as_ref().iter().any(|prefix| prefix.covers(world)) {
             return Ok(());
         }
         if !self.docker {
-            return Err(Refusal::NotAllowed(world));
+            return Err(AdmissionError::NotAllowed(world));
         }
         if self.share_idle_time <= 0.0 {
-            return Err(Refusal::NotShared(world));
+            return Err(AdmissionError::NotShared(world));
         }
         if load.percent() > self.share_idle_time {
-            return Err(Refusal::Busy { load: load.percent(), threshold: self.share_idle_time });
+            return Err(AdmissionError::Busy { load: load.percent(), threshold: self.share_idle_time });
         }
         Ok(())
     }
@@ -80,7 +80,7 @@ mod tests {
         let prefixes = |texts: &[&str]| {
             texts.iter().map(|text| UrlPrefix::try_from((*text).to_owned()).unwrap()).collect::<Vec<_>>()
         };
-        let rules = |docker, share_idle_time| Rules {
+        let rules = |docker, share_idle_time| AdmissionRules {
             allowed: prefixes(&["https://github.com/lab"]),
             blocked: prefixes(&["https://github.com/lab/secret", "https://github.com/Evil"]),
             docker,

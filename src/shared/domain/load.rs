@@ -12,7 +12,7 @@ pub struct Load(f64);
 /// A number that is not a load.
 #[derive(Debug, PartialEq, thiserror::Error)]
 #[error("{0} is no load; a load is a finite number of percent that is not negative")]
-pub struct NoLoad(String);
+pub struct LoadError(String);
 
 impl Load {
     /// No load at all.
@@ -35,18 +35,18 @@ impl Load {
     ///
     /// # Errors
     /// When the body is anything else.
-    pub fn parse(body: &[u8]) -> Result<Self, NoLoad> {
+    pub fn parse(body: &[u8]) -> Result<Self, LoadError> {
         let text = String::from_utf8_lossy(body);
-        let number: f64 = text.trim().parse().map_err(|_| NoLoad(format!("{:?}", text.trim())))?;
+        let number: f64 = text.trim().parse().map_err(|_| LoadError(format!("{:?}", text.trim())))?;
         Self::try_from(number)
     }
 }
 
 impl TryFrom<f64> for Load {
-    type Error = NoLoad;
+    type Error = LoadError;
 
-    fn try_from(number: f64) -> Result<Self, NoLoad> {
-        if number.is_finite() && number >= 0.0 { Ok(Self(number)) } else { Err(NoLoad(number.to_string())) }
+    fn try_from(number: f64) -> Result<Self, LoadError> {
+        if number.is_finite() && number >= 0.0 { Ok(Self(number)) } else { Err(LoadError(number.to_string())) }
     }
 }
 

@@ -51,13 +51,13 @@ pub struct Reading {
 #[error(
     "Wrong Webots simulation URL: {problem}. Allowed is https://github.com/USER/REPOSITORY/blob/REFERENCE/PATH/worlds/NAME.wbt."
 )]
-pub struct NoProject {
+pub struct ProjectUrlError {
     /// What is wrong with it, without a capital and a period.
     pub problem: String,
 }
 
-fn no_project(problem: impl Into<String>) -> NoProject {
-    NoProject { problem: problem.into() }
+fn url_error(problem: impl Into<String>) -> ProjectUrlError {
+    ProjectUrlError { problem: problem.into() }
 }
 
 /// The longest URL that is read.
@@ -69,9 +69,9 @@ impl ProjectUrl {
     /// # Errors
     /// When it is not `https`, names a user, holds `.` or `..` as segments, encoded slashes or control characters, or does
     /// not end in `/worlds/NAME.wbt`. A query and a fragment, as pages of forges add them, count for nothing.
-    pub fn parse(text: &str) -> Result<Self, NoProject> {
+    pub fn parse(text: &str) -> Result<Self, ProjectUrlError> {
         if text.len() > LONGEST {
-            return Err(no_project(format!("it is longer than {LONGEST} bytes")));
+            return Err(url_error(format!("it is longer than {LONGEST} bytes")));
         }
         let (host, mut segments) = split_url(text.split(['?', '#']).next().unwrap_or_default())?;
         let (repository, reference, kind) = split_repository(&segments)?;
@@ -81,18 +81,18 @@ impl ProjectUrl {
         let inside = segments.get(reference..).unwrap_or_default();
         let world = match inside {
             [.., folder, world] if folder == "worlds" => world,
-            _ => return Err(no_project("missing worlds folder: it does not end in /worlds/NAME.wbt")),
+            _ => return Err(url_error("missing worlds folder: it does not end in /worlds/NAME.wbt")),
         };
         let is_world =
             world.len() > 4 && world.get(world.len() - 4..).is_some_and(|end| end.eq_ignore_ascii_case(".wbt"));
         if !is_world {
-            return Err(no_project(format!("missing world file: {world:?} is no world file")));
+            return Err(url_error(format!("missing world file: {world:?} is no world file")));
         }
         if inside.len() < 3 {
-            return Err(no_project("it names no branch or tag"));
+            return Err(url_error("it names no branch or tag"));
         }
         if inside.iter().any(|segment| segment.eq_ignore_ascii_case(".git")) {
-            return Err(no_project("a folder is called .git"));
+            return Err(url_error("a folder is called .git"));
         }
         let owner = owner(&host, &segments);
         Ok(Self { host, segments, repository, reference, kind, owner })
@@ -102,9 +102,9 @@ impl ProjectUrl {
     ///
     /// # Errors
     /// When that is no URL of a repository.
-    pub fn in_repository(&self, url: &str) -> Result<Self, NoProject> {
+    pub fn in_repository(&self, url: &str) -> Result<Self, ProjectUrlError> {
         let (host, mut segments) = split_url(url)?;
-        let name = segments.last_mut().ok_or_else(|| no_project("it names no repository"))?;
+        let name = segments.last_mut().ok_or_else(|| url_error("it names no repository"))?;
         *name = without_git(name)?;
         let repository = segments.len();
         let reference = repository + self.reference.saturating_sub(self.repository);
@@ -182,15 +182,15 @@ pub(super) fn owner(host: &str, segments: &[String]) -> u64 {
 }
 
 /// A repository's name without the `.git` that git may add to it: both mean the same repository.
-pub(super) fn without_git(name: &str) -> Result<String, NoProject> {
+pub(super) fn without_git(name: &str) -> Result<String, ProjectUrlError> {
     let plain = name.get(name.len().saturating_sub(4)..).filter(|end| end.eq_ignore_ascii_case(".git"));
     let plain = plain.and_then(|end| name.get(..name.len() - end.len())).unwrap_or(name);
     if plain.is_empty() {
-        return Err(no_project("it names no repository"));
+        return Err(url_error("it names no repository"));
     }
     // git would find the same repository by this name, and who blocks it would not.
     if plain.len() < name.len() && plain.to_ascii_lowercase().ends_with(".git") {
-        return Err(no_project(format!("the repository's name {name:?} ends in .git more than once")));
+        return Err(url_error(format!("the repository's name {name:?} ends in .git more than once")));
     }
     Ok(plain.to_owned())
 }
@@ -200,20 +200,20 @@ pub(super) fn without_git(name: &str) -> Result<String, NoProject> {
 ///
 /// # Errors
 /// See [`ProjectUrl::parse`].
-pub(super) fn split_url(text: &str) -> Result<(String, Vec<String>), NoProject> {
+pub(super) fn split_url(text: &str) -> Result<(String, Vec<String>), ProjectUrlError> {
     if text.len() > LONGEST {
-        return Err(no_project(format!("it is longer than {LONGEST} bytes")));
+        return Err(url_error(format!("it is longer than {LONGEST} bytes")));
     }
     if text.chars().any(|letter| letter.is_control() || letter == '\\') {
-        return Err(no_project("it holds a backslash or a control character"));
+        return Err(url_error("it holds a backslash or a control character"));
     }
     let Some(rest) = text.get(..8).filter(|scheme| scheme.eq_ignore_ascii_case("https://")).and_then(|_| text.get(8..))
     else {
-        return Err(no_project("it does not begin with https://"));
+        return Err(url_error("it does not begin with https://"));
     };
     let (authority, path) = rest.split_once('/').unwrap_or((rest, ""));
     if path.contains(['?', '#']) {
-        return Err(no_project("it holds ? or #"));
+        return Err(url_error("it holds ? or #"));
     }
     let host = parse_host(authority)?;
     if path.is_empty() {
@@ -223,40 +223,38 @@ pub(super) fn split_url(text: &str) -> Result<(String, Vec<String>), NoProject> 
     Ok((host, segments))
 }
 
-fn parse_host(authority: &str) -> Result<String, NoProject> {
+fn parse_host(authority: &str) -> Result<String, ProjectUrlError> {
     if authority.contains('@') {
-        return Err(no_project("it names a user"));
+        return Err(url_error("it names a user"));
     }
     let parsed = url::Url::parse(&format!("https://{authority}/"))
-        .map_err(|error| no_project(format!("its host {authority:?} can't be read ({error})")))?;
+        .map_err(|error| url_error(format!("its host {authority:?} can't be read ({error})")))?;
     let host = parsed.host_str().unwrap_or_default();
     let is_label = |label: &str| {
         let mut letters = label.chars();
         !label.starts_with('-') && letters.all(|letter| letter.is_ascii_alphanumeric() || "-_".contains(letter))
     };
     if matches!(parsed.host(), Some(url::Host::Domain(name)) if !name.split('.').all(is_label)) {
-        return Err(no_project(format!("its host {authority:?} is not the name of a host")));
+        return Err(url_error(format!("its host {authority:?} is not the name of a host")));
     }
     let host = if host == "www.github.com" { "github.com" } else { host }.to_owned();
     Ok(parsed.port().map_or(host.clone(), |port| format!("{host}:{port}")))
 }
 
-fn decode_segment(raw: &str) -> Result<String, NoProject> {
-    let segment = percent_decode_str(raw)
-        .decode_utf8()
-        .map_err(|_| no_project(format!("{raw:?} is no UTF-8 text")))?
-        .into_owned();
+fn decode_segment(raw: &str) -> Result<String, ProjectUrlError> {
+    let segment =
+        percent_decode_str(raw).decode_utf8().map_err(|_| url_error(format!("{raw:?} is no UTF-8 text")))?.into_owned();
     if segment.is_empty() || segment == "." || segment == ".." {
-        return Err(no_project("its path holds an empty segment, . or .."));
+        return Err(url_error("its path holds an empty segment, . or .."));
     }
     if segment.chars().any(|letter| letter.is_control() || letter == '/' || letter == '\\') {
-        return Err(no_project(format!("{raw:?} holds an encoded slash or control character")));
+        return Err(url_error(format!("{raw:?} holds an encoded slash or control character")));
     }
     Ok(segment)
 }
 
 /// Finds where the repository ends and where the reference begins.
-pub(super) fn split_repository(segments: &[String]) -> Result<(usize, usize, RefKind), NoProject> {
+pub(super) fn split_repository(segments: &[String]) -> Result<(usize, usize, RefKind), ProjectUrlError> {
     let words: Vec<&str> = segments.iter().map(String::as_str).collect();
     if let Some(dash) = words.iter().position(|word| *word == "-")
         && dash >= 2
@@ -270,9 +268,9 @@ pub(super) fn split_repository(segments: &[String]) -> Result<(usize, usize, Ref
         [_, _, "src", "tag", ..] => Ok((2, 4, RefKind::Tag)),
         [_, _, "src", "commit", ..] => Ok((2, 4, RefKind::Commit)),
         [_, _, other, ..] => {
-            Err(no_project(format!("missing blob or tree after the repository, where {other:?} stands")))
+            Err(url_error(format!("missing blob or tree after the repository, where {other:?} stands")))
         }
-        _ => Err(no_project("it names no repository")),
+        _ => Err(url_error("it names no repository")),
     }
 }
 

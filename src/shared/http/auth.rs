@@ -13,8 +13,8 @@ use governor::state::keyed::HashMapStateStore;
 use governor::{Quota, RateLimiter};
 use subtle::ConstantTimeEq;
 
-use super::paths::{refuse_other_sites, retry_after};
 use super::peer::Peer;
+use super::routing::{reject_cross_site, retry_after};
 use crate::shared::config::Secret;
 
 /// How many passwords an address may send in a burst: 30.
@@ -77,7 +77,7 @@ impl BasicAuth {
 /// Refuses a request for an action unless it brings the password and no page of another site has made it. Without a
 /// password in the configuration there are no actions.
 pub fn refuse_action(auth: Option<&BasicAuth>, request: &HttpRequest, peer: Peer) -> Option<HttpResponse> {
-    if let Some(refusal) = refuse_other_sites(request) {
+    if let Some(refusal) = reject_cross_site(request) {
         return Some(refusal);
     }
     let Some(auth) = auth else {

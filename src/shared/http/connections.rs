@@ -9,12 +9,12 @@ use actix_web::http::StatusCode;
 use parking_lot::Mutex;
 
 use super::address_quota::share;
-use super::paths::retry_after;
 use super::peer::Peer;
+use super::routing::retry_after;
 
 /// What is counted. Each has its own limits.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub enum Kind {
+pub enum ConnectionKind {
     /// A TCP connection, whatever is sent on it.
     Tcp,
     /// The WebSocket of a web client.
@@ -36,7 +36,7 @@ const MAX_PAGES: usize = 1000;
 
 /// Counts the open connections of a server. Clones share their counts.
 #[derive(Debug, Clone)]
-pub struct Connections {
+pub struct ConnectionLimiter {
     max_tcp: usize,
     max_clients: usize,
     /// How many web clients an address may have.
@@ -46,21 +46,21 @@ pub struct Connections {
 
 #[derive(Debug, Default)]
 struct Open {
-    all: HashMap<Kind, usize>,
-    by_address: HashMap<(Kind, IpAddr), usize>,
+    all: HashMap<ConnectionKind, usize>,
+    by_address: HashMap<(ConnectionKind, IpAddr), usize>,
 }
 
 /// One connection that is counted until this is dropped.
 #[derive(Debug)]
 pub struct ConnectionPermit {
-    kind: Kind,
+    kind: ConnectionKind,
     address: Option<IpAddr>,
     open: Arc<Mutex<Open>>,
 }
 
 /// Why a connection is refused. The words are for the client.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
-pub enum TooManyConnections {
+pub enum ConnectionLimitError {
     /// The server has too many.
     #[error("Error: too many connections.")]
     InAll,
@@ -69,7 +69,7 @@ pub enum TooManyConnections {
     FromAddress,
 }
 
-impl Connections {
+impl ConnectionLimiter {
     /// Allows `max_tcp` TCP connections and `max_clients` web clients, of which one address may have `per_address`, or a
     /// share where that is not said.
     pub fn new(max_tcp: usize, max_clients: usize, per_address: Option<usize>) -> Self {
@@ -78,7 +78,7 @@ impl Connections {
     }
 
     /// How many connections of a kind are open.
-    pub fn count(&self, kind: Kind) -> usize {
+    pub fn count(&self, kind: ConnectionKind) -> usize {
         self.open.lock().all.get(&kind).copied().unwrap_or_default()
     }
 
@@ -87,27 +87,27 @@ impl Connections {
     ///
     /// # Errors
     /// When the server or the address has too many connections of this kind.
-    pub fn admit(&self, kind: Kind, peer: Peer) -> Result<ConnectionPermit, TooManyConnections> {
+    pub fn admit(&self, kind: ConnectionKind, peer: Peer) -> Result<ConnectionPermit, ConnectionLimitError> {
         let (max, max_per_address) = match kind {
-            Kind::Tcp => {
+            ConnectionKind::Tcp => {
                 let wanted = self.per_address.saturating_mul(TCP_PER_CLIENT);
                 (self.max_tcp, wanted.min(share(self.max_tcp)).max(self.per_address))
             }
-            Kind::Client => (self.max_clients, self.per_address),
-            Kind::Stream => (self.max_clients * STREAMS_PER_CLIENT, self.per_address * STREAMS_PER_CLIENT),
-            Kind::Page => (MAX_PAGES, self.per_address.min(share(MAX_PAGES))),
+            ConnectionKind::Client => (self.max_clients, self.per_address),
+            ConnectionKind::Stream => (self.max_clients * STREAMS_PER_CLIENT, self.per_address * STREAMS_PER_CLIENT),
+            ConnectionKind::Page => (MAX_PAGES, self.per_address.min(share(MAX_PAGES))),
         };
         let address = peer.rate_limit_key();
         let mut open = self.open.lock();
         let Open { all, by_address } = &mut *open;
         let all = all.entry(kind).or_default();
         if *all >= max {
-            return Err(TooManyConnections::InAll);
+            return Err(ConnectionLimitError::InAll);
         }
         if let Some(address) = address {
             let count = by_address.entry((kind, address)).or_default();
             if *count >= max_per_address {
-                return Err(TooManyConnections::FromAddress);
+                return Err(ConnectionLimitError::FromAddress);
             }
             *count += 1;
         }
@@ -135,7 +135,7 @@ impl Drop for ConnectionPermit {
     }
 }
 
-impl TooManyConnections {
+impl ConnectionLimitError {
     /// Returns the response to a client that is refused.
     pub fn answer(self) -> HttpResponse {
         let status = match self {
@@ -156,27 +156,29 @@ mod tests {
 
     #[test]
     fn connections_are_counted_in_all_and_per_address() {
-        let connections = Connections::new(9, 4, Some(2));
-        let admit = |peer| connections.admit(Kind::Client, peer);
+        let connections = ConnectionLimiter::new(9, 4, Some(2));
+        let admit = |peer| connections.admit(ConnectionKind::Client, peer);
         let first = admit(client("203.0.113.9")).unwrap();
         let _second = admit(client("203.0.113.9")).unwrap();
-        assert_eq!(admit(client("203.0.113.9")).unwrap_err(), TooManyConnections::FromAddress);
+        assert_eq!(admit(client("203.0.113.9")).unwrap_err(), ConnectionLimitError::FromAddress);
         let _other = admit(client("203.0.113.10")).unwrap();
-        assert_eq!(connections.count(Kind::Client), 3);
+        assert_eq!(connections.count(ConnectionKind::Client), 3);
         drop(first);
         let _again = admit(client("203.0.113.9")).unwrap();
         let _proxy = admit(Peer::Proxy("127.0.0.1".parse().unwrap())).unwrap();
-        assert_eq!(admit(client("203.0.113.11")).unwrap_err(), TooManyConnections::InAll);
-        let _page = connections.admit(Kind::Page, client("203.0.113.9")).unwrap();
-        let tcp: Vec<_> = (0..9).map(|_| connections.admit(Kind::Tcp, client("203.0.113.9"))).collect();
+        assert_eq!(admit(client("203.0.113.11")).unwrap_err(), ConnectionLimitError::InAll);
+        let _page = connections.admit(ConnectionKind::Page, client("203.0.113.9")).unwrap();
+        let tcp: Vec<_> = (0..9).map(|_| connections.admit(ConnectionKind::Tcp, client("203.0.113.9"))).collect();
         assert_eq!(tcp.iter().filter(|one| one.is_ok()).count(), 2 * TCP_PER_CLIENT);
     }
 
     #[test]
     fn one_address_leaves_something_to_others() {
         for (tcp, clients) in [(2000, 1000), (21_000, 20_000), (16, 15), (4000, 1000)] {
-            let connections = Connections::new(tcp, clients, None);
-            for (kind, all) in [(Kind::Tcp, tcp), (Kind::Client, clients), (Kind::Page, MAX_PAGES)] {
+            let connections = ConnectionLimiter::new(tcp, clients, None);
+            for (kind, all) in
+                [(ConnectionKind::Tcp, tcp), (ConnectionKind::Client, clients), (ConnectionKind::Page, MAX_PAGES)]
+            {
                 let one: Vec<_> =
                     std::iter::repeat_with(|| connections.admit(kind, client("203.0.113.9"))).take(all).collect();
                 let had = one.iter().filter(|one| one.is_ok()).count();
@@ -188,14 +190,14 @@ mod tests {
 
     #[test]
     fn nothing_is_kept_of_those_who_have_left() {
-        let connections = Connections::new(9, 9, Some(1));
-        let admit = |address| connections.admit(Kind::Client, client(address));
+        let connections = ConnectionLimiter::new(9, 9, Some(1));
+        let admit = |address| connections.admit(ConnectionKind::Client, client(address));
         let permit = admit("2001:db8::1").unwrap();
-        assert_eq!(admit("2001:db8::2").unwrap_err(), TooManyConnections::FromAddress, "the same /64");
+        assert_eq!(admit("2001:db8::2").unwrap_err(), ConnectionLimitError::FromAddress, "the same /64");
         let _neighbour = admit("2001:db8:0:1::1").unwrap();
         assert_eq!(connections.open.lock().by_address.len(), 2);
         drop(permit);
         assert_eq!(connections.open.lock().by_address.len(), 1);
-        assert_eq!(connections.count(Kind::Client), 1);
+        assert_eq!(connections.count(ConnectionKind::Client), 1);
     }
 }

@@ -7,7 +7,7 @@ use crate::shared::domain::PublicAddress;
 
 /// What a page may load and reach: the value of `Content-Security-Policy`.
 #[derive(Debug, Clone)]
-pub struct Policy {
+pub struct ContentSecurityPolicy {
     scripts: Vec<String>,
     styles: Vec<String>,
     pictures: Vec<String>,
@@ -20,7 +20,7 @@ pub struct Policy {
 /// The most hosts that a policy names, so that it fits into a header.
 const MOST_HOSTS: usize = 40;
 
-impl Policy {
+impl ContentSecurityPolicy {
     /// A page that loads nothing but what its own server has, and no script or style that stands in the page itself.
     pub fn own() -> Self {
         let own = || vec!["'self'".to_owned()];
@@ -153,7 +153,7 @@ pub fn width(percent: &f64) -> String {
 }
 
 /// Answers with a page.
-pub fn html(page: Result<String, askama::Error>, policy: &Policy) -> HttpResponse {
+pub fn html(page: Result<String, askama::Error>, policy: &ContentSecurityPolicy) -> HttpResponse {
     match page {
         Ok(page) => HttpResponse::Ok()
             .insert_header((header::CONTENT_SECURITY_POLICY, policy.text()))
@@ -195,7 +195,7 @@ mod tests {
         let policy = |headers: &[(&'static str, &'static str)]| {
             let request = actix_web::test::TestRequest::default();
             let request = headers.iter().fold(request, |request, header| request.insert_header(*header));
-            Policy::own().own_websocket(&request.to_http_request()).text()
+            ContentSecurityPolicy::own().own_websocket(&request.to_http_request()).text()
         };
         assert!(
             policy(&[("host", "a.example:8443")])
@@ -212,7 +212,11 @@ mod tests {
     #[test]
     fn no_policy_lets_a_page_run_what_stands_in_it() {
         let fleet = vec!["http://a:*".to_owned()];
-        for policy in [Policy::own(), Policy::own().connect(&fleet).frames(), Policy::own().run(&fleet).any_picture()] {
+        for policy in [
+            ContentSecurityPolicy::own(),
+            ContentSecurityPolicy::own().connect(&fleet).frames(),
+            ContentSecurityPolicy::own().run(&fleet).any_picture(),
+        ] {
             assert!(!policy.text().contains("unsafe-inline"), "{}", policy.text());
             assert!(policy.text().starts_with("default-src 'none'; script-src 'self'"), "{}", policy.text());
         }

@@ -21,7 +21,7 @@ use socket2::{Domain, Protocol, Socket, Type};
 use tokio_util::sync::CancellationToken;
 
 use super::client_stream::ClientStream;
-use super::connections::{Connections, Kind};
+use super::connections::{ConnectionKind, ConnectionLimiter};
 use super::peer::TrustedProxies;
 
 /// How many connections may wait to be accepted. The system has a limit of its own, which counts where it is smaller.
@@ -52,7 +52,7 @@ pub fn listen(address: SocketAddr) -> io::Result<TcpListener> {
 
 /// How a server serves its connections.
 #[derive(Debug, Clone)]
-pub struct Options {
+pub struct HttpServerOptions {
     /// Threads that serve connections.
     pub workers: usize,
     /// How many connections a thread serves; further ones wait in the system's queue, where they need no open files.
@@ -70,7 +70,12 @@ pub struct Options {
 ///
 /// # Errors
 /// When the system does not let the port be used.
-pub fn serve<F, I, S, B>(port: TcpListener, connections: Connections, options: Options, app: F) -> io::Result<Server>
+pub fn serve<F, I, S, B>(
+    port: TcpListener,
+    connections: ConnectionLimiter,
+    options: HttpServerOptions,
+    app: F,
+) -> io::Result<Server>
 where
     F: Fn() -> I + Send + Clone + 'static,
     I: IntoServiceFactory<S, Request>,
@@ -80,7 +85,7 @@ where
     S::Response: Into<Response<B>>,
     B: MessageBody + 'static,
 {
-    let Options { workers, max_per_worker, stop, .. } = options;
+    let HttpServerOptions { workers, max_per_worker, stop, .. } = options;
     let server = Server::build().workers(workers).max_concurrent_connections(max_per_worker);
     let server = server.disable_signals().shutdown_timeout(stop.as_secs());
     // When the server stops, connections that wait for another request end at once.
@@ -102,13 +107,13 @@ where
 /// Counts a connection and sets its options. It is closed at once if its address has too many.
 fn accept(
     tcp: TcpStream,
-    connections: &Connections,
-    options: &Options,
+    connections: &ConnectionLimiter,
+    options: &HttpServerOptions,
     stopping: &CancellationToken,
 ) -> Result<(ClientStream, Option<SocketAddr>), DispatchError> {
     let address = tcp.peer_addr()?;
     let peer = options.trusted_proxies.of_connection(address.ip());
-    let permit = connections.admit(Kind::Tcp, peer).map_err(|error| {
+    let permit = connections.admit(ConnectionKind::Tcp, peer).map_err(|error| {
         log::debug!("{address}: {error}");
         io::Error::other(error)
     })?;

@@ -2,12 +2,12 @@
 
 mod app_error;
 mod logging;
-pub mod notify;
 mod open_files;
 pub mod permanent;
 mod pid_file;
 mod rotated_file;
-mod shutdown;
+pub mod service_manager;
+mod signals;
 pub mod start;
 mod supervisor;
 mod timestamp;
@@ -16,6 +16,6 @@ pub use app_error::AppError;
 pub use logging::LogTarget;
 pub use open_files::raise_open_files;
 pub use rotated_file::RotatedFile;
-pub use shutdown::{Phase, Request, Signals, closing};
+pub use signals::{Phase, ServerCommand, Signals, closing};
 pub use supervisor::{Supervisor, TooManyPanics};
 pub use timestamp::{read_timestamp, seconds_since_1970, timestamp, timestamp_in_milliseconds};

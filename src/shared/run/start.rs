@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use super::logging::{self, LogTarget};
-use super::{notify, pid_file};
+use super::{pid_file, service_manager};
 use crate::shared::config::{self, Configuration, LoadedConfig};
 use crate::shared::text::one_line;
 
@@ -17,7 +17,7 @@ pub const WRONG_CONFIGURATION: u8 = 2;
 
 /// The options that both programs have.
 #[derive(clap::Args)]
-pub struct Options {
+pub struct CommonArgs {
     /// Print the effective configuration, and on the simulation server what the machine lacks, and end
     #[arg(long)]
     pub check: bool,
@@ -59,7 +59,7 @@ pub fn check<C: Configuration>(loaded: &LoadedConfig<C>) -> ExitCode {
 /// Starts the log, writes the process id where that is asked for, and runs a server to its end.
 pub fn serve<E: std::error::Error>(
     target: LogTarget<'_>,
-    options: &Options,
+    options: &CommonArgs,
     warnings: &[String],
     server: impl Future<Output = Result<(), E>>,
 ) -> ExitCode {
@@ -93,7 +93,7 @@ pub fn announce(server: &str, http: &str, websocket: &str, port: u16) {
     log::info!("{server} {} listens on port {port}: {http}", env!("CARGO_PKG_VERSION"));
     // The reader may have gone.
     writeln!(std::io::stdout(), "{server:<18} {http}/monitor   {websocket}").ok();
-    notify::ready(port);
+    service_manager::ready(port);
 }
 
 fn failed(why: &str) -> ExitCode {

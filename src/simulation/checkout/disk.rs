@@ -5,7 +5,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use crate::simulation::process::folder_size::{self, FolderSize};
+use crate::simulation::process::disk_usage::{self, DiskUsage};
 use crate::simulation::process::remove_tree;
 
 /// Time between two looks at how much was written.
@@ -98,16 +98,16 @@ pub async fn outgrown(folders: Vec<Growing>) {
 /// What everything below a folder takes, each file and folder at least what a name takes of a disk. What nobody can look
 /// into does not count.
 pub fn room_of(folder: &Path) -> u64 {
-    sum(folder, |about| folder_size::length(about).max(folder_size::SMALLEST))
+    sum(folder, |about| disk_usage::length(about).max(disk_usage::SMALLEST))
 }
 
 /// The bytes of all files below a folder.
 pub fn size_of(folder: &Path) -> u64 {
-    sum(folder, folder_size::length)
+    sum(folder, disk_usage::length)
 }
 
 fn sum(folder: &Path, measure: fn(&fs::Metadata) -> u64) -> u64 {
-    let mut size = FolderSize::new(measure, u64::MAX);
+    let mut size = DiskUsage::new(measure, u64::MAX);
     size.add_folder(folder).ok();
     size.total()
 }

@@ -2,34 +2,34 @@
 //!
 //! To change how long a fetch may take, or how much it may bring, see [`limits`]; what git obeys, see [`git`].
 
-mod cache;
 mod cache_dir;
-mod checkout;
-mod copy;
+mod canonical_remotes;
+mod checkout_error;
+mod checkout_limits;
+mod checkout_service;
+mod commit_resolver;
 mod disk;
-mod error;
-mod finder;
+mod eviction_signal;
+mod file_restore;
 mod git;
 mod git_error;
-mod growth;
 mod lfs;
-mod limits;
 mod mirrors;
 mod project;
 mod redirect;
+mod remote_query;
 mod repository;
-mod restored;
+mod repository_cache;
 mod revision;
-mod search;
 mod single_flight;
-mod spellings;
 mod steps;
+mod work_tree;
 mod world_file;
 
 pub use cache_dir::CacheDir;
-pub use checkout::{Checkouts, Progress};
-pub use error::CheckoutError;
-pub use limits::Limits;
+pub use checkout_error::CheckoutError;
+pub use checkout_limits::CheckoutLimits;
+pub use checkout_service::{CheckoutService, Progress};
 pub use mirrors::Mirrors;
 pub use project::Project;
 pub use single_flight::SingleFlight;

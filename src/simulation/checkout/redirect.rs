@@ -7,11 +7,11 @@
 
 use url::Url;
 
-use super::error::CheckoutError;
+use super::checkout_error::CheckoutError;
 use super::git::{Call, Git};
 use super::mirrors::{Mirrors, Remote};
 use super::repository::Repository;
-use crate::shared::domain::{Load, ProjectUrl, Rules};
+use crate::shared::domain::{AdmissionRules, Load, ProjectUrl};
 
 /// How many redirects are followed for a world.
 pub const MOST: usize = 5;
@@ -26,7 +26,7 @@ const FIRST_QUESTION: &str = "/info/refs";
 pub async fn follow(
     git: &Git,
     repository: &Repository,
-    (mirrors, rules): (&Mirrors, &Rules),
+    (mirrors, rules): (&Mirrors, &AdmissionRules),
     world: &ProjectUrl,
 ) -> Result<(ProjectUrl, Remote), CheckoutError> {
     let target = match location(git, repository).await {
@@ -64,7 +64,7 @@ async fn location(git: &Git, repository: &Repository) -> Option<String> {
 /// The world in the repository at this location, or why it may not be taken from there, in words for the client.
 fn target(
     mirrors: &Mirrors,
-    rules: &Rules,
+    rules: &AdmissionRules,
     world: &ProjectUrl,
     location: &str,
 ) -> Result<(ProjectUrl, Remote), String> {
@@ -102,7 +102,7 @@ mod tests {
             |texts: &[&str]| texts.iter().map(|text| UrlPrefix::try_from((*text).to_owned()).unwrap()).collect();
         let allowed = prefixes(&["https://github.com/lab", "https://git.lab"]);
         let blocked = prefixes(&["https://github.com/lab/secret"]);
-        let rules = Rules { allowed, blocked, docker: false, share_idle_time: 0.0 };
+        let rules = AdmissionRules { allowed, blocked, docker: false, share_idle_time: 0.0 };
         let old = "https://github.com/lab/old/blob/main/p/worlds/a.wbt";
         let mirrored = "https://git.lab/g/s/old/-/blob/main/worlds/a.wbt";
         let table = [

@@ -9,11 +9,11 @@ use std::time::Instant;
 use parking_lot::Mutex;
 use tokio::sync::{AcquireError, OwnedMutexGuard, Semaphore, SemaphorePermit, watch};
 
+use super::checkout_limits::CheckoutLimits;
 use super::disk::{blocking, packed, received, remove_all, remove_leftovers};
+use super::eviction_signal::EvictionSignal;
 use super::git::{Call, Git, MOST_MEMORY};
 use super::git_error::GitError;
-use super::growth::Growth;
-use super::limits::Limits;
 use super::mirrors::Remote;
 use super::revision::{self, FetchRequest};
 use super::single_flight::SingleFlight;
@@ -25,8 +25,8 @@ pub struct Repository {
     /// Where it is fetched from. Forges have several spellings of it.
     remote: Mutex<Arc<Remote>>,
     git: Arc<Git>,
-    limits: Limits,
-    growth: Arc<Growth>,
+    limits: CheckoutLimits,
+    growth: Arc<EvictionSignal>,
     /// Held by whoever changes the repository.
     lock: Arc<tokio::sync::Mutex<()>>,
     /// Held by whoever asks the remote what it has.
@@ -42,7 +42,13 @@ const QUESTIONS: usize = 4;
 
 impl Repository {
     /// The repository at `path`, which need not exist yet, for commits of `remote`.
-    pub fn new(path: PathBuf, remote: Remote, git: Arc<Git>, limits: Limits, growth: Arc<Growth>) -> Self {
+    pub fn new(
+        path: PathBuf,
+        remote: Remote,
+        git: Arc<Git>,
+        limits: CheckoutLimits,
+        growth: Arc<EvictionSignal>,
+    ) -> Self {
         let (lock, fetches, made) = (Arc::default(), SingleFlight::default(), Mutex::default());
         let asking = Semaphore::new(QUESTIONS);
         Self { path, remote: Mutex::new(Arc::new(remote)), git, limits, growth, lock, asking, fetches, made }
@@ -166,7 +172,7 @@ impl Repository {
         let this = Arc::clone(self);
         tokio::spawn(async move {
             let _guard = guard;
-            let call = Call { time: this.limits.patience(), ..this.call(&["gc", "--auto", "--quiet"]) };
+            let call = Call { time: this.limits.stall_timeout(), ..this.call(&["gc", "--auto", "--quiet"]) };
             if let Err(error) = this.git.run(call, |_| ()).await {
                 log::warn!("{} can't be packed: {error}", this.path.display());
             }
@@ -200,7 +206,7 @@ impl Drop for Repository {
 }
 
 /// Says in the end, whichever that is, that the cache has grown.
-struct Grown<'cache>(&'cache Growth);
+struct Grown<'cache>(&'cache EvictionSignal);
 
 impl Drop for Grown<'_> {
     fn drop(&mut self) {

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 /// Why a file is no world that can be opened. Its words are for the client.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub enum NoWorld {
+pub enum WorldFileError {
     /// There is no such file.
     #[error("{0} does not exist")]
     Missing(String),
@@ -36,16 +36,16 @@ impl WorldFile {
     ///
     /// # Errors
     /// When it is no world inside of that folder.
-    pub fn open(root: &Path, path: &Path) -> Result<Self, NoWorld> {
+    pub fn open(root: &Path, path: &Path) -> Result<Self, WorldFileError> {
         let name = || path.file_name().unwrap_or_default().to_string_lossy().into_owned();
-        let missing = |_| NoWorld::Missing(name());
+        let missing = |_| WorldFileError::Missing(name());
         let root = root.canonicalize().map_err(missing)?;
         let path = path.canonicalize().map_err(missing)?;
         if !path.starts_with(&root) {
-            return Err(NoWorld::Outside(name()));
+            return Err(WorldFileError::Outside(name()));
         }
         if !path.is_file() {
-            return Err(NoWorld::Missing(name()));
+            return Err(WorldFileError::Missing(name()));
         }
         let file = std::fs::File::open(&path).map_err(missing)?;
         let mut line = Vec::new();
@@ -53,7 +53,7 @@ impl WorldFile {
         let line = String::from_utf8_lossy(&line).trim().to_owned();
         match line.split_whitespace().collect::<Vec<_>>().as_slice() {
             ["#VRML_SIM", version, "utf8", ..] => Ok(Self { version: (*version).to_owned(), path }),
-            _ => Err(NoWorld::Header { name: name(), found: line }),
+            _ => Err(WorldFileError::Header { name: name(), found: line }),
         }
     }
 }
@@ -85,11 +85,11 @@ mod tests {
         assert_eq!(open("good.wbt").unwrap(), "R2025a");
         assert_eq!(open("windows.wbt").unwrap(), "R2023b");
         assert_eq!(open("in.wbt").unwrap(), "R2025a");
-        assert_eq!(open("out.wbt"), Err(NoWorld::Outside("out.wbt".to_owned())));
-        assert_eq!(open("passwd.wbt"), Err(NoWorld::Outside("passwd.wbt".to_owned())));
-        assert_eq!(open("missing.wbt"), Err(NoWorld::Missing("missing.wbt".to_owned())));
-        assert_eq!(open("none.wbt"), Err(NoWorld::Missing("none.wbt".to_owned())));
-        assert!(matches!(open("bad.wbt"), Err(NoWorld::Header { .. })));
-        assert!(matches!(open("empty.wbt"), Err(NoWorld::Header { .. })));
+        assert_eq!(open("out.wbt"), Err(WorldFileError::Outside("out.wbt".to_owned())));
+        assert_eq!(open("passwd.wbt"), Err(WorldFileError::Outside("passwd.wbt".to_owned())));
+        assert_eq!(open("missing.wbt"), Err(WorldFileError::Missing("missing.wbt".to_owned())));
+        assert_eq!(open("none.wbt"), Err(WorldFileError::Missing("none.wbt".to_owned())));
+        assert!(matches!(open("bad.wbt"), Err(WorldFileError::Header { .. })));
+        assert!(matches!(open("empty.wbt"), Err(WorldFileError::Header { .. })));
     }
 }

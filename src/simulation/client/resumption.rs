@@ -6,19 +6,19 @@ use std::time::{Duration, Instant};
 use actix::prelude::*;
 
 use crate::shared::run::seconds_since_1970;
-use crate::simulation::places::{Move, NoPlace, Places, Report, Ticket, Update};
 use crate::simulation::protocol;
 use crate::simulation::sessions::{Registration, Token};
 use crate::simulation::simulation_id::SimulationId;
-use crate::simulation::snapshot::Change;
+use crate::simulation::slots::{Move, Report, SlotError, SlotLease, SlotPool, UpdateSimulation};
+use crate::simulation::snapshot::SimulationChange;
 
 /// How a client comes back.
 pub struct Resumption {
     registration: Registration,
     /// The one that the client was given last; none before it could come back.
     token: Option<Token>,
-    ticket: SimulationId,
-    places: Addr<Places>,
+    simulation: SimulationId,
+    slots: Addr<SlotPool>,
     launched: Instant,
     /// The texts that its project asks for.
     texts: Vec<String>,
@@ -39,12 +39,12 @@ pub fn seconds_until(then: Instant) -> u64 {
 impl Resumption {
     /// For a session that can be found, and holds this ticket.
     #[must_use]
-    pub fn new(registration: Registration, ticket: &Ticket, places: Addr<Places>) -> Self {
+    pub fn new(registration: Registration, lease: &SlotLease, slots: Addr<SlotPool>) -> Self {
         Self {
             registration,
             token: None,
-            ticket: ticket.id(),
-            places,
+            simulation: lease.id(),
+            slots,
             launched: Instant::now(),
             texts: Vec::new(),
             url: String::new(),
@@ -99,13 +99,13 @@ impl Resumption {
     pub fn move_to(
         &self,
         address: Option<IpAddr>,
-    ) -> impl Future<Output = Result<Result<(), NoPlace>, MailboxError>> + use<> {
-        self.places.send(Move { id: self.ticket, address })
+    ) -> impl Future<Output = Result<Result<(), SlotError>, MailboxError>> + use<> {
+        self.slots.send(Move { id: self.simulation, address })
     }
 
     /// Has its place count for this address again.
     pub fn stay_at(&self, address: Option<IpAddr>) {
-        self.places.do_send(Move { id: self.ticket, address });
+        self.slots.do_send(Move { id: self.simulation, address });
     }
 
     /// The simulation has ended, and its client may ask why. The first reason counts.
@@ -125,7 +125,7 @@ impl Resumption {
     pub fn back(&mut self, timeout: u64, absence: Duration) -> Vec<String> {
         self.show(None);
         let left = timeout.saturating_sub(self.launched.elapsed().as_secs());
-        let mut texts = vec![protocol::session(self.ticket), protocol::shutdown_timeout(left)];
+        let mut texts = vec![protocol::session(self.simulation), protocol::shutdown_timeout(left)];
         texts.extend(self.texts.iter().cloned());
         texts.push(protocol::webots(&self.url));
         texts.extend(self.offer(absence));
@@ -139,6 +139,6 @@ impl Resumption {
     }
 
     fn show(&self, until: Option<u64>) {
-        self.places.do_send(Update(self.ticket, Report::Change(Change::Away(until))));
+        self.slots.do_send(UpdateSimulation(self.simulation, Report::Change(SimulationChange::Away(until))));
     }
 }

@@ -17,12 +17,12 @@ use crate::shared::http::Peer;
 use crate::shared::run::closing;
 use crate::simulation::checkout::Progress;
 use crate::simulation::ends::EndReason;
-use crate::simulation::places::PlaceEvent;
 use crate::simulation::protocol::{self, Mode};
 use crate::simulation::sessions::{Attachment, FromClient, Said, ToClient};
+use crate::simulation::slots::{Slot, SlotEvent};
 use crate::simulation::state::AppState;
 use crate::simulation::streams::Watched;
-use crate::simulation::webots::{Exit, Keep, RestoreController, WebotsEvent};
+use crate::simulation::webots::{Keep, ResetController, WebotsEvent, WebotsExit};
 use crate::simulation::who::Who;
 
 /// The actor.
@@ -117,7 +117,7 @@ impl Session {
             log::warn!("{}: asks to reset a controller while another is being reset; ignored", self.name());
             return;
         }
-        let restored = webots.send(RestoreController(file.clone())).into_actor(self);
+        let restored = webots.send(ResetController(file.clone())).into_actor(self);
         restored
             .map(move |answer, this, _| {
                 this.restoring = false;
@@ -131,7 +131,7 @@ impl Session {
             .spawn(ctx);
     }
 
-    fn exited(&mut self, Exit { clean, own, why }: &Exit, ctx: &mut Context<Self>) {
+    fn exited(&mut self, WebotsExit { clean, own, why }: &WebotsExit, ctx: &mut Context<Self>) {
         if *own {
             let fail = if self.start.is_open() { Self::fail_own } else { Self::refer };
             return fail(self, Outcome::NoWebots, why, ctx);
@@ -202,31 +202,31 @@ impl Handler<FromClient> for Session {
     }
 }
 
-impl Handler<PlaceEvent> for Session {
+impl Handler<SlotEvent> for Session {
     type Result = ();
 
-    fn handle(&mut self, event: PlaceEvent, ctx: &mut Self::Context) {
+    fn handle(&mut self, event: SlotEvent, ctx: &mut Self::Context) {
         match (event, std::mem::replace(&mut self.state, State::Over)) {
-            (PlaceEvent::Granted(port), State::Waiting { request, ticket }) => {
-                self.check_out(request, (ticket, port), ctx);
+            (SlotEvent::Granted(port), State::Waiting { request, lease }) => {
+                self.check_out(request, Slot { lease, port }, ctx);
             }
-            (PlaceEvent::Refused(full), State::Waiting { .. }) => {
+            (SlotEvent::Rejected(full), State::Waiting { .. }) => {
                 self.fail_start(Outcome::Full, &full.to_string(), ctx);
             }
-            (PlaceEvent::Ahead(ahead), state @ State::Waiting { .. }) => {
+            (SlotEvent::Queued(ahead), state @ State::Waiting { .. }) => {
                 self.state = state;
                 for text in protocol::queue(ahead) {
                     self.text(text);
                 }
             }
-            (PlaceEvent::AwayTooLong, state @ State::Launched(_)) if self.client.is_none() => {
+            (SlotEvent::AwayTooLong, state @ State::Launched(_)) if self.client.is_none() => {
                 let why = "Too many simulations waited for their clients, and this one had waited longest";
                 log::info!("{}: {why}", self.name());
                 state.end(EndReason::Left, why);
                 self.finish(protocol::error(why), why, CloseCode::Normal, ctx);
             }
-            (PlaceEvent::Stopped(_), State::Over) => {}
-            (PlaceEvent::Stopped(why), state) => {
+            (SlotEvent::Stopped(_), State::Over) => {}
+            (SlotEvent::Stopped(why), state) => {
                 state.end(EndReason::Administrator, "The administrator has stopped it");
                 self.finish(protocol::error(&why), &why, CloseCode::Normal, ctx);
             }

@@ -13,10 +13,10 @@ use super::state::{StartRequest, State, WebotsHandle};
 use crate::simulation::checkout::{Progress, Project};
 use crate::simulation::ends::EndReason;
 use crate::simulation::machine::sensors::Gpu;
-use crate::simulation::places::Ticket;
 use crate::simulation::protocol::{self, Mode};
 use crate::simulation::readiness;
-use crate::simulation::snapshot::Change;
+use crate::simulation::slots::{Slot, SlotLease};
+use crate::simulation::snapshot::SimulationChange;
 use crate::simulation::webots::{LaunchSpec, Webots};
 
 impl Session {
@@ -52,20 +52,21 @@ impl Session {
             Err(why) if self.server.takes_nobody() => return self.refer(Outcome::Refused, &why, ctx),
             Err(why) => return self.fail_start(Outcome::Refused, &why, ctx),
         };
-        let ticket = Ticket::new(&self.server.places, ctx.address().recipient(), &world, (self.peer, self.who.clone()));
-        self.id = format!("{}: ", ticket.id());
-        self.text(protocol::session(ticket.id()));
+        let lease =
+            SlotLease::new(&self.server.slots, ctx.address().recipient(), &world, (self.peer, self.who.clone()));
+        self.id = format!("{}: ", lease.id());
+        self.text(protocol::session(lease.id()));
         log::info!("{}: asks for {world}{}", self.name(), self.who);
-        self.state = State::Waiting { request: StartRequest { world, mode }, ticket };
+        self.state = State::Waiting { request: StartRequest { world, mode }, lease };
     }
 
     pub(super) fn check_out(
         &mut self,
         StartRequest { world, mode }: StartRequest,
-        place: (Ticket, u16),
+        slot: Slot,
         ctx: &mut Context<Self>,
     ) {
-        self.state = State::CheckingOut { mode, place };
+        self.state = State::CheckingOut { mode, slot };
         let instance = match self.server.run.instance() {
             Ok(instance) => instance,
             Err(error) => return self.fail_own(Outcome::NoCheckout, &format!("No room for a project: {error}"), ctx),
@@ -89,18 +90,18 @@ impl Session {
             Ok(program) => program,
             Err(why) => return self.fail_own(Outcome::NoWebots, &why, ctx),
         };
-        let State::CheckingOut { mode, place } = std::mem::replace(&mut self.state, State::Over) else { return };
+        let State::CheckingOut { mode, slot } = std::mem::replace(&mut self.state, State::Over) else { return };
         log::info!("{}: {} is for Webots {}", self.name(), project.world.path.display(), project.world.version);
-        place.0.update(Change::Version(project.world.version.clone()));
+        slot.lease.update(SimulationChange::Version(project.world.version.clone()));
         for warning in &project.warnings {
             self.text(protocol::loading(warning));
         }
         self.text(protocol::loading("webots is starting"));
         if self.resumable && !self.server.config.timing.absence.is_zero() {
             let registration = self.server.sessions.register(ctx.address().recipient());
-            self.resumption = Some(Resumption::new(registration, &place.0, self.server.places.clone()));
+            self.resumption = Some(Resumption::new(registration, &slot.lease, self.server.slots.clone()));
         }
-        let gpu = self.take_gpu(&place.0);
+        let gpu = self.take_gpu(&slot.lease);
         let spec = LaunchSpec {
             config: Arc::clone(&self.server.config),
             containers: self.server.containers.clone(),
@@ -111,21 +112,21 @@ impl Session {
             project: Arc::new(project),
             mode,
             gpu,
-            place,
+            slot,
             streams: Arc::clone(&self.server.streams),
             watched: ctx.address().recipient(),
             events: ctx.address().recipient(),
         };
-        let webots = Webots::start_in_arbiter(self.server.webots_thread(spec.place.1), |_| Webots::new(spec));
+        let webots = Webots::start_in_arbiter(self.server.webots_thread(spec.slot.port), |_| Webots::new(spec));
         self.state = State::Launched(WebotsHandle(webots));
     }
 
     /// Takes a GPU for a simulation, where they are spread over several and one answers.
-    fn take_gpu(&self, ticket: &Ticket) -> Option<Gpu> {
+    fn take_gpu(&self, lease: &SlotLease) -> Option<Gpu> {
         let spread = self.server.spread.as_ref()?;
         let gpu = spread.take(&self.server.readings.borrow().gpus, Instant::now())?;
-        ticket.update(Change::Gpu(gpu.index));
-        ticket.log(log::Level::Info, format!("it gets GPU {}, {}", gpu.index, gpu.name));
+        lease.update(SimulationChange::Gpu(gpu.index));
+        lease.log(log::Level::Info, format!("it gets GPU {}, {}", gpu.index, gpu.name));
         Some(gpu)
     }
 }

@@ -4,8 +4,8 @@ use actix::prelude::*;
 
 use crate::shared::domain::ProjectUrl;
 use crate::simulation::ends::{EndReason, Taken};
-use crate::simulation::places::Ticket;
 use crate::simulation::protocol::Mode;
+use crate::simulation::slots::{Slot, SlotLease};
 use crate::simulation::webots::{Stop, Webots};
 
 /// The life of a simulation, as its session knows it.
@@ -22,14 +22,14 @@ pub enum State {
         /// What was asked for.
         request: StartRequest,
         /// The place in the line.
-        ticket: Ticket,
+        lease: SlotLease,
     },
     /// The project is being checked out; the job ends with the actor.
     CheckingOut {
         /// How it is shown.
         mode: Mode,
         /// The place and its port.
-        place: (Ticket, u16),
+        slot: Slot,
     },
     /// Webots was started.
     Launched(WebotsHandle),
@@ -41,8 +41,8 @@ impl State {
     /// Tells how the simulation ends, before the state is dropped. What Webots has told of its own end comes first.
     pub fn end(&self, reason: EndReason, why: &str) {
         match self {
-            Self::Waiting { ticket, .. } | Self::CheckingOut { place: (ticket, _), .. } => {
-                ticket.end(reason, why, Taken::default());
+            Self::Waiting { lease, .. } | Self::CheckingOut { slot: Slot { lease, .. }, .. } => {
+                lease.end(reason, why, Taken::default());
             }
             Self::Launched(WebotsHandle(webots)) => webots.do_send(Stop(reason)),
             Self::Asked { .. } | Self::Over => {}

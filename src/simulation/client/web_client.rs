@@ -14,7 +14,7 @@ use crate::shared::http::Peer;
 use crate::shared::http::liveness::{self, Liveness};
 use crate::shared::http::websocket::{ClientMessage, MessageReader};
 use crate::shared::run::closing;
-use crate::simulation::protocol::{self, Request};
+use crate::simulation::protocol::{self, ClientRequest};
 use crate::simulation::sessions::{Attachment, Resume, Said, ToClient, Token};
 use crate::simulation::state::AppState;
 use crate::simulation::who::Who;
@@ -96,23 +96,25 @@ impl WebClient {
     }
 
     fn understand(&mut self, text: &str, ctx: &mut Context) {
-        match Request::parse(text) {
-            Ok(Some(Request::Start { .. } | Request::Resume(_))) if !matches!(self.session, Attached::No) => {
+        match ClientRequest::parse(text) {
+            Ok(Some(ClientRequest::Start { .. } | ClientRequest::Resume(_)))
+                if !matches!(self.session, Attached::No) =>
+            {
                 log::warn!("client {}: asks for a second simulation on one connection; ignored", self.peer);
             }
-            Ok(Some(Request::Start { url, mode, resumable, name })) => {
+            Ok(Some(ClientRequest::Start { url, mode, resumable, name })) => {
                 let server = Arc::clone(&self.server);
                 let client = ctx.address().recipient();
                 let who = Who::new(self.user.as_deref(), name.as_deref());
                 self.session = Attached::To(Session::open(server, (self.peer, who), client, (url, mode, resumable)));
             }
-            Ok(Some(Request::Resume(token))) => self.resume(token, ctx),
-            Ok(Some(Request::Keep)) => {
+            Ok(Some(ClientRequest::Resume(token))) => self.resume(token, ctx),
+            Ok(Some(ClientRequest::Keep)) => {
                 if let Attached::To(session) = &self.session {
                     session.say(Said::Keep);
                 }
             }
-            Ok(Some(Request::ResetController(file))) => match &self.session {
+            Ok(Some(ClientRequest::ResetController(file))) => match &self.session {
                 Attached::To(session) => session.say(Said::ResetController(file)),
                 Attached::No | Attached::Coming | Attached::Over => ctx.text(protocol::nothing_to_reset()),
             },

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::shared::config::{ExpandedPath, InvalidValue, one_or_many, whole};
+use crate::shared::config::{ExpandedPath, InvalidValueError, one_or_many, whole};
 
 /// How simulations run in containers.
 #[derive(Debug, Clone, Serialize, Deserialize)]
@@ -74,7 +74,7 @@ pub const EDITOR_PORT: u16 = 500;
 ///
 /// # Errors
 /// When there are too many places for that.
-pub fn check_ports(in_containers: bool, port: u16, places: u16) -> Result<(), InvalidValue> {
+pub fn check_ports(in_containers: bool, port: u16, places: u16) -> Result<(), InvalidValueError> {
     let last = u32::from(port) + u32::from(places) + u32::from(EDITOR_PORT);
     if !in_containers || (places <= EDITOR_PORT && u16::try_from(last).is_ok()) {
         return Ok(());
@@ -83,7 +83,7 @@ pub fn check_ports(in_containers: bool, port: u16, places: u16) -> Result<(), In
         "{places} places above port {port} don't go together with containers, whose editors have the port of their Webots \
          + {EDITOR_PORT}; allowed are up to {EDITOR_PORT} places, and editors up to port 65535"
     );
-    Err(InvalidValue { key: "maxConnections", problem })
+    Err(InvalidValueError { key: "maxConnections", problem })
 }
 
 impl Default for ContainerSettings {

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use serde::de::Error as _;
 use serde::{Deserialize, Deserializer, Serialize};
 
-use crate::shared::config::{ExpandedPath, InvalidValue, one_or_many};
+use crate::shared::config::{ExpandedPath, InvalidValueError, one_or_many};
 
 /// What each sandbox has by itself.
 const OF_EACH: [&str; 3] = ["/", "/proc", "/dev"];
@@ -13,7 +13,7 @@ const OF_EACH: [&str; 3] = ["/", "/proc", "/dev"];
 /// The key `isolation`: at which level simulations are started.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
-pub enum Isolation {
+pub enum IsolationSetting {
     /// As the server's own user, in a process group.
     None,
     /// By bubblewrap, or not at all.
@@ -25,17 +25,17 @@ pub enum Isolation {
     Container,
 }
 
-impl Isolation {
+impl IsolationSetting {
     /// The level that both keys ask for: `docker` is the original's key for containers.
     ///
     /// # Errors
     /// When they contradict each other.
-    pub fn with_docker(self, docker: bool) -> Result<Self, InvalidValue> {
+    pub fn with_docker(self, docker: bool) -> Result<Self, InvalidValueError> {
         match self {
             Self::Auto if docker => Ok(Self::Container),
             Self::None | Self::Sandbox if docker => {
                 let problem = "true asks for containers, but isolation for another level; remove one of them";
-                Err(InvalidValue { key: "docker", problem: problem.to_owned() })
+                Err(InvalidValueError { key: "docker", problem: problem.to_owned() })
             }
             level => Ok(level),
         }
@@ -46,13 +46,13 @@ impl Isolation {
 ///
 /// # Errors
 /// When the value is no level.
-pub fn level<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Isolation, D::Error> {
+pub fn level<'de, D: Deserializer<'de>>(deserializer: D) -> Result<IsolationSetting, D::Error> {
     let value = serde_json::Value::deserialize(deserializer)?;
     if !value.is_string() {
         let allowed = "\"auto\", \"sandbox\", \"none\" and \"container\"";
         return Err(D::Error::custom(format!("{value} is no level; allowed are {allowed}")));
     }
-    Isolation::deserialize(value).map_err(D::Error::custom)
+    IsolationSetting::deserialize(value).map_err(D::Error::custom)
 }
 
 /// The key `sandbox.network`: which network the programs in a sandbox have.
@@ -97,12 +97,12 @@ impl SandboxFolders {
     ///
     /// # Errors
     /// When a folder is all of the system, or one that each sandbox has by itself.
-    pub fn check<'own>(&self, own: impl Iterator<Item = &'own Path>) -> Result<Vec<String>, InvalidValue> {
+    pub fn check<'own>(&self, own: impl Iterator<Item = &'own Path>) -> Result<Vec<String>, InvalidValueError> {
         for (key, paths) in [("sandbox.readable", &self.readable), ("sandbox.writable", &self.writable)] {
             if let Some(path) = paths.iter().find(|path| OF_EACH.iter().any(|one| real(&path.0) == Path::new(one))) {
                 let path = path.0.display();
                 let problem = format!("\"{path}\" can't be shown: each sandbox has its own; allowed is what is inside");
-                return Err(InvalidValue { key, problem });
+                return Err(InvalidValueError { key, problem });
             }
         }
         let writable: Vec<PathBuf> = self.writable.iter().map(|path| real(&path.0)).collect();

@@ -12,8 +12,8 @@ mod urls;
 
 pub use container::{ContainerDisplay, ContainerNetwork, ContainerSettings, EDITOR_PORT};
 pub use gpus::GpuUse;
-pub use isolation::{Isolation, SandboxFolders, SandboxNetwork, VariableName};
-pub use resources::Resources;
+pub use isolation::{IsolationSetting, SandboxFolders, SandboxNetwork, VariableName};
+pub use resources::ResourceLimits;
 pub use simulation_config::SimulationConfig;
 pub use streaming::Streaming;
 pub use timing::Timing;

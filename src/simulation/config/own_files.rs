@@ -2,8 +2,8 @@
 
 use std::path::Path;
 
-use super::{Isolation, SimulationConfig};
-use crate::shared::config::{InvalidValue, Secret};
+use super::{IsolationSetting, SimulationConfig};
+use crate::shared::config::{InvalidValueError, Secret};
 
 impl SimulationConfig {
     /// Returns the files that may hold secrets: this configuration's own, and those that it names.
@@ -16,12 +16,12 @@ impl SimulationConfig {
     ///
     /// # Errors
     /// When it would take the sandbox apart.
-    pub(super) fn check_sandbox(&self) -> Result<Vec<String>, InvalidValue> {
-        if !matches!(self.isolation, Isolation::Auto | Isolation::Sandbox) {
+    pub(super) fn check_sandbox(&self) -> Result<Vec<String>, InvalidValueError> {
+        if !matches!(self.isolation, IsolationSetting::Auto | IsolationSetting::Sandbox) {
             if self.sandbox.network.is_demanded() {
                 let problem =
                     "networks of simulations' own are for sandboxes, and isolation is neither \"sandbox\" nor \"auto\"";
-                return Err(InvalidValue { key: "sandbox.network", problem: problem.to_owned() });
+                return Err(InvalidValueError { key: "sandbox.network", problem: problem.to_owned() });
             }
             return Ok(Vec::new());
         }

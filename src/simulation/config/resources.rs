@@ -7,7 +7,7 @@ use crate::shared::config::whole;
 /// What one simulation may take.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(rename_all = "camelCase", default, deny_unknown_fields)]
-pub struct Resources {
+pub struct ResourceLimits {
     /// How much of its output is read, in KiB per second; short lines count more. It waits as it prints more. Default: 512.
     #[serde(deserialize_with = "whole::<1, 1_000_000, _, _>")]
     pub output: u64,
@@ -28,7 +28,7 @@ pub struct Resources {
     pub cores: Option<u64>,
 }
 
-impl Default for Resources {
+impl Default for ResourceLimits {
     fn default() -> Self {
         Self { output: 512, disk: 1024, processes: 4096, open_files: 4096, memory: None, cores: None }
     }

@@ -8,12 +8,12 @@ use serde::{Deserialize, Serialize};
 
 use super::container::{ContainerDisplay, ContainerSettings, check_ports};
 use super::gpus::GpuUse;
-use super::isolation::{Isolation, SandboxFolders, VariableName, level};
-use super::resources::Resources;
+use super::isolation::{IsolationSetting, SandboxFolders, VariableName, level};
+use super::resources::ResourceLimits;
 use super::streaming::{Streaming, streaming};
 use super::timing::Timing;
 use crate::shared::config::{
-    Configuration, ExpandedPath, InvalidValue, Secret, expanded, folder, local_address, minutes_or_zero, object,
+    Configuration, ExpandedPath, InvalidValueError, Secret, expanded, folder, local_address, minutes_or_zero, object,
     one_or_many, optional_expanded, optional_whole, percent, seconds, whole,
 };
 use crate::shared::domain::{PublicUrl, UrlPrefix, check_host};
@@ -71,7 +71,7 @@ pub struct SimulationConfig {
     pub projects_dir: Option<ExpandedPath>,
     /// At which level of isolation simulations run. Default: `auto`.
     #[serde(default, deserialize_with = "level")]
-    pub isolation: Isolation,
+    pub isolation: IsolationSetting,
     /// What a sandbox has besides the system and Webots.
     #[serde(default, deserialize_with = "object")]
     pub sandbox: SandboxFolders,
@@ -83,7 +83,7 @@ pub struct SimulationConfig {
     pub environment: Vec<VariableName>,
     /// What one simulation may take.
     #[serde(default, deserialize_with = "object")]
-    pub limits: Resources,
+    pub limits: ResourceLimits,
     /// Run Webots in containers: the original's key for `isolation: "container"`. Default: false.
     #[serde(default)]
     pub docker: bool,
@@ -208,14 +208,14 @@ impl SimulationConfig {
     /// Whether simulations are spread over the GPUs of the machine.
     #[must_use]
     pub fn spreads(&self) -> bool {
-        self.gpus == GpuUse::Spread && (self.container.gpu || self.isolation != Isolation::Container)
+        self.gpus == GpuUse::Spread && (self.container.gpu || self.isolation != IsolationSetting::Container)
     }
 
     /// The displays of the GPUs, where Webots opens its windows on them.
     #[must_use]
     pub fn displays_of_gpus(&self) -> &[DisplayName] {
         let is_virtual = match self.isolation {
-            Isolation::Container => self.container.display == ContainerDisplay::Virtual,
+            IsolationSetting::Container => self.container.display == ContainerDisplay::Virtual,
             _ => self.xvfb,
         };
         if self.spreads() && !is_virtual { &self.displays } else { &[] }
@@ -232,35 +232,35 @@ impl SimulationConfig {
 impl Configuration for SimulationConfig {
     const ALIASES: &'static [&'static str] = &["fullyQualifiedDomainName", "persistentDockerImages"];
 
-    fn complete(&mut self, file: &Path) -> Result<Vec<String>, InvalidValue> {
+    fn complete(&mut self, file: &Path) -> Result<Vec<String>, InvalidValueError> {
         file.clone_into(&mut self.file);
         let mut warnings = Vec::new();
         if self.server.is_empty() {
             warnings.push("server is not set: URLs will name localhost".to_owned());
             "localhost".clone_into(&mut self.server);
         }
-        check_host(&self.server, self.port_rewrite).map_err(|problem| InvalidValue { key: "server", problem })?;
+        check_host(&self.server, self.port_rewrite).map_err(|problem| InvalidValueError { key: "server", problem })?;
         if self.webots_home.is_none() {
             self.webots_home = std::env::var_os("WEBOTS_HOME").map(ExpandedPath::plain);
         }
         self.isolation = self.isolation.with_docker(self.docker)?;
-        self.docker = self.isolation == Isolation::Container;
+        self.docker = self.isolation == IsolationSetting::Container;
         check_ports(self.docker, self.port, self.max_connections)?;
         warnings.extend(self.check_sandbox()?);
         warnings.extend(self.sandbox.missing().map(|path| format!("sandbox: {} is not there", path.display())));
         if self.port.checked_add(self.max_connections).is_none() {
             let problem = format!("{} places above port {} leave the range of ports", self.max_connections, self.port);
-            return Err(InvalidValue { key: "maxConnections", problem });
+            return Err(InvalidValueError { key: "maxConnections", problem });
         }
         if self.timing.silence <= self.timing.ping {
             let problem = format!("{} s is not more than timing.ping", self.timing.silence.as_secs_f64());
-            return Err(InvalidValue { key: "timing.silence", problem });
+            return Err(InvalidValueError { key: "timing.silence", problem });
         }
         for address in &self.notify {
             let is_web = url::Url::parse(address).is_ok_and(|url| matches!(url.scheme(), "http" | "https"));
             if !is_web {
                 let problem = format!("{address:?} is no URL; allowed are http and https URLs");
-                return Err(InvalidValue { key: "notify", problem });
+                return Err(InvalidValueError { key: "notify", problem });
             }
         }
         if !self.displays.is_empty() && self.displays_of_gpus().is_empty() {

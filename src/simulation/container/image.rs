@@ -9,10 +9,10 @@ use std::time::Duration;
 use tokio::sync::{Semaphore, watch};
 
 use super::blocking::blocking;
-use super::compose::DEFAULT_MEMORY;
+use super::compose_project::DEFAULT_MEMORY;
 use super::docker::{Docker, DockerError, SHORT};
-use super::objects::Owner;
 use super::opened::{self, About};
+use super::owned_resources::ResourceOwner;
 use super::start_error::{StartError, is_disk_full};
 use super::steps;
 use crate::simulation::checkout::{Project, SingleFlight};
@@ -21,7 +21,7 @@ use crate::simulation::config::SimulationConfig;
 /// The images of this server.
 pub struct Images {
     pub(super) docker: Docker,
-    pub(super) owner: Owner,
+    pub(super) owner: ResourceOwner,
     /// The registries of the images that this server is configured to use, and Docker Hub's.
     registries: [String; 3],
     /// How long an image may take.
@@ -56,7 +56,7 @@ type Whose = fn(String) -> StartError;
 impl Images {
     /// The images of this owner.
     #[must_use]
-    pub fn new(docker: Docker, owner: Owner, config: &SimulationConfig) -> Self {
+    pub fn new(docker: Docker, owner: ResourceOwner, config: &SimulationConfig) -> Self {
         let (builds, limit) = (Semaphore::new(config.container.builds), config.timing.build);
         let memory = config.limits.memory.unwrap_or(DEFAULT_MEMORY);
         let registries = ["", &config.container.image, &config.container.editor_image];

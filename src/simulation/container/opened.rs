@@ -9,7 +9,7 @@ use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 
 use super::dockerfile::{LABEL, NO_VOLUME};
-use super::objects::digest;
+use super::owned_resources::digest;
 use crate::shared::text::one_line;
 
 /// How programs run in an image.

@@ -3,11 +3,11 @@
 use std::sync::Arc;
 
 use super::blocking::blocking;
+use super::build_plan::{self, PROJECT_PATH};
 use super::docker::DockerError;
 use super::dockerfile;
 use super::image::{Build, Images};
 use super::opened;
-use super::recipe::{self, PROJECT_PATH};
 use super::start_error::{StartError, is_disk_full};
 use crate::simulation::checkout::Project;
 
@@ -62,7 +62,7 @@ impl Images {
         blocking(move || std::fs::write(file, text)).await?;
         let (root, folder) = (project.folder().to_owned(), folder.to_owned());
         // What was copied out of an image may have put a link to anywhere in its place.
-        let context = blocking(move || recipe::inside(&root, &folder)).await?;
+        let context = blocking(move || build_plan::inside(&root, &folder)).await?;
         let project = Arc::clone(project);
         self.build(Build { key, dockerfile, context, arguments, network, project }, progress).await
     }

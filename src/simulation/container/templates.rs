@@ -8,7 +8,7 @@ use std::path::PathBuf;
 use serde::Deserialize;
 use serde::de::IgnoredAny;
 
-use super::webots_yml::Kind;
+use super::webots_yml::ProjectKind;
 use crate::simulation::config::ContainerSettings;
 
 /// A file that comes with this server.
@@ -70,7 +70,11 @@ impl Templates {
             return vec![format!("container.templates, {}: {error}", folder.display())];
         }
         let edited = || String::new();
-        let kinds = [Kind::Default, Kind::Editor { folder: edited() }, Kind::Competition { folder: edited() }];
+        let kinds = [
+            ProjectKind::Default,
+            ProjectKind::Editor { folder: edited() },
+            ProjectKind::Competition { folder: edited() },
+        ];
         let files = [DOCKERFILE, CONTROLLER, LAUNCHER];
         let unreadable = |name: &&str| Some(format!("{name} of container.templates: {}", self.text(name).err()?));
         let faults = kinds.iter().filter_map(|kind| self.compose(kind).err());
@@ -81,11 +85,11 @@ impl Templates {
     ///
     /// # Errors
     /// Why it can't be read, in words for the client.
-    pub fn compose(&self, kind: &Kind) -> Result<Template, String> {
+    pub fn compose(&self, kind: &ProjectKind) -> Result<Template, String> {
         let kind = match kind {
-            Kind::Default => "default",
-            Kind::Editor { .. } => "theia",
-            Kind::Competition { .. } => "competition",
+            ProjectKind::Default => "default",
+            ProjectKind::Editor { .. } => "theia",
+            ProjectKind::Competition { .. } => "competition",
         };
         let name = format!("docker-compose-{kind}{}.yml", if self.debug { "-debug" } else { "" });
         let broken = |error: String| format!("The template {name} of this simulation server can't be used: {error}");
@@ -181,11 +185,12 @@ mod tests {
             ("services: {}\n", "no service \"webots\""),
         ] {
             std::fs::write(folder.path().join("docker-compose-default.yml"), text).unwrap();
-            let wrong = templates.compose(&Kind::Default).unwrap_err();
+            let wrong = templates.compose(&ProjectKind::Default).unwrap_err();
             assert!(wrong.starts_with("The template docker-compose-default.yml") && wrong.contains(words), "{wrong}");
             assert_eq!(templates.faults(), [wrong]);
         }
-        for kind in [Kind::Editor { folder: String::new() }, Kind::Competition { folder: String::new() }] {
+        for kind in [ProjectKind::Editor { folder: String::new() }, ProjectKind::Competition { folder: String::new() }]
+        {
             for debug in [false, true] {
                 assert!(Templates { folder: None, debug }.compose(&kind).is_ok());
             }

@@ -3,14 +3,14 @@
 use std::collections::BTreeMap;
 use std::time::Duration;
 
-use super::objects::{Owner, PROJECT, quietly};
+use super::owned_resources::{PROJECT, ResourceOwner, quietly};
 use crate::simulation::isolation::docker_cgroups;
 use crate::simulation::machine::{Measured, Sum, Usage, cgroup_sum};
 
 /// Measures the simulations of an owner: those on these ports, whose processes are named for each. Blocks for some
 /// milliseconds; for two seconds where control groups can't be read.
 #[must_use]
-pub fn measure(owner: &Owner, roots: &BTreeMap<u16, i32>) -> Vec<(i32, Measured)> {
+pub fn measure(owner: &ResourceOwner, roots: &BTreeMap<u16, i32>) -> Vec<(i32, Measured)> {
     let (filter, format) = (format!("label={PROJECT}"), format!("{{{{.ID}}}} {{{{.Label \"{PROJECT}\"}}}}"));
     let listed = quietly(&["ps", "--no-trunc", "--filter", &filter, "--format", &format]);
     let found = listed.lines().filter_map(|line| line.split_once(' '));

@@ -30,7 +30,7 @@ const ALLOWED: &str =
 
 /// What runs beside Webots.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
-pub enum Kind {
+pub enum ProjectKind {
     /// Nothing.
     #[default]
     Default,
@@ -46,7 +46,7 @@ pub enum Kind {
     },
 }
 
-impl Kind {
+impl ProjectKind {
     /// The folder below the project's own, such as `controllers/edit`. It may be missing there, or be a link to anywhere:
     /// nobody has looked yet.
     #[must_use]
@@ -60,7 +60,7 @@ impl Kind {
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct WebotsYml {
     /// What runs beside Webots.
-    pub kind: Kind,
+    pub kind: ProjectKind,
     /// The message to the web client with the simulation's type, such as `type:demo` and a line end: the line without its
     /// spaces, as the original sends it.
     pub project_type: Option<String>,
@@ -89,7 +89,7 @@ impl WebotsYml {
         let text = text.trim_start_matches('\u{feff}');
         let mut found = Self::default();
         let asked = text.lines().filter_map(|line| line.strip_prefix("dockerCompose:")).next_back();
-        match asked.map_or(Ok(Kind::Default), kind_of) {
+        match asked.map_or(Ok(ProjectKind::Default), kind_of) {
             Ok(kind) => found.kind = kind,
             Err(warning) => found.warnings.push(warning),
         }
@@ -106,12 +106,12 @@ impl WebotsYml {
 }
 
 /// The kind that the value of `dockerCompose` asks for, such as `theia:webots-project/controllers`.
-fn kind_of(value: &str) -> Result<Kind, String> {
+fn kind_of(value: &str) -> Result<ProjectKind, String> {
     let value = value.split_once(" #").map_or(value, |(value, _comment)| value).trim();
     let quoted = |quote| value.strip_prefix(quote)?.strip_suffix(quote);
     let value = quoted('"').or_else(|| quoted('\'')).unwrap_or(value);
     if value.is_empty() {
-        return Ok(Kind::Default);
+        return Ok(ProjectKind::Default);
     }
     let Some((kind, folder)) = value.split_once(':') else {
         return Err(format!("dockerCompose in webots.yml is {}: it may be {ALLOWED}", shown(value)));
@@ -141,7 +141,7 @@ fn kind_of(value: &str) -> Result<Kind, String> {
         return wrong("must begin with webots-project, which stands for the project");
     }
     let folder = folder.to_owned();
-    Ok(if is_editor { Kind::Editor { folder } } else { Kind::Competition { folder } })
+    Ok(if is_editor { ProjectKind::Editor { folder } } else { ProjectKind::Competition { folder } })
 }
 
 fn shown(value: &str) -> String {
@@ -154,21 +154,21 @@ mod tests {
 
     use super::*;
 
-    fn editor(folder: &str) -> Kind {
-        Kind::Editor { folder: folder.to_owned() }
+    fn editor(folder: &str) -> ProjectKind {
+        ProjectKind::Editor { folder: folder.to_owned() }
     }
 
-    fn competition(folder: &str) -> Kind {
-        Kind::Competition { folder: folder.to_owned() }
+    fn competition(folder: &str) -> ProjectKind {
+        ProjectKind::Competition { folder: folder.to_owned() }
     }
 
     #[test]
     fn what_projects_ask_for_is_read_in_every_form() {
         for (text, kind) in [
-            ("", Kind::Default),
-            ("# a comment\n", Kind::Default),
-            ("publish: true\ntype: demo\n", Kind::Default),
-            ("dockerCompose:\npublish: true\n", Kind::Default),
+            ("", ProjectKind::Default),
+            ("# a comment\n", ProjectKind::Default),
+            ("publish: true\ntype: demo\n", ProjectKind::Default),
+            ("dockerCompose:\npublish: true\n", ProjectKind::Default),
             (
                 "publish: true\ntype: demo\ndockerCompose:theia:webots-project/controllers/",
                 editor("webots-project/controllers/"),
@@ -183,8 +183,8 @@ mod tests {
                 editor("webots-project/y"),
             ),
             ("\u{feff}dockerCompose:theia:webots-project/x", editor("webots-project/x")),
-            ("#dockerCompose:theia:webots-project/x\n", Kind::Default),
-            ("docker:\n  dockerCompose:theia:webots-project/x\n", Kind::Default),
+            ("#dockerCompose:theia:webots-project/x\n", ProjectKind::Default),
+            ("docker:\n  dockerCompose:theia:webots-project/x\n", ProjectKind::Default),
             (
                 "publish: true\ntype: competition\nworld:\n  file: worlds/a.wbt\n  max-duration: 60\n  metric: time-speed\n  \
                  higher-is-better: true\ndockerCompose: competition:webots-project/controllers/participant/\n",
@@ -223,7 +223,7 @@ mod tests {
             (&long, "is too long"),
         ] {
             let found = WebotsYml::parse(text);
-            assert_eq!(found.kind, Kind::Default, "{text:?}");
+            assert_eq!(found.kind, ProjectKind::Default, "{text:?}");
             assert_eq!(found.warnings.len(), 1, "{text:?}: {:?}", found.warnings);
             assert!(found.warnings[0].contains(warning), "{text:?}: {:?}", found.warnings);
         }
@@ -250,7 +250,7 @@ mod tests {
         {
             assert_eq!(editor(folder).folder_in_project(), Some(PathBuf::from(inside)), "{folder}");
         }
-        assert_eq!(Kind::Default.folder_in_project(), None);
+        assert_eq!(ProjectKind::Default.folder_in_project(), None);
     }
 
     #[test]

@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 
 use procfs::process::Process;
 
-use crate::simulation::config::Resources;
+use crate::simulation::config::ResourceLimits;
 use crate::simulation::ends::Taken;
 
 /// The control groups below this server's own.
@@ -43,7 +43,7 @@ const PAUSE: Duration = Duration::from_millis(5);
 impl Cgroups {
     /// The control groups that are delegated to this server, if they are. So many processes of each are not its own.
     #[must_use]
-    pub fn delegated(limits: &Resources, runners: u64) -> Option<Self> {
+    pub fn delegated(limits: &ResourceLimits, runners: u64) -> Option<Self> {
         let folder = own_folder()?;
         match Self::divide(&folder) {
             Ok(()) => {
@@ -173,7 +173,7 @@ fn offered(folder: &Path) -> io::Result<Controllers> {
 }
 
 /// The limits as the kernel has them. A simulation that runs out of memory ends as a whole.
-fn settings(limits: &Resources, runners: u64) -> Vec<(&'static str, String)> {
+fn settings(limits: &ResourceLimits, runners: u64) -> Vec<(&'static str, String)> {
     let mut settings =
         vec![("pids.max", (limits.processes + runners).to_string()), ("memory.oom.group", "1".to_owned())];
     settings.extend(limits.memory.map(|memory| ("memory.max", (memory << 20).to_string())));

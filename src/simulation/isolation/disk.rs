@@ -4,7 +4,7 @@ use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 use crate::simulation::process::DiskRoom;
-use crate::simulation::process::folder_size::SMALLEST;
+use crate::simulation::process::disk_usage::SMALLEST;
 
 /// The disk, as it was at the last look.
 #[derive(Debug)]

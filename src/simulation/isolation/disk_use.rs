@@ -4,7 +4,7 @@ use std::os::unix::fs::MetadataExt;
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
-use crate::simulation::process::folder_size::{FolderSize, Unknown, room};
+use crate::simulation::process::disk_usage::{DiskUsage, Unknown, room};
 use crate::simulation::process::process_tree::{nameless_files, tree};
 
 /// What one simulation has taken, as it was last counted.
@@ -52,7 +52,7 @@ impl DiskUse {
 
     /// Counts what it takes, within this time. Returns what is wrong, in words for its client.
     pub fn count(&mut self, lost: u64, time: Duration) -> Option<String> {
-        let mut size = FolderSize::new(room, self.allowed().unwrap_or(u64::MAX)).within(time);
+        let mut size = DiskUsage::new(room, self.allowed().unwrap_or(u64::MAX)).within(time);
         let counted = size.add_folder(&self.folder);
         self.add_nameless(&mut size, time);
         (self.taken, self.lost, self.counted) = (size.total(), lost, Instant::now());
@@ -68,7 +68,7 @@ impl DiskUse {
         })
     }
 
-    fn add_nameless(&mut self, size: &mut FolderSize, time: Duration) {
+    fn add_nameless(&mut self, size: &mut DiskUsage, time: Duration) {
         let (until, device) = (Instant::now() + time, self.folder.metadata().map(|about| about.dev()).ok());
         self.hides = false;
         for process in tree(self.root) {

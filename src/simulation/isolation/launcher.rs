@@ -17,15 +17,15 @@ use super::environment;
 use super::network::OwnNetwork;
 use super::program::Program;
 use super::sandbox::Sandbox;
-use super::unkept::{Means, unkept};
+use super::unenforced_limits::{Enforcement, unenforced_limits};
 use super::watcher::MostProcesses;
-use crate::simulation::config::{Isolation, Resources, SandboxNetwork, SimulationConfig, VariableName};
+use crate::simulation::config::{IsolationSetting, ResourceLimits, SandboxNetwork, SimulationConfig, VariableName};
 use crate::simulation::process::SpawnSpec;
 
 /// The levels of isolation that this server can keep.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
-pub enum Level {
+pub enum IsolationLevel {
     /// A process group of the server's own user.
     None,
     /// bubblewrap.
@@ -39,7 +39,7 @@ pub enum Level {
 pub enum IsolationError {
     /// A level.
     #[error("isolation is \"sandbox\", but {0}; \"none\" runs worlds without it")]
-    Level(String),
+    IsolationLevel(String),
     /// A network of simulations' own.
     #[error("sandbox.network is \"own\" or \"closed\", but {0}; \"shared\" runs worlds in the machine's network")]
     Network(String),
@@ -82,7 +82,7 @@ pub struct Launcher {
     cgroups: Option<Cgroups>,
     prlimit: Option<PathBuf>,
     variables: Vec<VariableName>,
-    limits: Resources,
+    limits: ResourceLimits,
 }
 
 impl Launcher {
@@ -93,10 +93,10 @@ impl Launcher {
     pub fn new(config: &SimulationConfig) -> Result<Self, IsolationError> {
         let sandbox = || Sandbox::new(config).and_then(Sandbox::tried);
         let (method, shortcoming) = match config.isolation {
-            Isolation::None => (Method::Plain, None),
-            Isolation::Container => (Method::Container, None),
-            Isolation::Sandbox => (Method::Sandbox(sandbox().map_err(IsolationError::Level)?), None),
-            Isolation::Auto => match sandbox() {
+            IsolationSetting::None => (Method::Plain, None),
+            IsolationSetting::Container => (Method::Container, None),
+            IsolationSetting::Sandbox => (Method::Sandbox(sandbox().map_err(IsolationError::IsolationLevel)?), None),
+            IsolationSetting::Auto => match sandbox() {
                 Ok(sandbox) => (Method::Sandbox(sandbox), None),
                 Err(why) => (Method::Plain, Some(why)),
             },
@@ -125,7 +125,7 @@ impl Launcher {
         match joined {
             Err(why) if wanted.is_demanded() => Err(IsolationError::Network(why)),
             joined => {
-                self.why_shared = joined.err().filter(|_| self.level() == Level::Sandbox);
+                self.why_shared = joined.err().filter(|_| self.level() == IsolationLevel::Sandbox);
                 Ok(())
             }
         }
@@ -145,10 +145,10 @@ impl Launcher {
         if let Some(network) = launcher.network_in_words() {
             log::info!("network of simulations: {network}");
         }
-        for line in launcher.unkept() {
+        for line in launcher.unenforced_limits() {
             log::warn!("{line}");
         }
-        if launcher.level() != Level::Container {
+        if launcher.level() != IsolationLevel::Container {
             launcher.cgroups = Cgroups::delegated(&launcher.limits, launcher.runners());
         }
         Ok(launcher)
@@ -156,26 +156,26 @@ impl Launcher {
 
     /// Which limits this machine can't keep, a line each. Before simulations have control groups.
     #[must_use]
-    pub fn unkept(&self) -> Vec<String> {
-        if self.level() == Level::Container {
+    pub fn unenforced_limits(&self) -> Vec<String> {
+        if self.level() == IsolationLevel::Container {
             // Docker keeps them.
             return Vec::new();
         }
-        let means = Means {
+        let means = Enforcement {
             has_prlimit: self.prlimit.is_some(),
             leaves_namespaces: matches!(&self.method, Method::Sandbox(sandbox) if !sandbox.ends_namespaces()),
             controllers: Cgroups::controllers(),
         };
-        unkept(&means, &self.limits)
+        unenforced_limits(&means, &self.limits)
     }
 
     /// The level.
     #[must_use]
-    pub fn level(&self) -> Level {
+    pub fn level(&self) -> IsolationLevel {
         match self.method {
-            Method::Plain => Level::None,
-            Method::Sandbox(_) => Level::Sandbox,
-            Method::Container => Level::Container,
+            Method::Plain => IsolationLevel::None,
+            Method::Sandbox(_) => IsolationLevel::Sandbox,
+            Method::Container => IsolationLevel::Container,
         }
     }
 
@@ -241,12 +241,12 @@ impl Launcher {
     #[must_use]
     pub fn remark(&self) -> &'static str {
         match self.level() {
-            Level::None => "",
-            Level::Container => {
+            IsolationLevel::None => "",
+            IsolationLevel::Container => {
                 " It ran in a container, which has its image and its project only; the server's administrator can give it \
                  more (container, limits)."
             }
-            Level::Sandbox => {
+            IsolationLevel::Sandbox => {
                 " It ran in a sandbox, which shows it the system and Webots only; the server's administrator can show it \
                  more (sandbox.readable, sandbox.writable), or run worlds without (isolation)."
             }
@@ -293,13 +293,13 @@ impl Launcher {
     /// Whether the kernel counts the processes of each sandbox by itself.
     fn limits_by_namespace(&self) -> bool {
         let is_ordinary = !nix::unistd::getuid().is_root();
-        self.level() == Level::Sandbox && is_ordinary && self.prlimit.is_some() && counts_by_namespace()
+        self.level() == IsolationLevel::Sandbox && is_ordinary && self.prlimit.is_some() && counts_by_namespace()
     }
 
     /// How many processes a simulation may have; `None` if the kernel or Docker refuses more.
     #[must_use]
     pub fn most_processes(&self) -> Option<MostProcesses> {
-        let is_kept = self.level() == Level::Container
+        let is_kept = self.level() == IsolationLevel::Container
             || self.limits_by_namespace()
             || self.cgroups.as_ref().is_some_and(Cgroups::limit_processes);
         (!is_kept).then(|| MostProcesses { limit: self.limits.processes, runners: self.runners() })
@@ -333,7 +333,7 @@ fn counts_by_namespace() -> bool {
     procfs::sys::kernel::Version::current().is_ok_and(|version| (version.major, version.minor) >= (5, 14))
 }
 
-impl fmt::Display for Level {
+impl fmt::Display for IsolationLevel {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
         out.write_str(match self {
             Self::None => "none",

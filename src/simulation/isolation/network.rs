@@ -13,7 +13,7 @@ use std::path::{Path, PathBuf};
 
 use which::which;
 
-use super::place::{Content, Place};
+use super::mount::{Mount, MountKind};
 use super::program::Program;
 use crate::simulation::config::{SandboxNetwork, SimulationConfig};
 
@@ -125,9 +125,9 @@ impl OwnNetwork {
     }
 
     /// What a sandbox shows so that programs find names.
-    pub fn places(&self, instance: &Path) -> Option<Place> {
+    pub fn mounts(&self, instance: &Path) -> Option<Mount> {
         let at = Path::new(RESOLV_CONF).canonicalize().ok().filter(|_| !self.closed)?;
-        Some(Place { at, content: Content::ReadableFile(resolv_conf(instance)) })
+        Some(Mount { at, content: MountKind::ReadableFile(resolv_conf(instance)) })
     }
 }
 

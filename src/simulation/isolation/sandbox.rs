@@ -15,8 +15,8 @@ use which::which;
 
 use super::display::Display;
 use super::keyrings;
+use super::mount::{Mount, MountKind, hidden};
 use super::network::{CHECK, OwnNetwork};
-use super::place::{Content, Place, hidden};
 use super::program::Program;
 use crate::shared::text::one_line;
 use crate::simulation::config::{SandboxNetwork, SimulationConfig};
@@ -28,7 +28,7 @@ pub struct Sandbox {
     bubblewrap: PathBuf,
     user: u32,
     homes: Vec<PathBuf>,
-    places: Vec<Place>,
+    mounts: Vec<Mount>,
     /// Whether programs inside can be kept from making user namespaces, which bubblewrap can from 0.8 on.
     ends_namespaces: bool,
     /// What gives it a network of its own, if it has one.
@@ -66,19 +66,19 @@ impl Sandbox {
             "bubblewrap (bwrap) is not there; on Debian, Ubuntu and Fedora the package bubblewrap has it".to_owned()
         })?;
         let shown = |path: &PathBuf| path.canonicalize().ok();
-        let mut places = vec![Place::new("/run", Content::Empty)];
+        let mut mounts = vec![Mount::new("/run", MountKind::EmptyFolder)];
         let names = NAMES_RUN.into_iter().filter(|_| config.sandbox.network != SandboxNetwork::Closed);
-        places.extend(names.chain(SYSTEM_RUN).map(|at| Place::new(at, Content::Readable)));
+        mounts.extend(names.chain(SYSTEM_RUN).map(|at| Mount::new(at, MountKind::ReadOnly)));
         let readable = config.webots_home.iter().chain(&config.sandbox.readable).filter_map(|path| shown(&path.0));
-        places.extend(readable.map(|at| Place { at, content: Content::Readable }));
+        mounts.extend(readable.map(|at| Mount { at, content: MountKind::ReadOnly }));
         let writable = config.sandbox.writable.iter().filter_map(|path| shown(&path.0));
-        places.extend(writable.map(|at| Place { at: at.clone(), content: Content::Writable(at) }));
+        mounts.extend(writable.map(|at| Mount { at: at.clone(), content: MountKind::ReadWrite(at) }));
         // Last, for nothing makes up for these.
         let homes = homes();
-        places.extend(hidden(config, &homes));
-        places.retain(|place| place.at.exists());
+        mounts.extend(hidden(config, &homes));
+        mounts.retain(|mount| mount.at.exists());
         let (user, shared_memory) = (nix::unistd::getuid().as_raw(), config.limits.disk << 20);
-        Ok(Self { bubblewrap, user, homes, places, ends_namespaces: true, network: None, shared_memory })
+        Ok(Self { bubblewrap, user, homes, mounts, ends_namespaces: true, network: None, shared_memory })
     }
 
     /// The command that runs a program in a sandbox of its own. Makes the folders that it needs in the instance's folder.
@@ -112,13 +112,13 @@ impl Sandbox {
         for device in devices() {
             command.extend(["--dev-bind-try".into(), device.clone().into(), device.into()]);
         }
-        let mut places = self.own(program)?;
-        places.extend(self.places.iter().cloned());
+        let mut mounts = self.own(program)?;
+        mounts.extend(self.mounts.iter().cloned());
         // Sorting keeps the order of equals: of two at the same place the last one counts.
-        places.sort_by_key(|place| place.at.components().count());
+        mounts.sort_by_key(|mount| mount.at.components().count());
         // What is empty is memory, and stays empty; so does the rest of `/dev`.
-        let closed = empty(&places);
-        command.extend(places.into_iter().flat_map(Place::into_arguments));
+        let closed = empty(&mounts);
+        command.extend(mounts.into_iter().flat_map(Mount::into_arguments));
         command.extend(self.shared_memory());
         command.extend(closed.into_iter().flat_map(|at| ["--remount-ro".into(), at.into()]));
         command.extend(["--chdir".into(), program.folder.into(), "--".into()]);
@@ -133,24 +133,24 @@ impl Sandbox {
     }
 
     /// What is different from one simulation to another.
-    fn own(&self, program: &Program<'_>) -> io::Result<Vec<Place>> {
+    fn own(&self, program: &Program<'_>) -> io::Result<Vec<Mount>> {
         let inside = |name: &str| {
             let folder = program.instance.join(name);
             std::fs::create_dir_all(&folder).map(|()| folder)
         };
         let (home, run, tmp) = (inside("home")?, inside("run")?, inside("tmp")?);
         program.display.prepare(&tmp)?;
-        let mut own: Vec<Place> = Vec::new();
-        own.extend(temporary_folders().map(|at| Place { at, content: Content::Writable(tmp.clone()) }));
-        own.push(Place { at: self.runtime_folder(), content: Content::Writable(run) });
-        own.extend(self.homes.iter().map(|at| Place { at: at.clone(), content: Content::Writable(home.clone()) }));
-        own.push(Place { at: program.project.clone(), content: Content::Writable(program.project.clone()) });
+        let mut own: Vec<Mount> = Vec::new();
+        own.extend(temporary_folders().map(|at| Mount { at, content: MountKind::ReadWrite(tmp.clone()) }));
+        own.push(Mount { at: self.runtime_folder(), content: MountKind::ReadWrite(run) });
+        own.extend(self.homes.iter().map(|at| Mount { at: at.clone(), content: MountKind::ReadWrite(home.clone()) }));
+        own.push(Mount { at: program.project.clone(), content: MountKind::ReadWrite(program.project.clone()) });
         // A link is looked up in the sandbox, where it may lead to what is not there.
         let files = program.command.first().map(PathBuf::from).into_iter().chain(self.display_files(program));
         let files = files.filter_map(|file| file.canonicalize().ok());
-        own.extend(files.map(|at| Place { at, content: Content::Readable }));
-        own.extend(self.network.as_ref().and_then(|network| network.places(program.instance)));
-        own.retain(|place| place.at.exists() || place.at == self.runtime_folder());
+        own.extend(files.map(|at| Mount { at, content: MountKind::ReadOnly }));
+        own.extend(self.network.as_ref().and_then(|network| network.mounts(program.instance)));
+        own.retain(|mount| mount.at.exists() || mount.at == self.runtime_folder());
         Ok(own)
     }
 
@@ -274,10 +274,10 @@ fn temporary_folders() -> impl Iterator<Item = PathBuf> {
 }
 
 /// Where an empty folder is shown and nothing else in its place, and `/dev`.
-fn empty(places: &[Place]) -> Vec<PathBuf> {
-    let is_last = |number: usize, place: &Place| !places.iter().skip(number + 1).any(|other| other.at == place.at);
-    let empty = places.iter().enumerate().filter(|(_, place)| matches!(place.content, Content::Empty));
-    let last = empty.filter(|(number, place)| is_last(*number, place)).map(|(_, place)| place.at.clone());
+fn empty(mounts: &[Mount]) -> Vec<PathBuf> {
+    let is_last = |number: usize, mount: &Mount| !mounts.iter().skip(number + 1).any(|other| other.at == mount.at);
+    let empty = mounts.iter().enumerate().filter(|(_, mount)| matches!(mount.content, MountKind::EmptyFolder));
+    let last = empty.filter(|(number, mount)| is_last(*number, mount)).map(|(_, mount)| mount.at.clone());
     last.chain(["/dev".into()]).collect()
 }
 

@@ -178,8 +178,8 @@ impl Table {
         self.disk.relieve();
         // The one that had grown most is counted first, then those that were not counted for the longest time.
         self.all.sort_by_key(|one| one.disk.counted());
-        let most = self.all.iter().enumerate().max_by_key(|(_, one)| one.disk.growth()).map(|(place, _)| place);
-        most.inspect(|place| self.all.swap(0, *place));
+        let most = self.all.iter().enumerate().max_by_key(|(_, one)| one.disk.growth()).map(|(mount, _)| mount);
+        most.inspect(|mount| self.all.swap(0, *mount));
         for one in &mut self.all {
             if Instant::now() >= until {
                 break;
@@ -207,9 +207,9 @@ impl Table {
     /// Tells those who asked, and watches these simulations no longer.
     fn end(&mut self, excesses: impl IntoIterator<Item = (i32, String)>) {
         for (root, why) in excesses {
-            if let Some(place) = self.all.iter().position(|one| one.watch.root == root) {
+            if let Some(mount) = self.all.iter().position(|one| one.watch.root == root) {
                 // Who asked may be gone.
-                self.all.swap_remove(place).excess.send(why).ok();
+                self.all.swap_remove(mount).excess.send(why).ok();
             }
         }
     }

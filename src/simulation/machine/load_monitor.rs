@@ -17,7 +17,7 @@ use super::gpus::Gpus;
 use super::sensors::{self, Gpu, GpuReading, GpuSensor, Host, Machine, MachineSensor};
 use super::spread::Spread;
 use crate::shared::domain::Load;
-use crate::simulation::places::{GetSnapshot, Places};
+use crate::simulation::slots::{GetSnapshot, SlotPool};
 
 /// Time between two samples.
 const PERIOD: Duration = Duration::from_secs(1);
@@ -98,7 +98,7 @@ struct GpusRead(GpuReading);
 
 /// The actor.
 pub struct LoadMonitor {
-    places: Addr<Places>,
+    slots: Addr<SlotPool>,
     published: watch::Sender<Arc<Readings>>,
     csv: Option<PathBuf>,
     csv_lines: usize,
@@ -113,18 +113,18 @@ impl LoadMonitor {
     /// `spread` chooses the GPU of the next simulation; without it the least busy one counts for the load.
     #[must_use]
     pub fn new(
-        places: Addr<Places>,
+        slots: Addr<SlotPool>,
         disk: &Path,
         csv: Option<PathBuf>,
         spread: Option<Arc<Spread>>,
     ) -> (Self, watch::Receiver<Arc<Readings>>) {
         let (published, readings) = watch::channel(Arc::default());
         let (machine, disk, gpus) = (Machine::default(), disk.to_owned(), Gpus::default());
-        (Self { places, published, csv, csv_lines: 0, disk, machine, gpus, spread }, readings)
+        (Self { slots, published, csv, csv_lines: 0, disk, machine, gpus, spread }, readings)
     }
 
     fn sample(&mut self, ctx: &mut Context<Self>) {
-        let snapshot = self.places.send(GetSnapshot).timeout(PERIOD);
+        let snapshot = self.slots.send(GetSnapshot).timeout(PERIOD);
         snapshot
             .into_actor(self)
             .map(|snapshot, this, _| {
@@ -303,8 +303,8 @@ mod tests {
 
     #[actix_rt::test]
     async fn the_load_is_the_mean_of_five_seconds_and_the_history_is_ten_minutes_long() {
-        let places = Places::new(2001..=2001, 1, None).start();
-        let (mut monitor, readings) = LoadMonitor::new(places, Path::new("/"), None, None);
+        let slots = SlotPool::new(2001..=2001, 1, None).start();
+        let (mut monitor, readings) = LoadMonitor::new(slots, Path::new("/"), None, None);
         let load = || readings.borrow().load.map(Load::percent);
         assert_eq!(load(), None);
         let mut read = |cpu: f64| {
@@ -329,8 +329,8 @@ mod tests {
         let gpu = |index, compute| Gpu { index, compute, ..Gpu::default() };
         let gpus = [gpu(0, 90.0), gpu(1, 60.0), gpu(2, 10.0)];
         for (spread, load) in [(None, 10.0), (Some(Spread::over(0)), 10.0), (Some(Spread::over(2)), 60.0)] {
-            let places = Places::new(2001..=2001, 1, None).start();
-            let (mut monitor, readings) = LoadMonitor::new(places, Path::new("/"), None, spread.map(Arc::new));
+            let slots = SlotPool::new(2001..=2001, 1, None).start();
+            let (mut monitor, readings) = LoadMonitor::new(slots, Path::new("/"), None, spread.map(Arc::new));
             monitor.gpus.read(Instant::now(), GpuReading { gpus: gpus.to_vec(), lost: 0 });
             monitor.publish(0, 0);
             assert_eq!(readings.borrow().load.map(Load::percent), Some(load));
@@ -339,8 +339,8 @@ mod tests {
 
     #[actix_rt::test]
     async fn gpus_that_are_no_longer_read_do_not_count() {
-        let places = Places::new(2001..=2001, 1, None).start();
-        let (mut monitor, readings) = LoadMonitor::new(places, Path::new("/"), None, None);
+        let slots = SlotPool::new(2001..=2001, 1, None).start();
+        let (mut monitor, readings) = LoadMonitor::new(slots, Path::new("/"), None, None);
         let gpu = Gpu { compute: 90.0, ..Gpu::default() };
         let before = |age| Instant::now().checked_sub(Duration::from_secs(age)).unwrap();
         let reading = GpuReading { gpus: vec![gpu], lost: 0 };

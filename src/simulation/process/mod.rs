@@ -2,7 +2,7 @@
 
 mod answer;
 mod disk_room;
-pub mod folder_size;
+pub mod disk_usage;
 pub mod guardian;
 mod instance_dir;
 mod lines;

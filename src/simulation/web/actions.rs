@@ -5,9 +5,9 @@ use actix_web::{HttpRequest, HttpResponse, web};
 use serde::Deserialize;
 
 use super::queries::{stop_simulation, too_busy};
-use crate::shared::http::paths::{GET, POST, path};
+use crate::shared::http::routing::{GET, POST, path};
 use crate::shared::http::{body, refuse_action};
-use crate::shared::run::Request;
+use crate::shared::run::ServerCommand;
 use crate::shared::text::excerpt;
 use crate::simulation::protocol;
 use crate::simulation::state::AppState;
@@ -38,7 +38,7 @@ async fn drain(request: HttpRequest, server: web::Data<AppState>) -> HttpRespons
     if let Some(refusal) = refusal(&request, &server) {
         return refusal;
     }
-    match server.requests.try_send(Request::Drain) {
+    match server.requests.try_send(ServerCommand::Drain) {
         Ok(()) => HttpResponse::Accepted().body("draining"),
         Err(error) => HttpResponse::ServiceUnavailable().body(format!("Error: {error}.")),
     }

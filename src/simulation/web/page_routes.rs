@@ -14,8 +14,8 @@ use super::queries::{snapshot, too_busy};
 use super::webots_viewer;
 use crate::asset;
 use crate::shared::http::assets::{self, Asset};
-use crate::shared::http::paths::{GET, READ, path};
-use crate::shared::http::{Kind, Policy, html, is_administrator};
+use crate::shared::http::routing::{GET, READ, path};
+use crate::shared::http::{ConnectionKind, ContentSecurityPolicy, html, is_administrator};
 use crate::simulation::container;
 use crate::simulation::ends::output_file;
 use crate::simulation::machine::{Tree, Usages};
@@ -68,7 +68,7 @@ async fn monitor(request: HttpRequest, server: web::Data<AppState>) -> HttpRespo
         return too_busy();
     };
     let usages = usages(&server, &snapshot).await;
-    html(pages::monitor(&server, &snapshot, &usages, reader(&request, &server)), &Policy::own())
+    html(pages::monitor(&server, &snapshot, &usages, reader(&request, &server)), &ContentSecurityPolicy::own())
 }
 
 async fn usages(server: &AppState, snapshot: &Snapshot) -> Usages {
@@ -89,7 +89,7 @@ async fn usages(server: &AppState, snapshot: &Snapshot) -> Usages {
 }
 
 async fn events(request: HttpRequest, server: web::Data<AppState>) -> HttpResponse {
-    let permit = match server.connections.admit(Kind::Page, server.config.trusted_proxies.peer(&request)) {
+    let permit = match server.connections.admit(ConnectionKind::Page, server.config.trusted_proxies.peer(&request)) {
         Ok(permit) => permit,
         Err(refused) => return refused.answer(),
     };

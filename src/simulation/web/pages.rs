@@ -6,12 +6,12 @@ use askama::Template;
 use url::Url;
 
 use crate::shared::domain::UrlPrefix;
-use crate::shared::http::{Row, View};
+use crate::shared::http::{PageView, TableRow};
 use crate::shared::run::{seconds_since_1970, timestamp};
 use crate::shared::text::{one_line, without_paths};
 use crate::simulation::config::SimulationConfig;
 use crate::simulation::ends::Ended;
-use crate::simulation::isolation::Level;
+use crate::simulation::isolation::IsolationLevel;
 use crate::simulation::machine::sensors::{self, Gpu, Host, Machine};
 use crate::simulation::machine::{Readings, Sample};
 use crate::simulation::machine::{Usage, Usages};
@@ -53,8 +53,8 @@ struct Monitor<'server> {
     glance: &'server str,
     /// The columns of the charts' numbers.
     columns: String,
-    rows: &'server [Row],
-    ends: &'server [Row],
+    rows: &'server [TableRow],
+    ends: &'server [TableRow],
     host: &'server Host,
     gpus: Vec<(&'server Gpu, String)>,
     memory: String,
@@ -63,7 +63,7 @@ struct Monitor<'server> {
     blocked: &'server [UrlPrefix],
     docker: bool,
     share_idle_time: f64,
-    isolation: Level,
+    isolation: IsolationLevel,
     network: Option<String>,
     shows_ports: bool,
     /// What worlds' programs may do that they should not, and why.
@@ -121,21 +121,27 @@ struct SimulationRow<'one> {
 ///
 /// # Errors
 /// When a template can't be rendered.
-pub fn view(server: &AppState, snapshot: &Snapshot, usages: &Usages, reader: Reader) -> Result<View, askama::Error> {
+pub fn view(
+    server: &AppState,
+    snapshot: &Snapshot,
+    usages: &Usages,
+    reader: Reader,
+) -> Result<PageView, askama::Error> {
     let readings = server.readings.borrow().clone();
     let shows_port = reader.sees_ports(&server.config);
     let rows = snapshot.simulations.iter().map(|one| {
         let usage = one.pid.and_then(|pid| usages.get(&pid)).copied();
         let html = SimulationRow::new(one, usage, server.config.timeout, (reader, shows_port)).render()?;
-        Ok(Row { key: one.id.to_string(), html })
+        Ok(TableRow { key: one.id.to_string(), html })
     });
-    let rows = rows.collect::<Result<Vec<Row>, askama::Error>>()?;
+    let rows = rows.collect::<Result<Vec<TableRow>, askama::Error>>()?;
     let ends = server.ends.latest();
-    let ends = ends.iter().map(|one| Ok(Row { key: one.id.to_string(), html: EndRow::new(one, reader).render()? }));
-    let ends = ends.collect::<Result<Vec<Row>, askama::Error>>()?;
+    let ends =
+        ends.iter().map(|one| Ok(TableRow { key: one.id.to_string(), html: EndRow::new(one, reader).render()? }));
+    let ends = ends.collect::<Result<Vec<TableRow>, askama::Error>>()?;
     let glance = Glance::new(server, snapshot, &readings).render()?;
     let sample = readings.history.back().map(Sample::columns).unwrap_or_default();
-    Ok(View { parts: [("glance", glance)].into(), tables: [("simulations", rows), ("ends", ends)].into(), sample })
+    Ok(PageView { parts: [("glance", glance)].into(), tables: [("simulations", rows), ("ends", ends)].into(), sample })
 }
 
 /// The whole of `/monitor`.

@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use actix_web::HttpResponse;
 
-use crate::simulation::places::{GetSnapshot, StopOne};
+use crate::simulation::slots::{GetSnapshot, StopOne};
 use crate::simulation::snapshot::Snapshot;
 use crate::simulation::state::AppState;
 
@@ -13,13 +13,13 @@ const PATIENCE: Duration = Duration::from_secs(2);
 
 /// All simulations of this server; none when the actor that knows them is too busy to answer.
 pub async fn snapshot(server: &AppState) -> Option<Snapshot> {
-    let snapshot = server.places.send(GetSnapshot);
+    let snapshot = server.slots.send(GetSnapshot);
     actix_rt::time::timeout(PATIENCE, snapshot).await.ok().and_then(Result::ok)
 }
 
 /// Stops a simulation. Returns whether there is one with this id; none when the actor is too busy to answer.
 pub async fn stop_simulation(server: &AppState, id: String, why: String) -> Option<bool> {
-    let stopped = server.places.send(StopOne { id, why });
+    let stopped = server.slots.send(StopOne { id, why });
     actix_rt::time::timeout(PATIENCE, stopped).await.ok().and_then(Result::ok)
 }
 

@@ -9,18 +9,18 @@ use super::administrator::may_see_ports;
 use super::origins::refuse_origin;
 use super::page_routes;
 use super::queries::{snapshot, too_busy};
-use super::status::{self, StatusPage};
+use super::status::{self, StatusResponse};
 use super::stream_routes;
 use super::watch_routes;
-use crate::shared::http::paths::{self, GET, READ, path};
+use crate::shared::http::routing::{self, GET, READ, path};
 use crate::shared::http::websocket;
-use crate::shared::http::{CONTENT_TYPE, Kind};
+use crate::shared::http::{CONTENT_TYPE, ConnectionKind};
 use crate::simulation::client::WebClient;
 use crate::simulation::state::AppState;
 
 /// Adds all paths to an app.
 pub fn configure(app: &mut web::ServiceConfig) {
-    app.service(paths::all(add, "/monitor, /status, /load, /metrics or /health"));
+    app.service(routing::all(add, "/monitor, /status, /load, /metrics or /health"));
 }
 
 fn add(app: &mut web::ServiceConfig) {
@@ -40,7 +40,7 @@ async fn client(request: HttpRequest, stream: web::Payload, server: web::Data<Ap
         return refusal;
     }
     let peer = server.config.trusted_proxies.peer(&request);
-    let permit = match server.connections.admit(Kind::Client, peer) {
+    let permit = match server.connections.admit(ConnectionKind::Client, peer) {
         Ok(permit) => permit,
         Err(refused) => return refused.answer(),
     };
@@ -64,7 +64,7 @@ async fn status_json(request: HttpRequest, server: web::Data<AppState>) -> HttpR
     if !with_ports {
         snapshot.simulations.iter_mut().for_each(|one| one.port = None);
     }
-    HttpResponse::Ok().json(StatusPage::new(&server, snapshot))
+    HttpResponse::Ok().json(StatusResponse::new(&server, snapshot))
 }
 
 async fn metrics(server: web::Data<AppState>) -> HttpResponse {

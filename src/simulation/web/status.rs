@@ -5,7 +5,7 @@ use serde::Serialize;
 use super::webots_viewer;
 use crate::shared::domain::ServerReport;
 use crate::shared::http::Gauge;
-use crate::simulation::isolation::{Level, Network};
+use crate::simulation::isolation::{IsolationLevel, Network};
 use crate::simulation::machine::sensors::{Gpu, Host, Machine};
 use crate::simulation::snapshot::{Simulation, Snapshot};
 use crate::simulation::state::AppState;
@@ -13,12 +13,12 @@ use crate::simulation::state::AppState;
 /// The page `/status`.
 #[derive(Debug, Serialize)]
 #[serde(rename_all = "camelCase")]
-pub struct StatusPage {
+pub struct StatusResponse {
     /// The part that session servers read.
     #[serde(flatten)]
     pub report: ServerReport,
     /// At which level of isolation simulations run.
-    pub isolation: Level,
+    pub isolation: IsolationLevel,
     /// Which network their programs have, where that is not Docker's.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub network: Option<Network>,
@@ -40,7 +40,7 @@ pub struct StatusPage {
     pub simulations: Vec<Simulation>,
 }
 
-impl StatusPage {
+impl StatusResponse {
     /// The state of the server at this moment.
     #[must_use]
     pub fn new(server: &AppState, snapshot: Snapshot) -> Self {

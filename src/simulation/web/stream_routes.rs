@@ -4,8 +4,8 @@ use actix_web::http::header;
 use actix_web::{HttpRequest, HttpResponse, web};
 
 use super::origins::refuse_origin;
-use crate::shared::http::Kind;
-use crate::shared::http::paths::{GET, path};
+use crate::shared::http::ConnectionKind;
+use crate::shared::http::routing::{GET, path};
 use crate::simulation::relay::{self, Upstream};
 use crate::simulation::state::AppState;
 use crate::simulation::streams::Found;
@@ -32,7 +32,7 @@ async fn stream(request: HttpRequest, payload: web::Payload, server: web::Data<A
         return refusal;
     }
     let peer = server.config.trusted_proxies.peer(&request);
-    let permit = match server.connections.admit(Kind::Stream, peer) {
+    let permit = match server.connections.admit(ConnectionKind::Stream, peer) {
         Ok(permit) => permit,
         Err(refused) => return refused.answer(),
     };

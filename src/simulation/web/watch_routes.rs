@@ -6,8 +6,8 @@ use serde::Deserialize;
 
 use super::administrator::refuse_others;
 use super::webots_viewer;
-use crate::shared::http::paths::{GET, READ, path};
-use crate::shared::http::{Policy, html, own_sources};
+use crate::shared::http::routing::{GET, READ, path};
+use crate::shared::http::{ContentSecurityPolicy, html, own_sources};
 use crate::simulation::state::AppState;
 
 /// The page `/watch`.
@@ -58,11 +58,11 @@ async fn watch(request: HttpRequest, which: web::Query<Which>, server: web::Data
         stream: format!("stream/{}", token.reveal()),
         script: installed.filter(|_| which.viewer != "small"),
     };
-    html(page.render(), &Policy::own().own_websocket(&request).frames())
+    html(page.render(), &ContentSecurityPolicy::own().own_websocket(&request).frames())
 }
 
 /// Webots' own viewer shows what worlds bring: it runs in an embedded page with an origin of its own.
 async fn viewer(request: HttpRequest) -> HttpResponse {
     let page = WebotsViewer { version: env!("CARGO_PKG_VERSION") };
-    html(page.render(), &Policy::own().run(&own_sources(&request)).any_picture().framed().foreign())
+    html(page.render(), &ContentSecurityPolicy::own().run(&own_sources(&request)).any_picture().framed().foreign())
 }

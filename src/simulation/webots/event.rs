@@ -26,12 +26,12 @@ pub enum WebotsEvent {
     /// It is paused, and ends then for that; or it does not end for that any more.
     IdleEnd(Option<Instant>),
     /// It has ended, and why.
-    Exited(Exit),
+    Exited(WebotsExit),
 }
 
 /// Why a Webots has ended.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Exit {
+pub struct WebotsExit {
     /// Whether it ended by itself and in order.
     pub clean: bool,
     /// Whether it is this server's fault, so that another one may take the client: Docker has failed or stopped, or Webots
@@ -41,7 +41,7 @@ pub struct Exit {
     pub why: String,
 }
 
-impl Exit {
+impl WebotsExit {
     /// The end of a Webots that has ended by itself and in order.
     #[must_use]
     pub fn clean() -> Self {
@@ -89,7 +89,7 @@ impl Drop for ExitNotifier {
     fn drop(&mut self) {
         if !self.exit_told {
             let why = "The simulation was lost by a fault of this server".to_owned();
-            self.tell(WebotsEvent::Exited(Exit { clean: false, own: true, why }));
+            self.tell(WebotsEvent::Exited(WebotsExit { clean: false, own: true, why }));
         }
     }
 }

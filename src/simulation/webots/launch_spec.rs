@@ -11,16 +11,16 @@ use futures_util::future::LocalBoxFuture;
 
 use super::command::WebotsCommand;
 use super::event::WebotsEvent;
-use crate::simulation::checkout::{Checkouts, Project};
+use crate::simulation::checkout::{CheckoutService, Project};
 use crate::simulation::config::SimulationConfig;
-use crate::simulation::container::{Containers, Request};
+use crate::simulation::container::{ContainerRequest, ContainerService};
 use crate::simulation::ends::FOLDER_OF_RUNNING;
 use crate::simulation::isolation::{Cgroup, Display, Launcher, Peak, Program, Watch, Watcher};
 use crate::simulation::machine::display;
 use crate::simulation::machine::sensors::Gpu;
-use crate::simulation::places::Ticket;
 use crate::simulation::process::{SpawnSpec, until_answering};
 use crate::simulation::protocol::Mode;
+use crate::simulation::slots::Slot;
 use crate::simulation::streams::{Registration, Streams, Watched};
 
 /// Everything that one Webots is started with.
@@ -28,7 +28,7 @@ pub struct LaunchSpec {
     /// The server's configuration.
     pub config: Arc<SimulationConfig>,
     /// Makes the containers in which it runs, where it does.
-    pub containers: Option<Arc<Containers>>,
+    pub containers: Option<Arc<ContainerService>>,
     /// How simulations are launched.
     pub launcher: Arc<Launcher>,
     /// Watches over what it takes.
@@ -36,7 +36,7 @@ pub struct LaunchSpec {
     /// The program to start.
     pub program: PathBuf,
     /// Where controllers are restored from.
-    pub checkouts: Arc<Checkouts>,
+    pub checkouts: Arc<CheckoutService>,
     /// What was checked out.
     pub project: Arc<Project>,
     /// How it is shown.
@@ -44,7 +44,7 @@ pub struct LaunchSpec {
     /// The GPU that it was given, if one was.
     pub gpu: Option<Gpu>,
     /// The place, and its port.
-    pub place: (Ticket, u16),
+    pub slot: Slot,
     /// Where its stream is found while it runs.
     pub streams: Arc<Streams>,
     /// Who hears whether it is watched.
@@ -58,26 +58,26 @@ impl LaunchSpec {
     #[must_use]
     pub fn log_file(&self) -> PathBuf {
         let folder = self.config.log_dir.0.join("simulation").join(FOLDER_OF_RUNNING);
-        folder.join(format!("{}.log", self.place.0.id()))
+        folder.join(format!("{}.log", self.slot.lease.id()))
     }
 
     /// Has the stream found that this port has.
     #[must_use]
     pub fn register(&self, port: u16) -> Registration {
-        self.streams.register(self.place.0.id(), port, self.watched.clone())
+        self.streams.register(self.slot.lease.id(), port, self.watched.clone())
     }
 
     /// What its containers are made of.
     #[must_use]
-    pub fn request(&self) -> Request {
-        let (config, mode, port) = (Arc::clone(&self.config), self.mode, self.place.1);
+    pub fn request(&self) -> ContainerRequest {
+        let (config, mode, port) = (Arc::clone(&self.config), self.mode, self.slot.port);
         let command = move |world: &str| {
             let program = Path::new(&config.container.program);
             let world = Path::new(world);
             let command = WebotsCommand { program, mode, port, heartbeat: config.timing.heartbeat, world };
             command.to_arguments().into_iter().map(|word| word.to_string_lossy().into_owned()).collect()
         };
-        Request { project: Arc::clone(&self.project), port, gpu: self.gpu.clone(), command: Box::new(command) }
+        ContainerRequest { project: Arc::clone(&self.project), port, gpu: self.gpu.clone(), command: Box::new(command) }
     }
 
     /// The display of the machine on which it opens its window.
@@ -99,7 +99,7 @@ impl LaunchSpec {
         let command = WebotsCommand {
             program: &self.program,
             mode: self.mode,
-            port: self.place.1,
+            port: self.slot.port,
             heartbeat: self.config.timing.heartbeat,
             world: &self.project.world.path,
         };
@@ -108,7 +108,7 @@ impl LaunchSpec {
             instance: self.project.instance.path(),
             project: self.project.instance.project(),
             folder: self.project.folder(),
-            port: self.place.1,
+            port: self.slot.port,
             display,
             variables: &self.variables(),
             grace: self.config.timing.grace,
@@ -123,7 +123,7 @@ impl LaunchSpec {
             folder: self.project.instance.path().to_owned(),
             disk: self.config.limits.disk,
             processes: self.launcher.most_processes(),
-            port: self.forwarded().is_none().then_some(self.place.1),
+            port: self.forwarded().is_none().then_some(self.slot.port),
             peak,
         };
         let watcher = self.watcher.clone();
@@ -148,13 +148,13 @@ impl LaunchSpec {
     fn forwarded(&self) -> Option<SocketAddr> {
         let of_container = self.containers.as_ref().map(|_| IpAddr::from(self.config.address_of_simulations()));
         let address = of_container.or_else(|| self.launcher.reached());
-        address.map(|address| (address, self.place.1).into())
+        address.map(|address| (address, self.slot.port).into())
     }
 
     /// Waits until it answers on the port that is forwarded to it, or one of these processes listens on a port that Webots
     /// may have taken, and returns the port.
     pub fn listening_port(&self, root: i32) -> LocalBoxFuture<'static, u16> {
-        let (watcher, port) = (self.watcher.clone(), self.place.1);
+        let (watcher, port) = (self.watcher.clone(), self.slot.port);
         match self.forwarded() {
             Some(address) => until_answering(address).map(move |()| port).boxed_local(),
             None => async move { watcher.listening_port(root, port).await }.boxed_local(),

@@ -9,9 +9,9 @@ use actix::dev::ToEnvelope;
 use actix::prelude::*;
 
 use super::launch_spec::LaunchSpec;
+use super::launch_target::LaunchTarget;
 use super::output::{self, OutputEvent, Tail};
 use super::paced_reader::PacedReader;
-use super::runtime::Runtime;
 use crate::shared::run::RotatedFile;
 use crate::simulation::container::Cause;
 use crate::simulation::ends::Taken;
@@ -54,7 +54,7 @@ const LAST_OUTPUT: Duration = Duration::from_secs(1);
 /// When a process, a thread or a folder can't be made.
 pub fn launch<A>(
     spec: &LaunchSpec,
-    runtime: Runtime,
+    runtime: LaunchTarget,
     events: Addr<A>,
 ) -> std::io::Result<(Launched, impl Future<Output = End> + use<A>)>
 where
@@ -63,7 +63,7 @@ where
     let log = spec.log_file();
     let file = RotatedFile::open(&log, OLD_LOGS).inspect_err(|error| {
         let why = format!("what Webots prints is not kept: {} can't be written: {error}", log.display());
-        spec.place.0.log(log::Level::Warn, why);
+        spec.slot.lease.log(log::Level::Warn, why);
     });
     let log = file.is_ok().then_some(log);
     let (reader, output) = std::io::pipe()?;
@@ -71,9 +71,9 @@ where
     let (tail, all_read) = output::follow(reader, file.ok(), events)?;
     let errors = output.try_clone()?;
     let (process, cgroup) = match &runtime {
-        Runtime::Containers(containers) => (containers.spawn_spec(spec.config.timing.grace), None),
-        Runtime::Machine(display) => spec.spawn_spec(display)?,
-        Runtime::BesideDisplay(display) => spec.spawn_spec(&Display::Outside(display.environment()))?,
+        LaunchTarget::ContainerService(containers) => (containers.spawn_spec(spec.config.timing.grace), None),
+        LaunchTarget::Machine(display) => spec.spawn_spec(display)?,
+        LaunchTarget::BesideDisplay(display) => spec.spawn_spec(&Display::Outside(display.environment()))?,
     };
     let (group, ended) = ProcessGroup::start(&process, output.into(), errors.into())?;
     let folder = cgroup.as_ref().map(|cgroup| cgroup.path().to_owned());
@@ -95,8 +95,8 @@ where
 }
 
 /// Hears what a Webots takes that runs on this.
-fn peak_of(runtime: &Runtime) -> Arc<Peak> {
-    let Runtime::Containers(containers) = runtime else { return Arc::default() };
+fn peak_of(runtime: &LaunchTarget) -> Arc<Peak> {
+    let LaunchTarget::ContainerService(containers) = runtime else { return Arc::default() };
     let (ids, peak) = (containers.ids(), Arc::new(Peak::of_containers()));
     let named = Arc::clone(&peak);
     // Its start does not wait for that.

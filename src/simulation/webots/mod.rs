@@ -4,15 +4,15 @@ mod command;
 mod event;
 mod idleness;
 mod launch_spec;
+mod launch_target;
 mod launched;
 mod output;
 mod paced_reader;
-mod runtime;
 mod verdict;
 mod virtual_display;
 mod webots;
 
-pub use event::{Exit, WebotsEvent};
+pub use event::{WebotsEvent, WebotsExit};
 pub use idleness::Keep;
 pub use launch_spec::LaunchSpec;
-pub use webots::{RestoreController, Stop, Webots};
+pub use webots::{ResetController, Stop, Webots};

@@ -10,18 +10,18 @@ use actix::prelude::*;
 use log::Level;
 use tokio::sync::Notify;
 
-use super::event::{Exit, ExitNotifier, WebotsEvent};
+use super::event::{ExitNotifier, WebotsEvent, WebotsExit};
 use super::launch_spec::LaunchSpec;
+use super::launch_target::{LaunchTarget, Preparation};
 use super::launched::{self, End, Launched};
 use super::output::{OutputEvent, Tail};
-use super::runtime::{Preparation, Runtime};
 use super::verdict::verdict;
 use crate::shared::run::seconds_since_1970;
 use crate::simulation::checkout::CheckoutError;
 use crate::simulation::container::StartError;
 use crate::simulation::ends::{EndReason, Taken};
 use crate::simulation::process::ProcessGroup;
-use crate::simulation::snapshot::{Change, Stage};
+use crate::simulation::snapshot::{SimulationChange, Stage};
 use crate::simulation::streams::Registration;
 
 /// Asks Webots to end, because its client has gone or for another reason.
@@ -32,7 +32,7 @@ pub struct Stop(pub EndReason);
 /// Asks to restore a file below the project's `controllers` folder to the state of the checkout.
 #[derive(Message)]
 #[rtype(result = "Result<(), CheckoutError>")]
-pub struct RestoreController(pub String);
+pub struct ResetController(pub String);
 
 /// The actor.
 pub struct Webots {
@@ -76,7 +76,7 @@ impl Webots {
     pub fn new(spec: LaunchSpec) -> Self {
         Self {
             stream: None,
-            port: spec.place.1,
+            port: spec.slot.port,
             events: ExitNotifier::new(spec.events.clone()),
             spec,
             preparing: None,
@@ -106,7 +106,7 @@ impl Webots {
         })));
     }
 
-    fn launch(&mut self, runtime: Runtime, ctx: &mut Context<Self>) {
+    fn launch(&mut self, runtime: LaunchTarget, ctx: &mut Context<Self>) {
         self.preparing = None;
         self.restart = runtime.restart();
         runtime.news().into_iter().for_each(|event| self.tell(event));
@@ -131,13 +131,13 @@ impl Webots {
     }
 
     /// Starts the process, and has [`Self::ended`] called when it has ended.
-    fn spawn(&mut self, runtime: Runtime, ctx: &mut Context<Self>) -> std::io::Result<()> {
+    fn spawn(&mut self, runtime: LaunchTarget, ctx: &mut Context<Self>) -> std::io::Result<()> {
         let (Launched { group, cgroup, tail, log, peak }, ended) =
             launched::launch(&self.spec, runtime, ctx.address())?;
         let (program, world) = (self.spec.program.display(), self.spec.project.world.path.display());
         let (at, pid) = (seconds_since_1970(), group.leader());
         self.log(Level::Info, &format!("started {program} for {world} (process {pid})"));
-        self.spec.place.0.update(Change::Launched { at, pid, cgroup, port: self.port, log });
+        self.spec.slot.lease.update(SimulationChange::Launched { at, pid, cgroup, port: self.port, log });
         (self.tail, self.group) = (tail, Some(group));
         ended.into_actor(self).map(|end, this, ctx| this.ended(&end, ctx)).spawn(ctx);
         let excess = self.spec.until_too_much(pid, peak).into_actor(self);
@@ -167,10 +167,10 @@ impl Webots {
         if port != self.port {
             self.log(Level::Warn, &format!("it was taken, Webots listens on {port}"));
         }
-        self.spec.place.0.log(Level::Info, format!("port {port}: ready"));
+        self.spec.slot.lease.log(Level::Info, format!("port {port}: ready"));
         self.listening = true;
         self.last_heartbeat = Instant::now();
-        self.spec.place.0.update(Change::Port(port));
+        self.spec.slot.lease.update(SimulationChange::Port(port));
         self.show_pace();
         let stream = self.stream.insert(self.spec.register(port)).token();
         self.tell(WebotsEvent::Listening(port, stream));
@@ -180,7 +180,7 @@ impl Webots {
     /// Shows whether the simulation runs, unless Webots is starting or ending.
     fn show_pace(&self) {
         if self.listening && self.stopped_for.is_none() {
-            self.spec.place.0.update(Change::Stage(if self.runs { Stage::Running } else { Stage::Idle }));
+            self.spec.slot.lease.update(SimulationChange::Stage(if self.runs { Stage::Running } else { Stage::Idle }));
         }
     }
 
@@ -205,7 +205,7 @@ impl Webots {
         if self.stopped_for.is_none() {
             self.log(Level::Info, &format!("ending: {why}"));
             self.stopped_for = Some((kind, why.to_owned()));
-            self.spec.place.0.update(Change::Stage(Stage::Stopping));
+            self.spec.slot.lease.update(SimulationChange::Stage(Stage::Stopping));
             self.group.iter_mut().for_each(ProcessGroup::terminate);
         }
     }
@@ -215,7 +215,7 @@ impl Webots {
         if self.stopped_for.is_none() {
             self.log(Level::Warn, &format!("ended: {why}"));
             self.stopped_for = Some((EndReason::Limit, why.to_owned()));
-            self.spec.place.0.update(Change::Stage(Stage::Stopping));
+            self.spec.slot.lease.update(SimulationChange::Stage(Stage::Stopping));
             self.group = None;
         }
     }
@@ -224,10 +224,10 @@ impl Webots {
         self.stream = None;
         self.log(Level::Info, &format!("Webots {}", end.reason));
         let (kind, why) = verdict(self.stopped_for.take(), end, self.listening);
-        self.spec.place.0.end(kind, &why, end.taken);
+        self.spec.slot.lease.end(kind, &why, end.taken);
         let mut exit = match kind {
-            EndReason::Finished => Exit::clean(),
-            EndReason::Fault => Exit { own: true, ..self.failure(&why) },
+            EndReason::Finished => WebotsExit::clean(),
+            EndReason::Fault => WebotsExit { own: true, ..self.failure(&why) },
             _ => self.failure(&why),
         };
         if self.listening || matches!(kind, EndReason::Finished | EndReason::Fault) {
@@ -242,19 +242,19 @@ impl Webots {
     }
 
     fn not_started(&mut self, kind: EndReason, why: &str, ctx: &mut Context<Self>) {
-        self.spec.place.0.end(kind, why, Taken::default());
-        self.exited(Exit { own: kind == EndReason::Fault, ..self.failure(why) }, ctx);
+        self.spec.slot.lease.end(kind, why, Taken::default());
+        self.exited(WebotsExit { own: kind == EndReason::Fault, ..self.failure(why) }, ctx);
     }
 
-    fn exited(&mut self, exit: Exit, ctx: &mut Context<Self>) {
+    fn exited(&mut self, exit: WebotsExit, ctx: &mut Context<Self>) {
         self.tell(WebotsEvent::Exited(exit));
         ctx.stop();
     }
 
     /// An end that is not in order. What containers run is made by their project.
-    fn failure(&self, why: &str) -> Exit {
+    fn failure(&self, why: &str) -> WebotsExit {
         let why = format!("{why}{}", self.tail.last_words(&self.spec.project.instance.project()));
-        Exit { clean: false, own: !self.listening && self.spec.containers.is_none(), why }
+        WebotsExit { clean: false, own: !self.listening && self.spec.containers.is_none(), why }
     }
 
     pub(super) fn tell(&mut self, event: WebotsEvent) {
@@ -262,7 +262,7 @@ impl Webots {
     }
 
     fn log(&self, level: Level, event: &str) {
-        self.spec.place.0.log(level, format!("port {}: {event}", self.port));
+        self.spec.slot.lease.log(level, format!("port {}: {event}", self.port));
     }
 }
 
@@ -298,10 +298,10 @@ impl Handler<OutputEvent> for Webots {
     }
 }
 
-impl Handler<RestoreController> for Webots {
+impl Handler<ResetController> for Webots {
     type Result = ResponseFuture<Result<(), CheckoutError>>;
 
-    fn handle(&mut self, RestoreController(file): RestoreController, _: &mut Self::Context) -> Self::Result {
+    fn handle(&mut self, ResetController(file): ResetController, _: &mut Self::Context) -> Self::Result {
         let (checkouts, project) = (Arc::clone(&self.spec.checkouts), Arc::clone(&self.spec.project));
         Box::pin(async move { checkouts.restore_controller(&project, &file).await })
     }

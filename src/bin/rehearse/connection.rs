@@ -1,0 +1,173 @@
+//! A WebSocket as a browser's page sees it: texts that come and go, each wait with a limit.
+
+use std::time::{Duration, Instant};
+
+use futures_util::{SinkExt, StreamExt};
+use serde::Deserialize;
+use tokio::net::TcpStream;
+use tokio_tungstenite::tungstenite::protocol::WebSocketConfig;
+use tokio_tungstenite::tungstenite::{Error, Message};
+use tokio_tungstenite::{Connector, MaybeTlsStream, WebSocketStream, connect_async_tls_with_config};
+
+use crate::session::encryption;
+
+/// How long a connection may take, or a text to be sent.
+const CONNECT: Duration = Duration::from_secs(20);
+/// The largest message of a server, in bytes.
+const LARGEST_MESSAGE: usize = 1 << 20;
+/// The same of Webots: the scene of a large world comes in one message.
+const LARGEST_SCENE: usize = 64 << 20;
+
+/// An open WebSocket.
+pub(crate) struct Connection {
+    socket: WebSocketStream<MaybeTlsStream<TcpStream>>,
+}
+
+/// Why a conversation is over.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub(crate) enum Ended {
+    /// The connection can't be made.
+    #[error("{0} can't be reached: {1}")]
+    Unreachable(String, String),
+    /// The other side has closed it.
+    #[error("closed with {0}")]
+    Closed(String),
+    /// It broke.
+    #[error("broken: {0}")]
+    Broken(String),
+    /// What was waited for did not come in time, whatever else came.
+    #[error("not within {} s", .0.as_secs())]
+    Late(Duration),
+    /// The other side has said that it can't go on.
+    #[error("{0}")]
+    Fault(String),
+}
+
+/// Until when all of a step has to be done.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Deadline {
+    end: Instant,
+    limit: Duration,
+}
+
+impl Deadline {
+    /// So long from now.
+    pub(crate) fn within(limit: Duration) -> Self {
+        Self { end: Instant::now() + limit, limit }
+    }
+}
+
+/// A text of Webots, or its end: after `error: ...` nothing else comes.
+///
+/// # Errors
+/// When the text is such an end.
+pub(crate) fn unless_error(text: String) -> Result<String, Ended> {
+    if text.starts_with("error:") { Err(Ended::Fault(text)) } else { Ok(text) }
+}
+
+/// An update of the scene; only its time counts here.
+#[derive(Deserialize)]
+struct Update {
+    /// Simulated time, in milliseconds.
+    time: f64,
+}
+
+/// The simulated time of an update, in milliseconds.
+pub(crate) fn simulated_time(text: &str) -> Option<f64> {
+    let update: Update = serde_json::from_str(text.strip_prefix("application/json:")?).ok()?;
+    Some(update.time)
+}
+
+impl Connection {
+    /// Connects to a WebSocket URL of a server.
+    ///
+    /// # Errors
+    /// When nobody takes the connection in time.
+    pub(crate) async fn open(url: &str) -> Result<Self, Ended> {
+        Self::open_for(url, LARGEST_MESSAGE).await
+    }
+
+    /// Connects to a WebSocket URL of a Webots.
+    ///
+    /// # Errors
+    /// When nobody takes the connection in time.
+    pub(crate) async fn open_scene(url: &str) -> Result<Self, Ended> {
+        Self::open_for(url, LARGEST_SCENE).await
+    }
+
+    async fn open_for(url: &str, largest: usize) -> Result<Self, Ended> {
+        let config = WebSocketConfig::default().max_message_size(Some(largest)).max_frame_size(Some(largest));
+        let failed = |why: String| Ended::Unreachable(url.to_owned(), why);
+        let connecting = connect_async_tls_with_config(url, Some(config), true, encryption().map(Connector::Rustls));
+        let connected =
+            actix_rt::time::timeout(CONNECT, connecting).await.map_err(|_| failed("too slow".to_owned()))?;
+        let (socket, _) = connected.map_err(|error| failed(error.to_string()))?;
+        Ok(Self { socket })
+    }
+
+    /// Sends a text.
+    ///
+    /// # Errors
+    /// When the connection is broken, or nobody reads.
+    pub(crate) async fn say(&mut self, text: &str) -> Result<(), Ended> {
+        let sending = actix_rt::time::timeout(CONNECT, self.socket.send(Message::text(text)));
+        let sent = sending.await.map_err(|_| Ended::Late(CONNECT))?;
+        sent.map_err(|error| Ended::Broken(error.to_string()))
+    }
+
+    /// The next text.
+    ///
+    /// # Errors
+    /// When the connection is over.
+    pub(crate) async fn receive(&mut self) -> Result<String, Ended> {
+        loop {
+            match self.socket.next().await {
+                Some(Ok(Message::Text(text))) => return Ok(text.to_string()),
+                Some(Ok(Message::Close(frame))) => {
+                    let code = frame.map_or_else(|| "no code".to_owned(), |frame| frame.code.to_string());
+                    return Err(Ended::Closed(code));
+                }
+                Some(Ok(_)) => {}
+                None | Some(Err(Error::ConnectionClosed | Error::AlreadyClosed)) => {
+                    return Err(Ended::Closed("no code".to_owned()));
+                }
+                Some(Err(error)) => return Err(Ended::Broken(error.to_string())),
+            }
+        }
+    }
+
+    /// The next text, if it comes before the deadline. Where texts come all the time, none comes after it.
+    ///
+    /// # Errors
+    /// When the connection is over, or the time is.
+    pub(crate) async fn receive_by(&mut self, deadline: Deadline) -> Result<String, Ended> {
+        let late = Ended::Late(deadline.limit);
+        if Instant::now() >= deadline.end {
+            return Err(late);
+        }
+        tokio::time::timeout_at(deadline.end.into(), self.receive()).await.unwrap_or(Err(late))
+    }
+
+    /// Closes the connection as a page does that is left, and does not wait for long.
+    pub(crate) async fn close(mut self) {
+        let closing = async {
+            if self.socket.close(None).await.is_ok() {
+                while let Some(Ok(_)) = self.socket.next().await {}
+            }
+        };
+        // Who does not answer is left all the same.
+        actix_rt::time::timeout(Duration::from_secs(2), closing).await.ok();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_time_of_updates_alone_is_read() {
+        assert_eq!(simulated_time(r#"application/json:{"time":1.024e+06,"updates":[{"id":1}]}"#), Some(1_024_000.0));
+        assert_eq!(simulated_time("application/json:{}"), None);
+        assert_eq!(simulated_time("pause: 12"), None);
+    }
+}

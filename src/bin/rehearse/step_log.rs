@@ -1,0 +1,58 @@
+//! The steps of an acceptance run, and how they are told: each as soon as it is known.
+
+use std::io::Write;
+use std::time::Instant;
+
+use crate::arguments::Arguments;
+use crate::words::line;
+
+/// The walk through the steps.
+pub(crate) struct StepLog {
+    began: Instant,
+    last: Instant,
+    /// How many steps were made.
+    steps: usize,
+    /// Those of them that are not as expected.
+    differing: Vec<&'static str>,
+}
+
+impl StepLog {
+    /// Begins now, and prints what comes above the steps.
+    pub(crate) fn begin(arguments: &Arguments) -> Self {
+        let (name, version) = (env!("CARGO_PKG_NAME"), env!("CARGO_PKG_VERSION"));
+        print(&format!("`rehearse {} --explain`, {name} {version}", arguments.fleet));
+        print(&format!("World: {}\n", arguments.world));
+        print("| step | at | took | expected | came | |\n|---|---|---|---|---|---|");
+        let now = Instant::now();
+        Self { began: now, last: now, steps: 0, differing: Vec::new() }
+    }
+
+    /// Prints what came at a step, and begins the next.
+    pub(crate) fn note(&mut self, name: &'static str, expected: &'static str, came: &str, agrees: bool) {
+        let (at, took) = (self.began.elapsed().as_secs_f64(), self.last.elapsed().as_secs_f64());
+        self.last = Instant::now();
+        self.steps += 1;
+        if !agrees {
+            self.differing.push(name);
+        }
+        let verdict = if agrees { "ok" } else { "**differs**" };
+        let came = line(came).replace('|', "\\|");
+        print(&format!("| {name} | {at:.2} s | {took:.2} s | {expected} | {came} | {verdict} |"));
+    }
+
+    /// Prints which steps differ. Returns whether none does.
+    pub(crate) fn end(self) -> bool {
+        let verdict = match self.differing.as_slice() {
+            [] => "All steps are as expected.".to_owned(),
+            names => format!("{} of {} steps differ: {}.", names.len(), self.steps, names.join(", ")),
+        };
+        print(&format!("\n{verdict}"));
+        self.differing.is_empty()
+    }
+}
+
+/// Nobody may be listening any more.
+fn print(line: &str) {
+    let mut out = std::io::stdout();
+    writeln!(out, "{line}").and_then(|()| out.flush()).ok();
+}

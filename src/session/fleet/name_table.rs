@@ -1,0 +1,113 @@
+//! The names of `simulationServers`, and the simulation servers that each leads to. Part of the registry.
+//!
+//! A name server that fails, or has nothing to tell, changes nothing: the servers that were found last stay.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::time::SystemTime;
+
+use super::fleet_status::NameStatus;
+use super::monitors::{MonitorRecipients, Monitors};
+use super::name_monitor::LookupResult;
+use crate::session::config::{DnsName, ServerEntry};
+use crate::shared::domain::PublicAddress;
+use crate::shared::text::one_line;
+
+/// All names.
+#[derive(Default)]
+pub struct NameTable(BTreeMap<DnsName, MonitoredName>);
+
+/// One name.
+struct MonitoredName {
+    servers: BTreeSet<PublicAddress>,
+    /// Why the last lookup failed, if it did.
+    error: Option<String>,
+    /// Since when lookups fail or don't.
+    since: SystemTime,
+}
+
+/// How many letters of an error are kept.
+const LONGEST_ERROR: usize = 120;
+
+/// What a lookup has changed.
+#[derive(Debug, PartialEq, Eq)]
+pub struct NameChange {
+    /// Whether it leads to other servers than before.
+    pub servers: bool,
+    /// That lookups have begun to fail, or work again.
+    pub turn: Option<LookupTransition>,
+}
+
+/// A name begins to fail, or ceases to.
+#[derive(Debug, PartialEq, Eq)]
+pub enum LookupTransition {
+    /// It can't be looked up, for this reason.
+    Fails(String),
+    /// It can be again, and leads to so many servers.
+    WorksAgain(usize),
+}
+
+impl NameTable {
+    /// Looks up the names among these entries, and no others.
+    pub fn apply(&mut self, entries: &[ServerEntry], monitors: &mut Monitors, results: &MonitorRecipients) {
+        let wanted: BTreeSet<&DnsName> = entries.iter().filter_map(ServerEntry::name).collect();
+        self.0.retain(|name, _| {
+            let stays = wanted.contains(name);
+            if !stays {
+                monitors.stop_looking_up(name);
+            }
+            stays
+        });
+        for name in wanted {
+            self.0.entry(name.clone()).or_insert_with(|| {
+                monitors.look_up(name, results);
+                MonitoredName { servers: BTreeSet::new(), error: None, since: SystemTime::now() }
+            });
+        }
+    }
+
+    /// Takes in what a lookup brought. Returns what has changed, nothing for a name that is no longer wanted.
+    pub fn record(&mut self, LookupResult { name, answer }: LookupResult) -> Option<NameChange> {
+        let looked = self.0.get_mut(&name)?;
+        let failed = looked.error.is_some();
+        let mut servers = false;
+        let turn = match answer {
+            Ok(found) => {
+                looked.error = None;
+                servers = found != looked.servers;
+                looked.servers = found;
+                failed.then_some(LookupTransition::WorksAgain(looked.servers.len()))
+            }
+            Err(error) => {
+                let error: String = one_line(&error).chars().take(LONGEST_ERROR).collect();
+                looked.error = Some(error.clone());
+                (!failed).then_some(LookupTransition::Fails(error))
+            }
+        };
+        if turn.is_some() {
+            looked.since = SystemTime::now();
+        }
+        Some(NameChange { servers, turn })
+    }
+
+    /// The servers that these entries stand for, in their order, each once.
+    pub fn servers(&self, entries: &[ServerEntry]) -> Vec<PublicAddress> {
+        let mut seen = BTreeSet::new();
+        let mut servers = Vec::new();
+        for entry in entries {
+            let found = entry.name().and_then(|name| self.0.get(name)).into_iter().flat_map(|looked| &looked.servers);
+            servers.extend(entry.server().into_iter().chain(found).filter(|server| seen.insert(*server)).cloned());
+        }
+        servers
+    }
+
+    /// What is known of each name.
+    pub fn status(&self) -> Vec<NameStatus> {
+        let status = |(name, looked): (&DnsName, &MonitoredName)| NameStatus {
+            name: name.clone(),
+            servers: looked.servers.len(),
+            error: looked.error.clone(),
+            since: looked.since,
+        };
+        self.0.iter().map(status).collect()
+    }
+}

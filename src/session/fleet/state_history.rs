@@ -1,0 +1,94 @@
+//! Changes of the state of simulation servers, and of the names that lead to some: each is one log line, one line of `/monitor`, and the notices to the
+//! administrator. Part of the registry.
+
+use std::collections::VecDeque;
+use std::time::SystemTime;
+
+use actix::prelude::*;
+
+use super::fleet_status::{ServerState, StateChange};
+use super::name_table::LookupTransition;
+use super::server_record::{ServerChange, ServerRecord};
+use crate::session::config::{DnsName, SessionConfig};
+use crate::session::mail::{self, Mailer, Notice, NoticeKind, Topic, Way};
+use crate::shared::domain::PublicAddress;
+use crate::shared::run::{Supervisor, TooManyPanics};
+
+/// The last changes, and the mailer that tells the administrator.
+pub struct StateHistory {
+    recent: VecDeque<StateChange>,
+    /// One for each way on which notices go.
+    mailers: Supervisor<Way, Mailer>,
+}
+
+/// How many changes are kept.
+const KEPT: usize = 50;
+
+impl StateHistory {
+    /// No changes yet; notices go to these actors.
+    pub fn new(all: Vec<(Way, Addr<Mailer>)>) -> Self {
+        let mut mailers = Supervisor::new("mailer of notices by");
+        for (way, mailer) in all {
+            mailers.add(way, mailer);
+        }
+        Self { recent: VecDeque::new(), mailers }
+    }
+
+    /// Starts another mailer if the last one has panicked. What it had not sent is lost.
+    ///
+    /// # Errors
+    /// When there were too many panics.
+    pub fn restart_gone(&mut self, config: &SessionConfig) -> Result<(), TooManyPanics> {
+        self.mailers.restart_gone(|way| mail::start(config, *way))
+    }
+
+    /// Returns the last changes, the newest first.
+    pub fn recent(&self) -> &VecDeque<StateChange> {
+        &self.recent
+    }
+
+    /// Adds a change of a server whose record is now `record`.
+    pub fn add(&mut self, server: &PublicAddress, record: &ServerRecord, change: ServerChange) {
+        let ServerChange { state, still, at, why, events } = change;
+        let words = if still { "still " } else { "" };
+        self.list(words, StateChange { at, server: server.to_string(), state, why });
+        // The last that is known: a server that does not answer tells no load, and one that works again no error.
+        let load = record.report.as_ref().map(|report| report.load);
+        for event in events {
+            let error = record.last_error.as_ref().filter(|_| event.topic() == Topic::Health).map(ToString::to_string);
+            self.notify(&Notice { server: server.to_string(), event, load, error, at });
+        }
+    }
+
+    /// Adds that a name has begun to fail, or works again.
+    pub fn add_name(&mut self, name: &DnsName, turn: LookupTransition) {
+        let (at, server) = (SystemTime::now(), name.to_string());
+        let (state, event, why, error) = match turn {
+            LookupTransition::Fails(error) => {
+                let why = format!("{error}; the servers that it led to before stay");
+                (ServerState::Down, NoticeKind::LookupFails, why, Some(error))
+            }
+            LookupTransition::WorksAgain(servers) => {
+                (ServerState::Up, NoticeKind::LookupWorks, format!("it leads to {servers} simulation servers"), None)
+            }
+        };
+        self.list("", StateChange { at, server: server.clone(), state, why });
+        self.notify(&Notice { server, event, load: None, error, at });
+    }
+
+    fn list(&mut self, words: &str, change: StateChange) {
+        let StateChange { server, state, why, .. } = &change;
+        let level = if *state == ServerState::Down { log::Level::Warn } else { log::Level::Info };
+        log::log!(level, "{server}: {words}{}: {why}", state.word());
+        self.recent.truncate(KEPT - 1);
+        self.recent.push_front(change);
+    }
+
+    fn notify(&self, notice: &Notice) {
+        for mailer in self.mailers.all() {
+            if let Err(lost) = mailer.try_send(notice.clone()) {
+                log::error!("{}: no notice is sent: {lost}", notice.server);
+            }
+        }
+    }
+}

@@ -1,0 +1,173 @@
+//! A simulation server's report: the part of `GET /status` that both servers know.
+
+use serde::{Deserialize, Serialize};
+
+use super::admission::AdmissionRules;
+use super::load::Load;
+use super::project_url::ProjectUrl;
+use super::url_prefix::UrlPrefix;
+use crate::shared::config::{object, optional_object};
+use crate::shared::text::one_line;
+
+/// The part of a simulation server's `/status` by which the session server places clients.
+///
+/// Only `load` is required. Every other field has a default for 'not reported', so that the report of an older server,
+/// or of a Python one, can be read too.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "camelCase")]
+pub struct ServerReport {
+    /// Mean load of the last five seconds, in percent.
+    pub load: Load,
+    /// The server's version.
+    #[serde(default, deserialize_with = "line")]
+    pub version: String,
+    /// Simulations by state, if the server counts them.
+    #[serde(default, deserialize_with = "optional_object")]
+    pub instances: Option<Instances>,
+    /// Repositories whose worlds the server runs at any load.
+    #[serde(default)]
+    pub allowed_repositories: Vec<UrlPrefix>,
+    /// Repositories whose worlds it never runs.
+    #[serde(default)]
+    pub blocked_repositories: Vec<UrlPrefix>,
+    /// The highest load, in percent, at which other worlds may run; 0: never.
+    #[serde(default)]
+    pub share_idle_time: f64,
+    /// Whether the server can run other worlds in containers.
+    #[serde(default)]
+    pub docker: Option<bool>,
+    /// Whether the server takes no new clients because it is about to stop.
+    #[serde(default)]
+    pub draining: bool,
+    /// How many of the last starts in a row failed for a reason of the server's own.
+    #[serde(default)]
+    pub failed_starts: u32,
+    /// Why the server can start no simulation at all, if so.
+    #[serde(default, skip_serializing_if = "Option::is_none", deserialize_with = "optional_line")]
+    pub problem: Option<String>,
+}
+
+/// Number of simulations of a server by state.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "camelCase", default)]
+pub struct Instances {
+    /// Clients in the waiting line.
+    pub queued: u32,
+    /// Checking out or launching.
+    pub starting: u32,
+    /// Webots runs, its simulation is paused.
+    pub idle: u32,
+    /// Webots runs, and so does its simulation.
+    pub running: u32,
+    /// How many simulations fit.
+    pub places: u32,
+    /// Clients that asked for a start since the server began; it only grows.
+    pub arrivals: u64,
+}
+
+fn line<'de, D: serde::Deserializer<'de>>(deserializer: D) -> Result<String, D::Error> {
+    String::deserialize(deserializer).map(|text| one_line(&text))
+}
+
+fn optional_line<'de, D: serde::Deserializer<'de>>(deserializer: D) -> Result<Option<String>, D::Error> {
+    Option::<String>::deserialize(deserializer).map(|text| text.map(|text| one_line(&text)))
+}
+
+impl Instances {
+    /// Clients that hold a place or wait for one.
+    pub fn present(&self) -> u32 {
+        // Another server's numbers may be anything.
+        [self.starting, self.idle, self.running].into_iter().fold(self.queued, u32::saturating_add)
+    }
+}
+
+impl ServerReport {
+    /// Reads the JSON of `/status`.
+    ///
+    /// # Errors
+    /// When it is no JSON object with a `load`.
+    pub fn parse(page: &[u8]) -> serde_json::Result<Self> {
+        let mut json = serde_json::Deserializer::from_slice(page);
+        let report = object(&mut json)?;
+        json.end().map(|()| report)
+    }
+
+    /// The report of a server that has only `/load`.
+    pub fn load_only(load: Load) -> Self {
+        Self {
+            load,
+            version: String::new(),
+            instances: None,
+            allowed_repositories: Vec::new(),
+            blocked_repositories: Vec::new(),
+            share_idle_time: 0.0,
+            docker: None,
+            draining: false,
+            failed_starts: 0,
+            problem: None,
+        }
+    }
+
+    /// Whether the server will run this world, as far as the report tells.
+    ///
+    /// A report without `docker` comes from a Python server: it is expected to run every world that it does not rule
+    /// out, as the Python session server expects it.
+    pub fn accepts(&self, world: &ProjectUrl) -> bool {
+        let Some(docker) = self.docker else {
+            let blocked = self.blocked_repositories.iter().any(|prefix| prefix.may_cover(world));
+            let open = self.allowed_repositories.is_empty() || self.share_idle_time > 0.0;
+            return !blocked && (open || self.allowed_repositories.iter().any(|prefix| prefix.covers(world)));
+        };
+        let rules = AdmissionRules {
+            allowed: self.allowed_repositories.as_slice(),
+            blocked: self.blocked_repositories.as_slice(),
+            docker,
+            share_idle_time: self.share_idle_time,
+        };
+        rules.admit(world, self.load).is_ok()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_server_is_sent_only_worlds_that_it_will_run() {
+        let lab = ProjectUrl::parse("https://github.com/lab/arm/blob/main/worlds/a.wbt").unwrap();
+        let other = ProjectUrl::parse("https://github.com/other/arm/blob/main/worlds/a.wbt").unwrap();
+        let table = [
+            (r#"{"load": 1}"#, true, true, "it says nothing"),
+            (
+                r#"{"load": 1, "allowedRepositories": ["https://github.com/lab"]}"#,
+                true,
+                false,
+                "Python, shares nothing",
+            ),
+            (
+                r#"{"load": 1, "allowedRepositories": ["https://github.com/lab"], "shareIdleTime": 50}"#,
+                true,
+                true,
+                "Python",
+            ),
+            (r#"{"load": 1, "docker": false}"#, false, false, "ours, allows nobody"),
+            (r#"{"load": 1, "docker": false, "allowedRepositories": ["https://github.com/lab"]}"#, true, false, "ours"),
+            (
+                r#"{"load": 60, "docker": true, "shareIdleTime": 50, "allowedRepositories": ["https://github.com/lab"]}"#,
+                true,
+                false,
+                "busy",
+            ),
+            (
+                r#"{"load": 40, "docker": true, "shareIdleTime": 50, "blockedRepositories": ["https://github.com/lab"]}"#,
+                false,
+                true,
+                "blocked",
+            ),
+        ];
+        for (text, runs_lab, runs_other, why) in table {
+            let status: ServerReport = serde_json::from_str(text).unwrap();
+            assert_eq!((status.accepts(&lab), status.accepts(&other)), (runs_lab, runs_other), "{why}");
+        }
+    }
+}

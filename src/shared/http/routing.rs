@@ -1,0 +1,108 @@
+//! What the paths of both servers share: allowed methods, CORS headers, the answer for unknown paths.
+
+use actix_web::dev::HttpServiceFactory;
+use actix_web::http::header::{self, HeaderName, HeaderValue};
+use actix_web::http::{Method, StatusCode};
+use actix_web::middleware::DefaultHeaders;
+use actix_web::{FromRequest, Handler, HttpRequest, HttpResponse, Resource, Responder, guard, web};
+use rand::RngExt;
+
+/// The values of `Retry-After`, in seconds.
+const RETRY_AFTER: std::ops::RangeInclusive<u16> = 2..=6;
+
+/// For what is read. What watches over servers likes to ask for the head alone (RFC 9110, section 9.3.2).
+pub const READ: &[Method] = &[Method::GET, Method::HEAD];
+/// For WebSockets and event streams, whose answers have no end.
+pub const GET: &[Method] = &[Method::GET];
+/// For what changes something.
+pub const POST: &[Method] = &[Method::POST];
+
+/// A path that takes these methods. Others are refused by name (RFC 9110, section 15.5.6), and OPTIONS is answered.
+pub fn path<F, Arguments>(name: &str, methods: &'static [Method], handler: F) -> Resource
+where
+    F: Handler<Arguments, Output: Responder + 'static>,
+    Arguments: FromRequest + 'static,
+{
+    let route = web::route().guard(guard::fn_guard(move |request| methods.contains(&request.head().method)));
+    web::resource(name)
+        .route(route.to(handler))
+        .route(web::method(Method::OPTIONS).to(HttpResponse::NoContent))
+        .default_service(web::to(move || async move { wrong_method(methods) }))
+}
+
+fn wrong_method(methods: &[Method]) -> HttpResponse {
+    let allowed = methods.iter().map(Method::as_str).collect::<Vec<_>>().join(", ");
+    let words = format!("Error: wrong method; allowed here: {allowed}.");
+    HttpResponse::MethodNotAllowed().insert_header((header::ALLOW, allowed)).body(words)
+}
+
+/// Refuses a request that a page of another site made (CSRF): the browser would add the password that it remembers.
+///
+/// Browsers tell where a request comes from in `Sec-Fetch-Site`, older ones in `Origin`; other programs send neither.
+pub fn reject_cross_site(request: &HttpRequest) -> Option<HttpResponse> {
+    let header = |name: HeaderName| request.headers().get(name).map(|value| value.to_str().unwrap_or_default());
+    let same_site =
+        header(HeaderName::from_static("sec-fetch-site")).is_none_or(|site| matches!(site, "same-origin" | "none"));
+    let host = header(header::HOST).unwrap_or_default();
+    let same_host = header(header::ORIGIN).is_none_or(|origin| {
+        let of_page = origin.split_once("://").map_or(origin, |(_, authority)| authority);
+        of_page.eq_ignore_ascii_case(host)
+    });
+    let refusal = || HttpResponse::Forbidden().body("Error: this request comes from a page of another site.");
+    (!same_site || !same_host).then(refusal)
+}
+
+/// The value of `Retry-After`, in seconds. Random, so that a class that was refused together does not come back together.
+pub fn retry_after() -> (HeaderName, HeaderValue) {
+    (header::RETRY_AFTER, HeaderValue::from(rand::rng().random_range(RETRY_AFTER)))
+}
+
+/// All paths of a server, which pages of any origin may use; `hint` names those that people look for.
+pub fn all(configure: fn(&mut web::ServiceConfig), hint: &'static str) -> impl HttpServiceFactory + 'static {
+    let headers = DefaultHeaders::new()
+        .add((header::ACCESS_CONTROL_ALLOW_ORIGIN, "*"))
+        .add((header::ACCESS_CONTROL_ALLOW_HEADERS, "x-requested-with"))
+        .add((header::ACCESS_CONTROL_ALLOW_METHODS, "POST, GET, OPTIONS"))
+        .add((header::ACCESS_CONTROL_EXPOSE_HEADERS, "Retry-After"))
+        .add((header::CACHE_CONTROL, "no-store"))
+        .add((header::X_CONTENT_TYPE_OPTIONS, "nosniff"));
+    web::scope("")
+        .wrap(headers)
+        .configure(configure)
+        .route("/{path:.*}", web::method(Method::OPTIONS).to(HttpResponse::NoContent))
+        .default_service(web::to(move || async move {
+            let words = format!("Error: there is nothing here. Try {hint}.");
+            HttpResponse::build(StatusCode::NOT_FOUND).body(words)
+        }))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use actix_web::test::TestRequest;
+
+    #[test]
+    fn only_pages_of_the_same_site_and_other_programs_change_something() {
+        for (site, origin, allowed) in [
+            (None, None, true),
+            (Some("same-origin"), Some("https://lab.org:2000"), true),
+            (Some("none"), None, true),
+            (None, Some("http://LAB.org:2000"), true),
+            (Some("cross-site"), None, false),
+            (Some("same-site"), Some("https://lab.org:2000"), false),
+            (None, Some("https://lab.org"), false),
+            (None, Some("https://lab.org:2000.evil.example"), false),
+            (None, Some("null"), false),
+        ] {
+            let mut request = TestRequest::post().insert_header((header::HOST, "lab.org:2000"));
+            if let Some(site) = site {
+                request = request.insert_header(("sec-fetch-site", site));
+            }
+            if let Some(origin) = origin {
+                request = request.insert_header((header::ORIGIN, origin));
+            }
+            let refusal = reject_cross_site(&request.to_http_request());
+            assert_eq!(refusal.is_none(), allowed, "{site:?} {origin:?}");
+        }
+    }
+}

@@ -1,0 +1,64 @@
+//! Signals to a server, and the phases of its life that follow from them.
+
+use actix_rt::signal::unix::{Signal, SignalKind, signal};
+
+/// The signals of a server. They are caught as long as this exists.
+pub struct Signals {
+    terminate: Signal,
+    interrupt: Signal,
+    hang_up: Signal,
+    user: Signal,
+}
+
+/// What a signal, or an administrator's request, asks for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum ServerCommand {
+    /// SIGTERM or SIGINT: stop.
+    Stop,
+    /// SIGHUP: read the configuration again.
+    Reload,
+    /// SIGUSR1: take no new clients, and stop when the last one has gone.
+    Drain,
+}
+
+impl Signals {
+    /// Starts to catch the signals.
+    ///
+    /// # Errors
+    /// When the system does not allow it.
+    pub fn catch() -> std::io::Result<Self> {
+        Ok(Self {
+            terminate: signal(SignalKind::terminate())?,
+            interrupt: signal(SignalKind::interrupt())?,
+            hang_up: signal(SignalKind::hangup())?,
+            user: signal(SignalKind::user_defined1())?,
+        })
+    }
+
+    /// Waits for the next request.
+    pub async fn next(&mut self) -> ServerCommand {
+        tokio::select! {
+            _ = self.terminate.recv() => ServerCommand::Stop,
+            _ = self.interrupt.recv() => ServerCommand::Stop,
+            _ = self.hang_up.recv() => ServerCommand::Reload,
+            _ = self.user.recv() => ServerCommand::Drain,
+        }
+    }
+}
+
+/// The phase of a server's life. Its parts see it in a watch channel.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Phase {
+    /// It takes clients.
+    Open,
+    /// It keeps its clients, and takes no new ones.
+    Draining,
+    /// It stops: connections are closed.
+    Closing,
+}
+
+/// Waits until a server is closing.
+pub async fn closing(mut phase: tokio::sync::watch::Receiver<Phase>) {
+    // Without a sender the server has stopped already.
+    phase.wait_for(|phase| *phase == Phase::Closing).await.ok();
+}

@@ -1,0 +1,203 @@
+//! Checks worlds out of git for clients: cached, joined, cancellable, with progress.
+//!
+//! First the commit is brought into the cache (see [`super::commit_resolver`]); then each client gets its own copy of the
+//! project's folder. Both run on the server's main thread as tasks: whoever drops the handle no longer waits.
+
+use std::io;
+use std::path::Path;
+use std::sync::Arc;
+use std::time::Instant;
+
+use actix::prelude::*;
+use tokio::runtime::Handle;
+use tokio::sync::Semaphore;
+use tokio_util::task::AbortOnDropHandle;
+
+use super::cache_dir::CacheDir;
+use super::checkout_error::{CheckoutError, git_failed, machine, too_large, too_slow};
+use super::checkout_limits::CheckoutLimits;
+use super::commit_resolver::CommitResolver;
+use super::file_restore::{self, FileRestore};
+use super::git::Git;
+use super::lfs;
+use super::mirrors::Mirrors;
+use super::project::Project;
+use super::redirect;
+use super::repository_cache::RepositoryCache;
+use super::revision::Revision;
+use super::steps;
+use super::work_tree::{self, WorkTree, copy_call};
+use crate::shared::domain::{AdmissionRules, ProjectUrl};
+use crate::simulation::process::InstanceDir;
+
+/// Checks worlds out; one for the whole server.
+pub struct CheckoutService {
+    git: Arc<Git>,
+    cache: Arc<RepositoryCache>,
+    finder: Arc<CommitResolver>,
+    limits: CheckoutLimits,
+    runtime: Handle,
+    /// How many projects are copied at a time.
+    copies: Semaphore,
+    has_lfs: bool,
+    _keeps_within_budget: AbortOnDropHandle<()>,
+}
+
+/// How many projects are copied at a time: git may hold files in memory as it writes them.
+const COPIES: usize = 16;
+
+/// A step of a checkout, in words.
+#[derive(Message)]
+#[rtype(result = "()")]
+pub struct Progress(pub String);
+
+impl CheckoutService {
+    /// Prepares checkouts on the thread whose runtime this is. `run` is the folder of this run of the server; the
+    /// cached repositories may take `budget` bytes; `config` is a file of settings for git; `rules` say where a forge may
+    /// send to.
+    ///
+    /// # Errors
+    /// When the cache can't be made.
+    pub fn open(
+        dir: CacheDir,
+        run: &Path,
+        budget: u64,
+        (mirrors, config): (Mirrors, Option<&Path>),
+        rules: AdmissionRules,
+        limits: CheckoutLimits,
+        runtime: Handle,
+    ) -> io::Result<Self> {
+        let git = Arc::new(Git::new(run, config, limits.stall_timeout()));
+        let cache = Arc::new(RepositoryCache::open(dir, budget, Arc::clone(&git), limits)?);
+        let finder = Arc::new(CommitResolver::new(Arc::clone(&git), Arc::clone(&cache), (mirrors, rules), limits));
+        let keeper = AbortOnDropHandle::new(runtime.spawn(Arc::clone(&cache).keep_within_budget()));
+        let (copies, has_lfs) = (Semaphore::new(COPIES), lfs::is_installed());
+        Ok(Self { git, cache, finder, limits, runtime, copies, has_lfs, _keeps_within_budget: keeper })
+    }
+
+    /// Starts to check a world out into a client's folder. `progress` hears each step in words.
+    pub fn start(
+        self: &Arc<Self>,
+        world: ProjectUrl,
+        instance: InstanceDir,
+        progress: impl Fn(String) + Send + Sync + 'static,
+    ) -> AbortOnDropHandle<Result<Project, CheckoutError>> {
+        let this = Arc::clone(self);
+        let job = async move {
+            let limit = this.limits.time;
+            let done = actix_rt::time::timeout(limit, this.check_out(&world, instance, progress)).await;
+            done.unwrap_or_else(|_| Err(too_slow(&world, limit)))
+        };
+        AbortOnDropHandle::new(self.runtime.spawn(job))
+    }
+
+    async fn check_out(
+        &self,
+        world: &ProjectUrl,
+        instance: InstanceDir,
+        progress: impl Fn(String) + Send + Sync,
+    ) -> Result<Project, CheckoutError> {
+        let start = Instant::now();
+        let (mut world, mut redirects, mut is_mended) = (world.clone(), 0, false);
+        let checked_out = loop {
+            match self.attempt(&world, &instance, &progress).await {
+                Err(CheckoutError::Moved(..)) if redirects < redirect::MOST => {
+                    redirects += 1;
+                    world = self.finder.moved(&world).await?;
+                }
+                Err(error) if !is_mended => {
+                    is_mended = true;
+                    self.mend(&world, start, error).await?;
+                }
+                done => break done,
+            }
+        };
+        let (revision, WorkTree { pointers, world: file, .. }) = checked_out?;
+        let file = file?;
+        let warning = (pointers > 0).then(|| lfs::warning(pointers, self.has_lfs));
+        progress(steps::DONE.to_owned());
+        Ok(Project {
+            world: file,
+            warnings: warning.into_iter().collect(),
+            url: world,
+            folder: instance.project().join(&revision.folder),
+            revision,
+            instance,
+        })
+    }
+
+    /// Throws a cached repository away that was found to be broken, unless it was made after `since`: it can be fetched
+    /// anew.
+    ///
+    /// # Errors
+    /// The failure, if it is another one.
+    async fn mend(&self, world: &ProjectUrl, since: Instant, failure: CheckoutError) -> Result<(), CheckoutError> {
+        let CheckoutError::Damaged { .. } = &failure else {
+            return Err(failure);
+        };
+        log::warn!("{failure}. The cached repository is broken: it is fetched anew");
+        self.finder.discard(world, since).await
+    }
+
+    /// Finds and copies a project, with its large files.
+    async fn attempt(
+        &self,
+        world: &ProjectUrl,
+        instance: &InstanceDir,
+        progress: &(impl Fn(String) + Send + Sync),
+    ) -> Result<(Revision, WorkTree), CheckoutError> {
+        let found = self.finder.find(world, progress).await?;
+        let turn = self.copies.acquire().await;
+        let _turn = turn.map_err(|error| machine(world, &io::Error::other(error)))?;
+        let name = &found.revision.name;
+        progress(steps::checking_out(name, None));
+        let told = |line: &str| {
+            if line.contains('%') {
+                progress(steps::checking_out(name, Some(line)));
+            }
+        };
+        let written = work_tree::write(&self.git, &found, instance, (&self.limits, self.has_lfs), told).await;
+        if self.has_lfs {
+            self.cache.grown();
+        }
+        if written.map_err(|source| git_failed(world, source))? {
+            let copied = work_tree::look(world, instance, &found.revision).await?;
+            if copied.size <= self.limits.size {
+                return Ok((found.revision.clone(), copied));
+            }
+        }
+        Err(too_large("The project".to_owned(), self.limits.size))
+    }
+
+    /// Restores a file below the project's `controllers` folder to the state of the checkout.
+    ///
+    /// # Errors
+    /// When it is no file of the checkout there, or git fails.
+    pub async fn restore_controller(&self, project: &Project, file: &str) -> Result<(), CheckoutError> {
+        let refused = || CheckoutError::NoController(file.to_owned());
+        let path = file_restore::controller(&project.revision.folder, file).ok_or_else(refused)?;
+        let start = Instant::now();
+        let is_there = match self.restore(project, &path).await {
+            Err(error) => {
+                self.mend(&project.url, start, error).await?;
+                self.restore(project, &path).await?
+            }
+            Ok(is_there) => is_there,
+        };
+        if is_there { Ok(()) } else { Err(refused()) }
+    }
+
+    /// Restores a file of a project's repository. Returns whether it is there.
+    async fn restore(&self, project: &Project, path: &str) -> Result<bool, CheckoutError> {
+        let Project { url, revision, instance, .. } = project;
+        let Some(repository) = self.finder.file(url, revision, path).await? else {
+            return Ok(false);
+        };
+        let failed = |error| machine(url, &error);
+        let restored = FileRestore::new(instance.path()).map_err(failed)?;
+        let paths = [path.as_bytes(), b"\0"].concat();
+        let call = copy_call(&repository, revision, &paths, (restored.path(), &restored.files())).await;
+        self.git.run(call.map_err(failed)?, |_| ()).await.map_err(|source| git_failed(url, source))?;
+        restored.place(instance.project(), path.to_owned()).await.map_err(failed)
+    }
+}

@@ -1,0 +1,232 @@
+//! Finds the commit that a world's URL names, and brings it into the cache: once for all who want it at the same time.
+
+use std::sync::Arc;
+use std::time::Instant;
+
+use tokio::sync::watch;
+
+use super::canonical_remotes::CanonicalRemotes;
+use super::checkout_error::{CheckoutError, fetch_failed, git_failed, machine, no_reference};
+use super::checkout_limits::CheckoutLimits;
+use super::git::Git;
+use super::git_error::GitError;
+use super::mirrors::{Mirrors, Remote};
+use super::redirect;
+use super::remote_query::RemoteQuery;
+use super::repository::Repository;
+use super::repository_cache::RepositoryCache;
+use super::revision::{self, Revision, TrustSource};
+use super::single_flight::SingleFlight;
+use super::steps;
+use super::world_file::WorldFileError;
+use crate::shared::domain::{AdmissionRules, ProjectUrl};
+
+/// Finds commits; one for the whole server.
+#[derive(Debug)]
+pub struct CommitResolver {
+    git: Arc<Git>,
+    cache: Arc<RepositoryCache>,
+    mirrors: Mirrors,
+    rules: AdmissionRules,
+    limits: CheckoutLimits,
+    searches: SingleFlight<ProjectUrl, Result<Arc<ResolvedCommit>, CheckoutError>>,
+    spellings: CanonicalRemotes,
+}
+
+/// A world's commit in the cache.
+#[derive(Debug)]
+pub struct ResolvedCommit {
+    /// Where it is.
+    pub repository: Arc<Repository>,
+    /// What it is.
+    pub revision: Revision,
+    /// The files of the folders above the project's, each path ended by a zero byte: worlds may refer to them.
+    pub above: Vec<u8>,
+}
+
+/// What git says of a commit in the cache.
+enum Answer {
+    /// What it was asked for.
+    Text(Vec<u8>),
+    /// The reference names a file alone.
+    File,
+    /// The commit is not there.
+    Absent,
+}
+
+impl CommitResolver {
+    /// Finds commits by `git`, and keeps them in `cache`.
+    pub fn new(
+        git: Arc<Git>,
+        cache: Arc<RepositoryCache>,
+        (mirrors, rules): (Mirrors, AdmissionRules),
+        limits: CheckoutLimits,
+    ) -> Self {
+        let (searches, spellings) = (SingleFlight::default(), CanonicalRemotes::default());
+        Self { git, cache, mirrors, rules, limits, searches, spellings }
+    }
+
+    /// Waits for a world's commit to be in the cache, together with everybody who waits for the same.
+    ///
+    /// # Errors
+    /// Why it can't be there.
+    pub async fn find(
+        self: &Arc<Self>,
+        world: &ProjectUrl,
+        progress: &(impl Fn(String) + Send + Sync),
+    ) -> Result<Arc<ResolvedCommit>, CheckoutError> {
+        let (this, wanted) = (Arc::clone(self), world.clone());
+        let search = |told| async move { this.search(&wanted, &told).await.map(Arc::new) };
+        self.searches.join(world.clone(), progress, search).await
+    }
+
+    /// The world in the repository to which its forge sends.
+    ///
+    /// # Errors
+    /// When that may not be followed.
+    pub async fn moved(&self, world: &ProjectUrl) -> Result<ProjectUrl, CheckoutError> {
+        let repository = self.repository(world).await?;
+        let (moved, remote) = redirect::follow(&self.git, &repository, (&self.mirrors, &self.rules), world).await?;
+        self.spellings.insert(remote);
+        Ok(moved)
+    }
+
+    /// The first of the commits that a URL may mean in which its world is.
+    async fn search(&self, world: &ProjectUrl, told: &watch::Sender<String>) -> Result<ResolvedCommit, CheckoutError> {
+        let progress = |step| drop(told.send_replace(step));
+        progress(steps::looking_for(&world.repository()));
+        let repository = self.repository(world).await?;
+        let search = self.with(world, &repository, &progress);
+        let mut missing = None;
+        for revision in self.revisions(search).await? {
+            let path = revision.world_path(world);
+            let Some(answer) = self.read(search, &revision, &path).await? else {
+                continue;
+            };
+            if let Some(above) = revision.files_above(&answer, &path) {
+                return Ok(ResolvedCommit { repository, revision, above });
+            }
+            missing = Some(WorldFileError::Missing(format!("{path} in {}", revision.name)));
+        }
+        Err(missing.map_or_else(|| no_reference(world), CheckoutError::World))
+    }
+
+    fn with<'job>(
+        &'job self,
+        world: &'job ProjectUrl,
+        repository: &'job Arc<Repository>,
+        progress: &'job (dyn Fn(String) + Send + Sync),
+    ) -> RemoteQuery<'job> {
+        let (git, cache, limits) = (&*self.git, &*self.cache, &self.limits);
+        RemoteQuery { git, cache, limits, world, repository, progress }
+    }
+
+    async fn repository(&self, world: &ProjectUrl) -> Result<Arc<Repository>, CheckoutError> {
+        self.cache.commits(&self.remote(world)?).await.map_err(|error| machine(world, &error))
+    }
+
+    fn remote(&self, world: &ProjectUrl) -> Result<Remote, CheckoutError> {
+        let remote = self.mirrors.remote(world).ok_or_else(|| CheckoutError::Forge(world.host().to_owned()))?;
+        Ok(self.spellings.of(remote))
+    }
+
+    /// The commits that a URL may mean, the likeliest first.
+    async fn revisions(&self, search: RemoteQuery<'_>) -> Result<Vec<Revision>, CheckoutError> {
+        if let Some(commit) = revision::commit_of(search.world, self.limits.any_commit) {
+            return Ok(vec![commit]);
+        }
+        let answer = search.ask().await?;
+        Ok(revision::found(search.world, &answer))
+    }
+
+    /// Whether there is a file at a path of a commit that was found before. It is fetched again if it has left the cache
+    /// meanwhile. Returns the repository if so.
+    ///
+    /// # Errors
+    /// When the commit can't be read.
+    pub async fn file(
+        &self,
+        world: &ProjectUrl,
+        revision: &Revision,
+        path: &str,
+    ) -> Result<Option<Arc<Repository>>, CheckoutError> {
+        let repository = self.repository(world).await?;
+        let search = self.with(world, &repository, &drop);
+        let answer = self.read(search, revision, path).await?;
+        let is_file = answer.is_some_and(|answer| revision.files_above(&answer, path).is_some());
+        Ok(is_file.then_some(repository))
+    }
+
+    /// Has git list a path of a commit, which is fetched before if it is not in the cache. Nothing where the revision is no
+    /// folder.
+    async fn read(
+        &self,
+        search: RemoteQuery<'_>,
+        revision: &Revision,
+        path: &str,
+    ) -> Result<Option<Vec<u8>>, CheckoutError> {
+        let mut answer = self.answer(search, revision, path).await?;
+        if matches!(answer, Answer::Absent) {
+            if revision.trust == TrustSource::Url && !search.is_accepted(revision).await? {
+                let (repository, commit) = (search.world.repository(), revision.name.clone());
+                return Err(CheckoutError::NotReachable { repository, commit });
+            }
+            self.fetch(search, revision).await?;
+            answer = self.answer(search, revision, path).await?;
+        }
+        match answer {
+            Answer::Text(text) => Ok(Some(text)),
+            Answer::File => Ok(None),
+            Answer::Absent => {
+                Err(machine(search.world, &std::io::Error::other("the commit that was fetched is not there")))
+            }
+        }
+    }
+
+    async fn answer(
+        &self,
+        RemoteQuery { world, repository, .. }: RemoteQuery<'_>,
+        revision: &Revision,
+        path: &str,
+    ) -> Result<Answer, CheckoutError> {
+        match repository.read(&revision.list_arguments(path)).await {
+            Ok(text) => Ok(Answer::Text(text)),
+            Err(error @ (GitError::Machine(_) | GitError::TooLong(_) | GitError::Slow(_))) => {
+                Err(git_failed(world, error))
+            }
+            Err(error)
+                if repository.read(&["rev-parse", "--quiet", "--verify", &revision.reference()]).await.is_err() =>
+            {
+                log::debug!("{} is not in the cache: {error}", revision.commit);
+                Ok(Answer::Absent)
+            }
+            Err(source) => {
+                match repository.read(&["cat-file", "-t", &format!("{}^{{}}", revision.reference())]).await {
+                    Ok(kind) if kind.starts_with(b"blob") => Ok(Answer::File),
+                    _ => Err(CheckoutError::Damaged { repository: world.repository(), source }),
+                }
+            }
+        }
+    }
+
+    async fn fetch(&self, search: RemoteQuery<'_>, revision: &Revision) -> Result<(), CheckoutError> {
+        let RemoteQuery { world, repository, progress, .. } = search;
+        let tell = |said: String| progress(steps::fetching(&world.repository(), &said));
+        let failed =
+            |error| fetch_failed(world, || format!("{} (at depth 1)", world.repository()), self.limits.size, error);
+        repository.fetch(&revision.request(&repository.remote().location), &tell).await.map_err(failed)
+    }
+
+    /// Throws away what is cached of a world's repository, unless it was made after `since`.
+    ///
+    /// # Errors
+    /// When it can't be removed.
+    pub async fn discard(&self, world: &ProjectUrl, since: Instant) -> Result<(), CheckoutError> {
+        let remote = self.remote(world)?;
+        let discarded = async {
+            self.cache.commits(&remote).await?.discard(since).await?;
+            self.cache.history(&remote).await?.discard(since).await
+        };
+        discarded.await.map_err(|error| machine(world, &error))
+    }
+}

@@ -1,0 +1,181 @@
+//! The cached repositories: `CACHEDIR/git/NAME` is a bare repository, and a folder's time says when it was used last.
+//!
+//! They are kept below a size. Where they have grown above it, those that nobody uses go, the least recently used first.
+
+use std::collections::HashMap;
+use std::fs::File;
+use std::io;
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Weak};
+use std::time::SystemTime;
+
+use sha2::{Digest, Sha256};
+use tokio::sync::Mutex;
+
+use super::cache_dir::CacheDir;
+use super::checkout_limits::CheckoutLimits;
+use super::disk::size_of;
+use super::eviction_signal::EvictionSignal;
+use super::git::Git;
+use super::mirrors::Remote;
+use super::repository::Repository;
+use crate::simulation::process::remove_tree;
+
+/// The cached repositories of a server.
+#[derive(Debug)]
+pub struct RepositoryCache {
+    folder: PathBuf,
+    /// How many bytes they may take.
+    budget: u64,
+    git: Arc<Git>,
+    limits: CheckoutLimits,
+    /// Those that somebody uses.
+    in_use: Mutex<HashMap<PathBuf, Weak<Repository>>>,
+    growth: Arc<EvictionSignal>,
+    _dir: CacheDir,
+}
+
+/// The ending of a folder that is being removed. Names of repositories have no dots.
+const REMOVED: &str = "removed";
+
+impl RepositoryCache {
+    /// Opens the cache in `dir`, which may take `budget` bytes.
+    ///
+    /// # Errors
+    /// When its folder can't be made.
+    pub fn open(dir: CacheDir, budget: u64, git: Arc<Git>, limits: CheckoutLimits) -> io::Result<Self> {
+        let folder = dir.path().join("git");
+        std::fs::create_dir_all(&folder)?;
+        Ok(Self { folder, budget, git, limits, in_use: Mutex::default(), growth: Arc::default(), _dir: dir })
+    }
+
+    /// The repository that holds commits of `remote`. It is in use until what is returned is dropped.
+    ///
+    /// # Errors
+    /// When the cache's folder can't be made.
+    pub async fn commits(&self, remote: &Remote) -> io::Result<Arc<Repository>> {
+        self.repository(&remote.key(), remote).await
+    }
+
+    /// The repository that holds the history of `remote`: the commits of all branches and tags, without files where the
+    /// remote can leave them out.
+    ///
+    /// # Errors
+    /// When the cache's folder can't be made.
+    pub async fn history(&self, remote: &Remote) -> io::Result<Arc<Repository>> {
+        self.repository(&format!("{} history", remote.key()), remote).await
+    }
+
+    async fn repository(&self, key: &str, remote: &Remote) -> io::Result<Arc<Repository>> {
+        let path = self.folder.join(folder_name(key));
+        let repository = {
+            let mut in_use = self.in_use.lock().await;
+            in_use.retain(|_, repository| repository.strong_count() > 0);
+            let known = in_use.get(&path).and_then(Weak::upgrade);
+            if let Some(repository) = &known {
+                repository.set_remote(remote);
+            }
+            known.unwrap_or_else(|| {
+                let (git, growth) = (Arc::clone(&self.git), Arc::clone(&self.growth));
+                let repository = Arc::new(Repository::new(path.clone(), remote.clone(), git, self.limits, growth));
+                in_use.insert(path.clone(), Arc::downgrade(&repository));
+                repository
+            })
+        };
+        let folder = self.folder.clone();
+        actix_rt::task::spawn_blocking(move || {
+            std::fs::create_dir_all(folder)?;
+            match File::open(&path).and_then(|folder| folder.set_modified(SystemTime::now())) {
+                Err(error) if error.kind() != io::ErrorKind::NotFound => Err(error),
+                _ => Ok(()),
+            }
+        })
+        .await??;
+        Ok(repository)
+    }
+
+    /// Says that a repository has grown.
+    pub fn grown(&self) {
+        self.growth.grown();
+    }
+
+    /// Keeps the cache below its budget, for ever.
+    pub async fn keep_within_budget(self: Arc<Self>) {
+        loop {
+            let this = Arc::clone(&self);
+            if let Err(error) = actix_rt::task::spawn_blocking(move || this.shrink()).await {
+                log::error!("the cache can't be kept within its budget: {error}");
+            }
+            self.growth.changed().await;
+        }
+    }
+
+    /// Removes repositories until the others fit into the budget. Blocks.
+    fn shrink(&self) {
+        // A repository that is released from now on triggers another pass.
+        self.growth.set_over_budget(true);
+        let mut all: Vec<(SystemTime, u64, PathBuf)> = Vec::new();
+        for entry in std::fs::read_dir(&self.folder).into_iter().flatten().flatten() {
+            let path = entry.path();
+            if path.extension().is_some_and(|extension| extension == REMOVED) {
+                remove(&path);
+            } else if let Ok(used) = entry.metadata().and_then(|about| about.modified()) {
+                all.push((used, size_of(&path), path));
+            }
+        }
+        all.sort();
+        let mut total: u64 = all.iter().map(|(_, size, _)| size).sum();
+        for (_, size, path) in all {
+            if total > self.budget && self.remove_unused(&path) {
+                log::info!("removed {} from the cache", path.display());
+                total -= size;
+            }
+        }
+        self.growth.set_over_budget(total > self.budget);
+    }
+
+    /// Removes a repository unless somebody uses it. Blocks.
+    fn remove_unused(&self, path: &Path) -> bool {
+        let removed = path.with_extension(REMOVED);
+        {
+            // Whoever comes meanwhile waits, and then makes it anew.
+            let in_use = self.in_use.blocking_lock();
+            if in_use.get(&path.with_extension("")).is_some_and(|repository| repository.strong_count() > 0)
+                || std::fs::rename(path, &removed).is_err()
+            {
+                return false;
+            }
+        }
+        remove(&removed)
+    }
+}
+
+/// Removes a folder; what can't be removed is tried again by the next pass. Returns whether it is gone.
+fn remove(folder: &Path) -> bool {
+    // A branch's name may have a thousand levels of folders.
+    let removed = remove_tree(folder);
+    if let Err(error) = &removed {
+        log::warn!("{} can't be removed: {error}", folder.display());
+    }
+    removed.is_ok()
+}
+
+/// A readable name, made unique by a hash: `https---github-com-lab-arm-git-0123456789abcdef`.
+fn folder_name(key: &str) -> String {
+    let readable = key.chars().map(|letter| if letter.is_ascii_alphanumeric() { letter } else { '-' });
+    let readable: String = readable.skip_while(|letter| *letter == '-').take(100).collect();
+    let hash = Sha256::digest(key).iter().take(8).fold(0, |hash: u64, byte| (hash << 8) | u64::from(*byte));
+    format!("{readable}-{hash:016x}")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_are_short_readable_unique_and_always_the_same() {
+        assert_eq!(folder_name("https://github.com/lab/arm.git"), "https---github-com-lab-arm-git-a74f228b568c06bb");
+        assert_ne!(folder_name(&format!("{}a", "x".repeat(300))), folder_name(&format!("{}b", "x".repeat(300))));
+        assert!(folder_name(&"x".repeat(2000)).len() < 200);
+    }
+}

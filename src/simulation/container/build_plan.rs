@@ -1,0 +1,175 @@
+//! What is made of a project that was checked out: its Dockerfiles, and the files that they need.
+
+use std::fs::OpenOptions;
+use std::io::{self, Write};
+use std::os::unix::fs::OpenOptionsExt;
+use std::path::{Path, PathBuf};
+
+use nix::fcntl::OFlag;
+
+use super::dockerfile;
+use super::project_file::text_of;
+use super::templates::{CONTROLLER, DOCKERFILE, LAUNCHER, Templates};
+use super::webots_yml::{ProjectKind, WebotsYml};
+
+/// Where a project is in its container, as real Dockerfiles expect.
+pub const PROJECT_PATH: &str = "/usr/local/webots-project";
+
+/// What is made of a project.
+#[derive(Debug)]
+pub struct BuildPlan {
+    /// What it asks for.
+    pub asks: WebotsYml,
+    /// The Dockerfile of Webots' image; nothing where the image of Webots will do as it is.
+    pub dockerfile: Option<String>,
+    /// That of the controllers' image.
+    pub controller: Option<String>,
+    /// Whether there is a Makefile.
+    pub make: bool,
+    /// What its author should know.
+    pub warnings: Vec<String>,
+}
+
+/// Files with which a project would say itself how its containers run.
+const IGNORED: [&str; 3] = ["docker-compose.yml", "docker-compose.yaml", ".env"];
+
+impl BuildPlan {
+    /// Reads a project, and adds the files that a competition needs. Works on the disk: not for a thread that serves
+    /// others.
+    ///
+    /// # Errors
+    /// What is wrong, in words for the client.
+    pub fn read(project: &Path, templates: &Templates, owner: &str) -> Result<Self, String> {
+        let asks = WebotsYml::read(project);
+        let mut warnings = asks.warnings.clone();
+        let ignored = IGNORED.iter().filter(|name| project.join(name).symlink_metadata().is_ok());
+        warnings.extend(ignored.map(|name| format!("{name} of the project is not used here")));
+        let make = project.join("Makefile").is_file();
+        let own = text_of(&project.join("Dockerfile"))?;
+        let is_needed = make || templates.has(DOCKERFILE);
+        let default = || templates.text(DOCKERFILE).map(String::from).map_err(|error| format!("{DOCKERFILE}: {error}"));
+        let dockerfile = match own {
+            Some(text) => Some(text),
+            None if is_needed => Some(default()?),
+            None => None,
+        };
+        let controller = match &asks.kind {
+            ProjectKind::Competition { .. } => Some(competition(project, templates)?),
+            ProjectKind::Default | ProjectKind::Editor { .. } => None,
+        };
+        let labelled = |text: Option<String>| text.map(|text| dockerfile::labelled(&text, owner)).transpose();
+        Ok(Self { dockerfile: labelled(dockerfile)?, controller: labelled(controller)?, asks, make, warnings })
+    }
+}
+
+/// The Dockerfile of a competition's controllers. Puts the launcher where it and the project's can copy it from.
+fn competition(project: &Path, templates: &Templates) -> Result<String, String> {
+    let controllers = inside(project, "controllers")?;
+    let launcher = templates.text(LAUNCHER).map_err(|error| format!("{LAUNCHER}: {error}"))?;
+    for folder in [project, controllers.as_path()] {
+        place(&folder.join(LAUNCHER), &launcher).map_err(|error| format!("{LAUNCHER} can't be placed: {error}"))?;
+    }
+    match text_of(&controllers.join("Dockerfile"))? {
+        Some(text) => Ok(text),
+        None => templates.text(CONTROLLER).map(String::from).map_err(|error| format!("{CONTROLLER}: {error}")),
+    }
+}
+
+/// A folder of the project, which must not be a link to anywhere else.
+///
+/// # Errors
+/// When there is none, in words for the client.
+pub fn inside(project: &Path, folder: &str) -> Result<PathBuf, String> {
+    let found = project.canonicalize().and_then(|root| Ok((project.join(folder).canonicalize()?, root)));
+    match found {
+        Ok((found, root)) if found.starts_with(&root) && found.is_dir() => Ok(found),
+        _ => Err(format!("The project has no folder {folder}")),
+    }
+}
+
+/// Makes a file that is not there yet; one that the project brings stays.
+fn place(path: &Path, text: &str) -> io::Result<()> {
+    match OpenOptions::new().write(true).create_new(true).open(path) {
+        Ok(mut file) => file.write_all(text.as_bytes()),
+        Err(error) if error.kind() == io::ErrorKind::AlreadyExists => Ok(()),
+        Err(error) => Err(error),
+    }
+}
+
+/// Lets the robot of a competition's participant be run from outside of Webots: `controller "participant"` becomes
+/// `controller "<extern>"` in the world.
+///
+/// # Errors
+/// When the file can't be read or written.
+pub fn open_participant(world: &Path) -> io::Result<()> {
+    let text = std::fs::read_to_string(world)?.replace("controller \"participant\"", "controller \"<extern>\"");
+    let flags = OFlag::O_NOFOLLOW.bits();
+    OpenOptions::new().write(true).truncate(true).custom_flags(flags).open(world)?.write_all(text.as_bytes())
+}
+
+/// The image of Webots for a version: those up to R2023a are made on Ubuntu 20.04, later ones on 22.04.
+#[must_use]
+pub fn image_of(pattern: &str, version: &str) -> String {
+    let ubuntu = if version < "R2023b" { "20.04" } else { "22.04" };
+    pattern.replace("{version}", version).replace("{ubuntu}", ubuntu)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_image_follows_the_version() {
+        let pattern = "cyberbotics/webots.cloud:{version}-ubuntu{ubuntu}";
+        for (version, image) in [
+            ("R2022b", "cyberbotics/webots.cloud:R2022b-ubuntu20.04"),
+            ("R2023a", "cyberbotics/webots.cloud:R2023a-ubuntu20.04"),
+            ("R2023b", "cyberbotics/webots.cloud:R2023b-ubuntu22.04"),
+            ("R2025a", "cyberbotics/webots.cloud:R2025a-ubuntu22.04"),
+        ] {
+            assert_eq!(image_of(pattern, version), image);
+        }
+        assert_eq!(image_of("mine", "R2025a"), "mine");
+    }
+
+    fn templates() -> Templates {
+        Templates { folder: None, debug: false }
+    }
+
+    #[test]
+    fn an_image_is_built_only_where_there_is_something_to_build() {
+        let project = tempfile::tempdir().unwrap();
+        let recipe = BuildPlan::read(project.path(), &templates(), "x").unwrap();
+        assert!(recipe.dockerfile.is_none() && recipe.warnings.is_empty());
+        std::fs::write(project.path().join("Makefile"), "all:\n").unwrap();
+        std::fs::write(project.path().join(".env"), "A=b").unwrap();
+        let recipe = BuildPlan::read(project.path(), &templates(), "x").unwrap();
+        assert!(recipe.make && recipe.dockerfile.is_some_and(|text| text.contains("LABEL webots-fleet.owner=x")));
+        assert_eq!(recipe.warnings, [".env of the project is not used here"]);
+        std::fs::write(project.path().join("Dockerfile"), "FROM mine\n").unwrap();
+        let recipe = BuildPlan::read(project.path(), &templates(), "x").unwrap();
+        assert_eq!(recipe.dockerfile.unwrap(), "FROM mine\nLABEL webots-fleet.owner=x\n");
+    }
+
+    #[test]
+    fn a_dockerfile_that_is_no_plain_file_is_refused_at_once() {
+        let project = tempfile::tempdir().unwrap();
+        let file = project.path().join("Dockerfile");
+        std::os::unix::fs::symlink("/etc/passwd", &file).unwrap();
+        assert!(BuildPlan::read(project.path(), &templates(), "x").is_err());
+        std::fs::remove_file(&file).unwrap();
+        nix::unistd::mkfifo(&file, nix::sys::stat::Mode::S_IRWXU).unwrap();
+        let wrong = BuildPlan::read(project.path(), &templates(), "x").unwrap_err();
+        assert_eq!(wrong, "Dockerfile of the project is no plain file of at most 256 KiB");
+    }
+
+    #[test]
+    fn a_participant_is_run_from_outside() {
+        let folder = tempfile::tempdir().unwrap();
+        let world = folder.path().join("a.wbt");
+        std::fs::write(&world, "Robot { controller \"participant\" }\nRobot { controller \"other\" }\n").unwrap();
+        open_participant(&world).unwrap();
+        let text = std::fs::read_to_string(world).unwrap();
+        assert_eq!(text, "Robot { controller \"<extern>\" }\nRobot { controller \"other\" }\n");
+    }
+}

@@ -1,0 +1,277 @@
+//! The files of a compose project: the template, its variables, and what holds for each service whatever the template says.
+
+use std::collections::BTreeMap;
+use std::io;
+use std::path::{Path, PathBuf};
+
+use serde_json::{Value, json};
+
+use super::build_plan::PROJECT_PATH;
+use super::docker_features::DockerFeatures;
+use super::templates::Template;
+use crate::simulation::config::{ContainerDisplay, EDITOR_PORT, SimulationConfig};
+use crate::simulation::machine::sensors::Gpu;
+
+/// What the compose project of one simulation is made of.
+#[derive(Debug)]
+pub struct ComposeProject<'parts> {
+    /// Its name.
+    pub name: &'parts str,
+    /// The folder of the instance, in which its files are.
+    pub instance: &'parts Path,
+    /// The folder of the project on the machine.
+    pub project: &'parts Path,
+    /// The folder that the editor shows.
+    pub edited: Option<PathBuf>,
+    /// What the project asked to be shown, as it is written.
+    pub volume: Option<&'parts str>,
+    /// The image of Webots.
+    pub image: &'parts str,
+    /// The image of a competition's controller.
+    pub controller: Option<&'parts str>,
+    /// Webots and its arguments, as they are in the container.
+    pub command: &'parts [String],
+    /// The port of Webots.
+    pub port: u16,
+    /// The GPU that it was given.
+    pub gpu: Option<&'parts Gpu>,
+    /// Whether there is a Makefile.
+    pub make: bool,
+    /// What Docker offers.
+    pub engine: &'parts DockerFeatures,
+}
+
+/// Variables: names and values.
+pub type Variables = Vec<(&'static str, String)>;
+
+/// The template.
+const TEMPLATE: &str = "docker-compose.yml";
+/// What holds for each service.
+const OVERRIDE: &str = "override.json";
+/// Shared memory, as much as a browser's engine inside of Webots needs.
+const SHARED_MEMORY: &str = "256m";
+/// Where there is a display of the machine.
+const DISPLAYS: &str = "/tmp/.X11-unix";
+
+impl ComposeProject<'_> {
+    /// Writes the files, and returns the options by which compose finds them, and the variables that it has to have: those of
+    /// this server's environment would count for more than a file of them.
+    ///
+    /// # Errors
+    /// When a file can't be written.
+    pub fn write(&self, template: &Template, config: &SimulationConfig) -> io::Result<(Vec<String>, Variables)> {
+        let folder = self.instance.join("compose");
+        std::fs::create_dir_all(&folder)?;
+        std::fs::create_dir_all(self.exchange())?;
+        std::fs::write(folder.join(TEMPLATE), template.text.as_bytes())?;
+        std::fs::write(folder.join(OVERRIDE), self.overridden(template, config).to_string())?;
+        let path = |name: &str| folder.join(name).to_string_lossy().into_owned();
+        let (name, folder) = (self.name.to_owned(), folder.to_string_lossy().into_owned());
+        let words = [
+            "--project-name",
+            &name,
+            "--project-directory",
+            &folder,
+            "--file",
+            &path(TEMPLATE),
+            "--file",
+            &path(OVERRIDE),
+        ];
+        Ok((words.map(str::to_owned).into(), self.variables(config)))
+    }
+
+    /// The folder through which Webots and a controller in another container talk.
+    fn exchange(&self) -> PathBuf {
+        self.instance.join("ipc")
+    }
+
+    /// The variables of the template.
+    fn variables(&self, config: &SimulationConfig) -> Variables {
+        let command = self.command.join(" ");
+        let plain = |letter: char| letter.is_alphanumeric() || " -_./=:+,".contains(letter);
+        // A template may hand it to a shell, which reads quotes, dollars and backslashes in ways of its own.
+        let command = if command.chars().all(plain) { command } else { String::new() };
+        let path = |path: &Path| path.to_string_lossy().into_owned();
+        let edited = self.edited.as_ref().map_or_else(|| path(self.project), |folder| path(folder));
+        vec![
+            ("IMAGE", self.image.to_owned()),
+            ("CONTROLLER_IMAGE", self.controller.unwrap_or_default().to_owned()),
+            ("PROJECT_PATH", PROJECT_PATH.to_owned()),
+            ("PROJECT", path(self.project)),
+            ("MAKE", u8::from(self.make).to_string()),
+            ("BIND", config.bind_of_containers().to_string()),
+            ("PORT", self.port.to_string()),
+            ("COMPOSE_PROJECT_NAME", self.name.to_owned()),
+            ("WEBOTS", command),
+            ("THEIA_IMAGE", config.container.editor_image.clone()),
+            ("THEIA_VOLUME", self.volume.unwrap_or_default().to_owned()),
+            ("THEIA_FOLDER", edited),
+            ("THEIA_PORT", (self.port + EDITOR_PORT).to_string()),
+            ("IPC", path(&self.exchange())),
+            ("DISPLAY", self.display(config).unwrap_or_default()),
+        ]
+    }
+
+    /// The display of the machine, where that is asked for.
+    fn display(&self, config: &SimulationConfig) -> Option<String> {
+        let is_machine = config.container.display == ContainerDisplay::Machine;
+        is_machine.then(|| config.display_on(self.gpu.map(|gpu| gpu.index)))
+    }
+
+    /// What holds for each service.
+    fn overridden(&self, template: &Template, config: &SimulationConfig) -> Value {
+        let services: serde_json::Map<String, Value> = template
+            .services
+            .iter()
+            .map(|(name, has_command)| (name.clone(), self.service(name, *has_command, config)))
+            .collect();
+        let network = json!({ "default": { "external": true, "name": config.container.network.name() } });
+        json!({ "services": services, "networks": network })
+    }
+
+    fn service(&self, name: &str, has_command: bool, config: &SimulationConfig) -> Value {
+        let (settings, limits) = (&config.container, &config.limits);
+        let memory = format!("{}m", limits.memory.unwrap_or(DEFAULT_MEMORY));
+        let mut service = Service::from_iter([
+            ("container_name", json!(container_of(self.name, name))),
+            ("restart", json!("no")),
+            ("privileged", json!(false)),
+            ("read_only", json!(settings.read_only)),
+            ("cap_drop", json!(["ALL"])),
+            ("cap_add", json!(settings.capabilities)),
+            ("security_opt", json!([format!("no-new-privileges:{}", !settings.new_privileges)])),
+            ("user", json!(format!("{}:{}", nix::unistd::getuid(), nix::unistd::getgid()))),
+            ("tmpfs", json!(memory_folders(limits.disk))),
+            ("shm_size", json!(SHARED_MEMORY)),
+            ("mem_limit", json!(memory)),
+            ("memswap_limit", json!(memory)),
+            ("pids_limit", json!(limits.processes)),
+            (
+                "ulimits",
+                json!({ "nofile": { "soft": limits.open_files.min(1024), "hard": limits.open_files }, "core": 0 }),
+            ),
+            ("logging", json!({ "driver": "none" })),
+            // Reaps orphans and forwards signals. That Docker has one is found at the server's start.
+            ("init", json!(true)),
+            // The daemon would run it, as often as the image says.
+            ("healthcheck", json!({ "disable": true })),
+        ]);
+        let image = match name {
+            "webots" => Some(self.image),
+            "controller" => self.controller,
+            "theia" => Some(settings.editor_image.as_str()),
+            _ => None,
+        };
+        service.extend(image.map(|image| ("image", json!(image))));
+        service.extend(limits.cores.map(|cores| ("cpus", json!(cores))));
+        let mut environment = ENVIRONMENT.map(|(name, value)| (name, value.to_owned())).to_vec();
+        if name == "webots" {
+            if !has_command {
+                let words: Vec<String> = self.command.iter().map(|word| word.replace('$', "$$")).collect();
+                service.insert("command", json!(words));
+            }
+            self.show(&mut service, &mut environment, config);
+        }
+        // The images of these two have a program that makes it.
+        let home = if ["webots", "controller"].contains(&name) { "/tmp/home" } else { "/tmp" };
+        environment.push(("HOME", home.to_owned()));
+        service.insert("environment", json!(BTreeMap::from_iter(environment)));
+        json!(service)
+    }
+
+    /// Gives Webots graphics cards, the display of the machine, and the administrator's folders.
+    fn show(&self, service: &mut Service, environment: &mut Vec<(&'static str, String)>, config: &SimulationConfig) {
+        let mut volumes: Vec<String> = config.container.mounts.clone();
+        if let Some(display) = self.display(config) {
+            environment.push(("DISPLAY", display));
+            volumes.push(format!("{DISPLAYS}:{DISPLAYS}"));
+            if let Some(authority) = std::env::var_os("XAUTHORITY") {
+                let authority = authority.to_string_lossy().into_owned();
+                volumes.push(format!("{authority}:{authority}:ro"));
+                environment.push(("XAUTHORITY", authority));
+            }
+        }
+        service.insert("volumes", json!(volumes));
+        if let Some(groups) = self.engine.graphics.as_ref().filter(|_| config.container.gpu) {
+            service.insert("devices", json!(["/dev/dri:/dev/dri"]));
+            service.insert("group_add", json!(groups.iter().map(u32::to_string).collect::<Vec<_>>()));
+        }
+        if self.engine.nvidia && config.container.gpu {
+            // An image or a template may ask for all by this variable.
+            environment.extend(self.gpu.map(|gpu| ("NVIDIA_VISIBLE_DEVICES", gpu.id.clone())));
+            let (key, value) = self.gpu.map_or(("count", json!("all")), |gpu| ("device_ids", json!([gpu.id])));
+            let devices = json!({ "driver": "nvidia", key: value, "capabilities": ["gpu"] });
+            service.insert("deploy", json!({ "resources": { "reservations": { "devices": [devices] } } }));
+            environment.push(("NVIDIA_DRIVER_CAPABILITIES", "all".to_owned()));
+        }
+    }
+}
+
+/// Folders that are memory, which is limited: those that programs need to write into.
+fn memory_folders(size: u64) -> [String; 3] {
+    [("/tmp", size), ("/var/tmp", size), ("/run", 16)]
+        .map(|(path, size)| format!("{path}:rw,exec,nosuid,nodev,mode=1777,size={size}m"))
+}
+
+/// The name of the container of a service of a compose project.
+#[must_use]
+pub fn container_of(project: &str, service: &str) -> String {
+    format!("{project}-{service}")
+}
+
+/// What compose is told of a service.
+type Service = BTreeMap<&'static str, Value>;
+
+/// Variables that all services have: with them programs write where they may, and find each other.
+const ENVIRONMENT: [(&str, &str); 3] = [("USER", "webots"), ("XDG_RUNTIME_DIR", "/tmp"), ("QT_X11_NO_MITSHM", "1")];
+
+/// How much memory a container may take where `limits.memory` does not say, in MiB.
+pub const DEFAULT_MEMORY: u64 = 4096;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::simulation::config::ContainerSettings;
+
+    #[test]
+    fn a_container_gets_the_gpu_that_was_chosen_and_its_display_or_all_gpus() {
+        let keys = json!({ "isolation": "container", "gpus": "spread", "displays": [":0.0", ":0.1"], "display": ":7" });
+        let mut config: SimulationConfig = serde_json::from_value(keys).unwrap();
+        config.container = ContainerSettings { display: ContainerDisplay::Machine, ..ContainerSettings::default() };
+        let engine = DockerFeatures { nvidia: true, graphics: None };
+        let gpu = Gpu { index: 1, id: "GPU-b".to_owned(), ..Gpu::default() };
+        let service = |gpu: Option<&Gpu>, name: &str| {
+            let (folder, command) = (Path::new("/srv/one"), ["webots".to_owned()]);
+            let parts = ComposeProject {
+                name: "one",
+                instance: folder,
+                project: folder,
+                edited: None,
+                volume: None,
+                image: "image",
+                controller: None,
+                command: &command,
+                port: 2001,
+                gpu,
+                make: false,
+                engine: &engine,
+            };
+            parts.service(name, false, &config)
+        };
+        let devices = |service: &Value| service["deploy"]["resources"]["reservations"]["devices"].clone();
+        let one = service(Some(&gpu), "webots");
+        let expected = json!([{ "driver": "nvidia", "device_ids": ["GPU-b"], "capabilities": ["gpu"] }]);
+        assert_eq!(devices(&one), expected);
+        assert_eq!(
+            (&one["environment"]["DISPLAY"], &one["environment"]["NVIDIA_VISIBLE_DEVICES"]),
+            (&json!(":0.1"), &json!("GPU-b"))
+        );
+        let all = service(None, "webots");
+        assert_eq!(devices(&all), json!([{ "driver": "nvidia", "count": "all", "capabilities": ["gpu"] }]));
+        assert_eq!(
+            (&all["environment"]["DISPLAY"], &all["environment"]["NVIDIA_VISIBLE_DEVICES"]),
+            (&json!(":0.0"), &Value::Null)
+        );
+        assert_eq!(devices(&service(Some(&gpu), "theia")), Value::Null);
+    }
+}

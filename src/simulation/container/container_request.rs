@@ -1,0 +1,43 @@
+//! A simulation that is to run in containers.
+
+use std::sync::Arc;
+
+use super::build_plan::PROJECT_PATH;
+use crate::simulation::checkout::Project;
+use crate::simulation::config::{ContainerDisplay, SimulationConfig};
+use crate::simulation::machine::sensors::Gpu;
+
+/// Makes a command, given where the world is in the container.
+pub type Command = Box<dyn Fn(&str) -> Vec<String> + Send>;
+
+/// A simulation that is to run in containers.
+pub struct ContainerRequest {
+    /// What was checked out.
+    pub project: Arc<Project>,
+    /// The port of Webots.
+    pub port: u16,
+    /// The GPU that it was given; without one, it gets all.
+    pub gpu: Option<Gpu>,
+    /// Webots and its arguments, given where its world is in the container.
+    pub command: Command,
+}
+
+impl std::fmt::Debug for ContainerRequest {
+    fn fmt(&self, out: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(out, "ContainerRequest on port {}", self.port)
+    }
+}
+
+/// What runs a program on a virtual display: a part of the images of Webots.
+const VIRTUAL_DISPLAY: [&str; 2] = ["xvfb-run", "--auto-servernum"];
+
+/// Webots and its arguments, as they are in the container.
+#[must_use]
+pub fn command(config: &SimulationConfig, request: &ContainerRequest, world: &str) -> Vec<String> {
+    let webots = (request.command)(&format!("{PROJECT_PATH}/{world}"));
+    let display = match config.container.display {
+        ContainerDisplay::Virtual => &VIRTUAL_DISPLAY[..],
+        ContainerDisplay::Machine => &[],
+    };
+    display.iter().map(|word| (*word).to_owned()).chain(webots).collect()
+}

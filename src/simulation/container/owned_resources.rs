@@ -1,0 +1,139 @@
+//! What a server has in Docker: the containers of its simulations, found by the label that compose gives to all that it
+//! makes. There are no networks and no named volumes of theirs: templates that have some are refused.
+//!
+//! The names of its compose projects begin alike, so that what a server that has crashed left is found again.
+
+use std::collections::HashSet;
+use std::path::Path;
+use std::time::Duration;
+
+use sha2::{Digest, Sha256};
+
+use super::docker::{Docker, DockerError, SHORT};
+use crate::simulation::process::Run;
+
+/// The label by which compose knows its projects.
+pub const PROJECT: &str = "com.docker.compose.project";
+
+/// Whose compose projects and images some are: those of a server, or of one run of it. Their names begin alike.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct ResourceOwner(String);
+
+/// How long each command of a sweep may take.
+const SWEEP: Duration = Duration::from_secs(20);
+/// How containers are removed, whatever they do.
+const REMOVE: [&str; 3] = ["rm", "--force", "--volumes"];
+
+impl ResourceOwner {
+    /// The server that has this cache folder, which no other one has.
+    #[must_use]
+    pub fn of(cache: &Path) -> Self {
+        let cache = cache.canonicalize().unwrap_or_else(|_| cache.to_owned());
+        Self(format!("{:012x}", digest(cache.as_os_str().as_encoded_bytes()) >> 80))
+    }
+
+    /// One run of this server: what the next one has is not its own.
+    #[must_use]
+    pub fn run(&self) -> Self {
+        Self(format!("{}-{:08x}", self.0, rand::random::<u32>()))
+    }
+
+    /// The name of an owner as [`Self::name`] gives it.
+    #[must_use]
+    pub fn named(name: &str) -> Self {
+        Self(name.to_owned())
+    }
+
+    /// Its name.
+    #[must_use]
+    pub fn name(&self) -> &str {
+        &self.0
+    }
+
+    /// A name for the compose project of a simulation on this port.
+    #[must_use]
+    pub fn project(&self, port: u16) -> String {
+        format!("{}{port}-{:08x}", self.prefix(), rand::random::<u32>())
+    }
+
+    /// The port of the simulation whose compose project has this name, if it is one of this owner.
+    #[must_use]
+    pub fn port_of(&self, project: &str) -> Option<u16> {
+        project.strip_prefix(&self.prefix())?.split('-').next()?.parse().ok()
+    }
+
+    fn prefix(&self) -> String {
+        format!("webots-fleet-{}-", self.0)
+    }
+
+    /// The projects of this owner that have a container.
+    ///
+    /// # Errors
+    /// When Docker fails.
+    pub async fn projects(&self, docker: &Docker) -> Result<HashSet<String>, DockerError> {
+        let (filter, format) = (format!("label={PROJECT}"), format!("{{{{.Label \"{PROJECT}\"}}}}"));
+        let listed = docker.run(&["ps", "--all", "--filter", &filter, "--format", &format], SHORT).await?;
+        let prefix = self.prefix();
+        Ok(listed.lines().filter(|name| name.starts_with(&prefix)).map(str::to_owned).collect())
+    }
+}
+
+/// A number that tells one text from all others.
+#[must_use]
+pub fn digest(text: &[u8]) -> u128 {
+    Sha256::digest(text).iter().take(16).fold(0, |number: u128, byte| (number << 8) | u128::from(*byte))
+}
+
+/// Removes the containers of a project.
+///
+/// # Errors
+/// When Docker fails; then something may be left.
+pub async fn remove(docker: &Docker, project: &str) -> Result<(), DockerError> {
+    let filter = format!("label={PROJECT}={project}");
+    let listed = docker.run(&["ps", "--all", "--quiet", "--filter", &filter], SHORT).await?;
+    let words: Vec<&str> = REMOVE.into_iter().chain(listed.split_whitespace()).collect();
+    if words.len() == REMOVE.len() {
+        return Ok(());
+    }
+    match docker.run(&words, SHORT).await {
+        // Somebody else may have removed it meanwhile.
+        Err(DockerError::Failed { message, .. }) if message.to_lowercase().contains("no such") => Ok(()),
+        Err(DockerError::Failed { message, .. }) if message.contains("already in progress") => Ok(()),
+        done => done.map(drop),
+    }
+}
+
+/// Removes the containers of a server: for a process that watches over the server's end. Blocks.
+pub fn sweep(owner: &ResourceOwner) {
+    let prefix = owner.prefix();
+    let format = format!("{{{{.ID}}}} {{{{.Label \"{PROJECT}\"}}}}");
+    let filter = format!("label={PROJECT}");
+    let listed = quietly(&["ps", "--all", "--filter", &filter, "--format", &format]);
+    let found = listed.lines().filter_map(|line| line.split_once(' '));
+    let found: Vec<&str> = found.filter(|(_, project)| project.starts_with(&prefix)).map(|(id, _)| id).collect();
+    if !found.is_empty() {
+        quietly(&REMOVE.into_iter().chain(found).collect::<Vec<_>>());
+    }
+}
+
+/// Runs docker within a time limit, and returns what it prints. Blocks.
+pub fn quietly(arguments: &[&str]) -> String {
+    let run = Run::new(std::iter::once("docker").chain(arguments.iter().copied()), Path::new("/"), SWEEP);
+    run.blocking(drop).map(|ran| String::from_utf8_lossy(&ran.answer).into_owned()).unwrap_or_default()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_names_of_projects_tell_whose_they_are_and_suit_compose() {
+        let (ours, theirs) =
+            (ResourceOwner::of(Path::new("/var/cache/a")), ResourceOwner::of(Path::new("/var/cache/b")));
+        let name = ours.project(2001);
+        assert!(name.starts_with(&ours.prefix()) && !name.starts_with(&theirs.prefix()), "{name}");
+        assert!(name.chars().all(|letter| letter.is_ascii_lowercase() || letter.is_ascii_digit() || letter == '-'));
+        assert_ne!(name, ours.project(2001));
+        assert_eq!((ours.port_of(&name), theirs.port_of(&name)), (Some(2001), None));
+    }
+}

@@ -1,0 +1,93 @@
+//! What a sandbox shows at which place, and what it hides of the server.
+
+use std::collections::BTreeSet;
+use std::ffi::OsString;
+use std::fs::DirEntry;
+use std::path::{Path, PathBuf};
+
+use crate::simulation::config::SimulationConfig;
+
+/// A file or folder of which a sandbox shows something else than the system has there.
+#[derive(Debug, Clone)]
+pub struct Mount {
+    /// Where.
+    pub at: PathBuf,
+    /// What is shown there.
+    pub content: MountKind,
+}
+
+/// What a sandbox shows at a place.
+#[derive(Debug, Clone)]
+pub enum MountKind {
+    /// An empty folder.
+    EmptyFolder,
+    /// An empty file.
+    EmptyFile,
+    /// What is there, only to be read.
+    ReadOnly,
+    /// A file at another path, only to be read.
+    ReadableFile(PathBuf),
+    /// What is at another path, to be read and written.
+    ReadWrite(PathBuf),
+}
+
+/// The administrator's folder, in which a package of this server has its configuration.
+const ETC: &str = "/etc/webots-fleet";
+
+impl Mount {
+    /// Shows this at a path.
+    pub fn new(at: &str, content: MountKind) -> Self {
+        Self { at: at.into(), content }
+    }
+
+    /// Shows an empty folder.
+    pub fn empty(at: PathBuf) -> Self {
+        Self { at, content: MountKind::EmptyFolder }
+    }
+
+    /// The words by which bubblewrap does so.
+    pub fn into_arguments(self) -> Vec<OsString> {
+        match self.content {
+            MountKind::EmptyFolder => vec!["--tmpfs".into(), self.at.into()],
+            MountKind::EmptyFile => vec!["--ro-bind".into(), "/dev/null".into(), self.at.into()],
+            MountKind::ReadOnly => vec!["--ro-bind-try".into(), self.at.clone().into(), self.at.into()],
+            MountKind::ReadableFile(content) => vec!["--ro-bind".into(), content.into(), self.at.into()],
+            MountKind::ReadWrite(content) => vec!["--bind".into(), content.into(), self.at.into()],
+        }
+    }
+}
+
+/// What only the server may see: its log, its cache with all simulations, its configuration and other secrets.
+pub fn hidden(config: &SimulationConfig, homes: &[PathBuf]) -> Vec<Mount> {
+    let folders = [&config.log_dir.0, &config.cache_dir.0].into_iter().filter_map(|folder| folder.canonicalize().ok());
+    let folders = folders.chain(std::iter::once(ETC.into())).chain(folders_of_secrets(config, homes));
+    let mut hidden: Vec<Mount> = folders.map(Mount::empty).collect();
+    for file in config.secret_files() {
+        let Some(real) = file.canonicalize().ok().filter(|file| file.is_file()) else { continue };
+        // The other configurations are beside it: those of the session server are in a folder beside this one.
+        let beside = ["session", "simulation"].map(|name| real.parent().unwrap_or(&real).with_file_name(name));
+        if beside.iter().any(|one| real.parent() == Some(one)) {
+            hidden.extend(beside.map(Mount::empty));
+        }
+        hidden.push(Mount { at: real, content: MountKind::EmptyFile });
+    }
+    hidden
+}
+
+/// The folders that hold nothing but secrets of the server: a file that takes the place of another one is seen again unless
+/// its folder is hidden. Programs may need whatever else is in a folder.
+fn folders_of_secrets(config: &SimulationConfig, homes: &[PathBuf]) -> Vec<PathBuf> {
+    let named = config.secret_files().filter_map(|file| {
+        let folder = file.parent()?.canonicalize().ok()?;
+        Some(folder.join(file.file_name()?))
+    });
+    let secrets: BTreeSet<PathBuf> = named.flat_map(|file| file.canonicalize().into_iter().chain([file])).collect();
+    let shown = config.sandbox.readable.iter().chain(&config.sandbox.writable).chain(&config.webots_home);
+    let shown = shown.map(|path| path.0.clone()).chain(homes.iter().cloned()).chain([std::env::temp_dir()]);
+    let shown: Vec<PathBuf> = shown.filter_map(|path| path.canonicalize().ok()).collect();
+    let is_secret = |entry: std::io::Result<DirEntry>| entry.is_ok_and(|entry| secrets.contains(&entry.path()));
+    let holds_only_secrets = |folder: &Path| folder.read_dir().is_ok_and(|mut entries| entries.all(is_secret));
+    let folders: BTreeSet<&Path> = secrets.iter().filter_map(|file| file.parent()).collect();
+    let hidden = folders.into_iter().filter(|at| !shown.iter().any(|one| one == at) && holds_only_secrets(at));
+    hidden.map(Path::to_owned).collect()
+}

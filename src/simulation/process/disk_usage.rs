@@ -1,0 +1,189 @@
+//! How much the files below a folder take, also while programs change it.
+
+use std::collections::HashSet;
+use std::fs::Metadata;
+use std::io::ErrorKind;
+use std::os::unix::fs::MetadataExt;
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+/// Adds up files. One that has several names, or is met again because it was moved meanwhile, counts once if it is large.
+#[derive(Debug)]
+pub struct DiskUsage {
+    measure: fn(&Metadata) -> u64,
+    /// Nobody wants to know how much more it is.
+    enough: u64,
+    /// When to stop counting.
+    until: Option<Instant>,
+    total: u64,
+    /// Device and inode of large files.
+    met: HashSet<(u64, u64)>,
+}
+
+/// Why what is below a folder is not all counted.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Unknown {
+    /// Folders are closed to this server, or nested so deep that nobody would do that but on purpose.
+    Hidden,
+    /// There was no time for more.
+    Late,
+}
+
+/// The least that a name takes of the disk, in bytes.
+pub const SMALLEST: u64 = 4096;
+/// Files from this size on, in bytes, are remembered.
+const LARGE: u64 = 64 * 1024;
+/// How many folders may be in each other: a look at each takes time for all above it.
+const DEEPEST: usize = 200;
+/// How many entries of a folder are counted between two looks at the clock.
+const BETWEEN_CLOCKS: usize = 64;
+
+/// What a file or folder takes of the disk. Holes take nothing.
+pub fn room(about: &Metadata) -> u64 {
+    (about.blocks() * 512).max(SMALLEST)
+}
+
+/// What a folder takes of the disk; nothing where nobody can tell, since folders in it are closed or too deep.
+pub fn room_of(folder: &Path) -> Option<u64> {
+    let mut size = DiskUsage::new(room, u64::MAX);
+    size.add_folder(folder).ok().map(|()| size.total())
+}
+
+/// What is in a file.
+pub fn length(about: &Metadata) -> u64 {
+    if about.is_dir() { 0 } else { about.len() }
+}
+
+impl DiskUsage {
+    /// Adds up by this measure, to no more than `enough`.
+    pub fn new(measure: fn(&Metadata) -> u64, enough: u64) -> Self {
+        Self { measure, enough, until: None, total: 0, met: HashSet::new() }
+    }
+
+    /// Stops counting after this time.
+    #[must_use]
+    pub fn within(mut self, time: Duration) -> Self {
+        self.until = Some(Instant::now() + time);
+        self
+    }
+
+    /// What was added up until now.
+    pub fn total(&self) -> u64 {
+        self.total
+    }
+
+    /// Adds everything below a folder. Links are not followed.
+    ///
+    /// # Errors
+    /// When there is more than anybody can tell; the rest is added. When the time is over.
+    pub fn add_folder(&mut self, folder: &Path) -> Result<(), Unknown> {
+        let mut open: Vec<(PathBuf, usize)> = vec![(folder.to_owned(), 0)];
+        let mut all = Ok(());
+        while let Some((folder, depth)) = open.pop() {
+            if self.is_late() {
+                return Err(Unknown::Late);
+            }
+            let entries = match std::fs::read_dir(&folder) {
+                Ok(entries) => entries,
+                // It was removed meanwhile.
+                Err(error) if matches!(error.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory) => continue,
+                Err(_) => {
+                    all = Err(Unknown::Hidden);
+                    continue;
+                }
+            };
+            for (number, entry) in entries.flatten().enumerate() {
+                if number % BETWEEN_CLOCKS == BETWEEN_CLOCKS - 1 && self.is_late() {
+                    return Err(Unknown::Late);
+                }
+                let Ok(about) = entry.metadata() else { continue };
+                self.add(&about);
+                if self.total > self.enough {
+                    return Ok(());
+                }
+                if about.is_dir() {
+                    all = if depth < DEEPEST { all } else { Err(Unknown::Hidden) };
+                    open.push((entry.path(), depth + 1));
+                }
+            }
+        }
+        all
+    }
+
+    /// Adds a file that has lost its names while a process has it open.
+    pub fn add_nameless(&mut self, about: &Metadata) {
+        if self.met.insert((about.dev(), about.ino())) {
+            self.total = self.total.saturating_add((self.measure)(about));
+        }
+    }
+
+    fn is_late(&self) -> bool {
+        self.until.is_some_and(|until| Instant::now() >= until)
+    }
+
+    fn add(&mut self, about: &Metadata) {
+        let size = (self.measure)(about);
+        let is_new = size < LARGE || self.met.insert((about.dev(), about.ino()));
+        self.total = self.total.saturating_add(if is_new { size } else { SMALLEST });
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn size(folder: &Path, measure: fn(&Metadata) -> u64) -> Result<u64, Unknown> {
+        let mut size = DiskUsage::new(measure, u64::MAX);
+        size.add_folder(folder).map(|()| size.total())
+    }
+
+    #[test]
+    fn what_a_folder_takes_is_counted_by_blocks() {
+        let folder = tempfile::tempdir().unwrap();
+        std::fs::write(folder.path().join("a"), vec![1; 100_000]).unwrap();
+        std::fs::create_dir(folder.path().join("b")).unwrap();
+        std::fs::write(folder.path().join("b/empty"), "").unwrap();
+        std::fs::File::create(folder.path().join("hole")).unwrap().set_len(1 << 40).unwrap();
+        std::os::unix::fs::symlink("/", folder.path().join("link")).unwrap();
+        let bytes = size(folder.path(), room).unwrap();
+        assert!((100_000 + 4 * SMALLEST..200_000).contains(&bytes), "{bytes}");
+        assert_eq!(size(folder.path(), length), Ok(100_000 + (1 << 40) + 1));
+    }
+
+    #[test]
+    fn a_large_file_with_several_names_counts_once() {
+        let folder = tempfile::tempdir().unwrap();
+        std::fs::write(folder.path().join("0"), vec![1; 1_000_000]).unwrap();
+        for name in 1..10 {
+            std::fs::hard_link(folder.path().join("0"), folder.path().join(name.to_string())).unwrap();
+        }
+        let bytes = size(folder.path(), room).unwrap();
+        assert!((1_000_000 + 9 * SMALLEST..1_200_000).contains(&bytes), "{bytes}");
+    }
+
+    #[test]
+    fn no_more_is_added_than_anybody_wants_to_know() {
+        let folder = tempfile::tempdir().unwrap();
+        for name in 0..100 {
+            std::fs::write(folder.path().join(name.to_string()), "").unwrap();
+        }
+        let mut size = DiskUsage::new(room, 10 * SMALLEST);
+        size.add_folder(folder.path()).unwrap();
+        assert_eq!(size.total(), 11 * SMALLEST);
+    }
+
+    #[test]
+    fn folders_that_are_too_deep_are_told() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut deepest = std::fs::File::open(folder.path()).unwrap();
+        for level in 0..3000 {
+            assert_eq!(size(folder.path(), room).is_err(), level > DEEPEST, "{level}");
+            if level == DEEPEST + 2 {
+                break;
+            }
+            nix::sys::stat::mkdirat(&deepest, "nested", nix::sys::stat::Mode::S_IRWXU).unwrap();
+            let flags = nix::fcntl::OFlag::O_DIRECTORY;
+            deepest = nix::fcntl::openat(&deepest, "nested", flags, nix::sys::stat::Mode::empty()).unwrap().into();
+        }
+    }
+}

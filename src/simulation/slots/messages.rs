@@ -1,0 +1,50 @@
+//! What is said to the actor of places, and what it says.
+
+use std::net::IpAddr;
+
+use actix::prelude::*;
+
+use super::present::{Present, Report};
+use super::slot_error::SlotError;
+use crate::simulation::simulation_id::SimulationId;
+use crate::simulation::snapshot::Snapshot;
+
+/// Asks for a place, in the name of a ticket.
+#[derive(Message)]
+#[rtype(result = "()")]
+pub(super) struct Acquire(pub Box<Present>);
+
+/// What the holder of a ticket reports of its simulation.
+#[derive(Message)]
+#[rtype(result = "()")]
+pub struct UpdateSimulation(pub SimulationId, pub Report);
+
+/// Asks for a snapshot of all simulations.
+#[derive(Message)]
+#[rtype(result = "Snapshot")]
+pub struct GetSnapshot;
+
+/// Gives a place, or one in the line, back.
+#[derive(Message)]
+#[rtype(result = "()")]
+pub struct Release(pub SimulationId);
+
+/// Stops the simulation that has this id now, and no other one; the answer is whether there is one.
+#[derive(Message)]
+#[rtype(result = "bool")]
+pub struct StopOne {
+    /// The id as it is written.
+    pub id: String,
+    /// Why, in words for its client.
+    pub why: String,
+}
+
+/// Says that the client of a ticket has another address now; the answer is why that may not be.
+#[derive(Message)]
+#[rtype(result = "Result<(), SlotError>")]
+pub struct Move {
+    /// The id of the simulation.
+    pub id: SimulationId,
+    /// Where the client is now, if that is known.
+    pub address: Option<IpAddr>,
+}

@@ -1,0 +1,339 @@
+//! Actor: lends places to simulations, keeps the waiting line, and knows all simulations of this server.
+//!
+//! One for the whole server, created at start; it never ends. A place is a streaming port. Whoever wants one makes a
+//! [`SlotLease`] and then hears how many are ahead, until a port is granted. Dropping the ticket leaves the line or frees
+//! the port, so that neither is lost in any state or by any panic.
+
+use std::collections::{BTreeMap, HashMap, HashSet, VecDeque};
+use std::io::ErrorKind;
+use std::net::{Ipv4Addr, Ipv6Addr, TcpListener};
+use std::ops::RangeInclusive;
+use std::time::Duration;
+
+use actix::prelude::*;
+
+use super::messages::{Acquire, GetSnapshot, Move, Release, StopOne, UpdateSimulation};
+use super::party::{Party, Shares};
+use super::present::{Present, Report, longest_away};
+use super::slot_error::SlotError;
+use super::slot_event::SlotEvent;
+use crate::shared::domain::{Instances, ProjectUrl};
+use crate::shared::http::Peer;
+use crate::simulation::ends::{End, EndReason, Ends, Taken};
+use crate::simulation::simulation_id::SimulationId;
+use crate::simulation::snapshot::{SimulationChange, Snapshot, Stage};
+use crate::simulation::who::Who;
+
+/// A place, or a place in the line for one. Dropping it gives it back.
+#[derive(Debug)]
+pub struct SlotLease {
+    id: SimulationId,
+    slots: Addr<SlotPool>,
+}
+
+/// A port for one simulation, and the right to it.
+#[derive(Debug)]
+pub struct Slot {
+    /// Frees the slot when it is dropped.
+    pub lease: SlotLease,
+    /// The port on which Webots listens.
+    pub port: u16,
+}
+
+/// The actor.
+pub struct SlotPool {
+    ports: RangeInclusive<u16>,
+    queue_capacity: usize,
+    shares: Shares,
+    /// How many tickets there were, also of clients that were refused.
+    arrivals: u64,
+    present: BTreeMap<SimulationId, Present>,
+    line: VecDeque<Waiting>,
+    /// Hears of each end.
+    ends: Option<Ends>,
+}
+
+struct Waiting {
+    id: SimulationId,
+    parties: Vec<Party>,
+    client: Recipient<SlotEvent>,
+    told: Option<usize>,
+}
+
+/// Time between two checks whether a port is free again that somebody outside of this server has taken.
+const RECHECK: Duration = Duration::from_secs(1);
+
+impl SlotPool {
+    /// Lends these ports; `queue_capacity` clients may wait. One address may have `per_address` places, and the same part of
+    /// the line; without it, all of both.
+    #[must_use]
+    pub fn new(ports: RangeInclusive<u16>, queue_capacity: usize, per_address: Option<usize>) -> Self {
+        let shares = Shares { address: share(&ports, queue_capacity, per_address), user: None };
+        let (present, line) = (BTreeMap::new(), VecDeque::new());
+        Self { ports, queue_capacity, shares, arrivals: 0, present, line, ends: None }
+    }
+
+    /// One user may have so many places, and the same part of the line; without a number, all of both.
+    #[must_use]
+    pub fn with_share_of_users(mut self, per_user: Option<usize>) -> Self {
+        self.shares.user = share(&self.ports, self.queue_capacity, per_user);
+        self
+    }
+
+    /// Has each end recorded.
+    #[must_use]
+    pub fn with_ends(self, ends: Ends) -> Self {
+        Self { ends: Some(ends), ..self }
+    }
+
+    /// The first in the line whose address and user may have another place.
+    fn next_in_line(&self) -> Option<usize> {
+        if self.shares.are_none() {
+            return (!self.line.is_empty()).then_some(0);
+        }
+        let mut lent: HashMap<Party, usize> = HashMap::new();
+        for party in self.present.values().filter(|one| one.lent.is_some()).flat_map(Present::parties) {
+            *lent.entry(party).or_default() += 1;
+        }
+        let has_room = |party: &Party| {
+            let most = self.shares.of(party).map(|(most, _)| most);
+            most.is_none_or(|most| lent.get(party).is_none_or(|count| *count < most))
+        };
+        self.line.iter().position(|waiting| waiting.parties.iter().all(has_room))
+    }
+
+    /// How many places the clients of a party have, and how many of them wait.
+    fn of_party(&self, party: &Party) -> (usize, usize) {
+        let present = self.present.values().filter(|one| one.parties().contains(party));
+        let (lent, waiting): (Vec<_>, Vec<_>) = present.partition(|one| one.lent.is_some());
+        (lent.len(), waiting.len())
+    }
+
+    /// Why another client of these parties gets no place and may not wait, if so.
+    fn refusal(&self, parties: &[Party]) -> Option<SlotError> {
+        let shares = parties.iter().filter_map(|party| Some((party, self.shares.of(party)?, self.of_party(party))));
+        let shares: Vec<_> = shares.collect();
+        let may_have_one = shares.iter().all(|(_, (most, _), (places, _))| places < most);
+        if may_have_one && self.next_in_line().is_none() && self.free_port().is_some() {
+            return None;
+        }
+        let has_its_share = |((most_places, most_waiting), (places, waiting)): ((usize, usize), (usize, usize))| {
+            waiting >= most_waiting && (places >= most_places || waiting > 0)
+        };
+        if let Some((party, _, has)) = shares.into_iter().find(|(_, may, has)| has_its_share((*may, *has))) {
+            return Some(party.refusal(has));
+        }
+        let (places, waiting) = (self.ports.len(), self.line.len());
+        (waiting >= self.queue_capacity).then_some(SlotError::QueueFull { places, waiting })
+    }
+
+    /// Gives free places to those who wait, and tells the others how many are ahead.
+    fn serve(&mut self) {
+        while let Some(next) = self.next_in_line()
+            && let Some(port) = self.free_port()
+            && let Some(first) = self.line.remove(next)
+        {
+            match first.client.try_send(SlotEvent::Granted(port)) {
+                Ok(()) => self.lend(first.id, port),
+                // It stays where it is in the line until the next check.
+                Err(SendError::Full(_)) => {
+                    self.line.insert(next, first);
+                    break;
+                }
+                // Its actor has stopped, which drops its ticket too.
+                Err(SendError::Closed(_)) => {}
+            }
+        }
+        for (ahead, waiting) in self.line.iter_mut().enumerate() {
+            if waiting.told != Some(ahead) && waiting.client.try_send(SlotEvent::Queued(ahead)).is_ok() {
+                waiting.told = Some(ahead);
+            }
+        }
+    }
+
+    /// Simulations whose clients are away hold half of the places at most, or one where there is only one.
+    fn end_longest_away(&mut self) {
+        if let Some(id) = longest_away(&self.present, (self.ports.len() / 2).max(1))
+            && let Some(longest) = self.present.get_mut(&id)
+        {
+            longest.shown.away_until = None;
+            longest.listener.do_send(SlotEvent::AwayTooLong);
+        }
+    }
+
+    fn lend(&mut self, id: SimulationId, port: u16) {
+        if let Some(present) = self.present.get_mut(&id) {
+            present.lend(port);
+        }
+    }
+
+    /// The lowest port that is neither lent nor used by anybody else.
+    fn free_port(&self) -> Option<u16> {
+        let taken: HashSet<u16> = self.present.values().flat_map(|one| [one.lent, one.shown.port]).flatten().collect();
+        self.ports.clone().filter(|port| !taken.contains(port)).find(|port| is_free(*port))
+    }
+
+    fn instances(&self) -> Instances {
+        let count = |stages: &[Stage]| {
+            let matching = self.present.values().filter(|one| stages.contains(&one.shown.stage)).count();
+            u32::try_from(matching).unwrap_or(u32::MAX)
+        };
+        Instances {
+            queued: count(&[Stage::Queued]),
+            starting: count(&[Stage::CheckingOut, Stage::Launching]),
+            idle: count(&[Stage::Idle, Stage::Stopping]),
+            running: count(&[Stage::Running]),
+            places: u32::try_from(self.ports.len()).unwrap_or(u32::MAX),
+            arrivals: self.arrivals,
+        }
+    }
+}
+
+/// What a party may have that may have so many places: these, and the same part of the line.
+fn share(ports: &RangeInclusive<u16>, queue_capacity: usize, places: Option<usize>) -> Option<(usize, usize)> {
+    let all = ports.len().max(1);
+    places.map(|places| (places, (queue_capacity * places.min(all)).div_ceil(all)))
+}
+
+/// Whether nobody listens on a port, by either version of IP; a machine may have but one of them.
+fn is_free(port: u16) -> bool {
+    let is_taken = |error: std::io::Error| error.kind() == ErrorKind::AddrInUse;
+    TcpListener::bind((Ipv4Addr::UNSPECIFIED, port)).is_ok()
+        && !TcpListener::bind((Ipv6Addr::UNSPECIFIED, port)).is_err_and(is_taken)
+}
+
+impl Actor for SlotPool {
+    type Context = Context<Self>;
+
+    fn started(&mut self, ctx: &mut Self::Context) {
+        ctx.run_interval(RECHECK, |places, _| places.serve());
+    }
+}
+
+impl Handler<Acquire> for SlotPool {
+    type Result = ();
+
+    fn handle(&mut self, Acquire(present): Acquire, _: &mut Self::Context) {
+        self.arrivals += 1;
+        let (id, parties, client) = (present.shown.id, present.parties(), present.listener.clone());
+        if let Some(refusal) = self.refusal(&parties) {
+            return client.do_send(SlotEvent::Rejected(refusal));
+        }
+        self.present.insert(id, *present);
+        self.line.push_back(Waiting { id, parties, client, told: None });
+        self.serve();
+    }
+}
+
+impl Handler<Release> for SlotPool {
+    type Result = ();
+
+    fn handle(&mut self, Release(id): Release, _: &mut Self::Context) {
+        if let Some((present, ends)) = self.present.remove(&id).zip(self.ends.as_ref()) {
+            ends.record(present.ended());
+        }
+        self.line.retain(|waiting| waiting.id != id);
+        self.serve();
+    }
+}
+
+impl Handler<UpdateSimulation> for SlotPool {
+    type Result = ();
+
+    fn handle(&mut self, UpdateSimulation(id, report): UpdateSimulation, _: &mut Self::Context) {
+        let is_away = matches!(report, Report::Change(SimulationChange::Away(Some(_))));
+        if let Some(present) = self.present.get_mut(&id) {
+            present.take(report);
+        }
+        if is_away {
+            self.end_longest_away();
+        }
+    }
+}
+
+impl Handler<Move> for SlotPool {
+    type Result = Result<(), SlotError>;
+
+    fn handle(&mut self, Move { id, address }: Move, _: &mut Self::Context) -> Self::Result {
+        let is_there = self.present.get(&id).is_none_or(|one| one.address == address);
+        let share = self.shares.address.zip(address).filter(|_| !is_there);
+        if let Some(((most, _), address)) = share
+            && let party = Party::Address(address)
+            && let has = self.of_party(&party)
+            && has.0 >= most
+        {
+            return Err(party.refusal(has));
+        }
+        if let Some(present) = self.present.get_mut(&id) {
+            present.address = address;
+        }
+        Ok(())
+    }
+}
+
+impl Handler<StopOne> for SlotPool {
+    type Result = bool;
+
+    fn handle(&mut self, StopOne { id, why }: StopOne, _: &mut Self::Context) -> bool {
+        let found = self.present.values().find(|one| one.shown.id.to_string() == id);
+        found.inspect(|one| one.listener.do_send(SlotEvent::Stopped(why))).is_some()
+    }
+}
+
+impl Handler<GetSnapshot> for SlotPool {
+    type Result = Snapshot;
+
+    fn handle(&mut self, _: GetSnapshot, _: &mut Self::Context) -> Snapshot {
+        let simulations = self.present.values().map(|one| one.shown.clone()).collect();
+        Snapshot { instances: self.instances(), simulations }
+    }
+}
+
+impl SlotLease {
+    /// Gets into the line for a place. `listener` hears what comes of it, `world` is shown, and the client counts by its
+    /// address and its user.
+    #[must_use]
+    pub fn new(
+        slots: &Addr<SlotPool>,
+        listener: Recipient<SlotEvent>,
+        world: &ProjectUrl,
+        (client, who): (Peer, Who),
+    ) -> Self {
+        let id = SimulationId::next();
+        slots.do_send(Acquire(Box::new(Present::new(id, world, (client, who), listener))));
+        Self { id, slots: slots.clone() }
+    }
+
+    /// The id of the simulation.
+    #[must_use]
+    pub fn id(&self) -> SimulationId {
+        self.id
+    }
+
+    /// Tells what has changed in the simulation.
+    pub fn update(&self, change: SimulationChange) {
+        self.report(Report::Change(change));
+    }
+
+    /// Logs an event of the simulation under its id, and keeps it.
+    pub fn log(&self, level: log::Level, event: String) {
+        log::log!(target: "simulation", level, "{}: {event}", self.id);
+        self.report(Report::Event(event));
+    }
+
+    /// Tells how the simulation ends, before the ticket is dropped. What comes first counts.
+    pub fn end(&self, reason: EndReason, why: &str, taken: Taken) {
+        self.report(Report::End(End { reason, why: why.to_owned(), taken }));
+    }
+
+    fn report(&self, report: Report) {
+        // The actor lives as long as the server; without it there is nothing to show.
+        self.slots.do_send(UpdateSimulation(self.id, report));
+    }
+}
+
+impl Drop for SlotLease {
+    fn drop(&mut self) {
+        self.slots.do_send(Release(self.id));
+    }
+}
