@@ -1,10 +1,11 @@
 //! A fleet for interactive robot simulations in the browser: a session server and simulation servers.
 //!
-//! They are the successors of two Python servers, which comments call the original. This page is the map. Each folder is a room: its `mod.rs` says what belongs together there and hands out a few names.
+//! They succeed two Python servers, which comments call the original. This page is the map. Each directory is a module:
+//! its `mod.rs` says what belongs there and re-exports its public API.
 //!
-//! | room | holds |
+//! | module | contents |
 //! |---|---|
-//! | [`shared::text`] | texts from outside, made safe to show |
+//! | [`shared::text`] | untrusted texts, made safe to show |
 //! | [`shared::config`] | configuration files: loading, errors, kinds of values |
 //! | [`shared::domain`] | addresses, loads, world URLs, repositories, a server's report |
 //! | [`shared::run`] | start, readiness, log, stop |
@@ -13,16 +14,16 @@
 //! | `session::announcements` | what the administrator tells everybody |
 //! | [`session::mail`] | notices to the administrator, by mail and by webhook |
 //! | [`session::fleet`] | the registry and the monitors of simulation servers |
-//! | [`session::web`] | paths, pages and the WebSocket of the session server |
-//! | [`simulation::process`] | process trees and folders of simulations |
+//! | [`session::web`] | routes, pages and the WebSocket of the session server |
+//! | [`simulation::process`] | process trees and directories of simulations |
 //! | [`simulation::machine`] | readings of the machine, the load |
-//! | [`simulation::checkout`] | worlds out of git |
+//! | [`simulation::checkout`] | worlds checked out with git |
 //! | `simulation::isolation` | how a simulation is launched: its level of isolation, environment and limits |
-//! | [`simulation::container`] | simulations in containers: what a project asks for, its image, its compose project |
+//! | [`simulation::container`] | simulations in containers: what a project requests, its image, its compose project |
 //! | [`simulation::ends`] | how simulations have ended: counter, table, kept output |
 //! | [`simulation::webots`] | one running Webots |
 //! | [`simulation::client`] | one web client, the session of its simulation |
-//! | `simulation::web` | paths and pages of the simulation server |
+//! | `simulation::web` | routes and pages of the simulation server |
 //!
 //! Each server also has a folder `config` (every key), its `app` (start and end) and its `state` (what its paths share). Files
 //! of `simulation` are the wire [`protocol`](simulation::protocol), the [`slots`](simulation::slots) that clients wait for,
@@ -54,41 +55,44 @@
 //!     | one per simulation  |  |
 //!   Session --- SlotLease -----'  |
 //!     ^  ^------- SlotEvent --'
-//!     |  |--- checkout (a task on the main thread, shared by all who want the same world) --> git
+//!     |  |--- checkout (a task on the main thread, shared by all clients of the same world) --> git
 //!     |  '--- starts ---> Webots (one per simulation) --> Webots' process group, in a sandbox
 //!     '------ WebotsEvent ---'
 //! ```
 //!
-//! The [`session::fleet::Registry`] alone decides availability: it hears of every report and of every pick.
-//! A [`simulation::webots::Webots`] owns its process group, its folder and its place through guards, so that leaving in any
-//! state, even by a panic, frees all three. One [`simulation::process::guardian`] process ends everything that the
-//! simulation server has started when the server is gone in whatever way.
-//! One `simulation::isolation::Watcher` looks at all simulations: what they take, and where those that start listen.
+//! The [`session::fleet::Registry`] alone decides availability: it receives every report and every pick. A
+//! [`simulation::webots::Webots`] owns its process group and its instance directory through guards, and its
+//! [`simulation::client::Session`] owns the lease of its slot, so that all three are freed in any state, even after a
+//! panic. One [`simulation::process::guardian`] process ends everything that the simulation server has started once the
+//! server is gone, whatever ended it.
+//! One `simulation::isolation::Watcher` measures what each simulation uses, and finds the ports on which starting
+//! simulations listen.
 //!
-//! # What ends, and what is started again
+//! # What ends, and what restarts
 //!
 //! | actor | ends by itself | after a panic |
 //! |---|---|---|
-//! | Registry, `SlotPool`, `LoadMonitor` | never | the server logs it and ends with exit code 1: the service manager starts it again |
-//! | `ServerMonitor` | when its server leaves the configuration, or has left its name and does not answer | its supervisor makes a new one |
-//! | `NameMonitor` | when its name leaves the configuration | its supervisor makes a new one |
-//! | Mailer | never | its supervisor makes a new one; what it had not sent is lost |
-//! | Announcer | when all are told or given up | it is not started again: announcing is a courtesy |
-//! | `WebClient` | with its connection | its connection closes, and its session hears of it |
-//! | `Session` | with its simulation, or its client | what it leased is freed, and its client is told |
-//! | Webots | with its process tree; it is never restarted, its client is told | its process tree is killed at once, its folder removed, its place freed |
+//! | Registry, `SlotPool`, `LoadMonitor` | never | the server logs it and exits with code 1: the service manager restarts it |
+//! | `ServerMonitor` | when its server leaves the configuration, or its name no longer resolves to it and it does not answer | its supervisor starts a new one |
+//! | `NameMonitor` | when its name leaves the configuration | its supervisor starts a new one |
+//! | Mailer | never | its supervisor starts a new one; unsent notices are lost |
+//! | Announcer | when each announcement has succeeded or been given up | it is not restarted: announcements are best effort |
+//! | `WebClient` | with its connection | its connection closes, and its session is notified |
+//! | `Session` | with its simulation, or its client | its lease is released, and its client is notified |
+//! | Webots | with its process tree; it is never restarted, its client is notified | its process tree is killed at once, its directory removed, its slot released |
 //!
-//! The registry looks after the supervisors ([`shared::run::Supervisor`], one for each kind). More than five panics of a kind
+//! The registry runs the supervisors ([`shared::run::Supervisor`], one for each kind). More than five panics of a kind
 //! within a minute end the server with exit code 1, too.
 //!
-//! # Facts about actix 0.13 that this rests on
+//! # Facts about actix 0.13 that this relies on
 //!
 //! 1. A `Supervisor` restarts an actor that has stopped with the same value: resetting it is its own job.
 //! 2. After a panic in a handler the actor is dropped, not restarted, and every later message fails as 'closed'.
-//! 3. When the system ends, an actor is dropped without `stopped`. Only `Drop` is sure to run.
+//! 3. When the system ends, an actor is dropped without `stopped`. Only `Drop` always runs.
 //! 4. tokio's `kill_on_drop` reaches the direct child only; Webots' launcher has a child of its own.
-//! 5. An actor whose WebSocket's peer does not read is not polled once the buffers are full: whoever must be closed
-//!    for that reason has to be closed before, see [`shared::http::liveness`].
+//! 5. If the peer of a WebSocket does not read, its actor is not polled once the buffers are full: such a connection
+//! must be
+//! |   closed before that, see [`shared::http::liveness`].
 
 pub mod session;
 pub mod shared;

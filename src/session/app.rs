@@ -1,4 +1,4 @@
-//! The session server as a whole: its parts, its start and its end.
+//! The session server as a whole: its parts, its start and its shutdown.
 
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
@@ -25,14 +25,14 @@ use crate::shared::run::{
     AppError, Phase, ServerCommand, Signals, permanent, raise_open_files, service_manager, start,
 };
 
-/// How many open files the server needs for itself: logs, threads, mail.
+/// Open files that the server itself needs: logs, threads, mail.
 const OWN_FILES: usize = 128;
-/// How many connections there are to one simulation server: one in use, one that is being closed.
+/// Connections to one simulation server: one in use, one that is closing.
 const FILES_PER_SERVER: usize = 2;
-/// To how many simulation servers a name leads at most, as far as open files are kept for them.
+/// Simulation servers behind one name for which open files are reserved.
 const SERVERS_PER_NAME: usize = 1000;
 
-/// The values of the metric's label `outcome`. All of them are exported from the start.
+/// Values of the metric's label `outcome`. All of them are exported from the start.
 const OUTCOMES: [&str; 4] = ["placed", "unavailable", "not_accepted", "wrong_url"];
 
 /// Runs the server until a signal stops it. SIGHUP reads the configuration `file` again.
@@ -93,7 +93,7 @@ async fn obey(signals: &mut Signals, file: &Path, server: &AppState, port: u16) 
     }
 }
 
-/// How the HTTP server serves so many connections.
+/// Options of the HTTP server for this many connections.
 fn options(config: &SessionConfig, connections: usize) -> HttpServerOptions {
     HttpServerOptions {
         workers: threads(),
@@ -104,14 +104,13 @@ fn options(config: &SessionConfig, connections: usize) -> HttpServerOptions {
     }
 }
 
-/// Returns how many connections and how many clients there may be, so that `files` open files are enough for them and the
-/// rest of the server. There are fewer clients than connections, so that some are left to tell others that there are too
-/// many clients.
+/// Returns the limits of connections and of clients, so that `files` open files are enough for them and the rest of the
+/// server. The limit of clients is lower: the remaining connections serve the error that there are too many clients.
 fn bound_clients(files: u64, config: &SessionConfig) -> (usize, usize) {
     let files = usize::try_from(files).unwrap_or(usize::MAX);
     let names = config.simulation_servers.iter().filter(|entry| entry.name().is_some()).count();
     let servers = config.simulation_servers.len() - names;
-    // Nobody knows yet to how many servers names lead: they don't take more than a quarter.
+    // It is not known yet how many servers the names resolve to: they reserve at most a quarter.
     let looked_up = (FILES_PER_SERVER * SERVERS_PER_NAME * names).min(files / 4);
     let connections = files.saturating_sub(OWN_FILES + FILES_PER_SERVER * servers + looked_up);
     let clients = connections - connections / 16;
@@ -125,12 +124,12 @@ fn bound_clients(files: u64, config: &SessionConfig) -> (usize, usize) {
     (connections, clients.min(config.max_clients))
 }
 
-/// Returns how many threads serve connections.
+/// Number of threads that serve connections.
 fn threads() -> usize {
     std::thread::available_parallelism().map_or(1, usize::from)
 }
 
-/// Makes the server's state, and starts its actors.
+/// Creates the server's state, and starts its actors.
 fn assemble(
     config: SessionConfig,
     connections: ConnectionLimiter,

@@ -1,4 +1,4 @@
-//! The session server: the one door to a fleet of simulation servers.
+//! The session server: the entry point to a fleet of simulation servers.
 
 mod announcements;
 pub mod app;

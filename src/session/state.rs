@@ -1,4 +1,4 @@
-//! The state that the routes, the pages and the web clients of a session server share. `app` makes it.
+//! The state that the routes, the pages and the web clients of a session server share. `app` creates it.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
@@ -27,15 +27,15 @@ pub struct AppState {
     pub available: watch::Receiver<bool>,
     /// `timing` of the configuration.
     pub timing: Timing,
-    /// How the URLs of simulation servers are formed for clients.
+    /// Forms the URLs of simulation servers for clients.
     pub client_urls: ClientUrls,
-    /// Whether clients are taken.
+    /// Whether the server accepts clients.
     pub phase: watch::Receiver<Phase>,
     /// Limits and counts connections.
     pub connections: ConnectionLimiter,
-    /// Web servers whose headers are believed.
+    /// Web servers whose `X-Forwarded-For` is trusted.
     pub trusted_proxies: TrustedProxies,
-    /// The metrics.
+    /// Counters and histograms for `/metrics`.
     pub metrics: Metrics,
     /// Counts requests for a simulation server, by outcome.
     pub picks: prometheus::IntCounterVec,
@@ -63,11 +63,11 @@ pub struct PickResponse {
     pub refusal: Option<PickError>,
 }
 
-/// How long the registry may take to pick a server.
+/// Timeout of a pick by the registry.
 const PICK_TIMEOUT: Duration = Duration::from_secs(2);
 
 impl AppState {
-    /// Returns how many web clients are connected.
+    /// Number of connected web clients.
     pub fn clients(&self) -> usize {
         self.connections.count(ConnectionKind::Client)
     }
@@ -90,7 +90,7 @@ impl AppState {
         self.picks.with_label_values(&[outcome]).inc();
         match picked {
             Ok(address) => PickResponse { text: self.client_urls.websocket_url(&address), refusal: None },
-            // These words hold nothing from outside.
+            // This text contains nothing untrusted.
             Err(PickError::Unavailable) => {
                 PickResponse { text: PickError::Unavailable.to_string(), refusal: Some(PickError::Unavailable) }
             }

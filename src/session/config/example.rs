@@ -1,4 +1,4 @@
-//! The key `examples`: worlds to try on the page `/viewer`.
+//! The key `examples`: worlds that the page `/viewer` offers.
 
 use serde::{Deserialize, Serialize};
 

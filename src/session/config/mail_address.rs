@@ -8,8 +8,8 @@ use serde::{Deserialize, Deserializer};
 /// Reads a mail address that may be absent, as `NAME@HOST` or `Some Name <NAME@HOST>`. An empty text counts as absent.
 ///
 /// # Errors
-/// When the text is no mail address, is several, or its address is not ASCII: other letters need SMTPUTF8, which few
-/// servers have.
+/// When the text is not a mail address, is several, or its address is not ASCII: other characters need SMTPUTF8, which
+/// few servers support.
 pub fn optional<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Option<Mailbox>, D::Error> {
     let Some(text) = Option::<String>::deserialize(deserializer)?.filter(|text| !text.is_empty()) else {
         return Ok(None);

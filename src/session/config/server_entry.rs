@@ -1,4 +1,4 @@
-//! The key `simulationServers`: addresses of simulation servers, and names that DNS is asked for.
+//! The key `simulationServers`: addresses of simulation servers, and names that are resolved by DNS.
 
 use std::fmt;
 use std::net::IpAddr;
@@ -13,27 +13,27 @@ use crate::shared::domain::PublicAddress;
 pub enum ServerEntry {
     /// A simulation server.
     Server(PublicAddress),
-    /// A name that leads to simulation servers.
+    /// A name that resolves to simulation servers.
     Name(DnsName),
 }
 
 /// `dns+HOST:PORT`: all addresses of a host (A and AAAA), each with this port. A final dot makes the host absolute, as
-/// everywhere in DNS.
+/// usual in DNS.
 ///
-/// It is written as Thanos, Loki and Mimir write theirs. A URL `dns://...` would look alike, but is something else: its
-/// host is the name server (RFC 4501), and so has gRPC it.
+/// Thanos, Loki and Mimir use the same notation. A URL `dns://...` means something else: its host is the DNS server
+/// (RFC 4501, also in gRPC).
 #[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct DnsName {
-    /// The host.
+    /// The host, as DNS resolves it.
     pub host: String,
-    /// The port.
+    /// The port of all of its simulation servers.
     pub port: u16,
 }
 
-/// A text that is no entry of `simulationServers`.
+/// A text that is not an entry of `simulationServers`.
 #[derive(Debug, thiserror::Error)]
 pub enum EntryError {
-    /// A form that there was.
+    /// A form that was removed.
     #[error("{0:?}: dnssrv+ was removed; dns+NAME:PORT stands for all addresses of a name")]
     Service(String),
     /// Anything else.
@@ -53,7 +53,7 @@ impl ServerEntry {
         }
     }
 
-    /// The name to be looked up, if this is one.
+    /// The name to resolve, if this is one.
     pub fn name(&self) -> Option<&DnsName> {
         match self {
             Self::Name(name) => Some(name),
@@ -104,7 +104,7 @@ fn dns_name(text: &str) -> Option<DnsName> {
     plain_name(host).map(|host| DnsName { host, port })
 }
 
-/// A name as DNS is asked for it, none for what is no name. A final dot stays.
+/// The host name that DNS resolves; `None` if the text is not a host name. A final dot stays.
 fn plain_name(text: &str) -> Option<String> {
     let relative = text.strip_suffix('.').unwrap_or(text);
     let address: PublicAddress = format!("{relative}:1").parse().ok()?;

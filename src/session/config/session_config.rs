@@ -36,16 +36,16 @@ pub struct SessionConfig {
     /// Local address to listen on. Default: `::`, all addresses of IPv4 and IPv6.
     #[serde(default = "default_bind", deserialize_with = "local_address")]
     pub bind: IpAddr,
-    /// Whether a web server in front rewrites ports in URLs: HOST/PORT, not HOST:PORT. Default: true.
+    /// Whether a reverse proxy rewrites ports in URLs: HOST/PORT, not HOST:PORT. Default: true.
     #[serde(default = "default_true")]
     pub port_rewrite: bool,
-    /// How clients reach the simulation servers through one web server: a URL with the placeholders `{host}` and `{port}`.
-    /// Default: none, and each is reached under its own address.
+    /// How clients reach the simulation servers through one reverse proxy: a URL with the placeholders `{host}` and
+    /// `{port}`. Default: none, and each is reached under its own address.
     #[serde(default, deserialize_with = "optional_expanded")]
     pub public_url: Option<PublicUrl>,
     /// The simulation servers: HOST:PORT, HOST/PORT, or `dns+NAME:PORT` for all addresses of a name.
     pub simulation_servers: Vec<ServerEntry>,
-    /// Those of `simulationServers` that get no new clients. They are still watched. Default: none.
+    /// Those of `simulationServers` that get no new clients. They are still monitored. Default: none.
     #[serde(default)]
     pub drained_servers: Vec<PublicAddress>,
     /// Mail address of the administrator, who gets notifications. Default: none, and there are no notifications.
@@ -88,21 +88,21 @@ pub struct SessionConfig {
     /// Default: 95.
     #[serde(default = "default_load_threshold", deserialize_with = "threshold")]
     pub load_threshold: f64,
-    /// Seconds between two requests for the load of a simulation server. Default: 1.
+    /// Interval between two probes of a simulation server, in seconds. Default: 1.
     #[serde(default = "default_load_refresh", with = "seconds")]
     pub load_refresh: Duration,
-    /// How much load (percent) a client adds to a simulation server that reports only its load. For the others it is
+    /// Load (percent) that a client adds to a simulation server that reports only its load. For the others it is
     /// learned, starting from this. Default: 2.
     #[serde(default = "default_client_cost", deserialize_with = "percent")]
     pub client_cost: f64,
-    /// How many client `WebSockets` may be open in all. Default: 20000.
+    /// Limit of open client `WebSockets` in all. Default: 20000.
     #[serde(default = "default_max_clients", deserialize_with = "whole::<1, 1_000_000, _, _>")]
     pub max_clients: usize,
-    /// How many of them one client address may have. Default: three quarters, but at most 1000, for a class sits behind
-    /// one address.
+    /// Limit of open client `WebSockets` per client address. Default: three quarters of `maxClients`, but at most 1000,
+    /// because a class sits behind one address.
     #[serde(default, deserialize_with = "optional_whole::<1, 1_000_000, _, _>")]
     pub max_clients_per_address: Option<usize>,
-    /// Web servers, as addresses or networks, whose header `X-Forwarded-For` is believed.
+    /// Reverse proxies, as addresses or networks, whose header `X-Forwarded-For` is trusted.
     /// Default: `["127.0.0.0/8", "::1/128"]`.
     #[serde(default)]
     pub trusted_proxies: TrustedProxies,
@@ -117,10 +117,10 @@ pub struct SessionConfig {
     pub timing: Timing,
 }
 
-/// The upper limit of `timing.stop`: the server stops within five seconds.
+/// Upper limit of `timing.stop`: the server stops within five seconds.
 const LONGEST_STOP: Duration = Duration::from_millis(4500);
 
-/// How long a new client takes to show in the load: its start, and the five seconds of which the load is the mean.
+/// Time until a new client shows fully in the load: its start, and the five seconds of which the load is the mean.
 const SETTLING: Duration = Duration::from_secs(8);
 
 /// The keys that take effect when the configuration is read again.
@@ -138,8 +138,8 @@ const RELOADED: [&str; 10] = [
 ];
 
 impl SessionConfig {
-    /// Returns the configuration to go on with when `new` was read while the server runs with this one. Changes that need
-    /// a restart are logged.
+    /// Returns the configuration to continue with after `new` was read. Keys that need a restart are logged if they
+    /// have changed.
     pub fn reload(&self, new: &Self) -> Self {
         let takes_effect = |key: &&String| RELOADED.contains(&key.as_str()) || (*key == "port" && new.port == 0);
         for key in changed_keys(self, new).iter().filter(|key| !takes_effect(key)) {
@@ -163,7 +163,7 @@ impl SessionConfig {
         PublicAddress::new(&self.server, self.port, self.port_rewrite)
     }
 
-    /// Returns the HTTP URL under which clients reach this server. With a public URL, it is that of the web server.
+    /// Returns the HTTP URL under which clients reach this server. With a public URL, it is that of the reverse proxy.
     pub fn http_url(&self) -> String {
         self.public_url.as_ref().map_or_else(|| self.address().http_url(self.ssl), PublicUrl::http_door)
     }
@@ -174,14 +174,14 @@ impl SessionConfig {
         format!("{}/session", door.unwrap_or_else(|| self.address().websocket_url(self.ssl)))
     }
 
-    /// Returns how the URLs of simulation servers are formed for clients.
+    /// Returns what forms the URLs of simulation servers for clients.
     pub fn client_urls(&self) -> ClientUrls {
         ClientUrls { ssl: self.ssl, public: self.public_url.clone() }
     }
 }
 
 impl SessionConfig {
-    /// Writes the addresses of simulation servers in the usual way, and checks that each is there once.
+    /// Normalizes the addresses of simulation servers, and checks that each is listed once.
     fn check_servers(&mut self) -> Result<(), InvalidValueError> {
         let listed = self.simulation_servers.iter_mut().filter_map(|entry| match entry {
             ServerEntry::Server(address) => Some(address),
@@ -197,7 +197,7 @@ impl SessionConfig {
                 return Err(InvalidValueError { key: "simulationServers", problem });
             }
         }
-        // A name may lead to any server.
+        // A name may resolve to any server.
         let has_names = self.simulation_servers.iter().any(|entry| entry.name().is_some());
         let is_listed = |address: &PublicAddress| seen.contains(&ServerEntry::Server(address.clone()));
         match self.drained_servers.iter().find(|address| !has_names && !is_listed(address)) {

@@ -10,34 +10,34 @@ use crate::shared::config::seconds;
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(rename_all = "camelCase", default, deny_unknown_fields)]
 pub struct Timing {
-    /// How long a simulation server may take to answer. Default: 3.
+    /// Timeout of a probe of a simulation server. Default: 3.
     #[serde(with = "seconds")]
     pub answer: Duration,
-    /// Between two pings of a client. Default: 20.
+    /// Interval between two pings of a client. Default: 20.
     #[serde(with = "seconds")]
     pub ping: Duration,
-    /// A client that has answered no ping for so long is disconnected. Default: 60.
+    /// A client that answers no ping for this long is disconnected. Must exceed `ping`. Default: 60.
     #[serde(with = "seconds")]
     pub silence: Duration,
-    /// How long a client that was sent to a simulation server is counted there if it never arrives. Default: 15.
+    /// Time after which a client that was sent to a simulation server and never arrived is given up. Default: 15.
     #[serde(with = "seconds")]
     pub placement: Duration,
-    /// How long notices are collected before they are sent in one mail. Default: 10.
+    /// Time for which notices are collected before they are sent in one mail. Default: 10.
     #[serde(with = "seconds")]
     pub gather: Duration,
-    /// Least time between two mails about the same simulation server. Default: 600.
+    /// Shortest interval between two mails about the same simulation server. Default: 600.
     #[serde(with = "seconds")]
     pub flapping: Duration,
-    /// How long to wait before a mail that failed is sent again. The wait doubles each time. Default: 10.
+    /// Delay before a failed mail is retried. It doubles with each failure. Default: 10.
     #[serde(with = "seconds")]
     pub mail_retry: Duration,
-    /// How long a mail that fails is tried. Default: 3600.
+    /// Time after which a failing mail is given up. Default: 3600.
     #[serde(with = "seconds")]
     pub mail_patience: Duration,
-    /// How long an SMTP server may take for one mail. Default: 30.
+    /// Timeout of the delivery of one mail. Default: 30.
     #[serde(with = "seconds")]
     pub mail_answer: Duration,
-    /// How long open connections may take to end when the server stops, at most 4.5. Default: 4.
+    /// Timeout of open connections when the server stops, at most 4.5. Default: 4.
     #[serde(with = "seconds")]
     pub stop: Duration,
 }

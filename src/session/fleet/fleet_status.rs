@@ -1,4 +1,4 @@
-//! The status of the fleet, for pages and metrics. Plain data.
+//! The status of the fleet, for pages and metrics.
 
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -16,49 +16,49 @@ pub struct FleetStatus {
     pub available: bool,
     /// The mean load of the servers that answer.
     pub mean_load: Option<f64>,
-    /// Each simulation server, in the order of the configuration; last those that no name leads to any more.
+    /// Each simulation server, in the order of the configuration; those that no name resolves to any more come last.
     pub servers: Vec<ServerStatus>,
-    /// Each name of the configuration that is looked up.
+    /// Each name of the configuration that is resolved.
     pub names: Vec<NameStatus>,
     /// The last changes of state, the newest first.
     pub changes: VecDeque<StateChange>,
 }
 
-/// What is known of a name that leads to simulation servers.
+/// What is known of a name that resolves to simulation servers.
 #[derive(Debug, Clone)]
 pub struct NameStatus {
-    /// The name.
+    /// The entry of `simulationServers`.
     pub name: DnsName,
-    /// To how many servers it leads.
+    /// Number of servers that it resolves to.
     pub servers: usize,
     /// Why the last lookup failed, if it did: the servers are those that were found before.
     pub error: Option<String>,
-    /// Since when lookups fail or don't.
+    /// When lookups last began to fail or to succeed.
     pub since: SystemTime,
 }
 
 /// What is known of one simulation server.
 #[derive(Debug, Clone)]
 pub struct ServerStatus {
-    /// Its address.
+    /// Its address; unique in the fleet.
     pub address: PublicAddress,
-    /// Its state.
+    /// Its state, as of its last probe.
     pub state: ServerState,
-    /// Since when it has been in that state.
+    /// When it entered that state.
     pub since: SystemTime,
     /// Its last report.
     pub report: Option<Arc<ServerReport>>,
     /// Why the last probe failed, if it did, or why others are preferred to it, if they are.
     pub error: Option<String>,
-    /// The reported load and that of the clients it does not show yet, in percent.
+    /// The reported load plus that of the clients that it does not show yet, in percent.
     pub effective_load: Option<f64>,
-    /// How many clients were sent there and have not come yet.
+    /// Number of clients that were sent there and have not arrived yet.
     pub in_flight: usize,
-    /// What one more client is expected to cost, in percent of load.
+    /// Expected cost of one more client, in percent of load.
     pub client_cost: Option<f64>,
-    /// How long the last probe took.
+    /// Duration of the last probe.
     pub latency: Option<Duration>,
-    /// When it last gave a good answer.
+    /// Time of its last valid answer.
     pub answered: Option<Instant>,
 }
 
@@ -67,17 +67,17 @@ pub struct ServerStatus {
 pub enum ServerState {
     /// It was not probed yet.
     Unknown,
-    /// It takes clients.
+    /// It accepts clients.
     Up,
-    /// Its load leaves no room for one more client, or it has no place left.
+    /// Its load leaves no room for one more client, or it has no free slot.
     Full,
-    /// It takes no new clients, because it or the configuration says so.
+    /// It accepts no new clients, because it or the configuration drains it.
     Draining,
-    /// It gives no usable answer.
+    /// Its last probe failed.
     Down,
 }
 
-/// A simulation server has changed its state, or a name that leads to some has begun to fail or works again.
+/// A simulation server has changed its state, or lookups of a name have begun to fail or to succeed.
 #[derive(Debug, Clone)]
 pub struct StateChange {
     /// When it changed.
@@ -86,12 +86,12 @@ pub struct StateChange {
     pub server: String,
     /// Its new state.
     pub state: ServerState,
-    /// Why, in words.
+    /// The reason, as text.
     pub why: String,
 }
 
 impl ServerState {
-    /// The name of the state, as pages and metrics have it.
+    /// The name of the state in pages and metrics.
     pub fn word(self) -> &'static str {
         match self {
             Self::Unknown => "unknown",
@@ -103,7 +103,7 @@ impl ServerState {
     }
 }
 
-/// Returns the mean load as `/load` shows it, in percent: -1 where no server answers.
+/// Returns the mean load as `/load` shows it, in percent; -1 if no server answers.
 pub fn displayed_mean_load(mean_load: Option<f64>) -> f64 {
     mean_load.and_then(|mean| Load::try_from(mean).ok()).map_or(-1.0, Load::percent)
 }

@@ -1,4 +1,4 @@
-//! The simulation servers: who is there, what each last told, and which one gets the next client.
+//! The simulation servers: which there are, the last report of each, and which one gets the next client.
 
 mod fleet_status;
 mod monitors;

@@ -1,5 +1,5 @@
-//! The monitors of simulation servers and of names, in a thread of their own, so that requests of clients do not wait for
-//! them. Part of the registry.
+//! The monitors of simulation servers and of names, on a thread of their own, so that requests of clients do not wait
+//! for them. Part of the registry.
 
 use std::sync::Arc;
 
@@ -14,25 +14,25 @@ use crate::shared::domain::PublicAddress;
 use crate::shared::http::tls;
 use crate::shared::run::{Supervisor, TooManyPanics};
 
-/// All monitors.
+/// All monitors, by server or name.
 pub struct Monitors {
     makers: Makers,
     servers: Supervisor<PublicAddress, ServerMonitor>,
     names: Supervisor<DnsName, NameMonitor>,
 }
 
-/// What makes monitors.
+/// Starts monitors.
 struct Makers {
     thread: Arbiter,
     tls: Option<Arc<ClientConfig>>,
     resolver: TokioResolver,
 }
 
-/// Who gets what the monitors find.
+/// Recipients of what the monitors find.
 pub struct MonitorRecipients {
-    /// For each probe of a simulation server.
+    /// Receives each probe of a simulation server.
     pub probes: Recipient<ProbeResult>,
-    /// For each lookup of a name.
+    /// Receives each lookup of a name.
     pub lookups: Recipient<LookupResult>,
 }
 
@@ -57,7 +57,7 @@ impl Makers {
 }
 
 impl Monitors {
-    /// A thread without monitors.
+    /// Starts the thread, without monitors.
     pub fn new(resolver: TokioResolver) -> Self {
         let makers = Makers { thread: Arbiter::new(), tls: tls::client_config(), resolver };
         Self { makers, servers: Supervisor::new("monitor of server"), names: Supervisor::new("monitor of name") }

@@ -1,7 +1,7 @@
-//! Actor: looks one name of `simulationServers` up, again and again.
+//! Actor: resolves one name of `simulationServers` periodically.
 //!
-//! Created by the registry for each name. Every second it asks DNS, whatever time to live an answer has. The result goes to the
-//! registry, which judges it. The monitor ends when the registry says so; after a panic the registry starts a new one.
+//! Created by the registry for each name. It queries DNS every second regardless of TTL, and sends the result to the
+//! registry. The monitor ends when the registry stops it; after a panic the registry starts a new one.
 
 use std::collections::BTreeSet;
 use std::time::Duration;
@@ -13,13 +13,13 @@ use super::server_monitor::Stop;
 use crate::session::config::DnsName;
 use crate::shared::domain::PublicAddress;
 
-/// What looking a name up brought.
+/// The result of a lookup.
 #[derive(Message, Debug)]
 #[rtype(result = "()")]
 pub struct LookupResult {
-    /// The name.
+    /// The entry of `simulationServers`.
     pub name: DnsName,
-    /// The simulation servers that it leads to, at least one; or why they are not known.
+    /// The simulation servers that it resolves to, at least one; or why the lookup failed.
     pub answer: Result<BTreeSet<PublicAddress>, String>,
 }
 
@@ -29,7 +29,7 @@ pub struct NameMonitor {
     results: Recipient<LookupResult>,
 }
 
-/// Between the end of a lookup and the next one.
+/// Pause between the end of a lookup and the next one.
 const PAUSE: Duration = Duration::from_secs(1);
 
 impl NameMonitor {
@@ -43,11 +43,11 @@ impl NameMonitor {
             .into_actor(self)
             .map(|answer, monitor, ctx| {
                 match monitor.results.try_send(LookupResult { name: monitor.name.clone(), answer }) {
-                    // One that is lost is followed by another.
+                    // A full mailbox drops this result; the next lookup replaces it.
                     Ok(()) | Err(SendError::Full(_)) => {
                         ctx.run_later(PAUSE, Self::look_up);
                     }
-                    // The registry is gone, and with it the server.
+                    // The registry has stopped, and the server with it.
                     Err(SendError::Closed(_)) => ctx.stop(),
                 }
             })
@@ -55,7 +55,7 @@ impl NameMonitor {
     }
 }
 
-/// The simulation servers that a name leads to.
+/// Resolves a name to simulation servers.
 async fn servers(name: DnsName) -> Result<BTreeSet<PublicAddress>, String> {
     let addresses = look_up(&name.host).await?;
     let host = |address: std::net::IpAddr| if address.is_ipv6() { format!("[{address}]") } else { address.to_string() };

@@ -1,6 +1,6 @@
-//! The names of `simulationServers`, and the simulation servers that each leads to. Part of the registry.
+//! The names of `simulationServers`, and the simulation servers that each resolves to. Part of the registry.
 //!
-//! A name server that fails, or has nothing to tell, changes nothing: the servers that were found last stay.
+//! If a lookup fails or returns no records, the last known servers stay.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::SystemTime;
@@ -12,7 +12,7 @@ use crate::session::config::{DnsName, ServerEntry};
 use crate::shared::domain::PublicAddress;
 use crate::shared::text::one_line;
 
-/// All names.
+/// The names that are resolved.
 #[derive(Default)]
 pub struct NameTable(BTreeMap<DnsName, MonitoredName>);
 
@@ -21,33 +21,33 @@ struct MonitoredName {
     servers: BTreeSet<PublicAddress>,
     /// Why the last lookup failed, if it did.
     error: Option<String>,
-    /// Since when lookups fail or don't.
+    /// When lookups last began to fail or to succeed.
     since: SystemTime,
 }
 
-/// How many letters of an error are kept.
+/// Longest error text that is kept, in characters.
 const LONGEST_ERROR: usize = 120;
 
 /// What a lookup has changed.
 #[derive(Debug, PartialEq, Eq)]
 pub struct NameChange {
-    /// Whether it leads to other servers than before.
+    /// Whether it resolves to other servers than before.
     pub servers: bool,
-    /// That lookups have begun to fail, or work again.
+    /// Whether lookups have begun to fail, or to succeed again.
     pub turn: Option<LookupTransition>,
 }
 
-/// A name begins to fail, or ceases to.
+/// Lookups of a name begin to fail, or to succeed again.
 #[derive(Debug, PartialEq, Eq)]
 pub enum LookupTransition {
-    /// It can't be looked up, for this reason.
+    /// They fail, for this reason.
     Fails(String),
-    /// It can be again, and leads to so many servers.
+    /// They succeed again, with this many servers.
     WorksAgain(usize),
 }
 
 impl NameTable {
-    /// Looks up the names among these entries, and no others.
+    /// Monitors exactly the names among these entries.
     pub fn apply(&mut self, entries: &[ServerEntry], monitors: &mut Monitors, results: &MonitorRecipients) {
         let wanted: BTreeSet<&DnsName> = entries.iter().filter_map(ServerEntry::name).collect();
         self.0.retain(|name, _| {
@@ -65,7 +65,7 @@ impl NameTable {
         }
     }
 
-    /// Takes in what a lookup brought. Returns what has changed, nothing for a name that is no longer wanted.
+    /// Records a lookup. Returns what has changed; `None` if the name is no longer listed.
     pub fn record(&mut self, LookupResult { name, answer }: LookupResult) -> Option<NameChange> {
         let looked = self.0.get_mut(&name)?;
         let failed = looked.error.is_some();

@@ -1,4 +1,4 @@
-//! The request for a simulation server, and why none is given.
+//! The request for a simulation server, and why it is refused.
 
 use std::net::IpAddr;
 
@@ -7,7 +7,7 @@ use actix::prelude::*;
 use crate::shared::domain::PublicAddress;
 use crate::shared::domain::{ProjectUrl, ProjectUrlError};
 
-/// Asks for the least loaded simulation server that will run this world.
+/// Requests the least loaded simulation server that accepts this world.
 #[derive(Message, Debug)]
 #[rtype(result = "Result<PublicAddress, PickError>")]
 pub struct Pick {
@@ -17,13 +17,13 @@ pub struct Pick {
     pub from: Option<IpAddr>,
 }
 
-/// Why no simulation server is given. The texts are those of the protocol.
+/// Why no simulation server is picked. The texts are those of the protocol.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum PickError {
     /// No server has room.
     #[error("Error: no simulation server available at the moment.")]
     Unavailable,
-    /// No server runs worlds of this repository.
+    /// No server accepts worlds of this repository.
     #[error("Error: no simulation server accepts {0}.")]
     NotAccepted(String),
     /// The URL does not name a world.
@@ -32,7 +32,7 @@ pub enum PickError {
 }
 
 impl Pick {
-    /// A request from a client of this address, for a world or without preference.
+    /// Parses a request from a client of this address, for a world or without one.
     ///
     /// # Errors
     /// When the URL does not name a world.

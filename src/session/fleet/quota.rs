@@ -1,19 +1,19 @@
-//! How many placements of one client address take room on the simulation servers.
+//! Rate limit of the placements of one client address that reserve room on the simulation servers.
 //!
-//! A placement takes room until its client comes or is given up. Somebody who only asks, again and again, could so keep
-//! everybody out. So the placements of an address are limited by rate: those beyond the limit are made all the same, but
-//! take room only once their clients have come. Where the address is not known, or too many are, clients are believed.
+//! A placement reserves room until its client arrives or is given up. A client that requests servers again and again
+//! could thus lock out all others. Placements beyond the limit are still made, but take room only once their clients
+//! have arrived. There is no limit if the address is unknown, or if the quota tracks too many addresses.
 
 use std::num::NonZeroU32;
 
 use crate::shared::http::AddressQuota;
 
-/// How many placements of an address take room at once: 200, a large class behind one address.
+/// Placements of an address that may reserve room at once: 200, a large class behind one address.
 const BURST: NonZeroU32 = NonZeroU32::MIN.saturating_add(199);
-/// How many more of them take room in each minute after that: 12.
+/// Further placements that may reserve room, per minute: 12.
 const PER_MINUTE: NonZeroU32 = NonZeroU32::MIN.saturating_add(11);
 
-/// The quota of placements that take room.
+/// The quota of placements that reserve room.
 pub fn placements() -> AddressQuota {
     AddressQuota::new(BURST, PER_MINUTE)
 }

@@ -1,8 +1,8 @@
 //! Actor: owns the state of the fleet; answers picks; publishes whether a server can take a client.
 //!
-//! One for the whole server, created at start; it never ends. It alone decides availability: it gets every report and
-//! every pick, so that a pick counts at once. It starts a monitor for each simulation server and for each name that leads
-//! to some, and another one if a monitor has panicked.
+//! One for the whole server, created at start; it never ends. It alone decides availability: it receives every report
+//! and every pick, so that a pick counts at once. It starts a monitor for each simulation server and for each name that
+//! resolves to some, and a new one after a panic.
 
 use std::net::IpAddr;
 use std::sync::Arc;
@@ -32,17 +32,17 @@ use crate::shared::domain::PublicAddress;
 use crate::shared::domain::ServerReport;
 use crate::shared::http::AddressQuota;
 
-/// Asks for everything that is known of the fleet.
+/// Requests the status of the fleet.
 #[derive(Message)]
 #[rtype(result = "Arc<FleetStatus>")]
 pub struct GetStatus;
 
-/// Asks whether the registry still answers.
+/// Checks that the registry still answers.
 #[derive(Message)]
 #[rtype(result = "()")]
 pub struct Ping;
 
-/// Replaces the configuration; see [`SessionConfig::reload`] for what counts at once.
+/// Replaces the configuration; see [`SessionConfig::reload`] for the keys that take effect at once.
 #[derive(Message)]
 #[rtype(result = "()")]
 pub struct Reconfigure(pub Arc<SessionConfig>);
@@ -54,16 +54,16 @@ pub struct Registry {
     fleet: LoadBalancer<PublicAddress>,
     quota: AddressQuota,
     servers: ServerTable,
-    /// Whether a simulation server can take a client, for all web clients.
+    /// Whether a simulation server can take a client; all web clients follow it.
     available: watch::Sender<bool>,
     changes: StateHistory,
 }
 
-/// Time between two checks of what changes without a report: placements that expire, monitors that have panicked.
+/// Interval between checks of what changes without a report: placements that expire, monitors that have panicked.
 const TICK: Duration = Duration::from_millis(250);
 
 impl Registry {
-    /// A registry whose monitors are started with it.
+    /// Creates the registry; its monitors start with the actor.
     pub fn new(
         config: Arc<SessionConfig>,
         mailers: Vec<(Way, Addr<Mailer>)>,
@@ -81,7 +81,7 @@ impl Registry {
         }
     }
 
-    /// Follows another list of servers.
+    /// Applies a change of the list of servers.
     fn follow(&mut self, ListChange { added, gone, turned }: ListChange) {
         for server in added {
             self.fleet.add(server);
@@ -92,7 +92,7 @@ impl Registry {
         self.reevaluate(turned);
     }
 
-    /// Evaluates the last reports of these servers once more: thresholds have changed, or who is drained.
+    /// Evaluates the last reports of these servers again, because a threshold or `drainedServers` has changed.
     fn reevaluate(&mut self, servers: Vec<PublicAddress>) {
         for server in servers {
             let record = self.servers.get(&server);
@@ -105,7 +105,7 @@ impl Registry {
     fn tick(&mut self, ctx: &mut Context<Self>) {
         let restarted = self.servers.monitors().restart_gone(&self.config, &results(ctx));
         if let Err(too_many) = restarted.and_then(|()| self.changes.restart_gone(&self.config)) {
-            // The app ends the server when the registry is gone.
+            // The app stops the server when the registry has stopped.
             log::error!("{too_many}");
             ctx.stop();
         }
@@ -121,7 +121,7 @@ impl Registry {
         }
     }
 
-    /// Records what a probe of a server brought at this time.
+    /// Records the result of a probe that ended at this time.
     fn record(&mut self, server: &PublicAddress, answer: Result<ServerReport, ProbeError>, at: Instant) {
         let Some(record) = self.servers.get_mut(server) else {
             return;
@@ -179,12 +179,12 @@ impl Registry {
     }
 }
 
-/// Why others are preferred to a server.
+/// The reason why a server is ejected, as text.
 fn ejected(failed: u32) -> String {
     format!("its last {failed} starts failed for a reason of its own; others are preferred for a while")
 }
 
-/// Who hears what the monitors find: the registry.
+/// The registry as the recipient of what the monitors find.
 fn results(ctx: &Context<Registry>) -> MonitorRecipients {
     MonitorRecipients { probes: ctx.address().recipient(), lookups: ctx.address().recipient() }
 }
@@ -193,7 +193,7 @@ impl Actor for Registry {
     type Context = Context<Self>;
 
     fn started(&mut self, ctx: &mut Self::Context) {
-        // The requests and reports of a whole fleet may come in the same moment.
+        // The requests and reports of a whole fleet may arrive at the same moment.
         ctx.set_mailbox_capacity(4096);
         let change = self.servers.apply(&self.config, &results(ctx));
         self.follow(change);

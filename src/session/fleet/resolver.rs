@@ -1,7 +1,8 @@
-//! Resolves the names and hosts of simulation servers as the machine is set up: `/etc/hosts` and `/etc/resolv.conf`.
+//! Resolves the names and hosts of simulation servers by the system's configuration: `/etc/hosts` and
+//! `/etc/resolv.conf`.
 //!
-//! The system's own `getaddrinfo` blocks a thread for each lookup, which can't be cancelled: a name server that hangs would
-//! use up all threads.
+//! The system's `getaddrinfo` blocks a thread for each lookup and can't be cancelled: a DNS server that hangs would use
+//! up all threads.
 
 use std::cell::RefCell;
 use std::error::Error;
@@ -16,21 +17,21 @@ use hickory_resolver::net::NetError;
 use hickory_resolver::net::runtime::TokioRuntimeProvider;
 use hickory_resolver::system_conf::read_system_conf;
 
-/// How long a lookup may take before the last answer is used in its place.
+/// Timeout of a lookup after which the last answer is used instead.
 const SLOW: Duration = Duration::from_millis(500);
-/// How long a name server has for an answer about a host, at most.
+/// Upper limit of the resolver's timeout for one attempt.
 const TIMEOUT: Duration = Duration::from_secs(1);
 
 /// The resolver of all hosts. Clones share its connections and its cache.
 ///
 /// # Errors
-/// When no resolver can be made.
+/// When no resolver can be created.
 pub fn resolver() -> std::io::Result<TokioResolver> {
     let (config, mut options) = read_system_conf().unwrap_or_else(|error| {
         log::warn!("/etc/resolv.conf can't be used, only /etc/hosts is: {error}");
         (ResolverConfig::from_name_servers(Vec::new()), ResolverOpts::default())
     });
-    // Two attempts fit into the time that a simulation server has for its answer (`timing.answer`).
+    // Two attempts fit into the timeout of a probe (`timing.answer`).
     options.timeout = options.timeout.min(TIMEOUT);
     build(config, options).map_err(std::io::Error::other)
 }
@@ -40,13 +41,13 @@ fn build(config: ResolverConfig, mut options: ResolverOpts) -> Result<TokioResol
     TokioResolver::builder_with_config(config, TokioRuntimeProvider::default()).with_options(options).build()
 }
 
-/// All addresses that a name has now; there is at least one.
+/// Resolves a name to its current addresses, at least one.
 ///
-/// The resolver is made for this lookup: engines give their names a time to live of minutes, and dnsmasq answers on a
-/// connection that is kept what it knew when that began.
+/// Each lookup creates its own resolver: orchestrators publish TTLs of minutes, and dnsmasq answers on a kept
+/// connection with what it knew when the connection began.
 ///
 /// # Errors
-/// In words, when there is no answer or nothing in it.
+/// As text, when there is no answer or no address in it.
 pub async fn look_up(name: &str) -> Result<Vec<IpAddr>, String> {
     let resolver = read_system_conf().and_then(|(config, options)| build(config, options));
     look_up_by(&resolver.map_err(|error| error.to_string())?, name).await
@@ -60,14 +61,14 @@ async fn look_up_by(resolver: &TokioResolver, name: &str) -> Result<Vec<IpAddr>,
     }
 }
 
-/// Resolves the host of one simulation server. The last answer holds while a lookup fails or takes long.
+/// Resolves the host of one simulation server. The last answer is used while a lookup fails or takes long.
 pub struct HostResolver {
     resolver: TokioResolver,
     last: RefCell<Vec<IpAddr>>,
 }
 
 impl HostResolver {
-    /// Resolves by this resolver.
+    /// Uses this resolver for the lookups.
     pub fn new(resolver: TokioResolver) -> Self {
         Self { resolver, last: RefCell::default() }
     }

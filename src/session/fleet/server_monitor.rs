@@ -1,12 +1,12 @@
 //! Actor: probes one simulation server.
 //!
-//! Created by the registry for each address in `simulationServers`. Every [`ProbeSettings::interval`] it asks the server
-//! for its state, one request at a time, and sends the result to the registry without judging it. A result for which the
-//! registry's mailbox has no room is dropped: there will be another one. The monitor ends when the registry says so; after
-//! a panic the registry starts a new one.
+//! Created by the registry for each simulation server. Every [`ProbeSettings::interval`] it requests the server's
+//! state, one request at a time, and sends the result to the registry. If the registry's mailbox is full, the result is
+//! dropped: the next probe replaces it. The monitor ends when the registry stops it; after a panic the registry starts
+//! a new one.
 //!
-//! It asks for `/status`, and for `/load` where a server has no such page, as the original is asked. No answer is trusted:
-//! a probe as a whole has a time limit, an answer has a largest size, and a load must be a number that makes sense.
+//! It requests `/status`, or `/load` if the server has no such page: the original has only that. No answer is trusted:
+//! the whole probe has a timeout, the answer a size limit, and the load must be plausible.
 
 use std::sync::{Arc, LazyLock};
 use std::time::{Duration, Instant};
@@ -27,15 +27,15 @@ use crate::shared::domain::{Load, PublicAddress, ServerReport};
 use crate::shared::http::tls;
 use crate::shared::text::excerpt;
 
-/// What a probe of a simulation server brought.
+/// The result of a probe.
 #[derive(Message, Debug)]
 #[rtype(result = "()")]
 pub struct ProbeResult {
     /// The server.
     pub server: PublicAddress,
-    /// How long the probe took.
+    /// Duration of the probe.
     pub latency: Duration,
-    /// The server's report, or why there is none.
+    /// The server's report, or why the probe failed.
     pub answer: Result<ServerReport, ProbeError>,
 }
 
@@ -43,9 +43,9 @@ pub struct ProbeResult {
 #[derive(Message, Debug, Clone, Copy, PartialEq)]
 #[rtype(result = "()")]
 pub struct ProbeSettings {
-    /// Time between the begins of two probes.
+    /// Interval between the starts of two probes.
     pub interval: Duration,
-    /// How long a probe may take.
+    /// Timeout of a probe.
     pub timeout: Duration,
     /// Whether the fleet is behind https.
     pub ssl: bool,
@@ -58,7 +58,7 @@ impl ProbeSettings {
     }
 }
 
-/// Asks a monitor to end.
+/// Stops a monitor.
 #[derive(Message)]
 #[rtype(result = "()")]
 pub struct Stop;
@@ -72,28 +72,28 @@ pub struct ServerMonitor {
     probing: bool,
     /// The timer of the next probe, or of all that follow.
     timer: SpawnHandle,
-    /// Until when a server that has no `/status` is asked for `/load` alone.
+    /// Until when only `/load` is requested, because the server has no `/status`.
     load_only_until: Option<Instant>,
 }
 
-/// The largest answer that is read, in bytes.
+/// Size limit of an answer, in bytes.
 const LARGEST_ANSWER: usize = 1024 * 1024;
-/// The highest load that is believed, in percent.
+/// The highest plausible load, in percent.
 const LARGEST_LOAD: f64 = 1000.0;
-/// Longer than any probe may take: awc has time limits of its own, which can't all be turned off.
+/// Longer than any probe may take: awc has timeouts of its own, which can't all be turned off.
 const NEVER: Duration = Duration::from_hours(24);
-/// Probes of all monitors begin at multiples of this time, so that the thread is woken once for many of them.
+/// Probes of all monitors start at multiples of this time, so that the thread wakes once for many of them.
 const SLOT: Duration = Duration::from_millis(10);
-/// From when slots are counted.
+/// The start of the first of these slots.
 static BEGIN: LazyLock<Instant> = LazyLock::new(Instant::now);
-/// How long a server that has no `/status` is asked for `/load` alone.
+/// How long only `/load` is requested from a server that has no `/status`.
 const LOAD_ONLY: Duration = Duration::from_mins(1);
 
-/// The statuses of a server that has no such page; some servers answer only that the request is wrong.
+/// Status codes of a server that has no such page; some servers answer only that the request is invalid.
 const NO_SUCH_PAGE: [StatusCode; 4] =
     [StatusCode::NOT_FOUND, StatusCode::BAD_REQUEST, StatusCode::METHOD_NOT_ALLOWED, StatusCode::NOT_IMPLEMENTED];
 
-/// A usable answer.
+/// A valid answer.
 enum Answer {
     Status(ServerReport),
     /// There is no `/status`, but a `/load`.
@@ -103,7 +103,7 @@ enum Answer {
 /// An HTTP client that keeps one connection to the simulation server.
 fn client(interval: Duration, resolver: TokioResolver, tls: Option<Arc<ClientConfig>>) -> awc::Client {
     let idle = (interval * 3).max(Duration::from_secs(15));
-    // A probe as a whole has a time limit, its parts have none.
+    // The whole probe has a timeout, its parts have none.
     let tcp = TcpConnector::new(Resolver::custom(HostResolver::new(resolver))).service();
     let mut connector = awc::Connector::new().connector(tcp).conn_keep_alive(idle).timeout(NEVER);
     if let Some(config) = tls {
@@ -113,7 +113,7 @@ fn client(interval: Duration, resolver: TokioResolver, tls: Option<Arc<ClientCon
 }
 
 impl ServerMonitor {
-    /// A monitor of one server, whose host this resolver looks up. To be created in the thread in which it will run.
+    /// A monitor of one server, whose host this resolver resolves. Must be created on the thread on which it will run.
     pub fn new(
         server: PublicAddress,
         settings: ProbeSettings,
@@ -126,8 +126,8 @@ impl ServerMonitor {
         Self { server, settings, client, results, probing: false, timer, load_only_until: None }
     }
 
-    /// Probes now, and then at regular times in a random slot: if all servers were probed in the same slot, clients would
-    /// wait meanwhile.
+    /// Probes now, and then at regular times in a random slot: reports of all servers in the same slot would delay the
+    /// requests of clients.
     fn start_probing(&mut self, ctx: &mut Context<Self>) {
         ctx.cancel_future(self.timer);
         self.probe(ctx);
@@ -160,14 +160,14 @@ impl ServerMonitor {
                 match monitor.results.try_send(ProbeResult { server: monitor.server.clone(), latency, answer }) {
                     Ok(()) => {}
                     Err(SendError::Full(_)) => log::warn!("{}: a report is lost, too many are waiting", monitor.server),
-                    // The registry is gone, and with it the server.
+                    // The registry has stopped, and the server with it.
                     Err(SendError::Closed(_)) => ctx.stop(),
                 }
             })
             .spawn(ctx);
     }
 
-    /// Makes a report of an answer, and notes which page the server has.
+    /// Turns an answer into a report, and notes which page the server has.
     fn report(&mut self, answer: Answer) -> ServerReport {
         match answer {
             Answer::Status(report) => report,
@@ -222,7 +222,7 @@ async fn probe(client: &awc::Client, url: &str, load_only: bool) -> Result<Answe
 /// When there is no answer, or one that is neither.
 async fn get(client: &awc::Client, url: &str) -> Result<Option<Bytes>, ProbeError> {
     let answer = match client.get(url).send().await {
-        // A kept connection may have been closed meanwhile, which is no fault of the server.
+        // A kept connection may have been closed, which is not a fault of the server.
         Err(error) if is_broken(&error) => client.get(url).send().await,
         answer => answer,
     }
@@ -259,7 +259,7 @@ fn no_answer(error: SendRequestError) -> ProbeError {
     })
 }
 
-/// Reads a `/status`; it must have a load, and may lack anything else.
+/// Parses a `/status`; it must contain a load, all else is optional.
 fn parse_status(body: &[u8]) -> Result<ServerReport, ProbeError> {
     let report = ServerReport::parse(body).map_err(|error| {
         let text = String::from_utf8_lossy(body.get(..body.len().min(40)).unwrap_or_default()).into_owned();
@@ -277,10 +277,10 @@ fn plausible(load: Load) -> Result<Load, ProbeError> {
     if is_none { Err(ProbeError::BadAnswer(shortened(&format!("a load of {load} %")))) } else { Ok(load) }
 }
 
-/// The most letters that are kept of what a server says.
+/// Longest text of a server that is kept, in characters.
 const LONGEST_REASON: usize = 500;
 
-/// Cuts a text that may contain what somebody else wrote.
+/// Cuts an untrusted text.
 fn shortened(text: &str) -> String {
     excerpt(text, LONGEST_REASON)
 }

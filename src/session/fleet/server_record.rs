@@ -1,4 +1,4 @@
-//! What the registry knows of one simulation server, and what a change of it means. Part of the registry.
+//! What the registry knows of one simulation server, and what its changes mean. Part of the registry.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
@@ -15,25 +15,25 @@ use crate::shared::domain::ServerReport;
 /// One simulation server.
 #[derive(Debug)]
 pub struct ServerRecord {
-    /// Whether the configuration has it drained.
+    /// Whether it is listed in `drainedServers`.
     pub drained: bool,
-    /// Whether no name leads to it any more.
+    /// Whether no name resolves to it any more.
     pub unlisted: bool,
-    /// Its state.
+    /// Its state, as of its last probe.
     pub state: ServerState,
-    /// Since when.
+    /// When it entered that state.
     pub since: SystemTime,
     /// Its last report; kept when it is down.
     pub report: Option<Arc<ServerReport>>,
     /// Why the last probe failed, if it did.
     pub error: Option<ProbeError>,
-    /// The last error, also when the server has answered since.
+    /// The last error; kept after the server has answered again.
     pub last_error: Option<ProbeError>,
-    /// How long the last probe took.
+    /// Duration of the last probe.
     pub latency: Option<Duration>,
-    /// When it last gave a good answer.
+    /// Time of its last valid answer.
     pub answered: Option<Instant>,
-    /// Whether the last mail about its load says that it is full.
+    /// Whether the last mail about its load said that it is full.
     told_full: bool,
 }
 
@@ -44,11 +44,11 @@ pub struct ServerChange {
     pub state: ServerState,
     /// Whether it was in that state before, for another reason.
     pub still: bool,
-    /// When.
+    /// Time of the change.
     pub at: SystemTime,
-    /// Why, in words.
+    /// The reason, as text.
     pub why: String,
-    /// What the administrator is told of it.
+    /// What is mailed to the administrator.
     pub events: Vec<NoticeKind>,
 }
 
@@ -69,8 +69,8 @@ impl ServerRecord {
         }
     }
 
-    /// Records a report that came at this time; the server counts as full from the load `limit` on, in percent. Returns
-    /// what has changed.
+    /// Records a report that arrived at this time; the server counts as full from the load `limit` on, in percent.
+    /// Returns what has changed.
     pub fn succeeded(&mut self, report: ServerReport, at: Instant, limit: f64) -> Option<ServerChange> {
         let (state, why) = self.judge(&report, limit);
         self.report = Some(Arc::new(report));
@@ -86,7 +86,7 @@ impl ServerRecord {
         self.error = Some(error.clone());
         self.last_error = Some(error);
         let change = self.enter(ServerState::Down, || why.clone());
-        // It is down as before, but for another reason, which whoever repairs it should know.
+        // It is still down, but for another reason, which helps to repair it.
         change.or_else(|| {
             another.then(|| ServerChange {
                 state: ServerState::Down,
@@ -98,18 +98,18 @@ impl ServerRecord {
         })
     }
 
-    /// The last report, if it still holds.
+    /// The last report, unless the server is down.
     pub fn current(&self) -> Option<&ServerReport> {
         self.report.as_deref().filter(|_| self.state != ServerState::Down)
     }
 
-    /// Whether the server runs a world, by its last report; `None` if it never answered.
+    /// Whether the server accepts a world, by its last report; `None` if it never answered.
     pub fn accepts(&self, world: &ProjectUrl) -> Option<bool> {
         self.report.as_ref().map(|report| report.accepts(world))
     }
 
-    /// The last report in the terms of the placement policy; `None` for a server that must not get clients and does not
-    /// count its instances, for which only being down keeps clients away.
+    /// The last report in the terms of the placement policy. `None` takes the server out of placement: it is down, or
+    /// it is drained and does not report counts, without which `accepting` can't be passed on.
     pub fn for_placement(&self) -> Option<placement::LoadReport> {
         let report = self.current()?;
         let accepting = self.state != ServerState::Draining;
@@ -122,7 +122,7 @@ impl ServerRecord {
         (accepting || instances.is_some()).then(|| placement::LoadReport { load: report.load.percent(), instances })
     }
 
-    /// The status of the server, without what only the placement knows.
+    /// The status of the server; the fields that only placement knows stay empty.
     pub fn status(&self, address: &PublicAddress) -> ServerStatus {
         ServerStatus {
             address: address.clone(),
@@ -191,8 +191,8 @@ impl ServerRecord {
     }
 }
 
-/// Whether some server refuses a world, and no other accepts it or has yet to be asked for the first time. A server that
-/// has never answered may never do so: it does not count.
+/// Whether some server refuses a world, no other accepts it, and all have been probed. A server that has never answered
+/// does not count, because it may never answer.
 pub fn is_refused<'a>(servers: impl Iterator<Item = &'a ServerRecord>, world: &ProjectUrl) -> bool {
     let mut refused = false;
     for server in servers {
@@ -214,7 +214,7 @@ mod tests {
         ServerReport::load_only(Load::try_from(load).unwrap())
     }
 
-    /// The events of each step: a load, or nothing for a failure.
+    /// The events of each step: a load, or `None` for a failure.
     fn events(steps: &[Option<f64>]) -> Vec<Vec<NoticeKind>> {
         let mut record = ServerRecord::new(false);
         let change = |step: &Option<f64>| match step {

@@ -1,8 +1,8 @@
-//! The simulation servers that are watched: those of the configuration, and those that its names lead to. Part of the
+//! The monitored simulation servers: those of the configuration, and those that its names resolve to. Part of the
 //! registry.
 //!
-//! A server that no name leads to any more gets no clients. It is watched for as long as it answers, for it may be listed
-//! again, and its clients are to be seen until they are gone.
+//! A server that no name resolves to any more gets no clients. It is monitored as long as it answers, because a name
+//! may resolve to it again, and so that its clients stay visible until they have left.
 
 use std::collections::{BTreeSet, HashMap};
 
@@ -25,14 +25,14 @@ pub struct ServerTable {
     watched: HashMap<PublicAddress, ServerRecord>,
 }
 
-/// How another list of servers differs from the one before.
+/// The difference between two lists of servers.
 #[derive(Debug, Default)]
 pub struct ListChange {
-    /// These are watched from now on.
+    /// Servers that are monitored from now on.
     pub added: Vec<PublicAddress>,
-    /// These are forgotten.
+    /// Servers that are no longer monitored.
     pub gone: Vec<PublicAddress>,
-    /// A name leads to these again, or no longer.
+    /// Servers that a name resolves to again, or no longer.
     pub turned: Vec<PublicAddress>,
 }
 
@@ -47,13 +47,13 @@ impl ServerTable {
         }
     }
 
-    /// Follows a configuration: what it no longer lists is forgotten.
+    /// Applies a configuration: servers that it no longer lists are removed.
     pub fn apply(&mut self, config: &SessionConfig, results: &MonitorRecipients) -> ListChange {
         self.names.apply(&config.simulation_servers, &mut self.monitors, results);
         self.list(config, results, true)
     }
 
-    /// Follows the names: what no name leads to any more is forgotten if it does not answer.
+    /// Applies changed names: a server that no name resolves to any more is removed if it does not answer.
     pub fn follow_names(&mut self, config: &SessionConfig, results: &MonitorRecipients) -> ListChange {
         self.list(config, results, false)
     }
@@ -85,7 +85,7 @@ impl ServerTable {
         change
     }
 
-    /// Ends the watch on a server.
+    /// Removes a server and stops its monitor.
     pub fn forget(&mut self, server: &PublicAddress) {
         if self.watched.remove(server).is_some() {
             log::info!("{server}: no longer watched");
@@ -93,7 +93,7 @@ impl ServerTable {
         }
     }
 
-    /// Takes in what a lookup brought; nothing comes back for a name that is no longer listed.
+    /// Records a lookup; `None` if the name is no longer listed.
     pub fn record_lookup(&mut self, result: LookupResult) -> Option<NameChange> {
         self.names.record(result)
     }
@@ -108,7 +108,7 @@ impl ServerTable {
         self.watched.get(server)
     }
 
-    /// The same, to be changed.
+    /// The mutable record of a server.
     pub fn get_mut(&mut self, server: &PublicAddress) -> Option<&mut ServerRecord> {
         self.watched.get_mut(server)
     }
@@ -118,7 +118,7 @@ impl ServerTable {
         self.watched.values()
     }
 
-    /// All servers in the order of the configuration; last those that are listed no longer.
+    /// All servers in the order of the configuration; those that are no longer listed come last.
     pub fn in_order(&self) -> impl Iterator<Item = &PublicAddress> {
         let unlisted = self.watched.iter().filter(|(_, record)| record.unlisted);
         let unlisted: BTreeSet<_> = unlisted.map(|(server, _)| server).collect();

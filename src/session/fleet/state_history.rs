@@ -1,5 +1,5 @@
-//! Changes of the state of simulation servers, and of the names that lead to some: each is one log line, one line of `/monitor`, and the notices to the
-//! administrator. Part of the registry.
+//! Changes of the state of simulation servers, and of the names that resolve to them: each is one log line, one line of
+//! `/monitor`, and the notices to the administrator. Part of the registry.
 
 use std::collections::VecDeque;
 use std::time::SystemTime;
@@ -14,7 +14,7 @@ use crate::session::mail::{self, Mailer, Notice, NoticeKind, Topic, Way};
 use crate::shared::domain::PublicAddress;
 use crate::shared::run::{Supervisor, TooManyPanics};
 
-/// The last changes, and the mailer that tells the administrator.
+/// The last changes, and the mailer that notifies the administrator.
 pub struct StateHistory {
     recent: VecDeque<StateChange>,
     /// One for each way on which notices go.
@@ -34,7 +34,7 @@ impl StateHistory {
         Self { recent: VecDeque::new(), mailers }
     }
 
-    /// Starts another mailer if the last one has panicked. What it had not sent is lost.
+    /// Starts a new mailer if the last one has panicked. Its unsent notices are lost.
     ///
     /// # Errors
     /// When there were too many panics.
@@ -52,7 +52,7 @@ impl StateHistory {
         let ServerChange { state, still, at, why, events } = change;
         let words = if still { "still " } else { "" };
         self.list(words, StateChange { at, server: server.to_string(), state, why });
-        // The last that is known: a server that does not answer tells no load, and one that works again no error.
+        // The last known values: a server that does not answer reports no load, and one that works again no error.
         let load = record.report.as_ref().map(|report| report.load);
         for event in events {
             let error = record.last_error.as_ref().filter(|_| event.topic() == Topic::Health).map(ToString::to_string);
@@ -60,7 +60,7 @@ impl StateHistory {
         }
     }
 
-    /// Adds that a name has begun to fail, or works again.
+    /// Adds that lookups of a name have begun to fail, or succeed again.
     pub fn add_name(&mut self, name: &DnsName, turn: LookupTransition) {
         let (at, server) = (SystemTime::now(), name.to_string());
         let (state, event, why, error) = match turn {

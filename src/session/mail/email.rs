@@ -1,6 +1,6 @@
-//! Composes e-mails: a subject, and plain text out of a template.
+//! Composes e-mails: a subject, and plain text from a template.
 //!
-//! Text from outside, such as a server's error, becomes one line without control characters, in the text and in headers.
+//! Untrusted text, such as a server's error, becomes one line without control characters, in the text and in headers.
 
 use askama::Template;
 use lettre::Message;
@@ -13,7 +13,7 @@ use crate::session::config::SessionConfig;
 use crate::shared::run::timestamp;
 use crate::shared::text::excerpt;
 
-/// How many letters of a text from outside are shown.
+/// Longest untrusted text that is shown, in characters.
 const MAX_LETTERS: usize = 500;
 
 /// Composes the texts of one session server.
@@ -39,7 +39,7 @@ struct Text<'mail> {
     composer: &'mail Composer,
 }
 
-/// What an e-mail says about one server.
+/// The lines of an e-mail about one server.
 struct Line {
     server: String,
     event: &'static str,
@@ -123,7 +123,7 @@ impl EmailComposer {
     fn message(&self, (subject, text): (String, String)) -> Result<Message, MailError> {
         let builder = Message::builder().from(self.from.clone()).to(self.to.clone()).subject(subject).message_id(None);
         let mut message = builder.header(ContentType::TEXT_PLAIN).body(text)?;
-        // Automatic responders shall not answer (RFC 3834).
+        // Automatic responders must not answer (RFC 3834).
         let name = HeaderName::new_from_ascii_str("Auto-Submitted");
         message.headers_mut().insert_raw(HeaderValue::new(name, "auto-generated".to_owned()));
         Ok(message)

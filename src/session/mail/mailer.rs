@@ -67,7 +67,7 @@ impl Mailer {
         })
     }
 
-    /// Waits until the next e-mail is due, which a new notice or the end of the last e-mail may change.
+    /// Sets the timer of the next e-mail. A new notice, or the end of the last e-mail, may change when it is due.
     fn wait(&mut self, ctx: &mut Context<Self>) {
         ctx.cancel_future(self.timer);
         if let (false, Some(due)) = (self.sending, self.outbox.due()) {
@@ -92,7 +92,7 @@ impl Mailer {
             .spawn(ctx);
     }
 
-    /// Reports to the outbox and the log how sending a batch went.
+    /// Reports the outcome of sending a batch to the outbox and the log.
     fn handle_outcome(&mut self, batch: Vec<MailEntry>, sent: Result<String, MailError>) {
         let (now, subject, count) = (Instant::now(), in_words(&batch), batch.len());
         let way = self.way;

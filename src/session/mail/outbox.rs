@@ -1,14 +1,14 @@
-//! Notices that wait to be mailed: gathered, held back while a server flaps, and tried again after a failure. Pure; time
-//! is passed in.
+//! Notices that wait to be mailed: collected, held back while a server flaps, and retried after a failure. The caller
+//! passes the time.
 //!
-//! There are two topics about a simulation server: whether it responds, and whether it has room. Of each the newest
-//! notice waits, and counts those that it has replaced.
+//! A simulation server has two topics: whether it responds, and whether it has room. For each topic only the newest
+//! notice waits; it counts those that it has replaced.
 //!
 //! 1. The first notice waits for `gather`, so that servers that fail together are reported in one e-mail.
 //! 2. For `flapping` after an e-mail about a server, its notices are held back. After that time the next e-mail has one
 //!    entry for each topic.
 //! 3. One notice is not held back: that a server does not respond, if the last e-mail was only about its load.
-//! 4. After a failure all entries are tried again, with a delay that doubles. An entry is given up after `mailPatience`.
+//! 4. After a failure all entries are retried, with a delay that doubles. An entry is given up after `mailPatience`.
 
 use std::collections::{BTreeMap, HashMap};
 use std::time::{Duration, Instant, SystemTime};
@@ -18,17 +18,17 @@ use actix::Message;
 use crate::session::config::Timing;
 use crate::shared::domain::Load;
 
-/// A change of a simulation server that the administrator should know of.
+/// A change of a simulation server that is mailed to the administrator.
 #[derive(Message, Debug, Clone, PartialEq)]
 #[rtype(result = "()")]
 pub struct Notice {
-    /// The simulation server's address, or the name that leads to some.
+    /// The simulation server's address, or the name that resolves to some.
     pub server: String,
     /// What happened.
     pub event: NoticeKind,
     /// Its load, if known.
     pub load: Option<Load>,
-    /// The last error, if any. It may hold any text.
+    /// The last error, if any; untrusted text.
     pub error: Option<String>,
     /// When it happened.
     pub at: SystemTime,
@@ -37,31 +37,31 @@ pub struct Notice {
 /// What happened to a simulation server or to a name, in the order of the lines in an e-mail.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum NoticeKind {
-    /// It gives no usable answer.
+    /// Its probes fail.
     NotResponding,
-    /// It gives good answers again.
+    /// Its probes succeed again.
     WorkingAgain,
     /// Its load reached the threshold.
     MaximumLoad,
     /// Its load is below the threshold again.
     AvailableAgain,
-    /// A name can't be looked up.
+    /// Lookups of a name fail.
     LookupFails,
-    /// It can be again.
+    /// They succeed again.
     LookupWorks,
 }
 
 /// What an event is about.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Topic {
-    /// Whether a server responds, or a name.
+    /// Whether a server responds, or lookups of a name succeed.
     Health,
     /// Whether a server has room for clients.
     Capacity,
 }
 
 impl NoticeKind {
-    /// What it happens to, one and many.
+    /// What it happens to: singular and plural.
     pub fn nouns(self) -> [&'static str; 2] {
         match self {
             Self::LookupFails | Self::LookupWorks => ["lookup of simulation servers", "lookups of simulation servers"],
@@ -69,7 +69,7 @@ impl NoticeKind {
         }
     }
 
-    /// The event in words that follow those of [`NoticeKind::nouns`].
+    /// The event as text that follows [`NoticeKind::nouns`].
     pub fn words(self) -> &'static str {
         match self {
             Self::LookupFails => "failing",
@@ -89,12 +89,12 @@ impl NoticeKind {
     }
 }
 
-/// One entry of an e-mail: the newest notice about a server and topic, and how many it stands for.
+/// One entry of an e-mail: the newest notice about a server and topic, and how many it replaces.
 #[derive(Debug, Clone, PartialEq)]
 pub struct MailEntry {
     /// The newest notice, with the last error that is known.
     pub notice: Notice,
-    /// How many earlier notices it has replaced.
+    /// Number of earlier notices that it has replaced.
     pub held_back: usize,
     /// When the first of them came.
     since: Instant,
@@ -109,7 +109,7 @@ pub struct Outbox {
     servers: HashMap<String, Server>,
     /// The delay after the next failure.
     delay: Duration,
-    /// After a failure: nothing is sent before.
+    /// After a failure: nothing is sent before this time.
     retry_at: Option<Instant>,
 }
 
@@ -129,7 +129,7 @@ struct Cooldown {
 }
 
 impl MailEntry {
-    /// Takes in an older entry about the same.
+    /// Merges an older entry about the same server and topic.
     fn replace(&mut self, older: Self) {
         self.held_back += older.held_back + 1;
         self.since = older.since;
@@ -155,14 +155,14 @@ impl Outbox {
         server.waiting.insert(topic, entry);
     }
 
-    /// When the next e-mail is due, if no other notice comes.
+    /// When the next e-mail is due, unless another notice is added.
     pub fn due(&self) -> Option<Instant> {
         let due = self.servers.values().filter_map(|server| server.due(self.timing.gather)).min()?;
         Some(self.retry_at.map_or(due, |retry_at| due.max(retry_at)))
     }
 
-    /// Takes out what is to be mailed now, by event, then by server. The outcome is to be reported by
-    /// [`Self::succeeded`] or [`Self::failed`].
+    /// Removes and returns what is due for mail now, sorted by event, then by server. The caller must report the
+    /// outcome by [`Self::succeeded`] or [`Self::failed`].
     pub fn take(&mut self, now: Instant) -> Vec<MailEntry> {
         self.servers.retain(|_, server| {
             !server.waiting.is_empty() || server.cooldown.is_some_and(|cooldown| cooldown.end > now)
@@ -170,7 +170,7 @@ impl Outbox {
         if self.due().is_none_or(|due| due > now) {
             return Vec::new();
         }
-        // An e-mail that is sent anyway includes what would else wait for `gather` only.
+        // An e-mail that is sent anyway includes the entries that wait only for `gather`.
         let ready = self.servers.values_mut().filter(|server| server.held_until().is_none_or(|end| end <= now));
         let mut batch: Vec<MailEntry> =
             ready.flat_map(|server| std::mem::take(&mut server.waiting).into_values()).collect();
@@ -183,7 +183,7 @@ impl Outbox {
         batch
     }
 
-    /// A batch was sent.
+    /// Records that a batch was sent.
     pub fn succeeded(&mut self, batch: &[MailEntry], now: Instant) {
         (self.delay, self.retry_at) = (self.timing.mail_retry, None);
         let end = now + self.timing.flapping;
@@ -194,10 +194,10 @@ impl Outbox {
         }
     }
 
-    /// A batch was not sent. Returns the entries that are given up; the others wait for the next try.
+    /// Records that a batch was not sent. Returns the entries that are given up; the others wait for the next try.
     ///
-    /// A permanent failure is tried again too, since only an e-mail can tell the administrator of it; but with the longest
-    /// delay from the start, so that no account is locked for too many wrong logins.
+    /// A permanent failure is retried too, because the administrator learns of it only by e-mail; but with the longest
+    /// delay from the start, so that no account is locked for too many failed logins.
     pub fn failed(&mut self, batch: Vec<MailEntry>, permanent: bool, now: Instant) -> Vec<MailEntry> {
         let patience = self.timing.mail_patience;
         let longest = self.timing.mail_retry.max(patience / 6);
@@ -206,7 +206,7 @@ impl Outbox {
         if permanent {
             self.delay = longest;
         }
-        // The last try of an entry is at the end of its time, not some time before.
+        // The last try of an entry is exactly at the end of its time.
         let last = kept.iter().map(end).min();
         for entry in kept {
             let waiting = &mut self.servers.entry(entry.notice.server.clone()).or_default().waiting;
@@ -245,14 +245,14 @@ mod tests {
 
     use NoticeKind::{AvailableAgain, MaximumLoad, NotResponding, WorkingAgain};
 
-    /// When (second), and what (port, event, held back).
+    /// When (in seconds), and what (port, event, held back).
     type Mail = (u64, Vec<(u16, NoticeKind, usize)>);
 
     fn notice(port: u16, event: NoticeKind) -> Notice {
         Notice { server: format!("host:{port}"), event, load: None, error: None, at: SystemTime::UNIX_EPOCH }
     }
 
-    /// With a gathering of 10 s, a flapping limit of 600 s, and an hour in which an e-mail is tried.
+    /// With the defaults: `gather` 10 s, `flapping` 600 s, `mailPatience` one hour.
     fn outbox() -> Outbox {
         Outbox::new(&Timing::default())
     }

@@ -1,7 +1,7 @@
-//! Delivers e-mails to the SMTP server by lettre's transport.
+//! Delivers e-mails to the SMTP server with lettre's transport.
 //!
-//! With a password the connection is encrypted before the login: from the first byte (implicit TLS), or by STARTTLS. The
-//! trusted authorities are read from the system for each e-mail, so that a renewed file needs no restart.
+//! With a password the connection is encrypted before the login: from the first byte (implicit TLS), or by STARTTLS.
+//! The trusted authorities are read from the system for each e-mail, so that a renewed file needs no restart.
 
 use std::error::Error;
 use std::time::Duration;
@@ -16,7 +16,7 @@ use crate::session::config::SessionConfig;
 use crate::shared::config::Secret;
 use crate::shared::text::one_line;
 
-/// The port on which connections are usually encrypted from the first byte.
+/// The usual port of implicit TLS.
 const IMPLICIT_TLS_PORT: u16 = 465;
 const DEFAULT_PORT: u16 = 25;
 const DEFAULT_PORT_WITH_PASSWORD: u16 = 587;
@@ -24,7 +24,7 @@ const DEFAULT_PORT_WITH_PASSWORD: u16 = 587;
 /// Why an e-mail was not sent, in one line.
 #[derive(Debug, thiserror::Error)]
 pub enum MailError {
-    /// A key without which no e-mail is sent is not set.
+    /// This key is required for e-mails and not set.
     #[error("notifications are off: {0} is not set")]
     Off(&'static str),
     /// The text can't be rendered.
@@ -38,7 +38,7 @@ pub enum MailError {
     Delivery {
         /// `HOST:PORT` of the SMTP server.
         server: String,
-        /// The reason in the words of the SMTP server or of the system.
+        /// The reason, as text of the SMTP server or of the system.
         problem: String,
         /// Whether the configuration or the SMTP server must change before another try can succeed (RFC 5321, 4.2.1).
         permanent: bool,
@@ -66,7 +66,7 @@ impl Relay {
     /// The SMTP server of the configuration.
     ///
     /// # Errors
-    /// When a key without which no e-mail is sent is not set.
+    /// When a key that is required for e-mails is not set.
     pub fn new(config: &SessionConfig) -> Result<Self, MailError> {
         let sender = config.mail_sender.as_ref().ok_or(MailError::Off("mailSender"))?;
         let host = config.mail_server.clone().ok_or(MailError::Off("mailServer"))?;
@@ -98,7 +98,8 @@ impl Relay {
     /// # Errors
     /// When the SMTP server does not take it, or does not say so in time.
     pub async fn deliver(&self, message: Message) -> Result<String, MailError> {
-        // lettre limits the time of connecting only. Its pool would hand a connection that was given up to the next e-mail.
+        // lettre's timeout covers connecting only. Its pool would reuse a connection after a timeout for the next
+        // e-mail.
         let delivered = timeout(self.time_limit, async { self.transport()?.send(message).await }).await;
         match delivered {
             Ok(Ok(answer)) => Ok(one_line(answer.first_line().unwrap_or_default())),
@@ -141,7 +142,7 @@ fn chain<'error>(error: &'error (dyn Error + 'static)) -> impl Iterator<Item = &
     std::iter::successors(Some(error), |error| (*error).source())
 }
 
-/// The words of the innermost cause.
+/// The text of the innermost cause.
 fn root(error: &(dyn Error + 'static)) -> String {
     chain(error).last().unwrap_or(error).to_string()
 }

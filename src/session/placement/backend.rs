@@ -1,4 +1,4 @@
-//! What is known of one simulation server: its last report, and the clients that were sent to it since.
+//! What is known of one simulation server: its last report, and the clients that were sent to it since then.
 
 use super::cost::{CostFit, Estimate, FULL, FleetCost, believable};
 use super::policy::PlacementPolicy;
@@ -6,28 +6,28 @@ use super::replicas::Replicas;
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 
-/// A server's load is the mean of samples over so long: a client that left stays in it that long.
+/// A server's load is the mean of its samples over this time: a client that has left stays in it this long.
 const MEAN_WINDOW: Duration = Duration::from_secs(5);
 
-/// What a simulation server answered when it was asked for its status.
+/// What a simulation server answered to a probe.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct LoadReport {
-    /// The mean load of the last five seconds, in percent. A server that reports no finite number from 0 on is taken as lost.
+    /// The mean load of the last five seconds, in percent. A load that is negative or not finite counts as no answer.
     pub load: f64,
-    /// Its simulations; `None` for a server that reports only a load.
+    /// Its simulations; `None` if the server reports only a load.
     pub instances: Option<ClientCounts>,
 }
 
-/// The part of a report that tells of the server's simulations.
+/// The part of a report about the server's simulations.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ClientCounts {
-    /// The simulations that are there: queued, starting, idle and running.
+    /// Number of simulations: queued, starting, idle and running.
     pub present: u32,
-    /// How many the server can hold.
+    /// Number of slots.
     pub places: u32,
-    /// How many clients have started something since that server began.
+    /// Number of clients that have started a simulation since that server was started.
     pub arrivals: u64,
-    /// Whether the server takes new clients; `false` while it is drained.
+    /// Whether the server accepts new clients; `false` while it is drained.
     pub accepting: bool,
 }
 
@@ -35,11 +35,11 @@ pub struct ClientCounts {
 #[derive(Debug, Clone, Copy)]
 struct Placement {
     at: Instant,
-    /// Whether it takes room, see [`super::LoadBalancer::pick_unreserved`].
+    /// Whether it reserves room, see [`super::LoadBalancer::pick_unreserved`].
     takes_room: bool,
 }
 
-/// Clients that came (positive) or left (negative) and that the mean load does not fully show yet.
+/// Clients that arrived (positive) or left (negative) and that the mean load does not fully show yet.
 #[derive(Debug, Clone, Copy)]
 struct ClientDelta {
     at: Instant,
@@ -62,7 +62,7 @@ impl ClientDelta {
 /// Clients that a report does not show.
 #[derive(Debug, Clone, Copy, Default)]
 struct Unseen {
-    /// Those that take room.
+    /// Those that reserve room.
     reserved: f64,
     /// The others.
     unreserved: f64,
@@ -76,17 +76,17 @@ pub(super) struct Backend {
     last: Option<(Instant, LoadReport)>,
     /// The placements whose clients have not been seen yet, oldest first.
     in_flight: VecDeque<Placement>,
-    /// How many of them take room.
+    /// Number of them that reserve room.
     reserved: usize,
-    /// How many of these have been placed since the last report.
+    /// Number of these that were placed since the last report.
     fresh: usize,
-    /// How many clients come for each that is placed here, those of other session servers included.
+    /// Number of clients that arrive per placement made here, including those of other session servers.
     clients_per_placement: f64,
     settling: VecDeque<ClientDelta>,
     /// What `settling` hid from the last report.
     unseen: Unseen,
     fit: CostFit,
-    /// What the fleet has been told of that fit.
+    /// The estimate from that fit that the fleet has.
     estimate: Estimate,
     /// What a client is expected to add to the load, in percent.
     cost: f64,
@@ -95,7 +95,7 @@ pub(super) struct Backend {
 }
 
 impl Backend {
-    /// A server that nothing is known of: down until its first report.
+    /// A server without reports: down until its first one.
     pub(super) fn new(policy: &PlacementPolicy, turn: u64) -> Self {
         Self {
             up: false,
@@ -113,7 +113,7 @@ impl Backend {
         }
     }
 
-    /// Takes in a report that came at `now`; one that is older than the last is passed over.
+    /// Records a report that arrived at `now`; a report that is older than the last is ignored.
     pub(super) fn report(
         &mut self,
         now: Instant,
@@ -138,19 +138,19 @@ impl Backend {
         self.update_cost(fleet, policy);
     }
 
-    /// The server does not answer.
+    /// Records that the server does not answer.
     pub(super) fn lose(&mut self) {
         self.up = false;
     }
 
-    /// A client has been sent here.
+    /// Records that a client was sent here.
     pub(super) fn place(&mut self, now: Instant, takes_room: bool) {
         self.in_flight.push_back(Placement { at: now, takes_room });
         self.reserved += usize::from(takes_room);
         self.fresh += usize::from(takes_room);
     }
 
-    /// Gives up the clients that should have come by now.
+    /// Gives up overdue clients.
     pub(super) fn expire(&mut self, now: Instant, policy: &PlacementPolicy, peers: &mut Replicas) {
         let is_late = |placed: &Placement| now.saturating_duration_since(placed.at) >= policy.patience;
         let late = self.in_flight.partition_point(is_late);
@@ -159,7 +159,7 @@ impl Backend {
         peers.count(0.0, count(given_up));
     }
 
-    /// When the oldest placement is given up, if its client does not come before.
+    /// When the oldest placement is given up, unless its client arrives before.
     pub(super) fn next_expiry(&self, policy: &PlacementPolicy) -> Option<Instant> {
         self.in_flight.front().and_then(|placed| placed.at.checked_add(policy.patience))
     }
@@ -176,53 +176,55 @@ impl Backend {
         has_place && self.effective_load().is_some_and(|load| load < self.limit(policy))
     }
 
-    /// The load, in percent, from which on this server takes no client.
+    /// The load, in percent, from which on this server gets no client.
     pub(super) fn limit(&self, policy: &PlacementPolicy) -> f64 {
-        // A client that costs much is turned away earlier, because it would take more than the machine has.
-        // A threshold that no load reaches says that the load is to close no server.
+        // A server whose clients cost much is full earlier, because the next one would need more than the machine has.
+        // A threshold above 100 means that the load never makes a server full.
         if policy.threshold > 100.0 { policy.threshold } else { policy.threshold.min(100.0 - self.cost) }
     }
 
-    /// The load, in percent, that is expected once all clients show that take room here; `None` if the server is down.
+    /// The load, in percent, that is expected once it shows all clients that reserve room; `None` if the server is
+    /// down.
     pub(super) fn effective_load(&self) -> Option<f64> {
         self.load_with(self.unseen.reserved, self.reserved)
     }
 
-    /// The same with all clients that were sent here: what servers are compared by.
+    /// The same with all clients that were sent here; servers are compared by this load.
     pub(super) fn rank_load(&self) -> Option<f64> {
         self.load_with(self.unseen.reserved + self.unseen.unreserved, self.in_flight.len())
     }
 
     fn load_with(&self, unseen: f64, in_flight: usize) -> Option<f64> {
         let (_, LoadReport { load, .. }) = self.last.filter(|_| self.up)?;
-        // How far a full machine is over is not known, so those who left may not have made it less than full.
+        // The overload of a full machine is unknown, so it may still be full after clients have left.
         let unseen = if load < FULL { unseen } else { unseen.max(0.0) };
         let ahead = unseen + count(in_flight) + self.sent_by_others();
         Some((load + self.cost * ahead).max(0.0))
     }
 
-    /// How many clients other session servers have sent here since the last report, as far as can be known.
+    /// Estimated number of clients that other session servers have sent here since the last report.
     fn sent_by_others(&self) -> f64 {
         count(self.fresh.min(self.reserved)) * (self.clients_per_placement - 1.0)
     }
 
-    /// How many clients were sent here and have neither been seen nor given up.
+    /// Number of clients that were sent here and have neither been seen nor given up.
     pub(super) fn in_flight(&self) -> usize {
         self.in_flight.len()
     }
 
-    /// What one more client is expected to add to the load, in percent.
+    /// Load that one more client is expected to add, in percent.
     pub(super) fn cost(&self) -> f64 {
         self.cost
     }
 
-    /// What this server says about the cost of a client.
+    /// This server's estimate of the cost of a client.
     pub(super) fn estimate(&self) -> Estimate {
         self.estimate
     }
 
-    /// Tells the fleet what has been learned here, and takes over what follows from all servers. A server that reports
-    /// only its load teaches nothing, because it does not tell which part of that are clients: its cost is the fixed one.
+    /// Passes this server's estimate to the fleet, and takes the cost that follows from all servers. A report of only a
+    /// load teaches nothing, because it does not show which part of the load is clients: that server's cost is the
+    /// fixed one.
     fn update_cost(&mut self, fleet: &mut FleetCost, policy: &PlacementPolicy) {
         let counts = self.last.is_some_and(|(_, report)| report.instances.is_some());
         let estimate = if counts { self.fit.estimate(self.cost) } else { Estimate::default() };
@@ -236,15 +238,15 @@ impl Backend {
             return;
         };
         let unseen = self.unseen.reserved + self.unseen.unreserved;
-        // Those who wait for a place cost nothing yet.
+        // Clients in the queue cost nothing yet.
         let present = f64::from(instances.present.min(instances.places));
         let shown = (present - unseen).max(0.0);
-        // While many are starting, it is not well known how much of them the load shows.
+        // While many start, it is uncertain how much of them the load shows.
         let trust = if shown < present { shown / present } else { 1.0 };
         self.fit.learn(shown, report.load, now.saturating_duration_since(before), trust * trust);
     }
 
-    /// Forgets the changes that the load shows by now, and sums up the others.
+    /// Drops the changes that the load shows by now, and sums up the others.
     fn settle(&mut self, now: Instant, policy: &PlacementPolicy) {
         self.settling.retain(|change| change.unseen(now, policy.settling) != 0.0);
         self.unseen = Unseen::default();
@@ -254,10 +256,10 @@ impl Backend {
         }
     }
 
-    /// Compares the report with the one before: who came, who left.
+    /// Compares the report with the one before: which clients arrived, which left.
     fn note_changes(&mut self, now: Instant, new: Option<ClientCounts>, peers: &mut Replicas) {
         let Some(new) = new else {
-            // A load alone does not tell who came: every placement is taken to have come as it was made.
+            // A load alone does not show arrivals: every placement is assumed to have arrived at once.
             let all = self.in_flight.drain(..);
             self.settling.extend(all.map(|Placement { at, takes_room }| ClientDelta { at, clients: 1.0, takes_room }));
             self.reserved = 0;
@@ -265,8 +267,8 @@ impl Backend {
         };
         let old = self.last.and_then(|(at, report)| report.instances.map(|old| (at, old)));
         let Some((before, old)) = old.filter(|(_, old)| old.arrivals <= new.arrivals) else {
-            // The first report, or a server that was started again: its load has nothing of the past in it. Placements in
-            // flight may still come.
+            // The first report, or a restarted server: its load contains nothing of the past. Placements in flight may
+            // still arrive.
             self.settling.clear();
             self.fit.count_arrivals(f64::from(new.present));
             return;
@@ -275,13 +277,14 @@ impl Backend {
         let came = arrivals.min(self.in_flight.len());
         peers.count(count(arrivals), count(came));
         self.clients_per_placement = peers.clients_per_placement();
-        // The latest placements are taken to be those that came. Nothing tells clients apart; were the oldest taken, then
-        // a client that never comes would stay in flight as long as others follow it.
+        // Reports do not identify clients, so arrivals are matched to the most recent placements. If the oldest were
+        // taken, a client that never arrives would stay in flight as long as others follow it.
         for Placement { at, takes_room } in self.in_flight.drain(self.in_flight.len() - came..) {
             self.settling.push_back(ClientDelta { at, clients: 1.0, takes_room: true });
             self.reserved -= usize::from(takes_room);
         }
-        // Those who left, less those who came without having been sent; some time since the last report.
+        // Other changes: clients that arrived without a placement from here, minus those that left. When they happened
+        // is unknown: half-way between the reports is assumed.
         let came = count(came);
         let others = f64::from(new.present) - f64::from(old.present) - came;
         self.fit.count_arrivals(came + others.max(0.0));
@@ -301,7 +304,7 @@ fn count(clients: usize) -> f64 {
 mod tests {
     use super::*;
 
-    /// One server, the time from which its seconds are counted, and what its fleet has learned of costs and of others.
+    /// One server, the start of its clock, and what its fleet has learned of costs and of other session servers.
     struct Server(Backend, Instant, FleetCost, Replicas);
 
     impl Server {

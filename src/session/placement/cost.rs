@@ -1,50 +1,50 @@
 //! What one client costs a server, learned from its reports.
 //!
 //! Each server has a least squares fit of `load = base + cost * clients` ([`CostFit`]), in which old reports fade and
-//! which starts from a guess. Load of other programs only ever adds to that of the clients, so a report that lies far above
-//! the fit counts for little. Clients differ, so a server that has seen few knows little, and after one client nothing. The fleet ([`FleetCost`]) knows
-//! how far its servers differ, and draws each server's estimate towards the mean of all: servers that look alike are
-//! treated alike, and a new one starts from what the others have learned.
+//! which starts from a guess. Other programs only ever add load, so a report far above the fit counts little. Clients
+//! differ, so a server that has seen few knows little, and after one client nothing. The fleet ([`FleetCost`]) knows
+//! how much its servers differ, and shrinks each server's estimate towards the mean of all: similar servers are treated
+//! alike, and a new one starts from what the others have learned.
 
 use std::time::Duration;
 
-/// How long a report is remembered: its weight falls to 1/e in that time, of which only the time with clients counts.
+/// Time in which the weight of a report falls to 1/e; only time with clients counts.
 const MEMORY: Duration = Duration::from_mins(10);
-/// The most time that one report stands for, so that a gap between reports does not make the next one weigh too much.
+/// Longest time that one report stands for, so that the report after a gap does not weigh too much.
 const LONGEST_STEP: Duration = Duration::from_secs(10);
-/// An idle server's load is expected to be 0; that weighs as much as so many seconds of reports.
+/// Weight of the assumption that an idle server's load is 0, in seconds of reports.
 const BASE_TRUST: f64 = 2.0;
-/// For how many seconds an idle server's load is remembered.
+/// Largest weight of the load of an idle server, in seconds.
 const IDLE_MEMORY: f64 = 60.0;
-/// How far a load lies from the fit, as a variance in percent squared, for one second of reports: 2 % for five seconds,
-/// because each load is a mean of five seconds.
+/// Variance of a load around the fit, in percent squared, for one second of reports: 2 % for five seconds, because each
+/// load is a mean of five seconds.
 const NOISE: f64 = 2.0 * 2.0 * 5.0;
-/// A load that lies so far above the fit, in percent, is taken to be that of other programs.
+/// A load that is this far above the fit, in percent, counts as load of other programs.
 const FOREIGN: f64 = 15.0;
-/// How much a report counts that contains load of other programs: a fiftieth. Not nothing, because it may be that of
-/// clients which have become more expensive.
+/// Weight of a report that contains load of other programs: a fiftieth. It is not zero, because clients may have become
+/// more expensive.
 const FOREIGN_TRUST: f64 = 0.02;
-/// How far clients differ: the variance of one client's cost, relative to the square of the mean cost.
+/// Variance of one client's cost, relative to the square of the mean cost.
 const VARIETY: f64 = 0.16;
-/// From this load on, in percent, a report only says 'at least so much', because the machine has no more to give.
+/// From this load on, in percent, a report is only a lower bound, because the machine has no more to give.
 pub(super) const FULL: f64 = 99.0;
-/// The lowest cost that is believed, in percent: clients that do nothing yet may start to.
+/// The lowest plausible cost, in percent: idle clients may become active.
 const LOWEST: f64 = 0.25;
-/// The highest cost that is believed, in percent.
+/// The highest plausible cost, in percent.
 const HIGHEST: f64 = 50.0;
 
-/// Limits a cost to what is believed, in percent; what is not a number becomes the highest.
+/// Clamps a cost to the plausible range, in percent; NaN becomes the highest.
 pub(super) fn believable(cost: f64) -> f64 {
     if cost.is_nan() { HIGHEST } else { cost.clamp(LOWEST, HIGHEST) }
 }
 
-/// Whether a load lies so far above the expected one, both in percent, that other programs must be running.
+/// Whether a load is so far above the expected one, both in percent, that other programs must be running.
 fn is_foreign(load: f64, expected: f64) -> bool {
     load > expected + FOREIGN
 }
 
-/// What one server says about its cost: the logarithm, and how sure it is (one over the variance of that logarithm).
-/// The default says nothing.
+/// One server's estimate of its cost: the logarithm, and its precision (one over the variance of that logarithm). The
+/// default contains no information.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Estimate {
     log: f64,
@@ -60,12 +60,12 @@ pub(super) struct CostFit {
     clients_squared: f64,
     load: f64,
     clients_by_load: f64,
-    /// The load without clients, in percent, and for how many seconds it was seen.
+    /// The load without clients, in percent, and its weight in seconds.
     idle_load: f64,
     idle_weight: f64,
-    /// How many clients the fit rests on.
+    /// Number of clients that the fit is based on.
     seen: f64,
-    /// How many more have arrived since the last report that counts in full.
+    /// Number of arrivals since the last report that counted in full.
     arrived: f64,
     base: f64,
     slope: f64,
@@ -93,13 +93,13 @@ impl CostFit {
         }
     }
 
-    /// This server's own estimate. `believed` is what its clients have been taken to cost until now, in percent: an
-    /// estimate is not surer for being high.
+    /// This server's own estimate. `believed` is the cost that was assumed until now, in percent: a high estimate is
+    /// not more precise for being high.
     pub(super) fn estimate(&self, believed: f64) -> Estimate {
         let relative = self.variance / (believed * believed);
-        // One start is no evidence: whatever else began at the same time would be taken for its load.
+        // One start is not evidence: any load that began at the same time would be attributed to it.
         let seen = if self.seen > 1.0 { self.seen } else { 0.0 };
-        // The precision is 1 / (relative + VARIETY / seen), and 0 where there is no evidence.
+        // The precision is 1 / (relative + VARIETY / seen), and 0 without evidence.
         Estimate { log: self.slope.ln(), precision: seen / (seen * relative + VARIETY) }
     }
 
@@ -108,12 +108,12 @@ impl CostFit {
         self.arrived += clients;
     }
 
-    /// Learns that the server had this `load`, in percent, while it held so many `clients`. `elapsed` is the time since
-    /// the report before, and `trust` (0 to 1) tells how well the number of clients is known.
+    /// Learns that the server had this `load`, in percent, with this number of `clients`. `elapsed` is the time since
+    /// the report before, and `trust` (0 to 1) how well the number of clients is known.
     pub(super) fn learn(&mut self, clients: f64, load: f64, elapsed: Duration, trust: f64) {
         let seconds = elapsed.min(LONGEST_STEP).as_secs_f64();
         let load = load.min(100.0);
-        // A full machine can teach that its clients cost more than was thought, but not that they cost less.
+        // A full machine can show that its clients cost more than assumed, but not that they cost less.
         let says_nothing = load >= FULL && self.base + self.slope * clients >= load;
         if says_nothing || seconds == 0.0 {
             return;
@@ -146,10 +146,11 @@ impl CostFit {
         let (weight, load) = (self.weight + self.idle_weight, self.load + self.idle_weight * self.idle_load);
         let squares = self.clients_squared + trust;
         let products = self.clients_by_load + trust * self.guess;
-        // Positive, because weight * clients_squared >= clients * clients holds without what is added to the first two.
+        // Positive, because weight * clients_squared >= clients * clients holds before the positive terms are added to
+        // the first two.
         let determinant = weight * squares - self.clients * self.clients;
         let base = (load * squares - self.clients * products) / determinant;
-        // No machine is less than idle: if the best fit says so, then the best one without a base.
+        // A base can't be negative: if the best fit has a negative one, use the best fit without a base.
         let (base, slope, variance) = if base < 0.0 {
             (0.0, products / squares, NOISE / squares)
         } else {
@@ -161,8 +162,8 @@ impl CostFit {
     }
 }
 
-/// What the servers of a fleet have in common: sums over their estimates. From these follow the mean, and how far servers
-/// differ from it beyond the doubt in their estimates.
+/// Sums over the estimates of a fleet's servers. From these follow the mean, and how much servers differ from it beyond
+/// the uncertainty of their estimates.
 #[derive(Debug, Clone, Default)]
 pub(super) struct FleetCost {
     servers: f64,
@@ -173,7 +174,7 @@ pub(super) struct FleetCost {
 }
 
 impl FleetCost {
-    /// Replaces what a server said before by what it says now.
+    /// Replaces a server's estimate.
     pub(super) fn replace(&mut self, old: Estimate, new: Estimate) {
         for (sign, estimate) in [(-1.0, old), (1.0, new)] {
             let Estimate { log, precision } = estimate;
@@ -185,10 +186,10 @@ impl FleetCost {
         }
     }
 
-    /// What a client costs a server with this estimate, in percent: always positive and finite. `guess` is what a client
-    /// is expected to cost when nothing is known.
+    /// Cost of a client on a server with this estimate, in percent: always positive and finite. `guess` is the cost
+    /// that is assumed without any data.
     pub(super) fn cost(&self, own: Estimate, guess: f64) -> f64 {
-        // The guess counts as one more server, which is in doubt by a factor of e.
+        // The guess counts as one more server, with an uncertainty of a factor of e.
         let mean = (self.log + believable(guess).ln()) / (self.precision + 1.0);
         let own_share = own.precision * self.spread();
         believable(((own.log * own_share + mean) / (own_share + 1.0)).exp())
@@ -199,7 +200,7 @@ impl FleetCost {
         if self.servers < 2.0 || self.precision <= 0.0 {
             return 0.0;
         }
-        // The estimator of DerSimonian and Laird (1986), who compare clinical trials as servers are compared here.
+        // The estimator of DerSimonian and Laird (1986), which compares clinical trials as this compares servers.
         let scatter = self.log_squared - self.log * self.log / self.precision;
         let scale = self.precision - self.precision_squared / self.precision;
         if scale <= 0.0 {
@@ -214,7 +215,7 @@ mod tests {
     use crate::session::placement::{ClientCounts, LoadBalancer, LoadReport, PlacementPolicy};
     use std::time::{Duration, Instant};
 
-    /// A fleet of so many servers, and when it began.
+    /// A fleet of this many servers, and its start.
     fn fleet(client_cost: f64, servers: u32) -> (LoadBalancer<u32>, Instant) {
         let mut fleet = LoadBalancer::new(PlacementPolicy { client_cost, ..PlacementPolicy::default() });
         (0..servers).for_each(|id| fleet.add(id));
@@ -262,7 +263,7 @@ mod tests {
         assert_eq!(fleet.client_cost(&9), Some(2.0));
         fleet.report(&9, start, report(0.0, 0, 0));
         assert_near(fleet.client_cost(&9), 6.0, 0.6);
-        // Those that look alike are taken as alike, up to how much the mean moved between their last reports.
+        // Similar servers count as equal, apart from the shift of the mean between their last reports.
         assert_near(fleet.client_cost(&1), 6.0, 0.6);
     }
 
@@ -286,7 +287,7 @@ mod tests {
         assert!(fleet.client_cost(&0).is_some_and(|cost| cost >= 2.0));
     }
 
-    /// One server, whose reports of so many seconds have these loads and clients.
+    /// One server, with reports of (seconds, load, clients).
     fn taught(reports: &[(u32, f64, u32)]) -> (LoadBalancer<u32>, Instant) {
         let (mut fleet, start) = fleet(2.0, 1);
         let (mut second, mut arrivals, mut before) = (0, 0, 0);
@@ -303,7 +304,7 @@ mod tests {
 
     #[test]
     fn one_noisy_start_teaches_nothing() {
-        // One client comes and goes while other programs take so much.
+        // One client arrives and leaves while other programs add this much load.
         for noise in [5.0, 8.0, 13.0, 40.0] {
             let (mut fleet, now) = taught(&[(30, 3.0, 0), (60, 5.0 + noise, 1), (10, 3.0, 0)]);
             assert_near(fleet.client_cost(&0), 2.0, 0.1);
@@ -314,7 +315,7 @@ mod tests {
 
     #[test]
     fn load_of_other_programs_that_comes_and_goes_is_not_that_of_clients() {
-        // Clients cost 2 %. Other programs take 40 % for two thirds of the time, also while nobody is there.
+        // Clients cost 2 %. Other programs take 40 % for two thirds of the time, also without clients.
         let mut reports = vec![(60, 3.0, 0), (30, 43.0, 0)];
         for present in [2, 5, 8, 5, 8, 3] {
             let load = 3.0 + 2.0 * f64::from(present);

@@ -1,21 +1,22 @@
-//! A server whose starts fail for reasons of its own comes last for a while that doubles.
+//! Ejects a server whose starts fail for reasons of its own: it comes last for a time that doubles.
 //!
 //! The rule is that of Envoy's outlier detection (`consecutive_5xx` with an ejection time that grows, and panic routing),
 //! with the half-open state of a circuit breaker:
 //!
 //! 1. The server is ejected for [`FIRST`] once it reports [`FAILURES`] failed starts in a row.
-//! 2. After that time one client is sent there. While its start is not known to have succeeded, the server is ejected again.
-//! 3. If it fails, the time doubles, up to [`LONGEST`]. If it succeeds, all is forgotten.
+//! 2. After that time one client is sent there. Until its start succeeds, the server is ejected again.
+//! 3. If it fails, the time doubles, up to [`LONGEST`]. If it succeeds, all of this is reset.
 //!
-//! An ejected server gets clients if no other has room: where all fail alike, as without a forge, none is to blame.
+//! An ejected server gets clients if no other has room: if all fail alike, as without a Git host, none of them is the
+//! cause.
 
 use std::time::{Duration, Instant};
 
-/// The number of failed starts in a row that ejects a server: with fewer, a client that is unlucky would do.
+/// Number of failed starts in a row that ejects a server; below it, an unlucky client could eject one.
 const FAILURES: u32 = 3;
-/// The first ejection time.
+/// Duration of the first ejection.
 const FIRST: Duration = Duration::from_secs(30);
-/// The longest ejection time.
+/// Longest duration of an ejection.
 const LONGEST: Duration = Duration::from_mins(5);
 
 /// What is known of a server's failed starts.
@@ -23,16 +24,16 @@ const LONGEST: Duration = Duration::from_mins(5);
 pub(super) struct Ejection {
     /// Failed starts in a row, as last reported.
     failed: u32,
-    /// How often the server was ejected since a start succeeded, trials excluded.
+    /// Number of ejections since the last successful start, trials excluded.
     times: u32,
     /// The end of the ejection.
     until: Option<Instant>,
-    /// Whether a client was sent there after an ejection, whose start is not known to have succeeded or failed.
+    /// Whether a client was sent there after an ejection, and the outcome of its start is not known yet.
     is_on_trial: bool,
 }
 
 impl Ejection {
-    /// Takes in how many of the last starts have failed in a row.
+    /// Records how many of the last starts have failed in a row.
     pub(super) fn report(&mut self, now: Instant, failed: u32) {
         if failed == 0 {
             *self = Self::default();
@@ -47,7 +48,7 @@ impl Ejection {
         }
     }
 
-    /// A client has been sent to the server.
+    /// Records that a client was sent to the server.
     pub(super) fn place(&mut self, now: Instant) {
         if self.times > 0 && self.until.is_none() {
             self.eject(now);
@@ -75,7 +76,7 @@ impl Ejection {
 mod tests {
     use super::*;
 
-    /// After these reports of failed starts, one a second: until which second the server is ejected.
+    /// The second at which the ejection ends, after these reports of failed starts, one per second.
     fn ejected(reports: &[u32]) -> Option<u64> {
         let (begin, mut ejection) = (Instant::now(), Ejection::default());
         for (second, failed) in (0..).zip(reports) {

@@ -12,8 +12,7 @@ use std::collections::hash_map::Entry;
 use std::hash::Hash;
 use std::time::Instant;
 
-/// The simulation servers, what is known of each, and the choice between them. `Id` is whatever the owner knows a server
-/// by.
+/// The simulation servers, what is known of each, and the choice between them. `Id` is the owner's key of a server.
 ///
 /// ```
 /// use std::time::Instant;
@@ -31,8 +30,8 @@ use std::time::Instant;
 #[derive(Debug)]
 pub struct LoadBalancer<Id> {
     policy: PlacementPolicy,
-    /// By their numbers, so that a choice has to compare and hash no `Id`: among a thousand servers each is somewhere else in
-    /// memory.
+    /// By index, so that a choice neither compares nor hashes an `Id`: with a thousand servers each of these is
+    /// elsewhere in memory.
     servers: Slab<Server<Id>>,
     numbers: HashMap<Id, usize>,
     cost: FleetCost,
@@ -63,7 +62,7 @@ impl<Id: Clone + Eq + Hash> LoadBalancer<Id> {
         }
     }
 
-    /// Changes the policy. What servers have learned until now stays.
+    /// Changes the policy. What was learned of the servers stays.
     pub fn set_policy(&mut self, policy: PlacementPolicy) {
         self.policy = policy;
         for (number, server) in &mut self.servers {
@@ -71,7 +70,7 @@ impl<Id: Clone + Eq + Hash> LoadBalancer<Id> {
         }
     }
 
-    /// Adds a server, which is down until its first report. One that is there already stays as it is.
+    /// Adds a server, which is down until its first report. A known server is not changed.
     pub fn add(&mut self, id: Id) {
         self.turns += 1;
         if let Entry::Vacant(entry) = self.numbers.entry(id) {
@@ -90,7 +89,7 @@ impl<Id: Clone + Eq + Hash> LoadBalancer<Id> {
         }
     }
 
-    /// Takes in what a server answered at `now`. A server that is not in the fleet is passed over.
+    /// Records what a server answered at `now`. A server that is not in the fleet is ignored.
     pub fn report(&mut self, id: &Id, now: Instant, report: LoadReport) {
         let Some((number, server)) = find(&self.numbers, &mut self.servers, id) else { return };
         server.backend.expire(now, &self.policy, &mut self.peers);
@@ -98,8 +97,8 @@ impl<Id: Clone + Eq + Hash> LoadBalancer<Id> {
         server.sort_in(number, &self.policy, &mut self.order);
     }
 
-    /// A server reports how many of its last starts in a row have failed for a reason of its own. After some, others are
-    /// preferred for a while.
+    /// Records how many of a server's last starts in a row have failed for a reason of its own. After some, other
+    /// servers are preferred for a while.
     pub fn note_failures(&mut self, id: &Id, now: Instant, failed: u32) {
         let Some((number, server)) = find(&self.numbers, &mut self.servers, id) else { return };
         server.ejection.expire(now);
@@ -112,21 +111,21 @@ impl<Id: Clone + Eq + Hash> LoadBalancer<Id> {
         self.server(id).is_some_and(|server| server.ejection.until().is_some())
     }
 
-    /// A server does not answer: it gets no clients until its next report.
+    /// Records that a server does not answer: it gets no clients until its next report.
     pub fn lose(&mut self, id: &Id) {
         let Some((number, server)) = find(&self.numbers, &mut self.servers, id) else { return };
         server.backend.lose();
         server.sort_in(number, &self.policy, &mut self.order);
     }
 
-    /// Returns the server of least load among those that have room and are `eligible`, and counts the client as sent
-    /// there. Of servers with equal loads it is the one that was chosen longest ago; one that is ejected comes last.
+    /// Returns the server with the lowest load among those that have room and are `eligible`, and counts the client as
+    /// sent there. Of servers with equal loads it is the one that was chosen longest ago; ejected servers come last.
     pub fn place(&mut self, now: Instant, eligible: impl Fn(&Id) -> bool) -> Option<Id> {
         self.send(now, true, eligible)
     }
 
-    /// The same for a client that may well not come. It counts when servers are compared, and takes no room: however many
-    /// there are of these, no server is full for them before they have come.
+    /// The same for a client that may never arrive. It counts when servers are compared, and reserves no room: any
+    /// number of these does not make a server full before they have arrived.
     pub fn pick_unreserved(&mut self, now: Instant, eligible: impl Fn(&Id) -> bool) -> Option<Id> {
         self.send(now, false, eligible)
     }
@@ -144,7 +143,7 @@ impl<Id: Clone + Eq + Hash> LoadBalancer<Id> {
         Some(server.id.clone())
     }
 
-    /// Gives up the placements whose clients should have come by now, and ends ejections.
+    /// Gives up overdue placements, and ends ejections.
     fn expire(&mut self, now: Instant) {
         for number in self.order.expired(now).collect::<Vec<_>>() {
             if let Some(server) = self.servers.get_mut(number) {
@@ -161,22 +160,23 @@ impl<Id: Clone + Eq + Hash> LoadBalancer<Id> {
         self.order.servers().next().is_some()
     }
 
-    /// The load, in percent, that is expected once all clients show that take room on a server; `None` if it is down.
+    /// The load, in percent, that is expected once it shows all clients that reserve room; `None` if the server is
+    /// down.
     pub fn effective_load(&self, id: &Id) -> Option<f64> {
         self.backend(id)?.effective_load()
     }
 
-    /// The load, in percent, from which on a server takes no client; `None` if it is not in the fleet.
+    /// The load, in percent, from which on a server gets no client; `None` if it is not in the fleet.
     pub fn limit(&self, id: &Id) -> Option<f64> {
         self.backend(id).map(|server| server.limit(&self.policy))
     }
 
-    /// How many clients were sent to a server and have neither been seen there nor given up.
+    /// Number of clients that were sent to a server and have neither been seen there nor been given up.
     pub fn in_flight(&self, id: &Id) -> usize {
         self.backend(id).map_or(0, Backend::in_flight)
     }
 
-    /// What a client is expected to cost a server, in percent of load; `None` if it is not in the fleet.
+    /// Expected cost of a client on a server, in percent of load; `None` if it is not in the fleet.
     pub fn client_cost(&self, id: &Id) -> Option<f64> {
         self.backend(id).map(Backend::cost)
     }
@@ -200,7 +200,7 @@ fn find<'servers, Id: Eq + Hash>(
 }
 
 impl<Id> Server<Id> {
-    /// Sorts a server in anew after something happened to it.
+    /// Updates the rank of a server after a change.
     fn sort_in(&mut self, number: usize, policy: &PlacementPolicy, order: &mut Ranking) {
         let load = self.backend.rank_load().filter(|_| self.backend.has_room(policy));
         let until = self.ejection.until();
@@ -414,7 +414,7 @@ mod tests {
             LoadReport { load: 1.0, instances: Some(instances) }
         };
         let mut fleet = fleet(0.25, now, [report(0, 0)]);
-        // All of them were sent by others.
+        // All of them were sent by other session servers.
         fleet.report(&0, now + Duration::from_secs(1), report(0, 1_000));
         let mut placed = 0;
         for second in 2..15 {
@@ -425,7 +425,7 @@ mod tests {
         assert_eq!(placed, 20, "of 20 clients that wait for 20 places");
     }
 
-    /// Sends so many clients at once; returns how many each server got.
+    /// Sends this many clients at once; returns how many each server got.
     fn burst(fleet: &mut LoadBalancer<u32>, now: Instant, clients: usize, servers: u32) -> Vec<usize> {
         for _ in 0..clients {
             fleet.place(now, |_| true);
@@ -452,7 +452,7 @@ mod tests {
             let level = |id| fleet.effective_load(&id).unwrap();
             let lowest = (0..servers).map(level).fold(f64::INFINITY, f64::min);
             for (id, placed) in (0..).zip(placed) {
-                // Whoever got a client is at most one client above the least loaded.
+                // A server that got a client is at most one client above the least loaded.
                 prop_assert!(placed == 0 || level(id) <= lowest + 2.0 + 1e-9);
                 prop_assert!(level(id) < 95.0 + 2.0);
             }

@@ -1,17 +1,17 @@
 //! Which server gets the next client: the pure placement policy.
 //!
-//! A report of a simulation server is always old. Whoever goes by the reports alone sends a whole class to the one server
-//! that looked best a moment ago. The [`LoadBalancer`] therefore counts each of its own placements as load at once, until the
+//! A report of a simulation server is always old. Scheduling by reports alone sends a whole class to the server with
+//! the lowest last report. The [`LoadBalancer`] therefore counts each of its own placements as load at once, until the
 //! reports show it.
 //!
-//! - `fleet`: the servers, and the choice between them; `policy`: what can be set;
-//! - `order`: the servers sorted by load, so that a large fleet is as fast as a small one;
+//! - `load_balancer`: the servers, and the choice between them; `policy`: its parameters;
+//! - `ranking`: the servers sorted by load, so that a large fleet is as fast as a small one;
 //! - `backend`: what is known of one server;
 //! - `cost`: what a client costs a server, learned from its reports;
-//! - `ejection`: which servers come last, because starts fail there;
-//! - `peers`: how many clients other session servers send.
+//! - `ejection`: which servers come last, because their starts fail;
+//! - `replicas`: how many clients other session servers send.
 //!
-//! Nothing here reads a clock or does any input or output: every call is told the time.
+//! Nothing here reads a clock or does I/O: the caller passes the time.
 //! `docs/placement.md` explains the policy, and `cargo bench --bench placement` measures it.
 
 mod backend;

@@ -1,18 +1,20 @@
-//! What can be set about placement.
+//! The parameters of placement.
 
 use std::time::Duration;
 
-/// What the owner of a fleet can set.
+/// The parameters that the owner of a fleet sets.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PlacementPolicy {
-    /// A server takes clients while its effective load is under this, in percent. Default: 95.
+    /// A server gets clients while its effective load is below this, in percent, and below 100 minus the cost of a
+    /// client. Above 100, the load does not matter. Default: 95.
     pub threshold: f64,
-    /// What a client costs a server that reports only its load, in percent; the others start from this and learn. Default: 2.
+    /// Cost of a client on a server that reports only its load, in percent; the others start from this and learn.
+    /// Default: 2.
     pub client_cost: f64,
-    /// How long a placement counts whose client does not come. Default: 15 seconds.
+    /// Time after which a placement is given up if its client does not arrive. Default: 15 seconds.
     pub patience: Duration,
-    /// How long it takes until a client that came shows fully in the reported load, which is a mean of five seconds, and a
-    /// simulation needs a while to start. Default: 8 seconds.
+    /// Time until an arrived client shows fully in the reported load, which is a mean of five seconds, and a simulation
+    /// takes a while to start. Default: 8 seconds.
     pub settling: Duration,
 }
 

@@ -1,14 +1,15 @@
-//! The servers that have room, sorted by load, so that a choice among a thousand costs no more than one among ten.
+//! The servers that have room, sorted by load, so that a choice among a thousand is as fast as one among ten.
 //!
-//! A server's load changes only with a report, with a placement, and when a placement is given up. The fleet updates the
-//! order after each of these; `expired` tells which servers have placements to give up.
+//! A server's rank changes only when it is probed or chosen, when one of its placements or its ejection expires, and
+//! with the policy. The fleet updates the ranking after each of these; `expired` returns the servers with something to
+//! expire.
 
 use std::cmp::Ordering;
 use std::collections::BTreeSet;
 use std::time::Instant;
 
-/// What servers are sorted by: those that are ejected go last, then the least load goes first, and of equal loads the
-/// server that was chosen longest ago.
+/// Sort key of a server: ejected servers come last, then the lowest load comes first, and of equal loads the server
+/// that was chosen longest ago.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Rank {
     pub(super) is_ejected: bool,
@@ -31,16 +32,16 @@ impl PartialOrd for Rank {
     }
 }
 
-/// Where a server stands in the order.
+/// A server's entry in the ranking.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub(super) struct RankEntry {
     /// `None` if the server has no room.
     pub(super) rank: Option<Rank>,
-    /// When the oldest of its placements is given up, or its ejection ends.
+    /// When the oldest of its placements is given up, or its ejection ends, whichever is first.
     pub(super) expiry: Option<Instant>,
 }
 
-/// The order of a fleet, whose servers it knows by their numbers.
+/// The ranking of a fleet, whose servers it knows by index.
 #[derive(Debug, Default)]
 pub(super) struct Ranking {
     ranked: BTreeSet<(Rank, usize)>,
@@ -48,7 +49,7 @@ pub(super) struct Ranking {
 }
 
 impl Ranking {
-    /// Puts a server that stood somewhere else.
+    /// Moves a server from one entry to another.
     pub(super) fn put(&mut self, server: usize, before: RankEntry, now: RankEntry) {
         if before.rank != now.rank {
             before.rank.map(|rank| self.ranked.remove(&(rank, server)));

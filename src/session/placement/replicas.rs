@@ -1,21 +1,21 @@
 //! How many clients other session servers send to the same fleet.
 //!
-//! Session servers share nothing, so none sees what the others have placed since the last reports. But each sees how many
-//! clients come and how many of them it has sent, so it knows for how many each of its placements stands: with three like
-//! it beside it, for four. That counts from one report of a server to the next, so that a mistake is short.
+//! Session servers share nothing, so none sees what the others have placed since the last reports. But each sees how
+//! many clients arrive and how many of them it has sent, so it knows how many clients each of its placements stands
+//! for: four, with three others like it. It applies only until the server's next report, so an error is short-lived.
 //!
-//! Dispatchers that take the arrivals of all to be theirs times their number are known from Goren, Vargaftik and Moses,
-//! "Stochastic Coordination in Heterogeneous Load Balancing Systems" (PODC 2021); here the number is learned instead of set.
+//! Goren, Vargaftik and Moses, "Stochastic Coordination in Heterogeneous Load Balancing Systems" (PODC 2021), describe
+//! dispatchers that multiply their own arrivals by their number; here the number is learned instead of set.
 
-/// After so many clients, what was seen before them weighs 1/e.
+/// Number of clients after which earlier ones weigh 1/e.
 const MEMORY: f64 = 200.0;
-/// What is believed from the beginning, that nobody else sends clients, weighs as much as so many of them.
+/// Weight of the initial assumption that no other session server sends clients, in clients.
 const DOUBT: f64 = 20.0;
-/// The most that is believed: more session servers are not recommended, and somebody who starts simulations without asking
-/// for a server is not to close the fleet.
+/// Upper limit of the estimate: more session servers are not recommended, and a client that starts simulations without
+/// requesting a server must not close the fleet.
 const MOST: f64 = 4.0;
 
-/// The clients that came to the servers of a fleet, and how many of them were sent from here.
+/// The clients that arrived at the servers of a fleet, and how many of them were sent from here.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Replicas {
     came: f64,
@@ -23,14 +23,14 @@ pub(super) struct Replicas {
 }
 
 impl Replicas {
-    /// So many clients came to some server; so many that were sent there from here have come or have been given up.
+    /// Counts clients that arrived at some server, and clients sent there from here that have arrived or been given up.
     pub(super) fn count(&mut self, came: f64, sent: f64) {
         let fade = (-came.max(sent) / MEMORY).exp();
         self.came = self.came * fade + came.min(MEMORY);
         self.sent = self.sent * fade + sent.min(MEMORY);
     }
 
-    /// How many clients come for each that is sent from here: 1 where nobody else sends any.
+    /// Number of clients that arrive for each that is sent from here: 1 if no other session server sends any.
     pub(super) fn clients_per_placement(&self) -> f64 {
         ((self.came + DOUBT) / (self.sent + DOUBT)).clamp(1.0, MOST)
     }
@@ -40,7 +40,7 @@ impl Replicas {
 mod tests {
     use super::*;
 
-    /// Clients that come one by one, of which each `n`th was sent from here.
+    /// Clients that arrive one by one, of which each `n`th was sent from here.
     fn after(peers: &mut Replicas, clients: u32, n: u32) -> f64 {
         for client in 1..=clients {
             peers.count(1.0, f64::from(u8::from(client % n == 0)));

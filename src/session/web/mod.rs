@@ -1,4 +1,4 @@
-//! What browsers and programs meet: paths, pages, and the WebSocket of a web client.
+//! The interface to browsers and programs: routes, pages, and the WebSocket of a web client.
 
 mod actions;
 mod page_routes;

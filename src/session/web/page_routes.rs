@@ -1,4 +1,4 @@
-//! The paths of the session server's pages, with what they load and listen to.
+//! Routes of the session server's pages, with their assets and event streams.
 
 use actix_web::{HttpRequest, HttpResponse, web};
 use askama::Template;
@@ -13,7 +13,7 @@ use crate::shared::http::assets::{self, Asset};
 use crate::shared::http::routing::{GET, READ, path};
 use crate::shared::http::{ConnectionKind, ContentSecurityPolicy, any_host, fleet_sources, html};
 
-/// Assets of this server's pages, besides those of all pages.
+/// Assets of this server's pages, besides those that both servers share.
 const ASSETS: &[Asset] = &[
     asset!("viewer.css"),
     asset!("viewer.js"),
@@ -32,7 +32,7 @@ const ASSETS: &[Asset] = &[
     asset!("webots_viewer.js"),
 ];
 
-/// Adds the paths to an app.
+/// Adds the routes to an app.
 pub fn configure(app: &mut web::ServiceConfig) {
     app.service(path("/monitor", READ, monitor))
         .service(path("/events", GET, events))
@@ -79,8 +79,8 @@ async fn viewer(request: HttpRequest, server: web::Data<AppState>) -> HttpRespon
     .await
 }
 
-/// Webots' own viewer is foreign code, and a link to this page can name another script on a host of the fleet. So it runs
-/// in an embedded page with an origin of its own.
+/// Webots' own viewer is third-party code, and a link to this page can name another script on a host of the fleet. So
+/// it runs in an embedded page with an origin of its own.
 async fn webots_viewer(server: web::Data<AppState>) -> HttpResponse {
     with_status(&server, |status| {
         let mut sources = fleet(&server, status);
@@ -94,7 +94,7 @@ async fn webots_viewer(server: web::Data<AppState>) -> HttpResponse {
 fn fleet(server: &AppState, status: &FleetStatus) -> Vec<String> {
     match &server.client_urls.public {
         Some(public) => vec![public.http_door(), public.websocket_door()],
-        // Names may lead to others by the time that the page starts a simulation.
+        // Names may resolve to other servers by the time the page starts a simulation.
         None if !status.names.is_empty() => any_host(server.client_urls.ssl),
         None => fleet_sources(status.servers.iter().map(|one| &one.address), server.client_urls.ssl),
     }

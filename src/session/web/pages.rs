@@ -1,4 +1,4 @@
-//! The session server's pages for people: the monitor of its fleet, and the viewer.
+//! The session server's HTML pages: the monitor of its fleet, and the viewer.
 
 use std::collections::VecDeque;
 use std::time::{Duration, SystemTime};
@@ -88,9 +88,9 @@ struct Changes<'status> {
 pub struct Viewer<'config> {
     /// Version of the server.
     pub version: &'static str,
-    /// Worlds to try.
+    /// Worlds that the page offers.
     pub examples: &'config [Example],
-    /// Where Webots' own viewer comes from, if it is configured.
+    /// URL of Webots' own viewer, if `viewerScript` is set.
     pub script: Option<&'config str>,
 }
 
@@ -156,7 +156,7 @@ impl<'status> Glance<'status> {
         let count =
             |wanted: &[ServerState]| status.servers.iter().filter(|server| wanted.contains(&server.state)).count();
         let instances = || status.servers.iter().filter_map(known_instances);
-        // Another server's numbers may be anything.
+        // Numbers that another server reports may be arbitrarily large.
         let sum = |part: fn(Instances) -> u32| instances().map(|one| u64::from(part(one))).sum::<u64>();
         Self {
             names: &status.names,
@@ -216,7 +216,7 @@ fn known_instances(server: &ServerStatus) -> Option<Instances> {
     server.report.as_ref().filter(|_| server.state != ServerState::Down)?.instances
 }
 
-/// The rank of a state in sorting: what needs attention comes first.
+/// Sort rank of a state: states that need attention come first.
 fn rank(state: ServerState) -> u8 {
     match state {
         ServerState::Down => 0,
@@ -231,7 +231,7 @@ fn without_scheme(url: &str) -> &str {
     url.split_once("://").map_or(url, |(_, rest)| rest)
 }
 
-/// A latency in words, rounded so that the page of a calm fleet has nothing to send.
+/// A latency as text, rounded so that the page of an idle fleet does not change.
 fn milliseconds(time: Duration) -> String {
     match time.as_millis() {
         0 => "< 1 ms".to_owned(),

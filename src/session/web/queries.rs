@@ -1,4 +1,4 @@
-//! Asks the registry on behalf of a request.
+//! Queries the registry on behalf of a request.
 
 use std::time::Duration;
 
@@ -9,10 +9,10 @@ use crate::session::fleet::FleetStatus;
 use crate::session::fleet::{GetStatus, Registry};
 use crate::session::state::AppState;
 
-/// How long the registry may take to answer.
+/// Timeout of the registry's answer.
 const PATIENCE: Duration = Duration::from_secs(2);
 
-/// Asks the registry; nothing when it is too busy to answer.
+/// Queries the registry; `None` if it does not answer in time.
 pub async fn ask<M>(server: &AppState, message: M) -> Option<M::Result>
 where
     M: Message<Result: Send> + Send + 'static,
@@ -22,7 +22,7 @@ where
     actix_rt::time::timeout(PATIENCE, answer).await.ok().and_then(Result::ok)
 }
 
-/// Answers with what is known of the fleet.
+/// Answers with the status of the fleet, or with 503 if the registry does not answer in time.
 pub async fn with_status(server: &AppState, answer: impl FnOnce(&FleetStatus) -> HttpResponse) -> HttpResponse {
     match ask(server, GetStatus).await {
         Some(status) => answer(&status),

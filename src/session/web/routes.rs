@@ -1,4 +1,4 @@
-//! The session server's public paths: each reads the request, asks the registry, and maps the answer.
+//! The session server's routes: each parses the request, queries the registry, and maps the answer.
 
 use std::borrow::Cow;
 use std::sync::Arc;
@@ -20,7 +20,7 @@ use crate::shared::http::routing::{self, GET, READ, path, retry_after};
 use crate::shared::http::websocket;
 use crate::shared::http::{CONTENT_TYPE, ConnectionKind};
 
-/// Adds all paths to an app.
+/// Adds all routes to an app.
 pub fn configure(app: &mut web::ServiceConfig) {
     app.service(routing::all(add, "/session, /monitor, /viewer, /status, /load, /metrics or /health"));
 }
@@ -68,8 +68,8 @@ async fn session(request: HttpRequest, stream: web::Payload, server: web::Data<A
     response.content_type("text/plain; charset=utf-8").body(answer.text)
 }
 
-/// The world of a query. `webots.js` does not percent-encode it, so that it is all that follows `url=`: a plus sign
-/// or an ampersand may be part of it. Others do, as is usual in queries, and then it has no `:` in it.
+/// The world of a query. `webots.js` does not percent-encode it, so everything after `url=` is the world: a plus sign
+/// or an ampersand may be part of it. Other clients encode it as usual in queries; then it contains no `:`.
 fn wanted_world(query: &str) -> Option<Cow<'_, str>> {
     let begin = query.strip_prefix("url=").or_else(|| query.split_once("&url=").map(|(_, world)| world));
     let world = begin.filter(|world| !world.is_empty())?;

@@ -1,4 +1,4 @@
-//! What the session server tells other programs of its fleet: `/status` and `/metrics`.
+//! The fleet for other programs: `/status` and `/metrics`.
 
 use std::time::Duration;
 
@@ -21,7 +21,7 @@ pub struct StatusResponse {
     uptime: u64,
     available: bool,
     clients: usize,
-    /// Percent; absent where no server answers.
+    /// In percent; absent if no server answers.
     load: Option<f64>,
     servers: Vec<ServerStatusJson>,
     names: Vec<NameStatusJson>,
@@ -44,7 +44,7 @@ struct ServerStatusJson {
     version: String,
     /// Seconds since the last good answer.
     age: Option<f64>,
-    /// Seconds.
+    /// In seconds.
     latency: Option<f64>,
     error: Option<String>,
 }
@@ -194,7 +194,7 @@ fn server_gauges<'text>(servers: &[ServerStatus]) -> Vec<Gauge<'text>> {
     ]
 }
 
-/// The gauges of each name that simulation servers are looked up by.
+/// The gauges of each name that resolves to simulation servers.
 fn name_gauges<'text>(names: &[NameStatus]) -> Vec<Gauge<'text>> {
     let of_each = |value: &dyn Fn(&NameStatus) -> f64| {
         names.iter().map(|name| (vec![name.name.to_string()], value(name))).collect()

@@ -1,7 +1,8 @@
-//! Actor: the WebSocket of one web client, which is told whether some simulation server can take a client, and which.
+//! Actor: the WebSocket of one web client, which receives the fleet's availability and requests simulation servers.
 //!
-//! Created by the route for each connection; ends with it. It follows the registry's availability, of which only the latest
-//! value counts, and never sends the same value twice in a row. A text from the client asks for a simulation server.
+//! Created by the route for each connection; ends with it. It follows the registry's availability, of which only the
+//! latest value counts, and never sends the same value twice in a row. A text from the client requests a simulation
+//! server.
 
 use std::sync::Arc;
 
@@ -55,12 +56,12 @@ impl WebClient {
         let server = Arc::clone(&self.server);
         let (wanted, from) = (wanted_world(text), self.peer.rate_limit_key());
         let picked = async move { server.pick(Pick::parse(wanted.as_deref(), from)).await };
-        // Nothing else is done meanwhile, so that answers come in the order of the texts, and before a close.
+        // The actor handles nothing else until then, so that answers keep the order of the texts and precede a close.
         picked.into_actor(self).map(|answer, _, ctx| ctx.text(answer.text)).wait(ctx);
     }
 }
 
-/// The world that a message names: a URL, `{"url": ...}`, or nothing in particular.
+/// The world that a message names, as a URL or `{"url": ...}`; `None` if it names none.
 fn wanted_world(text: &str) -> Option<String> {
     #[derive(Deserialize)]
     struct Wanted {
@@ -86,15 +87,15 @@ impl Actor for WebClient {
     }
 }
 
-/// What a web client is sent without asking.
+/// A message to the web client that is not an answer.
 enum Update {
     /// Whether some simulation server can take a client.
     Availability(bool),
-    /// The server stops.
+    /// The server stops; the connection is closed.
     Closing,
 }
 
-/// The availability now, and whenever it changes; the end of the server, after which nothing follows.
+/// The current availability and its changes; then the stop of the server, which ends the stream.
 fn updates(mut available: watch::Receiver<bool>, phase: watch::Receiver<Phase>) -> impl Stream<Item = Update> {
     available.mark_changed();
     stream::unfold((available, Box::pin(closing(phase)), false), async |(mut available, mut closing, is_closed)| {
