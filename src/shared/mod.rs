@@ -1,4 +1,4 @@
-//! What both servers stand on. Knows neither of them.
+//! The modules that both servers share. They depend on neither server.
 
 pub mod config;
 pub mod domain;

@@ -1,13 +1,13 @@
-//! Texts from outside. Pure.
+//! Makes untrusted text safe to show. Pure.
 
 use icu_properties::props::{BinaryProperty, DefaultIgnorableCodePoint};
 
-/// Returns a text in which nothing begins a new line, steers a terminal, changes the direction of writing, or is invisible.
+/// Returns a text without line breaks, terminal control sequences, direction marks and invisible characters.
 ///
-/// Control characters become spaces; invisible characters, which those for the direction are among, become U+FFFD.
+/// Control characters become spaces. Invisible characters, including those for the direction, become U+FFFD.
 pub fn one_line(text: &str) -> String {
     let visible = |letter: char| match letter {
-        // Most are of this kind, and need no look into Unicode's tables.
+        // The fast path: most characters need no lookup in Unicode's tables.
         ' '..='~' => letter,
         '\u{2028}' | '\u{2029}' => ' ',
         letter if letter.is_control() => ' ',
@@ -17,7 +17,7 @@ pub fn one_line(text: &str) -> String {
     text.chars().map(visible).collect()
 }
 
-/// Returns a text as one line of at most so many letters, with `...` where it was cut.
+/// Returns a text as one line of at most `most` characters, with `...` if it was cut.
 pub fn excerpt(text: &str, most: usize) -> String {
     let mut excerpt: String = one_line(text).chars().take(most).collect();
     if text.chars().nth(most).is_some() {
@@ -26,14 +26,14 @@ pub fn excerpt(text: &str, most: usize) -> String {
     excerpt
 }
 
-/// What a path in a text may be between.
+/// Quotes around a path in a text.
 const QUOTES: [char; 3] = ['\'', '"', '`'];
-/// What ends a path in a text, besides white space.
+/// Characters that end a path in a text, besides white space.
 const PATH_ENDS: &str = "'\"`,;:<>|";
 
-/// Returns a text for a web client in one line, in which nothing begins a tag or a character reference of HTML.
+/// Returns a text for a web client in one line, without characters that begin a tag or a character reference of HTML.
 ///
-/// Webots' page puts such texts into `innerHTML`. Other clients show them as they are, so that the characters are replaced
+/// Webots' page inserts such texts into `innerHTML`. Other clients show them verbatim, so the characters are replaced
 /// by similar ones instead of being escaped.
 pub fn client_text(text: &str) -> String {
     let harmless = |letter: char| match letter {
@@ -45,7 +45,7 @@ pub fn client_text(text: &str) -> String {
     one_line(text).chars().map(harmless).collect()
 }
 
-/// Returns a text in which each absolute path is cut to its last name. URLs and relative paths stay as they are.
+/// Returns a text in which each absolute path is cut to its last component. URLs and relative paths stay unchanged.
 ///
 /// Texts for web clients pass through this: the paths of a machine are of no use to them.
 pub fn without_paths(text: &str) -> String {
@@ -53,7 +53,7 @@ pub fn without_paths(text: &str) -> String {
     let mut rest = text;
     while let Some(at) = rest.find('/') {
         let (before, from) = rest.split_at(at);
-        // In quotes, a path may have spaces.
+        // A quoted path may contain spaces.
         let quote = before.chars().next_back().filter(|letter| QUOTES.contains(letter));
         let ends = |letter: char| letter.is_whitespace() || PATH_ENDS.contains(letter);
         let end = quote.and_then(|quote| from.find(quote)).or_else(|| from.find(ends)).unwrap_or(from.len());

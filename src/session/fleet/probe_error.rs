@@ -1,4 +1,4 @@
-//! Why a probe of a simulation server failed.
+//! Why a probe of a simulation server failed. Pure.
 
 use std::time::Duration;
 

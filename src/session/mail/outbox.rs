@@ -1,5 +1,5 @@
-//! Notices that wait to be mailed: collected, held back while a server flaps, and retried after a failure. The caller
-//! passes the time.
+//! Notices that wait to be mailed: collected, held back while a server flaps, and retried after a failure. Pure; the
+//! caller passes the time.
 //!
 //! A simulation server has two topics: whether it responds, and whether it has room. For each topic only the newest
 //! notice waits; it counts those that it has replaced.

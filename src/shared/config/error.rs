@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-/// Why a configuration can't be used, in one line.
+/// Why a configuration is invalid, in one line.
 #[derive(Debug, thiserror::Error)]
 #[error("{}: {problem}", file.display())]
 pub struct ConfigError {

@@ -1,7 +1,7 @@
 //! Reads configuration files: JSON with camelCase keys.
 //!
-//! An error is one line with the file, the key, what was found and what is allowed. An unknown key is a warning that
-//! names the most similar known one.
+//! An error is one line with the file, the key, what was found and what is expected. An unknown key is a warning with
+//! the most similar known key.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
@@ -15,12 +15,13 @@ use crate::shared::text::one_line;
 
 /// A server's configuration.
 pub trait Configuration: DeserializeOwned + Serialize {
-    /// Other names of keys that are accepted.
+    /// Aliases of keys.
     const ALIASES: &'static [&'static str];
-    /// Keys that there were, and what to do instead.
+    /// Removed keys, and what to do instead.
     const REMOVED: &'static [(&'static str, &'static str)] = &[];
 
-    /// Sets what depends on the machine and on the file that it was read from, and checks the rules between values. Returns warnings.
+    /// Sets the values that depend on the machine and on the configuration file, and checks the rules between values.
+    /// Returns warnings.
     ///
     /// # Errors
     /// When a value contradicts others.
@@ -32,7 +33,7 @@ pub trait Configuration: DeserializeOwned + Serialize {
 pub struct InvalidValueError {
     /// The key of the value.
     pub key: &'static str,
-    /// What was found, and what is allowed.
+    /// What was found, and what is expected.
     pub problem: String,
 }
 
@@ -41,7 +42,7 @@ pub struct InvalidValueError {
 pub struct LoadedConfig<C> {
     /// The effective values.
     pub config: C,
-    /// Warnings for the administrator, a line each.
+    /// Warnings for the administrator, one line each.
     pub warnings: Vec<String>,
 }
 
@@ -69,7 +70,7 @@ pub fn load<C: Configuration>(file: &Path) -> Result<LoadedConfig<C>, ConfigErro
         let problem = one_line(&source.to_string());
         wrong(if key == "." || key == "?" { problem } else { format!("{key}: {problem}") })
     })?;
-    // One that comes again is told once.
+    // A repeated key is reported once.
     unknown.retain(|key: &String| seen.insert(key.clone()));
     if let Some((key, advice)) = C::REMOVED.iter().find(|(key, _)| seen.contains(*key)) {
         return Err(wrong(format!("{key}: {advice}")));
@@ -82,14 +83,14 @@ pub fn load<C: Configuration>(file: &Path) -> Result<LoadedConfig<C>, ConfigErro
     Ok(LoadedConfig { config, warnings })
 }
 
-/// Returns the keys whose values differ; the keys of parts as `part.key`. The key of a secret is never among them.
+/// Returns the keys whose values differ; nested keys as `part.key`. Secrets are never among them.
 pub fn changed_keys<C: Serialize>(one: &C, other: &C) -> Vec<String> {
     let (one, other) = (flat_values(one), flat_values(other));
     let keys: BTreeSet<&String> = one.keys().chain(other.keys()).collect();
     keys.into_iter().filter(|key| one.get(*key) != other.get(*key)).cloned().collect()
 }
 
-/// Returns all values of a configuration; those of its parts under `part.key`.
+/// Returns all values of a configuration; nested ones under `part.key`.
 fn flat_values<C: Serialize>(config: &C) -> BTreeMap<String, serde_json::Value> {
     let values = serde_json::to_value(config).unwrap_or_default();
     let mut flat = BTreeMap::new();
@@ -112,7 +113,7 @@ fn known_keys<C: Configuration>(config: &C) -> Vec<String> {
     aliases.chain(flat_values(config).into_keys()).chain(parts).collect()
 }
 
-/// A warning about an unknown key, with the most similar known one.
+/// The warning about an unknown key, with the most similar known one.
 fn unknown_key(file: &Path, key: &str, known: &[String]) -> String {
     let nearest = known
         .iter()

@@ -1,4 +1,4 @@
-//! Configuration files: how they are read, what can be wrong in them, and the types of values.
+//! Configuration files: loading, errors, and the types of values.
 
 mod error;
 mod loading;

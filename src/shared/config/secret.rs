@@ -1,4 +1,4 @@
-//! Secrets of a configuration, and the files they may be in.
+//! Secrets of a configuration, and the files that may contain them.
 
 use std::fmt;
 use std::io;
@@ -8,10 +8,10 @@ use serde::{Deserialize, Serialize, Serializer};
 
 use super::value::ExpandedPath;
 
-/// Reads a regular file. A FIFO would block until somebody writes to it, and a device may never end.
+/// Reads a regular file. A FIFO would block until another process writes to it, and a device may never end.
 ///
 /// # Errors
-/// When it can't be read, or is something else.
+/// When it can't be read, or is not a regular file.
 pub fn read_file(file: &Path) -> io::Result<String> {
     if !std::fs::metadata(file)?.is_file() {
         return Err(io::Error::other("it is not a regular file"));
@@ -19,7 +19,7 @@ pub fn read_file(file: &Path) -> io::Result<String> {
     std::fs::read_to_string(file)
 }
 
-/// A text that is never printed or logged: `********` stands for it. It is written as it is, or is in a file.
+/// A text that is never printed or logged; output shows `********`. The configuration contains it, or names a file.
 #[derive(Clone, Deserialize)]
 #[serde(try_from = "WireSecret")]
 pub struct Secret {
@@ -48,12 +48,12 @@ impl TryFrom<WireSecret> for Secret {
 }
 
 impl Secret {
-    /// Returns the text.
+    /// Returns the secret text.
     pub fn reveal(&self) -> &str {
         &self.text
     }
 
-    /// The file that it was read from, if it was.
+    /// The file that it was read from; `None` if the configuration contains it.
     pub fn file(&self) -> Option<&Path> {
         self.file.as_deref()
     }

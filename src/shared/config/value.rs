@@ -1,4 +1,4 @@
-//! Types of configuration values. The error for a value that is not allowed says what is.
+//! Types of configuration values. The error of an invalid value says what is expected.
 
 use std::borrow::Cow;
 use std::fmt;
@@ -11,13 +11,13 @@ use serde::de::value::MapAccessDeserializer;
 use serde::de::{DeserializeOwned, Error as _, MapAccess, Unexpected, Visitor};
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
-/// A path in which `~` and `$VARIABLE` have been replaced.
+/// A path with `~` and `$VARIABLE` expanded.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(try_from = "String")]
 pub struct ExpandedPath(pub PathBuf);
 
 impl ExpandedPath {
-    /// Takes a path as it is.
+    /// Creates a path without expanding it.
     pub fn plain(path: impl Into<PathBuf>) -> Self {
         Self(path.into())
     }
@@ -37,7 +37,7 @@ impl TryFrom<String> for ExpandedPath {
     }
 }
 
-/// Reads a text in which `$VARIABLE` is replaced.
+/// Reads a text and expands `$VARIABLE`.
 ///
 /// # Errors
 /// When the value is not a text, or names a variable that is not set.
@@ -48,7 +48,7 @@ pub fn expanded<'de, D: Deserializer<'de>>(deserializer: D) -> Result<String, D:
     })
 }
 
-/// Reads the path of a folder.
+/// Reads the path of a directory.
 ///
 /// # Errors
 /// When the value is not a text, or empty.
@@ -68,7 +68,7 @@ pub fn local_address<'de, D: Deserializer<'de>>(deserializer: D) -> Result<IpAdd
         .map_err(|_| D::Error::custom(format!("{text:?} is not an IP address; allowed are such as 127.0.0.1 or ::1")))
 }
 
-/// Reads a text in which `$VARIABLE` is replaced, and makes a value of it; `null` is none.
+/// Reads a text, expands `$VARIABLE`, and converts it to a value; `null` is `None`.
 ///
 /// # Errors
 /// When the value is not a text, names a variable that is not set, or is not allowed.
@@ -135,7 +135,7 @@ pub fn percent<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f64, D::Err
     deserializer.deserialize_any(Between { least: 0.0, most: 100.0, what: "a number of percent" })
 }
 
-/// Reads a percentage from 0 to 1000. No measured load is more than 100.
+/// Reads a percentage from 0 to 1000. No measured load exceeds 100.
 ///
 /// # Errors
 /// When the value is something else.
@@ -232,7 +232,7 @@ impl Visitor<'_> for Between {
     }
 }
 
-/// Reads an object. Without this, serde accepts a list as well, with the values of the first keys.
+/// Reads an object. serde alone accepts a list as well, as the values of the first keys.
 ///
 /// # Errors
 /// When the value is something else.

@@ -1,5 +1,5 @@
-//! Where a server is reached from outside: `HOST:PORT`, or `HOST/PORT` behind a web server that rewrites ports.
-//! A web server that is not on its usual port makes that `HOST:WEBPORT/PORT`.
+//! The public address of a server: `HOST:PORT`, or `HOST/PORT` behind a reverse proxy that rewrites ports. If that
+//! proxy is not on its usual port, it is `HOST:WEBPORT/PORT`.
 
 use std::fmt;
 use std::str::FromStr;
@@ -9,12 +9,12 @@ use serde::{Deserialize, Serialize};
 
 /// A server's public address.
 ///
-/// With port rewrite (a web server on port 443 forwards `https://HOST/PORT/...` to that local port) the port is the
+/// With port rewrite (a reverse proxy on port 443 forwards `https://HOST/PORT/...` to that local port) the port is the
 /// first segment of the path: `HOST/PORT`. Without, it is the plain `HOST:PORT`.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
 pub struct PublicAddress {
-    /// Shared, because addresses are the keys of servers and are cloned often.
+    /// Shared, because addresses are used as keys and are cloned often.
     host: Arc<str>,
     port: u16,
     rewritten: bool,
@@ -23,7 +23,7 @@ pub struct PublicAddress {
 /// Checks that a text is a host name or an IP address.
 ///
 /// # Errors
-/// When it is neither; the text says what was found, and what is allowed.
+/// When it is neither; the text says what was found, and what is expected.
 pub fn check_host(host: &str, rewritten: bool) -> Result<(), String> {
     let address = format!("{host}{}1", if rewritten { '/' } else { ':' });
     let plain = address.parse::<PublicAddress>().is_ok();
@@ -35,22 +35,22 @@ pub fn check_host(host: &str, rewritten: bool) -> Result<(), String> {
 }
 
 impl PublicAddress {
-    /// The address of `port` on `host`; `rewritten` tells whether a web server in front rewrites ports.
+    /// The address of `port` on `host`; `rewritten` tells whether a reverse proxy rewrites ports.
     pub fn new(host: &str, port: u16, rewritten: bool) -> Self {
         Self { host: host.into(), port, rewritten }
     }
 
-    /// The host alone.
+    /// The host in lower case, with the port of the reverse proxy if that is not the usual one.
     pub fn host(&self) -> &str {
         &self.host
     }
 
-    /// The port alone.
+    /// The port of the server itself.
     pub fn port(&self) -> u16 {
         self.port
     }
 
-    /// The same address without the port of the web server in front, if that is the usual one.
+    /// The same address without the port of the reverse proxy, if that is the usual one.
     pub fn without_usual_web_port(self, ssl: bool) -> Self {
         let usual = if ssl { ":443" } else { ":80" };
         match self.host.strip_suffix(usual).filter(|_| self.rewritten) {
@@ -59,7 +59,7 @@ impl PublicAddress {
         }
     }
 
-    /// Whether a web server in front rewrites ports.
+    /// Whether a reverse proxy rewrites ports.
     pub fn is_rewritten(&self) -> bool {
         self.rewritten
     }
@@ -112,7 +112,7 @@ impl FromStr for PublicAddress {
             Some((name, web_port)) if rewritten && !host.ends_with(']') => number(web_port).map(|_| name)?,
             _ => host,
         };
-        // As it is asked for: names in lower case, as RFC 4343 has it, and in ASCII. One server must not count as two.
+        // Normalized, so that one server does not count as two: names in lower case (RFC 4343) and in ASCII.
         let is_of_name = |letter: char| letter.is_ascii_alphanumeric() || "-._".contains(letter);
         let plain = match url::Host::parse(name).map_err(|_| no_address())? {
             url::Host::Domain(domain) if !domain.chars().all(is_of_name) => return Err(no_address()),

@@ -1,10 +1,10 @@
-//! Whether a world may run here, now. Pure.
+//! Whether a world may run on a server at its current load. Pure.
 
 use super::load::Load;
 use super::project_url::ProjectUrl;
 use super::url_prefix::UrlPrefix;
 
-/// The rules of a server.
+/// The admission rules of a server.
 #[derive(Debug, Clone)]
 pub struct AdmissionRules<Prefixes = Vec<UrlPrefix>> {
     /// Repositories whose worlds run at any load.
@@ -17,23 +17,23 @@ pub struct AdmissionRules<Prefixes = Vec<UrlPrefix>> {
     pub share_idle_time: f64,
 }
 
-/// Why a world may not run. Its words are for the client; they are made only where somebody asks for them, for a session
-/// server asks the rules of each server.
+/// Why a world may not run, as text for the client. It is formatted only on demand, because a session server checks the
+/// rules of every server.
 #[derive(Debug, PartialEq, thiserror::Error)]
 pub enum AdmissionError<'world> {
     /// Its repository is blocked.
     #[error("Cannot run simulation from blocked repository: {}", .0.repository())]
     Blocked(&'world ProjectUrl),
-    /// Its repository is not allowed, and the server has no containers.
+    /// Its repository is not allowed, and the server does not run containers.
     #[error(
         "Docker not enabled: cannot host simulations from repositories outside of those that this simulation server allows, and {} is not one of them",
         .0.repository()
     )]
     NotAllowed(&'world ProjectUrl),
-    /// Its repository is not allowed, and the server shares no idle time.
+    /// Its repository is not allowed, and the server does not share idle time.
     #[error("This simulation server is not configured to share idle time: it does not allow {}", .0.repository())]
     NotShared(&'world ProjectUrl),
-    /// Its repository is allowed only while the server is less busy.
+    /// Its repository is allowed only at a lower load.
     #[error(
         "Cannot share idle time when current load is above threshold: {load:.0} % are more than {threshold} %. Try again later"
     )]
@@ -46,8 +46,8 @@ pub enum AdmissionError<'world> {
 }
 
 impl<Prefixes: AsRef<[UrlPrefix]>> AdmissionRules<Prefixes> {
-    /// Whether a world may run at this load. A blocked repository never may; the original asks that only of worlds
-    /// that are not allowed.
+    /// Whether a world may run at this load. A world of a blocked repository never may; the original checks the blocked
+    /// repositories only for worlds that are not allowed.
     ///
     /// # Errors
     /// Why it may not.

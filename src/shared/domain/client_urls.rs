@@ -4,14 +4,14 @@ use serde::{Deserialize, Serialize};
 
 use super::address::PublicAddress;
 
-/// The WebSocket URL of servers that are reached through one web server, with placeholders: `wss://DOOR/{host}/{port}`.
+/// The WebSocket URL of servers behind one reverse proxy, with placeholders: `wss://DOOR/{host}/{port}`.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
 pub struct PublicUrl {
-    /// The web server, `HOST` or `HOST:PORT`.
+    /// The reverse proxy, `HOST` or `HOST:PORT`.
     door: String,
     ssl: bool,
-    /// What follows the web server, with placeholders.
+    /// The path after the reverse proxy, with placeholders.
     path: String,
 }
 
@@ -26,12 +26,12 @@ impl PublicUrl {
         format!("{}{}", self.http_door(), self.path_of(address))
     }
 
-    /// Returns the WebSocket URL of the web server itself, without a slash at its end.
+    /// Returns the WebSocket URL of the reverse proxy itself, without a slash at its end.
     pub fn websocket_door(&self) -> String {
         format!("{}://{}", if self.ssl { "wss" } else { "ws" }, self.door)
     }
 
-    /// Returns the HTTP URL of the web server itself, without a slash at its end.
+    /// Returns the HTTP URL of the reverse proxy itself, without a slash at its end.
     pub fn http_door(&self) -> String {
         format!("{}://{}", if self.ssl { "https" } else { "http" }, self.door)
     }
@@ -53,7 +53,7 @@ impl TryFrom<String> for PublicUrl {
                 _ => return None,
             };
             let (door, path) = rest.split_at_checked(rest.find('/')?)?;
-            // As in an address of a server, the name is written in one way only.
+            // The name is normalized, as in the address of a server.
             let door: PublicAddress = format!("{door}/1").parse().ok()?;
             let plain = path.replacen("{host}", "", 1).replacen("{port}", "", 1);
             let is_of_path = |letter: char| letter.is_ascii_alphanumeric() || "/-._".contains(letter);
@@ -72,12 +72,12 @@ impl From<PublicUrl> for String {
     }
 }
 
-/// How the URLs of a fleet's servers are formed for clients.
+/// Forms the URLs of a fleet's servers for clients.
 #[derive(Debug, Clone)]
 pub struct ClientUrls {
-    /// Whether URLs begin with `https` and `wss`, where there is no public URL.
+    /// Whether URLs begin with `https` and `wss`, if there is no public URL.
     pub ssl: bool,
-    /// The URL of servers behind one web server.
+    /// The URL of servers behind one reverse proxy.
     pub public: Option<PublicUrl>,
 }
 

@@ -1,10 +1,10 @@
-//! How busy a machine is.
+//! The load of a machine.
 
 use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
-/// A machine's load in percent: finite and not negative. It may pass 100.
+/// A machine's load in percent: finite and not negative. It may exceed 100.
 #[derive(Debug, Clone, Copy, PartialEq, PartialOrd, Serialize, Deserialize)]
 #[serde(try_from = "f64", into = "f64")]
 pub struct Load(f64);
@@ -15,9 +15,9 @@ pub struct Load(f64);
 pub struct LoadError(String);
 
 impl Load {
-    /// No load at all.
+    /// The load of an idle machine.
     pub const ZERO: Self = Self(0.0);
-    /// The load of a machine that takes no more clients.
+    /// The load of a machine that accepts no more clients.
     pub const FULL: Self = Self(100.0);
 
     /// The load as a number of percent.
@@ -25,7 +25,7 @@ impl Load {
         self.0
     }
 
-    /// The mean of loads; nothing where there are none.
+    /// The mean of loads; `None` if there are none.
     pub fn mean(loads: impl Iterator<Item = Self>) -> Option<Self> {
         let (sum, count) = loads.fold((0.0, 0_u32), |(sum, count), load| (sum + load.0, count + 1));
         (count > 0).then(|| Self(sum / f64::from(count)))

@@ -1,4 +1,4 @@
-//! The terms that both servers speak in: addresses, loads, world URLs, repositories, a server's report. Pure.
+//! The terms that both servers share: addresses, loads, world URLs, repositories, a server's report. Pure.
 
 mod address;
 mod admission;

@@ -5,26 +5,26 @@ use std::hash::{DefaultHasher, Hash, Hasher};
 
 use percent_encoding::percent_decode_str;
 
-/// A world's place: a repository on a forge, and the path of a world file below a reference of it.
+/// A world: a repository on a Git host, and the path of a world file below a reference of it.
 ///
-/// The reference may hold slashes (`feature/arm`), so the URL alone doesn't tell where it ends;
-/// [`ProjectUrl::candidates`] gives the possible readings, and the repository decides.
+/// The reference may contain slashes (`feature/arm`), so the URL alone does not tell where it ends;
+/// [`ProjectUrl::candidates`] returns the possible readings, and the repository decides.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub struct ProjectUrl {
     host: String,
     /// Every path segment, percent-decoded.
     segments: Vec<String>,
-    /// How many of the segments name the repository.
+    /// Number of segments that name the repository.
     repository: usize,
-    /// How many segments come before the reference.
+    /// Number of segments before the reference.
     reference: usize,
-    /// What kind of reference the URL says it is; GitHub and GitLab don't say.
+    /// The kind of reference that the URL names; GitHub and GitLab don't name it.
     kind: RefKind,
     /// The hash of host and owner, see [`owner`].
     owner: u64,
 }
 
-/// What a URL says of its reference.
+/// The kind of reference that a URL names.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum RefKind {
     /// A branch, a tag or a commit.
@@ -42,17 +42,17 @@ pub enum RefKind {
 pub struct Reading {
     /// Branch, tag or commit.
     pub reference: String,
-    /// The project's folder inside the repository; empty for its root.
+    /// The project's directory inside the repository; empty for its root.
     pub folder: String,
 }
 
-/// Why a text is not a world's URL. The text is for the web client.
+/// Why a text is not the URL of a world. The message is for the web client.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error(
     "Wrong Webots simulation URL: {problem}. Allowed is https://github.com/USER/REPOSITORY/blob/REFERENCE/PATH/worlds/NAME.wbt."
 )]
 pub struct ProjectUrlError {
-    /// What is wrong with it, without a capital and a period.
+    /// The problem, without a capital letter and a period.
     pub problem: String,
 }
 
@@ -60,7 +60,7 @@ fn url_error(problem: impl Into<String>) -> ProjectUrlError {
     ProjectUrlError { problem: problem.into() }
 }
 
-/// The longest URL that is read.
+/// Longest URL that is parsed, in bytes.
 const LONGEST: usize = 2000;
 
 impl ProjectUrl {
@@ -68,7 +68,7 @@ impl ProjectUrl {
     ///
     /// # Errors
     /// When it is not `https`, names a user, holds `.` or `..` as segments, encoded slashes or control characters, or does
-    /// not end in `/worlds/NAME.wbt`. A query and a fragment, as pages of forges add them, count for nothing.
+    /// not end in `/worlds/NAME.wbt`. A query and a fragment, as pages of Git hosts add them, are ignored.
     pub fn parse(text: &str) -> Result<Self, ProjectUrlError> {
         if text.len() > LONGEST {
             return Err(url_error(format!("it is longer than {LONGEST} bytes")));
@@ -98,10 +98,10 @@ impl ProjectUrl {
         Ok(Self { host, segments, repository, reference, kind, owner })
     }
 
-    /// The same world in the repository at this URL.
+    /// Returns the same world in the repository at this URL.
     ///
     /// # Errors
-    /// When that is no URL of a repository.
+    /// When that is not the URL of a repository.
     pub fn in_repository(&self, url: &str) -> Result<Self, ProjectUrlError> {
         let (host, mut segments) = split_url(url)?;
         let name = segments.last_mut().ok_or_else(|| url_error("it names no repository"))?;
@@ -113,7 +113,7 @@ impl ProjectUrl {
         Ok(Self { host, segments, repository, reference, kind: self.kind, owner })
     }
 
-    /// The forge, in small letters, with its port where that is not 443.
+    /// The Git host, in lower case, with its port if that is not 443.
     pub fn host(&self) -> &str {
         &self.host
     }
@@ -138,7 +138,8 @@ impl ProjectUrl {
         self.owner
     }
 
-    /// The path segments after the repository: reference, folder and world, without the words that a forge puts before.
+    /// The path segments after the repository: reference, directory and world, without the segments that a Git host
+    /// inserts before them.
     pub(super) fn inside(&self) -> &[String] {
         self.segments.get(self.reference..).unwrap_or_default()
     }
@@ -153,7 +154,7 @@ impl ProjectUrl {
         self.segments.last().map_or("", String::as_str)
     }
 
-    /// The possible readings, that with the shortest reference first.
+    /// The possible readings, sorted by the length of the reference, shortest first.
     pub fn candidates(&self) -> Vec<Reading> {
         let inside = self.inside();
         let before_worlds = inside.len().saturating_sub(2);
@@ -173,30 +174,30 @@ impl fmt::Display for ProjectUrl {
     }
 }
 
-/// The hash of a host and the first path segment, the owner of a repository, by which long lists of repositories are
-/// searched quickly. It holds within one process only.
+/// The hash of a host and the first path segment (the owner of a repository), for fast searches in long lists of
+/// repositories. It is stable within one process only.
 pub(super) fn owner(host: &str, segments: &[String]) -> u64 {
     let mut hasher = DefaultHasher::new();
     (host, segments.first().map(|owner| owner.to_ascii_lowercase())).hash(&mut hasher);
     hasher.finish()
 }
 
-/// A repository's name without the `.git` that git may add to it: both mean the same repository.
+/// A repository's name without the `.git` that git may append: both name the same repository.
 pub(super) fn without_git(name: &str) -> Result<String, ProjectUrlError> {
     let plain = name.get(name.len().saturating_sub(4)..).filter(|end| end.eq_ignore_ascii_case(".git"));
     let plain = plain.and_then(|end| name.get(..name.len() - end.len())).unwrap_or(name);
     if plain.is_empty() {
         return Err(url_error("it names no repository"));
     }
-    // git would find the same repository by this name, and who blocks it would not.
+    // git would find the same repository under this name, but a block of the repository would not match it.
     if plain.len() < name.len() && plain.to_ascii_lowercase().ends_with(".git") {
         return Err(url_error(format!("the repository's name {name:?} ends in .git more than once")));
     }
     Ok(plain.to_owned())
 }
 
-/// Splits an `https` URL into its host and its percent-decoded path segments, and refuses what could mean another place to
-/// git or to the file system.
+/// Splits an `https` URL into its host and its percent-decoded path segments, and refuses anything that git or the file
+/// system could resolve differently.
 ///
 /// # Errors
 /// See [`ProjectUrl::parse`].
@@ -253,7 +254,7 @@ fn decode_segment(raw: &str) -> Result<String, ProjectUrlError> {
     Ok(segment)
 }
 
-/// Finds where the repository ends and where the reference begins.
+/// Finds the end of the repository and the begin of the reference.
 pub(super) fn split_repository(segments: &[String]) -> Result<(usize, usize, RefKind), ProjectUrlError> {
     let words: Vec<&str> = segments.iter().map(String::as_str).collect();
     if let Some(dash) = words.iter().position(|word| *word == "-")

@@ -9,19 +9,19 @@ use super::url_prefix::UrlPrefix;
 use crate::shared::config::{object, optional_object};
 use crate::shared::text::one_line;
 
-/// The part of a simulation server's `/status` by which the session server places clients.
+/// The part of a simulation server's `/status` that the session server uses to place clients.
 ///
 /// Only `load` is required. Every other field has a default for 'not reported', so that the report of an older server,
-/// or of a Python one, can be read too.
+/// or of a Python one, can be parsed too.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "camelCase")]
 pub struct ServerReport {
     /// Mean load of the last five seconds, in percent.
     pub load: Load,
-    /// The server's version.
+    /// The server's version; empty if it is not reported.
     #[serde(default, deserialize_with = "line")]
     pub version: String,
-    /// Simulations by state, if the server counts them.
+    /// Simulations by state; `None` if the server does not report them.
     #[serde(default, deserialize_with = "optional_object")]
     pub instances: Option<Instances>,
     /// Repositories whose worlds the server runs at any load.
@@ -36,13 +36,13 @@ pub struct ServerReport {
     /// Whether the server can run other worlds in containers.
     #[serde(default)]
     pub docker: Option<bool>,
-    /// Whether the server takes no new clients because it is about to stop.
+    /// Whether the server accepts no new clients because it is about to stop.
     #[serde(default)]
     pub draining: bool,
-    /// How many of the last starts in a row failed for a reason of the server's own.
+    /// Number of consecutive starts that failed last for a reason of the server's own.
     #[serde(default)]
     pub failed_starts: u32,
-    /// Why the server can start no simulation at all, if so.
+    /// Why the server can't start simulations; `None` if it can.
     #[serde(default, skip_serializing_if = "Option::is_none", deserialize_with = "optional_line")]
     pub problem: Option<String>,
 }
@@ -51,17 +51,17 @@ pub struct ServerReport {
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "camelCase", default)]
 pub struct Instances {
-    /// Clients in the waiting line.
+    /// Clients in the queue.
     pub queued: u32,
     /// Checking out or launching.
     pub starting: u32,
-    /// Webots runs, its simulation is paused.
+    /// Webots runs, and its simulation is paused.
     pub idle: u32,
     /// Webots runs, and so does its simulation.
     pub running: u32,
-    /// How many simulations fit.
+    /// Number of slots.
     pub places: u32,
-    /// Clients that asked for a start since the server began; it only grows.
+    /// Clients that have requested a start since the server started; it only grows.
     pub arrivals: u64,
 }
 
@@ -74,9 +74,9 @@ fn optional_line<'de, D: serde::Deserializer<'de>>(deserializer: D) -> Result<Op
 }
 
 impl Instances {
-    /// Clients that hold a place or wait for one.
+    /// Clients that hold a slot or wait for one.
     pub fn present(&self) -> u32 {
-        // Another server's numbers may be anything.
+        // Numbers that another server reports may be arbitrarily large.
         [self.starting, self.idle, self.running].into_iter().fold(self.queued, u32::saturating_add)
     }
 }
@@ -85,7 +85,7 @@ impl ServerReport {
     /// Reads the JSON of `/status`.
     ///
     /// # Errors
-    /// When it is no JSON object with a `load`.
+    /// When it is not a JSON object with a `load`.
     pub fn parse(page: &[u8]) -> serde_json::Result<Self> {
         let mut json = serde_json::Deserializer::from_slice(page);
         let report = object(&mut json)?;
@@ -108,10 +108,10 @@ impl ServerReport {
         }
     }
 
-    /// Whether the server will run this world, as far as the report tells.
+    /// Whether the server accepts this world, by this report.
     ///
-    /// A report without `docker` comes from a Python server: it is expected to run every world that it does not rule
-    /// out, as the Python session server expects it.
+    /// A report without `docker` comes from a Python server. The Python session server expects it to run every world
+    /// that it does not rule out, and so does this one.
     pub fn accepts(&self, world: &ProjectUrl) -> bool {
         let Some(docker) = self.docker else {
             let blocked = self.blocked_repositories.iter().any(|prefix| prefix.may_cover(world));

@@ -4,8 +4,8 @@ use serde::{Deserialize, Serialize};
 
 use super::project_url::{ProjectUrl, ProjectUrlError, RefKind, owner, split_repository, split_url, without_git};
 
-/// A URL prefix by whole path segments: `https://github.com/lab` covers `https://github.com/lab/x`, and not
-/// `https://github.com/lab-evil/x` (the original compares letters, and lets that pass).
+/// A URL prefix by whole path segments: `https://github.com/lab` covers `https://github.com/lab/x`, but not
+/// `https://github.com/lab-evil/x` (the original compares characters, and accepts it).
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
 pub struct UrlPrefix {
@@ -13,11 +13,11 @@ pub struct UrlPrefix {
     host: String,
     segments: Vec<String>,
     inside: Option<Inside>,
-    /// The hash of host and owner; nothing where the prefix is a whole host.
+    /// The hash of host and owner; `None` if the prefix is a whole host.
     owner: Option<u64>,
 }
 
-/// A text of the configuration that is no prefix.
+/// A text of the configuration that is not a URL prefix.
 #[derive(Debug, thiserror::Error)]
 #[error("{text:?} is no URL prefix: {problem}; allowed are such as https://github.com/USER")]
 pub struct UrlPrefixError {
@@ -25,12 +25,12 @@ pub struct UrlPrefixError {
     problem: String,
 }
 
-/// What a prefix names within one repository, whatever form its forge gives to the URL.
+/// The part of a prefix within one repository, in any Git host's form of URL.
 #[derive(Debug, Clone, PartialEq, Eq)]
 struct Inside {
-    /// How many of the segments name the repository.
+    /// Number of segments that name the repository.
     repository: usize,
-    /// How many of them come before the reference.
+    /// Number of segments before the reference.
     reference: usize,
     kind: RefKind,
 }
@@ -38,9 +38,9 @@ struct Inside {
 impl UrlPrefix {
     /// Whether this prefix covers a world's URL.
     ///
-    /// Hosts, owners and repositories are compared without regard to case, for the forges do so too; what follows
-    /// them lies inside the repository, where git tells cases apart. Of that the reference and the folder count, not
-    /// the words by which the forges tell that they follow: `tree`, `blob`, `-/blob` and `src/branch` name the same.
+    /// Hosts, owners and repositories are compared case-insensitively, as the Git hosts do; the rest lies inside the
+    /// repository, and git is case-sensitive. Of that part the reference and the directory count, not the marker before
+    /// them: `tree`, `blob`, `-/blob` and `src/branch` mean the same.
     pub fn covers(&self, world: &ProjectUrl) -> bool {
         self.may_be_of(world)
             && self.host == world.host()
@@ -52,7 +52,7 @@ impl UrlPrefix {
         self.may_be_of(world) && (self.covers(world) || (self.host == world.host() && self.covers_inside(world, true)))
     }
 
-    /// Whether the owner may be the same. Most comparisons end here, without a look at any text.
+    /// Whether the owner may be the same. Most comparisons end here, without comparing text.
     fn may_be_of(&self, world: &ProjectUrl) -> bool {
         self.owner.is_none_or(|owner| owner == world.owner())
     }
@@ -76,7 +76,7 @@ impl UrlPrefix {
             && world.inside().starts_with(self.segments.get(reference..).unwrap_or_default())
     }
 
-    /// How many path segments this prefix has: the longer of two prefixes is the more exact one.
+    /// Number of path segments: the longer of two prefixes is the more specific one.
     pub fn depth(&self) -> usize {
         self.segments.len()
     }
@@ -86,7 +86,7 @@ impl UrlPrefix {
         world.repository_segments().get(self.segments.len()..).unwrap_or_default()
     }
 
-    /// The prefix as it was written.
+    /// The prefix as configured.
     pub fn as_str(&self) -> &str {
         &self.text
     }

@@ -1,36 +1,37 @@
-//! How much one client address may have, so that others get something too.
+//! Limits for one client address, so that it does not use up everything.
 
 use std::net::IpAddr;
 use std::num::NonZeroU32;
 
 use governor::{DefaultKeyedRateLimiter, Quota, RateLimiter};
 
-/// How many addresses are remembered.
+/// Largest number of addresses that are tracked.
 const MOST_ADDRESSES: usize = 10_000;
 
-/// How much of so many places, connections or the like one address may have where the configuration does not say it: three
-/// quarters. A class often sits behind one address, and so may somebody who takes all that there is.
+/// Default limit for one address, of `all` slots, connections and the like: three quarters. A class often sits behind
+/// one address, and so may a client that would take everything.
 pub fn share(all: usize) -> usize {
     all - all / 4
 }
 
-/// How often each address may do something.
+/// Rate limit per client address.
 #[derive(Debug)]
 pub struct AddressQuota(DefaultKeyedRateLimiter<IpAddr>);
 
 impl AddressQuota {
-    /// A quota that nobody has used yet: `burst` times at once, and `per_minute` times in each minute after that.
+    /// An unused quota: `burst` times at once, and `per_minute` times in each minute after that.
     pub fn new(burst: NonZeroU32, per_minute: NonZeroU32) -> Self {
         Self(RateLimiter::keyed(Quota::per_minute(per_minute).allow_burst(burst)))
     }
 
-    /// Whether an address may do it once more. It may where it is not known, and where too many addresses are remembered.
+    /// Takes one from the quota of an address. Returns whether it had one left; always true if the address is unknown,
+    /// or if too many addresses are tracked.
     pub fn take(&self, address: Option<IpAddr>) -> bool {
         let Some(address) = address else {
             return true;
         };
         if self.0.len() >= MOST_ADDRESSES {
-            // Those whose whole quota is available again are forgotten.
+            // Drops the addresses whose whole quota is available again.
             self.0.retain_recent();
         }
         self.0.len() >= MOST_ADDRESSES || self.0.check_key(&address).is_ok()

@@ -1,4 +1,4 @@
-//! Style sheets, scripts and pictures of the pages, which are part of the program.
+//! Style sheets, scripts and images of the pages, which are embedded in the program.
 
 use std::hash::{DefaultHasher, Hash, Hasher};
 
@@ -8,13 +8,13 @@ use actix_web::{HttpRequest, HttpResponse};
 /// A file that pages refer to as `assets/NAME`.
 #[derive(Debug, Clone, Copy)]
 pub struct Asset {
-    /// Its name; the extension tells its type.
+    /// Its file name; the extension determines its type.
     pub name: &'static str,
-    /// Its text.
+    /// Its content.
     pub text: &'static str,
 }
 
-/// Names a file of `templates/assets` and reads it at build time.
+/// Embeds a file of `templates/assets` at build time.
 #[macro_export]
 macro_rules! asset {
     ($name:literal) => {
@@ -25,7 +25,7 @@ macro_rules! asset {
     };
 }
 
-/// What pages of both servers use.
+/// Assets that pages of both servers use.
 pub const COMMON: &[Asset] = &[asset!("style.css"), asset!("live.js"), asset!("times.js"), asset!("icon.svg")];
 
 impl Asset {
@@ -45,7 +45,7 @@ impl Asset {
     }
 }
 
-/// Answers a request for one of these files. A browser keeps it, and asks each time whether it is still the same.
+/// Answers a request for one of these files. Browsers may cache it, and must revalidate it each time.
 pub fn answer(request: &HttpRequest, assets: &[Asset]) -> HttpResponse {
     let name = request.match_info().get("name").unwrap_or_default();
     let Some(asset) = assets.iter().chain(COMMON).find(|asset| asset.name == name) else {

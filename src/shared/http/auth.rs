@@ -17,11 +17,12 @@ use super::peer::Peer;
 use super::routing::{reject_cross_site, retry_after};
 use crate::shared::config::Secret;
 
-/// How many passwords an address may send in a burst: 30.
+/// Passwords that an address may send in a burst: 30.
 const BURST: NonZeroU32 = NonZeroU32::MIN.saturating_add(29);
-/// How many passwords an address may send per minute after a burst: 12.
+/// Passwords that an address may send per minute after a burst: 12.
 const PER_MINUTE: NonZeroU32 = NonZeroU32::MIN.saturating_add(11);
-/// How many addresses are counted. Further ones may send no password until the others have been quiet for a while.
+/// Largest number of addresses that are tracked. Others may send no password until some of these have regained their
+/// quota.
 const MAX_ADDRESSES: usize = 10_000;
 
 /// Checks the password of requests.
@@ -31,7 +32,7 @@ pub struct BasicAuth {
     attempts: RateLimiter<Option<IpAddr>, HashMapStateStore<Option<IpAddr>>, DefaultClock>,
 }
 
-/// Why a request is refused. The words are for the client.
+/// Why a request is refused, as text for the client.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum AuthError {
     /// The request has no password, or a wrong one.
@@ -48,14 +49,14 @@ impl BasicAuth {
         Self { password, attempts: RateLimiter::hashmap(Quota::per_minute(PER_MINUTE).allow_burst(BURST)) }
     }
 
-    /// Checks the password of a request, in a time that does not depend on it. Right passwords count as attempts too,
-    /// so that a client over the limit does not learn which one is right.
+    /// Checks the password of a request, in constant time. Right passwords count as attempts too, so that a client over
+    /// the limit does not learn which one is right.
     ///
     /// # Errors
     /// When the password is missing or wrong, or `peer` has sent too many.
     pub fn check(&self, request: &HttpRequest, peer: Peer) -> Result<(), AuthError> {
         let given = password_of(request).ok_or(AuthError::NoPassword)?;
-        // A proxy that says nothing of its clients stands for all of them.
+        // A proxy that does not report client addresses shares one quota with all such proxies.
         if !self.may_try(peer) {
             return Err(AuthError::TooMany);
         }
@@ -103,7 +104,7 @@ fn password_of(request: &HttpRequest) -> Option<String> {
 }
 
 impl AuthError {
-    /// The response to a request that is refused.
+    /// The response to a refused request.
     pub fn answer(self) -> HttpResponse {
         match self {
             Self::NoPassword => HttpResponse::Unauthorized()

@@ -1,8 +1,8 @@
-//! A client's TCP connection, on which the next request is read only once the one before is being answered, and none once
-//! the server stops.
+//! A client's TCP connection that reads the next request only once the answer to the one before has begun, and none
+//! once the server stops.
 //!
-//! actix decodes all requests that it has read before it answers the first. Without this a client that sends many requests
-//! and reads no answer would fill the memory.
+//! actix decodes all requests that it has read before it answers the first. Without this limit, a client that sends
+//! many requests and reads no answer would fill the memory.
 
 use std::io;
 use std::pin::Pin;
@@ -14,16 +14,16 @@ use tokio_util::sync::{CancellationToken, WaitForCancellationFutureOwned};
 
 use super::connections::ConnectionPermit;
 
-/// How many bytes are taken from the system at once.
+/// Size of one read from the socket, in bytes.
 const READ_AT_ONCE: usize = 4 * 1024;
-/// How the answer begins that makes a connection a WebSocket.
+/// Begin of the answer that upgrades a connection to a WebSocket.
 const SWITCHING_PROTOCOLS: &[u8] = b"HTTP/1.1 101 ";
 /// How many bytes of a line are looked at, which is enough for the length of a body.
 const LINE: usize = 40;
 /// The largest body that is handed over, in bytes. What has a larger one, or one in chunks, gets its answer without it.
 pub const LARGEST_BODY: usize = 8 * 1024;
 
-/// What the connection is used for at the moment.
+/// What the connection is currently used for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum State {
     /// The head of a request is read.
@@ -40,7 +40,7 @@ enum State {
 #[derive(Debug)]
 pub struct ClientStream {
     tcp: TcpStream,
-    /// What was taken from the system and not yet handed over.
+    /// Bytes that were read from the socket and not yet passed to actix.
     unread: Vec<u8>,
     /// The beginning of the line that is read, without line breaks.
     line: Vec<u8>,
@@ -51,13 +51,13 @@ pub struct ClientStream {
     /// Whether the system takes no more of an answer, since the client does not read.
     is_blocked: bool,
     state: State,
-    /// Nothing once it is a WebSocket, which its actor closes.
+    /// `None` once it is a WebSocket, which its actor closes.
     stopping: Option<Pin<Box<WaitForCancellationFutureOwned>>>,
     _permit: ConnectionPermit,
 }
 
 impl ClientStream {
-    /// A connection that `permit` counts, of a server that stops when `stopping` is cancelled.
+    /// A connection that `permit` counts; `stopping` is cancelled when the server stops.
     pub fn new(tcp: TcpStream, permit: ConnectionPermit, stopping: CancellationToken) -> Self {
         Self {
             tcp,
@@ -72,7 +72,7 @@ impl ClientStream {
         }
     }
 
-    /// Gives back what only requests need: thousands of WebSockets are open at a time, and most of them are idle.
+    /// Frees what only requests need: thousands of WebSockets are open at a time, and most of them are idle.
     fn release(&mut self) {
         if self.state == State::WebSocket {
             self.stopping = None;
@@ -83,7 +83,7 @@ impl ClientStream {
         }
     }
 
-    /// How many of the unread bytes may be handed over, at most `room`: those of one request.
+    /// Number of unread bytes that may be passed on, at most `room`: those of one request.
     fn readable(&mut self, room: usize) -> usize {
         let room = room.min(self.unread.len());
         if self.state == State::WebSocket {
@@ -143,12 +143,12 @@ impl AsyncRead for ClientStream {
         buffer: &mut ReadBuf<'_>,
     ) -> Poll<io::Result<()>> {
         if self.is_blocked || self.state == State::Answer {
-            // The task is woken by the next write, or once the system takes more.
+            // The next write wakes the task, or the socket once it accepts more.
             return Poll::Pending;
         }
         let is_stopping = |end: &mut Pin<Box<WaitForCancellationFutureOwned>>| end.as_mut().poll(context).is_ready();
         if self.state == State::Request && self.stopping.as_mut().is_some_and(is_stopping) {
-            // The end of what the client sends: what is being answered is answered, and the connection closes.
+            // End of input: requests in progress are answered, and the connection closes.
             return Poll::Ready(Ok(()));
         }
         if self.unread.is_empty() {

@@ -12,10 +12,10 @@ use super::address_quota::share;
 use super::peer::Peer;
 use super::routing::retry_after;
 
-/// What is counted. Each has its own limits.
+/// What is counted. Each kind has its own limits.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum ConnectionKind {
-    /// A TCP connection, whatever is sent on it.
+    /// A TCP connection, with any content.
     Tcp,
     /// The WebSocket of a web client.
     Client,
@@ -25,13 +25,13 @@ pub enum ConnectionKind {
     Stream,
 }
 
-/// How many TCP connections an address may have for each client that it may have: browsers open several.
+/// TCP connections of an address for each client that it may have: browsers open several.
 const TCP_PER_CLIENT: usize = 2;
 /// How much may be relayed at once for each client that there may be: a stream, and the files of a scene.
 const STREAMS_PER_CLIENT: usize = 2;
 /// How many web clients an address may have at most where the configuration does not say it.
 const MOST_CLIENTS: usize = 1000;
-/// How many pages may listen to `/events`.
+/// Limit of pages that listen to `/events`.
 const MAX_PAGES: usize = 1000;
 
 /// Counts the open connections of a server. Clones share their counts.
@@ -39,7 +39,7 @@ const MAX_PAGES: usize = 1000;
 pub struct ConnectionLimiter {
     max_tcp: usize,
     max_clients: usize,
-    /// How many web clients an address may have.
+    /// Limit of web clients per address.
     per_address: usize,
     open: Arc<Mutex<Open>>,
 }
@@ -58,7 +58,7 @@ pub struct ConnectionPermit {
     open: Arc<Mutex<Open>>,
 }
 
-/// Why a connection is refused. The words are for the client.
+/// Why a connection is refused, as text for the client.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum ConnectionLimitError {
     /// The server has too many.
@@ -70,20 +70,20 @@ pub enum ConnectionLimitError {
 }
 
 impl ConnectionLimiter {
-    /// Allows `max_tcp` TCP connections and `max_clients` web clients, of which one address may have `per_address`, or a
-    /// share where that is not said.
+    /// Allows `max_tcp` TCP connections and `max_clients` web clients, of which one address may have `per_address`;
+    /// `None` is [`share`] of them, but at most [`MOST_CLIENTS`].
     pub fn new(max_tcp: usize, max_clients: usize, per_address: Option<usize>) -> Self {
         let per_address = per_address.unwrap_or_else(|| share(max_clients).min(MOST_CLIENTS));
         Self { max_tcp, max_clients, per_address, open: Arc::default() }
     }
 
-    /// How many connections of a kind are open.
+    /// Number of open connections of a kind.
     pub fn count(&self, kind: ConnectionKind) -> usize {
         self.open.lock().all.get(&kind).copied().unwrap_or_default()
     }
 
-    /// Counts a connection. A proxy that does not tell its clients' addresses stands for many clients, so that only the
-    /// limits in all apply to it.
+    /// Counts a connection. A proxy that does not report its clients' addresses stands for many clients, so only the
+    /// total limits apply to it.
     ///
     /// # Errors
     /// When the server or the address has too many connections of this kind.
@@ -136,7 +136,7 @@ impl Drop for ConnectionPermit {
 }
 
 impl ConnectionLimitError {
-    /// Returns the response to a client that is refused.
+    /// Returns the response to a refused client.
     pub fn answer(self) -> HttpResponse {
         let status = match self {
             Self::InAll => StatusCode::SERVICE_UNAVAILABLE,

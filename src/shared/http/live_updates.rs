@@ -1,7 +1,7 @@
 //! Live pages: server-sent events with the parts of a page that change.
 //!
-//! While pages listen, one task per server renders these parts once per second, and publishes them if they have changed. Each
-//! page is sent the latest; one that is too slow misses some.
+//! While pages listen, one task per server renders these parts once per second, and publishes them if they have
+//! changed. Each page receives the latest version; a slow one skips versions.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -19,17 +19,17 @@ use tokio::sync::watch;
 use super::connections::ConnectionPermit;
 use crate::shared::run::{Phase, closing};
 
-/// The time between two renderings.
+/// Interval between two renderings.
 const PERIOD: Duration = Duration::from_secs(1);
-/// After an event, the next rendering waits one more period for each so many bytes, so that a hundred pages of a large fleet do
-/// not keep the server busy.
+/// After an event, the next rendering waits one more period per this many bytes, so that a hundred pages of a large
+/// fleet do not keep the server busy.
 const LARGE: usize = 32 * 1024;
-/// The longest time between two renderings, in periods.
+/// Longest interval between two renderings, in periods.
 const MAX_PERIODS: usize = 5;
-/// After this time without a change a page is sent an empty event, which tells it that the server is there.
+/// Interval of empty events while nothing changes, which show a page that the server is alive.
 const KEEP_ALIVE: Duration = Duration::from_secs(15);
-/// How many bytes are handed to a connection at once. All connections share the bytes of an event; only what is handed to
-/// one is copied, so that a page which does not read costs little memory.
+/// Bytes that are written to a connection at once. All connections share the bytes of an event; only a chunk is copied,
+/// so that a page that does not read costs little memory.
 const CHUNK: usize = 8 * 1024;
 
 /// The parts of a page that change. Each text is HTML.
@@ -46,16 +46,16 @@ pub struct PageView {
 /// A row of a table.
 #[derive(Debug, Clone, Serialize)]
 pub struct TableRow {
-    /// Identifies the row among those of its table.
+    /// Key of the row, unique in its table.
     pub key: String,
-    /// Its cells.
+    /// The HTML of its cells.
     pub html: String,
 }
 
 /// An event as the page's script reads it.
 #[derive(Serialize)]
 struct Event<'view> {
-    /// The server's version: a page of another version reloads itself.
+    /// The server's version; a page of another version reloads itself.
     version: &'static str,
     #[serde(flatten)]
     view: &'view PageView,
@@ -64,12 +64,12 @@ struct Event<'view> {
 /// The live pages of a server.
 #[derive(Clone, Default)]
 pub struct LiveUpdates {
-    /// The events of the task that renders, while there is one.
+    /// The events of the rendering task; `None` if no page listens.
     events: Arc<Mutex<Option<watch::Receiver<Bytes>>>>,
 }
 
 impl LiveUpdates {
-    /// Answers a page that wants to listen. `permit` counts it; `render` is called once per second.
+    /// Answers a page that listens. `permit` counts it; `render` is called once per second.
     pub fn listen<R, F>(&self, permit: ConnectionPermit, phase: watch::Receiver<Phase>, render: R) -> HttpResponse
     where
         R: Fn() -> F + 'static,
@@ -91,7 +91,7 @@ impl LiveUpdates {
         HttpResponse::Ok()
             .content_type("text/event-stream")
             .insert_header((header::CACHE_CONTROL, "no-store"))
-            // A web server in front must not collect events.
+            // A reverse proxy must not buffer events.
             .insert_header(("X-Accel-Buffering", "no"))
             .streaming(stream::unfold(stream_of_events, EventStream::next))
     }
@@ -105,7 +105,7 @@ impl LiveUpdates {
             let periods = render().await.map_or(1, |view| publish(&events, &view));
             actix_rt::time::sleep(PERIOD * periods).await;
             let mut running = self.events.lock();
-            // The last receiver is the one that is kept for new pages.
+            // The last receiver is the one in `self.events`.
             if events.receiver_count() == 1 {
                 *running = None;
                 return;
@@ -114,7 +114,7 @@ impl LiveUpdates {
     }
 }
 
-/// Publishes a view if it has changed. Returns how many periods to wait until the next rendering.
+/// Publishes a view if it has changed. Returns the number of periods until the next rendering.
 fn publish(events: &watch::Sender<Bytes>, view: &PageView) -> u32 {
     let json = serde_json::to_string(&Event { version: env!("CARGO_PKG_VERSION"), view }).unwrap_or_default();
     let event = Bytes::from(format!("data: {json}\n\n"));
@@ -137,7 +137,7 @@ struct EventStream {
 }
 
 impl EventStream {
-    /// Returns the next bytes for the page; none when the server stops or the task that renders has panicked.
+    /// Returns the next bytes for the page; `None` if the server stops or the rendering task has panicked.
     async fn next(mut self) -> Option<(Result<Bytes, std::convert::Infallible>, Self)> {
         if self.unsent.is_empty() {
             self.unsent = tokio::select! {

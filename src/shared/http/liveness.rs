@@ -1,4 +1,4 @@
-//! Pings on a WebSocket, by which a peer that is gone, or does not read, is noticed.
+//! Pings on a WebSocket, which detect a peer that has disconnected or does not read.
 
 use std::time::{Duration, Instant};
 
@@ -7,9 +7,9 @@ use actix_web_actors::ws::WebsocketContext;
 
 /// The pings of one WebSocket connection.
 ///
-/// A half-open connection never says that it is one; RFC 6455, section 5.5.2, has pings for this. Each ping carries a
-/// number that can't be guessed, and only its return counts. A peer that sends without reading would make answers
-/// pile up in memory, so the number of answers between two pings is limited.
+/// A half-open connection reports no error; RFC 6455, section 5.5.2, defines pings for this. Each ping carries a random
+/// number, and only a pong with that number counts. Answers to a peer that sends without reading would pile up in
+/// memory, so the number of answers between two pongs is limited.
 #[derive(Debug)]
 pub struct Liveness {
     alive: Instant,
@@ -17,11 +17,11 @@ pub struct Liveness {
     answers: u32,
 }
 
-/// The most answers between two pongs.
+/// Limit of answers between two pongs.
 const ANSWERS: u32 = 100;
 
 impl Liveness {
-    /// Starts with a connection that was just opened.
+    /// Starts with a new connection.
     pub fn new() -> Self {
         Self { alive: Instant::now(), asked: rand::random(), answers: 0 }
     }
@@ -46,7 +46,7 @@ impl Liveness {
         self.answers <= ANSWERS
     }
 
-    /// Whether the peer has answered no ping for so long.
+    /// Whether the peer has answered no ping for this long.
     fn is_gone(&self, silence: Duration) -> bool {
         self.alive.elapsed() >= silence
     }
@@ -61,7 +61,7 @@ where
         let liveness = of(actor);
         let left = silence.saturating_sub(liveness.alive.elapsed());
         ctx.ping(&liveness.ping());
-        // The time is up between two pings, mostly.
+        // The timeout usually ends between two pings.
         if left < ping {
             ctx.run_later(left, move |actor, ctx| {
                 if of(actor).is_gone(silence) {

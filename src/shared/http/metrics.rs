@@ -16,13 +16,13 @@ pub const CONTENT_TYPE: &str = prometheus::TEXT_FORMAT;
 /// A gauge with its help text and its values, each with the values of its labels.
 #[derive(Debug)]
 pub struct Gauge<'text> {
-    /// The metric's name.
+    /// The metric's name; unique in a server.
     pub name: &'text str,
-    /// What it means, with its unit.
+    /// Its help text, with its unit.
     pub help: &'text str,
     /// The names of its labels.
     pub labels: &'text [&'text str],
-    /// The values.
+    /// Each value, after the values of its labels.
     pub values: Vec<(Vec<String>, f64)>,
 }
 

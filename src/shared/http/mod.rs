@@ -1,4 +1,4 @@
-//! What the web sides of both servers use: pages, live updates, WebSockets, limits, certificates, metrics.
+//! What the HTTP interfaces of both servers share: pages, live updates, WebSockets, limits, certificates, metrics.
 
 mod address_quota;
 pub mod assets;

@@ -1,4 +1,4 @@
-//! Origins of web pages, as browsers tell them (RFC 6454, section 6.1). Pure.
+//! Origins of web pages, as browsers send them (RFC 6454, section 6.1). Pure.
 
 use serde::{Deserialize, Serialize};
 use url::Url;
@@ -22,7 +22,7 @@ impl TryFrom<String> for Origin {
         match Url::parse(&text) {
             Ok(url) if ["http", "https"].contains(&url.scheme()) => {
                 let origin = url.origin().ascii_serialization();
-                // A spelling that no browser sends would never match, so it is an error.
+                // Browsers never send another spelling, so it would never match: it is an error.
                 if text.eq_ignore_ascii_case(&origin) {
                     Ok(Self(origin))
                 } else {

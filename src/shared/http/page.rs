@@ -1,11 +1,11 @@
-//! How pages are sent: their type, and headers that let them do only what they need.
+//! Responses with pages: their type, and headers that restrict them to what they need.
 
 use actix_web::http::header;
 use actix_web::{HttpRequest, HttpResponse};
 
 use crate::shared::domain::PublicAddress;
 
-/// What a page may load and reach: the value of `Content-Security-Policy`.
+/// What a page may load and connect to: the value of `Content-Security-Policy`.
 #[derive(Debug, Clone)]
 pub struct ContentSecurityPolicy {
     scripts: Vec<String>,
@@ -17,11 +17,11 @@ pub struct ContentSecurityPolicy {
     foreign: bool,
 }
 
-/// The most hosts that a policy names, so that it fits into a header.
+/// Largest number of hosts in a policy, so that it fits into a header.
 const MOST_HOSTS: usize = 40;
 
 impl ContentSecurityPolicy {
-    /// A page that loads nothing but what its own server has, and no script or style that stands in the page itself.
+    /// A page that loads only files of its own server, and no inline script or style.
     pub fn own() -> Self {
         let own = || vec!["'self'".to_owned()];
         Self {
@@ -35,8 +35,8 @@ impl ContentSecurityPolicy {
         }
     }
 
-    /// Lets a page open WebSockets to the server that it comes from: older browsers don't take them for its own. Only
-    /// `Host` tells which that is: `X-Forwarded-Host` and `Forwarded` may be anybody's word.
+    /// Lets a page open WebSockets to the server that it comes from: for older browsers `'self'` does not include them.
+    /// The host comes from `Host` only: any client can set `X-Forwarded-Host` and `Forwarded`.
     pub fn own_websocket(mut self, request: &HttpRequest) -> Self {
         self.connections.extend(own_sources(request).into_iter().filter(|source| source.starts_with("ws")));
         self
@@ -48,7 +48,7 @@ impl ContentSecurityPolicy {
         self
     }
 
-    /// Lets a page run scripts of these sources, which may be WebAssembly, with their styles and pictures.
+    /// Lets a page run scripts of these sources, also WebAssembly, with their styles and images.
     pub fn run(mut self, sources: &[String]) -> Self {
         let files = || sources.iter().filter(|source| !source.starts_with("ws")).cloned();
         for list in [&mut self.scripts, &mut self.styles, &mut self.pictures] {
@@ -59,7 +59,7 @@ impl ContentSecurityPolicy {
         self
     }
 
-    /// Lets a page show pictures and fetch data that a world names, wherever they are.
+    /// Lets a page load images and data that a world refers to, from any host.
     pub fn any_picture(mut self) -> Self {
         self.pictures.extend(["data:".to_owned(), "blob:".to_owned(), "https:".to_owned()]);
         self.connections.extend(["data:".to_owned(), "blob:".to_owned(), "https:".to_owned()]);
@@ -128,7 +128,7 @@ pub fn fleet_sources<'address>(addresses: impl Iterator<Item = &'address PublicA
     hosts.iter().flat_map(|host| [format!("{http}://{host}"), format!("{websocket}://{host}")]).collect()
 }
 
-/// The sources from which a fleet is reached whose hosts are not known yet: any host.
+/// The sources of a fleet whose hosts are not known yet: any host.
 pub fn any_host(ssl: bool) -> Vec<String> {
     let (http, websocket) = schemes(ssl);
     vec![format!("{http}:"), format!("{websocket}:")]
@@ -138,7 +138,7 @@ fn schemes(ssl: bool) -> (&'static str, &'static str) {
     if ssl { ("https", "wss") } else { ("http", "ws") }
 }
 
-/// The CSS class of a bar that shows so many percent.
+/// The CSS class of the color of a bar, for a value in percent.
 pub fn heat(percent: &f64) -> &'static str {
     match *percent {
         ..70.0 => "cool",
@@ -147,7 +147,7 @@ pub fn heat(percent: &f64) -> &'static str {
     }
 }
 
-/// The CSS class that sets the length of a bar that shows so many percent.
+/// The length of a bar that shows this many percent, as text from `0.0` to `100.0`.
 pub fn width(percent: &f64) -> String {
     format!("{:.1}", percent.clamp(0.0, 100.0))
 }

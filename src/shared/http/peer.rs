@@ -1,8 +1,8 @@
-//! Who is at the other end of a connection, where a web server may stand in between.
+//! The client at the other end of a connection, possibly behind a reverse proxy.
 //!
-//! A web server that forwards requests tells the address of its client in the header `X-Forwarded-For`. Anybody can write
-//! this header. It counts only on connections from a trusted proxy, and is read from its end: each trusted proxy added the
-//! address that it saw, and the last address that is none of theirs is the client's.
+//! A reverse proxy sends its client's address in the header `X-Forwarded-For`. Any client can set this header. It
+//! counts only on connections from a trusted proxy, and is read from its end: each trusted proxy has appended the
+//! address that it saw, and the last address that is not a trusted proxy is the client's.
 
 use std::fmt;
 use std::net::{IpAddr, Ipv6Addr, SocketAddr};
@@ -12,7 +12,7 @@ use actix_web::http::header::{HeaderMap, HeaderName};
 use ipnet::IpNet;
 use serde::{Deserialize, Serialize};
 
-/// The networks of proxies whose header `X-Forwarded-For` is believed.
+/// The networks of proxies whose header `X-Forwarded-For` is trusted.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(try_from = "Vec<String>", into = "Vec<String>")]
 pub struct TrustedProxies(Vec<IpNet>);
@@ -25,16 +25,16 @@ pub struct UserHeader(HeaderName);
 /// The client at the other end of a connection.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Peer {
-    /// The client's own address; that of the last proxy, where the header before it can't be read.
+    /// The client's own address; or, if the header can't be parsed, that of the last proxy before the invalid part.
     Client(IpAddr),
     /// A trusted proxy that sends no header, or a client on the same machine: it may stand for many clients.
     Proxy(IpAddr),
-    /// Unknown: not a TCP connection.
+    /// Unknown, because it is not a TCP connection.
     Unknown,
 }
 
 impl Peer {
-    /// The key by which rate limits count a client, if its address is known. An IPv6 client has a whole /64 of addresses,
+    /// The key of rate limits for this client, if its address is known. An IPv6 client has a whole /64 of addresses,
     /// which count as one.
     pub fn rate_limit_key(self) -> Option<IpAddr> {
         match self {
@@ -46,7 +46,7 @@ impl Peer {
 }
 
 impl TrustedProxies {
-    /// The other end of a request.
+    /// The client of a request.
     pub fn peer(&self, request: &HttpRequest) -> Peer {
         match request.peer_addr() {
             Some(address) => self.resolve(address.ip().to_canonical(), request.headers()),
@@ -54,7 +54,7 @@ impl TrustedProxies {
         }
     }
 
-    /// The other end of a connection on which nothing was said yet.
+    /// The client of a connection on which no request was received yet.
     pub fn of_connection(&self, address: IpAddr) -> Peer {
         let address = address.to_canonical();
         if self.trusts(address) { Peer::Proxy(address) } else { Peer::Client(address) }
@@ -99,13 +99,13 @@ impl TrustedProxies {
     }
 }
 
-/// Joins all lines of a header; `None` where there is none. A line that is not text becomes `?`, which is not an address.
+/// Joins all lines of a header; `None` if there are none. A line that is not text becomes `?`, which is not an address.
 fn joined(headers: &HeaderMap, name: &str) -> Option<String> {
     let lines: Vec<&str> = headers.get_all(name).map(|line| line.to_str().unwrap_or("?")).collect();
     (!lines.is_empty()).then(|| lines.join(","))
 }
 
-/// An address as web servers write it: some add the port.
+/// Parses an address as reverse proxies write it: some add the port.
 fn address(text: &str) -> Option<IpAddr> {
     let bare = text.strip_prefix('[').and_then(|text| text.strip_suffix(']')).unwrap_or(text);
     let address = bare.parse().ok().or_else(|| text.parse::<SocketAddr>().ok().map(|address| address.ip()));

@@ -1,4 +1,4 @@
-//! What the paths of both servers share: allowed methods, CORS headers, the answer for unknown paths.
+//! What the routes of both servers share: allowed methods, CORS headers, the answer for unknown paths.
 
 use actix_web::dev::HttpServiceFactory;
 use actix_web::http::header::{self, HeaderName, HeaderValue};
@@ -7,17 +7,18 @@ use actix_web::middleware::DefaultHeaders;
 use actix_web::{FromRequest, Handler, HttpRequest, HttpResponse, Resource, Responder, guard, web};
 use rand::RngExt;
 
-/// The values of `Retry-After`, in seconds.
+/// Range of `Retry-After`, in seconds.
 const RETRY_AFTER: std::ops::RangeInclusive<u16> = 2..=6;
 
-/// For what is read. What watches over servers likes to ask for the head alone (RFC 9110, section 9.3.2).
+/// For reads. Monitoring programs like to request the head alone (RFC 9110, section 9.3.2).
 pub const READ: &[Method] = &[Method::GET, Method::HEAD];
-/// For WebSockets and event streams, whose answers have no end.
+/// For WebSockets and event streams, whose answers are unbounded.
 pub const GET: &[Method] = &[Method::GET];
-/// For what changes something.
+/// For requests that change state.
 pub const POST: &[Method] = &[Method::POST];
 
-/// A path that takes these methods. Others are refused by name (RFC 9110, section 15.5.6), and OPTIONS is answered.
+/// A route with these methods. Other methods get 405 with the allowed ones (RFC 9110, section 15.5.6), and OPTIONS is
+/// answered.
 pub fn path<F, Arguments>(name: &str, methods: &'static [Method], handler: F) -> Resource
 where
     F: Handler<Arguments, Output: Responder + 'static>,
@@ -36,9 +37,9 @@ fn wrong_method(methods: &[Method]) -> HttpResponse {
     HttpResponse::MethodNotAllowed().insert_header((header::ALLOW, allowed)).body(words)
 }
 
-/// Refuses a request that a page of another site made (CSRF): the browser would add the password that it remembers.
+/// Refuses a request from a page of another site (CSRF): the browser would add the stored password.
 ///
-/// Browsers tell where a request comes from in `Sec-Fetch-Site`, older ones in `Origin`; other programs send neither.
+/// Browsers send the origin of a request in `Sec-Fetch-Site`, older ones in `Origin`; other programs send neither.
 pub fn reject_cross_site(request: &HttpRequest) -> Option<HttpResponse> {
     let header = |name: HeaderName| request.headers().get(name).map(|value| value.to_str().unwrap_or_default());
     let same_site =
@@ -52,12 +53,12 @@ pub fn reject_cross_site(request: &HttpRequest) -> Option<HttpResponse> {
     (!same_site || !same_host).then(refusal)
 }
 
-/// The value of `Retry-After`, in seconds. Random, so that a class that was refused together does not come back together.
+/// The header `Retry-After`, in seconds. Random, so that a class that was refused at once does not retry at once.
 pub fn retry_after() -> (HeaderName, HeaderValue) {
     (header::RETRY_AFTER, HeaderValue::from(rand::rng().random_range(RETRY_AFTER)))
 }
 
-/// All paths of a server, which pages of any origin may use; `hint` names those that people look for.
+/// All routes of a server, usable by pages of any origin; `hint` lists the usual paths for the 404 page.
 pub fn all(configure: fn(&mut web::ServiceConfig), hint: &'static str) -> impl HttpServiceFactory + 'static {
     let headers = DefaultHeaders::new()
         .add((header::ACCESS_CONTROL_ALLOW_ORIGIN, "*"))

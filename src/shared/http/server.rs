@@ -1,7 +1,8 @@
-//! Listening on a port, and serving an app on it.
+//! Listens on a port, and serves an app on it.
 //!
-//! actix-web's `HttpServer` makes its connections itself, and decodes all requests of one at once. To count connections and to
-//! hold them to one request at a time, this builds the same service of the public parts that `HttpServer` is made of.
+//! actix-web's `HttpServer` accepts its connections itself, and decodes all requests of a connection at once. To count
+//! connections and to limit each to one request at a time, this builds the same service from the public parts of
+//! `HttpServer`.
 
 use std::fmt::Debug;
 use std::future::ready;
@@ -24,12 +25,12 @@ use super::client_stream::ClientStream;
 use super::connections::{ConnectionKind, ConnectionLimiter};
 use super::peer::TrustedProxies;
 
-/// How many connections may wait to be accepted. The system has a limit of its own, which counts where it is smaller.
+/// Backlog of connections to be accepted. The kernel's own limit applies if it is smaller.
 ///
-/// Of the standard library's 128, those that come in a larger burst would be lost, and tried again a second later.
+/// With the standard library's 128, connections of a larger burst would be dropped, and retried a second later.
 const BACKLOG: i32 = i32::MAX;
 
-/// Listens on an address. `::` is all addresses, of IPv6 and IPv4; of IPv4 alone where the machine has no IPv6.
+/// Listens on an address. `::` is all addresses, of IPv6 and IPv4; of IPv4 alone if the machine has no IPv6.
 ///
 /// # Errors
 /// When the address is taken, or may not be used.
@@ -50,23 +51,23 @@ pub fn listen(address: SocketAddr) -> io::Result<TcpListener> {
     Ok(socket.into())
 }
 
-/// How a server serves its connections.
+/// Options of a server's connections.
 #[derive(Debug, Clone)]
 pub struct HttpServerOptions {
-    /// Threads that serve connections.
+    /// Number of threads that serve connections.
     pub workers: usize,
-    /// How many connections a thread serves; further ones wait in the system's queue, where they need no open files.
+    /// Limit of connections per thread; further ones wait in the kernel's queue, where they need no open files.
     pub max_per_worker: usize,
-    /// After how long a connection is closed to which nothing could be delivered.
+    /// Time after which a connection is closed if nothing could be delivered to it.
     pub silence: Duration,
-    /// How long connections may take to end when the server stops; whole seconds count.
+    /// Timeout of open connections when the server stops, in whole seconds.
     pub stop: Duration,
-    /// Proxies that may have more connections than one client.
+    /// Proxies, to which the limits per address do not apply.
     pub trusted_proxies: TrustedProxies,
 }
 
-/// Serves an app on a port. Unlike actix-web's `HttpServer` it counts connections per address, and reads from each only as
-/// fast as its client takes the answers.
+/// Serves an app on a port. Unlike actix-web's `HttpServer` it counts connections per address, and reads from each only
+/// as fast as its client reads the answers.
 ///
 /// # Errors
 /// When the system does not let the port be used.
@@ -88,7 +89,7 @@ where
     let HttpServerOptions { workers, max_per_worker, stop, .. } = options;
     let server = Server::build().workers(workers).max_concurrent_connections(max_per_worker);
     let server = server.disable_signals().shutdown_timeout(stop.as_secs());
-    // When the server stops, connections that wait for another request end at once.
+    // When the server stops, idle connections end at once.
     let (stops, stopping) = (server.graceful_shutdown_signal(), CancellationToken::new());
     let told = stopping.clone();
     actix_web::rt::spawn(async move {
@@ -104,7 +105,7 @@ where
     Ok(server.run())
 }
 
-/// Counts a connection and sets its options. It is closed at once if its address has too many.
+/// Counts a connection and sets its options. An address with too many connections is refused.
 fn accept(
     tcp: TcpStream,
     connections: &ConnectionLimiter,
@@ -117,9 +118,9 @@ fn accept(
         log::debug!("{address}: {error}");
         io::Error::other(error)
     })?;
-    // Messages are small, and must not wait until the one before is acknowledged.
+    // Messages are small, and must not wait for the acknowledgement of the one before.
     tcp.set_nodelay(true)?;
-    // RFC 5482; on Linux it counts also for a client that reads nothing (tcp(7)).
+    // RFC 5482; on Linux it also covers a client that does not read (tcp(7)).
     let silence = u32::try_from(options.silence.as_millis()).unwrap_or(u32::MAX);
     if let Err(error) = setsockopt(&tcp, sockopt::TcpUserTimeout, &silence) {
         log::warn!("a connection has no time limit for its answers: {error}");

@@ -1,7 +1,7 @@
-//! Requests to https servers: which certificates are trusted, and why others are not, in words.
+//! Requests to https servers: which certificates are trusted, and why others are not.
 //!
-//! The trust store is the system's, where a lab adds its own authority with `update-ca-certificates`. Where one of the
-//! environment variables `SSL_CERT_FILE` and `SSL_CERT_DIR` is set, it is that file or folder alone.
+//! The trust store is the system's, to which a lab adds its own authority with `update-ca-certificates`. If one of the
+//! environment variables `SSL_CERT_FILE` and `SSL_CERT_DIR` is set, it is that file or directory alone.
 
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
@@ -18,9 +18,9 @@ use rustls::{
 
 use crate::shared::run::timestamp;
 
-/// Returns how requests are encrypted; `None` where rustls can't be set up.
+/// Returns the TLS configuration of requests; `None` if rustls can't be set up.
 ///
-/// Parts of the trust store that can't be read are logged. Only servers that need them are not trusted.
+/// Unreadable parts of the trust store are logged. Only servers that need them are not trusted.
 pub fn client_config() -> Option<Arc<ClientConfig>> {
     let found = rustls_native_certs::load_native_certs();
     for problem in &found.errors {
@@ -44,11 +44,11 @@ pub fn client_config() -> Option<Arc<ClientConfig>> {
     Some(Arc::new(builder.with_no_client_auth()))
 }
 
-/// Verifies certificates as webpki does, and accepts also those of servers that are themselves in the trust store.
+/// Verifies certificates as webpki does, and also accepts server certificates that are themselves in the trust store.
 ///
-/// webpki refuses a certificate that may sign others (`CA:TRUE`) as a server's own. `openssl req -x509` makes such
-/// certificates, and OpenSSL and curl accept them. Nothing is lost by that: whoever has the key of a trusted authority
-/// can make a certificate for every name.
+/// webpki refuses a certificate that may sign others (`CA:TRUE`) as a server's own. `openssl req -x509` creates such
+/// certificates, and OpenSSL and curl accept them. It does not weaken security: the owner of a trusted authority's key
+/// can create a certificate for every name anyway.
 #[derive(Debug)]
 struct Verifier {
     webpki: Arc<WebPkiServerVerifier>,
@@ -56,7 +56,7 @@ struct Verifier {
 }
 
 impl Verifier {
-    /// Returns `None` where the trust store is empty.
+    /// Returns `None` if the trust store is empty.
     fn new(roots: RootCertStore, trusted: Vec<CertificateDer<'static>>, crypto: Arc<CryptoProvider>) -> Option<Self> {
         let webpki = WebPkiServerVerifier::builder_with_provider(Arc::new(roots), crypto).build().ok()?;
         Some(Self { webpki, trusted })
@@ -74,7 +74,7 @@ impl ServerCertVerifier for Verifier {
     ) -> Result<ServerCertVerified, Error> {
         let verified = self.webpki.verify_server_cert(certificate, intermediates, name, ocsp_response, now);
         match verified {
-            // Before this error webpki has checked the dates, and after it the name would be checked.
+            // webpki checks the dates before it returns this error, and would check the name after it.
             Err(Error::InvalidCertificate(error)) if is_of_authority(&error) && self.trusted.contains(certificate) => {
                 verify_server_name(&ParsedCertificate::try_from(certificate)?, name)?;
                 Ok(ServerCertVerified::assertion())
@@ -114,7 +114,7 @@ fn is_of_authority(error: &CertificateError) -> bool {
     source.downcast_ref() == Some(&webpki::Error::CaUsedAsEndEntity)
 }
 
-/// Says why a request failed, where encryption is the cause.
+/// Returns why a request failed, if TLS is the cause.
 pub fn reason(error: &SendRequestError) -> Option<String> {
     let SendRequestError::Connect(ConnectError::Io(error)) = error else {
         return None;
@@ -154,7 +154,7 @@ fn distrust(problem: &CertificateError) -> String {
     }
 }
 
-/// Returns the name alone of what rustls writes as `DnsName("lab.org")`.
+/// Returns the bare name from rustls' notation `DnsName("lab.org")`.
 fn bare(name: &str) -> &str {
     let inner = name.split_once('(').and_then(|(_, rest)| rest.strip_suffix(')'));
     inner.map_or(name, |inner| inner.trim_matches('"'))

@@ -1,5 +1,5 @@
-//! WebSockets: opening them, joining messages that come in several frames, and bounding what a client can make the
-//! server hold in memory.
+//! WebSockets: opens them, joins messages of several frames, and bounds the memory that a client can make the server
+//! use.
 
 use std::pin::Pin;
 use std::sync::Arc;
@@ -15,39 +15,39 @@ use actix_web_actors::ws::{CloseCode, CloseReason, Message, ProtocolError, Webso
 use bytestring::ByteString;
 use futures_util::Stream;
 
-/// The largest message of a client, in bytes.
+/// Size limit of a client's message, in bytes.
 const MAX_MESSAGE: usize = 8 * 1024;
-/// How many received bytes may wait to be read as messages. actix tells the size of a message only when all of it is
-/// there, and goes on reading while earlier messages wait: without this bound one client could fill the memory.
+/// Limit of received bytes that wait to be read as messages. actix reports the size of a message only when it is
+/// complete, and continues reading while earlier messages wait: without this limit one client could fill the memory.
 const MAX_BACKLOG: usize = 128 * 1024;
-/// The largest header of a WebSocket frame, in bytes (RFC 6455, section 5.2).
+/// Largest header of a WebSocket frame, in bytes (RFC 6455, section 5.2).
 const FRAME_HEADER: usize = 14;
 
-/// Reads the messages of one WebSocket, and joins those that come in several frames.
+/// Reads the messages of one WebSocket, and joins those of several frames.
 #[derive(Debug, Default)]
 pub struct MessageReader {
     backlog: Backlog,
-    /// The frames so far of a text whose last frame has not come yet (RFC 6455, section 5.4).
+    /// The frames received so far of a text whose last frame is missing (RFC 6455, section 5.4).
     partial: Option<Vec<u8>>,
 }
 
-/// How many bytes were received and not yet read as messages.
+/// Number of bytes that were received and not yet read as messages.
 type Backlog = Arc<AtomicUsize>;
 
 /// A complete message of a client.
 #[derive(Debug)]
 pub enum ClientMessage {
-    /// A text.
+    /// A text message.
     Text(ByteString),
-    /// A ping, which wants a pong with the same content.
+    /// A ping, which requires a pong with the same content.
     Ping(Bytes),
     /// The answer to a ping.
     Pong(Bytes),
-    /// The client closes the connection, or is gone.
+    /// The client closes the connection, or has disconnected.
     Close(Option<CloseReason>),
 }
 
-/// Why a message can't be read; the connection must be closed. The words are for the client.
+/// Why a message can't be read, as text for the client; the connection must be closed.
 #[derive(Debug, thiserror::Error)]
 pub enum MessageError {
     /// The message is longer than [`MAX_MESSAGE`].
@@ -56,10 +56,10 @@ pub enum MessageError {
     /// The client sends faster than its messages are read.
     #[error("Wrong message: more than {} KiB wait to be read", MAX_BACKLOG / 1024)]
     TooMany,
-    /// The message is binary, or no UTF-8.
+    /// The message is binary, or not UTF-8.
     #[error("Wrong message: allowed are short texts")]
     NotText,
-    /// The frame breaks the rules of WebSockets.
+    /// The frame violates the WebSocket protocol.
     #[error("Wrong message: {0}")]
     Protocol(ProtocolError),
 }
@@ -77,10 +77,10 @@ impl MessageError {
 }
 
 impl MessageReader {
-    /// Reads what actix hands over. Returns nothing while a message is incomplete.
+    /// Reads a message from actix. Returns `None` while a message is incomplete.
     ///
     /// # Errors
-    /// When the message is too large, is no text, breaks the rules of WebSockets, or too many wait.
+    /// When the message is too large, is not text, breaks the rules of WebSockets, or too many wait.
     pub fn read(&mut self, message: Result<Message, ProtocolError>) -> Result<Option<ClientMessage>, MessageError> {
         self.count(&message);
         match message {
@@ -98,13 +98,13 @@ impl MessageReader {
             Ok(Message::Continuation(Item::Last(piece))) => self.join(&piece, true),
             Err(ProtocolError::Overflow) => Err(MessageError::TooLarge),
             Err(_) if self.backlog.load(Ordering::Relaxed) > MAX_BACKLOG => Err(MessageError::TooMany),
-            // The connection broke without a close frame, as with every closed laptop.
+            // The connection broke without a close frame, as when a laptop is closed.
             Err(ProtocolError::Io(_)) => Ok(Some(ClientMessage::Close(None))),
             Err(error) => Err(MessageError::Protocol(error)),
         }
     }
 
-    /// Appends a frame to the text that is under way.
+    /// Appends a frame to the incomplete text.
     fn join(&mut self, piece: &[u8], is_last: bool) -> Result<Option<ClientMessage>, MessageError> {
         let Some(mut text) = self.partial.take() else {
             return Err(MessageError::Protocol(ProtocolError::ContinuationNotStarted));
@@ -121,7 +121,7 @@ impl MessageReader {
         Ok(Some(ClientMessage::Text(text.into())))
     }
 
-    /// Takes the bytes of a message off the backlog.
+    /// Subtracts the bytes of a message from the backlog.
     fn count(&self, message: &Result<Message, ProtocolError>) {
         let content = match message {
             Ok(Message::Text(text)) => text.len(),
@@ -142,7 +142,7 @@ impl MessageReader {
     }
 }
 
-/// The bytes that a client sends; ends with an error once the backlog is too large.
+/// The bytes from a client; ends with an error once the backlog is too large.
 struct BoundedPayload {
     payload: Payload,
     backlog: Backlog,
@@ -163,8 +163,8 @@ impl Stream for BoundedPayload {
     }
 }
 
-/// Upgrades a request to a WebSocket that the given actor serves, or answers why that can't be. The actor must hand all
-/// messages to the reader that it is given.
+/// Upgrades a request to a WebSocket that the given actor serves, or answers with the error. The actor must pass all
+/// messages to its reader.
 pub fn open<A>(request: &HttpRequest, payload: Payload, actor: impl FnOnce(MessageReader) -> A) -> HttpResponse
 where
     A: Actor<Context = WebsocketContext<A>> + StreamHandler<Result<Message, ProtocolError>>,

@@ -1,27 +1,27 @@
-//! Why a server ends with an error.
+//! Why a server exits with an error.
 
 use std::net::SocketAddr;
 use std::path::PathBuf;
 
-/// Why a server can't start, or can't go on.
+/// Why a server can't start, or can't continue.
 #[derive(Debug, thiserror::Error)]
 pub enum AppError {
-    /// The port is taken, or the system does not allow it.
+    /// The port is in use, or the system does not allow it.
     #[error("can't listen on {address}: {source}")]
     Bind {
         /// Host and port.
         address: SocketAddr,
-        /// What the system says.
+        /// The error of the system.
         source: std::io::Error,
     },
-    /// A folder of the configuration can't be used.
+    /// A directory of the configuration can't be used.
     #[error("the folder {} ({key}) can't be used: {source}", folder.display())]
     Folder {
         /// The key of the configuration.
         key: &'static str,
-        /// The folder.
+        /// The path of the directory.
         folder: PathBuf,
-        /// What the system says.
+        /// The error of the system.
         source: std::io::Error,
     },
     /// The limit of open files is too low.
@@ -31,10 +31,10 @@ pub enum AppError {
     NoClients {
         /// The limit of open files.
         files: u64,
-        /// What at least must be possible.
+        /// What the server needs at least.
         needed: String,
     },
-    /// What the configuration asks for can't be had on this machine.
+    /// The configuration requires what this machine does not have.
     #[error("{0}")]
     Unavailable(String),
     /// Another error of the system.
@@ -43,7 +43,7 @@ pub enum AppError {
     /// A metric has an invalid name.
     #[error(transparent)]
     Metrics(#[from] prometheus::Error),
-    /// An actor that must live has stopped. This is a fault in this program.
+    /// A permanent actor has stopped, which is a bug in this program.
     #[error("{0}")]
     ActorStopped(String),
 }

@@ -1,4 +1,4 @@
-//! Where log lines go: a file that is rotated, or standard output.
+//! The log: to a file that is rotated, or to standard output.
 
 use std::fmt;
 use std::io::Write;
@@ -10,10 +10,10 @@ use super::rotated_file::RotatedFile;
 use super::timestamp::timestamp_in_milliseconds;
 use crate::shared::text::one_line;
 
-/// How many old files are kept beside the newest. The Python servers keep as many.
+/// Number of rotated files that are kept, as in the Python servers.
 const OLD_FILES: usize = 10;
 
-/// Where log lines go.
+/// The destination of log lines.
 #[derive(Debug, Clone, Copy)]
 pub enum LogTarget<'path> {
     /// To standard output, debug lines included.
@@ -23,7 +23,7 @@ pub enum LogTarget<'path> {
 }
 
 impl<'path> LogTarget<'path> {
-    /// Standard output where `debug` is set, else this file.
+    /// Standard output if `debug` is set, else this file.
     pub fn new(debug: bool, file: &'path Path) -> Self {
         if debug { Self::Stdout } else { Self::File(file) }
     }
@@ -38,13 +38,13 @@ impl fmt::Display for LogTarget<'_> {
     }
 }
 
-/// Starts logging. The environment variable `RUST_LOG` can change which lines are written.
+/// Starts logging. The environment variable `RUST_LOG` overrides which lines are written.
 ///
 /// # Errors
-/// When the file or its folder can't be made.
+/// When the file or its directory can't be created.
 pub fn start(target: LogTarget<'_>) -> std::io::Result<()> {
-    // The decoder of HTTP logs each malformed message as an error. Strangers could fill the log with them. What the resolver
-    // finds out is told by who asks it.
+    // The HTTP decoder logs each malformed message as an error. Any client could flood the log with these. Resolver
+    // errors are logged by the caller.
     let default_level = match target {
         LogTarget::Stdout => {
             "debug,actix_http=info,actix_http::h1::decoder=off,actix_server=info,mio=info,rustls=info,h2=info,\

@@ -1,4 +1,4 @@
-//! How a server starts, says that it is ready, writes its log, and handles signals.
+//! Start of a server, its readiness, its log, and signals.
 
 mod app_error;
 mod logging;

@@ -1,12 +1,12 @@
-//! The limit of open files. Shells give 1,024, and the system mostly allows many more.
+//! The limit of open files. The default is often 1,024, and the hard limit is mostly much higher.
 
 use nix::sys::resource::{Resource, getrlimit, setrlimit};
 
-/// The limit that is assumed where the system does not say.
+/// The limit that is assumed if the system does not report it.
 const USUAL: u64 = 1024;
 
-/// Raises the limit of open files to `wanted`, or as near to it as the system allows. A limit that is higher already stays.
-/// Returns the limit.
+/// Raises the limit of open files to `wanted`, or as close as the system allows. A higher limit stays. Returns the
+/// limit.
 pub fn raise_open_files(wanted: u64) -> u64 {
     let limits = getrlimit(Resource::RLIMIT_NOFILE);
     let raised = limits.and_then(|(now, most)| {

@@ -1,16 +1,17 @@
-//! Actors that must live as long as the server.
+//! Actors that must run as long as the server.
 
 use std::time::Duration;
 
 use actix::prelude::*;
 
-/// How often an actor is looked at.
+/// Interval between two checks of an actor.
 const INTERVAL: Duration = Duration::from_millis(500);
 
-/// Waits until an actor has stopped, and returns a sentence that says so. It has panicked: this is a fault in this program.
+/// Waits until an actor has stopped, and returns a message about it. Such an actor has panicked, which is a bug in this
+/// program, or has given up on others that panic.
 ///
-/// actix does not restart an actor after a panic, and every later message to it fails. The server must end and be started
-/// again.
+/// actix does not restart an actor after a panic, and every later message to it fails. The server must exit, and its
+/// service manager restarts it.
 pub async fn stopped<A: Actor>(name: &str, actor: Addr<A>) -> String {
     while actor.connected() {
         actix_rt::time::sleep(INTERVAL).await;

@@ -1,11 +1,11 @@
-//! A file that tells other programs whether a server runs, and in which process.
+//! A PID file, which shows other programs whether a server runs, and in which process.
 
 use std::fs::{File, TryLockError};
 use std::io::{self, Read, Write};
 use std::path::Path;
 
-/// Writes the process id to a file, and locks the file (`flock`) until the returned file is closed, which the system does
-/// when the process ends in whatever way.
+/// Writes the process id to a file, and locks the file (`flock`) until the returned file is closed. The kernel closes
+/// it when the process ends for any reason.
 ///
 /// # Errors
 /// When the file can't be written, or another server holds it.

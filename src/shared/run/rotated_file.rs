@@ -1,17 +1,17 @@
-//! A log file that is rotated by its size. It never panics, and never grows beyond its size.
+//! A log file that is rotated by size. It never panics, and never exceeds its size limit by more than one write.
 //!
-//! The crates for this do one or the other: file-rotate 0.8 panics where a folder can't be read, and rolling-file 0.2 and
-//! logroller 0.1 let the file grow for ever, or write nothing more, where it can't be renamed.
+//! Crates for this fail in one way or another: file-rotate 0.8 panics if a directory can't be read; with rolling-file
+//! 0.2 and logroller 0.1, a file that can't be renamed grows without limit or is no longer written.
 
 use std::ffi::OsString;
 use std::fs::File;
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
-/// How large a file may be before it is rotated, in bytes. The Python servers have the same limit.
+/// Size from which a file is rotated, in bytes. The Python servers have the same limit.
 const FILE_SIZE: u64 = 500_000;
 
-/// A file to which lines are added. Beside it are older ones: `NAME.1` is the newest, then `NAME.2` and so on.
+/// A file to which lines are appended. Beside it are rotated ones: `NAME.1` is the newest, then `NAME.2` and so on.
 #[derive(Debug)]
 pub struct RotatedFile {
     path: PathBuf,
@@ -23,10 +23,10 @@ pub struct RotatedFile {
 }
 
 impl RotatedFile {
-    /// Opens a file for appending, and makes its folder. `old_files` older ones are kept.
+    /// Opens a file for appending, and creates its directory. `old_files` rotated ones are kept.
     ///
     /// # Errors
-    /// When the folder can't be made, or the file can't be opened.
+    /// When the directory can't be created, or the file can't be opened.
     pub fn open(path: &Path, old_files: usize) -> io::Result<Self> {
         if let Some(folder) = path.parent() {
             std::fs::create_dir_all(folder)?;
@@ -53,7 +53,7 @@ impl RotatedFile {
         Ok(())
     }
 
-    /// Adds all of this, or nothing: a line that is cut off would spoil the next one.
+    /// Appends all bytes or none: a truncated line would corrupt the next one.
     fn add(&mut self, bytes: &[u8]) -> io::Result<()> {
         self.file.write_all(bytes).inspect_err(|_| drop(self.file.set_len(self.size)))?;
         self.size += bytes.len() as u64;
@@ -70,7 +70,7 @@ impl RotatedFile {
 }
 
 impl Write for RotatedFile {
-    /// Writes whole lines. Those that the disk has no room for are lost.
+    /// Writes whole lines. Lines for which the disk has no space are lost.
     fn write(&mut self, lines: &[u8]) -> io::Result<usize> {
         if self.size >= FILE_SIZE {
             // A file that can't be renamed must not grow without limit either.

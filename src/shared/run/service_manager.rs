@@ -1,16 +1,16 @@
-//! Messages to the service manager (systemd). Without one nothing is sent.
+//! Messages to the service manager (systemd). Without one, no message is sent.
 //!
-//! Its watchdog ends and restarts a server that sends no message for too long, so a message is sent only after an actor
-//! that the server can't do without has answered.
+//! Its watchdog kills and restarts a server that sends no message for too long, so a message is sent only after an
+//! actor that the server depends on has answered.
 
 use sd_notify::NotifyState;
 
-/// Says that the server listens on `port` and its actors run.
+/// Reports that the server listens on `port` and its actors run.
 pub fn ready(port: u16) {
     send(&[NotifyState::Ready, NotifyState::Status(&format!("listens on port {port}"))]);
 }
 
-/// Says that the server reads its configuration again. [`ready`] says when that is done.
+/// Reports that the server reloads its configuration. [`ready`] reports the end.
 pub fn reloading() {
     match NotifyState::monotonic_usec_now() {
         Ok(now) => send(&[NotifyState::Reloading, now]),
@@ -18,17 +18,17 @@ pub fn reloading() {
     }
 }
 
-/// Says what the server is doing, for `systemctl status`.
+/// Reports what the server is doing, for `systemctl status`.
 pub fn status(what: &str) {
     send(&[NotifyState::Status(what)]);
 }
 
-/// Says that the server ends in order, and why.
+/// Reports that the server stops in an orderly way, and why.
 pub fn stopping(why: &str) {
     send(&[NotifyState::Stopping, NotifyState::Status(why)]);
 }
 
-/// Sends the watchdog, if there is one, a message three times within its limit, each after `answers` has returned true.
+/// Sends a message to the watchdog, if there is one, three times within its limit, each time `answers` returns true.
 /// Never returns.
 pub async fn feed_watchdog(mut answers: impl AsyncFnMut() -> bool) {
     let Some(limit) = sd_notify::watchdog_enabled() else {

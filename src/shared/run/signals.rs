@@ -1,8 +1,8 @@
-//! Signals to a server, and the phases of its life that follow from them.
+//! Signals to a server, and the phases of its life cycle.
 
 use actix_rt::signal::unix::{Signal, SignalKind, signal};
 
-/// The signals of a server. They are caught as long as this exists.
+/// The signals of a server. They are caught until this is dropped.
 pub struct Signals {
     terminate: Signal,
     interrupt: Signal,
@@ -10,14 +10,14 @@ pub struct Signals {
     user: Signal,
 }
 
-/// What a signal, or an administrator's request, asks for.
+/// The command of a signal, or of an administrator's request.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum ServerCommand {
     /// SIGTERM or SIGINT: stop.
     Stop,
     /// SIGHUP: read the configuration again.
     Reload,
-    /// SIGUSR1: take no new clients, and stop when the last one has gone.
+    /// SIGUSR1: accept no new clients, and stop when the last one has left.
     Drain,
 }
 
@@ -46,12 +46,12 @@ impl Signals {
     }
 }
 
-/// The phase of a server's life. Its parts see it in a watch channel.
+/// The phase of a server's life cycle, published in a watch channel.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Phase {
-    /// It takes clients.
+    /// It accepts clients.
     Open,
-    /// It keeps its clients, and takes no new ones.
+    /// It keeps its clients, and accepts no new ones.
     Draining,
     /// It stops: connections are closed.
     Closing,

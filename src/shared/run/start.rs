@@ -1,4 +1,4 @@
-//! How a program starts: configuration, log, then the server, and an exit code.
+//! Start of a program: configuration, log, then the server, and the exit code.
 
 use std::io::Write;
 use std::mem::ManuallyDrop;
@@ -10,9 +10,9 @@ use super::{pid_file, service_manager};
 use crate::shared::config::{self, Configuration, LoadedConfig};
 use crate::shared::text::one_line;
 
-/// Exit code: the server failed at run time, as where its port is taken.
+/// Exit code: the server failed at run time, for example because its port is in use.
 pub const FAILED: u8 = 1;
-/// Exit code: the configuration can't be used.
+/// Exit code: the configuration is invalid.
 pub const WRONG_CONFIGURATION: u8 = 2;
 
 /// The options that both programs have.
@@ -26,13 +26,13 @@ pub struct CommonArgs {
     pub pid_file: Option<PathBuf>,
 }
 
-/// Reads a configuration file. What is wrong in it is printed, in one line.
+/// Reads a configuration file. Prints what is invalid in it, in one line.
 ///
 /// # Errors
-/// The program's exit code, where the configuration can't be used.
+/// The program's exit code, if the configuration is invalid.
 pub fn read<C: Configuration>(file: &Path) -> Result<LoadedConfig<C>, ExitCode> {
     config::load(file).map_err(|error| {
-        // A key may hold anything.
+        // A key may contain any text.
         eprintln!("error: {}", one_line(&error.to_string()));
         ExitCode::from(WRONG_CONFIGURATION)
     })
@@ -45,7 +45,7 @@ pub fn check<C: Configuration>(loaded: &LoadedConfig<C>) -> ExitCode {
     }
     match serde_json::to_string_pretty(&loaded.config) {
         Ok(text) => {
-            // The reader may have gone.
+            // The reader may have closed the pipe.
             writeln!(std::io::stdout(), "{text}").ok();
             ExitCode::SUCCESS
         }
@@ -56,7 +56,7 @@ pub fn check<C: Configuration>(loaded: &LoadedConfig<C>) -> ExitCode {
     }
 }
 
-/// Starts the log, writes the process id where that is asked for, and runs a server to its end.
+/// Starts the log, writes the PID file if requested, and runs a server until it stops.
 pub fn serve<E: std::error::Error>(
     target: LogTarget<'_>,
     options: &CommonArgs,
@@ -71,12 +71,12 @@ pub fn serve<E: std::error::Error>(
     if let Err(error) = logging::start(target) {
         return failed(&format!("the log {target} can't be written: {error}"));
     }
-    // A panic is a fault in this program. It is logged, as nobody reads the terminal of a service.
+    // A panic is a bug in this program. It is logged, because a service has no terminal.
     std::panic::set_hook(Box::new(|panic| log::error!("{panic}")));
     for warning in warnings {
         log::warn!("{warning}");
     }
-    // It is not dropped: that would wait for threads which the system keeps busy, as in a slow lookup of a name.
+    // It is not dropped, because that would wait for blocking threads, as in a slow lookup of a name.
     let system = ManuallyDrop::new(actix_rt::System::new());
     match system.block_on(server) {
         Ok(()) => ExitCode::SUCCESS,
@@ -87,11 +87,11 @@ pub fn serve<E: std::error::Error>(
     }
 }
 
-/// Tells the log, standard output and the service manager that a server can be reached: its HTTP URL, and that of its
-/// WebSocket.
+/// Reports to the log, standard output and the service manager that a server is reachable: its HTTP URL and its
+/// WebSocket URL.
 pub fn announce(server: &str, http: &str, websocket: &str, port: u16) {
     log::info!("{server} {} listens on port {port}: {http}", env!("CARGO_PKG_VERSION"));
-    // The reader may have gone.
+    // The reader may have closed the pipe.
     writeln!(std::io::stdout(), "{server:<18} {http}/monitor   {websocket}").ok();
     service_manager::ready(port);
 }

@@ -1,4 +1,4 @@
-//! Starts actors again that have panicked, and gives up when that happens too often.
+//! Restarts actors that have panicked, and gives up if that happens too often.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::fmt::Display;
@@ -6,18 +6,18 @@ use std::time::{Duration, Instant};
 
 use actix::prelude::*;
 
-/// How many panics of one kind of actor there may be within [`WINDOW`].
+/// Limit of panics of one kind of actor within [`WINDOW`].
 const MOST_PANICS: usize = 5;
 const WINDOW: Duration = Duration::from_mins(1);
 
-/// All actors of one kind, by what each is for. actix does not restart an actor that has panicked.
+/// All actors of one kind, by key. actix does not restart an actor that has panicked.
 pub struct Supervisor<K, A: Actor> {
     kind: &'static str,
     actors: BTreeMap<K, Addr<A>>,
     panics: VecDeque<Instant>,
 }
 
-/// Actors of one kind panic again and again: the server is to end, and to be started anew.
+/// Actors of one kind panic again and again: the server must exit and be restarted.
 #[derive(Debug, PartialEq, Eq, thiserror::Error)]
 #[error("more than {MOST_PANICS} panics of one kind of actor ({kind}) within {} s", WINDOW.as_secs())]
 pub struct TooManyPanics {
@@ -35,7 +35,7 @@ impl<K: Ord + Display, A: Actor> Supervisor<K, A> {
         self.actors.insert(key, actor);
     }
 
-    /// Forgets an actor, and returns it.
+    /// Removes an actor, and returns it.
     pub fn remove(&mut self, key: &K) -> Option<Addr<A>> {
         self.actors.remove(key)
     }
