@@ -1,4 +1,4 @@
-//! The folder `cacheDir`, which one server has to itself.
+//! The directory `cacheDir`, which only one server may use.
 
 use std::fs::{File, Metadata, TryLockError};
 use std::io;
@@ -8,23 +8,24 @@ use std::time::{Duration, Instant};
 
 use nix::fcntl::OFlag;
 
-/// The folder `cacheDir`, locked as long as this lives and the process runs.
+/// The directory `cacheDir`, locked until this is dropped or the process exits.
 #[derive(Debug)]
 pub struct CacheDir {
     folder: PathBuf,
     _lock: File,
 }
 
-/// How long a server that was killed may still hold the lock: a child that it was just starting has it until it runs.
+/// Time for which a killed server may still hold the lock: a child forked just before keeps the descriptor until
+/// `execve`.
 const LOCK_WAIT: Duration = Duration::from_secs(1);
-/// Time between two attempts to lock.
+/// Interval between two attempts to lock.
 const PAUSE: Duration = Duration::from_millis(20);
 
 impl CacheDir {
-    /// Makes the folder if need be, and locks it. Blocks for up to a second: for the start.
+    /// Creates the directory if necessary, and locks it. Blocks for up to a second, which is acceptable during start.
     ///
     /// # Errors
-    /// When the folder can't be made, or another server uses it.
+    /// When the directory can't be created, or another server uses it.
     pub fn claim(folder: &Path) -> io::Result<Self> {
         std::fs::create_dir_all(folder)?;
         let folder = folder.canonicalize()?;
@@ -49,8 +50,8 @@ impl CacheDir {
     }
 }
 
-/// Opens the file that is locked. Without a sandbox, a world's program may have put something else in its place: a FIFO
-/// would make the start wait for ever, a link lead elsewhere.
+/// Opens the lock file. Without a sandbox, a world's program may have replaced it: opening a FIFO would block, and a
+/// symlink would resolve to another file.
 fn open(path: &Path) -> io::Result<File> {
     let is_file = |about: &Metadata| about.is_file();
     if path.symlink_metadata().is_ok_and(|about| !is_file(&about)) {

@@ -1,4 +1,4 @@
-//! How forges spell their repositories: GitLab sends to `REPOSITORY.git` who asks without the ending.
+//! The canonical URLs of repositories: GitLab redirects requests without the ending `.git` to `REPOSITORY.git`.
 
 use std::collections::HashMap;
 
@@ -6,15 +6,15 @@ use parking_lot::Mutex;
 
 use super::mirrors::Remote;
 
-/// Remotes as their forges spell them, by their keys.
+/// Canonical remotes, by [`Remote::key`].
 #[derive(Debug, Default)]
 pub struct CanonicalRemotes(Mutex<HashMap<String, Remote>>);
 
-/// How many are remembered.
+/// Number of remotes from which on all are dropped.
 const MOST: usize = 1000;
 
 impl CanonicalRemotes {
-    /// Remembers how a forge spells a remote.
+    /// Records the canonical URL of a remote.
     pub fn insert(&self, remote: Remote) {
         let mut known = self.0.lock();
         if known.len() >= MOST {

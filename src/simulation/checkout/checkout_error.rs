@@ -1,4 +1,4 @@
-//! Why a checkout failed, in words for its client. Pure.
+//! Why a checkout failed, as text for its client. Pure.
 
 use std::io;
 use std::time::Duration;
@@ -7,32 +7,32 @@ use super::git_error::{Cause, GitError};
 use super::world_file::WorldFileError;
 use crate::shared::domain::ProjectUrl;
 
-/// Why a checkout failed. Its words are for the client.
+/// Why a checkout failed. The messages are for the client.
 #[derive(Debug, Clone, thiserror::Error)]
 pub enum CheckoutError {
-    /// No way to this forge.
+    /// This Git host is not supported.
     #[error(
         "This simulation server takes worlds from github.com and from the mirrors that it is configured with, not from {0}"
     )]
     Forge(String),
-    /// The repository is not there.
+    /// The repository does not exist.
     #[error("{0} does not exist or is not public")]
     NoRepository(String),
-    /// Its forge sends elsewhere.
+    /// Its Git host redirects to another URL.
     #[error("{0} has moved {1}")]
     Moved(String, String),
-    /// The reference is not there.
+    /// The reference does not exist.
     #[error("{repository} has no branch, tag or commit called {reference:?}")]
     NoReference {
         /// The repository's URL.
         repository: String,
-        /// As the URL has it.
+        /// The reference, as in the URL.
         reference: String,
     },
     /// The world can't be opened.
     #[error(transparent)]
     World(#[from] WorldFileError),
-    /// The commit is not one that the repository's owner vouches for.
+    /// The commit is in no branch or tag of the repository.
     #[error(
         "{commit} is in no branch or tag of {repository}. Forges also hand out commits that a repository's owner never \
          accepted; this simulation server runs them only if its administrator sets anyCommit"
@@ -40,10 +40,10 @@ pub enum CheckoutError {
     NotReachable {
         /// The repository's URL.
         repository: String,
-        /// The hash.
+        /// The hash of the commit.
         commit: String,
     },
-    /// It took too long.
+    /// It exceeded its timeout.
     #[error("Fetching {repository} took longer than {seconds} seconds")]
     TooSlow {
         /// The repository's URL.
@@ -51,20 +51,20 @@ pub enum CheckoutError {
         /// The limit.
         seconds: u64,
     },
-    /// It is too large.
+    /// It exceeds the size limit.
     #[error("{what} is larger than {limit} MiB")]
     TooLarge {
-        /// What.
+        /// What is too large.
         what: String,
         /// The limit.
         limit: u64,
     },
-    /// It takes more of git, or of this server, than is allowed.
+    /// git needs more memory, or gives a longer answer, than is allowed.
     #[error("{repository} takes more memory than this simulation server allows: {source}")]
     TooMuch {
         /// The repository's URL.
         repository: String,
-        /// What git says.
+        /// The error of git.
         source: GitError,
     },
     /// git failed.
@@ -72,21 +72,21 @@ pub enum CheckoutError {
     Git {
         /// The repository's URL.
         repository: String,
-        /// What git says.
+        /// The error of git.
         source: GitError,
     },
-    /// The cached repository is broken.
+    /// The cached repository is corrupt.
     #[error("{repository} can't be checked out: {source}")]
     Damaged {
         /// The repository's URL.
         repository: String,
-        /// What git says.
+        /// The error of git.
         source: GitError,
     },
     /// The machine failed.
     #[error("{0} can't be checked out: {1}")]
     Machine(String, String),
-    /// The file to restore is not there.
+    /// The file to restore does not exist.
     #[error("{0:?} is no file below the project's controllers folder")]
     NoController(String),
 }

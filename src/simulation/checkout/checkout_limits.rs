@@ -1,13 +1,14 @@
-//! What a checkout may take. Pure.
+//! Limits of a checkout. Pure.
 
 use std::time::Duration;
 
-/// What a checkout may take.
+/// Limits of a checkout.
 #[derive(Debug, Clone, Copy)]
 pub struct CheckoutLimits {
-    /// Time limit of a whole checkout: the fetch, the copy and large files.
+    /// Timeout of a whole checkout: the fetch, the copy and large files.
     pub time: Duration,
-    /// In bytes: what is fetched, and what is checked out. Each file and folder counts at least what it takes of a disk.
+    /// Size limit of a fetch, and of a checkout, in bytes. Each file and directory counts at least the space of its
+    /// entry.
     pub size: u64,
     /// Whether any commit may be fetched by its hash, not only those of branches and tags.
     pub any_commit: bool,

@@ -1,7 +1,7 @@
-//! Checks worlds out of git for clients: cached, joined, cancellable, with progress.
+//! Checks worlds out with git for clients: cached, joined, cancellable, with progress.
 //!
-//! First the commit is brought into the cache (see [`super::commit_resolver`]); then each client gets its own copy of the
-//! project's folder. Both run on the server's main thread as tasks: whoever drops the handle no longer waits.
+//! First the commit is fetched into the cache (see [`super::commit_resolver`]); then each client gets its own copy of
+//! the project's directory. Both run as tasks on the server's main thread; dropping the handle cancels them.
 
 use std::io;
 use std::path::Path;
@@ -37,27 +37,27 @@ pub struct CheckoutService {
     finder: Arc<CommitResolver>,
     limits: CheckoutLimits,
     runtime: Handle,
-    /// How many projects are copied at a time.
+    /// Limits the number of projects that are copied at a time.
     copies: Semaphore,
     has_lfs: bool,
     _keeps_within_budget: AbortOnDropHandle<()>,
 }
 
-/// How many projects are copied at a time: git may hold files in memory as it writes them.
+/// Projects that are copied at a time: git may hold files in memory while it writes them.
 const COPIES: usize = 16;
 
-/// A step of a checkout, in words.
+/// A step of a checkout, as text for the client.
 #[derive(Message)]
 #[rtype(result = "()")]
 pub struct Progress(pub String);
 
 impl CheckoutService {
-    /// Prepares checkouts on the thread whose runtime this is. `run` is the folder of this run of the server; the
-    /// cached repositories may take `budget` bytes; `config` is a file of settings for git; `rules` say where a forge may
-    /// send to.
+    /// Prepares checkouts on the thread of this runtime. `run` is the directory of this run of the server; the cached
+    /// repositories may use `budget` bytes; `config` is a file of settings for git; `rules` limit redirects of Git
+    /// hosts.
     ///
     /// # Errors
-    /// When the cache can't be made.
+    /// When the cache can't be created.
     pub fn open(
         dir: CacheDir,
         run: &Path,
@@ -75,7 +75,7 @@ impl CheckoutService {
         Ok(Self { git, cache, finder, limits, runtime, copies, has_lfs, _keeps_within_budget: keeper })
     }
 
-    /// Starts to check a world out into a client's folder. `progress` hears each step in words.
+    /// Starts to check a world out into a client's directory. `progress` receives each step as text.
     pub fn start(
         self: &Arc<Self>,
         world: ProjectUrl,
@@ -126,11 +126,10 @@ impl CheckoutService {
         })
     }
 
-    /// Throws a cached repository away that was found to be broken, unless it was made after `since`: it can be fetched
-    /// anew.
+    /// Discards a cached repository that is corrupt, unless it was created after `since`, so that it is fetched again.
     ///
     /// # Errors
-    /// The failure, if it is another one.
+    /// The failure, if it has another cause.
     async fn mend(&self, world: &ProjectUrl, since: Instant, failure: CheckoutError) -> Result<(), CheckoutError> {
         let CheckoutError::Damaged { .. } = &failure else {
             return Err(failure);
@@ -139,7 +138,7 @@ impl CheckoutService {
         self.finder.discard(world, since).await
     }
 
-    /// Finds and copies a project, with its large files.
+    /// Resolves and copies a project, with its large files.
     async fn attempt(
         &self,
         world: &ProjectUrl,
@@ -169,10 +168,10 @@ impl CheckoutService {
         Err(too_large("The project".to_owned(), self.limits.size))
     }
 
-    /// Restores a file below the project's `controllers` folder to the state of the checkout.
+    /// Restores a file below the project's `controllers` directory to the state of the checkout.
     ///
     /// # Errors
-    /// When it is no file of the checkout there, or git fails.
+    /// When it is not a file of the checkout there, or git fails.
     pub async fn restore_controller(&self, project: &Project, file: &str) -> Result<(), CheckoutError> {
         let refused = || CheckoutError::NoController(file.to_owned());
         let path = file_restore::controller(&project.revision.folder, file).ok_or_else(refused)?;
@@ -187,7 +186,7 @@ impl CheckoutService {
         if is_there { Ok(()) } else { Err(refused()) }
     }
 
-    /// Restores a file of a project's repository. Returns whether it is there.
+    /// Restores a file of a project's repository. Returns whether it exists.
     async fn restore(&self, project: &Project, path: &str) -> Result<bool, CheckoutError> {
         let Project { url, revision, instance, .. } = project;
         let Some(repository) = self.finder.file(url, revision, path).await? else {

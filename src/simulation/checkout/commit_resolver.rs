@@ -1,4 +1,4 @@
-//! Finds the commit that a world's URL names, and brings it into the cache: once for all who want it at the same time.
+//! Resolves a world's URL to a commit, and fetches it into the cache: once for all clients that wait for it.
 
 use std::sync::Arc;
 use std::time::Instant;
@@ -21,7 +21,7 @@ use super::steps;
 use super::world_file::WorldFileError;
 use crate::shared::domain::{AdmissionRules, ProjectUrl};
 
-/// Finds commits; one for the whole server.
+/// Resolves commits; one for the whole server.
 #[derive(Debug)]
 pub struct CommitResolver {
     git: Arc<Git>,
@@ -36,21 +36,21 @@ pub struct CommitResolver {
 /// A world's commit in the cache.
 #[derive(Debug)]
 pub struct ResolvedCommit {
-    /// Where it is.
+    /// The repository that contains it.
     pub repository: Arc<Repository>,
-    /// What it is.
+    /// The commit and the project's directory in it.
     pub revision: Revision,
-    /// The files of the folders above the project's, each path ended by a zero byte: worlds may refer to them.
+    /// The files of the directories above the project's, each path ended by a zero byte: worlds may refer to them.
     pub above: Vec<u8>,
 }
 
-/// What git says of a commit in the cache.
+/// git's answer about a commit in the cache.
 enum Answer {
-    /// What it was asked for.
+    /// The requested text.
     Text(Vec<u8>),
-    /// The reference names a file alone.
+    /// The reference is a single file (a blob).
     File,
-    /// The commit is not there.
+    /// The commit is not in the cache.
     Absent,
 }
 
@@ -66,10 +66,10 @@ impl CommitResolver {
         Self { git, cache, mirrors, rules, limits, searches, spellings }
     }
 
-    /// Waits for a world's commit to be in the cache, together with everybody who waits for the same.
+    /// Waits until a world's commit is in the cache. Callers with the same world share one search.
     ///
     /// # Errors
-    /// Why it can't be there.
+    /// Why it can't be fetched.
     pub async fn find(
         self: &Arc<Self>,
         world: &ProjectUrl,
@@ -80,10 +80,10 @@ impl CommitResolver {
         self.searches.join(world.clone(), progress, search).await
     }
 
-    /// The world in the repository to which its forge sends.
+    /// The same world in the repository to which its Git host redirects.
     ///
     /// # Errors
-    /// When that may not be followed.
+    /// When the redirect may not be followed.
     pub async fn moved(&self, world: &ProjectUrl) -> Result<ProjectUrl, CheckoutError> {
         let repository = self.repository(world).await?;
         let (moved, remote) = redirect::follow(&self.git, &repository, (&self.mirrors, &self.rules), world).await?;
@@ -91,7 +91,7 @@ impl CommitResolver {
         Ok(moved)
     }
 
-    /// The first of the commits that a URL may mean in which its world is.
+    /// Returns the first of the commits that a URL may mean that contains its world.
     async fn search(&self, world: &ProjectUrl, told: &watch::Sender<String>) -> Result<ResolvedCommit, CheckoutError> {
         let progress = |step| drop(told.send_replace(step));
         progress(steps::looking_for(&world.repository()));
@@ -130,7 +130,7 @@ impl CommitResolver {
         Ok(self.spellings.of(remote))
     }
 
-    /// The commits that a URL may mean, the likeliest first.
+    /// The commits that a URL may mean, the most likely first.
     async fn revisions(&self, search: RemoteQuery<'_>) -> Result<Vec<Revision>, CheckoutError> {
         if let Some(commit) = revision::commit_of(search.world, self.limits.any_commit) {
             return Ok(vec![commit]);
@@ -139,8 +139,8 @@ impl CommitResolver {
         Ok(revision::found(search.world, &answer))
     }
 
-    /// Whether there is a file at a path of a commit that was found before. It is fetched again if it has left the cache
-    /// meanwhile. Returns the repository if so.
+    /// Checks that a file exists at a path of a commit that was found before. The commit is fetched again if it was
+    /// evicted from the cache. Returns the repository if the file exists.
     ///
     /// # Errors
     /// When the commit can't be read.
@@ -157,8 +157,8 @@ impl CommitResolver {
         Ok(is_file.then_some(repository))
     }
 
-    /// Has git list a path of a commit, which is fetched before if it is not in the cache. Nothing where the revision is no
-    /// folder.
+    /// Lists a path of a commit with git; the commit is fetched first if it is not in the cache. Returns `None` if the
+    /// revision is a single file.
     async fn read(
         &self,
         search: RemoteQuery<'_>,
@@ -217,7 +217,7 @@ impl CommitResolver {
         repository.fetch(&revision.request(&repository.remote().location), &tell).await.map_err(failed)
     }
 
-    /// Throws away what is cached of a world's repository, unless it was made after `since`.
+    /// Discards what is cached of a world's repository, unless it was created after `since`.
     ///
     /// # Errors
     /// When it can't be removed.

@@ -1,4 +1,4 @@
-//! File work on cached repositories, all of which blocks.
+//! Blocking file I/O on cached repositories.
 
 use std::fs;
 use std::io;
@@ -8,18 +8,18 @@ use std::time::Duration;
 use crate::simulation::process::disk_usage::{self, DiskUsage};
 use crate::simulation::process::remove_tree;
 
-/// Time between two looks at how much was written.
+/// Interval between two checks of the written size.
 const BETWEEN_LOOKS: Duration = Duration::from_millis(500);
 
-/// Does file work on a thread that serves nobody.
+/// Runs blocking file I/O on the blocking thread pool.
 ///
 /// # Errors
-/// Those of the work.
+/// Those of `work`.
 pub async fn blocking<T: Send + 'static>(work: impl FnOnce() -> io::Result<T> + Send + 'static) -> io::Result<T> {
     actix_rt::task::spawn_blocking(work).await?
 }
 
-/// Removes what a git that was killed has left: a lock that would make every later fetch fail, and half a pack.
+/// Removes what a killed git has left: a lock that would make every later fetch fail, and incomplete packs.
 ///
 /// # Errors
 /// When that can't be done.
@@ -31,7 +31,7 @@ pub fn remove_leftovers(repository: &Path) -> io::Result<()> {
     Ok(())
 }
 
-/// Removes folders, with all that is inside, as far as they are there.
+/// Removes those of these directories that exist, with their contents.
 ///
 /// # Errors
 /// When that can't be done.
@@ -39,7 +39,7 @@ pub fn remove_all(folders: &[&Path]) -> io::Result<()> {
     folders.iter().try_for_each(|folder| remove_tree(folder))
 }
 
-/// What is not there need not be removed.
+/// Treats `NotFound` as success.
 fn absent(result: io::Result<()>) -> io::Result<()> {
     result.or_else(|error| if error.kind() == io::ErrorKind::NotFound { Ok(()) } else { Err(error) })
 }
@@ -54,7 +54,7 @@ pub fn received(repository: &Path) -> u64 {
     unfinished(repository).map(|path| length(&path)).sum()
 }
 
-/// The packs that are being received or made.
+/// The packs that are being received or written.
 fn unfinished(repository: &Path) -> impl Iterator<Item = PathBuf> {
     let is_new = |name: &[u8]| name.starts_with(b"tmp_") || name.starts_with(b".tmp-");
     files(&repository.join("objects/pack"))
@@ -69,7 +69,7 @@ fn length(file: &Path) -> u64 {
     file.metadata().map_or(0, |about| about.len())
 }
 
-/// A folder, and how much it may take.
+/// A directory and its size limit in bytes.
 #[derive(Debug, Clone)]
 pub struct Growing {
     folder: PathBuf,
@@ -83,7 +83,7 @@ impl Growing {
     }
 }
 
-/// Waits until one of the folders takes more than it may.
+/// Waits until one of the directories exceeds its limit.
 pub async fn outgrown(folders: Vec<Growing>) {
     loop {
         actix_rt::time::sleep(BETWEEN_LOOKS).await;

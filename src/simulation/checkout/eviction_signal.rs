@@ -1,10 +1,10 @@
-//! How the cache learns that it may have something to remove.
+//! The signal that wakes the eviction of cached repositories.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use tokio::sync::Notify;
 
-/// Tells the cache that it may have something to remove.
+/// Wakes the eviction of the cache.
 #[derive(Debug, Default)]
 pub struct EvictionSignal {
     over_budget: AtomicBool,
@@ -12,24 +12,24 @@ pub struct EvictionSignal {
 }
 
 impl EvictionSignal {
-    /// A repository has grown.
+    /// Signals that a repository has grown.
     pub fn grown(&self) {
         self.changed.notify_one();
     }
 
-    /// Notes whether the cache is larger than its budget.
+    /// Records whether the cache exceeds its budget.
     pub fn set_over_budget(&self, is_over: bool) {
         self.over_budget.store(is_over, Ordering::Relaxed);
     }
 
-    /// A repository is no longer in use.
+    /// Signals that a repository is no longer in use, if the cache exceeds its budget.
     pub fn left(&self) {
         if self.over_budget.load(Ordering::Relaxed) {
             self.changed.notify_one();
         }
     }
 
-    /// Waits until there may be something to remove.
+    /// Waits until a repository may have to be evicted.
     pub async fn changed(&self) {
         self.changed.notified().await;
     }

@@ -1,8 +1,9 @@
-//! A file of a project that is restored while its simulation runs.
+//! Restores a file of a project while its simulation runs.
 //!
-//! The simulation's programs may change every folder of the project at any moment, also between two steps of git: a link
-//! in place of a folder would have git write elsewhere, in the name of the server. So git writes into a folder that a
-//! sandbox does not show, and from there the file is moved into its folder, which the kernel looks up through no link.
+//! The simulation's programs may change every directory of the project at any moment, also between two steps of git: a
+//! symlink in place of a directory would make git write elsewhere with the server's rights. So git writes into a
+//! directory that the sandbox does not mount, and the file is moved from there into its directory, which the kernel
+//! resolves without symlinks.
 
 use std::fs::File;
 use std::io;
@@ -13,7 +14,7 @@ use tempfile::TempDir;
 
 use super::disk::blocking;
 
-/// A folder into which git writes what is restored, removed with this.
+/// A directory into which git writes the restored file; removed on drop.
 #[derive(Debug)]
 pub struct FileRestore {
     folder: TempDir,
@@ -28,7 +29,7 @@ pub fn controller(place: &str, file: &str) -> Option<String> {
 }
 
 impl FileRestore {
-    /// Makes the folder in the folder of an instance.
+    /// Creates the directory in the directory of an instance.
     ///
     /// # Errors
     /// When that can't be done.
@@ -39,18 +40,18 @@ impl FileRestore {
         Ok(restored)
     }
 
-    /// The folder.
+    /// The directory, with scratch files of git.
     pub fn path(&self) -> &Path {
         self.folder.path()
     }
 
-    /// Where git writes the file.
+    /// The directory into which git writes the file.
     pub fn files(&self) -> PathBuf {
         self.path().join("files")
     }
 
-    /// Moves the file at this path of the repository to the same path of the project. Returns false where its folder is
-    /// none any more, or a folder has taken its place.
+    /// Moves the file at this path of the repository to the same path of the project. Returns false if its parent is no
+    /// longer a directory, or a directory has replaced the file.
     ///
     /// # Errors
     /// When the project can't be opened.

@@ -1,4 +1,4 @@
-//! Runs git: without a shell, without prompts and hooks, with one protocol, and ended with whoever waits for it.
+//! Runs git: without a shell, without prompts and hooks, with one protocol. Dropping the future ends git.
 
 use std::ffi::{OsStr, OsString};
 use std::path::{Path, PathBuf};
@@ -9,10 +9,10 @@ use rustix::process::Resource;
 use super::git_error::GitError;
 use crate::simulation::process::{ExitReason, Ran, Run, RunError};
 
-/// How git is run by this server.
+/// Runs git with this server's settings.
 #[derive(Debug)]
 pub struct Git {
-    /// The file with its settings, and what belongs into it.
+    /// The file with git's settings, and its text.
     settings: (PathBuf, String),
     mark: PathBuf,
 }
@@ -20,7 +20,7 @@ pub struct Git {
 /// One git command.
 #[derive(Debug, Clone)]
 pub struct Call<'call> {
-    /// The bare repository it works on.
+    /// The bare repository.
     pub repository: &'call Path,
     /// Settings that it needs, each as `name=value`.
     pub settings: Vec<String>,
@@ -28,21 +28,21 @@ pub struct Call<'call> {
     pub arguments: Vec<OsString>,
     /// The one protocol that it may use.
     pub protocol: &'static str,
-    /// How much memory it may take, in bytes, without the files that it maps.
+    /// Memory limit in bytes, without mapped files.
     pub memory: u64,
-    /// How large a file may be that it writes, in bytes.
+    /// Size limit of a written file, in bytes.
     pub file_size: Option<u64>,
-    /// How long it may take.
+    /// Timeout of the command.
     pub time: Duration,
-    /// Further variables.
+    /// Additional environment variables.
     pub environment: Vec<(OsString, OsString)>,
 }
 
-/// git reads this in place of the settings of the user as whom the server runs, for a world's program could have written
-/// those. What the administrator has set for the machine, or in the file that `gitConfig` names, holds where this says
-/// nothing else. Any repository may be read: a mirror may belong to somebody else, and nothing that it holds is run.
-/// Redirects are not followed: they could lead to a repository, or into a network, that the configuration forbids. A remote
-/// that has sent nothing for too long is given up.
+/// git reads this instead of the settings of the server's user, because a world's program could have written those. The
+/// settings of the system, and of the file that `gitConfig` names, apply unless this overrides them. Any repository may
+/// be read: a mirror may belong to another user, and nothing in it is executed. Redirects are off: they could resolve
+/// to a repository, or into a network, that the configuration forbids. A remote that stays silent for too long is given
+/// up.
 const SETTINGS: &str = "\
 [safe]
 	directory = *
@@ -76,17 +76,17 @@ const SETTINGS: &str = "\
 	detachedHead = false
 ";
 
-/// How much memory git may take, in bytes, for an answer of a remote, which is enough for a million branches, or for a copy.
+/// Memory limit in bytes for an answer of a remote, which is enough for a million branches, or for a copy.
 pub const LITTLE_MEMORY: u64 = 512 << 20;
-/// How much memory a git process may take at most.
+/// Largest memory limit of a git process, in bytes.
 pub const MOST_MEMORY: u64 = 2 << 30;
-/// The commands that may keep all cores busy for long: simulations that run already come before them.
+/// Commands that may keep all cores busy for long: running simulations have priority.
 const HEAVY: [&str; 2] = ["fetch", "gc"];
-/// How much less priority these have, as `nice` has it.
+/// The niceness of these commands.
 const NICENESS: i32 = 10;
-/// The most that is read of a command's answer, in bytes.
+/// Size limit of a command's answer, in bytes.
 const LARGEST_ANSWER: u64 = 64 * 1024 * 1024;
-/// The most that is kept of a line of what it says besides, in bytes.
+/// Longest line of standard error that is kept, in bytes.
 const LONGEST_LINE: usize = 500;
 
 impl Git {
@@ -101,7 +101,7 @@ impl Git {
         Self { settings, mark: run.to_owned() }
     }
 
-    /// Writes the settings, unless they are there as they should be.
+    /// Writes the file of settings, unless it has the right text.
     async fn write_settings(&self) -> std::io::Result<()> {
         let (file, text) = self.settings.clone();
         let write = move || {
@@ -116,9 +116,9 @@ impl Git {
         actix_rt::task::spawn_blocking(write).await?
     }
 
-    /// Runs a command to its end. Returns its answer. `progress` hears each line of progress.
+    /// Runs a command to its end. Returns its answer. `progress` receives each line of standard error.
     ///
-    /// Dropping the future ends git and all that it has started.
+    /// Dropping the future ends git and its child processes.
     ///
     /// # Errors
     /// When git can't be started, fails, or takes too long.
@@ -164,14 +164,14 @@ impl Git {
         run.niceness = if HEAVY.contains(&name) { NICENESS } else { 0 };
         run.limits.push((Resource::Data, call.memory));
         if let Some(size) = call.file_size {
-            // Who writes more is ended by the system, which should keep nothing of it.
+            // A larger write ends git with SIGXFSZ, which must not leave a core dump.
             run.limits.extend([(Resource::Core, 0), (Resource::Fsize, size)]);
         }
         run
     }
 }
 
-/// Of what git says, the first fatal line names the cause, else the first error; what follows only tells what came of it.
+/// Ranks git's messages: the first fatal line names the cause, else the first error; later lines are consequences.
 fn weight(line: &str) -> u8 {
     if line.starts_with("fatal:") { 2 } else { u8::from(line.starts_with("error:")) }
 }

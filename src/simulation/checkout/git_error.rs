@@ -11,23 +11,23 @@ pub enum GitError {
     /// The machine can't run git.
     #[error("{0}")]
     Machine(String),
-    /// It ended with another exit code than 0, or by a signal.
+    /// It exited with another code than 0, or by a signal.
     #[error("git {command} {ending}: {message}")]
     Failed {
-        /// Which command.
+        /// The git command, such as `fetch`.
         command: String,
-        /// How it ended.
+        /// Its exit code or signal.
         ending: ExitReason,
-        /// What it said of the cause.
+        /// Its message about the cause.
         message: String,
     },
-    /// It answered more than is read.
+    /// Its answer exceeds the size limit.
     #[error("the answer of git {0} is too long")]
     TooLong(String),
-    /// It has brought more than may come.
+    /// The fetch exceeds the size limit.
     #[error("it is too large")]
     TooLarge,
-    /// It took too long.
+    /// It exceeded its timeout.
     #[error("git did not end within {} seconds", .0.as_secs())]
     Slow(Duration),
 }
@@ -38,28 +38,28 @@ impl From<io::Error> for GitError {
     }
 }
 
-/// What a failure means for whoever wanted the command.
+/// What a failure means for the caller.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Cause {
-    /// The remote has no such repository, or shows it to nobody.
+    /// The repository does not exist, or is not public.
     NoRepository,
-    /// The remote does not hand out the commit.
+    /// The remote does not have the commit, or does not serve it.
     NoCommit,
-    /// The remote sends elsewhere.
+    /// The remote redirects to another URL.
     Moved,
-    /// It takes more memory than git may have, or more than is read of its answer.
+    /// It exceeds git's memory limit, or the size limit of an answer.
     TooMuch,
-    /// The cached repository is broken.
+    /// The cached repository is corrupt.
     Damaged,
     /// The machine or its network fails.
     Machine,
-    /// Something else: most of all the remote.
+    /// Something else, mostly a failure of the remote.
     Other,
 }
 
-/// git ends with the same exit codes whatever the cause is, so its words must tell (`LC_ALL=C`). This is the only place
-/// that reads them. The first that is found counts. git asks for a user's name where a forge says 'not found': forges
-/// don't tell private from missing.
+/// git's exit codes do not depend on the cause, so its messages must be parsed (`LC_ALL=C`). Only this table does that.
+/// The first match counts. git asks for a user name if a Git host answers 'not found': Git hosts don't distinguish
+/// private from missing repositories.
 const MESSAGES: &[(&str, Cause)] = &[
     ("No space left on device", Cause::Machine),
     ("Disk quota exceeded", Cause::Machine),
@@ -68,7 +68,7 @@ const MESSAGES: &[(&str, Cause)] = &[
     ("Too many open files", Cause::Machine),
     ("Cannot allocate memory", Cause::Machine),
     ("Resource temporarily unavailable", Cause::Machine),
-    // Hosts are those of the configuration: a URL with another one does not come so far.
+    // These hosts come from the configuration: URLs with other hosts are refused before.
     ("Could not resolve host", Cause::Machine),
     ("Failed to connect to", Cause::Machine),
     ("Couldn't connect to", Cause::Machine),
@@ -102,7 +102,7 @@ const MESSAGES: &[(&str, Cause)] = &[
     ("reference broken", Cause::Damaged),
     ("invalid reference", Cause::Damaged),
     ("did not send all necessary objects", Cause::Damaged),
-    // A lock that a killed git has left.
+    // The lock of a killed git.
     ("File exists", Cause::Damaged),
 ];
 

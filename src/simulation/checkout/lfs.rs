@@ -1,4 +1,4 @@
-//! Git LFS: large files that a repository only points to.
+//! Git LFS: large files of which a repository contains only pointers.
 
 use std::path::Path;
 
@@ -6,9 +6,9 @@ use which::which;
 
 use super::mirrors::Remote;
 
-/// How a pointer begins.
+/// The first bytes of a pointer.
 const BEGINNING: &[u8] = b"version https://git-lfs.github.com/spec/";
-/// No pointer is larger, in bytes.
+/// Size limit of a pointer, in bytes.
 const LARGEST: u64 = 1024;
 
 /// How many pointers there are below a folder. Reads from disk: not for a thread that serves others.
@@ -43,13 +43,13 @@ pub fn settings(remote: &Remote) -> Vec<String> {
     };
     vec![
         format!("lfs.url={url}"),
-        // For a folder, git-lfs looks here.
+        // For a local directory, git-lfs reads this.
         format!("remote.origin.url={url}"),
         "filter.lfs.process=git-lfs filter-process".to_owned(),
         "filter.lfs.smudge=git-lfs smudge -- %f".to_owned(),
         "filter.lfs.clean=git-lfs clean -- %f".to_owned(),
         "filter.lfs.required=false".to_owned(),
-        // A file that can't be had stays a pointer, and is told.
+        // A file that can't be loaded stays a pointer, and is reported.
         "lfs.skipdownloaderrors=true".to_owned(),
         "lfs.locksverify=false".to_owned(),
     ]

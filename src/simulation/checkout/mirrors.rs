@@ -1,4 +1,4 @@
-//! From where a repository is cloned. Pure.
+//! The remote of a repository, or of its mirror. Pure.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -20,10 +20,10 @@ struct Mirror {
     replacement: String,
 }
 
-/// Where git finds a repository.
+/// The remote of a repository.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub struct Remote {
-    /// What git is given.
+    /// The URL or path for git.
     pub location: String,
     /// The one protocol that git may use for it.
     pub protocol: &'static str,
@@ -40,10 +40,10 @@ impl Remote {
     }
 }
 
-/// The forge that needs no mirror.
+/// The Git host that needs no mirror.
 const GITHUB: &str = "https://github.com";
 
-/// What must be escaped in a path segment of a URL.
+/// Characters that must be escaped in a path segment of a URL.
 const ESCAPED: &AsciiSet =
     &CONTROLS.add(b' ').add(b'"').add(b'#').add(b'%').add(b'<').add(b'>').add(b'?').add(b'`').add(b'{').add(b'}');
 

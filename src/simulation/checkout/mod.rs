@@ -1,6 +1,6 @@
-//! A client's world, checked out of git: cached, fetched once for all who want it, cancellable, with progress.
+//! A client's world, checked out with git: cached, fetched once for all clients of it, cancellable, with progress.
 //!
-//! To change how long a fetch may take, or how much it may bring, see [`limits`]; what git obeys, see [`git`].
+//! For the timeout and the size limit of a fetch see [`checkout_limits`]; for git's settings see [`git`].
 
 mod cache_dir;
 mod canonical_remotes;

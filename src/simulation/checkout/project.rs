@@ -7,19 +7,19 @@ use super::world_file::WorldFile;
 use crate::shared::domain::ProjectUrl;
 use crate::simulation::process::InstanceDir;
 
-/// A project that was checked out for one client.
+/// A client's checked-out project, removed on drop.
 #[derive(Debug)]
 pub struct Project {
     /// The world to open.
     pub world: WorldFile,
-    /// What the client should know.
+    /// Warnings for the client.
     pub warnings: Vec<String>,
-    /// Where it came from.
+    /// The URL that it was checked out from.
     pub(super) url: ProjectUrl,
     pub(super) revision: Revision,
-    /// The project's folder.
+    /// The project's directory.
     pub(super) folder: PathBuf,
-    /// Removed with the project.
+    /// The instance directory; removed with the project.
     pub instance: InstanceDir,
 }
 

@@ -1,9 +1,8 @@
-//! Repositories that have moved: where their forge sends to is followed within that forge, and only to what the lists
+//! Repositories that have moved: redirects are followed within their Git host, and only to repositories that the lists
 //! allow.
 //!
-//! git follows all redirects or none, and none is what it is told. Where it meets one, it is had to tell what the forge has
-//! answered, and the world is looked for there: so the lists, and git's settings for proxies, certificates and passwords, hold
-//! for each step.
+//! Redirects are off in git. On a redirect, a traced `git ls-remote` yields the `Location` header, and the world is
+//! resolved there: so the lists, and git's settings for proxies, certificates and passwords, apply to each step.
 
 use url::Url;
 
@@ -13,16 +12,16 @@ use super::mirrors::{Mirrors, Remote};
 use super::repository::Repository;
 use crate::shared::domain::{AdmissionRules, Load, ProjectUrl};
 
-/// How many redirects are followed for a world.
+/// Limit of redirects for a world.
 pub const MOST: usize = 5;
 
-/// What git asks a forge for first.
+/// The first path that git requests from a Git host.
 const FIRST_QUESTION: &str = "/info/refs";
 
-/// The world in the repository to which its forge sends, and where that is.
+/// The world in the repository to which its Git host redirects, and the remote of that repository.
 ///
 /// # Errors
-/// When that may not be followed.
+/// When the redirect may not be followed.
 pub async fn follow(
     git: &Git,
     repository: &Repository,
@@ -38,7 +37,7 @@ pub async fn follow(
     Ok((moved, remote))
 }
 
-/// Where a forge sends to who asks for a repository, as it says it.
+/// The `Location` to which a Git host redirects requests for a repository.
 async fn location(git: &Git, repository: &Repository) -> Option<String> {
     let trace = [("GIT_TRACE_CURL", "1"), ("GIT_TRACE_CURL_NO_DATA", "1")];
     let environment = trace.map(|(name, value)| (name.into(), value.into())).to_vec();
@@ -61,7 +60,7 @@ async fn location(git: &Git, repository: &Repository) -> Option<String> {
     location
 }
 
-/// The world in the repository at this location, or why it may not be taken from there, in words for the client.
+/// The world in the repository at this location, or why the redirect is not followed, as text for the client.
 fn target(
     mirrors: &Mirrors,
     rules: &AdmissionRules,

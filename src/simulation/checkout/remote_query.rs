@@ -1,4 +1,4 @@
-//! What a search for a commit asks the remote, and the history of its branches and tags.
+//! Queries of a remote for a commit, and the fetched history of its branches and tags.
 
 use std::ffi::OsStr;
 use std::sync::Arc;
@@ -12,20 +12,20 @@ use super::revision::{self, Revision};
 use super::steps;
 use crate::shared::domain::ProjectUrl;
 
-/// What a world is looked for with.
+/// The context of the search for a world's commit.
 #[derive(Clone, Copy)]
 pub struct RemoteQuery<'job> {
     /// Runs git.
     pub git: &'job Git,
-    /// Where histories are kept.
+    /// The cache of histories.
     pub cache: &'job RepositoryCache,
-    /// What may be fetched.
+    /// The limits of a fetch.
     pub limits: &'job CheckoutLimits,
-    /// What is looked for.
+    /// The world to find.
     pub world: &'job ProjectUrl,
-    /// Where its commits are kept.
+    /// The cached repository of its commits.
     pub repository: &'job Arc<Repository>,
-    /// Hears each step in words.
+    /// Receives each step as text.
     pub progress: &'job (dyn Fn(String) + Send + Sync),
 }
 
@@ -35,7 +35,7 @@ impl RemoteQuery<'_> {
         history.map_err(|error| machine(self.world, &error))
     }
 
-    /// Fetches the commits of all branches and tags; `commit` tells which kind of hashes there are.
+    /// Fetches the commits of all branches and tags; `commit` determines the hash algorithm.
     async fn fetch_history(self, history: &Arc<Repository>, commit: &str) -> Result<(), CheckoutError> {
         let RemoteQuery { world, progress, .. } = self;
         let what = || format!("The history of {}", world.repository());
@@ -51,7 +51,7 @@ impl RemoteQuery<'_> {
     /// Whether a commit that is named by its hash is in a branch or tag.
     ///
     /// # Errors
-    /// Why that can't be found out.
+    /// Why it can't be determined.
     pub async fn is_accepted(self, revision: &Revision) -> Result<bool, CheckoutError> {
         let answer = self.tips().await?;
         if revision::is_of_other_length(&answer, &revision.commit) {
@@ -60,7 +60,7 @@ impl RemoteQuery<'_> {
         Ok(revision::is_tip(&answer, &revision.commit) || self.is_in_history(&revision.commit).await?)
     }
 
-    /// Whether a commit was ever part of a branch or tag. For that the history is fetched.
+    /// Whether a commit is part of a branch or tag. Fetches the history if it is not cached.
     async fn is_in_history(self, commit: &str) -> Result<bool, CheckoutError> {
         let history = self.history().await?;
         let is_small = history.packed().await <= self.limits.size;
@@ -86,7 +86,7 @@ impl RemoteQuery<'_> {
         self.answer(&["ls-remote", "--quiet", "--heads", "--tags", "--", location]).await
     }
 
-    /// Asks the remote for the branches and tags that the world's URL may mean.
+    /// Requests from the remote the branches and tags that the world's URL may mean.
     ///
     /// # Errors
     /// When it can't answer.

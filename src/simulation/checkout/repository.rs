@@ -1,4 +1,4 @@
-//! One cached repository: an ordinary bare one, into which git fetches commits of one remote, one fetch at a time.
+//! One cached repository: a bare repository into which git fetches commits of one remote, one fetch at a time.
 
 use std::ffi::OsStr;
 use std::io;
@@ -18,26 +18,26 @@ use super::mirrors::Remote;
 use super::revision::{self, FetchRequest};
 use super::single_flight::SingleFlight;
 
-/// A cached repository. It is not removed from the cache as long as this lives.
+/// A cached repository. It is not evicted from the cache until this is dropped.
 #[derive(Debug)]
 pub struct Repository {
     path: PathBuf,
-    /// Where it is fetched from. Forges have several spellings of it.
+    /// The remote. Its URL may have several spellings.
     remote: Mutex<Arc<Remote>>,
     git: Arc<Git>,
     limits: CheckoutLimits,
     growth: Arc<EvictionSignal>,
-    /// Held by whoever changes the repository.
+    /// Held by the task that changes the repository.
     lock: Arc<tokio::sync::Mutex<()>>,
-    /// Held by whoever asks the remote what it has.
+    /// Limits concurrent queries of the remote.
     asking: Semaphore,
-    /// The fetches that are wanted, by the name of the request.
+    /// The fetches in progress, by the name of the request.
     fetches: SingleFlight<String, Result<(), GitError>>,
-    /// When it was made, if this server has made it since it came into use.
+    /// When it was created, if that was after this value was created.
     made: Mutex<Option<Instant>>,
 }
 
-/// How many questions the remote is asked at a time: its answers may take memory.
+/// Limit of concurrent queries of the remote, because its answers use memory.
 const QUESTIONS: usize = 4;
 
 impl Repository {
@@ -59,7 +59,7 @@ impl Repository {
         Arc::clone(&self.remote.lock())
     }
 
-    /// Goes on with another spelling of the remote, the newest that was asked for.
+    /// Changes the remote to the last requested spelling of its URL.
     pub fn set_remote(&self, remote: &Remote) {
         *self.remote.lock() = Arc::new(remote.clone());
     }
@@ -84,14 +84,14 @@ impl Repository {
     /// When git fails.
     pub async fn read(&self, arguments: &[impl AsRef<OsStr>]) -> Result<Vec<u8>, GitError> {
         let mut call = self.call(arguments);
-        // What is missing must not be asked for: the remote of a history would be.
+        // Missing objects must not be fetched, as git would do in a history.
         call.protocol = "none";
         call.environment.push(("GIT_NO_LAZY_FETCH".into(), "1".into()));
         self.git.run(call, |_| ()).await
     }
 
-    /// Fetches what is wished for, together with everybody who requests for the same. It ends with the last of them.
-    /// `progress` is told git's progress.
+    /// Joins an identical fetch in progress, or starts one. Cancelled when the last waiter drops. `progress` receives
+    /// git's progress lines.
     ///
     /// # Errors
     /// Why it can't be fetched.
@@ -129,15 +129,15 @@ impl Repository {
         Ok(())
     }
 
-    /// Waits until the remote may be asked what it has.
+    /// Waits for a permit to query the remote.
     ///
     /// # Errors
-    /// Never: nobody closes the semaphore.
+    /// Never, because the semaphore is never closed.
     pub async fn may_ask(&self) -> Result<SemaphorePermit<'_>, AcquireError> {
         self.asking.acquire().await
     }
 
-    /// Waits until nobody else changes the repository.
+    /// Waits until no other task changes the repository.
     async fn lock(&self, told: &watch::Sender<String>) -> OwnedMutexGuard<()> {
         let lock = Arc::clone(&self.lock);
         if let Ok(guard) = Arc::clone(&lock).try_lock_owned() {
@@ -147,9 +147,9 @@ impl Repository {
         lock.lock_owned().await
     }
 
-    /// Makes the bare repository unless it is there. Else removes what a git that was killed has left.
+    /// Creates the bare repository unless it exists. Else removes what a killed git has left.
     async fn make(&self, request: &FetchRequest) -> Result<(), GitError> {
-        // It takes its place when it is whole.
+        // It is renamed to its final path when it is complete.
         let new = self.path.with_extension("new");
         let (path, new_path) = (self.path.clone(), new.clone());
         let is_there = blocking(move || {
@@ -167,7 +167,7 @@ impl Repository {
         Ok(())
     }
 
-    /// Has git pack what many fetches have left. Nobody waits for that but the next fetch, and that not for long.
+    /// Runs `git gc --auto` in the background, for at most `stall_timeout()`; only the next fetch waits for it.
     fn collect_garbage(self: &Arc<Self>, guard: OwnedMutexGuard<()>) {
         let this = Arc::clone(self);
         tokio::spawn(async move {
@@ -179,7 +179,7 @@ impl Repository {
         });
     }
 
-    /// Throws the repository away, unless it was made after `since`.
+    /// Discards the repository, unless it was created after `since`.
     ///
     /// # Errors
     /// When it can't be removed.
@@ -192,7 +192,7 @@ impl Repository {
         blocking(move || remove_all(&[&path])).await
     }
 
-    /// How many bytes its packs have.
+    /// Size of its packs, in bytes.
     pub async fn packed(&self) -> u64 {
         let path = self.path.clone();
         blocking(move || Ok(packed(&path))).await.unwrap_or_default()
@@ -205,7 +205,7 @@ impl Drop for Repository {
     }
 }
 
-/// Says in the end, whichever that is, that the cache has grown.
+/// On drop, marks the cache as grown, whatever the outcome.
 struct Grown<'cache>(&'cache EvictionSignal);
 
 impl Drop for Grown<'_> {

@@ -1,6 +1,6 @@
-//! The cached repositories: `CACHEDIR/git/NAME` is a bare repository, and a folder's time says when it was used last.
+//! The cached repositories: `CACHEDIR/git/NAME` is a bare repository, and its mtime is the last use.
 //!
-//! They are kept below a size. Where they have grown above it, those that nobody uses go, the least recently used first.
+//! Above `cacheSize`, repositories not in use are evicted, least recently used first.
 
 use std::collections::HashMap;
 use std::fs::File;
@@ -25,43 +25,43 @@ use crate::simulation::process::remove_tree;
 #[derive(Debug)]
 pub struct RepositoryCache {
     folder: PathBuf,
-    /// How many bytes they may take.
+    /// Size limit of all repositories, in bytes.
     budget: u64,
     git: Arc<Git>,
     limits: CheckoutLimits,
-    /// Those that somebody uses.
+    /// The repositories in use.
     in_use: Mutex<HashMap<PathBuf, Weak<Repository>>>,
     growth: Arc<EvictionSignal>,
     _dir: CacheDir,
 }
 
-/// The ending of a folder that is being removed. Names of repositories have no dots.
+/// The extension of a directory that is being removed. Names of repositories have no dots.
 const REMOVED: &str = "removed";
 
 impl RepositoryCache {
-    /// Opens the cache in `dir`, which may take `budget` bytes.
+    /// Opens the cache in `dir`, with a limit of `budget` bytes.
     ///
     /// # Errors
-    /// When its folder can't be made.
+    /// When its directory can't be created.
     pub fn open(dir: CacheDir, budget: u64, git: Arc<Git>, limits: CheckoutLimits) -> io::Result<Self> {
         let folder = dir.path().join("git");
         std::fs::create_dir_all(&folder)?;
         Ok(Self { folder, budget, git, limits, in_use: Mutex::default(), growth: Arc::default(), _dir: dir })
     }
 
-    /// The repository that holds commits of `remote`. It is in use until what is returned is dropped.
+    /// The repository with commits of `remote`. It is in use until the returned value is dropped.
     ///
     /// # Errors
-    /// When the cache's folder can't be made.
+    /// When the cache's directory can't be created.
     pub async fn commits(&self, remote: &Remote) -> io::Result<Arc<Repository>> {
         self.repository(&remote.key(), remote).await
     }
 
-    /// The repository that holds the history of `remote`: the commits of all branches and tags, without files where the
-    /// remote can leave them out.
+    /// The repository with the history of `remote`: the commits of all branches and tags, without files if the remote
+    /// supports that.
     ///
     /// # Errors
-    /// When the cache's folder can't be made.
+    /// When the cache's directory can't be created.
     pub async fn history(&self, remote: &Remote) -> io::Result<Arc<Repository>> {
         self.repository(&format!("{} history", remote.key()), remote).await
     }
@@ -94,12 +94,12 @@ impl RepositoryCache {
         Ok(repository)
     }
 
-    /// Says that a repository has grown.
+    /// Signals that a repository has grown.
     pub fn grown(&self) {
         self.growth.grown();
     }
 
-    /// Keeps the cache below its budget, for ever.
+    /// Keeps the cache within its budget. Never returns.
     pub async fn keep_within_budget(self: Arc<Self>) {
         loop {
             let this = Arc::clone(&self);
@@ -110,7 +110,7 @@ impl RepositoryCache {
         }
     }
 
-    /// Removes repositories until the others fit into the budget. Blocks.
+    /// Evicts unused repositories until the others fit into the budget. Blocks.
     fn shrink(&self) {
         // A repository that is released from now on triggers another pass.
         self.growth.set_over_budget(true);
@@ -134,11 +134,11 @@ impl RepositoryCache {
         self.growth.set_over_budget(total > self.budget);
     }
 
-    /// Removes a repository unless somebody uses it. Blocks.
+    /// Removes a repository unless it is in use. Blocks.
     fn remove_unused(&self, path: &Path) -> bool {
         let removed = path.with_extension(REMOVED);
         {
-            // Whoever comes meanwhile waits, and then makes it anew.
+            // The lock makes new users wait; they then recreate the repository.
             let in_use = self.in_use.blocking_lock();
             if in_use.get(&path.with_extension("")).is_some_and(|repository| repository.strong_count() > 0)
                 || std::fs::rename(path, &removed).is_err()
@@ -150,9 +150,9 @@ impl RepositoryCache {
     }
 }
 
-/// Removes a folder; what can't be removed is tried again by the next pass. Returns whether it is gone.
+/// Removes a directory; a failed removal is retried by the next pass. Returns whether it was removed.
 fn remove(folder: &Path) -> bool {
-    // A branch's name may have a thousand levels of folders.
+    // A branch's name may have a thousand levels of directories.
     let removed = remove_tree(folder);
     if let Err(error) = &removed {
         log::warn!("{} can't be removed: {error}", folder.display());

@@ -1,38 +1,38 @@
-//! Which commit a world's URL means, and what lies in it: arguments for git and the reading of its answers. Pure.
+//! The commit that a world's URL means, and its contents: arguments for git, and parsers of its answers. Pure.
 
 use crate::shared::domain::{ProjectUrl, Reading, RefKind};
 
 /// One commit that a world's URL may mean.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Revision {
-    /// The hash: of a commit, or of the tag that stands for one.
+    /// The hash of a commit, or of an annotated tag of one.
     pub commit: String,
-    /// Branch, tag or commit, as the URL has it.
+    /// Branch, tag or commit, as in the URL.
     pub name: String,
-    /// The project's folder; empty for the root.
+    /// The project's directory; empty for the root.
     pub folder: String,
     /// Why the commit is trusted to be the repository's own.
     pub trust: TrustSource,
 }
 
-/// Why a commit is trusted to be the repository's own. Forges hand out by their hash also commits of forks and of
-/// proposals, which the repository's owner never accepted: allowing a repository must not allow those.
+/// Why a commit is trusted to be the repository's own. Git hosts also serve commits of forks and of proposals by their
+/// hash, which the repository's owner never accepted: allowing a repository must not allow those.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum TrustSource {
-    /// The remote, which has it as the newest of a branch or tag.
+    /// The remote reports it as the newest commit of a branch or tag.
     Tip,
-    /// The URL alone: it must be looked for in the branches and tags before it is fetched.
+    /// Only the URL names it: it must be found in the branches and tags before it is fetched.
     Url,
-    /// The configuration, which allows any commit.
+    /// The configuration allows any commit.
     AnyCommit,
 }
 
-/// What to ask git to fetch.
+/// A fetch for git.
 #[derive(Debug, Clone)]
 pub struct FetchRequest {
-    /// Equal requests have equal names.
+    /// Unique among different requests; equal requests have equal names.
     pub name: String,
-    /// Settings that git needs for it, each as `name=value`.
+    /// Additional settings of git, each as `name=value`.
     pub settings: Vec<String>,
     /// What git is to do.
     pub arguments: Vec<String>,
@@ -40,7 +40,7 @@ pub struct FetchRequest {
     pub is_sha256: bool,
 }
 
-/// How many readings of a URL are looked for: no real branch has more slashes in its name.
+/// Limit of readings of a URL: no real branch has more slashes in its name.
 const MOST_READINGS: usize = 12;
 
 /// The commit that a URL names by its full hash: then nobody need be asked what it is. `allow_any` tells whether any will

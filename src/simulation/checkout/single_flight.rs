@@ -1,7 +1,7 @@
-//! Jobs that are done once for all who want the same at the same time.
+//! Jobs that run once for all concurrent callers with the same key.
 //!
-//! A job is a future that all who wait for it share. It runs as long as one of them waits; when the last has gone it is
-//! dropped, and whatever it has started ends with it.
+//! A job is a future that all its waiters share. It runs as long as one of them waits; when the last waiter drops it,
+//! it is cancelled with everything it has started.
 
 use std::collections::HashMap;
 use std::fmt;
@@ -14,7 +14,7 @@ use futures_util::future::{BoxFuture, Shared, WeakShared};
 use parking_lot::Mutex;
 use tokio::sync::watch;
 
-/// The jobs of one kind that are under way, by what is wanted.
+/// The jobs of one kind that are in progress, by key.
 pub struct SingleFlight<K, T: Clone>(Mutex<HashMap<K, Job<T>>>);
 
 struct Job<T: Clone> {
@@ -22,12 +22,12 @@ struct Job<T: Clone> {
     result: WeakShared<BoxFuture<'static, T>>,
 }
 
-/// The shortest time between two steps that are told: nobody reads faster.
+/// Shortest interval between two steps that are sent to a waiter.
 const BETWEEN_STEPS: Duration = Duration::from_millis(100);
 
 impl<K: Eq + Hash, T: Clone + Send + Sync + 'static> SingleFlight<K, T> {
-    /// Waits for a job, together with everybody who waits for the same. `progress` hears each step in words, also those
-    /// of a job that others have started.
+    /// Joins the job with this key, or starts it. `progress` receives each step as text, also if another caller has
+    /// started the job.
     pub async fn join<F>(
         &self,
         key: K,
@@ -41,7 +41,7 @@ impl<K: Eq + Hash, T: Clone + Send + Sync + 'static> SingleFlight<K, T> {
         let mut told = Instant::now().checked_sub(BETWEEN_STEPS).unwrap_or_else(Instant::now);
         loop {
             let step = async {
-                // What comes too soon waits, and only the newest of it is told.
+                // Throttled: within `BETWEEN_STEPS` only the newest step is sent.
                 actix_rt::time::sleep_until((told + BETWEEN_STEPS).into()).await;
                 news.changed().await.map(|()| news.borrow_and_update().clone())
             };
@@ -71,7 +71,7 @@ impl<K: Eq + Hash, T: Clone + Send + Sync + 'static> SingleFlight<K, T> {
             return (result, job.progress.clone());
         }
         let (sender, progress) = watch::channel(String::new());
-        // Each of those who wait has a time limit of its own; the job ends with the last of them.
+        // Each waiter has a timeout of its own; the job ends with the last of them.
         let result = start(sender).boxed().shared();
         if let Some(weak) = result.downgrade() {
             jobs.insert(key, Job { progress: progress.clone(), result: weak });

@@ -1,14 +1,15 @@
-//! The steps of a checkout, in words for its client. Pure.
+//! The steps of a checkout, as text for its client. Pure.
 //!
-//! Webots' page moves its bar by texts such as `Step 3/9 : ...`, in which each number has one digit, and by one that ends in
-//! `done`. Most of a start is the fetch, so that it takes several steps, by the percentage that git tells.
+//! Webots' page moves its progress bar by texts such as `Step 3/9 : ...`, in which each number has one digit, and by
+//! one that ends in `done`. Most of a start is the fetch, so it takes several steps, by the percentage that git
+//! reports.
 
-/// How many steps there are.
+/// Number of steps.
 const STEPS: u64 = 9;
-/// The steps of a fetch, of which the later ones are those of what is received.
+/// The first and the last step of a fetch; the steps between them follow the received objects.
 const FETCH: (u64, u64) = (2, 7);
 
-/// The last words.
+/// The last text.
 pub const DONE: &str = "checkout done";
 
 fn step(number: u64, what: &str) -> String {
@@ -46,7 +47,7 @@ fn percent(text: &str) -> u64 {
 mod tests {
     use super::*;
 
-    /// How Webots' page reads a text: one digit each at these places.
+    /// How Webots' page parses a text: one digit at each of these positions.
     fn bar(text: &str) -> Option<f64> {
         let digit = |at| text.chars().nth(at).and_then(|letter| letter.to_digit(10)).map(f64::from);
         text.starts_with("Step ").then_some(())?;

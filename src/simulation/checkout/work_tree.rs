@@ -1,4 +1,4 @@
-//! A client's own copy of a project: how git writes it, and what is in it.
+//! A client's own copy of a project: its checkout by git, and its contents.
 
 use std::ffi::OsString;
 use std::io;
@@ -17,18 +17,19 @@ use super::world_file::{WorldFile, WorldFileError};
 use crate::shared::domain::ProjectUrl;
 use crate::simulation::process::InstanceDir;
 
-/// What is in a copy.
+/// The contents of a copy.
 #[derive(Debug)]
 pub struct WorkTree {
-    /// How many bytes it takes.
+    /// Its size in bytes, at least the space of an entry for each file and directory.
     pub size: u64,
-    /// How many files only point to larger ones, which could not be loaded.
+    /// Number of LFS pointers whose files could not be loaded.
     pub pointers: usize,
-    /// The world.
+    /// The world file, or why it can't be opened.
     pub world: Result<WorldFile, WorldFileError>,
 }
 
-/// Has git write these paths of a commit, each ended by a zero byte, into a folder. What it needs besides is in `scratch`.
+/// A git command that writes these paths of a commit, each ended by a zero byte, into a directory. Its scratch files
+/// are in `scratch`.
 ///
 /// # Errors
 /// When the list of paths can't be written.
@@ -54,8 +55,8 @@ pub async fn copy_call<'call>(
     Ok(call)
 }
 
-/// Has git write a project, with its large files, and tell its progress line by line. Returns whether it is small enough:
-/// what is in the commit may be smaller than what git's attributes make of it, and a forge may send more than it should.
+/// Writes a project with git, with its large files; `told` receives its progress lines. Returns whether it is within
+/// the size limit: git's attributes may make it larger than the commit, and a Git host may send more than it should.
 ///
 /// # Errors
 /// When git fails.
@@ -73,7 +74,7 @@ pub async fn write(
     let mut growing = vec![Growing::new(project, limits.size)];
     if has_lfs {
         call.settings = lfs::settings(&found.repository.remote());
-        // git-lfs keeps what it loads here, into which others may load meanwhile, and copies it into the project.
+        // git-lfs stores its downloads here, shared with concurrent checkouts, and copies them into the project.
         let kept = call.repository.join("lfs");
         let before = disk::blocking({
             let kept = kept.clone();
@@ -88,7 +89,7 @@ pub async fn write(
     }
 }
 
-/// Looks at a copy.
+/// Inspects a copy.
 ///
 /// # Errors
 /// When the machine fails.

@@ -1,41 +1,41 @@
-//! The world of a checkout: it must be a file inside, and say which version of Webots it is for.
+//! The world of a checkout: it must be a file inside of it, and name its version of Webots.
 
 use std::io::{BufRead, BufReader, Read};
 use std::path::{Path, PathBuf};
 
-/// Why a file is no world that can be opened. Its words are for the client.
+/// Why a file is not a valid world. The messages are for the client.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum WorldFileError {
     /// There is no such file.
     #[error("{0} does not exist")]
     Missing(String),
-    /// It is a link to a file outside of the checkout.
+    /// It is a symlink to a file outside of the checkout.
     #[error("{0} leads out of its repository")]
     Outside(String),
-    /// It does not begin as worlds do.
+    /// Its first line is not that of a world.
     #[error("{name} is no world file: its first line is {found:?}, not like \"#VRML_SIM R2025a utf8\"")]
     Header {
-        /// The file.
+        /// The file name.
         name: String,
         /// Its first line.
         found: String,
     },
 }
 
-/// A world that can be opened.
+/// A valid world.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct WorldFile {
-    /// The file, without links.
+    /// The canonical path of the file, without symlinks.
     pub path: PathBuf,
     /// The version of Webots that it was made for, such as `R2025a`.
     pub version: String,
 }
 
 impl WorldFile {
-    /// Looks at a world file below the folder `root`. Reads from disk: not for a thread that serves others.
+    /// Inspects a world file below the directory `root`. Blocks.
     ///
     /// # Errors
-    /// When it is no world inside of that folder.
+    /// When it is not a world inside of that directory.
     pub fn open(root: &Path, path: &Path) -> Result<Self, WorldFileError> {
         let name = || path.file_name().unwrap_or_default().to_string_lossy().into_owned();
         let missing = |_| WorldFileError::Missing(name());
