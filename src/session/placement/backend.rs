@@ -25,7 +25,7 @@ pub struct ClientCounts {
     pub present: u32,
     /// Number of slots.
     pub places: u32,
-    /// Number of clients that have started a simulation since that server was started.
+    /// Number of clients that have requested a start since that server was started.
     pub arrivals: u64,
     /// Whether the server accepts new clients; `false` while it is drained.
     pub accepting: bool,

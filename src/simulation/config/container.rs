@@ -9,71 +9,70 @@ use crate::shared::config::{ExpandedPath, InvalidValueError, one_or_many, whole}
 #[serde(rename_all = "camelCase", default, deny_unknown_fields)]
 #[expect(clippy::struct_excessive_bools, reason = "they are keys of a file")]
 pub struct ContainerSettings {
-    /// Folder of templates; a file that is not in it is the one that comes with this server. Default: none.
+    /// Directory of templates; the built-in template replaces a file that is missing there. Default: none.
     pub templates: Option<ExpandedPath>,
     /// The image of Webots for a world whose project has no Dockerfile. `{version}` is that of the world, such as R2023b,
     /// `{ubuntu}` the Ubuntu that the image of that version has. Default: `cyberbotics/webots.cloud:{version}-ubuntu{ubuntu}`.
     pub image: String,
-    /// The image of the editor that a project may ask for. Default: the one that the original names.
+    /// The image of the editor that a project may request. Default: that of the original.
     pub editor_image: String,
     /// Webots' launcher in the image. Default: `webots`.
     pub program: String,
-    /// Whether the variants of the templates are taken that help to find a fault in a project. Default: false.
+    /// Whether to use the debug variants of the templates, which help to debug a project. Default: false.
     pub debug: bool,
-    /// Which display Webots has: a virtual one inside (`xvfb-run` of its image), or that of the machine. Default:
-    /// virtual.
+    /// The display of Webots: a virtual one inside (`xvfb-run` of its image), or that of the machine. Default: virtual.
     pub display: ContainerDisplay,
-    /// What of the network containers reach. Default: internet.
+    /// The network that containers reach. Default: internet.
     pub network: ContainerNetwork,
-    /// Whether containers get the graphics cards of the machine, where there are some. Default: true.
+    /// Whether containers get the GPUs of the machine, if it has any. Default: true.
     pub gpu: bool,
-    /// Whether the files of the image can only be read. Default: true.
+    /// Whether the files of the image are read-only. Default: true.
     pub read_only: bool,
     /// Whether programs may gain privileges, as `sudo` does. Default: false.
     pub new_privileges: bool,
     /// Linux capabilities that containers keep, such as `SYS_PTRACE`. Default: none.
     #[serde(deserialize_with = "one_or_many")]
     pub capabilities: Vec<String>,
-    /// Folders of the machine that containers see, as `FOLDER:PATH` or `FOLDER:PATH:ro`. Default: none.
+    /// Directories of the machine that are mounted in containers, as `FOLDER:PATH` or `FOLDER:PATH:ro`. Default: none.
     #[serde(deserialize_with = "one_or_many")]
     pub mounts: Vec<String>,
-    /// How many images are built at a time. Default: 3.
+    /// Images that are built at a time. Default: 3.
     #[serde(deserialize_with = "whole::<1, 1000, _, _>")]
     pub builds: usize,
-    /// After how many days an image that this server has built is removed, unless a container uses it. Default: 14.
+    /// Days after which an image that this server has built is removed, unless a container uses it. Default: 14.
     #[serde(deserialize_with = "whole::<1, 10_000, _, _>")]
     pub images_age: u64,
 }
 
-/// Which display Webots has in its container.
+/// The display of Webots in its container.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum ContainerDisplay {
-    /// A virtual one.
+    /// A virtual display.
     #[default]
     Virtual,
-    /// That of the machine, as the original has it: whoever shares it can watch, and type into, the windows of others.
+    /// That of the machine, as in the original: each simulation on it can read, and type into, the windows of others.
     Machine,
 }
 
-/// What of the network containers reach.
+/// The network that containers reach.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum ContainerNetwork {
     /// The internet, without private addresses and the machine itself.
     #[default]
     Internet,
-    /// Nothing. Clients reach Webots all the same.
+    /// No network. Clients still reach Webots.
     Closed,
 }
 
-/// How far above the port of its Webots the port of an editor is, as the original's page expects.
+/// Offset from the port of a Webots to the port of its editor, as the original's page expects.
 pub const EDITOR_PORT: u16 = 500;
 
 /// Checks that no editor gets the port of another simulation, or one that does not exist.
 ///
 /// # Errors
-/// When there are too many places for that.
+/// When there are too many slots for that.
 pub fn check_ports(in_containers: bool, port: u16, places: u16) -> Result<(), InvalidValueError> {
     let last = u32::from(port) + u32::from(places) + u32::from(EDITOR_PORT);
     if !in_containers || (places <= EDITOR_PORT && u16::try_from(last).is_ok()) {
@@ -108,7 +107,7 @@ impl Default for ContainerSettings {
 }
 
 impl ContainerNetwork {
-    /// The name of the Docker network, and of its interface. The packet filter knows it by that.
+    /// The name of the Docker network, and of its interface, which the packet filter matches.
     #[must_use]
     pub fn name(self) -> &'static str {
         match self {

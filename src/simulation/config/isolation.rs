@@ -1,4 +1,4 @@
-//! The keys `isolation`, `sandbox` and `environment`: what a world's programs may see.
+//! The keys `isolation`, `sandbox` and `environment`: what a world's programs can access.
 
 use std::path::{Path, PathBuf};
 
@@ -7,26 +7,26 @@ use serde::{Deserialize, Deserializer, Serialize};
 
 use crate::shared::config::{ExpandedPath, InvalidValueError, one_or_many};
 
-/// What each sandbox has by itself.
+/// Paths that each sandbox mounts itself.
 const OF_EACH: [&str; 3] = ["/", "/proc", "/dev"];
 
-/// The key `isolation`: at which level simulations are started.
+/// The key `isolation`: the isolation level of simulations.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum IsolationSetting {
-    /// As the server's own user, in a process group.
+    /// As the server's own user, in a process group, without isolation.
     None,
-    /// By bubblewrap, or not at all.
+    /// With bubblewrap; the server does not start without it.
     Sandbox,
-    /// By bubblewrap where it works, otherwise as with `none`.
+    /// With bubblewrap if it works, otherwise as with `none`.
     #[default]
     Auto,
-    /// By Docker.
+    /// With Docker.
     Container,
 }
 
 impl IsolationSetting {
-    /// The level that both keys ask for: `docker` is the original's key for containers.
+    /// The level that both keys request: `docker` is the original's key for containers.
     ///
     /// # Errors
     /// When they contradict each other.
@@ -45,7 +45,7 @@ impl IsolationSetting {
 /// Reads the key `isolation`.
 ///
 /// # Errors
-/// When the value is no level.
+/// When the value is not a level.
 pub fn level<'de, D: Deserializer<'de>>(deserializer: D) -> Result<IsolationSetting, D::Error> {
     let value = serde_json::Value::deserialize(deserializer)?;
     if !value.is_string() {
@@ -82,10 +82,10 @@ impl SandboxNetwork {
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct SandboxFolders {
-    /// Files and folders that can be read. Default: none.
+    /// Files and directories that are readable. Default: none.
     #[serde(deserialize_with = "one_or_many")]
     pub readable: Vec<ExpandedPath>,
-    /// Files and folders that can also be written. Default: none.
+    /// Files and directories that are also writable. Default: none.
     #[serde(deserialize_with = "one_or_many")]
     pub writable: Vec<ExpandedPath>,
     /// Which network it has. Default: auto.
@@ -93,10 +93,11 @@ pub struct SandboxFolders {
 }
 
 impl SandboxFolders {
-    /// Refuses what would take the sandbox apart, and warns of what opens it: `own` is what only the server should change.
+    /// Refuses what would break the sandbox, and warns of what weakens it: `own` are the paths that only the server
+    /// should change.
     ///
     /// # Errors
-    /// When a folder is all of the system, or one that each sandbox has by itself.
+    /// When a directory is the root of the system, or one that each sandbox mounts itself.
     pub fn check<'own>(&self, own: impl Iterator<Item = &'own Path>) -> Result<Vec<String>, InvalidValueError> {
         for (key, paths) in [("sandbox.readable", &self.readable), ("sandbox.writable", &self.writable)] {
             if let Some(path) = paths.iter().find(|path| OF_EACH.iter().any(|one| real(&path.0) == Path::new(one))) {
@@ -112,13 +113,13 @@ impl SandboxFolders {
         Ok(open.map(told).collect())
     }
 
-    /// What is named, but not there.
+    /// The configured paths that do not exist.
     pub fn missing(&self) -> impl Iterator<Item = &Path> {
         self.readable.iter().chain(&self.writable).map(|path| path.0.as_path()).filter(|path| !path.exists())
     }
 }
 
-/// A path without links, as far as it is there.
+/// The canonical path, as far as it exists.
 fn real(path: &Path) -> PathBuf {
     let absolute = std::path::absolute(path).unwrap_or_else(|_| path.to_owned());
     let there =
@@ -129,13 +130,13 @@ fn real(path: &Path) -> PathBuf {
     )
 }
 
-/// The name of an environment variable, or with `*` at its end the beginning of such names.
+/// The name of an environment variable, or the prefix of such names, ended by `*`.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(try_from = "String")]
 pub struct VariableName(String);
 
 impl VariableName {
-    /// Whether this is the name of a variable, or its beginning.
+    /// Whether this is the name of a variable, or a prefix of it.
     #[must_use]
     pub fn covers(&self, variable: &str) -> bool {
         match self.0.strip_suffix('*') {

@@ -1,4 +1,4 @@
-//! The files and folders of the configuration that are only the server's.
+//! The files and directories of the configuration that belong to the server alone.
 
 use std::path::Path;
 
@@ -6,16 +6,16 @@ use super::{IsolationSetting, SimulationConfig};
 use crate::shared::config::{InvalidValueError, Secret};
 
 impl SimulationConfig {
-    /// Returns the files that may hold secrets: this configuration's own, and those that it names.
+    /// Returns the files that may contain secrets: the configuration file, and those that it names.
     pub fn secret_files(&self) -> impl Iterator<Item = &Path> {
         let password = self.admin_password.as_ref().and_then(Secret::file);
         [Some(self.file.as_path()), self.git_config.as_ref().map(|file| &*file.0), password].into_iter().flatten()
     }
 
-    /// Checks the key `sandbox`, where it counts. Returns warnings.
+    /// Checks the key `sandbox`, if the isolation level uses it. Returns warnings.
     ///
     /// # Errors
-    /// When it would take the sandbox apart.
+    /// When it would break the sandbox.
     pub(super) fn check_sandbox(&self) -> Result<Vec<String>, InvalidValueError> {
         if !matches!(self.isolation, IsolationSetting::Auto | IsolationSetting::Sandbox) {
             if self.sandbox.network.is_demanded() {

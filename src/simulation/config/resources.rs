@@ -1,29 +1,31 @@
-//! The key `limits`: what one simulation may take of the machine.
+//! The key `limits`: the resource limits of one simulation.
 
 use serde::{Deserialize, Deserializer, Serialize};
 
 use crate::shared::config::whole;
 
-/// What one simulation may take.
+/// The resource limits of one simulation.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(rename_all = "camelCase", default, deny_unknown_fields)]
 pub struct ResourceLimits {
-    /// How much of its output is read, in KiB per second; short lines count more. It waits as it prints more. Default: 512.
+    /// Output that is read, in KiB per second; short lines count more. A simulation that prints more is blocked.
+    /// Default: 512.
     #[serde(deserialize_with = "whole::<1, 1_000_000, _, _>")]
     pub output: u64,
-    /// How much it may write into its folders beyond its project, in MiB. One that writes more is ended. Default: 1024.
+    /// Space that it may use in its directories beyond its project, in MiB. If it exceeds that, it is ended. Default:
+    /// 1024.
     #[serde(deserialize_with = "whole::<1, 100_000_000, _, _>")]
     pub disk: u64,
-    /// How many processes and threads it may have. Default: 4096.
+    /// Limit of its processes and threads. Default: 4096.
     #[serde(deserialize_with = "whole::<10, 4_000_000, _, _>")]
     pub processes: u64,
-    /// How many files each of its processes may have open. Default: 4096.
+    /// Limit of open files for each of its processes. Default: 4096.
     #[serde(deserialize_with = "whole::<64, 1_000_000, _, _>")]
     pub open_files: u64,
-    /// How much memory it may take, in MiB, where control groups can be had. Default: none.
+    /// Memory limit in MiB, if control groups are available. Default: none.
     #[serde(deserialize_with = "optional")]
     pub memory: Option<u64>,
-    /// How many cores it may keep busy, where control groups can be had. Default: none.
+    /// Limit of busy cores, if control groups are available. Default: none.
     #[serde(deserialize_with = "optional")]
     pub cores: Option<u64>,
 }

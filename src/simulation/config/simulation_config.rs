@@ -38,11 +38,11 @@ pub struct SimulationConfig {
     /// Local address to listen on. Default: `::`, all addresses of IPv4 and IPv6.
     #[serde(default = "default_bind", deserialize_with = "local_address")]
     pub bind: IpAddr,
-    /// Whether a web server in front rewrites ports in URLs: HOST/PORT, not HOST:PORT. Default: true.
+    /// Whether a reverse proxy rewrites ports in URLs: HOST/PORT, not HOST:PORT. Default: true.
     #[serde(default = "default_true")]
     pub port_rewrite: bool,
-    /// How clients reach this server and its simulations through one web server: a URL with the placeholders `{host}`
-    /// (that is `server`) and `{port}`. Default: none, and they are reached under their own addresses.
+    /// How clients reach this server and its simulations through one reverse proxy: a URL with the placeholders
+    /// `{host}` (that is `server`) and `{port}`. Default: none, and they are reached under their own addresses.
     #[serde(default, deserialize_with = "optional_expanded")]
     pub public_url: Option<PublicUrl>,
     /// How clients reach the streams of simulations: at the ports of their Webots, or through this server. Default: `direct`.
@@ -60,19 +60,19 @@ pub struct SimulationConfig {
     /// Text below the headline.
     #[serde(default)]
     pub description: Option<String>,
-    /// Where Webots is installed. Default: the environment variable `WEBOTS_HOME`.
+    /// Installation directory of Webots. Default: the environment variable `WEBOTS_HOME`.
     #[serde(default)]
     pub webots_home: Option<ExpandedPath>,
-    /// The program to start in place of the one in `webotsHome`.
+    /// The program to start instead of the one in `webotsHome`.
     #[serde(default)]
     pub webots: Option<ExpandedPath>,
-    /// Folder of local projects. Accepted for existing files; not used.
+    /// Directory of local projects. Accepted for existing files; not used.
     #[serde(default)]
     pub projects_dir: Option<ExpandedPath>,
-    /// At which level of isolation simulations run. Default: `auto`.
+    /// The isolation level of simulations. Default: `auto`.
     #[serde(default, deserialize_with = "level")]
     pub isolation: IsolationSetting,
-    /// What a sandbox has besides the system and Webots.
+    /// What a sandbox mounts besides the system and Webots.
     #[serde(default, deserialize_with = "object")]
     pub sandbox: SandboxFolders,
     /// How simulations run in containers.
@@ -81,7 +81,7 @@ pub struct SimulationConfig {
     /// Environment variables that simulations get besides those that Webots needs. Default: none.
     #[serde(default, deserialize_with = "one_or_many")]
     pub environment: Vec<VariableName>,
-    /// What one simulation may take.
+    /// The resource limits of one simulation.
     #[serde(default, deserialize_with = "object")]
     pub limits: ResourceLimits,
     /// Run Webots in containers: the original's key for `isolation: "container"`. Default: false.
@@ -102,21 +102,21 @@ pub struct SimulationConfig {
     /// URLs to which the server announces itself when it starts. Default: none.
     #[serde(default, deserialize_with = "one_or_many")]
     pub notify: Vec<String>,
-    /// How many simulations may run at a time. Webots uses port+1 .. port+maxConnections. Default: 100.
+    /// Number of slots: simulations that may run at a time. Webots uses port+1 .. port+maxConnections. Default: 100.
     #[serde(default = "default_max_connections", deserialize_with = "whole::<1, 10_000, _, _>")]
     pub max_connections: u16,
-    /// How many clients may wait for a place. Default: 100.
+    /// Limit of clients that wait for a slot. Default: 100.
     #[serde(default = "default_waiting_line", deserialize_with = "whole::<0, 100_000, _, _>")]
     pub waiting_line: usize,
-    /// How many client `WebSockets` may be open in all, with or without a simulation. Default: 1000.
+    /// Limit of open client `WebSockets` in all, with or without a simulation. Default: 1000.
     #[serde(default = "default_max_clients", deserialize_with = "whole::<1, 1_000_000, _, _>")]
     pub max_clients: usize,
-    /// How many of them one client address may have. Default: three quarters, but at most 1000, for a class sits behind
-    /// one address.
+    /// Limit of open client `WebSockets` per client address. Default: three quarters of `maxClients`, but at most 1000,
+    /// because a class sits behind one address.
     #[serde(default, deserialize_with = "optional_whole::<1, 1_000_000, _, _>")]
     pub max_clients_per_address: Option<usize>,
-    /// How many of the places one client address may have, and the same share of the waiting line. Default: all, for a
-    /// class sits behind one address.
+    /// Limit of slots per client address; the same share of the queue applies. Default: all, because a class sits
+    /// behind one address.
     #[serde(default, deserialize_with = "optional_whole::<1, 10_000, _, _>")]
     pub max_places_per_address: Option<usize>,
     /// How many of the places one user may have (`userHeader`), and the same share of the waiting line. Default: all.
@@ -139,27 +139,28 @@ pub struct SimulationConfig {
     /// Write `simulation/monitor.csv`. Default: true.
     #[serde(default = "default_true")]
     pub monitor_log_enabled: bool,
-    /// Whether a world's URL may name any commit by its hash, not only one that is in a branch or tag. Forges also serve
-    /// commits of forks and pull requests, which the repository's owner never accepted. Default: false.
+    /// Whether a world's URL may name any commit by its hash, not only one that is in a branch or tag. Git hosts also
+    /// serve commits of forks and pull requests, which the repository's owner never accepted. Default: false.
     #[serde(default)]
     pub any_commit: bool,
-    /// Where repositories are fetched from in place of their URL: {URL prefix: replacement}. Default: none.
+    /// Where repositories are fetched from instead of their URL: {URL prefix: replacement}. Default: none.
     #[serde(default)]
     pub git_mirrors: Mirrors,
-    /// Settings for git, in git's own form: a proxy, certificates, credentials. They add to those of the machine.
+    /// File of settings for git, in git's own format: a proxy, certificates, credentials. They add to those of the
+    /// machine.
     /// Default: none.
     #[serde(default)]
     pub git_config: Option<ExpandedPath>,
-    /// Folder of cached repositories and of the projects of running simulations. Default: `cache`.
+    /// Directory of cached repositories and of the projects of running simulations. Default: `cache`.
     #[serde(default = "default_cache_dir", deserialize_with = "folder")]
     pub cache_dir: ExpandedPath,
-    /// Size limit of the cached repositories together, in MiB. Default: 10240.
+    /// Size limit of all cached repositories, in MiB. Default: 10240.
     #[serde(default = "default_cache_size", deserialize_with = "whole::<1, 100_000_000, _, _>")]
     pub cache_size: u64,
-    /// Size limit of a project, in MiB; for what is fetched and for what is checked out. Default: 1024.
+    /// Size limit of a project, in MiB, for the fetch and for the checkout. Default: 1024.
     #[serde(default = "default_project_size", deserialize_with = "whole::<1, 100_000_000, _, _>")]
     pub project_size: u64,
-    /// How much room the disk of `cacheDir` must have left for new simulations, in MiB; 0: any. Default: 512.
+    /// Free space that the disk of `cacheDir` must have for new simulations, in MiB; 0: any. Default: 512.
     #[serde(default = "default_disk_reserve", deserialize_with = "whole::<0, 100_000_000, _, _>")]
     pub disk_reserve: u64,
     /// Whether the server is ready only while it sees GPUs and none is lost. Default: false.
@@ -177,7 +178,7 @@ pub struct SimulationConfig {
     /// Give each Webots a virtual display of its own (needs `Xvfb`). Default: false.
     #[serde(default)]
     pub xvfb: bool,
-    /// How many seconds after six missed heartbeats a simulation is ended. Default: 60.
+    /// Seconds after six missed heartbeats until a simulation is ended. Default: 60.
     #[serde(default = "default_hang_limit", with = "seconds")]
     pub hang_limit: Duration,
     /// Pages from which browsers may open `/client`, as origins (`https://lab.org`). Default: any.
@@ -189,13 +190,13 @@ pub struct SimulationConfig {
     /// All other durations.
     #[serde(default, deserialize_with = "object")]
     pub timing: Timing,
-    /// The file that all this was read from; empty where it was not.
+    /// The file that this was read from; empty if there is none.
     #[serde(skip)]
     pub file: PathBuf,
 }
 
 impl SimulationConfig {
-    /// Returns the program that is started for each client; `None` where neither `webots` nor `webotsHome` says.
+    /// Returns the program that is started for each client; `None` if neither `webots` nor `webotsHome` is set.
     #[must_use]
     pub fn webots_program(&self) -> Option<PathBuf> {
         if let Some(program) = &self.webots {

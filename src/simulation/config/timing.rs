@@ -10,34 +10,34 @@ use crate::shared::config::{seconds, seconds_or_zero};
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(rename_all = "camelCase", default, deny_unknown_fields)]
 pub struct Timing {
-    /// How long a checkout may take. Default: 120.
+    /// Timeout of a checkout. Default: 120.
     #[serde(with = "seconds")]
     pub checkout: Duration,
-    /// How long an image may take to be pulled and built. Default: 900.
+    /// Timeout of pulling and building an image. Default: 900.
     #[serde(with = "seconds")]
     pub build: Duration,
-    /// How long Webots may take until it listens on its port. Default: 120.
+    /// Timeout of Webots' start, until it listens on its port. Default: 120.
     #[serde(with = "seconds")]
     pub launch: Duration,
-    /// Between two heartbeats of Webots. Default: 5.
+    /// Interval between two heartbeats of Webots. Default: 5.
     #[serde(with = "seconds")]
     pub heartbeat: Duration,
-    /// How long Webots may take to end after SIGTERM, before SIGKILL. Default: 5.
+    /// Time between SIGTERM and SIGKILL when Webots is ended. Default: 5.
     #[serde(with = "seconds")]
     pub grace: Duration,
-    /// Between two pings of a client. Default: 20.
+    /// Interval between two pings of a client. Default: 20.
     #[serde(with = "seconds")]
     pub ping: Duration,
-    /// A client that has answered no ping for so long is disconnected, and its simulation ends. Default: 60.
+    /// A client that answers no ping for this long is disconnected. Must exceed `ping`. Default: 60.
     #[serde(with = "seconds")]
     pub silence: Duration,
-    /// How long a simulation waits for a client that may come back; 0: not at all. Default: 60.
+    /// Time for which a simulation waits for a disconnected client; 0: not at all. Default: 60.
     #[serde(with = "seconds_or_zero")]
     pub absence: Duration,
-    /// How long open connections and simulations may take to end when the server stops. Default: 9.
+    /// Timeout of open connections and simulations when the server stops. Default: 9.
     #[serde(with = "seconds")]
     pub stop: Duration,
-    /// Between two tries to announce the server. Default: 5.
+    /// Interval between two attempts to announce the server. Default: 5.
     #[serde(with = "seconds")]
     pub announce: Duration,
 }

@@ -1,4 +1,4 @@
-//! Under which URLs and ports clients reach this server and its simulations.
+//! The URLs and ports of this server and its simulations.
 
 use std::net::{IpAddr, Ipv4Addr};
 use std::ops::RangeInclusive;
@@ -6,17 +6,17 @@ use std::ops::RangeInclusive;
 use super::{SimulationConfig, Streaming};
 use crate::shared::domain::{ClientUrls, PublicAddress};
 
-/// If its port is taken, Webots silently takes one of this many that follow.
+/// Number of following ports that Webots tries silently if its port is in use.
 const NEXT_PORTS: u16 = 10;
 
 impl SimulationConfig {
-    /// Returns the HTTP URL under which clients reach this server.
+    /// Returns this server's HTTP URL for clients.
     #[must_use]
     pub fn http_url(&self) -> String {
         self.client_urls().http_url(&self.address(self.port))
     }
 
-    /// Returns the WebSocket URL under which clients reach a port of this server: its own, or that of a Webots.
+    /// Returns the WebSocket URL for clients of a port of this server: its own, or that of a Webots.
     #[must_use]
     pub fn websocket_url(&self, port: u16) -> String {
         self.client_urls().websocket_url(&self.address(port))
@@ -69,7 +69,7 @@ impl SimulationConfig {
         self.port + 1..=self.port.saturating_add(self.max_connections)
     }
 
-    /// Returns the ports on which a Webots may come to listen that was given this one.
+    /// Returns the ports on which a Webots may listen that was started with this port.
     #[must_use]
     pub fn ports_from(port: u16) -> RangeInclusive<u16> {
         port..=port.saturating_add(NEXT_PORTS)

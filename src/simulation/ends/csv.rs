@@ -13,7 +13,7 @@ const HEADING: &str = "id,begin,end,client,repository,world,port,level,peak memo
 /// How many older files are kept beside the newest.
 const OLD_FILES: usize = 10;
 
-/// Adds a line to the file at this path.
+/// Appends a line to the file at this path.
 ///
 /// # Errors
 /// When it can't be written.
@@ -42,7 +42,7 @@ fn line(level: &str, ended: &Ended) -> String {
     fields.map(|text| field(&text)).join(",") + "\n"
 }
 
-/// A field. Where a program for tables would take it for a formula, it begins with an apostrophe.
+/// A quoted field. An apostrophe is prepended if a spreadsheet would read the text as a formula.
 fn field(text: &str) -> String {
     let formula = text.starts_with(['=', '+', '-', '@', '\t', '\r', '\n']);
     let text = if formula { format!("'{}", one_line(text)) } else { one_line(text) };

@@ -3,9 +3,9 @@
 /// Why a simulation has ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum EndReason {
-    /// Its client has gone, or was sent away.
+    /// Its client has left, or was disconnected.
     Left,
-    /// Webots has ended by itself and in order.
+    /// Webots has exited by itself, without an error.
     Finished,
     /// It has reached the time limit.
     TimeLimit,
@@ -21,11 +21,11 @@ pub enum EndReason {
     NoWebots,
     /// Webots was ready, and has ended with an error.
     Crashed,
-    /// Webots gave no sign of life.
+    /// Webots sent no heartbeat.
     Hung,
     /// It has exceeded a limit of memory, disk, processes or ports.
     Limit,
-    /// A fault of this server, its machine or its Docker.
+    /// An error of this server, its machine or its Docker.
     Fault,
 }
 
@@ -65,7 +65,7 @@ impl EndReason {
         }
     }
 
-    /// What the monitor says of it.
+    /// Its text on the monitor.
     #[must_use]
     pub fn words(self) -> &'static str {
         match self {
@@ -84,7 +84,7 @@ impl EndReason {
         }
     }
 
-    /// Whether somebody will ask why: its output is kept for longer. A world that can't be checked out has none.
+    /// Whether its cause may have to be found, so that its output is kept for longer. A failed checkout has no output.
     #[must_use]
     pub fn is_abnormal(self) -> bool {
         matches!(self, Self::NoWebots | Self::Crashed | Self::Hung | Self::Limit | Self::Fault)

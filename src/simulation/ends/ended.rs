@@ -7,7 +7,7 @@ use super::end_reason::EndReason;
 use crate::simulation::simulation_id::SimulationId;
 use crate::simulation::who::Who;
 
-/// What a simulation has taken, as far as it is known.
+/// The resources that a simulation has used, as far as they are known.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Taken {
     /// Its peak memory, in bytes.
@@ -19,20 +19,20 @@ pub struct Taken {
 /// The end of a simulation.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct End {
-    /// Of which kind it is.
+    /// The kind of end.
     pub reason: EndReason,
-    /// Why, in words, without its output.
+    /// The reason as text, without its output.
     pub why: String,
-    /// What it has taken.
+    /// The resources that it has used.
     pub taken: Taken,
 }
 
 /// A simulation that has ended. Times are seconds since 1970.
 #[derive(Debug, Clone)]
 pub struct Ended {
-    /// Its id.
+    /// Its id; unique.
     pub id: SimulationId,
-    /// When it was asked for.
+    /// When its client requested it.
     pub begin: u64,
     /// When it ended.
     pub end: u64,
@@ -44,13 +44,13 @@ pub struct Ended {
     pub repository: String,
     /// The URL of the world.
     pub world: String,
-    /// Its port, if it was given one.
+    /// Its port, if it got one.
     pub port: Option<u16>,
     /// The file with its output, if it was launched.
     pub log: Option<PathBuf>,
-    /// What happened to it: a line each, with the time.
+    /// Its events: one line each, with the time.
     pub events: Vec<String>,
-    /// How it ended.
+    /// Its end.
     pub how: End,
 }
 

@@ -1,4 +1,4 @@
-//! Records how simulations end. A thread of its own writes the files, so that a slow disk holds up nobody.
+//! Records how simulations end. A thread of its own writes the files, so that a slow disk delays no actor.
 
 use std::collections::VecDeque;
 use std::path::{Path, PathBuf};
@@ -15,7 +15,7 @@ use super::ended::Ended;
 use super::{csv, kept_output};
 use crate::shared::http::Metrics;
 
-/// Records how simulations end. All clones are one.
+/// Records how simulations end. Clones share the records.
 #[derive(Debug, Clone)]
 pub struct Ends {
     counter: IntCounterVec,
@@ -23,22 +23,22 @@ pub struct Ends {
     writer: Sender<Job>,
 }
 
-/// What the thread is asked to do.
+/// A job of the thread.
 enum Job {
     Write(Arc<Ended>),
-    /// To say when it has come so far.
+    /// Answers once all earlier jobs are done.
     Flush(oneshot::Sender<()>),
 }
 
-/// How many ends the monitor lists.
+/// Number of ends that the monitor lists.
 const LISTED: usize = 20;
-/// How often it is looked for files that are too old, at least.
+/// Longest interval between two removals of old files.
 const BETWEEN_LOOKS: Duration = Duration::from_hours(1);
-/// How long the server waits at its end for what is to be written.
+/// Timeout of pending writes when the server stops.
 const FLUSH: Duration = Duration::from_secs(1);
 
 impl Ends {
-    /// Starts the thread. `logs` is the folder of the server's log, `level` that at which simulations run.
+    /// Starts the thread. `logs` is the directory of the server's log, `level` the isolation level of simulations.
     ///
     /// # Errors
     /// When a thread can't be started, or a counter `webots_simulation_ends_total` exists.
@@ -63,7 +63,7 @@ impl Ends {
             latest.pop_back();
         }
         latest.push_front(Arc::clone(&ended));
-        // The thread lives as long as this.
+        // The thread runs until the last sender is dropped.
         self.writer.send(Job::Write(ended)).ok();
     }
 
@@ -73,7 +73,7 @@ impl Ends {
         self.latest.lock().iter().cloned().collect()
     }
 
-    /// Waits until everything is written, for a second at most.
+    /// Waits until all records are written, for a second at most.
     pub async fn flush(&self) {
         let (done, written) = oneshot::channel();
         self.writer.send(Job::Flush(done)).ok();
@@ -85,7 +85,7 @@ impl Ends {
 
 fn write_all(logs: &Path, level: &str, jobs: &Receiver<Job>) {
     loop {
-        // Once for all that have ended at the same time.
+        // Once per batch of jobs.
         kept_output::prune(logs);
         let first = match jobs.recv_timeout(BETWEEN_LOOKS) {
             Ok(job) => job,
@@ -95,7 +95,7 @@ fn write_all(logs: &Path, level: &str, jobs: &Receiver<Job>) {
         for job in std::iter::once(first).chain(jobs.try_iter()) {
             match job {
                 Job::Write(ended) => write(logs, level, &ended),
-                // Who waits may be gone.
+                // The waiter may have been dropped.
                 Job::Flush(done) => drop(done.send(())),
             }
         }

@@ -1,6 +1,7 @@
-//! The output of simulations that have ended: its last 64 KiB, with what happened to the simulation, in a file for each.
+//! The output of simulations that have ended: its last 64 KiB, after the events of the simulation, in one file per
+//! simulation.
 //!
-//! Files are kept of the newest hundred abnormal ends and of the newest twenty others, for two weeks at most.
+//! The files of the newest hundred abnormal ends and of the newest twenty others are kept, for two weeks at most.
 
 use std::fs;
 use std::io::{self, Read, Seek, SeekFrom};
@@ -10,17 +11,18 @@ use std::time::{Duration, SystemTime};
 use super::ended::Ended;
 use crate::simulation::simulation_id::SimulationId;
 
-/// The folder with the output of simulations that run.
+/// The directory with the output of running simulations.
 pub const FOLDER_OF_RUNNING: &str = "instances";
-/// The folder for ends in order.
+/// The directory for normal ends.
 const ENDED: &str = "ended";
-/// The folder for abnormal ends.
+/// The directory for abnormal ends.
 const FAILED: &str = "failed";
-/// Of how many simulations files are kept, by folder.
+/// Number of files that are kept, by directory.
 const KEPT: [(&str, usize); 2] = [(ENDED, 20), (FAILED, 100)];
-/// How long a file is kept. One of a simulation that was never told to have ended, because the server was killed, too.
+/// Age from which a file is removed. That includes the output of a simulation whose end was not recorded because the
+/// server was killed.
 const AGE: Duration = Duration::from_hours(14 * 24);
-/// How much of an output is kept, in bytes.
+/// Size of the kept output, in bytes.
 const OUTPUT: usize = 64 * 1024;
 
 /// Returns the file with the output of the simulation with this id, whether it runs or has ended.
@@ -29,16 +31,16 @@ pub fn output_file(logs: &Path, id: &str) -> Option<PathBuf> {
     if !SimulationId::is_like(id) {
         return None;
     }
-    // What is kept comes first: a process that outlives its simulation may write another file.
+    // Kept files come first: a process that outlives its simulation may write another file.
     let files = [FAILED, ENDED, FOLDER_OF_RUNNING].map(|folder| logs.join(folder).join(format!("{id}.log")));
     files.into_iter().find(|file| file.is_file())
 }
 
-/// Keeps the end of an output, and removes the file that it was written to.
+/// Keeps the end of an output, and removes the file of the running simulation.
 ///
 /// # Errors
-/// When the file can't be made. What was written while the simulation ran is gone nevertheless: a disk that is full needs
-/// the room.
+/// When the file can't be created. The file of the running simulation is removed nevertheless, because a full disk
+/// needs the space.
 pub(super) fn keep(logs: &Path, ended: &Ended) -> io::Result<()> {
     let log = logs.join(FOLDER_OF_RUNNING).join(format!("{}.log", ended.id));
     let output = last_output(&log);
@@ -55,7 +57,7 @@ pub(super) fn keep(logs: &Path, ended: &Ended) -> io::Result<()> {
     fs::write(folder.join(format!("{}.log", ended.id)), text)
 }
 
-/// Removes files that are too many or too old.
+/// Removes surplus and old files.
 pub(super) fn prune(logs: &Path) {
     for (folder, most) in KEPT {
         let mut all = files(&logs.join(folder));
@@ -82,14 +84,14 @@ fn remove(file: &Path) {
     }
 }
 
-/// The files of a folder, with the time when each was written. None where there is no folder.
+/// The files of a directory, with the mtime of each. Empty if there is no such directory.
 fn files(folder: &Path) -> Vec<(SystemTime, PathBuf)> {
     let entries = fs::read_dir(folder).into_iter().flatten().flatten();
     let about = entries.filter_map(|entry| Some((entry.metadata().ok()?, entry.path())));
     about.filter_map(|(about, path)| Some((about.is_file().then(|| about.modified().ok())??, path))).collect()
 }
 
-/// The file that an output was rotated to.
+/// The rotated file of an output.
 fn older(log: &Path) -> PathBuf {
     let mut name = log.as_os_str().to_owned();
     name.push(".1");
@@ -102,11 +104,11 @@ fn last_output(log: &Path) -> String {
     bytes.extend(end_of(log).unwrap_or_default());
     let surplus = bytes.len().saturating_sub(OUTPUT);
     let text = String::from_utf8_lossy(bytes.get(surplus..).unwrap_or_default());
-    // What was cut begins in the middle of a line.
+    // A cut text begins in the middle of a line.
     if surplus > 0 { text.split_once('\n').map_or("", |(_, rest)| rest).to_owned() } else { text.into_owned() }
 }
 
-/// The end of a file: a byte more than is kept, so that it is seen whether something was cut.
+/// The end of a file: one byte more than is kept, to detect that something was cut.
 fn end_of(file: &Path) -> io::Result<Vec<u8>> {
     let mut file = fs::File::open(file)?;
     let most = OUTPUT as u64 + 1;

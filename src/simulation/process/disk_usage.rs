@@ -1,4 +1,4 @@
-//! How much the files below a folder take, also while programs change it.
+//! The size of the files below a directory, also while programs change it.
 
 use std::collections::HashSet;
 use std::fs::Metadata;
@@ -7,11 +7,11 @@ use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-/// Adds up files. One that has several names, or is met again because it was moved meanwhile, counts once if it is large.
+/// Adds up files. A large file with several names, or that is found again because it was moved, counts once.
 #[derive(Debug)]
 pub struct DiskUsage {
     measure: fn(&Metadata) -> u64,
-    /// Nobody wants to know how much more it is.
+    /// Counting stops above this many bytes.
     enough: u64,
     /// When to stop counting.
     until: Option<Instant>,
@@ -29,11 +29,11 @@ pub enum Unknown {
     Late,
 }
 
-/// The least that a name takes of the disk, in bytes.
+/// Least disk usage of a file or directory, in bytes.
 pub const SMALLEST: u64 = 4096;
-/// Files from this size on, in bytes, are remembered.
+/// Files from this size on, in bytes, are tracked by inode.
 const LARGE: u64 = 64 * 1024;
-/// How many folders may be in each other: a look at each takes time for all above it.
+/// Limit of nested directories: the kernel resolves the whole path for each.
 const DEEPEST: usize = 200;
 /// How many entries of a folder are counted between two looks at the clock.
 const BETWEEN_CLOCKS: usize = 64;
@@ -72,7 +72,7 @@ impl DiskUsage {
         self.total
     }
 
-    /// Adds everything below a folder. Links are not followed.
+    /// Adds everything below a directory. Symlinks are not followed.
     ///
     /// # Errors
     /// When there is more than anybody can tell; the rest is added. When the time is over.
@@ -85,7 +85,7 @@ impl DiskUsage {
             }
             let entries = match std::fs::read_dir(&folder) {
                 Ok(entries) => entries,
-                // It was removed meanwhile.
+                // It was removed during the walk.
                 Err(error) if matches!(error.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory) => continue,
                 Err(_) => {
                     all = Err(Unknown::Hidden);

@@ -1,13 +1,14 @@
-//! A process beside the server that ends the simulations when the server is gone, in whatever way.
+//! A process beside the server that ends the simulations when the server has exited, for any reason.
 //!
-//! The server starts its own program once more, as `simulation-server guard FOLDER` with the folder of this run. The
+//! The server starts its own program once more, as `simulation-server guard FOLDER` with the directory of this run. The
 //! guardian reads its standard input, a pipe whose other end only the server holds. The kernel closes that end when the
-//! server has ended, also after SIGKILL. Then the guardian does at once what the next start of the server would do: it kills
-//! every process that carries the mark of this run (see [`process_tree::MARK`]), and removes the folder. After an orderly
-//! stop it finds nothing left to do.
+//! server exits, also after SIGKILL. Then the guardian does at once what the next start of the server would do: it
+//! kills every process with the mark of this run (see [`process_tree::MARK`]), and removes the directory. After an
+//! orderly stop there is nothing left to do.
 //!
-//! A process that the server was just starting holds that end as well, until it executes its program and so has the mark:
-//! one look is enough. Nobody looks after the guardian: where it has ended before the server, the next start does its work.
+//! A child that the server has just forked holds that end as well, until `execve`, and has the mark from then on: one
+//! pass is enough. The guardian is not supervised: if it exits before the server, the next start of the server does its
+//! work.
 
 use std::io::PipeWriter;
 use std::path::{Path, PathBuf};
@@ -37,7 +38,7 @@ pub struct Guardian {
 }
 
 impl Guardian {
-    /// Starts a guardian for the run that has this folder; `containers` is whose containers it removes too.
+    /// Starts a guardian for the run with this directory; `containers` names the owner whose containers it removes too.
     ///
     /// # Errors
     /// When the system can start no more processes.

@@ -1,4 +1,4 @@
-//! The folders of running simulations: guards that remove them when they are dropped.
+//! The directories of running simulations: guards that remove them on drop.
 
 use std::io;
 use std::path::{Path, PathBuf};
@@ -7,41 +7,41 @@ use std::time::Duration;
 use super::process_tree;
 use super::remove_tree::remove_tree;
 
-/// The folder of one run of the server: `runs/run-*` in the cache folder. It holds a folder for each simulation.
+/// The directory of one run of the server: `runs/run-*` in `cacheDir`. It contains a directory for each simulation.
 #[derive(Debug)]
 pub struct RunDir {
     folder: PathBuf,
 }
 
-/// The folder of one simulation. Dropping it removes it with everything inside.
+/// The directory of one simulation. Dropping it removes it with its contents.
 #[derive(Debug)]
 pub struct InstanceDir {
     folder: PathBuf,
 }
 
-/// What earlier runs had left.
+/// What earlier runs have left.
 #[derive(Debug, Default, PartialEq, Eq)]
 pub struct Leftovers {
-    /// Runs that had ended without removing their folder.
+    /// Number of runs that ended without removing their directory.
     pub runs: usize,
-    /// Processes of theirs that were still alive.
+    /// Number of their processes that were still alive.
     pub processes: usize,
 }
 
-/// How often it is tried to remove a folder before that is left to the next start, and the pause between two tries.
+/// Attempts to remove a directory before that is left to the next start, and the pause between two attempts.
 const TRIES: u32 = 60;
 const PAUSE: Duration = Duration::from_secs(1);
 
 impl RunDir {
-    /// Makes the folder of this run below `cache`, and removes what earlier runs have left there. Only for the server
-    /// that owns the cache folder: the processes of every other run are killed.
+    /// Creates the directory of this run below `cache`, and removes what earlier runs have left there. Only for the
+    /// server that owns `cache`: the processes of every other run are killed.
     ///
     /// # Errors
-    /// When the folder can't be made.
+    /// When the directory can't be created.
     pub fn open(cache: &Path) -> io::Result<(Self, Leftovers)> {
         let runs = cache.join("runs");
         std::fs::create_dir_all(&runs)?;
-        // Marks of processes are compared with this path: it must be the one without links.
+        // Marks of processes are compared with this path, so it must be canonical.
         let runs = runs.canonicalize()?;
         let mut leftovers = Leftovers::default();
         for dead in std::fs::read_dir(&runs)?.flatten() {
@@ -53,12 +53,12 @@ impl RunDir {
         Ok((Self { folder }, leftovers))
     }
 
-    /// Makes a folder for a simulation, with the folder of its project inside.
+    /// Creates a directory for a simulation, with the directory of its project inside.
     ///
     /// # Errors
-    /// When a folder can't be made.
+    /// When a directory can't be created.
     pub fn instance(&self) -> io::Result<InstanceDir> {
-        // Somebody may have removed the folder of the run.
+        // The directory of the run may have been removed.
         std::fs::create_dir_all(&self.folder)?;
         let folder = tempfile::Builder::new().prefix("instance-").tempdir_in(&self.folder)?.keep();
         let instance = InstanceDir { folder };
@@ -71,7 +71,7 @@ impl RunDir {
         &self.folder
     }
 
-    /// Removes the folder with everything inside. Whoever still uses it does so in vain.
+    /// Removes the directory with its contents.
     pub fn remove(&self) {
         remove(&self.folder);
     }
@@ -89,7 +89,7 @@ impl InstanceDir {
         &self.folder
     }
 
-    /// The folder of the project. It is there as long as the instance is: whoever made it later could make it again after
+    /// The directory of the project. It is created with the instance: if it were created later, that could happen after
     /// the instance was removed.
     pub fn project(&self) -> PathBuf {
         self.folder.join("project")
@@ -98,7 +98,7 @@ impl InstanceDir {
 
 impl Drop for InstanceDir {
     fn drop(&mut self) {
-        // A project may hold many files, and this may run on a thread that serves others.
+        // A project may contain many files, and this may run on an actor's thread.
         let folder = std::mem::take(&mut self.folder);
         let shown = folder.display().to_string();
         if let Err(error) = std::thread::Builder::new().spawn(move || remove_patiently(&folder)) {
@@ -107,8 +107,8 @@ impl Drop for InstanceDir {
     }
 }
 
-/// Removes a folder, and tries again each second for a minute: a machine that has no file or process left for `rm` has
-/// them again. Blocks: only for threads of their own.
+/// Removes a directory, and retries each second for a minute: a machine without free files or processes for `rm` may
+/// recover. Blocks: only for threads of their own.
 fn remove_patiently(folder: &Path) {
     for _ in 0..TRIES {
         if remove_tree(folder).is_ok() {
@@ -119,7 +119,7 @@ fn remove_patiently(folder: &Path) {
     remove(folder);
 }
 
-/// Removes a folder. What can't be removed is logged, and left to the next start. Blocks.
+/// Removes a directory. What can't be removed is logged, and left to the next start. Blocks.
 pub fn remove(folder: &Path) {
     if let Err(error) = remove_tree(folder) {
         log::error!("{} can't be removed: {error}", folder.display());

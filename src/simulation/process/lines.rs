@@ -1,8 +1,8 @@
-//! Splits what a program prints into lines.
+//! Splits the output of a program into lines.
 
 use crate::shared::text::one_line;
 
-/// The line that a program is printing.
+/// The incomplete last line of an output.
 #[derive(Debug)]
 pub struct Lines {
     line: Vec<u8>,
@@ -15,8 +15,8 @@ impl Lines {
         Self { line: Vec::new(), longest }
     }
 
-    /// Tells each line that ends in these bytes, made printable; also those that the program overwrites (`\r`). Empty ones
-    /// are left out.
+    /// Passes on each line that ends in these bytes, made printable; also lines that the program overwrites (`\r`).
+    /// Empty lines are dropped.
     pub fn feed(&mut self, bytes: &[u8], mut told: impl FnMut(String)) {
         for byte in bytes {
             match byte {
@@ -27,7 +27,7 @@ impl Lines {
         }
     }
 
-    /// Tells the line that the output has ended in, if there is one.
+    /// Passes on the line in which the output ended, if there is one.
     pub fn end(&mut self, mut told: impl FnMut(String)) {
         let text = one_line(String::from_utf8_lossy(&self.line).trim_end());
         self.line.clear();

@@ -1,7 +1,7 @@
-//! Which ports of this machine are listened on, as the kernel answers by netlink (`sock_diag`, see `man 7 sock_diag`).
+//! The listening ports of this machine, from the kernel's netlink interface (`sock_diag`, see `man 7 sock_diag`).
 //!
-//! Only sockets in the state LISTEN are asked for, so that the kernel walks its small table of listeners. A read of `/proc/net/tcp`
-//! makes it walk all connections, which took 8.7 ms on a machine without any.
+//! Only sockets in the state LISTEN are requested, so that the kernel walks its small table of listeners. A read of
+//! `/proc/net/tcp` makes it walk all connections, which took 8.7 ms on a machine without any.
 
 use std::io;
 use std::ops::RangeInclusive;
@@ -18,11 +18,11 @@ use netlink_sys::{Socket, SocketAddr};
 pub struct Listener {
     /// Its port.
     pub port: u16,
-    /// The number by which the descriptors of processes name it.
+    /// Its inode, as in the descriptors of processes (`socket:[INODE]`).
     pub inode: u64,
 }
 
-/// The sockets that listen on ports of a range, by either version of IP, the lowest port first.
+/// The sockets that listen on ports of a range, IPv4 and IPv6, sorted by port.
 ///
 /// # Errors
 /// When the system has no `sock_diag`.
@@ -38,7 +38,7 @@ pub fn listeners(ports: &RangeInclusive<u16>) -> io::Result<Vec<Listener>> {
     Ok(found)
 }
 
-/// Asks for all listeners of a version of IP.
+/// Requests all listeners of a version of IP.
 fn ask(socket: &Socket, family: u8, socket_id: SocketId) -> io::Result<()> {
     let mut header = NetlinkHeader::default();
     header.flags = NLM_F_REQUEST | NLM_F_DUMP;
@@ -89,7 +89,7 @@ mod tests {
         assert_eq!(found.len(), 1 + usize::from(six.is_some()), "{found:?}");
         assert!(found.iter().all(|one| one.port == port && one.inode > 0), "{found:?}");
         drop((four, six));
-        // Another socket may have the port by now.
+        // Another socket may use the port by now.
         let left = listeners(&(port..=port)).unwrap();
         assert!(left.iter().all(|one| !found.contains(one)), "{left:?}");
     }

@@ -1,4 +1,4 @@
-//! What a simulation leaves in the system, and how it is removed: process trees and folders.
+//! What a simulation uses of the system, and how it is removed: process trees and directories.
 
 mod answer;
 mod disk_room;

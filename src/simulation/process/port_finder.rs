@@ -1,4 +1,4 @@
-//! Finds the ports on which starting simulations listen: one thread, and one query of the kernel for all of them.
+//! Finds the ports on which starting simulations listen: one thread, and one kernel query for all of them.
 //!
 //! The thread sleeps while nothing starts.
 
@@ -17,31 +17,31 @@ use super::process_tree::{sockets, tree};
 #[derive(Debug, Clone)]
 pub struct PortFinder(Sender<Search>);
 
-/// A process whose port is looked for.
+/// A process whose port is searched for.
 #[derive(Debug)]
 struct Search {
     root: i32,
     ports: RangeInclusive<u16>,
     since: Instant,
-    /// The listeners that were not its own when its tree was walked, and when that was.
+    /// The candidates of earlier walks of its tree, none of which were its own, and the time of the last walk.
     foreign: HashSet<u64>,
     walked: Instant,
     found: Option<oneshot::Sender<u16>>,
 }
 
-/// The pause between two queries is this part of the time for which the youngest search has been running.
+/// The pause between two queries, as a fraction (1/16) of the age of the youngest search.
 const PART: u32 = 16;
-/// The shortest pause: what a start loses by it, on average, is half of it.
+/// The shortest pause; it delays a start by half of it on average.
 const SHORTEST: Duration = Duration::from_millis(4);
-/// The pause is at least this many times as long as a query took, so that a class that starts leaves the cores to Webots.
+/// Least pause as a multiple of the duration of a query, so that a class that starts leaves the cores to Webots.
 const QUERIES: u32 = 15;
 /// The longest pause.
 const LONGEST: Duration = Duration::from_millis(200);
-/// A tree is walked this often although no listener is new: `/proc` may leave out a child while others come and go.
+/// Interval between two walks of a tree without new listeners: `/proc` may omit a child while others start and exit.
 const WALK_AGAIN: Duration = Duration::from_secs(1);
 
 impl PortFinder {
-    /// Starts the thread. `ports` are all that may be asked for.
+    /// Starts the thread. `ports` contain the ranges of all searches.
     ///
     /// # Errors
     /// When the system can't start a thread.
@@ -51,13 +51,13 @@ impl PortFinder {
         Ok(Self(sender))
     }
 
-    /// Waits until a process that descends from `root` listens on a port of a range, and returns the port. A listener of
-    /// another process does not count. Never returns if there is none: the caller has the time limit.
+    /// Waits until a process that descends from `root` listens on a port of a range, and returns the port. Listeners of
+    /// other processes are ignored. Never returns if there is none: the caller sets a timeout.
     pub async fn find(&self, root: i32, ports: RangeInclusive<u16>) -> u16 {
         let (sender, found) = oneshot::channel();
         let now = Instant::now();
         let search = Search { root, ports, since: now, foreign: HashSet::new(), walked: now, found: Some(sender) };
-        // The thread lives as long as this.
+        // The thread runs until the last sender is dropped.
         self.0.send(search).ok();
         match found.await {
             Ok(port) => port,
@@ -66,13 +66,13 @@ impl PortFinder {
     }
 }
 
-/// Serves searches until nobody can ask for another one.
+/// Serves searches until the last sender is dropped.
 fn run(searches: &Receiver<Search>, ports: &RangeInclusive<u16>) {
     let mut open: Vec<Search> = Vec::new();
     let mut owned = HashSet::new();
     let mut pause = Duration::ZERO;
     loop {
-        // Who comes during a long pause ends it.
+        // A new search ends a long pause.
         let next = if open.is_empty() { searches.recv().ok() } else { searches.recv_timeout(pause).ok() };
         match next {
             Some(search) => open.push(search),
@@ -94,12 +94,13 @@ fn run(searches: &Receiver<Search>, ports: &RangeInclusive<u16>) {
     }
 }
 
-/// Looks once for all searches. `owned` are the listeners that were found until now.
+/// Queries the kernel once for all searches. `owned` are the listeners that were found so far.
 fn look(open: &mut [Search], owned: &mut HashSet<u64>, ports: &RangeInclusive<u16>) -> io::Result<()> {
     let all = listeners(ports)?;
     let there: HashSet<u64> = all.iter().map(|one| one.inode).collect();
     owned.retain(|inode| there.contains(inode));
-    // First the port that each was given, so that of those who start side by side none takes another's listener for new.
+    // First only the requested port of each search, so that none of several concurrent starts claims the listener of
+    // another.
     for is_first in [true, false] {
         for search in open.iter_mut() {
             let (first, last) = (*search.ports.start(), *search.ports.end());
@@ -109,7 +110,7 @@ fn look(open: &mut [Search], owned: &mut HashSet<u64>, ports: &RangeInclusive<u1
                 && let Some(found) = search.found.take()
             {
                 owned.insert(inode);
-                // Who asked may be gone.
+                // The receiver may have been dropped.
                 found.send(port).ok();
             }
         }
@@ -117,7 +118,7 @@ fn look(open: &mut [Search], owned: &mut HashSet<u64>, ports: &RangeInclusive<u1
     Ok(())
 }
 
-/// Those of a list, which is in the order of ports, that are in a range.
+/// The listeners of a range, in a list that is sorted by port.
 fn listeners_in(all: &[Listener], ports: RangeInclusive<u16>) -> impl Iterator<Item = &Listener> {
     let begin = all.partition_point(|one| one.port < *ports.start());
     all.get(begin..).unwrap_or_default().iter().take_while(move |one| ports.contains(&one.port))

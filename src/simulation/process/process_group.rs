@@ -1,7 +1,7 @@
-//! A program that the server has started, with the process group that it leads.
+//! A program that the server has started, and the process group that it leads.
 //!
-//! The lines are our own because the crates that offer this (process-wrap, command-group) kill on drop only the leader,
-//! and know no grace time; what they would save is the call of `killpg`.
+//! The crates for this (process-wrap, command-group) kill only the leader on drop, and have no grace period; all that
+//! they would save is the call of `killpg`.
 
 use std::ffi::OsString;
 use std::fmt;
@@ -19,21 +19,21 @@ use tokio::sync::oneshot;
 
 use super::process_tree;
 
-/// What to start, and how it is ended.
+/// How to start and how to end a program.
 #[derive(Debug)]
 pub struct SpawnSpec {
-    /// The program and its arguments; no shell ever sees them.
+    /// The program and its arguments, without a shell.
     pub command: Vec<OsString>,
-    /// Whether it has the server's own environment.
+    /// Whether it inherits the server's environment.
     pub inherits: bool,
-    /// Variables of its environment, in place of the server's own or besides them.
+    /// Environment variables, which replace the server's or add to them (see `inherits`).
     pub environment: Vec<(OsString, OsString)>,
     /// How many programs wait outside of what is really run, each the parent of the next one: bubblewrap, and pasta before
     /// it. What bubblewrap has started leads a group of its own, and all of that ends with each of them.
     pub wrappers: usize,
     /// Working folder; the server's own where absent.
     pub folder: Option<PathBuf>,
-    /// The folder by which all processes of the tree are found again, see [`process_tree::MARK`].
+    /// The directory that marks all processes of the tree, see [`process_tree::MARK`].
     pub mark: PathBuf,
     /// Time between SIGTERM and SIGKILL.
     pub grace: Duration,
@@ -70,25 +70,25 @@ pub enum ExitReason {
     Signal(u8),
     /// It could not be started: a launcher did not find it.
     NotStarted,
-    /// The system does not tell.
+    /// The system does not report it.
     Unknown,
 }
 
 /// Exit code of a launcher (a shell, `env`, `nice`) that does not find its program.
 const NOT_FOUND: u8 = 127;
-/// What bubblewrap adds to the number of the signal that has ended its program.
+/// Offset that bubblewrap adds to the number of the signal that has ended its program.
 const SIGNALLED: u8 = 128;
-/// How long killed processes may take to vanish.
+/// Timeout of killed processes until they have exited.
 const VANISH: Duration = Duration::from_secs(1);
-/// Time between two checks whether the group is empty.
+/// Interval between two checks whether the group is empty.
 const POLL: Duration = Duration::from_millis(5);
 
 impl ProcessGroup {
-    /// Starts a program as the leader of a new group. The future resolves when the program has ended and the rest of
-    /// its group was killed; dropping the future kills the group too.
+    /// Starts a program as the leader of a new group. The future resolves when the program has exited and the rest of
+    /// its group is killed; dropping the future kills the group too.
     ///
     /// # Errors
-    /// When the program is not there, or the system can start no more processes.
+    /// When the program does not exist, or the system can start no more processes.
     pub fn start(
         spec: &SpawnSpec,
         output: Stdio,
@@ -117,24 +117,24 @@ impl ProcessGroup {
         self.leader
     }
 
-    /// Asks for an orderly end: SIGTERM, the grace time, SIGKILL.
+    /// Requests an orderly end: SIGTERM, the grace period, SIGKILL.
     pub fn terminate(&mut self) {
         if let Some(terminate) = self.terminate.take() {
-            // A group that has ended needs no signal.
+            // The group may have ended already.
             terminate.send(()).ok();
         }
     }
 }
 
-/// Waits for the end of a program. `asked` brings the wish for an orderly end; where its sender is dropped without one,
-/// the group is killed at once.
+/// Waits for the end of a program. `asked` receives the request for an orderly end; if its sender is dropped without
+/// one, the group is killed at once.
 async fn wait(mut group: KillOnDrop, mut child: Child, asked: oneshot::Receiver<()>, grace: Duration) -> ExitReason {
     let status = tokio::select! {
         status = child.wait() => status,
         asked = asked => {
             if asked.is_ok() {
                 group.ask_to_end();
-                // A launcher may end before what it has launched.
+                // A launcher may exit before its child.
                 let end = async {
                     child.wait().await.ok();
                     group.emptied().await;
@@ -147,7 +147,7 @@ async fn wait(mut group: KillOnDrop, mut child: Child, asked: oneshot::Receiver<
     };
     group.signal(Signal::SIGKILL);
     actix_rt::time::timeout(VANISH, group.emptied()).await.ok();
-    // The number of an empty group may be given to another one.
+    // The id of an empty group may be reused.
     group.leader = None;
     status.map_or(ExitReason::Unknown, |status| ExitReason::of(status, group.wrappers > 0))
 }
@@ -161,7 +161,7 @@ struct KillOnDrop {
 impl KillOnDrop {
     fn signal(&self, signal: Signal) {
         if let Some(group) = self.leader {
-            // The only fault is that the group is empty, which is what is wanted.
+            // The only possible error is that the group is empty, as intended.
             killpg(group, signal).ok();
         }
     }
@@ -178,12 +178,12 @@ impl KillOnDrop {
         }
         let is_asked = inside.into_iter().any(|child| killpg(Pid::from_raw(child), Signal::SIGTERM).is_ok());
         if !is_asked {
-            // It has not come so far as to start anything.
+            // bubblewrap has not started anything yet.
             self.signal(Signal::SIGKILL);
         }
     }
 
-    /// Waits until the group has no process any more.
+    /// Waits until the group is empty.
     async fn emptied(&self) {
         while self.leader.is_some_and(|group| killpg(group, None) != Err(Errno::ESRCH)) {
             actix_rt::time::sleep(POLL).await;
@@ -198,7 +198,7 @@ impl Drop for KillOnDrop {
 }
 
 impl ExitReason {
-    /// How a program ended. bubblewrap tells of a signal as shells do: 128 and its number.
+    /// How a program ended. bubblewrap reports a signal as shells do: 128 plus its number.
     fn of(status: ExitStatus, in_sandbox: bool) -> Self {
         let signal = status.signal().and_then(|number| u8::try_from(number).ok());
         match u8::try_from(status.code().unwrap_or_default()).unwrap_or_default() {
@@ -273,7 +273,7 @@ mod tests {
     async fn what_a_launcher_has_launched_gets_the_grace_time_too() {
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("written");
-        // The launcher ends at once, what it has launched does its last work.
+        // The launcher exits at once, while its child still does its last work.
         let script = format!("(trap 'sleep 0.2; echo done > {}; exit' TERM; sleep 1000 & wait) & wait", file.display());
         let (reader, output) = std::io::pipe().unwrap();
         let script = format!("echo ready; {script}");

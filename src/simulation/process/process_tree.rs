@@ -1,4 +1,5 @@
-//! The processes of a simulation: how they are found, and how those are ended that a server has left. Linux: `/proc`.
+//! The process trees of simulations: how to find their processes, and how to kill those of a run that has ended. Linux:
+//! `/proc`.
 
 use std::collections::HashSet;
 use std::ffi::OsStr;
@@ -13,9 +14,9 @@ use nix::sys::signal::{Signal, kill, killpg};
 use nix::unistd::{Pid, getpgid};
 use procfs::process::{Process, all_processes};
 
-/// The environment variable that marks every process of a simulation: its value is the instance's folder. Children
-/// inherit it, so that also those are found that have left their process group and lost their parent. One that has
-/// also dropped its environment is not found.
+/// The environment variable that marks every process of a simulation: its value is the instance's directory. Children
+/// inherit it, so that processes are found that have left their process group and lost their parent. A process that has
+/// also cleared its environment is not found.
 pub const MARK: &str = "WEBOTS_FLEET_INSTANCE";
 
 /// A process and all that descends from it at this moment.
@@ -41,8 +42,8 @@ pub fn children(pid: i32) -> Vec<i32> {
     children.flat_map(|ids| ids.split_whitespace().filter_map(|id| id.parse().ok()).collect::<Vec<_>>()).collect()
 }
 
-/// Kills every process that carries the mark of an instance below `folder`, and the groups that such processes lead.
-/// Returns how many marked processes there were.
+/// Kills every process that has the mark of an instance below `folder`, and the groups that such processes lead.
+/// Returns the number of marked processes.
 ///
 /// It looks until it has found none twice in a row: a process may have forked meanwhile, and one that is just executing
 /// another program has no environment for a moment. Blocks for 5 ms at least, for some seconds at most.
@@ -57,7 +58,7 @@ pub fn kill_marked(folder: &Path) -> usize {
         found_none = found.is_empty();
         for process in found {
             let pid = Pid::from_raw(process.pid());
-            // The only fault is that the process has ended, which is what is wanted.
+            // The only possible error is that the process has exited, as intended.
             if getpgid(Some(pid)) == Ok(pid) {
                 killpg(pid, Signal::SIGKILL).ok();
             } else {
@@ -70,11 +71,11 @@ pub fn kill_marked(folder: &Path) -> usize {
     known.len()
 }
 
-/// How often marked processes are looked for at most.
+/// Largest number of scans for marked processes.
 const MOST_SCANS: usize = 200;
-/// Time between two scans: killed processes need a moment to vanish.
+/// Pause between two scans: killed processes need a moment to exit.
 const BETWEEN_SCANS: Duration = Duration::from_millis(5);
-/// How much is read of a process's environment: a process can make its own any size.
+/// Limit of what is read of a process's environment, in bytes: a process can set any size.
 const ENVIRONMENT: u64 = 128 * 1024;
 
 fn marked(folder: &Path) -> Vec<Process> {
@@ -82,7 +83,7 @@ fn marked(folder: &Path) -> Vec<Process> {
     all_processes().into_iter().flatten().flatten().filter(carries_mark).collect()
 }
 
-/// The mark of a process. One that has ended, and was not yet waited for, has no environment.
+/// The mark of a process. A zombie has no environment.
 fn mark(pid: i32) -> Option<PathBuf> {
     let mut environment = Vec::new();
     File::open(format!("/proc/{pid}/environ")).ok()?.take(ENVIRONMENT).read_to_end(&mut environment).ok()?;
@@ -130,7 +131,8 @@ mod tests {
     #[test]
     fn all_that_carries_the_mark_is_killed_with_the_groups_that_it_leads() {
         let folder = tempfile::tempdir().unwrap();
-        // A grandchild in a session of its own keeps the mark; one without environment stays in the group of its parent.
+        // A grandchild in a session of its own keeps the mark; one without an environment stays in the group of its
+        // parent.
         let script = "setsid sleep 100 & env -i sleep 100 & echo $!; wait";
         let mut shell = Command::new("bash");
         shell.args(["-c", script]).env(MARK, folder.path().join("instance")).process_group(0);
@@ -159,7 +161,7 @@ mod tests {
         let mark = folder.path().join("instance");
         let found = |size: usize| {
             let mut sleep = Command::new("sleep");
-            // Variables are in the order of their names.
+            // Variables are sorted by name.
             sleep.arg("100").env_clear().env("PATH", "/usr/bin:/bin").env(MARK, &mark);
             for name in ["A", "B", "C"] {
                 sleep.env(name, "x".repeat(size));

@@ -1,5 +1,5 @@
-//! Removes a folder with everything inside, by the system's `rm`: it manages any depth, which a recursion in the server would
-//! not, and follows no links.
+//! Removes a directory with its contents by the system's `rm`: it handles any depth, which a recursion in the server
+//! would not, and does not follow symlinks.
 
 use std::ffi::OsString;
 use std::io;
@@ -9,10 +9,10 @@ use std::time::Duration;
 use super::process_group::ExitReason;
 use super::runner::Run;
 
-/// How long it may take: a program that still runs may add files for ever.
+/// Timeout: a program that still runs may keep adding files.
 const LIMIT: Duration = Duration::from_mins(10);
 
-/// Removes a folder. One that is not there is no error. Blocks.
+/// Removes a directory. Treats `NotFound` as success. Blocks.
 ///
 /// # Errors
 /// When something in it can't be removed, or after ten minutes.
@@ -21,7 +21,7 @@ pub fn remove_tree(folder: &Path) -> io::Result<()> {
         return Ok(());
     }
     run(&["rm", "-rf", "--"], folder).or_else(|_| {
-        // A world's program may have taken the right to change its own folders.
+        // A world's program may have removed the write permission of its directories.
         run(&["chmod", "-R", "u+rwX", "--"], folder).ok();
         run(&["rm", "-rf", "--"], folder)
     })
@@ -30,7 +30,7 @@ pub fn remove_tree(folder: &Path) -> io::Result<()> {
 fn run(words: &[&str], folder: &Path) -> io::Result<()> {
     let command = words.iter().map(OsString::from).chain([folder.into()]);
     let mut complaint = String::new();
-    // Its mark is no run's: whoever ends a run does not end it.
+    // Its mark is not that of a run: ending a run does not kill it.
     let ran = Run::new(command, Path::new("/"), LIMIT).blocking(|line| complaint = line);
     let ran = ran.map_err(|error| io::Error::other(format!("{} {error}", words.join(" "))))?;
     if ran.ending == ExitReason::Code(0) { Ok(()) } else { Err(io::Error::other(complaint)) }

@@ -1,4 +1,4 @@
-//! Runs a program to its end: without a shell, within limits, and ended with whoever waits for it.
+//! Runs a program to its end: without a shell, within limits. Dropping the future kills it.
 
 use std::ffi::OsString;
 use std::io;
@@ -13,50 +13,50 @@ use tokio::net::unix::pipe::Receiver;
 use super::lines::Lines;
 use super::process_group::{ExitReason, ProcessGroup, SpawnSpec};
 
-/// A program to run to its end, and what it may take.
+/// A program to run to its end, with its limits.
 #[derive(Debug)]
 pub struct Run {
     /// How it is started.
     pub spec: SpawnSpec,
-    /// How long it may take; then it is killed.
+    /// Timeout, after which it is killed.
     pub time: Duration,
-    /// How much of its answer is read, in bytes.
+    /// Size limit of its answer, in bytes.
     pub answer: u64,
-    /// How much is kept of a line of what it says, in bytes.
+    /// Longest line that is kept, in bytes.
     pub line: usize,
-    /// What the system lets it and its children have. It holds a moment after the start.
+    /// Resource limits of it and its children. They apply a moment after the start.
     pub limits: Vec<(Resource, u64)>,
-    /// How much less priority it has, as `nice` has it.
+    /// Its niceness.
     pub niceness: i32,
 }
 
 /// How a program ended.
 #[derive(Debug)]
 pub struct Ran {
-    /// How.
+    /// Its exit code or signal.
     pub ending: ExitReason,
     /// What it printed on its standard output.
     pub answer: Vec<u8>,
 }
 
-/// Why a program has not ended by itself. Its words follow those that name the program.
+/// Why a program has not ended by itself. The message follows the name of the program.
 #[derive(Debug, thiserror::Error)]
 pub enum RunError {
-    /// It is not there, or the system can start no more.
+    /// It does not exist, or the system can start no more processes.
     #[error("can't be started: {0}")]
     NotStarted(#[from] io::Error),
-    /// It took too long.
+    /// It exceeded its timeout.
     #[error("did not end within {} seconds", .0.as_secs_f64())]
     Slow(Duration),
-    /// It answered more than is read.
+    /// Its answer exceeds the size limit.
     #[error("has answered too much")]
     TooLong,
 }
 
-/// How much is read at once, in bytes, and how long is waited after it if that was all of it: a program that prints without
-/// end waits.
+/// Size of a read in bytes, and the pause after a read that fills it, so that a program that prints without end is
+/// slowed down.
 const CHUNK: (usize, Duration) = (16 * 1024, Duration::from_millis(5));
-/// For so many lines at once it is waited once more: each is looked at and told, however short it is.
+/// Lines per extra pause: each line costs work, however short.
 const LINES: u32 = 50;
 
 impl Run {
@@ -66,26 +66,25 @@ impl Run {
         Self { spec, time, answer: 1 << 20, line: 1000, limits: Vec::new(), niceness: 0 }
     }
 
-    /// Runs it. `told` hears each line that it prints on its standard error. Dropping the future kills it and all that it
-    /// has started.
+    /// Runs it. `told` receives each line of its standard error. Dropping the future kills it and its process group.
     ///
     /// # Errors
-    /// When it can't be started, or is killed since it takes too much.
+    /// When it can't be started, or is killed because it exceeds a limit.
     pub async fn run(self, told: impl FnMut(String)) -> Result<Ran, RunError> {
         let (output, answer) = io::pipe()?;
         self.finish(Some(output), answer.into(), told).await
     }
 
-    /// The same, but `told` hears what it prints on its standard output as well, and there is no answer.
+    /// The same, but `told` receives its standard output as well, and there is no answer.
     ///
     /// # Errors
-    /// When it can't be started, or is killed since it takes too long.
+    /// When it can't be started, or is killed because it exceeds its timeout.
     pub async fn follow(self, told: impl FnMut(String)) -> Result<ExitReason, RunError> {
         let ran = self.finish(None, None, told).await;
         ran.map(|ran| ran.ending)
     }
 
-    /// The same as [`Self::run`], for a thread that serves nobody.
+    /// The same as [`Self::run`], but blocks the calling thread.
     ///
     /// # Errors
     /// Those of `run`.
@@ -94,7 +93,7 @@ impl Run {
             let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
             runtime.block_on(self.run(told))
         };
-        // The thread that calls may have a runtime already.
+        // The calling thread may have a runtime already.
         std::thread::scope(|scope| {
             let ran = std::thread::Builder::new().spawn_scoped(scope, run)?.join();
             ran.unwrap_or_else(|_| Err(io::Error::other("its thread has panicked").into()))
@@ -110,7 +109,7 @@ impl Run {
         let Self { spec, time, answer: most, line, limits, niceness } = self;
         let (said, errors) = io::pipe()?;
         let answer = answer.map_or_else(|| errors.try_clone(), Ok)?;
-        // A thread that starts a process waits until it runs its program, which takes long on a busy machine.
+        // `spawn` blocks until `execve`, which takes long on a busy machine.
         let start = move || {
             let (group, ended) = ProcessGroup::start(&spec, answer.into(), errors.into())?;
             bound(group.leader(), &limits, niceness);
@@ -127,7 +126,7 @@ impl Run {
     }
 }
 
-/// Bounds a program that has just been started. What it starts inherits that.
+/// Limits a program that has just been started. Its children inherit the limits.
 fn bound(leader: i32, limits: &[(Resource, u64)], niceness: i32) {
     let pid = Pid::from_raw(leader);
     let limit = |(resource, most): &(Resource, u64)| {
@@ -142,13 +141,13 @@ fn bound(leader: i32, limits: &[(Resource, u64)], niceness: i32) {
 async fn read(output: Option<Receiver>, most: u64) -> Vec<u8> {
     let mut answer = Vec::new();
     if let Some(output) = output {
-        // A broken pipe is the end of the answer; whether that is right is told by how the program ended.
+        // A broken pipe ends the answer; the exit code decides whether that is an error.
         output.take(most + 1).read_to_end(&mut answer).await.ok();
     }
     answer
 }
 
-/// Tells each line, made printable; also those that the program overwrites.
+/// Passes on each line, made printable; also lines that the program overwrites.
 async fn tell(mut said: impl AsyncRead + Unpin, longest: usize, mut told: impl FnMut(String)) {
     let (mut lines, mut chunk) = (Lines::new(longest), vec![0; CHUNK.0]);
     while let Ok(length @ 1..) = said.read(&mut chunk).await {

@@ -1,9 +1,9 @@
-//! How a connection and the session of its simulation are attached to each other, and what they say.
+//! The attachment of a connection to the session of its simulation, and their messages.
 
 use actix::prelude::*;
 use actix_web_actors::ws::CloseCode;
 
-/// What a session has for its client.
+/// Messages from a session to its client.
 #[derive(Message)]
 #[rtype(result = "()")]
 pub enum ToClient {
@@ -11,21 +11,21 @@ pub enum ToClient {
     Attached(Attachment),
     /// A text of the protocol.
     Text(String),
-    /// The last text of the protocol, and how the connection closes after it.
+    /// The last text of the protocol, and the code with which the connection then closes.
     End(String, CloseCode),
 }
 
-/// What a client has for its session.
+/// A message from a client to its session.
 #[derive(Message, Debug, Clone, PartialEq, Eq)]
 #[rtype(result = "()")]
 pub struct FromClient {
-    /// Which attachment says it: that of an earlier connection has nothing more to say.
+    /// Number of the attachment; messages of an earlier attachment are ignored.
     pub attachment: u64,
-    /// What it says.
+    /// The content of the message.
     pub what: Said,
 }
 
-/// What a client says.
+/// The content of a client's message.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Said {
     /// Restore this file below `controllers/`.
@@ -38,22 +38,22 @@ pub enum Said {
     Gone,
 }
 
-/// The attachment of a connection to a session. Dropping it tells the session that its client has gone.
+/// The attachment of a connection to a session. Dropping it sends [`Said::Gone`] to the session.
 pub struct Attachment {
     number: u64,
     session: Recipient<FromClient>,
 }
 
 impl Attachment {
-    /// Attaches a connection to a session; `number` tells it from others.
+    /// Attaches a connection to a session; `number` is unique among the session's attachments.
     #[must_use]
     pub fn new(session: Recipient<FromClient>, number: u64) -> Self {
         Self { number, session }
     }
 
-    /// Says something to the session.
+    /// Sends a message to the session.
     pub fn say(&self, what: Said) {
-        // A session that has ended has told its client so.
+        // A session that has ended has notified its client.
         self.session.do_send(FromClient { attachment: self.number, what });
     }
 }

@@ -1,4 +1,4 @@
-//! How a connection is attached to the session of its simulation, and how a client finds its session again.
+//! The attachment of a connection to the session of its simulation, and how a client finds its session again.
 
 mod attachment;
 mod sessions;

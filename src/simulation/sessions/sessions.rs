@@ -1,4 +1,4 @@
-//! The sessions that their clients may come back to.
+//! The sessions that their clients can resume.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -10,24 +10,24 @@ use super::attachment::ToClient;
 use super::token::Token;
 use crate::shared::http::Peer;
 
-/// Asks a session to go on with another connection, which is then attached to it. The answer is why not, in words for the
-/// client.
+/// Asks a session to continue with another connection, which is then attached to it. The answer is the reason of a
+/// refusal, as text for the client.
 #[derive(Message)]
 #[rtype(result = "Result<(), String>")]
 pub struct Resume {
-    /// What the client proves with that the session is its own.
+    /// The token that proves that the session belongs to the client.
     pub token: Token,
-    /// The connection.
+    /// The client's new connection.
     pub client: Recipient<ToClient>,
-    /// Where the client is now.
+    /// The client's current address.
     pub peer: Peer,
 }
 
-/// Where sessions are found again.
+/// The registered sessions, by number.
 #[derive(Default)]
 pub struct Sessions(Mutex<HashMap<u64, Recipient<Resume>>>);
 
-/// A session that can be found. Dropping it ends that.
+/// The registration of a session. Dropping it removes the session.
 pub struct Registration {
     number: u64,
     sessions: Arc<Sessions>,
@@ -37,7 +37,7 @@ impl Sessions {
     /// Registers a session.
     #[must_use]
     pub fn register(self: &Arc<Self>, session: Recipient<Resume>) -> Registration {
-        // Not one that an earlier run of the server has used.
+        // Random, so that it differs from the numbers of earlier runs of the server.
         let number = rand::random();
         self.0.lock().insert(number, session);
         Registration { number, sessions: Arc::clone(self) }
@@ -51,7 +51,7 @@ impl Sessions {
 }
 
 impl Registration {
-    /// A new token for it.
+    /// Creates a new token for the session.
     #[must_use]
     pub fn token(&self) -> Token {
         Token::new(self.number)

@@ -1,17 +1,17 @@
-//! The token by which a client comes back to its simulation.
+//! The token with which a client resumes its session.
 
 use std::fmt;
 
 use subtle::ConstantTimeEq;
 
-/// Names a session, and proves that the client is its own. It never comes into a log, a page or a URL.
+/// Identifies a session, and proves that it belongs to the client. It never appears in a log, a page or a URL.
 #[derive(Clone, Copy)]
 pub struct Token {
     number: u64,
     secret: [u8; 16],
 }
 
-/// How many hexadecimal digits name the session.
+/// Number of hexadecimal digits of the session's number.
 const DIGITS: usize = 16;
 
 impl Token {
@@ -21,7 +21,7 @@ impl Token {
         Self { number, secret: rand::random() }
     }
 
-    /// Reads a token of a client; nothing where it is none.
+    /// Parses a token of a client; `None` if it is invalid.
     #[must_use]
     pub fn parse(text: &str) -> Option<Self> {
         let is_hex = text.len() == 3 * DIGITS && text.bytes().all(|byte| byte.is_ascii_hexdigit());
@@ -36,7 +36,7 @@ impl Token {
         self.number
     }
 
-    /// The token as its client gets it, and nobody else.
+    /// The token as text, only for its client.
     #[must_use]
     pub fn reveal(&self) -> String {
         format!("{:016x}{:032x}", self.number, u128::from_be_bytes(self.secret))
@@ -44,7 +44,7 @@ impl Token {
 }
 
 impl PartialEq for Token {
-    /// Takes a time that does not depend on the secrets.
+    /// Compares the secrets in constant time.
     fn eq(&self, other: &Self) -> bool {
         self.number == other.number && self.secret.ct_eq(&other.secret).into()
     }

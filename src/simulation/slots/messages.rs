@@ -1,4 +1,4 @@
-//! What is said to the actor of places, and what it says.
+//! Messages to the slot pool.
 
 use std::net::IpAddr;
 
@@ -9,22 +9,22 @@ use super::slot_error::SlotError;
 use crate::simulation::simulation_id::SimulationId;
 use crate::simulation::snapshot::Snapshot;
 
-/// Asks for a place, in the name of a ticket.
+/// Requests a slot for a lease.
 #[derive(Message)]
 #[rtype(result = "()")]
 pub(super) struct Acquire(pub Box<Present>);
 
-/// What the holder of a ticket reports of its simulation.
+/// A report of a lease's owner about its simulation.
 #[derive(Message)]
 #[rtype(result = "()")]
 pub struct UpdateSimulation(pub SimulationId, pub Report);
 
-/// Asks for a snapshot of all simulations.
+/// Requests a snapshot of all simulations.
 #[derive(Message)]
 #[rtype(result = "Snapshot")]
 pub struct GetSnapshot;
 
-/// Gives a place, or one in the line, back.
+/// Releases a slot, or leaves the queue.
 #[derive(Message)]
 #[rtype(result = "()")]
 pub struct Release(pub SimulationId);
@@ -45,6 +45,6 @@ pub struct StopOne {
 pub struct Move {
     /// The id of the simulation.
     pub id: SimulationId,
-    /// Where the client is now, if that is known.
+    /// The client's current address, if it is known.
     pub address: Option<IpAddr>,
 }

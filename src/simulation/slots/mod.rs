@@ -1,4 +1,4 @@
-//! The places that clients wait for: who has one, who is next, and how many one address may have.
+//! The slots that clients wait for: leases, the queue, and the limit per address.
 
 mod messages;
 mod party;

@@ -1,4 +1,4 @@
-//! A simulation that has a place or waits for one, and what becomes of it.
+//! A simulation that has a slot or waits for one, and its record.
 
 use std::cmp::Reverse;
 use std::collections::BTreeMap;
@@ -18,26 +18,26 @@ use crate::simulation::simulation_id::SimulationId;
 use crate::simulation::snapshot::{Simulation, SimulationChange, Stage};
 use crate::simulation::who::Who;
 
-/// What its owner reports of a simulation.
+/// A report of its owner about a simulation.
 #[derive(Debug)]
 pub enum Report {
-    /// Something that is shown.
+    /// A change of what pages show.
     Change(SimulationChange),
-    /// An event, in words.
+    /// An event, as text.
     Event(String),
-    /// How it ends. The first one counts.
+    /// How it ends. Only the first report counts.
     End(End),
 }
 
 /// A simulation of this server.
 pub(super) struct Present {
-    /// The port that is lent, which is not always the one that Webots took.
+    /// The leased port, which Webots may not have used.
     pub lent: Option<u16>,
-    /// The address by which its client counts.
+    /// The address that counts for the limit per address.
     pub address: Option<IpAddr>,
-    /// Hears what becomes of it.
+    /// Receives its events.
     pub listener: Recipient<SlotEvent>,
-    /// As pages show it.
+    /// The part that pages show.
     pub shown: Simulation,
     client: Peer,
     repository: String,
@@ -45,13 +45,13 @@ pub(super) struct Present {
     how: Option<End>,
 }
 
-/// How many events are kept of a simulation.
+/// Number of events that are kept of a simulation.
 const MAX_EVENTS: usize = 60;
-/// How many letters are kept of an event.
+/// Longest text of an event, in characters.
 const EVENT_LENGTH: usize = 500;
 
-/// Where more simulations than this wait for clients that are away: the one that has to end. It has been away longest, of
-/// the address that has most of them, so that who comes and goes harms himself only.
+/// The simulation to end if more than `most` wait for disconnected clients. It has waited longest, among those of the
+/// address that has most of them, so that a client that reconnects often harms only itself.
 pub(super) fn longest_away(all: &BTreeMap<SimulationId, Present>, most: usize) -> Option<SimulationId> {
     let away = || all.values().filter(|one| one.shown.away_until.is_some());
     let of_address = |address| away().filter(|one| one.address == address).count();
@@ -104,7 +104,7 @@ impl Present {
         self.note(&format!("it is given port {port}, its world is checked out"));
     }
 
-    /// Takes in what its owner reports.
+    /// Records a report of its owner.
     pub(super) fn take(&mut self, report: Report) {
         match report {
             Report::Change(change) => self.shown.apply(change),
@@ -113,7 +113,8 @@ impl Present {
         }
     }
 
-    /// Who may read the output may read this, so it holds no address and no path of the machine.
+    /// Adds an event. Clients that may read the output may read it, so it contains no address and no path of the
+    /// machine.
     fn note(&mut self, event: &str) {
         if self.events.len() < MAX_EVENTS {
             self.events.push(format!(
@@ -124,7 +125,8 @@ impl Present {
         }
     }
 
-    /// What it leaves when its owner is gone. One that says nothing has lost its client, or panicked while Webots ran.
+    /// The record of its end, once its owner has stopped. An owner that has reported no end has lost its client, or
+    /// panicked while Webots ran.
     pub(super) fn ended(mut self) -> Ended {
         let how = self.how.take().unwrap_or_else(|| {
             let (reason, why) = match self.shown.launched {

@@ -1,27 +1,27 @@
-//! Why a client gets no place.
+//! Why a client gets no slot.
 
-/// Why there is no place. The words are for the client.
+/// Why a client gets no slot. The messages are for the client.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum SlotError {
-    /// Everything is taken, the waiting line too.
+    /// All slots are taken, and the queue is full.
     #[error(
         "All {places} places of this simulation server are taken, and {waiting} clients are waiting already. Try again later"
     )]
     QueueFull {
-        /// Places in all.
+        /// Number of slots.
         places: usize,
-        /// Length of the waiting line.
+        /// Length of the queue.
         waiting: usize,
     },
-    /// The client's address has its share.
+    /// The client's address has reached its limit.
     #[error(
         "Clients of your address have {places} places of this simulation server, and {waiting} more are waiting. The rest \
          is kept for others. Try again later"
     )]
     AddressLimit {
-        /// Places that the address has.
+        /// Number of slots that the address has.
         places: usize,
-        /// Clients of the address that wait.
+        /// Number of clients of the address that wait.
         waiting: usize,
     },
     /// The client's user has its share.

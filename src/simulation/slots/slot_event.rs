@@ -1,4 +1,4 @@
-//! What the holder of a place, or of one in the line, hears.
+//! The events of a lease.
 
 use actix::prelude::*;
 
@@ -8,13 +8,13 @@ use super::slot_error::SlotError;
 #[derive(Message, Debug, Clone, PartialEq, Eq)]
 #[rtype(result = "()")]
 pub enum SlotEvent {
-    /// So many clients are ahead in the waiting line.
+    /// This many clients are ahead in the queue.
     Queued(usize),
-    /// This port may be used as long as the ticket lives.
+    /// This port may be used until the lease is dropped.
     Granted(u16),
-    /// There is no room in the waiting line either.
+    /// The slots and the queue are full, or the address has reached its limit.
     Rejected(SlotError),
-    /// Too many simulations wait for clients that are away, and this one has waited longest: it has to end.
+    /// Too many simulations wait for disconnected clients, and this one has waited longest: it must end.
     AwayTooLong,
     /// The administrator stops the simulation; the words are for its client.
     Stopped(String),

@@ -1,8 +1,8 @@
-//! Actor: lends places to simulations, keeps the waiting line, and knows all simulations of this server.
+//! Actor: leases slots to simulations, keeps the queue, and knows all simulations of this server.
 //!
-//! One for the whole server, created at start; it never ends. A place is a streaming port. Whoever wants one makes a
-//! [`SlotLease`] and then hears how many are ahead, until a port is granted. Dropping the ticket leaves the line or frees
-//! the port, so that neither is lost in any state or by any panic.
+//! One for the whole server, created at start; it never ends. A slot is a streaming port. A session creates a
+//! [`SlotLease`], and receives its position in the queue until a port is granted. Dropping the lease leaves the queue
+//! or frees the port, so that neither leaks in any state or after any panic.
 
 use std::collections::{BTreeMap, HashMap, HashSet, VecDeque};
 use std::io::ErrorKind;
@@ -24,14 +24,14 @@ use crate::simulation::simulation_id::SimulationId;
 use crate::simulation::snapshot::{SimulationChange, Snapshot, Stage};
 use crate::simulation::who::Who;
 
-/// A place, or a place in the line for one. Dropping it gives it back.
+/// A slot, or a position in the queue for one. Dropping it releases it.
 #[derive(Debug)]
 pub struct SlotLease {
     id: SimulationId,
     slots: Addr<SlotPool>,
 }
 
-/// A port for one simulation, and the right to it.
+/// A port for one simulation, with its lease.
 #[derive(Debug)]
 pub struct Slot {
     /// Frees the slot when it is dropped.
@@ -49,7 +49,7 @@ pub struct SlotPool {
     arrivals: u64,
     present: BTreeMap<SimulationId, Present>,
     line: VecDeque<Waiting>,
-    /// Hears of each end.
+    /// Records each end.
     ends: Option<Ends>,
 }
 
@@ -60,12 +60,12 @@ struct Waiting {
     told: Option<usize>,
 }
 
-/// Time between two checks whether a port is free again that somebody outside of this server has taken.
+/// Interval between two checks of the ports that other programs have used.
 const RECHECK: Duration = Duration::from_secs(1);
 
 impl SlotPool {
-    /// Lends these ports; `queue_capacity` clients may wait. One address may have `per_address` places, and the same part of
-    /// the line; without it, all of both.
+    /// Leases these ports; `queue_capacity` clients may wait. One address may have `per_address` slots, and the same
+    /// share of the queue; without it, all of both.
     #[must_use]
     pub fn new(ports: RangeInclusive<u16>, queue_capacity: usize, per_address: Option<usize>) -> Self {
         let shares = Shares { address: share(&ports, queue_capacity, per_address), user: None };
@@ -80,7 +80,7 @@ impl SlotPool {
         self
     }
 
-    /// Has each end recorded.
+    /// Records each end with `ends`.
     #[must_use]
     pub fn with_ends(self, ends: Ends) -> Self {
         Self { ends: Some(ends), ..self }
@@ -127,7 +127,7 @@ impl SlotPool {
         (waiting >= self.queue_capacity).then_some(SlotError::QueueFull { places, waiting })
     }
 
-    /// Gives free places to those who wait, and tells the others how many are ahead.
+    /// Grants free slots to the clients in the queue, and sends the others their position.
     fn serve(&mut self) {
         while let Some(next) = self.next_in_line()
             && let Some(port) = self.free_port()
@@ -135,12 +135,12 @@ impl SlotPool {
         {
             match first.client.try_send(SlotEvent::Granted(port)) {
                 Ok(()) => self.lend(first.id, port),
-                // It stays where it is in the line until the next check.
+                // It keeps its position in the queue until the next check.
                 Err(SendError::Full(_)) => {
                     self.line.insert(next, first);
                     break;
                 }
-                // Its actor has stopped, which drops its ticket too.
+                // Its actor has stopped, which drops its lease too.
                 Err(SendError::Closed(_)) => {}
             }
         }
@@ -151,7 +151,7 @@ impl SlotPool {
         }
     }
 
-    /// Simulations whose clients are away hold half of the places at most, or one where there is only one.
+    /// Simulations with disconnected clients hold at most half of the slots, or one if there is only one.
     fn end_longest_away(&mut self) {
         if let Some(id) = longest_away(&self.present, (self.ports.len() / 2).max(1))
             && let Some(longest) = self.present.get_mut(&id)
@@ -167,7 +167,7 @@ impl SlotPool {
         }
     }
 
-    /// The lowest port that is neither lent nor used by anybody else.
+    /// The lowest port that is neither leased nor used by another program.
     fn free_port(&self) -> Option<u16> {
         let taken: HashSet<u16> = self.present.values().flat_map(|one| [one.lent, one.shown.port]).flatten().collect();
         self.ports.clone().filter(|port| !taken.contains(port)).find(|port| is_free(*port))
@@ -310,24 +310,24 @@ impl SlotLease {
         self.id
     }
 
-    /// Tells what has changed in the simulation.
+    /// Reports a change of the simulation.
     pub fn update(&self, change: SimulationChange) {
         self.report(Report::Change(change));
     }
 
-    /// Logs an event of the simulation under its id, and keeps it.
+    /// Logs an event of the simulation under its id, and records it.
     pub fn log(&self, level: log::Level, event: String) {
         log::log!(target: "simulation", level, "{}: {event}", self.id);
         self.report(Report::Event(event));
     }
 
-    /// Tells how the simulation ends, before the ticket is dropped. What comes first counts.
+    /// Reports how the simulation ends, before the lease is dropped. Only the first report counts.
     pub fn end(&self, reason: EndReason, why: &str, taken: Taken) {
         self.report(Report::End(End { reason, why: why.to_owned(), taken }));
     }
 
     fn report(&self, report: Report) {
-        // The actor lives as long as the server; without it there is nothing to show.
+        // The actor runs as long as the server; without it there is nothing to show.
         self.slots.do_send(UpdateSimulation(self.id, report));
     }
 }
