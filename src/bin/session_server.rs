@@ -10,7 +10,7 @@ use webots_fleet::session::config::SessionConfig;
 use webots_fleet::session::mail;
 use webots_fleet::shared::run::{LogTarget, start};
 
-/// The one door to a fleet of simulation servers.
+/// The entry point of a fleet of simulation servers.
 #[derive(Parser)]
 #[command(version)]
 struct Arguments {

@@ -42,7 +42,7 @@ pub(crate) struct Args {
     /// Print warnings and errors on stderr
     #[arg(long)]
     pub(crate) stderr: bool,
-    // accepted, but without effect here
+    // accepted, but without effect
     #[arg(long, hide = true)]
     minimize: bool,
     #[arg(long, hide = true)]
@@ -63,7 +63,7 @@ fn stream_mode(value: &str) -> Result<String, &'static str> {
     }
 }
 
-/// What is wrong with a command line, on one line.
+/// The error of a command line, on one line.
 pub(crate) fn message(error: &clap::Error) -> String {
     let text = error.to_string();
     let paragraph = text.split("\n\n").next().unwrap_or_default();

@@ -1,8 +1,7 @@
-//! The actor of one WebSocket, created for each connection. It sends the simulation what the peer says, as
-//! events, and the peer what the simulation says. The simulation reaches it through a `ClientHandle`.
-//!
-//! Queues are bounded. A peer that talks faster than the simulation handles it is disconnected. The actor of
-//! a peer that does not read is not run, so that its mailbox fills up; if the peer ever reads on, it is
+//! The actor of one WebSocket, created for each connection. It sends the simulation the peer's messages, as events, and
+//! the peer the simulation's messages. The simulation reaches it through a `ClientHandle`.
+//! Queues are bounded. A peer that sends faster than the simulation handles its messages is disconnected. The actor of
+//! a peer that does not read is not polled, so that its mailbox fills up; if the peer continues to read, it is
 //! disconnected.
 
 use std::sync::Arc;
@@ -13,18 +12,18 @@ use actix_web_actors::ws::{self, CloseCode, CloseReason, WebsocketContext};
 use bytestring::ByteString;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 
-/// Texts of the peer that the simulation has not handled yet, at most.
+/// Limit of texts of the peer that the simulation has not handled yet.
 const MAX_INCOMING: usize = 256;
-/// Texts that wait to be sent to the peer, at most.
+/// Limit of texts that wait to be sent to the peer.
 const MAX_OUTGOING: usize = 64;
-/// Of these, updates of poses.
+/// Limit of updates of poses among these.
 const MAX_UPDATES: usize = 4;
 
-/// Identifies a connection.
+/// Identifies a connection; unique in a run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) struct ClientId(u64);
 
-/// What the simulation sends.
+/// A message from the simulation to a client.
 #[derive(Message)]
 #[rtype(result = "()")]
 enum Outgoing {
@@ -32,7 +31,7 @@ enum Outgoing {
     Close,
 }
 
-/// What happens on a connection.
+/// An event of a connection.
 #[derive(Message)]
 #[rtype(result = "()")]
 pub(crate) enum Event {
@@ -44,14 +43,14 @@ pub(crate) enum Event {
     Disconnected(ClientId),
 }
 
-/// How the simulation reaches a client.
+/// The simulation's handle of a client.
 pub(crate) struct ClientHandle {
     client: Recipient<Outgoing>,
     updates: Arc<Semaphore>,
 }
 
 impl ClientHandle {
-    /// Queues a text. Returns false if the queue is full or the client is gone.
+    /// Queues a text. Returns false if the queue is full or the client has disconnected.
     pub(crate) fn send(&self, text: ByteString) -> bool {
         self.client.try_send(Outgoing::Text(text, None)).is_ok()
     }
@@ -78,7 +77,7 @@ pub(crate) struct Client {
     id: ClientId,
     simulation: Recipient<Event>,
     incoming: Arc<Semaphore>,
-    /// Closed when the client is to be disconnected.
+    /// Closed when the client must be disconnected.
     updates: Arc<Semaphore>,
     /// Whether the closing handshake was started from here.
     closing: bool,
@@ -149,7 +148,7 @@ impl Handler<Outgoing> for Client {
             }
             Outgoing::Close => {
                 self.closing = true;
-                // with any other code Webots' page tells its user of a lost connection
+                // with any other code Webots' page reports a lost connection
                 ctx.close(Some(CloseCode::Normal.into()));
             }
         }

@@ -12,13 +12,13 @@ use crate::client::{ClientHandle, ClientId};
 #[derive(Default)]
 pub(crate) struct Clients {
     connected: BTreeMap<ClientId, Connected>,
-    /// Dropped when the last client has gone.
+    /// Dropped when the last client has disconnected.
     closing: Option<oneshot::Sender<()>>,
 }
 
 struct Connected {
     handle: ClientHandle,
-    /// Whether it has asked for the scene.
+    /// Whether it has requested the scene.
     watching: bool,
     /// Whether it read too slowly for the last update.
     missed_update: bool,
@@ -30,13 +30,13 @@ impl Clients {
         self.connected.insert(id, Connected { handle, watching: false, missed_update: false });
     }
 
-    /// Removes a client that has gone.
+    /// Removes a disconnected client.
     pub(crate) fn remove(&mut self, id: ClientId) {
         self.connected.remove(&id);
         self.closing.take_if(|_| self.connected.is_empty());
     }
 
-    /// From now on this client gets what is broadcast.
+    /// Adds this client to the recipients of broadcasts.
     pub(crate) fn watch(&mut self, id: ClientId) {
         if let Some(client) = self.connected.get_mut(&id) {
             client.watching = true;
@@ -49,12 +49,12 @@ impl Clients {
         self.send_where(&text, |client, _| client == id);
     }
 
-    /// Sends a text to all who watch.
+    /// Sends a text to all clients that watch.
     pub(crate) fn broadcast(&mut self, text: impl Into<ByteString>) {
         self.send_where(&text.into(), |_, client| client.watching);
     }
 
-    /// Sends an update to all who watch and read fast enough.
+    /// Sends an update to all clients that watch and read fast enough.
     pub(crate) fn broadcast_update(&mut self, text: impl Into<ByteString>) {
         let text = text.into();
         for client in self.connected.values_mut().filter(|client| client.watching) {
@@ -62,12 +62,12 @@ impl Clients {
         }
     }
 
-    /// Sends an update to those who missed the last one.
+    /// Sends an update to the clients that missed the last one.
     pub(crate) fn send_missed_update(&mut self, text: impl Into<ByteString>) {
         self.send_where(&text.into(), |_, client| mem::take(&mut client.missed_update));
     }
 
-    /// Starts the closing handshake with every client. The returned channel is closed when all have gone.
+    /// Starts the closing handshake with every client. The returned channel is closed when all have disconnected.
     pub(crate) fn close(&mut self) -> oneshot::Receiver<()> {
         let (closing, closed) = oneshot::channel();
         self.closing = Some(closing).filter(|_| !self.connected.is_empty());
@@ -77,7 +77,7 @@ impl Clients {
         closed
     }
 
-    /// Disconnects those whose queue is full.
+    /// Sends a text to some clients. Disconnects those whose queue is full.
     fn send_where(&mut self, text: &ByteString, mut is_meant: impl FnMut(ClientId, &mut Connected) -> bool) {
         self.connected.retain(|id, client| {
             let is_alive = !is_meant(*id, client) || client.handle.send(text.clone());

@@ -1,14 +1,14 @@
-//! Simulation time: how far it advances in a span of wall time, and when it pauses by itself. Pure; the
-//! simulation tells it how much wall time has passed.
+//! Simulation time: its speed relative to wall time, and when it pauses by itself. Pure; the simulation passes the
+//! elapsed wall time.
 
 use std::time::Duration;
 
 use clap::ValueEnum;
 
-/// How many times faster than real time `fast` is. Webots runs as fast as it can; here a limit lets many
-/// demo simulators share a machine.
+/// Speed of `fast` as a multiple of real time. Webots runs as fast as it can; here a limit lets many demo simulators
+/// share a machine.
 const FAST_SPEED: f64 = 16.0;
-/// Longest wall time between two calls that counts: a process that was stopped does not catch up.
+/// Longest wall time between two calls that counts: a suspended process does not catch up.
 const LONGEST_SPAN: Duration = Duration::from_secs(1);
 
 /// Whether and how time runs.
@@ -25,7 +25,7 @@ pub(crate) enum Mode {
     Fast,
 }
 
-/// What a span of wall time has led to.
+/// The effect of a span of wall time.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Progress {
     /// Not enough time for a step has passed.

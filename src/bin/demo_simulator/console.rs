@@ -1,10 +1,9 @@
-//! What the program prints. Each line is flushed at once, because whoever started the program reads it
-//! from a pipe.
+//! The output of the program. Each line is flushed at once, because the parent process reads it from a pipe.
 
 use std::fmt::Display;
 use std::io;
 
-/// Prints information and errors as far as the command line asks for them.
+/// Prints information and errors if the command line requests them.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Console {
     /// Whether information is printed on the standard output.
@@ -36,22 +35,22 @@ impl Console {
     }
 }
 
-/// Prints why the program ends with a failure; does not depend on the command line.
+/// Prints why the program fails, regardless of the command line.
 pub(crate) fn fatal(text: impl Display) {
     print(io::stderr(), &format!("webots: {text}"));
 }
 
-/// Prints a text on the standard error as it is.
+/// Prints a text verbatim on the standard error.
 pub(crate) fn explain(text: &str) {
     print(io::stderr(), text);
 }
 
-/// Prints a line that simulation servers read, such as `.` or `pause`; does not depend on the command line.
+/// Prints a line that simulation servers parse, such as `.` or `pause`, regardless of the command line.
 pub(crate) fn status(line: &str) {
     print(io::stdout(), line);
 }
 
 fn print(mut stream: impl io::Write, line: &str) {
-    // a reader that went away is no reason to end: the signal to end comes separately
+    // a closed pipe does not end the program: the signal to end comes separately
     drop(writeln!(stream, "{line}").and_then(|()| stream.flush()));
 }

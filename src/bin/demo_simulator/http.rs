@@ -15,12 +15,12 @@ use crate::client::{Client, Event};
 const EXTENSIONS: [&str; 11] = ["png", "jpg", "jpeg", "ico", "html", "css", "js", "dae", "obj", "mtl", "stl"];
 const NOT_FOUND: &str = include_str!("../../../templates/demo/not_found.html");
 
-/// The folder whose files are served, with its links resolved.
+/// The directory whose files are served, without symlinks.
 #[derive(Clone, Debug)]
 pub(crate) struct ProjectFolder(PathBuf);
 
 impl ProjectFolder {
-    /// Serves files of `folder`; none if there is no such folder.
+    /// Serves files of `folder`; none if there is no such directory.
     pub(crate) fn new(folder: &Path) -> Self {
         Self(folder.canonicalize().unwrap_or_else(|_| PathBuf::from("/dev/null")))
     }
@@ -32,7 +32,7 @@ impl ProjectFolder {
         if !path.components().all(|part| matches!(part, Component::Normal(_))) {
             return None;
         }
-        // links must not lead out of the folder
+        // symlinks must not resolve to a path outside the directory
         let file = self.0.join(path).canonicalize().ok()?;
         let extension = file.extension()?.to_str()?.to_ascii_lowercase();
         let is_allowed = EXTENSIONS.contains(&extension.as_str());

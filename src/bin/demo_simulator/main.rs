@@ -1,13 +1,12 @@
-//! A stand-in for Webots: takes its command line and speaks its standard output and its streaming protocol,
-//! so that a fleet can be tried, tested and measured on a machine that has no Webots. The servers know
-//! nothing of it; a configuration names it as the Webots to start.
+//! A stand-in for Webots: takes its command line and implements its standard output and its streaming protocol, so that
+//! a fleet can be tried, tested and measured on a machine without Webots. The servers do not know it; a configuration
+//! names it as the Webots to start.
 //!
-//! It does not read world files beyond their first line: what viewers see and what moves comes from two
-//! files beside the world (`scene`), or from a small scene that is built in. It simulates no physics, runs
-//! no controllers and renders no pictures.
+//! It does not read world files beyond their first line: the scene and the motion come from two files beside the world
+//! (`scene`), or from a small built-in scene. It simulates no physics, runs no controllers and renders no pictures.
 //!
 //! `main` reads the command line, opens the port, and only then loads the world, as Webots does: a client
-//! that connects early is told about the loading. Two actors do the rest: one `simulation`, and a
+//! that connects early receives the progress of the loading. Two actors do the rest: one `simulation`, and a
 //! `client` for each WebSocket, on the HTTP server's one worker thread.
 
 mod args;

@@ -1,5 +1,5 @@
-//! How robots move: each drives in a circle. A pose depends on simulation time alone, so that it is the same
-//! again after a reset. Pure.
+//! The motion of robots: each drives in a circle. A pose depends on simulation time alone, so that it is the same again
+//! after a reset. Pure.
 
 use std::f64::consts::TAU;
 
@@ -15,13 +15,13 @@ pub(crate) struct Robot {
     start: [f64; 3],
     /// Direction at time 0, in radians from the x axis about the vertical axis.
     heading: f64,
-    /// Of the circle, in metres; negative for a right turn.
+    /// Radius of the circle, in metres; negative for a right turn.
     radius: f64,
-    /// In metres per second.
+    /// Speed, in metres per second.
     speed: f64,
 }
 
-/// Where a robot is, as clients are told.
+/// The pose of a robot, as it is sent to clients.
 #[derive(Debug, PartialEq, Serialize)]
 pub(crate) struct Pose {
     id: u32,

@@ -1,4 +1,4 @@
-//! The port to listen on: the one asked for, or one of the ten after it.
+//! The port to listen on: the requested one, or one of the ten after it.
 
 use std::env;
 use std::error::Error;
@@ -7,7 +7,7 @@ use std::net::{IpAddr, Ipv4Addr, SocketAddr, TcpListener};
 
 use crate::console::Console;
 
-/// Ports tried after the first.
+/// Number of ports that are tried after the first.
 const MORE_PORTS: u16 = 10;
 /// The environment variable with the address to listen on; by default, all IPv4 addresses.
 const BIND_VARIABLE: &str = "DEMO_SIMULATOR_BIND";

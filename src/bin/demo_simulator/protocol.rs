@@ -1,15 +1,15 @@
-//! The texts that a client and the simulator exchange over a WebSocket. Pure; they are spelled only here.
+//! The texts that a client and the simulator exchange over a WebSocket. Pure; only this file contains them.
 //!
 //! | client sends | meaning |
 //! |---|---|
 //! | `x3d`, `w3d`, both also with `;broadcast` | send the scene and then what moves; without `;broadcast` the simulation pauses at its next step unless the client runs it |
 //! | `mjpeg: WxH` | send pictures (an error: nothing is rendered here) |
-//! | `pause`, `step`, `reset`, `reload` (`revert`), `load:WORLD` | do so |
-//! | `real-time:MS`, `fast:MS` | run, and pause by itself after so much simulation time; never if negative |
-//! | `timeout:MS` | change that time only |
+//! | `pause`, `step`, `reset`, `reload` (`revert`), `load:WORLD` | the command of that name |
+//! | `real-time:MS`, `fast:MS` | run, and pause by itself after this much simulation time; never if negative |
+//! | `timeout:MS` | change only that time |
 //! | `robot:...` | for a controller; none runs here |
 //!
-//! The constants and functions below make what the simulator sends.
+//! The constants and functions below create what the simulator sends.
 
 use crate::world::WorldNames;
 
@@ -30,7 +30,7 @@ pub(crate) enum Command {
 }
 
 impl Command {
-    /// Parses a client's text; `None` if it is no request.
+    /// Parses a client's text; `None` if it is not a request.
     pub(crate) fn parse(text: &str) -> Option<Self> {
         let command = match text {
             "pause" => Self::Pause,
@@ -69,9 +69,9 @@ pub(crate) const FAST: &str = "fast";
 pub(crate) const RESET_FINISHED: &str = "reset finished";
 /// The last part of a scene.
 pub(crate) const SCENE_COMPLETED: &str = "scene load completed";
-/// The first status of a world that is being loaded; with the blank, as Webots spells it.
+/// The first status of a world that is being loaded; with the trailing space, as in Webots.
 pub(crate) const READING: &str = "Reading world file ";
-/// Another world is going to be loaded.
+/// Announces that another world will be loaded.
 pub(crate) const DELETE_WORLD: &str = "delete world";
 
 /// The state of a paused simulation, at `time` milliseconds.
@@ -79,12 +79,12 @@ pub(crate) fn paused(time: f64) -> String {
     format!("pause: {time}")
 }
 
-/// How far a world has been loaded.
+/// The progress of loading a world.
 pub(crate) fn loading(status: &str, percent: u8) -> String {
     format!("loading:{status}:{percent}")
 }
 
-/// The world that is simulated, and those that could be.
+/// The world that is simulated, and all worlds of the project.
 pub(crate) fn world(names: &WorldNames) -> String {
     format!("world:{}:{}", names.current, names.all.join(";"))
 }

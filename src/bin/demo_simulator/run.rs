@@ -22,16 +22,15 @@ use crate::port;
 use crate::simulation::{CloseClients, Simulation};
 use crate::world::WorldFile;
 
-/// Connections at a time; more wait.
+/// Limit of connections; more wait.
 const MAX_CONNECTIONS: usize = 256;
-/// How long clients have for the closing handshake.
+/// Timeout of the closing handshake with clients.
 const CLOSE_TIMEOUT: Duration = Duration::from_secs(1);
 
-/// Runs a simulation until it is told to end, and returns the exit code.
+/// Runs a simulation until a signal ends it, and returns the exit code.
 ///
-/// The process is to exit then without waiting for any thread: one may still be reading the world. None of
-/// the threads that run actors ends before, since actix's thread-local values panic when they are dropped on
-/// two threads at once.
+/// The process must exit then without waiting for any thread: one may still be reading the world. No thread with actors
+/// ends before, because actix's thread-local values panic when they are dropped on two threads at once.
 pub(crate) fn run(args: Args) -> i32 {
     let (sender, code) = mpsc::channel();
     let thread = thread::Builder::new().spawn(move || {
@@ -77,7 +76,7 @@ async fn simulate(args: &Args) -> Result<(), Box<dyn Error>> {
     Ok(())
 }
 
-/// Completes at the first signal that asks the program to end.
+/// Completes at the first signal that ends the program.
 async fn first_of(mut signals: Vec<Signal>) {
     select_all(signals.iter_mut().map(|signal| Box::pin(signal.recv()))).await;
 }

@@ -1,12 +1,12 @@
-//! What clients are shown, prepared beside each world:
+//! The scene that clients see, prepared beside each world:
 //!
 //! | file | |
 //! |---|---|
 //! | `NAME.wbt` | the world; only its first line is read |
-//! | `NAME.x3d` | the model, as clients are sent it |
-//! | `NAME.motion.json` | the step, the frame rate, and how the model's robots move |
+//! | `NAME.x3d` | the model, as it is sent to clients |
+//! | `NAME.motion.json` | the step, the frame rate, and the motion of the model's robots |
 //!
-//! A world without a model is shown as a small scene that is built in, with the file's name as its title.
+//! A world without a model is shown as a small built-in scene, with the file's name as its title.
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -19,7 +19,7 @@ use thiserror::Error;
 
 use crate::motion::{Pose, Robot};
 
-/// Size of a file, in bytes.
+/// Size limit of a file, in bytes.
 const MAX_FILE: u64 = 32 * 1024 * 1024;
 const EMPTY_MODEL: &str = include_str!("../../../templates/demo/empty.x3d");
 const DEFAULT_MOTION: &str = include_str!("../../../templates/demo/default.motion.json");
@@ -33,7 +33,7 @@ pub(crate) enum SceneError {
     Motion(#[from] serde_json::Error),
 }
 
-/// What clients are shown.
+/// The scene that clients see.
 #[derive(Debug)]
 pub(crate) struct Scene {
     /// The model, as XML on one line.
@@ -50,7 +50,7 @@ struct Motion {
     /// Updates per second of wall time, at most.
     #[serde(rename = "FPS")]
     fps: f64,
-    /// By name.
+    /// The robots, by name.
     robots: BTreeMap<String, Robot>,
 }
 
@@ -107,7 +107,7 @@ impl Scene {
         self.motion.fps.clamp(1.0, 240.0)
     }
 
-    /// Returns, as JSON, where the robots are at `time`, in milliseconds.
+    /// Returns, as JSON, the poses of the robots at `time`, in milliseconds.
     pub(crate) fn update(&self, time: f64) -> String {
         // by way of text, so that a whole number of milliseconds has no decimal point, as in Webots
         let number = time.to_string().parse().unwrap_or_else(|_| 0.into());

@@ -1,6 +1,6 @@
-//! The actor that runs the simulation: it loads worlds, advances the clock and does what clients ask for.
-//! Created by `run`, lives as long as the program. Receives events from the clients and answers through their
-//! handles; tells `run` if the first world cannot be read.
+//! The actor that runs the simulation: it loads worlds, advances the clock and executes the clients' requests. Created
+//! by `run`, lives as long as the program. Receives events from the clients and answers through their handles; notifies
+//! `run` if the first world cannot be read.
 
 use std::time::{Duration, Instant};
 
@@ -32,7 +32,7 @@ pub(crate) struct Simulation {
     scene: Option<Scene>,
     clock: Clock,
     clients: Clients,
-    /// Who asked for the scene while there was none.
+    /// Clients that requested the scene while it was being loaded.
     waiting: Vec<ClientId>,
     console: Console,
     /// Whether clients are served at all.
@@ -40,12 +40,12 @@ pub(crate) struct Simulation {
     /// Fires as long as time runs.
     ticker: Option<SpawnHandle>,
     last_tick: Instant,
-    /// Where to report that the first world cannot be read.
+    /// Reports that the first world cannot be read.
     failure: Option<oneshot::Sender<WorldError>>,
 }
 
 impl Simulation {
-    /// A simulation of `file` that starts in `mode`. `failure` is told if the file cannot be read.
+    /// A simulation of `file` that starts in `mode`. `failure` receives the error if the file cannot be read.
     pub(crate) fn new(
         file: WorldFile,
         mode: Mode,
@@ -103,7 +103,7 @@ impl Handler<CloseClients> for Simulation {
     }
 }
 
-/// What clients ask for.
+/// Requests of clients.
 impl Simulation {
     fn obey(&mut self, command: Command, id: ClientId, ctx: &mut Context<Self>) {
         match command {
@@ -172,7 +172,7 @@ impl Simulation {
         self.console.error(format_args!("Streaming server: {text}"));
     }
 
-    /// The clock's state, as clients are told.
+    /// The clock's state, as it is sent to clients.
     fn state(&self) -> String {
         match self.clock.mode() {
             Mode::Pause => protocol::paused(self.clock.now()),
@@ -215,7 +215,7 @@ impl Simulation {
         }));
     }
 
-    /// Shows the scene to all who watch: from time 0, in the same mode.
+    /// Sends the scene to all clients that watch: from time 0, in the same mode.
     fn loaded(&mut self, names: WorldNames, scene: Result<Scene, WorldError>, ctx: &mut Context<Self>) {
         let scene = match (scene, self.failure.take()) {
             (Ok(scene), _) => scene,
@@ -223,7 +223,7 @@ impl Simulation {
                 drop(failure.send(error));
                 return;
             }
-            // like Webots: the empty world takes its place
+            // like Webots: the empty world replaces it
             (Err(error), _) => {
                 self.console.error(format_args!("'{}': {error}", self.file.path().display()));
                 Scene::empty()

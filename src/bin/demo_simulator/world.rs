@@ -1,4 +1,4 @@
-//! World files: where they are in their project, and which are valid.
+//! World files: their paths in their project, and their validity.
 
 use std::fs::{self, File};
 use std::io::{self, BufRead as _, BufReader, Read as _};
@@ -8,7 +8,7 @@ use thiserror::Error;
 
 use crate::scene::{Scene, SceneError};
 
-/// Length of the first line, in bytes.
+/// Longest first line, in bytes.
 const MAX_HEADER: u64 = 1024;
 
 /// The worlds of a project, as paths in it.
@@ -16,7 +16,7 @@ const MAX_HEADER: u64 = 1024;
 pub(crate) struct WorldNames {
     /// The one that is simulated.
     pub(crate) current: String,
-    /// All of them, in order.
+    /// All of them, sorted.
     pub(crate) all: Vec<String>,
 }
 
@@ -31,7 +31,7 @@ pub(crate) enum WorldError {
     Scene(#[from] SceneError),
 }
 
-/// Where a world is.
+/// The paths of a world and its project.
 #[derive(Clone, Debug)]
 pub(crate) struct WorldFile {
     path: PathBuf,
@@ -39,8 +39,8 @@ pub(crate) struct WorldFile {
 }
 
 impl WorldFile {
-    /// The world at `path`. Its project is the folder that has `worlds`; where the world is not in such a
-    /// folder, its own folder.
+    /// The world at `path`. Its project is the parent of the directory `worlds`; the world's own directory if that has
+    /// another name.
     pub(crate) fn new(path: &Path) -> Self {
         let path = std::path::absolute(path).unwrap_or_else(|_| path.to_owned());
         let folder = path.parent().unwrap_or(Path::new("/"));
@@ -51,17 +51,17 @@ impl WorldFile {
         Self { project: project.to_owned(), path }
     }
 
-    /// The file.
+    /// The absolute path of the world file.
     pub(crate) fn path(&self) -> &Path {
         &self.path
     }
 
-    /// The folder that has the world's project.
+    /// The directory of the world's project.
     pub(crate) fn project(&self) -> &Path {
         &self.project
     }
 
-    /// Returns the world in the same folder that has the file name of `path`, if there is one.
+    /// Returns the world in the same directory with the file name of `path`, if there is one.
     pub(crate) fn sibling(&self, path: &str) -> Option<Self> {
         let path = self.path.with_file_name(Path::new(path).file_name()?);
         (is_world(&path) && path.exists()).then(|| Self { path, project: self.project.clone() })

@@ -1,4 +1,4 @@
-//! What can be asked of the program.
+//! The command line of the program.
 
 use std::path::PathBuf;
 use std::time::Duration;
@@ -9,9 +9,9 @@ use webots_fleet::shared::run::raise_open_files;
 
 use crate::behaviour::{Behaviour, Mix};
 
-/// No time that can be asked for is longer: 30 days.
+/// Longest time of an argument: 30 days.
 const LONGEST: Duration = Duration::from_hours(30 * 24);
-/// The open files that one client needs (its connections), and those that the program needs besides.
+/// Open files that one client needs (its connections), and those that the program itself needs.
 const FILES: (u64, u64) = (4, 64);
 
 /// Plays a class of web clients against a fleet, and says how many fit.
@@ -74,10 +74,10 @@ pub(crate) struct Arguments {
 }
 
 impl Arguments {
-    /// Whether this machine can do what is asked for, before anything is begun.
+    /// Checks before the start that this machine can do what is requested.
     ///
     /// # Errors
-    /// What can't be done, in words.
+    /// What can't be done, as text.
     pub(crate) fn prepare(&self) -> Result<(), String> {
         if !self.fleet.username().is_empty() || self.fleet.password().is_some() {
             return Err("the session server's URL has a user name or a password, which nobody would be sent".to_owned());
@@ -96,15 +96,15 @@ impl Arguments {
         opened.map(drop).map_err(|error| format!("{} can't be written: {error}", file.display()))
     }
 
-    /// How the clients behave.
+    /// The mix of the clients' behaviours.
     ///
     /// # Errors
-    /// When the shares are more than all, in words.
+    /// When the shares exceed 100 percent, as text.
     pub(crate) fn mix(&self) -> Result<Mix, String> {
         self.misbehave.clone().with(Behaviour::Return, self.reload)
     }
 
-    /// What is going to happen, in words: `200 clients within 1m, each for 10m`.
+    /// A summary of the rehearsal: `200 clients within 1m, each for 10m`.
     pub(crate) fn summary(&self) -> String {
         if self.explain {
             return "one client".to_owned();

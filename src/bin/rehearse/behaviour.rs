@@ -1,4 +1,4 @@
-//! How clients behave, well or not. Pure.
+//! The behaviours of clients, good and bad. Pure.
 
 use std::fmt;
 use std::str::FromStr;
@@ -13,21 +13,21 @@ use serde::Serialize;
 pub(crate) enum Behaviour {
     /// Watches its simulation and closes its page.
     Ordinary,
-    /// Reloads its page in the middle, and so begins anew.
+    /// Reloads its page in the middle, and starts again.
     Reload,
-    /// Reloads its page in the middle, and comes back to its simulation.
+    /// Reloads its page in the middle, and resumes its simulation.
     Return,
-    /// Leaves without closing its connections: a browser that crashes.
+    /// Leaves without closing its connections, as a browser that crashes.
     Drop,
-    /// Reads nothing for the second half: a tab that sleeps.
+    /// Reads nothing in the second half, as a sleeping tab.
     Sleep,
-    /// Neither reads nor closes from the middle on: a network that is gone.
+    /// Neither reads nor closes from the middle on, as a broken network.
     Vanish,
-    /// Leaves as soon as it has asked for its simulation.
+    /// Leaves as soon as it has requested its simulation.
     Hasty,
 }
 
-/// Shares of behaviours, in percent; what is left of 100 is ordinary.
+/// Shares of behaviours, in percent; the rest to 100 is ordinary.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub(crate) struct Mix(Vec<(Behaviour, u32)>);
 
@@ -41,7 +41,7 @@ const NAMES: [(&str, Behaviour); 6] = [
 ];
 
 impl Mix {
-    /// The same, and so many percent of another behaviour.
+    /// Adds this many percent of another behaviour.
     ///
     /// # Errors
     /// When the sum is more than 100 percent.

@@ -1,13 +1,13 @@
-//! What is shown while a rehearsal runs: how many clients are where.
+//! The display of a running rehearsal: the number of clients at each stage.
 
 use std::cell::{Cell, RefCell};
 use std::io::{IsTerminal, Write};
 use std::time::{Duration, Instant};
 
-/// Where a client is.
+/// The stage of a client.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Stage {
-    /// Waits for a place.
+    /// Waits for a slot.
     Waiting,
     /// Its world is being checked out, or Webots starts.
     Starting,
@@ -15,7 +15,7 @@ pub(crate) enum Stage {
     Running,
 }
 
-/// Counts clients by stage, and shows that on the terminal.
+/// Counts clients by stage, and shows the counts on the terminal.
 pub(crate) struct Board {
     start: Instant,
     counts: [Cell<u32>; 3],
@@ -25,7 +25,7 @@ pub(crate) struct Board {
     factors: RefCell<(f64, u32)>,
 }
 
-/// Between two lines where there is no terminal.
+/// Interval between two lines if there is no terminal.
 const BETWEEN_LINES: Duration = Duration::from_secs(10);
 
 impl Board {
@@ -46,18 +46,18 @@ impl Board {
         self.start.elapsed().as_secs_f64()
     }
 
-    /// A client has come.
+    /// Counts a client that starts its visit.
     pub(crate) fn came(&self) {
         self.asked.update(|count| count + 1);
     }
 
-    /// A client has gone; `got_one` tells whether its simulation ran, or it left on purpose.
+    /// Counts a client that has left; `got_one` tells whether its simulation ran, or it left on purpose.
     pub(crate) fn gone(&self, got_one: bool) {
         let counter = if got_one { &self.done } else { &self.refused };
         counter.update(|count| count + 1);
     }
 
-    /// A client is at a stage as long as the guard lives.
+    /// Counts a client at a stage until the guard is dropped.
     pub(crate) fn enter(&self, stage: Stage) -> AtStage<'_> {
         let count = match stage {
             Stage::Waiting => &self.counts[0],
@@ -68,7 +68,7 @@ impl Board {
         AtStage(count)
     }
 
-    /// A simulation ran at this share of real time within the last second.
+    /// Records that a simulation ran at this share of real time within the last second.
     pub(crate) fn paced(&self, factor: f64) {
         let mut factors = self.factors.borrow_mut();
         factors.0 += factor;
@@ -90,7 +90,7 @@ impl Board {
         }
     }
 
-    /// Removes what was shown.
+    /// Clears the shown line.
     pub(crate) fn clear() {
         if std::io::stderr().is_terminal() {
             rewrite_line("");
@@ -116,11 +116,11 @@ impl Board {
     }
 }
 
-/// Writes a text over the terminal's last line, which it cuts where the terminal ends.
+/// Overwrites the terminal's last line with a text, cut at the terminal's width.
 fn rewrite_line(text: &str) {
-    // To the begin of the line, without wrapping; what was there is erased.
+    // To the begin of the line, without wrapping; the old text is erased.
     let written = write!(std::io::stderr(), "\r\x1b[?7l\x1b[2K{text}\x1b[?7h");
-    // The reader may have gone.
+    // The reader may have closed the pipe.
     written.and_then(|()| std::io::stderr().flush()).ok();
 }
 

@@ -1,4 +1,4 @@
-//! One client: the steps of Webots' web page from the wish for a simulation to its end.
+//! One client: the steps of Webots' web page from the request of a simulation to its end.
 
 use std::cell::RefCell;
 use std::time::{Duration, Instant};
@@ -12,34 +12,35 @@ use crate::session::Session;
 use crate::visit::{Outcome, Pace, Steps, Visit};
 use crate::words::line;
 
-/// How long simulated time is watched for one value of the pace.
+/// Duration of the measurement of one value of the pace.
 const PACE_PERIOD: Duration = Duration::from_secs(1);
-/// After others were faster, before the next look at the availability: at first, and doubled each time up to the longest.
+/// Pause before the next check of the availability after other clients were faster: the first one, and the longest one.
+/// It doubles each time.
 const FIRST_PAUSE: Duration = Duration::from_secs(1);
 const LONGEST_PAUSE: Duration = Duration::from_secs(8);
 
-/// A client and what it knows.
+/// A client and its state.
 pub(crate) struct Browser<'class> {
     arguments: &'class Arguments,
     board: &'class Board,
     session: &'class Session,
     behaviour: Behaviour,
     visit: Visit,
-    /// Where the visit is kept in the end.
+    /// Receives the visit at its end.
     visits: &'class RefCell<Vec<Visit>>,
-    /// What the session server said when it last had no place, although it was available just before.
+    /// The session server's last message that no slot was available, although one was just before.
     full: Option<String>,
 }
 
-/// A simulation that runs: the connection that keeps it, and the one to its Webots.
+/// A running simulation: the connection that owns it, and the one to its Webots.
 struct Running {
     lease: Connection,
     stream: Connection,
-    /// For one that comes back.
+    /// For a client that returns.
     way_back: Option<WayBack>,
 }
 
-/// Why a start came to nothing.
+/// Why a start failed.
 enum StartError {
     Refused(String),
     Failed(String),
@@ -53,7 +54,8 @@ impl From<Ended> for StartError {
 }
 
 impl<'class> Browser<'class> {
-    /// A client that asks now. What it has met comes to `visits` once it is dropped, also where that interrupts it.
+    /// A client that requests a simulation now. Its visit is added to `visits` when this is dropped, also if that
+    /// interrupts it.
     pub(crate) fn new(
         arguments: &'class Arguments,
         board: &'class Board,
@@ -75,7 +77,8 @@ impl<'class> Browser<'class> {
         Self { arguments, board, session, behaviour, visit, visits, full: None }
     }
 
-    /// Goes through all steps. `meet` hears which simulation server the client was sent to, and whether it may go there.
+    /// Goes through all steps. `meet` receives the simulation server of the client, and returns whether the client may
+    /// connect to it.
     pub(crate) async fn visit(mut self, meet: impl Fn(&str) -> bool) {
         self.board.came();
         let patience = self.arguments.patience;
@@ -86,7 +89,7 @@ impl<'class> Browser<'class> {
         });
         self.visit.outcome = match started {
             Ok(running) => {
-                // As long as nothing else is known.
+                // The outcome if the visit is interrupted.
                 self.visit.outcome = Outcome::Unseen;
                 let _stage = self.board.enter(Stage::Running);
                 self.watch(running).await
@@ -147,7 +150,7 @@ impl<'class> Browser<'class> {
         Ok(Running { lease, stream, way_back })
     }
 
-    /// Waits until the fleet is available and asks for a simulation server; again and again where others were faster.
+    /// Waits until the fleet is available and requests a simulation server; retries if other clients were faster.
     async fn find_server(&mut self) -> Result<String, StartError> {
         let mut pause = FIRST_PAUSE;
         loop {
@@ -161,13 +164,13 @@ impl<'class> Browser<'class> {
                 Err(why) if is_of_no_place(&why) => self.full = Some(why),
                 Err(why) => return Err(StartError::Refused(why)),
             }
-            // Those who wait together don't ask together.
+            // Clients that wait together must not retry together.
             actix_rt::time::sleep(pause.mul_f64(rand::random_range(0.5..1.0))).await;
             pause = (pause * 2).min(LONGEST_PAUSE);
         }
     }
 
-    /// The next text of the simulation server; a refusal is one whatever it begins with.
+    /// The next text of the simulation server; an error with any of the prefixes is a refusal.
     async fn hear_of_start(&self, lease: &mut Connection) -> Result<String, StartError> {
         let text = lease.receive().await?;
         let refusal = ["loading: Error: ", "error:", "Error: "].iter().find_map(|begin| text.strip_prefix(begin));
@@ -177,7 +180,7 @@ impl<'class> Browser<'class> {
         }
     }
 
-    /// Connects to Webots as its viewer does, waits for the scene, and lets time pass.
+    /// Connects to Webots as its viewer does, waits for the scene, and starts the simulation.
     async fn open_stream(&self, url: &str) -> Result<Connection, StartError> {
         let mut stream = Connection::open_scene(&format!("{}/", url.trim_end_matches('/'))).await?;
         stream.say(&self.arguments.viewer).await?;
@@ -196,7 +199,7 @@ impl<'class> Browser<'class> {
         }
     }
 
-    /// Watches a simulation until its client leaves, in whatever way.
+    /// Watches a simulation until its client leaves.
     async fn watch(&mut self, mut running: Running) -> Outcome {
         let stay = self.arguments.stay;
         let attentive = match self.behaviour {
@@ -208,7 +211,7 @@ impl<'class> Browser<'class> {
             return Outcome::BrokeOff(why);
         }
         if let Some(way_back) = running.way_back.take() {
-            // The page is loaded again: both connections are gone.
+            // The page is reloaded: both connections are dropped.
             drop(running);
             running = match Box::pin(way_back.go(&self.arguments.viewer)).await {
                 Ok((lease, stream)) => Running { lease, stream, way_back: None },
@@ -225,7 +228,7 @@ impl<'class> Browser<'class> {
             // The page closes both at once.
             futures_util::future::join(running.stream.close(), running.lease.close()).await;
         }
-        // Who vanishes or crashes says nothing: the connections are dropped.
+        // Clients that vanish or crash drop the connections without closing them.
         match self.behaviour {
             // Its simulation may have ended long before.
             Behaviour::Sleep | Behaviour::Vanish => Outcome::Unseen,
@@ -233,7 +236,7 @@ impl<'class> Browser<'class> {
         }
     }
 
-    /// Reads what comes and measures the pace, until the simulation ends. Returns why it ended.
+    /// Reads all messages and measures the pace, until the simulation ends. Returns why it ended.
     async fn look_on(&mut self, running: &mut Running) -> String {
         let (mut since, mut first, mut last) = (Instant::now(), None, None);
         let mut period = actix_rt::time::interval(PACE_PERIOD);
@@ -257,7 +260,7 @@ impl<'class> Browser<'class> {
                     if wall < PACE_PERIOD.as_secs_f64() / 2.0 {
                         continue;
                     }
-                    // A simulation that stands still sends nothing.
+                    // A paused simulation sends nothing.
                     let simulated = first.zip(last).map_or(0.0, |(first, last): (f64, f64)| last - first) / 1000.0;
                     let factor = simulated / wall;
                     self.board.paced(factor);
@@ -279,12 +282,12 @@ impl Drop for Browser<'_> {
     }
 }
 
-/// Whether an answer of the session server says that all simulation servers are full, which may change.
+/// Whether an answer of the session server says that all simulation servers are full, which is temporary.
 fn is_of_no_place(answer: &str) -> bool {
     answer.to_ascii_lowercase().contains("no simulation server available")
 }
 
-/// Whether a text says that there is no place yet.
+/// Whether a text says that no slot is free yet.
 fn is_of_waiting(text: &str) -> bool {
     text.starts_with("queue:") || text.to_ascii_lowercase().starts_with("loading: waiting for a place")
 }

@@ -1,4 +1,4 @@
-//! Lets the clients come, each at its time.
+//! Starts the clients, each at its time.
 
 use std::cell::RefCell;
 use std::collections::BTreeMap;
@@ -17,20 +17,21 @@ use crate::servers::Servers;
 use crate::session::Session;
 use crate::visit::Visit;
 
-/// Between two visits of a client that comes again and again.
+/// Pause between two visits of a client in a soak.
 const PAUSE: Duration = Duration::from_millis(500);
 
-/// What came of a class.
+/// The result of a class.
 pub(crate) struct Played {
-    /// What each client has met.
+    /// The visits of the clients.
     pub(crate) visits: Vec<Visit>,
     /// The highest load of each server.
     pub(crate) peaks: BTreeMap<String, Option<f64>>,
-    /// Whether Ctrl-C or SIGTERM has ended it.
+    /// Whether Ctrl-C or SIGTERM interrupted it.
     pub(crate) interrupted: bool,
 }
 
-/// Plays the whole class, or until Ctrl-C or SIGTERM. Ends at once where nobody agrees to load a server that a client is sent to.
+/// Plays the whole class, or until Ctrl-C or SIGTERM. Ends at once if the user refuses to load a server that a client
+/// is sent to.
 pub(crate) async fn play(arguments: &Arguments, consent: &Consent<'_>) -> Played {
     let class = Class {
         arguments,
@@ -45,7 +46,7 @@ pub(crate) async fn play(arguments: &Arguments, consent: &Consent<'_>) -> Played
     let clients = join_all((0..arguments.clients).map(|client| class.come(client)));
     let aside = futures_util::future::join(class.board.show(), class.servers.watch());
     let mut interrupted = false;
-    // Clients that are dropped leave behind what they have met until then.
+    // Clients that are dropped record their visits until then.
     tokio::select! {
         _ = clients => {}
         _ = aside => {}
@@ -56,11 +57,11 @@ pub(crate) async fn play(arguments: &Arguments, consent: &Consent<'_>) -> Played
     Played { visits: class.visits.take(), peaks: class.servers.peaks(), interrupted }
 }
 
-/// What all clients share.
+/// The state that all clients share.
 struct Class<'arguments> {
     arguments: &'arguments Arguments,
     consent: &'arguments Consent<'arguments>,
-    /// Nobody agreed to load a server that a client was sent to.
+    /// Notified when the user refused to load a server that a client was sent to.
     refused: Notify,
     board: Board,
     session: Session,
@@ -70,7 +71,7 @@ struct Class<'arguments> {
 }
 
 impl Class<'_> {
-    /// One client, who comes once, or again and again in a soak.
+    /// One client, which visits once, or repeatedly in a soak.
     async fn come(&self, client: u32) {
         actix_rt::time::sleep(self.arguments.over * client / self.arguments.clients).await;
         let end = self.arguments.soak.map_or(0.0, |soak| soak.as_secs_f64());
@@ -78,7 +79,7 @@ impl Class<'_> {
             let behaviour = self.draw.borrow_mut().next();
             self.visit(client, behaviour).await;
             if behaviour == Behaviour::Reload {
-                // The page is there again, and stays.
+                // The reloaded page stays.
                 self.visit(client, Behaviour::Ordinary).await;
             }
             if self.board.now() >= end {
@@ -88,7 +89,7 @@ impl Class<'_> {
         }
     }
 
-    /// Whether a client may go on to the server that it was sent to.
+    /// Whether a client may connect to the server that it was sent to.
     fn meet(&self, server: &str) -> bool {
         let may_load = self.consent.has_server(server);
         if may_load {

@@ -1,4 +1,4 @@
-//! A WebSocket as a browser's page sees it: texts that come and go, each wait with a limit.
+//! A WebSocket as a web page uses it: texts in both directions.
 
 use std::time::{Duration, Instant};
 
@@ -11,7 +11,7 @@ use tokio_tungstenite::{Connector, MaybeTlsStream, WebSocketStream, connect_asyn
 
 use crate::session::encryption;
 
-/// How long a connection may take, or a text to be sent.
+/// Timeout of connecting, and of sending a text.
 const CONNECT: Duration = Duration::from_secs(20);
 /// The largest message of a server, in bytes.
 const LARGEST_MESSAGE: usize = 1 << 20;
@@ -23,27 +23,27 @@ pub(crate) struct Connection {
     socket: WebSocketStream<MaybeTlsStream<TcpStream>>,
 }
 
-/// Why a conversation is over.
+/// Why a connection can't be used any more.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub(crate) enum Ended {
-    /// The connection can't be made.
+    /// The connection can't be established.
     #[error("{0} can't be reached: {1}")]
     Unreachable(String, String),
-    /// The other side has closed it.
+    /// The peer has closed it.
     #[error("closed with {0}")]
     Closed(String),
     /// It broke.
     #[error("broken: {0}")]
     Broken(String),
-    /// What was waited for did not come in time, whatever else came.
+    /// The expected message did not arrive in time; others may have.
     #[error("not within {} s", .0.as_secs())]
     Late(Duration),
-    /// The other side has said that it can't go on.
+    /// The peer has reported an error.
     #[error("{0}")]
     Fault(String),
 }
 
-/// Until when all of a step has to be done.
+/// The deadline of a step.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Deadline {
     end: Instant,
@@ -51,21 +51,21 @@ pub(crate) struct Deadline {
 }
 
 impl Deadline {
-    /// So long from now.
+    /// A deadline after this time from now.
     pub(crate) fn within(limit: Duration) -> Self {
         Self { end: Instant::now() + limit, limit }
     }
 }
 
-/// A text of Webots, or its end: after `error: ...` nothing else comes.
+/// A text of Webots, unless it is `error: ...`, after which Webots sends nothing else.
 ///
 /// # Errors
-/// When the text is such an end.
+/// When the text is such an error.
 pub(crate) fn unless_error(text: String) -> Result<String, Ended> {
     if text.starts_with("error:") { Err(Ended::Fault(text)) } else { Ok(text) }
 }
 
-/// An update of the scene; only its time counts here.
+/// An update of the scene; only its time is parsed.
 #[derive(Deserialize)]
 struct Update {
     /// Simulated time, in milliseconds.
@@ -82,7 +82,7 @@ impl Connection {
     /// Connects to a WebSocket URL of a server.
     ///
     /// # Errors
-    /// When nobody takes the connection in time.
+    /// When the connection is not established in time.
     pub(crate) async fn open(url: &str) -> Result<Self, Ended> {
         Self::open_for(url, LARGEST_MESSAGE).await
     }
@@ -108,7 +108,7 @@ impl Connection {
     /// Sends a text.
     ///
     /// # Errors
-    /// When the connection is broken, or nobody reads.
+    /// When the connection is broken, or the peer does not read.
     pub(crate) async fn say(&mut self, text: &str) -> Result<(), Ended> {
         let sending = actix_rt::time::timeout(CONNECT, self.socket.send(Message::text(text)));
         let sent = sending.await.map_err(|_| Ended::Late(CONNECT))?;
@@ -136,7 +136,7 @@ impl Connection {
         }
     }
 
-    /// The next text, if it comes before the deadline. Where texts come all the time, none comes after it.
+    /// The next text, if it arrives before the deadline, also while other texts arrive all the time.
     ///
     /// # Errors
     /// When the connection is over, or the time is.
@@ -148,14 +148,14 @@ impl Connection {
         tokio::time::timeout_at(deadline.end.into(), self.receive()).await.unwrap_or(Err(late))
     }
 
-    /// Closes the connection as a page does that is left, and does not wait for long.
+    /// Closes the connection as a page does that is left, with a short timeout.
     pub(crate) async fn close(mut self) {
         let closing = async {
             if self.socket.close(None).await.is_ok() {
                 while let Some(Ok(_)) = self.socket.next().await {}
             }
         };
-        // Who does not answer is left all the same.
+        // A peer that does not answer is left anyway.
         actix_rt::time::timeout(Duration::from_secs(2), closing).await.ok();
     }
 }

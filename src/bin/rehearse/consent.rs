@@ -1,4 +1,4 @@
-//! The consent of whoever sits at the terminal to load a fleet, or a part of it, that is not on this machine.
+//! The user's consent to load a fleet, or a part of it, that is not on this machine.
 
 use std::cell::{Cell, RefCell};
 use std::collections::BTreeSet;
@@ -9,28 +9,28 @@ use url::Url;
 use crate::arguments::Arguments;
 use crate::localhost::is_localhost;
 
-/// Whom this program may load: this machine, and everybody once somebody has agreed.
+/// The servers that this program may load: those on this machine, and all others once the user has agreed.
 pub(crate) struct Consent<'arguments> {
     arguments: &'arguments Arguments,
     everywhere: Cell<bool>,
-    /// The simulation servers that are known to be on this machine.
+    /// The simulation servers that were found to be on this machine.
     here: RefCell<BTreeSet<String>>,
     refusal: RefCell<Option<String>>,
 }
 
 impl<'arguments> Consent<'arguments> {
-    /// Nobody was asked yet; `--yes` has agreed.
+    /// No question was asked yet; `--yes` agrees.
     pub(crate) fn new(arguments: &'arguments Arguments) -> Self {
         Self { arguments, everywhere: Cell::new(arguments.yes), here: RefCell::default(), refusal: RefCell::default() }
     }
 
-    /// Whether the session server may be loaded; asks where it is not on this machine.
+    /// Whether the session server may be loaded; asks if it is not on this machine.
     pub(crate) fn has_fleet(&self) -> bool {
         let fleet = &self.arguments.fleet;
         self.everywhere.get() || is_localhost(fleet) || self.agrees(fleet.as_str(), "")
     }
 
-    /// Whether the simulation server may be loaded to which the session server sends a client.
+    /// Whether a simulation server may be loaded to which the session server sends a client.
     pub(crate) fn has_server(&self, server: &str) -> bool {
         if self.everywhere.get() || self.here.borrow().contains(server) {
             return true;
@@ -41,12 +41,12 @@ impl<'arguments> Consent<'arguments> {
         self.agrees(server, &format!(", where {} sends its clients", self.arguments.fleet))
     }
 
-    /// Why this can't go on: nobody agreed.
+    /// The error if the user did not agree.
     pub(crate) fn refusal(&self) -> Option<String> {
         self.refusal.borrow().clone()
     }
 
-    /// Asks once for all. Nobody there means no.
+    /// Asks once for all servers. Without a terminal the answer is no.
     fn agrees(&self, whom: &str, why: &str) -> bool {
         if self.refusal.borrow().is_some() {
             return false;

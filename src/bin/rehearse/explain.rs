@@ -1,5 +1,5 @@
-//! The acceptance run: one client goes through all steps, and each is compared with what a fleet and Webots are expected
-//! to do (`docs/protocol.md`). What is printed is Markdown that can be pasted into an issue.
+//! The acceptance run: one client goes through all steps, and each is compared with the expected behaviour of a fleet
+//! and of Webots (`docs/protocol.md`). The output is Markdown that can be pasted into an issue.
 
 use std::time::{Duration, Instant};
 
@@ -11,19 +11,19 @@ use crate::session::Session;
 use crate::step_log::StepLog;
 use crate::words::{add, excerpt, over, told};
 
-/// How long an answer may take, whatever else comes before it.
+/// Timeout of an answer; other texts may arrive before it.
 const ANSWER: Duration = Duration::from_secs(20);
-/// How long the scene may take.
+/// Timeout of the scene.
 const SCENE: Duration = Duration::from_mins(1);
-/// The next heartbeat, which is due after 5 s, comes within this time; busy machines are late.
+/// Timeout of the next heartbeat, which is due after 5 s; busy machines are late.
 const HEARTBEAT: Duration = Duration::from_secs(10);
-/// Heartbeats that came before they were listened to are read within this time.
+/// Time in which buffered heartbeats are discarded.
 const BUFFERED: Duration = Duration::from_millis(100);
-/// How long updates are watched, from the first one on.
+/// Time for which updates are measured, from the first one on.
 const WATCH: Duration = Duration::from_secs(3);
-/// How long Webots may take to be gone once its client has left.
+/// Timeout of Webots' end once its client has left.
 const GONE: Duration = Duration::from_secs(15);
-/// How the texts begin that Webots' page knows on the connection to the simulation server.
+/// Prefixes of the texts that Webots' page knows on the connection to the simulation server.
 const KNOWN: [&str; 10] = [
     "session:",
     "loading:",
@@ -37,18 +37,18 @@ const KNOWN: [&str; 10] = [
     ".",
 ];
 
-/// The walk can't go on.
+/// The walk can't continue.
 struct StepError;
 
-/// Walks through all steps and prints what came. Returns whether all of it was as expected.
+/// Walks through all steps and prints the results. Returns whether all of them were as expected.
 ///
 /// # Errors
-/// When the session server does not answer at all, or nobody agreed to load what it names.
+/// When the session server does not answer at all, or the user did not agree to load a server.
 pub(crate) async fn run(arguments: &Arguments, consent: &Consent<'_>) -> Result<bool, Fault> {
     let session = Session::new(&arguments.fleet);
     session.answers().await?;
     let mut walk = StepLog::begin(arguments);
-    // Where it got stuck is the last of the steps.
+    // The last printed step shows where it failed.
     Box::pin(walk.go(arguments, &session, consent)).await.ok();
     match consent.refusal() {
         Some(why) => Err(Fault::NotAgreed(why)),
@@ -56,12 +56,12 @@ pub(crate) async fn run(arguments: &Arguments, consent: &Consent<'_>) -> Result<
     }
 }
 
-/// What came on the connection to the simulation server until Webots was ready, or could not be.
+/// The texts on the connection to the simulation server until Webots was ready, or its start failed.
 struct Start {
     texts: u32,
     unknown: Vec<String>,
     limit: Option<String>,
-    /// `webots:...`, or why it never came.
+    /// `webots:...`, or why it was not received.
     end: String,
 }
 
@@ -108,7 +108,7 @@ impl StepLog {
         if agrees { Ok(()) } else { Err(StepError) }
     }
 
-    /// Asks for a simulation server and starts the world there. Returns the connection and the URL of Webots.
+    /// Requests a simulation server and starts the world there. Returns the connection and the URL of Webots.
     async fn start(
         &mut self,
         arguments: &Arguments,
@@ -169,7 +169,7 @@ impl StepLog {
         ended.map_or(Ok(()), |_| Err(StepError))
     }
 
-    /// Sends a command and waits for its answer; updates may come before.
+    /// Sends a command and waits for its answer; updates may arrive before.
     async fn command(
         &mut self,
         arguments: &Arguments,
@@ -224,7 +224,7 @@ impl StepLog {
     }
 
     async fn hear_heartbeats(&mut self, arguments: &Arguments, lease: &mut Connection) -> Result<(), StepError> {
-        // What came while nobody listened says nothing of when.
+        // The arrival time of buffered texts is unknown.
         let buffered = Deadline::within(BUFFERED);
         while lease.receive_by(buffered).await.is_ok() {}
         let (began, deadline) = (Instant::now(), limit(HEARTBEAT, arguments));
@@ -244,7 +244,7 @@ impl StepLog {
         let deadline = Instant::now() + GONE;
         let mut is_gone = false;
         while !is_gone && Instant::now() < deadline {
-            // Who takes no connection in time is not gone.
+            // A Webots that does not accept a connection in time may still run.
             let opened = tokio::time::timeout_at(deadline.into(), Connection::open(address)).await;
             is_gone = opened.is_ok_and(|opened| opened.is_err());
             actix_rt::time::sleep(Duration::from_millis(100)).await;
@@ -254,7 +254,7 @@ impl StepLog {
     }
 }
 
-/// Starts the world, and follows what is said until Webots is ready, or can't be.
+/// Starts the world, and reads texts until Webots is ready, or its start fails.
 async fn follow(lease: &mut Connection, arguments: &Arguments) -> Start {
     let deadline = Deadline::within(arguments.patience);
     let mut start = Start { texts: 0, unknown: Vec::new(), limit: None, end: String::new() };
@@ -285,7 +285,7 @@ async fn follow(lease: &mut Connection, arguments: &Arguments) -> Start {
     }
 }
 
-/// The deadline of a step that begins now: nobody waits for longer than the patience.
+/// The deadline of a step that begins now, limited by `--patience`.
 fn limit(step: Duration, arguments: &Arguments) -> Deadline {
     Deadline::within(step.min(arguments.patience))
 }

@@ -5,7 +5,7 @@ use std::future::pending;
 use tokio::signal::ctrl_c;
 use tokio::signal::unix::{SignalKind, signal};
 
-/// Waits until this program is to end early. A signal that can't be waited for never comes.
+/// Waits for a signal that interrupts this program. A signal without a handler never arrives.
 pub(crate) async fn interruption() {
     let terminated = async {
         match signal(SignalKind::terminate()) {

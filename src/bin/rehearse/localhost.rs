@@ -4,7 +4,7 @@ use std::net::{SocketAddr, TcpListener, ToSocketAddrs};
 
 use url::Url;
 
-/// Whether all addresses of a URL's host belong to this machine. A name that can't be looked up does not.
+/// Whether all addresses of a URL's host belong to this machine; false if the name can't be resolved.
 pub(crate) fn is_localhost(url: &Url) -> bool {
     let Some(host) = url.host_str() else {
         return false;
@@ -17,7 +17,8 @@ pub(crate) fn is_localhost(url: &Url) -> bool {
     addresses.peek().is_some() && addresses.all(is_own)
 }
 
-/// Only an own address can be listened on; and the loopback is one, also where IPv6 is off and /etc/hosts still has `::1`.
+/// Only an address of this machine can be bound. The loopback always is one, also if IPv6 is off and /etc/hosts still
+/// has `::1`.
 fn is_own(address: SocketAddr) -> bool {
     address.ip().to_canonical().is_loopback() || TcpListener::bind(address).is_ok()
 }

@@ -1,10 +1,10 @@
 //! Plays a class of browsers against a fleet and says how many fit.
 //!
-//! It speaks the original's protocol alone, so that it measures a fleet of Python servers as well. `arguments` says what
-//! can be asked for; `consent` asks before another machine is loaded; `class` lets the clients come, each of which is a
-//! `browser` that goes through the steps of Webots' web page and leaves a `visit` behind; `servers` watches the load
-//! meanwhile; `report` and `table` say what came of it, with `factors` and `reasons`. `explain` goes through the steps with one client and compares what
-//! comes with what is expected; `walk` prints the steps, `words` what came.
+//! It uses only the original's protocol, so that it also measures a fleet of Python servers. `arguments` is the command
+//! line; `consent` asks before another machine is loaded; `class` starts the clients, each of which is a `browser` that
+//! goes through the steps of Webots' web page and records a `visit`; `servers` monitors the load; `report` and `table`
+//! show the result, with `real_time_factors` and `reasons`. `explain` goes through the steps with one client and
+//! compares the results with the expected ones; `step_log` prints the steps, `words` the texts.
 
 mod arguments;
 mod behaviour;
@@ -37,11 +37,11 @@ use crate::class::Played;
 use crate::consent::Consent;
 use crate::interruption::interruption;
 
-/// The class did not fit as `--expect` demands, or nothing could be measured.
+/// Exit code: fewer clients fit than expected, or nothing could be measured.
 const NOT_AS_EXPECTED: u8 = 1;
-/// Ctrl-C or SIGTERM has ended it, as shells tell the first.
+/// Exit code: interrupted by Ctrl-C or SIGTERM; the code of shells for Ctrl-C.
 const INTERRUPTED: u8 = 130;
-/// The arguments can't be used.
+/// Exit code: the arguments are invalid.
 const WRONG_ARGUMENTS: u8 = 2;
 
 fn main() -> ExitCode {
@@ -80,11 +80,11 @@ fn refused(consent: &Consent<'_>) -> Fault {
     Fault::NotAgreed(consent.refusal().unwrap_or_default())
 }
 
-/// Why nothing can be measured, in words.
+/// Why nothing can be measured, as text.
 enum Fault {
-    /// Nobody agreed to load what is elsewhere.
+    /// The user did not agree to load another machine.
     NotAgreed(String),
-    /// There is nothing to measure, or nowhere to write it.
+    /// There is nothing to measure, or the result can't be written.
     Failed(String),
 }
 
@@ -94,10 +94,10 @@ impl From<String> for Fault {
     }
 }
 
-/// Walks through the steps of an acceptance run, which are printed as they are known. Returns the exit code.
+/// Walks through the steps of an acceptance run, and prints each at its end. Returns the exit code.
 ///
 /// # Errors
-/// When the fleet does not answer at all, or nobody agreed to load all of it.
+/// When the fleet does not answer at all, or the user did not agree to load all of it.
 async fn explain(arguments: &Arguments, consent: &Consent<'_>) -> Result<u8, Fault> {
     tokio::select! {
         walked = Box::pin(explain::run(arguments, consent)) => walked.map(code),
@@ -108,10 +108,10 @@ async fn explain(arguments: &Arguments, consent: &Consent<'_>) -> Result<u8, Fau
     }
 }
 
-/// Plays the class and prints what came of it. Returns the exit code.
+/// Plays the class and prints the result. Returns the exit code.
 ///
 /// # Errors
-/// When the fleet does not answer at all or nobody agreed to load all of it, or the file for machines can't be written.
+/// When the fleet does not answer at all, the user did not agree to load all of it, or the JSON file can't be written.
 async fn rehearse(arguments: &Arguments, consent: &Consent<'_>) -> Result<u8, Fault> {
     session::Session::new(&arguments.fleet).answers().await?;
     let Played { visits, peaks, interrupted } = class::play(arguments, consent).await;
@@ -122,7 +122,7 @@ async fn rehearse(arguments: &Arguments, consent: &Consent<'_>) -> Result<u8, Fa
     if interrupted {
         report.interrupt();
     }
-    // Nobody may be listening any more.
+    // The reader may have closed the pipe.
     writeln!(std::io::stdout(), "{}", table::text(&report)).ok();
     if let Some(file) = &arguments.json {
         report.write(&visits, file).map_err(|error| format!("{} can't be written: {error}", file.display()))?;

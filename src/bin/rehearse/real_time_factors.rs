@@ -1,30 +1,30 @@
-//! How fast simulated time passed, in two numbers. Pure.
+//! The speed of simulated time, in two numbers. Pure.
 
 use serde::Serialize;
 
 use crate::visit::Visit;
 
-/// How fast simulated time passed; 1 is real time.
+/// The speed of simulated time; 1 is real time.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub(crate) struct RealTimeFactors {
-    /// In 5 % of the seconds it was this or less.
+    /// The 5th percentile of the seconds.
     pub(crate) p5: f64,
-    /// In half of the seconds.
+    /// The median of the seconds.
     pub(crate) median: f64,
 }
 
-/// The paces of a simulation, but for its first second, in which it gets going.
+/// The paces of a simulation without its first second, in which it starts.
 pub(crate) fn factors_of(visit: &Visit) -> impl Iterator<Item = f64> {
     visit.pace.iter().skip(1).map(|pace| pace.factor)
 }
 
-/// The factors of all these seconds; nothing if there are none.
+/// The factors of all these seconds; `None` if there are none.
 pub(crate) fn factors(values: impl Iterator<Item = f64>) -> Option<RealTimeFactors> {
     let values = sorted(values);
     Some(RealTimeFactors { p5: quantile(&values, 0.05)?, median: quantile(&values, 0.5)? })
 }
 
-/// From the lowest to the highest.
+/// Sorts from the lowest to the highest.
 pub(crate) fn sorted(values: impl Iterator<Item = f64>) -> Vec<f64> {
     let mut values: Vec<f64> = values.collect();
     values.sort_by(f64::total_cmp);

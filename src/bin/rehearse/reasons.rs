@@ -4,13 +4,13 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use crate::visit::Visit;
 
-/// So many simulation servers are named with a reason; of more the number is.
+/// Limit of simulation servers that are named with a reason; of more only the number is shown.
 const MOST_NAMED: usize = 3;
 
-/// What begins the part of a reason that a simulation has printed.
+/// The prefix of the part of a reason that a simulation has printed.
 const OUTPUT: &str = "Its last output:";
 
-/// How often each kind of reason was met, apart for those that a simulation server is to blame for.
+/// Counts of each kind of reason, separate for reasons that a simulation server has caused.
 #[derive(Default)]
 pub(crate) struct Reasons<'visits>(BTreeMap<(String, bool), Kind<'visits>>);
 
@@ -23,7 +23,7 @@ struct Kind<'visits> {
 }
 
 impl<'visits> Reasons<'visits> {
-    /// A client has met a reason: at the simulation server that it was sent to, if it was.
+    /// Counts a client's reason, with the simulation server that it was sent to, if any.
     pub(crate) fn add(&mut self, why: &'visits str, visit: &'visits Visit) {
         let why = why.trim_end_matches('.');
         // Some reasons name their server themselves.
@@ -34,8 +34,8 @@ impl<'visits> Reasons<'visits> {
         met.servers.extend(server);
     }
 
-    /// Each kind of reason in words, with its servers, and how often it was met. Where its texts differ, dots stand for the
-    /// words that do.
+    /// Each kind of reason as text, with its servers and its count. If its texts differ, dots replace the differing
+    /// words.
     pub(crate) fn told(self) -> BTreeMap<String, u32> {
         let told = |((kind, _), Kind { count, texts, servers }): ((String, bool), Kind<'_>)| {
             let why = texts.first().filter(|_| texts.len() == 1).map_or(kind, |text| (*text).to_owned());
@@ -51,8 +51,8 @@ impl<'visits> Reasons<'visits> {
     }
 }
 
-/// The kind of a reason: its text with dots for what differs from client to client, which are numbers, names in quotes,
-/// addresses and what a simulation has printed.
+/// The kind of a reason: its text with dots for the parts that differ between clients: numbers, quoted names, addresses
+/// and the output of a simulation.
 fn kind(why: &str) -> String {
     let (why, output) = why.split_once(OUTPUT).map_or((why, ""), |(why, _)| (why, OUTPUT));
     let mut words: Vec<&str> = Vec::new();

@@ -1,4 +1,4 @@
-//! What came of a rehearsal, in numbers.
+//! The result of a rehearsal, in numbers.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -14,45 +14,45 @@ use crate::visit::{Outcome, Steps, Visit};
 #[derive(Debug, Clone, PartialEq, Serialize)]
 #[serde(rename_all = "camelCase")]
 pub(crate) struct Report {
-    /// The fleet, as it was named.
+    /// The fleet's URL, as on the command line.
     pub(crate) fleet: String,
-    /// The world that was started.
+    /// The URL of the world that was started.
     pub(crate) world: String,
-    /// What was played, in words.
+    /// A summary of what was played.
     pub(crate) played: String,
-    /// Seats.
+    /// The seats of all clients.
     pub(crate) seats: Seats,
-    /// How long it took until a simulation ran, in seconds.
+    /// The time until a simulation ran, in seconds.
     pub(crate) times: Vec<Row>,
-    /// How fast simulated time passed; 1 is real time. Nothing if no simulation ran for long enough.
+    /// The speed of simulated time; 1 is real time. `None` if no simulation ran for long enough.
     pub(crate) pace: Option<RealTimeFactors>,
     /// Each simulation server.
     pub(crate) servers: Vec<Server>,
     /// The result in one sentence.
     pub(crate) verdict: String,
-    /// How many had to fit.
+    /// Number of clients that had to fit.
     pub(crate) expected: Option<u32>,
     /// Whether it was interrupted, so that only a part was played.
     pub(crate) interrupted: bool,
 }
 
-/// Seats that were asked for, and what came of them.
+/// The requested seats, and their outcomes.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "camelCase")]
 pub(crate) struct Seats {
-    /// Simulations that were asked for.
+    /// Simulations that were requested.
     pub(crate) asked: u32,
     /// Simulations that ran.
     pub(crate) given: u32,
-    /// Those of them that ran to their client's end, not below the share of real time that was asked for.
+    /// Those of them that ran to their client's end, at least at the requested share of real time.
     pub(crate) fit: u32,
-    /// Clients that were told why they get none, or got none, by the reason and the simulation server that it came from.
+    /// Clients that were refused or got none, by the reason and the simulation server that it came from.
     pub(crate) refused: BTreeMap<String, u32>,
     /// Simulations that ended before their client left, by the reason and the simulation server.
     pub(crate) broke_off: BTreeMap<String, u32>,
-    /// Simulations that ran and whose end nobody saw: their client slept, vanished, or was interrupted.
+    /// Simulations that ran and whose end was not observed: their client slept, vanished, or was interrupted.
     pub(crate) unseen: u32,
-    /// Simulations that ran to their client's end, which came too soon to tell their pace.
+    /// Simulations that ran to their client's end, but too briefly to measure their pace.
     pub(crate) unmeasured: u32,
     /// Clients that left before their simulation ran.
     pub(crate) left: u32,
@@ -63,11 +63,11 @@ pub(crate) struct Seats {
 pub(crate) struct Row {
     /// The step.
     pub(crate) step: &'static str,
-    /// Half of the clients took no longer.
+    /// The median.
     pub(crate) median: f64,
-    /// 95 % took no longer.
+    /// The 95th percentile.
     pub(crate) p95: f64,
-    /// The slowest.
+    /// The maximum.
     pub(crate) worst: f64,
 }
 
@@ -79,13 +79,13 @@ pub(crate) struct Server {
     pub(crate) address: String,
     /// Simulations that ran there.
     pub(crate) seats: u32,
-    /// The most that ran at the same time.
+    /// The largest number that ran at the same time.
     pub(crate) most_at_once: u32,
-    /// The highest load that it told, in percent.
+    /// The highest load that it reported, in percent.
     pub(crate) peak_load: Option<f64>,
-    /// How fast simulated time passed there.
+    /// The speed of simulated time there.
     pub(crate) pace: Option<RealTimeFactors>,
-    /// The first second in which its simulations ran below real time on the average.
+    /// The first of two seconds in a row in which its simulations ran below real time on average.
     pub(crate) slow: Option<Slow>,
 }
 
@@ -93,13 +93,13 @@ pub(crate) struct Server {
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 #[serde(rename_all = "camelCase")]
 pub(crate) struct Slow {
-    /// Seconds since the beginning.
+    /// Seconds since the start.
     pub(crate) at: f64,
-    /// How many simulations ran there.
+    /// Number of simulations that ran there.
     pub(crate) simulations: u32,
 }
 
-/// What is written for machines: the numbers, and each client's visit.
+/// The JSON file: the numbers, and each client's visit.
 #[derive(Serialize)]
 struct File<'report> {
     #[serde(flatten)]
@@ -107,7 +107,7 @@ struct File<'report> {
     visits: Vec<OneVisit<'report>>,
 }
 
-/// A visit, and how fast simulated time passed in it.
+/// A visit, and the speed of simulated time in it.
 #[derive(Serialize)]
 #[serde(rename_all = "camelCase")]
 struct OneVisit<'report> {
@@ -117,7 +117,7 @@ struct OneVisit<'report> {
 }
 
 impl Report {
-    /// Makes the numbers of what each client has met and of the highest load of each server.
+    /// Computes the numbers from the clients' visits and the highest load of each server.
     pub(crate) fn new(arguments: &Arguments, visits: &[Visit], peaks: &BTreeMap<String, Option<f64>>) -> Self {
         let seats = seats(visits, arguments.real_time);
         let servers: Vec<Server> = peaks
@@ -142,13 +142,13 @@ impl Report {
         }
     }
 
-    /// Notes that only a part of it was played.
+    /// Records that only a part of it was played.
     pub(crate) fn interrupt(&mut self) {
         self.interrupted = true;
         self.played += ", interrupted";
     }
 
-    /// Whether as many fit as were expected; without an expectation, whether any did.
+    /// Whether as many fit as expected; without `--expect`, whether any did.
     pub(crate) fn is_as_expected(&self) -> bool {
         self.seats.fit >= self.expected.unwrap_or(1)
     }
@@ -173,7 +173,7 @@ fn seats(visits: &[Visit], real_time: f64) -> Seats {
         match &visit.outcome {
             Outcome::Ran => match factors(factors_of(visit)) {
                 Some(pace) => seats.fit += u32::from(pace.median >= real_time),
-                // Where any pace will do, none has to be known.
+                // If any pace is allowed, it need not be known.
                 None if real_time > 0.0 => seats.unmeasured += 1,
                 None => seats.fit += 1,
             },
@@ -213,7 +213,7 @@ fn server(address: &str, peak_load: Option<f64>, here: &[&Visit], real_time: f64
     }
 }
 
-/// When a visit's simulation began to run, in seconds since the beginning.
+/// When a visit's simulation began to run, in seconds since the start.
 fn began(visit: &Visit) -> f64 {
     visit.asked + visit.steps.until_running.unwrap_or_default()
 }
@@ -229,7 +229,7 @@ fn most_at_once(here: &[&Visit]) -> u32 {
     most.max().and_then(|most| u32::try_from(most).ok()).unwrap_or_default()
 }
 
-/// The first second in which the simulations of a server ran below a share of real time on the average.
+/// The first of two slow seconds in a row, in which a server's simulations ran below a share of real time on average.
 fn first_slow(here: &[&Visit], real_time: f64) -> Option<Slow> {
     let mut seconds: BTreeMap<u64, Vec<f64>> = BTreeMap::new();
     for pace in here.iter().flat_map(|visit| visit.pace.iter().skip(1)) {

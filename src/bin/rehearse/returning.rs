@@ -1,13 +1,13 @@
-//! A page that is loaded again: it comes back to its simulation, whose time has gone on.
+//! A reloaded page: it resumes its simulation, whose time has continued.
 
 use std::time::Duration;
 
 use crate::connection::{Connection, Deadline, Ended, simulated_time, unless_error};
 
-/// How long each step may take.
+/// Timeout of each step.
 const STEP: Duration = Duration::from_secs(20);
 
-/// What a client needs to come back.
+/// What a client needs to resume its simulation.
 pub(crate) struct WayBack {
     server: String,
     webots: String,
@@ -15,10 +15,10 @@ pub(crate) struct WayBack {
 }
 
 impl WayBack {
-    /// Waits for the token, which comes once Webots is ready. `server` and `webots` are where both are.
+    /// Waits for the token, which is sent once Webots is ready. `server` and `webots` are their URLs.
     ///
     /// # Errors
-    /// When none comes: the server knows nothing of coming back, or it is turned off there.
+    /// When none is received: the server does not support resuming, or it is turned off there.
     pub(crate) async fn find(lease: &mut Connection, server: &str, webots: &str) -> Result<Self, Ended> {
         let deadline = Deadline::within(STEP);
         loop {
@@ -28,10 +28,11 @@ impl WayBack {
         }
     }
 
-    /// Comes back, and waits until time passes. Returns the connection that keeps the simulation, and the one to Webots.
+    /// Resumes the simulation, and waits until its time passes. Returns the connection that owns it, and the one to
+    /// Webots.
     ///
     /// # Errors
-    /// Why the simulation was not found again.
+    /// Why the simulation could not be resumed.
     pub(crate) async fn go(self, viewer: &str) -> Result<(Connection, Connection), Ended> {
         let deadline = Deadline::within(STEP);
         let mut lease = Connection::open(&format!("{}/client", self.server)).await?;

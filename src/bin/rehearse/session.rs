@@ -1,4 +1,4 @@
-//! The session server as a web page meets it.
+//! The session server as a web page uses it.
 
 use std::sync::{Arc, LazyLock};
 use std::time::Duration;
@@ -12,11 +12,11 @@ use webots_fleet::shared::http::tls;
 use crate::connection::{Connection, Ended};
 use crate::words::{excerpt, line};
 
-/// How long an answer may take.
+/// Timeout of an answer.
 const ANSWER: Duration = Duration::from_secs(20);
-/// No answer is longer, in bytes.
+/// Size limit of an answer, in bytes.
 const LONGEST_ANSWER: usize = 64 << 10;
-/// How requests and WebSockets are encrypted: the trust store is read once. Nothing where encryption can't be set up.
+/// The TLS configuration of requests and WebSockets; the trust store is read once. `None` if TLS can't be set up.
 static TLS: LazyLock<Option<Arc<ClientConfig>>> = LazyLock::new(tls::client_config);
 
 /// A session server.
@@ -32,10 +32,10 @@ impl Session {
         Self { url: url.clone(), http: client() }
     }
 
-    /// Looks whether there is a session server at all.
+    /// Checks that this is a session server.
     ///
     /// # Errors
-    /// What came in place of a load and of the availability.
+    /// What was received instead of a load and of the availability.
     pub(crate) async fn answers(&self) -> Result<(), String> {
         let url = format!("{}/load", self.base());
         let text = get(&self.http, &url).await?;
@@ -49,17 +49,17 @@ impl Session {
                     "{url} tells no availability ({why}): no session server, maybe a simulation server"
                 ));
             }
-            // Whoever goes on meets it.
+            // Later steps report this error.
             Err(_) => {}
         }
         Ok(())
     }
 
-    /// Waits until the session server says that a simulation server can take a client. Its WebSocket tells that at once,
-    /// and then whenever it changes.
+    /// Waits until the session server reports that a simulation server can take a client. Its WebSocket sends that at
+    /// once, and then on each change.
     ///
     /// # Errors
-    /// When the connection is over.
+    /// When the connection has ended.
     pub(crate) async fn until_available(&self) -> Result<(), Ended> {
         let mut availability = Connection::open(&self.availability_url()).await?;
         while availability.receive().await? != "1" {}
@@ -67,17 +67,18 @@ impl Session {
         Ok(())
     }
 
-    /// The URL of the WebSocket that tells the availability: the original has it at `/`.
+    /// The URL of the WebSocket that sends the availability: in the original it is `/`.
     pub(crate) fn availability_url(&self) -> String {
         format!("{}/", to_web_socket(&self.base()))
     }
 
-    /// Asks for a simulation server for a world: `ws://HOST:PORT` or `wss://HOST/PORT`.
+    /// Requests a simulation server for a world: `ws://HOST:PORT` or `wss://HOST/PORT`.
     ///
     /// # Errors
-    /// What was said in place of it.
+    /// The text that was received instead.
     pub(crate) async fn simulation_server(&self, world: &str) -> Result<String, String> {
-        // The page writes the world as it is, and its browser then encodes what no URL may have, such as spaces.
+        // The page inserts the world verbatim, and its browser encodes characters that a URL must not contain, such as
+        // spaces.
         let url = format!("{}/session?url={world}", self.base());
         let url = Url::parse(&url).map_err(|error| format!("{url} is no URL: {error}"))?;
         let answer = get(&self.http, url.as_str()).await?;
@@ -91,12 +92,12 @@ impl Session {
     }
 }
 
-/// How what goes to `https://` and `wss://` is encrypted.
+/// The TLS configuration for `https://` and `wss://`.
 pub(crate) fn encryption() -> Option<Arc<ClientConfig>> {
     TLS.clone()
 }
 
-/// A client for short answers, of `https://` servers too.
+/// A client for short answers, also from `https://` servers.
 pub(crate) fn client() -> Client {
     let connector = awc::Connector::new();
     let connector = match encryption() {
@@ -106,7 +107,7 @@ pub(crate) fn client() -> Client {
     Client::builder().connector(connector).timeout(ANSWER).finish()
 }
 
-/// The body of an answer, whatever its status is: the page reads no more of it either.
+/// The body of an answer with any status: the page ignores the status too.
 ///
 /// # Errors
 /// Why there is none.

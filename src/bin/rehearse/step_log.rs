@@ -1,4 +1,4 @@
-//! The steps of an acceptance run, and how they are told: each as soon as it is known.
+//! The steps of an acceptance run, printed one by one.
 
 use std::io::Write;
 use std::time::Instant;
@@ -10,14 +10,14 @@ use crate::words::line;
 pub(crate) struct StepLog {
     began: Instant,
     last: Instant,
-    /// How many steps were made.
+    /// Number of steps so far.
     steps: usize,
-    /// Those of them that are not as expected.
+    /// The steps that are not as expected.
     differing: Vec<&'static str>,
 }
 
 impl StepLog {
-    /// Begins now, and prints what comes above the steps.
+    /// Begins now, and prints the heading of the table.
     pub(crate) fn begin(arguments: &Arguments) -> Self {
         let (name, version) = (env!("CARGO_PKG_NAME"), env!("CARGO_PKG_VERSION"));
         print(&format!("`rehearse {} --explain`, {name} {version}", arguments.fleet));
@@ -27,7 +27,7 @@ impl StepLog {
         Self { began: now, last: now, steps: 0, differing: Vec::new() }
     }
 
-    /// Prints what came at a step, and begins the next.
+    /// Prints the result of a step, and begins the next.
     pub(crate) fn note(&mut self, name: &'static str, expected: &'static str, came: &str, agrees: bool) {
         let (at, took) = (self.began.elapsed().as_secs_f64(), self.last.elapsed().as_secs_f64());
         self.last = Instant::now();
@@ -51,7 +51,7 @@ impl StepLog {
     }
 }
 
-/// Nobody may be listening any more.
+/// Prints a line. The reader may have closed the pipe.
 fn print(line: &str) {
     let mut out = std::io::stdout();
     writeln!(out, "{line}").and_then(|()| out.flush()).ok();

@@ -1,4 +1,4 @@
-//! The numbers of a rehearsal as a text that a teacher reads. Pure.
+//! The numbers of a rehearsal as text for users. Pure.
 
 use std::collections::BTreeMap;
 use std::fmt;

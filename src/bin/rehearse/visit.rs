@@ -1,32 +1,32 @@
-//! What one client has met, from its wish to its end.
+//! The record of one client, from its request to its end.
 
 use serde::Serialize;
 
 use crate::behaviour::Behaviour;
 
-/// What came of one client. Times are seconds; those of the day begin with the rehearsal.
+/// The visit of one client. Times are in seconds since the start of the rehearsal.
 #[derive(Debug, Clone, Serialize)]
 #[serde(rename_all = "camelCase")]
 pub(crate) struct Visit {
-    /// Which client.
+    /// The number of the client.
     pub(crate) client: u32,
-    /// How it behaved.
+    /// Its behaviour.
     pub(crate) behaviour: Behaviour,
-    /// When it asked.
+    /// When it requested a simulation.
     pub(crate) asked: f64,
     /// The simulation server that it was sent to, as `HOST:PORT` or `HOST/PORT`.
     pub(crate) server: Option<String>,
-    /// What came of it.
+    /// Its outcome.
     pub(crate) outcome: Outcome,
-    /// How long each step took, as far as it came.
+    /// The duration of each step that it completed.
     pub(crate) steps: Steps,
-    /// How fast simulated time passed, while the simulation ran.
+    /// The speed of simulated time while the simulation ran.
     pub(crate) pace: Vec<Pace>,
-    /// When it was gone.
+    /// When it had left.
     pub(crate) ended: f64,
 }
 
-/// What came of a client's wish.
+/// The outcome of a client's request.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "camelCase", tag = "outcome", content = "why")]
 pub(crate) enum Outcome {
@@ -34,36 +34,36 @@ pub(crate) enum Outcome {
     Ran,
     /// Its simulation ran, and ended before it left.
     BrokeOff(String),
-    /// Its simulation ran, and nobody looked on until the end: it slept, vanished, or the rehearsal was interrupted.
+    /// Its simulation ran, and its end was not observed: the client slept, vanished, or the rehearsal was interrupted.
     Unseen,
-    /// It was told why it gets none.
+    /// It was refused, with this reason.
     Refused(String),
-    /// It got none, and no reason.
+    /// It got none, for this reason, without a refusal.
     Failed(String),
     /// It left on purpose before its simulation ran.
     Left,
 }
 
-/// How long the steps to a running simulation took, in seconds.
+/// The durations of the steps to a running simulation, in seconds.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
 #[serde(rename_all = "camelCase")]
 pub(crate) struct Steps {
-    /// Until a simulation server had a place: availability, the session server's answer, the waiting line.
+    /// Until a simulation server had a slot: availability, the session server's answer, the queue.
     pub(crate) waiting: Option<f64>,
     /// From then until Webots was started: the world's checkout.
     pub(crate) checkout: Option<f64>,
     /// From then until simulated time passed.
     pub(crate) launch: Option<f64>,
-    /// All of it.
+    /// The whole time.
     pub(crate) until_running: Option<f64>,
 }
 
-/// How fast simulated time passed within about a second.
+/// The speed of simulated time within about a second.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub(crate) struct Pace {
-    /// When: the end of that second.
+    /// The end of that second.
     pub(crate) at: f64,
-    /// Simulated by real time: 1 is real time.
+    /// Simulated time divided by real time: 1 is real time.
     pub(crate) factor: f64,
 }
 

@@ -1,22 +1,22 @@
-//! What came, in words that fit into one line. Pure.
+//! The results of steps as text that fits into one line. Pure.
 
 use webots_fleet::shared::text;
 
 use crate::connection::Ended;
 
-/// What is told of one text, in characters.
+/// Longest excerpt of a text, in characters.
 const EXCERPT: usize = 90;
 /// The longest line that a server's text is shown in, in characters: a simulation's last output is part of a reason.
 const LONGEST_LINE: usize = 2000;
 /// So many texts are told of those that are out of place.
 const LONGEST_LIST: usize = 8;
 
-/// What came, or why nothing did.
+/// The received text, or why there is none.
 pub(crate) fn told(came: &Result<String, Ended>) -> String {
     came.as_ref().map_or_else(over, |text| excerpt(text))
 }
 
-/// Why a conversation is over, in words.
+/// Why a connection can't be used any more, as text.
 pub(crate) fn over(ended: &Ended) -> String {
     match ended {
         Ended::Closed(_) | Ended::Broken(_) => format!("the connection was {ended}"),
@@ -25,7 +25,7 @@ pub(crate) fn over(ended: &Ended) -> String {
     }
 }
 
-/// Adds a text to a list that is told, as long as that is short.
+/// Adds a text to a list that is shown, up to its limit.
 pub(crate) fn add(list: &mut Vec<String>, text: &str) {
     match list.len() {
         0..LONGEST_LIST => list.push(excerpt(text)),
