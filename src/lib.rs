@@ -61,10 +61,9 @@
 //! ```
 //!
 //! The [`session::fleet::Registry`] alone decides availability: it receives every report and every pick. A
-//! [`simulation::webots::Webots`] owns its process group and its instance directory through guards, and its
-//! [`simulation::client::Session`] owns the lease of its slot, so that all three are freed in any state, even after a
-//! panic. One [`simulation::process::guardian`] process ends everything that the simulation server has started once the
-//! server is gone, whatever ended it.
+//! [`simulation::webots::Webots`] owns its process group, its instance directory and the lease of its slot through
+//! guards, so that all three are freed in any state, even after a panic. One [`simulation::process::guardian`] process
+//! ends everything that the simulation server has started once the server is gone, whatever ended it.
 //! One `simulation::isolation::Watcher` measures what each simulation uses, and finds the ports on which starting
 //! simulations listen.
 //!

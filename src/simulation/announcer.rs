@@ -1,7 +1,7 @@
-//! Actor: tells other services, at start, that this server is there.
+//! Actor: announces this server to other services at start.
 //!
-//! One for the whole server. It posts the form of the original to each address in `notify`, up to six times, and holds
-//! up nothing. It ends when all are told or given up.
+//! One for the whole server. It posts the form of the original to each address in `notify`, up to six times; no other
+//! actor waits for it. It ends when each announcement has succeeded or been given up.
 
 use std::time::Duration;
 
@@ -11,12 +11,12 @@ use futures_util::future::join_all;
 use super::config::SimulationConfig;
 use crate::shared::http::tls;
 
-/// How often each address is tried.
+/// Number of attempts for each address.
 const TRIES: u32 = 6;
-/// How long an address may take to answer.
+/// Timeout of an answer.
 const ANSWER: Duration = Duration::from_secs(10);
 
-/// The largest answer that is read, in bytes.
+/// Size limit of an answer, in bytes.
 const LARGEST_ANSWER: usize = 64 * 1024;
 
 /// An answer that refuses an announcement, although its status is 200.

@@ -1,4 +1,4 @@
-//! The simulation server as a whole: its parts, its start and its end.
+//! The simulation server as a whole: its parts, its start and its shutdown.
 
 use std::net::{SocketAddr, TcpListener};
 use std::sync::Arc;
@@ -30,20 +30,20 @@ use crate::simulation::process::{Guardian, Leftovers, RunDir};
 use crate::simulation::relay::Upstream;
 use crate::simulation::web::configure;
 
-/// How often it is checked whether all simulations have ended.
+/// Interval between two checks whether all simulations have ended.
 const POLL_INTERVAL: Duration = Duration::from_millis(50);
 
-/// How many open files the server needs for itself: logs, threads, pages.
+/// Open files that the server itself needs: logs, threads, pages.
 const OWN_FILES: usize = 128;
 
-/// How many connections there may be for each client: browsers load pages beside their WebSocket.
+/// Connections per client: browsers load pages beside their WebSocket.
 const CONNECTIONS_PER_CLIENT: usize = 2;
 
-/// How many open files a simulation needs at most, besides its client's connection: pipes and processes of git and Webots,
-/// its log.
+/// Largest number of open files of a simulation, besides its client's connection: pipes and processes of git and
+/// Webots, its log.
 const FILES_PER_SIMULATION: usize = 8;
 
-/// Runs the server until it is asked to stop.
+/// Runs the server until a signal or an administrator stops it.
 ///
 /// # Errors
 /// When the server can't start, or an actor that must live has stopped.
@@ -51,7 +51,7 @@ pub async fn run(config: SimulationConfig) -> Result<(), AppError> {
     serve(Application::new(config)?).await
 }
 
-/// A server before it serves: it holds its port, and its actors run.
+/// A server that is ready to serve: its port is bound, and its actors run.
 pub struct Application {
     server: Arc<AppState>,
     socket: TcpListener,
@@ -61,7 +61,7 @@ pub struct Application {
 }
 
 impl Application {
-    /// Takes the port, starts the actors, and removes what earlier runs left.
+    /// Binds the port, starts the actors, and removes what earlier runs have left.
     ///
     /// # Errors
     /// When the server can't start.
@@ -82,8 +82,8 @@ impl Application {
     }
 }
 
-/// Raises the limit of open files, and returns how many clients it allows. `maxClients` may be lowered: each client has
-/// connections for pages besides its WebSocket.
+/// Raises the limit of open files, and returns the number of clients that it allows. `maxClients` may be lowered,
+/// because each client has connections for pages besides its WebSocket.
 fn bound_clients(config: &SimulationConfig) -> Result<usize, AppError> {
     let places = config.max_connections;
     let needed = OWN_FILES + FILES_PER_SIMULATION * usize::from(places);
@@ -106,7 +106,7 @@ fn bound_clients(config: &SimulationConfig) -> Result<usize, AppError> {
     Ok(clients)
 }
 
-/// Runs a server until it is asked to stop.
+/// Runs a server until a signal or an administrator stops it.
 ///
 /// # Errors
 /// When an actor that must live has stopped, or the system refuses what the server needs.
@@ -154,8 +154,8 @@ pub async fn serve(assembly: Application) -> Result<(), AppError> {
     Ok(())
 }
 
-/// Does what signals and administrators ask for, until the server is to end. Returns why: `webots-fleet-renew` tells by
-/// this text whether a server was drained or stopped.
+/// Handles signals and requests of administrators, until the server must stop. Returns the reason: `webots-fleet-renew`
+/// decides by this text whether a server was drained or stopped.
 async fn obey(
     signals: &mut Signals,
     asked: &mut Receiver<ServerCommand>,
@@ -185,12 +185,12 @@ fn bind(config: &SimulationConfig) -> Result<TcpListener, AppError> {
     server::listen(address).map_err(|source| AppError::Bind { address, source })
 }
 
-/// How many TCP connections may be open: those of clients, and as many again for pages and other requests.
+/// Limit of TCP connections: those of clients, and the same number for pages and other requests.
 fn max_tcp(config: &SimulationConfig) -> usize {
     config.max_clients.saturating_mul(CONNECTIONS_PER_CLIENT)
 }
 
-/// Makes the server's state, and starts its actors.
+/// Creates the server's state, and starts its actors.
 fn assemble(
     config: Arc<SimulationConfig>,
     phase: watch::Receiver<Phase>,
@@ -267,7 +267,7 @@ fn assemble(
     })
 }
 
-/// Gets ready to make containers, where simulations run in these.
+/// Opens the container service, if simulations run in containers.
 fn open_containers(config: &Arc<SimulationConfig>, run: &RunDir) -> Result<Option<Arc<ContainerService>>, AppError> {
     if config.isolation != IsolationSetting::Container {
         return Ok(None);
@@ -276,7 +276,7 @@ fn open_containers(config: &Arc<SimulationConfig>, run: &RunDir) -> Result<Optio
     Ok(Some(Arc::new(ContainerService::open(Arc::clone(config), run.path()).map_err(unavailable)?)))
 }
 
-/// Opens the cache of repositories with the bounds that the configuration sets.
+/// Opens the cache of repositories with the limits of the configuration.
 fn open_checkouts(
     config: &SimulationConfig,
     cache_dir: CacheDir,
@@ -291,14 +291,14 @@ fn open_checkouts(
     CheckoutService::open(cache_dir, run.path(), budget, git, rules.clone(), limits, runtime)
 }
 
-/// Waits until the server is draining and has no client any more.
+/// Waits until the server is draining and has no simulation left.
 async fn drained(server: &AppState) {
     let mut phase = server.phase.clone();
     phase.wait_for(|phase| *phase == Phase::Draining).await.ok();
     empty(&server.slots).await;
 }
 
-/// Waits until there is no simulation, and nobody waits for one.
+/// Waits until there is no simulation, and the queue is empty.
 async fn empty(slots: &Addr<SlotPool>) {
     while slots.send(GetSnapshot).await.is_ok_and(|snapshot| !snapshot.simulations.is_empty()) {
         actix_rt::time::sleep(POLL_INTERVAL).await;

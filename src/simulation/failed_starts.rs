@@ -1,9 +1,10 @@
-//! Counts the last starts that failed for a reason of this server's own, so that session servers prefer others.
+//! Counts consecutive starts that failed for a reason of this server's own, so that session servers prefer other
+//! servers.
 
 use std::sync::atomic::{AtomicU32, Ordering};
 
-/// How many starts in a row have failed for a reason of this server's own. A start that failed for its world's or its
-/// client's reason leaves the count as it is.
+/// Number of consecutive starts that failed for a reason of this server's own. A start that failed for its world's or
+/// its client's reason does not change it.
 #[derive(Debug, Default)]
 pub struct FailedStarts(AtomicU32);
 
@@ -14,12 +15,12 @@ impl FailedStarts {
         log::warn!("a start has failed for a reason of this server's own, {count} in a row: {why}");
     }
 
-    /// Forgets them: a start has succeeded, or what was wrong with the server is repaired.
+    /// Resets the count: a start has succeeded, or the server's problem is solved.
     pub fn reset(&self) {
         self.0.store(0, Ordering::Relaxed);
     }
 
-    /// How many there were in a row.
+    /// The number in a row.
     #[must_use]
     pub fn count(&self) -> u32 {
         self.0.load(Ordering::Relaxed)

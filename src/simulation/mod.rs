@@ -1,4 +1,4 @@
-//! The simulation server: one Webots per client, none left behind.
+//! The simulation server: one Webots per client, and no process left behind.
 
 mod announcer;
 pub mod app;

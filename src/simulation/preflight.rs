@@ -13,9 +13,9 @@ use crate::simulation::machine::sensors::{GpuReading, GpuSensor};
 /// The result of one check.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Finding {
-    /// What was checked.
+    /// The subject of the check.
     pub topic: &'static str,
-    /// What was found; or what is missing, and what to do about it.
+    /// What was found; or the problem, and what to do about it.
     pub result: Result<String, String>,
 }
 

@@ -11,12 +11,12 @@
 //! | to the client (text) | |
 //! |---|---|
 //! | `session: ID` | the id of the simulation, by which the administrator finds it |
-//! | `queue: N` | N clients are ahead in the waiting line |
+//! | `queue: N` | N clients are ahead in the queue |
 //! | `ide: enable` | the project has an editor, on Webots' port + 500 |
-//! | `type:TYPE` | what the project's `webots.yml` says of it |
+//! | `type:TYPE` | the project's type in its `webots.yml` |
 //! | `loading: TEXT` | progress |
 //! | `loading: Error: TEXT` | why the simulation failed; the connection is closed after it |
-//! | `shutdownTimeout: SECONDS` | the process was launched, and will be closed after so many seconds |
+//! | `shutdownTimeout: SECONDS` | the process was launched, and will be ended after this many seconds |
 //! | `webots:URL` | Webots is ready there |
 //! | `absence: SECONDS` | how long the simulation waits for its client once the connection is broken |
 //! | `resume: TOKEN` | what to come back with |
@@ -25,8 +25,8 @@
 //! | `watched: 1` or `watched: 0` | an administrator watches the simulation from now on, or no longer |
 //! | `reset controller: NAME/FILE` | done |
 //!
-//! Webots' page puts every TEXT into `innerHTML`: it passes through [`client_text`] here, and nowhere else,
-//! and through [`without_paths`].
+//! Webots' page inserts every TEXT into `innerHTML`: it passes through [`client_text`] and [`without_paths`] here, and
+//! nowhere else.
 
 use serde_json::Value;
 
@@ -38,16 +38,16 @@ use crate::simulation::sessions::Token;
 pub enum ClientRequest {
     /// Start a simulation of the world at this URL.
     Start {
-        /// The URL as the client wrote it.
+        /// The URL, as the client sent it.
         url: String,
         /// How the simulation is shown.
         mode: Mode,
-        /// Whether its client may come back after its connection has broken.
+        /// Whether its client may resume it after its connection has broken.
         resumable: bool,
         /// What its client calls itself.
         name: Option<String>,
     },
-    /// Come back to the simulation of this token; none is a text that can't be one.
+    /// Resume the simulation of this token; `None` if the text is not a token.
     Resume(Option<Token>),
     /// Keep a simulation that is to end because it is paused.
     Keep,
@@ -67,7 +67,7 @@ pub enum Mode {
     Mjpeg,
 }
 
-/// Why a message can't be understood. The words are for the client.
+/// Why a message is invalid. The message is for the client.
 #[derive(Debug, PartialEq, Eq, thiserror::Error)]
 #[error(
     "Wrong message: {0}. Allowed are {{\"start\": {{\"url\": ..., \"mode\": \"x3d\", \"w3d\" or \"mjpeg\"}}}} and {{\"reset controller\": \"NAME/FILE\"}}."
@@ -75,10 +75,10 @@ pub enum Mode {
 pub struct ClientRequestError(String);
 
 impl ClientRequest {
-    /// Reads a message of a client; nothing if it is JSON that asks for nothing.
+    /// Parses a message of a client; `None` if it is JSON without a request.
     ///
     /// # Errors
-    /// When the message is no JSON, or its request has a wrong form.
+    /// When the message is not JSON, or its request is malformed.
     pub fn parse(text: &str) -> Result<Option<Self>, ClientRequestError> {
         let wrong = |problem: &str| ClientRequestError(problem.to_owned());
         let message: Value = serde_json::from_str(text).map_err(|_| wrong("it is no JSON"))?;
@@ -117,17 +117,17 @@ impl ClientRequest {
     }
 }
 
-/// The heartbeat that is passed on.
+/// The heartbeat of Webots.
 pub const HEARTBEAT: &str = ".";
 
-/// A text that a project asks for: `ide: enable`, or its type, which ends its line as with the original.
+/// A text that a project requests: `ide: enable`, or its type, which ends its line as in the original.
 #[must_use]
 pub fn of_project(text: &str) -> String {
     let end = if text.ends_with('\n') { "\n" } else { "" };
     client_text(text.trim_end()) + end
 }
 
-/// Progress, in words.
+/// Progress, as text.
 #[must_use]
 pub fn loading(text: &str) -> String {
     format!("loading: {}", client_text(&without_paths(text)))
@@ -139,19 +139,19 @@ pub fn error(text: &str) -> String {
     loading(&format!("Error: {text}"))
 }
 
-/// Why everything ends here.
+/// The server stops.
 #[must_use]
 pub fn stopping() -> String {
     error("This simulation server is stopping")
 }
 
-/// The answer to a request for a controller where there is none.
+/// The answer to `reset controller` without a running simulation.
 #[must_use]
 pub fn nothing_to_reset() -> String {
     error("A controller can be reset only while a simulation runs")
 }
 
-/// Why a simulation can't start here, where another server may take its client.
+/// Why a simulation can't start here; another server may accept its client.
 #[must_use]
 pub fn elsewhere(why: &str) -> String {
     let why = why.trim_end_matches('.');
@@ -171,8 +171,7 @@ pub fn session(id: impl std::fmt::Display) -> String {
     format!("session: {id}")
 }
 
-/// How many clients are ahead in the waiting line: once for programs, and once in words, since Webots' page shows only
-/// those.
+/// The number of clients ahead in the queue: once for programs, and once as text, because Webots' page shows only that.
 #[must_use]
 pub fn queue(ahead: usize) -> [String; 2] {
     let clients = match ahead {
@@ -183,7 +182,7 @@ pub fn queue(ahead: usize) -> [String; 2] {
     [format!("queue: {ahead}"), loading(&format!("waiting for a place, {clients}"))]
 }
 
-/// After how many seconds the simulation will be closed.
+/// The time limit of the simulation, in seconds.
 #[must_use]
 pub fn shutdown_timeout(seconds: u64) -> String {
     format!("shutdownTimeout: {seconds}")
@@ -219,19 +218,19 @@ pub fn ended(why: Option<&str>) -> String {
     error(&why.map_or("this simulation has ended".to_owned(), |why| format!("this simulation has ended: {why}")))
 }
 
-/// Why a connection ends whose token another one has used.
+/// Why a connection is closed: another one has used its token.
 #[must_use]
 pub fn taken_over() -> String {
     error("this simulation was taken over elsewhere")
 }
 
-/// Where Webots is ready.
+/// The URL of Webots, which is ready.
 #[must_use]
 pub fn webots(url: &str) -> String {
     format!("webots:{url}")
 }
 
-/// Webots has been silent for so many seconds.
+/// Webots has sent no heartbeat for this many seconds.
 #[must_use]
 pub fn hanging(seconds: u64) -> String {
     loading(&format!("Webots has given no sign of life for {seconds} seconds"))

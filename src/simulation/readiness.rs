@@ -1,5 +1,6 @@
-//! Whether the server can start simulations at all. Checked every five seconds: Webots may be installed again, a disk or a
-//! display may go and come back. The check does what a start does: it writes to the disk and starts a process.
+//! Whether the server can start simulations at all. It is checked every five seconds, because Webots may be
+//! reinstalled, and a disk or a display may fail and recover. The check does what a start does: it writes to the disk
+//! and starts a process.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::io::Write;
@@ -21,19 +22,21 @@ use crate::simulation::process::DiskRoom;
 /// A connection to each display that simulations are given.
 type KeptConnections = BTreeMap<String, KeptConnection>;
 
-/// Time between two checks.
+/// Interval between two checks.
 const PERIOD: Duration = Duration::from_secs(5);
-/// The same while the server is not ready.
+/// Interval while the server is not ready.
 const PERIOD_WHILE_NOT_READY: Duration = Duration::from_secs(1);
-/// A check that takes longer hangs: a disk that does not answer holds up whoever writes. No other one is begun before it ends.
+/// Timeout of a check: a disk that does not answer blocks its writers. The next check starts only after the last one
+/// has ended.
 const HUNG: Duration = Duration::from_mins(1);
-/// How much each check writes to the disk, in bytes. An empty file can be made on a full disk.
+/// Bytes that each check writes to the disk. An empty file can be created on a full disk.
 const WRITTEN: usize = 1 << 20;
-/// The least step of the machine's clock that is logged.
+/// Smallest step of the machine's clock that is logged.
 const CLOCK_STEP: Duration = Duration::from_mins(1);
 
-/// Starts the checks. The channel holds why the server can start no simulation, in words for clients and administrators.
-/// `run` is the folder of this run. Starts that failed before the server was ready again no longer count.
+/// Starts the checks. The channel contains the reason why the server can't start simulations, as text for clients and
+/// administrators. `run` is the directory of this run. When the server is ready again, the count of failed starts is
+/// reset.
 #[must_use]
 pub fn watch(
     config: Arc<SimulationConfig>,
@@ -79,7 +82,7 @@ pub fn watch(
     problem
 }
 
-/// Publishes what a check has found, and logs it if it is new.
+/// Publishes the result of a check, and logs it if it is new.
 fn publish(sender: &watch::Sender<Option<String>>, found: Option<String>, failed_starts: &FailedStarts) {
     sender.send_if_modified(|problem| {
         let is_new = *problem != found;
@@ -96,8 +99,8 @@ fn publish(sender: &watch::Sender<Option<String>>, found: Option<String>, failed
     });
 }
 
-/// Logs a step of the machine's clock since these times. It stops no simulation and no start, but git may take
-/// certificates of forges for expired. Returns the present times.
+/// Logs a step of the machine's clock since these times. It stops no simulation and no start, but git may then reject
+/// certificates of Git hosts as expired. Returns the current times.
 fn log_clock_step((instant, time): (Instant, SystemTime)) -> (Instant, SystemTime) {
     let (now, expected) = (SystemTime::now(), time + instant.elapsed());
     let (by, direction) =
@@ -125,7 +128,7 @@ fn check(config: &SimulationConfig, run: &Path, gpus: &[u32], kept: &mut KeptCon
     {
         check_room(&folder, "disk of Docker", config.disk_reserve)?;
     }
-    // Webots itself always needs a display. What stands in for it (`webots`) may not.
+    // Webots itself always needs a display. A replacement (`webots`) may not.
     if config.webots.is_none() && !config.xvfb && config.isolation != IsolationSetting::Container {
         for display in displays(config, gpus) {
             let checked = kept.entry(display.clone()).or_default().check(&display);
@@ -156,26 +159,26 @@ fn check_gpus(config: &SimulationConfig, readings: &Readings) -> Result<(), Stri
     Ok(())
 }
 
-/// Starts a process and waits for its end. It needs file handles for its input and output, too.
+/// Starts a process and waits for its end. That also needs file handles for its input and output.
 fn start_process() -> std::io::Result<()> {
     let mut command = Command::new("true");
     match command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null()).status() {
-        // It was the new process that did not find the program.
+        // The new process did not find the program, so starting processes works.
         Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(()),
         status => status.map(drop),
     }
 }
 
-/// Checks that the disk of a folder has `reserve` MiB and some inodes left for users. `disk` names it.
+/// Checks that the disk of a directory has `reserve` MiB and some inodes left for users. `disk` is its name.
 fn check_room(folder: &Path, disk: &str, reserve: u64) -> Result<(), String> {
     let room = DiskRoom::of(folder).map_err(|error| not_writable(&error))?;
     let full = |left| Err(format!("This simulation server's {disk} is full: less than {left}"));
     room.shortage(reserve).map_or(Ok(()), full)
 }
 
-/// Writes a file that has no name, and waits until the disk has it.
+/// Writes an unnamed file, and waits until it is on the disk.
 fn write(folder: &Path) -> Result<(), String> {
-    // The error of `tempfile` names the folder; its kind is enough.
+    // The error of `tempfile` contains the path; its kind is enough.
     let mut file = tempfile::tempfile_in(folder).map_err(|error| not_writable(&error.kind().into()))?;
     file.write_all(&vec![0; WRITTEN]).and_then(|()| file.sync_all()).map_err(|error| not_writable(&error))
 }
@@ -184,7 +187,8 @@ fn not_writable(error: &std::io::Error) -> String {
     format!("This simulation server can't write in its cache: {error}")
 }
 
-/// Checks that containers can have an init process. One that was found is not looked for again: it takes a container.
+/// Checks that containers can have an init process. It is not checked again after success, because that starts a
+/// container.
 fn check_init(config: &SimulationConfig, has_init: bool) -> Result<(), String> {
     if has_init || config.isolation != IsolationSetting::Container {
         return Ok(());
@@ -195,7 +199,7 @@ fn check_init(config: &SimulationConfig, has_init: bool) -> Result<(), String> {
 /// The program that is started for each client; in a container, that of its image.
 ///
 /// # Errors
-/// What is missing, and how to set it, in words for the client.
+/// What is missing, and how to set it, as text for the client.
 pub fn webots_program(config: &SimulationConfig) -> Result<PathBuf, String> {
     if config.isolation == IsolationSetting::Container {
         return Ok(PathBuf::from(&config.container.program));

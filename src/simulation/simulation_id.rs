@@ -1,4 +1,4 @@
-//! The id of a simulation, by which its log lines, its output and its line in `simulations.csv` are found.
+//! The id of a simulation, which names its log lines, its output and its line in `simulations.csv`.
 
 use std::fmt;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -8,9 +8,10 @@ use serde::{Serialize, Serializer};
 
 use crate::shared::run::timestamp_in_milliseconds;
 
-/// The time at which a simulation was asked for, and its number since the server's start: `20261122T220517042-17`, to the millisecond.
+/// The time at which a simulation was requested, and its number since the server's start: `20261122T220517042-17`, to
+/// the millisecond.
 ///
-/// Ids are ordered by their numbers, whatever the clock does.
+/// Ids are ordered by their numbers, regardless of the clock.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct SimulationId {
     number: u64,
@@ -20,14 +21,14 @@ pub struct SimulationId {
 static NEXT: AtomicU64 = AtomicU64::new(1);
 
 impl SimulationId {
-    /// Returns an id that no other simulation of this server has.
+    /// Returns a new id; unique on this server.
     #[must_use]
     pub fn next() -> Self {
         let asked = SystemTime::UNIX_EPOCH.elapsed().unwrap_or_default();
         Self { number: NEXT.fetch_add(1, Ordering::Relaxed), asked }
     }
 
-    /// Whether a text has the letters of an id, so that it can stand in the name of a file.
+    /// Whether a text has only characters of an id, so that it is safe in a file name.
     #[must_use]
     pub fn is_like(text: &str) -> bool {
         text.starts_with(|letter: char| letter.is_ascii_digit())

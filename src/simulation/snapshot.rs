@@ -9,7 +9,7 @@ use crate::shared::domain::Instances;
 use crate::simulation::simulation_id::SimulationId;
 use crate::simulation::who::Who;
 
-/// What has changed in a simulation.
+/// A change of a simulation.
 #[derive(Debug)]
 pub enum SimulationChange {
     /// It is in another state.
@@ -20,9 +20,9 @@ pub enum SimulationChange {
     Launched {
         /// When, in seconds since 1970.
         at: u64,
-        /// The process from which all of it descends.
+        /// The root of its process tree.
         pid: i32,
-        /// The folder of its control group, if it has one.
+        /// The directory of its control group, if it has one.
         cgroup: Option<PathBuf>,
         /// The port that was granted.
         port: u16,
@@ -33,7 +33,8 @@ pub enum SimulationChange {
     Gpu(u32),
     /// It streams on this port.
     Port(u16),
-    /// Its client is away, and it waits until so many seconds since 1970; or its client is there again.
+    /// Its client has disconnected, and it waits until this time, in seconds since 1970; `None` if its client is
+    /// connected again.
     Away(Option<u64>),
 }
 
@@ -41,7 +42,7 @@ pub enum SimulationChange {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Stage {
-    /// In the waiting line.
+    /// In the queue.
     Queued,
     /// Its project is checked out.
     CheckingOut,
@@ -58,17 +59,17 @@ pub enum Stage {
 /// All simulations at one moment.
 #[derive(Debug, Clone, Default, MessageResponse)]
 pub struct Snapshot {
-    /// How many, by state.
+    /// The numbers by state.
     pub instances: Instances,
-    /// Each simulation, the oldest first.
+    /// Each simulation, sorted by id.
     pub simulations: Vec<Simulation>,
 }
 
-/// One simulation as it is shown.
+/// One simulation, as pages and programs see it.
 #[derive(Debug, Clone, Serialize)]
 #[serde(rename_all = "camelCase")]
 pub struct Simulation {
-    /// Its id.
+    /// Its id; unique.
     pub id: SimulationId,
     /// The world's URL.
     pub world: String,
@@ -77,13 +78,13 @@ pub struct Simulation {
     pub who: Who,
     /// Its state.
     pub stage: Stage,
-    /// When its client asked for it, in seconds since 1970.
+    /// When its client requested it, in seconds since 1970.
     pub since: u64,
-    /// When it was launched, in seconds since 1970; from then on its time is limited.
+    /// When it was launched, in seconds since 1970; the time limit starts then.
     pub launched: Option<u64>,
-    /// The process from which all of it descends, once it is launched.
+    /// The root of its process tree, once it is launched.
     pub pid: Option<i32>,
-    /// The folder of its control group, if it has one.
+    /// The directory of its control group, if it has one.
     #[serde(skip)]
     pub cgroup: Option<PathBuf>,
     /// The streaming port, once there is one.

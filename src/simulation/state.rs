@@ -1,4 +1,4 @@
-//! The state that the routes, the pages and the web clients of a simulation server share. `app` makes it.
+//! The state that the routes, the pages and the web clients of a simulation server share. `app` creates it.
 
 use std::sync::Arc;
 use std::time::Instant;
@@ -28,8 +28,8 @@ use crate::simulation::machine::UsageMonitor;
 use crate::simulation::machine::{LoadMonitor, Readings, Spread};
 use crate::simulation::process::RunDir;
 
-/// How many threads start Webots. One that starts a process waits until it runs its program, which takes long on a busy
-/// machine. They live as long as the server: bubblewrap ends with the thread that has started it.
+/// Threads that start Webots: `spawn` blocks until `execve`, which takes long on a busy machine. They live as long as
+/// the server, because bubblewrap exits with the thread that has started it.
 pub const WEBOTS_THREADS: usize = 4;
 
 /// The shared state.
@@ -38,9 +38,9 @@ pub struct AppState {
     pub config: Arc<SimulationConfig>,
     /// Which worlds may run.
     pub rules: AdmissionRules,
-    /// Lends places.
+    /// Leases slots.
     pub slots: Addr<SlotPool>,
-    /// The sessions that their clients may come back to.
+    /// The sessions that their clients can resume.
     pub sessions: Arc<Sessions>,
     /// The streams of running simulations.
     pub streams: Arc<Streams>,
@@ -52,35 +52,35 @@ pub struct AppState {
     pub spread: Option<Arc<Spread>>,
     /// Launches simulations at a level of isolation.
     pub launcher: Arc<Launcher>,
-    /// Watches over simulations: what they take, and where they listen.
+    /// Monitors the limits and the ports of simulations.
     pub watcher: Watcher,
-    /// Makes the containers in which simulations run, where they do.
+    /// Creates the containers of simulations; `None` if they don't run in containers.
     pub containers: Option<Arc<ContainerService>>,
     /// Checks worlds out.
     pub checkouts: Arc<CheckoutService>,
-    /// The folder of this run, with the folders of simulations in it.
+    /// The directory of this run, with the directories of simulations in it.
     pub run: Arc<RunDir>,
-    /// Whether clients are taken.
+    /// Whether the server accepts clients.
     pub phase: watch::Receiver<Phase>,
-    /// Why the server can start no simulation, if so.
+    /// Why the server can't start simulations; `None` if it can.
     pub problem: watch::Receiver<Option<String>>,
-    /// The last starts that failed for a reason of this server's own.
+    /// Counts starts that failed for a reason of this server's own.
     pub failed_starts: Arc<FailedStarts>,
-    /// How simulations have ended.
+    /// Records the ends of simulations.
     pub ends: Ends,
-    /// Takes requests to drain.
+    /// Sends requests to drain.
     pub requests: tokio::sync::mpsc::Sender<ServerCommand>,
     /// The threads on which the actors of Webots run.
     pub webots_threads: [ArbiterHandle; WEBOTS_THREADS],
-    /// Checks the administrator's password, where one is configured.
+    /// Checks the administrator's password, if one is configured.
     pub admin_auth: Option<BasicAuth>,
     /// Limits and counts connections.
     pub connections: ConnectionLimiter,
-    /// How often one address may ask for a simulation.
+    /// Rate limit of requests for simulations per address.
     pub start_quota: AddressQuota,
-    /// The metrics.
+    /// Counters for `/metrics`.
     pub metrics: Metrics,
-    /// Counts clients that asked for a simulation, by outcome.
+    /// Counts requests for simulations, by outcome.
     pub starts: prometheus::IntCounterVec,
     /// The open monitor pages.
     pub live: LiveUpdates,
@@ -93,7 +93,7 @@ pub struct AppState {
 }
 
 impl AppState {
-    /// Returns the thread for the Webots that was given this port.
+    /// Returns the thread for the Webots with this port.
     #[must_use]
     pub fn webots_thread(&self, port: u16) -> &ArbiterHandle {
         let [first, second, third, fourth] = &self.webots_threads;
@@ -105,13 +105,13 @@ impl AppState {
         }
     }
 
-    /// Returns the load to report: 100 % while the server is draining or can start no simulation.
+    /// Returns the load to report: 100 % while the server is draining or can't start simulations.
     #[must_use]
     pub fn load(&self) -> Load {
         if self.takes_nobody() { Load::FULL } else { self.readings.borrow().load.unwrap_or(Load::ZERO) }
     }
 
-    /// Whether no client can have a simulation here, whatever its world is.
+    /// Whether the server accepts no client, regardless of its world.
     #[must_use]
     pub fn takes_nobody(&self) -> bool {
         self.is_draining() || self.problem.borrow().is_some()
@@ -123,10 +123,10 @@ impl AppState {
         *self.phase.borrow() != Phase::Open
     }
 
-    /// Checks whether a world may run here now: its URL, the rules, and that the server takes clients.
+    /// Checks whether a world may run here now: its URL, the rules, and that the server accepts clients.
     ///
     /// # Errors
-    /// The reason why not, in words for the client.
+    /// The reason why not, as text for the client.
     pub fn admit(&self, url: &str) -> Result<ProjectUrl, String> {
         let world = ProjectUrl::parse(url).map_err(|wrong| wrong.to_string())?;
         if self.is_draining() {
@@ -139,7 +139,7 @@ impl AppState {
         Ok(world)
     }
 
-    /// Returns why this server can start no simulation at all, if so.
+    /// Returns why this server can't start simulations; `None` if it can.
     #[must_use]
     pub fn problem(&self) -> Option<String> {
         self.problem.borrow().clone()

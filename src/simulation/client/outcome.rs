@@ -8,9 +8,9 @@ use crate::simulation::ends::EndReason;
 /// The outcome of a request to start a simulation.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Outcome {
-    /// The rules do not allow this world, its URL is wrong, or its address asks too often.
+    /// The rules do not allow this world, its URL is wrong, or its address requests too often.
     Refused,
-    /// All places and the waiting line are taken, or what the address may have of them.
+    /// All slots and the queue are full, or the address has reached its limit.
     Full,
     /// The world could not be checked out.
     NoCheckout,
@@ -18,7 +18,7 @@ pub enum Outcome {
     NoWebots,
     /// The client left before Webots was ready.
     Left,
-    /// The server was asked to stop before Webots was ready.
+    /// The server was stopped before Webots was ready.
     Stopped,
     /// Webots was ready.
     Ready,
@@ -35,7 +35,7 @@ const ALL: [Outcome; 7] = [
 ];
 
 impl Outcome {
-    /// How a simulation ends whose start has this outcome.
+    /// The end of a simulation whose start has this outcome.
     #[must_use]
     pub fn end(self) -> EndReason {
         match self {
@@ -59,7 +59,7 @@ impl Outcome {
     }
 }
 
-/// Makes the counter `webots_simulation_starts_total`, with a zero for each outcome.
+/// Creates the counter `webots_simulation_starts_total`, with a zero for each outcome.
 ///
 /// # Errors
 /// When a counter of this name exists.
@@ -76,7 +76,7 @@ pub fn counter(metrics: &Metrics) -> Result<IntCounterVec, prometheus::Error> {
 pub struct Pending(Option<IntCounterVec>);
 
 impl Pending {
-    /// A start that has just been asked for.
+    /// A start that was just requested.
     #[must_use]
     pub fn new(counter: &IntCounterVec) -> Self {
         Self(Some(counter.clone()))

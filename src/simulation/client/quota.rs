@@ -1,15 +1,15 @@
-//! How many simulations the clients of one address may ask for: each costs a checkout and a start of Webots.
+//! Rate limit of simulations that the clients of one address request: each costs a checkout and a start of Webots.
 
 use std::num::NonZeroU32;
 
 use crate::shared::http::AddressQuota;
 
-/// How many at once, at least: 200, a large class behind one address.
+/// Least number at once: 200, a large class behind one address.
 const BURST: NonZeroU32 = NonZeroU32::MIN.saturating_add(199);
-/// How many in each minute after that: 60.
+/// Number per minute after that: 60.
 const PER_MINUTE: NonZeroU32 = NonZeroU32::MIN.saturating_add(59);
 
-/// The quota of simulations that are asked for, on a server with so many places: a class that takes all of them, and then
+/// The quota of requested simulations on a server with this many slots: a class that takes all of them, and then
 /// reloads its pages, stays within it.
 #[must_use]
 pub fn starts(places: u16) -> AddressQuota {

@@ -1,4 +1,4 @@
-//! How a session waits for its client, and goes on with another connection of it.
+//! How a session waits for its client, and continues with the client's next connection.
 
 use actix::prelude::*;
 use actix_web_actors::ws::CloseCode;
@@ -9,7 +9,7 @@ use crate::simulation::protocol;
 use crate::simulation::sessions::{Attachment, Resume, ToClient};
 
 impl Session {
-    /// Waits for a client that may come back, and ends where none may.
+    /// Waits for a client that may return; ends the session if it can't be resumed.
     pub(super) fn await_client(&mut self, ctx: &mut Context<Self>) {
         let absence = self.server.config.timing.absence;
         let name = self.name();
@@ -28,7 +28,7 @@ impl Session {
         }));
     }
 
-    /// Goes on with another connection of its client, and tells the one before.
+    /// Continues with another connection of its client, and closes the one before.
     fn go_on(&mut self, client: Recipient<ToClient>, peer: Peer, ctx: &mut Context<Self>) {
         log::info!("{}: goes on as client {peer}", self.name());
         self.peer = peer;
@@ -70,11 +70,11 @@ impl Handler<Resume> for Session {
             if let Ok(Err(no_place)) = moved {
                 return Err(protocol::error(&no_place.to_string()));
             }
-            // Another connection may have come with the same token meanwhile.
+            // Another connection may have used the same token since then.
             if let Some((resumption, refusal)) =
                 this.resumption.as_ref().and_then(|one| Some((one, one.refusal(&token)?)))
             {
-                // The place counts for the address of that one.
+                // The slot counts for the address of that connection.
                 resumption.stay_at(this.peer.rate_limit_key());
                 return Err(refusal);
             }

@@ -1,4 +1,4 @@
-//! What a session keeps so that its client can come back: its token, what the client hears then, and until when it waits.
+//! What a session keeps for a client that returns: its token, the texts to send again, and the deadline.
 
 use std::net::IpAddr;
 use std::time::{Duration, Instant};
@@ -12,15 +12,15 @@ use crate::simulation::simulation_id::SimulationId;
 use crate::simulation::slots::{Move, Report, SlotError, SlotLease, SlotPool, UpdateSimulation};
 use crate::simulation::snapshot::SimulationChange;
 
-/// How a client comes back.
+/// The state for a client that returns.
 pub struct Resumption {
     registration: Registration,
-    /// The one that the client was given last; none before it could come back.
+    /// The last token that the client got; `None` before it can return.
     token: Option<Token>,
     simulation: SimulationId,
     slots: Addr<SlotPool>,
     launched: Instant,
-    /// The texts that its project asks for.
+    /// The texts that its project requests.
     texts: Vec<String>,
     url: String,
     /// When the simulation ends because it is paused.
@@ -37,7 +37,7 @@ pub fn seconds_until(then: Instant) -> u64 {
 }
 
 impl Resumption {
-    /// For a session that can be found, and holds this ticket.
+    /// Creates it for a registered session with this lease.
     #[must_use]
     pub fn new(registration: Registration, lease: &SlotLease, slots: Addr<SlotPool>) -> Self {
         Self {
@@ -54,12 +54,12 @@ impl Resumption {
         }
     }
 
-    /// Webots was started: its time is counted.
+    /// Records that Webots was started: the time limit starts.
     pub fn launched(&mut self) {
         self.launched = Instant::now();
     }
 
-    /// Keeps a text for a client that comes back.
+    /// Keeps a text for a client that returns.
     pub fn keep(&mut self, text: String) {
         self.texts.push(text);
     }
@@ -80,13 +80,13 @@ impl Resumption {
         [protocol::absence(absence.as_secs()), protocol::resume(token)]
     }
 
-    /// Whether the client may come back.
+    /// Whether the client may return.
     #[must_use]
     pub fn is_ready(&self) -> bool {
         self.token.is_some()
     }
 
-    /// Why a client with this token may not come back, if so, in words for it.
+    /// Why a client with this token may not return, as text for it; `None` if it may.
     #[must_use]
     pub fn refusal(&self, token: &Token) -> Option<String> {
         if self.token.as_ref() != Some(token) {
@@ -95,7 +95,7 @@ impl Resumption {
         self.ended.as_ref().map(|why| protocol::ended(Some(why)))
     }
 
-    /// Asks whether the client may have its place at this address.
+    /// Requests that the slot counts for this address.
     pub fn move_to(
         &self,
         address: Option<IpAddr>,
@@ -103,17 +103,18 @@ impl Resumption {
         self.slots.send(Move { id: self.simulation, address })
     }
 
-    /// Has its place count for this address again.
+    /// Makes the slot count for this address again.
     pub fn stay_at(&self, address: Option<IpAddr>) {
         self.slots.do_send(Move { id: self.simulation, address });
     }
 
-    /// The simulation has ended, and its client may ask why. The first reason counts.
+    /// Records that the simulation has ended, for a client that returns. Only the first reason counts.
     pub fn end(&mut self, why: &str) {
         self.ended.get_or_insert_with(|| why.to_owned());
     }
 
-    /// The client has gone, and the simulation waits for so long, unless it has ended. Returns whether it waits.
+    /// Records that the client has disconnected; the simulation waits for this long, unless it has ended. Returns
+    /// whether it waits.
     pub fn away(&self, absence: Duration) -> bool {
         if self.ended.is_none() {
             self.show(Some(seconds_since_1970() + absence.as_secs()));
@@ -121,7 +122,7 @@ impl Resumption {
         self.ended.is_none()
     }
 
-    /// The client is back. Returns what it hears: what it has heard before, and a new token.
+    /// Records that the client is back. Returns the texts for it: those that it got before, and a new token.
     pub fn back(&mut self, timeout: u64, absence: Duration) -> Vec<String> {
         self.show(None);
         let left = timeout.saturating_sub(self.launched.elapsed().as_secs());
@@ -133,7 +134,7 @@ impl Resumption {
         texts
     }
 
-    /// What ends the wait, if there is one.
+    /// The timer that ends the wait, if there is one.
     pub fn deadline(&mut self) -> &mut Option<SpawnHandle> {
         &mut self.deadline
     }

@@ -1,8 +1,8 @@
 //! Actor: the session of one simulation, from the request for it to its end, as one state machine.
 //!
-//! Created by a web client that asks for a simulation. Whatever it holds in any state (a place in the line, a checkout
-//! under way, a running Webots) is given back when it is dropped. It ends with its client, or some time after the
-//! connection of one that may come back.
+//! Created by a web client that requests a simulation. Dropping it releases what it holds in its state: a position in
+//! the queue, a checkout in progress, a running Webots. It ends with its client, or some time after the connection of a
+//! client that may return.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -39,18 +39,18 @@ pub struct Session {
     pub(super) state: State,
     restoring: bool,
     pub(super) start: Pending,
-    /// Whether its client has asked to be able to come back.
+    /// Whether its client has requested a resumable simulation.
     pub(super) resumable: bool,
-    /// What it keeps so that its client can.
+    /// What it keeps for a client that returns.
     pub(super) resumption: Option<Resumption>,
     pub(super) is_watched: bool,
 }
 
-/// How often a client that may come back gets a sign of life.
+/// Interval of `absence` messages to a client that may return, which show that the connection works.
 const SIGN_OF_LIFE: Duration = Duration::from_secs(4);
 
 impl Session {
-    /// Opens the session of a client that asks for the world at this URL.
+    /// Opens the session of a client that requests the world at this URL.
     #[must_use]
     pub fn open(
         server: Arc<AppState>,
@@ -88,7 +88,7 @@ impl Session {
         }
     }
 
-    /// Sends the client a text that it misses where it can't keep up.
+    /// Sends the client a text that is dropped if it can't keep up.
     fn hint(&self, text: String) {
         if let Some(client) = &self.client
             && let Err(lost) = client.try_send(ToClient::Text(text))
@@ -97,7 +97,7 @@ impl Session {
         }
     }
 
-    /// Gives everything back, and sends its client the last words. One that has not heard them can come back for `why`.
+    /// Releases everything, and sends its client the last text. A client that has not received it can return for `why`.
     pub(super) fn finish(&mut self, last_words: String, why: &str, code: CloseCode, ctx: &mut Context<Self>) {
         self.state = State::Over;
         if let Some(client) = self.client.take() {
@@ -123,7 +123,7 @@ impl Session {
                 this.restoring = false;
                 match answer {
                     Ok(Ok(())) => this.text(protocol::reset_controller(&file)),
-                    // That does not end the simulation.
+                    // This error does not end the simulation.
                     Ok(Err(error)) => this.text(protocol::error(&error.to_string())),
                     Err(error) => log::warn!("{}: no controller was reset: {error}", this.name()),
                 }
@@ -166,7 +166,7 @@ impl Actor for Session {
 }
 
 impl Drop for Session {
-    /// A client that still waits for something has lost it: its session has panicked.
+    /// A client that is still attached has lost its simulation, because the session has panicked.
     fn drop(&mut self) {
         if let Some(client) = self.client.take() {
             let why = "The simulation was lost by a fault of this server";
@@ -284,7 +284,7 @@ impl Handler<WebotsEvent> for Session {
                     for text in offer {
                         self.text(text);
                     }
-                    // A Webots that is busy says nothing for a while, which its client would take for a lost connection.
+                    // A busy Webots sends nothing for a while, and its client would assume a lost connection.
                     ctx.run_interval(SIGN_OF_LIFE, move |this, _| this.hint(protocol::absence(absence.as_secs())));
                 }
             }

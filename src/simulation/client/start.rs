@@ -1,4 +1,4 @@
-//! How a session starts its simulation: a place, the checkout, Webots; and the ends of a start that fails.
+//! How a session starts its simulation: a slot, the checkout, Webots; and how a failed start ends.
 
 use std::sync::Arc;
 use std::time::Instant;
@@ -28,7 +28,7 @@ impl Session {
         self.finish(protocol::error(why), why, CloseCode::Normal, ctx);
     }
 
-    /// The same for a client that another server may take: the close code says so to programs.
+    /// The same for a client that another server may accept: the close code shows that to programs.
     pub(super) fn refer(&mut self, outcome: Outcome, why: &str, ctx: &mut Context<Self>) {
         self.start.resolve(outcome);
         log::info!("{}: {why}", self.name());
@@ -72,7 +72,7 @@ impl Session {
             Err(error) => return self.fail_own(Outcome::NoCheckout, &format!("No room for a project: {error}"), ctx),
         };
         let me = ctx.address();
-        // Where the mailbox is full, the client misses one line of progress.
+        // A full mailbox drops this line of progress.
         let progress = move |text: String| drop(me.try_send(Progress(text)));
         let job = self.server.checkouts.start(world, instance, progress);
         job.into_actor(self)

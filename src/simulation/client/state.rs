@@ -1,4 +1,4 @@
-//! The states of a session, and what it holds in each. Dropping a state gives everything back.
+//! The states of a session, and what it holds in each. Dropping a state releases that.
 
 use actix::prelude::*;
 
@@ -8,37 +8,37 @@ use crate::simulation::protocol::Mode;
 use crate::simulation::slots::{Slot, SlotLease};
 use crate::simulation::webots::{Stop, Webots};
 
-/// The life of a simulation, as its session knows it.
+/// The life cycle of a simulation, as its session knows it.
 pub enum State {
-    /// Its client has asked for it.
+    /// Its client has requested it.
     Asked {
-        /// The URL as the client wrote it.
+        /// The URL, as the client sent it.
         url: String,
         /// How it is shown.
         mode: Mode,
     },
-    /// Waiting for a place.
+    /// Waiting for a slot.
     Waiting {
-        /// What was asked for.
+        /// The request.
         request: StartRequest,
-        /// The place in the line.
+        /// The lease, which holds the position in the queue.
         lease: SlotLease,
     },
     /// The project is being checked out; the job ends with the actor.
     CheckingOut {
         /// How it is shown.
         mode: Mode,
-        /// The place and its port.
+        /// The slot and its port.
         slot: Slot,
     },
     /// Webots was started.
     Launched(WebotsHandle),
-    /// The client was told the end.
+    /// The client got its last text.
     Over,
 }
 
 impl State {
-    /// Tells how the simulation ends, before the state is dropped. What Webots has told of its own end comes first.
+    /// Reports how the simulation ends, before the state is dropped. Webots' own report takes precedence.
     pub fn end(&self, reason: EndReason, why: &str) {
         match self {
             Self::Waiting { lease, .. } | Self::CheckingOut { slot: Slot { lease, .. }, .. } => {
@@ -50,9 +50,9 @@ impl State {
     }
 }
 
-/// The simulation that a client has asked for.
+/// A simulation that a client has requested.
 pub struct StartRequest {
-    /// Where the world is.
+    /// The URL of the world.
     pub world: ProjectUrl,
     /// How it is shown.
     pub mode: Mode,

@@ -1,7 +1,8 @@
-//! Actor: one WebSocket on `/client`. It reads what its client says, and sends what the session of its simulation has for it.
+//! Actor: one WebSocket on `/client`. It parses its client's messages, and sends it the messages of the simulation's
+//! session.
 //!
-//! Created by the route for each connection; ends with it. The connection is the lease: the [`Session`] that it is
-//! attached to hears of its end, also by a panic.
+//! Created by the route for each connection; ends with it. The simulation depends on the connection: the [`Session`]
+//! that it is attached to is notified of its end, also after a panic.
 
 use std::sync::Arc;
 
@@ -33,17 +34,17 @@ pub struct WebClient {
 
 /// Whether the client has a session.
 enum Attached {
-    /// It has asked for nothing yet.
+    /// It has not requested one yet.
     No,
-    /// It has asked to go on with one.
+    /// It has requested to resume one.
     Coming,
     /// It has one.
     To(Attachment),
-    /// It was told the end.
+    /// It got its last text.
     Over,
 }
 
-/// How many texts may wait for a client that reads slowly, before those that may be lost are.
+/// Limit of texts that wait for a slow client, from which on optional texts are dropped.
 const MAILBOX: usize = 64;
 
 type Context = WebsocketContext<WebClient>;
@@ -66,14 +67,14 @@ impl WebClient {
         ctx.stop();
     }
 
-    /// Ends the simulation of a client that leaves in order, or that breaks the rules.
+    /// Ends the simulation of a client that closes its connection regularly, or violates the protocol.
     fn give_up(&self) {
         if let Attached::To(session) = &self.session {
             session.say(Said::Left);
         }
     }
 
-    /// Asks the session that a token names to go on with this connection.
+    /// Requests from the session of a token to continue with this connection.
     fn resume(&mut self, token: Option<Token>, ctx: &mut Context) {
         let found = token.and_then(|token| Some((token, self.server.sessions.find(&token)?)));
         let Some((token, session)) = found else {
@@ -139,7 +140,7 @@ impl Actor for WebClient {
         closing(self.server.phase.clone())
             .into_actor(self)
             .map(|(), this, ctx| {
-                // Its session tells a client that has one.
+                // A client with a session is notified by its session.
                 if matches!(this.session, Attached::No | Attached::Coming) {
                     this.finish(protocol::stopping(), CloseCode::Away, ctx);
                 }
@@ -159,7 +160,7 @@ impl StreamHandler<Result<Message, ProtocolError>> for WebClient {
             Ok(Some(ClientMessage::Ping(data))) if self.liveness.may_answer() => ctx.pong(&data),
             Ok(Some(ClientMessage::Pong(content))) => self.liveness.pong(&content),
             Ok(Some(ClientMessage::Close(reason))) => {
-                // Whatever else comes, or nothing: the client may come back.
+                // After any other close code, or none, the client may return.
                 if reason.as_ref().is_some_and(|reason| reason.code == CloseCode::Normal) {
                     self.give_up();
                 }

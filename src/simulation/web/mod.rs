@@ -1,4 +1,4 @@
-//! What browsers and programs meet: paths, pages, `/status` and `/metrics`.
+//! The interface to browsers and programs: routes, pages, `/status` and `/metrics`.
 
 mod actions;
 mod administrator;

@@ -1,4 +1,4 @@
-//! The paths of the simulation server's page, with what it loads and listens to, and of Webots' own viewer.
+//! Routes of the simulation server's page, with its assets and event stream, and of Webots' own viewer.
 
 use std::collections::BTreeMap;
 use std::io::{Read, Seek, SeekFrom};
@@ -43,7 +43,7 @@ const ASSETS: &[Asset] = &[
 /// How much of an output's end is shown, in bytes: all that is kept of one that has ended, with its events.
 const LARGEST_TAIL: u64 = 96 * 1024;
 
-/// Adds the paths to an app.
+/// Adds the routes to an app.
 pub fn configure(app: &mut web::ServiceConfig) {
     app.service(path("/monitor", READ, monitor))
         .service(path("/events", GET, events))
@@ -74,7 +74,7 @@ async fn monitor(request: HttpRequest, server: web::Data<AppState>) -> HttpRespo
 async fn usages(server: &AppState, snapshot: &Snapshot) -> Usages {
     let (usage, simulations) = (server.usage.clone(), snapshot.simulations.iter());
     let read = if let Some(containers) = &server.containers {
-        // The process is that of docker, which waits for them.
+        // The process is `docker`, which waits for the containers.
         let roots: BTreeMap<u16, i32> = simulations.filter_map(|one| Some((one.port?, one.pid?))).collect();
         let owner = containers.run().clone();
         let read =
@@ -122,8 +122,8 @@ struct Which {
     id: String,
 }
 
-/// The last lines that a simulation has printed, also one that has ended. They may be private, so the administrator's password protects them if one
-/// is configured.
+/// The last output lines of a simulation, running or ended. They may be private, so the administrator's password
+/// protects them if one is configured.
 async fn output(request: HttpRequest, which: web::Query<Which>, server: web::Data<AppState>) -> HttpResponse {
     if let Some(auth) = &server.admin_auth
         && let Err(refused) = auth.check(&request, server.config.trusted_proxies.peer(&request))

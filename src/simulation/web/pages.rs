@@ -1,4 +1,4 @@
-//! The simulation server's page for people.
+//! The simulation server's HTML page.
 
 use std::time::{Duration, SystemTime};
 
@@ -76,14 +76,14 @@ struct Monitor<'server> {
 #[template(path = "simulation/glance.html")]
 struct Glance<'readings> {
     draining: bool,
-    /// Why no simulation can be started, if so.
+    /// Why no simulation can be started; `None` if some can.
     problem: Option<String>,
     load: f64,
     busiest_part: &'static str,
     machine: Machine,
     memory: String,
     gpus: Vec<(&'readings Gpu, String)>,
-    /// What is wrong with the GPUs, if something is.
+    /// The problem with the GPUs, if there is one.
     gpu_problem: Option<&'readings str>,
     running: u32,
     idle: u32,
@@ -105,7 +105,7 @@ struct SimulationRow<'one> {
     stage: &'static str,
     class: &'static str,
     since: String,
-    /// Seconds since 1970; 0 where it is not launched.
+    /// When its time limit ends, in seconds since 1970; 0 if it is not launched.
     ends: u64,
     left: String,
     cpu: String,
@@ -212,7 +212,7 @@ impl<'readings> Glance<'readings> {
     }
 }
 
-/// Each GPU with the size of its memory in words.
+/// Each GPU with the size of its memory as text.
 fn with_sizes(gpus: &[Gpu]) -> Vec<(&Gpu, String)> {
     gpus.iter().map(|gpu| (gpu, bytes(gpu.memory_total))).collect()
 }
@@ -248,7 +248,7 @@ fn text_of(seconds_since_1970: u64) -> String {
     timestamp(SystemTime::UNIX_EPOCH + Duration::from_secs(seconds_since_1970))
 }
 
-/// What forges put between a repository and a path in it.
+/// Separators of Git hosts between a repository and a path in it.
 const SEPARATORS: [&str; 4] = ["/-/", "/blob/", "/tree/", "/src/"];
 
 /// The URL of a world as a link, in which nothing is invisible or turns letters around.
@@ -290,7 +290,7 @@ impl<'one> SimulationRow<'one> {
     }
 }
 
-/// A stage in words, and the class by which it gets its colour.
+/// A stage as text, and the CSS class of its color.
 fn words(stage: Stage) -> (&'static str, &'static str) {
     match stage {
         Stage::Queued => ("waiting", "queued"),
@@ -316,7 +316,7 @@ fn bytes(count: u64) -> String {
     }
 }
 
-/// A number of seconds in words, without the seconds, which the page's script adds.
+/// A duration as text in hours and minutes; the page's script adds the seconds.
 fn duration(seconds: u64) -> String {
     match (seconds / 3600, seconds / 60 % 60) {
         (0, minutes) => format!("{minutes} min"),
@@ -325,7 +325,7 @@ fn duration(seconds: u64) -> String {
     }
 }
 
-/// What worlds' programs may do that they should not, and why.
+/// What worlds' programs can do because isolation is incomplete, and why it is.
 fn shortcoming(server: &AppState) -> Option<(&'static str, &str)> {
     let of_level = server.launcher.shortcoming().map(|why| ("worlds' programs may do whatever this server may.", why));
     let of_containers = server.containers.as_ref().and_then(|containers| containers.shortcoming());

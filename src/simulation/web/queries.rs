@@ -1,4 +1,4 @@
-//! Asks for the snapshot of simulations on behalf of a request.
+//! Queries the snapshot of simulations on behalf of a request.
 
 use std::time::Duration;
 
@@ -8,10 +8,10 @@ use crate::simulation::slots::{GetSnapshot, StopOne};
 use crate::simulation::snapshot::Snapshot;
 use crate::simulation::state::AppState;
 
-/// How long an actor may take to answer a page.
+/// Timeout of the slot pool's answer to a page.
 const PATIENCE: Duration = Duration::from_secs(2);
 
-/// All simulations of this server; none when the actor that knows them is too busy to answer.
+/// All simulations of this server; `None` if the slot pool does not answer in time.
 pub async fn snapshot(server: &AppState) -> Option<Snapshot> {
     let snapshot = server.slots.send(GetSnapshot);
     actix_rt::time::timeout(PATIENCE, snapshot).await.ok().and_then(Result::ok)

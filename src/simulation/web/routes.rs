@@ -1,4 +1,4 @@
-//! The simulation server's public paths: each reads the request, asks for what it needs, and maps the answer.
+//! The simulation server's routes: each parses the request, queries what it needs, and maps the answer.
 
 use std::sync::Arc;
 
@@ -18,7 +18,7 @@ use crate::shared::http::{CONTENT_TYPE, ConnectionKind};
 use crate::simulation::client::WebClient;
 use crate::simulation::state::AppState;
 
-/// Adds all paths to an app.
+/// Adds all routes to an app.
 pub fn configure(app: &mut web::ServiceConfig) {
     app.service(routing::all(add, "/monitor, /status, /load, /metrics or /health"));
 }

@@ -1,4 +1,4 @@
-//! What the simulation server tells other programs: `/status` and `/metrics`.
+//! The simulation server for other programs: `/status` and `/metrics`.
 
 use serde::Serialize;
 
@@ -14,10 +14,10 @@ use crate::simulation::state::AppState;
 #[derive(Debug, Serialize)]
 #[serde(rename_all = "camelCase")]
 pub struct StatusResponse {
-    /// The part that session servers read.
+    /// The part that session servers parse.
     #[serde(flatten)]
     pub report: ServerReport,
-    /// At which level of isolation simulations run.
+    /// The isolation level of simulations.
     pub isolation: IsolationLevel,
     /// Which network their programs have, where that is not Docker's.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -30,10 +30,10 @@ pub struct StatusResponse {
     pub machine: Machine,
     /// The newest readings of its GPUs.
     pub gpus: Vec<Gpu>,
-    /// What is wrong with the GPUs, if some have answered and don't any more.
+    /// The problem with the GPUs, if some have answered before and don't any more.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub gpu_problem: Option<String>,
-    /// Where Webots' own viewer can be had from this server.
+    /// Path of Webots' own viewer on this server, if it has one.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub viewer: Option<&'static str>,
     /// Each simulation.

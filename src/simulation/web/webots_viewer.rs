@@ -1,4 +1,4 @@
-//! Webots' own viewer for browsers, where Webots is installed: which of its files may be sent.
+//! Webots' own viewer for browsers in the installation of Webots, and which of its files may be sent.
 
 use std::path::{Component, Path, PathBuf};
 
@@ -6,14 +6,14 @@ use percent_encoding::percent_decode_str;
 
 use crate::simulation::config::SimulationConfig;
 
-/// Where Webots keeps it, below its folder.
+/// Its directory below that of Webots.
 const FOLDER: &str = "resources/web/wwi";
-/// The viewer itself.
+/// The viewer's main script.
 const SCRIPT: &str = "WebotsView.js";
-/// Its path on this server, as `/status` tells it.
+/// Its path on this server, as in `/status`.
 pub const PATH: &str = "wwi/WebotsView.js";
 
-/// The viewer's folder, if Webots is installed here.
+/// The viewer's directory, if Webots is installed here.
 #[must_use]
 pub fn folder(config: &SimulationConfig) -> Option<PathBuf> {
     let home = &config.webots_home.as_ref()?.0;
@@ -21,7 +21,7 @@ pub fn folder(config: &SimulationConfig) -> Option<PathBuf> {
     places.into_iter().find(|folder| folder.join(SCRIPT).is_file())
 }
 
-/// A file of a folder, unless the path or a link leads out of it.
+/// A file below a directory; `None` if the path or a symlink resolves to a path outside of it.
 #[must_use]
 pub fn file_below(folder: &Path, path: &str) -> Option<PathBuf> {
     let path = percent_decode_str(path).decode_utf8().ok()?;
