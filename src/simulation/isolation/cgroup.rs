@@ -1,7 +1,7 @@
-//! A control group (cgroup v2) for each simulation, where systemd delegates them to this server (`Delegate=yes`).
+//! A control group (cgroup v2) for each simulation, if systemd delegates them to this server (`Delegate=yes`).
 //!
-//! They limit memory, processors and processes, and what is in one ends with it, however it hides. Nothing is delegated
-//! to a server that was started in a terminal: it shares its group with others, whose processes it must not move.
+//! They limit memory, CPU time and processes, and all processes in a group end with it, however they hide. A server
+//! that was started in a terminal gets none: it shares its group with other processes, which it must not move.
 
 use std::ffi::OsString;
 use std::io;
@@ -20,28 +20,30 @@ pub struct Cgroups {
     settings: Vec<(&'static str, String)>,
 }
 
-/// What control groups can limit, by the kernel's names.
+/// The cgroup controllers that are available, by the kernel's names.
 pub type Controllers = Vec<&'static str>;
 
-/// The control group of one simulation. Dropping it ends all that is inside, and removes it.
+/// The control group of one simulation. Dropping it kills all processes inside, and removes it.
 #[derive(Debug)]
 pub struct Cgroup {
     folder: PathBuf,
 }
 
-/// The group of the server itself: where there are groups below, none of the kernel's limits holds for processes beside them.
+/// The group of the server itself: in a group with subgroups, the kernel's limits do not apply to processes beside
+/// these.
 const OWN: &str = "server";
-/// What is limited.
+/// The controllers that are used.
 const CONTROLLERS: [&str; 3] = ["cpu", "memory", "pids"];
-/// The kernel's period for the time of processors, in microseconds.
+/// The kernel's period of CPU limits, in microseconds.
 const PERIOD: u64 = 100_000;
-/// How long it may take until killed processes have gone.
+/// Timeout of killed processes until they have exited.
 const VANISH: Duration = Duration::from_secs(2);
-/// Time between two looks whether they have.
+/// Interval between two checks whether they have.
 const PAUSE: Duration = Duration::from_millis(5);
 
 impl Cgroups {
-    /// The control groups that are delegated to this server, if they are. So many processes of each are not its own.
+    /// The control groups that are delegated to this server, if they are. `runners` is the number of processes that run
+    /// each simulation (see [`MostProcesses`](super::watcher::MostProcesses)).
     #[must_use]
     pub fn delegated(limits: &ResourceLimits, runners: u64) -> Option<Self> {
         let folder = own_folder()?;
@@ -57,7 +59,7 @@ impl Cgroups {
         }
     }
 
-    /// Moves this server into a group of its own, so that there can be others beside it.
+    /// Moves this server into a subgroup, so that there can be others beside it.
     fn divide(folder: &Path) -> io::Result<()> {
         let own = folder.join(OWN);
         if !own.is_dir() {
@@ -70,26 +72,26 @@ impl Cgroups {
         Ok(())
     }
 
-    /// What the control groups of simulations limit on a server that starts now.
+    /// The controllers that the control groups of simulations have on a server that starts now.
     #[must_use]
     pub fn controllers() -> Controllers {
         own_folder().and_then(|folder| offered(&folder).ok()).unwrap_or_default()
     }
 
-    /// Whether the kernel counts the processes of each simulation, and refuses more than are allowed.
+    /// Whether the kernel counts the processes of each simulation, and enforces their limit.
     pub fn limit_processes(&self) -> bool {
         std::fs::read_to_string(self.folder.join("cgroup.subtree_control"))
             .is_ok_and(|controllers| controllers.split_whitespace().any(|one| one == "pids"))
     }
 
-    /// Makes a group for a simulation. Where that fails, it runs without.
+    /// Creates a group for a simulation; `None` if that fails, and it runs without one.
     pub fn make(&self) -> Option<Cgroup> {
         let made = tempfile::Builder::new().prefix("simulation-").tempdir_in(&self.folder);
         let made = made.inspect_err(|error| log::warn!("no control group can be made: {error}"));
         let cgroup = Cgroup { folder: made.ok()?.keep() };
         for (file, value) in &self.settings {
             let file = cgroup.folder.join(file);
-            // What is not offered to this server can't be limited.
+            // A controller that this server does not have can't limit anything.
             if file.exists()
                 && let Err(error) = std::fs::write(&file, value)
             {
@@ -101,18 +103,18 @@ impl Cgroups {
 }
 
 impl Cgroup {
-    /// Its folder.
+    /// The directory of the group.
     pub fn path(&self) -> &Path {
         &self.folder
     }
 
-    /// The words that run a program in this group.
+    /// The prefix of a command that runs it in this group.
     pub fn joining(&self) -> Vec<OsString> {
         let words = ["/bin/sh", "-c", "echo 0 >\"$0\" && exec \"$@\""].map(OsString::from);
         words.into_iter().chain(std::iter::once(self.folder.join("cgroup.procs").into())).collect()
     }
 
-    /// Whether the kernel has ended something inside because it took more memory than it may.
+    /// Whether the kernel has killed a process inside because of the memory limit.
     #[must_use]
     pub fn has_run_out_of_memory(&self) -> bool {
         let events = std::fs::read_to_string(self.folder.join("memory.events")).unwrap_or_default();
@@ -125,7 +127,7 @@ impl Cgroup {
         taken_in(&self.folder)
     }
 
-    /// Ends all that is inside. Blocks until it has ended, for two seconds at most.
+    /// Kills all processes inside. Blocks until they have exited, for two seconds at most.
     pub fn kill(&self) {
         kill(&self.folder);
     }
@@ -160,19 +162,19 @@ impl Drop for Cgroup {
                 log::warn!("{} can't be removed: {error}", folder.display());
             }
         };
-        // Where there is no thread, systemd removes the group with the unit.
+        // Without a thread, systemd removes the group with the unit.
         drop(std::thread::Builder::new().spawn(remove));
     }
 }
 
-/// What can be limited below a group.
+/// The controllers that are available below a group.
 fn offered(folder: &Path) -> io::Result<Controllers> {
     let offered = std::fs::read_to_string(folder.join("cgroup.controllers"))?;
     let is_offered = |name: &&str| offered.split_whitespace().any(|one| one == *name);
     Ok(CONTROLLERS.into_iter().filter(is_offered).collect())
 }
 
-/// The limits as the kernel has them. A simulation that runs out of memory ends as a whole.
+/// The limits in the kernel's format. A simulation that runs out of memory is killed as a whole.
 fn settings(limits: &ResourceLimits, runners: u64) -> Vec<(&'static str, String)> {
     let mut settings =
         vec![("pids.max", (limits.processes + runners).to_string()), ("memory.oom.group", "1".to_owned())];
@@ -181,7 +183,7 @@ fn settings(limits: &ResourceLimits, runners: u64) -> Vec<(&'static str, String)
     settings
 }
 
-/// The folder of this server's control group, if nobody else is in it.
+/// The directory of this server's control group; `None` if other processes are in it.
 fn own_folder() -> Option<PathBuf> {
     let me = Process::myself().ok()?;
     let mounts = me.mountinfo().ok()?;

@@ -1,10 +1,11 @@
-//! The environment of a simulation: of the server's own only what Webots and its controllers need.
+//! The environment of a simulation: only the variables of the server's environment that Webots and its controllers
+//! need.
 
 use std::ffi::OsString;
 
 use crate::simulation::config::VariableName;
 
-/// Variables that Webots, Qt, graphics drivers and interpreters read; with `*`, all that begin so. None of them is a
+/// Variables that Webots, Qt, graphics drivers and interpreters read; with `*`, all with this prefix. None of them is a
 /// secret of the server.
 const NEEDED: [&str; 32] = [
     "PATH",

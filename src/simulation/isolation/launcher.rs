@@ -1,6 +1,6 @@
-//! How simulations are launched on this server: decided once at its start, the same for all.
+//! The launcher of simulations on this server: its isolation level is decided once at start, the same for all.
 //!
-//! A level of isolation is a way to turn a program into a command that runs it so ([`SpawnSpec`]).
+//! A level of isolation turns a program into a command that runs it at that level ([`SpawnSpec`]).
 
 use std::ffi::OsString;
 use std::fmt;
@@ -22,7 +22,7 @@ use super::watcher::MostProcesses;
 use crate::simulation::config::{IsolationSetting, ResourceLimits, SandboxNetwork, SimulationConfig, VariableName};
 use crate::simulation::process::SpawnSpec;
 
-/// The levels of isolation that this server can keep.
+/// The levels of isolation that this server supports.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum IsolationLevel {
@@ -57,13 +57,13 @@ pub enum Network {
     Closed,
 }
 
-/// How many open files programs expect to be allowed; one that uses `select` can't stand more.
+/// Soft limit of open files that programs expect; programs that use `select` can't handle more.
 const USUAL_FILES: u64 = 1024;
 
-/// How a program is run at a level.
+/// How a program is started at a level.
 #[derive(Debug)]
 enum Method {
-    /// As it is.
+    /// Without a wrapper.
     Plain,
     /// In a sandbox.
     Sandbox(Sandbox),
@@ -75,7 +75,7 @@ enum Method {
 #[derive(Debug)]
 pub struct Launcher {
     method: Method,
-    /// Why it is not a sandbox, where the configuration leaves it to the machine.
+    /// Why it is not a sandbox, with `isolation: "auto"`.
     shortcoming: Option<String>,
     /// Why it has no network of its own, where the configuration leaves it to the machine.
     why_shared: Option<String>,
@@ -86,10 +86,10 @@ pub struct Launcher {
 }
 
 impl Launcher {
-    /// Finds out at which level simulations can run. Blocks for some milliseconds, for five seconds at most.
+    /// Determines the isolation level. Blocks for some milliseconds, for ten seconds at most.
     ///
     /// # Errors
-    /// When the configuration demands a level that can't be had.
+    /// When the configuration requires a level that is not available.
     pub fn new(config: &SimulationConfig) -> Result<Self, IsolationError> {
         let sandbox = || Sandbox::new(config).and_then(Sandbox::tried);
         let (method, shortcoming) = match config.isolation {
@@ -132,10 +132,10 @@ impl Launcher {
     }
 
     /// The same for a server that is starting: it logs the level, and each simulation gets a control group of its own
-    /// where these are delegated to this server.
+    /// if these are delegated to this server.
     ///
     /// # Errors
-    /// When the configuration demands a level that can't be had.
+    /// When the configuration requires a level that is not available.
     pub fn start(config: &SimulationConfig) -> Result<Self, IsolationError> {
         let mut launcher = Self::new(config)?;
         match &launcher.shortcoming {
@@ -154,11 +154,11 @@ impl Launcher {
         Ok(launcher)
     }
 
-    /// Which limits this machine can't keep, a line each. Before simulations have control groups.
+    /// The limits that this machine can't enforce, one line each. To be called before simulations have control groups.
     #[must_use]
     pub fn unenforced_limits(&self) -> Vec<String> {
         if self.level() == IsolationLevel::Container {
-            // Docker keeps them.
+            // Docker enforces them.
             return Vec::new();
         }
         let means = Enforcement {
@@ -169,7 +169,7 @@ impl Launcher {
         unenforced_limits(&means, &self.limits)
     }
 
-    /// The level.
+    /// The isolation level of all simulations.
     #[must_use]
     pub fn level(&self) -> IsolationLevel {
         match self.method {
@@ -237,7 +237,7 @@ impl Launcher {
         self.shortcoming.as_deref()
     }
 
-    /// What a client should know of the level where a program did not even become ready.
+    /// A remark on the level for the client of a program that did not become ready.
     #[must_use]
     pub fn remark(&self) -> &'static str {
         match self.level() {
@@ -253,10 +253,10 @@ impl Launcher {
         }
     }
 
-    /// How a program is started and ended, and its control group.
+    /// The specification of the process that runs a program, and its control group.
     ///
     /// # Errors
-    /// When a folder can't be made.
+    /// When a directory can't be created.
     pub fn prepare(&self, mut program: Program<'_>) -> io::Result<(SpawnSpec, Option<Cgroup>)> {
         let cgroup = self.cgroups.as_ref().and_then(Cgroups::make);
         let mut command = cgroup.as_ref().map(Cgroup::joining).unwrap_or_default();
@@ -264,7 +264,7 @@ impl Launcher {
         environment.extend(program.display.variables());
         environment.extend(program.variables.iter().cloned());
         if let Method::Sandbox(sandbox) = &self.method {
-            // Links are not followed out of a sandbox.
+            // Symlinks are not followed out of a sandbox.
             if let Some(file) = program.command.first_mut()
                 && let Ok(real) = Path::new(&*file).canonicalize()
             {
@@ -290,13 +290,13 @@ impl Launcher {
         Ok((spec, cgroup))
     }
 
-    /// Whether the kernel counts the processes of each sandbox by itself.
+    /// Whether the kernel counts the processes of each sandbox separately.
     fn limits_by_namespace(&self) -> bool {
         let is_ordinary = !nix::unistd::getuid().is_root();
         self.level() == IsolationLevel::Sandbox && is_ordinary && self.prlimit.is_some() && counts_by_namespace()
     }
 
-    /// How many processes a simulation may have; `None` if the kernel or Docker refuses more.
+    /// Limit of a simulation's processes; `None` if the kernel or Docker enforces it.
     #[must_use]
     pub fn most_processes(&self) -> Option<MostProcesses> {
         let is_kept = self.level() == IsolationLevel::Container
@@ -305,7 +305,7 @@ impl Launcher {
         (!is_kept).then(|| MostProcesses { limit: self.limits.processes, runners: self.runners() })
     }
 
-    /// The words that run a program within the kernel's limits for processes.
+    /// The prefix of a command that runs it with the kernel's limits for processes.
     fn limited(&self) -> Vec<OsString> {
         let Some(prlimit) = &self.prlimit else {
             return Vec::new();
@@ -314,7 +314,8 @@ impl Launcher {
         let size = at_most(Resource::RLIMIT_FSIZE, self.limits.disk << 20);
         let mut words = vec![format!("--nofile={}:{files}", files.min(USUAL_FILES)), format!("--fsize={size}")];
         words.push("--core=0".to_owned());
-        // The kernel counts all processes of a user, but in a user namespace only those in it, one of which is bubblewrap.
+        // The kernel counts all processes of a user, but in a user namespace only those inside, one of which is
+        // bubblewrap.
         if self.limits_by_namespace() {
             words.push(format!("--nproc={}", at_most(Resource::RLIMIT_NPROC, self.limits.processes + 1)));
         }
@@ -323,12 +324,12 @@ impl Launcher {
     }
 }
 
-/// A limit, or what this server itself may have at most, which nobody can raise for its programs.
+/// A limit, capped at this server's own hard limit, which its child processes can't exceed.
 fn at_most(resource: Resource, limit: u64) -> u64 {
     getrlimit(resource).map_or(limit, |(_, most)| limit.min(most))
 }
 
-/// Since Linux 5.14 the processes of a user are counted in each user namespace.
+/// Since Linux 5.14 the kernel counts the processes of a user in each user namespace.
 fn counts_by_namespace() -> bool {
     procfs::sys::kernel::Version::current().is_ok_and(|version| (version.major, version.minor) >= (5, 14))
 }

@@ -1,4 +1,4 @@
-//! How a simulation is launched: at which level of isolation, with which environment and limits, and what ends with it.
+//! The launch of a simulation: its isolation level, environment and limits, and what ends with it.
 
 mod cgroup;
 mod disk;

@@ -1,4 +1,4 @@
-//! What a sandbox shows at which place, and what it hides of the server.
+//! The mounts of a sandbox, and what they hide of the server.
 
 use std::collections::BTreeSet;
 use std::ffi::OsString;
@@ -7,23 +7,23 @@ use std::path::{Path, PathBuf};
 
 use crate::simulation::config::SimulationConfig;
 
-/// A file or folder of which a sandbox shows something else than the system has there.
+/// A path at which a sandbox shows something else than the system.
 #[derive(Debug, Clone)]
 pub struct Mount {
-    /// Where.
+    /// The absolute path.
     pub at: PathBuf,
-    /// What is shown there.
+    /// What is mounted there.
     pub content: MountKind,
 }
 
-/// What a sandbox shows at a place.
+/// What a sandbox mounts at a path.
 #[derive(Debug, Clone)]
 pub enum MountKind {
-    /// An empty folder.
+    /// An empty directory.
     EmptyFolder,
     /// An empty file.
     EmptyFile,
-    /// What is there, only to be read.
+    /// The same path, read-only.
     ReadOnly,
     /// A file at another path, only to be read.
     ReadableFile(PathBuf),
@@ -31,21 +31,21 @@ pub enum MountKind {
     ReadWrite(PathBuf),
 }
 
-/// The administrator's folder, in which a package of this server has its configuration.
+/// The administrator's directory, in which a package of this server has its configuration.
 const ETC: &str = "/etc/webots-fleet";
 
 impl Mount {
-    /// Shows this at a path.
+    /// Mounts this at a path.
     pub fn new(at: &str, content: MountKind) -> Self {
         Self { at: at.into(), content }
     }
 
-    /// Shows an empty folder.
+    /// Mounts an empty directory.
     pub fn empty(at: PathBuf) -> Self {
         Self { at, content: MountKind::EmptyFolder }
     }
 
-    /// The words by which bubblewrap does so.
+    /// The arguments of bubblewrap for this mount.
     pub fn into_arguments(self) -> Vec<OsString> {
         match self.content {
             MountKind::EmptyFolder => vec!["--tmpfs".into(), self.at.into()],
@@ -57,14 +57,15 @@ impl Mount {
     }
 }
 
-/// What only the server may see: its log, its cache with all simulations, its configuration and other secrets.
+/// The mounts that hide what only the server may read: its log, its cache with all simulations, its configuration and
+/// other secrets.
 pub fn hidden(config: &SimulationConfig, homes: &[PathBuf]) -> Vec<Mount> {
     let folders = [&config.log_dir.0, &config.cache_dir.0].into_iter().filter_map(|folder| folder.canonicalize().ok());
     let folders = folders.chain(std::iter::once(ETC.into())).chain(folders_of_secrets(config, homes));
     let mut hidden: Vec<Mount> = folders.map(Mount::empty).collect();
     for file in config.secret_files() {
         let Some(real) = file.canonicalize().ok().filter(|file| file.is_file()) else { continue };
-        // The other configurations are beside it: those of the session server are in a folder beside this one.
+        // The other configurations are nearby: those of the session server are in a directory beside this one.
         let beside = ["session", "simulation"].map(|name| real.parent().unwrap_or(&real).with_file_name(name));
         if beside.iter().any(|one| real.parent() == Some(one)) {
             hidden.extend(beside.map(Mount::empty));
@@ -74,8 +75,8 @@ pub fn hidden(config: &SimulationConfig, homes: &[PathBuf]) -> Vec<Mount> {
     hidden
 }
 
-/// The folders that hold nothing but secrets of the server: a file that takes the place of another one is seen again unless
-/// its folder is hidden. Programs may need whatever else is in a folder.
+/// The directories that contain only secrets of the server: a file that replaces another one would be visible unless
+/// its directory is hidden. Programs may need anything else in a directory.
 fn folders_of_secrets(config: &SimulationConfig, homes: &[PathBuf]) -> Vec<PathBuf> {
     let named = config.secret_files().filter_map(|file| {
         let folder = file.parent()?.canonicalize().ok()?;

@@ -8,7 +8,7 @@ use super::docker_cgroup::taken_by_container;
 use crate::simulation::ends::Taken;
 use crate::simulation::machine::Usage;
 
-/// What a simulation has taken at most, as far as ticks have seen it.
+/// The highest usage of a simulation that ticks have measured.
 #[derive(Debug, Default)]
 pub struct Peak {
     /// Its containers, where it runs in some: what its processes here take is nothing then.
@@ -59,7 +59,7 @@ impl Peak {
         self.time.fetch_max(u64::try_from(time.as_millis()).unwrap_or(u64::MAX), Ordering::Relaxed);
     }
 
-    /// What it has taken; nothing is known of one that ended before the first tick.
+    /// The usage; its fields are `None` if the simulation ended before the first tick.
     #[must_use]
     pub fn taken(&self) -> Taken {
         let (memory, time) = (self.memory.load(Ordering::Relaxed), self.time.load(Ordering::Relaxed));

@@ -1,4 +1,4 @@
-//! What is launched.
+//! The program to launch.
 
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
@@ -11,11 +11,11 @@ use super::display::Display;
 pub struct Program<'start> {
     /// The program and its arguments.
     pub command: Vec<OsString>,
-    /// The instance's folder.
+    /// The instance's directory.
     pub instance: &'start Path,
-    /// The folder of its project, which it may change.
+    /// The directory of its project, which is writable.
     pub project: PathBuf,
-    /// The working folder.
+    /// The working directory.
     pub folder: &'start Path,
     /// The port that it is to stream on.
     pub port: u16,

@@ -1,8 +1,8 @@
-//! A sandbox by bubblewrap: the system is there to be read, what is the server's own is not, and everything inside ends
-//! with it.
+//! A sandbox by bubblewrap: the system is read-only, the server's own files are hidden, and everything inside ends with
+//! it.
 //!
-//! Which folders are hidden and which are shown is one list, the outer folders before the inner ones: what is said of a
-//! folder holds for all that is inside, unless something else is said of that.
+//! The mounts are one list, outer directories before inner ones. The most specific path wins: a mount covers a
+//! directory and its contents unless a longer path overrides it.
 
 use std::collections::BTreeSet;
 use std::ffi::OsString;
@@ -22,14 +22,14 @@ use crate::shared::text::one_line;
 use crate::simulation::config::{SandboxNetwork, SimulationConfig};
 use crate::simulation::process::{ExitReason, Ran, Run, RunError};
 
-/// What every sandbox of this server has in common.
+/// The common part of all sandboxes of this server.
 #[derive(Debug)]
 pub struct Sandbox {
     bubblewrap: PathBuf,
     user: u32,
     homes: Vec<PathBuf>,
     mounts: Vec<Mount>,
-    /// Whether programs inside can be kept from making user namespaces, which bubblewrap can from 0.8 on.
+    /// Whether programs inside can be kept from creating user namespaces, which bubblewrap supports since 0.8.
     ends_namespaces: bool,
     /// What gives it a network of its own, if it has one.
     network: Option<OwnNetwork>,
@@ -45,9 +45,9 @@ const NAMES_RUN: [&str; 4] =
 const SYSTEM_RUN: [&str; 4] = ["/run/udev", "/run/nvidia-persistenced", "/run/opengl-driver", "/run/current-system"];
 /// Graphics cards; also all in `/dev` that begins with `nvidia`.
 const DEVICES: [&str; 2] = ["/dev/dri", "/dev/kfd"];
-/// How long it may take to try whether a sandbox can be made.
+/// Timeout of the trial whether a sandbox works.
 const TRIAL: Duration = Duration::from_secs(5);
-/// Where nothing of bubblewrap works: what may be done about it.
+/// What an administrator can do if bubblewrap does not work.
 const REMEDY: &str = "user namespaces must be allowed (sysctl user.max_user_namespaces, \
                       kernel.unprivileged_userns_clone, kernel.apparmor_restrict_unprivileged_userns), and /proc not be \
                       covered as in a container";
@@ -60,7 +60,7 @@ impl Sandbox {
     /// Prepares sandboxes for a server with this configuration.
     ///
     /// # Errors
-    /// When bubblewrap is not there, in words for an administrator.
+    /// When bubblewrap is not installed, as text for an administrator.
     pub fn new(config: &SimulationConfig) -> Result<Self, String> {
         let bubblewrap = which("bwrap").map_err(|_| {
             "bubblewrap (bwrap) is not there; on Debian, Ubuntu and Fedora the package bubblewrap has it".to_owned()
@@ -73,7 +73,7 @@ impl Sandbox {
         mounts.extend(readable.map(|at| Mount { at, content: MountKind::ReadOnly }));
         let writable = config.sandbox.writable.iter().filter_map(|path| shown(&path.0));
         mounts.extend(writable.map(|at| Mount { at: at.clone(), content: MountKind::ReadWrite(at) }));
-        // Last, for nothing makes up for these.
+        // Last, so that nothing overrides these.
         let homes = homes();
         mounts.extend(hidden(config, &homes));
         mounts.retain(|mount| mount.at.exists());
@@ -81,10 +81,11 @@ impl Sandbox {
         Ok(Self { bubblewrap, user, homes, mounts, ends_namespaces: true, network: None, shared_memory })
     }
 
-    /// The command that runs a program in a sandbox of its own. Makes the folders that it needs in the instance's folder.
+    /// The prefix of the command that runs a program in a sandbox of its own. Creates the directories that it needs in
+    /// the instance's directory.
     ///
     /// # Errors
-    /// When a folder can't be made.
+    /// When a directory can't be created.
     pub fn command(&self, program: &Program<'_>) -> io::Result<Vec<OsString>> {
         let mut command = self.network.as_ref().map_or_else(|| Ok(Vec::new()), |network| network.command(program))?;
         let filter = program.instance.join("system-calls");
@@ -107,14 +108,14 @@ impl Sandbox {
             command.extend(["--uid".into(), user.into(), "--gid".into(), group.into()]);
         }
         command.extend(["--ro-bind", "/", "/", "--dev", "/dev", "--proc", "/proc"].map(Into::into));
-        // The kernel lets root write there without any capability.
+        // The kernel lets root write there without capabilities.
         command.extend(["--ro-bind-try", "/proc/sys", "/proc/sys"].map(Into::into));
         for device in devices() {
             command.extend(["--dev-bind-try".into(), device.clone().into(), device.into()]);
         }
         let mut mounts = self.own(program)?;
         mounts.extend(self.mounts.iter().cloned());
-        // Sorting keeps the order of equals: of two at the same place the last one counts.
+        // The sort is stable: of two mounts at the same path the last one counts.
         mounts.sort_by_key(|mount| mount.at.components().count());
         // What is empty is memory, and stays empty; so does the rest of `/dev`.
         let closed = empty(&mounts);
@@ -145,7 +146,7 @@ impl Sandbox {
         own.push(Mount { at: self.runtime_folder(), content: MountKind::ReadWrite(run) });
         own.extend(self.homes.iter().map(|at| Mount { at: at.clone(), content: MountKind::ReadWrite(home.clone()) }));
         own.push(Mount { at: program.project.clone(), content: MountKind::ReadWrite(program.project.clone()) });
-        // A link is looked up in the sandbox, where it may lead to what is not there.
+        // The sandbox resolves symlinks inside, where their targets may not exist.
         let files = program.command.first().map(PathBuf::from).into_iter().chain(self.display_files(program));
         let files = files.filter_map(|file| file.canonicalize().ok());
         own.extend(files.map(|at| Mount { at, content: MountKind::ReadOnly }));
@@ -167,7 +168,7 @@ impl Sandbox {
         socket.into_iter().chain(authority.or_else(usual)).collect()
     }
 
-    /// Variables that are different in a sandbox. Shared memory with the display is out of reach.
+    /// Variables that differ in a sandbox. Shared memory with the display is not available.
     pub fn environment(&self) -> Vec<(OsString, OsString)> {
         let home = self.homes.first().map_or_else(|| "/tmp".into(), Clone::clone);
         vec![
@@ -182,13 +183,13 @@ impl Sandbox {
         PathBuf::from(format!("/run/user/{}", self.user))
     }
 
-    /// Tries whether a sandbox can be made here. Blocks for five seconds at most.
+    /// Tries whether a sandbox works here. Blocks for ten seconds at most.
     ///
     /// # Errors
-    /// Why not, and what to do about it, in words for an administrator.
+    /// Why not, and what to do about it, as text for an administrator.
     pub fn tried(mut self) -> Result<Self, String> {
         let mut tried = self.trial();
-        // One that does not end will not without these options.
+        // A trial that hangs would also hang without these options.
         if tried.as_ref().is_err_and(|error| error.kind() != io::ErrorKind::TimedOut) {
             self.ends_namespaces = false;
             tried = self.trial();
@@ -223,7 +224,7 @@ impl Sandbox {
         self.ends_namespaces
     }
 
-    /// Runs a program that does nothing in a sandbox that has everything.
+    /// Runs `true` in a sandbox with all mounts.
     fn trial(&self) -> io::Result<()> {
         let instance = tempfile::tempdir()?;
         let project = instance.path().join("project");
@@ -251,7 +252,7 @@ impl Sandbox {
     }
 }
 
-/// The homes of the server's user: the one that the environment names, and the one that the system knows.
+/// The home directories of the server's user: `HOME`, and the one in the user database.
 fn homes() -> Vec<PathBuf> {
     let named = std::env::var_os("HOME").map(PathBuf::from);
     let known = nix::unistd::User::from_uid(nix::unistd::getuid()).ok().flatten().map(|user| user.dir);
@@ -265,7 +266,7 @@ fn homes() -> Vec<PathBuf> {
     homes
 }
 
-/// The folders for temporary files of the system and of this server, without links.
+/// The directories for temporary files of the system and of this server, without symlinks.
 fn temporary_folders() -> impl Iterator<Item = PathBuf> {
     let all = ["/tmp".into(), "/var/tmp".into(), std::env::temp_dir()];
     let real = all.into_iter().filter_map(|folder: PathBuf| folder.canonicalize().ok());

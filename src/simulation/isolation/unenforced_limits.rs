@@ -1,20 +1,20 @@
-//! What the configuration promises of simulations and this machine can't keep, in words for an administrator.
+//! The configured limits that this machine can't enforce, as text for an administrator.
 
 use super::cgroup::Controllers;
 use crate::simulation::config::ResourceLimits;
 
-/// What a level has on this machine.
+/// The means of enforcement on this machine.
 #[derive(Debug)]
 pub struct Enforcement {
-    /// Whether there is a program that sets the kernel's limits.
+    /// Whether `prlimit` is installed, which sets the kernel's limits.
     pub has_prlimit: bool,
-    /// Whether simulations run in sandboxes that can't be kept from making user namespaces.
+    /// Whether programs in sandboxes can create user namespaces.
     pub leaves_namespaces: bool,
-    /// What control groups limit.
+    /// The controllers of control groups.
     pub controllers: Controllers,
 }
 
-/// The limits that can't be kept, a line each.
+/// The limits that can't be enforced, one line each.
 pub fn unenforced_limits(means: &Enforcement, limits: &ResourceLimits) -> Vec<String> {
     let mut lines = Vec::new();
     if !means.has_prlimit {

@@ -29,53 +29,53 @@ use crate::simulation::process::PortFinder;
 use crate::simulation::process::listeners::{Listener, listeners};
 use crate::simulation::process::process_tree::{sockets, tree};
 
-/// Watches over simulations. Its threads end when the last clone is dropped.
+/// Monitors simulations. Its threads end when the last clone is dropped.
 #[derive(Debug, Clone)]
 pub struct Watcher {
     watches: Sender<Watched>,
     ports: PortFinder,
 }
 
-/// What is watched of one simulation.
+/// What is monitored of one simulation.
 #[derive(Debug)]
 pub struct Watch {
-    /// The process from which all of it descends.
+    /// The root of its process tree.
     pub root: i32,
-    /// The folder of the instance.
+    /// The directory of the instance.
     pub folder: PathBuf,
-    /// How much it may write into that folder, in MiB.
+    /// Limit of what it may write into that directory, in MiB.
     pub disk: u64,
-    /// How many processes and threads it may have; `None` if the kernel refuses more.
+    /// Limit of its processes and threads; `None` if the kernel enforces it.
     pub processes: Option<MostProcesses>,
-    /// The port that it was given; `None` if it has a network of its own.
+    /// Its port; `None` if it has a network of its own.
     pub port: Option<u16>,
     /// Hears what it has taken; `None` if its control group knows.
     pub peak: Option<Arc<Peak>>,
 }
 
-/// A limit of processes that the kernel does not keep.
+/// A limit of processes that the kernel does not enforce.
 #[derive(Debug, Clone, Copy)]
 pub struct MostProcesses {
-    /// The limit.
+    /// The limit of the simulation's own processes and threads.
     pub limit: u64,
-    /// How many of the tree's processes run the simulation and are none of its own.
+    /// Number of the tree's processes that run the simulation, and do not count.
     pub runners: u64,
 }
 
-/// A simulation that is watched, and what is known of it.
+/// A monitored simulation, and its state.
 #[derive(Debug)]
 struct Watched {
     watch: Watch,
-    /// Who waits to hear that it takes too much.
+    /// Receives the message when it exceeds a limit.
     excess: oneshot::Sender<String>,
     disk: DiskUse,
 }
 
 /// The shortest time between two ticks.
 const SHORTEST: Duration = Duration::from_secs(1);
-/// The longest: a simulation that makes ticks slow gains no more than this.
+/// The longest time between two ticks: a simulation that makes ticks slow gains no more than this.
 const LONGEST: Duration = Duration::from_secs(10);
-/// The pause after a tick is this many times as long as the processor time of the tick: 1 % of one core.
+/// The pause after a tick, as a multiple of its CPU time: 1 % of one core.
 const PAUSE: u32 = 99;
 /// How much processor time a tick may take for folders. What is left is counted in the next one.
 const FOLDERS: Duration = Duration::from_millis(100);
@@ -88,7 +88,7 @@ const COUNTS_AT_RESERVE: Duration = Duration::from_millis(300);
 const FORGET: Duration = Duration::from_secs(30);
 
 impl Watcher {
-    /// Starts the threads. `run` is the folder with the folders of all instances.
+    /// Starts the threads. `run` is the directory with the directories of all instances.
     ///
     /// # Errors
     /// When the system can't start a thread.
@@ -96,7 +96,7 @@ impl Watcher {
         let (watches, receiver) = channel();
         let ports = config.streaming_ports();
         let last = *SimulationConfig::ports_from(*ports.end()).end();
-        // Where the system does not tell, no simulation would become ready.
+        // Without `sock_diag`, no simulation would become ready.
         listeners(&ports)?;
         let finder = PortFinder::start(*ports.start()..=last)?;
         let disk = Disk::new(run, config.disk_reserve);
@@ -106,14 +106,14 @@ impl Watcher {
         Ok(Self { watches, ports: finder })
     }
 
-    /// Waits until a process that descends from `root` listens on the port that it was given, or on one that Webots takes in
-    /// its place, and returns the port. Never returns if there is none.
+    /// Waits until a process that descends from `root` listens on the port `given`, or on one that Webots takes
+    /// instead, and returns the port. Never returns if there is none.
     pub async fn listening_port(&self, root: i32, given: u16) -> u16 {
         self.ports.find(root, SimulationConfig::ports_from(given)).await
     }
 
-    /// Waits until a simulation takes more than it may, and returns what, in words for its client. Dropping the future ends
-    /// the watch.
+    /// Waits until a simulation exceeds a limit. Returns the message for its client. Dropping the future ends the
+    /// monitoring.
     pub async fn until_too_much(&self, watch: Watch) -> String {
         let (excess, told) = oneshot::channel();
         let disk = DiskUse::new(watch.root, watch.folder.clone(), watch.disk);
@@ -126,15 +126,15 @@ impl Watcher {
     }
 }
 
-/// All simulations that are watched.
+/// All monitored simulations.
 struct Table {
     disk: Disk,
     ports: RangeInclusive<u16>,
     usage: UsageMonitor,
     all: Vec<Watched>,
-    /// Whose each listener is: the root of a simulation's tree, `None` for somebody else's.
+    /// The owner of each listener, by inode: the root of a simulation's tree, `None` for another program.
     owners: HashMap<u64, Option<i32>>,
-    /// When those of somebody else were forgotten last.
+    /// When the listeners of other programs were last dropped from `owners`.
     forgotten: Instant,
 }
 
@@ -198,7 +198,7 @@ impl Table {
         let mut excesses = self.count_folders(begin);
         excesses.extend(self.count_processes());
         if self.all.iter().any(|one| one.watch.port.is_some()) {
-            // An error is logged by those who start.
+            // The port finder logs errors.
             excesses.extend(listeners(&self.ports).map(|all| self.look_at_ports(&all)).unwrap_or_default());
         }
         self.end(excesses);
@@ -269,7 +269,7 @@ impl Table {
         too_many.map(|(root, ports)| (root, told(ports))).collect()
     }
 
-    /// Finds out whose the listeners are that were not there before: mostly of the simulation that was given the port.
+    /// Determines the owners of new listeners: mostly the simulation with that port.
     fn find_owners(&mut self, all: &[Listener]) {
         let there: HashSet<u64> = all.iter().map(|one| one.inode).collect();
         // `/proc` may leave out a child while others come and go: its listener would be taken for somebody else's for good.
@@ -298,7 +298,7 @@ fn processor_time() -> Duration {
     clock_gettime(ClockId::CLOCK_THREAD_CPUTIME_ID).map(Duration::from).unwrap_or_default()
 }
 
-/// How long to wait after a tick that took so much processor time.
+/// The pause after a tick with this CPU time.
 fn pause_after(tick: Duration) -> Duration {
     (tick * PAUSE).clamp(SHORTEST, LONGEST)
 }

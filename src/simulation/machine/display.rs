@@ -10,9 +10,9 @@ use x11rb::protocol::xproto::ConnectionExt;
 use x11rb::reexports::x11rb_protocol::parse_display::parse_display;
 use x11rb::rust_connection::RustConnection;
 
-/// How long a display may take to answer.
+/// Timeout of a display's answer.
 const ANSWER: Duration = Duration::from_secs(2);
-/// The port of display 0 is 6000; those of the others follow.
+/// The highest display number: display N listens on port 6000 + N.
 const LAST_NUMBER: u16 = u16::MAX - 6000;
 
 /// Why Webots can't open its window on a display.
@@ -21,31 +21,31 @@ pub enum DisplayError {
     /// The name of the display is malformed.
     #[error("{0:?} is no display; allowed is HOST:NUMBER or :NUMBER")]
     BadName(String),
-    /// No X server is there.
+    /// No X server listens there.
     #[error(
         "no display answers at {0}: start an X server there (without a monitor: Xvfb, or Xorg after nvidia-xconfig \
          --allow-empty-initial-configuration), or set xvfb: true in the server's configuration"
     )]
     NoServer(String),
-    /// There is one, but this user may not use it.
+    /// The X server refuses this user.
     #[error(
         "the display {display} refuses this user ({reason}): run 'xhost +si:localuser:{user}' as its owner, or let \
          the environment variable XAUTHORITY name its authority file"
     )]
     Refused {
-        /// The display.
+        /// The name of the display.
         display: String,
-        /// What the X server says.
+        /// The reason of the X server.
         reason: String,
-        /// Who asked.
+        /// The user of this server.
         user: String,
     },
-    /// What listens there is silent, or does not speak the X protocol.
+    /// The program that listens there does not answer, or does not use the X protocol.
     #[error("what is at {display} does not answer as a display does: {reason}")]
     Strange {
-        /// The display.
+        /// The name of the display.
         display: String,
-        /// What is wrong.
+        /// The problem.
         reason: String,
     },
 }
@@ -73,7 +73,7 @@ pub fn effective(configured: Option<&DisplayName>) -> String {
     configured.map(|display| display.0.clone()).or_else(of_environment).unwrap_or_else(|| ":0".to_owned())
 }
 
-/// The display that the environment variable `DISPLAY` names.
+/// The display in the environment variable `DISPLAY`.
 #[must_use]
 pub fn of_environment() -> Option<String> {
     std::env::var("DISPLAY").ok().filter(|display| !display.is_empty())

@@ -1,25 +1,25 @@
-//! The GPUs of the machine: those that answer, and whether some are lost. Pure; the time is passed in.
+//! The GPUs of the machine: those that answer, and whether some are lost. Pure; the caller passes the time.
 
 use std::time::{Duration, Instant};
 
 use super::sensors::{Gpu, GpuReading};
 
-/// How long a reading is used, and how long the GPUs may be silent.
+/// Time for which a reading is used, and timeout of silent GPUs.
 const SILENCE: Duration = Duration::from_secs(10);
 
 /// What is known of the GPUs.
 #[derive(Debug, Default)]
 pub(super) struct Gpus {
     reading: GpuReading,
-    /// When that was read.
+    /// The time of that reading.
     read: Option<Instant>,
-    /// How many have answered at once, at most, and when so many did last.
+    /// The largest number that have answered at once, and when that many last did.
     answered: Option<(Instant, usize)>,
     problem: Option<String>,
 }
 
 impl Gpus {
-    /// Takes in a reading.
+    /// Records a reading.
     pub(super) fn read(&mut self, now: Instant, reading: GpuReading) {
         if !reading.gpus.is_empty() {
             if self.answered.is_none() {
@@ -35,7 +35,7 @@ impl Gpus {
         self.reading = reading;
     }
 
-    /// Returns the GPUs that answer, and what is wrong if some did and don't any more. Logs what has changed.
+    /// Returns the GPUs that answer, and the problem if some have answered before and don't any more. Logs changes.
     pub(super) fn current(&mut self, now: Instant) -> (Vec<Gpu>, Option<String>) {
         let is_recent = |at: Instant| now.saturating_duration_since(at) <= SILENCE;
         if !self.read.is_some_and(is_recent) {

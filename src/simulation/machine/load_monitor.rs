@@ -1,8 +1,8 @@
 //! Actor: takes a sample of the machine each second, keeps ten minutes of them, and writes them to a CSV file.
 //!
 //! One for the whole server, created at start; it never ends. Two threads read the machine and the GPUs, so that a
-//! driver that hangs holds up nothing: readings of GPUs that are too old no longer count. Everybody else reads the
-//! newest [`Readings`] from a watch channel, which costs no wait.
+//! driver that hangs blocks nothing: readings of GPUs that are too old no longer count. All others read the newest
+//! [`Readings`] from a watch channel, without waiting.
 
 use std::collections::VecDeque;
 use std::io::Write;
@@ -19,13 +19,13 @@ use super::spread::Spread;
 use crate::shared::domain::Load;
 use crate::simulation::slots::{GetSnapshot, SlotPool};
 
-/// Time between two samples.
+/// Interval between two samples.
 const PERIOD: Duration = Duration::from_secs(1);
-/// How many samples the load is a mean of.
+/// Number of samples of which the load is the mean.
 const MEAN_OF: usize = 5;
-/// How many samples are kept: ten minutes.
+/// Number of samples that are kept: ten minutes.
 const KEPT: usize = 600;
-/// How long GPUs may be missing before the driver is opened again.
+/// Time without all GPUs after which the driver is opened again.
 const OPEN_AGAIN: Duration = Duration::from_secs(10);
 /// Lines of `monitor.csv` until it is renamed to `monitor.csv.1`: a day.
 const CSV_LINES: usize = 86_400;
@@ -53,11 +53,11 @@ const COLUMNS: [Column; 12] = [
 pub struct Readings {
     /// The mean of the last five seconds.
     pub load: Option<Load>,
-    /// What the machine is.
+    /// The machine's name, system and hardware.
     pub host: Host,
     /// The newest reading.
     pub machine: Machine,
-    /// The newest reading; empty without GPUs.
+    /// The newest readings of the GPUs; empty without GPUs.
     pub gpus: Vec<Gpu>,
     /// The GPU that counts for the load: the one that the next simulation gets.
     pub next_gpu: Option<Gpu>,
@@ -175,7 +175,7 @@ impl LoadMonitor {
         let first = self.csv_lines.is_multiple_of(CSV_LINES);
         let put_aside = first && self.csv_lines > 0;
         self.csv_lines += 1;
-        // Where the disk is full, the lines are lost and nothing else.
+        // On a full disk, only these lines are lost.
         drop(actix_rt::task::spawn_blocking(move || append(&path, &sample, first, put_aside)));
     }
 }
@@ -225,8 +225,8 @@ impl Actor for LoadMonitor {
     }
 }
 
-/// Opens the driver and reads the GPUs, on a thread that the runtime does not wait for: both may hang. A driver that is not
-/// there, or has lost a GPU, is opened again after a while: it may have been loaded since then.
+/// Opens the driver and reads the GPUs, on a thread that the runtime does not wait for: both may hang. A driver that is
+/// missing, or has lost a GPU, is opened again after a while: it may have been loaded since then.
 fn read_gpus(actor: Recipient<GpusRead>) {
     let reading = std::thread::Builder::new().name("gpus".to_owned()).spawn(move || {
         let (mut most, mut told) = (1, false);
@@ -247,14 +247,14 @@ fn read_gpus(actor: Recipient<GpusRead>) {
     }
 }
 
-/// Reads the GPUs each second until fewer than the most that have answered do so for a while, or the actor is gone.
+/// Reads the GPUs each second until some have been missing for a while, or the actor has stopped.
 fn read_until_missing(actor: &Recipient<GpusRead>, sensor: &GpuSensor, most: &mut usize) {
     let mut complete = Instant::now();
     while complete.elapsed() < OPEN_AGAIN {
         let reading = sensor.read();
         *most = reading.gpus.len().max(*most);
         complete = if reading.lost == 0 && reading.gpus.len() == *most { Instant::now() } else { complete };
-        // A full mailbox costs one reading.
+        // A full mailbox drops this reading.
         if let Err(SendError::Closed(_)) = actor.try_send(GpusRead(reading)) {
             return;
         }
@@ -262,14 +262,14 @@ fn read_until_missing(actor: &Recipient<GpusRead>, sensor: &GpuSensor, most: &mu
     }
 }
 
-/// Reads a sensor on a thread of its own, for as long as the actor takes the readings.
+/// Reads a sensor on a thread of its own, until the actor has stopped.
 fn read_each_period<M>(actor: Recipient<M>, mut read: impl FnMut() -> M + Send + 'static)
 where
     M: Message<Result = ()> + Send + 'static,
 {
     let reading = std::thread::Builder::new().name("sensor".to_owned()).spawn(move || {
         loop {
-            // A full mailbox costs one reading.
+            // A full mailbox drops this reading.
             if let Err(SendError::Closed(_)) = actor.try_send(read()) {
                 return;
             }

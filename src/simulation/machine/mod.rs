@@ -1,4 +1,4 @@
-//! The machine: CPU, memory, disk, network, GPUs and display, and the load that is made of them.
+//! The machine: CPU, memory, disk, network, GPUs and display, and its load.
 
 pub mod display;
 mod gpus;

@@ -25,7 +25,7 @@ pub struct Machine {
     pub memory: f64,
     /// Percent in use; 0 without swap.
     pub swap: f64,
-    /// Percent in use of the disk that holds the cache, as `df` tells it.
+    /// Percent in use of the disk with the cache, as `df` reports it.
     pub disk: f64,
     /// MB per second, all interfaces but the loopback.
     pub network_sent: f64,
@@ -59,7 +59,7 @@ pub struct Gpu {
 pub struct GpuReading {
     /// Those that answer.
     pub gpus: Vec<Gpu>,
-    /// How many the driver has lost: they have fallen off their bus.
+    /// Number of GPUs that the driver has lost: they have fallen off their bus.
     pub lost: usize,
 }
 
@@ -90,7 +90,7 @@ pub fn least_busy<'gpus>(machine: &Machine, gpus: &'gpus [Gpu]) -> Option<&'gpus
     gpus.iter().min_by(|one, other| load_with(machine, one).total_cmp(&load_with(machine, other)))
 }
 
-/// Which reading the load comes from, in words.
+/// The reading that determines the load, as text.
 #[must_use]
 pub fn busiest(machine: &Machine, gpu: Option<&Gpu>) -> &'static str {
     let total = load(machine, gpu).percent();
@@ -110,7 +110,7 @@ pub fn busiest(machine: &Machine, gpu: Option<&Gpu>) -> &'static str {
 #[derive(Debug, Clone, Default, Serialize)]
 #[serde(rename_all = "camelCase")]
 pub struct Host {
-    /// Its name.
+    /// Its host name.
     pub name: String,
     /// Operating system and version.
     pub system: String,
@@ -135,7 +135,7 @@ pub struct MachineSensor {
 }
 
 impl MachineSensor {
-    /// Prepares readings; `disk` is a folder on the disk that is watched.
+    /// Prepares readings; `disk` is a directory on the disk that is monitored.
     ///
     /// # Errors
     /// When the system does not give the readings.
@@ -151,7 +151,7 @@ impl MachineSensor {
         })
     }
 
-    /// What the machine is.
+    /// The machine's name, system and hardware.
     #[must_use]
     pub fn host(&self) -> Host {
         let cpu = self.system.cpus().first().map(|cpu| cpu.brand().trim().to_owned()).unwrap_or_default();
@@ -186,8 +186,8 @@ impl MachineSensor {
     }
 }
 
-/// Percent in use of the disk that holds a folder, as `df` tells it: of what users can have, without the blocks that are
-/// reserved for root. 0 where the folder is not there.
+/// Percent in use of a directory's disk, as `df` reports it: of the space for users, without the blocks that are
+/// reserved for root. 0 if the directory does not exist.
 fn disk_use(folder: &Path) -> f64 {
     statvfs(folder).map_or(0.0, |disk| {
         let used = disk.blocks().saturating_sub(disk.blocks_free());
@@ -214,9 +214,9 @@ impl GpuSensor {
     /// Loads NVIDIA's library.
     ///
     /// # Errors
-    /// When it is not there or finds no driver: then there is no GPU to read.
+    /// When it is not installed or finds no driver: then there is no GPU to read.
     pub fn open() -> Result<Self, NvmlError> {
-        // The driver installs the name with the version; the other one comes with the development package only.
+        // The driver installs the name with the version; only the development package installs the other one.
         let versioned = Nvml::builder().lib_path(std::ffi::OsStr::new("libnvidia-ml.so.1")).init();
         Ok(Self { nvml: versioned.or_else(|_| Nvml::init())? })
     }
@@ -284,7 +284,7 @@ mod tests {
         let told = String::from_utf8(output.stdout).unwrap();
         let told: f64 = told.lines().nth(1).unwrap().trim().trim_end_matches('%').parse().unwrap();
         let own = disk_use(Path::new("/tmp"));
-        // df rounds up, and others write meanwhile.
+        // df rounds up, and other programs write in between.
         assert!((told - 1.5..=told + 0.5).contains(&own), "{own} where df says {told}");
     }
 

@@ -1,7 +1,7 @@
-//! CPU and memory of each simulation: from its control group, otherwise from its process tree, or from what only its level of
-//! isolation knows.
+//! CPU and memory of each simulation: from its control group, otherwise from its process tree, or from a source of its
+//! isolation level.
 //!
-//! One pass over `/proc` serves all simulations and all that ask, at most once in 1.8 s, and only when somebody asks.
+//! One pass over `/proc` serves all simulations and all callers, at most once in 1.8 s, and only on demand.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
 use std::path::{Path, PathBuf};
@@ -14,47 +14,47 @@ use procfs::process::{Stat, all_processes};
 /// The processes of a simulation.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Tree {
-    /// The process from which all of them descend.
+    /// The root of the process tree.
     pub root: i32,
-    /// The folder of their control group, if they have one.
+    /// The directory of their control group, if they have one.
     pub cgroup: Option<PathBuf>,
 }
 
-/// What the processes of a simulation take.
+/// The resource usage of a simulation's processes.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Usage {
-    /// Percent of one core, the mean since the reading before; `None` at the first.
+    /// Percent of one core, as a mean since the last reading; `None` at the first.
     pub cpu: Option<f64>,
-    /// Memory in bytes: what their control group is charged for, or what is resident, where what processes share counts
-    /// for each.
+    /// Memory in bytes: what their control group is charged for, or the resident memory, in which memory that processes
+    /// share counts for each.
     pub memory: u64,
-    /// How many processes and threads there are.
+    /// Number of processes and threads.
     pub threads: u64,
-    /// Processor time until now, that of processes which were waited for included; zero where Docker tells of it.
+    /// CPU time so far, including child processes that have exited; zero if Docker reports the usage.
     pub time: Duration,
 }
 
 /// Readings of process trees, by the process at the root.
 pub type Usages = BTreeMap<i32, Usage>;
 
-/// Reads process trees for whoever asks.
+/// Reads process trees on demand.
 #[derive(Debug, Clone, Default)]
 pub struct UsageMonitor(Arc<Mutex<Readings>>);
 
 #[derive(Debug, Default)]
 struct Readings {
     read: Option<Instant>,
-    /// The trees that were asked for then. Some may have no reading.
+    /// The trees of that reading. Some may have no usage.
     roots: BTreeSet<i32>,
-    /// The processor time of each tree.
+    /// The CPU time of each tree.
     times: HashMap<i32, Duration>,
     usages: Usages,
 }
 
-/// What processes have taken until now.
+/// The total usage of processes so far.
 #[derive(Debug, Default, Clone, Copy, PartialEq, Eq)]
 pub struct Sum {
-    /// Processor time.
+    /// CPU time.
     pub time: Duration,
     /// Memory in bytes.
     pub memory: u64,
@@ -65,13 +65,13 @@ pub struct Sum {
 /// A reading of a simulation.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Measured {
-    /// What it has taken until now.
+    /// Its total usage so far.
     Sum(Sum),
-    /// What it takes, of which another program has taken the mean.
+    /// Its current usage, as another program has computed it.
     Usage(Usage),
 }
 
-/// How long a reading is cached.
+/// Time for which a reading is cached.
 const AGE: Duration = Duration::from_millis(1800);
 
 impl Tree {
@@ -89,7 +89,7 @@ impl UsageMonitor {
         self.read_by(&trees.iter().map(|tree| tree.root).collect::<Vec<_>>(), || sums_of(trees))
     }
 
-    /// The same for simulations whose processes only `measure` finds. It is called when the last reading is too old.
+    /// The same for simulations whose processes only `measure` finds. It is called if the last reading is too old.
     #[must_use]
     pub fn read_by(&self, roots: &[i32], measure: impl FnOnce() -> Vec<(i32, Measured)>) -> Usages {
         if roots.is_empty() {
@@ -111,7 +111,7 @@ impl Readings {
         let before = std::mem::take(&mut self.times);
         self.usages.clear();
         let all = measure();
-        // It may have taken longer than its result is kept, where Docker hangs.
+        // If Docker hangs, this may have taken longer than a reading is cached.
         let passed = self.read.map(|read| read.elapsed());
         self.read = Some(Instant::now());
         for (root, measured) in all {
@@ -141,7 +141,7 @@ fn sums_of(trees: &[Tree]) -> Vec<(i32, Measured)> {
     sums.collect()
 }
 
-/// What a control group of version 2 has taken; `None` if the kernel does not count all of it there.
+/// The usage of a cgroup v2; `None` if the kernel does not count all of it there.
 #[must_use]
 pub fn cgroup_sum(folder: &Path) -> Option<Sum> {
     let number = |file: &str| std::fs::read_to_string(folder.join(file)).ok()?.trim().parse().ok();
@@ -163,12 +163,12 @@ fn all_by_parent() -> HashMap<i32, Vec<Stat>> {
     below
 }
 
-/// What a process, its group and all that descends from it have taken.
+/// The usage of a process, its group and all its descendants.
 fn tree_sum(root: i32, below: &HashMap<i32, Vec<Stat>>) -> Sum {
     let (mut seen, mut open, mut sum) = (HashSet::new(), vec![root], Sum::default());
     while let Some(pid) = open.pop() {
         for stat in below.get(&pid).into_iter().flatten().filter(|stat| seen.insert(stat.pid)) {
-            // Children that were waited for count for their parent: a program that starts others one by one is busy, too.
+            // Children that have exited count for their parent: a program that starts others one by one is busy, too.
             let waited = u64::try_from(stat.cutime.saturating_add(stat.cstime)).unwrap_or_default();
             sum.time += Duration::from_secs(stat.utime + stat.stime + waited) / ticks_per_second();
             sum.memory += stat.rss * procfs::page_size();
@@ -189,7 +189,7 @@ mod tests {
 
     use super::*;
 
-    /// A tree of its own: the children of other tests come and go below this process.
+    /// A tree of its own: the children of other tests start and exit below this process.
     #[test]
     fn a_busy_process_group_is_seen() {
         let mut leader = std::process::Command::new("sh");
@@ -199,7 +199,7 @@ mod tests {
         let first = monitor.read(&[Tree::of(root)])[&root];
         assert_eq!((first.cpu, first.threads), (None, 1), "nothing to compare with");
         let deadline = Instant::now() + Duration::from_mins(1);
-        // A process that has just begun may be told to have no memory: the kernel counts it in batches.
+        // A process that has just started may be reported without memory: the kernel counts it in batches.
         while !matches!(monitor.read(&[Tree::of(root)])[&root], Usage { cpu: Some(5.0..), memory: 10_000.., .. }) {
             assert!(Instant::now() < deadline, "it takes nothing: {:?}", monitor.read(&[Tree::of(root)]));
             std::thread::sleep(Duration::from_millis(100));
@@ -221,7 +221,7 @@ mod tests {
         let begin = Instant::now();
         assert_eq!(read(&[1, 2]), (vec![1], 1));
         let again = read(&[1, 2]);
-        // A machine may stand still for longer than a reading is kept.
+        // A machine may be suspended for longer than a reading is cached.
         assert!(again == (vec![1], 1) || begin.elapsed() >= AGE, "{again:?}");
         assert_eq!(read(&[1, 2, 3]).1, again.1 + 1, "a new simulation is read at once");
     }

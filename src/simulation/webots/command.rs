@@ -6,16 +6,16 @@ use std::time::Duration;
 
 use crate::simulation::protocol::Mode;
 
-/// What decides Webots' command line.
+/// The parameters of Webots' command line.
 #[derive(Debug, Clone)]
 pub struct WebotsCommand<'path> {
-    /// Webots' launcher, or what stands in for it.
+    /// Webots' launcher, or its replacement.
     pub program: &'path Path,
     /// How the simulation is shown.
     pub mode: Mode,
     /// The port to stream on.
     pub port: u16,
-    /// The period of its heartbeat.
+    /// The interval of its heartbeat.
     pub heartbeat: Duration,
     /// The world file.
     pub world: &'path Path,
@@ -24,7 +24,7 @@ pub struct WebotsCommand<'path> {
 impl WebotsCommand<'_> {
     /// The program and its arguments.
     ///
-    /// The 3D stream is asked for as plain `--stream`: `--stream=x3d` is refused by R2025a, `--stream=w3d` by R2023b.
+    /// The 3D stream is requested as plain `--stream`: R2025a rejects `--stream=x3d`, R2023b rejects `--stream=w3d`.
     /// The MJPEG stream shows the window, which therefore must be neither minimized nor without rendering.
     #[must_use]
     pub fn to_arguments(&self) -> Vec<OsString> {

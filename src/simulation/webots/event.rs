@@ -1,4 +1,4 @@
-//! The events of a running Webots, for the actor of its web client.
+//! The events of a running Webots, for its session.
 
 use std::time::Instant;
 
@@ -11,9 +11,9 @@ use crate::simulation::sessions::Token;
 #[derive(Message, Debug, Clone, PartialEq, Eq)]
 #[rtype(result = "()")]
 pub enum WebotsEvent {
-    /// What has to be done before it starts is under way; in words.
+    /// A step of its preparation, as text.
     Progress(String),
-    /// A text of the protocol that its project asks for, as it is.
+    /// A text of the protocol that its project requests, unchanged.
     Text(String),
     /// Its process was started.
     Started,
@@ -21,7 +21,7 @@ pub enum WebotsEvent {
     Listening(u16, Token),
     /// It has sent a heartbeat.
     Heartbeat,
-    /// It has sent no heartbeat for so many seconds.
+    /// It has sent no heartbeat for this many seconds.
     Hanging(u64),
     /// It is paused, and ends then for that; or it does not end for that any more.
     IdleEnd(Option<Instant>),
@@ -29,27 +29,27 @@ pub enum WebotsEvent {
     Exited(WebotsExit),
 }
 
-/// Why a Webots has ended.
+/// Why a Webots has exited.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct WebotsExit {
-    /// Whether it ended by itself and in order.
+    /// Whether it exited by itself, without an error.
     pub clean: bool,
-    /// Whether it is this server's fault, so that another one may take the client: Docker has failed or stopped, or Webots
-    /// has ended before it listened, which it does before it loads its world.
+    /// Whether this server is the cause, so that another one may accept the client: Docker has failed or stopped, or
+    /// Webots has exited before it listened, which it does before it loads its world.
     pub own: bool,
-    /// In words, for the client.
+    /// The reason, as text for the client.
     pub why: String,
 }
 
 impl WebotsExit {
-    /// The end of a Webots that has ended by itself and in order.
+    /// The exit of a Webots by itself, without an error.
     #[must_use]
     pub fn clean() -> Self {
         Self { clean: true, own: false, why: "Webots has ended".to_owned() }
     }
 }
 
-/// What has ended a container, in words for the client.
+/// The cause of a container's end, as text for the client.
 #[must_use]
 pub fn words(cause: Cause) -> &'static str {
     match cause {
@@ -59,7 +59,7 @@ pub fn words(cause: Cause) -> &'static str {
     }
 }
 
-/// Sends a client the events of its Webots. The exit is sent in any case, also where the actor panics and is dropped.
+/// Sends a session the events of its Webots. The exit is always sent, also if the actor panics and is dropped.
 pub struct ExitNotifier {
     events: Recipient<WebotsEvent>,
     exit_told: bool,
@@ -75,7 +75,7 @@ impl ExitNotifier {
     /// Sends an event.
     pub fn tell(&mut self, event: WebotsEvent) {
         self.exit_told |= matches!(event, WebotsEvent::Exited(_));
-        // A heartbeat may be lost where a client can't keep up; how to reach Webots and its end may not.
+        // A full mailbox may drop progress and heartbeats, but not the URL of Webots and its exit.
         let may_be_lost = matches!(event, WebotsEvent::Progress(_) | WebotsEvent::Heartbeat | WebotsEvent::Hanging(_));
         if !may_be_lost {
             self.events.do_send(event);

@@ -27,17 +27,17 @@ use crate::simulation::streams::{Registration, Streams, Watched};
 pub struct LaunchSpec {
     /// The server's configuration.
     pub config: Arc<SimulationConfig>,
-    /// Makes the containers in which it runs, where it does.
+    /// Creates its containers; `None` if it does not run in containers.
     pub containers: Option<Arc<ContainerService>>,
-    /// How simulations are launched.
+    /// Launches simulations.
     pub launcher: Arc<Launcher>,
-    /// Watches over what it takes.
+    /// Monitors its limits.
     pub watcher: Watcher,
     /// The program to start.
     pub program: PathBuf,
-    /// Where controllers are restored from.
+    /// Restores controllers.
     pub checkouts: Arc<CheckoutService>,
-    /// What was checked out.
+    /// The project that was checked out.
     pub project: Arc<Project>,
     /// How it is shown.
     pub mode: Mode,
@@ -54,7 +54,7 @@ pub struct LaunchSpec {
 }
 
 impl LaunchSpec {
-    /// The file that its output is kept in while it runs.
+    /// The file of its output while it runs.
     #[must_use]
     pub fn log_file(&self) -> PathBuf {
         let folder = self.config.log_dir.0.join("simulation").join(FOLDER_OF_RUNNING);
@@ -115,8 +115,8 @@ impl LaunchSpec {
         })
     }
 
-    /// Waits until the simulation whose processes descend from this one takes more than it may, and returns what, in words
-    /// for its client. `peak` hears what it takes.
+    /// Waits until the simulation with this root process exceeds a limit, and returns the message for its client.
+    /// `peak` records its usage.
     pub fn until_too_much(&self, root: i32, peak: Option<Arc<Peak>>) -> impl Future<Output = String> + use<> {
         let watch = Watch {
             root,
@@ -130,7 +130,7 @@ impl LaunchSpec {
         async move { watcher.until_too_much(watch).await }
     }
 
-    /// What the client of a Webots that did not become ready should know besides: of its isolation, and of its display.
+    /// Hints for the client of a Webots that did not become ready, about its isolation and its display.
     pub fn hint(&self) -> impl Future<Output = String> + use<> {
         let remark = self.launcher.remark();
         let has_own_display = self.config.xvfb || self.containers.is_some();

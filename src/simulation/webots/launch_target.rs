@@ -1,4 +1,4 @@
-//! What a Webots runs on: the machine with one of its displays, or containers.
+//! The target on which a Webots runs: the machine with one of its displays, or containers.
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -11,7 +11,7 @@ use super::virtual_display::{VirtualDisplay, write_authority};
 use crate::simulation::container::{Cause, ContainerRequest, ContainerService, SimulationContainers, StartError};
 use crate::simulation::isolation::{Display, IsolationLevel};
 
-/// What a Webots runs on.
+/// The target on which a Webots runs.
 #[derive(Debug)]
 pub enum LaunchTarget {
     /// The machine, with a display of Webots' own in its sandbox or the configured one.
@@ -22,7 +22,7 @@ pub enum LaunchTarget {
     ContainerService(Box<SimulationContainers>),
 }
 
-/// What has to be done before a Webots can start.
+/// The preparation of a Webots' start.
 #[derive(Debug)]
 pub enum Preparation {
     /// Nothing: it has the display with this name.
@@ -34,7 +34,7 @@ pub enum Preparation {
 }
 
 impl Preparation {
-    /// What has to be done for this Webots.
+    /// The preparation that this Webots needs.
     #[must_use]
     pub fn of(spec: &LaunchSpec) -> Self {
         match &spec.containers {
@@ -44,10 +44,10 @@ impl Preparation {
         }
     }
 
-    /// Does it. `progress` hears each step in words. Dropping the future gives up what was made.
+    /// Runs it. `progress` receives each step as text. Dropping the future discards what was created.
     ///
     /// # Errors
-    /// Whose fault it is that it can't be done.
+    /// Why it failed, and whether the project or this server is the cause.
     pub async fn run(self, progress: impl Fn(String) + Send + Sync) -> Result<LaunchTarget, StartError> {
         match self {
             Self::None(name) => Ok(LaunchTarget::Machine(Display::Outside(vec![("DISPLAY".into(), name.into())]))),
@@ -71,7 +71,7 @@ impl Preparation {
 }
 
 impl LaunchTarget {
-    /// Asks to start the controller of a competition's participant anew, where there is one.
+    /// Restarts the controller of a competition's participant; `None` if there is none.
     #[must_use]
     pub fn restart(&self) -> Option<Arc<Notify>> {
         match self {
@@ -80,7 +80,7 @@ impl LaunchTarget {
         }
     }
 
-    /// What the client should know of it.
+    /// The events for the client about it.
     #[must_use]
     pub fn news(&self) -> Vec<WebotsEvent> {
         let Self::ContainerService(containers) = self else { return Vec::new() };
@@ -88,7 +88,8 @@ impl LaunchTarget {
         warnings.chain(containers.texts.iter().cloned().map(WebotsEvent::Text)).collect()
     }
 
-    /// Ends what a Webots ran on, after its own end with this exit code. Returns what has ended it, if Docker knows.
+    /// Ends the target, after the Webots on it has ended with this exit code. Returns the cause of its end, if Docker
+    /// reports one.
     pub async fn end(self, code: Option<i32>) -> Option<Cause> {
         match self {
             Self::Machine(_) => None,

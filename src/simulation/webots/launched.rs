@@ -1,4 +1,4 @@
-//! Starts the process of a Webots, and waits until nothing of it is left.
+//! Starts the process of a Webots, and waits until its whole process tree has ended.
 
 use std::future::Future;
 use std::path::PathBuf;
@@ -22,11 +22,11 @@ use crate::simulation::process::{ExitReason, ProcessGroup};
 pub struct Launched {
     /// Its processes.
     pub group: ProcessGroup,
-    /// The folder of its control group, if it has one.
+    /// The directory of its control group, if it has one.
     pub cgroup: Option<PathBuf>,
     /// The last lines of its output.
     pub tail: Tail,
-    /// The file that its output is kept in.
+    /// The file of its output.
     pub log: Option<PathBuf>,
     /// Hears what it takes, where it has no control group of its own.
     pub peak: Option<Arc<Peak>>,
@@ -35,23 +35,23 @@ pub struct Launched {
 /// How a Webots has ended.
 #[derive(Debug)]
 pub struct End {
-    /// As its process tells.
+    /// The exit of its process.
     pub reason: ExitReason,
-    /// What else is known of it, if anything.
+    /// The cause, if control groups or Docker report one.
     pub cause: Option<Cause>,
-    /// What it has taken.
+    /// The resources that it has used.
     pub taken: Taken,
 }
 
-/// How many older files of its output are kept beside the newest.
+/// Number of rotated files of its output.
 const OLD_LOGS: usize = 1;
-/// How long the rest of an output may take to be read.
+/// Timeout of reading the rest of an output.
 const LAST_OUTPUT: Duration = Duration::from_secs(1);
 
-/// Starts a Webots on what was prepared for it. The future resolves when nothing of it is left.
+/// Starts a Webots on its target. The future resolves when its whole process tree has ended.
 ///
 /// # Errors
-/// When a process, a thread or a folder can't be made.
+/// When a process, a thread or a directory can't be created.
 pub fn launch<A>(
     spec: &LaunchSpec,
     runtime: LaunchTarget,
@@ -87,7 +87,7 @@ where
             Some(cgroup) => actix_rt::task::spawn_blocking(move || end_all(&cgroup)).await.unwrap_or_default(),
             None => (false, seen.map(|peak| peak.taken()).unwrap_or_default()),
         };
-        // What was printed last tells why. A process that nobody can end may keep the pipe open.
+        // The last output shows the cause. A process that can't be killed may keep the pipe open.
         actix_rt::time::timeout(LAST_OUTPUT, all_read).await.ok();
         End { reason, cause: in_container.or(on_machine.then_some(Cause::OutOfMemory)), taken }
     };

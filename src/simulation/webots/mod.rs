@@ -1,4 +1,4 @@
-//! A running Webots: its command line, its output, and the actor that watches over it.
+//! A running Webots: its command line, its output, and its actor.
 
 mod command;
 mod event;

@@ -1,7 +1,7 @@
-//! The output of a simulator: a few lines tell its state, all others are kept in a log.
+//! The output of a simulator: some lines show its state, all others are written to a log.
 //!
-//! A thread per simulator reads its output, so that neither a flood of it nor a slow disk holds up anybody else: a
-//! simulator that prints faster than this thread reads waits in its own write.
+//! A thread per simulator reads its output, so that neither a flood of it nor a slow disk delays others: a simulator
+//! that prints faster than this thread reads blocks in its own write.
 
 use std::collections::VecDeque;
 use std::io::{BufRead, BufReader, Write};
@@ -19,7 +19,7 @@ use crate::shared::run::RotatedFile;
 use crate::shared::text::one_line;
 use crate::simulation::container::RUNS;
 
-/// What a line of Webots' output tells of its state.
+/// The state that a line of Webots' output shows.
 #[derive(Message, Debug, Clone, Copy, PartialEq, Eq)]
 #[rtype(result = "()")]
 pub enum OutputEvent {
@@ -31,7 +31,7 @@ pub enum OutputEvent {
     Paused,
     /// `real-time`, `fast`, `step`: the simulation runs.
     Running,
-    /// `reset`: the simulation was set back to its beginning.
+    /// `reset`: the simulation was reset to its start.
     Reset,
 }
 
@@ -39,17 +39,17 @@ pub enum OutputEvent {
 #[derive(Debug, Clone, Default)]
 pub struct Tail(Arc<Mutex<VecDeque<String>>>);
 
-/// How many lines are kept.
+/// Number of lines that are kept.
 const LINES: usize = 20;
-/// Bytes that are kept of a line; what comes after it, up to the next line break, is dropped.
+/// Bytes that are kept of a line; the rest, up to the next line break, is dropped.
 const LINE_SIZE: usize = 1000;
-/// How much is read at once, in bytes. What follows waits for its pace.
+/// Size of a read, in bytes. The next read waits for its pace.
 const CHUNK: usize = 8 * 1024;
-/// Time between two events. Webots tells of its state every few seconds; a program that floods it waits.
+/// Shortest time between two events. Webots prints its state every few seconds; a program that floods it is blocked.
 const BETWEEN_EVENTS: Duration = Duration::from_millis(20);
 
 impl OutputEvent {
-    /// The meaning of a line, if it has one. All other lines are the simulation's own.
+    /// The event of a line; `None` for the simulation's own lines.
     #[must_use]
     pub fn parse(line: &str) -> Option<Self> {
         match line {
@@ -64,8 +64,8 @@ impl OutputEvent {
 }
 
 impl Tail {
-    /// The lines as the end of a sentence, for the client: Webots mostly says there what is wrong. Paths inside of the
-    /// project are those of its repository.
+    /// The lines as the end of a sentence, for the client: Webots usually prints there what is wrong. The path of the
+    /// project is removed.
     #[must_use]
     pub fn last_words(&self, project: &Path) -> String {
         let lines = self.0.lock();
@@ -85,11 +85,11 @@ impl Tail {
     }
 }
 
-/// Reads an output until its end: events go to `events`, other lines to the file and to the tail. Returns the tail, and
-/// a receiver that hears when the end was reached.
+/// Reads an output until its end: events are sent to `events`, other lines are written to the file and to the tail.
+/// Returns the tail, and a receiver that is notified at the end.
 ///
 /// # Errors
-/// When the thread can't be made.
+/// When the thread can't be created.
 pub fn follow<A>(
     output: PacedReader,
     mut file: Option<RotatedFile>,
@@ -113,19 +113,19 @@ where
                 told = Some(Instant::now());
             } else {
                 if let Some(file) = &mut file {
-                    // A full disk costs the lines, not the simulation.
+                    // On a full disk the lines are lost, and the simulation continues.
                     file.write_all(format!("{line}\n").as_bytes()).ok();
                 }
                 kept.push(line);
             }
         }
-        // The receiver may be gone.
+        // The receiver may have been dropped.
         end.send(()).ok();
     })?;
     Ok((tail, ended))
 }
 
-/// Sends an event. An actor that can't keep up makes the simulator wait, not the mailbox grow.
+/// Sends an event. If the actor can't keep up, the simulator blocks, and the mailbox does not grow.
 fn deliver<A>(events: &Addr<A>, event: OutputEvent)
 where
     A: Actor<Context: ToEnvelope<A, OutputEvent>> + Handler<OutputEvent>,
@@ -135,7 +135,7 @@ where
     }
 }
 
-/// The next line, cut to [`LINE_SIZE`] and made printable; nothing at the end of the output.
+/// The next line, cut to [`LINE_SIZE`] and made printable; `None` at the end of the output.
 fn next_line(reader: &mut impl BufRead) -> Option<String> {
     let mut line = Vec::new();
     loop {

@@ -1,29 +1,29 @@
-//! Reads an output no faster than its limit, so that a flood costs this server no more than a small part of a core.
+//! Reads an output no faster than its limit, so that a flood uses only a small part of a core.
 //!
-//! Who prints faster waits in its own write.
+//! A program that prints faster blocks in its own write.
 
 use std::io::{PipeReader, Read};
 use std::time::Duration;
 
-/// The reading end of a pipe, with its pace.
+/// The read end of a pipe, with a rate limit.
 #[derive(Debug)]
 pub struct PacedReader {
     output: PipeReader,
     /// In bytes per second.
     limit: u64,
-    /// What was read and not waited for, in bytes.
+    /// Bytes that were read without a pause for them.
     debt: u64,
 }
 
-/// What a line costs beside its length, in bytes: it is looked at, kept and written by itself.
+/// Cost of a line besides its length, in bytes: each line is parsed, kept and written separately.
 const LINE: u64 = 200;
-/// What a read costs beside its length, in bytes: who writes byte by byte has each read by itself.
+/// Cost of a read besides its length, in bytes: a program that writes byte by byte causes a read for each.
 const READ: u64 = 200;
-/// Bytes that are not waited for: ordinary output is read at once.
+/// Bytes without a pause: ordinary output is read at once.
 const FREE: u64 = 1024;
 
 impl PacedReader {
-    /// Reads a pipe at so many bytes per second at most.
+    /// Reads a pipe at this many bytes per second at most.
     #[must_use]
     pub fn new(output: PipeReader, limit: u64) -> Self {
         Self { output, limit: limit.max(1), debt: 0 }

@@ -1,11 +1,12 @@
-//! How a simulation has ended, from what is known of its Webots. Pure.
+//! The verdict on how a simulation has ended, from what is known of its Webots. Pure.
 
 use super::event;
 use super::launched::End;
 use crate::simulation::ends::EndReason;
 use crate::simulation::process::ExitReason;
 
-/// The kind of an end, and the end in words. `stopped` says why Webots was asked to end, `was_ready` whether it had listened.
+/// The kind of an end, and the reason as text. `stopped` is the reason for which Webots was stopped, `was_ready`
+/// whether it had listened.
 pub fn verdict(stopped: Option<(EndReason, String)>, end: &End, was_ready: bool) -> (EndReason, String) {
     if let Some(stopped) = stopped {
         return stopped;

@@ -1,7 +1,7 @@
 //! A virtual display (Xvfb) for one Webots that has no sandbox.
 //!
-//! Xvfb chooses a free display number by itself and prints it (`-displayfd`). Started so, it writes no lock file, and
-//! takes over the socket that a killed one has left in `/tmp/.X11-unix`: nothing has to be removed after it.
+//! Xvfb chooses a free display number by itself and prints it (`-displayfd`). In this mode it writes no lock file, and
+//! reuses the socket that a killed one has left in `/tmp/.X11-unix`: nothing has to be removed after it.
 
 use std::ffi::OsString;
 use std::fs::File;
@@ -26,20 +26,20 @@ pub struct VirtualDisplay {
     ended: JoinHandle<ExitReason>,
 }
 
-/// How long Xvfb may take to start.
+/// Timeout of Xvfb's start.
 const START: Duration = Duration::from_secs(10);
-/// How long Xvfb may take to end after SIGTERM.
+/// Time between SIGTERM and SIGKILL when Xvfb is ended.
 const GRACE: Duration = Duration::from_secs(1);
 /// In an authority file: the entry counts for every host. `FamilyWild` of X11/Xauth.h.
 const EVERY_HOST: u16 = 0xffff;
-/// The only kind of authorization that all clients know.
+/// The only authorization method that all clients support.
 const COOKIE: &[u8] = b"MIT-MAGIC-COOKIE-1";
 
 impl VirtualDisplay {
-    /// Starts Xvfb. It keeps its files in the instance's folder, whose mark it carries.
+    /// Starts Xvfb. Its files are in the instance's directory, whose mark it has.
     ///
     /// # Errors
-    /// When Xvfb can't be started, ends, or names no display within ten seconds.
+    /// When Xvfb can't be started, exits, or prints no display within ten seconds.
     pub async fn start(instance: &Path) -> std::io::Result<Self> {
         let (authority, log) = (write_authority(instance)?, instance.join("xvfb.log"));
         let (reader, output) = std::io::pipe()?;
@@ -62,13 +62,13 @@ impl VirtualDisplay {
         }
     }
 
-    /// The variables by which programs find the display.
+    /// The environment variables that name the display.
     #[must_use]
     pub fn environment(&self) -> Vec<(OsString, OsString)> {
         vec![("DISPLAY".into(), self.name.clone().into()), ("XAUTHORITY".into(), self.authority.clone().into())]
     }
 
-    /// Ends Xvfb. Returns when it has ended.
+    /// Stops Xvfb. Returns when it has exited.
     pub async fn stop(mut self) {
         self.group.terminate();
         self.ended.await.ok();
@@ -80,7 +80,7 @@ pub fn write_authority(instance: &Path) -> std::io::Result<PathBuf> {
     let path = instance.join("Xauthority");
     let cookie: [u8; 16] = rand::random();
     let mut entry = EVERY_HOST.to_be_bytes().to_vec();
-    // No address and no display number: the entry counts for all.
+    // No address and no display number: the entry applies to all.
     for field in [&[], &[], COOKIE, &cookie] {
         entry.extend(u16::try_from(field.len()).unwrap_or_default().to_be_bytes());
         entry.extend(field);

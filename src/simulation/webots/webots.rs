@@ -1,7 +1,7 @@
-//! Actor: one running Webots. Owns its process group, its folder and its place; ends with all three.
+//! Actor: one running Webots. Owns its process group, its instance directory and its slot; ends with all three.
 //!
-//! Created by a web client once its project is checked out. Starts Webots, waits until it listens, watches its heartbeat
-//! and the time limit, sends [`WebotsEvent`]s, and ends when nothing of Webots' process tree is left. Never restarted.
+//! Created by a session once its project is checked out. Starts Webots, waits until it listens, monitors its heartbeat
+//! and the time limit, sends [`WebotsEvent`]s, and ends when Webots' whole process tree has ended. Never restarted.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -24,12 +24,12 @@ use crate::simulation::process::ProcessGroup;
 use crate::simulation::snapshot::{SimulationChange, Stage};
 use crate::simulation::streams::Registration;
 
-/// Asks Webots to end, because its client has gone or for another reason.
+/// Requests Webots' end, because its client has left or for another reason.
 #[derive(Message)]
 #[rtype(result = "()")]
 pub struct Stop(pub EndReason);
 
-/// Asks to restore a file below the project's `controllers` folder to the state of the checkout.
+/// Requests to restore a file below the project's `controllers` directory to the state of the checkout.
 #[derive(Message)]
 #[rtype(result = "Result<(), CheckoutError>")]
 pub struct ResetController(pub String);
@@ -41,10 +41,10 @@ pub struct Webots {
     pub(super) spec: LaunchSpec,
     port: u16,
     events: ExitNotifier,
-    /// What it runs on is being prepared.
+    /// The preparation of its target, while it runs.
     preparing: Option<SpawnHandle>,
     group: Option<ProcessGroup>,
-    /// Asks to start the controller of a competition's participant anew.
+    /// Restarts the controller of a competition's participant.
     restart: Option<Arc<Notify>>,
     /// The wait until it listens.
     awaiting: Option<SpawnHandle>,
@@ -56,7 +56,7 @@ pub struct Webots {
     pub(super) idle_end: Option<IdleEnd>,
     last_heartbeat: Instant,
     hanging: bool,
-    /// Why it was asked to end, if it was.
+    /// Why it was stopped, if it was.
     stopped_for: Option<(EndReason, String)>,
 }
 
@@ -71,7 +71,7 @@ pub(super) struct IdleEnd {
 const MISSED_HEARTBEATS: u32 = 6;
 
 impl Webots {
-    /// Prepares a Webots; it starts with the actor.
+    /// Creates the actor; Webots starts with it.
     #[must_use]
     pub fn new(spec: LaunchSpec) -> Self {
         Self {
@@ -93,10 +93,10 @@ impl Webots {
         }
     }
 
-    /// Prepares what Webots runs on, then starts it.
+    /// Prepares Webots' target, then starts it.
     fn prepare(&mut self, ctx: &mut Context<Self>) {
         let client = self.spec.events.clone();
-        // Where a client can't keep up, it misses a line.
+        // A full mailbox drops this line.
         let progress = move |text| drop(client.try_send(WebotsEvent::Progress(text)));
         let prepared = Preparation::of(&self.spec).run(progress).into_actor(self);
         self.preparing = Some(ctx.spawn(prepared.map(|prepared, this, ctx| match prepared {
@@ -114,7 +114,7 @@ impl Webots {
             return self.not_started(EndReason::Fault, &format!("Webots can't be started: {error}"), ctx);
         }
         self.tell(WebotsEvent::Started);
-        // A container says itself when it runs.
+        // A container prints when it runs.
         self.spec.containers.is_none().then(|| self.await_port(ctx));
         ctx.run_interval(self.spec.config.timing.heartbeat, Self::check_heartbeat);
         let limit = self.spec.config.timing.launch;
@@ -130,7 +130,7 @@ impl Webots {
         });
     }
 
-    /// Starts the process, and has [`Self::ended`] called when it has ended.
+    /// Starts the process, and calls [`Self::ended`] when it has ended.
     fn spawn(&mut self, runtime: LaunchTarget, ctx: &mut Context<Self>) -> std::io::Result<()> {
         let (Launched { group, cgroup, tail, log, peak }, ended) =
             launched::launch(&self.spec, runtime, ctx.address())?;
@@ -145,7 +145,7 @@ impl Webots {
         Ok(())
     }
 
-    /// Waits until it listens, unless it does or is waited for.
+    /// Waits until it listens, unless it does already or the wait has begun.
     fn await_port(&mut self, ctx: &mut Context<Self>) {
         if let (Some(group), None, false) = (&self.group, self.awaiting, self.listening) {
             let listening = self.spec.listening_port(group.leader()).into_actor(self);
@@ -185,7 +185,7 @@ impl Webots {
     }
 
     fn check_heartbeat(&mut self, _: &mut Context<Self>) {
-        // Until it listens, the time for its launch counts.
+        // Until it listens, the timeout of its launch applies.
         if !self.listening {
             return;
         }
@@ -210,7 +210,7 @@ impl Webots {
         }
     }
 
-    /// Ends Webots without a grace time, in which it could take even more.
+    /// Kills Webots at once: during a grace period it could exceed its limit further.
     fn end_at_once(&mut self, why: &str) {
         if self.stopped_for.is_none() {
             self.log(Level::Warn, &format!("ended: {why}"));
@@ -251,7 +251,7 @@ impl Webots {
         ctx.stop();
     }
 
-    /// An end that is not in order. What containers run is made by their project.
+    /// An abnormal exit. In containers it is the project's own, because the project determines what they run.
     fn failure(&self, why: &str) -> WebotsExit {
         let why = format!("{why}{}", self.tail.last_words(&self.spec.project.instance.project()));
         WebotsExit { clean: false, own: !self.listening && self.spec.containers.is_none(), why }
