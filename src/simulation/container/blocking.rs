@@ -1,11 +1,11 @@
-//! File work of the preparation of containers.
+//! Blocking file I/O for the preparation of containers.
 
 use super::start_error::StartError;
 
 /// Runs blocking file I/O on the blocking thread pool.
 ///
 /// # Errors
-/// Those of the work.
+/// Those of `work`.
 pub async fn blocking<T, E>(work: impl FnOnce() -> Result<T, E> + Send + 'static) -> Result<T, StartError>
 where
     T: Send + 'static,

@@ -1,4 +1,4 @@
-//! What is made of a project that was checked out: its Dockerfiles, and the files that they need.
+//! The build plan of a checked-out project: its Dockerfiles, and the files that they need.
 
 use std::fs::OpenOptions;
 use std::io::{self, Write};
@@ -12,33 +12,32 @@ use super::project_file::text_of;
 use super::templates::{CONTROLLER, DOCKERFILE, LAUNCHER, Templates};
 use super::webots_yml::{ProjectKind, WebotsYml};
 
-/// Where a project is in its container, as real Dockerfiles expect.
+/// The path of a project in its container, as existing Dockerfiles expect.
 pub const PROJECT_PATH: &str = "/usr/local/webots-project";
 
-/// What is made of a project.
+/// The build plan of a project.
 #[derive(Debug)]
 pub struct BuildPlan {
-    /// What it asks for.
+    /// What its `webots.yml` requests.
     pub asks: WebotsYml,
-    /// The Dockerfile of Webots' image; nothing where the image of Webots will do as it is.
+    /// The Dockerfile of Webots' image; `None` if the base image is used unchanged.
     pub dockerfile: Option<String>,
-    /// That of the controllers' image.
+    /// The Dockerfile of the controllers' image.
     pub controller: Option<String>,
-    /// Whether there is a Makefile.
+    /// Whether the project has a Makefile.
     pub make: bool,
-    /// What its author should know.
+    /// Warnings for its author.
     pub warnings: Vec<String>,
 }
 
-/// Files with which a project would say itself how its containers run.
+/// Files with which a project would configure its containers itself.
 const IGNORED: [&str; 3] = ["docker-compose.yml", "docker-compose.yaml", ".env"];
 
 impl BuildPlan {
-    /// Reads a project, and adds the files that a competition needs. Works on the disk: not for a thread that serves
-    /// others.
+    /// Reads a project, and adds the files that a competition needs. Blocks.
     ///
     /// # Errors
-    /// What is wrong, in words for the client.
+    /// The problem, as text for the client.
     pub fn read(project: &Path, templates: &Templates, owner: &str) -> Result<Self, String> {
         let asks = WebotsYml::read(project);
         let mut warnings = asks.warnings.clone();
@@ -62,7 +61,8 @@ impl BuildPlan {
     }
 }
 
-/// The Dockerfile of a competition's controllers. Puts the launcher where it and the project's can copy it from.
+/// The Dockerfile of a competition's controllers. Writes the launcher to the paths from which this one and the
+/// project's can copy it.
 fn competition(project: &Path, templates: &Templates) -> Result<String, String> {
     let controllers = inside(project, "controllers")?;
     let launcher = templates.text(LAUNCHER).map_err(|error| format!("{LAUNCHER}: {error}"))?;
@@ -75,10 +75,10 @@ fn competition(project: &Path, templates: &Templates) -> Result<String, String> 
     }
 }
 
-/// A folder of the project, which must not be a link to anywhere else.
+/// A directory of the project, which must not be a symlink to a path outside.
 ///
 /// # Errors
-/// When there is none, in words for the client.
+/// When there is none, as text for the client.
 pub fn inside(project: &Path, folder: &str) -> Result<PathBuf, String> {
     let found = project.canonicalize().and_then(|root| Ok((project.join(folder).canonicalize()?, root)));
     match found {
@@ -87,7 +87,7 @@ pub fn inside(project: &Path, folder: &str) -> Result<PathBuf, String> {
     }
 }
 
-/// Makes a file that is not there yet; one that the project brings stays.
+/// Creates a file unless it exists; the project's own file stays.
 fn place(path: &Path, text: &str) -> io::Result<()> {
     match OpenOptions::new().write(true).create_new(true).open(path) {
         Ok(mut file) => file.write_all(text.as_bytes()),
@@ -96,7 +96,7 @@ fn place(path: &Path, text: &str) -> io::Result<()> {
     }
 }
 
-/// Lets the robot of a competition's participant be run from outside of Webots: `controller "participant"` becomes
+/// Makes the robot of a competition's participant an external controller: `controller "participant"` becomes
 /// `controller "<extern>"` in the world.
 ///
 /// # Errors
@@ -107,7 +107,7 @@ pub fn open_participant(world: &Path) -> io::Result<()> {
     OpenOptions::new().write(true).truncate(true).custom_flags(flags).open(world)?.write_all(text.as_bytes())
 }
 
-/// The image of Webots for a version: those up to R2023a are made on Ubuntu 20.04, later ones on 22.04.
+/// The image of Webots for a version: up to R2023a on Ubuntu 20.04, later ones on 22.04.
 #[must_use]
 pub fn image_of(pattern: &str, version: &str) -> String {
     let ubuntu = if version < "R2023b" { "20.04" } else { "22.04" };

@@ -1,4 +1,4 @@
-//! Whether this machine can run simulations in containers, now.
+//! Checks whether this machine can run simulations in containers now.
 
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
@@ -10,11 +10,11 @@ use super::templates::Templates;
 use crate::simulation::config::SimulationConfig;
 use crate::simulation::process::{ExitReason, Ran, Run, RunError};
 
-/// How long a command that starts a container may take.
+/// Timeout of a command that starts a container.
 const START: Duration = Duration::from_secs(15);
-/// How long a daemon may take to answer.
+/// Timeout of the daemon's answer.
 const ANSWER: Duration = Duration::from_secs(5);
-/// Where Docker puts its init process into a container. The program is static: it runs in an empty image.
+/// The path of Docker's init process in a container. The program is static: it runs in an empty image.
 const INIT: &str = "/sbin/docker-init";
 /// The empty image, shared by all servers of a machine.
 const EMPTY_IMAGE: &str = "webots-fleet/init";
@@ -24,7 +24,7 @@ const EMPTY_TAR: [u8; 1024] = [0; 1024];
 /// Checks whether simulations can run in containers. Blocks for some seconds at most.
 ///
 /// # Errors
-/// What is missing, in words for an administrator.
+/// What is missing, as text for an administrator.
 pub fn check(config: &SimulationConfig) -> Result<String, String> {
     Docker::find(Path::new("/"))?;
     daemon_fault().map_or(Ok(()), Err)?;
@@ -36,7 +36,7 @@ pub fn check(config: &SimulationConfig) -> Result<String, String> {
 /// Checks the administrator's templates.
 ///
 /// # Errors
-/// What is wrong with them, in words for an administrator.
+/// The problems with them, as text for an administrator.
 pub fn check_templates(config: &SimulationConfig) -> Result<String, String> {
     let faults = Templates::of(&config.container).faults();
     let found = match &config.container.templates {
@@ -46,15 +46,15 @@ pub fn check_templates(config: &SimulationConfig) -> Result<String, String> {
     if faults.is_empty() { Ok(found) } else { Err(faults.join("; ")) }
 }
 
-/// Why the daemon can't be used now, in words for clients and administrators. Blocks for five seconds at most.
+/// Why the daemon can't be used now, as text for clients and administrators. Blocks for five seconds at most.
 #[must_use]
 pub fn daemon_fault() -> Option<String> {
     let why = failure(ANSWER, &["version", "--format", "{{.Server.Version}}"])?;
     Some(format!("Docker does not answer on this simulation server: {why}"))
 }
 
-/// The folder in which Docker keeps images and containers, where it runs on this machine. Asked once; blocks for five seconds
-/// at most.
+/// The directory in which Docker keeps images and containers; `None` if it does not run on this machine. Cached after
+/// the first answer; blocks for five seconds at most.
 #[must_use]
 pub fn data_folder() -> Option<PathBuf> {
     static FOLDER: OnceLock<PathBuf> = OnceLock::new();
@@ -65,17 +65,17 @@ pub fn data_folder() -> Option<PathBuf> {
         let ran = docker(ANSWER, &["info", "--format", "{{.DockerRootDir}}"]).blocking(drop).ok()?;
         let told = String::from_utf8(ran.answer).ok()?;
         let folder = told.lines().last().map(Path::new).filter(|folder| folder.is_absolute() && folder.exists())?;
-        // Another check may have been as fast.
+        // A concurrent check may have set it.
         FOLDER.set(folder.to_owned()).ok();
     }
     FOLDER.get().cloned()
 }
 
-/// Why containers can't have an init process, in words for clients and administrators; `None` if they can.
+/// Why containers can't have an init process, as text for clients and administrators; `None` if they can.
 ///
-/// Without one, `xvfb-run` of the images is process 1, to which Xvfb sends no signal, so that it waits forever. What
-/// `docker info` prints does not tell: the version of Debian's docker-init is empty there. So a container runs it.
-/// Blocks for a second, for 45 at most.
+/// Without one, `xvfb-run` of the images is process 1, to which Xvfb sends no signal, so that it waits forever. `docker
+/// info` does not show it: the version of Debian's docker-init is empty there. So this runs it in a container. Blocks
+/// for a second, for 45 at most.
 #[must_use]
 pub fn init_fault() -> Option<String> {
     let import = || {
@@ -96,12 +96,12 @@ pub fn init_fault() -> Option<String> {
     ))
 }
 
-/// Docker with these arguments, within a time limit.
+/// Docker with these arguments and this timeout.
 fn docker(limit: Duration, arguments: &[&str]) -> Run {
     Run::new(std::iter::once("docker").chain(arguments.iter().copied()), Path::new("/"), limit)
 }
 
-/// Runs docker within a time limit. Returns the line that says why it fails, if it does.
+/// Runs docker with a timeout. Returns the line with the reason if it fails.
 fn failure(limit: Duration, arguments: &[&str]) -> Option<String> {
     let mut said: Vec<String> = Vec::new();
     match docker(limit, arguments).blocking(|line| said.push(line)) {

@@ -1,4 +1,5 @@
-//! The files of a compose project: the template, its variables, and what holds for each service whatever the template says.
+//! The files of a compose project: the template, its variables, and the settings that override the template for each
+//! service.
 
 use std::collections::BTreeMap;
 use std::io;
@@ -12,24 +13,24 @@ use super::templates::Template;
 use crate::simulation::config::{ContainerDisplay, EDITOR_PORT, SimulationConfig};
 use crate::simulation::machine::sensors::Gpu;
 
-/// What the compose project of one simulation is made of.
+/// The parts of the compose project of one simulation.
 #[derive(Debug)]
 pub struct ComposeProject<'parts> {
-    /// Its name.
+    /// Its name; unique on this machine.
     pub name: &'parts str,
-    /// The folder of the instance, in which its files are.
+    /// The directory of the instance, which contains its files.
     pub instance: &'parts Path,
-    /// The folder of the project on the machine.
+    /// The directory of the project on the machine.
     pub project: &'parts Path,
-    /// The folder that the editor shows.
+    /// The directory that the editor shows.
     pub edited: Option<PathBuf>,
-    /// What the project asked to be shown, as it is written.
+    /// The directory for the editor, as in the project's `webots.yml`.
     pub volume: Option<&'parts str>,
     /// The image of Webots.
     pub image: &'parts str,
     /// The image of a competition's controller.
     pub controller: Option<&'parts str>,
-    /// Webots and its arguments, as they are in the container.
+    /// Webots and its arguments in the container.
     pub command: &'parts [String],
     /// The port of Webots.
     pub port: u16,
@@ -37,20 +38,20 @@ pub struct ComposeProject<'parts> {
     pub gpu: Option<&'parts Gpu>,
     /// Whether there is a Makefile.
     pub make: bool,
-    /// What Docker offers.
+    /// The features of this machine's Docker.
     pub engine: &'parts DockerFeatures,
 }
 
-/// Variables: names and values.
+/// Environment variables: names and values.
 pub type Variables = Vec<(&'static str, String)>;
 
-/// The template.
+/// File name of the template.
 const TEMPLATE: &str = "docker-compose.yml";
-/// What holds for each service.
+/// The settings of each service, which override the template.
 const OVERRIDE: &str = "override.json";
-/// Shared memory, as much as a browser's engine inside of Webots needs.
+/// Size of shared memory: what a browser's engine inside of Webots needs.
 const SHARED_MEMORY: &str = "256m";
-/// Where there is a display of the machine.
+/// The directory with the sockets of the machine's displays.
 const DISPLAYS: &str = "/tmp/.X11-unix";
 
 impl ComposeProject<'_> {
@@ -80,7 +81,7 @@ impl ComposeProject<'_> {
         Ok((words.map(str::to_owned).into(), self.variables(config)))
     }
 
-    /// The folder through which Webots and a controller in another container talk.
+    /// The directory through which Webots and a controller in another container communicate.
     fn exchange(&self) -> PathBuf {
         self.instance.join("ipc")
     }
@@ -89,7 +90,7 @@ impl ComposeProject<'_> {
     fn variables(&self, config: &SimulationConfig) -> Variables {
         let command = self.command.join(" ");
         let plain = |letter: char| letter.is_alphanumeric() || " -_./=:+,".contains(letter);
-        // A template may hand it to a shell, which reads quotes, dollars and backslashes in ways of its own.
+        // A template may pass it to a shell, which interprets quotes, dollars and backslashes.
         let command = if command.chars().all(plain) { command } else { String::new() };
         let path = |path: &Path| path.to_string_lossy().into_owned();
         let edited = self.edited.as_ref().map_or_else(|| path(self.project), |folder| path(folder));
@@ -118,7 +119,7 @@ impl ComposeProject<'_> {
         is_machine.then(|| config.display_on(self.gpu.map(|gpu| gpu.index)))
     }
 
-    /// What holds for each service.
+    /// The settings of each service, which override the template.
     fn overridden(&self, template: &Template, config: &SimulationConfig) -> Value {
         let services: serde_json::Map<String, Value> = template
             .services
@@ -151,9 +152,9 @@ impl ComposeProject<'_> {
                 json!({ "nofile": { "soft": limits.open_files.min(1024), "hard": limits.open_files }, "core": 0 }),
             ),
             ("logging", json!({ "driver": "none" })),
-            // Reaps orphans and forwards signals. That Docker has one is found at the server's start.
+            // Reaps orphans and forwards signals. The server checks at its start that Docker has one.
             ("init", json!(true)),
-            // The daemon would run it, as often as the image says.
+            // The daemon would run it, at the interval of the image.
             ("healthcheck", json!({ "disable": true })),
         ]);
         let image = match name {
@@ -172,14 +173,14 @@ impl ComposeProject<'_> {
             }
             self.show(&mut service, &mut environment, config);
         }
-        // The images of these two have a program that makes it.
+        // The images of these two have a program that creates it.
         let home = if ["webots", "controller"].contains(&name) { "/tmp/home" } else { "/tmp" };
         environment.push(("HOME", home.to_owned()));
         service.insert("environment", json!(BTreeMap::from_iter(environment)));
         json!(service)
     }
 
-    /// Gives Webots graphics cards, the display of the machine, and the administrator's folders.
+    /// Gives Webots the GPUs, the display of the machine, and the administrator's directories.
     fn show(&self, service: &mut Service, environment: &mut Vec<(&'static str, String)>, config: &SimulationConfig) {
         let mut volumes: Vec<String> = config.container.mounts.clone();
         if let Some(display) = self.display(config) {
@@ -207,7 +208,7 @@ impl ComposeProject<'_> {
     }
 }
 
-/// Folders that are memory, which is limited: those that programs need to write into.
+/// Directories in memory with a size limit, into which programs must write.
 fn memory_folders(size: u64) -> [String; 3] {
     [("/tmp", size), ("/var/tmp", size), ("/run", 16)]
         .map(|(path, size)| format!("{path}:rw,exec,nosuid,nodev,mode=1777,size={size}m"))
@@ -222,10 +223,10 @@ pub fn container_of(project: &str, service: &str) -> String {
 /// What compose is told of a service.
 type Service = BTreeMap<&'static str, Value>;
 
-/// Variables that all services have: with them programs write where they may, and find each other.
+/// Variables of all services: with them programs write only to writable paths, and find each other.
 const ENVIRONMENT: [(&str, &str); 3] = [("USER", "webots"), ("XDG_RUNTIME_DIR", "/tmp"), ("QT_X11_NO_MITSHM", "1")];
 
-/// How much memory a container may take where `limits.memory` does not say, in MiB.
+/// Memory limit of a container without `limits.memory`, in MiB.
 pub const DEFAULT_MEMORY: u64 = 4096;
 
 #[cfg(test)]

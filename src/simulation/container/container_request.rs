@@ -1,4 +1,4 @@
-//! A simulation that is to run in containers.
+//! A simulation that will run in containers.
 
 use std::sync::Arc;
 
@@ -7,12 +7,12 @@ use crate::simulation::checkout::Project;
 use crate::simulation::config::{ContainerDisplay, SimulationConfig};
 use crate::simulation::machine::sensors::Gpu;
 
-/// Makes a command, given where the world is in the container.
+/// Creates a command from the world's path in the container.
 pub type Command = Box<dyn Fn(&str) -> Vec<String> + Send>;
 
-/// A simulation that is to run in containers.
+/// A simulation that will run in containers.
 pub struct ContainerRequest {
-    /// What was checked out.
+    /// The project that was checked out.
     pub project: Arc<Project>,
     /// The port of Webots.
     pub port: u16,
@@ -28,10 +28,10 @@ impl std::fmt::Debug for ContainerRequest {
     }
 }
 
-/// What runs a program on a virtual display: a part of the images of Webots.
+/// Runs a program on a virtual display; part of the images of Webots.
 const VIRTUAL_DISPLAY: [&str; 2] = ["xvfb-run", "--auto-servernum"];
 
-/// Webots and its arguments, as they are in the container.
+/// Webots and its arguments in the container.
 #[must_use]
 pub fn command(config: &SimulationConfig, request: &ContainerRequest, world: &str) -> Vec<String> {
     let webots = (request.command)(&format!("{PROJECT_PATH}/{world}"));

@@ -1,4 +1,4 @@
-//! Makes the containers of simulations; one for the whole server.
+//! Creates the containers of simulations; one for the whole server.
 
 use std::io;
 use std::path::Path;
@@ -28,7 +28,7 @@ use super::templates::Templates;
 use super::webots_yml::ProjectKind;
 use crate::simulation::config::SimulationConfig;
 
-/// Makes the containers of simulations.
+/// Creates the containers of simulations.
 #[derive(Debug)]
 pub struct ContainerService {
     docker: Docker,
@@ -39,18 +39,18 @@ pub struct ContainerService {
     live: ActiveProjects,
     engine: OnceCell<DockerFeatures>,
     shortcoming: Option<String>,
-    /// Who may have compose make containers now.
+    /// Limits concurrent runs of compose.
     turns: Semaphore,
     config: Arc<SimulationConfig>,
     _keeper: AbortOnDropHandle<()>,
 }
 
 impl ContainerService {
-    /// Gets ready to make containers, on the thread whose runtime this is. `run` is the folder of this run of the server.
-    /// Removes what an earlier run has left. Blocks for a moment.
+    /// Opens the service on the thread of this runtime. `run` is the directory of this run of the server. Removes what
+    /// an earlier run has left. Blocks for a moment.
     ///
     /// # Errors
-    /// When Docker or compose is not installed, in words for an administrator.
+    /// When Docker or compose is not installed, as text for an administrator.
     pub fn open(config: Arc<SimulationConfig>, run: &Path) -> Result<Self, String> {
         let docker = Docker::find(run)?;
         let owner = ResourceOwner::of(&config.cache_dir.0);
@@ -81,24 +81,24 @@ impl ContainerService {
         })
     }
 
-    /// Whose containers these are, for a process that removes them after the server's end.
+    /// The owner of these containers, for a process that removes them after the server's end.
     #[must_use]
     pub fn run(&self) -> &ResourceOwner {
         &self.run
     }
 
-    /// What containers may do on this machine that they should not, if so.
+    /// What containers can do because the packet filter is missing; `None` if it is loaded.
     #[must_use]
     pub fn shortcoming(&self) -> Option<&str> {
         self.shortcoming.as_deref()
     }
 
-    /// Makes the containers of a simulation, but starts none. `progress` hears each step in words.
+    /// Creates the containers of a simulation, but starts none. `progress` receives each step as text.
     ///
-    /// Dropping the future gives up whatever was made.
+    /// Dropping the future discards everything that was created.
     ///
     /// # Errors
-    /// Whose fault it is that they can't be made.
+    /// Why they can't be created, and whether the project or this server is the cause.
     pub async fn prepare(
         &self,
         request: ContainerRequest,
@@ -143,7 +143,7 @@ impl ContainerService {
         blocking(move || BuildPlan::read(&folder, &templates, &owner)).await
     }
 
-    /// Copies a folder of an image into the instance's folder.
+    /// Copies a directory of an image into the instance's directory.
     async fn copy(
         &self,
         lease: &ProjectGuard,
@@ -157,7 +157,7 @@ impl ContainerService {
         copy.run(&self.docker).await
     }
 
-    /// Writes the compose project, and lets compose make the containers.
+    /// Writes the compose project, and creates the containers with compose.
     async fn make(
         &self,
         request: ContainerRequest,
@@ -198,7 +198,7 @@ impl ContainerService {
             Ok::<_, StartError>((options, variables, template.services.into_keys()))
         };
         let (options, variables, services) = blocking(files).await?;
-        // More at a time would only be slower together.
+        // More concurrent runs would only be slower.
         let turn = self.turns.acquire().await.map_err(|error| StartError::Server(error.to_string()))?;
         progress(steps::CREATING.to_owned());
         let up = ["up", "--no-start", "--no-build"].map(str::to_owned);
@@ -219,7 +219,7 @@ impl ContainerService {
     }
 }
 
-/// Why a competition's world can't be changed. An image may bring one that is no text, or with any mode.
+/// Why a competition's world can't be changed. An image may contain one that is not text, or with any mode.
 fn not_changed(error: &io::Error) -> StartError {
     let why = format!("The world can't be changed: {error}");
     match error.kind() {

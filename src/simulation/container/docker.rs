@@ -1,4 +1,4 @@
-//! Runs the programs `docker` and `docker compose`: without a shell, within a time limit, and ended with whoever waits.
+//! Runs the programs `docker` and `docker compose`: without a shell, with a timeout. Dropping the future ends them.
 
 use std::ffi::{OsStr, OsString};
 use std::path::{Path, PathBuf};
@@ -8,47 +8,47 @@ use which::which;
 
 use crate::simulation::process::{ExitReason, Run, RunError, SpawnSpec};
 
-/// How Docker is called on this machine.
+/// The commands of Docker on this machine.
 #[derive(Debug, Clone)]
 pub struct Docker {
-    /// `docker compose`, or `docker-compose` where only that is there.
+    /// `docker compose`, or `docker-compose` if only that is installed.
     compose: Vec<OsString>,
-    /// The folder of this run of the server, whose mark all processes carry.
+    /// The directory of this run of the server, which marks all processes.
     mark: PathBuf,
 }
 
-/// Why Docker has not done something. Its words are for the client.
+/// Why a Docker command failed. The messages are for the client.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum DockerError {
-    /// A program is not there, or the system can start no more.
+    /// A program does not exist, or the system can start no more processes.
     #[error("Docker can't be started: {0}")]
     NotStarted(String),
     /// The daemon does not answer.
     #[error("Docker does not answer on this simulation server: {0}")]
     NoDaemon(String),
-    /// It took too long.
+    /// It exceeded its timeout.
     #[error("Docker did not end `{command}` within {} seconds", limit.as_secs())]
     Slow {
-        /// What was done.
+        /// The command.
         command: String,
-        /// How long it could take.
+        /// The timeout.
         limit: Duration,
     },
     /// It failed.
     #[error("`{command}` failed: {message}")]
     Failed {
-        /// What was done.
+        /// The command.
         command: String,
-        /// The line that says why.
+        /// The line with the reason.
         message: String,
     },
 }
 
-/// How long what only asks, or makes something small, may take.
+/// Timeout of queries and of other short commands.
 pub const SHORT: Duration = Duration::from_secs(30);
-/// How long it may take to find out how Docker is called.
+/// Timeout of the check which compose command exists.
 const FIND: Duration = Duration::from_secs(10);
-/// The most that is kept of an output, in bytes.
+/// Size limit of the kept output, in bytes.
 const LONGEST_OUTPUT: usize = 1 << 20;
 /// How a line begins that says of which containers the lines before it are.
 const LIST: &str = "Error: failed to start containers";
@@ -61,10 +61,10 @@ const NO_DAEMON: [&str; 4] = [
 ];
 
 impl Docker {
-    /// Finds out how Docker is called here. Blocks for some seconds at most.
+    /// Determines the commands of Docker. Blocks for some seconds at most.
     ///
     /// # Errors
-    /// What is missing, in words for an administrator.
+    /// What is missing, as text for an administrator.
     pub fn find(mark: &Path) -> Result<Self, String> {
         which("docker")
             .map_err(|_| "docker is not there; on Debian and Ubuntu the package docker.io has it".to_owned())?;
@@ -92,7 +92,7 @@ impl Docker {
         self.call(command, Vec::new(), limit, |_| ()).await
     }
 
-    /// The same, but `told` hears each line that it prints.
+    /// The same, but `told` receives each line that it prints.
     ///
     /// # Errors
     /// When it fails or takes longer than the limit.
@@ -119,10 +119,10 @@ impl Docker {
         self.call(self.compose.iter().cloned().chain(arguments).collect(), variables, limit, |_| ()).await.map(drop)
     }
 
-    /// How a program is started that talks to the daemon. Dropping its process group ends only that program.
+    /// The specification of a client program of the daemon. Dropping its process group ends only that program.
     #[must_use]
     pub fn spec(&self, command: Vec<OsString>, grace: Duration) -> SpawnSpec {
-        // The classic builder prints its steps, and builds on a network of ours; BuildKit has none of the kind.
+        // The classic builder prints its steps, and can build on the server's own network; BuildKit can't.
         let environment = vec![("DOCKER_BUILDKIT".into(), "0".into()), ("COMPOSE_ANSI".into(), "never".into())];
         SpawnSpec { environment, grace, ..SpawnSpec::new(command, &self.mark) }
     }

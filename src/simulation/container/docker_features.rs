@@ -1,33 +1,33 @@
-//! What this machine's Docker offers to containers.
+//! The features of this machine's Docker for containers.
 
 use std::os::unix::fs::MetadataExt;
 use std::path::Path;
 
 use super::docker::{Docker, DockerError, SHORT};
 
-/// What this machine's Docker offers.
+/// The features of this machine's Docker.
 #[derive(Debug, Clone, Default)]
 pub struct DockerFeatures {
-    /// Graphics cards of NVIDIA, with the runtime for containers.
+    /// Whether there are NVIDIA GPUs, and their container runtime.
     pub nvidia: bool,
-    /// The groups that may use other graphics cards, where there are some.
+    /// The groups of the devices of other GPUs; `None` if there are no such GPUs.
     pub graphics: Option<Vec<u32>>,
 }
 
-/// Other graphics cards.
+/// The directory of the devices of other GPUs.
 const DRI: &str = "/dev/dri";
-/// One of NVIDIA.
+/// A device of NVIDIA's driver.
 const NVIDIA: &str = "/dev/nvidiactl";
 
 impl DockerFeatures {
-    /// Asks Docker.
+    /// Queries Docker.
     ///
     /// # Errors
     /// When Docker fails.
     pub async fn ask(docker: &Docker) -> Result<Self, DockerError> {
         let format = "{{range $name, $_ := .Runtimes}}{{$name}} {{end}}";
         let told = docker.run(&["info", "--format", format], SHORT).await?;
-        // The newest line is the answer; warnings come before it.
+        // The last line is the answer; warnings precede it.
         let answer = told.lines().last().unwrap_or_default();
         let nvidia = answer.split_whitespace().any(|name| name == "nvidia") && Path::new(NVIDIA).exists();
         Ok(Self { nvidia, graphics: graphics() })

@@ -5,21 +5,21 @@ use std::fmt::Write as _;
 
 use crate::shared::text::excerpt;
 
-/// The label of all that this server has built, also of what a build that failed has left.
+/// The label of everything that this server has built, also of leftovers of failed builds.
 pub const LABEL: &str = "webots-fleet.owner";
-/// Why a Dockerfile has no volume, as the end of a sentence.
+/// Why a Dockerfile can't have a volume, as the end of a sentence.
 pub const NO_VOLUME: &str = "a volume would take the machine's disk without a limit; what a program writes has its place in the \
     project or in /tmp";
-/// Why a Dockerfile has no here-document, as the end of a sentence.
+/// Why a Dockerfile can't have a here-document, as the end of a sentence.
 const NO_HERE_DOCUMENT: &str = "RUN, ADD and COPY can't have `<<`: the builder used here knows no here-documents";
-/// What is shown of a line in an error, in letters.
+/// Longest excerpt of a line in an error, in characters.
 const SHOWN: usize = 100;
 
 /// Labels every stage of a Dockerfile with its owner.
 ///
 /// # Errors
-/// When it asks the daemon to fetch something, which would be done from the machine's own network; when it has a volume; or
-/// when it may be read in more than one way. In words for the client, with the line.
+/// When it makes the daemon fetch something, which would use the machine's own network; when it has a volume; or when
+/// it is ambiguous. As text for the client, with the line.
 pub fn labelled(text: &str, owner: &str) -> Result<String, String> {
     let (mut labelled, mut instruction, mut first) = (String::new(), String::new(), 1);
     for (number, line) in (1..).zip(text.trim_start_matches('\u{feff}').lines()) {
@@ -40,7 +40,7 @@ pub fn labelled(text: &str, owner: &str) -> Result<String, String> {
         }
         check(&instruction).map_err(|why| wrong(first, &instruction, why))?;
         if keyword(&instruction) == "FROM" {
-            // Writing to a text can't fail.
+            // Writing to a string can't fail.
             writeln!(labelled, "LABEL {LABEL}={owner}").ok();
         }
         instruction.clear();
@@ -52,7 +52,7 @@ fn wrong(number: usize, line: &str, why: &str) -> String {
     format!("The Dockerfile of this project can't be used, line {number}, `{}`: {why}", excerpt(line.trim(), SHOWN))
 }
 
-/// Refuses a comment that changes how the lines below are read.
+/// Refuses a comment that changes how the lines below are parsed.
 fn check_directive(comment: &str) -> Result<(), String> {
     let directive = comment.trim_start_matches('#').trim().to_lowercase();
     let escape = directive.strip_prefix("escape").and_then(|rest| rest.trim_start().strip_prefix('='));
@@ -65,19 +65,19 @@ fn check_directive(comment: &str) -> Result<(), String> {
     }
 }
 
-/// What a line has before the backslash with which it goes on in the next one.
+/// The part of a line before the backslash that continues it in the next line.
 fn continued(line: &str) -> Result<Option<&str>, &'static str> {
     let Some(before) = line.trim_end().strip_suffix('\\') else { return Ok(None) };
     let after = line.get(before.len() + 1..).unwrap_or_default();
-    // For some versions of Docker such a line goes on, for others it does not.
+    // Some versions of Docker continue such a line, others don't.
     if before.ends_with('\\') || after.contains(|letter: char| !" \t".contains(letter)) {
         return Err("a line ends with one backslash or none");
     }
     Ok(Some(before))
 }
 
-/// The images that the stages of a Dockerfile begin with, given its arguments as `NAME=value`. One that depends on what
-/// can't be read here is left out.
+/// The base images of the stages of a Dockerfile, given its arguments as `NAME=value`. An image that depends on a
+/// variable that is unknown here is left out.
 #[must_use]
 pub fn bases(text: &str, arguments: &[String]) -> Vec<String> {
     let given = arguments.iter().filter_map(|argument| argument.split_once('='));
@@ -95,7 +95,7 @@ pub fn bases(text: &str, arguments: &[String]) -> Vec<String> {
                 let mut rest = rest.iter().filter(|word| !word.starts_with("--"));
                 let image = rest.next().map(|image| resolved(image, &variables)).unwrap_or_default();
                 let is_known = stages.contains(&image.to_lowercase()) || bases.contains(&image);
-                // Each stage has a name, or at least a number, which no image has.
+                // Each stage has a name, or a number, which no image has.
                 stages.push(rest.nth(1).map(|name| name.to_lowercase()).unwrap_or_default());
                 if !is_known && !image.is_empty() && !image.contains('$') {
                     bases.push(image);
@@ -110,7 +110,7 @@ pub fn bases(text: &str, arguments: &[String]) -> Vec<String> {
 /// A word of a Dockerfile with the values of variables, as `$NAME` or `${NAME}`.
 fn resolved(word: &str, variables: &HashMap<&str, &str>) -> String {
     let mut names: Vec<_> = variables.iter().collect();
-    // Of two names that begin alike the longer one is meant.
+    // The longest name wins if one is a prefix of another.
     names.sort_by_key(|(name, _)| std::cmp::Reverse(name.len()));
     names.into_iter().fold(word.to_owned(), |word, (name, value)| {
         word.replace(&format!("${{{name}}}"), value).replace(&format!("${name}"), value)
@@ -125,7 +125,8 @@ fn check(instruction: &str) -> Result<(), &'static str> {
     let words = instruction.split_whitespace();
     let mut words = words.skip_while(|word| word.to_uppercase() == "ONBUILD");
     match words.next().map(str::to_uppercase).as_deref() {
-        // The parser knows them, though, and takes other lines than these for the instructions that follow.
+        // The classic builder's parser recognizes them, though, and may take other lines for instructions than this
+        // check does.
         Some("RUN" | "ADD" | "COPY") if instruction.contains("<<") => return Err(NO_HERE_DOCUMENT),
         Some("VOLUME") => return Err(NO_VOLUME),
         Some("ADD") => {}
@@ -133,10 +134,10 @@ fn check(instruction: &str) -> Result<(), &'static str> {
     }
     let mut words: Vec<&str> = words.skip_while(|word| word.starts_with("--")).collect();
     if !words.first().is_some_and(|word| word.starts_with('[')) {
-        // Where it goes to.
+        // The destination.
         words.pop();
     }
-    // An address has a colon, which a variable or a backslash may stand for.
+    // A URL contains a colon, which a variable or an escape may hide.
     if words.iter().any(|word| word.contains([':', '$', '\\'])) {
         return Err("ADD may copy files of the project only, named without variables; RUN can fetch others");
     }

@@ -1,4 +1,4 @@
-//! The images of simulations: pulled, and built once for all who want the same.
+//! The images of simulations: pulled, and built once for all clients of the same project.
 
 use std::ffi::OsString;
 use std::fmt;
@@ -22,35 +22,35 @@ use crate::simulation::config::SimulationConfig;
 pub struct Images {
     pub(super) docker: Docker,
     pub(super) owner: ResourceOwner,
-    /// The registries of the images that this server is configured to use, and Docker Hub's.
+    /// The registries of the configured images, and Docker Hub's.
     registries: [String; 3],
-    /// How long an image may take.
+    /// Timeout of an image.
     limit: Duration,
-    /// How much memory a step of a build may take, in MiB.
+    /// Memory limit of a build step, in MiB.
     memory: u64,
-    /// As many images are built at a time.
+    /// Limits concurrent builds.
     builds: Semaphore,
     jobs: SingleFlight<String, Result<(), StartError>>,
 }
 
-/// An image to be built.
+/// An image to build.
 #[derive(Debug, Clone)]
 pub struct Build {
-    /// What tells this image from others.
+    /// Key of this image, unique among those of the server.
     pub key: String,
     /// The Dockerfile, a file outside of the project.
     pub dockerfile: PathBuf,
-    /// The folder that it copies from.
+    /// The directory that it copies from.
     pub context: PathBuf,
     /// Arguments, as `NAME=value`.
     pub arguments: Vec<String>,
     /// The Docker network that it may use.
     pub network: &'static str,
-    /// The project, which stays as long as it is built.
+    /// The project, kept until the build has ended.
     pub project: Arc<Project>,
 }
 
-/// The kind of a fault, by who is at fault.
+/// The kind of an error, by its cause.
 type Whose = fn(String) -> StartError;
 
 impl Images {
@@ -64,15 +64,16 @@ impl Images {
         Self { docker, owner, registries, limit, memory, builds, jobs: SingleFlight::default() }
     }
 
-    /// The name under which this server keeps its images. No other image has it.
+    /// The repository name of this server's images; unique.
     pub(super) fn repository(&self) -> String {
         format!("webots-fleet/{}", self.owner.name())
     }
 
-    /// Makes sure that a published image is there. Returns its id, by which it is told from later ones of the same name.
+    /// Pulls a published image unless it exists. Returns its id, which differs from those of later images of the same
+    /// name.
     ///
     /// # Errors
-    /// Why it can't be pulled, in words for the client.
+    /// Why it can't be pulled, as text for the client.
     pub async fn pull(
         self: &Arc<Self>,
         image: &str,
@@ -99,10 +100,10 @@ impl Images {
         self.limited(pull, whose).await
     }
 
-    /// Builds an image, unless it is there. Returns its name.
+    /// Builds an image unless it exists. Returns its name.
     ///
     /// # Errors
-    /// Why it can't be built, in words for the client.
+    /// Why it can't be built, as text for the client.
     pub async fn build(
         self: &Arc<Self>,
         build: Build,
@@ -133,10 +134,10 @@ impl Images {
         };
         let done = self.run_build(words, &build.dockerfile, &build.context, told).await;
         done.map_err(|error| not_built(&step, error, |image| self.whose(image)))?;
-        // It has no name of its own: it goes with the image on top.
+        // It has no name of its own: it is removed with the image on top.
         let id = blocking(move || std::fs::read_to_string(id)).await?;
         self.open_now(&id, name, &build.project).await
-        // Until here the folder that was copied from has to stay.
+        // The directory that was copied from must exist until here.
     }
 
     /// Runs `docker build` with these options. `told` receives each line that it prints.
@@ -157,11 +158,11 @@ impl Images {
         self.docker.follow(words, self.limit + SHORT, told).await
     }
 
-    /// Makes the image in which the server's user finds what the image's own user has at home, unless it is there. Returns
-    /// its name.
+    /// Creates the image in which the server's user can read the home directory of the image's own user, unless it
+    /// exists. Returns its name.
     ///
     /// # Errors
-    /// Why it can't be made, in words for the client.
+    /// Why it can't be created, as text for the client.
     pub async fn open(
         self: &Arc<Self>,
         id: String,
@@ -174,7 +175,7 @@ impl Images {
         self.once(name, progress, job).await
     }
 
-    /// Has a job make an image, unless it is there. Joins one that is doing so.
+    /// Runs a job that creates an image, unless it exists. Joins such a job in progress.
     async fn once<F: Future<Output = Result<(), StartError>> + Send + 'static>(
         self: &Arc<Self>,
         name: String,
@@ -197,19 +198,20 @@ impl Images {
         permit.map_err(|_| StartError::Server(busy()))?.map_err(|error| StartError::Server(error.to_string()))
     }
 
-    /// Each job has a limit of time, for which it need not wait for others. `whose` names who is at fault after that.
+    /// Runs a job with a timeout, which does not include waiting for others. `whose` is the kind of error after a
+    /// timeout.
     async fn limited(&self, job: impl Future<Output = Result<(), StartError>>, whose: Whose) -> Result<(), StartError> {
         let slow = || format!("Its image was not ready within {} seconds (timing.build)", self.limit.as_secs());
         actix_rt::time::timeout(self.limit, job).await.unwrap_or_else(|_| Err(whose(slow())))
     }
 
-    /// Who is at fault when the registry of an image does not answer: a project may name any.
+    /// The kind of error if the registry of an image does not answer: a project may name any registry.
     fn whose(&self, image: &str) -> Whose {
         let is_ours = self.registries.iter().any(|ours| ours == registry(image));
         if is_ours { StartError::Server } else { StartError::Project }
     }
 
-    /// What tells an image from later ones of the same name; `None` if it is not there.
+    /// The id of an image, which differs from those of later images of the same name; `None` if it does not exist.
     ///
     /// # Errors
     /// When Docker fails.
@@ -221,10 +223,10 @@ impl Images {
         }
     }
 
-    /// What an image says of the programs that run in it.
+    /// The image's configuration of the programs that run in it.
     ///
     /// # Errors
-    /// When Docker fails, a word of them is too long, or the image keeps data in a place of its own.
+    /// When Docker fails, an entry of the configuration can't be parsed, or the image has a volume.
     pub async fn about(&self, image: &str) -> Result<About, StartError> {
         let answer = self.docker.run(&["image", "inspect", "--format", opened::FORMAT, image], SHORT).await?;
         Ok(About::read(&answer)?)
@@ -237,7 +239,7 @@ fn registry(image: &str) -> &str {
     if first.contains(['.', ':']) || first == "localhost" { first } else { "" }
 }
 
-/// Why an image is not there, in words for the client. `whose` names who is at fault when its registry does not answer.
+/// Why an image can't be pulled, as text for the client. `whose` is the kind of error if its registry does not answer.
 fn not_pulled(image: &str, error: DockerError, whose: Whose) -> StartError {
     match error {
         DockerError::Failed { message, .. } if is_unknown(&message) => StartError::Project(format!(
@@ -256,7 +258,7 @@ fn not_pulled(image: &str, error: DockerError, whose: Whose) -> StartError {
     }
 }
 
-/// Why an image was not built, in words for the client. Only a step that begins with an image can miss it.
+/// Why an image was not built, as text for the client. Only a `FROM` step can fail because of a missing image.
 fn not_built(step: &str, error: DockerError, whose: impl FnOnce(&str) -> Whose) -> StartError {
     let from = step.split_once(" : ").and_then(|(_, instruction)| instruction.strip_prefix("FROM "));
     match (from, error) {
@@ -272,14 +274,14 @@ fn not_built(step: &str, error: DockerError, whose: impl FnOnce(&str) -> Whose) 
     }
 }
 
-/// Whether a registry says that there is no such image.
+/// Whether a registry reports that there is no such image.
 fn is_unknown(message: &str) -> bool {
     ["not found", "pull access denied", "manifest unknown", "repository does not exist"]
         .iter()
         .any(|words| message.contains(words))
 }
 
-/// Whether a registry does not answer, or not now. An image's name has no space.
+/// Whether a registry does not answer, or not now. Image names contain no spaces.
 fn is_silent(message: &str) -> bool {
     let message = message.to_lowercase();
     let words = ["toomanyrequests: ", "i/o timeout", "handshake timeout", "timeout exceeded", "deadline exceeded"];

@@ -1,4 +1,5 @@
-//! Copies what is in an image onto the machine, where containers can change it: things were built there.
+//! Copies a directory of an image onto the machine, where containers can change it: the image's build may have created
+//! files in it.
 
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -9,33 +10,33 @@ use super::owned_resources;
 use super::start_error::StartError;
 use crate::simulation::process::{disk_usage, remove_tree};
 
-/// What is copied where.
+/// The source and the destination of a copy.
 #[derive(Debug)]
 pub struct ImageExport<'copy> {
-    /// The compose project that it is for.
+    /// The name of the compose project.
     pub name: &'copy str,
-    /// The image.
+    /// The id or name of the image.
     pub image: &'copy str,
-    /// The folder in it.
+    /// The directory in the image.
     pub from: String,
-    /// A folder that is not there yet.
+    /// A temporary directory that does not exist yet.
     pub through: PathBuf,
-    /// The folder that is made, or replaced.
+    /// The directory that is created or replaced.
     pub to: &'copy Path,
-    /// How large it may be, in MiB.
+    /// Size limit, in MiB.
     pub size: u64,
 }
 
-/// How long it may take.
+/// Timeout of the copy.
 const LIMIT: Duration = Duration::from_mins(2);
-/// How often it is looked how much was copied.
+/// Interval between two checks of the copied size.
 const LOOK: Duration = Duration::from_millis(300);
 
 impl ImageExport<'_> {
-    /// Copies.
+    /// Runs the copy.
     ///
     /// # Errors
-    /// Why not, in words for the client.
+    /// Why not, as text for the client.
     pub async fn run(self, docker: &Docker) -> Result<(), StartError> {
         let label = format!("{}={}", owned_resources::PROJECT, self.name);
         let create = ["create", "--label", &label, "--network", "none", self.image, "true"];
@@ -73,7 +74,7 @@ fn not_copied(error: DockerError, from: &str) -> StartError {
     }
 }
 
-/// Waits until a folder takes more of the disk than it may.
+/// Waits until a directory exceeds its size limit, or can't be measured.
 async fn outgrown(folder: &Path, most: u64) {
     loop {
         actix_rt::time::sleep(LOOK).await;

@@ -1,4 +1,4 @@
-//! Simulations in containers of Docker: what a project asks for, its image, and a compose project for each simulation.
+//! Simulations in Docker containers: what a project requests, its image, and a compose project for each simulation.
 
 mod blocking;
 mod build_plan;

@@ -1,8 +1,9 @@
-//! An image in which the server's user finds what the image's own user has at home: assets and settings of Webots.
+//! An image in which the server's user can read the home directory of the image's own user: assets and settings of
+//! Webots.
 //!
-//! Simulations run as the server's user, so that what they write is the server's to show, measure and remove, and so that
-//! no program in a folder of this machine is ever root's. Official images of Webots keep assets and settings in `/root`,
-//! which no other user may read. So a layer on top of an image opens it once.
+//! Simulations run as the server's user, so that the server can read, measure and remove what they write, and so that
+//! no program in a directory of this machine ever runs as root. Official images of Webots keep assets and settings in
+//! `/root`, which no other user may read. So a layer on top of an image opens it once.
 
 use std::io;
 use std::os::unix::fs::PermissionsExt;
@@ -12,10 +13,10 @@ use super::dockerfile::{LABEL, NO_VOLUME};
 use super::owned_resources::digest;
 use crate::shared::text::one_line;
 
-/// How programs run in an image.
+/// The configuration of the programs that run in an image.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct About {
-    /// What tells the image from later ones of the same name.
+    /// The id of the image, which differs from those of later images of the same name.
     pub id: String,
     /// Its user, `root` if empty.
     user: String,
@@ -25,26 +26,27 @@ pub struct About {
     command: Vec<String>,
 }
 
-/// How Docker is asked: a line each for the id, the user, and the words of the entry point and of the command.
+/// The format for `docker image inspect`: one line each for the id, the user, the words of the entry point and of the
+/// command, and the volumes.
 pub const FORMAT: &str = "id {{json .Id}}{{println}}user {{json .Config.User}}{{println}}\
     {{range .Config.Entrypoint}}entrypoint {{json .}}{{println}}{{end}}\
     {{range .Config.Cmd}}command {{json .}}{{println}}{{end}}\
     {{range $path, $_ := .Config.Volumes}}volume {{json $path}}{{println}}{{end}}";
-/// What the first program of a container prints when it runs: from then on its network has an address.
+/// The first output of a container when it runs: from then on its network has an address.
 pub const RUNS: &str = "webots-fleet: the container runs";
-/// Programs that the image gets: names and texts.
+/// Programs that are added to the image: names and texts.
 const PROGRAMS: [(&str, &str); 2] = [
     ("open-home", include_str!("../../../config/simulation/docker/open-home")),
     ("start-at-home", include_str!("../../../config/simulation/docker/start-at-home")),
 ];
-/// Where they are in the image.
+/// Their directory in the image.
 const FOLDER: &str = "/usr/local/share/webots-fleet";
 
 impl About {
-    /// Reads what Docker answers.
+    /// Parses Docker's answer.
     ///
     /// # Errors
-    /// When a word is too long for a line of the answer, or the image has a volume; in words for the client.
+    /// When a line can't be parsed, or the image has a volume; as text for the client.
     pub fn read(answer: &str) -> Result<Self, String> {
         let unreadable = || "The image has an ENTRYPOINT, CMD or VOLUME that can't be read here".to_owned();
         let mut about = Self::default();
@@ -72,7 +74,7 @@ impl About {
         let Self { id, user, entrypoint, command } = self;
         let open = words(&["/bin/sh".to_owned(), format!("{FOLDER}/open-home"), user.clone()]);
         let entrypoint = words(&[&[format!("{FOLDER}/start-at-home")], entrypoint.as_slice()].concat());
-        // An entry point drops the command of the image below.
+        // An entry point clears the command of the image below.
         let command = if command.is_empty() { String::new() } else { format!("CMD {}\n", words(command)) };
         format!(
             "FROM {id}\nLABEL {LABEL}={owner}\nUSER root\nCOPY . {FOLDER}\nRUN {open}\nENTRYPOINT {entrypoint}\n{command}"
@@ -80,14 +82,14 @@ impl About {
     }
 }
 
-/// A tag for an image that is opened, which all of these parts decide.
+/// A tag for an opened image, a hash of all these parts.
 #[must_use]
 pub fn key<'part>(parts: impl Iterator<Item = &'part str>) -> String {
     let parts: Vec<&str> = parts.chain(PROGRAMS.map(|(_, program)| program)).collect();
     format!("{:032x}", digest(parts.join("\0").as_bytes()))
 }
 
-/// Writes the programs into a folder.
+/// Writes the programs into a directory.
 ///
 /// # Errors
 /// When that can't be done.
@@ -98,7 +100,7 @@ pub fn write_programs(folder: &Path) -> io::Result<()> {
         std::fs::write(&path, text)?;
         std::fs::set_permissions(path, std::fs::Permissions::from_mode(0o755))?;
     }
-    // The mode of the folder becomes that of the image's.
+    // The mode of the directory is copied into the image.
     std::fs::set_permissions(folder, std::fs::Permissions::from_mode(0o755))
 }
 

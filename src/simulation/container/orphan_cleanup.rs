@@ -1,4 +1,4 @@
-//! Removes what simulations have left that nobody could remove when they ended, and images that nobody needs.
+//! Removes orphaned compose projects and unused images.
 
 use std::collections::HashSet;
 use std::sync::Arc;
@@ -14,27 +14,27 @@ use super::image::Images;
 use super::owned_resources::{self, ResourceOwner};
 use crate::simulation::config::SimulationConfig;
 
-/// The compose projects that are in use.
+/// The compose projects in use.
 #[derive(Debug, Clone, Default)]
 pub struct ActiveProjects(Arc<(Mutex<HashSet<String>>, Notify)>);
 
-/// How often it is looked for what nobody uses, at least.
+/// Longest time between two sweeps for orphans; a released project triggers one sooner.
 const PERIOD: Duration = Duration::from_mins(1);
-/// How often it is tried again to remove what could not be removed.
+/// Delay before each sweep, and between retries.
 const AGAIN: Duration = Duration::from_secs(2);
-/// How often images are looked at.
+/// Interval between image prunings.
 const PRUNE: Duration = Duration::from_mins(30);
 /// How old an image is at least that is removed because the disk is full, in hours: one that was just built has no container
 /// yet.
 const YOUNGEST: u64 = 1;
 
 impl ActiveProjects {
-    /// Notes a name.
+    /// Adds a name.
     pub fn insert(&self, name: &str) {
         self.names().insert(name.to_owned());
     }
 
-    /// Forgets a name: what is left of it can be removed.
+    /// Removes a name, and triggers a sweep.
     pub fn remove(&self, name: &str) {
         self.names().remove(name);
         self.0.1.notify_one();
@@ -45,7 +45,7 @@ impl ActiveProjects {
     }
 }
 
-/// Removes what simulations have left that nobody could remove when they ended, and images that nobody needs.
+/// Removes orphaned compose projects and unused images.
 pub async fn run_cleanup(
     docker: Docker,
     owner: ResourceOwner,
@@ -58,11 +58,11 @@ pub async fn run_cleanup(
     let mut pause = Duration::ZERO;
     loop {
         actix_rt::time::timeout(pause, live.0.1.notified()).await.ok();
-        // Most has been removed by then.
+        // Most is removed by then without a sweep.
         actix_rt::time::sleep(AGAIN).await;
         pause = match tidy(&docker, &owner, &live).await {
             Ok(0) => PERIOD,
-            // What Docker was about to end when it was stopped appears one after the other.
+            // Containers that Docker was removing when it was stopped appear one by one.
             Ok(_) => AGAIN,
             Err(error) => {
                 log::debug!("containers that nobody uses are not removed yet: {error}");
@@ -93,7 +93,7 @@ async fn tidy(docker: &Docker, owner: &ResourceOwner, live: &ActiveProjects) -> 
     let left: Vec<String> = found.into_iter().filter(|name| !live.names().contains(name)).collect();
     let mut done = Ok(left.len());
     for name in left {
-        // One that can't be removed holds up no other.
+        // A failed removal does not stop the others.
         match owned_resources::remove(docker, &name).await {
             Ok(()) => log::info!("{name} was left: removed"),
             Err(error) => done = Err(error),

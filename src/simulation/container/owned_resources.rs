@@ -1,7 +1,7 @@
 //! What a server has in Docker: the containers of its simulations, found by the label that compose gives to all that it
 //! makes. There are no networks and no named volumes of theirs: templates that have some are refused.
 //!
-//! The names of its compose projects begin alike, so that what a server that has crashed left is found again.
+//! The names of its compose projects have a common prefix, so that the resources of a crashed server are found again.
 
 use std::collections::HashSet;
 use std::path::Path;
@@ -12,10 +12,10 @@ use sha2::{Digest, Sha256};
 use super::docker::{Docker, DockerError, SHORT};
 use crate::simulation::process::Run;
 
-/// The label by which compose knows its projects.
+/// The label with which compose marks its projects.
 pub const PROJECT: &str = "com.docker.compose.project";
 
-/// Whose compose projects and images some are: those of a server, or of one run of it. Their names begin alike.
+/// The owner of compose projects and images: a server, or one run of it. Their names have a common prefix.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ResourceOwner(String);
 
@@ -25,38 +25,38 @@ const SWEEP: Duration = Duration::from_secs(20);
 const REMOVE: [&str; 3] = ["rm", "--force", "--volumes"];
 
 impl ResourceOwner {
-    /// The server that has this cache folder, which no other one has.
+    /// The server with this cache directory, which only one server uses.
     #[must_use]
     pub fn of(cache: &Path) -> Self {
         let cache = cache.canonicalize().unwrap_or_else(|_| cache.to_owned());
         Self(format!("{:012x}", digest(cache.as_os_str().as_encoded_bytes()) >> 80))
     }
 
-    /// One run of this server: what the next one has is not its own.
+    /// One run of this server: resources of the next run have another owner.
     #[must_use]
     pub fn run(&self) -> Self {
         Self(format!("{}-{:08x}", self.0, rand::random::<u32>()))
     }
 
-    /// The name of an owner as [`Self::name`] gives it.
+    /// The owner with this name, from [`Self::name`].
     #[must_use]
     pub fn named(name: &str) -> Self {
         Self(name.to_owned())
     }
 
-    /// Its name.
+    /// Its name: 12 hexadecimal digits; for a run also `-` and 8 more.
     #[must_use]
     pub fn name(&self) -> &str {
         &self.0
     }
 
-    /// A name for the compose project of a simulation on this port.
+    /// A new name for the compose project of a simulation on this port.
     #[must_use]
     pub fn project(&self, port: u16) -> String {
         format!("{}{port}-{:08x}", self.prefix(), rand::random::<u32>())
     }
 
-    /// The port of the simulation whose compose project has this name, if it is one of this owner.
+    /// The port of the simulation with this compose project; `None` if it has another owner.
     #[must_use]
     pub fn port_of(&self, project: &str) -> Option<u16> {
         project.strip_prefix(&self.prefix())?.split('-').next()?.parse().ok()
@@ -78,7 +78,7 @@ impl ResourceOwner {
     }
 }
 
-/// A number that tells one text from all others.
+/// The first 128 bits of the SHA-256 of a text.
 #[must_use]
 pub fn digest(text: &[u8]) -> u128 {
     Sha256::digest(text).iter().take(16).fold(0, |number: u128, byte| (number << 8) | u128::from(*byte))
@@ -87,7 +87,7 @@ pub fn digest(text: &[u8]) -> u128 {
 /// Removes the containers of a project.
 ///
 /// # Errors
-/// When Docker fails; then something may be left.
+/// When Docker fails; then some resources may remain.
 pub async fn remove(docker: &Docker, project: &str) -> Result<(), DockerError> {
     let filter = format!("label={PROJECT}={project}");
     let listed = docker.run(&["ps", "--all", "--quiet", "--filter", &filter], SHORT).await?;
@@ -96,7 +96,7 @@ pub async fn remove(docker: &Docker, project: &str) -> Result<(), DockerError> {
         return Ok(());
     }
     match docker.run(&words, SHORT).await {
-        // Somebody else may have removed it meanwhile.
+        // Another process may have removed it.
         Err(DockerError::Failed { message, .. }) if message.to_lowercase().contains("no such") => Ok(()),
         Err(DockerError::Failed { message, .. }) if message.contains("already in progress") => Ok(()),
         done => done.map(drop),
@@ -116,7 +116,7 @@ pub fn sweep(owner: &ResourceOwner) {
     }
 }
 
-/// Runs docker within a time limit, and returns what it prints. Blocks.
+/// Runs docker with a timeout, and returns its output. Blocks.
 pub fn quietly(arguments: &[&str]) -> String {
     let run = Run::new(std::iter::once("docker").chain(arguments.iter().copied()), Path::new("/"), SWEEP);
     run.blocking(drop).map(|ran| String::from_utf8_lossy(&ran.answer).into_owned()).unwrap_or_default()

@@ -1,4 +1,4 @@
-//! Whether the packet filter is loaded that keeps containers off this machine and private addresses:
+//! Checks that the packet filter is loaded, which keeps containers off this machine and private addresses:
 //! `deploy/nftables/containers.nft`.
 
 use std::path::Path;
@@ -10,13 +10,13 @@ use crate::simulation::process::{ExitReason, Ran, Run, RunError};
 const TABLE: [&str; 5] = ["--terse", "list", "table", "inet", "webots_fleet"];
 /// The unit that loads it.
 const UNIT: [&str; 3] = ["is-active", "--quiet", "webots-fleet-packet-filter.service"];
-/// How long a program may take that is asked.
+/// Timeout of the `nft` or `systemctl` call.
 const PATIENCE: Duration = Duration::from_secs(5);
 
-/// Returns nothing where the packet filter is loaded, else what that means and how it is loaded, in one line. Only root may
-/// look; others are told by systemd whether its unit has run.
+/// Returns `None` if the packet filter is loaded, else the consequence and how to load it, in one line. Only root may
+/// list it; for other users systemd reports whether its unit has run.
 ///
-/// It runs a program, for five seconds at most: not for a thread that serves others.
+/// Blocks for five seconds at most, because it runs a program.
 #[must_use]
 pub fn missing() -> Option<String> {
     let is_root = nix::unistd::geteuid().is_root();
@@ -29,7 +29,7 @@ pub fn missing() -> Option<String> {
     ))
 }
 
-/// Whether a program ends in order, or why not.
+/// Whether a program exits with code 0, or why not.
 fn succeeds(program: &str, arguments: &[&str], patience: Duration) -> Result<(), String> {
     let name = || format!("'{program} {}'", arguments.join(" "));
     let command = std::iter::once(program).chain(arguments.iter().copied());

@@ -1,4 +1,4 @@
-//! Reads the files with which a project says how its containers are made.
+//! Reads the files with which a project configures its containers.
 
 use std::fs::{File, OpenOptions};
 use std::io::{self, Read};
@@ -7,13 +7,14 @@ use std::path::Path;
 
 use nix::fcntl::OFlag;
 
-/// What such a file may have at most, in bytes.
+/// Size limit of such a file, in bytes.
 const LARGEST: u64 = 256 * 1024;
 
-/// The text of a file, nothing where there is none. What is no plain file is refused: a link could lead anywhere.
+/// The text of a file; `None` if it does not exist. Anything but a regular file is refused: a symlink could resolve to
+/// any path.
 ///
 /// # Errors
-/// Why it can't be read, in words for the client.
+/// Why it can't be read, as text for the client.
 pub fn text_of(path: &Path) -> Result<Option<String>, String> {
     let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
     let flags = (OFlag::O_NOFOLLOW | OFlag::O_NONBLOCK).bits();

@@ -11,16 +11,16 @@ use super::opened;
 use super::start_error::{StartError, is_disk_full};
 use crate::simulation::checkout::Project;
 
-/// An image that is made from a project, or from a folder of it.
+/// An image that is built from a project, or from a directory of it.
 #[derive(Debug)]
 pub struct Part<'part> {
     /// The project.
     pub project: &'part Arc<Project>,
     /// The image of its version of Webots.
     pub base: &'part str,
-    /// The Dockerfile.
+    /// The text of the Dockerfile.
     pub text: &'part str,
-    /// The folder that it copies from, empty for the whole project.
+    /// The directory that it copies from; empty for the whole project.
     pub folder: &'part str,
     /// Whether the project has a Makefile.
     pub make: bool,
@@ -29,10 +29,10 @@ pub struct Part<'part> {
 }
 
 impl Images {
-    /// Builds an image of a project, unless it is there. Returns its name.
+    /// Builds an image of a project unless it exists. Returns its name.
     ///
     /// # Errors
-    /// Why it can't be built, in words for the client.
+    /// Why it can't be built, as text for the client.
     pub async fn of_project(
         self: &Arc<Self>,
         part: Part<'_>,
@@ -48,7 +48,7 @@ impl Images {
             arguments
                 .extend(["WEBOTS_CONTROLLER_URL=participant", "DEFAULT_CONTROLLER=participant"].map(str::to_owned));
         }
-        // The name of an image stays when what it names is updated.
+        // An image's name stays the same when the image is updated, so its id is part of the key.
         let mut bases = Vec::new();
         for image in dockerfile::bases(text, &arguments) {
             bases.push(self.pull(&image, progress).await?);
@@ -61,16 +61,16 @@ impl Images {
         let (file, text) = (dockerfile.clone(), text.to_owned());
         blocking(move || std::fs::write(file, text)).await?;
         let (root, folder) = (project.folder().to_owned(), folder.to_owned());
-        // What was copied out of an image may have put a link to anywhere in its place.
+        // A copy out of an image may have replaced it by a symlink to any path.
         let context = blocking(move || build_plan::inside(&root, &folder)).await?;
         let project = Arc::clone(project);
         self.build(Build { key, dockerfile, context, arguments, network, project }, progress).await
     }
 
-    /// Makes the image in which the server's user finds what the image's own user has at home.
+    /// Creates the image in which the server's user can read the home directory of the image's own user.
     ///
     /// # Errors
-    /// Why it can't be made, in words for the client.
+    /// Why it can't be created, as text for the client.
     pub async fn open_now(&self, image: &str, name: &str, project: &Project) -> Result<(), StartError> {
         let text = self.about(image).await?.dockerfile(self.owner.name());
         let context = project.instance.path().join(format!("opened-{}", opened::key(std::iter::once(name))));

@@ -1,4 +1,4 @@
-//! Where the parts of a project are.
+//! The paths of the parts of a project.
 
 use std::path::PathBuf;
 
@@ -7,10 +7,10 @@ use super::webots_yml::ProjectKind;
 use crate::shared::text::one_line;
 use crate::simulation::checkout::Project;
 
-/// The world's path in its project's folder.
+/// The world's path in its project's directory.
 ///
 /// # Errors
-/// When it is not there, in words for the client.
+/// When it does not exist, as text for the client.
 pub fn world_in(project: &Project) -> Result<String, String> {
     let outside = || "The world is behind a link that leads out of its project, which containers don't have".to_owned();
     let root = project.folder().canonicalize().map_err(|error| error.to_string())?;
@@ -26,25 +26,25 @@ pub fn world_in(project: &Project) -> Result<String, String> {
     inside.to_str().map(str::to_owned).ok_or_else(|| "The world's name is no text".to_owned())
 }
 
-/// The folder of the project, as containers are told of it.
+/// The directory of the project, as a mount for containers.
 ///
 /// # Errors
-/// When they can't be, in words for the client.
+/// When it can't be mounted, as text for the client.
 pub fn project_folder(project: &Project) -> Result<PathBuf, String> {
     project.folder().canonicalize().map_err(|error| error.to_string()).and_then(mountable)
 }
 
-/// The folder of a competition's participant. It is not in the project, where a world's program could put a link in its
-/// place before the controller is started anew.
+/// The directory of a competition's participant. It is not in the project, where a world's program could replace it by
+/// a symlink before the controller is restarted.
 #[must_use]
 pub fn participant_folder(project: &Project) -> PathBuf {
     project.instance.path().join("edited")
 }
 
-/// The folder that an editor shows.
+/// The directory that an editor shows.
 ///
 /// # Errors
-/// When it is not there, in words for the client.
+/// When it does not exist, as text for the client.
 pub fn edited_folder(kind: &ProjectKind, project: &Project) -> Result<Option<PathBuf>, String> {
     match kind {
         ProjectKind::Default => Ok(None),
@@ -56,7 +56,7 @@ pub fn edited_folder(kind: &ProjectKind, project: &Project) -> Result<Option<Pat
     }
 }
 
-/// The same as the project names it.
+/// The same directory, as the project names it.
 #[must_use]
 pub fn volume_of(kind: &ProjectKind) -> Option<&str> {
     match kind {
@@ -65,10 +65,10 @@ pub fn volume_of(kind: &ProjectKind) -> Option<&str> {
     }
 }
 
-/// Checks that compose can be told of a folder: it takes `:` for the end of a path, and a line break for that of a variable.
+/// Checks that compose can mount a directory: `:` would end its path, and a line break its variable.
 ///
 /// # Errors
-/// When not, in words for the client.
+/// When not, as text for the client.
 fn mountable(folder: PathBuf) -> Result<PathBuf, String> {
     let is_plain = |name: &str| !name.contains(|letter: char| letter == ':' || letter.is_control());
     if folder.to_str().is_some_and(is_plain) {

@@ -1,4 +1,4 @@
-//! Removes images of this server that nobody needs.
+//! Removes unused images of this server.
 
 use super::docker::{DockerError, SHORT};
 use super::dockerfile::LABEL;
@@ -13,7 +13,7 @@ impl Images {
     pub async fn prune(&self, hours: u64) -> Result<(), DockerError> {
         let (mine, old) = (format!("label={LABEL}={}", self.owner.name()), format!("until={hours}h"));
         let prune = ["image", "prune", "--force", "--filter", &mine, "--filter"];
-        // What a build that is under way makes is younger.
+        // The images of a build in progress are younger.
         for rest in [&["until=1h"][..], &[&old, "--all"]] {
             self.docker.run(&[&prune, rest].concat(), SHORT).await?;
         }

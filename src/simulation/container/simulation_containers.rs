@@ -1,4 +1,4 @@
-//! The containers of one simulation: made, and ready to be started. Whoever drops them gives them up to be removed.
+//! The containers of one simulation, created and ready to start. Dropping them leaves them to the orphan cleanup.
 
 use std::sync::Arc;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
@@ -19,40 +19,42 @@ pub struct SimulationContainers {
     lease: ProjectGuard,
     /// The container of each service.
     containers: Vec<(String, String)>,
-    /// Whether the project has made an image of theirs, which may be why Docker can't start one.
+    /// Whether the project has defined one of their images, which may be why Docker can't start one.
     is_projects: bool,
-    /// Texts that its client gets as they are.
+    /// Texts for its client, unchanged.
     pub texts: Vec<String>,
-    /// What its client should know.
+    /// Warnings for its client.
     pub warnings: Vec<String>,
-    /// Asks to start the participant's controller anew, where there is one.
+    /// Restarts the participant's controller; `None` if there is none.
     restart: Option<(Arc<Notify>, AbortOnDropHandle<()>)>,
 }
 
-/// The name of a compose project. As long as this lives, its containers are not taken for what somebody has left.
+/// The name of a compose project. Until this is dropped, its containers do not count as orphans.
 #[derive(Debug)]
 pub struct ProjectGuard {
-    /// The name.
+    /// The name; unique on this machine.
     pub name: String,
     live: ActiveProjects,
 }
 
-/// What has ended a container.
+/// The cause of a container's end.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Cause {
-    /// The kernel, because it took more memory than it may.
+    /// The kernel, because of the memory limit.
     OutOfMemory,
     /// Docker, which was stopped or has crashed.
     Docker,
-    /// Docker again, which could not start it, though no image is the project's.
+    /// Docker, which could not start it although the project has defined no image.
     NotStarted,
 }
 
-/// The exit codes of a program that was ended by SIGTERM or SIGKILL, as Docker ends all when it is stopped.
+/// The exit codes of a program that was ended by SIGTERM or SIGKILL, which Docker sends to all containers when it is
+/// stopped.
 const ENDED_BY_SIGNAL: [i32; 2] = [128 + 15, 128 + 9];
-/// How long before now Docker is asked for the end of a container, and after now: it answers when that has passed.
+/// The range of Docker's events that is queried for the end of a container, before and after now: Docker answers at the
+/// end of the range.
 const EVENTS: (Duration, Duration) = (Duration::from_mins(1), Duration::from_millis(100));
-/// The time between two starts of a participant's controller, at least.
+/// Shortest time between two restarts of a participant's controller.
 const BETWEEN_RESTARTS: Duration = Duration::from_secs(1);
 /// The service of a participant's controller.
 const CONTROLLER: &str = "controller";
@@ -60,7 +62,7 @@ const CONTROLLER: &str = "controller";
 const WEBOTS: &str = "webots";
 
 impl Cause {
-    /// Whether it is this server's fault, so that another one may take the client.
+    /// Whether this server is the cause, so that another one may accept the client.
     #[must_use]
     pub fn is_own(self) -> bool {
         self != Self::OutOfMemory
@@ -68,7 +70,7 @@ impl Cause {
 }
 
 impl ProjectGuard {
-    /// Takes a name.
+    /// Marks a name as in use.
     #[must_use]
     pub fn take(name: String, live: &ActiveProjects) -> Self {
         live.insert(&name);
@@ -83,8 +85,8 @@ impl Drop for ProjectGuard {
 }
 
 impl SimulationContainers {
-    /// The containers of a project that was made: pairs of service and container. `is_projects` says whether the project has
-    /// made an image of theirs.
+    /// The containers of a compose project that was created: pairs of service and container. `is_projects` tells
+    /// whether the project has defined one of their images.
     #[must_use]
     pub fn new(
         docker: Docker,
@@ -101,18 +103,18 @@ impl SimulationContainers {
         self.containers.iter().find(|(name, _)| name == service).map(|(_, container)| container.as_str())
     }
 
-    /// The process that starts Webots' container, prints what that prints, and ends with its exit code.
+    /// The process that starts Webots' container, prints its output, and exits with its exit code.
     #[must_use]
     pub fn spawn_spec(&self, grace: Duration) -> SpawnSpec {
         let webots = self.of(WEBOTS).unwrap_or_default();
         self.docker.spec(["docker", "start", "--attach", webots].map(Into::into).to_vec(), grace)
     }
 
-    /// Starts what runs beside Webots. It must be before Webots: nothing that a world's program makes in its folder can
-    /// lead these astray.
+    /// Starts the other services. That must happen before Webots is started, so that no symlink of a world's program
+    /// can redirect their mounts.
     ///
     /// # Errors
-    /// When Docker fails, and whose fault it is.
+    /// When Docker fails, with the project or this server as the cause.
     pub async fn start_others(&mut self) -> Result<(), StartError> {
         let others =
             self.containers.iter().filter(|(service, _)| service != WEBOTS).map(|(_, container)| container.as_str());
@@ -128,7 +130,7 @@ impl SimulationContainers {
         Ok(())
     }
 
-    /// Asks to start the participant's controller anew, as the original does when Webots was reset.
+    /// Restarts the participant's controller on notification, as the original does when Webots was reset.
     #[must_use]
     pub fn restart(&self) -> Option<Arc<Notify>> {
         self.restart.as_ref().map(|(asked, _)| Arc::clone(asked))
@@ -158,15 +160,15 @@ impl SimulationContainers {
         match state.split_whitespace().collect::<Vec<_>>().as_slice() {
             ["true", ..] => Some(Cause::OutOfMemory),
             [_, "created", _] => (!self.is_projects).then_some(Cause::NotStarted),
-            // The program has lost its daemon.
+            // The program has lost the connection to the daemon.
             [_, _, ended] if *ended != code.to_string() => Some(Cause::Docker),
             _ if ENDED_BY_SIGNAL.contains(&code) => self.was_stopped(webots).await.then_some(Cause::Docker),
             _ => None,
         }
     }
 
-    /// Whether Docker has ended a container, or has been started anew since its end. A daemon that has seen a container end
-    /// by itself tells of that end alone.
+    /// Whether Docker has stopped a container, or was restarted after its end. A daemon that has seen a container exit
+    /// by itself reports only that exit.
     async fn was_stopped(&self, container: &str) -> bool {
         let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
         let [since, until] = [now.saturating_sub(EVENTS.0), now + EVENTS.1]
@@ -185,7 +187,7 @@ impl SimulationContainers {
     }
 }
 
-/// Starts a container anew whenever that is asked for, one time after the other.
+/// Restarts a container on each notification, one restart at a time.
 async fn restart_when_asked(docker: Docker, container: String, asked: Arc<Notify>) {
     loop {
         asked.notified().await;

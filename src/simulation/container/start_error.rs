@@ -2,19 +2,20 @@
 
 use super::docker::DockerError;
 
-/// Why the containers of a simulation could not be started, in words for the client.
+/// The cause, as text for the client.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum StartError {
-    /// The project is at fault: no other server could start it.
+    /// The project is the cause: no other server could start it.
     #[error("{0}")]
     Project(String),
-    /// This server is at fault, its Docker or its disk: another one may take the client.
+    /// This server is the cause, its Docker or its disk: another one may accept the client.
     #[error("{0}")]
     Server(String),
 }
 
 impl StartError {
-    /// What Docker answers about an image that the project has made: it is at fault, unless the disk is full.
+    /// An error of Docker with an image that the project has defined: the project is the cause, unless the disk is
+    /// full.
     #[must_use]
     pub fn of_project(error: DockerError) -> Self {
         match &error {
@@ -24,14 +25,14 @@ impl StartError {
     }
 }
 
-/// Whose fault it is that Docker fails with the containers of a simulation. `is_projects` says whether the project has made
-/// an image of theirs.
+/// The cause if Docker fails with the containers of a simulation. `is_projects` tells whether the project has defined
+/// one of their images.
 #[must_use]
 pub fn blame(is_projects: bool, error: DockerError) -> StartError {
     if is_projects { StartError::of_project(error) } else { error.into() }
 }
 
-/// Whether Docker says that the disk is full. Only the end of its words counts: a project's names may be in them.
+/// Whether Docker reports a full disk. Only the end of the message counts, because it may contain names of the project.
 #[must_use]
 pub fn is_disk_full(message: &str) -> bool {
     message.ends_with("no space left on device")

@@ -1,21 +1,21 @@
-//! What Docker prints while it makes an image, in words for a client. Pure.
+//! Docker's output while it creates an image, as text for a client. Pure.
 //!
-//! Webots' page moves its bar by texts such as `Step 3/9 : ...`, in which each number has one digit, by `Creating network`,
-//! and by one that ends in `done`.
+//! Webots' page moves its progress bar by texts such as `Step 3/9 : ...`, in which each number has one digit, by
+//! `Creating network`, and by one that ends in `done`.
 
 /// The largest number of steps that the page understands.
 const STEPS: u64 = 9;
 
-/// The network is joined and the containers are made.
+/// The step in which the network is joined and the containers are created.
 pub const CREATING: &str = "Creating network and containers";
 
-/// An image is fetched, and Docker says this.
+/// The step of a pull, with Docker's output line.
 #[must_use]
 pub fn pulling(image: &str, said: &str) -> String {
     format!("Step 1/9 : fetching {image}: {said}")
 }
 
-/// Lines of a build that tell nobody anything.
+/// Lines of a build that are not shown.
 const NOISE: [&str; 6] = [
     " --->",
     "Removing intermediate container",
@@ -25,7 +25,7 @@ const NOISE: [&str; 6] = [
     "            environment-variable",
 ];
 
-/// An image is built, and Docker says this. Of its steps the page understands nine.
+/// The step of a build, from Docker's output line; `None` if it is not shown. The page supports nine steps.
 #[must_use]
 pub fn building(said: &str) -> Option<String> {
     if NOISE.iter().any(|beginning| said.starts_with(beginning)) {

@@ -1,4 +1,4 @@
-//! The templates for compose and Dockerfiles: those that come with this server, and the administrator's in their place.
+//! The templates for compose and Dockerfiles: the built-in ones, and the administrator's, which replace them.
 
 use std::borrow::Cow;
 use std::collections::BTreeMap;
@@ -11,28 +11,28 @@ use serde::de::IgnoredAny;
 use super::webots_yml::ProjectKind;
 use crate::simulation::config::ContainerSettings;
 
-/// A file that comes with this server.
+/// Embeds a built-in template.
 macro_rules! shipped {
     ($name:literal) => {
         ($name, include_str!(concat!("../../../config/simulation/docker/", $name)))
     };
 }
 
-/// Where templates are looked for.
+/// The source of templates.
 #[derive(Debug, Clone)]
 pub struct Templates {
-    /// The administrator's folder.
+    /// The administrator's directory.
     pub folder: Option<PathBuf>,
-    /// Whether the variants for those who look for a fault are taken.
+    /// Whether the debug variants are used.
     pub debug: bool,
 }
 
 /// A template for compose.
 #[derive(Debug)]
 pub struct Template {
-    /// The file as it is.
+    /// The unchanged file.
     pub text: Cow<'static, str>,
-    /// Its services, and whether each says what it runs.
+    /// Its services, and whether each has a command.
     pub services: BTreeMap<String, bool>,
 }
 
@@ -40,7 +40,7 @@ pub struct Template {
 pub const DOCKERFILE: &str = "Dockerfile.default";
 /// The Dockerfile of a competition's controllers that have none.
 pub const CONTROLLER: &str = "Dockerfile.controller";
-/// What runs a participant's controller.
+/// The launcher of a participant's controller.
 pub const LAUNCHER: &str = "remote_controller_launcher.py";
 
 /// The part of a compose file that this server reads.
@@ -56,13 +56,13 @@ struct Service {
 }
 
 impl Templates {
-    /// Those of a configuration.
+    /// The templates of a configuration.
     #[must_use]
     pub fn of(settings: &ContainerSettings) -> Self {
         Self { folder: settings.templates.as_ref().map(|folder| folder.0.clone()), debug: settings.debug }
     }
 
-    /// What is wrong with the administrator's files, with the line and what to write there.
+    /// The problems of the administrator's files, with the line and what to write there.
     #[must_use]
     pub fn faults(&self) -> Vec<String> {
         let Some(folder) = &self.folder else { return Vec::new() };
@@ -81,10 +81,10 @@ impl Templates {
         faults.chain(files.iter().filter_map(unreadable)).collect()
     }
 
-    /// The template for what a project asks for.
+    /// The template for what a project requests.
     ///
     /// # Errors
-    /// Why it can't be read, in words for the client.
+    /// Why it can't be used, as text for the client.
     pub fn compose(&self, kind: &ProjectKind) -> Result<Template, String> {
         let kind = match kind {
             ProjectKind::Default => "default",
@@ -140,10 +140,10 @@ const UNSUITABLE: [(&str, &str); 5] = [
     ("reservations:", "container.gpu gives graphics cards where there are some: leave it out"),
 ];
 
-/// The first line of a template that can't work here, and what to write there.
+/// The first line of a template that does not work here, and what to write there.
 fn unsuitable(text: &str) -> Option<String> {
     text.lines().enumerate().find_map(|(index, line)| {
-        // Services mount folders below the same word.
+        // Services have an indented key of the same name for their mounts.
         let (_, advice) = UNSUITABLE.iter().find(|(key, _)| match *key {
             "volumes:" | "networks:" => line.starts_with(key),
             key => line.trim_start().starts_with(key),
@@ -152,7 +152,7 @@ fn unsuitable(text: &str) -> Option<String> {
     })
 }
 
-/// The files that come with this server.
+/// The built-in templates.
 const SHIPPED: [(&str, &str); 9] = [
     shipped!("docker-compose-default.yml"),
     shipped!("docker-compose-default-debug.yml"),

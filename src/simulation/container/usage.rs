@@ -1,4 +1,5 @@
-//! What the containers of simulations take: from their control groups, else from `docker stats`, once for all.
+//! The resource usage of the containers of simulations: from their control groups, else from `docker stats`, once for
+//! all.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -28,7 +29,7 @@ pub fn measure(owner: &ResourceOwner, roots: &BTreeMap<u16, i32>) -> Vec<(i32, M
     }
 }
 
-/// The readings of a simulation's containers together.
+/// The sum of the readings of a simulation's containers.
 fn together<T: Default>(readings: Vec<(i32, T)>, add: impl Fn(&mut T, T)) -> impl Iterator<Item = (i32, T)> {
     let mut all = BTreeMap::<i32, T>::new();
     for (root, reading) in readings {
@@ -46,7 +47,7 @@ fn add_usage(all: &mut Usage, one: Usage) {
     *all = Usage { cpu, memory: all.memory + one.memory, threads: all.threads + one.threads, time: Duration::ZERO };
 }
 
-/// What Docker says of these containers.
+/// The usage of these containers from `docker stats`.
 fn statistics(containers: &BTreeMap<&str, i32>) -> Vec<(i32, Usage)> {
     let format = "{{.ID}}\t{{.CPUPerc}}\t{{.MemUsage}}\t{{.PIDs}}";
     let words = ["stats", "--no-stream", "--no-trunc", "--format", format];

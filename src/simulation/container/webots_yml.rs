@@ -1,12 +1,12 @@
-//! What a project asks for in its `webots.yml`, else `webots.yaml`.
+//! What a project requests in its `webots.yml`, else `webots.yaml`.
 //!
-//! | asked for | for what |
+//! | line | meaning |
 //! |---|---|
-//! | `dockerCompose: theia:webots-project/controllers/edit` | an editor of that folder beside Webots |
-//! | `dockerCompose: competition:webots-project/controllers/participant` | a competition, whose participant's folder that is |
-//! | `type: demo` | told to the web client |
+//! | `dockerCompose: theia:webots-project/controllers/edit` | an editor of that directory beside Webots |
+//! | `dockerCompose: competition:webots-project/controllers/participant` | a competition, with the participant's directory |
+//! | `type: demo` | sent to the web client |
 //!
-//! It is read line by line, as the original does: real files have lines that are no YAML, such as
+//! It is parsed line by line, as in the original: existing files have lines that are not YAML, such as
 //! `dockerCompose:theia:webots-project/controllers/`.
 
 use std::path::{Path, PathBuf};
@@ -14,41 +14,41 @@ use std::path::{Path, PathBuf};
 use super::project_file::text_of;
 use crate::shared::text::excerpt;
 
-/// The names of the file, the first that is there counts.
+/// The names of the file; the first one that exists counts.
 const NAMES: [&str; 2] = ["webots.yml", "webots.yaml"];
-/// What a line of the type and a folder may have at most, in bytes.
+/// Size limit of the line of the type, and of a directory, in bytes.
 const LENGTH: usize = 200;
-/// What is shown of a value in a warning, in letters.
+/// Longest excerpt of a value in a warning, in characters.
 const SHOWN: usize = 60;
-/// The first part of each folder: it stands for the project.
+/// The first component of each directory, which means the project.
 const PROJECT: &str = "webots-project";
-/// Where projects lie in a container. Some write this out, as a path that leads up to the root first.
+/// The parent of projects in a container. Some files contain it, as a path that goes up to the root first.
 const ABOVE_PROJECT: &str = "usr/local/";
-/// What may be asked for, in words.
+/// What may be requested, as text.
 const ALLOWED: &str =
     "theia:webots-project/FOLDER for an editor or competition:webots-project/FOLDER for a competition";
 
 /// What runs beside Webots.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub enum ProjectKind {
-    /// Nothing.
+    /// No other program.
     #[default]
     Default,
-    /// An editor of a folder of the project.
+    /// An editor of a directory of the project.
     Editor {
-        /// The folder, such as `webots-project/controllers/edit/`.
+        /// The directory, such as `webots-project/controllers/edit/`.
         folder: String,
     },
     /// The controller of a participant.
     Competition {
-        /// The folder of the participant, such as `webots-project/controllers/participant/`.
+        /// The directory of the participant, such as `webots-project/controllers/participant/`.
         folder: String,
     },
 }
 
 impl ProjectKind {
-    /// The folder below the project's own, such as `controllers/edit`. It may be missing there, or be a link to anywhere:
-    /// nobody has looked yet.
+    /// The directory below the project's own, such as `controllers/edit`. It is not checked yet: it may be missing, or
+    /// be a symlink to any path.
     #[must_use]
     pub fn folder_in_project(&self) -> Option<PathBuf> {
         let (Self::Editor { folder } | Self::Competition { folder }) = self else { return None };
@@ -56,7 +56,7 @@ impl ProjectKind {
     }
 }
 
-/// What a project asks for.
+/// What a project requests.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct WebotsYml {
     /// What runs beside Webots.
@@ -64,13 +64,12 @@ pub struct WebotsYml {
     /// The message to the web client with the simulation's type, such as `type:demo` and a line end: the line without its
     /// spaces, as the original sends it.
     pub project_type: Option<String>,
-    /// What is wrong with the file, in words for its author, each in one line.
+    /// The problems of the file, as text for its author, one line each.
     pub warnings: Vec<String>,
 }
 
 impl WebotsYml {
-    /// Reads the file of a project; a project without one asks for nothing. Reads from disk: not for a thread that serves
-    /// others.
+    /// Reads the file of a project; a project without one requests nothing. Blocks.
     #[must_use]
     pub fn read(project: &Path) -> Self {
         for name in NAMES {
@@ -83,7 +82,7 @@ impl WebotsYml {
         Self::default()
     }
 
-    /// Reads the text of a file.
+    /// Parses the text of a file.
     #[must_use]
     pub fn parse(text: &str) -> Self {
         let text = text.trim_start_matches('\u{feff}');
@@ -105,7 +104,7 @@ impl WebotsYml {
     }
 }
 
-/// The kind that the value of `dockerCompose` asks for, such as `theia:webots-project/controllers`.
+/// The kind that the value of `dockerCompose` requests, such as `theia:webots-project/controllers`.
 fn kind_of(value: &str) -> Result<ProjectKind, String> {
     let value = value.split_once(" #").map_or(value, |(value, _comment)| value).trim();
     let quoted = |quote| value.strip_prefix(quote)?.strip_suffix(quote);

@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
 
-/// A file that Webots does not have. A request for `/` would begin a WebSocket.
+/// A request for a file that Webots does not have. A request for `/` would open a WebSocket.
 const REQUEST: &[u8] = b"GET /robots.txt HTTP/1.0\r\nHost: localhost\r\n\r\n";
 /// Bounds of the pause between two requests.
 const PAUSE: (Duration, Duration) = (Duration::from_millis(5), Duration::from_millis(500));
@@ -17,7 +17,7 @@ const PAUSE: (Duration, Duration) = (Duration::from_millis(5), Duration::from_mi
 const PART: u32 = 20;
 /// Timeout of the first request: the proxy may accept it before anything inside listens.
 const FIRST_TIMEOUT: Duration = Duration::from_millis(100);
-/// Timeout that later ones approach: Webots answers none while it reads a world.
+/// Longest timeout of later ones: Webots answers none while it reads a world.
 const TIMEOUT: Duration = Duration::from_secs(2);
 
 /// Waits until there is an answer at this address. A container has to run: a request before it has its address holds all
