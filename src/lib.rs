@@ -32,7 +32,7 @@
 //! Imports point down only, in the order that `tests/project/layering.rs` lists. `session` and `simulation` never see each
 //! other. A child never names its parent: it is given a `Recipient` of its events, which are defined in the child's file.
 //!
-//! # Who talks to whom
+//! # Messages between actors
 //!
 //! ```text
 //! session server
@@ -63,7 +63,7 @@
 //! The [`session::fleet::Registry`] alone decides availability: it receives every report and every pick. A
 //! [`simulation::webots::Webots`] owns its process group, its instance directory and the lease of its slot through
 //! guards, so that all three are freed in any state, even after a panic. One [`simulation::process::guardian`] process
-//! ends everything that the simulation server has started once the server is gone, whatever ended it.
+//! ends everything that the simulation server has started once the server has exited for any reason.
 //! One `simulation::isolation::Watcher` measures what each simulation uses, and finds the ports on which starting
 //! simulations listen.
 //!
@@ -90,8 +90,7 @@
 //! 3. When the system ends, an actor is dropped without `stopped`. Only `Drop` always runs.
 //! 4. tokio's `kill_on_drop` reaches the direct child only; Webots' launcher has a child of its own.
 //! 5. If the peer of a WebSocket does not read, its actor is not polled once the buffers are full: such a connection
-//! must be
-//! |   closed before that, see [`shared::http::liveness`].
+//!    must be closed before that, see [`shared::http::liveness`].
 
 pub mod session;
 pub mod shared;

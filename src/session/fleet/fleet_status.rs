@@ -71,7 +71,7 @@ pub enum ServerState {
     Up,
     /// Its load leaves no room for one more client, or it has no free slot.
     Full,
-    /// It accepts no new clients, because it or the configuration drains it.
+    /// It accepts no new clients: it drains itself, the configuration drains it, or no name resolves to it any more.
     Draining,
     /// Its last probe failed.
     Down,

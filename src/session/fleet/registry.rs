@@ -92,7 +92,7 @@ impl Registry {
         self.reevaluate(turned);
     }
 
-    /// Evaluates the last reports of these servers again, because a threshold or `drainedServers` has changed.
+    /// Evaluates the last reports of these servers again, because a threshold has changed, or whether they are drained.
     fn reevaluate(&mut self, servers: Vec<PublicAddress>) {
         for server in servers {
             let record = self.servers.get(&server);
