@@ -10,7 +10,7 @@
 //!
 //! | to the client (text) | |
 //! |---|---|
-//! | `session: ID` | the id of the simulation, by which the administrator finds it |
+//! | `session: ID` | the id of the simulation, for the administrator |
 //! | `queue: N` | N clients are ahead in the queue |
 //! | `ide: enable` | the project has an editor, on Webots' port + 500 |
 //! | `type:TYPE` | the project's type in its `webots.yml` |

@@ -87,7 +87,7 @@ impl Monitors {
         }
     }
 
-    /// Starts monitors in place of those that have panicked.
+    /// Replaces monitors that have panicked.
     ///
     /// # Errors
     /// When there were too many panics.

@@ -89,7 +89,7 @@ impl NameTable {
         Some(NameChange { servers, turn })
     }
 
-    /// The servers that these entries stand for, in their order, each once.
+    /// The servers of these entries, in their order, without duplicates.
     pub fn servers(&self, entries: &[ServerEntry]) -> Vec<PublicAddress> {
         let mut seen = BTreeSet::new();
         let mut servers = Vec::new();

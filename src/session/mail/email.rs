@@ -87,7 +87,7 @@ impl Composer {
 }
 
 impl EmailComposer {
-    /// Composes e-mails as the configuration says.
+    /// Creates a composer from the configuration.
     ///
     /// # Errors
     /// When it names no administrator or sender.

@@ -144,7 +144,7 @@ impl ProjectUrl {
         self.segments.get(self.reference..).unwrap_or_default()
     }
 
-    /// What the URL says of its reference.
+    /// The kind of reference that the URL names.
     pub fn kind(&self) -> RefKind {
         self.kind
     }

@@ -50,7 +50,7 @@ impl<K: Ord + Display, A: Actor> Supervisor<K, A> {
         self.actors.values()
     }
 
-    /// Starts actors in place of those that have panicked.
+    /// Replaces actors that have panicked.
     ///
     /// # Errors
     /// When there were too many panics.
