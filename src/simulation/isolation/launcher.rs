@@ -39,7 +39,7 @@ pub enum IsolationLevel {
 pub enum IsolationError {
     /// A level.
     #[error("isolation is \"sandbox\", but {0}; \"none\" runs worlds without it")]
-    IsolationLevel(String),
+    Level(String),
     /// A network of simulations' own.
     #[error("sandbox.network is \"own\" or \"closed\", but {0}; \"shared\" runs worlds in the machine's network")]
     Network(String),
@@ -66,7 +66,7 @@ enum Method {
     /// Without a wrapper.
     Plain,
     /// In a sandbox.
-    Sandbox(Sandbox),
+    Sandbox(Box<Sandbox>),
     /// In a container, which is not started here.
     Container,
 }
@@ -95,9 +95,9 @@ impl Launcher {
         let (method, shortcoming) = match config.isolation {
             IsolationSetting::None => (Method::Plain, None),
             IsolationSetting::Container => (Method::Container, None),
-            IsolationSetting::Sandbox => (Method::Sandbox(sandbox().map_err(IsolationError::IsolationLevel)?), None),
+            IsolationSetting::Sandbox => (Method::Sandbox(Box::new(sandbox().map_err(IsolationError::Level)?)), None),
             IsolationSetting::Auto => match sandbox() {
-                Ok(sandbox) => (Method::Sandbox(sandbox), None),
+                Ok(sandbox) => (Method::Sandbox(Box::new(sandbox)), None),
                 Err(why) => (Method::Plain, Some(why)),
             },
         };
