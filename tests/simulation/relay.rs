@@ -522,8 +522,11 @@ async fn nobody_watches_without_the_password() {
     let (client, _) = stage.start().await;
     let watch = format!("/watch?id={}", client.id());
     assert_eq!(http::get(&stage.server.url(&watch)).await.status, 401);
-    let page = http::get(&stage.server.url("/monitor")).await.text();
-    assert!(page.contains(&format!("href=\"{}\"", &watch[1..])), "{page}");
+    let link = format!("href=\"{}\"", &watch[1..]);
+    assert!(!http::get(&stage.server.url("/monitor")).await.text().contains(&link));
+    let asked = awc::Client::new().get(stage.server.url("/monitor")).basic_auth("admin", "open sesame");
+    let page = asked.send().await.unwrap().body().limit(1 << 20).await.unwrap();
+    assert!(String::from_utf8_lossy(&page).contains(&link), "{page:?}");
     let ask = async |id: &str, password: &str| {
         let asked = awc::Client::new().get(stage.server.url(&format!("/watch?id={id}")));
         asked.basic_auth("admin", password).send().await.unwrap().status().as_u16()
