@@ -23,11 +23,14 @@
 //! | [`simulation::ends`] | how simulations have ended: counter, table, kept output |
 //! | [`simulation::webots`] | one running Webots |
 //! | [`simulation::client`] | one web client, the session of its simulation |
+//! | [`simulation::slots`] | the slots that clients wait for: leases, the queue, shares |
+//! | [`simulation::sessions`] | how a connection is attached to its session, and how a client resumes it |
+//! | [`simulation::streams`] | the streams of running simulations: which token leads to which, who watches |
+//! | `simulation::relay` | a stream between a client and the port of its Webots |
 //! | `simulation::web` | routes and pages of the simulation server |
 //!
 //! Each server also has a folder `config` (every key), its `app` (start and end) and its `state` (what its paths share). Files
-//! of `simulation` are the wire [`protocol`](simulation::protocol), the [`slots`](simulation::slots) that clients wait for,
-//! the `snapshot` of them, the `simulation_id`, `who` a client is, the `failed_starts`, the `announcer` (key `notify`), `preflight` (`--check`) and `readiness` (`/health`).
+//! of `simulation` are the wire [`protocol`](simulation::protocol), the `snapshot` of all simulations, the `simulation_id`, `who` a client is, the `failed_starts`, the `announcer` (key `notify`), `preflight` (`--check`) and `readiness` (`/health`).
 //! The programs are in `src/bin`.
 //! Imports point down only, in the order that `tests/project/layering.rs` lists. `session` and `simulation` never see each
 //! other. A child never names its parent: it is given a `Recipient` of its events, which are defined in the child's file.

@@ -17,7 +17,7 @@ use super::slots::{GetSnapshot, SlotPool};
 use super::state::AppState;
 use crate::shared::domain::AdmissionRules;
 use crate::shared::http::server::{self, HttpServerOptions};
-use crate::shared::http::{BasicAuth, ConnectionLimiter, LiveUpdates, Metrics};
+use crate::shared::http::{BasicAuth, ConnectionLimiter, LiveUpdates, Metrics, STREAMS_PER_CLIENT, TCP_PER_CLIENT};
 use crate::shared::run::{
     AppError, Phase, ServerCommand, Signals, permanent, raise_open_files, service_manager, start,
 };
@@ -35,9 +35,6 @@ const POLL_INTERVAL: Duration = Duration::from_millis(50);
 
 /// Open files that the server itself needs: logs, threads, pages.
 const OWN_FILES: usize = 128;
-
-/// Connections per client: browsers load pages beside their WebSocket.
-const CONNECTIONS_PER_CLIENT: usize = 2;
 
 /// Largest number of open files of a simulation, besides its client's connection: pipes and processes of git and
 /// Webots, its log.
@@ -88,7 +85,7 @@ fn bound_clients(config: &SimulationConfig) -> Result<usize, AppError> {
     let places = config.max_connections;
     let needed = OWN_FILES + FILES_PER_SIMULATION * usize::from(places);
     // What is relayed has a connection on either side.
-    let each = if config.ports_are_public() { CONNECTIONS_PER_CLIENT } else { 2 * CONNECTIONS_PER_CLIENT };
+    let each = if config.ports_are_public() { TCP_PER_CLIENT } else { 2 * TCP_PER_CLIENT };
     let wanted = config.max_clients.saturating_mul(each).saturating_add(needed);
     let files = raise_open_files(u64::try_from(wanted).unwrap_or(u64::MAX));
     let rest = usize::try_from(files).unwrap_or(usize::MAX).saturating_sub(needed);
@@ -185,9 +182,10 @@ fn bind(config: &SimulationConfig) -> Result<TcpListener, AppError> {
     server::listen(address).map_err(|source| AppError::Bind { address, source })
 }
 
-/// Limit of TCP connections: those of clients, and the same number for pages and other requests.
+/// Limit of TCP connections: those of clients, the same number for pages and other requests, and what is relayed.
 fn max_tcp(config: &SimulationConfig) -> usize {
-    config.max_clients.saturating_mul(CONNECTIONS_PER_CLIENT)
+    let streams = if config.ports_are_public() { 0 } else { STREAMS_PER_CLIENT };
+    config.max_clients.saturating_mul(TCP_PER_CLIENT + streams)
 }
 
 /// Creates the server's state, and starts its actors.

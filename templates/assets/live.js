@@ -44,6 +44,8 @@ function fill(row, html) {
   const before = cells.get(row) ?? [];
   const after = parsed(html);
   cells.set(row, after.map((cell) => cell.outerHTML));
+  while (row.children.length > after.length)
+    row.lastElementChild.remove();
   after.forEach((cell, column) => {
     if (before[column] === cell.outerHTML)
       return;

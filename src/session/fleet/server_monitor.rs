@@ -207,20 +207,25 @@ impl Handler<Stop> for ServerMonitor {
 }
 
 async fn probe(client: &awc::Client, url: &str, load_only: bool) -> Result<Answer, ProbeError> {
-    if !load_only && let Some(body) = get(client, &format!("{url}/status")).await? {
+    if !load_only && let Some((body, _)) = get(client, &format!("{url}/status")).await? {
         return parse_status(&body).map(Answer::Status);
     }
     let body = get(client, &format!("{url}/load")).await?;
-    let bytes = body.ok_or_else(|| ProbeError::BadAnswer("it has neither /status nor /load".to_owned()))?;
+    let (bytes, has_length) =
+        body.ok_or_else(|| ProbeError::BadAnswer("it has neither /status nor /load".to_owned()))?;
+    // awc takes the end of the connection for the end of the body: 95.5 may be 9. JSON that is cut off is none.
+    if !has_length {
+        return Err(ProbeError::BadAnswer("an answer without Content-Length".to_owned()));
+    }
     let load = Load::parse(&bytes).map_err(|error| ProbeError::BadAnswer(shortened(&error.to_string())))?;
     plausible(load).map(Answer::Load)
 }
 
-/// Returns the body of a page, `None` if the server has no such page.
+/// Returns the body of a page and whether its length was announced, `None` if the server has no such page.
 ///
 /// # Errors
 /// When there is no answer, or one that is neither.
-async fn get(client: &awc::Client, url: &str) -> Result<Option<Bytes>, ProbeError> {
+async fn get(client: &awc::Client, url: &str) -> Result<Option<(Bytes, bool)>, ProbeError> {
     let answer = match client.get(url).send().await {
         // A kept connection may have been closed, which is not a fault of the server.
         Err(error) if is_broken(&error) => client.get(url).send().await,
@@ -241,9 +246,7 @@ async fn get(client: &awc::Client, url: &str) -> Result<Option<Bytes>, ProbeErro
         Some(length) if bytes.len() < length => {
             Err(ProbeError::BadAnswer(format!("{} of {length} bytes", bytes.len())))
         }
-        Some(_) => Ok(Some(bytes)),
-        // awc takes the end of the connection for the end of the body: 95.5 may be 9.
-        None => Err(ProbeError::BadAnswer("an answer without Content-Length".to_owned())),
+        length => Ok(Some((bytes, length.is_some()))),
     }
 }
 

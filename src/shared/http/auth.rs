@@ -89,8 +89,15 @@ pub fn refuse_action(auth: Option<&BasicAuth>, request: &HttpRequest, peer: Peer
 
 /// Whether a page shows what only administrators may see: the request brings the password. With another one, which may be
 /// meant for a web server in front, the page is as everybody sees it.
-pub fn is_administrator(auth: Option<&BasicAuth>, request: &HttpRequest, peer: Peer) -> bool {
-    auth.is_some_and(|auth| auth.check(request, peer).is_ok())
+///
+/// # Errors
+/// When `peer` has sent too many passwords: the page must not pass for that of a stranger.
+pub fn is_administrator(auth: Option<&BasicAuth>, request: &HttpRequest, peer: Peer) -> Result<bool, AuthError> {
+    match auth.map(|auth| auth.check(request, peer)) {
+        Some(Ok(())) => Ok(true),
+        Some(Err(AuthError::TooMany)) => Err(AuthError::TooMany),
+        Some(Err(AuthError::NoPassword)) | None => Ok(false),
+    }
 }
 
 /// The password that a request brings, with whatever user name.

@@ -1,5 +1,5 @@
 //! A client's TCP connection that reads the next request only once the answer to the one before has begun, and none
-//! once the server stops.
+//! once the server stops. A request may have a body of up to 8 KiB.
 //!
 //! actix decodes all requests that it has read before it answers the first. Without this limit, a client that sends
 //! many requests and reads no answer would fill the memory.

@@ -25,10 +25,11 @@ pub enum ConnectionKind {
     Stream,
 }
 
-/// TCP connections of an address for each client that it may have: browsers open several.
-const TCP_PER_CLIENT: usize = 2;
-/// How much may be relayed at once for each client that there may be: a stream, and the files of a scene.
-const STREAMS_PER_CLIENT: usize = 2;
+/// TCP connections of an address for each client that it may have, at least: browsers open several.
+pub const TCP_PER_CLIENT: usize = 2;
+/// Limit of what is relayed at once for each client that there may be: a stream, and the files of a scene, of which
+/// browsers load six at a time.
+pub const STREAMS_PER_CLIENT: usize = 7;
 /// How many web clients an address may have at most where the configuration does not say it.
 const MOST_CLIENTS: usize = 1000;
 /// Limit of pages that listen to `/events`.
@@ -90,11 +91,15 @@ impl ConnectionLimiter {
     pub fn admit(&self, kind: ConnectionKind, peer: Peer) -> Result<ConnectionPermit, ConnectionLimitError> {
         let (max, max_per_address) = match kind {
             ConnectionKind::Tcp => {
-                let wanted = self.per_address.saturating_mul(TCP_PER_CLIENT);
+                let per_client = (self.max_tcp / self.max_clients.max(1)).max(TCP_PER_CLIENT);
+                let wanted = self.per_address.saturating_mul(per_client);
                 (self.max_tcp, wanted.min(share(self.max_tcp)).max(self.per_address))
             }
             ConnectionKind::Client => (self.max_clients, self.per_address),
-            ConnectionKind::Stream => (self.max_clients * STREAMS_PER_CLIENT, self.per_address * STREAMS_PER_CLIENT),
+            ConnectionKind::Stream => (
+                self.max_clients.saturating_mul(STREAMS_PER_CLIENT),
+                self.per_address.saturating_mul(STREAMS_PER_CLIENT),
+            ),
             ConnectionKind::Page => (MAX_PAGES, self.per_address.min(share(MAX_PAGES))),
         };
         let address = peer.rate_limit_key();

@@ -122,7 +122,13 @@ fn accept(
     tcp.set_nodelay(true)?;
     // RFC 5482; on Linux it also covers a client that does not read (tcp(7)).
     let silence = u32::try_from(options.silence.as_millis()).unwrap_or(u32::MAX);
-    if let Err(error) = setsockopt(&tcp, sockopt::TcpUserTimeout, &silence) {
+    // A peer that has vanished while nothing is sent, as on the stream of a paused simulation, is noticed by probes.
+    let seconds = u32::try_from(options.silence.as_secs()).unwrap_or(u32::MAX).clamp(1, 3600);
+    let limited = setsockopt(&tcp, sockopt::TcpUserTimeout, &silence)
+        .and_then(|()| setsockopt(&tcp, sockopt::KeepAlive, &true))
+        .and_then(|()| setsockopt(&tcp, sockopt::TcpKeepIdle, &seconds))
+        .and_then(|()| setsockopt(&tcp, sockopt::TcpKeepInterval, &seconds.div_ceil(3)));
+    if let Err(error) = limited {
         log::warn!("a connection has no time limit for its answers: {error}");
     }
     Ok((ClientStream::new(tcp, permit, stopping.clone()), Some(address)))

@@ -112,12 +112,13 @@ impl CheckoutService {
                 done => break done,
             }
         };
-        let (revision, WorkTree { pointers, world: file, .. }) = checked_out?;
+        let (revision, WorkTree { size, pointers, world: file }) = checked_out?;
         let file = file?;
         let warning = (pointers > 0).then(|| lfs::warning(pointers, self.has_lfs));
         progress(steps::DONE.to_owned());
         Ok(Project {
             world: file,
+            size,
             warnings: warning.into_iter().collect(),
             url: world,
             folder: instance.project().join(&revision.folder),

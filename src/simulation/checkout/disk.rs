@@ -98,7 +98,7 @@ pub async fn outgrown(folders: Vec<Growing>) {
 /// What everything below a folder takes, each file and folder at least what a name takes of a disk. What nobody can look
 /// into does not count.
 pub fn room_of(folder: &Path) -> u64 {
-    sum(folder, |about| disk_usage::length(about).max(disk_usage::SMALLEST))
+    sum(folder, |about| disk_usage::length(about).max(disk_usage::room(about)))
 }
 
 /// The bytes of all files below a folder.

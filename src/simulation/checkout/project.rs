@@ -12,6 +12,8 @@ use crate::simulation::process::InstanceDir;
 pub struct Project {
     /// The world to open.
     pub world: WorldFile,
+    /// What it takes of the disk, in bytes.
+    pub size: u64,
     /// Warnings for the client.
     pub warnings: Vec<String>,
     /// The URL that it was checked out from.

@@ -16,8 +16,8 @@ pub struct DiskUse {
     folder: PathBuf,
     /// How much it may write, in MiB.
     limit: u64,
-    /// What it took at first, in bytes. `None` until all of it was counted once.
-    first: Option<u64>,
+    /// What its project took at first, in bytes.
+    first: u64,
     /// What it takes at least, in bytes.
     taken: u64,
     /// Whether its processes hide which files they have open.
@@ -33,9 +33,9 @@ const COUNT_AGAIN: Duration = Duration::from_secs(10);
 const LEAST_GROWTH: u64 = 1 << 20;
 
 impl DiskUse {
-    /// A simulation that was not counted yet.
-    pub fn new(root: i32, folder: PathBuf, limit: u64) -> Self {
-        Self { root, folder, limit, first: None, taken: 0, hides: false, lost: 0, counted: Instant::now() }
+    /// A simulation that has written nothing yet. `lost` is how much room the disk has lost until now.
+    pub fn new(root: i32, folder: PathBuf, (first, limit): (u64, u64), lost: u64) -> Self {
+        Self { root, folder, limit, first, taken: first, hides: false, lost, counted: Instant::now() }
     }
 
     /// When it was counted last.
@@ -46,24 +46,21 @@ impl DiskUse {
     /// Whether it may have exceeded its limit since it was counted: the disk has lost as much as it may still write.
     /// `lost` is how much room the disk has lost until now.
     pub fn is_due(&self, lost: u64) -> bool {
-        let left = self.allowed().unwrap_or_default().saturating_sub(self.taken);
+        let left = self.allowed().saturating_sub(self.taken);
         lost.saturating_sub(self.lost) >= left && self.counted.elapsed() >= COUNT_AGAIN
     }
 
     /// Counts what it takes, within this time. Returns what is wrong, in words for its client.
     pub fn count(&mut self, lost: u64, time: Duration) -> Option<String> {
-        let mut size = DiskUsage::new(room, self.allowed().unwrap_or(u64::MAX)).within(time);
+        let mut size = DiskUsage::new(room, self.allowed()).within(time);
         let counted = size.add_folder(&self.folder);
         self.add_nameless(&mut size, time);
         (self.taken, self.lost, self.counted) = (size.total(), lost, Instant::now());
-        if counted == Ok(()) {
-            self.first.get_or_insert(size.total());
-        }
         if counted == Err(Unknown::Hidden) {
             return Some("The simulation has folders that nobody can look into, too deep or closed".to_owned());
         }
         let limit = self.limit;
-        self.allowed().is_some_and(|allowed| self.taken > allowed).then(|| {
+        (self.taken > self.allowed()).then(|| {
             format!("The simulation has written more than {limit} MiB, the limit of this server (limits.disk)")
         })
     }
@@ -86,13 +83,13 @@ impl DiskUse {
     }
 
     /// What it may take, in bytes: what it took at first counts besides the limit.
-    fn allowed(&self) -> Option<u64> {
-        self.first.map(|first| first.saturating_add(self.limit << 20))
+    fn allowed(&self) -> u64 {
+        self.first.saturating_add(self.limit << 20)
     }
 
     /// How much it has grown, in bytes, if that is worth its end. Who hides what it has open comes before all others.
     pub fn growth(&self) -> Option<u64> {
-        let grown = self.taken.saturating_sub(self.first.unwrap_or_default());
+        let grown = self.taken.saturating_sub(self.first);
         if self.hides { Some(u64::MAX) } else { Some(grown).filter(|grown| *grown >= LEAST_GROWTH) }
     }
 }

@@ -143,7 +143,8 @@ impl Launcher {
             None => log::info!("isolation: {}", launcher.level()),
         }
         if let Some(network) = launcher.network_in_words() {
-            log::info!("network of simulations: {network}");
+            let level = if launcher.why_shared.is_some() { log::Level::Warn } else { log::Level::Info };
+            log::log!(level, "network of simulations: {network}");
         }
         for line in launcher.unenforced_limits() {
             log::warn!("{line}");

@@ -33,6 +33,8 @@ pub struct OwnNetwork {
 const RESOLVER: &str = "169.254.1.1";
 /// The file that names it.
 const RESOLV_CONF: &str = "/etc/resolv.conf";
+/// The socket of the system's log.
+const SYSTEM_LOG: &str = "/dev/log";
 /// Where root has nft, and others don't look for programs.
 const NFT: &str = "/usr/sbin/nft";
 /// Versions of pasta until 2023 leave the socket on which they listen, which is one of the machine's network, to what they
@@ -50,6 +52,9 @@ impl OwnNetwork {
     pub fn new(config: &SimulationConfig) -> Result<Self, String> {
         if nix::unistd::getuid().is_root() {
             return Err("pasta gives none to root, run the server as a user of its own".to_owned());
+        }
+        if let Some(display) = remote_display(config) {
+            return Err(format!("the display {display} is reached by TCP, which such a network closes"));
         }
         let missing = |program, package| {
             format!("{program} is not there; on Debian, Ubuntu and Fedora the package {package} has it")
@@ -103,8 +108,10 @@ impl OwnNetwork {
         let is_any = self.forwarded == Ipv6Addr::UNSPECIFIED;
         let port = program.port;
         command.push(if is_any { port.to_string() } else { format!("{}/{port}", self.forwarded) }.into());
-        // Without a file it tells the system's log, and complains where there is none. Faults are printed as well.
-        command.extend(["--log-file".into(), program.instance.join("pasta.log").into()]);
+        // It complains where the system has no log. Where it has one, AppArmor may allow no other file.
+        if !Path::new(SYSTEM_LOG).exists() {
+            command.extend(["--log-file".into(), program.instance.join("pasta.log").into()]);
+        }
         if !self.closed {
             command.extend(["--dns-forward", RESOLVER].map(Into::into));
             std::fs::write(resolv_conf(program.instance), format!("nameserver {RESOLVER}\n"))?;
@@ -129,6 +136,13 @@ impl OwnNetwork {
         let at = Path::new(RESOLV_CONF).canonicalize().ok().filter(|_| !self.closed)?;
         Some(Mount { at, content: MountKind::ReadableFile(resolv_conf(instance)) })
     }
+}
+
+/// A display that simulations are given and reach by TCP.
+fn remote_display(config: &SimulationConfig) -> Option<String> {
+    let of_gpus = (0..config.displays_of_gpus().len()).map(|index| config.display_on(u32::try_from(index).ok()));
+    let mut displays = of_gpus.chain([config.display_on(None)]).filter(|_| !config.xvfb);
+    displays.find(|display| !display.starts_with(':') && !display.starts_with("unix:"))
 }
 
 fn resolv_conf(instance: &Path) -> PathBuf {

@@ -32,7 +32,7 @@ use crate::simulation::process::process_tree::{sockets, tree};
 /// Monitors simulations. Its threads end when the last clone is dropped.
 #[derive(Debug, Clone)]
 pub struct Watcher {
-    watches: Sender<Watched>,
+    watches: Sender<(Watch, oneshot::Sender<String>)>,
     ports: PortFinder,
 }
 
@@ -43,6 +43,8 @@ pub struct Watch {
     pub root: i32,
     /// The directory of the instance.
     pub folder: PathBuf,
+    /// What its project took at first, in bytes.
+    pub first: u64,
     /// Limit of what it may write into that directory, in MiB.
     pub disk: u64,
     /// Limit of its processes and threads; `None` if the kernel enforces it.
@@ -116,9 +118,8 @@ impl Watcher {
     /// monitoring.
     pub async fn until_too_much(&self, watch: Watch) -> String {
         let (excess, told) = oneshot::channel();
-        let disk = DiskUse::new(watch.root, watch.folder.clone(), watch.disk);
         // The thread lives as long as this.
-        self.watches.send(Watched { watch, excess, disk }).ok();
+        self.watches.send((watch, excess)).ok();
         match told.await {
             Ok(why) => why,
             Err(_) => std::future::pending().await,
@@ -139,18 +140,18 @@ struct Table {
 }
 
 impl Table {
-    fn run(&mut self, watches: &Receiver<Watched>) {
+    fn run(&mut self, watches: &Receiver<(Watch, oneshot::Sender<String>)>) {
         let mut tick = Instant::now() + SHORTEST;
         loop {
             let next = tick.min(Instant::now() + self.disk.pause());
-            // What comes meanwhile is taken at once: the first count says how much its folder took at first.
             loop {
                 let left = next.saturating_duration_since(Instant::now());
                 match if self.all.is_empty() { watches.recv().map_err(Into::into) } else { watches.recv_timeout(left) }
                 {
-                    Ok(mut new) => {
-                        new.disk.count(self.disk.lost(), COUNT);
-                        self.all.push(new);
+                    Ok((watch, excess)) => {
+                        let sizes = (watch.first, watch.disk);
+                        let disk = DiskUse::new(watch.root, watch.folder.clone(), sizes, self.disk.lost());
+                        self.all.push(Watched { watch, excess, disk });
                     }
                     Err(RecvTimeoutError::Timeout) => break,
                     Err(RecvTimeoutError::Disconnected) => return,

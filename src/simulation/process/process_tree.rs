@@ -32,12 +32,7 @@ pub fn tree(root: i32) -> Vec<i32> {
 
 /// The children of a process. One that has ended has none.
 pub fn children(pid: i32) -> Vec<i32> {
-    let Ok(threads) = std::fs::read_dir(format!("/proc/{pid}/task")) else {
-        // pasta hides itself where systemd mounts `/proc` so (ProtectProc=invisible), but not its children.
-        let all = all_processes().into_iter().flatten().flatten();
-        let child = |one: Process| one.stat().ok().filter(|stat| stat.ppid == pid).map(|stat| stat.pid);
-        return all.filter_map(child).collect();
-    };
+    let threads = std::fs::read_dir(format!("/proc/{pid}/task")).into_iter().flatten();
     let children = threads.flatten().filter_map(|thread| std::fs::read_to_string(thread.path().join("children")).ok());
     children.flat_map(|ids| ids.split_whitespace().filter_map(|id| id.parse().ok()).collect::<Vec<_>>()).collect()
 }

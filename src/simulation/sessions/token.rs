@@ -1,10 +1,11 @@
-//! The token with which a client resumes its session.
+//! The token with which a client resumes its session, or reaches the stream of its simulation.
 
 use std::fmt;
 
 use subtle::ConstantTimeEq;
 
-/// Identifies a session, and proves that it belongs to the client. It never appears in a log, a page or a URL.
+/// Identifies a session, and proves that it belongs to the client. It never appears in a log or on a page of others; the one of a session
+/// appears in no URL either.
 #[derive(Clone, Copy)]
 pub struct Token {
     number: u64,

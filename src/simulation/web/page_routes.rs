@@ -15,7 +15,7 @@ use super::webots_viewer;
 use crate::asset;
 use crate::shared::http::assets::{self, Asset};
 use crate::shared::http::routing::{GET, READ, path};
-use crate::shared::http::{ConnectionKind, ContentSecurityPolicy, html, is_administrator};
+use crate::shared::http::{AuthError, ConnectionKind, ContentSecurityPolicy, html, is_administrator};
 use crate::simulation::container;
 use crate::simulation::ends::output_file;
 use crate::simulation::machine::{Tree, Usages};
@@ -54,13 +54,13 @@ pub fn configure(app: &mut web::ServiceConfig) {
 }
 
 /// Who sees a page, as far as the password tells.
-fn reader(request: &HttpRequest, server: &AppState) -> Reader {
+fn reader(request: &HttpRequest, server: &AppState) -> Result<Reader, AuthError> {
     let peer = server.config.trusted_proxies.peer(request);
-    match &server.admin_auth {
+    Ok(match &server.admin_auth {
         None => Reader::Anybody,
-        auth if is_administrator(auth.as_ref(), request, peer) => Reader::Administrator,
+        auth if is_administrator(auth.as_ref(), request, peer)? => Reader::Administrator,
         Some(_) => Reader::Stranger,
-    }
+    })
 }
 
 async fn monitor(request: HttpRequest, server: web::Data<AppState>) -> HttpResponse {
@@ -68,7 +68,10 @@ async fn monitor(request: HttpRequest, server: web::Data<AppState>) -> HttpRespo
         return too_busy();
     };
     let usages = usages(&server, &snapshot).await;
-    html(pages::monitor(&server, &snapshot, &usages, reader(&request, &server)), &ContentSecurityPolicy::own())
+    match reader(&request, &server) {
+        Ok(reader) => html(pages::monitor(&server, &snapshot, &usages, reader), &ContentSecurityPolicy::own()),
+        Err(refused) => refused.answer(),
+    }
 }
 
 async fn usages(server: &AppState, snapshot: &Snapshot) -> Usages {
@@ -93,7 +96,10 @@ async fn events(request: HttpRequest, server: web::Data<AppState>) -> HttpRespon
         Ok(permit) => permit,
         Err(refused) => return refused.answer(),
     };
-    let seen_by = reader(&request, &server);
+    let seen_by = match reader(&request, &server) {
+        Ok(reader) => reader,
+        Err(refused) => return refused.answer(),
+    };
     let shown = server.clone();
     let render = move || {
         let server = shown.clone();

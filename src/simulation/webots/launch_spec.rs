@@ -43,7 +43,7 @@ pub struct LaunchSpec {
     pub mode: Mode,
     /// The GPU that it was given, if one was.
     pub gpu: Option<Gpu>,
-    /// The place, and its port.
+    /// The slot, with its port.
     pub slot: Slot,
     /// Where its stream is found while it runs.
     pub streams: Arc<Streams>,
@@ -121,6 +121,7 @@ impl LaunchSpec {
         let watch = Watch {
             root,
             folder: self.project.instance.path().to_owned(),
+            first: self.project.size,
             disk: self.config.limits.disk,
             processes: self.launcher.most_processes(),
             port: self.forwarded().is_none().then_some(self.slot.port),

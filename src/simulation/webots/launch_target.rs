@@ -19,7 +19,7 @@ pub enum LaunchTarget {
     /// The machine, with a display of Webots' own beside it.
     BesideDisplay(VirtualDisplay),
     /// Containers.
-    ContainerService(Box<SimulationContainers>),
+    Containers(Box<SimulationContainers>),
 }
 
 /// The preparation of a Webots' start.
@@ -64,7 +64,7 @@ impl Preparation {
             Self::ContainerService(containers, request) => {
                 let mut prepared = containers.prepare(request, &progress).await?;
                 prepared.start_others().await?;
-                Ok(LaunchTarget::ContainerService(Box::new(prepared)))
+                Ok(LaunchTarget::Containers(Box::new(prepared)))
             }
         }
     }
@@ -76,14 +76,14 @@ impl LaunchTarget {
     pub fn restart(&self) -> Option<Arc<Notify>> {
         match self {
             Self::Machine(_) | Self::BesideDisplay(_) => None,
-            Self::ContainerService(containers) => containers.restart(),
+            Self::Containers(containers) => containers.restart(),
         }
     }
 
     /// The events for the client about it.
     #[must_use]
     pub fn news(&self) -> Vec<WebotsEvent> {
-        let Self::ContainerService(containers) = self else { return Vec::new() };
+        let Self::Containers(containers) = self else { return Vec::new() };
         let warnings = containers.warnings.iter().cloned().map(WebotsEvent::Progress);
         warnings.chain(containers.texts.iter().cloned().map(WebotsEvent::Text)).collect()
     }
@@ -97,7 +97,7 @@ impl LaunchTarget {
                 display.stop().await;
                 None
             }
-            Self::ContainerService(containers) => {
+            Self::Containers(containers) => {
                 let cause = containers.cause(code).await;
                 containers.remove().await;
                 cause

@@ -71,7 +71,7 @@ where
     let (tail, all_read) = output::follow(reader, file.ok(), events)?;
     let errors = output.try_clone()?;
     let (process, cgroup) = match &runtime {
-        LaunchTarget::ContainerService(containers) => (containers.spawn_spec(spec.config.timing.grace), None),
+        LaunchTarget::Containers(containers) => (containers.spawn_spec(spec.config.timing.grace), None),
         LaunchTarget::Machine(display) => spec.spawn_spec(display)?,
         LaunchTarget::BesideDisplay(display) => spec.spawn_spec(&Display::Outside(display.environment()))?,
     };
@@ -96,7 +96,7 @@ where
 
 /// Hears what a Webots takes that runs on this.
 fn peak_of(runtime: &LaunchTarget) -> Arc<Peak> {
-    let LaunchTarget::ContainerService(containers) = runtime else { return Arc::default() };
+    let LaunchTarget::Containers(containers) = runtime else { return Arc::default() };
     let (ids, peak) = (containers.ids(), Arc::new(Peak::of_containers()));
     let named = Arc::clone(&peak);
     // Its start does not wait for that.
