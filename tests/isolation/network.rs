@@ -186,15 +186,7 @@ async fn limits_and_grace_time_hold_in_its_own_network() {
     let work = format!("sleep 0.3; echo saved $(ulimit -u) > '{}'", written.display());
     let webots = webots(&format!("trap \"{work}; exit 0\" TERM\n{DEMO} \"$@\" & wait"));
     let server = server(&stage, &webots, user, "own").set("sandbox.writable", open).set("limits.processes", 70);
-    // As the units for systemd have it, which hides pasta from its own server.
-    let hides =
-        "exec unshare --mount bash -c 'mount -t proc -o hidepid=2 proc /proc; exec \"$0\" \"$@\"' \"$0\" \"$@\"";
-    let hides = if nix::unistd::getuid().is_root() {
-        hides.replace("exec \"$0\" \"$@\"'", &format!("{user}'"))
-    } else {
-        user.to_owned()
-    };
-    let server = server.before(&hides).set("timing.grace", 10).start().await;
+    let server = server.set("timing.grace", 10).start().await;
     let mut client = Client::start(&server, &arm()).await;
     client.until("webots:").await;
     client.leave().await;

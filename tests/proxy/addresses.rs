@@ -2,14 +2,14 @@
 
 use super::browser::Browser;
 use super::fleet::Fleet;
-use super::rules::AdmissionRules;
+use super::rules::Rules;
 use crate::support::until;
 
 const FORGED: &[(&str, &str)] = &[("x-forwarded-for", "203.0.113.9"), ("forwarded", "for=203.0.113.9")];
 
-async fn limits_are_for_each_client(rules: AdmissionRules) {
+async fn limits_are_for_each_client(rules: Rules) {
     // With the documents' rules Apache adds its own line to what the client wrote.
-    let forged = if rules == AdmissionRules::Documents { &FORGED[..1] } else { FORGED };
+    let forged = if rules == Rules::Documents { &FORGED[..1] } else { FORGED };
     let fleet = Fleet::start_with(rules, |server| {
         server.set("trustedProxies", serde_json::json!(["127.0.0.1"])).set("maxClientsPerAddress", 2)
     })
@@ -43,5 +43,5 @@ through_both!(limits_are_for_each_client);
 
 #[actix_rt::test]
 async fn limits_behind_the_documents_rules_are_for_each_client() {
-    limits_are_for_each_client(AdmissionRules::Documents).await;
+    limits_are_for_each_client(Rules::Documents).await;
 }

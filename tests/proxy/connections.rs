@@ -7,14 +7,14 @@ use std::time::Duration;
 use futures_util::StreamExt;
 
 use super::fleet::{Fleet, IDLE};
-use super::rules::AdmissionRules;
+use super::rules::Rules;
 use crate::support::SOON;
 use crate::support::client::{Client, Heard};
 
 /// Longer than the web server's patience.
 const QUIET: Duration = Duration::from_millis(IDLE.as_millis() as u64 * 3 / 2);
 
-async fn quiet_connections_last(rules: AdmissionRules) {
+async fn quiet_connections_last(rules: Rules) {
     let fleet = Fleet::start(rules).await;
     let browser = &fleet.browser;
     let mut door = browser.connect(&rules.session_path(fleet.session.port, "/session")).await;
@@ -49,7 +49,7 @@ through_both!(quiet_connections_last);
 
 #[actix_rt::test]
 async fn the_documents_rules_keep_what_is_pinged_and_cut_what_is_silent() {
-    let fleet = Fleet::start(AdmissionRules::Documents).await;
+    let fleet = Fleet::start(Rules::Documents).await;
     let mut door = fleet.browser.connect(&format!("/{}/session", fleet.session.port)).await;
     let (mut client, stream) = fleet.simulate(&fleet.browser, &fleet.here).await;
     let mut viewer = fleet.browser.open(&format!("{stream}/")).await;
@@ -61,7 +61,7 @@ async fn the_documents_rules_keep_what_is_pinged_and_cut_what_is_silent() {
 }
 
 /// What a live page is told, or the pictures of a Webots that streams a video.
-async fn what_is_sent_in_pieces_comes_in_pieces(rules: AdmissionRules) {
+async fn what_is_sent_in_pieces_comes_in_pieces(rules: Rules) {
     let fleet = Fleet::start(rules).await;
     let port = fleet.here.port + 2;
     let listener = TcpListener::bind(("127.0.0.1", port)).unwrap();
@@ -91,7 +91,7 @@ async fn what_is_sent_in_pieces_comes_in_pieces(rules: AdmissionRules) {
 
 through_both!(what_is_sent_in_pieces_comes_in_pieces);
 
-async fn a_restart_costs_only_connections_of_its_own(rules: AdmissionRules) {
+async fn a_restart_costs_only_connections_of_its_own(rules: Rules) {
     let mut fleet = Fleet::start(rules).await;
     let (mut proxied, _) = fleet.simulate(&fleet.browser, &fleet.here).await;
     let mut direct = Client::start(&fleet.here, &super::fleet::arm()).await;

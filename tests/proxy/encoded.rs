@@ -5,7 +5,7 @@ use std::net::TcpListener;
 use std::sync::mpsc::{Receiver, channel};
 
 use super::fleet::Fleet;
-use super::rules::AdmissionRules;
+use super::rules::Rules;
 use super::web_server::Kind;
 use crate::support::listener::listen;
 
@@ -38,7 +38,7 @@ const PATHS: [(&str, Option<&str>, Option<&str>); 13] = [
     ("//a.png", Some("/a.png"), Some("/a.png")),
 ];
 
-async fn paths_arrive(rules: AdmissionRules) {
+async fn paths_arrive(rules: Rules) {
     let fleet = Fleet::start(rules).await;
     let port = fleet.here.port + 2;
     let asked = files_of_webots(port);

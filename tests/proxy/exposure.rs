@@ -3,7 +3,7 @@
 use std::net::TcpListener;
 
 use super::fleet::Fleet;
-use super::rules::{AdmissionRules, Place};
+use super::rules::{Place, Rules};
 use super::web_server::{Kind, WebServer};
 use crate::support::listener::listen;
 use crate::support::ports;
@@ -17,7 +17,7 @@ pub fn private_service() -> u16 {
     port
 }
 
-async fn only_the_fleet_is_reachable(rules: AdmissionRules) {
+async fn only_the_fleet_is_reachable(rules: Rules) {
     let fleet = Fleet::start(rules).await;
     let private = private_service();
     let here = fleet.here.port;
@@ -60,7 +60,7 @@ async fn only_the_fleet_is_reachable(rules: AdmissionRules) {
 
 through_both!(only_the_fleet_is_reachable);
 
-async fn an_editor_is_at_the_port_of_its_webots_and_500_more(rules: AdmissionRules) {
+async fn an_editor_is_at_the_port_of_its_webots_and_500_more(rules: Rules) {
     let fleet = Fleet::start(rules).await;
     let editor = fleet.here.port + 1 + 500;
     listen(TcpListener::bind(("127.0.0.1", editor)).unwrap(), |request| {
@@ -76,7 +76,25 @@ async fn an_editor_is_at_the_port_of_its_webots_and_500_more(rules: AdmissionRul
 
 through_both!(an_editor_is_at_the_port_of_its_webots_and_500_more);
 
-async fn pages_are_sent_on_to_https_and_the_bare_name(rules: AdmissionRules) {
+/// A browser sends the administrator's password to every path of the host that it was asked for.
+async fn no_simulation_gets_a_password(rules: Rules) {
+    let fleet = Fleet::start(rules).await;
+    let webots = fleet.here.port + 1;
+    listen(TcpListener::bind(("127.0.0.1", webots)).unwrap(), |request| {
+        let told = request.head.to_lowercase().contains("authorization");
+        Some((200, if told { "told" } else { "nothing" }))
+    });
+    let password = [("authorization", "Basic YWRtaW46b3BlbiBzZXNhbWU=")];
+    let url = |port: u16| format!("https://{}/{port}/", fleet.browser.host);
+    assert_eq!(fleet.browser.ask(&url(webots), &password).await.text(), "nothing");
+    // The server itself does: its answer to a wrong one says so.
+    let output = format!("{}output?id=none", url(fleet.here.port));
+    assert_eq!(fleet.browser.ask(&output, &[]).await.status, 404);
+}
+
+through_both!(no_simulation_gets_a_password);
+
+async fn pages_are_sent_on_to_https_and_the_bare_name(rules: Rules) {
     let fleet = Fleet::start(rules).await;
     let browser = &fleet.browser;
     let plain = format!("http://localhost:{}", browser.plain);
@@ -120,8 +138,7 @@ async fn nginx_takes_names_of_any_length() {
     let (http, https) = (ports::block(1), ports::block(1));
     let chain = certificate.chain.to_str().unwrap();
     let key = certificate.key.to_str().unwrap();
-    let text =
-        AdmissionRules::Nginx.text(&Place { http, https, session: 1999, here: &[2000], there: &[3000], chain, key });
+    let text = Rules::Nginx.text(&Place { http, https, session: 1999, here: &[2000], there: &[3000], chain, key });
     // With its www. as long as a name may be: 253 characters.
     let name = ["a".repeat(63), "b".repeat(63), "c".repeat(63), "d".repeat(57)].join(".");
     let text = text.replace("localhost", &name);

@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use super::browser::Browser;
-use super::rules::{AdmissionRules, Place};
+use super::rules::{Place, Rules};
 use super::web_server::WebServer;
 use crate::support::authority::{Authority, trusting};
 use crate::support::client::Client;
@@ -35,12 +35,12 @@ const PLACES: u16 = 3;
 pub const IDLE: Duration = Duration::from_secs(4);
 
 impl Fleet {
-    pub async fn start(rules: AdmissionRules) -> Self {
+    pub async fn start(rules: Rules) -> Self {
         Self::start_with(rules, |server| server).await
     }
 
     /// A fleet whose servers have some keys in common.
-    pub async fn start_with(rules: AdmissionRules, keys: impl Fn(Builder) -> Builder) -> Self {
+    pub async fn start_with(rules: Rules, keys: impl Fn(Builder) -> Builder) -> Self {
         let authority = Authority::new();
         let certificate = authority.issue(&["localhost", "www.localhost"]);
         let (http, https) = (ports::block(1), ports::block(1));

@@ -7,12 +7,12 @@ macro_rules! through_both {
         mod $test {
             #[actix_rt::test]
             async fn apache() {
-                super::$test(crate::proxy::rules::AdmissionRules::Apache).await;
+                super::$test(crate::proxy::rules::Rules::Apache).await;
             }
 
             #[actix_rt::test]
             async fn nginx() {
-                super::$test(crate::proxy::rules::AdmissionRules::Nginx).await;
+                super::$test(crate::proxy::rules::Rules::Nginx).await;
             }
         }
     };

@@ -4,7 +4,7 @@ use futures_util::StreamExt;
 
 use super::browser::Browser;
 use super::fleet::{Fleet, IDLE};
-use super::rules::AdmissionRules;
+use super::rules::Rules;
 use crate::support::SOON;
 
 /// What a page names in `src` and `href`, but for other pages.
@@ -37,7 +37,7 @@ async fn is_told_what_happens(browser: &Browser, path: &str) {
     }
 }
 
-async fn what_webots_sends_has_an_origin_of_its_own(fleet: &Fleet, rules: AdmissionRules) {
+async fn what_webots_sends_has_an_origin_of_its_own(fleet: &Fleet, rules: Rules) {
     let policy = async |path: String| {
         let url = format!("https://{}{path}", fleet.browser.host);
         let answer = fleet.browser.ask(&url, &[]).await;
@@ -55,7 +55,7 @@ async fn what_webots_sends_has_an_origin_of_its_own(fleet: &Fleet, rules: Admiss
     assert!(door.starts_with("default-src 'none'") && !door.contains("sandbox"), "{door}");
 }
 
-async fn pages_are_complete_and_live(rules: AdmissionRules) {
+async fn pages_are_complete_and_live(rules: Rules) {
     let fleet = Fleet::start(rules).await;
     what_webots_sends_has_an_origin_of_its_own(&fleet, rules).await;
     let browser = &fleet.browser;

@@ -1,10 +1,10 @@
 //! Streams through the simulation servers, behind each web server with our rules: one port of each machine is enough.
 
 use super::fleet::Fleet;
-use super::rules::AdmissionRules;
+use super::rules::Rules;
 use crate::support::until;
 
-async fn relayed(rules: AdmissionRules) {
+async fn relayed(rules: Rules) {
     // The relay reaches Webots on the loopback of its machine.
     let relay = |server: crate::support::program::Builder| {
         server.set("streaming", "relay").env("DEMO_SIMULATOR_BIND", "127.0.0.1")
@@ -42,10 +42,10 @@ async fn relayed(rules: AdmissionRules) {
 
 #[actix_rt::test]
 async fn streams_come_through_nginx_and_the_simulation_server() {
-    relayed(AdmissionRules::Nginx).await;
+    relayed(Rules::Nginx).await;
 }
 
 #[actix_rt::test]
 async fn streams_come_through_apache_and_the_simulation_server() {
-    relayed(AdmissionRules::Apache).await;
+    relayed(Rules::Apache).await;
 }

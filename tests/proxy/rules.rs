@@ -4,7 +4,7 @@ use super::web_server::Kind;
 
 /// A set of rules, which is made to fit the machine of a test.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub enum AdmissionRules {
+pub enum Rules {
     /// `deploy/apache.conf`
     Apache,
     /// `deploy/nginx.conf`
@@ -29,7 +29,7 @@ pub struct Place<'a> {
     pub key: &'a str,
 }
 
-impl AdmissionRules {
+impl Rules {
     pub fn kind(self) -> Kind {
         if matches!(self, Self::Nginx | Self::NginxWithUsers(_)) { Kind::Nginx } else { Kind::Apache }
     }
@@ -90,6 +90,8 @@ impl AdmissionRules {
                     ("listen 443 ssl;", &format!("listen 127.0.0.1:{https} ssl;")),
                     ("  2000    \"\";", &format!("  {} \"\";", here[0])),
                     ("  3000    \"\";", &format!("  {} \"\";", there[0])),
+                    ("  2000    $http_authorization;", &format!("  {} $http_authorization;", here[0])),
+                    ("  3000    $http_authorization;", &format!("  {} $http_authorization;", there[0])),
                     ("20[01][0-9]|2020", &pattern(here)),
                     ("30[01][0-9]|3020", &pattern(there)),
                     ("250[1-9]|251[0-9]|2520", &editors(here)),

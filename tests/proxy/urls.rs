@@ -1,7 +1,7 @@
 //! URLs that the servers hand out: they lead through the web server, from wherever they were read.
 
 use super::fleet::Fleet;
-use super::rules::AdmissionRules;
+use super::rules::Rules;
 use crate::support::http;
 use crate::support::smtp::Smtp;
 use crate::support::until;
@@ -11,7 +11,7 @@ fn first_url(text: &str) -> &str {
     text.split_whitespace().find(|word| word.starts_with("http")).unwrap_or_else(|| panic!("no URL in {text}"))
 }
 
-async fn urls_lead_through_the_web_server(rules: AdmissionRules) {
+async fn urls_lead_through_the_web_server(rules: Rules) {
     let mut smtp = Smtp::start(&[]).await;
     let port = smtp.port;
     let fleet = Fleet::start_with(rules, |server| {

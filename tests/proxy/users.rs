@@ -4,7 +4,7 @@ use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpListener;
 
 use super::fleet::{Fleet, arm};
-use super::rules::AdmissionRules;
+use super::rules::Rules;
 use crate::support::client::Client;
 use crate::support::http::PASSWORD;
 
@@ -38,7 +38,7 @@ async fn oauth2_proxy() -> u16 {
 
 #[actix_rt::test]
 async fn who_signs_in_at_the_web_server_is_known_to_the_administrator() {
-    let rules = AdmissionRules::NginxWithUsers(oauth2_proxy().await);
+    let rules = Rules::NginxWithUsers(oauth2_proxy().await);
     let keys = |builder: crate::support::program::Builder| builder.set("adminPassword", PASSWORD);
     // The session server, which signs in nowhere, knows its servers all the same.
     let fleet = Fleet::start_with(rules, |builder| keys(builder).set("userHeader", "X-Forwarded-User")).await;

@@ -3,10 +3,10 @@
 use tokio::net::TcpStream;
 
 use super::fleet::{Fleet, arm};
-use super::rules::AdmissionRules;
+use super::rules::Rules;
 use crate::support::until;
 
-async fn the_whole_way(rules: AdmissionRules) {
+async fn the_whole_way(rules: Rules) {
     let fleet = Fleet::start(rules).await;
     let browser = &fleet.browser;
     let at_the_door = |path: &str| rules.session_path(fleet.session.port, path);
@@ -57,5 +57,5 @@ through_both!(the_whole_way);
 
 #[actix_rt::test]
 async fn through_apache_with_the_documents_rules() {
-    the_whole_way(AdmissionRules::Documents).await;
+    the_whole_way(Rules::Documents).await;
 }
