@@ -1,5 +1,6 @@
 //! Who has which simulation: the user whom a trusted web server names, and what a client calls itself.
 
+use futures_util::StreamExt;
 use serde_json::json;
 
 use super::scene::arm;
@@ -32,7 +33,6 @@ async fn event(server: &Server) -> String {
     let mut answer = request.send().await.unwrap();
     let mut text = String::new();
     while !text.contains("simulations") || !text.ends_with("\n\n") {
-        use futures_util::StreamExt;
         text.push_str(&String::from_utf8_lossy(&answer.next().await.unwrap().unwrap()));
     }
     text
@@ -128,4 +128,21 @@ async fn a_name_that_is_none_is_refused_in_words() {
     client.send(&json!({"start": {"url": arm(), "name": ["anna"]}}).to_string()).await;
     let told = client.until("loading: Error:").await;
     assert!(told.contains("\"name\" is no text"), "{told}");
+}
+
+#[actix_rt::test]
+async fn who_has_sent_too_many_passwords_is_not_taken_for_a_stranger() {
+    let (forge, webots) = (Forge::new(), Webots::launcher());
+    let server = with_users(&webots, &forge, 1).start().await;
+    let ask = async |path: &str, password: &str| {
+        let request = awc::Client::default().get(server.url(path)).basic_auth("admin", password);
+        request.send().await.unwrap().status().as_u16()
+    };
+    let guesses = futures_util::stream::iter(0..60).then(|_| ask("/monitor", "guess"));
+    let answers: Vec<u16> = guesses.collect().await;
+    assert!(answers.starts_with(&[200; 30]) && answers.ends_with(&[429; 10]), "{answers:?}");
+    for path in ["/monitor", "/events", "/status"] {
+        assert_eq!(ask(path, PASSWORD).await, 429, "{path}");
+    }
+    assert_eq!(http::get(&server.url("/monitor")).await.status, 200, "without a password it is the page for all");
 }

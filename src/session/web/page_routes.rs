@@ -14,23 +14,8 @@ use crate::shared::http::routing::{GET, READ, path};
 use crate::shared::http::{ConnectionKind, ContentSecurityPolicy, any_host, fleet_sources, html};
 
 /// Assets of this server's pages, besides those that both servers share.
-const ASSETS: &[Asset] = &[
-    asset!("viewer.css"),
-    asset!("viewer.js"),
-    asset!("start.js"),
-    asset!("kept.js"),
-    asset!("lifeline.js"),
-    asset!("stream.js"),
-    asset!("small_viewer.js"),
-    asset!("scene.js"),
-    asset!("shapes.js"),
-    asset!("matrix.js"),
-    asset!("camera.js"),
-    asset!("draw.js"),
-    asset!("session_monitor.js"),
-    asset!("webots_viewer.css"),
-    asset!("webots_viewer.js"),
-];
+const ASSETS: &[Asset] =
+    &[asset!("viewer.js"), asset!("start.js"), asset!("kept.js"), asset!("lifeline.js"), asset!("session_monitor.js")];
 
 /// Adds the routes to an app.
 pub fn configure(app: &mut web::ServiceConfig) {

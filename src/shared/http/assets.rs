@@ -25,8 +25,23 @@ macro_rules! asset {
     };
 }
 
-/// Assets that pages of both servers use.
-pub const COMMON: &[Asset] = &[asset!("style.css"), asset!("live.js"), asset!("times.js"), asset!("icon.svg")];
+/// Assets that pages of both servers use: of each page, of live pages, and of the viewers.
+pub const COMMON: &[Asset] = &[
+    asset!("style.css"),
+    asset!("icon.svg"),
+    asset!("live.js"),
+    asset!("times.js"),
+    asset!("viewer.css"),
+    asset!("stream.js"),
+    asset!("small_viewer.js"),
+    asset!("scene.js"),
+    asset!("shapes.js"),
+    asset!("matrix.js"),
+    asset!("camera.js"),
+    asset!("draw.js"),
+    asset!("webots_viewer.css"),
+    asset!("webots_viewer.js"),
+];
 
 impl Asset {
     fn media_type(self) -> &'static str {

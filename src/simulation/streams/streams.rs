@@ -195,13 +195,25 @@ mod tests {
         }
     }
 
-    fn told() -> (Recipient<Watched>, Receiver<bool>) {
-        let (sender, told) = channel();
-        (Told(sender).start().recipient(), told)
+    /// Answered once all messages before it have been handled.
+    #[derive(Message)]
+    #[rtype(result = "()")]
+    struct Barrier;
+
+    impl Handler<Barrier> for Told {
+        type Result = ();
+
+        fn handle(&mut self, Barrier: Barrier, _: &mut Self::Context) {}
     }
 
-    async fn all(told: &Receiver<bool>) -> Vec<bool> {
-        actix_rt::time::sleep(Duration::from_millis(1)).await;
+    fn told() -> (Recipient<Watched>, (Addr<Told>, Receiver<bool>)) {
+        let (sender, told) = channel();
+        let actor = Told(sender).start();
+        (actor.clone().recipient(), (actor, told))
+    }
+
+    async fn all((actor, told): &(Addr<Told>, Receiver<bool>)) -> Vec<bool> {
+        actor.send(Barrier).await.unwrap();
         told.try_iter().collect()
     }
 

@@ -28,17 +28,7 @@ const ASSETS: &[Asset] = &[
     asset!("charts.js"),
     asset!("chart.js"),
     asset!("simulation_monitor.js"),
-    asset!("viewer.css"),
     asset!("watch.js"),
-    asset!("stream.js"),
-    asset!("small_viewer.js"),
-    asset!("scene.js"),
-    asset!("shapes.js"),
-    asset!("matrix.js"),
-    asset!("camera.js"),
-    asset!("draw.js"),
-    asset!("webots_viewer.css"),
-    asset!("webots_viewer.js"),
 ];
 /// How much of an output's end is shown, in bytes: all that is kept of one that has ended, with its events.
 const LARGEST_TAIL: u64 = 96 * 1024;
