@@ -105,6 +105,6 @@ async fn alerts_dashboard_and_docs_name_the_metrics_that_the_servers_export() {
         let unknown: Vec<&String> = named.difference(&all).collect();
         assert!(named.len() > 5 && unknown.is_empty(), "{what}: {unknown:?} of {named:?}");
     }
-    let docs = [read("docs/operations.md"), read("docs/operations-simulation.md")].join("\n");
+    let docs = read("docs/operations.md");
     assert_eq!(named(&docs), without_histograms(all), "the docs on the left");
 }
