@@ -15,6 +15,7 @@ mod peer;
 pub mod routing;
 pub mod server;
 pub mod tls;
+pub mod upgrade;
 pub mod websocket;
 
 pub use address_quota::{AddressQuota, share};

@@ -15,7 +15,7 @@ pub fn configure(app: &mut web::ServiceConfig) {
     app.service(path("/stream/{path:.*}", GET, stream));
 }
 
-async fn stream(request: HttpRequest, payload: web::Payload, server: web::Data<AppState>) -> HttpResponse {
+async fn stream(request: HttpRequest, server: web::Data<AppState>) -> HttpResponse {
     let nothing = || HttpResponse::NotFound().body("Error: there is no such stream.");
     // As the client has written it: what it has encoded stays so.
     let Some((token, path)) = relay::split(request.uri().path()) else { return nothing() };
@@ -43,9 +43,9 @@ async fn stream(request: HttpRequest, payload: web::Payload, server: web::Data<A
         return relay::fetch(upstream, &url, &request, permit).await;
     }
     if !only_watches {
-        return relay::connect(upstream, &url, (&request, payload), false, permit).await;
+        return relay::connect(upstream, &url, &request, false, permit).await;
     }
     let Some(watching) = server.streams.begin(&token) else { return nothing() };
     log::info!("{simulation}: client {peer} watches");
-    relay::connect(upstream, &url, (&request, payload), true, (permit, watching)).await
+    relay::connect(upstream, &url, &request, true, (permit, watching)).await
 }
