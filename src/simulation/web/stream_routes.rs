@@ -4,8 +4,8 @@ use actix_web::http::header;
 use actix_web::{HttpRequest, HttpResponse, web};
 
 use super::origins::refuse_origin;
-use crate::shared::http::ConnectionKind;
 use crate::shared::http::routing::{GET, path};
+use crate::shared::http::{ConnectionKind, body};
 use crate::simulation::relay::{self, Upstream};
 use crate::simulation::state::AppState;
 use crate::simulation::streams::Found;
@@ -20,11 +20,10 @@ async fn stream(request: HttpRequest, server: web::Data<AppState>) -> HttpRespon
     // As the client has written it: what it has encoded stays so.
     let Some((token, path)) = relay::split(request.uri().path()) else { return nothing() };
     let Some(found) = server.streams.find(&token) else { return nothing() };
-    let headers = request.headers();
-    let has_length = headers.get(header::CONTENT_LENGTH).is_some_and(|length| length != "0");
-    if has_length || headers.contains_key(header::TRANSFER_ENCODING) {
-        return HttpResponse::BadRequest().body("Error: nothing but a question is taken here.");
+    if let Some(refusal) = body::refuse(&request) {
+        return refusal;
     }
+    let headers = request.headers();
     let is_websocket = headers.contains_key(header::UPGRADE);
     // Worlds' pages and Webots' own viewer run in frames without an origin; the token is what strangers lack.
     let is_in_frame = headers.get(header::ORIGIN).is_some_and(|origin| origin == "null");
