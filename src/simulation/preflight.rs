@@ -5,8 +5,8 @@ use std::process::Command;
 use which::which;
 
 use super::config::{IsolationSetting, SimulationConfig};
-use super::container;
-use crate::simulation::isolation::{IsolationLevel, Launcher};
+use super::container::{self, packet_filter};
+use crate::simulation::isolation::{IsolationLevel, Launcher, Network};
 use crate::simulation::machine::display;
 use crate::simulation::machine::sensors::{GpuReading, GpuSensor};
 
@@ -46,6 +46,14 @@ pub fn check(config: &SimulationConfig) -> Vec<Finding> {
     let unenforced_limits = launcher.as_ref().map(Launcher::unenforced_limits).unwrap_or_default();
     let unenforced_limits = unenforced_limits.into_iter().map(|line| Finding { topic: "limits", result: Err(line) });
     let network = launcher.as_ref().ok().and_then(network);
+    let is_shared = launcher.as_ref().is_ok_and(|launcher| launcher.network() == Some(Network::Shared));
+    let streams = (is_shared && !config.ports_are_public()).then(|| streams(config));
+    let forgeable = is_shared && config.user_header.is_some() && config.trusted_proxies.trusts_loopback();
+    let users = forgeable.then(|| {
+        let why = "worlds' programs can pose as any user, for they share this machine's network, whose loopback is in \
+                   trustedProxies";
+        Finding { topic: "userHeader", result: Err(why.to_owned()) }
+    });
     let isolation = Finding { topic: "isolation", result: launcher.and_then(|launcher| isolation(&launcher)) };
     let gpus = config.spreads().then(|| Finding { topic: "GPUs", result: gpus(config) });
     first
@@ -55,6 +63,8 @@ pub fn check(config: &SimulationConfig) -> Vec<Finding> {
         .chain(last)
         .chain([isolation])
         .chain(network)
+        .chain(streams)
+        .chain(users)
         .chain(unenforced_limits)
         .collect()
 }
@@ -142,6 +152,20 @@ fn isolation(launcher: &Launcher) -> Result<String, String> {
 fn network(launcher: &Launcher) -> Option<Finding> {
     let words = launcher.network_in_words().filter(|_| launcher.level() == IsolationLevel::Sandbox)?;
     Some(Finding { topic: "network", result: Ok(words) })
+}
+
+/// Whether others reach the ports of simulations past the relay.
+fn streams(config: &SimulationConfig) -> Finding {
+    let (first, last) = config.streaming_ports().into_inner();
+    let result = match packet_filter::closes_streams() {
+        Some(true) => Ok("relayed; the packet filter keeps others from the ports of Webots".to_owned()),
+        Some(false) => Err(format!(
+            "whoever reaches ports {first} to {last} steers a simulation, for Webots shares this machine's network and no \
+             packet filter closes them (table webots_streams); see docs/deployment-web-server.md"
+        )),
+        None => Ok(format!("relayed; the firewall has to close ports {first} to {last}, on which Webots listens")),
+    };
+    Finding { topic: "streams", result }
 }
 
 /// Returns the first line that a program prints.

@@ -190,6 +190,8 @@ fn nginx_finds_no_fault_in_the_doors_and_they_have_the_rules_of_the_example() {
             "proxy_set_header ",
             "proxy_pass http://$",
             "map ",
+            "set ",
+            "access_log off",
         ] {
             let rules = |conf: &str| -> Vec<String> {
                 conf.lines().map(str::trim).filter(|line| line.starts_with(rule)).map(str::to_owned).collect()

@@ -118,3 +118,27 @@ fn displays_that_do_not_fit_the_gpus_are_warned_about() {
     let (_, told) = check(&json!({"displays": [":90.0"]}), |_| ());
     assert!(told.contains("displays has no effect") && !told.contains("GPUs: "), "{told}");
 }
+
+#[test]
+fn what_weakens_a_relay_in_a_shared_network_is_warned_about() {
+    let told = |keys: &Value| check(keys, |_| ()).1;
+    let words = "worlds' programs can pose as any user";
+    let users = |trusted: &str| json!({"isolation": "none", "userHeader": "X-User", "trustedProxies": [trusted]});
+    for (keys, is_warned) in [
+        (users("127.0.0.1"), true),
+        (users("::1"), true),
+        (users("192.0.2.1"), false),
+        (json!({"isolation": "none"}), false),
+    ] {
+        assert_eq!(told(&keys).contains(words), is_warned, "{keys}");
+    }
+    let relay = json!({"isolation": "none", "streaming": "relay", "port": 3000, "maxConnections": 20});
+    let is_root = nix::unistd::geteuid().is_root();
+    let words = if is_root {
+        "warning: streams: whoever reaches ports 3001 to 3020 steers a simulation"
+    } else {
+        "\nstreams: relayed; the firewall has to close ports 3001 to 3020"
+    };
+    assert!(told(&relay).contains(words), "{words}");
+    assert!(!told(&json!({"isolation": "none"})).contains("streams: "));
+}

@@ -103,7 +103,6 @@ impl Fleet {
             &door.site(&certificate, (http, https), &session.address()),
             &[
                 ("(?<fleet_port>2000)", &format!("(?<fleet_port>{port})")),
-                ("  2000    $http_authorization;", &format!("  {port} $http_authorization;")),
                 ("200[1-9]|201[0-9]|2020", &places.join("|")),
             ],
         );

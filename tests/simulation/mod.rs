@@ -12,6 +12,9 @@ mod idleness;
 mod large_files;
 mod life;
 mod limits;
+#[allow(dead_code, reason = "faults use more of it")]
+#[path = "../faults/network.rs"]
+mod network;
 mod opened;
 mod output;
 mod own_failures;

@@ -1,5 +1,6 @@
 //! Streams through the server (`"streaming": "relay"`): its client has all of what Webots sends, and nobody else any of it.
 
+use std::io::Write;
 use std::time::Duration;
 
 use futures_util::{SinkExt, StreamExt};
@@ -14,6 +15,7 @@ use tokio_tungstenite::tungstenite::{Error, Message};
 use tokio_tungstenite::{MaybeTlsStream, WebSocketStream};
 
 use super::life::quick;
+use super::network::Network;
 use super::scene::{arm, nothing_left};
 use crate::support::client::{Client, Heard};
 use crate::support::git::Forge;
@@ -219,6 +221,88 @@ async fn a_viewer_that_does_not_read_holds_up_nobody_and_fills_no_memory() {
     drop(webots);
     // And it has all of it, once it reads.
     assert_eq!(next(&mut lazy).await, Some(frame));
+}
+
+#[actix_rt::test]
+async fn a_viewer_that_has_vanished_is_noticed_though_nothing_is_sent() {
+    let Some(network) = Network::hide_from_others() else {
+        // Not by a macro: what those print is shown for tests that fail only.
+        std::io::stderr().write_all(b"SKIPPED, for packets can't be filtered: simulation::relay\n").unwrap();
+        return;
+    };
+    let played = Played::new(|builder| builder.set("timing.ping", 1).set("timing.silence", 2)).await;
+    let (_client, path) = played.stage.start().await;
+    let viewer = async {
+        let tcp = TcpStream::connect(("127.0.0.1", played.stage.server.port)).await.unwrap();
+        let port = tcp.local_addr().unwrap().port();
+        let url = played.stage.server.websocket(&path);
+        (tokio_tungstenite::client_async(url, tcp).await.unwrap().0, port)
+    };
+    let webots = async { tokio_tungstenite::accept_async(played.listener.accept().await.unwrap().0).await.unwrap() };
+    let ((_viewer, port), mut webots) = tokio::join!(viewer, webots);
+    let _lost = network.lose(1.0, &[port.to_string()]);
+    assert_eq!(next(&mut webots).await, None);
+}
+
+#[actix_rt::test]
+async fn streams_have_connections_of_their_own() {
+    let played = Played::new(|builder| builder.set("maxClients", 2)).await;
+    let (client, path) = played.stage.start().await;
+    let mut streams = Vec::new();
+    for _ in 0..14 {
+        streams.push(played.connect(&path).await);
+    }
+    assert_eq!(played.stage.refused(&path).await, 503);
+    assert_eq!(http::get(&played.stage.server.url(&format!("{path}/a.png"))).await.status, 503);
+    assert_eq!(played.stage.simulations().await.len(), 1);
+    let (mut viewer, mut webots) = streams.remove(0);
+    viewer.close(None).await.unwrap();
+    while next(&mut webots).await.is_some() {}
+    drop((viewer, webots));
+    // Without a key it is refused, but not for want of room.
+    let upgrade = format!("GET {path} HTTP/1.1\r\nHost: a\r\nConnection: upgrade, close\r\nUpgrade: websocket\r\n\r\n");
+    until("there is room again", async || played.stage.raw(&upgrade).await.starts_with("HTTP/1.1 400 ")).await;
+    client.leave().await;
+}
+
+#[actix_rt::test]
+async fn a_websocket_with_a_body_is_refused() {
+    let stage = Stage::new(|builder| builder).await;
+    let upgrade = "Host: localhost\r\nConnection: upgrade\r\nUpgrade: websocket\r\nSec-WebSocket-Version: 13\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n";
+    for body in ["Content-Length: 1\r\n\r\nx", "Transfer-Encoding: chunked\r\n\r\n1\r\nx\r\n0\r\n\r\n"] {
+        let answer = stage.raw(&format!("GET /client HTTP/1.1\r\n{upgrade}{body}")).await;
+        assert!(
+            answer.starts_with("HTTP/1.1 400 ") && answer.ends_with("Error: a request for this has no body."),
+            "{answer}"
+        );
+    }
+}
+
+#[actix_rt::test]
+async fn only_administrators_read_ports_in_an_output() {
+    for (mode, password, is_shown) in [("relay", false, false), ("relay", true, true), ("direct", false, true)] {
+        let stage = Stage::new(|builder| {
+            let builder = builder.set("streaming", mode);
+            if password { builder.set("adminPassword", "open sesame") } else { builder }
+        })
+        .await;
+        let mut client = Client::start(&stage.server, &arm()).await;
+        client.until("webots:").await;
+        let url = stage.server.url(&format!("/output?id={}", client.id()));
+        client.leave().await;
+        nothing_left(&stage.server, 2).await;
+        let mut text = String::new();
+        until("its events are kept", async || {
+            let asked = awc::Client::new().get(&url).basic_auth("admin", "open sesame");
+            let body = asked.send().await.unwrap().body().limit(1 << 20).await.unwrap();
+            text = String::from_utf8(body.to_vec()).unwrap();
+            text.contains(": ready")
+        })
+        .await;
+        let told =
+            if is_shown { format!("port {}: ready", stage.server.port + 1) } else { "port ...: ready".to_owned() };
+        assert!(text.contains(&told), "{mode} {password}: {text}");
+    }
 }
 
 #[actix_rt::test]

@@ -78,9 +78,11 @@ impl BasicAuth {
 /// Refuses a request for an action unless it brings the password and no page of another site has made it. Without a
 /// password in the configuration there are no actions.
 pub fn refuse_action(auth: Option<&BasicAuth>, request: &HttpRequest, peer: Peer) -> Option<HttpResponse> {
-    if let Some(refusal) = reject_cross_site(request) {
-        return Some(refusal);
-    }
+    reject_cross_site(request).or_else(|| require_administrator(auth, request, peer))
+}
+
+/// Refuses a request without the administrator's password, and every request if there is none in the configuration.
+pub fn require_administrator(auth: Option<&BasicAuth>, request: &HttpRequest, peer: Peer) -> Option<HttpResponse> {
     let Some(auth) = auth else {
         return Some(HttpResponse::Forbidden().body("Error: actions are off; adminPassword is not set."));
     };

@@ -1,4 +1,4 @@
-//! The body of a request for an action: small, of a length that is told, and in time.
+//! The bodies of requests: of actions they are small, of a known length and in time; other requests have none.
 
 use std::time::Duration;
 
@@ -11,6 +11,14 @@ use super::client_stream::LARGEST_BODY;
 
 /// How long a body may take.
 const PATIENCE: Duration = Duration::from_secs(5);
+
+/// Refuses a request with a body where none is read.
+pub fn refuse(request: &HttpRequest) -> Option<HttpResponse> {
+    let headers = request.headers();
+    let has_length = headers.get(header::CONTENT_LENGTH).is_some_and(|length| length != "0");
+    let has_body = has_length || headers.contains_key(header::TRANSFER_ENCODING);
+    has_body.then(|| HttpResponse::BadRequest().body("Error: a request for this has no body."))
+}
 
 /// Reads the JSON of a body; an empty one is the default. `form` tells how it has to be.
 ///

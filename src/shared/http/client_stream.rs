@@ -13,6 +13,7 @@ use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 use tokio_util::sync::{CancellationToken, WaitForCancellationFutureOwned};
 
 use super::connections::ConnectionPermit;
+use super::upgrade::{UpgradeSlot, Upgraded};
 
 /// Size of one read from the socket, in bytes.
 const READ_AT_ONCE: usize = 4 * 1024;
@@ -39,7 +40,9 @@ enum State {
 /// A client's TCP connection.
 #[derive(Debug)]
 pub struct ClientStream {
-    tcp: TcpStream,
+    /// The connection and its count. `None` once it was handed over.
+    connection: Option<(TcpStream, ConnectionPermit)>,
+    upgrade: UpgradeSlot,
     /// Bytes that were read from the socket and not yet passed to actix.
     unread: Vec<u8>,
     /// The beginning of the line that is read, without line breaks.
@@ -53,14 +56,14 @@ pub struct ClientStream {
     state: State,
     /// `None` once it is a WebSocket, which its actor closes.
     stopping: Option<Pin<Box<WaitForCancellationFutureOwned>>>,
-    _permit: ConnectionPermit,
 }
 
 impl ClientStream {
     /// A connection that `permit` counts; `stopping` is cancelled when the server stops.
     pub fn new(tcp: TcpStream, permit: ConnectionPermit, stopping: CancellationToken) -> Self {
         Self {
-            tcp,
+            connection: Some((tcp, permit)),
+            upgrade: UpgradeSlot::default(),
             unread: Vec::new(),
             line: Vec::new(),
             line_ended: false,
@@ -68,8 +71,17 @@ impl ClientStream {
             is_blocked: false,
             state: State::Request,
             stopping: Some(Box::pin(stopping.cancelled_owned())),
-            _permit: permit,
         }
+    }
+
+    /// Where this connection goes when it is upgraded.
+    pub fn upgrade_slot(&self) -> UpgradeSlot {
+        self.upgrade.clone()
+    }
+
+    fn tcp(&mut self) -> io::Result<Pin<&mut TcpStream>> {
+        let connection = self.connection.as_mut().map(|(tcp, _)| Pin::new(tcp));
+        connection.ok_or_else(|| io::ErrorKind::NotConnected.into())
     }
 
     /// Frees what only requests need: thousands of WebSockets are open at a time, and most of them are idle.
@@ -142,7 +154,12 @@ impl AsyncRead for ClientStream {
         context: &mut Context<'_>,
         buffer: &mut ReadBuf<'_>,
     ) -> Poll<io::Result<()>> {
-        if self.is_blocked || self.state == State::Answer {
+        if self.connection.is_none() {
+            // End of input: actix has no more to do with what was handed over.
+            return Poll::Ready(Ok(()));
+        }
+        let is_leaving = self.state == State::WebSocket && self.upgrade.is_wanted();
+        if self.is_blocked || self.state == State::Answer || is_leaving {
             // The next write wakes the task, or the socket once it accepts more.
             return Poll::Pending;
         }
@@ -153,11 +170,11 @@ impl AsyncRead for ClientStream {
         }
         if self.unread.is_empty() {
             if self.state == State::WebSocket {
-                return Pin::new(&mut self.tcp).poll_read(context, buffer);
+                return self.tcp()?.poll_read(context, buffer);
             }
             let mut bytes = [0; READ_AT_ONCE];
             let mut part = ReadBuf::new(&mut bytes);
-            ready!(Pin::new(&mut self.tcp).poll_read(context, &mut part))?;
+            ready!(self.tcp()?.poll_read(context, &mut part))?;
             self.unread.extend_from_slice(part.filled());
         }
         let count = self.readable(buffer.remaining());
@@ -170,7 +187,7 @@ impl AsyncRead for ClientStream {
 
 impl AsyncWrite for ClientStream {
     fn poll_write(mut self: Pin<&mut Self>, context: &mut Context<'_>, bytes: &[u8]) -> Poll<io::Result<usize>> {
-        let written = Pin::new(&mut self.tcp).poll_write(context, bytes);
+        let written = self.tcp()?.poll_write(context, bytes);
         self.is_blocked = written.is_pending();
         if let State::Body(left, _) = self.state {
             self.state = State::Body(left, true);
@@ -183,11 +200,24 @@ impl AsyncWrite for ClientStream {
         written
     }
 
+    /// actix calls this when all of an answer is written.
     fn poll_flush(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
-        Pin::new(&mut self.tcp).poll_flush(context)
+        if self.state == State::WebSocket
+            && self.upgrade.is_wanted()
+            && let Some((tcp, permit)) = self.connection.take()
+        {
+            let read_buffer = std::mem::take(&mut self.unread);
+            self.upgrade.fulfil(Upgraded { tcp, read_buffer, permit });
+            context.waker().wake_by_ref();
+        }
+        // A TCP connection has nothing to flush.
+        Poll::Ready(Ok(()))
     }
 
     fn poll_shutdown(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
-        Pin::new(&mut self.tcp).poll_shutdown(context)
+        match self.tcp() {
+            Ok(tcp) => tcp.poll_shutdown(context),
+            Err(_) => Poll::Ready(Ok(())),
+        }
     }
 }

@@ -5,7 +5,7 @@
 //! address that it saw, and the last address that is not a trusted proxy is the client's.
 
 use std::fmt;
-use std::net::{IpAddr, Ipv6Addr, SocketAddr};
+use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
 
 use actix_web::HttpRequest;
 use actix_web::http::header::{HeaderMap, HeaderName};
@@ -92,6 +92,11 @@ impl TrustedProxies {
             }
         }
         nearest
+    }
+
+    /// Whether programs on this machine are trusted.
+    pub fn trusts_loopback(&self) -> bool {
+        self.trusts(Ipv4Addr::LOCALHOST.into()) || self.trusts(Ipv6Addr::LOCALHOST.into())
     }
 
     fn trusts(&self, address: IpAddr) -> bool {

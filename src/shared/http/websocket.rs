@@ -15,6 +15,8 @@ use actix_web_actors::ws::{CloseCode, CloseReason, Message, ProtocolError, Webso
 use bytestring::ByteString;
 use futures_util::Stream;
 
+use super::body;
+
 /// Size limit of a client's message, in bytes.
 const MAX_MESSAGE: usize = 8 * 1024;
 /// Limit of received bytes that wait to be read as messages. actix reports the size of a message only when it is
@@ -169,6 +171,9 @@ pub fn open<A>(request: &HttpRequest, payload: Payload, actor: impl FnOnce(Messa
 where
     A: Actor<Context = WebsocketContext<A>> + StreamHandler<Result<Message, ProtocolError>>,
 {
+    if let Some(refusal) = body::refuse(request) {
+        return refusal;
+    }
     let reader = MessageReader::default();
     let payload = BoundedPayload { payload, backlog: Arc::clone(&reader.backlog) };
     let socket = WsResponseBuilder::new(actor(reader), request, payload).frame_size(MAX_MESSAGE).start();

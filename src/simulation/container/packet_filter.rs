@@ -7,7 +7,9 @@ use std::time::Duration;
 use crate::simulation::process::{ExitReason, Ran, Run, RunError};
 
 /// The table of the filter.
-const TABLE: [&str; 5] = ["--terse", "list", "table", "inet", "webots_fleet"];
+const TABLE: &str = "webots_fleet";
+/// The table that keeps others from the streams that this server relays.
+const STREAMS: &str = "webots_streams";
 /// The unit that loads it.
 const UNIT: [&str; 3] = ["is-active", "--quiet", "webots-fleet-packet-filter.service"];
 /// Timeout of the `nft` or `systemctl` call.
@@ -20,13 +22,25 @@ const PATIENCE: Duration = Duration::from_secs(5);
 #[must_use]
 pub fn missing() -> Option<String> {
     let is_root = nix::unistd::geteuid().is_root();
-    let result =
-        if is_root { succeeds("/usr/sbin/nft", &TABLE, PATIENCE) } else { succeeds("systemctl", &UNIT, PATIENCE) };
+    let result = if is_root { list(TABLE) } else { succeeds("systemctl", &UNIT, PATIENCE) };
     let why = result.err()?;
     Some(format!(
         "containers may reach this machine and private addresses, for the packet filter is not loaded ({why}): install \
          nftables and run 'systemctl enable --now webots-fleet-packet-filter'"
     ))
+}
+
+/// Whether a packet filter keeps others from the ports of Webots; unknown to users other than root.
+///
+/// Blocks for five seconds at most, because it runs a program.
+#[must_use]
+pub fn closes_streams() -> Option<bool> {
+    nix::unistd::geteuid().is_root().then(|| list(STREAMS).is_ok())
+}
+
+/// Lists a table of the filter, which only root may.
+fn list(table: &str) -> Result<(), String> {
+    succeeds("/usr/sbin/nft", &["--terse", "list", "table", "inet", table], PATIENCE)
 }
 
 /// Whether a program exits with code 0, or why not.

@@ -3,32 +3,32 @@
 use std::cell::Cell;
 
 use actix_http::ws::{Codec, Frame, Message};
-use actix_web::web::{BytesMut, Payload};
+use actix_web::web::BytesMut;
 use futures_util::StreamExt;
-use tokio::io::{AsyncWrite, AsyncWriteExt};
-use tokio_util::codec::{Decoder, Encoder};
+use tokio::io::{AsyncRead, AsyncWrite, AsyncWriteExt};
+use tokio_util::codec::{Encoder, FramedRead};
 
-/// The largest message of who watches, in bytes.
+/// The largest message of a watching client, in bytes.
 const MAX_MESSAGE: usize = 8 * 1024;
 
 /// Passes on how a client wants to watch, and drops all else. Returns when the client closes or breaks the rules.
-pub async fn introduce(mut payload: Payload, mut to_webots: impl AsyncWrite + Unpin, heard: &Cell<bool>) {
-    let (mut from_client, mut codec) = (Codec::new().max_size(MAX_MESSAGE), Codec::new().client_mode());
-    let mut bytes = BytesMut::new();
-    while let Some(Ok(part)) = payload.next().await {
-        bytes.extend_from_slice(&part);
-        loop {
-            let text = match from_client.decode(&mut bytes) {
-                Ok(Some(Frame::Text(text))) if !heard.get() => String::from_utf8_lossy(&text).into_owned(),
-                Ok(Some(Frame::Close(_))) | Err(_) => return,
-                Ok(Some(_)) => continue,
-                Ok(None) => break,
-            };
-            let mut frame = BytesMut::new();
-            let written = is_introduction(&text) && codec.encode(Message::Text(text.into()), &mut frame).is_ok();
-            if written && to_webots.write_all(&frame).await.is_err() {
-                return;
-            }
+pub async fn introduce(
+    from_client: impl AsyncRead + Unpin,
+    to_webots: &mut (impl AsyncWrite + Unpin),
+    has_answered: &Cell<bool>,
+) {
+    let mut frames = FramedRead::new(from_client, Codec::new().max_size(MAX_MESSAGE));
+    let mut codec = Codec::new().client_mode();
+    while let Some(Ok(frame)) = frames.next().await {
+        let text = match frame {
+            Frame::Text(text) if !has_answered.get() => String::from_utf8_lossy(&text).into_owned(),
+            Frame::Close(_) => return,
+            _ => continue,
+        };
+        let mut bytes = BytesMut::new();
+        let is_encoded = is_introduction(&text) && codec.encode(Message::Text(text.into()), &mut bytes).is_ok();
+        if is_encoded && to_webots.write_all(&bytes).await.is_err() {
+            return;
         }
     }
 }

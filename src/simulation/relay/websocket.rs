@@ -1,29 +1,34 @@
-//! The WebSocket of a stream. Once both sides have agreed on it, the bytes are copied as they are: frames, their kinds and
-//! close codes are not looked at. Each direction is read only as fast as the other side takes it.
+//! The WebSocket of a stream. Once both ends have agreed on it, the bytes are copied as they are: frames, their kinds and
+//! close codes are not parsed. Each direction is read only as fast as the other end takes it.
 
 use std::cell::Cell;
-use std::rc::Rc;
+use std::pin::pin;
+use std::time::Duration;
 
-use actix_web::web::{Bytes, Payload};
-use actix_web::{HttpRequest, HttpResponse};
+use actix_rt::time::timeout;
+use actix_web::HttpRequest;
+use actix_web::HttpResponse;
+use actix_web::web::Bytes;
 use actix_web_actors::ws;
-use futures_util::{StreamExt, future, stream};
-use tokio::io::{AsyncWrite, AsyncWriteExt};
-use tokio_util::io::ReaderStream;
-use tokio_util::sync::CancellationToken;
+use futures_util::future::{self, Either};
+use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt};
 
 use super::upstream::{ANSWER, Upstream};
 use super::watching;
+use crate::shared::http::upgrade;
 
-/// How much is read from Webots at once, in bytes.
-const READ_AT_ONCE: usize = 16 * 1024;
+/// Sizes of the buffers for what Webots sends, scenes and pictures, and for what clients send, in bytes.
+const FROM_WEBOTS: usize = 16 * 1024;
+const FROM_CLIENT: usize = 4 * 1024;
+/// How long the other direction may go on once one has ended.
+const CLOSING: Duration = Duration::from_secs(5);
 
 /// Connects a client with the WebSocket at this URL, or answers why that can't be. Of a client that `only_watches` nothing
 /// reaches Webots but how it wants to watch. `held` is dropped with the connection.
 pub async fn connect(
     upstream: &Upstream,
     url: &str,
-    (request, payload): (&HttpRequest, Payload),
+    request: &HttpRequest,
     only_watches: bool,
     held: impl std::any::Any,
 ) -> HttpResponse {
@@ -34,49 +39,70 @@ pub async fn connect(
             return HttpResponse::build(status).body(format!("Error: this is a WebSocket: {error}."));
         }
     };
-    let socket = match actix_rt::time::timeout(ANSWER, upstream.client().ws(url).connect()).await {
+    let webots = match timeout(ANSWER, upstream.client().ws(url).connect()).await {
         Ok(Ok((_, framed))) => framed.into_parts(),
         Ok(Err(_)) => return HttpResponse::BadGateway().body("Error: the simulation does not answer."),
         Err(_) => return HttpResponse::GatewayTimeout().body("Error: the simulation does not answer."),
     };
-    let (from_webots, to_webots) = tokio::io::split(socket.io);
-    let end = CancellationToken::new();
-    // Whether Webots has said something.
-    let heard = Rc::new(Cell::new(false));
-    actix_rt::spawn(carry(payload, to_webots, only_watches.then(|| Rc::clone(&heard)), end.clone()));
-    let first = (!socket.read_buf.is_empty()).then(|| Ok(socket.read_buf.freeze()));
-    let rest = ReaderStream::with_capacity(from_webots, READ_AT_ONCE);
-    let said = stream::iter(first).chain(rest).take_until(end.clone().cancelled_owned());
-    // It is dropped with the answer, thus when the client's connection is gone.
-    let held = (held, end.drop_guard());
-    response.streaming(said.map(move |part: std::io::Result<Bytes>| {
-        let _ = &held;
-        heard.set(true);
-        part
-    }))
-}
-
-/// Carries what a client says to Webots, until one of them or the connection ends; then ends the connection.
-async fn carry(
-    payload: Payload,
-    to_webots: impl AsyncWrite + Unpin,
-    watches: Option<Rc<Cell<bool>>>,
-    end: CancellationToken,
-) {
-    let carried = async {
-        match watches {
-            Some(heard) => watching::introduce(payload, to_webots, &heard).await,
-            None => copy(payload, to_webots).await,
+    let upgraded = upgrade::on(request);
+    actix_rt::spawn(async move {
+        // An error: the client has left before the answer.
+        if let Ok(mut client) = upgraded.await {
+            let client_end = (client.tcp.split(), client.read_buffer.into());
+            let webots_end = (tokio::io::split(webots.io), webots.read_buf.freeze());
+            relay(client_end, webots_end, only_watches).await;
         }
-    };
-    let (carried, ended) = (std::pin::pin!(carried), std::pin::pin!(end.cancelled()));
-    future::select(carried, ended).await;
-    end.cancel();
+        drop(held);
+    });
+    response.finish()
 }
 
-async fn copy(mut payload: Payload, mut to_webots: impl AsyncWrite + Unpin) {
-    while let Some(Ok(part)) = payload.next().await {
-        if to_webots.write_all(&part).await.is_err() {
+/// The reader and the writer of a connection, and what was read of it already.
+type End<R, W> = ((R, W), Bytes);
+
+/// Copies both directions until both have ended, or one has and the other goes on for too long.
+async fn relay<R, W, S, T>(client: End<R, W>, webots: End<S, T>, only_watches: bool)
+where
+    R: AsyncRead + Unpin,
+    W: AsyncWrite + Unpin,
+    S: AsyncRead + Unpin,
+    T: AsyncWrite + Unpin,
+{
+    let ((from_client, mut to_client), sent_by_client) = client;
+    let ((mut from_webots, mut to_webots), sent_by_webots) = webots;
+    // Whether Webots has sent something.
+    let has_answered = Cell::new(false);
+    let up = async {
+        let mut from_client = sent_by_client.as_ref().chain(from_client);
+        if only_watches {
+            watching::introduce(from_client, &mut to_webots, &has_answered).await;
+        } else {
+            copy(&mut from_client, &mut to_webots, FROM_CLIENT, || {}).await;
+        }
+        to_webots.shutdown().await.ok();
+    };
+    let down = async {
+        let mut from_webots = sent_by_webots.as_ref().chain(&mut from_webots);
+        copy(&mut from_webots, &mut to_client, FROM_WEBOTS, || has_answered.set(true)).await;
+        to_client.shutdown().await.ok();
+    };
+    match future::select(pin!(up), pin!(down)).await {
+        Either::Left(((), down)) => timeout(CLOSING, down).await.ok(),
+        Either::Right(((), up)) => timeout(CLOSING, up).await.ok(),
+    };
+}
+
+/// Copies until one end closes; calls `on_read` after each read.
+async fn copy(
+    from: &mut (impl AsyncRead + Unpin),
+    to: &mut (impl AsyncWrite + Unpin),
+    size: usize,
+    on_read: impl Fn(),
+) {
+    let mut buffer = vec![0; size];
+    while let Ok(length @ 1..) = from.read(&mut buffer).await {
+        on_read();
+        if to.write_all(buffer.get(..length).unwrap_or_default()).await.is_err() {
             return;
         }
     }

@@ -119,7 +119,7 @@ struct Which {
 }
 
 /// The last output lines of a simulation, running or ended. They may be private, so the administrator's password
-/// protects them if one is configured.
+/// protects them if one is configured. Without it they name no port that only the relay of streams should reach.
 async fn output(request: HttpRequest, which: web::Query<Which>, server: web::Data<AppState>) -> HttpResponse {
     if let Some(auth) = &server.admin_auth
         && let Err(refused) = auth.check(&request, server.config.trusted_proxies.peer(&request))
@@ -131,11 +131,23 @@ async fn output(request: HttpRequest, which: web::Query<Which>, server: web::Dat
     let Ok(Some(tail)) = tail else {
         return HttpResponse::NotFound().body("Error: nothing is kept of this simulation.");
     };
+    let has_ports = server.admin_auth.is_some() || server.config.ports_are_public();
+    let tail = if has_ports { tail } else { without_ports(&tail) };
     HttpResponse::Ok()
         .insert_header((header::X_CONTENT_TYPE_OPTIONS, "nosniff"))
         .insert_header((header::CONTENT_SECURITY_POLICY, "default-src 'none'; frame-ancestors 'none'"))
         .content_type("text/plain; charset=utf-8")
         .body(tail)
+}
+
+/// The text without the numbers of ports, as events and Webots write them: `port 2001`.
+fn without_ports(text: &str) -> String {
+    let mut parts = text.split("port ");
+    let first = parts.next().unwrap_or_default().to_owned();
+    parts.fold(first, |text, part| {
+        let rest = part.trim_start_matches(|one: char| one.is_ascii_digit());
+        text + "port " + if rest.len() < part.len() { "..." } else { "" } + rest
+    })
 }
 
 /// The last whole lines of a file.
@@ -170,6 +182,19 @@ async fn wwi(request: HttpRequest, server: web::Data<AppState>) -> HttpResponse 
 mod tests {
     use super::*;
     use std::fs;
+
+    #[test]
+    fn ports_are_left_out() {
+        for (text, shown) in [
+            ("12:00:00 port 2001: ready\nport 2002", "12:00:00 port ...: ready\nport ..."),
+            ("support 2001", "support ..."),
+            ("an export in 2026", "an export in 2026"),
+            ("port is 7", "port is 7"),
+            ("", ""),
+        ] {
+            assert_eq!(without_ports(text), shown, "{text}");
+        }
+    }
 
     #[test]
     fn only_the_end_of_an_output_is_read() {

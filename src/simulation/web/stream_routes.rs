@@ -4,8 +4,8 @@ use actix_web::http::header;
 use actix_web::{HttpRequest, HttpResponse, web};
 
 use super::origins::refuse_origin;
-use crate::shared::http::ConnectionKind;
 use crate::shared::http::routing::{GET, path};
+use crate::shared::http::{ConnectionKind, body};
 use crate::simulation::relay::{self, Upstream};
 use crate::simulation::state::AppState;
 use crate::simulation::streams::Found;
@@ -15,16 +15,15 @@ pub fn configure(app: &mut web::ServiceConfig) {
     app.service(path("/stream/{path:.*}", GET, stream));
 }
 
-async fn stream(request: HttpRequest, payload: web::Payload, server: web::Data<AppState>) -> HttpResponse {
+async fn stream(request: HttpRequest, server: web::Data<AppState>) -> HttpResponse {
     let nothing = || HttpResponse::NotFound().body("Error: there is no such stream.");
     // As the client has written it: what it has encoded stays so.
     let Some((token, path)) = relay::split(request.uri().path()) else { return nothing() };
     let Some(found) = server.streams.find(&token) else { return nothing() };
-    let headers = request.headers();
-    let has_length = headers.get(header::CONTENT_LENGTH).is_some_and(|length| length != "0");
-    if has_length || headers.contains_key(header::TRANSFER_ENCODING) {
-        return HttpResponse::BadRequest().body("Error: nothing but a question is taken here.");
+    if let Some(refusal) = body::refuse(&request) {
+        return refusal;
     }
+    let headers = request.headers();
     let is_websocket = headers.contains_key(header::UPGRADE);
     // Worlds' pages and Webots' own viewer run in frames without an origin; the token is what strangers lack.
     let is_in_frame = headers.get(header::ORIGIN).is_some_and(|origin| origin == "null");
@@ -43,9 +42,9 @@ async fn stream(request: HttpRequest, payload: web::Payload, server: web::Data<A
         return relay::fetch(upstream, &url, &request, permit).await;
     }
     if !only_watches {
-        return relay::connect(upstream, &url, (&request, payload), false, permit).await;
+        return relay::connect(upstream, &url, &request, false, permit).await;
     }
     let Some(watching) = server.streams.begin(&token) else { return nothing() };
     log::info!("{simulation}: client {peer} watches");
-    relay::connect(upstream, &url, (&request, payload), true, (permit, watching)).await
+    relay::connect(upstream, &url, &request, true, (permit, watching)).await
 }

@@ -4,10 +4,9 @@ use actix_web::{HttpRequest, HttpResponse, web};
 use askama::Template;
 use serde::Deserialize;
 
-use super::administrator::refuse_others;
 use super::webots_viewer;
 use crate::shared::http::routing::{GET, READ, path};
-use crate::shared::http::{ContentSecurityPolicy, html, own_sources};
+use crate::shared::http::{ContentSecurityPolicy, html, own_sources, require_administrator};
 use crate::simulation::state::AppState;
 
 /// The page `/watch`.
@@ -45,7 +44,8 @@ pub fn configure(app: &mut web::ServiceConfig) {
 /// The token that the page gets is new each time, so that its address, which may be kept or sent to others, leads nobody
 /// without the password to the stream.
 async fn watch(request: HttpRequest, which: web::Query<Which>, server: web::Data<AppState>) -> HttpResponse {
-    if let Some(refusal) = refuse_others(&request, &server) {
+    let peer = server.config.trusted_proxies.peer(&request);
+    if let Some(refusal) = require_administrator(server.admin_auth.as_ref(), &request, peer) {
         return refusal;
     }
     let Some(token) = server.streams.watch(&which.id) else {

@@ -165,7 +165,7 @@ impl Webots {
             return self.stop(EndReason::NoWebots, &why);
         }
         if port != self.port {
-            self.log(Level::Warn, &format!("it was taken, Webots listens on {port}"));
+            self.log(Level::Warn, &format!("it was taken, Webots listens on port {port}"));
         }
         self.spec.slot.lease.log(Level::Info, format!("port {port}: ready"));
         self.listening = true;
