@@ -84,7 +84,7 @@ class OneDoor(Fleet):
         users = adapted(
             (ROOT / "deploy/nginx-users.conf").read_text(), sign_in=("127.0.0.1:4180", f"127.0.0.1:{sign_in}"),
             # The session server asks the others directly, and visitors come from this machine.
-            unsigned=("allow 127.0.0.1;", ""))
+            unsigned=("allow 127.0.0.1;", ""), ports=(r"2000\|3000", "|".join(str(port) for _, port in self.hosts)))
         (folder / "users.conf").write_text(users)
         servers = "|".join(str(port) for _, port in self.hosts)
         site = adapted(

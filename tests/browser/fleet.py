@@ -180,6 +180,8 @@ class Fleet:
         forge = self.folder / "forge"
         work = self.folder / "work"
         shutil.copytree(ROOT / "config/demo", work)
+        (work / "worlds/textures").mkdir()
+        (work / "worlds/textures/wood.png").write_text("a picture")
         git = ["git", "-c", "user.name=Test", "-c", "user.email=test@localhost", "-c", "commit.gpgSign=false"]
         bare = forge / "demo/worlds"
         bare.mkdir(parents=True)
