@@ -33,10 +33,9 @@ class Browser:
         self.playwright.stop()
         self.profile.cleanup()
 
-    def page(self, scheme="light", width=1280, height=900, javascript=True, http_credentials=None):
+    def page(self, scheme="light", width=1280, height=900, javascript=True, **options):
         context = self.chromium.new_context(
-            color_scheme=scheme, viewport={"width": width, "height": height}, java_script_enabled=javascript,
-            http_credentials=http_credentials)
+            color_scheme=scheme, viewport={"width": width, "height": height}, java_script_enabled=javascript, **options)
         context.set_default_timeout(1000 * SOON)
         return Page(context)
 

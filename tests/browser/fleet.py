@@ -92,7 +92,7 @@ class Server:
 
     @property
     def address(self):
-        return f"127.0.0.1:{self.port}"
+        return f"{self.config['bind']}:{self.port}"
 
     def url(self, path):
         return f"http://{self.address}/{path}"
@@ -180,6 +180,8 @@ class Fleet:
         forge = self.folder / "forge"
         work = self.folder / "work"
         shutil.copytree(ROOT / "config/demo", work)
+        (work / "worlds/textures").mkdir()
+        (work / "worlds/textures/wood.png").write_text("a picture")
         git = ["git", "-c", "user.name=Test", "-c", "user.email=test@localhost", "-c", "commit.gpgSign=false"]
         bare = forge / "demo/worlds"
         bare.mkdir(parents=True)
@@ -194,9 +196,10 @@ class Fleet:
         return forge
 
     def _simulation(self, name, more):
-        places = 4
+        places = more.get("maxConnections", 4)
+        port = more.get("port") or free_ports(places + 12)
         return self.start("simulation-server", name, {
-            "port": free_ports(places + 12), "maxConnections": places, "webots": str(BIN / "demo-simulator"),
+            "port": port, "maxConnections": places, "webots": str(BIN / "demo-simulator"),
             "environment": "DEMO_SIMULATOR_BIND",
             "cacheDir": str(self.folder / name / "cache"),
             "allowedRepositories": ["https://github.com/demo"],

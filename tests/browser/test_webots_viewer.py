@@ -1,12 +1,15 @@
 """Webots' own viewer, taken from where Webots is installed: a stand-in for it, for no Webots is needed here."""
 
 import pathlib
+import re
 import tempfile
 import unittest
 
 from playwright.sync_api import expect
 
 from case import BrowserTest
+from door import COOKIE, OneDoor
+from fleet import WORLD, until
 
 # As the real one does, it names its style sheet by another site and makes a script in the page.
 COMPONENT = """
@@ -21,25 +24,44 @@ class WebotsView extends HTMLElement {
     script.textContent = 'window.ran = true;';
     document.head.appendChild(script);
   }
-  connect(server) {
+  connect(server, mode, broadcast) {
     localStorage.setItem('theme', 'dark');
     this.textContent = `${greeting} ${server} ${Module.locateFile('wren.data', '')} ${window.ran} ${window.origin}`;
+    this.stream(`${server}/`, broadcast);
+  }
+  // As the real one does it: texts over the stream, files from where the stream is.
+  stream(server, broadcast) {
+    const socket = new WebSocket(server);
+    socket.onopen = () => socket.send(broadcast ? 'x3d;broadcast' : 'x3d');
+    socket.onmessage = async ({ data }) => {
+      if (data === 'scene load completed') {
+        const file = await fetch(`${server.replace('ws', 'http')}worlds/textures/wood.png`);
+        this.textContent += ` ${data}, ${await file.text()}`;
+        socket.send('real-time:-1');
+      } else if (data.startsWith('application/json:'))
+        this.title = data;
+    };
   }
 }
 customElements.define('webots-view', WebotsView);
 """
 
 
+def installed(test):
+    """What a simulation server needs to have Webots' viewer."""
+    home = pathlib.Path(test.enterClassContext(tempfile.TemporaryDirectory()))
+    folder = home / "resources/web/wwi"
+    (folder / "css").mkdir(parents=True)
+    (folder / "WebotsView.js").write_text(COMPONENT)
+    (folder / "part.js").write_text("export const greeting = 'connected to';\n")
+    (folder / "css/wwi.css").write_text("webots-view { font-size: 20px; }\n")
+    return {"webotsHome": str(home)}
+
+
 class WebotsViewer(BrowserTest):
     @classmethod
     def setUpClass(cls):
-        home = pathlib.Path(cls.enterClassContext(tempfile.TemporaryDirectory()))
-        folder = home / "resources/web/wwi"
-        (folder / "css").mkdir(parents=True)
-        (folder / "WebotsView.js").write_text(COMPONENT)
-        (folder / "part.js").write_text("export const greeting = 'connected to';\n")
-        (folder / "css/wwi.css").write_text("webots-view { font-size: 20px; }\n")
-        cls.simulation = {"webotsHome": str(home)}
+        cls.simulation = installed(cls)
         super().setUpClass()
 
     def test_it_is_loaded_from_the_simulation_server_alone(self):
@@ -56,6 +78,40 @@ class WebotsViewer(BrowserTest):
     def test_a_scene_of_the_demonstration_is_shown_by_the_small_viewer(self):
         page, _ = self.start_world()
         expect(page.tab.locator("#view")).to_be_visible()
+
+
+class BehindTheDoor(BrowserTest):
+    """The same where streams are relayed, on several machines behind one web server at which visitors sign in."""
+
+    host = "localhost"
+
+    @classmethod
+    def make_fleet(cls):
+        return OneDoor(places=2, simulation={**installed(cls), "adminPassword": "secret"})
+
+    def visit(self, url, **options):
+        page = self.open("about:blank", ignore_https_errors=True, **options)
+        page.context.add_cookies([{"name": COOKIE, "value": "anna", "url": self.fleet.url("")}])
+        page.tab.goto(url)
+        return page
+
+    def test_it_streams_through_the_door_and_an_administrator_watches_with_it(self):
+        page = self.visit(self.fleet.url(f"viewer?url={WORLD.format('playground')}"))
+        expect(page.tab.locator("#light.on")).to_be_visible()
+        page.tab.get_by_label("Shown by").select_option("webots")
+        page.tab.get_by_role("button", name="Connect", exact=True).click()
+        view = page.tab.frame_locator("#stage iframe").locator("webots-view")
+        expect(view).to_contain_text(f"connected to wss://{self.fleet.host}/127.0.0.")
+        expect(view).to_contain_text("scene load completed, a picture")
+        moves = re.compile("^application/json:")
+        expect(view).to_have_attribute("title", moves)
+        server = page.tab.locator("[data-step=server] small").inner_text().replace("wss:", "https:")
+        teacher = self.visit(f"{server}/sign-in", http_credentials={"username": "teacher", "password": "secret"})
+        teacher.tab.goto(teacher.tab.get_by_role("link", name="Watch").evaluate("link => link.href"))
+        watched = teacher.tab.frame_locator("#stage iframe").locator("webots-view")
+        expect(watched).to_contain_text(f"connected to {server.replace('https:', 'wss:')}/stream/")
+        expect(watched).to_have_attribute("title", moves)
+        expect(page.tab.locator("#watched")).to_be_visible()
 
 
 if __name__ == "__main__":

@@ -51,6 +51,28 @@ async fn who_signs_in_at_the_web_server_is_known_to_the_administrator() {
     assert_eq!(visitor.get("/oauth2/sign_in").await.status.as_u16(), 200);
     assert_eq!(visitor.get("/oauth2/auth").await.status.as_u16(), 404, "nobody asks for others");
 
+    // What frames without an origin need is there for all, and leads to nothing else.
+    let port = fleet.here.port;
+    for (path, status) in [
+        ("/assets/style.css".to_owned(), 200),
+        (format!("/{port}/assets/style.css"), 200),
+        (format!("/{port}/wwi/WebotsView.js"), 404),
+        (format!("/{port}/stream/{}/", "0".repeat(32)), 404),
+        (format!("/{port}/assets/../monitor"), 302),
+        (format!("/{port}/assets/%2e%2e/monitor"), 302),
+        (format!("/{port}/assets/.%2E/monitor"), 302),
+        ("/assets/../monitor".to_owned(), 302),
+        (format!("/monitor?/{port}/assets/"), 302),
+        (format!("/{port}/status?/{port}/stream/"), 302),
+        (format!("/{port}/status#/{port}/stream/"), 302),
+        (format!("/{port}/status/{port}/stream/"), 302),
+        (format!("/{port}//assets/style.css"), 302),
+        (format!("/{}/stream/x", port + 1), 302),
+    ] {
+        let answer = visitor.get(&path).await;
+        assert_eq!(answer.status.as_u16(), status, "{path}: {answer:?}");
+    }
+
     let anna = [("cookie", "_oauth2_proxy=anna")];
     assert_eq!(visitor.ask(&format!("https://{}/viewer", visitor.host), &anna).await.status.as_u16(), 200);
     let mut running: Vec<Client> = Vec::new();

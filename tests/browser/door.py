@@ -1,0 +1,132 @@
+"""One door to a fleet: nginx with the rules of `deploy`, and a stand-in for oauth2-proxy, at which visitors sign in."""
+
+import contextlib
+import http.server
+import pathlib
+import re
+import shutil
+import subprocess
+import threading
+
+import trustme
+
+from fleet import BIN, ROOT, Fleet, free_ports, until
+
+# Debian has web servers where only root looks for programs.
+NGINX = shutil.which("nginx") or "/usr/sbin/nginx"
+COOKIE = "_oauth2_proxy"
+MACHINES = ["127.0.0.2", "127.0.0.3"]
+
+
+class SignIn(http.server.BaseHTTPRequestHandler):
+    """Whose cookie is a name has signed in with it."""
+
+    def do_GET(self):
+        names = re.findall(f"{COOKIE}=([a-z]+)", self.headers.get("cookie", ""))
+        if self.path != "/oauth2/auth":
+            self.send_response(200)
+        elif names:
+            self.send_response(202)
+            self.send_header("X-Auth-Request-Email", f"{names[0]}@school.example")
+        else:
+            self.send_response(401)
+        self.send_header("Content-Length", "0")
+        self.end_headers()
+
+    def log_message(self, *_):
+        pass
+
+
+def adapted(text, **changes):
+    """Rules for this machine: each pattern must be there."""
+    for what, (pattern, replacement) in changes.items():
+        text, count = re.subn(pattern, lambda _: replacement, text, flags=re.DOTALL)
+        assert count, f"{what}: {pattern} is not in {text}"
+    return text
+
+
+class OneDoor(Fleet):
+    """A fleet of two machines, 127.0.0.2 and 127.0.0.3, behind one https door where visitors sign in. Streams are relayed, so
+    that only the simulation servers' own ports are forwarded."""
+
+    def __init__(self, places, session=None, simulation=None):
+        self.exits = contextlib.ExitStack()
+        sign_in = http.server.ThreadingHTTPServer(("127.0.0.1", 0), SignIn)
+        self.exits.callback(sign_in.server_close)
+        threading.Thread(target=sign_in.serve_forever, daemon=True).start()
+        self.exits.callback(sign_in.shutdown)
+        # Each simulation server needs some ports after its own.
+        each = places + 12
+        plain, self.https, inside, *_ = ports = range(first := free_ports(3 + 2 * each), first + 3 + 2 * each)
+        self.hosts = [(host, ports[3 + number * each]) for number, host in enumerate(MACHINES)]
+        self.host = f"localhost:{self.https}"
+        public = {"publicUrl": f"wss://{self.host}/{{host}}/{{port}}"}
+        super().__init__(
+            {**public, "port": inside, **(session or {})},
+            {**public, "maxConnections": places, "streaming": "relay", "userHeader": "X-Forwarded-User", **(simulation or {})})
+        try:
+            self._open(plain, sign_in.server_port)
+        except BaseException:
+            self.close()
+            raise
+
+    def _simulation(self, name, more):
+        host, port = self.hosts[0 if name == "one" else 1]
+        return super()._simulation(name, {"server": host, "bind": host, "port": port, **more})
+
+    def _open(self, plain, sign_in):
+        """Starts nginx."""
+        folder = self.folder / "nginx"
+        folder.mkdir()
+        certificate = trustme.CA().issue_cert("localhost")
+        certificate.cert_chain_pems[0].write_to_path(folder / "chain.pem")
+        certificate.private_key_pem.write_to_path(folder / "key.pem")
+        users = adapted(
+            (ROOT / "deploy/nginx-users.conf").read_text(), sign_in=("127.0.0.1:4180", f"127.0.0.1:{sign_in}"),
+            # The session server asks the others directly, and visitors come from this machine.
+            unsigned=("allow 127.0.0.1;", ""), ports=(r"2000\|3000", "|".join(str(port) for _, port in self.hosts)))
+        (folder / "users.conf").write_text(users)
+        servers = "|".join(str(port) for _, port in self.hosts)
+        site = adapted(
+            (ROOT / "deploy/nginx-door.conf").read_text(),
+            certificate=("/etc/letsencrypt/live/fleet.example.org/fullchain.pem", f"{folder}/chain.pem"),
+            key=("/etc/letsencrypt/live/fleet.example.org/privkey.pem", f"{folder}/key.pem"),
+            name=("fleet.example.org", "localhost"),
+            any_address=(r"listen \[::\]:[^\n]*", ""),
+            plain=("listen 80;", f"listen 127.0.0.1:{plain};"),
+            https=("listen 443 ssl;", f"listen 127.0.0.1:{self.https} ssl;"),
+            session=("192.0.2.1:1999", self.session.address),
+            machines=(r"192\\\.0\\\.2\\\.\[0-9\]\+", r"127\.0\.0\.[23]"),
+            # What the file's head says of streams that are relayed: the location of Webots' own ports goes.
+            streams=(r"  # Their simulations, and editors\..*?\n  }\n", ""),
+            servers=(r"\(\?<fleet_port>2000\)", f"(?<fleet_port>{servers})"),
+            password=(r"  2000    \$http_authorization;", f"  ~^(?:{servers})$ $http_authorization;"),
+            users=(r"(  proxy_set_header Authorization[^\n]*\n)",
+                   f"  proxy_set_header Authorization $fleet_authorization;\n  include {folder}/users.conf;\n"),
+            log=("/var/log/nginx/access.log", f"{folder}/access.log"))
+        (folder / "site.conf").write_text(site)
+        temporary = "".join(f"{name}_temp_path {folder}/{name};\n" for name in ("client_body", "proxy", "fastcgi", "uwsgi", "scgi"))
+        (folder / "nginx.conf").write_text(
+            f"user root;\ndaemon off;\nworker_processes 1;\npid {folder}/pid;\nerror_log {folder}/error.log warn;\n"
+            f"events {{ worker_connections 1024; }}\nhttp {{\n{temporary}include {folder}/site.conf;\n}}\n")
+        with (folder / "output.txt").open("w") as output:
+            nginx = subprocess.Popen(
+                [NGINX, "-e", folder / "error.log", "-c", folder / "nginx.conf"], stdin=subprocess.DEVNULL, stdout=output, stderr=output)
+        self.exits.callback(nginx.wait)
+        self.exits.callback(nginx.terminate)
+        until("nginx runs", lambda: (folder / "pid").exists() or nginx.poll() is not None)
+
+    def url(self, path):
+        return f"https://{self.host}/{path}"
+
+    def machine(self, server):
+        """Where the door leads to this server."""
+        return self.url(f"{server.config['server']}/{server.port}")
+
+    def logs(self):
+        files = [self.folder / "nginx" / name for name in ("output.txt", "error.log", "access.log")]
+        return super().logs() + "".join(f"\n--- {file.name} ---\n{file.read_text()}" for file in files if file.exists())
+
+    def close(self):
+        self.exits.close()
+        super().close()

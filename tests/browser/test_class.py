@@ -1,0 +1,214 @@
+"""A class of thirty on two machines behind one door: who is who, watching, stopping, announcing, and a prank that fails."""
+
+import re
+import unittest
+
+from playwright.sync_api import expect
+
+from browser import Page
+from case import BrowserTest
+from door import COOKIE, OneDoor
+from fleet import SOON, WORLD, until
+
+PASSWORD = "open sesame"
+TABS = ["anna", "ben", "chloe"]
+OTHERS = [
+    "dora", "emil", "fay", "gus", "hana", "ivan", "jane", "kofi", "lena", "milo", "nora", "omar", "pia", "quinn", "rosa", "sami",
+    "tess", "uma", "vera", "will", "xena", "yara", "zeno", "amir", "bela", "carl", "dana"]
+CLASS = TABS + OTHERS
+# What a page does that shows nothing: it asks for a simulation server, starts a world there, and stays.
+START = """
+    async ([world, name]) => {
+      const server = await (await fetch(`session?url=${world}`)).text();
+      const socket = new WebSocket(`${server}/client`);
+      const heard = new Promise((resolve, reject) => {
+        socket.onmessage = ({ data }) => {
+          if (data.startsWith('webots:'))
+            resolve(data.slice('webots:'.length));
+          else if (data.startsWith('loading: Error:'))
+            reject(data);
+        };
+        socket.onclose = ({ code }) => reject(`${name} was left: ${code}`);
+      });
+      heard.catch(() => {});
+      (window.simulations ??= []).push(heard);
+      await new Promise((resolve, reject) => {
+        socket.onopen = resolve;
+        socket.onerror = () => reject(`${name} is not let in`);
+      });
+      socket.send(JSON.stringify({ start: { url: world, name } }));
+    }"""
+# Whether a WebSocket is opened; who is let in plays the prank.
+PRANK = """
+    (url) => new Promise((resolve) => {
+      const socket = new WebSocket(url);
+      socket.onopen = () => { socket.send('pause'); socket.send('reset'); resolve(true); };
+      socket.onerror = () => resolve(false);
+    })"""
+# From now on a page knows when its announcement was shown.
+NOTICE = """
+    () => {
+      const place = document.getElementById('announcement');
+      new MutationObserver(() => { window.announced ??= place.textContent && Date.now(); })
+        .observe(place, { childList: true, subtree: true, characterData: true, attributes: true });
+    }"""
+
+
+class AClass(BrowserTest):
+    host = "localhost"
+
+    @classmethod
+    def make_fleet(cls):
+        # Half of the class on each machine, and a place for who comes late.
+        return OneDoor(places=16, session={"adminPassword": PASSWORD}, simulation={"adminPassword": PASSWORD})
+
+    def visit(self, name, path, **options):
+        """A page in the browser of somebody who has signed in at the door, on a machine of its own."""
+        context = self.browser.chromium.new_context(ignore_https_errors=True, viewport={"width": 1000, "height": 700}, **options)
+        context.set_default_timeout(1000 * SOON)
+        context.add_cookies([{"name": COOKIE, "value": name, "url": self.fleet.url("")}])
+        page = Page(context)
+        self.addCleanup(page.close)
+        page.tab.goto(self.fleet.url(path))
+        return page
+
+    def student(self, name):
+        """A student whose viewer shows a simulation."""
+        page = self.visit(name, f"viewer?name={name.title()}&url={WORLD.format('playground')}")
+        expect(page.tab.locator("#visitor")).to_contain_text(f"The administrator sees you as {name.title()}.")
+        expect(page.tab.locator("#light.on")).to_be_visible()
+        page.tab.get_by_role("button", name="Connect", exact=True).click()
+        return page
+
+    def others(self):
+        """All others, in the background: each signs in with an own name."""
+        page = self.visit(OTHERS[0], "viewer")
+        for name in OTHERS:
+            page.context.add_cookies([{"name": COOKIE, "value": name, "url": self.fleet.url("")}])
+            page.tab.evaluate(START, [WORLD.format("carousel"), f"{name.title()} at desk {CLASS.index(name)}"])
+        return page
+
+    def monitors(self):
+        """What the teacher has open: the monitor of each machine, reached from that of the fleet."""
+        credentials = {"username": "teacher", "password": PASSWORD}
+        fleet = self.visit("teacher", "monitor", http_credentials=credentials)
+        expect(fleet.tab.locator("#servers .state.up, #servers .state.full")).to_have_count(2)
+        machines = []
+        for link in fleet.tab.locator("#servers th a").all():
+            machine = Page(fleet.context)
+            machine.tab.goto(link.get_attribute("href"))
+            machine.tab.get_by_role("link", name="Sign in").click()
+            expect(machine.tab.locator("#live")).to_have_text("Live")
+            machines.append(machine)
+        return fleet, machines
+
+    def test_a_teacher_has_a_class_of_thirty_in_hand(self):
+        students = {name: self.student(name) for name in TABS}
+        others = self.others()
+        streams = others.tab.evaluate("Promise.all(simulations)")
+        for page in students.values():
+            expect(page.tab.locator("[data-step=simulation].done")).to_be_visible()
+        anna = students["anna"]
+        anna.tab.get_by_role("button", name="Play", exact=True).click()
+        expect(anna.tab.locator("#mode")).to_have_text("real time")
+
+        fleet, machines = self.monitors()
+        self.every_student_has_a_name(machines)
+        machine = self.the_teacher_finds_and_watches(anna, machines)
+        self.the_prank_fails(students["ben"], anna, streams)
+        self.all_are_told(fleet, [students["ben"], students["chloe"], others])
+        self.one_is_stopped_with_a_reason(anna, machine)
+        # Nobody else has noticed anything.
+        for machine in machines:
+            machine.tab.get_by_label("Filter").fill("")
+        until("the others run on", lambda: sum(one.tab.locator("#simulations tr").count() for one in machines) == len(CLASS) - 1)
+        expect(students["ben"].tab.locator("#problem")).to_be_hidden()
+        for page in [fleet, *machines, *students.values()]:
+            self.keeps_to_the_rules(page)
+
+    def every_student_has_a_name(self, machines):
+        """Who has signed in is named so; what they call themselves stands beside it, unverified."""
+        read = """table => [...table.querySelectorAll('td[data-label=Who]')]
+            .map((cell) => [cell.querySelector('b')?.textContent, cell.querySelector('span')?.textContent])"""
+        parts = lambda: [dict(one.tab.locator("#simulations").evaluate(read)) for one in machines]
+        until("all are listed", lambda: sum(map(len, parts())) == len(CLASS))
+        one, other = parts()
+        self.assertEqual(sorted({**one, **other}), sorted(f"{name}@school.example" for name in CLASS))
+        for number, name in enumerate(CLASS):
+            label = name.title() if name in TABS else f"{name.title()} at desk {number}"
+            self.assertEqual((one | other)[f"{name}@school.example"], f"{label} unverified")
+        self.assertGreater(min(len(one), len(other)), 8, "each machine has its part of the class")
+
+    def the_teacher_finds_and_watches(self, student, machines):
+        """Gives back the monitor on which the student is."""
+        for machine in machines:
+            machine.tab.get_by_label("Filter").fill("anna@")
+        found = [one for one in machines if one.tab.locator("#simulations tr:visible").count()]
+        self.assertEqual(len(found), 1)
+        row = found[0].tab.locator("#simulations tr:visible")
+        expect(row).to_have_count(1)
+        expect(row).to_contain_text("anna@school.example")
+        with found[0].context.expect_page() as opened:
+            row.get_by_role("link", name="Watch").click()
+        watching = opened.value
+        expect(watching.locator("#state")).to_have_text("Watching")
+        expect(student.tab.locator("#watched")).to_have_text("Your teacher is watching.")
+        before = watching.locator("#clock").inner_text()
+        until("the teacher sees time pass", lambda: watching.locator("#clock").inner_text() != before)
+        watching.close()
+        expect(student.tab.locator("#watched")).to_be_hidden()
+        return found[0]
+
+    def the_prank_fails(self, prankster, victim, streams):
+        """Somebody of the same class reaches no simulation but the own one."""
+        stream = next(url for url in victim.asked if "/stream/" in url)
+        base, token = re.fullmatch(r"(wss://.*)/stream/([0-9a-f]+)/", stream).groups()
+        machine = base.replace("wss://", "https://")
+        status = prankster.tab.evaluate("url => fetch(url).then((answer) => answer.json())", f"{machine}/status")
+        self.assertGreater(len(status["simulations"]), 8)
+        for one in status["simulations"]:
+            self.assertIsNone(one["port"])
+        for secret in (token, "anna", "Anna"):
+            self.assertNotIn(secret, str(status))
+        # The ports, were they guessed, and tokens that are none: of others' ids, of a part, of another machine.
+        server = next(one for one in (self.fleet.simulation, self.fleet.other) if f"/{one.config['server']}/" in base)
+        elsewhere = next(url for url in streams if not url.startswith(base))
+        ports = [base.replace(f"/{server.port}", f"/{port}") + "/" for port in range(server.port + 1, server.port + 17)]
+        tokens = [one["id"] for one in status["simulations"]] + [token[:-1], token.upper() + "0", "0" * len(token), elsewhere.rsplit("/", 1)[1]]
+        complaints = len(prankster.complaints)
+        for url in ports + [f"{base}/stream/{one}/" for one in tokens]:
+            self.assertFalse(prankster.tab.evaluate(PRANK, url), url)
+        del prankster.complaints[complaints:]
+        for one in status["simulations"]:
+            stop = prankster.context.request.post(f"{machine}/simulations/{one['id']}/stop")
+            self.assertEqual(stop.status, 401)
+        expect(victim.tab.locator("#mode")).to_have_text("real time")
+
+    def all_are_told(self, fleet, pages):
+        """An announcement is on open viewers and monitors within two seconds."""
+        monitor = self.visit("ivan", "monitor")
+        expect(monitor.tab.locator("#live")).to_have_text("Live")
+        for page in [*pages, monitor]:
+            page.tab.evaluate(NOTICE)
+        fleet.tab.get_by_label("Text for all open viewers").fill("Please save your work.")
+        button = fleet.tab.get_by_role("button", name="Announce")
+        button.evaluate("button => button.addEventListener('click', () => { window.clicked = Date.now(); })")
+        button.click()
+        for page in [*pages, monitor]:
+            expect(page.tab.locator("#announcement")).to_contain_text("Please save your work.")
+            took = page.tab.evaluate("announced") - fleet.tab.evaluate("clicked")
+            self.assertLessEqual(took, 2000, page.tab.url)
+
+    def one_is_stopped_with_a_reason(self, student, machine):
+        machine.tab.locator("#simulations tr:visible").get_by_role("button", name="Stop").click()
+        dialog = machine.tab.get_by_role("dialog")
+        expect(dialog).to_contain_text("anna@school.example")
+        dialog.get_by_label("Reason").fill("Please come to my desk")
+        dialog.get_by_role("button", name="Stop it").click()
+        expect(dialog).to_be_hidden()
+        expect(student.tab.locator("#problem")).to_contain_text("Your teacher has stopped this simulation: Please come to my desk")
+        expect(machine.tab.locator("#ends tr").first).to_contain_text("anna@school.example")
+
+
+if __name__ == "__main__":
+    unittest.main()
