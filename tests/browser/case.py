@@ -6,7 +6,7 @@ import unittest
 from playwright.sync_api import expect
 
 from browser import Browser
-from fleet import SOON, Fleet
+from fleet import SOON, Fleet, until
 
 expect.set_options(timeout=1000 * SOON)
 
@@ -64,3 +64,38 @@ class BrowserTest(unittest.TestCase):
         servers = [one for one in (self.fleet.simulation, self.fleet.other) if chosen == f"ws://{one.address}"]
         self.assertEqual(len(servers), 1, chosen)
         return page, servers[0]
+
+
+def seconds(page):
+    """Simulated time, as the page shows it."""
+    minutes, rest = page.tab.locator("#clock").inner_text().split(":")
+    return 60 * int(minutes) + float(rest)
+
+
+class Running(BrowserTest):
+    """Tests of a simulation that runs."""
+
+    def running(self, **options):
+        """A page whose simulation runs in real time."""
+        page, server = self.start_world(**options)
+        page.tab.get_by_role("button", name="Play", exact=True).click()
+        expect(page.tab.locator("#mode")).to_have_text("real time")
+        until("time passes", lambda: seconds(page) > 0.2)
+        return page, server
+
+    def pid(self, server):
+        simulations = server.status()["simulations"]
+        self.assertEqual(len(simulations), 1, simulations)
+        return simulations[0]["pid"]
+
+    def goes_on(self, page, server, pid, before):
+        expect(page.tab.locator("[data-step=simulation].done")).to_be_visible()
+        expect(page.tab.locator("#mode")).to_have_text("real time")
+        until("the clock goes on", lambda: seconds(page) > before)
+        self.assertEqual(self.pid(server), pid)
+        expect(page.tab.locator("#problem")).to_be_hidden()
+        expect(page.tab.locator("#notice")).to_be_hidden()
+
+    def leaves_nothing(self, page, server):
+        page.tab.get_by_role("button", name="Disconnect").click()
+        until("the simulation is gone", lambda: not server.status()["simulations"])

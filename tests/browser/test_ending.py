@@ -1,0 +1,101 @@
+"""Simulations that end: whose page is away for too long, that stay paused, whose tab was closed."""
+
+import pathlib
+import re
+import unittest
+
+from playwright.sync_api import expect
+
+from case import Running, seconds
+from fleet import WORLD, until
+
+
+class OfflineForLong(Running):
+    # The same as 90 s with what is usual, at a sixth.
+    simulation = {"timing": {"absence": 10, "ping": 1, "silence": 3}}
+
+    def test_who_was_offline_for_too_long_leaves_nothing_and_is_told_why(self):
+        page, server = self.running()
+        pid = self.pid(server)
+        page.context.set_offline(True)
+        until("the simulation is gone", lambda: not server.status()["simulations"])
+        until("nothing is left of it", lambda: not pathlib.Path(f"/proc/{pid}").exists())
+        expect(page.tab.locator("#notice-advice")).to_have_text("Your simulation may have ended.")
+        self.assertEqual(page.tab.evaluate("JSON.parse(sessionStorage.getItem('simulation')).absence"), 10)
+        page.context.set_offline(False)
+        expect(page.tab.locator("#problem-text")).to_have_text(re.compile(
+            r"^This simulation has ended: there was no connection for \d+ s$|^There was no connection for \d+ s: the simulation has ended.$"))
+        expect(page.tab.get_by_role("button", name="Connect", exact=True)).to_be_enabled()
+        self.assertIsNone(page.tab.evaluate("sessionStorage.getItem('simulation')"))
+
+    def keeps_to_the_rules(self, page):
+        self.assertEqual(page.hosts(), {self.host}, "who was asked")
+
+
+class Idle(Running):
+    # Twelve seconds; the last six of them are told.
+    simulation = {"idleTimeout": 0.2}
+
+    def test_who_stays_paused_is_told_and_keeps_the_simulation_by_a_button(self):
+        page, server = self.start_world()
+        told = page.tab.locator("#idle")
+        expect(told).to_contain_text(re.compile("The simulation is paused, and ends in [1-6] s."))
+        expect(page.tab.locator("#spoken")).to_contain_text("The simulation is paused")
+        page.tab.get_by_role("button", name="Keep it").click()
+        expect(told).to_be_hidden()
+        expect(told).to_be_visible()
+        page.tab.get_by_role("button", name="Play", exact=True).click()
+        expect(told).to_be_hidden()
+        until("it has run for longer than it may be paused", lambda: seconds(page) > 13)
+        expect(told).to_be_hidden()
+        self.assertEqual(len(server.status()["simulations"]), 1)
+        page.tab.get_by_role("button", name="Pause", exact=True).click()
+        expect(page.tab.locator("#problem-text")).to_contain_text("The simulation was paused for 0.2 minutes")
+        expect(page.tab.locator("#problem-advice")).to_contain_text("Connect again")
+        expect(told).to_be_hidden()
+        self.assertEqual(server.status()["simulations"], [])
+
+    def test_one_that_a_controller_has_started_is_kept_by_the_page(self):
+        page = self.open(self.fleet.session.url("viewer"))
+        streams = []
+
+        def stream(socket):
+            streams.append(socket)
+            socket.connect_to_server()
+
+        page.tab.route_web_socket(re.compile(r"^ws://127\.0\.0\.1:\d+/$"), stream)
+        page.tab.get_by_role("button", name="Playground").click()
+        page.tab.get_by_role("button", name="Connect", exact=True).click()
+        expect(page.tab.locator("[data-step=simulation].done")).to_be_visible()
+        # As Webots says to all pages, and not in its output.
+        streams[-1].send("real-time")
+        expect(page.tab.locator("#mode")).to_have_text("real time")
+        told = page.tab.locator("#idle-text")
+        for _ in range(2):
+            until("it is told", lambda: told.inner_text() != "")
+            told.evaluate("element => element.textContent = ''")
+        expect(page.tab.locator("#idle")).to_be_hidden()
+        expect(page.tab.locator("#problem")).to_be_hidden()
+        page.tab.get_by_role("button", name="Disconnect").click()
+
+
+class Gone(Running):
+    simulation = {"timing": {"absence": 2}}
+
+    def test_of_a_tab_that_was_closed_nothing_is_left(self):
+        page, server = self.running()
+        page.tab.close()
+        until("the simulation is gone", lambda: not server.status()["simulations"])
+
+    def test_who_comes_back_too_late_is_told(self):
+        page, server = self.running()
+        page.tab.goto("about:blank")
+        until("the simulation is gone", lambda: not server.status()["simulations"])
+        page.tab.go_back()
+        expect(page.tab.locator("#problem-text")).to_contain_text("This simulation has ended")
+        expect(page.tab.get_by_role("button", name="Connect", exact=True)).to_be_enabled()
+        self.assertEqual(page.tab.get_by_label("URL of a world").input_value(), WORLD.format("playground"))
+
+
+if __name__ == "__main__":
+    unittest.main()
