@@ -4,12 +4,12 @@
 use std::path::Path;
 use std::time::Duration;
 
-use crate::simulation::process::{ExitReason, Ran, Run, RunError};
+use crate::simulation::process::{ExitReason, Ran, Run};
 
-/// The table of the filter.
-const TABLE: [&str; 5] = ["--terse", "list", "table", "inet", "webots_fleet"];
-/// The unit that loads it.
-const UNIT: [&str; 3] = ["is-active", "--quiet", "webots-fleet-packet-filter.service"];
+/// Lists the table of the filter.
+const LIST: &[&str] = &["/usr/sbin/nft", "--terse", "list", "table", "inet", "webots_fleet"];
+/// Asks for the unit that loads it.
+const UNIT: &[&str] = &["systemctl", "is-active", "--quiet", "webots-fleet-packet-filter.service"];
 /// Timeout of the `nft` or `systemctl` call.
 const PATIENCE: Duration = Duration::from_secs(5);
 
@@ -19,45 +19,15 @@ const PATIENCE: Duration = Duration::from_secs(5);
 /// Blocks for five seconds at most, because it runs a program.
 #[must_use]
 pub fn missing() -> Option<String> {
-    let is_root = nix::unistd::geteuid().is_root();
-    let result =
-        if is_root { succeeds("/usr/sbin/nft", &TABLE, PATIENCE) } else { succeeds("systemctl", &UNIT, PATIENCE) };
-    let why = result.err()?;
+    let command = if nix::unistd::geteuid().is_root() { LIST } else { UNIT };
+    let why = match Run::new(command, Path::new("/"), PATIENCE).blocking(drop) {
+        Ok(Ran { ending: ExitReason::Code(0), .. }) => return None,
+        Ok(_) => "says no".to_owned(),
+        Err(error) => error.to_string(),
+    };
     Some(format!(
-        "containers may reach this machine and private addresses, for the packet filter is not loaded ({why}): install \
-         nftables and run 'systemctl enable --now webots-fleet-packet-filter'"
+        "containers may reach this machine and private addresses, for the packet filter is not loaded ('{}' {why}): \
+         install nftables and run 'systemctl enable --now webots-fleet-packet-filter'",
+        command.join(" ")
     ))
-}
-
-/// Whether a program exits with code 0, or why not.
-fn succeeds(program: &str, arguments: &[&str], patience: Duration) -> Result<(), String> {
-    let name = || format!("'{program} {}'", arguments.join(" "));
-    let command = std::iter::once(program).chain(arguments.iter().copied());
-    match Run::new(command, Path::new("/"), patience).blocking(drop) {
-        Ok(Ran { ending: ExitReason::Code(0), .. }) => Ok(()),
-        Ok(_) => Err(format!("{} says no", name())),
-        Err(error @ RunError::NotStarted(_)) => Err(format!("{program} {error}")),
-        Err(_) => Err(format!("{} does not answer", name())),
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use std::time::Instant;
-
-    use super::*;
-
-    #[test]
-    fn a_filter_is_there_only_if_the_program_says_so() {
-        assert_eq!(succeeds("true", &[], PATIENCE), Ok(()));
-        assert_eq!(succeeds("false", &["x"], PATIENCE), Err("'false x' says no".to_owned()));
-        assert!(succeeds("/nowhere/nft", &[], PATIENCE).unwrap_err().contains("No such file"));
-    }
-
-    #[test]
-    fn a_program_that_hangs_is_ended() {
-        let (began, patience) = (Instant::now(), Duration::from_millis(50));
-        assert_eq!(succeeds("sleep", &["1000"], patience), Err("'sleep 1000' does not answer".to_owned()));
-        assert!(began.elapsed() >= patience, "{:?}", began.elapsed());
-    }
 }
