@@ -15,10 +15,11 @@ fn a_project_asks_for_nothing_outside_of_itself_whatever_is_in_its_webots_yml() 
             let line = message.strip_suffix('\n').unwrap();
             assert!(super::is_one_line(line) && line.starts_with("type:") && line.len() <= 200, "{message:?}");
         }
-        if let ProjectKind::Editor { folder } | ProjectKind::Competition { folder } = &found.kind {
+        if found.kind != ProjectKind::Default {
+            let folder = &found.folder;
             assert!(folder.starts_with("webots-project") && super::is_one_line(folder), "{folder:?}");
             assert!(!folder.contains([':', '$', '\\', '"', '\'', '`', '#']), "{folder:?}");
-            let inside = found.kind.folder_in_project().unwrap();
+            let inside = found.folder_in_project();
             assert!(inside.components().all(|part| matches!(part, Component::Normal(_))), "{inside:?}");
         }
     });

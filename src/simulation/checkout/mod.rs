@@ -30,6 +30,7 @@ pub use cache_dir::CacheDir;
 pub use checkout_error::CheckoutError;
 pub use checkout_limits::CheckoutLimits;
 pub use checkout_service::{CheckoutService, Progress};
+pub use disk::{Growing, outgrown};
 pub use mirrors::Mirrors;
 pub use project::Project;
 pub use single_flight::SingleFlight;

@@ -1,13 +1,10 @@
 //! The build plan of a checked-out project: its Dockerfiles, and the files that they need.
 
-use std::fs::OpenOptions;
+use std::fs::File;
 use std::io::{self, Write};
-use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 
-use nix::fcntl::OFlag;
-
-use super::dockerfile;
+use super::dockerfile::Dockerfile;
 use super::project_file::text_of;
 use super::templates::{CONTROLLER, DOCKERFILE, LAUNCHER, Templates};
 use super::webots_yml::{ProjectKind, WebotsYml};
@@ -19,13 +16,13 @@ pub const PROJECT_PATH: &str = "/usr/local/webots-project";
 #[derive(Debug)]
 pub struct BuildPlan {
     /// What its `webots.yml` requests.
-    pub asks: WebotsYml,
+    pub yml: WebotsYml,
     /// The Dockerfile of Webots' image; `None` if the base image is used unchanged.
-    pub dockerfile: Option<String>,
+    pub dockerfile: Option<Dockerfile>,
     /// The Dockerfile of the controllers' image.
-    pub controller: Option<String>,
+    pub controller: Option<Dockerfile>,
     /// Whether the project has a Makefile.
-    pub make: bool,
+    pub has_makefile: bool,
     /// Warnings for its author.
     pub warnings: Vec<String>,
 }
@@ -39,60 +36,51 @@ impl BuildPlan {
     /// # Errors
     /// The problem, as text for the client.
     pub fn read(project: &Path, templates: &Templates, owner: &str) -> Result<Self, String> {
-        let asks = WebotsYml::read(project);
-        let mut warnings = asks.warnings.clone();
+        let yml = WebotsYml::read(project);
+        let mut warnings = yml.warnings.clone();
         let ignored = IGNORED.iter().filter(|name| project.join(name).symlink_metadata().is_ok());
         warnings.extend(ignored.map(|name| format!("{name} of the project is not used here")));
-        let make = project.join("Makefile").is_file();
-        let own = text_of(&project.join("Dockerfile"))?;
-        let is_needed = make || templates.has(DOCKERFILE);
-        let default = || templates.text(DOCKERFILE).map(String::from).map_err(|error| format!("{DOCKERFILE}: {error}"));
-        let dockerfile = match own {
-            Some(text) => Some(text),
-            None if is_needed => Some(default()?),
-            None => None,
+        let has_makefile = project.join("Makefile").is_file();
+        let dockerfile = match text_of(&project.join("Dockerfile"))? {
+            None if has_makefile || templates.has(DOCKERFILE) => Some(templates.text(DOCKERFILE)?.into_owned()),
+            own => own,
         };
-        let controller = match &asks.kind {
-            ProjectKind::Competition { .. } => Some(competition(project, templates)?),
-            ProjectKind::Default | ProjectKind::Editor { .. } => None,
+        let controller = match yml.kind {
+            ProjectKind::Competition => Some(competition(project, templates)?),
+            ProjectKind::Default | ProjectKind::Editor => None,
         };
-        let labelled = |text: Option<String>| text.map(|text| dockerfile::labelled(&text, owner)).transpose();
-        Ok(Self { dockerfile: labelled(dockerfile)?, controller: labelled(controller)?, asks, make, warnings })
+        let read = |text: Option<String>| text.map(|text| Dockerfile::read(&text, owner)).transpose();
+        Ok(Self { dockerfile: read(dockerfile)?, controller: read(controller)?, yml, has_makefile, warnings })
     }
 }
 
 /// The Dockerfile of a competition's controllers. Writes the launcher to the paths from which this one and the
 /// project's can copy it.
 fn competition(project: &Path, templates: &Templates) -> Result<String, String> {
-    let controllers = inside(project, "controllers")?;
-    let launcher = templates.text(LAUNCHER).map_err(|error| format!("{LAUNCHER}: {error}"))?;
-    for folder in [project, controllers.as_path()] {
-        place(&folder.join(LAUNCHER), &launcher).map_err(|error| format!("{LAUNCHER} can't be placed: {error}"))?;
+    let controllers = inside(project, Path::new("controllers"))?;
+    let launcher = templates.text(LAUNCHER)?;
+    for folder in [project, &controllers] {
+        // The project's own file stays.
+        match File::create_new(folder.join(LAUNCHER)).and_then(|mut file| file.write_all(launcher.as_bytes())) {
+            Err(error) if error.kind() != io::ErrorKind::AlreadyExists => {
+                return Err(format!("{LAUNCHER} can't be written: {error}"));
+            }
+            _ => {}
+        }
     }
-    match text_of(&controllers.join("Dockerfile"))? {
-        Some(text) => Ok(text),
-        None => templates.text(CONTROLLER).map(String::from).map_err(|error| format!("{CONTROLLER}: {error}")),
-    }
+    let own = text_of(&controllers.join("Dockerfile"))?;
+    own.map_or_else(|| templates.text(CONTROLLER).map(String::from), Ok)
 }
 
 /// A directory of the project, which must not be a symlink to a path outside.
 ///
 /// # Errors
 /// When there is none, as text for the client.
-pub fn inside(project: &Path, folder: &str) -> Result<PathBuf, String> {
+pub fn inside(project: &Path, folder: &Path) -> Result<PathBuf, String> {
     let found = project.canonicalize().and_then(|root| Ok((project.join(folder).canonicalize()?, root)));
     match found {
         Ok((found, root)) if found.starts_with(&root) && found.is_dir() => Ok(found),
-        _ => Err(format!("The project has no folder {folder}")),
-    }
-}
-
-/// Creates a file unless it exists; the project's own file stays.
-fn place(path: &Path, text: &str) -> io::Result<()> {
-    match OpenOptions::new().write(true).create_new(true).open(path) {
-        Ok(mut file) => file.write_all(text.as_bytes()),
-        Err(error) if error.kind() == io::ErrorKind::AlreadyExists => Ok(()),
-        Err(error) => Err(error),
+        _ => Err(format!("The project has no folder {}", folder.display())),
     }
 }
 
@@ -102,9 +90,8 @@ fn place(path: &Path, text: &str) -> io::Result<()> {
 /// # Errors
 /// When the file can't be read or written.
 pub fn open_participant(world: &Path) -> io::Result<()> {
-    let text = std::fs::read_to_string(world)?.replace("controller \"participant\"", "controller \"<extern>\"");
-    let flags = OFlag::O_NOFOLLOW.bits();
-    OpenOptions::new().write(true).truncate(true).custom_flags(flags).open(world)?.write_all(text.as_bytes())
+    let text = std::fs::read_to_string(world)?;
+    std::fs::write(world, text.replace("controller \"participant\"", "controller \"<extern>\""))
 }
 
 /// The image of Webots for a version: up to R2023a on Ubuntu 20.04, later ones on 22.04.
@@ -139,16 +126,18 @@ mod tests {
     #[test]
     fn an_image_is_built_only_where_there_is_something_to_build() {
         let project = tempfile::tempdir().unwrap();
-        let recipe = BuildPlan::read(project.path(), &templates(), "x").unwrap();
-        assert!(recipe.dockerfile.is_none() && recipe.warnings.is_empty());
+        let plan = BuildPlan::read(project.path(), &templates(), "x").unwrap();
+        assert!(plan.dockerfile.is_none() && plan.warnings.is_empty());
         std::fs::write(project.path().join("Makefile"), "all:\n").unwrap();
         std::fs::write(project.path().join(".env"), "A=b").unwrap();
-        let recipe = BuildPlan::read(project.path(), &templates(), "x").unwrap();
-        assert!(recipe.make && recipe.dockerfile.is_some_and(|text| text.contains("LABEL webots-fleet.owner=x")));
-        assert_eq!(recipe.warnings, [".env of the project is not used here"]);
+        let plan = BuildPlan::read(project.path(), &templates(), "x").unwrap();
+        assert!(
+            plan.has_makefile && plan.dockerfile.is_some_and(|found| found.text.contains("LABEL webots-fleet.owner=x"))
+        );
+        assert_eq!(plan.warnings, [".env of the project is not used here"]);
         std::fs::write(project.path().join("Dockerfile"), "FROM mine\n").unwrap();
-        let recipe = BuildPlan::read(project.path(), &templates(), "x").unwrap();
-        assert_eq!(recipe.dockerfile.unwrap(), "FROM mine\nLABEL webots-fleet.owner=x\n");
+        let plan = BuildPlan::read(project.path(), &templates(), "x").unwrap();
+        assert_eq!(plan.dockerfile.unwrap().text, "FROM mine\nLABEL webots-fleet.owner=x\n");
     }
 
     #[test]

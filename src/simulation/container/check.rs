@@ -4,11 +4,10 @@ use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 use std::time::Duration;
 
-use super::docker::Docker;
+use super::docker::{self, Docker};
 use super::packet_filter;
 use super::templates::Templates;
 use crate::simulation::config::SimulationConfig;
-use crate::simulation::process::{ExitReason, Ran, Run, RunError};
 
 /// Timeout of a command that starts a container.
 const START: Duration = Duration::from_secs(15);
@@ -27,9 +26,7 @@ const EMPTY_TAR: [u8; 1024] = [0; 1024];
 /// What is missing, as text for an administrator.
 pub fn check(config: &SimulationConfig) -> Result<String, String> {
     Docker::find(Path::new("/"))?;
-    daemon_fault().map_or(Ok(()), Err)?;
-    init_fault().map_or(Ok(()), Err)?;
-    packet_filter::missing().map_or(Ok(()), Err)?;
+    [daemon_fault, init_fault, packet_filter::missing].iter().find_map(|fault| fault()).map_or(Ok(()), Err)?;
     Ok(format!("it answers; worlds run in {}, or the image of their project's Dockerfile", config.container.image))
 }
 
@@ -49,8 +46,8 @@ pub fn check_templates(config: &SimulationConfig) -> Result<String, String> {
 /// Why the daemon can't be used now, as text for clients and administrators. Blocks for five seconds at most.
 #[must_use]
 pub fn daemon_fault() -> Option<String> {
-    let why = failure(ANSWER, &["version", "--format", "{{.Server.Version}}"])?;
-    Some(format!("Docker does not answer on this simulation server: {why}"))
+    let version = docker::blocking(&["version", "--format", "{{.Server.Version}}"], ANSWER);
+    version.err().map(|error| error.to_string())
 }
 
 /// The directory in which Docker keeps images and containers; `None` if it does not run on this machine. Cached after
@@ -62,11 +59,10 @@ pub fn data_folder() -> Option<PathBuf> {
         return None;
     }
     if FOLDER.get().is_none() {
-        let ran = docker(ANSWER, &["info", "--format", "{{.DockerRootDir}}"]).blocking(drop).ok()?;
-        let told = String::from_utf8(ran.answer).ok()?;
-        let folder = told.lines().last().map(Path::new).filter(|folder| folder.is_absolute() && folder.exists())?;
+        let told = docker::blocking(&["info", "--format", "{{.DockerRootDir}}"], ANSWER).ok()?;
+        let folder = Some(PathBuf::from(told.trim())).filter(|folder| folder.is_absolute() && folder.exists())?;
         // A concurrent check may have set it.
-        FOLDER.set(folder.to_owned()).ok();
+        FOLDER.set(folder).ok();
     }
     FOLDER.get().cloned()
 }
@@ -78,38 +74,19 @@ pub fn data_folder() -> Option<PathBuf> {
 /// for a second, for 45 at most.
 #[must_use]
 pub fn init_fault() -> Option<String> {
-    let import = || {
-        let tar = tempfile::NamedTempFile::new().and_then(|tar| std::fs::write(tar.path(), EMPTY_TAR).map(|()| tar));
-        match tar {
-            Ok(tar) => failure(START, &["import", &tar.path().to_string_lossy(), EMPTY_IMAGE]),
-            Err(error) => Some(error.to_string()),
+    let run = || -> Result<String, String> {
+        if docker::blocking(&["image", "inspect", EMPTY_IMAGE], START).is_err() {
+            let tar = tempfile::NamedTempFile::new().map_err(|error| error.to_string())?;
+            std::fs::write(tar.path(), EMPTY_TAR).map_err(|error| error.to_string())?;
+            let import = ["import", &tar.path().to_string_lossy(), EMPTY_IMAGE];
+            docker::blocking(&import, START).map_err(|error| error.to_string())?;
         }
+        let words = ["run", "--rm", "--init", "--network", "none", EMPTY_IMAGE, INIT, "--version"];
+        docker::blocking(&words, START).map_err(|error| error.to_string())
     };
-    let is_missing = failure(START, &["image", "inspect", EMPTY_IMAGE]);
-    let why = is_missing
-        .and_then(|_| import())
-        .or_else(|| failure(START, &["run", "--rm", "--init", "--network", "none", EMPTY_IMAGE, INIT, "--version"]));
+    let why = run().err()?;
     Some(format!(
-        "Docker of this simulation server can't give containers an init process (docker run --init): {}. Its administrator \
-         can install docker-init: on Debian and Ubuntu the packages docker.io and tini have it, or docker-ce",
-        why?
+        "Docker of this simulation server can't give containers an init process (docker run --init): {why}. Its \
+         administrator can install docker-init: on Debian and Ubuntu the packages docker.io and tini have it, or docker-ce"
     ))
-}
-
-/// Docker with these arguments and this timeout.
-fn docker(limit: Duration, arguments: &[&str]) -> Run {
-    Run::new(std::iter::once("docker").chain(arguments.iter().copied()), Path::new("/"), limit)
-}
-
-/// Runs docker with a timeout. Returns the line with the reason if it fails.
-fn failure(limit: Duration, arguments: &[&str]) -> Option<String> {
-    let mut said: Vec<String> = Vec::new();
-    match docker(limit, arguments).blocking(|line| said.push(line)) {
-        Ok(Ran { ending: ExitReason::Code(0), .. }) => return None,
-        Ok(_) => {}
-        Err(RunError::Slow(_)) => said.clear(),
-        Err(error) => return Some(format!("docker {error}")),
-    }
-    let why = said.iter().find(|line| line.contains("rror")).or_else(|| said.last());
-    Some(why.cloned().unwrap_or_else(|| format!("it gives no answer within {} seconds", limit.as_secs())))
 }

@@ -9,7 +9,7 @@ use serde_json::{Value, json};
 
 use super::build_plan::PROJECT_PATH;
 use super::docker_features::DockerFeatures;
-use super::templates::Template;
+use super::templates::{Template, WEBOTS};
 use crate::simulation::config::{ContainerDisplay, EDITOR_PORT, SimulationConfig};
 use crate::simulation::machine::sensors::Gpu;
 
@@ -23,9 +23,9 @@ pub struct ComposeProject<'parts> {
     /// The directory of the project on the machine.
     pub project: &'parts Path,
     /// The directory that the editor shows.
-    pub edited: Option<PathBuf>,
+    pub edited: &'parts Path,
     /// The directory for the editor, as in the project's `webots.yml`.
-    pub volume: Option<&'parts str>,
+    pub volume: &'parts str,
     /// The image of Webots.
     pub image: &'parts str,
     /// The image of a competition's controller.
@@ -37,9 +37,9 @@ pub struct ComposeProject<'parts> {
     /// The GPU that it was given.
     pub gpu: Option<&'parts Gpu>,
     /// Whether there is a Makefile.
-    pub make: bool,
+    pub has_makefile: bool,
     /// The features of this machine's Docker.
-    pub engine: &'parts DockerFeatures,
+    pub features: &'parts DockerFeatures,
 }
 
 /// Environment variables: names and values.
@@ -66,17 +66,17 @@ impl ComposeProject<'_> {
         std::fs::create_dir_all(self.exchange())?;
         std::fs::write(folder.join(TEMPLATE), template.text.as_bytes())?;
         std::fs::write(folder.join(OVERRIDE), self.overridden(template, config).to_string())?;
-        let path = |name: &str| folder.join(name).to_string_lossy().into_owned();
-        let (name, folder) = (self.name.to_owned(), folder.to_string_lossy().into_owned());
+        let path = |path: &Path| path.to_string_lossy().into_owned();
+        let (template, settings) = (path(&folder.join(TEMPLATE)), path(&folder.join(OVERRIDE)));
         let words = [
             "--project-name",
-            &name,
+            self.name,
             "--project-directory",
-            &folder,
+            &path(&folder),
             "--file",
-            &path(TEMPLATE),
+            &template,
             "--file",
-            &path(OVERRIDE),
+            &settings,
         ];
         Ok((words.map(str::to_owned).into(), self.variables(config)))
     }
@@ -93,20 +93,19 @@ impl ComposeProject<'_> {
         // A template may pass it to a shell, which interprets quotes, dollars and backslashes.
         let command = if command.chars().all(plain) { command } else { String::new() };
         let path = |path: &Path| path.to_string_lossy().into_owned();
-        let edited = self.edited.as_ref().map_or_else(|| path(self.project), |folder| path(folder));
         vec![
             ("IMAGE", self.image.to_owned()),
             ("CONTROLLER_IMAGE", self.controller.unwrap_or_default().to_owned()),
             ("PROJECT_PATH", PROJECT_PATH.to_owned()),
             ("PROJECT", path(self.project)),
-            ("MAKE", u8::from(self.make).to_string()),
+            ("MAKE", u8::from(self.has_makefile).to_string()),
             ("BIND", config.bind_of_containers().to_string()),
             ("PORT", self.port.to_string()),
             ("COMPOSE_PROJECT_NAME", self.name.to_owned()),
             ("WEBOTS", command),
             ("THEIA_IMAGE", config.container.editor_image.clone()),
-            ("THEIA_VOLUME", self.volume.unwrap_or_default().to_owned()),
-            ("THEIA_FOLDER", edited),
+            ("THEIA_VOLUME", self.volume.to_owned()),
+            ("THEIA_FOLDER", path(self.edited)),
             ("THEIA_PORT", (self.port + EDITOR_PORT).to_string()),
             ("IPC", path(&self.exchange())),
             ("DISPLAY", self.display(config).unwrap_or_default()),
@@ -121,11 +120,8 @@ impl ComposeProject<'_> {
 
     /// The settings of each service, which override the template.
     fn overridden(&self, template: &Template, config: &SimulationConfig) -> Value {
-        let services: serde_json::Map<String, Value> = template
-            .services
-            .iter()
-            .map(|(name, has_command)| (name.clone(), self.service(name, *has_command, config)))
-            .collect();
+        let service = |name: &String| (name.clone(), self.service(name, template.has_command, config));
+        let services: serde_json::Map<String, Value> = template.services.iter().map(service).collect();
         let network = json!({ "default": { "external": true, "name": config.container.network.name() } });
         json!({ "services": services, "networks": network })
     }
@@ -158,7 +154,7 @@ impl ComposeProject<'_> {
             ("healthcheck", json!({ "disable": true })),
         ]);
         let image = match name {
-            "webots" => Some(self.image),
+            WEBOTS => Some(self.image),
             "controller" => self.controller,
             "theia" => Some(settings.editor_image.as_str()),
             _ => None,
@@ -166,15 +162,15 @@ impl ComposeProject<'_> {
         service.extend(image.map(|image| ("image", json!(image))));
         service.extend(limits.cores.map(|cores| ("cpus", json!(cores))));
         let mut environment = ENVIRONMENT.map(|(name, value)| (name, value.to_owned())).to_vec();
-        if name == "webots" {
+        if name == WEBOTS {
             if !has_command {
                 let words: Vec<String> = self.command.iter().map(|word| word.replace('$', "$$")).collect();
                 service.insert("command", json!(words));
             }
             self.show(&mut service, &mut environment, config);
         }
-        // The images of these two have a program that creates it.
-        let home = if ["webots", "controller"].contains(&name) { "/tmp/home" } else { "/tmp" };
+        // The images of Webots and of controllers have a program that creates it.
+        let home = if [WEBOTS, "controller"].contains(&name) { "/tmp/home" } else { "/tmp" };
         environment.push(("HOME", home.to_owned()));
         service.insert("environment", json!(BTreeMap::from_iter(environment)));
         json!(service)
@@ -193,11 +189,11 @@ impl ComposeProject<'_> {
             }
         }
         service.insert("volumes", json!(volumes));
-        if let Some(groups) = self.engine.graphics.as_ref().filter(|_| config.container.gpu) {
+        if let Some(groups) = self.features.graphics.as_ref().filter(|_| config.container.gpu) {
             service.insert("devices", json!(["/dev/dri:/dev/dri"]));
             service.insert("group_add", json!(groups.iter().map(u32::to_string).collect::<Vec<_>>()));
         }
-        if self.engine.nvidia && config.container.gpu {
+        if self.features.nvidia && config.container.gpu {
             // An image or a template may ask for all by this variable.
             environment.extend(self.gpu.map(|gpu| ("NVIDIA_VISIBLE_DEVICES", gpu.id.clone())));
             let (key, value) = self.gpu.map_or(("count", json!("all")), |gpu| ("device_ids", json!([gpu.id])));
@@ -239,7 +235,7 @@ mod tests {
         let keys = json!({ "isolation": "container", "gpus": "spread", "displays": [":0.0", ":0.1"], "display": ":7" });
         let mut config: SimulationConfig = serde_json::from_value(keys).unwrap();
         config.container = ContainerSettings { display: ContainerDisplay::Machine, ..ContainerSettings::default() };
-        let engine = DockerFeatures { nvidia: true, graphics: None };
+        let features = DockerFeatures { nvidia: true, graphics: None };
         let gpu = Gpu { index: 1, id: "GPU-b".to_owned(), ..Gpu::default() };
         let service = |gpu: Option<&Gpu>, name: &str| {
             let (folder, command) = (Path::new("/srv/one"), ["webots".to_owned()]);
@@ -247,15 +243,15 @@ mod tests {
                 name: "one",
                 instance: folder,
                 project: folder,
-                edited: None,
-                volume: None,
+                edited: folder,
+                volume: "",
                 image: "image",
                 controller: None,
                 command: &command,
                 port: 2001,
                 gpu,
-                make: false,
-                engine: &engine,
+                has_makefile: false,
+                features: &features,
             };
             parts.service(name, false, &config)
         };

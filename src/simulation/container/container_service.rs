@@ -13,15 +13,15 @@ use super::compose_project::{ComposeProject, container_of};
 use super::container_request::{ContainerRequest, command};
 use super::docker::{Docker, SHORT};
 use super::docker_features::DockerFeatures;
-use super::image::Images;
-use super::image_export::ImageExport;
+use super::dockerfile::Dockerfile;
+use super::image::{ImageBuild, Images};
+use super::image_export::export;
 use super::network;
-use super::orphan_cleanup::{ActiveProjects, run_cleanup};
+use super::orphan_cleanup::{ActiveProjects, ProjectGuard, run_cleanup};
 use super::owned_resources::{self, ResourceOwner};
 use super::packet_filter;
-use super::project_images::Part;
-use super::project_paths::{edited_folder, participant_folder, project_folder, volume_of, world_in};
-use super::simulation_containers::{ProjectGuard, SimulationContainers};
+use super::project_paths::{mounts, participant_folder, world_in};
+use super::simulation_containers::SimulationContainers;
 use super::start_error::{StartError, blame};
 use super::steps;
 use super::templates::Templates;
@@ -36,8 +36,8 @@ pub struct ContainerService {
     run: ResourceOwner,
     templates: Templates,
     images: Arc<Images>,
-    live: ActiveProjects,
-    engine: OnceCell<DockerFeatures>,
+    active: ActiveProjects,
+    features: OnceCell<DockerFeatures>,
     shortcoming: Option<String>,
     /// Limits concurrent runs of compose.
     turns: Semaphore,
@@ -63,8 +63,9 @@ impl ContainerService {
         let templates = Templates::of(&config.container);
         templates.faults().iter().for_each(|fault| log::error!("{fault}"));
         let images = Images::new(docker.clone(), owner.clone(), &config);
-        let (images, live) = (Arc::new(images), ActiveProjects::default());
-        let keeper = run_cleanup(docker.clone(), owner.clone(), live.clone(), Arc::clone(&images), Arc::clone(&config));
+        let (images, active) = (Arc::new(images), ActiveProjects::default());
+        let keeper =
+            run_cleanup(docker.clone(), owner.clone(), active.clone(), Arc::clone(&images), Arc::clone(&config));
         let keeper = AbortOnDropHandle::new(actix_rt::spawn(keeper));
         Ok(Self {
             docker,
@@ -72,8 +73,8 @@ impl ContainerService {
             run: this_run,
             templates,
             images,
-            live,
-            engine: OnceCell::new(),
+            active,
+            features: OnceCell::new(),
             shortcoming,
             turns: Semaphore::new(2 * std::thread::available_parallelism().map_or(2, usize::from)),
             config,
@@ -104,118 +105,95 @@ impl ContainerService {
         request: ContainerRequest,
         progress: &(impl Fn(String) + Send + Sync),
     ) -> Result<SimulationContainers, StartError> {
-        let recipe = self.recipe(&request).await?;
-        let lease = ProjectGuard::take(self.run.project(request.port), &self.live);
+        let (project, docker, size) = (&request.project, &self.docker, self.config.project_size);
+        let (folder, templates, owner) = (project.folder().to_owned(), self.templates.clone(), self.owner.clone());
+        let plan = blocking(move || BuildPlan::read(&folder, &templates, owner.name())).await?;
+        let guard = self.active.insert(self.run.project(request.port));
         let network = self.config.container.network.name();
-        let joined = network::join(&self.docker, network);
-        let version = &request.project.world.version;
-        let base = build_plan::image_of(&self.config.container.image, version);
-        let part =
-            |text, folder| Part { project: &request.project, base: &base, text, folder, make: recipe.make, network };
-        let image = if let Some(text) = &recipe.dockerfile {
-            joined.await?;
-            let image = self.images.of_project(part(text, ""), progress).await?;
-            self.copy(&lease, &image, PROJECT_PATH.to_owned(), &request, request.project.folder()).await?;
+        network::join(docker, network).await?;
+        let base = build_plan::image_of(&self.config.container.image, &project.world.version);
+        let build = |dockerfile: &Dockerfile, folder| ImageBuild {
+            project: Arc::clone(project),
+            base: base.clone(),
+            dockerfile: dockerfile.clone(),
+            folder,
+            has_makefile: plan.has_makefile,
+            network,
+        };
+        let image = if let Some(dockerfile) = &plan.dockerfile {
+            let image = self.images.build(build(dockerfile, ""), progress).await?;
+            let from = Path::new(PROJECT_PATH);
+            export(docker, &guard.name, (&image, from), project, project.folder(), size).await?;
             image
         } else {
-            let ((), id) = tokio::try_join!(joined, self.images.pull(&base, progress))?;
-            self.images.open(id, &request.project, progress).await?
+            let id = self.images.pull(&base, progress).await?;
+            self.images.open(id, project, progress).await?
         };
-        let controller = match &recipe.controller {
-            Some(text) => {
-                let image = self.images.of_project(part(text, "controllers"), progress).await?;
-                let folder = recipe.asks.kind.folder_in_project().unwrap_or_default();
-                let from = Path::new(PROJECT_PATH).join(folder).to_string_lossy().into_owned();
-                self.copy(&lease, &image, from, &request, &participant_folder(&request.project)).await?;
-                Some(image)
-            }
-            None => None,
-        };
-        if recipe.asks.kind != ProjectKind::Default {
+        let mut controller = None;
+        if let Some(dockerfile) = &plan.controller {
+            let image = self.images.build(build(dockerfile, "controllers"), progress).await?;
+            let (from, to) = (Path::new(PROJECT_PATH).join(plan.yml.folder_in_project()), participant_folder(project));
+            export(docker, &guard.name, (&image, &from), project, &to, size).await?;
+            controller = Some(image);
+        }
+        if plan.yml.kind != ProjectKind::Default {
             self.images.pull(&self.config.container.editor_image, progress).await?;
         }
-        self.make(request, recipe, lease, (image, controller), progress).await
-    }
-
-    async fn recipe(&self, request: &ContainerRequest) -> Result<BuildPlan, StartError> {
-        let (folder, templates) = (request.project.folder().to_owned(), self.templates.clone());
-        let owner = self.owner.name().to_owned();
-        blocking(move || BuildPlan::read(&folder, &templates, &owner)).await
-    }
-
-    /// Copies a directory of an image into the instance's directory.
-    async fn copy(
-        &self,
-        lease: &ProjectGuard,
-        image: &str,
-        from: String,
-        request: &ContainerRequest,
-        to: &Path,
-    ) -> Result<(), StartError> {
-        let through = request.project.instance.path().join("copied");
-        let copy = ImageExport { name: &lease.name, image, from, through, to, size: self.config.project_size };
-        copy.run(&self.docker).await
+        self.create(request, plan, guard, (image, controller), progress).await
     }
 
     /// Writes the compose project, and creates the containers with compose.
-    async fn make(
+    async fn create(
         &self,
         request: ContainerRequest,
-        recipe: BuildPlan,
-        lease: ProjectGuard,
+        plan: BuildPlan,
+        guard: ProjectGuard,
         (image, controller): (String, Option<String>),
         progress: &(impl Fn(String) + Send + Sync),
     ) -> Result<SimulationContainers, StartError> {
-        let is_projects = recipe.dockerfile.is_some() || controller.is_some();
-        let engine = self.engine.get_or_try_init(|| DockerFeatures::ask(&self.docker)).await?;
+        let is_projects = plan.dockerfile.is_some() || controller.is_some();
+        let features = self.features.get_or_try_init(|| DockerFeatures::ask(&self.docker)).await?.clone();
         let (config, templates) = (Arc::clone(&self.config), self.templates.clone());
-        let (name, engine, asks) = (lease.name.clone(), engine.clone(), recipe.asks.clone());
+        let (name, yml, has_makefile) = (guard.name.clone(), plan.yml.clone(), plan.has_makefile);
         let files = move || {
             let world = world_in(&request.project)?;
-            if matches!(asks.kind, ProjectKind::Competition { .. }) {
+            if yml.kind == ProjectKind::Competition {
                 let opened = build_plan::open_participant(&request.project.folder().join(&world));
                 opened.map_err(|error| not_changed(&error))?;
             }
-            let edited = edited_folder(&asks.kind, &request.project)?;
-            let command = command(&config, &request, &world);
-            let project = project_folder(&request.project)?;
+            let (project, edited) = mounts(&yml, &request.project)?;
             let parts = ComposeProject {
                 name: &name,
                 instance: request.project.instance.path(),
                 project: &project,
-                edited,
-                volume: volume_of(&asks.kind),
+                edited: &edited,
+                volume: &yml.folder,
                 image: &image,
                 controller: controller.as_deref(),
-                command: &command,
+                command: &command(&config, &request, &world),
                 port: request.port,
                 gpu: request.gpu.as_ref(),
-                make: recipe.make,
-                engine: &engine,
+                has_makefile,
+                features: &features,
             };
-            let template = templates.compose(&asks.kind).map_err(StartError::Server)?;
+            let template = templates.compose(yml.kind).map_err(StartError::Server)?;
             let (options, variables) = parts.write(&template, &config)?;
-            Ok::<_, StartError>((options, variables, template.services.into_keys()))
+            Ok::<_, StartError>((options, variables, template.services))
         };
         let (options, variables, services) = blocking(files).await?;
         // More concurrent runs would only be slower.
         let turn = self.turns.acquire().await.map_err(|error| StartError::Server(error.to_string()))?;
         progress(steps::CREATING.to_owned());
-        let up = ["up", "--no-start", "--no-build"].map(str::to_owned);
-        let words = options.into_iter().chain(up).map(Into::into).collect();
-        let made = self.docker.compose(words, variables, SHORT).await;
-        made.map_err(|error| blame(is_projects, error))?;
+        let words = options.into_iter().map(Into::into).chain(["up", "--no-start", "--no-build"].map(Into::into));
+        let created = self.docker.compose(words.collect(), variables, SHORT).await;
+        created.map_err(|error| blame(is_projects, error))?;
         drop(turn);
         // An editor has a port of its own, which the relay of streams does not reach.
-        let has_editor = recipe.asks.kind != ProjectKind::Default && self.config.ports_are_public();
-        let editor = has_editor.then(|| "ide: enable".to_owned());
-        let texts = editor.into_iter().chain(recipe.asks.project_type).collect();
-        let containers = services.map(|service| {
-            let container = container_of(&lease.name, &service);
-            (service, container)
-        });
-        let containers = containers.collect();
-        Ok(SimulationContainers::new(self.docker.clone(), lease, containers, is_projects, texts, recipe.warnings))
+        let has_editor = plan.yml.kind != ProjectKind::Default && self.config.ports_are_public();
+        let texts = has_editor.then(|| "ide: enable".to_owned()).into_iter().chain(plan.yml.project_type).collect();
+        let containers = services.into_iter().map(|service| (service.clone(), container_of(&guard.name, &service)));
+        let (docker, containers) = (self.docker.clone(), containers.collect());
+        Ok(SimulationContainers::new(docker, guard, containers, is_projects, texts, plan.warnings))
     }
 }
 

@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use which::which;
 
-use crate::simulation::process::{ExitReason, Run, RunError, SpawnSpec};
+use crate::simulation::process::{ExitReason, Ran, Run, RunError, SpawnSpec};
 
 /// The commands of Docker on this machine.
 #[derive(Debug, Clone)]
@@ -20,12 +20,9 @@ pub struct Docker {
 /// Why a Docker command failed. The messages are for the client.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum DockerError {
-    /// A program does not exist, or the system can start no more processes.
-    #[error("Docker can't be started: {0}")]
-    NotStarted(String),
-    /// The daemon does not answer.
-    #[error("Docker does not answer on this simulation server: {0}")]
-    NoDaemon(String),
+    /// Docker is not installed, its daemon does not answer, or the system can start no more processes.
+    #[error("{0}")]
+    Unavailable(String),
     /// It exceeded its timeout.
     #[error("Docker did not end `{command}` within {} seconds", limit.as_secs())]
     Slow {
@@ -48,10 +45,8 @@ pub enum DockerError {
 pub const SHORT: Duration = Duration::from_secs(30);
 /// Timeout of the check which compose command exists.
 const FIND: Duration = Duration::from_secs(10);
-/// Size limit of the kept output, in bytes.
-const LONGEST_OUTPUT: usize = 1 << 20;
-/// How a line begins that says of which containers the lines before it are.
-const LIST: &str = "Error: failed to start containers";
+/// How lines begin that follow the reason: which containers were not started, and where to find help.
+const AFTER_REASON: [&str; 3] = ["Error: failed to start containers", "See 'docker", "Run 'docker"];
 /// How a message begins that says that nobody listens.
 const NO_DAEMON: [&str; 4] = [
     "cannot connect to the docker daemon",
@@ -68,9 +63,7 @@ impl Docker {
     pub fn find(mark: &Path) -> Result<Self, String> {
         which("docker")
             .map_err(|_| "docker is not there; on Debian and Ubuntu the package docker.io has it".to_owned())?;
-        let plugin = Run::new(["docker", "compose", "version"], mark, FIND).blocking(drop);
-        let is_plugin = plugin.is_ok_and(|ran| ran.ending == ExitReason::Code(0));
-        let compose: &[&str] = if is_plugin {
+        let compose: &[&str] = if blocking(&["compose", "version"], FIND).is_ok() {
             &["docker", "compose"]
         } else if which("docker-compose").is_ok() {
             &["docker-compose"]
@@ -82,14 +75,16 @@ impl Docker {
         Ok(Self { compose: compose.iter().map(OsString::from).collect(), mark: mark.to_owned() })
     }
 
-    /// Runs `docker` with these arguments, and returns what it prints.
+    /// Runs `docker` with these arguments, and returns its standard output.
     ///
     /// # Errors
     /// When it fails or takes longer than the limit.
     pub async fn run<A: AsRef<OsStr>>(&self, arguments: &[A], limit: Duration) -> Result<String, DockerError> {
         let arguments = arguments.iter().map(|word| word.as_ref().to_owned());
-        let command = std::iter::once("docker".into()).chain(arguments).collect();
-        self.call(command, Vec::new(), limit, |_| ()).await
+        let command: Vec<OsString> = std::iter::once("docker".into()).chain(arguments).collect();
+        let (name, mut reason) = (name_of(&command), String::new());
+        let ran = Run::new(command, &self.mark, limit).run(|line| note(&mut reason, &line)).await;
+        result(name, ran, reason)
     }
 
     /// The same, but `told` receives each line that it prints.
@@ -103,7 +98,7 @@ impl Docker {
         told: impl FnMut(&str),
     ) -> Result<(), DockerError> {
         let command = std::iter::once("docker".into()).chain(arguments).collect();
-        self.call(command, Vec::new(), limit, told).await.map(drop)
+        self.call(command, Vec::new(), limit, told).await
     }
 
     /// Runs `docker compose` with these arguments and variables.
@@ -116,7 +111,7 @@ impl Docker {
         variables: Vec<(&'static str, String)>,
         limit: Duration,
     ) -> Result<(), DockerError> {
-        self.call(self.compose.iter().cloned().chain(arguments).collect(), variables, limit, |_| ()).await.map(drop)
+        self.call(self.compose.iter().cloned().chain(arguments).collect(), variables, limit, |_| ()).await
     }
 
     /// The specification of a client program of the daemon. Dropping its process group ends only that program.
@@ -133,43 +128,63 @@ impl Docker {
         variables: Vec<(&'static str, String)>,
         limit: Duration,
         mut told: impl FnMut(&str),
-    ) -> Result<String, DockerError> {
-        let name: Vec<_> =
-            command.iter().take_while(|word| !word.as_encoded_bytes().starts_with(b"-")).take(3).collect();
-        let name = name.iter().map(|word| word.to_string_lossy()).collect::<Vec<_>>().join(" ");
+    ) -> Result<(), DockerError> {
+        let (name, mut reason) = (name_of(&command), String::new());
         let mut run = Run::new([""], &self.mark, limit);
         run.spec = self.spec(command, Duration::ZERO);
         run.spec.environment.extend(variables.into_iter().map(|(name, value)| (name.into(), value.into())));
-        let mut printed = String::new();
-        let keep = |line: String| {
+        let line = |line: String| {
             told(&line);
-            if printed.len() > LONGEST_OUTPUT {
-                printed.clear();
-            }
-            printed.push_str(&line);
-            printed.push('\n');
+            note(&mut reason, &line);
         };
-        match run.follow(keep).await {
-            Ok(ExitReason::Code(0)) => Ok(printed),
-            Ok(ExitReason::NotStarted) => Err(DockerError::NotStarted(format!("there is no {name}"))),
-            Ok(_) => Err(failure(name, &printed)),
-            Err(RunError::Slow(_)) => Err(DockerError::Slow { command: name, limit }),
-            Err(error) => Err(DockerError::NotStarted(error.to_string())),
-        }
+        let ran = run.follow(line).await.map(|ending| Ran { ending, answer: Vec::new() });
+        result(name, ran, reason).map(drop)
     }
 }
 
-/// What a failed command has printed, as an error. Its last line says what was wrong, but for the one in which `docker start`
-/// lists the containers.
-fn failure(command: String, printed: &str) -> DockerError {
-    let mut lines = printed.lines().rev().map(str::trim);
-    let message =
-        lines.find(|line| !line.is_empty() && !line.starts_with(LIST)).unwrap_or("it says nothing").to_owned();
-    let said = printed.to_lowercase();
-    if NO_DAEMON.iter().any(|words| said.contains(words)) {
-        return DockerError::NoDaemon(message);
+/// Runs `docker` with these arguments, and returns its standard output. Blocks.
+///
+/// # Errors
+/// When it fails or takes longer than the limit.
+pub fn blocking(arguments: &[&str], limit: Duration) -> Result<String, DockerError> {
+    let command: Vec<OsString> = ["docker"].iter().chain(arguments).map(OsString::from).collect();
+    let (name, mut reason) = (name_of(&command), String::new());
+    let ran = Run::new(command, Path::new("/"), limit).blocking(|line| note(&mut reason, &line));
+    result(name, ran, reason)
+}
+
+/// The program and its subcommand.
+fn name_of(command: &[OsString]) -> String {
+    let words = command.iter().take_while(|word| !word.as_encoded_bytes().starts_with(b"-")).take(3);
+    words.map(|word| word.to_string_lossy()).collect::<Vec<_>>().join(" ")
+}
+
+/// Keeps a line that a command prints if it may be why that fails: the last one, or the one that tells of no daemon.
+fn note(reason: &mut String, line: &str) {
+    let line = line.trim();
+    if !line.is_empty() && !AFTER_REASON.iter().any(|begin| line.starts_with(begin)) && !has_no_daemon(reason) {
+        line.clone_into(reason);
     }
-    DockerError::Failed { command, message }
+}
+
+fn has_no_daemon(reason: &str) -> bool {
+    let reason = reason.to_lowercase();
+    NO_DAEMON.iter().any(|words| reason.contains(words))
+}
+
+fn result(command: String, ran: Result<Ran, RunError>, reason: String) -> Result<String, DockerError> {
+    let not_started = |why: String| DockerError::Unavailable(format!("Docker can't be started: {why}"));
+    match ran {
+        Ok(Ran { ending: ExitReason::Code(0), answer }) => Ok(String::from_utf8_lossy(&answer).into_owned()),
+        Ok(Ran { ending: ExitReason::NotStarted, .. }) => Err(not_started(format!("there is no {command}"))),
+        Ok(_) if has_no_daemon(&reason) => {
+            Err(DockerError::Unavailable(format!("Docker does not answer on this simulation server: {reason}")))
+        }
+        Ok(_) if reason.is_empty() => Err(DockerError::Failed { command, message: "it says nothing".to_owned() }),
+        Ok(_) => Err(DockerError::Failed { command, message: reason }),
+        Err(RunError::Slow(limit)) => Err(DockerError::Slow { command, limit }),
+        Err(error) => Err(not_started(error.to_string())),
+    }
 }
 
 #[cfg(test)]
@@ -178,13 +193,19 @@ mod tests {
 
     #[test]
     fn a_daemon_that_is_not_there_is_told_apart() {
-        let words = "Cannot connect to the Docker daemon at unix:///x. Is the docker daemon running?\n";
-        assert!(matches!(failure("docker ps".to_owned(), words), DockerError::NoDaemon(_)));
-        let error = failure("docker build".to_owned(), "Step 1/2\nno space left on device\n");
+        let failure = |command: &str, printed: &str| {
+            let mut reason = String::new();
+            printed.lines().for_each(|line| note(&mut reason, line));
+            let ran = Ran { ending: ExitReason::Code(1), answer: Vec::new() };
+            result(command.to_owned(), Ok(ran), reason).unwrap_err()
+        };
+        let words = "Couldn't connect to Docker daemon at unix:///x - is it running?\n\nIf it's elsewhere, say so.\n";
+        assert!(matches!(failure("docker ps", words), DockerError::Unavailable(_)));
+        let error = failure("docker build", "Step 1/2\nno space left on device\n");
         assert_eq!(error.to_string(), "`docker build` failed: no space left on device");
         let words =
             "Error response from daemon: port is already allocated\nError: failed to start containers: one, two\n";
-        let error = failure("docker start one".to_owned(), words);
+        let error = failure("docker start one", words);
         assert!(
             error.to_string().ends_with("failed: Error response from daemon: port is already allocated"),
             "{error}"

@@ -27,9 +27,7 @@ impl DockerFeatures {
     pub async fn ask(docker: &Docker) -> Result<Self, DockerError> {
         let format = "{{range $name, $_ := .Runtimes}}{{$name}} {{end}}";
         let told = docker.run(&["info", "--format", format], SHORT).await?;
-        // The last line is the answer; warnings precede it.
-        let answer = told.lines().last().unwrap_or_default();
-        let nvidia = answer.split_whitespace().any(|name| name == "nvidia") && Path::new(NVIDIA).exists();
+        let nvidia = told.split_whitespace().any(|name| name == "nvidia") && Path::new(NVIDIA).exists();
         Ok(Self { nvidia, graphics: graphics() })
     }
 }

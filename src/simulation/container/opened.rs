@@ -5,33 +5,32 @@
 //! no program in a directory of this machine ever runs as root. Official images of Webots keep assets and settings in
 //! `/root`, which no other user may read. So a layer on top of an image opens it once.
 
+use std::collections::BTreeMap;
 use std::io;
 use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
+
+use serde::Deserialize;
+use serde::de::IgnoredAny;
 
 use super::dockerfile::{LABEL, NO_VOLUME};
 use super::owned_resources::digest;
 use crate::shared::text::one_line;
 
-/// The configuration of the programs that run in an image.
-#[derive(Debug, Clone, PartialEq, Eq, Default)]
-pub struct About {
-    /// The id of the image, which differs from those of later images of the same name.
-    pub id: String,
+/// The configuration of the programs that run in an image, as Docker tells it.
+#[derive(Debug, Default, Deserialize)]
+#[serde(rename_all = "PascalCase", default)]
+pub struct ImageConfig {
     /// Its user, `root` if empty.
     user: String,
     /// The program that gets the command.
-    entrypoint: Vec<String>,
+    entrypoint: Option<Vec<String>>,
     /// The command if none is given.
-    command: Vec<String>,
+    cmd: Option<Vec<String>>,
+    /// The directories of its volumes.
+    volumes: Option<BTreeMap<String, IgnoredAny>>,
 }
 
-/// The format for `docker image inspect`: one line each for the id, the user, the words of the entry point and of the
-/// command, and the volumes.
-pub const FORMAT: &str = "id {{json .Id}}{{println}}user {{json .Config.User}}{{println}}\
-    {{range .Config.Entrypoint}}entrypoint {{json .}}{{println}}{{end}}\
-    {{range .Config.Cmd}}command {{json .}}{{println}}{{end}}\
-    {{range $path, $_ := .Config.Volumes}}volume {{json $path}}{{println}}{{end}}";
 /// The first output of a container when it runs: from then on its network has an address.
 pub const RUNS: &str = "webots-fleet: the container runs";
 /// Programs that are added to the image: names and texts.
@@ -42,50 +41,39 @@ const PROGRAMS: [(&str, &str); 2] = [
 /// Their directory in the image.
 const FOLDER: &str = "/usr/local/share/webots-fleet";
 
-impl About {
-    /// Parses Docker's answer.
+impl ImageConfig {
+    /// Parses what `docker image inspect` prints of it.
     ///
     /// # Errors
-    /// When a line can't be parsed, or the image has a volume; as text for the client.
-    pub fn read(answer: &str) -> Result<Self, String> {
-        let unreadable = || "The image has an ENTRYPOINT, CMD or VOLUME that can't be read here".to_owned();
-        let mut about = Self::default();
-        for line in answer.lines() {
-            let (name, word) = line.split_once(' ').ok_or_else(unreadable)?;
-            let word: String = serde_json::from_str(word).map_err(|_| unreadable())?;
-            match name {
-                "id" => about.id = word,
-                "user" => about.user = word,
-                "entrypoint" => about.entrypoint.push(word),
-                "command" => about.command.push(word),
-                "volume" => {
-                    return Err(format!("The image that it begins with has `VOLUME {}`: {NO_VOLUME}", one_line(&word)));
-                }
-                _ => return Err(unreadable()),
-            }
+    /// When it can't be parsed, or the image has a volume; as text for the client.
+    pub fn read(json: &str) -> Result<Self, String> {
+        let config: Self = serde_json::from_str(json)
+            .map_err(|error| format!("The configuration of the image can't be read: {error}"))?;
+        match config.volumes.as_ref().and_then(|volumes| volumes.keys().next()) {
+            Some(path) => Err(format!("The image that it begins with has `VOLUME {}`: {NO_VOLUME}", one_line(path))),
+            None => Ok(config),
         }
-        if about.id.is_empty() { Err(unreadable()) } else { Ok(about) }
     }
 
-    /// The Dockerfile of the image on top.
+    /// The Dockerfile of the image on top of the one with this id.
     #[must_use]
-    pub fn dockerfile(&self, owner: &str) -> String {
+    pub fn dockerfile(self, id: &str, owner: &str) -> String {
         let words = |words: &[String]| serde_json::json!(words).to_string();
-        let Self { id, user, entrypoint, command } = self;
-        let open = words(&["/bin/sh".to_owned(), format!("{FOLDER}/open-home"), user.clone()]);
-        let entrypoint = words(&[&[format!("{FOLDER}/start-at-home")], entrypoint.as_slice()].concat());
+        let open = words(&["/bin/sh".to_owned(), format!("{FOLDER}/open-home"), self.user]);
+        let entrypoint = [vec![format!("{FOLDER}/start-at-home")], self.entrypoint.unwrap_or_default()].concat();
         // An entry point clears the command of the image below.
-        let command = if command.is_empty() { String::new() } else { format!("CMD {}\n", words(command)) };
+        let command = self.cmd.map_or_else(String::new, |command| format!("CMD {}\n", words(&command)));
         format!(
-            "FROM {id}\nLABEL {LABEL}={owner}\nUSER root\nCOPY . {FOLDER}\nRUN {open}\nENTRYPOINT {entrypoint}\n{command}"
+            "FROM {id}\nLABEL {LABEL}={owner}\nUSER root\nCOPY . {FOLDER}\nRUN {open}\nENTRYPOINT {}\n{command}",
+            words(&entrypoint)
         )
     }
 }
 
 /// A tag for an opened image, a hash of all these parts.
 #[must_use]
-pub fn key<'part>(parts: impl Iterator<Item = &'part str>) -> String {
-    let parts: Vec<&str> = parts.chain(PROGRAMS.map(|(_, program)| program)).collect();
+pub fn key(parts: &[String]) -> String {
+    let parts: Vec<&str> = parts.iter().map(String::as_str).chain(PROGRAMS.map(|(_, program)| program)).collect();
     format!("{:032x}", digest(parts.join("\0").as_bytes()))
 }
 
@@ -110,10 +98,9 @@ mod tests {
 
     #[test]
     fn an_image_keeps_its_entry_point_and_command_as_data() {
-        let told = "id \"sha256:1\"\nuser \"x\\n\\\"\"\nentrypoint \"/bin/sh\"\nentrypoint \"-c\"\nentrypoint \"a \\\\\"\n\
-                    command \"b\"\ncommand \"\\n\"\n";
-        let about = About::read(told).unwrap();
-        let text = about.dockerfile("me");
+        let told =
+            r#"{"User":"x\n\"","Env":["A=b"],"Entrypoint":["/bin/sh","-c","a \\"],"Cmd":["b","\n"],"Volumes":null}"#;
+        let text = ImageConfig::read(told).unwrap().dockerfile("sha256:1", "me");
         let lines: Vec<&str> = text.lines().collect();
         assert_eq!(
             lines,
@@ -127,19 +114,13 @@ mod tests {
                 r#"CMD ["b","\n"]"#,
             ]
         );
-        let plain = About::read("id \"sha256:2\"\nuser \"\"\n").unwrap();
-        assert!(plain.dockerfile("me").ends_with("ENTRYPOINT [\"/usr/local/share/webots-fleet/start-at-home\"]\n"));
-    }
-
-    #[test]
-    fn an_answer_that_was_cut_is_not_read() {
-        assert!(About::read("id \"sha256:1\"\nuser \"\"\nentrypoint \"aaaa\n").is_err());
-        assert!(About::read("").is_err());
+        let plain = ImageConfig::read("{}").unwrap().dockerfile("sha256:2", "me");
+        assert!(plain.ends_with("ENTRYPOINT [\"/usr/local/share/webots-fleet/start-at-home\"]\n"));
     }
 
     #[test]
     fn an_image_that_keeps_data_is_refused() {
-        let wrong = About::read("id \"sha256:1\"\nuser \"\"\nvolume \"/data\"\n").unwrap_err();
+        let wrong = ImageConfig::read(r#"{"Volumes":{"/data":{}}}"#).unwrap_err();
         assert!(wrong.contains("`VOLUME /data`"), "{wrong}");
     }
 }

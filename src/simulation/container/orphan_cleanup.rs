@@ -1,22 +1,30 @@
 //! Removes orphaned compose projects and unused images.
 
-use std::collections::HashSet;
+use std::collections::{BTreeSet, HashSet};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use nix::sys::statvfs::statvfs;
-use parking_lot::{Mutex, MutexGuard};
+use parking_lot::Mutex;
 use tokio::sync::Notify;
 
 use super::check::data_folder;
-use super::docker::{Docker, DockerError};
+use super::docker::{Docker, DockerError, SHORT};
 use super::image::Images;
-use super::owned_resources::{self, ResourceOwner};
+use super::owned_resources::{self, LIST, ResourceOwner};
 use crate::simulation::config::SimulationConfig;
+use crate::simulation::process::DiskRoom;
 
 /// The compose projects in use.
 #[derive(Debug, Clone, Default)]
 pub struct ActiveProjects(Arc<(Mutex<HashSet<String>>, Notify)>);
+
+/// The name of a compose project. Until this is dropped, its containers do not count as orphans.
+#[derive(Debug)]
+pub struct ProjectGuard {
+    /// The name; unique on this machine.
+    pub name: String,
+    active: ActiveProjects,
+}
 
 /// Longest time between two sweeps for orphans; a released project triggers one sooner.
 const PERIOD: Duration = Duration::from_mins(1);
@@ -29,19 +37,18 @@ const PRUNE: Duration = Duration::from_mins(30);
 const YOUNGEST: u64 = 1;
 
 impl ActiveProjects {
-    /// Adds a name.
-    pub fn insert(&self, name: &str) {
-        self.names().insert(name.to_owned());
+    /// Marks a name as in use.
+    #[must_use]
+    pub fn insert(&self, name: String) -> ProjectGuard {
+        self.0.0.lock().insert(name.clone());
+        ProjectGuard { name, active: self.clone() }
     }
+}
 
-    /// Removes a name, and triggers a sweep.
-    pub fn remove(&self, name: &str) {
-        self.names().remove(name);
-        self.0.1.notify_one();
-    }
-
-    fn names(&self) -> MutexGuard<'_, HashSet<String>> {
-        self.0.0.lock()
+impl Drop for ProjectGuard {
+    fn drop(&mut self) {
+        self.active.0.0.lock().remove(&self.name);
+        self.active.0.1.notify_one();
     }
 }
 
@@ -49,7 +56,7 @@ impl ActiveProjects {
 pub async fn run_cleanup(
     docker: Docker,
     owner: ResourceOwner,
-    live: ActiveProjects,
+    active: ActiveProjects,
     images: Arc<Images>,
     config: Arc<SimulationConfig>,
 ) {
@@ -57,13 +64,13 @@ pub async fn run_cleanup(
     // What an earlier run has left may have filled the disk.
     let mut pause = Duration::ZERO;
     loop {
-        actix_rt::time::timeout(pause, live.0.1.notified()).await.ok();
+        actix_rt::time::timeout(pause, active.0.1.notified()).await.ok();
         // Most is removed by then without a sweep.
         actix_rt::time::sleep(AGAIN).await;
-        pause = match tidy(&docker, &owner, &live).await {
-            Ok(0) => PERIOD,
+        pause = match remove_orphans(&docker, &owner, &active).await {
+            Ok(false) => PERIOD,
             // Containers that Docker was removing when it was stopped appear one by one.
-            Ok(_) => AGAIN,
+            Ok(true) => AGAIN,
             Err(error) => {
                 log::debug!("containers that nobody uses are not removed yet: {error}");
                 AGAIN
@@ -83,21 +90,20 @@ pub async fn run_cleanup(
 
 /// Whether the disk of Docker's images has less room than new simulations need, in MiB.
 fn is_disk_full(reserve: u64) -> bool {
-    let about = data_folder().and_then(|folder| statvfs(&folder).ok());
-    about.is_some_and(|disk| disk.blocks_available().saturating_mul(disk.fragment_size()) >> 20 < reserve)
+    let room = data_folder().and_then(|folder| DiskRoom::of(&folder).ok());
+    room.is_some_and(|room| room.shortage(reserve).is_some())
 }
 
-/// Removes what is left. Returns how many projects it has found.
-async fn tidy(docker: &Docker, owner: &ResourceOwner, live: &ActiveProjects) -> Result<usize, DockerError> {
-    let found = owner.projects(docker).await?;
-    let left: Vec<String> = found.into_iter().filter(|name| !live.names().contains(name)).collect();
-    let mut done = Ok(left.len());
-    for name in left {
-        // A failed removal does not stop the others.
-        match owned_resources::remove(docker, &name).await {
-            Ok(()) => log::info!("{name} was left: removed"),
-            Err(error) => done = Err(error),
-        }
+/// Removes what is left. Returns whether there was something.
+async fn remove_orphans(docker: &Docker, owner: &ResourceOwner, active: &ActiveProjects) -> Result<bool, DockerError> {
+    let list = docker.run(&LIST, SHORT).await?;
+    let mut left: Vec<(&str, &str)> = owner.containers(&list).collect();
+    left.retain(|(_, project)| !active.0.0.lock().contains(*project));
+    if left.is_empty() {
+        return Ok(false);
     }
-    done
+    owned_resources::remove(docker, left.iter().map(|(id, _)| *id)).await?;
+    let projects: BTreeSet<&str> = left.into_iter().map(|(_, project)| project).collect();
+    projects.iter().for_each(|project| log::info!("{project} was left: removed"));
+    Ok(true)
 }

@@ -3,17 +3,26 @@
 //!
 //! The names of its compose projects have a common prefix, so that the resources of a crashed server are found again.
 
-use std::collections::HashSet;
 use std::path::Path;
 use std::time::Duration;
 
 use sha2::{Digest, Sha256};
 
-use super::docker::{Docker, DockerError, SHORT};
-use crate::simulation::process::Run;
+use super::docker::{self, Docker, DockerError, SHORT};
 
 /// The label with which compose marks its projects.
 pub const PROJECT: &str = "com.docker.compose.project";
+
+/// Arguments of docker that list all containers of compose: the id and the project of each.
+pub const LIST: [&str; 7] = [
+    "ps",
+    "--all",
+    "--no-trunc",
+    "--filter",
+    "label=com.docker.compose.project",
+    "--format",
+    "{{.ID}} {{.Label \"com.docker.compose.project\"}}",
+];
 
 /// The owner of compose projects and images: a server, or one run of it. Their names have a common prefix.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -66,15 +75,10 @@ impl ResourceOwner {
         format!("webots-fleet-{}-", self.0)
     }
 
-    /// The projects of this owner that have a container.
-    ///
-    /// # Errors
-    /// When Docker fails.
-    pub async fn projects(&self, docker: &Docker) -> Result<HashSet<String>, DockerError> {
-        let (filter, format) = (format!("label={PROJECT}"), format!("{{{{.Label \"{PROJECT}\"}}}}"));
-        let listed = docker.run(&["ps", "--all", "--filter", &filter, "--format", &format], SHORT).await?;
+    /// The containers of this owner in what [`LIST`] prints: the id and the project of each.
+    pub fn containers<'list>(&self, list: &'list str) -> impl Iterator<Item = (&'list str, &'list str)> {
         let prefix = self.prefix();
-        Ok(listed.lines().filter(|name| name.starts_with(&prefix)).map(str::to_owned).collect())
+        list.lines().filter_map(|line| line.split_once(' ')).filter(move |(_, project)| project.starts_with(&prefix))
     }
 }
 
@@ -84,42 +88,31 @@ pub fn digest(text: &[u8]) -> u128 {
     Sha256::digest(text).iter().take(16).fold(0, |number: u128, byte| (number << 8) | u128::from(*byte))
 }
 
-/// Removes the containers of a project.
+/// Removes containers.
 ///
 /// # Errors
-/// When Docker fails; then some resources may remain.
-pub async fn remove(docker: &Docker, project: &str) -> Result<(), DockerError> {
-    let filter = format!("label={PROJECT}={project}");
-    let listed = docker.run(&["ps", "--all", "--quiet", "--filter", &filter], SHORT).await?;
-    let words: Vec<&str> = REMOVE.into_iter().chain(listed.split_whitespace()).collect();
-    if words.len() == REMOVE.len() {
-        return Ok(());
-    }
+/// When Docker fails; then some may remain.
+pub async fn remove(docker: &Docker, containers: impl IntoIterator<Item = &str>) -> Result<(), DockerError> {
+    let words: Vec<&str> = REMOVE.into_iter().chain(containers).collect();
     match docker.run(&words, SHORT).await {
-        // Another process may have removed it.
-        Err(DockerError::Failed { message, .. }) if message.to_lowercase().contains("no such") => Ok(()),
-        Err(DockerError::Failed { message, .. }) if message.contains("already in progress") => Ok(()),
+        // Another process may remove it.
+        Err(DockerError::Failed { message, .. })
+            if message.contains("o such container") || message.contains("already in progress") =>
+        {
+            Ok(())
+        }
         done => done.map(drop),
     }
 }
 
 /// Removes the containers of a server: for a process that watches over the server's end. Blocks.
 pub fn sweep(owner: &ResourceOwner) {
-    let prefix = owner.prefix();
-    let format = format!("{{{{.ID}}}} {{{{.Label \"{PROJECT}\"}}}}");
-    let filter = format!("label={PROJECT}");
-    let listed = quietly(&["ps", "--all", "--filter", &filter, "--format", &format]);
-    let found = listed.lines().filter_map(|line| line.split_once(' '));
-    let found: Vec<&str> = found.filter(|(_, project)| project.starts_with(&prefix)).map(|(id, _)| id).collect();
+    let list = docker::blocking(&LIST, SWEEP).unwrap_or_default();
+    let found: Vec<&str> = owner.containers(&list).map(|(id, _)| id).collect();
     if !found.is_empty() {
-        quietly(&REMOVE.into_iter().chain(found).collect::<Vec<_>>());
+        // What is left is removed by the next start.
+        docker::blocking(&[&REMOVE, found.as_slice()].concat(), SWEEP).ok();
     }
-}
-
-/// Runs docker with a timeout, and returns its output. Blocks.
-pub fn quietly(arguments: &[&str]) -> String {
-    let run = Run::new(std::iter::once("docker").chain(arguments.iter().copied()), Path::new("/"), SWEEP);
-    run.blocking(drop).map(|ran| String::from_utf8_lossy(&ran.answer).into_owned()).unwrap_or_default()
 }
 
 #[cfg(test)]

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use super::build_plan;
-use super::webots_yml::ProjectKind;
+use super::webots_yml::{ProjectKind, WebotsYml};
 use crate::shared::text::one_line;
 use crate::simulation::checkout::Project;
 
@@ -26,14 +26,6 @@ pub fn world_in(project: &Project) -> Result<String, String> {
     inside.to_str().map(str::to_owned).ok_or_else(|| "The world's name is no text".to_owned())
 }
 
-/// The directory of the project, as a mount for containers.
-///
-/// # Errors
-/// When it can't be mounted, as text for the client.
-pub fn project_folder(project: &Project) -> Result<PathBuf, String> {
-    project.folder().canonicalize().map_err(|error| error.to_string()).and_then(mountable)
-}
-
 /// The directory of a competition's participant. It is not in the project, where a world's program could replace it by
 /// a symlink before the controller is restarted.
 #[must_use]
@@ -41,28 +33,18 @@ pub fn participant_folder(project: &Project) -> PathBuf {
     project.instance.path().join("edited")
 }
 
-/// The directory that an editor shows.
+/// The directories of the project and of what an editor shows, as mounts for containers.
 ///
 /// # Errors
-/// When it does not exist, as text for the client.
-pub fn edited_folder(kind: &ProjectKind, project: &Project) -> Result<Option<PathBuf>, String> {
-    match kind {
-        ProjectKind::Default => Ok(None),
-        ProjectKind::Competition { .. } => Ok(Some(participant_folder(project))),
-        ProjectKind::Editor { .. } => {
-            let folder = kind.folder_in_project().unwrap_or_default();
-            build_plan::inside(project.folder(), &folder.to_string_lossy()).and_then(mountable).map(Some)
-        }
-    }
-}
-
-/// The same directory, as the project names it.
-#[must_use]
-pub fn volume_of(kind: &ProjectKind) -> Option<&str> {
-    match kind {
-        ProjectKind::Default => None,
-        ProjectKind::Editor { folder } | ProjectKind::Competition { folder } => Some(folder),
-    }
+/// When one does not exist or can't be mounted, as text for the client.
+pub fn mounts(yml: &WebotsYml, project: &Project) -> Result<(PathBuf, PathBuf), String> {
+    let root = project.folder().canonicalize().map_err(|error| error.to_string())?;
+    let edited = match yml.kind {
+        ProjectKind::Default => root.clone(),
+        ProjectKind::Competition => participant_folder(project),
+        ProjectKind::Editor => build_plan::inside(&root, &yml.folder_in_project())?,
+    };
+    Ok((mountable(root)?, mountable(edited)?))
 }
 
 /// Checks that compose can mount a directory: `:` would end its path, and a line break its variable.

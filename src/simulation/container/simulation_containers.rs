@@ -7,16 +7,17 @@ use tokio::sync::Notify;
 use tokio_util::task::AbortOnDropHandle;
 
 use super::docker::{Docker, DockerError, SHORT};
-use super::orphan_cleanup::ActiveProjects;
+use super::orphan_cleanup::ProjectGuard;
 use super::owned_resources;
 use super::start_error::{StartError, blame};
+use super::templates::WEBOTS;
 use crate::simulation::process::SpawnSpec;
 
 /// The containers of one simulation.
 #[derive(Debug)]
 pub struct SimulationContainers {
     docker: Docker,
-    lease: ProjectGuard,
+    guard: ProjectGuard,
     /// The container of each service.
     containers: Vec<(String, String)>,
     /// Whether the project has defined one of their images, which may be why Docker can't start one.
@@ -27,14 +28,6 @@ pub struct SimulationContainers {
     pub warnings: Vec<String>,
     /// Restarts the participant's controller; `None` if there is none.
     restart: Option<(Arc<Notify>, AbortOnDropHandle<()>)>,
-}
-
-/// The name of a compose project. Until this is dropped, its containers do not count as orphans.
-#[derive(Debug)]
-pub struct ProjectGuard {
-    /// The name; unique on this machine.
-    pub name: String,
-    live: ActiveProjects,
 }
 
 /// The cause of a container's end.
@@ -58,8 +51,6 @@ const EVENTS: (Duration, Duration) = (Duration::from_mins(1), Duration::from_mil
 const BETWEEN_RESTARTS: Duration = Duration::from_secs(1);
 /// The service of a participant's controller.
 const CONTROLLER: &str = "controller";
-/// The service of Webots.
-const WEBOTS: &str = "webots";
 
 impl Cause {
     /// Whether this server is the cause, so that another one may accept the client.
@@ -69,34 +60,19 @@ impl Cause {
     }
 }
 
-impl ProjectGuard {
-    /// Marks a name as in use.
-    #[must_use]
-    pub fn take(name: String, live: &ActiveProjects) -> Self {
-        live.insert(&name);
-        Self { name, live: live.clone() }
-    }
-}
-
-impl Drop for ProjectGuard {
-    fn drop(&mut self) {
-        self.live.remove(&self.name);
-    }
-}
-
 impl SimulationContainers {
     /// The containers of a compose project that was created: pairs of service and container. `is_projects` tells
     /// whether the project has defined one of their images.
     #[must_use]
     pub fn new(
         docker: Docker,
-        lease: ProjectGuard,
+        guard: ProjectGuard,
         containers: Vec<(String, String)>,
         is_projects: bool,
         texts: Vec<String>,
         warnings: Vec<String>,
     ) -> Self {
-        Self { docker, lease, containers, is_projects, texts, warnings, restart: None }
+        Self { docker, guard, containers, is_projects, texts, warnings, restart: None }
     }
 
     fn of(&self, service: &str) -> Option<&str> {
@@ -181,8 +157,9 @@ impl SimulationContainers {
 
     /// Removes everything of this simulation.
     pub async fn remove(self) {
-        if let Err(error) = owned_resources::remove(&self.docker, &self.lease.name).await {
-            log::warn!("{} is not removed yet: {error}", self.lease.name);
+        let containers = self.containers.iter().map(|(_, container)| container.as_str());
+        if let Err(error) = owned_resources::remove(&self.docker, containers).await {
+            log::warn!("{} is not removed yet: {error}", self.guard.name);
         }
     }
 }

@@ -68,7 +68,6 @@ mod tests {
         assert!(!is_own(failed("mknod /x: operation not permitted")));
         assert!(!is_own(failed("no space left on device: no such file")));
         assert!(is_own(failed("write /x: no space left on device")));
-        assert!(is_own(DockerError::NoDaemon("refused".to_owned())));
-        assert!(is_own(DockerError::NotStarted("there is no docker".to_owned())));
+        assert!(is_own(DockerError::Unavailable("refused".to_owned())));
     }
 }

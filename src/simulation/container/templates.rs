@@ -2,7 +2,6 @@
 
 use std::borrow::Cow;
 use std::collections::BTreeMap;
-use std::io;
 use std::path::PathBuf;
 
 use serde::Deserialize;
@@ -32,10 +31,14 @@ pub struct Templates {
 pub struct Template {
     /// The unchanged file.
     pub text: Cow<'static, str>,
-    /// Its services, and whether each has a command.
-    pub services: BTreeMap<String, bool>,
+    /// Its services.
+    pub services: Vec<String>,
+    /// Whether it has a command for Webots.
+    pub has_command: bool,
 }
 
+/// The service of Webots.
+pub const WEBOTS: &str = "webots";
 /// The Dockerfile of a project that has none.
 pub const DOCKERFILE: &str = "Dockerfile.default";
 /// The Dockerfile of a competition's controllers that have none.
@@ -69,41 +72,33 @@ impl Templates {
         if let Err(error) = std::fs::read_dir(folder) {
             return vec![format!("container.templates, {}: {error}", folder.display())];
         }
-        let edited = || String::new();
-        let kinds = [
-            ProjectKind::Default,
-            ProjectKind::Editor { folder: edited() },
-            ProjectKind::Competition { folder: edited() },
-        ];
+        let kinds = [ProjectKind::Default, ProjectKind::Editor, ProjectKind::Competition];
         let files = [DOCKERFILE, CONTROLLER, LAUNCHER];
-        let unreadable = |name: &&str| Some(format!("{name} of container.templates: {}", self.text(name).err()?));
-        let faults = kinds.iter().filter_map(|kind| self.compose(kind).err());
-        faults.chain(files.iter().filter_map(unreadable)).collect()
+        let faults = kinds.into_iter().filter_map(|kind| self.compose(kind).err());
+        faults.chain(files.into_iter().filter_map(|name| self.text(name).err())).collect()
     }
 
     /// The template for what a project requests.
     ///
     /// # Errors
     /// Why it can't be used, as text for the client.
-    pub fn compose(&self, kind: &ProjectKind) -> Result<Template, String> {
+    pub fn compose(&self, kind: ProjectKind) -> Result<Template, String> {
         let kind = match kind {
             ProjectKind::Default => "default",
-            ProjectKind::Editor { .. } => "theia",
-            ProjectKind::Competition { .. } => "competition",
+            ProjectKind::Editor => "theia",
+            ProjectKind::Competition => "competition",
         };
         let name = format!("docker-compose-{kind}{}.yml", if self.debug { "-debug" } else { "" });
         let broken = |error: String| format!("The template {name} of this simulation server can't be used: {error}");
-        let text = self.text(&name).map_err(|error| broken(error.to_string()))?;
+        let text = self.text(&name)?;
         let document: Document = serde_saphyr::from_str(&text).map_err(|error| broken(error.to_string()))?;
-        let services: BTreeMap<String, bool> =
-            document.services.into_iter().map(|(name, service)| (name, service.command.is_some())).collect();
-        if !services.contains_key("webots") {
-            return Err(broken("it has no service \"webots\"".to_owned()));
-        }
+        let webots = document.services.get(WEBOTS);
+        let webots = webots.ok_or_else(|| broken(format!("it has no service {WEBOTS:?}")))?;
         if let Some(line) = unsuitable(&text) {
             return Err(broken(line));
         }
-        Ok(Template { text, services })
+        let has_command = webots.command.is_some();
+        Ok(Template { services: document.services.into_keys().collect(), text, has_command })
     }
 
     /// Whether the administrator has a file of this name.
@@ -115,13 +110,14 @@ impl Templates {
     /// The text of a template.
     ///
     /// # Errors
-    /// When the administrator's file can't be read.
-    pub fn text(&self, name: &str) -> io::Result<Cow<'static, str>> {
-        if let Some(folder) = self.folder.as_ref().filter(|_| self.has(name)) {
-            return std::fs::read_to_string(folder.join(name)).map(Cow::Owned);
+    /// When the administrator's file can't be read, as text for an administrator.
+    pub fn text(&self, name: &str) -> Result<Cow<'static, str>, String> {
+        match self.folder.as_ref().filter(|_| self.has(name)) {
+            Some(folder) => std::fs::read_to_string(folder.join(name))
+                .map(Cow::Owned)
+                .map_err(|error| format!("{name} of container.templates: {error}")),
+            None => Ok(SHIPPED.iter().find(|(shipped, _)| *shipped == name).map_or("", |(_, text)| text).into()),
         }
-        let found = SHIPPED.iter().find(|(shipped, _)| *shipped == name);
-        found.map(|(_, text)| Cow::Borrowed(*text)).ok_or_else(|| io::ErrorKind::NotFound.into())
     }
 }
 
@@ -185,14 +181,13 @@ mod tests {
             ("services: {}\n", "no service \"webots\""),
         ] {
             std::fs::write(folder.path().join("docker-compose-default.yml"), text).unwrap();
-            let wrong = templates.compose(&ProjectKind::Default).unwrap_err();
+            let wrong = templates.compose(ProjectKind::Default).unwrap_err();
             assert!(wrong.starts_with("The template docker-compose-default.yml") && wrong.contains(words), "{wrong}");
             assert_eq!(templates.faults(), [wrong]);
         }
-        for kind in [ProjectKind::Editor { folder: String::new() }, ProjectKind::Competition { folder: String::new() }]
-        {
+        for kind in [ProjectKind::Editor, ProjectKind::Competition] {
             for debug in [false, true] {
-                assert!(Templates { folder: None, debug }.compose(&kind).is_ok());
+                assert!(Templates { folder: None, debug }.compose(kind).is_ok());
             }
         }
     }

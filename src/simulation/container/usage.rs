@@ -1,58 +1,34 @@
-//! The resource usage of the containers of simulations: from their control groups, else from `docker stats`, once for
-//! all.
+//! The resource usage of the containers of simulations, from `docker stats` once for all.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
 
-use super::owned_resources::{PROJECT, ResourceOwner, quietly};
-use crate::simulation::isolation::docker_cgroups;
-use crate::simulation::machine::{Measured, Sum, Usage, cgroup_sum};
+use super::docker::blocking;
+use super::owned_resources::{LIST, ResourceOwner};
+use crate::simulation::machine::{Measured, Usage};
 
-/// Measures the simulations of an owner: those on these ports, whose processes are named for each. Blocks for some
-/// milliseconds; for two seconds where control groups can't be read.
+/// Timeout of each command.
+const LIMIT: Duration = Duration::from_secs(20);
+
+/// Measures the simulations of an owner: those on these ports, whose processes are named for each. Blocks for two
+/// seconds, which `docker stats` takes.
 #[must_use]
 pub fn measure(owner: &ResourceOwner, roots: &BTreeMap<u16, i32>) -> Vec<(i32, Measured)> {
-    let (filter, format) = (format!("label={PROJECT}"), format!("{{{{.ID}}}} {{{{.Label \"{PROJECT}\"}}}}"));
-    let listed = quietly(&["ps", "--no-trunc", "--filter", &filter, "--format", &format]);
-    let found = listed.lines().filter_map(|line| line.split_once(' '));
+    let list = blocking(&LIST, LIMIT).unwrap_or_default();
+    let root = |project: &str| roots.get(&owner.port_of(project)?).copied();
     let containers: BTreeMap<&str, i32> =
-        found.filter_map(|(id, project)| Some((id, *roots.get(&owner.port_of(project)?)?))).collect();
-    let sums: Option<Vec<(i32, Sum)>> = containers
-        .iter()
-        .map(|(id, root)| Some((*root, docker_cgroups(id).iter().find_map(|cgroup| cgroup_sum(cgroup))?)))
-        .collect();
-    match sums {
-        Some(sums) => together(sums, add_sum).map(|(root, sum)| (root, Measured::Sum(sum))).collect(),
-        None => {
-            together(statistics(&containers), add_usage).map(|(root, usage)| (root, Measured::Usage(usage))).collect()
-        }
-    }
-}
-
-/// The sum of the readings of a simulation's containers.
-fn together<T: Default>(readings: Vec<(i32, T)>, add: impl Fn(&mut T, T)) -> impl Iterator<Item = (i32, T)> {
-    let mut all = BTreeMap::<i32, T>::new();
-    for (root, reading) in readings {
-        add(all.entry(root).or_default(), reading);
-    }
-    all.into_iter()
-}
-
-fn add_sum(all: &mut Sum, one: Sum) {
-    *all = Sum { time: all.time + one.time, memory: all.memory + one.memory, threads: all.threads + one.threads };
-}
-
-fn add_usage(all: &mut Usage, one: Usage) {
-    let cpu = Some(all.cpu.unwrap_or_default() + one.cpu.unwrap_or_default());
-    *all = Usage { cpu, memory: all.memory + one.memory, threads: all.threads + one.threads, time: Duration::ZERO };
-}
-
-/// The usage of these containers from `docker stats`.
-fn statistics(containers: &BTreeMap<&str, i32>) -> Vec<(i32, Usage)> {
+        owner.containers(&list).filter_map(|(id, project)| Some((id, root(project)?))).collect();
     let format = "{{.ID}}\t{{.CPUPerc}}\t{{.MemUsage}}\t{{.PIDs}}";
     let words = ["stats", "--no-stream", "--no-trunc", "--format", format];
-    let printed = quietly(&words.iter().copied().chain(containers.keys().copied()).collect::<Vec<_>>());
-    printed.lines().filter_map(usage_of).filter_map(|(id, usage)| Some((*containers.get(id)?, usage))).collect()
+    let printed = blocking(&words.into_iter().chain(containers.keys().copied()).collect::<Vec<_>>(), LIMIT);
+    let mut all = BTreeMap::<i32, Usage>::new();
+    for (id, one) in printed.unwrap_or_default().lines().filter_map(usage_of) {
+        let Some(root) = containers.get(id) else { continue };
+        let sum = all.entry(*root).or_default();
+        let cpu = Some(sum.cpu.unwrap_or_default() + one.cpu.unwrap_or_default());
+        *sum = Usage { cpu, memory: sum.memory + one.memory, threads: sum.threads + one.threads, ..one };
+    }
+    all.into_iter().map(|(root, usage)| (root, Measured::Usage(usage))).collect()
 }
 
 /// A line of `docker stats`.

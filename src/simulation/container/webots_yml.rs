@@ -24,36 +24,17 @@ const SHOWN: usize = 60;
 const PROJECT: &str = "webots-project";
 /// The parent of projects in a container. Some files contain it, as a path that goes up to the root first.
 const ABOVE_PROJECT: &str = "usr/local/";
-/// What may be requested, as text.
-const ALLOWED: &str =
-    "theia:webots-project/FOLDER for an editor or competition:webots-project/FOLDER for a competition";
 
 /// What runs beside Webots.
-#[derive(Debug, Clone, PartialEq, Eq, Default)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum ProjectKind {
     /// No other program.
     #[default]
     Default,
     /// An editor of a directory of the project.
-    Editor {
-        /// The directory, such as `webots-project/controllers/edit/`.
-        folder: String,
-    },
-    /// The controller of a participant.
-    Competition {
-        /// The directory of the participant, such as `webots-project/controllers/participant/`.
-        folder: String,
-    },
-}
-
-impl ProjectKind {
-    /// The directory below the project's own, such as `controllers/edit`. It is not checked yet: it may be missing, or
-    /// be a symlink to any path.
-    #[must_use]
-    pub fn folder_in_project(&self) -> Option<PathBuf> {
-        let (Self::Editor { folder } | Self::Competition { folder }) = self else { return None };
-        Some(Path::new(folder).components().skip(1).collect())
-    }
+    Editor,
+    /// The controller of a participant, and an editor of its directory.
+    Competition,
 }
 
 /// What a project requests.
@@ -61,6 +42,8 @@ impl ProjectKind {
 pub struct WebotsYml {
     /// What runs beside Webots.
     pub kind: ProjectKind,
+    /// The directory of the editor, such as `webots-project/controllers/edit/`; empty without one.
+    pub folder: String,
     /// The message to the web client with the simulation's type, such as `type:demo` and a line end: the line without its
     /// spaces, as the original sends it.
     pub project_type: Option<String>,
@@ -72,14 +55,11 @@ impl WebotsYml {
     /// Reads the file of a project; a project without one requests nothing. Blocks.
     #[must_use]
     pub fn read(project: &Path) -> Self {
-        for name in NAMES {
-            match text_of(&project.join(name)) {
-                Ok(None) => {}
-                Ok(Some(text)) => return Self::parse(&text),
-                Err(warning) => return Self { warnings: vec![warning], ..Self::default() },
-            }
+        match NAMES.iter().find_map(|name| text_of(&project.join(name)).transpose()) {
+            None => Self::default(),
+            Some(Ok(text)) => Self::parse(&text),
+            Some(Err(warning)) => Self { warnings: vec![warning], ..Self::default() },
         }
-        Self::default()
     }
 
     /// Parses the text of a file.
@@ -87,64 +67,57 @@ impl WebotsYml {
     pub fn parse(text: &str) -> Self {
         let text = text.trim_start_matches('\u{feff}');
         let mut found = Self::default();
-        let asked = text.lines().filter_map(|line| line.strip_prefix("dockerCompose:")).next_back();
-        match asked.map_or(Ok(ProjectKind::Default), kind_of) {
-            Ok(kind) => found.kind = kind,
-            Err(warning) => found.warnings.push(warning),
-        }
-        if let Some(line) = text.lines().map(str::trim).find(|line| line.starts_with("type:")) {
-            let line: String = line.chars().filter(|letter| *letter != ' ' && !letter.is_control()).collect();
-            if line.len() <= LENGTH {
-                found.project_type = Some(line + "\n");
-            } else {
-                found.warnings.push(format!("the line of the type in webots.yml has more than {LENGTH} bytes"));
+        if let Some(value) = text.lines().filter_map(|line| line.strip_prefix("dockerCompose:")).next_back() {
+            match request(value) {
+                Some((kind, folder)) => (found.kind, found.folder) = (kind, folder),
+                None => found.warnings.push(warning(value)),
             }
         }
+        let line = text.lines().map(str::trim).find(|line| line.starts_with("type:")).unwrap_or_default();
+        let line: String = line.chars().filter(|letter| *letter != ' ' && !letter.is_control()).collect();
+        found.project_type = (1..=LENGTH).contains(&line.len()).then(|| line + "\n");
         found
+    }
+
+    /// The directory below the project's own, such as `controllers/edit`. It is not checked yet: it may be missing, or
+    /// be a symlink to any path.
+    #[must_use]
+    pub fn folder_in_project(&self) -> PathBuf {
+        Path::new(&self.folder).components().skip(1).collect()
     }
 }
 
-/// The kind that the value of `dockerCompose` requests, such as `theia:webots-project/controllers`.
-fn kind_of(value: &str) -> Result<ProjectKind, String> {
+/// What the value of `dockerCompose` requests, such as `theia:webots-project/controllers`; `None` for what nobody may
+/// request.
+fn request(value: &str) -> Option<(ProjectKind, String)> {
     let value = value.split_once(" #").map_or(value, |(value, _comment)| value).trim();
-    let quoted = |quote| value.strip_prefix(quote)?.strip_suffix(quote);
-    let value = quoted('"').or_else(|| quoted('\'')).unwrap_or(value);
+    let value = value.trim_matches(['"', '\'']);
     if value.is_empty() {
-        return Ok(ProjectKind::Default);
+        return Some(Default::default());
     }
-    let Some((kind, folder)) = value.split_once(':') else {
-        return Err(format!("dockerCompose in webots.yml is {}: it may be {ALLOWED}", shown(value)));
+    let (kind, folder) = value.split_once(':')?;
+    let kind = match kind.trim() {
+        "competition" => ProjectKind::Competition,
+        kind if kind.starts_with("theia") => ProjectKind::Editor,
+        _ => return None,
     };
-    let (kind, folder) = (kind.trim(), folder.trim());
-    let is_editor = kind.starts_with("theia");
-    if !is_editor && kind != "competition" {
-        return Err(format!("dockerCompose in webots.yml asks for {}: it may be {ALLOWED}", shown(kind)));
-    }
-    let wrong = |why: &str| {
-        let shown = shown(folder);
-        Err(format!("the folder {shown} of dockerCompose in webots.yml {why}; it is like {PROJECT}/controllers/edit"))
-    };
+    let folder = folder.trim();
     let from_root = folder.trim_start_matches("../").trim_start_matches('/').strip_prefix(ABOVE_PROJECT);
     let folder = from_root.unwrap_or(folder);
     let is_plain = |letter: char| letter.is_alphanumeric() || " _-+./".contains(letter);
-    if folder.len() > LENGTH {
-        return wrong("is too long");
-    }
-    if !folder.chars().all(is_plain) {
-        return wrong("may have letters, digits, spaces and _-+./ only");
-    }
-    if folder.split('/').any(|part| part == ".." || part == ".") {
-        return wrong("must not have the parts . and ..");
-    }
-    if folder.split('/').next() != Some(PROJECT) {
-        return wrong("must begin with webots-project, which stands for the project");
-    }
-    let folder = folder.to_owned();
-    Ok(if is_editor { ProjectKind::Editor { folder } } else { ProjectKind::Competition { folder } })
+    let is_allowed = folder.len() <= LENGTH
+        && folder.chars().all(is_plain)
+        && folder.split('/').next() == Some(PROJECT)
+        && !folder.split('/').any(|part| part == ".." || part == ".");
+    is_allowed.then(|| (kind, folder.to_owned()))
 }
 
-fn shown(value: &str) -> String {
-    format!("\"{}\"", excerpt(value, SHOWN))
+fn warning(value: &str) -> String {
+    format!(
+        "dockerCompose in webots.yml is \"{}\": it may be theia:{PROJECT}/FOLDER for an editor or competition:{PROJECT}/FOLDER \
+         for a competition, where FOLDER has letters, digits, spaces and _-+./ only, and no parts . and ..",
+        excerpt(value.trim(), SHOWN)
+    )
 }
 
 #[cfg(test)]
@@ -153,21 +126,23 @@ mod tests {
 
     use super::*;
 
-    fn editor(folder: &str) -> ProjectKind {
-        ProjectKind::Editor { folder: folder.to_owned() }
+    const NOTHING: (ProjectKind, &str) = (ProjectKind::Default, "");
+
+    fn editor(folder: &str) -> (ProjectKind, &str) {
+        (ProjectKind::Editor, folder)
     }
 
-    fn competition(folder: &str) -> ProjectKind {
-        ProjectKind::Competition { folder: folder.to_owned() }
+    fn competition(folder: &str) -> (ProjectKind, &str) {
+        (ProjectKind::Competition, folder)
     }
 
     #[test]
     fn what_projects_ask_for_is_read_in_every_form() {
-        for (text, kind) in [
-            ("", ProjectKind::Default),
-            ("# a comment\n", ProjectKind::Default),
-            ("publish: true\ntype: demo\n", ProjectKind::Default),
-            ("dockerCompose:\npublish: true\n", ProjectKind::Default),
+        for (text, expected) in [
+            ("", NOTHING),
+            ("# a comment\n", NOTHING),
+            ("publish: true\ntype: demo\n", NOTHING),
+            ("dockerCompose:\npublish: true\n", NOTHING),
             (
                 "publish: true\ntype: demo\ndockerCompose:theia:webots-project/controllers/",
                 editor("webots-project/controllers/"),
@@ -182,8 +157,8 @@ mod tests {
                 editor("webots-project/y"),
             ),
             ("\u{feff}dockerCompose:theia:webots-project/x", editor("webots-project/x")),
-            ("#dockerCompose:theia:webots-project/x\n", ProjectKind::Default),
-            ("docker:\n  dockerCompose:theia:webots-project/x\n", ProjectKind::Default),
+            ("#dockerCompose:theia:webots-project/x\n", NOTHING),
+            ("docker:\n  dockerCompose:theia:webots-project/x\n", NOTHING),
             (
                 "publish: true\ntype: competition\nworld:\n  file: worlds/a.wbt\n  max-duration: 60\n  metric: time-speed\n  \
                  higher-is-better: true\ndockerCompose: competition:webots-project/controllers/participant/\n",
@@ -195,37 +170,39 @@ mod tests {
             ),
             ("dockerCompose:theia:/usr/local/webots-project/x", editor("webots-project/x")),
         ] {
-            assert_eq!(WebotsYml::parse(text).kind, kind, "{text:?}");
+            let found = WebotsYml::parse(text);
+            assert_eq!((found.kind, found.folder.as_str()), expected, "{text:?}");
+            assert_eq!(found.warnings, [""; 0], "{text:?}");
         }
     }
 
     #[test]
     fn what_nobody_may_ask_for_is_warned_of() {
-        let long = format!("dockerCompose:theia:webots-project/{}", "x".repeat(LENGTH));
-        for (text, warning) in [
-            ("dockerCompose: postgres:webots-project/x", "\"postgres\": it may be theia:"),
-            ("dockerCompose: theia", "\"theia\": it may be theia:"),
-            ("dockerCompose: {theia: webots-project/x}", "\"{theia\": it may be"),
-            ("dockerCompose: theia:/etc", "must begin with webots-project"),
-            ("dockerCompose: theia:../../webots-project/x", "must not have the parts"),
-            ("dockerCompose: theia:../../../usr/local/webots/x", "must begin with webots-project"),
-            ("dockerCompose: theia:/usr/local/../local/webots-project/x", "must not have the parts"),
-            ("dockerCompose: theia:controllers/x", "must begin with webots-project"),
-            ("dockerCompose: 'theia:'", "must begin with webots-project"),
-            ("dockerCompose: theia:webots-project/../x", "must not have the parts"),
-            ("dockerCompose: theia:webots-project/./x", "must not have the parts"),
-            ("dockerCompose: theia:webots-project/x:/etc", "letters, digits"),
-            ("dockerCompose: theia:webots-project/$HOME", "letters, digits"),
-            ("dockerCompose: theia:webots-project/a\0b", "letters, digits"),
-            ("dockerCompose: theia:webots-project/a\rIMAGE=x", "letters, digits"),
-            ("dockerCompose: theia:webots-project/\u{202e}x", "letters, digits"),
-            (&long, "is too long"),
+        let long = format!("theia:webots-project/{}", "x".repeat(LENGTH));
+        for value in [
+            "postgres:webots-project/x",
+            "theia",
+            "{theia: webots-project/x}",
+            "theia:/etc",
+            "theia:../../webots-project/x",
+            "theia:../../../usr/local/webots/x",
+            "theia:/usr/local/../local/webots-project/x",
+            "theia:controllers/x",
+            "'theia:'",
+            "theia:webots-project/../x",
+            "theia:webots-project/./x",
+            "theia:webots-project/x:/etc",
+            "theia:webots-project/$HOME",
+            "theia:webots-project/a\0b",
+            "theia:webots-project/a\rIMAGE=x",
+            "theia:webots-project/\u{202e}x",
+            &long,
         ] {
-            let found = WebotsYml::parse(text);
-            assert_eq!(found.kind, ProjectKind::Default, "{text:?}");
-            assert_eq!(found.warnings.len(), 1, "{text:?}: {:?}", found.warnings);
-            assert!(found.warnings[0].contains(warning), "{text:?}: {:?}", found.warnings);
+            let found = WebotsYml::parse(&format!("dockerCompose: {value}"));
+            assert_eq!((found.kind, found.folder.as_str()), NOTHING, "{value:?}");
+            assert_eq!(found.warnings, [warning(value)], "{value:?}");
         }
+        assert!(warning(" postgres:x").starts_with("dockerCompose in webots.yml is \"postgres:x\": it may be theia:"));
     }
 
     #[test]
@@ -239,7 +216,7 @@ mod tests {
             assert_eq!(WebotsYml::parse(text).project_type.as_deref(), message, "{text:?}");
         }
         let long = WebotsYml::parse(&format!("type: {}", "x".repeat(LENGTH)));
-        assert_eq!((long.project_type, long.warnings.len()), (None, 1));
+        assert_eq!(long.project_type, None);
     }
 
     #[test]
@@ -247,9 +224,9 @@ mod tests {
         for (folder, inside) in
             [("webots-project/controllers//edit/", "controllers/edit"), ("webots-project/", ""), ("webots-project", "")]
         {
-            assert_eq!(editor(folder).folder_in_project(), Some(PathBuf::from(inside)), "{folder}");
+            let found = WebotsYml { folder: folder.to_owned(), ..WebotsYml::default() };
+            assert_eq!(found.folder_in_project(), PathBuf::from(inside), "{folder}");
         }
-        assert_eq!(ProjectKind::Default.folder_in_project(), None);
     }
 
     #[test]

@@ -16,7 +16,7 @@ fn names(container: &str) -> [String; 2] {
 
 /// Where the control group of a container is in version 2, with systemd and without.
 #[must_use]
-pub fn docker_cgroups(container: &str) -> [PathBuf; 2] {
+fn docker_cgroups(container: &str) -> [PathBuf; 2] {
     names(container).map(|name| Path::new(ROOT).join(name))
 }
 

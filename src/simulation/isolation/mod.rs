@@ -18,7 +18,6 @@ mod watcher;
 
 pub use cgroup::Cgroup;
 pub use display::{Display, SCREEN};
-pub use docker_cgroup::docker_cgroups;
 pub use launcher::{IsolationLevel, Launcher, Network};
 pub use peak::Peak;
 pub use program::Program;
