@@ -34,7 +34,6 @@ pub struct Announcer {
 
 impl Announcer {
     /// Prepares the announcements of a server.
-    #[must_use]
     pub fn new(config: &SimulationConfig) -> Self {
         let allowed: Vec<&str> =
             config.allowed_repositories.iter().map(crate::shared::domain::UrlPrefix::as_str).collect();

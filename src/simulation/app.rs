@@ -73,7 +73,6 @@ impl Application {
     }
 
     /// Returns the state that routes and web clients share.
-    #[must_use]
     pub fn server(&self) -> &Arc<AppState> {
         &self.server
     }

@@ -121,58 +121,49 @@ impl ClientRequest {
 pub const HEARTBEAT: &str = ".";
 
 /// A text that a project requests: `ide: enable`, or its type, which ends its line as in the original.
-#[must_use]
 pub fn of_project(text: &str) -> String {
     let end = if text.ends_with('\n') { "\n" } else { "" };
     client_text(text.trim_end()) + end
 }
 
 /// Progress, as text.
-#[must_use]
 pub fn loading(text: &str) -> String {
     format!("loading: {}", client_text(&without_paths(text)))
 }
 
 /// Why a simulation failed.
-#[must_use]
 pub fn error(text: &str) -> String {
     loading(&format!("Error: {text}"))
 }
 
 /// The server stops.
-#[must_use]
 pub fn stopping() -> String {
     error("This simulation server is stopping")
 }
 
 /// The answer to `reset controller` without a running simulation.
-#[must_use]
 pub fn nothing_to_reset() -> String {
     error("A controller can be reset only while a simulation runs")
 }
 
 /// Why a simulation can't start here; another server may accept its client.
-#[must_use]
 pub fn elsewhere(why: &str) -> String {
     let why = why.trim_end_matches('.');
     error(&format!("{why}. Connect again: the session server chooses another simulation server"))
 }
 
 /// Why an administrator has stopped a simulation, without what makes it an error.
-#[must_use]
 pub fn stopped_by_teacher(reason: &str) -> String {
     let words = "Your teacher has stopped this simulation";
     if reason.is_empty() { words.to_owned() } else { format!("{words}: {reason}") }
 }
 
 /// The id of a simulation.
-#[must_use]
 pub fn session(id: impl std::fmt::Display) -> String {
     format!("session: {id}")
 }
 
 /// The number of clients ahead in the queue: once for programs, and once as text, because Webots' page shows only that.
-#[must_use]
 pub fn queue(ahead: usize) -> [String; 2] {
     let clients = match ahead {
         0 => "you are next".to_owned(),
@@ -183,61 +174,51 @@ pub fn queue(ahead: usize) -> [String; 2] {
 }
 
 /// The time limit of the simulation, in seconds.
-#[must_use]
 pub fn shutdown_timeout(seconds: u64) -> String {
     format!("shutdownTimeout: {seconds}")
 }
 
 /// How long the simulation waits for its client once the connection is broken.
-#[must_use]
 pub fn absence(seconds: u64) -> String {
     format!("absence: {seconds}")
 }
 
 /// Whether an administrator watches the simulation.
-#[must_use]
 pub fn watched(is_watched: bool) -> String {
     format!("watched: {}", u8::from(is_watched))
 }
 
 /// What its client can come back with.
-#[must_use]
 pub fn resume(token: &Token) -> String {
     format!("resume: {}", token.reveal())
 }
 
 /// After how many seconds the simulation ends because it is paused, or that it does not any more.
-#[must_use]
 pub fn idle(seconds: Option<u64>) -> String {
     seconds.map_or("idle: never".to_owned(), |seconds| format!("idle: {seconds}"))
 }
 
 /// Why nobody can come back to a simulation; where it is known, why it has ended.
-#[must_use]
 pub fn ended(why: Option<&str>) -> String {
     error(&why.map_or("this simulation has ended".to_owned(), |why| format!("this simulation has ended: {why}")))
 }
 
 /// Why a connection is closed: another one has used its token.
-#[must_use]
 pub fn taken_over() -> String {
     error("this simulation was taken over elsewhere")
 }
 
 /// The URL of Webots, which is ready.
-#[must_use]
 pub fn webots(url: &str) -> String {
     format!("webots:{url}")
 }
 
 /// Webots has sent no heartbeat for this many seconds.
-#[must_use]
 pub fn hanging(seconds: u64) -> String {
     loading(&format!("Webots has given no sign of life for {seconds} seconds"))
 }
 
 /// A controller's file was restored.
-#[must_use]
 pub fn reset_controller(file: &str) -> String {
     format!("reset controller: {}", client_text(file))
 }

@@ -37,7 +37,6 @@ const CLOCK_STEP: Duration = Duration::from_mins(1);
 /// Starts the checks. The channel contains the reason why the server can't start simulations, as text for clients and
 /// administrators. `run` is the directory of this run. When the server is ready again, the count of failed starts is
 /// reset.
-#[must_use]
 pub fn watch(
     config: Arc<SimulationConfig>,
     run: PathBuf,

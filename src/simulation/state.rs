@@ -94,7 +94,6 @@ pub struct AppState {
 
 impl AppState {
     /// Returns the thread for the Webots with this port.
-    #[must_use]
     pub fn webots_thread(&self, port: u16) -> &ArbiterHandle {
         let [first, second, third, fourth] = &self.webots_threads;
         match port % 4 {
@@ -106,19 +105,16 @@ impl AppState {
     }
 
     /// Returns the load to report: 100 % while the server is draining or can't start simulations.
-    #[must_use]
     pub fn load(&self) -> Load {
         if self.takes_nobody() { Load::FULL } else { self.readings.borrow().load.unwrap_or(Load::ZERO) }
     }
 
     /// Whether the server accepts no client, regardless of its world.
-    #[must_use]
     pub fn takes_nobody(&self) -> bool {
         self.is_draining() || self.problem.borrow().is_some()
     }
 
     /// Whether new clients are refused.
-    #[must_use]
     pub fn is_draining(&self) -> bool {
         *self.phase.borrow() != Phase::Open
     }
@@ -140,7 +136,6 @@ impl AppState {
     }
 
     /// Returns why this server can't start simulations; `None` if it can.
-    #[must_use]
     pub fn problem(&self) -> Option<String> {
         self.problem.borrow().clone()
     }

@@ -31,14 +31,12 @@ pub struct Resumption {
 }
 
 /// How many seconds are left until then, rounded up.
-#[must_use]
 pub fn seconds_until(then: Instant) -> u64 {
     (then.saturating_duration_since(Instant::now()) + Duration::from_millis(999)).as_secs()
 }
 
 impl Resumption {
     /// Creates it for a registered session with this lease.
-    #[must_use]
     pub fn new(registration: Registration, lease: &SlotLease, slots: Addr<SlotPool>) -> Self {
         Self {
             registration,
@@ -81,13 +79,11 @@ impl Resumption {
     }
 
     /// Whether the client may return.
-    #[must_use]
     pub fn is_ready(&self) -> bool {
         self.token.is_some()
     }
 
     /// Why a client with this token may not return, as text for it; `None` if it may.
-    #[must_use]
     pub fn refusal(&self, token: &Token) -> Option<String> {
         if self.token.as_ref() != Some(token) {
             return Some(protocol::taken_over());

@@ -51,7 +51,6 @@ const SIGN_OF_LIFE: Duration = Duration::from_secs(4);
 
 impl Session {
     /// Opens the session of a client that requests the world at this URL.
-    #[must_use]
     pub fn open(
         server: Arc<AppState>,
         (peer, who): (Peer, Who),

@@ -51,7 +51,6 @@ type Context = WebsocketContext<WebClient>;
 
 impl WebClient {
     /// A client that has just connected; `permit` counts it, `reader` reads its messages.
-    #[must_use]
     pub fn new(
         server: Arc<AppState>,
         (peer, user): (Peer, Option<String>),

@@ -108,7 +108,6 @@ impl Default for ContainerSettings {
 
 impl ContainerNetwork {
     /// The name of the Docker network, and of its interface, which the packet filter matches.
-    #[must_use]
     pub fn name(self) -> &'static str {
         match self {
             Self::Internet => "webots-fleet",

@@ -197,7 +197,6 @@ pub struct SimulationConfig {
 
 impl SimulationConfig {
     /// Returns the program that is started for each client; `None` if neither `webots` nor `webotsHome` is set.
-    #[must_use]
     pub fn webots_program(&self) -> Option<PathBuf> {
         if let Some(program) = &self.webots {
             return Some(program.0.clone());
@@ -207,13 +206,11 @@ impl SimulationConfig {
     }
 
     /// Whether simulations are spread over the GPUs of the machine.
-    #[must_use]
     pub fn spreads(&self) -> bool {
         self.gpus == GpuUse::Spread && (self.container.gpu || self.isolation != IsolationSetting::Container)
     }
 
     /// The displays of the GPUs, where Webots opens its windows on them.
-    #[must_use]
     pub fn displays_of_gpus(&self) -> &[DisplayName] {
         let is_virtual = match self.isolation {
             IsolationSetting::Container => self.container.display == ContainerDisplay::Virtual,
@@ -223,7 +220,6 @@ impl SimulationConfig {
     }
 
     /// The display on which a Webots opens its window that has this GPU, if it has one.
-    #[must_use]
     pub fn display_on(&self, gpu: Option<u32>) -> String {
         let own = self.displays_of_gpus().get(gpu.unwrap_or_default() as usize);
         display::effective(own.or(self.display.as_ref()))

@@ -26,7 +26,6 @@ const AGE: Duration = Duration::from_hours(14 * 24);
 const OUTPUT: usize = 64 * 1024;
 
 /// Returns the file with the output of the simulation with this id, whether it runs or has ended.
-#[must_use]
 pub fn output_file(logs: &Path, id: &str) -> Option<PathBuf> {
     if !SimulationId::is_like(id) {
         return None;

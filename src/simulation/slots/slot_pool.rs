@@ -66,7 +66,6 @@ const RECHECK: Duration = Duration::from_secs(1);
 impl SlotPool {
     /// Leases these ports; `queue_capacity` clients may wait. One address may have `per_address` slots, and the same
     /// share of the queue; without it, all of both.
-    #[must_use]
     pub fn new(ports: RangeInclusive<u16>, queue_capacity: usize, per_address: Option<usize>) -> Self {
         let shares = Shares { address: share(&ports, queue_capacity, per_address), user: None };
         let (present, line) = (BTreeMap::new(), VecDeque::new());
@@ -74,14 +73,12 @@ impl SlotPool {
     }
 
     /// One user may have so many places, and the same part of the line; without a number, all of both.
-    #[must_use]
     pub fn with_share_of_users(mut self, per_user: Option<usize>) -> Self {
         self.shares.user = share(&self.ports, self.queue_capacity, per_user);
         self
     }
 
     /// Records each end with `ends`.
-    #[must_use]
     pub fn with_ends(self, ends: Ends) -> Self {
         Self { ends: Some(ends), ..self }
     }
@@ -292,7 +289,6 @@ impl Handler<GetSnapshot> for SlotPool {
 impl SlotLease {
     /// Gets into the line for a place. `listener` hears what comes of it, `world` is shown, and the client counts by its
     /// address and its user.
-    #[must_use]
     pub fn new(
         slots: &Addr<SlotPool>,
         listener: Recipient<SlotEvent>,
@@ -305,7 +301,6 @@ impl SlotLease {
     }
 
     /// The id of the simulation.
-    #[must_use]
     pub fn id(&self) -> SimulationId {
         self.id
     }

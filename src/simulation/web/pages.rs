@@ -184,7 +184,6 @@ pub fn monitor(
 }
 
 /// The charts' numbers of the last ten minutes, the oldest first.
-#[must_use]
 pub fn history(readings: &Readings) -> Vec<Vec<f64>> {
     let values = |sample: &Sample| sample.columns().iter().filter_map(|text| text.parse().ok()).collect();
     readings.history.iter().map(values).collect()

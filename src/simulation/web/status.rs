@@ -42,7 +42,6 @@ pub struct StatusResponse {
 
 impl StatusResponse {
     /// The state of the server at this moment.
-    #[must_use]
     pub fn new(server: &AppState, snapshot: Snapshot) -> Self {
         let readings = server.readings.borrow().clone();
         let rules = &server.rules;
@@ -74,7 +73,6 @@ impl StatusResponse {
 }
 
 /// The gauges of `/metrics`.
-#[must_use]
 pub fn gauges<'text>(server: &AppState, snapshot: &Snapshot) -> Vec<Gauge<'text>> {
     let readings = server.readings.borrow();
     let instances = snapshot.instances;

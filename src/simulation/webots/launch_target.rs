@@ -35,7 +35,6 @@ pub enum Preparation {
 
 impl Preparation {
     /// The preparation that this Webots needs.
-    #[must_use]
     pub fn of(spec: &LaunchSpec) -> Self {
         match &spec.containers {
             Some(containers) => Self::ContainerService(Arc::clone(containers), spec.request()),
@@ -72,7 +71,6 @@ impl Preparation {
 
 impl LaunchTarget {
     /// Restarts the controller of a competition's participant; `None` if there is none.
-    #[must_use]
     pub fn restart(&self) -> Option<Arc<Notify>> {
         match self {
             Self::Machine(_) | Self::BesideDisplay(_) => None,
@@ -81,7 +79,6 @@ impl LaunchTarget {
     }
 
     /// The events for the client about it.
-    #[must_use]
     pub fn news(&self) -> Vec<WebotsEvent> {
         let Self::Containers(containers) = self else { return Vec::new() };
         let warnings = containers.warnings.iter().cloned().map(WebotsEvent::Progress);

@@ -50,7 +50,6 @@ const BETWEEN_EVENTS: Duration = Duration::from_millis(20);
 
 impl OutputEvent {
     /// The event of a line; `None` for the simulation's own lines.
-    #[must_use]
     pub fn parse(line: &str) -> Option<Self> {
         match line {
             RUNS => Some(Self::ContainerRuns),
@@ -66,7 +65,6 @@ impl OutputEvent {
 impl Tail {
     /// The lines as the end of a sentence, for the client: Webots usually prints there what is wrong. The path of the
     /// project is removed.
-    #[must_use]
     pub fn last_words(&self, project: &Path) -> String {
         let lines = self.0.lock();
         if lines.is_empty() {

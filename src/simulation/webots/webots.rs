@@ -72,7 +72,6 @@ const MISSED_HEARTBEATS: u32 = 6;
 
 impl Webots {
     /// Creates the actor; Webots starts with it.
-    #[must_use]
     pub fn new(spec: LaunchSpec) -> Self {
         Self {
             stream: None,
