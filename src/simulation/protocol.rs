@@ -28,6 +28,7 @@
 //! Webots' page inserts every TEXT into `innerHTML`: it passes through [`client_text`] and [`without_paths`] here, and
 //! nowhere else.
 
+use serde::Deserialize;
 use serde_json::Value;
 
 use crate::shared::text::{client_text, without_paths};
@@ -56,7 +57,8 @@ pub enum ClientRequest {
 }
 
 /// How a simulation is shown.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
 pub enum Mode {
     /// A 3D scene that the browser renders; its name until R2023b.
     #[default]
@@ -74,46 +76,45 @@ pub enum Mode {
 )]
 pub struct ClientRequestError(String);
 
+/// A message as JSON; unknown fields are ignored.
+#[derive(Deserialize)]
+struct WireMessage {
+    #[serde(rename = "reset controller")]
+    reset_controller: Option<String>,
+    resume: Option<String>,
+    keep: Option<bool>,
+    start: Option<WireStart>,
+}
+
+#[derive(Deserialize)]
+struct WireStart {
+    url: String,
+    mode: Option<Mode>,
+    resumable: Option<bool>,
+    name: Option<String>,
+}
+
 impl ClientRequest {
     /// Parses a message of a client; `None` if it is JSON without a request.
     ///
     /// # Errors
     /// When the message is not JSON, or its request is malformed.
     pub fn parse(text: &str) -> Result<Option<Self>, ClientRequestError> {
-        let wrong = |problem: &str| ClientRequestError(problem.to_owned());
-        let message: Value = serde_json::from_str(text).map_err(|_| wrong("it is no JSON"))?;
-        if let Some(file) = message.get("reset controller") {
-            let file = file.as_str().ok_or_else(|| wrong("\"reset controller\" is no text"))?;
-            return Ok(Some(Self::ResetController(file.to_owned())));
-        }
-        if let Some(token) = message.get("resume") {
-            let token = token.as_str().ok_or_else(|| wrong("\"resume\" is no text"))?;
-            return Ok(Some(Self::Resume(Token::parse(token))));
-        }
-        if let Some(keep) = message.get("keep") {
-            return if keep == true { Ok(Some(Self::Keep)) } else { Err(wrong("\"keep\" is not true")) };
-        }
-        let Some(start) = message.get("start") else {
+        let message: Value = serde_json::from_str(text).map_err(|_| ClientRequestError("it is no JSON".to_owned()))?;
+        if !message.is_object() {
             return Ok(None);
-        };
-        let url =
-            start.get("url").and_then(Value::as_str).ok_or_else(|| wrong("\"start\" has no \"url\" that is a text"))?;
-        let mode = match start.get("mode").map(|mode| (mode, mode.as_str())) {
-            None | Some((Value::Null, _)) => Mode::default(),
-            Some((_, Some("x3d"))) => Mode::X3d,
-            Some((_, Some("w3d"))) => Mode::W3d,
-            Some((_, Some("mjpeg"))) => Mode::Mjpeg,
-            Some((other, _)) => return Err(ClientRequestError(format!("there is no \"mode\" {other}"))),
-        };
-        let resumable = match start.get("resumable") {
-            None | Some(Value::Null) => false,
-            Some(value) => value.as_bool().ok_or_else(|| wrong("\"resumable\" is neither true nor false"))?,
-        };
-        let name = match start.get("name") {
-            None | Some(Value::Null) => None,
-            Some(name) => Some(name.as_str().ok_or_else(|| wrong("\"name\" is no text"))?.to_owned()),
-        };
-        Ok(Some(Self::Start { url: url.to_owned(), mode, resumable, name }))
+        }
+        let message = WireMessage::deserialize(message).map_err(|error| ClientRequestError(error.to_string()))?;
+        Ok(match message {
+            WireMessage { reset_controller: Some(file), .. } => Some(Self::ResetController(file)),
+            WireMessage { resume: Some(token), .. } => Some(Self::Resume(Token::parse(&token))),
+            WireMessage { keep: Some(true), .. } => Some(Self::Keep),
+            WireMessage { start: Some(WireStart { url, mode, resumable, name }), .. } => {
+                let (mode, resumable) = (mode.unwrap_or_default(), resumable.unwrap_or_default());
+                Some(Self::Start { url, mode, resumable, name })
+            }
+            _ => None,
+        })
     }
 }
 
@@ -257,7 +258,7 @@ mod tests {
 
     #[test]
     fn other_json_is_ignored() {
-        for text in ["{}", "[1]", "5", "null", r#"{"init":["host","project"]}"#, r#""start""#] {
+        for text in ["{}", "[1]", "5", "null", r#"{"init":["host","project"]}"#, r#""start""#, r#"{"keep":false}"#] {
             assert_eq!(ClientRequest::parse(text), Ok(None), "{text}");
         }
     }
@@ -267,15 +268,15 @@ mod tests {
         let table = [
             ("", "it is no JSON"),
             ("garbage", "it is no JSON"),
-            (r#"{"start":{}}"#, "\"start\" has no \"url\""),
-            (r#"{"start":5}"#, "\"start\" has no \"url\""),
-            (r#"{"start":{"url":"x","mode":"vr"}}"#, "there is no \"mode\" \"vr\""),
-            (r#"{"start":{"url":5}}"#, "\"start\" has no \"url\""),
-            (r#"{"start":{"url":"x","resumable":1}}"#, "\"resumable\" is neither"),
-            (r#"{"start":{"url":"x","name":{}}}"#, "\"name\" is no text"),
-            (r#"{"resume":5}"#, "\"resume\" is no text"),
-            (r#"{"keep":false}"#, "\"keep\" is not true"),
-            (r#"{"reset controller":5}"#, "\"reset controller\" is no text"),
+            (r#"{"start":{}}"#, "missing field `url`"),
+            (r#"{"start":5}"#, "invalid type: integer `5`"),
+            (r#"{"start":{"url":"x","mode":"vr"}}"#, "unknown variant `vr`, expected one of `x3d`, `w3d`, `mjpeg`"),
+            (r#"{"start":{"url":5}}"#, "invalid type: integer `5`, expected a string"),
+            (r#"{"start":{"url":"x","resumable":1}}"#, "expected a boolean"),
+            (r#"{"start":{"url":"x","name":{}}}"#, "expected a string"),
+            (r#"{"resume":5}"#, "expected a string"),
+            (r#"{"keep":5}"#, "expected a boolean"),
+            (r#"{"reset controller":5}"#, "expected a string"),
         ];
         for (text, words) in table {
             let error = ClientRequest::parse(text).unwrap_err().to_string();
