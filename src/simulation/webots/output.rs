@@ -9,7 +9,6 @@ use std::path::Path;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use actix::dev::ToEnvelope;
 use actix::prelude::*;
 use parking_lot::Mutex;
 use tokio::sync::oneshot;
@@ -88,14 +87,11 @@ impl Tail {
 ///
 /// # Errors
 /// When the thread can't be created.
-pub fn follow<A>(
+pub fn follow(
     output: PacedReader,
     mut file: Option<RotatedFile>,
-    events: Addr<A>,
-) -> std::io::Result<(Tail, oneshot::Receiver<()>)>
-where
-    A: Actor<Context: ToEnvelope<A, OutputEvent>> + Handler<OutputEvent>,
-{
+    events: Recipient<OutputEvent>,
+) -> std::io::Result<(Tail, oneshot::Receiver<()>)> {
     let tail = Tail::default();
     let kept = tail.clone();
     let (end, ended) = oneshot::channel();
@@ -124,10 +120,7 @@ where
 }
 
 /// Sends an event. If the actor can't keep up, the simulator blocks, and the mailbox does not grow.
-fn deliver<A>(events: &Addr<A>, event: OutputEvent)
-where
-    A: Actor<Context: ToEnvelope<A, OutputEvent>> + Handler<OutputEvent>,
-{
+fn deliver(events: &Recipient<OutputEvent>, event: OutputEvent) {
     while let Err(SendError::Full(_)) = events.try_send(event) {
         std::thread::sleep(Duration::from_millis(5));
     }

@@ -12,7 +12,7 @@ use tokio::sync::Notify;
 
 use super::event::{ExitNotifier, WebotsEvent, WebotsExit};
 use super::launch_spec::LaunchSpec;
-use super::launch_target::{LaunchTarget, Preparation};
+use super::launch_target::LaunchTarget;
 use super::launched::{self, End, Launched};
 use super::output::{OutputEvent, Tail};
 use super::verdict::verdict;
@@ -97,7 +97,7 @@ impl Webots {
         let client = self.spec.events.clone();
         // A full mailbox drops this line.
         let progress = move |text| drop(client.try_send(WebotsEvent::Progress(text)));
-        let prepared = Preparation::of(&self.spec).run(progress).into_actor(self);
+        let prepared = LaunchTarget::prepare(&self.spec, progress).into_actor(self);
         self.preparing = Some(ctx.spawn(prepared.map(|prepared, this, ctx| match prepared {
             Ok(runtime) => this.launch(runtime, ctx),
             Err(StartError::Project(why)) => this.not_started(EndReason::NoWebots, &why, ctx),
@@ -132,7 +132,7 @@ impl Webots {
     /// Starts the process, and calls [`Self::ended`] when it has ended.
     fn spawn(&mut self, runtime: LaunchTarget, ctx: &mut Context<Self>) -> std::io::Result<()> {
         let (Launched { group, cgroup, tail, log, peak }, ended) =
-            launched::launch(&self.spec, runtime, ctx.address())?;
+            launched::launch(&self.spec, runtime, ctx.address().recipient())?;
         let (program, world) = (self.spec.program.display(), self.spec.project.world.path.display());
         let (at, pid) = (seconds_since_1970(), group.leader());
         self.log(Level::Info, &format!("started {program} for {world} (process {pid})"));
