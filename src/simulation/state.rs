@@ -12,20 +12,13 @@ use super::failed_starts::FailedStarts;
 use super::sessions::Sessions;
 use super::slots::SlotPool;
 use super::streams::Streams;
-use crate::shared::domain::AdmissionRules;
-use crate::shared::domain::Load;
-use crate::shared::domain::ProjectUrl;
-use crate::shared::http::AddressQuota;
-use crate::shared::http::BasicAuth;
-use crate::shared::http::ConnectionLimiter;
-use crate::shared::http::LiveUpdates;
-use crate::shared::http::Metrics;
+use crate::shared::domain::{AdmissionRules, Load, ProjectUrl};
+use crate::shared::http::{AddressQuota, BasicAuth, ConnectionLimiter, LiveUpdates, Metrics};
 use crate::shared::run::{Phase, ServerCommand};
 use crate::simulation::checkout::CheckoutService;
 use crate::simulation::container::ContainerService;
 use crate::simulation::isolation::{Launcher, Watcher};
-use crate::simulation::machine::UsageMonitor;
-use crate::simulation::machine::{LoadMonitor, Readings, Spread};
+use crate::simulation::machine::{LoadMonitor, Readings, Spread, UsageMonitor};
 use crate::simulation::process::RunDir;
 
 /// Threads that start Webots: `spawn` blocks until `execve`, which takes long on a busy machine. They live as long as

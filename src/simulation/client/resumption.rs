@@ -19,13 +19,15 @@ pub struct Resumption {
     token: Option<Token>,
     simulation: SimulationId,
     slots: Addr<SlotPool>,
-    launched: Instant,
+    /// When Webots was started: the time limit starts then.
+    pub(super) launched: Instant,
     /// The texts that its project requests.
-    texts: Vec<String>,
+    pub(super) texts: Vec<String>,
     url: String,
-    /// When the simulation ends because it is paused.
-    idle_end: Option<Instant>,
-    deadline: Option<SpawnHandle>,
+    /// When the simulation ends because it is paused, if it does.
+    pub(super) idle_end: Option<Instant>,
+    /// The timer that ends the wait for the client, if there is one.
+    pub(super) deadline: Option<SpawnHandle>,
     /// Why the simulation has ended, if it has.
     ended: Option<String>,
 }
@@ -50,21 +52,6 @@ impl Resumption {
             deadline: None,
             ended: None,
         }
-    }
-
-    /// Records that Webots was started: the time limit starts.
-    pub fn launched(&mut self) {
-        self.launched = Instant::now();
-    }
-
-    /// Keeps a text for a client that returns.
-    pub fn keep(&mut self, text: String) {
-        self.texts.push(text);
-    }
-
-    /// When the simulation ends because it is paused, if it does.
-    pub fn idle_end(&mut self, end: Option<Instant>) {
-        self.idle_end = end;
     }
 
     /// Webots is ready at this URL: from now on the client may come back. Returns what it hears of that.
@@ -128,11 +115,6 @@ impl Resumption {
         texts.extend(self.offer(absence));
         texts.extend(self.idle_end.map(|end| protocol::idle(Some(seconds_until(end)))));
         texts
-    }
-
-    /// The timer that ends the wait, if there is one.
-    pub fn deadline(&mut self) -> &mut Option<SpawnHandle> {
-        &mut self.deadline
     }
 
     fn show(&self, until: Option<u64>) {

@@ -5,7 +5,7 @@
 //! client that may return.
 
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use actix::prelude::*;
 use actix_web_actors::ws::CloseCode;
@@ -262,13 +262,13 @@ impl Handler<WebotsEvent> for Session {
             WebotsEvent::Text(text) => {
                 let text = protocol::of_project(&text);
                 if let Some(resumption) = &mut self.resumption {
-                    resumption.keep(text.clone());
+                    resumption.texts.push(text.clone());
                 }
                 self.text(text);
             }
             WebotsEvent::Started => {
                 if let Some(resumption) = &mut self.resumption {
-                    resumption.launched();
+                    resumption.launched = Instant::now();
                 }
                 self.text(protocol::shutdown_timeout(self.server.config.timeout));
             }
@@ -291,7 +291,7 @@ impl Handler<WebotsEvent> for Session {
             WebotsEvent::Hanging(seconds) => self.hint(protocol::hanging(seconds)),
             WebotsEvent::IdleEnd(end) => {
                 if let Some(resumption) = &mut self.resumption {
-                    resumption.idle_end(end);
+                    resumption.idle_end = end;
                 }
                 self.text(protocol::idle(end.map(seconds_until)));
             }

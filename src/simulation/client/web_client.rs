@@ -10,10 +10,9 @@ use actix::prelude::*;
 use actix_web_actors::ws::{CloseCode, CloseReason, Message, ProtocolError, WebsocketContext};
 
 use super::session::Session;
-use crate::shared::http::ConnectionPermit;
-use crate::shared::http::Peer;
 use crate::shared::http::liveness::{self, Liveness};
 use crate::shared::http::websocket::{ClientMessage, MessageReader};
+use crate::shared::http::{ConnectionPermit, Peer};
 use crate::shared::run::closing;
 use crate::simulation::protocol::{self, ClientRequest};
 use crate::simulation::sessions::{Attachment, Resume, Said, ToClient, Token};
