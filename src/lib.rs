@@ -78,7 +78,6 @@
 //! | `ServerMonitor` | when its server leaves the configuration, or its name no longer resolves to it and it does not answer | its supervisor starts a new one |
 //! | `NameMonitor` | when its name leaves the configuration | its supervisor starts a new one |
 //! | Mailer | never | its supervisor starts a new one; unsent notices are lost |
-//! | Announcer | when each announcement has succeeded or been given up | it is not restarted: announcements are best effort |
 //! | `WebClient` | with its connection | its connection closes, and its session is notified |
 //! | `Session` | with its simulation, or its client | its lease is released, and its client is notified |
 //! | Webots | with its process tree; it is never restarted, its client is notified | its process tree is killed at once, its directory removed, its slot released |

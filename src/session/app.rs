@@ -5,7 +5,6 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Instant, SystemTime};
 
-use actix::prelude::*;
 use actix_web::{App, web};
 use tokio::sync::watch;
 
@@ -13,14 +12,10 @@ use super::announcements::Announcements;
 use super::config::SessionConfig;
 use super::state::AppState;
 use crate::session::fleet::{Ping, Reconfigure, Registry, resolver};
-use crate::session::mail::{self, Way};
 use crate::session::web::configure;
 use crate::shared::config;
-use crate::shared::http::BasicAuth;
-use crate::shared::http::ConnectionLimiter;
-use crate::shared::http::LiveUpdates;
-use crate::shared::http::Metrics;
 use crate::shared::http::server::{self, HttpServerOptions};
+use crate::shared::http::{BasicAuth, ConnectionLimiter, LiveUpdates, Metrics};
 use crate::shared::run::{
     AppError, Phase, ServerCommand, Signals, permanent, raise_open_files, service_manager, start,
 };
@@ -141,14 +136,13 @@ fn assemble(
     for outcome in OUTCOMES {
         picks.with_label_values(&[outcome]).reset();
     }
-    let mailers = Way::ALL.into_iter().filter_map(|way| Some((way, mail::start(&config, way)?))).collect();
     let (timing, client_urls) = (config.timing.clone(), config.client_urls());
     let trusted_proxies = config.trusted_proxies.clone();
     let (examples, viewer_script) = (config.examples.clone(), config.viewer_script.clone());
     let announcements = Arc::new(Announcements::start(config.announcement.clone()));
     let admin_auth = config.admin_password.clone().map(BasicAuth::new);
     let (available_sender, available) = watch::channel(false);
-    let registry = Registry::new(Arc::new(config), mailers, latencies, (resolver()?, available_sender)).start();
+    let registry = Registry::start(Arc::new(config), latencies, resolver()?, available_sender);
     let (started, started_at) = (Instant::now(), SystemTime::now());
     Ok(AppState {
         registry,

@@ -8,16 +8,10 @@ use tokio::sync::watch;
 
 use super::announcements::Announcements;
 use super::config::{Example, Timing};
-use crate::session::fleet::Registry;
-use crate::session::fleet::{Pick, PickError};
+use crate::session::fleet::{Pick, PickError, Registry};
 use crate::shared::domain::ClientUrls;
-use crate::shared::http::BasicAuth;
-use crate::shared::http::LiveUpdates;
-use crate::shared::http::Metrics;
-use crate::shared::http::TrustedProxies;
-use crate::shared::http::{ConnectionKind, ConnectionLimiter};
+use crate::shared::http::{BasicAuth, ConnectionKind, ConnectionLimiter, LiveUpdates, Metrics, TrustedProxies};
 use crate::shared::run::Phase;
-use crate::shared::text::client_text;
 
 /// The shared state.
 pub struct AppState {
@@ -55,14 +49,6 @@ pub struct AppState {
     pub started_at: SystemTime,
 }
 
-/// The answer to a request for a simulation server.
-pub struct PickResponse {
-    /// A URL, or `Error: ...`.
-    pub text: String,
-    /// Why there is no URL.
-    pub refusal: Option<PickError>,
-}
-
 /// Timeout of a pick by the registry.
 const PICK_TIMEOUT: Duration = Duration::from_secs(2);
 
@@ -72,8 +58,12 @@ impl AppState {
         self.connections.count(ConnectionKind::Client)
     }
 
-    /// Asks the registry for a simulation server. A registry that does not answer in time counts as unavailable.
-    pub async fn pick(&self, wanted: Result<Pick, PickError>) -> PickResponse {
+    /// Asks the registry for a simulation server, and returns its URL. A registry that does not answer in time counts
+    /// as unavailable.
+    ///
+    /// # Errors
+    /// Why there is none.
+    pub async fn pick(&self, wanted: Result<Pick, PickError>) -> Result<String, PickError> {
         let picked = match wanted {
             Ok(pick) => {
                 let picked = actix_rt::time::timeout(PICK_TIMEOUT, self.registry.send(pick)).await;
@@ -88,13 +78,6 @@ impl AppState {
             Err(PickError::InvalidWorld(_)) => "wrong_url",
         };
         self.picks.with_label_values(&[outcome]).inc();
-        match picked {
-            Ok(address) => PickResponse { text: self.client_urls.websocket_url(&address), refusal: None },
-            // This text contains nothing untrusted.
-            Err(PickError::Unavailable) => {
-                PickResponse { text: PickError::Unavailable.to_string(), refusal: Some(PickError::Unavailable) }
-            }
-            Err(refusal) => PickResponse { text: client_text(&refusal.to_string()), refusal: Some(refusal) },
-        }
+        picked.map(|address| self.client_urls.websocket_url(&address))
     }
 }

@@ -1,14 +1,10 @@
-//! Actor: announces this server to other services at start.
-//!
-//! One for the whole server. It posts the form of the original to each address in `notify`, up to six times; no other
-//! actor waits for it. It ends when each announcement has succeeded or been given up.
+//! Announces this server to other services at start: posts the form of the original to each address in `notify`, up to
+//! six times. Nothing waits for it.
 
 use std::time::Duration;
 
-use actix::prelude::*;
-use futures_util::future::join_all;
-
 use super::config::SimulationConfig;
+use crate::shared::domain::UrlPrefix;
 use crate::shared::http::tls;
 
 /// Number of attempts for each address.
@@ -25,25 +21,16 @@ struct Refusal {
     error: serde_json::Value,
 }
 
-/// The actor.
-pub struct Announcer {
-    addresses: Vec<String>,
-    form: Vec<(&'static str, String)>,
-    pause: Duration,
-}
-
-impl Announcer {
-    /// Prepares the announcements of a server.
-    #[must_use]
-    pub fn new(config: &SimulationConfig) -> Self {
-        let allowed: Vec<&str> =
-            config.allowed_repositories.iter().map(crate::shared::domain::UrlPrefix::as_str).collect();
-        let form = vec![
-            ("url", config.http_url()),
-            ("shareIdleTime", config.share_idle_time.to_string()),
-            ("allowedRepositories", allowed.join(",")),
-        ];
-        Self { addresses: config.notify.clone(), form, pause: config.timing.announce }
+/// Starts the announcements of a server.
+pub fn start(config: &SimulationConfig) {
+    let allowed: Vec<&str> = config.allowed_repositories.iter().map(UrlPrefix::as_str).collect();
+    let form = vec![
+        ("url", config.http_url()),
+        ("shareIdleTime", config.share_idle_time.to_string()),
+        ("allowedRepositories", allowed.join(",")),
+    ];
+    for address in &config.notify {
+        actix_rt::spawn(announce(address.clone(), form.clone(), config.timing.announce));
     }
 }
 
@@ -70,14 +57,4 @@ async fn announce(address: String, form: Vec<(&'static str, String)>, pause: Dur
         actix_rt::time::sleep(pause).await;
     }
     log::error!("gave up announcing to {address}");
-}
-
-impl Actor for Announcer {
-    type Context = Context<Self>;
-
-    fn started(&mut self, ctx: &mut Self::Context) {
-        let (form, pause) = (self.form.clone(), self.pause);
-        let announcements = self.addresses.drain(..).map(|address| announce(address, form.clone(), pause));
-        join_all(announcements.collect::<Vec<_>>()).into_actor(self).map(|_, _, ctx| ctx.stop()).spawn(ctx);
-    }
 }

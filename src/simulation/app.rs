@@ -9,7 +9,7 @@ use actix_web::{App, web};
 use tokio::sync::mpsc::Receiver;
 use tokio::sync::watch;
 
-use super::announcer::Announcer;
+use super::announcer;
 use super::config::{IsolationSetting, SimulationConfig};
 use super::ends::Ends;
 use super::readiness;
@@ -73,7 +73,6 @@ impl Application {
     }
 
     /// Returns the state that routes and web clients share.
-    #[must_use]
     pub fn server(&self) -> &Arc<AppState> {
         &self.server
     }
@@ -221,9 +220,7 @@ fn assemble(
     let spread = config.spreads().then(|| Arc::new(Spread::over(config.displays_of_gpus().len())));
     let (load_monitor, readings) = LoadMonitor::new(slots.clone(), run.path(), csv, spread.clone());
     let load_monitor = load_monitor.start();
-    if !config.notify.is_empty() {
-        Announcer::new(&config).start();
-    }
+    announcer::start(&config);
     let usage = UsageMonitor::default();
     let system = |source| {
         AppError::Unavailable(format!("simulations can't be watched (threads, or netlink with sock_diag): {source}"))

@@ -21,7 +21,6 @@ impl FailedStarts {
     }
 
     /// The number in a row.
-    #[must_use]
     pub fn count(&self) -> u32 {
         self.0.load(Ordering::Relaxed)
     }

@@ -29,7 +29,6 @@ impl std::fmt::Display for Finding {
 }
 
 /// Checks everything. It runs programs and connects to the display, so it can take some seconds.
-#[must_use]
 pub fn check(config: &SimulationConfig) -> Vec<Finding> {
     let (first, last) = if config.isolation == IsolationSetting::Container {
         let checks = [("docker", container::check(config)), ("templates", container::check_templates(config))];

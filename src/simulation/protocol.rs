@@ -28,6 +28,7 @@
 //! Webots' page inserts every TEXT into `innerHTML`: it passes through [`client_text`] and [`without_paths`] here, and
 //! nowhere else.
 
+use serde::Deserialize;
 use serde_json::Value;
 
 use crate::shared::text::{client_text, without_paths};
@@ -56,7 +57,8 @@ pub enum ClientRequest {
 }
 
 /// How a simulation is shown.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
 pub enum Mode {
     /// A 3D scene that the browser renders; its name until R2023b.
     #[default]
@@ -74,46 +76,45 @@ pub enum Mode {
 )]
 pub struct ClientRequestError(String);
 
+/// A message as JSON; unknown fields are ignored.
+#[derive(Deserialize)]
+struct WireMessage {
+    #[serde(rename = "reset controller")]
+    reset_controller: Option<String>,
+    resume: Option<String>,
+    keep: Option<bool>,
+    start: Option<WireStart>,
+}
+
+#[derive(Deserialize)]
+struct WireStart {
+    url: String,
+    mode: Option<Mode>,
+    resumable: Option<bool>,
+    name: Option<String>,
+}
+
 impl ClientRequest {
     /// Parses a message of a client; `None` if it is JSON without a request.
     ///
     /// # Errors
     /// When the message is not JSON, or its request is malformed.
     pub fn parse(text: &str) -> Result<Option<Self>, ClientRequestError> {
-        let wrong = |problem: &str| ClientRequestError(problem.to_owned());
-        let message: Value = serde_json::from_str(text).map_err(|_| wrong("it is no JSON"))?;
-        if let Some(file) = message.get("reset controller") {
-            let file = file.as_str().ok_or_else(|| wrong("\"reset controller\" is no text"))?;
-            return Ok(Some(Self::ResetController(file.to_owned())));
-        }
-        if let Some(token) = message.get("resume") {
-            let token = token.as_str().ok_or_else(|| wrong("\"resume\" is no text"))?;
-            return Ok(Some(Self::Resume(Token::parse(token))));
-        }
-        if let Some(keep) = message.get("keep") {
-            return if keep == true { Ok(Some(Self::Keep)) } else { Err(wrong("\"keep\" is not true")) };
-        }
-        let Some(start) = message.get("start") else {
+        let message: Value = serde_json::from_str(text).map_err(|_| ClientRequestError("it is no JSON".to_owned()))?;
+        if !message.is_object() {
             return Ok(None);
-        };
-        let url =
-            start.get("url").and_then(Value::as_str).ok_or_else(|| wrong("\"start\" has no \"url\" that is a text"))?;
-        let mode = match start.get("mode").map(|mode| (mode, mode.as_str())) {
-            None | Some((Value::Null, _)) => Mode::default(),
-            Some((_, Some("x3d"))) => Mode::X3d,
-            Some((_, Some("w3d"))) => Mode::W3d,
-            Some((_, Some("mjpeg"))) => Mode::Mjpeg,
-            Some((other, _)) => return Err(ClientRequestError(format!("there is no \"mode\" {other}"))),
-        };
-        let resumable = match start.get("resumable") {
-            None | Some(Value::Null) => false,
-            Some(value) => value.as_bool().ok_or_else(|| wrong("\"resumable\" is neither true nor false"))?,
-        };
-        let name = match start.get("name") {
-            None | Some(Value::Null) => None,
-            Some(name) => Some(name.as_str().ok_or_else(|| wrong("\"name\" is no text"))?.to_owned()),
-        };
-        Ok(Some(Self::Start { url: url.to_owned(), mode, resumable, name }))
+        }
+        let message = WireMessage::deserialize(message).map_err(|error| ClientRequestError(error.to_string()))?;
+        Ok(match message {
+            WireMessage { reset_controller: Some(file), .. } => Some(Self::ResetController(file)),
+            WireMessage { resume: Some(token), .. } => Some(Self::Resume(Token::parse(&token))),
+            WireMessage { keep: Some(true), .. } => Some(Self::Keep),
+            WireMessage { start: Some(WireStart { url, mode, resumable, name }), .. } => {
+                let (mode, resumable) = (mode.unwrap_or_default(), resumable.unwrap_or_default());
+                Some(Self::Start { url, mode, resumable, name })
+            }
+            _ => None,
+        })
     }
 }
 
@@ -121,58 +122,49 @@ impl ClientRequest {
 pub const HEARTBEAT: &str = ".";
 
 /// A text that a project requests: `ide: enable`, or its type, which ends its line as in the original.
-#[must_use]
 pub fn of_project(text: &str) -> String {
     let end = if text.ends_with('\n') { "\n" } else { "" };
     client_text(text.trim_end()) + end
 }
 
 /// Progress, as text.
-#[must_use]
 pub fn loading(text: &str) -> String {
     format!("loading: {}", client_text(&without_paths(text)))
 }
 
 /// Why a simulation failed.
-#[must_use]
 pub fn error(text: &str) -> String {
     loading(&format!("Error: {text}"))
 }
 
 /// The server stops.
-#[must_use]
 pub fn stopping() -> String {
     error("This simulation server is stopping")
 }
 
 /// The answer to `reset controller` without a running simulation.
-#[must_use]
 pub fn nothing_to_reset() -> String {
     error("A controller can be reset only while a simulation runs")
 }
 
 /// Why a simulation can't start here; another server may accept its client.
-#[must_use]
 pub fn elsewhere(why: &str) -> String {
     let why = why.trim_end_matches('.');
     error(&format!("{why}. Connect again: the session server chooses another simulation server"))
 }
 
 /// Why an administrator has stopped a simulation, without what makes it an error.
-#[must_use]
 pub fn stopped_by_teacher(reason: &str) -> String {
     let words = "Your teacher has stopped this simulation";
     if reason.is_empty() { words.to_owned() } else { format!("{words}: {reason}") }
 }
 
 /// The id of a simulation.
-#[must_use]
 pub fn session(id: impl std::fmt::Display) -> String {
     format!("session: {id}")
 }
 
 /// The number of clients ahead in the queue: once for programs, and once as text, because Webots' page shows only that.
-#[must_use]
 pub fn queue(ahead: usize) -> [String; 2] {
     let clients = match ahead {
         0 => "you are next".to_owned(),
@@ -183,61 +175,51 @@ pub fn queue(ahead: usize) -> [String; 2] {
 }
 
 /// The time limit of the simulation, in seconds.
-#[must_use]
 pub fn shutdown_timeout(seconds: u64) -> String {
     format!("shutdownTimeout: {seconds}")
 }
 
 /// How long the simulation waits for its client once the connection is broken.
-#[must_use]
 pub fn absence(seconds: u64) -> String {
     format!("absence: {seconds}")
 }
 
 /// Whether an administrator watches the simulation.
-#[must_use]
 pub fn watched(is_watched: bool) -> String {
     format!("watched: {}", u8::from(is_watched))
 }
 
 /// What its client can come back with.
-#[must_use]
 pub fn resume(token: &Token) -> String {
     format!("resume: {}", token.reveal())
 }
 
 /// After how many seconds the simulation ends because it is paused, or that it does not any more.
-#[must_use]
 pub fn idle(seconds: Option<u64>) -> String {
     seconds.map_or("idle: never".to_owned(), |seconds| format!("idle: {seconds}"))
 }
 
 /// Why nobody can come back to a simulation; where it is known, why it has ended.
-#[must_use]
 pub fn ended(why: Option<&str>) -> String {
     error(&why.map_or("this simulation has ended".to_owned(), |why| format!("this simulation has ended: {why}")))
 }
 
 /// Why a connection is closed: another one has used its token.
-#[must_use]
 pub fn taken_over() -> String {
     error("this simulation was taken over elsewhere")
 }
 
 /// The URL of Webots, which is ready.
-#[must_use]
 pub fn webots(url: &str) -> String {
     format!("webots:{url}")
 }
 
 /// Webots has sent no heartbeat for this many seconds.
-#[must_use]
 pub fn hanging(seconds: u64) -> String {
     loading(&format!("Webots has given no sign of life for {seconds} seconds"))
 }
 
 /// A controller's file was restored.
-#[must_use]
 pub fn reset_controller(file: &str) -> String {
     format!("reset controller: {}", client_text(file))
 }
@@ -276,7 +258,7 @@ mod tests {
 
     #[test]
     fn other_json_is_ignored() {
-        for text in ["{}", "[1]", "5", "null", r#"{"init":["host","project"]}"#, r#""start""#] {
+        for text in ["{}", "[1]", "5", "null", r#"{"init":["host","project"]}"#, r#""start""#, r#"{"keep":false}"#] {
             assert_eq!(ClientRequest::parse(text), Ok(None), "{text}");
         }
     }
@@ -286,15 +268,15 @@ mod tests {
         let table = [
             ("", "it is no JSON"),
             ("garbage", "it is no JSON"),
-            (r#"{"start":{}}"#, "\"start\" has no \"url\""),
-            (r#"{"start":5}"#, "\"start\" has no \"url\""),
-            (r#"{"start":{"url":"x","mode":"vr"}}"#, "there is no \"mode\" \"vr\""),
-            (r#"{"start":{"url":5}}"#, "\"start\" has no \"url\""),
-            (r#"{"start":{"url":"x","resumable":1}}"#, "\"resumable\" is neither"),
-            (r#"{"start":{"url":"x","name":{}}}"#, "\"name\" is no text"),
-            (r#"{"resume":5}"#, "\"resume\" is no text"),
-            (r#"{"keep":false}"#, "\"keep\" is not true"),
-            (r#"{"reset controller":5}"#, "\"reset controller\" is no text"),
+            (r#"{"start":{}}"#, "missing field `url`"),
+            (r#"{"start":5}"#, "invalid type: integer `5`"),
+            (r#"{"start":{"url":"x","mode":"vr"}}"#, "unknown variant `vr`, expected one of `x3d`, `w3d`, `mjpeg`"),
+            (r#"{"start":{"url":5}}"#, "invalid type: integer `5`, expected a string"),
+            (r#"{"start":{"url":"x","resumable":1}}"#, "expected a boolean"),
+            (r#"{"start":{"url":"x","name":{}}}"#, "expected a string"),
+            (r#"{"resume":5}"#, "expected a string"),
+            (r#"{"keep":5}"#, "expected a boolean"),
+            (r#"{"reset controller":5}"#, "expected a string"),
         ];
         for (text, words) in table {
             let error = ClientRequest::parse(text).unwrap_err().to_string();

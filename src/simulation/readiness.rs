@@ -7,7 +7,7 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::sync::Arc;
-use std::time::{Duration, Instant, SystemTime};
+use std::time::Duration;
 
 use tokio::sync::watch;
 use which::which;
@@ -31,13 +31,10 @@ const PERIOD_WHILE_NOT_READY: Duration = Duration::from_secs(1);
 const HUNG: Duration = Duration::from_mins(1);
 /// Bytes that each check writes to the disk. An empty file can be created on a full disk.
 const WRITTEN: usize = 1 << 20;
-/// Smallest step of the machine's clock that is logged.
-const CLOCK_STEP: Duration = Duration::from_mins(1);
 
 /// Starts the checks. The channel contains the reason why the server can't start simulations, as text for clients and
 /// administrators. `run` is the directory of this run. When the server is ready again, the count of failed starts is
 /// reset.
-#[must_use]
 pub fn watch(
     config: Arc<SimulationConfig>,
     run: PathBuf,
@@ -50,12 +47,10 @@ pub fn watch(
     let (sender, problem) = watch::channel(None);
     publish(&sender, first, &failed_starts);
     actix_rt::spawn(async move {
-        let mut clocks = (Instant::now(), SystemTime::now());
         let mut has_init = sender.borrow().is_none();
         while !sender.is_closed() {
             let pause = if sender.borrow().is_some() { PERIOD_WHILE_NOT_READY } else { PERIOD };
             actix_rt::time::sleep(pause).await;
-            clocks = log_clock_step(clocks);
             let gpus = check_gpus(&config, &readings.borrow());
             let indexes: Vec<u32> = readings.borrow().gpus.iter().map(|gpu| gpu.index).collect();
             let (config, run) = (Arc::clone(&config), run.clone());
@@ -97,18 +92,6 @@ fn publish(sender: &watch::Sender<Option<String>>, found: Option<String>, failed
         *problem = found;
         is_new
     });
-}
-
-/// Logs a step of the machine's clock since these times. It stops no simulation and no start, but git may then reject
-/// certificates of Git hosts as expired. Returns the current times.
-fn log_clock_step((instant, time): (Instant, SystemTime)) -> (Instant, SystemTime) {
-    let (now, expected) = (SystemTime::now(), time + instant.elapsed());
-    let (by, direction) =
-        now.duration_since(expected).map_or_else(|error| (error.duration(), "back"), |by| (by, "ahead"));
-    if by >= CLOCK_STEP {
-        log::warn!("the machine's clock was set {direction} by {} s", by.as_secs());
-    }
-    (Instant::now(), now)
 }
 
 /// Checks everything that each simulation needs; `gpus` are the numbers of those that answer. Blocks for two seconds for

@@ -22,14 +22,12 @@ static NEXT: AtomicU64 = AtomicU64::new(1);
 
 impl SimulationId {
     /// Returns a new id; unique on this server.
-    #[must_use]
     pub fn next() -> Self {
         let asked = SystemTime::UNIX_EPOCH.elapsed().unwrap_or_default();
         Self { number: NEXT.fetch_add(1, Ordering::Relaxed), asked }
     }
 
     /// Whether a text has only characters of an id, so that it is safe in a file name.
-    #[must_use]
     pub fn is_like(text: &str) -> bool {
         text.starts_with(|letter: char| letter.is_ascii_digit())
             && text.len() <= 40

@@ -12,20 +12,13 @@ use super::failed_starts::FailedStarts;
 use super::sessions::Sessions;
 use super::slots::SlotPool;
 use super::streams::Streams;
-use crate::shared::domain::AdmissionRules;
-use crate::shared::domain::Load;
-use crate::shared::domain::ProjectUrl;
-use crate::shared::http::AddressQuota;
-use crate::shared::http::BasicAuth;
-use crate::shared::http::ConnectionLimiter;
-use crate::shared::http::LiveUpdates;
-use crate::shared::http::Metrics;
+use crate::shared::domain::{AdmissionRules, Load, ProjectUrl};
+use crate::shared::http::{AddressQuota, BasicAuth, ConnectionLimiter, LiveUpdates, Metrics};
 use crate::shared::run::{Phase, ServerCommand};
 use crate::simulation::checkout::CheckoutService;
 use crate::simulation::container::ContainerService;
 use crate::simulation::isolation::{Launcher, Watcher};
-use crate::simulation::machine::UsageMonitor;
-use crate::simulation::machine::{LoadMonitor, Readings, Spread};
+use crate::simulation::machine::{LoadMonitor, Readings, Spread, UsageMonitor};
 use crate::simulation::process::RunDir;
 
 /// Threads that start Webots: `spawn` blocks until `execve`, which takes long on a busy machine. They live as long as
@@ -94,7 +87,6 @@ pub struct AppState {
 
 impl AppState {
     /// Returns the thread for the Webots with this port.
-    #[must_use]
     pub fn webots_thread(&self, port: u16) -> &ArbiterHandle {
         let [first, second, third, fourth] = &self.webots_threads;
         match port % 4 {
@@ -106,19 +98,16 @@ impl AppState {
     }
 
     /// Returns the load to report: 100 % while the server is draining or can't start simulations.
-    #[must_use]
     pub fn load(&self) -> Load {
         if self.takes_nobody() { Load::FULL } else { self.readings.borrow().load.unwrap_or(Load::ZERO) }
     }
 
     /// Whether the server accepts no client, regardless of its world.
-    #[must_use]
     pub fn takes_nobody(&self) -> bool {
         self.is_draining() || self.problem.borrow().is_some()
     }
 
     /// Whether new clients are refused.
-    #[must_use]
     pub fn is_draining(&self) -> bool {
         *self.phase.borrow() != Phase::Open
     }
@@ -140,7 +129,6 @@ impl AppState {
     }
 
     /// Returns why this server can't start simulations; `None` if it can.
-    #[must_use]
     pub fn problem(&self) -> Option<String> {
         self.problem.borrow().clone()
     }

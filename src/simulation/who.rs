@@ -21,7 +21,6 @@ const LABEL_LENGTH: usize = 60;
 
 impl Who {
     /// Names of at most so many letters in one line; an empty one is none.
-    #[must_use]
     pub fn new(user: Option<&str>, label: Option<&str>) -> Self {
         let cut = |text: &str, most| one_line(text).trim().chars().take(most).collect::<String>();
         let cut = |text: Option<&str>, most| text.map(|text| cut(text, most)).filter(|text| !text.is_empty());

@@ -13,7 +13,7 @@ use ::log::Level;
 use actix::Addr;
 use serde_json::{Value, json};
 use webots_fleet::session::config::SessionConfig;
-use webots_fleet::session::mail::{self, Mailer, Notice, NoticeKind, Way};
+use webots_fleet::session::mail::{self, Channel, Mailer, Notice, NoticeKind};
 use webots_fleet::shared::config::Configuration;
 use webots_fleet::shared::domain::Load;
 
@@ -57,7 +57,7 @@ fn with(keys: &Value, more: &Value) -> Value {
 
 fn start(port: u16, more: &Value) -> Addr<Mailer> {
     keep_log();
-    mail::start(&config(port, more), Way::Mail).expect("mails are on")
+    mail::start(&config(port, more), Channel::Mail).expect("mails are on")
 }
 
 fn notice(host: &str, event: NoticeKind) -> Notice {

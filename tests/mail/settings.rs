@@ -16,7 +16,7 @@ async fn without_one_of_the_three_keys_mails_are_off() {
             "mailServer" => config.mail_server = None,
             _ => config.mail_sender = None,
         }
-        assert!(mail::start(&config, mail::Way::Mail).is_none(), "there is a mailer without {key}");
+        assert!(mail::start(&config, mail::Channel::Mail).is_none(), "there is a mailer without {key}");
         let error = test_mail(&config).await.unwrap_err().to_string();
         assert_eq!(error, format!("notifications are off: {key} is not set"));
     }

@@ -1,5 +1,6 @@
 //! The session server's configuration, `config/session/NAME.json`.
 
+use std::collections::HashSet;
 use std::net::{IpAddr, Ipv6Addr};
 use std::time::Duration;
 
@@ -12,10 +13,9 @@ use super::mail_address;
 use super::server_entry::ServerEntry;
 use super::timing::Timing;
 use crate::session::placement::PlacementPolicy;
-use crate::shared::config::{Configuration, InvalidValueError, changed_keys};
 use crate::shared::config::{
-    ExpandedPath, Secret, expanded, folder, local_address, object, one_or_many, optional_expanded, optional_whole,
-    percent, seconds, threshold, whole,
+    Configuration, ExpandedPath, InvalidValueError, Secret, changed_keys, expanded, folder, is_web_url, local_address,
+    object, one_or_many, optional_expanded, optional_whole, percent, require, seconds, whole,
 };
 use crate::shared::domain::{ClientUrls, PublicAddress, PublicUrl, check_host};
 use crate::shared::http::TrustedProxies;
@@ -86,14 +86,14 @@ pub struct SessionConfig {
     pub debug: bool,
     /// A simulation server with this load (percent) or more gets no client. Above 100, the load does not matter.
     /// Default: 95.
-    #[serde(default = "default_load_threshold", deserialize_with = "threshold")]
+    #[serde(default = "default_load_threshold", deserialize_with = "percent::<1000, _>")]
     pub load_threshold: f64,
     /// Interval between two probes of a simulation server, in seconds. Default: 1.
     #[serde(default = "default_load_refresh", with = "seconds")]
     pub load_refresh: Duration,
     /// Load (percent) that a client adds to a simulation server that reports only its load. For the others it is
     /// learned, starting from this. Default: 2.
-    #[serde(default = "default_client_cost", deserialize_with = "percent")]
+    #[serde(default = "default_client_cost", deserialize_with = "percent::<100, _>")]
     pub client_cost: f64,
     /// Limit of open client `WebSockets` in all. Default: 20000.
     #[serde(default = "default_max_clients", deserialize_with = "whole::<1, 1_000_000, _, _>")]
@@ -190,23 +190,19 @@ impl SessionConfig {
         for address in listed.chain(&mut self.drained_servers) {
             *address = address.clone().without_usual_web_port(self.ssl);
         }
-        let mut seen = std::collections::HashSet::new();
+        let mut seen = HashSet::new();
         for entry in &self.simulation_servers {
-            if !seen.insert(entry) {
-                let problem = format!("{entry} is listed twice; each simulation server is listed once");
-                return Err(InvalidValueError { key: "simulationServers", problem });
-            }
+            require(seen.insert(entry), "simulationServers", || {
+                format!("{entry} is listed twice; each simulation server is listed once")
+            })?;
         }
         // A name may resolve to any server.
         let has_names = self.simulation_servers.iter().any(|entry| entry.name().is_some());
-        let is_listed = |address: &PublicAddress| seen.contains(&ServerEntry::Server(address.clone()));
-        match self.drained_servers.iter().find(|address| !has_names && !is_listed(address)) {
-            Some(address) => {
-                let problem = format!("{address} is not one of simulationServers");
-                Err(InvalidValueError { key: "drainedServers", problem })
-            }
-            None => Ok(()),
+        for address in &self.drained_servers {
+            let is_listed = has_names || seen.contains(&ServerEntry::Server(address.clone()));
+            require(is_listed, "drainedServers", || format!("{address} is not one of simulationServers"))?;
         }
+        Ok(())
     }
 }
 
@@ -223,36 +219,30 @@ impl Configuration for SessionConfig {
         }
         check_host(&self.server, self.port_rewrite).map_err(|problem| InvalidValueError { key: "server", problem })?;
         self.check_servers()?;
-        if self.timing.silence <= self.timing.ping {
-            let problem = format!("{} s is not more than timing.ping", self.timing.silence.as_secs_f64());
-            return Err(InvalidValueError { key: "timing.silence", problem });
-        }
-        if self.timing.stop > LONGEST_STOP {
+        require(self.timing.silence > self.timing.ping, "timing.silence", || {
+            format!("{} s is not more than timing.ping", self.timing.silence.as_secs_f64())
+        })?;
+        require(self.timing.stop <= LONGEST_STOP, "timing.stop", || {
             let (stop, most) = (self.timing.stop.as_secs_f64(), LONGEST_STOP.as_secs_f64());
-            let problem = format!("{stop} s is too long; allowed is at most {most} s, for the server ends within 5 s");
-            return Err(InvalidValueError { key: "timing.stop", problem });
-        }
-        if let Some(script) =
-            self.viewer_script.as_ref().filter(|script| !script.has_host() || !script.scheme().starts_with("http"))
-        {
-            let problem = format!("{script} is no URL of a web server; allowed are http and https");
-            return Err(InvalidValueError { key: "viewerScript", problem });
+            format!("{stop} s is too long; allowed is at most {most} s, for the server ends within 5 s")
+        })?;
+        let allowed = "no URL of a web server; allowed are http and https";
+        if let Some(script) = &self.viewer_script {
+            require(is_web_url(script.as_str()), "viewerScript", || format!("{script} is {allowed}"))?;
         }
         self.webhook = self.webhook.take().filter(|url| !url.reveal().is_empty());
-        let is_web = |url: &url::Url| url.has_host() && matches!(url.scheme(), "http" | "https");
-        if self.webhook.as_ref().is_some_and(|url| !url::Url::parse(url.reveal()).is_ok_and(|url| is_web(&url))) {
+        if let Some(webhook) = &self.webhook {
             // The text itself is a secret.
-            let problem = "it is no URL of a web server; allowed are http and https".to_owned();
-            return Err(InvalidValueError { key: "webhook", problem });
+            require(is_web_url(webhook.reveal()), "webhook", || format!("it is {allowed}"))?;
         }
         if self.announcement.as_ref().is_some_and(Announcement::is_over) {
             warnings.push("announcement is over: it is not shown".to_owned());
         }
         self.mail_server = self.mail_server.take().filter(|host| !host.is_empty());
-        if let Some(host) = self.mail_server.as_deref().filter(|host| !mail_address::is_host(host)) {
-            let problem =
-                format!("{host:?} is no host; allowed is a name or an IP address (mailServerPort has the port)");
-            return Err(InvalidValueError { key: "mailServer", problem });
+        if let Some(host) = &self.mail_server {
+            require(mail_address::is_host(host), "mailServer", || {
+                format!("{host:?} is no host; allowed is a name or an IP address (mailServerPort has the port)")
+            })?;
         }
         if self.administrator.is_some() && self.mail_server.is_none() {
             warnings.push("mailServer is not set: notifications are off".to_owned());
@@ -272,7 +262,7 @@ fn default_bind() -> IpAddr {
 }
 
 fn default_log_dir() -> ExpandedPath {
-    ExpandedPath::plain("log")
+    ExpandedPath("log".into())
 }
 
 fn default_load_threshold() -> f64 {

@@ -4,10 +4,10 @@ use std::collections::VecDeque;
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
-use crate::session::config::DnsName;
-use crate::shared::domain::Load;
-use crate::shared::domain::PublicAddress;
-use crate::shared::domain::ServerReport;
+use serde::Serialize;
+
+use crate::shared::domain::{PublicAddress, ServerReport};
+use crate::shared::run::serialize_timestamp;
 
 /// Everything that is known of the fleet.
 #[derive(Debug, Clone)]
@@ -25,15 +25,16 @@ pub struct FleetStatus {
 }
 
 /// What is known of a name that resolves to simulation servers.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Serialize)]
 pub struct NameStatus {
     /// The entry of `simulationServers`.
-    pub name: DnsName,
+    pub name: String,
     /// Number of servers that it resolves to.
     pub servers: usize,
     /// Why the last lookup failed, if it did: the servers are those that were found before.
     pub error: Option<String>,
     /// When lookups last began to fail or to succeed.
+    #[serde(serialize_with = "serialize_timestamp")]
     pub since: SystemTime,
 }
 
@@ -46,7 +47,7 @@ pub struct ServerStatus {
     pub state: ServerState,
     /// When it entered that state.
     pub since: SystemTime,
-    /// Its last report.
+    /// Its last report, unless it is down.
     pub report: Option<Arc<ServerReport>>,
     /// Why the last probe failed, if it did, or why others are preferred to it, if they are.
     pub error: Option<String>,
@@ -63,7 +64,8 @@ pub struct ServerStatus {
 }
 
 /// The state of a simulation server.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
 pub enum ServerState {
     /// It was not probed yet.
     Unknown,
@@ -78,9 +80,10 @@ pub enum ServerState {
 }
 
 /// A simulation server has changed its state, or lookups of a name have begun to fail or to succeed.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Serialize)]
 pub struct StateChange {
     /// When it changed.
+    #[serde(serialize_with = "serialize_timestamp")]
     pub at: SystemTime,
     /// The simulation server's address, or the name.
     pub server: String,
@@ -103,7 +106,9 @@ impl ServerState {
     }
 }
 
-/// Returns the mean load as `/load` shows it, in percent; -1 if no server answers.
-pub fn displayed_mean_load(mean_load: Option<f64>) -> f64 {
-    mean_load.and_then(|mean| Load::try_from(mean).ok()).map_or(-1.0, Load::percent)
+impl FleetStatus {
+    /// The mean load as `/load` shows it, in percent; -1 if no server answers.
+    pub fn displayed_mean_load(&self) -> f64 {
+        self.mean_load.unwrap_or(-1.0)
+    }
 }

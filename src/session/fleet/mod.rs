@@ -14,7 +14,7 @@ mod server_record;
 mod server_table;
 mod state_history;
 
-pub use fleet_status::{FleetStatus, NameStatus, ServerState, ServerStatus, StateChange, displayed_mean_load};
+pub use fleet_status::{FleetStatus, NameStatus, ServerState, ServerStatus, StateChange};
 pub use pick::{Pick, PickError};
 pub use registry::{GetStatus, Ping, Reconfigure, Registry};
 pub use resolver::resolver;

@@ -9,7 +9,7 @@ use rustls::ClientConfig;
 
 use super::name_monitor::{LookupResult, NameMonitor};
 use super::server_monitor::{ProbeResult, ProbeSettings, ServerMonitor, Stop};
-use crate::session::config::{DnsName, SessionConfig};
+use crate::session::config::DnsName;
 use crate::shared::domain::PublicAddress;
 use crate::shared::http::tls;
 use crate::shared::run::{Supervisor, TooManyPanics};
@@ -26,6 +26,8 @@ struct Makers {
     thread: Arbiter,
     tls: Option<Arc<ClientConfig>>,
     resolver: TokioResolver,
+    settings: ProbeSettings,
+    results: MonitorRecipients,
 }
 
 /// Recipients of what the monitors find.
@@ -37,35 +39,30 @@ pub struct MonitorRecipients {
 }
 
 impl Makers {
-    fn server(
-        &self,
-        server: &PublicAddress,
-        settings: ProbeSettings,
-        results: &MonitorRecipients,
-    ) -> Addr<ServerMonitor> {
-        let (server, tls, results) = (server.clone(), self.tls.clone(), results.probes.clone());
-        let resolver = self.resolver.clone();
+    fn server(&self, server: &PublicAddress) -> Addr<ServerMonitor> {
+        let (server, tls, results) = (server.clone(), self.tls.clone(), self.results.probes.clone());
+        let (settings, resolver) = (self.settings, self.resolver.clone());
         ServerMonitor::start_in_arbiter(&self.thread.handle(), move |_| {
             ServerMonitor::new(server, settings, resolver, tls, results)
         })
     }
 
-    fn name(&self, name: &DnsName, results: &MonitorRecipients) -> Addr<NameMonitor> {
-        let (name, results) = (name.clone(), results.lookups.clone());
+    fn name(&self, name: &DnsName) -> Addr<NameMonitor> {
+        let (name, results) = (name.clone(), self.results.lookups.clone());
         NameMonitor::start_in_arbiter(&self.thread.handle(), move |_| NameMonitor::new(name, results))
     }
 }
 
 impl Monitors {
     /// Starts the thread, without monitors.
-    pub fn new(resolver: TokioResolver) -> Self {
-        let makers = Makers { thread: Arbiter::new(), tls: tls::client_config(), resolver };
+    pub fn new(resolver: TokioResolver, settings: ProbeSettings, results: MonitorRecipients) -> Self {
+        let makers = Makers { thread: Arbiter::new(), tls: tls::client_config(), resolver, settings, results };
         Self { makers, servers: Supervisor::new("monitor of server"), names: Supervisor::new("monitor of name") }
     }
 
     /// Starts the monitor of a simulation server.
-    pub fn watch(&mut self, server: &PublicAddress, config: &SessionConfig, results: &MonitorRecipients) {
-        self.servers.add(server.clone(), self.makers.server(server, ProbeSettings::new(config), results));
+    pub fn watch(&mut self, server: &PublicAddress) {
+        self.servers.add(server.clone(), self.makers.server(server));
     }
 
     /// Ends the monitor of a simulation server.
@@ -76,8 +73,8 @@ impl Monitors {
     }
 
     /// Starts the monitor of a name.
-    pub fn look_up(&mut self, name: &DnsName, results: &MonitorRecipients) {
-        self.names.add(name.clone(), self.makers.name(name, results));
+    pub fn look_up(&mut self, name: &DnsName) {
+        self.names.add(name.clone(), self.makers.name(name));
     }
 
     /// Ends the monitor of a name.
@@ -91,16 +88,15 @@ impl Monitors {
     ///
     /// # Errors
     /// When there were too many panics.
-    pub fn restart_gone(&mut self, config: &SessionConfig, results: &MonitorRecipients) -> Result<(), TooManyPanics> {
-        let Self { makers, servers, names } = self;
-        servers.restart_gone(|server| Some(makers.server(server, ProbeSettings::new(config), results)))?;
-        names.restart_gone(|name| Some(makers.name(name, results)))
+    pub fn restart_gone(&mut self) -> Result<(), TooManyPanics> {
+        self.servers.restart_gone(|server| Some(self.makers.server(server)))?;
+        self.names.restart_gone(|name| Some(self.makers.name(name)))
     }
 
     /// Changes how servers are probed.
-    pub fn set_probes(&self, settings: ProbeSettings) {
-        for monitor in self.servers.all() {
-            monitor.do_send(settings);
+    pub fn set_probes(&mut self, settings: ProbeSettings) {
+        if std::mem::replace(&mut self.makers.settings, settings) != settings {
+            self.servers.all().for_each(|monitor| monitor.do_send(settings));
         }
     }
 }

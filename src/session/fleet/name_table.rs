@@ -6,7 +6,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::time::SystemTime;
 
 use super::fleet_status::NameStatus;
-use super::monitors::{MonitorRecipients, Monitors};
+use super::monitors::Monitors;
 use super::name_monitor::LookupResult;
 use crate::session::config::{DnsName, ServerEntry};
 use crate::shared::domain::PublicAddress;
@@ -48,7 +48,7 @@ pub enum LookupTransition {
 
 impl NameTable {
     /// Monitors exactly the names among these entries.
-    pub fn apply(&mut self, entries: &[ServerEntry], monitors: &mut Monitors, results: &MonitorRecipients) {
+    pub fn apply(&mut self, entries: &[ServerEntry], monitors: &mut Monitors) {
         let wanted: BTreeSet<&DnsName> = entries.iter().filter_map(ServerEntry::name).collect();
         self.0.retain(|name, _| {
             let stays = wanted.contains(name);
@@ -59,7 +59,7 @@ impl NameTable {
         });
         for name in wanted {
             self.0.entry(name.clone()).or_insert_with(|| {
-                monitors.look_up(name, results);
+                monitors.look_up(name);
                 MonitoredName { servers: BTreeSet::new(), error: None, since: SystemTime::now() }
             });
         }
@@ -103,7 +103,7 @@ impl NameTable {
     /// What is known of each name.
     pub fn status(&self) -> Vec<NameStatus> {
         let status = |(name, looked): (&DnsName, &MonitoredName)| NameStatus {
-            name: name.clone(),
+            name: name.to_string(),
             servers: looked.servers.len(),
             error: looked.error.clone(),
             since: looked.since,

@@ -4,8 +4,8 @@ use std::net::IpAddr;
 
 use actix::prelude::*;
 
-use crate::shared::domain::PublicAddress;
-use crate::shared::domain::{ProjectUrl, ProjectUrlError};
+use crate::shared::domain::{ProjectUrl, ProjectUrlError, PublicAddress};
+use crate::shared::text::client_text;
 
 /// Requests the least loaded simulation server that accepts this world.
 #[derive(Message, Debug)]
@@ -29,6 +29,13 @@ pub enum PickError {
     /// The URL does not name a world.
     #[error("Error: {0}")]
     InvalidWorld(ProjectUrlError),
+}
+
+impl PickError {
+    /// The message for the client, safe to show.
+    pub fn for_client(&self) -> String {
+        client_text(&self.to_string())
+    }
 }
 
 impl Pick {

@@ -18,10 +18,3 @@ pub enum ProbeError {
     #[error("it can start no simulation: {0}")]
     NotReady(String),
 }
-
-impl ProbeError {
-    /// Whether both are the same variant, whatever their details.
-    pub fn is_same_kind(&self, other: &Self) -> bool {
-        std::mem::discriminant(self) == std::mem::discriminant(other)
-    }
-}

@@ -13,7 +13,7 @@ use hickory_resolver::TokioResolver;
 use tokio::sync::watch;
 
 use super::fleet_status::{FleetStatus, ServerStatus};
-use super::monitors::MonitorRecipients;
+use super::monitors::{MonitorRecipients, Monitors};
 use super::name_monitor::LookupResult;
 use super::name_table::NameChange;
 use super::pick::{Pick, PickError};
@@ -24,12 +24,8 @@ use super::server_record::{ServerRecord, is_refused};
 use super::server_table::{ListChange, ServerTable};
 use super::state_history::StateHistory;
 use crate::session::config::SessionConfig;
-use crate::session::mail::{Mailer, Way};
 use crate::session::placement::LoadBalancer;
-use crate::shared::domain::Load;
-use crate::shared::domain::ProjectUrl;
-use crate::shared::domain::PublicAddress;
-use crate::shared::domain::ServerReport;
+use crate::shared::domain::{Load, ProjectUrl, PublicAddress, ServerReport};
 use crate::shared::http::AddressQuota;
 
 /// Requests the status of the fleet.
@@ -63,22 +59,27 @@ pub struct Registry {
 const TICK: Duration = Duration::from_millis(250);
 
 impl Registry {
-    /// Creates the registry; its monitors start with the actor.
-    pub fn new(
+    /// Starts the registry and its monitors. It publishes in `available` whether a server can take a client.
+    pub fn start(
         config: Arc<SessionConfig>,
-        mailers: Vec<(Way, Addr<Mailer>)>,
         latencies: prometheus::Histogram,
-        (resolver, available): (TokioResolver, watch::Sender<bool>),
-    ) -> Self {
-        Self {
-            fleet: LoadBalancer::new(config.policy()),
-            quota: quota::placements(),
-            config,
-            latencies,
-            servers: ServerTable::new(resolver),
-            available,
-            changes: StateHistory::new(mailers),
-        }
+        resolver: TokioResolver,
+        available: watch::Sender<bool>,
+    ) -> Addr<Self> {
+        Self::create(|ctx| {
+            let registry = ctx.address();
+            let results = MonitorRecipients { probes: registry.clone().recipient(), lookups: registry.recipient() };
+            let monitors = Monitors::new(resolver, ProbeSettings::new(&config), results);
+            Self {
+                fleet: LoadBalancer::new(config.policy()),
+                quota: quota::placements(),
+                changes: StateHistory::new(&config),
+                config,
+                latencies,
+                servers: ServerTable::new(monitors),
+                available,
+            }
+        })
     }
 
     /// Applies a change of the list of servers.
@@ -103,7 +104,7 @@ impl Registry {
     }
 
     fn tick(&mut self, ctx: &mut Context<Self>) {
-        let restarted = self.servers.monitors().restart_gone(&self.config, &results(ctx));
+        let restarted = self.servers.monitors().restart_gone();
         if let Err(too_many) = restarted.and_then(|()| self.changes.restart_gone(&self.config)) {
             // The app stops the server when the registry has stopped.
             log::error!("{too_many}");
@@ -184,18 +185,13 @@ fn ejected(failed: u32) -> String {
     format!("its last {failed} starts failed for a reason of its own; others are preferred for a while")
 }
 
-/// The registry as the recipient of what the monitors find.
-fn results(ctx: &Context<Registry>) -> MonitorRecipients {
-    MonitorRecipients { probes: ctx.address().recipient(), lookups: ctx.address().recipient() }
-}
-
 impl Actor for Registry {
     type Context = Context<Self>;
 
     fn started(&mut self, ctx: &mut Self::Context) {
         // The requests and reports of a whole fleet may arrive at the same moment.
         ctx.set_mailbox_capacity(4096);
-        let change = self.servers.apply(&self.config, &results(ctx));
+        let change = self.servers.apply(&self.config);
         self.follow(change);
         ctx.run_interval(TICK, Self::tick);
     }
@@ -217,7 +213,7 @@ impl Handler<ProbeResult> for Registry {
 impl Handler<LookupResult> for Registry {
     type Result = ();
 
-    fn handle(&mut self, result: LookupResult, ctx: &mut Self::Context) {
+    fn handle(&mut self, result: LookupResult, _: &mut Self::Context) {
         let name = result.name.clone();
         let Some(NameChange { servers, turn }) = self.servers.record_lookup(result) else {
             return;
@@ -226,7 +222,7 @@ impl Handler<LookupResult> for Registry {
             self.changes.add_name(&name, turn);
         }
         if servers {
-            let change = self.servers.follow_names(&self.config, &results(ctx));
+            let change = self.servers.follow_names(&self.config);
             let (added, gone) = (change.added.len(), change.gone.len() + change.turned.len());
             log::info!("{name}: leads to other servers: {added} new, {gone} gone or back");
             self.follow(change);
@@ -269,17 +265,12 @@ impl Handler<GetStatus> for Registry {
 impl Handler<Reconfigure> for Registry {
     type Result = ();
 
-    fn handle(&mut self, Reconfigure(config): Reconfigure, ctx: &mut Self::Context) {
-        let before = ProbeSettings::new(&self.config);
+    fn handle(&mut self, Reconfigure(config): Reconfigure, _: &mut Self::Context) {
         let config = Arc::new(self.config.reload(&config));
         self.fleet.set_policy(config.policy());
         self.config = config;
-        let change = self.servers.apply(&self.config, &results(ctx));
+        let change = self.servers.apply(&self.config);
         self.follow(change);
-        let settings = ProbeSettings::new(&self.config);
-        if settings != before {
-            self.servers.monitors().set_probes(settings);
-        }
         let all = self.servers.in_order().cloned().collect();
         self.reevaluate(all);
         self.publish();

@@ -7,10 +7,7 @@ use super::fleet_status::{ServerState, ServerStatus};
 use super::probe_error::ProbeError;
 use crate::session::mail::NoticeKind;
 use crate::session::placement;
-use crate::shared::domain::Load;
-use crate::shared::domain::ProjectUrl;
-use crate::shared::domain::PublicAddress;
-use crate::shared::domain::ServerReport;
+use crate::shared::domain::{Load, ProjectUrl, PublicAddress, ServerReport};
 
 /// One simulation server.
 #[derive(Debug)]
@@ -37,13 +34,11 @@ pub struct ServerRecord {
     told_full: bool,
 }
 
-/// A server has changed its state, or is down for another reason than before.
+/// A server has changed its state.
 #[derive(Debug, PartialEq)]
 pub struct ServerChange {
     /// Its new state.
     pub state: ServerState,
-    /// Whether it was in that state before, for another reason.
-    pub still: bool,
     /// Time of the change.
     pub at: SystemTime,
     /// The reason, as text.
@@ -82,20 +77,9 @@ impl ServerRecord {
     /// Records that a probe has failed. Returns what has changed.
     pub fn failed(&mut self, error: ProbeError) -> Option<ServerChange> {
         let why = error.to_string();
-        let another = self.error.as_ref().is_some_and(|before| !before.is_same_kind(&error));
         self.error = Some(error.clone());
         self.last_error = Some(error);
-        let change = self.enter(ServerState::Down, || why.clone());
-        // It is still down, but for another reason, which helps to repair it.
-        change.or_else(|| {
-            another.then(|| ServerChange {
-                state: ServerState::Down,
-                still: true,
-                at: SystemTime::now(),
-                why,
-                events: Vec::new(),
-            })
-        })
+        self.enter(ServerState::Down, || why)
     }
 
     /// The last report, unless the server is down.
@@ -128,7 +112,7 @@ impl ServerRecord {
             address: address.clone(),
             state: self.state,
             since: self.since,
-            report: self.report.clone(),
+            report: self.report.clone().filter(|_| self.state != ServerState::Down),
             error: self.error.as_ref().map(ToString::to_string),
             effective_load: None,
             in_flight: 0,
@@ -170,7 +154,7 @@ impl ServerRecord {
             return None;
         }
         self.since = SystemTime::now();
-        Some(ServerChange { state, still: false, at: self.since, why: why(), events: self.events(before) })
+        Some(ServerChange { state, at: self.since, why: why(), events: self.events(before) })
     }
 
     /// The four events of the original. A server that was full, then down, then up is both working again and available
@@ -241,21 +225,6 @@ mod tests {
                 vec![WorkingAgain, AvailableAgain]
             ]
         );
-    }
-
-    #[test]
-    fn another_reason_is_a_change_without_an_event() {
-        let mut record = ServerRecord::new(false);
-        let refused = |why: &str| ProbeError::Connection(why.to_owned());
-        assert!(record.failed(refused("one")).is_some());
-        assert_eq!(record.failed(refused("other words")), None);
-        let slow = ProbeError::Timeout(Duration::from_secs(3));
-        let change = record.failed(slow.clone()).unwrap();
-        assert_eq!(
-            (change.state, change.why, change.events),
-            (ServerState::Down, "no answer within 3 s".to_owned(), vec![])
-        );
-        assert_eq!(record.failed(slow), None);
     }
 
     #[test]

@@ -6,12 +6,11 @@
 
 use std::collections::{BTreeSet, HashMap};
 
-use hickory_resolver::TokioResolver;
-
 use super::fleet_status::NameStatus;
-use super::monitors::{MonitorRecipients, Monitors};
+use super::monitors::Monitors;
 use super::name_monitor::LookupResult;
 use super::name_table::{NameChange, NameTable};
+use super::server_monitor::ProbeSettings;
 use super::server_record::ServerRecord;
 use crate::session::config::SessionConfig;
 use crate::shared::domain::PublicAddress;
@@ -38,27 +37,23 @@ pub struct ListChange {
 
 impl ServerTable {
     /// No servers yet.
-    pub fn new(resolver: TokioResolver) -> Self {
-        Self {
-            monitors: Monitors::new(resolver),
-            names: NameTable::default(),
-            listed: Vec::new(),
-            watched: HashMap::new(),
-        }
+    pub fn new(monitors: Monitors) -> Self {
+        Self { monitors, names: NameTable::default(), listed: Vec::new(), watched: HashMap::new() }
     }
 
     /// Applies a configuration: servers that it no longer lists are removed.
-    pub fn apply(&mut self, config: &SessionConfig, results: &MonitorRecipients) -> ListChange {
-        self.names.apply(&config.simulation_servers, &mut self.monitors, results);
-        self.list(config, results, true)
+    pub fn apply(&mut self, config: &SessionConfig) -> ListChange {
+        self.monitors.set_probes(ProbeSettings::new(config));
+        self.names.apply(&config.simulation_servers, &mut self.monitors);
+        self.list(config, true)
     }
 
     /// Applies changed names: a server that no name resolves to any more is removed if it does not answer.
-    pub fn follow_names(&mut self, config: &SessionConfig, results: &MonitorRecipients) -> ListChange {
-        self.list(config, results, false)
+    pub fn follow_names(&mut self, config: &SessionConfig) -> ListChange {
+        self.list(config, false)
     }
 
-    fn list(&mut self, config: &SessionConfig, results: &MonitorRecipients, at_once: bool) -> ListChange {
+    fn list(&mut self, config: &SessionConfig, at_once: bool) -> ListChange {
         let mut change = ListChange::default();
         self.listed = self.names.servers(&config.simulation_servers);
         let listed: BTreeSet<&PublicAddress> = self.listed.iter().collect();
@@ -79,7 +74,7 @@ impl ServerTable {
             self.forget(server);
         }
         for server in &change.added {
-            self.monitors.watch(server, config, results);
+            self.monitors.watch(server);
             self.watched.insert(server.clone(), ServerRecord::new(config.drained_servers.contains(server)));
         }
         change

@@ -4,32 +4,32 @@
 use std::collections::VecDeque;
 use std::time::SystemTime;
 
-use actix::prelude::*;
-
 use super::fleet_status::{ServerState, StateChange};
 use super::name_table::LookupTransition;
 use super::server_record::{ServerChange, ServerRecord};
 use crate::session::config::{DnsName, SessionConfig};
-use crate::session::mail::{self, Mailer, Notice, NoticeKind, Topic, Way};
+use crate::session::mail::{self, Channel, Mailer, Notice, NoticeKind, Topic};
 use crate::shared::domain::PublicAddress;
 use crate::shared::run::{Supervisor, TooManyPanics};
 
 /// The last changes, and the mailer that notifies the administrator.
 pub struct StateHistory {
     recent: VecDeque<StateChange>,
-    /// One for each way on which notices go.
-    mailers: Supervisor<Way, Mailer>,
+    /// One for each channel of notices.
+    mailers: Supervisor<Channel, Mailer>,
 }
 
 /// How many changes are kept.
 const KEPT: usize = 50;
 
 impl StateHistory {
-    /// No changes yet; notices go to these actors.
-    pub fn new(all: Vec<(Way, Addr<Mailer>)>) -> Self {
+    /// No changes yet. Starts the mailers.
+    pub fn new(config: &SessionConfig) -> Self {
         let mut mailers = Supervisor::new("mailer of notices by");
-        for (way, mailer) in all {
-            mailers.add(way, mailer);
+        for channel in Channel::ALL {
+            if let Some(mailer) = mail::start(config, channel) {
+                mailers.add(channel, mailer);
+            }
         }
         Self { recent: VecDeque::new(), mailers }
     }
@@ -39,7 +39,7 @@ impl StateHistory {
     /// # Errors
     /// When there were too many panics.
     pub fn restart_gone(&mut self, config: &SessionConfig) -> Result<(), TooManyPanics> {
-        self.mailers.restart_gone(|way| mail::start(config, *way))
+        self.mailers.restart_gone(|channel| mail::start(config, *channel))
     }
 
     /// Returns the last changes, the newest first.
@@ -49,9 +49,8 @@ impl StateHistory {
 
     /// Adds a change of a server whose record is now `record`.
     pub fn add(&mut self, server: &PublicAddress, record: &ServerRecord, change: ServerChange) {
-        let ServerChange { state, still, at, why, events } = change;
-        let words = if still { "still " } else { "" };
-        self.list(words, StateChange { at, server: server.to_string(), state, why });
+        let ServerChange { state, at, why, events } = change;
+        self.list(StateChange { at, server: server.to_string(), state, why });
         // The last known values: a server that does not answer reports no load, and one that works again no error.
         let load = record.report.as_ref().map(|report| report.load);
         for event in events {
@@ -72,14 +71,14 @@ impl StateHistory {
                 (ServerState::Up, NoticeKind::LookupWorks, format!("it leads to {servers} simulation servers"), None)
             }
         };
-        self.list("", StateChange { at, server: server.clone(), state, why });
+        self.list(StateChange { at, server: server.clone(), state, why });
         self.notify(&Notice { server, event, load: None, error, at });
     }
 
-    fn list(&mut self, words: &str, change: StateChange) {
+    fn list(&mut self, change: StateChange) {
         let StateChange { server, state, why, .. } = &change;
         let level = if *state == ServerState::Down { log::Level::Warn } else { log::Level::Info };
-        log::log!(level, "{server}: {words}{}: {why}", state.word());
+        log::log!(level, "{server}: {}: {why}", state.word());
         self.recent.truncate(KEPT - 1);
         self.recent.push_front(change);
     }

@@ -1,23 +1,24 @@
-//! Actor: sends notices to the administrator on one way, by mail or by webhook.
+//! Actor: sends notices to the administrator on one channel, by mail or by webhook.
 //!
-//! Created by the app, and again by the registry if it has panicked; only if the configuration is for this way. It accepts
-//! [`Notice`]s. [`Outbox`] decides what is sent, and when. One batch is sent at a time; nothing waits for it.
+//! Created by the app, and again by the registry if it has panicked; only if it is configured. It accepts [`Notice`]s.
+//! [`Outbox`] decides what is sent, and when. One batch is sent at a time; nothing waits for it.
 
 use std::time::{Duration, Instant};
 
 use actix::prelude::*;
 
-use super::email::EmailComposer;
+use super::channel::{Channel, Transport};
+use super::notice_text::Composer;
 use super::outbox::{MailEntry, Notice, Outbox};
-use super::smtp::{MailError, Relay};
-use super::way::{Carrier, Way};
+use super::smtp::{MailError, SmtpRelay};
 use super::webhook::Webhook;
 use crate::session::config::SessionConfig;
 
 /// The actor.
 pub struct Mailer {
-    way: Way,
-    carrier: Carrier,
+    channel: Channel,
+    transport: Transport,
+    composer: Composer,
     outbox: Outbox,
     patience: Duration,
     sending: bool,
@@ -25,10 +26,10 @@ pub struct Mailer {
     timer: SpawnHandle,
 }
 
-/// Starts the mailer of a way; none if the configuration is not for it.
-pub fn start(config: &SessionConfig, way: Way) -> Option<Addr<Mailer>> {
-    let mailer = Mailer::new(config, way).inspect_err(|why| {
-        if way == Way::Mail {
+/// Starts the mailer of a channel; `None` if it is not configured.
+pub fn start(config: &SessionConfig, channel: Channel) -> Option<Addr<Mailer>> {
+    let mailer = Mailer::new(config, channel).inspect_err(|why| {
+        if channel == Channel::Mail {
             log::info!("{why}");
         }
     });
@@ -38,11 +39,11 @@ pub fn start(config: &SessionConfig, way: Way) -> Option<Addr<Mailer>> {
 /// Sends a test e-mail now. Returns what the SMTP server answered.
 ///
 /// # Errors
-/// When the configuration is not for e-mails, or the SMTP server did not take it.
+/// When e-mails are not configured, or the SMTP server did not take it.
 pub async fn test_mail(config: &SessionConfig) -> Result<String, MailError> {
-    let (relay, composer) = (Relay::new(config)?, EmailComposer::new(config)?);
-    let answer = relay.deliver(composer.test()?).await?;
-    Ok(format!("{} ({}) took a mail for {}: {answer}", relay.name(), relay.privacy(), composer.recipient()))
+    let relay = SmtpRelay::new(config)?;
+    let answer = relay.deliver(Composer::new(config).test()?).await?;
+    Ok(format!("{}: {answer}", relay.description()))
 }
 
 /// Posts a test to the webhook now. Returns what was answered.
@@ -51,15 +52,16 @@ pub async fn test_mail(config: &SessionConfig) -> Result<String, MailError> {
 /// When the configuration has no webhook, or it did not take it.
 pub async fn test_webhook(config: &SessionConfig) -> Result<String, MailError> {
     let webhook = Webhook::new(config)?;
-    let answer = webhook.deliver(&[]).await?;
-    Ok(format!("the webhook at {} took a test: {answer}", webhook.name()))
+    let answer = webhook.deliver(&Composer::new(config).test()?.body).await?;
+    Ok(format!("the webhook at {} took a test: {answer}", webhook.server()))
 }
 
 impl Mailer {
-    fn new(config: &SessionConfig, way: Way) -> Result<Self, MailError> {
+    fn new(config: &SessionConfig, channel: Channel) -> Result<Self, MailError> {
         Ok(Self {
-            way,
-            carrier: Carrier::new(config, way)?,
+            channel,
+            transport: Transport::new(config, channel)?,
+            composer: Composer::new(config),
             outbox: Outbox::new(&config.timing),
             patience: config.timing.mail_patience,
             sending: false,
@@ -81,10 +83,10 @@ impl Mailer {
             return self.wait(ctx);
         }
         self.sending = true;
-        let carrier = self.carrier.clone();
-        async move { (carrier.carry(&batch).await, batch) }
+        let (transport, text) = (self.transport.clone(), self.composer.compose(&batch));
+        async move { transport.deliver(text?).await }
             .into_actor(self)
-            .map(|(sent, batch), mailer, ctx| {
+            .map(move |sent, mailer, ctx| {
                 mailer.sending = false;
                 mailer.handle_outcome(batch, sent);
                 mailer.wait(ctx);
@@ -95,23 +97,23 @@ impl Mailer {
     /// Reports the outcome of sending a batch to the outbox and the log.
     fn handle_outcome(&mut self, batch: Vec<MailEntry>, sent: Result<String, MailError>) {
         let (now, subject, count) = (Instant::now(), in_words(&batch), batch.len());
-        let way = self.way;
+        let channel = self.channel;
         let error = match sent {
             Ok(answer) => {
-                log::info!("{way} sent by {} ({subject}): {answer}", self.carrier.name());
+                log::info!("{channel} sent by {} ({subject}): {answer}", self.transport.server());
                 return self.outbox.succeeded(&batch, now);
             }
             Err(error) => error,
         };
         let lost = self.outbox.failed(batch, error.is_permanent(), now);
         if !lost.is_empty() {
-            log::error!("{way} given up after {} s ({}): {error}", self.patience.as_secs_f64(), in_words(&lost));
+            log::error!("{channel} given up after {} s ({}): {error}", self.patience.as_secs_f64(), in_words(&lost));
         }
         if lost.len() < count
             && let Some(next) = self.outbox.due()
         {
             let wait = next.saturating_duration_since(now).as_secs_f64();
-            log::warn!("{way} not sent, next try in {wait:.0} s ({subject}): {error}");
+            log::warn!("{channel} not sent, next try in {wait:.0} s ({subject}): {error}");
         }
     }
 }

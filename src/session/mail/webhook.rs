@@ -1,14 +1,12 @@
 //! Posts notices to a messenger: one JSON object with the field `text`, which Slack, Matrix' hookshot and Mattermost take.
 //!
-//! Who knows the URL can write there, so that it is a secret: it comes into no log and no error.
+//! Anybody who knows the URL can post there, so it is a secret: no log and no error contains it.
 
 use std::time::Duration;
 
 use awc::http::StatusCode;
 use serde_json::json;
 
-use super::email::Composer;
-use super::outbox::MailEntry;
 use super::smtp::MailError;
 use crate::session::config::SessionConfig;
 use crate::shared::config::Secret;
@@ -20,8 +18,7 @@ use crate::shared::text::client_text;
 pub(super) struct Webhook {
     url: Secret,
     /// `HOST:PORT`.
-    name: String,
-    composer: Composer,
+    server: String,
     time_limit: Duration,
 }
 
@@ -34,27 +31,26 @@ impl Webhook {
         let url = config.webhook.clone().ok_or(MailError::Off("webhook"))?;
         let parsed = url::Url::parse(url.reveal()).ok();
         let host = parsed.as_ref().and_then(|url| Some((url.host_str()?, url.port_or_known_default()?)));
-        let name = host.map(|(host, port)| format!("{host}:{port}")).ok_or(MailError::Off("webhook"))?;
-        Ok(Self { url, name, composer: Composer::new(config), time_limit: config.timing.mail_answer })
+        let server = host.map(|(host, port)| format!("{host}:{port}")).ok_or(MailError::Off("webhook"))?;
+        Ok(Self { url, server, time_limit: config.timing.mail_answer })
     }
 
-    pub(super) fn name(&self) -> &str {
-        &self.name
+    pub(super) fn server(&self) -> &str {
+        &self.server
     }
 
-    /// Posts a text about these entries; a test without any.
+    /// Posts a text. Returns the status of the answer.
     ///
     /// # Errors
     /// When it is not taken, or that is not said within `timing.mailAnswer`.
-    pub(super) async fn deliver(&self, entries: &[MailEntry]) -> Result<String, MailError> {
-        let text = if entries.is_empty() { self.composer.test()? } else { self.composer.compose(entries)? }.1;
+    pub(super) async fn deliver(&self, text: &str) -> Result<String, MailError> {
         // Messengers take what is in angle brackets for links and calls.
         let text: Vec<String> = text.lines().map(client_text).collect();
         let mut connector = awc::Connector::new().timeout(self.time_limit);
         if let Some(config) = tls::client_config() {
             connector = connector.rustls_0_23(config);
         }
-        // A redirect would carry the notices to somebody else.
+        // A redirect would send the notices to another server.
         let client = awc::Client::builder().connector(connector).timeout(self.time_limit).disable_redirects().finish();
         let request = client.post(self.url.reveal()).send_json(&json!({ "text": text.join("\n") }));
         match actix_rt::time::timeout(self.time_limit, request).await {
@@ -69,12 +65,12 @@ impl Webhook {
     }
 
     fn failure(&self, problem: &str, permanent: bool) -> MailError {
-        MailError::Delivery { server: self.name.clone(), problem: client_text(problem), permanent }
+        MailError::Delivery { server: self.server.clone(), problem: client_text(problem), permanent }
     }
 }
 
-/// Whether somebody has to change something before another try can succeed.
+/// Whether the configuration or the messenger must change before another try can succeed.
 fn is_permanent(status: StatusCode) -> bool {
-    let for_now = [StatusCode::REQUEST_TIMEOUT, StatusCode::TOO_MANY_REQUESTS];
-    !status.is_server_error() && !for_now.contains(&status)
+    let temporary = [StatusCode::REQUEST_TIMEOUT, StatusCode::TOO_MANY_REQUESTS];
+    !status.is_server_error() && !temporary.contains(&status)
 }

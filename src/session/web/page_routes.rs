@@ -4,10 +4,9 @@ use actix_web::{HttpRequest, HttpResponse, web};
 use askama::Template;
 
 use super::pages::{self, Viewer, WebotsViewer};
-use super::queries::{ask, with_status};
+use super::queries::{status, with_status};
 use crate::asset;
 use crate::session::fleet::FleetStatus;
-use crate::session::fleet::GetStatus;
 use crate::session::state::AppState;
 use crate::shared::http::assets::{self, Asset};
 use crate::shared::http::routing::{GET, READ, path};
@@ -45,7 +44,7 @@ async fn events(request: HttpRequest, server: web::Data<AppState>) -> HttpRespon
     let render = move || {
         let server = shown.clone();
         async move {
-            let status = ask(&server, GetStatus).await?;
+            let status = status(&server).await?;
             let announcement = server.announcements.current();
             let view = pages::view(&status, server.clients(), &server.client_urls, announcement.as_deref());
             view.inspect_err(|error| log::error!("the monitor page can't be rendered: {error}")).ok()

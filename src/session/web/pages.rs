@@ -7,8 +7,7 @@ use askama::Template;
 
 use crate::session::config::{Announcement, Example};
 use crate::session::fleet::{FleetStatus, NameStatus, ServerState, ServerStatus, StateChange};
-use crate::shared::domain::ClientUrls;
-use crate::shared::domain::Instances;
+use crate::shared::domain::{ClientUrls, Instances};
 use crate::shared::http::{PageView, TableRow};
 use crate::shared::run::timestamp;
 use crate::shared::text::one_line;
@@ -155,7 +154,7 @@ impl<'status> Glance<'status> {
     fn new(status: &'status FleetStatus, clients: usize) -> Self {
         let count =
             |wanted: &[ServerState]| status.servers.iter().filter(|server| wanted.contains(&server.state)).count();
-        let instances = || status.servers.iter().filter_map(known_instances);
+        let instances = || status.servers.iter().filter_map(instances);
         // Numbers that another server reports may be arbitrarily large.
         let sum = |part: fn(Instances) -> u32| instances().map(|one| u64::from(part(one))).sum::<u64>();
         Self {
@@ -178,7 +177,7 @@ impl<'status> Glance<'status> {
 
 impl<'server> ServerRow<'server> {
     fn new(server: &'server ServerStatus, urls: &ClientUrls) -> Self {
-        let report = server.report.as_ref().filter(|_| server.state != ServerState::Down);
+        let report = server.report.as_deref();
         let load = report.map(|report| report.load.percent());
         let repositories = report.map(|report| report.allowed_repositories.as_slice()).unwrap_or_default();
         let accepted = match report {
@@ -195,7 +194,7 @@ impl<'server> ServerRow<'server> {
             load_value: sort_value(load),
             effective: server.effective_load,
             effective_value: sort_value(server.effective_load),
-            instances: known_instances(server),
+            instances: instances(server),
             repositories: repositories.iter().map(|prefix| one_line(without_scheme(prefix.as_str()))).collect(),
             accepted,
             version: report.map(|report| report.version.as_str()).unwrap_or_default(),
@@ -212,8 +211,8 @@ impl Changes<'_> {
     }
 }
 
-fn known_instances(server: &ServerStatus) -> Option<Instances> {
-    server.report.as_ref().filter(|_| server.state != ServerState::Down)?.instances
+fn instances(server: &ServerStatus) -> Option<Instances> {
+    server.report.as_ref()?.instances
 }
 
 /// Sort rank of a state: states that need attention come first.

@@ -8,17 +8,15 @@ use actix_web::{HttpRequest, HttpResponse, web};
 use percent_encoding::percent_decode_str;
 
 use super::actions;
+use super::metrics;
 use super::page_routes;
-use super::queries::{ask, with_status};
-use super::status::{self, StatusResponse};
+use super::queries::{status, with_status};
+use super::status::StatusResponse;
 use super::web_client::WebClient;
-use crate::session::fleet::GetStatus;
-use crate::session::fleet::displayed_mean_load;
 use crate::session::fleet::{Pick, PickError};
 use crate::session::state::AppState;
 use crate::shared::http::routing::{self, GET, READ, path, retry_after};
-use crate::shared::http::websocket;
-use crate::shared::http::{CONTENT_TYPE, ConnectionKind};
+use crate::shared::http::{CONTENT_TYPE, ConnectionKind, websocket};
 
 /// Adds all routes to an app.
 pub fn configure(app: &mut web::ServiceConfig) {
@@ -32,7 +30,7 @@ fn add(app: &mut web::ServiceConfig) {
         .service(path("/load", READ, load))
         .configure(page_routes::configure)
         .service(path("/status", READ, status_json))
-        .service(path("/metrics", READ, metrics))
+        .service(path("/metrics", READ, metrics_text))
         .service(path("/health", READ, health))
         .configure(actions::configure);
 }
@@ -52,20 +50,20 @@ async fn session(request: HttpRequest, stream: web::Payload, server: web::Data<A
     }
     let from = server.trusted_proxies.peer(&request).rate_limit_key();
     let world = wanted_world(request.query_string());
-    let answer = server.pick(Pick::parse(world.as_deref(), from)).await;
-    let status = match answer.refusal {
-        None => StatusCode::OK,
+    let picked = server.pick(Pick::parse(world.as_deref(), from)).await;
+    let status = match &picked {
+        Ok(_) => StatusCode::OK,
         // As the Python server answers: clients such as PHP's `file_get_contents` read no body with another status.
-        Some(_) if world.is_none() => StatusCode::OK,
-        Some(PickError::Unavailable) => StatusCode::SERVICE_UNAVAILABLE,
-        Some(PickError::NotAccepted(_)) => StatusCode::FORBIDDEN,
-        Some(PickError::InvalidWorld(_)) => StatusCode::BAD_REQUEST,
+        Err(_) if world.is_none() => StatusCode::OK,
+        Err(PickError::Unavailable) => StatusCode::SERVICE_UNAVAILABLE,
+        Err(PickError::NotAccepted(_)) => StatusCode::FORBIDDEN,
+        Err(PickError::InvalidWorld(_)) => StatusCode::BAD_REQUEST,
     };
     let mut response = HttpResponse::build(status);
     if status == StatusCode::SERVICE_UNAVAILABLE {
         response.insert_header(retry_after());
     }
-    response.content_type("text/plain; charset=utf-8").body(answer.text)
+    response.content_type("text/plain; charset=utf-8").body(picked.unwrap_or_else(|error| error.for_client()))
 }
 
 /// The world of a query. `webots.js` does not percent-encode it, so everything after `url=` is the world: a plus sign
@@ -98,16 +96,16 @@ async fn availability(server: web::Data<AppState>) -> HttpResponse {
 }
 
 async fn load(server: web::Data<AppState>) -> HttpResponse {
-    let mean = ask(&server, GetStatus).await.and_then(|status| status.mean_load);
-    HttpResponse::Ok().content_type("text/plain").body(displayed_mean_load(mean).to_string())
+    let load = status(&server).await.map_or(-1.0, |status| status.displayed_mean_load());
+    HttpResponse::Ok().content_type("text/plain").body(load.to_string())
 }
 
 async fn status_json(server: web::Data<AppState>) -> HttpResponse {
     with_status(&server, |status| HttpResponse::Ok().json(StatusResponse::new(&server, status))).await
 }
 
-async fn metrics(server: web::Data<AppState>) -> HttpResponse {
-    with_status(&server, |status| match server.metrics.render(&status::gauges(server.clients(), status)) {
+async fn metrics_text(server: web::Data<AppState>) -> HttpResponse {
+    with_status(&server, |status| match server.metrics.render(&metrics::gauges(server.clients(), status)) {
         Ok(text) => HttpResponse::Ok().content_type(CONTENT_TYPE).body(text),
         Err(error) => HttpResponse::InternalServerError().body(format!("Error: {error}.")),
     })

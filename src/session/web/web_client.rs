@@ -15,10 +15,9 @@ use tokio::sync::watch;
 use crate::session::config::Announcement;
 use crate::session::fleet::Pick;
 use crate::session::state::AppState;
-use crate::shared::http::ConnectionPermit;
-use crate::shared::http::Peer;
 use crate::shared::http::liveness::{self, Liveness};
 use crate::shared::http::websocket::{ClientMessage, MessageReader};
+use crate::shared::http::{ConnectionPermit, Peer};
 use crate::shared::run::{Phase, closing};
 use crate::shared::text::client_text;
 
@@ -57,7 +56,10 @@ impl WebClient {
         let (wanted, from) = (wanted_world(text), self.peer.rate_limit_key());
         let picked = async move { server.pick(Pick::parse(wanted.as_deref(), from)).await };
         // The actor handles nothing else until then, so that answers keep the order of the texts and precede a close.
-        picked.into_actor(self).map(|answer, _, ctx| ctx.text(answer.text)).wait(ctx);
+        picked
+            .into_actor(self)
+            .map(|picked, _, ctx| ctx.text(picked.unwrap_or_else(|error| error.for_client())))
+            .wait(ctx);
     }
 }
 

@@ -37,6 +37,14 @@ pub struct InvalidValueError {
     pub problem: String,
 }
 
+/// Checks a rule for the value of a key; `problem` says what was found, and what is expected.
+///
+/// # Errors
+/// When the rule does not hold.
+pub fn require(holds: bool, key: &'static str, problem: impl FnOnce() -> String) -> Result<(), InvalidValueError> {
+    if holds { Ok(()) } else { Err(InvalidValueError { key, problem: problem() }) }
+}
+
 /// A configuration that was read from a file.
 #[derive(Debug)]
 pub struct LoadedConfig<C> {

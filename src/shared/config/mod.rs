@@ -6,9 +6,9 @@ mod secret;
 mod value;
 
 pub use error::ConfigError;
-pub use loading::{Configuration, InvalidValueError, LoadedConfig, changed_keys, load};
+pub use loading::{Configuration, InvalidValueError, LoadedConfig, changed_keys, load, require};
 pub use secret::Secret;
 pub use value::{
-    ExpandedPath, expanded, folder, local_address, minutes_or_zero, object, one_or_many, optional_expanded,
-    optional_object, optional_whole, percent, seconds, seconds_or_zero, threshold, whole,
+    ExpandedPath, expanded, folder, is_web_url, local_address, minutes_or_zero, object, one_or_many, optional_expanded,
+    optional_object, optional_whole, percent, seconds, seconds_or_zero, whole,
 };

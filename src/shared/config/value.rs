@@ -16,13 +16,6 @@ use serde::{Deserialize, Deserializer, Serialize, Serializer};
 #[serde(try_from = "String")]
 pub struct ExpandedPath(pub PathBuf);
 
-impl ExpandedPath {
-    /// Creates a path without expanding it.
-    pub fn plain(path: impl Into<PathBuf>) -> Self {
-        Self(path.into())
-    }
-}
-
 impl TryFrom<String> for ExpandedPath {
     type Error = String;
 
@@ -83,6 +76,11 @@ where
     text.map(|Text(text)| T::try_from(text).map_err(D::Error::custom)).transpose()
 }
 
+/// Whether a text is the URL of a web server.
+pub fn is_web_url(text: &str) -> bool {
+    url::Url::parse(text).is_ok_and(|url| url.has_host() && matches!(url.scheme(), "http" | "https"))
+}
+
 /// Reads a whole number from `MIN` to `MAX`.
 ///
 /// # Errors
@@ -127,20 +125,12 @@ where
     Ok(Option::<Number<MIN, MAX, T>>::deserialize(deserializer)?.map(|number| number.0))
 }
 
-/// Reads a percentage from 0 to 100.
+/// Reads a percentage from 0 to `MAX`.
 ///
 /// # Errors
 /// When the value is something else.
-pub fn percent<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f64, D::Error> {
-    deserializer.deserialize_any(Between { least: 0.0, most: 100.0, what: "a number of percent" })
-}
-
-/// Reads a percentage from 0 to 1000. No measured load exceeds 100.
-///
-/// # Errors
-/// When the value is something else.
-pub fn threshold<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f64, D::Error> {
-    deserializer.deserialize_any(Between { least: 0.0, most: 1000.0, what: "a number of percent" })
+pub fn percent<'de, const MAX: u16, D: Deserializer<'de>>(deserializer: D) -> Result<f64, D::Error> {
+    deserializer.deserialize_any(Between { least: 0.0, most: MAX.into(), what: "a number of percent" })
 }
 
 /// A duration, written as a number of seconds.

@@ -18,4 +18,4 @@ pub use open_files::raise_open_files;
 pub use rotated_file::RotatedFile;
 pub use signals::{Phase, ServerCommand, Signals, closing};
 pub use supervisor::{Supervisor, TooManyPanics};
-pub use timestamp::{read_timestamp, seconds_since_1970, timestamp, timestamp_in_milliseconds};
+pub use timestamp::{read_timestamp, seconds_since_1970, serialize_timestamp, timestamp, timestamp_in_milliseconds};

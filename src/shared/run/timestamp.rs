@@ -17,6 +17,14 @@ pub fn timestamp_in_milliseconds(time: SystemTime) -> String {
     text(time, format_rfc3339_millis)
 }
 
+/// Serializes a time as RFC 3339 in UTC, to the second.
+///
+/// # Errors
+/// When the output fails.
+pub fn serialize_timestamp<S: serde::Serializer>(time: &SystemTime, serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.serialize_str(&timestamp(*time))
+}
+
 /// Reads a time as RFC 3339 in UTC: `2026-12-31T12:00:00Z`.
 pub fn read_timestamp(text: &str) -> Option<SystemTime> {
     humantime::parse_rfc3339(text).ok()

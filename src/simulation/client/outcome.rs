@@ -36,7 +36,6 @@ const ALL: [Outcome; 7] = [
 
 impl Outcome {
     /// The end of a simulation whose start has this outcome.
-    #[must_use]
     pub fn end(self) -> EndReason {
         match self {
             Self::NoCheckout => EndReason::NoCheckout,
@@ -77,13 +76,11 @@ pub struct Pending(Option<IntCounterVec>);
 
 impl Pending {
     /// A start that was just requested.
-    #[must_use]
     pub fn new(counter: &IntCounterVec) -> Self {
         Self(Some(counter.clone()))
     }
 
     /// Whether the outcome is not known yet.
-    #[must_use]
     pub fn is_open(&self) -> bool {
         self.0.is_some()
     }

@@ -11,7 +11,6 @@ const PER_MINUTE: NonZeroU32 = NonZeroU32::MIN.saturating_add(59);
 
 /// The quota of requested simulations on a server with this many slots: a class that takes all of them, and then
 /// reloads its pages, stays within it.
-#[must_use]
 pub fn starts(places: u16) -> AddressQuota {
     AddressQuota::new(NonZeroU32::new(2 * u32::from(places)).map_or(BURST, |twice| BURST.max(twice)), PER_MINUTE)
 }

@@ -16,13 +16,13 @@ impl Session {
         let Some(resumption) = self.resumption.as_mut().filter(|resumption| resumption.is_ready()) else {
             return ctx.stop();
         };
-        if resumption.deadline().is_some() {
+        if resumption.deadline.is_some() {
             return;
         }
         if resumption.away(absence) {
             log::info!("{name}: away; it may come back within {} s", absence.as_secs());
         }
-        *resumption.deadline() = Some(ctx.run_later(absence, move |this, ctx| {
+        resumption.deadline = Some(ctx.run_later(absence, move |this, ctx| {
             log::info!("{}: has not come back within {} s", this.name(), absence.as_secs());
             ctx.stop();
         }));
@@ -40,7 +40,7 @@ impl Session {
         let (timeout, absence) = (self.server.config.timeout, self.server.config.timing.absence);
         let mut texts = Vec::new();
         if let Some(resumption) = &mut self.resumption {
-            if let Some(deadline) = resumption.deadline().take() {
+            if let Some(deadline) = resumption.deadline.take() {
                 ctx.cancel_future(deadline);
             }
             texts = resumption.back(timeout, absence);

@@ -19,26 +19,26 @@ pub struct Resumption {
     token: Option<Token>,
     simulation: SimulationId,
     slots: Addr<SlotPool>,
-    launched: Instant,
+    /// When Webots was started: the time limit starts then.
+    pub(super) launched: Instant,
     /// The texts that its project requests.
-    texts: Vec<String>,
+    pub(super) texts: Vec<String>,
     url: String,
-    /// When the simulation ends because it is paused.
-    idle_end: Option<Instant>,
-    deadline: Option<SpawnHandle>,
+    /// When the simulation ends because it is paused, if it does.
+    pub(super) idle_end: Option<Instant>,
+    /// The timer that ends the wait for the client, if there is one.
+    pub(super) deadline: Option<SpawnHandle>,
     /// Why the simulation has ended, if it has.
     ended: Option<String>,
 }
 
 /// How many seconds are left until then, rounded up.
-#[must_use]
 pub fn seconds_until(then: Instant) -> u64 {
     (then.saturating_duration_since(Instant::now()) + Duration::from_millis(999)).as_secs()
 }
 
 impl Resumption {
     /// Creates it for a registered session with this lease.
-    #[must_use]
     pub fn new(registration: Registration, lease: &SlotLease, slots: Addr<SlotPool>) -> Self {
         Self {
             registration,
@@ -54,21 +54,6 @@ impl Resumption {
         }
     }
 
-    /// Records that Webots was started: the time limit starts.
-    pub fn launched(&mut self) {
-        self.launched = Instant::now();
-    }
-
-    /// Keeps a text for a client that returns.
-    pub fn keep(&mut self, text: String) {
-        self.texts.push(text);
-    }
-
-    /// When the simulation ends because it is paused, if it does.
-    pub fn idle_end(&mut self, end: Option<Instant>) {
-        self.idle_end = end;
-    }
-
     /// Webots is ready at this URL: from now on the client may come back. Returns what it hears of that.
     pub fn ready(&mut self, url: String, absence: Duration) -> [String; 2] {
         self.url = url;
@@ -81,13 +66,11 @@ impl Resumption {
     }
 
     /// Whether the client may return.
-    #[must_use]
     pub fn is_ready(&self) -> bool {
         self.token.is_some()
     }
 
     /// Why a client with this token may not return, as text for it; `None` if it may.
-    #[must_use]
     pub fn refusal(&self, token: &Token) -> Option<String> {
         if self.token.as_ref() != Some(token) {
             return Some(protocol::taken_over());
@@ -132,11 +115,6 @@ impl Resumption {
         texts.extend(self.offer(absence));
         texts.extend(self.idle_end.map(|end| protocol::idle(Some(seconds_until(end)))));
         texts
-    }
-
-    /// The timer that ends the wait, if there is one.
-    pub fn deadline(&mut self) -> &mut Option<SpawnHandle> {
-        &mut self.deadline
     }
 
     fn show(&self, until: Option<u64>) {

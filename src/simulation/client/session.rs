@@ -5,7 +5,7 @@
 //! client that may return.
 
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use actix::prelude::*;
 use actix_web_actors::ws::CloseCode;
@@ -51,7 +51,6 @@ const SIGN_OF_LIFE: Duration = Duration::from_secs(4);
 
 impl Session {
     /// Opens the session of a client that requests the world at this URL.
-    #[must_use]
     pub fn open(
         server: Arc<AppState>,
         (peer, who): (Peer, Who),
@@ -263,13 +262,13 @@ impl Handler<WebotsEvent> for Session {
             WebotsEvent::Text(text) => {
                 let text = protocol::of_project(&text);
                 if let Some(resumption) = &mut self.resumption {
-                    resumption.keep(text.clone());
+                    resumption.texts.push(text.clone());
                 }
                 self.text(text);
             }
             WebotsEvent::Started => {
                 if let Some(resumption) = &mut self.resumption {
-                    resumption.launched();
+                    resumption.launched = Instant::now();
                 }
                 self.text(protocol::shutdown_timeout(self.server.config.timeout));
             }
@@ -292,7 +291,7 @@ impl Handler<WebotsEvent> for Session {
             WebotsEvent::Hanging(seconds) => self.hint(protocol::hanging(seconds)),
             WebotsEvent::IdleEnd(end) => {
                 if let Some(resumption) = &mut self.resumption {
-                    resumption.idle_end(end);
+                    resumption.idle_end = end;
                 }
                 self.text(protocol::idle(end.map(seconds_until)));
             }

@@ -10,10 +10,9 @@ use actix::prelude::*;
 use actix_web_actors::ws::{CloseCode, CloseReason, Message, ProtocolError, WebsocketContext};
 
 use super::session::Session;
-use crate::shared::http::ConnectionPermit;
-use crate::shared::http::Peer;
 use crate::shared::http::liveness::{self, Liveness};
 use crate::shared::http::websocket::{ClientMessage, MessageReader};
+use crate::shared::http::{ConnectionPermit, Peer};
 use crate::shared::run::closing;
 use crate::simulation::protocol::{self, ClientRequest};
 use crate::simulation::sessions::{Attachment, Resume, Said, ToClient, Token};
@@ -51,7 +50,6 @@ type Context = WebsocketContext<WebClient>;
 
 impl WebClient {
     /// A client that has just connected; `permit` counts it, `reader` reads its messages.
-    #[must_use]
     pub fn new(
         server: Arc<AppState>,
         (peer, user): (Peer, Option<String>),

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::shared::config::{ExpandedPath, InvalidValueError, one_or_many, whole};
+use crate::shared::config::{ExpandedPath, InvalidValueError, one_or_many, require, whole};
 
 /// How simulations run in containers.
 #[derive(Debug, Clone, Serialize, Deserialize)]
@@ -75,14 +75,13 @@ pub const EDITOR_PORT: u16 = 500;
 /// When there are too many slots for that.
 pub fn check_ports(in_containers: bool, port: u16, places: u16) -> Result<(), InvalidValueError> {
     let last = u32::from(port) + u32::from(places) + u32::from(EDITOR_PORT);
-    if !in_containers || (places <= EDITOR_PORT && u16::try_from(last).is_ok()) {
-        return Ok(());
-    }
-    let problem = format!(
-        "{places} places above port {port} don't go together with containers, whose editors have the port of their Webots \
-         + {EDITOR_PORT}; allowed are up to {EDITOR_PORT} places, and editors up to port 65535"
-    );
-    Err(InvalidValueError { key: "maxConnections", problem })
+    let fits = !in_containers || (places <= EDITOR_PORT && u16::try_from(last).is_ok());
+    require(fits, "maxConnections", || {
+        format!(
+            "{places} places above port {port} don't go together with containers, whose editors have the port of their \
+             Webots + {EDITOR_PORT}; allowed are up to {EDITOR_PORT} places, and editors up to port 65535"
+        )
+    })
 }
 
 impl Default for ContainerSettings {
@@ -108,7 +107,6 @@ impl Default for ContainerSettings {
 
 impl ContainerNetwork {
     /// The name of the Docker network, and of its interface, which the packet filter matches.
-    #[must_use]
     pub fn name(self) -> &'static str {
         match self {
             Self::Internet => "webots-fleet",

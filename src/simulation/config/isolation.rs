@@ -72,7 +72,6 @@ pub enum SandboxNetwork {
 
 impl SandboxNetwork {
     /// Whether the administrator relies on it.
-    #[must_use]
     pub fn is_demanded(self) -> bool {
         matches!(self, Self::Own | Self::Closed)
     }
@@ -137,7 +136,6 @@ pub struct VariableName(String);
 
 impl VariableName {
     /// Whether this is the name of a variable, or a prefix of it.
-    #[must_use]
     pub fn covers(&self, variable: &str) -> bool {
         match self.0.strip_suffix('*') {
             Some(beginning) => variable.starts_with(beginning),

@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use super::{IsolationSetting, SimulationConfig};
-use crate::shared::config::{InvalidValueError, Secret};
+use crate::shared::config::{InvalidValueError, Secret, require};
 
 impl SimulationConfig {
     /// Returns the files that may contain secrets: the configuration file, and those that it names.
@@ -18,11 +18,9 @@ impl SimulationConfig {
     /// When it would break the sandbox.
     pub(super) fn check_sandbox(&self) -> Result<Vec<String>, InvalidValueError> {
         if !matches!(self.isolation, IsolationSetting::Auto | IsolationSetting::Sandbox) {
-            if self.sandbox.network.is_demanded() {
-                let problem =
-                    "networks of simulations' own are for sandboxes, and isolation is neither \"sandbox\" nor \"auto\"";
-                return Err(InvalidValueError { key: "sandbox.network", problem: problem.to_owned() });
-            }
+            let problem =
+                "networks of simulations' own are for sandboxes, and isolation is neither \"sandbox\" nor \"auto\"";
+            require(!self.sandbox.network.is_demanded(), "sandbox.network", || problem.to_owned())?;
             return Ok(Vec::new());
         }
         let own = [self.log_dir.0.as_path(), &self.cache_dir.0].into_iter().chain(self.secret_files());

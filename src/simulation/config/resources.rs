@@ -1,8 +1,8 @@
 //! The key `limits`: the resource limits of one simulation.
 
-use serde::{Deserialize, Deserializer, Serialize};
+use serde::{Deserialize, Serialize};
 
-use crate::shared::config::whole;
+use crate::shared::config::{optional_whole, whole};
 
 /// The resource limits of one simulation.
 #[derive(Debug, Clone, Serialize, Deserialize)]
@@ -23,10 +23,10 @@ pub struct ResourceLimits {
     #[serde(deserialize_with = "whole::<64, 1_000_000, _, _>")]
     pub open_files: u64,
     /// Memory limit in MiB, if control groups are available. Default: none.
-    #[serde(deserialize_with = "optional")]
+    #[serde(deserialize_with = "optional_whole::<1, 100_000_000, _, _>")]
     pub memory: Option<u64>,
     /// Limit of busy cores, if control groups are available. Default: none.
-    #[serde(deserialize_with = "optional")]
+    #[serde(deserialize_with = "optional_whole::<1, 100_000_000, _, _>")]
     pub cores: Option<u64>,
 }
 
@@ -34,12 +34,4 @@ impl Default for ResourceLimits {
     fn default() -> Self {
         Self { output: 512, disk: 1024, processes: 4096, open_files: 4096, memory: None, cores: None }
     }
-}
-
-/// Reads a whole number from 1 to 100 million, or `null`.
-fn optional<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Option<u64>, D::Error> {
-    /// A number in its range.
-    #[derive(Deserialize)]
-    struct Number(#[serde(deserialize_with = "whole::<1, 100_000_000, _, _>")] u64);
-    Ok(Option::<Number>::deserialize(deserializer)?.map(|number| number.0))
 }

@@ -13,8 +13,8 @@ use super::resources::ResourceLimits;
 use super::streaming::{Streaming, streaming};
 use super::timing::Timing;
 use crate::shared::config::{
-    Configuration, ExpandedPath, InvalidValueError, Secret, expanded, folder, local_address, minutes_or_zero, object,
-    one_or_many, optional_expanded, optional_whole, percent, seconds, whole,
+    Configuration, ExpandedPath, InvalidValueError, Secret, expanded, folder, is_web_url, local_address,
+    minutes_or_zero, object, one_or_many, optional_expanded, optional_whole, percent, require, seconds, whole,
 };
 use crate::shared::domain::{PublicUrl, UrlPrefix, check_host};
 use crate::shared::http::{Origin, TrustedProxies, UserHeader};
@@ -23,181 +23,220 @@ use crate::simulation::machine::display::{self, DisplayName};
 
 /// Every key of the simulation server. The original's keys keep their meaning.
 #[derive(Debug, Clone, Serialize, Deserialize)]
-#[serde(rename_all = "camelCase")]
+#[serde(rename_all = "camelCase", default)]
 #[expect(clippy::struct_excessive_bools, reason = "they are keys of a file that exists")]
 pub struct SimulationConfig {
     /// Fully qualified domain name of the simulation server. Default: `localhost`, with a warning.
-    #[serde(default, alias = "fullyQualifiedDomainName", deserialize_with = "expanded")]
+    #[serde(alias = "fullyQualifiedDomainName", deserialize_with = "expanded")]
     pub server: String,
     /// Whether URLs begin with `https` and `wss`. Default: true.
-    #[serde(default = "default_true")]
     pub ssl: bool,
     /// Local port. Webots uses the ports that follow it. Default: 2000.
-    #[serde(default = "default_port", deserialize_with = "whole::<1, 65000, _, _>")]
+    #[serde(deserialize_with = "whole::<1, 65000, _, _>")]
     pub port: u16,
     /// Local address to listen on. Default: `::`, all addresses of IPv4 and IPv6.
-    #[serde(default = "default_bind", deserialize_with = "local_address")]
+    #[serde(deserialize_with = "local_address")]
     pub bind: IpAddr,
     /// Whether a reverse proxy rewrites ports in URLs: HOST/PORT, not HOST:PORT. Default: true.
-    #[serde(default = "default_true")]
     pub port_rewrite: bool,
     /// How clients reach this server and its simulations through one reverse proxy: a URL with the placeholders
     /// `{host}` (that is `server`) and `{port}`. Default: none, and they are reached under their own addresses.
-    #[serde(default, deserialize_with = "optional_expanded")]
+    #[serde(deserialize_with = "optional_expanded")]
     pub public_url: Option<PublicUrl>,
     /// How clients reach the streams of simulations: at the ports of their Webots, or through this server. Default: `direct`.
-    #[serde(default, deserialize_with = "streaming")]
+    #[serde(deserialize_with = "streaming")]
     pub streaming: Streaming,
     /// Folder of `simulation/output.log`, `simulation/monitor.csv` and the instances' output. Default: `log`.
-    #[serde(default = "default_log_dir", deserialize_with = "folder")]
+    #[serde(deserialize_with = "folder")]
     pub log_dir: ExpandedPath,
     /// Log to standard output. Default: false.
-    #[serde(default)]
     pub debug: bool,
     /// Headline of the monitor page.
-    #[serde(default)]
     pub title: Option<String>,
     /// Text below the headline.
-    #[serde(default)]
     pub description: Option<String>,
     /// Installation directory of Webots. Default: the environment variable `WEBOTS_HOME`.
-    #[serde(default)]
     pub webots_home: Option<ExpandedPath>,
     /// The program to start instead of the one in `webotsHome`.
-    #[serde(default)]
     pub webots: Option<ExpandedPath>,
     /// Directory of local projects. Accepted for existing files; not used.
-    #[serde(default)]
     pub projects_dir: Option<ExpandedPath>,
     /// The isolation level of simulations. Default: `auto`.
-    #[serde(default, deserialize_with = "level")]
+    #[serde(deserialize_with = "level")]
     pub isolation: IsolationSetting,
     /// What a sandbox mounts besides the system and Webots.
-    #[serde(default, deserialize_with = "object")]
+    #[serde(deserialize_with = "object")]
     pub sandbox: SandboxFolders,
     /// How simulations run in containers.
-    #[serde(default, deserialize_with = "object")]
+    #[serde(deserialize_with = "object")]
     pub container: ContainerSettings,
     /// Environment variables that simulations get besides those that Webots needs. Default: none.
-    #[serde(default, deserialize_with = "one_or_many")]
+    #[serde(deserialize_with = "one_or_many")]
     pub environment: Vec<VariableName>,
     /// The resource limits of one simulation.
-    #[serde(default, deserialize_with = "object")]
+    #[serde(deserialize_with = "object")]
     pub limits: ResourceLimits,
     /// Run Webots in containers: the original's key for `isolation: "container"`. Default: false.
-    #[serde(default)]
     pub docker: bool,
     /// A key of the original, without effect: only images that this server has built are ever removed.
-    #[serde(default, alias = "persistentDockerImages", deserialize_with = "one_or_many")]
+    #[serde(alias = "persistentDockerImages", deserialize_with = "one_or_many")]
     pub persistant_docker_images: Vec<String>,
     /// Repositories whose worlds may run, as URL prefixes of whole path segments. Default: none.
-    #[serde(default, deserialize_with = "one_or_many")]
+    #[serde(deserialize_with = "one_or_many")]
     pub allowed_repositories: Vec<UrlPrefix>,
     /// Repositories whose worlds never run, as URL prefixes. Default: none.
-    #[serde(default, deserialize_with = "one_or_many")]
+    #[serde(deserialize_with = "one_or_many")]
     pub blocked_repositories: Vec<UrlPrefix>,
     /// With docker, worlds of other repositories run while the load (percent) is at most this; 0: never. Default: 50.
-    #[serde(default = "default_share_idle_time", deserialize_with = "percent")]
+    #[serde(deserialize_with = "percent::<100, _>")]
     pub share_idle_time: f64,
     /// URLs to which the server announces itself when it starts. Default: none.
-    #[serde(default, deserialize_with = "one_or_many")]
+    #[serde(deserialize_with = "one_or_many")]
     pub notify: Vec<String>,
     /// Number of slots: simulations that may run at a time. Webots uses port+1 .. port+maxConnections. Default: 100.
-    #[serde(default = "default_max_connections", deserialize_with = "whole::<1, 10_000, _, _>")]
+    #[serde(deserialize_with = "whole::<1, 10_000, _, _>")]
     pub max_connections: u16,
     /// Limit of clients that wait for a slot. Default: 100.
-    #[serde(default = "default_waiting_line", deserialize_with = "whole::<0, 100_000, _, _>")]
+    #[serde(deserialize_with = "whole::<0, 100_000, _, _>")]
     pub waiting_line: usize,
     /// Limit of open client `WebSockets` in all, with or without a simulation. Default: 1000.
-    #[serde(default = "default_max_clients", deserialize_with = "whole::<1, 1_000_000, _, _>")]
+    #[serde(deserialize_with = "whole::<1, 1_000_000, _, _>")]
     pub max_clients: usize,
     /// Limit of open client `WebSockets` per client address. Default: three quarters of `maxClients`, but at most 1000,
     /// because a class sits behind one address.
-    #[serde(default, deserialize_with = "optional_whole::<1, 1_000_000, _, _>")]
+    #[serde(deserialize_with = "optional_whole::<1, 1_000_000, _, _>")]
     pub max_clients_per_address: Option<usize>,
     /// Limit of slots per client address; the same share of the queue applies. Default: all, because a class sits
     /// behind one address.
-    #[serde(default, deserialize_with = "optional_whole::<1, 10_000, _, _>")]
+    #[serde(deserialize_with = "optional_whole::<1, 10_000, _, _>")]
     pub max_places_per_address: Option<usize>,
     /// How many of the places one user may have (`userHeader`), and the same share of the waiting line. Default: all.
-    #[serde(default, deserialize_with = "optional_whole::<1, 10_000, _, _>")]
+    #[serde(deserialize_with = "optional_whole::<1, 10_000, _, _>")]
     pub max_places_per_user: Option<usize>,
     /// The header in which a web server of `trustedProxies` tells the name of the user, such as `X-Forwarded-User`.
     /// Default: none.
-    #[serde(default)]
     pub user_header: Option<UserHeader>,
     /// Web servers, as addresses or networks, whose header `X-Forwarded-For` is believed.
     /// Default: `["127.0.0.0/8", "::1/128"]`.
-    #[serde(default)]
     pub trusted_proxies: TrustedProxies,
     /// Seconds after which a simulation is closed, at least 360. Default: 7200.
-    #[serde(default = "default_timeout", deserialize_with = "whole::<360, 31_536_000, _, _>")]
+    #[serde(deserialize_with = "whole::<360, 31_536_000, _, _>")]
     pub timeout: u64,
     /// Minutes after which a simulation that is paused is closed; 0: never. Default: 0.
-    #[serde(default, with = "minutes_or_zero")]
+    #[serde(with = "minutes_or_zero")]
     pub idle_timeout: Duration,
     /// Write `simulation/monitor.csv`. Default: true.
-    #[serde(default = "default_true")]
     pub monitor_log_enabled: bool,
     /// Whether a world's URL may name any commit by its hash, not only one that is in a branch or tag. Git hosts also
     /// serve commits of forks and pull requests, which the repository's owner never accepted. Default: false.
-    #[serde(default)]
     pub any_commit: bool,
     /// Where repositories are fetched from instead of their URL: {URL prefix: replacement}. Default: none.
-    #[serde(default)]
     pub git_mirrors: Mirrors,
     /// File of settings for git, in git's own format: a proxy, certificates, credentials. They add to those of the
     /// machine.
     /// Default: none.
-    #[serde(default)]
     pub git_config: Option<ExpandedPath>,
     /// Directory of cached repositories and of the projects of running simulations. Default: `cache`.
-    #[serde(default = "default_cache_dir", deserialize_with = "folder")]
+    #[serde(deserialize_with = "folder")]
     pub cache_dir: ExpandedPath,
     /// Size limit of all cached repositories, in MiB. Default: 10240.
-    #[serde(default = "default_cache_size", deserialize_with = "whole::<1, 100_000_000, _, _>")]
+    #[serde(deserialize_with = "whole::<1, 100_000_000, _, _>")]
     pub cache_size: u64,
     /// Size limit of a project, in MiB, for the fetch and for the checkout. Default: 1024.
-    #[serde(default = "default_project_size", deserialize_with = "whole::<1, 100_000_000, _, _>")]
+    #[serde(deserialize_with = "whole::<1, 100_000_000, _, _>")]
     pub project_size: u64,
     /// Free space that the disk of `cacheDir` must have for new simulations, in MiB; 0: any. Default: 512.
-    #[serde(default = "default_disk_reserve", deserialize_with = "whole::<0, 100_000_000, _, _>")]
+    #[serde(deserialize_with = "whole::<0, 100_000_000, _, _>")]
     pub disk_reserve: u64,
     /// Whether the server is ready only while it sees GPUs and none is lost. Default: false.
-    #[serde(default)]
     pub require_gpu: bool,
     /// Which GPU a simulation gets, of several. Default: the first.
-    #[serde(default)]
     pub gpus: GpuUse,
     /// The X screen that each GPU drives, in the order of `nvidia-smi`; with `gpus: "spread"`. Default: none.
-    #[serde(default, deserialize_with = "one_or_many")]
+    #[serde(deserialize_with = "one_or_many")]
     pub displays: Vec<DisplayName>,
     /// The display that Webots opens its window on. Default: the environment variable `DISPLAY`, else `:0`.
-    #[serde(default)]
     pub display: Option<DisplayName>,
     /// Give each Webots a virtual display of its own (needs `Xvfb`). Default: false.
-    #[serde(default)]
     pub xvfb: bool,
     /// Seconds after six missed heartbeats until a simulation is ended. Default: 60.
-    #[serde(default = "default_hang_limit", with = "seconds")]
+    #[serde(with = "seconds")]
     pub hang_limit: Duration,
     /// Pages from which browsers may open `/client`, as origins (`https://lab.org`). Default: any.
-    #[serde(default, deserialize_with = "one_or_many")]
+    #[serde(deserialize_with = "one_or_many")]
     pub allowed_origins: Vec<Origin>,
     /// Password for actions such as `/drain`. Default: none, and actions are off.
-    #[serde(default)]
     pub admin_password: Option<Secret>,
     /// All other durations.
-    #[serde(default, deserialize_with = "object")]
+    #[serde(deserialize_with = "object")]
     pub timing: Timing,
     /// The file that this was read from; empty if there is none.
     #[serde(skip)]
     pub file: PathBuf,
 }
 
+impl Default for SimulationConfig {
+    fn default() -> Self {
+        Self {
+            server: String::new(),
+            ssl: true,
+            port: 2000,
+            bind: Ipv6Addr::UNSPECIFIED.into(),
+            port_rewrite: true,
+            public_url: None,
+            streaming: Streaming::default(),
+            log_dir: ExpandedPath("log".into()),
+            debug: false,
+            title: None,
+            description: None,
+            webots_home: None,
+            webots: None,
+            projects_dir: None,
+            isolation: IsolationSetting::default(),
+            sandbox: SandboxFolders::default(),
+            container: ContainerSettings::default(),
+            environment: Vec::new(),
+            limits: ResourceLimits::default(),
+            docker: false,
+            persistant_docker_images: Vec::new(),
+            allowed_repositories: Vec::new(),
+            blocked_repositories: Vec::new(),
+            share_idle_time: 50.0,
+            notify: Vec::new(),
+            max_connections: 100,
+            waiting_line: 100,
+            max_clients: 1000,
+            max_clients_per_address: None,
+            max_places_per_address: None,
+            max_places_per_user: None,
+            user_header: None,
+            trusted_proxies: TrustedProxies::default(),
+            timeout: 7200,
+            idle_timeout: Duration::ZERO,
+            monitor_log_enabled: true,
+            any_commit: false,
+            git_mirrors: Mirrors::default(),
+            git_config: None,
+            cache_dir: ExpandedPath("cache".into()),
+            cache_size: 10 * 1024,
+            project_size: 1024,
+            disk_reserve: 512,
+            require_gpu: false,
+            gpus: GpuUse::default(),
+            displays: Vec::new(),
+            display: None,
+            xvfb: false,
+            hang_limit: Duration::from_mins(1),
+            allowed_origins: Vec::new(),
+            admin_password: None,
+            timing: Timing::default(),
+            file: PathBuf::new(),
+        }
+    }
+}
+
 impl SimulationConfig {
     /// Returns the program that is started for each client; `None` if neither `webots` nor `webotsHome` is set.
-    #[must_use]
     pub fn webots_program(&self) -> Option<PathBuf> {
         if let Some(program) = &self.webots {
             return Some(program.0.clone());
@@ -207,13 +246,11 @@ impl SimulationConfig {
     }
 
     /// Whether simulations are spread over the GPUs of the machine.
-    #[must_use]
     pub fn spreads(&self) -> bool {
         self.gpus == GpuUse::Spread && (self.container.gpu || self.isolation != IsolationSetting::Container)
     }
 
     /// The displays of the GPUs, where Webots opens its windows on them.
-    #[must_use]
     pub fn displays_of_gpus(&self) -> &[DisplayName] {
         let is_virtual = match self.isolation {
             IsolationSetting::Container => self.container.display == ContainerDisplay::Virtual,
@@ -223,7 +260,6 @@ impl SimulationConfig {
     }
 
     /// The display on which a Webots opens its window that has this GPU, if it has one.
-    #[must_use]
     pub fn display_on(&self, gpu: Option<u32>) -> String {
         let own = self.displays_of_gpus().get(gpu.unwrap_or_default() as usize);
         display::effective(own.or(self.display.as_ref()))
@@ -242,27 +278,23 @@ impl Configuration for SimulationConfig {
         }
         check_host(&self.server, self.port_rewrite).map_err(|problem| InvalidValueError { key: "server", problem })?;
         if self.webots_home.is_none() {
-            self.webots_home = std::env::var_os("WEBOTS_HOME").map(ExpandedPath::plain);
+            self.webots_home = std::env::var_os("WEBOTS_HOME").map(|home| ExpandedPath(home.into()));
         }
         self.isolation = self.isolation.with_docker(self.docker)?;
         self.docker = self.isolation == IsolationSetting::Container;
         check_ports(self.docker, self.port, self.max_connections)?;
         warnings.extend(self.check_sandbox()?);
         warnings.extend(self.sandbox.missing().map(|path| format!("sandbox: {} is not there", path.display())));
-        if self.port.checked_add(self.max_connections).is_none() {
-            let problem = format!("{} places above port {} leave the range of ports", self.max_connections, self.port);
-            return Err(InvalidValueError { key: "maxConnections", problem });
-        }
-        if self.timing.silence <= self.timing.ping {
-            let problem = format!("{} s is not more than timing.ping", self.timing.silence.as_secs_f64());
-            return Err(InvalidValueError { key: "timing.silence", problem });
-        }
+        require(self.port.checked_add(self.max_connections).is_some(), "maxConnections", || {
+            format!("{} places above port {} leave the range of ports", self.max_connections, self.port)
+        })?;
+        require(self.timing.silence > self.timing.ping, "timing.silence", || {
+            format!("{} s is not more than timing.ping", self.timing.silence.as_secs_f64())
+        })?;
         for address in &self.notify {
-            let is_web = url::Url::parse(address).is_ok_and(|url| matches!(url.scheme(), "http" | "https"));
-            if !is_web {
-                let problem = format!("{address:?} is no URL; allowed are http and https URLs");
-                return Err(InvalidValueError { key: "notify", problem });
-            }
+            require(is_web_url(address), "notify", || {
+                format!("{address:?} is no URL; allowed are http and https URLs")
+            })?;
         }
         if !self.displays.is_empty() && self.displays_of_gpus().is_empty() {
             let why =
@@ -274,60 +306,4 @@ impl Configuration for SimulationConfig {
         }
         Ok(warnings)
     }
-}
-
-fn default_true() -> bool {
-    true
-}
-
-fn default_port() -> u16 {
-    2000
-}
-
-fn default_bind() -> IpAddr {
-    Ipv6Addr::UNSPECIFIED.into()
-}
-
-fn default_log_dir() -> ExpandedPath {
-    ExpandedPath::plain("log")
-}
-
-fn default_cache_dir() -> ExpandedPath {
-    ExpandedPath::plain("cache")
-}
-
-fn default_share_idle_time() -> f64 {
-    50.0
-}
-
-fn default_max_connections() -> u16 {
-    100
-}
-
-fn default_waiting_line() -> usize {
-    100
-}
-
-fn default_max_clients() -> usize {
-    1000
-}
-
-fn default_timeout() -> u64 {
-    7200
-}
-
-fn default_cache_size() -> u64 {
-    10 * 1024
-}
-
-fn default_project_size() -> u64 {
-    1024
-}
-
-fn default_disk_reserve() -> u64 {
-    512
-}
-
-fn default_hang_limit() -> Duration {
-    Duration::from_mins(1)
 }

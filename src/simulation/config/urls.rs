@@ -11,19 +11,16 @@ const NEXT_PORTS: u16 = 10;
 
 impl SimulationConfig {
     /// Returns this server's HTTP URL for clients.
-    #[must_use]
     pub fn http_url(&self) -> String {
         self.client_urls().http_url(&self.address(self.port))
     }
 
     /// Returns the WebSocket URL for clients of a port of this server: its own, or that of a Webots.
-    #[must_use]
     pub fn websocket_url(&self, port: u16) -> String {
         self.client_urls().websocket_url(&self.address(port))
     }
 
     /// Returns the URL under which a client reaches the stream of its simulation, which has this port and this token.
-    #[must_use]
     pub fn stream_url(&self, port: u16, token: &str) -> String {
         match self.streaming {
             Streaming::Direct => self.websocket_url(port),
@@ -33,13 +30,11 @@ impl SimulationConfig {
 
     /// Whether clients reach simulations at their own ports, which must then be reachable from outside. Otherwise this
     /// server alone reaches them, on the machine itself.
-    #[must_use]
     pub fn ports_are_public(&self) -> bool {
         self.streaming == Streaming::Direct
     }
 
     /// Returns the address to which the ports of containers are bound.
-    #[must_use]
     pub fn bind_of_containers(&self) -> Ipv4Addr {
         match self.bind {
             _ if !self.ports_are_public() => Ipv4Addr::LOCALHOST,
@@ -49,7 +44,6 @@ impl SimulationConfig {
     }
 
     /// Returns the address at which this server itself reaches simulations.
-    #[must_use]
     pub fn address_of_simulations(&self) -> Ipv4Addr {
         let bind = self.bind_of_containers();
         if self.docker && !bind.is_unspecified() { bind } else { Ipv4Addr::LOCALHOST }
@@ -64,13 +58,11 @@ impl SimulationConfig {
     }
 
     /// Returns the ports that Webots may use.
-    #[must_use]
     pub fn streaming_ports(&self) -> RangeInclusive<u16> {
         self.port + 1..=self.port.saturating_add(self.max_connections)
     }
 
     /// Returns the ports on which a Webots may listen that was started with this port.
-    #[must_use]
     pub fn ports_from(port: u16) -> RangeInclusive<u16> {
         port..=port.saturating_add(NEXT_PORTS)
     }

@@ -47,7 +47,6 @@ impl EndReason {
     ];
 
     /// Its name in `/metrics` and in `simulations.csv`.
-    #[must_use]
     pub fn label(self) -> &'static str {
         match self {
             Self::Left => "left",
@@ -66,7 +65,6 @@ impl EndReason {
     }
 
     /// Its text on the monitor.
-    #[must_use]
     pub fn words(self) -> &'static str {
         match self {
             Self::Left => "client gone",
@@ -85,7 +83,6 @@ impl EndReason {
     }
 
     /// Whether its cause may have to be found, so that its output is kept for longer. A failed checkout has no output.
-    #[must_use]
     pub fn is_abnormal(self) -> bool {
         matches!(self, Self::NoWebots | Self::Crashed | Self::Hung | Self::Limit | Self::Fault)
     }

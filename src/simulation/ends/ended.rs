@@ -56,7 +56,6 @@ pub struct Ended {
 
 impl Ended {
     /// Whether its output is kept for a while.
-    #[must_use]
     pub fn has_output(&self) -> bool {
         self.log.is_some() || self.how.reason.is_abnormal()
     }

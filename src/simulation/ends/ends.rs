@@ -68,7 +68,6 @@ impl Ends {
     }
 
     /// The last ends since the start of the server, the newest first.
-    #[must_use]
     pub fn latest(&self) -> Vec<Arc<Ended>> {
         self.latest.lock().iter().cloned().collect()
     }

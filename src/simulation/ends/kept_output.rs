@@ -23,10 +23,9 @@ const KEPT: [(&str, usize); 2] = [(ENDED, 20), (FAILED, 100)];
 /// server was killed.
 const AGE: Duration = Duration::from_hours(14 * 24);
 /// Size of the kept output, in bytes.
-const OUTPUT: usize = 64 * 1024;
+const OUTPUT: u64 = 64 * 1024;
 
 /// Returns the file with the output of the simulation with this id, whether it runs or has ended.
-#[must_use]
 pub fn output_file(logs: &Path, id: &str) -> Option<PathBuf> {
     if !SimulationId::is_like(id) {
         return None;
@@ -98,24 +97,27 @@ fn older(log: &Path) -> PathBuf {
     name.into()
 }
 
-/// The last whole lines of an output.
+/// The last lines of an output, from its rotated file and the newest one.
 fn last_output(log: &Path) -> String {
-    let mut bytes = end_of(&older(log)).unwrap_or_default();
-    bytes.extend(end_of(log).unwrap_or_default());
-    let surplus = bytes.len().saturating_sub(OUTPUT);
-    let text = String::from_utf8_lossy(bytes.get(surplus..).unwrap_or_default());
-    // A cut text begins in the middle of a line.
-    if surplus > 0 { text.split_once('\n').map_or("", |(_, rest)| rest).to_owned() } else { text.into_owned() }
+    let room = OUTPUT.saturating_sub(fs::metadata(log).map_or(0, |about| about.len()));
+    let older = last_lines(&older(log), room).unwrap_or_default();
+    older + &last_lines(log, OUTPUT).unwrap_or_default()
 }
 
-/// The end of a file: one byte more than is kept, to detect that something was cut.
-fn end_of(file: &Path) -> io::Result<Vec<u8>> {
+/// The last whole lines of a file, of at most this many bytes.
+///
+/// # Errors
+/// When it can't be read.
+pub fn last_lines(file: &Path, most: u64) -> io::Result<String> {
     let mut file = fs::File::open(file)?;
-    let most = OUTPUT as u64 + 1;
-    file.seek(SeekFrom::Start(file.metadata()?.len().saturating_sub(most)))?;
+    let skipped = file.metadata()?.len().saturating_sub(most);
+    file.seek(SeekFrom::Start(skipped))?;
     let mut bytes = Vec::new();
     file.take(most).read_to_end(&mut bytes)?;
-    Ok(bytes)
+    let text = String::from_utf8_lossy(&bytes);
+    // A cut text begins in the middle of a line.
+    let whole = if skipped > 0 { text.split_once('\n').map_or("", |(_, rest)| rest) } else { &text };
+    Ok(whole.to_owned())
 }
 
 #[cfg(test)]
@@ -156,7 +158,7 @@ mod tests {
         let text = fs::read_to_string(&kept).unwrap();
         assert!(text.starts_with("12:00:00 it began\n\nThe last"), "{text}");
         assert!(text.ends_with("\nbefore the rotation\nlast words\n") && text.contains(":\n\nbefore"), "{text}");
-        assert!((60_000..OUTPUT + 200).contains(&text.len()), "{}", text.len());
+        assert!((60_000..OUTPUT + 200).contains(&(text.len() as u64)), "{}", text.len());
         assert!(!log.exists() && !older(&log).exists());
     }
 

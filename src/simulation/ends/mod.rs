@@ -9,4 +9,4 @@ mod kept_output;
 pub use end_reason::EndReason;
 pub use ended::{End, Ended, Taken};
 pub use ends::Ends;
-pub use kept_output::{FOLDER_OF_RUNNING, output_file};
+pub use kept_output::{FOLDER_OF_RUNNING, last_lines, output_file};

@@ -46,7 +46,6 @@ pub struct Attachment {
 
 impl Attachment {
     /// Attaches a connection to a session; `number` is unique among the session's attachments.
-    #[must_use]
     pub fn new(session: Recipient<FromClient>, number: u64) -> Self {
         Self { number, session }
     }

@@ -35,7 +35,6 @@ pub struct Registration {
 
 impl Sessions {
     /// Registers a session.
-    #[must_use]
     pub fn register(self: &Arc<Self>, session: Recipient<Resume>) -> Registration {
         // Random, so that it differs from the numbers of earlier runs of the server.
         let number = rand::random();
@@ -44,7 +43,6 @@ impl Sessions {
     }
 
     /// The session that a token names, if it has not ended.
-    #[must_use]
     pub fn find(&self, token: &Token) -> Option<Recipient<Resume>> {
         self.0.lock().get(&token.number()).cloned()
     }
@@ -52,7 +50,6 @@ impl Sessions {
 
 impl Registration {
     /// Creates a new token for the session.
-    #[must_use]
     pub fn token(&self) -> Token {
         Token::new(self.number)
     }

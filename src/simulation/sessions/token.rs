@@ -17,13 +17,11 @@ const DIGITS: usize = 16;
 
 impl Token {
     /// A new token for the session with this number.
-    #[must_use]
     pub fn new(number: u64) -> Self {
         Self { number, secret: rand::random() }
     }
 
     /// Parses a token of a client; `None` if it is invalid.
-    #[must_use]
     pub fn parse(text: &str) -> Option<Self> {
         let is_hex = text.len() == 3 * DIGITS && text.bytes().all(|byte| byte.is_ascii_hexdigit());
         let (number, secret) = text.split_at_checked(DIGITS).filter(|_| is_hex)?;
@@ -32,13 +30,11 @@ impl Token {
     }
 
     /// The number of the session.
-    #[must_use]
     pub fn number(&self) -> u64 {
         self.number
     }
 
     /// The token as text, only for its client.
-    #[must_use]
     pub fn reveal(&self) -> String {
         format!("{:016x}{:032x}", self.number, u128::from_be_bytes(self.secret))
     }

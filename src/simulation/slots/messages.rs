@@ -39,7 +39,7 @@ pub struct StopOne {
     pub why: String,
 }
 
-/// Says that the client of a ticket has another address now; the answer is why that may not be.
+/// Makes a slot count for another address of its client; the answer is why it may not.
 #[derive(Message)]
 #[rtype(result = "Result<(), SlotError>")]
 pub struct Move {

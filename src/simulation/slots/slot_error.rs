@@ -24,15 +24,15 @@ pub enum SlotError {
         /// Number of clients of the address that wait.
         waiting: usize,
     },
-    /// The client's user has its share.
+    /// The client's user has reached its limit.
     #[error(
         "You have {places} places of this simulation server, and {waiting} more clients of yours are waiting. The rest is \
          kept for others. Try again later"
     )]
-    ShareOfUser {
-        /// Places that the user has.
+    UserLimit {
+        /// Number of slots that the user has.
         places: usize,
-        /// Clients of the user that wait.
+        /// Number of clients of the user that wait.
         waiting: usize,
     },
 }

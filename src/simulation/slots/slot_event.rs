@@ -4,7 +4,7 @@ use actix::prelude::*;
 
 use super::slot_error::SlotError;
 
-/// What the holder of a ticket hears.
+/// An event of a lease.
 #[derive(Message, Debug, Clone, PartialEq, Eq)]
 #[rtype(result = "()")]
 pub enum SlotEvent {

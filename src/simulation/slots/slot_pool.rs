@@ -13,7 +13,7 @@ use std::time::Duration;
 use actix::prelude::*;
 
 use super::messages::{Acquire, GetSnapshot, Move, Release, StopOne, UpdateSimulation};
-use super::party::{Party, Shares};
+use super::party::{Party, Share, Shares};
 use super::present::{Present, Report, longest_away};
 use super::slot_error::SlotError;
 use super::slot_event::SlotEvent;
@@ -45,10 +45,10 @@ pub struct SlotPool {
     ports: RangeInclusive<u16>,
     queue_capacity: usize,
     shares: Shares,
-    /// How many tickets there were, also of clients that were refused.
+    /// Number of leases that were requested, including those of clients that were refused.
     arrivals: u64,
     present: BTreeMap<SimulationId, Present>,
-    line: VecDeque<Waiting>,
+    queue: VecDeque<Waiting>,
     /// Records each end.
     ends: Option<Ends>,
 }
@@ -57,7 +57,7 @@ struct Waiting {
     id: SimulationId,
     parties: Vec<Party>,
     client: Recipient<SlotEvent>,
-    told: Option<usize>,
+    sent_position: Option<usize>,
 }
 
 /// Interval between two checks of the ports that other programs have used.
@@ -66,87 +66,75 @@ const RECHECK: Duration = Duration::from_secs(1);
 impl SlotPool {
     /// Leases these ports; `queue_capacity` clients may wait. One address may have `per_address` slots, and the same
     /// share of the queue; without it, all of both.
-    #[must_use]
     pub fn new(ports: RangeInclusive<u16>, queue_capacity: usize, per_address: Option<usize>) -> Self {
-        let shares = Shares { address: share(&ports, queue_capacity, per_address), user: None };
-        let (present, line) = (BTreeMap::new(), VecDeque::new());
-        Self { ports, queue_capacity, shares, arrivals: 0, present, line, ends: None }
+        let share = |slots| Share::new(slots, ports.len(), queue_capacity);
+        let shares = Shares { address: share(per_address), user: share(None) };
+        let (present, queue) = (BTreeMap::new(), VecDeque::new());
+        Self { ports, queue_capacity, shares, arrivals: 0, present, queue, ends: None }
     }
 
-    /// One user may have so many places, and the same part of the line; without a number, all of both.
-    #[must_use]
+    /// One user may have this many slots, and the same share of the queue; without a number, all of both.
     pub fn with_share_of_users(mut self, per_user: Option<usize>) -> Self {
-        self.shares.user = share(&self.ports, self.queue_capacity, per_user);
+        self.shares.user = Share::new(per_user, self.ports.len(), self.queue_capacity);
         self
     }
 
     /// Records each end with `ends`.
-    #[must_use]
     pub fn with_ends(self, ends: Ends) -> Self {
         Self { ends: Some(ends), ..self }
     }
 
-    /// The first in the line whose address and user may have another place.
-    fn next_in_line(&self) -> Option<usize> {
-        if self.shares.are_none() {
-            return (!self.line.is_empty()).then_some(0);
-        }
+    /// The position of the first client in the queue whose address and user may have another slot.
+    fn next_in_queue(&self) -> Option<usize> {
         let mut lent: HashMap<Party, usize> = HashMap::new();
         for party in self.present.values().filter(|one| one.lent.is_some()).flat_map(Present::parties) {
             *lent.entry(party).or_default() += 1;
         }
-        let has_room = |party: &Party| {
-            let most = self.shares.of(party).map(|(most, _)| most);
-            most.is_none_or(|most| lent.get(party).is_none_or(|count| *count < most))
-        };
-        self.line.iter().position(|waiting| waiting.parties.iter().all(has_room))
+        let may_have_one = |party: &Party| lent.get(party).is_none_or(|slots| *slots < self.shares.of(party).slots);
+        self.queue.iter().position(|waiting| waiting.parties.iter().all(may_have_one))
     }
 
-    /// How many places the clients of a party have, and how many of them wait.
-    fn of_party(&self, party: &Party) -> (usize, usize) {
+    /// What the clients of a party have.
+    fn share_of(&self, party: &Party) -> Share {
         let present = self.present.values().filter(|one| one.parties().contains(party));
         let (lent, waiting): (Vec<_>, Vec<_>) = present.partition(|one| one.lent.is_some());
-        (lent.len(), waiting.len())
+        Share { slots: lent.len(), waiting: waiting.len() }
     }
 
-    /// Why another client of these parties gets no place and may not wait, if so.
+    /// Why another client of these parties gets no slot and may not wait, if so.
     fn refusal(&self, parties: &[Party]) -> Option<SlotError> {
-        let shares = parties.iter().filter_map(|party| Some((party, self.shares.of(party)?, self.of_party(party))));
-        let shares: Vec<_> = shares.collect();
-        let may_have_one = shares.iter().all(|(_, (most, _), (places, _))| places < most);
-        if may_have_one && self.next_in_line().is_none() && self.free_port().is_some() {
+        let shares: Vec<_> = parties.iter().map(|party| (party, self.shares.of(party), self.share_of(party))).collect();
+        let may_have_one = shares.iter().all(|(_, may, has)| has.slots < may.slots);
+        if may_have_one && self.next_in_queue().is_none() && self.free_port().is_some() {
             return None;
         }
-        let has_its_share = |((most_places, most_waiting), (places, waiting)): ((usize, usize), (usize, usize))| {
-            waiting >= most_waiting && (places >= most_places || waiting > 0)
-        };
-        if let Some((party, _, has)) = shares.into_iter().find(|(_, may, has)| has_its_share((*may, *has))) {
+        if let Some((party, _, has)) = shares.into_iter().find(|(_, may, has)| may.is_used_up(*has)) {
             return Some(party.refusal(has));
         }
-        let (places, waiting) = (self.ports.len(), self.line.len());
+        let (places, waiting) = (self.ports.len(), self.queue.len());
         (waiting >= self.queue_capacity).then_some(SlotError::QueueFull { places, waiting })
     }
 
     /// Grants free slots to the clients in the queue, and sends the others their position.
     fn serve(&mut self) {
-        while let Some(next) = self.next_in_line()
+        while let Some(next) = self.next_in_queue()
             && let Some(port) = self.free_port()
-            && let Some(first) = self.line.remove(next)
+            && let Some(first) = self.queue.remove(next)
         {
             match first.client.try_send(SlotEvent::Granted(port)) {
                 Ok(()) => self.lend(first.id, port),
                 // It keeps its position in the queue until the next check.
                 Err(SendError::Full(_)) => {
-                    self.line.insert(next, first);
+                    self.queue.insert(next, first);
                     break;
                 }
                 // Its actor has stopped, which drops its lease too.
                 Err(SendError::Closed(_)) => {}
             }
         }
-        for (ahead, waiting) in self.line.iter_mut().enumerate() {
-            if waiting.told != Some(ahead) && waiting.client.try_send(SlotEvent::Queued(ahead)).is_ok() {
-                waiting.told = Some(ahead);
+        for (ahead, waiting) in self.queue.iter_mut().enumerate() {
+            if waiting.sent_position != Some(ahead) && waiting.client.try_send(SlotEvent::Queued(ahead)).is_ok() {
+                waiting.sent_position = Some(ahead);
             }
         }
     }
@@ -189,13 +177,7 @@ impl SlotPool {
     }
 }
 
-/// What a party may have that may have so many places: these, and the same part of the line.
-fn share(ports: &RangeInclusive<u16>, queue_capacity: usize, places: Option<usize>) -> Option<(usize, usize)> {
-    let all = ports.len().max(1);
-    places.map(|places| (places, (queue_capacity * places.min(all)).div_ceil(all)))
-}
-
-/// Whether nobody listens on a port, by either version of IP; a machine may have but one of them.
+/// Whether no program listens on a port, over IPv4 or IPv6; a machine may have only one of them.
 fn is_free(port: u16) -> bool {
     let is_taken = |error: std::io::Error| error.kind() == ErrorKind::AddrInUse;
     TcpListener::bind((Ipv4Addr::UNSPECIFIED, port)).is_ok()
@@ -206,7 +188,7 @@ impl Actor for SlotPool {
     type Context = Context<Self>;
 
     fn started(&mut self, ctx: &mut Self::Context) {
-        ctx.run_interval(RECHECK, |places, _| places.serve());
+        ctx.run_interval(RECHECK, |slots, _| slots.serve());
     }
 }
 
@@ -220,7 +202,7 @@ impl Handler<Acquire> for SlotPool {
             return client.do_send(SlotEvent::Rejected(refusal));
         }
         self.present.insert(id, *present);
-        self.line.push_back(Waiting { id, parties, client, told: None });
+        self.queue.push_back(Waiting { id, parties, client, sent_position: None });
         self.serve();
     }
 }
@@ -232,7 +214,7 @@ impl Handler<Release> for SlotPool {
         if let Some((present, ends)) = self.present.remove(&id).zip(self.ends.as_ref()) {
             ends.record(present.ended());
         }
-        self.line.retain(|waiting| waiting.id != id);
+        self.queue.retain(|waiting| waiting.id != id);
         self.serve();
     }
 }
@@ -256,13 +238,11 @@ impl Handler<Move> for SlotPool {
 
     fn handle(&mut self, Move { id, address }: Move, _: &mut Self::Context) -> Self::Result {
         let is_there = self.present.get(&id).is_none_or(|one| one.address == address);
-        let share = self.shares.address.zip(address).filter(|_| !is_there);
-        if let Some(((most, _), address)) = share
-            && let party = Party::Address(address)
-            && let has = self.of_party(&party)
-            && has.0 >= most
-        {
-            return Err(party.refusal(has));
+        if let Some(party) = address.map(Party::Address).filter(|_| !is_there) {
+            let has = self.share_of(&party);
+            if has.slots >= self.shares.of(&party).slots {
+                return Err(party.refusal(has));
+            }
         }
         if let Some(present) = self.present.get_mut(&id) {
             present.address = address;
@@ -290,9 +270,8 @@ impl Handler<GetSnapshot> for SlotPool {
 }
 
 impl SlotLease {
-    /// Gets into the line for a place. `listener` hears what comes of it, `world` is shown, and the client counts by its
-    /// address and its user.
-    #[must_use]
+    /// Joins the queue for a slot. `listener` receives the events, `world` is shown, and the client counts for its address and
+    /// its user.
     pub fn new(
         slots: &Addr<SlotPool>,
         listener: Recipient<SlotEvent>,
@@ -305,7 +284,6 @@ impl SlotLease {
     }
 
     /// The id of the simulation.
-    #[must_use]
     pub fn id(&self) -> SimulationId {
         self.id
     }

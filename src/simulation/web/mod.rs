@@ -2,6 +2,7 @@
 
 mod actions;
 mod administrator;
+mod metrics;
 mod origins;
 mod page_routes;
 mod pages;

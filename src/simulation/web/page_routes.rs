@@ -1,23 +1,22 @@
 //! Routes of the simulation server's page, with its assets and event stream, and of Webots' own viewer.
 
 use std::collections::BTreeMap;
-use std::io::{Read, Seek, SeekFrom};
-use std::path::Path;
 
 use actix_files::NamedFile;
 use actix_web::http::header::{self, HeaderValue};
 use actix_web::{HttpRequest, HttpResponse, web};
 use serde::Deserialize;
 
-use super::pages::{self, Reader};
+use super::administrator::Visitor;
+use super::pages;
 use super::queries::{snapshot, too_busy};
 use super::webots_viewer;
 use crate::asset;
 use crate::shared::http::assets::{self, Asset};
 use crate::shared::http::routing::{GET, READ, path};
-use crate::shared::http::{AuthError, ConnectionKind, ContentSecurityPolicy, html, is_administrator};
+use crate::shared::http::{ConnectionKind, ContentSecurityPolicy, html};
 use crate::simulation::container;
-use crate::simulation::ends::output_file;
+use crate::simulation::ends::{last_lines, output_file};
 use crate::simulation::machine::{Tree, Usages};
 use crate::simulation::snapshot::{Simulation, Snapshot};
 use crate::simulation::state::AppState;
@@ -43,23 +42,13 @@ pub fn configure(app: &mut web::ServiceConfig) {
         .service(path("/wwi/{path:.*}", GET, wwi));
 }
 
-/// Who sees a page, as far as the password tells.
-fn reader(request: &HttpRequest, server: &AppState) -> Result<Reader, AuthError> {
-    let peer = server.config.trusted_proxies.peer(request);
-    Ok(match &server.admin_auth {
-        None => Reader::Anybody,
-        auth if is_administrator(auth.as_ref(), request, peer)? => Reader::Administrator,
-        Some(_) => Reader::Stranger,
-    })
-}
-
 async fn monitor(request: HttpRequest, server: web::Data<AppState>) -> HttpResponse {
     let Some(snapshot) = snapshot(&server).await else {
         return too_busy();
     };
     let usages = usages(&server, &snapshot).await;
-    match reader(&request, &server) {
-        Ok(reader) => html(pages::monitor(&server, &snapshot, &usages, reader), &ContentSecurityPolicy::own()),
+    match Visitor::of(&request, &server) {
+        Ok(visitor) => html(pages::monitor(&server, &snapshot, &usages, visitor), &ContentSecurityPolicy::own()),
         Err(refused) => refused.answer(),
     }
 }
@@ -86,8 +75,8 @@ async fn events(request: HttpRequest, server: web::Data<AppState>) -> HttpRespon
         Ok(permit) => permit,
         Err(refused) => return refused.answer(),
     };
-    let seen_by = match reader(&request, &server) {
-        Ok(reader) => reader,
+    let visitor = match Visitor::of(&request, &server) {
+        Ok(visitor) => visitor,
         Err(refused) => return refused.answer(),
     };
     let shown = server.clone();
@@ -96,11 +85,11 @@ async fn events(request: HttpRequest, server: web::Data<AppState>) -> HttpRespon
         async move {
             let snapshot = snapshot(&server).await?;
             let usages = usages(&server, &snapshot).await;
-            let view = pages::view(&server, &snapshot, &usages, seen_by);
+            let view = pages::view(&server, &snapshot, &usages, visitor);
             view.inspect_err(|error| log::error!("the monitor page can't be rendered: {error}")).ok()
         }
     };
-    let live = if seen_by == Reader::Administrator { &server.administrators } else { &server.live };
+    let live = if visitor == Visitor::Administrator { &server.administrators } else { &server.live };
     live.listen(permit, server.phase.clone(), render)
 }
 
@@ -119,7 +108,7 @@ struct Which {
 }
 
 /// The last output lines of a simulation, running or ended. They may be private, so the administrator's password
-/// protects them if one is configured. Without it they name no port that only the relay of streams should reach.
+/// protects them if one is configured.
 async fn output(request: HttpRequest, which: web::Query<Which>, server: web::Data<AppState>) -> HttpResponse {
     if let Some(auth) = &server.admin_auth
         && let Err(refused) = auth.check(&request, server.config.trusted_proxies.peer(&request))
@@ -127,39 +116,16 @@ async fn output(request: HttpRequest, which: web::Query<Which>, server: web::Dat
         return refused.answer();
     }
     let logs = server.config.log_dir.0.join("simulation");
-    let tail = web::block(move || output_file(&logs, &which.id).and_then(|file| tail(&file).ok())).await;
+    let tail =
+        web::block(move || output_file(&logs, &which.id).and_then(|file| last_lines(&file, LARGEST_TAIL).ok())).await;
     let Ok(Some(tail)) = tail else {
         return HttpResponse::NotFound().body("Error: nothing is kept of this simulation.");
     };
-    let has_ports = server.admin_auth.is_some() || server.config.ports_are_public();
-    let tail = if has_ports { tail } else { without_ports(&tail) };
     HttpResponse::Ok()
         .insert_header((header::X_CONTENT_TYPE_OPTIONS, "nosniff"))
         .insert_header((header::CONTENT_SECURITY_POLICY, "default-src 'none'; frame-ancestors 'none'"))
         .content_type("text/plain; charset=utf-8")
         .body(tail)
-}
-
-/// The text without the numbers of ports, as events and Webots write them: `port 2001`.
-fn without_ports(text: &str) -> String {
-    let mut parts = text.split("port ");
-    let first = parts.next().unwrap_or_default().to_owned();
-    parts.fold(first, |text, part| {
-        let rest = part.trim_start_matches(|one: char| one.is_ascii_digit());
-        text + "port " + if rest.len() < part.len() { "..." } else { "" } + rest
-    })
-}
-
-/// The last whole lines of a file.
-fn tail(path: &Path) -> std::io::Result<String> {
-    let mut file = std::fs::File::open(path)?;
-    let skipped = file.metadata()?.len().saturating_sub(LARGEST_TAIL);
-    file.seek(SeekFrom::Start(skipped))?;
-    let mut bytes = Vec::new();
-    file.take(LARGEST_TAIL).read_to_end(&mut bytes)?;
-    let text = String::from_utf8_lossy(&bytes);
-    let whole = if skipped > 0 { text.split_once('\n').map_or("", |(_, rest)| rest) } else { &text };
-    Ok(whole.to_owned())
 }
 
 /// A file of Webots' own viewer.
@@ -176,34 +142,4 @@ async fn wwi(request: HttpRequest, server: web::Data<AppState>) -> HttpResponse 
     response.headers_mut().insert(header::CACHE_CONTROL, HeaderValue::from_static("no-cache"));
     response.headers_mut().insert(header::X_CONTENT_TYPE_OPTIONS, HeaderValue::from_static("nosniff"));
     response
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use std::fs;
-
-    #[test]
-    fn ports_are_left_out() {
-        for (text, shown) in [
-            ("12:00:00 port 2001: ready\nport 2002", "12:00:00 port ...: ready\nport ..."),
-            ("support 2001", "support ..."),
-            ("an export in 2026", "an export in 2026"),
-            ("port is 7", "port is 7"),
-            ("", ""),
-        ] {
-            assert_eq!(without_ports(text), shown, "{text}");
-        }
-    }
-
-    #[test]
-    fn only_the_end_of_an_output_is_read() {
-        let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("1.log");
-        fs::write(&path, "a short one\n").unwrap();
-        assert_eq!(tail(&path).unwrap(), "a short one\n");
-        fs::write(&path, "a line of the flood\n".repeat(10_000)).unwrap();
-        let end = tail(&path).unwrap();
-        assert!(end.len() as u64 <= LARGEST_TAIL && end.starts_with("a line"), "{}", end.len());
-    }
 }

@@ -5,47 +5,23 @@ use std::time::{Duration, SystemTime};
 use askama::Template;
 use url::Url;
 
-use crate::shared::domain::UrlPrefix;
+use super::administrator::Visitor;
+use crate::shared::domain::{Instances, UrlPrefix};
 use crate::shared::http::{PageView, TableRow};
 use crate::shared::run::{seconds_since_1970, timestamp};
 use crate::shared::text::{one_line, without_paths};
-use crate::simulation::config::SimulationConfig;
 use crate::simulation::ends::Ended;
 use crate::simulation::isolation::IsolationLevel;
 use crate::simulation::machine::sensors::{self, Gpu, Host, Machine};
-use crate::simulation::machine::{Readings, Sample};
-use crate::simulation::machine::{Usage, Usages};
+use crate::simulation::machine::{Readings, Sample, Usage, Usages};
 use crate::simulation::snapshot::{Simulation, Snapshot, Stage};
 use crate::simulation::state::AppState;
-
-/// Who sees the page.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Reader {
-    /// Somebody, where no password is configured.
-    Anybody,
-    /// Somebody who has not sent the password.
-    Stranger,
-    /// Somebody who has.
-    Administrator,
-}
-
-impl Reader {
-    /// Whether it shows the ports of simulations: whoever reaches one steers its simulation. Without a password and where
-    /// clients need the ports everybody sees them, as on the original's page.
-    fn sees_ports(self, config: &SimulationConfig) -> bool {
-        match self {
-            Self::Administrator => true,
-            Self::Stranger => false,
-            Self::Anybody => config.ports_are_public(),
-        }
-    }
-}
 
 /// The whole page `/monitor`.
 #[derive(Template)]
 #[template(path = "simulation/monitor.html")]
 struct Monitor<'server> {
-    reader: Reader,
+    visitor: Visitor,
     version: &'static str,
     started: String,
     title: &'server str,
@@ -85,19 +61,14 @@ struct Glance<'readings> {
     gpus: Vec<(&'readings Gpu, String)>,
     /// The problem with the GPUs, if there is one.
     gpu_problem: Option<&'readings str>,
-    running: u32,
-    idle: u32,
-    starting: u32,
-    queued: u32,
-    present: u32,
-    places: u32,
+    instances: Instances,
 }
 
 /// The cells of one simulation.
 #[derive(Template)]
 #[template(path = "simulation/row.html")]
 struct SimulationRow<'one> {
-    reader: Reader,
+    visitor: Visitor,
     one: &'one Simulation,
     link: String,
     world: String,
@@ -125,19 +96,19 @@ pub fn view(
     server: &AppState,
     snapshot: &Snapshot,
     usages: &Usages,
-    reader: Reader,
+    visitor: Visitor,
 ) -> Result<PageView, askama::Error> {
     let readings = server.readings.borrow().clone();
-    let shows_port = reader.sees_ports(&server.config);
+    let shows_port = visitor.sees_ports(&server.config);
     let rows = snapshot.simulations.iter().map(|one| {
         let usage = one.pid.and_then(|pid| usages.get(&pid)).copied();
-        let html = SimulationRow::new(one, usage, server.config.timeout, (reader, shows_port)).render()?;
+        let html = SimulationRow::new(one, usage, server.config.timeout, (visitor, shows_port)).render()?;
         Ok(TableRow { key: one.id.to_string(), html })
     });
     let rows = rows.collect::<Result<Vec<TableRow>, askama::Error>>()?;
     let ends = server.ends.latest();
     let ends =
-        ends.iter().map(|one| Ok(TableRow { key: one.id.to_string(), html: EndRow::new(one, reader).render()? }));
+        ends.iter().map(|one| Ok(TableRow { key: one.id.to_string(), html: EndRow::new(one, visitor).render()? }));
     let ends = ends.collect::<Result<Vec<TableRow>, askama::Error>>()?;
     let glance = Glance::new(server, snapshot, &readings).render()?;
     let sample = readings.history.back().map(Sample::columns).unwrap_or_default();
@@ -152,12 +123,12 @@ pub fn monitor(
     server: &AppState,
     snapshot: &Snapshot,
     usages: &Usages,
-    reader: Reader,
+    visitor: Visitor,
 ) -> Result<String, askama::Error> {
-    let view = view(server, snapshot, usages, reader)?;
+    let view = view(server, snapshot, usages, visitor)?;
     let readings = server.readings.borrow().clone();
     let page = Monitor {
-        reader,
+        visitor,
         version: env!("CARGO_PKG_VERSION"),
         started: timestamp(SystemTime::now() - server.started.elapsed()),
         title: server.config.title.as_deref().unwrap_or("Webots simulation server"),
@@ -176,7 +147,7 @@ pub fn monitor(
         share_idle_time: server.rules.share_idle_time,
         isolation: server.launcher.level(),
         network: server.launcher.network_in_words(),
-        shows_ports: reader.sees_ports(&server.config),
+        shows_ports: visitor.sees_ports(&server.config),
         shortcoming: shortcoming(server),
         limit: duration(server.config.timeout),
     };
@@ -184,7 +155,6 @@ pub fn monitor(
 }
 
 /// The charts' numbers of the last ten minutes, the oldest first.
-#[must_use]
 pub fn history(readings: &Readings) -> Vec<Vec<f64>> {
     let values = |sample: &Sample| sample.columns().iter().filter_map(|text| text.parse().ok()).collect();
     readings.history.iter().map(values).collect()
@@ -192,7 +162,6 @@ pub fn history(readings: &Readings) -> Vec<Vec<f64>> {
 
 impl<'readings> Glance<'readings> {
     fn new(server: &AppState, snapshot: &Snapshot, readings: &'readings Readings) -> Self {
-        let instances = snapshot.instances;
         Self {
             draining: server.is_draining(),
             problem: server.problem(),
@@ -202,12 +171,7 @@ impl<'readings> Glance<'readings> {
             memory: bytes(readings.host.memory),
             gpus: with_sizes(&readings.gpus),
             gpu_problem: readings.gpu_problem.as_deref(),
-            running: instances.running,
-            idle: instances.idle,
-            starting: instances.starting,
-            queued: instances.queued,
-            present: instances.present(),
-            places: instances.places,
+            instances: snapshot.instances,
         }
     }
 }
@@ -221,7 +185,7 @@ fn with_sizes(gpus: &[Gpu]) -> Vec<(&Gpu, String)> {
 #[derive(Template)]
 #[template(path = "simulation/end.html")]
 struct EndRow<'one> {
-    reader: Reader,
+    visitor: Visitor,
     one: &'one Ended,
     link: String,
     world: String,
@@ -234,13 +198,13 @@ struct EndRow<'one> {
 }
 
 impl<'one> EndRow<'one> {
-    fn new(one: &'one Ended, reader: Reader) -> Self {
+    fn new(one: &'one Ended, visitor: Visitor) -> Self {
         let (repository, world) = names(&one.world);
         let (ended, after) = (text_of(one.end), duration(one.end.saturating_sub(one.begin)));
         let (reason, why) = (one.how.reason, without_paths(&one.how.why));
         let link = link(&one.world);
         let abnormal = reason.is_abnormal();
-        Self { reader, one, link, world, repository, ended, after, reason: reason.words(), abnormal, why }
+        Self { visitor, one, link, world, repository, ended, after, reason: reason.words(), abnormal, why }
     }
 }
 
@@ -264,13 +228,13 @@ fn names(url: &str) -> (String, String) {
 }
 
 impl<'one> SimulationRow<'one> {
-    fn new(one: &'one Simulation, usage: Option<Usage>, limit: u64, (reader, shows_port): (Reader, bool)) -> Self {
+    fn new(one: &'one Simulation, usage: Option<Usage>, limit: u64, (visitor, shows_port): (Visitor, bool)) -> Self {
         let (stage, class) = words(one.stage);
         let ends = one.launched.map_or(0, |launched| launched + limit);
         let now = seconds_since_1970();
         let (repository, world) = names(&one.world);
         Self {
-            reader,
+            visitor,
             one,
             link: link(&one.world),
             world,
@@ -375,16 +339,17 @@ mod tests {
             ("https://gitlab.com/g/s/r/-/blob/main/worlds/a.wbt", "gitlab.com/g/s/r"),
             ("https://codeberg.org/u/r/src/branch/main/worlds/a.wbt", "codeberg.org/u/r"),
         ] {
-            assert_eq!(SimulationRow::new(&simulation(world), None, 7200, (Reader::Anybody, true)).repository, name);
+            assert_eq!(SimulationRow::new(&simulation(world), None, 7200, (Visitor::Anybody, true)).repository, name);
         }
     }
 
     #[test]
     fn what_a_client_names_is_only_text() {
         let one = simulation("https://github.com/u/<i>\"'&/blob/main/worlds/<script>.wbt");
-        for (reader, has_names) in [(Reader::Anybody, false), (Reader::Stranger, false), (Reader::Administrator, true)]
+        for (visitor, has_names) in
+            [(Visitor::Anybody, false), (Visitor::Stranger, false), (Visitor::Administrator, true)]
         {
-            let html = SimulationRow::new(&one, None, 7200, (reader, true)).render().unwrap();
+            let html = SimulationRow::new(&one, None, 7200, (visitor, true)).render().unwrap();
             assert!(!html.contains("<script>") && !html.contains("<i>"), "{html}");
             assert_eq!(html.contains("root"), has_names, "{html}");
         }

@@ -24,7 +24,6 @@ pub async fn stop_simulation(server: &AppState, id: String, why: String) -> Opti
 }
 
 /// The answer when the actor is too busy.
-#[must_use]
 pub fn too_busy() -> HttpResponse {
     HttpResponse::ServiceUnavailable().body("Error: the server is too busy to tell.")
 }

@@ -5,16 +5,16 @@ use std::sync::Arc;
 use actix_web::{HttpRequest, HttpResponse, web};
 
 use super::actions;
-use super::administrator::may_see_ports;
+use super::administrator::Visitor;
+use super::metrics;
 use super::origins::refuse_origin;
 use super::page_routes;
 use super::queries::{snapshot, too_busy};
-use super::status::{self, StatusResponse};
+use super::status::StatusResponse;
 use super::stream_routes;
 use super::watch_routes;
 use crate::shared::http::routing::{self, GET, READ, path};
-use crate::shared::http::websocket;
-use crate::shared::http::{CONTENT_TYPE, ConnectionKind};
+use crate::shared::http::{CONTENT_TYPE, ConnectionKind, websocket};
 use crate::simulation::client::WebClient;
 use crate::simulation::state::AppState;
 
@@ -30,7 +30,7 @@ fn add(app: &mut web::ServiceConfig) {
         .configure(stream_routes::configure)
         .configure(watch_routes::configure)
         .service(path("/status", READ, status_json))
-        .service(path("/metrics", READ, metrics))
+        .service(path("/metrics", READ, metrics_text))
         .service(path("/health", READ, health))
         .configure(actions::configure);
 }
@@ -54,24 +54,24 @@ async fn load(server: web::Data<AppState>) -> HttpResponse {
 }
 
 async fn status_json(request: HttpRequest, server: web::Data<AppState>) -> HttpResponse {
-    let with_ports = match may_see_ports(&request, &server) {
-        Ok(with_ports) => with_ports,
+    let visitor = match Visitor::of(&request, &server) {
+        Ok(visitor) => visitor,
         Err(refused) => return refused.answer(),
     };
     let Some(mut snapshot) = snapshot(&server).await else {
         return too_busy();
     };
-    if !with_ports {
+    if !visitor.sees_ports(&server.config) {
         snapshot.simulations.iter_mut().for_each(|one| one.port = None);
     }
     HttpResponse::Ok().json(StatusResponse::new(&server, snapshot))
 }
 
-async fn metrics(server: web::Data<AppState>) -> HttpResponse {
+async fn metrics_text(server: web::Data<AppState>) -> HttpResponse {
     let Some(snapshot) = snapshot(&server).await else {
         return too_busy();
     };
-    match server.metrics.render(&status::gauges(&server, &snapshot)) {
+    match server.metrics.render(&metrics::gauges(&server, &snapshot)) {
         Ok(text) => HttpResponse::Ok().content_type(CONTENT_TYPE).body(text),
         Err(error) => HttpResponse::InternalServerError().body(format!("Error: {error}.")),
     }

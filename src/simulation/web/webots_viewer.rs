@@ -14,7 +14,6 @@ const SCRIPT: &str = "WebotsView.js";
 pub const PATH: &str = "wwi/WebotsView.js";
 
 /// The viewer's directory, if Webots is installed here.
-#[must_use]
 pub fn folder(config: &SimulationConfig) -> Option<PathBuf> {
     let home = &config.webots_home.as_ref()?.0;
     let places = [home.join(FOLDER), home.join("Contents").join(FOLDER)];
@@ -22,7 +21,6 @@ pub fn folder(config: &SimulationConfig) -> Option<PathBuf> {
 }
 
 /// A file below a directory; `None` if the path or a symlink resolves to a path outside of it.
-#[must_use]
 pub fn file_below(folder: &Path, path: &str) -> Option<PathBuf> {
     let path = percent_decode_str(path).decode_utf8().ok()?;
     let path = Path::new(path.as_ref());

@@ -26,7 +26,6 @@ impl WebotsCommand<'_> {
     ///
     /// The 3D stream is requested as plain `--stream`: R2025a rejects `--stream=x3d`, R2023b rejects `--stream=w3d`.
     /// The MJPEG stream shows the window, which therefore must be neither minimized nor without rendering.
-    #[must_use]
     pub fn to_arguments(&self) -> Vec<OsString> {
         let mut arguments: Vec<OsString> = vec![self.program.into()];
         arguments.extend(["--batch", "--mode=pause"].map(OsString::from));

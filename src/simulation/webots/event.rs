@@ -43,14 +43,12 @@ pub struct WebotsExit {
 
 impl WebotsExit {
     /// The exit of a Webots by itself, without an error.
-    #[must_use]
     pub fn clean() -> Self {
         Self { clean: true, own: false, why: "Webots has ended".to_owned() }
     }
 }
 
 /// The cause of a container's end, as text for the client.
-#[must_use]
 pub fn words(cause: Cause) -> &'static str {
     match cause {
         Cause::OutOfMemory => "The simulation has taken more memory than it may (limits.memory)",
@@ -67,7 +65,6 @@ pub struct ExitNotifier {
 
 impl ExitNotifier {
     /// Sends to this recipient.
-    #[must_use]
     pub fn new(events: Recipient<WebotsEvent>) -> Self {
         Self { events, exit_told: false }
     }

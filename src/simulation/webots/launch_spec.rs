@@ -55,20 +55,17 @@ pub struct LaunchSpec {
 
 impl LaunchSpec {
     /// The file of its output while it runs.
-    #[must_use]
     pub fn log_file(&self) -> PathBuf {
         let folder = self.config.log_dir.0.join("simulation").join(FOLDER_OF_RUNNING);
         folder.join(format!("{}.log", self.slot.lease.id()))
     }
 
     /// Has the stream found that this port has.
-    #[must_use]
     pub fn register(&self, port: u16) -> Registration {
         self.streams.register(self.slot.lease.id(), port, self.watched.clone())
     }
 
     /// What its containers are made of.
-    #[must_use]
     pub fn request(&self) -> ContainerRequest {
         let (config, mode, port) = (Arc::clone(&self.config), self.mode, self.slot.port);
         let command = move |world: &str| {
@@ -81,7 +78,6 @@ impl LaunchSpec {
     }
 
     /// The display of the machine on which it opens its window.
-    #[must_use]
     pub fn display(&self) -> String {
         self.config.display_on(self.gpu.as_ref().map(|gpu| gpu.index))
     }

@@ -1,14 +1,16 @@
 //! The target on which a Webots runs: the machine with one of its displays, or containers.
 
-use std::path::PathBuf;
+use std::future::ready;
 use std::sync::Arc;
 
+use futures_util::FutureExt;
+use futures_util::future::LocalBoxFuture;
 use tokio::sync::Notify;
 
 use super::event::WebotsEvent;
 use super::launch_spec::LaunchSpec;
 use super::virtual_display::{VirtualDisplay, write_authority};
-use crate::simulation::container::{Cause, ContainerRequest, ContainerService, SimulationContainers, StartError};
+use crate::simulation::container::{Cause, SimulationContainers, StartError};
 use crate::simulation::isolation::{Display, IsolationLevel};
 
 /// The target on which a Webots runs.
@@ -22,57 +24,40 @@ pub enum LaunchTarget {
     Containers(Box<SimulationContainers>),
 }
 
-/// The preparation of a Webots' start.
-#[derive(Debug)]
-pub enum Preparation {
-    /// Nothing: it has the display with this name.
-    None(String),
-    /// Its own display has to be started, in its sandbox or beside it; it keeps its files in the instance's folder.
-    Display(PathBuf, IsolationLevel),
-    /// Containers have to be made.
-    ContainerService(Arc<ContainerService>, ContainerRequest),
-}
-
-impl Preparation {
-    /// The preparation that this Webots needs.
-    #[must_use]
-    pub fn of(spec: &LaunchSpec) -> Self {
-        match &spec.containers {
-            Some(containers) => Self::ContainerService(Arc::clone(containers), spec.request()),
-            None if spec.config.xvfb => Self::Display(spec.project.instance.path().to_owned(), spec.launcher.level()),
-            None => Self::None(spec.display()),
-        }
-    }
-
-    /// Runs it. `progress` receives each step as text. Dropping the future discards what was created.
-    ///
-    /// # Errors
-    /// Why it failed, and whether the project or this server is the cause.
-    pub async fn run(self, progress: impl Fn(String) + Send + Sync) -> Result<LaunchTarget, StartError> {
-        match self {
-            Self::None(name) => Ok(LaunchTarget::Machine(Display::Outside(vec![("DISPLAY".into(), name.into())]))),
-            Self::Display(instance, level) => {
-                let started = if level == IsolationLevel::Sandbox {
-                    write_authority(&instance).and_then(Display::inside).map(LaunchTarget::Machine)
-                } else {
-                    VirtualDisplay::start(&instance).await.map(LaunchTarget::BesideDisplay)
-                };
-                let failed =
-                    |error| StartError::Server(format!("The virtual display (Xvfb) can't be started: {error}"));
-                started.map_err(failed)
-            }
-            Self::ContainerService(containers, request) => {
+impl LaunchTarget {
+    /// Prepares the target of a Webots: containers, a display of its own, or nothing. `progress` receives each step as text.
+    /// Dropping the future discards what was created. Its error says why it failed, and whether the project or this server
+    /// is the cause.
+    pub fn prepare(
+        spec: &LaunchSpec,
+        progress: impl Fn(String) + Send + Sync + 'static,
+    ) -> LocalBoxFuture<'static, Result<Self, StartError>> {
+        if let Some(containers) = &spec.containers {
+            let (containers, request) = (Arc::clone(containers), spec.request());
+            let prepare = async move {
                 let mut prepared = containers.prepare(request, &progress).await?;
                 prepared.start_others().await?;
-                Ok(LaunchTarget::Containers(Box::new(prepared)))
-            }
+                Ok(Self::Containers(Box::new(prepared)))
+            };
+            return prepare.boxed_local();
         }
+        if !spec.config.xvfb {
+            let name = spec.display();
+            return ready(Ok(Self::Machine(Display::Outside(vec![("DISPLAY".into(), name.into())])))).boxed_local();
+        }
+        let (instance, level) = (spec.project.instance.path().to_owned(), spec.launcher.level());
+        let start = async move {
+            let started = if level == IsolationLevel::Sandbox {
+                write_authority(&instance).and_then(Display::inside).map(Self::Machine)
+            } else {
+                VirtualDisplay::start(&instance).await.map(Self::BesideDisplay)
+            };
+            started.map_err(|error| StartError::Server(format!("The virtual display (Xvfb) can't be started: {error}")))
+        };
+        start.boxed_local()
     }
-}
 
-impl LaunchTarget {
     /// Restarts the controller of a competition's participant; `None` if there is none.
-    #[must_use]
     pub fn restart(&self) -> Option<Arc<Notify>> {
         match self {
             Self::Machine(_) | Self::BesideDisplay(_) => None,
@@ -81,7 +66,6 @@ impl LaunchTarget {
     }
 
     /// The events for the client about it.
-    #[must_use]
     pub fn news(&self) -> Vec<WebotsEvent> {
         let Self::Containers(containers) = self else { return Vec::new() };
         let warnings = containers.warnings.iter().cloned().map(WebotsEvent::Progress);

@@ -5,7 +5,6 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
-use actix::dev::ToEnvelope;
 use actix::prelude::*;
 
 use super::launch_spec::LaunchSpec;
@@ -52,14 +51,11 @@ const LAST_OUTPUT: Duration = Duration::from_secs(1);
 ///
 /// # Errors
 /// When a process, a thread or a directory can't be created.
-pub fn launch<A>(
+pub fn launch(
     spec: &LaunchSpec,
     runtime: LaunchTarget,
-    events: Addr<A>,
-) -> std::io::Result<(Launched, impl Future<Output = End> + use<A>)>
-where
-    A: Actor<Context: ToEnvelope<A, OutputEvent>> + Handler<OutputEvent>,
-{
+    events: Recipient<OutputEvent>,
+) -> std::io::Result<(Launched, impl Future<Output = End> + use<>)> {
     let log = spec.log_file();
     let file = RotatedFile::open(&log, OLD_LOGS).inspect_err(|error| {
         let why = format!("what Webots prints is not kept: {} can't be written: {error}", log.display());

@@ -9,7 +9,6 @@ use std::path::Path;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use actix::dev::ToEnvelope;
 use actix::prelude::*;
 use parking_lot::Mutex;
 use tokio::sync::oneshot;
@@ -50,7 +49,6 @@ const BETWEEN_EVENTS: Duration = Duration::from_millis(20);
 
 impl OutputEvent {
     /// The event of a line; `None` for the simulation's own lines.
-    #[must_use]
     pub fn parse(line: &str) -> Option<Self> {
         match line {
             RUNS => Some(Self::ContainerRuns),
@@ -66,7 +64,6 @@ impl OutputEvent {
 impl Tail {
     /// The lines as the end of a sentence, for the client: Webots usually prints there what is wrong. The path of the
     /// project is removed.
-    #[must_use]
     pub fn last_words(&self, project: &Path) -> String {
         let lines = self.0.lock();
         if lines.is_empty() {
@@ -90,14 +87,11 @@ impl Tail {
 ///
 /// # Errors
 /// When the thread can't be created.
-pub fn follow<A>(
+pub fn follow(
     output: PacedReader,
     mut file: Option<RotatedFile>,
-    events: Addr<A>,
-) -> std::io::Result<(Tail, oneshot::Receiver<()>)>
-where
-    A: Actor<Context: ToEnvelope<A, OutputEvent>> + Handler<OutputEvent>,
-{
+    events: Recipient<OutputEvent>,
+) -> std::io::Result<(Tail, oneshot::Receiver<()>)> {
     let tail = Tail::default();
     let kept = tail.clone();
     let (end, ended) = oneshot::channel();
@@ -126,10 +120,7 @@ where
 }
 
 /// Sends an event. If the actor can't keep up, the simulator blocks, and the mailbox does not grow.
-fn deliver<A>(events: &Addr<A>, event: OutputEvent)
-where
-    A: Actor<Context: ToEnvelope<A, OutputEvent>> + Handler<OutputEvent>,
-{
+fn deliver(events: &Recipient<OutputEvent>, event: OutputEvent) {
     while let Err(SendError::Full(_)) = events.try_send(event) {
         std::thread::sleep(Duration::from_millis(5));
     }

@@ -24,7 +24,6 @@ const FREE: u64 = 1024;
 
 impl PacedReader {
     /// Reads a pipe at this many bytes per second at most.
-    #[must_use]
     pub fn new(output: PipeReader, limit: u64) -> Self {
         Self { output, limit: limit.max(1), debt: 0 }
     }

@@ -63,7 +63,6 @@ impl VirtualDisplay {
     }
 
     /// The environment variables that name the display.
-    #[must_use]
     pub fn environment(&self) -> Vec<(OsString, OsString)> {
         vec![("DISPLAY".into(), self.name.clone().into()), ("XAUTHORITY".into(), self.authority.clone().into())]
     }

@@ -12,7 +12,7 @@ use tokio::sync::Notify;
 
 use super::event::{ExitNotifier, WebotsEvent, WebotsExit};
 use super::launch_spec::LaunchSpec;
-use super::launch_target::{LaunchTarget, Preparation};
+use super::launch_target::LaunchTarget;
 use super::launched::{self, End, Launched};
 use super::output::{OutputEvent, Tail};
 use super::verdict::verdict;
@@ -72,7 +72,6 @@ const MISSED_HEARTBEATS: u32 = 6;
 
 impl Webots {
     /// Creates the actor; Webots starts with it.
-    #[must_use]
     pub fn new(spec: LaunchSpec) -> Self {
         Self {
             stream: None,
@@ -98,7 +97,7 @@ impl Webots {
         let client = self.spec.events.clone();
         // A full mailbox drops this line.
         let progress = move |text| drop(client.try_send(WebotsEvent::Progress(text)));
-        let prepared = Preparation::of(&self.spec).run(progress).into_actor(self);
+        let prepared = LaunchTarget::prepare(&self.spec, progress).into_actor(self);
         self.preparing = Some(ctx.spawn(prepared.map(|prepared, this, ctx| match prepared {
             Ok(runtime) => this.launch(runtime, ctx),
             Err(StartError::Project(why)) => this.not_started(EndReason::NoWebots, &why, ctx),
@@ -133,7 +132,7 @@ impl Webots {
     /// Starts the process, and calls [`Self::ended`] when it has ended.
     fn spawn(&mut self, runtime: LaunchTarget, ctx: &mut Context<Self>) -> std::io::Result<()> {
         let (Launched { group, cgroup, tail, log, peak }, ended) =
-            launched::launch(&self.spec, runtime, ctx.address())?;
+            launched::launch(&self.spec, runtime, ctx.address().recipient())?;
         let (program, world) = (self.spec.program.display(), self.spec.project.world.path.display());
         let (at, pid) = (seconds_since_1970(), group.leader());
         self.log(Level::Info, &format!("started {program} for {world} (process {pid})"));
@@ -165,9 +164,9 @@ impl Webots {
             return self.stop(EndReason::NoWebots, &why);
         }
         if port != self.port {
-            self.log(Level::Warn, &format!("it was taken, Webots listens on port {port}"));
+            self.log(Level::Warn, &format!("it was taken, Webots listens on {}", self.name(port)));
         }
-        self.spec.slot.lease.log(Level::Info, format!("port {port}: ready"));
+        self.spec.slot.lease.log(Level::Info, format!("{}: ready", self.name(port)));
         self.listening = true;
         self.last_heartbeat = Instant::now();
         self.spec.slot.lease.update(SimulationChange::Port(port));
@@ -262,7 +261,15 @@ impl Webots {
     }
 
     fn log(&self, level: Level, event: &str) {
-        self.spec.slot.lease.log(level, format!("port {}: {event}", self.port));
+        self.spec.slot.lease.log(level, format!("{}: {event}", self.name(self.port)));
+    }
+
+    /// A port as `/output` shows it: without a password everybody reads that, and a relayed stream is reached by its token
+    /// only.
+    fn name(&self, port: u16) -> String {
+        let config = &self.spec.config;
+        let is_shown = config.ports_are_public() || config.admin_password.is_some();
+        if is_shown { format!("port {port}") } else { "a port".to_owned() }
     }
 }
 

@@ -1,14 +1,10 @@
-//! Composes e-mails: a subject, and plain text from a template.
+//! Composes the text of notices: a subject, and plain text from a template.
 //!
 //! Untrusted text, such as a server's error, becomes one line without control characters, in the text and in headers.
 
 use askama::Template;
-use lettre::Message;
-use lettre::message::Mailbox;
-use lettre::message::header::{ContentType, HeaderName, HeaderValue};
 
 use super::outbox::{MailEntry, NoticeKind};
-use super::smtp::MailError;
 use crate::session::config::SessionConfig;
 use crate::shared::run::timestamp;
 use crate::shared::text::excerpt;
@@ -16,19 +12,20 @@ use crate::shared::text::excerpt;
 /// Longest untrusted text that is shown, in characters.
 const MAX_LETTERS: usize = 500;
 
+/// A text about notices, for all channels.
+#[derive(Debug)]
+pub struct NoticeText {
+    /// The subject of a mail.
+    pub subject: String,
+    /// The text, of several lines.
+    pub body: String,
+}
+
 /// Composes the texts of one session server.
-#[derive(Debug, Clone)]
+#[derive(Debug)]
 pub struct Composer {
     session_server: String,
     monitor: String,
-}
-
-/// Composes the e-mails of one session server.
-#[derive(Debug, Clone)]
-pub struct EmailComposer {
-    from: Mailbox,
-    to: Mailbox,
-    texts: Composer,
 }
 
 #[derive(Template)]
@@ -39,7 +36,7 @@ struct Text<'mail> {
     composer: &'mail Composer,
 }
 
-/// The lines of an e-mail about one server.
+/// The lines of a text about one server.
 struct Line {
     server: String,
     event: &'static str,
@@ -50,7 +47,7 @@ struct Line {
 }
 
 impl Composer {
-    /// Composes texts that tell where they come from.
+    /// Composes texts that name this session server.
     pub fn new(config: &SessionConfig) -> Self {
         Self {
             session_server: excerpt(&config.address().to_string(), MAX_LETTERS),
@@ -58,11 +55,11 @@ impl Composer {
         }
     }
 
-    /// The subject and the text about these entries.
+    /// The text about these entries.
     ///
     /// # Errors
     /// When the template can't be rendered.
-    pub fn compose(&self, entries: &[MailEntry]) -> Result<(String, String), MailError> {
+    pub fn compose(&self, entries: &[MailEntry]) -> askama::Result<NoticeText> {
         let events: Vec<NoticeKind> = entries.iter().map(|entry| entry.notice.event).collect();
         let lines: Vec<Line> = entries.iter().map(Line::new).collect();
         let mut subject = summary(&events);
@@ -72,61 +69,17 @@ impl Composer {
         self.text(subject, lines)
     }
 
-    /// The subject and the text of `--test-mail`.
+    /// The text of `--test-mail`.
     ///
     /// # Errors
     /// When the template can't be rendered.
-    pub fn test(&self) -> Result<(String, String), MailError> {
+    pub fn test(&self) -> askama::Result<NoticeText> {
         self.text("Test of the session server's notifications".to_owned(), Vec::new())
     }
 
-    fn text(&self, subject: String, lines: Vec<Line>) -> Result<(String, String), MailError> {
-        let text = Text { summary: &subject, lines, composer: self }.render()?;
-        Ok((subject, text))
-    }
-}
-
-impl EmailComposer {
-    /// Creates a composer from the configuration.
-    ///
-    /// # Errors
-    /// When it names no administrator or sender.
-    pub fn new(config: &SessionConfig) -> Result<Self, MailError> {
-        Ok(Self {
-            from: config.mail_sender.clone().ok_or(MailError::Off("mailSender"))?,
-            to: config.administrator.clone().ok_or(MailError::Off("administrator"))?,
-            texts: Composer::new(config),
-        })
-    }
-
-    /// The address of the administrator.
-    pub fn recipient(&self) -> &str {
-        self.to.email.as_ref()
-    }
-
-    /// The e-mail about these entries.
-    ///
-    /// # Errors
-    /// When it can't be written.
-    pub fn compose(&self, entries: &[MailEntry]) -> Result<Message, MailError> {
-        self.message(self.texts.compose(entries)?)
-    }
-
-    /// The e-mail of `--test-mail`.
-    ///
-    /// # Errors
-    /// When it can't be written.
-    pub fn test(&self) -> Result<Message, MailError> {
-        self.message(self.texts.test()?)
-    }
-
-    fn message(&self, (subject, text): (String, String)) -> Result<Message, MailError> {
-        let builder = Message::builder().from(self.from.clone()).to(self.to.clone()).subject(subject).message_id(None);
-        let mut message = builder.header(ContentType::TEXT_PLAIN).body(text)?;
-        // Automatic responders must not answer (RFC 3834).
-        let name = HeaderName::new_from_ascii_str("Auto-Submitted");
-        message.headers_mut().insert_raw(HeaderValue::new(name, "auto-generated".to_owned()));
-        Ok(message)
+    fn text(&self, subject: String, lines: Vec<Line>) -> askama::Result<NoticeText> {
+        let body = Text { summary: &subject, lines, composer: self }.render()?;
+        Ok(NoticeText { subject, body })
     }
 }
 

@@ -1,0 +1,68 @@
+//! The Prometheus metrics of `/metrics` that follow from the state of the server. Counters are in `client/outcome.rs` and
+//! `ends/ends.rs`.
+
+use crate::shared::http::Gauge;
+use crate::simulation::machine::sensors::Gpu;
+use crate::simulation::snapshot::Snapshot;
+use crate::simulation::state::AppState;
+
+/// The gauges of `/metrics`.
+pub fn gauges<'text>(server: &AppState, snapshot: &Snapshot) -> Vec<Gauge<'text>> {
+    let readings = server.readings.borrow();
+    let instances = snapshot.instances;
+    let machine = readings.machine;
+    let by_state = [
+        ("queued", instances.queued),
+        ("starting", instances.starting),
+        ("idle", instances.idle),
+        ("running", instances.running),
+    ];
+    let gpu = |value: fn(&Gpu) -> f64| {
+        let labels = |gpu: &Gpu| vec![gpu.index.to_string(), gpu.name.clone()];
+        readings.gpus.iter().map(|gpu| (labels(gpu), value(gpu))).collect()
+    };
+    let ready = f64::from(u8::from(server.problem().is_none()));
+    let failed_starts = f64::from(server.failed_starts.count());
+    let away = snapshot.simulations.iter().filter(|one| one.away_until.is_some()).count();
+    let away = u32::try_from(away).unwrap_or(u32::MAX);
+    let draining = f64::from(u8::from(server.is_draining()));
+    vec![
+        Gauge::plain("webots_simulation_load_percent", "Load as /load tells it", server.load().percent()),
+        Gauge::plain("webots_simulation_ready", "0 while no simulation can be started", ready),
+        Gauge::plain(
+            "webots_simulation_failed_starts",
+            "Starts in a row that failed for a reason of this server's own",
+            failed_starts,
+        ),
+        Gauge::plain("webots_simulation_draining", "1 while no new clients are taken", draining),
+        Gauge::plain("webots_simulation_away", "Simulations that wait for their clients", f64::from(away)),
+        Gauge::plain("webots_simulation_places", "Simulations that fit", f64::from(instances.places)),
+        Gauge {
+            name: "webots_simulation_instances",
+            help: "Simulations by state",
+            labels: &["state"],
+            values: by_state.iter().map(|(state, count)| (vec![(*state).to_owned()], f64::from(*count))).collect(),
+        },
+        Gauge::plain("webots_machine_cpu_percent", "CPU in use", machine.cpu),
+        Gauge::plain("webots_machine_memory_percent", "Memory in use", machine.memory),
+        Gauge::plain("webots_machine_swap_percent", "Swap in use", machine.swap),
+        Gauge::plain("webots_machine_disk_percent", "Disk in use where the cache is", machine.disk),
+        Gauge::plain(
+            "webots_machine_gpu_lost",
+            "1 while GPUs have answered and some or all don't any more",
+            f64::from(u8::from(readings.gpu_problem.is_some())),
+        ),
+        Gauge {
+            name: "webots_machine_gpu_compute_percent",
+            help: "GPU: time in which a kernel ran",
+            labels: &["gpu", "name"],
+            values: gpu(|gpu| gpu.compute),
+        },
+        Gauge {
+            name: "webots_machine_gpu_memory_percent",
+            help: "GPU: memory in use",
+            labels: &["gpu", "name"],
+            values: gpu(|gpu| gpu.memory),
+        },
+    ]
+}
