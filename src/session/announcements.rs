@@ -1,4 +1,4 @@
-//! What the administrator tells everybody at the moment: one announcement, or none.
+//! The administrator's current announcement, if there is one.
 
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
@@ -8,18 +8,18 @@ use tokio::sync::watch;
 
 use super::config::Announcement;
 
-/// The announcement that counts now: that of the configuration, or the one that was posted since.
+/// The current announcement: that of the configuration, or the one that was posted since.
 pub struct Announcements {
     current: watch::Sender<Option<Arc<Announcement>>>,
-    /// The one that the configuration had when it was read last: a file that still says the same changes nothing.
+    /// The announcement of the configuration when it was last read: an unchanged one replaces nothing.
     configured: Mutex<Option<Announcement>>,
 }
 
-/// The longest time between two looks whether it is over: the clock may be set meanwhile.
+/// Longest time between two checks whether it has expired, because the clock may be set.
 const LOOK: Duration = Duration::from_secs(10);
 
 impl Announcements {
-    /// Begins with that of the configuration. It ends in time while the server runs.
+    /// Starts with the announcement of the configuration, and a task that removes expired ones.
     pub fn start(configured: Option<Announcement>) -> Self {
         let (current, changes) = watch::channel(None);
         let announcements = Self { current, configured: Mutex::new(configured.clone()) };
@@ -28,7 +28,7 @@ impl Announcements {
         announcements
     }
 
-    /// Replaces it; one that is over already is none.
+    /// Replaces the announcement; an expired one removes it.
     pub fn set(&self, announcement: Option<Announcement>) {
         let announcement = announcement.filter(|one| !one.is_over());
         match &announcement {
@@ -38,7 +38,7 @@ impl Announcements {
         self.current.send_replace(announcement.map(Arc::new));
     }
 
-    /// Takes that of a configuration that was read again, if it is another one than before.
+    /// Takes the announcement of a reloaded configuration if it has changed there.
     pub fn reconfigure(&self, announcement: Option<Announcement>) {
         let mut configured = self.configured.lock();
         if *configured != announcement {
@@ -47,18 +47,18 @@ impl Announcements {
         }
     }
 
-    /// The one that counts now.
+    /// The current announcement.
     pub fn current(&self) -> Option<Arc<Announcement>> {
         self.current.borrow().clone()
     }
 
-    /// Hears of changes.
+    /// Receives changes.
     pub fn subscribe(&self) -> watch::Receiver<Option<Arc<Announcement>>> {
         self.current.subscribe()
     }
 }
 
-/// Ends each announcement when it is over.
+/// Removes each announcement when it expires.
 async fn end_in_time(
     current: watch::Sender<Option<Arc<Announcement>>>,
     mut told: watch::Receiver<Option<Arc<Announcement>>>,

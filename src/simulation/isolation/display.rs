@@ -1,7 +1,7 @@
-//! The display on which a simulation opens its window: one that is there, or a virtual one (Xvfb) in its sandbox.
+//! The display on which a simulation opens its window: an existing one, or a virtual one (Xvfb) in its sandbox.
 //!
-//! In a sandbox Xvfb is within the simulation's limits and its view of the files, and ends with it. It listens on a socket
-//! in the sandbox's own `/tmp` alone, so that its number is always the same.
+//! In a sandbox Xvfb has the simulation's limits and its view of the files, and ends with it. It listens only on a
+//! socket in the sandbox's own `/tmp`, so that its number is always the same.
 
 use std::ffi::OsString;
 use std::io;
@@ -13,9 +13,9 @@ use which::which;
 /// The display of a simulation.
 #[derive(Debug)]
 pub enum Display {
-    /// It is there already; the variables by which programs find it.
+    /// An existing display: the variables by which programs find it.
     Outside(Vec<(OsString, OsString)>),
-    /// It is started in the sandbox, before the program.
+    /// A virtual display, started in the sandbox before the program.
     Inside {
         /// The program of Xvfb.
         xvfb: PathBuf,
@@ -28,8 +28,9 @@ pub enum Display {
 pub const SCREEN: &str = "1280x1024x24";
 /// The name of the display in a sandbox.
 const NAME: &str = ":99";
-/// Starts Xvfb, waits until it says that it is ready, and then becomes the program that follows its own three arguments: the
-/// number, Xvfb and the authority file. Xvfb has a session of its own: the SIGTERM for the program is not for it.
+/// Starts Xvfb, waits until it reports that it is ready, and then becomes the program that follows its own three
+/// arguments: the number, Xvfb and the authority file. Xvfb has a session of its own, so that the SIGTERM for the program
+/// does not reach it.
 const LAUNCHER: &str = r#"
 ready=/tmp/.xvfb; log=/tmp/.xvfb.log
 mkfifo "$ready" || exit
@@ -63,14 +64,14 @@ impl Display {
         }
     }
 
-    /// The words that start it in a sandbox before the program.
+    /// The command that precedes a program to start the display in its sandbox.
     pub fn launcher(&self) -> Vec<OsString> {
         let Self::Inside { xvfb, authority } = self else { return Vec::new() };
         let words = ["/bin/sh", "-c", LAUNCHER, SCREEN, NAME].map(OsString::from);
         words.into_iter().chain([xvfb.into(), authority.into()]).collect()
     }
 
-    /// Makes what it needs in the folder that is `/tmp` in the sandbox: an ordinary user's Xvfb does not make its own.
+    /// Makes the folder of its socket in the sandbox's `/tmp`, because Xvfb of an ordinary user does not.
     pub fn prepare(&self, tmp: &Path) -> io::Result<()> {
         if matches!(self, Self::Outside(_)) {
             return Ok(());

@@ -1,13 +1,13 @@
 //! A filter of system calls for each sandbox: none of those for keyrings.
 //!
-//! Keyrings belong to sessions and users: no namespace keeps a program from that of the session in which the server was
-//! started, which all simulations would share. A new one for each would count for the user's quota of 200 keys
+//! Keyrings belong to sessions and users, and no namespace isolates them: all simulations would share that of the
+//! session in which the server was started. A new one for each would count for the user's quota of 200 keys
 //! (`kernel.keys.maxkeys`). Docker's filter refuses these calls too.
 
-/// Of each architecture that a program may claim to be of: its number, and that of `add_key`, which `request_key` and
-/// `keyctl` follow. They are x86 and ARM, of 64 and 32 bits.
+/// Each architecture that a program may use: its number, and that of `add_key`, which is followed by `request_key` and
+/// `keyctl`. They are x86 and ARM, of 64 and 32 bits.
 const ARCHITECTURES: [(u32, u32); 4] = [(0xc000_003e, 248), (0x4000_0003, 286), (0xc000_00b7, 217), (0x4000_0028, 309)];
-/// A call by the ABI x32 has the number of x86 with 64 bits, and a bit besides.
+/// A call by the ABI x32 has the number of x86 with 64 bits and this bit.
 const NUMBER: u32 = 0x3fff_ffff;
 /// Results of a filter: the call is made, or fails with `EPERM`.
 const ALLOW: u32 = 0x7fff_0000;
@@ -18,7 +18,7 @@ pub fn filter() -> Vec<u8> {
     let (load, and, subtract, if_equal, if_at_least, give) = (0x20, 0x54, 0x14, 0x15, 0x35, 0x06);
     let of_architecture = |(architecture, first)| {
         [
-            // Of the call: its architecture is at 4, its number at 0.
+            // In the call's data, the architecture is at 4 and the number at 0.
             (load, 0, 0, 4),
             // Otherwise the next block begins after six more.
             (if_equal, 0, 6, architecture),

@@ -1,4 +1,4 @@
-//! What a simulation without a control group of its own has taken, from the readings that are made for all of them.
+//! The peak usage of a simulation without a control group of its own, from the readings of all simulations.
 
 use std::sync::OnceLock;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -11,7 +11,7 @@ use crate::simulation::machine::Usage;
 /// The highest usage of a simulation that ticks have measured.
 #[derive(Debug, Default)]
 pub struct Peak {
-    /// Its containers, where it runs in some: what its processes here take is nothing then.
+    /// Its containers, if it runs in some; its process tree here does not count then.
     containers: Option<OnceLock<Vec<String>>>,
     /// In bytes; 0 before the first tick.
     memory: AtomicU64,
@@ -29,18 +29,18 @@ impl Peak {
     /// Names the containers, by their ids.
     pub fn name_containers(&self, ids: Vec<String>) {
         if let Some(containers) = &self.containers {
-            // They are named once.
+            // They never change.
             containers.set(ids).ok();
         }
     }
 
-    /// Whether what its process tree takes is what it takes.
+    /// Whether the usage of its process tree is that of the simulation.
     #[must_use]
     pub fn is_of_tree(&self) -> bool {
         self.containers.is_none()
     }
 
-    /// Takes in a reading: that of the process tree, or what the kernel has counted for its containers.
+    /// Adds a reading: of the process tree, or the kernel's counters of its containers.
     pub fn look(&self, tree: Option<&Usage>) {
         match &self.containers {
             Some(containers) => {

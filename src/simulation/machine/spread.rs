@@ -1,4 +1,4 @@
-//! Which GPU the next simulation gets, where simulations are spread over all of them.
+//! Which GPU the next simulation gets, with `gpus: "spread"`.
 
 use std::collections::HashMap;
 use std::time::{Duration, Instant};
@@ -7,23 +7,23 @@ use parking_lot::Mutex;
 
 use super::sensors::Gpu;
 
-/// For so long a simulation that was started may not be seen in the readings of its GPU: Webots loads its world first.
+/// How long a started simulation may be missing in the readings of its GPU: Webots loads its world first.
 const UNSEEN: Duration = Duration::from_secs(10);
-/// As much counts for each of those, in percent.
+/// Load that is added for each of those, in percent.
 const EXPECTED: f64 = 10.0;
 
-/// Spreads simulations over GPUs: the one with the least load gets the next. A simulation that was given to a GPU in the last
-/// ten seconds counts as 10 % of load there; of several that are equal, the one that was chosen longest ago comes first.
+/// Spreads simulations over GPUs: the one with the least load gets the next. A simulation that was assigned to a GPU in
+/// the last ten seconds counts as 10 % of load; of equal GPUs, the one that was chosen longest ago comes first.
 #[derive(Debug, Default)]
 pub struct Spread {
-    /// How many GPUs, the first ones, have a display; `None` where no simulation needs one.
+    /// Number of GPUs that have a display, the first ones; `None` if no simulation needs one.
     displays: Option<usize>,
-    /// When simulations were given to each GPU: the last time, and those that may not be seen yet.
+    /// Times of assignments to each GPU: the last one, and those that readings may not show yet.
     given: Mutex<HashMap<u32, Vec<Instant>>>,
 }
 
 impl Spread {
-    /// Spreads over the GPUs that have one of these displays; over all, where there is none.
+    /// Spreads over the first `displays` GPUs; over all if it is 0.
     #[must_use]
     pub fn over(displays: usize) -> Self {
         Self { displays: (displays > 0).then_some(displays), ..Self::default() }
@@ -35,7 +35,7 @@ impl Spread {
         self.choose(&self.given.lock(), gpus, now)
     }
 
-    /// Gives a simulation to a GPU, of those that answer; `None` where none does.
+    /// Assigns a simulation to one of the GPUs that answer; `None` if none does.
     #[must_use]
     pub fn take(&self, gpus: &[Gpu], now: Instant) -> Option<Gpu> {
         let mut given = self.given.lock();
@@ -75,7 +75,7 @@ mod tests {
         (0..).zip(loads).map(|(index, compute)| Gpu { index, compute: *compute, ..Gpu::default() }).collect()
     }
 
-    /// Which GPUs so many simulations get at once.
+    /// The GPUs of this number of simulations that start at once.
     fn taken(spread: &Spread, gpus: &[Gpu], count: usize, now: Instant) -> Vec<u32> {
         (0..count).map(|_| spread.take(gpus, now).unwrap().index).collect()
     }

@@ -6,13 +6,13 @@ use futures_util::StreamExt;
 
 use super::upstream::{ANSWER, Upstream};
 
-/// What Webots says of a file, and its client hears.
+/// Headers of Webots' answer that the client gets.
 const PASSED_ON: [HeaderName; 4] = [header::CONTENT_TYPE, header::ETAG, header::CACHE_CONTROL, header::LAST_MODIFIED];
 
-/// Asks Webots for what is at this URL, and passes its answer on as fast as the client takes it. `held` is dropped with the
+/// Requests this URL from Webots, and forwards the answer as fast as the client reads it. `held` is dropped with the
 /// answer.
 pub async fn fetch(upstream: &Upstream, url: &str, request: &HttpRequest, held: impl std::any::Any) -> HttpResponse {
-    // A connection that is kept could lead to another simulation on the same port later.
+    // A kept connection could reach a later simulation on the same port.
     let mut asked = upstream.client().get(url).no_decompress().force_close();
     if let Some(tag) = request.headers().get(header::IF_NONE_MATCH) {
         asked = asked.insert_header((header::IF_NONE_MATCH, tag));
@@ -28,8 +28,8 @@ pub async fn fetch(upstream: &Upstream, url: &str, request: &HttpRequest, held: 
             response.insert_header((name, value));
         }
     }
-    // Worlds make what is sent: their pages get an origin of their own, so that they can't act as the pages of this server,
-    // and don't tell their address, which has the token.
+    // The content is made by worlds: it gets an origin of its own, so that it can't act as a page of this server, and no
+    // referrer, because its URL has the token.
     response.insert_header((header::CONTENT_SECURITY_POLICY, "sandbox allow-scripts"));
     response.insert_header((header::REFERRER_POLICY, "no-referrer"));
     let length = answer.headers().get(header::CONTENT_LENGTH).and_then(|length| length.to_str().ok()?.parse().ok());

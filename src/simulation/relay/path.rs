@@ -1,14 +1,14 @@
-//! The path of a stream, `/stream/TOKEN/...`: what of it Webots gets. Pure.
+//! The path of a stream, `/stream/TOKEN/...`, and the part of it that Webots gets. Pure.
 
 use percent_encoding::percent_decode_str;
 
 use crate::simulation::sessions::Token;
 
-/// What the path of each stream begins with.
+/// Prefix of the path of each stream.
 const BEGINNING: &str = "/stream/";
 
-/// The token in a path, as the client has sent it, and what follows for Webots. Nothing where one of them is missing or
-/// would lead out of a folder.
+/// The token in a path, as the client has sent it, and the rest for Webots. `None` if one of them is missing, or if the
+/// rest would leave a folder.
 #[must_use]
 pub fn split(path: &str) -> Option<(Token, &str)> {
     let rest = path.strip_prefix(BEGINNING)?;
@@ -20,7 +20,7 @@ pub fn split(path: &str) -> Option<(Token, &str)> {
     }
 }
 
-/// Whether a part of a path names a file or folder, also for who decodes it twice.
+/// Whether a segment of a path names a file or folder, even if it is decoded twice.
 fn is_name(part: &str) -> bool {
     let Ok(once) = percent_decode_str(part).decode_utf8() else { return false };
     let Ok(twice) = percent_decode_str(&once).decode_utf8() else { return false };

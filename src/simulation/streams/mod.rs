@@ -1,4 +1,4 @@
-//! The streams of running simulations: who may have one, and who watches.
+//! The streams of running simulations: their tokens, and their watchers.
 
 mod streams;
 

@@ -1,5 +1,5 @@
-//! The streams of running simulations, found by tokens: that of the simulation's client, and those of administrators who
-//! watch.
+//! The streams of running simulations, found by tokens: that of the simulation's client, and those of watching
+//! administrators.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -11,17 +11,17 @@ use parking_lot::Mutex;
 use crate::simulation::sessions::Token;
 use crate::simulation::simulation_id::SimulationId;
 
-/// How long after it was given a token of a watcher can be used. Once it is, it holds as long as its connection.
+/// How long a watcher's token can be used after it was issued. A used one is valid as long as its connection.
 const UNUSED: Duration = Duration::from_mins(1);
-/// How many tokens of watchers there may be. Further ones are given once others have ended.
+/// Largest number of watchers' tokens. No further one is issued until another has ended.
 const MOST_WATCHERS: usize = 1000;
 
-/// Tells a session whether somebody watches its simulation.
+/// Notifies a session whether its simulation is watched.
 #[derive(Message, Debug, Clone, Copy, PartialEq, Eq)]
 #[rtype(result = "()")]
 pub struct Watched(pub bool);
 
-/// Where streams are found.
+/// The registry of streams.
 #[derive(Default)]
 pub struct Streams(Mutex<Open>);
 
@@ -47,31 +47,31 @@ struct Watcher {
     watches: bool,
 }
 
-/// What a token leads to.
+/// The stream of a token.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Found {
     /// The simulation.
     pub simulation: SimulationId,
     /// Its port on this machine.
     pub port: u16,
-    /// Whether it is the token of somebody who only watches.
+    /// Whether it is a watcher's token.
     pub only_watches: bool,
 }
 
-/// A stream that can be found. Dropping it ends that, also for those who watch.
+/// A registered stream. Dropping it removes the stream and its watchers' tokens.
 pub struct Registration {
     token: Token,
     streams: Arc<Streams>,
 }
 
-/// The connection of somebody who watches. Dropping it ends its token.
+/// The connection of a watcher. Dropping it ends its token.
 pub struct Watching {
     number: u64,
     streams: Arc<Streams>,
 }
 
 impl Streams {
-    /// Registers the stream of a simulation on this port; `session` hears whether it is watched.
+    /// Registers the stream of a simulation on this port; `session` is notified whether it is watched.
     #[must_use]
     pub fn register(
         self: &Arc<Self>,
@@ -84,7 +84,7 @@ impl Streams {
         Registration { token, streams: Arc::clone(self) }
     }
 
-    /// What a token leads to, if it is one.
+    /// The stream of a token, if the token is valid.
     #[must_use]
     pub fn find(&self, token: &Token) -> Option<Found> {
         let open = self.0.lock();
@@ -98,7 +98,7 @@ impl Streams {
         open.streams.get(&watcher.stream).map(|stream| stream.found(true))
     }
 
-    /// A token with which somebody may watch a simulation, if it streams.
+    /// Issues a token for watching a simulation, if it has a stream.
     #[must_use]
     pub fn watch(&self, simulation: &str) -> Option<Token> {
         let mut open = self.0.lock();
@@ -113,7 +113,7 @@ impl Streams {
         Some(token)
     }
 
-    /// Begins to watch with a token that [`Self::find`] has found. Nothing where it was used already.
+    /// Begins to watch with a token that [`Self::find`] has found. `None` if it was used already.
     #[must_use]
     pub fn begin(self: &Arc<Self>, token: &Token) -> Option<Watching> {
         let mut open = self.0.lock();
@@ -126,7 +126,7 @@ impl Streams {
 }
 
 impl Open {
-    /// Tells a session that it is watched from now on, or no longer: the others don't change that.
+    /// Notifies a session of its first watcher, and of the end of the last one.
     fn tell_if_only_one(&self, stream: u64, is_watched: bool) {
         let watching = self.watchers.values().filter(|watcher| watcher.watches && watcher.stream == stream).count();
         if watching == 1
@@ -195,7 +195,7 @@ mod tests {
         }
     }
 
-    /// Answered once all messages before it have been handled.
+    /// Its answer comes once all earlier messages have been handled.
     #[derive(Message)]
     #[rtype(result = "()")]
     struct Barrier;
