@@ -120,7 +120,11 @@ pub async fn serve(assembly: Application) -> Result<(), AppError> {
         trusted_proxies: server.config.trusted_proxies.clone(),
     };
     let simulations = server.launcher.reached().unwrap_or_else(|| server.config.address_of_simulations().into());
-    let app = move || App::new().app_data(shared.clone()).app_data(Upstream::new(simulations)).configure(configure);
+    let stream_thread = Arbiter::new().handle();
+    let app = move || {
+        let upstream = Upstream::new(simulations, stream_thread.clone());
+        App::new().app_data(shared.clone()).app_data(upstream).configure(configure)
+    };
     let http = server::serve(socket, server.connections.clone(), options, app)?;
     let handle = http.handle();
     let serving = actix_rt::spawn(http);

@@ -4,7 +4,7 @@ use actix_web::http::header::{self, HeaderName};
 use actix_web::{HttpRequest, HttpResponse};
 use futures_util::StreamExt;
 
-use super::upstream::{ANSWER, Upstream};
+use super::upstream::{ANSWER_TIMEOUT, Upstream};
 
 /// Headers of Webots' answer that the client gets.
 const PASSED_ON: [HeaderName; 4] = [header::CONTENT_TYPE, header::ETAG, header::CACHE_CONTROL, header::LAST_MODIFIED];
@@ -17,7 +17,7 @@ pub async fn fetch(upstream: &Upstream, url: &str, request: &HttpRequest, held: 
     if let Some(tag) = request.headers().get(header::IF_NONE_MATCH) {
         asked = asked.insert_header((header::IF_NONE_MATCH, tag));
     }
-    let answer = match actix_rt::time::timeout(ANSWER, asked.send()).await {
+    let answer = match actix_rt::time::timeout(ANSWER_TIMEOUT, asked.send()).await {
         Ok(Ok(answer)) if !answer.status().is_informational() => answer,
         Ok(_) => return HttpResponse::BadGateway().body("Error: the simulation does not answer."),
         Err(_) => return HttpResponse::GatewayTimeout().body("Error: the simulation does not answer."),

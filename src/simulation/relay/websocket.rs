@@ -2,94 +2,98 @@
 //! close codes are not parsed. Each direction is read only as fast as the other end takes it.
 
 use std::cell::Cell;
+use std::io;
+use std::net::TcpStream as StdStream;
 use std::pin::pin;
 use std::time::Duration;
 
+use actix_rt::net::TcpStream;
 use actix_rt::time::timeout;
-use actix_web::HttpRequest;
-use actix_web::HttpResponse;
 use actix_web::web::Bytes;
+use actix_web::{HttpRequest, HttpResponse, ResponseError};
 use actix_web_actors::ws;
 use futures_util::future::{self, Either};
 use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt};
 
-use super::upstream::{ANSWER, Upstream};
+use super::upstream::{ANSWER_TIMEOUT, Upstream, open_websocket};
 use super::watching;
 use crate::shared::http::upgrade;
 
-/// Sizes of the buffers for what Webots sends, scenes and pictures, and for what clients send, in bytes.
-const FROM_WEBOTS: usize = 16 * 1024;
-const FROM_CLIENT: usize = 4 * 1024;
-/// How long the other direction may go on once one has ended.
-const CLOSING: Duration = Duration::from_secs(5);
+/// Size of the buffer for what Webots sends, scenes and pictures, in bytes.
+const WEBOTS_BUFFER: usize = 16 * 1024;
+/// Size of the buffer for what a client sends, in bytes.
+const CLIENT_BUFFER: usize = 4 * 1024;
+/// Timeout of the other direction once one has ended.
+const CLOSE_TIMEOUT: Duration = Duration::from_secs(5);
 
-/// Connects a client with the WebSocket at this URL, or answers why that can't be. Of a client that `only_watches` nothing
-/// reaches Webots but how it wants to watch. `held` is dropped with the connection.
+/// Connects a client with the WebSocket at this URL, or answers why that can't be. A client that `only_watches` can only
+/// say to Webots how it wants to watch. `held` is dropped with the connection.
 pub async fn connect(
     upstream: &Upstream,
     url: &str,
     request: &HttpRequest,
     only_watches: bool,
-    held: impl std::any::Any,
+    held: impl Send + 'static,
 ) -> HttpResponse {
     let mut response = match ws::handshake(request) {
         Ok(response) => response,
         Err(error) => {
-            let status = actix_web::ResponseError::error_response(&error).status();
+            let status = error.error_response().status();
             return HttpResponse::build(status).body(format!("Error: this is a WebSocket: {error}."));
         }
     };
-    let webots = match timeout(ANSWER, upstream.client().ws(url).connect()).await {
-        Ok(Ok((_, framed))) => framed.into_parts(),
+    let (webots, from_webots) = match timeout(ANSWER_TIMEOUT, open_websocket(url)).await {
+        Ok(Ok(opened)) => opened,
         Ok(Err(_)) => return HttpResponse::BadGateway().body("Error: the simulation does not answer."),
         Err(_) => return HttpResponse::GatewayTimeout().body("Error: the simulation does not answer."),
     };
     let upgraded = upgrade::on(request);
+    let stream_thread = upstream.stream_thread().clone();
     actix_rt::spawn(async move {
         // An error: the client has left before the answer.
-        if let Ok(mut client) = upgraded.await {
-            let client_end = (client.tcp.split(), client.read_buffer.into());
-            let webots_end = (tokio::io::split(webots.io), webots.read_buf.freeze());
-            relay(client_end, webots_end, only_watches).await;
-        }
-        drop(held);
+        let Ok(client) = upgraded.await else { return };
+        let (Ok(to_client), Ok(to_webots)) = (client.tcp.into_std(), webots.into_std()) else { return };
+        let held = (held, client.permit);
+        stream_thread.spawn_fn(move || {
+            let ends = [(to_client, client.read_buffer.into()), (to_webots, from_webots)];
+            actix_rt::spawn(async move {
+                if let Err(error) = relay(ends, only_watches).await {
+                    log::debug!("a stream is not relayed: {error}");
+                }
+                drop(held);
+            });
+        });
     });
     response.finish()
 }
 
-/// The reader and the writer of a connection, and what was read of it already.
-type End<R, W> = ((R, W), Bytes);
-
-/// Copies both directions until both have ended, or one has and the other goes on for too long.
-async fn relay<R, W, S, T>(client: End<R, W>, webots: End<S, T>, only_watches: bool)
-where
-    R: AsyncRead + Unpin,
-    W: AsyncWrite + Unpin,
-    S: AsyncRead + Unpin,
-    T: AsyncWrite + Unpin,
-{
-    let ((from_client, mut to_client), sent_by_client) = client;
-    let ((mut from_webots, mut to_webots), sent_by_webots) = webots;
+/// Copies both directions until both have ended, or one has and the other takes too long. The ends are the client's and
+/// that of Webots, with what was read of them already.
+async fn relay(ends: [(StdStream, Bytes); 2], only_watches: bool) -> io::Result<()> {
+    let [(client, sent_by_client), (webots, sent_by_webots)] = ends;
+    let (mut client, mut webots) = (TcpStream::from_std(client)?, TcpStream::from_std(webots)?);
+    let ((from_client, mut to_client), (from_webots, mut to_webots)) = (client.split(), webots.split());
+    let mut from_client = sent_by_client.as_ref().chain(from_client);
+    let mut from_webots = sent_by_webots.as_ref().chain(from_webots);
     // Whether Webots has sent something.
     let has_answered = Cell::new(false);
     let up = async {
-        let mut from_client = sent_by_client.as_ref().chain(from_client);
         if only_watches {
             watching::introduce(from_client, &mut to_webots, &has_answered).await;
         } else {
-            copy(&mut from_client, &mut to_webots, FROM_CLIENT, || {}).await;
+            copy(&mut from_client, &mut to_webots, CLIENT_BUFFER, || {}).await;
         }
         to_webots.shutdown().await.ok();
     };
     let down = async {
-        let mut from_webots = sent_by_webots.as_ref().chain(&mut from_webots);
-        copy(&mut from_webots, &mut to_client, FROM_WEBOTS, || has_answered.set(true)).await;
+        copy(&mut from_webots, &mut to_client, WEBOTS_BUFFER, || has_answered.set(true)).await;
         to_client.shutdown().await.ok();
     };
     match future::select(pin!(up), pin!(down)).await {
-        Either::Left(((), down)) => timeout(CLOSING, down).await.ok(),
-        Either::Right(((), up)) => timeout(CLOSING, up).await.ok(),
+        Either::Left(((), down)) => timeout(CLOSE_TIMEOUT, down).await.ok(),
+        Either::Right(((), up)) => timeout(CLOSE_TIMEOUT, up).await.ok(),
     };
+    Ok(())
 }
 
 /// Copies until one end closes; calls `on_read` after each read.
