@@ -1,4 +1,4 @@
-//! What the administrator tells everybody at the moment: one announcement, or none.
+//! The administrator's current announcement to all clients: one, or none.
 
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
@@ -15,8 +15,8 @@ pub struct Announcements {
     configured: Mutex<Option<Announcement>>,
 }
 
-/// The longest time between two looks whether it is over: the clock may be set meanwhile.
-const LOOK: Duration = Duration::from_secs(10);
+/// Longest time between two checks whether it is over: the clock may be set in between.
+const CHECK_INTERVAL: Duration = Duration::from_secs(10);
 
 impl Announcements {
     /// Begins with that of the configuration. It ends in time while the server runs.
@@ -52,7 +52,7 @@ impl Announcements {
         self.current.borrow().clone()
     }
 
-    /// Hears of changes.
+    /// Follows changes.
     pub fn subscribe(&self) -> watch::Receiver<Option<Arc<Announcement>>> {
         self.current.subscribe()
     }
@@ -61,14 +61,14 @@ impl Announcements {
 /// Ends each announcement when it is over.
 async fn end_in_time(
     current: watch::Sender<Option<Arc<Announcement>>>,
-    mut told: watch::Receiver<Option<Arc<Announcement>>>,
+    mut changes: watch::Receiver<Option<Arc<Announcement>>>,
 ) {
     loop {
-        let until = told.borrow_and_update().as_ref().and_then(|one| one.until);
+        let until = changes.borrow_and_update().as_ref().and_then(|one| one.until);
         let left = until.map(|until| until.duration_since(SystemTime::now()).unwrap_or_default());
         tokio::select! {
-            another = told.changed() => if another.is_err() { return },
-            () = actix_rt::time::sleep(left.unwrap_or_default().min(LOOK)), if left.is_some() => {
+            another = changes.changed() => if another.is_err() { return },
+            () = actix_rt::time::sleep(left.unwrap_or_default().min(CHECK_INTERVAL)), if left.is_some() => {
                 current.send_if_modified(|one| one.take_if(|one| one.is_over()).is_some());
             }
         }
