@@ -7,30 +7,32 @@
 //! |---|---|
 //! | [`shared::text`] | untrusted texts, made safe to show |
 //! | [`shared::config`] | configuration files: loading, errors, kinds of values |
-//! | [`shared::domain`] | addresses, loads, world URLs, repositories, a server's report |
+//! | [`shared::domain`] | addresses, loads, world URLs and the forges that they name, a server's report |
 //! | [`shared::run`] | start, readiness, log, stop |
 //! | [`shared::http`] | pages, live updates, WebSockets, limits, certificates, metrics |
-//! | [`session::placement`] | which server gets the next client |
-//! | `session::announcements` | what the administrator tells everybody |
-//! | [`session::mail`] | notices to the administrator, by mail and by webhook |
+//! | [`session::placement`] | which server gets the next client: ranking, load, cost |
+//! | `session::announcements` | the administrator's message to all clients |
+//! | [`session::mail`] | notices: to whom, what is in them, when they go, by mail and by webhook |
 //! | [`session::fleet`] | the registry and the monitors of simulation servers |
-//! | [`session::web`] | routes, pages and the WebSocket of the session server |
-//! | [`simulation::process`] | process trees and directories of simulations |
-//! | [`simulation::machine`] | readings of the machine, the load |
+//! | [`session::web`] | routes, pages, `/status`, Prometheus metrics and the WebSocket of the session server |
+//! | [`simulation::process`] | process trees: how they start and end; directories of simulations |
+//! | [`simulation::machine`] | readings of the machine and its GPUs, the load |
 //! | [`simulation::checkout`] | worlds checked out with git |
 //! | `simulation::isolation` | how a simulation is launched: its level of isolation, environment and limits |
 //! | [`simulation::container`] | simulations in containers: what a project requests, its image, its compose project |
 //! | [`simulation::ends`] | how simulations have ended: counter, table, kept output |
-//! | [`simulation::webots`] | one running Webots |
+//! | [`simulation::webots`] | one running Webots: command line, output, end |
 //! | [`simulation::client`] | one web client, the session of its simulation |
 //! | [`simulation::slots`] | the slots that clients wait for: leases, the queue, shares |
 //! | [`simulation::sessions`] | how a connection is attached to its session, and how a client resumes it |
 //! | [`simulation::streams`] | the streams of running simulations: which token leads to which, who watches |
 //! | `simulation::relay` | a stream between a client and the port of its Webots |
-//! | `simulation::web` | routes and pages of the simulation server |
+//! | `simulation::web` | routes, pages, `/status` and Prometheus metrics of the simulation server |
+//!
+//! The HTML of pages is in `templates/session` and `templates/simulation`, their styles and scripts in `templates/assets`.
 //!
 //! Each server also has a folder `config` (every key), its `app` (start and end) and its `state` (what its paths share). Files
-//! of `simulation` are the wire [`protocol`](simulation::protocol), the `snapshot` of all simulations, the `simulation_id`, `who` a client is, the `failed_starts`, the `announcer` (key `notify`), `preflight` (`--check`) and `readiness` (`/health`).
+//! of `simulation` are the wire [`protocol`](simulation::protocol), the `snapshot` of all simulations, the `simulation_id`, the `client_identity`, the `failed_starts`, the `announcer` (key `notify`), `preflight` (`--check`) and `readiness` (`/health`).
 //! The programs are in `src/bin`.
 //! Imports point down only, in the order that `tests/project/layering.rs` lists. `session` and `simulation` never see each
 //! other. A child never names its parent: it is given a `Recipient` of its events, which are defined in the child's file.

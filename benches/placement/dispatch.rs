@@ -47,7 +47,7 @@ impl Own {
 
     /// Chooses among the servers that are eligible.
     pub(crate) fn place_among(&mut self, now: f64, eligible: impl Fn(&usize) -> bool) -> Option<usize> {
-        self.fleet.place(self.at(now), eligible)
+        self.fleet.pick(self.at(now), eligible)
     }
 
     fn at(&self, now: f64) -> Instant {

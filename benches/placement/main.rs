@@ -151,7 +151,7 @@ fn speed() {
     (0..SERVERS).for_each(|id| fleet.report(&id, start, report(0)));
     let begin = Instant::now();
     for _ in 0..ROUNDS {
-        black_box(fleet.place(start, |_| true));
+        black_box(fleet.pick(start, |_| true));
     }
     let place = begin.elapsed() / ROUNDS;
     let begin = Instant::now();

@@ -16,7 +16,7 @@ pub struct Announcements {
 }
 
 /// Longest time between two checks whether it has expired, because the clock may be set.
-const LOOK: Duration = Duration::from_secs(10);
+const CHECK_INTERVAL: Duration = Duration::from_secs(10);
 
 impl Announcements {
     /// Starts with the announcement of the configuration, and a task that removes expired ones.
@@ -61,14 +61,14 @@ impl Announcements {
 /// Removes each announcement when it expires.
 async fn end_in_time(
     current: watch::Sender<Option<Arc<Announcement>>>,
-    mut told: watch::Receiver<Option<Arc<Announcement>>>,
+    mut changes: watch::Receiver<Option<Arc<Announcement>>>,
 ) {
     loop {
-        let until = told.borrow_and_update().as_ref().and_then(|one| one.until);
+        let until = changes.borrow_and_update().as_ref().and_then(|one| one.until);
         let left = until.map(|until| until.duration_since(SystemTime::now()).unwrap_or_default());
         tokio::select! {
-            another = told.changed() => if another.is_err() { return },
-            () = actix_rt::time::sleep(left.unwrap_or_default().min(LOOK)), if left.is_some() => {
+            another = changes.changed() => if another.is_err() { return },
+            () = actix_rt::time::sleep(left.unwrap_or_default().min(CHECK_INTERVAL)), if left.is_some() => {
                 current.send_if_modified(|one| one.take_if(|one| one.is_over()).is_some());
             }
         }

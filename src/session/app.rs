@@ -3,7 +3,7 @@
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::time::{Instant, SystemTime};
+use std::time::Instant;
 
 use actix_web::{App, web};
 use tokio::sync::watch;
@@ -17,7 +17,7 @@ use crate::shared::config;
 use crate::shared::http::server::{self, HttpServerOptions};
 use crate::shared::http::{BasicAuth, ConnectionLimiter, LiveUpdates, Metrics};
 use crate::shared::run::{
-    AppError, Phase, ServerCommand, Signals, permanent, raise_open_files, service_manager, start,
+    AppError, Phase, ServerCommand, Signals, limit_clients, permanent, raise_open_files, service_manager, start,
 };
 
 /// Open files that the server itself needs: logs, threads, mail.
@@ -37,10 +37,7 @@ const OUTCOMES: [&str; 4] = ["placed", "unavailable", "not_accepted", "wrong_url
 pub async fn run(mut config: SessionConfig, file: PathBuf) -> Result<(), AppError> {
     let mut signals = Signals::catch()?;
     let files = raise_open_files(u64::MAX);
-    let (connections, clients) = bound_clients(files, &config);
-    if clients == 0 {
-        return Err(AppError::NoClients { files, needed: "one client".to_owned() });
-    }
+    let (connections, clients) = bound_clients(files, &config)?;
     let options = options(&config, connections);
     let connections = ConnectionLimiter::new(connections, clients, config.max_clients_per_address);
     let (phase_sender, phase) = watch::channel(Phase::Open);
@@ -60,7 +57,7 @@ pub async fn run(mut config: SessionConfig, file: PathBuf) -> Result<(), AppErro
     let registry = server.registry.clone();
     actix_rt::spawn(service_manager::feed_watchdog(async move || registry.send(Ping).await.is_ok()));
     tokio::select! {
-        () = obey(&mut signals, &file, &server, port) => {}
+        () = handle_commands(&mut signals, &file, &server, port) => {}
         fault = permanent::stopped("Registry", server.registry.clone()) => return Err(AppError::ActorStopped(fault)),
     }
     log::info!("stopping");
@@ -73,8 +70,8 @@ pub async fn run(mut config: SessionConfig, file: PathBuf) -> Result<(), AppErro
     Ok(())
 }
 
-/// Does what signals ask for, until one asks for the end.
-async fn obey(signals: &mut Signals, file: &Path, server: &AppState, port: u16) {
+/// Handles signals, until the server must stop.
+async fn handle_commands(signals: &mut Signals, file: &Path, server: &AppState, port: u16) {
     loop {
         match signals.next().await {
             ServerCommand::Stop => return,
@@ -101,22 +98,15 @@ fn options(config: &SessionConfig, connections: usize) -> HttpServerOptions {
 
 /// Returns the limits of connections and of clients, so that `files` open files are enough for them and the rest of the
 /// server. The limit of clients is lower: the remaining connections serve the error that there are too many clients.
-fn bound_clients(files: u64, config: &SessionConfig) -> (usize, usize) {
-    let files = usize::try_from(files).unwrap_or(usize::MAX);
+fn bound_clients(files: u64, config: &SessionConfig) -> Result<(usize, usize), AppError> {
+    let all = usize::try_from(files).unwrap_or(usize::MAX);
     let names = config.simulation_servers.iter().filter(|entry| entry.name().is_some()).count();
     let servers = config.simulation_servers.len() - names;
     // It is not known yet how many servers the names resolve to: they reserve at most a quarter.
-    let looked_up = (FILES_PER_SERVER * SERVERS_PER_NAME * names).min(files / 4);
-    let connections = files.saturating_sub(OWN_FILES + FILES_PER_SERVER * servers + looked_up);
-    let clients = connections - connections / 16;
-    if clients < config.max_clients {
-        log::warn!(
-            "{files} files may be open, which is enough for {clients} clients, not for maxClients ({}); ulimit -Hn, or \
-             LimitNOFILE of systemd, allows more",
-            config.max_clients
-        );
-    }
-    (connections, clients.min(config.max_clients))
+    let looked_up = (FILES_PER_SERVER * SERVERS_PER_NAME * names).min(all / 4);
+    let connections = all.saturating_sub(OWN_FILES + FILES_PER_SERVER * servers + looked_up);
+    let possible = connections - connections / 16;
+    Ok((connections, limit_clients(files, possible, config.max_clients, "one client".to_owned())?))
 }
 
 /// Number of threads that serve connections.
@@ -136,31 +126,23 @@ fn assemble(
     for outcome in OUTCOMES {
         picks.with_label_values(&[outcome]).reset();
     }
-    let (timing, client_urls) = (config.timing.clone(), config.client_urls());
-    let trusted_proxies = config.trusted_proxies.clone();
-    let (examples, viewer_script) = (config.examples.clone(), config.viewer_script.clone());
     let announcements = Arc::new(Announcements::start(config.announcement.clone()));
-    let admin_auth = config.admin_password.clone().map(BasicAuth::new);
     let (available_sender, available) = watch::channel(false);
-    let registry = Registry::start(Arc::new(config), latencies, resolver()?, available_sender);
-    let (started, started_at) = (Instant::now(), SystemTime::now());
+    let config = Arc::new(config);
+    let registry = Registry::start(Arc::clone(&config), latencies, resolver()?, available_sender);
     Ok(AppState {
         registry,
         available,
-        timing,
-        client_urls,
+        client_urls: config.client_urls(),
         phase,
         connections,
-        trusted_proxies,
         metrics,
         picks,
         live: LiveUpdates::default(),
         announcements,
-        admin_auth,
-        examples,
-        viewer_script,
-        started,
-        started_at,
+        admin_auth: config.admin_password.clone().map(BasicAuth::new),
+        started: Instant::now(),
+        config,
     })
 }
 

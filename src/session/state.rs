@@ -1,16 +1,16 @@
 //! The state that the routes, the pages and the web clients of a session server share. `app` creates it.
 
 use std::sync::Arc;
-use std::time::{Duration, Instant, SystemTime};
+use std::time::{Duration, Instant};
 
 use actix::prelude::*;
 use tokio::sync::watch;
 
 use super::announcements::Announcements;
-use super::config::{Example, Timing};
+use super::config::SessionConfig;
 use crate::session::fleet::{Pick, PickError, Registry};
 use crate::shared::domain::ClientUrls;
-use crate::shared::http::{BasicAuth, ConnectionKind, ConnectionLimiter, LiveUpdates, Metrics, TrustedProxies};
+use crate::shared::http::{BasicAuth, ConnectionKind, ConnectionLimiter, LiveUpdates, Metrics};
 use crate::shared::run::Phase;
 
 /// The shared state.
@@ -19,34 +19,26 @@ pub struct AppState {
     pub registry: Addr<Registry>,
     /// Whether a simulation server can take a client; the registry publishes it.
     pub available: watch::Receiver<bool>,
-    /// `timing` of the configuration.
-    pub timing: Timing,
+    /// The configuration at the start of the server: only the registry follows a change.
+    pub config: Arc<SessionConfig>,
     /// Forms the URLs of simulation servers for clients.
     pub client_urls: ClientUrls,
     /// Whether the server accepts clients.
     pub phase: watch::Receiver<Phase>,
     /// Limits and counts connections.
     pub connections: ConnectionLimiter,
-    /// Web servers whose `X-Forwarded-For` is trusted.
-    pub trusted_proxies: TrustedProxies,
     /// Counters and histograms for `/metrics`.
     pub metrics: Metrics,
     /// Counts requests for a simulation server, by outcome.
     pub picks: prometheus::IntCounterVec,
     /// The open monitor pages.
     pub live: LiveUpdates,
-    /// What the administrator tells everybody.
+    /// The administrator's announcement.
     pub announcements: Arc<Announcements>,
     /// Checks the administrator's password, where one is configured.
     pub admin_auth: Option<BasicAuth>,
-    /// The examples on the page `/viewer`.
-    pub examples: Vec<Example>,
-    /// URL of Webots' own viewer.
-    pub viewer_script: Option<url::Url>,
     /// When the server was started.
     pub started: Instant,
-    /// The same moment as a time of day.
-    pub started_at: SystemTime,
 }
 
 /// Timeout of a pick by the registry.

@@ -19,7 +19,7 @@ use crate::shared::domain::AdmissionRules;
 use crate::shared::http::server::{self, HttpServerOptions};
 use crate::shared::http::{BasicAuth, ConnectionLimiter, LiveUpdates, Metrics, STREAMS_PER_CLIENT, TCP_PER_CLIENT};
 use crate::shared::run::{
-    AppError, Phase, ServerCommand, Signals, permanent, raise_open_files, service_manager, start,
+    AppError, Phase, ServerCommand, Signals, limit_clients, permanent, raise_open_files, service_manager, start,
 };
 use crate::simulation::checkout::{CacheDir, CheckoutLimits, CheckoutService};
 use crate::simulation::client::{outcome, quota};
@@ -54,7 +54,7 @@ pub struct Application {
     socket: TcpListener,
     signals: Signals,
     phase: watch::Sender<Phase>,
-    asked: Receiver<ServerCommand>,
+    commands: Receiver<ServerCommand>,
 }
 
 impl Application {
@@ -66,10 +66,10 @@ impl Application {
         let signals = Signals::catch()?;
         config.max_clients = bound_clients(&config)?;
         let (phase_sender, phase) = watch::channel(Phase::Open);
-        let (requests, asked) = tokio::sync::mpsc::channel(4);
+        let (requests, commands) = tokio::sync::mpsc::channel(4);
         let socket = bind(&config)?;
         let server = Arc::new(assemble(Arc::new(config), phase, requests)?);
-        Ok(Self { server, socket, signals, phase: phase_sender, asked })
+        Ok(Self { server, socket, signals, phase: phase_sender, commands })
     }
 
     /// Returns the state that routes and web clients share.
@@ -88,18 +88,7 @@ fn bound_clients(config: &SimulationConfig) -> Result<usize, AppError> {
     let wanted = config.max_clients.saturating_mul(each).saturating_add(needed);
     let files = raise_open_files(u64::try_from(wanted).unwrap_or(u64::MAX));
     let rest = usize::try_from(files).unwrap_or(usize::MAX).saturating_sub(needed);
-    let clients = (rest / each).min(config.max_clients);
-    if clients == 0 {
-        return Err(AppError::NoClients { files, needed: format!("{places} places and one client") });
-    }
-    if clients < config.max_clients {
-        log::warn!(
-            "{files} files may be open, which is enough for {clients} clients, not for maxClients ({}); ulimit -Hn, or \
-             LimitNOFILE of systemd, allows more",
-            config.max_clients
-        );
-    }
-    Ok(clients)
+    limit_clients(files, rest / each, config.max_clients, format!("{places} places and one client"))
 }
 
 /// Runs a server until a signal or an administrator stops it.
@@ -107,7 +96,7 @@ fn bound_clients(config: &SimulationConfig) -> Result<usize, AppError> {
 /// # Errors
 /// When an actor that must live has stopped, or the system refuses what the server needs.
 pub async fn serve(assembly: Application) -> Result<(), AppError> {
-    let Application { server, socket, mut signals, phase: phase_sender, mut asked } = assembly;
+    let Application { server, socket, mut signals, phase: phase_sender, mut commands } = assembly;
     let owner = server.containers.as_ref().map(|containers| containers.run().name());
     let _guardian = Guardian::start(server.run.path(), owner)?;
     let shared = web::Data::from(Arc::clone(&server));
@@ -134,7 +123,7 @@ pub async fn serve(assembly: Application) -> Result<(), AppError> {
     let watched = slots.clone();
     actix_rt::spawn(service_manager::feed_watchdog(async move || watched.send(GetSnapshot).await.is_ok()));
     let why = tokio::select! {
-        why = obey(&mut signals, &mut asked, &server, &phase_sender) => why,
+        why = handle_commands(&mut signals, &mut commands, &server, &phase_sender) => why,
         fault = permanent::stopped("SlotPool", slots.clone()) => return Err(AppError::ActorStopped(fault)),
         fault = permanent::stopped("LoadMonitor", server.load_monitor.clone()) => {
             return Err(AppError::ActorStopped(fault));
@@ -156,19 +145,19 @@ pub async fn serve(assembly: Application) -> Result<(), AppError> {
 
 /// Handles signals and requests of administrators, until the server must stop. Returns the reason: `webots-fleet-renew`
 /// decides by this text whether a server was drained or stopped.
-async fn obey(
+async fn handle_commands(
     signals: &mut Signals,
-    asked: &mut Receiver<ServerCommand>,
+    commands: &mut Receiver<ServerCommand>,
     server: &AppState,
     phase: &watch::Sender<Phase>,
 ) -> &'static str {
     loop {
-        let request = tokio::select! {
-            request = signals.next() => request,
-            Some(request) = asked.recv() => request,
+        let command = tokio::select! {
+            command = signals.next() => command,
+            Some(command) = commands.recv() => command,
             () = drained(server) => return "drained: its last simulation has ended",
         };
-        match request {
+        match command {
             ServerCommand::Stop => return "stopping",
             ServerCommand::Drain => {
                 log::info!("draining: no new clients, the server ends when the last has gone");

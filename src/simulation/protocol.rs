@@ -199,7 +199,7 @@ pub fn idle(seconds: Option<u64>) -> String {
     seconds.map_or("idle: never".to_owned(), |seconds| format!("idle: {seconds}"))
 }
 
-/// Why nobody can come back to a simulation; where it is known, why it has ended.
+/// Why a client can't come back to a simulation, with the reason for its end if it is known.
 pub fn ended(why: Option<&str>) -> String {
     error(&why.map_or("this simulation has ended".to_owned(), |why| format!("this simulation has ended: {why}")))
 }

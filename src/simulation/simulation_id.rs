@@ -15,7 +15,7 @@ use crate::shared::run::timestamp_in_milliseconds;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct SimulationId {
     number: u64,
-    asked: Duration,
+    requested: Duration,
 }
 
 static NEXT: AtomicU64 = AtomicU64::new(1);
@@ -23,8 +23,8 @@ static NEXT: AtomicU64 = AtomicU64::new(1);
 impl SimulationId {
     /// Returns a new id; unique on this server.
     pub fn next() -> Self {
-        let asked = SystemTime::UNIX_EPOCH.elapsed().unwrap_or_default();
-        Self { number: NEXT.fetch_add(1, Ordering::Relaxed), asked }
+        let requested = SystemTime::UNIX_EPOCH.elapsed().unwrap_or_default();
+        Self { number: NEXT.fetch_add(1, Ordering::Relaxed), requested }
     }
 
     /// Whether a text has only characters of an id, so that it is safe in a file name.
@@ -37,9 +37,9 @@ impl SimulationId {
 
 impl fmt::Display for SimulationId {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let asked = timestamp_in_milliseconds(SystemTime::UNIX_EPOCH + self.asked);
-        let asked: String = asked.chars().filter(|letter| letter.is_ascii_digit() || *letter == 'T').collect();
-        write!(out, "{asked}-{}", self.number)
+        let requested = timestamp_in_milliseconds(SystemTime::UNIX_EPOCH + self.requested);
+        let requested: String = requested.chars().filter(|letter| letter.is_ascii_digit() || *letter == 'T').collect();
+        write!(out, "{requested}-{}", self.number)
     }
 }
 
@@ -55,7 +55,7 @@ mod tests {
 
     #[test]
     fn an_id_tells_when_and_is_the_name_of_a_file() {
-        let id = SimulationId { number: 17, asked: Duration::from_millis(1_795_385_117_042) };
+        let id = SimulationId { number: 17, requested: Duration::from_millis(1_795_385_117_042) };
         assert_eq!(id.to_string(), "20261122T220517042-17");
         assert!(SimulationId::is_like(&id.to_string()));
         assert!(SimulationId::next() < SimulationId::next());

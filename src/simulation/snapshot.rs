@@ -6,8 +6,8 @@ use actix::prelude::*;
 use serde::Serialize;
 
 use crate::shared::domain::Instances;
+use crate::simulation::client_identity::ClientIdentity;
 use crate::simulation::simulation_id::SimulationId;
-use crate::simulation::who::Who;
 
 /// A change of a simulation.
 #[derive(Debug)]
@@ -73,9 +73,9 @@ pub struct Simulation {
     pub id: SimulationId,
     /// The world's URL.
     pub world: String,
-    /// Who its client is; for administrators alone.
+    /// Its client's identity, only for administrators.
     #[serde(skip)]
-    pub who: Who,
+    pub identity: ClientIdentity,
     /// Its state.
     pub stage: Stage,
     /// When its client requested it, in seconds since 1970.

@@ -21,7 +21,7 @@ const SESSION: [&str; 9] = [
     "session::app",
 ];
 const SIMULATION: [&str; 24] = [
-    "simulation::who",
+    "simulation::client_identity",
     "simulation::simulation_id",
     "simulation::ends",
     "simulation::snapshot",

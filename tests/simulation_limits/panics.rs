@@ -11,6 +11,7 @@ use webots_fleet::shared::domain::ProjectUrl;
 use webots_fleet::shared::http::websocket::MessageReader;
 use webots_fleet::shared::http::{ConnectionKind, Peer};
 use webots_fleet::simulation::client::WebClient;
+use webots_fleet::simulation::client_identity::ClientIdentity;
 use webots_fleet::simulation::ends::EndReason;
 use webots_fleet::simulation::machine::LoadMonitor;
 use webots_fleet::simulation::protocol::Mode;
@@ -20,7 +21,6 @@ use webots_fleet::simulation::snapshot::Stage;
 use webots_fleet::simulation::state::AppState;
 use webots_fleet::simulation::streams::Watched;
 use webots_fleet::simulation::webots::{LaunchSpec, Stop, Webots, WebotsEvent, WebotsExit};
-use webots_fleet::simulation::who::Who;
 
 use crate::inside::{Inside, arm, ask};
 use crate::support::SOON;
@@ -144,7 +144,8 @@ async fn launch(server: &AppState) -> (Addr<Webots>, UnboundedReceiver<WebotsExi
     let (exits, ended) = unbounded_channel();
     let listener = Listener { places, exits }.start();
     let world = ProjectUrl::parse(&arm()).unwrap();
-    let lease = SlotLease::new(&server.slots, listener.clone().recipient(), &world, (Peer::Unknown, Who::default()));
+    let lease =
+        SlotLease::new(&server.slots, listener.clone().recipient(), &world, (Peer::Unknown, ClientIdentity::default()));
     let port = granted.recv().await.unwrap();
     let project = server.checkouts.start(world, server.run.instance().unwrap(), |_| ()).await.unwrap().unwrap();
     let spec = LaunchSpec {

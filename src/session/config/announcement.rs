@@ -1,4 +1,4 @@
-//! The key `announcement`: what the administrator tells everybody.
+//! The key `announcement`: the administrator's message to all clients.
 
 use std::time::SystemTime;
 
@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use crate::shared::run::{read_timestamp, timestamp};
 use crate::shared::text::one_line;
 
-/// What the administrator tells everybody.
+/// The administrator's message to all clients.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(try_from = "WireAnnouncement", into = "WireAnnouncement")]
 pub struct Announcement {
@@ -25,8 +25,8 @@ struct WireAnnouncement {
     until: Option<String>,
 }
 
-/// How many letters an announcement may have.
-const LENGTH: usize = 300;
+/// Longest announcement, in characters.
+const MAX_LENGTH: usize = 300;
 
 impl Announcement {
     /// Makes an announcement; `until` is a time of RFC 3339.
@@ -35,8 +35,8 @@ impl Announcement {
     /// What is wrong with it, in words.
     pub fn new(text: &str, until: Option<&str>) -> Result<Self, String> {
         let text = one_line(text.trim());
-        if text.is_empty() || text.chars().count() > LENGTH {
-            return Err(format!("the text of an announcement has 1 to {LENGTH} letters"));
+        if text.is_empty() || text.chars().count() > MAX_LENGTH {
+            return Err(format!("the text of an announcement has 1 to {MAX_LENGTH} letters"));
         }
         let until = until.map(|until| {
             read_timestamp(until)

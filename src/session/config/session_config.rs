@@ -72,7 +72,7 @@ pub struct SessionConfig {
     /// URL to which each mail's notices are posted as JSON, `{"text": ...}`, as Slack and Matrix take them. Default: none.
     #[serde(default)]
     pub webhook: Option<Secret>,
-    /// What open viewers and the monitor tell everybody: `{"text": ..., "until": ...}`. Default: none.
+    /// A message that open viewers and the monitor show: `{"text": ..., "until": ...}`. Default: none.
     #[serde(default)]
     pub announcement: Option<Announcement>,
     /// Password for actions such as `/announcement`. Default: none, and actions are off.
@@ -153,7 +153,7 @@ impl SessionConfig {
         PlacementPolicy {
             threshold: self.load_threshold,
             client_cost: self.client_cost,
-            patience: self.timing.placement,
+            placement_timeout: self.timing.placement,
             settling: SETTLING,
         }
     }

@@ -160,7 +160,7 @@ impl Registry {
         let eligible = |address: &PublicAddress| world.is_none_or(|world| accepts(address, world) == Some(true));
         let now = Instant::now();
         let picked =
-            if self.quota.take(from) { fleet.place(now, eligible) } else { fleet.pick_unreserved(now, eligible) };
+            if self.quota.take(from) { fleet.pick(now, eligible) } else { fleet.pick_unreserved(now, eligible) };
         picked.ok_or_else(|| match world {
             Some(world) if is_refused(servers.records(), world) => PickError::NotAccepted(world.repository()),
             _ => PickError::Unavailable,

@@ -91,12 +91,12 @@ pub(super) struct Backend {
     /// What a client is expected to add to the load, in percent.
     cost: f64,
     /// When this server was chosen last, as a number that grows with each placement of the fleet.
-    pub(super) turn: u64,
+    pub(super) last_pick: u64,
 }
 
 impl Backend {
     /// A server without reports: down until its first one.
-    pub(super) fn new(policy: &PlacementPolicy, turn: u64) -> Self {
+    pub(super) fn new(policy: &PlacementPolicy, last_pick: u64) -> Self {
         Self {
             up: false,
             last: None,
@@ -109,7 +109,7 @@ impl Backend {
             fit: CostFit::new(policy.client_cost),
             cost: believable(policy.client_cost),
             estimate: Estimate::default(),
-            turn,
+            last_pick,
         }
     }
 
@@ -120,7 +120,7 @@ impl Backend {
         report: LoadReport,
         policy: &PlacementPolicy,
         fleet: &mut FleetCost,
-        peers: &mut Replicas,
+        replicas: &mut Replicas,
     ) {
         if !report.load.is_finite() || report.load < 0.0 {
             self.lose();
@@ -129,7 +129,7 @@ impl Backend {
         if self.last.is_some_and(|(at, _)| now < at) {
             return;
         }
-        self.note_changes(now, report.instances, peers);
+        self.note_changes(now, report.instances, replicas);
         self.fresh = 0;
         self.settle(now, policy);
         self.learn(now, report);
@@ -144,24 +144,24 @@ impl Backend {
     }
 
     /// Records that a client was sent here.
-    pub(super) fn place(&mut self, now: Instant, takes_room: bool) {
+    pub(super) fn add_placement(&mut self, now: Instant, takes_room: bool) {
         self.in_flight.push_back(Placement { at: now, takes_room });
         self.reserved += usize::from(takes_room);
         self.fresh += usize::from(takes_room);
     }
 
     /// Gives up overdue clients.
-    pub(super) fn expire(&mut self, now: Instant, policy: &PlacementPolicy, peers: &mut Replicas) {
-        let is_late = |placed: &Placement| now.saturating_duration_since(placed.at) >= policy.patience;
+    pub(super) fn expire(&mut self, now: Instant, policy: &PlacementPolicy, replicas: &mut Replicas) {
+        let is_late = |placed: &Placement| now.saturating_duration_since(placed.at) >= policy.placement_timeout;
         let late = self.in_flight.partition_point(is_late);
         let given_up = self.in_flight.drain(..late).filter(|placed| placed.takes_room).count();
         self.reserved -= given_up;
-        peers.count(0.0, count(given_up));
+        replicas.count(0.0, count(given_up));
     }
 
     /// When the oldest placement is given up, unless its client arrives before.
     pub(super) fn next_expiry(&self, policy: &PlacementPolicy) -> Option<Instant> {
-        self.in_flight.front().and_then(|placed| placed.at.checked_add(policy.patience))
+        self.in_flight.front().and_then(|placed| placed.at.checked_add(policy.placement_timeout))
     }
 
     /// Whether a client can be sent here.
@@ -257,7 +257,7 @@ impl Backend {
     }
 
     /// Compares the report with the one before: which clients arrived, which left.
-    fn note_changes(&mut self, now: Instant, new: Option<ClientCounts>, peers: &mut Replicas) {
+    fn note_changes(&mut self, now: Instant, new: Option<ClientCounts>, replicas: &mut Replicas) {
         let Some(new) = new else {
             // A load alone does not show arrivals: every placement is assumed to have arrived at once.
             let all = self.in_flight.drain(..);
@@ -275,8 +275,8 @@ impl Backend {
         };
         let arrivals = usize::try_from(new.arrivals - old.arrivals).unwrap_or(usize::MAX);
         let came = arrivals.min(self.in_flight.len());
-        peers.count(count(arrivals), count(came));
-        self.clients_per_placement = peers.clients_per_placement();
+        replicas.count(count(arrivals), count(came));
+        self.clients_per_placement = replicas.clients_per_placement();
         // Reports do not identify clients, so arrivals are matched to the most recent placements. If the oldest were
         // taken, a client that never arrives would stay in flight as long as others follow it.
         for Placement { at, takes_room } in self.in_flight.drain(self.in_flight.len() - came..) {
@@ -324,7 +324,7 @@ mod tests {
         }
 
         fn place(&mut self, seconds: f64) {
-            self.0.place(self.at(seconds), true);
+            self.0.add_placement(self.at(seconds), true);
         }
 
         /// A report with a load and, of the server's clients, those present and the arrivals.

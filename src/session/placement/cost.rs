@@ -308,7 +308,7 @@ mod tests {
         for noise in [5.0, 8.0, 13.0, 40.0] {
             let (mut fleet, now) = taught(&[(30, 3.0, 0), (60, 5.0 + noise, 1), (10, 3.0, 0)]);
             assert_near(fleet.client_cost(&0), 2.0, 0.1);
-            let placed = (0..40).filter(|_| fleet.place(now, |_| true).is_some()).count();
+            let placed = (0..40).filter(|_| fleet.pick(now, |_| true).is_some()).count();
             assert_eq!(placed, 40, "at {:?} % each", fleet.client_cost(&0));
         }
     }

@@ -49,7 +49,7 @@ impl Ejection {
     }
 
     /// Records that a client was sent to the server.
-    pub(super) fn place(&mut self, now: Instant) {
+    pub(super) fn note_pick(&mut self, now: Instant) {
         if self.times > 0 && self.until.is_none() {
             self.eject(now);
             self.is_on_trial = true;
@@ -105,7 +105,7 @@ mod tests {
             now = until;
             ejection.expire(now);
             assert_eq!(ejection.until(), None, "a client may try");
-            ejection.place(now);
+            ejection.note_pick(now);
             assert!(ejection.until().is_some(), "one is enough");
             ejection.report(now, failed);
         }
@@ -122,7 +122,7 @@ mod tests {
         for _ in 0..5 {
             now += Duration::from_secs(30);
             ejection.expire(now);
-            ejection.place(now);
+            ejection.note_pick(now);
             ejection.report(now, 3);
             assert_eq!(ejection.until(), Some(now + Duration::from_secs(30)));
         }

@@ -24,7 +24,7 @@ use std::time::Instant;
 ///     fleet.add(id);
 ///     fleet.report(&id, now, LoadReport { load, instances: None });
 /// }
-/// assert_eq!(fleet.place(now, |_| true), Some("idle"));
+/// assert_eq!(fleet.pick(now, |_| true), Some("idle"));
 /// assert_eq!(fleet.effective_load(&"idle"), Some(5.0));
 /// ```
 #[derive(Debug)]
@@ -35,9 +35,10 @@ pub struct LoadBalancer<Id> {
     servers: Slab<Server<Id>>,
     numbers: HashMap<Id, usize>,
     cost: FleetCost,
-    peers: Replicas,
-    order: Ranking,
-    turns: u64,
+    replicas: Replicas,
+    ranking: Ranking,
+    /// Number of picks.
+    picks: u64,
 }
 
 #[derive(Debug)]
@@ -45,7 +46,7 @@ struct Server<Id> {
     id: Id,
     backend: Backend,
     ejection: Ejection,
-    standing: RankEntry,
+    rank_entry: RankEntry,
 }
 
 impl<Id: Clone + Eq + Hash> LoadBalancer<Id> {
@@ -56,9 +57,9 @@ impl<Id: Clone + Eq + Hash> LoadBalancer<Id> {
             servers: Slab::new(),
             numbers: HashMap::new(),
             cost: FleetCost::default(),
-            peers: Replicas::default(),
-            order: Ranking::default(),
-            turns: 0,
+            replicas: Replicas::default(),
+            ranking: Ranking::default(),
+            picks: 0,
         }
     }
 
@@ -66,17 +67,17 @@ impl<Id: Clone + Eq + Hash> LoadBalancer<Id> {
     pub fn set_policy(&mut self, policy: PlacementPolicy) {
         self.policy = policy;
         for (number, server) in &mut self.servers {
-            server.sort_in(number, &self.policy, &mut self.order);
+            server.sort_in(number, &self.policy, &mut self.ranking);
         }
     }
 
     /// Adds a server, which is down until its first report. A known server is not changed.
     pub fn add(&mut self, id: Id) {
-        self.turns += 1;
+        self.picks += 1;
         if let Entry::Vacant(entry) = self.numbers.entry(id) {
-            let (id, backend) = (entry.key().clone(), Backend::new(&self.policy, self.turns));
-            let (ejection, standing) = (Ejection::default(), RankEntry::default());
-            entry.insert(self.servers.insert(Server { id, backend, ejection, standing }));
+            let (id, backend) = (entry.key().clone(), Backend::new(&self.policy, self.picks));
+            let (ejection, rank_entry) = (Ejection::default(), RankEntry::default());
+            entry.insert(self.servers.insert(Server { id, backend, ejection, rank_entry }));
         }
     }
 
@@ -85,16 +86,16 @@ impl<Id: Clone + Eq + Hash> LoadBalancer<Id> {
         let Some(number) = self.numbers.remove(id) else { return };
         if let Some(server) = self.servers.try_remove(number) {
             self.cost.replace(server.backend.estimate(), Estimate::default());
-            self.order.put(number, server.standing, RankEntry::default());
+            self.ranking.update(number, server.rank_entry, RankEntry::default());
         }
     }
 
     /// Records what a server answered at `now`. A server that is not in the fleet is ignored.
     pub fn report(&mut self, id: &Id, now: Instant, report: LoadReport) {
         let Some((number, server)) = find(&self.numbers, &mut self.servers, id) else { return };
-        server.backend.expire(now, &self.policy, &mut self.peers);
-        server.backend.report(now, report, &self.policy, &mut self.cost, &mut self.peers);
-        server.sort_in(number, &self.policy, &mut self.order);
+        server.backend.expire(now, &self.policy, &mut self.replicas);
+        server.backend.report(now, report, &self.policy, &mut self.cost, &mut self.replicas);
+        server.sort_in(number, &self.policy, &mut self.ranking);
     }
 
     /// Records how many of a server's last starts in a row have failed for a reason of its own. After some, other
@@ -103,7 +104,7 @@ impl<Id: Clone + Eq + Hash> LoadBalancer<Id> {
         let Some((number, server)) = find(&self.numbers, &mut self.servers, id) else { return };
         server.ejection.expire(now);
         server.ejection.report(now, failed);
-        server.sort_in(number, &self.policy, &mut self.order);
+        server.sort_in(number, &self.policy, &mut self.ranking);
     }
 
     /// Whether others are preferred to a server, because its last starts have failed.
@@ -115,41 +116,41 @@ impl<Id: Clone + Eq + Hash> LoadBalancer<Id> {
     pub fn lose(&mut self, id: &Id) {
         let Some((number, server)) = find(&self.numbers, &mut self.servers, id) else { return };
         server.backend.lose();
-        server.sort_in(number, &self.policy, &mut self.order);
+        server.sort_in(number, &self.policy, &mut self.ranking);
     }
 
     /// Returns the server with the lowest load among those that have room and are `eligible`, and counts the client as
     /// sent there. Of servers with equal loads it is the one that was chosen longest ago; ejected servers come last.
-    pub fn place(&mut self, now: Instant, eligible: impl Fn(&Id) -> bool) -> Option<Id> {
-        self.send(now, true, eligible)
+    pub fn pick(&mut self, now: Instant, eligible: impl Fn(&Id) -> bool) -> Option<Id> {
+        self.pick_from(now, true, eligible)
     }
 
     /// The same for a client that may never arrive. It counts when servers are compared, and reserves no room: any
     /// number of these does not make a server full before they have arrived.
     pub fn pick_unreserved(&mut self, now: Instant, eligible: impl Fn(&Id) -> bool) -> Option<Id> {
-        self.send(now, false, eligible)
+        self.pick_from(now, false, eligible)
     }
 
-    fn send(&mut self, now: Instant, takes_room: bool, eligible: impl Fn(&Id) -> bool) -> Option<Id> {
+    fn pick_from(&mut self, now: Instant, takes_room: bool, eligible: impl Fn(&Id) -> bool) -> Option<Id> {
         self.expire(now);
         let is_eligible = |number: &usize| self.servers.get(*number).is_some_and(|server| eligible(&server.id));
-        let number = self.order.servers().find(is_eligible)?;
-        self.turns += 1;
+        let number = self.ranking.servers().find(is_eligible)?;
+        self.picks += 1;
         let server = self.servers.get_mut(number)?;
-        server.backend.turn = self.turns;
-        server.backend.place(now, takes_room);
-        server.ejection.place(now);
-        server.sort_in(number, &self.policy, &mut self.order);
+        server.backend.last_pick = self.picks;
+        server.backend.add_placement(now, takes_room);
+        server.ejection.note_pick(now);
+        server.sort_in(number, &self.policy, &mut self.ranking);
         Some(server.id.clone())
     }
 
     /// Gives up overdue placements, and ends ejections.
     fn expire(&mut self, now: Instant) {
-        for number in self.order.expired(now).collect::<Vec<_>>() {
+        for number in self.ranking.expired(now).collect::<Vec<_>>() {
             if let Some(server) = self.servers.get_mut(number) {
                 server.ejection.expire(now);
-                server.backend.expire(now, &self.policy, &mut self.peers);
-                server.sort_in(number, &self.policy, &mut self.order);
+                server.backend.expire(now, &self.policy, &mut self.replicas);
+                server.sort_in(number, &self.policy, &mut self.ranking);
             }
         }
     }
@@ -157,7 +158,7 @@ impl<Id: Clone + Eq + Hash> LoadBalancer<Id> {
     /// Whether some server can take a client.
     pub fn available(&mut self, now: Instant) -> bool {
         self.expire(now);
-        self.order.servers().next().is_some()
+        self.ranking.servers().next().is_some()
     }
 
     /// The load, in percent, that is expected once it shows all clients that reserve room; `None` if the server is
@@ -201,13 +202,13 @@ fn find<'servers, Id: Eq + Hash>(
 
 impl<Id> Server<Id> {
     /// Updates the rank of a server after a change.
-    fn sort_in(&mut self, number: usize, policy: &PlacementPolicy, order: &mut Ranking) {
+    fn sort_in(&mut self, number: usize, policy: &PlacementPolicy, ranking: &mut Ranking) {
         let load = self.backend.rank_load().filter(|_| self.backend.has_room(policy));
         let until = self.ejection.until();
-        let rank = load.map(|load| Rank { is_ejected: until.is_some(), load, turn: self.backend.turn });
+        let rank = load.map(|load| Rank { is_ejected: until.is_some(), load, last_pick: self.backend.last_pick });
         let expiry = self.backend.next_expiry(policy).into_iter().chain(until).min();
-        let standing = RankEntry { rank, expiry };
-        order.put(number, std::mem::replace(&mut self.standing, standing), standing);
+        let entry = RankEntry { rank, expiry };
+        ranking.update(number, std::mem::replace(&mut self.rank_entry, entry), entry);
     }
 }
 
@@ -243,9 +244,9 @@ mod tests {
         let mut fleet = LoadBalancer::new(PlacementPolicy::default());
         assert!(!fleet.available(now));
         fleet.add("a");
-        assert_eq!((fleet.available(now), fleet.place(now, |_| true)), (false, None));
+        assert_eq!((fleet.available(now), fleet.pick(now, |_| true)), (false, None));
         fleet.report(&"a", now, load_only(20.0));
-        assert_eq!((fleet.available(now), fleet.place(now, |_| true)), (true, Some("a")));
+        assert_eq!((fleet.available(now), fleet.pick(now, |_| true)), (true, Some("a")));
         fleet.lose(&"a");
         assert_eq!((fleet.available(now), fleet.effective_load(&"a")), (false, None));
         fleet.report(&"a", now, load_only(20.0));
@@ -260,8 +261,8 @@ mod tests {
     fn only_an_eligible_server_is_chosen() {
         let now = Instant::now();
         let mut fleet = fleet(2.0, now, [load_only(1.0), load_only(50.0)]);
-        assert_eq!(fleet.place(now, |id| *id != 0), Some(1));
-        assert_eq!(fleet.place(now, |_| false), None);
+        assert_eq!(fleet.pick(now, |id| *id != 0), Some(1));
+        assert_eq!(fleet.pick(now, |_| false), None);
     }
 
     #[test]
@@ -283,7 +284,7 @@ mod tests {
             let now = Instant::now();
             let mut fleet = fleet(2.0, now, [LoadReport { load, instances }]);
             assert_eq!(fleet.available(now), available, "{why}");
-            assert_eq!(fleet.place(now, |_| true).is_some(), available, "{why}");
+            assert_eq!(fleet.pick(now, |_| true).is_some(), available, "{why}");
         }
     }
 
@@ -293,10 +294,10 @@ mod tests {
         let mut report = full_report(0.0, 8, 8);
         report.instances = report.instances.map(|instances| ClientCounts { places: 10, ..instances });
         let mut few_places = fleet(2.0, now, [report]);
-        assert_eq!([(); 3].map(|()| few_places.place(now, |_| true)), [Some(0), Some(0), None]);
+        assert_eq!([(); 3].map(|()| few_places.pick(now, |_| true)), [Some(0), Some(0), None]);
 
         let mut loaded = fleet(2.0, now, [load_only(90.0)]);
-        assert_eq!([(); 4].map(|()| loaded.place(now, |_| true)), [Some(0), Some(0), Some(0), None]);
+        assert_eq!([(); 4].map(|()| loaded.pick(now, |_| true)), [Some(0), Some(0), Some(0), None]);
         assert_eq!(loaded.effective_load(&0), Some(96.0));
     }
 
@@ -312,8 +313,8 @@ mod tests {
         let now = Instant::now();
         let at = |seconds| now + Duration::from_secs_f64(seconds);
         let mut fleet = fleet(2.0, now, [full_report(92.9, 10, 10)]);
-        fleet.place(now, |_| true);
-        fleet.place(at(1.0), |_| true);
+        fleet.pick(now, |_| true);
+        fleet.pick(at(1.0), |_| true);
         assert_eq!((fleet.available(at(14.9)), fleet.in_flight(&0)), (false, 2));
         assert_eq!((fleet.available(at(15.0)), fleet.in_flight(&0)), (true, 1));
         assert_eq!((fleet.available(at(16.0)), fleet.in_flight(&0)), (true, 0));
@@ -359,7 +360,7 @@ mod tests {
         let place = |fleet: &mut LoadBalancer<u32>, seconds, clients| -> Vec<u32> {
             fleet.report(&0, at(seconds), full_report(1.0, 0, 0));
             fleet.report(&1, at(seconds), full_report(50.0, 0, 0));
-            (0..clients).filter_map(|_| fleet.place(at(seconds), |_| true)).collect()
+            (0..clients).filter_map(|_| fleet.pick(at(seconds), |_| true)).collect()
         };
         assert_eq!(place(&mut fleet, 0, 2), [0, 0]);
         fleet.note_failures(&0, at(1), 2);
@@ -382,8 +383,8 @@ mod tests {
         let mut fleet = fleet(2.0, now, [load_only(10.0), load_only(20.0)]);
         (0..2).for_each(|id| fleet.note_failures(&id, now, 5));
         assert!(fleet.available(now));
-        assert_eq!(fleet.place(now, |_| true), Some(0));
-        assert_eq!(fleet.place(now, |id| *id == 1), Some(1));
+        assert_eq!(fleet.pick(now, |_| true), Some(0));
+        assert_eq!(fleet.pick(now, |id| *id == 1), Some(1));
     }
 
     #[test]
@@ -396,13 +397,13 @@ mod tests {
         let mut beside = [(); 2].map(|()| fleet(0.25, now, [report(0)]));
         for client in 0..300_u32 {
             let at = now + Duration::from_secs(client.into());
-            beside[usize::from(client % 2 == 0)].place(at, |_| true);
+            beside[usize::from(client % 2 == 0)].pick(at, |_| true);
             for fleet in &mut beside {
                 fleet.report(&0, at, report(client + 1));
             }
         }
         let at = now + Duration::from_mins(5);
-        let placed = beside.map(|mut fleet| std::iter::from_fn(|| fleet.place(at, |_| true)).count());
+        let placed = beside.map(|mut fleet| std::iter::from_fn(|| fleet.pick(at, |_| true)).count());
         assert!(placed.iter().all(|placed| (95..=115).contains(placed)), "200 places are left: {placed:?}");
     }
 
@@ -419,7 +420,7 @@ mod tests {
         let mut placed = 0;
         for second in 2..15 {
             let at = now + Duration::from_secs(second);
-            placed += std::iter::from_fn(|| fleet.place(at, |_| true)).count();
+            placed += std::iter::from_fn(|| fleet.pick(at, |_| true)).count();
             fleet.report(&0, at, report(0, 1_000));
         }
         assert_eq!(placed, 20, "of 20 clients that wait for 20 places");
@@ -428,7 +429,7 @@ mod tests {
     /// Sends this many clients at once; returns how many each server got.
     fn burst(fleet: &mut LoadBalancer<u32>, now: Instant, clients: usize, servers: u32) -> Vec<usize> {
         for _ in 0..clients {
-            fleet.place(now, |_| true);
+            fleet.pick(now, |_| true);
         }
         (0..servers).map(|id| fleet.in_flight(&id)).collect()
     }
@@ -478,7 +479,7 @@ mod tests {
                 match action {
                     0 => fleet.lose(&id),
                     1 => { fleet.remove(&id); fleet.add(id); }
-                    2 => prop_assert_eq!(fleet.available(now), fleet.place(now, |_| true).is_some()),
+                    2 => prop_assert_eq!(fleet.available(now), fleet.pick(now, |_| true).is_some()),
                     3 => prop_assert_eq!(fleet.available(now), fleet.pick_unreserved(now, |_| true).is_some()),
                     _ => fleet.report(&id, now, LoadReport { load, instances }),
                 }

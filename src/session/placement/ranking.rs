@@ -14,7 +14,7 @@ use std::time::Instant;
 pub(super) struct Rank {
     pub(super) is_ejected: bool,
     pub(super) load: f64,
-    pub(super) turn: u64,
+    pub(super) last_pick: u64,
 }
 
 impl Eq for Rank {}
@@ -22,7 +22,7 @@ impl Eq for Rank {}
 impl Ord for Rank {
     fn cmp(&self, other: &Self) -> Ordering {
         let ejected = self.is_ejected.cmp(&other.is_ejected);
-        ejected.then(self.load.total_cmp(&other.load)).then(self.turn.cmp(&other.turn))
+        ejected.then(self.load.total_cmp(&other.load)).then(self.last_pick.cmp(&other.last_pick))
     }
 }
 
@@ -50,7 +50,7 @@ pub(super) struct Ranking {
 
 impl Ranking {
     /// Moves a server from one entry to another.
-    pub(super) fn put(&mut self, server: usize, before: RankEntry, now: RankEntry) {
+    pub(super) fn update(&mut self, server: usize, before: RankEntry, now: RankEntry) {
         if before.rank != now.rank {
             before.rank.map(|rank| self.ranked.remove(&(rank, server)));
             now.rank.map(|rank| self.ranked.insert((rank, server)));

@@ -41,31 +41,31 @@ mod tests {
     use super::*;
 
     /// Clients that arrive one by one, of which each `n`th was sent from here.
-    fn after(peers: &mut Replicas, clients: u32, n: u32) -> f64 {
+    fn after(replicas: &mut Replicas, clients: u32, n: u32) -> f64 {
         for client in 1..=clients {
-            peers.count(1.0, f64::from(u8::from(client % n == 0)));
+            replicas.count(1.0, f64::from(u8::from(client % n == 0)));
         }
-        peers.clients_per_placement()
+        replicas.clients_per_placement()
     }
 
     #[test]
     fn the_number_of_session_servers_is_learned_and_forgotten() {
-        let mut peers = Replicas::default();
-        assert_eq!(after(&mut peers, 500, 1).to_bits(), 1.0_f64.to_bits());
-        let four = after(&mut peers, 1000, 4);
+        let mut replicas = Replicas::default();
+        assert_eq!(after(&mut replicas, 500, 1).to_bits(), 1.0_f64.to_bits());
+        let four = after(&mut replicas, 1000, 4);
         assert!((3.0..=MOST).contains(&four), "{four}");
-        let one = after(&mut peers, 1000, 1);
+        let one = after(&mut replicas, 1000, 1);
         assert!(one < 1.1, "{one}");
     }
 
     #[test]
     fn clients_that_never_come_and_absurd_counts_do_no_harm() {
-        let mut peers = Replicas::default();
-        peers.count(0.0, 1e9);
-        assert_eq!(peers.clients_per_placement().to_bits(), 1.0_f64.to_bits());
-        peers.count(1e19, 0.0);
-        assert!(peers.clients_per_placement() <= MOST);
-        let recovered = after(&mut peers, 1000, 1);
+        let mut replicas = Replicas::default();
+        replicas.count(0.0, 1e9);
+        assert_eq!(replicas.clients_per_placement().to_bits(), 1.0_f64.to_bits());
+        replicas.count(1e19, 0.0);
+        assert!(replicas.clients_per_placement() <= MOST);
+        let recovered = after(&mut replicas, 1000, 1);
         assert!(recovered < 1.1, "{recovered}");
     }
 }

@@ -1,4 +1,4 @@
-//! What administrators do: each action needs their password.
+//! Actions of administrators: each needs their password.
 
 use actix_web::{HttpRequest, HttpResponse, web};
 use serde::Deserialize;
@@ -13,10 +13,10 @@ pub fn configure(app: &mut web::ServiceConfig) {
     app.service(path("/announcement", POST, announcement));
 }
 
-/// What is to be announced; nothing without a text.
+/// The body of `/announcement`; without a text the announcement ends.
 #[derive(Default, Deserialize)]
 #[serde(deny_unknown_fields)]
-struct Order {
+struct AnnouncementRequest {
     #[serde(default)]
     text: String,
     #[serde(default)]
@@ -24,12 +24,12 @@ struct Order {
 }
 
 async fn announcement(request: HttpRequest, payload: web::Payload, server: web::Data<AppState>) -> HttpResponse {
-    let peer = server.trusted_proxies.peer(&request);
+    let peer = server.config.trusted_proxies.peer(&request);
     if let Some(refusal) = refuse_action(server.admin_auth.as_ref(), &request, peer) {
         return refusal;
     }
     let order = body::json(&request, payload, "{\"text\": TEXT, \"until\": TIME}").await;
-    let Order { text, until } = match order {
+    let AnnouncementRequest { text, until } = match order {
         Ok(order) => order,
         Err(refusal) => return refusal,
     };

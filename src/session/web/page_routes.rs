@@ -1,5 +1,7 @@
 //! Routes of the session server's pages, with their assets and event streams.
 
+use std::time::SystemTime;
+
 use actix_web::{HttpRequest, HttpResponse, web};
 use askama::Template;
 
@@ -26,7 +28,7 @@ pub fn configure(app: &mut web::ServiceConfig) {
 }
 
 async fn monitor(server: web::Data<AppState>) -> HttpResponse {
-    let (clients, started) = (server.clients(), server.started_at);
+    let (clients, started) = (server.clients(), SystemTime::now() - server.started.elapsed());
     let announcement = server.announcements.current();
     let more = (announcement.as_deref(), server.admin_auth.is_some());
     with_status(&server, |status| {
@@ -36,7 +38,7 @@ async fn monitor(server: web::Data<AppState>) -> HttpResponse {
 }
 
 async fn events(request: HttpRequest, server: web::Data<AppState>) -> HttpResponse {
-    let permit = match server.connections.admit(ConnectionKind::Page, server.trusted_proxies.peer(&request)) {
+    let permit = match server.connections.admit(ConnectionKind::Page, server.config.trusted_proxies.peer(&request)) {
         Ok(permit) => permit,
         Err(refused) => return refused.answer(),
     };
@@ -55,8 +57,8 @@ async fn events(request: HttpRequest, server: web::Data<AppState>) -> HttpRespon
 
 async fn viewer(request: HttpRequest, server: web::Data<AppState>) -> HttpResponse {
     with_status(&server, |status| {
-        let script = server.viewer_script.as_ref().map(url::Url::as_str);
-        let page = Viewer { version: env!("CARGO_PKG_VERSION"), examples: &server.examples, script };
+        let script = server.config.viewer_script.as_ref().map(url::Url::as_str);
+        let page = Viewer { version: env!("CARGO_PKG_VERSION"), examples: &server.config.examples, script };
         let policy = ContentSecurityPolicy::own().own_websocket(&request).connect(&fleet(&server, status)).frames();
         html(page.render(), &policy)
     })
@@ -68,7 +70,7 @@ async fn viewer(request: HttpRequest, server: web::Data<AppState>) -> HttpRespon
 async fn webots_viewer(server: web::Data<AppState>) -> HttpResponse {
     with_status(&server, |status| {
         let mut sources = fleet(&server, status);
-        sources.extend(server.viewer_script.as_ref().map(|script| script.origin().ascii_serialization()));
+        sources.extend(server.config.viewer_script.as_ref().map(|script| script.origin().ascii_serialization()));
         let page = WebotsViewer { version: env!("CARGO_PKG_VERSION") };
         html(page.render(), &ContentSecurityPolicy::own().run(&sources).any_picture().framed().foreign())
     })

@@ -66,7 +66,7 @@ struct ServerRow<'server> {
     since: String,
 }
 
-/// What the administrator tells everybody.
+/// The administrator's announcement.
 #[derive(Template)]
 #[template(path = "session/announcement.html")]
 struct Announced<'one> {

@@ -48,7 +48,7 @@ async fn session(request: HttpRequest, stream: web::Payload, server: web::Data<A
     if wants_websocket(&request) {
         return open_websocket(&request, stream, &server);
     }
-    let from = server.trusted_proxies.peer(&request).rate_limit_key();
+    let from = server.config.trusted_proxies.peer(&request).rate_limit_key();
     let world = wanted_world(request.query_string());
     let picked = server.pick(Pick::parse(world.as_deref(), from)).await;
     let status = match &picked {
@@ -79,7 +79,7 @@ fn wanted_world(query: &str) -> Option<Cow<'_, str>> {
 }
 
 fn open_websocket(request: &HttpRequest, stream: web::Payload, server: &web::Data<AppState>) -> HttpResponse {
-    let peer = server.trusted_proxies.peer(request);
+    let peer = server.config.trusted_proxies.peer(request);
     let permit = match server.connections.admit(ConnectionKind::Client, peer) {
         Ok(permit) => permit,
         Err(refused) => return refused.answer(),

@@ -27,7 +27,7 @@ pub struct WebClient {
     peer: Peer,
     liveness: Liveness,
     sent: Option<bool>,
-    /// Whether it has asked to be told announcements.
+    /// Whether it has requested announcements.
     wants_announcements: bool,
     reader: MessageReader,
     _permit: ConnectionPermit,
@@ -80,7 +80,7 @@ impl Actor for WebClient {
     type Context = Context;
 
     fn started(&mut self, ctx: &mut Self::Context) {
-        let timing = &self.server.timing;
+        let timing = &self.server.config.timing;
         liveness::watch(ctx, timing.ping, timing.silence, |client| &mut client.liveness);
         ctx.add_stream(updates(self.server.available.clone(), self.server.phase.clone()));
         if self.wants_announcements {
@@ -122,7 +122,7 @@ fn updates(mut available: watch::Receiver<bool>, phase: watch::Receiver<Phase>) 
 #[rtype(result = "()")]
 struct Announced(String);
 
-/// The announcement that counts now, if there is one, and each change.
+/// The current announcement, if there is one, and each change.
 fn announcements(mut all: watch::Receiver<Option<Arc<Announcement>>>) -> impl Stream<Item = Announced> {
     if all.borrow().is_some() {
         all.mark_changed();

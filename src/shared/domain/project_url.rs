@@ -7,7 +7,7 @@ use percent_encoding::percent_decode_str;
 
 /// A world: a repository on a Git host, and the path of a world file below a reference of it.
 ///
-/// The reference may contain slashes (`feature/arm`), so the URL alone does not tell where it ends;
+/// The reference may contain slashes (`feature/arm`), so the URL alone does not show where it ends;
 /// [`ProjectUrl::candidates`] returns the possible readings, and the repository decides.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub struct ProjectUrl {

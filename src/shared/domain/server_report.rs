@@ -13,7 +13,7 @@ use crate::shared::text::one_line;
 ///
 /// Only `load` is required. Every other field has a default for 'not reported', so that the report of an older server,
 /// or of a Python one, can be parsed too.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "camelCase")]
 pub struct ServerReport {
     /// Mean load of the last five seconds, in percent.
@@ -94,18 +94,7 @@ impl ServerReport {
 
     /// The report of a server that has only `/load`.
     pub fn load_only(load: Load) -> Self {
-        Self {
-            load,
-            version: String::new(),
-            instances: None,
-            allowed_repositories: Vec::new(),
-            blocked_repositories: Vec::new(),
-            share_idle_time: 0.0,
-            docker: None,
-            draining: false,
-            failed_starts: 0,
-            problem: None,
-        }
+        Self { load, ..Self::default() }
     }
 
     /// Whether the server accepts this world, by this report.

@@ -14,7 +14,7 @@ mod timestamp;
 
 pub use app_error::AppError;
 pub use logging::LogTarget;
-pub use open_files::raise_open_files;
+pub use open_files::{limit_clients, raise_open_files};
 pub use rotated_file::RotatedFile;
 pub use signals::{Phase, ServerCommand, Signals, closing};
 pub use supervisor::{Supervisor, TooManyPanics};

@@ -2,6 +2,8 @@
 
 use nix::sys::resource::{Resource, getrlimit, setrlimit};
 
+use super::app_error::AppError;
+
 /// The limit that is assumed if the system does not report it.
 const USUAL: u64 = 1024;
 
@@ -17,4 +19,21 @@ pub fn raise_open_files(wanted: u64) -> u64 {
         log::warn!("the limit of open files can't be raised: {error}");
         limits.map_or(USUAL, |(now, _)| now)
     })
+}
+
+/// Returns the limit of clients: `max_clients`, or fewer if this many open `files` are enough only for `possible` ones.
+///
+/// # Errors
+/// When they are not even enough for what is `needed` at least.
+pub fn limit_clients(files: u64, possible: usize, max_clients: usize, needed: String) -> Result<usize, AppError> {
+    if possible == 0 {
+        return Err(AppError::NoClients { files, needed });
+    }
+    if possible < max_clients {
+        log::warn!(
+            "{files} files may be open, which is enough for {possible} clients, not for maxClients ({max_clients}); \
+             ulimit -Hn, or LimitNOFILE of systemd, allows more"
+        );
+    }
+    Ok(possible.min(max_clients))
 }

@@ -29,7 +29,7 @@ impl Session {
     }
 
     /// Continues with another connection of its client, and closes the one before.
-    fn go_on(&mut self, client: Recipient<ToClient>, peer: Peer, ctx: &mut Context<Self>) {
+    fn continue_with(&mut self, client: Recipient<ToClient>, peer: Peer, ctx: &mut Context<Self>) {
         log::info!("{}: goes on as client {peer}", self.name());
         self.peer = peer;
         self.attachment += 1;
@@ -78,7 +78,7 @@ impl Handler<Resume> for Session {
                 resumption.stay_at(this.peer.rate_limit_key());
                 return Err(refusal);
             }
-            this.go_on(client, peer, ctx);
+            this.continue_with(client, peer, ctx);
             Ok(())
         }))
     }

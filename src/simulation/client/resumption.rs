@@ -54,7 +54,7 @@ impl Resumption {
         }
     }
 
-    /// Webots is ready at this URL: from now on the client may come back. Returns what it hears of that.
+    /// Webots is ready at this URL: from now on the client may come back. Returns the texts that offer it.
     pub fn ready(&mut self, url: String, absence: Duration) -> [String; 2] {
         self.url = url;
         self.offer(absence)

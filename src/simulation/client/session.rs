@@ -16,21 +16,21 @@ use super::state::{State, WebotsHandle};
 use crate::shared::http::Peer;
 use crate::shared::run::closing;
 use crate::simulation::checkout::Progress;
+use crate::simulation::client_identity::ClientIdentity;
 use crate::simulation::ends::EndReason;
 use crate::simulation::protocol::{self, Mode};
-use crate::simulation::sessions::{Attachment, FromClient, Said, ToClient};
+use crate::simulation::sessions::{Attachment, ClientAction, FromClient, ToClient};
 use crate::simulation::slots::{Slot, SlotEvent};
 use crate::simulation::state::AppState;
 use crate::simulation::streams::Watched;
 use crate::simulation::webots::{Keep, ResetController, WebotsEvent, WebotsExit};
-use crate::simulation::who::Who;
 
 /// The actor.
 pub struct Session {
     pub(super) server: Arc<AppState>,
     pub(super) peer: Peer,
     /// Who has asked for it.
-    pub(super) who: Who,
+    pub(super) identity: ClientIdentity,
     /// The id of the simulation with what separates it from what follows; empty before there is one.
     pub(super) id: String,
     /// The connection of its client, until it has ended.
@@ -53,7 +53,7 @@ impl Session {
     /// Opens the session of a client that requests the world at this URL.
     pub fn open(
         server: Arc<AppState>,
-        (peer, who): (Peer, Who),
+        (peer, identity): (Peer, ClientIdentity),
         client: Recipient<ToClient>,
         (url, mode, resumable): (String, Mode, bool),
     ) -> Attachment {
@@ -61,7 +61,7 @@ impl Session {
         let session = Self {
             server,
             peer,
-            who,
+            identity,
             id: String::new(),
             client: Some(client),
             attachment: 0,
@@ -178,22 +178,22 @@ impl Drop for Session {
 impl Handler<FromClient> for Session {
     type Result = ();
 
-    fn handle(&mut self, FromClient { attachment, what }: FromClient, ctx: &mut Self::Context) {
+    fn handle(&mut self, FromClient { attachment, action }: FromClient, ctx: &mut Self::Context) {
         if attachment != self.attachment {
             return;
         }
-        match what {
-            Said::ResetController(file) => self.reset_controller(file, ctx),
-            Said::Keep => {
+        match action {
+            ClientAction::ResetController(file) => self.reset_controller(file, ctx),
+            ClientAction::Keep => {
                 if let State::Launched(WebotsHandle(webots)) = &self.state {
                     webots.do_send(Keep);
                 }
             }
-            Said::Left => {
+            ClientAction::Leave => {
                 self.client = None;
                 ctx.stop();
             }
-            Said::Gone => {
+            ClientAction::Disconnect => {
                 self.client = None;
                 self.await_client(ctx);
             }

@@ -53,10 +53,10 @@ impl Session {
             Err(why) => return self.fail_start(Outcome::Refused, &why, ctx),
         };
         let lease =
-            SlotLease::new(&self.server.slots, ctx.address().recipient(), &world, (self.peer, self.who.clone()));
+            SlotLease::new(&self.server.slots, ctx.address().recipient(), &world, (self.peer, self.identity.clone()));
         self.id = format!("{}: ", lease.id());
         self.text(protocol::session(lease.id()));
-        log::info!("{}: asks for {world}{}", self.name(), self.who);
+        log::info!("{}: asks for {world}{}", self.name(), self.identity);
         self.state = State::Waiting { request: StartRequest { world, mode }, lease };
     }
 

@@ -14,16 +14,16 @@ use crate::shared::http::liveness::{self, Liveness};
 use crate::shared::http::websocket::{ClientMessage, MessageReader};
 use crate::shared::http::{ConnectionPermit, Peer};
 use crate::shared::run::closing;
+use crate::simulation::client_identity::ClientIdentity;
 use crate::simulation::protocol::{self, ClientRequest};
-use crate::simulation::sessions::{Attachment, Resume, Said, ToClient, Token};
+use crate::simulation::sessions::{Attachment, ClientAction, Resume, ToClient, Token};
 use crate::simulation::state::AppState;
-use crate::simulation::who::Who;
 
 /// The actor.
 pub struct WebClient {
     server: Arc<AppState>,
     peer: Peer,
-    /// The user whom a trusted web server names.
+    /// The user name that a trusted reverse proxy sends.
     user: Option<String>,
     session: Attached,
     liveness: Liveness,
@@ -35,8 +35,8 @@ pub struct WebClient {
 enum Attached {
     /// It has not requested one yet.
     No,
-    /// It has requested to resume one.
-    Coming,
+    /// It has requested to resume one, and waits for the answer.
+    Resuming,
     /// It has one.
     To(Attachment),
     /// It got its last text.
@@ -66,9 +66,9 @@ impl WebClient {
     }
 
     /// Ends the simulation of a client that closes its connection regularly, or violates the protocol.
-    fn give_up(&self) {
+    fn leave(&self) {
         if let Attached::To(session) = &self.session {
-            session.say(Said::Left);
+            session.send(ClientAction::Leave);
         }
     }
 
@@ -79,7 +79,7 @@ impl WebClient {
             log::info!("client {}: comes back to a simulation that has ended", self.peer);
             return self.finish(protocol::ended(None), CloseCode::Normal, ctx);
         };
-        self.session = Attached::Coming;
+        self.session = Attached::Resuming;
         let resumed = session.send(Resume { token, client: ctx.address().recipient(), peer: self.peer });
         resumed
             .into_actor(self)
@@ -94,7 +94,7 @@ impl WebClient {
             .spawn(ctx);
     }
 
-    fn understand(&mut self, text: &str, ctx: &mut Context) {
+    fn handle_request(&mut self, text: &str, ctx: &mut Context) {
         match ClientRequest::parse(text) {
             Ok(Some(ClientRequest::Start { .. } | ClientRequest::Resume(_)))
                 if !matches!(self.session, Attached::No) =>
@@ -104,23 +104,24 @@ impl WebClient {
             Ok(Some(ClientRequest::Start { url, mode, resumable, name })) => {
                 let server = Arc::clone(&self.server);
                 let client = ctx.address().recipient();
-                let who = Who::new(self.user.as_deref(), name.as_deref());
-                self.session = Attached::To(Session::open(server, (self.peer, who), client, (url, mode, resumable)));
+                let identity = ClientIdentity::new(self.user.as_deref(), name.as_deref());
+                self.session =
+                    Attached::To(Session::open(server, (self.peer, identity), client, (url, mode, resumable)));
             }
             Ok(Some(ClientRequest::Resume(token))) => self.resume(token, ctx),
             Ok(Some(ClientRequest::Keep)) => {
                 if let Attached::To(session) = &self.session {
-                    session.say(Said::Keep);
+                    session.send(ClientAction::Keep);
                 }
             }
             Ok(Some(ClientRequest::ResetController(file))) => match &self.session {
-                Attached::To(session) => session.say(Said::ResetController(file)),
-                Attached::No | Attached::Coming | Attached::Over => ctx.text(protocol::nothing_to_reset()),
+                Attached::To(session) => session.send(ClientAction::ResetController(file)),
+                Attached::No | Attached::Resuming | Attached::Over => ctx.text(protocol::nothing_to_reset()),
             },
             Ok(None) => log::debug!("client {}: a message that asks for nothing is ignored", self.peer),
             Err(wrong) => {
                 log::info!("client {}: {wrong}", self.peer);
-                self.give_up();
+                self.leave();
                 self.finish(protocol::error(&wrong.to_string()), CloseCode::Normal, ctx);
             }
         }
@@ -139,7 +140,7 @@ impl Actor for WebClient {
             .into_actor(self)
             .map(|(), this, ctx| {
                 // A client with a session is notified by its session.
-                if matches!(this.session, Attached::No | Attached::Coming) {
+                if matches!(this.session, Attached::No | Attached::Resuming) {
                     this.finish(protocol::stopping(), CloseCode::Away, ctx);
                 }
             })
@@ -154,13 +155,13 @@ impl Actor for WebClient {
 impl StreamHandler<Result<Message, ProtocolError>> for WebClient {
     fn handle(&mut self, message: Result<Message, ProtocolError>, ctx: &mut Self::Context) {
         match self.reader.read(message) {
-            Ok(Some(ClientMessage::Text(text))) if self.liveness.may_answer() => self.understand(&text, ctx),
+            Ok(Some(ClientMessage::Text(text))) if self.liveness.may_answer() => self.handle_request(&text, ctx),
             Ok(Some(ClientMessage::Ping(data))) if self.liveness.may_answer() => ctx.pong(&data),
             Ok(Some(ClientMessage::Pong(content))) => self.liveness.pong(&content),
             Ok(Some(ClientMessage::Close(reason))) => {
                 // After any other close code, or none, the client may return.
                 if reason.as_ref().is_some_and(|reason| reason.code == CloseCode::Normal) {
-                    self.give_up();
+                    self.leave();
                 }
                 ctx.close(reason);
                 ctx.stop();
@@ -168,12 +169,12 @@ impl StreamHandler<Result<Message, ProtocolError>> for WebClient {
             Ok(None) => {}
             Ok(Some(ClientMessage::Text(_) | ClientMessage::Ping(_))) => {
                 log::warn!("client {}: asks too much between two pings", self.peer);
-                self.give_up();
+                self.leave();
                 self.finish(protocol::error("Too many requests on one connection"), CloseCode::Policy, ctx);
             }
             Err(error) => {
                 log::info!("client {}: {error}", self.peer);
-                self.give_up();
+                self.leave();
                 self.finish(protocol::error(&error.to_string()), error.code(), ctx);
             }
         }

@@ -110,13 +110,13 @@ pub struct SimulationConfig {
     /// behind one address.
     #[serde(deserialize_with = "optional_whole::<1, 10_000, _, _>")]
     pub max_places_per_address: Option<usize>,
-    /// How many of the places one user may have (`userHeader`), and the same share of the waiting line. Default: all.
+    /// Limit of slots per user (`userHeader`); the same share of the queue applies. Default: all.
     #[serde(deserialize_with = "optional_whole::<1, 10_000, _, _>")]
     pub max_places_per_user: Option<usize>,
-    /// The header in which a web server of `trustedProxies` tells the name of the user, such as `X-Forwarded-User`.
+    /// The header in which a reverse proxy of `trustedProxies` sends the user's name, such as `X-Forwarded-User`.
     /// Default: none.
     pub user_header: Option<UserHeader>,
-    /// Web servers, as addresses or networks, whose header `X-Forwarded-For` is believed.
+    /// Reverse proxies, as addresses or networks, whose header `X-Forwarded-For` is trusted.
     /// Default: `["127.0.0.0/8", "::1/128"]`.
     pub trusted_proxies: TrustedProxies,
     /// Seconds after which a simulation is closed, at least 360. Default: 7200.

@@ -36,8 +36,8 @@ fn line(level: &str, ended: &Ended) -> String {
         taken.memory.map(|bytes| bytes.to_string()).unwrap_or_default(),
         taken.time.map(|time| format!("{:.1}", time.as_secs_f64())).unwrap_or_default(),
         ended.how.reason.label().to_owned(),
-        ended.who.user.clone().unwrap_or_default(),
-        ended.who.label.clone().unwrap_or_default(),
+        ended.identity.user.clone().unwrap_or_default(),
+        ended.identity.label.clone().unwrap_or_default(),
     ];
     fields.map(|text| field(&text)).join(",") + "\n"
 }

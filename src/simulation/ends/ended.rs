@@ -4,8 +4,8 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use super::end_reason::EndReason;
+use crate::simulation::client_identity::ClientIdentity;
 use crate::simulation::simulation_id::SimulationId;
-use crate::simulation::who::Who;
 
 /// The resources that a simulation has used, as far as they are known.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
@@ -38,8 +38,8 @@ pub struct Ended {
     pub end: u64,
     /// The address of its client.
     pub client: String,
-    /// Who it is; for administrators alone.
-    pub who: Who,
+    /// The client's identity, only for administrators.
+    pub identity: ClientIdentity,
     /// The URL of the repository.
     pub repository: String,
     /// The URL of the world.

@@ -125,7 +125,7 @@ mod tests {
     use super::super::end_reason::EndReason;
     use super::super::ended::{End, Taken};
     use super::*;
-    use crate::simulation::who::Who;
+    use crate::simulation::client_identity::ClientIdentity;
 
     fn ended(logs: &Path, reason: EndReason) -> Ended {
         let id = SimulationId::next();
@@ -135,7 +135,7 @@ mod tests {
             begin: 0,
             end: 0,
             client: String::new(),
-            who: Who::default(),
+            identity: ClientIdentity::default(),
             repository: String::new(),
             world: String::new(),
             port: None,

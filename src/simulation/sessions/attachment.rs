@@ -21,24 +21,24 @@ pub enum ToClient {
 pub struct FromClient {
     /// Number of the attachment; messages of an earlier attachment are ignored.
     pub attachment: u64,
-    /// The content of the message.
-    pub what: Said,
+    /// What the client does.
+    pub action: ClientAction,
 }
 
-/// The content of a client's message.
+/// An action of a client.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Said {
+pub enum ClientAction {
     /// Restore this file below `controllers/`.
     ResetController(String),
-    /// Its simulation, which is paused, is to stay.
+    /// Keep its simulation, which is paused.
     Keep,
-    /// It needs its simulation no longer.
-    Left,
-    /// Its connection has ended.
-    Gone,
+    /// End its simulation.
+    Leave,
+    /// End its connection; it may come back.
+    Disconnect,
 }
 
-/// The attachment of a connection to a session. Dropping it sends [`Said::Gone`] to the session.
+/// The attachment of a connection to a session. Dropping it sends [`ClientAction::Disconnect`] to the session.
 pub struct Attachment {
     number: u64,
     session: Recipient<FromClient>,
@@ -51,14 +51,14 @@ impl Attachment {
     }
 
     /// Sends a message to the session.
-    pub fn say(&self, what: Said) {
+    pub fn send(&self, action: ClientAction) {
         // A session that has ended has notified its client.
-        self.session.do_send(FromClient { attachment: self.number, what });
+        self.session.do_send(FromClient { attachment: self.number, action });
     }
 }
 
 impl Drop for Attachment {
     fn drop(&mut self) {
-        self.say(Said::Gone);
+        self.send(ClientAction::Disconnect);
     }
 }

@@ -4,6 +4,6 @@ mod attachment;
 mod sessions;
 mod token;
 
-pub use attachment::{Attachment, FromClient, Said, ToClient};
+pub use attachment::{Attachment, ClientAction, FromClient, ToClient};
 pub use sessions::{Registration, Resume, Sessions};
 pub use token::Token;

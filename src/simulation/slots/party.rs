@@ -4,7 +4,7 @@ use std::net::IpAddr;
 
 use super::slot_error::SlotError;
 
-/// An address, or a user whom a trusted web server names.
+/// An address, or a user whose name a trusted reverse proxy sends.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub(super) enum Party {
     Address(IpAddr),

@@ -13,10 +13,10 @@ use crate::shared::domain::ProjectUrl;
 use crate::shared::http::Peer;
 use crate::shared::run::{seconds_since_1970, timestamp};
 use crate::shared::text::{excerpt, without_paths};
+use crate::simulation::client_identity::ClientIdentity;
 use crate::simulation::ends::{End, EndReason, Ended, Taken};
 use crate::simulation::simulation_id::SimulationId;
 use crate::simulation::snapshot::{Simulation, SimulationChange, Stage};
-use crate::simulation::who::Who;
 
 /// A report of its owner about a simulation.
 #[derive(Debug)]
@@ -65,13 +65,13 @@ impl Present {
     pub(super) fn new(
         id: SimulationId,
         world: &ProjectUrl,
-        (client, who): (Peer, Who),
+        (client, identity): (Peer, ClientIdentity),
         listener: Recipient<SlotEvent>,
     ) -> Self {
         let shown = Simulation {
             id,
             world: world.to_string(),
-            who,
+            identity,
             stage: Stage::Queued,
             since: seconds_since_1970(),
             launched: None,
@@ -90,9 +90,9 @@ impl Present {
         present
     }
 
-    /// By what its client shares the places.
+    /// The parties that its client belongs to.
     pub(super) fn parties(&self) -> Vec<Party> {
-        let user = self.shown.who.user.clone().map(Party::User);
+        let user = self.shown.identity.user.clone().map(Party::User);
         self.address.map(Party::Address).into_iter().chain(user).collect()
     }
 
@@ -142,7 +142,7 @@ impl Present {
             begin: self.shown.since,
             end: seconds_since_1970(),
             client: self.client.to_string(),
-            who: self.shown.who,
+            identity: self.shown.identity,
             repository: self.repository,
             world: self.shown.world,
             port: self.shown.port,

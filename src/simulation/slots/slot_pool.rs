@@ -19,10 +19,10 @@ use super::slot_error::SlotError;
 use super::slot_event::SlotEvent;
 use crate::shared::domain::{Instances, ProjectUrl};
 use crate::shared::http::Peer;
+use crate::simulation::client_identity::ClientIdentity;
 use crate::simulation::ends::{End, EndReason, Ends, Taken};
 use crate::simulation::simulation_id::SimulationId;
 use crate::simulation::snapshot::{SimulationChange, Snapshot, Stage};
-use crate::simulation::who::Who;
 
 /// A slot, or a position in the queue for one. Dropping it releases it.
 #[derive(Debug)]
@@ -276,10 +276,10 @@ impl SlotLease {
         slots: &Addr<SlotPool>,
         listener: Recipient<SlotEvent>,
         world: &ProjectUrl,
-        (client, who): (Peer, Who),
+        (client, identity): (Peer, ClientIdentity),
     ) -> Self {
         let id = SimulationId::next();
-        slots.do_send(Acquire(Box::new(Present::new(id, world, (client, who), listener))));
+        slots.do_send(Acquire(Box::new(Present::new(id, world, (client, identity), listener))));
         Self { id, slots: slots.clone() }
     }
 

@@ -1,4 +1,4 @@
-//! What administrators do: each action needs their password.
+//! Actions of administrators: each needs their password.
 
 use actix_web::http::header;
 use actix_web::{HttpRequest, HttpResponse, web};
@@ -12,7 +12,7 @@ use crate::shared::text::excerpt;
 use crate::simulation::protocol;
 use crate::simulation::state::AppState;
 
-/// How many letters of a reason are told.
+/// Longest reason, in characters.
 const REASON_LENGTH: usize = 300;
 
 /// Adds the paths to an app.
@@ -22,10 +22,10 @@ pub fn configure(app: &mut web::ServiceConfig) {
         .service(path("/sign-in", GET, sign_in));
 }
 
-/// What the body of a stop has, if it has one.
+/// The body of a request to stop a simulation, if it has one.
 #[derive(Default, Deserialize)]
 #[serde(deny_unknown_fields)]
-struct Order {
+struct StopRequest {
     #[serde(default)]
     reason: String,
 }
@@ -54,7 +54,7 @@ async fn stop(
     if let Some(refusal) = refusal(&request, &server) {
         return refusal;
     }
-    let Order { reason } = match body::json(&request, body, "{\"reason\": TEXT}").await {
+    let StopRequest { reason } = match body::json(&request, body, "{\"reason\": TEXT}").await {
         Ok(order) => order,
         Err(refusal) => return refusal,
     };

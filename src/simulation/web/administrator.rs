@@ -31,8 +31,8 @@ impl Visitor {
         })
     }
 
-    /// Whether the visitor may see the ports of simulations: a client that reaches one controls its simulation. Without a
-    /// password and where clients need the ports everybody sees them, as on the original's page.
+    /// Whether the visitor may see the ports of simulations: a client that reaches one controls its simulation. If no
+    /// password is configured and clients need the ports, all visitors see them, as on the original's page.
     pub fn sees_ports(self, config: &SimulationConfig) -> bool {
         match self {
             Self::Administrator => true,

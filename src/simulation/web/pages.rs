@@ -83,7 +83,7 @@ struct SimulationRow<'one> {
     cpu_value: f64,
     memory: String,
     memory_value: u64,
-    /// The port, where everybody may see it.
+    /// The port, if the visitor may see it.
     port: Option<u16>,
     can_be_watched: bool,
 }
@@ -299,8 +299,8 @@ fn shortcoming(server: &AppState) -> Option<(&'static str, &str)> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::simulation::client_identity::ClientIdentity;
     use crate::simulation::simulation_id::SimulationId;
-    use crate::simulation::who::Who;
 
     #[test]
     fn sizes_and_times_are_short() {
@@ -317,7 +317,7 @@ mod tests {
         Simulation {
             id: SimulationId::next(),
             world: world.to_owned(),
-            who: Who::new(Some("<i>root</i>"), Some("<script>'\"&")),
+            identity: ClientIdentity::new(Some("<i>root</i>"), Some("<script>'\"&")),
             stage: Stage::Idle,
             since: 0,
             launched: Some(1),

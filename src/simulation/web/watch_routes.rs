@@ -41,8 +41,8 @@ pub fn configure(app: &mut web::ServiceConfig) {
     app.service(path("/watch", GET, watch)).service(path("/webots-viewer", READ, viewer));
 }
 
-/// The token that the page gets is new each time, so that its address, which may be kept or sent to others, leads nobody
-/// without the password to the stream.
+/// The token in the page is new each time: the page's URL, which may be kept or sent to others, is useless without the
+/// password.
 async fn watch(request: HttpRequest, which: web::Query<Which>, server: web::Data<AppState>) -> HttpResponse {
     let peer = server.config.trusted_proxies.peer(&request);
     if let Some(refusal) = require_administrator(server.admin_auth.as_ref(), &request, peer) {

@@ -58,20 +58,20 @@ pub fn words(cause: Cause) -> &'static str {
 }
 
 /// Sends a session the events of its Webots. The exit is always sent, also if the actor panics and is dropped.
-pub struct ExitNotifier {
+pub struct EventSender {
     events: Recipient<WebotsEvent>,
-    exit_told: bool,
+    exit_sent: bool,
 }
 
-impl ExitNotifier {
+impl EventSender {
     /// Sends to this recipient.
     pub fn new(events: Recipient<WebotsEvent>) -> Self {
-        Self { events, exit_told: false }
+        Self { events, exit_sent: false }
     }
 
     /// Sends an event.
-    pub fn tell(&mut self, event: WebotsEvent) {
-        self.exit_told |= matches!(event, WebotsEvent::Exited(_));
+    pub fn send(&mut self, event: WebotsEvent) {
+        self.exit_sent |= matches!(event, WebotsEvent::Exited(_));
         // A full mailbox may drop progress and heartbeats, but not the URL of Webots and its exit.
         let may_be_lost = matches!(event, WebotsEvent::Progress(_) | WebotsEvent::Heartbeat | WebotsEvent::Hanging(_));
         if !may_be_lost {
@@ -82,11 +82,11 @@ impl ExitNotifier {
     }
 }
 
-impl Drop for ExitNotifier {
+impl Drop for EventSender {
     fn drop(&mut self) {
-        if !self.exit_told {
+        if !self.exit_sent {
             let why = "The simulation was lost by a fault of this server".to_owned();
-            self.tell(WebotsEvent::Exited(WebotsExit { clean: false, own: true, why }));
+            self.send(WebotsEvent::Exited(WebotsExit { clean: false, own: true, why }));
         }
     }
 }

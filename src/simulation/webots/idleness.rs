@@ -1,6 +1,6 @@
-//! How a simulation ends that stays paused. Some time before, its client is told, and may keep it.
+//! Ends a simulation that stays paused. Its client is notified some time before, and may keep it.
 //!
-//! What a page says to Webots does not pass this server: that a simulation is paused is known from what Webots prints.
+//! The messages between a page and Webots do not pass this server: Webots' output shows that a simulation is paused.
 
 use std::time::{Duration, Instant};
 
@@ -10,21 +10,21 @@ use super::event::WebotsEvent;
 use super::webots::{IdleEnd, Webots};
 use crate::simulation::ends::EndReason;
 
-/// So long before its end the client is told; where `idleTimeout` is shorter than twice that, half of it before.
+/// Time between the notice to the client and the end; at most half of `idleTimeout`.
 const NOTICE: Duration = Duration::from_mins(2);
 
-/// Asks to keep a simulation that is paused: `idleTimeout` begins again.
+/// Requests to keep a simulation that is paused: `idleTimeout` begins again.
 #[derive(Message)]
 #[rtype(result = "()")]
 pub struct Keep;
 
 impl Webots {
-    /// Somebody has done something with the simulation: if it is paused now, its `idleTimeout` begins.
+    /// Records that the simulation was used: if it is paused now, its `idleTimeout` begins.
     pub(super) fn used(&mut self, ctx: &mut Context<Self>) {
-        if let Some(IdleEnd { timer, is_told }) = self.idle_end.take() {
+        if let Some(IdleEnd { timer, is_announced }) = self.idle_end.take() {
             ctx.cancel_future(timer);
-            if is_told {
-                self.tell(WebotsEvent::IdleEnd(None));
+            if is_announced {
+                self.send(WebotsEvent::IdleEnd(None));
             }
         }
         let limit = self.spec.config.idle_timeout;
@@ -33,14 +33,14 @@ impl Webots {
         }
         let notice = NOTICE.min(limit / 2);
         let timer = ctx.run_later(limit.saturating_sub(notice), move |this, ctx| {
-            this.tell(WebotsEvent::IdleEnd(Some(Instant::now() + notice)));
+            this.send(WebotsEvent::IdleEnd(Some(Instant::now() + notice)));
             let timer = ctx.run_later(notice, move |this, _| {
                 let minutes = limit.as_secs_f64() / 60.0;
                 this.stop(EndReason::Idle, &format!("The simulation was paused for {minutes} minutes"));
             });
-            this.idle_end = Some(IdleEnd { timer, is_told: true });
+            this.idle_end = Some(IdleEnd { timer, is_announced: true });
         });
-        self.idle_end = Some(IdleEnd { timer, is_told: false });
+        self.idle_end = Some(IdleEnd { timer, is_announced: false });
     }
 }
 

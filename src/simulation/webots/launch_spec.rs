@@ -9,7 +9,7 @@ use actix::prelude::*;
 use futures_util::FutureExt;
 use futures_util::future::LocalBoxFuture;
 
-use super::command::WebotsCommand;
+use super::command::webots_command;
 use super::event::WebotsEvent;
 use crate::simulation::checkout::{CheckoutService, Project};
 use crate::simulation::config::SimulationConfig;
@@ -47,9 +47,9 @@ pub struct LaunchSpec {
     pub slot: Slot,
     /// Where its stream is found while it runs.
     pub streams: Arc<Streams>,
-    /// Who hears whether it is watched.
+    /// Is notified whether it is watched.
     pub watched: Recipient<Watched>,
-    /// Who gets the events.
+    /// Receives the events.
     pub events: Recipient<WebotsEvent>,
 }
 
@@ -60,19 +60,18 @@ impl LaunchSpec {
         folder.join(format!("{}.log", self.slot.lease.id()))
     }
 
-    /// Has the stream found that this port has.
+    /// Registers the stream of this port.
     pub fn register(&self, port: u16) -> Registration {
         self.streams.register(self.slot.lease.id(), port, self.watched.clone())
     }
 
-    /// What its containers are made of.
+    /// The request for its containers.
     pub fn request(&self) -> ContainerRequest {
         let (config, mode, port) = (Arc::clone(&self.config), self.mode, self.slot.port);
         let command = move |world: &str| {
-            let program = Path::new(&config.container.program);
-            let world = Path::new(world);
-            let command = WebotsCommand { program, mode, port, heartbeat: config.timing.heartbeat, world };
-            command.to_arguments().into_iter().map(|word| word.to_string_lossy().into_owned()).collect()
+            let (program, world) = (Path::new(&config.container.program), Path::new(world));
+            let command = webots_command(program, mode, port, config.timing.heartbeat, world);
+            command.into_iter().map(|word| word.to_string_lossy().into_owned()).collect()
         };
         ContainerRequest { project: Arc::clone(&self.project), port, gpu: self.gpu.clone(), command: Box::new(command) }
     }
@@ -92,15 +91,9 @@ impl LaunchSpec {
     /// # Errors
     /// When a folder that it needs can't be made.
     pub fn spawn_spec(&self, display: &Display) -> std::io::Result<(SpawnSpec, Option<Cgroup>)> {
-        let command = WebotsCommand {
-            program: &self.program,
-            mode: self.mode,
-            port: self.slot.port,
-            heartbeat: self.config.timing.heartbeat,
-            world: &self.project.world.path,
-        };
+        let (heartbeat, world) = (self.config.timing.heartbeat, &self.project.world.path);
         self.launcher.prepare(Program {
-            command: command.to_arguments(),
+            command: webots_command(&self.program, self.mode, self.slot.port, heartbeat, world),
             instance: self.project.instance.path(),
             project: self.project.instance.project(),
             folder: self.project.folder(),

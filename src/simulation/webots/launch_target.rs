@@ -66,7 +66,7 @@ impl LaunchTarget {
     }
 
     /// The events for the client about it.
-    pub fn news(&self) -> Vec<WebotsEvent> {
+    pub fn events(&self) -> Vec<WebotsEvent> {
         let Self::Containers(containers) = self else { return Vec::new() };
         let warnings = containers.warnings.iter().cloned().map(WebotsEvent::Progress);
         warnings.chain(containers.texts.iter().cloned().map(WebotsEvent::Text)).collect()

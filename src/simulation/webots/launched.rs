@@ -27,7 +27,7 @@ pub struct Launched {
     pub tail: Tail,
     /// The file of its output.
     pub log: Option<PathBuf>,
-    /// Hears what it takes, where it has no control group of its own.
+    /// Records its usage, if it has no control group of its own.
     pub peak: Option<Arc<Peak>>,
 }
 
@@ -53,7 +53,7 @@ const LAST_OUTPUT: Duration = Duration::from_secs(1);
 /// When a process, a thread or a directory can't be created.
 pub fn launch(
     spec: &LaunchSpec,
-    runtime: LaunchTarget,
+    target: LaunchTarget,
     events: Recipient<OutputEvent>,
 ) -> std::io::Result<(Launched, impl Future<Output = End> + use<>)> {
     let log = spec.log_file();
@@ -66,19 +66,19 @@ pub fn launch(
     let reader = PacedReader::new(reader, spec.config.limits.output << 10);
     let (tail, all_read) = output::follow(reader, file.ok(), events)?;
     let errors = output.try_clone()?;
-    let (process, cgroup) = match &runtime {
+    let (process, cgroup) = match &target {
         LaunchTarget::Containers(containers) => (containers.spawn_spec(spec.config.timing.grace), None),
         LaunchTarget::Machine(display) => spec.spawn_spec(display)?,
         LaunchTarget::BesideDisplay(display) => spec.spawn_spec(&Display::Outside(display.environment()))?,
     };
     let (group, ended) = ProcessGroup::start(&process, output.into(), errors.into())?;
     let folder = cgroup.as_ref().map(|cgroup| cgroup.path().to_owned());
-    let peak = cgroup.is_none().then(|| peak_of(&runtime));
+    let peak = cgroup.is_none().then(|| peak_of(&target));
     let seen = peak.clone();
     let ended = async move {
         let reason = ended.await;
         let code = if let ExitReason::Code(code) = reason { Some(code.into()) } else { None };
-        let in_container = runtime.end(code).await;
+        let in_container = target.end(code).await;
         let (on_machine, taken) = match cgroup {
             Some(cgroup) => actix_rt::task::spawn_blocking(move || end_all(&cgroup)).await.unwrap_or_default(),
             None => (false, seen.map(|peak| peak.taken()).unwrap_or_default()),
@@ -91,8 +91,8 @@ pub fn launch(
 }
 
 /// Hears what a Webots takes that runs on this.
-fn peak_of(runtime: &LaunchTarget) -> Arc<Peak> {
-    let LaunchTarget::Containers(containers) = runtime else { return Arc::default() };
+fn peak_of(target: &LaunchTarget) -> Arc<Peak> {
+    let LaunchTarget::Containers(containers) = target else { return Arc::default() };
     let (ids, peak) = (containers.ids(), Arc::new(Peak::of_containers()));
     let named = Arc::clone(&peak);
     // Its start does not wait for that.

@@ -10,7 +10,7 @@ use actix::prelude::*;
 use log::Level;
 use tokio::sync::Notify;
 
-use super::event::{ExitNotifier, WebotsEvent, WebotsExit};
+use super::event::{EventSender, WebotsEvent, WebotsExit};
 use super::launch_spec::LaunchSpec;
 use super::launch_target::LaunchTarget;
 use super::launched::{self, End, Launched};
@@ -40,7 +40,7 @@ pub struct Webots {
     stream: Option<Registration>,
     pub(super) spec: LaunchSpec,
     port: u16,
-    events: ExitNotifier,
+    events: EventSender,
     /// The preparation of its target, while it runs.
     preparing: Option<SpawnHandle>,
     group: Option<ProcessGroup>,
@@ -63,8 +63,8 @@ pub struct Webots {
 /// The wait until a simulation that is paused ends.
 pub(super) struct IdleEnd {
     pub(super) timer: SpawnHandle,
-    /// Whether its client was told of that end.
-    pub(super) is_told: bool,
+    /// Whether its client was notified of that end.
+    pub(super) is_announced: bool,
 }
 
 /// So many heartbeats may be missed before Webots counts as hanging.
@@ -76,7 +76,7 @@ impl Webots {
         Self {
             stream: None,
             port: spec.slot.port,
-            events: ExitNotifier::new(spec.events.clone()),
+            events: EventSender::new(spec.events.clone()),
             spec,
             preparing: None,
             group: None,
@@ -99,20 +99,20 @@ impl Webots {
         let progress = move |text| drop(client.try_send(WebotsEvent::Progress(text)));
         let prepared = LaunchTarget::prepare(&self.spec, progress).into_actor(self);
         self.preparing = Some(ctx.spawn(prepared.map(|prepared, this, ctx| match prepared {
-            Ok(runtime) => this.launch(runtime, ctx),
+            Ok(target) => this.launch(target, ctx),
             Err(StartError::Project(why)) => this.not_started(EndReason::NoWebots, &why, ctx),
             Err(StartError::Server(why)) => this.not_started(EndReason::Fault, &why, ctx),
         })));
     }
 
-    fn launch(&mut self, runtime: LaunchTarget, ctx: &mut Context<Self>) {
+    fn launch(&mut self, target: LaunchTarget, ctx: &mut Context<Self>) {
         self.preparing = None;
-        self.restart = runtime.restart();
-        runtime.news().into_iter().for_each(|event| self.tell(event));
-        if let Err(error) = self.spawn(runtime, ctx) {
+        self.restart = target.restart();
+        target.events().into_iter().for_each(|event| self.send(event));
+        if let Err(error) = self.spawn(target, ctx) {
             return self.not_started(EndReason::Fault, &format!("Webots can't be started: {error}"), ctx);
         }
-        self.tell(WebotsEvent::Started);
+        self.send(WebotsEvent::Started);
         // A container prints when it runs.
         self.spec.containers.is_none().then(|| self.await_port(ctx));
         ctx.run_interval(self.spec.config.timing.heartbeat, Self::check_heartbeat);
@@ -130,9 +130,9 @@ impl Webots {
     }
 
     /// Starts the process, and calls [`Self::ended`] when it has ended.
-    fn spawn(&mut self, runtime: LaunchTarget, ctx: &mut Context<Self>) -> std::io::Result<()> {
+    fn spawn(&mut self, target: LaunchTarget, ctx: &mut Context<Self>) -> std::io::Result<()> {
         let (Launched { group, cgroup, tail, log, peak }, ended) =
-            launched::launch(&self.spec, runtime, ctx.address().recipient())?;
+            launched::launch(&self.spec, target, ctx.address().recipient())?;
         let (program, world) = (self.spec.program.display(), self.spec.project.world.path.display());
         let (at, pid) = (seconds_since_1970(), group.leader());
         self.log(Level::Info, &format!("started {program} for {world} (process {pid})"));
@@ -172,7 +172,7 @@ impl Webots {
         self.spec.slot.lease.update(SimulationChange::Port(port));
         self.show_pace();
         let stream = self.stream.insert(self.spec.register(port)).token();
-        self.tell(WebotsEvent::Listening(port, stream));
+        self.send(WebotsEvent::Listening(port, stream));
         self.used(ctx);
     }
 
@@ -195,11 +195,11 @@ impl Webots {
         } else if silence > hangs_after && !self.hanging {
             self.hanging = true;
             self.log(Level::Warn, &format!("no sign of life for {} s", silence.as_secs()));
-            self.tell(WebotsEvent::Hanging(silence.as_secs()));
+            self.send(WebotsEvent::Hanging(silence.as_secs()));
         }
     }
 
-    /// Asks for an orderly end. The first reason is the one that is told.
+    /// Requests an orderly end. Only the first reason counts.
     pub(super) fn stop(&mut self, kind: EndReason, why: &str) {
         if self.stopped_for.is_none() {
             self.log(Level::Info, &format!("ending: {why}"));
@@ -246,7 +246,7 @@ impl Webots {
     }
 
     fn exited(&mut self, exit: WebotsExit, ctx: &mut Context<Self>) {
-        self.tell(WebotsEvent::Exited(exit));
+        self.send(WebotsEvent::Exited(exit));
         ctx.stop();
     }
 
@@ -256,8 +256,8 @@ impl Webots {
         WebotsExit { clean: false, own: !self.listening && self.spec.containers.is_none(), why }
     }
 
-    pub(super) fn tell(&mut self, event: WebotsEvent) {
-        self.events.tell(event);
+    pub(super) fn send(&mut self, event: WebotsEvent) {
+        self.events.send(event);
     }
 
     fn log(&self, level: Level, event: &str) {
@@ -288,7 +288,7 @@ impl Handler<OutputEvent> for Webots {
         self.last_heartbeat = Instant::now();
         self.hanging = false;
         match event {
-            OutputEvent::Heartbeat if self.listening => self.tell(WebotsEvent::Heartbeat),
+            OutputEvent::Heartbeat if self.listening => self.send(WebotsEvent::Heartbeat),
             OutputEvent::Heartbeat if self.spec.containers.is_some() => self.ready(self.port, ctx),
             OutputEvent::Heartbeat => {}
             OutputEvent::ContainerRuns => self.await_port(ctx),

@@ -1,26 +1,25 @@
-//! Who a client is, as far as somebody says.
+//! The identity of a client, as far as it is known.
 
 use std::fmt;
 
 use crate::shared::text::one_line;
 
-/// Who a client is. Pages show it to administrators alone; it is in the server's own log and in `simulations.csv`, and in
-/// nothing that others read.
+/// The identity of a client. Only administrators see it: on pages, in the server's log and in `simulations.csv`.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub struct Who {
-    /// The user whom a trusted web server names.
+pub struct ClientIdentity {
+    /// The user name that a trusted reverse proxy sends.
     pub user: Option<String>,
-    /// What the client calls itself, which nobody has checked.
+    /// The name that the client has chosen; it is not checked.
     pub label: Option<String>,
 }
 
-/// How many letters of a user's name count.
+/// Longest user name, in characters.
 const USER_LENGTH: usize = 200;
-/// How many letters of a label are shown.
+/// Longest label, in characters.
 const LABEL_LENGTH: usize = 60;
 
-impl Who {
-    /// Names of at most so many letters in one line; an empty one is none.
+impl ClientIdentity {
+    /// Cuts the names to their longest length, in one line; an empty name becomes `None`.
     pub fn new(user: Option<&str>, label: Option<&str>) -> Self {
         let cut = |text: &str, most| one_line(text).trim().chars().take(most).collect::<String>();
         let cut = |text: Option<&str>, most| text.map(|text| cut(text, most)).filter(|text| !text.is_empty());
@@ -28,8 +27,8 @@ impl Who {
     }
 }
 
-impl fmt::Display for Who {
-    /// For the server's own log; nothing where nothing is known.
+impl fmt::Display for ClientIdentity {
+    /// For the server's own log; empty if nothing is known.
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
         if let Some(user) = &self.user {
             write!(out, ", user {user:?}")?;
@@ -47,7 +46,7 @@ mod tests {
 
     #[test]
     fn a_name_is_one_short_line() {
-        let label = |text: &str| Who::new(None, Some(text)).label;
+        let label = |text: &str| ClientIdentity::new(None, Some(text)).label;
         for (text, shown) in [
             (" Anna ", Some("Anna")),
             ("", None),
@@ -58,6 +57,9 @@ mod tests {
         ] {
             assert_eq!(label(text).as_deref(), shown, "{text:?}");
         }
-        assert_eq!(Who::new(Some("anna@lab"), Some("A\"")).to_string(), r#", user "anna@lab", calls itself "A\"""#);
+        assert_eq!(
+            ClientIdentity::new(Some("anna@lab"), Some("A\"")).to_string(),
+            r#", user "anna@lab", calls itself "A\"""#
+        );
     }
 }
