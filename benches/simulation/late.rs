@@ -30,7 +30,8 @@ pub async fn measure(levels: &[String], sizes: &[u16]) {
             let forge = Forge::with_arm();
             let demo = std::path::Path::new(env!("CARGO_BIN_EXE_demo-simulator"));
             let builder = simulation_server(demo, forge.path(), size).set("isolation", level.as_str());
-            let server = builder.set("limits.disk", DISK).start().await;
+            // Clients whose turn has not come answer nothing.
+            let server = builder.set("limits.disk", DISK).set("timing.silence", 3600).start().await;
             let mut clients = Vec::new();
             while clients.len() < usize::from(size) {
                 clients.extend(ready(&server, AT_ONCE.min(size - clients.len() as u16)).await);

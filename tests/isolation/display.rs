@@ -1,6 +1,7 @@
 //! A virtual display of a simulation's own, in its sandbox; and a display for all that one of them takes up.
 
 use std::os::unix::fs::PermissionsExt;
+use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
@@ -8,9 +9,13 @@ use procfs::process::{FDTarget, Process};
 use serde_json::Value;
 use tokio::io::{AsyncBufReadExt, BufReader};
 use tokio::process::Command;
+use x11rb::connection::Connection;
+use x11rb::protocol::xproto::{ConnectionExt, CreateGCAux, Rectangle};
+use x11rb::rust_connection::{DefaultStream, RustConnection};
 
 use super::deeds::as_nobody;
-use crate::simulation::scene::{DEMO, arm, nothing_left};
+use super::limits::Delegated;
+use crate::simulation::scene::{DEMO, arm, instance_folders, nothing_left};
 use crate::support::client::Client;
 use crate::support::git::Forge;
 use crate::support::program::{Server, simulation_server};
@@ -80,6 +85,79 @@ async fn a_virtual_display_is_inside_of_the_sandbox() {
     }
 }
 
+/// Has the display of a simulation take `MEMORY`, as long as the connection is open.
+fn take_memory(server: &Server, level: &str) -> RustConnection<DefaultStream> {
+    let instance = instance_folders(&server.folder).remove(0);
+    let display =
+        |(pid, _): (i32, String)| Process::new(pid).ok()?.environ().ok()?.remove(std::ffi::OsStr::new("DISPLAY"));
+    let name = instances_below(&server.folder).into_iter().find_map(display).unwrap().into_string().unwrap();
+    let root = if level == "sandbox" { instance.as_path() } else { Path::new("/") };
+    let socket = UnixStream::connect(root.join("tmp/.X11-unix").join(name.replace(':', "X"))).unwrap();
+    let authority = std::fs::read(instance.join("Xauthority")).unwrap();
+    let cookie = authority[authority.len() - 16..].to_vec();
+    let (stream, _) = DefaultStream::from_unix_stream(socket).unwrap();
+    let method = b"MIT-MAGIC-COOKIE-1".to_vec();
+    let connection = RustConnection::connect_to_stream_with_auth_info(stream, 0, method, cookie).unwrap();
+    let screen = &connection.setup().roots[0];
+    let [picture, tool] = [connection.generate_id().unwrap(), connection.generate_id().unwrap()];
+    // Four bytes each.
+    let (width, height) = (8192, u16::try_from(MEMORY / 4 / 8192).unwrap());
+    connection.create_pixmap(screen.root_depth, picture, screen.root, width, height).unwrap();
+    connection.create_gc(tool, picture, &CreateGCAux::new().foreground(screen.white_pixel)).unwrap();
+    connection.poly_fill_rectangle(picture, tool, &[Rectangle { x: 0, y: 0, width, height }]).unwrap();
+    connection.get_input_focus().unwrap().reply().unwrap();
+    connection
+}
+
+/// In bytes.
+const MEMORY: u64 = 256 << 20;
+
+/// What the monitor tells of the memory of the only simulation, in bytes.
+async fn told_memory(server: &Server) -> u64 {
+    let page = http::get(&server.url("/monitor")).await.text();
+    let cell = page.split_once("data-label=\"Memory\"").map_or("", |(_, cell)| cell);
+    let value = cell.split_once("data-value=\"").and_then(|(_, value)| value.split_once('"'));
+    value.map_or(0, |(value, _)| value.parse().unwrap())
+}
+
+#[actix_rt::test]
+async fn what_a_virtual_display_takes_counts_for_its_simulation_in_a_sandbox() {
+    let _alone = display::alone().await;
+    for (level, counts) in [("sandbox", true), ("none", false)] {
+        let (forge, webots, group) = (Forge::with_arm(), Webots::launcher(), Delegated::new());
+        let builder = simulation_server(&webots.path(), forge.path(), 1).set("xvfb", true).set("isolation", level);
+        let join = group.as_ref().map_or("true".to_owned(), Delegated::join);
+        let server = builder.before(&join).start().await;
+        let mut client = Client::start(&server, &arm()).await;
+        client.until("webots:").await;
+        let (begin, _connection) = (Instant::now(), take_memory(&server, level));
+        if counts {
+            until("its memory counts", async || told_memory(&server).await >= MEMORY).await;
+        } else {
+            until("it was read again", async || {
+                assert!(told_memory(&server).await < MEMORY, "this is what the level does not promise");
+                begin.elapsed() > Duration::from_secs(5)
+            })
+            .await;
+        }
+        if let Some(group) = group.as_ref().filter(|_| counts) {
+            let own = group.groups().into_iter().find(|name| name.starts_with("simulation-")).unwrap();
+            let folder = group.0.join(own);
+            let inside = std::fs::read_to_string(folder.join("cgroup.procs")).unwrap();
+            assert!(inside.lines().any(|pid| pid == xvfb(&server).to_string()), "{inside}");
+            // Where systemd delegates this controller, it keeps `limits.memory`.
+            if let Ok(memory) = std::fs::read_to_string(folder.join("memory.current")) {
+                assert!(memory.trim().parse::<u64>().unwrap() >= MEMORY, "{memory}");
+            }
+        }
+        let pid = counts.then(|| xvfb(&server));
+        client.leave().await;
+        nothing_left(&server, 1).await;
+        let is_alive = |pid| Process::new(pid).is_ok_and(|one| one.is_alive());
+        assert!(!pid.is_some_and(is_alive));
+    }
+}
+
 /// The X server of a machine, for few clients.
 async fn x_server() -> (tokio::process::Child, String) {
     let mut command = Command::new("Xvfb");
@@ -104,7 +182,7 @@ async fn a_simulation_that_takes_all_connections_of_a_display_makes_no_server_il
     let builder = simulation_server(home, forge.path(), 1).set("webots", Value::Null).set("display", name.as_str());
     let server = builder.set("webotsHome", home.parent().unwrap().to_str().unwrap()).start().await;
     assert_eq!(health(&server).await, (200, "ok".to_owned()));
-    let connect = || x11rb::rust_connection::RustConnection::connect(Some(&name)).ok();
+    let connect = || RustConnection::connect(Some(&name)).ok();
     let all: Vec<_> = std::iter::from_fn(connect).collect();
     assert!(all.len() > 50 && connect().is_none(), "{}", all.len());
     let begin = Instant::now();

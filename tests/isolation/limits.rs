@@ -2,6 +2,8 @@
 
 use std::time::{Duration, Instant};
 
+use serde_json::json;
+
 use crate::simulation::scene::{DEMO, arm, instance_folders, nothing_left};
 use crate::support::client::Client;
 use crate::support::git::Forge;
@@ -140,17 +142,22 @@ async fn a_flood_of_output_costs_no_more_than_a_tenth_of_a_core() {
 }
 
 /// A control group that this process may divide as if systemd had delegated it; none where there is no cgroup v2.
-struct Delegated(std::path::PathBuf);
+pub struct Delegated(pub std::path::PathBuf);
 
 impl Delegated {
-    fn new() -> Option<Self> {
+    pub fn new() -> Option<Self> {
         let mounts = procfs::process::Process::myself().unwrap().mountinfo().unwrap();
         let mount = mounts.into_iter().find(|mount| mount.fs_type == "cgroup2" && mount.root == "/")?;
         let folder = mount.mount_point.join(format!("fleet-test-{}", rand::random::<u64>()));
         std::fs::create_dir(&folder).ok().map(|()| Self(folder))
     }
 
-    fn groups(&self) -> Vec<String> {
+    /// The shell's words by which a program joins it.
+    pub fn join(&self) -> String {
+        format!("echo $$ > {}/cgroup.procs", self.0.display())
+    }
+
+    pub fn groups(&self) -> Vec<String> {
         let inside = std::fs::read_dir(&self.0).unwrap().flatten().filter(|entry| entry.path().is_dir());
         inside.map(|entry| entry.file_name().into_string().unwrap()).collect()
     }
@@ -182,8 +189,7 @@ async fn a_simulation_has_a_control_group_of_its_own_where_they_are_delegated() 
         let hidden = format!("1000.{}", rand::random::<u64>());
         let webots = Webots::script(&format!("(env -i setsid sleep {hidden} &)\n{DEMO} \"$@\" & wait"));
         let builder = simulation_server(&webots.path(), forge.path(), 1).set("isolation", level);
-        let join = format!("echo $$ > {}/cgroup.procs", delegated.0.display());
-        let server = builder.before(&join).set("timing.grace", 0.5).start().await;
+        let server = builder.before(&delegated.join()).set("timing.grace", 0.5).start().await;
         let mut client = Client::start(&server, &arm()).await;
         client.until("webots:").await;
         let mut groups = delegated.groups();
@@ -201,15 +207,16 @@ async fn a_simulation_has_a_control_group_of_its_own_where_they_are_delegated() 
     }
 }
 
-/// What a program says that may start no thread and no process, as a user who has no other.
-fn said_without_threads(program: &str, arguments: &[&str]) -> String {
-    let mut command = std::process::Command::new("prlimit");
+/// What a program says that may start so many threads and processes, itself among them, as a user who has no other.
+fn said_within(processes: u32, program: &str, arguments: &[&str]) -> String {
+    let mut command = std::process::Command::new("timeout");
+    command.arg("20");
     if nix::unistd::getuid().is_root() {
         let user = rand::random_range(100_000..1_000_000_000).to_string();
-        command = std::process::Command::new("setpriv");
-        command.args(["--reuid", &user, "--regid", &user, "--clear-groups", "prlimit"]);
+        command.args(["setpriv", "--reuid", &user, "--regid", &user, "--clear-groups"]);
     }
-    let output = command.args(["--nproc=1", program]).args(arguments).output().unwrap();
+    let limit = format!("--nproc={processes}");
+    let output = command.args(["prlimit", &limit, program]).args(arguments).output().unwrap();
     String::from_utf8_lossy(&output.stderr).into_owned() + &String::from_utf8_lossy(&output.stdout)
 }
 
@@ -223,9 +230,37 @@ fn programs_that_may_start_no_thread_say_so_and_do_not_panic() {
     let (world, config) = (folder.path().join("a.wbt"), folder.path().join("config.json"));
     std::fs::write(&world, "#VRML_SIM R2025a utf8\n").unwrap();
     std::fs::write(&config, "{\"display\": \":59\", \"isolation\": \"none\"}").unwrap();
-    let said = said_without_threads(env!("CARGO_BIN_EXE_demo-simulator"), &["--stream", world.to_str().unwrap()]);
+    let said = said_within(1, env!("CARGO_BIN_EXE_demo-simulator"), &["--stream", world.to_str().unwrap()]);
     assert!(said.contains("no thread can be started") && !said.contains("panicked"), "{said}");
     let check = ["--check", config.to_str().unwrap()];
-    let said = said_without_threads(env!("CARGO_BIN_EXE_simulation-server"), &check);
+    let said = said_within(1, env!("CARGO_BIN_EXE_simulation-server"), &check);
     assert!(said.contains("no thread can be started to ask it") && !said.contains("panicked"), "{said}");
+}
+
+#[test]
+fn a_server_that_may_start_too_few_processes_says_so_in_one_line() {
+    if super::deeds::as_nobody().is_none() && nix::unistd::getuid().is_root() {
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::set_permissions(folder.path(), std::os::unix::fs::PermissionsExt::from_mode(0o777)).unwrap();
+    let path = |name| folder.path().join(name);
+    let simulation = json!({"port": 64_999, "bind": "127.0.0.1", "server": "localhost", "allowedRepositories": ["https://h/r"],
+        "logDir": path("log"), "cacheDir": path("cache"), "isolation": "none"});
+    let session = json!({"port": 64_999, "bind": "127.0.0.1", "server": "localhost", "simulationServers": ["localhost:1"],
+        "logDir": path("log")});
+    let servers = [
+        (env!("CARGO_BIN_EXE_simulation-server"), "simulation.json", simulation),
+        (env!("CARGO_BIN_EXE_session-server"), "session.json", session),
+    ];
+    for (program, name, config) in servers {
+        std::fs::write(path(name), config.to_string()).unwrap();
+        for processes in [1, 8, 12, 15, 20] {
+            // Another user each time.
+            std::fs::remove_dir_all(path("log")).ok();
+            let said = said_within(processes, program, &[path(name).to_str().unwrap()]);
+            let told = format!("error: only {} more processes and threads may be started", processes - 1);
+            assert!(said.starts_with(&told) && said.lines().count() == 1, "{name}, {processes}: {said}");
+        }
+    }
 }

@@ -7,6 +7,7 @@ use std::os::unix::fs::PermissionsExt;
 use std::os::unix::net::{SocketAddr, UnixListener};
 use std::path::Path;
 
+use nix::sched::{CloneFlags, unshare};
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 
@@ -305,5 +306,35 @@ async fn which_network_simulations_have_is_told() {
         let log = server.log();
         let told: Vec<&str> = log.lines().filter(|line| line.starts_with("error: ")).collect();
         assert!(told.len() == 1 && told[0].contains("but pasta is not there"), "{log}");
+    }
+}
+
+#[actix_rt::test]
+async fn a_machine_without_ipv4_or_ipv6_has_networks_of_simulations_own() {
+    let test = "a_machine_without_ipv4_or_ipv6_has_networks_of_simulations_own";
+    let Some(user) = ordinary(test) else { return };
+    for (ip, address, route) in [("ip -6", "2001:db8::2/64", "2001:db8::1"), ("ip -4", "192.0.2.2/24", "192.0.2.1")] {
+        // What this thread starts from here on is on a machine of its own, with this address and route alone.
+        if unshare(CloneFlags::CLONE_NEWNET).is_err() {
+            return skip(test, "only root can make a network namespace");
+        }
+        let script = format!(
+            "ip link set lo up && ip link add out type veth peer name far && ip link set far up && sysctl -qw net.ipv6.conf.out.accept_dad=0 && \
+             {ip} address add {address} dev out && ip link set out up && {ip} route add default via {route}"
+        );
+        let made = std::process::Command::new("sh").args(["-ec", &script]).output().unwrap();
+        if !made.status.success() {
+            return skip(test, &format!("no network: {}", String::from_utf8_lossy(&made.stderr)));
+        }
+        for streaming in ["direct", "relay"] {
+            let (stage, webots) = (stage(), webots(&format!("{DEMO} \"$@\" & wait")));
+            // All of them are of this namespace.
+            let server = server(&stage, &webots, user, "own").set("streaming", streaming).set("bind", "::");
+            let server = server.env("DEMO_SIMULATOR_BIND", "::").start().await;
+            let mut client = Client::start(&server, &arm()).await;
+            client.until("webots:").await;
+            client.leave().await;
+            nothing_left(&server, 2).await;
+        }
     }
 }

@@ -10,6 +10,7 @@ pub mod service_manager;
 mod signals;
 pub mod start;
 mod supervisor;
+mod threads;
 mod timestamp;
 
 pub use app_error::AppError;

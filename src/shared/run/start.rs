@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use super::logging::{self, LogTarget};
+use super::threads::check_threads;
 use super::{pid_file, service_manager};
 use crate::shared::config::{self, Configuration, LoadedConfig};
 use crate::shared::text::one_line;
@@ -75,6 +76,10 @@ pub fn serve<E: std::error::Error>(
     std::panic::set_hook(Box::new(|panic| log::error!("{panic}")));
     for warning in warnings {
         log::warn!("{warning}");
+    }
+    if let Err(why) = check_threads() {
+        log::error!("{why}");
+        return failed(&why);
     }
     // It is not dropped, because that would wait for blocking threads, as in a slow lookup of a name.
     let system = ManuallyDrop::new(actix_rt::System::new());

@@ -20,11 +20,11 @@ pub struct Disk {
 
 /// The longest and the shortest time between two looks.
 const LOOKS: (Duration, Duration) = (Duration::from_secs(1), Duration::from_millis(50));
-/// As fast as programs are taken to write, in bytes in a millisecond.
+/// Assumed speed of programs that write, in bytes per millisecond.
 const FASTEST: u64 = (4 << 30) / 1000;
 /// Time that an end has to show an effect before another simulation ends, unless the free room shrinks further.
 const EFFECT: Duration = Duration::from_secs(5);
-/// Another one ends when a part of the reserve has been used up since the last end: one in so many.
+/// Another simulation ends when this part of the reserve has been used up since the last end: one in so many.
 const PARTS: u64 = 4;
 
 impl Disk {
@@ -34,7 +34,7 @@ impl Disk {
         Self { folder, reserve, room, lost: 0, relieved: None }
     }
 
-    /// Looks how much room there is. What the file system does not tell stays as it was.
+    /// Reads the free room. It stays as it was if the file system does not answer.
     pub fn look(&mut self) {
         let Ok(room) = DiskRoom::of(&self.folder) else { return };
         let bytes = self.room.bytes.saturating_sub(room.bytes);
@@ -64,7 +64,7 @@ impl Disk {
         }
         match &mut self.relieved {
             None => true,
-            // What was ended is being removed.
+            // The folder of the ended simulation is being removed.
             Some((free, at)) if self.room.bytes > *free => {
                 (*free, *at) = (self.room.bytes, Instant::now());
                 false
@@ -73,7 +73,7 @@ impl Disk {
         }
     }
 
-    /// A simulation ends for the reserve, if there is one that has grown.
+    /// Notes that a simulation ends for the reserve, if one has grown.
     pub fn relieve(&mut self) {
         self.relieved = Some((self.room.bytes, Instant::now()));
     }

@@ -29,7 +29,7 @@ pub struct DiskUse {
 
 /// Time between two counts for `limits.disk`.
 const COUNT_AGAIN: Duration = Duration::from_secs(10);
-/// Who has grown less, in bytes, does not end for the reserve: its end would free nothing.
+/// A simulation that has grown less, in bytes, does not end for the reserve: its end would free nothing.
 const LEAST_GROWTH: u64 = 1 << 20;
 
 impl DiskUse {
@@ -50,7 +50,7 @@ impl DiskUse {
         lost.saturating_sub(self.lost) >= left && self.counted.elapsed() >= COUNT_AGAIN
     }
 
-    /// Counts what it takes, within this time. Returns what is wrong, in words for its client.
+    /// Counts what it takes, within this time. Returns a message for its client if it exceeds its limit.
     pub fn count(&mut self, lost: u64, time: Duration) -> Option<String> {
         let mut size = DiskUsage::new(room, self.allowed()).within(time);
         let counted = size.add_folder(&self.folder);
@@ -76,25 +76,25 @@ impl DiskUse {
                 Some(files) => {
                     files.iter().filter(|file| Some(file.dev()) == device).for_each(|file| size.add_nameless(file));
                 }
-                // What runs a sandbox hides, and writes nothing.
+                // The programs that run a sandbox hide, and write nothing.
                 None => self.hides |= process != self.root,
             }
         }
     }
 
-    /// What it may take, in bytes: what it took at first counts besides the limit.
+    /// What it may take, in bytes: the limit besides what it took at first.
     fn allowed(&self) -> u64 {
         self.first.saturating_add(self.limit << 20)
     }
 
-    /// How much it has grown, in bytes, if that is worth its end. Who hides what it has open comes before all others.
+    /// How much it has grown, in bytes, if its end would free room. One that hides its open files comes before all others.
     pub fn growth(&self) -> Option<u64> {
         let grown = self.taken.saturating_sub(self.first);
         if self.hides { Some(u64::MAX) } else { Some(grown).filter(|grown| *grown >= LEAST_GROWTH) }
     }
 }
 
-/// Why a simulation ends for the reserve, in words for its client.
+/// Why a simulation ends for the reserve, as text for its client.
 pub fn words(growth: u64) -> String {
     let what = match growth {
         u64::MAX => "hides which files it has open".to_owned(),

@@ -5,7 +5,7 @@
 use std::ffi::OsString;
 use std::fmt;
 use std::io;
-use std::net::{IpAddr, Ipv4Addr};
+use std::net::IpAddr;
 use std::path::{Path, PathBuf};
 
 use nix::sys::resource::{Resource, getrlimit};
@@ -228,8 +228,7 @@ impl Launcher {
     #[must_use]
     pub fn reached(&self) -> Option<IpAddr> {
         let Method::Sandbox(sandbox) = &self.method else { return None };
-        let address = sandbox.network().map(OwnNetwork::forwarded)?;
-        Some(if address.is_unspecified() { Ipv4Addr::LOCALHOST.into() } else { address })
+        sandbox.network().map(OwnNetwork::reached)
     }
 
     /// Why simulations run at level `none` although the configuration does not say so, if they do.

@@ -1,6 +1,6 @@
 //! A network of its own for each sandbox, by pasta (package passt): a network namespace whose packets pasta sends on as an
-//! ordinary program of this user. The machine's loopback, its abstract sockets and the ports of other simulations are not
-//! in it; one port of the machine is forwarded into it.
+//! ordinary program of this user. The machine's loopback, its abstract sockets and the ports of other simulations are out
+//! of reach; one port of the machine is forwarded into it.
 //!
 //! pasta starts bubblewrap and ends with it; bubblewrap ends with pasta, and pasta with the server (`PR_SET_PDEATHSIG`).
 //! In the namespace bubblewrap begins as its root. Before it gives that up, nft loads a packet filter there, which no
@@ -8,7 +8,7 @@
 
 use std::ffi::OsString;
 use std::io;
-use std::net::{IpAddr, Ipv4Addr, Ipv6Addr};
+use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, UdpSocket};
 use std::path::{Path, PathBuf};
 
 use which::which;
@@ -17,30 +17,37 @@ use super::mount::{Mount, MountKind};
 use super::program::Program;
 use crate::simulation::config::{SandboxNetwork, SimulationConfig};
 
-/// What gives each sandbox a network of its own.
+/// The programs and settings that give each sandbox a network of its own.
 #[derive(Debug)]
 pub struct OwnNetwork {
     pasta: PathBuf,
     setpriv: PathBuf,
     unshare: PathBuf,
-    /// What loads the packet filter; `None` where that can't be had.
+    /// The program that loads the packet filter; `None` if it is missing or fails.
     nft: Option<PathBuf>,
     closed: bool,
+    loopback: IpAddr,
+    /// The address of the machine on which the port of each simulation is forwarded: the one on which the server listens,
+    /// or the loopback where only this server is to reach simulations.
     forwarded: IpAddr,
 }
 
-/// Where programs in a sandbox ask for names, and pasta asks the machine's own name server.
+/// Where programs in a sandbox ask for names, and pasta asks the machine's own name server; on a machine without IPv4 the
+/// second one.
 const RESOLVER: &str = "169.254.1.1";
+const RESOLVER_6: &str = "fd53::1:1";
+/// An address of the internet (for documentation), to which nothing is sent.
+const INTERNET: (Ipv4Addr, u16) = (Ipv4Addr::new(203, 0, 113, 7), 9);
 /// The file that names it.
 const RESOLV_CONF: &str = "/etc/resolv.conf";
 /// The socket of the system's log.
 const SYSTEM_LOG: &str = "/dev/log";
-/// Where root has nft, and others don't look for programs.
+/// Path of nft, which is not in the `PATH` of ordinary users.
 const NFT: &str = "/usr/sbin/nft";
 /// Versions of pasta until 2023 leave the socket on which they listen, which is one of the machine's network, to what they
 /// start.
 const CLOSE: &str = "exec 3>&- 4>&- 5>&- 6>&- 7>&- 8>&- 9>&-";
-/// Fails where a program in the sandbox has inherited a socket.
+/// Fails if a program in the sandbox has inherited a socket.
 pub const CHECK: &str = "for one in /proc/self/fd/*; do case $(readlink \"$one\") in socket:*) \
                          echo 'pasta leaves sockets open' >&2; exit 1 ;; esac; done";
 
@@ -48,7 +55,7 @@ impl OwnNetwork {
     /// Prepares networks for a server with this configuration.
     ///
     /// # Errors
-    /// Why there can be none, in words for an administrator.
+    /// Why there can be none, as text for an administrator.
     pub fn new(config: &SimulationConfig) -> Result<Self, String> {
         if nix::unistd::getuid().is_root() {
             return Err("pasta gives none to root, run the server as a user of its own".to_owned());
@@ -67,7 +74,9 @@ impl OwnNetwork {
         if closed && nft.is_none() {
             return Err(missing("nft", "nftables"));
         }
-        Ok(Self { pasta, setpriv, unshare, nft, closed, forwarded: forwarded(config) })
+        let loopback = loopback();
+        let forwarded = if config.ports_are_public() { config.bind } else { loopback };
+        Ok(Self { pasta, setpriv, unshare, nft, closed, loopback, forwarded })
     }
 
     /// Whether programs reach nothing at all.
@@ -82,15 +91,15 @@ impl OwnNetwork {
         self.nft.is_some()
     }
 
-    /// Does without the packet filter, if that is allowed and makes a difference.
+    /// Drops the packet filter, if the configuration allows that. Returns whether there was one.
     pub fn give_up_filter(&mut self) -> bool {
         !self.closed && self.nft.take().is_some()
     }
 
-    /// The address of the machine on which the port of each simulation is forwarded.
+    /// The address at which this server reaches the forwarded port of each simulation.
     #[must_use]
-    pub fn forwarded(&self) -> IpAddr {
-        self.forwarded
+    pub fn reached(&self) -> IpAddr {
+        if self.forwarded.is_unspecified() { self.loopback } else { self.forwarded }
     }
 
     /// The words that run a program in a network of its own. Writes the files that it needs into the instance's folder.
@@ -101,20 +110,21 @@ impl OwnNetwork {
         let mut command: Vec<OsString> = vec![self.setpriv.clone().into()];
         command.extend(["--pdeathsig", "KILL", "--"].map(Into::into));
         command.push(self.pasta.clone().into());
-        // It would take the machine's loopback for its gateway, and open ports to and from the machine by itself.
+        // By default it maps its gateway to the machine's loopback, and opens ports to and from the machine.
         let fixed = ["--config-net", "--no-map-gw", "-u", "none", "-T", "none", "-U", "none", "-t"];
         command.extend(fixed.map(Into::into));
         // A port alone is one of all addresses, of either version of IP.
         let is_any = self.forwarded == Ipv6Addr::UNSPECIFIED;
         let port = program.port;
         command.push(if is_any { port.to_string() } else { format!("{}/{port}", self.forwarded) }.into());
-        // It complains where the system has no log. Where it has one, AppArmor may allow no other file.
+        // Without the system's log it prints errors. With it, AppArmor may allow no other file.
         if !Path::new(SYSTEM_LOG).exists() {
             command.extend(["--log-file".into(), program.instance.join("pasta.log").into()]);
         }
         if !self.closed {
-            command.extend(["--dns-forward", RESOLVER].map(Into::into));
-            std::fs::write(resolv_conf(program.instance), format!("nameserver {RESOLVER}\n"))?;
+            let resolver = if self.loopback.is_ipv4() { RESOLVER } else { RESOLVER_6 };
+            command.extend(["--dns-forward", resolver].map(Into::into));
+            std::fs::write(resolv_conf(program.instance), format!("nameserver {resolver}\n"))?;
         }
         command.extend(["--", "/bin/sh", "-c"].map(Into::into));
         if let Some(nft) = &self.nft {
@@ -131,14 +141,14 @@ impl OwnNetwork {
         Ok(command)
     }
 
-    /// What a sandbox shows so that programs find names.
+    /// The mount by which programs in a sandbox resolve names.
     pub fn mounts(&self, instance: &Path) -> Option<Mount> {
         let at = Path::new(RESOLV_CONF).canonicalize().ok().filter(|_| !self.closed)?;
         Some(Mount { at, content: MountKind::ReadableFile(resolv_conf(instance)) })
     }
 }
 
-/// A display that simulations are given and reach by TCP.
+/// A display of the configuration that is reached by TCP.
 fn remote_display(config: &SimulationConfig) -> Option<String> {
     let of_gpus = (0..config.displays_of_gpus().len()).map(|index| config.display_on(u32::try_from(index).ok()));
     let mut displays = of_gpus.chain([config.display_on(None)]).filter(|_| !config.xvfb);
@@ -149,8 +159,9 @@ fn resolv_conf(instance: &Path) -> PathBuf {
     instance.join("resolv.conf")
 }
 
-/// The address of the machine on which the port of each simulation is forwarded: the one on which the server listens, or
-/// the loopback where only this server is to reach simulations. Nothing else decides it.
-fn forwarded(config: &SimulationConfig) -> IpAddr {
-    if config.ports_are_public() { config.bind } else { Ipv4Addr::LOCALHOST.into() }
+/// The machine's loopback address. pasta makes networks without IPv4 where the machine has no route for it, and then
+/// forwards nothing from 127.0.0.1.
+fn loopback() -> IpAddr {
+    let has_route = UdpSocket::bind((Ipv4Addr::UNSPECIFIED, 0)).is_ok_and(|socket| socket.connect(INTERNET).is_ok());
+    if has_route { Ipv4Addr::LOCALHOST.into() } else { Ipv6Addr::LOCALHOST.into() }
 }

@@ -31,17 +31,17 @@ pub struct Sandbox {
     mounts: Vec<Mount>,
     /// Whether programs inside can be kept from creating user namespaces, which bubblewrap supports since 0.8.
     ends_namespaces: bool,
-    /// What gives it a network of its own, if it has one.
+    /// Its own network, if it has one.
     network: Option<OwnNetwork>,
-    /// How much its shared memory may hold, in bytes.
+    /// Size limit of its shared memory, in bytes.
     shared_memory: u64,
 }
 
-/// What of `/run` programs need to find names. Services answer there that ask the internet.
+/// What programs need of `/run` to resolve names. Services there send queries to the internet.
 const NAMES_RUN: [&str; 4] =
     ["/run/systemd/resolve", "/run/resolvconf", "/run/NetworkManager/resolv.conf", "/run/nscd"];
-/// What of `/run` programs need to find users and graphics cards. The rest are sockets of services, some of which start
-/// programs for whoever asks.
+/// What programs need of `/run` to find users and graphics cards. The rest are sockets of services, some of which start
+/// programs on request.
 const SYSTEM_RUN: [&str; 4] = ["/run/udev", "/run/nvidia-persistenced", "/run/opengl-driver", "/run/current-system"];
 /// Graphics cards; also all in `/dev` that begins with `nvidia`.
 const DEVICES: [&str; 2] = ["/dev/dri", "/dev/kfd"];
@@ -52,7 +52,7 @@ const REMEDY: &str = "user namespaces must be allowed (sysctl user.max_user_name
                       kernel.unprivileged_userns_clone, kernel.apparmor_restrict_unprivileged_userns), and /proc not be \
                       covered as in a container";
 
-/// Where nothing of pasta works: what may be done about it.
+/// What an administrator can do if pasta does not work.
 const NETWORK_REMEDY: &str = "ordinary users must be allowed to open /dev/net/tun (mode 0666, as udev has it), and the \
                               machine must have a default route";
 
@@ -117,7 +117,7 @@ impl Sandbox {
         mounts.extend(self.mounts.iter().cloned());
         // The sort is stable: of two mounts at the same path the last one counts.
         mounts.sort_by_key(|mount| mount.at.components().count());
-        // What is empty is memory, and stays empty; so does the rest of `/dev`.
+        // Empty directories are memory: they are made read-only, as is the rest of `/dev`.
         let closed = empty(&mounts);
         command.extend(mounts.into_iter().flat_map(Mount::into_arguments));
         command.extend(self.shared_memory());
@@ -201,7 +201,7 @@ impl Sandbox {
     /// Gives each sandbox a network of its own, if that works here. Blocks for ten seconds at most.
     ///
     /// # Errors
-    /// Why it does not, in words for an administrator.
+    /// Why it does not, as text for an administrator.
     pub fn join(&mut self, network: OwnNetwork) -> Result<(), String> {
         self.network = Some(network);
         let mut tried = self.trial();
@@ -214,12 +214,12 @@ impl Sandbox {
         })
     }
 
-    /// What gives it a network of its own, if it has one.
+    /// Its own network, if it has one.
     pub fn network(&self) -> Option<&OwnNetwork> {
         self.network.as_ref()
     }
 
-    /// Whether programs inside can't make user namespaces.
+    /// Whether programs inside are kept from creating user namespaces.
     pub fn ends_namespaces(&self) -> bool {
         self.ends_namespaces
     }
@@ -274,7 +274,7 @@ fn temporary_folders() -> impl Iterator<Item = PathBuf> {
     real.filter(|folder| folder.parent().is_some() && !folder.starts_with("/dev")).collect::<BTreeSet<_>>().into_iter()
 }
 
-/// Where an empty folder is shown and nothing else in its place, and `/dev`.
+/// The paths at which a directory stays empty, and `/dev`.
 fn empty(mounts: &[Mount]) -> Vec<PathBuf> {
     let is_last = |number: usize, mount: &Mount| !mounts.iter().skip(number + 1).any(|other| other.at == mount.at);
     let empty = mounts.iter().enumerate().filter(|(_, mount)| matches!(mount.content, MountKind::EmptyFolder));

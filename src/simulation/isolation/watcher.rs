@@ -51,7 +51,7 @@ pub struct Watch {
     pub processes: Option<MostProcesses>,
     /// Its port; `None` if it has a network of its own.
     pub port: Option<u16>,
-    /// Hears what it has taken; `None` if its control group knows.
+    /// Receives its usage; `None` if its control group counts it.
     pub peak: Option<Arc<Peak>>,
 }
 
@@ -79,14 +79,14 @@ const SHORTEST: Duration = Duration::from_secs(1);
 const LONGEST: Duration = Duration::from_secs(10);
 /// The pause after a tick, as a multiple of its CPU time: 1 % of one core.
 const PAUSE: u32 = 99;
-/// How much processor time a tick may take for folders. What is left is counted in the next one.
+/// Limit of processor time for folders in a tick. The remaining ones are counted in the next tick.
 const FOLDERS: Duration = Duration::from_millis(100);
-/// How long it may take to count a folder for `limits.disk`; while others wait for the look at the reserve, and in all
-/// for that look.
+/// Time limits: of counting a folder for `limits.disk`; of counting one when the reserve is reached, and of counting all
+/// folders then.
 const COUNT: Duration = Duration::from_secs(1);
 const COUNT_AT_RESERVE: Duration = Duration::from_millis(100);
 const COUNTS_AT_RESERVE: Duration = Duration::from_millis(300);
-/// Listeners of somebody else are forgotten after this time.
+/// Listeners of other programs are forgotten after this time.
 const FORGET: Duration = Duration::from_secs(30);
 
 impl Watcher {
@@ -175,9 +175,9 @@ impl Table {
     fn find_grown_most(&mut self) -> Option<(i32, String)> {
         let until = Instant::now() + COUNTS_AT_RESERVE;
         let lost = self.disk.lost();
-        // Also if none is found: the next try waits, too.
+        // Also if none is found, so that the next try waits, too.
         self.disk.relieve();
-        // The one that had grown most is counted first, then those that were not counted for the longest time.
+        // The one that had grown most is counted first, then those whose count is oldest.
         self.all.sort_by_key(|one| one.disk.counted());
         let most = self.all.iter().enumerate().max_by_key(|(_, one)| one.disk.growth()).map(|(mount, _)| mount);
         most.inspect(|mount| self.all.swap(0, *mount));
@@ -205,11 +205,11 @@ impl Table {
         self.end(excesses);
     }
 
-    /// Tells those who asked, and watches these simulations no longer.
+    /// Sends these messages, and stops monitoring these simulations.
     fn end(&mut self, excesses: impl IntoIterator<Item = (i32, String)>) {
         for (root, why) in excesses {
             if let Some(mount) = self.all.iter().position(|one| one.watch.root == root) {
-                // Who asked may be gone.
+                // The receiver may be gone.
                 self.all.swap_remove(mount).excess.send(why).ok();
             }
         }
@@ -294,7 +294,7 @@ impl Table {
     }
 }
 
-/// How much processor time this thread has taken. What a tick waits for a busy machine or its disk costs nobody anything.
+/// CPU time of this thread. Time that a tick waits for a busy machine or its disk does not count.
 fn processor_time() -> Duration {
     clock_gettime(ClockId::CLOCK_THREAD_CPUTIME_ID).map(Duration::from).unwrap_or_default()
 }
