@@ -9,35 +9,11 @@ from browser import Page
 from case import BrowserTest
 from door import COOKIE, OneDoor
 from fleet import SOON, WORLD, until
+from students import NAMES, label, start_all
 
 PASSWORD = "open sesame"
-TABS = ["anna", "ben", "chloe"]
-OTHERS = [
-    "dora", "emil", "fay", "gus", "hana", "ivan", "jane", "kofi", "lena", "milo", "nora", "omar", "pia", "quinn", "rosa", "sami",
-    "tess", "uma", "vera", "will", "xena", "yara", "zeno", "amir", "bela", "carl", "dana"]
-CLASS = TABS + OTHERS
-# What a page does that shows nothing: it asks for a simulation server, starts a world there, and stays.
-START = """
-    async ([world, name]) => {
-      const server = await (await fetch(`session?url=${world}`)).text();
-      const socket = new WebSocket(`${server}/client`);
-      const heard = new Promise((resolve, reject) => {
-        socket.onmessage = ({ data }) => {
-          if (data.startsWith('webots:'))
-            resolve(data.slice('webots:'.length));
-          else if (data.startsWith('loading: Error:'))
-            reject(data);
-        };
-        socket.onclose = ({ code }) => reject(`${name} was left: ${code}`);
-      });
-      heard.catch(() => {});
-      (window.simulations ??= []).push(heard);
-      await new Promise((resolve, reject) => {
-        socket.onopen = resolve;
-        socket.onerror = () => reject(`${name} is not let in`);
-      });
-      socket.send(JSON.stringify({ start: { url: world, name } }));
-    }"""
+# Who has a page that shows the simulation.
+TABS = NAMES[:3]
 # Whether a WebSocket is opened; who is let in plays the prank.
 PRANK = """
     (url) => new Promise((resolve) => {
@@ -49,7 +25,7 @@ PRANK = """
 NOTICE = """
     () => {
       const place = document.getElementById('announcement');
-      new MutationObserver(() => { window.announced ??= place.textContent && Date.now(); })
+      new MutationObserver(() => { window.announced ||= place.textContent && Date.now(); })
         .observe(place, { childList: true, subtree: true, characterData: true, attributes: true });
     }"""
 
@@ -80,14 +56,6 @@ class AClass(BrowserTest):
         page.tab.get_by_role("button", name="Connect", exact=True).click()
         return page
 
-    def others(self):
-        """All others, in the background: each signs in with an own name."""
-        page = self.visit(OTHERS[0], "viewer")
-        for name in OTHERS:
-            page.context.add_cookies([{"name": COOKIE, "value": name, "url": self.fleet.url("")}])
-            page.tab.evaluate(START, [WORLD.format("carousel"), f"{name.title()} at desk {CLASS.index(name)}"])
-        return page
-
     def monitors(self):
         """What the teacher has open: the monitor of each machine, reached from that of the fleet."""
         credentials = {"username": "teacher", "password": PASSWORD}
@@ -104,8 +72,10 @@ class AClass(BrowserTest):
 
     def test_a_teacher_has_a_class_of_thirty_in_hand(self):
         students = {name: self.student(name) for name in TABS}
-        others = self.others()
-        streams = others.tab.evaluate("Promise.all(simulations)")
+        # The others are there in the background, and everybody has signed in.
+        others = self.visit(NAMES[3], "viewer")
+        become = lambda name: others.context.add_cookies([{"name": COOKIE, "value": name, "url": self.fleet.url("")}])
+        streams = start_all(others, NAMES[3:], become, WORLD.format("carousel"))
         for page in students.values():
             expect(page.tab.locator("[data-step=simulation].done")).to_be_visible()
         anna = students["anna"]
@@ -121,7 +91,7 @@ class AClass(BrowserTest):
         # Nobody else has noticed anything.
         for machine in machines:
             machine.tab.get_by_label("Filter").fill("")
-        until("the others run on", lambda: sum(one.tab.locator("#simulations tr").count() for one in machines) == len(CLASS) - 1)
+        until("the others run on", lambda: sum(one.tab.locator("#simulations tr").count() for one in machines) == len(NAMES) - 1)
         expect(students["ben"].tab.locator("#problem")).to_be_hidden()
         for page in [fleet, *machines, *students.values()]:
             self.keeps_to_the_rules(page)
@@ -131,12 +101,12 @@ class AClass(BrowserTest):
         read = """table => [...table.querySelectorAll('td[data-label=Who]')]
             .map((cell) => [cell.querySelector('b')?.textContent, cell.querySelector('span')?.textContent])"""
         parts = lambda: [dict(one.tab.locator("#simulations").evaluate(read)) for one in machines]
-        until("all are listed", lambda: sum(map(len, parts())) == len(CLASS))
+        until("all are listed", lambda: sum(map(len, parts())) == len(NAMES))
         one, other = parts()
-        self.assertEqual(sorted({**one, **other}), sorted(f"{name}@school.example" for name in CLASS))
-        for number, name in enumerate(CLASS):
-            label = name.title() if name in TABS else f"{name.title()} at desk {number}"
-            self.assertEqual((one | other)[f"{name}@school.example"], f"{label} unverified")
+        self.assertEqual(sorted({**one, **other}), sorted(f"{name}@school.example" for name in NAMES))
+        for name in NAMES:
+            called = name.title() if name in TABS else label(name)
+            self.assertEqual((one | other)[f"{name}@school.example"], f"{called} unverified")
         self.assertGreater(min(len(one), len(other)), 8, "each machine has its part of the class")
 
     def the_teacher_finds_and_watches(self, student, machines):
