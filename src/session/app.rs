@@ -11,7 +11,7 @@ use tokio::sync::watch;
 use super::announcements::Announcements;
 use super::config::SessionConfig;
 use super::state::AppState;
-use crate::session::fleet::{Ping, Reconfigure, Registry, resolver};
+use crate::session::fleet::{GetStatus, Reconfigure, Registry, resolver};
 use crate::session::web::configure;
 use crate::shared::config;
 use crate::shared::http::server::{self, HttpServerOptions};
@@ -55,7 +55,7 @@ pub async fn run(mut config: SessionConfig, file: PathBuf) -> Result<(), AppErro
     let serving = actix_rt::spawn(http);
     start::announce("session server", &http_url, &websocket_url, port);
     let registry = server.registry.clone();
-    actix_rt::spawn(service_manager::feed_watchdog(async move || registry.send(Ping).await.is_ok()));
+    actix_rt::spawn(service_manager::feed_watchdog(async move || registry.send(GetStatus).await.is_ok()));
     tokio::select! {
         () = handle_commands(&mut signals, &file, &server, port) => {}
         fault = permanent::stopped("Registry", server.registry.clone()) => return Err(AppError::ActorStopped(fault)),

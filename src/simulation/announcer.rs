@@ -13,7 +13,7 @@ const TRIES: u32 = 6;
 const ANSWER: Duration = Duration::from_secs(10);
 
 /// Size limit of an answer, in bytes.
-const LARGEST_ANSWER: usize = 64 * 1024;
+const MAX_ANSWER_SIZE: usize = 64 * 1024;
 
 /// An answer that refuses an announcement, although its status is 200.
 #[derive(serde::Deserialize)]
@@ -43,7 +43,7 @@ async fn announce(address: String, form: Vec<(&'static str, String)>, pause: Dur
     for attempt in 1..=TRIES {
         let problem = match client.post(&address).send_form(&form).await {
             Ok(mut answer) if answer.status().is_success() => {
-                let body = answer.body().limit(LARGEST_ANSWER).await.unwrap_or_default();
+                let body = answer.body().limit(MAX_ANSWER_SIZE).await.unwrap_or_default();
                 let Ok(Refusal { error }) = serde_json::from_slice(&body) else {
                     log::info!("announced to {address}");
                     return;

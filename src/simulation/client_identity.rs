@@ -14,16 +14,16 @@ pub struct ClientIdentity {
 }
 
 /// Longest user name, in characters.
-const USER_LENGTH: usize = 200;
+const MAX_USER_LENGTH: usize = 200;
 /// Longest label, in characters.
-const LABEL_LENGTH: usize = 60;
+const MAX_LABEL_LENGTH: usize = 60;
 
 impl ClientIdentity {
     /// Cuts the names to their longest length, in one line; an empty name becomes `None`.
     pub fn new(user: Option<&str>, label: Option<&str>) -> Self {
         let cut = |text: &str, most| one_line(text).trim().chars().take(most).collect::<String>();
         let cut = |text: Option<&str>, most| text.map(|text| cut(text, most)).filter(|text| !text.is_empty());
-        Self { user: cut(user, USER_LENGTH), label: cut(label, LABEL_LENGTH) }
+        Self { user: cut(user, MAX_USER_LENGTH), label: cut(label, MAX_LABEL_LENGTH) }
     }
 }
 

@@ -104,7 +104,8 @@ impl ClientRequest {
         if !message.is_object() {
             return Ok(None);
         }
-        let message = WireMessage::deserialize(message).map_err(|error| ClientRequestError(error.to_string()))?;
+        let message: WireMessage =
+            serde_path_to_error::deserialize(message).map_err(|error| ClientRequestError(error.to_string()))?;
         Ok(match message {
             WireMessage { reset_controller: Some(file), .. } => Some(Self::ResetController(file)),
             WireMessage { resume: Some(token), .. } => Some(Self::Resume(Token::parse(&token))),
@@ -268,15 +269,21 @@ mod tests {
         let table = [
             ("", "it is no JSON"),
             ("garbage", "it is no JSON"),
-            (r#"{"start":{}}"#, "missing field `url`"),
-            (r#"{"start":5}"#, "invalid type: integer `5`"),
-            (r#"{"start":{"url":"x","mode":"vr"}}"#, "unknown variant `vr`, expected one of `x3d`, `w3d`, `mjpeg`"),
-            (r#"{"start":{"url":5}}"#, "invalid type: integer `5`, expected a string"),
-            (r#"{"start":{"url":"x","resumable":1}}"#, "expected a boolean"),
-            (r#"{"start":{"url":"x","name":{}}}"#, "expected a string"),
-            (r#"{"resume":5}"#, "expected a string"),
-            (r#"{"keep":5}"#, "expected a boolean"),
-            (r#"{"reset controller":5}"#, "expected a string"),
+            (r#"{"start":{}}"#, "start: missing field `url`"),
+            (r#"{"start":5}"#, "start: invalid type: integer `5`"),
+            (
+                r#"{"start":{"url":"x","mode":"vr"}}"#,
+                "start.mode: unknown variant `vr`, expected one of `x3d`, `w3d`, `mjpeg`",
+            ),
+            (r#"{"start":{"url":5}}"#, "start.url: invalid type: integer `5`, expected a string"),
+            (
+                r#"{"start":{"url":"x","resumable":1}}"#,
+                "start.resumable: invalid type: integer `1`, expected a boolean",
+            ),
+            (r#"{"start":{"url":"x","name":{}}}"#, "start.name: invalid type: map, expected a string"),
+            (r#"{"resume":5}"#, "resume: invalid type: integer `5`, expected a string"),
+            (r#"{"keep":5}"#, "keep: invalid type: integer `5`, expected a boolean"),
+            (r#"{"reset controller":5}"#, "reset controller: invalid type: integer `5`, expected a string"),
         ];
         for (text, words) in table {
             let error = ClientRequest::parse(text).unwrap_err().to_string();

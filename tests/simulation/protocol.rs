@@ -23,7 +23,7 @@ async fn a_message_that_is_none_is_answered_in_words() {
     let table = [
         ("garbage".to_owned(), "Wrong message"),
         ("[".repeat(5000), "Wrong message"),
-        (r#"{"start":{"url":"x","mode":"vr"}}"#.to_owned(), "unknown variant `vr`, expected one of `x3d`"),
+        (r#"{"start":{"url":"x","mode":"vr"}}"#.to_owned(), "start.mode: unknown variant `vr`, expected one of `x3d`"),
         (start("https://github.com/lab/arm"), "Wrong Webots simulation URL"),
         (start("ftp://github.com/lab/arm/blob/main/worlds/a.wbt"), "does not begin with https://"),
     ];

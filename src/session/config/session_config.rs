@@ -118,7 +118,7 @@ pub struct SessionConfig {
 }
 
 /// Upper limit of `timing.stop`: the server stops within five seconds.
-const LONGEST_STOP: Duration = Duration::from_millis(4500);
+const MAX_STOP: Duration = Duration::from_millis(4500);
 
 /// Time until a new client shows fully in the load: its start, and the five seconds of which the load is the mean.
 const SETTLING: Duration = Duration::from_secs(8);
@@ -222,8 +222,8 @@ impl Configuration for SessionConfig {
         require(self.timing.silence > self.timing.ping, "timing.silence", || {
             format!("{} s is not more than timing.ping", self.timing.silence.as_secs_f64())
         })?;
-        require(self.timing.stop <= LONGEST_STOP, "timing.stop", || {
-            let (stop, most) = (self.timing.stop.as_secs_f64(), LONGEST_STOP.as_secs_f64());
+        require(self.timing.stop <= MAX_STOP, "timing.stop", || {
+            let (stop, most) = (self.timing.stop.as_secs_f64(), MAX_STOP.as_secs_f64());
             format!("{stop} s is too long; allowed is at most {most} s, for the server ends within 5 s")
         })?;
         let allowed = "no URL of a web server; allowed are http and https";

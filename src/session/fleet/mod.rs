@@ -16,5 +16,5 @@ mod state_history;
 
 pub use fleet_status::{FleetStatus, NameStatus, ServerState, ServerStatus, StateChange};
 pub use pick::{Pick, PickError};
-pub use registry::{GetStatus, Ping, Reconfigure, Registry};
+pub use registry::{GetStatus, Reconfigure, Registry};
 pub use resolver::resolver;

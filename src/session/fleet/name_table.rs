@@ -26,7 +26,7 @@ struct MonitoredName {
 }
 
 /// Longest error text that is kept, in characters.
-const LONGEST_ERROR: usize = 120;
+const MAX_ERROR_LENGTH: usize = 120;
 
 /// What a lookup has changed.
 #[derive(Debug, PartialEq, Eq)]
@@ -78,7 +78,7 @@ impl NameTable {
                 failed.then_some(LookupTransition::WorksAgain(looked.servers.len()))
             }
             Err(error) => {
-                let error: String = one_line(&error).chars().take(LONGEST_ERROR).collect();
+                let error: String = one_line(&error).chars().take(MAX_ERROR_LENGTH).collect();
                 looked.error = Some(error.clone());
                 (!failed).then_some(LookupTransition::Fails(error))
             }

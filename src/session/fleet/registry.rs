@@ -33,11 +33,6 @@ use crate::shared::http::AddressQuota;
 #[rtype(result = "Arc<FleetStatus>")]
 pub struct GetStatus;
 
-/// Checks that the registry still answers.
-#[derive(Message)]
-#[rtype(result = "()")]
-pub struct Ping;
-
 /// Replaces the configuration; see [`SessionConfig::reload`] for the keys that take effect at once.
 #[derive(Message)]
 #[rtype(result = "()")]
@@ -239,12 +234,6 @@ impl Handler<Pick> for Registry {
         self.publish();
         answer
     }
-}
-
-impl Handler<Ping> for Registry {
-    type Result = ();
-
-    fn handle(&mut self, _: Ping, _: &mut Self::Context) {}
 }
 
 impl Handler<GetStatus> for Registry {

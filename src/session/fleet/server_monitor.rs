@@ -77,9 +77,9 @@ pub struct ServerMonitor {
 }
 
 /// Size limit of an answer, in bytes.
-const LARGEST_ANSWER: usize = 1024 * 1024;
+const MAX_ANSWER_SIZE: usize = 1024 * 1024;
 /// The highest plausible load, in percent.
-const LARGEST_LOAD: f64 = 1000.0;
+const MAX_LOAD: f64 = 1000.0;
 /// Longer than any probe may take: awc has timeouts of its own, which can't all be turned off.
 const NEVER: Duration = Duration::from_hours(24);
 /// Probes of all monitors start at multiples of this time, so that the thread wakes once for many of them.
@@ -92,13 +92,6 @@ const LOAD_ONLY: Duration = Duration::from_mins(1);
 /// Status codes of a server that has no such page; some servers answer only that the request is invalid.
 const NO_SUCH_PAGE: [StatusCode; 4] =
     [StatusCode::NOT_FOUND, StatusCode::BAD_REQUEST, StatusCode::METHOD_NOT_ALLOWED, StatusCode::NOT_IMPLEMENTED];
-
-/// A valid answer.
-enum Answer {
-    Status(ServerReport),
-    /// There is no `/status`, but a `/load`.
-    Load(Load),
-}
 
 /// An HTTP client that keeps one connection to the simulation server.
 fn client(interval: Duration, resolver: TokioResolver, tls: Option<Arc<ClientConfig>>) -> awc::Client {
@@ -154,9 +147,14 @@ impl ServerMonitor {
         };
         probe
             .into_actor(self)
-            .map(|(answer, latency), monitor, ctx| {
+            .map(move |(answer, latency), monitor, ctx| {
                 monitor.probing = false;
-                let answer = answer.map(|answer| monitor.report(answer));
+                if let Ok((_, has_status)) = answer
+                    && !load_only
+                {
+                    monitor.load_only_until = (!has_status).then(|| Instant::now() + LOAD_ONLY);
+                }
+                let answer = answer.map(|(report, _)| report);
                 match monitor.results.try_send(ProbeResult { server: monitor.server.clone(), latency, answer }) {
                     Ok(()) => {}
                     Err(SendError::Full(_)) => log::warn!("{}: a report is lost, too many are waiting", monitor.server),
@@ -165,19 +163,6 @@ impl ServerMonitor {
                 }
             })
             .spawn(ctx);
-    }
-
-    /// Turns an answer into a report, and notes which page the server has.
-    fn report(&mut self, answer: Answer) -> ServerReport {
-        match answer {
-            Answer::Status(report) => report,
-            Answer::Load(load) => {
-                if self.load_only_until.is_none_or(|end| Instant::now() >= end) {
-                    self.load_only_until = Some(Instant::now() + LOAD_ONLY);
-                }
-                ServerReport::load_only(load)
-            }
-        }
     }
 }
 
@@ -206,9 +191,10 @@ impl Handler<Stop> for ServerMonitor {
     }
 }
 
-async fn probe(client: &awc::Client, url: &str, load_only: bool) -> Result<Answer, ProbeError> {
+/// Requests the state of a server. Returns its report, and whether that comes from `/status`.
+async fn probe(client: &awc::Client, url: &str, load_only: bool) -> Result<(ServerReport, bool), ProbeError> {
     if !load_only && let Some((body, _)) = get(client, &format!("{url}/status")).await? {
-        return parse_status(&body).map(Answer::Status);
+        return parse_status(&body).map(|report| (report, true));
     }
     let body = get(client, &format!("{url}/load")).await?;
     let (bytes, has_length) =
@@ -218,7 +204,7 @@ async fn probe(client: &awc::Client, url: &str, load_only: bool) -> Result<Answe
         return Err(ProbeError::BadAnswer("an answer without Content-Length".to_owned()));
     }
     let load = Load::parse(&bytes).map_err(|error| ProbeError::BadAnswer(shortened(&error.to_string())))?;
-    plausible(load).map(Answer::Load)
+    plausible(load).map(|load| (ServerReport::load_only(load), false))
 }
 
 /// Returns the body of a page and whether its length was announced, `None` if the server has no such page.
@@ -240,7 +226,7 @@ async fn get(client: &awc::Client, url: &str) -> Result<Option<(Bytes, bool)>, P
         return Err(ProbeError::BadAnswer(format!("status {status}")));
     }
     let length = answer.headers().get(CONTENT_LENGTH).and_then(|value| value.to_str().ok()?.parse::<usize>().ok());
-    let bytes = answer.timeout(NEVER).body().limit(LARGEST_ANSWER).await;
+    let bytes = answer.timeout(NEVER).body().limit(MAX_ANSWER_SIZE).await;
     let bytes = bytes.map_err(|error| ProbeError::BadAnswer(shortened(&error.to_string())))?;
     match length {
         Some(length) if bytes.len() < length => {
@@ -276,16 +262,16 @@ fn parse_status(body: &[u8]) -> Result<ServerReport, ProbeError> {
 }
 
 fn plausible(load: Load) -> Result<Load, ProbeError> {
-    let is_none = load.percent() > LARGEST_LOAD;
+    let is_none = load.percent() > MAX_LOAD;
     if is_none { Err(ProbeError::BadAnswer(shortened(&format!("a load of {load} %")))) } else { Ok(load) }
 }
 
 /// Longest text of a server that is kept, in characters.
-const LONGEST_REASON: usize = 500;
+const MAX_REASON_LENGTH: usize = 500;
 
 /// Cuts an untrusted text.
 fn shortened(text: &str) -> String {
-    excerpt(text, LONGEST_REASON)
+    excerpt(text, MAX_REASON_LENGTH)
 }
 
 #[cfg(test)]

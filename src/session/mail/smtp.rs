@@ -145,7 +145,7 @@ impl SmtpRelay {
         let reason = root(error);
         if let Some(code) = error.status() {
             self.delivery(&format!("{code} {reason}"), error.is_permanent())
-        } else if let Some(rustls::Error::InvalidCertificate(_)) = tls_error(error) {
+        } else if reason.starts_with("invalid peer certificate") {
             let advice = "SSL_CERT_FILE may name another authority";
             self.delivery(&format!("its certificate is not trusted: {reason} ({advice})"), true)
         } else {
@@ -158,22 +158,9 @@ impl SmtpRelay {
     }
 }
 
-/// An error and its causes.
-fn chain<'error>(error: &'error (dyn Error + 'static)) -> impl Iterator<Item = &'error (dyn Error + 'static)> {
-    std::iter::successors(Some(error), |error| (*error).source())
-}
-
 /// The text of the innermost cause.
 fn root(error: &(dyn Error + 'static)) -> String {
-    chain(error).last().unwrap_or(error).to_string()
-}
-
-/// The TLS error among the causes of an error.
-fn tls_error<'error>(error: &'error (dyn Error + 'static)) -> Option<&'error rustls::Error> {
-    chain(error).find_map(|error| {
-        let inside = error.downcast_ref::<std::io::Error>().and_then(std::io::Error::get_ref);
-        inside.and_then(|inside| inside.downcast_ref()).or_else(|| error.downcast_ref())
-    })
+    std::iter::successors(Some(error), |error| (*error).source()).last().unwrap_or(error).to_string()
 }
 
 #[cfg(test)]

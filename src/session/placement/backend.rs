@@ -169,11 +169,11 @@ impl Backend {
         let Some((_, report)) = self.last.filter(|_| self.up) else {
             return false;
         };
-        let has_place = report.instances.is_none_or(|instances| {
+        let has_slot = report.instances.is_none_or(|instances| {
             let taken = f64::from(instances.present) + count(self.reserved) + self.sent_by_others();
             instances.accepting && taken < f64::from(instances.places)
         });
-        has_place && self.effective_load().is_some_and(|load| load < self.limit(policy))
+        has_slot && self.effective_load().is_some_and(|load| load < self.limit(policy))
     }
 
     /// The load, in percent, from which on this server gets no client.

@@ -11,7 +11,7 @@ use std::time::Duration;
 /// Time in which the weight of a report falls to 1/e; only time with clients counts.
 const MEMORY: Duration = Duration::from_mins(10);
 /// Longest time that one report stands for, so that the report after a gap does not weigh too much.
-const LONGEST_STEP: Duration = Duration::from_secs(10);
+const MAX_STEP: Duration = Duration::from_secs(10);
 /// Weight of the assumption that an idle server's load is 0, in seconds of reports.
 const BASE_TRUST: f64 = 2.0;
 /// Largest weight of the load of an idle server, in seconds.
@@ -111,7 +111,7 @@ impl CostFit {
     /// Learns that the server had this `load`, in percent, with this number of `clients`. `elapsed` is the time since
     /// the report before, and `trust` (0 to 1) how well the number of clients is known.
     pub(super) fn learn(&mut self, clients: f64, load: f64, elapsed: Duration, trust: f64) {
-        let seconds = elapsed.min(LONGEST_STEP).as_secs_f64();
+        let seconds = elapsed.min(MAX_STEP).as_secs_f64();
         let load = load.min(100.0);
         // A full machine can show that its clients cost more than assumed, but not that they cost less.
         let says_nothing = load >= FULL && self.base + self.slope * clients >= load;

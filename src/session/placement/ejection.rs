@@ -3,9 +3,9 @@
 //! The rule is that of Envoy's outlier detection (`consecutive_5xx` with an ejection time that grows, and panic routing),
 //! with the half-open state of a circuit breaker:
 //!
-//! 1. The server is ejected for [`FIRST`] once it reports [`FAILURES`] failed starts in a row.
+//! 1. The server is ejected for [`FIRST_EJECTION`] once it reports [`FAILURES`] failed starts in a row.
 //! 2. After that time one client is sent there. Until its start succeeds, the server is ejected again.
-//! 3. If it fails, the time doubles, up to [`LONGEST`]. If it succeeds, all of this is reset.
+//! 3. If it fails, the time doubles, up to [`MAX_EJECTION`]. If it succeeds, all of this is reset.
 //!
 //! An ejected server gets clients if no other has room: if all fail alike, as without a Git host, none of them is the
 //! cause.
@@ -15,9 +15,9 @@ use std::time::{Duration, Instant};
 /// Number of failed starts in a row that ejects a server; below it, an unlucky client could eject one.
 const FAILURES: u32 = 3;
 /// Duration of the first ejection.
-const FIRST: Duration = Duration::from_secs(30);
+const FIRST_EJECTION: Duration = Duration::from_secs(30);
 /// Longest duration of an ejection.
-const LONGEST: Duration = Duration::from_mins(5);
+const MAX_EJECTION: Duration = Duration::from_mins(5);
 
 /// What is known of a server's failed starts.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
@@ -57,7 +57,7 @@ impl Ejection {
     }
 
     fn eject(&mut self, now: Instant) {
-        let time = FIRST.saturating_mul(1 << (self.times - 1).min(8)).min(LONGEST);
+        let time = FIRST_EJECTION.saturating_mul(1 << (self.times - 1).min(8)).min(MAX_EJECTION);
         self.until = now.checked_add(time);
     }
 

@@ -13,7 +13,7 @@ const MEMORY: f64 = 200.0;
 const DOUBT: f64 = 20.0;
 /// Upper limit of the estimate: more session servers are not recommended, and a client that starts simulations without
 /// requesting a server must not close the fleet.
-const MOST: f64 = 4.0;
+const MAX_ESTIMATE: f64 = 4.0;
 
 /// The clients that arrived at the servers of a fleet, and how many of them were sent from here.
 #[derive(Debug, Clone, Default)]
@@ -32,7 +32,7 @@ impl Replicas {
 
     /// Number of clients that arrive for each that is sent from here: 1 if no other session server sends any.
     pub(super) fn clients_per_placement(&self) -> f64 {
-        ((self.came + DOUBT) / (self.sent + DOUBT)).clamp(1.0, MOST)
+        ((self.came + DOUBT) / (self.sent + DOUBT)).clamp(1.0, MAX_ESTIMATE)
     }
 }
 
@@ -53,7 +53,7 @@ mod tests {
         let mut replicas = Replicas::default();
         assert_eq!(after(&mut replicas, 500, 1).to_bits(), 1.0_f64.to_bits());
         let four = after(&mut replicas, 1000, 4);
-        assert!((3.0..=MOST).contains(&four), "{four}");
+        assert!((3.0..=MAX_ESTIMATE).contains(&four), "{four}");
         let one = after(&mut replicas, 1000, 1);
         assert!(one < 1.1, "{one}");
     }
@@ -64,7 +64,7 @@ mod tests {
         replicas.count(0.0, 1e9);
         assert_eq!(replicas.clients_per_placement().to_bits(), 1.0_f64.to_bits());
         replicas.count(1e19, 0.0);
-        assert!(replicas.clients_per_placement() <= MOST);
+        assert!(replicas.clients_per_placement() <= MAX_ESTIMATE);
         let recovered = after(&mut replicas, 1000, 1);
         assert!(recovered < 1.1, "{recovered}");
     }

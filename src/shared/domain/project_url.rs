@@ -61,7 +61,7 @@ fn url_error(problem: impl Into<String>) -> ProjectUrlError {
 }
 
 /// Longest URL that is parsed, in bytes.
-const LONGEST: usize = 2000;
+const MAX_LENGTH: usize = 2000;
 
 impl ProjectUrl {
     /// Reads a world's URL in the form of GitHub, GitLab (`/-/blob/`) or Gitea (`/src/branch/`).
@@ -70,8 +70,8 @@ impl ProjectUrl {
     /// When it is not `https`, names a user, holds `.` or `..` as segments, encoded slashes or control characters, or does
     /// not end in `/worlds/NAME.wbt`. A query and a fragment, as pages of Git hosts add them, are ignored.
     pub fn parse(text: &str) -> Result<Self, ProjectUrlError> {
-        if text.len() > LONGEST {
-            return Err(url_error(format!("it is longer than {LONGEST} bytes")));
+        if text.len() > MAX_LENGTH {
+            return Err(url_error(format!("it is longer than {MAX_LENGTH} bytes")));
         }
         let (host, mut segments) = split_url(text.split(['?', '#']).next().unwrap_or_default())?;
         let (repository, reference, kind) = split_repository(&segments)?;
@@ -202,8 +202,8 @@ pub(super) fn without_git(name: &str) -> Result<String, ProjectUrlError> {
 /// # Errors
 /// See [`ProjectUrl::parse`].
 pub(super) fn split_url(text: &str) -> Result<(String, Vec<String>), ProjectUrlError> {
-    if text.len() > LONGEST {
-        return Err(url_error(format!("it is longer than {LONGEST} bytes")));
+    if text.len() > MAX_LENGTH {
+        return Err(url_error(format!("it is longer than {MAX_LENGTH} bytes")));
     }
     if text.chars().any(|letter| letter.is_control() || letter == '\\') {
         return Err(url_error("it holds a backslash or a control character"));

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use actix::prelude::*;
 
 /// Limit of panics of one kind of actor within [`WINDOW`].
-const MOST_PANICS: usize = 5;
+const MAX_PANICS: usize = 5;
 const WINDOW: Duration = Duration::from_mins(1);
 
 /// All actors of one kind, by key. actix does not restart an actor that has panicked.
@@ -19,7 +19,7 @@ pub struct Supervisor<K, A: Actor> {
 
 /// Actors of one kind panic again and again: the server must exit and be restarted.
 #[derive(Debug, PartialEq, Eq, thiserror::Error)]
-#[error("more than {MOST_PANICS} panics of one kind of actor ({kind}) within {} s", WINDOW.as_secs())]
+#[error("more than {MAX_PANICS} panics of one kind of actor ({kind}) within {} s", WINDOW.as_secs())]
 pub struct TooManyPanics {
     kind: &'static str,
 }
@@ -65,7 +65,7 @@ impl<K: Ord + Display, A: Actor> Supervisor<K, A> {
             start(key).inspect(|new| *actor = new.clone()).is_some()
         });
         while self.panics.pop_front_if(|at| now.duration_since(*at) > WINDOW).is_some() {}
-        if self.panics.len() > MOST_PANICS { Err(TooManyPanics { kind: self.kind }) } else { Ok(()) }
+        if self.panics.len() > MAX_PANICS { Err(TooManyPanics { kind: self.kind }) } else { Ok(()) }
     }
 }
 
@@ -97,11 +97,11 @@ mod tests {
         supervisor.add("one", Fragile.start());
         supervisor.add("other", Fragile.start());
         let other = supervisor.get(&"other").unwrap().clone();
-        for panics in 1..=MOST_PANICS + 1 {
+        for panics in 1..=MAX_PANICS + 1 {
             let actor = supervisor.get(&"one").unwrap().clone();
             actor.send(Panic).await.unwrap_err();
             let enough = supervisor.restart_gone(|_| Some(Fragile.start()));
-            assert_eq!(enough.is_err(), panics > MOST_PANICS, "after {panics}");
+            assert_eq!(enough.is_err(), panics > MAX_PANICS, "after {panics}");
             assert_ne!(supervisor.get(&"one").unwrap(), &actor);
         }
         assert_eq!(supervisor.get(&"other").unwrap(), &other, "one that has not panicked was replaced");

@@ -67,8 +67,8 @@ impl Handler<Resume> for Session {
         }
         let moved = resumption.move_to(peer.rate_limit_key()).into_actor(self);
         Box::pin(moved.map(move |moved, this, ctx| {
-            if let Ok(Err(no_place)) = moved {
-                return Err(protocol::error(&no_place.to_string()));
+            if let Ok(Err(full)) = moved {
+                return Err(protocol::error(&full.to_string()));
             }
             // Another connection may have used the same token since then.
             if let Some((resumption, refusal)) =

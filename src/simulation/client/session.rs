@@ -57,23 +57,25 @@ impl Session {
         client: Recipient<ToClient>,
         (url, mode, resumable): (String, Mode, bool),
     ) -> Attachment {
-        let start = Pending::new(&server.starts);
-        let session = Self {
-            server,
-            peer,
-            identity,
-            id: String::new(),
-            client: Some(client),
-            attachment: 0,
-            state: State::Asked { url, mode },
-            restoring: false,
-            start,
-            resumable,
-            resumption: None,
-            is_watched: false,
-        };
-        let attachment = session.attachment;
-        Attachment::new(session.start().recipient(), attachment)
+        let session = Self::create(|ctx| {
+            let mut session = Self {
+                start: Pending::new(&server.starts),
+                server,
+                peer,
+                identity,
+                id: String::new(),
+                client: Some(client),
+                attachment: 0,
+                state: State::Over,
+                restoring: false,
+                resumable,
+                resumption: None,
+                is_watched: false,
+            };
+            session.request_slot(&url, mode, ctx);
+            session
+        });
+        Attachment::new(session.recipient(), 0)
     }
 
     pub(super) fn name(&self) -> String {
@@ -154,9 +156,6 @@ impl Actor for Session {
                 this.finish(protocol::stopping(), "", CloseCode::Away, ctx);
             })
             .spawn(ctx);
-        if let State::Asked { url, mode } = std::mem::replace(&mut self.state, State::Over) {
-            self.ask(&url, mode, ctx);
-        }
     }
 
     fn stopped(&mut self, _: &mut Self::Context) {

@@ -42,7 +42,7 @@ impl Session {
         self.refer(outcome, why, ctx);
     }
 
-    pub(super) fn ask(&mut self, url: &str, mode: Mode, ctx: &mut Context<Self>) {
+    pub(super) fn request_slot(&mut self, url: &str, mode: Mode, ctx: &mut Context<Self>) {
         if !self.server.start_quota.take(self.peer.rate_limit_key()) {
             let why = "Too many simulations were asked for from your address. Try again in a minute";
             return self.fail_start(Outcome::Refused, why, ctx);

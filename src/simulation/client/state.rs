@@ -10,13 +10,6 @@ use crate::simulation::webots::{Stop, Webots};
 
 /// The life cycle of a simulation, as its session knows it.
 pub enum State {
-    /// Its client has requested it.
-    Asked {
-        /// The URL, as the client sent it.
-        url: String,
-        /// How it is shown.
-        mode: Mode,
-    },
     /// Waiting for a slot.
     Waiting {
         /// The request.
@@ -33,7 +26,7 @@ pub enum State {
     },
     /// Webots was started.
     Launched(WebotsHandle),
-    /// The client got its last text.
+    /// It holds nothing: it was not admitted yet, or its client got the last text.
     Over,
 }
 
@@ -45,7 +38,7 @@ impl State {
                 lease.end(reason, why, Taken::default());
             }
             Self::Launched(WebotsHandle(webots)) => webots.do_send(Stop(reason)),
-            Self::Asked { .. } | Self::Over => {}
+            Self::Over => {}
         }
     }
 }

@@ -48,7 +48,7 @@ pub(super) struct Present {
 /// Number of events that are kept of a simulation.
 const MAX_EVENTS: usize = 60;
 /// Longest text of an event, in characters.
-const EVENT_LENGTH: usize = 500;
+const MAX_EVENT_LENGTH: usize = 500;
 
 /// The simulation to end if more than `most` wait for disconnected clients. It has waited longest, among those of the
 /// address that has most of them, so that a client that reconnects often harms only itself.
@@ -120,7 +120,7 @@ impl Present {
             self.events.push(format!(
                 "{} {}",
                 timestamp(SystemTime::now()),
-                excerpt(&without_paths(event), EVENT_LENGTH)
+                excerpt(&without_paths(event), MAX_EVENT_LENGTH)
             ));
         }
     }

@@ -122,7 +122,11 @@ impl SlotPool {
             && let Some(first) = self.queue.remove(next)
         {
             match first.client.try_send(SlotEvent::Granted(port)) {
-                Ok(()) => self.lend(first.id, port),
+                Ok(()) => {
+                    if let Some(present) = self.present.get_mut(&first.id) {
+                        present.lend(port);
+                    }
+                }
                 // It keeps its position in the queue until the next check.
                 Err(SendError::Full(_)) => {
                     self.queue.insert(next, first);
@@ -146,12 +150,6 @@ impl SlotPool {
         {
             longest.shown.away_until = None;
             longest.listener.do_send(SlotEvent::AwayTooLong);
-        }
-    }
-
-    fn lend(&mut self, id: SimulationId, port: u16) {
-        if let Some(present) = self.present.get_mut(&id) {
-            present.lend(port);
         }
     }
 

@@ -13,7 +13,7 @@ use crate::simulation::protocol;
 use crate::simulation::state::AppState;
 
 /// Longest reason, in characters.
-const REASON_LENGTH: usize = 300;
+const MAX_REASON_LENGTH: usize = 300;
 
 /// Adds the paths to an app.
 pub fn configure(app: &mut web::ServiceConfig) {
@@ -58,7 +58,7 @@ async fn stop(
         Ok(order) => order,
         Err(refusal) => return refusal,
     };
-    let (id, reason) = (id.into_inner(), excerpt(reason.trim(), REASON_LENGTH));
+    let (id, reason) = (id.into_inner(), excerpt(reason.trim(), MAX_REASON_LENGTH));
     match stop_simulation(&server, id.clone(), protocol::stopped_by_teacher(&reason)).await {
         Some(true) => {
             let peer = server.config.trusted_proxies.peer(&request);

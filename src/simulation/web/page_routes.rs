@@ -30,7 +30,7 @@ const ASSETS: &[Asset] = &[
     asset!("watch.js"),
 ];
 /// How much of an output's end is shown, in bytes: all that is kept of one that has ended, with its events.
-const LARGEST_TAIL: u64 = 96 * 1024;
+const MAX_TAIL: u64 = 96 * 1024;
 
 /// Adds the routes to an app.
 pub fn configure(app: &mut web::ServiceConfig) {
@@ -117,7 +117,7 @@ async fn output(request: HttpRequest, which: web::Query<Which>, server: web::Dat
     }
     let logs = server.config.log_dir.0.join("simulation");
     let tail =
-        web::block(move || output_file(&logs, &which.id).and_then(|file| last_lines(&file, LARGEST_TAIL).ok())).await;
+        web::block(move || output_file(&logs, &which.id).and_then(|file| last_lines(&file, MAX_TAIL).ok())).await;
     let Ok(Some(tail)) = tail else {
         return HttpResponse::NotFound().body("Error: nothing is kept of this simulation.");
     };

@@ -140,7 +140,7 @@ impl Webots {
         (self.tail, self.group) = (tail, Some(group));
         ended.into_actor(self).map(|end, this, ctx| this.ended(&end, ctx)).spawn(ctx);
         let excess = self.spec.until_too_much(pid, peak).into_actor(self);
-        excess.map(|why, this, _| this.end_at_once(&why)).spawn(ctx);
+        excess.map(|why, this, _| this.stop(EndReason::Limit, &why)).spawn(ctx);
         Ok(())
     }
 
@@ -199,23 +199,19 @@ impl Webots {
         }
     }
 
-    /// Requests an orderly end. Only the first reason counts.
+    /// Ends Webots: orderly, or at once if it exceeds a limit, which it could exceed further in a grace period. Only the
+    /// first reason counts.
     pub(super) fn stop(&mut self, kind: EndReason, why: &str) {
-        if self.stopped_for.is_none() {
-            self.log(Level::Info, &format!("ending: {why}"));
-            self.stopped_for = Some((kind, why.to_owned()));
-            self.spec.slot.lease.update(SimulationChange::Stage(Stage::Stopping));
-            self.group.iter_mut().for_each(ProcessGroup::terminate);
+        if self.stopped_for.is_some() {
+            return;
         }
-    }
-
-    /// Kills Webots at once: during a grace period it could exceed its limit further.
-    fn end_at_once(&mut self, why: &str) {
-        if self.stopped_for.is_none() {
-            self.log(Level::Warn, &format!("ended: {why}"));
-            self.stopped_for = Some((EndReason::Limit, why.to_owned()));
-            self.spec.slot.lease.update(SimulationChange::Stage(Stage::Stopping));
+        self.log(if kind == EndReason::Limit { Level::Warn } else { Level::Info }, &format!("ending: {why}"));
+        self.stopped_for = Some((kind, why.to_owned()));
+        self.spec.slot.lease.update(SimulationChange::Stage(Stage::Stopping));
+        if kind == EndReason::Limit {
             self.group = None;
+        } else {
+            self.group.iter_mut().for_each(ProcessGroup::terminate);
         }
     }
 
