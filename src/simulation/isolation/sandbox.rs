@@ -54,7 +54,7 @@ const REMEDY: &str = "user namespaces must be allowed (sysctl user.max_user_name
 
 /// What an administrator can do if pasta does not work.
 const NETWORK_REMEDY: &str = "ordinary users must be allowed to open /dev/net/tun (mode 0666, as udev has it), and the \
-                              machine must have a default route";
+                              machine must have a default route, of the version of IP of bind";
 
 impl Sandbox {
     /// Prepares sandboxes for a server with this configuration.

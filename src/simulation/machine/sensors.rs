@@ -1,5 +1,6 @@
-//! Readings of the machine (sysinfo) and of its NVIDIA GPUs (NVML).
+//! Readings of the machine (sysinfo, procfs) and of its NVIDIA GPUs (NVML).
 
+use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 use std::sync::mpsc;
 use std::time::{Duration, Instant};
@@ -7,8 +8,9 @@ use std::time::{Duration, Instant};
 use nix::sys::statvfs::statvfs;
 use nvml_wrapper::Nvml;
 use nvml_wrapper::error::NvmlError;
+use procfs::net::{DeviceStatus, dev_status};
 use serde::Serialize;
-use sysinfo::{CpuRefreshKind, MemoryRefreshKind, Networks, RefreshKind, System};
+use sysinfo::{CpuRefreshKind, MemoryRefreshKind, RefreshKind, System};
 
 use crate::shared::domain::Load;
 
@@ -129,7 +131,8 @@ pub struct Host {
 /// Reads the machine.
 pub struct MachineSensor {
     system: System,
-    networks: Networks,
+    /// The network interfaces by name, as of the last reading.
+    interfaces: HashMap<String, DeviceStatus>,
     disk: PathBuf,
     read: Instant,
 }
@@ -145,7 +148,7 @@ impl MachineSensor {
             .with_memory(MemoryRefreshKind::everything());
         Ok(Self {
             system: System::new_with_specifics(kinds)?,
-            networks: Networks::new_with_refreshed_list()?,
+            interfaces: dev_status().unwrap_or_default(),
             disk: disk.to_owned(),
             read: Instant::now(),
         })
@@ -170,11 +173,14 @@ impl MachineSensor {
     pub fn read(&mut self) -> Machine {
         self.system.refresh_cpu_usage();
         self.system.refresh_memory();
-        self.networks.refresh(true);
+        // One file, where sysinfo reads several of each interface.
+        let before = std::mem::replace(&mut self.interfaces, dev_status().unwrap_or_default());
         let seconds = std::mem::replace(&mut self.read, Instant::now()).elapsed().as_secs_f64().max(0.001);
-        let outside = || self.networks.iter().filter(|(name, _)| *name != "lo").map(|(_, data)| data);
-        let sent = outside().map(sysinfo::NetworkData::transmitted).sum::<u64>();
-        let received = outside().map(sysinfo::NetworkData::received).sum::<u64>();
+        let passed = |bytes: fn(&DeviceStatus) -> u64| -> u64 {
+            let outside = self.interfaces.values().filter(|one| one.name != "lo");
+            outside.filter_map(|one| Some(bytes(one).saturating_sub(bytes(before.get(&one.name)?)))).sum()
+        };
+        let (sent, received) = (passed(|one| one.sent_bytes), passed(|one| one.recv_bytes));
         Machine {
             cpu: f64::from(self.system.global_cpu_usage()),
             memory: percent(self.system.used_memory(), self.system.total_memory()),
