@@ -25,6 +25,7 @@ use super::project::Project;
 use super::redirect;
 use super::repository_cache::RepositoryCache;
 use super::revision::Revision;
+use super::single_flight::OnProgress;
 use super::steps;
 use super::work_tree::{self, WorkTree, copy_call};
 use crate::shared::domain::{AdmissionRules, ProjectUrl};
@@ -32,7 +33,6 @@ use crate::simulation::process::InstanceDir;
 
 /// Checks worlds out; one for the whole server.
 pub struct CheckoutService {
-    git: Arc<Git>,
     cache: Arc<RepositoryCache>,
     finder: Arc<CommitResolver>,
     limits: CheckoutLimits,
@@ -68,11 +68,11 @@ impl CheckoutService {
         runtime: Handle,
     ) -> io::Result<Self> {
         let git = Arc::new(Git::new(run, config, limits.stall_timeout()));
-        let cache = Arc::new(RepositoryCache::open(dir, budget, Arc::clone(&git), limits)?);
-        let finder = Arc::new(CommitResolver::new(Arc::clone(&git), Arc::clone(&cache), (mirrors, rules), limits));
+        let cache = Arc::new(RepositoryCache::open(dir, budget, git, limits)?);
+        let finder = Arc::new(CommitResolver::new(Arc::clone(&cache), (mirrors, rules), limits));
         let keeper = AbortOnDropHandle::new(runtime.spawn(Arc::clone(&cache).keep_within_budget()));
         let (copies, has_lfs) = (Semaphore::new(COPIES), lfs::is_installed());
-        Ok(Self { git, cache, finder, limits, runtime, copies, has_lfs, _keeps_within_budget: keeper })
+        Ok(Self { cache, finder, limits, runtime, copies, has_lfs, _keeps_within_budget: keeper })
     }
 
     /// Starts to check a world out into a client's directory. `progress` receives each step as text.
@@ -85,7 +85,7 @@ impl CheckoutService {
         let this = Arc::clone(self);
         let job = async move {
             let limit = this.limits.time;
-            let done = actix_rt::time::timeout(limit, this.check_out(&world, instance, progress)).await;
+            let done = actix_rt::time::timeout(limit, this.check_out(&world, instance, &progress)).await;
             done.unwrap_or_else(|_| Err(too_slow(&world, limit)))
         };
         AbortOnDropHandle::new(self.runtime.spawn(job))
@@ -95,12 +95,12 @@ impl CheckoutService {
         &self,
         world: &ProjectUrl,
         instance: InstanceDir,
-        progress: impl Fn(String) + Send + Sync,
+        progress: OnProgress<'_>,
     ) -> Result<Project, CheckoutError> {
         let start = Instant::now();
         let (mut world, mut redirects, mut is_mended) = (world.clone(), 0, false);
         let checked_out = loop {
-            match self.attempt(&world, &instance, &progress).await {
+            match self.attempt(&world, &instance, progress).await {
                 Err(CheckoutError::Moved(..)) if redirects < redirect::MOST => {
                     redirects += 1;
                     world = self.finder.moved(&world).await?;
@@ -144,7 +144,7 @@ impl CheckoutService {
         &self,
         world: &ProjectUrl,
         instance: &InstanceDir,
-        progress: &(impl Fn(String) + Send + Sync),
+        progress: OnProgress<'_>,
     ) -> Result<(Revision, WorkTree), CheckoutError> {
         let found = self.finder.find(world, progress).await?;
         let turn = self.copies.acquire().await;
@@ -156,7 +156,7 @@ impl CheckoutService {
                 progress(steps::checking_out(name, Some(line)));
             }
         };
-        let written = work_tree::write(&self.git, &found, instance, (&self.limits, self.has_lfs), told).await;
+        let written = work_tree::write(&found, instance, (&self.limits, self.has_lfs), told).await;
         if self.has_lfs {
             self.cache.grown();
         }
@@ -197,7 +197,7 @@ impl CheckoutService {
         let restored = FileRestore::new(instance.path()).map_err(failed)?;
         let paths = [path.as_bytes(), b"\0"].concat();
         let call = copy_call(&repository, revision, &paths, (restored.path(), &restored.files())).await;
-        self.git.run(call.map_err(failed)?, |_| ()).await.map_err(|source| git_failed(url, source))?;
+        repository.run(call.map_err(failed)?, |_| ()).await.map_err(|source| git_failed(url, source))?;
         restored.place(instance.project(), path.to_owned()).await.map_err(failed)
     }
 }

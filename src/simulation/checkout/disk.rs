@@ -44,11 +44,6 @@ fn absent(result: io::Result<()>) -> io::Result<()> {
     result.or_else(|error| if error.kind() == io::ErrorKind::NotFound { Ok(()) } else { Err(error) })
 }
 
-/// How many bytes the packs of a repository have.
-pub fn packed(repository: &Path) -> u64 {
-    files(&repository.join("objects/pack")).map(|path| length(&path)).sum()
-}
-
 /// How many bytes a running fetch has received.
 pub fn received(repository: &Path) -> u64 {
     unfinished(repository).map(|path| length(&path)).sum()
@@ -69,26 +64,12 @@ fn length(file: &Path) -> u64 {
     file.metadata().map_or(0, |about| about.len())
 }
 
-/// A directory and its size limit in bytes.
-#[derive(Debug, Clone)]
-pub struct Growing {
-    folder: PathBuf,
-    most: u64,
-}
-
-impl Growing {
-    /// This folder may take so many bytes.
-    pub fn new(folder: PathBuf, most: u64) -> Self {
-        Self { folder, most }
-    }
-}
-
-/// Waits until one of the directories exceeds its limit.
-pub async fn outgrown(folders: Vec<Growing>) {
+/// Waits until one of the directories exceeds its limit, in bytes.
+pub async fn outgrown(folders: Vec<(PathBuf, u64)>) {
     loop {
         actix_rt::time::sleep(BETWEEN_LOOKS).await;
         let looked_at = folders.clone();
-        let is_one = move || Ok(looked_at.iter().any(|one| room_of(&one.folder) > one.most));
+        let is_one = move || Ok(looked_at.iter().any(|(folder, most)| room_of(folder) > *most));
         if blocking(is_one).await.is_ok_and(|is_one| is_one) {
             return;
         }

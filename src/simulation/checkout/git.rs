@@ -43,38 +43,7 @@ pub struct Call<'call> {
 /// be read: a mirror may belong to another user, and nothing in it is executed. Redirects are off: they could resolve
 /// to a repository, or into a network, that the configuration forbids. A remote that stays silent for too long is given
 /// up.
-const SETTINGS: &str = "\
-[safe]
-	directory = *
-[core]
-	hooksPath = /dev/null
-	attributesFile = /dev/null
-	excludesFile = /dev/null
-	fsmonitor = false
-	packedGitLimit = 512m
-	packedGitWindowSize = 32m
-	bigFileThreshold = 16m
-[http]
-	followRedirects = false
-[filter \"lfs\"]
-	process =
-	smudge =
-	required = false
-[fetch]
-	recurseSubmodules = false
-	unpackLimit = 1
-[submodule]
-	recurse = false
-[gc]
-	autoDetach = false
-[maintenance]
-	auto = false
-[init]
-	defaultRefFormat = files
-	templateDir =
-[advice]
-	detachedHead = false
-";
+const SETTINGS: &str = include_str!("gitconfig");
 
 /// Memory limit in bytes for an answer of a remote, which is enough for a million branches, or for a copy.
 pub const LITTLE_MEMORY: u64 = 512 << 20;
@@ -101,19 +70,17 @@ impl Git {
         Self { settings, mark: run.to_owned() }
     }
 
-    /// Writes the file of settings, unless it has the right text.
+    /// Writes the file of settings, unless it is there.
     async fn write_settings(&self) -> std::io::Result<()> {
-        let (file, text) = self.settings.clone();
-        let write = move || {
-            if std::fs::read(&file).is_ok_and(|found| found == text.as_bytes()) {
-                return Ok(());
-            }
-            if let Some(folder) = file.parent() {
-                std::fs::create_dir_all(folder)?;
-            }
-            std::fs::write(&file, text)
-        };
-        actix_rt::task::spawn_blocking(write).await?
+        let (file, text) = &self.settings;
+        if tokio::fs::try_exists(file).await? {
+            return Ok(());
+        }
+        tokio::fs::create_dir_all(&self.mark).await?;
+        // Others that start at once never see half of it.
+        let new = self.mark.join(format!("gitconfig-{:08x}", rand::random::<u32>()));
+        tokio::fs::write(&new, text).await?;
+        tokio::fs::rename(&new, file).await
     }
 
     /// Runs a command to its end. Returns its answer. `progress` receives each line of standard error.

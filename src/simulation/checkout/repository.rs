@@ -7,16 +7,15 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use parking_lot::Mutex;
-use tokio::sync::{AcquireError, OwnedMutexGuard, Semaphore, SemaphorePermit, watch};
+use tokio::sync::{Notify, OwnedMutexGuard, watch};
 
 use super::checkout_limits::CheckoutLimits;
-use super::disk::{blocking, packed, received, remove_all, remove_leftovers};
-use super::eviction_signal::EvictionSignal;
-use super::git::{Call, Git, MOST_MEMORY};
+use super::disk::{blocking, received, remove_all, remove_leftovers};
+use super::git::{Call, Git, LITTLE_MEMORY, MOST_MEMORY};
 use super::git_error::GitError;
 use super::mirrors::Remote;
 use super::revision::{self, FetchRequest};
-use super::single_flight::SingleFlight;
+use super::single_flight::{OnProgress, SingleFlight};
 
 /// A cached repository. It is not evicted from the cache until this is dropped.
 #[derive(Debug)]
@@ -25,33 +24,22 @@ pub struct Repository {
     /// The remote. Its URL may have several spellings.
     remote: Mutex<Arc<Remote>>,
     git: Arc<Git>,
-    limits: CheckoutLimits,
-    growth: Arc<EvictionSignal>,
+    /// The limits of a fetch.
+    pub limits: CheckoutLimits,
+    growth: Arc<Notify>,
     /// Held by the task that changes the repository.
     lock: Arc<tokio::sync::Mutex<()>>,
-    /// Limits concurrent queries of the remote.
-    asking: Semaphore,
     /// The fetches in progress, by the name of the request.
     fetches: SingleFlight<String, Result<(), GitError>>,
     /// When it was created, if that was after this value was created.
     made: Mutex<Option<Instant>>,
 }
 
-/// Limit of concurrent queries of the remote, because its answers use memory.
-const QUESTIONS: usize = 4;
-
 impl Repository {
     /// The repository at `path`, which need not exist yet, for commits of `remote`.
-    pub fn new(
-        path: PathBuf,
-        remote: Remote,
-        git: Arc<Git>,
-        limits: CheckoutLimits,
-        growth: Arc<EvictionSignal>,
-    ) -> Self {
+    pub fn new(path: PathBuf, remote: Remote, git: Arc<Git>, limits: CheckoutLimits, growth: Arc<Notify>) -> Self {
         let (lock, fetches, made) = (Arc::default(), SingleFlight::default(), Mutex::default());
-        let asking = Semaphore::new(QUESTIONS);
-        Self { path, remote: Mutex::new(Arc::new(remote)), git, limits, growth, lock, asking, fetches, made }
+        Self { path, remote: Mutex::new(Arc::new(remote)), git, limits, growth, lock, fetches, made }
     }
 
     /// Where it is fetched from.
@@ -78,6 +66,14 @@ impl Repository {
         }
     }
 
+    /// Runs a command to its end. Returns its answer. `told` receives each line of standard error.
+    ///
+    /// # Errors
+    /// When git fails.
+    pub async fn run(&self, call: Call<'_>, told: impl FnMut(&str)) -> Result<Vec<u8>, GitError> {
+        self.git.run(call, told).await
+    }
+
     /// Runs a command that only reads the repository. Returns its answer.
     ///
     /// # Errors
@@ -95,11 +91,7 @@ impl Repository {
     ///
     /// # Errors
     /// Why it can't be fetched.
-    pub async fn fetch(
-        self: &Arc<Self>,
-        request: &FetchRequest,
-        progress: &(impl Fn(String) + Send + Sync),
-    ) -> Result<(), GitError> {
+    pub async fn fetch(self: &Arc<Self>, request: &FetchRequest, progress: OnProgress<'_>) -> Result<(), GitError> {
         let (this, wanted) = (Arc::clone(self), request.clone());
         let fetch = |told| async move { this.fetch_locked(&wanted, &told).await };
         self.fetches.join(request.name.clone(), progress, fetch).await
@@ -129,12 +121,13 @@ impl Repository {
         Ok(())
     }
 
-    /// Waits for a permit to query the remote.
+    /// Asks the remote. Returns its answer.
     ///
     /// # Errors
-    /// Never, because the semaphore is never closed.
-    pub async fn may_ask(&self) -> Result<SemaphorePermit<'_>, AcquireError> {
-        self.asking.acquire().await
+    /// When git fails.
+    pub async fn ask(&self, arguments: &[impl AsRef<OsStr>]) -> Result<String, GitError> {
+        let answer = self.run(Call { memory: LITTLE_MEMORY, ..self.call(arguments) }, |_| ()).await?;
+        Ok(String::from_utf8_lossy(&answer).into_owned())
     }
 
     /// Waits until no other task changes the repository.
@@ -191,25 +184,13 @@ impl Repository {
         let path = self.path.clone();
         blocking(move || remove_all(&[&path])).await
     }
-
-    /// Size of its packs, in bytes.
-    pub async fn packed(&self) -> u64 {
-        let path = self.path.clone();
-        blocking(move || Ok(packed(&path))).await.unwrap_or_default()
-    }
-}
-
-impl Drop for Repository {
-    fn drop(&mut self) {
-        self.growth.left();
-    }
 }
 
 /// On drop, marks the cache as grown, whatever the outcome.
-struct Grown<'cache>(&'cache EvictionSignal);
+struct Grown<'cache>(&'cache Notify);
 
 impl Drop for Grown<'_> {
     fn drop(&mut self) {
-        self.0.grown();
+        self.0.notify_one();
     }
 }

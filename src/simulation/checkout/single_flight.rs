@@ -22,18 +22,16 @@ struct Job<T: Clone> {
     result: WeakShared<BoxFuture<'static, T>>,
 }
 
+/// Receives each step of a job as text.
+pub type OnProgress<'job> = &'job (dyn Fn(String) + Send + Sync);
+
 /// Shortest interval between two steps that are sent to a waiter.
 const BETWEEN_STEPS: Duration = Duration::from_millis(100);
 
 impl<K: Eq + Hash, T: Clone + Send + Sync + 'static> SingleFlight<K, T> {
     /// Joins the job with this key, or starts it. `progress` receives each step as text, also if another caller has
     /// started the job.
-    pub async fn join<F>(
-        &self,
-        key: K,
-        progress: &(impl Fn(String) + Send + Sync),
-        start: impl FnOnce(watch::Sender<String>) -> F,
-    ) -> T
+    pub async fn join<F>(&self, key: K, progress: OnProgress<'_>, start: impl FnOnce(watch::Sender<String>) -> F) -> T
     where
         F: Future<Output = T> + Send + 'static,
     {

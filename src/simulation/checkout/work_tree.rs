@@ -7,8 +7,8 @@ use std::path::Path;
 use super::checkout_error::{CheckoutError, machine};
 use super::checkout_limits::CheckoutLimits;
 use super::commit_resolver::ResolvedCommit;
-use super::disk::{self, Growing};
-use super::git::{Call, Git, LITTLE_MEMORY};
+use super::disk;
+use super::git::{Call, LITTLE_MEMORY};
 use super::git_error::GitError;
 use super::lfs;
 use super::repository::Repository;
@@ -61,7 +61,6 @@ pub async fn copy_call<'call>(
 /// # Errors
 /// When git fails.
 pub async fn write(
-    git: &Git,
     found: &ResolvedCommit,
     instance: &InstanceDir,
     (limits, has_lfs): (&CheckoutLimits, bool),
@@ -71,20 +70,17 @@ pub async fn write(
     let project = instance.project();
     let call = copy_call(&found.repository, &found.revision, &paths, (instance.path(), &project));
     let mut call = call.await?;
-    let mut growing = vec![Growing::new(project, limits.size)];
+    let mut growing = vec![(project, limits.size)];
     if has_lfs {
         call.settings = lfs::settings(&found.repository.remote());
         // git-lfs stores its downloads here, shared with concurrent checkouts, and copies them into the project.
         let kept = call.repository.join("lfs");
-        let before = disk::blocking({
-            let kept = kept.clone();
-            move || Ok(disk::room_of(&kept))
-        });
-        let before = before.await?;
-        growing.push(Growing::new(kept, before.saturating_add(limits.size.saturating_mul(2))));
+        let measured = kept.clone();
+        let before = disk::blocking(move || Ok(disk::room_of(&measured))).await?;
+        growing.push((kept, before.saturating_add(limits.size.saturating_mul(2))));
     }
     tokio::select! {
-        written = git.run(call, told) => written.map(|_| true),
+        written = found.repository.run(call, told) => written.map(|_| true),
         () = disk::outgrown(growing) => Ok(false),
     }
 }

@@ -97,8 +97,7 @@ impl Docker {
         limit: Duration,
         told: impl FnMut(&str),
     ) -> Result<(), DockerError> {
-        let command = std::iter::once("docker".into()).chain(arguments).collect();
-        self.call(command, Vec::new(), limit, told).await
+        self.call(&["docker".into()], arguments, Vec::new(), limit, told).await
     }
 
     /// Runs `docker compose` with these arguments and variables.
@@ -111,7 +110,7 @@ impl Docker {
         variables: Vec<(&'static str, String)>,
         limit: Duration,
     ) -> Result<(), DockerError> {
-        self.call(self.compose.iter().cloned().chain(arguments).collect(), variables, limit, |_| ()).await
+        self.call(&self.compose, arguments, variables, limit, |_| ()).await
     }
 
     /// The specification of a client program of the daemon. Dropping its process group ends only that program.
@@ -124,11 +123,13 @@ impl Docker {
 
     async fn call(
         &self,
-        command: Vec<OsString>,
+        program: &[OsString],
+        arguments: Vec<OsString>,
         variables: Vec<(&'static str, String)>,
         limit: Duration,
         mut told: impl FnMut(&str),
     ) -> Result<(), DockerError> {
+        let command = [program, &arguments].concat();
         let (name, mut reason) = (name_of(&command), String::new());
         let mut run = Run::new([""], &self.mark, limit);
         run.spec = self.spec(command, Duration::ZERO);

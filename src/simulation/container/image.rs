@@ -1,14 +1,13 @@
 //! The images of simulations: pulled, and built once for all clients of the same project.
 
 use std::ffi::OsString;
-use std::fmt;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
+use actix_rt::task::spawn_blocking;
 use tokio::sync::{Semaphore, SemaphorePermit, watch};
 
-use super::blocking::blocking;
 use super::build_plan::{self, PROJECT_PATH};
 use super::compose_project::DEFAULT_MEMORY;
 use super::docker::{Docker, DockerError, SHORT};
@@ -17,10 +16,11 @@ use super::opened::{self, ImageConfig};
 use super::owned_resources::ResourceOwner;
 use super::start_error::{StartError, is_disk_full};
 use super::steps;
-use crate::simulation::checkout::{Project, SingleFlight};
+use crate::simulation::checkout::{OnProgress, Project, SingleFlight};
 use crate::simulation::config::SimulationConfig;
 
 /// The images of this server.
+#[derive(Debug)]
 pub struct Images {
     docker: Docker,
     owner: ResourceOwner,
@@ -52,20 +52,8 @@ pub struct ImageBuild {
 
 /// How a Dockerfile names the image of the world's version of Webots.
 const DEFAULT_BASE: [&str; 2] = ["$WEBOTS_DEFAULT_IMAGE", "${WEBOTS_DEFAULT_IMAGE}"];
-
-impl ImageBuild {
-    /// The arguments of the Dockerfile.
-    fn arguments(&self) -> Vec<String> {
-        let participant: &[&str] = match self.folder {
-            "" => &[],
-            _ => &["WEBOTS_CONTROLLER_URL=participant", "DEFAULT_CONTROLLER=participant"],
-        };
-        let (base, make) = (&self.base, u8::from(self.has_makefile));
-        let always =
-            [format!("WEBOTS_DEFAULT_IMAGE={base}"), format!("PROJECT_PATH={PROJECT_PATH}"), format!("MAKE={make}")];
-        always.into_iter().chain(participant.iter().map(|argument| (*argument).to_owned())).collect()
-    }
-}
+/// Arguments of the Dockerfile of a participant's controller.
+const PARTICIPANT: [&str; 2] = ["WEBOTS_CONTROLLER_URL=participant", "DEFAULT_CONTROLLER=participant"];
 
 impl Images {
     /// The images of this owner.
@@ -86,11 +74,7 @@ impl Images {
     ///
     /// # Errors
     /// Why it can't be pulled, as text for the client.
-    pub async fn pull(
-        self: &Arc<Self>,
-        image: &str,
-        progress: &(impl Fn(String) + Send + Sync),
-    ) -> Result<String, StartError> {
+    pub async fn pull(self: &Arc<Self>, image: &str, progress: OnProgress<'_>) -> Result<String, StartError> {
         if let Some(id) = self.id(image).await? {
             return Ok(id);
         }
@@ -109,13 +93,17 @@ impl Images {
     ///
     /// # Errors
     /// Why it can't be built, as text for the client.
-    pub async fn build(
-        self: &Arc<Self>,
-        build: ImageBuild,
-        progress: &(impl Fn(String) + Send + Sync),
-    ) -> Result<String, StartError> {
+    pub async fn build(self: &Arc<Self>, build: ImageBuild, progress: OnProgress<'_>) -> Result<String, StartError> {
+        let mut arguments = vec![
+            format!("WEBOTS_DEFAULT_IMAGE={}", build.base),
+            format!("PROJECT_PATH={PROJECT_PATH}"),
+            format!("MAKE={}", u8::from(build.has_makefile)),
+        ];
+        if !build.folder.is_empty() {
+            arguments.extend(PARTICIPANT.map(str::to_owned));
+        }
         let mut parts = vec![build.project.identity(), build.folder.to_owned(), build.dockerfile.text.clone()];
-        parts.extend(build.arguments());
+        parts.extend_from_slice(&arguments);
         // An image's name stays the same when the image is updated, so its id is part of the key. A base that is not here
         // yet has none: the build fetches it.
         for base in &build.dockerfile.bases {
@@ -128,12 +116,17 @@ impl Images {
         }
         let name = self.name(&parts);
         let (this, made) = (Arc::clone(self), name.clone());
-        self.once(name, progress, move |news| async move { this.build_now(&made, build, news).await }).await
+        self.once(name, progress, move |news| async move { this.build_now(&made, build, arguments, news).await }).await
     }
 
-    async fn build_now(&self, name: &str, build: ImageBuild, news: watch::Sender<String>) -> Result<(), StartError> {
+    async fn build_now(
+        &self,
+        name: &str,
+        build: ImageBuild,
+        arguments: Vec<String>,
+        news: watch::Sender<String>,
+    ) -> Result<(), StartError> {
         let _permit = self.permit(&news).await?;
-        let arguments = build.arguments();
         let ImageBuild { project, dockerfile, folder, network, .. } = build;
         let (file, root) = (project.instance.path().join(format!("Dockerfile{folder}")), project.folder().to_owned());
         let written = file.clone();
@@ -142,7 +135,7 @@ impl Images {
             // A copy out of an image may have replaced it by a symlink to any path.
             Ok::<_, StartError>(build_plan::inside(&root, Path::new(folder))?)
         };
-        let context = blocking(prepare).await?;
+        let context = spawn_blocking(prepare).await??;
         let id_file = file.with_extension("id");
         let mut options: Vec<OsString> =
             vec!["--network".into(), network.into(), "--iidfile".into(), (&id_file).into()];
@@ -159,7 +152,7 @@ impl Images {
         let done = self.run_build(options, file, context, told).await;
         done.map_err(|error| not_built(&step, error))?;
         // It has no name of its own: it is removed with the image on top.
-        let id = blocking(move || std::fs::read_to_string(id_file)).await?;
+        let id = tokio::fs::read_to_string(id_file).await?;
         self.open_now(&id, name, &project).await
     }
 
@@ -173,9 +166,8 @@ impl Images {
     ) -> Result<(), DockerError> {
         let memory = format!("{}m", self.memory);
         let always = ["build", "--force-rm", "--memory", &memory, "--memory-swap", &memory, "--file"];
-        let files = [dockerfile.into(), context.into()];
-        let [file, context] = files;
-        let words = always.map(OsString::from).into_iter().chain([file]).chain(options).chain([context]);
+        let words = always.map(OsString::from).into_iter().chain([dockerfile.into()]).chain(options);
+        let words = words.chain([context.into()]);
         self.docker.follow(words.collect(), self.limit, told).await
     }
 
@@ -188,7 +180,7 @@ impl Images {
         self: &Arc<Self>,
         id: String,
         project: &Arc<Project>,
-        progress: &(impl Fn(String) + Send + Sync),
+        progress: OnProgress<'_>,
     ) -> Result<String, StartError> {
         let name = self.name(std::slice::from_ref(&id));
         let (this, made, project) = (Arc::clone(self), name.clone(), Arc::clone(project));
@@ -201,7 +193,7 @@ impl Images {
         let context = project.instance.path().join(format!("opened-{}", opened::key(&[name.to_owned()])));
         let (dockerfile, folder) = (context.with_extension("Dockerfile"), context.clone());
         let file = dockerfile.clone();
-        blocking(move || std::fs::write(file, text).and_then(|()| opened::write_programs(&folder))).await?;
+        spawn_blocking(move || std::fs::write(file, text).and_then(|()| opened::write_programs(&folder))).await??;
         let options = ["--network", "none", "--tag", name].map(Into::into).to_vec();
         let done = self.run_build(options, dockerfile, context, |_| ()).await;
         done.map_err(|error| match StartError::of_project(error) {
@@ -216,7 +208,7 @@ impl Images {
     async fn once<F: Future<Output = Result<(), StartError>> + Send + 'static>(
         self: &Arc<Self>,
         name: String,
-        progress: &(impl Fn(String) + Send + Sync),
+        progress: OnProgress<'_>,
         job: impl FnOnce(watch::Sender<String>) -> F,
     ) -> Result<String, StartError> {
         if self.id(&name).await?.is_some() {
@@ -311,12 +303,6 @@ fn is_silent(message: &str) -> bool {
     let message = message.to_lowercase();
     let words = ["toomanyrequests: ", "i/o timeout", "handshake timeout", "timeout exceeded", "deadline exceeded"];
     words.iter().any(|words| message.contains(words))
-}
-
-impl fmt::Debug for Images {
-    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
-        out.write_str("Images")
-    }
 }
 
 #[cfg(test)]

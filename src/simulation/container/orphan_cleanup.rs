@@ -104,6 +104,8 @@ async fn remove_orphans(docker: &Docker, owner: &ResourceOwner, active: &ActiveP
     }
     owned_resources::remove(docker, left.iter().map(|(id, _)| *id)).await?;
     let projects: BTreeSet<&str> = left.into_iter().map(|(_, project)| project).collect();
-    projects.iter().for_each(|project| log::info!("{project} was left: removed"));
+    for project in projects {
+        log::info!("{project} was left: removed");
+    }
     Ok(true)
 }

@@ -38,7 +38,9 @@ impl ResourceOwner {
     #[must_use]
     pub fn of(cache: &Path) -> Self {
         let cache = cache.canonicalize().unwrap_or_else(|_| cache.to_owned());
-        Self(format!("{:012x}", digest(cache.as_os_str().as_encoded_bytes()) >> 80))
+        let mut name = digest(cache.as_os_str().as_encoded_bytes());
+        name.truncate(12);
+        Self(name)
     }
 
     /// One run of this server: resources of the next run have another owner.
@@ -82,10 +84,11 @@ impl ResourceOwner {
     }
 }
 
-/// The first 128 bits of the SHA-256 of a text.
+/// The SHA-256 of a text, in hexadecimal digits.
 #[must_use]
-pub fn digest(text: &[u8]) -> u128 {
-    Sha256::digest(text).iter().take(16).fold(0, |number: u128, byte| (number << 8) | u128::from(*byte))
+pub fn digest(text: &[u8]) -> String {
+    let digest = Sha256::digest(text);
+    digest.iter().fold(String::new(), |text, byte| format!("{text}{byte:02x}"))
 }
 
 /// Removes containers.

@@ -16,18 +16,20 @@ use crate::simulation::process::SpawnSpec;
 /// The containers of one simulation.
 #[derive(Debug)]
 pub struct SimulationContainers {
-    docker: Docker,
-    guard: ProjectGuard,
+    /// Runs Docker.
+    pub(super) docker: Docker,
+    /// The name of its compose project.
+    pub(super) guard: ProjectGuard,
     /// The container of each service.
-    containers: Vec<(String, String)>,
+    pub(super) containers: Vec<(String, String)>,
     /// Whether the project has defined one of their images, which may be why Docker can't start one.
-    is_projects: bool,
+    pub(super) is_projects: bool,
     /// Texts for its client, unchanged.
     pub texts: Vec<String>,
     /// Warnings for its client.
     pub warnings: Vec<String>,
     /// Restarts the participant's controller; `None` if there is none.
-    restart: Option<(Arc<Notify>, AbortOnDropHandle<()>)>,
+    pub(super) restart: Option<(Arc<Notify>, AbortOnDropHandle<()>)>,
 }
 
 /// The cause of a container's end.
@@ -61,20 +63,6 @@ impl Cause {
 }
 
 impl SimulationContainers {
-    /// The containers of a compose project that was created: pairs of service and container. `is_projects` tells
-    /// whether the project has defined one of their images.
-    #[must_use]
-    pub fn new(
-        docker: Docker,
-        guard: ProjectGuard,
-        containers: Vec<(String, String)>,
-        is_projects: bool,
-        texts: Vec<String>,
-        warnings: Vec<String>,
-    ) -> Self {
-        Self { docker, guard, containers, is_projects, texts, warnings, restart: None }
-    }
-
     fn of(&self, service: &str) -> Option<&str> {
         self.containers.iter().find(|(name, _)| name == service).map(|(_, container)| container.as_str())
     }

@@ -70,14 +70,18 @@ impl LaunchSpec {
     /// What its containers are made of.
     #[must_use]
     pub fn request(&self) -> ContainerRequest {
-        let (config, mode, port) = (Arc::clone(&self.config), self.mode, self.slot.port);
-        let command = move |world: &str| {
-            let program = Path::new(&config.container.program);
-            let world = Path::new(world);
-            let command = WebotsCommand { program, mode, port, heartbeat: config.timing.heartbeat, world };
-            command.to_arguments().into_iter().map(|word| word.to_string_lossy().into_owned()).collect()
+        let command = WebotsCommand {
+            program: Path::new(&self.config.container.program),
+            mode: self.mode,
+            port: self.slot.port,
+            heartbeat: self.config.timing.heartbeat,
+            world: Path::new(""),
         };
-        ContainerRequest { project: Arc::clone(&self.project), port, gpu: self.gpu.clone(), command: Box::new(command) }
+        let mut command = command.to_arguments();
+        // Where the world is in the container is known once its image is.
+        command.pop();
+        let command = command.into_iter().map(|word| word.to_string_lossy().into_owned()).collect();
+        ContainerRequest { project: Arc::clone(&self.project), port: self.slot.port, gpu: self.gpu.clone(), command }
     }
 
     /// The display of the machine on which it opens its window.
