@@ -16,7 +16,7 @@ pub struct CacheDir {
 /// `execve`.
 const LOCK_WAIT: Duration = Duration::from_secs(1);
 /// Interval between two attempts to lock.
-const PAUSE: Duration = Duration::from_millis(20);
+const RETRY_INTERVAL: Duration = Duration::from_millis(20);
 
 impl CacheDir {
     /// Creates the directory if necessary, and locks it. Blocks for up to a second, which is acceptable during start.
@@ -31,7 +31,7 @@ impl CacheDir {
         loop {
             match lock.try_lock() {
                 Ok(()) => return Ok(Self { folder, _lock: lock }),
-                Err(TryLockError::WouldBlock) if Instant::now() < deadline => std::thread::sleep(PAUSE),
+                Err(TryLockError::WouldBlock) if Instant::now() < deadline => std::thread::sleep(RETRY_INTERVAL),
                 Err(TryLockError::WouldBlock) => {
                     let words = "another simulation server uses it, and each needs one of its own";
                     return Err(io::Error::new(io::ErrorKind::ResourceBusy, words));

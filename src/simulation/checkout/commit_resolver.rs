@@ -45,7 +45,7 @@ pub struct ResolvedCommit {
 }
 
 /// Number of redirected remotes from which on all are dropped.
-const MOST_REDIRECTED: usize = 1000;
+const MAX_REDIRECTED: usize = 1000;
 impl CommitResolver {
     /// Keeps commits in `cache`.
     pub fn new(
@@ -60,13 +60,13 @@ impl CommitResolver {
     ///
     /// # Errors
     /// Why it can't be fetched.
-    pub async fn find(
+    pub async fn resolve(
         self: &Arc<Self>,
         world: &ProjectUrl,
         progress: OnProgress<'_>,
     ) -> Result<Arc<ResolvedCommit>, CheckoutError> {
         let (this, wanted) = (Arc::clone(self), world.clone());
-        let search = |told| async move { this.search(&wanted, &told).await.map(Arc::new) };
+        let search = |sender| async move { this.search(&wanted, &sender).await.map(Arc::new) };
         self.searches.join(world.clone(), progress, search).await
     }
 
@@ -78,7 +78,7 @@ impl CommitResolver {
         let repository = self.repository(world).await?;
         let (moved, remote) = redirect::follow(&repository, (&self.mirrors, &self.rules), world).await?;
         let mut redirected = self.redirected.lock();
-        if redirected.len() >= MOST_REDIRECTED {
+        if redirected.len() >= MAX_REDIRECTED {
             redirected.clear();
         }
         redirected.insert(remote.key(), remote);
@@ -86,8 +86,12 @@ impl CommitResolver {
     }
 
     /// Returns the first of the commits that a URL may mean that contains its world.
-    async fn search(&self, world: &ProjectUrl, told: &watch::Sender<String>) -> Result<ResolvedCommit, CheckoutError> {
-        let progress = |step| drop(told.send_replace(step));
+    async fn search(
+        &self,
+        world: &ProjectUrl,
+        sender: &watch::Sender<String>,
+    ) -> Result<ResolvedCommit, CheckoutError> {
+        let progress = |step| drop(sender.send_replace(step));
         progress(steps::looking_for(&world.repository()));
         let repository = self.repository(world).await?;
         let search = self.with(world, &repository, &progress);
@@ -193,10 +197,10 @@ impl CommitResolver {
 
     async fn fetch(&self, search: RemoteQuery<'_>, revision: &Revision) -> Result<(), CheckoutError> {
         let RemoteQuery { world, repository, progress, .. } = search;
-        let tell = |said: String| progress(steps::fetching(&world.repository(), &said));
+        let on_line = |line: String| progress(steps::fetching(&world.repository(), &line));
         let failed =
             |error| fetch_failed(world, || format!("{} (at depth 1)", world.repository()), self.limits.size, error);
-        repository.fetch(&revision.request(&repository.remote().location), &tell).await.map_err(failed)
+        repository.fetch(&revision.request(&repository.remote().location), &on_line).await.map_err(failed)
     }
 
     /// Discards what is cached of a world's repository, unless it was created after `since`.

@@ -9,7 +9,7 @@ use crate::simulation::process::disk_usage::{self, DiskUsage};
 use crate::simulation::process::remove_tree;
 
 /// Interval between two checks of the written size.
-const BETWEEN_LOOKS: Duration = Duration::from_millis(500);
+const CHECK_INTERVAL: Duration = Duration::from_millis(500);
 
 /// Runs blocking file I/O on the blocking thread pool.
 ///
@@ -67,7 +67,7 @@ fn length(file: &Path) -> u64 {
 /// Waits until one of the directories exceeds its limit, in bytes.
 pub async fn outgrown(folders: Vec<(PathBuf, u64)>) {
     loop {
-        actix_rt::time::sleep(BETWEEN_LOOKS).await;
+        actix_rt::time::sleep(CHECK_INTERVAL).await;
         let looked_at = folders.clone();
         let is_one = move || Ok(looked_at.iter().any(|(folder, most)| room_of(folder) > *most));
         if blocking(is_one).await.is_ok_and(|is_one| is_one) {

@@ -48,15 +48,15 @@ const SETTINGS: &str = include_str!("gitconfig");
 /// Memory limit in bytes for an answer of a remote, which is enough for a million branches, or for a copy.
 pub const LITTLE_MEMORY: u64 = 512 << 20;
 /// Largest memory limit of a git process, in bytes.
-pub const MOST_MEMORY: u64 = 2 << 30;
+pub const MAX_MEMORY: u64 = 2 << 30;
 /// Commands that may keep all cores busy for long: running simulations have priority.
 const HEAVY: [&str; 2] = ["fetch", "gc"];
 /// The niceness of these commands.
 const NICENESS: i32 = 10;
 /// Size limit of a command's answer, in bytes.
-const LARGEST_ANSWER: u64 = 64 * 1024 * 1024;
+const MAX_ANSWER: u64 = 64 * 1024 * 1024;
 /// Longest line of standard error that is kept, in bytes.
-const LONGEST_LINE: usize = 500;
+const MAX_LINE: usize = 500;
 
 impl Git {
     /// Prepares git for the server whose run has this folder. `config` is the administrator's file of settings; a remote may
@@ -94,13 +94,13 @@ impl Git {
         let command = command.map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
         self.write_settings().await?;
         let mut cause = String::new();
-        let told = |line: String| {
+        let on_line = |line: String| {
             progress(&line);
             if weight(&line) > weight(&cause) || weight(&cause) == 0 {
                 cause = line;
             }
         };
-        let ran = self.prepared(call, &command).run(told).await;
+        let ran = self.prepared(call, &command).run(on_line).await;
         match ran {
             Ok(Ran { ending: ExitReason::Code(0), answer }) => Ok(answer),
             Ok(Ran { ending: ExitReason::NotStarted, .. }) => Err(GitError::Machine(cause)),
@@ -127,7 +127,7 @@ impl Git {
         let mut run = Run::new(command, &self.mark, call.time);
         let fixed = fixed.into_iter().map(|(name, value)| (name.into(), value.into()));
         run.spec.environment = fixed.chain(call.environment).collect();
-        (run.answer, run.line) = (LARGEST_ANSWER, LONGEST_LINE);
+        (run.answer, run.line) = (MAX_ANSWER, MAX_LINE);
         run.niceness = if HEAVY.contains(&name) { NICENESS } else { 0 };
         run.limits.push((Resource::Data, call.memory));
         if let Some(size) = call.file_size {

@@ -13,7 +13,7 @@ use super::repository::Repository;
 use crate::shared::domain::{AdmissionRules, Load, ProjectUrl};
 
 /// Limit of redirects for a world.
-pub const MOST: usize = 5;
+pub const MAX_REDIRECTS: usize = 5;
 
 /// The first path that git requests from a Git host.
 const FIRST_QUESTION: &str = "/info/refs";
@@ -41,7 +41,7 @@ async fn location(repository: &Repository) -> Option<String> {
     let trace = [("GIT_TRACE_CURL", "1"), ("GIT_TRACE_CURL_NO_DATA", "1")];
     let environment = trace.map(|(name, value)| (name.into(), value.into())).to_vec();
     let mut location = None;
-    let look = |line: &str| {
+    let on_line = |line: &str| {
         let header = line.split_once("Recv header: ").and_then(|(_, header)| header.split_once(": "));
         if let Some((name, value)) = header
             && name.eq_ignore_ascii_case("location")
@@ -52,7 +52,7 @@ async fn location(repository: &Repository) -> Option<String> {
     let remote = repository.remote();
     let call = repository.call(&["ls-remote", "--quiet", "--", &remote.location, "HEAD"]);
     // It fails again, since the forge sends it elsewhere.
-    repository.run(Call { environment, ..call }, look).await.ok();
+    repository.run(Call { environment, ..call }, on_line).await.ok();
     location
 }
 

@@ -34,8 +34,9 @@ impl RemoteQuery<'_> {
     async fn fetch_history(self, history: &Arc<Repository>, commit: &str) -> Result<(), CheckoutError> {
         let (RemoteQuery { world, progress, .. }, limit) = (self, history.limits.size);
         let what = || format!("The history of {}", world.repository());
-        let tell = |said: String| progress(steps::fetching(&format!("the history of {}", world.repository()), &said));
-        let fetched = history.fetch(&revision::history(&history.remote().location, commit), &tell).await;
+        let on_line =
+            |line: String| progress(steps::fetching(&format!("the history of {}", world.repository()), &line));
+        let fetched = history.fetch(&revision::history(&history.remote().location, commit), &on_line).await;
         fetched.map_err(|error| fetch_failed(world, what, limit, error))
     }
 

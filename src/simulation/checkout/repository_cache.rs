@@ -38,7 +38,7 @@ pub struct RepositoryCache {
 /// The extension of a directory that is being removed. Names of repositories have no dots.
 const REMOVED: &str = "removed";
 /// Interval between two attempts to bring the cache within its budget: repositories in use stay.
-const AGAIN: Duration = Duration::from_secs(2);
+const RETRY_INTERVAL: Duration = Duration::from_secs(2);
 
 impl RepositoryCache {
     /// Opens the cache in `dir`, with a limit of `budget` bytes.
@@ -107,7 +107,7 @@ impl RepositoryCache {
             let this = Arc::clone(&self);
             let shrunk = actix_rt::task::spawn_blocking(move || this.shrink()).await;
             match shrunk.inspect_err(|error| log::error!("the cache can't be kept within its budget: {error}")) {
-                Ok(false) => actix_rt::time::sleep(AGAIN).await,
+                Ok(false) => actix_rt::time::sleep(RETRY_INTERVAL).await,
                 _ => self.growth.notified().await,
             }
         }

@@ -33,7 +33,7 @@ pub struct WorkTree {
 ///
 /// # Errors
 /// When the list of paths can't be written.
-pub async fn copy_call<'call>(
+pub async fn checkout_command<'call>(
     repository: &'call Repository,
     revision: &Revision,
     paths: &[u8],
@@ -55,7 +55,7 @@ pub async fn copy_call<'call>(
     Ok(call)
 }
 
-/// Writes a project with git, with its large files; `told` receives its progress lines. Returns whether it is within
+/// Writes a project with git, with its large files; `on_line` receives its progress lines. Returns whether it is within
 /// the size limit: git's attributes may make it larger than the commit, and a Git host may send more than it should.
 ///
 /// # Errors
@@ -64,11 +64,11 @@ pub async fn write(
     found: &ResolvedCommit,
     instance: &InstanceDir,
     (limits, has_lfs): (&CheckoutLimits, bool),
-    told: impl FnMut(&str),
+    on_line: impl FnMut(&str),
 ) -> Result<bool, GitError> {
     let paths = [found.revision.needed().as_bytes(), b"\0", &found.above].concat();
     let project = instance.project();
-    let call = copy_call(&found.repository, &found.revision, &paths, (instance.path(), &project));
+    let call = checkout_command(&found.repository, &found.revision, &paths, (instance.path(), &project));
     let mut call = call.await?;
     let mut growing = vec![(project, limits.size)];
     if has_lfs {
@@ -80,7 +80,7 @@ pub async fn write(
         growing.push((kept, before.saturating_add(limits.size.saturating_mul(2))));
     }
     tokio::select! {
-        written = found.repository.run(call, told) => written.map(|_| true),
+        written = found.repository.run(call, on_line) => written.map(|_| true),
         () = disk::outgrown(growing) => Ok(false),
     }
 }
@@ -89,7 +89,11 @@ pub async fn write(
 ///
 /// # Errors
 /// When the machine fails.
-pub async fn look(world: &ProjectUrl, instance: &InstanceDir, revision: &Revision) -> Result<WorkTree, CheckoutError> {
+pub async fn inspect(
+    world: &ProjectUrl,
+    instance: &InstanceDir,
+    revision: &Revision,
+) -> Result<WorkTree, CheckoutError> {
     let root = instance.project();
     let (folder, path) = (root.join(&revision.folder), root.join(revision.world_path(world)));
     let seen = disk::blocking(move || {

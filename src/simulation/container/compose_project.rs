@@ -199,7 +199,7 @@ pub fn container_of(project: &str, service: &str) -> String {
     format!("{project}-{service}")
 }
 
-/// What compose is told of a service.
+/// The settings of a service for compose.
 type Service = BTreeMap<&'static str, Value>;
 
 /// Variables of all services: with them programs write only to writable paths, and find each other.

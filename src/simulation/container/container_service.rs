@@ -10,7 +10,7 @@ use tokio_util::task::AbortOnDropHandle;
 use super::build_plan::{self, BuildPlan, PROJECT_PATH};
 use super::compose_project::{ComposeProject, container_of};
 use super::container_request::ContainerRequest;
-use super::docker::{Docker, SHORT};
+use super::docker::{Docker, SHORT_TIMEOUT};
 use super::docker_features::DockerFeatures;
 use super::dockerfile::Dockerfile;
 use super::image::{ImageBuild, Images};
@@ -152,7 +152,7 @@ impl ContainerService {
         progress: OnProgress<'_>,
     ) -> Result<SimulationContainers, StartError> {
         let is_projects = plan.dockerfile.is_some() || controller.is_some();
-        let features = self.features.get_or_try_init(|| DockerFeatures::ask(&self.docker)).await?.clone();
+        let features = self.features.get_or_try_init(|| DockerFeatures::query(&self.docker)).await?.clone();
         let (config, templates) = (Arc::clone(&self.config), self.templates.clone());
         let (name, yml, has_makefile) = (guard.name.clone(), plan.yml.clone(), plan.has_makefile);
         let files = move || {
@@ -184,7 +184,7 @@ impl ContainerService {
         let turn = self.turns.acquire().await.map_err(|error| StartError::Server(error.to_string()))?;
         progress(steps::CREATING.to_owned());
         let words = options.into_iter().map(Into::into).chain(["up", "--no-start", "--no-build"].map(Into::into));
-        let created = self.docker.compose(words.collect(), variables, SHORT).await;
+        let created = self.docker.compose(words.collect(), variables, SHORT_TIMEOUT).await;
         created.map_err(|error| blame(is_projects, error))?;
         drop(turn);
         // An editor has a port of its own, which the relay of streams does not reach.

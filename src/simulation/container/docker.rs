@@ -42,9 +42,9 @@ pub enum DockerError {
 }
 
 /// Timeout of queries and of other short commands.
-pub const SHORT: Duration = Duration::from_secs(30);
+pub const SHORT_TIMEOUT: Duration = Duration::from_secs(30);
 /// Timeout of the check which compose command exists.
-const FIND: Duration = Duration::from_secs(10);
+const FIND_TIMEOUT: Duration = Duration::from_secs(10);
 /// How lines begin that follow the reason: which containers were not started, and where to find help.
 const AFTER_REASON: [&str; 3] = ["Error: failed to start containers", "See 'docker", "Run 'docker"];
 /// How a message begins that says that nobody listens.
@@ -63,7 +63,7 @@ impl Docker {
     pub fn find(mark: &Path) -> Result<Self, String> {
         which("docker")
             .map_err(|_| "docker is not there; on Debian and Ubuntu the package docker.io has it".to_owned())?;
-        let compose: &[&str] = if blocking(&["compose", "version"], FIND).is_ok() {
+        let compose: &[&str] = if blocking(&["compose", "version"], FIND_TIMEOUT).is_ok() {
             &["docker", "compose"]
         } else if which("docker-compose").is_ok() {
             &["docker-compose"]
@@ -87,7 +87,7 @@ impl Docker {
         result(name, ran, reason)
     }
 
-    /// The same, but `told` receives each line that it prints.
+    /// The same, but `on_line` receives each line that it prints.
     ///
     /// # Errors
     /// When it fails or takes longer than the limit.
@@ -95,9 +95,9 @@ impl Docker {
         &self,
         arguments: Vec<OsString>,
         limit: Duration,
-        told: impl FnMut(&str),
+        on_line: impl FnMut(&str),
     ) -> Result<(), DockerError> {
-        self.call(&["docker".into()], arguments, Vec::new(), limit, told).await
+        self.call(&["docker".into()], arguments, Vec::new(), limit, on_line).await
     }
 
     /// Runs `docker compose` with these arguments and variables.
@@ -127,7 +127,7 @@ impl Docker {
         arguments: Vec<OsString>,
         variables: Vec<(&'static str, String)>,
         limit: Duration,
-        mut told: impl FnMut(&str),
+        mut on_line: impl FnMut(&str),
     ) -> Result<(), DockerError> {
         let command = [program, &arguments].concat();
         let (name, mut reason) = (name_of(&command), String::new());
@@ -135,7 +135,7 @@ impl Docker {
         run.spec = self.spec(command, Duration::ZERO);
         run.spec.environment.extend(variables.into_iter().map(|(name, value)| (name.into(), value.into())));
         let line = |line: String| {
-            told(&line);
+            on_line(&line);
             note(&mut reason, &line);
         };
         let ran = run.follow(line).await.map(|ending| Ran { ending, answer: Vec::new() });

@@ -10,7 +10,7 @@ use tokio::sync::{Semaphore, SemaphorePermit, watch};
 
 use super::build_plan::{self, PROJECT_PATH};
 use super::compose_project::DEFAULT_MEMORY;
-use super::docker::{Docker, DockerError, SHORT};
+use super::docker::{Docker, DockerError, SHORT_TIMEOUT};
 use super::dockerfile::{Dockerfile, LABEL};
 use super::opened::{self, ImageConfig};
 use super::owned_resources::ResourceOwner;
@@ -79,10 +79,10 @@ impl Images {
             return Ok(id);
         }
         let (this, name) = (Arc::clone(self), image.to_owned());
-        let pull = move |news: watch::Sender<String>| async move {
-            let _permit = this.permit(&news).await?;
-            let told = |line: &str| drop(news.send(steps::pulling(&name, line)));
-            let pulled = this.docker.follow(["pull", &name].map(OsString::from).to_vec(), this.limit, told).await;
+        let pull = move |sender: watch::Sender<String>| async move {
+            let _permit = this.permit(&sender).await?;
+            let on_line = |line: &str| drop(sender.send(steps::pulling(&name, line)));
+            let pulled = this.docker.follow(["pull", &name].map(OsString::from).to_vec(), this.limit, on_line).await;
             pulled.map_err(|error| not_pulled(&name, error))
         };
         self.jobs.join(image.to_owned(), progress, pull).await?;
@@ -115,8 +115,9 @@ impl Images {
             });
         }
         let name = self.name(&parts);
-        let (this, made) = (Arc::clone(self), name.clone());
-        self.once(name, progress, move |news| async move { this.build_now(&made, build, arguments, news).await }).await
+        let (this, tag) = (Arc::clone(self), name.clone());
+        self.once(name, progress, move |sender| async move { this.build_now(&tag, build, arguments, sender).await })
+            .await
     }
 
     async fn build_now(
@@ -124,9 +125,9 @@ impl Images {
         name: &str,
         build: ImageBuild,
         arguments: Vec<String>,
-        news: watch::Sender<String>,
+        sender: watch::Sender<String>,
     ) -> Result<(), StartError> {
-        let _permit = self.permit(&news).await?;
+        let _permit = self.permit(&sender).await?;
         let ImageBuild { project, dockerfile, folder, network, .. } = build;
         let (file, root) = (project.instance.path().join(format!("Dockerfile{folder}")), project.folder().to_owned());
         let written = file.clone();
@@ -141,34 +142,34 @@ impl Images {
             vec!["--network".into(), network.into(), "--iidfile".into(), (&id_file).into()];
         options.extend(arguments.into_iter().flat_map(|argument| ["--build-arg".into(), argument.into()]));
         let mut step = String::new();
-        let told = |line: &str| {
+        let on_line = |line: &str| {
             if line.starts_with("Step ") {
                 line.clone_into(&mut step);
             }
             if let Some(text) = steps::building(line) {
-                news.send(text).ok();
+                sender.send(text).ok();
             }
         };
-        let done = self.run_build(options, file, context, told).await;
+        let done = self.run_build(options, file, context, on_line).await;
         done.map_err(|error| not_built(&step, error))?;
         // It has no name of its own: it is removed with the image on top.
         let id = tokio::fs::read_to_string(id_file).await?;
         self.open_now(&id, name, &project).await
     }
 
-    /// Runs `docker build` with these options. `told` receives each line that it prints.
+    /// Runs `docker build` with these options. `on_line` receives each line that it prints.
     async fn run_build(
         &self,
         options: Vec<OsString>,
         dockerfile: PathBuf,
         context: PathBuf,
-        told: impl FnMut(&str),
+        on_line: impl FnMut(&str),
     ) -> Result<(), DockerError> {
         let memory = format!("{}m", self.memory);
         let always = ["build", "--force-rm", "--memory", &memory, "--memory-swap", &memory, "--file"];
         let words = always.map(OsString::from).into_iter().chain([dockerfile.into()]).chain(options);
         let words = words.chain([context.into()]);
-        self.docker.follow(words.collect(), self.limit, told).await
+        self.docker.follow(words.collect(), self.limit, on_line).await
     }
 
     /// Creates the image in which the server's user can read the home directory of the image's own user, unless it
@@ -183,12 +184,12 @@ impl Images {
         progress: OnProgress<'_>,
     ) -> Result<String, StartError> {
         let name = self.name(std::slice::from_ref(&id));
-        let (this, made, project) = (Arc::clone(self), name.clone(), Arc::clone(project));
-        self.once(name, progress, move |_| async move { this.open_now(&id, &made, &project).await }).await
+        let (this, tag, project) = (Arc::clone(self), name.clone(), Arc::clone(project));
+        self.once(name, progress, move |_| async move { this.open_now(&id, &tag, &project).await }).await
     }
 
     async fn open_now(&self, id: &str, name: &str, project: &Project) -> Result<(), StartError> {
-        let json = self.docker.run(&["image", "inspect", "--format", "{{json .Config}}", id], SHORT).await?;
+        let json = self.docker.run(&["image", "inspect", "--format", "{{json .Config}}", id], SHORT_TIMEOUT).await?;
         let text = ImageConfig::read(&json)?.dockerfile(id, self.owner.name());
         let context = project.instance.path().join(format!("opened-{}", opened::key(&[name.to_owned()])));
         let (dockerfile, folder) = (context.with_extension("Dockerfile"), context.clone());
@@ -217,11 +218,11 @@ impl Images {
         self.jobs.join(name.clone(), progress, job).await.map(|()| name)
     }
 
-    async fn permit(&self, news: &watch::Sender<String>) -> Result<SemaphorePermit<'_>, StartError> {
+    async fn permit(&self, sender: &watch::Sender<String>) -> Result<SemaphorePermit<'_>, StartError> {
         if let Ok(permit) = self.builds.try_acquire() {
             return Ok(permit);
         }
-        news.send("waiting for images of others to be built".to_owned()).ok();
+        sender.send("waiting for images of others to be built".to_owned()).ok();
         let busy = || format!("Images of others were being built for {} seconds (timing.build)", self.limit.as_secs());
         let permit = actix_rt::time::timeout(self.limit, self.builds.acquire()).await;
         permit.map_err(|_| StartError::Server(busy()))?.map_err(|error| StartError::Server(error.to_string()))
@@ -229,7 +230,7 @@ impl Images {
 
     /// The id of an image, which differs from those of later images of the same name; `None` if it does not exist.
     async fn id(&self, image: &str) -> Result<Option<String>, StartError> {
-        match self.docker.run(&["image", "inspect", "--format", "{{.Id}}", image], SHORT).await {
+        match self.docker.run(&["image", "inspect", "--format", "{{.Id}}", image], SHORT_TIMEOUT).await {
             Ok(id) => Ok(Some(id.trim().to_owned())),
             Err(DockerError::Failed { .. }) => Ok(None),
             Err(error) => Err(error.into()),
@@ -246,7 +247,7 @@ impl Images {
         let prune = ["image", "prune", "--force", "--filter", &mine, "--filter"];
         // The images of a build in progress are younger.
         for rest in [&["until=1h"][..], &[&old, "--all"]] {
-            self.docker.run(&[&prune, rest].concat(), SHORT).await?;
+            self.docker.run(&[&prune, rest].concat(), SHORT_TIMEOUT).await?;
         }
         Ok(())
     }

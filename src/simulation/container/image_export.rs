@@ -6,14 +6,14 @@ use std::time::Duration;
 
 use actix_rt::task::spawn_blocking;
 
-use super::docker::{Docker, DockerError, SHORT};
+use super::docker::{Docker, DockerError, SHORT_TIMEOUT};
 use super::owned_resources::{self, PROJECT};
 use super::start_error::StartError;
 use crate::simulation::checkout::{Project, outgrown};
 use crate::simulation::process::remove_tree;
 
 /// Timeout of the copy.
-const LIMIT: Duration = Duration::from_mins(2);
+const COPY_TIMEOUT: Duration = Duration::from_mins(2);
 
 /// Copies a directory of an image to `to`, which it creates or replaces, by a temporary directory of the project's
 /// instance. `name` is the compose project; `size` the limit, in MiB.
@@ -30,12 +30,12 @@ pub async fn export(
 ) -> Result<(), StartError> {
     let label = format!("{PROJECT}={name}");
     let create = ["create", "--label", &label, "--network", "none", image, "true"];
-    let container = docker.run(&create, SHORT).await.map_err(StartError::of_project)?;
+    let container = docker.run(&create, SHORT_TIMEOUT).await.map_err(StartError::of_project)?;
     let (container, through) = (container.trim(), project.instance.path().join("copied"));
     let source = format!("{container}:{}/.", from.display());
     let words = ["cp", &source, &through.to_string_lossy()].map(str::to_owned);
     tokio::select! {
-        copied = docker.run(&words, LIMIT) => drop(copied.map_err(|error| not_copied(error, from))?),
+        copied = docker.run(&words, COPY_TIMEOUT) => drop(copied.map_err(|error| not_copied(error, from))?),
         () = outgrown(vec![(through.clone(), size << 20)]) => {
             return Err(format!("The project in its image is larger than {size} MiB (projectSize)").into());
         }

@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use sha2::{Digest, Sha256};
 
-use super::docker::{self, Docker, DockerError, SHORT};
+use super::docker::{self, Docker, DockerError, SHORT_TIMEOUT};
 
 /// The label with which compose marks its projects.
 pub const PROJECT: &str = "com.docker.compose.project";
@@ -29,7 +29,7 @@ pub const LIST: [&str; 7] = [
 pub struct ResourceOwner(String);
 
 /// How long each command of a sweep may take.
-const SWEEP: Duration = Duration::from_secs(20);
+const SWEEP_TIMEOUT: Duration = Duration::from_secs(20);
 /// How containers are removed, whatever they do.
 const REMOVE: [&str; 3] = ["rm", "--force", "--volumes"];
 
@@ -97,7 +97,7 @@ pub fn digest(text: &[u8]) -> String {
 /// When Docker fails; then some may remain.
 pub async fn remove(docker: &Docker, containers: impl IntoIterator<Item = &str>) -> Result<(), DockerError> {
     let words: Vec<&str> = REMOVE.into_iter().chain(containers).collect();
-    match docker.run(&words, SHORT).await {
+    match docker.run(&words, SHORT_TIMEOUT).await {
         // Another process may remove it.
         Err(DockerError::Failed { message, .. })
             if message.contains("o such container") || message.contains("already in progress") =>
@@ -110,11 +110,11 @@ pub async fn remove(docker: &Docker, containers: impl IntoIterator<Item = &str>)
 
 /// Removes the containers of a server: for a process that watches over the server's end. Blocks.
 pub fn sweep(owner: &ResourceOwner) {
-    let list = docker::blocking(&LIST, SWEEP).unwrap_or_default();
+    let list = docker::blocking(&LIST, SWEEP_TIMEOUT).unwrap_or_default();
     let found: Vec<&str> = owner.containers(&list).map(|(id, _)| id).collect();
     if !found.is_empty() {
         // What is left is removed by the next start.
-        docker::blocking(&[&REMOVE, found.as_slice()].concat(), SWEEP).ok();
+        docker::blocking(&[&REMOVE, found.as_slice()].concat(), SWEEP_TIMEOUT).ok();
     }
 }
 

@@ -11,7 +11,7 @@ const LIST: &[&str] = &["/usr/sbin/nft", "--terse", "list", "table", "inet", "we
 /// Asks for the unit that loads it.
 const UNIT: &[&str] = &["systemctl", "is-active", "--quiet", "webots-fleet-packet-filter.service"];
 /// Timeout of the `nft` or `systemctl` call.
-const PATIENCE: Duration = Duration::from_secs(5);
+const TIMEOUT: Duration = Duration::from_secs(5);
 
 /// Returns `None` if the packet filter is loaded, else the consequence and how to load it, in one line. Only root may
 /// list it; for other users systemd reports whether its unit has run.
@@ -20,7 +20,7 @@ const PATIENCE: Duration = Duration::from_secs(5);
 #[must_use]
 pub fn missing() -> Option<String> {
     let command = if nix::unistd::geteuid().is_root() { LIST } else { UNIT };
-    let why = match Run::new(command, Path::new("/"), PATIENCE).blocking(drop) {
+    let why = match Run::new(command, Path::new("/"), TIMEOUT).blocking(drop) {
         Ok(Ran { ending: ExitReason::Code(0), .. }) => return None,
         Ok(_) => "says no".to_owned(),
         Err(error) => error.to_string(),
