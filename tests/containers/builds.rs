@@ -61,6 +61,22 @@ async fn a_projects_own_dockerfile_is_built_once_for_all_who_want_it_and_what_it
 }
 
 #[actix_rt::test]
+async fn an_image_is_built_again_when_the_one_below_it_has_changed() {
+    let Some(_docker) = docker().await else { return };
+    const BASE: &str = "webots-fleet.test/base";
+    let forge = with(&format!("FROM {BASE}\nCOPY . /usr/local/webots-project\n"));
+    let server = server(forge.path(), 1).start().await;
+    for version in ["one", "two"] {
+        super::daemon::build_from(&format!("FROM {NAME}\nRUN echo {version} >/usr/local/version\n"), BASE);
+        let mut client = Client::start(&server, &arm()).await;
+        client.patiently("webots:", BUILT).await;
+        assert_eq!(ask(&["exec", &of_service(&server, "webots")[0], "cat", "/usr/local/version"]), version);
+        client.leave().await;
+        until("its container is gone", async || containers(&server).is_empty()).await;
+    }
+}
+
+#[actix_rt::test]
 async fn a_makefile_is_run_in_the_default_image() {
     let Some(_docker) = docker().await else { return };
     let forge = Forge::with_arm();

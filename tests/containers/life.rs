@@ -73,6 +73,14 @@ async fn a_world_runs_in_a_container_and_nothing_is_left_when_its_client_goes() 
 }
 
 #[actix_rt::test]
+async fn a_start_in_a_container_waits_for_no_heartbeat() {
+    let Some(_docker) = docker().await else { return };
+    let forge = Forge::with_arm();
+    let server = server(forge.path(), 1).set("timing", json!({ "heartbeat": 600, "launch": 90 })).start().await;
+    Client::start(&server, &arm()).await.patiently("webots:", READY).await;
+}
+
+#[actix_rt::test]
 async fn who_comes_back_finds_its_container_as_it_runs() {
     let Some(_docker) = docker().await else { return };
     let forge = Forge::with_arm();

@@ -242,6 +242,8 @@ impl<'class> Browser<'class> {
         let mut period = actix_rt::time::interval(PACE_PERIOD);
         loop {
             tokio::select! {
+                // What has arrived is read before the second is over, also after this program was held up.
+                biased;
                 text = running.stream.receive() => match text {
                     Ok(text) => if let Some(time) = simulated_time(&text) {
                         first.get_or_insert(time);

@@ -25,16 +25,16 @@ use super::project::Project;
 use super::redirect;
 use super::repository_cache::RepositoryCache;
 use super::revision::Revision;
+use super::single_flight::OnProgress;
 use super::steps;
-use super::work_tree::{self, WorkTree, copy_call};
+use super::work_tree::{self, WorkTree, checkout_command};
 use crate::shared::domain::{AdmissionRules, ProjectUrl};
 use crate::simulation::process::InstanceDir;
 
 /// Checks worlds out; one for the whole server.
 pub struct CheckoutService {
-    git: Arc<Git>,
     cache: Arc<RepositoryCache>,
-    finder: Arc<CommitResolver>,
+    resolver: Arc<CommitResolver>,
     limits: CheckoutLimits,
     runtime: Handle,
     /// Limits the number of projects that are copied at a time.
@@ -68,11 +68,11 @@ impl CheckoutService {
         runtime: Handle,
     ) -> io::Result<Self> {
         let git = Arc::new(Git::new(run, config, limits.stall_timeout()));
-        let cache = Arc::new(RepositoryCache::open(dir, budget, Arc::clone(&git), limits)?);
-        let finder = Arc::new(CommitResolver::new(Arc::clone(&git), Arc::clone(&cache), (mirrors, rules), limits));
+        let cache = Arc::new(RepositoryCache::open(dir, budget, git, limits)?);
+        let resolver = Arc::new(CommitResolver::new(Arc::clone(&cache), (mirrors, rules), limits));
         let keeper = AbortOnDropHandle::new(runtime.spawn(Arc::clone(&cache).keep_within_budget()));
         let (copies, has_lfs) = (Semaphore::new(COPIES), lfs::is_installed());
-        Ok(Self { git, cache, finder, limits, runtime, copies, has_lfs, _keeps_within_budget: keeper })
+        Ok(Self { cache, resolver, limits, runtime, copies, has_lfs, _keeps_within_budget: keeper })
     }
 
     /// Starts to check a world out into a client's directory. `progress` receives each step as text.
@@ -85,7 +85,7 @@ impl CheckoutService {
         let this = Arc::clone(self);
         let job = async move {
             let limit = this.limits.time;
-            let done = actix_rt::time::timeout(limit, this.check_out(&world, instance, progress)).await;
+            let done = actix_rt::time::timeout(limit, this.check_out(&world, instance, &progress)).await;
             done.unwrap_or_else(|_| Err(too_slow(&world, limit)))
         };
         AbortOnDropHandle::new(self.runtime.spawn(job))
@@ -95,15 +95,15 @@ impl CheckoutService {
         &self,
         world: &ProjectUrl,
         instance: InstanceDir,
-        progress: impl Fn(String) + Send + Sync,
+        progress: OnProgress<'_>,
     ) -> Result<Project, CheckoutError> {
         let start = Instant::now();
         let (mut world, mut redirects, mut is_mended) = (world.clone(), 0, false);
         let checked_out = loop {
-            match self.attempt(&world, &instance, &progress).await {
-                Err(CheckoutError::Moved(..)) if redirects < redirect::MOST => {
+            match self.attempt(&world, &instance, progress).await {
+                Err(CheckoutError::Moved(..)) if redirects < redirect::MAX_REDIRECTS => {
                     redirects += 1;
-                    world = self.finder.moved(&world).await?;
+                    world = self.resolver.moved(&world).await?;
                 }
                 Err(error) if !is_mended => {
                     is_mended = true;
@@ -136,7 +136,7 @@ impl CheckoutService {
             return Err(failure);
         };
         log::warn!("{failure}. The cached repository is broken: it is fetched anew");
-        self.finder.discard(world, since).await
+        self.resolver.discard(world, since).await
     }
 
     /// Resolves and copies a project, with its large files.
@@ -144,24 +144,24 @@ impl CheckoutService {
         &self,
         world: &ProjectUrl,
         instance: &InstanceDir,
-        progress: &(impl Fn(String) + Send + Sync),
+        progress: OnProgress<'_>,
     ) -> Result<(Revision, WorkTree), CheckoutError> {
-        let found = self.finder.find(world, progress).await?;
+        let found = self.resolver.resolve(world, progress).await?;
         let turn = self.copies.acquire().await;
         let _turn = turn.map_err(|error| machine(world, &io::Error::other(error)))?;
         let name = &found.revision.name;
         progress(steps::checking_out(name, None));
-        let told = |line: &str| {
+        let on_line = |line: &str| {
             if line.contains('%') {
                 progress(steps::checking_out(name, Some(line)));
             }
         };
-        let written = work_tree::write(&self.git, &found, instance, (&self.limits, self.has_lfs), told).await;
+        let written = work_tree::write(&found, instance, (&self.limits, self.has_lfs), on_line).await;
         if self.has_lfs {
             self.cache.grown();
         }
         if written.map_err(|source| git_failed(world, source))? {
-            let copied = work_tree::look(world, instance, &found.revision).await?;
+            let copied = work_tree::inspect(world, instance, &found.revision).await?;
             if copied.size <= self.limits.size {
                 return Ok((found.revision.clone(), copied));
             }
@@ -190,14 +190,14 @@ impl CheckoutService {
     /// Restores a file of a project's repository. Returns whether it exists.
     async fn restore(&self, project: &Project, path: &str) -> Result<bool, CheckoutError> {
         let Project { url, revision, instance, .. } = project;
-        let Some(repository) = self.finder.file(url, revision, path).await? else {
+        let Some(repository) = self.resolver.file(url, revision, path).await? else {
             return Ok(false);
         };
         let failed = |error| machine(url, &error);
         let restored = FileRestore::new(instance.path()).map_err(failed)?;
         let paths = [path.as_bytes(), b"\0"].concat();
-        let call = copy_call(&repository, revision, &paths, (restored.path(), &restored.files())).await;
-        self.git.run(call.map_err(failed)?, |_| ()).await.map_err(|source| git_failed(url, source))?;
-        restored.place(instance.project(), path.to_owned()).await.map_err(failed)
+        let call = checkout_command(&repository, revision, &paths, (restored.path(), &restored.files())).await;
+        repository.run(call.map_err(failed)?, |_| ()).await.map_err(|source| git_failed(url, source))?;
+        restored.install(instance.project(), path.to_owned()).await.map_err(failed)
     }
 }

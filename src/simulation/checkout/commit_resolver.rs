@@ -1,14 +1,14 @@
 //! Resolves a world's URL to a commit, and fetches it into the cache: once for all clients that wait for it.
 
+use std::collections::HashMap;
 use std::sync::Arc;
 use std::time::Instant;
 
+use parking_lot::Mutex;
 use tokio::sync::watch;
 
-use super::canonical_remotes::CanonicalRemotes;
 use super::checkout_error::{CheckoutError, fetch_failed, git_failed, machine, no_reference};
 use super::checkout_limits::CheckoutLimits;
-use super::git::Git;
 use super::git_error::GitError;
 use super::mirrors::{Mirrors, Remote};
 use super::redirect;
@@ -16,7 +16,7 @@ use super::remote_query::RemoteQuery;
 use super::repository::Repository;
 use super::repository_cache::RepositoryCache;
 use super::revision::{self, Revision, TrustSource};
-use super::single_flight::SingleFlight;
+use super::single_flight::{OnProgress, SingleFlight};
 use super::steps;
 use super::world_file::WorldFileError;
 use crate::shared::domain::{AdmissionRules, ProjectUrl};
@@ -24,13 +24,13 @@ use crate::shared::domain::{AdmissionRules, ProjectUrl};
 /// Resolves commits; one for the whole server.
 #[derive(Debug)]
 pub struct CommitResolver {
-    git: Arc<Git>,
     cache: Arc<RepositoryCache>,
     mirrors: Mirrors,
     rules: AdmissionRules,
     limits: CheckoutLimits,
     searches: SingleFlight<ProjectUrl, Result<Arc<ResolvedCommit>, CheckoutError>>,
-    spellings: CanonicalRemotes,
+    /// The remotes to which Git hosts have redirected, by [`Remote::key`]: GitLab redirects to `REPOSITORY.git`.
+    redirected: Mutex<HashMap<String, Remote>>,
 }
 
 /// A world's commit in the cache.
@@ -44,39 +44,29 @@ pub struct ResolvedCommit {
     pub above: Vec<u8>,
 }
 
-/// git's answer about a commit in the cache.
-enum Answer {
-    /// The requested text.
-    Text(Vec<u8>),
-    /// The reference is a single file (a blob).
-    File,
-    /// The commit is not in the cache.
-    Absent,
-}
-
+/// Number of redirected remotes from which on all are dropped.
+const MAX_REDIRECTED: usize = 1000;
 impl CommitResolver {
-    /// Finds commits by `git`, and keeps them in `cache`.
+    /// Keeps commits in `cache`.
     pub fn new(
-        git: Arc<Git>,
         cache: Arc<RepositoryCache>,
         (mirrors, rules): (Mirrors, AdmissionRules),
         limits: CheckoutLimits,
     ) -> Self {
-        let (searches, spellings) = (SingleFlight::default(), CanonicalRemotes::default());
-        Self { git, cache, mirrors, rules, limits, searches, spellings }
+        Self { cache, mirrors, rules, limits, searches: SingleFlight::default(), redirected: Mutex::default() }
     }
 
     /// Waits until a world's commit is in the cache. Callers with the same world share one search.
     ///
     /// # Errors
     /// Why it can't be fetched.
-    pub async fn find(
+    pub async fn resolve(
         self: &Arc<Self>,
         world: &ProjectUrl,
-        progress: &(impl Fn(String) + Send + Sync),
+        progress: OnProgress<'_>,
     ) -> Result<Arc<ResolvedCommit>, CheckoutError> {
         let (this, wanted) = (Arc::clone(self), world.clone());
-        let search = |told| async move { this.search(&wanted, &told).await.map(Arc::new) };
+        let search = |sender| async move { this.search(&wanted, &sender).await.map(Arc::new) };
         self.searches.join(world.clone(), progress, search).await
     }
 
@@ -86,14 +76,22 @@ impl CommitResolver {
     /// When the redirect may not be followed.
     pub async fn moved(&self, world: &ProjectUrl) -> Result<ProjectUrl, CheckoutError> {
         let repository = self.repository(world).await?;
-        let (moved, remote) = redirect::follow(&self.git, &repository, (&self.mirrors, &self.rules), world).await?;
-        self.spellings.insert(remote);
+        let (moved, remote) = redirect::follow(&repository, (&self.mirrors, &self.rules), world).await?;
+        let mut redirected = self.redirected.lock();
+        if redirected.len() >= MAX_REDIRECTED {
+            redirected.clear();
+        }
+        redirected.insert(remote.key(), remote);
         Ok(moved)
     }
 
     /// Returns the first of the commits that a URL may mean that contains its world.
-    async fn search(&self, world: &ProjectUrl, told: &watch::Sender<String>) -> Result<ResolvedCommit, CheckoutError> {
-        let progress = |step| drop(told.send_replace(step));
+    async fn search(
+        &self,
+        world: &ProjectUrl,
+        sender: &watch::Sender<String>,
+    ) -> Result<ResolvedCommit, CheckoutError> {
+        let progress = |step| drop(sender.send_replace(step));
         progress(steps::looking_for(&world.repository()));
         let repository = self.repository(world).await?;
         let search = self.with(world, &repository, &progress);
@@ -115,10 +113,9 @@ impl CommitResolver {
         &'job self,
         world: &'job ProjectUrl,
         repository: &'job Arc<Repository>,
-        progress: &'job (dyn Fn(String) + Send + Sync),
+        progress: OnProgress<'job>,
     ) -> RemoteQuery<'job> {
-        let (git, cache, limits) = (&*self.git, &*self.cache, &self.limits);
-        RemoteQuery { git, cache, limits, world, repository, progress }
+        RemoteQuery { cache: &self.cache, world, repository, progress }
     }
 
     async fn repository(&self, world: &ProjectUrl) -> Result<Arc<Repository>, CheckoutError> {
@@ -127,7 +124,7 @@ impl CommitResolver {
 
     fn remote(&self, world: &ProjectUrl) -> Result<Remote, CheckoutError> {
         let remote = self.mirrors.remote(world).ok_or_else(|| CheckoutError::Forge(world.host().to_owned()))?;
-        Ok(self.spellings.of(remote))
+        Ok(self.redirected.lock().get(&remote.key()).cloned().unwrap_or(remote))
     }
 
     /// The commits that a URL may mean, the most likely first.
@@ -135,7 +132,7 @@ impl CommitResolver {
         if let Some(commit) = revision::commit_of(search.world, self.limits.any_commit) {
             return Ok(vec![commit]);
         }
-        let answer = search.ask().await?;
+        let answer = search.candidates().await?;
         Ok(revision::found(search.world, &answer))
     }
 
@@ -165,56 +162,45 @@ impl CommitResolver {
         revision: &Revision,
         path: &str,
     ) -> Result<Option<Vec<u8>>, CheckoutError> {
-        let mut answer = self.answer(search, revision, path).await?;
-        if matches!(answer, Answer::Absent) {
-            if revision.trust == TrustSource::Url && !search.is_accepted(revision).await? {
-                let (repository, commit) = (search.world.repository(), revision.name.clone());
-                return Err(CheckoutError::NotReachable { repository, commit });
-            }
-            self.fetch(search, revision).await?;
-            answer = self.answer(search, revision, path).await?;
-        }
-        match answer {
-            Answer::Text(text) => Ok(Some(text)),
-            Answer::File => Ok(None),
-            Answer::Absent => {
-                Err(machine(search.world, &std::io::Error::other("the commit that was fetched is not there")))
-            }
-        }
-    }
-
-    async fn answer(
-        &self,
-        RemoteQuery { world, repository, .. }: RemoteQuery<'_>,
-        revision: &Revision,
-        path: &str,
-    ) -> Result<Answer, CheckoutError> {
-        match repository.read(&revision.list_arguments(path)).await {
-            Ok(text) => Ok(Answer::Text(text)),
-            Err(error @ (GitError::Machine(_) | GitError::TooLong(_) | GitError::Slow(_))) => {
-                Err(git_failed(world, error))
-            }
-            Err(error)
-                if repository.read(&["rev-parse", "--quiet", "--verify", &revision.reference()]).await.is_err() =>
-            {
-                log::debug!("{} is not in the cache: {error}", revision.commit);
-                Ok(Answer::Absent)
-            }
-            Err(source) => {
-                match repository.read(&["cat-file", "-t", &format!("{}^{{}}", revision.reference())]).await {
-                    Ok(kind) if kind.starts_with(b"blob") => Ok(Answer::File),
-                    _ => Err(CheckoutError::Damaged { repository: world.repository(), source }),
+        let RemoteQuery { world, repository, .. } = search;
+        for is_fetched in [false, true] {
+            match repository.read(&revision.list_arguments(path)).await {
+                Ok(text) => return Ok(Some(text)),
+                Err(error @ (GitError::Machine(_) | GitError::TooLong(_) | GitError::Slow(_))) => {
+                    return Err(git_failed(world, error));
+                }
+                Err(_)
+                    if repository.read(&["rev-parse", "--quiet", "--verify", &revision.reference()]).await.is_err() => {
+                }
+                Err(source) => {
+                    let kind = repository.read(&["cat-file", "-t", &format!("{}^{{}}", revision.reference())]).await;
+                    if kind.is_ok_and(|kind| kind.starts_with(b"blob")) {
+                        return Ok(None);
+                    }
+                    return Err(CheckoutError::Damaged { repository: world.repository(), source });
                 }
             }
+            // It is not in the cache.
+            if is_fetched {
+                break;
+            }
+            if revision.trust == TrustSource::Url && !search.is_accepted(revision).await? {
+                return Err(CheckoutError::NotReachable {
+                    repository: world.repository(),
+                    commit: revision.name.clone(),
+                });
+            }
+            self.fetch(search, revision).await?;
         }
+        Err(machine(world, &std::io::Error::other("the commit that was fetched is not there")))
     }
 
     async fn fetch(&self, search: RemoteQuery<'_>, revision: &Revision) -> Result<(), CheckoutError> {
         let RemoteQuery { world, repository, progress, .. } = search;
-        let tell = |said: String| progress(steps::fetching(&world.repository(), &said));
+        let on_line = |line: String| progress(steps::fetching(&world.repository(), &line));
         let failed =
             |error| fetch_failed(world, || format!("{} (at depth 1)", world.repository()), self.limits.size, error);
-        repository.fetch(&revision.request(&repository.remote().location), &tell).await.map_err(failed)
+        repository.fetch(&revision.request(&repository.remote().location), &on_line).await.map_err(failed)
     }
 
     /// Discards what is cached of a world's repository, unless it was created after `since`.

@@ -9,7 +9,7 @@ use crate::simulation::process::disk_usage::{self, DiskUsage};
 use crate::simulation::process::remove_tree;
 
 /// Interval between two checks of the written size.
-const BETWEEN_LOOKS: Duration = Duration::from_millis(500);
+const CHECK_INTERVAL: Duration = Duration::from_millis(500);
 
 /// Runs blocking file I/O on the blocking thread pool.
 ///
@@ -44,11 +44,6 @@ fn absent(result: io::Result<()>) -> io::Result<()> {
     result.or_else(|error| if error.kind() == io::ErrorKind::NotFound { Ok(()) } else { Err(error) })
 }
 
-/// How many bytes the packs of a repository have.
-pub fn packed(repository: &Path) -> u64 {
-    files(&repository.join("objects/pack")).map(|path| length(&path)).sum()
-}
-
 /// How many bytes a running fetch has received.
 pub fn received(repository: &Path) -> u64 {
     unfinished(repository).map(|path| length(&path)).sum()
@@ -69,26 +64,12 @@ fn length(file: &Path) -> u64 {
     file.metadata().map_or(0, |about| about.len())
 }
 
-/// A directory and its size limit in bytes.
-#[derive(Debug, Clone)]
-pub struct Growing {
-    folder: PathBuf,
-    most: u64,
-}
-
-impl Growing {
-    /// This folder may take so many bytes.
-    pub fn new(folder: PathBuf, most: u64) -> Self {
-        Self { folder, most }
-    }
-}
-
-/// Waits until one of the directories exceeds its limit.
-pub async fn outgrown(folders: Vec<Growing>) {
+/// Waits until one of the directories exceeds its limit, in bytes.
+pub async fn outgrown(folders: Vec<(PathBuf, u64)>) {
     loop {
-        actix_rt::time::sleep(BETWEEN_LOOKS).await;
+        actix_rt::time::sleep(CHECK_INTERVAL).await;
         let looked_at = folders.clone();
-        let is_one = move || Ok(looked_at.iter().any(|one| room_of(&one.folder) > one.most));
+        let is_one = move || Ok(looked_at.iter().any(|(folder, most)| room_of(folder) > *most));
         if blocking(is_one).await.is_ok_and(|is_one| is_one) {
             return;
         }

@@ -20,12 +20,12 @@ pub struct FileRestore {
     folder: TempDir,
 }
 
-/// The path in its repository of a file below the `controllers` folder of the project at `place`; nothing where its name
+/// The path in its repository of a file below the `controllers` folder of the project in `folder`; nothing where its name
 /// leads elsewhere.
-pub fn controller(place: &str, file: &str) -> Option<String> {
+pub fn controller(folder: &str, file: &str) -> Option<String> {
     let plain = |segment: &str| !segment.is_empty() && segment != "." && segment != ".." && !segment.contains('\0');
-    let slash = if place.is_empty() { "" } else { "/" };
-    (file.contains('/') && file.split('/').all(plain)).then(|| format!("{place}{slash}controllers/{file}"))
+    let slash = if folder.is_empty() { "" } else { "/" };
+    (file.contains('/') && file.split('/').all(plain)).then(|| format!("{folder}{slash}controllers/{file}"))
 }
 
 impl FileRestore {
@@ -55,7 +55,7 @@ impl FileRestore {
     ///
     /// # Errors
     /// When the project can't be opened.
-    pub async fn place(self, project: PathBuf, path: String) -> io::Result<bool> {
+    pub async fn install(self, project: PathBuf, path: String) -> io::Result<bool> {
         blocking(move || {
             let (above, name) = path.rsplit_once('/').unwrap_or((".", &path));
             let how = OpenHow::new().flags(OFlag::O_PATH | OFlag::O_DIRECTORY | OFlag::O_CLOEXEC);

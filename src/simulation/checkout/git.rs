@@ -43,51 +43,20 @@ pub struct Call<'call> {
 /// be read: a mirror may belong to another user, and nothing in it is executed. Redirects are off: they could resolve
 /// to a repository, or into a network, that the configuration forbids. A remote that stays silent for too long is given
 /// up.
-const SETTINGS: &str = "\
-[safe]
-	directory = *
-[core]
-	hooksPath = /dev/null
-	attributesFile = /dev/null
-	excludesFile = /dev/null
-	fsmonitor = false
-	packedGitLimit = 512m
-	packedGitWindowSize = 32m
-	bigFileThreshold = 16m
-[http]
-	followRedirects = false
-[filter \"lfs\"]
-	process =
-	smudge =
-	required = false
-[fetch]
-	recurseSubmodules = false
-	unpackLimit = 1
-[submodule]
-	recurse = false
-[gc]
-	autoDetach = false
-[maintenance]
-	auto = false
-[init]
-	defaultRefFormat = files
-	templateDir =
-[advice]
-	detachedHead = false
-";
+const SETTINGS: &str = include_str!("gitconfig");
 
 /// Memory limit in bytes for an answer of a remote, which is enough for a million branches, or for a copy.
 pub const LITTLE_MEMORY: u64 = 512 << 20;
 /// Largest memory limit of a git process, in bytes.
-pub const MOST_MEMORY: u64 = 2 << 30;
+pub const MAX_MEMORY: u64 = 2 << 30;
 /// Commands that may keep all cores busy for long: running simulations have priority.
 const HEAVY: [&str; 2] = ["fetch", "gc"];
 /// The niceness of these commands.
 const NICENESS: i32 = 10;
 /// Size limit of a command's answer, in bytes.
-const LARGEST_ANSWER: u64 = 64 * 1024 * 1024;
+const MAX_ANSWER: u64 = 64 * 1024 * 1024;
 /// Longest line of standard error that is kept, in bytes.
-const LONGEST_LINE: usize = 500;
+const MAX_LINE: usize = 500;
 
 impl Git {
     /// Prepares git for the server whose run has this folder. `config` is the administrator's file of settings; a remote may
@@ -101,19 +70,17 @@ impl Git {
         Self { settings, mark: run.to_owned() }
     }
 
-    /// Writes the file of settings, unless it has the right text.
+    /// Writes the file of settings, unless it is there.
     async fn write_settings(&self) -> std::io::Result<()> {
-        let (file, text) = self.settings.clone();
-        let write = move || {
-            if std::fs::read(&file).is_ok_and(|found| found == text.as_bytes()) {
-                return Ok(());
-            }
-            if let Some(folder) = file.parent() {
-                std::fs::create_dir_all(folder)?;
-            }
-            std::fs::write(&file, text)
-        };
-        actix_rt::task::spawn_blocking(write).await?
+        let (file, text) = &self.settings;
+        if tokio::fs::try_exists(file).await? {
+            return Ok(());
+        }
+        tokio::fs::create_dir_all(&self.mark).await?;
+        // Others that start at once never see half of it.
+        let new = self.mark.join(format!("gitconfig-{:08x}", rand::random::<u32>()));
+        tokio::fs::write(&new, text).await?;
+        tokio::fs::rename(&new, file).await
     }
 
     /// Runs a command to its end. Returns its answer. `progress` receives each line of standard error.
@@ -127,13 +94,13 @@ impl Git {
         let command = command.map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
         self.write_settings().await?;
         let mut cause = String::new();
-        let told = |line: String| {
+        let on_line = |line: String| {
             progress(&line);
             if weight(&line) > weight(&cause) || weight(&cause) == 0 {
                 cause = line;
             }
         };
-        let ran = self.prepared(call, &command).run(told).await;
+        let ran = self.prepared(call, &command).run(on_line).await;
         match ran {
             Ok(Ran { ending: ExitReason::Code(0), answer }) => Ok(answer),
             Ok(Ran { ending: ExitReason::NotStarted, .. }) => Err(GitError::Machine(cause)),
@@ -160,7 +127,7 @@ impl Git {
         let mut run = Run::new(command, &self.mark, call.time);
         let fixed = fixed.into_iter().map(|(name, value)| (name.into(), value.into()));
         run.spec.environment = fixed.chain(call.environment).collect();
-        (run.answer, run.line) = (LARGEST_ANSWER, LONGEST_LINE);
+        (run.answer, run.line) = (MAX_ANSWER, MAX_LINE);
         run.niceness = if HEAVY.contains(&name) { NICENESS } else { 0 };
         run.limits.push((Resource::Data, call.memory));
         if let Some(size) = call.file_size {

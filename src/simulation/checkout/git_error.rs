@@ -60,50 +60,26 @@ pub enum Cause {
 /// git's exit codes do not depend on the cause, so its messages must be parsed (`LC_ALL=C`). Only this table does that.
 /// The first match counts. git asks for a user name if a Git host answers 'not found': Git hosts don't distinguish
 /// private from missing repositories.
-const MESSAGES: &[(&str, Cause)] = &[
-    ("No space left on device", Cause::Machine),
-    ("Disk quota exceeded", Cause::Machine),
-    ("Read-only file system", Cause::Machine),
-    ("Input/output error", Cause::Machine),
-    ("Too many open files", Cause::Machine),
-    ("Cannot allocate memory", Cause::Machine),
-    ("Resource temporarily unavailable", Cause::Machine),
+const MESSAGES: &[(Cause, &[&str])] = &[
+    (
+        Cause::Machine,
+        &["No space left on device", "Disk quota exceeded", "Read-only file system", "Input/output error"],
+    ),
+    (Cause::Machine, &["Too many open files", "Cannot allocate memory", "Resource temporarily unavailable"]),
     // These hosts come from the configuration: URLs with other hosts are refused before.
-    ("Could not resolve host", Cause::Machine),
-    ("Failed to connect to", Cause::Machine),
-    ("Couldn't connect to", Cause::Machine),
-    ("SSL certificate", Cause::Machine),
-    ("certificate verification failed", Cause::Machine),
-    ("returned error: 301", Cause::Moved),
-    ("returned error: 302", Cause::Moved),
-    ("returned error: 303", Cause::Moved),
-    ("returned error: 307", Cause::Moved),
-    ("returned error: 308", Cause::Moved),
-    ("Out of memory, ", Cause::TooMuch),
-    ("memory exhausted", Cause::TooMuch),
-    ("could not read Username", Cause::NoRepository),
-    ("not found", Cause::NoRepository),
-    ("does not appear to be a git repository", Cause::NoRepository),
-    ("does not exist", Cause::NoRepository),
-    ("couldn't find remote ref", Cause::NoCommit),
-    ("not our ref", Cause::NoCommit),
-    ("unadvertised object", Cause::NoCommit),
-    ("remote did not send", Cause::NoCommit),
-    ("mismatched algorithms", Cause::Damaged),
-    ("not a git repository", Cause::Damaged),
-    ("bad config", Cause::Damaged),
-    ("bad shallow", Cause::Damaged),
-    ("bad object", Cause::Damaged),
-    ("bad tree", Cause::Damaged),
-    ("corrupt", Cause::Damaged),
-    ("too short to be a packfile", Cause::Damaged),
-    ("unresolved delta", Cause::Damaged),
-    ("unable to read", Cause::Damaged),
-    ("reference broken", Cause::Damaged),
-    ("invalid reference", Cause::Damaged),
-    ("did not send all necessary objects", Cause::Damaged),
+    (Cause::Machine, &["Could not resolve host", "Failed to connect to", "Couldn't connect to"]),
+    (Cause::Machine, &["SSL certificate", "certificate verification failed"]),
+    (Cause::Moved, &["returned error: 301", "returned error: 302", "returned error: 303"]),
+    (Cause::Moved, &["returned error: 307", "returned error: 308"]),
+    (Cause::TooMuch, &["Out of memory, ", "memory exhausted"]),
+    (Cause::NoRepository, &["could not read Username", "not found", "does not appear to be a git repository"]),
+    (Cause::NoRepository, &["does not exist"]),
+    (Cause::NoCommit, &["couldn't find remote ref", "not our ref", "unadvertised object", "remote did not send"]),
+    (Cause::Damaged, &["mismatched algorithms", "not a git repository", "bad config", "bad shallow", "bad object"]),
+    (Cause::Damaged, &["bad tree", "corrupt", "too short to be a packfile", "unresolved delta", "unable to read"]),
+    (Cause::Damaged, &["reference broken", "invalid reference", "did not send all necessary objects"]),
     // The lock of a killed git.
-    ("File exists", Cause::Damaged),
+    (Cause::Damaged, &["File exists"]),
 ];
 
 impl GitError {
@@ -115,7 +91,8 @@ impl GitError {
             Self::Machine(_) => return Cause::Machine,
             Self::Failed { .. } | Self::TooLarge | Self::Slow(_) => return Cause::Other,
         };
-        MESSAGES.iter().find(|(words, _)| message.contains(words)).map_or(Cause::Other, |(_, cause)| *cause)
+        let is_of = |words: &[&str]| words.iter().any(|words| message.contains(words));
+        MESSAGES.iter().find(|(_, words)| is_of(words)).map_or(Cause::Other, |(cause, _)| *cause)
     }
 }
 

@@ -9,7 +9,7 @@ use super::mirrors::Remote;
 /// The first bytes of a pointer.
 const BEGINNING: &[u8] = b"version https://git-lfs.github.com/spec/";
 /// Size limit of a pointer, in bytes.
-const LARGEST: u64 = 1024;
+const MAX_SIZE: u64 = 1024;
 
 /// How many pointers there are below a folder. Reads from disk: not for a thread that serves others.
 pub fn pointers(folder: &Path) -> usize {
@@ -19,7 +19,7 @@ pub fn pointers(folder: &Path) -> usize {
         for entry in std::fs::read_dir(folder).into_iter().flatten().flatten() {
             match entry.metadata() {
                 Ok(about) if about.is_dir() => open.push(entry.path()),
-                Ok(about) if about.is_file() && about.len() < LARGEST => {
+                Ok(about) if about.is_file() && about.len() < MAX_SIZE => {
                     found += usize::from(is_pointer(&entry.path()));
                 }
                 _ => {}
@@ -55,7 +55,7 @@ pub fn settings(remote: &Remote) -> Vec<String> {
     ]
 }
 
-/// What a client is told of pointers that are left.
+/// The warning for a client about pointers that are left.
 pub fn warning(count: usize, is_installed: bool) -> String {
     let why = if is_installed { "could not be loaded" } else { "can't be loaded: this server has no git-lfs" };
     format!("Warning: {count} files of this project are kept in Git LFS and {why}")

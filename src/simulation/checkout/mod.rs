@@ -3,13 +3,11 @@
 //! For the timeout and the size limit of a fetch see [`checkout_limits`]; for git's settings see [`git`].
 
 mod cache_dir;
-mod canonical_remotes;
 mod checkout_error;
 mod checkout_limits;
 mod checkout_service;
 mod commit_resolver;
 mod disk;
-mod eviction_signal;
 mod file_restore;
 mod git;
 mod git_error;
@@ -30,7 +28,7 @@ pub use cache_dir::CacheDir;
 pub use checkout_error::CheckoutError;
 pub use checkout_limits::CheckoutLimits;
 pub use checkout_service::{CheckoutService, Progress};
-pub use disk::{Growing, outgrown};
+pub use disk::outgrown;
 pub use mirrors::Mirrors;
 pub use project::Project;
-pub use single_flight::SingleFlight;
+pub use single_flight::{OnProgress, SingleFlight};

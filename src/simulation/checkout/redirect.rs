@@ -7,13 +7,13 @@
 use url::Url;
 
 use super::checkout_error::CheckoutError;
-use super::git::{Call, Git};
+use super::git::Call;
 use super::mirrors::{Mirrors, Remote};
 use super::repository::Repository;
 use crate::shared::domain::{AdmissionRules, Load, ProjectUrl};
 
 /// Limit of redirects for a world.
-pub const MOST: usize = 5;
+pub const MAX_REDIRECTS: usize = 5;
 
 /// The first path that git requests from a Git host.
 const FIRST_QUESTION: &str = "/info/refs";
@@ -23,12 +23,11 @@ const FIRST_QUESTION: &str = "/info/refs";
 /// # Errors
 /// When the redirect may not be followed.
 pub async fn follow(
-    git: &Git,
     repository: &Repository,
     (mirrors, rules): (&Mirrors, &AdmissionRules),
     world: &ProjectUrl,
 ) -> Result<(ProjectUrl, Remote), CheckoutError> {
-    let target = match location(git, repository).await {
+    let target = match location(repository).await {
         Some(location) => target(mirrors, rules, world, &location),
         None => Err("to where its forge does not say".to_owned()),
     };
@@ -38,11 +37,11 @@ pub async fn follow(
 }
 
 /// The `Location` to which a Git host redirects requests for a repository.
-async fn location(git: &Git, repository: &Repository) -> Option<String> {
+async fn location(repository: &Repository) -> Option<String> {
     let trace = [("GIT_TRACE_CURL", "1"), ("GIT_TRACE_CURL_NO_DATA", "1")];
     let environment = trace.map(|(name, value)| (name.into(), value.into())).to_vec();
     let mut location = None;
-    let look = |line: &str| {
+    let on_line = |line: &str| {
         let header = line.split_once("Recv header: ").and_then(|(_, header)| header.split_once(": "));
         if let Some((name, value)) = header
             && name.eq_ignore_ascii_case("location")
@@ -50,13 +49,10 @@ async fn location(git: &Git, repository: &Repository) -> Option<String> {
             location = Some(value.to_owned());
         }
     };
+    let remote = repository.remote();
+    let call = repository.call(&["ls-remote", "--quiet", "--", &remote.location, "HEAD"]);
     // It fails again, since the forge sends it elsewhere.
-    git.run(
-        Call { environment, ..repository.call(&["ls-remote", "--quiet", "--", &repository.remote().location, "HEAD"]) },
-        look,
-    )
-    .await
-    .ok();
+    repository.run(Call { environment, ..call }, on_line).await.ok();
     location
 }
 

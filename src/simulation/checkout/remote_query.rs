@@ -3,30 +3,25 @@
 use std::ffi::OsStr;
 use std::sync::Arc;
 
-use super::checkout_error::{CheckoutError, fetch_failed, git_failed, machine, no_reference, too_large};
-use super::checkout_limits::CheckoutLimits;
-use super::git::{Call, Git, LITTLE_MEMORY};
+use super::checkout_error::{CheckoutError, fetch_failed, git_failed, machine, no_reference};
 use super::repository::Repository;
 use super::repository_cache::RepositoryCache;
 use super::revision::{self, Revision};
+use super::single_flight::OnProgress;
 use super::steps;
 use crate::shared::domain::ProjectUrl;
 
-/// The context of the search for a world's commit.
+/// The search for a world's commit.
 #[derive(Clone, Copy)]
 pub struct RemoteQuery<'job> {
-    /// Runs git.
-    pub git: &'job Git,
     /// The cache of histories.
     pub cache: &'job RepositoryCache,
-    /// The limits of a fetch.
-    pub limits: &'job CheckoutLimits,
     /// The world to find.
     pub world: &'job ProjectUrl,
     /// The cached repository of its commits.
     pub repository: &'job Arc<Repository>,
     /// Receives each step as text.
-    pub progress: &'job (dyn Fn(String) + Send + Sync),
+    pub progress: OnProgress<'job>,
 }
 
 impl RemoteQuery<'_> {
@@ -37,15 +32,12 @@ impl RemoteQuery<'_> {
 
     /// Fetches the commits of all branches and tags; `commit` determines the hash algorithm.
     async fn fetch_history(self, history: &Arc<Repository>, commit: &str) -> Result<(), CheckoutError> {
-        let RemoteQuery { world, progress, .. } = self;
+        let (RemoteQuery { world, progress, .. }, limit) = (self, history.limits.size);
         let what = || format!("The history of {}", world.repository());
-        let tell = |said: String| progress(steps::fetching(&format!("the history of {}", world.repository()), &said));
-        let fetched = history.fetch(&revision::history(&history.remote().location, commit), &tell).await;
-        fetched.map_err(|error| fetch_failed(world, what, self.limits.size, error))?;
-        if history.packed().await > self.limits.size {
-            return Err(too_large(what(), self.limits.size));
-        }
-        Ok(())
+        let on_line =
+            |line: String| progress(steps::fetching(&format!("the history of {}", world.repository()), &line));
+        let fetched = history.fetch(&revision::history(&history.remote().location, commit), &on_line).await;
+        fetched.map_err(|error| fetch_failed(world, what, limit, error))
     }
 
     /// Whether a commit that is named by its hash is in a branch or tag.
@@ -53,7 +45,8 @@ impl RemoteQuery<'_> {
     /// # Errors
     /// Why it can't be determined.
     pub async fn is_accepted(self, revision: &Revision) -> Result<bool, CheckoutError> {
-        let answer = self.tips().await?;
+        let location = &self.repository.remote().location;
+        let answer = self.ask(&["ls-remote", "--quiet", "--heads", "--tags", "--", location]).await?;
         if revision::is_of_other_length(&answer, &revision.commit) {
             return Err(no_reference(self.world));
         }
@@ -63,8 +56,7 @@ impl RemoteQuery<'_> {
     /// Whether a commit is part of a branch or tag. Fetches the history if it is not cached.
     async fn is_in_history(self, commit: &str) -> Result<bool, CheckoutError> {
         let history = self.history().await?;
-        let is_small = history.packed().await <= self.limits.size;
-        if is_small && self.is_reachable(&history, commit).await? {
+        if self.is_reachable(&history, commit).await? {
             return Ok(true);
         }
         self.fetch_history(&history, commit).await?;
@@ -80,25 +72,15 @@ impl RemoteQuery<'_> {
         branches.map(|answer| !answer.is_empty()).map_err(|error| git_failed(self.world, error))
     }
 
-    /// All branches and tags of the remote.
-    async fn tips(self) -> Result<String, CheckoutError> {
-        let location = &self.repository.remote().location;
-        self.answer(&["ls-remote", "--quiet", "--heads", "--tags", "--", location]).await
-    }
-
     /// Requests from the remote the branches and tags that the world's URL may mean.
     ///
     /// # Errors
     /// When it can't answer.
-    pub async fn ask(self) -> Result<String, CheckoutError> {
-        self.answer(&revision::search_arguments(self.world, &self.repository.remote().location)).await
+    pub async fn candidates(self) -> Result<String, CheckoutError> {
+        self.ask(&revision::search_arguments(self.world, &self.repository.remote().location)).await
     }
 
-    async fn answer(self, arguments: &[impl AsRef<OsStr>]) -> Result<String, CheckoutError> {
-        let turn = self.repository.may_ask().await;
-        let _turn = turn.map_err(|error| machine(self.world, &std::io::Error::other(error)))?;
-        let call = Call { memory: LITTLE_MEMORY, ..self.repository.call(arguments) };
-        let answer = self.git.run(call, |_| ()).await.map_err(|source| git_failed(self.world, source))?;
-        Ok(String::from_utf8_lossy(&answer).into_owned())
+    async fn ask(self, arguments: &[impl AsRef<OsStr>]) -> Result<String, CheckoutError> {
+        self.repository.ask(arguments).await.map_err(|source| git_failed(self.world, source))
     }
 }

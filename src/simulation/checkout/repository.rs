@@ -7,16 +7,15 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use parking_lot::Mutex;
-use tokio::sync::{AcquireError, OwnedMutexGuard, Semaphore, SemaphorePermit, watch};
+use tokio::sync::{Notify, OwnedMutexGuard, watch};
 
 use super::checkout_limits::CheckoutLimits;
-use super::disk::{blocking, packed, received, remove_all, remove_leftovers};
-use super::eviction_signal::EvictionSignal;
-use super::git::{Call, Git, MOST_MEMORY};
+use super::disk::{blocking, received, remove_all, remove_leftovers};
+use super::git::{Call, Git, LITTLE_MEMORY, MAX_MEMORY};
 use super::git_error::GitError;
 use super::mirrors::Remote;
 use super::revision::{self, FetchRequest};
-use super::single_flight::SingleFlight;
+use super::single_flight::{OnProgress, SingleFlight};
 
 /// A cached repository. It is not evicted from the cache until this is dropped.
 #[derive(Debug)]
@@ -25,33 +24,22 @@ pub struct Repository {
     /// The remote. Its URL may have several spellings.
     remote: Mutex<Arc<Remote>>,
     git: Arc<Git>,
-    limits: CheckoutLimits,
-    growth: Arc<EvictionSignal>,
+    /// The limits of a fetch.
+    pub limits: CheckoutLimits,
+    growth: Arc<Notify>,
     /// Held by the task that changes the repository.
     lock: Arc<tokio::sync::Mutex<()>>,
-    /// Limits concurrent queries of the remote.
-    asking: Semaphore,
     /// The fetches in progress, by the name of the request.
     fetches: SingleFlight<String, Result<(), GitError>>,
     /// When it was created, if that was after this value was created.
-    made: Mutex<Option<Instant>>,
+    created: Mutex<Option<Instant>>,
 }
-
-/// Limit of concurrent queries of the remote, because its answers use memory.
-const QUESTIONS: usize = 4;
 
 impl Repository {
     /// The repository at `path`, which need not exist yet, for commits of `remote`.
-    pub fn new(
-        path: PathBuf,
-        remote: Remote,
-        git: Arc<Git>,
-        limits: CheckoutLimits,
-        growth: Arc<EvictionSignal>,
-    ) -> Self {
-        let (lock, fetches, made) = (Arc::default(), SingleFlight::default(), Mutex::default());
-        let asking = Semaphore::new(QUESTIONS);
-        Self { path, remote: Mutex::new(Arc::new(remote)), git, limits, growth, lock, asking, fetches, made }
+    pub fn new(path: PathBuf, remote: Remote, git: Arc<Git>, limits: CheckoutLimits, growth: Arc<Notify>) -> Self {
+        let (lock, fetches, created) = (Arc::default(), SingleFlight::default(), Mutex::default());
+        Self { path, remote: Mutex::new(Arc::new(remote)), git, limits, growth, lock, fetches, created }
     }
 
     /// Where it is fetched from.
@@ -71,11 +59,19 @@ impl Repository {
             settings: Vec::new(),
             arguments: arguments.iter().map(Into::into).collect(),
             protocol: self.remote().protocol,
-            memory: MOST_MEMORY,
+            memory: MAX_MEMORY,
             file_size: None,
             time: self.limits.time,
             environment: Vec::new(),
         }
+    }
+
+    /// Runs a command to its end. Returns its answer. `on_line` receives each line of standard error.
+    ///
+    /// # Errors
+    /// When git fails.
+    pub async fn run(&self, call: Call<'_>, on_line: impl FnMut(&str)) -> Result<Vec<u8>, GitError> {
+        self.git.run(call, on_line).await
     }
 
     /// Runs a command that only reads the repository. Returns its answer.
@@ -95,32 +91,28 @@ impl Repository {
     ///
     /// # Errors
     /// Why it can't be fetched.
-    pub async fn fetch(
-        self: &Arc<Self>,
-        request: &FetchRequest,
-        progress: &(impl Fn(String) + Send + Sync),
-    ) -> Result<(), GitError> {
+    pub async fn fetch(self: &Arc<Self>, request: &FetchRequest, progress: OnProgress<'_>) -> Result<(), GitError> {
         let (this, wanted) = (Arc::clone(self), request.clone());
-        let fetch = |told| async move { this.fetch_locked(&wanted, &told).await };
+        let fetch = |sender| async move { this.fetch_locked(&wanted, &sender).await };
         self.fetches.join(request.name.clone(), progress, fetch).await
     }
 
     async fn fetch_locked(
         self: &Arc<Self>,
         request: &FetchRequest,
-        told: &watch::Sender<String>,
+        sender: &watch::Sender<String>,
     ) -> Result<(), GitError> {
         let _grown = Grown(&self.growth);
-        let guard = self.lock(told).await;
-        self.make(request).await?;
-        let tell = |line: &str| {
+        let guard = self.lock(sender).await;
+        self.create(request).await?;
+        let on_line = |line: &str| {
             if line.contains('%') {
-                told.send_replace(line.trim_start_matches("remote: ").to_owned());
+                sender.send_replace(line.trim_start_matches("remote: ").to_owned());
             }
         };
         let file_size = Some(self.limits.size);
         let call = Call { settings: request.settings.clone(), file_size, ..self.call(&request.arguments) };
-        if let Err(error) = self.git.run(call, tell).await {
+        if let Err(error) = self.git.run(call, on_line).await {
             let path = self.path.clone();
             let received = blocking(move || Ok(received(&path))).await?;
             return Err(if received < self.limits.size { error } else { GitError::TooLarge });
@@ -129,26 +121,27 @@ impl Repository {
         Ok(())
     }
 
-    /// Waits for a permit to query the remote.
+    /// Asks the remote. Returns its answer.
     ///
     /// # Errors
-    /// Never, because the semaphore is never closed.
-    pub async fn may_ask(&self) -> Result<SemaphorePermit<'_>, AcquireError> {
-        self.asking.acquire().await
+    /// When git fails.
+    pub async fn ask(&self, arguments: &[impl AsRef<OsStr>]) -> Result<String, GitError> {
+        let answer = self.run(Call { memory: LITTLE_MEMORY, ..self.call(arguments) }, |_| ()).await?;
+        Ok(String::from_utf8_lossy(&answer).into_owned())
     }
 
     /// Waits until no other task changes the repository.
-    async fn lock(&self, told: &watch::Sender<String>) -> OwnedMutexGuard<()> {
+    async fn lock(&self, sender: &watch::Sender<String>) -> OwnedMutexGuard<()> {
         let lock = Arc::clone(&self.lock);
         if let Ok(guard) = Arc::clone(&lock).try_lock_owned() {
             return guard;
         }
-        told.send_replace("waiting for another fetch".to_owned());
+        sender.send_replace("waiting for another fetch".to_owned());
         lock.lock_owned().await
     }
 
     /// Creates the bare repository unless it exists. Else removes what a killed git has left.
-    async fn make(&self, request: &FetchRequest) -> Result<(), GitError> {
+    async fn create(&self, request: &FetchRequest) -> Result<(), GitError> {
         // It is renamed to its final path when it is complete.
         let new = self.path.with_extension("new");
         let (path, new_path) = (self.path.clone(), new.clone());
@@ -163,7 +156,7 @@ impl Repository {
         let call = Call { repository: &new, ..self.call(&revision::init_arguments(request.is_sha256)) };
         self.git.run(call, |_| ()).await?;
         tokio::fs::rename(&new, &self.path).await?;
-        *self.made.lock() = Some(Instant::now());
+        *self.created.lock() = Some(Instant::now());
         Ok(())
     }
 
@@ -185,31 +178,19 @@ impl Repository {
     /// When it can't be removed.
     pub async fn discard(&self, since: Instant) -> io::Result<()> {
         let _guard = self.lock.lock().await;
-        if self.made.lock().is_some_and(|made| made > since) {
+        if self.created.lock().is_some_and(|created| created > since) {
             return Ok(());
         }
         let path = self.path.clone();
         blocking(move || remove_all(&[&path])).await
     }
-
-    /// Size of its packs, in bytes.
-    pub async fn packed(&self) -> u64 {
-        let path = self.path.clone();
-        blocking(move || Ok(packed(&path))).await.unwrap_or_default()
-    }
-}
-
-impl Drop for Repository {
-    fn drop(&mut self) {
-        self.growth.left();
-    }
 }
 
 /// On drop, marks the cache as grown, whatever the outcome.
-struct Grown<'cache>(&'cache EvictionSignal);
+struct Grown<'cache>(&'cache Notify);
 
 impl Drop for Grown<'_> {
     fn drop(&mut self) {
-        self.0.grown();
+        self.0.notify_one();
     }
 }

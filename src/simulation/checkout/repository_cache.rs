@@ -7,15 +7,14 @@ use std::fs::File;
 use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Weak};
-use std::time::SystemTime;
+use std::time::{Duration, SystemTime};
 
 use sha2::{Digest, Sha256};
-use tokio::sync::Mutex;
+use tokio::sync::{Mutex, Notify};
 
 use super::cache_dir::CacheDir;
 use super::checkout_limits::CheckoutLimits;
 use super::disk::size_of;
-use super::eviction_signal::EvictionSignal;
 use super::git::Git;
 use super::mirrors::Remote;
 use super::repository::Repository;
@@ -31,12 +30,15 @@ pub struct RepositoryCache {
     limits: CheckoutLimits,
     /// The repositories in use.
     in_use: Mutex<HashMap<PathBuf, Weak<Repository>>>,
-    growth: Arc<EvictionSignal>,
+    /// Signals that a repository has grown.
+    growth: Arc<Notify>,
     _dir: CacheDir,
 }
 
 /// The extension of a directory that is being removed. Names of repositories have no dots.
 const REMOVED: &str = "removed";
+/// Interval between two attempts to bring the cache within its budget: repositories in use stay.
+const RETRY_INTERVAL: Duration = Duration::from_secs(2);
 
 impl RepositoryCache {
     /// Opens the cache in `dir`, with a limit of `budget` bytes.
@@ -96,24 +98,23 @@ impl RepositoryCache {
 
     /// Signals that a repository has grown.
     pub fn grown(&self) {
-        self.growth.grown();
+        self.growth.notify_one();
     }
 
     /// Keeps the cache within its budget. Never returns.
     pub async fn keep_within_budget(self: Arc<Self>) {
         loop {
             let this = Arc::clone(&self);
-            if let Err(error) = actix_rt::task::spawn_blocking(move || this.shrink()).await {
-                log::error!("the cache can't be kept within its budget: {error}");
+            let shrunk = actix_rt::task::spawn_blocking(move || this.shrink()).await;
+            match shrunk.inspect_err(|error| log::error!("the cache can't be kept within its budget: {error}")) {
+                Ok(false) => actix_rt::time::sleep(RETRY_INTERVAL).await,
+                _ => self.growth.notified().await,
             }
-            self.growth.changed().await;
         }
     }
 
-    /// Evicts unused repositories until the others fit into the budget. Blocks.
-    fn shrink(&self) {
-        // A repository that is released from now on triggers another pass.
-        self.growth.set_over_budget(true);
+    /// Evicts unused repositories until the others fit into the budget. Returns whether they do. Blocks.
+    fn shrink(&self) -> bool {
         let mut all: Vec<(SystemTime, u64, PathBuf)> = Vec::new();
         for entry in std::fs::read_dir(&self.folder).into_iter().flatten().flatten() {
             let path = entry.path();
@@ -131,7 +132,7 @@ impl RepositoryCache {
                 total -= size;
             }
         }
-        self.growth.set_over_budget(total > self.budget);
+        total <= self.budget
     }
 
     /// Removes a repository unless it is in use. Blocks.

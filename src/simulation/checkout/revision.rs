@@ -41,7 +41,7 @@ pub struct FetchRequest {
 }
 
 /// Limit of readings of a URL: no real branch has more slashes in its name.
-const MOST_READINGS: usize = 12;
+const MAX_CANDIDATES: usize = 12;
 
 /// The commit that a URL names by its full hash: then nobody need be asked what it is. `allow_any` tells whether any will
 /// do, or only one that is in a branch or tag.
@@ -89,7 +89,7 @@ fn is_sha256(hash: &str) -> bool {
 
 /// Asks the remote for all branches and tags that a URL may mean.
 pub fn search_arguments(world: &ProjectUrl, location: &str) -> Vec<String> {
-    let names = world.candidates().into_iter().take(MOST_READINGS).flat_map(|reading| full_names(world, &reading));
+    let names = world.candidates().into_iter().take(MAX_CANDIDATES).flat_map(|reading| full_names(world, &reading));
     ["ls-remote", "--quiet", "--", location].map(str::to_owned).into_iter().chain(names).collect()
 }
 
@@ -107,7 +107,7 @@ fn full_names(world: &ProjectUrl, reading: &Reading) -> Vec<String> {
 /// What the remote has of what was asked for: the longest names first, branches before tags.
 pub fn found(world: &ProjectUrl, answer: &str) -> Vec<Revision> {
     let known: Vec<(&str, &str)> = answer.lines().filter_map(|line| line.split_once('\t')).collect();
-    let readings = world.candidates().into_iter().take(MOST_READINGS).rev();
+    let readings = world.candidates().into_iter().take(MAX_CANDIDATES).rev();
     readings
         .flat_map(|reading| full_names(world, &reading).into_iter().map(move |name| (name, reading.clone())))
         .filter_map(|(name, reading)| {

@@ -22,33 +22,31 @@ struct Job<T: Clone> {
     result: WeakShared<BoxFuture<'static, T>>,
 }
 
+/// Receives each step of a job as text.
+pub type OnProgress<'job> = &'job (dyn Fn(String) + Send + Sync);
+
 /// Shortest interval between two steps that are sent to a waiter.
-const BETWEEN_STEPS: Duration = Duration::from_millis(100);
+const STEP_INTERVAL: Duration = Duration::from_millis(100);
 
 impl<K: Eq + Hash, T: Clone + Send + Sync + 'static> SingleFlight<K, T> {
     /// Joins the job with this key, or starts it. `progress` receives each step as text, also if another caller has
     /// started the job.
-    pub async fn join<F>(
-        &self,
-        key: K,
-        progress: &(impl Fn(String) + Send + Sync),
-        start: impl FnOnce(watch::Sender<String>) -> F,
-    ) -> T
+    pub async fn join<F>(&self, key: K, progress: OnProgress<'_>, start: impl FnOnce(watch::Sender<String>) -> F) -> T
     where
         F: Future<Output = T> + Send + 'static,
     {
-        let (mut result, mut news) = self.join_or_start(key, start);
-        let mut told = Instant::now().checked_sub(BETWEEN_STEPS).unwrap_or_else(Instant::now);
+        let (mut result, mut steps) = self.join_or_start(key, start);
+        let mut sent = Instant::now().checked_sub(STEP_INTERVAL).unwrap_or_else(Instant::now);
         loop {
             let step = async {
-                // Throttled: within `BETWEEN_STEPS` only the newest step is sent.
-                actix_rt::time::sleep_until((told + BETWEEN_STEPS).into()).await;
-                news.changed().await.map(|()| news.borrow_and_update().clone())
+                // Throttled: within `STEP_INTERVAL` only the newest step is sent.
+                actix_rt::time::sleep_until((sent + STEP_INTERVAL).into()).await;
+                steps.changed().await.map(|()| steps.borrow_and_update().clone())
             };
             tokio::select! {
                 done = &mut result => return done,
                 Ok(step) = step => {
-                    told = Instant::now();
+                    sent = Instant::now();
                     progress(step);
                 }
             }

@@ -22,20 +22,20 @@ pub fn looking_for(repository: &str) -> String {
 }
 
 /// git fetches, and says this.
-pub fn fetching(what: &str, said: &str) -> String {
+pub fn fetching(what: &str, line: &str) -> String {
     let (first, last) = FETCH;
-    let number = match said.split_once(':') {
+    let number = match line.split_once(':') {
         Some(("Receiving objects", rest)) => first + (last - first) * percent(rest) / 100,
         Some(("Resolving deltas", _)) => last,
         _ => first,
     };
-    step(number, &format!("fetching {what}: {said}"))
+    step(number, &format!("fetching {what}: {line}"))
 }
 
 /// git writes the files of a branch, tag or commit, and says this.
-pub fn checking_out(name: &str, said: Option<&str>) -> String {
-    let said = said.map_or_else(String::new, |said| format!(": {said}"));
-    step(8, &format!("checking {name} out{said}"))
+pub fn checking_out(name: &str, line: Option<&str>) -> String {
+    let line = line.map_or_else(String::new, |line| format!(": {line}"));
+    step(8, &format!("checking {name} out{line}"))
 }
 
 fn percent(text: &str) -> u64 {

@@ -7,8 +7,8 @@ use std::path::Path;
 use super::checkout_error::{CheckoutError, machine};
 use super::checkout_limits::CheckoutLimits;
 use super::commit_resolver::ResolvedCommit;
-use super::disk::{self, Growing};
-use super::git::{Call, Git, LITTLE_MEMORY};
+use super::disk;
+use super::git::{Call, LITTLE_MEMORY};
 use super::git_error::GitError;
 use super::lfs;
 use super::repository::Repository;
@@ -33,7 +33,7 @@ pub struct WorkTree {
 ///
 /// # Errors
 /// When the list of paths can't be written.
-pub async fn copy_call<'call>(
+pub async fn checkout_command<'call>(
     repository: &'call Repository,
     revision: &Revision,
     paths: &[u8],
@@ -55,36 +55,32 @@ pub async fn copy_call<'call>(
     Ok(call)
 }
 
-/// Writes a project with git, with its large files; `told` receives its progress lines. Returns whether it is within
+/// Writes a project with git, with its large files; `on_line` receives its progress lines. Returns whether it is within
 /// the size limit: git's attributes may make it larger than the commit, and a Git host may send more than it should.
 ///
 /// # Errors
 /// When git fails.
 pub async fn write(
-    git: &Git,
     found: &ResolvedCommit,
     instance: &InstanceDir,
     (limits, has_lfs): (&CheckoutLimits, bool),
-    told: impl FnMut(&str),
+    on_line: impl FnMut(&str),
 ) -> Result<bool, GitError> {
     let paths = [found.revision.needed().as_bytes(), b"\0", &found.above].concat();
     let project = instance.project();
-    let call = copy_call(&found.repository, &found.revision, &paths, (instance.path(), &project));
+    let call = checkout_command(&found.repository, &found.revision, &paths, (instance.path(), &project));
     let mut call = call.await?;
-    let mut growing = vec![Growing::new(project, limits.size)];
+    let mut growing = vec![(project, limits.size)];
     if has_lfs {
         call.settings = lfs::settings(&found.repository.remote());
         // git-lfs stores its downloads here, shared with concurrent checkouts, and copies them into the project.
         let kept = call.repository.join("lfs");
-        let before = disk::blocking({
-            let kept = kept.clone();
-            move || Ok(disk::room_of(&kept))
-        });
-        let before = before.await?;
-        growing.push(Growing::new(kept, before.saturating_add(limits.size.saturating_mul(2))));
+        let measured = kept.clone();
+        let before = disk::blocking(move || Ok(disk::room_of(&measured))).await?;
+        growing.push((kept, before.saturating_add(limits.size.saturating_mul(2))));
     }
     tokio::select! {
-        written = git.run(call, told) => written.map(|_| true),
+        written = found.repository.run(call, on_line) => written.map(|_| true),
         () = disk::outgrown(growing) => Ok(false),
     }
 }
@@ -93,7 +89,11 @@ pub async fn write(
 ///
 /// # Errors
 /// When the machine fails.
-pub async fn look(world: &ProjectUrl, instance: &InstanceDir, revision: &Revision) -> Result<WorkTree, CheckoutError> {
+pub async fn inspect(
+    world: &ProjectUrl,
+    instance: &InstanceDir,
+    revision: &Revision,
+) -> Result<WorkTree, CheckoutError> {
     let root = instance.project();
     let (folder, path) = (root.join(&revision.folder), root.join(revision.world_path(world)));
     let seen = disk::blocking(move || {

@@ -23,8 +23,6 @@ pub struct BuildPlan {
     pub controller: Option<Dockerfile>,
     /// Whether the project has a Makefile.
     pub has_makefile: bool,
-    /// Warnings for its author.
-    pub warnings: Vec<String>,
 }
 
 /// Files with which a project would configure its containers itself.
@@ -36,10 +34,9 @@ impl BuildPlan {
     /// # Errors
     /// The problem, as text for the client.
     pub fn read(project: &Path, templates: &Templates, owner: &str) -> Result<Self, String> {
-        let yml = WebotsYml::read(project);
-        let mut warnings = yml.warnings.clone();
+        let mut yml = WebotsYml::read(project);
         let ignored = IGNORED.iter().filter(|name| project.join(name).symlink_metadata().is_ok());
-        warnings.extend(ignored.map(|name| format!("{name} of the project is not used here")));
+        yml.warnings.extend(ignored.map(|name| format!("{name} of the project is not used here")));
         let has_makefile = project.join("Makefile").is_file();
         let dockerfile = match text_of(&project.join("Dockerfile"))? {
             None if has_makefile || templates.has(DOCKERFILE) => Some(templates.text(DOCKERFILE)?.into_owned()),
@@ -50,7 +47,7 @@ impl BuildPlan {
             ProjectKind::Default | ProjectKind::Editor => None,
         };
         let read = |text: Option<String>| text.map(|text| Dockerfile::read(&text, owner)).transpose();
-        Ok(Self { dockerfile: read(dockerfile)?, controller: read(controller)?, yml, has_makefile, warnings })
+        Ok(Self { dockerfile: read(dockerfile)?, controller: read(controller)?, yml, has_makefile })
     }
 }
 
@@ -88,10 +85,11 @@ pub fn inside(project: &Path, folder: &Path) -> Result<PathBuf, String> {
 /// `controller "<extern>"` in the world.
 ///
 /// # Errors
-/// When the file can't be read or written.
-pub fn open_participant(world: &Path) -> io::Result<()> {
-    let text = std::fs::read_to_string(world)?;
-    std::fs::write(world, text.replace("controller \"participant\"", "controller \"<extern>\""))
+/// When the file can't be read or written, as text for the client.
+pub fn open_participant(world: &Path) -> Result<(), String> {
+    let open = |text: String| text.replace("controller \"participant\"", "controller \"<extern>\"");
+    let changed = std::fs::read_to_string(world).and_then(|text| std::fs::write(world, open(text)));
+    changed.map_err(|error| format!("The world can't be changed: {error}"))
 }
 
 /// The image of Webots for a version: up to R2023a on Ubuntu 20.04, later ones on 22.04.
@@ -127,14 +125,14 @@ mod tests {
     fn an_image_is_built_only_where_there_is_something_to_build() {
         let project = tempfile::tempdir().unwrap();
         let plan = BuildPlan::read(project.path(), &templates(), "x").unwrap();
-        assert!(plan.dockerfile.is_none() && plan.warnings.is_empty());
+        assert!(plan.dockerfile.is_none() && plan.yml.warnings.is_empty());
         std::fs::write(project.path().join("Makefile"), "all:\n").unwrap();
         std::fs::write(project.path().join(".env"), "A=b").unwrap();
         let plan = BuildPlan::read(project.path(), &templates(), "x").unwrap();
         assert!(
             plan.has_makefile && plan.dockerfile.is_some_and(|found| found.text.contains("LABEL webots-fleet.owner=x"))
         );
-        assert_eq!(plan.warnings, [".env of the project is not used here"]);
+        assert_eq!(plan.yml.warnings, [".env of the project is not used here"]);
         std::fs::write(project.path().join("Dockerfile"), "FROM mine\n").unwrap();
         let plan = BuildPlan::read(project.path(), &templates(), "x").unwrap();
         assert_eq!(plan.dockerfile.unwrap().text, "FROM mine\nLABEL webots-fleet.owner=x\n");

@@ -10,9 +10,9 @@ use super::templates::Templates;
 use crate::simulation::config::SimulationConfig;
 
 /// Timeout of a command that starts a container.
-const START: Duration = Duration::from_secs(15);
+const START_TIMEOUT: Duration = Duration::from_secs(15);
 /// Timeout of the daemon's answer.
-const ANSWER: Duration = Duration::from_secs(5);
+const ANSWER_TIMEOUT: Duration = Duration::from_secs(5);
 /// The path of Docker's init process in a container. The program is static: it runs in an empty image.
 const INIT: &str = "/sbin/docker-init";
 /// The empty image, shared by all servers of a machine.
@@ -46,7 +46,7 @@ pub fn check_templates(config: &SimulationConfig) -> Result<String, String> {
 /// Why the daemon can't be used now, as text for clients and administrators. Blocks for five seconds at most.
 #[must_use]
 pub fn daemon_fault() -> Option<String> {
-    let version = docker::blocking(&["version", "--format", "{{.Server.Version}}"], ANSWER);
+    let version = docker::blocking(&["version", "--format", "{{.Server.Version}}"], ANSWER_TIMEOUT);
     version.err().map(|error| error.to_string())
 }
 
@@ -59,8 +59,8 @@ pub fn data_folder() -> Option<PathBuf> {
         return None;
     }
     if FOLDER.get().is_none() {
-        let told = docker::blocking(&["info", "--format", "{{.DockerRootDir}}"], ANSWER).ok()?;
-        let folder = Some(PathBuf::from(told.trim())).filter(|folder| folder.is_absolute() && folder.exists())?;
+        let output = docker::blocking(&["info", "--format", "{{.DockerRootDir}}"], ANSWER_TIMEOUT).ok()?;
+        let folder = Some(PathBuf::from(output.trim())).filter(|folder| folder.is_absolute() && folder.exists())?;
         // A concurrent check may have set it.
         FOLDER.set(folder).ok();
     }
@@ -75,14 +75,14 @@ pub fn data_folder() -> Option<PathBuf> {
 #[must_use]
 pub fn init_fault() -> Option<String> {
     let run = || -> Result<String, String> {
-        if docker::blocking(&["image", "inspect", EMPTY_IMAGE], START).is_err() {
+        if docker::blocking(&["image", "inspect", EMPTY_IMAGE], START_TIMEOUT).is_err() {
             let tar = tempfile::NamedTempFile::new().map_err(|error| error.to_string())?;
             std::fs::write(tar.path(), EMPTY_TAR).map_err(|error| error.to_string())?;
             let import = ["import", &tar.path().to_string_lossy(), EMPTY_IMAGE];
-            docker::blocking(&import, START).map_err(|error| error.to_string())?;
+            docker::blocking(&import, START_TIMEOUT).map_err(|error| error.to_string())?;
         }
         let words = ["run", "--rm", "--init", "--network", "none", EMPTY_IMAGE, INIT, "--version"];
-        docker::blocking(&words, START).map_err(|error| error.to_string())
+        docker::blocking(&words, START_TIMEOUT).map_err(|error| error.to_string())
     };
     let why = run().err()?;
     Some(format!(

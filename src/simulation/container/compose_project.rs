@@ -66,19 +66,9 @@ impl ComposeProject<'_> {
         std::fs::create_dir_all(self.exchange())?;
         std::fs::write(folder.join(TEMPLATE), template.text.as_bytes())?;
         std::fs::write(folder.join(OVERRIDE), self.overridden(template, config).to_string())?;
-        let path = |path: &Path| path.to_string_lossy().into_owned();
-        let (template, settings) = (path(&folder.join(TEMPLATE)), path(&folder.join(OVERRIDE)));
-        let words = [
-            "--project-name",
-            self.name,
-            "--project-directory",
-            &path(&folder),
-            "--file",
-            &template,
-            "--file",
-            &settings,
-        ];
-        Ok((words.map(str::to_owned).into(), self.variables(config)))
+        let path = |name: &str| folder.join(name).to_string_lossy().into_owned();
+        let options = ["--file", &path(TEMPLATE), "--file", &path(OVERRIDE)].map(str::to_owned);
+        Ok((options.into(), self.variables(config)))
     }
 
     /// The directory through which Webots and a controller in another container communicate.
@@ -153,13 +143,6 @@ impl ComposeProject<'_> {
             // The daemon would run it, at the interval of the image.
             ("healthcheck", json!({ "disable": true })),
         ]);
-        let image = match name {
-            WEBOTS => Some(self.image),
-            "controller" => self.controller,
-            "theia" => Some(settings.editor_image.as_str()),
-            _ => None,
-        };
-        service.extend(image.map(|image| ("image", json!(image))));
         service.extend(limits.cores.map(|cores| ("cpus", json!(cores))));
         let mut environment = ENVIRONMENT.map(|(name, value)| (name, value.to_owned())).to_vec();
         if name == WEBOTS {
@@ -216,7 +199,7 @@ pub fn container_of(project: &str, service: &str) -> String {
     format!("{project}-{service}")
 }
 
-/// What compose is told of a service.
+/// The settings of a service for compose.
 type Service = BTreeMap<&'static str, Value>;
 
 /// Variables of all services: with them programs write only to writable paths, and find each other.

@@ -1,17 +1,16 @@
 //! Creates the containers of simulations; one for the whole server.
 
-use std::io;
 use std::path::Path;
 use std::sync::Arc;
 
+use actix_rt::task::spawn_blocking;
 use tokio::sync::{OnceCell, Semaphore};
 use tokio_util::task::AbortOnDropHandle;
 
-use super::blocking::blocking;
 use super::build_plan::{self, BuildPlan, PROJECT_PATH};
 use super::compose_project::{ComposeProject, container_of};
-use super::container_request::{ContainerRequest, command};
-use super::docker::{Docker, SHORT};
+use super::container_request::ContainerRequest;
+use super::docker::{Docker, SHORT_TIMEOUT};
 use super::docker_features::DockerFeatures;
 use super::dockerfile::Dockerfile;
 use super::image::{ImageBuild, Images};
@@ -26,6 +25,7 @@ use super::start_error::{StartError, blame};
 use super::steps;
 use super::templates::Templates;
 use super::webots_yml::ProjectKind;
+use crate::simulation::checkout::OnProgress;
 use crate::simulation::config::SimulationConfig;
 
 /// Creates the containers of simulations.
@@ -103,11 +103,11 @@ impl ContainerService {
     pub async fn prepare(
         &self,
         request: ContainerRequest,
-        progress: &(impl Fn(String) + Send + Sync),
+        progress: OnProgress<'_>,
     ) -> Result<SimulationContainers, StartError> {
         let (project, docker, size) = (&request.project, &self.docker, self.config.project_size);
         let (folder, templates, owner) = (project.folder().to_owned(), self.templates.clone(), self.owner.clone());
-        let plan = blocking(move || BuildPlan::read(&folder, &templates, owner.name())).await?;
+        let plan = spawn_blocking(move || BuildPlan::read(&folder, &templates, owner.name())).await??;
         let guard = self.active.insert(self.run.project(request.port));
         let network = self.config.container.network.name();
         network::join(docker, network).await?;
@@ -149,17 +149,16 @@ impl ContainerService {
         plan: BuildPlan,
         guard: ProjectGuard,
         (image, controller): (String, Option<String>),
-        progress: &(impl Fn(String) + Send + Sync),
+        progress: OnProgress<'_>,
     ) -> Result<SimulationContainers, StartError> {
         let is_projects = plan.dockerfile.is_some() || controller.is_some();
-        let features = self.features.get_or_try_init(|| DockerFeatures::ask(&self.docker)).await?.clone();
+        let features = self.features.get_or_try_init(|| DockerFeatures::query(&self.docker)).await?.clone();
         let (config, templates) = (Arc::clone(&self.config), self.templates.clone());
         let (name, yml, has_makefile) = (guard.name.clone(), plan.yml.clone(), plan.has_makefile);
         let files = move || {
             let world = world_in(&request.project)?;
             if yml.kind == ProjectKind::Competition {
-                let opened = build_plan::open_participant(&request.project.folder().join(&world));
-                opened.map_err(|error| not_changed(&error))?;
+                build_plan::open_participant(&request.project.folder().join(&world))?;
             }
             let (project, edited) = mounts(&yml, &request.project)?;
             let parts = ComposeProject {
@@ -170,7 +169,7 @@ impl ContainerService {
                 volume: &yml.folder,
                 image: &image,
                 controller: controller.as_deref(),
-                command: &command(&config, &request, &world),
+                command: &request.command(&config, &world),
                 port: request.port,
                 gpu: request.gpu.as_ref(),
                 has_makefile,
@@ -180,28 +179,19 @@ impl ContainerService {
             let (options, variables) = parts.write(&template, &config)?;
             Ok::<_, StartError>((options, variables, template.services))
         };
-        let (options, variables, services) = blocking(files).await?;
+        let (options, variables, services) = spawn_blocking(files).await??;
         // More concurrent runs would only be slower.
         let turn = self.turns.acquire().await.map_err(|error| StartError::Server(error.to_string()))?;
         progress(steps::CREATING.to_owned());
         let words = options.into_iter().map(Into::into).chain(["up", "--no-start", "--no-build"].map(Into::into));
-        let created = self.docker.compose(words.collect(), variables, SHORT).await;
+        let created = self.docker.compose(words.collect(), variables, SHORT_TIMEOUT).await;
         created.map_err(|error| blame(is_projects, error))?;
         drop(turn);
         // An editor has a port of its own, which the relay of streams does not reach.
         let has_editor = plan.yml.kind != ProjectKind::Default && self.config.ports_are_public();
         let texts = has_editor.then(|| "ide: enable".to_owned()).into_iter().chain(plan.yml.project_type).collect();
         let containers = services.into_iter().map(|service| (service.clone(), container_of(&guard.name, &service)));
-        let (docker, containers) = (self.docker.clone(), containers.collect());
-        Ok(SimulationContainers::new(docker, guard, containers, is_projects, texts, plan.warnings))
-    }
-}
-
-/// Why a competition's world can't be changed. An image may contain one that is not text, or with any mode.
-fn not_changed(error: &io::Error) -> StartError {
-    let why = format!("The world can't be changed: {error}");
-    match error.kind() {
-        io::ErrorKind::InvalidData | io::ErrorKind::PermissionDenied => StartError::Project(why),
-        _ => StartError::Server(why),
+        let (docker, containers, warnings) = (self.docker.clone(), containers.collect(), plan.yml.warnings);
+        Ok(SimulationContainers { docker, guard, containers, is_projects, texts, warnings, restart: None })
     }
 }

@@ -42,9 +42,9 @@ pub enum DockerError {
 }
 
 /// Timeout of queries and of other short commands.
-pub const SHORT: Duration = Duration::from_secs(30);
+pub const SHORT_TIMEOUT: Duration = Duration::from_secs(30);
 /// Timeout of the check which compose command exists.
-const FIND: Duration = Duration::from_secs(10);
+const FIND_TIMEOUT: Duration = Duration::from_secs(10);
 /// How lines begin that follow the reason: which containers were not started, and where to find help.
 const AFTER_REASON: [&str; 3] = ["Error: failed to start containers", "See 'docker", "Run 'docker"];
 /// How a message begins that says that nobody listens.
@@ -63,7 +63,7 @@ impl Docker {
     pub fn find(mark: &Path) -> Result<Self, String> {
         which("docker")
             .map_err(|_| "docker is not there; on Debian and Ubuntu the package docker.io has it".to_owned())?;
-        let compose: &[&str] = if blocking(&["compose", "version"], FIND).is_ok() {
+        let compose: &[&str] = if blocking(&["compose", "version"], FIND_TIMEOUT).is_ok() {
             &["docker", "compose"]
         } else if which("docker-compose").is_ok() {
             &["docker-compose"]
@@ -87,7 +87,7 @@ impl Docker {
         result(name, ran, reason)
     }
 
-    /// The same, but `told` receives each line that it prints.
+    /// The same, but `on_line` receives each line that it prints.
     ///
     /// # Errors
     /// When it fails or takes longer than the limit.
@@ -95,10 +95,9 @@ impl Docker {
         &self,
         arguments: Vec<OsString>,
         limit: Duration,
-        told: impl FnMut(&str),
+        on_line: impl FnMut(&str),
     ) -> Result<(), DockerError> {
-        let command = std::iter::once("docker".into()).chain(arguments).collect();
-        self.call(command, Vec::new(), limit, told).await
+        self.call(&["docker".into()], arguments, Vec::new(), limit, on_line).await
     }
 
     /// Runs `docker compose` with these arguments and variables.
@@ -111,7 +110,7 @@ impl Docker {
         variables: Vec<(&'static str, String)>,
         limit: Duration,
     ) -> Result<(), DockerError> {
-        self.call(self.compose.iter().cloned().chain(arguments).collect(), variables, limit, |_| ()).await
+        self.call(&self.compose, arguments, variables, limit, |_| ()).await
     }
 
     /// The specification of a client program of the daemon. Dropping its process group ends only that program.
@@ -124,17 +123,19 @@ impl Docker {
 
     async fn call(
         &self,
-        command: Vec<OsString>,
+        program: &[OsString],
+        arguments: Vec<OsString>,
         variables: Vec<(&'static str, String)>,
         limit: Duration,
-        mut told: impl FnMut(&str),
+        mut on_line: impl FnMut(&str),
     ) -> Result<(), DockerError> {
+        let command = [program, &arguments].concat();
         let (name, mut reason) = (name_of(&command), String::new());
         let mut run = Run::new([""], &self.mark, limit);
         run.spec = self.spec(command, Duration::ZERO);
         run.spec.environment.extend(variables.into_iter().map(|(name, value)| (name.into(), value.into())));
         let line = |line: String| {
-            told(&line);
+            on_line(&line);
             note(&mut reason, &line);
         };
         let ran = run.follow(line).await.map(|ending| Ran { ending, answer: Vec::new() });

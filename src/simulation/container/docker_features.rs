@@ -3,7 +3,7 @@
 use std::os::unix::fs::MetadataExt;
 use std::path::Path;
 
-use super::docker::{Docker, DockerError, SHORT};
+use super::docker::{Docker, DockerError, SHORT_TIMEOUT};
 
 /// The features of this machine's Docker.
 #[derive(Debug, Clone, Default)]
@@ -24,10 +24,10 @@ impl DockerFeatures {
     ///
     /// # Errors
     /// When Docker fails.
-    pub async fn ask(docker: &Docker) -> Result<Self, DockerError> {
+    pub async fn query(docker: &Docker) -> Result<Self, DockerError> {
         let format = "{{range $name, $_ := .Runtimes}}{{$name}} {{end}}";
-        let told = docker.run(&["info", "--format", format], SHORT).await?;
-        let nvidia = told.split_whitespace().any(|name| name == "nvidia") && Path::new(NVIDIA).exists();
+        let runtimes = docker.run(&["info", "--format", format], SHORT_TIMEOUT).await?;
+        let nvidia = runtimes.split_whitespace().any(|name| name == "nvidia") && Path::new(NVIDIA).exists();
         Ok(Self { nvidia, graphics: graphics() })
     }
 }

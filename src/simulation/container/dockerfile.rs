@@ -24,7 +24,7 @@ const NO_HERE_DOCUMENT: &str = "RUN, ADD and COPY can't have `<<`: the builder u
 /// network.
 const NO_URL: &str = "ADD may copy files of the project only, named without variables; RUN can fetch others";
 /// Longest excerpt of a line in an error, in characters.
-const SHOWN: usize = 100;
+const MAX_EXCERPT: usize = 100;
 
 impl Dockerfile {
     /// Reads the text of a Dockerfile.
@@ -96,7 +96,10 @@ impl Dockerfile {
 }
 
 fn wrong(number: usize, line: &str, why: &str) -> String {
-    format!("The Dockerfile of this project can't be used, line {number}, `{}`: {why}", excerpt(line.trim(), SHOWN))
+    format!(
+        "The Dockerfile of this project can't be used, line {number}, `{}`: {why}",
+        excerpt(line.trim(), MAX_EXCERPT)
+    )
 }
 
 /// Whether a comment changes the character by which lines are continued. Docker knows two.

@@ -1,26 +1,26 @@
 //! The images of simulations: pulled, and built once for all clients of the same project.
 
 use std::ffi::OsString;
-use std::fmt;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
+use actix_rt::task::spawn_blocking;
 use tokio::sync::{Semaphore, SemaphorePermit, watch};
 
-use super::blocking::blocking;
 use super::build_plan::{self, PROJECT_PATH};
 use super::compose_project::DEFAULT_MEMORY;
-use super::docker::{Docker, DockerError, SHORT};
+use super::docker::{Docker, DockerError, SHORT_TIMEOUT};
 use super::dockerfile::{Dockerfile, LABEL};
 use super::opened::{self, ImageConfig};
 use super::owned_resources::ResourceOwner;
 use super::start_error::{StartError, is_disk_full};
 use super::steps;
-use crate::simulation::checkout::{Project, SingleFlight};
+use crate::simulation::checkout::{OnProgress, Project, SingleFlight};
 use crate::simulation::config::SimulationConfig;
 
 /// The images of this server.
+#[derive(Debug)]
 pub struct Images {
     docker: Docker,
     owner: ResourceOwner,
@@ -52,20 +52,8 @@ pub struct ImageBuild {
 
 /// How a Dockerfile names the image of the world's version of Webots.
 const DEFAULT_BASE: [&str; 2] = ["$WEBOTS_DEFAULT_IMAGE", "${WEBOTS_DEFAULT_IMAGE}"];
-
-impl ImageBuild {
-    /// The arguments of the Dockerfile.
-    fn arguments(&self) -> Vec<String> {
-        let participant: &[&str] = match self.folder {
-            "" => &[],
-            _ => &["WEBOTS_CONTROLLER_URL=participant", "DEFAULT_CONTROLLER=participant"],
-        };
-        let (base, make) = (&self.base, u8::from(self.has_makefile));
-        let always =
-            [format!("WEBOTS_DEFAULT_IMAGE={base}"), format!("PROJECT_PATH={PROJECT_PATH}"), format!("MAKE={make}")];
-        always.into_iter().chain(participant.iter().map(|argument| (*argument).to_owned())).collect()
-    }
-}
+/// Arguments of the Dockerfile of a participant's controller.
+const PARTICIPANT: [&str; 2] = ["WEBOTS_CONTROLLER_URL=participant", "DEFAULT_CONTROLLER=participant"];
 
 impl Images {
     /// The images of this owner.
@@ -86,19 +74,15 @@ impl Images {
     ///
     /// # Errors
     /// Why it can't be pulled, as text for the client.
-    pub async fn pull(
-        self: &Arc<Self>,
-        image: &str,
-        progress: &(impl Fn(String) + Send + Sync),
-    ) -> Result<String, StartError> {
+    pub async fn pull(self: &Arc<Self>, image: &str, progress: OnProgress<'_>) -> Result<String, StartError> {
         if let Some(id) = self.id(image).await? {
             return Ok(id);
         }
         let (this, name) = (Arc::clone(self), image.to_owned());
-        let pull = move |news: watch::Sender<String>| async move {
-            let _permit = this.permit(&news).await?;
-            let told = |line: &str| drop(news.send(steps::pulling(&name, line)));
-            let pulled = this.docker.follow(["pull", &name].map(OsString::from).to_vec(), this.limit, told).await;
+        let pull = move |sender: watch::Sender<String>| async move {
+            let _permit = this.permit(&sender).await?;
+            let on_line = |line: &str| drop(sender.send(steps::pulling(&name, line)));
+            let pulled = this.docker.follow(["pull", &name].map(OsString::from).to_vec(), this.limit, on_line).await;
             pulled.map_err(|error| not_pulled(&name, error))
         };
         self.jobs.join(image.to_owned(), progress, pull).await?;
@@ -109,13 +93,17 @@ impl Images {
     ///
     /// # Errors
     /// Why it can't be built, as text for the client.
-    pub async fn build(
-        self: &Arc<Self>,
-        build: ImageBuild,
-        progress: &(impl Fn(String) + Send + Sync),
-    ) -> Result<String, StartError> {
+    pub async fn build(self: &Arc<Self>, build: ImageBuild, progress: OnProgress<'_>) -> Result<String, StartError> {
+        let mut arguments = vec![
+            format!("WEBOTS_DEFAULT_IMAGE={}", build.base),
+            format!("PROJECT_PATH={PROJECT_PATH}"),
+            format!("MAKE={}", u8::from(build.has_makefile)),
+        ];
+        if !build.folder.is_empty() {
+            arguments.extend(PARTICIPANT.map(str::to_owned));
+        }
         let mut parts = vec![build.project.identity(), build.folder.to_owned(), build.dockerfile.text.clone()];
-        parts.extend(build.arguments());
+        parts.extend_from_slice(&arguments);
         // An image's name stays the same when the image is updated, so its id is part of the key. A base that is not here
         // yet has none: the build fetches it.
         for base in &build.dockerfile.bases {
@@ -127,13 +115,19 @@ impl Images {
             });
         }
         let name = self.name(&parts);
-        let (this, made) = (Arc::clone(self), name.clone());
-        self.once(name, progress, move |news| async move { this.build_now(&made, build, news).await }).await
+        let (this, tag) = (Arc::clone(self), name.clone());
+        self.once(name, progress, move |sender| async move { this.build_now(&tag, build, arguments, sender).await })
+            .await
     }
 
-    async fn build_now(&self, name: &str, build: ImageBuild, news: watch::Sender<String>) -> Result<(), StartError> {
-        let _permit = self.permit(&news).await?;
-        let arguments = build.arguments();
+    async fn build_now(
+        &self,
+        name: &str,
+        build: ImageBuild,
+        arguments: Vec<String>,
+        sender: watch::Sender<String>,
+    ) -> Result<(), StartError> {
+        let _permit = self.permit(&sender).await?;
         let ImageBuild { project, dockerfile, folder, network, .. } = build;
         let (file, root) = (project.instance.path().join(format!("Dockerfile{folder}")), project.folder().to_owned());
         let written = file.clone();
@@ -142,41 +136,40 @@ impl Images {
             // A copy out of an image may have replaced it by a symlink to any path.
             Ok::<_, StartError>(build_plan::inside(&root, Path::new(folder))?)
         };
-        let context = blocking(prepare).await?;
+        let context = spawn_blocking(prepare).await??;
         let id_file = file.with_extension("id");
         let mut options: Vec<OsString> =
             vec!["--network".into(), network.into(), "--iidfile".into(), (&id_file).into()];
         options.extend(arguments.into_iter().flat_map(|argument| ["--build-arg".into(), argument.into()]));
         let mut step = String::new();
-        let told = |line: &str| {
+        let on_line = |line: &str| {
             if line.starts_with("Step ") {
                 line.clone_into(&mut step);
             }
             if let Some(text) = steps::building(line) {
-                news.send(text).ok();
+                sender.send(text).ok();
             }
         };
-        let done = self.run_build(options, file, context, told).await;
+        let done = self.run_build(options, file, context, on_line).await;
         done.map_err(|error| not_built(&step, error))?;
         // It has no name of its own: it is removed with the image on top.
-        let id = blocking(move || std::fs::read_to_string(id_file)).await?;
+        let id = tokio::fs::read_to_string(id_file).await?;
         self.open_now(&id, name, &project).await
     }
 
-    /// Runs `docker build` with these options. `told` receives each line that it prints.
+    /// Runs `docker build` with these options. `on_line` receives each line that it prints.
     async fn run_build(
         &self,
         options: Vec<OsString>,
         dockerfile: PathBuf,
         context: PathBuf,
-        told: impl FnMut(&str),
+        on_line: impl FnMut(&str),
     ) -> Result<(), DockerError> {
         let memory = format!("{}m", self.memory);
         let always = ["build", "--force-rm", "--memory", &memory, "--memory-swap", &memory, "--file"];
-        let files = [dockerfile.into(), context.into()];
-        let [file, context] = files;
-        let words = always.map(OsString::from).into_iter().chain([file]).chain(options).chain([context]);
-        self.docker.follow(words.collect(), self.limit, told).await
+        let words = always.map(OsString::from).into_iter().chain([dockerfile.into()]).chain(options);
+        let words = words.chain([context.into()]);
+        self.docker.follow(words.collect(), self.limit, on_line).await
     }
 
     /// Creates the image in which the server's user can read the home directory of the image's own user, unless it
@@ -188,20 +181,20 @@ impl Images {
         self: &Arc<Self>,
         id: String,
         project: &Arc<Project>,
-        progress: &(impl Fn(String) + Send + Sync),
+        progress: OnProgress<'_>,
     ) -> Result<String, StartError> {
         let name = self.name(std::slice::from_ref(&id));
-        let (this, made, project) = (Arc::clone(self), name.clone(), Arc::clone(project));
-        self.once(name, progress, move |_| async move { this.open_now(&id, &made, &project).await }).await
+        let (this, tag, project) = (Arc::clone(self), name.clone(), Arc::clone(project));
+        self.once(name, progress, move |_| async move { this.open_now(&id, &tag, &project).await }).await
     }
 
     async fn open_now(&self, id: &str, name: &str, project: &Project) -> Result<(), StartError> {
-        let json = self.docker.run(&["image", "inspect", "--format", "{{json .Config}}", id], SHORT).await?;
+        let json = self.docker.run(&["image", "inspect", "--format", "{{json .Config}}", id], SHORT_TIMEOUT).await?;
         let text = ImageConfig::read(&json)?.dockerfile(id, self.owner.name());
         let context = project.instance.path().join(format!("opened-{}", opened::key(&[name.to_owned()])));
         let (dockerfile, folder) = (context.with_extension("Dockerfile"), context.clone());
         let file = dockerfile.clone();
-        blocking(move || std::fs::write(file, text).and_then(|()| opened::write_programs(&folder))).await?;
+        spawn_blocking(move || std::fs::write(file, text).and_then(|()| opened::write_programs(&folder))).await??;
         let options = ["--network", "none", "--tag", name].map(Into::into).to_vec();
         let done = self.run_build(options, dockerfile, context, |_| ()).await;
         done.map_err(|error| match StartError::of_project(error) {
@@ -216,7 +209,7 @@ impl Images {
     async fn once<F: Future<Output = Result<(), StartError>> + Send + 'static>(
         self: &Arc<Self>,
         name: String,
-        progress: &(impl Fn(String) + Send + Sync),
+        progress: OnProgress<'_>,
         job: impl FnOnce(watch::Sender<String>) -> F,
     ) -> Result<String, StartError> {
         if self.id(&name).await?.is_some() {
@@ -225,11 +218,11 @@ impl Images {
         self.jobs.join(name.clone(), progress, job).await.map(|()| name)
     }
 
-    async fn permit(&self, news: &watch::Sender<String>) -> Result<SemaphorePermit<'_>, StartError> {
+    async fn permit(&self, sender: &watch::Sender<String>) -> Result<SemaphorePermit<'_>, StartError> {
         if let Ok(permit) = self.builds.try_acquire() {
             return Ok(permit);
         }
-        news.send("waiting for images of others to be built".to_owned()).ok();
+        sender.send("waiting for images of others to be built".to_owned()).ok();
         let busy = || format!("Images of others were being built for {} seconds (timing.build)", self.limit.as_secs());
         let permit = actix_rt::time::timeout(self.limit, self.builds.acquire()).await;
         permit.map_err(|_| StartError::Server(busy()))?.map_err(|error| StartError::Server(error.to_string()))
@@ -237,7 +230,7 @@ impl Images {
 
     /// The id of an image, which differs from those of later images of the same name; `None` if it does not exist.
     async fn id(&self, image: &str) -> Result<Option<String>, StartError> {
-        match self.docker.run(&["image", "inspect", "--format", "{{.Id}}", image], SHORT).await {
+        match self.docker.run(&["image", "inspect", "--format", "{{.Id}}", image], SHORT_TIMEOUT).await {
             Ok(id) => Ok(Some(id.trim().to_owned())),
             Err(DockerError::Failed { .. }) => Ok(None),
             Err(error) => Err(error.into()),
@@ -254,7 +247,7 @@ impl Images {
         let prune = ["image", "prune", "--force", "--filter", &mine, "--filter"];
         // The images of a build in progress are younger.
         for rest in [&["until=1h"][..], &[&old, "--all"]] {
-            self.docker.run(&[&prune, rest].concat(), SHORT).await?;
+            self.docker.run(&[&prune, rest].concat(), SHORT_TIMEOUT).await?;
         }
         Ok(())
     }
@@ -311,12 +304,6 @@ fn is_silent(message: &str) -> bool {
     let message = message.to_lowercase();
     let words = ["toomanyrequests: ", "i/o timeout", "handshake timeout", "timeout exceeded", "deadline exceeded"];
     words.iter().any(|words| message.contains(words))
-}
-
-impl fmt::Debug for Images {
-    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
-        out.write_str("Images")
-    }
 }
 
 #[cfg(test)]

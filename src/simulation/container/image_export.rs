@@ -4,15 +4,16 @@
 use std::path::Path;
 use std::time::Duration;
 
-use super::blocking::blocking;
-use super::docker::{Docker, DockerError, SHORT};
+use actix_rt::task::spawn_blocking;
+
+use super::docker::{Docker, DockerError, SHORT_TIMEOUT};
 use super::owned_resources::{self, PROJECT};
 use super::start_error::StartError;
-use crate::simulation::checkout::{Growing, Project, outgrown};
+use crate::simulation::checkout::{Project, outgrown};
 use crate::simulation::process::remove_tree;
 
 /// Timeout of the copy.
-const LIMIT: Duration = Duration::from_mins(2);
+const COPY_TIMEOUT: Duration = Duration::from_mins(2);
 
 /// Copies a directory of an image to `to`, which it creates or replaces, by a temporary directory of the project's
 /// instance. `name` is the compose project; `size` the limit, in MiB.
@@ -29,35 +30,33 @@ pub async fn export(
 ) -> Result<(), StartError> {
     let label = format!("{PROJECT}={name}");
     let create = ["create", "--label", &label, "--network", "none", image, "true"];
-    let container = docker.run(&create, SHORT).await.map_err(StartError::of_project)?;
+    let container = docker.run(&create, SHORT_TIMEOUT).await.map_err(StartError::of_project)?;
     let (container, through) = (container.trim(), project.instance.path().join("copied"));
     let source = format!("{container}:{}/.", from.display());
     let words = ["cp", &source, &through.to_string_lossy()].map(str::to_owned);
     tokio::select! {
-        copied = docker.run(&words, LIMIT) => drop(copied.map_err(|error| not_copied(error, from))?),
-        () = outgrown(vec![Growing::new(through.clone(), size << 20)]) => {
+        copied = docker.run(&words, COPY_TIMEOUT) => drop(copied.map_err(|error| not_copied(error, from))?),
+        () = outgrown(vec![(through.clone(), size << 20)]) => {
             return Err(format!("The project in its image is larger than {size} MiB (projectSize)").into());
         }
     }
     owned_resources::remove(docker, [container]).await?;
     let to = to.to_owned();
-    blocking(move || remove_tree(&to).and_then(|()| std::fs::rename(&through, &to))).await
+    Ok(spawn_blocking(move || remove_tree(&to).and_then(|()| std::fs::rename(&through, &to))).await??)
 }
 
 fn not_copied(error: DockerError, from: &Path) -> StartError {
+    let from = from.display();
     match error {
         DockerError::Failed { message, .. }
             if message.contains("ould not find") || message.contains("o such container:path") =>
         {
-            format!(
-                "The image of this project has no folder {}: its Dockerfile has to COPY the project there",
-                from.display()
-            )
-            .into()
+            format!("The image of this project has no folder {from}: its Dockerfile has to COPY the project there")
+                .into()
         }
         DockerError::Failed { message, .. } if message.contains("invalid symlink") => {
             let target = message.split_once(" -> ").map_or("elsewhere", |(_, target)| target);
-            let what = format!("{} in the image of this project has a link to {target}", from.display());
+            let what = format!("{from} in the image of this project has a link to {target}");
             format!("{what}, which leads out of it: `docker cp` refuses that").into()
         }
         error => StartError::of_project(error),

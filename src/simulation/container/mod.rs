@@ -1,6 +1,5 @@
 //! Simulations in Docker containers: what a project requests, its image, and a compose project for each simulation.
 
-mod blocking;
 mod build_plan;
 mod check;
 mod compose_project;

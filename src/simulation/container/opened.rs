@@ -5,13 +5,12 @@
 //! no program in a directory of this machine ever runs as root. Official images of Webots keep assets and settings in
 //! `/root`, which no other user may read. So a layer on top of an image opens it once.
 
-use std::collections::BTreeMap;
 use std::io;
 use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 
 use serde::Deserialize;
-use serde::de::IgnoredAny;
+use serde_json::Value;
 
 use super::dockerfile::{LABEL, NO_VOLUME};
 use super::owned_resources::digest;
@@ -28,7 +27,7 @@ pub struct ImageConfig {
     /// The command if none is given.
     cmd: Option<Vec<String>>,
     /// The directories of its volumes.
-    volumes: Option<BTreeMap<String, IgnoredAny>>,
+    volumes: Option<serde_json::Map<String, Value>>,
 }
 
 /// The first output of a container when it runs: from then on its network has an address.
@@ -74,7 +73,7 @@ impl ImageConfig {
 #[must_use]
 pub fn key(parts: &[String]) -> String {
     let parts: Vec<&str> = parts.iter().map(String::as_str).chain(PROGRAMS.map(|(_, program)| program)).collect();
-    format!("{:032x}", digest(parts.join("\0").as_bytes()))
+    digest(parts.join("\0").as_bytes())
 }
 
 /// Writes the programs into a directory.

@@ -8,7 +8,7 @@ use parking_lot::Mutex;
 use tokio::sync::Notify;
 
 use super::check::data_folder;
-use super::docker::{Docker, DockerError, SHORT};
+use super::docker::{Docker, DockerError, SHORT_TIMEOUT};
 use super::image::Images;
 use super::owned_resources::{self, LIST, ResourceOwner};
 use crate::simulation::config::SimulationConfig;
@@ -27,14 +27,14 @@ pub struct ProjectGuard {
 }
 
 /// Longest time between two sweeps for orphans; a released project triggers one sooner.
-const PERIOD: Duration = Duration::from_mins(1);
+const SWEEP_INTERVAL: Duration = Duration::from_mins(1);
 /// Delay before each sweep, and between retries.
-const AGAIN: Duration = Duration::from_secs(2);
+const RETRY_INTERVAL: Duration = Duration::from_secs(2);
 /// Interval between image prunings.
-const PRUNE: Duration = Duration::from_mins(30);
+const PRUNE_INTERVAL: Duration = Duration::from_mins(30);
 /// How old an image is at least that is removed because the disk is full, in hours: one that was just built has no container
 /// yet.
-const YOUNGEST: u64 = 1;
+const MIN_AGE: u64 = 1;
 
 impl ActiveProjects {
     /// Marks a name as in use.
@@ -66,20 +66,20 @@ pub async fn run_cleanup(
     loop {
         actix_rt::time::timeout(pause, active.0.1.notified()).await.ok();
         // Most is removed by then without a sweep.
-        actix_rt::time::sleep(AGAIN).await;
+        actix_rt::time::sleep(RETRY_INTERVAL).await;
         pause = match remove_orphans(&docker, &owner, &active).await {
-            Ok(false) => PERIOD,
+            Ok(false) => SWEEP_INTERVAL,
             // Containers that Docker was removing when it was stopped appear one by one.
-            Ok(true) => AGAIN,
+            Ok(true) => RETRY_INTERVAL,
             Err(error) => {
                 log::debug!("containers that nobody uses are not removed yet: {error}");
-                AGAIN
+                RETRY_INTERVAL
             }
         };
         let reserve = config.disk_reserve;
         let is_full = actix_rt::task::spawn_blocking(move || is_disk_full(reserve)).await.unwrap_or_default();
-        if is_full || pruned.is_none_or(|at| at.elapsed() > PRUNE) {
-            let hours = if is_full { YOUNGEST } else { 24 * config.container.images_age };
+        if is_full || pruned.is_none_or(|at| at.elapsed() > PRUNE_INTERVAL) {
+            let hours = if is_full { MIN_AGE } else { 24 * config.container.images_age };
             if let Err(error) = images.prune(hours).await {
                 log::warn!("images that nobody needs are not removed: {error}");
             }
@@ -96,7 +96,7 @@ fn is_disk_full(reserve: u64) -> bool {
 
 /// Removes what is left. Returns whether there was something.
 async fn remove_orphans(docker: &Docker, owner: &ResourceOwner, active: &ActiveProjects) -> Result<bool, DockerError> {
-    let list = docker.run(&LIST, SHORT).await?;
+    let list = docker.run(&LIST, SHORT_TIMEOUT).await?;
     let mut left: Vec<(&str, &str)> = owner.containers(&list).collect();
     left.retain(|(_, project)| !active.0.0.lock().contains(*project));
     if left.is_empty() {
@@ -104,6 +104,8 @@ async fn remove_orphans(docker: &Docker, owner: &ResourceOwner, active: &ActiveP
     }
     owned_resources::remove(docker, left.iter().map(|(id, _)| *id)).await?;
     let projects: BTreeSet<&str> = left.into_iter().map(|(_, project)| project).collect();
-    projects.iter().for_each(|project| log::info!("{project} was left: removed"));
+    for project in projects {
+        log::info!("{project} was left: removed");
+    }
     Ok(true)
 }

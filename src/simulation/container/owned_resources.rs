@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use sha2::{Digest, Sha256};
 
-use super::docker::{self, Docker, DockerError, SHORT};
+use super::docker::{self, Docker, DockerError, SHORT_TIMEOUT};
 
 /// The label with which compose marks its projects.
 pub const PROJECT: &str = "com.docker.compose.project";
@@ -29,7 +29,7 @@ pub const LIST: [&str; 7] = [
 pub struct ResourceOwner(String);
 
 /// How long each command of a sweep may take.
-const SWEEP: Duration = Duration::from_secs(20);
+const SWEEP_TIMEOUT: Duration = Duration::from_secs(20);
 /// How containers are removed, whatever they do.
 const REMOVE: [&str; 3] = ["rm", "--force", "--volumes"];
 
@@ -38,7 +38,9 @@ impl ResourceOwner {
     #[must_use]
     pub fn of(cache: &Path) -> Self {
         let cache = cache.canonicalize().unwrap_or_else(|_| cache.to_owned());
-        Self(format!("{:012x}", digest(cache.as_os_str().as_encoded_bytes()) >> 80))
+        let mut name = digest(cache.as_os_str().as_encoded_bytes());
+        name.truncate(12);
+        Self(name)
     }
 
     /// One run of this server: resources of the next run have another owner.
@@ -82,10 +84,11 @@ impl ResourceOwner {
     }
 }
 
-/// The first 128 bits of the SHA-256 of a text.
+/// The SHA-256 of a text, in hexadecimal digits.
 #[must_use]
-pub fn digest(text: &[u8]) -> u128 {
-    Sha256::digest(text).iter().take(16).fold(0, |number: u128, byte| (number << 8) | u128::from(*byte))
+pub fn digest(text: &[u8]) -> String {
+    let digest = Sha256::digest(text);
+    digest.iter().fold(String::new(), |text, byte| format!("{text}{byte:02x}"))
 }
 
 /// Removes containers.
@@ -94,7 +97,7 @@ pub fn digest(text: &[u8]) -> u128 {
 /// When Docker fails; then some may remain.
 pub async fn remove(docker: &Docker, containers: impl IntoIterator<Item = &str>) -> Result<(), DockerError> {
     let words: Vec<&str> = REMOVE.into_iter().chain(containers).collect();
-    match docker.run(&words, SHORT).await {
+    match docker.run(&words, SHORT_TIMEOUT).await {
         // Another process may remove it.
         Err(DockerError::Failed { message, .. })
             if message.contains("o such container") || message.contains("already in progress") =>
@@ -107,11 +110,11 @@ pub async fn remove(docker: &Docker, containers: impl IntoIterator<Item = &str>)
 
 /// Removes the containers of a server: for a process that watches over the server's end. Blocks.
 pub fn sweep(owner: &ResourceOwner) {
-    let list = docker::blocking(&LIST, SWEEP).unwrap_or_default();
+    let list = docker::blocking(&LIST, SWEEP_TIMEOUT).unwrap_or_default();
     let found: Vec<&str> = owner.containers(&list).map(|(id, _)| id).collect();
     if !found.is_empty() {
         // What is left is removed by the next start.
-        docker::blocking(&[&REMOVE, found.as_slice()].concat(), SWEEP).ok();
+        docker::blocking(&[&REMOVE, found.as_slice()].concat(), SWEEP_TIMEOUT).ok();
     }
 }
 

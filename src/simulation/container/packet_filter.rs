@@ -13,7 +13,7 @@ const STREAMS: &str = "webots_streams";
 /// Asks for the unit that loads it.
 const UNIT: &[&str] = &["systemctl", "is-active", "--quiet", "webots-fleet-packet-filter.service"];
 /// Timeout of the `nft` or `systemctl` call.
-const PATIENCE: Duration = Duration::from_secs(5);
+const TIMEOUT: Duration = Duration::from_secs(5);
 
 /// Returns `None` if the packet filter is loaded, else the consequence and how to load it, in one line. Only root may
 /// list it; for other users systemd reports whether its unit has run.
@@ -44,7 +44,7 @@ fn list(table: &str) -> Result<(), String> {
 
 /// Whether a program exits with code 0, or why not.
 fn succeeds(command: &[&str]) -> Result<(), String> {
-    let why = match Run::new(command, Path::new("/"), PATIENCE).blocking(drop) {
+    let why = match Run::new(command, Path::new("/"), TIMEOUT).blocking(drop) {
         Ok(Ran { ending: ExitReason::Code(0), .. }) => return Ok(()),
         Ok(_) => "says no".to_owned(),
         Err(error) => error.to_string(),

@@ -1,6 +1,6 @@
 //! The paths of the parts of a project.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use super::build_plan;
 use super::webots_yml::{ProjectKind, WebotsYml};
@@ -12,18 +12,14 @@ use crate::simulation::checkout::Project;
 /// # Errors
 /// When it does not exist, as text for the client.
 pub fn world_in(project: &Project) -> Result<String, String> {
-    let outside = || "The world is behind a link that leads out of its project, which containers don't have".to_owned();
+    let name = project.world.path.file_name().unwrap_or_default().to_string_lossy();
     let root = project.folder().canonicalize().map_err(|error| error.to_string())?;
-    let name = project.world.path.file_name().unwrap_or_default();
-    let path = root.join("worlds").join(name);
-    let path = path
-        .canonicalize()
-        .map_err(|_| format!("The image of this project has no worlds/{}", name.to_string_lossy()))?;
-    if !path.is_file() {
-        return Err(format!("worlds/{} of this project is no file in its image", name.to_string_lossy()));
-    }
-    let inside = path.strip_prefix(&root).map_err(|_| outside())?;
-    inside.to_str().map(str::to_owned).ok_or_else(|| "The world's name is no text".to_owned())
+    let path = root.join("worlds").join(&*name).canonicalize().ok().filter(|path| path.is_file());
+    let path = path.ok_or_else(|| format!("The image of this project has no worlds/{name}"))?;
+    let inside = path.strip_prefix(&root).ok().and_then(Path::to_str).map(str::to_owned);
+    inside.ok_or_else(|| {
+        "The world is behind a link that leads out of its project, which containers don't have".to_owned()
+    })
 }
 
 /// The directory of a competition's participant. It is not in the project, where a world's program could replace it by

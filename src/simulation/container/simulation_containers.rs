@@ -6,7 +6,7 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 use tokio::sync::Notify;
 use tokio_util::task::AbortOnDropHandle;
 
-use super::docker::{Docker, DockerError, SHORT};
+use super::docker::{Docker, DockerError, SHORT_TIMEOUT};
 use super::orphan_cleanup::ProjectGuard;
 use super::owned_resources;
 use super::start_error::{StartError, blame};
@@ -16,18 +16,20 @@ use crate::simulation::process::SpawnSpec;
 /// The containers of one simulation.
 #[derive(Debug)]
 pub struct SimulationContainers {
-    docker: Docker,
-    guard: ProjectGuard,
+    /// Runs Docker.
+    pub(super) docker: Docker,
+    /// The name of its compose project.
+    pub(super) guard: ProjectGuard,
     /// The container of each service.
-    containers: Vec<(String, String)>,
+    pub(super) containers: Vec<(String, String)>,
     /// Whether the project has defined one of their images, which may be why Docker can't start one.
-    is_projects: bool,
+    pub(super) is_projects: bool,
     /// Texts for its client, unchanged.
     pub texts: Vec<String>,
     /// Warnings for its client.
     pub warnings: Vec<String>,
     /// Restarts the participant's controller; `None` if there is none.
-    restart: Option<(Arc<Notify>, AbortOnDropHandle<()>)>,
+    pub(super) restart: Option<(Arc<Notify>, AbortOnDropHandle<()>)>,
 }
 
 /// The cause of a container's end.
@@ -48,7 +50,7 @@ const ENDED_BY_SIGNAL: [i32; 2] = [128 + 15, 128 + 9];
 /// end of the range.
 const EVENTS: (Duration, Duration) = (Duration::from_mins(1), Duration::from_millis(100));
 /// Shortest time between two restarts of a participant's controller.
-const BETWEEN_RESTARTS: Duration = Duration::from_secs(1);
+const RESTART_INTERVAL: Duration = Duration::from_secs(1);
 /// The service of a participant's controller.
 const CONTROLLER: &str = "controller";
 
@@ -61,20 +63,6 @@ impl Cause {
 }
 
 impl SimulationContainers {
-    /// The containers of a compose project that was created: pairs of service and container. `is_projects` tells
-    /// whether the project has defined one of their images.
-    #[must_use]
-    pub fn new(
-        docker: Docker,
-        guard: ProjectGuard,
-        containers: Vec<(String, String)>,
-        is_projects: bool,
-        texts: Vec<String>,
-        warnings: Vec<String>,
-    ) -> Self {
-        Self { docker, guard, containers, is_projects, texts, warnings, restart: None }
-    }
-
     fn of(&self, service: &str) -> Option<&str> {
         self.containers.iter().find(|(name, _)| name == service).map(|(_, container)| container.as_str())
     }
@@ -96,12 +84,12 @@ impl SimulationContainers {
             self.containers.iter().filter(|(service, _)| service != WEBOTS).map(|(_, container)| container.as_str());
         let words: Vec<&str> = std::iter::once("start").chain(others).collect();
         if words.len() > 1 {
-            self.docker.run(&words, SHORT).await.map_err(|error| blame(self.is_projects, error))?;
+            self.docker.run(&words, SHORT_TIMEOUT).await.map_err(|error| blame(self.is_projects, error))?;
         }
         if let Some(controller) = self.of(CONTROLLER) {
-            let asked = Arc::new(Notify::new());
-            let restarts = restart_when_asked(self.docker.clone(), controller.to_owned(), Arc::clone(&asked));
-            self.restart = Some((asked, AbortOnDropHandle::new(actix_rt::spawn(restarts))));
+            let request = Arc::new(Notify::new());
+            let restarts = restart_on_request(self.docker.clone(), controller.to_owned(), Arc::clone(&request));
+            self.restart = Some((request, AbortOnDropHandle::new(actix_rt::spawn(restarts))));
         }
         Ok(())
     }
@@ -109,7 +97,7 @@ impl SimulationContainers {
     /// Restarts the participant's controller on notification, as the original does when Webots was reset.
     #[must_use]
     pub fn restart(&self) -> Option<Arc<Notify>> {
-        self.restart.as_ref().map(|(asked, _)| Arc::clone(asked))
+        self.restart.as_ref().map(|(request, _)| Arc::clone(request))
     }
 
     /// The ids of its containers, which the kernel knows them by; none where Docker fails.
@@ -119,7 +107,7 @@ impl SimulationContainers {
         let words: Vec<String> =
             ["inspect", "--format", "{{.Id}}"].map(str::to_owned).into_iter().chain(names).collect();
         async move {
-            let ids = docker.run(&words, SHORT).await.unwrap_or_default();
+            let ids = docker.run(&words, SHORT_TIMEOUT).await.unwrap_or_default();
             ids.lines().map(|id| id.trim().to_owned()).collect()
         }
     }
@@ -128,7 +116,7 @@ impl SimulationContainers {
     pub async fn cause(&self, code: Option<i32>) -> Option<Cause> {
         let (webots, code) = (self.of(WEBOTS)?, code?);
         let format = "{{.State.OOMKilled}} {{.State.Status}} {{.State.ExitCode}}";
-        let state = match self.docker.run(&["inspect", "--format", format, webots], SHORT).await {
+        let state = match self.docker.run(&["inspect", "--format", format, webots], SHORT_TIMEOUT).await {
             Ok(state) => state,
             Err(DockerError::Failed { .. }) => return None,
             Err(_) => return Some(Cause::Docker),
@@ -151,7 +139,7 @@ impl SimulationContainers {
             .map(|time| format!("{}.{:09}", time.as_secs(), time.subsec_nanos()));
         let container = format!("container={container}");
         let words = ["events", "--since", &since, "--until", &until, "--filter", &container, "--format", "{{.Action}}"];
-        let seen = self.docker.run(&words, SHORT).await;
+        let seen = self.docker.run(&words, SHORT_TIMEOUT).await;
         seen.map_or(true, |seen| !seen.lines().any(|line| line == "die") || seen.lines().any(|line| line == "kill"))
     }
 
@@ -165,12 +153,12 @@ impl SimulationContainers {
 }
 
 /// Restarts a container on each notification, one restart at a time.
-async fn restart_when_asked(docker: Docker, container: String, asked: Arc<Notify>) {
+async fn restart_on_request(docker: Docker, container: String, request: Arc<Notify>) {
     loop {
-        asked.notified().await;
-        if let Err(error) = docker.run(&["restart", "--time", "0", &container], SHORT).await {
+        request.notified().await;
+        if let Err(error) = docker.run(&["restart", "--time", "0", &container], SHORT_TIMEOUT).await {
             log::warn!("a participant's controller is not started anew: {error}");
         }
-        actix_rt::time::sleep(BETWEEN_RESTARTS).await;
+        actix_rt::time::sleep(RESTART_INTERVAL).await;
     }
 }

@@ -56,6 +56,12 @@ impl From<std::io::Error> for StartError {
     }
 }
 
+impl From<tokio::task::JoinError> for StartError {
+    fn from(error: tokio::task::JoinError) -> Self {
+        Self::Server(error.to_string())
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -11,8 +11,8 @@ pub const CREATING: &str = "Creating network and containers";
 
 /// The step of a pull, with Docker's output line.
 #[must_use]
-pub fn pulling(image: &str, said: &str) -> String {
-    format!("Step 1/9 : fetching {image}: {said}")
+pub fn pulling(image: &str, line: &str) -> String {
+    format!("Step 1/9 : fetching {image}: {line}")
 }
 
 /// Lines of a build that are not shown.
@@ -27,18 +27,18 @@ const NOISE: [&str; 6] = [
 
 /// The step of a build, from Docker's output line; `None` if it is not shown. The page supports nine steps.
 #[must_use]
-pub fn building(said: &str) -> Option<String> {
-    if NOISE.iter().any(|beginning| said.starts_with(beginning)) {
+pub fn building(line: &str) -> Option<String> {
+    if NOISE.iter().any(|beginning| line.starts_with(beginning)) {
         return None;
     }
     let scaled = || {
-        let (numbers, instruction) = said.strip_prefix("Step ")?.split_once(" : ")?;
+        let (numbers, instruction) = line.strip_prefix("Step ")?.split_once(" : ")?;
         let (step, of) = numbers.split_once('/')?;
         let (step, of): (u64, u64) = (step.parse().ok()?, of.parse().ok()?);
         let step = if of > STEPS { (step.saturating_mul(STEPS) / of).max(1) } else { step };
         Some(format!("Step {step}/{} : {instruction}", of.min(STEPS)))
     };
-    Some(scaled().unwrap_or_else(|| said.to_owned()))
+    Some(scaled().unwrap_or_else(|| line.to_owned()))
 }
 
 #[cfg(test)]

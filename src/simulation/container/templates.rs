@@ -124,15 +124,9 @@ impl Templates {
 /// What a template of the original has that can't work here, by the beginning of its line, and what to write there.
 const UNSUITABLE: [(&str, &str); 5] = [
     ("networks:", "all services are in the network of container.network: leave it out"),
-    (
-        "volumes:",
-        "a volume belongs to root, and programs run as the server's user: mount ${PROJECT} or ${THEIA_FOLDER} instead",
-    ),
-    (
-        "build:",
-        "images are built before, once for all who want the same: write `image: ${IMAGE}`, or ${CONTROLLER_IMAGE}",
-    ),
     ("network_mode:", "all services are in the network of container.network: leave it out"),
+    ("volumes:", "programs can't write into a volume of Docker: mount ${PROJECT} or ${THEIA_FOLDER} instead"),
+    ("build:", "images are built before: write `image: ${IMAGE}`, or ${CONTROLLER_IMAGE}"),
     ("reservations:", "container.gpu gives graphics cards where there are some: leave it out"),
 ];
 
@@ -140,10 +134,9 @@ const UNSUITABLE: [(&str, &str); 5] = [
 fn unsuitable(text: &str) -> Option<String> {
     text.lines().enumerate().find_map(|(index, line)| {
         // Services have an indented key of the same name for their mounts.
-        let (_, advice) = UNSUITABLE.iter().find(|(key, _)| match *key {
-            "volumes:" | "networks:" => line.starts_with(key),
-            key => line.trim_start().starts_with(key),
-        })?;
+        let is_indented = |key: &str| !["volumes:", "networks:"].contains(&key);
+        let is_key = |key: &str| line.starts_with(key) || is_indented(key) && line.trim_start().starts_with(key);
+        let (_, advice) = UNSUITABLE.iter().find(|(key, _)| is_key(key))?;
         Some(format!("line {}, `{}`: {advice}", index + 1, line.trim()))
     })
 }

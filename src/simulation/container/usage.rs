@@ -8,19 +8,19 @@ use super::owned_resources::{LIST, ResourceOwner};
 use crate::simulation::machine::{Measured, Usage};
 
 /// Timeout of each command.
-const LIMIT: Duration = Duration::from_secs(20);
+const TIMEOUT: Duration = Duration::from_secs(20);
 
 /// Measures the simulations of an owner: those on these ports, whose processes are named for each. Blocks for two
 /// seconds, which `docker stats` takes.
 #[must_use]
 pub fn measure(owner: &ResourceOwner, roots: &BTreeMap<u16, i32>) -> Vec<(i32, Measured)> {
-    let list = blocking(&LIST, LIMIT).unwrap_or_default();
+    let list = blocking(&LIST, TIMEOUT).unwrap_or_default();
     let root = |project: &str| roots.get(&owner.port_of(project)?).copied();
     let containers: BTreeMap<&str, i32> =
         owner.containers(&list).filter_map(|(id, project)| Some((id, root(project)?))).collect();
     let format = "{{.ID}}\t{{.CPUPerc}}\t{{.MemUsage}}\t{{.PIDs}}";
     let words = ["stats", "--no-stream", "--no-trunc", "--format", format];
-    let printed = blocking(&words.into_iter().chain(containers.keys().copied()).collect::<Vec<_>>(), LIMIT);
+    let printed = blocking(&words.into_iter().chain(containers.keys().copied()).collect::<Vec<_>>(), TIMEOUT);
     let mut all = BTreeMap::<i32, Usage>::new();
     for (id, one) in printed.unwrap_or_default().lines().filter_map(usage_of) {
         let Some(root) = containers.get(id) else { continue };

@@ -17,9 +17,9 @@ use crate::shared::text::excerpt;
 /// The names of the file; the first one that exists counts.
 const NAMES: [&str; 2] = ["webots.yml", "webots.yaml"];
 /// Size limit of the line of the type, and of a directory, in bytes.
-const LENGTH: usize = 200;
+const MAX_LENGTH: usize = 200;
 /// Longest excerpt of a value in a warning, in characters.
-const SHOWN: usize = 60;
+const MAX_EXCERPT: usize = 60;
 /// The first component of each directory, which means the project.
 const PROJECT: &str = "webots-project";
 /// The parent of projects in a container. Some files contain it, as a path that goes up to the root first.
@@ -75,7 +75,7 @@ impl WebotsYml {
         }
         let line = text.lines().map(str::trim).find(|line| line.starts_with("type:")).unwrap_or_default();
         let line: String = line.chars().filter(|letter| *letter != ' ' && !letter.is_control()).collect();
-        found.project_type = (1..=LENGTH).contains(&line.len()).then(|| line + "\n");
+        found.project_type = (1..=MAX_LENGTH).contains(&line.len()).then(|| line + "\n");
         found
     }
 
@@ -105,7 +105,7 @@ fn request(value: &str) -> Option<(ProjectKind, String)> {
     let from_root = folder.trim_start_matches("../").trim_start_matches('/').strip_prefix(ABOVE_PROJECT);
     let folder = from_root.unwrap_or(folder);
     let is_plain = |letter: char| letter.is_alphanumeric() || " _-+./".contains(letter);
-    let is_allowed = folder.len() <= LENGTH
+    let is_allowed = folder.len() <= MAX_LENGTH
         && folder.chars().all(is_plain)
         && folder.split('/').next() == Some(PROJECT)
         && !folder.split('/').any(|part| part == ".." || part == ".");
@@ -116,7 +116,7 @@ fn warning(value: &str) -> String {
     format!(
         "dockerCompose in webots.yml is \"{}\": it may be theia:{PROJECT}/FOLDER for an editor or competition:{PROJECT}/FOLDER \
          for a competition, where FOLDER has letters, digits, spaces and _-+./ only, and no parts . and ..",
-        excerpt(value.trim(), SHOWN)
+        excerpt(value.trim(), MAX_EXCERPT)
     )
 }
 
@@ -178,7 +178,7 @@ mod tests {
 
     #[test]
     fn what_nobody_may_ask_for_is_warned_of() {
-        let long = format!("theia:webots-project/{}", "x".repeat(LENGTH));
+        let long = format!("theia:webots-project/{}", "x".repeat(MAX_LENGTH));
         for value in [
             "postgres:webots-project/x",
             "theia",
@@ -215,7 +215,7 @@ mod tests {
         ] {
             assert_eq!(WebotsYml::parse(text).project_type.as_deref(), message, "{text:?}");
         }
-        let long = WebotsYml::parse(&format!("type: {}", "x".repeat(LENGTH)));
+        let long = WebotsYml::parse(&format!("type: {}", "x".repeat(MAX_LENGTH)));
         assert_eq!(long.project_type, None);
     }
 

@@ -67,13 +67,12 @@ impl LaunchSpec {
 
     /// The request for its containers.
     pub fn request(&self) -> ContainerRequest {
-        let (config, mode, port) = (Arc::clone(&self.config), self.mode, self.slot.port);
-        let command = move |world: &str| {
-            let (program, world) = (Path::new(&config.container.program), Path::new(world));
-            let command = webots_command(program, mode, port, config.timing.heartbeat, world);
-            command.into_iter().map(|word| word.to_string_lossy().into_owned()).collect()
-        };
-        ContainerRequest { project: Arc::clone(&self.project), port, gpu: self.gpu.clone(), command: Box::new(command) }
+        let (program, heartbeat) = (Path::new(&self.config.container.program), self.config.timing.heartbeat);
+        let mut command = webots_command(program, self.mode, self.slot.port, heartbeat, Path::new(""));
+        // The path of the world in its container is known once its image is.
+        command.pop();
+        let command = command.into_iter().map(|word| word.to_string_lossy().into_owned()).collect();
+        ContainerRequest { project: Arc::clone(&self.project), port: self.slot.port, gpu: self.gpu.clone(), command }
     }
 
     /// The display of the machine on which it opens its window.
