@@ -8,6 +8,7 @@ use std::io;
 use std::pin::Pin;
 use std::task::{Context, Poll, ready};
 
+use actix_http::Extensions;
 use actix_web::rt::net::TcpStream;
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 use tokio_util::sync::{CancellationToken, WaitForCancellationFutureOwned};
@@ -74,9 +75,9 @@ impl ClientStream {
         }
     }
 
-    /// Where this connection goes when it is upgraded.
-    pub fn upgrade_slot(&self) -> UpgradeSlot {
-        self.upgrade.clone()
+    /// Called by actix for each new connection, so that its requests find its slot.
+    pub fn on_connect(&self, data: &mut Extensions) {
+        data.insert(self.upgrade.clone());
     }
 
     fn tcp(&mut self) -> io::Result<Pin<&mut TcpStream>> {
