@@ -82,8 +82,8 @@ prepare() { # NAME
     [[ -n ${FLEET_BIN-} ]] || build "$1"
     for server in $(servers "$1"); do
         remarks=$("$BIN/${server%/*}-server" --check "config/$server.json" 2>&1 >/dev/null) || fail 2 "${remarks#error: }"
-        # The demo simulator needs no display.
-        [[ $(setting "$server" webots) != */demo-simulator ]] || remarks=$(grep -v '^warning: display: ' <<<"$remarks")
+        # The demo simulator needs no display, and listens on the loopback only.
+        [[ $(setting "$server" webots) != */demo-simulator ]] || remarks=$(grep -vE '^warning: (display|streams): ' <<<"$remarks")
         grep '^warning: ' <<<"$remarks" >&2 || true
         # What worlds may do here, which depends on the packages of the machine.
         grep -E '^(isolation|network): ' <<<"$remarks" || true

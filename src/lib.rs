@@ -25,7 +25,7 @@
 //! | [`simulation::client`] | one web client, the session of its simulation |
 //! | [`simulation::slots`] | the slots that clients wait for: leases, the queue, shares |
 //! | [`simulation::sessions`] | how a connection is attached to its session, and how a client resumes it |
-//! | [`simulation::streams`] | the streams of running simulations: which token leads to which, who watches |
+//! | [`simulation::streams`] | the streams of running simulations, and the tokens that lead to them |
 //! | `simulation::relay` | a stream between a client and the port of its Webots |
 //! | `simulation::web` | routes, pages, `/status` and Prometheus metrics of the simulation server |
 //!

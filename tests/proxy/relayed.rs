@@ -1,5 +1,7 @@
 //! Streams through the simulation servers, behind each web server with our rules: one port of each machine is enough.
 
+use nix::sys::signal::Signal;
+
 use super::fleet::Fleet;
 use super::rules::Rules;
 use crate::support::until;
@@ -38,6 +40,17 @@ async fn relayed(rules: Rules) {
         until("the request is logged", async || fleet.web.access_log().contains(&known)).await;
         assert!(!fleet.web.access_log().contains(&token), "{}", fleet.web.access_log());
     }
+    // Nor where the server does not answer.
+    let port = fleet.here.port;
+    fleet.here.signal(Signal::SIGTERM);
+    let is_gone = async || [502, 503].contains(&browser.get(&format!("/{port}/status")).await.status.as_u16());
+    until("the server has ended", is_gone).await;
+    let answer = browser.get(&format!("/{port}/stream/0123456789abcdef/a.png")).await;
+    assert!([502, 503].contains(&answer.status.as_u16()), "{answer:?}");
+    if rules == Rules::Nginx {
+        until("the error is logged", async || fleet.web.log().contains(&format!("GET /{port}/status"))).await;
+    }
+    assert!(!fleet.web.log().contains("0123456789abcdef"), "{}", fleet.web.log());
 }
 
 #[actix_rt::test]

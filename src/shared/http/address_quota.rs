@@ -6,7 +6,7 @@ use std::num::NonZeroU32;
 use governor::{DefaultKeyedRateLimiter, Quota, RateLimiter};
 
 /// Largest number of addresses that are tracked.
-const MOST_ADDRESSES: usize = 10_000;
+const MAX_ADDRESSES: usize = 10_000;
 
 /// Default limit for one address, of `all` slots, connections and the like: three quarters. A class often sits behind
 /// one address, and so may a client that would take everything.
@@ -30,11 +30,11 @@ impl AddressQuota {
         let Some(address) = address else {
             return true;
         };
-        if self.0.len() >= MOST_ADDRESSES {
+        if self.0.len() >= MAX_ADDRESSES {
             // Drops the addresses whose whole quota is available again.
             self.0.retain_recent();
         }
-        self.0.len() >= MOST_ADDRESSES || self.0.check_key(&address).is_ok()
+        self.0.len() >= MAX_ADDRESSES || self.0.check_key(&address).is_ok()
     }
 }
 
@@ -66,7 +66,7 @@ mod tests {
         for number in 0..12_000 {
             assert!(quota.take(Some(address(number))));
         }
-        assert!(quota.0.len() <= MOST_ADDRESSES);
+        assert!(quota.0.len() <= MAX_ADDRESSES);
     }
 
     #[test]

@@ -7,10 +7,10 @@ use actix_web::web::Payload;
 use actix_web::{HttpRequest, HttpResponse};
 use serde::de::DeserializeOwned;
 
-use super::client_stream::LARGEST_BODY;
+use super::client_stream::MAX_BODY;
 
-/// How long a body may take.
-const PATIENCE: Duration = Duration::from_secs(5);
+/// Timeout of a body.
+const BODY_TIMEOUT: Duration = Duration::from_secs(5);
 
 /// Refuses a request with a body where none is read.
 pub fn refuse(request: &HttpRequest) -> Option<HttpResponse> {
@@ -20,7 +20,7 @@ pub fn refuse(request: &HttpRequest) -> Option<HttpResponse> {
     has_body.then(|| HttpResponse::BadRequest().body("Error: a request for this has no body."))
 }
 
-/// Reads the JSON of a body; an empty one is the default. `form` tells how it has to be.
+/// Reads the JSON of a body; an empty one is the default. `form` is the expected form, for the error message.
 ///
 /// # Errors
 /// The answer to a request whose body can't be read.
@@ -33,12 +33,12 @@ pub async fn json<T: DeserializeOwned + Default>(
         return Err(HttpResponse::LengthRequired().body("Error: a body needs Content-Length."));
     }
     let length = request.headers().get(header::CONTENT_LENGTH).and_then(|length| length.to_str().ok());
-    if length.and_then(|length| length.parse().ok()).is_some_and(|length: usize| length > LARGEST_BODY) {
-        let words = format!("Error: the body is larger than {LARGEST_BODY} bytes.");
+    if length.and_then(|length| length.parse().ok()).is_some_and(|length: usize| length > MAX_BODY) {
+        let words = format!("Error: the body is larger than {MAX_BODY} bytes.");
         return Err(HttpResponse::PayloadTooLarge().force_close().body(words));
     }
     let wrong = || HttpResponse::BadRequest().body(format!("Error: the body is not {form}."));
-    let read = actix_web::rt::time::timeout(PATIENCE, payload.to_bytes_limited(LARGEST_BODY)).await;
+    let read = actix_web::rt::time::timeout(BODY_TIMEOUT, payload.to_bytes_limited(MAX_BODY)).await;
     match read {
         Ok(Ok(Ok(body))) if body.is_empty() => Ok(T::default()),
         Ok(Ok(Ok(body))) => serde_json::from_slice(&body).map_err(|_| wrong()),

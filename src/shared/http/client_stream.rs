@@ -8,6 +8,7 @@ use std::io;
 use std::pin::Pin;
 use std::task::{Context, Poll, ready};
 
+use actix_http::Extensions;
 use actix_web::rt::net::TcpStream;
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 use tokio_util::sync::{CancellationToken, WaitForCancellationFutureOwned};
@@ -19,10 +20,10 @@ use super::upgrade::{UpgradeSlot, Upgraded};
 const READ_AT_ONCE: usize = 4 * 1024;
 /// Begin of the answer that upgrades a connection to a WebSocket.
 const SWITCHING_PROTOCOLS: &[u8] = b"HTTP/1.1 101 ";
-/// How many bytes of a line are looked at, which is enough for the length of a body.
-const LINE: usize = 40;
-/// The largest body that is handed over, in bytes. What has a larger one, or one in chunks, gets its answer without it.
-pub const LARGEST_BODY: usize = 8 * 1024;
+/// Number of bytes that are kept of a line, enough for the header Content-Length.
+const MAX_LINE: usize = 40;
+/// Size limit of a body, in bytes. A request with a larger one, or one in chunks, is answered without it.
+pub const MAX_BODY: usize = 8 * 1024;
 
 /// What the connection is currently used for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -74,9 +75,9 @@ impl ClientStream {
         }
     }
 
-    /// Where this connection goes when it is upgraded.
-    pub fn upgrade_slot(&self) -> UpgradeSlot {
-        self.upgrade.clone()
+    /// Called by actix for each new connection, so that its requests find its slot.
+    pub fn on_connect(&self, data: &mut Extensions) {
+        data.insert(self.upgrade.clone());
     }
 
     fn tcp(&mut self) -> io::Result<Pin<&mut TcpStream>> {
@@ -122,7 +123,7 @@ impl ClientStream {
                 b'\r' => {}
                 other => {
                     self.line_ended = false;
-                    if self.line.len() < LINE {
+                    if self.line.len() < MAX_LINE {
                         self.line.push(*other);
                     }
                 }
@@ -144,7 +145,7 @@ fn after(left: usize, is_answered: bool) -> State {
 /// The length of a body, where this line of a head tells it and it is not too large.
 fn content_length(line: &[u8]) -> Option<usize> {
     let (name, value) = std::str::from_utf8(line).ok()?.split_once(':')?;
-    let length = value.trim().parse().ok().filter(|length| *length <= LARGEST_BODY)?;
+    let length = value.trim().parse().ok().filter(|length| *length <= MAX_BODY)?;
     name.eq_ignore_ascii_case("content-length").then_some(length)
 }
 

@@ -30,8 +30,8 @@ pub const TCP_PER_CLIENT: usize = 2;
 /// Limit of what is relayed at once for each client that there may be: a stream, and the files of a scene, of which
 /// browsers load six at a time.
 pub const STREAMS_PER_CLIENT: usize = 7;
-/// How many web clients an address may have at most where the configuration does not say it.
-const MOST_CLIENTS: usize = 1000;
+/// Default limit of web clients per address.
+const MAX_CLIENTS_PER_ADDRESS: usize = 1000;
 /// Limit of pages that listen to `/events`.
 const MAX_PAGES: usize = 1000;
 
@@ -72,9 +72,9 @@ pub enum ConnectionLimitError {
 
 impl ConnectionLimiter {
     /// Allows `max_tcp` TCP connections and `max_clients` web clients, of which one address may have `per_address`;
-    /// `None` is [`share`] of them, but at most [`MOST_CLIENTS`].
+    /// `None` is [`share`] of them, but at most [`MAX_CLIENTS_PER_ADDRESS`].
     pub fn new(max_tcp: usize, max_clients: usize, per_address: Option<usize>) -> Self {
-        let per_address = per_address.unwrap_or_else(|| share(max_clients).min(MOST_CLIENTS));
+        let per_address = per_address.unwrap_or_else(|| share(max_clients).min(MAX_CLIENTS_PER_ADDRESS));
         Self { max_tcp, max_clients, per_address, open: Arc::default() }
     }
 

@@ -60,9 +60,9 @@ impl TrustedProxies {
         if self.trusts(address) { Peer::Proxy(address) } else { Peer::Client(address) }
     }
 
-    /// What a trusted proxy tells in this header, if one is at the other end. A header that is there twice is believed in
-    /// neither form: one of them may be the client's own word.
-    pub fn told(&self, request: &HttpRequest, header: &UserHeader) -> Option<String> {
+    /// The value of a header that a trusted proxy sets. A header that is there twice has none: the client may have sent one
+    /// of them.
+    pub fn trusted_header(&self, request: &HttpRequest, header: &UserHeader) -> Option<String> {
         let is_trusted = request.peer_addr().is_some_and(|address| self.trusts(address.ip().to_canonical()));
         let mut lines = request.headers().get_all(&header.0).filter(|_| is_trusted);
         match (lines.next(), lines.next()) {

@@ -24,7 +24,6 @@ use tokio_util::sync::CancellationToken;
 use super::client_stream::ClientStream;
 use super::connections::{ConnectionKind, ConnectionLimiter};
 use super::peer::TrustedProxies;
-use super::upgrade;
 
 /// Backlog of connections to be accepted. The kernel's own limit applies if it is smaller.
 ///
@@ -99,8 +98,9 @@ where
     });
     let server = server.listen("http", port, move || {
         let app = app().into_factory().map_err(|error| error.into().error_response());
-        let http =
-            HttpService::build().on_connect_ext(upgrade::on_connect).h1(map_config(app, |()| AppConfig::default()));
+        let http = HttpService::build()
+            .on_connect_ext(ClientStream::on_connect)
+            .h1(map_config(app, |()| AppConfig::default()));
         let (connections, options, stopping) = (connections.clone(), options.clone(), stopping.clone());
         fn_service(move |tcp| ready(accept(tcp, &connections, &options, &stopping))).and_then(http)
     })?;

@@ -4,12 +4,10 @@
 use std::cell::RefCell;
 use std::rc::Rc;
 
-use actix_http::Extensions;
 use actix_web::HttpRequest;
 use actix_web::rt::net::TcpStream;
 use tokio::sync::oneshot;
 
-use super::client_stream::ClientStream;
 use super::connections::ConnectionPermit;
 
 /// A connection that speaks another protocol than HTTP from now on.
@@ -40,11 +38,6 @@ impl UpgradeSlot {
             receiver.send(upgraded).ok();
         }
     }
-}
-
-/// Called by actix for each new connection, whose requests then find its slot.
-pub fn on_connect(stream: &ClientStream, data: &mut Extensions) {
-    data.insert(stream.upgrade_slot());
 }
 
 /// The connection of a request, once the answer 101 was written to it. An error means that it has ended before.

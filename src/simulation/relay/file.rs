@@ -6,24 +6,24 @@ use futures_util::StreamExt;
 
 use super::upstream::{ANSWER_TIMEOUT, Upstream};
 
-/// Headers of Webots' answer that the client gets.
-const PASSED_ON: [HeaderName; 4] = [header::CONTENT_TYPE, header::ETAG, header::CACHE_CONTROL, header::LAST_MODIFIED];
+/// Headers of Webots' answer that its client gets.
+const FORWARDED_HEADERS: [HeaderName; 4] =
+    [header::CONTENT_TYPE, header::ETAG, header::CACHE_CONTROL, header::LAST_MODIFIED];
 
-/// Requests this URL from Webots, and forwards the answer as fast as the client reads it. `held` is dropped with the
-/// answer.
+/// Fetches a file of Webots, and forwards the answer as fast as the client reads it. `held` is dropped with the answer.
 pub async fn fetch(upstream: &Upstream, url: &str, request: &HttpRequest, held: impl std::any::Any) -> HttpResponse {
-    // A kept connection could reach a later simulation on the same port.
-    let mut asked = upstream.client().get(url).no_decompress().force_close();
+    // A connection that is kept could lead to another simulation on the same port later.
+    let mut query = upstream.client().get(url).no_decompress().force_close();
     if let Some(tag) = request.headers().get(header::IF_NONE_MATCH) {
-        asked = asked.insert_header((header::IF_NONE_MATCH, tag));
+        query = query.insert_header((header::IF_NONE_MATCH, tag));
     }
-    let answer = match actix_rt::time::timeout(ANSWER_TIMEOUT, asked.send()).await {
+    let answer = match actix_rt::time::timeout(ANSWER_TIMEOUT, query.send()).await {
         Ok(Ok(answer)) if !answer.status().is_informational() => answer,
         Ok(_) => return HttpResponse::BadGateway().body("Error: the simulation does not answer."),
         Err(_) => return HttpResponse::GatewayTimeout().body("Error: the simulation does not answer."),
     };
     let mut response = HttpResponse::build(answer.status());
-    for name in PASSED_ON {
+    for name in FORWARDED_HEADERS {
         if let Some(value) = answer.headers().get(&name) {
             response.insert_header((name, value));
         }

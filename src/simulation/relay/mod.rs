@@ -4,10 +4,10 @@
 mod file;
 mod path;
 mod upstream;
-mod watching;
+mod view_requests;
 mod websocket;
 
 pub use file::fetch;
-pub use path::split;
+pub use path::parse_path;
 pub use upstream::Upstream;
 pub use websocket::connect;

@@ -1,27 +1,26 @@
-//! The path of a stream, `/stream/TOKEN/...`, and the part of it that Webots gets. Pure.
+//! The path of a stream, `/stream/TOKEN/...`. Pure.
 
 use percent_encoding::percent_decode_str;
 
 use crate::simulation::sessions::Token;
 
-/// Prefix of the path of each stream.
-const BEGINNING: &str = "/stream/";
+/// Prefix of each stream's path.
+const PREFIX: &str = "/stream/";
 
-/// The token in a path, as the client has sent it, and the rest for Webots. `None` if one of them is missing, or if the
-/// rest would leave a folder.
+/// Splits a path, as the client has sent it, into the token and the path for Webots. `None` if either is invalid.
 #[must_use]
-pub fn split(path: &str) -> Option<(Token, &str)> {
-    let rest = path.strip_prefix(BEGINNING)?;
+pub fn parse_path(path: &str) -> Option<(Token, &str)> {
+    let rest = path.strip_prefix(PREFIX)?;
     let (token, path) = rest.split_at(rest.find('/').unwrap_or(rest.len()));
     let token = Token::parse(token)?;
     match path.strip_prefix('/') {
         None | Some("") => Some((token, "/")),
-        Some(inside) => inside.split('/').all(is_name).then_some((token, path)),
+        Some(inside) => inside.split('/').all(is_safe_segment).then_some((token, path)),
     }
 }
 
 /// Whether a segment of a path names a file or folder, even if it is decoded twice.
-fn is_name(part: &str) -> bool {
+fn is_safe_segment(part: &str) -> bool {
     let Ok(once) = percent_decode_str(part).decode_utf8() else { return false };
     let Ok(twice) = percent_decode_str(&once).decode_utf8() else { return false };
     [once.as_ref(), twice.as_ref()].into_iter().all(|name| {
@@ -62,12 +61,12 @@ mod tests {
             ("/%ff", None),
         ] {
             let path = path(rest);
-            assert_eq!(split(&path), passed.map(|passed| (token, passed)), "{rest}");
+            assert_eq!(parse_path(&path), passed.map(|passed| (token, passed)), "{rest}");
         }
         for path in
             ["/stream/", "/stream//a", "/stream/x/a", "/streams/x", "/", &path("x/a"), &format!("/x{}", path("/a"))]
         {
-            assert_eq!(split(path), None, "{path}");
+            assert_eq!(parse_path(path), None, "{path}");
         }
     }
 }

@@ -16,7 +16,7 @@ use futures_util::future::{self, Either};
 use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt};
 
 use super::upstream::{ANSWER_TIMEOUT, Upstream, open_websocket};
-use super::watching;
+use super::view_requests;
 use crate::shared::http::upgrade;
 
 /// Size of the buffer for what Webots sends, scenes and pictures, in bytes.
@@ -26,13 +26,13 @@ const CLIENT_BUFFER: usize = 4 * 1024;
 /// Timeout of the other direction once one has ended.
 const CLOSE_TIMEOUT: Duration = Duration::from_secs(5);
 
-/// Connects a client with the WebSocket at this URL, or answers why that can't be. A client that `only_watches` can only
-/// say to Webots how it wants to watch. `held` is dropped with the connection.
+/// Connects a client with the WebSocket at this URL, or answers why that can't be. A client that is `read_only` can only
+/// request a kind of stream. `held` is dropped with the connection.
 pub async fn connect(
     upstream: &Upstream,
     url: &str,
     request: &HttpRequest,
-    only_watches: bool,
+    read_only: bool,
     held: impl Send + 'static,
 ) -> HttpResponse {
     let mut response = match ws::handshake(request) {
@@ -57,7 +57,7 @@ pub async fn connect(
         stream_thread.spawn_fn(move || {
             let ends = [(to_client, client.read_buffer.into()), (to_webots, from_webots)];
             actix_rt::spawn(async move {
-                if let Err(error) = relay(ends, only_watches).await {
+                if let Err(error) = relay(ends, read_only).await {
                     log::debug!("a stream is not relayed: {error}");
                 }
                 drop(held);
@@ -69,7 +69,7 @@ pub async fn connect(
 
 /// Copies both directions until both have ended, or one has and the other takes too long. The ends are the client's and
 /// that of Webots, with what was read of them already.
-async fn relay(ends: [(StdStream, Bytes); 2], only_watches: bool) -> io::Result<()> {
+async fn relay(ends: [(StdStream, Bytes); 2], read_only: bool) -> io::Result<()> {
     let [(client, sent_by_client), (webots, sent_by_webots)] = ends;
     let (mut client, mut webots) = (TcpStream::from_std(client)?, TcpStream::from_std(webots)?);
     let ((from_client, mut to_client), (from_webots, mut to_webots)) = (client.split(), webots.split());
@@ -78,8 +78,8 @@ async fn relay(ends: [(StdStream, Bytes); 2], only_watches: bool) -> io::Result<
     // Whether Webots has sent something.
     let has_answered = Cell::new(false);
     let up = async {
-        if only_watches {
-            watching::introduce(from_client, &mut to_webots, &has_answered).await;
+        if read_only {
+            view_requests::forward(from_client, &mut to_webots, &has_answered).await;
         } else {
             copy(&mut from_client, &mut to_webots, CLIENT_BUFFER, || {}).await;
         }

@@ -1,5 +1,5 @@
-//! The streams of running simulations: their tokens, and their watchers.
+//! The streams of running simulations, and the tokens that lead to them.
 
 mod streams;
 
-pub use streams::{Found, Registration, Streams, Watched, Watching};
+pub use streams::{StreamRegistration, StreamTarget, Streams, WatchGuard, Watched};

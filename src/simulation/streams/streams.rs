@@ -1,4 +1,4 @@
-//! The streams of running simulations, found by tokens: that of the simulation's client, and those of watching
+//! The streams of running simulations by token: the token of the simulation's client, and those of watching
 //! administrators.
 
 use std::collections::HashMap;
@@ -11,22 +11,22 @@ use parking_lot::Mutex;
 use crate::simulation::sessions::Token;
 use crate::simulation::simulation_id::SimulationId;
 
-/// How long a watcher's token can be used after it was issued. A used one is valid as long as its connection.
-const UNUSED: Duration = Duration::from_mins(1);
-/// Largest number of watchers' tokens. No further one is issued until another has ended.
-const MOST_WATCHERS: usize = 1000;
+/// Timeout of a watcher's token that is not used. A used one is valid as long as its connection.
+const TOKEN_TIMEOUT: Duration = Duration::from_mins(1);
+/// Limit of watchers' tokens.
+const MAX_WATCHERS: usize = 1000;
 
-/// Notifies a session whether its simulation is watched.
+/// Sent to a session when the first watcher of its simulation connects, and when the last one leaves.
 #[derive(Message, Debug, Clone, Copy, PartialEq, Eq)]
 #[rtype(result = "()")]
 pub struct Watched(pub bool);
 
-/// The registry of streams.
+/// The streams of this server.
 #[derive(Default)]
-pub struct Streams(Mutex<Open>);
+pub struct Streams(Mutex<Tables>);
 
 #[derive(Default)]
-struct Open {
+struct Tables {
     streams: HashMap<u64, Stream>,
     watchers: HashMap<u64, Watcher>,
 }
@@ -42,93 +42,94 @@ struct Watcher {
     token: Token,
     /// The number of the stream.
     stream: u64,
-    given: Instant,
+    issued_at: Instant,
     /// Whether its connection is open.
-    watches: bool,
+    is_connected: bool,
 }
 
-/// The stream of a token.
+/// The stream that belongs to a token.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Found {
+pub struct StreamTarget {
     /// The simulation.
     pub simulation: SimulationId,
     /// Its port on this machine.
     pub port: u16,
-    /// Whether it is a watcher's token.
-    pub only_watches: bool,
+    /// Whether the token is a watcher's, which may change nothing.
+    pub read_only: bool,
 }
 
-/// A registered stream. Dropping it removes the stream and its watchers' tokens.
-pub struct Registration {
+/// Keeps a stream registered. Dropping it invalidates its tokens, those of watchers too.
+pub struct StreamRegistration {
     token: Token,
     streams: Arc<Streams>,
 }
 
-/// The connection of a watcher. Dropping it ends its token.
-pub struct Watching {
+/// A watcher's connection. Dropping it invalidates its token.
+pub struct WatchGuard {
     number: u64,
     streams: Arc<Streams>,
 }
 
 impl Streams {
-    /// Registers the stream of a simulation on this port; `session` is notified whether it is watched.
+    /// Registers the stream of a simulation on this port; `session` is notified of watchers.
     #[must_use]
     pub fn register(
         self: &Arc<Self>,
         simulation: SimulationId,
         port: u16,
         session: Recipient<Watched>,
-    ) -> Registration {
+    ) -> StreamRegistration {
         let token = Token::new(rand::random());
         self.0.lock().streams.insert(token.number(), Stream { simulation, token, port, session });
-        Registration { token, streams: Arc::clone(self) }
+        StreamRegistration { token, streams: Arc::clone(self) }
     }
 
     /// The stream of a token, if the token is valid.
     #[must_use]
-    pub fn find(&self, token: &Token) -> Option<Found> {
+    pub fn find(&self, token: &Token) -> Option<StreamTarget> {
         let open = self.0.lock();
         if let Some(stream) = open.streams.get(&token.number()).filter(|stream| stream.token == *token) {
-            return Some(stream.found(false));
+            return Some(stream.target(false));
         }
         let watcher = open.watchers.get(&token.number()).filter(|watcher| watcher.token == *token)?;
         if !watcher.is_valid() {
             return None;
         }
-        open.streams.get(&watcher.stream).map(|stream| stream.found(true))
+        open.streams.get(&watcher.stream).map(|stream| stream.target(true))
     }
 
-    /// Issues a token for watching a simulation, if it has a stream.
+    /// Issues a token to watch a simulation; `None` if it has no stream, or there are too many watchers.
     #[must_use]
     pub fn watch(&self, simulation: &str) -> Option<Token> {
         let mut open = self.0.lock();
         open.watchers.retain(|_, watcher| watcher.is_valid());
         let mut streams = open.streams.iter();
         let stream = *streams.find(|(_, stream)| stream.simulation.to_string() == simulation)?.0;
-        if open.watchers.len() >= MOST_WATCHERS {
+        if open.watchers.len() >= MAX_WATCHERS {
             return None;
         }
         let token = Token::new(rand::random());
-        open.watchers.insert(token.number(), Watcher { token, stream, given: Instant::now(), watches: false });
+        open.watchers.insert(token.number(), Watcher { token, stream, issued_at: Instant::now(), is_connected: false });
         Some(token)
     }
 
-    /// Begins to watch with a token that [`Self::find`] has found. `None` if it was used already.
+    /// Marks a watcher's token as used; `None` if it already was.
     #[must_use]
-    pub fn begin(self: &Arc<Self>, token: &Token) -> Option<Watching> {
+    pub fn start_watching(self: &Arc<Self>, token: &Token) -> Option<WatchGuard> {
         let mut open = self.0.lock();
-        let watcher = open.watchers.get_mut(&token.number()).filter(|watcher| !watcher.watches)?;
-        watcher.watches = true;
+        let watcher = open.watchers.get_mut(&token.number()).filter(|watcher| !watcher.is_connected)?;
+        watcher.is_connected = true;
         let stream = watcher.stream;
-        open.tell_if_only_one(stream, true);
-        Some(Watching { number: token.number(), streams: Arc::clone(self) })
+        open.notify_session(stream, true);
+        Some(WatchGuard { number: token.number(), streams: Arc::clone(self) })
     }
 }
 
-impl Open {
-    /// Notifies a session of its first watcher, and of the end of the last one.
-    fn tell_if_only_one(&self, stream: u64, is_watched: bool) {
-        let watching = self.watchers.values().filter(|watcher| watcher.watches && watcher.stream == stream).count();
+impl Tables {
+    /// Notifies a session if one watcher is connected: the first one has come, or the last one leaves.
+    fn notify_session(&self, stream: u64, is_watched: bool) {
+        let watching =
+            self.watchers.values().filter(|watcher| watcher.is_connected && watcher.stream == stream).count();
         if watching == 1
             && let Some(stream) = self.streams.get(&stream)
         {
@@ -138,18 +139,18 @@ impl Open {
 }
 
 impl Stream {
-    fn found(&self, only_watches: bool) -> Found {
-        Found { simulation: self.simulation, port: self.port, only_watches }
+    fn target(&self, read_only: bool) -> StreamTarget {
+        StreamTarget { simulation: self.simulation, port: self.port, read_only }
     }
 }
 
 impl Watcher {
     fn is_valid(&self) -> bool {
-        self.watches || self.given.elapsed() < UNUSED
+        self.is_connected || self.issued_at.elapsed() < TOKEN_TIMEOUT
     }
 }
 
-impl Registration {
+impl StreamRegistration {
     /// The token for the simulation's client.
     #[must_use]
     pub fn token(&self) -> Token {
@@ -157,7 +158,7 @@ impl Registration {
     }
 }
 
-impl Drop for Registration {
+impl Drop for StreamRegistration {
     fn drop(&mut self) {
         let number = self.token.number();
         let mut open = self.streams.0.lock();
@@ -166,11 +167,11 @@ impl Drop for Registration {
     }
 }
 
-impl Drop for Watching {
+impl Drop for WatchGuard {
     fn drop(&mut self) {
         let mut open = self.streams.0.lock();
         if let Some(stream) = open.watchers.get(&self.number).map(|watcher| watcher.stream) {
-            open.tell_if_only_one(stream, false);
+            open.notify_session(stream, false);
         }
         open.watchers.remove(&self.number);
     }
@@ -181,13 +182,13 @@ mod tests {
     use super::*;
     use std::sync::mpsc::{Receiver, Sender, channel};
 
-    struct Told(Sender<bool>);
+    struct Recorder(Sender<bool>);
 
-    impl Actor for Told {
+    impl Actor for Recorder {
         type Context = Context<Self>;
     }
 
-    impl Handler<Watched> for Told {
+    impl Handler<Watched> for Recorder {
         type Result = ();
 
         fn handle(&mut self, Watched(is_watched): Watched, _: &mut Self::Context) {
@@ -200,19 +201,19 @@ mod tests {
     #[rtype(result = "()")]
     struct Barrier;
 
-    impl Handler<Barrier> for Told {
+    impl Handler<Barrier> for Recorder {
         type Result = ();
 
         fn handle(&mut self, Barrier: Barrier, _: &mut Self::Context) {}
     }
 
-    fn told() -> (Recipient<Watched>, (Addr<Told>, Receiver<bool>)) {
+    fn told() -> (Recipient<Watched>, (Addr<Recorder>, Receiver<bool>)) {
         let (sender, told) = channel();
-        let actor = Told(sender).start();
+        let actor = Recorder(sender).start();
         (actor.clone().recipient(), (actor, told))
     }
 
-    async fn all((actor, told): &(Addr<Told>, Receiver<bool>)) -> Vec<bool> {
+    async fn all((actor, told): &(Addr<Recorder>, Receiver<bool>)) -> Vec<bool> {
         actor.send(Barrier).await.unwrap();
         told.try_iter().collect()
     }
@@ -224,7 +225,7 @@ mod tests {
         let stream = streams.register(id, 2001, told().0);
         let other = streams.register(SimulationId::next(), 2002, told().0);
         let token = stream.token();
-        assert_eq!(streams.find(&token), Some(Found { simulation: id, port: 2001, only_watches: false }));
+        assert_eq!(streams.find(&token), Some(StreamTarget { simulation: id, port: 2001, read_only: false }));
         assert_eq!(streams.find(&other.token()).unwrap().port, 2002);
         // The same number with another secret.
         assert_eq!(streams.find(&Token::new(token.number())), None);
@@ -241,12 +242,12 @@ mod tests {
         let stream = streams.register(id, 2001, session);
         assert!(streams.watch("20261122T220517042-17").is_none(), "no such simulation");
         let [one, two] = [(); 2].map(|()| streams.watch(&id.to_string()).unwrap());
-        assert_eq!(streams.find(&one), Some(Found { simulation: id, port: 2001, only_watches: true }));
-        assert!(streams.begin(&stream.token()).is_none(), "it is no token for watching");
+        assert_eq!(streams.find(&one), Some(StreamTarget { simulation: id, port: 2001, read_only: true }));
+        assert!(streams.start_watching(&stream.token()).is_none(), "it is no token for watching");
         assert!(all(&told).await.is_empty());
-        let first = streams.begin(&one).unwrap();
-        assert!(streams.begin(&one).is_none(), "it is used");
-        let second = streams.begin(&two).unwrap();
+        let first = streams.start_watching(&one).unwrap();
+        assert!(streams.start_watching(&one).is_none(), "it is used");
+        let second = streams.start_watching(&two).unwrap();
         assert_eq!(all(&told).await, [true]);
         drop(first);
         assert_eq!(streams.find(&one), None);
@@ -265,9 +266,9 @@ mod tests {
         let id = SimulationId::next();
         let _stream = streams.register(id, 2001, told().0);
         let [used, unused] = [(); 2].map(|()| streams.watch(&id.to_string()).unwrap());
-        let _watching = streams.begin(&used).unwrap();
+        let _watching = streams.start_watching(&used).unwrap();
         for watcher in streams.0.lock().watchers.values_mut() {
-            watcher.given = Instant::now().checked_sub(UNUSED).unwrap();
+            watcher.issued_at = Instant::now().checked_sub(TOKEN_TIMEOUT).unwrap();
         }
         assert!(streams.find(&used).is_some());
         assert_eq!(streams.find(&unused), None);

@@ -44,7 +44,11 @@ async fn client(request: HttpRequest, stream: web::Payload, server: web::Data<Ap
         Ok(permit) => permit,
         Err(refused) => return refused.answer(),
     };
-    let user = server.config.user_header.as_ref().and_then(|name| server.config.trusted_proxies.told(&request, name));
+    let user = server
+        .config
+        .user_header
+        .as_ref()
+        .and_then(|name| server.config.trusted_proxies.trusted_header(&request, name));
     let server = Arc::clone(&server);
     websocket::open(&request, stream, |reader| WebClient::new(server, (peer, user), (permit, reader)))
 }

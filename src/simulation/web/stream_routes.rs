@@ -8,7 +8,7 @@ use crate::shared::http::routing::{GET, path};
 use crate::shared::http::{ConnectionKind, body};
 use crate::simulation::relay::{self, Upstream};
 use crate::simulation::state::AppState;
-use crate::simulation::streams::Found;
+use crate::simulation::streams::StreamTarget;
 
 /// Adds the paths to an app.
 pub fn configure(app: &mut web::ServiceConfig) {
@@ -18,8 +18,8 @@ pub fn configure(app: &mut web::ServiceConfig) {
 async fn stream(request: HttpRequest, server: web::Data<AppState>) -> HttpResponse {
     let nothing = || HttpResponse::NotFound().body("Error: there is no such stream.");
     // As the client has written it: what it has encoded stays so.
-    let Some((token, path)) = relay::split(request.uri().path()) else { return nothing() };
-    let Some(found) = server.streams.find(&token) else { return nothing() };
+    let Some((token, path)) = relay::parse_path(request.uri().path()) else { return nothing() };
+    let Some(target) = server.streams.find(&token) else { return nothing() };
     if let Some(refusal) = body::refuse(&request) {
         return refusal;
     }
@@ -36,15 +36,15 @@ async fn stream(request: HttpRequest, server: web::Data<AppState>) -> HttpRespon
         Err(refused) => return refused.answer(),
     };
     let Some(upstream) = request.app_data::<Upstream>() else { return nothing() };
-    let Found { simulation, port, only_watches } = found;
+    let StreamTarget { simulation, port, read_only } = target;
     let url = upstream.url(port, path, request.uri().query());
     if !is_websocket {
         return relay::fetch(upstream, &url, &request, permit).await;
     }
-    if !only_watches {
+    if !read_only {
         return relay::connect(upstream, &url, &request, false, permit).await;
     }
-    let Some(watching) = server.streams.begin(&token) else { return nothing() };
+    let Some(guard) = server.streams.start_watching(&token) else { return nothing() };
     log::info!("{simulation}: client {peer} watches");
-    relay::connect(upstream, &url, &request, true, (permit, watching)).await
+    relay::connect(upstream, &url, &request, true, (permit, guard)).await
 }

@@ -21,7 +21,7 @@ use crate::simulation::machine::sensors::Gpu;
 use crate::simulation::process::{SpawnSpec, until_answering};
 use crate::simulation::protocol::Mode;
 use crate::simulation::slots::Slot;
-use crate::simulation::streams::{Registration, Streams, Watched};
+use crate::simulation::streams::{StreamRegistration, Streams, Watched};
 
 /// Everything that one Webots is started with.
 pub struct LaunchSpec {
@@ -61,7 +61,7 @@ impl LaunchSpec {
     }
 
     /// Registers the stream of this port.
-    pub fn register(&self, port: u16) -> Registration {
+    pub fn register(&self, port: u16) -> StreamRegistration {
         self.streams.register(self.slot.lease.id(), port, self.watched.clone())
     }
 

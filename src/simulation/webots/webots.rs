@@ -22,7 +22,7 @@ use crate::simulation::container::StartError;
 use crate::simulation::ends::{EndReason, Taken};
 use crate::simulation::process::ProcessGroup;
 use crate::simulation::snapshot::{SimulationChange, Stage};
-use crate::simulation::streams::Registration;
+use crate::simulation::streams::StreamRegistration;
 
 /// Requests Webots' end, because its client has left or for another reason.
 #[derive(Message)]
@@ -37,7 +37,7 @@ pub struct ResetController(pub String);
 /// The actor.
 pub struct Webots {
     /// Its stream, which is not found any more before another simulation may have its port.
-    stream: Option<Registration>,
+    stream: Option<StreamRegistration>,
     pub(super) spec: LaunchSpec,
     port: u16,
     events: EventSender,

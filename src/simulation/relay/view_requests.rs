@@ -1,4 +1,4 @@
-//! What a client that only watches may say to Webots: how it wants to watch, until Webots has answered that.
+//! The messages of a read-only client that reach Webots: requests for a kind of stream, until Webots has answered.
 
 use std::cell::Cell;
 
@@ -8,11 +8,11 @@ use futures_util::StreamExt;
 use tokio::io::{AsyncRead, AsyncWrite, AsyncWriteExt};
 use tokio_util::codec::{Encoder, FramedRead};
 
-/// The largest message of a watching client, in bytes.
+/// Size limit of a message, in bytes.
 const MAX_MESSAGE: usize = 8 * 1024;
 
-/// Passes on how a client wants to watch, and drops all else. Returns when the client closes or breaks the rules.
-pub async fn introduce(
+/// Forwards requests for a kind of stream, and drops all else. Returns when the client closes or violates the protocol.
+pub async fn forward(
     from_client: impl AsyncRead + Unpin,
     to_webots: &mut (impl AsyncWrite + Unpin),
     has_answered: &Cell<bool>,
@@ -26,15 +26,15 @@ pub async fn introduce(
             _ => continue,
         };
         let mut bytes = BytesMut::new();
-        let is_encoded = is_introduction(&text) && codec.encode(Message::Text(text.into()), &mut bytes).is_ok();
+        let is_encoded = is_view_request(&text) && codec.encode(Message::Text(text.into()), &mut bytes).is_ok();
         if is_encoded && to_webots.write_all(&bytes).await.is_err() {
             return;
         }
     }
 }
 
-/// Whether a text says how its sender wants to watch, and changes nothing for others.
-fn is_introduction(text: &str) -> bool {
+/// Whether a text requests a kind of stream, and changes nothing for others.
+fn is_view_request(text: &str) -> bool {
     let is_size = |size: &str| {
         size.split_once('x').is_some_and(|(width, height)| {
             [width, height]
@@ -54,9 +54,9 @@ mod tests {
     use super::*;
 
     #[test]
-    fn nothing_else_is_an_introduction() {
+    fn nothing_else_is_a_view_request() {
         for text in ["x3d;broadcast", "w3d;broadcast", "mjpeg: 800x600;broadcast"] {
-            assert!(is_introduction(text), "{text}");
+            assert!(is_view_request(text), "{text}");
         }
         for text in [
             "x3d",
@@ -68,7 +68,7 @@ mod tests {
             "mjpeg: 8x6\npause;broadcast",
             ";broadcast",
         ] {
-            assert!(!is_introduction(text), "{text}");
+            assert!(!is_view_request(text), "{text}");
         }
     }
 }
