@@ -1,7 +1,7 @@
-"""Takes the pictures of README.md and docs: pictures.py FOLDER [rehearsal | pages]
+"""Takes the pictures of README.md and docs: pictures.py FOLDER [rehearsal | pages | class]
 
 The rehearsal is what `rehearse` prints. The pages show the demo at work: two simulation servers and one that is down, with
-clients who have come and gone while the charts filled.
+clients who have come and gone while the charts filled. The class is twelve students, and a list of 200.
 """
 
 import base64
@@ -17,12 +17,17 @@ from playwright.sync_api import expect
 from browser import Browser
 from demo import Demo
 from fleet import BIN, SOON, until
+from students import NAMES, start_all
 
 # How many seconds the charts show.
 HISTORY = 600
 WIDTH = 1200
+# A part of a page is cut off below this height.
+HIGHEST = 720
+PASSWORD = "open sesame"
+PLAYGROUND = "https://github.com/webots-fleet/demo/blob/main/worlds/playground.wbt"
 REHEARSAL = [
-    "--world", "https://github.com/webots-fleet/demo/blob/main/worlds/playground.wbt",
+    "--world", PLAYGROUND,
     "--clients", "30", "--over", "5s", "--stay", "20s", "--patience", "12s"]
 TERMINAL = """
     <!doctype html><meta charset="utf-8">
@@ -53,14 +58,22 @@ def wait(demo, count):
         until(f"{more} seconds have passed", lambda: samples(demo) >= more)
 
 
-def shoot(page, folder, name, hosts):
-    page.tab.evaluate("scrollTo(0, 0)")
-    width, height = page.tab.evaluate("[innerWidth, document.documentElement.scrollHeight]")
+def shoot(page, folder, name, hosts, part=None, margin=16, whole=True):
+    """A picture of a page, of one of its parts, or of what is in sight."""
+    if whole:
+        page.tab.evaluate("scrollTo(0, 0)")
+    x, y, width, height = page.tab.evaluate("[0, scrollY, innerWidth, innerHeight]")
+    if part:
+        box = part.bounding_box()
+        x, y, width, height = box["x"] - margin, box["y"] - margin, box["width"] + 2 * margin, box["height"] + 2 * margin
+        height = min(height, HIGHEST)
+    elif whole:
+        height = page.tab.evaluate("document.documentElement.scrollHeight")
     chromium = page.context.new_cdp_session(page.tab)
     # Playwright itself knows no WebP, which takes half the room of PNG.
     taken = chromium.send("Page.captureScreenshot", {
         "format": "webp", "quality": 90, "captureBeyondViewport": True,
-        "clip": {"x": 0, "y": 0, "width": width, "height": height, "scale": 1}})
+        "clip": {"x": x, "y": y, "width": width, "height": height, "scale": 1}})
     (folder / f"{name}.webp").write_bytes(base64.b64decode(taken["data"]))
     if page.complaints or page.hosts() != hosts:
         raise AssertionError(f"{name}: {page.complaints} {page.hosts()}")
@@ -107,13 +120,97 @@ def pages(browser, demo, folder):
         one.close()
 
 
+def student(browser, demo, name, world, width=WIDTH):
+    """A page on which somebody of this name runs a world."""
+    page = browser.page(width=width, height=860)
+    page.tab.goto(f"http://{demo.session}/viewer?name={name}")
+    expect(page.tab.locator("#light.on")).to_be_visible()
+    page.tab.get_by_role("button", name=world).click()
+    page.tab.get_by_role("button", name="Connect", exact=True).click()
+    page.tab.get_by_role("button", name="Play", exact=True).click()
+    return page
+
+
+def a_class(browser, demo, folder):
+    """What a teacher has of a class: who is who, watching, stopping, announcing, a list of 200 on a phone."""
+    hosts = {"localhost"}
+    credentials = {"username": "teacher", "password": PASSWORD}
+    anna, ben = student(browser, demo, "Anna", "Playground"), student(browser, demo, "Ben", "Carousel", width=360)
+    others = browser.page(width=360, height=300)
+    others.tab.goto(f"http://{demo.session}/viewer")
+    start_all(others, NAMES[2:12], lambda name: None, PLAYGROUND)
+    teacher = browser.page(width=WIDTH, height=860, http_credentials=credentials)
+    teacher.tab.goto(f"http://{demo.simulation}/sign-in")
+    rows = teacher.tab.locator("#simulations tr")
+    expect(rows).to_have_count(12)
+    expect(rows.locator("[data-label=CPU]", has_text="%")).to_have_count(12)
+    shoot(teacher, folder, "class", hosts, teacher.tab.locator("section:has(#simulations)"), margin=8)
+    teacher.tab.get_by_label("Filter").fill("anna")
+    row = teacher.tab.locator("#simulations tr:visible")
+    expect(row).to_have_count(1)
+    with teacher.context.expect_page() as opened:
+        row.get_by_role("link", name="Watch").click()
+    opened.value.close()
+    watching = browser.page(width=WIDTH, height=760, http_credentials=credentials)
+    watching.tab.goto(row.get_by_role("link", name="Watch").evaluate("link => link.href"))
+    expect(watching.tab.locator("#state")).to_have_text("Watching")
+    expect(anna.tab.locator("#watched")).to_be_visible()
+    fleet = browser.page(width=WIDTH, height=860, http_credentials=credentials)
+    fleet.tab.goto(f"http://{demo.session}/monitor")
+    fleet.tab.get_by_label("Text for all open viewers").fill("Maintenance from noon on: please save your work.")
+    fleet.tab.get_by_role("button", name="Announce").click()
+    expect(anna.tab.locator("#announcement")).to_be_visible()
+    shoot(watching, folder, "watch", hosts)
+    shoot(anna, folder, "viewer-watched", hosts)
+    watching.close()
+    row.get_by_role("button", name="Stop").click()
+    teacher.tab.get_by_label("Reason").fill("Please come to my desk")
+    shoot(teacher, folder, "stop", hosts, teacher.tab.get_by_role("dialog"), margin=60)
+    phone(browser, demo, folder, credentials, hosts)
+    for one in [anna, ben, others, teacher, fleet]:
+        one.close()
+
+
+def phone(browser, demo, folder, credentials, hosts):
+    """The list of a class, with each row many times."""
+    page = browser.page(width=390, height=844, http_credentials=credentials)
+    page.tab.goto(f"http://{demo.simulation}/sign-in")
+    row = page.tab.locator("#simulations tr").first
+    known = page.tab.locator("#simulations tr").evaluate_all("rows => rows.map((row) => [row.dataset.key, row.innerHTML])")
+    many = []
+    for number in range(200):
+        key, html = known[number % len(known)]
+        name = f"{key.rsplit('-', 1)[0]}-{number + 1}"
+        many.append({"key": name, "html": html.replace(key, name).replace(" at desk ", f" at desk {number // len(known) + 1}.")})
+    event = "data: " + json.dumps({"tables": {"simulations": many}}) + "\n\n"
+    page.tab.route("**/events", lambda route: route.fulfill(content_type="text/event-stream", body=event))
+    page.tab.reload()
+    expect(row).to_be_visible()
+    expect(page.tab.locator("#simulations tr")).to_have_count(200)
+    page.tab.get_by_label("Filter").fill("dora")
+    page.tab.evaluate("document.querySelector('section:has(#simulations)').scrollIntoView()")
+    # What comes into sight is drawn in the next frame.
+    page.tab.evaluate("new Promise((drawn) => requestAnimationFrame(() => requestAnimationFrame(drawn)))")
+    shoot(page, folder, "phone", hosts, whole=False)
+    page.close()
+
+
 def main(folder, wanted):
     expect.set_options(timeout=1000 * SOON)
-    takes = {"rehearsal": rehearsal, "pages": pages}
-    with Demo() as demo, Browser() as browser:
-        demo.add("second", "The machine in the cellar")
-        for take in [takes[name] for name in wanted or takes]:
-            take(browser, demo, folder)
+    takes = {"rehearsal": rehearsal, "pages": pages, "class": a_class}
+    wanted = set(wanted or takes)
+    assert wanted <= takes.keys(), wanted
+    with Browser() as browser:
+        if wanted != {"class"}:
+            with Demo() as demo:
+                demo.add("second", "The machine in the cellar")
+                for name in ["rehearsal", "pages"]:
+                    if name in wanted:
+                        takes[name](browser, demo, folder)
+        if "class" in wanted:
+            more = {"adminPassword": PASSWORD}
+            with Demo(more, {**more, "maxConnections": 14}) as demo:
+                a_class(browser, demo, folder)
 
 
 main(pathlib.Path(sys.argv[1]).resolve(), sys.argv[2:])

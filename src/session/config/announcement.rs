@@ -40,7 +40,7 @@ impl Announcement {
         }
         let until = until.map(|until| {
             read_timestamp(until)
-                .ok_or_else(|| format!("until is {until:?}; allowed are times in UTC such as 2026-12-31T12:00:00Z"))
+                .ok_or_else(|| format!("until is {until:?}; allowed are times such as 2026-12-31T12:00:00Z (UTC) or 2026-12-31T13:00:00+01:00"))
         });
         Ok(Self { text, until: until.transpose()? })
     }

@@ -1,11 +1,13 @@
 //! The time of day, as text and as a number.
 
-use std::time::SystemTime;
+use std::time::{Duration, SystemTime};
 
 use humantime::{Rfc3339Timestamp, format_rfc3339_millis, format_rfc3339_seconds};
 
 /// The end of the year 9999, in seconds since 1970.
 const END: u64 = 253_402_300_800;
+/// The length of `+01:00`.
+const OFFSET: usize = 6;
 
 /// Formats a time as RFC 3339 in UTC, to the second. Empty for a time before 1970 or after 9999.
 pub fn timestamp(time: SystemTime) -> String {
@@ -25,9 +27,18 @@ pub fn serialize_timestamp<S: serde::Serializer>(time: &SystemTime, serializer: 
     serializer.serialize_str(&timestamp(*time))
 }
 
-/// Reads a time as RFC 3339 in UTC: `2026-12-31T12:00:00Z`.
+/// Reads a time as RFC 3339: `2026-12-31T12:00:00Z`, `2026-12-31T13:00:00+01:00`.
 pub fn read_timestamp(text: &str) -> Option<SystemTime> {
-    humantime::parse_rfc3339(text).ok()
+    let (local, offset) = text.len().checked_sub(OFFSET).and_then(|at| text.split_at_checked(at)).unwrap_or((text, ""));
+    let &[sign @ (b'+' | b'-'), h1 @ b'0'..=b'2', h2 @ b'0'..=b'9', b':', m1 @ b'0'..=b'5', m2 @ b'0'..=b'9'] =
+        offset.as_bytes()
+    else {
+        return humantime::parse_rfc3339(text).ok();
+    };
+    let number = |tens: u8, ones: u8| u64::from(tens - b'0') * 10 + u64::from(ones - b'0');
+    let ahead = Duration::from_secs(3600 * number(h1, h2) + 60 * number(m1, m2));
+    let time = humantime::parse_rfc3339(&format!("{local}Z")).ok()?;
+    if sign == b'+' { time.checked_sub(ahead) } else { time.checked_add(ahead) }
 }
 
 /// Returns the current time in seconds since 1970-01-01 UTC.
@@ -43,8 +54,6 @@ fn text(time: SystemTime, format: fn(SystemTime) -> Rfc3339Timestamp) -> String 
 
 #[cfg(test)]
 mod tests {
-    use std::time::Duration;
-
     use super::*;
 
     #[test]
@@ -52,6 +61,29 @@ mod tests {
         let time = SystemTime::UNIX_EPOCH + Duration::from_millis(1_795_385_837_500);
         assert_eq!(timestamp(time), "2026-11-22T22:17:17Z");
         assert_eq!(timestamp_in_milliseconds(time), "2026-11-22T22:17:17.500Z");
+    }
+
+    #[test]
+    fn times_of_any_zone_are_read() {
+        for text in [
+            "2026-11-22T22:17:17Z",
+            "2026-11-22T23:17:17+01:00",
+            "2026-11-22T17:47:17-04:30",
+            "2026-11-22T22:17:17+00:00",
+        ] {
+            assert_eq!(read_timestamp(text).map(timestamp).as_deref(), Some("2026-11-22T22:17:17Z"), "{text}");
+        }
+        for text in [
+            "",
+            "+01:00",
+            "2026-11-22T22:17:17",
+            "2026-11-22",
+            "2026-11-22T22:17:17+1:00",
+            "2026-11-22T22:17:17+01:60",
+            "2026-11-22T22:17:17+0100",
+        ] {
+            assert_eq!(read_timestamp(text), None, "{text}");
+        }
     }
 
     #[test]
