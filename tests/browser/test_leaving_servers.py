@@ -72,7 +72,7 @@ class Failing(LeavingServers):
         cls.addClassCleanup(shutil.rmtree, folder)
         cls.repaired = folder / "repaired"
         webots = folder / "webots"
-        webots.write_text(f"#!/bin/sh\n[ -e {cls.repaired} ] || exit 3\nexec {BIN / 'demo-simulator'} \"$@\"\n")
+        webots.write_text(f"#!/bin/sh\n[ -e {cls.repaired} ] || exit 3\nexec \"{BIN / 'demo-simulator'}\" \"$@\"\n")
         webots.chmod(0o755)
         return Fleet(simulation={"webots": str(webots), "isolation": "none"})
 

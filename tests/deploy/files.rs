@@ -32,11 +32,11 @@ fn systemd_finds_no_fault_in_the_units() {
     for unit in units() {
         let folder = tempfile::tempdir().unwrap();
         let text = std::fs::read_to_string(&unit).unwrap();
-        // The programs are looked for where the package installs them.
-        let text = text.replace(
-            "/usr/bin/",
-            &format!("{}/", Path::new(env!("CARGO_BIN_EXE_session-server")).parent().unwrap().display()),
-        );
+        // The programs are looked for where the package installs them. The folder of those here may have a space in its name.
+        let programs = folder.path().join("programs");
+        let built = Path::new(env!("CARGO_BIN_EXE_session-server")).parent().unwrap();
+        std::os::unix::fs::symlink(built, &programs).unwrap();
+        let text = text.replace("/usr/bin/", &format!("{}/", programs.display()));
         let name = unit.file_name().unwrap().to_str().unwrap().replace('@', "@main");
         let copy = folder.path().join(name);
         std::fs::write(&copy, text).unwrap();

@@ -239,9 +239,9 @@ async fn temporary_folders_are_the_simulations_own_wherever_they_are() {
     std::fs::write(folder.path().join("secret"), "a secret").unwrap();
     let there = shown(&folder);
     let deeds = [
-        ("use it", format!("touch {there}/new.$$ && rm {there}/new.$$")),
+        ("use it", format!("touch '{there}'/new.$$ && rm '{there}'/new.$$")),
         ("use the usual ones", "touch /tmp/new.$$ /var/tmp/new.$$ && rm /tmp/new.$$".to_owned()),
-        ("read what others have there", format!("grep secret {there}/secret")),
+        ("read what others have there", format!("grep secret '{there}'/secret")),
     ];
     let done = stage.tried(&deeds, "sandbox", |builder| builder.env("TMPDIR", &there)).await;
     assert_eq!(done, ["use it", "use the usual ones"]);

@@ -37,8 +37,8 @@ async fn a_server_that_drains_keeps_its_clients_takes_no_others_and_ends_with_th
             assert_eq!(http::get(&server.url("/status")).await.json()["draining"], false);
             assert_eq!(drain("secret").await.unwrap().status(), 202);
         }
-        until("it drains", async || http::get(&server.url("/load")).await.text() == "100").await;
-        assert_eq!(http::get(&server.url("/status")).await.json()["draining"], true);
+        until("it drains", async || http::get(&server.url("/status")).await.json()["draining"] == true).await;
+        assert_eq!(http::get(&server.url("/load")).await.text(), "100");
         let mut late = Client::start(&server, &arm()).await;
         let told = late.until("loading: Error:").await;
         assert!(told.contains("about to end, and takes no new clients. Connect again"), "{told}");
