@@ -64,27 +64,36 @@ fn length(file: &Path) -> u64 {
     file.metadata().map_or(0, |about| about.len())
 }
 
-/// Waits until one of the directories exceeds its limit, in bytes.
+/// Waits until one of the directories exceeds its limit, in bytes, or has one in it that can't be read.
 pub async fn outgrown(folders: Vec<(PathBuf, u64)>) {
     loop {
         actix_rt::time::sleep(CHECK_INTERVAL).await;
         let looked_at = folders.clone();
-        let is_one = move || Ok(looked_at.iter().any(|(folder, most)| room_of(folder) > *most));
+        let is_one = move || Ok(looked_at.iter().any(|(folder, most)| is_beyond(folder, *most)));
         if blocking(is_one).await.is_ok_and(|is_one| is_one) {
             return;
         }
     }
 }
 
+fn is_beyond(folder: &Path, most: u64) -> bool {
+    let mut size = DiskUsage::new(measure, most);
+    size.add_folder(folder).is_err() || size.total() > most
+}
+
 /// What everything below a folder takes, each file and folder at least what a name takes of a disk. What nobody can look
 /// into does not count.
 pub fn room_of(folder: &Path) -> u64 {
-    sum(folder, |about| disk_usage::length(about).max(disk_usage::room(about)))
+    sum(folder, measure)
 }
 
 /// The bytes of all files below a folder.
 pub fn size_of(folder: &Path) -> u64 {
     sum(folder, disk_usage::length)
+}
+
+fn measure(about: &fs::Metadata) -> u64 {
+    disk_usage::length(about).max(disk_usage::room(about))
 }
 
 fn sum(folder: &Path, measure: fn(&fs::Metadata) -> u64) -> u64 {

@@ -7,7 +7,7 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use parking_lot::Mutex;
-use tokio::sync::{Notify, OwnedMutexGuard, watch};
+use tokio::sync::{Notify, OwnedMutexGuard, Semaphore, watch};
 
 use super::checkout_limits::CheckoutLimits;
 use super::disk::{blocking, received, remove_all, remove_leftovers};
@@ -29,17 +29,23 @@ pub struct Repository {
     growth: Arc<Notify>,
     /// Held by the task that changes the repository.
     lock: Arc<tokio::sync::Mutex<()>>,
+    /// Limits concurrent queries of the remote: a class may want as many worlds of one repository.
+    queries: Semaphore,
     /// The fetches in progress, by the name of the request.
     fetches: SingleFlight<String, Result<(), GitError>>,
     /// When it was created, if that was after this value was created.
     created: Mutex<Option<Instant>>,
 }
 
+/// Number of concurrent queries of a remote for one repository.
+const MAX_QUERIES: usize = 4;
+
 impl Repository {
     /// The repository at `path`, which need not exist yet, for commits of `remote`.
     pub fn new(path: PathBuf, remote: Remote, git: Arc<Git>, limits: CheckoutLimits, growth: Arc<Notify>) -> Self {
         let (lock, fetches, created) = (Arc::default(), SingleFlight::default(), Mutex::default());
-        Self { path, remote: Mutex::new(Arc::new(remote)), git, limits, growth, lock, fetches, created }
+        let queries = Semaphore::new(MAX_QUERIES);
+        Self { path, remote: Mutex::new(Arc::new(remote)), git, limits, growth, lock, queries, fetches, created }
     }
 
     /// Where it is fetched from.
@@ -126,6 +132,8 @@ impl Repository {
     /// # Errors
     /// When git fails.
     pub async fn ask(&self, arguments: &[impl AsRef<OsStr>]) -> Result<String, GitError> {
+        // It is never closed.
+        let _permit = self.queries.acquire().await.ok();
         let answer = self.run(Call { memory: LITTLE_MEMORY, ..self.call(arguments) }, |_| ()).await?;
         Ok(String::from_utf8_lossy(&answer).into_owned())
     }

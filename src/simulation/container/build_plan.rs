@@ -1,11 +1,15 @@
 //! The build plan of a checked-out project: its Dockerfiles, and the files that they need.
 
-use std::fs::File;
-use std::io::{self, Write};
+use std::fs::{File, OpenOptions};
+use std::io::{ErrorKind, Write};
+use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
+
+use nix::fcntl::OFlag;
 
 use super::dockerfile::Dockerfile;
 use super::project_file::text_of;
+use super::start_error::StartError;
 use super::templates::{CONTROLLER, DOCKERFILE, LAUNCHER, Templates};
 use super::webots_yml::{ProjectKind, WebotsYml};
 
@@ -59,7 +63,7 @@ fn competition(project: &Path, templates: &Templates) -> Result<String, String> 
     for folder in [project, &controllers] {
         // The project's own file stays.
         match File::create_new(folder.join(LAUNCHER)).and_then(|mut file| file.write_all(launcher.as_bytes())) {
-            Err(error) if error.kind() != io::ErrorKind::AlreadyExists => {
+            Err(error) if error.kind() != ErrorKind::AlreadyExists => {
                 return Err(format!("{LAUNCHER} can't be written: {error}"));
             }
             _ => {}
@@ -85,11 +89,19 @@ pub fn inside(project: &Path, folder: &Path) -> Result<PathBuf, String> {
 /// `controller "<extern>"` in the world.
 ///
 /// # Errors
-/// When the file can't be read or written, as text for the client.
-pub fn open_participant(world: &Path) -> Result<(), String> {
-    let open = |text: String| text.replace("controller \"participant\"", "controller \"<extern>\"");
-    let changed = std::fs::read_to_string(world).and_then(|text| std::fs::write(world, open(text)));
-    changed.map_err(|error| format!("The world can't be changed: {error}"))
+/// When the file can't be read or written: the project's fault if it is no text, or its image has closed or replaced it.
+pub fn open_participant(world: &Path) -> Result<(), StartError> {
+    let open = || {
+        let text = std::fs::read_to_string(world)?.replace("controller \"participant\"", "controller \"<extern>\"");
+        let flags = OFlag::O_NOFOLLOW.bits();
+        OpenOptions::new().write(true).truncate(true).custom_flags(flags).open(world)?.write_all(text.as_bytes())
+    };
+    open().map_err(|error| match error.kind() {
+        ErrorKind::InvalidData | ErrorKind::PermissionDenied => {
+            StartError::Project(format!("The world can't be changed: {error}"))
+        }
+        _ => error.into(),
+    })
 }
 
 /// The image of Webots for a version: up to R2023a on Ubuntu 20.04, later ones on 22.04.

@@ -184,6 +184,7 @@ fn result(command: String, ran: Result<Ran, RunError>, reason: String) -> Result
         Ok(_) if reason.is_empty() => Err(DockerError::Failed { command, message: "it says nothing".to_owned() }),
         Ok(_) => Err(DockerError::Failed { command, message: reason }),
         Err(RunError::Slow(limit)) => Err(DockerError::Slow { command, limit }),
+        Err(error @ RunError::TooLong) => Err(DockerError::Failed { command, message: error.to_string() }),
         Err(error) => Err(not_started(error.to_string())),
     }
 }

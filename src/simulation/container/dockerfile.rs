@@ -51,8 +51,9 @@ impl Dockerfile {
             let whole = line.trim_end_matches([' ', '\t']);
             let continued = whole.strip_suffix('\\');
             // Some versions of Docker continue such a line, others don't.
-            if continued.is_some_and(|before| before.ends_with('\\')) {
-                return Err(wrong(number, line, "a line ends with one backslash or none"));
+            let is_unclear = continued.map_or(words.ends_with('\\'), |before| before.ends_with('\\'));
+            if is_unclear || line.contains('\r') {
+                return Err(wrong(number, line, "a line ends with one backslash or none, and a line break"));
             }
             instruction.push_str(continued.unwrap_or(line));
             if continued.is_none() {
@@ -149,6 +150,9 @@ mod tests {
             r#"ADD ["http\u003a//a", "/x"]"#,
             "RUN a \\\\\nADD http://a /x",
             "RUN a \\\u{a0}\nADD http://a /x",
+            "ADD \\\r\r\nhttp://a /x",
+            "ADD \\\u{b}\nhttp://a /x",
+            "ADD \\\rhttp://a /x",
             "VOLUME /data",
             "volume \\\n /data",
             "ONBUILD VOLUME /data",

@@ -14,7 +14,7 @@ use super::docker::{Docker, DockerError, SHORT_TIMEOUT};
 use super::dockerfile::{Dockerfile, LABEL};
 use super::opened::{self, ImageConfig};
 use super::owned_resources::ResourceOwner;
-use super::start_error::{StartError, is_disk_full};
+use super::start_error::{StartError, blame, is_disk_full};
 use super::steps;
 use crate::simulation::checkout::{OnProgress, Project, SingleFlight};
 use crate::simulation::config::SimulationConfig;
@@ -154,7 +154,7 @@ impl Images {
         done.map_err(|error| not_built(&step, error))?;
         // It has no name of its own: it is removed with the image on top.
         let id = tokio::fs::read_to_string(id_file).await?;
-        self.open_now(&id, name, &project).await
+        self.open_now(&id, name, &project, true).await
     }
 
     /// Runs `docker build` with these options. `on_line` receives each line that it prints.
@@ -185,11 +185,13 @@ impl Images {
     ) -> Result<String, StartError> {
         let name = self.name(std::slice::from_ref(&id));
         let (this, tag, project) = (Arc::clone(self), name.clone(), Arc::clone(project));
-        self.once(name, progress, move |_| async move { this.open_now(&id, &tag, &project).await }).await
+        self.once(name, progress, move |_| async move { this.open_now(&id, &tag, &project, false).await }).await
     }
 
-    async fn open_now(&self, id: &str, name: &str, project: &Project) -> Result<(), StartError> {
-        let json = self.docker.run(&["image", "inspect", "--format", "{{json .Config}}", id], SHORT_TIMEOUT).await?;
+    /// `is_projects` tells whether the project has defined the image, which then is to blame.
+    async fn open_now(&self, id: &str, name: &str, project: &Project, is_projects: bool) -> Result<(), StartError> {
+        let inspect = ["image", "inspect", "--format", "{{json .Config}}", id];
+        let json = self.docker.run(&inspect, SHORT_TIMEOUT).await.map_err(|error| blame(is_projects, error))?;
         let text = ImageConfig::read(&json)?.dockerfile(id, self.owner.name());
         let context = project.instance.path().join(format!("opened-{}", opened::key(&[name.to_owned()])));
         let (dockerfile, folder) = (context.with_extension("Dockerfile"), context.clone());
@@ -197,11 +199,14 @@ impl Images {
         spawn_blocking(move || std::fs::write(file, text).and_then(|()| opened::write_programs(&folder))).await??;
         let options = ["--network", "none", "--tag", name].map(Into::into).to_vec();
         let done = self.run_build(options, dockerfile, context, |_| ()).await;
-        done.map_err(|error| match StartError::of_project(error) {
-            StartError::Project(why) => {
-                StartError::Project(format!("The image can't be prepared for this server's user: {why}"))
-            }
-            error @ StartError::Server(_) => error,
+        done.map_err(|error| match error {
+            DockerError::Slow { limit, .. } if is_projects => StartError::Project(too_slow(limit)),
+            error => match StartError::of_project(error) {
+                StartError::Project(why) => {
+                    StartError::Project(format!("The image can't be prepared for this server's user: {why}"))
+                }
+                error @ StartError::Server(_) => error,
+            },
         })
     }
 

@@ -13,7 +13,8 @@ use super::docker::{self, Docker, DockerError, SHORT_TIMEOUT};
 /// The label with which compose marks its projects.
 pub const PROJECT: &str = "com.docker.compose.project";
 
-/// Arguments of docker that list all containers of compose: the id and the project of each.
+/// Arguments of docker that list all containers of compose: the id and the project of each. A container inherits labels of
+/// its image, which a project may have made: a quoted beginning of it is one word on one line.
 pub const LIST: [&str; 7] = [
     "ps",
     "--all",
@@ -21,7 +22,7 @@ pub const LIST: [&str; 7] = [
     "--filter",
     "label=com.docker.compose.project",
     "--format",
-    "{{.ID}} {{.Label \"com.docker.compose.project\"}}",
+    "{{.ID}} {{printf \"%.100q\" (.Label \"com.docker.compose.project\")}}",
 ];
 
 /// The owner of compose projects and images: a server, or one run of it. Their names have a common prefix.
@@ -80,7 +81,8 @@ impl ResourceOwner {
     /// The containers of this owner in what [`LIST`] prints: the id and the project of each.
     pub fn containers<'list>(&self, list: &'list str) -> impl Iterator<Item = (&'list str, &'list str)> {
         let prefix = self.prefix();
-        list.lines().filter_map(|line| line.split_once(' ')).filter(move |(_, project)| project.starts_with(&prefix))
+        let lines = list.lines().filter_map(|line| line.strip_suffix('"')?.split_once(" \""));
+        lines.filter(move |(_, project)| project.starts_with(&prefix))
     }
 }
 

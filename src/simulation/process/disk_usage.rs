@@ -43,12 +43,6 @@ pub fn room(about: &Metadata) -> u64 {
     (about.blocks() * 512).max(SMALLEST)
 }
 
-/// What a folder takes of the disk; nothing where nobody can tell, since folders in it are closed or too deep.
-pub fn room_of(folder: &Path) -> Option<u64> {
-    let mut size = DiskUsage::new(room, u64::MAX);
-    size.add_folder(folder).ok().map(|()| size.total())
-}
-
 /// What is in a file.
 pub fn length(about: &Metadata) -> u64 {
     if about.is_dir() { 0 } else { about.len() }
