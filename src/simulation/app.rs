@@ -84,7 +84,7 @@ fn bound_clients(config: &SimulationConfig) -> Result<usize, AppError> {
     let places = config.max_connections;
     let needed = OWN_FILES + FILES_PER_SIMULATION * usize::from(places);
     // What is relayed has a connection on either side.
-    let each = if config.ports_are_public() { TCP_PER_CLIENT } else { 2 * TCP_PER_CLIENT };
+    let each = TCP_PER_CLIENT + 2 * streams_per_client(config);
     let wanted = config.max_clients.saturating_mul(each).saturating_add(needed);
     let files = raise_open_files(u64::try_from(wanted).unwrap_or(u64::MAX));
     let rest = usize::try_from(files).unwrap_or(usize::MAX).saturating_sub(needed);
@@ -176,8 +176,11 @@ fn bind(config: &SimulationConfig) -> Result<TcpListener, AppError> {
 
 /// Limit of TCP connections: those of clients, the same number for pages and other requests, and what is relayed.
 fn max_tcp(config: &SimulationConfig) -> usize {
-    let streams = if config.ports_are_public() { 0 } else { STREAMS_PER_CLIENT };
-    config.max_clients.saturating_mul(TCP_PER_CLIENT + streams)
+    config.max_clients.saturating_mul(TCP_PER_CLIENT + streams_per_client(config))
+}
+
+fn streams_per_client(config: &SimulationConfig) -> usize {
+    if config.ports_are_public() { 0 } else { STREAMS_PER_CLIENT }
 }
 
 /// Creates the server's state, and starts its actors.

@@ -76,23 +76,24 @@ async fn an_editor_is_at_the_port_of_its_webots_and_500_more(rules: Rules) {
 
 through_both!(an_editor_is_at_the_port_of_its_webots_and_500_more);
 
-/// A browser sends the administrator's password to every path of the host that it was asked for.
-async fn no_simulation_gets_a_password(rules: Rules) {
+/// A browser sends the administrator's password, and the cookie of who has signed in, to every path of their host.
+async fn no_simulation_gets_a_password_or_a_cookie(rules: Rules) {
     let fleet = Fleet::start(rules).await;
     let webots = fleet.here.port + 1;
     listen(TcpListener::bind(("127.0.0.1", webots)).unwrap(), |request| {
-        let told = request.head.to_lowercase().contains("authorization");
+        let head = request.head.to_lowercase();
+        let told = head.contains("authorization") || head.contains("cookie");
         Some((200, if told { "told" } else { "nothing" }))
     });
-    let password = [("authorization", "Basic YWRtaW46b3BlbiBzZXNhbWU=")];
+    let secrets = [("authorization", "Basic YWRtaW46b3BlbiBzZXNhbWU="), ("cookie", "_oauth2_proxy=SECRET")];
     let url = |port: u16| format!("https://{}/{port}/", fleet.browser.host);
-    assert_eq!(fleet.browser.ask(&url(webots), &password).await.text(), "nothing");
+    assert_eq!(fleet.browser.ask(&url(webots), &secrets).await.text(), "nothing");
     // The server itself does: its answer to a wrong one says so.
     let output = format!("{}output?id=none", url(fleet.here.port));
     assert_eq!(fleet.browser.ask(&output, &[]).await.status, 404);
 }
 
-through_both!(no_simulation_gets_a_password);
+through_both!(no_simulation_gets_a_password_or_a_cookie);
 
 async fn pages_are_sent_on_to_https_and_the_bare_name(rules: Rules) {
     let fleet = Fleet::start(rules).await;

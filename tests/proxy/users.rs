@@ -67,7 +67,8 @@ async fn who_signs_in_at_the_web_server_is_known_to_the_administrator() {
         (format!("/{port}/status#/{port}/stream/"), 302),
         (format!("/{port}/status/{port}/stream/"), 302),
         (format!("/{port}//assets/style.css"), 302),
-        (format!("/{}/stream/x", port + 1), 302),
+        (format!("/{}/stream/x", port + 1), 404),
+        (format!("/{}/{port}/stream/x", port + 1), 302),
     ] {
         let answer = visitor.get(&path).await;
         assert_eq!(answer.status.as_u16(), status, "{path}: {answer:?}");

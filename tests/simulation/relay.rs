@@ -279,6 +279,44 @@ async fn a_websocket_with_a_body_is_refused() {
 }
 
 #[actix_rt::test]
+async fn an_answer_without_a_body_ends_with_its_head() {
+    let played = Played::new(|builder| builder).await;
+    let (_client, path) = played.stage.start().await;
+    let headers = "Host: localhost\r\nIf-None-Match: \"x\"\r\nConnection: close\r\n";
+    let request = format!("GET {path}/a.png HTTP/1.1\r\n{headers}\r\n");
+    let webots = async {
+        let (mut socket, _) = played.listener.accept().await.unwrap();
+        let mut head = [0; 4096];
+        let length = socket.read(&mut head).await.unwrap();
+        socket.write_all(b"HTTP/1.1 304 Not Modified\r\nETag: \"x\"\r\n\r\n").await.unwrap();
+        String::from_utf8_lossy(&head[..length]).into_owned()
+    };
+    let (answer, head) = tokio::join!(played.stage.raw(&request), webots);
+    assert!(head.contains("\r\nIf-None-Match: \"x\"\r\n"), "{head}");
+    assert!(answer.starts_with("HTTP/1.1 304 ") && answer.split_once("\r\n\r\n").unwrap().1.is_empty(), "{answer}");
+}
+
+#[actix_rt::test]
+async fn a_stream_is_relayed_however_its_answer_begins() {
+    let played = Played::new(|builder| builder).await;
+    let (_client, path) = played.stage.start().await;
+    let upgrade = "Host: localhost\r\nConnection: upgrade\r\nUpgrade: websocket\r\nSec-WebSocket-Version: 13\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n";
+    let mut client = TcpStream::connect(("127.0.0.1", played.stage.server.port)).await.unwrap();
+    let request = format!("GET {path} HTTP/1.1\r\n{upgrade}Expect: 100-continue\r\n\r\n");
+    client.write_all(request.as_bytes()).await.unwrap();
+    let (socket, _) = played.listener.accept().await.unwrap();
+    let mut webots = tokio_tungstenite::accept_async(socket).await.unwrap();
+    webots.send(Message::text("a scene")).await.unwrap();
+    let mut answer = Vec::new();
+    let reads = async {
+        while !answer.ends_with(b"a scene") {
+            assert!(client.read_buf(&mut answer).await.unwrap() > 0, "it has ended");
+        }
+    };
+    actix_rt::time::timeout(SOON, reads).await.expect("what Webots has sent");
+}
+
+#[actix_rt::test]
 async fn only_administrators_read_ports_in_an_output() {
     for (mode, password, is_shown) in [("relay", false, false), ("relay", true, true), ("direct", false, true)] {
         let stage = Stage::new(|builder| {
@@ -377,9 +415,9 @@ async fn no_trick_leads_anywhere_else() {
     let (answer, head) = tokio::join!(stage.raw(&both), webots);
     let port = stage.server.port + 1;
     assert!(head.starts_with("GET /a.png?x=1 HTTP/1.1\r\n"), "{head}");
-    assert!(head.contains(&format!("\r\nhost: 127.0.0.1:{port}\r\n")), "{head}");
+    assert!(head.contains(&format!("\r\nHost: 127.0.0.1:{port}\r\n")), "{head}");
     let names: Vec<&str> = head.lines().skip(1).filter_map(|line| Some(line.split_once(':')?.0)).collect();
-    assert_eq!(names, ["content-length", "connection", "host", "date"], "{head}");
+    assert_eq!(names, ["Content-Length", "Connection", "Host", "Date"], "{head}");
     assert!(answer.starts_with("HTTP/1.1 302 Found\r\n") && !answer.contains("ocation:"), "{answer}");
     assert_eq!(answer.matches("HTTP/1.1 ").count(), 1, "{answer}");
     assert!(!stage.server.log().contains(&token[16..]));

@@ -159,8 +159,7 @@ impl AsyncRead for ClientStream {
             // End of input: actix has no more to do with what was handed over.
             return Poll::Ready(Ok(()));
         }
-        let is_leaving = self.state == State::WebSocket && self.upgrade.is_wanted();
-        if self.is_blocked || self.state == State::Answer || is_leaving {
+        if self.is_blocked || self.state == State::Answer || self.upgrade.is_wanted() {
             // The next write wakes the task, or the socket once it accepts more.
             return Poll::Pending;
         }
@@ -203,8 +202,7 @@ impl AsyncWrite for ClientStream {
 
     /// actix calls this when all of an answer is written.
     fn poll_flush(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
-        if self.state == State::WebSocket
-            && self.upgrade.is_wanted()
+        if self.upgrade.is_wanted()
             && let Some((tcp, permit)) = self.connection.take()
         {
             let read_buffer = std::mem::take(&mut self.unread);

@@ -1,5 +1,6 @@
 //! A file that Webots serves, or its video.
 
+use actix_web::http::StatusCode;
 use actix_web::http::header::{self, HeaderName};
 use actix_web::{HttpRequest, HttpResponse};
 use futures_util::StreamExt;
@@ -13,7 +14,8 @@ const FORWARDED_HEADERS: [HeaderName; 4] =
 /// Fetches a file of Webots, and forwards the answer as fast as the client reads it. `held` is dropped with the answer.
 pub async fn fetch(upstream: &Upstream, url: &str, request: &HttpRequest, held: impl std::any::Any) -> HttpResponse {
     // A connection that is kept could lead to another simulation on the same port later.
-    let mut query = upstream.client().get(url).no_decompress().force_close();
+    // Webots compares the names of headers letter by letter (WbTcpServer.cpp of R2025a).
+    let mut query = upstream.client().get(url).no_decompress().force_close().camel_case();
     if let Some(tag) = request.headers().get(header::IF_NONE_MATCH) {
         query = query.insert_header((header::IF_NONE_MATCH, tag));
     }
@@ -32,6 +34,9 @@ pub async fn fetch(upstream: &Upstream, url: &str, request: &HttpRequest, held: 
     // referrer, because its URL has the token.
     response.insert_header((header::CONTENT_SECURITY_POLICY, "sandbox allow-scripts"));
     response.insert_header((header::REFERRER_POLICY, "no-referrer"));
+    if matches!(answer.status(), StatusCode::NO_CONTENT | StatusCode::NOT_MODIFIED) {
+        return response.finish();
+    }
     let length = answer.headers().get(header::CONTENT_LENGTH).and_then(|length| length.to_str().ok()?.parse().ok());
     if let Some(length) = length {
         response.no_chunking(length);

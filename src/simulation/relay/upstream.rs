@@ -16,10 +16,13 @@ use actix_web::web::Bytes;
 use base64::Engine;
 use base64::prelude::BASE64_STANDARD;
 use futures_util::{SinkExt, StreamExt};
+use nix::sys::socket::{setsockopt, sockopt};
 use tokio_util::codec::Framed;
 
 /// Timeout of a simulation's answer.
 pub const ANSWER_TIMEOUT: Duration = Duration::from_secs(10);
+/// Timeout of what a simulation does not read, in milliseconds: until then nobody notices that the client has left.
+const STALL_TIMEOUT: u32 = 60_000;
 
 /// Reaches simulations on this machine.
 #[derive(Clone)]
@@ -67,6 +70,7 @@ pub async fn open_websocket(url: &str) -> io::Result<(TcpStream, Bytes)> {
     let tcp = TcpStream::connect(&authority).await?;
     // Messages are small, and must not wait until the one before is acknowledged.
     tcp.set_nodelay(true)?;
+    setsockopt(&tcp, sockopt::TcpUserTimeout, &STALL_TIMEOUT)?;
     let key = BASE64_STANDARD.encode(rand::random::<[u8; 16]>());
     let mut head = RequestHead::default();
     head.uri = uri;
