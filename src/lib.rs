@@ -12,11 +12,11 @@
 //! | [`shared::http`] | pages, live updates, WebSockets, limits, certificates, metrics |
 //! | [`session::placement`] | which server gets the next client: ranking, load, cost |
 //! | `session::announcements` | the administrator's message to all clients |
-//! | [`session::mail`] | notices: to whom, what is in them, when they go, by mail and by webhook |
+//! | [`session::mail`] | notices: to whom (`smtp`), what is in them (`notice_text`), when they go (`outbox`), by mail and by webhook |
 //! | [`session::fleet`] | the registry and the monitors of simulation servers |
 //! | [`session::web`] | routes, pages, `/status`, Prometheus metrics and the WebSocket of the session server |
 //! | [`simulation::process`] | process trees: how they start and end; directories of simulations |
-//! | [`simulation::machine`] | readings of the machine and its GPUs, the load |
+//! | [`simulation::machine`] | readings of the machine and its GPUs, the load; which GPU a simulation gets (`spread`) |
 //! | [`simulation::checkout`] | worlds checked out with git |
 //! | `simulation::isolation` | how a simulation is launched: its level of isolation, environment and limits |
 //! | [`simulation::container`] | simulations in containers: what a project requests, its image, its compose project |
@@ -32,7 +32,8 @@
 //! The HTML of pages is in `templates/session` and `templates/simulation`, their styles and scripts in `templates/assets`.
 //!
 //! Each server also has a folder `config` (every key), its `app` (start and end) and its `state` (what its paths share). Files
-//! of `simulation` are the wire [`protocol`](simulation::protocol), the `snapshot` of all simulations, the `simulation_id`, the `client_identity`, the `failed_starts`, the `announcer` (key `notify`), `preflight` (`--check`) and `readiness` (`/health`).
+//! of `simulation` are the wire [`protocol`](simulation::protocol), the `snapshot` of all simulations, the `simulation_id`, the
+//! `client_identity`, the `failed_starts`, the `announcer` (key `notify`), `preflight` (`--check`) and `readiness` (`/health`).
 //! The programs are in `src/bin`.
 //! Imports point down only, in the order that `tests/project/layering.rs` lists. `session` and `simulation` never see each
 //! other. A child never names its parent: it is given a `Recipient` of its events, which are defined in the child's file.

@@ -9,8 +9,7 @@ use super::copy::{root, walk};
 /// The rooms of the library from the bottom to the top: files and folders. Each may name those before it, and what is in
 /// it. `session` and `simulation` don't see each other.
 const SHARED: [&str; 5] = ["shared::text", "shared::config", "shared::domain", "shared::run", "shared::http"];
-const SESSION: [&str; 9] = [
-    "session::mail_address",
+const SESSION: [&str; 8] = [
     "session::placement",
     "session::config",
     "session::announcements",

@@ -302,7 +302,12 @@ impl Configuration for SimulationConfig {
             warnings.push(format!("displays has no effect: {why}"));
         }
         if self.allowed_repositories.is_empty() {
-            warnings.push("allowedRepositories is not set: no world will run here".to_owned());
+            let effect = if self.docker && self.share_idle_time > 0.0 {
+                format!("any repository runs while the load is at most {} % (shareIdleTime)", self.share_idle_time)
+            } else {
+                "no world will run here".to_owned()
+            };
+            warnings.push(format!("allowedRepositories is not set: {effect}"));
         }
         Ok(warnings)
     }
