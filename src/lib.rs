@@ -71,7 +71,7 @@
 //! guards, so that all three are freed in any state, even after a panic. One [`simulation::process::guardian`] process
 //! ends everything that the simulation server has started once the server has exited for any reason.
 //! One `simulation::isolation::Watcher` measures what each simulation uses, and finds the ports on which starting
-//! simulations listen.
+//! simulations listen. One thread copies all streams that are relayed.
 //!
 //! # What ends, and what restarts
 //!

@@ -28,7 +28,7 @@
 //! Webots' page inserts every TEXT into `innerHTML`: it passes through [`client_text`] and [`without_paths`] here, and
 //! nowhere else.
 
-use serde::Deserialize;
+use serde::{Deserialize, Deserializer};
 use serde_json::Value;
 
 use crate::shared::text::{client_text, without_paths};
@@ -79,19 +79,27 @@ pub struct ClientRequestError(String);
 /// A message as JSON; unknown fields are ignored.
 #[derive(Deserialize)]
 struct WireMessage {
-    #[serde(rename = "reset controller")]
+    #[serde(rename = "reset controller", default, deserialize_with = "value")]
     reset_controller: Option<String>,
+    #[serde(default, deserialize_with = "value")]
     resume: Option<String>,
     keep: Option<bool>,
+    #[serde(default, deserialize_with = "value")]
     start: Option<WireStart>,
 }
 
 #[derive(Deserialize)]
+#[serde(expecting = "an object with a url")]
 struct WireStart {
     url: String,
     mode: Option<Mode>,
     resumable: Option<bool>,
     name: Option<String>,
+}
+
+/// Reads a field that is there: `null` is no request, and the client would wait for an answer.
+fn value<'de, D: Deserializer<'de>, T: Deserialize<'de>>(field: D) -> Result<Option<T>, D::Error> {
+    T::deserialize(field).map(Some)
 }
 
 impl ClientRequest {
@@ -281,6 +289,8 @@ mod tests {
                 "start.resumable: invalid type: integer `1`, expected a boolean",
             ),
             (r#"{"start":{"url":"x","name":{}}}"#, "start.name: invalid type: map, expected a string"),
+            (r#"{"resume":null}"#, "resume: invalid type: null, expected a string"),
+            (r#"{"start":"URL"}"#, "start: invalid type: string \"URL\", expected an object with a url"),
             (r#"{"resume":5}"#, "resume: invalid type: integer `5`, expected a string"),
             (r#"{"keep":5}"#, "keep: invalid type: integer `5`, expected a boolean"),
             (r#"{"reset controller":5}"#, "reset controller: invalid type: integer `5`, expected a string"),

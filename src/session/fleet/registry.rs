@@ -4,6 +4,7 @@
 //! and every pick, so that a pick counts at once. It starts a monitor for each simulation server and for each name that
 //! resolves to some, and a new one after a panic.
 
+use std::mem::discriminant;
 use std::net::IpAddr;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -130,7 +131,14 @@ impl Registry {
         let failed_starts = answer.as_ref().ok().map(|report| report.failed_starts);
         let change = match answer {
             Ok(report) => record.succeeded(report, at, self.fleet.limit(server).unwrap_or(self.config.load_threshold)),
-            Err(error) => record.failed(error),
+            Err(error) => {
+                let is_another =
+                    record.error.as_ref().is_some_and(|before| discriminant(before) != discriminant(&error));
+                if is_another {
+                    log::info!("{server}: still down: {error}");
+                }
+                record.failed(error)
+            }
         };
         match record.for_placement() {
             Some(report) => self.fleet.report(server, at, report),

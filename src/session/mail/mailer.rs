@@ -1,6 +1,6 @@
 //! Actor: sends notices to the administrator on one channel, by mail or by webhook.
 //!
-//! Created by the app, and again by the registry if it has panicked; only if it is configured. It accepts [`Notice`]s.
+//! Created by the registry, again if it has panicked; only if it is configured. It accepts [`Notice`]s.
 //! [`Outbox`] decides what is sent, and when. One batch is sent at a time; nothing waits for it.
 
 use std::time::{Duration, Instant};

@@ -36,9 +36,15 @@ pub fn read_timestamp(text: &str) -> Option<SystemTime> {
         return humantime::parse_rfc3339(text).ok();
     };
     let number = |tens: u8, ones: u8| u64::from(tens - b'0') * 10 + u64::from(ones - b'0');
-    let ahead = Duration::from_secs(3600 * number(h1, h2) + 60 * number(m1, m2));
+    let (hours, minutes) = (number(h1, h2), number(m1, m2));
+    // humantime takes a second Z.
+    if hours > 23 || local.ends_with('Z') {
+        return None;
+    }
+    let ahead = Duration::from_secs(3600 * hours + 60 * minutes);
     let time = humantime::parse_rfc3339(&format!("{local}Z")).ok()?;
-    if sign == b'+' { time.checked_sub(ahead) } else { time.checked_add(ahead) }
+    let time = if sign == b'+' { time.checked_sub(ahead) } else { time.checked_add(ahead) };
+    time.filter(|time| !timestamp(*time).is_empty())
 }
 
 /// Returns the current time in seconds since 1970-01-01 UTC.
@@ -81,6 +87,9 @@ mod tests {
             "2026-11-22T22:17:17+1:00",
             "2026-11-22T22:17:17+01:60",
             "2026-11-22T22:17:17+0100",
+            "2026-11-22T22:17:17Z+01:00",
+            "2026-11-22T22:17:17+25:00",
+            "9999-12-31T23:59:59-23:00",
         ] {
             assert_eq!(read_timestamp(text), None, "{text}");
         }

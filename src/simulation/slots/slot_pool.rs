@@ -297,6 +297,12 @@ impl SlotLease {
         self.report(Report::Event(event));
     }
 
+    /// Logs an event of the simulation under its id, and records what everybody may read of it.
+    pub fn log_privately(&self, level: log::Level, event: &str, shown: String) {
+        log::log!(target: "simulation", level, "{}: {event}", self.id);
+        self.report(Report::Event(shown));
+    }
+
     /// Reports how the simulation ends, before the lease is dropped. Only the first report counts.
     pub fn end(&self, reason: EndReason, why: &str, taken: Taken) {
         self.report(Report::End(End { reason, why: why.to_owned(), taken }));

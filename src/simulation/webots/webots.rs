@@ -164,9 +164,9 @@ impl Webots {
             return self.stop(EndReason::NoWebots, &why);
         }
         if port != self.port {
-            self.log(Level::Warn, &format!("it was taken, Webots listens on {}", self.name(port)));
+            self.log(Level::Warn, "it was taken, Webots has chosen another");
         }
-        self.spec.slot.lease.log(Level::Info, format!("{}: ready", self.name(port)));
+        self.log_on(port, Level::Info, "ready");
         self.listening = true;
         self.last_heartbeat = Instant::now();
         self.spec.slot.lease.update(SimulationChange::Port(port));
@@ -257,15 +257,17 @@ impl Webots {
     }
 
     fn log(&self, level: Level, event: &str) {
-        self.spec.slot.lease.log(level, format!("{}: {event}", self.name(self.port)));
+        self.log_on(self.port, level, event);
     }
 
-    /// A port as `/output` shows it: without a password everybody reads that, and a relayed stream is reached by its token
-    /// only.
-    fn name(&self, port: u16) -> String {
+    /// Logs an event with its port. Without a password everybody reads `/output`, and a relayed stream is reached by its
+    /// token only: then it has no port.
+    fn log_on(&self, port: u16, level: Level, event: &str) {
         let config = &self.spec.config;
         let is_shown = config.ports_are_public() || config.admin_password.is_some();
-        if is_shown { format!("port {port}") } else { "a port".to_owned() }
+        let line = format!("port {port}: {event}");
+        let shown = if is_shown { line.clone() } else { event.to_owned() };
+        self.spec.slot.lease.log_privately(level, &line, shown);
     }
 }
 
