@@ -98,12 +98,11 @@ class OneDoor(Fleet):
             session=("192.0.2.1:1999", self.session.address),
             machines=(r"192\\\.0\\\.2\\\.\[0-9\]\+", r"127\.0\.0\.[23]"),
             # What the file's head says of streams that are relayed: the location of Webots' own ports goes.
-            streams=(r"  # Their simulations, and editors\..*?\n  }\n", ""),
+            streams=(r'  # Only for simulation servers with "streaming": "direct".*?\n  }\n', ""),
             servers=(r"\(\?<fleet_port>2000\)", f"(?<fleet_port>{servers})"),
-            password=(r"  2000    \$http_authorization;", f"  ~^(?:{servers})$ $http_authorization;"),
-            users=(r"(  proxy_set_header Authorization[^\n]*\n)",
-                   f"  proxy_set_header Authorization $fleet_authorization;\n  include {folder}/users.conf;\n"),
-            log=("/var/log/nginx/access.log", f"{folder}/access.log"))
+            users=(r"  proxy_set_header Cookie[^\n]*\n",
+                   f"  proxy_set_header Cookie $fleet_cookie;\n  include {folder}/users.conf;\n"),
+            log=("/var/log/nginx/access.log", f"{folder}/access.log"), errors=("/var/log/nginx/error.log", f"{folder}/error.log"))
         (folder / "site.conf").write_text(site)
         temporary = "".join(f"{name}_temp_path {folder}/{name};\n" for name in ("client_body", "proxy", "fastcgi", "uwsgi", "scgi"))
         (folder / "nginx.conf").write_text(

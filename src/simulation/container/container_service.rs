@@ -2,6 +2,7 @@
 
 use std::path::Path;
 use std::sync::Arc;
+use std::time::Duration;
 
 use actix_rt::task::spawn_blocking;
 use tokio::sync::{OnceCell, Semaphore};
@@ -10,7 +11,7 @@ use tokio_util::task::AbortOnDropHandle;
 use super::build_plan::{self, BuildPlan, PROJECT_PATH};
 use super::compose_project::{ComposeProject, container_of};
 use super::container_request::ContainerRequest;
-use super::docker::{Docker, SHORT_TIMEOUT};
+use super::docker::Docker;
 use super::docker_features::DockerFeatures;
 use super::dockerfile::Dockerfile;
 use super::image::{ImageBuild, Images};
@@ -44,6 +45,9 @@ pub struct ContainerService {
     config: Arc<SimulationConfig>,
     _keeper: AbortOnDropHandle<()>,
 }
+
+/// Timeout of the creation of a simulation's containers: the disk of Docker may be busy with images of others.
+const CREATE_TIMEOUT: Duration = Duration::from_mins(2);
 
 impl ContainerService {
     /// Opens the service on the thread of this runtime. `run` is the directory of this run of the server. Removes what
@@ -184,7 +188,7 @@ impl ContainerService {
         let turn = self.turns.acquire().await.map_err(|error| StartError::Server(error.to_string()))?;
         progress(steps::CREATING.to_owned());
         let words = options.into_iter().map(Into::into).chain(["up", "--no-start", "--no-build"].map(Into::into));
-        let created = self.docker.compose(words.collect(), variables, SHORT_TIMEOUT).await;
+        let created = self.docker.compose(words.collect(), variables, CREATE_TIMEOUT).await;
         created.map_err(|error| blame(is_projects, error))?;
         drop(turn);
         // An editor has a port of its own, which the relay of streams does not reach.
