@@ -95,15 +95,17 @@ impl Client {
     fn receive(&self, text: ByteString, ctx: &mut WebsocketContext<Self>) {
         match Arc::clone(&self.incoming).try_acquire_owned() {
             Ok(permit) => self.simulation.do_send(Event::Received(self.id, text, permit)),
-            Err(_) => end(ctx, Some(CloseCode::Policy.into())),
+            Err(_) => self.end(ctx, Some(CloseCode::Policy.into())),
         }
     }
-}
 
-/// Sends a close frame and ends without waiting for an answer.
-fn end(ctx: &mut WebsocketContext<Client>, reason: Option<CloseReason>) {
-    ctx.close(reason);
-    ctx.stop();
+    /// Sends a close frame, unless it has sent one, and ends without waiting for an answer.
+    fn end(&self, ctx: &mut WebsocketContext<Self>, reason: Option<CloseReason>) {
+        if !self.closing {
+            ctx.close(reason);
+        }
+        ctx.stop();
+    }
 }
 
 impl Actor for Client {
@@ -123,13 +125,14 @@ impl Actor for Client {
 impl StreamHandler<Result<ws::Message, ws::ProtocolError>> for Client {
     fn handle(&mut self, message: Result<ws::Message, ws::ProtocolError>, ctx: &mut Self::Context) {
         match message {
-            Ok(ws::Message::Close(_)) if self.closing => ctx.stop(),
-            Ok(ws::Message::Close(reason)) => end(ctx, reason),
+            Ok(ws::Message::Close(reason)) => self.end(ctx, reason),
             Ok(ws::Message::Text(text)) => self.receive(text, ctx),
             Ok(ws::Message::Ping(data)) => ctx.pong(&data),
             Ok(ws::Message::Pong(_) | ws::Message::Nop) => (),
-            Ok(ws::Message::Binary(_) | ws::Message::Continuation(_)) => end(ctx, Some(CloseCode::Unsupported.into())),
-            Err(_) => end(ctx, Some(CloseCode::Protocol.into())),
+            Ok(ws::Message::Binary(_) | ws::Message::Continuation(_)) => {
+                self.end(ctx, Some(CloseCode::Unsupported.into()));
+            }
+            Err(_) => self.end(ctx, Some(CloseCode::Protocol.into())),
         }
     }
 }
@@ -139,7 +142,7 @@ impl Handler<Outgoing> for Client {
 
     fn handle(&mut self, message: Outgoing, ctx: &mut Self::Context) {
         match message {
-            _ if self.updates.is_closed() => end(ctx, Some(CloseCode::Policy.into())),
+            _ if self.updates.is_closed() => self.end(ctx, Some(CloseCode::Policy.into())),
             // Nothing may follow a close frame (RFC 6455, section 5.5.1).
             Outgoing::Text(..) if self.closing => {}
             Outgoing::Text(text, permit) => {

@@ -80,10 +80,16 @@ pub async fn run_cleanup(
         let is_full = actix_rt::task::spawn_blocking(move || is_disk_full(reserve)).await.unwrap_or_default();
         if is_full || pruned.is_none_or(|at| at.elapsed() > PRUNE_INTERVAL) {
             let hours = if is_full { MIN_AGE } else { 24 * config.container.images_age };
-            if let Err(error) = images.prune(hours).await {
-                log::warn!("images that nobody needs are not removed: {error}");
+            match images.prune(hours).await {
+                // Docker prunes for one at a time, also of other servers.
+                Err(error) if error.to_string().contains("already running") => pause = RETRY_INTERVAL,
+                done => {
+                    if let Err(error) = done {
+                        log::warn!("images that nobody needs are not removed: {error}");
+                    }
+                    pruned = Some(Instant::now());
+                }
             }
-            pruned = Some(Instant::now());
         }
     }
 }
