@@ -6,6 +6,9 @@ if [ "$1" = --inside ]; then
     shift
     ip link set lo up
     ip link add eth0 type veth peer name eth1
+    # Else the kernel adds addresses of IPv6 a second later.
+    ip link set eth0 addrgenmode none
+    ip link set eth1 addrgenmode none
     ip link set eth1 up
     ip link set eth0 up
     ip address add 192.0.2.2/24 dev eth0
