@@ -109,9 +109,9 @@ pub async fn serve(assembly: Application) -> Result<(), AppError> {
         trusted_proxies: server.config.trusted_proxies.clone(),
     };
     let simulations = server.launcher.reached().unwrap_or_else(|| server.config.address_of_simulations().into());
-    let stream_thread = Arbiter::new().handle();
+    let (stream_thread, silence) = (Arbiter::new().handle(), options.silence);
     let app = move || {
-        let upstream = Upstream::new(simulations, stream_thread.clone());
+        let upstream = Upstream::new(simulations, stream_thread.clone(), silence);
         App::new().app_data(shared.clone()).app_data(upstream).configure(configure)
     };
     let http = server::serve(socket, server.connections.clone(), options, app)?;

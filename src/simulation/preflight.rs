@@ -49,8 +49,8 @@ pub fn check(config: &SimulationConfig) -> Vec<Finding> {
     let streams = (is_shared && !config.ports_are_public()).then(|| streams(config));
     let forgeable = is_shared && config.user_header.is_some() && config.trusted_proxies.trusts_loopback();
     let users = forgeable.then(|| {
-        let why = "worlds' programs can pose as any user, for they share this machine's network, whose loopback is in \
-                   trustedProxies";
+        let why = "worlds' programs can pose as any user, because they share this machine's network, and trustedProxies \
+                   contains its loopback";
         Finding { topic: "userHeader", result: Err(why.to_owned()) }
     });
     let isolation = Finding { topic: "isolation", result: launcher.and_then(|launcher| isolation(&launcher)) };
@@ -159,8 +159,8 @@ fn streams(config: &SimulationConfig) -> Finding {
     let result = match packet_filter::closes_streams() {
         Some(true) => Ok("relayed; the packet filter keeps others from the ports of Webots".to_owned()),
         Some(false) => Err(format!(
-            "whoever reaches ports {first} to {last} steers a simulation, for Webots shares this machine's network and no \
-             packet filter closes them (table webots_streams); see docs/deployment-web-server.md"
+            "anybody who reaches ports {first} to {last} can control simulations: Webots shares this machine's network, \
+             and no packet filter closes them (table webots_streams); see docs/deployment-web-server.md"
         )),
         None => Ok(format!("relayed; the firewall has to close ports {first} to {last}, on which Webots listens")),
     };

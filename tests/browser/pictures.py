@@ -35,10 +35,10 @@ TERMINAL = """
     <pre>%s</pre>"""
 
 
-def start(browser, demo, world, width=360, height=300):
-    """A page of the viewer on which a world runs. Small ones cost little to draw."""
+def start(browser, demo, world, width=360, height=300, name=""):
+    """A page of the viewer on which somebody of this name runs a world. Small ones cost little to draw."""
     page = browser.page(width=width, height=height)
-    page.tab.goto(f"http://{demo.session}/viewer")
+    page.tab.goto(f"http://{demo.session}/viewer?name={name}")
     expect(page.tab.locator("#light.on")).to_be_visible()
     page.tab.get_by_role("button", name=world).click()
     page.tab.get_by_role("button", name="Connect", exact=True).click()
@@ -120,22 +120,12 @@ def pages(browser, demo, folder):
         one.close()
 
 
-def student(browser, demo, name, world, width=WIDTH):
-    """A page on which somebody of this name runs a world."""
-    page = browser.page(width=width, height=860)
-    page.tab.goto(f"http://{demo.session}/viewer?name={name}")
-    expect(page.tab.locator("#light.on")).to_be_visible()
-    page.tab.get_by_role("button", name=world).click()
-    page.tab.get_by_role("button", name="Connect", exact=True).click()
-    page.tab.get_by_role("button", name="Play", exact=True).click()
-    return page
-
-
 def a_class(browser, demo, folder):
     """What a teacher has of a class: who is who, watching, stopping, announcing, a list of 200 on a phone."""
     hosts = {"localhost"}
     credentials = {"username": "teacher", "password": PASSWORD}
-    anna, ben = student(browser, demo, "Anna", "Playground"), student(browser, demo, "Ben", "Carousel", width=360)
+    anna = start(browser, demo, "Playground", width=WIDTH, height=860, name="Anna")
+    ben = start(browser, demo, "Carousel", height=860, name="Ben")
     others = browser.page(width=360, height=300)
     others.tab.goto(f"http://{demo.session}/viewer")
     start_all(others, NAMES[2:12], lambda name: None, PLAYGROUND)

@@ -68,13 +68,15 @@ async fn what_an_earlier_run_has_left_is_removed_and_nothing_of_others() {
     };
     let (mine, other) = (owner.project(2001), "webots-fleet-000000000000-2001-0".to_owned());
     let containers = [make(&mine), make(&other)];
+    // The label of an image may have any text, and its containers inherit it.
+    let forged = make(&format!("x\n{} {mine}", containers[1]));
     let _server = server(forge.path(), 1).folder(folder.path()).start().await;
     let is_there = |container: &str| {
         !ask(&["ps", "--all", "--quiet", "--no-trunc", "--filter", &format!("id={container}")]).is_empty()
     };
     until("what it left is gone", async || !is_there(&containers[0])).await;
     assert!(is_there(&containers[1]));
-    ask(&["rm", &containers[1]]);
+    ask(&["rm", &containers[1], &forged]);
 }
 
 #[actix_rt::test]

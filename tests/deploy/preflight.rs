@@ -120,6 +120,21 @@ fn displays_that_do_not_fit_the_gpus_are_warned_about() {
 }
 
 #[test]
+fn whose_worlds_run_is_warned_about_where_the_configuration_does_not_say() {
+    for (keys, effect) in [
+        (json!({"isolation": "none", "allowedRepositories": []}), "no world will run here"),
+        (
+            json!({"docker": true, "allowedRepositories": []}),
+            "any repository runs while the load is at most 50 % (shareIdleTime)",
+        ),
+        (json!({"docker": true, "shareIdleTime": 0, "allowedRepositories": []}), "no world will run here"),
+    ] {
+        let told = check(&keys, |_| ()).1;
+        assert!(told.contains(&format!("allowedRepositories is not set: {effect}")), "{keys}: {told}");
+    }
+}
+
+#[test]
 fn what_weakens_a_relay_in_a_shared_network_is_warned_about() {
     let told = |keys: &Value| check(keys, |_| ()).1;
     let words = "worlds' programs can pose as any user";
@@ -135,7 +150,7 @@ fn what_weakens_a_relay_in_a_shared_network_is_warned_about() {
     let relay = json!({"isolation": "none", "streaming": "relay", "port": 3000, "maxConnections": 20});
     let is_root = nix::unistd::geteuid().is_root();
     let words = if is_root {
-        "warning: streams: whoever reaches ports 3001 to 3020 steers a simulation"
+        "warning: streams: anybody who reaches ports 3001 to 3020 can control simulations"
     } else {
         "\nstreams: relayed; the firewall has to close ports 3001 to 3020"
     };

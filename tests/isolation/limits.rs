@@ -207,6 +207,16 @@ async fn a_simulation_has_a_control_group_of_its_own_where_they_are_delegated() 
     }
 }
 
+/// A folder for others, if they can run these programs.
+fn open_to_others() -> Option<tempfile::TempDir> {
+    if super::deeds::as_nobody().is_none() && nix::unistd::getuid().is_root() {
+        return None;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::set_permissions(folder.path(), std::os::unix::fs::PermissionsExt::from_mode(0o777)).unwrap();
+    Some(folder)
+}
+
 /// What a program says that may start so many threads and processes, itself among them, as a user who has no other.
 fn said_within(processes: u32, program: &str, arguments: &[&str]) -> String {
     let mut command = std::process::Command::new("timeout");
@@ -222,11 +232,7 @@ fn said_within(processes: u32, program: &str, arguments: &[&str]) -> String {
 
 #[test]
 fn programs_that_may_start_no_thread_say_so_and_do_not_panic() {
-    if super::deeds::as_nobody().is_none() && nix::unistd::getuid().is_root() {
-        return;
-    }
-    let folder = tempfile::tempdir().unwrap();
-    std::fs::set_permissions(folder.path(), std::os::unix::fs::PermissionsExt::from_mode(0o755)).unwrap();
+    let Some(folder) = open_to_others() else { return };
     let (world, config) = (folder.path().join("a.wbt"), folder.path().join("config.json"));
     std::fs::write(&world, "#VRML_SIM R2025a utf8\n").unwrap();
     std::fs::write(&config, "{\"display\": \":59\", \"isolation\": \"none\"}").unwrap();
@@ -239,11 +245,7 @@ fn programs_that_may_start_no_thread_say_so_and_do_not_panic() {
 
 #[test]
 fn a_server_that_may_start_too_few_processes_says_so_in_one_line() {
-    if super::deeds::as_nobody().is_none() && nix::unistd::getuid().is_root() {
-        return;
-    }
-    let folder = tempfile::tempdir().unwrap();
-    std::fs::set_permissions(folder.path(), std::os::unix::fs::PermissionsExt::from_mode(0o777)).unwrap();
+    let Some(folder) = open_to_others() else { return };
     let path = |name| folder.path().join(name);
     let simulation = json!({"port": 64_999, "bind": "127.0.0.1", "server": "localhost", "allowedRepositories": ["https://h/r"],
         "logDir": path("log"), "cacheDir": path("cache"), "isolation": "none"});

@@ -143,6 +143,17 @@ async fn the_log_goes_to_a_file_that_is_rotated() {
 }
 
 #[actix_rt::test]
+async fn the_log_has_each_new_reason_why_a_server_is_down() {
+    let server = StandIn::start(Manner::Reset);
+    let session = session_server(&addresses(std::slice::from_ref(&server))).set("loadRefresh", 0.05).start().await;
+    until("it is down", async || session.log().contains(": down: no connection")).await;
+    server.set(Manner::Body(500, Vec::new()));
+    until("the other reason is there", async || session.log().contains(": still down: an answer that makes no sense"))
+        .await;
+    assert_eq!(times_logged(&session, ": still down: "), 1);
+}
+
+#[actix_rt::test]
 async fn port_0_takes_a_free_port_and_says_which() {
     let session = session_server(&[]).set("port", 0).set("portRewrite", true).spawn();
     let line = async || session.log().lines().find(|line| line.starts_with("session server ")).map(str::to_owned);

@@ -266,6 +266,23 @@ async fn streams_have_connections_of_their_own() {
 }
 
 #[actix_rt::test]
+async fn a_webots_that_does_not_read_holds_no_connection_of_a_client_that_has_left() {
+    let played =
+        Played::new(|builder| builder.set("maxClients", 1).set("timing", json!({"ping": 0.5, "silence": 1}))).await;
+    let (_client, path) = played.stage.start().await;
+    let mut deaf = Vec::new();
+    for _ in 0..7 {
+        let (mut viewer, webots) = played.connect(&path).await;
+        // As much as fits, and then no more.
+        let flood = async { while viewer.send(Message::binary(vec![0; 1 << 20])).await.is_ok() {} };
+        actix_rt::time::timeout(Duration::from_millis(300), flood).await.ok();
+        drop(viewer);
+        deaf.push(webots);
+    }
+    until("there is room again", async || played.stage.refused(&path).await != 503).await;
+}
+
+#[actix_rt::test]
 async fn a_websocket_with_a_body_is_refused() {
     let stage = Stage::new(|builder| builder).await;
     let upgrade = "Host: localhost\r\nConnection: upgrade\r\nUpgrade: websocket\r\nSec-WebSocket-Version: 13\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n";

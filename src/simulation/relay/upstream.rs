@@ -21,8 +21,6 @@ use tokio_util::codec::Framed;
 
 /// Timeout of a simulation's answer.
 pub const ANSWER_TIMEOUT: Duration = Duration::from_secs(10);
-/// Timeout of what a simulation does not read, in milliseconds: until then nobody notices that the client has left.
-const STALL_TIMEOUT: u32 = 60_000;
 
 /// Reaches simulations on this machine.
 #[derive(Clone)]
@@ -30,16 +28,18 @@ pub struct Upstream {
     client: awc::Client,
     address: IpAddr,
     stream_thread: ArbiterHandle,
+    silence: Duration,
 }
 
 impl Upstream {
-    /// Reaches them at this address. Streams are copied on this thread.
+    /// Reaches them at this address. Streams are copied on this thread. A simulation has `silence` to read what was sent to
+    /// it: until then nobody notices that its client has left.
     #[must_use]
-    pub fn new(address: IpAddr, stream_thread: ArbiterHandle) -> Self {
+    pub fn new(address: IpAddr, stream_thread: ArbiterHandle, silence: Duration) -> Self {
         let connector = awc::Connector::new().limit(0);
         // Redirects are not followed, and an answer may take as long as the simulation.
         let client = awc::Client::builder().connector(connector).disable_timeout().disable_redirects();
-        Self { client: client.no_default_headers().finish(), address, stream_thread }
+        Self { client: client.no_default_headers().finish(), address, stream_thread, silence }
     }
 
     /// The client.
@@ -60,33 +60,34 @@ impl Upstream {
         let (mark, query) = query.map_or(("", ""), |query| ("?", query));
         format!("http://{}{path}{mark}{query}", SocketAddr::from((self.address, port)))
     }
-}
 
-/// Opens the WebSocket at this URL of a simulation. Returns the connection, and what was read of it after the handshake.
-pub async fn open_websocket(url: &str) -> io::Result<(TcpStream, Bytes)> {
-    let invalid = |problem: &str| io::Error::new(io::ErrorKind::InvalidData, problem.to_owned());
-    let uri: Uri = url.parse().map_err(io::Error::other)?;
-    let authority = uri.authority().ok_or_else(|| invalid("no address"))?.as_str().to_owned();
-    let tcp = TcpStream::connect(&authority).await?;
-    // Messages are small, and must not wait until the one before is acknowledged.
-    tcp.set_nodelay(true)?;
-    setsockopt(&tcp, sockopt::TcpUserTimeout, &STALL_TIMEOUT)?;
-    let key = BASE64_STANDARD.encode(rand::random::<[u8; 16]>());
-    let mut head = RequestHead::default();
-    head.uri = uri;
-    head.set_connection_type(ConnectionType::Upgrade);
-    head.headers.insert(header::UPGRADE, HeaderValue::from_static("websocket"));
-    head.headers.insert(header::SEC_WEBSOCKET_VERSION, HeaderValue::from_static("13"));
-    for (name, value) in [(header::HOST, &authority), (header::SEC_WEBSOCKET_KEY, &key)] {
-        head.headers.insert(name, HeaderValue::from_str(value).map_err(io::Error::other)?);
+    /// Opens the WebSocket at this URL of a simulation, as awc does, which does not give its TCP connection away. Returns
+    /// the connection, and what was read of it after the handshake.
+    pub async fn open_websocket(&self, url: &str) -> io::Result<(TcpStream, Bytes)> {
+        let invalid = |problem: &str| io::Error::new(io::ErrorKind::InvalidData, problem.to_owned());
+        let uri: Uri = url.parse().map_err(io::Error::other)?;
+        let authority = uri.authority().ok_or_else(|| invalid("no address"))?.as_str().to_owned();
+        let tcp = TcpStream::connect(&authority).await?;
+        // Messages are small, and must not wait until the one before is acknowledged.
+        tcp.set_nodelay(true)?;
+        setsockopt(&tcp, sockopt::TcpUserTimeout, &u32::try_from(self.silence.as_millis()).unwrap_or(u32::MAX))?;
+        let key = BASE64_STANDARD.encode(rand::random::<[u8; 16]>());
+        let mut head = RequestHead::default();
+        head.uri = uri;
+        head.set_connection_type(ConnectionType::Upgrade);
+        head.headers.insert(header::UPGRADE, HeaderValue::from_static("websocket"));
+        head.headers.insert(header::SEC_WEBSOCKET_VERSION, HeaderValue::from_static("13"));
+        for (name, value) in [(header::HOST, &authority), (header::SEC_WEBSOCKET_KEY, &key)] {
+            head.headers.insert(name, HeaderValue::from_str(value).map_err(io::Error::other)?);
+        }
+        let mut framed = Framed::new(tcp, ClientCodec::default());
+        framed.send((RequestHeadType::Owned(head), BodySize::None).into()).await?;
+        let answer = framed.next().await.ok_or(io::ErrorKind::UnexpectedEof)?.map_err(io::Error::other)?;
+        let accept = answer.headers.get(header::SEC_WEBSOCKET_ACCEPT).map(HeaderValue::as_bytes);
+        if answer.status != StatusCode::SWITCHING_PROTOCOLS || accept != Some(&hash_key(key.as_bytes())[..]) {
+            return Err(invalid("the handshake has failed"));
+        }
+        let parts = framed.into_parts();
+        Ok((parts.io, parts.read_buf.freeze()))
     }
-    let mut framed = Framed::new(tcp, ClientCodec::default());
-    framed.send((RequestHeadType::Owned(head), BodySize::None).into()).await?;
-    let answer = framed.next().await.ok_or(io::ErrorKind::UnexpectedEof)?.map_err(io::Error::other)?;
-    let accept = answer.headers.get(header::SEC_WEBSOCKET_ACCEPT).map(HeaderValue::as_bytes);
-    if answer.status != StatusCode::SWITCHING_PROTOCOLS || accept != Some(&hash_key(key.as_bytes())[..]) {
-        return Err(invalid("the handshake has failed"));
-    }
-    let parts = framed.into_parts();
-    Ok((parts.io, parts.read_buf.freeze()))
 }

@@ -15,7 +15,7 @@ use actix_web_actors::ws;
 use futures_util::future::{self, Either};
 use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt};
 
-use super::upstream::{ANSWER_TIMEOUT, Upstream, open_websocket};
+use super::upstream::{ANSWER_TIMEOUT, Upstream};
 use super::view_requests;
 use crate::shared::http::upgrade;
 
@@ -42,7 +42,7 @@ pub async fn connect(
             return HttpResponse::build(status).body(format!("Error: this is a WebSocket: {error}."));
         }
     };
-    let (webots, from_webots) = match timeout(ANSWER_TIMEOUT, open_websocket(url)).await {
+    let (webots, from_webots) = match timeout(ANSWER_TIMEOUT, upstream.open_websocket(url)).await {
         Ok(Ok(opened)) => opened,
         Ok(Err(_)) => return HttpResponse::BadGateway().body("Error: the simulation does not answer."),
         Err(_) => return HttpResponse::GatewayTimeout().body("Error: the simulation does not answer."),
