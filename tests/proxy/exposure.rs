@@ -4,6 +4,7 @@ use std::net::TcpListener;
 
 use super::fleet::Fleet;
 use super::rules::{Place, Rules};
+use super::users::oauth2_proxy;
 use super::web_server::{Kind, WebServer};
 use crate::support::listener::listen;
 use crate::support::ports;
@@ -76,24 +77,34 @@ async fn an_editor_is_at_the_port_of_its_webots_and_500_more(rules: Rules) {
 
 through_both!(an_editor_is_at_the_port_of_its_webots_and_500_more);
 
-/// A browser sends the administrator's password, and the cookie of who has signed in, to every path of their host.
-async fn no_simulation_gets_a_password_or_a_cookie(rules: Rules) {
+/// A browser sends the administrator's password, and the cookie of who has signed in, to every path of their host; the web server
+/// tells simulation servers who that is.
+async fn no_simulation_gets_a_secret(rules: Rules) {
     let fleet = Fleet::start(rules).await;
+    let visitor = fleet.browser.at("127.0.0.9");
     let webots = fleet.here.port + 1;
     listen(TcpListener::bind(("127.0.0.1", webots)).unwrap(), |request| {
         let head = request.head.to_lowercase();
-        let told = head.contains("authorization") || head.contains("cookie");
-        Some((200, if told { "told" } else { "nothing" }))
+        let secrets = ["authorization", "cookie", "x-forwarded-user", "anna"];
+        Some((200, if secrets.iter().any(|secret| head.contains(secret)) { "told" } else { "nothing" }))
     });
-    let secrets = [("authorization", "Basic YWRtaW46b3BlbiBzZXNhbWU="), ("cookie", "_oauth2_proxy=SECRET")];
+    let secrets = [("authorization", "Basic YWRtaW46b3BlbiBzZXNhbWU="), ("cookie", "_oauth2_proxy=anna")];
     let url = |port: u16| format!("https://{}/{port}/", fleet.browser.host);
-    assert_eq!(fleet.browser.ask(&url(webots), &secrets).await.text(), "nothing");
+    assert_eq!(visitor.ask(&url(webots), &secrets).await.text(), "nothing");
     // The server itself does: its answer to a wrong one says so.
     let output = format!("{}output?id=none", url(fleet.here.port));
     assert_eq!(fleet.browser.ask(&output, &[]).await.status, 404);
 }
 
-through_both!(no_simulation_gets_a_password_or_a_cookie);
+#[actix_rt::test]
+async fn no_simulation_gets_a_secret_through_apache() {
+    no_simulation_gets_a_secret(Rules::ApacheWithUsers).await;
+}
+
+#[actix_rt::test]
+async fn no_simulation_gets_a_secret_through_nginx() {
+    no_simulation_gets_a_secret(Rules::NginxWithUsers(oauth2_proxy().await)).await;
+}
 
 async fn pages_are_sent_on_to_https_and_the_bare_name(rules: Rules) {
     let fleet = Fleet::start(rules).await;

@@ -7,6 +7,8 @@ use super::web_server::Kind;
 pub enum Rules {
     /// `deploy/apache.conf`
     Apache,
+    /// The same, where somebody has signed in.
+    ApacheWithUsers,
     /// `deploy/nginx.conf`
     Nginx,
     /// The same with `deploy/nginx-users.conf`, and oauth2-proxy on this port.
@@ -37,7 +39,7 @@ impl Rules {
     /// Where a client finds the session server's door.
     pub fn session_path(self, session: u16, path: &str) -> String {
         match self {
-            Self::Apache | Self::Nginx | Self::NginxWithUsers(_) => path.to_owned(),
+            Self::Apache | Self::ApacheWithUsers | Self::Nginx | Self::NginxWithUsers(_) => path.to_owned(),
             Self::Documents => format!("/{session}{path}"),
         }
     }
@@ -70,6 +72,11 @@ impl Rules {
                     ("192.0.2.3", "127.0.0.2"),
                 ],
             ),
+            Self::ApacheWithUsers => {
+                let last = "  RequestHeader unset X-Forwarded-User early\n";
+                let user = "  RequestHeader set X-Forwarded-User anna@lab.example\n";
+                adapt(&Self::Apache.text(place), &[(last, &format!("{last}{user}"))])
+            }
             Self::NginxWithUsers(port) => {
                 let changes = [("4180", port.to_string()), ("2000|3000", format!("{}|{}", here[0], there[0]))];
                 let changes = changes.each_ref().map(|(from, to)| (*from, to.as_str()));

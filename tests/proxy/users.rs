@@ -9,7 +9,7 @@ use crate::support::client::Client;
 use crate::support::http::PASSWORD;
 
 /// A stand-in for oauth2-proxy: whose cookie is a name has signed in with it.
-async fn oauth2_proxy() -> u16 {
+pub async fn oauth2_proxy() -> u16 {
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let port = listener.local_addr().unwrap().port();
     actix_rt::spawn(async move {
