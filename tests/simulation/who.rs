@@ -46,7 +46,12 @@ async fn a_name_is_for_administrators_alone_and_never_markup() {
     let mut client = start(&server, &[("x-forwarded-user", user)], Some(label)).await;
     client.until("webots:").await;
     let id = client.id().to_owned();
-    for text in [page(&server).await, event(&server).await] {
+    let watch = server.url(&format!("/watch?id={id}"));
+    let watched = get_as_administrator(&watch).await.text();
+    assert!(watched.contains(&format!("href=\"{}\"", arm())) && watched.contains(">a.wbt</a>"), "{watched}");
+    let refused = http::get(&watch).await;
+    assert_eq!((refused.status.as_u16(), refused.text().contains("anna")), (401, false));
+    for text in [page(&server).await, event(&server).await, watched] {
         assert!(text.contains("anna@lab") && text.contains("alert(1)") && text.contains("unverified"), "{text}");
         assert!(!text.contains("<b>anna") && !text.contains("<script>alert"), "{text}");
     }

@@ -216,12 +216,12 @@ fn text_of(seconds_since_1970: u64) -> String {
 const SEPARATORS: [&str; 4] = ["/-/", "/blob/", "/tree/", "/src/"];
 
 /// The URL of a world as a link, in which nothing is invisible or turns letters around.
-fn link(url: &str) -> String {
+pub fn link(url: &str) -> String {
     Url::parse(url).map_or_else(|_| one_line(url), String::from)
 }
 
 /// The repository of a world, and the name of its file, from its URL.
-fn names(url: &str) -> (String, String) {
+pub fn names(url: &str) -> (String, String) {
     let path = url.split_once("://").map_or(url, |(_, path)| path);
     let (repository, file) = SEPARATORS.iter().find_map(|word| path.split_once(word)).unwrap_or((path, path));
     (one_line(repository), one_line(file.rsplit('/').next().unwrap_or(file)))

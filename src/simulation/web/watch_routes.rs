@@ -4,17 +4,23 @@ use actix_web::{HttpRequest, HttpResponse, web};
 use askama::Template;
 use serde::Deserialize;
 
+use super::pages::{link, names};
+use super::queries::{snapshot, too_busy};
 use super::webots_viewer;
 use crate::shared::http::routing::{GET, READ, path};
 use crate::shared::http::{ContentSecurityPolicy, html, own_sources, require_administrator};
+use crate::simulation::snapshot::Simulation;
 use crate::simulation::state::AppState;
 
 /// The page `/watch`.
 #[derive(Template)]
 #[template(path = "simulation/watch.html")]
-struct Watch<'id> {
+struct Watch<'one> {
     version: &'static str,
-    id: &'id str,
+    one: &'one Simulation,
+    link: String,
+    repository: String,
+    world: String,
     /// The path of the stream, with a token for one connection.
     stream: String,
     /// Webots' own viewer, where this server has it.
@@ -48,13 +54,21 @@ async fn watch(request: HttpRequest, which: web::Query<Which>, server: web::Data
     if let Some(refusal) = require_administrator(server.admin_auth.as_ref(), &request, peer) {
         return refusal;
     }
-    let Some(token) = server.streams.watch(&which.id) else {
+    let Some(snapshot) = snapshot(&server).await else {
+        return too_busy();
+    };
+    let one = snapshot.simulations.iter().find(|one| one.id.to_string() == which.id);
+    let Some((one, token)) = one.zip(server.streams.watch(&which.id)) else {
         return HttpResponse::NotFound().body("Error: this simulation does not stream, or too many watch.");
     };
     let installed = webots_viewer::folder(&server.config).map(|_| webots_viewer::PATH);
+    let (repository, world) = names(&one.world);
     let page = Watch {
         version: env!("CARGO_PKG_VERSION"),
-        id: &which.id,
+        one,
+        link: link(&one.world),
+        repository,
+        world,
         stream: format!("stream/{}", token.reveal()),
         script: installed.filter(|_| which.viewer != "small"),
     };
