@@ -74,8 +74,6 @@ pub fn without_paths(text: &str) -> String {
 
 #[cfg(test)]
 mod tests {
-    use proptest::prelude::*;
-
     use super::*;
 
     #[test]
@@ -107,15 +105,6 @@ mod tests {
             ("Step 3/9 : fetching", "Step 3/9 : fetching"),
         ] {
             assert_eq!(without_paths(text), shown, "{text:?}");
-        }
-    }
-
-    proptest! {
-        #[test]
-        fn no_folder_of_a_path_is_shown(before in "[a-z '(=]{0,9}[ '(=]", folders in "(/[a-z0-9.]{1,9}){1,5}", after in "[ a-z.]{0,9}") {
-            let path = format!("/secret{folders}/name");
-            let shown = without_paths(&format!("{before}{path}{after}"));
-            prop_assert!(!shown.contains("secret") && shown.contains("name"), "{}", shown);
         }
     }
 

@@ -300,18 +300,4 @@ mod tests {
             assert!(error.contains(words), "{text}: {error}");
         }
     }
-
-    #[test]
-    fn answers_are_those_of_the_original() {
-        assert_eq!(webots("wss://host/2001"), "webots:wss://host/2001");
-        assert_eq!(shutdown_timeout(7200), "shutdownTimeout: 7200");
-        assert_eq!(error("no"), "loading: Error: no");
-        assert_eq!(queue(3), ["queue: 3", "loading: waiting for a place, 3 clients are ahead"]);
-    }
-
-    #[test]
-    fn no_text_to_a_client_is_html() {
-        let texts = [loading("<b>"), error("<b>"), reset_controller("<b>")];
-        assert!(texts.iter().all(|text| !text.contains(['<', '>'])), "{texts:?}");
-    }
 }

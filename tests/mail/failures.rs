@@ -7,7 +7,7 @@ use serde_json::json;
 use webots_fleet::session::mail::{NoticeKind, test_mail};
 
 use super::log::{logged, wait_for_log};
-use super::{config, notice, start};
+use super::{loaded, notice, start};
 use crate::support::ports::dead_port;
 use crate::support::smtp::Smtp;
 use crate::support::stopwatch::Stopwatch;
@@ -20,7 +20,7 @@ async fn what_a_server_refuses_is_named() {
         (&["--login", "fleet:s3cret"], "530 5.7.0 Authentication required"),
     ] {
         let smtp = Smtp::start(options).await;
-        let error = test_mail(&config(smtp.port, &json!({}))).await.unwrap_err().to_string();
+        let error = test_mail(&loaded(smtp.port, &json!({}))).await.unwrap_err().to_string();
         assert_eq!(error, format!("127.0.0.1:{}: {words}", smtp.port));
     }
 }
@@ -28,7 +28,7 @@ async fn what_a_server_refuses_is_named() {
 #[actix_rt::test]
 async fn a_test_mail_says_how_it_went() {
     let mut smtp = Smtp::start(&[]).await;
-    let said = test_mail(&config(smtp.port, &json!({}))).await.unwrap();
+    let said = test_mail(&loaded(smtp.port, &json!({}))).await.unwrap();
     let port = smtp.port;
     let words = format!("127.0.0.1:{port} (not encrypted) took a mail for admin@example.org: 2.0.0 OK: queued");
     assert_eq!(said, words);
@@ -40,11 +40,11 @@ async fn a_test_mail_says_how_it_went() {
 #[actix_rt::test]
 async fn a_dead_host_is_named() {
     let (_reserved, dead) = dead_port();
-    let error = test_mail(&config(dead, &json!({}))).await.unwrap_err().to_string();
+    let error = test_mail(&loaded(dead, &json!({}))).await.unwrap_err().to_string();
     assert!(error.starts_with(&format!("127.0.0.1:{dead}: Connection refused")), "{error}");
     // A label of 64 letters can't be in any name server, so that none is asked.
     let nobody = format!("{}.example.org", "a".repeat(64));
-    let error = test_mail(&config(25, &json!({"mailServer": nobody}))).await.unwrap_err().to_string();
+    let error = test_mail(&loaded(25, &json!({"mailServer": nobody}))).await.unwrap_err().to_string();
     assert!(error.starts_with(&format!("{nobody}:25: failed to lookup address information")), "{error}");
 }
 
@@ -81,17 +81,6 @@ async fn a_mail_is_given_up_with_one_line() {
     mailer.send(notice("new", NoticeKind::NotResponding)).await.unwrap();
     assert_eq!(smtp.mail().await.subject(), "Simulation server not responding: new:2000");
     assert_eq!(logged(Level::Error, port).len(), 1);
-}
-
-#[actix_rt::test]
-async fn what_is_refused_for_good_is_tried_seldom_and_given_up() {
-    let mut smtp = Smtp::start(&["--refuse", "recipient"]).await;
-    let mailer = start(smtp.port, &json!({"timing": {"mailRetry": 0.01, "mailPatience": 1.2}}));
-    mailer.send(notice("sim", NoticeKind::NotResponding)).await.unwrap();
-    let lines = wait_for_log(Level::Error, smtp.port, 1).await;
-    assert!(lines[0].contains("550 5.1.1 no such user here"), "{lines:?}");
-    let tries = smtp.count("opened");
-    assert!((2..=8).contains(&tries), "{tries} tries; every 0.2 s for 1.2 s was asked for");
 }
 
 #[actix_rt::test]

@@ -4,7 +4,6 @@ mod failures;
 mod log;
 mod login;
 mod notices;
-mod own_process;
 mod settings;
 
 use std::time::SystemTime;
@@ -22,7 +21,7 @@ use self::log::{keep_log, logged};
 const LOGIN: &[&str] = &["--login", "fleet:s3cret"];
 
 /// A configuration for mails to this port of this machine; `more` replaces and adds keys.
-fn config(port: u16, more: &Value) -> SessionConfig {
+fn config(port: u16, more: &Value) -> Value {
     let mut keys = json!({
         "server": "session.example.org",
         "ssl": true,
@@ -32,6 +31,7 @@ fn config(port: u16, more: &Value) -> SessionConfig {
         "mailServer": "127.0.0.1",
         "mailServerPort": port,
         "mailSender": "fleet@example.org",
+        "mailSenderUser": "fleet",
         "timing": {"gather": 0.1, "flapping": 0.6, "mailRetry": 0.1, "mailPatience": 60, "mailAnswer": 10},
     });
     for (key, value) in more.as_object().unwrap() {
@@ -40,24 +40,19 @@ fn config(port: u16, more: &Value) -> SessionConfig {
             _ => keys[key] = value.clone(),
         }
     }
-    let mut config: SessionConfig = serde_json::from_value(keys).unwrap();
+    keys
+}
+
+/// The same as the server has it.
+fn loaded(port: u16, more: &Value) -> SessionConfig {
+    let mut config: SessionConfig = serde_json::from_value(config(port, more)).unwrap();
     assert_eq!(config.complete(std::path::Path::new("main.json")).unwrap(), [""; 0]);
     config
 }
 
-fn with_password(password: &str) -> Value {
-    json!({"mailSenderUser": "fleet", "mailSenderPassword": password})
-}
-
-fn with(keys: &Value, more: &Value) -> Value {
-    let mut keys = keys.as_object().unwrap().clone();
-    keys.extend(more.as_object().unwrap().clone());
-    Value::Object(keys)
-}
-
 fn start(port: u16, more: &Value) -> Addr<Mailer> {
     keep_log();
-    mail::start(&config(port, more), Channel::Mail).expect("mails are on")
+    mail::start(&loaded(port, more), Channel::Mail).expect("mails are on")
 }
 
 fn notice(host: &str, event: NoticeKind) -> Notice {

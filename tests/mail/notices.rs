@@ -34,24 +34,6 @@ async fn a_notice_becomes_a_mail_in_plain_text() {
 }
 
 #[actix_rt::test]
-async fn each_event_has_its_subject() {
-    let mut smtp = Smtp::start(&[]).await;
-    let mailer = start(smtp.port, &json!({}));
-    for (host, event, subject) in [
-        ("a", NoticeKind::NotResponding, "Simulation server not responding: a:2000"),
-        ("b", NoticeKind::WorkingAgain, "Simulation server working again: b:2000"),
-        ("c", NoticeKind::MaximumLoad, "Simulation server reached maximum load: c:2000"),
-        ("d", NoticeKind::AvailableAgain, "Simulation server available again: d:2000"),
-        ("dns+e", NoticeKind::LookupFails, "Lookup of simulation servers failing: dns+e:2000"),
-        ("dns+f", NoticeKind::LookupWorks, "Lookup of simulation servers working again: dns+f:2000"),
-    ] {
-        mailer.send(notice(host, event)).await.unwrap();
-        assert_eq!(smtp.mail().await.subject(), subject);
-    }
-    nothing_unexpected(smtp.port);
-}
-
-#[actix_rt::test]
 async fn a_thousand_servers_that_fail_together_are_one_mail() {
     let mut smtp = Smtp::start(&[]).await;
     let mailer = start(smtp.port, &json!({"timing": {"gather": 3}}));

@@ -38,9 +38,7 @@ async fn verdict(certificate: &Certificate, trusted: &Authority) -> String {
     let (_web, port) = web_server(certificate).await;
     let mut smtp = Smtp::start(&[]).await;
     let session = watcher(&format!("localhost:{port}/2000")).env("SSL_CERT_FILE", trusted.file().to_str().unwrap());
-    let session = session.set("administrator", "admin@example.org").set("mailSender", "fleet@example.org");
-    let session = session.set("mailServer", "127.0.0.1").set("mailServerPort", smtp.port).set("timing.gather", 0.1);
-    let session = session.start().await;
+    let session = session.mails_to(smtp.port).set("timing.gather", 0.1).start().await;
     let error = page_of_the_server(&session, "down").await["error"].as_str().unwrap().to_owned();
     assert!(session.log().contains(&error), "{error} is not in the log");
     assert!(http::get(&session.url("/monitor")).await.text().contains("its certificate is not trusted"));

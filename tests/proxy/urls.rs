@@ -14,11 +14,7 @@ fn first_url(text: &str) -> &str {
 async fn urls_lead_through_the_web_server(rules: Rules) {
     let mut smtp = Smtp::start(&[]).await;
     let port = smtp.port;
-    let fleet = Fleet::start_with(rules, |server| {
-        let server = server.set("administrator", "admin@example.org").set("mailSender", "fleet@example.org");
-        server.set("mailServer", "127.0.0.1").set("mailServerPort", port)
-    })
-    .await;
+    let fleet = Fleet::start_with(rules, |server| server.mails_to(port)).await;
     let Fleet { browser, session, here, there, .. } = fleet;
 
     // A page, and what its parts are told.

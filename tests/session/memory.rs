@@ -8,7 +8,7 @@ use socket2::{Domain, Socket, Type};
 
 use super::until_states;
 use crate::support::program::{Server, session_server};
-use crate::support::{SOON, http};
+use crate::support::http;
 
 const CLIENTS: usize = 100;
 /// How long they send, at most.
@@ -83,28 +83,4 @@ async fn live_pages_that_read_nothing_cost_little() {
     fill(&mut first, b"GET /events HTTP/1.1\r\nHost: x\r\n\r\n").await;
     let cost = cost(&session, b"GET /events HTTP/1.1\r\nHost: x\r\n\r\n").await;
     assert!(cost < LIMIT, "{cost} bytes");
-}
-
-#[actix_rt::test]
-async fn requests_that_come_at_once_are_answered_in_their_order() {
-    let session = session_server(&[]).start().await;
-    let (sent, read) = (200, std::io::Read::read_to_end);
-    let mut client = TcpStream::connect(session.address()).unwrap();
-    client.set_read_timeout(Some(SOON)).unwrap();
-    let request = |number| match number % 2 {
-        0 => "GET /health HTTP/1.1\r\nHost: x\r\n\r\n",
-        _ => "GET /load HTTP/1.1\r\nHost: x\r\n\r\n",
-    };
-    let requests: String = (0..sent).map(request).collect();
-    let answers = actix_rt::task::spawn_blocking(move || {
-        client.write_all(requests.as_bytes()).unwrap();
-        client.write_all(b"GET /health HTTP/1.1\r\nHost: x\r\nConnection: close\r\n\r\n").unwrap();
-        let mut answers = Vec::new();
-        read(&mut client, &mut answers).unwrap();
-        String::from_utf8(answers).unwrap()
-    });
-    let answers = answers.await.unwrap();
-    let bodies = answers.split("\r\n\r\n").skip(1).map(|part| part.split("HTTP/1.1").next().unwrap());
-    let expected = (0..=sent).map(|number| if number % 2 == 0 { "ok" } else { "-1" });
-    assert!(bodies.eq(expected), "{answers}");
 }

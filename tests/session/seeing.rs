@@ -19,6 +19,7 @@ async fn a_refusal_carries_a_time_to_come_back_that_is_drawn_at_random() {
             http::get(&session.url(&format!("/session?url={}", world("lab/arm", "main", "worlds/a.wbt")))).await;
         assert_eq!(refused.status, 503);
         assert_eq!(refused.text(), "Error: no simulation server available at the moment.");
+        assert_eq!(refused.header("access-control-expose-headers"), Some("Retry-After"));
         seconds.insert(refused.header("retry-after").unwrap().parse::<u32>().unwrap());
     }
     assert_eq!(seconds, HashSet::from([2, 3, 4, 5, 6]));
@@ -70,17 +71,6 @@ async fn the_status_tells_all_of_each_server() {
     for server in &servers {
         assert!(page.text().contains(&server.address()));
     }
-}
-
-#[actix_rt::test]
-async fn what_a_server_says_is_data_on_the_page_and_in_the_log() {
-    let evil = "<script>alert(1)</script>\r\n2026-01-01T00:00:00Z [ERROR] forged";
-    let servers = [StandIn::start(Manner::Body(200, evil.as_bytes().to_vec()))];
-    let session = session_server(&addresses(&servers)).start().await;
-    until_states(&session, &["down"]).await;
-    let page = http::get(&session.url("/monitor")).await.text();
-    assert!(!page.contains("<script>alert"), "{page}");
-    assert!(session.log().lines().all(|line| !line.starts_with("2026-01-01T00:00:00Z [ERROR]")));
 }
 
 #[actix_rt::test]
@@ -195,15 +185,6 @@ async fn a_fault_of_the_configuration_is_one_line_and_exit_code_2() {
 }
 
 #[actix_rt::test]
-async fn a_port_that_is_taken_is_one_line_and_exit_code_1() {
-    let taken = StandIn::start(Manner::Hang);
-    let mut session = session_server(&[]).set("port", taken.port()).spawn();
-    assert_eq!(session.ended().await, Some(1));
-    let said = session.log();
-    assert!(said.contains(&format!("error: can't listen on {}: ", taken.address())), "{said}");
-}
-
-#[actix_rt::test]
 async fn what_watches_over_servers_may_ask_for_the_head_alone() {
     let session = session_server(&[]).start().await;
     for path in ["/health", "/status", "/monitor"] {
@@ -233,14 +214,18 @@ async fn the_mean_load_is_that_of_all_who_answer() {
 }
 
 #[actix_rt::test]
-async fn what_hides_or_turns_letters_around_is_shown_as_such() {
+async fn what_a_server_says_is_data_on_the_page_and_in_the_log_and_hides_nothing() {
+    let evil = "<script>alert(1)</script>\r\n2026-01-01T00:00:00Z [ERROR] forged";
     let hidden = "1\u{202e}gpj\u{200b}.exe\u{2028}";
     let repository = "https://github.com/lab\u{202e}bal";
     let status = json!({"load": 1, "version": hidden, "allowedRepositories": [repository]});
-    let servers = [Manner::Status(status), Manner::Body(200, format!("{hidden}\n").into_bytes())].map(StandIn::start);
+    let bodies = [format!("{hidden}\n"), evil.to_owned()].map(|text| Manner::Body(200, text.into_bytes()));
+    let servers: Vec<_> = [Manner::Status(status)].into_iter().chain(bodies).map(StandIn::start).collect();
     let session = session_server(&addresses(&servers)).start().await;
-    until_states(&session, &["up", "down"]).await;
+    until_states(&session, &["up", "down", "down"]).await;
     let page = http::get(&session.url("/monitor")).await.text();
+    assert!(!page.contains("<script>alert"), "{page}");
+    assert!(session.log().lines().all(|line| !line.starts_with("2026-01-01T00:00:00Z [ERROR]")));
     assert!(page.contains("1\u{fffd}gpj\u{fffd}.exe") && page.contains("lab\u{fffd}bal"), "{page}");
     for text in [page, session.log()] {
         assert!(!text.contains(['\u{202e}', '\u{200b}', '\u{2028}']), "{text}");

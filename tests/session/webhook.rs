@@ -25,12 +25,8 @@ fn with_webhook(servers: &[StandIn], scheme: &str, port: u16) -> Builder {
 }
 
 /// Three servers that work, which the session server knows.
-async fn fleet() -> Vec<StandIn> {
-    let mut servers = Vec::new();
-    for _ in 0..3 {
-        servers.push(StandIn::start(Manner::idle(7.0, 10)));
-    }
-    servers
+fn fleet() -> Vec<StandIn> {
+    (0..3).map(|_| StandIn::start(Manner::idle(7.0, 10))).collect()
 }
 
 async fn fail(session: &Server, servers: &[StandIn]) {
@@ -46,7 +42,7 @@ fn says_nothing_secret(session: &Server) {
 
 #[actix_rt::test]
 async fn the_notices_of_a_mail_are_one_message_and_need_no_mail() {
-    let (servers, receiver) = (fleet().await, Receiver::start(None).await);
+    let (servers, receiver) = (fleet(), Receiver::start(None).await);
     let session = with_webhook(&servers, "http", receiver.port).start().await;
     fail(&session, &servers).await;
     let text = receiver.texts(1).await.remove(0);
@@ -76,12 +72,10 @@ async fn the_notices_of_a_mail_are_one_message_and_need_no_mail() {
 
 #[actix_rt::test]
 async fn a_message_that_is_not_taken_is_tried_again_and_so_is_a_mail_for_itself() {
-    let (servers, receiver) = (fleet().await, Receiver::start(None).await);
+    let (servers, receiver) = (fleet(), Receiver::start(None).await);
     receiver.answer("503 Busy");
     let mut smtp = Smtp::start(&[]).await;
-    let builder = with_webhook(&servers, "http", receiver.port);
-    let builder = builder.set("administrator", "admin@example.org").set("mailSender", "fleet@example.org");
-    let session = builder.set("mailServer", "127.0.0.1").set("mailServerPort", smtp.port).start().await;
+    let session = with_webhook(&servers, "http", receiver.port).mails_to(smtp.port).start().await;
     fail(&session, &servers).await;
     // The mail does not wait for the messenger.
     assert_eq!(smtp.mail().await.subject(), "3 simulation servers not responding");
@@ -99,9 +93,7 @@ async fn a_message_that_is_not_taken_is_tried_again_and_so_is_a_mail_for_itself(
         server.set(Manner::idle(7.0, 10));
     }
     let before = receiver.posted().len();
-    let builder = with_webhook(&servers, "http", receiver.port);
-    let builder = builder.set("administrator", "admin@example.org").set("mailSender", "fleet@example.org");
-    let session = builder.set("mailServer", "127.0.0.1").set("mailServerPort", dead).start().await;
+    let session = with_webhook(&servers, "http", receiver.port).mails_to(dead).start().await;
     fail(&session, &servers).await;
     receiver.texts(before + 1).await;
     until("the mail is tried", async || session.log().contains("mail not sent, next try in")).await;
@@ -113,7 +105,7 @@ async fn a_messenger_whose_certificate_is_not_trusted_is_told_nothing() {
     let (lab, other) = (Authority::new(), Authority::new());
     let receiver = Receiver::start(Some(&lab.issue(&["localhost"]))).await;
     for (authority, trusted) in [(&other, false), (&lab, true)] {
-        let servers = fleet().await;
+        let servers = fleet();
         let builder = with_webhook(&servers, "https", receiver.port);
         let session = builder.env("SSL_CERT_FILE", authority.file().to_str().unwrap()).start().await;
         fail(&session, &servers).await;
@@ -130,7 +122,7 @@ async fn a_messenger_whose_certificate_is_not_trusted_is_told_nothing() {
 
 #[actix_rt::test]
 async fn a_redirect_leads_notices_to_nobody_else() {
-    let (servers, receiver, other) = (fleet().await, Receiver::start(None).await, Receiver::start(None).await);
+    let (servers, receiver, other) = (fleet(), Receiver::start(None).await, Receiver::start(None).await);
     receiver.answer(&format!("307 Elsewhere\r\nLocation: http://127.0.0.1:{}/", other.port));
     let session = with_webhook(&servers, "http", receiver.port).start().await;
     fail(&session, &servers).await;

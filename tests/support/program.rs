@@ -71,6 +71,12 @@ impl Builder {
         self
     }
 
+    /// Has a session server send mails to an SMTP server on this machine.
+    pub fn mails_to(self, port: u16) -> Self {
+        let addressed = self.set("administrator", "admin@example.org").set("mailSender", "fleet@example.org");
+        addressed.set("mailServer", "127.0.0.1").set("mailServerPort", port)
+    }
+
     /// Sets a variable of the environment.
     pub fn env(mut self, name: &str, value: &str) -> Self {
         self.environment.push((name.to_owned(), value.to_owned()));

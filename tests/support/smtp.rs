@@ -118,10 +118,6 @@ impl Mail {
         self.0["to"].as_array().unwrap().iter().map(|to| to.as_str().unwrap()).collect()
     }
 
-    pub fn is_encrypted(&self) -> bool {
-        self.0["encrypted"] == true
-    }
-
     /// The values of a header.
     pub fn header(&self, name: &str) -> Vec<&str> {
         let headers = self.0["headers"].as_array().unwrap().iter();

@@ -159,15 +159,3 @@ impl Connection {
         actix_rt::time::timeout(Duration::from_secs(2), closing).await.ok();
     }
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn the_time_of_updates_alone_is_read() {
-        assert_eq!(simulated_time(r#"application/json:{"time":1.024e+06,"updates":[{"id":1}]}"#), Some(1_024_000.0));
-        assert_eq!(simulated_time("application/json:{}"), None);
-        assert_eq!(simulated_time("pause: 12"), None);
-    }
-}

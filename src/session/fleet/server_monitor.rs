@@ -273,33 +273,3 @@ const MAX_REASON_LENGTH: usize = 500;
 fn shortened(text: &str) -> String {
     excerpt(text, MAX_REASON_LENGTH)
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_status_needs_a_load_that_is_one() {
-        let status =
-            parse_status(br#"{"load": 12.5, "allowedRepositories": ["https://github.com/lab"], "new": 1}"#).unwrap();
-        assert!((status.load.percent() - 12.5).abs() < f64::EPSILON);
-        assert_eq!(status.allowed_repositories.len(), 1);
-        for odd in [
-            "",
-            "{}",
-            "[]",
-            "12",
-            "[12]",
-            r#"{"load": 1} x"#,
-            r#"{"load": 1, "instances": [0, 0, 0, 0, 9, 5]}"#,
-            r#"{"load": -1}"#,
-            r#"{"load": "1"}"#,
-            r#"{"load": null}"#,
-            r#"{"load": 1e308}"#,
-            "<html>",
-            "\u{0}",
-        ] {
-            assert!(matches!(parse_status(odd.as_bytes()), Err(ProbeError::BadAnswer(_))), "{odd:?}");
-        }
-    }
-}

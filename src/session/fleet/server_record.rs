@@ -226,18 +226,4 @@ mod tests {
             ]
         );
     }
-
-    #[test]
-    fn a_drained_server_is_for_nobody_whether_it_counts_or_not() {
-        let mut record = ServerRecord::new(true);
-        let change = record.succeeded(report(1.0), Instant::now(), 95.0).unwrap();
-        assert_eq!(
-            (change.state, change.why.as_str()),
-            (ServerState::Draining, "load 1.0 % (drained by drainedServers)")
-        );
-        assert_eq!(record.for_placement(), None);
-        record.drained = false;
-        record.succeeded(report(1.0), Instant::now(), 95.0);
-        assert!(record.for_placement().is_some());
-    }
 }

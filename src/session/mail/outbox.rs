@@ -286,77 +286,62 @@ mod tests {
     }
 
     #[test]
-    fn servers_that_fail_together_are_one_mail() {
-        let notices = [(0, 1, NotResponding), (3, 2, NotResponding), (9, 3, MaximumLoad), (11, 4, NotResponding)];
-        let first = vec![(1, NotResponding, 0), (2, NotResponding, 0), (3, MaximumLoad, 0)];
-        assert_eq!(play(&notices), [(10, first), (21, vec![(4, NotResponding, 0)])]);
+    fn what_belongs_together_is_one_mail_and_a_server_has_one_in_ten_minutes() {
+        let one = |second, event, held_back| (second, vec![(1, event, held_back)]);
+        for (notices, mails) in [
+            // Servers that fail together.
+            (
+                vec![(0, 1, NotResponding), (3, 2, NotResponding), (9, 3, MaximumLoad), (11, 4, NotResponding)],
+                vec![
+                    (10, vec![(1, NotResponding, 0), (2, NotResponding, 0), (3, MaximumLoad, 0)]),
+                    (21, vec![(4, NotResponding, 0)]),
+                ],
+            ),
+            // The end of a failure is told once the time of flapping is over.
+            (
+                vec![(0, 1, NotResponding), (100, 1, WorkingAgain)],
+                vec![one(10, NotResponding, 0), one(610, WorkingAgain, 0)],
+            ),
+            (
+                vec![(0, 1, MaximumLoad), (590, 1, AvailableAgain)],
+                vec![one(10, MaximumLoad, 0), one(610, AvailableAgain, 0)],
+            ),
+            // A second failure soon after the first waits.
+            (
+                vec![(0, 1, NotResponding), (100, 1, WorkingAgain), (200, 1, NotResponding)],
+                vec![one(10, NotResponding, 0), one(610, NotResponding, 1)],
+            ),
+            // A failure is told though the same server was at maximum load before.
+            (
+                vec![(0, 1, MaximumLoad), (60, 1, NotResponding)],
+                vec![one(10, MaximumLoad, 0), one(70, NotResponding, 0)],
+            ),
+            // One that flaps does not hold up the others.
+            (
+                vec![(0, 1, NotResponding), (20, 1, WorkingAgain), (21, 1, NotResponding), (30, 2, NotResponding)],
+                vec![one(10, NotResponding, 0), (40, vec![(2, NotResponding, 0)]), one(610, NotResponding, 1)],
+            ),
+        ] {
+            assert_eq!(play(&notices), mails, "{notices:?}");
+        }
     }
 
-    #[test]
-    fn the_end_of_a_failure_is_told_once_the_time_of_flapping_is_over() {
-        let mails = play(&[(0, 1, NotResponding), (100, 1, WorkingAgain)]);
-        assert_eq!(mails, [(10, vec![(1, NotResponding, 0)]), (610, vec![(1, WorkingAgain, 0)])]);
-        let mails = play(&[(0, 1, MaximumLoad), (590, 1, AvailableAgain)]);
-        assert_eq!(mails, [(10, vec![(1, MaximumLoad, 0)]), (610, vec![(1, AvailableAgain, 0)])]);
+    /// Has one server meet these events, one after the other, from a second on; returns when the mails come, and how many
+    /// notices each has held back.
+    fn flap(begin: u64, step: u64, events: &[NoticeKind], until: u64) -> Vec<(u64, usize)> {
+        let seconds = (begin..until).step_by(usize::try_from(step).unwrap());
+        let notices: Vec<_> = seconds.zip(events.iter().cycle()).map(|(second, event)| (second, 1, *event)).collect();
+        play(&notices).into_iter().map(|(when, mail)| (when, mail[0].2)).collect()
     }
 
     #[test]
     fn a_flapping_server_is_one_mail_in_ten_minutes_with_a_count() {
-        let turns = |step: u64, until: u64| -> Vec<_> {
-            (0..until / step)
-                .map(|turn| (turn * step, 1, if turn % 2 == 0 { NotResponding } else { WorkingAgain }))
-                .collect()
-        };
-        let entry = |event, held_back| vec![(1, event, held_back)];
-        let each_second = play(&turns(1, 1_000));
-        assert_eq!(each_second.iter().map(|(when, _)| *when).collect::<Vec<_>>(), [10, 610, 1_210]);
-        assert_eq!(each_second[0].1, entry(NotResponding, 10));
-        assert_eq!(each_second[1].1, entry(NotResponding, 599));
-        assert_eq!(each_second[2].1, entry(WorkingAgain, 388));
-        let each_half_minute = play(&turns(30, 600));
-        assert_eq!(each_half_minute, [(10, entry(NotResponding, 0)), (610, entry(WorkingAgain, 18))]);
-    }
-
-    #[test]
-    fn a_second_failure_soon_after_the_first_waits() {
-        let notices = [(0, 1, NotResponding), (100, 1, WorkingAgain), (200, 1, NotResponding)];
-        assert_eq!(play(&notices), [(10, vec![(1, NotResponding, 0)]), (610, vec![(1, NotResponding, 1)])]);
-    }
-
-    #[test]
-    fn a_failure_is_told_though_the_same_server_was_at_maximum_load_before() {
-        let mails = play(&[(0, 1, MaximumLoad), (60, 1, NotResponding)]);
-        assert_eq!(mails, [(10, vec![(1, MaximumLoad, 0)]), (70, vec![(1, NotResponding, 0)])]);
-    }
-
-    #[test]
-    fn a_server_that_is_full_and_fails_again_and_again_is_one_mail_in_ten_minutes_after_the_first_two() {
-        let notices: Vec<_> = (0..300)
-            .flat_map(|turn| {
-                [
-                    (turn * 4, MaximumLoad),
-                    (turn * 4 + 1, NotResponding),
-                    (turn * 4 + 2, WorkingAgain),
-                    (turn * 4 + 3, AvailableAgain),
-                ]
-            })
-            .map(|(second, event)| (second, 1, event))
-            .collect();
-        let mails: Vec<u64> = play(&notices).into_iter().map(|(when, _)| when).collect();
+        let flapping = [NotResponding, WorkingAgain];
+        assert_eq!(flap(0, 1, &flapping, 1_000), [(10, 10), (610, 599), (1_210, 388)]);
+        assert_eq!(flap(0, 30, &flapping, 600), [(10, 0), (610, 18)]);
+        let full_too = [MaximumLoad, NotResponding, WorkingAgain, AvailableAgain];
+        let mails: Vec<u64> = flap(0, 1, &full_too, 1_200).into_iter().map(|(when, _)| when).collect();
         assert_eq!(mails, [10, 610, 1_210]);
-        let full_then_flapping: Vec<_> = std::iter::once((0, 1, MaximumLoad))
-            .chain((20..500).map(|second| (second, 1, if second % 2 == 0 { NotResponding } else { WorkingAgain })))
-            .collect();
-        let mails: Vec<u64> = play(&full_then_flapping).into_iter().map(|(when, _)| when).collect();
-        assert_eq!(mails, [10, 30, 630]);
-    }
-
-    #[test]
-    fn one_flapping_server_does_not_hold_up_the_others() {
-        let notices = [(0, 1, NotResponding), (20, 1, WorkingAgain), (21, 1, NotResponding), (30, 2, NotResponding)];
-        let expected =
-            [(10, vec![(1, NotResponding, 0)]), (40, vec![(2, NotResponding, 0)]), (610, vec![(1, NotResponding, 1)])];
-        assert_eq!(play(&notices), expected);
     }
 
     #[test]
@@ -388,12 +373,8 @@ mod tests {
     }
 
     #[test]
-    fn delays_grow_for_an_hour_then_the_mail_is_given_up() {
+    fn delays_grow_for_an_hour_then_the_mail_is_given_up_and_a_refusal_is_tried_seldom() {
         assert_eq!(tries(false), [0, 10, 30, 70, 150, 310, 630, 1_230, 1_830, 2_430, 3_030, 3_600]);
-    }
-
-    #[test]
-    fn a_permanent_failure_is_tried_seldom() {
         assert_eq!(tries(true), [0, 600, 1_200, 1_800, 2_400, 3_000, 3_600]);
     }
 

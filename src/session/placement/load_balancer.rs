@@ -258,14 +258,6 @@ mod tests {
     }
 
     #[test]
-    fn only_an_eligible_server_is_chosen() {
-        let now = Instant::now();
-        let mut fleet = fleet(2.0, now, [load_only(1.0), load_only(50.0)]);
-        assert_eq!(fleet.pick(now, |id| *id != 0), Some(1));
-        assert_eq!(fleet.pick(now, |_| false), None);
-    }
-
-    #[test]
     fn a_report_decides_whether_a_server_takes_clients() {
         let instances = |present, places, accepting| Some(ClientCounts { present, places, arrivals: 7, accepting });
         for (why, load, instances, available) in [
@@ -286,38 +278,6 @@ mod tests {
             assert_eq!(fleet.available(now), available, "{why}");
             assert_eq!(fleet.pick(now, |_| true).is_some(), available, "{why}");
         }
-    }
-
-    #[test]
-    fn placements_in_flight_use_up_places_and_load() {
-        let now = Instant::now();
-        let mut report = full_report(0.0, 8, 8);
-        report.instances = report.instances.map(|instances| ClientCounts { places: 10, ..instances });
-        let mut few_places = fleet(2.0, now, [report]);
-        assert_eq!([(); 3].map(|()| few_places.pick(now, |_| true)), [Some(0), Some(0), None]);
-
-        let mut loaded = fleet(2.0, now, [load_only(90.0)]);
-        assert_eq!([(); 4].map(|()| loaded.pick(now, |_| true)), [Some(0), Some(0), Some(0), None]);
-        assert_eq!(loaded.effective_load(&0), Some(96.0));
-    }
-
-    #[test]
-    fn a_client_must_fit_into_what_the_machine_has() {
-        let now = Instant::now();
-        assert!(fleet(20.0, now, [load_only(79.0)]).available(now));
-        assert!(!fleet(20.0, now, [load_only(81.0)]).available(now));
-    }
-
-    #[test]
-    fn a_client_that_never_comes_is_given_up() {
-        let now = Instant::now();
-        let at = |seconds| now + Duration::from_secs_f64(seconds);
-        let mut fleet = fleet(2.0, now, [full_report(92.9, 10, 10)]);
-        fleet.pick(now, |_| true);
-        fleet.pick(at(1.0), |_| true);
-        assert_eq!((fleet.available(at(14.9)), fleet.in_flight(&0)), (false, 2));
-        assert_eq!((fleet.available(at(15.0)), fleet.in_flight(&0)), (true, 1));
-        assert_eq!((fleet.available(at(16.0)), fleet.in_flight(&0)), (true, 0));
     }
 
     #[test]
@@ -350,31 +310,6 @@ mod tests {
         assert_eq!((fleet.effective_load(&0), fleet.in_flight(&0)), (Some(10.0), 1));
         fleet.report(&0, now, full_report(10.0, 1, 1));
         assert_eq!((fleet.effective_load(&0), fleet.in_flight(&0)), (Some(12.0), 0));
-    }
-
-    #[test]
-    fn a_server_whose_starts_fail_comes_last_and_is_tried_by_one_client_after_a_while() {
-        let now = Instant::now();
-        let at = |seconds| now + Duration::from_secs(seconds);
-        let mut fleet = fleet(2.0, now, [full_report(1.0, 0, 0), full_report(50.0, 0, 0)]);
-        let place = |fleet: &mut LoadBalancer<u32>, seconds, clients| -> Vec<u32> {
-            fleet.report(&0, at(seconds), full_report(1.0, 0, 0));
-            fleet.report(&1, at(seconds), full_report(50.0, 0, 0));
-            (0..clients).filter_map(|_| fleet.pick(at(seconds), |_| true)).collect()
-        };
-        assert_eq!(place(&mut fleet, 0, 2), [0, 0]);
-        fleet.note_failures(&0, at(1), 2);
-        assert_eq!(place(&mut fleet, 1, 1), [0], "two may be chance");
-        fleet.note_failures(&0, at(2), 3);
-        assert!(fleet.is_ejected(&0));
-        assert_eq!(place(&mut fleet, 2, 3), [1, 1, 1]);
-        assert_eq!(place(&mut fleet, 31, 1), [1]);
-        assert_eq!(place(&mut fleet, 32, 3), [0, 1, 1], "one tries it");
-        fleet.note_failures(&0, at(33), 4);
-        assert_eq!(place(&mut fleet, 92, 1), [1], "its time has doubled");
-        assert_eq!(place(&mut fleet, 93, 2), [0, 1]);
-        fleet.note_failures(&0, at(94), 0);
-        assert_eq!(place(&mut fleet, 94, 2), [0, 0]);
     }
 
     #[test]
@@ -435,15 +370,6 @@ mod tests {
     }
 
     proptest! {
-        #[test]
-        fn a_burst_over_equal_servers_differs_by_one(servers in 1..60_usize, load in 0.0..50.0, clients in 0..1500_usize) {
-            let now = Instant::now();
-            let mut fleet = fleet(0.25, now, vec![full_report(load, 3, 3); servers]);
-            let placed = burst(&mut fleet, now, clients, u32::try_from(servers).unwrap());
-            let (least, most) = (placed.iter().min().copied(), placed.iter().max().copied());
-            prop_assert!(most.unwrap_or(0) - least.unwrap_or(0) <= 1, "{placed:?}");
-        }
-
         #[test]
         fn a_burst_over_unequal_servers_ends_level(loads in prop::collection::vec(0.0..94.0, 1..40), clients in 0..2000_usize) {
             let now = Instant::now();

@@ -35,37 +35,3 @@ impl Replicas {
         ((self.came + DOUBT) / (self.sent + DOUBT)).clamp(1.0, MAX_ESTIMATE)
     }
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    /// Clients that arrive one by one, of which each `n`th was sent from here.
-    fn after(replicas: &mut Replicas, clients: u32, n: u32) -> f64 {
-        for client in 1..=clients {
-            replicas.count(1.0, f64::from(u8::from(client % n == 0)));
-        }
-        replicas.clients_per_placement()
-    }
-
-    #[test]
-    fn the_number_of_session_servers_is_learned_and_forgotten() {
-        let mut replicas = Replicas::default();
-        assert_eq!(after(&mut replicas, 500, 1).to_bits(), 1.0_f64.to_bits());
-        let four = after(&mut replicas, 1000, 4);
-        assert!((3.0..=MAX_ESTIMATE).contains(&four), "{four}");
-        let one = after(&mut replicas, 1000, 1);
-        assert!(one < 1.1, "{one}");
-    }
-
-    #[test]
-    fn clients_that_never_come_and_absurd_counts_do_no_harm() {
-        let mut replicas = Replicas::default();
-        replicas.count(0.0, 1e9);
-        assert_eq!(replicas.clients_per_placement().to_bits(), 1.0_f64.to_bits());
-        replicas.count(1e19, 0.0);
-        assert!(replicas.clients_per_placement() <= MAX_ESTIMATE);
-        let recovered = after(&mut replicas, 1000, 1);
-        assert!(recovered < 1.1, "{recovered}");
-    }
-}

@@ -61,17 +61,3 @@ impl fmt::Display for Load {
         fmt::Display::fmt(&self.0, out)
     }
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_load_is_a_finite_number_that_is_not_negative() {
-        assert_eq!(Load::parse(b" 12.5\n").map(Load::percent), Ok(12.5));
-        assert_eq!(Load::parse(b"0").map(Load::percent), Ok(0.0));
-        for odd in ["", "NaN", "inf", "-1", "12%", "<html>", "\u{ff}", "1e999"] {
-            assert!(Load::parse(odd.as_bytes()).is_err(), "{odd:?} was taken for a load");
-        }
-    }
-}

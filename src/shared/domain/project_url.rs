@@ -278,48 +278,6 @@ pub(super) fn split_repository(segments: &[String]) -> Result<(usize, usize, Ref
 #[cfg(test)]
 mod tests {
     use super::*;
-    use proptest::prelude::*;
-
-    #[test]
-    fn the_url_forms_of_the_forges_are_read() {
-        let table = [
-            ("https://github.com/u/r/blob/main/worlds/a.wbt", "https://github.com/u/r", "main", ""),
-            ("https://GitHub.com/u/r/tree/v1.0/p/q/worlds/a.wbt", "https://github.com/u/r", "v1.0", "p/q"),
-            (
-                "https://github.com:443/u/r/blob/my%20tag/p%2B/worlds/a%20b.wbt",
-                "https://github.com/u/r",
-                "my tag",
-                "p+",
-            ),
-            ("https://gitlab.lab.org/g/s/r/-/blob/main/p/worlds/a.wbt", "https://gitlab.lab.org/g/s/r", "main", "p"),
-            ("https://git.lab:3000/u/r/src/branch/main/p/worlds/a.wbt", "https://git.lab:3000/u/r", "main", "p"),
-            ("https://git.lab/u/r/src/tag/v1/worlds/a.WBT", "https://git.lab/u/r", "v1", ""),
-            ("https://github.com/u/r.git/blob/main/worlds/a.wbt", "https://github.com/u/r", "main", ""),
-            ("https://github.com/u/r%2eGIT/blob/main/worlds/a.wbt", "https://github.com/u/r", "main", ""),
-            ("https://github.com/u//r/blob/main//worlds/a.wbt", "https://github.com/u/r", "main", ""),
-            ("https://github.com/u/r/blob/main/p/worlds/a.wbt?raw=true", "https://github.com/u/r", "main", "p"),
-            ("https://github.com/u/r/blob/main/worlds/a.wbt#L5", "https://github.com/u/r", "main", ""),
-            ("https://www.GitHub.com/u/r/blob/main/worlds/a.wbt", "https://github.com/u/r", "main", ""),
-        ];
-        for (text, repository, reference, folder) in table {
-            let url = ProjectUrl::parse(text).unwrap_or_else(|error| panic!("{text}: {error}"));
-            assert_eq!(url.repository(), repository, "{text}");
-            assert!(
-                url.candidates().contains(&Reading { reference: reference.to_owned(), folder: folder.to_owned() }),
-                "{text}: {:?}",
-                url.candidates()
-            );
-        }
-    }
-
-    #[test]
-    fn a_reference_with_slashes_has_several_readings() {
-        let url = ProjectUrl::parse("https://github.com/u/r/blob/feature/arm/lab/worlds/a.wbt").unwrap();
-        let readings: Vec<_> =
-            url.candidates().into_iter().map(|reading| (reading.reference, reading.folder)).collect();
-        let expected = [("feature", "arm/lab"), ("feature/arm", "lab"), ("feature/arm/lab", "")];
-        assert_eq!(readings, expected.map(|(reference, folder)| (reference.to_owned(), folder.to_owned())));
-    }
 
     #[test]
     fn tricks_are_refused() {
@@ -354,25 +312,6 @@ mod tests {
             "https://a.-b.org/u/r/blob/main/worlds/a.wbt",
         ] {
             assert!(ProjectUrl::parse(text).is_err(), "{text:?} was taken for a world");
-        }
-    }
-
-    proptest! {
-        #[test]
-        fn reading_any_text_never_panics(text in "\\PC*", path in "[a-z%2./-]{0,60}") {
-            let any = ProjectUrl::parse(&text);
-            let likely = ProjectUrl::parse(&format!("https://github.com/{path}/worlds/a.wbt"));
-            prop_assert!(any.is_err() || !text.is_empty());
-            drop(likely);
-        }
-
-        #[test]
-        fn no_segment_of_a_url_leaves_its_folder(path in "([a-z]{1,3}|%2e|\\.|%2f|/|\\.\\.){1,30}") {
-            if let Ok(url) = ProjectUrl::parse(&format!("https://github.com/u/r/blob/{path}/worlds/a.wbt")) {
-                for segment in url.segments() {
-                    prop_assert!(!segment.contains('/') && segment != ".." && segment != "." && !segment.is_empty());
-                }
-            }
         }
     }
 }

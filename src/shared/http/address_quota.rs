@@ -51,16 +51,6 @@ mod tests {
     }
 
     #[test]
-    fn each_address_has_a_quota_of_its_own() {
-        let quota = quota();
-        let taken = |address| (0..1000).filter(|_| quota.take(address)).count();
-        for number in [1, 2] {
-            assert!((200..205).contains(&taken(Some(address(number)))));
-        }
-        assert_eq!(taken(None), 1000, "who asks through a proxy that tells no addresses is not limited");
-    }
-
-    #[test]
     fn the_addresses_that_are_remembered_are_bounded() {
         let quota = quota();
         for number in 0..12_000 {

@@ -133,17 +133,6 @@ mod tests {
     }
 
     #[test]
-    fn attempts_are_counted_for_each_address() {
-        let auth = auth();
-        let client = |last| Peer::Client(IpAddr::from([203, 0, 113, last]));
-        for _ in 0..BURST.get() {
-            assert!(auth.may_try(client(1)));
-        }
-        assert!(!auth.may_try(client(1)));
-        assert!(auth.may_try(client(2)));
-    }
-
-    #[test]
     fn only_so_many_addresses_are_counted() {
         let auth = auth();
         for number in 0..MAX_ADDRESSES + 9 {

@@ -160,24 +160,6 @@ mod tests {
     }
 
     #[test]
-    fn connections_are_counted_in_all_and_per_address() {
-        let connections = ConnectionLimiter::new(9, 4, Some(2));
-        let admit = |peer| connections.admit(ConnectionKind::Client, peer);
-        let first = admit(client("203.0.113.9")).unwrap();
-        let _second = admit(client("203.0.113.9")).unwrap();
-        assert_eq!(admit(client("203.0.113.9")).unwrap_err(), ConnectionLimitError::FromAddress);
-        let _other = admit(client("203.0.113.10")).unwrap();
-        assert_eq!(connections.count(ConnectionKind::Client), 3);
-        drop(first);
-        let _again = admit(client("203.0.113.9")).unwrap();
-        let _proxy = admit(Peer::Proxy("127.0.0.1".parse().unwrap())).unwrap();
-        assert_eq!(admit(client("203.0.113.11")).unwrap_err(), ConnectionLimitError::InAll);
-        let _page = connections.admit(ConnectionKind::Page, client("203.0.113.9")).unwrap();
-        let tcp: Vec<_> = (0..9).map(|_| connections.admit(ConnectionKind::Tcp, client("203.0.113.9"))).collect();
-        assert_eq!(tcp.iter().filter(|one| one.is_ok()).count(), 2 * TCP_PER_CLIENT);
-    }
-
-    #[test]
     fn one_address_leaves_something_to_others() {
         for (tcp, clients) in [(2000, 1000), (21_000, 20_000), (16, 15), (4000, 1000)] {
             let connections = ConnectionLimiter::new(tcp, clients, None);

@@ -24,22 +24,3 @@ pub fn write(path: &Path) -> io::Result<File> {
     writeln!(file, "{}", std::process::id())?;
     Ok(file)
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn one_process_holds_the_file_and_a_stale_one_is_taken_over() {
-        let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("server.pid");
-        std::fs::write(&path, "a text that is longer than a process id\n").unwrap();
-        let own = format!("{}\n", std::process::id());
-        let file = write(&path).unwrap();
-        assert_eq!(std::fs::read_to_string(&path).unwrap(), own);
-        let error = write(&path).unwrap_err().to_string();
-        assert!(error.contains(own.trim()), "{error}");
-        drop(file);
-        write(&path).unwrap();
-    }
-}

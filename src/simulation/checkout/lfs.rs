@@ -66,17 +66,6 @@ mod tests {
     use super::*;
 
     #[test]
-    fn pointers_are_told_from_other_files() {
-        let folder = tempfile::tempdir().unwrap();
-        let write = |name: &str, text: &[u8]| std::fs::write(folder.path().join(name), text).unwrap();
-        std::fs::create_dir(folder.path().join("meshes")).unwrap();
-        write("meshes/a.dae", b"version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 1234\n");
-        write("small.txt", b"size 5\n");
-        write("binary", b"\xff\xfeversion https://git-lfs.github.com/spec/v1\nsize 5\n");
-        assert_eq!(pointers(folder.path()), 1);
-    }
-
-    #[test]
     fn large_files_come_from_where_the_repository_is() {
         let first = |location: &str, protocol| {
             let location = location.to_owned();

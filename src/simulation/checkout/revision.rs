@@ -199,42 +199,6 @@ mod tests {
     }
 
     #[test]
-    fn a_full_hash_is_a_commit() {
-        let commit = commit_of(&world(&format!("tree/{A}/p/worlds/a.wbt")), false).unwrap();
-        assert_eq!((commit.commit.as_str(), commit.trust), (A, TrustSource::Url));
-        assert_eq!(commit.world_path(&world("blob/x/worlds/a.wbt")), "p/worlds/a.wbt");
-        assert_eq!(commit_of(&world("blob/aaaaaaa/worlds/a.wbt"), false), None, "short hashes are not unique");
-        assert_eq!(
-            commit_of(&world(&format!("src/branch/{A}/worlds/a.wbt")), false),
-            None,
-            "it says that it is a branch"
-        );
-    }
-
-    #[test]
-    fn only_branches_and_tags_vouch_for_a_commit() {
-        let answer = format!("{A}\trefs/pull/1/head\n{B}\trefs/tags/v1^{{}}\n");
-        assert!(is_tip(&answer, B) && !is_tip(&answer, A));
-    }
-
-    #[test]
-    fn a_hash_of_another_length_is_of_no_commit() {
-        let answer = format!("{A}\trefs/heads/main\n");
-        assert!(is_of_other_length(&answer, &"a".repeat(64)) && !is_of_other_length(&answer, B));
-        assert!(!is_of_other_length("", B), "nothing is known of an empty repository");
-    }
-
-    #[test]
-    fn only_files_above_the_project_are_taken_with_it() {
-        let commit = commit_of(&world(&format!("tree/{A}/p/q/worlds/a.wbt")), false).unwrap();
-        let answer = b"100644 blob a\ttop.proto\x00040000 tree b\tother\x00120000 blob c\tp/mid link\x00100644 blob d\tp/q/no.proto\x00\
-            160000 commit e\tmodule\x00100644 blob f\tp/q/worlds/a.wbt\x00";
-        assert_eq!(commit.files_above(answer, "p/q/worlds/a.wbt").unwrap(), b"top.proto\0p/mid link\0");
-        assert_eq!(commit.files_above(answer, "p/q/worlds/b.wbt"), None);
-        assert_eq!(commit.files_above(answer, "other"), None, "it is a folder");
-    }
-
-    #[test]
     fn an_answer_that_is_no_hash_is_never_used() {
         let url = world("blob/main/worlds/a.wbt");
         assert_eq!(found(&url, "--upload-pack=evil\trefs/heads/main\n"), []);

@@ -57,39 +57,3 @@ impl WorldFile {
         }
     }
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn only_a_world_inside_is_opened() {
-        let folder = tempfile::tempdir().unwrap();
-        let inside = folder.path().join("project");
-        std::fs::create_dir(&inside).unwrap();
-        let write = |name: &str, text: &str| std::fs::write(inside.join(name), text).unwrap();
-        write("good.wbt", "#VRML_SIM R2025a utf8\nWorldInfo {}\n");
-        write("windows.wbt", "#VRML_SIM R2023b utf8\r\n");
-        write("bad.wbt", "<html>");
-        write("empty.wbt", "");
-        std::fs::write(folder.path().join("outside.wbt"), "#VRML_SIM R2025a utf8\n").unwrap();
-        for (target, link) in [
-            ("../outside.wbt", "out.wbt"),
-            ("/etc/passwd", "passwd.wbt"),
-            ("good.wbt", "in.wbt"),
-            ("nothing", "none.wbt"),
-        ] {
-            std::os::unix::fs::symlink(target, inside.join(link)).unwrap();
-        }
-        let open = |name: &str| WorldFile::open(&inside, &inside.join(name)).map(|world| world.version);
-        assert_eq!(open("good.wbt").unwrap(), "R2025a");
-        assert_eq!(open("windows.wbt").unwrap(), "R2023b");
-        assert_eq!(open("in.wbt").unwrap(), "R2025a");
-        assert_eq!(open("out.wbt"), Err(WorldFileError::Outside("out.wbt".to_owned())));
-        assert_eq!(open("passwd.wbt"), Err(WorldFileError::Outside("passwd.wbt".to_owned())));
-        assert_eq!(open("missing.wbt"), Err(WorldFileError::Missing("missing.wbt".to_owned())));
-        assert_eq!(open("none.wbt"), Err(WorldFileError::Missing("none.wbt".to_owned())));
-        assert!(matches!(open("bad.wbt"), Err(WorldFileError::Header { .. })));
-        assert!(matches!(open("empty.wbt"), Err(WorldFileError::Header { .. })));
-    }
-}

@@ -181,16 +181,4 @@ mod tests {
         prune(folder.path());
         assert_eq!((count(ENDED), count(FAILED)), (20, 30));
     }
-
-    #[test]
-    fn an_output_is_found_by_its_id_alone() {
-        let folder = tempfile::tempdir().unwrap();
-        fs::write(folder.path().join("secret.log"), "").unwrap();
-        fs::create_dir(folder.path().join(ENDED)).unwrap();
-        fs::write(folder.path().join(ENDED).join("1-1.log"), "").unwrap();
-        assert!(output_file(folder.path(), "1-1").is_some());
-        for id in ["../secret", "1-2", "", "/etc/passwd"] {
-            assert_eq!(output_file(folder.path(), id), None, "{id}");
-        }
-    }
 }

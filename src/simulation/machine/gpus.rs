@@ -95,32 +95,4 @@ mod tests {
         let (left, why) = gpus.current(at(32));
         assert!(left.is_empty() && why.is_some());
     }
-
-    #[test]
-    fn one_of_several_that_is_gone_is_told_and_the_others_count() {
-        let begin = Instant::now();
-        let at = |second| begin + Duration::from_secs(second);
-        let mut gpus = Gpus::default();
-        gpus.read(at(0), reading(3, 0));
-        for second in 1..=11 {
-            gpus.read(at(second), reading(1, 0));
-            let (left, why) = gpus.current(at(second));
-            let told = (second > 10).then_some("2 of 3 GPUs don't answer any more");
-            assert_eq!((left.len(), why.as_deref()), (1, told), "after {second} s");
-        }
-        gpus.read(at(12), reading(3, 0));
-        assert_eq!(gpus.current(at(12)).1, None);
-    }
-
-    #[test]
-    fn a_card_that_is_lost_is_told_at_once_and_the_others_count() {
-        let now = Instant::now();
-        let mut gpus = Gpus::default();
-        gpus.read(now, reading(1, 1));
-        let (left, why) = gpus.current(now);
-        assert!(left.len() == 1 && why.unwrap().contains("has lost 1 of 2 GPUs"));
-        gpus.read(now, reading(0, 2));
-        let (left, why) = gpus.current(now);
-        assert!(left.is_empty() && why.unwrap().contains("has lost 2 of 2 GPUs"));
-    }
 }

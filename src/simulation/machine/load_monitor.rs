@@ -336,22 +336,4 @@ mod tests {
             assert_eq!(readings.borrow().load.map(Load::percent), Some(load));
         }
     }
-
-    #[actix_rt::test]
-    async fn gpus_that_are_no_longer_read_do_not_count() {
-        let slots = SlotPool::new(2001..=2001, 1, None).start();
-        let (mut monitor, readings) = LoadMonitor::new(slots, Path::new("/"), None, None);
-        let gpu = Gpu { compute: 90.0, ..Gpu::default() };
-        let before = |age| Instant::now().checked_sub(Duration::from_secs(age)).unwrap();
-        let reading = GpuReading { gpus: vec![gpu], lost: 0 };
-        monitor.gpus.read(before(5), reading.clone());
-        monitor.publish(0, 0);
-        assert_eq!(readings.borrow().gpus.len(), 1);
-        assert_eq!(readings.borrow().load.map(Load::percent), Some(90.0));
-        monitor.gpus.read(before(20), reading);
-        monitor.publish(0, 0);
-        assert_eq!(readings.borrow().gpus, []);
-        assert!(readings.borrow().gpu_problem.is_some());
-        assert_eq!(readings.borrow().load.map(Load::percent), Some(45.0));
-    }
 }

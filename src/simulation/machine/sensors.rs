@@ -311,13 +311,4 @@ mod tests {
             assert!((load.percent() - expected).abs() < 1e-9, "{why}: {load}");
         }
     }
-
-    #[test]
-    fn this_machine_can_be_read() {
-        let mut sensor = MachineSensor::open(Path::new("/")).unwrap();
-        let machine = sensor.read();
-        assert!((0.0..=100.0).contains(&machine.cpu) && (0.0..=100.0).contains(&machine.disk), "{machine:?}");
-        assert!(machine.memory > 0.0 && machine.memory <= 100.0, "{machine:?}");
-        assert!(sensor.host().threads > 0);
-    }
 }

@@ -109,13 +109,4 @@ mod tests {
         slowly.sort_unstable();
         assert_eq!(slowly, [0, 1, 2, 3]);
     }
-
-    #[test]
-    fn a_gpu_that_is_lost_or_has_no_display_gets_nothing() {
-        let now = Instant::now();
-        let mut three = gpus(&[0.0; 4]);
-        three.remove(1);
-        assert_eq!(taken(&Spread::default(), &three, 6, now), [0, 2, 3, 0, 2, 3]);
-        assert_eq!(taken(&Spread::over(3), &three, 4, now), [0, 2, 0, 2]);
-    }
 }

@@ -125,32 +125,3 @@ pub fn remove(folder: &Path) {
         log::error!("{} can't be removed: {error}", folder.display());
     }
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn an_earlier_run_is_removed_with_its_processes() {
-        let cache = tempfile::tempdir().unwrap();
-        let dead = cache.path().canonicalize().unwrap().join("runs/run-dead");
-        std::fs::create_dir_all(dead.join("instance-x")).unwrap();
-        let mut orphan = std::process::Command::new("sleep");
-        let mut orphan = orphan.arg("100").env(process_tree::MARK, dead.join("instance-x")).spawn().unwrap();
-        let (run, leftovers) = RunDir::open(cache.path()).unwrap();
-        assert_eq!(leftovers, Leftovers { runs: 1, processes: 1 });
-        assert!(!orphan.wait().unwrap().success());
-        assert!(run.path().exists() && !dead.exists());
-    }
-
-    #[test]
-    fn dropping_removes() {
-        let cache = tempfile::tempdir().unwrap();
-        let (run, _) = RunDir::open(cache.path()).unwrap();
-        let instance = run.instance().unwrap();
-        std::fs::write(instance.path().join("file"), "x").unwrap();
-        let folder = run.path().to_owned();
-        drop((instance, run));
-        assert!(!folder.exists());
-    }
-}

@@ -137,35 +137,3 @@ impl Search {
         candidates.iter().find(|one| own.contains(&one.inode)).copied()
     }
 }
-
-#[cfg(test)]
-mod tests {
-    use std::net::TcpListener;
-    use std::process::{Child, Command, Stdio};
-
-    use super::*;
-
-    struct Ended(Child);
-
-    impl Drop for Ended {
-        fn drop(&mut self) {
-            self.0.kill().ok();
-            self.0.wait().ok();
-        }
-    }
-
-    #[actix_rt::test]
-    async fn a_listener_counts_for_the_tree_that_it_belongs_to() {
-        let finder = PortFinder::start(1..=u16::MAX).unwrap();
-        let ours = TcpListener::bind("127.0.0.1:0").unwrap();
-        let port = ours.local_addr().unwrap().port();
-        let sleeper = Command::new("sleep").arg("100").stdin(Stdio::null()).spawn().unwrap();
-        let sleeper = Ended(sleeper);
-        let other = finder.find(i32::try_from(sleeper.0.id()).unwrap(), port..=port);
-        let found = actix_rt::time::timeout(Duration::from_millis(300), other).await;
-        assert!(found.is_err(), "a listener of another process counts: {found:?}");
-        let me = i32::try_from(std::process::id()).unwrap();
-        let found = actix_rt::time::timeout(Duration::from_secs(20), finder.find(me, port..=port)).await;
-        assert_eq!(found.ok(), Some(port));
-    }
-}

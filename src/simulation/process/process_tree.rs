@@ -120,35 +120,7 @@ fn is_running(pid: i32) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use std::os::unix::process::CommandExt;
-    use std::process::{Command, Stdio};
-
-    #[test]
-    fn all_that_carries_the_mark_is_killed_with_the_groups_that_it_leads() {
-        let folder = tempfile::tempdir().unwrap();
-        // A grandchild in a session of its own keeps the mark; one without an environment stays in the group of its
-        // parent.
-        let script = "setsid sleep 100 & env -i sleep 100 & echo $!; wait";
-        let mut shell = Command::new("bash");
-        shell.args(["-c", script]).env(MARK, folder.path().join("instance")).process_group(0);
-        let mut shell = shell.stdout(Stdio::piped()).spawn().unwrap();
-        let mut line = String::new();
-        std::io::BufRead::read_line(&mut std::io::BufReader::new(shell.stdout.take().unwrap()), &mut line).unwrap();
-        let bare = line.trim().parse().unwrap();
-        let deadline = std::time::Instant::now() + Duration::from_secs(20);
-        let pid = i32::try_from(shell.id()).unwrap();
-        while tree(pid).len() < 3 || marked(folder.path()).len() != 2 {
-            assert!(std::time::Instant::now() < deadline, "{:?}", tree(pid));
-            std::thread::sleep(BETWEEN_SCANS);
-        }
-        assert_eq!(kill_marked(folder.path()), 2);
-        assert!(!shell.wait().unwrap().success());
-        assert_eq!(marked(folder.path()).len(), 0);
-        while Process::new(bare).is_ok_and(|process| process.stat().is_ok_and(|stat| stat.state != 'Z')) {
-            assert!(std::time::Instant::now() < deadline, "the one without environment lives on");
-            std::thread::sleep(BETWEEN_SCANS);
-        }
-    }
+    use std::process::Command;
 
     #[test]
     fn no_more_is_read_of_an_environment_than_is_allowed() {

@@ -40,25 +40,9 @@ fn run(words: &[&str], folder: &Path) -> io::Result<()> {
 mod tests {
     use std::os::unix::fs::PermissionsExt;
 
-    use nix::fcntl::{OFlag, openat};
-    use nix::sys::stat::{Mode, mkdirat};
+    use nix::sys::stat::Mode;
 
     use super::*;
-
-    #[test]
-    fn a_deep_tree_is_removed() {
-        let place = tempfile::tempdir().unwrap();
-        let folder = place.path().join("deep");
-        std::fs::create_dir(&folder).unwrap();
-        let mut deepest = std::fs::File::open(&folder).unwrap();
-        for _ in 0..3000 {
-            mkdirat(&deepest, "nested", Mode::S_IRWXU).unwrap();
-            deepest = openat(&deepest, "nested", OFlag::O_DIRECTORY, Mode::empty()).unwrap().into();
-        }
-        remove_tree(&folder).unwrap();
-        assert!(!folder.exists());
-        remove_tree(&folder).unwrap();
-    }
 
     #[test]
     fn links_are_removed_and_not_followed() {

@@ -180,91 +180,25 @@ impl Drop for WatchGuard {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use std::sync::mpsc::{Receiver, Sender, channel};
 
-    struct Recorder(Sender<bool>);
+    struct Session;
 
-    impl Actor for Recorder {
+    impl Actor for Session {
         type Context = Context<Self>;
     }
 
-    impl Handler<Watched> for Recorder {
+    impl Handler<Watched> for Session {
         type Result = ();
 
-        fn handle(&mut self, Watched(is_watched): Watched, _: &mut Self::Context) {
-            self.0.send(is_watched).unwrap();
-        }
-    }
-
-    /// Its answer comes once all earlier messages have been handled.
-    #[derive(Message)]
-    #[rtype(result = "()")]
-    struct Barrier;
-
-    impl Handler<Barrier> for Recorder {
-        type Result = ();
-
-        fn handle(&mut self, Barrier: Barrier, _: &mut Self::Context) {}
-    }
-
-    fn told() -> (Recipient<Watched>, (Addr<Recorder>, Receiver<bool>)) {
-        let (sender, told) = channel();
-        let actor = Recorder(sender).start();
-        (actor.clone().recipient(), (actor, told))
-    }
-
-    async fn all((actor, told): &(Addr<Recorder>, Receiver<bool>)) -> Vec<bool> {
-        actor.send(Barrier).await.unwrap();
-        told.try_iter().collect()
+        fn handle(&mut self, _: Watched, _: &mut Self::Context) {}
     }
 
     #[actix_rt::test]
-    async fn a_token_leads_to_its_simulation_as_long_as_that_runs() {
+    async fn a_token_for_watching_that_was_not_used_for_a_minute_is_none() {
         let streams = Arc::<Streams>::default();
         let id = SimulationId::next();
-        let stream = streams.register(id, 2001, told().0);
-        let other = streams.register(SimulationId::next(), 2002, told().0);
-        let token = stream.token();
-        assert_eq!(streams.find(&token), Some(StreamTarget { simulation: id, port: 2001, read_only: false }));
-        assert_eq!(streams.find(&other.token()).unwrap().port, 2002);
-        // The same number with another secret.
-        assert_eq!(streams.find(&Token::new(token.number())), None);
-        drop(stream);
-        assert_eq!(streams.find(&token), None);
-        assert!(streams.find(&other.token()).is_some());
-    }
-
-    #[actix_rt::test]
-    async fn who_watches_has_a_token_for_one_connection_and_the_session_hears_of_it() {
-        let streams = Arc::<Streams>::default();
-        let (session, told) = told();
-        let id = SimulationId::next();
-        let stream = streams.register(id, 2001, session);
-        assert!(streams.watch("20261122T220517042-17").is_none(), "no such simulation");
-        let [one, two] = [(); 2].map(|()| streams.watch(&id.to_string()).unwrap());
-        assert_eq!(streams.find(&one), Some(StreamTarget { simulation: id, port: 2001, read_only: true }));
-        assert!(streams.start_watching(&stream.token()).is_none(), "it is no token for watching");
-        assert!(all(&told).await.is_empty());
-        let first = streams.start_watching(&one).unwrap();
-        assert!(streams.start_watching(&one).is_none(), "it is used");
-        let second = streams.start_watching(&two).unwrap();
-        assert_eq!(all(&told).await, [true]);
-        drop(first);
-        assert_eq!(streams.find(&one), None);
-        assert!(all(&told).await.is_empty());
-        drop(second);
-        assert_eq!(all(&told).await, [false]);
-        let third = streams.watch(&id.to_string()).unwrap();
-        drop(stream);
-        assert_eq!(streams.find(&third), None);
-        assert!(streams.0.lock().watchers.is_empty());
-    }
-
-    #[actix_rt::test]
-    async fn a_token_that_was_not_used_for_a_minute_is_none() {
-        let streams = Arc::<Streams>::default();
-        let id = SimulationId::next();
-        let _stream = streams.register(id, 2001, told().0);
+        let stream = streams.register(id, 2001, Session.start().recipient());
+        assert_eq!(streams.find(&Token::new(stream.token().number())), None, "the same number with another secret");
         let [used, unused] = [(); 2].map(|()| streams.watch(&id.to_string()).unwrap());
         let _watching = streams.start_watching(&used).unwrap();
         for watcher in streams.0.lock().watchers.values_mut() {
@@ -272,5 +206,7 @@ mod tests {
         }
         assert!(streams.find(&used).is_some());
         assert_eq!(streams.find(&unused), None);
+        drop(stream);
+        assert!(streams.0.lock().watchers.is_empty());
     }
 }

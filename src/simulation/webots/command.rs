@@ -22,23 +22,3 @@ pub fn webots_command(program: &Path, mode: Mode, port: u16, heartbeat: Duration
     command.push(world.into());
     command
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn the_command_line_is_the_documented_one() {
-        let text = |mode| {
-            let (program, world) = (Path::new("/usr/local/webots/webots"), Path::new("/tmp/a b/worlds/$(id).wbt"));
-            let command = webots_command(program, mode, 2001, Duration::from_secs(5), world);
-            command.join(std::ffi::OsStr::new("|")).into_string().unwrap()
-        };
-        let common = "/usr/local/webots/webots|--batch|--mode=pause|";
-        let rest = "--port=2001|--heartbeat=5000|";
-        let world = "|/tmp/a b/worlds/$(id).wbt";
-        assert_eq!(text(Mode::X3d), format!("{common}--minimize|--no-rendering|{rest}--stream{world}"));
-        assert_eq!(text(Mode::W3d), text(Mode::X3d));
-        assert_eq!(text(Mode::Mjpeg), format!("{common}{rest}--stream=mjpeg{world}"));
-    }
-}
