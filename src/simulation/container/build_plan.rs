@@ -10,7 +10,7 @@ use nix::fcntl::OFlag;
 use super::dockerfile::Dockerfile;
 use super::project_file::text_of;
 use super::start_error::StartError;
-use super::templates::{CONTROLLER, DOCKERFILE, LAUNCHER, Templates};
+use super::templates::{CONTROLLER_DOCKERFILE, DOCKERFILE, LAUNCHER, Templates};
 use super::webots_yml::{ProjectKind, WebotsYml};
 
 /// The path of a project in its container, as existing Dockerfiles expect.
@@ -21,14 +21,18 @@ pub const PROJECT_PATH: &str = "/usr/local/webots-project";
 pub struct BuildPlan {
     /// What its `webots.yml` requests.
     pub yml: WebotsYml,
-    /// The Dockerfile of Webots' image; `None` if the base image is used unchanged.
-    pub dockerfile: Option<Dockerfile>,
+    /// The Dockerfile of Webots' image.
+    pub dockerfile: Dockerfile,
+    /// Whether that image has the project, which the build may have changed.
+    pub has_project: bool,
     /// The Dockerfile of the controllers' image.
     pub controller: Option<Dockerfile>,
     /// Whether the project has a Makefile.
     pub has_makefile: bool,
 }
 
+/// The Dockerfile for a project that has nothing to build.
+const NO_DOCKERFILE: &str = "ARG WEBOTS_DEFAULT_IMAGE\nFROM ${WEBOTS_DEFAULT_IMAGE}\n";
 /// Files with which a project would configure its containers itself.
 const IGNORED: [&str; 3] = ["docker-compose.yml", "docker-compose.yaml", ".env"];
 
@@ -50,8 +54,10 @@ impl BuildPlan {
             ProjectKind::Competition => Some(competition(project, templates)?),
             ProjectKind::Default | ProjectKind::Editor => None,
         };
-        let read = |text: Option<String>| text.map(|text| Dockerfile::read(&text, owner)).transpose();
-        Ok(Self { dockerfile: read(dockerfile)?, controller: read(controller)?, yml, has_makefile })
+        let has_project = dockerfile.is_some();
+        let dockerfile = Dockerfile::read(dockerfile.as_deref().unwrap_or(NO_DOCKERFILE), owner)?;
+        let controller = controller.map(|text| Dockerfile::read(&text, owner)).transpose()?;
+        Ok(Self { dockerfile, has_project, controller, yml, has_makefile })
     }
 }
 
@@ -70,7 +76,7 @@ fn competition(project: &Path, templates: &Templates) -> Result<String, String> 
         }
     }
     let own = text_of(&controllers.join("Dockerfile"))?;
-    own.map_or_else(|| templates.text(CONTROLLER).map(String::from), Ok)
+    own.map_or_else(|| templates.text(CONTROLLER_DOCKERFILE).map(String::from), Ok)
 }
 
 /// A directory of the project, which must not be a symlink to a path outside.
@@ -137,17 +143,17 @@ mod tests {
     fn an_image_is_built_only_where_there_is_something_to_build() {
         let project = tempfile::tempdir().unwrap();
         let plan = BuildPlan::read(project.path(), &templates(), "x").unwrap();
-        assert!(plan.dockerfile.is_none() && plan.yml.warnings.is_empty());
+        assert!(
+            !plan.has_project && plan.dockerfile.bases == ["${WEBOTS_DEFAULT_IMAGE}"] && plan.yml.warnings.is_empty()
+        );
         std::fs::write(project.path().join("Makefile"), "all:\n").unwrap();
         std::fs::write(project.path().join(".env"), "A=b").unwrap();
         let plan = BuildPlan::read(project.path(), &templates(), "x").unwrap();
-        assert!(
-            plan.has_makefile && plan.dockerfile.is_some_and(|found| found.text.contains("LABEL webots-fleet.owner=x"))
-        );
+        assert!(plan.has_makefile && plan.has_project && plan.dockerfile.text.contains("LABEL webots-fleet.owner=x"));
         assert_eq!(plan.yml.warnings, [".env of the project is not used here"]);
         std::fs::write(project.path().join("Dockerfile"), "FROM mine\n").unwrap();
         let plan = BuildPlan::read(project.path(), &templates(), "x").unwrap();
-        assert_eq!(plan.dockerfile.unwrap().text, "FROM mine\nLABEL webots-fleet.owner=x\n");
+        assert!(plan.dockerfile.text.starts_with("FROM mine\nLABEL webots-fleet.owner=x\nRUN "));
     }
 
     #[test]

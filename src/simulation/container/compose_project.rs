@@ -8,8 +8,9 @@ use std::path::{Path, PathBuf};
 use serde_json::{Value, json};
 
 use super::build_plan::PROJECT_PATH;
+use super::built_image::BuiltImage;
 use super::docker_features::DockerFeatures;
-use super::templates::{Template, WEBOTS};
+use super::templates::{CONTROLLER, Template, WEBOTS};
 use crate::simulation::config::{ContainerDisplay, EDITOR_PORT, SimulationConfig};
 use crate::simulation::machine::sensors::Gpu;
 
@@ -27,9 +28,9 @@ pub struct ComposeProject<'parts> {
     /// The directory for the editor, as in the project's `webots.yml`.
     pub volume: &'parts str,
     /// The image of Webots.
-    pub image: &'parts str,
+    pub image: &'parts BuiltImage,
     /// The image of a competition's controller.
-    pub controller: Option<&'parts str>,
+    pub controller: Option<&'parts BuiltImage>,
     /// Webots and its arguments in the container.
     pub command: &'parts [String],
     /// The port of Webots.
@@ -84,8 +85,8 @@ impl ComposeProject<'_> {
         let command = if command.chars().all(plain) { command } else { String::new() };
         let path = |path: &Path| path.to_string_lossy().into_owned();
         vec![
-            ("IMAGE", self.image.to_owned()),
-            ("CONTROLLER_IMAGE", self.controller.unwrap_or_default().to_owned()),
+            ("IMAGE", self.image.name.clone()),
+            ("CONTROLLER_IMAGE", self.controller.map_or_else(String::new, |image| image.name.clone())),
             ("PROJECT_PATH", PROJECT_PATH.to_owned()),
             ("PROJECT", path(self.project)),
             ("MAKE", u8::from(self.has_makefile).to_string()),
@@ -110,7 +111,7 @@ impl ComposeProject<'_> {
 
     /// The settings of each service, which override the template.
     fn overridden(&self, template: &Template, config: &SimulationConfig) -> Value {
-        let service = |name: &String| (name.clone(), self.service(name, template.has_command, config));
+        let service = |(name, has_command): (&String, &bool)| (name.clone(), self.service(name, *has_command, config));
         let services: serde_json::Map<String, Value> = template.services.iter().map(service).collect();
         let network = json!({ "default": { "external": true, "name": config.container.network.name() } });
         json!({ "services": services, "networks": network })
@@ -145,16 +146,23 @@ impl ComposeProject<'_> {
         ]);
         service.extend(limits.cores.map(|cores| ("cpus", json!(cores))));
         let mut environment = ENVIRONMENT.map(|(name, value)| (name, value.to_owned())).to_vec();
+        let built = match name {
+            WEBOTS => Some((self.image, self.command.to_vec())),
+            CONTROLLER => self.controller.map(|image| (image, image.command())),
+            _ => None,
+        };
+        // Its entry point creates it.
+        environment.push(("HOME", if built.is_some() { "/tmp/home" } else { "/tmp" }.to_owned()));
+        if let Some((image, command)) = built {
+            let plain =
+                |words: Vec<String>| json!(words.iter().map(|word| word.replace('$', "$$")).collect::<Vec<_>>());
+            service.insert("entrypoint", plain(image.entrypoint()));
+            // With an entry point here the image's own command does not count.
+            service.extend((!has_command).then(|| ("command", plain(command))));
+        }
         if name == WEBOTS {
-            if !has_command {
-                let words: Vec<String> = self.command.iter().map(|word| word.replace('$', "$$")).collect();
-                service.insert("command", json!(words));
-            }
             self.show(&mut service, &mut environment, config);
         }
-        // The images of Webots and of controllers have a program that creates it.
-        let home = if [WEBOTS, "controller"].contains(&name) { "/tmp/home" } else { "/tmp" };
-        environment.push(("HOME", home.to_owned()));
         service.insert("environment", json!(BTreeMap::from_iter(environment)));
         json!(service)
     }
@@ -228,7 +236,7 @@ mod tests {
                 project: folder,
                 edited: folder,
                 volume: "",
-                image: "image",
+                image: &BuiltImage::default(),
                 controller: None,
                 command: &command,
                 port: 2001,

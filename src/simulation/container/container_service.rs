@@ -9,6 +9,7 @@ use tokio::sync::{OnceCell, Semaphore};
 use tokio_util::task::AbortOnDropHandle;
 
 use super::build_plan::{self, BuildPlan, PROJECT_PATH};
+use super::built_image::BuiltImage;
 use super::compose_project::{ComposeProject, container_of};
 use super::container_request::ContainerRequest;
 use super::docker::Docker;
@@ -124,20 +125,16 @@ impl ContainerService {
             has_makefile: plan.has_makefile,
             network,
         };
-        let image = if let Some(dockerfile) = &plan.dockerfile {
-            let image = self.images.build(build(dockerfile, ""), progress).await?;
+        let image = self.images.build(build(&plan.dockerfile, plan.has_project.then_some("")), progress).await?;
+        if plan.has_project {
             let from = Path::new(PROJECT_PATH);
-            export(docker, &guard.name, (&image, from), project, project.folder(), size).await?;
-            image
-        } else {
-            let id = self.images.pull(&base, progress).await?;
-            self.images.open(id, project, progress).await?
-        };
+            export(docker, &guard.name, (&image.name, from), project, project.folder(), size).await?;
+        }
         let mut controller = None;
         if let Some(dockerfile) = &plan.controller {
-            let image = self.images.build(build(dockerfile, "controllers"), progress).await?;
+            let image = self.images.build(build(dockerfile, Some("controllers")), progress).await?;
             let (from, to) = (Path::new(PROJECT_PATH).join(plan.yml.folder_in_project()), participant_folder(project));
-            export(docker, &guard.name, (&image, &from), project, &to, size).await?;
+            export(docker, &guard.name, (&image.name, &from), project, &to, size).await?;
             controller = Some(image);
         }
         if plan.yml.kind != ProjectKind::Default {
@@ -152,10 +149,10 @@ impl ContainerService {
         request: ContainerRequest,
         plan: BuildPlan,
         guard: ProjectGuard,
-        (image, controller): (String, Option<String>),
+        (image, controller): (BuiltImage, Option<BuiltImage>),
         progress: OnProgress<'_>,
     ) -> Result<SimulationContainers, StartError> {
-        let is_projects = plan.dockerfile.is_some() || controller.is_some();
+        let is_projects = plan.has_project || controller.is_some();
         let features = self.features.get_or_try_init(|| DockerFeatures::query(&self.docker)).await?.clone();
         let (config, templates) = (Arc::clone(&self.config), self.templates.clone());
         let (name, yml, has_makefile) = (guard.name.clone(), plan.yml.clone(), plan.has_makefile);
@@ -172,7 +169,7 @@ impl ContainerService {
                 edited: &edited,
                 volume: &yml.folder,
                 image: &image,
-                controller: controller.as_deref(),
+                controller: controller.as_ref(),
                 command: &request.command(&config, &world),
                 port: request.port,
                 gpu: request.gpu.as_ref(),
@@ -194,7 +191,7 @@ impl ContainerService {
         // An editor has a port of its own, which the relay of streams does not reach.
         let has_editor = plan.yml.kind != ProjectKind::Default && self.config.ports_are_public();
         let texts = has_editor.then(|| "ide: enable".to_owned()).into_iter().chain(plan.yml.project_type).collect();
-        let containers = services.into_iter().map(|service| (service.clone(), container_of(&guard.name, &service)));
+        let containers = services.into_keys().map(|service| (service.clone(), container_of(&guard.name, &service)));
         let (docker, containers, warnings) = (self.docker.clone(), containers.collect(), plan.yml.warnings);
         Ok(SimulationContainers { docker, guard, containers, is_projects, texts, warnings, restart: None })
     }

@@ -7,7 +7,7 @@ use crate::shared::text::excerpt;
 /// A Dockerfile that this server builds.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Dockerfile {
-    /// Its text, in which every stage has the label of its owner.
+    /// Its text, in which every stage has the label of its owner, and the last one opens the home of its user.
     pub text: String,
     /// What its stages begin with, as it stands after each `FROM`.
     pub bases: Vec<String>,
@@ -15,6 +15,14 @@ pub struct Dockerfile {
 
 /// The label of everything that this server has built, also of leftovers of failed builds.
 pub const LABEL: &str = "webots-fleet.owner";
+/// The last instruction: the server's user may read what the image's own user has at home, such as the assets and settings of
+/// Webots in `/root`. A file whose mode changes is copied into a layer of the image, so that only those change that have to.
+/// Users other than root may not change the mode of all.
+const OPEN_HOME: &str = concat!(
+    r#"RUN ["/bin/sh","-c","[ ! -d \"$HOME\" ] || [ \"$HOME\" = / ] || find \"$HOME\" -xdev "#,
+    r#"\\( -type d ! -perm -5 -o -type f ! -perm -4 \\) -exec chmod a+rX {} + || [ $(id -u) != 0 ]"]"#,
+    "\n"
+);
 /// Why a Dockerfile can't have a volume, as the end of a sentence.
 pub const NO_VOLUME: &str = "a volume would take the machine's disk without a limit; what a program writes has its place in the \
     project or in /tmp";
@@ -61,8 +69,11 @@ impl Dockerfile {
                 instruction.clear();
             }
         }
-        // Docker would take an instruction that the end of the file cuts off.
-        found.take(&instruction, owner).map_err(|why| wrong(first, &instruction, why)).map(|()| found)
+        if !instruction.is_empty() {
+            return Err(wrong(first, &instruction, "the file ends within it"));
+        }
+        found.text.push_str(OPEN_HOME);
+        Ok(found)
     }
 
     /// Checks an instruction, and labels a stage that begins with it.
@@ -122,7 +133,10 @@ mod tests {
         let expected = "# a comment\nARG IMAGE\nfrom $IMAGE \\\n  as base\nLABEL webots-fleet.owner=x\nRUN a \\\n  # inside\n  \
                         FROM b\nFROM scratch\nLABEL webots-fleet.owner=x\n";
         let found = Dockerfile::read(text, "x").unwrap();
-        assert_eq!((found.text.as_str(), found.bases), (expected, vec!["$IMAGE".to_owned(), "scratch".to_owned()]));
+        assert_eq!(
+            (found.text.strip_suffix(OPEN_HOME), found.bases),
+            (Some(expected), vec!["$IMAGE".to_owned(), "scratch".to_owned()])
+        );
     }
 
     #[test]
@@ -156,6 +170,7 @@ mod tests {
             "VOLUME /data",
             "volume \\\n /data",
             "ONBUILD VOLUME /data",
+            "RUN a \\",
         ] {
             assert!(labelled(&format!("FROM a\n{line}\n")).is_err(), "{line}");
         }

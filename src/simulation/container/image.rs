@@ -1,7 +1,7 @@
 //! The images of simulations: pulled, and built once for all clients of the same project.
 
 use std::ffi::OsString;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -9,12 +9,12 @@ use actix_rt::task::spawn_blocking;
 use tokio::sync::{Semaphore, SemaphorePermit, watch};
 
 use super::build_plan::{self, PROJECT_PATH};
+use super::built_image::BuiltImage;
 use super::compose_project::DEFAULT_MEMORY;
 use super::docker::{Docker, DockerError, SHORT_TIMEOUT};
 use super::dockerfile::{Dockerfile, LABEL};
-use super::opened::{self, ImageConfig};
-use super::owned_resources::ResourceOwner;
-use super::start_error::{StartError, blame, is_disk_full};
+use super::owned_resources::{ResourceOwner, digest};
+use super::start_error::{StartError, is_disk_full};
 use super::steps;
 use crate::simulation::checkout::{OnProgress, Project, SingleFlight};
 use crate::simulation::config::SimulationConfig;
@@ -33,7 +33,7 @@ pub struct Images {
     jobs: SingleFlight<String, Result<(), StartError>>,
 }
 
-/// An image to build from a project, or from a directory of it.
+/// An image to build.
 #[derive(Debug)]
 pub struct ImageBuild {
     /// The project, kept until the build has ended.
@@ -42,8 +42,9 @@ pub struct ImageBuild {
     pub base: String,
     /// The Dockerfile.
     pub dockerfile: Dockerfile,
-    /// The directory that it copies from; empty for the whole project.
-    pub folder: &'static str,
+    /// The directory of the project that it copies from, empty for the whole project; `None` for the image of Webots, which
+    /// is the same for all projects.
+    pub folder: Option<&'static str>,
     /// Whether the project has a Makefile.
     pub has_makefile: bool,
     /// The Docker network that it may use.
@@ -52,6 +53,12 @@ pub struct ImageBuild {
 
 /// How a Dockerfile names the image of the world's version of Webots.
 const DEFAULT_BASE: [&str; 2] = ["$WEBOTS_DEFAULT_IMAGE", "${WEBOTS_DEFAULT_IMAGE}"];
+/// Formats of what is asked of an image: its id, which differs from those of later images of the same name, and the
+/// configuration of its programs.
+const ID: &str = "{{.Id}}";
+const CONFIG: &str = "{{json .Config}}";
+/// Why an image is not there although it was, as text for the client.
+const REMOVED: &str = "An image that this simulation needs was removed meanwhile";
 /// Arguments of the Dockerfile of a participant's controller.
 const PARTICIPANT: [&str; 2] = ["WEBOTS_CONTROLLER_URL=participant", "DEFAULT_CONTROLLER=participant"];
 
@@ -64,18 +71,13 @@ impl Images {
         Self { docker, owner, limit, memory, builds, jobs: SingleFlight::default() }
     }
 
-    /// The name of one of this server's images; unique.
-    fn name(&self, parts: &[String]) -> String {
-        format!("webots-fleet/{}:{}", self.owner.name(), opened::key(parts))
-    }
-
     /// Pulls a configured image unless it exists. Returns its id, which differs from those of later images of the same
     /// name.
     ///
     /// # Errors
     /// Why it can't be pulled, as text for the client.
     pub async fn pull(self: &Arc<Self>, image: &str, progress: OnProgress<'_>) -> Result<String, StartError> {
-        if let Some(id) = self.id(image).await? {
+        if let Some(id) = self.inspect(image, ID).await? {
             return Ok(id);
         }
         let (this, name) = (Arc::clone(self), image.to_owned());
@@ -86,23 +88,28 @@ impl Images {
             pulled.map_err(|error| not_pulled(&name, error))
         };
         self.jobs.join(image.to_owned(), progress, pull).await?;
-        self.id(image).await?.ok_or_else(|| StartError::Server(format!("The image {image} was removed meanwhile")))
+        self.inspect(image, ID).await?.ok_or_else(|| StartError::Server(REMOVED.to_owned()))
     }
 
-    /// Builds an image of a project unless it exists, opened for the server's user. Returns its name.
+    /// Builds an image unless it exists.
     ///
     /// # Errors
-    /// Why it can't be built, as text for the client.
-    pub async fn build(self: &Arc<Self>, build: ImageBuild, progress: OnProgress<'_>) -> Result<String, StartError> {
+    /// Why it can't be built or used, as text for the client.
+    pub async fn build(
+        self: &Arc<Self>,
+        build: ImageBuild,
+        progress: OnProgress<'_>,
+    ) -> Result<BuiltImage, StartError> {
         let mut arguments = vec![
             format!("WEBOTS_DEFAULT_IMAGE={}", build.base),
             format!("PROJECT_PATH={PROJECT_PATH}"),
             format!("MAKE={}", u8::from(build.has_makefile)),
         ];
-        if !build.folder.is_empty() {
-            arguments.extend(PARTICIPANT.map(str::to_owned));
+        let mut parts = vec![build.dockerfile.text.clone()];
+        if let Some(folder) = build.folder {
+            parts.extend([build.project.identity(), folder.to_owned()]);
+            arguments.extend(PARTICIPANT.iter().filter(|_| !folder.is_empty()).map(|word| (*word).to_owned()));
         }
-        let mut parts = vec![build.project.identity(), build.folder.to_owned(), build.dockerfile.text.clone()];
         parts.extend_from_slice(&arguments);
         // An image's name stays the same when the image is updated, so its id is part of the key. A base that is not here
         // yet has none: the build fetches it.
@@ -111,13 +118,18 @@ impl Images {
             parts.extend(if is_default {
                 Some(self.pull(&build.base, progress).await?)
             } else {
-                self.id(base).await?
+                self.inspect(base, ID).await?
             });
         }
-        let name = self.name(&parts);
+        let name = format!("webots-fleet/{}:{}", self.owner.name(), digest(parts.join("\0").as_bytes()));
+        if let Some(config) = self.inspect(&name, CONFIG).await? {
+            return Ok(BuiltImage::read(name, &config)?);
+        }
         let (this, tag) = (Arc::clone(self), name.clone());
-        self.once(name, progress, move |sender| async move { this.build_now(&tag, build, arguments, sender).await })
-            .await
+        let job = |sender| async move { this.build_now(&tag, build, arguments, sender).await };
+        self.jobs.join(name.clone(), progress, job).await?;
+        let config = self.inspect(&name, CONFIG).await?;
+        Ok(BuiltImage::read(name, &config.ok_or_else(|| StartError::Server(REMOVED.to_owned()))?)?)
     }
 
     async fn build_now(
@@ -129,18 +141,22 @@ impl Images {
     ) -> Result<(), StartError> {
         let _permit = self.permit(&sender).await?;
         let ImageBuild { project, dockerfile, folder, network, .. } = build;
-        let (file, root) = (project.instance.path().join(format!("Dockerfile{folder}")), project.folder().to_owned());
-        let written = file.clone();
+        let (instance, root) = (project.instance.path().to_owned(), project.folder().to_owned());
         let prepare = move || {
-            std::fs::write(written, dockerfile.text)?;
+            let file = instance.join(format!("Dockerfile{}", folder.unwrap_or_default()));
+            std::fs::write(&file, dockerfile.text)?;
+            let empty = instance.join("empty");
+            std::fs::create_dir_all(&empty)?;
             // A copy out of an image may have replaced it by a symlink to any path.
-            Ok::<_, StartError>(build_plan::inside(&root, Path::new(folder))?)
+            let context = folder.map_or(Ok(empty), |folder| build_plan::inside(&root, Path::new(folder)))?;
+            Ok::<_, StartError>((file, context))
         };
-        let context = spawn_blocking(prepare).await??;
-        let id_file = file.with_extension("id");
-        let mut options: Vec<OsString> =
-            vec!["--network".into(), network.into(), "--iidfile".into(), (&id_file).into()];
-        options.extend(arguments.into_iter().flat_map(|argument| ["--build-arg".into(), argument.into()]));
+        let (file, context) = spawn_blocking(prepare).await??;
+        let memory = format!("{}m", self.memory);
+        let options = ["build", "--force-rm", "--memory", &memory, "--memory-swap", &memory, "--network", network];
+        let words = options.into_iter().chain(["--tag", name, "--file"]).map(OsString::from).chain([file.into()]);
+        let arguments = arguments.into_iter().flat_map(|argument| ["--build-arg".into(), argument.into()]);
+        let words = words.chain(arguments).chain([context.into()]);
         let mut step = String::new();
         let on_line = |line: &str| {
             if line.starts_with("Step ") {
@@ -150,77 +166,8 @@ impl Images {
                 sender.send(text).ok();
             }
         };
-        let done = self.run_build(options, file, context, on_line).await;
-        done.map_err(|error| not_built(&step, error))?;
-        // It has no name of its own: it is removed with the image on top.
-        let id = tokio::fs::read_to_string(id_file).await?;
-        self.open_now(&id, name, &project, true).await
-    }
-
-    /// Runs `docker build` with these options. `on_line` receives each line that it prints.
-    async fn run_build(
-        &self,
-        options: Vec<OsString>,
-        dockerfile: PathBuf,
-        context: PathBuf,
-        on_line: impl FnMut(&str),
-    ) -> Result<(), DockerError> {
-        let memory = format!("{}m", self.memory);
-        let always = ["build", "--force-rm", "--memory", &memory, "--memory-swap", &memory, "--file"];
-        let words = always.map(OsString::from).into_iter().chain([dockerfile.into()]).chain(options);
-        let words = words.chain([context.into()]);
-        self.docker.follow(words.collect(), self.limit, on_line).await
-    }
-
-    /// Creates the image in which the server's user can read the home directory of the image's own user, unless it
-    /// exists. Returns its name.
-    ///
-    /// # Errors
-    /// Why it can't be created, as text for the client.
-    pub async fn open(
-        self: &Arc<Self>,
-        id: String,
-        project: &Arc<Project>,
-        progress: OnProgress<'_>,
-    ) -> Result<String, StartError> {
-        let name = self.name(std::slice::from_ref(&id));
-        let (this, tag, project) = (Arc::clone(self), name.clone(), Arc::clone(project));
-        self.once(name, progress, move |_| async move { this.open_now(&id, &tag, &project, false).await }).await
-    }
-
-    /// `is_projects` tells whether the project has defined the image, which then is to blame.
-    async fn open_now(&self, id: &str, name: &str, project: &Project, is_projects: bool) -> Result<(), StartError> {
-        let inspect = ["image", "inspect", "--format", "{{json .Config}}", id];
-        let json = self.docker.run(&inspect, SHORT_TIMEOUT).await.map_err(|error| blame(is_projects, error))?;
-        let text = ImageConfig::read(&json)?.dockerfile(id, self.owner.name());
-        let context = project.instance.path().join(format!("opened-{}", opened::key(&[name.to_owned()])));
-        let (dockerfile, folder) = (context.with_extension("Dockerfile"), context.clone());
-        let file = dockerfile.clone();
-        spawn_blocking(move || std::fs::write(file, text).and_then(|()| opened::write_programs(&folder))).await??;
-        let options = ["--network", "none", "--tag", name].map(Into::into).to_vec();
-        let done = self.run_build(options, dockerfile, context, |_| ()).await;
-        done.map_err(|error| match error {
-            DockerError::Slow { limit, .. } if is_projects => StartError::Project(too_slow(limit)),
-            error => match StartError::of_project(error) {
-                StartError::Project(why) => {
-                    StartError::Project(format!("The image can't be prepared for this server's user: {why}"))
-                }
-                error @ StartError::Server(_) => error,
-            },
-        })
-    }
-
-    /// Runs a job that creates an image, unless it exists. Joins such a job in progress.
-    async fn once<F: Future<Output = Result<(), StartError>> + Send + 'static>(
-        self: &Arc<Self>,
-        name: String,
-        progress: OnProgress<'_>,
-        job: impl FnOnce(watch::Sender<String>) -> F,
-    ) -> Result<String, StartError> {
-        if self.id(&name).await?.is_some() {
-            return Ok(name);
-        }
-        self.jobs.join(name.clone(), progress, job).await.map(|()| name)
+        let done = self.docker.follow(words.collect(), self.limit, on_line).await;
+        done.map_err(|error| not_built(&step, error))
     }
 
     async fn permit(&self, sender: &watch::Sender<String>) -> Result<SemaphorePermit<'_>, StartError> {
@@ -233,10 +180,10 @@ impl Images {
         permit.map_err(|_| StartError::Server(busy()))?.map_err(|error| StartError::Server(error.to_string()))
     }
 
-    /// The id of an image, which differs from those of later images of the same name; `None` if it does not exist.
-    async fn id(&self, image: &str) -> Result<Option<String>, StartError> {
-        match self.docker.run(&["image", "inspect", "--format", "{{.Id}}", image], SHORT_TIMEOUT).await {
-            Ok(id) => Ok(Some(id.trim().to_owned())),
+    /// What Docker says of an image in this format; `None` if it does not exist.
+    async fn inspect(&self, image: &str, format: &str) -> Result<Option<String>, StartError> {
+        match self.docker.run(&["image", "inspect", "--format", format, image], SHORT_TIMEOUT).await {
+            Ok(found) => Ok(Some(found.trim().to_owned())),
             Err(DockerError::Failed { .. }) => Ok(None),
             Err(error) => Err(error.into()),
         }

@@ -1,6 +1,7 @@
 //! Simulations in Docker containers: what a project requests, its image, and a compose project for each simulation.
 
 mod build_plan;
+mod built_image;
 mod check;
 mod compose_project;
 mod container_request;
@@ -11,7 +12,6 @@ mod dockerfile;
 mod image;
 mod image_export;
 mod network;
-mod opened;
 mod orphan_cleanup;
 mod owned_resources;
 pub mod packet_filter;
@@ -24,10 +24,10 @@ mod templates;
 mod usage;
 mod webots_yml;
 
+pub use built_image::RUNS;
 pub use check::{check, check_templates, daemon_fault, data_folder, init_fault};
 pub use container_request::ContainerRequest;
 pub use container_service::ContainerService;
-pub use opened::RUNS;
 pub use owned_resources::{ResourceOwner, sweep};
 pub use simulation_containers::{Cause, SimulationContainers};
 pub use start_error::StartError;

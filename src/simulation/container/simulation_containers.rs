@@ -10,7 +10,7 @@ use super::docker::{Docker, DockerError, SHORT_TIMEOUT};
 use super::orphan_cleanup::ProjectGuard;
 use super::owned_resources;
 use super::start_error::{StartError, blame};
-use super::templates::WEBOTS;
+use super::templates::{CONTROLLER, WEBOTS};
 use crate::simulation::process::SpawnSpec;
 
 /// The containers of one simulation.
@@ -51,8 +51,6 @@ const ENDED_BY_SIGNAL: [i32; 2] = [128 + 15, 128 + 9];
 const EVENTS: (Duration, Duration) = (Duration::from_mins(1), Duration::from_millis(100));
 /// Shortest time between two restarts of a participant's controller.
 const RESTART_INTERVAL: Duration = Duration::from_secs(1);
-/// The service of a participant's controller.
-const CONTROLLER: &str = "controller";
 
 impl Cause {
     /// Whether this server is the cause, so that another one may accept the client.

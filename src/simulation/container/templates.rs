@@ -31,18 +31,18 @@ pub struct Templates {
 pub struct Template {
     /// The unchanged file.
     pub text: Cow<'static, str>,
-    /// Its services.
-    pub services: Vec<String>,
-    /// Whether it has a command for Webots.
-    pub has_command: bool,
+    /// Its services, and whether it has a command for each.
+    pub services: BTreeMap<String, bool>,
 }
 
 /// The service of Webots.
 pub const WEBOTS: &str = "webots";
+/// The service of a participant's controller.
+pub const CONTROLLER: &str = "controller";
 /// The Dockerfile of a project that has none.
 pub const DOCKERFILE: &str = "Dockerfile.default";
 /// The Dockerfile of a competition's controllers that have none.
-pub const CONTROLLER: &str = "Dockerfile.controller";
+pub const CONTROLLER_DOCKERFILE: &str = "Dockerfile.controller";
 /// The launcher of a participant's controller.
 pub const LAUNCHER: &str = "remote_controller_launcher.py";
 
@@ -73,7 +73,7 @@ impl Templates {
             return vec![format!("container.templates, {}: {error}", folder.display())];
         }
         let kinds = [ProjectKind::Default, ProjectKind::Editor, ProjectKind::Competition];
-        let files = [DOCKERFILE, CONTROLLER, LAUNCHER];
+        let files = [DOCKERFILE, CONTROLLER_DOCKERFILE, LAUNCHER];
         let faults = kinds.into_iter().filter_map(|kind| self.compose(kind).err());
         faults.chain(files.into_iter().filter_map(|name| self.text(name).err())).collect()
     }
@@ -92,13 +92,14 @@ impl Templates {
         let broken = |error: String| format!("The template {name} of this simulation server can't be used: {error}");
         let text = self.text(&name)?;
         let document: Document = serde_saphyr::from_str(&text).map_err(|error| broken(error.to_string()))?;
-        let webots = document.services.get(WEBOTS);
-        let webots = webots.ok_or_else(|| broken(format!("it has no service {WEBOTS:?}")))?;
+        if !document.services.contains_key(WEBOTS) {
+            return Err(broken(format!("it has no service {WEBOTS:?}")));
+        }
         if let Some(line) = unsuitable(&text) {
             return Err(broken(line));
         }
-        let has_command = webots.command.is_some();
-        Ok(Template { services: document.services.into_keys().collect(), text, has_command })
+        let services = document.services.into_iter().map(|(name, service)| (name, service.command.is_some()));
+        Ok(Template { services: services.collect(), text })
     }
 
     /// Whether the administrator has a file of this name.
