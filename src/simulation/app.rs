@@ -218,10 +218,8 @@ fn assemble(
     let load_monitor = load_monitor.start();
     announcer::start(&config);
     let usage = UsageMonitor::default();
-    let system = |source| {
-        AppError::Unavailable(format!("simulations can't be watched (threads, or netlink with sock_diag): {source}"))
-    };
-    let watcher = Watcher::start(run.path().to_owned(), &config, usage.clone()).map_err(system)?;
+    let watcher = Watcher::start(run.path().to_owned(), config.disk_reserve, usage.clone());
+    let watcher = watcher.map_err(|error| AppError::Unavailable(format!("simulations can't be watched: {error}")))?;
     let starts = outcome::counter(&metrics)?;
     let failed_starts = Arc::default();
     let problem =

@@ -31,8 +31,6 @@ pub enum SimulationChange {
     },
     /// It was given the GPU with this number.
     Gpu(u32),
-    /// It streams on this port.
-    Port(u16),
     /// Its client has disconnected, and it waits until this time, in seconds since 1970; `None` if its client is
     /// connected again.
     Away(Option<u64>),
@@ -108,7 +106,6 @@ impl Simulation {
             SimulationChange::Stage(stage) => self.stage = stage,
             SimulationChange::Version(version) => self.version = Some(version),
             SimulationChange::Gpu(index) => self.gpu = Some(index),
-            SimulationChange::Port(port) => self.port = Some(port),
             SimulationChange::Away(until) => self.away_until = until,
             SimulationChange::Launched { at, pid, cgroup, port, log } => {
                 self.cgroup = cgroup;

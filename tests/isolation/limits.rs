@@ -95,20 +95,6 @@ async fn files_that_are_open_are_bounded() {
     }
 }
 
-#[actix_rt::test]
-async fn who_takes_the_ports_of_others_is_told_and_ended() {
-    let deed = "for one; do case $one in --port=*) port=${one#--port=};; esac; done\n\
-                python3 -c \"import socket, time; s = [socket.create_server(('127.0.0.1', p)) for p in range($port + 1, \
-                $port + 4)]; time.sleep(1000)\" &";
-    for level in LEVELS {
-        let told = told_for(deed, level, "processes", 4096).await;
-        assert!(
-            told.contains("The simulation listens on the ports ") && told.contains("only one is its own"),
-            "{told}"
-        );
-    }
-}
-
 /// The time of processors that a server has taken, in seconds.
 fn taken(server: &Server) -> f64 {
     let stat = procfs::process::Process::new(server.pid()).unwrap().stat().unwrap();

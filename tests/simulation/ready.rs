@@ -1,7 +1,6 @@
 //! When Webots is ready, where, and when it is not.
 
 use std::collections::BTreeSet;
-use std::net::TcpListener;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
@@ -16,45 +15,6 @@ use crate::support::program::{Server, simulation_server};
 use crate::support::stopwatch::Stopwatch;
 use crate::support::webots::{Webots, instances_below};
 use crate::support::{display, until};
-
-#[actix_rt::test]
-async fn the_port_that_webots_really_took_is_handed_out() {
-    let (forge, folder) = (Forge::with_arm(), tempfile::tempdir().unwrap());
-    let go = folder.path().join("go");
-    let webots = Webots::script(&format!("until [ -e {} ]; do sleep 0.01; done\n{DEMO} \"$@\" & wait", go.display()));
-    let builder = simulation_server(&webots.path(), forge.path(), 3).set("isolation", "none");
-    let server = builder.start().await;
-    let mut client = Client::start(&server, &arm()).await;
-    client.until("shutdownTimeout").await;
-    // Somebody takes the port after it was lent; Webots silently moves on.
-    let foreign = TcpListener::bind(("127.0.0.1", server.port + 1)).unwrap();
-    assert!(client.is_silent(Duration::from_millis(300)).await, "a listener of somebody else was taken for Webots");
-    std::fs::write(&go, "").unwrap();
-    assert_eq!(client.until("webots:").await, format!("webots:ws://localhost:{}", server.port + 2));
-    let mut viewer = Client::connect(&format!("ws://127.0.0.1:{}/", server.port + 2)).await;
-    viewer.send("x3d").await;
-    viewer.until("scene load completed").await;
-    // The next client gets neither of the two.
-    let mut next = Client::start(&server, &arm()).await;
-    assert_eq!(next.until("webots:").await, format!("webots:ws://localhost:{}", server.port + 3));
-    drop(foreign);
-}
-
-#[actix_rt::test]
-async fn a_port_outside_of_the_servers_range_fails_the_start() {
-    let forge = Forge::with_arm();
-    let webots = Webots::script(&format!(
-        "args=()\nfor one; do case $one in --port=*) one=--port=$((${{one#--port=}} + 1));; esac; args+=(\"$one\"); done\n{DEMO} \"${{args[@]}}\" & wait"
-    ));
-    let server = simulation_server(&webots.path(), forge.path(), 1).start().await;
-    let mut client = Client::start(&server, &arm()).await;
-    let told = client.until("loading: Error:").await;
-    let (first, next) = (server.port + 1, server.port + 2);
-    let words = format!("Webots listens on port {next}, outside of this server's ports {first} to {first}");
-    assert!(told.contains(&words), "{told}");
-    assert_eq!(client.closed().await, Some(1013));
-    nothing_left(&server, 2).await;
-}
 
 #[actix_rt::test]
 async fn a_launch_that_never_listens_ends_with_its_last_words() {

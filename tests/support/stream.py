@@ -18,11 +18,16 @@ def copy(source, target):
             pass
 
 
+def serve(near):
+    if near.recv(1, socket.MSG_PEEK):  # else the server has looked whether anything listens
+        far = socket.create_connection(("127.0.0.1", other))
+        threading.Thread(target=copy, args=(near, far), daemon=True).start()
+        copy(far, near)
+
+
 port = next(int(word.split("=")[1]) for word in sys.argv if word.startswith("--port="))
 other = int(sys.argv[-1])
 listener = socket.create_server(("127.0.0.1", port), backlog=128)
 while True:
     near, _ = listener.accept()
-    far = socket.create_connection(("127.0.0.1", other))
-    for pair in ((near, far), (far, near)):
-        threading.Thread(target=copy, args=pair, daemon=True).start()
+    threading.Thread(target=serve, args=(near,), daemon=True).start()

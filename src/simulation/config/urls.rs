@@ -6,9 +6,6 @@ use std::ops::RangeInclusive;
 use super::{SimulationConfig, Streaming};
 use crate::shared::domain::{ClientUrls, PublicAddress};
 
-/// Number of following ports that Webots tries silently if its port is in use.
-const NEXT_PORTS: u16 = 10;
-
 impl SimulationConfig {
     /// Returns this server's HTTP URL for clients.
     pub fn http_url(&self) -> String {
@@ -60,10 +57,5 @@ impl SimulationConfig {
     /// Returns the ports that Webots may use.
     pub fn streaming_ports(&self) -> RangeInclusive<u16> {
         self.port + 1..=self.port.saturating_add(self.max_connections)
-    }
-
-    /// Returns the ports on which a Webots may listen that was started with this port.
-    pub fn ports_from(port: u16) -> RangeInclusive<u16> {
-        port..=port.saturating_add(NEXT_PORTS)
     }
 }

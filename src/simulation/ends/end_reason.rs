@@ -23,7 +23,7 @@ pub enum EndReason {
     Crashed,
     /// Webots sent no heartbeat.
     Hung,
-    /// It has exceeded a limit of memory, disk, processes or ports.
+    /// It has exceeded a limit of memory, disk or processes.
     Limit,
     /// An error of this server, its machine or its Docker.
     Fault,

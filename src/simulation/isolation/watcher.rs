@@ -1,17 +1,14 @@
-//! Watches over what simulations take that the kernel does not limit: room on the disk, ports, and on some machines
-//! processes. One thread looks for all of them; another one finds the ports of those that start.
+//! Watches over what simulations take that the kernel does not limit: room on the disk, and on some machines processes.
+//! One thread looks for all of them.
 //!
 //! The free room of the disk is looked at each second, and more often as it comes close to the reserve (`diskReserve`). At the
 //! reserve the simulation ends that has grown most, then the next.
 //!
-//! All else is done in ticks that take 1 % of one core at most: as they take longer, the pause between them grows. Readings that
-//! serve all simulations are made once for all: one query for listeners, one pass over `/proc`. Folders, which have to be
-//! counted one by one, are counted only when the disk has lost as much room as the simulation may still write, and every ten
-//! seconds at most.
+//! All else is done in ticks that take 1 % of one core at most: as they take longer, the pause between them grows. One pass
+//! over `/proc` serves all simulations. Folders, which have to be counted one by one, are counted only when the disk has lost
+//! as much room as the simulation may still write, and every ten seconds at most.
 
-use std::collections::{BTreeSet, HashMap, HashSet};
 use std::io;
-use std::ops::RangeInclusive;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
@@ -23,18 +20,11 @@ use tokio::sync::oneshot;
 use super::disk::Disk;
 use super::disk_use::{DiskUse, words};
 use super::peak::Peak;
-use crate::simulation::config::SimulationConfig;
 use crate::simulation::machine::{Tree, UsageMonitor};
-use crate::simulation::process::PortFinder;
-use crate::simulation::process::listeners::{Listener, listeners};
-use crate::simulation::process::process_tree::{sockets, tree};
 
-/// Monitors simulations. Its threads end when the last clone is dropped.
+/// Monitors simulations. Its thread ends when the last clone is dropped.
 #[derive(Debug, Clone)]
-pub struct Watcher {
-    watches: Sender<(Watch, oneshot::Sender<String>)>,
-    ports: PortFinder,
-}
+pub struct Watcher(Sender<(Watch, oneshot::Sender<String>)>);
 
 /// What is monitored of one simulation.
 #[derive(Debug)]
@@ -49,8 +39,6 @@ pub struct Watch {
     pub disk: u64,
     /// Limit of its processes and threads; `None` if the kernel enforces it.
     pub processes: Option<MostProcesses>,
-    /// Its port; `None` if it has a network of its own.
-    pub port: Option<u16>,
     /// Receives its usage; `None` if its control group counts it.
     pub peak: Option<Arc<Peak>>,
 }
@@ -86,32 +74,17 @@ const FOLDERS: Duration = Duration::from_millis(100);
 const COUNT: Duration = Duration::from_secs(1);
 const COUNT_AT_RESERVE: Duration = Duration::from_millis(100);
 const COUNTS_AT_RESERVE: Duration = Duration::from_millis(300);
-/// Listeners of other programs are forgotten after this time.
-const FORGET: Duration = Duration::from_secs(30);
 
 impl Watcher {
-    /// Starts the threads. `run` is the directory with the directories of all instances.
+    /// Starts the thread. `run` is the directory with the directories of all instances, `reserve` is `diskReserve`.
     ///
     /// # Errors
     /// When the system can't start a thread.
-    pub fn start(run: PathBuf, config: &SimulationConfig, usage: UsageMonitor) -> io::Result<Self> {
+    pub fn start(run: PathBuf, reserve: u64, usage: UsageMonitor) -> io::Result<Self> {
         let (watches, receiver) = channel();
-        let ports = config.streaming_ports();
-        let last = *SimulationConfig::ports_from(*ports.end()).end();
-        // Without `sock_diag`, no simulation would become ready.
-        listeners(&ports)?;
-        let finder = PortFinder::start(*ports.start()..=last)?;
-        let disk = Disk::new(run, config.disk_reserve);
-        let mut table =
-            Table { disk, ports, usage, all: Vec::new(), owners: HashMap::new(), forgotten: Instant::now() };
+        let mut table = Table { disk: Disk::new(run, reserve), usage, all: Vec::new() };
         std::thread::Builder::new().name("watcher".to_owned()).spawn(move || table.run(&receiver))?;
-        Ok(Self { watches, ports: finder })
-    }
-
-    /// Waits until a process that descends from `root` listens on the port `given`, or on one that Webots takes
-    /// instead, and returns the port. Never returns if there is none.
-    pub async fn listening_port(&self, root: i32, given: u16) -> u16 {
-        self.ports.find(root, SimulationConfig::ports_from(given)).await
+        Ok(Self(watches))
     }
 
     /// Waits until a simulation exceeds a limit. Returns the message for its client. Dropping the future ends the
@@ -119,7 +92,7 @@ impl Watcher {
     pub async fn until_too_much(&self, watch: Watch) -> String {
         let (excess, told) = oneshot::channel();
         // The thread lives as long as this.
-        self.watches.send((watch, excess)).ok();
+        self.0.send((watch, excess)).ok();
         match told.await {
             Ok(why) => why,
             Err(_) => std::future::pending().await,
@@ -130,13 +103,8 @@ impl Watcher {
 /// All monitored simulations.
 struct Table {
     disk: Disk,
-    ports: RangeInclusive<u16>,
     usage: UsageMonitor,
     all: Vec<Watched>,
-    /// The owner of each listener, by inode: the root of a simulation's tree, `None` for another program.
-    owners: HashMap<u64, Option<i32>>,
-    /// When the listeners of other programs were last dropped from `owners`.
-    forgotten: Instant,
 }
 
 impl Table {
@@ -198,10 +166,6 @@ impl Table {
     fn look(&mut self, begin: Duration) {
         let mut excesses = self.count_folders(begin);
         excesses.extend(self.count_processes());
-        if self.all.iter().any(|one| one.watch.port.is_some()) {
-            // The port finder logs errors.
-            excesses.extend(listeners(&self.ports).map(|all| self.look_at_ports(&all)).unwrap_or_default());
-        }
         self.end(excesses);
     }
 
@@ -251,46 +215,6 @@ impl Table {
                 (root, why)
             })
             .collect()
-    }
-
-    /// Finds simulations that listen on more than one of the ports of simulations.
-    fn look_at_ports(&mut self, all: &[Listener]) -> Vec<(i32, String)> {
-        self.find_owners(all);
-        let mut taken: HashMap<i32, BTreeSet<u16>> = HashMap::new();
-        for one in all {
-            if let Some(Some(root)) = self.owners.get(&one.inode) {
-                taken.entry(*root).or_default().insert(one.port);
-            }
-        }
-        let too_many = taken.into_iter().filter(|(_, ports)| ports.len() > 1);
-        let told = |ports: BTreeSet<u16>| {
-            let ports: Vec<String> = ports.iter().map(u16::to_string).collect();
-            format!("The simulation listens on the ports {}, of which only one is its own", ports.join(", "))
-        };
-        too_many.map(|(root, ports)| (root, told(ports))).collect()
-    }
-
-    /// Determines the owners of new listeners: mostly the simulation with that port.
-    fn find_owners(&mut self, all: &[Listener]) {
-        let there: HashSet<u64> = all.iter().map(|one| one.inode).collect();
-        // `/proc` may leave out a child while others come and go: its listener would be taken for somebody else's for good.
-        let forget = self.forgotten.elapsed() >= FORGET;
-        self.owners.retain(|inode, owner| there.contains(inode) && (owner.is_some() || !forget));
-        self.forgotten = if forget { Instant::now() } else { self.forgotten };
-        let mut new: Vec<&Listener> = all.iter().filter(|one| !self.owners.contains_key(&one.inode)).collect();
-        for exact in [true, false] {
-            for one in self.all.iter().filter(|one| one.watch.port.is_some()) {
-                let is_wanted = |listener: &&Listener| !exact || Some(listener.port) == one.watch.port;
-                if !new.iter().any(is_wanted) {
-                    continue;
-                }
-                let own: HashSet<u64> = tree(one.watch.root).into_iter().flat_map(sockets).collect();
-                for listener in new.extract_if(.., |listener| own.contains(&listener.inode)) {
-                    self.owners.insert(listener.inode, Some(one.watch.root));
-                }
-            }
-        }
-        self.owners.extend(new.into_iter().map(|listener| (listener.inode, None)));
     }
 }
 

@@ -1,7 +1,7 @@
-//! Whether Webots in a network of its own answers on the port that is forwarded to it.
+//! Whether a Webots that starts is ready at its port.
 //!
-//! Docker's proxy and pasta listen on it from the start on, and accept connections that nothing inside takes. So only the
-//! answer to a request tells.
+//! In the machine's network a connection tells. Docker's proxy and pasta accept connections from the start on, also those
+//! that nothing inside takes: behind them only the answer to a request tells.
 
 use std::net::SocketAddr;
 use std::time::{Duration, Instant};
@@ -20,12 +20,12 @@ const FIRST_TIMEOUT: Duration = Duration::from_millis(100);
 /// Longest timeout of later ones: Webots answers none while it reads a world.
 const TIMEOUT: Duration = Duration::from_secs(2);
 
-/// Waits until there is an answer at this address. A container has to run: a request before it has its address holds all
+/// Waits until Webots is ready at this address. A container has to run: a request before it has its address holds all
 /// others up for a second, until the kernel asks for that address again.
-pub async fn until_answering(address: SocketAddr) {
+pub async fn until_answering(address: SocketAddr, is_forwarded: bool) {
     let (begin, mut timeout) = (Instant::now(), FIRST_TIMEOUT);
     loop {
-        match actix_rt::time::timeout(timeout, answers(address)).await {
+        match actix_rt::time::timeout(timeout, answers(address, is_forwarded)).await {
             Ok(Ok(true)) => return,
             Ok(_) => actix_rt::time::sleep((begin.elapsed() / PART).clamp(PAUSE.0, PAUSE.1)).await,
             Err(_) => timeout = TIMEOUT.min(timeout * 2),
@@ -33,8 +33,11 @@ pub async fn until_answering(address: SocketAddr) {
     }
 }
 
-async fn answers(address: SocketAddr) -> std::io::Result<bool> {
+async fn answers(address: SocketAddr, is_forwarded: bool) -> std::io::Result<bool> {
     let mut stream = TcpStream::connect(address).await?;
+    if !is_forwarded {
+        return Ok(true);
+    }
     stream.write_all(REQUEST).await?;
     let mut answer = [0; 5];
     stream.read_exact(&mut answer).await?;
@@ -51,7 +54,7 @@ mod tests {
     async fn a_proxy_that_accepts_for_nobody_is_no_answer() {
         let listener = tokio::net::TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).await.unwrap();
         let address = listener.local_addr().unwrap();
-        let waiting = actix_rt::spawn(until_answering(address));
+        let waiting = actix_rt::spawn(until_answering(address, true));
         drop(listener.accept().await.unwrap());
         let (mut stream, _) = listener.accept().await.unwrap();
         assert!(!waiting.is_finished());

@@ -88,13 +88,6 @@ fn mark(pid: i32) -> Option<PathBuf> {
         .map(|mark| OsStr::from_bytes(mark).into())
 }
 
-/// The inodes of the sockets that a process has open.
-pub fn sockets(pid: i32) -> Vec<u64> {
-    let descriptors = std::fs::read_dir(format!("/proc/{pid}/fd")).into_iter().flatten().flatten();
-    let targets = descriptors.filter_map(|descriptor| std::fs::read_link(descriptor.path()).ok());
-    targets.filter_map(|target| target.to_str()?.strip_prefix("socket:[")?.strip_suffix(']')?.parse().ok()).collect()
-}
-
 /// The files that a process has open and that have lost their names. `None` if it hides what it has open.
 #[must_use]
 pub fn nameless_files(pid: i32) -> Option<Vec<Metadata>> {

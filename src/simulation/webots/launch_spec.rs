@@ -1,13 +1,11 @@
 //! The launch specification: everything that one Webots is started with.
 
 use std::ffi::OsString;
-use std::net::{IpAddr, SocketAddr};
+use std::net::{IpAddr, Ipv4Addr};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use actix::prelude::*;
-use futures_util::FutureExt;
-use futures_util::future::LocalBoxFuture;
 
 use super::command::webots_command;
 use super::event::WebotsEvent;
@@ -60,9 +58,9 @@ impl LaunchSpec {
         folder.join(format!("{}.log", self.slot.lease.id()))
     }
 
-    /// Registers the stream of this port.
-    pub fn register(&self, port: u16) -> StreamRegistration {
-        self.streams.register(self.slot.lease.id(), port, self.watched.clone())
+    /// Registers its stream.
+    pub fn register(&self) -> StreamRegistration {
+        self.streams.register(self.slot.lease.id(), self.slot.port, self.watched.clone())
     }
 
     /// The request for its containers.
@@ -112,7 +110,6 @@ impl LaunchSpec {
             first: self.project.size,
             disk: self.config.limits.disk,
             processes: self.launcher.most_processes(),
-            port: self.forwarded().is_none().then_some(self.slot.port),
             peak,
         };
         let watcher = self.watcher.clone();
@@ -133,20 +130,11 @@ impl LaunchSpec {
         }
     }
 
-    /// Where this server reaches the port that is forwarded to it, if it has a network of its own.
-    fn forwarded(&self) -> Option<SocketAddr> {
+    /// Waits until it is ready at its port.
+    pub fn until_ready(&self) -> impl Future<Output = ()> + use<> {
         let of_container = self.containers.as_ref().map(|_| IpAddr::from(self.config.address_of_simulations()));
-        let address = of_container.or_else(|| self.launcher.reached());
-        address.map(|address| (address, self.slot.port).into())
-    }
-
-    /// Waits until it answers on the port that is forwarded to it, or one of these processes listens on a port that Webots
-    /// may have taken, and returns the port.
-    pub fn listening_port(&self, root: i32) -> LocalBoxFuture<'static, u16> {
-        let (watcher, port) = (self.watcher.clone(), self.slot.port);
-        match self.forwarded() {
-            Some(address) => until_answering(address).map(move |()| port).boxed_local(),
-            None => async move { watcher.listening_port(root, port).await }.boxed_local(),
-        }
+        let forwarded = of_container.or_else(|| self.launcher.reached());
+        let address = forwarded.unwrap_or(Ipv4Addr::LOCALHOST.into());
+        until_answering((address, self.slot.port).into(), forwarded.is_some())
     }
 }

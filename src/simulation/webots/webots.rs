@@ -39,7 +39,6 @@ pub struct Webots {
     /// Its stream, which is not found any more before another simulation may have its port.
     stream: Option<StreamRegistration>,
     pub(super) spec: LaunchSpec,
-    port: u16,
     events: EventSender,
     /// The preparation of its target, while it runs.
     preparing: Option<SpawnHandle>,
@@ -75,7 +74,6 @@ impl Webots {
     pub fn new(spec: LaunchSpec) -> Self {
         Self {
             stream: None,
-            port: spec.slot.port,
             events: EventSender::new(spec.events.clone()),
             spec,
             preparing: None,
@@ -136,7 +134,7 @@ impl Webots {
         let (program, world) = (self.spec.program.display(), self.spec.project.world.path.display());
         let (at, pid) = (seconds_since_1970(), group.leader());
         self.log(Level::Info, &format!("started {program} for {world} (process {pid})"));
-        self.spec.slot.lease.update(SimulationChange::Launched { at, pid, cgroup, port: self.port, log });
+        self.spec.slot.lease.update(SimulationChange::Launched { at, pid, cgroup, port: self.spec.slot.port, log });
         (self.tail, self.group) = (tail, Some(group));
         ended.into_actor(self).map(|end, this, ctx| this.ended(&end, ctx)).spawn(ctx);
         let excess = self.spec.until_too_much(pid, peak).into_actor(self);
@@ -146,33 +144,23 @@ impl Webots {
 
     /// Waits until it listens, unless it does already or the wait has begun.
     fn await_port(&mut self, ctx: &mut Context<Self>) {
-        if let (Some(group), None, false) = (&self.group, self.awaiting, self.listening) {
-            let listening = self.spec.listening_port(group.leader()).into_actor(self);
-            self.awaiting = Some(ctx.spawn(listening.map(|port, this, ctx| this.ready(port, ctx))));
+        if let (None, false) = (self.awaiting, self.listening) {
+            let ready = self.spec.until_ready().into_actor(self);
+            self.awaiting = Some(ctx.spawn(ready.map(|(), this, ctx| this.ready(ctx))));
         }
     }
 
-    fn ready(&mut self, port: u16, ctx: &mut Context<Self>) {
+    fn ready(&mut self, ctx: &mut Context<Self>) {
         self.awaiting.take().map(|awaiting| ctx.cancel_future(awaiting));
         if self.stopped_for.is_some() || self.listening {
             return;
         }
-        let allowed = self.spec.config.streaming_ports();
-        if !allowed.contains(&port) {
-            let (first, last) = (allowed.start(), allowed.end());
-            let why = format!("Webots listens on port {port}, outside of this server's ports {first} to {last}");
-            return self.stop(EndReason::NoWebots, &why);
-        }
-        if port != self.port {
-            self.log(Level::Warn, "it was taken, Webots has chosen another");
-        }
-        self.log_on(port, Level::Info, "ready");
+        self.log(Level::Info, "ready");
         self.listening = true;
         self.last_heartbeat = Instant::now();
-        self.spec.slot.lease.update(SimulationChange::Port(port));
         self.show_pace();
-        let stream = self.stream.insert(self.spec.register(port)).token();
-        self.send(WebotsEvent::Listening(port, stream));
+        let stream = self.stream.insert(self.spec.register()).token();
+        self.send(WebotsEvent::Listening(self.spec.slot.port, stream));
         self.used(ctx);
     }
 
@@ -256,14 +244,10 @@ impl Webots {
         self.events.send(event);
     }
 
-    fn log(&self, level: Level, event: &str) {
-        self.log_on(self.port, level, event);
-    }
-
     /// Logs an event with its port. Without a password everybody reads `/output`, and a relayed stream is reached by its
     /// token only: then it has no port.
-    fn log_on(&self, port: u16, level: Level, event: &str) {
-        let config = &self.spec.config;
+    fn log(&self, level: Level, event: &str) {
+        let (config, port) = (&self.spec.config, self.spec.slot.port);
         let is_shown = config.ports_are_public() || config.admin_password.is_some();
         let line = format!("port {port}: {event}");
         let shown = if is_shown { line.clone() } else { event.to_owned() };
@@ -287,7 +271,7 @@ impl Handler<OutputEvent> for Webots {
         self.hanging = false;
         match event {
             OutputEvent::Heartbeat if self.listening => self.send(WebotsEvent::Heartbeat),
-            OutputEvent::Heartbeat if self.spec.containers.is_some() => self.ready(self.port, ctx),
+            OutputEvent::Heartbeat if self.spec.containers.is_some() => self.ready(ctx),
             OutputEvent::Heartbeat => {}
             OutputEvent::ContainerRuns => self.await_port(ctx),
             OutputEvent::Reset => {
