@@ -57,7 +57,7 @@ impl BuildPlan {
         let has_project = dockerfile.is_some();
         let dockerfile = Dockerfile::read(dockerfile.as_deref().unwrap_or(NO_DOCKERFILE), owner)?;
         let controller = controller.map(|text| Dockerfile::read(&text, owner)).transpose()?;
-        Ok(Self { dockerfile, has_project, controller, yml, has_makefile })
+        Ok(Self { yml, dockerfile, has_project, controller, has_makefile })
     }
 }
 
