@@ -47,6 +47,9 @@ async fn a_world_runs_in_a_container_and_nothing_is_left_when_its_client_goes() 
         value("CPU").is_some_and(|percent| percent > 0.0) && value("Memory").is_some_and(|bytes| bytes > 1e6)
     })
     .await;
+    let now = simulated(&mut viewer).await;
+    // Long enough for a look at what it takes.
+    while simulated(&mut viewer).await < now + 4000.0 {}
     drop(viewer);
     client.leave().await;
     let begin = Instant::now();
@@ -60,6 +63,10 @@ async fn a_world_runs_in_a_container_and_nothing_is_left_when_its_client_goes() 
     .await;
     let read = || std::fs::read_to_string(server.folder.join("log/simulation/simulations.csv")).unwrap_or_default();
     until("its end is in simulations.csv", async || read().lines().count() == 2).await;
+    let table = read();
+    let line: Vec<_> = table.lines().nth(1).unwrap().split(',').collect();
+    let (memory, time): (u64, f64) = (line[8].parse().unwrap(), line[9].parse().unwrap());
+    assert!((1 << 20..1 << 32).contains(&memory) && (0.05..100.0).contains(&time), "{table}");
     // The port is free, and the next one gets it.
     let mut next = Client::start(&server, &arm()).await;
     assert_eq!(next.patiently("webots:", READY).await, address);

@@ -145,6 +145,30 @@ async fn a_webots_that_does_not_start_or_hangs_is_told_as_such() {
 }
 
 #[actix_rt::test]
+async fn what_a_simulation_has_taken_is_told() {
+    let forge = Forge::with_arm();
+    let webots = Webots::script(&format!("{DEMO} \"$@\" &\nwhile :; do :; done & wait"));
+    let server = simulation_server(&webots.path(), forge.path(), 1)
+        .set("isolation", "none")
+        .set("timing.heartbeat", 1)
+        .set("timing.grace", 0.2)
+        .start()
+        .await;
+    let mut client = Client::start(&server, &arm()).await;
+    client.until("webots:").await;
+    // The pauses between two readings are ten seconds at most.
+    for _ in 0..13 {
+        client.heard.clear();
+        client.until(".").await;
+    }
+    let simulations = http::get(&server.url("/status")).await.json()["simulations"].clone();
+    client.leave().await;
+    let line = line(&server, simulations[0]["id"].as_str().unwrap()).await;
+    let (memory, time): (u64, f64) = (line[8].parse().unwrap(), line[9].parse().unwrap());
+    assert!((1 << 20..1 << 32).contains(&memory) && (0.2..100.0).contains(&time), "{line:?}");
+}
+
+#[actix_rt::test]
 async fn what_is_kept_needs_the_password_where_there_is_one() {
     let (forge, folder) = (Forge::with_arm(), tempfile::tempdir().unwrap());
     let file = folder.path().join("code");

@@ -98,6 +98,18 @@ impl SimulationContainers {
         self.restart.as_ref().map(|(request, _)| Arc::clone(request))
     }
 
+    /// The ids of its containers, which the kernel knows them by; none where Docker fails.
+    pub fn ids(&self) -> impl Future<Output = Vec<String>> + use<> {
+        let docker = self.docker.clone();
+        let names = self.containers.iter().map(|(_, container)| container.clone());
+        let words: Vec<String> =
+            ["inspect", "--format", "{{.Id}}"].map(str::to_owned).into_iter().chain(names).collect();
+        async move {
+            let ids = docker.run(&words, SHORT_TIMEOUT).await.unwrap_or_default();
+            ids.lines().map(|id| id.trim().to_owned()).collect()
+        }
+    }
+
     /// Why Webots' container has ended, given the exit code of the program `docker`; nothing if Docker knows no more.
     pub async fn cause(&self, code: Option<i32>) -> Option<Cause> {
         let (webots, code) = (self.of(WEBOTS)?, code?);

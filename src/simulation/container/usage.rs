@@ -26,7 +26,7 @@ pub fn measure(owner: &ResourceOwner, roots: &BTreeMap<u16, i32>) -> Vec<(i32, M
         let Some(root) = containers.get(id) else { continue };
         let sum = all.entry(*root).or_default();
         let cpu = Some(sum.cpu.unwrap_or_default() + one.cpu.unwrap_or_default());
-        *sum = Usage { cpu, memory: sum.memory + one.memory, threads: sum.threads + one.threads };
+        *sum = Usage { cpu, memory: sum.memory + one.memory, threads: sum.threads + one.threads, ..one };
     }
     all.into_iter().map(|(root, usage)| (root, Measured::Usage(usage))).collect()
 }
@@ -37,7 +37,7 @@ fn usage_of(line: &str) -> Option<(&str, Usage)> {
     let id = columns.next()?;
     let cpu = columns.next()?.trim_end_matches('%').parse().ok();
     let memory = bytes(columns.next()?.split_once(" / ")?.0)?;
-    Some((id, Usage { cpu, memory, threads: columns.next()?.parse().ok()? }))
+    Some((id, Usage { cpu, memory, threads: columns.next()?.parse().ok()?, time: Duration::ZERO }))
 }
 
 /// An amount such as `12.3MiB`.
@@ -55,7 +55,7 @@ mod tests {
 
     #[test]
     fn a_line_of_docker_is_read() {
-        let usage = Usage { cpu: Some(12.5), memory: 12_897_484, threads: 7 };
+        let usage = Usage { cpu: Some(12.5), memory: 12_897_484, threads: 7, time: Duration::ZERO };
         assert_eq!(usage_of("ab\t12.50%\t12.3MiB / 4GiB\t7"), Some(("ab", usage)));
         for line in ["ab\t--\t-- / --\t--", "", "ab\t1%\t12 / 13\t7", "ab\t1%\t1parsec / 2GiB\t7"] {
             assert_eq!(usage_of(line), None, "{line}");

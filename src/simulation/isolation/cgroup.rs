@@ -121,19 +121,26 @@ impl Cgroup {
         events.lines().any(|line| line.strip_prefix("oom_kill ").is_some_and(|count| count.trim() != "0"))
     }
 
-    /// What has been taken in it, as far as the kernel counts it. It knows the peak of memory since Linux 5.19.
+    /// What has been taken in it.
+    #[must_use]
     pub fn taken(&self) -> Taken {
-        let read = |file| std::fs::read_to_string(self.folder.join(file)).ok();
-        let time = read("cpu.stat")
-            .and_then(|times| times.lines().find_map(|line| line.strip_prefix("usage_usec ")?.trim().parse().ok()));
-        let memory = read("memory.peak").and_then(|bytes| bytes.trim().parse().ok());
-        Taken { memory, time: time.map(Duration::from_micros) }
+        taken_in(&self.folder)
     }
 
     /// Kills all processes inside. Blocks until they have exited, for two seconds at most.
     pub fn kill(&self) {
         kill(&self.folder);
     }
+}
+
+/// What has been taken in the control group with this folder, as far as the kernel counts it. It knows the peak of memory
+/// since Linux 5.19.
+pub(super) fn taken_in(folder: &Path) -> Taken {
+    let read = |file| std::fs::read_to_string(folder.join(file)).ok();
+    let time = read("cpu.stat")
+        .and_then(|times| times.lines().find_map(|line| line.strip_prefix("usage_usec ")?.trim().parse().ok()));
+    let memory = read("memory.peak").and_then(|bytes| bytes.trim().parse().ok());
+    Taken { memory, time: time.map(Duration::from_micros) }
 }
 
 /// Ends all that is in a group. What is forked meanwhile is ended too.

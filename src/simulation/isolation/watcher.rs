@@ -10,6 +10,7 @@
 
 use std::io;
 use std::path::PathBuf;
+use std::sync::Arc;
 use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
 use std::time::{Duration, Instant};
 
@@ -18,6 +19,7 @@ use tokio::sync::oneshot;
 
 use super::disk::Disk;
 use super::disk_use::{DiskUse, words};
+use super::peak::Peak;
 use crate::simulation::machine::{Tree, UsageMonitor};
 
 /// Monitors simulations. Its thread ends when the last clone is dropped.
@@ -37,6 +39,8 @@ pub struct Watch {
     pub disk: u64,
     /// Limit of its processes and threads; `None` if the kernel enforces it.
     pub processes: Option<MostProcesses>,
+    /// Receives its usage; `None` if its control group counts it.
+    pub peak: Option<Arc<Peak>>,
 }
 
 /// A limit of processes that the kernel does not enforce.
@@ -190,9 +194,17 @@ impl Table {
     }
 
     fn count_processes(&self) -> Vec<(i32, String)> {
-        let counted = || self.all.iter().filter_map(|one| Some((one.watch.root, one.watch.processes?)));
-        let usages = self.usage.read(&counted().map(|(root, _)| Tree::of(root)).collect::<Vec<_>>());
-        let too_many = counted().filter(|(root, most)| {
+        let is_counted =
+            |watch: &Watch| watch.processes.is_some() || watch.peak.as_ref().is_some_and(|peak| peak.is_of_tree());
+        let trees = self.all.iter().filter(|one| is_counted(&one.watch)).map(|one| Tree::of(one.watch.root));
+        let usages = self.usage.read(&trees.collect::<Vec<_>>());
+        for Watch { root, peak, .. } in self.all.iter().map(|one| &one.watch) {
+            if let Some(peak) = peak {
+                peak.look(usages.get(root));
+            }
+        }
+        let counted = self.all.iter().filter_map(|one| Some((one.watch.root, one.watch.processes?)));
+        let too_many = counted.filter(|(root, most)| {
             usages.get(root).is_some_and(|usage| usage.threads > most.limit.saturating_add(most.runners))
         });
         too_many

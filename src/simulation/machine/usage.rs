@@ -30,6 +30,8 @@ pub struct Usage {
     pub memory: u64,
     /// Number of processes and threads.
     pub threads: u64,
+    /// CPU time so far, including child processes that have exited; zero if Docker reports the usage.
+    pub time: Duration,
 }
 
 /// Readings of process trees, by the process at the root.
@@ -121,7 +123,7 @@ impl Readings {
                         100.0 * time.saturating_sub(*before).as_secs_f64() / passed.as_secs_f64()
                     });
                     self.times.insert(root, time);
-                    Usage { cpu, memory, threads }
+                    Usage { cpu, memory, threads, time }
                 }
             };
             self.usages.insert(root, usage);
@@ -212,6 +214,6 @@ mod tests {
         std::fs::write(group.path().join("pids.current"), "7777\n").unwrap();
         assert_ne!(read().threads, 7777, "there is no memory.current");
         std::fs::write(group.path().join("memory.current"), "123\n").unwrap();
-        assert_eq!(read(), Usage { cpu: None, memory: 123, threads: 7777 });
+        assert_eq!(read(), Usage { cpu: None, memory: 123, threads: 7777, time: Duration::from_secs(5) });
     }
 }

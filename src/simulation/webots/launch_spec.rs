@@ -13,7 +13,7 @@ use crate::simulation::checkout::{CheckoutService, Project};
 use crate::simulation::config::SimulationConfig;
 use crate::simulation::container::{ContainerRequest, ContainerService};
 use crate::simulation::ends::FOLDER_OF_RUNNING;
-use crate::simulation::isolation::{Cgroup, Display, Launcher, Program, Watch, Watcher};
+use crate::simulation::isolation::{Cgroup, Display, Launcher, Peak, Program, Watch, Watcher};
 use crate::simulation::machine::display;
 use crate::simulation::machine::sensors::Gpu;
 use crate::simulation::process::{SpawnSpec, until_answering};
@@ -102,13 +102,15 @@ impl LaunchSpec {
     }
 
     /// Waits until the simulation with this root process exceeds a limit, and returns the message for its client.
-    pub fn until_too_much(&self, root: i32) -> impl Future<Output = String> + use<> {
+    /// `peak` records its usage.
+    pub fn until_too_much(&self, root: i32, peak: Option<Arc<Peak>>) -> impl Future<Output = String> + use<> {
         let watch = Watch {
             root,
             folder: self.project.instance.path().to_owned(),
             first: self.project.size,
             disk: self.config.limits.disk,
             processes: self.launcher.most_processes(),
+            peak,
         };
         let watcher = self.watcher.clone();
         async move { watcher.until_too_much(watch).await }

@@ -2,6 +2,7 @@
 
 use std::future::Future;
 use std::path::PathBuf;
+use std::sync::Arc;
 use std::time::Duration;
 
 use actix::prelude::*;
@@ -13,7 +14,7 @@ use super::paced_reader::PacedReader;
 use crate::shared::run::RotatedFile;
 use crate::simulation::container::Cause;
 use crate::simulation::ends::Taken;
-use crate::simulation::isolation::{Cgroup, Display};
+use crate::simulation::isolation::{Cgroup, Display, Peak};
 use crate::simulation::process::{ExitReason, ProcessGroup};
 
 /// A Webots that was started.
@@ -26,6 +27,8 @@ pub struct Launched {
     pub tail: Tail,
     /// The file of its output.
     pub log: Option<PathBuf>,
+    /// Records its usage, if it has no control group of its own.
+    pub peak: Option<Arc<Peak>>,
 }
 
 /// How a Webots has ended.
@@ -35,7 +38,7 @@ pub struct End {
     pub reason: ExitReason,
     /// The cause, if control groups or Docker report one.
     pub cause: Option<Cause>,
-    /// The resources that it has used, if it had a control group of its own.
+    /// The resources that it has used.
     pub taken: Taken,
 }
 
@@ -70,19 +73,31 @@ pub fn launch(
     };
     let (group, ended) = ProcessGroup::start(&process, output.into(), errors.into())?;
     let folder = cgroup.as_ref().map(|cgroup| cgroup.path().to_owned());
+    let peak = cgroup.is_none().then(|| peak_of(&target));
+    let seen = peak.clone();
     let ended = async move {
         let reason = ended.await;
         let code = if let ExitReason::Code(code) = reason { Some(code.into()) } else { None };
         let in_container = target.end(code).await;
         let (on_machine, taken) = match cgroup {
             Some(cgroup) => actix_rt::task::spawn_blocking(move || end_all(&cgroup)).await.unwrap_or_default(),
-            None => (false, Taken::default()),
+            None => (false, seen.map(|peak| peak.taken()).unwrap_or_default()),
         };
         // The last output shows the cause. A process that can't be killed may keep the pipe open.
         actix_rt::time::timeout(LAST_OUTPUT, all_read).await.ok();
         End { reason, cause: in_container.or(on_machine.then_some(Cause::OutOfMemory)), taken }
     };
-    Ok((Launched { group, cgroup: folder, tail, log }, ended))
+    Ok((Launched { group, cgroup: folder, tail, log, peak }, ended))
+}
+
+/// Hears what a Webots takes that runs on this.
+fn peak_of(target: &LaunchTarget) -> Arc<Peak> {
+    let LaunchTarget::Containers(containers) = target else { return Arc::default() };
+    let (ids, peak) = (containers.ids(), Arc::new(Peak::of_containers()));
+    let named = Arc::clone(&peak);
+    // Its start does not wait for that.
+    actix_rt::spawn(async move { named.name_containers(ids.await) });
+    peak
 }
 
 /// Ends what has left the process group. Returns whether the kernel has ended something because it took too much memory,

@@ -129,7 +129,7 @@ impl Webots {
 
     /// Starts the process, and calls [`Self::ended`] when it has ended.
     fn spawn(&mut self, target: LaunchTarget, ctx: &mut Context<Self>) -> std::io::Result<()> {
-        let (Launched { group, cgroup, tail, log }, ended) =
+        let (Launched { group, cgroup, tail, log, peak }, ended) =
             launched::launch(&self.spec, target, ctx.address().recipient())?;
         let (program, world) = (self.spec.program.display(), self.spec.project.world.path.display());
         let (at, pid) = (seconds_since_1970(), group.leader());
@@ -137,7 +137,7 @@ impl Webots {
         self.spec.slot.lease.update(SimulationChange::Launched { at, pid, cgroup, port: self.spec.slot.port, log });
         (self.tail, self.group) = (tail, Some(group));
         ended.into_actor(self).map(|end, this, ctx| this.ended(&end, ctx)).spawn(ctx);
-        let excess = self.spec.until_too_much(pid).into_actor(self);
+        let excess = self.spec.until_too_much(pid, peak).into_actor(self);
         excess.map(|why, this, _| this.stop(EndReason::Limit, &why)).spawn(ctx);
         Ok(())
     }
