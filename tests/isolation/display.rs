@@ -62,7 +62,12 @@ async fn a_virtual_display_is_inside_of_the_sandbox() {
         std::fs::write(fonts.join("fonts.dir"), "0\n").unwrap();
         let mut client = Client::start(&server, &arm()).await;
         client.until("webots:").await;
-        let printed = std::fs::read_to_string(server.output_file(&client)).unwrap();
+        let mut printed = String::new();
+        until("all of its output is kept", async || {
+            printed = std::fs::read_to_string(server.output_file(&client)).unwrap();
+            printed.contains("DONE refuse others")
+        })
+        .await;
         let done: Vec<&str> = printed.lines().filter_map(|line| line.strip_prefix("DONE ")).collect();
         assert_eq!(done, ["socket", "use it", "refuse others"], "{user}: {printed}");
         let pid = xvfb(&server);
