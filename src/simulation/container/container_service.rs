@@ -9,14 +9,14 @@ use tokio::sync::Semaphore;
 use tokio_util::task::AbortOnDropHandle;
 
 use super::build_plan::{BuildPlan, ImageBuild, PROJECT_PATH};
-use super::compose_project::{ComposeProject, container_of};
+use super::compose_project::ComposeProject;
 use super::container_request::ContainerRequest;
 use super::docker::Docker;
 use super::image::Images;
 use super::image_export::export;
 use super::network;
 use super::orphan_cleanup::{ActiveProjects, run_cleanup};
-use super::owned_resources::{self, ResourceOwner};
+use super::owned_resources::{ResourceOwner, sweep_all};
 use super::packet_filter;
 use super::project_paths::participant_folder;
 use super::simulation_containers::SimulationContainers;
@@ -32,11 +32,13 @@ use crate::simulation::config::SimulationConfig;
 pub struct ContainerService {
     docker: Docker,
     owner: ResourceOwner,
-    run: ResourceOwner,
+    /// The owner of these containers, for a process that removes them after the server's end.
+    pub run: ResourceOwner,
     templates: Templates,
     images: Arc<Images>,
     active: ActiveProjects,
-    shortcoming: Option<String>,
+    /// What containers can do because the packet filter is missing; `None` if it is loaded.
+    pub shortcoming: Option<String>,
     /// Limits concurrent runs of compose.
     turns: Semaphore,
     config: Arc<SimulationConfig>,
@@ -55,7 +57,7 @@ impl ContainerService {
     pub fn open(config: Arc<SimulationConfig>, run: &Path) -> Result<Self, String> {
         let docker = Docker::find(run)?;
         let owner = ResourceOwner::of(&config.cache_dir.0);
-        owned_resources::sweep(&owner);
+        sweep_all(&owner);
         let this_run = owner.run();
         let shortcoming = packet_filter::missing();
         if let Some(why) = &shortcoming {
@@ -65,8 +67,7 @@ impl ContainerService {
         templates.faults().iter().for_each(|fault| log::error!("{fault}"));
         let images = Images::new(docker.clone(), owner.clone(), Arc::clone(&config));
         let (images, active) = (Arc::new(images), ActiveProjects::default());
-        let keeper =
-            run_cleanup(docker.clone(), owner.clone(), active.clone(), Arc::clone(&images), Arc::clone(&config));
+        let keeper = run_cleanup(owner.clone(), active.clone(), Arc::clone(&images), Arc::clone(&config));
         let keeper = AbortOnDropHandle::new(actix_rt::spawn(keeper));
         Ok(Self {
             docker,
@@ -80,18 +81,6 @@ impl ContainerService {
             config,
             _keeper: keeper,
         })
-    }
-
-    /// The owner of these containers, for a process that removes them after the server's end.
-    #[must_use]
-    pub fn run(&self) -> &ResourceOwner {
-        &self.run
-    }
-
-    /// What containers can do because the packet filter is missing; `None` if it is loaded.
-    #[must_use]
-    pub fn shortcoming(&self) -> Option<&str> {
-        self.shortcoming.as_deref()
     }
 
     /// Creates the containers of a simulation, but starts none. `progress` receives each step as text.
@@ -134,15 +123,15 @@ impl ContainerService {
         // More concurrent runs would only be slower.
         let turn = self.turns.acquire().await.map_err(|error| StartError::Server(error.to_string()))?;
         progress(steps::CREATING.to_owned());
-        let words = options.into_iter().map(Into::into).chain(["up", "--no-start", "--no-build"].map(Into::into));
-        let created = self.docker.compose(words.collect(), variables, CREATE_TIMEOUT).await;
+        let up = ["up", "--no-start", "--no-build"].map(str::to_owned);
+        let words = self.docker.compose.iter().map(|word| (*word).to_owned()).chain(options).chain(up);
+        let created = self.docker.follow(words.map(Into::into).collect(), variables, CREATE_TIMEOUT, |_| ()).await;
         created.map_err(|error| blame(is_projects, error))?;
         drop(turn);
         // An editor has a port of its own, which the relay of streams does not reach.
         let has_editor = yml.kind != ProjectKind::Default && self.config.ports_are_public();
         let texts = has_editor.then(|| "ide: enable".to_owned()).into_iter().chain(yml.project_type).collect();
-        let containers = services.into_keys().map(|service| (service.clone(), container_of(&guard.name, &service)));
-        let (docker, containers, warnings) = (self.docker.clone(), containers.collect(), yml.warnings);
-        Ok(SimulationContainers { docker, guard, containers, is_projects, texts, warnings, restart: None })
+        let (docker, services, warnings) = (self.docker.clone(), services.into_keys().collect(), yml.warnings);
+        Ok(SimulationContainers { docker, guard, services, is_projects, texts, warnings, restart: None })
     }
 }

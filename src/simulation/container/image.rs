@@ -59,10 +59,8 @@ impl Images {
         let pull = move |sender: watch::Sender<String>| async move {
             let _permit = this.permit(&sender).await?;
             let on_line = |line: &str| drop(sender.send(steps::pulling(&name, line)));
-            let pulled = this
-                .docker
-                .follow(["pull", &name].map(OsString::from).to_vec(), this.config.timing.build, on_line)
-                .await;
+            let command = ["docker", "pull", &name].map(OsString::from).to_vec();
+            let pulled = this.docker.follow(command, Vec::new(), this.config.timing.build, on_line).await;
             pulled.map_err(|error| not_pulled(&name, error))
         };
         self.jobs.join(image.to_owned(), progress, pull).await?;
@@ -127,8 +125,9 @@ impl Images {
         let (file, context) = spawn_blocking(prepare).await??;
         let memory = format!("{}m", self.config.limits.memory.unwrap_or(DEFAULT_MEMORY));
         let network = self.config.container.network.name();
-        let options = ["build", "--force-rm", "--memory", &memory, "--memory-swap", &memory, "--network", network];
-        let words = options.into_iter().chain(["--tag", name, "--file"]).map(OsString::from).chain([file.into()]);
+        let limited = ["docker", "build", "--force-rm", "--memory", &memory, "--memory-swap", &memory];
+        let options = ["--network", network, "--tag", name, "--file"];
+        let words = limited.into_iter().chain(options).map(OsString::from).chain([file.into()]);
         let arguments = arguments.into_iter().flat_map(|argument| ["--build-arg".into(), argument.into()]);
         let words = words.chain(arguments).chain([context.into()]);
         let mut step = String::new();
@@ -140,7 +139,7 @@ impl Images {
                 sender.send(text).ok();
             }
         };
-        let done = self.docker.follow(words.collect(), self.config.timing.build, on_line).await;
+        let done = self.docker.follow(words.collect(), Vec::new(), self.config.timing.build, on_line).await;
         done.map_err(|error| not_built(&step, error))
     }
 

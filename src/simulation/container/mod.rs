@@ -28,7 +28,7 @@ pub use built_image::RUNS;
 pub use check::{check, check_templates, daemon_fault, data_folder, init_fault};
 pub use container_request::ContainerRequest;
 pub use container_service::ContainerService;
-pub use owned_resources::{ResourceOwner, sweep};
+pub use owned_resources::{ResourceOwner, sweep_all};
 pub use simulation_containers::{Cause, SimulationContainers};
 pub use start_error::StartError;
 pub use usage::measure;
