@@ -56,9 +56,8 @@ fn main() -> ExitCode {
         return sweep(config);
     }
     if let Some(Part::Guard(arguments)) = &arguments.part {
-        let remove = || {
-            arguments.containers.iter().for_each(|owner| container::sweep_all(&container::ResourceOwner::named(owner)))
-        };
+        let sweep = |owner: &String| container::sweep_all(&container::ResourceOwner::named(owner));
+        let remove = || arguments.containers.iter().for_each(sweep);
         return ExitCode::from(guardian::guard(arguments, remove));
     }
     let loaded = match start::read::<SimulationConfig>(&arguments.config) {

@@ -77,9 +77,9 @@ impl Images {
         build: &ImageBuild,
         progress: OnProgress<'_>,
     ) -> Result<BuiltImage, StartError> {
-        let base = build_plan::image_of(&self.config.container.image, &project.world.version);
+        let webots = build_plan::image_of(&self.config.container.image, &project.world.version);
         let mut build = build.clone();
-        build.arguments.push(format!("WEBOTS_DEFAULT_IMAGE={base}"));
+        build.arguments.push(format!("WEBOTS_DEFAULT_IMAGE={webots}"));
         let mut parts = [vec![build.dockerfile.text.clone()], build.arguments.clone()].concat();
         parts.extend(build.folder.into_iter().flat_map(|folder| [project.identity(), folder.to_owned()]));
         // An image's name stays the same when the image is updated, so its id is part of the key. A base that is not here
@@ -87,7 +87,7 @@ impl Images {
         for base in &build.dockerfile.bases {
             let is_default = DEFAULT_BASE.contains(&base.as_str());
             parts.extend(if is_default {
-                Some(self.pull(&base, progress).await?)
+                Some(self.pull(&webots, progress).await?)
             } else {
                 self.inspect(base, ID).await?
             });
