@@ -1,4 +1,4 @@
-//! What a start in containers takes beside `docker compose up` of the same project, done by hand: one, and thirty at once.
+//! What starts in containers take beside `docker compose up` of the same project, done by hand: one, and thirty at once.
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
@@ -15,46 +15,37 @@ mod daemon;
 #[path = "../../tests/containers/image.rs"]
 mod image;
 
-/// So many simulations start at once.
-const MANY: u16 = 30;
 /// A start may take this share of what it takes by hand.
 const SHARE: f64 = 1.2;
-/// Starts one after the other, of which the median counts.
-const ROUNDS: usize = 7;
 /// How long a start may take at most.
 const PATIENCE: Duration = Duration::from_secs(300);
 
-pub async fn measure(verdict: &mut Verdict) {
+/// Compares so many starts at once, in turns, of which the medians count.
+pub async fn measure(verdict: &mut Verdict, sizes: &[u16], rounds: usize) {
     let Some(_docker) = daemon::docker().await else { return };
-    let forge = Forge::with_arm();
-    let server = daemon::server(forge.path(), MANY)
-        .set("maxPlacesPerAddress", MANY)
+    let (forge, most) = (Forge::with_arm(), *sizes.iter().max().unwrap());
+    let server = daemon::server(forge.path(), most)
+        .set("maxPlacesPerAddress", most)
         .set("timing", serde_json::json!({ "launch": 300, "silence": 600 }))
         .start()
         .await;
     let mut first = Client::start(&server, &arm()).await;
     first.patiently("webots:", PATIENCE).await;
-    let project = ByHand::of(&server);
+    let project = ByHand::of(&server, most);
     first.leave().await;
     gone(&server).await;
-    let (mut ours, mut by_hand) = (Vec::new(), Vec::new());
-    for _ in 0..ROUNDS {
-        by_hand.push(project.up(1));
-        ours.push(started(&server, 1).await);
+    for &size in sizes {
+        let (mut ours, mut by_hand) = (Vec::new(), Vec::new());
+        for _ in 0..rounds {
+            by_hand.push(project.up(size));
+            ours.push(started(&server, size).await);
+        }
+        let (ours, by_hand) = (median(ours), median(by_hand));
+        let what = format!("{size} at once, until the last is ready");
+        let share = ours.as_secs_f64() / by_hand.as_secs_f64();
+        println!("{what}: {ours:.2?}, by hand {by_hand:.2?}, {share:.2} times as long");
+        verdict.bound(&what, ours, by_hand.mul_f64(SHARE));
     }
-    let (ours, by_hand) = (median(ours), median(by_hand));
-    compare(verdict, "one start", ours, by_hand);
-    let by_hand = project.up(MANY);
-    let ours = started(&server, MANY).await;
-    compare(verdict, "thirty at once, until the last", ours, by_hand);
-}
-
-fn compare(verdict: &mut Verdict, what: &str, ours: Duration, by_hand: Duration) {
-    println!(
-        "{what}: {ours:.2?}, by hand {by_hand:.2?}, {:.2} times as long",
-        ours.as_secs_f64() / by_hand.as_secs_f64()
-    );
-    verdict.bound(what, ours, by_hand.mul_f64(SHARE));
 }
 
 /// Starts simulations at once, and ends them. Returns the time until the last client has the address of its Webots.
@@ -87,20 +78,23 @@ async fn gone(server: &Server) {
 /// The compose project of a simulation, copied from what the server has written.
 struct ByHand {
     folder: tempfile::TempDir,
+    image: String,
     ports: Vec<u16>,
 }
 
 impl ByHand {
     /// That of the one simulation which runs.
-    fn of(server: &Server) -> Self {
+    fn of(server: &Server, most: u16) -> Self {
         let runs = std::fs::read_dir(server.cache().join("runs")).unwrap().flatten().map(|run| run.path());
         let instances = runs.flat_map(|run| std::fs::read_dir(run).unwrap().flatten().map(|file| file.path()));
         let instance = instances.into_iter().find(|folder| folder.join("compose").is_dir()).unwrap();
         let folder = tempfile::tempdir().unwrap();
         let copied = Command::new("cp").arg("-R").arg(instance).arg(folder.path().join("instance")).status().unwrap();
         assert!(copied.success());
-        let first = crate::support::ports::block(MANY);
-        Self { folder, ports: (first..first + MANY).collect() }
+        let webots = &daemon::of_service(server, "webots")[0];
+        let image = daemon::ask(&["inspect", "--format", "{{.Config.Image}}", webots]);
+        let first = crate::support::ports::block(most);
+        Self { folder, image, ports: (first..first + most).collect() }
     }
 
     fn instance(&self) -> PathBuf {
@@ -140,8 +134,9 @@ impl ByHand {
         let own = self.folder.path().join(format!("{port}.json"));
         std::fs::write(&own, override_for(&folder, port)).unwrap();
         command.arg("--file").arg(folder.join("docker-compose.yml")).arg("--file").arg(own).args(words);
-        command.env("PORT", port.to_string()).env("PROJECT", project).stdin(Stdio::null());
-        command.stdout(Stdio::null()).stderr(Stdio::null());
+        command.env("PORT", port.to_string()).env("PROJECT", project).env("IMAGE", &self.image);
+        command.env("BIND", "127.0.0.1").env("PROJECT_PATH", "/usr/local/webots-project");
+        command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null());
         command
     }
 }

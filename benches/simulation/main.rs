@@ -62,15 +62,15 @@ struct Arguments {
     /// Cached starts for `start`.
     #[arg(long, default_value_t = 100)]
     cached: usize,
-    /// How many start at once in `class`, in place of 1, 10, 100 and 200, or run in `late`, in place of 10 and 100, or in
-    /// `stream`, in place of 1 and 100.
+    /// How many start at once in `class`, in place of 1, 10, 100 and 200, or in `containers`, in place of 1 and 30, or run in
+    /// `late`, in place of 10 and 100, or in `stream`, in place of 1 and 100.
     #[arg(long)]
     size: Vec<u16>,
     /// Levels of isolation for `class`, `idle` and `late`, in place of `none` and `sandbox`. `own` is a sandbox with a network
     /// of its own.
     #[arg(long)]
     level: Vec<String>,
-    /// Rounds of each row of `class`.
+    /// Rounds of each row of `class` and `containers`.
     #[arg(long, default_value_t = 5)]
     rounds: usize,
     /// Seconds of each row of `idle` and `stream`.
@@ -145,7 +145,8 @@ async fn main() -> ExitCode {
         stream::measure(&arguments.size, Duration::from_secs(arguments.seconds)).await;
     }
     if is_wanted(Part::Containers) {
-        containers::measure(&mut verdict).await;
+        let sizes = if arguments.size.is_empty() { &[1, 30][..] } else { &arguments.size };
+        containers::measure(&mut verdict, sizes, arguments.rounds).await;
     }
     if is_wanted(Part::Relay) {
         relay::measure(&mut verdict, Duration::from_secs(arguments.seconds), arguments.rounds).await;

@@ -42,7 +42,7 @@ enum Part {
 fn sweep(config: &std::path::Path) -> ExitCode {
     match start::read::<SimulationConfig>(config) {
         Ok(loaded) if loaded.config.isolation == IsolationSetting::Container => {
-            container::sweep(&container::ResourceOwner::of(&loaded.config.cache_dir.0));
+            container::sweep_all(&container::ResourceOwner::of(&loaded.config.cache_dir.0));
             ExitCode::SUCCESS
         }
         Ok(_) => ExitCode::SUCCESS,
@@ -56,8 +56,8 @@ fn main() -> ExitCode {
         return sweep(config);
     }
     if let Some(Part::Guard(arguments)) = &arguments.part {
-        let remove =
-            || arguments.containers.iter().for_each(|owner| container::sweep(&container::ResourceOwner::named(owner)));
+        let sweep = |owner: &String| container::sweep_all(&container::ResourceOwner::named(owner));
+        let remove = || arguments.containers.iter().for_each(sweep);
         return ExitCode::from(guardian::guard(arguments, remove));
     }
     let loaded = match start::read::<SimulationConfig>(&arguments.config) {

@@ -22,7 +22,7 @@ async fn a_projects_own_dockerfile_is_built_once_for_all_who_want_it_and_what_it
     let Some(_docker) = docker().await else { return };
     let forge = with(&format!(
         "FROM {NAME}\nARG PROJECT_PATH\nRUN mkdir -p $PROJECT_PATH\nCOPY . $PROJECT_PATH\nRUN sleep 2 && cp \
-         $PROJECT_PATH/controllers/c/c.py $PROJECT_PATH/controllers/c/built\n"
+         $PROJECT_PATH/controllers/c/c.py $PROJECT_PATH/controllers/c/built\nHEALTHCHECK --interval=1ms CMD true\n"
     ));
     forge.commit(
         "lab/arm",
@@ -35,7 +35,7 @@ async fn a_projects_own_dockerfile_is_built_once_for_all_who_want_it_and_what_it
         client.patiently("webots:", BUILT).await;
         let heard = client.heard.join("\n");
         for words in [
-            "loading: Step 5/7 : COPY . $PROJECT_PATH",
+            "loading: Step 5/8 : COPY . $PROJECT_PATH",
             "loading: docker-compose.yml of the project is not used here",
             "loading: .env of the project is not used here",
         ] {
@@ -51,6 +51,8 @@ async fn a_projects_own_dockerfile_is_built_once_for_all_who_want_it_and_what_it
         assert_eq!(built, "print('original')");
         // It may change its project, and nothing else.
         ask(&["exec", &container, "touch", "/usr/local/webots-project/new", "/tmp/new"]);
+        // A check of its image costs the machine nothing.
+        assert_eq!(ask(&["inspect", "--format", "{{json .State.Health}}", &container]), "null");
     }
     // The next one need not wait for a build.
     one.leave().await;
@@ -111,9 +113,10 @@ async fn what_can_not_be_built_is_told_in_words_and_leaves_nothing() {
         ("no Dockerfile at all\n".to_owned(), "can't be built"),
     ];
     super::daemon::build_from(&format!("FROM {NAME}\nVOLUME [\"/a:b\"]\n"), "webots-fleet.test/volume");
+    let forge = Forge::with_arm();
+    let server = server(forge.path(), 1).start().await;
     for (dockerfile, words) in table {
-        let forge = with(&dockerfile);
-        let server = server(forge.path(), 1).start().await;
+        forge.commit("lab/arm", "main", &[("Dockerfile", &dockerfile)]);
         let mut client = Client::start(&server, &arm()).await;
         let told = client.patiently("loading: Error:", BUILT).await;
         let words = words.trim_end_matches(" ‹?");

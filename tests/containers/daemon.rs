@@ -32,6 +32,8 @@ static USERS: RwLock<()> = RwLock::const_new(());
 static DAEMON: OnceLock<Option<Daemon>> = OnceLock::new();
 /// How long the daemon may take to begin.
 const START: Duration = Duration::from_secs(60);
+/// How many networks it has room for, so that simulations are soon more.
+pub const NETWORKS: u16 = 2;
 /// The interface of the servers' network. It stays when the daemon is killed.
 const INTERFACE: &str = "webots-fleet";
 
@@ -128,6 +130,8 @@ impl Daemon {
                 "--iptables=false",
                 "--ip6tables=false",
                 "--ip-masq=false",
+                // Two halves.
+                "--default-address-pool=base=10.213.0.0/16,size=17",
             ]);
             command.args(options);
             let mut child: Child = command

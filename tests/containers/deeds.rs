@@ -37,8 +37,12 @@ async fn running(builder: Builder) -> (Server, Client) {
 async fn a_program_sees_its_image_and_its_project_only() {
     let Some(_docker) = docker().await else { return };
     let forge = doing("");
-    let (server, _client) = running(server(forge.path(), 1).env("SECRET", "xyz")).await;
+    // Variables of the server's own mean nothing to compose.
+    let builder =
+        server(forge.path(), 1).env("SECRET", "xyz").env("PORT", "9").env("PROJECT", "/etc").env("BIND", "nobody");
+    let (server, _client) = running(builder).await;
     let webots = &of_service(&server, "webots")[0];
+    assert_eq!(ask(&["exec", webots, "cat", "/usr/local/webots-project/controllers/c/c.py"]), "print('original')");
     let inside = |command: &str| ask(&["exec", webots, "bash", "-c", &format!("({command}) 2>&1 || true")]);
     assert!(!inside("env").contains("SECRET"));
     // The machine's processes, folders and devices.

@@ -99,7 +99,7 @@ async fn a_server_that_is_started_again_at_once_keeps_what_it_starts() {
 }
 
 #[actix_rt::test]
-async fn a_daemon_that_is_stopped_is_told_and_all_goes_on_when_it_is_back() {
+async fn a_docker_that_is_stopped_or_has_no_init_process_is_told_and_all_goes_on_when_it_is_back() {
     let Some(docker) = alone().await else { return };
     let forge = Forge::with_arm();
     let server = server(forge.path(), 2).start().await;
@@ -118,20 +118,9 @@ async fn a_daemon_that_is_stopped_is_told_and_all_goes_on_when_it_is_back() {
     let told = Client::start(&server, &arm()).await.patiently("loading: Error:", Duration::from_secs(60)).await;
     assert!(told.contains("Docker does not answer on this simulation server"), "{told}");
     until("it says so", async || !takes_clients(&server).await).await;
-    docker.start(&[]);
-    until("it takes clients again", async || takes_clients(&server).await).await;
-    Client::start(&server, &arm()).await.patiently("webots:", Duration::from_secs(60)).await;
-    until("what the daemon has kept is gone", async || containers(&server).len() <= 1).await;
-}
-
-#[actix_rt::test]
-async fn a_docker_without_an_init_process_is_told_with_what_to_install() {
-    let Some(docker) = alone().await else { return };
-    docker.kill();
     docker.start(&["--init-path", "/nowhere/docker-init"]);
-    let forge = Forge::with_arm();
-    let server = server(forge.path(), 1).start().await;
-    until("it takes no client", async || !takes_clients(&server).await).await;
+    let problem = async || http::get(&server.url("/status")).await.json()["problem"].to_string();
+    until("it looks for the init process", async || problem().await.contains("init process")).await;
     let told = Client::start(&server, &arm()).await.patiently("loading: Error:", Duration::from_secs(60)).await;
     assert!(told.contains("docker-init: on Debian and Ubuntu the packages docker.io and tini"), "{told}");
     let checked = check(&server);
@@ -140,26 +129,21 @@ async fn a_docker_without_an_init_process_is_told_with_what_to_install() {
     docker.start(&[]);
     until("it takes clients again", async || takes_clients(&server).await).await;
     Client::start(&server, &arm()).await.patiently("webots:", Duration::from_secs(60)).await;
-}
-
-/// A world whose Webots ends as if Docker had been stopped, after this line of a shell.
-fn with_webots(line: &str) -> Forge {
-    let forge = Forge::with_arm();
-    let dockerfile = format!(
-        "FROM {}\nCOPY . /usr/local/webots-project\nRUN cp /usr/local/webots-project/fake /usr/local/webots/webots && chmod \
-         755 /usr/local/webots/webots\n",
-        super::image::NAME
-    );
-    forge.commit("lab/arm", "main", &[("Dockerfile", &dockerfile), ("fake", &format!("#!/bin/sh\n{line}\n"))]);
-    forge
+    until("what the daemon has kept is gone", async || containers(&server).len() <= 1).await;
 }
 
 #[actix_rt::test]
 async fn a_world_that_ends_like_one_of_a_stopped_docker_is_not_taken_for_that() {
     let Some(_docker) = docker().await else { return };
+    let forge = Forge::with_arm();
+    let server = server(forge.path(), 1).start().await;
+    let dockerfile = format!(
+        "FROM {}\nCOPY . /usr/local/webots-project\nRUN cp /usr/local/webots-project/fake /usr/local/webots/webots && chmod \
+         755 /usr/local/webots/webots\n",
+        super::image::NAME
+    );
     for (line, words) in [("exit 143", "exit code 143"), ("kill -KILL $$", "exit code 137")] {
-        let forge = with_webots(line);
-        let server = server(forge.path(), 1).start().await;
+        forge.commit("lab/arm", "main", &[("Dockerfile", &dockerfile), ("fake", &format!("#!/bin/sh\n{line}\n"))]);
         let mut client = Client::start(&server, &arm()).await;
         let told = client.patiently("loading: Error:", Duration::from_secs(90)).await;
         assert!(told.contains(words) && !told.contains("Docker"), "{told}");

@@ -39,47 +39,6 @@ async fn a_link_in_an_image_leads_no_build_to_files_of_the_machine() {
 }
 
 #[actix_rt::test]
-async fn a_folders_name_mounts_nothing_else_of_the_machine() {
-    let Some(_docker) = docker().await else { return };
-    let forge = Forge::with_arm();
-    let work = forge.work_tree("lab/arm", "main");
-    // As a line of its own it would say where the project is.
-    let folder = work.join("controllers/x\nPROJECT=/etc");
-    std::fs::create_dir_all(&folder).unwrap();
-    std::fs::write(folder.join("file"), "").unwrap();
-    std::os::unix::fs::symlink("x\nPROJECT=/etc", work.join("controllers/edit")).unwrap();
-    std::fs::write(work.join("webots.yml"), "dockerCompose: \"theia:webots-project/controllers/edit\"\n").unwrap();
-    forge.commit_work_tree("lab/arm", "main");
-    let server = server(forge.path(), 1).start().await;
-    let mut client = Client::start(&server, &arm()).await;
-    let told = client.patiently("loading: Error:", BUILT).await;
-    assert!(told.contains("line break"), "{told}; heard {:#?}", client.heard);
-}
-
-#[actix_rt::test]
-async fn variables_of_the_servers_own_environment_mean_nothing_to_compose() {
-    let Some(_docker) = docker().await else { return };
-    let forge = Forge::with_arm();
-    let server = server(forge.path(), 1).env("PORT", "9").env("PROJECT", "/etc").env("BIND", "nobody").start().await;
-    let mut client = Client::start(&server, &arm()).await;
-    client.patiently("webots:", BUILT).await;
-    let webots = &of_service(&server, "webots")[0];
-    assert_eq!(ask(&["exec", webots, "cat", "/usr/local/webots-project/controllers/c/c.py"]), "print('original')");
-}
-
-#[actix_rt::test]
-async fn checks_that_an_image_declares_cost_the_machine_nothing() {
-    let Some(_docker) = docker().await else { return };
-    let declared = "HEALTHCHECK --interval=1ms CMD true\n";
-    let forge = with(&format!("FROM {NAME}\nCOPY . /usr/local/webots-project\n{declared}"));
-    let server = server(forge.path(), 1).start().await;
-    let mut client = Client::start(&server, &arm()).await;
-    client.patiently("webots:", BUILT).await;
-    let webots = &of_service(&server, "webots")[0];
-    assert_eq!(ask(&["inspect", "--format", "{{json .State.Health}}", webots]), "null");
-}
-
-#[actix_rt::test]
 async fn a_build_has_no_more_memory_than_a_simulation() {
     let Some(_docker) = docker().await else { return };
     // It ends by itself, without having been stopped, at 200 MB.
@@ -91,34 +50,29 @@ async fn a_build_has_no_more_memory_than_a_simulation() {
     assert!(told.contains("can't be built") && told.contains("137"), "{told}");
 }
 
-/// Starts a world whose Dockerfile ends so, and checks that the server does not take its failure for its own.
-async fn fails_by_itself(line: &str) -> String {
-    let forge = with(&format!("FROM {NAME}\nCOPY . /usr/local/webots-project\n{line}\n"));
-    let folder = tempfile::tempdir().unwrap();
-    let server = as_ordinary(server(forge.path(), 1), forge.path(), folder.path()).start().await;
-    let mut client = Client::start(&server, &arm()).await;
-    let told = client.patiently("loading: Error:", BUILT).await;
-    assert_eq!(client.closed().await, Some(1000), "{line}: {told}");
-    let status = http::get(&server.url("/status")).await.json();
-    assert_eq!(status["failedStarts"], 0, "{line}: {told}");
-    assert!(!told.contains(server.folder().to_str().unwrap()), "{line}: {told}");
-    told
-}
-
 #[actix_rt::test]
-async fn an_image_without_the_folders_that_containers_get_is_its_projects_fault() {
+async fn what_an_image_does_to_folders_and_devices_is_its_projects_fault() {
     let Some(_docker) = docker().await else { return };
-    for folder in ["/tmp", "/run", "/var/tmp"] {
-        fails_by_itself(&format!("RUN rm -rf {folder} && touch {folder}")).await;
+    let (forge, folder) = (Forge::with_arm(), tempfile::tempdir().unwrap());
+    let server = as_ordinary(server(forge.path(), 1), forge.path(), folder.path()).start().await;
+    let replaced = |folder| (format!("rm -rf {folder} && touch {folder}"), "");
+    // An ordinary user can't even copy a device out of the image.
+    let device = ("mknod /usr/local/webots-project/zero c 1 5".to_owned(), "not permitted");
+    for (line, words) in ["/tmp", "/run", "/var/tmp"].map(replaced).into_iter().chain([device]) {
+        let dockerfile = format!("FROM {NAME}\nCOPY . /usr/local/webots-project\nRUN {line}\n");
+        forge.commit("lab/arm", "main", &[("Dockerfile", &dockerfile)]);
+        let mut client = Client::start(&server, &arm()).await;
+        let told = client.patiently("loading: Error:", BUILT).await;
+        assert_eq!(client.closed().await, Some(1000), "{line}: {told}");
+        let status = http::get(&server.url("/status")).await.json();
+        assert_eq!(status["failedStarts"], 0, "{line}: {told}");
+        assert!(told.contains(words) && !told.contains(server.folder().to_str().unwrap()), "{line}: {told}");
     }
 }
 
 #[actix_rt::test]
 async fn a_device_that_a_dockerfile_makes_in_the_project_opens_nothing() {
     let Some(_docker) = docker().await else { return };
-    // An ordinary user can't even copy one out of the image.
-    let told = fails_by_itself("RUN mknod /usr/local/webots-project/zero c 1 5").await;
-    assert!(told.contains("not permitted"), "{told}");
     // The memory of the machine, and a disk that there may be.
     let devices = "cd /usr/local/webots-project && mknod mem c 1 1 && mknod disk b 254 0 && mknod controllers/zero c 1 5 \
                    && chmod 666 mem disk controllers/zero";

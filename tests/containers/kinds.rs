@@ -39,16 +39,23 @@ async fn a_project_has_an_editor_on_the_port_of_webots_plus_500() {
 }
 
 #[actix_rt::test]
-async fn a_folder_that_leads_out_of_the_project_is_not_shown_to_an_editor() {
+async fn a_folder_that_leads_out_of_the_project_or_has_an_odd_name_is_not_shown_to_an_editor() {
     let Some(_docker) = docker().await else { return };
     let forge = Forge::with_arm();
     let work = forge.work_tree("lab/arm", "main");
-    std::os::unix::fs::symlink("/etc", work.join("controllers/out")).unwrap();
-    std::fs::write(work.join("webots.yml"), "dockerCompose: \"theia:webots-project/controllers/out\"\n").unwrap();
-    forge.commit_work_tree("lab/arm", "main");
+    // As a line of its own it would say where the project is.
+    let folder = work.join("controllers/x\nPROJECT=/etc");
+    std::fs::create_dir_all(&folder).unwrap();
+    std::fs::write(folder.join("file"), "").unwrap();
     let server = server(forge.path(), 1).start().await;
-    let told = Client::start(&server, &arm()).await.patiently("loading: Error:", BUILT).await;
-    assert!(told.contains("The project has no folder controllers/out"), "{told}");
+    for (target, words) in [("/etc", "The project has no folder controllers/edit"), ("x\nPROJECT=/etc", "line break")] {
+        std::fs::remove_file(work.join("controllers/edit")).ok();
+        std::os::unix::fs::symlink(target, work.join("controllers/edit")).unwrap();
+        std::fs::write(work.join("webots.yml"), "dockerCompose: \"theia:webots-project/controllers/edit\"\n").unwrap();
+        forge.commit_work_tree("lab/arm", "main");
+        let told = Client::start(&server, &arm()).await.patiently("loading: Error:", BUILT).await;
+        assert!(told.contains(words), "{told}");
+    }
 }
 
 /// The layout of the Dockerfiles of real competitions: a default port that their server replaces, and an entry point that

@@ -10,7 +10,7 @@ use nix::fcntl::OFlag;
 use super::dockerfile::Dockerfile;
 use super::project_file::text_of;
 use super::start_error::StartError;
-use super::templates::{CONTROLLER_DOCKERFILE, DOCKERFILE, LAUNCHER, Templates};
+use super::templates::{CONTROLLER_DOCKERFILE, DOCKERFILE, LAUNCHER, Template, Templates};
 use super::webots_yml::{ProjectKind, WebotsYml};
 
 /// The path of a project in its container, as existing Dockerfiles expect.
@@ -21,16 +21,30 @@ pub const PROJECT_PATH: &str = "/usr/local/webots-project";
 pub struct BuildPlan {
     /// What its `webots.yml` requests.
     pub yml: WebotsYml,
-    /// The Dockerfile of Webots' image.
-    pub dockerfile: Dockerfile,
-    /// Whether that image has the project, which the build may have changed.
-    pub has_project: bool,
-    /// The Dockerfile of the controllers' image.
-    pub controller: Option<Dockerfile>,
+    /// The template for that.
+    pub template: Template,
+    /// The image of Webots.
+    pub image: ImageBuild,
+    /// The image of the controllers.
+    pub controller: Option<ImageBuild>,
     /// Whether the project has a Makefile.
     pub has_makefile: bool,
 }
 
+/// An image to build.
+#[derive(Debug, Clone)]
+pub struct ImageBuild {
+    /// The Dockerfile.
+    pub dockerfile: Dockerfile,
+    /// The directory of the project that it copies from, empty for the whole project; `None` for the image of Webots, which
+    /// is the same for all projects.
+    pub folder: Option<&'static str>,
+    /// Its arguments, such as `MAKE=1`.
+    pub arguments: Vec<String>,
+}
+
+/// Arguments of the Dockerfile of a participant's controller.
+const PARTICIPANT: [&str; 2] = ["WEBOTS_CONTROLLER_URL=participant", "DEFAULT_CONTROLLER=participant"];
 /// The Dockerfile for a project that has nothing to build.
 const NO_DOCKERFILE: &str = "ARG WEBOTS_DEFAULT_IMAGE\nFROM ${WEBOTS_DEFAULT_IMAGE}\n";
 /// Files with which a project would configure its containers itself.
@@ -40,8 +54,8 @@ impl BuildPlan {
     /// Reads a project, and adds the files that a competition needs. Blocks.
     ///
     /// # Errors
-    /// The problem, as text for the client.
-    pub fn read(project: &Path, templates: &Templates, owner: &str) -> Result<Self, String> {
+    /// The problem, in the project or in the administrator's template.
+    pub fn read(project: &Path, templates: &Templates, owner: &str) -> Result<Self, StartError> {
         let mut yml = WebotsYml::read(project);
         let ignored = IGNORED.iter().filter(|name| project.join(name).symlink_metadata().is_ok());
         yml.warnings.extend(ignored.map(|name| format!("{name} of the project is not used here")));
@@ -54,10 +68,19 @@ impl BuildPlan {
             ProjectKind::Competition => Some(competition(project, templates)?),
             ProjectKind::Default | ProjectKind::Editor => None,
         };
-        let has_project = dockerfile.is_some();
-        let dockerfile = Dockerfile::read(dockerfile.as_deref().unwrap_or(NO_DOCKERFILE), owner)?;
-        let controller = controller.map(|text| Dockerfile::read(&text, owner)).transpose()?;
-        Ok(Self { yml, dockerfile, has_project, controller, has_makefile })
+        let build = |text: &str, folder, more: &[&str]| {
+            let mut arguments =
+                vec![format!("PROJECT_PATH={PROJECT_PATH}"), format!("MAKE={}", u8::from(has_makefile))];
+            arguments.extend(more.iter().map(|argument| (*argument).to_owned()));
+            Ok::<_, String>(ImageBuild { dockerfile: Dockerfile::read(text, owner)?, folder, arguments })
+        };
+        let image = match dockerfile {
+            Some(text) => build(&text, Some(""), &[])?,
+            None => build(NO_DOCKERFILE, None, &[])?,
+        };
+        let controller = controller.map(|text| build(&text, Some("controllers"), &PARTICIPANT)).transpose()?;
+        let template = templates.compose(yml.kind).map_err(StartError::Server)?;
+        Ok(Self { yml, template, image, controller, has_makefile })
     }
 }
 
@@ -144,16 +167,22 @@ mod tests {
         let project = tempfile::tempdir().unwrap();
         let plan = BuildPlan::read(project.path(), &templates(), "x").unwrap();
         assert!(
-            !plan.has_project && plan.dockerfile.bases == ["${WEBOTS_DEFAULT_IMAGE}"] && plan.yml.warnings.is_empty()
+            plan.image.folder.is_none()
+                && plan.image.dockerfile.bases == ["${WEBOTS_DEFAULT_IMAGE}"]
+                && plan.yml.warnings.is_empty()
         );
         std::fs::write(project.path().join("Makefile"), "all:\n").unwrap();
         std::fs::write(project.path().join(".env"), "A=b").unwrap();
         let plan = BuildPlan::read(project.path(), &templates(), "x").unwrap();
-        assert!(plan.has_makefile && plan.has_project && plan.dockerfile.text.contains("LABEL webots-fleet.owner=x"));
+        assert!(
+            plan.has_makefile
+                && plan.image.folder == Some("")
+                && plan.image.dockerfile.text.contains("LABEL webots-fleet.owner=x")
+        );
         assert_eq!(plan.yml.warnings, [".env of the project is not used here"]);
         std::fs::write(project.path().join("Dockerfile"), "FROM mine\n").unwrap();
         let plan = BuildPlan::read(project.path(), &templates(), "x").unwrap();
-        assert!(plan.dockerfile.text.starts_with("FROM mine\nLABEL webots-fleet.owner=x\nRUN "));
+        assert!(plan.image.dockerfile.text.starts_with("FROM mine\nLABEL webots-fleet.owner=x\nRUN "));
     }
 
     #[test]
@@ -165,7 +194,7 @@ mod tests {
         std::fs::remove_file(&file).unwrap();
         nix::unistd::mkfifo(&file, nix::sys::stat::Mode::S_IRWXU).unwrap();
         let wrong = BuildPlan::read(project.path(), &templates(), "x").unwrap_err();
-        assert_eq!(wrong, "Dockerfile of the project is no plain file of at most 256 KiB");
+        assert_eq!(wrong.to_string(), "Dockerfile of the project is no plain file of at most 256 KiB");
     }
 
     #[test]

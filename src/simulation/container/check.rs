@@ -17,8 +17,6 @@ const ANSWER_TIMEOUT: Duration = Duration::from_secs(5);
 const INIT: &str = "/sbin/docker-init";
 /// The empty image, shared by all servers of a machine.
 const EMPTY_IMAGE: &str = "webots-fleet/init";
-/// An empty archive in the format of tar: two blocks of zeros.
-const EMPTY_TAR: [u8; 1024] = [0; 1024];
 
 /// Checks whether simulations can run in containers. Blocks for some seconds at most.
 ///
@@ -74,15 +72,12 @@ pub fn data_folder() -> Option<PathBuf> {
 /// for a second, for 45 at most.
 #[must_use]
 pub fn init_fault() -> Option<String> {
-    let run = || -> Result<String, String> {
+    let run = || {
         if docker::blocking(&["image", "inspect", EMPTY_IMAGE], START_TIMEOUT).is_err() {
-            let tar = tempfile::NamedTempFile::new().map_err(|error| error.to_string())?;
-            std::fs::write(tar.path(), EMPTY_TAR).map_err(|error| error.to_string())?;
-            let import = ["import", &tar.path().to_string_lossy(), EMPTY_IMAGE];
-            docker::blocking(&import, START_TIMEOUT).map_err(|error| error.to_string())?;
+            docker::blocking(&["import", "/dev/null", EMPTY_IMAGE], START_TIMEOUT)?;
         }
         let words = ["run", "--rm", "--init", "--network", "none", EMPTY_IMAGE, INIT, "--version"];
-        docker::blocking(&words, START_TIMEOUT).map_err(|error| error.to_string())
+        docker::blocking(&words, START_TIMEOUT)
     };
     let why = run().err()?;
     Some(format!(

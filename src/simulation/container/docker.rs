@@ -12,7 +12,7 @@ use crate::simulation::process::{ExitReason, Ran, Run, RunError, SpawnSpec};
 #[derive(Debug, Clone)]
 pub struct Docker {
     /// `docker compose`, or `docker-compose` if only that is installed.
-    compose: Vec<OsString>,
+    pub compose: &'static [&'static str],
     /// The directory of this run of the server, which marks all processes.
     mark: PathBuf,
 }
@@ -63,7 +63,7 @@ impl Docker {
     pub fn find(mark: &Path) -> Result<Self, String> {
         which("docker")
             .map_err(|_| "docker is not there; on Debian and Ubuntu the package docker.io has it".to_owned())?;
-        let compose: &[&str] = if blocking(&["compose", "version"], FIND_TIMEOUT).is_ok() {
+        let compose: &[_] = if blocking(&["compose", "version"], FIND_TIMEOUT).is_ok() {
             &["docker", "compose"]
         } else if which("docker-compose").is_ok() {
             &["docker-compose"]
@@ -72,7 +72,7 @@ impl Docker {
                 "docker compose is not there; the package docker-compose or docker-compose-plugin has it".to_owned()
             );
         };
-        Ok(Self { compose: compose.iter().map(OsString::from).collect(), mark: mark.to_owned() })
+        Ok(Self { compose, mark: mark.to_owned() })
     }
 
     /// Runs `docker` with these arguments, and returns its standard output.
@@ -87,49 +87,17 @@ impl Docker {
         result(name, ran, reason)
     }
 
-    /// The same, but `on_line` receives each line that it prints.
+    /// Runs a program with its arguments and these variables. `on_line` receives each line that it prints.
     ///
     /// # Errors
     /// When it fails or takes longer than the limit.
     pub async fn follow(
         &self,
-        arguments: Vec<OsString>,
-        limit: Duration,
-        on_line: impl FnMut(&str),
-    ) -> Result<(), DockerError> {
-        self.call(&["docker".into()], arguments, Vec::new(), limit, on_line).await
-    }
-
-    /// Runs `docker compose` with these arguments and variables.
-    ///
-    /// # Errors
-    /// When it fails or takes longer than the limit.
-    pub async fn compose(
-        &self,
-        arguments: Vec<OsString>,
-        variables: Vec<(&'static str, String)>,
-        limit: Duration,
-    ) -> Result<(), DockerError> {
-        self.call(&self.compose, arguments, variables, limit, |_| ()).await
-    }
-
-    /// The specification of a client program of the daemon. Dropping its process group ends only that program.
-    #[must_use]
-    pub fn spec(&self, command: Vec<OsString>, grace: Duration) -> SpawnSpec {
-        // The classic builder prints its steps, and can build on the server's own network; BuildKit can't.
-        let environment = vec![("DOCKER_BUILDKIT".into(), "0".into()), ("COMPOSE_ANSI".into(), "never".into())];
-        SpawnSpec { environment, grace, ..SpawnSpec::new(command, &self.mark) }
-    }
-
-    async fn call(
-        &self,
-        program: &[OsString],
-        arguments: Vec<OsString>,
+        command: Vec<OsString>,
         variables: Vec<(&'static str, String)>,
         limit: Duration,
         mut on_line: impl FnMut(&str),
     ) -> Result<(), DockerError> {
-        let command = [program, &arguments].concat();
         let (name, mut reason) = (name_of(&command), String::new());
         let mut run = Run::new([""], &self.mark, limit);
         run.spec = self.spec(command, Duration::ZERO);
@@ -140,6 +108,14 @@ impl Docker {
         };
         let ran = run.follow(line).await.map(|ending| Ran { ending, answer: Vec::new() });
         result(name, ran, reason).map(drop)
+    }
+
+    /// The specification of a client program of the daemon. Dropping its process group ends only that program.
+    #[must_use]
+    pub fn spec(&self, command: Vec<OsString>, grace: Duration) -> SpawnSpec {
+        // The classic builder prints its steps, and can build on the server's own network; BuildKit can't.
+        let environment = vec![("DOCKER_BUILDKIT".into(), "0".into()), ("COMPOSE_ANSI".into(), "never".into())];
+        SpawnSpec { environment, grace, ..SpawnSpec::new(command, &self.mark) }
     }
 }
 

@@ -3,16 +3,15 @@
 use std::ffi::OsString;
 use std::path::Path;
 use std::sync::Arc;
-use std::time::Duration;
 
 use actix_rt::task::spawn_blocking;
 use tokio::sync::{Semaphore, SemaphorePermit, watch};
 
-use super::build_plan::{self, PROJECT_PATH};
+use super::build_plan::{self, ImageBuild};
 use super::built_image::BuiltImage;
 use super::compose_project::DEFAULT_MEMORY;
 use super::docker::{Docker, DockerError, SHORT_TIMEOUT};
-use super::dockerfile::{Dockerfile, LABEL};
+use super::dockerfile::LABEL;
 use super::owned_resources::{ResourceOwner, digest};
 use super::start_error::{StartError, is_disk_full};
 use super::steps;
@@ -24,31 +23,10 @@ use crate::simulation::config::SimulationConfig;
 pub struct Images {
     docker: Docker,
     owner: ResourceOwner,
-    /// Timeout of a pull, and of a build.
-    limit: Duration,
-    /// Memory limit of a build step, in MiB.
-    memory: u64,
+    config: Arc<SimulationConfig>,
     /// Limits concurrent builds.
     builds: Semaphore,
     jobs: SingleFlight<String, Result<(), StartError>>,
-}
-
-/// An image to build.
-#[derive(Debug)]
-pub struct ImageBuild {
-    /// The project, kept until the build has ended.
-    pub project: Arc<Project>,
-    /// The image of its version of Webots.
-    pub base: String,
-    /// The Dockerfile.
-    pub dockerfile: Dockerfile,
-    /// The directory of the project that it copies from, empty for the whole project; `None` for the image of Webots, which
-    /// is the same for all projects.
-    pub folder: Option<&'static str>,
-    /// Whether the project has a Makefile.
-    pub has_makefile: bool,
-    /// The Docker network that it may use.
-    pub network: &'static str,
 }
 
 /// How a Dockerfile names the image of the world's version of Webots.
@@ -59,16 +37,13 @@ const ID: &str = "{{.Id}}";
 const CONFIG: &str = "{{json .Config}}";
 /// Why an image is not there although it was, as text for the client.
 const REMOVED: &str = "An image that this simulation needs was removed meanwhile";
-/// Arguments of the Dockerfile of a participant's controller.
-const PARTICIPANT: [&str; 2] = ["WEBOTS_CONTROLLER_URL=participant", "DEFAULT_CONTROLLER=participant"];
 
 impl Images {
     /// The images of this owner.
     #[must_use]
-    pub fn new(docker: Docker, owner: ResourceOwner, config: &SimulationConfig) -> Self {
-        let (builds, limit) = (Semaphore::new(config.container.builds), config.timing.build);
-        let memory = config.limits.memory.unwrap_or(DEFAULT_MEMORY);
-        Self { docker, owner, limit, memory, builds, jobs: SingleFlight::default() }
+    pub fn new(docker: Docker, owner: ResourceOwner, config: Arc<SimulationConfig>) -> Self {
+        let builds = Semaphore::new(config.container.builds);
+        Self { docker, owner, config, builds, jobs: SingleFlight::default() }
     }
 
     /// Pulls a configured image unless it exists. Returns its id, which differs from those of later images of the same
@@ -84,39 +59,35 @@ impl Images {
         let pull = move |sender: watch::Sender<String>| async move {
             let _permit = this.permit(&sender).await?;
             let on_line = |line: &str| drop(sender.send(steps::pulling(&name, line)));
-            let pulled = this.docker.follow(["pull", &name].map(OsString::from).to_vec(), this.limit, on_line).await;
+            let command = ["docker", "pull", &name].map(OsString::from).to_vec();
+            let pulled = this.docker.follow(command, Vec::new(), this.config.timing.build, on_line).await;
             pulled.map_err(|error| not_pulled(&name, error))
         };
         self.jobs.join(image.to_owned(), progress, pull).await?;
         self.inspect(image, ID).await?.ok_or_else(|| StartError::Server(REMOVED.to_owned()))
     }
 
-    /// Builds an image unless it exists.
+    /// Builds an image of a project unless it exists.
     ///
     /// # Errors
     /// Why it can't be built or used, as text for the client.
     pub async fn build(
         self: &Arc<Self>,
-        build: ImageBuild,
+        project: &Arc<Project>,
+        build: &ImageBuild,
         progress: OnProgress<'_>,
     ) -> Result<BuiltImage, StartError> {
-        let mut arguments = vec![
-            format!("WEBOTS_DEFAULT_IMAGE={}", build.base),
-            format!("PROJECT_PATH={PROJECT_PATH}"),
-            format!("MAKE={}", u8::from(build.has_makefile)),
-        ];
-        let mut parts = vec![build.dockerfile.text.clone()];
-        if let Some(folder) = build.folder {
-            parts.extend([build.project.identity(), folder.to_owned()]);
-            arguments.extend(PARTICIPANT.iter().filter(|_| !folder.is_empty()).map(|word| (*word).to_owned()));
-        }
-        parts.extend_from_slice(&arguments);
+        let webots = build_plan::image_of(&self.config.container.image, &project.world.version);
+        let mut build = build.clone();
+        build.arguments.push(format!("WEBOTS_DEFAULT_IMAGE={webots}"));
+        let mut parts = [vec![build.dockerfile.text.clone()], build.arguments.clone()].concat();
+        parts.extend(build.folder.into_iter().flat_map(|folder| [project.identity(), folder.to_owned()]));
         // An image's name stays the same when the image is updated, so its id is part of the key. A base that is not here
         // yet has none: the build fetches it.
         for base in &build.dockerfile.bases {
             let is_default = DEFAULT_BASE.contains(&base.as_str());
             parts.extend(if is_default {
-                Some(self.pull(&build.base, progress).await?)
+                Some(self.pull(&webots, progress).await?)
             } else {
                 self.inspect(base, ID).await?
             });
@@ -125,8 +96,8 @@ impl Images {
         if let Some(config) = self.inspect(&name, CONFIG).await? {
             return Ok(BuiltImage::read(name, &config)?);
         }
-        let (this, tag) = (Arc::clone(self), name.clone());
-        let job = |sender| async move { this.build_now(&tag, build, arguments, sender).await };
+        let (this, project, tag) = (Arc::clone(self), Arc::clone(project), name.clone());
+        let job = |sender| async move { this.build_now(&tag, &project, build, sender).await };
         self.jobs.join(name.clone(), progress, job).await?;
         let config = self.inspect(&name, CONFIG).await?;
         Ok(BuiltImage::read(name, &config.ok_or_else(|| StartError::Server(REMOVED.to_owned()))?)?)
@@ -135,12 +106,12 @@ impl Images {
     async fn build_now(
         &self,
         name: &str,
+        project: &Project,
         build: ImageBuild,
-        arguments: Vec<String>,
         sender: watch::Sender<String>,
     ) -> Result<(), StartError> {
         let _permit = self.permit(&sender).await?;
-        let ImageBuild { project, dockerfile, folder, network, .. } = build;
+        let ImageBuild { dockerfile, folder, arguments } = build;
         let (instance, root) = (project.instance.path().to_owned(), project.folder().to_owned());
         let prepare = move || {
             let file = instance.join(format!("Dockerfile{}", folder.unwrap_or_default()));
@@ -152,9 +123,11 @@ impl Images {
             Ok::<_, StartError>((file, context))
         };
         let (file, context) = spawn_blocking(prepare).await??;
-        let memory = format!("{}m", self.memory);
-        let options = ["build", "--force-rm", "--memory", &memory, "--memory-swap", &memory, "--network", network];
-        let words = options.into_iter().chain(["--tag", name, "--file"]).map(OsString::from).chain([file.into()]);
+        let memory = format!("{}m", self.config.limits.memory.unwrap_or(DEFAULT_MEMORY));
+        let network = self.config.container.network.name();
+        let limited = ["docker", "build", "--force-rm", "--memory", &memory, "--memory-swap", &memory];
+        let options = ["--network", network, "--tag", name, "--file"];
+        let words = limited.into_iter().chain(options).map(OsString::from).chain([file.into()]);
         let arguments = arguments.into_iter().flat_map(|argument| ["--build-arg".into(), argument.into()]);
         let words = words.chain(arguments).chain([context.into()]);
         let mut step = String::new();
@@ -166,7 +139,7 @@ impl Images {
                 sender.send(text).ok();
             }
         };
-        let done = self.docker.follow(words.collect(), self.limit, on_line).await;
+        let done = self.docker.follow(words.collect(), Vec::new(), self.config.timing.build, on_line).await;
         done.map_err(|error| not_built(&step, error))
     }
 
@@ -175,8 +148,9 @@ impl Images {
             return Ok(permit);
         }
         sender.send("waiting for images of others to be built".to_owned()).ok();
-        let busy = || format!("Images of others were being built for {} seconds (timing.build)", self.limit.as_secs());
-        let permit = actix_rt::time::timeout(self.limit, self.builds.acquire()).await;
+        let limit = self.config.timing.build;
+        let busy = || format!("Images of others were being built for {} seconds (timing.build)", limit.as_secs());
+        let permit = actix_rt::time::timeout(limit, self.builds.acquire()).await;
         permit.map_err(|_| StartError::Server(busy()))?.map_err(|error| StartError::Server(error.to_string()))
     }
 
@@ -196,45 +170,37 @@ impl Images {
     /// When Docker fails.
     pub async fn prune(&self, hours: u64) -> Result<(), DockerError> {
         let (mine, old) = (format!("label={LABEL}={}", self.owner.name()), format!("until={hours}h"));
-        let prune = ["image", "prune", "--force", "--filter", &mine, "--filter"];
-        // The images of a build in progress are younger.
-        for rest in [&["until=1h"][..], &[&old, "--all"]] {
-            self.docker.run(&[&prune, rest].concat(), SHORT_TIMEOUT).await?;
-        }
-        Ok(())
+        let prune = ["image", "prune", "--all", "--force", "--filter", &mine, "--filter", &old];
+        self.docker.run(&prune, SHORT_TIMEOUT).await.map(drop)
     }
 }
 
 /// Why a configured image can't be pulled, as text for the client.
 fn not_pulled(image: &str, error: DockerError) -> StartError {
-    match error {
-        DockerError::Failed { message, .. } if is_unknown(&message) => no_image(image),
-        DockerError::Failed { message, .. } => {
-            let is_own = is_disk_full(&message) || is_silent(&message);
-            let kind = if is_own { StartError::Server } else { StartError::Project };
-            kind(format!("The image {image} can't be fetched: {message}"))
-        }
-        DockerError::Slow { limit, .. } => StartError::Server(too_slow(limit)),
-        DockerError::Unavailable(_) => error.into(),
+    let is_own = matches!(error, DockerError::Slow { .. }) || is_silent(&error.to_string());
+    match not_made(Some(image), |message| format!("The image {image} can't be fetched: {message}"), error) {
+        StartError::Project(why) if is_own => StartError::Server(why),
+        error => error,
     }
 }
 
 /// Why an image was not built in this step, as text for the client. Only a `FROM` step can fail because of a missing image.
 fn not_built(step: &str, error: DockerError) -> StartError {
-    let base = step.split_once(" : FROM ").map(|(_, image)| image.split(' ').next().unwrap_or_default());
-    match (base, error) {
-        (Some(image), DockerError::Failed { message, .. }) if is_unknown(&message) => no_image(image),
-        (_, DockerError::Failed { message, .. }) => {
-            let kind = if is_disk_full(&message) { StartError::Server } else { StartError::Project };
-            kind(format!("The image of this project can't be built: {message} ({step})"))
-        }
-        (_, DockerError::Slow { limit, .. }) => StartError::Project(too_slow(limit)),
-        (_, error) => error.into(),
-    }
+    let base = step.split_once(" : FROM ").and_then(|(_, image)| image.split(' ').next());
+    not_made(base, |message| format!("The image of this project can't be built: {message} ({step})"), error)
 }
 
-fn too_slow(limit: Duration) -> String {
-    format!("Its image was not ready within {} seconds (timing.build)", limit.as_secs())
+/// Why an image with this base was not made, as text for the client.
+fn not_made(base: Option<&str>, tell: impl Fn(&str) -> String, error: DockerError) -> StartError {
+    match (base, error) {
+        (Some(image), DockerError::Failed { message, .. }) if is_unknown(&message) => no_image(image),
+        (_, DockerError::Failed { message, .. }) if is_disk_full(&message) => StartError::Server(tell(&message)),
+        (_, DockerError::Failed { message, .. }) => StartError::Project(tell(&message)),
+        (_, DockerError::Slow { limit, .. }) => {
+            StartError::Project(format!("Its image was not ready within {} seconds (timing.build)", limit.as_secs()))
+        }
+        (_, error) => error.into(),
+    }
 }
 
 fn no_image(image: &str) -> StartError {

@@ -8,7 +8,7 @@ use actix_rt::task::spawn_blocking;
 
 use super::docker::{Docker, DockerError, SHORT_TIMEOUT};
 use super::owned_resources::{self, PROJECT};
-use super::start_error::StartError;
+use super::start_error::{StartError, blame};
 use crate::simulation::checkout::{Project, outgrown};
 use crate::simulation::process::remove_tree;
 
@@ -30,7 +30,7 @@ pub async fn export(
 ) -> Result<(), StartError> {
     let label = format!("{PROJECT}={name}");
     let create = ["create", "--label", &label, "--network", "none", image, "true"];
-    let container = docker.run(&create, SHORT_TIMEOUT).await.map_err(StartError::of_project)?;
+    let container = docker.run(&create, SHORT_TIMEOUT).await.map_err(|error| blame(true, error))?;
     let (container, through) = (container.trim(), project.instance.path().join("copied"));
     let source = format!("{container}:{}/.", from.display());
     let words = ["cp", &source, &through.to_string_lossy()].map(str::to_owned);
@@ -40,7 +40,7 @@ pub async fn export(
             return Err(format!("The project in its image is larger than {size} MiB (projectSize)").into());
         }
     }
-    owned_resources::remove(docker, [container]).await?;
+    owned_resources::remove(docker, &[container.to_owned()]).await?;
     let to = to.to_owned();
     Ok(spawn_blocking(move || remove_tree(&to).and_then(|()| std::fs::rename(&through, &to))).await??)
 }
@@ -59,7 +59,7 @@ fn not_copied(error: DockerError, from: &Path) -> StartError {
             let what = format!("{from} in the image of this project has a link to {target}");
             format!("{what}, which leads out of it: `docker cp` refuses that").into()
         }
-        error => StartError::of_project(error),
+        error => blame(true, error),
     }
 }
 

@@ -1,26 +1,24 @@
 //! The network of all containers, whose interface name the packet filter matches.
 
-use super::docker::{Docker, SHORT_TIMEOUT};
-use super::start_error::StartError;
+use super::docker::{Docker, DockerError, SHORT_TIMEOUT};
 
 /// The option by which containers in a network can't reach each other.
 const ALONE: &str = "com.docker.network.bridge.enable_icc=false";
+
+/// What Docker says of a network that exists.
+const KNOWN: [&str; 2] = ["already exists", "have same bridge name"];
 
 /// Creates the network of this name, which is also that of its interface, unless it exists.
 ///
 /// # Errors
 /// When Docker fails.
-pub async fn join(docker: &Docker, name: &str) -> Result<(), StartError> {
-    if docker.run(&["network", "inspect", name], SHORT_TIMEOUT).await.is_ok() {
-        return Ok(());
-    }
+pub async fn join(docker: &Docker, name: &str) -> Result<(), DockerError> {
     // One network for all, because Docker's address pools allow only some thirty.
     let interface = format!("com.docker.network.bridge.name={name}");
     let create = ["network", "create", "--driver", "bridge", "--opt", &interface, "--opt", ALONE, name];
-    let created = docker.run(&create, SHORT_TIMEOUT).await;
-    match created {
-        // Another server, or another client of this one, may have created it first.
-        Err(error) if docker.run(&["network", "inspect", name], SHORT_TIMEOUT).await.is_err() => Err(error.into()),
-        _ => Ok(()),
+    match docker.run(&create, SHORT_TIMEOUT).await {
+        // Two that are created at the same time would have the same interface, which Docker refuses.
+        Err(DockerError::Failed { message, .. }) if KNOWN.iter().any(|words| message.contains(words)) => Ok(()),
+        created => created.map(drop),
     }
 }

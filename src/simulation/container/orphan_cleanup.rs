@@ -1,6 +1,6 @@
 //! Removes orphaned compose projects and unused images.
 
-use std::collections::{BTreeSet, HashSet};
+use std::collections::HashSet;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -8,9 +8,8 @@ use parking_lot::Mutex;
 use tokio::sync::Notify;
 
 use super::check::data_folder;
-use super::docker::{Docker, DockerError, SHORT_TIMEOUT};
 use super::image::Images;
-use super::owned_resources::{self, LIST, ResourceOwner};
+use super::owned_resources::{self, ResourceOwner};
 use crate::simulation::config::SimulationConfig;
 use crate::simulation::process::DiskRoom;
 
@@ -54,7 +53,6 @@ impl Drop for ProjectGuard {
 
 /// Removes orphaned compose projects and unused images.
 pub async fn run_cleanup(
-    docker: Docker,
     owner: ResourceOwner,
     active: ActiveProjects,
     images: Arc<Images>,
@@ -67,14 +65,17 @@ pub async fn run_cleanup(
         actix_rt::time::timeout(pause, active.0.1.notified()).await.ok();
         // Most is removed by then without a sweep.
         actix_rt::time::sleep(RETRY_INTERVAL).await;
-        pause = match remove_orphans(&docker, &owner, &active).await {
-            Ok(false) => SWEEP_INTERVAL,
+        let (of, used) = (owner.clone(), active.clone());
+        let sweep = move || owned_resources::sweep(&of, |project| used.0.0.lock().contains(project));
+        pause = match actix_rt::task::spawn_blocking(sweep).await {
+            Ok(Ok(left)) if left.is_empty() => SWEEP_INTERVAL,
             // Containers that Docker was removing when it was stopped appear one by one.
-            Ok(true) => RETRY_INTERVAL,
-            Err(error) => {
-                log::debug!("containers that nobody uses are not removed yet: {error}");
+            Ok(Ok(left)) => {
+                log::info!("{} was left: removed", left.into_iter().collect::<Vec<_>>().join(", "));
                 RETRY_INTERVAL
             }
+            // Docker does not answer, or another process removes the same.
+            _ => RETRY_INTERVAL,
         };
         let reserve = config.disk_reserve;
         let is_full = actix_rt::task::spawn_blocking(move || is_disk_full(reserve)).await.unwrap_or_default();
@@ -98,20 +99,4 @@ pub async fn run_cleanup(
 fn is_disk_full(reserve: u64) -> bool {
     let room = data_folder().and_then(|folder| DiskRoom::of(&folder).ok());
     room.is_some_and(|room| room.shortage(reserve).is_some())
-}
-
-/// Removes what is left. Returns whether there was something.
-async fn remove_orphans(docker: &Docker, owner: &ResourceOwner, active: &ActiveProjects) -> Result<bool, DockerError> {
-    let list = docker.run(&LIST, SHORT_TIMEOUT).await?;
-    let mut left: Vec<(&str, &str)> = owner.containers(&list).collect();
-    left.retain(|(_, project)| !active.0.0.lock().contains(*project));
-    if left.is_empty() {
-        return Ok(false);
-    }
-    owned_resources::remove(docker, left.iter().map(|(id, _)| *id)).await?;
-    let projects: BTreeSet<&str> = left.into_iter().map(|(_, project)| project).collect();
-    for project in projects {
-        log::info!("{project} was left: removed");
-    }
-    Ok(true)
 }

@@ -3,6 +3,7 @@
 //!
 //! The names of its compose projects have a common prefix, so that the resources of a crashed server are found again.
 
+use std::collections::BTreeSet;
 use std::path::Path;
 use std::time::Duration;
 
@@ -97,8 +98,8 @@ pub fn digest(text: &[u8]) -> String {
 ///
 /// # Errors
 /// When Docker fails; then some may remain.
-pub async fn remove(docker: &Docker, containers: impl IntoIterator<Item = &str>) -> Result<(), DockerError> {
-    let words: Vec<&str> = REMOVE.into_iter().chain(containers).collect();
+pub async fn remove(docker: &Docker, containers: &[String]) -> Result<(), DockerError> {
+    let words: Vec<&str> = REMOVE.into_iter().chain(containers.iter().map(String::as_str)).collect();
     match docker.run(&words, SHORT_TIMEOUT).await {
         // Another process may remove it.
         Err(DockerError::Failed { message, .. })
@@ -110,14 +111,25 @@ pub async fn remove(docker: &Docker, containers: impl IntoIterator<Item = &str>)
     }
 }
 
-/// Removes the containers of a server: for a process that watches over the server's end. Blocks.
-pub fn sweep(owner: &ResourceOwner) {
-    let list = docker::blocking(&LIST, SWEEP_TIMEOUT).unwrap_or_default();
-    let found: Vec<&str> = owner.containers(&list).map(|(id, _)| id).collect();
-    if !found.is_empty() {
-        // What is left is removed by the next start.
-        docker::blocking(&[&REMOVE, found.as_slice()].concat(), SWEEP_TIMEOUT).ok();
+/// Removes the containers of an owner, except those of projects in use. Returns the projects of what it has removed.
+/// Blocks.
+///
+/// # Errors
+/// When Docker fails; then some may remain.
+pub fn sweep(owner: &ResourceOwner, is_used: impl Fn(&str) -> bool) -> Result<BTreeSet<String>, DockerError> {
+    let list = docker::blocking(&LIST, SWEEP_TIMEOUT)?;
+    let (ids, projects): (Vec<_>, BTreeSet<_>) =
+        owner.containers(&list).filter(|(_, project)| !is_used(project)).unzip();
+    if !ids.is_empty() {
+        docker::blocking(&[&REMOVE, ids.as_slice()].concat(), SWEEP_TIMEOUT)?;
     }
+    Ok(projects.into_iter().map(str::to_owned).collect())
+}
+
+/// Removes all containers of an owner: for a process that watches over the server's end. What is left is removed by the next
+/// start. Blocks.
+pub fn sweep_all(owner: &ResourceOwner) {
+    sweep(owner, |_| false).ok();
 }
 
 #[cfg(test)]

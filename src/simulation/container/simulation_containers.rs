@@ -6,6 +6,7 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 use tokio::sync::Notify;
 use tokio_util::task::AbortOnDropHandle;
 
+use super::compose_project::container_of;
 use super::docker::{Docker, DockerError, SHORT_TIMEOUT};
 use super::orphan_cleanup::ProjectGuard;
 use super::owned_resources;
@@ -20,8 +21,8 @@ pub struct SimulationContainers {
     pub(super) docker: Docker,
     /// The name of its compose project.
     pub(super) guard: ProjectGuard,
-    /// The container of each service.
-    pub(super) containers: Vec<(String, String)>,
+    /// Its services, each with a container.
+    pub(super) services: Vec<String>,
     /// Whether the project has defined one of their images, which may be why Docker can't start one.
     pub(super) is_projects: bool,
     /// Texts for its client, unchanged.
@@ -61,15 +62,19 @@ impl Cause {
 }
 
 impl SimulationContainers {
-    fn of(&self, service: &str) -> Option<&str> {
-        self.containers.iter().find(|(name, _)| name == service).map(|(_, container)| container.as_str())
+    fn container(&self, service: &str) -> String {
+        container_of(&self.guard.name, service)
+    }
+
+    fn all(&self) -> Vec<String> {
+        self.services.iter().map(|service| self.container(service)).collect()
     }
 
     /// The process that starts Webots' container, prints its output, and exits with its exit code.
     #[must_use]
     pub fn spawn_spec(&self, grace: Duration) -> SpawnSpec {
-        let webots = self.of(WEBOTS).unwrap_or_default();
-        self.docker.spec(["docker", "start", "--attach", webots].map(Into::into).to_vec(), grace)
+        let webots = self.container(WEBOTS);
+        self.docker.spec(["docker", "start", "--attach", &webots].map(Into::into).to_vec(), grace)
     }
 
     /// Starts the other services. That must happen before Webots is started, so that no symlink of a world's program
@@ -78,15 +83,15 @@ impl SimulationContainers {
     /// # Errors
     /// When Docker fails, with the project or this server as the cause.
     pub async fn start_others(&mut self) -> Result<(), StartError> {
-        let others =
-            self.containers.iter().filter(|(service, _)| service != WEBOTS).map(|(_, container)| container.as_str());
-        let words: Vec<&str> = std::iter::once("start").chain(others).collect();
+        let others = self.services.iter().filter(|service| *service != WEBOTS).map(|service| self.container(service));
+        let words: Vec<String> = std::iter::once("start".to_owned()).chain(others).collect();
         if words.len() > 1 {
             self.docker.run(&words, SHORT_TIMEOUT).await.map_err(|error| blame(self.is_projects, error))?;
         }
-        if let Some(controller) = self.of(CONTROLLER) {
+        if self.services.iter().any(|service| service == CONTROLLER) {
+            let controller = self.container(CONTROLLER);
             let request = Arc::new(Notify::new());
-            let restarts = restart_on_request(self.docker.clone(), controller.to_owned(), Arc::clone(&request));
+            let restarts = restart_on_request(self.docker.clone(), controller, Arc::clone(&request));
             self.restart = Some((request, AbortOnDropHandle::new(actix_rt::spawn(restarts))));
         }
         Ok(())
@@ -100,10 +105,8 @@ impl SimulationContainers {
 
     /// The ids of its containers, which the kernel knows them by; none where Docker fails.
     pub fn ids(&self) -> impl Future<Output = Vec<String>> + use<> {
-        let docker = self.docker.clone();
-        let names = self.containers.iter().map(|(_, container)| container.clone());
-        let words: Vec<String> =
-            ["inspect", "--format", "{{.Id}}"].map(str::to_owned).into_iter().chain(names).collect();
+        let (docker, all) = (self.docker.clone(), self.all());
+        let words = [["inspect", "--format", "{{.Id}}"].map(str::to_owned).to_vec(), all].concat();
         async move {
             let ids = docker.run(&words, SHORT_TIMEOUT).await.unwrap_or_default();
             ids.lines().map(|id| id.trim().to_owned()).collect()
@@ -112,9 +115,9 @@ impl SimulationContainers {
 
     /// Why Webots' container has ended, given the exit code of the program `docker`; nothing if Docker knows no more.
     pub async fn cause(&self, code: Option<i32>) -> Option<Cause> {
-        let (webots, code) = (self.of(WEBOTS)?, code?);
+        let (webots, code) = (self.container(WEBOTS), code?);
         let format = "{{.State.OOMKilled}} {{.State.Status}} {{.State.ExitCode}}";
-        let state = match self.docker.run(&["inspect", "--format", format, webots], SHORT_TIMEOUT).await {
+        let state = match self.docker.run(&["inspect", "--format", format, &webots], SHORT_TIMEOUT).await {
             Ok(state) => state,
             Err(DockerError::Failed { .. }) => return None,
             Err(_) => return Some(Cause::Docker),
@@ -124,7 +127,7 @@ impl SimulationContainers {
             [_, "created", _] => (!self.is_projects).then_some(Cause::NotStarted),
             // The program has lost the connection to the daemon.
             [_, _, ended] if *ended != code.to_string() => Some(Cause::Docker),
-            _ if ENDED_BY_SIGNAL.contains(&code) => self.was_stopped(webots).await.then_some(Cause::Docker),
+            _ if ENDED_BY_SIGNAL.contains(&code) => self.was_stopped(&webots).await.then_some(Cause::Docker),
             _ => None,
         }
     }
@@ -143,8 +146,7 @@ impl SimulationContainers {
 
     /// Removes everything of this simulation.
     pub async fn remove(self) {
-        let containers = self.containers.iter().map(|(_, container)| container.as_str());
-        if let Err(error) = owned_resources::remove(&self.docker, containers).await {
+        if let Err(error) = owned_resources::remove(&self.docker, &self.all()).await {
             log::warn!("{} is not removed yet: {error}", self.guard.name);
         }
     }

@@ -13,23 +13,16 @@ pub enum StartError {
     Server(String),
 }
 
-impl StartError {
-    /// An error of Docker with an image that the project has defined: the project is the cause, unless the disk is
-    /// full.
-    #[must_use]
-    pub fn of_project(error: DockerError) -> Self {
-        match &error {
-            DockerError::Failed { message, .. } if !is_disk_full(message) => Self::Project(error.to_string()),
-            _ => error.into(),
-        }
-    }
-}
-
 /// The cause if Docker fails with the containers of a simulation. `is_projects` tells whether the project has defined
-/// one of their images.
+/// one of their images: then the project is the cause, unless the disk is full.
 #[must_use]
 pub fn blame(is_projects: bool, error: DockerError) -> StartError {
-    if is_projects { StartError::of_project(error) } else { error.into() }
+    match &error {
+        DockerError::Failed { message, .. } if is_projects && !is_disk_full(message) => {
+            StartError::Project(error.to_string())
+        }
+        _ => error.into(),
+    }
 }
 
 /// Whether Docker reports a full disk. Only the end of the message counts, because it may contain names of the project.
@@ -70,7 +63,7 @@ mod tests {
     fn what_docker_answers_about_a_projects_image_is_the_projects_fault() {
         let failed =
             |message: &str| DockerError::Failed { command: "docker cp".to_owned(), message: message.to_owned() };
-        let is_own = |error| matches!(StartError::of_project(error), StartError::Server(_));
+        let is_own = |error| matches!(blame(true, error), StartError::Server(_));
         assert!(!is_own(failed("mknod /x: operation not permitted")));
         assert!(!is_own(failed("no space left on device: no such file")));
         assert!(is_own(failed("write /x: no space left on device")));

@@ -58,7 +58,7 @@ async fn usages(server: &AppState, snapshot: &Snapshot) -> Usages {
     let read = if let Some(containers) = &server.containers {
         // The process is `docker`, which waits for the containers.
         let roots: BTreeMap<u16, i32> = simulations.filter_map(|one| Some((one.port?, one.pid?))).collect();
-        let owner = containers.run().clone();
+        let owner = containers.run.clone();
         let read =
             move || usage.read_by(&roots.values().copied().collect::<Vec<_>>(), || container::measure(&owner, &roots));
         actix_rt::task::spawn_blocking(read)
