@@ -10,7 +10,6 @@ use actix::prelude::*;
 use super::launch_spec::LaunchSpec;
 use super::launch_target::LaunchTarget;
 use super::output::{self, OutputEvent, Tail};
-use super::paced_reader::PacedReader;
 use crate::shared::run::RotatedFile;
 use crate::simulation::container::Cause;
 use crate::simulation::ends::Taken;
@@ -63,8 +62,7 @@ pub fn launch(
     });
     let log = file.is_ok().then_some(log);
     let (reader, output) = std::io::pipe()?;
-    let reader = PacedReader::new(reader, spec.config.limits.output << 10);
-    let (tail, all_read) = output::follow(reader, file.ok(), events)?;
+    let (tail, all_read) = output::follow(reader, spec.config.limits.output << 10, file.ok(), events)?;
     let errors = output.try_clone()?;
     let (process, cgroup) = match &target {
         LaunchTarget::Containers(containers) => (containers.spawn_spec(spec.config.timing.grace), None),

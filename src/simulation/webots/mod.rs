@@ -7,7 +7,6 @@ mod launch_spec;
 mod launch_target;
 mod launched;
 mod output;
-mod paced_reader;
 mod verdict;
 mod virtual_display;
 mod webots;
