@@ -29,7 +29,7 @@ fn sockets(pid: i32) -> Vec<u64> {
 }
 
 fn xvfb(server: &Server) -> i32 {
-    instances_below(&server.folder).into_iter().find(|(_, words)| words.contains("Xvfb :")).unwrap().0
+    instances_below(&server.folder).into_iter().find(|(_, words)| words.contains("Xvfb -screen")).unwrap().0
 }
 
 fn namespace(pid: &str, name: &str) -> PathBuf {
@@ -78,7 +78,7 @@ async fn a_virtual_display_is_inside_of_the_sandbox() {
         let unix = std::fs::read_to_string(format!("/proc/{pid}/net/unix")).unwrap();
         let is_own = |line: &&str| own.iter().any(|inode| line.split(' ').any(|word| word == inode.to_string()));
         let own_unix: Vec<&str> = unix.lines().filter(is_own).collect();
-        assert!(own_unix.iter().any(|line| line.ends_with(" /tmp/.X11-unix/X99")), "{user}: {own_unix:?}");
+        assert!(own_unix.iter().any(|line| line.contains(" /tmp/.X11-unix/X")), "{user}: {own_unix:?}");
         assert!(!own_unix.iter().any(|line| line.contains('@')), "{user}: {own_unix:?}");
         let listens = |one: &procfs::net::TcpNetEntry| own.contains(&one.inode);
         let process = Process::new(pid).unwrap();
@@ -126,26 +126,18 @@ async fn told_memory(server: &Server) -> u64 {
 }
 
 #[actix_rt::test]
-async fn what_a_virtual_display_takes_counts_for_its_simulation_in_a_sandbox() {
+async fn what_a_virtual_display_takes_counts_for_its_simulation() {
     let _alone = display::alone().await;
-    for (level, counts) in [("sandbox", true), ("none", false)] {
+    for level in ["sandbox", "none"] {
         let (forge, webots, group) = (Forge::with_arm(), Webots::launcher(), Delegated::new());
         let builder = simulation_server(&webots.path(), forge.path(), 1).set("xvfb", true).set("isolation", level);
         let join = group.as_ref().map_or("true".to_owned(), Delegated::join);
         let server = builder.before(&join).start().await;
         let mut client = Client::start(&server, &arm()).await;
         client.until("webots:").await;
-        let (begin, _connection) = (Instant::now(), take_memory(&server, level));
-        if counts {
-            until("its memory counts", async || told_memory(&server).await >= MEMORY).await;
-        } else {
-            until("it was read again", async || {
-                assert!(told_memory(&server).await < MEMORY, "this is what the level does not promise");
-                begin.elapsed() > Duration::from_secs(5)
-            })
-            .await;
-        }
-        if let Some(group) = group.as_ref().filter(|_| counts) {
+        let _connection = take_memory(&server, level);
+        until("its memory counts", async || told_memory(&server).await >= MEMORY).await;
+        if let Some(group) = &group {
             let own = group.groups().into_iter().find(|name| name.starts_with("simulation-")).unwrap();
             let folder = group.0.join(own);
             let inside = std::fs::read_to_string(folder.join("cgroup.procs")).unwrap();
@@ -155,11 +147,11 @@ async fn what_a_virtual_display_takes_counts_for_its_simulation_in_a_sandbox() {
                 assert!(memory.trim().parse::<u64>().unwrap() >= MEMORY, "{memory}");
             }
         }
-        let pid = counts.then(|| xvfb(&server));
+        let pid = xvfb(&server);
         client.leave().await;
         nothing_left(&server, 1).await;
         let is_alive = |pid| Process::new(pid).is_ok_and(|one| one.is_alive());
-        assert!(!pid.is_some_and(is_alive));
+        until("it has ended", async || !is_alive(pid)).await;
     }
 }
 

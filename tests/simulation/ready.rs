@@ -174,7 +174,7 @@ async fn each_webots_gets_a_virtual_display_of_its_own() {
         "test -S /tmp/.X11-unix/X${{DISPLAY#:}} || exit 9\necho \"display $DISPLAY\"\n{DEMO} \"$@\" & wait"
     ));
     let builder = simulation_server(&webots.path(), forge.path(), 2).set("xvfb", true);
-    // In a sandbox each has the same number.
+    // Sandboxes see only their own display: their numbers may be the same.
     let server = builder.set("isolation", "none").start().await;
     let mut clients = Vec::new();
     let mut displays = Vec::new();
@@ -215,7 +215,7 @@ async fn the_number_of_a_virtual_display_that_was_killed_is_used_again() {
         let mut client = Client::start(&server, &arm()).await;
         client.until("webots:").await;
         numbers.insert(display_of(&server, &client).await);
-        let xvfb = instances_below(&server.folder).into_iter().find(|one| one.1.starts_with("Xvfb")).unwrap().0;
+        let xvfb = instances_below(&server.folder).into_iter().find(|one| one.1.contains("Xvfb -screen")).unwrap().0;
         kill(Pid::from_raw(xvfb), Signal::SIGKILL).unwrap();
         client.leave().await;
         nothing_left(&server, 1).await;

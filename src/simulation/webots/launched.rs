@@ -13,7 +13,7 @@ use super::output::{self, OutputEvent, Tail};
 use crate::shared::run::RotatedFile;
 use crate::simulation::container::Cause;
 use crate::simulation::ends::Taken;
-use crate::simulation::isolation::{Cgroup, Display, Peak};
+use crate::simulation::isolation::{Cgroup, Peak};
 use crate::simulation::process::{ExitReason, ProcessGroup};
 
 /// A Webots that was started.
@@ -67,7 +67,6 @@ pub fn launch(
     let (process, cgroup) = match &target {
         LaunchTarget::Containers(containers) => (containers.spawn_spec(spec.config.timing.grace), None),
         LaunchTarget::Machine(display) => spec.spawn_spec(display)?,
-        LaunchTarget::BesideDisplay(display) => spec.spawn_spec(&Display::Outside(display.environment()))?,
     };
     let (group, ended) = ProcessGroup::start(&process, output.into(), errors.into())?;
     let folder = cgroup.as_ref().map(|cgroup| cgroup.path().to_owned());

@@ -8,7 +8,6 @@ mod launch_target;
 mod launched;
 mod output;
 mod verdict;
-mod virtual_display;
 mod webots;
 
 pub use event::{WebotsEvent, WebotsExit};
