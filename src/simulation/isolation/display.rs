@@ -26,13 +26,13 @@ pub enum Display {
     },
 }
 
-/// Starts Xvfb, waits until it reports its number, and then becomes the program that follows its own two arguments: Xvfb
-/// and the authority file. Xvfb has a session of its own, so that the SIGTERM for the program does not reach it. Its only
+/// Starts Xvfb, waits until it reports its number, and then becomes the program that follows its own three arguments: Xvfb,
+/// the authority file, and options. Xvfb has a session of its own, so that the SIGTERM for the program does not reach it. Its only
 /// screen has the width, height and bits of a pixel that `xvfb-run` has.
 const LAUNCHER: &str = r#"
 folder=$(mktemp -d) && mkfifo "$folder/ready" || exit
-setpriv --pdeathsig KILL setsid "$0" -screen 0 1280x1024x24 -nolisten tcp -nolisten local -fp built-ins -auth "$1" \
-    -displayfd 3 3>"$folder/ready" >"$folder/log" 2>&1 &
+setpriv --pdeathsig KILL setsid "$0" -screen 0 1280x1024x24 -nolisten tcp $2 -fp built-ins -auth "$1" -displayfd 3 \
+    3>"$folder/ready" >"$folder/log" 2>&1 &
 read -r number <"$folder/ready"
 why=$(tail -n 1 "$folder/log")
 rm -r "$folder"
@@ -41,7 +41,7 @@ if [ -z "$number" ]; then
     exit 1
 fi
 export DISPLAY=":$number"
-shift
+shift 2
 exec "$@"
 "#;
 /// In an authority file: the entry counts for every host. `FamilyWild` of X11/Xauth.h.
@@ -76,20 +76,22 @@ impl Display {
         }
     }
 
-    /// The command that precedes a program to start its virtual display.
-    pub fn launcher(&self) -> Vec<OsString> {
+    /// The command that precedes a program to start its virtual display. In a sandbox it has no abstract socket; beside
+    /// others it needs one, by which it finds a free number.
+    pub fn launcher(&self, in_sandbox: bool) -> Vec<OsString> {
         let Self::Virtual { xvfb, authority } = self else { return Vec::new() };
         let words = ["/bin/sh", "-c", LAUNCHER].map(OsString::from);
-        words.into_iter().chain([xvfb.into(), authority.into()]).collect()
+        let options = if in_sandbox { "-nolisten local" } else { "" };
+        words.into_iter().chain([xvfb.into(), authority.into(), options.into()]).collect()
     }
 
-    /// Makes the folder of its socket in `/tmp`, or what is mounted there, because Xvfb of an ordinary user does not.
+    /// Makes the folder of its socket in the sandbox's `/tmp`, because Xvfb of an ordinary user does not.
     pub fn prepare(&self, tmp: &Path) -> io::Result<()> {
         let folder = tmp.join(".X11-unix");
-        if matches!(self, Self::Outside(_)) || folder.is_dir() {
+        if matches!(self, Self::Outside(_)) {
             return Ok(());
         }
-        std::fs::create_dir(&folder)?;
+        std::fs::create_dir_all(&folder)?;
         std::fs::set_permissions(folder, Permissions::from_mode(0o1777))
     }
 }

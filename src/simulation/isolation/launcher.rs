@@ -272,11 +272,9 @@ impl Launcher {
             }
             command.extend(sandbox.command(&program)?);
             environment.extend(sandbox.environment());
-        } else {
-            program.display.prepare(Path::new("/tmp"))?;
         }
         command.extend(self.limited());
-        command.extend(program.display.launcher());
+        command.extend(program.display.launcher(self.level() == IsolationLevel::Sandbox));
         let spec = SpawnSpec {
             command: command.into_iter().chain(program.command).collect(),
             inherits: false,
