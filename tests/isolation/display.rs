@@ -1,14 +1,10 @@
-//! A virtual display of a simulation's own, in its sandbox; and a display for all that one of them takes up.
+//! A virtual display of a simulation's own.
 
 use std::os::unix::fs::PermissionsExt;
 use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
-use std::time::{Duration, Instant};
 
 use procfs::process::{FDTarget, Process};
-use serde_json::Value;
-use tokio::io::{AsyncBufReadExt, BufReader};
-use tokio::process::Command;
 use x11rb::connection::Connection;
 use x11rb::protocol::xproto::{ConnectionExt, CreateGCAux, Rectangle};
 use x11rb::rust_connection::{DefaultStream, RustConnection};
@@ -153,45 +149,4 @@ async fn what_a_virtual_display_takes_counts_for_its_simulation() {
         let is_alive = |pid| Process::new(pid).is_ok_and(|one| one.is_alive());
         until("it has ended", async || !is_alive(pid)).await;
     }
-}
-
-/// The X server of a machine, for few clients.
-async fn x_server() -> (tokio::process::Child, String) {
-    let mut command = Command::new("Xvfb");
-    command.args(["-displayfd", "1", "-nolisten", "tcp", "-maxclients", "64"]).kill_on_drop(true);
-    let mut child = command.stdout(std::process::Stdio::piped()).stderr(std::process::Stdio::null()).spawn().unwrap();
-    let mut line = String::new();
-    BufReader::new(child.stdout.take().unwrap()).read_line(&mut line).await.unwrap();
-    (child, format!(":{}", line.trim()))
-}
-
-async fn health(server: &Server) -> (u16, String) {
-    let answer = http::try_get(&server.url("/health")).await.unwrap();
-    (answer.status.as_u16(), answer.text())
-}
-
-#[actix_rt::test]
-async fn a_simulation_that_takes_all_connections_of_a_display_makes_no_server_ill() {
-    let _alone = display::alone().await;
-    let (mut child, name) = x_server().await;
-    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
-    let home: &Path = &webots.path();
-    let builder = simulation_server(home, forge.path(), 1).set("webots", Value::Null).set("display", name.as_str());
-    let server = builder.set("webotsHome", home.parent().unwrap().to_str().unwrap()).start().await;
-    assert_eq!(health(&server).await, (200, "ok".to_owned()));
-    let connect = || RustConnection::connect(Some(&name)).ok();
-    let all: Vec<_> = std::iter::from_fn(connect).collect();
-    assert!(all.len() > 50 && connect().is_none(), "{}", all.len());
-    let begin = Instant::now();
-    // Checks are five seconds apart.
-    until("it was checked twice", async || {
-        assert_eq!(health(&server).await, (200, "ok".to_owned()));
-        begin.elapsed() > Duration::from_secs(11)
-    })
-    .await;
-    // One that is gone is noticed all the same.
-    child.kill().await.unwrap();
-    until("it is told", async || health(&server).await.0 == 503).await;
-    let (_, why) = health(&server).await;
-    assert!(why.contains("no display answers at"), "{why}");
 }
