@@ -174,7 +174,7 @@ async fn each_webots_gets_a_virtual_display_of_its_own() {
         "test -S /tmp/.X11-unix/X${{DISPLAY#:}} || exit 9\necho \"display $DISPLAY\"\n{DEMO} \"$@\" & wait"
     ));
     let builder = simulation_server(&webots.path(), forge.path(), 2).set("xvfb", true);
-    // Sandboxes see only their own display: their numbers may be the same.
+    // In a sandbox each has the same number.
     let server = builder.set("isolation", "none").start().await;
     let mut clients = Vec::new();
     let mut displays = Vec::new();

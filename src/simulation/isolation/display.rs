@@ -76,12 +76,12 @@ impl Display {
         }
     }
 
-    /// The command that precedes a program to start its virtual display. In a sandbox it has no abstract socket; beside
-    /// others it needs one, by which it finds a free number.
+    /// The command that precedes a program to start its virtual display. In a sandbox it has no abstract socket, and a
+    /// number that no display of the machine should have; beside others it finds a free number by its abstract socket.
     pub fn launcher(&self, in_sandbox: bool) -> Vec<OsString> {
         let Self::Virtual { xvfb, authority } = self else { return Vec::new() };
         let words = ["/bin/sh", "-c", LAUNCHER].map(OsString::from);
-        let options = if in_sandbox { "-nolisten local" } else { "" };
+        let options = if in_sandbox { ":99 -nolisten local" } else { "" };
         words.into_iter().chain([xvfb.into(), authority.into(), options.into()]).collect()
     }
 
