@@ -106,7 +106,8 @@ fn display(config: &SimulationConfig) -> Result<String, String> {
 /// The GPUs over which simulations are spread.
 fn gpus(config: &SimulationConfig) -> Result<String, String> {
     let unread = |why: &str| format!("gpus is \"spread\", but no NVIDIA GPU is read, so none is chosen: {why}");
-    let GpuReading { gpus, lost } = GpuSensor::read_once().map_err(|why| unread(&why))?;
+    let sensor = GpuSensor::open().map_err(|error| unread(&error.to_string()))?;
+    let GpuReading { gpus, lost } = sensor.read();
     let (count, displays) = (gpus.len() + lost, config.displays_of_gpus().len());
     match (count, displays) {
         (0, _) => return Err(unread("NVIDIA's driver knows none")),

@@ -2,7 +2,7 @@
 //! reinstalled, and a disk or a display may fail and recover. The check does what a start does: it writes to the disk
 //! and starts a process.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
@@ -16,11 +16,8 @@ use super::config::{IsolationSetting, SimulationConfig};
 use super::failed_starts::FailedStarts;
 use crate::simulation::container::{daemon_fault, data_folder, init_fault};
 use crate::simulation::machine::Readings;
-use crate::simulation::machine::display::KeptConnection;
+use crate::simulation::machine::display;
 use crate::simulation::process::DiskRoom;
-
-/// A connection to each display that simulations are given.
-type KeptConnections = BTreeMap<String, KeptConnection>;
 
 /// Interval between two checks.
 const PERIOD: Duration = Duration::from_secs(5);
@@ -42,8 +39,7 @@ pub fn watch(
     failed_starts: Arc<FailedStarts>,
 ) -> watch::Receiver<Option<String>> {
     // The first check comes before the first client; GPUs are not read yet.
-    let mut display = KeptConnections::new();
-    let first = check(&config, &run, &[], &mut display).and_then(|()| check_init(&config, false)).err();
+    let first = check(&config, &run, &[]).and_then(|()| check_init(&config, false)).err();
     let (sender, problem) = watch::channel(None);
     publish(&sender, first, &failed_starts);
     actix_rt::spawn(async move {
@@ -54,10 +50,9 @@ pub fn watch(
             let gpus = check_gpus(&config, &readings.borrow());
             let indexes: Vec<u32> = readings.borrow().gpus.iter().map(|gpu| gpu.index).collect();
             let (config, run) = (Arc::clone(&config), run.clone());
-            let mut kept = std::mem::take(&mut display);
             let all = move || {
-                let found = gpus.and_then(|()| check(&config, &run, &indexes, &mut kept));
-                (found.and_then(|()| check_init(&config, has_init)).err(), kept)
+                let found = gpus.and_then(|()| check(&config, &run, &indexes));
+                found.and_then(|()| check_init(&config, has_init)).err()
             };
             let mut checked = actix_rt::task::spawn_blocking(all);
             let found = if let Ok(found) = actix_rt::time::timeout(HUNG, &mut checked).await {
@@ -67,8 +62,7 @@ pub fn watch(
                 publish(&sender, Some(hangs), &failed_starts);
                 checked.await
             };
-            if let Ok((found, kept)) = found {
-                display = kept;
+            if let Ok(found) = found {
                 has_init |= found.is_none();
                 publish(&sender, found, &failed_starts);
             }
@@ -96,7 +90,7 @@ fn publish(sender: &watch::Sender<Option<String>>, found: Option<String>, failed
 
 /// Checks everything that each simulation needs; `gpus` are the numbers of those that answer. Blocks for two seconds for
 /// each display, and for as long as the disk does.
-fn check(config: &SimulationConfig, run: &Path, gpus: &[u32], kept: &mut KeptConnections) -> Result<(), String> {
+fn check(config: &SimulationConfig, run: &Path, gpus: &[u32]) -> Result<(), String> {
     if config.isolation == IsolationSetting::Container {
         daemon_fault().map_or(Ok(()), Err)?;
     }
@@ -114,8 +108,7 @@ fn check(config: &SimulationConfig, run: &Path, gpus: &[u32], kept: &mut KeptCon
     // Webots itself always needs a display. A replacement (`webots`) may not.
     if config.webots.is_none() && !config.xvfb && config.isolation != IsolationSetting::Container {
         for display in displays(config, gpus) {
-            let checked = kept.entry(display.clone()).or_default().check(&display);
-            checked.map_err(|error| format!("Webots can't open its window: {error}"))?;
+            display::check(&display).map_err(|error| format!("Webots can't open its window: {error}"))?;
         }
     }
     Ok(())

@@ -7,8 +7,8 @@ use std::time::{Duration, Instant};
 use socket2::{Domain, Socket, Type};
 
 use super::until_states;
-use crate::support::program::{Server, session_server};
 use crate::support::http;
+use crate::support::program::{Server, session_server};
 
 const CLIENTS: usize = 100;
 /// How long they send, at most.

@@ -158,28 +158,3 @@ async fn wrong_names_are_told_in_words_and_no_cache_is_thrown_away_for_them() {
         .await;
     }
 }
-
-#[actix_rt::test]
-async fn a_repository_whose_hashes_are_of_sha_256_runs_too() {
-    let (forge, webots) = (Forge::new(), reader());
-    let (bare, work) = (forge.path().join("lab/arm"), forge.path().join(".work/lab/arm"));
-    for (folder, is_bare) in [(&bare, "--bare"), (&work, "--no-bare")] {
-        std::fs::create_dir_all(folder).unwrap();
-        git(folder, &["init", "--quiet", is_bare, "--object-format=sha256", "--initial-branch=main"]);
-    }
-    git(&work, &["remote", "add", "origin", bare.to_str().unwrap()]);
-    let commit = |text: &str| forge.commit("lab/arm", "main", &[("worlds/a.wbt", &world_text(text))]);
-    let commits = [commit("first"), commit("second")];
-    assert_eq!(commits[0].len(), 64);
-    let server = simulation_server(&webots.path(), forge.path(), 2).start().await;
-    let third = commit("third");
-    for (name, text) in [("main", "third"), (&third, "third"), (&commits[0], "first"), (&commits[1], "second")] {
-        let told = outcome(&server, &world("lab/arm", name, "worlds/a.wbt")).await;
-        assert!(told.contains(&format!("opened [{text}]")), "{name}: {told}");
-    }
-    let told = outcome(&server, &world("lab/arm", &"a".repeat(40), "worlds/a.wbt")).await;
-    assert!(told.contains("has no branch, tag or commit called"), "{told}");
-    for repository in cached(&server) {
-        git(&repository, &["fsck", "--full"]);
-    }
-}

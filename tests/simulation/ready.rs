@@ -215,7 +215,7 @@ async fn the_number_of_a_virtual_display_that_was_killed_is_used_again() {
         let mut client = Client::start(&server, &arm()).await;
         client.until("webots:").await;
         numbers.insert(display_of(&server, &client).await);
-        let xvfb = instances_below(&server.folder).into_iter().find(|one| one.1.starts_with("Xvfb")).unwrap().0;
+        let xvfb = instances_below(&server.folder).into_iter().find(|one| one.1.contains("Xvfb -screen")).unwrap().0;
         kill(Pid::from_raw(xvfb), Signal::SIGKILL).unwrap();
         client.leave().await;
         nothing_left(&server, 1).await;

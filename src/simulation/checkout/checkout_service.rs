@@ -6,7 +6,6 @@
 use std::io;
 use std::path::Path;
 use std::sync::Arc;
-use std::time::Instant;
 
 use actix::prelude::*;
 use tokio::runtime::Handle;
@@ -97,21 +96,17 @@ impl CheckoutService {
         instance: InstanceDir,
         progress: OnProgress<'_>,
     ) -> Result<Project, CheckoutError> {
-        let start = Instant::now();
-        let (mut world, mut redirects, mut is_mended) = (world.clone(), 0, false);
+        let (mut world, mut redirects) = (world.clone(), 0);
         let checked_out = loop {
             match self.attempt(&world, &instance, progress).await {
                 Err(CheckoutError::Moved(..)) if redirects < redirect::MAX_REDIRECTS => {
                     redirects += 1;
                     world = self.resolver.moved(&world).await?;
                 }
-                Err(error) if !is_mended => {
-                    is_mended = true;
-                    self.mend(&world, start, error).await?;
-                }
                 done => break done,
             }
         };
+        self.mend(&world, checked_out.as_ref().err()).await?;
         let (revision, WorkTree { size, pointers, world: file }) = checked_out?;
         let file = file?;
         let warning = (pointers > 0).then(|| lfs::warning(pointers, self.has_lfs));
@@ -127,16 +122,11 @@ impl CheckoutService {
         })
     }
 
-    /// Discards a cached repository that is corrupt, unless it was created after `since`, so that it is fetched again.
-    ///
-    /// # Errors
-    /// The failure, if it has another cause.
-    async fn mend(&self, world: &ProjectUrl, since: Instant, failure: CheckoutError) -> Result<(), CheckoutError> {
-        let CheckoutError::Damaged { .. } = &failure else {
-            return Err(failure);
-        };
-        log::warn!("{failure}. The cached repository is broken: it is fetched anew");
-        self.resolver.discard(world, since).await
+    /// Discards a cached repository that has turned out to be corrupt, so that the next start fetches it anew.
+    async fn mend(&self, world: &ProjectUrl, failure: Option<&CheckoutError>) -> Result<(), CheckoutError> {
+        let Some(failure @ CheckoutError::Damaged(..)) = failure else { return Ok(()) };
+        log::warn!("{failure}. The cached repository is broken: it is fetched anew for the next client");
+        self.resolver.discard(world).await
     }
 
     /// Resolves and copies a project, with its large files.
@@ -166,7 +156,7 @@ impl CheckoutService {
                 return Ok((found.revision.clone(), copied));
             }
         }
-        Err(too_large("The project".to_owned(), self.limits.size))
+        Err(too_large("The project", self.limits.size))
     }
 
     /// Restores a file below the project's `controllers` directory to the state of the checkout.
@@ -176,15 +166,9 @@ impl CheckoutService {
     pub async fn restore_controller(&self, project: &Project, file: &str) -> Result<(), CheckoutError> {
         let refused = || CheckoutError::NoController(file.to_owned());
         let path = file_restore::controller(&project.revision.folder, file).ok_or_else(refused)?;
-        let start = Instant::now();
-        let is_there = match self.restore(project, &path).await {
-            Err(error) => {
-                self.mend(&project.url, start, error).await?;
-                self.restore(project, &path).await?
-            }
-            Ok(is_there) => is_there,
-        };
-        if is_there { Ok(()) } else { Err(refused()) }
+        let restored = self.restore(project, &path).await;
+        self.mend(&project.url, restored.as_ref().err()).await?;
+        if restored? { Ok(()) } else { Err(refused()) }
     }
 
     /// Restores a file of a project's repository. Returns whether it exists.

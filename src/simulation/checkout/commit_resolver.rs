@@ -1,8 +1,8 @@
 //! Resolves a world's URL to a commit, and fetches it into the cache: once for all clients that wait for it.
 
 use std::collections::HashMap;
+use std::ffi::OsStr;
 use std::sync::Arc;
-use std::time::Instant;
 
 use parking_lot::Mutex;
 use tokio::sync::watch;
@@ -12,10 +12,9 @@ use super::checkout_limits::CheckoutLimits;
 use super::git_error::GitError;
 use super::mirrors::{Mirrors, Remote};
 use super::redirect;
-use super::remote_query::RemoteQuery;
 use super::repository::Repository;
 use super::repository_cache::RepositoryCache;
-use super::revision::{self, Revision, TrustSource};
+use super::revision::{self, FetchRequest, Revision, TrustSource};
 use super::single_flight::{OnProgress, SingleFlight};
 use super::steps;
 use super::world_file::WorldFileError;
@@ -44,8 +43,19 @@ pub struct ResolvedCommit {
     pub above: Vec<u8>,
 }
 
+/// The search for a world's commit.
+#[derive(Clone, Copy)]
+struct Search<'job> {
+    world: &'job ProjectUrl,
+    /// The cached repository of its commits.
+    repository: &'job Arc<Repository>,
+    /// Receives each step as text.
+    progress: OnProgress<'job>,
+}
+
 /// Number of redirected remotes from which on all are dropped.
 const MAX_REDIRECTED: usize = 1000;
+
 impl CommitResolver {
     /// Keeps commits in `cache`.
     pub fn new(
@@ -94,7 +104,7 @@ impl CommitResolver {
         let progress = |step| drop(sender.send_replace(step));
         progress(steps::looking_for(&world.repository()));
         let repository = self.repository(world).await?;
-        let search = self.with(world, &repository, &progress);
+        let search = Search { world, repository: &repository, progress: &progress };
         let mut missing = None;
         for revision in self.revisions(search).await? {
             let path = revision.world_path(world);
@@ -109,15 +119,6 @@ impl CommitResolver {
         Err(missing.map_or_else(|| no_reference(world), CheckoutError::World))
     }
 
-    fn with<'job>(
-        &'job self,
-        world: &'job ProjectUrl,
-        repository: &'job Arc<Repository>,
-        progress: OnProgress<'job>,
-    ) -> RemoteQuery<'job> {
-        RemoteQuery { cache: &self.cache, world, repository, progress }
-    }
-
     async fn repository(&self, world: &ProjectUrl) -> Result<Arc<Repository>, CheckoutError> {
         self.cache.commits(&self.remote(world)?).await.map_err(|error| machine(world, &error))
     }
@@ -128,11 +129,12 @@ impl CommitResolver {
     }
 
     /// The commits that a URL may mean, the most likely first.
-    async fn revisions(&self, search: RemoteQuery<'_>) -> Result<Vec<Revision>, CheckoutError> {
+    async fn revisions(&self, search: Search<'_>) -> Result<Vec<Revision>, CheckoutError> {
         if let Some(commit) = revision::commit_of(search.world, self.limits.any_commit) {
             return Ok(vec![commit]);
         }
-        let answer = search.candidates().await?;
+        let location = &search.repository.remote().location;
+        let answer = search.ask(&revision::search_arguments(search.world, location)).await?;
         Ok(revision::found(search.world, &answer))
     }
 
@@ -148,7 +150,7 @@ impl CommitResolver {
         path: &str,
     ) -> Result<Option<Arc<Repository>>, CheckoutError> {
         let repository = self.repository(world).await?;
-        let search = self.with(world, &repository, &drop);
+        let search = Search { world, repository: &repository, progress: &drop };
         let answer = self.read(search, revision, path).await?;
         let is_file = answer.is_some_and(|answer| revision.files_above(&answer, path).is_some());
         Ok(is_file.then_some(repository))
@@ -158,61 +160,96 @@ impl CommitResolver {
     /// revision is a single file.
     async fn read(
         &self,
-        search: RemoteQuery<'_>,
+        search: Search<'_>,
         revision: &Revision,
         path: &str,
     ) -> Result<Option<Vec<u8>>, CheckoutError> {
-        let RemoteQuery { world, repository, .. } = search;
-        for is_fetched in [false, true] {
-            match repository.read(&revision.list_arguments(path)).await {
-                Ok(text) => return Ok(Some(text)),
-                Err(error @ (GitError::Machine(_) | GitError::TooLong(_) | GitError::Slow(_))) => {
-                    return Err(git_failed(world, error));
-                }
-                Err(_)
-                    if repository.read(&["rev-parse", "--quiet", "--verify", &revision.reference()]).await.is_err() => {
-                }
-                Err(source) => {
-                    let kind = repository.read(&["cat-file", "-t", &format!("{}^{{}}", revision.reference())]).await;
-                    if kind.is_ok_and(|kind| kind.starts_with(b"blob")) {
-                        return Ok(None);
-                    }
-                    return Err(CheckoutError::Damaged { repository: world.repository(), source });
-                }
-            }
-            // It is not in the cache.
-            if is_fetched {
-                break;
-            }
-            if revision.trust == TrustSource::Url && !search.is_accepted(revision).await? {
-                return Err(CheckoutError::NotReachable {
-                    repository: world.repository(),
-                    commit: revision.name.clone(),
-                });
-            }
+        let Search { world, repository, .. } = search;
+        let (reference, arguments) = (revision.reference(), revision.list_arguments(path));
+        let mut listed = repository.read(&arguments).await;
+        if matches!(listed, Err(GitError::Failed { .. }))
+            && repository.read(&["rev-parse", "--quiet", "--verify", &reference]).await.is_err()
+        {
             self.fetch(search, revision).await?;
+            listed = repository.read(&arguments).await;
         }
-        Err(machine(world, &std::io::Error::other("the commit that was fetched is not there")))
+        match listed {
+            Ok(text) => Ok(Some(text)),
+            Err(source @ GitError::Failed { .. }) => {
+                let kind = repository.read(&["cat-file", "-t", &format!("{reference}^{{}}")]).await;
+                let is_file = kind.is_ok_and(|kind| kind.starts_with(b"blob"));
+                if is_file { Ok(None) } else { Err(CheckoutError::Damaged(world.repository(), source)) }
+            }
+            Err(error) => Err(git_failed(world, error)),
+        }
     }
 
-    async fn fetch(&self, search: RemoteQuery<'_>, revision: &Revision) -> Result<(), CheckoutError> {
-        let RemoteQuery { world, repository, progress, .. } = search;
-        let on_line = |line: String| progress(steps::fetching(&world.repository(), &line));
-        let failed =
-            |error| fetch_failed(world, || format!("{} (at depth 1)", world.repository()), self.limits.size, error);
-        repository.fetch(&revision.request(&repository.remote().location), &on_line).await.map_err(failed)
+    /// Fetches a commit, if a branch or tag vouches for it or none need to.
+    async fn fetch(&self, search: Search<'_>, revision: &Revision) -> Result<(), CheckoutError> {
+        let Search { world, repository, .. } = search;
+        let name = world.repository();
+        if revision.trust == TrustSource::Url && !self.is_accepted(search, &revision.commit).await? {
+            return Err(CheckoutError::NotReachable(name, revision.name.clone()));
+        }
+        let request = revision.request(&repository.remote().location);
+        search.fetch(repository, &request, (&name, &format!("{name} (at depth 1)"))).await
     }
 
-    /// Discards what is cached of a world's repository, unless it was created after `since`.
+    /// Whether a commit that is named by its hash is in a branch or tag. The history is fetched unless it is cached.
+    async fn is_accepted(&self, search: Search<'_>, commit: &str) -> Result<bool, CheckoutError> {
+        let remote = search.repository.remote();
+        let tips = search.ask(&["ls-remote", "--quiet", "--heads", "--tags", "--", &remote.location]).await?;
+        if revision::is_tip(&tips, commit) {
+            return Ok(true);
+        }
+        let history = self.cache.history(&remote).await.map_err(|error| machine(search.world, &error))?;
+        if search.is_reachable(&history, commit).await? {
+            return Ok(true);
+        }
+        let name = search.world.repository();
+        let names = (&*format!("the history of {name}"), &*format!("The history of {name}"));
+        search.fetch(&history, &revision::history(&remote.location), names).await?;
+        search.is_reachable(&history, commit).await
+    }
+
+    /// Discards what is cached of a world's repository.
     ///
     /// # Errors
     /// When it can't be removed.
-    pub async fn discard(&self, world: &ProjectUrl, since: Instant) -> Result<(), CheckoutError> {
+    pub async fn discard(&self, world: &ProjectUrl) -> Result<(), CheckoutError> {
         let remote = self.remote(world)?;
         let discarded = async {
-            self.cache.commits(&remote).await?.discard(since).await?;
-            self.cache.history(&remote).await?.discard(since).await
+            self.cache.commits(&remote).await?.discard().await?;
+            self.cache.history(&remote).await?.discard().await
         };
         discarded.await.map_err(|error| machine(world, &error))
+    }
+}
+
+impl Search<'_> {
+    async fn ask(self, arguments: &[impl AsRef<OsStr>]) -> Result<String, CheckoutError> {
+        self.repository.ask(arguments).await.map_err(|source| git_failed(self.world, source))
+    }
+
+    /// Fetches into a repository. The first of the names is for the client's progress, the second for what is too large.
+    async fn fetch(
+        self,
+        into: &Arc<Repository>,
+        request: &FetchRequest,
+        (name, whole): (&str, &str),
+    ) -> Result<(), CheckoutError> {
+        let on_line = |line: String| (self.progress)(steps::fetching(name, &line));
+        let fetched = into.fetch(request, &on_line).await;
+        fetched.map_err(|error| fetch_failed(self.world, whole, into.limits.size, error))
+    }
+
+    /// Whether a commit is part of a branch or tag of a history.
+    async fn is_reachable(self, history: &Repository, commit: &str) -> Result<bool, CheckoutError> {
+        if history.read(&["cat-file", "-e", commit]).await.is_err() {
+            return Ok(false);
+        }
+        let branches = ["for-each-ref", "--count=1", "--contains", commit, "refs/heads", "refs/tags"];
+        let branches = history.read(&branches).await;
+        branches.map(|answer| !answer.is_empty()).map_err(|error| git_failed(self.world, error))
     }
 }

@@ -44,24 +44,11 @@ fn absent(result: io::Result<()>) -> io::Result<()> {
     result.or_else(|error| if error.kind() == io::ErrorKind::NotFound { Ok(()) } else { Err(error) })
 }
 
-/// How many bytes a running fetch has received.
-pub fn received(repository: &Path) -> u64 {
-    unfinished(repository).map(|path| length(&path)).sum()
-}
-
 /// The packs that are being received or written.
 fn unfinished(repository: &Path) -> impl Iterator<Item = PathBuf> {
     let is_new = |name: &[u8]| name.starts_with(b"tmp_") || name.starts_with(b".tmp-");
-    files(&repository.join("objects/pack"))
-        .filter(move |path| path.file_name().is_some_and(|name| is_new(name.as_encoded_bytes())))
-}
-
-fn files(folder: &Path) -> impl Iterator<Item = PathBuf> + use<> {
-    fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.path())
-}
-
-fn length(file: &Path) -> u64 {
-    file.metadata().map_or(0, |about| about.len())
+    let all = fs::read_dir(repository.join("objects/pack")).into_iter().flatten().flatten();
+    all.filter(move |entry| is_new(entry.file_name().as_encoded_bytes())).map(|entry| entry.path())
 }
 
 /// Waits until one of the directories exceeds its limit, in bytes, or has one in it that can't be read.

@@ -24,9 +24,6 @@ pub enum GitError {
     /// Its answer exceeds the size limit.
     #[error("the answer of git {0} is too long")]
     TooLong(String),
-    /// The fetch exceeds the size limit.
-    #[error("it is too large")]
-    TooLarge,
     /// It exceeded its timeout.
     #[error("git did not end within {} seconds", .0.as_secs())]
     Slow(Duration),
@@ -47,8 +44,8 @@ pub enum Cause {
     NoCommit,
     /// The remote redirects to another URL.
     Moved,
-    /// It exceeds git's memory limit, or the size limit of an answer.
-    TooMuch,
+    /// The fetch exceeds the size limit: the kernel has ended the program that writes its pack.
+    TooLarge,
     /// The cached repository is corrupt.
     Damaged,
     /// The machine or its network fails.
@@ -71,11 +68,11 @@ const MESSAGES: &[(Cause, &[&str])] = &[
     (Cause::Machine, &["SSL certificate", "certificate verification failed"]),
     (Cause::Moved, &["returned error: 301", "returned error: 302", "returned error: 303"]),
     (Cause::Moved, &["returned error: 307", "returned error: 308"]),
-    (Cause::TooMuch, &["Out of memory, ", "memory exhausted"]),
+    (Cause::TooLarge, &["invalid index-pack output"]),
     (Cause::NoRepository, &["could not read Username", "not found", "does not appear to be a git repository"]),
     (Cause::NoRepository, &["does not exist"]),
     (Cause::NoCommit, &["couldn't find remote ref", "not our ref", "unadvertised object", "remote did not send"]),
-    (Cause::Damaged, &["mismatched algorithms", "not a git repository", "bad config", "bad shallow", "bad object"]),
+    (Cause::Damaged, &["not a git repository", "bad config", "bad shallow", "bad object"]),
     (Cause::Damaged, &["bad tree", "corrupt", "too short to be a packfile", "unresolved delta", "unable to read"]),
     (Cause::Damaged, &["reference broken", "invalid reference", "did not send all necessary objects"]),
     // The lock of a killed git.
@@ -87,9 +84,8 @@ impl GitError {
     pub fn cause(&self) -> Cause {
         let message = match self {
             Self::Failed { ending: ExitReason::Code(_), message, .. } => message,
-            Self::TooLong(_) => return Cause::TooMuch,
             Self::Machine(_) => return Cause::Machine,
-            Self::Failed { .. } | Self::TooLarge | Self::Slow(_) => return Cause::Other,
+            Self::Failed { .. } | Self::TooLong(_) | Self::Slow(_) => return Cause::Other,
         };
         let is_of = |words: &[&str]| words.iter().any(|words| message.contains(words));
         MESSAGES.iter().find(|(_, words)| is_of(words)).map_or(Cause::Other, |(cause, _)| *cause)
@@ -118,7 +114,7 @@ mod tests {
             ("error: cannot lock ref 'refs/fleet/01': Unable to create '01.lock': File exists.", Cause::Damaged),
             ("error: unable to create file a: No space left on device", Cause::Machine),
             ("fatal: unable to access 'https://a.forge/': Could not resolve host: a.forge", Cause::Machine),
-            ("fatal: Out of memory, malloc failed (tried to allocate 9 bytes)", Cause::TooMuch),
+            ("fatal: fetch-pack: invalid index-pack output", Cause::TooLarge),
             ("fatal: early EOF", Cause::Other),
         ] {
             assert_eq!(cause(message, ExitReason::Code(128)), expected, "{message}");

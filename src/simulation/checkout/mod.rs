@@ -15,7 +15,6 @@ mod lfs;
 mod mirrors;
 mod project;
 mod redirect;
-mod remote_query;
 mod repository;
 mod repository_cache;
 mod revision;

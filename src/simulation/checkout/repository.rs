@@ -4,17 +4,16 @@ use std::ffi::OsStr;
 use std::io;
 use std::path::PathBuf;
 use std::sync::Arc;
-use std::time::Instant;
 
 use parking_lot::Mutex;
 use tokio::sync::{Notify, OwnedMutexGuard, Semaphore, watch};
 
 use super::checkout_limits::CheckoutLimits;
-use super::disk::{blocking, received, remove_all, remove_leftovers};
+use super::disk::{blocking, remove_all, remove_leftovers};
 use super::git::{Call, Git, LITTLE_MEMORY, MAX_MEMORY};
 use super::git_error::GitError;
 use super::mirrors::Remote;
-use super::revision::{self, FetchRequest};
+use super::revision::FetchRequest;
 use super::single_flight::{OnProgress, SingleFlight};
 
 /// A cached repository. It is not evicted from the cache until this is dropped.
@@ -33,8 +32,6 @@ pub struct Repository {
     queries: Semaphore,
     /// The fetches in progress, by the name of the request.
     fetches: SingleFlight<String, Result<(), GitError>>,
-    /// When it was created, if that was after this value was created.
-    created: Mutex<Option<Instant>>,
 }
 
 /// Number of concurrent queries of a remote for one repository.
@@ -43,9 +40,8 @@ const MAX_QUERIES: usize = 4;
 impl Repository {
     /// The repository at `path`, which need not exist yet, for commits of `remote`.
     pub fn new(path: PathBuf, remote: Remote, git: Arc<Git>, limits: CheckoutLimits, growth: Arc<Notify>) -> Self {
-        let (lock, fetches, created) = (Arc::default(), SingleFlight::default(), Mutex::default());
-        let queries = Semaphore::new(MAX_QUERIES);
-        Self { path, remote: Mutex::new(Arc::new(remote)), git, limits, growth, lock, queries, fetches, created }
+        let (lock, fetches, queries) = (Arc::default(), SingleFlight::default(), Semaphore::new(MAX_QUERIES));
+        Self { path, remote: Mutex::new(Arc::new(remote)), git, limits, growth, lock, queries, fetches }
     }
 
     /// Where it is fetched from.
@@ -110,7 +106,7 @@ impl Repository {
     ) -> Result<(), GitError> {
         let _grown = Grown(&self.growth);
         let guard = self.lock(sender).await;
-        self.create(request).await?;
+        self.create().await?;
         let on_line = |line: &str| {
             if line.contains('%') {
                 sender.send_replace(line.trim_start_matches("remote: ").to_owned());
@@ -118,11 +114,7 @@ impl Repository {
         };
         let file_size = Some(self.limits.size);
         let call = Call { settings: request.settings.clone(), file_size, ..self.call(&request.arguments) };
-        if let Err(error) = self.git.run(call, on_line).await {
-            let path = self.path.clone();
-            let received = blocking(move || Ok(received(&path))).await?;
-            return Err(if received < self.limits.size { error } else { GitError::TooLarge });
-        }
+        self.git.run(call, on_line).await?;
         self.collect_garbage(guard);
         Ok(())
     }
@@ -149,7 +141,7 @@ impl Repository {
     }
 
     /// Creates the bare repository unless it exists. Else removes what a killed git has left.
-    async fn create(&self, request: &FetchRequest) -> Result<(), GitError> {
+    async fn create(&self) -> Result<(), GitError> {
         // It is renamed to its final path when it is complete.
         let new = self.path.with_extension("new");
         let (path, new_path) = (self.path.clone(), new.clone());
@@ -161,11 +153,9 @@ impl Repository {
         if is_there.await? {
             return Ok(());
         }
-        let call = Call { repository: &new, ..self.call(&revision::init_arguments(request.is_sha256)) };
+        let call = Call { repository: &new, ..self.call(&["init", "--quiet", "--bare"]) };
         self.git.run(call, |_| ()).await?;
-        tokio::fs::rename(&new, &self.path).await?;
-        *self.created.lock() = Some(Instant::now());
-        Ok(())
+        Ok(tokio::fs::rename(&new, &self.path).await?)
     }
 
     /// Runs `git gc --auto` in the background, for at most `stall_timeout()`; only the next fetch waits for it.
@@ -180,15 +170,12 @@ impl Repository {
         });
     }
 
-    /// Discards the repository, unless it was created after `since`.
+    /// Discards the repository.
     ///
     /// # Errors
     /// When it can't be removed.
-    pub async fn discard(&self, since: Instant) -> io::Result<()> {
+    pub async fn discard(&self) -> io::Result<()> {
         let _guard = self.lock.lock().await;
-        if self.created.lock().is_some_and(|created| created > since) {
-            return Ok(());
-        }
         let path = self.path.clone();
         blocking(move || remove_all(&[&path])).await
     }

@@ -36,8 +36,6 @@ pub struct FetchRequest {
     pub settings: Vec<String>,
     /// What git is to do.
     pub arguments: Vec<String>,
-    /// Whether the repository's hashes are of SHA-256.
-    pub is_sha256: bool,
 }
 
 /// Limit of readings of a URL: no real branch has more slashes in its name.
@@ -47,17 +45,11 @@ const MAX_CANDIDATES: usize = 12;
 /// do, or only one that is in a branch or tag.
 pub fn commit_of(world: &ProjectUrl, allow_any: bool) -> Option<Revision> {
     let Reading { reference, folder } = world.candidates().into_iter().next()?;
-    let is_hash = [40, 64].contains(&reference.len()) && reference.bytes().all(|byte| byte.is_ascii_hexdigit());
+    let is_hash = reference.len() == 40 && reference.bytes().all(|byte| byte.is_ascii_hexdigit());
     let kind = matches!(world.kind(), RefKind::Any | RefKind::Commit);
     let commit = reference.to_ascii_lowercase();
     let trust = if allow_any { TrustSource::AnyCommit } else { TrustSource::Url };
     (is_hash && kind).then_some(Revision { commit, name: reference, folder, trust })
-}
-
-/// Makes a bare repository. git before 2.29 knows only the older kind of hashes, and no name for it.
-pub fn init_arguments(is_sha256: bool) -> Vec<&'static str> {
-    let kind = is_sha256.then_some("--object-format=sha256");
-    ["init", "--quiet", "--bare"].into_iter().chain(kind).collect()
 }
 
 /// Whether a commit is the newest of a branch or tag in such an answer.
@@ -67,24 +59,14 @@ pub fn is_tip(answer: &str, commit: &str) -> bool {
     tips.filter(|(_, name)| accepted(name)).any(|(tip, _)| tip == commit)
 }
 
-/// Whether the remote's hashes have another length than this one: then it can't have that commit.
-pub fn is_of_other_length(answer: &str, commit: &str) -> bool {
-    let mut tips = answer.lines().filter_map(|line| line.split_once('\t')).peekable();
-    tips.peek().is_some() && tips.all(|(tip, _)| tip.len() != commit.len())
-}
-
 /// Fetches all branches and tags: only their commits where the remote can do that, else everything. git keeps note of
 /// that only for remotes that have a name.
-pub fn history(location: &str, commit: &str) -> FetchRequest {
+pub fn history(location: &str) -> FetchRequest {
     let settings = vec![format!("remote.origin.url={location}")];
     let options = ["fetch", "--filter=tree:0", "--prune", "--no-tags", "--no-write-fetch-head", "--progress", "--"];
     let all = ["origin", "+refs/heads/*:refs/heads/*", "+refs/tags/*:refs/tags/*"];
     let arguments = options.into_iter().chain(all).map(str::to_owned).collect();
-    FetchRequest { name: "history".to_owned(), settings, arguments, is_sha256: is_sha256(commit) }
-}
-
-fn is_sha256(hash: &str) -> bool {
-    hash.len() == 64
+    FetchRequest { name: "history".to_owned(), settings, arguments }
 }
 
 /// Asks the remote for all branches and tags that a URL may mean.
@@ -112,7 +94,7 @@ pub fn found(world: &ProjectUrl, answer: &str) -> Vec<Revision> {
         .flat_map(|reading| full_names(world, &reading).into_iter().map(move |name| (name, reading.clone())))
         .filter_map(|(name, reading)| {
             let (commit, _) = known.iter().find(|(_, known)| *known == name)?;
-            let is_hash = commit.len() >= 40 && commit.bytes().all(|byte| byte.is_ascii_hexdigit());
+            let is_hash = commit.len() == 40 && commit.bytes().all(|byte| byte.is_ascii_hexdigit());
             is_hash.then(|| Revision {
                 commit: (*commit).to_owned(),
                 name: reading.reference,
@@ -136,7 +118,7 @@ impl Revision {
         let refspec = format!("+{}:{}", self.commit, self.reference());
         let options = ["fetch", "--depth=1", "--no-tags", "--no-write-fetch-head", "--progress", "--"];
         let arguments = options.into_iter().chain([location, &refspec]).map(str::to_owned).collect();
-        FetchRequest { name: self.reference(), settings: Vec::new(), arguments, is_sha256: is_sha256(&self.commit) }
+        FetchRequest { name: self.reference(), settings: Vec::new(), arguments }
     }
 
     /// The folder to check out, as git wants it named.

@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use super::docker::blocking;
 use super::owned_resources::{LIST, ResourceOwner};
-use crate::simulation::machine::{Measured, Usage};
+use crate::simulation::machine::{Usage, Usages};
 
 /// Timeout of each command.
 const TIMEOUT: Duration = Duration::from_secs(20);
@@ -13,7 +13,7 @@ const TIMEOUT: Duration = Duration::from_secs(20);
 /// Measures the simulations of an owner: those on these ports, whose processes are named for each. Blocks for two
 /// seconds, which `docker stats` takes.
 #[must_use]
-pub fn measure(owner: &ResourceOwner, roots: &BTreeMap<u16, i32>) -> Vec<(i32, Measured)> {
+pub fn measure(owner: &ResourceOwner, roots: &BTreeMap<u16, i32>) -> Usages {
     let list = blocking(&LIST, TIMEOUT).unwrap_or_default();
     let root = |project: &str| roots.get(&owner.port_of(project)?).copied();
     let containers: BTreeMap<&str, i32> =
@@ -21,14 +21,14 @@ pub fn measure(owner: &ResourceOwner, roots: &BTreeMap<u16, i32>) -> Vec<(i32, M
     let format = "{{.ID}}\t{{.CPUPerc}}\t{{.MemUsage}}\t{{.PIDs}}";
     // Of all that run: one that is named and has ended meanwhile would fail all.
     let printed = blocking(&["stats", "--no-stream", "--no-trunc", "--format", format], TIMEOUT);
-    let mut all = BTreeMap::<i32, Usage>::new();
+    let mut all = Usages::new();
     for (id, one) in printed.unwrap_or_default().lines().filter_map(usage_of) {
         let Some(root) = containers.get(id) else { continue };
         let sum = all.entry(*root).or_default();
         let cpu = Some(sum.cpu.unwrap_or_default() + one.cpu.unwrap_or_default());
         *sum = Usage { cpu, memory: sum.memory + one.memory, threads: sum.threads + one.threads, ..one };
     }
-    all.into_iter().map(|(root, usage)| (root, Measured::Usage(usage))).collect()
+    all
 }
 
 /// A line of `docker stats`.

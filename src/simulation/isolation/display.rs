@@ -1,11 +1,13 @@
-//! The display on which a simulation opens its window: an existing one, or a virtual one (Xvfb) in its sandbox.
+//! The display on which a simulation opens its window: an existing one, or a virtual one (Xvfb) of its own.
 //!
-//! In a sandbox Xvfb has the simulation's limits and its view of the files, and ends with it. It listens only on a
-//! socket in the sandbox's own `/tmp`, so that its number is always the same.
+//! Xvfb is a child of the program that it is for, with its limits and its view of the files, and the kernel kills it as
+//! soon as that has ended. It chooses a free number by itself and prints it (`-displayfd`). In this mode it writes no lock
+//! file, and reuses the socket that a killed one has left.
 
 use std::ffi::OsString;
-use std::io;
-use std::os::unix::fs::PermissionsExt;
+use std::fs::{File, Permissions};
+use std::io::{self, Write};
+use std::os::unix::fs::{OpenOptionsExt, PermissionsExt};
 use std::path::{Path, PathBuf};
 
 use which::which;
@@ -13,10 +15,10 @@ use which::which;
 /// The display of a simulation.
 #[derive(Debug)]
 pub enum Display {
-    /// An existing display: the variables by which programs find it.
-    Outside(Vec<(OsString, OsString)>),
-    /// A virtual display, started in the sandbox before the program.
-    Inside {
+    /// An existing display, by its name.
+    Outside(String),
+    /// A virtual display, started before the program.
+    Virtual {
         /// The program of Xvfb.
         xvfb: PathBuf,
         /// The file that authorizes its users.
@@ -24,60 +26,72 @@ pub enum Display {
     },
 }
 
-/// The only screen of a virtual display: width, height and bits of a pixel, as `xvfb-run` has it.
-pub const SCREEN: &str = "1280x1024x24";
-/// The name of the display in a sandbox.
-const NAME: &str = ":99";
-/// Starts Xvfb, waits until it reports that it is ready, and then becomes the program that follows its own three
-/// arguments: the number, Xvfb and the authority file. Xvfb has a session of its own, so that the SIGTERM for the program
-/// does not reach it.
+/// Starts Xvfb, waits until it reports its number, and then becomes the program that follows its own three arguments: Xvfb,
+/// the authority file, and options. Xvfb has a session of its own, so that the SIGTERM for the program does not reach it. Its only
+/// screen has the width, height and bits of a pixel that `xvfb-run` has.
 const LAUNCHER: &str = r#"
-ready=/tmp/.xvfb; log=/tmp/.xvfb.log
-mkfifo "$ready" || exit
-(setsid "$2" "$1" -screen 0 "$0" -nolisten tcp -nolisten local -fp built-ins -auth "$3" -displayfd 3 3>"$ready" >"$log" 2>&1 &)
-if ! read -r number <"$ready"; then
-    echo "The virtual display (Xvfb) can't be started: $(tail -n 1 "$log")" >&2
+folder=$(mktemp -d) && mkfifo "$folder/ready" || exit
+setpriv --pdeathsig KILL setsid "$0" -screen 0 1280x1024x24 -nolisten tcp $2 -fp built-ins -auth "$1" -displayfd 3 \
+    3>"$folder/ready" >"$folder/log" 2>&1 &
+read -r number <"$folder/ready"
+why=$(tail -n 1 "$folder/log")
+rm -r "$folder"
+if [ -z "$number" ]; then
+    echo "The virtual display (Xvfb) can't be started: $why" >&2
     exit 1
 fi
-rm -f "$ready"
-shift 3
+export DISPLAY=":$number"
+shift 2
 exec "$@"
 "#;
+/// In an authority file: the entry counts for every host. `FamilyWild` of X11/Xauth.h.
+const EVERY_HOST: u16 = 0xffff;
+/// The only authorization method that all clients support.
+const COOKIE: &[u8] = b"MIT-MAGIC-COOKIE-1";
 
 impl Display {
-    /// A virtual display that is started in the sandbox.
+    /// A virtual display; its authority file is in the instance's folder.
     ///
     /// # Errors
-    /// When there is no Xvfb.
-    pub fn inside(authority: PathBuf) -> io::Result<Self> {
+    /// When there is no Xvfb, or the file can't be written.
+    pub fn new_virtual(instance: &Path) -> io::Result<Self> {
         let xvfb = which("Xvfb").map_err(io::Error::other)?.canonicalize()?;
-        Ok(Self::Inside { xvfb, authority })
+        let authority = instance.join("Xauthority");
+        let cookie: [u8; 16] = rand::random();
+        let mut entry = EVERY_HOST.to_be_bytes().to_vec();
+        // No address and no display number: the entry applies to all.
+        for field in [&[], &[], COOKIE, &cookie] {
+            entry.extend(u16::try_from(field.len()).unwrap_or_default().to_be_bytes());
+            entry.extend(field);
+        }
+        File::options().create(true).truncate(true).write(true).mode(0o600).open(&authority)?.write_all(&entry)?;
+        Ok(Self::Virtual { xvfb, authority })
     }
 
-    /// The variables by which programs find it.
-    pub fn variables(&self) -> Vec<(OsString, OsString)> {
+    /// The variable by which programs find it: a virtual one is named by its launcher.
+    pub fn variable(&self) -> (OsString, OsString) {
         match self {
-            Self::Outside(variables) => variables.clone(),
-            Self::Inside { authority, .. } => {
-                vec![("DISPLAY".into(), NAME.into()), ("XAUTHORITY".into(), authority.into())]
-            }
+            Self::Outside(name) => ("DISPLAY".into(), name.into()),
+            Self::Virtual { authority, .. } => ("XAUTHORITY".into(), authority.into()),
         }
     }
 
-    /// The command that precedes a program to start the display in its sandbox.
-    pub fn launcher(&self) -> Vec<OsString> {
-        let Self::Inside { xvfb, authority } = self else { return Vec::new() };
-        let words = ["/bin/sh", "-c", LAUNCHER, SCREEN, NAME].map(OsString::from);
-        words.into_iter().chain([xvfb.into(), authority.into()]).collect()
+    /// The command that precedes a program to start its virtual display. In a sandbox it has no abstract socket, and a
+    /// number that no display of the machine should have; beside others it finds a free number by its abstract socket.
+    pub fn launcher(&self, in_sandbox: bool) -> Vec<OsString> {
+        let Self::Virtual { xvfb, authority } = self else { return Vec::new() };
+        let words = ["/bin/sh", "-c", LAUNCHER].map(OsString::from);
+        let options = if in_sandbox { ":99 -nolisten local" } else { "" };
+        words.into_iter().chain([xvfb.into(), authority.into(), options.into()]).collect()
     }
 
     /// Makes the folder of its socket in the sandbox's `/tmp`, because Xvfb of an ordinary user does not.
     pub fn prepare(&self, tmp: &Path) -> io::Result<()> {
+        let folder = tmp.join(".X11-unix");
         if matches!(self, Self::Outside(_)) {
             return Ok(());
         }
-        let folder = tmp.join(".X11-unix");
         std::fs::create_dir_all(&folder)?;
-        std::fs::set_permissions(folder, std::fs::Permissions::from_mode(0o1777))
+        std::fs::set_permissions(folder, Permissions::from_mode(0o1777))
     }
 }

@@ -261,7 +261,7 @@ impl Launcher {
         let cgroup = self.cgroups.as_ref().and_then(Cgroups::make);
         let mut command = cgroup.as_ref().map(Cgroup::joining).unwrap_or_default();
         let mut environment = environment::allowed(&self.variables);
-        environment.extend(program.display.variables());
+        environment.push(program.display.variable());
         environment.extend(program.variables.iter().cloned());
         if let Method::Sandbox(sandbox) = &self.method {
             // Symlinks are not followed out of a sandbox.
@@ -274,7 +274,7 @@ impl Launcher {
             environment.extend(sandbox.environment());
         }
         command.extend(self.limited());
-        command.extend(program.display.launcher());
+        command.extend(program.display.launcher(self.level() == IsolationLevel::Sandbox));
         let spec = SpawnSpec {
             command: command.into_iter().chain(program.command).collect(),
             inherits: false,

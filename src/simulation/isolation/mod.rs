@@ -17,7 +17,7 @@ mod unenforced_limits;
 mod watcher;
 
 pub use cgroup::Cgroup;
-pub use display::{Display, SCREEN};
+pub use display::Display;
 pub use launcher::{IsolationLevel, Launcher, Network};
 pub use peak::Peak;
 pub use program::Program;

@@ -157,15 +157,13 @@ impl Sandbox {
 
     /// The socket of the display, and the file that authorizes its users; or the program of one that is started inside.
     fn display_files(&self, program: &Program<'_>) -> Vec<PathBuf> {
-        let variables = match program.display {
-            Display::Outside(variables) => variables,
-            Display::Inside { xvfb, authority } => return vec![xvfb.clone(), authority.clone()],
+        let name = match program.display {
+            Display::Outside(name) => name,
+            Display::Virtual { xvfb, authority } => return vec![xvfb.clone(), authority.clone()],
         };
-        let variable = |name: &str| variables.iter().find(|(one, _)| one == name).map(|(_, value)| value.clone());
-        let socket = variable("DISPLAY").and_then(|display| socket_of(&display.to_string_lossy()));
-        let authority = variable("XAUTHORITY").or_else(|| std::env::var_os("XAUTHORITY")).map(PathBuf::from);
+        let authority = std::env::var_os("XAUTHORITY").map(PathBuf::from);
         let usual = || self.homes.first().map(|home| home.join(".Xauthority"));
-        socket.into_iter().chain(authority.or_else(usual)).collect()
+        socket_of(name).into_iter().chain(authority.or_else(usual)).collect()
     }
 
     /// Variables that differ in a sandbox. Shared memory with the display is not available.
@@ -237,7 +235,7 @@ impl Sandbox {
             // One that was free a moment ago.
             port: TcpListener::bind((Ipv4Addr::LOCALHOST, 0))?.local_addr()?.port(),
             variables: &[],
-            display: &Display::Outside(Vec::new()),
+            display: &Display::Outside(String::new()),
             grace: TRIAL,
         })?;
         let check = if self.network.is_some() { CHECK } else { "true" };

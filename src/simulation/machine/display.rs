@@ -4,9 +4,7 @@ use std::sync::mpsc;
 use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
-use x11rb::connection::Connection;
 use x11rb::errors::ConnectError;
-use x11rb::protocol::xproto::ConnectionExt;
 use x11rb::reexports::x11rb_protocol::parse_display::parse_display;
 use x11rb::rust_connection::RustConnection;
 
@@ -84,56 +82,17 @@ pub fn of_environment() -> Option<String> {
 /// # Errors
 /// Why Webots can't open its window there, and what to do about it.
 pub fn check(display: &str) -> Result<(), DisplayError> {
-    connect(display).map(drop)
-}
-
-/// A connection to a display that is kept from one check to the next: a simulation that takes all others (an X server has
-/// 256) does not take this one.
-#[derive(Default)]
-pub struct KeptConnection(Option<RustConnection>);
-
-impl KeptConnection {
-    /// Asks the display on the connection, or connects if that is gone. Blocks for four seconds at most.
-    ///
-    /// # Errors
-    /// Why Webots can't open its window there, and what to do about it.
-    pub fn check(&mut self, display: &str) -> Result<(), DisplayError> {
-        if let Some(connection) = self.0.take() {
-            self.0 = within_time(move || answers(&connection).then_some(connection)).ok().flatten();
-        }
-        if self.0.is_none() {
-            self.0 = Some(connect(display)?);
-        }
-        Ok(())
-    }
-}
-
-/// Whether an X server answers. All clients get some events; they are thrown away.
-fn answers(connection: &RustConnection) -> bool {
-    let answers = connection.get_input_focus().is_ok_and(|focus| focus.reply().is_ok());
-    while let Ok(Some(_)) = connection.poll_for_event() {}
-    answers
-}
-
-fn connect(display: &str) -> Result<RustConnection, DisplayError> {
     DisplayName::try_from(display.to_owned())?;
-    let name = display.to_owned();
-    match within_time(move || RustConnection::connect(Some(&name))) {
-        Ok(Ok((connection, _))) => Ok(connection),
-        Ok(Err(error)) => Err(explain(display, error)),
-        Err(reason) => Err(DisplayError::Strange { display: display.to_owned(), reason }),
-    }
-}
-
-/// What this returns, if it does in time: a connection has no time limit of its own.
-///
-/// # Errors
-/// Why not, in words.
-fn within_time<T: Send + 'static>(ask: impl FnOnce() -> T + Send + 'static) -> Result<T, String> {
-    let (sender, answer) = mpsc::channel();
-    let thread = std::thread::Builder::new().name("display".to_owned());
-    thread.spawn(move || sender.send(ask())).map_err(|error| format!("no thread can be started to ask it: {error}"))?;
-    answer.recv_timeout(ANSWER).map_err(|_| format!("it is silent for {} s", ANSWER.as_secs()))
+    let strange = |reason| DisplayError::Strange { display: display.to_owned(), reason };
+    let (name, (sender, answer)) = (display.to_owned(), mpsc::channel());
+    // A connection has no time limit of its own.
+    let asking = move || sender.send(RustConnection::connect(Some(&name)).map(drop));
+    let thread = std::thread::Builder::new().name("display".to_owned()).spawn(asking);
+    thread.map_err(|error| strange(format!("no thread can be started to ask it: {error}")))?;
+    let answer = answer.recv_timeout(ANSWER);
+    answer
+        .map_err(|_| strange(format!("it is silent for {} s", ANSWER.as_secs())))?
+        .map_err(|error| explain(display, error))
 }
 
 fn explain(display: &str, error: ConnectError) -> DisplayError {

@@ -213,79 +213,69 @@ impl Actor for LoadMonitor {
 
     fn started(&mut self, ctx: &mut Self::Context) {
         match MachineSensor::open(&self.disk) {
-            Ok(mut sensor) => {
-                let host = sensor.host();
+            Ok(sensor) => {
+                let (host, actor) = (sensor.host(), ctx.address().recipient());
                 self.published.send_modify(|readings| Arc::make_mut(readings).host = host);
-                read_each_period(ctx.address().recipient(), move || MachineRead(sensor.read()));
+                on_a_thread("sensor", move || read_machine(&actor, sensor));
             }
             Err(error) => log::error!("the machine can't be read: {error}"),
         }
-        read_gpus(ctx.address().recipient());
-        ctx.run_interval(PERIOD, Self::sample);
+        let actor = ctx.address().recipient();
+        on_a_thread("gpus", move || read_gpus(&actor));
     }
 }
 
-/// Opens the driver and reads the GPUs, on a thread that the runtime does not wait for: both may hang. A driver that is
-/// missing, or has lost a GPU, is opened again after a while: it may have been loaded since then.
-fn read_gpus(actor: Recipient<GpusRead>) {
-    let reading = std::thread::Builder::new().name("gpus".to_owned()).spawn(move || {
-        let (mut most, mut told) = (1, false);
-        while actor.connected() {
-            match GpuSensor::open() {
-                Ok(sensor) => read_until_missing(&actor, &sensor, &mut most),
-                Err(error) => {
-                    if !std::mem::replace(&mut told, true) {
-                        log::info!("no NVIDIA GPU is read: {error}");
-                    }
-                    std::thread::sleep(OPEN_AGAIN);
+/// Runs this on a thread that the runtime does not wait for.
+fn on_a_thread(name: &str, run: impl FnOnce() + Send + 'static) {
+    if let Err(error) = std::thread::Builder::new().name(name.to_owned()).spawn(run) {
+        log::error!("no thread can be started to read the machine: {error}");
+    }
+}
+
+/// Reads the machine each second, until the actor has stopped.
+fn read_machine(actor: &Recipient<MachineRead>, mut sensor: MachineSensor) {
+    while actor.connected() {
+        // A full mailbox drops this reading.
+        actor.try_send(MachineRead(sensor.read())).ok();
+        std::thread::sleep(PERIOD);
+    }
+}
+
+/// Opens the driver and reads the GPUs, until the actor has stopped: both may hang. A driver that is missing, or has lost a
+/// GPU, is opened again after a while: it may have been loaded since then.
+fn read_gpus(actor: &Recipient<GpusRead>) {
+    let (mut most, mut told) = (1, false);
+    while actor.connected() {
+        match GpuSensor::open() {
+            Ok(sensor) => read_until_missing(actor, &sensor, &mut most),
+            Err(error) => {
+                if !std::mem::replace(&mut told, true) {
+                    log::info!("no NVIDIA GPU is read: {error}");
                 }
+                std::thread::sleep(OPEN_AGAIN);
             }
         }
-    });
-    if let Err(error) = reading {
-        log::error!("no thread can be started to read the GPUs: {error}");
     }
 }
 
 /// Reads the GPUs each second until some have been missing for a while, or the actor has stopped.
 fn read_until_missing(actor: &Recipient<GpusRead>, sensor: &GpuSensor, most: &mut usize) {
     let mut complete = Instant::now();
-    while complete.elapsed() < OPEN_AGAIN {
+    while actor.connected() && complete.elapsed() < OPEN_AGAIN {
         let reading = sensor.read();
         *most = reading.gpus.len().max(*most);
         complete = if reading.lost == 0 && reading.gpus.len() == *most { Instant::now() } else { complete };
-        // A full mailbox drops this reading.
-        if let Err(SendError::Closed(_)) = actor.try_send(GpusRead(reading)) {
-            return;
-        }
+        actor.try_send(GpusRead(reading)).ok();
         std::thread::sleep(PERIOD);
-    }
-}
-
-/// Reads a sensor on a thread of its own, until the actor has stopped.
-fn read_each_period<M>(actor: Recipient<M>, mut read: impl FnMut() -> M + Send + 'static)
-where
-    M: Message<Result = ()> + Send + 'static,
-{
-    let reading = std::thread::Builder::new().name("sensor".to_owned()).spawn(move || {
-        loop {
-            // A full mailbox drops this reading.
-            if let Err(SendError::Closed(_)) = actor.try_send(read()) {
-                return;
-            }
-            std::thread::sleep(PERIOD);
-        }
-    });
-    if let Err(error) = reading {
-        log::error!("no thread can be started to read the machine: {error}");
     }
 }
 
 impl Handler<MachineRead> for LoadMonitor {
     type Result = ();
 
-    fn handle(&mut self, MachineRead(machine): MachineRead, _: &mut Self::Context) {
+    fn handle(&mut self, MachineRead(machine): MachineRead, ctx: &mut Self::Context) {
         self.machine = machine;
+        self.sample(ctx);
     }
 }
 

@@ -9,4 +9,4 @@ mod usage;
 
 pub use load_monitor::{LoadMonitor, Readings, Sample};
 pub use spread::Spread;
-pub use usage::{Measured, Sum, Tree, Usage, UsageMonitor, Usages, cgroup_sum};
+pub use usage::{Tree, Usage, UsageMonitor, Usages};

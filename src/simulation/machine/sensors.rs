@@ -2,8 +2,7 @@
 
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
-use std::sync::mpsc;
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use nix::sys::statvfs::statvfs;
 use nvml_wrapper::Nvml;
@@ -13,9 +12,6 @@ use serde::Serialize;
 use sysinfo::{CpuRefreshKind, MemoryRefreshKind, RefreshKind, System};
 
 use crate::shared::domain::Load;
-
-/// How long NVIDIA's driver may take to answer a check.
-const ANSWER: Duration = Duration::from_secs(5);
 
 /// A reading of the machine.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
@@ -225,19 +221,6 @@ impl GpuSensor {
         // The driver installs the name with the version; only the development package installs the other one.
         let versioned = Nvml::builder().lib_path(std::ffi::OsStr::new("libnvidia-ml.so.1")).init();
         Ok(Self { nvml: versioned.or_else(|_| Nvml::init())? })
-    }
-
-    /// Opens the library and reads all GPUs once.
-    ///
-    /// # Errors
-    /// Why there are none to read, in words. A driver that hangs is given up after some seconds.
-    pub fn read_once() -> Result<GpuReading, String> {
-        let (sender, answer) = mpsc::channel();
-        std::thread::spawn(move || sender.send(Self::open().map(|sensor| sensor.read())));
-        match answer.recv_timeout(ANSWER) {
-            Ok(read) => read.map_err(|error| error.to_string()),
-            Err(_) => Err(format!("NVIDIA's driver is silent for {} s", ANSWER.as_secs())),
-        }
     }
 
     /// Reads all GPUs.

@@ -23,7 +23,7 @@ pub struct Tree {
 /// The resource usage of a simulation's processes.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Usage {
-    /// Percent of one core, as a mean since the last reading; `None` at the first.
+    /// Percent of one core: what Docker reports, or a mean since the last reading, `None` at the first.
     pub cpu: Option<f64>,
     /// Memory in bytes: what their control group is charged for, or the resident memory, in which memory that processes
     /// share counts for each.
@@ -46,29 +46,7 @@ struct Readings {
     read: Option<Instant>,
     /// The trees of that reading. Some may have no usage.
     roots: BTreeSet<i32>,
-    /// The CPU time of each tree.
-    times: HashMap<i32, Duration>,
     usages: Usages,
-}
-
-/// The total usage of processes so far.
-#[derive(Debug, Default, Clone, Copy, PartialEq, Eq)]
-pub struct Sum {
-    /// CPU time.
-    pub time: Duration,
-    /// Memory in bytes.
-    pub memory: u64,
-    /// Processes and threads.
-    pub threads: u64,
-}
-
-/// A reading of a simulation.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Measured {
-    /// Its total usage so far.
-    Sum(Sum),
-    /// Its current usage, as another program has computed it.
-    Usage(Usage),
 }
 
 /// Time for which a reading is cached.
@@ -89,9 +67,10 @@ impl UsageMonitor {
         self.read_by(&trees.iter().map(|tree| tree.root).collect::<Vec<_>>(), || sums_of(trees))
     }
 
-    /// The same for simulations whose processes only `measure` finds. It is called if the last reading is too old.
+    /// The same for simulations whose processes only `measure` finds. It is called if the last reading is too old, and
+    /// leaves out the use of the CPU unless it knows it.
     #[must_use]
-    pub fn read_by(&self, roots: &[i32], measure: impl FnOnce() -> Vec<(i32, Measured)>) -> Usages {
+    pub fn read_by(&self, roots: &[i32], measure: impl FnOnce() -> Usages) -> Usages {
         if roots.is_empty() {
             return Usages::new();
         }
@@ -102,52 +81,41 @@ impl UsageMonitor {
 }
 
 impl Readings {
-    fn renew(&mut self, roots: &[i32], measure: impl FnOnce() -> Vec<(i32, Measured)>) {
+    fn renew(&mut self, roots: &[i32], measure: impl FnOnce() -> Usages) {
         let known = roots.iter().all(|root| self.roots.contains(root));
         if known && self.read.is_some_and(|read| read.elapsed() < AGE) {
             return;
         }
         self.roots = roots.iter().copied().collect();
-        let before = std::mem::take(&mut self.times);
-        self.usages.clear();
-        let all = measure();
+        let mut usages = measure();
         // If Docker hangs, this may have taken longer than a reading is cached.
-        let passed = self.read.map(|read| read.elapsed());
+        let passed = self.read.map(|read| read.elapsed().as_secs_f64()).filter(|passed| *passed > 0.0);
         self.read = Some(Instant::now());
-        for (root, measured) in all {
-            let usage = match measured {
-                Measured::Usage(usage) => usage,
-                Measured::Sum(Sum { time, memory, threads }) => {
-                    let known = before.get(&root).zip(passed).filter(|(_, passed)| !passed.is_zero());
-                    let cpu = known.map(|(before, passed)| {
-                        100.0 * time.saturating_sub(*before).as_secs_f64() / passed.as_secs_f64()
-                    });
-                    self.times.insert(root, time);
-                    Usage { cpu, memory, threads, time }
-                }
-            };
-            self.usages.insert(root, usage);
+        for (root, usage) in &mut usages {
+            let before = self.usages.get(root).zip(passed);
+            let mean =
+                before.map(|(before, passed)| 100.0 * usage.time.saturating_sub(before.time).as_secs_f64() / passed);
+            usage.cpu = usage.cpu.or(mean);
         }
+        self.usages = usages;
     }
 }
 
-fn sums_of(trees: &[Tree]) -> Vec<(i32, Measured)> {
+fn sums_of(trees: &[Tree]) -> Usages {
     let mut processes = None;
     let sums = trees.iter().map(|Tree { root, cgroup }| {
         let sum = cgroup.as_deref().and_then(cgroup_sum);
-        let sum = sum.unwrap_or_else(|| tree_sum(*root, processes.get_or_insert_with(all_by_parent)));
-        (*root, Measured::Sum(sum))
+        (*root, sum.unwrap_or_else(|| tree_sum(*root, processes.get_or_insert_with(all_by_parent))))
     });
     sums.collect()
 }
 
-/// The usage of a cgroup v2; `None` if the kernel does not count all of it there.
-#[must_use]
-pub fn cgroup_sum(folder: &Path) -> Option<Sum> {
+/// The usage of a cgroup v2 so far; `None` if the kernel does not count all of it there.
+fn cgroup_sum(folder: &Path) -> Option<Usage> {
     let number = |file: &str| std::fs::read_to_string(folder.join(file)).ok()?.trim().parse().ok();
     let times = std::fs::read_to_string(folder.join("cpu.stat")).ok()?;
-    let time = times.lines().find_map(|line| line.strip_prefix("usage_usec "))?.parse().ok()?;
-    Some(Sum { time: Duration::from_micros(time), memory: number("memory.current")?, threads: number("pids.current")? })
+    let time = Duration::from_micros(times.lines().find_map(|line| line.strip_prefix("usage_usec "))?.parse().ok()?);
+    Some(Usage { cpu: None, memory: number("memory.current")?, threads: number("pids.current")?, time })
 }
 
 /// All processes, each below its parent and below the leader of its group.
@@ -164,8 +132,8 @@ fn all_by_parent() -> HashMap<i32, Vec<Stat>> {
 }
 
 /// The usage of a process, its group and all its descendants.
-fn tree_sum(root: i32, below: &HashMap<i32, Vec<Stat>>) -> Sum {
-    let (mut seen, mut open, mut sum) = (HashSet::new(), vec![root], Sum::default());
+fn tree_sum(root: i32, below: &HashMap<i32, Vec<Stat>>) -> Usage {
+    let (mut seen, mut open, mut sum) = (HashSet::new(), vec![root], Usage::default());
     while let Some(pid) = open.pop() {
         for stat in below.get(&pid).into_iter().flatten().filter(|stat| seen.insert(stat.pid)) {
             // Children that have exited count for their parent: a program that starts others one by one is busy, too.
@@ -193,7 +161,7 @@ mod tests {
         let mut read = |roots: &[i32]| {
             let usages = monitor.read_by(roots, || {
                 asked += 1;
-                vec![(1, Measured::Usage(Usage::default()))]
+                Usages::from([(1, Usage::default())])
             });
             (usages.into_keys().collect::<Vec<_>>(), asked)
         };

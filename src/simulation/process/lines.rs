@@ -39,7 +39,26 @@ impl Lines {
 
 #[cfg(test)]
 mod tests {
+    use proptest::prelude::*;
+
     use super::*;
+
+    proptest! {
+        #[test]
+        fn every_line_is_short_and_printable_whatever_is_printed(
+            bytes in prop::collection::vec(prop_oneof![3 => any::<u8>(), 1 => Just(b'\n'), 1 => Just(0x1b)], 0..4000),
+            size in 1_usize..64,
+        ) {
+            let (mut lines, mut told) = (Lines::new(50), Vec::new());
+            bytes.chunks(size).for_each(|chunk| lines.feed(chunk, |line| told.push(line)));
+            lines.end(|line| told.push(line));
+            for line in &told {
+                prop_assert!(!line.chars().any(char::is_control) && line.chars().count() <= 50, "{line:?}");
+            }
+            let breaks = bytes.split(|byte| b"\r\n".contains(byte)).count();
+            prop_assert!(told.len() <= breaks, "{} lines of {breaks}", told.len());
+        }
+    }
 
     #[test]
     fn lines_come_whole_whatever_the_parts_they_are_read_in() {

@@ -9,17 +9,14 @@ use tokio::sync::Notify;
 
 use super::event::WebotsEvent;
 use super::launch_spec::LaunchSpec;
-use super::virtual_display::{VirtualDisplay, write_authority};
 use crate::simulation::container::{Cause, SimulationContainers, StartError};
-use crate::simulation::isolation::{Display, IsolationLevel};
+use crate::simulation::isolation::Display;
 
 /// The target on which a Webots runs.
 #[derive(Debug)]
 pub enum LaunchTarget {
-    /// The machine, with a display of Webots' own in its sandbox or the configured one.
+    /// The machine, with this display.
     Machine(Display),
-    /// The machine, with a display of Webots' own beside it.
-    BesideDisplay(VirtualDisplay),
     /// Containers.
     Containers(Box<SimulationContainers>),
 }
@@ -41,26 +38,19 @@ impl LaunchTarget {
             };
             return prepare.boxed_local();
         }
-        if !spec.config.xvfb {
-            let name = spec.display();
-            return ready(Ok(Self::Machine(Display::Outside(vec![("DISPLAY".into(), name.into())])))).boxed_local();
-        }
-        let (instance, level) = (spec.project.instance.path().to_owned(), spec.launcher.level());
-        let start = async move {
-            let started = if level == IsolationLevel::Sandbox {
-                write_authority(&instance).and_then(Display::inside).map(Self::Machine)
-            } else {
-                VirtualDisplay::start(&instance).await.map(Self::BesideDisplay)
-            };
-            started.map_err(|error| StartError::Server(format!("The virtual display (Xvfb) can't be started: {error}")))
+        let display = if spec.config.xvfb {
+            Display::new_virtual(spec.project.instance.path())
+        } else {
+            Ok(Display::Outside(spec.display()))
         };
-        start.boxed_local()
+        let failed = |error| StartError::Server(format!("The virtual display (Xvfb) can't be started: {error}"));
+        ready(display.map(Self::Machine).map_err(failed)).boxed_local()
     }
 
     /// Restarts the controller of a competition's participant; `None` if there is none.
     pub fn restart(&self) -> Option<Arc<Notify>> {
         match self {
-            Self::Machine(_) | Self::BesideDisplay(_) => None,
+            Self::Machine(_) => None,
             Self::Containers(containers) => containers.restart(),
         }
     }
@@ -77,10 +67,6 @@ impl LaunchTarget {
     pub async fn end(self, code: Option<i32>) -> Option<Cause> {
         match self {
             Self::Machine(_) => None,
-            Self::BesideDisplay(display) => {
-                display.stop().await;
-                None
-            }
             Self::Containers(containers) => {
                 let cause = containers.cause(code).await;
                 containers.remove().await;

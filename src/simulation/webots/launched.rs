@@ -10,11 +10,10 @@ use actix::prelude::*;
 use super::launch_spec::LaunchSpec;
 use super::launch_target::LaunchTarget;
 use super::output::{self, OutputEvent, Tail};
-use super::paced_reader::PacedReader;
 use crate::shared::run::RotatedFile;
 use crate::simulation::container::Cause;
 use crate::simulation::ends::Taken;
-use crate::simulation::isolation::{Cgroup, Display, Peak};
+use crate::simulation::isolation::{Cgroup, Peak};
 use crate::simulation::process::{ExitReason, ProcessGroup};
 
 /// A Webots that was started.
@@ -63,13 +62,11 @@ pub fn launch(
     });
     let log = file.is_ok().then_some(log);
     let (reader, output) = std::io::pipe()?;
-    let reader = PacedReader::new(reader, spec.config.limits.output << 10);
-    let (tail, all_read) = output::follow(reader, file.ok(), events)?;
+    let (tail, all_read) = output::follow(reader, spec.config.limits.output << 10, file.ok(), events)?;
     let errors = output.try_clone()?;
     let (process, cgroup) = match &target {
         LaunchTarget::Containers(containers) => (containers.spawn_spec(spec.config.timing.grace), None),
         LaunchTarget::Machine(display) => spec.spawn_spec(display)?,
-        LaunchTarget::BesideDisplay(display) => spec.spawn_spec(&Display::Outside(display.environment()))?,
     };
     let (group, ended) = ProcessGroup::start(&process, output.into(), errors.into())?;
     let folder = cgroup.as_ref().map(|cgroup| cgroup.path().to_owned());

@@ -7,9 +7,7 @@ mod launch_spec;
 mod launch_target;
 mod launched;
 mod output;
-mod paced_reader;
 mod verdict;
-mod virtual_display;
 mod webots;
 
 pub use event::{WebotsEvent, WebotsExit};

@@ -1,10 +1,10 @@
 //! The output of a simulator: some lines show its state, all others are written to a log.
 //!
-//! A thread per simulator reads its output, so that neither a flood of it nor a slow disk delays others: a simulator
-//! that prints faster than this thread reads blocks in its own write.
+//! A thread per simulator reads its output, no faster than its limit, so that neither a flood of it nor a slow disk delays
+//! others: a simulator that prints faster than this thread reads blocks in its own write.
 
 use std::collections::VecDeque;
-use std::io::{BufRead, BufReader, Write};
+use std::io::{PipeReader, Read, Write};
 use std::path::Path;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -13,10 +13,9 @@ use actix::prelude::*;
 use parking_lot::Mutex;
 use tokio::sync::oneshot;
 
-use super::paced_reader::PacedReader;
 use crate::shared::run::RotatedFile;
-use crate::shared::text::one_line;
 use crate::simulation::container::RUNS;
+use crate::simulation::process::Lines;
 
 /// The state that a line of Webots' output shows.
 #[derive(Message, Debug, Clone, Copy, PartialEq, Eq)]
@@ -40,10 +39,16 @@ pub struct Tail(Arc<Mutex<VecDeque<String>>>);
 
 /// Number of lines that are kept.
 const LINES: usize = 20;
-/// Bytes that are kept of a line; the rest, up to the next line break, is dropped.
+/// Bytes that are kept of a line.
 const LINE_SIZE: usize = 1000;
-/// Size of a read, in bytes. The next read waits for its pace.
+/// Size of a read, in bytes.
 const CHUNK: usize = 8 * 1024;
+/// Cost of a line besides its length, in bytes: each line is parsed, kept and written separately.
+const LINE: u64 = 200;
+/// Cost of a read besides its length, in bytes: a program that writes byte by byte causes a read for each.
+const READ: u64 = 200;
+/// Bytes without a pause: ordinary output is read at once.
+const FREE: u64 = 1024;
 /// Shortest time between two events. Webots prints its state every few seconds; a program that floods it is blocked.
 const BETWEEN_EVENTS: Duration = Duration::from_millis(20);
 
@@ -82,13 +87,14 @@ impl Tail {
     }
 }
 
-/// Reads an output until its end: events are sent to `events`, other lines are written to the file and to the tail.
-/// Returns the tail, and a receiver that is notified at the end.
+/// Reads an output until its end, at this many bytes per second at most: events are sent to `events`, other lines are
+/// written to the file and to the tail. Returns the tail, and a receiver that is notified at the end.
 ///
 /// # Errors
 /// When the thread can't be created.
 pub fn follow(
-    output: PacedReader,
+    mut output: PipeReader,
+    limit: u64,
     mut file: Option<RotatedFile>,
     events: Recipient<OutputEvent>,
 ) -> std::io::Result<(Tail, oneshot::Receiver<()>)> {
@@ -96,14 +102,13 @@ pub fn follow(
     let kept = tail.clone();
     let (end, ended) = oneshot::channel();
     std::thread::Builder::new().name("output".to_owned()).spawn(move || {
-        let mut reader = BufReader::with_capacity(CHUNK, output);
-        let mut told = None;
-        while let Some(line) = next_line(&mut reader) {
+        let mut told: Option<Instant> = None;
+        let mut take = |line: String| {
             if let Some(event) = OutputEvent::parse(&line) {
                 if let Some(told) = told {
-                    std::thread::sleep(BETWEEN_EVENTS.saturating_sub(Instant::elapsed(&told)));
+                    std::thread::sleep(BETWEEN_EVENTS.saturating_sub(told.elapsed()));
                 }
-                deliver(&events, event);
+                events.do_send(event);
                 told = Some(Instant::now());
             } else {
                 if let Some(file) = &mut file {
@@ -112,63 +117,29 @@ pub fn follow(
                 }
                 kept.push(line);
             }
+        };
+        let (mut lines, mut chunk, mut debt) = (Lines::new(LINE_SIZE), vec![0; CHUNK], 0);
+        while let Ok(length @ 1..) = output.read(&mut chunk) {
+            debt += READ + u64::try_from(length).unwrap_or_default();
+            lines.feed(chunk.get(..length).unwrap_or_default(), |line| {
+                debt += LINE;
+                take(line);
+            });
+            if debt > FREE {
+                std::thread::sleep(Duration::from_millis(1000 * debt / limit.max(1)));
+                debt = 0;
+            }
         }
+        lines.end(take);
         // The receiver may have been dropped.
         end.send(()).ok();
     })?;
     Ok((tail, ended))
 }
 
-/// Sends an event. If the actor can't keep up, the simulator blocks, and the mailbox does not grow.
-fn deliver(events: &Recipient<OutputEvent>, event: OutputEvent) {
-    while let Err(SendError::Full(_)) = events.try_send(event) {
-        std::thread::sleep(Duration::from_millis(5));
-    }
-}
-
-/// The next line, cut to [`LINE_SIZE`] and made printable; `None` at the end of the output.
-fn next_line(reader: &mut impl BufRead) -> Option<String> {
-    let mut line = Vec::new();
-    loop {
-        let chunk = match reader.fill_buf() {
-            Ok([]) => return (!line.is_empty()).then(|| printable(&line)),
-            Ok(chunk) => chunk,
-            Err(error) if error.kind() == std::io::ErrorKind::Interrupted => continue,
-            Err(_) => return None,
-        };
-        let end = chunk.iter().position(|byte| *byte == b'\n');
-        let text = chunk.get(..end.unwrap_or(chunk.len())).unwrap_or_default();
-        let room = LINE_SIZE.saturating_sub(line.len()).min(text.len());
-        line.extend_from_slice(text.get(..room).unwrap_or_default());
-        let used = end.map_or(chunk.len(), |end| end + 1);
-        reader.consume(used);
-        if end.is_some() {
-            return Some(printable(&line));
-        }
-    }
-}
-
-fn printable(line: &[u8]) -> String {
-    one_line(String::from_utf8_lossy(line).trim_end())
-}
-
 #[cfg(test)]
 mod tests {
-    use proptest::prelude::*;
-
     use super::*;
-
-    #[test]
-    fn lines_are_cut_and_made_printable() {
-        let flood = "x".repeat(1_000_000);
-        let text = format!(".\n{flood}\npause\r\n\u{1b}[31mred\n");
-        let mut bytes = text.into_bytes();
-        bytes.extend_from_slice(b"\xff\xfe no text\nlast");
-        let mut reader = BufReader::with_capacity(16, bytes.as_slice());
-        let lines: Vec<String> = std::iter::from_fn(|| next_line(&mut reader)).collect();
-        let kept = "x".repeat(LINE_SIZE);
-        assert_eq!(lines, [".", &kept, "pause", " [31mred", "\u{fffd}\u{fffd} no text", "last"]);
-    }
 
     #[test]
     fn only_whole_lines_are_events() {
@@ -182,22 +153,6 @@ mod tests {
         }
         for line in ["..", "", "paused", "real-time:", "open", "INFO: pause"] {
             assert_eq!(OutputEvent::parse(line), None, "{line:?}");
-        }
-    }
-
-    proptest! {
-        #[test]
-        fn every_line_is_short_and_printable_whatever_is_printed(
-            bytes in prop::collection::vec(prop_oneof![3 => any::<u8>(), 1 => Just(b'\n'), 1 => Just(0x1b)], 0..4000),
-            buffer in 1_usize..64,
-        ) {
-            let mut reader = BufReader::with_capacity(buffer, bytes.as_slice());
-            let lines: Vec<String> = std::iter::from_fn(|| next_line(&mut reader)).collect();
-            for line in &lines {
-                prop_assert!(!line.chars().any(char::is_control) && line.chars().count() <= LINE_SIZE, "{line:?}");
-            }
-            let breaks = bytes.split(|byte| *byte == b'\n').count();
-            prop_assert!(lines.len() <= breaks, "{} lines of {breaks}", lines.len());
         }
     }
 }
