@@ -27,7 +27,7 @@ use crate::simulation::container::ContainerService;
 use crate::simulation::isolation::{Launcher, Watcher};
 use crate::simulation::machine::{LoadMonitor, Spread, UsageMonitor};
 use crate::simulation::process::{Guardian, Leftovers, RunDir};
-use crate::simulation::relay::Upstream;
+use crate::simulation::relay::{StreamThread, Upstream};
 use crate::simulation::web::configure;
 
 /// Interval between two checks whether all simulations have ended.
@@ -109,7 +109,10 @@ pub async fn serve(assembly: Application) -> Result<(), AppError> {
         trusted_proxies: server.config.trusted_proxies.clone(),
     };
     let simulations = server.launcher.reached().unwrap_or_else(|| server.config.address_of_simulations().into());
-    let (stream_thread, silence) = (Arbiter::new().handle(), options.silence);
+    let stream_thread = StreamThread::start();
+    let stream_thread =
+        stream_thread.map_err(|why| AppError::Unavailable(format!("streams can't be relayed: {why}")))?;
+    let silence = options.silence;
     let app = move || {
         let upstream = Upstream::new(simulations, stream_thread.clone(), silence);
         App::new().app_data(shared.clone()).app_data(upstream).configure(configure)

@@ -100,8 +100,8 @@ class OneDoor(Fleet):
             # What the file's head says of streams that are relayed: the location of Webots' own ports goes.
             streams=(r'  # Only for simulation servers with "streaming": "direct".*?\n  }\n', ""),
             servers=(r"\(\?<fleet_port>2000\)", f"(?<fleet_port>{servers})"),
-            users=(r"  proxy_set_header Cookie[^\n]*\n",
-                   f"  proxy_set_header Cookie $fleet_cookie;\n  include {folder}/users.conf;\n"),
+            users=("  proxy_set_header X-Forwarded-User \"\";\n",
+                   f"  proxy_set_header X-Forwarded-User \"\";\n  include {folder}/users.conf;\n"),
             log=("/var/log/nginx/access.log", f"{folder}/access.log"), errors=("/var/log/nginx/error.log", f"{folder}/error.log"))
         (folder / "site.conf").write_text(site)
         temporary = "".join(f"{name}_temp_path {folder}/{name};\n" for name in ("client_body", "proxy", "fastcgi", "uwsgi", "scgi"))

@@ -3,11 +3,14 @@
 
 mod file;
 mod path;
+mod stream;
+mod stream_thread;
 mod upstream;
 mod view_requests;
 mod websocket;
 
 pub use file::fetch;
 pub use path::parse_path;
+pub use stream_thread::StreamThread;
 pub use upstream::Upstream;
 pub use websocket::connect;

@@ -8,7 +8,6 @@ use actix_http::body::BodySize;
 use actix_http::h1::ClientCodec;
 use actix_http::ws::hash_key;
 use actix_http::{ConnectionType, RequestHead, RequestHeadType};
-use actix_rt::ArbiterHandle;
 use actix_rt::net::TcpStream;
 use actix_web::http::header::{self, HeaderValue};
 use actix_web::http::{StatusCode, Uri};
@@ -19,6 +18,8 @@ use futures_util::{SinkExt, StreamExt};
 use nix::sys::socket::{setsockopt, sockopt};
 use tokio_util::codec::Framed;
 
+use super::stream_thread::StreamThread;
+
 /// Timeout of a simulation's answer.
 pub const ANSWER_TIMEOUT: Duration = Duration::from_secs(10);
 
@@ -27,7 +28,7 @@ pub const ANSWER_TIMEOUT: Duration = Duration::from_secs(10);
 pub struct Upstream {
     client: awc::Client,
     address: IpAddr,
-    stream_thread: ArbiterHandle,
+    stream_thread: StreamThread,
     silence: Duration,
 }
 
@@ -35,7 +36,7 @@ impl Upstream {
     /// Reaches them at this address. Streams are copied on this thread. A simulation has `silence` to read what was sent to
     /// it: until then nobody notices that its client has left.
     #[must_use]
-    pub fn new(address: IpAddr, stream_thread: ArbiterHandle, silence: Duration) -> Self {
+    pub fn new(address: IpAddr, stream_thread: StreamThread, silence: Duration) -> Self {
         let connector = awc::Connector::new().limit(0);
         // Redirects are not followed, and an answer may take as long as the simulation.
         let client = awc::Client::builder().connector(connector).disable_timeout().disable_redirects();
@@ -48,9 +49,9 @@ impl Upstream {
         &self.client
     }
 
-    /// The thread of all streams: one epoll instance serves them with fewer wakeups than several.
+    /// The thread of all streams.
     #[must_use]
-    pub fn stream_thread(&self) -> &ArbiterHandle {
+    pub fn stream_thread(&self) -> &StreamThread {
         &self.stream_thread
     }
 

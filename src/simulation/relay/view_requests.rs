@@ -1,35 +1,50 @@
 //! The messages of a read-only client that reach Webots: requests for a kind of stream, until Webots has answered.
 
-use std::cell::Cell;
+use std::io;
 
 use actix_http::ws::{Codec, Frame, Message};
-use actix_web::web::BytesMut;
-use futures_util::StreamExt;
-use tokio::io::{AsyncRead, AsyncWrite, AsyncWriteExt};
-use tokio_util::codec::{Encoder, FramedRead};
+use actix_web::web::{Bytes, BytesMut};
+use tokio_util::codec::{Decoder, Encoder};
 
 /// Size limit of a message, in bytes.
 const MAX_MESSAGE: usize = 8 * 1024;
 
-/// Forwards requests for a kind of stream, and drops all else. Returns when the client closes or violates the protocol.
-pub async fn forward(
-    from_client: impl AsyncRead + Unpin,
-    to_webots: &mut (impl AsyncWrite + Unpin),
-    has_answered: &Cell<bool>,
-) {
-    let mut frames = FramedRead::new(from_client, Codec::new().max_size(MAX_MESSAGE));
-    let mut codec = Codec::new().client_mode();
-    while let Some(Ok(frame)) = frames.next().await {
-        let text = match frame {
-            Frame::Text(text) if !has_answered.get() => String::from_utf8_lossy(&text).into_owned(),
-            Frame::Close(_) => return,
-            _ => continue,
-        };
-        let mut bytes = BytesMut::new();
-        let is_encoded = is_view_request(&text) && codec.encode(Message::Text(text.into()), &mut bytes).is_ok();
-        if is_encoded && to_webots.write_all(&bytes).await.is_err() {
-            return;
+/// Reads what a read-only client sends.
+pub struct ViewRequests {
+    from_client: Codec,
+    to_webots: Codec,
+    /// What is no whole frame yet.
+    unread: BytesMut,
+}
+
+impl Default for ViewRequests {
+    fn default() -> Self {
+        let from_client = Codec::new().max_size(MAX_MESSAGE);
+        Self { from_client, to_webots: Codec::new().client_mode(), unread: BytesMut::new() }
+    }
+}
+
+impl ViewRequests {
+    /// Keeps requests for a kind of stream of what the client has sent, unless Webots has answered, and drops all else.
+    ///
+    /// # Errors
+    /// When the client closes or violates the protocol.
+    pub fn filter(&mut self, sent: &[u8], has_answered: bool) -> io::Result<Bytes> {
+        self.unread.extend_from_slice(sent);
+        let mut kept = BytesMut::new();
+        while let Some(frame) = self.from_client.decode(&mut self.unread).map_err(io::Error::other)? {
+            match frame {
+                Frame::Text(text) if !has_answered => {
+                    let text = String::from_utf8_lossy(&text).into_owned();
+                    if is_view_request(&text) {
+                        self.to_webots.encode(Message::Text(text.into()), &mut kept).map_err(io::Error::other)?;
+                    }
+                }
+                Frame::Close(_) => return Err(io::ErrorKind::UnexpectedEof.into()),
+                _ => {}
+            }
         }
+        Ok(kept.freeze())
     }
 }
 
