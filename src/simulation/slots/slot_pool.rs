@@ -101,14 +101,10 @@ impl SlotPool {
         Share { slots: lent.len(), waiting: waiting.len() }
     }
 
-    /// Why another client of these parties gets no slot and may not wait, if so.
+    /// Why another client of these parties may not wait, if so.
     fn refusal(&self, parties: &[Party]) -> Option<SlotError> {
-        let shares: Vec<_> = parties.iter().map(|party| (party, self.shares.of(party), self.share_of(party))).collect();
-        let may_have_one = shares.iter().all(|(_, may, has)| has.slots < may.slots);
-        if may_have_one && self.next_in_queue().is_none() && self.free_port().is_some() {
-            return None;
-        }
-        if let Some((party, _, has)) = shares.into_iter().find(|(_, may, has)| may.is_used_up(*has)) {
+        let mut shares = parties.iter().map(|party| (party, self.shares.of(party), self.share_of(party)));
+        if let Some((party, _, has)) = shares.find(|(_, may, has)| may.is_used_up(*has)) {
             return Some(party.refusal(has));
         }
         let (places, waiting) = (self.ports.len(), self.queue.len());
@@ -117,6 +113,15 @@ impl SlotPool {
 
     /// Grants free slots to the clients in the queue, and sends the others their position.
     fn serve(&mut self) {
+        self.grant();
+        for (ahead, waiting) in self.queue.iter_mut().enumerate() {
+            if waiting.sent_position != Some(ahead) && waiting.client.try_send(SlotEvent::Queued(ahead)).is_ok() {
+                waiting.sent_position = Some(ahead);
+            }
+        }
+    }
+
+    fn grant(&mut self) {
         while let Some(next) = self.next_in_queue()
             && let Some(port) = self.free_port()
             && let Some(first) = self.queue.remove(next)
@@ -134,11 +139,6 @@ impl SlotPool {
                 }
                 // Its actor has stopped, which drops its lease too.
                 Err(SendError::Closed(_)) => {}
-            }
-        }
-        for (ahead, waiting) in self.queue.iter_mut().enumerate() {
-            if waiting.sent_position != Some(ahead) && waiting.client.try_send(SlotEvent::Queued(ahead)).is_ok() {
-                waiting.sent_position = Some(ahead);
             }
         }
     }
@@ -196,11 +196,16 @@ impl Handler<Acquire> for SlotPool {
     fn handle(&mut self, Acquire(present): Acquire, _: &mut Self::Context) {
         self.arrivals += 1;
         let (id, parties, client) = (present.shown.id, present.parties(), present.listener.clone());
-        if let Some(refusal) = self.refusal(&parties) {
-            return client.do_send(SlotEvent::Rejected(refusal));
-        }
+        let refusal = self.refusal(&parties);
         self.present.insert(id, *present);
         self.queue.push_back(Waiting { id, parties, client, sent_position: None });
+        self.grant();
+        if let Some(refusal) = refusal
+            && let Some(refused) = self.queue.pop_back_if(|last| last.id == id)
+        {
+            self.present.remove(&id);
+            refused.client.do_send(SlotEvent::Rejected(refusal));
+        }
         self.serve();
     }
 }
