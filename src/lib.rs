@@ -61,7 +61,7 @@
 //!     | one per simulation  |  |
 //!   Session --- SlotLease -----'  |
 //!     ^  ^------- SlotEvent --'
-//!     |  |--- checkout (a task on the main thread, shared by all clients of the same world) --> git
+//!     |  |--- checkout (its search is shared by all clients of a world, each copy has a thread) --> git
 //!     |  '--- starts ---> Webots (one per simulation) --> Webots' process group, in a sandbox
 //!     '------ WebotsEvent ---'
 //! ```

@@ -1,7 +1,7 @@
 //! Checks worlds out with git for clients: cached, joined, cancellable, with progress.
 //!
 //! First the commit is fetched into the cache (see [`super::commit_resolver`]); then each client gets its own copy of
-//! the project's directory. Both run as tasks on the server's main thread; dropping the handle cancels them.
+//! the project's directory, written on a thread of its own. Dropping the handle cancels both.
 
 use std::io;
 use std::path::Path;
@@ -24,11 +24,11 @@ use super::project::Project;
 use super::redirect;
 use super::repository_cache::RepositoryCache;
 use super::revision::Revision;
-use super::single_flight::OnProgress;
+use super::single_flight::SharedProgress;
 use super::steps;
 use super::work_tree::{self, WorkTree, checkout_command};
 use crate::shared::domain::{AdmissionRules, ProjectUrl};
-use crate::simulation::process::InstanceDir;
+use crate::simulation::process::{InstanceDir, on_own_thread};
 
 /// Checks worlds out; one for the whole server.
 pub struct CheckoutService {
@@ -51,7 +51,7 @@ const COPIES: usize = 16;
 pub struct Progress(pub String);
 
 impl CheckoutService {
-    /// Prepares checkouts on the thread of this runtime. `run` is the directory of this run of the server; the cached
+    /// Prepares checkouts, which are led on the thread of this runtime. `run` is the directory of this run of the server; the cached
     /// repositories may use `budget` bytes; `config` is a file of settings for git; `rules` limit redirects of Git
     /// hosts.
     ///
@@ -82,6 +82,7 @@ impl CheckoutService {
         progress: impl Fn(String) + Send + Sync + 'static,
     ) -> AbortOnDropHandle<Result<Project, CheckoutError>> {
         let this = Arc::clone(self);
+        let progress: SharedProgress = Arc::new(progress);
         let job = async move {
             let limit = this.limits.time;
             let done = actix_rt::time::timeout(limit, this.check_out(&world, instance, &progress)).await;
@@ -94,8 +95,9 @@ impl CheckoutService {
         &self,
         world: &ProjectUrl,
         instance: InstanceDir,
-        progress: OnProgress<'_>,
+        progress: &SharedProgress,
     ) -> Result<Project, CheckoutError> {
+        let instance = Arc::new(instance);
         let (mut world, mut redirects) = (world.clone(), 0);
         let checked_out = loop {
             match self.attempt(&world, &instance, progress).await {
@@ -133,30 +135,35 @@ impl CheckoutService {
     async fn attempt(
         &self,
         world: &ProjectUrl,
-        instance: &InstanceDir,
-        progress: OnProgress<'_>,
+        instance: &Arc<InstanceDir>,
+        progress: &SharedProgress,
     ) -> Result<(Revision, WorkTree), CheckoutError> {
-        let found = self.resolver.resolve(world, progress).await?;
+        let found = self.resolver.resolve(world, &**progress).await?;
         let turn = self.copies.acquire().await;
         let _turn = turn.map_err(|error| machine(world, &io::Error::other(error)))?;
-        let name = &found.revision.name;
-        progress(steps::checking_out(name, None));
-        let on_line = |line: &str| {
-            if line.contains('%') {
-                progress(steps::checking_out(name, Some(line)));
-            }
+        let (commit, revision) = (Arc::clone(&found), &found.revision);
+        let (wanted, instance, progress) = (world.clone(), Arc::clone(instance), Arc::clone(progress));
+        let (limits, has_lfs) = (self.limits, self.has_lfs);
+        let copy = async move || {
+            let name = &commit.revision.name;
+            progress(steps::checking_out(name, None));
+            let on_line = |line: &str| {
+                if line.contains('%') {
+                    progress(steps::checking_out(name, Some(line)));
+                }
+            };
+            let written = work_tree::write(&commit, &instance, (&limits, has_lfs), on_line).await?;
+            let copied = written.fits.then(|| work_tree::inspect(&wanted, &instance, &commit.revision));
+            Ok((copied, written.has_grown))
         };
-        let written = work_tree::write(&found, instance, (&self.limits, self.has_lfs), on_line).await;
-        if self.has_lfs {
+        let copied = on_own_thread(copy).await.map_err(|error| machine(world, &error))?;
+        if self.has_lfs && !matches!(copied, Ok((_, false))) {
             self.cache.grown();
         }
-        if written.map_err(|source| git_failed(world, source))? {
-            let copied = work_tree::inspect(world, instance, &found.revision).await?;
-            if copied.size <= self.limits.size {
-                return Ok((found.revision.clone(), copied));
-            }
+        match copied.map_err(|source| git_failed(world, source))? {
+            (Some(copied), _) if copied.size <= limits.size => Ok((revision.clone(), copied)),
+            _ => Err(too_large("The project", limits.size)),
         }
-        Err(too_large("The project", self.limits.size))
     }
 
     /// Restores a file below the project's `controllers` directory to the state of the checkout.
@@ -180,7 +187,7 @@ impl CheckoutService {
         let failed = |error| machine(url, &error);
         let restored = FileRestore::new(instance.path()).map_err(failed)?;
         let paths = [path.as_bytes(), b"\0"].concat();
-        let call = checkout_command(&repository, revision, &paths, (restored.path(), &restored.files())).await;
+        let call = checkout_command(&repository, revision, &paths, (restored.path(), &restored.files()));
         repository.run(call.map_err(failed)?, |_| ()).await.map_err(|source| git_failed(url, source))?;
         restored.install(instance.project(), path.to_owned()).await.map_err(failed)
     }

@@ -36,6 +36,8 @@ pub struct Call<'call> {
     pub time: Duration,
     /// Additional environment variables.
     pub environment: Vec<(OsString, OsString)>,
+    /// Whether its start may block the calling thread.
+    pub may_block: bool,
 }
 
 /// git reads this instead of the settings of the server's user, because a world's program could have written those. The
@@ -71,16 +73,16 @@ impl Git {
     }
 
     /// Writes the file of settings, unless it is there.
-    async fn write_settings(&self) -> std::io::Result<()> {
+    fn write_settings(&self) -> std::io::Result<()> {
         let (file, text) = &self.settings;
-        if tokio::fs::try_exists(file).await? {
+        if std::fs::exists(file)? {
             return Ok(());
         }
-        tokio::fs::create_dir_all(&self.mark).await?;
+        std::fs::create_dir_all(&self.mark)?;
         // Others that start at once never see half of it.
         let new = self.mark.join(format!("gitconfig-{:08x}", rand::random::<u32>()));
-        tokio::fs::write(&new, text).await?;
-        tokio::fs::rename(&new, file).await
+        std::fs::write(&new, text)?;
+        std::fs::rename(&new, file)
     }
 
     /// Runs a command to its end. Returns its answer. `progress` receives each line of standard error.
@@ -92,7 +94,7 @@ impl Git {
     pub async fn run(&self, call: Call<'_>, mut progress: impl FnMut(&str)) -> Result<Vec<u8>, GitError> {
         let command = call.arguments.iter().find(|argument| !argument.as_encoded_bytes().starts_with(b"-"));
         let command = command.map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
-        self.write_settings().await?;
+        self.write_settings()?;
         let mut cause = String::new();
         let on_line = |line: String| {
             progress(&line);
@@ -128,6 +130,7 @@ impl Git {
         let fixed = fixed.into_iter().map(|(name, value)| (name.into(), value.into()));
         run.spec.environment = fixed.chain(call.environment).collect();
         (run.answer, run.line) = (MAX_ANSWER, MAX_LINE);
+        run.may_block = call.may_block;
         run.niceness = if HEAVY.contains(&name) { NICENESS } else { 0 };
         run.limits.push((Resource::Data, call.memory));
         if let Some(size) = call.file_size {

@@ -1,6 +1,7 @@
 //! A project that was checked out for one client.
 
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use super::revision::Revision;
 use super::world_file::WorldFile;
@@ -22,7 +23,7 @@ pub struct Project {
     /// The project's directory.
     pub(super) folder: PathBuf,
     /// The instance directory; removed with the project.
-    pub instance: InstanceDir,
+    pub instance: Arc<InstanceDir>,
 }
 
 impl Project {

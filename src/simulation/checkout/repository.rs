@@ -65,6 +65,7 @@ impl Repository {
             file_size: None,
             time: self.limits.time,
             environment: Vec::new(),
+            may_block: false,
         }
     }
 

@@ -7,6 +7,7 @@ use std::collections::HashMap;
 use std::fmt;
 use std::future::Future;
 use std::hash::Hash;
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use futures_util::FutureExt;
@@ -24,6 +25,8 @@ struct Job<T: Clone> {
 
 /// Receives each step of a job as text.
 pub type OnProgress<'job> = &'job (dyn Fn(String) + Send + Sync);
+/// The same, for a job on another thread.
+pub type SharedProgress = Arc<dyn Fn(String) + Send + Sync>;
 
 /// Shortest interval between two steps that are sent to a waiter.
 const STEP_INTERVAL: Duration = Duration::from_millis(100);

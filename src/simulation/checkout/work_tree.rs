@@ -4,7 +4,6 @@ use std::ffi::OsString;
 use std::io;
 use std::path::Path;
 
-use super::checkout_error::{CheckoutError, machine};
 use super::checkout_limits::CheckoutLimits;
 use super::commit_resolver::ResolvedCommit;
 use super::disk;
@@ -33,14 +32,14 @@ pub struct WorkTree {
 ///
 /// # Errors
 /// When the list of paths can't be written.
-pub async fn checkout_command<'call>(
+pub fn checkout_command<'call>(
     repository: &'call Repository,
     revision: &Revision,
     paths: &[u8],
     (scratch, into): (&Path, &Path),
 ) -> io::Result<Call<'call>> {
     let list = scratch.join("paths");
-    tokio::fs::write(&list, paths).await?;
+    std::fs::write(&list, paths)?;
     let with = |option: &str, path: &Path| {
         let mut argument = OsString::from(option);
         argument.push(path);
@@ -55,8 +54,17 @@ pub async fn checkout_command<'call>(
     Ok(call)
 }
 
-/// Writes a project with git, with its large files; `on_line` receives its progress lines. Returns whether it is within
-/// the size limit: git's attributes may make it larger than the commit, and a Git host may send more than it should.
+/// A written project.
+#[derive(Debug, Clone, Copy)]
+pub struct Written {
+    /// Whether it is within the size limit: git's attributes may make it larger than the commit, and a Git host may send
+    /// more than it should.
+    pub fits: bool,
+    /// Whether the cache has grown by its large files.
+    pub has_grown: bool,
+}
+
+/// Writes a project with git, with its large files; `on_line` receives its progress lines. Blocks its thread.
 ///
 /// # Errors
 /// When git fails.
@@ -65,40 +73,30 @@ pub async fn write(
     instance: &InstanceDir,
     (limits, has_lfs): (&CheckoutLimits, bool),
     on_line: impl FnMut(&str),
-) -> Result<bool, GitError> {
+) -> Result<Written, GitError> {
     let paths = [found.revision.needed().as_bytes(), b"\0", &found.above].concat();
     let project = instance.project();
-    let call = checkout_command(&found.repository, &found.revision, &paths, (instance.path(), &project));
-    let mut call = call.await?;
+    let mut call = checkout_command(&found.repository, &found.revision, &paths, (instance.path(), &project))?;
+    call.may_block = true;
+    // git-lfs stores its downloads here, shared with concurrent checkouts, and copies them into the project.
+    let kept = call.repository.join("lfs");
+    let before = if has_lfs { disk::room_of(&kept) } else { 0 };
     let mut growing = vec![(project, limits.size)];
     if has_lfs {
         call.settings = lfs::settings(&found.repository.remote());
-        // git-lfs stores its downloads here, shared with concurrent checkouts, and copies them into the project.
-        let kept = call.repository.join("lfs");
-        let measured = kept.clone();
-        let before = disk::blocking(move || Ok(disk::room_of(&measured))).await?;
-        growing.push((kept, before.saturating_add(limits.size.saturating_mul(2))));
+        growing.push((kept.clone(), before.saturating_add(limits.size.saturating_mul(2))));
     }
-    tokio::select! {
-        written = found.repository.run(call, on_line) => written.map(|_| true),
-        () = disk::outgrown(growing) => Ok(false),
-    }
+    let fits = tokio::select! {
+        written = found.repository.run(call, on_line) => written.map(|_| true)?,
+        () = disk::outgrown(growing) => false,
+    };
+    Ok(Written { fits, has_grown: has_lfs && disk::room_of(&kept) > before })
 }
 
-/// Inspects a copy.
-///
-/// # Errors
-/// When the machine fails.
-pub async fn inspect(
-    world: &ProjectUrl,
-    instance: &InstanceDir,
-    revision: &Revision,
-) -> Result<WorkTree, CheckoutError> {
+/// Inspects a copy. Blocks.
+pub fn inspect(world: &ProjectUrl, instance: &InstanceDir, revision: &Revision) -> WorkTree {
     let root = instance.project();
     let (folder, path) = (root.join(&revision.folder), root.join(revision.world_path(world)));
-    let seen = disk::blocking(move || {
-        let (size, pointers) = (disk::room_of(&root), lfs::pointers(&folder));
-        Ok(WorkTree { size, pointers, world: WorldFile::open(&root, &path) })
-    });
-    seen.await.map_err(|error| machine(world, &error))
+    let (size, pointers) = (disk::room_of(&root), lfs::pointers(&folder));
+    WorkTree { size, pointers, world: WorldFile::open(&root, &path) }
 }

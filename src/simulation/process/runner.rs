@@ -28,6 +28,8 @@ pub struct Run {
     pub limits: Vec<(Resource, u64)>,
     /// Its niceness.
     pub niceness: i32,
+    /// Whether its start may block the calling thread, until `execve`, which takes long on a busy machine.
+    pub may_block: bool,
 }
 
 /// How a program ended.
@@ -63,7 +65,7 @@ impl Run {
     /// A program of the server's own with its arguments, in the server's environment and with this mark.
     pub fn new<A: Into<OsString>>(command: impl IntoIterator<Item = A>, mark: &Path, time: Duration) -> Self {
         let spec = SpawnSpec::new(command.into_iter().map(Into::into).collect(), mark);
-        Self { spec, time, answer: 1 << 20, line: 1000, limits: Vec::new(), niceness: 0 }
+        Self { spec, time, answer: 1 << 20, line: 1000, limits: Vec::new(), niceness: 0, may_block: false }
     }
 
     /// Runs it. `told` receives each line of its standard error. Dropping the future kills it and its process group.
@@ -88,7 +90,8 @@ impl Run {
     ///
     /// # Errors
     /// Those of `run`.
-    pub fn blocking(self, told: impl FnMut(String) + Send) -> Result<Ran, RunError> {
+    pub fn blocking(mut self, told: impl FnMut(String) + Send) -> Result<Ran, RunError> {
+        self.may_block = true;
         let run = || {
             let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
             runtime.block_on(self.run(told))
@@ -106,16 +109,19 @@ impl Run {
         answer: Option<io::PipeWriter>,
         told: impl FnMut(String),
     ) -> Result<Ran, RunError> {
-        let Self { spec, time, answer: most, line, limits, niceness } = self;
+        let Self { spec, time, answer: most, line, limits, niceness, may_block } = self;
         let (said, errors) = io::pipe()?;
         let answer = answer.map_or_else(|| errors.try_clone(), Ok)?;
-        // `spawn` blocks until `execve`, which takes long on a busy machine.
         let start = move || {
             let (group, ended) = ProcessGroup::start(&spec, answer.into(), errors.into())?;
             bound(group.leader(), &limits, niceness);
             io::Result::Ok((group, ended.boxed()))
         };
-        let (_group, ended) = actix_rt::task::spawn_blocking(start).await.map_err(io::Error::other)??;
+        let (_group, ended) = if may_block {
+            start()?
+        } else {
+            actix_rt::task::spawn_blocking(start).await.map_err(io::Error::other)??
+        };
         let said = Receiver::from_owned_fd(said.into())?;
         let output = output.map(|output| Receiver::from_owned_fd(output.into())).transpose()?;
         let all = async { tokio::join!(read(output, most), tell(said, line, told), ended) };
