@@ -119,16 +119,18 @@ async fn a_docker_that_is_stopped_or_has_no_init_process_is_told_and_all_goes_on
     assert!(told.contains("Docker does not answer on this simulation server"), "{told}");
     until("it says so", async || !takes_clients(&server).await).await;
     docker.start(&["--init-path", "/nowhere/docker-init"]);
-    let problem = async || http::get(&server.url("/status")).await.json()["problem"].to_string();
-    until("it looks for the init process", async || problem().await.contains("init process")).await;
-    let told = Client::start(&server, &arm()).await.patiently("loading: Error:", Duration::from_secs(60)).await;
+    let second = super::daemon::server(forge.path(), 1).start().await;
+    until("it takes no client", async || !takes_clients(&second).await).await;
+    let told = Client::start(&second, &arm()).await.patiently("loading: Error:", Duration::from_secs(60)).await;
     assert!(told.contains("docker-init: on Debian and Ubuntu the packages docker.io and tini"), "{told}");
-    let checked = check(&server);
+    let checked = check(&second);
     assert!(checked.contains("can't give containers an init process"), "{checked}");
     docker.kill();
     docker.start(&[]);
-    until("it takes clients again", async || takes_clients(&server).await).await;
-    Client::start(&server, &arm()).await.patiently("webots:", Duration::from_secs(60)).await;
+    for server in [&server, &second] {
+        until("it takes clients again", async || takes_clients(server).await).await;
+        Client::start(server, &arm()).await.patiently("webots:", Duration::from_secs(60)).await;
+    }
     until("what the daemon has kept is gone", async || containers(&server).len() <= 1).await;
 }
 

@@ -7,7 +7,7 @@ use serde_json::json;
 use super::daemon::{as_ordinary, ask, docker, of_service, server};
 use super::image::NAME;
 use crate::support::client::Client;
-use crate::support::git::{Forge, arm};
+use crate::support::git::{Forge, arm, world};
 use crate::support::http;
 
 /// How long a build may take on a busy machine.
@@ -54,14 +54,17 @@ async fn a_build_has_no_more_memory_than_a_simulation() {
 async fn what_an_image_does_to_folders_and_devices_is_its_projects_fault() {
     let Some(_docker) = docker().await else { return };
     let (forge, folder) = (Forge::with_arm(), tempfile::tempdir().unwrap());
-    let server = as_ordinary(server(forge.path(), 1), forge.path(), folder.path()).start().await;
     let replaced = |folder| (format!("rm -rf {folder} && touch {folder}"), "");
     // An ordinary user can't even copy a device out of the image.
     let device = ("mknod /usr/local/webots-project/zero c 1 5".to_owned(), "not permitted");
-    for (line, words) in ["/tmp", "/run", "/var/tmp"].map(replaced).into_iter().chain([device]) {
+    let all = [replaced("/tmp"), replaced("/run"), replaced("/var/tmp"), device];
+    for (branch, (line, _)) in ["a", "b", "c", "d"].into_iter().zip(&all) {
         let dockerfile = format!("FROM {NAME}\nCOPY . /usr/local/webots-project\nRUN {line}\n");
-        forge.commit("lab/arm", "main", &[("Dockerfile", &dockerfile)]);
-        let mut client = Client::start(&server, &arm()).await;
+        forge.commit("lab/arm", branch, &[("Dockerfile", &dockerfile)]);
+    }
+    let server = as_ordinary(server(forge.path(), 1), forge.path(), folder.path()).start().await;
+    for (branch, (line, words)) in ["a", "b", "c", "d"].into_iter().zip(all) {
+        let mut client = Client::start(&server, &world("lab/arm", branch, "worlds/a.wbt")).await;
         let told = client.patiently("loading: Error:", BUILT).await;
         assert_eq!(client.closed().await, Some(1000), "{line}: {told}");
         let status = http::get(&server.url("/status")).await.json();

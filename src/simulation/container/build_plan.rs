@@ -27,8 +27,6 @@ pub struct BuildPlan {
     pub image: ImageBuild,
     /// The image of the controllers.
     pub controller: Option<ImageBuild>,
-    /// Whether the project has a Makefile.
-    pub has_makefile: bool,
 }
 
 /// An image to build.
@@ -80,7 +78,7 @@ impl BuildPlan {
         };
         let controller = controller.map(|text| build(&text, Some("controllers"), &PARTICIPANT)).transpose()?;
         let template = templates.compose(yml.kind).map_err(StartError::Server)?;
-        Ok(Self { yml, template, image, controller, has_makefile })
+        Ok(Self { yml, template, image, controller })
     }
 }
 
@@ -175,7 +173,7 @@ mod tests {
         std::fs::write(project.path().join(".env"), "A=b").unwrap();
         let plan = BuildPlan::read(project.path(), &templates(), "x").unwrap();
         assert!(
-            plan.has_makefile
+            plan.image.arguments.contains(&"MAKE=1".to_owned())
                 && plan.image.folder == Some("")
                 && plan.image.dockerfile.text.contains("LABEL webots-fleet.owner=x")
         );

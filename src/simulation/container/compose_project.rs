@@ -80,7 +80,6 @@ impl ComposeProject {
             ("CONTROLLER_IMAGE", self.controller.as_ref().map_or_else(String::new, |image| image.name.clone())),
             ("PROJECT_PATH", PROJECT_PATH.to_owned()),
             ("PROJECT", path(&paths.project)),
-            ("MAKE", u8::from(self.plan.has_makefile).to_string()),
             ("BIND", config.bind_of_containers().to_string()),
             ("PORT", port.to_string()),
             ("COMPOSE_PROJECT_NAME", self.name.clone()),

@@ -4,8 +4,7 @@ use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 
-use serde::Deserialize;
-use serde::de::IgnoredAny;
+use serde_json::Value;
 
 use super::webots_yml::ProjectKind;
 use crate::simulation::config::ContainerSettings;
@@ -46,18 +45,6 @@ pub const CONTROLLER_DOCKERFILE: &str = "Dockerfile.controller";
 /// The launcher of a participant's controller.
 pub const LAUNCHER: &str = "remote_controller_launcher.py";
 
-/// The part of a compose file that this server reads.
-#[derive(Deserialize)]
-struct Document {
-    services: BTreeMap<String, Service>,
-}
-
-/// A service of it.
-#[derive(Deserialize)]
-struct Service {
-    command: Option<IgnoredAny>,
-}
-
 impl Templates {
     /// The templates of a configuration.
     #[must_use]
@@ -91,15 +78,19 @@ impl Templates {
         let name = format!("docker-compose-{kind}{}.yml", if self.debug { "-debug" } else { "" });
         let broken = |error: String| format!("The template {name} of this simulation server can't be used: {error}");
         let text = self.text(&name)?;
-        let document: Document = serde_saphyr::from_str(&text).map_err(|error| broken(error.to_string()))?;
-        if !document.services.contains_key(WEBOTS) {
+        let document: Value = serde_saphyr::from_str(&text).map_err(|error| broken(error.to_string()))?;
+        let services = document.get("services").and_then(Value::as_object).into_iter().flatten();
+        let has_command = |(name, service): (&String, &Value)| {
+            (name.clone(), service.get("command").is_some_and(|command| !command.is_null()))
+        };
+        let services: BTreeMap<_, _> = services.map(has_command).collect();
+        if !services.contains_key(WEBOTS) {
             return Err(broken(format!("it has no service {WEBOTS:?}")));
         }
         if let Some(line) = unsuitable(&text) {
             return Err(broken(line));
         }
-        let services = document.services.into_iter().map(|(name, service)| (name, service.command.is_some()));
-        Ok(Template { services: services.collect(), text })
+        Ok(Template { text, services })
     }
 
     /// Whether the administrator has a file of this name.
