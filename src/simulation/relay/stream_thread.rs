@@ -1,7 +1,7 @@
 //! The thread that copies all streams: one epoll instance serves them with fewer wakeups than several, and without the wakers
 //! of tasks a message costs little more than a read and a write.
 
-use std::collections::{HashMap, VecDeque};
+use std::collections::{BTreeSet, HashMap, VecDeque};
 use std::io;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -37,8 +37,9 @@ impl StreamThread {
     pub fn start() -> io::Result<Self> {
         let epoll = Epoll::new(EpollCreateFlags::EPOLL_CLOEXEC)?;
         let shared = Arc::new(Shared { epoll, streams: Mutex::default(), next: AtomicU64::new(0) });
-        let thread = Arc::clone(&shared);
-        std::thread::Builder::new().name("streams".to_owned()).spawn(move || thread.run())?;
+        let (buffer, interrupted, closing) = (vec![0; BUFFER], BTreeSet::new(), VecDeque::new());
+        let copier = Copier { shared: Arc::clone(&shared), buffer, interrupted, closing };
+        std::thread::Builder::new().name("streams".to_owned()).spawn(move || copier.run())?;
         Ok(Self(shared))
     }
 
@@ -63,55 +64,57 @@ fn key(number: u64, end: End) -> u64 {
     number << 1 | u64::from(matches!(end, End::Webots))
 }
 
-impl Shared {
-    fn run(&self) {
-        let mut buffer = vec![0; BUFFER];
+/// What the thread itself keeps.
+struct Copier {
+    shared: Arc<Shared>,
+    buffer: Vec<u8>,
+    /// Streams that go on once others had their turn.
+    interrupted: BTreeSet<u64>,
+    /// Streams of which one direction has ended, and until when they have time.
+    closing: VecDeque<(Instant, u64)>,
+}
+
+impl Copier {
+    fn run(mut self) {
         let mut events = [EpollEvent::empty(); MAX_EVENTS];
-        let mut closing: VecDeque<(Instant, u64)> = VecDeque::new();
-        let mut interrupted: Vec<u64> = Vec::new();
         loop {
-            let timeout = if interrupted.is_empty() { until_first(&closing) } else { EpollTimeout::ZERO };
+            let timeout = if self.interrupted.is_empty() { until_first(&self.closing) } else { EpollTimeout::ZERO };
             // A signal may interrupt it.
-            let count = self.epoll.wait(&mut events, timeout).unwrap_or_default();
-            let mut copy = |number: u64, event: Option<EpollEvent>, again: &mut Vec<u64>| {
-                let mut streams = self.streams.lock();
-                let Some(stream) = streams.get_mut(&number) else { return };
-                if let Some(event) = event {
-                    let end = if event.data() & 1 == 0 { End::Client } else { End::Webots };
-                    stream.note(end, source(event.events()));
-                }
-                let was_closing = stream.is_closing();
-                match stream.copy(&mut buffer) {
-                    Progress::Ended => {
-                        let ended = streams.remove(&number);
-                        drop(streams);
-                        drop(ended);
-                        return;
-                    }
-                    Progress::Interrupted => again.push(number),
-                    Progress::Waiting => {}
-                }
-                if !was_closing && stream.is_closing() {
-                    closing.push_back((Instant::now() + CLOSE_TIMEOUT, number));
-                }
-            };
-            let mut again = Vec::new();
-            for number in interrupted {
-                copy(number, None, &mut again);
+            let count = self.shared.epoll.wait(&mut events, timeout).unwrap_or_default();
+            for number in std::mem::take(&mut self.interrupted) {
+                self.copy(number, None);
             }
             for event in events.into_iter().take(count) {
-                copy(event.data() >> 1, Some(event), &mut again);
+                let end = if event.data() & 1 == 0 { End::Client } else { End::Webots };
+                self.copy(event.data() >> 1, Some((end, source(event.events()))));
             }
-            interrupted = again;
-            self.remove_late(&mut closing);
+            self.remove_late();
+        }
+    }
+
+    /// Copies what can be copied of a stream, of which epoll has reported this.
+    fn copy(&mut self, number: u64, reported: Option<(End, Source)>) {
+        let mut streams = self.shared.streams.lock();
+        let Some(stream) = streams.get_mut(&number) else { return };
+        if let Some((end, source)) = reported {
+            stream.note(end, source);
+        }
+        let was_closing = stream.is_closing();
+        let progress = stream.copy(&mut self.buffer);
+        if !was_closing && stream.is_closing() {
+            self.closing.push_back((Instant::now() + CLOSE_TIMEOUT, number));
+        }
+        match progress {
+            Progress::Ended => drop(streams.remove(&number)),
+            Progress::Interrupted => drop(self.interrupted.insert(number)),
+            Progress::Waiting => {}
         }
     }
 
     /// Removes streams whose second direction has not ended in time.
-    fn remove_late(&self, closing: &mut VecDeque<(Instant, u64)>) {
-        while let Some((_, number)) = closing.pop_front_if(|(deadline, _)| *deadline <= Instant::now()) {
-            let late = self.streams.lock().remove(&number);
-            drop(late);
+    fn remove_late(&mut self) {
+        while let Some((_, number)) = self.closing.pop_front_if(|(deadline, _)| *deadline <= Instant::now()) {
+            drop(self.shared.streams.lock().remove(&number));
         }
     }
 }
