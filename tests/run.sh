@@ -55,7 +55,7 @@ trap 'exit 130' INT TERM HUP
 # Starts a command beside whatever else runs, in a process group of its own.
 start() { # COMMAND...
     set -m
-    FLEET_BIN=$PWD/target/debug "$@" >"$logs/${*//\//-}" 2>&1 </dev/null &
+    FLEET_BIN=$PWD/target/debug FLEET_BUSY=$logs/busy "$@" >"$logs/${*//\//-}" 2>&1 </dev/null &
     set +m
     jobs[$*]=$!
 }
@@ -94,13 +94,15 @@ echo "built: $(elapsed)"
 # All of these wait most of the time, and run side by side, the longest first. What needs a machine of its own, or a daemon with
 # images, is in memory: where there is little of it, these run one after another.
 containers="tests/own_network.sh ${CARGO[*]} --test containers"
-beside=("$containers" 'tests/browser/run' 'tests/deploy/guide.sh' "${CARGO[*]} --test simulation_limits")
+faults="${CARGO[*]} --test faults --"
+beside=("$containers" 'tests/browser/run' "$faults whole_again" "${CARGO[*]} --test simulation_limits")
 memory=$(awk '$1 == "MemAvailable:" { print int($2 / 1024) }' /proc/meminfo)
-# The package is mostly systemd that waits: what is measured beside it does not notice.
-start tests/deploy/package.sh
-((memory > 10000)) || finish tests/deploy/package.sh
-"${CARGO[@]}" --lib --bins --test integration || failed+=('cargo test')
-[[ -z ${jobs[tests/deploy/package.sh]-} ]] || finish tests/deploy/package.sh
+# The package and the guide are mostly systemd and apt that wait: what is measured beside them does not notice.
+for command in tests/deploy/{guide,package}.sh; do
+    start "$command"
+    ((memory > 10000)) || finish "$command"
+done
+tests/own_tmp.sh "${CARGO[@]}" --lib --bins --test integration || failed+=('cargo test')
 echo "runs side by side, and tells when each has ended: ${beside[*]@Q}"
 for command in "${beside[@]}"; do
     # shellcheck disable=SC2086 # None of its words has a space.
@@ -108,17 +110,21 @@ for command in "${beside[@]}"; do
     # shellcheck disable=SC2086
     ((memory > 10000)) || finish $command
 done
-for command in "${beside[@]}"; do
+# The images of this one don't wait for a machine of its own.
+touch "$logs/busy"
+((memory <= 10000)) || start tests/swarm.sh
+for command in tests/deploy/{package,guide}.sh "${beside[@]}"; do
     # shellcheck disable=SC2086
     [[ -z ${jobs[$command]-} ]] || finish $command
 done
 # These measure times: nothing runs beside them.
-for command in "${CARGO[*]} --test faults" tests/swarm.sh; do
-    # shellcheck disable=SC2086
-    start $command
-    # shellcheck disable=SC2086
-    finish $command
-done
+# shellcheck disable=SC2086
+start $faults --skip whole_again
+# shellcheck disable=SC2086
+finish $faults --skip whole_again
+rm "$logs/busy"
+[[ -n ${jobs[tests/swarm.sh]-} ]] || start tests/swarm.sh
+finish tests/swarm.sh
 
 echo "tests: $(elapsed), build included"
 ((${#skipped[@]} == 0)) || echo "SKIPPED, not passed: ${skipped[*]}" >&2

@@ -4,7 +4,8 @@
 #
 # dockerd runs in namespaces of its own, from which nothing can be reached. So the images that the Dockerfile begins with are
 # a Debian that debootstrap makes, kept in target/deploy, with an apt-get that has nothing to do and a cargo that copies what is built
-# already: FLEET_BIN, an absolute path, names its folder. `tests/swarm.sh prepare` makes that Debian alone.
+# already: FLEET_BIN, an absolute path, names its folder. `tests/swarm.sh prepare` makes that Debian alone. As long as there is a file FLEET_BUSY,
+# it makes the images, and nothing that is measured.
 set -Eeuo pipefail
 cd "$(dirname "$(readlink -f "${BASH_SOURCE[0]}")")/.."
 PATH=$PATH:/usr/sbin:/sbin
@@ -210,7 +211,7 @@ unshare --net --mount --pid --fork --kill-child --mount-proc --propagation priva
     exec dockerd --data-root "$0/data" --exec-root /run/docker --pidfile /run/docker.pid --host "unix://$0/docker.sock" --cgroup-parent "/$1"
 ' "$WORK" "$GROUP" >"$WORK/dockerd" 2>&1 &
 keeper=$!
-for ((tries = 0; tries < 150; tries++)); do
+for ((tries = 0; tries < 300; tries++)); do
     machine=$(pgrep --parent "$keeper" || true)
     docker info >/dev/null 2>&1 && break
     sleep 0.2
@@ -263,6 +264,7 @@ build nginxinc/nginx-unprivileged:1.28 "$WORK/nginx"
 
 # --- The fleet.
 
+until [[ ! -e ${FLEET_BUSY-} ]]; do sleep 0.1; done
 mkdir -p "$WORK/project/deploy"
 cp --recursive deploy/swarm "$WORK/project/deploy"
 ln -s project/deploy/swarm "$WORK/swarm"

@@ -184,7 +184,7 @@ class Fleet:
         (work / "worlds/textures/wood.png").write_text("a picture")
         # Drawing takes most of the time of a machine without a graphics card.
         for motion in work.glob("worlds/*.motion.json"):
-            motion.write_text(json.dumps({**json.loads(motion.read_text()), "FPS": 5}))
+            motion.write_text(json.dumps({**json.loads(motion.read_text()), "FPS": 2}))
         git = ["git", "-c", "user.name=Test", "-c", "user.email=test@localhost", "-c", "commit.gpgSign=false"]
         bare = forge / "demo/worlds"
         bare.mkdir(parents=True)

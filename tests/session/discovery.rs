@@ -123,6 +123,7 @@ async fn a_name_server_that_fails_or_has_nothing_to_tell_changes_nothing_and_is_
             let given = http::get(&session.url("/session")).await.text();
             assert!(given.starts_with("ws://127.0.0."), "{given}");
             assert!(begin.elapsed() < Duration::from_secs(1), "an answer took {:?}", begin.elapsed());
+            actix_rt::time::sleep(Duration::from_millis(20)).await;
         }
         until_states(&session, &["up"; 2]).await;
         let told = |words: &str| times_logged(&session, &format!("{name}: {words}"));

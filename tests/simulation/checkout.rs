@@ -21,7 +21,7 @@ use crate::support::webots::{Webots, instances_below};
 async fn every_kind_of_url_opens_its_world() {
     let (forge, webots) = (Forge::new(), reader());
     let first = forge.commit("lab/arm", "main", &[("worlds/a.wbt", &world_text("root of main"))]);
-    forge.tag("lab/arm", "v1.0");
+    forge.tag("lab/arm", "v1.0", "main");
     forge.commit(
         "lab/arm",
         "main",
@@ -131,8 +131,9 @@ async fn a_repository_can_run_nothing() {
     forge.commit_work_tree("lab/arm", "main");
     // Hooks and filters of the forge's own repository.
     let bare = forge.path().join("lab/arm");
+    std::fs::create_dir(bare.join("hooks")).unwrap();
     for hook in ["post-checkout", "pre-auto-gc", "reference-transaction"] {
-        std::fs::write(bare.join("hooks").join(hook), format!("#!/bin/sh\n{}\n", touch(hook))).ok();
+        std::fs::write(bare.join("hooks").join(hook), format!("#!/bin/sh\n{}\n", touch(hook))).unwrap();
         git(&bare, &["config", "filter.evil.smudge", &touch("smudge")]);
     }
     // Settings of the user as whom the server runs.

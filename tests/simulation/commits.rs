@@ -12,7 +12,7 @@ async fn any_commit_of_a_branch_or_tag_runs() {
     let commit = |branch: &str, text: &str| forge.commit("lab/arm", branch, &[("worlds/a.wbt", &world_text(text))]);
     let commits = [commit("main", "first"), commit("main", "second"), commit("main", "third")];
     let tagged = [commit("side", "tagged before"), commit("side", "tagged")];
-    forge.tag("lab/arm", "v1");
+    forge.tag("lab/arm", "v1", "side");
     let bare = forge.path().join("lab/arm");
     git(&bare, &["update-ref", "-d", "refs/heads/side"]);
     // One forge sends commits alone when it is asked to, the other does not know how.
@@ -80,8 +80,8 @@ async fn a_commit_that_no_branch_or_tag_vouches_for_runs_only_where_that_is_allo
 #[actix_rt::test]
 async fn a_history_that_is_too_large_is_told() {
     let (forge, webots) = (Forge::with_arm(), reader());
-    let work = forge.work_tree("lab/arm", "main");
     let old = forge.commit("lab/arm", "main", &[("worlds/a.wbt", &world_text("old"))]);
+    let work = forge.work_tree("lab/arm", "main");
     std::fs::write(work.join("noise"), super::opened::noise(6 << 20)).unwrap();
     forge.commit_work_tree("lab/arm", "main");
     let server = simulation_server(&webots.path(), forge.path(), 2).set("projectSize", 1).start().await;

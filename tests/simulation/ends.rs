@@ -147,7 +147,9 @@ async fn a_webots_that_does_not_start_or_hangs_is_told_as_such() {
 #[actix_rt::test]
 async fn what_a_simulation_has_taken_is_told() {
     let forge = Forge::with_arm();
-    let webots = Webots::script(&format!("{DEMO} \"$@\" &\nwhile :; do :; done & wait"));
+    let webots = Webots::script(&format!(
+        "{DEMO} \"$@\" &\n{{ for ((n = 0; n < 500000; n++)); do :; done; sleep 1000; }} & wait"
+    ));
     let server = simulation_server(&webots.path(), forge.path(), 1)
         .set("isolation", "none")
         .set("timing.heartbeat", 1)

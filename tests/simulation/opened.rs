@@ -36,14 +36,9 @@ pub fn size_of(folder: &Path) -> u64 {
 
 /// Bytes that can't be packed.
 pub fn noise(bytes: usize) -> Vec<u8> {
-    let mut state = 0x9e37_79b9_7f4a_7c15_u64 ^ (bytes as u64);
-    let mut next = || {
-        state ^= state << 13;
-        state ^= state >> 7;
-        state ^= state << 17;
-        state
-    };
-    (0..bytes.div_ceil(8)).flat_map(|_| next().to_le_bytes()).collect()
+    let mut noise = vec![0; bytes];
+    rand::fill(&mut noise[..]);
+    noise
 }
 
 pub fn cached(server: &Server) -> Vec<PathBuf> {

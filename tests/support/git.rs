@@ -1,7 +1,8 @@
 //! Real git repositories in a folder of the test, as a forge would have them.
 
+use std::io::Write;
 use std::path::{Path, PathBuf};
-use std::process::Command;
+use std::process::{Command, Stdio};
 
 /// A folder of bare repositories: `repositories/lab/arm` is what `https://github.com/lab/arm` is mirrored to.
 pub struct Forge {
@@ -28,31 +29,54 @@ impl Forge {
         self.folder.path()
     }
 
-    /// Adds these files to a branch, which is made if need be; gives back the commit's hash.
+    /// Adds these files to a branch, which is made from `main` if need be; gives back the commit's hash.
     pub fn commit(&self, repository: &str, branch: &str, files: &[(&str, &str)]) -> String {
-        let work = self.work_tree(repository, branch);
-        for (path, text) in files {
-            let path = work.join(path);
-            std::fs::create_dir_all(path.parent().unwrap()).unwrap();
-            std::fs::write(path, text).unwrap();
+        let bare = self.bare(repository);
+        let mut stream =
+            format!("commit refs/heads/{branch}\nmark :1\ncommitter Test <test@localhost> now\ndata 4\ntest\n");
+        if let Some(parent) =
+            [branch, "main"].map(|name| format!("refs/heads/{name}")).iter().find(|name| exists(&bare, name))
+        {
+            stream += &format!("from {parent}^0\n");
         }
-        self.commit_work_tree(repository, branch)
+        for (path, text) in files {
+            stream += &format!("M 644 inline {path}\ndata {}\n{text}\n", text.len());
+        }
+        stream += "get-mark :1\n";
+        let mut import = Command::new("git")
+            .current_dir(&bare)
+            .args(["fast-import", "--quiet", "--date-format=now"])
+            .stdin(Stdio::piped())
+            .stdout(Stdio::piped())
+            .spawn()
+            .unwrap();
+        import.stdin.take().unwrap().write_all(stream.as_bytes()).unwrap();
+        let output = import.wait_with_output().unwrap();
+        assert!(output.status.success(), "{stream}");
+        String::from_utf8(output.stdout).unwrap().trim().to_owned()
+    }
+
+    /// A repository, which is made if need be.
+    fn bare(&self, repository: &str) -> PathBuf {
+        let bare = self.folder.path().join(repository);
+        if !bare.exists() {
+            std::fs::create_dir_all(&bare).unwrap();
+            git(&bare, &["init", "--quiet", "--bare", "--template=", "--initial-branch=main"]);
+        }
+        bare
     }
 
     /// A checkout of a branch, to change at will before [`Forge::commit_work_tree`].
     pub fn work_tree(&self, repository: &str, branch: &str) -> PathBuf {
-        let work = self.folder.path().join(".work").join(repository);
-        let bare = self.folder.path().join(repository);
-        if !bare.exists() {
-            std::fs::create_dir_all(&bare).unwrap();
-            git(&bare, &["init", "--quiet", "--bare", "--initial-branch=main"]);
-            std::fs::create_dir_all(&work).unwrap();
-            git(&work, &["init", "--quiet", "--initial-branch", branch]);
-            git(&work, &["remote", "add", "origin", bare.to_str().unwrap()]);
-        } else if git(&work, &["branch", "--show-current"]).trim() != branch {
-            let known = git(&work, &["branch", "--list", branch]);
-            let make: &[&str] = if known.trim().is_empty() { &["-b"] } else { &[] };
-            git(&work, &[&["checkout", "--quiet"], make, &[branch]].concat());
+        let (bare, work) = (self.bare(repository), self.folder.path().join(".work").join(repository));
+        if !work.exists() {
+            git(self.folder.path(), &["clone", "--quiet", bare.to_str().unwrap(), work.to_str().unwrap()]);
+        }
+        if exists(&bare, &format!("refs/heads/{branch}")) {
+            git(&work, &["fetch", "--quiet", "origin"]);
+            git(&work, &["checkout", "--quiet", "-B", branch, &format!("origin/{branch}")]);
+        } else {
+            git(&work, &["checkout", "--quiet", "-B", branch]);
         }
         work
     }
@@ -67,11 +91,15 @@ impl Forge {
     }
 
     /// Tags what a branch has.
-    pub fn tag(&self, repository: &str, name: &str) {
-        let work = self.folder.path().join(".work").join(repository);
-        git(&work, &["tag", "--annotate", "--message", "test", name]);
-        git(&work, &["push", "--quiet", "origin", &format!("refs/tags/{name}")]);
+    pub fn tag(&self, repository: &str, name: &str, branch: &str) {
+        git(&self.bare(repository), &["tag", "--annotate", "--message", "test", name, branch]);
     }
+}
+
+/// Whether a repository has a reference.
+fn exists(bare: &Path, reference: &str) -> bool {
+    let asked = Command::new("git").current_dir(bare).args(["show-ref", "--quiet", "--verify", reference]).status();
+    asked.unwrap().success()
 }
 
 /// The URL of a world.
