@@ -42,21 +42,27 @@ const VANISH: Duration = Duration::from_secs(2);
 const PAUSE: Duration = Duration::from_millis(5);
 
 impl Cgroups {
-    /// The control groups that are delegated to this server, if they are. `runners` is the number of processes that run
-    /// each simulation (see [`MostProcesses`](super::watcher::MostProcesses)).
+    /// The control groups that are delegated to this server, if they are, as yet without limits. Nothing may have been
+    /// started before: what is just exiting would be taken for another owner of the server's group.
     #[must_use]
-    pub fn delegated(limits: &ResourceLimits, runners: u64) -> Option<Self> {
+    pub fn delegated() -> Option<Self> {
         let folder = own_folder()?;
         match Self::divide(&folder) {
             Ok(()) => {
                 log::info!("each simulation gets a control group below {}", folder.display());
-                Some(Self { folder, settings: settings(limits, runners) })
+                Some(Self { folder, settings: Vec::new() })
             }
             Err(error) => {
                 log::info!("simulations get no control groups: {} can't be divided: {error}", folder.display());
                 None
             }
         }
+    }
+
+    /// The same with these limits. `runners` is the number of processes that run each simulation (see
+    /// [`MostProcesses`](super::watcher::MostProcesses)).
+    pub fn with_limits(self, limits: &ResourceLimits, runners: u64) -> Self {
+        Self { settings: settings(limits, runners), ..self }
     }
 
     /// Moves this server into a subgroup, so that there can be others beside it.

@@ -12,7 +12,7 @@ use nix::sys::resource::{Resource, getrlimit};
 use serde::Serialize;
 use which::which;
 
-use super::cgroup::{Cgroup, Cgroups};
+use super::cgroup::{Cgroup, Cgroups, Controllers};
 use super::environment;
 use super::network::OwnNetwork;
 use super::program::Program;
@@ -80,6 +80,7 @@ pub struct Launcher {
     /// Why it has no network of its own, where the configuration leaves it to the machine.
     why_shared: Option<String>,
     cgroups: Option<Cgroups>,
+    controllers: Controllers,
     prlimit: Option<PathBuf>,
     variables: Vec<VariableName>,
     limits: ResourceLimits,
@@ -91,6 +92,8 @@ impl Launcher {
     /// # Errors
     /// When the configuration requires a level that is not available.
     pub fn new(config: &SimulationConfig) -> Result<Self, IsolationError> {
+        // Before a sandbox is tried: what that has started may still be in this server's group.
+        let controllers = Cgroups::controllers();
         let sandbox = || Sandbox::new(config).and_then(Sandbox::tried);
         let (method, shortcoming) = match config.isolation {
             IsolationSetting::None => (Method::Plain, None),
@@ -106,6 +109,7 @@ impl Launcher {
             shortcoming,
             why_shared: None,
             cgroups: None,
+            controllers,
             prlimit: which("prlimit").ok(),
             variables: config.environment.clone(),
             limits: config.limits.clone(),
@@ -137,6 +141,10 @@ impl Launcher {
     /// # Errors
     /// When the configuration requires a level that is not available.
     pub fn start(config: &SimulationConfig) -> Result<Self, IsolationError> {
+        let cgroups = match config.isolation {
+            IsolationSetting::Container => None,
+            _ => Cgroups::delegated(),
+        };
         let mut launcher = Self::new(config)?;
         match &launcher.shortcoming {
             Some(why) => log::warn!("worlds' programs may do whatever this user may (isolation: none): {why}"),
@@ -149,13 +157,11 @@ impl Launcher {
         for line in launcher.unenforced_limits() {
             log::warn!("{line}");
         }
-        if launcher.level() != IsolationLevel::Container {
-            launcher.cgroups = Cgroups::delegated(&launcher.limits, launcher.runners());
-        }
+        launcher.cgroups = cgroups.map(|cgroups| cgroups.with_limits(&launcher.limits, launcher.runners()));
         Ok(launcher)
     }
 
-    /// The limits that this machine can't enforce, one line each. To be called before simulations have control groups.
+    /// The limits that this machine can't enforce, one line each.
     #[must_use]
     pub fn unenforced_limits(&self) -> Vec<String> {
         if self.level() == IsolationLevel::Container {
@@ -165,7 +171,7 @@ impl Launcher {
         let means = Enforcement {
             has_prlimit: self.prlimit.is_some(),
             leaves_namespaces: matches!(&self.method, Method::Sandbox(sandbox) if !sandbox.ends_namespaces()),
-            controllers: Cgroups::controllers(),
+            controllers: self.controllers.clone(),
         };
         unenforced_limits(&means, &self.limits)
     }
