@@ -11,7 +11,7 @@ use tokio::sync::watch;
 use super::announcements::Announcements;
 use super::config::SessionConfig;
 use super::state::AppState;
-use crate::session::fleet::{GetStatus, Reconfigure, Registry, resolver};
+use crate::session::fleet::{GetStatus, Reconfigure, Registry};
 use crate::session::web::configure;
 use crate::shared::config;
 use crate::shared::http::server::{self, HttpServerOptions};
@@ -129,7 +129,7 @@ fn assemble(
     let announcements = Arc::new(Announcements::start(config.announcement.clone()));
     let (available_sender, available) = watch::channel(false);
     let config = Arc::new(config);
-    let registry = Registry::start(Arc::clone(&config), latencies, resolver()?, available_sender);
+    let registry = Registry::start(Arc::clone(&config), latencies, available_sender);
     Ok(AppState {
         registry,
         available,

@@ -13,7 +13,7 @@ pub fn gauges<'text>(clients: usize, status: &FleetStatus) -> Vec<Gauge<'text>> 
 
 /// The gauges of the fleet as a whole.
 fn fleet_gauges<'text>(clients: usize, status: &FleetStatus) -> Vec<Gauge<'text>> {
-    let count = |wanted: ServerState| status.servers.iter().filter(move |server| server.state == wanted).count();
+    let count = |wanted: ServerState| status.servers.iter().filter(move |server| server.record.state == wanted).count();
     let every = [ServerState::Unknown, ServerState::Up, ServerState::Full, ServerState::Draining, ServerState::Down];
     vec![
         Gauge::plain(
@@ -48,14 +48,14 @@ fn server_gauges<'text>(servers: &[ServerStatus]) -> Vec<Gauge<'text>> {
             help: "1 while a simulation server gives good answers",
             labels,
             values: of_each(&|server| {
-                Some(f64::from(u8::from(!matches!(server.state, ServerState::Down | ServerState::Unknown))))
+                Some(f64::from(u8::from(!matches!(server.record.state, ServerState::Down | ServerState::Unknown))))
             }),
         },
         Gauge {
             name: "webots_session_server_load_percent",
             help: "Load that a simulation server reported last",
             labels,
-            values: of_each(&|server| server.report.as_ref().map(|report| report.load.percent())),
+            values: of_each(&|server| server.record.current().map(|report| report.load.percent())),
         },
         Gauge {
             name: "webots_session_server_effective_load_percent",
@@ -73,7 +73,7 @@ fn server_gauges<'text>(servers: &[ServerStatus]) -> Vec<Gauge<'text>> {
             name: "webots_session_server_latency_seconds",
             help: "Time in which a simulation server answered last",
             labels,
-            values: of_each(&|server| server.latency.map(|latency| latency.as_secs_f64())),
+            values: of_each(&|server| server.record.latency.map(|latency| latency.as_secs_f64())),
         },
     ]
 }

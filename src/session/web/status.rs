@@ -66,12 +66,12 @@ impl<'status> StatusResponse<'status> {
 
 impl<'status> ServerStatusJson<'status> {
     fn new(server: &'status ServerStatus, urls: &ClientUrls) -> Self {
-        let report = server.report.as_deref();
+        let (record, report) = (&server.record, server.record.current());
         Self {
             address: &server.address,
             monitor: format!("{}/monitor", urls.http_url(&server.address)),
-            state: server.state,
-            since: server.since,
+            state: record.state,
+            since: record.since,
             load: report.map(|report| report.load),
             effective_load: server.effective_load,
             in_flight: server.in_flight,
@@ -79,8 +79,8 @@ impl<'status> ServerStatusJson<'status> {
             instances: report.and_then(|report| report.instances),
             allowed_repositories: report.map(|report| report.allowed_repositories.as_slice()).unwrap_or_default(),
             version: report.map(|report| report.version.as_str()).unwrap_or_default(),
-            age: server.answered.map(|answered| answered.elapsed().as_secs_f64()),
-            latency: server.latency.as_ref().map(Duration::as_secs_f64),
+            age: record.answered.map(|answered| answered.elapsed().as_secs_f64()),
+            latency: record.latency.as_ref().map(Duration::as_secs_f64),
             error: server.error.as_deref(),
         }
     }
