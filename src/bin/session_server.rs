@@ -8,7 +8,7 @@ use clap::Parser;
 use webots_fleet::session::app;
 use webots_fleet::session::config::SessionConfig;
 use webots_fleet::session::mail::Channel;
-use webots_fleet::shared::run::{LogTarget, start};
+use webots_fleet::shared::run::start;
 
 /// The entry point of a fleet of simulation servers.
 #[derive(Parser)]
@@ -37,9 +37,9 @@ fn main() -> ExitCode {
         return test_mail(&loaded.config);
     }
     let log = loaded.config.log_dir.0.join("session/output.log");
-    let target = LogTarget::new(loaded.config.debug, &log);
+    let log = (!loaded.config.debug).then_some(log.as_path());
     let server = app::run(loaded.config.clone(), arguments.config);
-    start::serve(target, &arguments.options, &loaded.warnings, server)
+    start::serve(log, &arguments.options, &loaded.warnings, server)
 }
 
 /// Sends one mail to the administrator, and a test to the webhook if there is one, and says how that went.
