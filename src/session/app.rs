@@ -156,7 +156,9 @@ fn reload(file: &Path, server: &AppState) {
             let entries = loaded.config.simulation_servers.len();
             log::info!("read {} again: {entries} entries in simulationServers", file.display());
             server.announcements.reconfigure(loaded.config.announcement.clone());
-            server.registry.do_send(Reconfigure(Arc::new(loaded.config)));
+            // The URLs of the fleet stay as they were at the start.
+            let config = SessionConfig { ssl: server.config.ssl, ..loaded.config };
+            server.registry.do_send(Reconfigure(Arc::new(config)));
         }
         Err(error) => log::error!("the configuration stays as it was: {error}"),
     }
