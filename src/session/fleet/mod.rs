@@ -4,7 +4,6 @@ mod fleet_status;
 mod name_table;
 mod pick;
 mod probe_error;
-mod quota;
 mod registry;
 mod resolver;
 mod server_monitor;

@@ -6,6 +6,7 @@
 
 use std::mem::discriminant;
 use std::net::IpAddr;
+use std::num::NonZeroU32;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -16,7 +17,6 @@ use super::fleet_status::{FleetStatus, ServerStatus};
 use super::name_table::{self, LookupResult, NameChange};
 use super::pick::{Pick, PickError};
 use super::probe_error::ProbeError;
-use super::quota;
 use super::server_monitor::ProbeResult;
 use super::server_record::is_refused;
 use super::server_table::{ListChange, ServerTable};
@@ -31,7 +31,7 @@ use crate::shared::http::AddressQuota;
 #[rtype(result = "Arc<FleetStatus>")]
 pub struct GetStatus;
 
-/// Replaces the configuration; see [`SessionConfig::reload`] for the keys that take effect at once.
+/// Replaces the configuration: the servers, what is known of placing on them, and how they are probed.
 #[derive(Message)]
 #[rtype(result = "()")]
 pub struct Reconfigure(pub Arc<SessionConfig>);
@@ -41,6 +41,9 @@ pub struct Registry {
     config: Arc<SessionConfig>,
     latencies: prometheus::Histogram,
     fleet: LoadBalancer<PublicAddress>,
+    /// Limits the placements of an address that reserve room. A placement reserves room until its client arrives or is
+    /// given up, so a client that requests servers again and again could lock out all others. Placements beyond the limit
+    /// take room only once their clients have arrived.
     quota: AddressQuota,
     servers: ServerTable,
     /// Whether a simulation server can take a client; all web clients follow it.
@@ -48,6 +51,10 @@ pub struct Registry {
     changes: StateHistory,
 }
 
+/// Placements of an address that may reserve room at once: 200, a large class behind one address.
+const BURST: NonZeroU32 = NonZeroU32::MIN.saturating_add(199);
+/// Further placements that may reserve room, per minute: 12.
+const PER_MINUTE: NonZeroU32 = NonZeroU32::MIN.saturating_add(11);
 /// Interval between two lookups of a name.
 const LOOKUP_INTERVAL: Duration = Duration::from_secs(1);
 /// Interval between checks of what changes without a report: placements that expire, monitors that have panicked.
@@ -64,7 +71,7 @@ impl Registry {
             let servers = ServerTable::new(&config, ctx.address().recipient());
             Self {
                 fleet: LoadBalancer::new(config.policy()),
-                quota: quota::placements(),
+                quota: AddressQuota::new(BURST, PER_MINUTE),
                 changes: StateHistory::new(&config),
                 config,
                 latencies,
@@ -269,7 +276,6 @@ impl Handler<Reconfigure> for Registry {
     type Result = ();
 
     fn handle(&mut self, Reconfigure(config): Reconfigure, _: &mut Self::Context) {
-        let config = Arc::new(self.config.reload(&config));
         self.fleet.set_policy(config.policy());
         self.config = config;
         let change = self.servers.apply(&self.config);

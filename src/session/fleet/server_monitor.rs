@@ -176,21 +176,20 @@ async fn probe(client: &awc::Client, url: &str, load_only: bool) -> Result<(Serv
         return parse_status(&body).map(|report| (report, true));
     }
     let body = get(client, &format!("{url}/load")).await?;
-    let (bytes, has_length) =
-        body.ok_or_else(|| ProbeError::BadAnswer("it has neither /status nor /load".to_owned()))?;
+    let (bytes, length) = body.ok_or_else(|| ProbeError::BadAnswer("it has neither /status nor /load".to_owned()))?;
     // awc takes the end of the connection for the end of the body: 95.5 may be 9. JSON that is cut off is none.
-    if !has_length {
-        return Err(ProbeError::BadAnswer("an answer without Content-Length".to_owned()));
+    if length != Some(bytes.len()) {
+        return Err(ProbeError::BadAnswer("an answer that does not end as its Content-Length says".to_owned()));
     }
     let load = Load::parse(&bytes).map_err(|error| ProbeError::BadAnswer(shortened(&error.to_string())))?;
     plausible(load).map(|load| (ServerReport::load_only(load), false))
 }
 
-/// Returns the body of a page and whether its length was announced, `None` if the server has no such page.
+/// Returns the body of a page and its length as announced, `None` if the server has no such page.
 ///
 /// # Errors
 /// When there is no answer, or one that is neither.
-async fn get(client: &awc::Client, url: &str) -> Result<Option<(Bytes, bool)>, ProbeError> {
+async fn get(client: &awc::Client, url: &str) -> Result<Option<(Bytes, Option<usize>)>, ProbeError> {
     let answer = match client.get(url).send().await {
         // A kept connection may have been closed, which is not a fault of the server.
         Err(error) if is_broken(&error) => client.get(url).send().await,
@@ -207,12 +206,7 @@ async fn get(client: &awc::Client, url: &str) -> Result<Option<(Bytes, bool)>, P
     let length = answer.headers().get(CONTENT_LENGTH).and_then(|value| value.to_str().ok()?.parse::<usize>().ok());
     let bytes = answer.timeout(NEVER).body().limit(MAX_ANSWER_SIZE).await;
     let bytes = bytes.map_err(|error| ProbeError::BadAnswer(shortened(&error.to_string())))?;
-    match length {
-        Some(length) if bytes.len() < length => {
-            Err(ProbeError::BadAnswer(format!("{} of {length} bytes", bytes.len())))
-        }
-        length => Ok(Some((bytes, length.is_some()))),
-    }
+    Ok(Some((bytes, length)))
 }
 
 /// Whether a connection broke, as opposed to one that could not be made.

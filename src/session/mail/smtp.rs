@@ -18,8 +18,6 @@ use crate::shared::config::Secret;
 
 /// The usual port of implicit TLS.
 const IMPLICIT_TLS_PORT: u16 = 465;
-const DEFAULT_PORT: u16 = 25;
-const DEFAULT_PORT_WITH_PASSWORD: u16 = 587;
 
 /// The SMTP server that takes the e-mails, and their addresses.
 #[derive(Debug, Clone)]
@@ -45,8 +43,7 @@ impl SmtpRelay {
         let user = config.mail_sender_user.clone().filter(|user| !user.is_empty());
         let user = user.unwrap_or_else(|| from.email.to_string());
         let login = password.map(|password| Credentials::new(user, password.to_owned()));
-        let default_port = if login.is_some() { DEFAULT_PORT_WITH_PASSWORD } else { DEFAULT_PORT };
-        let port = config.mail_server_port.unwrap_or(default_port);
+        let port = config.mail_server_port.unwrap_or(if login.is_some() { 587 } else { 25 });
         let implicit_tls = config.mail_server_implicit_tls.unwrap_or(port == IMPLICIT_TLS_PORT);
         Ok(Self { from, to, host, port, implicit_tls, login })
     }
@@ -54,10 +51,6 @@ impl SmtpRelay {
     /// `HOST:PORT`.
     pub(super) fn server(&self) -> String {
         format!("{}:{}", self.host, self.port)
-    }
-
-    fn is_encrypted(&self) -> bool {
-        self.login.is_some() || self.implicit_tls
     }
 
     /// Delivers an e-mail. Returns the SMTP server's answer.
@@ -75,7 +68,7 @@ impl SmtpRelay {
 
     fn transport(&self) -> Result<AsyncSmtpTransport<Tokio1Executor>, SmtpError> {
         let mut builder = AsyncSmtpTransport::<Tokio1Executor>::builder_dangerous(self.host.as_str()).port(self.port);
-        if self.is_encrypted() {
+        if self.login.is_some() || self.implicit_tls {
             let parameters = TlsParameters::new(self.host.clone())?;
             builder = builder.tls(if self.implicit_tls { Tls::Wrapper(parameters) } else { Tls::Required(parameters) });
         }
@@ -105,25 +98,20 @@ mod tests {
 
     #[test]
     fn port_and_encryption_follow_from_the_password() {
-        for (keys, port, implicit_tls, is_encrypted) in [
-            (r#""mailSenderUser": "fleet""#, 25, false, false),
-            (r#""mailSenderPassword": """#, 25, false, false),
-            (r#""mailSenderPassword": "x""#, 587, false, true),
-            (r#""mailSenderPassword": "x", "mailServerPort": 25"#, 25, false, true),
-            (r#""mailSenderPassword": "x", "mailServerPort": 465"#, 465, true, true),
-            (r#""mailServerPort": 465"#, 465, true, true),
-            (r#""mailServerPort": 2465, "mailServerImplicitTls": true"#, 2465, true, true),
+        for (keys, port, implicit_tls) in [
+            (r#""mailSenderUser": "fleet""#, 25, false),
+            (r#""mailSenderPassword": """#, 25, false),
+            (r#""mailSenderPassword": "x""#, 587, false),
+            (r#""mailSenderPassword": "x", "mailServerPort": 25"#, 25, false),
+            (r#""mailSenderPassword": "x", "mailServerPort": 465"#, 465, true),
+            (r#""mailServerPort": 465"#, 465, true),
+            (r#""mailServerPort": 2465, "mailServerImplicitTls": true"#, 2465, true),
         ] {
             let json = format!(
-                r#"{{"port": 1999, "simulationServers": [], "administrator": "a@example.org", "mailServer": "smtp",
-                     "mailSender": "b@example.org", {keys}}}"#
+                r#"{{"administrator": "a@example.org", "mailServer": "smtp", "mailSender": "b@example.org", {keys}}}"#
             );
             let relay = SmtpRelay::new(&serde_json::from_str(&json).unwrap()).unwrap();
-            assert_eq!(
-                (relay.port, relay.implicit_tls, relay.is_encrypted()),
-                (port, implicit_tls, is_encrypted),
-                "{keys}"
-            );
+            assert_eq!((relay.port, relay.implicit_tls), (port, implicit_tls), "{keys}");
         }
     }
 }
