@@ -29,7 +29,7 @@ use support::git::{Forge, world};
 use support::program::{Server, session_server, simulation_server};
 use support::webots::Webots;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
-use webots_fleet::session::fleet::{FleetStatus, ServerState, ServerStatus, StateChange};
+use webots_fleet::session::fleet::{FleetStatus, ServerRecord, ServerState, ServerStatus, StateChange};
 use webots_fleet::session::web::pages;
 use webots_fleet::shared::domain::ClientUrls;
 
@@ -76,15 +76,17 @@ fn fleet() -> FleetStatus {
     let address = |number: u16| format!("simulation{number}.example.org:{}", 2000 + number).parse().unwrap();
     let servers = (0..SERVERS).map(|number| ServerStatus {
         address: address(number),
-        state: if number % 10 == 0 { ServerState::Full } else { ServerState::Up },
-        since: SystemTime::now(),
-        report: Some(Arc::new(serde_json::from_value(report.clone()).unwrap())),
+        record: ServerRecord {
+            state: if number % 10 == 0 { ServerState::Full } else { ServerState::Up },
+            report: Some(Arc::new(serde_json::from_value(report.clone()).unwrap())),
+            latency: Some(Duration::from_millis(3)),
+            answered: Some(Instant::now()),
+            ..ServerRecord::new(false)
+        },
         error: None,
         effective_load: Some(44.5),
         in_flight: 1,
         client_cost: Some(1.0),
-        latency: Some(Duration::from_millis(3)),
-        answered: Some(Instant::now()),
     });
     let change = |number| StateChange {
         at: SystemTime::now(),

@@ -49,8 +49,6 @@
 //!     |  ^                                               | ServerMonitor -- GET /status, /load --> simulation server
 //!     |  '- availability (watch channel) -- Registry     '-- ProbeResult --> Registry
 //!
-//!   NameMonitor -- A, AAAA --> DNS server; -- LookupResult --> Registry (one per name in simulationServers)
-//!
 //!   The monitors share a thread of their own, so that clients never wait for them.
 //!
 //! simulation server
@@ -79,7 +77,6 @@
 //! |---|---|---|
 //! | Registry, `SlotPool`, `LoadMonitor` | never | the server logs it and exits with code 1: the service manager restarts it |
 //! | `ServerMonitor` | when its server leaves the configuration, or its name no longer resolves to it and it does not answer | its supervisor starts a new one |
-//! | `NameMonitor` | when its name leaves the configuration | its supervisor starts a new one |
 //! | Mailer | never | its supervisor starts a new one; unsent notices are lost |
 //! | `WebClient` | with its connection | its connection closes, and its session is notified |
 //! | `Session` | with its simulation, or its client | its lease is released, and its client is notified |

@@ -7,8 +7,8 @@ use std::process::ExitCode;
 use clap::Parser;
 use webots_fleet::session::app;
 use webots_fleet::session::config::SessionConfig;
-use webots_fleet::session::mail;
-use webots_fleet::shared::run::{LogTarget, start};
+use webots_fleet::session::mail::Channel;
+use webots_fleet::shared::run::start;
 
 /// The entry point of a fleet of simulation servers.
 #[derive(Parser)]
@@ -37,20 +37,20 @@ fn main() -> ExitCode {
         return test_mail(&loaded.config);
     }
     let log = loaded.config.log_dir.0.join("session/output.log");
-    let target = LogTarget::new(loaded.config.debug, &log);
+    let log = (!loaded.config.debug).then_some(log.as_path());
     let server = app::run(loaded.config.clone(), arguments.config);
-    start::serve(target, &arguments.options, &loaded.warnings, server)
+    start::serve(log, &arguments.options, &loaded.warnings, server)
 }
 
 /// Sends one mail to the administrator, and a test to the webhook if there is one, and says how that went.
 fn test_mail(config: &SessionConfig) -> ExitCode {
     let system = actix_rt::System::new();
-    let webhook = config.webhook.is_some().then(|| system.block_on(mail::test_webhook(config)));
+    let webhook = Channel::webhook(config).map(Ok);
     let has_mail = config.administrator.is_some() || webhook.is_none();
-    let mail = has_mail.then(|| system.block_on(mail::test_mail(config)));
+    let mail = has_mail.then(|| Channel::mail(config));
     let mut code = ExitCode::SUCCESS;
-    for result in [mail, webhook].into_iter().flatten() {
-        match result {
+    for channel in [mail, webhook].into_iter().flatten() {
+        match channel.and_then(|channel| system.block_on(channel.test(config))) {
             // The reader may have gone.
             Ok(how) => drop(writeln!(std::io::stdout(), "{how}")),
             Err(error) => {

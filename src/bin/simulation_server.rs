@@ -4,7 +4,7 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 
 use clap::Parser;
-use webots_fleet::shared::run::{LogTarget, start};
+use webots_fleet::shared::run::start;
 use webots_fleet::simulation::config::{IsolationSetting, SimulationConfig};
 use webots_fleet::simulation::container;
 use webots_fleet::simulation::process::guardian;
@@ -72,6 +72,6 @@ fn main() -> ExitCode {
         return code;
     }
     let log = loaded.config.log_dir.0.join("simulation/output.log");
-    let target = LogTarget::new(loaded.config.debug, &log);
-    start::serve(target, &arguments.options, &loaded.warnings, app::run(loaded.config.clone()))
+    let log = (!loaded.config.debug).then_some(log.as_path());
+    start::serve(log, &arguments.options, &loaded.warnings, app::run(loaded.config.clone()))
 }

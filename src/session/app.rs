@@ -11,7 +11,7 @@ use tokio::sync::watch;
 use super::announcements::Announcements;
 use super::config::SessionConfig;
 use super::state::AppState;
-use crate::session::fleet::{GetStatus, Reconfigure, Registry, resolver};
+use crate::session::fleet::{GetStatus, Reconfigure, Registry};
 use crate::session::web::configure;
 use crate::shared::config;
 use crate::shared::http::server::{self, HttpServerOptions};
@@ -129,7 +129,7 @@ fn assemble(
     let announcements = Arc::new(Announcements::start(config.announcement.clone()));
     let (available_sender, available) = watch::channel(false);
     let config = Arc::new(config);
-    let registry = Registry::start(Arc::clone(&config), latencies, resolver()?, available_sender);
+    let registry = Registry::start(Arc::clone(&config), latencies, available_sender);
     Ok(AppState {
         registry,
         available,
@@ -156,7 +156,9 @@ fn reload(file: &Path, server: &AppState) {
             let entries = loaded.config.simulation_servers.len();
             log::info!("read {} again: {entries} entries in simulationServers", file.display());
             server.announcements.reconfigure(loaded.config.announcement.clone());
-            server.registry.do_send(Reconfigure(Arc::new(loaded.config)));
+            // The URLs of the fleet stay as they were at the start.
+            let config = SessionConfig { ssl: server.config.ssl, ..loaded.config };
+            server.registry.do_send(Reconfigure(Arc::new(config)));
         }
         Err(error) => log::error!("the configuration stays as it was: {error}"),
     }

@@ -1,7 +1,7 @@
 //! The state that the routes, the pages and the web clients of a session server share. `app` creates it.
 
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use actix::prelude::*;
 use tokio::sync::watch;
@@ -41,26 +41,19 @@ pub struct AppState {
     pub started: Instant,
 }
 
-/// Timeout of a pick by the registry.
-const PICK_TIMEOUT: Duration = Duration::from_secs(2);
-
 impl AppState {
     /// Number of connected web clients.
     pub fn clients(&self) -> usize {
         self.connections.count(ConnectionKind::Client)
     }
 
-    /// Asks the registry for a simulation server, and returns its URL. A registry that does not answer in time counts
-    /// as unavailable.
+    /// Asks the registry for a simulation server, and returns its URL.
     ///
     /// # Errors
     /// Why there is none.
     pub async fn pick(&self, wanted: Result<Pick, PickError>) -> Result<String, PickError> {
         let picked = match wanted {
-            Ok(pick) => {
-                let picked = actix_rt::time::timeout(PICK_TIMEOUT, self.registry.send(pick)).await;
-                picked.ok().and_then(Result::ok).unwrap_or(Err(PickError::Unavailable))
-            }
+            Ok(pick) => self.registry.send(pick).await.unwrap_or(Err(PickError::Unavailable)),
             Err(wrong) => Err(wrong),
         };
         let outcome = match &picked {

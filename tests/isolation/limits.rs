@@ -2,8 +2,6 @@
 
 use std::time::{Duration, Instant};
 
-use serde_json::json;
-
 use crate::simulation::scene::{DEMO, arm, instance_folders, nothing_left};
 use crate::support::client::Client;
 use crate::support::git::Forge;
@@ -227,28 +225,4 @@ fn programs_that_may_start_no_thread_say_so_and_do_not_panic() {
     let check = ["--check", config.to_str().unwrap()];
     let said = said_within(1, env!("CARGO_BIN_EXE_simulation-server"), &check);
     assert!(said.contains("no thread can be started to ask it") && !said.contains("panicked"), "{said}");
-}
-
-#[test]
-fn a_server_that_may_start_too_few_processes_says_so_in_one_line() {
-    let Some(folder) = open_to_others() else { return };
-    let path = |name| folder.path().join(name);
-    let simulation = json!({"port": 64_999, "bind": "127.0.0.1", "server": "localhost", "allowedRepositories": ["https://h/r"],
-        "logDir": path("log"), "cacheDir": path("cache"), "isolation": "none"});
-    let session = json!({"port": 64_999, "bind": "127.0.0.1", "server": "localhost", "simulationServers": ["localhost:1"],
-        "logDir": path("log")});
-    let servers = [
-        (env!("CARGO_BIN_EXE_simulation-server"), "simulation.json", simulation),
-        (env!("CARGO_BIN_EXE_session-server"), "session.json", session),
-    ];
-    for (program, name, config) in servers {
-        std::fs::write(path(name), config.to_string()).unwrap();
-        for processes in [1, 8, 12, 15, 20] {
-            // Another user each time.
-            std::fs::remove_dir_all(path("log")).ok();
-            let said = said_within(processes, program, &[path(name).to_str().unwrap()]);
-            let told = format!("error: only {} more processes and threads may be started", processes - 1);
-            assert!(said.starts_with(&told) && said.lines().count() == 1, "{name}, {processes}: {said}");
-        }
-    }
 }

@@ -52,7 +52,11 @@ fn loaded(port: u16, more: &Value) -> SessionConfig {
 
 fn start(port: u16, more: &Value) -> Addr<Mailer> {
     keep_log();
-    mail::start(&loaded(port, more), Channel::Mail).expect("mails are on")
+    mail::start(&loaded(port, more)).all().next().expect("mails are on").clone()
+}
+
+async fn test_mail(config: &SessionConfig) -> Result<String, String> {
+    Channel::mail(config)?.test(config).await
 }
 
 fn notice(host: &str, event: NoticeKind) -> Notice {

@@ -11,11 +11,10 @@ use webots_fleet::simulation::config::SimulationConfig;
 
 use super::copy::{root, walk};
 
-/// A server: its program, its part of the page, the least that it must be told, and other names of its keys.
+/// A server: its program, its part of the page, and other names of its keys.
 struct Kind {
     program: &'static str,
     heading: &'static str,
-    least: Value,
     aliases: &'static [&'static str],
 }
 
@@ -24,13 +23,11 @@ fn kinds() -> [Kind; 2] {
         Kind {
             program: env!("CARGO_BIN_EXE_session-server"),
             heading: "## Session server",
-            least: json!({"port": 1999, "simulationServers": []}),
             aliases: SessionConfig::ALIASES,
         },
         Kind {
             program: env!("CARGO_BIN_EXE_simulation-server"),
             heading: "## Simulation server",
-            least: json!({}),
             aliases: SimulationConfig::ALIASES,
         },
     ]
@@ -46,7 +43,7 @@ impl Kind {
 
     /// Every key with its default; of a part, as `part.key`.
     fn defaults(&self) -> BTreeMap<String, Value> {
-        let output = self.check(&self.least.to_string());
+        let output = self.check("{}");
         let Value::Object(all) = serde_json::from_slice(&output.stdout).unwrap() else { panic!("{output:?}") };
         let mut keys = BTreeMap::new();
         for (key, value) in all {
@@ -116,11 +113,7 @@ fn the_page_names_every_key_once_with_its_default_and_no_other() {
         assert_eq!(named, known, "{}", kind.heading);
         for (key, told) in &rows {
             let default = &defaults[key];
-            if told == "required" {
-                let mut config = kind.least.clone();
-                config.as_object_mut().unwrap().remove(key).unwrap();
-                assert_eq!(kind.check(&config.to_string()).status.code(), Some(2), "{key} is not required");
-            } else if told == "none" {
+            if told == "none" {
                 let empty = [json!(null), json!([]), json!({})];
                 assert!(empty.contains(default), "{key}: the page says none, it is {default}");
             } else {
@@ -185,7 +178,7 @@ fn a_list_is_taken_for_no_object() {
     ];
     for (kind, table) in kinds().iter().zip(tables) {
         for (key, value) in table {
-            let mut config = kind.least.clone();
+            let mut config = json!({});
             config[*key] = value.clone();
             let output = kind.check(&config.to_string());
             let told = String::from_utf8_lossy(&output.stderr);
@@ -198,7 +191,7 @@ fn a_list_is_taken_for_no_object() {
 #[test]
 fn what_is_wrong_inside_an_object_is_named_by_its_key() {
     for kind in kinds() {
-        let mut config = kind.least.clone();
+        let mut config = json!({});
         config["timing"] = json!({"ping": 10, "silence": "long"});
         let told = String::from_utf8(kind.check(&config.to_string()).stderr).unwrap();
         assert!(told.contains("timing.silence: ") && told.contains("a number of seconds"), "{told}");
@@ -212,7 +205,7 @@ fn a_password_may_lie_in_a_file_and_is_not_shown() {
     std::fs::write(secret.path(), "s3cret\n").unwrap();
     for (kind, key) in [(session, "mailSenderPassword"), (simulation, "adminPassword")] {
         let with = |value: Value| {
-            let mut config = kind.least.clone();
+            let mut config = json!({});
             config[key] = value;
             kind.check(&config.to_string())
         };
@@ -235,7 +228,7 @@ fn a_password_may_lie_in_a_file_and_is_not_shown() {
 #[test]
 fn engines_set_addresses_by_the_environment() {
     for kind in kinds() {
-        let mut config = kind.least.clone();
+        let mut config = json!({});
         config["server"] = "$FLEET_ADDRESS".into();
         config["publicUrl"] = "$FLEET_URL".into();
         let file = tempfile::NamedTempFile::new().unwrap();

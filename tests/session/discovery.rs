@@ -113,7 +113,7 @@ async fn a_name_server_that_fails_or_has_nothing_to_tell_changes_nothing_and_is_
         }
         until("the page tells it", async || error().await.as_str().is_some()).await;
         assert!(error().await.as_str().unwrap().contains(words), "{}", error().await);
-        assert_eq!(smtp.mail().await.subject(), format!("Lookup of simulation servers failing: {name}"));
+        assert_eq!(smtp.mail().await.subject(), format!("Simulation server not responding: {name}"));
         let page = http::get(&session.url("/monitor")).await.text();
         assert!(page.contains(&format!("{name} can't be looked up.")), "{page}");
         // It is asked again and again meanwhile, and nobody waits for that.
@@ -136,7 +136,7 @@ async fn a_name_server_that_fails_or_has_nothing_to_tell_changes_nothing_and_is_
             }
         }
         until("the page tells that it works", async || error().await.is_null()).await;
-        assert_eq!(smtp.mail().await.subject(), format!("Lookup of simulation servers working again: {name}"));
+        assert_eq!(smtp.mail().await.subject(), format!("Simulation server working again: {name}"));
     }
     assert_eq!(times_logged(&session, "no longer watched"), 0);
 }

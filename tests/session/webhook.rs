@@ -46,7 +46,7 @@ async fn the_notices_of_a_mail_are_one_message_and_need_no_mail() {
     let session = with_webhook(&servers, "http", receiver.port).start().await;
     fail(&session, &servers).await;
     let text = receiver.texts(1).await.remove(0);
-    assert!(text.starts_with("3 simulation servers not responding\n"), "{text}");
+    assert!(text.starts_with("Simulation servers: 3 not responding\n"), "{text}");
     for server in addresses(&servers) {
         assert!(text.contains(&format!("{server}: not responding")), "{text}");
     }
@@ -78,13 +78,13 @@ async fn a_message_that_is_not_taken_is_tried_again_and_so_is_a_mail_for_itself(
     let session = with_webhook(&servers, "http", receiver.port).mails_to(smtp.port).start().await;
     fail(&session, &servers).await;
     // The mail does not wait for the messenger.
-    assert_eq!(smtp.mail().await.subject(), "3 simulation servers not responding");
+    assert_eq!(smtp.mail().await.subject(), "Simulation servers: 3 not responding");
     receiver.texts(3).await;
     until("it is logged", async || session.log().contains("webhook not sent, next try in")).await;
     assert!(session.log().contains("503 Service Unavailable"), "{}", session.log());
     receiver.answer("204 Taken");
     until("it is sent", async || session.log().contains("webhook sent by")).await;
-    assert!(receiver.texts(4).await.last().unwrap().starts_with("3 simulation servers not responding"));
+    assert!(receiver.texts(4).await.last().unwrap().starts_with("Simulation servers: 3 not responding"));
     drop(session);
 
     // And the messenger not for the mail.
@@ -150,7 +150,7 @@ async fn the_webhook_can_be_tried_and_a_wrong_one_is_refused_without_showing_it(
     };
     let url = format!("http://127.0.0.1:{}/{SECRET}", receiver.port);
     let (code, said) = run(url.clone(), "--test-mail").await;
-    assert_eq!((code, said), (Some(0), format!("the webhook at 127.0.0.1:{} took a test: 200 OK\n", receiver.port)));
+    assert_eq!((code, said), (Some(0), format!("127.0.0.1:{} took a test: 200 OK\n", receiver.port)));
     assert!(receiver.texts(1).await[0].contains("Nothing has happened"));
     receiver.answer("404 Gone");
     let (code, said) = run(url.clone(), "--test-mail").await;

@@ -8,7 +8,6 @@ use actix_web::{App, HttpRequest, HttpResponse, HttpServer, web};
 use actix_web_actors::ws::WsResponseBuilder;
 use tokio::sync::mpsc::{UnboundedReceiver, UnboundedSender, unbounded_channel};
 use webots_fleet::shared::domain::ProjectUrl;
-use webots_fleet::shared::http::websocket::MessageReader;
 use webots_fleet::shared::http::{ConnectionKind, Peer};
 use webots_fleet::simulation::client::WebClient;
 use webots_fleet::simulation::client_identity::ClientIdentity;
@@ -56,7 +55,7 @@ async fn gate(
 ) -> HttpResponse {
     let peer = server.config.trusted_proxies.peer(&request);
     let connection = server.connections.admit(ConnectionKind::Client, peer).unwrap();
-    let client = WebClient::new(Arc::clone(&server), (peer, None), (connection, MessageReader::default()));
+    let client = WebClient::new(Arc::clone(&server), (peer, None), connection);
     let (address, response) = WsResponseBuilder::new(client, &request, stream).start_with_addr().unwrap();
     clients.send(address).unwrap();
     response

@@ -4,7 +4,7 @@ use std::time::SystemTime;
 
 use serde::{Deserialize, Serialize};
 
-use crate::shared::run::{read_timestamp, timestamp};
+use crate::shared::run::timestamp;
 use crate::shared::text::one_line;
 
 /// The administrator's message to all clients.
@@ -29,7 +29,7 @@ struct WireAnnouncement {
 const MAX_LENGTH: usize = 300;
 
 impl Announcement {
-    /// Makes an announcement; `until` is a time of RFC 3339.
+    /// Makes an announcement; `until` is a time of RFC 3339 in UTC.
     ///
     /// # Errors
     /// What is wrong with it, in words.
@@ -39,8 +39,8 @@ impl Announcement {
             return Err(format!("the text of an announcement has 1 to {MAX_LENGTH} letters"));
         }
         let until = until.map(|until| {
-            read_timestamp(until)
-                .ok_or_else(|| format!("until is {until:?}; allowed are times such as 2026-12-31T12:00:00Z (UTC) or 2026-12-31T13:00:00+01:00"))
+            let wrong = |_| format!("until is {until:?}; allowed are times such as 2026-12-31T12:00:00Z (UTC)");
+            humantime::parse_rfc3339(until).map_err(wrong)
         });
         Ok(Self { text, until: until.transpose()? })
     }

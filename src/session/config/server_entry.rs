@@ -32,17 +32,11 @@ pub struct DnsName {
 
 /// A text that is not an entry of `simulationServers`.
 #[derive(Debug, thiserror::Error)]
-pub enum EntryError {
-    /// A form that was removed.
-    #[error("{0:?}: dnssrv+ was removed; dns+NAME:PORT stands for all addresses of a name")]
-    Service(String),
-    /// Anything else.
-    #[error(
-        "{0:?} is no simulation server; allowed is HOST:PORT, or HOST/PORT where a web server rewrites ports, and \
-         dns+NAME:PORT for all addresses of a name"
-    )]
-    Other(String),
-}
+#[error(
+    "{0:?} is no simulation server; allowed is HOST:PORT, or HOST/PORT where a web server rewrites ports, and \
+     dns+NAME:PORT for all addresses of a name"
+)]
+pub struct EntryError(String);
 
 impl ServerEntry {
     /// The address of the simulation server, unless this is a name.
@@ -66,14 +60,11 @@ impl TryFrom<String> for ServerEntry {
     type Error = EntryError;
 
     fn try_from(text: String) -> Result<Self, EntryError> {
-        if text.starts_with("dnssrv+") {
-            return Err(EntryError::Service(text));
-        }
         let entry = match text.strip_prefix("dns+") {
             Some(name) => dns_name(name).map(Self::Name),
             None => text.parse().ok().map(Self::Server),
         };
-        entry.ok_or(EntryError::Other(text))
+        entry.ok_or(EntryError(text))
     }
 }
 
@@ -98,20 +89,15 @@ impl fmt::Display for DnsName {
     }
 }
 
+/// A name with its port. It is a host of which the address is not known.
 fn dns_name(text: &str) -> Option<DnsName> {
     let (host, port) = text.rsplit_once(':')?;
-    let port = format!("host:{port}").parse::<PublicAddress>().ok().filter(|address| !address.is_rewritten())?.port();
-    plain_name(host).map(|host| DnsName { host, port })
-}
-
-/// The host name that DNS resolves; `None` if the text is not a host name. A final dot stays.
-fn plain_name(text: &str) -> Option<String> {
-    let relative = text.strip_suffix('.').unwrap_or(text);
-    let address: PublicAddress = format!("{relative}:1").parse().ok()?;
-    let host = address.host();
-    let is_address = host.starts_with('[') || host.parse::<IpAddr>().is_ok();
-    (!is_address && !relative.ends_with('.'))
-        .then(|| format!("{host}{}", text.get(relative.len()..).unwrap_or_default()))
+    let relative = host.strip_suffix('.').unwrap_or(host);
+    let address: PublicAddress = format!("{relative}:{port}").parse().ok()?;
+    let is_address = address.host().starts_with('[') || address.host().parse::<IpAddr>().is_ok();
+    let end = if host == relative { "" } else { "." };
+    (!is_address && !address.is_rewritten() && !relative.ends_with('.'))
+        .then(|| DnsName { host: format!("{}{end}", address.host()), port: address.port() })
 }
 
 #[cfg(test)]

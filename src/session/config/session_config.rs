@@ -14,147 +14,108 @@ use super::server_entry::ServerEntry;
 use super::timing::Timing;
 use crate::session::placement::PlacementPolicy;
 use crate::shared::config::{
-    Configuration, ExpandedPath, InvalidValueError, Secret, changed_keys, expanded, folder, is_web_url, local_address,
-    object, one_or_many, optional_expanded, optional_whole, percent, require, seconds, whole,
+    Configuration, ExpandedPath, InvalidValueError, Secret, expanded, folder, is_web_url, local_address, object,
+    one_or_many, optional_expanded, optional_whole, percent, require, seconds, whole,
 };
 use crate::shared::domain::{ClientUrls, PublicAddress, PublicUrl, check_host};
 use crate::shared::http::TrustedProxies;
 
 /// Every key of the session server. The original's keys keep their meaning.
 #[derive(Debug, Clone, Serialize, Deserialize)]
-#[serde(rename_all = "camelCase")]
+#[serde(rename_all = "camelCase", default)]
 pub struct SessionConfig {
     /// Fully qualified domain name of the session server. Default: `localhost`, with a warning.
-    #[serde(default, deserialize_with = "expanded")]
+    #[serde(deserialize_with = "expanded")]
     pub server: String,
     /// Whether URLs begin with `https` and `wss`. Default: true.
-    #[serde(default = "default_true")]
     pub ssl: bool,
-    /// Local port; 0 takes any free one.
+    /// Local port; 0 takes any free one. Default: 1999.
     #[serde(deserialize_with = "whole::<0, 65535, _, _>")]
     pub port: u16,
     /// Local address to listen on. Default: `::`, all addresses of IPv4 and IPv6.
-    #[serde(default = "default_bind", deserialize_with = "local_address")]
+    #[serde(deserialize_with = "local_address")]
     pub bind: IpAddr,
     /// Whether a reverse proxy rewrites ports in URLs: HOST/PORT, not HOST:PORT. Default: true.
-    #[serde(default = "default_true")]
     pub port_rewrite: bool,
     /// How clients reach the simulation servers through one reverse proxy: a URL with the placeholders `{host}` and
     /// `{port}`. Default: none, and each is reached under its own address.
-    #[serde(default, deserialize_with = "optional_expanded")]
+    #[serde(deserialize_with = "optional_expanded")]
     pub public_url: Option<PublicUrl>,
-    /// The simulation servers: HOST:PORT, HOST/PORT, or `dns+NAME:PORT` for all addresses of a name.
+    /// The simulation servers: HOST:PORT, HOST/PORT, or `dns+NAME:PORT` for all addresses of a name. Default:
+    /// none.
     pub simulation_servers: Vec<ServerEntry>,
     /// Those of `simulationServers` that get no new clients. They are still monitored. Default: none.
-    #[serde(default)]
     pub drained_servers: Vec<PublicAddress>,
     /// Mail address of the administrator, who gets notifications. Default: none, and there are no notifications.
-    #[serde(default, deserialize_with = "mail_address::optional")]
+    #[serde(deserialize_with = "mail_address::optional")]
     pub administrator: Option<Mailbox>,
     /// Host of the SMTP server. Default: none, and there are no notifications.
-    #[serde(default)]
     pub mail_server: Option<String>,
     /// SMTP port. Default: 25, with a password 587.
-    #[serde(default, deserialize_with = "optional_whole::<1, 65535, _, _>")]
+    #[serde(deserialize_with = "optional_whole::<1, 65535, _, _>")]
     pub mail_server_port: Option<u16>,
     /// Whether the SMTP server encrypts from the first byte, without STARTTLS. Default: true for port 465, else false.
-    #[serde(default)]
     pub mail_server_implicit_tls: Option<bool>,
     /// Mail address that notifications come from. Default: none, and there are no notifications.
-    #[serde(default, deserialize_with = "mail_address::optional")]
+    #[serde(deserialize_with = "mail_address::optional")]
     pub mail_sender: Option<Mailbox>,
     /// User name for SMTP. Default: `mailSender`.
-    #[serde(default)]
     pub mail_sender_user: Option<String>,
     /// Password for SMTP. With a password the connection is always encrypted. Default: none.
-    #[serde(default)]
     pub mail_sender_password: Option<Secret>,
     /// URL to which each mail's notices are posted as JSON, `{"text": ...}`, as Slack and Matrix take them. Default: none.
-    #[serde(default)]
     pub webhook: Option<Secret>,
     /// A message that open viewers and the monitor show: `{"text": ..., "until": ...}`. Default: none.
-    #[serde(default)]
     pub announcement: Option<Announcement>,
     /// Password for actions such as `/announcement`. Default: none, and actions are off.
-    #[serde(default)]
     pub admin_password: Option<Secret>,
     /// Folder of `session/output.log`. Default: `log`.
-    #[serde(default = "default_log_dir", deserialize_with = "folder")]
+    #[serde(deserialize_with = "folder")]
     pub log_dir: ExpandedPath,
     /// Log to standard output. Default: false.
-    #[serde(default)]
     pub debug: bool,
     /// A simulation server with this load (percent) or more gets no client. Above 100, the load does not matter.
     /// Default: 95.
-    #[serde(default = "default_load_threshold", deserialize_with = "percent::<1000, _>")]
+    #[serde(deserialize_with = "percent::<1000, _>")]
     pub load_threshold: f64,
     /// Interval between two probes of a simulation server, in seconds. Default: 1.
-    #[serde(default = "default_load_refresh", with = "seconds")]
+    #[serde(with = "seconds")]
     pub load_refresh: Duration,
     /// Load (percent) that a client adds to a simulation server that reports only its load. For the others it is
     /// learned, starting from this. Default: 2.
-    #[serde(default = "default_client_cost", deserialize_with = "percent::<100, _>")]
+    #[serde(deserialize_with = "percent::<100, _>")]
     pub client_cost: f64,
     /// Limit of open client `WebSockets` in all. Default: 20000.
-    #[serde(default = "default_max_clients", deserialize_with = "whole::<1, 1_000_000, _, _>")]
+    #[serde(deserialize_with = "whole::<1, 1_000_000, _, _>")]
     pub max_clients: usize,
     /// Limit of open client `WebSockets` per client address. Default: three quarters of `maxClients`, but at most 1000,
     /// because a class sits behind one address.
-    #[serde(default, deserialize_with = "optional_whole::<1, 1_000_000, _, _>")]
+    #[serde(deserialize_with = "optional_whole::<1, 1_000_000, _, _>")]
     pub max_clients_per_address: Option<usize>,
     /// Reverse proxies, as addresses or networks, whose header `X-Forwarded-For` is trusted.
     /// Default: `["127.0.0.0/8", "::1/128"]`.
-    #[serde(default)]
     pub trusted_proxies: TrustedProxies,
     /// Worlds that the page `/viewer` offers: URLs, or `{"title": ..., "url": ...}`. Default: none.
-    #[serde(default, deserialize_with = "one_or_many")]
+    #[serde(deserialize_with = "one_or_many")]
     pub examples: Vec<Example>,
     /// URL of Webots' own viewer (`WebotsView.js`), for simulation servers that don't have it. Default: none.
-    #[serde(default)]
     pub viewer_script: Option<url::Url>,
     /// All other durations.
-    #[serde(default, deserialize_with = "object")]
+    #[serde(deserialize_with = "object")]
     pub timing: Timing,
 }
 
 /// Upper limit of `timing.stop`: the server stops within five seconds.
 const MAX_STOP: Duration = Duration::from_millis(4500);
 
-/// Time until a new client shows fully in the load: its start, and the five seconds of which the load is the mean.
-const SETTLING: Duration = Duration::from_secs(8);
-
-/// The keys that take effect when the configuration is read again.
-const RELOADED: [&str; 10] = [
-    "announcement",
-    "announcement.text",
-    "announcement.until",
-    "simulationServers",
-    "drainedServers",
-    "loadThreshold",
-    "loadRefresh",
-    "clientCost",
-    "timing.answer",
-    "timing.placement",
-];
-
 impl SessionConfig {
-    /// Returns the configuration to continue with after `new` was read. Keys that need a restart are logged if they
-    /// have changed.
-    pub fn reload(&self, new: &Self) -> Self {
-        let takes_effect = |key: &&String| RELOADED.contains(&key.as_str()) || (*key == "port" && new.port == 0);
-        for key in changed_keys(self, new).iter().filter(|key| !takes_effect(key)) {
-            log::warn!("{key} has changed, which takes effect with a restart");
-        }
-        Self { ssl: self.ssl, ..new.clone() }
-    }
-
     /// The parameters of placement.
     pub fn policy(&self) -> PlacementPolicy {
         PlacementPolicy {
             threshold: self.load_threshold,
             client_cost: self.client_cost,
             placement_timeout: self.timing.placement,
-            settling: SETTLING,
+            ..PlacementPolicy::default()
         }
     }
 
@@ -208,8 +169,6 @@ impl SessionConfig {
 
 impl Configuration for SessionConfig {
     const ALIASES: &'static [&'static str] = &[];
-    const REMOVED: &'static [(&'static str, &'static str)] =
-        &[("nameServers", "was removed: names are looked up as /etc/resolv.conf and /etc/hosts of the machine say")];
 
     fn complete(&mut self, _: &std::path::Path) -> Result<Vec<String>, InvalidValueError> {
         let mut warnings = Vec::new();
@@ -253,30 +212,39 @@ impl Configuration for SessionConfig {
     }
 }
 
-fn default_true() -> bool {
-    true
-}
-
-fn default_bind() -> IpAddr {
-    Ipv6Addr::UNSPECIFIED.into()
-}
-
-fn default_log_dir() -> ExpandedPath {
-    ExpandedPath("log".into())
-}
-
-fn default_load_threshold() -> f64 {
-    95.0
-}
-
-fn default_load_refresh() -> Duration {
-    Duration::from_secs(1)
-}
-
-fn default_client_cost() -> f64 {
-    2.0
-}
-
-fn default_max_clients() -> usize {
-    20_000
+impl Default for SessionConfig {
+    fn default() -> Self {
+        let PlacementPolicy { threshold, client_cost, .. } = PlacementPolicy::default();
+        Self {
+            server: String::new(),
+            ssl: true,
+            port: 1999,
+            bind: Ipv6Addr::UNSPECIFIED.into(),
+            port_rewrite: true,
+            public_url: None,
+            simulation_servers: Vec::new(),
+            drained_servers: Vec::new(),
+            administrator: None,
+            mail_server: None,
+            mail_server_port: None,
+            mail_server_implicit_tls: None,
+            mail_sender: None,
+            mail_sender_user: None,
+            mail_sender_password: None,
+            webhook: None,
+            announcement: None,
+            admin_password: None,
+            log_dir: ExpandedPath("log".into()),
+            debug: false,
+            load_threshold: threshold,
+            load_refresh: Duration::from_secs(1),
+            client_cost,
+            max_clients: 20_000,
+            max_clients_per_address: None,
+            trusted_proxies: TrustedProxies::default(),
+            examples: Vec::new(),
+            viewer_script: None,
+            timing: Timing::default(),
+        }
+    }
 }

@@ -25,7 +25,8 @@ pub struct Timing {
     /// Time for which notices are collected before they are sent in one mail. Default: 10.
     #[serde(with = "seconds")]
     pub gather: Duration,
-    /// Shortest interval between two mails about the same simulation server. Default: 600.
+    /// Shortest interval between two mails about whether the same simulation server responds, and between two about its
+    /// load. Default: 600.
     #[serde(with = "seconds")]
     pub flapping: Duration,
     /// Delay before a failed mail is retried. It doubles with each failure. Default: 10.

@@ -1,12 +1,12 @@
 //! The status of the fleet, for pages and metrics.
 
 use std::collections::VecDeque;
-use std::sync::Arc;
-use std::time::{Duration, Instant, SystemTime};
+use std::time::SystemTime;
 
 use serde::Serialize;
 
-use crate::shared::domain::{PublicAddress, ServerReport};
+use super::server_record::ServerRecord;
+use crate::shared::domain::PublicAddress;
 use crate::shared::run::serialize_timestamp;
 
 /// Everything that is known of the fleet.
@@ -43,12 +43,8 @@ pub struct NameStatus {
 pub struct ServerStatus {
     /// Its address; unique in the fleet.
     pub address: PublicAddress,
-    /// Its state, as of its last probe.
-    pub state: ServerState,
-    /// When it entered that state.
-    pub since: SystemTime,
-    /// Its last report, unless it is down.
-    pub report: Option<Arc<ServerReport>>,
+    /// What its probes have shown.
+    pub record: ServerRecord,
     /// Why the last probe failed, if it did, or why others are preferred to it, if they are.
     pub error: Option<String>,
     /// The reported load plus that of the clients that it does not show yet, in percent.
@@ -57,10 +53,6 @@ pub struct ServerStatus {
     pub in_flight: usize,
     /// Expected cost of one more client, in percent of load.
     pub client_cost: Option<f64>,
-    /// Duration of the last probe.
-    pub latency: Option<Duration>,
-    /// Time of its last valid answer.
-    pub answered: Option<Instant>,
 }
 
 /// The state of a simulation server.

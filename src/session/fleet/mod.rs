@@ -1,12 +1,9 @@
 //! The simulation servers: which there are, the last report of each, and which one gets the next client.
 
 mod fleet_status;
-mod monitors;
-mod name_monitor;
 mod name_table;
 mod pick;
 mod probe_error;
-mod quota;
 mod registry;
 mod resolver;
 mod server_monitor;
@@ -17,4 +14,4 @@ mod state_history;
 pub use fleet_status::{FleetStatus, NameStatus, ServerState, ServerStatus, StateChange};
 pub use pick::{Pick, PickError};
 pub use registry::{GetStatus, Reconfigure, Registry};
-pub use resolver::resolver;
+pub use server_record::ServerRecord;

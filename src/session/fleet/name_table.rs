@@ -1,92 +1,92 @@
-//! The names of `simulationServers`, and the simulation servers that each resolves to. Part of the registry.
+//! The names of `simulationServers`, and the simulation servers that each resolves to. Part of the registry, which looks
+//! each name up every second regardless of TTL.
 //!
 //! If a lookup fails or returns no records, the last known servers stay.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::net::SocketAddr;
 use std::time::SystemTime;
 
 use super::fleet_status::NameStatus;
-use super::monitors::Monitors;
-use super::name_monitor::LookupResult;
+use super::resolver::look_up;
 use crate::session::config::{DnsName, ServerEntry};
 use crate::shared::domain::PublicAddress;
-use crate::shared::text::one_line;
+use crate::shared::text::excerpt;
+
+/// The simulation servers that a name resolves to, at least one; or why the lookup failed.
+pub type LookupResult = Result<BTreeSet<PublicAddress>, String>;
 
 /// The names that are resolved.
 #[derive(Default)]
-pub struct NameTable(BTreeMap<DnsName, MonitoredName>);
+pub struct NameTable(BTreeMap<DnsName, ResolvedName>);
 
 /// One name.
-struct MonitoredName {
+struct ResolvedName {
     servers: BTreeSet<PublicAddress>,
     /// Why the last lookup failed, if it did.
     error: Option<String>,
     /// When lookups last began to fail or to succeed.
     since: SystemTime,
+    /// Whether a lookup is in progress.
+    is_looked_up: bool,
 }
 
 /// Longest error text that is kept, in characters.
 const MAX_ERROR_LENGTH: usize = 120;
 
 /// What a lookup has changed.
-#[derive(Debug, PartialEq, Eq)]
 pub struct NameChange {
     /// Whether it resolves to other servers than before.
     pub servers: bool,
-    /// Whether lookups have begun to fail, or to succeed again.
-    pub turn: Option<LookupTransition>,
+    /// The new status, if lookups have begun to fail, or to succeed again.
+    pub turned: Option<NameStatus>,
 }
 
-/// Lookups of a name begin to fail, or to succeed again.
-#[derive(Debug, PartialEq, Eq)]
-pub enum LookupTransition {
-    /// They fail, for this reason.
-    Fails(String),
-    /// They succeed again, with this many servers.
-    WorksAgain(usize),
+/// Resolves a name to simulation servers.
+pub async fn servers(name: DnsName) -> LookupResult {
+    let addresses = look_up(&name.host).await?;
+    let servers = addresses.into_iter().map(|address| SocketAddr::new(address, name.port).to_string().parse());
+    servers.collect()
 }
 
 impl NameTable {
-    /// Monitors exactly the names among these entries.
-    pub fn apply(&mut self, entries: &[ServerEntry], monitors: &mut Monitors) {
-        let wanted: BTreeSet<&DnsName> = entries.iter().filter_map(ServerEntry::name).collect();
-        self.0.retain(|name, _| {
-            let stays = wanted.contains(name);
-            if !stays {
-                monitors.stop_looking_up(name);
-            }
-            stays
-        });
-        for name in wanted {
-            self.0.entry(name.clone()).or_insert_with(|| {
-                monitors.look_up(name);
-                MonitoredName { servers: BTreeSet::new(), error: None, since: SystemTime::now() }
+    /// Keeps exactly the names among these entries.
+    pub fn apply(&mut self, entries: &[ServerEntry]) {
+        let mut before = std::mem::take(&mut self.0);
+        for name in entries.iter().filter_map(ServerEntry::name) {
+            let known = before.remove(name).unwrap_or_else(|| ResolvedName {
+                servers: BTreeSet::new(),
+                error: None,
+                since: SystemTime::now(),
+                is_looked_up: false,
             });
+            self.0.insert(name.clone(), known);
         }
     }
 
-    /// Records a lookup. Returns what has changed; `None` if the name is no longer listed.
-    pub fn record(&mut self, LookupResult { name, answer }: LookupResult) -> Option<NameChange> {
-        let looked = self.0.get_mut(&name)?;
-        let failed = looked.error.is_some();
-        let mut servers = false;
-        let turn = match answer {
-            Ok(found) => {
-                looked.error = None;
-                servers = found != looked.servers;
-                looked.servers = found;
-                failed.then_some(LookupTransition::WorksAgain(looked.servers.len()))
-            }
-            Err(error) => {
-                let error: String = one_line(&error).chars().take(MAX_ERROR_LENGTH).collect();
-                looked.error = Some(error.clone());
-                (!failed).then_some(LookupTransition::Fails(error))
-            }
+    /// The names that are not being looked up. The caller looks them up and reports it by [`Self::record`].
+    pub fn due(&mut self) -> Vec<DnsName> {
+        let due = |(name, known): (&DnsName, &mut ResolvedName)| {
+            (!std::mem::replace(&mut known.is_looked_up, true)).then(|| name.clone())
         };
-        if turn.is_some() {
-            looked.since = SystemTime::now();
+        self.0.iter_mut().filter_map(due).collect()
+    }
+
+    /// Records a lookup. Returns what has changed; `None` if the name is no longer listed.
+    pub fn record(&mut self, name: &DnsName, answer: LookupResult) -> Option<NameChange> {
+        let known = self.0.get_mut(name)?;
+        known.is_looked_up = false;
+        let failed_before = known.error.take().is_some();
+        let mut has_moved = false;
+        match answer {
+            Ok(servers) => has_moved = std::mem::replace(&mut known.servers, servers) != known.servers,
+            Err(error) => known.error = Some(excerpt(&error, MAX_ERROR_LENGTH)),
         }
-        Some(NameChange { servers, turn })
+        let has_turned = failed_before != known.error.is_some();
+        if has_turned {
+            known.since = SystemTime::now();
+        }
+        Some(NameChange { servers: has_moved, turned: has_turned.then(|| known.status(name)) })
     }
 
     /// The servers of these entries, in their order, without duplicates.
@@ -94,7 +94,7 @@ impl NameTable {
         let mut seen = BTreeSet::new();
         let mut servers = Vec::new();
         for entry in entries {
-            let found = entry.name().and_then(|name| self.0.get(name)).into_iter().flat_map(|looked| &looked.servers);
+            let found = entry.name().and_then(|name| self.0.get(name)).into_iter().flat_map(|known| &known.servers);
             servers.extend(entry.server().into_iter().chain(found).filter(|server| seen.insert(*server)).cloned());
         }
         servers
@@ -102,12 +102,13 @@ impl NameTable {
 
     /// What is known of each name.
     pub fn status(&self) -> Vec<NameStatus> {
-        let status = |(name, looked): (&DnsName, &MonitoredName)| NameStatus {
-            name: name.to_string(),
-            servers: looked.servers.len(),
-            error: looked.error.clone(),
-            since: looked.since,
-        };
-        self.0.iter().map(status).collect()
+        self.0.iter().map(|(name, known)| known.status(name)).collect()
+    }
+}
+
+impl ResolvedName {
+    fn status(&self, name: &DnsName) -> NameStatus {
+        let (servers, error) = (self.servers.len(), self.error.clone());
+        NameStatus { name: name.to_string(), servers, error, since: self.since }
     }
 }

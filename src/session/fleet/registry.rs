@@ -6,25 +6,22 @@
 
 use std::mem::discriminant;
 use std::net::IpAddr;
+use std::num::NonZeroU32;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use actix::prelude::*;
-use hickory_resolver::TokioResolver;
 use tokio::sync::watch;
 
 use super::fleet_status::{FleetStatus, ServerStatus};
-use super::monitors::{MonitorRecipients, Monitors};
-use super::name_monitor::LookupResult;
-use super::name_table::NameChange;
+use super::name_table::{self, LookupResult, NameChange};
 use super::pick::{Pick, PickError};
 use super::probe_error::ProbeError;
-use super::quota;
-use super::server_monitor::{ProbeResult, ProbeSettings};
-use super::server_record::{ServerRecord, is_refused};
+use super::server_monitor::ProbeResult;
+use super::server_record::is_refused;
 use super::server_table::{ListChange, ServerTable};
 use super::state_history::StateHistory;
-use crate::session::config::SessionConfig;
+use crate::session::config::{DnsName, SessionConfig};
 use crate::session::placement::LoadBalancer;
 use crate::shared::domain::{Load, ProjectUrl, PublicAddress, ServerReport};
 use crate::shared::http::AddressQuota;
@@ -34,7 +31,7 @@ use crate::shared::http::AddressQuota;
 #[rtype(result = "Arc<FleetStatus>")]
 pub struct GetStatus;
 
-/// Replaces the configuration; see [`SessionConfig::reload`] for the keys that take effect at once.
+/// Replaces the configuration: the servers, what is known of placing on them, and how they are probed.
 #[derive(Message)]
 #[rtype(result = "()")]
 pub struct Reconfigure(pub Arc<SessionConfig>);
@@ -44,6 +41,9 @@ pub struct Registry {
     config: Arc<SessionConfig>,
     latencies: prometheus::Histogram,
     fleet: LoadBalancer<PublicAddress>,
+    /// Limits the placements of an address that reserve room. A placement reserves room until its client arrives or is
+    /// given up, so a client that requests servers again and again could lock out all others. Placements beyond the limit
+    /// take room only once their clients have arrived.
     quota: AddressQuota,
     servers: ServerTable,
     /// Whether a simulation server can take a client; all web clients follow it.
@@ -51,6 +51,12 @@ pub struct Registry {
     changes: StateHistory,
 }
 
+/// Placements of an address that may reserve room at once: 200, a large class behind one address.
+const BURST: NonZeroU32 = NonZeroU32::MIN.saturating_add(199);
+/// Further placements that may reserve room, per minute: 12.
+const PER_MINUTE: NonZeroU32 = NonZeroU32::MIN.saturating_add(11);
+/// Interval between two lookups of a name.
+const LOOKUP_INTERVAL: Duration = Duration::from_secs(1);
 /// Interval between checks of what changes without a report: placements that expire, monitors that have panicked.
 const TICK: Duration = Duration::from_millis(250);
 
@@ -59,20 +65,17 @@ impl Registry {
     pub fn start(
         config: Arc<SessionConfig>,
         latencies: prometheus::Histogram,
-        resolver: TokioResolver,
         available: watch::Sender<bool>,
     ) -> Addr<Self> {
         Self::create(|ctx| {
-            let registry = ctx.address();
-            let results = MonitorRecipients { probes: registry.clone().recipient(), lookups: registry.recipient() };
-            let monitors = Monitors::new(resolver, ProbeSettings::new(&config), results);
+            let servers = ServerTable::new(&config, ctx.address().recipient());
             Self {
                 fleet: LoadBalancer::new(config.policy()),
-                quota: quota::placements(),
+                quota: AddressQuota::new(BURST, PER_MINUTE),
                 changes: StateHistory::new(&config),
                 config,
                 latencies,
-                servers: ServerTable::new(monitors),
+                servers,
                 available,
             }
         })
@@ -100,8 +103,7 @@ impl Registry {
     }
 
     fn tick(&mut self, ctx: &mut Context<Self>) {
-        let restarted = self.servers.monitors().restart_gone();
-        if let Err(too_many) = restarted.and_then(|()| self.changes.restart_gone(&self.config)) {
+        if let Err(too_many) = self.servers.restart_gone().and_then(|()| self.changes.restart_gone()) {
             // The app stops the server when the registry has stopped.
             log::error!("{too_many}");
             ctx.stop();
@@ -132,8 +134,7 @@ impl Registry {
         let change = match answer {
             Ok(report) => record.succeeded(report, at, self.fleet.limit(server).unwrap_or(self.config.load_threshold)),
             Err(error) => {
-                let is_another =
-                    record.error.as_ref().is_some_and(|before| discriminant(before) != discriminant(&error));
+                let is_another = record.error().is_some_and(|before| discriminant(before) != discriminant(&error));
                 if is_another {
                     log::info!("{server}: still down: {error}");
                 }
@@ -171,15 +172,45 @@ impl Registry {
     }
 
     fn status_of(&self, address: &PublicAddress) -> Option<ServerStatus> {
-        let status = self.servers.get(address)?.status(address);
-        let failed = status.report.as_ref().map_or(0, |report| report.failed_starts);
+        let record = self.servers.get(address)?.clone();
+        let failed = record.current().map_or(0, |report| report.failed_starts);
+        let error = record.error().map(ToString::to_string);
         Some(ServerStatus {
-            error: status.error.or_else(|| self.fleet.is_ejected(address).then(|| ejected(failed))),
+            error: error.or_else(|| self.fleet.is_ejected(address).then(|| ejected(failed))),
             effective_load: self.fleet.effective_load(address),
             in_flight: self.fleet.in_flight(address),
             client_cost: self.fleet.client_cost(address),
-            ..status
+            address: address.clone(),
+            record,
         })
+    }
+
+    /// Looks up each name whose last lookup has ended.
+    fn look_up_names(&mut self, ctx: &mut Context<Self>) {
+        for name in self.servers.names.due() {
+            actix_rt::spawn(name_table::servers(name.clone()))
+                .into_actor(self)
+                .map(move |answer, registry, _| {
+                    registry.record_lookup(&name, answer.unwrap_or_else(|panic| Err(panic.to_string())));
+                })
+                .spawn(ctx);
+        }
+    }
+
+    fn record_lookup(&mut self, name: &DnsName, answer: LookupResult) {
+        let Some(NameChange { servers, turned }) = self.servers.names.record(name, answer) else {
+            return;
+        };
+        if let Some(status) = turned {
+            self.changes.add_name(status);
+        }
+        if servers {
+            let change = self.servers.follow_names(&self.config);
+            let (added, gone) = (change.added.len(), change.gone.len() + change.turned.len());
+            log::info!("{name}: leads to other servers: {added} new, {gone} gone or back");
+            self.follow(change);
+            self.publish();
+        }
     }
 }
 
@@ -197,6 +228,8 @@ impl Actor for Registry {
         let change = self.servers.apply(&self.config);
         self.follow(change);
         ctx.run_interval(TICK, Self::tick);
+        self.look_up_names(ctx);
+        ctx.run_interval(LOOKUP_INTERVAL, Self::look_up_names);
     }
 }
 
@@ -210,27 +243,6 @@ impl Handler<ProbeResult> for Registry {
         }
         self.record(&server, answer, Instant::now());
         self.publish();
-    }
-}
-
-impl Handler<LookupResult> for Registry {
-    type Result = ();
-
-    fn handle(&mut self, result: LookupResult, _: &mut Self::Context) {
-        let name = result.name.clone();
-        let Some(NameChange { servers, turn }) = self.servers.record_lookup(result) else {
-            return;
-        };
-        if let Some(turn) = turn {
-            self.changes.add_name(&name, turn);
-        }
-        if servers {
-            let change = self.servers.follow_names(&self.config);
-            let (added, gone) = (change.added.len(), change.gone.len() + change.turned.len());
-            log::info!("{name}: leads to other servers: {added} new, {gone} gone or back");
-            self.follow(change);
-            self.publish();
-        }
     }
 }
 
@@ -251,9 +263,10 @@ impl Handler<GetStatus> for Registry {
         let servers = self.servers.in_order().filter_map(|address| self.status_of(address));
         MessageResult(Arc::new(FleetStatus {
             available: *self.available.borrow(),
-            mean_load: Load::mean(self.servers.records().filter_map(ServerRecord::load)).map(Load::percent),
+            mean_load: Load::mean(self.servers.records().filter_map(|record| Some(record.current()?.load)))
+                .map(Load::percent),
             servers: servers.collect(),
-            names: self.servers.names(),
+            names: self.servers.names.status(),
             changes: self.changes.recent().clone(),
         }))
     }
@@ -263,7 +276,6 @@ impl Handler<Reconfigure> for Registry {
     type Result = ();
 
     fn handle(&mut self, Reconfigure(config): Reconfigure, _: &mut Self::Context) {
-        let config = Arc::new(self.config.reload(&config));
         self.fleet.set_policy(config.policy());
         self.config = config;
         let change = self.servers.apply(&self.config);

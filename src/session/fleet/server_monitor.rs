@@ -17,7 +17,6 @@ use actix_web::web::Bytes;
 use awc::error::{ConnectError, SendRequestError};
 use awc::http::StatusCode;
 use awc::http::header::CONTENT_LENGTH;
-use hickory_resolver::TokioResolver;
 use rustls::ClientConfig;
 
 use super::probe_error::ProbeError;
@@ -39,9 +38,8 @@ pub struct ProbeResult {
     pub answer: Result<ServerReport, ProbeError>,
 }
 
-/// How a server is probed. As a message it changes the settings of a monitor.
-#[derive(Message, Debug, Clone, Copy, PartialEq)]
-#[rtype(result = "()")]
+/// How servers are probed.
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ProbeSettings {
     /// Interval between the starts of two probes.
     pub interval: Duration,
@@ -70,8 +68,6 @@ pub struct ServerMonitor {
     client: awc::Client,
     results: Recipient<ProbeResult>,
     probing: bool,
-    /// The timer of the next probe, or of all that follow.
-    timer: SpawnHandle,
     /// Until when only `/load` is requested, because the server has no `/status`.
     load_only_until: Option<Instant>,
 }
@@ -94,10 +90,10 @@ const NO_SUCH_PAGE: [StatusCode; 4] =
     [StatusCode::NOT_FOUND, StatusCode::BAD_REQUEST, StatusCode::METHOD_NOT_ALLOWED, StatusCode::NOT_IMPLEMENTED];
 
 /// An HTTP client that keeps one connection to the simulation server.
-fn client(interval: Duration, resolver: TokioResolver, tls: Option<Arc<ClientConfig>>) -> awc::Client {
+fn client(interval: Duration, tls: Option<Arc<ClientConfig>>) -> awc::Client {
     let idle = (interval * 3).max(Duration::from_secs(15));
     // The whole probe has a timeout, its parts have none.
-    let tcp = TcpConnector::new(Resolver::custom(HostResolver::new(resolver))).service();
+    let tcp = TcpConnector::new(Resolver::custom(HostResolver::default())).service();
     let mut connector = awc::Connector::new().connector(tcp).conn_keep_alive(idle).timeout(NEVER);
     if let Some(config) = tls {
         connector = connector.rustls_0_23(config);
@@ -106,31 +102,15 @@ fn client(interval: Duration, resolver: TokioResolver, tls: Option<Arc<ClientCon
 }
 
 impl ServerMonitor {
-    /// A monitor of one server, whose host this resolver resolves. Must be created on the thread on which it will run.
+    /// A monitor of one server. Must be created on the thread on which it will run.
     pub fn new(
         server: PublicAddress,
         settings: ProbeSettings,
-        resolver: TokioResolver,
         tls: Option<Arc<ClientConfig>>,
         results: Recipient<ProbeResult>,
     ) -> Self {
-        let timer = SpawnHandle::default();
-        let client = client(settings.interval, resolver, tls);
-        Self { server, settings, client, results, probing: false, timer, load_only_until: None }
-    }
-
-    /// Probes now, and then at regular times in a random slot: reports of all servers in the same slot would delay the
-    /// requests of clients.
-    fn start_probing(&mut self, ctx: &mut Context<Self>) {
-        ctx.cancel_future(self.timer);
-        self.probe(ctx);
-        let since = BEGIN.elapsed();
-        let first = (since + self.settings.interval.mul_f64(rand::random())).div_duration_f64(SLOT).ceil();
-        let first = SLOT.mul_f64(first).saturating_sub(since);
-        self.timer = ctx.run_later(first, |monitor, ctx| {
-            monitor.probe(ctx);
-            monitor.timer = ctx.run_interval(monitor.settings.interval, Self::probe);
-        });
+        let client = client(settings.interval, tls);
+        Self { server, settings, client, results, probing: false, load_only_until: None }
     }
 
     fn probe(&mut self, ctx: &mut Context<Self>) {
@@ -169,17 +149,16 @@ impl ServerMonitor {
 impl Actor for ServerMonitor {
     type Context = Context<Self>;
 
+    /// Probes now, and then at regular times in a random slot: reports of all servers in the same slot would delay the
+    /// requests of clients.
     fn started(&mut self, ctx: &mut Self::Context) {
-        self.start_probing(ctx);
-    }
-}
-
-impl Handler<ProbeSettings> for ServerMonitor {
-    type Result = ();
-
-    fn handle(&mut self, settings: ProbeSettings, ctx: &mut Self::Context) {
-        self.settings = settings;
-        self.start_probing(ctx);
+        self.probe(ctx);
+        let since = BEGIN.elapsed();
+        let first = (since + self.settings.interval.mul_f64(rand::random())).div_duration_f64(SLOT).ceil();
+        ctx.run_later(SLOT.mul_f64(first).saturating_sub(since), |monitor, ctx| {
+            monitor.probe(ctx);
+            ctx.run_interval(monitor.settings.interval, Self::probe);
+        });
     }
 }
 
@@ -197,21 +176,20 @@ async fn probe(client: &awc::Client, url: &str, load_only: bool) -> Result<(Serv
         return parse_status(&body).map(|report| (report, true));
     }
     let body = get(client, &format!("{url}/load")).await?;
-    let (bytes, has_length) =
-        body.ok_or_else(|| ProbeError::BadAnswer("it has neither /status nor /load".to_owned()))?;
+    let (bytes, length) = body.ok_or_else(|| ProbeError::BadAnswer("it has neither /status nor /load".to_owned()))?;
     // awc takes the end of the connection for the end of the body: 95.5 may be 9. JSON that is cut off is none.
-    if !has_length {
-        return Err(ProbeError::BadAnswer("an answer without Content-Length".to_owned()));
+    if length != Some(bytes.len()) {
+        return Err(ProbeError::BadAnswer("an answer that does not end as its Content-Length says".to_owned()));
     }
     let load = Load::parse(&bytes).map_err(|error| ProbeError::BadAnswer(shortened(&error.to_string())))?;
     plausible(load).map(|load| (ServerReport::load_only(load), false))
 }
 
-/// Returns the body of a page and whether its length was announced, `None` if the server has no such page.
+/// Returns the body of a page and its length as announced, `None` if the server has no such page.
 ///
 /// # Errors
 /// When there is no answer, or one that is neither.
-async fn get(client: &awc::Client, url: &str) -> Result<Option<(Bytes, bool)>, ProbeError> {
+async fn get(client: &awc::Client, url: &str) -> Result<Option<(Bytes, Option<usize>)>, ProbeError> {
     let answer = match client.get(url).send().await {
         // A kept connection may have been closed, which is not a fault of the server.
         Err(error) if is_broken(&error) => client.get(url).send().await,
@@ -228,12 +206,7 @@ async fn get(client: &awc::Client, url: &str) -> Result<Option<(Bytes, bool)>, P
     let length = answer.headers().get(CONTENT_LENGTH).and_then(|value| value.to_str().ok()?.parse::<usize>().ok());
     let bytes = answer.timeout(NEVER).body().limit(MAX_ANSWER_SIZE).await;
     let bytes = bytes.map_err(|error| ProbeError::BadAnswer(shortened(&error.to_string())))?;
-    match length {
-        Some(length) if bytes.len() < length => {
-            Err(ProbeError::BadAnswer(format!("{} of {length} bytes", bytes.len())))
-        }
-        length => Ok(Some((bytes, length.is_some()))),
-    }
+    Ok(Some((bytes, length)))
 }
 
 /// Whether a connection broke, as opposed to one that could not be made.

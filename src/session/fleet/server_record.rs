@@ -3,14 +3,14 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
-use super::fleet_status::{ServerState, ServerStatus};
+use super::fleet_status::ServerState;
 use super::probe_error::ProbeError;
 use crate::session::mail::NoticeKind;
 use crate::session::placement;
-use crate::shared::domain::{Load, ProjectUrl, PublicAddress, ServerReport};
+use crate::shared::domain::{ProjectUrl, ServerReport};
 
 /// One simulation server.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub struct ServerRecord {
     /// Whether it is listed in `drainedServers`.
     pub drained: bool,
@@ -22,8 +22,6 @@ pub struct ServerRecord {
     pub since: SystemTime,
     /// Its last report; kept when it is down.
     pub report: Option<Arc<ServerReport>>,
-    /// Why the last probe failed, if it did.
-    pub error: Option<ProbeError>,
     /// The last error; kept after the server has answered again.
     pub last_error: Option<ProbeError>,
     /// Duration of the last probe.
@@ -31,7 +29,7 @@ pub struct ServerRecord {
     /// Time of its last valid answer.
     pub answered: Option<Instant>,
     /// Whether the last mail about its load said that it is full.
-    told_full: bool,
+    pub told_full: bool,
 }
 
 /// A server has changed its state.
@@ -56,7 +54,6 @@ impl ServerRecord {
             state: ServerState::Unknown,
             since: SystemTime::now(),
             report: None,
-            error: None,
             last_error: None,
             latency: None,
             answered: None,
@@ -69,7 +66,6 @@ impl ServerRecord {
     pub fn succeeded(&mut self, report: ServerReport, at: Instant, limit: f64) -> Option<ServerChange> {
         let (state, why) = self.judge(&report, limit);
         self.report = Some(Arc::new(report));
-        self.error = None;
         self.answered = Some(at);
         self.enter(state, why)
     }
@@ -77,9 +73,13 @@ impl ServerRecord {
     /// Records that a probe has failed. Returns what has changed.
     pub fn failed(&mut self, error: ProbeError) -> Option<ServerChange> {
         let why = error.to_string();
-        self.error = Some(error.clone());
         self.last_error = Some(error);
         self.enter(ServerState::Down, || why)
+    }
+
+    /// Why the last probe failed, if it did.
+    pub fn error(&self) -> Option<&ProbeError> {
+        self.last_error.as_ref().filter(|_| self.state == ServerState::Down)
     }
 
     /// The last report, unless the server is down.
@@ -104,27 +104,6 @@ impl ServerRecord {
             accepting,
         });
         (accepting || instances.is_some()).then(|| placement::LoadReport { load: report.load.percent(), instances })
-    }
-
-    /// The status of the server; the fields that only placement knows stay empty.
-    pub fn status(&self, address: &PublicAddress) -> ServerStatus {
-        ServerStatus {
-            address: address.clone(),
-            state: self.state,
-            since: self.since,
-            report: self.report.clone().filter(|_| self.state != ServerState::Down),
-            error: self.error.as_ref().map(ToString::to_string),
-            effective_load: None,
-            in_flight: 0,
-            client_cost: None,
-            latency: self.latency,
-            answered: self.answered,
-        }
-    }
-
-    /// The last load, if the server is not down.
-    pub fn load(&self) -> Option<Load> {
-        self.current().map(|report| report.load)
     }
 
     fn judge(&self, report: &ServerReport, limit: f64) -> (ServerState, impl FnOnce() -> String + use<>) {
@@ -193,6 +172,7 @@ pub fn is_refused<'a>(servers: impl Iterator<Item = &'a ServerRecord>, world: &P
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::shared::domain::Load;
 
     fn report(load: f64) -> ServerReport {
         ServerReport::load_only(Load::try_from(load).unwrap())

@@ -6,22 +6,28 @@
 
 use std::collections::{BTreeSet, HashMap};
 
-use super::fleet_status::NameStatus;
-use super::monitors::Monitors;
-use super::name_monitor::LookupResult;
-use super::name_table::{NameChange, NameTable};
-use super::server_monitor::ProbeSettings;
+use actix::prelude::*;
+
+use super::name_table::NameTable;
+use super::server_monitor::{ProbeResult, ProbeSettings, ServerMonitor, Stop};
 use super::server_record::ServerRecord;
 use crate::session::config::SessionConfig;
 use crate::shared::domain::PublicAddress;
+use crate::shared::http::tls;
+use crate::shared::run::{Supervisor, TooManyPanics};
 
-/// All servers and names, with their monitors.
+/// All servers and names, with the servers' monitors.
 pub struct ServerTable {
-    monitors: Monitors,
-    names: NameTable,
+    /// The names of the configuration that are resolved.
+    pub names: NameTable,
     /// In the order of the configuration.
     listed: Vec<PublicAddress>,
     watched: HashMap<PublicAddress, ServerRecord>,
+    settings: ProbeSettings,
+    monitors: Supervisor<PublicAddress, ServerMonitor>,
+    /// The thread of the monitors, so that requests of clients do not wait for them.
+    thread: Arbiter,
+    results: Recipient<ProbeResult>,
 }
 
 /// The difference between two lists of servers.
@@ -36,16 +42,32 @@ pub struct ListChange {
 }
 
 impl ServerTable {
-    /// No servers yet.
-    pub fn new(monitors: Monitors) -> Self {
-        Self { monitors, names: NameTable::default(), listed: Vec::new(), watched: HashMap::new() }
+    /// No servers yet; `results` receives each probe.
+    pub fn new(config: &SessionConfig, results: Recipient<ProbeResult>) -> Self {
+        let (settings, thread) = (ProbeSettings::new(config), Arbiter::new());
+        let monitors = monitors(&thread, settings, results.clone());
+        let (names, listed, watched) = (NameTable::default(), Vec::new(), HashMap::new());
+        Self { names, listed, watched, settings, monitors, thread, results }
     }
 
     /// Applies a configuration: servers that it no longer lists are removed.
     pub fn apply(&mut self, config: &SessionConfig) -> ListChange {
-        self.monitors.set_probes(ProbeSettings::new(config));
-        self.names.apply(&config.simulation_servers, &mut self.monitors);
+        let settings = ProbeSettings::new(config);
+        if std::mem::replace(&mut self.settings, settings) != settings {
+            self.monitors.all().for_each(|monitor| monitor.do_send(Stop));
+            self.monitors = monitors(&self.thread, settings, self.results.clone());
+            self.watched.keys().for_each(|server| self.monitors.add(server.clone()));
+        }
+        self.names.apply(&config.simulation_servers);
         self.list(config, true)
+    }
+
+    /// Replaces monitors that have panicked.
+    ///
+    /// # Errors
+    /// When there were too many panics.
+    pub fn restart_gone(&mut self) -> Result<(), TooManyPanics> {
+        self.monitors.restart_gone()
     }
 
     /// Applies changed names: a server that no name resolves to any more is removed if it does not answer.
@@ -74,7 +96,7 @@ impl ServerTable {
             self.forget(server);
         }
         for server in &change.added {
-            self.monitors.watch(server);
+            self.monitors.add(server.clone());
             self.watched.insert(server.clone(), ServerRecord::new(config.drained_servers.contains(server)));
         }
         change
@@ -84,18 +106,10 @@ impl ServerTable {
     pub fn forget(&mut self, server: &PublicAddress) {
         if self.watched.remove(server).is_some() {
             log::info!("{server}: no longer watched");
-            self.monitors.unwatch(server);
+            if let Some(monitor) = self.monitors.remove(server) {
+                monitor.do_send(Stop);
+            }
         }
-    }
-
-    /// Records a lookup; `None` if the name is no longer listed.
-    pub fn record_lookup(&mut self, result: LookupResult) -> Option<NameChange> {
-        self.names.record(result)
-    }
-
-    /// The monitors of servers and names.
-    pub fn monitors(&mut self) -> &mut Monitors {
-        &mut self.monitors
     }
 
     /// What is known of a server.
@@ -119,9 +133,18 @@ impl ServerTable {
         let unlisted: BTreeSet<_> = unlisted.map(|(server, _)| server).collect();
         self.listed.iter().chain(unlisted)
     }
+}
 
-    /// What is known of each name.
-    pub fn names(&self) -> Vec<NameStatus> {
-        self.names.status()
-    }
+/// No monitors yet; they run on this thread.
+fn monitors(
+    thread: &Arbiter,
+    settings: ProbeSettings,
+    results: Recipient<ProbeResult>,
+) -> Supervisor<PublicAddress, ServerMonitor> {
+    let (thread, tls) = (thread.handle(), tls::client_config());
+    Supervisor::new("monitor of server", move |server: &PublicAddress| {
+        let (server, tls, results) = (server.clone(), tls.clone(), results.clone());
+        let monitor = move |_: &mut Context<ServerMonitor>| ServerMonitor::new(server, settings, tls, results);
+        Some(ServerMonitor::start_in_arbiter(&thread, monitor))
+    })
 }

@@ -2,13 +2,11 @@
 //! `/monitor`, and the notices to the administrator. Part of the registry.
 
 use std::collections::VecDeque;
-use std::time::SystemTime;
 
-use super::fleet_status::{ServerState, StateChange};
-use super::name_table::LookupTransition;
+use super::fleet_status::{NameStatus, ServerState, StateChange};
 use super::server_record::{ServerChange, ServerRecord};
-use crate::session::config::{DnsName, SessionConfig};
-use crate::session::mail::{self, Channel, Mailer, Notice, NoticeKind, Topic};
+use crate::session::config::SessionConfig;
+use crate::session::mail::{self, Mailer, Notice, NoticeKind, Topic};
 use crate::shared::domain::PublicAddress;
 use crate::shared::run::{Supervisor, TooManyPanics};
 
@@ -16,7 +14,7 @@ use crate::shared::run::{Supervisor, TooManyPanics};
 pub struct StateHistory {
     recent: VecDeque<StateChange>,
     /// One for each channel of notices.
-    mailers: Supervisor<Channel, Mailer>,
+    mailers: Supervisor<&'static str, Mailer>,
 }
 
 /// How many changes are kept.
@@ -25,21 +23,15 @@ const KEPT: usize = 50;
 impl StateHistory {
     /// No changes yet. Starts the mailers.
     pub fn new(config: &SessionConfig) -> Self {
-        let mut mailers = Supervisor::new("mailer of notices by");
-        for channel in Channel::ALL {
-            if let Some(mailer) = mail::start(config, channel) {
-                mailers.add(channel, mailer);
-            }
-        }
-        Self { recent: VecDeque::new(), mailers }
+        Self { recent: VecDeque::new(), mailers: mail::start(config) }
     }
 
     /// Starts a new mailer if the last one has panicked. Its unsent notices are lost.
     ///
     /// # Errors
     /// When there were too many panics.
-    pub fn restart_gone(&mut self, config: &SessionConfig) -> Result<(), TooManyPanics> {
-        self.mailers.restart_gone(|channel| mail::start(config, *channel))
+    pub fn restart_gone(&mut self) -> Result<(), TooManyPanics> {
+        self.mailers.restart_gone()
     }
 
     /// Returns the last changes, the newest first.
@@ -60,19 +52,16 @@ impl StateHistory {
     }
 
     /// Adds that lookups of a name have begun to fail, or succeed again.
-    pub fn add_name(&mut self, name: &DnsName, turn: LookupTransition) {
-        let (at, server) = (SystemTime::now(), name.to_string());
-        let (state, event, why, error) = match turn {
-            LookupTransition::Fails(error) => {
+    pub fn add_name(&mut self, NameStatus { name, servers, error, since }: NameStatus) {
+        let (state, event, why) = match &error {
+            Some(error) => {
                 let why = format!("{error}; the servers that it led to before stay");
-                (ServerState::Down, NoticeKind::LookupFails, why, Some(error))
+                (ServerState::Down, NoticeKind::NotResponding, why)
             }
-            LookupTransition::WorksAgain(servers) => {
-                (ServerState::Up, NoticeKind::LookupWorks, format!("it leads to {servers} simulation servers"), None)
-            }
+            None => (ServerState::Up, NoticeKind::WorkingAgain, format!("it leads to {servers} simulation servers")),
         };
-        self.list(StateChange { at, server: server.clone(), state, why });
-        self.notify(&Notice { server, event, load: None, error, at });
+        self.list(StateChange { at: since, server: name.clone(), state, why });
+        self.notify(&Notice { server: name, event, load: None, error, at: since });
     }
 
     fn list(&mut self, change: StateChange) {

@@ -1,70 +1,78 @@
 //! The channels on which notices go: by mail, and to a messenger.
 
-use std::fmt;
+use std::time::Duration;
 
-use super::notice_text::NoticeText;
-use super::smtp::{MailError, SmtpRelay};
+use tokio::time::timeout;
+
+use super::notice_text::{NoticeText, signature};
+use super::smtp::SmtpRelay;
 use super::webhook::Webhook;
 use crate::session::config::SessionConfig;
+use crate::shared::text::one_line;
 
 /// A channel for notices. Each has its own retries: one that does not work holds up no other.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub enum Channel {
-    /// To the administrator's mail address.
-    Mail,
-    /// To the URL of the key `webhook`.
-    Webhook,
-}
-
-impl Channel {
-    /// All of them.
-    pub const ALL: [Self; 2] = [Self::Mail, Self::Webhook];
-}
-
-impl fmt::Display for Channel {
-    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
-        out.write_str(match self {
-            Self::Mail => "mail",
-            Self::Webhook => "webhook",
-        })
-    }
-}
-
-/// What delivers the notices of a channel.
 #[derive(Clone)]
-pub(super) enum Transport {
+pub struct Channel {
+    /// `HOST:PORT` of the server that takes the texts.
+    pub(super) server: String,
+    transport: Transport,
+    time_limit: Duration,
+}
+
+#[derive(Clone)]
+enum Transport {
     Smtp(Box<SmtpRelay>),
     Webhook(Webhook),
 }
 
-impl Transport {
-    /// The transport of a channel.
+impl Channel {
+    /// To the administrator's mail address.
     ///
     /// # Errors
-    /// When a key without which nothing is sent on this channel is not set.
-    pub(super) fn new(config: &SessionConfig, channel: Channel) -> Result<Self, MailError> {
-        match channel {
-            Channel::Mail => SmtpRelay::new(config).map(|relay| Self::Smtp(Box::new(relay))),
-            Channel::Webhook => Webhook::new(config).map(Self::Webhook),
+    /// When a key without which no mail is sent is not set.
+    pub fn mail(config: &SessionConfig) -> Result<Self, String> {
+        let relay = SmtpRelay::new(config).map_err(|key| format!("notifications are off: {key} is not set"))?;
+        let (server, transport) = (relay.server(), Transport::Smtp(Box::new(relay)));
+        Ok(Self { server, transport, time_limit: config.timing.mail_answer })
+    }
+
+    /// To the URL of the key `webhook`, if it is set.
+    pub fn webhook(config: &SessionConfig) -> Option<Self> {
+        let webhook = config.webhook.clone().map(Webhook)?;
+        let (server, transport) = (webhook.server(), Transport::Webhook(webhook));
+        Some(Self { server, transport, time_limit: config.timing.mail_answer })
+    }
+
+    /// Its name in the log.
+    pub(super) fn name(&self) -> &'static str {
+        match self.transport {
+            Transport::Smtp(_) => "mail",
+            Transport::Webhook(_) => "webhook",
         }
     }
 
-    /// `HOST:PORT` of the server that it delivers to.
-    pub(super) fn server(&self) -> &str {
-        match self {
-            Self::Smtp(relay) => relay.server(),
-            Self::Webhook(webhook) => webhook.server(),
-        }
-    }
-
-    /// Delivers a text. Returns the server's answer.
+    /// Delivers a text within `timing.mailAnswer`. Returns the server's answer.
     ///
     /// # Errors
-    /// When it is not taken.
-    pub(super) async fn deliver(&self, text: NoticeText) -> Result<String, MailError> {
-        match self {
-            Self::Smtp(relay) => relay.deliver(text).await,
-            Self::Webhook(webhook) => webhook.deliver(&text.body).await,
-        }
+    /// Why it is not taken, in one line.
+    pub(super) async fn deliver(&self, text: NoticeText) -> Result<String, String> {
+        let delivered = timeout(self.time_limit, async {
+            match &self.transport {
+                Transport::Smtp(relay) => relay.deliver(text).await,
+                Transport::Webhook(webhook) => webhook.deliver(&text.body).await,
+            }
+        });
+        let timed_out = |_| Err(format!("no answer within {} s", self.time_limit.as_secs_f64()));
+        let problem = |problem: String| format!("{}: {}", self.server, one_line(&problem));
+        delivered.await.unwrap_or_else(timed_out).map(|answer| one_line(&answer)).map_err(problem)
+    }
+
+    /// Sends a test now. Returns what was answered.
+    ///
+    /// # Errors
+    /// Why it was not taken.
+    pub async fn test(&self, config: &SessionConfig) -> Result<String, String> {
+        let answer = self.deliver(NoticeText::test(&signature(config))).await?;
+        Ok(format!("{} took a test: {answer}", self.server))
     }
 }

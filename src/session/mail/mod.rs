@@ -8,6 +8,5 @@ mod smtp;
 mod webhook;
 
 pub use channel::Channel;
-pub use mailer::{Mailer, start, test_mail, test_webhook};
+pub use mailer::{Mailer, start};
 pub use outbox::{Notice, NoticeKind, Topic};
-pub use smtp::MailError;

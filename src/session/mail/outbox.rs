@@ -5,12 +5,10 @@
 //! notice waits; it counts those that it has replaced.
 //!
 //! 1. The first notice waits for `gather`, so that servers that fail together are reported in one e-mail.
-//! 2. For `flapping` after an e-mail about a server, its notices are held back. After that time the next e-mail has one
-//!    entry for each topic.
-//! 3. One notice is not held back: that a server does not respond, if the last e-mail was only about its load.
-//! 4. After a failure all entries are retried, with a delay that doubles. An entry is given up after `mailPatience`.
+//! 2. For `flapping` after an e-mail about a topic, its notices are held back.
+//! 3. After a failure all entries are retried, with a delay that doubles. An entry is given up after `mailPatience`.
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::BTreeMap;
 use std::time::{Duration, Instant, SystemTime};
 
 use actix::Message;
@@ -34,25 +32,21 @@ pub struct Notice {
     pub at: SystemTime,
 }
 
-/// What happened to a simulation server or to a name, in the order of the lines in an e-mail.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+/// What happened to a simulation server, or to a name that resolves to some.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum NoticeKind {
-    /// Its probes fail.
+    /// Its probes or lookups fail.
     NotResponding,
-    /// Its probes succeed again.
+    /// They succeed again.
     WorkingAgain,
     /// Its load reached the threshold.
     MaximumLoad,
     /// Its load is below the threshold again.
     AvailableAgain,
-    /// Lookups of a name fail.
-    LookupFails,
-    /// They succeed again.
-    LookupWorks,
 }
 
 /// What an event is about.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Topic {
     /// Whether a server responds, or lookups of a name succeed.
     Health,
@@ -61,20 +55,11 @@ pub enum Topic {
 }
 
 impl NoticeKind {
-    /// What it happens to: singular and plural.
-    pub fn nouns(self) -> [&'static str; 2] {
-        match self {
-            Self::LookupFails | Self::LookupWorks => ["lookup of simulation servers", "lookups of simulation servers"],
-            _ => ["simulation server", "simulation servers"],
-        }
-    }
-
-    /// The event as text that follows [`NoticeKind::nouns`].
+    /// The event as text that follows 'simulation server'.
     pub fn words(self) -> &'static str {
         match self {
-            Self::LookupFails => "failing",
             Self::NotResponding => "not responding",
-            Self::WorkingAgain | Self::LookupWorks => "working again",
+            Self::WorkingAgain => "working again",
             Self::MaximumLoad => "reached maximum load",
             Self::AvailableAgain => "available again",
         }
@@ -83,14 +68,14 @@ impl NoticeKind {
     /// The topic of the event.
     pub fn topic(self) -> Topic {
         match self {
-            Self::NotResponding | Self::WorkingAgain | Self::LookupFails | Self::LookupWorks => Topic::Health,
+            Self::NotResponding | Self::WorkingAgain => Topic::Health,
             Self::MaximumLoad | Self::AvailableAgain => Topic::Capacity,
         }
     }
 }
 
-/// One entry of an e-mail: the newest notice about a server and topic, and how many it replaces.
-#[derive(Debug, Clone, PartialEq)]
+/// One entry of an e-mail: the newest notice about a topic of a server, and how many it replaces.
+#[derive(Debug, Clone)]
 pub struct MailEntry {
     /// The newest notice, with the last error that is known.
     pub notice: Notice,
@@ -103,139 +88,103 @@ pub struct MailEntry {
 }
 
 /// The notices that wait, and when the next e-mail is due.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub struct Outbox {
     timing: Timing,
-    servers: HashMap<String, Server>,
+    topics: BTreeMap<(Topic, String), TopicState>,
     /// The delay after the next failure.
     delay: Duration,
     /// After a failure: nothing is sent before this time.
     retry_at: Option<Instant>,
 }
 
-/// What the outbox knows of one server.
-#[derive(Debug, Default)]
-struct Server {
-    waiting: BTreeMap<Topic, MailEntry>,
-    cooldown: Option<Cooldown>,
-}
-
-/// The time after an e-mail about a server in which its notices are held back.
-#[derive(Debug, Clone, Copy)]
-struct Cooldown {
-    end: Instant,
-    /// Whether that e-mail had an entry about the server's health.
-    about_health: bool,
-}
-
-impl MailEntry {
-    /// Merges an older entry about the same server and topic.
-    fn replace(&mut self, older: Self) {
-        self.held_back += older.held_back + 1;
-        self.since = older.since;
-        self.notice.error = self.notice.error.take().or(older.notice.error);
-    }
+/// What the outbox knows of one topic of one server.
+#[derive(Debug, Clone, Default)]
+struct TopicState {
+    waiting: Option<MailEntry>,
+    /// Until when its notices are held back, after an e-mail about it.
+    held_until: Option<Instant>,
 }
 
 impl Outbox {
     /// An empty outbox.
     pub fn new(timing: &Timing) -> Self {
-        Self { timing: timing.clone(), servers: HashMap::new(), delay: timing.mail_retry, retry_at: None }
+        Self { timing: timing.clone(), topics: BTreeMap::new(), delay: timing.mail_retry, retry_at: None }
+    }
+
+    fn topic(&mut self, notice: &Notice) -> &mut TopicState {
+        self.topics.entry((notice.event.topic(), notice.server.clone())).or_default()
     }
 
     /// Adds a notice.
     pub fn add(&mut self, notice: Notice, now: Instant) {
-        let server = self.servers.entry(notice.server.clone()).or_default();
-        server.cooldown.take_if(|cooldown| cooldown.end <= now);
-        let topic = notice.event.topic();
-        let mut entry = MailEntry { notice, held_back: 0, since: now, first_try: None };
-        if let Some(older) = server.waiting.remove(&topic) {
-            entry.replace(older);
-        }
-        server.waiting.insert(topic, entry);
+        let topic = self.topic(&notice);
+        let older = topic.waiting.take();
+        let entry = MailEntry { notice, held_back: 0, since: now, first_try: None };
+        topic.waiting = Some(match older {
+            Some(older) => entry.replacing(older),
+            None => entry,
+        });
     }
 
     /// When the next e-mail is due, unless another notice is added.
     pub fn due(&self) -> Option<Instant> {
-        let due = self.servers.values().filter_map(|server| server.due(self.timing.gather)).min()?;
-        Some(self.retry_at.map_or(due, |retry_at| due.max(retry_at)))
+        let due = self.topics.values().filter_map(|topic| {
+            let gathered = topic.waiting.as_ref()?.since + self.timing.gather;
+            Some(topic.held_until.map_or(gathered, |end| end.max(gathered)))
+        });
+        due.min().map(|due| self.retry_at.map_or(due, |at| due.max(at)))
     }
 
-    /// Removes and returns what is due for mail now, sorted by event, then by server. The caller must report the
+    /// Removes and returns what is due for mail now, sorted by topic, then by server. The caller must report the
     /// outcome by [`Self::succeeded`] or [`Self::failed`].
     pub fn take(&mut self, now: Instant) -> Vec<MailEntry> {
-        self.servers.retain(|_, server| {
-            !server.waiting.is_empty() || server.cooldown.is_some_and(|cooldown| cooldown.end > now)
-        });
+        self.topics.retain(|_, topic| topic.waiting.is_some() || topic.held_until > Some(now));
         if self.due().is_none_or(|due| due > now) {
             return Vec::new();
         }
         // An e-mail that is sent anyway includes the entries that wait only for `gather`.
-        let ready = self.servers.values_mut().filter(|server| server.held_until().is_none_or(|end| end <= now));
-        let mut batch: Vec<MailEntry> =
-            ready.flat_map(|server| std::mem::take(&mut server.waiting).into_values()).collect();
+        let ready = self.topics.values_mut().filter(|topic| topic.held_until <= Some(now));
+        let mut batch: Vec<MailEntry> = ready.filter_map(|topic| topic.waiting.take()).collect();
         for entry in &mut batch {
             entry.first_try.get_or_insert(now);
         }
-        batch.sort_by(|one, other| {
-            (one.notice.event, &one.notice.server).cmp(&(other.notice.event, &other.notice.server))
-        });
         batch
     }
 
     /// Records that a batch was sent.
     pub fn succeeded(&mut self, batch: &[MailEntry], now: Instant) {
         (self.delay, self.retry_at) = (self.timing.mail_retry, None);
-        let end = now + self.timing.flapping;
         for MailEntry { notice, .. } in batch {
-            let cooldown = &mut self.servers.entry(notice.server.clone()).or_default().cooldown;
-            let before = cooldown.is_some_and(|cooldown| cooldown.end == end && cooldown.about_health);
-            *cooldown = Some(Cooldown { end, about_health: before || notice.event.topic() == Topic::Health });
+            self.topic(notice).held_until = Some(now + self.timing.flapping);
         }
     }
 
     /// Records that a batch was not sent. Returns the entries that are given up; the others wait for the next try.
-    ///
-    /// A permanent failure is retried too, because the administrator learns of it only by e-mail; but with the longest
-    /// delay from the start, so that no account is locked for too many failed logins.
-    pub fn failed(&mut self, batch: Vec<MailEntry>, permanent: bool, now: Instant) -> Vec<MailEntry> {
+    pub fn failed(&mut self, batch: Vec<MailEntry>, now: Instant) -> Vec<MailEntry> {
         let patience = self.timing.mail_patience;
-        let longest = self.timing.mail_retry.max(patience / 6);
-        let end = |entry: &MailEntry| entry.first_try.unwrap_or(now) + patience;
-        let (given_up, kept): (Vec<_>, Vec<_>) = batch.into_iter().partition(|entry| end(entry) <= now);
-        if permanent {
-            self.delay = longest;
-        }
-        // The last try of an entry is exactly at the end of its time.
-        let last = kept.iter().map(end).min();
+        let (given_up, kept): (Vec<_>, Vec<_>) =
+            batch.into_iter().partition(|entry| entry.first_try.is_some_and(|first| first + patience <= now));
         for entry in kept {
-            let waiting = &mut self.servers.entry(entry.notice.server.clone()).or_default().waiting;
-            match waiting.get_mut(&entry.notice.event.topic()) {
-                Some(newer) => newer.replace(entry),
-                None => drop(waiting.insert(entry.notice.event.topic(), entry)),
-            }
+            let topic = self.topic(&entry.notice);
+            topic.waiting = Some(match topic.waiting.take() {
+                Some(newer) => newer.replacing(entry),
+                None => entry,
+            });
         }
-        let next = now + self.delay;
-        self.retry_at = Some(last.map_or(next, |last| next.min(last)));
-        self.delay = (self.delay * 2).min(longest);
+        self.retry_at = Some(now + self.delay);
+        self.delay = (self.delay * 2).min(self.timing.mail_retry.max(patience / 6));
         given_up
     }
 }
 
-impl Server {
-    /// Until when the waiting entries are held back, if they are.
-    fn held_until(&self) -> Option<Instant> {
-        let cooldown = self.cooldown?;
-        let fails =
-            |entry: &MailEntry| matches!(entry.notice.event, NoticeKind::NotResponding | NoticeKind::LookupFails);
-        let fails_now = !cooldown.about_health && self.waiting.get(&Topic::Health).is_some_and(fails);
-        (!fails_now).then_some(cooldown.end)
-    }
-
-    /// When the waiting entries may be mailed.
-    fn due(&self, gather: Duration) -> Option<Instant> {
-        let first = self.waiting.values().map(|entry| entry.since).min()?;
-        Some(self.held_until().unwrap_or(first + gather))
+impl MailEntry {
+    /// This entry in place of an older one about the same topic.
+    fn replacing(mut self, older: Self) -> Self {
+        self.held_back += older.held_back + 1;
+        self.since = older.since;
+        self.notice.error = self.notice.error.or(older.notice.error);
+        self
     }
 }
 
@@ -281,7 +230,7 @@ mod tests {
                 mails.push((second, mail));
             }
         }
-        assert!(state.servers.is_empty(), "something is kept for good: {state:?}");
+        assert!(state.topics.is_empty(), "something is kept for good: {state:?}");
         mails
     }
 
@@ -357,7 +306,7 @@ mod tests {
     }
 
     /// The seconds of all tries until an e-mail is given up.
-    fn tries(permanent: bool) -> Vec<u64> {
+    fn tries() -> Vec<u64> {
         let start = Instant::now();
         let mut outbox = outbox();
         outbox.add(notice(1, NotResponding), start);
@@ -366,16 +315,15 @@ mod tests {
         while let Some(due) = outbox.due() {
             tries.push((due - first).as_secs());
             let batch = outbox.take(due);
-            let last = outbox.failed(batch, permanent, due);
+            let last = outbox.failed(batch, due);
             assert_eq!(last.len(), usize::from(outbox.due().is_none()));
         }
         tries
     }
 
     #[test]
-    fn delays_grow_for_an_hour_then_the_mail_is_given_up_and_a_refusal_is_tried_seldom() {
-        assert_eq!(tries(false), [0, 10, 30, 70, 150, 310, 630, 1_230, 1_830, 2_430, 3_030, 3_600]);
-        assert_eq!(tries(true), [0, 600, 1_200, 1_800, 2_400, 3_000, 3_600]);
+    fn delays_grow_for_an_hour_then_the_mail_is_given_up() {
+        assert_eq!(tries(), [0, 10, 30, 70, 150, 310, 630, 1_230, 1_830, 2_430, 3_030, 3_630]);
     }
 
     #[test]
@@ -384,7 +332,7 @@ mod tests {
         outbox.add(notice(1, NotResponding), Instant::now());
         let due = outbox.due().unwrap();
         let batch = outbox.take(due);
-        outbox.failed(batch, true, due);
+        outbox.failed(batch, due);
         let later = outbox.due().unwrap();
         assert!(outbox.take(due).is_empty(), "tried before it was due");
         let batch = outbox.take(later);
@@ -404,10 +352,10 @@ mod tests {
         let batch = outbox.take(due);
         outbox.add(notice(3, MaximumLoad), due);
         outbox.add(notice(1, WorkingAgain), due);
-        outbox.failed(batch, false, due);
+        outbox.failed(batch, due);
         let later = outbox.due().unwrap();
         let entries: Vec<_> =
             outbox.take(later).into_iter().map(|entry| (entry.notice.event, entry.held_back)).collect();
-        assert_eq!(entries, [(NotResponding, 0), (WorkingAgain, 1), (MaximumLoad, 0)]);
+        assert_eq!(entries, [(WorkingAgain, 1), (NotResponding, 0), (MaximumLoad, 0)]);
     }
 }

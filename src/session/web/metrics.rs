@@ -5,16 +5,16 @@ use crate::shared::http::Gauge;
 
 /// The gauges of `/metrics`.
 pub fn gauges<'text>(clients: usize, status: &FleetStatus) -> Vec<Gauge<'text>> {
-    let mut gauges = fleet_gauges(clients, status);
-    gauges.extend(server_gauges(&status.servers));
-    gauges.extend(name_gauges(&status.names));
-    gauges
-}
-
-/// The gauges of the fleet as a whole.
-fn fleet_gauges<'text>(clients: usize, status: &FleetStatus) -> Vec<Gauge<'text>> {
-    let count = |wanted: ServerState| status.servers.iter().filter(move |server| server.state == wanted).count();
-    let every = [ServerState::Unknown, ServerState::Up, ServerState::Full, ServerState::Draining, ServerState::Down];
+    let count = |wanted: ServerState| status.servers.iter().filter(|server| server.record.state == wanted).count();
+    let all = [ServerState::Unknown, ServerState::Up, ServerState::Full, ServerState::Draining, ServerState::Down];
+    let of_servers = |name, help, value: &dyn Fn(&ServerStatus) -> Option<f64>| {
+        let value = |server: &ServerStatus| Some((vec![server.address.to_string()], value(server)?));
+        Gauge { name, help, labels: &["server"], values: status.servers.iter().filter_map(value).collect() }
+    };
+    let of_names = |name, help, value: &dyn Fn(&NameStatus) -> f64| {
+        let value = |one: &NameStatus| (vec![one.name.clone()], value(one));
+        Gauge { name, help, labels: &["name"], values: status.names.iter().map(value).collect() }
+    };
     vec![
         Gauge::plain(
             "webots_session_available",
@@ -31,70 +31,35 @@ fn fleet_gauges<'text>(clients: usize, status: &FleetStatus) -> Vec<Gauge<'text>
             name: "webots_session_servers",
             help: "Simulation servers by state",
             labels: &["state"],
-            values: every.iter().map(|one| (vec![one.word().to_owned()], number(count(*one)))).collect(),
+            values: all.iter().map(|state| (vec![state.word().to_owned()], number(count(*state)))).collect(),
         },
-    ]
-}
-
-/// The gauges of each simulation server.
-fn server_gauges<'text>(servers: &[ServerStatus]) -> Vec<Gauge<'text>> {
-    let of_each = |value: &dyn Fn(&ServerStatus) -> Option<f64>| {
-        servers.iter().filter_map(|server| Some((vec![server.address.to_string()], value(server)?))).collect()
-    };
-    let labels: &[&str] = &["server"];
-    vec![
-        Gauge {
-            name: "webots_session_server_up",
-            help: "1 while a simulation server gives good answers",
-            labels,
-            values: of_each(&|server| {
-                Some(f64::from(u8::from(!matches!(server.state, ServerState::Down | ServerState::Unknown))))
-            }),
-        },
-        Gauge {
-            name: "webots_session_server_load_percent",
-            help: "Load that a simulation server reported last",
-            labels,
-            values: of_each(&|server| server.report.as_ref().map(|report| report.load.percent())),
-        },
-        Gauge {
-            name: "webots_session_server_effective_load_percent",
-            help: "The same, and the clients that it can't show yet",
-            labels,
-            values: of_each(&|server| server.effective_load),
-        },
-        Gauge {
-            name: "webots_session_server_in_flight",
-            help: "Clients that were sent to a simulation server and have not come yet",
-            labels,
-            values: of_each(&|server| Some(number(server.in_flight))),
-        },
-        Gauge {
-            name: "webots_session_server_latency_seconds",
-            help: "Time in which a simulation server answered last",
-            labels,
-            values: of_each(&|server| server.latency.map(|latency| latency.as_secs_f64())),
-        },
-    ]
-}
-
-/// The gauges of each name that resolves to simulation servers.
-fn name_gauges<'text>(names: &[NameStatus]) -> Vec<Gauge<'text>> {
-    let of_each =
-        |value: &dyn Fn(&NameStatus) -> f64| names.iter().map(|name| (vec![name.name.clone()], value(name))).collect();
-    vec![
-        Gauge {
-            name: "webots_session_lookup_up",
-            help: "1 while a name of simulation servers can be looked up",
-            labels: &["name"],
-            values: of_each(&|name| f64::from(u8::from(name.error.is_none()))),
-        },
-        Gauge {
-            name: "webots_session_lookup_servers",
-            help: "Simulation servers that a name leads to",
-            labels: &["name"],
-            values: of_each(&|name| number(name.servers)),
-        },
+        of_servers("webots_session_server_up", "1 while a simulation server gives good answers", &|server| {
+            Some(f64::from(u8::from(!matches!(server.record.state, ServerState::Down | ServerState::Unknown))))
+        }),
+        of_servers("webots_session_server_load_percent", "Load that a simulation server reported last", &|server| {
+            server.record.current().map(|report| report.load.percent())
+        }),
+        of_servers(
+            "webots_session_server_effective_load_percent",
+            "The same, and the clients that it can't show yet",
+            &|server| server.effective_load,
+        ),
+        of_servers(
+            "webots_session_server_in_flight",
+            "Clients that were sent to a simulation server and have not come yet",
+            &|server| Some(number(server.in_flight)),
+        ),
+        of_servers(
+            "webots_session_server_latency_seconds",
+            "Time in which a simulation server answered last",
+            &|server| server.record.latency.map(|latency| latency.as_secs_f64()),
+        ),
+        of_names("webots_session_lookup_up", "1 while a name of simulation servers can be looked up", &|name| {
+            f64::from(u8::from(name.error.is_none()))
+        }),
+        of_names("webots_session_lookup_servers", "Simulation servers that a name leads to", &|name| {
+            number(name.servers)
+        }),
     ]
 }
 

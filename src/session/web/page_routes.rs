@@ -59,7 +59,7 @@ async fn viewer(request: HttpRequest, server: web::Data<AppState>) -> HttpRespon
     with_status(&server, |status| {
         let script = server.config.viewer_script.as_ref().map(url::Url::as_str);
         let page = Viewer { version: env!("CARGO_PKG_VERSION"), examples: &server.config.examples, script };
-        let policy = ContentSecurityPolicy::own().own_websocket(&request).connect(&fleet(&server, status)).frames();
+        let policy = ContentSecurityPolicy::viewer(&request, &fleet(&server, status));
         html(page.render(), &policy)
     })
     .await
@@ -72,7 +72,7 @@ async fn webots_viewer(server: web::Data<AppState>) -> HttpResponse {
         let mut sources = fleet(&server, status);
         sources.extend(server.config.viewer_script.as_ref().map(|script| script.origin().ascii_serialization()));
         let page = WebotsViewer { version: env!("CARGO_PKG_VERSION") };
-        html(page.render(), &ContentSecurityPolicy::own().run(&sources).any_picture().framed().foreign())
+        html(page.render(), &ContentSecurityPolicy::foreign(&sources))
     })
     .await
 }

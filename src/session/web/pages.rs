@@ -152,8 +152,9 @@ pub fn monitor(
 
 impl<'status> Glance<'status> {
     fn new(status: &'status FleetStatus, clients: usize) -> Self {
-        let count =
-            |wanted: &[ServerState]| status.servers.iter().filter(|server| wanted.contains(&server.state)).count();
+        let count = |wanted: &[ServerState]| {
+            status.servers.iter().filter(|server| wanted.contains(&server.record.state)).count()
+        };
         let instances = || status.servers.iter().filter_map(instances);
         // Numbers that another server reports may be arbitrarily large.
         let sum = |part: fn(Instances) -> u32| instances().map(|one| u64::from(part(one))).sum::<u64>();
@@ -177,7 +178,7 @@ impl<'status> Glance<'status> {
 
 impl<'server> ServerRow<'server> {
     fn new(server: &'server ServerStatus, urls: &ClientUrls) -> Self {
-        let report = server.report.as_deref();
+        let (record, report) = (&server.record, server.record.current());
         let load = report.map(|report| report.load.percent());
         let repositories = report.map(|report| report.allowed_repositories.as_slice()).unwrap_or_default();
         let accepted = match report {
@@ -188,8 +189,8 @@ impl<'server> ServerRow<'server> {
         Self {
             server,
             monitor: format!("{}/monitor", urls.http_url(&server.address)),
-            rank: rank(server.state),
-            error: server.error.as_deref().filter(|_| server.state == ServerState::Down),
+            rank: rank(record.state),
+            error: server.error.as_deref().filter(|_| record.state == ServerState::Down),
             load,
             load_value: sort_value(load),
             effective: server.effective_load,
@@ -198,9 +199,9 @@ impl<'server> ServerRow<'server> {
             repositories: repositories.iter().map(|prefix| one_line(without_scheme(prefix.as_str()))).collect(),
             accepted,
             version: report.map(|report| report.version.as_str()).unwrap_or_default(),
-            latency: server.latency.map(milliseconds).unwrap_or_default(),
-            latency_value: server.latency.unwrap_or_default().as_micros(),
-            since: timestamp(server.since),
+            latency: record.latency.map(milliseconds).unwrap_or_default(),
+            latency_value: record.latency.unwrap_or_default().as_micros(),
+            since: timestamp(record.since),
         }
     }
 }
@@ -212,7 +213,7 @@ impl Changes<'_> {
 }
 
 fn instances(server: &ServerStatus) -> Option<Instances> {
-    server.report.as_ref()?.instances
+    server.record.current()?.instances
 }
 
 /// Sort rank of a state: states that need attention come first.

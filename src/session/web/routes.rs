@@ -11,7 +11,7 @@ use super::actions;
 use super::metrics;
 use super::page_routes;
 use super::queries::{status, with_status};
-use super::status::StatusResponse;
+use super::status::status_page;
 use super::web_client::WebClient;
 use crate::session::fleet::{Pick, PickError};
 use crate::session::state::AppState;
@@ -87,7 +87,7 @@ fn open_websocket(request: &HttpRequest, stream: web::Payload, server: &web::Dat
     let server = Arc::clone(server);
     // Pages that don't ask for them would not understand them.
     let wants_announcements = request.query_string().split('&').any(|one| one == "announcements=1");
-    websocket::open(request, stream, |reader| WebClient::new(server, peer, wants_announcements, (permit, reader)))
+    websocket::open(request, stream, WebClient::new(server, peer, wants_announcements, permit))
 }
 
 async fn availability(server: web::Data<AppState>) -> HttpResponse {
@@ -101,7 +101,7 @@ async fn load(server: web::Data<AppState>) -> HttpResponse {
 }
 
 async fn status_json(server: web::Data<AppState>) -> HttpResponse {
-    with_status(&server, |status| HttpResponse::Ok().json(StatusResponse::new(&server, status))).await
+    with_status(&server, |status| HttpResponse::Ok().json(status_page(&server, status))).await
 }
 
 async fn metrics_text(server: web::Data<AppState>) -> HttpResponse {

@@ -8,6 +8,7 @@ use std::sync::Arc;
 
 use actix::prelude::*;
 use actix_web_actors::ws::{CloseCode, CloseReason, Message, ProtocolError, WebsocketContext};
+use futures_util::StreamExt;
 use futures_util::stream::{self, Stream};
 use serde::Deserialize;
 use tokio::sync::watch;
@@ -36,14 +37,10 @@ pub struct WebClient {
 type Context = WebsocketContext<WebClient>;
 
 impl WebClient {
-    /// A client that has just connected; `permit` counts it, `reader` reads its messages.
-    pub fn new(
-        server: Arc<AppState>,
-        peer: Peer,
-        wants_announcements: bool,
-        (permit, reader): (ConnectionPermit, MessageReader),
-    ) -> Self {
-        Self { server, peer, liveness: Liveness::new(), sent: None, wants_announcements, reader, _permit: permit }
+    /// A client that has just connected; `permit` counts it.
+    pub fn new(server: Arc<AppState>, peer: Peer, wants_announcements: bool, permit: ConnectionPermit) -> Self {
+        let (liveness, reader) = (Liveness::new(), MessageReader::default());
+        Self { server, peer, liveness, sent: None, wants_announcements, reader, _permit: permit }
     }
 
     fn close(code: CloseCode, ctx: &mut Context) {
@@ -84,7 +81,7 @@ impl Actor for WebClient {
         liveness::watch(ctx, timing.ping, timing.silence, |client| &mut client.liveness);
         ctx.add_stream(updates(self.server.available.clone(), self.server.phase.clone()));
         if self.wants_announcements {
-            ctx.add_message_stream(announcements(self.server.announcements.subscribe()));
+            ctx.add_stream(announcements(self.server.announcements.subscribe()));
         }
     }
 }
@@ -93,6 +90,8 @@ impl Actor for WebClient {
 enum Update {
     /// Whether some simulation server can take a client.
     Availability(bool),
+    /// The text of the announcement; empty once it is over.
+    Announcement(String),
     /// The server stops; the connection is closed.
     Closing,
 }
@@ -100,51 +99,30 @@ enum Update {
 /// The current availability and its changes; then the stop of the server, which ends the stream.
 fn updates(mut available: watch::Receiver<bool>, phase: watch::Receiver<Phase>) -> impl Stream<Item = Update> {
     available.mark_changed();
-    stream::unfold((available, Box::pin(closing(phase)), false), async |(mut available, mut closing, is_closed)| {
-        if is_closed {
-            return None;
-        }
-        let update = tokio::select! {
-            biased;
-            () = &mut closing => Update::Closing,
-            changed = available.changed() => {
-                changed.ok()?;
-                Update::Availability(*available.borrow_and_update())
-            }
-        };
-        let is_closed = matches!(update, Update::Closing);
-        Some((update, (available, closing, is_closed)))
-    })
+    let changes = stream::unfold(available, async |mut available| {
+        available.changed().await.ok()?;
+        let update = Update::Availability(*available.borrow_and_update());
+        Some((update, available))
+    });
+    changes.take_until(Box::pin(closing(phase))).chain(stream::iter([Update::Closing]))
 }
 
-/// Text of the announcement for a client; empty once it is over.
-#[derive(Message)]
-#[rtype(result = "()")]
-struct Announced(String);
-
 /// The current announcement, if there is one, and each change.
-fn announcements(mut all: watch::Receiver<Option<Arc<Announcement>>>) -> impl Stream<Item = Announced> {
+fn announcements(mut all: watch::Receiver<Option<Arc<Announcement>>>) -> impl Stream<Item = Update> {
     if all.borrow().is_some() {
         all.mark_changed();
     }
     stream::unfold(all, async |mut all| {
         all.changed().await.ok()?;
         let text = all.borrow_and_update().as_ref().map(|one| client_text(&one.text)).unwrap_or_default();
-        Some((Announced(text), all))
+        Some((Update::Announcement(text), all))
     })
-}
-
-impl Handler<Announced> for WebClient {
-    type Result = ();
-
-    fn handle(&mut self, Announced(text): Announced, ctx: &mut Context) {
-        ctx.text(format!("announcement: {text}").trim_end().to_owned());
-    }
 }
 
 impl StreamHandler<Update> for WebClient {
     fn handle(&mut self, update: Update, ctx: &mut Context) {
         match update {
+            Update::Announcement(text) => ctx.text(format!("announcement: {text}").trim_end().to_owned()),
             Update::Closing => Self::close(CloseCode::Away, ctx),
             Update::Availability(available) if self.sent.replace(available) != Some(available) => {
                 ctx.text(if available { "1" } else { "0" });

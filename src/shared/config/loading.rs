@@ -17,8 +17,6 @@ use crate::shared::text::one_line;
 pub trait Configuration: DeserializeOwned + Serialize {
     /// Aliases of keys.
     const ALIASES: &'static [&'static str];
-    /// Removed keys, and what to do instead.
-    const REMOVED: &'static [(&'static str, &'static str)] = &[];
 
     /// Sets the values that depend on the machine and on the configuration file, and checks the rules between values.
     /// Returns warnings.
@@ -80,22 +78,12 @@ pub fn load<C: Configuration>(file: &Path) -> Result<LoadedConfig<C>, ConfigErro
     })?;
     // A repeated key is reported once.
     unknown.retain(|key: &String| seen.insert(key.clone()));
-    if let Some((key, advice)) = C::REMOVED.iter().find(|(key, _)| seen.contains(*key)) {
-        return Err(wrong(format!("{key}: {advice}")));
-    }
     let known = known_keys(&config);
     let mut warnings: Vec<String> = unknown.iter().map(|key| unknown_key(file, key, &known)).collect();
     let more =
         config.complete(file).map_err(|InvalidValueError { key, problem }| wrong(format!("{key}: {problem}")))?;
     warnings.extend(more.iter().map(|warning| format!("{}: {warning}", file.display())));
     Ok(LoadedConfig { config, warnings })
-}
-
-/// Returns the keys whose values differ; nested keys as `part.key`. Secrets are never among them.
-pub fn changed_keys<C: Serialize>(one: &C, other: &C) -> Vec<String> {
-    let (one, other) = (flat_values(one), flat_values(other));
-    let keys: BTreeSet<&String> = one.keys().chain(other.keys()).collect();
-    keys.into_iter().filter(|key| one.get(*key) != other.get(*key)).cloned().collect()
 }
 
 /// Returns all values of a configuration; nested ones under `part.key`.

@@ -6,7 +6,7 @@ mod secret;
 mod value;
 
 pub use error::ConfigError;
-pub use loading::{Configuration, InvalidValueError, LoadedConfig, changed_keys, load, require};
+pub use loading::{Configuration, InvalidValueError, LoadedConfig, load, require};
 pub use secret::Secret;
 pub use value::{
     ExpandedPath, expanded, folder, is_web_url, local_address, minutes_or_zero, object, one_or_many, optional_expanded,

@@ -52,7 +52,7 @@ impl<Prefixes: AsRef<[UrlPrefix]>> AdmissionRules<Prefixes> {
     /// # Errors
     /// Why it may not.
     pub fn admit<'world>(&self, world: &'world ProjectUrl, load: Load) -> Result<(), AdmissionError<'world>> {
-        if self.blocked.as_ref().iter().any(|prefix| prefix.may_cover(world)) {
+        if self.blocked.as_ref().iter().any(|prefix| prefix.covers(world)) {
             return Err(AdmissionError::Blocked(world));
         }
         if self.allowed.as_ref().iter().any(|prefix| prefix.covers(world)) {

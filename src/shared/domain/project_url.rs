@@ -1,7 +1,6 @@
 //! The URL of a world in a git repository, as a web client types it.
 
 use std::fmt;
-use std::hash::{DefaultHasher, Hash, Hasher};
 
 use percent_encoding::percent_decode_str;
 
@@ -20,8 +19,6 @@ pub struct ProjectUrl {
     reference: usize,
     /// The kind of reference that the URL names; GitHub and GitLab don't name it.
     kind: RefKind,
-    /// The hash of host and owner, see [`owner`].
-    owner: u64,
 }
 
 /// The kind of reference that a URL names.
@@ -94,8 +91,7 @@ impl ProjectUrl {
         if inside.iter().any(|segment| segment.eq_ignore_ascii_case(".git")) {
             return Err(url_error("a folder is called .git"));
         }
-        let owner = owner(&host, &segments);
-        Ok(Self { host, segments, repository, reference, kind, owner })
+        Ok(Self { host, segments, repository, reference, kind })
     }
 
     /// Returns the same world in the repository at this URL.
@@ -109,8 +105,7 @@ impl ProjectUrl {
         let repository = segments.len();
         let reference = repository + self.reference.saturating_sub(self.repository);
         segments.extend(self.segments.iter().skip(self.repository).cloned());
-        let owner = owner(&host, &segments);
-        Ok(Self { host, segments, repository, reference, kind: self.kind, owner })
+        Ok(Self { host, segments, repository, reference, kind: self.kind })
     }
 
     /// The Git host, in lower case, with its port if that is not 443.
@@ -133,14 +128,9 @@ impl ProjectUrl {
         format!("https://{}/{}", self.host, self.repository_segments().join("/"))
     }
 
-    /// The hash of host and owner, see [`owner`].
-    pub(super) fn owner(&self) -> u64 {
-        self.owner
-    }
-
     /// The path segments after the repository: reference, directory and world, without the segments that a Git host
     /// inserts before them.
-    pub(super) fn inside(&self) -> &[String] {
+    fn inside(&self) -> &[String] {
         self.segments.get(self.reference..).unwrap_or_default()
     }
 
@@ -172,14 +162,6 @@ impl fmt::Display for ProjectUrl {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(out, "https://{}/{}", self.host, self.segments.join("/"))
     }
-}
-
-/// The hash of a host and the first path segment (the owner of a repository), for fast searches in long lists of
-/// repositories. It is stable within one process only.
-pub(super) fn owner(host: &str, segments: &[String]) -> u64 {
-    let mut hasher = DefaultHasher::new();
-    (host, segments.first().map(|owner| owner.to_ascii_lowercase())).hash(&mut hasher);
-    hasher.finish()
 }
 
 /// A repository's name without the `.git` that git may append: both name the same repository.

@@ -103,7 +103,7 @@ impl ServerReport {
     /// that it does not rule out, and so does this one.
     pub fn accepts(&self, world: &ProjectUrl) -> bool {
         let Some(docker) = self.docker else {
-            let blocked = self.blocked_repositories.iter().any(|prefix| prefix.may_cover(world));
+            let blocked = self.blocked_repositories.iter().any(|prefix| prefix.covers(world));
             let open = self.allowed_repositories.is_empty() || self.share_idle_time > 0.0;
             return !blocked && (open || self.allowed_repositories.iter().any(|prefix| prefix.covers(world)));
         };

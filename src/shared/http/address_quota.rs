@@ -27,14 +27,17 @@ impl AddressQuota {
     /// Takes one from the quota of an address. Returns whether it had one left; always true if the address is unknown,
     /// or if too many addresses are tracked.
     pub fn take(&self, address: Option<IpAddr>) -> bool {
-        let Some(address) = address else {
-            return true;
-        };
+        address.and_then(|address| self.check(address)).unwrap_or(true)
+    }
+
+    /// Takes one from the quota of an address. Returns whether it had one left; `None` if too many addresses are
+    /// tracked.
+    pub fn check(&self, address: IpAddr) -> Option<bool> {
         if self.0.len() >= MAX_ADDRESSES {
             // Drops the addresses whose whole quota is available again.
             self.0.retain_recent();
         }
-        self.0.len() >= MAX_ADDRESSES || self.0.check_key(&address).is_ok()
+        (self.0.len() < MAX_ADDRESSES).then(|| self.0.check_key(&address).is_ok())
     }
 }
 
@@ -57,6 +60,7 @@ mod tests {
             assert!(quota.take(Some(address(number))));
         }
         assert!(quota.0.len() <= MAX_ADDRESSES);
+        assert_eq!(quota.check(address(20_000)), None);
     }
 
     #[test]

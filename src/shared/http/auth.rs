@@ -1,18 +1,16 @@
 //! HTTP basic authentication (RFC 7617) with the administrator's password and any user name, with a rate limit for
 //! guesses.
 
-use std::net::IpAddr;
+use std::net::Ipv6Addr;
 use std::num::NonZeroU32;
 
 use actix_web::http::header;
 use actix_web::{HttpRequest, HttpResponse};
 use base64::Engine;
 use base64::prelude::BASE64_STANDARD;
-use governor::clock::DefaultClock;
-use governor::state::keyed::HashMapStateStore;
-use governor::{Quota, RateLimiter};
 use subtle::ConstantTimeEq;
 
+use super::address_quota::AddressQuota;
 use super::peer::Peer;
 use super::routing::{reject_cross_site, retry_after};
 use crate::shared::config::Secret;
@@ -21,15 +19,12 @@ use crate::shared::config::Secret;
 const BURST: NonZeroU32 = NonZeroU32::MIN.saturating_add(29);
 /// Passwords that an address may send per minute after a burst: 12.
 const PER_MINUTE: NonZeroU32 = NonZeroU32::MIN.saturating_add(11);
-/// Largest number of addresses that are tracked. Others may send no password until some of these have regained their
-/// quota.
-const MAX_ADDRESSES: usize = 10_000;
 
 /// Checks the password of requests.
 #[derive(Debug)]
 pub struct BasicAuth {
     password: Secret,
-    attempts: RateLimiter<Option<IpAddr>, HashMapStateStore<Option<IpAddr>>, DefaultClock>,
+    attempts: AddressQuota,
 }
 
 /// Why a request is refused, as text for the client.
@@ -46,7 +41,7 @@ pub enum AuthError {
 impl BasicAuth {
     /// Creates an authenticator for this password.
     pub fn new(password: Secret) -> Self {
-        Self { password, attempts: RateLimiter::hashmap(Quota::per_minute(PER_MINUTE).allow_burst(BURST)) }
+        Self { password, attempts: AddressQuota::new(BURST, PER_MINUTE) }
     }
 
     /// Checks the password of a request, in constant time. Right passwords count as attempts too, so that a client over
@@ -56,8 +51,10 @@ impl BasicAuth {
     /// When the password is missing or wrong, or `peer` has sent too many.
     pub fn check(&self, request: &HttpRequest, peer: Peer) -> Result<(), AuthError> {
         let given = password_of(request).ok_or(AuthError::NoPassword)?;
-        // A proxy that does not report client addresses shares one quota with all such proxies.
-        if !self.may_try(peer) {
+        // A proxy that does not report client addresses shares one quota with all such proxies. While too many addresses
+        // are tracked, others may send no password.
+        let address = peer.rate_limit_key().unwrap_or(Ipv6Addr::UNSPECIFIED.into());
+        if self.attempts.check(address) != Some(true) {
             return Err(AuthError::TooMany);
         }
         if given.as_bytes().ct_eq(self.password.reveal().as_bytes()).into() {
@@ -65,13 +62,6 @@ impl BasicAuth {
         }
         log::warn!("client {peer}: a wrong administrator password");
         Err(AuthError::NoPassword)
-    }
-
-    fn may_try(&self, peer: Peer) -> bool {
-        if self.attempts.len() >= MAX_ADDRESSES {
-            self.attempts.retain_recent();
-        }
-        self.attempts.len() < MAX_ADDRESSES && self.attempts.check_key(&peer.rate_limit_key()).is_ok()
     }
 }
 
@@ -121,24 +111,5 @@ impl AuthError {
                 .body(self.to_string()),
             Self::TooMany => HttpResponse::TooManyRequests().insert_header(retry_after()).body(self.to_string()),
         }
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    fn auth() -> BasicAuth {
-        BasicAuth::new(serde_json::from_str("\"open sesame\"").unwrap())
-    }
-
-    #[test]
-    fn only_so_many_addresses_are_counted() {
-        let auth = auth();
-        for number in 0..MAX_ADDRESSES + 9 {
-            let address = IpAddr::from(u32::try_from(number << 8).unwrap().to_be_bytes());
-            assert_eq!(auth.may_try(Peer::Client(address)), number < MAX_ADDRESSES, "{number}");
-        }
-        assert!(auth.attempts.len() <= MAX_ADDRESSES);
     }
 }

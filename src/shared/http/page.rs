@@ -6,16 +6,8 @@ use actix_web::{HttpRequest, HttpResponse};
 use crate::shared::domain::PublicAddress;
 
 /// What a page may load and connect to: the value of `Content-Security-Policy`.
-#[derive(Debug, Clone)]
-pub struct ContentSecurityPolicy {
-    scripts: Vec<String>,
-    styles: Vec<String>,
-    pictures: Vec<String>,
-    connections: Vec<String>,
-    frames: bool,
-    framed: bool,
-    foreign: bool,
-}
+#[derive(Debug)]
+pub struct ContentSecurityPolicy(String);
 
 /// Largest number of hosts in a policy, so that it fits into a header.
 const MOST_HOSTS: usize = 40;
@@ -23,82 +15,36 @@ const MOST_HOSTS: usize = 40;
 impl ContentSecurityPolicy {
     /// A page that loads only files of its own server, and no inline script or style.
     pub fn own() -> Self {
-        let own = || vec!["'self'".to_owned()];
-        Self {
-            scripts: own(),
-            styles: own(),
-            pictures: own(),
-            connections: own(),
-            frames: false,
-            framed: false,
-            foreign: false,
-        }
+        Self::new(&[], "", &[], ["'none'", "'none'"], "")
     }
 
-    /// Lets a page open WebSockets to the server that it comes from: for older browsers `'self'` does not include them.
-    /// The host comes from `Host` only: any client can set `X-Forwarded-Host` and `Forwarded`.
-    pub fn own_websocket(mut self, request: &HttpRequest) -> Self {
-        self.connections.extend(own_sources(request).into_iter().filter(|source| source.starts_with("ws")));
-        self
+    /// A viewer: it also connects to these sources, and embeds pages of its own server (`frame-src`). It may open
+    /// WebSockets to that server, which for older browsers `'self'` does not include. The host comes from `Host` only:
+    /// any client can set `X-Forwarded-Host` and `Forwarded`.
+    pub fn viewer(request: &HttpRequest, sources: &[String]) -> Self {
+        let own = own_sources(request).into_iter().filter(|source| source.starts_with("ws"));
+        let connections: Vec<String> = own.chain(sources.iter().cloned()).collect();
+        Self::new(&[], "", &connections, ["'self'", "'none'"], "")
     }
 
-    /// Lets a page connect to these sources.
-    pub fn connect(mut self, sources: &[String]) -> Self {
-        self.connections.extend_from_slice(sources);
-        self
+    /// A page that runs scripts of these sources, also WebAssembly, with their styles and images, and loads images and
+    /// data that a world refers to, from any host. Pages of the same server embed it (`frame-ancestors`). It has an origin
+    /// of its own (`sandbox`): its scripts can't use the password or the storage of the server's other pages.
+    pub fn foreign(sources: &[String]) -> Self {
+        let sandbox = "; sandbox allow-scripts allow-modals allow-pointer-lock";
+        Self::new(sources, " data: blob: https:", sources, ["'none'", "'self'"], sandbox)
     }
 
-    /// Lets a page run scripts of these sources, also WebAssembly, with their styles and images.
-    pub fn run(mut self, sources: &[String]) -> Self {
-        let files = || sources.iter().filter(|source| !source.starts_with("ws")).cloned();
-        for list in [&mut self.scripts, &mut self.styles, &mut self.pictures] {
-            list.extend(files());
-        }
-        self.connections.extend_from_slice(sources);
-        self.scripts.push("'wasm-unsafe-eval'".to_owned());
-        self
-    }
-
-    /// Lets a page load images and data that a world refers to, from any host.
-    pub fn any_picture(mut self) -> Self {
-        self.pictures.extend(["data:".to_owned(), "blob:".to_owned(), "https:".to_owned()]);
-        self.connections.extend(["data:".to_owned(), "blob:".to_owned(), "https:".to_owned()]);
-        self
-    }
-
-    /// Lets a page embed pages of its own server (`frame-src`).
-    pub fn frames(mut self) -> Self {
-        self.frames = true;
-        self
-    }
-
-    /// Lets pages of the same server embed this one (`frame-ancestors`).
-    pub fn framed(mut self) -> Self {
-        self.framed = true;
-        self
-    }
-
-    /// Gives a page an origin of its own (`sandbox`): its scripts can't use the password or the storage of the server's
-    /// other pages.
-    pub fn foreign(mut self) -> Self {
-        self.foreign = true;
-        self
-    }
-
-    /// Returns the header's value.
-    pub fn text(&self) -> String {
-        let own_or_none = |allowed| if allowed { "'self'" } else { "'none'" };
-        format!(
-            "default-src 'none'; script-src {}; style-src {}; img-src {}; connect-src {}; frame-src {}; \
-             frame-ancestors {}; base-uri 'none'; form-action 'self'{}",
-            self.scripts.join(" "),
-            self.styles.join(" "),
-            self.pictures.join(" "),
-            self.connections.join(" "),
-            own_or_none(self.frames),
-            own_or_none(self.framed),
-            if self.foreign { "; sandbox allow-scripts allow-modals allow-pointer-lock" } else { "" },
-        )
+    fn new(run: &[String], data: &str, connect: &[String], [frames, ancestors]: [&str; 2], sandbox: &str) -> Self {
+        let own = |sources: Vec<&str>| [vec!["'self'"], sources].concat().join(" ");
+        let files = own(run.iter().map(String::as_str).filter(|source| !source.starts_with("ws")).collect());
+        let wasm = if run.is_empty() { "" } else { " 'wasm-unsafe-eval'" };
+        let connect = own(connect.iter().map(String::as_str).collect());
+        Self(format!(
+            "default-src 'none'; script-src {files}{wasm}; style-src {files}; img-src {files}{data}; \
+             connect-src {connect}{data}; frame-src {frames}; frame-ancestors {ancestors}; base-uri 'none'; \
+             form-action 'self'{sandbox}"
+        ))
     }
 }
 
@@ -156,7 +102,7 @@ pub fn width(percent: &f64) -> String {
 pub fn html(page: Result<String, askama::Error>, policy: &ContentSecurityPolicy) -> HttpResponse {
     match page {
         Ok(page) => HttpResponse::Ok()
-            .insert_header((header::CONTENT_SECURITY_POLICY, policy.text()))
+            .insert_header((header::CONTENT_SECURITY_POLICY, policy.0.as_str()))
             .insert_header((header::X_CONTENT_TYPE_OPTIONS, "nosniff"))
             .insert_header((header::REFERRER_POLICY, "no-referrer"))
             .insert_header(("Cross-Origin-Opener-Policy", "same-origin"))
@@ -168,6 +114,8 @@ pub fn html(page: Result<String, askama::Error>, policy: &ContentSecurityPolicy)
 
 #[cfg(test)]
 mod tests {
+    use actix_web::test::TestRequest;
+
     use super::*;
 
     fn addresses(texts: &[&str]) -> Vec<PublicAddress> {
@@ -193,9 +141,9 @@ mod tests {
     #[test]
     fn a_page_reaches_the_host_that_it_was_asked_from() {
         let policy = |headers: &[(&'static str, &'static str)]| {
-            let request = actix_web::test::TestRequest::default();
+            let request = TestRequest::default();
             let request = headers.iter().fold(request, |request, header| request.insert_header(*header));
-            ContentSecurityPolicy::own().own_websocket(&request.to_http_request()).text()
+            ContentSecurityPolicy::viewer(&request.to_http_request(), &[]).0
         };
         assert!(
             policy(&[("host", "a.example:8443")])
@@ -214,11 +162,11 @@ mod tests {
         let fleet = vec!["http://a:*".to_owned()];
         for policy in [
             ContentSecurityPolicy::own(),
-            ContentSecurityPolicy::own().connect(&fleet).frames(),
-            ContentSecurityPolicy::own().run(&fleet).any_picture(),
+            ContentSecurityPolicy::viewer(&TestRequest::default().to_http_request(), &fleet),
+            ContentSecurityPolicy::foreign(&fleet),
         ] {
-            assert!(!policy.text().contains("unsafe-inline"), "{}", policy.text());
-            assert!(policy.text().starts_with("default-src 'none'; script-src 'self'"), "{}", policy.text());
+            assert!(!policy.0.contains("unsafe-inline"), "{}", policy.0);
+            assert!(policy.0.starts_with("default-src 'none'; script-src 'self'"), "{}", policy.0);
         }
     }
 }

@@ -1,6 +1,5 @@
 //! The log: to a file that is rotated, or to standard output.
 
-use std::fmt;
 use std::io::Write;
 use std::path::Path;
 
@@ -13,51 +12,26 @@ use crate::shared::text::one_line;
 /// Number of rotated files that are kept, as in the Python servers.
 const OLD_FILES: usize = 10;
 
-/// The destination of log lines.
-#[derive(Debug, Clone, Copy)]
-pub enum LogTarget<'path> {
-    /// To standard output, debug lines included.
-    Stdout,
-    /// To this file, which is rotated.
-    File(&'path Path),
-}
-
-impl<'path> LogTarget<'path> {
-    /// Standard output if `debug` is set, else this file.
-    pub fn new(debug: bool, file: &'path Path) -> Self {
-        if debug { Self::Stdout } else { Self::File(file) }
-    }
-}
-
-impl fmt::Display for LogTarget<'_> {
-    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::Stdout => out.write_str("standard output"),
-            Self::File(path) => path.display().fmt(out),
-        }
-    }
-}
-
-/// Starts logging. The environment variable `RUST_LOG` overrides which lines are written.
+/// Starts logging to a file, which is rotated; without one to standard output, debug lines included. The environment variable `RUST_LOG` overrides which lines are written.
 ///
 /// # Errors
 /// When the file or its directory can't be created.
-pub fn start(target: LogTarget<'_>) -> std::io::Result<()> {
+pub fn start(file: Option<&Path>) -> std::io::Result<()> {
     // The HTTP decoder logs each malformed message as an error. Any client could flood the log with these. Resolver
     // errors are logged by the caller.
-    let default_level = match target {
-        LogTarget::Stdout => {
+    let default_level = match file {
+        None => {
             "debug,actix_http=info,actix_http::h1::decoder=off,actix_server=info,mio=info,rustls=info,h2=info,\
              hickory_net=off,hickory_proto=off,hickory_resolver=off"
         }
-        LogTarget::File(_) => {
+        Some(_) => {
             "info,actix_http::h1::decoder=off,actix_server=warn,hickory_net=off,hickory_proto=off,hickory_resolver=off"
         }
     };
     let mut builder = Builder::from_env(Env::default().default_filter_or(default_level));
-    builder.target(match target {
-        LogTarget::Stdout => Target::Stdout,
-        LogTarget::File(path) => Target::Pipe(Box::new(RotatedFile::open(path, OLD_FILES)?)),
+    builder.target(match file {
+        None => Target::Stdout,
+        Some(path) => Target::Pipe(Box::new(RotatedFile::open(path, OLD_FILES)?)),
     });
     builder.format(|out, record| {
         let time = timestamp_in_milliseconds(std::time::SystemTime::now());

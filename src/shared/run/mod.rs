@@ -10,13 +10,11 @@ pub mod service_manager;
 mod signals;
 pub mod start;
 mod supervisor;
-mod threads;
 mod timestamp;
 
 pub use app_error::AppError;
-pub use logging::LogTarget;
 pub use open_files::{limit_clients, raise_open_files};
 pub use rotated_file::RotatedFile;
 pub use signals::{Phase, ServerCommand, Signals, closing};
 pub use supervisor::{Supervisor, TooManyPanics};
-pub use timestamp::{read_timestamp, seconds_since_1970, serialize_timestamp, timestamp, timestamp_in_milliseconds};
+pub use timestamp::{seconds_since_1970, serialize_timestamp, timestamp, timestamp_in_milliseconds};

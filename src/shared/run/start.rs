@@ -5,8 +5,7 @@ use std::mem::ManuallyDrop;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
-use super::logging::{self, LogTarget};
-use super::threads::check_threads;
+use super::logging;
 use super::{pid_file, service_manager};
 use crate::shared::config::{self, Configuration, LoadedConfig};
 use crate::shared::text::one_line;
@@ -57,9 +56,9 @@ pub fn check<C: Configuration>(loaded: &LoadedConfig<C>) -> ExitCode {
     }
 }
 
-/// Starts the log, writes the PID file if requested, and runs a server until it stops.
+/// Starts the log in a file, without one on standard output, writes the PID file if requested, and runs a server until it stops.
 pub fn serve<E: std::error::Error>(
-    target: LogTarget<'_>,
+    log: Option<&Path>,
     options: &CommonArgs,
     warnings: &[String],
     server: impl Future<Output = Result<(), E>>,
@@ -69,17 +68,14 @@ pub fn serve<E: std::error::Error>(
         Ok(file) => file,
         Err(error) => return failed(&format!("the process id can't be written: {error}")),
     };
-    if let Err(error) = logging::start(target) {
-        return failed(&format!("the log {target} can't be written: {error}"));
+    if let Err(error) = logging::start(log) {
+        let log = log.unwrap_or(Path::new("to standard output"));
+        return failed(&format!("the log {} can't be written: {error}", log.display()));
     }
     // A panic is a bug in this program. It is logged, because a service has no terminal.
     std::panic::set_hook(Box::new(|panic| log::error!("{panic}")));
     for warning in warnings {
         log::warn!("{warning}");
-    }
-    if let Err(why) = check_threads() {
-        log::error!("{why}");
-        return failed(&why);
     }
     // It is not dropped, because that would wait for blocking threads, as in a slow lookup of a name.
     let system = ManuallyDrop::new(actix_rt::System::new());

@@ -10,9 +10,13 @@ use actix::prelude::*;
 const MAX_PANICS: usize = 5;
 const WINDOW: Duration = Duration::from_mins(1);
 
+/// Starts an actor; `None` if it can't.
+type Start<K, A> = Box<dyn Fn(&K) -> Option<Addr<A>>>;
+
 /// All actors of one kind, by key. actix does not restart an actor that has panicked.
 pub struct Supervisor<K, A: Actor> {
     kind: &'static str,
+    start: Start<K, A>,
     actors: BTreeMap<K, Addr<A>>,
     panics: VecDeque<Instant>,
 }
@@ -25,24 +29,21 @@ pub struct TooManyPanics {
 }
 
 impl<K: Ord + Display, A: Actor> Supervisor<K, A> {
-    /// No actors yet.
-    pub fn new(kind: &'static str) -> Self {
-        Self { kind, actors: BTreeMap::new(), panics: VecDeque::new() }
+    /// No actors yet; `start` starts one.
+    pub fn new(kind: &'static str, start: impl Fn(&K) -> Option<Addr<A>> + 'static) -> Self {
+        Self { kind, start: Box::new(start), actors: BTreeMap::new(), panics: VecDeque::new() }
     }
 
-    /// Adds an actor that was started.
-    pub fn add(&mut self, key: K, actor: Addr<A>) {
-        self.actors.insert(key, actor);
+    /// Starts an actor.
+    pub fn add(&mut self, key: K) {
+        if let Some(actor) = (self.start)(&key) {
+            self.actors.insert(key, actor);
+        }
     }
 
     /// Removes an actor, and returns it.
     pub fn remove(&mut self, key: &K) -> Option<Addr<A>> {
         self.actors.remove(key)
-    }
-
-    /// Returns an actor.
-    pub fn get(&self, key: &K) -> Option<&Addr<A>> {
-        self.actors.get(key)
     }
 
     /// Returns all actors.
@@ -54,7 +55,7 @@ impl<K: Ord + Display, A: Actor> Supervisor<K, A> {
     ///
     /// # Errors
     /// When there were too many panics.
-    pub fn restart_gone(&mut self, start: impl Fn(&K) -> Option<Addr<A>>) -> Result<(), TooManyPanics> {
+    pub fn restart_gone(&mut self) -> Result<(), TooManyPanics> {
         let now = Instant::now();
         self.actors.retain(|key, actor| {
             if actor.connected() {
@@ -62,7 +63,7 @@ impl<K: Ord + Display, A: Actor> Supervisor<K, A> {
             }
             log::error!("{} {key} has panicked, a new one is started", self.kind);
             self.panics.push_back(now);
-            start(key).inspect(|new| *actor = new.clone()).is_some()
+            (self.start)(key).inspect(|new| *actor = new.clone()).is_some()
         });
         while self.panics.pop_front_if(|at| now.duration_since(*at) > WINDOW).is_some() {}
         if self.panics.len() > MAX_PANICS { Err(TooManyPanics { kind: self.kind }) } else { Ok(()) }
@@ -93,17 +94,16 @@ mod tests {
 
     #[actix_rt::test]
     async fn an_actor_that_panics_is_started_again_until_it_happens_too_often() {
-        let mut supervisor = Supervisor::new("the actor");
-        supervisor.add("one", Fragile.start());
-        supervisor.add("other", Fragile.start());
-        let other = supervisor.get(&"other").unwrap().clone();
+        let mut supervisor = Supervisor::new("the actor", |_: &&str| Some(Fragile.start()));
+        supervisor.add("one");
+        supervisor.add("other");
+        let other = supervisor.actors["other"].clone();
         for panics in 1..=MAX_PANICS + 1 {
-            let actor = supervisor.get(&"one").unwrap().clone();
+            let actor = supervisor.actors["one"].clone();
             actor.send(Panic).await.unwrap_err();
-            let enough = supervisor.restart_gone(|_| Some(Fragile.start()));
-            assert_eq!(enough.is_err(), panics > MAX_PANICS, "after {panics}");
-            assert_ne!(supervisor.get(&"one").unwrap(), &actor);
+            assert_eq!(supervisor.restart_gone().is_err(), panics > MAX_PANICS, "after {panics}");
+            assert_ne!(supervisor.actors["one"], actor);
         }
-        assert_eq!(supervisor.get(&"other").unwrap(), &other, "one that has not panicked was replaced");
+        assert_eq!(supervisor.actors["other"], other, "one that has not panicked was replaced");
     }
 }

@@ -49,13 +49,10 @@ const MAILBOX: usize = 64;
 type Context = WebsocketContext<WebClient>;
 
 impl WebClient {
-    /// A client that has just connected; `permit` counts it, `reader` reads its messages.
-    pub fn new(
-        server: Arc<AppState>,
-        (peer, user): (Peer, Option<String>),
-        (permit, reader): (ConnectionPermit, MessageReader),
-    ) -> Self {
-        Self { server, peer, user, session: Attached::No, liveness: Liveness::new(), reader, _permit: permit }
+    /// A client that has just connected; `permit` counts it.
+    pub fn new(server: Arc<AppState>, (peer, user): (Peer, Option<String>), permit: ConnectionPermit) -> Self {
+        let (liveness, reader) = (Liveness::new(), MessageReader::default());
+        Self { server, peer, user, session: Attached::No, liveness, reader, _permit: permit }
     }
 
     fn finish(&mut self, last_words: String, code: CloseCode, ctx: &mut Context) {

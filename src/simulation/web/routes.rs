@@ -50,7 +50,7 @@ async fn client(request: HttpRequest, stream: web::Payload, server: web::Data<Ap
         .as_ref()
         .and_then(|name| server.config.trusted_proxies.trusted_header(&request, name));
     let server = Arc::clone(&server);
-    websocket::open(&request, stream, |reader| WebClient::new(server, (peer, user), (permit, reader)))
+    websocket::open(&request, stream, WebClient::new(server, (peer, user), permit))
 }
 
 async fn load(server: web::Data<AppState>) -> HttpResponse {

@@ -72,11 +72,11 @@ async fn watch(request: HttpRequest, which: web::Query<Which>, server: web::Data
         stream: format!("stream/{}", token.reveal()),
         script: installed.filter(|_| which.viewer != "small"),
     };
-    html(page.render(), &ContentSecurityPolicy::own().own_websocket(&request).frames())
+    html(page.render(), &ContentSecurityPolicy::viewer(&request, &[]))
 }
 
 /// Webots' own viewer shows what worlds bring: it runs in an embedded page with an origin of its own.
 async fn viewer(request: HttpRequest) -> HttpResponse {
     let page = WebotsViewer { version: env!("CARGO_PKG_VERSION") };
-    html(page.render(), &ContentSecurityPolicy::own().run(&own_sources(&request)).any_picture().framed().foreign())
+    html(page.render(), &ContentSecurityPolicy::foreign(&own_sources(&request)))
 }
