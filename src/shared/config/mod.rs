@@ -1,11 +1,13 @@
 //! Configuration files: loading, errors, and the types of values.
 
 mod error;
+mod keys;
 mod loading;
 mod secret;
 mod value;
 
 pub use error::ConfigError;
+pub(crate) use keys::keys;
 pub use loading::{Configuration, InvalidValueError, LoadedConfig, changed_keys, load, require};
 pub use secret::Secret;
 pub use value::{
