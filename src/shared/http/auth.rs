@@ -124,6 +124,12 @@ impl AuthError {
     }
 }
 
+impl actix_web::ResponseError for AuthError {
+    fn error_response(&self) -> HttpResponse {
+        self.answer()
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
