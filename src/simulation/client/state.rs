@@ -21,6 +21,8 @@ pub enum State {
     CheckingOut {
         /// How it is shown.
         mode: Mode,
+        /// Whether its client may resume it.
+        resumable: bool,
         /// The slot and its port.
         slot: Slot,
     },
@@ -49,6 +51,8 @@ pub struct StartRequest {
     pub world: ProjectUrl,
     /// How it is shown.
     pub mode: Mode,
+    /// Whether its client may resume it.
+    pub resumable: bool,
 }
 
 /// A running Webots. Dropping the handle stops it.
