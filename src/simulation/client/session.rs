@@ -17,7 +17,7 @@ use crate::shared::run::closing;
 use crate::simulation::checkout::Progress;
 use crate::simulation::client_identity::ClientIdentity;
 use crate::simulation::ends::EndReason;
-use crate::simulation::protocol;
+use crate::simulation::protocol::{self, Mode};
 use crate::simulation::sessions::{Attachment, ClientAction, FromClient, ToClient};
 use crate::simulation::simulation_id::SimulationId;
 use crate::simulation::slots::{Slot, SlotEvent};
@@ -37,6 +37,10 @@ pub struct Session {
     pub(super) client: Option<Recipient<ToClient>>,
     pub(super) attachment: u64,
     pub(super) state: State,
+    /// How it is shown.
+    pub(super) mode: Mode,
+    /// Whether its client may resume it.
+    pub(super) resumable: bool,
     /// Whether Webots was ready.
     pub(super) is_ready: bool,
     /// What it keeps for a client that returns.
@@ -64,11 +68,13 @@ impl Session {
                 client: Some(client),
                 attachment: 0,
                 state: State::Over,
+                mode: request.mode.unwrap_or_default(),
+                resumable: request.resumable.unwrap_or_default(),
                 is_ready: false,
                 resumption: Resumption::default(),
                 is_watched: false,
             };
-            session.request_slot(request, ctx);
+            session.request_slot(&request.url, ctx);
             session
         });
         Attachment::new(session.recipient(), 0)
@@ -190,8 +196,8 @@ impl Handler<SlotEvent> for Session {
 
     fn handle(&mut self, event: SlotEvent, ctx: &mut Self::Context) {
         match (event, std::mem::replace(&mut self.state, State::Over)) {
-            (SlotEvent::Granted(port), State::Waiting { request, lease }) => {
-                self.check_out(request, Slot { lease, port }, ctx);
+            (SlotEvent::Granted(port), State::Waiting { world, lease }) => {
+                self.check_out(world, Slot { lease, port }, ctx);
             }
             (SlotEvent::Rejected(why), State::Waiting { .. }) => {
                 self.count("full");
@@ -223,7 +229,7 @@ impl Handler<Progress> for Session {
     type Result = ();
 
     fn handle(&mut self, Progress(text): Progress, _: &mut Self::Context) {
-        if matches!(self.state, State::CheckingOut { .. }) {
+        if matches!(self.state, State::CheckingOut(_)) {
             self.hint(protocol::loading(&text));
         }
     }

@@ -7,7 +7,8 @@ use actix::prelude::*;
 use actix_web_actors::ws::CloseCode;
 
 use super::session::Session;
-use super::state::{StartRequest, State, WebotsHandle};
+use super::state::{State, WebotsHandle};
+use crate::shared::domain::ProjectUrl;
 use crate::simulation::checkout::{Progress, Project};
 use crate::simulation::ends::EndReason;
 use crate::simulation::machine::sensors::Gpu;
@@ -41,9 +42,9 @@ impl Session {
         self.refer(why, ctx);
     }
 
-    pub(super) fn request_slot(&mut self, request: &protocol::Start, ctx: &mut Context<Self>) {
+    pub(super) fn request_slot(&mut self, url: &str, ctx: &mut Context<Self>) {
         let admitted = if self.server.start_quota.take(self.peer.rate_limit_key()) {
-            self.server.admit(&request.url)
+            self.server.admit(url)
         } else {
             Err("Too many simulations were asked for from your address. Try again in a minute".to_owned())
         };
@@ -59,17 +60,11 @@ impl Session {
         self.id = Some(lease.id());
         self.text(protocol::session(lease.id()));
         log::info!("{}: asks for {world}{}", self.name(), self.identity);
-        let (mode, resumable) = (request.mode.unwrap_or_default(), request.resumable.unwrap_or_default());
-        self.state = State::Waiting { request: StartRequest { world, mode, resumable }, lease };
+        self.state = State::Waiting { world, lease };
     }
 
-    pub(super) fn check_out(
-        &mut self,
-        StartRequest { world, mode, resumable }: StartRequest,
-        slot: Slot,
-        ctx: &mut Context<Self>,
-    ) {
-        self.state = State::CheckingOut { mode, resumable, slot };
+    pub(super) fn check_out(&mut self, world: ProjectUrl, slot: Slot, ctx: &mut Context<Self>) {
+        self.state = State::CheckingOut(slot);
         let instance = match self.server.run.instance() {
             Ok(instance) => instance,
             Err(error) => return self.fail_own(&format!("No room for a project: {error}"), ctx),
@@ -97,9 +92,7 @@ impl Session {
             Ok(program) => program,
             Err(why) => return self.fail_own(&why, ctx),
         };
-        let State::CheckingOut { mode, resumable, slot } = std::mem::replace(&mut self.state, State::Over) else {
-            return;
-        };
+        let State::CheckingOut(slot) = std::mem::replace(&mut self.state, State::Over) else { return };
         log::info!("{}: {} is for Webots {}", self.name(), project.world.path.display(), project.world.version);
         let version = project.world.version.clone();
         slot.lease.update(|one| one.version = Some(version));
@@ -107,7 +100,7 @@ impl Session {
             self.text(protocol::loading(warning));
         }
         self.text(protocol::loading("webots is starting"));
-        if resumable && !self.server.config.timing.absence.is_zero() {
+        if self.resumable && !self.server.config.timing.absence.is_zero() {
             self.resumption.number = Some(self.server.sessions.register(ctx.address().recipient()));
         }
         let gpu = self.take_gpu(&slot.lease);
@@ -119,7 +112,7 @@ impl Session {
             program,
             checkouts: Arc::clone(&self.server.checkouts),
             project: Arc::new(project),
-            mode,
+            mode: self.mode,
             gpu,
             slot,
             streams: Arc::clone(&self.server.streams),

@@ -18,7 +18,7 @@ const ENDED: &str = "ended";
 /// The directory for abnormal ends.
 const FAILED: &str = "failed";
 /// Number of files that are kept, by directory.
-const KEPT: [(&str, usize); 2] = [(ENDED, 20), (FAILED, 100)];
+const KEPT: [(&str, usize); 3] = [(FOLDER_OF_RUNNING, usize::MAX), (ENDED, 20), (FAILED, 100)];
 /// Age from which a file is removed. That includes the output of a simulation whose end was not recorded because the
 /// server was killed.
 const AGE: Duration = Duration::from_hours(14 * 24);
@@ -58,28 +58,18 @@ pub(super) fn keep(logs: &Path, ended: &Ended) -> io::Result<()> {
 
 /// Removes surplus and old files.
 pub(super) fn prune(logs: &Path) {
+    let is_old = |written| SystemTime::now().duration_since(written).is_ok_and(|age| age > AGE);
     for (folder, most) in KEPT {
         let mut all = files(&logs.join(folder));
         all.sort();
         let surplus = all.len().saturating_sub(most);
-        for (_, file) in all.drain(..surplus) {
-            remove(&file);
+        for (number, (written, file)) in all.into_iter().enumerate() {
+            if (number < surplus || is_old(written))
+                && let Err(error) = fs::remove_file(&file)
+            {
+                log::warn!("{} can't be removed: {error}", file.display());
+            }
         }
-    }
-    for folder in [FOLDER_OF_RUNNING, ENDED, FAILED] {
-        for (_, file) in files(&logs.join(folder)).into_iter().filter(|(written, _)| is_old(*written)) {
-            remove(&file);
-        }
-    }
-}
-
-fn is_old(written: SystemTime) -> bool {
-    SystemTime::now().duration_since(written).is_ok_and(|age| age > AGE)
-}
-
-fn remove(file: &Path) {
-    if let Err(error) = fs::remove_file(file) {
-        log::warn!("{} can't be removed: {error}", file.display());
     }
 }
 
