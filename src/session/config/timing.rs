@@ -4,7 +4,8 @@ use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
-use crate::shared::config::{keys, seconds};
+use crate::shared::config::keys::keys;
+use crate::shared::config::seconds;
 
 keys! {
 /// Durations, in seconds.

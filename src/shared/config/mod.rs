@@ -1,16 +1,15 @@
 //! Configuration files: loading, errors, and the types of values.
 
 mod error;
-mod keys;
+pub mod keys;
 mod loading;
 mod secret;
 mod value;
 
 pub use error::ConfigError;
-pub(crate) use keys::keys;
 pub use loading::{Configuration, InvalidValueError, LoadedConfig, changed_keys, load, require};
 pub use secret::Secret;
 pub use value::{
-    ExpandedPath, expanded, folder, is_web_url, local_address, minutes_or_zero, object, one_or_many, optional_expanded,
-    optional_object, optional_whole, percent, seconds, seconds_or_zero, whole,
+    ExpandedPath, choice, expanded, folder, is_web_url, local_address, minutes_or_zero, object, one_or_many,
+    optional_expanded, optional_object, optional_whole, percent, seconds, seconds_or_zero, whole,
 };

@@ -1,6 +1,7 @@
 //! A web client, and the session of its simulation from the request for it to its end.
 
 pub mod quota;
+mod resume;
 mod resumption;
 mod session;
 mod start;

@@ -2,7 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::shared::config::{ExpandedPath, keys, one_or_many, whole};
+use crate::shared::config::keys::keys;
+use crate::shared::config::{ExpandedPath, one_or_many, whole};
 
 keys! {
 /// How simulations run in containers.

@@ -2,7 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::shared::config::{keys, optional_whole, whole};
+use crate::shared::config::keys::keys;
+use crate::shared::config::{optional_whole, whole};
 
 keys! {
 /// The resource limits of one simulation.

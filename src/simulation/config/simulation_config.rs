@@ -12,8 +12,9 @@ use super::isolation::{IsolationSetting, SandboxFolders, VariableName};
 use super::resources::ResourceLimits;
 use super::streaming::Streaming;
 use super::timing::Timing;
+use crate::shared::config::keys::keys;
 use crate::shared::config::{
-    Configuration, ExpandedPath, InvalidValueError, Secret, expanded, folder, is_web_url, keys, local_address,
+    Configuration, ExpandedPath, InvalidValueError, Secret, choice, expanded, folder, is_web_url, local_address,
     minutes_or_zero, object, one_or_many, optional_expanded, optional_whole, percent, require, seconds, whole,
 };
 use crate::shared::domain::{PublicUrl, UrlPrefix, check_host};
@@ -44,6 +45,7 @@ pub struct SimulationConfig {
     #[serde(deserialize_with = "optional_expanded")]
     pub public_url: Option<PublicUrl> = None,
     /// How clients reach the streams of simulations: at the ports of their Webots, or through this server. Default: `direct`.
+    #[serde(deserialize_with = "choice")]
     pub streaming: Streaming = Streaming::default(),
     /// Folder of `simulation/output.log`, `simulation/monitor.csv` and the instances' output. Default: `log`.
     #[serde(deserialize_with = "folder")]
@@ -61,6 +63,7 @@ pub struct SimulationConfig {
     /// Directory of local projects. Accepted for existing files; not used.
     pub projects_dir: Option<ExpandedPath> = None,
     /// The isolation level of simulations. Default: `auto`.
+    #[serde(deserialize_with = "choice")]
     pub isolation: IsolationSetting = IsolationSetting::default(),
     /// What a sandbox mounts besides the system and Webots.
     #[serde(deserialize_with = "object")]

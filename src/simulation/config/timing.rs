@@ -4,7 +4,8 @@ use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
-use crate::shared::config::{keys, seconds, seconds_or_zero};
+use crate::shared::config::keys::keys;
+use crate::shared::config::{seconds, seconds_or_zero};
 
 keys! {
 /// Durations, in seconds.
