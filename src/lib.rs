@@ -6,8 +6,8 @@
 //! | module | contents |
 //! |---|---|
 //! | [`shared::text`] | untrusted texts, made safe to show |
-//! | [`shared::config`] | configuration files: loading, errors, kinds of values |
-//! | [`shared::domain`] | addresses, loads, world URLs and the forges that they name, a server's report |
+//! | [`shared::config`] | configuration files: loading, errors, kinds of values, keys with their defaults (`keys`) |
+//! | [`shared::domain`] | addresses, loads, world URLs and the forges that they name (`project_url`), a server's report |
 //! | [`shared::run`] | start, readiness, log, stop |
 //! | [`shared::http`] | pages, live updates, WebSockets, limits, certificates, metrics |
 //! | [`session::placement`] | which server gets the next client: ranking, load, cost |
@@ -15,21 +15,22 @@
 //! | [`session::mail`] | notices: to whom (`smtp`), what is in them (`notice_text`), when they go (`outbox`), by mail and by webhook |
 //! | [`session::fleet`] | the registry and the monitors of simulation servers |
 //! | [`session::web`] | routes, pages, `/status`, Prometheus metrics and the WebSocket of the session server |
-//! | [`simulation::process`] | process trees: how they start and end; directories of simulations |
+//! | [`simulation::process`] | process trees: how they start and end (`process_group`; what has left its group: `process_tree`); directories of simulations |
 //! | [`simulation::machine`] | readings of the machine and its GPUs, the load; which GPU a simulation gets (`spread`) |
-//! | [`simulation::checkout`] | worlds checked out with git |
+//! | [`simulation::checkout`] | worlds checked out with git, within limits of time and size (`checkout_limits`) |
 //! | `simulation::isolation` | how a simulation is launched: its level of isolation, environment and limits |
 //! | [`simulation::container`] | simulations in containers: what a project requests, its image, its compose project |
-//! | [`simulation::ends`] | how simulations have ended: counter, table, kept output |
-//! | [`simulation::webots`] | one running Webots: command line, output, end |
+//! | [`simulation::ends`] | how simulations have ended: counter, table, their logs (`kept_output`) |
+//! | [`simulation::webots`] | one running Webots: command line, what it prints and its log (`output`), end |
 //! | [`simulation::client`] | one web client, the session of its simulation |
-//! | [`simulation::slots`] | the slots that clients wait for: leases, the queue, shares |
+//! | [`simulation::slots`] | the slots that clients wait for: leases, the queue (`slot_pool`), shares (`party`) |
 //! | [`simulation::sessions`] | how a connection is attached to its session, and how a client resumes it |
 //! | [`simulation::streams`] | the streams of running simulations, and the tokens that lead to them |
 //! | `simulation::relay` | a stream between a client and the port of its Webots |
 //! | `simulation::web` | routes, pages, `/status` and Prometheus metrics of the simulation server |
 //!
-//! The HTML of pages is in `templates/session` and `templates/simulation`, their styles and scripts in `templates/assets`.
+//! The HTML of pages is in `templates/session` and `templates/simulation` (`row.html`: a row of the monitor's table), their
+//! styles and scripts in `templates/assets`.
 //!
 //! Each server also has a folder `config` (every key), its `app` (start and end) and its `state` (what its paths share). Files
 //! of `simulation` are the wire [`protocol`](simulation::protocol), the `snapshot` of all simulations, the `simulation_id`, the

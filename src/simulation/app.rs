@@ -22,7 +22,7 @@ use crate::shared::run::{
     AppError, Phase, ServerCommand, Signals, limit_clients, permanent, raise_open_files, service_manager, start,
 };
 use crate::simulation::checkout::{CacheDir, CheckoutLimits, CheckoutService};
-use crate::simulation::client::{outcome, quota};
+use crate::simulation::client::quota;
 use crate::simulation::container::ContainerService;
 use crate::simulation::isolation::{Launcher, Watcher};
 use crate::simulation::machine::{LoadMonitor, Spread, UsageMonitor};
@@ -213,8 +213,9 @@ fn assemble(
     let logs = config.log_dir.0.join("simulation");
     let ends = Ends::start(logs, launcher.level().to_string(), &metrics);
     let ends = ends.map_err(|why| AppError::Unavailable(format!("ends of simulations can't be recorded: {why}")))?;
-    let slots = SlotPool::new(config.streaming_ports(), config.waiting_line, config.max_places_per_address);
-    let slots = slots.with_share_of_users(config.max_places_per_user).with_ends(ends.clone()).start();
+    let (per_address, per_user) = (config.max_places_per_address, config.max_places_per_user);
+    let slots =
+        SlotPool::new(config.streaming_ports(), config.waiting_line, per_address, per_user, ends.clone()).start();
     let csv = config.monitor_log_enabled.then(|| config.log_dir.0.join("simulation/monitor.csv"));
     let spread = config.spreads().then(|| Arc::new(Spread::over(config.displays_of_gpus().len())));
     let (load_monitor, readings) = LoadMonitor::new(slots.clone(), run.path(), csv, spread.clone());
@@ -223,7 +224,10 @@ fn assemble(
     let usage = UsageMonitor::default();
     let watcher = Watcher::start(run.path().to_owned(), config.disk_reserve, usage.clone());
     let watcher = watcher.map_err(|error| AppError::Unavailable(format!("simulations can't be watched: {error}")))?;
-    let starts = outcome::counter(&metrics)?;
+    let starts = metrics.counter("webots_simulation_starts_total", "Simulations that were asked for", "outcome")?;
+    for outcome in ["ready", "refused", "full"] {
+        starts.with_label_values(&[outcome]);
+    }
     let failed_starts = Arc::default();
     let problem =
         readiness::watch(Arc::clone(&config), run.path().to_owned(), readings.clone(), Arc::clone(&failed_starts));

@@ -10,62 +10,53 @@ use crate::simulation::isolation::{IsolationLevel, Launcher, Network};
 use crate::simulation::machine::display;
 use crate::simulation::machine::sensors::{GpuReading, GpuSensor};
 
-/// The result of one check.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Finding {
-    /// The subject of the check.
-    pub topic: &'static str,
-    /// What was found; or the problem, and what to do about it.
-    pub result: Result<String, String>,
-}
-
-impl std::fmt::Display for Finding {
-    fn fmt(&self, out: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        match &self.result {
-            Ok(found) => write!(out, "{}: {found}", self.topic),
-            Err(problem) => write!(out, "warning: {}: {problem}", self.topic),
-        }
-    }
-}
-
-/// Checks everything. It runs programs and connects to the display, so it can take some seconds.
-pub fn check(config: &SimulationConfig) -> Vec<Finding> {
-    let (first, last) = if config.isolation == IsolationSetting::Container {
-        let checks = [("docker", container::check(config)), ("templates", container::check_templates(config))];
-        (checks.map(|(topic, result)| Finding { topic, result }).to_vec(), None)
+/// Checks everything, and returns a line for each finding: what was found; or the problem, and what to do about it. It
+/// runs programs and connects to the display, so it can take some seconds.
+pub fn check(config: &SimulationConfig) -> Vec<String> {
+    let mut findings = if config.isolation == IsolationSetting::Container {
+        vec![("docker", container::check(config)), ("templates", container::check_templates(config))]
     } else {
-        let first = [("webots", webots(config)), ("display", display(config))];
-        let first = first.map(|(topic, result)| Finding { topic, result });
-        (first.to_vec(), Some(Finding { topic: "Xvfb", result: xvfb(config) }))
+        vec![("webots", webots(config)), ("display", display(config))]
     };
-    let git = version(&["git", "--version"], "git is not there: no world can be checked out");
-    let lfs = version(&["git-lfs", "--version"], "git-lfs is not there: large files of Git LFS will be missing");
-    let always = [("git", git), ("git-lfs", lfs)].map(|(topic, result)| Finding { topic, result });
-    let launcher = Launcher::new(config).map_err(|error| format!("the server does not start: {error}"));
-    let unenforced_limits = launcher.as_ref().map(Launcher::unenforced_limits).unwrap_or_default();
-    let unenforced_limits = unenforced_limits.into_iter().map(|line| Finding { topic: "limits", result: Err(line) });
-    let network = launcher.as_ref().ok().and_then(network);
-    let is_shared = launcher.as_ref().is_ok_and(|launcher| launcher.network() == Some(Network::Shared));
-    let streams = (is_shared && !config.ports_are_public()).then(|| streams(config));
-    let forgeable = is_shared && config.user_header.is_some() && config.trusted_proxies.trusts_loopback();
-    let users = forgeable.then(|| {
+    if config.spreads() {
+        findings.push(("GPUs", gpus(config)));
+    }
+    findings.push(("git", version(&["git", "--version"], "git is not there: no world can be checked out")));
+    let no_lfs = "git-lfs is not there: large files of Git LFS will be missing";
+    findings.push(("git-lfs", version(&["git-lfs", "--version"], no_lfs)));
+    if config.xvfb && config.isolation != IsolationSetting::Container {
+        findings.push(("Xvfb", xvfb()));
+    }
+    match Launcher::new(config) {
+        Ok(launcher) => findings.extend(isolation(config, &launcher)),
+        Err(error) => findings.push(("isolation", Err(format!("the server does not start: {error}")))),
+    }
+    let line = |(topic, result)| match result {
+        Ok(found) => format!("{topic}: {found}"),
+        Err(problem) => format!("warning: {topic}: {problem}"),
+    };
+    findings.into_iter().map(line).collect()
+}
+
+/// The findings on what worlds' programs may do.
+fn isolation(config: &SimulationConfig, launcher: &Launcher) -> Vec<(&'static str, Result<String, String>)> {
+    let mut findings = vec![match launcher.shortcoming() {
+        Some(why) => ("isolation", Err(format!("none, worlds' programs may do whatever this user may: {why}"))),
+        None => ("isolation", Ok(launcher.level().to_string())),
+    }];
+    let words = launcher.network_in_words().filter(|_| launcher.level() == IsolationLevel::Sandbox);
+    findings.extend(words.map(|words| ("network", Ok(words))));
+    let is_shared = launcher.network() == Some(Network::Shared);
+    if is_shared && !config.ports_are_public() {
+        findings.push(("streams", streams(config)));
+    }
+    if is_shared && config.user_header.is_some() && config.trusted_proxies.trusts_loopback() {
         let why = "worlds' programs can pose as any user, because they share this machine's network, and trustedProxies \
                    contains its loopback";
-        Finding { topic: "userHeader", result: Err(why.to_owned()) }
-    });
-    let isolation = Finding { topic: "isolation", result: launcher.and_then(|launcher| isolation(&launcher)) };
-    let gpus = config.spreads().then(|| Finding { topic: "GPUs", result: gpus(config) });
-    first
-        .into_iter()
-        .chain(gpus)
-        .chain(always)
-        .chain(last)
-        .chain([isolation])
-        .chain(network)
-        .chain(streams)
-        .chain(users)
-        .chain(unenforced_limits)
-        .collect()
+        findings.push(("userHeader", Err(why.to_owned())));
+    }
+    findings.extend(launcher.unenforced_limits().into_iter().map(|line| ("limits", Err(line))));
+    findings
 }
 
 fn webots(config: &SimulationConfig) -> Result<String, String> {
@@ -129,43 +120,23 @@ fn gpus(config: &SimulationConfig) -> Result<String, String> {
     Ok(format!("simulations are spread over {}", names.join(", ")))
 }
 
-fn xvfb(config: &SimulationConfig) -> Result<String, String> {
-    match which("Xvfb") {
-        Ok(program) => Ok(program.display().to_string()),
-        Err(_) if config.xvfb => {
-            Err("it is not there, but xvfb is true: no Webots can start. On Debian and Ubuntu the \
-                                    package xvfb has it"
-                .to_owned())
-        }
-        Err(_) => Ok("it is not there, and not needed: xvfb is false".to_owned()),
-    }
-}
-
-fn isolation(launcher: &Launcher) -> Result<String, String> {
-    match launcher.shortcoming() {
-        Some(why) => Err(format!("none, worlds' programs may do whatever this user may: {why}")),
-        None => Ok(launcher.level().to_string()),
-    }
-}
-
-/// The network of sandboxes.
-fn network(launcher: &Launcher) -> Option<Finding> {
-    let words = launcher.network_in_words().filter(|_| launcher.level() == IsolationLevel::Sandbox)?;
-    Some(Finding { topic: "network", result: Ok(words) })
+fn xvfb() -> Result<String, String> {
+    let missing =
+        "it is not there, but xvfb is true: no Webots can start. On Debian and Ubuntu the package xvfb has it";
+    which("Xvfb").map(|program| program.display().to_string()).map_err(|_| missing.to_owned())
 }
 
 /// Whether others reach the ports of simulations past the relay.
-fn streams(config: &SimulationConfig) -> Finding {
+fn streams(config: &SimulationConfig) -> Result<String, String> {
     let (first, last) = config.streaming_ports().into_inner();
-    let result = match packet_filter::closes_streams() {
+    match packet_filter::closes_streams() {
         Some(true) => Ok("relayed; the packet filter keeps others from the ports of Webots".to_owned()),
         Some(false) => Err(format!(
             "anybody who reaches ports {first} to {last} can control simulations: Webots shares this machine's network, \
              and no packet filter closes them (table webots_streams); see docs/deployment-web-server.md"
         )),
         None => Ok(format!("relayed; the firewall has to close ports {first} to {last}, on which Webots listens")),
-    };
-    Finding { topic: "streams", result }
+    }
 }
 
 /// Returns the first line that a program prints.

@@ -34,26 +34,35 @@ use serde_json::Value;
 use crate::shared::text::{client_text, without_paths};
 use crate::simulation::sessions::Token;
 
-/// A request of a client.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub enum ClientRequest {
-    /// Start a simulation of the world at this URL.
-    Start {
-        /// The URL, as the client sent it.
-        url: String,
-        /// How the simulation is shown.
-        mode: Mode,
-        /// Whether its client may resume it after its connection has broken.
-        resumable: bool,
-        /// What its client calls itself.
-        name: Option<String>,
-    },
-    /// Resume the simulation of this token; `None` if the text is not a token.
-    Resume(Option<Token>),
-    /// Keep a simulation that is to end because it is paused.
-    Keep,
+/// The requests of a client, of which the first one counts; unknown fields are ignored.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Deserialize)]
+#[serde(default)]
+pub struct ClientRequest {
     /// Restore this file below `controllers/`.
-    ResetController(String),
+    #[serde(rename = "reset controller", deserialize_with = "value")]
+    pub reset_controller: Option<String>,
+    /// Resume the simulation of this token.
+    #[serde(deserialize_with = "value")]
+    pub resume: Option<String>,
+    /// Keep a simulation that is to end because it is paused.
+    pub keep: bool,
+    /// Start a simulation.
+    #[serde(deserialize_with = "value")]
+    pub start: Option<Start>,
+}
+
+/// A simulation that a client requests.
+#[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
+#[serde(expecting = "an object with a url")]
+pub struct Start {
+    /// The URL of its world.
+    pub url: String,
+    /// How it is shown.
+    pub mode: Option<Mode>,
+    /// Whether its client may resume it after its connection has broken.
+    pub resumable: Option<bool>,
+    /// What its client calls itself.
+    pub name: Option<String>,
 }
 
 /// How a simulation is shown.
@@ -76,54 +85,22 @@ pub enum Mode {
 )]
 pub struct ClientRequestError(String);
 
-/// A message as JSON; unknown fields are ignored.
-#[derive(Deserialize)]
-struct WireMessage {
-    #[serde(rename = "reset controller", default, deserialize_with = "value")]
-    reset_controller: Option<String>,
-    #[serde(default, deserialize_with = "value")]
-    resume: Option<String>,
-    keep: Option<bool>,
-    #[serde(default, deserialize_with = "value")]
-    start: Option<WireStart>,
-}
-
-#[derive(Deserialize)]
-#[serde(expecting = "an object with a url")]
-struct WireStart {
-    url: String,
-    mode: Option<Mode>,
-    resumable: Option<bool>,
-    name: Option<String>,
-}
-
 /// Reads a field that is there: `null` is no request, and the client would wait for an answer.
 fn value<'de, D: Deserializer<'de>, T: Deserialize<'de>>(field: D) -> Result<Option<T>, D::Error> {
     T::deserialize(field).map(Some)
 }
 
 impl ClientRequest {
-    /// Parses a message of a client; `None` if it is JSON without a request.
+    /// Parses a message of a client. JSON that is not an object requests nothing.
     ///
     /// # Errors
     /// When the message is not JSON, or its request is malformed.
-    pub fn parse(text: &str) -> Result<Option<Self>, ClientRequestError> {
+    pub fn parse(text: &str) -> Result<Self, ClientRequestError> {
         let message: Value = serde_json::from_str(text).map_err(|_| ClientRequestError("it is no JSON".to_owned()))?;
         if !message.is_object() {
-            return Ok(None);
+            return Ok(Self::default());
         }
-        let message: WireMessage =
-            serde_path_to_error::deserialize(message).map_err(|error| ClientRequestError(error.to_string()))?;
-        Ok(match message {
-            WireMessage { reset_controller: Some(file), .. } => Some(Self::ResetController(file)),
-            WireMessage { resume: Some(token), .. } => Some(Self::Resume(Token::parse(&token))),
-            WireMessage { keep: Some(true), .. } => Some(Self::Keep),
-            WireMessage { start: Some(WireStart { url, mode, resumable, name }), .. } => {
-                let (mode, resumable) = (mode.unwrap_or_default(), resumable.unwrap_or_default());
-                Some(Self::Start { url, mode, resumable, name })
-            }
-            _ => None,
-        })
+        serde_path_to_error::deserialize(message).map_err(|error| ClientRequestError(error.to_string()))
     }
 }
 
@@ -239,36 +216,26 @@ mod tests {
 
     #[test]
     fn requests_are_read() {
-        let named = |mode, resumable, name: Option<&str>| ClientRequest::Start {
-            url: "https://x".to_owned(),
-            mode,
-            resumable,
-            name: name.map(str::to_owned),
+        let start = |mode, resumable, name: Option<&str>| {
+            let start = Start { url: "https://x".to_owned(), mode, resumable, name: name.map(str::to_owned) };
+            ClientRequest { start: Some(start), ..ClientRequest::default() }
         };
-        let ask = |mode, resumable| named(mode, resumable, None);
-        let start = |mode| ask(mode, false);
-        let token = Token::new(5);
-        let resume = format!(r#"{{"resume": "{}"}}"#, token.reveal());
+        let (nothing, file) = (ClientRequest::default(), Some("a/a.py".to_owned()));
         let table = [
-            (r#"{"start":{"url":"https://x"}}"#, start(Mode::X3d)),
-            (r#"{"start":{"url":"https://x","mode":"mjpeg","more":1}}"#, start(Mode::Mjpeg)),
-            (r#"{"start":{"url":"https://x","mode":"w3d"}}"#, start(Mode::W3d)),
-            (r#"{"start":{"url":"https://x","resumable":true}}"#, ask(Mode::X3d, true)),
-            (r#"{"start":{"url":"https://x","name":"Anna"}}"#, named(Mode::X3d, false, Some("Anna"))),
-            (&resume, ClientRequest::Resume(Some(token))),
-            (r#"{"resume":"what is no token"}"#, ClientRequest::Resume(None)),
-            (r#"{"keep":true}"#, ClientRequest::Keep),
-            (r#"{ "reset controller" : "a/a.py" }"#, ClientRequest::ResetController("a/a.py".to_owned())),
+            (r#"{"start":{"url":"https://x"}}"#, start(None, None, None)),
+            (r#"{"start":{"url":"https://x","mode":"mjpeg","more":1}}"#, start(Some(Mode::Mjpeg), None, None)),
+            (r#"{"start":{"url":"https://x","mode":"w3d"}}"#, start(Some(Mode::W3d), None, None)),
+            (r#"{"start":{"url":"https://x","resumable":true}}"#, start(None, Some(true), None)),
+            (r#"{"start":{"url":"https://x","name":"Anna"}}"#, start(None, None, Some("Anna"))),
+            (r#"{"resume":"any text"}"#, ClientRequest { resume: Some("any text".to_owned()), ..nothing.clone() }),
+            (r#"{"keep":true}"#, ClientRequest { keep: true, ..nothing.clone() }),
+            (r#"{ "reset controller" : "a/a.py" }"#, ClientRequest { reset_controller: file, ..nothing }),
         ];
         for (text, request) in table {
-            assert_eq!(ClientRequest::parse(text), Ok(Some(request)), "{text}");
+            assert_eq!(ClientRequest::parse(text), Ok(request), "{text}");
         }
-    }
-
-    #[test]
-    fn other_json_is_ignored() {
         for text in ["{}", "[1]", "5", "null", r#"{"init":["host","project"]}"#, r#""start""#, r#"{"keep":false}"#] {
-            assert_eq!(ClientRequest::parse(text), Ok(None), "{text}");
+            assert_eq!(ClientRequest::parse(text), Ok(ClientRequest::default()), "{text}");
         }
     }
 

@@ -5,36 +5,10 @@ use std::path::PathBuf;
 use actix::prelude::*;
 use serde::Serialize;
 
-use crate::shared::domain::Instances;
+use crate::shared::domain::{Instances, ProjectUrl};
+use crate::shared::run::seconds_since_1970;
 use crate::simulation::client_identity::ClientIdentity;
 use crate::simulation::simulation_id::SimulationId;
-
-/// A change of a simulation.
-#[derive(Debug)]
-pub enum SimulationChange {
-    /// It is in another state.
-    Stage(Stage),
-    /// Its world was made for this version of Webots.
-    Version(String),
-    /// Its process was started: it was granted this port, and its output is kept in this file.
-    Launched {
-        /// When, in seconds since 1970.
-        at: u64,
-        /// The root of its process tree.
-        pid: i32,
-        /// The directory of its control group, if it has one.
-        cgroup: Option<PathBuf>,
-        /// The port that was granted.
-        port: u16,
-        /// The file.
-        log: Option<PathBuf>,
-    },
-    /// It was given the GPU with this number.
-    Gpu(u32),
-    /// Its client has disconnected, and it waits until this time, in seconds since 1970; `None` if its client is
-    /// connected again.
-    Away(Option<u64>),
-}
 
 /// The states of a simulation, as pages and programs see them.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
@@ -71,6 +45,9 @@ pub struct Simulation {
     pub id: SimulationId,
     /// The world's URL.
     pub world: String,
+    /// The URL of its repository.
+    #[serde(skip)]
+    pub repository: String,
     /// Its client's identity, only for administrators.
     #[serde(skip)]
     pub identity: ClientIdentity,
@@ -100,21 +77,23 @@ pub struct Simulation {
 }
 
 impl Simulation {
-    /// Applies a change.
-    pub fn apply(&mut self, change: SimulationChange) {
-        match change {
-            SimulationChange::Stage(stage) => self.stage = stage,
-            SimulationChange::Version(version) => self.version = Some(version),
-            SimulationChange::Gpu(index) => self.gpu = Some(index),
-            SimulationChange::Away(until) => self.away_until = until,
-            SimulationChange::Launched { at, pid, cgroup, port, log } => {
-                self.cgroup = cgroup;
-                self.launched = Some(at);
-                self.pid = Some(pid);
-                self.port = Some(port);
-                self.log = log;
-                self.stage = Stage::Launching;
-            }
+    /// A simulation that a client has just requested.
+    pub fn new(id: SimulationId, world: &ProjectUrl, identity: ClientIdentity) -> Self {
+        Self {
+            id,
+            world: world.to_string(),
+            repository: world.repository(),
+            identity,
+            stage: Stage::Queued,
+            since: seconds_since_1970(),
+            launched: None,
+            pid: None,
+            cgroup: None,
+            port: None,
+            gpu: None,
+            away_until: None,
+            version: None,
+            log: None,
         }
     }
 }

@@ -82,12 +82,8 @@ fn what_is_missing_is_warned_about() {
     let (_, told) = check(&json!({"isolation": "none"}), path(empty.path()));
     assert!(told.contains("\nisolation: none\n"), "{told}");
     let (_, told) = check(&json!({"display": ":59000"}), path(empty.path()));
-    for words in [
-        "warning: webots: neither webotsHome nor the environment variable WEBOTS_HOME is set\n",
-        "Xvfb: it is not there, and not needed: xvfb is false\n",
-    ] {
-        assert!(told.contains(words), "{words} is not in\n{told}");
-    }
+    let words = "warning: webots: neither webotsHome nor the environment variable WEBOTS_HOME is set\n";
+    assert!(told.contains(words), "{told}");
 }
 
 #[test]

@@ -147,10 +147,7 @@ async fn a_level_that_can_not_be_is_refused_in_one_line() {
     for (builder, words) in [
         (docker.set("isolation", "sandbox"), "docker: true asks for containers, but isolation for another level"),
         (containers(1).set("isolation", "jail"), "isolation: unknown variant `jail`"),
-        (
-            containers(1).set("isolation", true),
-            "isolation: true is no level; allowed are \"auto\", \"sandbox\", \"none\"",
-        ),
+        (containers(1).set("isolation", true), "isolation: invalid type: boolean `true`"),
         (sandbox(json!({"readable": "/"})), "sandbox.readable: \"/\" can't be shown"),
         (sandbox(json!({"writable": ["/srv", "/proc/self/.."]})), "sandbox.writable: \"/proc/self/..\" can't be shown"),
         (sandbox(json!({"network": "open"})), "unknown variant `open`"),

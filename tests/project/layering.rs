@@ -22,8 +22,8 @@ const SESSION: [&str; 8] = [
 const SIMULATION: [&str; 24] = [
     "simulation::client_identity",
     "simulation::simulation_id",
-    "simulation::ends",
     "simulation::snapshot",
+    "simulation::ends",
     "simulation::failed_starts",
     "simulation::slots",
     "simulation::sessions",

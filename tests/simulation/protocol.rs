@@ -231,12 +231,12 @@ async fn pages_tell_what_they_should() {
 async fn outcomes_are_counted() {
     let (forge, webots) = (Forge::with_arm(), Webots::launcher());
     let server = simulation_server(&webots.path(), forge.path(), 1).set("waitingLine", 1).start().await;
-    let count = async |outcome: &str| {
+    let count = async |name: &str| {
         let text = http::get(&server.url("/metrics")).await.text();
-        let name = format!("webots_simulation_starts_total{{outcome=\"{outcome}\"}} ");
+        let name = format!("webots_simulation_{name} ");
         text.lines().find_map(|line| line.strip_prefix(&name)).unwrap().parse::<u32>().unwrap()
     };
-    assert_eq!(count("ready").await, 0);
+    assert_eq!(count("starts_total{outcome=\"ready\"}").await, 0);
     let mut ready = Client::start(&server, &arm()).await;
     ready.until("webots:").await;
     let mut waits = Client::start(&server, &arm()).await;
@@ -247,9 +247,14 @@ async fn outcomes_are_counted() {
     ready.leave().await;
     super::scene::nothing_left(&server, 1).await;
     Client::start(&server, &world("lab/none", "main", "worlds/a.wbt")).await.until("loading: Error:").await;
-    for (outcome, expected) in
-        [("ready", 1), ("left", 1), ("full", 1), ("refused", 1), ("no_checkout", 1), ("no_webots", 0)]
-    {
-        until(outcome, async || count(outcome).await == expected).await;
+    for (counter, expected) in [
+        ("starts_total{outcome=\"ready\"}", 1),
+        ("starts_total{outcome=\"full\"}", 1),
+        ("starts_total{outcome=\"refused\"}", 1),
+        ("ends_total{reason=\"left\"}", 2),
+        ("ends_total{reason=\"no_checkout\"}", 1),
+        ("ends_total{reason=\"no_webots\"}", 0),
+    ] {
+        until(counter, async || count(counter).await == expected).await;
     }
 }

@@ -56,7 +56,7 @@ async fn a_simulation_is_stopped_in_any_state_and_its_client_hears_why() {
         let metrics = http::get(&server.url("/metrics")).await.text();
         assert!(metrics.contains("webots_simulation_ends_total{reason=\"administrator\"} 1"), "{metrics}");
         let page = http::get(&server.url("/monitor")).await.text();
-        assert!(page.contains("stopped by the administrator"), "{state:?}");
+        assert!(page.contains("The administrator has stopped it"), "{state:?}");
         assert!(!page.contains("to work"), "what a student was told is not for everybody");
     }
 }

@@ -1,6 +1,7 @@
 //! Configuration files: loading, errors, and the types of values.
 
 mod error;
+pub mod keys;
 mod loading;
 mod secret;
 mod value;
@@ -9,6 +10,6 @@ pub use error::ConfigError;
 pub use loading::{Configuration, InvalidValueError, LoadedConfig, load, require};
 pub use secret::Secret;
 pub use value::{
-    ExpandedPath, expanded, folder, is_web_url, local_address, minutes_or_zero, object, one_or_many, optional_expanded,
-    optional_object, optional_whole, percent, seconds, seconds_or_zero, whole,
+    ExpandedPath, choice, expanded, folder, is_web_url, local_address, minutes_or_zero, object, one_or_many,
+    optional_expanded, optional_object, optional_whole, percent, seconds, seconds_or_zero, whole,
 };

@@ -8,7 +8,7 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use serde::de::value::MapAccessDeserializer;
-use serde::de::{DeserializeOwned, Error as _, MapAccess, Unexpected, Visitor};
+use serde::de::{DeserializeOwned, Error as _, IntoDeserializer, MapAccess, Unexpected, Visitor};
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
 /// A path with `~` and `$VARIABLE` expanded.
@@ -74,6 +74,14 @@ where
     struct Text(#[serde(deserialize_with = "expanded")] String);
     let text = Option::<Text>::deserialize(deserializer)?;
     text.map(|Text(text)| T::try_from(text).map_err(D::Error::custom)).transpose()
+}
+
+/// Reads the name of a choice.
+///
+/// # Errors
+/// When the value is not a text, or no choice.
+pub fn choice<'de, T: DeserializeOwned, D: Deserializer<'de>>(deserializer: D) -> Result<T, D::Error> {
+    T::deserialize(String::deserialize(deserializer)?.into_deserializer())
 }
 
 /// Whether a text is the URL of a web server.

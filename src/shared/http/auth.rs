@@ -113,3 +113,9 @@ impl AuthError {
         }
     }
 }
+
+impl actix_web::ResponseError for AuthError {
+    fn error_response(&self) -> HttpResponse {
+        self.answer()
+    }
+}

@@ -151,6 +151,12 @@ impl ConnectionLimitError {
     }
 }
 
+impl actix_web::ResponseError for ConnectionLimitError {
+    fn error_response(&self) -> HttpResponse {
+        self.answer()
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -10,7 +10,6 @@ use std::time::{Duration, Instant};
 use actix::prelude::*;
 use actix_web_actors::ws::CloseCode;
 
-use super::outcome::{Outcome, Pending};
 use super::resumption::{Resumption, seconds_until};
 use super::state::{State, WebotsHandle};
 use crate::shared::http::Peer;
@@ -20,6 +19,7 @@ use crate::simulation::client_identity::ClientIdentity;
 use crate::simulation::ends::EndReason;
 use crate::simulation::protocol::{self, Mode};
 use crate::simulation::sessions::{Attachment, ClientAction, FromClient, ToClient};
+use crate::simulation::simulation_id::SimulationId;
 use crate::simulation::slots::{Slot, SlotEvent};
 use crate::simulation::state::AppState;
 use crate::simulation::streams::Watched;
@@ -31,18 +31,20 @@ pub struct Session {
     pub(super) peer: Peer,
     /// Who has asked for it.
     pub(super) identity: ClientIdentity,
-    /// The id of the simulation with what separates it from what follows; empty before there is one.
-    pub(super) id: String,
+    /// The id of the simulation, once there is one.
+    pub(super) id: Option<SimulationId>,
     /// The connection of its client, until it has ended.
     pub(super) client: Option<Recipient<ToClient>>,
     pub(super) attachment: u64,
     pub(super) state: State,
-    restoring: bool,
-    pub(super) start: Pending,
-    /// Whether its client has requested a resumable simulation.
+    /// How it is shown.
+    pub(super) mode: Mode,
+    /// Whether its client may resume it.
     pub(super) resumable: bool,
+    /// Whether Webots was ready.
+    pub(super) is_ready: bool,
     /// What it keeps for a client that returns.
-    pub(super) resumption: Option<Resumption>,
+    pub(super) resumption: Resumption,
     pub(super) is_watched: bool,
 }
 
@@ -50,36 +52,37 @@ pub struct Session {
 const SIGN_OF_LIFE: Duration = Duration::from_secs(4);
 
 impl Session {
-    /// Opens the session of a client that requests the world at this URL.
+    /// Opens the session of a client that requests a simulation.
     pub fn open(
         server: Arc<AppState>,
         (peer, identity): (Peer, ClientIdentity),
         client: Recipient<ToClient>,
-        (url, mode, resumable): (String, Mode, bool),
+        request: &protocol::Start,
     ) -> Attachment {
         let session = Self::create(|ctx| {
             let mut session = Self {
-                start: Pending::new(&server.starts),
                 server,
                 peer,
                 identity,
-                id: String::new(),
+                id: None,
                 client: Some(client),
                 attachment: 0,
                 state: State::Over,
-                restoring: false,
-                resumable,
-                resumption: None,
+                mode: request.mode.unwrap_or_default(),
+                resumable: request.resumable.unwrap_or_default(),
+                is_ready: false,
+                resumption: Resumption::default(),
                 is_watched: false,
             };
-            session.request_slot(&url, mode, ctx);
+            session.request_slot(&request.url, ctx);
             session
         });
         Attachment::new(session.recipient(), 0)
     }
 
     pub(super) fn name(&self) -> String {
-        format!("{}client {}", self.id, self.peer)
+        let id = self.id.map(|id| format!("{id}: ")).unwrap_or_default();
+        format!("{id}client {}", self.peer)
     }
 
     /// Sends the client a text that it must not miss.
@@ -104,9 +107,7 @@ impl Session {
         if let Some(client) = self.client.take() {
             client.do_send(ToClient::End(last_words, code));
         }
-        if let Some(resumption) = &mut self.resumption {
-            resumption.end(why);
-        }
+        self.resumption.ended.get_or_insert_with(|| why.to_owned());
         self.await_client(ctx);
     }
 
@@ -114,31 +115,22 @@ impl Session {
         let State::Launched(WebotsHandle(webots)) = &self.state else {
             return self.text(protocol::nothing_to_reset());
         };
-        if std::mem::replace(&mut self.restoring, true) {
-            log::warn!("{}: asks to reset a controller while another is being reset; ignored", self.name());
-            return;
-        }
         let restored = webots.send(ResetController(file.clone())).into_actor(self);
         restored
-            .map(move |answer, this, _| {
-                this.restoring = false;
-                match answer {
-                    Ok(Ok(())) => this.text(protocol::reset_controller(&file)),
-                    // This error does not end the simulation.
-                    Ok(Err(error)) => this.text(protocol::error(&error.to_string())),
-                    Err(error) => log::warn!("{}: no controller was reset: {error}", this.name()),
-                }
+            .map(move |answer, this, _| match answer {
+                Ok(Ok(())) => this.text(protocol::reset_controller(&file)),
+                // This error does not end the simulation.
+                Ok(Err(error)) => this.text(protocol::error(&error.to_string())),
+                Err(error) => log::warn!("{}: no controller was reset: {error}", this.name()),
             })
             .spawn(ctx);
     }
 
     fn exited(&mut self, WebotsExit { clean, own, why }: &WebotsExit, ctx: &mut Context<Self>) {
         if *own {
-            let fail = if self.start.is_open() { Self::fail_own } else { Self::refer };
-            return fail(self, Outcome::NoWebots, why, ctx);
+            return if self.is_ready { self.refer(why, ctx) } else { self.fail_own(why, ctx) };
         }
         let words = if *clean { protocol::loading(why) } else { protocol::error(why) };
-        self.start.resolve(Outcome::NoWebots);
         self.finish(words, why, CloseCode::Normal, ctx);
     }
 }
@@ -150,9 +142,8 @@ impl Actor for Session {
         closing(self.server.phase.clone())
             .into_actor(self)
             .map(|(), this, ctx| {
-                this.start.resolve(Outcome::Stopped);
                 this.state.end(EndReason::Stopped, "The server was stopped");
-                this.resumption = None;
+                this.resumption = Resumption::default();
                 this.finish(protocol::stopping(), "", CloseCode::Away, ctx);
             })
             .spawn(ctx);
@@ -205,11 +196,12 @@ impl Handler<SlotEvent> for Session {
 
     fn handle(&mut self, event: SlotEvent, ctx: &mut Self::Context) {
         match (event, std::mem::replace(&mut self.state, State::Over)) {
-            (SlotEvent::Granted(port), State::Waiting { request, lease }) => {
-                self.check_out(request, Slot { lease, port }, ctx);
+            (SlotEvent::Granted(port), State::Waiting { world, lease }) => {
+                self.check_out(world, Slot { lease, port }, ctx);
             }
-            (SlotEvent::Rejected(full), State::Waiting { .. }) => {
-                self.fail_start(Outcome::Full, &full.to_string(), ctx);
+            (SlotEvent::Rejected(why), State::Waiting { .. }) => {
+                self.count("full");
+                self.give_up(&why, ctx);
             }
             (SlotEvent::Queued(ahead), state @ State::Waiting { .. }) => {
                 self.state = state;
@@ -237,7 +229,7 @@ impl Handler<Progress> for Session {
     type Result = ();
 
     fn handle(&mut self, Progress(text): Progress, _: &mut Self::Context) {
-        if matches!(self.state, State::CheckingOut { .. }) {
+        if matches!(self.state, State::CheckingOut(_)) {
             self.hint(protocol::loading(&text));
         }
     }
@@ -260,25 +252,21 @@ impl Handler<WebotsEvent> for Session {
             WebotsEvent::Progress(text) => self.hint(protocol::loading(&text)),
             WebotsEvent::Text(text) => {
                 let text = protocol::of_project(&text);
-                if let Some(resumption) = &mut self.resumption {
-                    resumption.texts.push(text.clone());
-                }
+                self.resumption.texts.push(text.clone());
                 self.text(text);
             }
             WebotsEvent::Started => {
-                if let Some(resumption) = &mut self.resumption {
-                    resumption.launched = Instant::now();
-                }
+                self.resumption.launched = Some(Instant::now());
                 self.text(protocol::shutdown_timeout(self.server.config.timeout));
             }
             WebotsEvent::Listening(port, stream) => {
-                self.start.resolve(Outcome::Ready);
+                self.is_ready = true;
+                self.count("ready");
                 self.server.failed_starts.reset();
                 let url = self.server.config.stream_url(port, &stream.reveal());
                 self.text(protocol::webots(&url));
                 let absence = self.server.config.timing.absence;
-                let offer = self.resumption.as_mut().map(|resumption| resumption.ready(url, absence));
-                if let Some(offer) = offer {
+                if let Some(offer) = self.resumption.offer(url, absence) {
                     for text in offer {
                         self.text(text);
                     }
@@ -289,9 +277,7 @@ impl Handler<WebotsEvent> for Session {
             WebotsEvent::Heartbeat => self.hint(protocol::HEARTBEAT.to_owned()),
             WebotsEvent::Hanging(seconds) => self.hint(protocol::hanging(seconds)),
             WebotsEvent::IdleEnd(end) => {
-                if let Some(resumption) = &mut self.resumption {
-                    resumption.idle_end = end;
-                }
+                self.resumption.idle_end = end;
                 self.text(protocol::idle(end.map(seconds_until)));
             }
             WebotsEvent::Exited(exit) => self.exited(&exit, ctx),

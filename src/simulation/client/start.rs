@@ -6,70 +6,68 @@ use std::time::Instant;
 use actix::prelude::*;
 use actix_web_actors::ws::CloseCode;
 
-use super::outcome::Outcome;
-use super::resumption::Resumption;
 use super::session::Session;
-use super::state::{StartRequest, State, WebotsHandle};
+use super::state::{State, WebotsHandle};
+use crate::shared::domain::ProjectUrl;
 use crate::simulation::checkout::{Progress, Project};
 use crate::simulation::ends::EndReason;
 use crate::simulation::machine::sensors::Gpu;
-use crate::simulation::protocol::{self, Mode};
+use crate::simulation::protocol;
 use crate::simulation::readiness;
 use crate::simulation::slots::{Slot, SlotLease};
-use crate::simulation::snapshot::SimulationChange;
 use crate::simulation::webots::{LaunchSpec, Webots};
 
 impl Session {
-    /// Counts the failed start, sends the client the reason, and ends.
-    pub(super) fn fail_start(&mut self, outcome: Outcome, why: &str, ctx: &mut Context<Self>) {
-        self.start.resolve(outcome);
-        self.state.end(outcome.end(), why);
+    /// Counts a request for a simulation, for `/metrics`.
+    pub(super) fn count(&self, outcome: &str) {
+        self.server.starts.with_label_values(&[outcome]).inc();
+    }
+
+    /// Sends the client the reason, and ends.
+    pub(super) fn give_up(&mut self, why: &str, ctx: &mut Context<Self>) {
         log::info!("{}: {why}", self.name());
         self.finish(protocol::error(why), why, CloseCode::Normal, ctx);
     }
 
     /// The same for a client that another server may accept: the close code shows that to programs.
-    pub(super) fn refer(&mut self, outcome: Outcome, why: &str, ctx: &mut Context<Self>) {
-        self.start.resolve(outcome);
+    pub(super) fn refer(&mut self, why: &str, ctx: &mut Context<Self>) {
         log::info!("{}: {why}", self.name());
         self.finish(protocol::elsewhere(why), why, CloseCode::Again, ctx);
     }
 
     /// The same for a start that fails for a reason of this server's own, which is reported to session servers.
-    pub(super) fn fail_own(&mut self, outcome: Outcome, why: &str, ctx: &mut Context<Self>) {
+    pub(super) fn fail_own(&mut self, why: &str, ctx: &mut Context<Self>) {
         self.server.failed_starts.add(&format!("{}: {why}", self.name()));
         self.state.end(EndReason::Fault, why);
-        self.refer(outcome, why, ctx);
+        self.refer(why, ctx);
     }
 
-    pub(super) fn request_slot(&mut self, url: &str, mode: Mode, ctx: &mut Context<Self>) {
-        if !self.server.start_quota.take(self.peer.rate_limit_key()) {
-            let why = "Too many simulations were asked for from your address. Try again in a minute";
-            return self.fail_start(Outcome::Refused, why, ctx);
-        }
-        let world = match self.server.admit(url) {
+    pub(super) fn request_slot(&mut self, url: &str, ctx: &mut Context<Self>) {
+        let admitted = if self.server.start_quota.take(self.peer.rate_limit_key()) {
+            self.server.admit(url)
+        } else {
+            Err("Too many simulations were asked for from your address. Try again in a minute".to_owned())
+        };
+        let world = match admitted {
             Ok(world) => world,
-            Err(why) if self.server.takes_nobody() => return self.refer(Outcome::Refused, &why, ctx),
-            Err(why) => return self.fail_start(Outcome::Refused, &why, ctx),
+            Err(why) => {
+                self.count("refused");
+                return if self.server.takes_nobody() { self.refer(&why, ctx) } else { self.give_up(&why, ctx) };
+            }
         };
         let lease =
             SlotLease::new(&self.server.slots, ctx.address().recipient(), &world, (self.peer, self.identity.clone()));
-        self.id = format!("{}: ", lease.id());
+        self.id = Some(lease.id());
         self.text(protocol::session(lease.id()));
         log::info!("{}: asks for {world}{}", self.name(), self.identity);
-        self.state = State::Waiting { request: StartRequest { world, mode }, lease };
+        self.state = State::Waiting { world, lease };
     }
 
-    pub(super) fn check_out(
-        &mut self,
-        StartRequest { world, mode }: StartRequest,
-        slot: Slot,
-        ctx: &mut Context<Self>,
-    ) {
-        self.state = State::CheckingOut { mode, slot };
+    pub(super) fn check_out(&mut self, world: ProjectUrl, slot: Slot, ctx: &mut Context<Self>) {
+        self.state = State::CheckingOut(slot);
         let instance = match self.server.run.instance() {
             Ok(instance) => instance,
-            Err(error) => return self.fail_own(Outcome::NoCheckout, &format!("No room for a project: {error}"), ctx),
+            Err(error) => return self.fail_own(&format!("No room for a project: {error}"), ctx),
         };
         let me = ctx.address();
         // A full mailbox drops this line of progress.
@@ -78,9 +76,13 @@ impl Session {
         job.into_actor(self)
             .map(|result, this, ctx| match result {
                 Ok(Ok(project)) => this.launch(project, ctx),
-                Ok(Err(error)) if error.is_own() => this.fail_own(Outcome::NoCheckout, &error.to_string(), ctx),
-                Ok(Err(error)) => this.fail_start(Outcome::NoCheckout, &error.to_string(), ctx),
-                Err(error) => this.fail_own(Outcome::NoCheckout, &format!("The checkout broke off: {error}"), ctx),
+                Ok(Err(error)) if error.is_own() => this.fail_own(&error.to_string(), ctx),
+                Ok(Err(error)) => {
+                    let why = error.to_string();
+                    this.state.end(EndReason::NoCheckout, &why);
+                    this.give_up(&why, ctx);
+                }
+                Err(error) => this.fail_own(&format!("The checkout broke off: {error}"), ctx),
             })
             .spawn(ctx);
     }
@@ -88,18 +90,18 @@ impl Session {
     pub(super) fn launch(&mut self, project: Project, ctx: &mut Context<Self>) {
         let program = match readiness::webots_program(&self.server.config) {
             Ok(program) => program,
-            Err(why) => return self.fail_own(Outcome::NoWebots, &why, ctx),
+            Err(why) => return self.fail_own(&why, ctx),
         };
-        let State::CheckingOut { mode, slot } = std::mem::replace(&mut self.state, State::Over) else { return };
+        let State::CheckingOut(slot) = std::mem::replace(&mut self.state, State::Over) else { return };
         log::info!("{}: {} is for Webots {}", self.name(), project.world.path.display(), project.world.version);
-        slot.lease.update(SimulationChange::Version(project.world.version.clone()));
+        let version = project.world.version.clone();
+        slot.lease.update(|one| one.version = Some(version));
         for warning in &project.warnings {
             self.text(protocol::loading(warning));
         }
         self.text(protocol::loading("webots is starting"));
         if self.resumable && !self.server.config.timing.absence.is_zero() {
-            let registration = self.server.sessions.register(ctx.address().recipient());
-            self.resumption = Some(Resumption::new(registration, &slot.lease, self.server.slots.clone()));
+            self.resumption.number = Some(self.server.sessions.register(ctx.address().recipient()));
         }
         let gpu = self.take_gpu(&slot.lease);
         let spec = LaunchSpec {
@@ -110,7 +112,7 @@ impl Session {
             program,
             checkouts: Arc::clone(&self.server.checkouts),
             project: Arc::new(project),
-            mode,
+            mode: self.mode,
             gpu,
             slot,
             streams: Arc::clone(&self.server.streams),
@@ -125,8 +127,9 @@ impl Session {
     fn take_gpu(&self, lease: &SlotLease) -> Option<Gpu> {
         let spread = self.server.spread.as_ref()?;
         let gpu = spread.take(&self.server.readings.borrow().gpus, Instant::now())?;
-        lease.update(SimulationChange::Gpu(gpu.index));
-        lease.log(log::Level::Info, format!("it gets GPU {}, {}", gpu.index, gpu.name));
+        let (index, event) = (gpu.index, format!("it gets GPU {}, {}", gpu.index, gpu.name));
+        lease.update(move |one| one.gpu = Some(index));
+        lease.log(log::Level::Info, &event, event.clone());
         Some(gpu)
     }
 }

@@ -4,7 +4,6 @@ use actix::prelude::*;
 
 use crate::shared::domain::ProjectUrl;
 use crate::simulation::ends::{EndReason, Taken};
-use crate::simulation::protocol::Mode;
 use crate::simulation::slots::{Slot, SlotLease};
 use crate::simulation::webots::{Stop, Webots};
 
@@ -12,18 +11,13 @@ use crate::simulation::webots::{Stop, Webots};
 pub enum State {
     /// Waiting for a slot.
     Waiting {
-        /// The request.
-        request: StartRequest,
+        /// The world.
+        world: ProjectUrl,
         /// The lease, which holds the position in the queue.
         lease: SlotLease,
     },
-    /// The project is being checked out; the job ends with the actor.
-    CheckingOut {
-        /// How it is shown.
-        mode: Mode,
-        /// The slot and its port.
-        slot: Slot,
-    },
+    /// The project is being checked out for this slot; the job ends with the actor.
+    CheckingOut(Slot),
     /// Webots was started.
     Launched(WebotsHandle),
     /// It holds nothing: it was not admitted yet, or its client got the last text.
@@ -34,21 +28,13 @@ impl State {
     /// Reports how the simulation ends, before the state is dropped. Webots' own report takes precedence.
     pub fn end(&self, reason: EndReason, why: &str) {
         match self {
-            Self::Waiting { lease, .. } | Self::CheckingOut { slot: Slot { lease, .. }, .. } => {
+            Self::Waiting { lease, .. } | Self::CheckingOut(Slot { lease, .. }) => {
                 lease.end(reason, why, Taken::default());
             }
             Self::Launched(WebotsHandle(webots)) => webots.do_send(Stop(reason)),
             Self::Over => {}
         }
     }
-}
-
-/// A simulation that a client has requested.
-pub struct StartRequest {
-    /// The URL of the world.
-    pub world: ProjectUrl,
-    /// How it is shown.
-    pub mode: Mode,
 }
 
 /// A running Webots. Dropping the handle stops it.

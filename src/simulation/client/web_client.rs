@@ -70,8 +70,8 @@ impl WebClient {
     }
 
     /// Requests from the session of a token to continue with this connection.
-    fn resume(&mut self, token: Option<Token>, ctx: &mut Context) {
-        let found = token.and_then(|token| Some((token, self.server.sessions.find(&token)?)));
+    fn resume(&mut self, token: &str, ctx: &mut Context) {
+        let found = Token::parse(token).and_then(|token| Some((token, self.server.sessions.find(&token)?)));
         let Some((token, session)) = found else {
             log::info!("client {}: comes back to a simulation that has ended", self.peer);
             return self.finish(protocol::ended(None), CloseCode::Normal, ctx);
@@ -92,35 +92,30 @@ impl WebClient {
     }
 
     fn handle_request(&mut self, text: &str, ctx: &mut Context) {
-        match ClientRequest::parse(text) {
-            Ok(Some(ClientRequest::Start { .. } | ClientRequest::Resume(_)))
-                if !matches!(self.session, Attached::No) =>
-            {
-                log::warn!("client {}: asks for a second simulation on one connection; ignored", self.peer);
-            }
-            Ok(Some(ClientRequest::Start { url, mode, resumable, name })) => {
-                let server = Arc::clone(&self.server);
-                let client = ctx.address().recipient();
-                let identity = ClientIdentity::new(self.user.as_deref(), name.as_deref());
-                self.session =
-                    Attached::To(Session::open(server, (self.peer, identity), client, (url, mode, resumable)));
-            }
-            Ok(Some(ClientRequest::Resume(token))) => self.resume(token, ctx),
-            Ok(Some(ClientRequest::Keep)) => {
-                if let Attached::To(session) = &self.session {
-                    session.send(ClientAction::Keep);
-                }
-            }
-            Ok(Some(ClientRequest::ResetController(file))) => match &self.session {
-                Attached::To(session) => session.send(ClientAction::ResetController(file)),
-                Attached::No | Attached::Resuming | Attached::Over => ctx.text(protocol::nothing_to_reset()),
-            },
-            Ok(None) => log::debug!("client {}: a message that asks for nothing is ignored", self.peer),
+        let request = match ClientRequest::parse(text) {
+            Ok(request) => request,
             Err(wrong) => {
                 log::info!("client {}: {wrong}", self.peer);
                 self.leave();
-                self.finish(protocol::error(&wrong.to_string()), CloseCode::Normal, ctx);
+                return self.finish(protocol::error(&wrong.to_string()), CloseCode::Normal, ctx);
             }
+        };
+        match (request, &self.session) {
+            (ClientRequest { reset_controller: Some(file), .. }, Attached::To(session)) => {
+                session.send(ClientAction::ResetController(file));
+            }
+            (ClientRequest { reset_controller: Some(_), .. }, _) => ctx.text(protocol::nothing_to_reset()),
+            (ClientRequest { resume: Some(token), .. }, Attached::No) => self.resume(&token, ctx),
+            (ClientRequest { keep: true, .. }, Attached::To(session)) => session.send(ClientAction::Keep),
+            (ClientRequest { start: Some(start), .. }, Attached::No) => {
+                let identity = ClientIdentity::new(self.user.as_deref(), start.name.as_deref());
+                let (server, client) = (Arc::clone(&self.server), ctx.address().recipient());
+                self.session = Attached::To(Session::open(server, (self.peer, identity), client, &start));
+            }
+            _ => log::info!(
+                "client {}: a message that asks for nothing, or for a second simulation on one connection; ignored",
+                self.peer
+            ),
         }
     }
 }

@@ -2,46 +2,48 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::shared::config::{ExpandedPath, InvalidValueError, one_or_many, require, whole};
+use crate::shared::config::keys::keys;
+use crate::shared::config::{ExpandedPath, one_or_many, whole};
 
+keys! {
 /// How simulations run in containers.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(rename_all = "camelCase", default, deny_unknown_fields)]
-#[expect(clippy::struct_excessive_bools, reason = "they are keys of a file")]
 pub struct ContainerSettings {
     /// Directory of templates; the built-in template replaces a file that is missing there. Default: none.
-    pub templates: Option<ExpandedPath>,
+    pub templates: Option<ExpandedPath> = None,
     /// The image of Webots for a world whose project has no Dockerfile. `{version}` is that of the world, such as R2023b,
     /// `{ubuntu}` the Ubuntu that the image of that version has. Default: `cyberbotics/webots.cloud:{version}-ubuntu{ubuntu}`.
-    pub image: String,
+    pub image: String = "cyberbotics/webots.cloud:{version}-ubuntu{ubuntu}".to_owned(),
     /// The image of the editor that a project may request. Default: that of the original.
-    pub editor_image: String,
+    pub editor_image: String = "benjamindeleze/theia-test:test3".to_owned(),
     /// Webots' launcher in the image. Default: `webots`.
-    pub program: String,
+    pub program: String = "webots".to_owned(),
     /// Whether to use the debug variants of the templates, which help to debug a project. Default: false.
-    pub debug: bool,
+    pub debug: bool = false,
     /// The display of Webots: a virtual one inside (`xvfb-run` of its image), or that of the machine. Default: virtual.
-    pub display: ContainerDisplay,
+    pub display: ContainerDisplay = ContainerDisplay::default(),
     /// The network that containers reach. Default: internet.
-    pub network: ContainerNetwork,
+    pub network: ContainerNetwork = ContainerNetwork::default(),
     /// Whether containers get the GPUs of the machine, if it has any. Default: true.
-    pub gpu: bool,
+    pub gpu: bool = true,
     /// Whether the files of the image are read-only. Default: true.
-    pub read_only: bool,
+    pub read_only: bool = true,
     /// Whether programs may gain privileges, as `sudo` does. Default: false.
-    pub new_privileges: bool,
+    pub new_privileges: bool = false,
     /// Linux capabilities that containers keep, such as `SYS_PTRACE`. Default: none.
     #[serde(deserialize_with = "one_or_many")]
-    pub capabilities: Vec<String>,
+    pub capabilities: Vec<String> = Vec::new(),
     /// Directories of the machine that are mounted in containers, as `FOLDER:PATH` or `FOLDER:PATH:ro`. Default: none.
     #[serde(deserialize_with = "one_or_many")]
-    pub mounts: Vec<String>,
+    pub mounts: Vec<String> = Vec::new(),
     /// Images that are built at a time. Default: 3.
     #[serde(deserialize_with = "whole::<1, 1000, _, _>")]
-    pub builds: usize,
+    pub builds: usize = 3,
     /// Days after which an image that this server has built is removed, unless a container uses it. Default: 14.
     #[serde(deserialize_with = "whole::<1, 10_000, _, _>")]
-    pub images_age: u64,
+    pub images_age: u64 = 14,
+}
 }
 
 /// The display of Webots in its container.
@@ -68,42 +70,6 @@ pub enum ContainerNetwork {
 
 /// Offset from the port of a Webots to the port of its editor, as the original's page expects.
 pub const EDITOR_PORT: u16 = 500;
-
-/// Checks that no editor gets the port of another simulation, or one that does not exist.
-///
-/// # Errors
-/// When there are too many slots for that.
-pub fn check_ports(in_containers: bool, port: u16, places: u16) -> Result<(), InvalidValueError> {
-    let last = u32::from(port) + u32::from(places) + u32::from(EDITOR_PORT);
-    let fits = !in_containers || (places <= EDITOR_PORT && u16::try_from(last).is_ok());
-    require(fits, "maxConnections", || {
-        format!(
-            "{places} places above port {port} don't go together with containers, whose editors have the port of their \
-             Webots + {EDITOR_PORT}; allowed are up to {EDITOR_PORT} places, and editors up to port 65535"
-        )
-    })
-}
-
-impl Default for ContainerSettings {
-    fn default() -> Self {
-        Self {
-            templates: None,
-            image: "cyberbotics/webots.cloud:{version}-ubuntu{ubuntu}".to_owned(),
-            editor_image: "benjamindeleze/theia-test:test3".to_owned(),
-            program: "webots".to_owned(),
-            debug: false,
-            display: ContainerDisplay::default(),
-            network: ContainerNetwork::default(),
-            gpu: true,
-            read_only: true,
-            new_privileges: false,
-            capabilities: Vec::new(),
-            mounts: Vec::new(),
-            builds: 3,
-            images_age: 14,
-        }
-    }
-}
 
 impl ContainerNetwork {
     /// The name of the Docker network, and of its interface, which the packet filter matches.

@@ -3,7 +3,6 @@
 mod container;
 mod gpus;
 mod isolation;
-mod own_files;
 mod resources;
 mod simulation_config;
 mod streaming;

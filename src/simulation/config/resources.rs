@@ -2,8 +2,10 @@
 
 use serde::{Deserialize, Serialize};
 
+use crate::shared::config::keys::keys;
 use crate::shared::config::{optional_whole, whole};
 
+keys! {
 /// The resource limits of one simulation.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(rename_all = "camelCase", default, deny_unknown_fields)]
@@ -11,27 +13,22 @@ pub struct ResourceLimits {
     /// Output that is read, in KiB per second; short lines count more. A simulation that prints more is blocked.
     /// Default: 512.
     #[serde(deserialize_with = "whole::<1, 1_000_000, _, _>")]
-    pub output: u64,
+    pub output: u64 = 512,
     /// Space that it may use in its directories beyond its project, in MiB. If it exceeds that, it is ended. Default:
     /// 1024.
     #[serde(deserialize_with = "whole::<1, 100_000_000, _, _>")]
-    pub disk: u64,
+    pub disk: u64 = 1024,
     /// Limit of its processes and threads. Default: 4096.
     #[serde(deserialize_with = "whole::<10, 4_000_000, _, _>")]
-    pub processes: u64,
+    pub processes: u64 = 4096,
     /// Limit of open files for each of its processes. Default: 4096.
     #[serde(deserialize_with = "whole::<64, 1_000_000, _, _>")]
-    pub open_files: u64,
+    pub open_files: u64 = 4096,
     /// Memory limit in MiB, if control groups are available. Default: none.
     #[serde(deserialize_with = "optional_whole::<1, 100_000_000, _, _>")]
-    pub memory: Option<u64>,
+    pub memory: Option<u64> = None,
     /// Limit of busy cores, if control groups are available. Default: none.
     #[serde(deserialize_with = "optional_whole::<1, 100_000_000, _, _>")]
-    pub cores: Option<u64>,
+    pub cores: Option<u64> = None,
 }
-
-impl Default for ResourceLimits {
-    fn default() -> Self {
-        Self { output: 512, disk: 1024, processes: 4096, open_files: 4096, memory: None, cores: None }
-    }
 }

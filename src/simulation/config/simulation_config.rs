@@ -6,14 +6,15 @@ use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
-use super::container::{ContainerDisplay, ContainerSettings, check_ports};
+use super::container::{ContainerDisplay, ContainerSettings, EDITOR_PORT};
 use super::gpus::GpuUse;
-use super::isolation::{IsolationSetting, SandboxFolders, VariableName, level};
+use super::isolation::{IsolationSetting, SandboxFolders, VariableName};
 use super::resources::ResourceLimits;
-use super::streaming::{Streaming, streaming};
+use super::streaming::Streaming;
 use super::timing::Timing;
+use crate::shared::config::keys::keys;
 use crate::shared::config::{
-    Configuration, ExpandedPath, InvalidValueError, Secret, expanded, folder, is_web_url, local_address,
+    Configuration, ExpandedPath, InvalidValueError, Secret, choice, expanded, folder, is_web_url, local_address,
     minutes_or_zero, object, one_or_many, optional_expanded, optional_whole, percent, require, seconds, whole,
 };
 use crate::shared::domain::{PublicUrl, UrlPrefix, check_host};
@@ -21,218 +22,159 @@ use crate::shared::http::{Origin, TrustedProxies, UserHeader};
 use crate::simulation::checkout::Mirrors;
 use crate::simulation::machine::display::{self, DisplayName};
 
+keys! {
 /// Every key of the simulation server. The original's keys keep their meaning.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(rename_all = "camelCase", default)]
-#[expect(clippy::struct_excessive_bools, reason = "they are keys of a file that exists")]
 pub struct SimulationConfig {
     /// Fully qualified domain name of the simulation server. Default: `localhost`, with a warning.
     #[serde(alias = "fullyQualifiedDomainName", deserialize_with = "expanded")]
-    pub server: String,
+    pub server: String = String::new(),
     /// Whether URLs begin with `https` and `wss`. Default: true.
-    pub ssl: bool,
+    pub ssl: bool = true,
     /// Local port. Webots uses the ports that follow it. Default: 2000.
     #[serde(deserialize_with = "whole::<1, 65000, _, _>")]
-    pub port: u16,
+    pub port: u16 = 2000,
     /// Local address to listen on. Default: `::`, all addresses of IPv4 and IPv6.
     #[serde(deserialize_with = "local_address")]
-    pub bind: IpAddr,
+    pub bind: IpAddr = Ipv6Addr::UNSPECIFIED.into(),
     /// Whether a reverse proxy rewrites ports in URLs: HOST/PORT, not HOST:PORT. Default: true.
-    pub port_rewrite: bool,
+    pub port_rewrite: bool = true,
     /// How clients reach this server and its simulations through one reverse proxy: a URL with the placeholders
     /// `{host}` (that is `server`) and `{port}`. Default: none, and they are reached under their own addresses.
     #[serde(deserialize_with = "optional_expanded")]
-    pub public_url: Option<PublicUrl>,
+    pub public_url: Option<PublicUrl> = None,
     /// How clients reach the streams of simulations: at the ports of their Webots, or through this server. Default: `direct`.
-    #[serde(deserialize_with = "streaming")]
-    pub streaming: Streaming,
+    #[serde(deserialize_with = "choice")]
+    pub streaming: Streaming = Streaming::default(),
     /// Folder of `simulation/output.log`, `simulation/monitor.csv` and the instances' output. Default: `log`.
     #[serde(deserialize_with = "folder")]
-    pub log_dir: ExpandedPath,
+    pub log_dir: ExpandedPath = ExpandedPath("log".into()),
     /// Log to standard output. Default: false.
-    pub debug: bool,
+    pub debug: bool = false,
     /// Headline of the monitor page.
-    pub title: Option<String>,
+    pub title: Option<String> = None,
     /// Text below the headline.
-    pub description: Option<String>,
+    pub description: Option<String> = None,
     /// Installation directory of Webots. Default: the environment variable `WEBOTS_HOME`.
-    pub webots_home: Option<ExpandedPath>,
+    pub webots_home: Option<ExpandedPath> = None,
     /// The program to start instead of the one in `webotsHome`.
-    pub webots: Option<ExpandedPath>,
+    pub webots: Option<ExpandedPath> = None,
     /// Directory of local projects. Accepted for existing files; not used.
-    pub projects_dir: Option<ExpandedPath>,
+    pub projects_dir: Option<ExpandedPath> = None,
     /// The isolation level of simulations. Default: `auto`.
-    #[serde(deserialize_with = "level")]
-    pub isolation: IsolationSetting,
+    #[serde(deserialize_with = "choice")]
+    pub isolation: IsolationSetting = IsolationSetting::default(),
     /// What a sandbox mounts besides the system and Webots.
     #[serde(deserialize_with = "object")]
-    pub sandbox: SandboxFolders,
+    pub sandbox: SandboxFolders = SandboxFolders::default(),
     /// How simulations run in containers.
     #[serde(deserialize_with = "object")]
-    pub container: ContainerSettings,
+    pub container: ContainerSettings = ContainerSettings::default(),
     /// Environment variables that simulations get besides those that Webots needs. Default: none.
     #[serde(deserialize_with = "one_or_many")]
-    pub environment: Vec<VariableName>,
+    pub environment: Vec<VariableName> = Vec::new(),
     /// The resource limits of one simulation.
     #[serde(deserialize_with = "object")]
-    pub limits: ResourceLimits,
+    pub limits: ResourceLimits = ResourceLimits::default(),
     /// Run Webots in containers: the original's key for `isolation: "container"`. Default: false.
-    pub docker: bool,
+    pub docker: bool = false,
     /// A key of the original, without effect: only images that this server has built are ever removed.
     #[serde(alias = "persistentDockerImages", deserialize_with = "one_or_many")]
-    pub persistant_docker_images: Vec<String>,
+    pub persistant_docker_images: Vec<String> = Vec::new(),
     /// Repositories whose worlds may run, as URL prefixes of whole path segments. Default: none.
     #[serde(deserialize_with = "one_or_many")]
-    pub allowed_repositories: Vec<UrlPrefix>,
+    pub allowed_repositories: Vec<UrlPrefix> = Vec::new(),
     /// Repositories whose worlds never run, as URL prefixes. Default: none.
     #[serde(deserialize_with = "one_or_many")]
-    pub blocked_repositories: Vec<UrlPrefix>,
+    pub blocked_repositories: Vec<UrlPrefix> = Vec::new(),
     /// With docker, worlds of other repositories run while the load (percent) is at most this; 0: never. Default: 50.
     #[serde(deserialize_with = "percent::<100, _>")]
-    pub share_idle_time: f64,
+    pub share_idle_time: f64 = 50.0,
     /// URLs to which the server announces itself when it starts. Default: none.
     #[serde(deserialize_with = "one_or_many")]
-    pub notify: Vec<String>,
+    pub notify: Vec<String> = Vec::new(),
     /// Number of slots: simulations that may run at a time. Webots uses port+1 .. port+maxConnections. Default: 100.
     #[serde(deserialize_with = "whole::<1, 10_000, _, _>")]
-    pub max_connections: u16,
+    pub max_connections: u16 = 100,
     /// Limit of clients that wait for a slot. Default: 100.
     #[serde(deserialize_with = "whole::<0, 100_000, _, _>")]
-    pub waiting_line: usize,
+    pub waiting_line: usize = 100,
     /// Limit of open client `WebSockets` in all, with or without a simulation. Default: 1000.
     #[serde(deserialize_with = "whole::<1, 1_000_000, _, _>")]
-    pub max_clients: usize,
+    pub max_clients: usize = 1000,
     /// Limit of open client `WebSockets` per client address. Default: three quarters of `maxClients`, but at most 1000,
     /// because a class sits behind one address.
     #[serde(deserialize_with = "optional_whole::<1, 1_000_000, _, _>")]
-    pub max_clients_per_address: Option<usize>,
+    pub max_clients_per_address: Option<usize> = None,
     /// Limit of slots per client address; the same share of the queue applies. Default: all, because a class sits
     /// behind one address.
     #[serde(deserialize_with = "optional_whole::<1, 10_000, _, _>")]
-    pub max_places_per_address: Option<usize>,
+    pub max_places_per_address: Option<usize> = None,
     /// Limit of slots per user (`userHeader`); the same share of the queue applies. Default: all.
     #[serde(deserialize_with = "optional_whole::<1, 10_000, _, _>")]
-    pub max_places_per_user: Option<usize>,
+    pub max_places_per_user: Option<usize> = None,
     /// The header in which a reverse proxy of `trustedProxies` sends the user's name, such as `X-Forwarded-User`.
     /// Default: none.
-    pub user_header: Option<UserHeader>,
+    pub user_header: Option<UserHeader> = None,
     /// Reverse proxies, as addresses or networks, whose header `X-Forwarded-For` is trusted.
     /// Default: `["127.0.0.0/8", "::1/128"]`.
-    pub trusted_proxies: TrustedProxies,
+    pub trusted_proxies: TrustedProxies = TrustedProxies::default(),
     /// Seconds after which a simulation is closed, at least 360. Default: 7200.
     #[serde(deserialize_with = "whole::<360, 31_536_000, _, _>")]
-    pub timeout: u64,
+    pub timeout: u64 = 7200,
     /// Minutes after which a simulation that is paused is closed; 0: never. Default: 0.
     #[serde(with = "minutes_or_zero")]
-    pub idle_timeout: Duration,
+    pub idle_timeout: Duration = Duration::ZERO,
     /// Write `simulation/monitor.csv`. Default: true.
-    pub monitor_log_enabled: bool,
+    pub monitor_log_enabled: bool = true,
     /// Whether a world's URL may name any commit by its hash, not only one that is in a branch or tag. Git hosts also
     /// serve commits of forks and pull requests, which the repository's owner never accepted. Default: false.
-    pub any_commit: bool,
+    pub any_commit: bool = false,
     /// Where repositories are fetched from instead of their URL: {URL prefix: replacement}. Default: none.
-    pub git_mirrors: Mirrors,
+    pub git_mirrors: Mirrors = Mirrors::default(),
     /// File of settings for git, in git's own format: a proxy, certificates, credentials. They add to those of the
     /// machine.
     /// Default: none.
-    pub git_config: Option<ExpandedPath>,
+    pub git_config: Option<ExpandedPath> = None,
     /// Directory of cached repositories and of the projects of running simulations. Default: `cache`.
     #[serde(deserialize_with = "folder")]
-    pub cache_dir: ExpandedPath,
+    pub cache_dir: ExpandedPath = ExpandedPath("cache".into()),
     /// Size limit of all cached repositories, in MiB. Default: 10240.
     #[serde(deserialize_with = "whole::<1, 100_000_000, _, _>")]
-    pub cache_size: u64,
+    pub cache_size: u64 = 10 * 1024,
     /// Size limit of a project, in MiB, for the fetch and for the checkout. Default: 1024.
     #[serde(deserialize_with = "whole::<1, 100_000_000, _, _>")]
-    pub project_size: u64,
+    pub project_size: u64 = 1024,
     /// Free space that the disk of `cacheDir` must have for new simulations, in MiB; 0: any. Default: 512.
     #[serde(deserialize_with = "whole::<0, 100_000_000, _, _>")]
-    pub disk_reserve: u64,
+    pub disk_reserve: u64 = 512,
     /// Whether the server is ready only while it sees GPUs and none is lost. Default: false.
-    pub require_gpu: bool,
+    pub require_gpu: bool = false,
     /// Which GPU a simulation gets, of several. Default: the first.
-    pub gpus: GpuUse,
+    pub gpus: GpuUse = GpuUse::default(),
     /// The X screen that each GPU drives, in the order of `nvidia-smi`; with `gpus: "spread"`. Default: none.
     #[serde(deserialize_with = "one_or_many")]
-    pub displays: Vec<DisplayName>,
+    pub displays: Vec<DisplayName> = Vec::new(),
     /// The display that Webots opens its window on. Default: the environment variable `DISPLAY`, else `:0`.
-    pub display: Option<DisplayName>,
+    pub display: Option<DisplayName> = None,
     /// Give each Webots a virtual display of its own (needs `Xvfb`). Default: false.
-    pub xvfb: bool,
+    pub xvfb: bool = false,
     /// Seconds after six missed heartbeats until a simulation is ended. Default: 60.
     #[serde(with = "seconds")]
-    pub hang_limit: Duration,
+    pub hang_limit: Duration = Duration::from_mins(1),
     /// Pages from which browsers may open `/client`, as origins (`https://lab.org`). Default: any.
     #[serde(deserialize_with = "one_or_many")]
-    pub allowed_origins: Vec<Origin>,
+    pub allowed_origins: Vec<Origin> = Vec::new(),
     /// Password for actions such as `/drain`. Default: none, and actions are off.
-    pub admin_password: Option<Secret>,
+    pub admin_password: Option<Secret> = None,
     /// All other durations.
     #[serde(deserialize_with = "object")]
-    pub timing: Timing,
+    pub timing: Timing = Timing::default(),
     /// The file that this was read from; empty if there is none.
     #[serde(skip)]
-    pub file: PathBuf,
+    pub file: PathBuf = PathBuf::new(),
 }
-
-impl Default for SimulationConfig {
-    fn default() -> Self {
-        Self {
-            server: String::new(),
-            ssl: true,
-            port: 2000,
-            bind: Ipv6Addr::UNSPECIFIED.into(),
-            port_rewrite: true,
-            public_url: None,
-            streaming: Streaming::default(),
-            log_dir: ExpandedPath("log".into()),
-            debug: false,
-            title: None,
-            description: None,
-            webots_home: None,
-            webots: None,
-            projects_dir: None,
-            isolation: IsolationSetting::default(),
-            sandbox: SandboxFolders::default(),
-            container: ContainerSettings::default(),
-            environment: Vec::new(),
-            limits: ResourceLimits::default(),
-            docker: false,
-            persistant_docker_images: Vec::new(),
-            allowed_repositories: Vec::new(),
-            blocked_repositories: Vec::new(),
-            share_idle_time: 50.0,
-            notify: Vec::new(),
-            max_connections: 100,
-            waiting_line: 100,
-            max_clients: 1000,
-            max_clients_per_address: None,
-            max_places_per_address: None,
-            max_places_per_user: None,
-            user_header: None,
-            trusted_proxies: TrustedProxies::default(),
-            timeout: 7200,
-            idle_timeout: Duration::ZERO,
-            monitor_log_enabled: true,
-            any_commit: false,
-            git_mirrors: Mirrors::default(),
-            git_config: None,
-            cache_dir: ExpandedPath("cache".into()),
-            cache_size: 10 * 1024,
-            project_size: 1024,
-            disk_reserve: 512,
-            require_gpu: false,
-            gpus: GpuUse::default(),
-            displays: Vec::new(),
-            display: None,
-            xvfb: false,
-            hang_limit: Duration::from_mins(1),
-            allowed_origins: Vec::new(),
-            admin_password: None,
-            timing: Timing::default(),
-            file: PathBuf::new(),
-        }
-    }
 }
 
 impl SimulationConfig {
@@ -241,8 +183,13 @@ impl SimulationConfig {
         if let Some(program) = &self.webots {
             return Some(program.0.clone());
         }
-        let inside = if cfg!(target_os = "macos") { "Contents/MacOS/webots" } else { "webots" };
-        self.webots_home.as_ref().map(|home| home.0.join(inside))
+        self.webots_home.as_ref().map(|home| home.0.join("webots"))
+    }
+
+    /// Returns the files that may contain secrets: the configuration file, and those that it names.
+    pub fn secret_files(&self) -> impl Iterator<Item = &Path> {
+        let password = self.admin_password.as_ref().and_then(Secret::file);
+        [Some(self.file.as_path()), self.git_config.as_ref().map(|file| &*file.0), password].into_iter().flatten()
     }
 
     /// Whether simulations are spread over the GPUs of the machine.
@@ -280,14 +227,32 @@ impl Configuration for SimulationConfig {
         if self.webots_home.is_none() {
             self.webots_home = std::env::var_os("WEBOTS_HOME").map(|home| ExpandedPath(home.into()));
         }
-        self.isolation = self.isolation.with_docker(self.docker)?;
+        if self.docker {
+            let is_free = matches!(self.isolation, IsolationSetting::Auto | IsolationSetting::Container);
+            require(is_free, "docker", || {
+                "true asks for containers, but isolation for another level; remove one of them".to_owned()
+            })?;
+            self.isolation = IsolationSetting::Container;
+        }
         self.docker = self.isolation == IsolationSetting::Container;
-        check_ports(self.docker, self.port, self.max_connections)?;
-        warnings.extend(self.check_sandbox()?);
-        warnings.extend(self.sandbox.missing().map(|path| format!("sandbox: {} is not there", path.display())));
-        require(self.port.checked_add(self.max_connections).is_some(), "maxConnections", || {
-            format!("{} places above port {} leave the range of ports", self.max_connections, self.port)
+        let (places, editors) = (self.max_connections, if self.docker { EDITOR_PORT } else { 0 });
+        let last = u32::from(self.port) + u32::from(places) + u32::from(editors);
+        require(u16::try_from(last).is_ok() && (!self.docker || places <= EDITOR_PORT), "maxConnections", || {
+            format!(
+                "{places} places above port {} leave the range of ports; with containers allowed are up to {EDITOR_PORT} \
+                 places, and editors up to port 65535: each has the port of its Webots + {EDITOR_PORT}",
+                self.port
+            )
         })?;
+        if matches!(self.isolation, IsolationSetting::Auto | IsolationSetting::Sandbox) {
+            self.sandbox.check()?;
+        } else {
+            require(!self.sandbox.network.is_demanded(), "sandbox.network", || {
+                "networks of simulations' own are for sandboxes, and isolation is neither \"sandbox\" nor \"auto\""
+                    .to_owned()
+            })?;
+        }
+        warnings.extend(self.sandbox.missing().map(|path| format!("sandbox: {} is not there", path.display())));
         require(self.timing.silence > self.timing.ping, "timing.silence", || {
             format!("{} s is not more than timing.ping", self.timing.silence.as_secs_f64())
         })?;

@@ -1,7 +1,6 @@
 //! How clients reach the streams of simulations.
 
-use serde::de::Error;
-use serde::{Deserialize, Deserializer, Serialize};
+use serde::{Deserialize, Serialize};
 
 /// How clients reach the streams of simulations.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -12,11 +11,4 @@ pub enum Streaming {
     Direct,
     /// Through this server, with a token.
     Relay,
-}
-
-/// Reads the key `streaming`.
-pub fn streaming<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Streaming, D::Error> {
-    let value = serde_json::Value::deserialize(deserializer)?;
-    let problem = || D::Error::custom(format!("{value} is not allowed; allowed are \"direct\" and \"relay\""));
-    Streaming::deserialize(&value).map_err(|_| problem())
 }

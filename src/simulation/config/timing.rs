@@ -4,57 +4,43 @@ use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
+use crate::shared::config::keys::keys;
 use crate::shared::config::{seconds, seconds_or_zero};
 
+keys! {
 /// Durations, in seconds.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(rename_all = "camelCase", default, deny_unknown_fields)]
 pub struct Timing {
     /// Timeout of a checkout. Default: 120.
     #[serde(with = "seconds")]
-    pub checkout: Duration,
+    pub checkout: Duration = Duration::from_mins(2),
     /// Timeout of pulling and building an image. Default: 900.
     #[serde(with = "seconds")]
-    pub build: Duration,
+    pub build: Duration = Duration::from_mins(15),
     /// Timeout of Webots' start, until it listens on its port. Default: 120.
     #[serde(with = "seconds")]
-    pub launch: Duration,
+    pub launch: Duration = Duration::from_mins(2),
     /// Interval between two heartbeats of Webots. Default: 5.
     #[serde(with = "seconds")]
-    pub heartbeat: Duration,
+    pub heartbeat: Duration = Duration::from_secs(5),
     /// Time between SIGTERM and SIGKILL when Webots is ended. Default: 5.
     #[serde(with = "seconds")]
-    pub grace: Duration,
+    pub grace: Duration = Duration::from_secs(5),
     /// Interval between two pings of a client. Default: 20.
     #[serde(with = "seconds")]
-    pub ping: Duration,
+    pub ping: Duration = Duration::from_secs(20),
     /// A client that answers no ping for this long is disconnected. Must exceed `ping`. Default: 60.
     #[serde(with = "seconds")]
-    pub silence: Duration,
+    pub silence: Duration = Duration::from_mins(1),
     /// Time for which a simulation waits for a disconnected client; 0: not at all. Default: 60.
     #[serde(with = "seconds_or_zero")]
-    pub absence: Duration,
+    pub absence: Duration = Duration::from_mins(1),
     /// Timeout of open connections and simulations when the server stops. Default: 9.
     #[serde(with = "seconds")]
-    pub stop: Duration,
+    pub stop: Duration = Duration::from_secs(9),
     /// Interval between two attempts to announce the server. Default: 5.
     #[serde(with = "seconds")]
-    pub announce: Duration,
+    pub announce: Duration = Duration::from_secs(5),
 }
-
-impl Default for Timing {
-    fn default() -> Self {
-        Self {
-            checkout: Duration::from_mins(2),
-            build: Duration::from_mins(15),
-            launch: Duration::from_mins(2),
-            heartbeat: Duration::from_secs(5),
-            grace: Duration::from_secs(5),
-            ping: Duration::from_secs(20),
-            silence: Duration::from_mins(1),
-            absence: Duration::from_mins(1),
-            stop: Duration::from_secs(9),
-            announce: Duration::from_secs(5),
-        }
-    }
 }

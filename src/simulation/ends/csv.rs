@@ -23,21 +23,21 @@ pub(super) fn append(path: &Path, level: &str, ended: &Ended) -> io::Result<()> 
 
 fn line(level: &str, ended: &Ended) -> String {
     let time = |seconds| timestamp(SystemTime::UNIX_EPOCH + Duration::from_secs(seconds));
-    let taken = ended.how.taken;
+    let (simulation, taken) = (&ended.simulation, ended.how.taken);
     let fields = [
-        ended.id.to_string(),
-        time(ended.begin),
-        time(ended.end),
-        ended.client.clone(),
-        ended.repository.clone(),
-        ended.world.clone(),
-        ended.port.map(|port| port.to_string()).unwrap_or_default(),
+        simulation.id.to_string(),
+        time(simulation.since),
+        time(ended.at),
+        ended.client.to_string(),
+        simulation.repository.clone(),
+        simulation.world.clone(),
+        simulation.port.map(|port| port.to_string()).unwrap_or_default(),
         level.to_owned(),
         taken.memory.map(|bytes| bytes.to_string()).unwrap_or_default(),
         taken.time.map(|time| format!("{:.1}", time.as_secs_f64())).unwrap_or_default(),
         ended.how.reason.label().to_owned(),
-        ended.identity.user.clone().unwrap_or_default(),
-        ended.identity.label.clone().unwrap_or_default(),
+        simulation.identity.user.clone().unwrap_or_default(),
+        simulation.identity.label.clone().unwrap_or_default(),
     ];
     fields.map(|text| field(&text)).join(",") + "\n"
 }

@@ -30,56 +30,25 @@ pub enum EndReason {
 }
 
 impl EndReason {
-    /// All of them.
-    pub const ALL: [Self; 12] = [
-        Self::Left,
-        Self::Finished,
-        Self::TimeLimit,
-        Self::Idle,
-        Self::Stopped,
-        Self::Administrator,
-        Self::NoCheckout,
-        Self::NoWebots,
-        Self::Crashed,
-        Self::Hung,
-        Self::Limit,
-        Self::Fault,
+    /// All of them, with their names in `/metrics`, in `simulations.csv` and on the monitor.
+    pub const ALL: [(Self, &'static str); 12] = [
+        (Self::Left, "left"),
+        (Self::Finished, "finished"),
+        (Self::TimeLimit, "time_limit"),
+        (Self::Idle, "idle"),
+        (Self::Stopped, "stopped"),
+        (Self::Administrator, "administrator"),
+        (Self::NoCheckout, "no_checkout"),
+        (Self::NoWebots, "no_webots"),
+        (Self::Crashed, "crashed"),
+        (Self::Hung, "hung"),
+        (Self::Limit, "limit"),
+        (Self::Fault, "fault"),
     ];
 
-    /// Its name in `/metrics` and in `simulations.csv`.
+    /// Its name.
     pub fn label(self) -> &'static str {
-        match self {
-            Self::Left => "left",
-            Self::Finished => "finished",
-            Self::TimeLimit => "time_limit",
-            Self::Idle => "idle",
-            Self::Stopped => "stopped",
-            Self::Administrator => "administrator",
-            Self::NoCheckout => "no_checkout",
-            Self::NoWebots => "no_webots",
-            Self::Crashed => "crashed",
-            Self::Hung => "hung",
-            Self::Limit => "limit",
-            Self::Fault => "fault",
-        }
-    }
-
-    /// Its text on the monitor.
-    pub fn words(self) -> &'static str {
-        match self {
-            Self::Left => "client gone",
-            Self::Finished => "finished",
-            Self::TimeLimit => "time limit",
-            Self::Idle => "paused for too long",
-            Self::Stopped => "server stopped",
-            Self::Administrator => "stopped by the administrator",
-            Self::NoCheckout => "no checkout",
-            Self::NoWebots => "no start",
-            Self::Crashed => "crashed",
-            Self::Hung => "hung",
-            Self::Limit => "limit exceeded",
-            Self::Fault => "fault of this server",
-        }
+        Self::ALL.iter().find(|(reason, _)| *reason == self).map_or("", |(_, label)| label)
     }
 
     /// Whether its cause may have to be found, so that its output is kept for longer. A failed checkout has no output.

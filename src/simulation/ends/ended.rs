@@ -1,11 +1,10 @@
 //! A simulation that has ended.
 
-use std::path::PathBuf;
 use std::time::Duration;
 
 use super::end_reason::EndReason;
-use crate::simulation::client_identity::ClientIdentity;
-use crate::simulation::simulation_id::SimulationId;
+use crate::shared::http::Peer;
+use crate::simulation::snapshot::Simulation;
 
 /// The resources that a simulation has used, as far as they are known.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
@@ -27,27 +26,15 @@ pub struct End {
     pub taken: Taken,
 }
 
-/// A simulation that has ended. Times are seconds since 1970.
+/// A simulation that has ended.
 #[derive(Debug, Clone)]
 pub struct Ended {
-    /// Its id; unique.
-    pub id: SimulationId,
-    /// When its client requested it.
-    pub begin: u64,
-    /// When it ended.
-    pub end: u64,
-    /// The address of its client.
-    pub client: String,
-    /// The client's identity, only for administrators.
-    pub identity: ClientIdentity,
-    /// The URL of the repository.
-    pub repository: String,
-    /// The URL of the world.
-    pub world: String,
-    /// Its port, if it got one.
-    pub port: Option<u16>,
-    /// The file with its output, if it was launched.
-    pub log: Option<PathBuf>,
+    /// What pages showed of it last.
+    pub simulation: Simulation,
+    /// Its client.
+    pub client: Peer,
+    /// When it ended, in seconds since 1970.
+    pub at: u64,
     /// Its events: one line each, with the time.
     pub events: Vec<String>,
     /// Its end.
@@ -57,6 +44,6 @@ pub struct Ended {
 impl Ended {
     /// Whether its output is kept for a while.
     pub fn has_output(&self) -> bool {
-        self.log.is_some() || self.how.reason.is_abnormal()
+        self.simulation.log.is_some() || self.how.reason.is_abnormal()
     }
 }

@@ -46,8 +46,8 @@ impl Ends {
         let counter = metrics
             .counter("webots_simulation_ends_total", "Simulations that have ended", "reason")
             .map_err(std::io::Error::other)?;
-        for reason in EndReason::ALL {
-            counter.with_label_values(&[reason.label()]);
+        for (_, label) in EndReason::ALL {
+            counter.with_label_values(&[label]);
         }
         let (writer, jobs) = channel();
         std::thread::Builder::new().name("ends".to_owned()).spawn(move || write_all(&logs, &level, &jobs))?;
@@ -103,9 +103,9 @@ fn write_all(logs: &Path, level: &str, jobs: &Receiver<Job>) {
 
 fn write(logs: &Path, level: &str, ended: &Ended) {
     if let Err(error) = csv::append(&logs.join("simulations.csv"), level, ended) {
-        log::warn!("{}: its end is not in simulations.csv: {error}", ended.id);
+        log::warn!("{}: its end is not in simulations.csv: {error}", ended.simulation.id);
     }
     if let Err(error) = kept_output::keep(logs, ended) {
-        log::warn!("{}: its output is not kept: {error}", ended.id);
+        log::warn!("{}: its output is not kept: {error}", ended.simulation.id);
     }
 }

@@ -18,7 +18,7 @@ const ENDED: &str = "ended";
 /// The directory for abnormal ends.
 const FAILED: &str = "failed";
 /// Number of files that are kept, by directory.
-const KEPT: [(&str, usize); 2] = [(ENDED, 20), (FAILED, 100)];
+const KEPT: [(&str, usize); 3] = [(FOLDER_OF_RUNNING, usize::MAX), (ENDED, 20), (FAILED, 100)];
 /// Age from which a file is removed. That includes the output of a simulation whose end was not recorded because the
 /// server was killed.
 const AGE: Duration = Duration::from_hours(14 * 24);
@@ -41,7 +41,7 @@ pub fn output_file(logs: &Path, id: &str) -> Option<PathBuf> {
 /// When the file can't be created. The file of the running simulation is removed nevertheless, because a full disk
 /// needs the space.
 pub(super) fn keep(logs: &Path, ended: &Ended) -> io::Result<()> {
-    let log = logs.join(FOLDER_OF_RUNNING).join(format!("{}.log", ended.id));
+    let log = logs.join(FOLDER_OF_RUNNING).join(format!("{}.log", ended.simulation.id));
     let output = last_output(&log);
     for file in [older(&log), log] {
         fs::remove_file(file).ok();
@@ -53,33 +53,23 @@ pub(super) fn keep(logs: &Path, ended: &Ended) -> io::Result<()> {
     fs::create_dir_all(&folder)?;
     let events = ended.events.join("\n");
     let text = format!("{events}\n\nThe last lines that it has printed:\n\n{output}");
-    fs::write(folder.join(format!("{}.log", ended.id)), text)
+    fs::write(folder.join(format!("{}.log", ended.simulation.id)), text)
 }
 
 /// Removes surplus and old files.
 pub(super) fn prune(logs: &Path) {
+    let is_old = |written| SystemTime::now().duration_since(written).is_ok_and(|age| age > AGE);
     for (folder, most) in KEPT {
         let mut all = files(&logs.join(folder));
         all.sort();
         let surplus = all.len().saturating_sub(most);
-        for (_, file) in all.drain(..surplus) {
-            remove(&file);
+        for (number, (written, file)) in all.into_iter().enumerate() {
+            if (number < surplus || is_old(written))
+                && let Err(error) = fs::remove_file(&file)
+            {
+                log::warn!("{} can't be removed: {error}", file.display());
+            }
         }
-    }
-    for folder in [FOLDER_OF_RUNNING, ENDED, FAILED] {
-        for (_, file) in files(&logs.join(folder)).into_iter().filter(|(written, _)| is_old(*written)) {
-            remove(&file);
-        }
-    }
-}
-
-fn is_old(written: SystemTime) -> bool {
-    SystemTime::now().duration_since(written).is_ok_and(|age| age > AGE)
-}
-
-fn remove(file: &Path) {
-    if let Err(error) = fs::remove_file(file) {
-        log::warn!("{} can't be removed: {error}", file.display());
     }
 }
 
@@ -125,36 +115,29 @@ mod tests {
     use super::super::end_reason::EndReason;
     use super::super::ended::{End, Taken};
     use super::*;
+    use crate::shared::domain::ProjectUrl;
+    use crate::shared::http::Peer;
     use crate::simulation::client_identity::ClientIdentity;
+    use crate::simulation::snapshot::Simulation;
 
     fn ended(logs: &Path, reason: EndReason) -> Ended {
-        let id = SimulationId::next();
-        let log = logs.join(FOLDER_OF_RUNNING).join(format!("{id}.log"));
-        Ended {
-            id,
-            begin: 0,
-            end: 0,
-            client: String::new(),
-            identity: ClientIdentity::default(),
-            repository: String::new(),
-            world: String::new(),
-            port: None,
-            log: Some(log),
-            events: vec!["12:00:00 it began".to_owned()],
-            how: End { reason, why: String::new(), taken: Taken::default() },
-        }
+        let world = ProjectUrl::parse("https://github.com/lab/arm/blob/main/worlds/arm.wbt").unwrap();
+        let mut simulation = Simulation::new(SimulationId::next(), &world, ClientIdentity::default());
+        simulation.log = Some(logs.join(FOLDER_OF_RUNNING).join(format!("{}.log", simulation.id)));
+        let how = End { reason, why: String::new(), taken: Taken::default() };
+        Ended { simulation, client: Peer::Unknown, at: 0, events: vec!["12:00:00 it began".to_owned()], how }
     }
 
     #[test]
     fn only_the_end_of_an_output_is_kept_with_the_events() {
         let folder = tempfile::tempdir().unwrap();
         let one = ended(folder.path(), EndReason::Crashed);
-        let log = one.log.clone().unwrap();
+        let log = one.simulation.log.clone().unwrap();
         fs::create_dir_all(log.parent().unwrap()).unwrap();
         fs::write(older(&log), "before the rotation\n".repeat(10_000)).unwrap();
         fs::write(&log, "last words\n").unwrap();
         keep(folder.path(), &one).unwrap();
-        let kept = output_file(folder.path(), &one.id.to_string()).unwrap();
+        let kept = output_file(folder.path(), &one.simulation.id.to_string()).unwrap();
         let text = fs::read_to_string(&kept).unwrap();
         assert!(text.starts_with("12:00:00 it began\n\nThe last"), "{text}");
         assert!(text.ends_with("\nbefore the rotation\nlast words\n") && text.contains(":\n\nbefore"), "{text}");

@@ -290,11 +290,17 @@ impl Handler<GpusRead> for LoadMonitor {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::shared::http::Metrics;
+    use crate::simulation::ends::Ends;
+
+    fn slots() -> Addr<SlotPool> {
+        let ends = Ends::start(PathBuf::from("/nonexistent"), String::new(), &Metrics::new()).unwrap();
+        SlotPool::new(2001..=2001, 1, None, None, ends).start()
+    }
 
     #[actix_rt::test]
     async fn the_load_is_the_mean_of_five_seconds_and_the_history_is_ten_minutes_long() {
-        let slots = SlotPool::new(2001..=2001, 1, None).start();
-        let (mut monitor, readings) = LoadMonitor::new(slots, Path::new("/"), None, None);
+        let (mut monitor, readings) = LoadMonitor::new(slots(), Path::new("/"), None, None);
         let load = || readings.borrow().load.map(Load::percent);
         assert_eq!(load(), None);
         let mut read = |cpu: f64| {
@@ -319,8 +325,7 @@ mod tests {
         let gpu = |index, compute| Gpu { index, compute, ..Gpu::default() };
         let gpus = [gpu(0, 90.0), gpu(1, 60.0), gpu(2, 10.0)];
         for (spread, load) in [(None, 10.0), (Some(Spread::over(0)), 10.0), (Some(Spread::over(2)), 60.0)] {
-            let slots = SlotPool::new(2001..=2001, 1, None).start();
-            let (mut monitor, readings) = LoadMonitor::new(slots, Path::new("/"), None, spread.map(Arc::new));
+            let (mut monitor, readings) = LoadMonitor::new(slots(), Path::new("/"), None, spread.map(Arc::new));
             monitor.gpus.read(Instant::now(), GpuReading { gpus: gpus.to_vec(), lost: 0 });
             monitor.publish(0, 0);
             assert_eq!(readings.borrow().load.map(Load::percent), Some(load));

@@ -5,5 +5,5 @@ mod sessions;
 mod token;
 
 pub use attachment::{Attachment, ClientAction, FromClient, ToClient};
-pub use sessions::{Registration, Resume, Sessions};
+pub use sessions::{Resume, Sessions};
 pub use token::Token;

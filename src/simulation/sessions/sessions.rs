@@ -1,7 +1,6 @@
 //! The sessions that their clients can resume.
 
 use std::collections::HashMap;
-use std::sync::Arc;
 
 use actix::prelude::*;
 use parking_lot::Mutex;
@@ -27,36 +26,19 @@ pub struct Resume {
 #[derive(Default)]
 pub struct Sessions(Mutex<HashMap<u64, Recipient<Resume>>>);
 
-/// The registration of a session. Dropping it removes the session.
-pub struct Registration {
-    number: u64,
-    sessions: Arc<Sessions>,
-}
-
 impl Sessions {
-    /// Registers a session.
-    pub fn register(self: &Arc<Self>, session: Recipient<Resume>) -> Registration {
-        // Random, so that it differs from the numbers of earlier runs of the server.
+    /// Registers a session until it ends. Returns the number for its tokens: random, so that it differs from those of
+    /// earlier runs of the server.
+    pub fn register(&self, session: Recipient<Resume>) -> u64 {
         let number = rand::random();
-        self.0.lock().insert(number, session);
-        Registration { number, sessions: Arc::clone(self) }
+        let mut sessions = self.0.lock();
+        sessions.retain(|_, session| session.connected());
+        sessions.insert(number, session);
+        number
     }
 
     /// The session that a token names, if it has not ended.
     pub fn find(&self, token: &Token) -> Option<Recipient<Resume>> {
-        self.0.lock().get(&token.number()).cloned()
-    }
-}
-
-impl Registration {
-    /// Creates a new token for the session.
-    pub fn token(&self) -> Token {
-        Token::new(self.number)
-    }
-}
-
-impl Drop for Registration {
-    fn drop(&mut self) {
-        self.sessions.0.lock().remove(&self.number);
+        self.0.lock().get(&token.number()).cloned().filter(Recipient::connected)
     }
 }

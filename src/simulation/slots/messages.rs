@@ -1,11 +1,8 @@
 //! Messages to the slot pool.
 
-use std::net::IpAddr;
-
 use actix::prelude::*;
 
-use super::present::{Present, Report};
-use super::slot_error::SlotError;
+use super::present::Present;
 use crate::simulation::simulation_id::SimulationId;
 use crate::simulation::snapshot::Snapshot;
 
@@ -14,10 +11,10 @@ use crate::simulation::snapshot::Snapshot;
 #[rtype(result = "()")]
 pub(super) struct Acquire(pub Box<Present>);
 
-/// A report of a lease's owner about its simulation.
+/// Changes the record of a simulation.
 #[derive(Message)]
 #[rtype(result = "()")]
-pub struct UpdateSimulation(pub SimulationId, pub Report);
+pub(super) struct Update(pub SimulationId, pub Box<dyn FnOnce(&mut Present) + Send>);
 
 /// Requests a snapshot of all simulations.
 #[derive(Message)]
@@ -27,7 +24,7 @@ pub struct GetSnapshot;
 /// Releases a slot, or leaves the queue.
 #[derive(Message)]
 #[rtype(result = "()")]
-pub struct Release(pub SimulationId);
+pub(super) struct Release(pub SimulationId);
 
 /// Stops the simulation that has this id now, and no other one; the answer is whether there is one.
 #[derive(Message)]
@@ -37,14 +34,4 @@ pub struct StopOne {
     pub id: String,
     /// Why, in words for its client.
     pub why: String,
-}
-
-/// Makes a slot count for another address of its client; the answer is why it may not.
-#[derive(Message)]
-#[rtype(result = "Result<(), SlotError>")]
-pub struct Move {
-    /// The id of the simulation.
-    pub id: SimulationId,
-    /// The client's current address, if it is known.
-    pub address: Option<IpAddr>,
 }

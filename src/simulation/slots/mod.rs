@@ -3,12 +3,11 @@
 mod messages;
 mod party;
 mod present;
-mod slot_error;
 mod slot_event;
+mod slot_lease;
 mod slot_pool;
 
-pub use messages::{GetSnapshot, Move, StopOne, UpdateSimulation};
-pub use present::Report;
-pub use slot_error::SlotError;
+pub use messages::{GetSnapshot, StopOne};
 pub use slot_event::SlotEvent;
-pub use slot_pool::{Slot, SlotLease, SlotPool};
+pub use slot_lease::{Slot, SlotLease, update};
+pub use slot_pool::SlotPool;

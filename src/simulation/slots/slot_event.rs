@@ -2,8 +2,6 @@
 
 use actix::prelude::*;
 
-use super::slot_error::SlotError;
-
 /// An event of a lease.
 #[derive(Message, Debug, Clone, PartialEq, Eq)]
 #[rtype(result = "()")]
@@ -12,8 +10,8 @@ pub enum SlotEvent {
     Queued(usize),
     /// This port may be used until the lease is dropped.
     Granted(u16),
-    /// The slots and the queue are full, or the address has reached its limit.
-    Rejected(SlotError),
+    /// The slots and the queue are full, or the address or the user has reached its limit: why, in words for the client.
+    Rejected(String),
     /// Too many simulations wait for disconnected clients, and this one has waited longest: it must end.
     AwayTooLong,
     /// The administrator stops the simulation; the words are for its client.

@@ -13,38 +13,31 @@ use crate::simulation::simulation_id::SimulationId;
 
 /// Timeout of a watcher's token that is not used. A used one is valid as long as its connection.
 const TOKEN_TIMEOUT: Duration = Duration::from_mins(1);
-/// Limit of watchers' tokens.
-const MAX_WATCHERS: usize = 1000;
 
 /// Sent to a session when the first watcher of its simulation connects, and when the last one leaves.
 #[derive(Message, Debug, Clone, Copy, PartialEq, Eq)]
 #[rtype(result = "()")]
 pub struct Watched(pub bool);
 
-/// The streams of this server.
+/// The streams of this server, by the number of the token that leads to each.
 #[derive(Default)]
-pub struct Streams(Mutex<Tables>);
+pub struct Streams(Mutex<HashMap<u64, Stream>>);
 
-#[derive(Default)]
-struct Tables {
-    streams: HashMap<u64, Stream>,
-    watchers: HashMap<u64, Watcher>,
-}
-
+/// The stream of a simulation, for its client or for one watcher.
+#[derive(Clone)]
 struct Stream {
-    simulation: SimulationId,
     token: Token,
+    simulation: SimulationId,
     port: u16,
     session: Recipient<Watched>,
+    watcher: Option<Watcher>,
 }
 
-struct Watcher {
-    token: Token,
-    /// The number of the stream.
-    stream: u64,
-    issued_at: Instant,
-    /// Whether its connection is open.
-    is_connected: bool,
+#[derive(Clone, Copy)]
+enum Watcher {
+    /// It got its token at this time.
+    Issued(Instant),
+    Connected,
 }
 
 /// The stream that belongs to a token.
@@ -61,18 +54,19 @@ pub struct StreamTarget {
 /// Keeps a stream registered. Dropping it invalidates its tokens, those of watchers too.
 pub struct StreamRegistration {
     token: Token,
+    simulation: SimulationId,
     streams: Arc<Streams>,
 }
 
 /// A watcher's connection. Dropping it invalidates its token.
 pub struct WatchGuard {
     number: u64,
+    simulation: SimulationId,
     streams: Arc<Streams>,
 }
 
 impl Streams {
     /// Registers the stream of a simulation on this port; `session` is notified of watchers.
-    #[must_use]
     pub fn register(
         self: &Arc<Self>,
         simulation: SimulationId,
@@ -80,79 +74,60 @@ impl Streams {
         session: Recipient<Watched>,
     ) -> StreamRegistration {
         let token = Token::new(rand::random());
-        self.0.lock().streams.insert(token.number(), Stream { simulation, token, port, session });
-        StreamRegistration { token, streams: Arc::clone(self) }
+        self.0.lock().insert(token.number(), Stream { token, simulation, port, session, watcher: None });
+        StreamRegistration { token, simulation, streams: Arc::clone(self) }
     }
 
     /// The stream of a token, if the token is valid.
-    #[must_use]
     pub fn find(&self, token: &Token) -> Option<StreamTarget> {
-        let open = self.0.lock();
-        if let Some(stream) = open.streams.get(&token.number()).filter(|stream| stream.token == *token) {
-            return Some(stream.target(false));
-        }
-        let watcher = open.watchers.get(&token.number()).filter(|watcher| watcher.token == *token)?;
-        if !watcher.is_valid() {
-            return None;
-        }
-        open.streams.get(&watcher.stream).map(|stream| stream.target(true))
+        let streams = self.0.lock();
+        let Stream { simulation, port, watcher, .. } =
+            streams.get(&token.number()).filter(|stream| stream.token == *token && stream.is_valid())?;
+        Some(StreamTarget { simulation: *simulation, port: *port, read_only: watcher.is_some() })
     }
 
-    /// Issues a token to watch a simulation; `None` if it has no stream, or there are too many watchers.
-    #[must_use]
+    /// Issues a token to watch a simulation; `None` if it has no stream.
     pub fn watch(&self, simulation: &str) -> Option<Token> {
-        let mut open = self.0.lock();
-        open.watchers.retain(|_, watcher| watcher.is_valid());
-        let mut streams = open.streams.iter();
-        let stream = *streams.find(|(_, stream)| stream.simulation.to_string() == simulation)?.0;
-        if open.watchers.len() >= MAX_WATCHERS {
-            return None;
-        }
+        let mut streams = self.0.lock();
+        streams.retain(|_, stream| stream.is_valid());
+        let stream = streams.values().find(|stream| stream.simulation.to_string() == simulation)?;
         let token = Token::new(rand::random());
-        open.watchers.insert(token.number(), Watcher { token, stream, issued_at: Instant::now(), is_connected: false });
+        let watched = Stream { token, watcher: Some(Watcher::Issued(Instant::now())), ..stream.clone() };
+        streams.insert(token.number(), watched);
         Some(token)
     }
 
     /// Marks a watcher's token as used; `None` if it already was.
-    #[must_use]
     pub fn start_watching(self: &Arc<Self>, token: &Token) -> Option<WatchGuard> {
-        let mut open = self.0.lock();
-        let watcher = open.watchers.get_mut(&token.number()).filter(|watcher| !watcher.is_connected)?;
-        watcher.is_connected = true;
-        let stream = watcher.stream;
-        open.notify_session(stream, true);
-        Some(WatchGuard { number: token.number(), streams: Arc::clone(self) })
+        let mut streams = self.0.lock();
+        let stream = streams.get_mut(&token.number())?;
+        if !matches!(stream.watcher, Some(Watcher::Issued(_))) {
+            return None;
+        }
+        stream.watcher = Some(Watcher::Connected);
+        let simulation = stream.simulation;
+        notify_session(&streams, simulation, true);
+        Some(WatchGuard { number: token.number(), simulation, streams: Arc::clone(self) })
     }
 }
 
-impl Tables {
-    /// Notifies a session if one watcher is connected: the first one has come, or the last one leaves.
-    fn notify_session(&self, stream: u64, is_watched: bool) {
-        let watching =
-            self.watchers.values().filter(|watcher| watcher.is_connected && watcher.stream == stream).count();
-        if watching == 1
-            && let Some(stream) = self.streams.get(&stream)
-        {
-            stream.session.do_send(Watched(is_watched));
-        }
+/// Notifies a session if one watcher is connected: the first one has come, or the last one leaves.
+fn notify_session(streams: &HashMap<u64, Stream>, simulation: SimulationId, is_watched: bool) {
+    let is_connected = |stream: &&Stream| matches!(stream.watcher, Some(Watcher::Connected));
+    let mut watching = streams.values().filter(|stream| stream.simulation == simulation).filter(is_connected);
+    if let (Some(only), None) = (watching.next(), watching.next()) {
+        only.session.do_send(Watched(is_watched));
     }
 }
 
 impl Stream {
-    fn target(&self, read_only: bool) -> StreamTarget {
-        StreamTarget { simulation: self.simulation, port: self.port, read_only }
-    }
-}
-
-impl Watcher {
     fn is_valid(&self) -> bool {
-        self.is_connected || self.issued_at.elapsed() < TOKEN_TIMEOUT
+        !matches!(self.watcher, Some(Watcher::Issued(at)) if at.elapsed() >= TOKEN_TIMEOUT)
     }
 }
 
 impl StreamRegistration {
     /// The token for the simulation's client.
-    #[must_use]
     pub fn token(&self) -> Token {
         self.token
     }
@@ -160,20 +135,17 @@ impl StreamRegistration {
 
 impl Drop for StreamRegistration {
     fn drop(&mut self) {
-        let number = self.token.number();
-        let mut open = self.streams.0.lock();
-        open.streams.remove(&number);
-        open.watchers.retain(|_, watcher| watcher.stream != number);
+        self.streams.0.lock().retain(|_, stream| stream.simulation != self.simulation);
     }
 }
 
 impl Drop for WatchGuard {
     fn drop(&mut self) {
-        let mut open = self.streams.0.lock();
-        if let Some(stream) = open.watchers.get(&self.number).map(|watcher| watcher.stream) {
-            open.notify_session(stream, false);
+        let mut streams = self.streams.0.lock();
+        if streams.contains_key(&self.number) {
+            notify_session(&streams, self.simulation, false);
+            streams.remove(&self.number);
         }
-        open.watchers.remove(&self.number);
     }
 }
 
@@ -201,12 +173,14 @@ mod tests {
         assert_eq!(streams.find(&Token::new(stream.token().number())), None, "the same number with another secret");
         let [used, unused] = [(); 2].map(|()| streams.watch(&id.to_string()).unwrap());
         let _watching = streams.start_watching(&used).unwrap();
-        for watcher in streams.0.lock().watchers.values_mut() {
-            watcher.issued_at = Instant::now().checked_sub(TOKEN_TIMEOUT).unwrap();
+        for stream in streams.0.lock().values_mut() {
+            if let Some(Watcher::Issued(at)) = &mut stream.watcher {
+                *at = Instant::now().checked_sub(TOKEN_TIMEOUT).unwrap();
+            }
         }
         assert!(streams.find(&used).is_some());
         assert_eq!(streams.find(&unused), None);
         drop(stream);
-        assert!(streams.0.lock().watchers.is_empty());
+        assert!(streams.0.lock().is_empty());
     }
 }

@@ -1,15 +1,17 @@
 //! Actions of administrators: each needs their password.
 
+use actix_web::error::ErrorNotFound;
 use actix_web::http::header;
 use actix_web::{HttpRequest, HttpResponse, web};
 use serde::Deserialize;
 
-use super::queries::{stop_simulation, too_busy};
+use super::queries::ask;
 use crate::shared::http::routing::{GET, POST, path};
-use crate::shared::http::{body, refuse_action};
+use crate::shared::http::{body, refuse_action, require_administrator};
 use crate::shared::run::ServerCommand;
 use crate::shared::text::excerpt;
 use crate::simulation::protocol;
+use crate::simulation::slots::StopOne;
 use crate::simulation::state::AppState;
 
 /// Longest reason, in characters.
@@ -50,34 +52,26 @@ async fn stop(
     id: web::Path<String>,
     body: web::Payload,
     server: web::Data<AppState>,
-) -> HttpResponse {
+) -> actix_web::Result<HttpResponse> {
     if let Some(refusal) = refusal(&request, &server) {
-        return refusal;
+        return Ok(refusal);
     }
     let StopRequest { reason } = match body::json(&request, body, "{\"reason\": TEXT}").await {
         Ok(order) => order,
-        Err(refusal) => return refusal,
+        Err(refusal) => return Ok(refusal),
     };
     let (id, reason) = (id.into_inner(), excerpt(reason.trim(), MAX_REASON_LENGTH));
-    match stop_simulation(&server, id.clone(), protocol::stopped_by_teacher(&reason)).await {
-        Some(true) => {
-            let peer = server.config.trusted_proxies.peer(&request);
-            log::info!("{id}: client {peer} stops it, reason: {}", if reason.is_empty() { "none" } else { &reason });
-            HttpResponse::Accepted().body("stopping")
-        }
-        Some(false) => HttpResponse::NotFound().body("Error: there is no such simulation; it may have ended."),
-        None => too_busy(),
+    if !ask(&server, StopOne { id: id.clone(), why: protocol::stopped_by_teacher(&reason) }).await? {
+        return Err(ErrorNotFound("Error: there is no such simulation; it may have ended."));
     }
+    let peer = server.config.trusted_proxies.peer(&request);
+    log::info!("{id}: client {peer} stops it, reason: {}", if reason.is_empty() { "none" } else { &reason });
+    Ok(HttpResponse::Accepted().body("stopping"))
 }
 
 /// Has the browser ask for the password, which it then sends to the monitor page too.
 async fn sign_in(request: HttpRequest, server: web::Data<AppState>) -> HttpResponse {
     let peer = server.config.trusted_proxies.peer(&request);
-    match &server.admin_auth {
-        None => HttpResponse::NotFound().body("Error: adminPassword is not set."),
-        Some(auth) => match auth.check(&request, peer) {
-            Ok(()) => HttpResponse::SeeOther().insert_header((header::LOCATION, "monitor")).finish(),
-            Err(refused) => refused.answer(),
-        },
-    }
+    let refusal = require_administrator(server.admin_auth.as_ref(), &request, peer);
+    refusal.unwrap_or_else(|| HttpResponse::SeeOther().insert_header((header::LOCATION, "monitor")).finish())
 }

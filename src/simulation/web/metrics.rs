@@ -1,5 +1,5 @@
-//! The Prometheus metrics of `/metrics` that follow from the state of the server. Counters are in `client/outcome.rs` and
-//! `ends/ends.rs`.
+//! The Prometheus metrics of `/metrics` that follow from the state of the server. The counter of starts is in
+//! `app.rs`, that of ends in `ends/ends.rs`.
 
 use crate::shared::http::Gauge;
 use crate::simulation::machine::sensors::Gpu;
@@ -21,21 +21,24 @@ pub fn gauges<'text>(server: &AppState, snapshot: &Snapshot) -> Vec<Gauge<'text>
         let labels = |gpu: &Gpu| vec![gpu.index.to_string(), gpu.name.clone()];
         readings.gpus.iter().map(|gpu| (labels(gpu), value(gpu))).collect()
     };
-    let ready = f64::from(u8::from(server.problem().is_none()));
-    let failed_starts = f64::from(server.failed_starts.count());
+    let flag = |is_set: bool| f64::from(u8::from(is_set));
     let away = snapshot.simulations.iter().filter(|one| one.away_until.is_some()).count();
-    let away = u32::try_from(away).unwrap_or(u32::MAX);
-    let draining = f64::from(u8::from(server.is_draining()));
+    let failed = "Starts in a row that failed for a reason of this server's own";
+    let lost = "1 while GPUs have answered and some or all don't any more";
     vec![
         Gauge::plain("webots_simulation_load_percent", "Load as /load tells it", server.load().percent()),
-        Gauge::plain("webots_simulation_ready", "0 while no simulation can be started", ready),
         Gauge::plain(
-            "webots_simulation_failed_starts",
-            "Starts in a row that failed for a reason of this server's own",
-            failed_starts,
+            "webots_simulation_ready",
+            "0 while no simulation can be started",
+            flag(server.problem().is_none()),
         ),
-        Gauge::plain("webots_simulation_draining", "1 while no new clients are taken", draining),
-        Gauge::plain("webots_simulation_away", "Simulations that wait for their clients", f64::from(away)),
+        Gauge::plain("webots_simulation_failed_starts", failed, f64::from(server.failed_starts.count())),
+        Gauge::plain("webots_simulation_draining", "1 while no new clients are taken", flag(server.is_draining())),
+        Gauge::plain(
+            "webots_simulation_away",
+            "Simulations that wait for their clients",
+            f64::from(u32::try_from(away).unwrap_or(u32::MAX)),
+        ),
         Gauge::plain("webots_simulation_places", "Simulations that fit", f64::from(instances.places)),
         Gauge {
             name: "webots_simulation_instances",
@@ -47,11 +50,7 @@ pub fn gauges<'text>(server: &AppState, snapshot: &Snapshot) -> Vec<Gauge<'text>
         Gauge::plain("webots_machine_memory_percent", "Memory in use", machine.memory),
         Gauge::plain("webots_machine_swap_percent", "Swap in use", machine.swap),
         Gauge::plain("webots_machine_disk_percent", "Disk in use where the cache is", machine.disk),
-        Gauge::plain(
-            "webots_machine_gpu_lost",
-            "1 while GPUs have answered and some or all don't any more",
-            f64::from(u8::from(readings.gpu_problem.is_some())),
-        ),
+        Gauge::plain("webots_machine_gpu_lost", lost, flag(readings.gpu_problem.is_some())),
         Gauge {
             name: "webots_machine_gpu_compute_percent",
             help: "GPU: time in which a kernel ran",

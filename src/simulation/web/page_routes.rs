@@ -3,13 +3,14 @@
 use std::collections::BTreeMap;
 
 use actix_files::NamedFile;
+use actix_web::error::ErrorNotFound;
 use actix_web::http::header::{self, HeaderValue};
 use actix_web::{HttpRequest, HttpResponse, web};
 use serde::Deserialize;
 
 use super::administrator::Visitor;
 use super::pages;
-use super::queries::{snapshot, too_busy};
+use super::queries::ask;
 use super::webots_viewer;
 use crate::asset;
 use crate::shared::http::assets::{self, Asset};
@@ -18,6 +19,7 @@ use crate::shared::http::{ConnectionKind, ContentSecurityPolicy, html};
 use crate::simulation::container;
 use crate::simulation::ends::{last_lines, output_file};
 use crate::simulation::machine::{Tree, Usages};
+use crate::simulation::slots::GetSnapshot;
 use crate::simulation::snapshot::{Simulation, Snapshot};
 use crate::simulation::state::AppState;
 
@@ -42,15 +44,11 @@ pub fn configure(app: &mut web::ServiceConfig) {
         .service(path("/wwi/{path:.*}", GET, wwi));
 }
 
-async fn monitor(request: HttpRequest, server: web::Data<AppState>) -> HttpResponse {
-    let Some(snapshot) = snapshot(&server).await else {
-        return too_busy();
-    };
+async fn monitor(request: HttpRequest, server: web::Data<AppState>) -> actix_web::Result<HttpResponse> {
+    let visitor = Visitor::of(&request, &server)?;
+    let snapshot = ask(&server, GetSnapshot).await?;
     let usages = usages(&server, &snapshot).await;
-    match Visitor::of(&request, &server) {
-        Ok(visitor) => html(pages::monitor(&server, &snapshot, &usages, visitor), &ContentSecurityPolicy::own()),
-        Err(refused) => refused.answer(),
-    }
+    Ok(html(pages::monitor(&server, &snapshot, &usages, visitor), &ContentSecurityPolicy::own()))
 }
 
 async fn usages(server: &AppState, snapshot: &Snapshot) -> Usages {
@@ -70,27 +68,21 @@ async fn usages(server: &AppState, snapshot: &Snapshot) -> Usages {
     read.await.unwrap_or_default()
 }
 
-async fn events(request: HttpRequest, server: web::Data<AppState>) -> HttpResponse {
-    let permit = match server.connections.admit(ConnectionKind::Page, server.config.trusted_proxies.peer(&request)) {
-        Ok(permit) => permit,
-        Err(refused) => return refused.answer(),
-    };
-    let visitor = match Visitor::of(&request, &server) {
-        Ok(visitor) => visitor,
-        Err(refused) => return refused.answer(),
-    };
+async fn events(request: HttpRequest, server: web::Data<AppState>) -> actix_web::Result<HttpResponse> {
+    let permit = server.connections.admit(ConnectionKind::Page, server.config.trusted_proxies.peer(&request))?;
+    let visitor = Visitor::of(&request, &server)?;
     let shown = server.clone();
     let render = move || {
         let server = shown.clone();
         async move {
-            let snapshot = snapshot(&server).await?;
+            let snapshot = ask(&server, GetSnapshot).await.ok()?;
             let usages = usages(&server, &snapshot).await;
             let view = pages::view(&server, &snapshot, &usages, visitor);
             view.inspect_err(|error| log::error!("the monitor page can't be rendered: {error}")).ok()
         }
     };
     let live = if visitor == Visitor::Administrator { &server.administrators } else { &server.live };
-    live.listen(permit, server.phase.clone(), render)
+    Ok(live.listen(permit, server.phase.clone(), render))
 }
 
 async fn history(server: web::Data<AppState>) -> HttpResponse {
@@ -109,37 +101,33 @@ struct Which {
 
 /// The last output lines of a simulation, running or ended. They may be private, so the administrator's password
 /// protects them if one is configured.
-async fn output(request: HttpRequest, which: web::Query<Which>, server: web::Data<AppState>) -> HttpResponse {
-    if let Some(auth) = &server.admin_auth
-        && let Err(refused) = auth.check(&request, server.config.trusted_proxies.peer(&request))
-    {
-        return refused.answer();
+async fn output(
+    request: HttpRequest,
+    which: web::Query<Which>,
+    server: web::Data<AppState>,
+) -> actix_web::Result<HttpResponse> {
+    if let Some(auth) = &server.admin_auth {
+        auth.check(&request, server.config.trusted_proxies.peer(&request))?;
     }
     let logs = server.config.log_dir.0.join("simulation");
     let tail =
         web::block(move || output_file(&logs, &which.id).and_then(|file| last_lines(&file, MAX_TAIL).ok())).await;
-    let Ok(Some(tail)) = tail else {
-        return HttpResponse::NotFound().body("Error: nothing is kept of this simulation.");
-    };
-    HttpResponse::Ok()
-        .insert_header((header::X_CONTENT_TYPE_OPTIONS, "nosniff"))
+    let tail = tail?.ok_or_else(|| ErrorNotFound("Error: nothing is kept of this simulation."))?;
+    Ok(HttpResponse::Ok()
         .insert_header((header::CONTENT_SECURITY_POLICY, "default-src 'none'; frame-ancestors 'none'"))
         .content_type("text/plain; charset=utf-8")
-        .body(tail)
+        .body(tail))
 }
 
 /// A file of Webots' own viewer.
-async fn wwi(request: HttpRequest, server: web::Data<AppState>) -> HttpResponse {
+async fn wwi(request: HttpRequest, server: web::Data<AppState>) -> actix_web::Result<HttpResponse> {
     let path = request.match_info().query("path").to_owned();
     let file = web::block(move || {
         let file = webots_viewer::file_below(&webots_viewer::folder(&server.config)?, &path)?;
         NamedFile::open(file).ok()
     });
-    let Ok(Some(file)) = file.await else {
-        return HttpResponse::NotFound().body("Error: there is no such file.");
-    };
+    let file = file.await?.ok_or_else(|| ErrorNotFound("Error: there is no such file."))?;
     let mut response = file.disable_content_disposition().into_response(&request);
     response.headers_mut().insert(header::CACHE_CONTROL, HeaderValue::from_static("no-cache"));
-    response.headers_mut().insert(header::X_CONTENT_TYPE_OPTIONS, HeaderValue::from_static("nosniff"));
-    response
+    Ok(response)
 }

@@ -6,13 +6,12 @@ use askama::Template;
 use url::Url;
 
 use super::administrator::Visitor;
-use crate::shared::domain::{Instances, UrlPrefix};
+use crate::shared::domain::Instances;
 use crate::shared::http::{PageView, TableRow};
 use crate::shared::run::{seconds_since_1970, timestamp};
 use crate::shared::text::{one_line, without_paths};
 use crate::simulation::ends::Ended;
-use crate::simulation::isolation::IsolationLevel;
-use crate::simulation::machine::sensors::{self, Gpu, Host, Machine};
+use crate::simulation::machine::sensors::{self, Gpu, Machine};
 use crate::simulation::machine::{Readings, Sample, Usage, Usages};
 use crate::simulation::snapshot::{Simulation, Snapshot, Stage};
 use crate::simulation::state::AppState;
@@ -21,26 +20,20 @@ use crate::simulation::state::AppState;
 #[derive(Template)]
 #[template(path = "simulation/monitor.html")]
 struct Monitor<'server> {
+    server: &'server AppState,
+    readings: &'server Readings,
     visitor: Visitor,
     version: &'static str,
     started: String,
     title: &'server str,
-    description: &'server str,
     glance: &'server str,
     /// The columns of the charts' numbers.
     columns: String,
     rows: &'server [TableRow],
     ends: &'server [TableRow],
-    host: &'server Host,
     gpus: Vec<(&'server Gpu, String)>,
     memory: String,
     swap: String,
-    allowed: &'server [UrlPrefix],
-    blocked: &'server [UrlPrefix],
-    docker: bool,
-    share_idle_time: f64,
-    isolation: IsolationLevel,
-    network: Option<String>,
     shows_ports: bool,
     /// What worlds' programs may do that they should not, and why.
     shortcoming: Option<(&'static str, &'server str)>,
@@ -107,8 +100,9 @@ pub fn view(
     });
     let rows = rows.collect::<Result<Vec<TableRow>, askama::Error>>()?;
     let ends = server.ends.latest();
-    let ends =
-        ends.iter().map(|one| Ok(TableRow { key: one.id.to_string(), html: EndRow::new(one, visitor).render()? }));
+    let ends = ends
+        .iter()
+        .map(|one| Ok(TableRow { key: one.simulation.id.to_string(), html: EndRow::new(one, visitor).render()? }));
     let ends = ends.collect::<Result<Vec<TableRow>, askama::Error>>()?;
     let glance = Glance::new(server, snapshot, &readings).render()?;
     let sample = readings.history.back().map(Sample::columns).unwrap_or_default();
@@ -127,26 +121,21 @@ pub fn monitor(
 ) -> Result<String, askama::Error> {
     let view = view(server, snapshot, usages, visitor)?;
     let readings = server.readings.borrow().clone();
+    let table = |name| view.tables.get(name).map(Vec::as_slice).unwrap_or_default();
     let page = Monitor {
+        server,
+        readings: &readings,
         visitor,
         version: env!("CARGO_PKG_VERSION"),
         started: timestamp(SystemTime::now() - server.started.elapsed()),
         title: server.config.title.as_deref().unwrap_or("Webots simulation server"),
-        description: server.config.description.as_deref().unwrap_or_default(),
         glance: view.parts.get("glance").map(String::as_str).unwrap_or_default(),
         columns: Sample::headings(),
-        rows: view.tables.get("simulations").map(Vec::as_slice).unwrap_or_default(),
-        ends: view.tables.get("ends").map(Vec::as_slice).unwrap_or_default(),
-        host: &readings.host,
+        rows: table("simulations"),
+        ends: table("ends"),
         gpus: with_sizes(&readings.gpus),
         memory: bytes(readings.host.memory),
         swap: bytes(readings.host.swap),
-        allowed: &server.rules.allowed,
-        blocked: &server.rules.blocked,
-        docker: server.rules.docker,
-        share_idle_time: server.rules.share_idle_time,
-        isolation: server.launcher.level(),
-        network: server.launcher.network_in_words(),
         shows_ports: visitor.sees_ports(&server.config),
         shortcoming: shortcoming(server),
         limit: duration(server.config.timeout),
@@ -186,25 +175,23 @@ fn with_sizes(gpus: &[Gpu]) -> Vec<(&Gpu, String)> {
 #[template(path = "simulation/end.html")]
 struct EndRow<'one> {
     visitor: Visitor,
-    one: &'one Ended,
+    record: &'one Ended,
+    one: &'one Simulation,
     link: String,
     world: String,
     repository: String,
     ended: String,
     after: String,
-    reason: &'static str,
-    abnormal: bool,
     why: String,
 }
 
 impl<'one> EndRow<'one> {
-    fn new(one: &'one Ended, visitor: Visitor) -> Self {
-        let (repository, world) = names(&one.world);
-        let (ended, after) = (text_of(one.end), duration(one.end.saturating_sub(one.begin)));
-        let (reason, why) = (one.how.reason, without_paths(&one.how.why));
-        let link = link(&one.world);
-        let abnormal = reason.is_abnormal();
-        Self { visitor, one, link, world, repository, ended, after, reason: reason.words(), abnormal, why }
+    fn new(record: &'one Ended, visitor: Visitor) -> Self {
+        let one = &record.simulation;
+        let (repository, world) = names(one);
+        let (ended, after) = (text_of(record.at), duration(record.at.saturating_sub(one.since)));
+        let (link, why) = (link(&one.world), without_paths(&record.how.why));
+        Self { visitor, record, one, link, world, repository, ended, after, why }
     }
 }
 
@@ -212,19 +199,15 @@ fn text_of(seconds_since_1970: u64) -> String {
     timestamp(SystemTime::UNIX_EPOCH + Duration::from_secs(seconds_since_1970))
 }
 
-/// Separators of Git hosts between a repository and a path in it.
-const SEPARATORS: [&str; 4] = ["/-/", "/blob/", "/tree/", "/src/"];
-
 /// The URL of a world as a link, in which nothing is invisible or turns letters around.
 pub fn link(url: &str) -> String {
     Url::parse(url).map_or_else(|_| one_line(url), String::from)
 }
 
-/// The repository of a world, and the name of its file, from its URL.
-pub fn names(url: &str) -> (String, String) {
-    let path = url.split_once("://").map_or(url, |(_, path)| path);
-    let (repository, file) = SEPARATORS.iter().find_map(|word| path.split_once(word)).unwrap_or((path, path));
-    (one_line(repository), one_line(file.rsplit('/').next().unwrap_or(file)))
+/// The repository of a world without its scheme, and the name of its file.
+pub fn names(one: &Simulation) -> (String, String) {
+    let file = one.world.rsplit('/').next().unwrap_or_default();
+    (one_line(one.repository.trim_start_matches("https://")), one_line(file))
 }
 
 impl<'one> SimulationRow<'one> {
@@ -232,7 +215,7 @@ impl<'one> SimulationRow<'one> {
         let (stage, class) = words(one.stage);
         let ends = one.launched.map_or(0, |launched| launched + limit);
         let now = seconds_since_1970();
-        let (repository, world) = names(&one.world);
+        let (repository, world) = names(one);
         Self {
             visitor,
             one,
@@ -299,6 +282,7 @@ fn shortcoming(server: &AppState) -> Option<(&'static str, &str)> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::shared::domain::ProjectUrl;
     use crate::simulation::client_identity::ClientIdentity;
     use crate::simulation::simulation_id::SimulationId;
 
@@ -313,39 +297,11 @@ mod tests {
         }
     }
 
-    fn simulation(world: &str) -> Simulation {
-        Simulation {
-            id: SimulationId::next(),
-            world: world.to_owned(),
-            identity: ClientIdentity::new(Some("<i>root</i>"), Some("<script>'\"&")),
-            stage: Stage::Idle,
-            since: 0,
-            launched: Some(1),
-            pid: None,
-            cgroup: None,
-            port: Some(2001),
-            gpu: None,
-            away_until: None,
-            version: None,
-            log: None,
-        }
-    }
-
-    #[test]
-    fn a_repository_is_named_as_its_forge_does() {
-        for (world, name) in [
-            ("https://github.com/u/r/blob/main/src/worlds/a.wbt", "github.com/u/r"),
-            ("https://github.com/u/r/tree/main/worlds/a.wbt", "github.com/u/r"),
-            ("https://gitlab.com/g/s/r/-/blob/main/worlds/a.wbt", "gitlab.com/g/s/r"),
-            ("https://codeberg.org/u/r/src/branch/main/worlds/a.wbt", "codeberg.org/u/r"),
-        ] {
-            assert_eq!(SimulationRow::new(&simulation(world), None, 7200, (Visitor::Anybody, true)).repository, name);
-        }
-    }
-
     #[test]
     fn what_a_client_names_is_only_text() {
-        let one = simulation("https://github.com/u/<i>\"'&/blob/main/worlds/<script>.wbt");
+        let world = ProjectUrl::parse("https://github.com/u/<i>\"'&/blob/main/worlds/<script>.wbt").unwrap();
+        let identity = ClientIdentity::new(Some("<i>root</i>"), Some("<script>'\"&"));
+        let one = Simulation::new(SimulationId::next(), &world, identity);
         for (visitor, has_names) in
             [(Visitor::Anybody, false), (Visitor::Stranger, false), (Visitor::Administrator, true)]
         {

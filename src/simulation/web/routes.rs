@@ -2,20 +2,22 @@
 
 use std::sync::Arc;
 
+use actix_web::error::ErrorInternalServerError;
 use actix_web::{HttpRequest, HttpResponse, web};
 
 use super::actions;
 use super::administrator::Visitor;
 use super::metrics;
-use super::origins::refuse_origin;
+use super::origins::check_origin;
 use super::page_routes;
-use super::queries::{snapshot, too_busy};
+use super::queries::ask;
 use super::status::StatusResponse;
 use super::stream_routes;
 use super::watch_routes;
 use crate::shared::http::routing::{self, GET, READ, path};
 use crate::shared::http::{CONTENT_TYPE, ConnectionKind, websocket};
 use crate::simulation::client::WebClient;
+use crate::simulation::slots::GetSnapshot;
 use crate::simulation::state::AppState;
 
 /// Adds all routes to an app.
@@ -35,50 +37,37 @@ fn add(app: &mut web::ServiceConfig) {
         .configure(actions::configure);
 }
 
-async fn client(request: HttpRequest, stream: web::Payload, server: web::Data<AppState>) -> HttpResponse {
-    if let Some(refusal) = refuse_origin(&request, &server.config.allowed_origins) {
-        return refusal;
-    }
-    let peer = server.config.trusted_proxies.peer(&request);
-    let permit = match server.connections.admit(ConnectionKind::Client, peer) {
-        Ok(permit) => permit,
-        Err(refused) => return refused.answer(),
-    };
-    let user = server
-        .config
-        .user_header
-        .as_ref()
-        .and_then(|name| server.config.trusted_proxies.trusted_header(&request, name));
+async fn client(
+    request: HttpRequest,
+    stream: web::Payload,
+    server: web::Data<AppState>,
+) -> actix_web::Result<HttpResponse> {
+    let (config, proxies) = (&server.config, &server.config.trusted_proxies);
+    check_origin(&request, &config.allowed_origins)?;
+    let peer = proxies.peer(&request);
+    let permit = server.connections.admit(ConnectionKind::Client, peer)?;
+    let user = config.user_header.as_ref().and_then(|name| proxies.trusted_header(&request, name));
     let server = Arc::clone(&server);
-    websocket::open(&request, stream, WebClient::new(server, (peer, user), permit))
+    Ok(websocket::open(&request, stream, WebClient::new(server, (peer, user), permit)))
 }
 
 async fn load(server: web::Data<AppState>) -> HttpResponse {
     HttpResponse::Ok().content_type("text/plain").body(server.load().to_string())
 }
 
-async fn status_json(request: HttpRequest, server: web::Data<AppState>) -> HttpResponse {
-    let visitor = match Visitor::of(&request, &server) {
-        Ok(visitor) => visitor,
-        Err(refused) => return refused.answer(),
-    };
-    let Some(mut snapshot) = snapshot(&server).await else {
-        return too_busy();
-    };
+async fn status_json(request: HttpRequest, server: web::Data<AppState>) -> actix_web::Result<HttpResponse> {
+    let visitor = Visitor::of(&request, &server)?;
+    let mut snapshot = ask(&server, GetSnapshot).await?;
     if !visitor.sees_ports(&server.config) {
         snapshot.simulations.iter_mut().for_each(|one| one.port = None);
     }
-    HttpResponse::Ok().json(StatusResponse::new(&server, snapshot))
+    Ok(HttpResponse::Ok().json(StatusResponse::new(&server, snapshot)))
 }
 
-async fn metrics_text(server: web::Data<AppState>) -> HttpResponse {
-    let Some(snapshot) = snapshot(&server).await else {
-        return too_busy();
-    };
-    match server.metrics.render(&metrics::gauges(&server, &snapshot)) {
-        Ok(text) => HttpResponse::Ok().content_type(CONTENT_TYPE).body(text),
-        Err(error) => HttpResponse::InternalServerError().body(format!("Error: {error}.")),
-    }
+async fn metrics_text(server: web::Data<AppState>) -> actix_web::Result<HttpResponse> {
+    let snapshot = ask(&server, GetSnapshot).await?;
+    let text = server.metrics.render(&metrics::gauges(&server, &snapshot)).map_err(ErrorInternalServerError)?;
+    Ok(HttpResponse::Ok().content_type(CONTENT_TYPE).body(text))
 }
 
 async fn health(server: web::Data<AppState>) -> HttpResponse {

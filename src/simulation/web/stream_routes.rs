@@ -1,9 +1,10 @@
 //! The streams of simulations, `/stream/TOKEN/...`: WebSockets, and the files that Webots serves.
 
+use actix_web::error::ErrorNotFound;
 use actix_web::http::header;
 use actix_web::{HttpRequest, HttpResponse, web};
 
-use super::origins::refuse_origin;
+use super::origins::check_origin;
 use crate::shared::http::routing::{GET, path};
 use crate::shared::http::{ConnectionKind, body};
 use crate::simulation::relay::{self, Upstream};
@@ -15,36 +16,32 @@ pub fn configure(app: &mut web::ServiceConfig) {
     app.service(path("/stream/{path:.*}", GET, stream));
 }
 
-async fn stream(request: HttpRequest, server: web::Data<AppState>) -> HttpResponse {
-    let nothing = || HttpResponse::NotFound().body("Error: there is no such stream.");
+async fn stream(request: HttpRequest, server: web::Data<AppState>) -> actix_web::Result<HttpResponse> {
+    let nothing = || ErrorNotFound("Error: there is no such stream.");
     // As the client has written it: what it has encoded stays so.
-    let Some((token, path)) = relay::parse_path(request.uri().path()) else { return nothing() };
-    let Some(target) = server.streams.find(&token) else { return nothing() };
+    let (token, path) = relay::parse_path(request.uri().path()).ok_or_else(nothing)?;
+    let StreamTarget { simulation, port, read_only } = server.streams.find(&token).ok_or_else(nothing)?;
     if let Some(refusal) = body::refuse(&request) {
-        return refusal;
+        return Ok(refusal);
     }
     let headers = request.headers();
     let is_websocket = headers.contains_key(header::UPGRADE);
     // Worlds' pages and Webots' own viewer run in frames without an origin; the token is what strangers lack.
     let is_in_frame = headers.get(header::ORIGIN).is_some_and(|origin| origin == "null");
-    if !is_in_frame && let Some(refusal) = refuse_origin(&request, &server.config.allowed_origins) {
-        return refusal;
+    if !is_in_frame {
+        check_origin(&request, &server.config.allowed_origins)?;
     }
     let peer = server.config.trusted_proxies.peer(&request);
-    let permit = match server.connections.admit(ConnectionKind::Stream, peer) {
-        Ok(permit) => permit,
-        Err(refused) => return refused.answer(),
-    };
-    let Some(upstream) = request.app_data::<Upstream>() else { return nothing() };
-    let StreamTarget { simulation, port, read_only } = target;
+    let permit = server.connections.admit(ConnectionKind::Stream, peer)?;
+    let upstream = request.app_data::<Upstream>().ok_or_else(nothing)?;
     let url = upstream.url(port, path, request.uri().query());
     if !is_websocket {
-        return relay::fetch(upstream, &url, &request, permit).await;
+        return Ok(relay::fetch(upstream, &url, &request, permit).await);
     }
     if !read_only {
-        return relay::connect(upstream, &url, &request, false, permit).await;
+        return Ok(relay::connect(upstream, &url, &request, false, permit).await);
     }
-    let Some(guard) = server.streams.start_watching(&token) else { return nothing() };
+    let guard = server.streams.start_watching(&token).ok_or_else(nothing)?;
     log::info!("{simulation}: client {peer} watches");
-    relay::connect(upstream, &url, &request, true, (permit, guard)).await
+    Ok(relay::connect(upstream, &url, &request, true, (permit, guard)).await)
 }

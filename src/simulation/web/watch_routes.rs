@@ -1,14 +1,16 @@
 //! The page on which an administrator watches a simulation, and what it loads.
 
+use actix_web::error::ErrorNotFound;
 use actix_web::{HttpRequest, HttpResponse, web};
 use askama::Template;
 use serde::Deserialize;
 
 use super::pages::{link, names};
-use super::queries::{snapshot, too_busy};
+use super::queries::ask;
 use super::webots_viewer;
 use crate::shared::http::routing::{GET, READ, path};
 use crate::shared::http::{ContentSecurityPolicy, html, own_sources, require_administrator};
+use crate::simulation::slots::GetSnapshot;
 use crate::simulation::snapshot::Simulation;
 use crate::simulation::state::AppState;
 
@@ -49,20 +51,21 @@ pub fn configure(app: &mut web::ServiceConfig) {
 
 /// The token in the page is new each time: the page's URL, which may be kept or sent to others, is useless without the
 /// password.
-async fn watch(request: HttpRequest, which: web::Query<Which>, server: web::Data<AppState>) -> HttpResponse {
+async fn watch(
+    request: HttpRequest,
+    which: web::Query<Which>,
+    server: web::Data<AppState>,
+) -> actix_web::Result<HttpResponse> {
     let peer = server.config.trusted_proxies.peer(&request);
     if let Some(refusal) = require_administrator(server.admin_auth.as_ref(), &request, peer) {
-        return refusal;
+        return Ok(refusal);
     }
-    let Some(snapshot) = snapshot(&server).await else {
-        return too_busy();
-    };
+    let snapshot = ask(&server, GetSnapshot).await?;
     let one = snapshot.simulations.iter().find(|one| one.id.to_string() == which.id);
-    let Some((one, token)) = one.zip(server.streams.watch(&which.id)) else {
-        return HttpResponse::NotFound().body("Error: this simulation does not stream, or too many watch.");
-    };
+    let found = one.zip(server.streams.watch(&which.id));
+    let (one, token) = found.ok_or_else(|| ErrorNotFound("Error: this simulation does not stream."))?;
     let installed = webots_viewer::folder(&server.config).map(|_| webots_viewer::PATH);
-    let (repository, world) = names(&one.world);
+    let (repository, world) = names(one);
     let page = Watch {
         version: env!("CARGO_PKG_VERSION"),
         one,
@@ -72,7 +75,7 @@ async fn watch(request: HttpRequest, which: web::Query<Which>, server: web::Data
         stream: format!("stream/{}", token.reveal()),
         script: installed.filter(|_| which.viewer != "small"),
     };
-    html(page.render(), &ContentSecurityPolicy::viewer(&request, &[]))
+    Ok(html(page.render(), &ContentSecurityPolicy::viewer(&request, &[])))
 }
 
 /// Webots' own viewer shows what worlds bring: it runs in an embedded page with an origin of its own.

@@ -16,8 +16,7 @@ pub const PATH: &str = "wwi/WebotsView.js";
 /// The viewer's directory, if Webots is installed here.
 pub fn folder(config: &SimulationConfig) -> Option<PathBuf> {
     let home = &config.webots_home.as_ref()?.0;
-    let places = [home.join(FOLDER), home.join("Contents").join(FOLDER)];
-    places.into_iter().find(|folder| folder.join(SCRIPT).is_file())
+    Some(home.join(FOLDER)).filter(|folder| folder.join(SCRIPT).is_file())
 }
 
 /// A file below a directory; `None` if the path or a symlink resolves to a path outside of it.

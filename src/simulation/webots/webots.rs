@@ -21,7 +21,7 @@ use crate::simulation::checkout::CheckoutError;
 use crate::simulation::container::StartError;
 use crate::simulation::ends::{EndReason, Taken};
 use crate::simulation::process::ProcessGroup;
-use crate::simulation::snapshot::{SimulationChange, Stage};
+use crate::simulation::snapshot::Stage;
 use crate::simulation::streams::StreamRegistration;
 
 /// Requests Webots' end, because its client has left or for another reason.
@@ -132,9 +132,12 @@ impl Webots {
         let (Launched { group, cgroup, tail, log, peak }, ended) =
             launched::launch(&self.spec, target, ctx.address().recipient())?;
         let (program, world) = (self.spec.program.display(), self.spec.project.world.path.display());
-        let (at, pid) = (seconds_since_1970(), group.leader());
+        let pid = group.leader();
         self.log(Level::Info, &format!("started {program} for {world} (process {pid})"));
-        self.spec.slot.lease.update(SimulationChange::Launched { at, pid, cgroup, port: self.spec.slot.port, log });
+        self.spec.slot.lease.update(move |one| {
+            (one.stage, one.launched) = (Stage::Launching, Some(seconds_since_1970()));
+            (one.pid, one.cgroup, one.log) = (Some(pid), cgroup, log);
+        });
         (self.tail, self.group) = (tail, Some(group));
         ended.into_actor(self).map(|end, this, ctx| this.ended(&end, ctx)).spawn(ctx);
         let excess = self.spec.until_too_much(pid, peak).into_actor(self);
@@ -167,7 +170,8 @@ impl Webots {
     /// Shows whether the simulation runs, unless Webots is starting or ending.
     fn show_pace(&self) {
         if self.listening && self.stopped_for.is_none() {
-            self.spec.slot.lease.update(SimulationChange::Stage(if self.runs { Stage::Running } else { Stage::Idle }));
+            let stage = if self.runs { Stage::Running } else { Stage::Idle };
+            self.spec.slot.lease.update(move |one| one.stage = stage);
         }
     }
 
@@ -195,7 +199,7 @@ impl Webots {
         }
         self.log(if kind == EndReason::Limit { Level::Warn } else { Level::Info }, &format!("ending: {why}"));
         self.stopped_for = Some((kind, why.to_owned()));
-        self.spec.slot.lease.update(SimulationChange::Stage(Stage::Stopping));
+        self.spec.slot.lease.update(|one| one.stage = Stage::Stopping);
         if kind == EndReason::Limit {
             self.group = None;
         } else {
@@ -251,7 +255,7 @@ impl Webots {
         let is_shown = config.ports_are_public() || config.admin_password.is_some();
         let line = format!("port {port}: {event}");
         let shown = if is_shown { line.clone() } else { event.to_owned() };
-        self.spec.slot.lease.log_privately(level, &line, shown);
+        self.spec.slot.lease.log(level, &line, shown);
     }
 }
 
