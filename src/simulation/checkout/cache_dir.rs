@@ -6,7 +6,6 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 /// The directory `cacheDir`, locked until this is dropped or the process exits.
-#[derive(Debug)]
 pub struct CacheDir {
     folder: PathBuf,
     _lock: File,

@@ -16,7 +16,7 @@ use super::cache_dir::CacheDir;
 use super::checkout_error::{CheckoutError, git_failed, machine, too_large, too_slow};
 use super::checkout_limits::CheckoutLimits;
 use super::commit_resolver::CommitResolver;
-use super::file_restore::{self, FileRestore};
+use super::file_restore;
 use super::git::Git;
 use super::lfs;
 use super::mirrors::Mirrors;
@@ -139,8 +139,8 @@ impl CheckoutService {
         progress: &SharedProgress,
     ) -> Result<(Revision, WorkTree), CheckoutError> {
         let found = self.resolver.resolve(world, &**progress).await?;
-        let turn = self.copies.acquire().await;
-        let _turn = turn.map_err(|error| machine(world, &io::Error::other(error)))?;
+        // It is never closed.
+        let _turn = self.copies.acquire().await.ok();
         let (commit, revision) = (Arc::clone(&found), &found.revision);
         let (wanted, instance, progress) = (world.clone(), Arc::clone(instance), Arc::clone(progress));
         let (limits, has_lfs) = (self.limits, self.has_lfs);
@@ -185,10 +185,10 @@ impl CheckoutService {
             return Ok(false);
         };
         let failed = |error| machine(url, &error);
-        let restored = FileRestore::new(instance.path()).map_err(failed)?;
+        let restored = file_restore::prepare(instance.path()).map_err(failed)?;
         let paths = [path.as_bytes(), b"\0"].concat();
-        let call = checkout_command(&repository, revision, &paths, (restored.path(), &restored.files()));
+        let call = checkout_command(&repository, revision, &paths, (restored.path(), &restored.path().join("files")));
         repository.run(call.map_err(failed)?, |_| ()).await.map_err(|source| git_failed(url, source))?;
-        restored.install(instance.project(), path.to_owned()).await.map_err(failed)
+        file_restore::install(restored, instance.project(), path.to_owned()).await.map_err(failed)
     }
 }

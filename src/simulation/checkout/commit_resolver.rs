@@ -21,7 +21,6 @@ use super::world_file::WorldFileError;
 use crate::shared::domain::{AdmissionRules, ProjectUrl};
 
 /// Resolves commits; one for the whole server.
-#[derive(Debug)]
 pub struct CommitResolver {
     cache: Arc<RepositoryCache>,
     mirrors: Mirrors,
@@ -33,7 +32,6 @@ pub struct CommitResolver {
 }
 
 /// A world's commit in the cache.
-#[derive(Debug)]
 pub struct ResolvedCommit {
     /// The repository that contains it.
     pub repository: Arc<Repository>,
@@ -52,9 +50,6 @@ struct Search<'job> {
     /// Receives each step as text.
     progress: OnProgress<'job>,
 }
-
-/// Number of redirected remotes from which on all are dropped.
-const MAX_REDIRECTED: usize = 1000;
 
 impl CommitResolver {
     /// Keeps commits in `cache`.
@@ -87,11 +82,7 @@ impl CommitResolver {
     pub async fn moved(&self, world: &ProjectUrl) -> Result<ProjectUrl, CheckoutError> {
         let repository = self.repository(world).await?;
         let (moved, remote) = redirect::follow(&repository, (&self.mirrors, &self.rules), world).await?;
-        let mut redirected = self.redirected.lock();
-        if redirected.len() >= MAX_REDIRECTED {
-            redirected.clear();
-        }
-        redirected.insert(remote.key(), remote);
+        self.redirected.lock().insert(remote.key(), remote);
         Ok(moved)
     }
 

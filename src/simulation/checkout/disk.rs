@@ -6,7 +6,6 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use crate::simulation::process::disk_usage::{self, DiskUsage};
-use crate::simulation::process::remove_tree;
 
 /// Interval between two checks of the written size.
 const CHECK_INTERVAL: Duration = Duration::from_millis(500);
@@ -20,35 +19,14 @@ pub async fn blocking<T: Send + 'static>(work: impl FnOnce() -> io::Result<T> + 
 }
 
 /// Removes what a killed git has left: a lock that would make every later fetch fail, and incomplete packs.
-///
-/// # Errors
-/// When that can't be done.
-pub fn remove_leftovers(repository: &Path) -> io::Result<()> {
-    let lock = repository.join("shallow.lock");
-    for path in unfinished(repository).chain(std::iter::once(lock)) {
-        absent(fs::remove_file(path))?;
+pub fn remove_leftovers(repository: &Path) {
+    let is_unfinished = |name: &[u8]| name.starts_with(b"tmp_") || name.starts_with(b".tmp-");
+    let packs = fs::read_dir(repository.join("objects/pack")).into_iter().flatten().flatten();
+    let unfinished = packs.filter(|pack| is_unfinished(pack.file_name().as_encoded_bytes())).map(|pack| pack.path());
+    for path in unfinished.chain([repository.join("shallow.lock")]) {
+        // What is still there fails the fetch.
+        fs::remove_file(path).ok();
     }
-    Ok(())
-}
-
-/// Removes those of these directories that exist, with their contents.
-///
-/// # Errors
-/// When that can't be done.
-pub fn remove_all(folders: &[&Path]) -> io::Result<()> {
-    folders.iter().try_for_each(|folder| remove_tree(folder))
-}
-
-/// Treats `NotFound` as success.
-fn absent(result: io::Result<()>) -> io::Result<()> {
-    result.or_else(|error| if error.kind() == io::ErrorKind::NotFound { Ok(()) } else { Err(error) })
-}
-
-/// The packs that are being received or written.
-fn unfinished(repository: &Path) -> impl Iterator<Item = PathBuf> {
-    let is_new = |name: &[u8]| name.starts_with(b"tmp_") || name.starts_with(b".tmp-");
-    let all = fs::read_dir(repository.join("objects/pack")).into_iter().flatten().flatten();
-    all.filter(move |entry| is_new(entry.file_name().as_encoded_bytes())).map(|entry| entry.path())
 }
 
 /// Waits until one of the directories exceeds its limit, in bytes, or has one in it that can't be read.

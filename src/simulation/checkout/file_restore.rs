@@ -14,12 +14,6 @@ use tempfile::TempDir;
 
 use super::disk::blocking;
 
-/// A directory into which git writes the restored file; removed on drop.
-#[derive(Debug)]
-pub struct FileRestore {
-    folder: TempDir,
-}
-
 /// The path in its repository of a file below the `controllers` folder of the project in `folder`; nothing where its name
 /// leads elsewhere.
 pub fn controller(folder: &str, file: &str) -> Option<String> {
@@ -28,41 +22,28 @@ pub fn controller(folder: &str, file: &str) -> Option<String> {
     (file.contains('/') && file.split('/').all(plain)).then(|| format!("{folder}{slash}controllers/{file}"))
 }
 
-impl FileRestore {
-    /// Creates the directory in the directory of an instance.
-    ///
-    /// # Errors
-    /// When that can't be done.
-    pub fn new(instance: &Path) -> io::Result<Self> {
-        let folder = tempfile::Builder::new().prefix("restored-").tempdir_in(instance)?;
-        let restored = Self { folder };
-        std::fs::create_dir(restored.files())?;
-        Ok(restored)
-    }
+/// Creates a directory in that of an instance, with scratch files of git and `files`, into which git writes the file.
+///
+/// # Errors
+/// When that can't be done.
+pub fn prepare(instance: &Path) -> io::Result<TempDir> {
+    let folder = tempfile::Builder::new().prefix("restored-").tempdir_in(instance)?;
+    std::fs::create_dir(folder.path().join("files"))?;
+    Ok(folder)
+}
 
-    /// The directory, with scratch files of git.
-    pub fn path(&self) -> &Path {
-        self.folder.path()
-    }
-
-    /// The directory into which git writes the file.
-    pub fn files(&self) -> PathBuf {
-        self.path().join("files")
-    }
-
-    /// Moves the file at this path of the repository to the same path of the project. Returns false if its parent is no
-    /// longer a directory, or a directory has replaced the file.
-    ///
-    /// # Errors
-    /// When the project can't be opened.
-    pub async fn install(self, project: PathBuf, path: String) -> io::Result<bool> {
-        blocking(move || {
-            let (above, name) = path.rsplit_once('/').unwrap_or((".", &path));
-            let how = OpenHow::new().flags(OFlag::O_PATH | OFlag::O_DIRECTORY | OFlag::O_CLOEXEC);
-            let how = how.resolve(ResolveFlag::RESOLVE_BENEATH | ResolveFlag::RESOLVE_NO_SYMLINKS);
-            let folder = openat2(File::open(project)?, above, how);
-            Ok(folder.is_ok_and(|folder| renameat(AT_FDCWD, &self.files().join(&path), folder, name).is_ok()))
-        })
-        .await
-    }
+/// Moves the file at this path of the repository to the same path of the project. Returns false if its parent is no
+/// longer a directory, or a directory has replaced the file.
+///
+/// # Errors
+/// When the project can't be opened.
+pub async fn install(restored: TempDir, project: PathBuf, path: String) -> io::Result<bool> {
+    blocking(move || {
+        let (above, name) = path.rsplit_once('/').unwrap_or((".", &path));
+        let how = OpenHow::new().flags(OFlag::O_PATH | OFlag::O_DIRECTORY | OFlag::O_CLOEXEC);
+        let how = how.resolve(ResolveFlag::RESOLVE_BENEATH | ResolveFlag::RESOLVE_NO_SYMLINKS);
+        let (folder, file) = (openat2(File::open(project)?, above, how), restored.path().join("files").join(&path));
+        Ok(folder.is_ok_and(|folder| renameat(AT_FDCWD, &file, folder, name).is_ok()))
+    })
+    .await
 }

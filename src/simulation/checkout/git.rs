@@ -10,7 +10,6 @@ use super::git_error::GitError;
 use crate::simulation::process::{ExitReason, Ran, Run, RunError};
 
 /// Runs git with this server's settings.
-#[derive(Debug)]
 pub struct Git {
     /// The file with git's settings, and its text.
     settings: (PathBuf, String),

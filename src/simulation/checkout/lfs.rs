@@ -51,7 +51,6 @@ pub fn settings(remote: &Remote) -> Vec<String> {
         "filter.lfs.required=false".to_owned(),
         // A file that can't be loaded stays a pointer, and is reported.
         "lfs.skipdownloaderrors=true".to_owned(),
-        "lfs.locksverify=false".to_owned(),
     ]
 }
 

@@ -9,15 +9,15 @@ use parking_lot::Mutex;
 use tokio::sync::{Notify, OwnedMutexGuard, Semaphore, watch};
 
 use super::checkout_limits::CheckoutLimits;
-use super::disk::{blocking, remove_all, remove_leftovers};
+use super::disk::{blocking, remove_leftovers};
 use super::git::{Call, Git, LITTLE_MEMORY, MAX_MEMORY};
 use super::git_error::GitError;
 use super::mirrors::Remote;
 use super::revision::FetchRequest;
 use super::single_flight::{OnProgress, SingleFlight};
+use crate::simulation::process::remove_tree;
 
 /// A cached repository. It is not evicted from the cache until this is dropped.
-#[derive(Debug)]
 pub struct Repository {
     path: PathBuf,
     /// The remote. Its URL may have several spellings.
@@ -148,8 +148,12 @@ impl Repository {
         let (path, new_path) = (self.path.clone(), new.clone());
         let is_there = blocking(move || {
             let is_there = path.join("HEAD").is_file();
-            let done = if is_there { remove_leftovers(&path) } else { remove_all(&[&path, &new_path]) };
-            done.map(|()| is_there)
+            if is_there {
+                remove_leftovers(&path);
+            } else {
+                remove_tree(&path).and_then(|()| remove_tree(&new_path))?;
+            }
+            Ok(is_there)
         });
         if is_there.await? {
             return Ok(());
@@ -178,7 +182,7 @@ impl Repository {
     pub async fn discard(&self) -> io::Result<()> {
         let _guard = self.lock.lock().await;
         let path = self.path.clone();
-        blocking(move || remove_all(&[&path])).await
+        blocking(move || remove_tree(&path)).await
     }
 }
 

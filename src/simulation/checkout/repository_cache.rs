@@ -21,7 +21,6 @@ use super::repository::Repository;
 use crate::simulation::process::remove_tree;
 
 /// The cached repositories of a server.
-#[derive(Debug)]
 pub struct RepositoryCache {
     folder: PathBuf,
     /// Size limit of all repositories, in bytes.

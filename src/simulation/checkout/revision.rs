@@ -38,9 +38,6 @@ pub struct FetchRequest {
     pub arguments: Vec<String>,
 }
 
-/// Limit of readings of a URL: no real branch has more slashes in its name.
-const MAX_CANDIDATES: usize = 12;
-
 /// The commit that a URL names by its full hash: then nobody need be asked what it is. `allow_any` tells whether any will
 /// do, or only one that is in a branch or tag.
 pub fn commit_of(world: &ProjectUrl, allow_any: bool) -> Option<Revision> {
@@ -71,7 +68,7 @@ pub fn history(location: &str) -> FetchRequest {
 
 /// Asks the remote for all branches and tags that a URL may mean.
 pub fn search_arguments(world: &ProjectUrl, location: &str) -> Vec<String> {
-    let names = world.candidates().into_iter().take(MAX_CANDIDATES).flat_map(|reading| full_names(world, &reading));
+    let names = world.candidates().into_iter().flat_map(|reading| full_names(world, &reading));
     ["ls-remote", "--quiet", "--", location].map(str::to_owned).into_iter().chain(names).collect()
 }
 
@@ -89,7 +86,7 @@ fn full_names(world: &ProjectUrl, reading: &Reading) -> Vec<String> {
 /// What the remote has of what was asked for: the longest names first, branches before tags.
 pub fn found(world: &ProjectUrl, answer: &str) -> Vec<Revision> {
     let known: Vec<(&str, &str)> = answer.lines().filter_map(|line| line.split_once('\t')).collect();
-    let readings = world.candidates().into_iter().take(MAX_CANDIDATES).rev();
+    let readings = world.candidates().into_iter().rev();
     readings
         .flat_map(|reading| full_names(world, &reading).into_iter().map(move |name| (name, reading.clone())))
         .filter_map(|(name, reading)| {
@@ -119,11 +116,6 @@ impl Revision {
         let options = ["fetch", "--depth=1", "--no-tags", "--no-write-fetch-head", "--progress", "--"];
         let arguments = options.into_iter().chain([location, &refspec]).map(str::to_owned).collect();
         FetchRequest { name: self.reference(), settings: Vec::new(), arguments }
-    }
-
-    /// The folder to check out, as git wants it named.
-    pub fn needed(&self) -> &str {
-        if self.folder.is_empty() { "." } else { &self.folder }
     }
 
     /// Asks for an entry of the repository, and for all that is directly in the folders above the project's.

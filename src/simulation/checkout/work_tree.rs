@@ -17,7 +17,6 @@ use crate::shared::domain::ProjectUrl;
 use crate::simulation::process::InstanceDir;
 
 /// The contents of a copy.
-#[derive(Debug)]
 pub struct WorkTree {
     /// Its size in bytes, at least the space of an entry for each file and directory.
     pub size: u64,
@@ -74,7 +73,8 @@ pub async fn write(
     (limits, has_lfs): (&CheckoutLimits, bool),
     on_line: impl FnMut(&str),
 ) -> Result<Written, GitError> {
-    let paths = [found.revision.needed().as_bytes(), b"\0", &found.above].concat();
+    let folder = if found.revision.folder.is_empty() { "." } else { &found.revision.folder };
+    let paths = [folder.as_bytes(), b"\0", &found.above].concat();
     let project = instance.project();
     let mut call = checkout_command(&found.repository, &found.revision, &paths, (instance.path(), &project))?;
     call.may_block = true;

@@ -44,9 +44,6 @@ impl WorldFile {
         if !path.starts_with(&root) {
             return Err(WorldFileError::Outside(name()));
         }
-        if !path.is_file() {
-            return Err(WorldFileError::Missing(name()));
-        }
         let file = std::fs::File::open(&path).map_err(missing)?;
         let mut line = Vec::new();
         BufReader::new(file.take(200)).read_until(b'\n', &mut line).map_err(missing)?;

@@ -28,7 +28,6 @@ use crate::simulation::checkout::OnProgress;
 use crate::simulation::config::SimulationConfig;
 
 /// Creates the containers of simulations.
-#[derive(Debug)]
 pub struct ContainerService {
     docker: Docker,
     owner: ResourceOwner,

@@ -19,7 +19,6 @@ use crate::simulation::checkout::{OnProgress, Project, SingleFlight};
 use crate::simulation::config::SimulationConfig;
 
 /// The images of this server.
-#[derive(Debug)]
 pub struct Images {
     docker: Docker,
     owner: ResourceOwner,

@@ -14,17 +14,12 @@ use crate::simulation::config::ResourceLimits;
 use crate::simulation::ends::Taken;
 
 /// The control groups below this server's own.
-#[derive(Debug)]
 pub struct Cgroups {
     folder: PathBuf,
     settings: Vec<(&'static str, String)>,
 }
 
-/// The cgroup controllers that are available, by the kernel's names.
-pub type Controllers = Vec<&'static str>;
-
 /// The control group of one simulation. Dropping it kills all processes inside, and removes it.
-#[derive(Debug)]
 pub struct Cgroup {
     folder: PathBuf,
 }
@@ -44,7 +39,6 @@ const PAUSE: Duration = Duration::from_millis(5);
 impl Cgroups {
     /// The control groups that are delegated to this server, if they are, as yet without limits. Nothing may have been
     /// started before: what is just exiting would be taken for another owner of the server's group.
-    #[must_use]
     pub fn delegated() -> Option<Self> {
         let folder = own_folder()?;
         match Self::divide(&folder) {
@@ -78,9 +72,8 @@ impl Cgroups {
         Ok(())
     }
 
-    /// The controllers that the control groups of simulations have on a server that starts now.
-    #[must_use]
-    pub fn controllers() -> Controllers {
+    /// The controllers that the control groups of simulations have on a server that starts now, by the kernel's names.
+    pub fn controllers() -> Vec<&'static str> {
         own_folder().and_then(|folder| offered(&folder).ok()).unwrap_or_default()
     }
 
@@ -121,14 +114,12 @@ impl Cgroup {
     }
 
     /// Whether the kernel has killed a process inside because of the memory limit.
-    #[must_use]
     pub fn has_run_out_of_memory(&self) -> bool {
         let events = std::fs::read_to_string(self.folder.join("memory.events")).unwrap_or_default();
         events.lines().any(|line| line.strip_prefix("oom_kill ").is_some_and(|count| count.trim() != "0"))
     }
 
     /// What has been taken in it.
-    #[must_use]
     pub fn taken(&self) -> Taken {
         taken_in(&self.folder)
     }
@@ -174,7 +165,7 @@ impl Drop for Cgroup {
 }
 
 /// The controllers that are available below a group.
-fn offered(folder: &Path) -> io::Result<Controllers> {
+fn offered(folder: &Path) -> io::Result<Vec<&'static str>> {
     let offered = std::fs::read_to_string(folder.join("cgroup.controllers"))?;
     let is_offered = |name: &&str| offered.split_whitespace().any(|one| one == *name);
     Ok(CONTROLLERS.into_iter().filter(is_offered).collect())

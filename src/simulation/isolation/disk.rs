@@ -7,7 +7,6 @@ use crate::simulation::process::DiskRoom;
 use crate::simulation::process::disk_usage::SMALLEST;
 
 /// The disk, as it was at the last look.
-#[derive(Debug)]
 pub struct Disk {
     folder: PathBuf,
     /// `diskReserve`, in MiB.

@@ -8,7 +8,6 @@ use crate::simulation::process::disk_usage::{DiskUsage, Unknown, room};
 use crate::simulation::process::process_tree::{nameless_files, tree};
 
 /// What one simulation has taken, as it was last counted.
-#[derive(Debug)]
 pub struct DiskUse {
     /// The process from which all of it descends.
     root: i32,

@@ -13,7 +13,6 @@ use std::path::{Path, PathBuf};
 use which::which;
 
 /// The display of a simulation.
-#[derive(Debug)]
 pub enum Display {
     /// An existing display, by its name.
     Outside(String),

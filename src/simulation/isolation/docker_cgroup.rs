@@ -1,6 +1,6 @@
 //! What the kernel has counted for a container, in the control groups that Docker makes. They vanish with the container.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::time::Duration;
 
 use super::cgroup::taken_in;
@@ -14,16 +14,9 @@ fn names(container: &str) -> [String; 2] {
     [format!("system.slice/docker-{container}.scope"), format!("docker/{container}")]
 }
 
-/// Where the control group of a container is in version 2, with systemd and without.
-#[must_use]
-fn docker_cgroups(container: &str) -> [PathBuf; 2] {
-    names(container).map(|name| Path::new(ROOT).join(name))
-}
-
 /// What a container has taken until now, as far as the kernel counts it, in control groups of either version.
-#[must_use]
 pub fn taken_by_container(container: &str) -> Taken {
-    let of_version_2 = docker_cgroups(container).map(|folder| taken_in(&folder));
+    let of_version_2 = names(container).map(|name| taken_in(&Path::new(ROOT).join(name)));
     let number = |controller: &str, name: &str, file| {
         std::fs::read_to_string(Path::new(ROOT).join(controller).join(name).join(file)).ok()?.trim().parse().ok()
     };

@@ -12,12 +12,11 @@ use nix::sys::resource::{Resource, getrlimit};
 use serde::Serialize;
 use which::which;
 
-use super::cgroup::{Cgroup, Cgroups, Controllers};
+use super::cgroup::{Cgroup, Cgroups};
 use super::environment;
 use super::network::OwnNetwork;
 use super::program::Program;
 use super::sandbox::Sandbox;
-use super::unenforced_limits::{Enforcement, unenforced_limits};
 use super::watcher::MostProcesses;
 use crate::simulation::config::{IsolationSetting, ResourceLimits, SandboxNetwork, SimulationConfig, VariableName};
 use crate::simulation::process::SpawnSpec;
@@ -61,7 +60,6 @@ pub enum Network {
 const USUAL_FILES: u64 = 1024;
 
 /// How a program is started at a level.
-#[derive(Debug)]
 enum Method {
     /// Without a wrapper.
     Plain,
@@ -72,7 +70,6 @@ enum Method {
 }
 
 /// Launches simulations at one level.
-#[derive(Debug)]
 pub struct Launcher {
     method: Method,
     /// Why it is not a sandbox, with `isolation: "auto"`.
@@ -80,7 +77,7 @@ pub struct Launcher {
     /// Why it has no network of its own, where the configuration leaves it to the machine.
     why_shared: Option<String>,
     cgroups: Option<Cgroups>,
-    controllers: Controllers,
+    controllers: Vec<&'static str>,
     prlimit: Option<PathBuf>,
     variables: Vec<VariableName>,
     limits: ResourceLimits,
@@ -162,22 +159,41 @@ impl Launcher {
     }
 
     /// The limits that this machine can't enforce, one line each.
-    #[must_use]
     pub fn unenforced_limits(&self) -> Vec<String> {
         if self.level() == IsolationLevel::Container {
             // Docker enforces them.
             return Vec::new();
         }
-        let means = Enforcement {
-            has_prlimit: self.prlimit.is_some(),
-            leaves_namespaces: matches!(&self.method, Method::Sandbox(sandbox) if !sandbox.ends_namespaces()),
-            controllers: self.controllers.clone(),
-        };
-        unenforced_limits(&means, &self.limits)
+        let mut lines = Vec::new();
+        if self.prlimit.is_none() {
+            lines.push(
+                "limits.openFiles does not hold, and files, core dumps and processes have no limit of the kernel's: prlimit \
+                 is not there; on Debian, Ubuntu and Fedora the package util-linux has it"
+                    .to_owned(),
+            );
+        }
+        if matches!(&self.method, Method::Sandbox(sandbox) if !sandbox.ends_namespaces()) {
+            lines.push(
+                "worlds' programs can make user namespaces, which brings more of the kernel within their reach: only \
+                 bubblewrap from 0.8 on forbids it"
+                    .to_owned(),
+            );
+        }
+        let (controllers, limits) = (&self.controllers, &self.limits);
+        for (key, controller, is_set) in
+            [("limits.memory", "memory", limits.memory.is_some()), ("limits.cores", "cpu", limits.cores.is_some())]
+        {
+            if is_set && !controllers.contains(&controller) {
+                lines.push(format!(
+                    "{key} does not hold: systemd has not delegated control groups with the controller {controller} to \
+                     this program (Delegate={controller} in its unit)"
+                ));
+            }
+        }
+        lines
     }
 
     /// The isolation level of all simulations.
-    #[must_use]
     pub fn level(&self) -> IsolationLevel {
         match self.method {
             Method::Plain => IsolationLevel::None,
@@ -188,7 +204,6 @@ impl Launcher {
 
     /// How many processes of each simulation are what runs it: bubblewrap has one outside of the sandbox and one inside, and
     /// pasta is one.
-    #[must_use]
     pub fn runners(&self) -> u64 {
         match &self.method {
             Method::Plain | Method::Container => 0,
@@ -197,7 +212,6 @@ impl Launcher {
     }
 
     /// Which network the programs of worlds have; at level `container` that is Docker's.
-    #[must_use]
     pub fn network(&self) -> Option<Network> {
         match &self.method {
             Method::Plain => Some(Network::Shared),
@@ -211,7 +225,6 @@ impl Launcher {
     }
 
     /// The same for an administrator: what can be reached, and why no less.
-    #[must_use]
     pub fn network_in_words(&self) -> Option<String> {
         Some(match (self.network()?, &self.why_shared) {
             (Network::Shared, None) => "shared with this machine".to_owned(),
@@ -231,20 +244,17 @@ impl Launcher {
     }
 
     /// The address at which this server reaches the forwarded ports of simulations, if each has a network of its own.
-    #[must_use]
     pub fn reached(&self) -> Option<IpAddr> {
         let Method::Sandbox(sandbox) = &self.method else { return None };
         sandbox.network().map(OwnNetwork::reached)
     }
 
     /// Why simulations run at level `none` although the configuration does not say so, if they do.
-    #[must_use]
     pub fn shortcoming(&self) -> Option<&str> {
         self.shortcoming.as_deref()
     }
 
     /// A remark on the level for the client of a program that did not become ready.
-    #[must_use]
     pub fn remark(&self) -> &'static str {
         match self.level() {
             IsolationLevel::None => "",
@@ -303,7 +313,6 @@ impl Launcher {
     }
 
     /// Limit of a simulation's processes; `None` if the kernel or Docker enforces it.
-    #[must_use]
     pub fn most_processes(&self) -> Option<MostProcesses> {
         let is_kept = self.level() == IsolationLevel::Container
             || self.limits_by_namespace()

@@ -13,7 +13,6 @@ mod network;
 mod peak;
 mod program;
 mod sandbox;
-mod unenforced_limits;
 mod watcher;
 
 pub use cgroup::Cgroup;

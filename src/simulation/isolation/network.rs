@@ -18,7 +18,6 @@ use super::program::Program;
 use crate::simulation::config::{SandboxNetwork, SimulationConfig};
 
 /// The programs and settings that give each sandbox a network of its own.
-#[derive(Debug)]
 pub struct OwnNetwork {
     pasta: PathBuf,
     setpriv: PathBuf,
@@ -80,13 +79,11 @@ impl OwnNetwork {
     }
 
     /// Whether programs reach nothing at all.
-    #[must_use]
     pub fn is_closed(&self) -> bool {
         self.closed
     }
 
     /// Whether a packet filter keeps programs from private addresses.
-    #[must_use]
     pub fn is_filtered(&self) -> bool {
         self.nft.is_some()
     }
@@ -97,7 +94,6 @@ impl OwnNetwork {
     }
 
     /// The address at which this server reaches the forwarded port of each simulation.
-    #[must_use]
     pub fn reached(&self) -> IpAddr {
         if self.forwarded.is_unspecified() { self.loopback } else { self.forwarded }
     }

@@ -1,27 +1,23 @@
 //! The peak usage of a simulation without a control group of its own, from the readings of all simulations.
 
 use std::sync::OnceLock;
-use std::sync::atomic::{AtomicU64, Ordering};
-use std::time::Duration;
+
+use parking_lot::Mutex;
 
 use super::docker_cgroup::taken_by_container;
 use crate::simulation::ends::Taken;
 use crate::simulation::machine::Usage;
 
 /// The highest usage of a simulation that ticks have measured.
-#[derive(Debug, Default)]
+#[derive(Default)]
 pub struct Peak {
     /// Its containers, if it runs in some; its process tree here does not count then.
     containers: Option<OnceLock<Vec<String>>>,
-    /// In bytes; 0 before the first tick.
-    memory: AtomicU64,
-    /// Processor time, in milliseconds.
-    time: AtomicU64,
+    taken: Mutex<Taken>,
 }
 
 impl Peak {
     /// For a simulation that runs in containers.
-    #[must_use]
     pub fn of_containers() -> Self {
         Self { containers: Some(OnceLock::new()), ..Self::default() }
     }
@@ -35,35 +31,26 @@ impl Peak {
     }
 
     /// Whether the usage of its process tree is that of the simulation.
-    #[must_use]
     pub fn is_of_tree(&self) -> bool {
         self.containers.is_none()
     }
 
     /// Adds a reading: of the process tree, or the kernel's counters of its containers.
     pub fn look(&self, tree: Option<&Usage>) {
+        let mut taken = self.taken.lock();
+        let mut add = |memory, time| *taken = Taken { memory: taken.memory.max(memory), time: taken.time.max(time) };
         match &self.containers {
             Some(containers) => {
-                let taken = containers.get().into_iter().flatten().map(|id| taken_by_container(id));
-                let (memory, time) = taken.fold((0, Duration::ZERO), |(memory, time), taken| {
-                    (memory + taken.memory.unwrap_or_default(), time + taken.time.unwrap_or_default())
-                });
-                self.add(memory, time);
+                let all: Vec<Taken> = containers.get().into_iter().flatten().map(|id| taken_by_container(id)).collect();
+                let memory = all.iter().filter_map(|one| one.memory).reduce(|one, other| one + other);
+                add(memory, all.iter().filter_map(|one| one.time).reduce(|one, other| one + other));
             }
-            None => tree.iter().for_each(|usage| self.add(usage.memory, usage.time)),
+            None => tree.iter().for_each(|usage| add(Some(usage.memory), Some(usage.time))),
         }
     }
 
-    fn add(&self, memory: u64, time: Duration) {
-        self.memory.fetch_max(memory, Ordering::Relaxed);
-        self.time.fetch_max(u64::try_from(time.as_millis()).unwrap_or(u64::MAX), Ordering::Relaxed);
-    }
-
     /// The usage; its fields are `None` if the simulation ended before the first tick.
-    #[must_use]
     pub fn taken(&self) -> Taken {
-        let (memory, time) = (self.memory.load(Ordering::Relaxed), self.time.load(Ordering::Relaxed));
-        let is_known = memory > 0 || time > 0;
-        Taken { memory: Some(memory).filter(|memory| *memory > 0), time: is_known.then(|| Duration::from_millis(time)) }
+        *self.taken.lock()
     }
 }

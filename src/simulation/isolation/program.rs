@@ -7,7 +7,6 @@ use std::time::Duration;
 use super::display::Display;
 
 /// A program that is to be launched for a simulation.
-#[derive(Debug)]
 pub struct Program<'start> {
     /// The program and its arguments.
     pub command: Vec<OsString>,

@@ -23,7 +23,6 @@ use crate::simulation::config::{SandboxNetwork, SimulationConfig};
 use crate::simulation::process::{ExitReason, Ran, Run, RunError};
 
 /// The common part of all sandboxes of this server.
-#[derive(Debug)]
 pub struct Sandbox {
     bubblewrap: PathBuf,
     user: u32,

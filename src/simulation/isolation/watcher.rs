@@ -27,7 +27,6 @@ use crate::simulation::machine::{Tree, UsageMonitor};
 pub struct Watcher(Sender<(Watch, oneshot::Sender<String>)>);
 
 /// What is monitored of one simulation.
-#[derive(Debug)]
 pub struct Watch {
     /// The root of its process tree.
     pub root: i32,
@@ -53,7 +52,6 @@ pub struct MostProcesses {
 }
 
 /// A monitored simulation, and its state.
-#[derive(Debug)]
 struct Watched {
     watch: Watch,
     /// Receives the message when it exceeds a limit.

@@ -66,13 +66,11 @@ impl TryFrom<String> for DisplayName {
 }
 
 /// The display to use: the configured one, else that of the environment variable `DISPLAY`, else `:0`.
-#[must_use]
 pub fn effective(configured: Option<&DisplayName>) -> String {
     configured.map(|display| display.0.clone()).or_else(of_environment).unwrap_or_else(|| ":0".to_owned())
 }
 
 /// The display in the environment variable `DISPLAY`.
-#[must_use]
 pub fn of_environment() -> Option<String> {
     std::env::var("DISPLAY").ok().filter(|display| !display.is_empty())
 }

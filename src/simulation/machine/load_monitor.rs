@@ -111,7 +111,6 @@ pub struct LoadMonitor {
 impl LoadMonitor {
     /// Creates the actor. `disk` is a folder on the disk that is watched, `csv` the file that samples are written to,
     /// `spread` chooses the GPU of the next simulation; without it the least busy one counts for the load.
-    #[must_use]
     pub fn new(
         slots: Addr<SlotPool>,
         disk: &Path,
@@ -196,13 +195,11 @@ fn append(path: &Path, sample: &Sample, first: bool, put_aside: bool) -> std::io
 
 impl Sample {
     /// The first line of `monitor.csv`: the headings of its columns.
-    #[must_use]
     pub fn headings() -> String {
         COLUMNS.map(|(heading, _)| heading).join(", ")
     }
 
     /// The values of `monitor.csv`, in the order of its columns.
-    #[must_use]
     pub fn columns(&self) -> Vec<String> {
         COLUMNS.iter().map(|(_, value)| value(self)).collect()
     }

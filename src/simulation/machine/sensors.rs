@@ -63,7 +63,6 @@ pub struct GpuReading {
 
 impl Gpu {
     /// How busy it is, in percent.
-    #[must_use]
     pub fn load(&self) -> f64 {
         self.compute.max(self.memory)
     }
@@ -71,7 +70,6 @@ impl Gpu {
 
 /// The load of a machine: `max(CPU, (swap + memory + GPU memory) / 3, GPU compute)`, all in percent, as the original
 /// has it. Of several GPUs that one counts which a new client could use.
-#[must_use]
 pub fn load(machine: &Machine, gpu: Option<&Gpu>) -> Load {
     let percent = gpu.map_or_else(|| load_with(machine, &Gpu::default()), |gpu| load_with(machine, gpu));
     Load::try_from(percent).unwrap_or(Load::ZERO)
@@ -83,13 +81,11 @@ fn load_with(machine: &Machine, gpu: &Gpu) -> f64 {
 }
 
 /// The GPU that a new client could use best.
-#[must_use]
 pub fn least_busy<'gpus>(machine: &Machine, gpus: &'gpus [Gpu]) -> Option<&'gpus Gpu> {
     gpus.iter().min_by(|one, other| load_with(machine, one).total_cmp(&load_with(machine, other)))
 }
 
 /// The reading that determines the load, as text.
-#[must_use]
 pub fn busiest(machine: &Machine, gpu: Option<&Gpu>) -> &'static str {
     let total = load(machine, gpu).percent();
     let close = |value: f64| (value - total).abs() < 1e-9;
@@ -151,7 +147,6 @@ impl MachineSensor {
     }
 
     /// The machine's name, system and hardware.
-    #[must_use]
     pub fn host(&self) -> Host {
         let cpu = self.system.cpus().first().map(|cpu| cpu.brand().trim().to_owned()).unwrap_or_default();
         Host {
@@ -224,7 +219,6 @@ impl GpuSensor {
     }
 
     /// Reads all GPUs.
-    #[must_use]
     pub fn read(&self) -> GpuReading {
         let count = self.nvml.device_count().unwrap_or(0);
         let mut reading = GpuReading::default();

@@ -24,19 +24,16 @@ pub struct Spread {
 
 impl Spread {
     /// Spreads over the first `displays` GPUs; over all if it is 0.
-    #[must_use]
     pub fn over(displays: usize) -> Self {
         Self { displays: (displays > 0).then_some(displays), ..Self::default() }
     }
 
     /// The GPU that the next simulation would get.
-    #[must_use]
     pub fn next<'gpus>(&self, gpus: &'gpus [Gpu], now: Instant) -> Option<&'gpus Gpu> {
         self.choose(&self.given.lock(), gpus, now)
     }
 
     /// Assigns a simulation to one of the GPUs that answer; `None` if none does.
-    #[must_use]
     pub fn take(&self, gpus: &[Gpu], now: Instant) -> Option<Gpu> {
         let mut given = self.given.lock();
         let chosen = self.choose(&given, gpus, now)?;

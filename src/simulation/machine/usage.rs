@@ -54,7 +54,6 @@ const AGE: Duration = Duration::from_millis(1800);
 
 impl Tree {
     /// A tree without a control group.
-    #[must_use]
     pub fn of(root: i32) -> Self {
         Self { root, cgroup: None }
     }
@@ -62,14 +61,12 @@ impl Tree {
 
 impl UsageMonitor {
     /// The usage of each of these trees, never much older than two seconds. Blocks for some milliseconds.
-    #[must_use]
     pub fn read(&self, trees: &[Tree]) -> Usages {
         self.read_by(&trees.iter().map(|tree| tree.root).collect::<Vec<_>>(), || sums_of(trees))
     }
 
     /// The same for simulations whose processes only `measure` finds. It is called if the last reading is too old, and
     /// leaves out the use of the CPU unless it knows it.
-    #[must_use]
     pub fn read_by(&self, roots: &[i32], measure: impl FnOnce() -> Usages) -> Usages {
         if roots.is_empty() {
             return Usages::new();

@@ -30,7 +30,6 @@ impl DiskRoom {
     }
 
     /// What is less than the reserve (in MiB), in words. Without the numbers that change with each call.
-    #[must_use]
     pub fn shortage(&self, reserve: u64) -> Option<String> {
         if self.bytes >> 20 < reserve {
             return Some(format!("{reserve} MiB are left (diskReserve)"));

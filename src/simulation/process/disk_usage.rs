@@ -8,7 +8,6 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 /// Adds up files. A large file with several names, or that is found again because it was moved, counts once.
-#[derive(Debug)]
 pub struct DiskUsage {
     measure: fn(&Metadata) -> u64,
     /// Counting stops above this many bytes.
@@ -55,7 +54,6 @@ impl DiskUsage {
     }
 
     /// Stops counting after this time.
-    #[must_use]
     pub fn within(mut self, time: Duration) -> Self {
         self.until = Some(Instant::now() + time);
         self

@@ -31,7 +31,6 @@ pub struct Arguments {
 }
 
 /// A running guardian. It acts when this is dropped.
-#[derive(Debug)]
 pub struct Guardian {
     _child: Child,
     _lifeline: PipeWriter,

@@ -8,7 +8,6 @@ use super::process_tree;
 use super::remove_tree::remove_tree;
 
 /// The directory of one run of the server: `runs/run-*` in `cacheDir`. It contains a directory for each simulation.
-#[derive(Debug)]
 pub struct RunDir {
     folder: PathBuf,
 }

@@ -3,7 +3,6 @@
 use crate::shared::text::one_line;
 
 /// The incomplete last line of an output.
-#[derive(Debug)]
 pub struct Lines {
     line: Vec<u8>,
     longest: usize,

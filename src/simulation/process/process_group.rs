@@ -20,7 +20,6 @@ use tokio::sync::oneshot;
 use super::process_tree;
 
 /// How to start and how to end a program.
-#[derive(Debug)]
 pub struct SpawnSpec {
     /// The program and its arguments, without a shell.
     pub command: Vec<OsString>,
@@ -55,7 +54,6 @@ impl SpawnSpec {
 }
 
 /// A running process group. Dropping it kills the group.
-#[derive(Debug)]
 pub struct ProcessGroup {
     leader: i32,
     terminate: Option<oneshot::Sender<()>>,

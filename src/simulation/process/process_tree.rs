@@ -89,7 +89,6 @@ fn mark(pid: i32) -> Option<PathBuf> {
 }
 
 /// The files that a process has open and that have lost their names. `None` if it hides what it has open.
-#[must_use]
 pub fn nameless_files(pid: i32) -> Option<Vec<Metadata>> {
     let descriptors = match std::fs::read_dir(format!("/proc/{pid}/fd")) {
         Ok(descriptors) => descriptors,

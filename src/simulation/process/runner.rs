@@ -14,7 +14,6 @@ use super::lines::Lines;
 use super::process_group::{ExitReason, ProcessGroup, SpawnSpec};
 
 /// A program to run to its end, with its limits.
-#[derive(Debug)]
 pub struct Run {
     /// How it is started.
     pub spec: SpawnSpec,

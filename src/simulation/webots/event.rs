@@ -41,13 +41,6 @@ pub struct WebotsExit {
     pub why: String,
 }
 
-impl WebotsExit {
-    /// The exit of a Webots by itself, without an error.
-    pub fn clean() -> Self {
-        Self { clean: true, own: false, why: "Webots has ended".to_owned() }
-    }
-}
-
 /// The cause of a container's end, as text for the client.
 pub fn words(cause: Cause) -> &'static str {
     match cause {
@@ -72,13 +65,7 @@ impl EventSender {
     /// Sends an event.
     pub fn send(&mut self, event: WebotsEvent) {
         self.exit_sent |= matches!(event, WebotsEvent::Exited(_));
-        // A full mailbox may drop progress and heartbeats, but not the URL of Webots and its exit.
-        let may_be_lost = matches!(event, WebotsEvent::Progress(_) | WebotsEvent::Heartbeat | WebotsEvent::Hanging(_));
-        if !may_be_lost {
-            self.events.do_send(event);
-        } else if let Err(lost) = self.events.try_send(event) {
-            log::debug!("a client does not listen: {lost}");
-        }
+        self.events.do_send(event);
     }
 }
 

@@ -13,7 +13,6 @@ use crate::simulation::container::{Cause, SimulationContainers, StartError};
 use crate::simulation::isolation::Display;
 
 /// The target on which a Webots runs.
-#[derive(Debug)]
 pub enum LaunchTarget {
     /// The machine, with this display.
     Machine(Display),

@@ -213,7 +213,7 @@ impl Webots {
         let (kind, why) = verdict(self.stopped_for.take(), end, self.listening);
         self.spec.slot.lease.end(kind, &why, end.taken);
         let mut exit = match kind {
-            EndReason::Finished => WebotsExit::clean(),
+            EndReason::Finished => WebotsExit { clean: true, own: false, why },
             EndReason::Fault => WebotsExit { own: true, ..self.failure(&why) },
             _ => self.failure(&why),
         };
