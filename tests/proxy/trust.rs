@@ -1,5 +1,7 @@
 //! Certificates of a lab's own authority, and those that can't be trusted.
 
+use std::path::Path;
+
 use rcgen::CertificateParams;
 use serde_json::Value;
 
@@ -7,7 +9,7 @@ use super::web_server::{Kind, WebServer};
 use crate::support::authority::{Authority, Certificate};
 use crate::support::program::{Builder, Server, session_server};
 use crate::support::smtp::Smtp;
-use crate::support::{http, ports, until};
+use crate::support::{ports, until};
 
 /// A web server with this certificate and nothing behind it.
 async fn web_server(certificate: &Certificate) -> (WebServer, u16) {
@@ -27,68 +29,13 @@ fn watcher(address: &str) -> Builder {
 }
 
 async fn page_of_the_server(session: &Server, state: &str) -> Value {
-    let server = async || http::get(&session.url("/status")).await.json()["servers"][0].clone();
+    let server = async || session.status().await["servers"][0].clone();
     until(&format!("the simulation server is {state}"), async || server().await["state"] == state).await;
     server().await
 }
 
-/// What the session server says of a server with this certificate, when it trusts this authority: the same in its
-/// answers, its log, its page and its mail.
-async fn verdict(certificate: &Certificate, trusted: &Authority) -> String {
-    let (_web, port) = web_server(certificate).await;
-    let mut smtp = Smtp::start(&[]).await;
-    let session = watcher(&format!("localhost:{port}/2000")).env("SSL_CERT_FILE", trusted.file().to_str().unwrap());
-    let session = session.mails_to(smtp.port).set("timing.gather", 0.1).start().await;
-    let error = page_of_the_server(&session, "down").await["error"].as_str().unwrap().to_owned();
-    assert!(session.log().contains(&error), "{error} is not in the log");
-    assert!(http::get(&session.url("/monitor")).await.text().contains("its certificate is not trusted"));
-    let mail = smtp.mail().await;
-    let told = mail.field("text").split_whitespace().collect::<Vec<_>>().join(" ");
-    assert!(told.contains(&error), "{error} is not in the mail: {told}");
-    error.strip_prefix("no connection: its certificate is not trusted: ").unwrap_or(&error).to_owned()
-}
-
-#[actix_rt::test]
-async fn a_lab_s_own_authority_is_trusted_when_it_is_named() {
-    let lab = Authority::new();
-    let (_web, port) = web_server(&lab.issue(&["localhost"])).await;
-    let address = format!("localhost:{port}/2000");
-    let session = watcher(&address).env("SSL_CERT_FILE", lab.file().to_str().unwrap()).start().await;
-    assert_eq!(page_of_the_server(&session, "up").await["load"], 12.5);
-}
-
-#[actix_rt::test]
-async fn a_certificate_that_is_not_trusted_is_named_with_the_reason() {
-    let (lab, other, careless) = (Authority::new(), Authority::new(), Authority::new());
-    // What `openssl req -x509` makes.
-    let is_authority = |params: &mut CertificateParams| {
-        params.is_ca = rcgen::IsCa::Ca(rcgen::BasicConstraints::Unconstrained);
-    };
-    let dated = |from: i32, until: i32| {
-        move |params: &mut CertificateParams| {
-            params.not_before = rcgen::date_time_ymd(from, 1, 1);
-            params.not_after = rcgen::date_time_ymd(until, 1, 1);
-        }
-    };
-    let table = [
-        (lab.issue(&["localhost"]), &other, "it comes from an authority that is not known here"),
-        (lab.issue_as(&["localhost"], dated(2010, 2011)), &lab, "it expired on 2011-01-01T00:00:00Z"),
-        (lab.issue_as(&["localhost"], dated(2400, 2401)), &lab, "it is valid only from 2400-01-01T00:00:00Z"),
-        (lab.issue(&["lab.example"]), &lab, "it is for lab.example, not for localhost"),
-        (
-            careless.issue_as(&["localhost"], is_authority),
-            &careless,
-            "it is that of an authority (CA:TRUE) and not itself known here",
-        ),
-    ];
-    for (certificate, trusted, words) in &table {
-        let said = verdict(certificate, trusted).await;
-        assert!(said.starts_with(words), "{said:?} is not {words:?}");
-    }
-}
-
 /// What `openssl req -x509` makes for a name: a certificate that has signed itself and may sign others.
-fn self_signed(folder: &std::path::Path, name: &str) -> Certificate {
+fn self_signed(folder: &Path, name: &str) -> Certificate {
     let files = Certificate { chain: folder.join(format!("{name}.pem")), key: folder.join(format!("{name}.key")) };
     let output = std::process::Command::new("openssl")
         .args(["req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "30", "-subj", &format!("/CN={name}")])
@@ -100,37 +47,69 @@ fn self_signed(folder: &std::path::Path, name: &str) -> Certificate {
     files
 }
 
-#[actix_rt::test]
-async fn a_certificate_that_has_signed_itself_is_trusted_where_it_is_in_the_trust_store() {
-    let folder = tempfile::tempdir().unwrap();
-    let own = self_signed(folder.path(), "localhost");
-    let (_web, port) = web_server(&own).await;
-    let watch = async |store: &std::path::Path, state: &str| {
-        let server = watcher(&format!("localhost:{port}/2000")).env("SSL_CERT_FILE", store.to_str().unwrap());
-        page_of_the_server(&server.start().await, state).await
-    };
-    assert_eq!(watch(&own.chain, "up").await["load"], 12.5);
-    // Another one for the same name is not that one.
-    let others = tempfile::tempdir().unwrap();
-    let error = watch(&self_signed(others.path(), "localhost").chain, "down").await["error"].to_string();
-    assert!(error.contains("it is that of an authority (CA:TRUE) and not itself known here"), "{error}");
-
+/// One that has signed itself long ago.
+fn expired(folder: &Path) -> Certificate {
     let mut params = CertificateParams::new(["localhost".to_owned()]).unwrap();
     params.is_ca = rcgen::IsCa::Ca(rcgen::BasicConstraints::Unconstrained);
     params.not_after = rcgen::date_time_ymd(2011, 1, 1);
     let key = rcgen::KeyPair::generate().unwrap();
-    let expired = Certificate { chain: folder.path().join("expired.pem"), key: folder.path().join("expired.key") };
+    let expired = Certificate { chain: folder.join("expired.pem"), key: folder.join("expired.key") };
     std::fs::write(&expired.chain, params.self_signed(&key).unwrap().pem()).unwrap();
     std::fs::write(&expired.key, key.serialize_pem()).unwrap();
-    for (certificate, words) in [
-        (&self_signed(folder.path(), "lab.example"), "it is for lab.example, not for localhost"),
-        (&expired, "it expired on 2011-01-01"),
-    ] {
+    expired
+}
+
+#[actix_rt::test]
+async fn a_certificate_is_trusted_or_named_with_the_reason_in_answers_log_page_and_mail() {
+    let (lab, other, careless) = (Authority::new(), Authority::new(), Authority::new());
+    let is_authority = |params: &mut CertificateParams| {
+        params.is_ca = rcgen::IsCa::Ca(rcgen::BasicConstraints::Unconstrained);
+    };
+    let dated = |from: i32, until: i32| {
+        move |params: &mut CertificateParams| {
+            params.not_before = rcgen::date_time_ymd(from, 1, 1);
+            params.not_after = rcgen::date_time_ymd(until, 1, 1);
+        }
+    };
+    let (folder, others) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+    let [own, named] = ["localhost", "lab.example"].map(|name| self_signed(folder.path(), name));
+    let (another, expired) = (self_signed(others.path(), "localhost"), expired(folder.path()));
+    let an_authority = Some("it is that of an authority (CA:TRUE) and not itself known here");
+    let of_another_name = Some("it is for lab.example, not for localhost");
+    let table = [
+        (&lab.issue(&["localhost"]), lab.file(), None),
+        (&lab.issue(&["localhost"]), other.file(), Some("it comes from an authority that is not known here")),
+        (&lab.issue_as(&["localhost"], dated(2010, 2011)), lab.file(), Some("it expired on 2011-01-01T00:00:00Z")),
+        (
+            &lab.issue_as(&["localhost"], dated(2400, 2401)),
+            lab.file(),
+            Some("it is valid only from 2400-01-01T00:00:00Z"),
+        ),
+        (&lab.issue(&["lab.example"]), lab.file(), of_another_name),
+        (&careless.issue_as(&["localhost"], is_authority), careless.file(), an_authority),
+        // One that has signed itself is trusted where it is in the trust store; another one for the same name is not that one.
+        (&own, own.chain.clone(), None),
+        (&own, another.chain.clone(), an_authority),
+        (&named, named.chain.clone(), of_another_name),
+        (&expired, expired.chain.clone(), Some("it expired on 2011-01-01")),
+    ];
+    for (certificate, store, wrong) in table {
         let (_web, port) = web_server(certificate).await;
-        let server =
-            watcher(&format!("localhost:{port}/2000")).env("SSL_CERT_FILE", certificate.chain.to_str().unwrap());
-        let error = page_of_the_server(&server.start().await, "down").await["error"].to_string();
-        assert!(error.contains(words), "{error}");
+        let mut smtp = Smtp::start(&[]).await;
+        let session = watcher(&format!("localhost:{port}/2000")).env("SSL_CERT_FILE", store.to_str().unwrap());
+        let session = session.mails_to(smtp.port).set("timing.gather", 0.1).start().await;
+        let Some(words) = wrong else {
+            assert_eq!(page_of_the_server(&session, "up").await["load"], 12.5);
+            continue;
+        };
+        let error = page_of_the_server(&session, "down").await["error"].as_str().unwrap().to_owned();
+        let reason = error.strip_prefix("no connection: its certificate is not trusted: ");
+        assert!(reason.is_some_and(|reason| reason.starts_with(words)), "{error:?} is not {words:?}");
+        assert!(session.log().contains(&error), "{error} is not in the log");
+        assert!(session.monitor().await.contains("its certificate is not trusted"));
+        let mail = smtp.mail().await;
+        let told = mail.field("text").split_whitespace().collect::<Vec<_>>().join(" ");
+        assert!(told.contains(&error), "{error} is not in the mail: {told}");
     }
 }
 
