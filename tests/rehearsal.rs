@@ -15,7 +15,7 @@ use crate::support::ports;
 use crate::support::program::{Server, session_server, simulation_server};
 use crate::support::stand_in::{Script, StandIn};
 use crate::support::webots::Webots;
-use crate::support::{SOON, http, until};
+use crate::support::{SOON, until};
 
 /// How long a rehearsal may take.
 const BOUND: Duration = Duration::from_secs(90);
@@ -105,7 +105,7 @@ async fn a_class_that_reloads_comes_back_to_its_simulations() {
     let arguments = ["--clients", "2", "--over", "0s", "--stay", "8s", "--reload", "100", "--expect", "2"];
     let told = fleet.rehearse(&[&arguments[..], &["--real-time", "0"]].concat()).await;
     assert!(told.status.success(), "{}", text(&told.stdout));
-    let status = http::get(&fleet.simulation.url("/status")).await.json();
+    let status = fleet.simulation.status().await;
     assert_eq!(status["instances"]["arrivals"], 2, "they began anew: {}", text(&told.stdout));
     let refused = fleet.rehearse(&["--reload", "60", "--misbehave", "drop=41"]).await;
     assert!(text(&refused.stderr).contains("the shares are 101 percent"), "{}", text(&refused.stderr));
@@ -239,27 +239,22 @@ async fn explained(script: Script) -> String {
 }
 
 #[actix_rt::test]
-async fn the_acceptance_run_ends_at_a_step_that_never_does_and_says_where() {
-    let (waiting, loading) = futures_util::future::join(
-        explained(Script { client: vec!["loading: wait"], ..Script::default() }),
-        explained(Script { webots: vec!["world:a"], ..Script::default() }),
-    )
-    .await;
-    let ready = waiting.lines().find(|line| line.starts_with("| Webots is ready |")).unwrap();
-    assert!(ready.contains("not within 6 s") && ready.ends_with("| **differs** |"), "{waiting}");
-    let scene = loading.lines().find(|line| line.starts_with("| scene |")).unwrap();
-    assert!(scene.contains("`world:`, ") && scene.contains("then not within 6 s"), "{loading}");
-    assert!(loading.contains("steps differ: "), "{loading}");
-}
-
-#[actix_rt::test]
-async fn the_acceptance_run_shows_an_error_of_webots() {
-    let started = explained(Script { client: vec!["error: no display"], ..Script::default() }).await;
-    let ready = started.lines().find(|line| line.starts_with("| Webots is ready |")).unwrap();
-    assert!(ready.contains("`error: no display`"), "{started}");
-    let loaded = explained(Script { webots: vec!["world:a", "error: no such world"], ..Script::default() }).await;
-    let scene = loaded.lines().find(|line| line.starts_with("| scene |")).unwrap();
-    assert!(scene.contains("`world:`, then `error: no such world`"), "{loaded}");
+async fn the_acceptance_run_ends_at_a_step_that_never_does_or_fails_and_says_where() {
+    let client = |text| Script { client: vec![text], ..Script::default() };
+    let webots = |texts| Script { webots: texts, ..Script::default() };
+    let cases = [
+        (client("loading: wait"), "| Webots is ready |", ["not within 6 s", "| **differs** |"]),
+        (webots(vec!["world:a"]), "| scene |", ["`world:`, ", "then not within 6 s"]),
+        (client("error: no display"), "| Webots is ready |", ["`error: no display`", ""]),
+        (webots(vec!["world:a", "error: no such world"]), "| scene |", ["`world:`, then `error: no such world`", ""]),
+    ];
+    let all = cases.map(|(script, step, words)| async move {
+        let said = explained(script).await;
+        let line = said.lines().find(|line| line.starts_with(step)).unwrap();
+        assert!(words.iter().all(|words| line.contains(words)), "{said}");
+        assert!(step != "| scene |" || said.contains("steps differ: "), "{said}");
+    });
+    futures_util::future::join_all(all).await;
 }
 
 #[actix_rt::test]

@@ -5,9 +5,7 @@ use std::time::{Duration, Instant};
 use nix::sys::signal::Signal;
 
 use crate::support::client::Client;
-use crate::support::git::{Forge, arm};
-use crate::support::program::{session_server, simulation_server};
-use crate::support::webots::Webots;
+use crate::support::program::{demo_server, session_server};
 use crate::support::{SOON, http, until};
 
 async fn ask(request: awc::ClientRequest, password: Option<&str>) -> u16 {
@@ -20,8 +18,7 @@ async fn ask(request: awc::ClientRequest, password: Option<&str>) -> u16 {
 
 #[actix_rt::test]
 async fn a_draining_server_is_offered_for_less_than_a_second_more() {
-    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
-    let server = simulation_server(&webots.path(), forge.path(), 40).start().await;
+    let server = demo_server(40).start().await;
     // As the fleets of deploy/swarm and deploy/kubernetes have it.
     let config = std::fs::read(concat!(env!("CARGO_MANIFEST_DIR"), "/deploy/swarm/session.json")).unwrap();
     let config: serde_json::Value = serde_json::from_slice(&config).unwrap();
@@ -30,8 +27,7 @@ async fn a_draining_server_is_offered_for_less_than_a_second_more() {
     let session = session.set("loadThreshold", 1000).set("clientCost", 0.001).start().await;
     let offered = async || http::get(&session.url("/session")).await.text().starts_with("ws://");
     until("it is offered", offered).await;
-    let mut client = Client::start(&server, &arm()).await;
-    client.until("webots:").await;
+    let _client = Client::ready(&server).await;
     assert!(offered().await);
 
     server.signal(Signal::SIGUSR1);
@@ -50,9 +46,7 @@ async fn a_draining_server_is_offered_for_less_than_a_second_more() {
 
 #[actix_rt::test]
 async fn passwords_can_not_be_guessed_at_without_end() {
-    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
-    let mut server =
-        simulation_server(&webots.path(), forge.path(), 1).set("adminPassword", "open sesame").start().await;
+    let mut server = demo_server(1).set("adminPassword", "open sesame").start().await;
     let clients = awc::Client::builder().timeout(SOON).finish();
     let at = |request: awc::ClientRequest, address| request.insert_header(("x-forwarded-for", address));
     let output = async |address, password| ask(at(clients.get(server.url("/output?id=1")), address), password).await;

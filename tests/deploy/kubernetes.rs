@@ -1,13 +1,11 @@
 //! `deploy/kubernetes` and the images that it names: what programs say of them that read such files. No cluster is here.
 
-use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
 use serde_json::Value;
 
-use crate::support::authority::Authority;
-use crate::support::needs;
+use crate::support::{needs, skip};
 
 fn project(path: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join(path)
@@ -44,8 +42,7 @@ fn all() -> Vec<(&'static str, String)> {
     let version: Value = serde_json::from_str(&version).unwrap();
     let minor = version["clientVersion"]["minor"].as_str().unwrap().trim_end_matches('+').parse::<u32>().unwrap();
     if minor < 25 {
-        // Not by a macro: what those print is shown for tests that fail only.
-        std::io::stderr().write_all(b"SKIPPED, for kubectl is older than 1.25: deploy::kubernetes\n").unwrap();
+        skip("deploy::kubernetes", "kubectl is older than 1.25");
         return Vec::new();
     }
     let mut all: Vec<(&str, String)> = ["base", "overlays/demo", "overlays/gpu"]
@@ -169,61 +166,5 @@ fn the_configurations_are_taken_as_pods_get_them() {
                 assert!(grace > config["timeout"].as_f64(), "{name}: a simulation would not end by itself");
             }
         }
-    }
-}
-
-#[test]
-fn nginx_finds_no_fault_in_the_doors_and_they_have_the_rules_of_the_example() {
-    needs("nginx", "nginx");
-    let (authority, folder) = (Authority::new(), tempfile::tempdir().unwrap());
-    let certificate = authority.issue(&["fleet.example.org"]);
-    let here = folder.path().display().to_string();
-    let example = std::fs::read_to_string(project("deploy/nginx-door.conf")).unwrap();
-    for (name, yaml) in all() {
-        let objects = objects(&yaml);
-        let door = settings(&objects, "door", "fleet.conf");
-        for rule in [
-            "rewrite ",
-            "add_header ",
-            "proxy_read_timeout ",
-            "proxy_connect_timeout ",
-            "proxy_set_header ",
-            "proxy_pass http://$",
-            "map ",
-            "set ",
-            "access_log off",
-        ] {
-            let rules = |conf: &str| -> Vec<String> {
-                conf.lines().map(str::trim).filter(|line| line.starts_with(rule)).map(str::to_owned).collect()
-            };
-            assert_eq!(rules(door), rules(&example), "{name}");
-        }
-        // The service's name is known in the cluster alone.
-        let door = door
-            .replace("/etc/nginx/conf.d", &here)
-            .replace("/var/log/nginx", &here)
-            .replace("http://session:1999", "http://127.0.0.1:1999");
-        let tls = settings(&objects, "door", "tls.part")
-            .replace("/etc/nginx/tls/tls.crt", certificate.chain.to_str().unwrap())
-            .replace("/etc/nginx/tls/tls.key", certificate.key.to_str().unwrap());
-        assert_eq!(tls.is_empty(), name == "overlays/demo");
-        std::fs::write(folder.path().join("fleet.conf"), door).unwrap();
-        std::fs::write(folder.path().join("tls.part"), tls).unwrap();
-        let temporary: String = ["client_body", "proxy", "fastcgi", "uwsgi", "scgi"]
-            .iter()
-            .fold(String::new(), |text, part| text + &format!("{part}_temp_path {here}/{part};\n"));
-        let main =
-            format!("pid {here}/pid;\nevents {{}}\nhttp {{ {temporary} access_log off; include {here}/*.conf; }}\n");
-        std::fs::write(folder.path().join("main"), main).unwrap();
-        let log = folder.path().join("error.log");
-        let output = Command::new("nginx")
-            .arg("-t")
-            .arg("-c")
-            .arg(folder.path().join("main"))
-            .arg("-e")
-            .arg(log)
-            .output()
-            .unwrap();
-        assert!(output.status.success(), "{name}: {output:?}");
     }
 }

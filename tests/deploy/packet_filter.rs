@@ -12,7 +12,7 @@ use std::time::{Duration, Instant};
 use nix::sched::{CloneFlags, setns, unshare};
 use webots_fleet::simulation::container::packet_filter;
 
-use crate::support::{SOON, needs};
+use crate::support::{SOON, needs, skip};
 
 /// What clouds and carriers have at addresses of their own.
 const SPECIAL: [&str; 4] = ["169.254.169.254", "168.63.129.16", "100.64.0.9", "10.9.9.9"];
@@ -121,10 +121,7 @@ impl Network {
     /// Nothing, and a word, where it can't be made.
     fn new() -> Option<Self> {
         needs("ip", "iproute2");
-        let skip = |why: &str| {
-            // Not by a macro: what those print is shown for tests that fail only.
-            io::stderr().write_all(format!("SKIPPED, for {why}: deploy::packet_filter\n").as_bytes()).unwrap();
-        };
+        let skip = |why: &str| skip("deploy::packet_filter", why);
         let Some(machine) = Place::new() else {
             skip("only root may make networks");
             return None;
@@ -316,8 +313,7 @@ fn a_container_does_not_reach_its_neighbour() {
     let shown = network.machine.within(|| std::fs::read_to_string("/proc/sys/net/bridge/bridge-nf-call-iptables"));
     if !shown.is_ok_and(|shown| shown.trim() == "1") {
         // dockerd loads br_netfilter, without which no filter sees what goes through a bridge.
-        io::stderr().write_all(b"SKIPPED, for there is no br_netfilter: deploy::packet_filter\n").unwrap();
-        return;
+        return skip("deploy::packet_filter", "there is no br_netfilter");
     }
     let _controller = network.neighbour.listen("[::]:2001");
     for is_loaded in [false, true] {

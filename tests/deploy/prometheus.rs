@@ -8,9 +8,7 @@ use regex::Regex;
 use serde_json::Value;
 
 use crate::simulation::readings;
-use crate::support::git::Forge;
-use crate::support::program::{session_server, simulation_server};
-use crate::support::webots::Webots;
+use crate::support::program::{demo_server, session_server};
 use crate::support::{http, needs, until};
 
 fn project(path: &str) -> PathBuf {
@@ -78,11 +76,7 @@ fn the_queries_of_the_dashboard_are_some() {
 #[actix_rt::test]
 async fn alerts_dashboard_and_docs_name_the_metrics_that_the_servers_export() {
     let driver = readings::gpu_driver();
-    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
-    let simulation = simulation_server(&webots.path(), forge.path(), 1)
-        .env("LD_LIBRARY_PATH", driver.path().to_str().unwrap())
-        .start()
-        .await;
+    let simulation = demo_server(1).env("LD_LIBRARY_PATH", driver.path().to_str().unwrap()).start().await;
     let session = session_server(&[simulation.address(), "dns+fleet.test:2000".to_owned()]).start().await;
     let metrics = async |url: String| exported(&http::get(&url).await.text());
     let all = async || {

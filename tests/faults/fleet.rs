@@ -16,7 +16,7 @@ use crate::support::git::{Forge, arm};
 use crate::support::name_server::NameServer;
 use crate::support::program::{Builder, Server, session_server, simulation_server};
 use crate::support::relay::Relay;
-use crate::support::webots::{Webots, instances_below};
+use crate::support::webots::{Webots, instance_folders_in, instances_below};
 use crate::support::{SOON, http, ports};
 
 /// How many simulation servers there are.
@@ -201,9 +201,7 @@ impl Fleet {
     }
 
     fn instance_folders(&self, index: usize) -> usize {
-        let runs = std::fs::read_dir(self.folder(index).join("cache/runs")).into_iter().flatten().flatten();
-        let inside = runs.flat_map(|run| std::fs::read_dir(run.path()).into_iter().flatten().flatten());
-        inside.filter(|entry| entry.file_name().to_string_lossy().starts_with("instance-")).count()
+        instance_folders_in(&self.folder(index).join("cache")).len()
     }
 
     /// Waits until nothing is left of any simulation: no process, port or folder, and memory as it was.

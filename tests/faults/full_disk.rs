@@ -24,7 +24,7 @@ fn server(forge: &Forge, webots: &Webots, folder: &Path) -> Builder {
 
 /// The state of the second simulation server, and the last error that was met there.
 async fn second(session: &Server) -> (String, String) {
-    let page: Value = http::get(&session.url("/status")).await.json();
+    let page: Value = session.status().await;
     let text = |key: &str| page["servers"][1][key].as_str().unwrap_or_default().to_owned();
     (text("state"), text("error"))
 }
@@ -62,18 +62,18 @@ async fn a_server_with_a_full_disk_takes_nobody_and_the_whole_class_runs_elsewhe
     assert!(why.contains("disk is full: less than 8 MiB are left (diskReserve)"), "{why}");
     let health = http::try_get(&full.url("/health")).await.unwrap();
     assert!(health.status.as_u16() == 503 && health.text().contains("disk is full"), "{}", health.text());
-    let page = http::get(&full.url("/monitor")).await.text();
+    let page = full.monitor().await;
     assert!(page.contains("Not ready") && page.contains("disk is full"), "{page}");
     let all = class(&session, CLASS).await;
     assert_eq!(all.len(), usize::from(CLASS));
-    let known: Value = http::get(&healthy.url("/status")).await.json();
+    let known: Value = healthy.status().await;
     assert_eq!(known["simulations"].as_array().unwrap().len(), usize::from(CLASS));
     running.until(".").await;
 
     // It empties.
     drop(filler);
     until("it is offered again", async || second(&session).await.0 == "up").await;
-    assert_eq!(http::try_get(&full.url("/health")).await.unwrap().status.as_u16(), 200);
+    assert_eq!(full.health().await.0, 200);
     for client in all {
         client.leave().await;
     }

@@ -17,8 +17,7 @@ const BOUND: Duration = Duration::from_secs(20);
 
 #[actix_rt::test]
 async fn five_thousand_clients_come_back_at_once_and_hear_the_truth() {
-    let limits = nix::sys::resource::getrlimit(nix::sys::resource::Resource::RLIMIT_NOFILE).unwrap();
-    nix::sys::resource::setrlimit(nix::sys::resource::Resource::RLIMIT_NOFILE, limits.1, limits.1).unwrap();
+    crate::support::raise_file_limit();
     let folder = tempfile::tempdir().unwrap();
     let (reserved, simulation_port) = dead_port();
     let servers = [format!("127.0.0.1:{simulation_port}")];
@@ -37,7 +36,7 @@ async fn five_thousand_clients_come_back_at_once_and_hear_the_truth() {
     let began = Instant::now();
     let clients = come(&url, "1").await;
     assert!(began.elapsed() < BOUND, "it took {:?}", began.elapsed());
-    let status = crate::support::http::get(&session.url("/status")).await.json();
+    let status = session.status().await;
     assert_eq!(status["clients"], clients.len());
 }
 

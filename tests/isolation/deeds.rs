@@ -41,6 +41,15 @@ impl Stage {
         stage
     }
 
+    /// One whose folder elsewhere is shown in a sandbox. Nothing, and a word, where there can be no such folder.
+    fn apart(test: &str) -> Option<Self> {
+        if apart().is_none() {
+            let hidden = "the home and folders for temporary files, which a sandbox hides";
+            skip(test, &format!("this user can write nowhere but in {hidden}"));
+        }
+        apart().map(|_| Self::new())
+    }
+
     pub fn builder(&self, webots: &Webots, level: &str) -> Builder {
         let builder = simulation_server(&webots.path(), self.forge.path(), 2).folder(self.folder.path());
         let builder = builder.set("isolation", level).set("adminPassword", "a secret").set("timing.grace", 0.5);
@@ -57,7 +66,6 @@ impl Stage {
         let one =
             |(name, line): &(&str, String)| format!("if ( {line} ) >/dev/null 2>&1; then echo 'DONE {name}'; fi\n");
         let webots = Webots::script(&format!("{}\necho THE END\nexit 1", deeds.iter().map(one).collect::<String>()));
-        std::fs::set_permissions(webots.path().parent().unwrap(), std::fs::Permissions::from_mode(0o755)).unwrap();
         let server = change(self.builder(&webots, level)).start().await;
         let told = Client::start(&server, &arm()).await.until("loading: Error:").await;
         assert!(told.contains("THE END"), "{told}");
@@ -85,18 +93,6 @@ fn apart() -> Option<&'static str> {
             && !hidden.iter().any(|place| real.starts_with(place))
             && tempfile::tempdir_in(real).is_ok()
     })
-}
-
-/// Whether there can be such a folder; otherwise, a word.
-fn can_be_apart(test: &str) -> bool {
-    let can = apart().is_some();
-    if !can {
-        skip(
-            test,
-            "this user can write nowhere but in the home and in folders for temporary files, which a sandbox hides",
-        );
-    }
-    can
 }
 
 fn shown(path: impl AsRef<Path>) -> String {
@@ -152,10 +148,8 @@ async fn compare(stage: &Stage, change: impl Fn(Builder) -> Builder, levels: &[u
 
 #[actix_rt::test]
 async fn a_world_sees_and_changes_what_its_level_allows() {
-    if !can_be_apart("a_world_sees_and_changes_what_its_level_allows") {
-        return;
-    }
-    compare(&Stage::new(), |builder| builder.set("limits.output", 10_000), &[1, 0]).await;
+    let Some(stage) = Stage::apart("a_world_sees_and_changes_what_its_level_allows") else { return };
+    compare(&stage, |builder| builder.set("limits.output", 10_000), &[1, 0]).await;
 }
 
 /// What runs a server as an ordinary user; nothing where that can't be.
@@ -172,11 +166,7 @@ pub fn as_nobody() -> Option<&'static str> {
 #[actix_rt::test]
 async fn a_sandbox_holds_for_an_ordinary_user_too() {
     let Some(nobody) = as_nobody() else { return };
-    if !can_be_apart("a_sandbox_holds_for_an_ordinary_user_too") {
-        return;
-    }
-    let stage = Stage::new();
-    std::fs::set_permissions(stage.forge.path(), std::fs::Permissions::from_mode(0o755)).unwrap();
+    let Some(stage) = Stage::apart("a_sandbox_holds_for_an_ordinary_user_too") else { return };
     compare(&stage, |builder| builder.before(nobody), &[1]).await;
     // One of them is bubblewrap.
     let processes = [("be bounded by the kernel", "test $(ulimit -u) = 71".to_owned())];
@@ -187,15 +177,13 @@ async fn a_sandbox_holds_for_an_ordinary_user_too() {
 /// What a running simulation reads of a file that was replaced after its start.
 #[actix_rt::test]
 async fn secrets_that_are_written_anew_stay_hidden() {
-    if !can_be_apart("secrets_that_are_written_anew_stay_hidden") {
-        return;
-    }
+    let Some(stage) = Stage::apart("secrets_that_are_written_anew_stay_hidden") else { return };
     let folder = || {
         let folder = tempfile::tempdir_in(apart().unwrap()).unwrap();
         std::fs::set_permissions(folder.path(), std::fs::Permissions::from_mode(0o755)).unwrap();
         folder
     };
-    let (stage, password, links) = (Stage::new(), folder(), folder());
+    let (password, links) = (folder(), folder());
     let replace = |file: PathBuf| {
         let new = file.with_extension("new");
         std::fs::write(&new, "a secret").unwrap();
@@ -275,7 +263,6 @@ async fn a_sandbox_makes_no_user_namespaces_and_sets_nothing_of_the_kernel() {
     ];
     for user in std::iter::once("true").chain(as_nobody()) {
         let stage = Stage::new();
-        std::fs::set_permissions(stage.forge.path(), std::fs::Permissions::from_mode(0o755)).unwrap();
         let done = stage.tried(&deeds, "sandbox", |builder| builder.before(user)).await;
         assert_eq!(done, ["read the settings of the kernel"], "{user}");
     }
@@ -296,10 +283,7 @@ async fn a_sandbox_has_no_keyring_of_the_servers_session() {
 
 #[actix_rt::test]
 async fn folders_are_shown_and_opened_by_keys() {
-    if !can_be_apart("folders_are_shown_and_opened_by_keys") {
-        return;
-    }
-    let stage = Stage::new();
+    let Some(stage) = Stage::apart("folders_are_shown_and_opened_by_keys") else { return };
     let (home, elsewhere) = (shown(&stage.home), shown(&stage.elsewhere));
     let deeds = [
         ("read home", format!("grep secret {home}/secret")),
@@ -360,18 +344,14 @@ async fn attacked(stage: &Stage, level: &str) -> (Server, Client) {
         shown(&config)
     ));
     let server = stage.builder(&webots, level).start().await;
-    let mut client = Client::start(&server, &arm()).await;
-    client.until("webots:").await;
+    let client = Client::ready(&server).await;
     std::fs::write(&ready, "").unwrap();
     (server, client)
 }
 
 #[actix_rt::test]
 async fn a_world_can_kill_the_server_only_without_a_sandbox() {
-    if !can_be_apart("a_world_can_kill_the_server_only_without_a_sandbox") {
-        return;
-    }
-    let stage = Stage::new();
+    let Some(stage) = Stage::apart("a_world_can_kill_the_server_only_without_a_sandbox") else { return };
     let (mut server, _client) = attacked(&stage, "none").await;
     assert_eq!(server.ended().await, None, "it was killed");
     let stage = Stage::new();
@@ -390,7 +370,6 @@ async fn what_is_empty_in_a_sandbox_stays_so_and_its_shared_memory_is_bounded() 
         return skip("what_is_empty_in_a_sandbox_stays_so", "bubblewrap is older than 0.8");
     }
     let stage = Stage::new();
-    std::fs::set_permissions(stage.forge.path(), std::fs::Permissions::from_mode(0o755)).unwrap();
     // Hidden folders must be there when the server starts.
     for name in ["log", "cache"] {
         let folder = stage.folder.path().join(name);

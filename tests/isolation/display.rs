@@ -11,12 +11,12 @@ use x11rb::rust_connection::{DefaultStream, RustConnection};
 
 use super::deeds::as_nobody;
 use super::limits::Delegated;
-use crate::simulation::scene::{DEMO, arm, instance_folders, nothing_left};
+use crate::simulation::scene::{DEMO, instance_folders, nothing_left};
 use crate::support::client::Client;
 use crate::support::git::Forge;
 use crate::support::program::{Server, simulation_server};
 use crate::support::webots::{Webots, instances_below};
-use crate::support::{display, http, needs, until};
+use crate::support::{display, needs, until};
 
 /// The inodes of the sockets that a process has open.
 fn sockets(pid: i32) -> Vec<u64> {
@@ -51,13 +51,11 @@ async fn a_virtual_display_is_inside_of_the_sandbox() {
              {DEMO} \"$@\" & wait",
             fonts.display()
         ));
-        std::fs::set_permissions(webots.path().parent().unwrap(), std::fs::Permissions::from_mode(0o755)).unwrap();
         let builder = simulation_server(&webots.path(), forge.path(), 1).set("xvfb", true).set("isolation", "sandbox");
         let server = builder.folder(folder.path()).before(before).start().await;
         std::fs::create_dir_all(&fonts).unwrap();
         std::fs::write(fonts.join("fonts.dir"), "0\n").unwrap();
-        let mut client = Client::start(&server, &arm()).await;
-        client.until("webots:").await;
+        let client = Client::ready(&server).await;
         let mut printed = String::new();
         until("all of its output is kept", async || {
             printed = std::fs::read_to_string(server.output_file(&client)).unwrap();
@@ -116,7 +114,7 @@ const MEMORY: u64 = 256 << 20;
 
 /// What the monitor tells of the memory of the only simulation, in bytes.
 async fn told_memory(server: &Server) -> u64 {
-    let page = http::get(&server.url("/monitor")).await.text();
+    let page = server.monitor().await;
     let cell = page.split_once("data-label=\"Memory\"").map_or("", |(_, cell)| cell);
     let value = cell.split_once("data-value=\"").and_then(|(_, value)| value.split_once('"'));
     value.map_or(0, |(value, _)| value.parse().unwrap())
@@ -130,8 +128,7 @@ async fn what_a_virtual_display_takes_counts_for_its_simulation() {
         let builder = simulation_server(&webots.path(), forge.path(), 1).set("xvfb", true).set("isolation", level);
         let join = group.as_ref().map_or("true".to_owned(), Delegated::join);
         let server = builder.before(&join).start().await;
-        let mut client = Client::start(&server, &arm()).await;
-        client.until("webots:").await;
+        let client = Client::ready(&server).await;
         let _connection = take_memory(&server, level);
         until("its memory counts", async || told_memory(&server).await >= MEMORY).await;
         if let Some(group) = &group {

@@ -5,18 +5,13 @@ use serde_json::json;
 use crate::simulation::scene::arm;
 use crate::support::client::Client;
 use crate::support::git::Forge;
-use crate::support::http;
-use crate::support::program::{Builder, simulation_server};
+use crate::support::program::{Builder, demo_server, simulation_server};
 use crate::support::webots::Webots;
+use crate::support::{self};
 
 /// A folder with git and a shell, and with a bubblewrap that fails if one is wanted.
 fn programs(bubblewrap: Option<&str>) -> tempfile::TempDir {
-    let folder = tempfile::tempdir().unwrap();
-    for program in ["git", "bash", "env", "sh", "sleep", "rm"] {
-        let paths = std::env::var_os("PATH").unwrap();
-        let real = std::env::split_paths(&paths).map(|folder| folder.join(program)).find(|path| path.is_file());
-        std::os::unix::fs::symlink(real.unwrap(), folder.path().join(program)).unwrap();
-    }
+    let folder = support::programs(&["git", "bash", "env", "sh", "sleep", "rm"]);
     if let Some(script) = bubblewrap {
         let failing = Webots::script(script);
         std::fs::copy(failing.path(), folder.path().join("bwrap")).unwrap();
@@ -41,15 +36,9 @@ async fn a_sandbox_that_is_demanded_and_can_not_be_had_refuses_the_start_in_one_
     ];
     for (bubblewrap, words) in table {
         let programs = programs(bubblewrap);
-        let mut server = with(simulation_server(&webots.path(), forge.path(), 1), &programs, "sandbox").spawn();
-        assert_eq!(server.ended().await, Some(1));
-        let log = server.log();
-        let told: Vec<&str> = log.lines().filter(|line| line.starts_with("error: ")).collect();
-        assert_eq!(told.len(), 1, "{log}");
-        assert!(
-            told[0].starts_with("error: isolation is \"sandbox\", but bubblewrap") && told[0].contains(words),
-            "{log}"
-        );
+        let told = with(simulation_server(&webots.path(), forge.path(), 1), &programs, "sandbox").refused(1).await;
+        let begin = "error: isolation is \"sandbox\", but bubblewrap";
+        assert!(told.starts_with(begin) && told.contains(words), "{told}");
     }
 }
 
@@ -69,37 +58,32 @@ async fn a_network_that_is_demanded_and_can_not_be_had_refuses_the_start_in_one_
         ));
     }
     for (builder, words) in table {
-        let mut server = builder.spawn();
-        assert_eq!(server.ended().await, Some(1));
-        let log = server.log();
-        let told: Vec<&str> = log.lines().filter(|line| line.starts_with("error: ")).collect();
-        assert!(told.len() == 1 && told[0].contains(words), "{log}");
+        let told = builder.refused(1).await;
+        assert!(told.contains(words), "{told}");
     }
 }
 
 #[actix_rt::test]
 async fn where_no_sandbox_can_be_had_auto_falls_back_with_a_warning_on_log_and_monitor_page() {
-    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
     let programs = programs(Some("echo 'bwrap: No permissions' >&2; exit 1"));
-    let server = with(simulation_server(&webots.path(), forge.path(), 1), &programs, "auto").start().await;
+    let server = with(demo_server(1), &programs, "auto").start().await;
     let words = "bubblewrap makes no sandbox here (bwrap: No permissions)";
     let log = server.log();
     assert!(
         log.lines().any(|line| line.contains("WARN") && line.contains("(isolation: none)") && line.contains(words)),
         "{log}"
     );
-    let page = http::get(&server.url("/monitor")).await.text();
+    let page = server.monitor().await;
     assert!(page.contains(words) && page.contains("may do whatever this server may"), "{page}");
-    assert_eq!(http::get(&server.url("/status")).await.json()["isolation"], "none");
-    Client::start(&server, &arm()).await.until("webots:").await;
+    assert_eq!(server.status().await["isolation"], "none");
+    Client::ready(&server).await;
 }
 
 #[actix_rt::test]
 async fn a_sandbox_is_what_a_machine_has_by_itself() {
-    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
-    let server = simulation_server(&webots.path(), forge.path(), 1).start().await;
-    assert_eq!(http::get(&server.url("/status")).await.json()["isolation"], "sandbox");
-    let page = http::get(&server.url("/monitor")).await.text();
+    let server = demo_server(1).start().await;
+    assert_eq!(server.status().await["isolation"], "sandbox");
+    let page = server.monitor().await;
     assert!(page.contains("<dt>Isolation</dt><dd>sandbox</dd>"), "{page}");
     let log = server.log();
     // What the machine that runs the test may lack.
@@ -161,24 +145,17 @@ async fn a_level_that_can_not_be_is_refused_in_one_line() {
         (containers(1).set("container", json!({ "network": "open" })), "unknown variant `open`"),
         (containers(1).set("container", json!({ "netwrok": "closed" })), "netwrok"),
     ] {
-        let mut server = builder.spawn();
-        assert_eq!(server.ended().await, Some(2));
-        let log = server.log();
-        assert!(log.lines().count() == 1 && log.contains(words), "{log}");
+        let told = builder.refused(2).await;
+        assert!(told.contains(words), "{told}");
     }
 }
 
 #[actix_rt::test]
 async fn containers_without_docker_refuse_the_start_in_one_line() {
-    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
-    let programs = programs(None);
-    let mut server = with(simulation_server(&webots.path(), forge.path(), 1), &programs, "container").spawn();
-    assert_eq!(server.ended().await, Some(1));
-    let log = server.log();
-    let told: Vec<&str> = log.lines().filter(|line| line.starts_with("error: ")).collect();
+    let told = with(demo_server(1), &programs(None), "container").refused(1).await;
     let words =
         "error: isolation is \"container\", but docker is not there; on Debian and Ubuntu the package docker.io has it";
-    assert_eq!(told, [words], "{log}");
+    assert_eq!(told, words);
 }
 
 #[actix_rt::test]

@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 use crate::simulation::scene::{DEMO, arm, instance_folders, nothing_left};
 use crate::support::client::Client;
 use crate::support::git::Forge;
-use crate::support::program::{Server, simulation_server};
+use crate::support::program::{Server, server_of, simulation_server};
 use crate::support::webots::Webots;
 use crate::support::{SOON, http, skip, until};
 
@@ -13,14 +13,12 @@ const LEVELS: [&str; 2] = ["none", "sandbox"];
 
 /// What the client of a simulation is told that does this once it is ready, and is ended for it.
 async fn told_for(deed: &str, level: &str, key: &str, value: u64) -> String {
-    let forge = Forge::with_arm();
     let webots = Webots::script(&format!("{DEMO} \"$@\" &\nuntil [ -e go ]; do sleep 0.05; done\n{deed}\nwait"));
-    let builder = simulation_server(&webots.path(), forge.path(), 4).set("isolation", level);
+    let builder = server_of(webots, 4).set("isolation", level);
     // In a network of its own there are no ports of others.
     let builder = builder.set("sandbox.network", "shared");
     let server = builder.set(&format!("limits.{key}"), value).start().await;
-    let mut client = Client::start(&server, &arm()).await;
-    client.until("webots:").await;
+    let mut client = Client::ready(&server).await;
     std::fs::write(instance_folders(&server.folder)[0].join("project/go"), "").unwrap();
     // Its heartbeats go on as long as it is not ended.
     let told = actix_rt::time::timeout(2 * SOON, client.until("loading: Error:")).await;
@@ -106,17 +104,28 @@ async fn a_flood_of_output_costs_no_more_than_a_tenth_of_a_core() {
         ("yes", "sandbox"),
         ("yes .", "none"),
         ("tr '\\0' x < /dev/zero", "none"),
+        ("cat /dev/urandom", "none"),
         ("while :; do echo pause; echo fast; done", "none"),
         // A write for each byte, which is read before the next one comes.
         ("python3 -c 'import os\nwhile True: os.write(1, b\"x\")'", "none"),
     ] {
-        let forge = Forge::with_arm();
         let webots = Webots::script(&format!("{DEMO} \"$@\" >/dev/null &\n{flood} & wait"));
-        let server = simulation_server(&webots.path(), forge.path(), 1).set("isolation", level).start().await;
-        let mut client = Client::start(&server, &arm()).await;
-        client.until("webots:").await;
+        let server = server_of(webots, 1).set("isolation", level).start().await;
+        let client = Client::ready(&server).await;
         let (begin, before) = (Instant::now(), taken(&server));
-        until("it has gone on for a while", async || begin.elapsed() > Duration::from_secs(3)).await;
+        let log = server.output_file(&client);
+        let size = || -> u64 {
+            let files = std::fs::read_dir(log.parent().unwrap()).unwrap().flatten();
+            files.map(|file| file.metadata().unwrap().len()).sum()
+        };
+        until("it has gone on for a while", async || {
+            assert!(size() < 1_200_000, "{flood}: {} bytes", size());
+            begin.elapsed() > Duration::from_secs(3)
+        })
+        .await;
+        // A line that never ends is never written, and what tells of events is none.
+        let is_written = ["yes", "cat /dev/urandom"].contains(&flood);
+        assert!(!is_written || size() > 500, "{flood}: {} bytes", size());
         let share = (taken(&server) - before) / begin.elapsed().as_secs_f64();
         assert!(share < 0.1, "{flood}, {level}: {share}");
         assert!(http::get(&server.url("/load")).await.text().parse::<f64>().is_ok());
@@ -169,13 +178,11 @@ async fn a_simulation_has_a_control_group_of_its_own_where_they_are_delegated() 
         );
     };
     for level in LEVELS {
-        let forge = Forge::with_arm();
         let hidden = format!("1000.{}", rand::random::<u64>());
         let webots = Webots::script(&format!("(env -i setsid sleep {hidden} &)\n{DEMO} \"$@\" & wait"));
-        let builder = simulation_server(&webots.path(), forge.path(), 1).set("isolation", level);
+        let builder = server_of(webots, 1).set("isolation", level);
         let server = builder.before(&delegated.join()).set("timing.grace", 0.5).start().await;
-        let mut client = Client::start(&server, &arm()).await;
-        client.until("webots:").await;
+        let client = Client::ready(&server).await;
         let mut groups = delegated.groups();
         groups.sort();
         assert_eq!(groups.len(), 2, "{groups:?}");

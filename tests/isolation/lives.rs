@@ -5,10 +5,10 @@ use std::time::{Duration, Instant};
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 
-use crate::simulation::scene::{DEMO, arm, gone_within, nothing_left};
+use crate::simulation::scene::{DEMO, gone_within, nothing_left};
 use crate::support::client::Client;
 use crate::support::git::Forge;
-use crate::support::program::simulation_server;
+use crate::support::program::{server_of, simulation_server};
 use crate::support::until;
 use crate::support::webots::Webots;
 
@@ -31,8 +31,7 @@ async fn what_hides_on_purpose_ends_with_its_sandbox() {
         let webots = Webots::script(&format!("(env -i setsid sleep {hidden} &)\n{DEMO} \"$@\" & wait"));
         let builder = simulation_server(&webots.path(), forge.path(), 1).set("isolation", level);
         let mut server = builder.set("timing.grace", 0.5).start().await;
-        let mut client = Client::start(&server, &arm()).await;
-        client.until("webots:").await;
+        let client = Client::ready(&server).await;
         until("it hides", async || named(&hidden).len() == 1).await;
         if reason == "client" {
             client.leave().await;
@@ -61,8 +60,7 @@ async fn a_simulation_has_its_grace_time_at_each_level() {
         let webots = Webots::script(&format!("trap '{work}; exit 0' TERM\n{DEMO} \"$@\" & wait"));
         let builder = simulation_server(&webots.path(), forge.path(), 1).set("isolation", level);
         let server = builder.set("sandbox.writable", folder.path().to_str().unwrap()).start().await;
-        let mut client = Client::start(&server, &arm()).await;
-        client.until("webots:").await;
+        let client = Client::ready(&server).await;
         client.leave().await;
         nothing_left(&server, 1).await;
         assert_eq!(std::fs::read_to_string(&written).unwrap_or_default(), "saved\n", "{level}");
@@ -72,12 +70,10 @@ async fn a_simulation_has_its_grace_time_at_each_level() {
 #[actix_rt::test]
 async fn a_simulation_that_takes_no_notice_is_killed_after_its_grace_time() {
     for level in ["none", "sandbox"] {
-        let forge = Forge::with_arm();
         let webots = Webots::script(&format!("trap '' TERM\n{DEMO} \"$@\" &\nwhile true; do wait; sleep 0.1; done"));
-        let builder = simulation_server(&webots.path(), forge.path(), 1).set("isolation", level);
+        let builder = server_of(webots, 1).set("isolation", level);
         let server = builder.set("timing.grace", 0.5).start().await;
-        let mut client = Client::start(&server, &arm()).await;
-        client.until("webots:").await;
+        let client = Client::ready(&server).await;
         let left = Instant::now();
         client.leave().await;
         let took = gone_within(0.5, left, &server).await;

@@ -16,7 +16,7 @@ use crate::simulation::scene::{DEMO, arm, gone_within, nothing_left};
 use crate::support::client::{Client, Heard};
 use crate::support::program::{Builder, Server};
 use crate::support::webots::{Webots, instances_below};
-use crate::support::{display, http, needs, skip, until};
+use crate::support::{display, http, needs, programs, skip, until};
 
 /// What runs a server as an ordinary user who can have networks; nothing, and a word, where there is none.
 fn ordinary(test: &str) -> Option<&'static str> {
@@ -27,19 +27,6 @@ fn ordinary(test: &str) -> Option<&'static str> {
         return None;
     }
     if nix::unistd::getuid().is_root() { as_nobody() } else { Some("true") }
-}
-
-fn stage() -> Stage {
-    let stage = Stage::new();
-    std::fs::set_permissions(stage.forge.path(), std::fs::Permissions::from_mode(0o755)).unwrap();
-    stage
-}
-
-/// A program that others may run.
-fn webots(script: &str) -> Webots {
-    let webots = Webots::script(script);
-    std::fs::set_permissions(webots.path().parent().unwrap(), std::fs::Permissions::from_mode(0o755)).unwrap();
-    webots
 }
 
 /// A server of an ordinary user in whose sandboxes this network is.
@@ -58,7 +45,7 @@ fn python(line: &str) -> String {
 #[actix_rt::test]
 async fn a_world_in_its_own_network_reaches_nothing_of_the_machine() {
     let Some(user) = ordinary("a_world_in_its_own_network_reaches_nothing_of_the_machine") else { return };
-    let stage = stage();
+    let stage = Stage::new();
     let name = format!("fleet-test-{}", rand::random::<u64>());
     let _abstract = UnixListener::bind_addr(&SocketAddr::from_abstract_name(&name).unwrap()).unwrap();
     let four = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
@@ -125,11 +112,10 @@ const TAKES_ALL: &str = "python3 -c \"import ctypes, socket, time; ctypes.CDLL(N
 async fn who_takes_all_ports_in_its_own_network_keeps_nobody_out() {
     let Some(user) = ordinary("who_takes_all_ports_in_its_own_network_keeps_nobody_out") else { return };
     for network in ["own", "shared"] {
-        let stage = stage();
-        let webots = webots(&format!("export PYTHONUNBUFFERED=1\n{PORT}\n{TAKES_ALL}\n{DEMO} \"$@\" & wait"));
+        let stage = Stage::new();
+        let webots = Webots::script(&format!("export PYTHONUNBUFFERED=1\n{PORT}\n{TAKES_ALL}\n{DEMO} \"$@\" & wait"));
         let server = server(&stage, &webots, user, network).set("maxConnections", 3).start().await;
-        let mut first = Client::start(&server, &arm()).await;
-        first.until("webots:").await;
+        let first = Client::ready(&server).await;
         let log = server.output_file(&first);
         until("all are taken", async || std::fs::read_to_string(&log).is_ok_and(|text| text.contains("TAKEN"))).await;
         let mut second = Client::start(&server, &arm()).await;
@@ -152,17 +138,15 @@ async fn who_takes_all_ports_in_its_own_network_keeps_nobody_out() {
 async fn a_simulation_in_its_own_network_does_not_reach_its_neighbour() {
     let Some(user) = ordinary("a_simulation_in_its_own_network_does_not_reach_its_neighbour") else { return };
     for (network, is_reached) in [("own", false), ("shared", true)] {
-        let stage = stage();
+        let stage = Stage::new();
         // The second one looks for the first, at the port before its own.
         let look = python("s.create_connection(('127.0.0.1', $port - 1), 5); print('REACHED')");
-        let webots = webots(&format!("{PORT}\n{look}; echo LOOKED\n{DEMO} \"$@\" & wait"));
+        let webots = Webots::script(&format!("{PORT}\n{look}; echo LOOKED\n{DEMO} \"$@\" & wait"));
         let server = server(&stage, &webots, user, network).start().await;
-        let mut first = Client::start(&server, &arm()).await;
-        first.until("webots:").await;
+        let _first = Client::ready(&server).await;
         // Clients reach it all the same.
         http::get(&format!("http://127.0.0.1:{}/index.html", server.port + 1)).await;
-        let mut second = Client::start(&server, &arm()).await;
-        second.until("webots:").await;
+        let second = Client::ready(&server).await;
         let told = std::fs::read_to_string(server.output_file(&second)).unwrap();
         assert_eq!(told.contains("REACHED"), is_reached, "{network}: {told}");
         assert!(told.contains("LOOKED"), "{told}");
@@ -176,20 +160,19 @@ async fn a_display_is_within_reach_of_its_own_network() {
     needs("xhost", "x11-xserver-utils");
     let deeds = [("use the display", "xhost".to_owned())];
     let change = |builder: Builder| builder.before(user).set("sandbox.network", "own").set("xvfb", true);
-    assert_eq!(stage().tried(&deeds, "sandbox", change).await, ["use the display"]);
+    assert_eq!(Stage::new().tried(&deeds, "sandbox", change).await, ["use the display"]);
 }
 
 #[actix_rt::test]
 async fn limits_and_grace_time_hold_in_its_own_network() {
     let Some(user) = ordinary("limits_and_grace_time_hold_in_its_own_network") else { return };
-    let stage = stage();
+    let stage = Stage::new();
     let (open, written) = (stage.elsewhere.path().to_str().unwrap(), stage.elsewhere.path().join("written"));
     let work = format!("sleep 0.3; echo saved $(ulimit -u) > '{}'", written.display());
-    let webots = webots(&format!("trap \"{work}; exit 0\" TERM\n{DEMO} \"$@\" & wait"));
+    let webots = Webots::script(&format!("trap \"{work}; exit 0\" TERM\n{DEMO} \"$@\" & wait"));
     let server = server(&stage, &webots, user, "own").set("sandbox.writable", open).set("limits.processes", 70);
     let server = server.set("timing.grace", 10).start().await;
-    let mut client = Client::start(&server, &arm()).await;
-    client.until("webots:").await;
+    let client = Client::ready(&server).await;
     client.leave().await;
     nothing_left(&server, 2).await;
     // One of the processes is bubblewrap.
@@ -205,14 +188,13 @@ fn all_of(server: &Server) -> Vec<(i32, String)> {
 async fn pasta_ends_with_its_simulation_and_with_the_server() {
     let Some(user) = ordinary("pasta_ends_with_its_simulation_and_with_the_server") else { return };
     for end in ["client", "ignores", "pasta", "server"] {
-        let stage = stage();
+        let stage = Stage::new();
         let trap = if end == "ignores" { "trap '' TERM" } else { "" };
-        let webots = webots(&format!(
+        let webots = Webots::script(&format!(
             "{trap}\n(env -i setsid sleep 1000 &)\n{DEMO} \"$@\" &\nwhile true; do wait; sleep 0.1; done"
         ));
         let mut server = server(&stage, &webots, user, "own").set("maxConnections", 1).start().await;
-        let mut client = Client::start(&server, &arm()).await;
-        client.until("webots:").await;
+        let mut client = Client::ready(&server).await;
         let parent = server.pid();
         let is_pasta = |one: &procfs::process::Process| {
             one.stat().is_ok_and(|stat| stat.ppid == parent && stat.comm.starts_with("pas"))
@@ -253,12 +235,12 @@ async fn pasta_ends_with_its_simulation_and_with_the_server() {
 #[actix_rt::test]
 async fn how_a_program_has_ended_is_told_from_its_own_network() {
     let Some(user) = ordinary("how_a_program_has_ended_is_told_from_its_own_network") else { return };
-    let stage = stage();
+    let stage = Stage::new();
     for (script, words) in [
         ("echo LAST; exit 7", "Webots ended with exit code 7. Its last output: LAST"),
         ("kill -SEGV $$", "Webots was ended by the signal SIGSEGV"),
     ] {
-        let webots = webots(script);
+        let webots = Webots::script(script);
         let server = server(&stage, &webots, user, "own").start().await;
         let told = Client::start(&server, &arm()).await.until("loading: Error:").await;
         assert!(told.contains(words), "{told}");
@@ -268,20 +250,8 @@ async fn how_a_program_has_ended_is_told_from_its_own_network() {
 #[actix_rt::test]
 async fn which_network_simulations_have_is_told() {
     let Some(user) = ordinary("which_network_simulations_have_is_told") else { return };
-    let without = |program: &str| {
-        let folder = tempfile::tempdir().unwrap();
-        std::fs::set_permissions(folder.path(), std::fs::Permissions::from_mode(0o755)).unwrap();
-        for one in ["git", "bash", "env", "sh", "setpriv", "bwrap", "prlimit", "unshare", "pasta"]
-            .into_iter()
-            .filter(|one| *one != program)
-        {
-            let paths = std::env::var_os("PATH").unwrap();
-            let real = std::env::split_paths(&paths).map(|folder| folder.join(one)).find(|path| path.is_file());
-            std::os::unix::fs::symlink(real.unwrap(), folder.path().join(one)).unwrap();
-        }
-        folder
-    };
-    let (all, none) = (without("nothing"), without("pasta"));
+    let names = ["git", "bash", "env", "sh", "setpriv", "bwrap", "prlimit", "unshare", "pasta"];
+    let (all, none) = (programs(&names), programs(&names[..8]));
     let path = |folder: &tempfile::TempDir| folder.path().to_str().unwrap().to_owned();
     for (network, path, shown, words) in [
         ("auto", path(&all), "own", "own, with the internet, without this machine and private addresses"),
@@ -289,23 +259,20 @@ async fn which_network_simulations_have_is_told() {
         ("shared", path(&all), "shared", "shared with this machine"),
         ("auto", path(&none), "shared", "shared with this machine: pasta is not there; on Debian"),
     ] {
-        let stage = stage();
-        let webots = webots("exit 1");
+        let stage = Stage::new();
+        let webots = Webots::script("exit 1");
         let setpriv = user.replace("setpriv", "/usr/bin/setpriv");
         let server = server(&stage, &webots, &setpriv, network).env("PATH", &path).start().await;
-        assert_eq!(http::get(&server.url("/status")).await.json()["network"], shown);
-        let page = http::get(&server.url("/monitor")).await.text();
+        assert_eq!(server.status().await["network"], shown);
+        let page = server.monitor().await;
         assert!(page.contains(&format!("<dd>{words}")), "{page}");
         assert!(server.log().contains(&format!("network of simulations: {words}")), "{}", server.log());
     }
     for network in ["own", "closed"] {
-        let (stage, webots) = (stage(), webots("exit 1"));
+        let (stage, webots) = (Stage::new(), Webots::script("exit 1"));
         let setpriv = user.replace("setpriv", "/usr/bin/setpriv");
-        let mut server = server(&stage, &webots, &setpriv, network).env("PATH", &path(&none)).spawn();
-        assert_eq!(server.ended().await, Some(1));
-        let log = server.log();
-        let told: Vec<&str> = log.lines().filter(|line| line.starts_with("error: ")).collect();
-        assert!(told.len() == 1 && told[0].contains("but pasta is not there"), "{log}");
+        let told = server(&stage, &webots, &setpriv, network).env("PATH", &path(&none)).refused(1).await;
+        assert!(told.contains("but pasta is not there"), "{told}");
     }
 }
 
@@ -327,12 +294,11 @@ async fn a_machine_without_ipv4_or_ipv6_has_networks_of_simulations_own() {
             return skip(test, &format!("no network: {}", String::from_utf8_lossy(&made.stderr)));
         }
         for streaming in ["direct", "relay"] {
-            let (stage, webots) = (stage(), webots(&format!("{DEMO} \"$@\" & wait")));
+            let (stage, webots) = (Stage::new(), Webots::script(&format!("{DEMO} \"$@\" & wait")));
             // All of them are of this namespace.
             let server = server(&stage, &webots, user, "own").set("streaming", streaming).set("bind", "::");
             let server = server.env("DEMO_SIMULATOR_BIND", "::").start().await;
-            let mut client = Client::start(&server, &arm()).await;
-            client.until("webots:").await;
+            let client = Client::ready(&server).await;
             client.leave().await;
             nothing_left(&server, 2).await;
         }

@@ -9,13 +9,13 @@ use std::time::Duration;
 use nix::sys::statvfs::statvfs;
 
 use super::deeds::as_nobody;
-use crate::simulation::scene::{DEMO, arm, instance_folders, nothing_left};
+use crate::simulation::scene::{DEMO, instance_folders, nothing_left};
 use crate::support::client::Client;
 use crate::support::disk::{self, Full};
 use crate::support::git::Forge;
 use crate::support::program::{Builder, Server, simulation_server};
 use crate::support::webots::Webots;
-use crate::support::{SOON, http, skip, until};
+use crate::support::{SOON, skip, until};
 
 /// The size of the disk, in MiB; `diskReserve` is as it is by itself.
 const SIZE: u32 = 1024;
@@ -96,8 +96,7 @@ fn webots() -> Webots {
 /// Starts a simulation, which does this once it is ready. Returns its client and the folder of its instance.
 async fn doing(server: &Server, deed: &str) -> (Client, PathBuf) {
     let before = instance_folders(&server.folder);
-    let mut client = Client::start(server, &arm()).await;
-    client.until("webots:").await;
+    let client = Client::ready(server).await;
     let new = instance_folders(&server.folder).into_iter().find(|folder| !before.contains(folder)).unwrap();
     std::fs::write(new.join("project/deed"), deed).unwrap();
     (client, new)
@@ -144,7 +143,7 @@ async fn simulations_never_use_up_the_reserve_of_the_disk() {
             eprintln!("{what}: {} MiB were left, {told}", least.mib());
             assert!(least.mib() > 0, "{what}: the reserve was used up");
             until("there is room again", async || free(&small) >> 20 > 512).await;
-            let is_ready = async || http::get(&server.url("/health")).await.status.as_u16() == 200;
+            let is_ready = async || server.health().await.0 == 200;
             until("it is ready again", is_ready).await;
             innocent.until(".").await;
         }
@@ -162,10 +161,9 @@ async fn no_simulation_ends_where_another_program_fills_the_disk() {
     }
     let (forge, webots) = (Forge::with_arm(), Webots::script(&format!("{DEMO} \"$@\" & wait")));
     let server = server(&forge, &webots, folder.path(), |builder| builder.set("diskReserve", 8)).await;
-    let mut client = Client::start(&server, &arm()).await;
-    client.until("webots:").await;
+    let mut client = Client::ready(&server).await;
     let _filler = Full::at(folder.path());
-    until("it is full", async || http::try_get(&server.url("/health")).await.unwrap().status.as_u16() == 503).await;
+    until("it is full", async || server.health().await.0 == 503).await;
     // Longer than an end needs to show an effect.
     for _ in 0..12 {
         client.until(".").await;

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use crate::simulation::scene::{DEMO, arm, instance_folders, nothing_left};
+use crate::simulation::scene::{DEMO, instance_folders, nothing_left};
 use crate::support::client::Client;
 use crate::support::git::Forge;
 use crate::support::program::simulation_server;
@@ -47,8 +47,7 @@ async fn a_reset_replaces_a_link_and_follows_none() {
             let git = "echo '*.py working-tree-encoding=UTF-16' > .gitattributes; echo 'gitdir: /tmp' > .git";
             let webots = Webots::script(&format!("{deed}\n{git}\n{DEMO} \"$@\" & wait"));
             let server = simulation_server(&webots.path(), forge.path(), 1).set("isolation", level).start().await;
-            let mut client = Client::start(&server, &arm()).await;
-            client.until("webots:").await;
+            let mut client = Client::ready(&server).await;
             let answer = reset(&mut client).await;
             let folder = instance_folders(&server.folder)[0].clone();
             let file = folder.join("project/controllers/c/c.py");
@@ -86,8 +85,7 @@ async fn who_exchanges_folders_and_links_during_a_reset_leads_nothing_out_of_the
     let server = simulation_server(&webots.path(), forge.path(), 1).set("isolation", "sandbox");
     // A client may ask for so much between two pings.
     let server = server.set("timing.ping", 0.2).start().await;
-    let mut client = Client::start(&server, &arm()).await;
-    client.until("webots:").await;
+    let mut client = Client::ready(&server).await;
     let project = instance_folders(&server.folder)[0].join("project");
     until("the names are exchanged", async || project.join("exchanging").exists()).await;
     for _ in 0..100 {

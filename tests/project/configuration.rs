@@ -130,24 +130,6 @@ fn the_page_names_every_key_once_with_its_default_and_no_other() {
 }
 
 #[test]
-fn simulations_have_the_limits_that_were_agreed_on() {
-    let defaults = kinds().into_iter().find(|kind| kind.heading.contains("imulation")).unwrap().defaults();
-    for (key, default) in [
-        ("timing.checkout", 120.0),
-        ("timing.launch", 120.0),
-        ("timing.heartbeat", 5.0),
-        ("timing.grace", 5.0),
-        ("projectSize", 1024.0),
-        ("cacheSize", 10_240.0),
-        ("waitingLine", 100.0),
-        ("timeout", 7200.0),
-    ] {
-        assert_eq!(defaults[key].as_f64(), Some(default), "{key}");
-    }
-    assert_eq!(defaults["display"], json!(null));
-}
-
-#[test]
 fn the_page_names_what_else_keys_may_be_called() {
     for kind in kinds() {
         for alias in kind.aliases {
@@ -167,34 +149,6 @@ fn the_examples_of_the_page_are_taken_without_a_warning() {
             let output = kind.check(example);
             assert!(output.status.success() && output.stderr.is_empty(), "{example}{output:?}");
         }
-    }
-}
-
-#[test]
-fn a_list_is_taken_for_no_object() {
-    let tables: [&[(&str, Value)]; 2] = [
-        &[("timing", json!([1])), ("timing", json!([])), ("examples", json!([["a title", "https://a.world"]]))],
-        &[("timing", json!([1])), ("timing", json!([])), ("gitMirrors", json!([["https://a.forge", "file:b"]]))],
-    ];
-    for (kind, table) in kinds().iter().zip(tables) {
-        for (key, value) in table {
-            let mut config = json!({});
-            config[*key] = value.clone();
-            let output = kind.check(&config.to_string());
-            let told = String::from_utf8_lossy(&output.stderr);
-            assert_eq!((output.status.code(), told.lines().count()), (Some(2), 1), "{key}: {value}: {told}");
-            assert!(told.contains(&format!(" {key}: ")), "{told}");
-        }
-    }
-}
-
-#[test]
-fn what_is_wrong_inside_an_object_is_named_by_its_key() {
-    for kind in kinds() {
-        let mut config = json!({});
-        config["timing"] = json!({"ping": 10, "silence": "long"});
-        let told = String::from_utf8(kind.check(&config.to_string()).stderr).unwrap();
-        assert!(told.contains("timing.silence: ") && told.contains("a number of seconds"), "{told}");
     }
 }
 

@@ -123,14 +123,6 @@ impl Project {
         left
     }
 
-    /// The folders of simulations.
-    pub fn instances(&self) -> Vec<PathBuf> {
-        let runs = std::fs::read_dir(self.path("cache/runs")).into_iter().flatten();
-        let entries = runs.flat_map(|run| std::fs::read_dir(run.unwrap().path()).into_iter().flatten());
-        let paths = entries.map(|entry| entry.unwrap().path());
-        paths.filter(|path| path.file_name().unwrap().to_string_lossy().starts_with("instance-")).collect()
-    }
-
     /// The process of a server, `KIND`, of a configuration.
     pub fn pid(&self, kind: &str, name: &str) -> i32 {
         let text = std::fs::read_to_string(self.path(&format!("log/{kind}/{name}.pid"))).unwrap();

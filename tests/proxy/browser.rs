@@ -56,6 +56,14 @@ impl Browser {
         Answer { status: answer.status(), headers: answer.headers().clone(), body }
     }
 
+    /// Asserts that a path leads to nothing: no page, nor a WebSocket.
+    pub async fn finds_nothing(&self, path: &str) {
+        let answer = self.get(path).await;
+        assert!([400, 403, 404].contains(&answer.status.as_u16()), "{path}: {}", answer.status);
+        assert!(!answer.text().contains("secret"), "{path}");
+        assert!(self.try_open(&format!("wss://{}{path}", self.host), &[]).await.is_err(), "{path}");
+    }
+
     /// A WebSocket of `wss://HOST`.
     pub async fn connect(&self, path: &str) -> Client {
         self.open(&format!("wss://{}{path}", self.host)).await

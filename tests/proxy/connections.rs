@@ -20,9 +20,7 @@ async fn quiet_connections_last(rules: Rules) {
     let mut door = browser.connect(&rules.session_path(fleet.session.port, "/session")).await;
     let mut idle = browser.open(&format!("{}/client", fleet.wss(&fleet.here))).await;
     let (mut client, stream) = fleet.simulate(browser, &fleet.there).await;
-    let mut viewer = browser.open(&format!("{stream}/")).await;
-    viewer.send("x3d").await;
-    viewer.until("scene load completed").await;
+    let mut viewer = browser.open(&format!("{stream}/")).await.with_scene().await;
     viewer.send("pause").await;
     viewer.until("paused by client").await;
     // Nothing but pings goes over these connections; over Webots' stream not even these.
@@ -52,9 +50,7 @@ async fn the_documents_rules_keep_what_is_pinged_and_cut_what_is_silent() {
     let fleet = Fleet::start(Rules::Documents).await;
     let mut door = fleet.browser.connect(&format!("/{}/session", fleet.session.port)).await;
     let (mut client, stream) = fleet.simulate(&fleet.browser, &fleet.here).await;
-    let mut viewer = fleet.browser.open(&format!("{stream}/")).await;
-    viewer.send("x3d").await;
-    viewer.until("scene load completed").await;
+    let mut viewer = fleet.browser.open(&format!("{stream}/")).await.with_scene().await;
     viewer.closed().await;
     client.until(".").await;
     a_door_still_answers(&mut door).await;

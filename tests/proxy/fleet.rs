@@ -20,9 +20,9 @@ pub struct Fleet {
     pub browser: Browser,
     pub web: WebServer,
     pub session: Server,
-    /// On the web server's machine.
+    /// On the first of the machines.
     pub here: Server,
-    /// On another: 127.0.0.2.
+    /// On the second.
     pub there: Server,
     _authority: Authority,
     _webots: Webots,
@@ -30,7 +30,7 @@ pub struct Fleet {
 }
 
 /// How many simulations fit on each simulation server.
-const PLACES: u16 = 3;
+pub const PLACES: u16 = 3;
 /// A web server's default, shortened: connections on which nothing is sent for so long are closed.
 pub const IDLE: Duration = Duration::from_secs(4);
 
@@ -47,13 +47,30 @@ impl Fleet {
         let host = format!("localhost:{https}");
         let (webots, forge) = (Webots::launcher(), Forge::with_arm());
         forge.commit("lab/arm", "main", &[("worlds/textures/old wood.png", "a picture")]);
-        let simulation = |address: &str| {
-            let server = simulation_server(&webots.path(), forge.path(), PLACES).env("DEMO_SIMULATOR_BIND", address);
-            let server = server.set("bind", address).set("timing.heartbeat", 0.2);
-            keys(behind(server, &host)).spawn()
+        let behind = |server: Builder| {
+            let server = if rules.is_door() {
+                server.set("publicUrl", format!("wss://{host}/{{host}}/{{port}}"))
+            } else {
+                server.set("server", host.as_str()).set("ssl", true).set("portRewrite", true)
+            };
+            keys(server.set("timing.ping", 0.5).set("timing.silence", 10))
         };
-        let (here, there) = (simulation("127.0.0.1"), simulation("127.0.0.2"));
-        let addresses = [&here, &there].map(|server| format!("{host}/{}", server.port));
+        let port = ports::block(PLACES + 12);
+        let [here, there] = rules.machines().map(|machine| {
+            let server = simulation_server(&webots.path(), forge.path(), PLACES).env("DEMO_SIMULATOR_BIND", machine);
+            let server = server.set("bind", machine).set("timing.heartbeat", 0.2);
+            if rules.is_door() {
+                // As engines tell a container which host it is.
+                behind(server.port(port).set("server", "$FLEET_TEST_HOST").env("FLEET_TEST_HOST", machine)).spawn()
+            } else {
+                behind(server).spawn()
+            }
+        });
+        let addresses = if rules.is_door() {
+            rules.machines().map(|machine| format!("{machine}:{port}"))
+        } else {
+            [&here, &there].map(|server| format!("{host}/{}", server.port))
+        };
         let examples = serde_json::json!([{"title": "Arm", "url": arm()}]);
         let session = session_server(&addresses)
             .set("examples", examples)
@@ -62,7 +79,7 @@ impl Fleet {
             .set("timing.gather", 0.1)
             .set("timing.flapping", 0.1)
             .env("SSL_CERT_FILE", authority.file().to_str().unwrap());
-        let session = keys(behind(session, &host)).spawn();
+        let session = behind(session).spawn();
         let ports = |server: &Server| (server.port..=server.port + PLACES).collect::<Vec<_>>();
         let place = Place {
             http,
@@ -102,9 +119,4 @@ impl Fleet {
     pub fn wss(&self, server: &Server) -> String {
         format!("wss://{}/{}", self.browser.host, server.port)
     }
-}
-
-fn behind(server: Builder, host: &str) -> Builder {
-    let server = server.set("server", host).set("ssl", true).set("portRewrite", true);
-    server.set("timing.ping", 0.5).set("timing.silence", 10)
 }

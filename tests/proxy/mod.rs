@@ -31,6 +31,5 @@ mod one_door;
 mod pages;
 mod relayed;
 mod trust;
-mod urls;
 mod users;
 mod whole_way;

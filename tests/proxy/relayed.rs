@@ -6,7 +6,7 @@ use super::fleet::Fleet;
 use super::rules::Rules;
 use crate::support::until;
 
-async fn relayed(rules: Rules) {
+async fn streams_come_through_the_simulation_server(rules: Rules) {
     // The relay reaches Webots on the loopback of its machine.
     let relay = |server: crate::support::program::Builder| {
         server.set("streaming", "relay").env("DEMO_SIMULATOR_BIND", "127.0.0.1")
@@ -17,9 +17,7 @@ async fn relayed(rules: Rules) {
         let (client, stream) = fleet.simulate(browser, server).await;
         let beginning = format!("{}/stream/", fleet.wss(server));
         let token = stream.strip_prefix(&beginning).unwrap_or_else(|| panic!("{stream}")).to_owned();
-        let mut viewer = browser.open(&format!("{stream}/")).await;
-        viewer.send("x3d").await;
-        viewer.until("scene load completed").await;
+        let mut viewer = browser.open(&format!("{stream}/")).await.with_scene().await;
         viewer.send("real-time:-1").await;
         viewer.until("application/json:").await;
         let of = |path: &str| format!("/{}/stream/{token}{path}", server.port);
@@ -53,12 +51,4 @@ async fn relayed(rules: Rules) {
     assert!(!fleet.web.log().contains("0123456789abcdef"), "{}", fleet.web.log());
 }
 
-#[actix_rt::test]
-async fn streams_come_through_nginx_and_the_simulation_server() {
-    relayed(Rules::Nginx).await;
-}
-
-#[actix_rt::test]
-async fn streams_come_through_apache_and_the_simulation_server() {
-    relayed(Rules::Apache).await;
-}
+through_both!(streams_come_through_the_simulation_server);

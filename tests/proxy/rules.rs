@@ -13,6 +13,10 @@ pub enum Rules {
     Nginx,
     /// The same with `deploy/nginx-users.conf`, and oauth2-proxy on this port.
     NginxWithUsers(u16),
+    /// `deploy/nginx-door.conf`: one nginx in front of machines whose servers have the same port.
+    Door,
+    /// The same of `deploy/kubernetes`.
+    KubernetesDoor,
     /// The documents' page on a machine with a session server: every port of the machine, and three pages.
     Documents,
 }
@@ -33,14 +37,24 @@ pub struct Place<'a> {
 
 impl Rules {
     pub fn kind(self) -> Kind {
-        if matches!(self, Self::Nginx | Self::NginxWithUsers(_)) { Kind::Nginx } else { Kind::Apache }
+        if matches!(self, Self::Apache | Self::ApacheWithUsers | Self::Documents) { Kind::Apache } else { Kind::Nginx }
+    }
+
+    /// Whether all machines are behind one nginx on another.
+    pub fn is_door(self) -> bool {
+        matches!(self, Self::Door | Self::KubernetesDoor)
+    }
+
+    /// The addresses of the machines. Where there is no door, the first is also the web server's.
+    pub fn machines(self) -> [&'static str; 2] {
+        if self.is_door() { ["127.0.0.2", "127.0.0.3"] } else { ["127.0.0.1", "127.0.0.2"] }
     }
 
     /// Where a client finds the session server's door.
     pub fn session_path(self, session: u16, path: &str) -> String {
         match self {
-            Self::Apache | Self::ApacheWithUsers | Self::Nginx | Self::NginxWithUsers(_) => path.to_owned(),
             Self::Documents => format!("/{session}{path}"),
+            _ => path.to_owned(),
         }
     }
 
@@ -106,6 +120,39 @@ impl Rules {
                     ("250[1-9]|251[0-9]|2520", &editors(here)),
                     ("350[1-9]|351[0-9]|3520", &editors(there)),
                     ("192.0.2.3", "127.0.0.2"),
+                ],
+            ),
+            Self::Door => adapt(
+                include_str!("../../deploy/nginx-door.conf"),
+                &[
+                    ("/etc/letsencrypt/live/fleet.example.org/fullchain.pem", chain),
+                    ("/etc/letsencrypt/live/fleet.example.org/privkey.pem", key),
+                    ("fleet.example.org", "localhost"),
+                    (&any_address("80"), "\n"),
+                    (&any_address("443 ssl"), "\n"),
+                    ("listen 80;", &format!("listen 127.0.0.1:{http};")),
+                    ("listen 443 ssl;", &format!("listen 127.0.0.1:{https} ssl;")),
+                    ("192\\.0\\.2\\.[0-9]+", "127\\.0\\.0\\.[23]"),
+                    ("192.0.2.1:1999", &format!("127.0.0.1:{session}")),
+                    ("(?<fleet_port>2000)", &format!("(?<fleet_port>{})", here[0])),
+                    ("200[1-9]|201[0-9]|2020", &pattern(&here[1..])),
+                ],
+            ),
+            Self::KubernetesDoor => adapt(
+                include_str!("../../deploy/kubernetes/base/config/fleet.conf"),
+                &[
+                    (
+                        "include /etc/nginx/conf.d/tls*.part;",
+                        include_str!("../../deploy/kubernetes/base/config/tls.part"),
+                    ),
+                    ("/etc/nginx/tls/tls.crt", chain),
+                    ("/etc/nginx/tls/tls.key", key),
+                    ("listen 8080;", &format!("listen 127.0.0.1:{http};")),
+                    ("listen 8443 ssl;", &format!("listen 127.0.0.1:{https} ssl;")),
+                    ("^10\\.[0-9]+\\.[0-9]+\\.[0-9]+$", "^127\\.0\\.0\\.[23]$"),
+                    ("session:1999", &format!("127.0.0.1:{session}")),
+                    ("(?<fleet_port>2000)", &format!("(?<fleet_port>{})", here[0])),
+                    ("200[1-9]|201[0-9]|2020", &pattern(&here[1..])),
                 ],
             ),
             Self::Documents => {

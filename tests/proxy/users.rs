@@ -1,44 +1,31 @@
 //! Users who sign in at the web server: a stand-in for oauth2-proxy, the real nginx, and what a simulation server makes of it.
 
-use tokio::io::{AsyncReadExt, AsyncWriteExt};
-use tokio::net::TcpListener;
+use std::net::TcpListener;
 
 use super::fleet::{Fleet, arm};
 use super::rules::Rules;
 use crate::support::client::Client;
 use crate::support::http::PASSWORD;
+use crate::support::listener::serve;
 
 /// A stand-in for oauth2-proxy: whose cookie is a name has signed in with it.
-pub async fn oauth2_proxy() -> u16 {
-    let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+pub fn oauth2_proxy() -> u16 {
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let port = listener.local_addr().unwrap().port();
-    actix_rt::spawn(async move {
-        while let Ok((mut socket, _)) = listener.accept().await {
-            actix_rt::spawn(async move {
-                let mut head = Vec::new();
-                while !head.ends_with(b"\r\n\r\n") {
-                    if socket.read_buf(&mut head).await.unwrap_or(0) == 0 {
-                        return;
-                    }
-                }
-                let head = String::from_utf8_lossy(&head).into_owned();
-                let name = head.lines().find_map(|line| line.strip_prefix("cookie: _oauth2_proxy="));
-                let answer = match (head.starts_with("GET /oauth2/auth "), name) {
-                    (true, Some(name)) => format!("202 Accepted\r\nX-Auth-Request-Email: {name}@lab.example"),
-                    (true, None) => "401 Unauthorized".to_owned(),
-                    (false, _) => "200 OK".to_owned(),
-                };
-                let answer = format!("HTTP/1.1 {answer}\r\nContent-Length: 0\r\nConnection: close\r\n\r\n");
-                socket.write_all(answer.as_bytes()).await.ok();
-            });
-        }
+    serve(listener, None, |request| {
+        let answer = match (request.path(), request.header("cookie").strip_prefix("_oauth2_proxy=")) {
+            ("/oauth2/auth", Some(name)) => format!("202 Accepted\r\nX-Auth-Request-Email: {name}@lab.example"),
+            ("/oauth2/auth", None) => "401 Unauthorized".to_owned(),
+            _ => "200 OK".to_owned(),
+        };
+        Some((answer, Vec::new()))
     });
     port
 }
 
 #[actix_rt::test]
 async fn who_signs_in_at_the_web_server_is_known_to_the_administrator() {
-    let rules = Rules::NginxWithUsers(oauth2_proxy().await);
+    let rules = Rules::NginxWithUsers(oauth2_proxy());
     let keys = |builder: crate::support::program::Builder| builder.set("adminPassword", PASSWORD);
     // The session server, which signs in nowhere, knows its servers all the same.
     let fleet = Fleet::start_with(rules, |builder| keys(builder).set("userHeader", "X-Forwarded-User")).await;

@@ -1,26 +1,33 @@
-//! From the first click to the end of a simulation, through each web server with each set of rules.
+//! From the first click to the end of a simulation, through each web server with each set of rules. Whatever URLs the servers
+//! hand out lead through the web server, from wherever they were read.
 
 use tokio::net::TcpStream;
 
 use super::fleet::{Fleet, arm};
 use super::rules::Rules;
+use crate::support::smtp::Smtp;
 use crate::support::until;
 
 async fn the_whole_way(rules: Rules) {
-    let fleet = Fleet::start(rules).await;
+    let mut smtp = Smtp::start(&[]).await;
+    let port = smtp.port;
+    let fleet = Fleet::start_with(rules, |server| server.mails_to(port)).await;
     let browser = &fleet.browser;
     let at_the_door = |path: &str| rules.session_path(fleet.session.port, path);
 
     // Pages.
     let page = browser.get(&at_the_door("/monitor")).await;
     assert_eq!(page.status, 200);
+    let status = browser.get(&at_the_door("/status")).await.json();
+    let named: Vec<_> = status["servers"].as_array().unwrap().iter().map(|one| one["monitor"].clone()).collect();
     for server in [&fleet.here, &fleet.there] {
-        assert!(page.text().contains(&format!("https://{}/{}/monitor", browser.host, server.port)), "{}", page.text());
-        assert_eq!(browser.get(&format!("/{}/monitor", server.port)).await.status, 200);
+        let monitor = format!("https://{}/{}/monitor", browser.host, server.port);
+        assert!(page.text().contains(&monitor), "{}", page.text());
+        assert!(named.len() == 2 && named.contains(&monitor.clone().into()), "{named:?}");
+        assert_eq!(browser.ask(&monitor, &[]).await.status, 200);
         let load = browser.get(&format!("/{}/load", server.port)).await.text();
         assert!(load.parse::<f64>().is_ok(), "{load}");
     }
-    assert_eq!(browser.get(&at_the_door("/status")).await.json()["servers"].as_array().unwrap().len(), 2);
     until("the door is open", async || browser.get(&at_the_door("/request")).await.text() == "1").await;
 
     // The door.
@@ -39,9 +46,7 @@ async fn the_whole_way(rules: Rules) {
     for (server, address) in [(&fleet.here, "127.0.0.1"), (&fleet.there, "127.0.0.2")] {
         let (client, stream) = fleet.simulate(browser, server).await;
         assert_eq!(stream, format!("wss://{}/{}", browser.host, server.port + 1));
-        let mut viewer = browser.open(&format!("{stream}/")).await;
-        viewer.send("x3d").await;
-        viewer.until("scene load completed").await;
+        let mut viewer = browser.open(&format!("{stream}/")).await.with_scene().await;
         let file = browser.get(&format!("/{}/worlds/textures/old%20wood.png?x=1", server.port + 1)).await;
         assert_eq!((file.status.as_u16(), file.text().as_str()), (200, "a picture"));
         viewer.send("real-time:-1").await;
@@ -51,6 +56,23 @@ async fn the_whole_way(rules: Rules) {
         until("Webots has ended", async || TcpStream::connect((address, server.port + 1)).await.is_err()).await;
     }
     door.leave().await;
+
+    // The log, and a mail.
+    let door = format!("https://{}/{}", browser.host, fleet.session.port);
+    let line = format!("listens on port {}: {door}", fleet.session.port);
+    assert!(fleet.session.log().contains(&line), "{}", fleet.session.log());
+    let lost = format!("{}/{}", browser.host, fleet.there.port);
+    drop(fleet.there);
+    // Before there was a web server, none of them answered.
+    let mail = loop {
+        let mail = smtp.mail().await;
+        if mail.subject() == format!("Simulation server not responding: {lost}") {
+            break mail;
+        }
+    };
+    let link = mail.field("text").split_whitespace().find(|word| word.starts_with("http"));
+    assert_eq!(link, Some(format!("{door}/monitor").as_str()), "{mail:?}");
+    assert_eq!(browser.ask(link.unwrap(), &[]).await.status, 200);
 }
 
 through_both!(the_whole_way);

@@ -6,7 +6,7 @@ use nix::sys::signal::Signal;
 use serde_json::{Value, json};
 
 use crate::support::client::Client;
-use crate::support::http::{self, PASSWORD, post};
+use crate::support::http::{PASSWORD, post};
 use crate::support::program::{Server, session_server};
 use crate::support::until;
 
@@ -17,7 +17,7 @@ async fn announce(session: &Server, order: &Value) -> u16 {
 }
 
 async fn page(session: &Server) -> String {
-    http::get(&session.url("/monitor")).await.text()
+    session.monitor().await
 }
 
 /// A time so many milliseconds from now.

@@ -34,7 +34,7 @@ fn looking_up(entries: &[String], names: &NameServer) -> Builder {
 
 /// What `/status` tells of each server: its address and its state.
 async fn servers(session: &Server) -> Vec<(String, String)> {
-    let status = http::get(&session.url("/status")).await.json();
+    let status = session.status().await;
     let text = |value: &Value| value.as_str().unwrap().to_owned();
     let servers = status["servers"].as_array().unwrap();
     servers.iter().map(|server| (text(&server["address"]), text(&server["state"]))).collect()
@@ -103,7 +103,7 @@ async fn a_name_server_that_fails_or_has_nothing_to_tell_changes_nothing_and_is_
         .start()
         .await;
     until_states(&session, &["up"; 2]).await;
-    let error = async || http::get(&session.url("/status")).await.json()["names"][0]["error"].clone();
+    let error = async || session.status().await["names"][0]["error"].clone();
     let stopwatch = Stopwatch::start();
     for (outage, words) in [(0, "timed out"), (1, "no such records"), (2, "")] {
         match outage {
@@ -114,7 +114,7 @@ async fn a_name_server_that_fails_or_has_nothing_to_tell_changes_nothing_and_is_
         until("the page tells it", async || error().await.as_str().is_some()).await;
         assert!(error().await.as_str().unwrap().contains(words), "{}", error().await);
         assert_eq!(smtp.mail().await.subject(), format!("Simulation server not responding: {name}"));
-        let page = http::get(&session.url("/monitor")).await.text();
+        let page = session.monitor().await;
         assert!(page.contains(&format!("{name} can't be looked up.")), "{page}");
         // It is asked again and again meanwhile, and nobody waits for that.
         let asked = servers[0].requests();
@@ -151,7 +151,7 @@ async fn a_thousand_servers_are_found_behind_one_name() {
     names.set("fleet.test", &addresses);
     let builder = looking_up(&[format!("dns+fleet.test:{port}")], &names);
     let session = builder.set("loadRefresh", 600).set("timing", json!({"answer": 15})).start().await;
-    let metrics = async |line: String| http::get(&session.url("/metrics")).await.text().lines().any(|one| one == line);
+    let metrics = async |line: String| session.metrics().await.lines().any(|one| one == line);
     until("all are found", async || metrics("webots_session_servers{state=\"up\"} 1000".to_owned()).await).await;
     assert!(metrics(format!("webots_session_lookup_servers{{name=\"dns+fleet.test:{port}\"}} 1000")).await);
     names.set("fleet.test", &addresses[..500]);
@@ -188,5 +188,5 @@ async fn names_come_and_go_with_the_configuration() {
     until_states(&session, &["up", "draining"]).await;
     reload(json!([]), json!([]));
     until_states(&session, &[]).await;
-    assert_eq!(http::get(&session.url("/status")).await.json()["names"], json!([]));
+    assert_eq!(session.status().await["names"], json!([]));
 }

@@ -2,16 +2,14 @@
 
 use super::stand_in::{Manner, StandIn};
 use crate::support::client::Client;
-use crate::support::git::{Forge, world};
+use crate::support::git::world;
 use crate::support::http;
-use crate::support::program::{session_server, simulation_server};
+use crate::support::program::{demo_server, session_server};
 use crate::support::until;
-use crate::support::webots::Webots;
 
 #[actix_rt::test]
 async fn a_client_is_led_to_the_simulation_server_that_is_there() {
-    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
-    let simulation = simulation_server(&webots.path(), forge.path(), 9).start().await;
+    let simulation = demo_server(9).start().await;
     // Whatever else keeps this machine busy closes no server.
     let session = session_server(&[simulation.address()]).set("loadThreshold", 1000).start().await;
     let mut client = Client::connect(&session.websocket("/session")).await;

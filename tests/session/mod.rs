@@ -7,7 +7,6 @@ mod discovery;
 mod door;
 mod mail;
 mod memory;
-mod names;
 mod placement;
 mod pushing;
 mod seeing;
@@ -16,7 +15,7 @@ mod watching;
 mod webhook;
 
 use crate::support::program::Server;
-use crate::support::{http, until};
+use crate::support::until;
 use stand_in::StandIn;
 
 /// `HOST:PORT` of each.
@@ -27,7 +26,7 @@ fn addresses(servers: &[StandIn]) -> Vec<String> {
 /// Waits until the session server has its simulation servers in these states, in the order of its configuration.
 async fn until_states(session: &Server, expected: &[&str]) {
     until(&format!("the servers are {expected:?}"), async || {
-        let status = http::get(&session.url("/status")).await.json();
+        let status = session.status().await;
         let servers = status["servers"].as_array().unwrap();
         servers.iter().map(|server| server["state"].as_str().unwrap()).eq(expected.iter().copied())
     })

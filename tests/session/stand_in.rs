@@ -109,11 +109,6 @@ impl StandIn {
         self.address.to_string()
     }
 
-    /// Its port.
-    pub fn port(&self) -> u16 {
-        self.address.port()
-    }
-
     /// What the session server tells a client that is sent here.
     pub fn url(&self) -> String {
         format!("ws://{}", self.address())

@@ -132,13 +132,7 @@ async fn a_configuration_that_can_not_be_used_changes_nothing() {
     until("it is judged anew", async || servers[0].requests() >= asked + 3).await;
     until_states(&session, &["up"]).await;
     assert_eq!(http::get(&session.url("/session")).await.text(), servers[0].url());
-}
-
-#[actix_rt::test]
-async fn a_pipe_in_the_place_of_the_configuration_is_not_waited_for() {
-    let servers = [StandIn::start(Manner::idle(1.0, 10))];
-    let session = session_server(&addresses(&servers)).start().await;
-    until_states(&session, &["up"]).await;
+    // Nor is a pipe in its place waited for.
     let file = session.folder.join("config.json");
     std::fs::remove_file(&file).unwrap();
     nix::unistd::mkfifo(&file, nix::sys::stat::Mode::S_IRWXU).unwrap();

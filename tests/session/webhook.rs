@@ -42,7 +42,7 @@ fn says_nothing_secret(session: &Server) {
 
 #[actix_rt::test]
 async fn the_notices_of_a_mail_are_one_message_and_need_no_mail() {
-    let (servers, receiver) = (fleet(), Receiver::start(None).await);
+    let (servers, receiver) = (fleet(), Receiver::start(None));
     let session = with_webhook(&servers, "http", receiver.port).start().await;
     fail(&session, &servers).await;
     let text = receiver.texts(1).await.remove(0);
@@ -72,7 +72,7 @@ async fn the_notices_of_a_mail_are_one_message_and_need_no_mail() {
 
 #[actix_rt::test]
 async fn a_message_that_is_not_taken_is_tried_again_and_so_is_a_mail_for_itself() {
-    let (servers, receiver) = (fleet(), Receiver::start(None).await);
+    let (servers, receiver) = (fleet(), Receiver::start(None));
     receiver.answer("503 Busy");
     let mut smtp = Smtp::start(&[]).await;
     let session = with_webhook(&servers, "http", receiver.port).mails_to(smtp.port).start().await;
@@ -103,7 +103,7 @@ async fn a_message_that_is_not_taken_is_tried_again_and_so_is_a_mail_for_itself(
 #[actix_rt::test]
 async fn a_messenger_whose_certificate_is_not_trusted_is_told_nothing() {
     let (lab, other) = (Authority::new(), Authority::new());
-    let receiver = Receiver::start(Some(&lab.issue(&["localhost"]))).await;
+    let receiver = Receiver::start(Some(&lab.issue(&["localhost"])));
     for (authority, trusted) in [(&other, false), (&lab, true)] {
         let servers = fleet();
         let builder = with_webhook(&servers, "https", receiver.port);
@@ -122,7 +122,7 @@ async fn a_messenger_whose_certificate_is_not_trusted_is_told_nothing() {
 
 #[actix_rt::test]
 async fn a_redirect_leads_notices_to_nobody_else() {
-    let (servers, receiver, other) = (fleet(), Receiver::start(None).await, Receiver::start(None).await);
+    let (servers, receiver, other) = (fleet(), Receiver::start(None), Receiver::start(None));
     receiver.answer(&format!("307 Elsewhere\r\nLocation: http://127.0.0.1:{}/", other.port));
     let session = with_webhook(&servers, "http", receiver.port).start().await;
     fail(&session, &servers).await;
@@ -135,7 +135,7 @@ async fn a_redirect_leads_notices_to_nobody_else() {
 
 #[actix_rt::test]
 async fn the_webhook_can_be_tried_and_a_wrong_one_is_refused_without_showing_it() {
-    let receiver = Receiver::start(None).await;
+    let receiver = Receiver::start(None);
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("webhook.json");
     let run = async |webhook: String, option: &'static str| {

@@ -2,13 +2,12 @@
 
 use std::path::Path;
 
-use nix::sys::signal::Signal;
 use serde_json::Value;
 
 use super::scene::{DEMO, arm};
 use crate::support::client::Client;
 use crate::support::git::{Forge, world};
-use crate::support::program::{Server, simulation_server};
+use crate::support::program::{Server, server_of, simulation_server};
 use crate::support::webots::Webots;
 use crate::support::{http, until};
 
@@ -28,14 +27,14 @@ fn lines(server: &Server) -> Vec<Vec<String>> {
 }
 
 /// Waits for the line of a simulation, and returns its columns.
-async fn line(server: &Server, id: &str) -> Vec<String> {
+pub async fn line(server: &Server, id: &str) -> Vec<String> {
     let find = || lines(server).into_iter().find(|line| line[0] == id);
     until("its end is in simulations.csv", async || find().is_some()).await;
     find().unwrap()
 }
 
 async fn ends(server: &Server, reason: &str) -> f64 {
-    let metrics = http::get(&server.url("/metrics")).await.text();
+    let metrics = server.metrics().await;
     let begin = format!("webots_simulation_ends_total{{reason=\"{reason}\"}} ");
     metrics.lines().find_map(|line| line.strip_prefix(&begin)).unwrap_or_else(|| panic!("{metrics}")).parse().unwrap()
 }
@@ -46,13 +45,12 @@ async fn a_simulation_has_one_id_from_its_first_message_to_its_last_trace() {
     let file = folder.path().join("code");
     let webots = ending(false, &file);
     let server = simulation_server(&webots.path(), forge.path(), 1).set("isolation", "none").start().await;
-    let mut client = Client::start(&server, &arm()).await;
-    client.until("webots:").await;
+    let mut client = Client::ready(&server).await;
     assert!(client.heard[0].starts_with("session: "), "{:?}", client.heard);
     let id = client.id().to_owned();
-    let status: Value = http::get(&server.url("/status")).await.json();
+    let status: Value = server.status().await;
     assert_eq!(status["simulations"][0]["id"], id.as_str());
-    assert!(http::get(&server.url("/monitor")).await.text().contains(&id));
+    assert!(server.monitor().await.contains(&id));
     let url = server.url(&format!("/output?id={id}"));
     assert_eq!(http::get(&url).await.text(), "begun\n");
     std::fs::write(&file, "3").unwrap();
@@ -73,7 +71,7 @@ async fn a_simulation_has_one_id_from_its_first_message_to_its_last_trace() {
     {
         assert!(kept.contains(words), "{words:?}: {kept}");
     }
-    let page = http::get(&server.url("/monitor")).await.text();
+    let page = server.monitor().await;
     assert!(page.contains("crashed") && page.contains(&format!("output?id={id}")), "{page}");
     assert!(!page.contains("last words"), "who may see the page may not see the output");
     let log = server.log();
@@ -88,11 +86,7 @@ async fn each_kind_of_end_is_told_as_such() {
     let file = folder.path().join("code");
     let webots = ending(false, &file);
     let mut server = simulation_server(&webots.path(), forge.path(), 1).set("isolation", "none").start().await;
-    let start = async || {
-        let mut client = Client::start(&server, &arm()).await;
-        client.until("webots:").await;
-        client
-    };
+    let start = async || Client::ready(&server).await;
     // It ends in order.
     let mut finished = start().await;
     std::fs::write(&file, "0").unwrap();
@@ -114,8 +108,7 @@ async fn each_kind_of_end_is_told_as_such() {
     // A client that waits, and one that runs, while the server is stopped.
     let (running, mut waiting) = (start().await, Client::start(&server, &arm()).await);
     waiting.until("queue:").await;
-    server.signal(Signal::SIGTERM);
-    assert_eq!(server.ended().await, Some(0));
+    server.stops().await;
     let last = lines(&server);
     for client in [&running, &waiting] {
         let line = last.iter().find(|line| line[0] == client.id()).unwrap_or_else(|| panic!("{last:?}"));
@@ -125,45 +118,19 @@ async fn each_kind_of_end_is_told_as_such() {
 }
 
 #[actix_rt::test]
-async fn a_webots_that_does_not_start_or_hangs_is_told_as_such() {
-    let (forge, folder) = (Forge::with_arm(), tempfile::tempdir().unwrap());
-    let file = folder.path().join("code");
-    std::fs::write(&file, "7").unwrap();
-    let broken = ending(true, &file);
-    let server = simulation_server(&broken.path(), forge.path(), 1).set("isolation", "none").start().await;
-    let mut client = Client::start(&server, &arm()).await;
-    client.until("loading: Error:").await;
-    assert_eq!(line(&server, client.id()).await[10], "no_webots");
-    // It listens, then stands still.
-    let webots = Webots::script(&format!("{DEMO} \"$@\" | {{ head --lines 1; sleep 1000; }} & wait"));
-    let builder = simulation_server(&webots.path(), forge.path(), 1).set("isolation", "none");
-    let builder = builder.set("timing.heartbeat", 0.1).set("hangLimit", 1).set("timing.grace", 0.2);
-    let server = builder.start().await;
-    let mut client = Client::start(&server, &arm()).await;
-    client.until("loading: Error: Webots gave no sign of life").await;
-    assert_eq!(line(&server, client.id()).await[10], "hung");
-}
-
-#[actix_rt::test]
 async fn what_a_simulation_has_taken_is_told() {
-    let forge = Forge::with_arm();
     let webots = Webots::script(&format!(
         "{DEMO} \"$@\" &\n{{ for ((n = 0; n < 500000; n++)); do :; done; sleep 1000; }} & wait"
     ));
-    let server = simulation_server(&webots.path(), forge.path(), 1)
-        .set("isolation", "none")
-        .set("timing.heartbeat", 1)
-        .set("timing.grace", 0.2)
-        .start()
-        .await;
-    let mut client = Client::start(&server, &arm()).await;
-    client.until("webots:").await;
+    let server =
+        server_of(webots, 1).set("isolation", "none").set("timing.heartbeat", 1).set("timing.grace", 0.2).start().await;
+    let mut client = Client::ready(&server).await;
     // The pauses between two readings are ten seconds at most.
     for _ in 0..13 {
         client.heard.clear();
         client.until(".").await;
     }
-    let simulations = http::get(&server.url("/status")).await.json()["simulations"].clone();
+    let simulations = server.status().await["simulations"].clone();
     client.leave().await;
     let line = line(&server, simulations[0]["id"].as_str().unwrap()).await;
     let (memory, time): (u64, f64) = (line[8].parse().unwrap(), line[9].parse().unwrap());
@@ -207,13 +174,13 @@ async fn what_hides_or_turns_letters_around_in_a_worlds_name_is_shown_as_such() 
         clients.push(client);
     }
     let hides = |text: &str| text.contains(['\u{202e}', '\u{2028}', '\u{200b}']);
-    let page = http::get(&server.url("/monitor")).await.text();
+    let page = server.monitor().await;
     assert!(page.contains("a\u{fffd}b \u{fffd}.wbt") && page.contains("%E2%80%AEb"), "{page}");
     assert!(!hides(&page), "{page}");
     for client in clients {
         client.leave().await;
     }
-    let page = async || http::get(&server.url("/monitor")).await.text();
+    let page = async || server.monitor().await;
     until("their ends are shown", async || page().await.matches("data-label=\"After\"").count() == 2).await;
     let page = page().await;
     assert!(!hides(&page) && !hides(&server.log()), "{page}");

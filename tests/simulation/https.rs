@@ -1,16 +1,14 @@
 //! Repositories over HTTPS, as from a real forge: git's own server behind TLS.
 
-use std::io::{BufRead, BufReader, Read, Write};
-use std::net::{TcpListener, TcpStream};
+use std::io::Write;
+use std::net::TcpListener;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
-use std::sync::Arc;
-
-use rustls::pki_types::PrivateKeyDer;
-use rustls::{ServerConfig, ServerConnection, StreamOwned};
 
 use super::opened::{cached, outcome, reader, world_text};
+use crate::support::authority::Authority;
 use crate::support::git::{Forge, git, world};
+use crate::support::listener::{Request, serve};
 use crate::support::program::{Builder, simulation_server};
 use crate::support::webots::Webots;
 
@@ -18,7 +16,7 @@ use crate::support::webots::Webots;
 struct Https {
     forge: Forge,
     port: u16,
-    folder: tempfile::TempDir,
+    authority: Authority,
 }
 
 impl Https {
@@ -27,25 +25,15 @@ impl Https {
     fn new(forge: Forge, elsewhere: String) -> Self {
         let listener = TcpListener::bind("127.0.0.1:0").unwrap();
         let port = listener.local_addr().unwrap().port();
-        let made = rcgen::generate_simple_self_signed(vec!["127.0.0.1".to_owned()]).unwrap();
-        let folder = tempfile::tempdir().unwrap();
-        std::fs::write(folder.path().join("cert.pem"), made.cert.pem()).unwrap();
-        let key = PrivateKeyDer::Pkcs8(made.signing_key.serialize_der().into());
-        let provider = Arc::new(rustls::crypto::ring::default_provider());
-        let config = ServerConfig::builder_with_provider(provider).with_safe_default_protocol_versions().unwrap();
-        let config = config.with_no_client_auth().with_single_cert(vec![made.cert.der().clone()], key).unwrap();
-        let (config, root) = (Arc::new(config), forge.path().to_owned());
-        std::thread::spawn(move || {
-            for socket in listener.incoming().flatten() {
-                let (config, root, elsewhere) = (Arc::clone(&config), root.clone(), elsewhere.clone());
-                std::thread::spawn(move || answer(socket, config, &root, &elsewhere));
-            }
-        });
-        Self { forge, port, folder }
+        let authority = Authority::new();
+        let root = forge.path().to_owned();
+        let certificate = authority.issue(&["127.0.0.1"]).server();
+        serve(listener, Some(certificate), move |request| answer(request, &root, &elsewhere));
+        Self { forge, port, authority }
     }
 
     fn certificate(&self) -> PathBuf {
-        self.folder.path().join("cert.pem")
+        self.authority.file()
     }
 
     /// A simulation server that takes all repositories from here.
@@ -55,61 +43,44 @@ impl Https {
     }
 }
 
-/// Answers one request; who breaks off is not answered.
-fn answer(socket: TcpStream, config: Arc<ServerConfig>, root: &Path, elsewhere: &str) -> Option<()> {
-    let tls = StreamOwned::new(ServerConnection::new(config).unwrap(), socket);
-    let mut reader = BufReader::new(tls);
-    let mut line = String::new();
-    reader.read_line(&mut line).ok()?;
-    let mut words = line.split(' ');
-    let (method, target) = (words.next()?.to_owned(), words.next()?.to_owned());
-    let mut headers = std::collections::HashMap::new();
-    loop {
-        let mut line = String::new();
-        reader.read_line(&mut line).ok()?;
-        let Some((name, value)) = line.trim_end().split_once(": ") else { break };
-        headers.insert(name.to_lowercase(), value.to_owned());
-    }
-    let header = |name: &str| headers.get(name).cloned().unwrap_or_default();
-    let mut body = vec![0; header("content-length").parse().unwrap_or(0)];
-    reader.read_exact(&mut body).ok()?;
-    let (path, query) = target.split_once('?').unwrap_or((&target, ""));
+fn answer(request: &Request, root: &Path, elsewhere: &str) -> Option<(String, Vec<u8>)> {
+    let target = request.path();
+    let (path, query) = target.split_once('?').unwrap_or((target, ""));
     // Forges ignore case.
     let lowercase = path.to_lowercase();
     let path = lowercase.as_str();
-    let is_known = header("authorization") == "Basic dTpw";
-    let (head, content) = if path.starts_with("/lab/private") && !is_known {
-        ("Status: 401 Unauthorized\r\nWWW-Authenticate: Basic realm=\"x\"".to_owned(), Vec::new())
-    } else if path.starts_with("/lab/away") {
-        (format!("Status: 302 Found\r\nLocation: {elsewhere}{target}"), Vec::new())
-    } else if let Some(rest) = target.strip_prefix("/lab/dotted/") {
+    let is_known = request.header("authorization") == "Basic dTpw";
+    let moved = |location: String| Some((format!("301 Moved Permanently\r\nLocation: {location}"), Vec::new()));
+    if path.starts_with("/lab/private") && !is_known {
+        return Some(("401 Unauthorized\r\nWWW-Authenticate: Basic realm=\"x\"".to_owned(), Vec::new()));
+    }
+    if path.starts_with("/lab/away") {
+        return Some((format!("302 Found\r\nLocation: {elsewhere}{target}"), Vec::new()));
+    }
+    if let Some(rest) = target.strip_prefix("/lab/dotted/") {
         // As GitLab does.
-        (format!("Status: 301 Moved Permanently\r\nLocation: /lab/dotted.git/{rest}"), Vec::new())
-    } else if let Some(name) = target.strip_prefix("/lab/old-") {
-        let there = name.split_once("--").map_or(format!("/lab/{name}"), |(owner, name)| format!("/{owner}/{name}"));
-        (format!("Status: 301 Moved Permanently\r\nLocation: {there}"), Vec::new())
-    } else {
-        let mut backend = Command::new("git");
-        backend.arg("http-backend").env("GIT_PROJECT_ROOT", root).env("GIT_HTTP_EXPORT_ALL", "1");
-        backend.envs([("REQUEST_METHOD", method.as_str()), ("PATH_INFO", path), ("QUERY_STRING", query)]);
-        backend.env("CONTENT_TYPE", header("content-type")).env("CONTENT_LENGTH", body.len().to_string());
-        backend.env("HTTP_CONTENT_ENCODING", header("content-encoding"));
-        backend.env("GIT_PROTOCOL", header("git-protocol")).env("REMOTE_ADDR", "127.0.0.1");
-        let mut backend = backend.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::null()).spawn().unwrap();
-        let mut input = backend.stdin.take().unwrap();
-        let fed = std::thread::spawn(move || input.write_all(&body));
-        let output = backend.wait_with_output().unwrap().stdout;
-        fed.join().unwrap().ok();
-        let end = output.windows(4).position(|four| four == b"\r\n\r\n")?;
-        (String::from_utf8_lossy(&output[..end]).into_owned(), output[end + 4..].to_vec())
-    };
-    let status = head.lines().find_map(|line| line.strip_prefix("Status: ")).unwrap_or("200 OK").to_owned();
-    let length = content.len();
-    let tls = reader.get_mut();
-    write!(tls, "HTTP/1.1 {status}\r\nConnection: close\r\nContent-Length: {length}\r\n{head}\r\n\r\n").ok()?;
-    tls.write_all(&content).ok()?;
-    tls.conn.send_close_notify();
-    tls.flush().ok()
+        return moved(format!("/lab/dotted.git/{rest}"));
+    }
+    if let Some(name) = target.strip_prefix("/lab/old-") {
+        return moved(name.split_once("--").map_or(format!("/lab/{name}"), |(owner, name)| format!("/{owner}/{name}")));
+    }
+    let method = request.head.split(' ').next()?;
+    let mut backend = Command::new("git");
+    backend.arg("http-backend").env("GIT_PROJECT_ROOT", root).env("GIT_HTTP_EXPORT_ALL", "1");
+    backend.envs([("REQUEST_METHOD", method), ("PATH_INFO", path), ("QUERY_STRING", query)]);
+    backend.env("CONTENT_TYPE", request.header("content-type"));
+    backend.env("CONTENT_LENGTH", request.content.len().to_string());
+    backend.env("HTTP_CONTENT_ENCODING", request.header("content-encoding"));
+    backend.env("GIT_PROTOCOL", request.header("git-protocol")).env("REMOTE_ADDR", "127.0.0.1");
+    let mut backend = backend.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::null()).spawn().unwrap();
+    let (mut input, body) = (backend.stdin.take().unwrap(), request.content.clone());
+    let fed = std::thread::spawn(move || input.write_all(&body));
+    let output = backend.wait_with_output().unwrap().stdout;
+    fed.join().unwrap().ok();
+    let end = output.windows(4).position(|four| four == b"\r\n\r\n")?;
+    let head = String::from_utf8_lossy(&output[..end]).into_owned();
+    let status = head.lines().find_map(|line| line.strip_prefix("Status: ")).unwrap_or("200 OK");
+    Some((format!("{status}\r\n{head}"), output[end + 4..].to_vec()))
 }
 
 #[actix_rt::test]

@@ -4,10 +4,12 @@ use std::time::{Duration, Instant};
 
 use serde_json::json;
 
-use super::resuming::{ENDED, Stage, time, token};
+use super::life::quick;
+use super::resuming::{ENDED, refused, time};
 use super::scene::{arm, nothing_left};
 use crate::support::client::Client;
-use crate::support::{http, until};
+use crate::support::program::demo_server;
+use crate::support::until;
 
 /// In minutes: three seconds. Half of it before the end the client is told.
 const LIMIT: f64 = 0.05;
@@ -16,37 +18,35 @@ const WHY: &str = "The simulation was paused for 0.05 minutes";
 
 #[actix_rt::test]
 async fn who_stays_paused_is_told_and_keeps_its_simulation_or_loses_it() {
-    let stage = Stage::new(1, |builder| builder.set("idleTimeout", LIMIT)).await;
+    let server = quick(demo_server(1)).set("idleTimeout", LIMIT).start().await;
     // An old page, which sends nothing more.
     let begin = Instant::now();
-    let mut client = Client::start(&stage.server, &arm()).await;
+    let mut client = Client::start(&server, &arm()).await;
     assert_eq!(client.until("idle:").await, TOLD);
     assert!(client.heard.iter().any(|text| text.starts_with("webots:")));
     let told = client.until("loading: Error:").await;
     assert!(told.starts_with(&format!("loading: Error: {WHY}")), "{told}");
     assert_eq!(client.closed().await, Some(1000));
     assert!(begin.elapsed() >= Duration::from_secs(3), "{:?}", begin.elapsed());
-    nothing_left(&stage.server, 1).await;
-    let metrics = http::get(&stage.server.url("/metrics")).await.text();
+    nothing_left(&server, 1).await;
+    let metrics = server.metrics().await;
     assert!(metrics.contains("webots_simulation_ends_total{reason=\"idle\"} 1"), "{metrics}");
 
-    let (mut client, _) = stage.start().await;
+    let (mut client, _) = Client::resumable(&server).await;
     for _ in 0..2 {
         assert_eq!(client.until("idle:").await, TOLD);
         client.send(&json!({"keep": true}).to_string()).await;
         assert_eq!(client.until("idle:").await, "idle: never");
     }
     client.until(&format!("loading: Error: {WHY}")).await;
-    nothing_left(&stage.server, 1).await;
+    nothing_left(&server, 1).await;
 }
 
 #[actix_rt::test]
 async fn who_runs_is_never_ended_for_it() {
-    let stage = Stage::new(1, |builder| builder.set("idleTimeout", LIMIT)).await;
-    let (mut client, _) = stage.start().await;
-    let mut viewer = Client::connect(&format!("ws://127.0.0.1:{}/", stage.server.port + 1)).await;
-    viewer.send("x3d").await;
-    viewer.until("scene load completed").await;
+    let server = quick(demo_server(1)).set("idleTimeout", LIMIT).start().await;
+    let (mut client, _) = Client::resumable(&server).await;
+    let mut viewer = Client::connect(&format!("ws://127.0.0.1:{}/", server.port + 1)).await.with_scene().await;
     viewer.send("real-time:-1").await;
     // Twice as long as it may be paused.
     while time(&mut viewer).await < 6000.0 {}
@@ -58,32 +58,26 @@ async fn who_runs_is_never_ended_for_it() {
     assert_eq!(client.until("idle:").await, "idle: never");
     let now = time(&mut viewer).await;
     while time(&mut viewer).await < now + 3000.0 {}
-    assert_eq!(stage.simulations().await.len(), 1);
+    assert_eq!(server.simulations().await.len(), 1);
 }
 
 #[actix_rt::test]
 async fn who_is_away_and_paused_keeps_to_both_rules() {
-    let stage = Stage::new(1, |builder| builder.set("idleTimeout", LIMIT)).await;
+    let server = quick(demo_server(1)).set("idleTimeout", LIMIT).start().await;
     // Who comes back in time is told again.
-    let (mut client, first) = stage.start().await;
+    let (mut client, first) = Client::resumable(&server).await;
     client.until(TOLD).await;
     drop(client);
-    let mut client = stage.resume(&first).await;
-    let second = token(&mut client).await;
+    let mut client = Client::resuming(&server, &first).await;
+    let second = client.token().await;
     let told = client.until("idle:").await;
     assert!(["idle: 2", "idle: 1"].contains(&told.as_str()), "{told}");
     client.send(&json!({"keep": true}).to_string()).await;
     client.until("idle: never").await;
     // Who does not finds out why.
     drop(client);
-    stage.until_away(1).await;
-    until("it has ended", async || stage.simulations().await.is_empty()).await;
-    let told = stage.refused(&second).await;
+    server.until_away(1).await;
+    until("it has ended", async || server.simulations().await.is_empty()).await;
+    let told = refused(&server, &second).await;
     assert!(told.starts_with(&format!("{ENDED}: {WHY}")), "{told}");
-
-    let stage = Stage::new(1, |builder| builder.set("idleTimeout", 5).set("timing.absence", 1.5)).await;
-    let (client, token) = stage.start().await;
-    drop(client);
-    nothing_left(&stage.server, 1).await;
-    assert_eq!(stage.refused(&token).await, ENDED);
 }

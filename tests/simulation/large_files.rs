@@ -7,9 +7,9 @@ use super::opened::{outcome, reader};
 use super::scene::arm;
 use crate::support::client::Client;
 use crate::support::git::{Forge, git};
-use crate::support::needs;
 use crate::support::program::simulation_server;
 use crate::support::webots::Webots;
+use crate::support::{needs, programs};
 
 const POINTER: &str = "version https://git-lfs.github.com/spec/v1\noid sha256:0000000000000000000000000000000000000000000000000000000000000000\nsize 12345\n";
 
@@ -27,15 +27,9 @@ async fn files_that_are_missing_from_git_lfs_are_told() {
     assert!(told.starts_with("loading: Warning: 1 files of this project are kept in Git LFS and c"), "{told}");
     client.until("loading: Error: Webots ended with exit code 1").await;
     // Without git-lfs it is told that this is what is missing.
-    let bin = tempfile::tempdir().unwrap();
-    for program in ["git", "bash", "sed", "env", "sh", "rm"] {
-        let found = std::env::split_paths(&std::env::var_os("PATH").unwrap())
-            .map(|folder| folder.join(program))
-            .find(|path| path.is_file());
-        std::os::unix::fs::symlink(found.unwrap(), bin.path().join(program)).unwrap();
-    }
-    let server =
-        simulation_server(&webots.path(), forge.path(), 1).env("PATH", bin.path().to_str().unwrap()).start().await;
+    let bin = programs(&["git", "bash", "sed", "env", "sh", "rm"]);
+    let builder = simulation_server(&webots.path(), forge.path(), 1);
+    let server = builder.env("PATH", bin.path().to_str().unwrap()).start().await;
     let told = Client::start(&server, &arm()).await.until("loading: Warning:").await;
     assert!(told.ends_with("can't be loaded: this server has no git-lfs"), "{told}");
 }

@@ -9,7 +9,7 @@
 //! | the connection is half open | the same | `a_half_open_connection_is_found_by_ping_in_any_state` |
 //! | Webots ends, in three ways | launching, idle, running: in others there is none | `a_client_is_told_how_webots_ended` |
 //! | Webots does not end when asked | stopping | `isolation::lives::a_simulation_that_takes_no_notice_is_killed_after_its_grace_time` |
-//! | git is killed, or hangs | checking out | `checkout::a_kill_in_the_middle_of_a_fetch...`, `checkout::a_remote_that_hangs...` |
+//! | git is killed, or hangs | checking out | `checkout::a_kill_in_the_middle_of_a_fetch...`, `fetching::a_git_that_is_stopped...` |
 //! | the time limit | launching, idle, running, stopping: it counts from the start of Webots | `simulation_limits` (`time`) |
 //! | the limits of a checkout and of a launch | checking out, launching | `simulation_limits` (`time`), `ready::a_launch_that_never_listens...` |
 //! | SIGTERM to the server | all | `a_server_that_stops_tells_its_clients_and_leaves_nothing_in_any_state` |
@@ -24,8 +24,7 @@ use nix::unistd::Pid;
 
 use super::scene::{ALL, DEMO, Scene, State, arm, gone_within, instance_folders, nothing_left, stages};
 use crate::support::client::Client;
-use crate::support::git::Forge;
-use crate::support::program::{Builder, Server, simulation_server};
+use crate::support::program::{Builder, Server, demo_server, server_of};
 use crate::support::until;
 use crate::support::webots::{Webots, instances_below};
 
@@ -38,24 +37,6 @@ pub fn quick(builder: Builder) -> Builder {
 
 const WITH_CLIENT: [State; 6] =
     [State::Connected, State::Waiting, State::CheckingOut, State::Launching, State::Idle, State::Running];
-
-#[actix_rt::test]
-async fn a_simulation_runs_from_the_first_message_to_the_last_trace() {
-    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
-    let server = simulation_server(&webots.path(), forge.path(), 2).start().await;
-    let mut client = Client::start(&server, &arm()).await;
-    assert_eq!(client.until("shutdownTimeout").await, "shutdownTimeout: 7200");
-    let url = client.until("webots:").await;
-    assert_eq!(url, format!("webots:ws://localhost:{}", server.port + 1));
-    let mut viewer = Client::connect(&format!("ws://127.0.0.1:{}/", server.port + 1)).await;
-    viewer.send("x3d").await;
-    viewer.until("scene load completed").await;
-    assert!(instances_below(&server.folder).len() >= 2, "launcher and simulator");
-    let left = Instant::now();
-    client.leave().await;
-    nothing_left(&server, 2).await;
-    assert!(left.elapsed() < Duration::from_secs(5), "the grace time was waited for in vain");
-}
 
 #[actix_rt::test]
 async fn a_client_that_closes_leaves_nothing_in_any_state() {
@@ -140,8 +121,7 @@ async fn what_a_killed_server_has_left_is_removed_at_the_next_start() {
     let mark = instance_folders(scene.folder.path()).remove(0).canonicalize().unwrap();
     let mut orphan =
         std::process::Command::new("sleep").arg("1000").env("WEBOTS_FLEET_INSTANCE", mark).spawn().unwrap();
-    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
-    let next = simulation_server(&webots.path(), forge.path(), 1).folder(scene.folder.path()).start().await;
+    let next = demo_server(1).folder(scene.folder.path()).start().await;
     assert!(!orphan.wait().unwrap().success(), "it was killed");
     assert_eq!(instance_folders(scene.folder.path()).len(), 0);
     assert!(next.log().contains("removed what 1 earlier runs had left"), "{}", next.log());
@@ -170,13 +150,12 @@ async fn a_client_is_told_how_webots_ended() {
         ("echo 'no licence' >&2; exit 3", "loading: Error: Webots ended with exit code 3. Its last output: no licence"),
         ("kill -SEGV $$", "loading: Error: Webots was ended by the signal SIGSEGV"),
     ];
-    let forge = Forge::with_arm();
     for (end, words) in table {
         // It ends while it is launching, when it was ready, or while it runs.
         let ready = |pace: &str| format!("{DEMO} \"$@\" &\nsleep 0.5; echo {pace}");
         for start in [String::new(), ready("pause"), ready("real-time")] {
             let webots = Webots::script(&format!("{start}\n{end}"));
-            let server = quick(simulation_server(&webots.path(), forge.path(), 1)).start().await;
+            let server = quick(server_of(webots, 1)).start().await;
             let mut client = Client::start(&server, &arm()).await;
             client.until("shutdownTimeout").await;
             client.until("loading: ").await;

@@ -1,56 +1,19 @@
 //! Simulators that misbehave harm nobody.
 
-use std::path::PathBuf;
-
 use super::scene::{DEMO, arm, nothing_left};
 use crate::support::client::Client;
 use crate::support::git::Forge;
-use crate::support::program::{Server, simulation_server};
+use crate::support::program::{server_of, simulation_server};
 use crate::support::webots::Webots;
 use crate::support::{http, until};
 
-/// The file of a simulation's output, as the server tells.
-async fn log_of(server: &Server) -> PathBuf {
-    let status = http::get(&server.url("/status")).await.json();
-    PathBuf::from(status["simulations"][0]["log"].as_str().unwrap())
-}
-
-#[actix_rt::test]
-async fn a_flood_of_output_harms_nobody_and_its_file_is_bounded() {
-    let forge = Forge::with_arm();
-    let floods = ["yes 'a line of a flood that never ends'", "tr '\\0' x < /dev/zero", "cat /dev/urandom"];
-    for flood in floods {
-        let webots = Webots::script(&format!("{DEMO} \"$@\" >/dev/null &\n{flood} & wait"));
-        let builder = simulation_server(&webots.path(), forge.path(), 2).set("timing.grace", 0.5);
-        let server = builder.start().await;
-        let mut client = Client::start(&server, &arm()).await;
-        client.until("webots:").await;
-        let log = log_of(&server).await;
-        assert_eq!(log.parent(), Some(server.folder.join("log/simulation/instances").as_path()));
-        let size = || -> u64 {
-            let files = std::fs::read_dir(log.parent().unwrap()).unwrap().flatten();
-            files.map(|file| file.metadata().unwrap().len()).sum()
-        };
-        // A line that never ends is never written.
-        until("the flood is written", async || size() > 500 || flood.starts_with("tr")).await;
-        for _ in 0..200 {
-            assert!(http::get(&server.url("/load")).await.text().parse::<f64>().is_ok());
-            assert!(size() < 1_200_000, "{flood}: {} bytes", size());
-        }
-        client.leave().await;
-        nothing_left(&server, 2).await;
-    }
-}
-
 #[actix_rt::test]
 async fn the_output_of_a_simulation_is_kept_and_printable() {
-    let forge = Forge::with_arm();
     let webots = Webots::script(&format!(
         "printf 'one\\nred \\033[31m text\\n\\377 no text\\nlast without end' >&2\n{DEMO} \"$@\" & wait"
     ));
-    let server = simulation_server(&webots.path(), forge.path(), 1).set("timing.heartbeat", 0.1).start().await;
-    let mut client = Client::start(&server, &arm()).await;
-    client.until("webots:").await;
+    let server = server_of(webots, 1).set("timing.heartbeat", 0.1).start().await;
+    let mut client = Client::ready(&server).await;
     client.until(".").await;
     let url = server.url(&format!("/output?id={}", client.id()));
     let text = http::get(&url).await.text();

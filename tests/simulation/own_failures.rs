@@ -6,6 +6,7 @@ use std::path::Path;
 
 use serde_json::Value;
 
+use super::ends::line;
 use super::scene::{DEMO, arm};
 use crate::support::client::Client;
 use crate::support::git::{Forge, world};
@@ -14,7 +15,7 @@ use crate::support::webots::Webots;
 use crate::support::{http, until};
 
 async fn failed_starts(server: &Server) -> u64 {
-    let page: Value = http::get(&server.url("/status")).await.json();
+    let page: Value = server.status().await;
     page["failedStarts"].as_u64().unwrap()
 }
 
@@ -31,15 +32,16 @@ async fn a_client_whose_start_fails_for_the_servers_reason_is_sent_elsewhere_and
         assert!(told.contains("Webots ended with exit code 3.") && told.ends_with(words), "{told}");
         assert_eq!(client.closed().await, Some(1013));
         assert_eq!(failed_starts(&server).await, count);
+        assert_eq!(line(&server, client.id()).await[10], "no_webots");
     }
     // A world that is not there is not the server's fault.
     let mut client = Client::start(&server, &world("lab/arm", "main", "worlds/none.wbt")).await;
     client.until("loading: Error:").await;
     assert_eq!((client.closed().await, failed_starts(&server).await), (Some(1000), 3));
-    let metrics = http::get(&server.url("/metrics")).await.text();
+    let metrics = server.metrics().await;
     assert!(metrics.contains("\nwebots_simulation_failed_starts 3\n"), "{metrics}");
     std::fs::write(&repaired, "").unwrap();
-    Client::start(&server, &arm()).await.until("webots:").await;
+    Client::ready(&server).await;
     assert_eq!(failed_starts(&server).await, 0);
 }
 
@@ -54,7 +56,7 @@ async fn a_black_hole_takes_a_handful_of_clients_and_not_a_class() {
     // What else runs on this machine must not close the fleet.
     let servers = [healthy.address(), hole.address()];
     let session = session_server(&servers).set("loadThreshold", 1000).start().await;
-    let status = async || -> Value { http::get(&session.url("/status")).await.json() };
+    let status = async || -> Value { session.status().await };
     let state = |page: &Value, one: usize| page["servers"][one]["state"].as_str().unwrap().to_owned();
     until("both work", async || {
         let page = status().await;
@@ -85,7 +87,7 @@ async fn a_black_hole_takes_a_handful_of_clients_and_not_a_class() {
     assert!(session.log().contains("failed for a reason of its own; others are preferred"), "{}", session.log());
     // Who comes by itself shows that it works again.
     std::fs::write(&repaired, "").unwrap();
-    Client::start(&hole, &arm()).await.until("webots:").await;
+    Client::ready(&hole).await;
     until("it is as good as others", async || status().await["servers"][1]["error"].is_null()).await;
 }
 

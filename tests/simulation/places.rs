@@ -7,15 +7,12 @@ use std::time::Duration;
 
 use super::scene::{arm, nothing_left};
 use crate::support::client::Client;
-use crate::support::git::Forge;
-use crate::support::program::simulation_server;
-use crate::support::webots::Webots;
-use crate::support::{http, until};
+use crate::support::program::demo_server;
+use crate::support::until;
 
 #[actix_rt::test]
 async fn the_waiting_line_is_served_in_order_and_forgets_who_leaves() {
-    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
-    let server = simulation_server(&webots.path(), forge.path(), 2).set("waitingLine", 4).start().await;
+    let server = demo_server(2).set("waitingLine", 4).start().await;
     let mut inside = Vec::new();
     for place in 1..=2 {
         let mut client = Client::start(&server, &arm()).await;
@@ -40,7 +37,7 @@ async fn the_waiting_line_is_served_in_order_and_forgets_who_leaves() {
     assert_eq!(line[1].until("queue:").await, "queue: 1");
     assert_eq!(line[2].until("queue:").await, "queue: 2");
     assert!(line[0].is_silent(Duration::from_millis(50)).await);
-    let instances = http::get(&server.url("/status")).await.json()["instances"].clone();
+    let instances = server.status().await["instances"].clone();
     assert_eq!((instances["queued"].as_u64(), instances["places"].as_u64()), (Some(3), Some(2)));
     assert_eq!(instances["arrivals"].as_u64(), Some(7));
     // The first in the line gets the place that becomes free, at its port.
@@ -56,8 +53,7 @@ async fn the_waiting_line_is_served_in_order_and_forgets_who_leaves() {
 
 #[actix_rt::test]
 async fn one_address_leaves_places_and_a_part_of_the_line_to_others() {
-    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
-    let builder = simulation_server(&webots.path(), forge.path(), 4).set("waitingLine", 4);
+    let builder = demo_server(4).set("waitingLine", 4);
     let server = builder.set("maxPlacesPerAddress", 3).start().await;
     let (greedy, other, third) = ("203.0.113.9", "203.0.113.10", "203.0.113.11");
     let mut inside = Vec::new();
@@ -93,8 +89,7 @@ async fn one_address_leaves_places_and_a_part_of_the_line_to_others() {
 
 #[actix_rt::test]
 async fn a_class_behind_one_address_gets_every_free_place_and_the_whole_line() {
-    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
-    let server = simulation_server(&webots.path(), forge.path(), 4).set("waitingLine", 2).start().await;
+    let server = demo_server(4).set("waitingLine", 2).start().await;
     let mut all = Vec::new();
     for _ in 0..4 {
         let mut client = Client::start_from(&server, "203.0.113.9", &arm()).await;
@@ -111,22 +106,8 @@ async fn a_class_behind_one_address_gets_every_free_place_and_the_whole_line() {
 }
 
 #[actix_rt::test]
-async fn an_address_has_as_many_places_as_the_configuration_says() {
-    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
-    let builder = simulation_server(&webots.path(), forge.path(), 4).set("waitingLine", 0);
-    let server = builder.set("maxPlacesPerAddress", 1).start().await;
-    let mut first = Client::start_from(&server, "2001:db8::1", &arm()).await;
-    first.until("webots:").await;
-    let told = Client::start_from(&server, "2001:db8::2", &arm()).await.until("").await;
-    assert!(told.starts_with("loading: Error: Clients of your address have 1 places"), "the same /64: {told}");
-    let mut other = Client::start_from(&server, "2001:db8:0:1::1", &arm()).await;
-    other.until("webots:").await;
-}
-
-#[actix_rt::test]
 async fn an_address_may_ask_only_so_often() {
-    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
-    let server = simulation_server(&webots.path(), forge.path(), 1).start().await;
+    let server = demo_server(1).start().await;
     let ask = async |address: &str| {
         Client::start_from(&server, address, "https://github.com/none").await.until("loading: Error:").await
     };
@@ -142,8 +123,7 @@ async fn an_address_may_ask_only_so_often() {
 
 #[actix_rt::test]
 async fn a_port_that_somebody_else_has_is_not_lent() {
-    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
-    let server = simulation_server(&webots.path(), forge.path(), 2).start().await;
+    let server = demo_server(2).start().await;
     let first = TcpListener::bind(("127.0.0.1", server.port + 1)).unwrap();
     let mut client = Client::start(&server, &arm()).await;
     assert_eq!(client.until("webots:").await, format!("webots:ws://localhost:{}", server.port + 2));
@@ -155,8 +135,7 @@ async fn a_port_that_somebody_else_has_is_not_lent() {
 
 #[actix_rt::test]
 async fn a_crowd_is_served_to_the_last_one_and_no_two_share_a_place() {
-    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
-    let server = simulation_server(&webots.path(), forge.path(), 3).start().await;
+    let server = demo_server(3).start().await;
     let (held, were_all_held) = (RefCell::new(BTreeSet::new()), Cell::new(false));
     let visits = (0..12).map(|_| async {
         let mut client = Client::start(&server, &arm()).await;
@@ -174,7 +153,7 @@ async fn a_crowd_is_served_to_the_last_one_and_no_two_share_a_place() {
     assert!(urls.iter().all(|url| allowed.contains(url)), "{urls:?}");
     nothing_left(&server, 3).await;
     until("all are counted", async || {
-        http::get(&server.url("/metrics")).await.text().contains("webots_simulation_starts_total{outcome=\"ready\"} 12")
+        server.metrics().await.contains("webots_simulation_starts_total{outcome=\"ready\"} 12")
     })
     .await;
 }

@@ -6,18 +6,13 @@ use super::scene::{arm, stages};
 use crate::support::client::Client;
 use crate::support::git::{Forge, world};
 use crate::support::http;
-use crate::support::program::{Server, simulation_server};
+use crate::support::program::{Server, demo_server, simulation_server};
 use crate::support::until;
 use crate::support::webots::{Webots, instances_below};
 
-async fn server() -> (Server, Forge, Webots) {
-    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
-    (simulation_server(&webots.path(), forge.path(), 2).start().await, forge, webots)
-}
-
 #[actix_rt::test]
 async fn a_message_that_is_none_is_answered_in_words() {
-    let (server, _forge, _webots) = server().await;
+    let server = demo_server(2).start().await;
     let (_running, mut viewer, processes) = running(&server).await;
     let start = |url: &str| serde_json::json!({"start": {"url": url}}).to_string();
     let table = [
@@ -41,9 +36,7 @@ async fn a_message_that_is_none_is_answered_in_words() {
 async fn running(server: &Server) -> (Client, Client, Vec<i32>) {
     let mut client = Client::start(server, &arm()).await;
     let url = client.until("webots:").await;
-    let mut viewer = Client::connect(&format!("{}/", url.strip_prefix("webots:").unwrap())).await;
-    viewer.send("x3d").await;
-    viewer.until("scene load completed").await;
+    let viewer = Client::connect(&format!("{}/", url.strip_prefix("webots:").unwrap())).await.with_scene().await;
     let processes = processes(server);
     assert!(processes.len() >= 2, "launcher and simulator");
     (client, viewer, processes)
@@ -62,20 +55,8 @@ async fn goes_on(server: &Server, viewer: &mut Client, before: &[i32]) {
 }
 
 #[actix_rt::test]
-async fn other_json_is_ignored() {
-    let (server, _forge, _webots) = server().await;
-    let mut client = Client::connect(&server.websocket("/client")).await;
-    for text in ["{}", r#"{"init": ["host", "project", "world"]}"#, "[1]"] {
-        client.send(text).await;
-    }
-    client.send(&serde_json::json!({"start": {"url": arm()}}).to_string()).await;
-    client.until("webots:").await;
-    assert!(!client.heard.iter().any(|text| text.contains("Error")), "{:?}", client.heard);
-}
-
-#[actix_rt::test]
 async fn no_text_to_a_client_is_html() {
-    let (server, _forge, _webots) = server().await;
+    let server = demo_server(2).start().await;
     let image = "%3Cimg%20src=x%20onerror=alert(1)%3E";
     for url in [
         world("lab/arm", "main", &format!("worlds/{image}.wbt")),
@@ -92,7 +73,7 @@ async fn no_text_to_a_client_is_html() {
 
 #[actix_rt::test]
 async fn oversized_and_binary_messages_end_the_connection_in_words() {
-    let (server, _forge, _webots) = server().await;
+    let server = demo_server(2).start().await;
     let connect = async || Client::connect(&server.websocket("/client")).await;
     let large = "loading: Error: Wrong message: it is longer than 8 KiB";
     let piece = [b'x'; 5000];
@@ -115,7 +96,7 @@ async fn oversized_and_binary_messages_end_the_connection_in_words() {
 
 #[actix_rt::test]
 async fn a_message_may_come_in_pieces() {
-    let (server, _forge, _webots) = server().await;
+    let server = demo_server(2).start().await;
     let text = serde_json::json!({"start": {"url": arm()}, "é": "é".repeat(3000)}).to_string();
     let mut client = Client::connect(&server.websocket("/client")).await;
     let pieces: Vec<&[u8]> = text.as_bytes().chunks(1001).collect();
@@ -128,7 +109,7 @@ async fn a_message_may_come_in_pieces() {
 
 #[actix_rt::test]
 async fn a_reset_that_comes_too_early_ends_nothing() {
-    let (server, _forge, _webots) = server().await;
+    let server = demo_server(2).start().await;
     let mut client = Client::connect(&server.websocket("/client")).await;
     let refused = "loading: Error: A controller can be reset only while a simulation runs";
     let reset = r#"{"reset controller": "c/c.py"}"#;
@@ -142,9 +123,8 @@ async fn a_reset_that_comes_too_early_ends_nothing() {
 
 #[actix_rt::test]
 async fn who_asks_without_reading_is_sent_away() {
-    let (server, _forge, _webots) = server().await;
-    let mut client = Client::start(&server, &arm()).await;
-    client.until("webots:").await;
+    let server = demo_server(2).start().await;
+    let mut client = Client::ready(&server).await;
     for _ in 0..150 {
         client.send(&serde_json::json!({"start": {"url": arm()}}).to_string()).await;
     }
@@ -154,9 +134,8 @@ async fn who_asks_without_reading_is_sent_away() {
 
 #[actix_rt::test]
 async fn a_second_start_on_a_connection_is_ignored() {
-    let (server, _forge, _webots) = server().await;
-    let mut client = Client::start(&server, &arm()).await;
-    client.until("webots:").await;
+    let server = demo_server(2).start().await;
+    let mut client = Client::ready(&server).await;
     client.send(&serde_json::json!({"start": {"url": arm()}}).to_string()).await;
     until("it is logged", async || server.log().contains("second simulation on one connection; ignored")).await;
     assert_eq!(super::scene::stages(&server).await.len(), 1);
@@ -164,8 +143,7 @@ async fn a_second_start_on_a_connection_is_ignored() {
 
 #[actix_rt::test]
 async fn only_pages_of_allowed_origins_may_start_simulations() {
-    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
-    let builder = simulation_server(&webots.path(), forge.path(), 1);
+    let builder = demo_server(1);
     let server = builder.set("allowedOrigins", serde_json::json!(["https://lab.org"])).start().await;
     for (origin, allowed) in
         [(Some("https://lab.org"), true), (Some("https://evil.org"), false), (Some("null"), false), (None, true)]
@@ -204,7 +182,7 @@ async fn connections_are_bounded() {
 
 #[actix_rt::test]
 async fn pages_tell_what_they_should() {
-    let (server, _forge, _webots) = server().await;
+    let server = demo_server(2).start().await;
     let load = http::get(&server.url("/load")).await;
     assert!(load.text().parse::<f64>().unwrap() >= 0.0);
     assert_eq!(load.header("access-control-allow-origin"), Some("*"));
@@ -212,9 +190,8 @@ async fn pages_tell_what_they_should() {
     assert_eq!(none.status, 404);
     let options = awc::Client::new().options(server.url("/load")).send().await.unwrap();
     assert_eq!(options.status(), 204);
-    let mut client = Client::start(&server, &arm()).await;
-    client.until("webots:").await;
-    let status = http::get(&server.url("/status")).await.json();
+    let _client = Client::ready(&server).await;
+    let status = server.status().await;
     let one = &status["simulations"][0];
     assert_eq!(one["world"], arm());
     assert_eq!((one["stage"].as_str(), one["version"].as_str()), (Some("idle"), Some("R2025a")));
@@ -223,22 +200,20 @@ async fn pages_tell_what_they_should() {
     assert_eq!(status["allowedRepositories"], serde_json::json!(["https://github.com/lab"]));
     assert_eq!(status["version"], env!("CARGO_PKG_VERSION"));
     assert!(status["machine"]["memory"].is_number() && status["host"]["threads"].as_u64() > Some(0));
-    let page = http::get(&server.url("/monitor")).await.text();
+    let page = server.monitor().await;
     assert!(page.contains("github.com/lab/arm") && page.contains("idle"), "{page}");
 }
 
 #[actix_rt::test]
 async fn outcomes_are_counted() {
-    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
-    let server = simulation_server(&webots.path(), forge.path(), 1).set("waitingLine", 1).start().await;
+    let server = demo_server(1).set("waitingLine", 1).start().await;
     let count = async |name: &str| {
-        let text = http::get(&server.url("/metrics")).await.text();
+        let text = server.metrics().await;
         let name = format!("webots_simulation_{name} ");
         text.lines().find_map(|line| line.strip_prefix(&name)).unwrap().parse::<u32>().unwrap()
     };
     assert_eq!(count("starts_total{outcome=\"ready\"}").await, 0);
-    let mut ready = Client::start(&server, &arm()).await;
-    ready.until("webots:").await;
+    let ready = Client::ready(&server).await;
     let mut waits = Client::start(&server, &arm()).await;
     waits.until("queue: 0").await;
     Client::start(&server, &arm()).await.until("loading: Error: All 1 places").await;

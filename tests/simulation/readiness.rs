@@ -1,24 +1,17 @@
 //! A server that can start no simulation says so and is not offered; one that is limited says that too.
 
-use std::path::PathBuf;
-
 use serde_json::Value;
 
-use super::scene::{arm, instance_folders, nothing_left};
+use super::scene::arm;
 use crate::support::client::Client;
 use crate::support::git::Forge;
-use crate::support::program::{Server, session_server, simulation_server};
+use crate::support::program::{Server, demo_server, session_server, simulation_server};
 use crate::support::webots::Webots;
 use crate::support::{http, until};
 
-async fn health(server: &Server) -> (u16, String) {
-    let answer = http::try_get(&server.url("/health")).await.unwrap();
-    (answer.status.as_u16(), answer.text())
-}
-
 /// Whether the session server counts its only simulation server as one that works; a busy machine may make it full.
 async fn works(session: &Server) -> bool {
-    let page: Value = http::get(&session.url("/status")).await.json();
+    let page: Value = session.status().await;
     ["up", "full"].contains(&page["servers"][0]["state"].as_str().unwrap())
 }
 
@@ -32,16 +25,16 @@ async fn a_server_without_webots_says_so_and_is_not_offered_until_there_is_one()
     std::fs::rename(webots.path(), &away).unwrap();
     until("it does not work", async || !works(&session).await).await;
     assert_eq!(http::get(&session.url("/request")).await.text(), "0");
-    let (status, text) = health(&server).await;
+    let (status, text) = server.health().await;
     assert!(status == 503 && text.contains("has no Webots that it can run at"), "{status} {text}");
     assert_eq!(http::get(&server.url("/load")).await.text(), "100");
-    let page: Value = http::get(&server.url("/status")).await.json();
+    let page: Value = server.status().await;
     assert!(page["problem"].as_str().unwrap().contains("has no Webots that it can run at"), "{page}");
     assert!(server.log().contains("no simulation can be started"), "{}", server.log());
     until("the session server tells why", async || session.log().contains("can start no simulation")).await;
     std::fs::rename(&away, webots.path()).unwrap();
     until("it works again", async || works(&session).await).await;
-    assert_eq!(health(&server).await, (200, "ok".to_owned()));
+    assert_eq!(server.health().await, (200, "ok".to_owned()));
 }
 
 #[actix_rt::test]
@@ -54,8 +47,8 @@ async fn a_display_that_is_missing_is_a_problem_for_webots_itself() {
         .set("display", ":59")
         .start()
         .await;
-    until("it is told", async || health(&server).await.0 == 503).await;
-    assert!(health(&server).await.1.contains("no display answers at :59"));
+    until("it is told", async || server.health().await.0 == 503).await;
+    assert!(server.health().await.1.contains("no display answers at :59"));
     let told = Client::start(&server, &arm()).await.until("loading: Error:").await;
     assert!(told.contains("no display answers at :59"), "{told}");
 }
@@ -74,18 +67,17 @@ async fn the_display_of_each_gpu_that_answers_is_needed() {
         .set("displays", serde_json::json!([":59000", ":59001"]))
         .start()
         .await;
-    until("the first is missing", async || health(&server).await.1.contains("no display answers at :59000")).await;
+    until("the first is missing", async || server.health().await.1.contains("no display answers at :59000")).await;
     std::fs::write(&mark, "").unwrap();
     let second = "no display answers at :59001";
-    until("that of a lost one is not needed", async || health(&server).await.1.contains(second)).await;
+    until("that of a lost one is not needed", async || server.health().await.1.contains(second)).await;
 }
 
 #[actix_rt::test]
 async fn a_server_below_its_reserve_of_disk_refuses_clients_and_says_so() {
-    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
-    let server = simulation_server(&webots.path(), forge.path(), 1).set("diskReserve", 100_000_000).start().await;
-    until("it is told", async || health(&server).await.0 == 503).await;
-    let (_, text) = health(&server).await;
+    let server = demo_server(1).set("diskReserve", 100_000_000).start().await;
+    until("it is told", async || server.health().await.0 == 503).await;
+    let (_, text) = server.health().await;
     assert!(text.contains("disk is full: less than 100000000 MiB are left (diskReserve)"), "{text}");
     let mut client = Client::start(&server, &arm()).await;
     let told = client.until("loading: Error:").await;
@@ -95,8 +87,7 @@ async fn a_server_below_its_reserve_of_disk_refuses_clients_and_says_so() {
 
 #[actix_rt::test]
 async fn a_server_that_can_open_no_file_is_not_ready_until_it_can() {
-    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
-    let server = simulation_server(&webots.path(), forge.path(), 1).start().await;
+    let server = demo_server(1).start().await;
     let session = session_server(&[server.address()]).start().await;
     until("it works", async || works(&session).await).await;
     let limits = |soft: &str| {
@@ -117,31 +108,9 @@ async fn a_server_that_can_open_no_file_is_not_ready_until_it_can() {
 }
 
 #[actix_rt::test]
-async fn the_folder_of_the_run_is_made_anew_where_somebody_removes_it() {
-    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
-    let server = simulation_server(&webots.path(), forge.path(), 1).start().await;
-    for _ in 0..2 {
-        let runs = server.folder.join("cache/runs");
-        // The server may be making it anew meanwhile.
-        until("it is removed", async || std::fs::remove_dir_all(&runs).is_ok()).await;
-        let mut client = Client::start(&server, &arm()).await;
-        client.until("webots:").await;
-        let run = std::fs::read_dir(server.folder.join("cache/runs")).unwrap().next().unwrap().unwrap().path();
-        assert!(std::fs::read_to_string(run.join("gitconfig")).unwrap().contains("hooksPath"));
-        client.leave().await;
-        nothing_left(&server, 1).await;
-    }
-}
-
-#[actix_rt::test]
 async fn a_limit_of_files_that_allows_no_client_is_refused_in_one_line() {
-    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
-    let builder = simulation_server(&webots.path(), forge.path(), 1).set("debug", false);
-    let mut server = builder.files(128).spawn();
-    assert_eq!(server.ended().await, Some(1));
-    let said = server.log();
+    let said = demo_server(1).files(128).refused(1).await;
     assert!(said.starts_with("error: 128 files may be open, which is not enough for 1 places"), "{said}");
-    assert_eq!(said.lines().count(), 1, "{said}");
 }
 
 #[actix_rt::test]
@@ -154,20 +123,4 @@ async fn the_limit_of_files_is_raised_as_far_as_it_is_needed() {
     assert_eq!(soft, 128 + 10 * 8 + 300 * 2);
     let few = simulation_server(&webots.path(), forge.path(), 10).files(300).start().await;
     assert!(few.log().contains("300 files may be open, which is enough for 46 clients"), "{}", few.log());
-}
-
-#[actix_rt::test]
-async fn clients_that_leave_at_once_leave_no_folder() {
-    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
-    let server = simulation_server(&webots.path(), forge.path(), 8).start().await;
-    let visitor = async |number: u64| {
-        for visit in 0..40 {
-            let client = Client::start(&server, &arm()).await;
-            actix_rt::time::sleep(std::time::Duration::from_millis((number + 5 * visit) % 50)).await;
-            client.leave().await;
-        }
-    };
-    futures_util::future::join_all((0..8).map(visitor)).await;
-    until("no folder is left", async || instance_folders(&server.folder) == Vec::<PathBuf>::new()).await;
-    nothing_left(&server, 8).await;
 }

@@ -3,13 +3,12 @@
 use std::path::Path;
 use std::process::Command;
 
-use nix::sys::signal::Signal;
 use serde_json::Value;
 
 use super::scene::arm;
 use crate::support::client::Client;
 use crate::support::git::Forge;
-use crate::support::program::{Builder, Server, simulation_server};
+use crate::support::program::{Builder, Server, demo_server, simulation_server};
 use crate::support::webots::Webots;
 use crate::support::{http, needs, until};
 
@@ -24,17 +23,15 @@ pub fn gpu_driver() -> tempfile::TempDir {
     folder
 }
 
-fn with(library: &Path, forge: &Forge, webots: &Webots) -> Builder {
-    simulation_server(&webots.path(), forge.path(), 1).env("LD_LIBRARY_PATH", library.to_str().unwrap())
+fn with(library: &Path) -> Builder {
+    demo_server(1).env("LD_LIBRARY_PATH", library.to_str().unwrap())
 }
 
 #[actix_rt::test]
 async fn gpus_are_read_and_the_least_busy_one_counts() {
     let library = gpu_driver();
-    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
-    let server =
-        with(library.path(), &forge, &webots).env("NVML_COMPUTE_0", "100").env("NVML_COMPUTE_1", "99").start().await;
-    let status = async || http::get(&server.url("/status")).await.json();
+    let server = with(library.path()).env("NVML_COMPUTE_0", "100").env("NVML_COMPUTE_1", "99").start().await;
+    let status = async || server.status().await;
     until("GPUs are told", async || status().await["gpus"].as_array().is_some_and(|gpus| gpus.len() == 2)).await;
     let gpus = status().await["gpus"].clone();
     assert_eq!((gpus[0]["name"].as_str(), gpus[0]["compute"].as_f64()), (Some("Stand-in A"), Some(100.0)));
@@ -42,7 +39,7 @@ async fn gpus_are_read_and_the_least_busy_one_counts() {
     assert_eq!(gpus[0]["memoryTraffic"].as_f64(), Some(7.0));
     assert_eq!(gpus[0]["memoryTotal"].as_u64(), Some(8 << 30));
     let load = async || http::get(&server.url("/load")).await.text().parse::<f64>().unwrap();
-    let metrics = async || http::get(&server.url("/metrics")).await.text();
+    let metrics = async || server.metrics().await;
     // Where other tests leave the processor no rest, its load counts.
     let is_full = async || metrics().await.contains("\nwebots_machine_cpu_percent 100\n");
     let counts = async || (99.0..100.0).contains(&load().await) || is_full().await;
@@ -53,7 +50,7 @@ async fn gpus_are_read_and_the_least_busy_one_counts() {
 
 /// The state of a server's GPUs: what is wrong with them.
 async fn gpu_problem(server: &Server) -> Option<String> {
-    let page: Value = http::get(&server.url("/status")).await.json();
+    let page: Value = server.status().await;
     page["gpuProblem"].as_str().map(str::to_owned)
 }
 
@@ -61,22 +58,21 @@ async fn gpu_problem(server: &Server) -> Option<String> {
 async fn gpus_that_are_lost_are_told_and_come_back() {
     let library = gpu_driver();
     let mark = library.path().join("mark");
-    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
     for (variable, words, left) in [
         ("NVML_LOST", "NVIDIA's driver has lost 1 of 2 GPUs", 1),
         ("NVML_GONE", "no GPU answers any more, of 2 that did", 0),
         ("NVML_ONE", "1 of 2 GPUs don't answer any more", 1),
     ] {
-        let server = with(library.path(), &forge, &webots).env(variable, mark.to_str().unwrap()).start().await;
-        let gpus = async || http::get(&server.url("/status")).await.json()["gpus"].as_array().unwrap().len();
+        let server = with(library.path()).env(variable, mark.to_str().unwrap()).start().await;
+        let gpus = async || server.status().await["gpus"].as_array().unwrap().len();
         until("GPUs are told", async || gpus().await == 2).await;
         assert_eq!(gpu_problem(&server).await, None);
         std::fs::write(&mark, "").unwrap();
         until("they are lost", async || gpu_problem(&server).await.is_some_and(|why| why.contains(words))).await;
         assert_eq!(gpus().await, left);
         assert!(server.log().contains(words), "{}", server.log());
-        assert!(http::get(&server.url("/metrics")).await.text().contains("\nwebots_machine_gpu_lost 1\n"));
-        let page = http::get(&server.url("/monitor")).await.text().replace("&#39;", "'");
+        assert!(server.metrics().await.contains("\nwebots_machine_gpu_lost 1\n"));
+        let page = server.monitor().await.replace("&#39;", "'");
         assert!(page.contains(words), "{page}");
         assert_eq!(http::get(&server.url("/health")).await.text(), "ok", "they are not required");
         std::fs::remove_file(&mark).unwrap();
@@ -90,10 +86,9 @@ async fn a_driver_that_is_loaded_later_or_anew_is_found() {
     let library = gpu_driver();
     let mark = library.path().join("mark");
     std::fs::write(&mark, "").unwrap();
-    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
-    let builder = with(library.path(), &forge, &webots).env("NVML_UNLOADED", mark.to_str().unwrap());
+    let builder = with(library.path()).env("NVML_UNLOADED", mark.to_str().unwrap());
     let server = builder.start().await;
-    let gpus = async || http::get(&server.url("/status")).await.json()["gpus"].as_array().unwrap().len();
+    let gpus = async || server.status().await["gpus"].as_array().unwrap().len();
     until("the driver is missed", async || server.log().contains("no NVIDIA GPU is read")).await;
     std::fs::remove_file(&mark).unwrap();
     until("its GPUs are read", async || gpus().await == 2).await;
@@ -109,7 +104,7 @@ async fn a_server_that_requires_gpus_is_ready_only_with_them() {
     let library = gpu_driver();
     let mark = library.path().join("mark");
     let (forge, webots) = (Forge::with_arm(), Webots::launcher());
-    let builder = with(library.path(), &forge, &webots).set("requireGpu", true);
+    let builder = with(library.path()).set("requireGpu", true);
     let server = builder.env("NVML_LOST", mark.to_str().unwrap()).start().await;
     let health = async |server: &Server| http::try_get(&server.url("/health")).await.unwrap();
     until("it is ready", async || health(&server).await.text() == "ok").await;
@@ -126,19 +121,17 @@ async fn a_server_that_requires_gpus_is_ready_only_with_them() {
 #[actix_rt::test]
 async fn a_driver_that_hangs_or_is_missing_holds_up_nothing() {
     let library = gpu_driver();
-    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
     for hang in ["init", "read", "no driver"] {
-        let mut server = with(library.path(), &forge, &webots).env("NVML_HANG", hang).start().await;
+        let mut server = with(library.path()).env("NVML_HANG", hang).start().await;
         let csv = server.folder.join("log/simulation/monitor.csv");
         until("samples go on", async || std::fs::read_to_string(&csv).is_ok_and(|text| text.lines().count() >= 4))
             .await;
-        Client::start(&server, &arm()).await.until("webots:").await;
-        assert_eq!(http::get(&server.url("/status")).await.json()["gpus"], serde_json::json!([]));
+        Client::ready(&server).await;
+        assert_eq!(server.status().await["gpus"], serde_json::json!([]));
         if hang == "no driver" {
             assert_eq!(server.log().matches("no NVIDIA GPU is read").count(), 1);
         }
-        server.signal(Signal::SIGTERM);
-        assert_eq!(server.ended().await, Some(0), "{hang}: it can't end");
+        server.stops().await;
     }
 }
 
@@ -146,8 +139,7 @@ async fn a_driver_that_hangs_or_is_missing_holds_up_nothing() {
 async fn samples_are_written_with_the_columns_of_the_original() {
     let (forge, webots) = (Forge::with_arm(), Webots::launcher());
     let server = simulation_server(&webots.path(), forge.path(), 1).start().await;
-    let mut client = Client::start(&server, &arm()).await;
-    client.until("webots:").await;
+    let _client = Client::ready(&server).await;
     let csv = server.folder.join("log/simulation/monitor.csv");
     let text = || std::fs::read_to_string(&csv).unwrap_or_default();
     until("an idle simulation is counted", async || text().lines().skip(1).any(|line| line.contains(", 0, 1, "))).await;
@@ -166,7 +158,7 @@ async fn samples_are_written_with_the_columns_of_the_original() {
 
 /// What of the GPU each simulation of a server with four is told: its number on `/status`, and its variables.
 async fn given(server: &Server) -> Vec<(Option<u64>, String, String)> {
-    let status = http::get(&server.url("/status")).await.json();
+    let status = server.status().await;
     let simulations = status["simulations"].as_array().unwrap().clone();
     let told = simulations.iter().map(|one| {
         let pid = i32::try_from(one["pid"].as_i64().unwrap()).unwrap();
@@ -184,9 +176,8 @@ async fn given(server: &Server) -> Vec<(Option<u64>, String, String)> {
 async fn simulations_are_spread_over_gpus_and_a_lost_one_gets_none() {
     let library = gpu_driver();
     let mark = library.path().join("mark");
-    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
     let displays = [":90.0", ":90.1", ":90.2", ":90.3"];
-    let four = simulation_server(&webots.path(), forge.path(), 12)
+    let four = demo_server(12)
         .env("LD_LIBRARY_PATH", library.path().to_str().unwrap())
         .env("NVML_COUNT", "4")
         .env("NVML_COMPUTE_2", "95")
@@ -196,7 +187,7 @@ async fn simulations_are_spread_over_gpus_and_a_lost_one_gets_none() {
         .set("gpus", "spread")
         .set("displays", serde_json::json!(displays));
     let server = four.start().await;
-    until("GPUs are read", async || http::get(&server.url("/status")).await.json()["gpus"][3].is_object()).await;
+    until("GPUs are read", async || server.status().await["gpus"][3].is_object()).await;
     // The first has the most memory in use, the third computes.
     let mut clients = Vec::new();
     for _ in 0..4 {
@@ -212,13 +203,13 @@ async fn simulations_are_spread_over_gpus_and_a_lost_one_gets_none() {
     let mut told = given(&server).await;
     told.sort();
     assert_eq!(told, expected(&[1, 1, 3, 3]));
-    let page = http::get(&server.url("/monitor")).await.text();
+    let page = server.monitor().await;
     assert!(page.contains("<small>GPU 3</small>") && page.contains("GPU 2: Stand-in C"), "{page}");
     assert!(server.log().contains("it gets GPU 1, Stand-in B"), "{}", server.log());
     std::fs::write(&mark, "").unwrap();
     until("one is lost", async || gpu_problem(&server).await.is_some()).await;
     drop(clients);
-    let simulations = async || http::get(&server.url("/status")).await.json()["simulations"].clone();
+    let simulations = async || server.status().await["simulations"].clone();
     until("all are gone", async || simulations().await == serde_json::json!([])).await;
     let mut clients = Vec::new();
     for _ in 0..3 {
@@ -226,20 +217,18 @@ async fn simulations_are_spread_over_gpus_and_a_lost_one_gets_none() {
         clients.last_mut().unwrap().until("webots:").await;
     }
     assert!(given(&server).await.iter().all(|(gpu, ..)| *gpu == Some(3)), "{:?}", given(&server).await);
-    let metrics = http::get(&server.url("/metrics")).await.text();
+    let metrics = server.metrics().await;
     assert!(metrics.contains("webots_machine_gpu_compute_percent{gpu=\"2\",name=\"Stand-in C\"} 95"), "{metrics}");
 }
 
 #[actix_rt::test]
 async fn without_being_told_simulations_are_not_spread() {
     let library = gpu_driver();
-    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
-    let builder = with(library.path(), &forge, &webots).set("displays", serde_json::json!([":90.0", ":90.1"]));
+    let builder = with(library.path()).set("displays", serde_json::json!([":90.0", ":90.1"]));
     let server = builder.set("display", ":91").start().await;
-    until("GPUs are read", async || http::get(&server.url("/status")).await.json()["gpus"][1].is_object()).await;
-    Client::start(&server, &arm()).await.until("webots:").await;
-    let mut client = Client::start(&server, &arm()).await;
-    client.until("webots:").await;
+    until("GPUs are read", async || server.status().await["gpus"][1].is_object()).await;
+    Client::ready(&server).await;
+    let _client = Client::ready(&server).await;
     let told = given(&server).await;
     assert!(told.iter().all(|one| *one == (None, String::new(), ":91".to_owned())), "{told:?}");
     assert!(server.log().contains("displays has no effect"), "{}", server.log());

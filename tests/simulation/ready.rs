@@ -7,14 +7,15 @@ use std::time::Duration;
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 
+use super::ends::line;
 use super::opened::{outcome, world_text};
-use super::scene::{DEMO, arm, instance_folders_in, nothing_left, stages};
+use super::scene::{DEMO, arm, nothing_left, stages};
 use crate::support::client::Client;
 use crate::support::git::{Forge, world};
-use crate::support::program::{Server, simulation_server};
+use crate::support::program::{Server, demo_server, server_of, simulation_server};
 use crate::support::stopwatch::Stopwatch;
-use crate::support::webots::{Webots, instances_below};
-use crate::support::{display, until};
+use crate::support::webots::{Webots, instance_folders_in, instances_below};
+use crate::support::{display, programs, until};
 
 #[actix_rt::test]
 async fn a_launch_that_never_listens_ends_with_its_last_words() {
@@ -32,17 +33,15 @@ async fn a_launch_that_never_listens_ends_with_its_last_words() {
 
 #[actix_rt::test]
 async fn a_webots_that_hangs_is_told_and_ended() {
-    let forge = Forge::with_arm();
     // A simulator without heartbeat.
     let webots = Webots::script(&format!(
         "args=()\nfor one; do case $one in --heartbeat*) ;; *) args+=(\"$one\");; esac; done\n{DEMO} \"${{args[@]}}\" & wait"
     ));
-    let builder = simulation_server(&webots.path(), forge.path(), 1).set("timing.heartbeat", 0.5);
+    let builder = server_of(webots, 1).set("timing.heartbeat", 0.5);
     let server = builder.set("hangLimit", 1.1).start().await;
     let stopwatch = Stopwatch::start();
     let begun = stopwatch.lap();
-    let mut client = Client::start(&server, &arm()).await;
-    client.until("webots:").await;
+    let mut client = Client::ready(&server).await;
     let words = "loading: Webots has given no sign of life for ";
     let told = client.until(words).await;
     let seconds = |words: &str| words.split(' ').next().and_then(|number| number.parse::<u64>().ok());
@@ -60,22 +59,19 @@ async fn a_webots_that_hangs_is_told_and_ended() {
         "{told}"
     );
     assert!(begun.wall() > Duration::from_secs(4), "hangLimit was not waited for");
+    assert_eq!(line(&server, client.id()).await[10], "hung");
     assert_eq!(client.closed().await, Some(1000));
     nothing_left(&server, 1).await;
 }
 
 #[actix_rt::test]
 async fn signs_of_life_are_passed_on_and_the_pace_is_shown() {
-    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
-    let server = simulation_server(&webots.path(), forge.path(), 1).set("timing.heartbeat", 0.1).start().await;
-    let mut client = Client::start(&server, &arm()).await;
-    client.until("webots:").await;
+    let server = demo_server(1).set("timing.heartbeat", 0.1).start().await;
+    let mut client = Client::ready(&server).await;
     for _ in 0..3 {
         assert_eq!(client.until("").await, ".");
     }
-    let mut viewer = Client::connect(&format!("ws://127.0.0.1:{}/", server.port + 1)).await;
-    viewer.send("x3d").await;
-    viewer.until("scene load completed").await;
+    let mut viewer = Client::connect(&format!("ws://127.0.0.1:{}/", server.port + 1)).await.with_scene().await;
     for (ask, shown) in [("real-time:-1", "running"), ("pause", "idle"), ("fast:-1", "running")] {
         viewer.send(ask).await;
         until(shown, async || stages(&server).await == [shown]).await;
@@ -84,9 +80,8 @@ async fn signs_of_life_are_passed_on_and_the_pace_is_shown() {
 
 #[actix_rt::test]
 async fn webots_is_given_the_documented_command_line() {
-    let forge = Forge::with_arm();
     let webots = Webots::script("echo \"args: $*\"; exit 1");
-    let server = simulation_server(&webots.path(), forge.path(), 1).start().await;
+    let server = server_of(webots, 1).start().await;
     let port = server.port + 1;
     let rest = format!("--port={port} --heartbeat=5000");
     let table = [
@@ -152,13 +147,7 @@ async fn a_missing_webots_or_xvfb_is_told_with_what_to_do() {
     let told = Client::start(&server, &arm()).await.until("loading: Error:").await;
     assert!(told.contains("has no Webots that it can run at \"webots\"") && told.contains("webotsHome"), "{told}");
     let webots = Webots::launcher();
-    let git = tempfile::tempdir().unwrap();
-    for program in ["git", "bash", "env", "sh", "rm"] {
-        let paths = std::env::var_os("PATH").unwrap();
-        let real =
-            std::env::split_paths(&paths).map(|folder| folder.join(program)).find(|path| path.is_file()).unwrap();
-        std::os::unix::fs::symlink(real, git.path().join(program)).unwrap();
-    }
+    let git = programs(&["git", "bash", "env", "sh", "rm"]);
     let builder = simulation_server(&webots.path(), forge.path(), 1).set("xvfb", true);
     let server = builder.env("PATH", git.path().to_str().unwrap()).start().await;
     let told = Client::start(&server, &arm()).await.until("loading: Error:").await;
@@ -170,17 +159,14 @@ async fn a_missing_webots_or_xvfb_is_told_with_what_to_do() {
 async fn each_webots_gets_a_virtual_display_of_its_own() {
     let _alone = display::alone().await;
     let forge = Forge::with_arm();
-    let webots = Webots::script(&format!(
-        "test -S /tmp/.X11-unix/X${{DISPLAY#:}} || exit 9\necho \"display $DISPLAY\"\n{DEMO} \"$@\" & wait"
-    ));
+    let webots = telling_its_display();
     let builder = simulation_server(&webots.path(), forge.path(), 2).set("xvfb", true);
     // In a sandbox each has the same number.
     let server = builder.set("isolation", "none").start().await;
     let mut clients = Vec::new();
     let mut displays = Vec::new();
     for _ in 1..=2 {
-        let mut client = Client::start(&server, &arm()).await;
-        client.until("webots:").await;
+        let client = Client::ready(&server).await;
         displays.push(display_of(&server, &client).await);
         clients.push(client);
     }
@@ -189,6 +175,13 @@ async fn each_webots_gets_a_virtual_display_of_its_own() {
         client.leave().await;
     }
     nothing_left(&server, 2).await;
+}
+
+/// A simulator that tells which display it has, and fails without.
+fn telling_its_display() -> Webots {
+    Webots::script(&format!(
+        "test -S /tmp/.X11-unix/X${{DISPLAY#:}} || exit 9\necho \"display $DISPLAY\"\n{DEMO} \"$@\" & wait"
+    ))
 }
 
 /// The display that a simulator has printed.
@@ -205,15 +198,12 @@ async fn display_of(server: &Server, client: &Client) -> String {
 async fn the_number_of_a_virtual_display_that_was_killed_is_used_again() {
     let _alone = display::alone().await;
     let forge = Forge::with_arm();
-    let webots = Webots::script(&format!(
-        "test -S /tmp/.X11-unix/X${{DISPLAY#:}} || exit 9\necho \"display $DISPLAY\"\n{DEMO} \"$@\" & wait"
-    ));
+    let webots = telling_its_display();
     let builder = simulation_server(&webots.path(), forge.path(), 1).set("xvfb", true);
     let server = builder.set("isolation", "none").start().await;
     let mut numbers = BTreeSet::new();
     for _ in 0..12 {
-        let mut client = Client::start(&server, &arm()).await;
-        client.until("webots:").await;
+        let client = Client::ready(&server).await;
         numbers.insert(display_of(&server, &client).await);
         let xvfb = instances_below(&server.folder).into_iter().find(|one| one.1.contains("Xvfb -screen")).unwrap().0;
         kill(Pid::from_raw(xvfb), Signal::SIGKILL).unwrap();

@@ -1,6 +1,5 @@
 //! Streams through the server (`"streaming": "relay"`): its client has all of what Webots sends, and nobody else any of it.
 
-use std::io::Write;
 use std::time::Duration;
 
 use futures_util::{SinkExt, StreamExt};
@@ -19,9 +18,14 @@ use super::network::Network;
 use super::scene::{arm, nothing_left};
 use crate::support::client::{Client, Heard};
 use crate::support::git::Forge;
+use crate::support::http::{PASSWORD, get_as_administrator, get_with_password};
 use crate::support::program::{Builder, Server, simulation_server};
 use crate::support::webots::Webots;
-use crate::support::{SOON, http, until};
+use crate::support::{SOON, http, skip, until};
+
+/// The headers of who asks for a WebSocket.
+const UPGRADE: &str = "Host: localhost\r\nConnection: upgrade\r\nUpgrade: websocket\r\nSec-WebSocket-Version: 13\r\n\
+    Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n";
 
 /// A server, and what it needs.
 struct Stage {
@@ -76,10 +80,6 @@ impl Stage {
         actix_rt::time::timeout(SOON, socket.read_to_end(&mut answer)).await.expect("the connection ends").ok();
         String::from_utf8_lossy(&answer).into_owned()
     }
-
-    async fn simulations(&self) -> Vec<Value> {
-        http::get(&self.server.url("/status")).await.json()["simulations"].as_array().unwrap().clone()
-    }
 }
 
 type Socket<S> = WebSocketStream<S>;
@@ -112,6 +112,15 @@ impl Played {
         let both = actix_rt::time::timeout(SOON, async { tokio::join!(client, webots) }).await.expect("a connection");
         (both.0.unwrap().0, both.1)
     }
+
+    /// Answers one request with these bytes, as Webots; gives back the head of the request.
+    async fn answer(&self, bytes: &[u8]) -> String {
+        let (mut socket, _) = self.listener.accept().await.unwrap();
+        let mut head = [0; 4096];
+        let length = socket.read(&mut head).await.unwrap();
+        socket.write_all(bytes).await.unwrap();
+        String::from_utf8_lossy(&head[..length]).into_owned()
+    }
 }
 
 async fn next<S>(socket: &mut Socket<S>) -> Option<Message>
@@ -127,9 +136,7 @@ async fn a_simulation_is_steered_and_its_files_are_had_through_the_server_alone(
     for level in ["none", "sandbox"] {
         let stage = Stage::new(|builder| builder.set("isolation", level)).await;
         let (client, path) = stage.start().await;
-        let mut viewer = stage.viewer(&path).await;
-        viewer.send("x3d").await;
-        viewer.until("scene load completed").await;
+        let mut viewer = stage.viewer(&path).await.with_scene().await;
         viewer.send("real-time:-1").await;
         viewer.until("real-time").await;
         viewer.until("application/json:").await;
@@ -226,9 +233,7 @@ async fn a_viewer_that_does_not_read_holds_up_nobody_and_fills_no_memory() {
 #[actix_rt::test]
 async fn a_viewer_that_has_vanished_is_noticed_though_nothing_is_sent() {
     let Some(network) = Network::hide_from_others() else {
-        // Not by a macro: what those print is shown for tests that fail only.
-        std::io::stderr().write_all(b"SKIPPED, for packets can't be filtered: simulation::relay\n").unwrap();
-        return;
+        return skip("simulation::relay", "packets can't be filtered");
     };
     let played = Played::new(|builder| builder.set("timing.ping", 1).set("timing.silence", 2)).await;
     let (_client, path) = played.stage.start().await;
@@ -254,7 +259,7 @@ async fn streams_have_connections_of_their_own() {
     }
     assert_eq!(played.stage.refused(&path).await, 503);
     assert_eq!(http::get(&played.stage.server.url(&format!("{path}/a.png"))).await.status, 503);
-    assert_eq!(played.stage.simulations().await.len(), 1);
+    assert_eq!(played.stage.server.simulations().await.len(), 1);
     let (mut viewer, mut webots) = streams.remove(0);
     viewer.close(None).await.unwrap();
     while next(&mut webots).await.is_some() {}
@@ -285,9 +290,8 @@ async fn a_webots_that_does_not_read_holds_no_connection_of_a_client_that_has_le
 #[actix_rt::test]
 async fn a_websocket_with_a_body_is_refused() {
     let stage = Stage::new(|builder| builder).await;
-    let upgrade = "Host: localhost\r\nConnection: upgrade\r\nUpgrade: websocket\r\nSec-WebSocket-Version: 13\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n";
     for body in ["Content-Length: 1\r\n\r\nx", "Transfer-Encoding: chunked\r\n\r\n1\r\nx\r\n0\r\n\r\n"] {
-        let answer = stage.raw(&format!("GET /client HTTP/1.1\r\n{upgrade}{body}")).await;
+        let answer = stage.raw(&format!("GET /client HTTP/1.1\r\n{UPGRADE}{body}")).await;
         assert!(
             answer.starts_with("HTTP/1.1 400 ") && answer.ends_with("Error: a request for this has no body."),
             "{answer}"
@@ -301,13 +305,7 @@ async fn an_answer_without_a_body_ends_with_its_head() {
     let (_client, path) = played.stage.start().await;
     let headers = "Host: localhost\r\nIf-None-Match: \"x\"\r\nConnection: close\r\n";
     let request = format!("GET {path}/a.png HTTP/1.1\r\n{headers}\r\n");
-    let webots = async {
-        let (mut socket, _) = played.listener.accept().await.unwrap();
-        let mut head = [0; 4096];
-        let length = socket.read(&mut head).await.unwrap();
-        socket.write_all(b"HTTP/1.1 304 Not Modified\r\nETag: \"x\"\r\n\r\n").await.unwrap();
-        String::from_utf8_lossy(&head[..length]).into_owned()
-    };
+    let webots = played.answer(b"HTTP/1.1 304 Not Modified\r\nETag: \"x\"\r\n\r\n");
     let (answer, head) = tokio::join!(played.stage.raw(&request), webots);
     assert!(head.contains("\r\nIf-None-Match: \"x\"\r\n"), "{head}");
     assert!(answer.starts_with("HTTP/1.1 304 ") && answer.split_once("\r\n\r\n").unwrap().1.is_empty(), "{answer}");
@@ -317,9 +315,8 @@ async fn an_answer_without_a_body_ends_with_its_head() {
 async fn a_stream_is_relayed_however_its_answer_begins() {
     let played = Played::new(|builder| builder).await;
     let (_client, path) = played.stage.start().await;
-    let upgrade = "Host: localhost\r\nConnection: upgrade\r\nUpgrade: websocket\r\nSec-WebSocket-Version: 13\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n";
     let mut client = TcpStream::connect(("127.0.0.1", played.stage.server.port)).await.unwrap();
-    let request = format!("GET {path} HTTP/1.1\r\n{upgrade}Expect: 100-continue\r\n\r\n");
+    let request = format!("GET {path} HTTP/1.1\r\n{UPGRADE}Expect: 100-continue\r\n\r\n");
     client.write_all(request.as_bytes()).await.unwrap();
     let (socket, _) = played.listener.accept().await.unwrap();
     let mut webots = tokio_tungstenite::accept_async(socket).await.unwrap();
@@ -338,19 +335,16 @@ async fn only_administrators_read_ports_in_an_output() {
     for (mode, password, is_shown) in [("relay", false, false), ("relay", true, true), ("direct", false, true)] {
         let stage = Stage::new(|builder| {
             let builder = builder.set("streaming", mode);
-            if password { builder.set("adminPassword", "open sesame") } else { builder }
+            if password { builder.set("adminPassword", PASSWORD) } else { builder }
         })
         .await;
-        let mut client = Client::start(&stage.server, &arm()).await;
-        client.until("webots:").await;
+        let client = Client::ready(&stage.server).await;
         let url = stage.server.url(&format!("/output?id={}", client.id()));
         client.leave().await;
         nothing_left(&stage.server, 2).await;
         let mut text = String::new();
         until("its events are kept", async || {
-            let asked = awc::Client::new().get(&url).basic_auth("admin", "open sesame");
-            let body = asked.send().await.unwrap().body().limit(1 << 20).await.unwrap();
-            text = String::from_utf8(body.to_vec()).unwrap();
+            text = get_as_administrator(&url).await.text();
             text.contains("ready")
         })
         .await;
@@ -366,7 +360,6 @@ async fn no_trick_leads_anywhere_else() {
     let stage = &played.stage;
     let (_client, path) = stage.start().await;
     let headers = "Host: localhost\r\nConnection: close\r\n";
-    let upgrade = "Host: localhost\r\nConnection: upgrade\r\nUpgrade: websocket\r\nSec-WebSocket-Version: 13\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n";
     let other = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let elsewhere = other.local_addr().unwrap();
     let token = path.rsplit('/').next().unwrap();
@@ -388,7 +381,7 @@ async fn no_trick_leads_anywhere_else() {
         ("/stream/".to_owned(), 404),
         ("/stream".to_owned(), 404),
     ] {
-        for headers in [headers, upgrade] {
+        for headers in [headers, UPGRADE] {
             let answer = stage.raw(&format!("GET {path} HTTP/1.1\r\n{headers}\r\n")).await;
             assert!(answer.starts_with(&format!("HTTP/1.1 {status} ")), "{path}: {answer}");
             assert!(!answer.contains(&token[16..]), "{answer}");
@@ -400,8 +393,8 @@ async fn no_trick_leads_anywhere_else() {
         (format!("CONNECT {elsewhere} HTTP/1.1\r\n{headers}\r\n"), 404),
         (format!("GET {path}/a.png HTTP/1.1\r\n{headers}Content-Length: 1\r\n\r\nx"), 400),
         (format!("GET {path}/a.png HTTP/1.1\r\n{headers}Transfer-Encoding: chunked\r\n\r\n0\r\n\r\n"), 400),
-        (format!("GET {path} HTTP/1.1\r\n{upgrade}Content-Length: 1\r\n\r\nx"), 400),
-        (format!("GET {path} HTTP/1.1\r\n{upgrade}Transfer-Encoding: chunked\r\n\r\n1\r\nx\r\n0\r\n\r\n"), 400),
+        (format!("GET {path} HTTP/1.1\r\n{UPGRADE}Content-Length: 1\r\n\r\nx"), 400),
+        (format!("GET {path} HTTP/1.1\r\n{UPGRADE}Transfer-Encoding: chunked\r\n\r\n1\r\nx\r\n0\r\n\r\n"), 400),
         (format!("GET {path} HTTP/1.1\r\nHost: localhost\r\nConnection: upgrade, close\r\nUpgrade: h2c\r\n\r\n"), 400),
         (format!("GET {path}/{} HTTP/1.1\r\n{headers}\r\n", "x".repeat(200_000)), 431),
     ] {
@@ -419,16 +412,7 @@ async fn no_trick_leads_anywhere_else() {
     let absolute =
         format!("GET http://{elsewhere}{path}/a.png?x=1 HTTP/1.1\r\n{headers}X-Secret: y\r\nAuthorization: z\r\n\r\n");
     let second = format!("GET {path}/second.png HTTP/1.1\r\n{headers}\r\n");
-    let webots = async {
-        let (mut socket, _) = played.listener.accept().await.unwrap();
-        let mut head = [0; 4096];
-        let length = socket.read(&mut head).await.unwrap();
-        socket
-            .write_all(b"HTTP/1.1 302 Found\r\nLocation: http://127.0.0.1:1/\r\nContent-Length: 2\r\n\r\nok")
-            .await
-            .unwrap();
-        String::from_utf8_lossy(&head[..length]).into_owned()
-    };
+    let webots = played.answer(b"HTTP/1.1 302 Found\r\nLocation: http://127.0.0.1:1/\r\nContent-Length: 2\r\n\r\nok");
     let both = format!("{absolute}{second}");
     let (answer, head) = tokio::join!(stage.raw(&both), webots);
     let port = stage.server.port + 1;
@@ -447,21 +431,9 @@ async fn a_webots_that_does_not_answer_costs_its_client_an_error() {
     let (_client, path) = played.stage.start().await;
     let url = played.stage.server.url(&format!("{path}/a.png"));
     for nonsense in ["", "nonsense\r\n\r\n", "HTTP/1.1 101 Switching Protocols\r\n\r\n"] {
-        let webots = async {
-            let (mut socket, _) = played.listener.accept().await.unwrap();
-            let mut head = [0; 4096];
-            assert!(socket.read(&mut head).await.unwrap() > 0);
-            socket.write_all(nonsense.as_bytes()).await.unwrap();
-        };
-        let (answer, ()) = tokio::join!(http::get(&url), webots);
+        let (answer, _) = tokio::join!(http::get(&url), played.answer(nonsense.as_bytes()));
         assert_eq!(answer.status, 502, "{nonsense}");
-        let webots = async {
-            let (mut socket, _) = played.listener.accept().await.unwrap();
-            let mut head = [0; 4096];
-            assert!(socket.read(&mut head).await.unwrap() > 0);
-            socket.write_all(nonsense.as_bytes()).await.unwrap();
-        };
-        let (status, ()) = tokio::join!(played.stage.refused(&path), webots);
+        let (status, _) = tokio::join!(played.stage.refused(&path), played.answer(nonsense.as_bytes()));
         assert_eq!(status, 502, "{nonsense}");
     }
 }
@@ -470,15 +442,12 @@ async fn a_webots_that_does_not_answer_costs_its_client_an_error() {
 async fn the_token_stays_for_who_comes_back_and_dies_with_the_simulation() {
     let stage = Stage::new(|builder| builder).await;
     let (mut client, path) = stage.start().await;
-    let resume = client.until("resume: ").await["resume: ".len()..].to_owned();
+    let resume = client.token().await;
     drop(client);
-    until("it is away", async || stage.simulations().await[0]["awayUntil"].is_u64()).await;
-    let mut client = stage.viewer("/client").await;
-    client.send(&json!({ "resume": resume }).to_string()).await;
+    stage.server.until_away(1).await;
+    let mut client = Client::resuming(&stage.server, &resume).await;
     assert_eq!(stage.path(&mut client).await, path);
-    let mut viewer = stage.viewer(&path).await;
-    viewer.send("x3d").await;
-    viewer.until("scene load completed").await;
+    let mut viewer = stage.viewer(&path).await.with_scene().await;
 
     let (other, others) = stage.start().await;
     assert_ne!(path, others);
@@ -503,34 +472,25 @@ async fn the_token_stays_for_who_comes_back_and_dies_with_the_simulation() {
 
 #[actix_rt::test]
 async fn a_stranger_sees_no_port_and_steers_nobody() {
-    let password = |builder: Builder| builder.set("adminPassword", "open sesame");
+    let password = |builder: Builder| builder.set("adminPassword", PASSWORD);
     for (mode, has_password) in [("direct", false), ("direct", true), ("relay", false), ("relay", true)] {
         let stage = Stage::new(|builder| {
             let builder = builder.set("streaming", mode);
             if has_password { password(builder) } else { builder }
         })
         .await;
-        let mut client = Client::start(&stage.server, &arm()).await;
-        client.until("webots:").await;
+        let _client = Client::ready(&stage.server).await;
         let port = stage.server.port + 1;
         let is_shown = (mode, has_password) == ("direct", false);
-        let simulation = stage.simulations().await.remove(0);
+        let simulation = stage.server.simulations().await.remove(0);
         assert_eq!(simulation["port"], if is_shown { json!(port) } else { Value::Null }, "{mode} {has_password}");
-        let page = http::get(&stage.server.url("/monitor")).await.text();
+        let page = stage.server.monitor().await;
         assert_eq!(page.contains(&format!(">{port}<")), is_shown, "{mode} {has_password}");
-        let ask = async |password: &str| {
-            let asked = awc::Client::new().get(stage.server.url("/status")).basic_auth("admin", password);
-            let mut answer = asked.send().await.unwrap();
-            (answer.status().as_u16(), answer.body().limit(1 << 20).await.unwrap())
-        };
-        if has_password {
-            let (status, body) = ask("wrong").await;
-            let told: Value = serde_json::from_slice(&body).unwrap();
-            assert_eq!((status, &told["simulations"][0]["port"]), (200, &Value::Null), "it may be meant for another");
-            let (status, body) = ask("open sesame").await;
-            assert_eq!(status, 200);
-            let told: Value = serde_json::from_slice(&body).unwrap();
-            assert_eq!(told["simulations"][0]["port"], port);
+        // A wrong password may be meant for another.
+        for (password, shown) in [("wrong", Value::Null), (PASSWORD, json!(port))].into_iter().filter(|_| has_password)
+        {
+            let answer = get_with_password(&stage.server.url("/status"), password).await;
+            assert_eq!((answer.status.as_u16(), &answer.json()["simulations"][0]["port"]), (200, &shown), "{password}");
         }
     }
 
@@ -576,11 +536,9 @@ async fn pages_of_other_origins_get_no_stream() {
 /// Opens the page on which an administrator watches the simulation of a client, and returns the path of its stream.
 async fn watched_by(stage: &Stage, client: &Client) -> String {
     let url = stage.server.url(&format!("/watch?id={}", client.id()));
-    let asked = awc::Client::new().get(url).basic_auth("admin", "open sesame");
-    let mut answer = asked.send().await.unwrap();
-    assert_eq!(answer.status(), 200);
-    assert_eq!(answer.headers().get("referrer-policy").unwrap(), "no-referrer");
-    let page = String::from_utf8(answer.body().await.unwrap().to_vec()).unwrap();
+    let answer = get_as_administrator(&url).await;
+    assert_eq!((answer.status.as_u16(), answer.header("referrer-policy")), (200, Some("no-referrer")));
+    let page = answer.text();
     let (_, rest) = page.split_once("data-stream=\"").unwrap();
     format!("/{}", rest.split_once('"').unwrap().0)
 }
@@ -588,7 +546,7 @@ async fn watched_by(stage: &Stage, client: &Client) -> String {
 #[actix_rt::test]
 async fn an_administrator_watches_and_changes_nothing() {
     for mode in ["direct", "relay"] {
-        let change = |builder: Builder| builder.set("adminPassword", "open sesame").set("streaming", mode);
+        let change = |builder: Builder| builder.set("adminPassword", PASSWORD).set("streaming", mode);
         let stage = Stage::new(change).await;
         let mut client = Client::start(&stage.server, &arm()).await;
         let address = client.until("webots:").await["webots:".len()..].to_owned();
@@ -637,15 +595,14 @@ async fn an_administrator_watches_and_changes_nothing() {
 
 #[actix_rt::test]
 async fn who_comes_back_hears_that_somebody_watches() {
-    let stage = Stage::new(|builder| builder.set("adminPassword", "open sesame")).await;
+    let stage = Stage::new(|builder| builder.set("adminPassword", PASSWORD)).await;
     let (mut client, _) = stage.start().await;
-    let resume = client.until("resume: ").await["resume: ".len()..].to_owned();
+    let resume = client.token().await;
     let mut watcher = stage.viewer(&watched_by(&stage, &client).await).await;
     client.until("watched: 1").await;
     drop(client);
-    until("it is away", async || stage.simulations().await[0]["awayUntil"].is_u64()).await;
-    let mut client = stage.viewer("/client").await;
-    client.send(&json!({ "resume": resume }).to_string()).await;
+    stage.server.until_away(1).await;
+    let mut client = Client::resuming(&stage.server, &resume).await;
     client.until("watched: 1").await;
     stage.server.signal(Signal::SIGTERM);
     while let Heard::Text(_) = watcher.next().await {}
@@ -657,23 +614,21 @@ async fn nobody_watches_without_the_password() {
     let (client, _) = stage.start().await;
     let watch = format!("/watch?id={}", client.id());
     assert_eq!(http::get(&stage.server.url(&watch)).await.status, 403, "there is no password");
-    assert!(!http::get(&stage.server.url("/monitor")).await.text().contains("watch?"));
+    assert!(!stage.server.monitor().await.contains("watch?"));
 
-    let stage = Stage::new(|builder| builder.set("adminPassword", "open sesame")).await;
+    let stage = Stage::new(|builder| builder.set("adminPassword", PASSWORD)).await;
     let (client, _) = stage.start().await;
     let watch = format!("/watch?id={}", client.id());
     assert_eq!(http::get(&stage.server.url(&watch)).await.status, 401);
     let link = format!("href=\"{}\"", &watch[1..]);
-    assert!(!http::get(&stage.server.url("/monitor")).await.text().contains(&link));
-    let asked = awc::Client::new().get(stage.server.url("/monitor")).basic_auth("admin", "open sesame");
-    let page = asked.send().await.unwrap().body().limit(1 << 20).await.unwrap();
-    assert!(String::from_utf8_lossy(&page).contains(&link), "{page:?}");
+    assert!(!stage.server.monitor().await.contains(&link));
+    let page = get_as_administrator(&stage.server.url("/monitor")).await.text();
+    assert!(page.contains(&link), "{page:?}");
     let ask = async |id: &str, password: &str| {
-        let asked = awc::Client::new().get(stage.server.url(&format!("/watch?id={id}")));
-        asked.basic_auth("admin", password).send().await.unwrap().status().as_u16()
+        get_with_password(&stage.server.url(&format!("/watch?id={id}")), password).await.status.as_u16()
     };
     assert_eq!(ask(client.id(), "wrong").await, 401);
     for id in ["", "x", "20261122T220517042-17", "%3Cscript%3E"] {
-        assert_eq!(ask(id, "open sesame").await, 404, "{id}");
+        assert_eq!(ask(id, PASSWORD).await, 404, "{id}");
     }
 }

@@ -8,8 +8,8 @@ use crate::support::client::Client;
 use crate::support::git::Forge;
 pub use crate::support::git::arm;
 use crate::support::program::{Builder, Server, simulation_server};
-use crate::support::webots::{Webots, instances_below};
-use crate::support::{http, until};
+use crate::support::until;
+use crate::support::webots::{Webots, instance_folders_in, instances_below};
 
 pub const DEMO: &str = concat!("'", env!("CARGO_BIN_EXE_demo-simulator"), "'");
 
@@ -69,8 +69,7 @@ impl Scene {
         let server = change(builder).start().await;
         let mut other = None;
         if state == State::Waiting {
-            let mut first = Client::start(&server, &arm()).await;
-            first.until("webots:").await;
+            let first = Client::ready(&server).await;
             other = Some(first);
         }
         let client = Client::connect(&server.websocket("/client")).await;
@@ -116,7 +115,7 @@ impl Scene {
 
 /// The states of all simulations, as the server shows them.
 pub async fn stages(server: &Server) -> Vec<String> {
-    let status = http::get(&server.url("/status")).await.json();
+    let status = server.status().await;
     status["simulations"].as_array().unwrap().iter().map(|one| one["stage"].as_str().unwrap().to_owned()).collect()
 }
 
@@ -143,12 +142,4 @@ pub async fn gone_within(grace: f64, left: Instant, server: &Server) -> Duration
 /// The folders of simulations below a server's folder.
 pub fn instance_folders(folder: &Path) -> Vec<PathBuf> {
     instance_folders_in(&folder.join("cache"))
-}
-
-/// Those in a cache.
-pub fn instance_folders_in(cache: &Path) -> Vec<PathBuf> {
-    let inside = |folder: PathBuf| std::fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.path());
-    let runs = inside(cache.join("runs"));
-    let is_instance = |path: &PathBuf| path.file_name().unwrap().to_string_lossy().starts_with("instance-");
-    runs.flat_map(inside).filter(is_instance).collect()
 }

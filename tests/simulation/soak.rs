@@ -9,7 +9,7 @@ use crate::support::client::Client;
 use crate::support::git::{Forge, world};
 use crate::support::program::{Server, simulation_server};
 use crate::support::webots::{Webots, instances_below};
-use crate::support::{holds_soon, http, until};
+use crate::support::{holds_soon, until};
 
 /// What a server holds at one moment.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -111,7 +111,7 @@ async fn visit(server: &Server, visits: usize) {
     };
     futures_util::future::join_all((0..AT_A_TIME).map(|_| visitor())).await;
     until("all are gone", async || {
-        let status = http::get(&server.url("/status")).await.json();
+        let status = server.status().await;
         status["simulations"].as_array().unwrap().is_empty() && instances_below(&server.folder).is_empty()
     })
     .await;

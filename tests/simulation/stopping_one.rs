@@ -4,13 +4,14 @@ use serde_json::json;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
 
-use super::scene::{Scene, State, arm, nothing_left};
+use super::ends::line;
+use super::scene::{Scene, State, nothing_left};
+use crate::support::SOON;
 use crate::support::client::Client;
 use crate::support::git::Forge;
 use crate::support::http::{self, PASSWORD, post};
-use crate::support::program::{Builder, Server, simulation_server};
+use crate::support::program::{Builder, Server, demo_server, simulation_server};
 use crate::support::webots::Webots;
-use crate::support::{SOON, until};
 
 const TOLD: &str = "loading: Error: Your teacher has stopped this simulation";
 
@@ -26,16 +27,6 @@ async fn stop(server: &Server, id: &str, body: &str) -> u16 {
     post(&path(server, id), Some(PASSWORD), body).await
 }
 
-async fn line(server: &Server, id: &str) -> String {
-    let file = server.folder.join("log/simulation/simulations.csv");
-    let find = || {
-        let text = std::fs::read_to_string(&file).unwrap_or_default();
-        text.lines().find(|line| line.starts_with(id)).map(str::to_owned)
-    };
-    until("its end is in simulations.csv", async || find().is_some()).await;
-    find().unwrap()
-}
-
 #[actix_rt::test]
 async fn a_simulation_is_stopped_in_any_state_and_its_client_hears_why() {
     for state in [State::Waiting, State::CheckingOut, State::Launching, State::Idle, State::Running] {
@@ -46,16 +37,16 @@ async fn a_simulation_is_stopped_in_any_state_and_its_client_hears_why() {
         let told = client.until("loading: Error:").await;
         assert_eq!(told, format!("{TOLD}: \u{2039}b\u{203a}Back to work"), "{state:?}");
         assert_eq!(client.closed().await, Some(1000), "{state:?}");
-        assert!(line(server, &id).await.contains(",administrator,"), "{state:?}");
+        assert_eq!(line(server, &id).await[10], "administrator", "{state:?}");
         assert_eq!(stop(server, &id, "").await, 404, "{state:?}");
         if let Some(other) = &mut scene.other {
             other.until(".").await;
         } else {
             nothing_left(server, 1).await;
         }
-        let metrics = http::get(&server.url("/metrics")).await.text();
+        let metrics = server.metrics().await;
         assert!(metrics.contains("webots_simulation_ends_total{reason=\"administrator\"} 1"), "{metrics}");
-        let page = http::get(&server.url("/monitor")).await.text();
+        let page = server.monitor().await;
         assert!(page.contains("The administrator has stopped it"), "{state:?}");
         assert!(!page.contains("to work"), "what a student was told is not for everybody");
     }
@@ -65,8 +56,7 @@ async fn a_simulation_is_stopped_in_any_state_and_its_client_hears_why() {
 async fn only_the_password_stops_a_simulation_and_no_page_of_another_site_does() {
     let (forge, webots) = (Forge::with_arm(), Webots::launcher());
     let server = with_password(simulation_server(&webots.path(), forge.path(), 2)).start().await;
-    let mut client = Client::start(&server, &arm()).await;
-    client.until("webots:").await;
+    let mut client = Client::ready(&server).await;
     let url = path(&server, client.id());
     assert_eq!(post(&url, None, "").await, 401);
     assert_eq!(post(&url, Some("guess"), "").await, 401);
@@ -80,8 +70,7 @@ async fn only_the_password_stops_a_simulation_and_no_page_of_another_site_does()
     assert_eq!(stop(&server, client.id(), &format!(r#"{{"reason": "{}"}}"#, "x".repeat(9000))).await, 413);
     client.until(".").await;
     // Without a reason, and with one that is too long.
-    let mut other = Client::start(&server, &arm()).await;
-    other.until("webots:").await;
+    let mut other = Client::ready(&server).await;
     assert_eq!(stop(&server, client.id(), "").await, 202);
     assert_eq!(client.until("loading: Error:").await, TOLD);
     assert_eq!(stop(&server, other.id(), &json!({"reason": "x\n".repeat(200)}).to_string()).await, 202);
@@ -89,8 +78,7 @@ async fn only_the_password_stops_a_simulation_and_no_page_of_another_site_does()
     assert!(told.len() < 400 && told.ends_with("..."), "{told}");
     // Without a password there are no actions.
     let server = simulation_server(&webots.path(), forge.path(), 1).start().await;
-    let mut client = Client::start(&server, &arm()).await;
-    client.until("webots:").await;
+    let mut client = Client::ready(&server).await;
     assert_eq!(post(&path(&server, client.id()), Some(PASSWORD), "").await, 403);
     client.until(".").await;
 }
@@ -114,8 +102,7 @@ async fn statuses(server: &Server, requests: &[String], count: usize) -> Vec<u16
 
 #[actix_rt::test]
 async fn a_body_belongs_to_its_request_and_holds_up_nobody() {
-    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
-    let server = with_password(simulation_server(&webots.path(), forge.path(), 1)).start().await;
+    let server = with_password(demo_server(1)).start().await;
     let post = |password: bool, more: &str, body: &str| {
         let password = if password { "Authorization: Basic YWRtaW46b3BlbiBzZXNhbWU=\r\n" } else { "" };
         format!("POST /simulations/1-1/stop HTTP/1.1\r\nHost: x\r\n{password}{more}\r\n{body}")
@@ -149,8 +136,7 @@ async fn a_stop_ends_no_simulation_that_has_come_in_the_place_of_another() {
     let server = builder().start().await;
     let mut ids = Vec::new();
     for _ in 0..3 {
-        let mut client = Client::start(&server, &arm()).await;
-        client.until("webots:").await;
+        let client = Client::ready(&server).await;
         ids.push(client.id().to_owned());
         client.close_with(1000).await;
         nothing_left(&server, 1).await;
@@ -158,8 +144,7 @@ async fn a_stop_ends_no_simulation_that_has_come_in_the_place_of_another() {
     drop(server);
     // Another run of the server counts from the beginning again, and gives the same place.
     let server = builder().start().await;
-    let mut client = Client::start(&server, &arm()).await;
-    client.until("webots:").await;
+    let mut client = Client::ready(&server).await;
     let id = client.id().to_owned();
     let number = id.split_once('-').unwrap().1;
     assert!(ids[0].ends_with(&format!("-{number}")) && !ids.contains(&id), "{ids:?} {id}");
@@ -169,24 +154,19 @@ async fn a_stop_ends_no_simulation_that_has_come_in_the_place_of_another() {
         assert!([404, 405].contains(&status), "{other}: {status}");
     }
     client.until(".").await;
-    assert_eq!(http::get(&server.url("/status")).await.json()["simulations"][0]["id"], id.as_str());
+    assert_eq!(server.status().await["simulations"][0]["id"], id.as_str());
 }
 
 #[actix_rt::test]
 async fn a_client_that_is_away_hears_of_the_stop_when_it_comes_back() {
-    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
-    let server = with_password(simulation_server(&webots.path(), forge.path(), 1)).start().await;
-    let mut client = Client::connect(&server.websocket("/client")).await;
-    client.send(&json!({"start": {"url": arm(), "resumable": true}}).to_string()).await;
-    let token = client.until("resume: ").await["resume: ".len()..].to_owned();
+    let server = with_password(demo_server(1)).start().await;
+    let (client, token) = Client::resumable(&server).await;
     let id = client.id().to_owned();
     drop(client);
-    let simulations = async || http::get(&server.url("/status")).await.json()["simulations"].clone();
-    until("it is away", async || simulations().await[0]["awayUntil"].is_u64()).await;
+    server.until_away(1).await;
     assert_eq!(stop(&server, &id, r#"{"reason": "That is enough"}"#).await, 202);
     nothing_left(&server, 1).await;
-    let mut back = Client::connect(&server.websocket("/client")).await;
-    back.send(&json!({ "resume": token }).to_string()).await;
+    let mut back = Client::resuming(&server, &token).await;
     let told = "this simulation has ended: Your teacher has stopped this simulation: That is enough";
     assert_eq!(back.until("").await, format!("loading: Error: {told}"));
     assert_eq!(back.closed().await, Some(1000));

@@ -12,7 +12,7 @@ use super::life::{children, guardian, is_there, quick};
 use super::scene::{DEMO, arm, instance_folders, nothing_left, stages};
 use crate::support::client::Client;
 use crate::support::git::Forge;
-use crate::support::program::simulation_server;
+use crate::support::program::{demo_server, server_of, simulation_server};
 use crate::support::until;
 use crate::support::webots::{Webots, instances_below};
 
@@ -29,8 +29,7 @@ async fn without_a_sandbox_the_group_ends_with_its_client_and_the_rest_with_the_
         ));
         let builder = quick(simulation_server(&webots.path(), forge.path(), 1)).set("isolation", "none");
         let mut server = builder.folder(folder.path()).start().await;
-        let mut client = Client::start(&server, &arm()).await;
-        client.until("webots:").await;
+        let client = Client::ready(&server).await;
         let told = || std::fs::read_to_string(&pids).unwrap_or_default();
         until("both are there", async || told().lines().count() == 2).await;
         let pid = |name| told().lines().find_map(|line| line.strip_prefix(name)?.trim().parse().ok()).unwrap();
@@ -42,12 +41,10 @@ async fn without_a_sandbox_the_group_ends_with_its_client_and_the_rest_with_the_
                 until("its group has ended", async || !is_there(stayed)).await;
                 until("its folder is gone", async || instance_folders(folder.path()).is_empty()).await;
                 assert!(is_there(left), "what has left the group ends with the server");
-                server.signal(Signal::SIGTERM);
-                assert_eq!(server.ended().await, Some(0));
+                server.stops().await;
             }
             "stop" => {
-                server.signal(Signal::SIGTERM);
-                assert_eq!(server.ended().await, Some(0));
+                server.stops().await;
             }
             _ => {
                 server.signal(Signal::SIGKILL);
@@ -61,21 +58,18 @@ async fn without_a_sandbox_the_group_ends_with_its_client_and_the_rest_with_the_
 
 #[actix_rt::test]
 async fn a_simulator_that_was_stopped_by_a_signal_ends() {
-    let forge = Forge::with_arm();
     let webots = Webots::script(&format!("{DEMO} \"$@\" &\nkill -STOP $$"));
-    let server = quick(simulation_server(&webots.path(), forge.path(), 1)).start().await;
-    let mut client = Client::start(&server, &arm()).await;
-    client.until("webots:").await;
+    let server = quick(server_of(webots, 1)).start().await;
+    let client = Client::ready(&server).await;
     client.leave().await;
     nothing_left(&server, 1).await;
 }
 
 #[actix_rt::test]
 async fn what_git_has_started_ends_with_its_client() {
-    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
     // As git's own child that reads the remote's folder.
     let wrapper = GitWrapper::new("case \"$*\" in *ls-remote*) sleep 1000;; esac");
-    let server = simulation_server(&webots.path(), forge.path(), 1).env("PATH", &wrapper.path()).start().await;
+    let server = demo_server(1).env("PATH", &wrapper.path()).start().await;
     let sleeps = || instances_below(&server.folder).iter().any(|one| one.1.starts_with("sleep"));
     let client = Client::start(&server, &arm()).await;
     until("git asks", async || sleeps()).await;
@@ -97,13 +91,10 @@ fn nest(folder: &Path, levels: usize) {
 
 #[actix_rt::test]
 async fn a_tree_of_20_000_nested_folders_is_removed_and_ends_nobody_elses_simulation() {
-    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
-    let server = simulation_server(&webots.path(), forge.path(), 2).files(1024).start().await;
-    let mut client = Client::start(&server, &arm()).await;
-    client.until("webots:").await;
+    let server = demo_server(2).files(1024).start().await;
+    let client = Client::ready(&server).await;
     let folder = instance_folders(&server.folder).remove(0);
-    let mut other = Client::start(&server, &arm()).await;
-    other.until("webots:").await;
+    let other = Client::ready(&server).await;
     nest(&folder, 20_000);
     client.leave().await;
     let begin = Instant::now();

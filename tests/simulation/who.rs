@@ -126,16 +126,6 @@ async fn one_user_has_a_share_of_the_places_wherever_it_is() {
 }
 
 #[actix_rt::test]
-async fn a_name_that_is_none_is_refused_in_words() {
-    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
-    let server = with_users(&webots, &forge, 1).start().await;
-    let mut client = Client::connect(&server.websocket("/client")).await;
-    client.send(&json!({"start": {"url": arm(), "name": ["anna"]}}).to_string()).await;
-    let told = client.until("loading: Error:").await;
-    assert!(told.contains("start.name: invalid type: sequence, expected a string"), "{told}");
-}
-
-#[actix_rt::test]
 async fn who_has_sent_too_many_passwords_is_not_taken_for_a_stranger() {
     let (forge, webots) = (Forge::new(), Webots::launcher());
     let server = with_users(&webots, &forge, 1).start().await;

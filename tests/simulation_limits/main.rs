@@ -46,7 +46,6 @@ fn main() {
         time::a_simulation_ends_at_its_time_limit_in_any_state,
     );
     run("time::who_is_away_at_the_time_limit_hears_it", time::who_is_away_at_the_time_limit_hears_it);
-    run("time::who_waits_or_checks_out_has_no_such_limit", time::who_waits_or_checks_out_has_no_such_limit);
     run("panics::a_client_leaves_nothing_in_any_state", panics::a_client_leaves_nothing_in_any_state);
     run("panics::a_webots_leaves_nothing_in_any_state", panics::a_webots_leaves_nothing_in_any_state);
     run("panics::an_actor_that_must_live_ends_the_server", panics::an_actor_that_must_live_ends_the_server);

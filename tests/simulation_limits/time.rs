@@ -54,30 +54,3 @@ pub async fn who_is_away_at_the_time_limit_hears_it() {
     assert_eq!(inside.server.ends.latest()[0].how.reason, EndReason::TimeLimit);
     inside.stop().await;
 }
-
-/// A checkout has a limit of its own (`timing.checkout`). In the line there is none: it moves, for those ahead have one.
-pub async fn who_waits_or_checks_out_has_no_such_limit() {
-    let inside = Inside::new(Stage::CheckingOut, |config| {
-        config.timeout = 1;
-        config.timing.checkout = Duration::from_secs(3);
-    })
-    .await;
-    let begin = Instant::now();
-    let mut client = inside.client().await;
-    let told = client.until("loading: Error:").await;
-    assert!(told.ends_with("took longer than 3 seconds"), "{told}");
-    assert!(begin.elapsed() >= Duration::from_secs(3));
-    inside.until_nothing_is_left().await;
-    inside.stop().await;
-
-    let inside = Inside::new(Stage::Idle, |config| config.timeout = 5).await;
-    let mut first = inside.client().await;
-    first.until("webots:").await;
-    let mut second = inside.client().await;
-    assert_eq!(second.until("queue").await, "queue: 0");
-    first.until("loading: Error: The time limit of 5 seconds was reached").await;
-    second.until("webots:").await;
-    second.leave().await;
-    inside.until_nothing_is_left().await;
-    inside.stop().await;
-}

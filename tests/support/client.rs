@@ -52,6 +52,42 @@ impl Client {
         client
     }
 
+    /// A client whose simulation of the world of [`arm`](super::git::arm) is ready.
+    pub async fn ready(server: &super::program::Server) -> Self {
+        let mut client = Self::start(server, &super::git::arm()).await;
+        client.until("webots:").await;
+        client
+    }
+
+    /// A client whose simulation is ready and that can come back to it, and its token.
+    pub async fn resumable(server: &super::program::Server) -> (Self, String) {
+        Self::connect(&server.websocket("/client")).await.start_resumable().await
+    }
+
+    /// A client that comes back with a token.
+    pub async fn resuming(server: &super::program::Server, token: &str) -> Self {
+        Self::connect(&server.websocket("/client")).await.resume(token).await
+    }
+
+    /// Asks for the world of [`arm`](super::git::arm), to be able to come back; waits until it is ready, and for the token.
+    pub async fn start_resumable(mut self) -> (Self, String) {
+        self.send(&serde_json::json!({"start": {"url": super::git::arm(), "resumable": true}}).to_string()).await;
+        self.until("webots:").await;
+        let token = self.token().await;
+        (self, token)
+    }
+
+    /// Comes back with a token.
+    pub async fn resume(mut self, token: &str) -> Self {
+        self.send(&serde_json::json!({ "resume": token }).to_string()).await;
+        self
+    }
+
+    /// The token that it is told next.
+    pub async fn token(&mut self) -> String {
+        self.until("resume: ").await.strip_prefix("resume: ").unwrap().to_owned()
+    }
+
     /// The same as through a web server, which says that the client has this address.
     pub async fn start_from(server: &super::program::Server, address: &str, world: &str) -> Self {
         let mut client = Self::try_from_address(server, address).await.unwrap_or_else(|error| panic!("{error}"));
@@ -74,6 +110,13 @@ impl Client {
             request.headers_mut().append(*name, value.parse().unwrap());
         }
         Self::new(tokio_tungstenite::connect_async(request).await.unwrap().0)
+    }
+
+    /// A viewer, once it has seen the scene.
+    pub async fn with_scene(mut self) -> Self {
+        self.send("x3d").await;
+        self.until("scene load completed").await;
+        self
     }
 
     /// The id of its simulation, once it was told.

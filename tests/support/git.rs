@@ -15,7 +15,7 @@ pub const WORLD: &str = "#VRML_SIM R2025a utf8\nWorldInfo { title \"Test\" basic
 
 impl Forge {
     pub fn new() -> Self {
-        Self { folder: tempfile::tempdir().unwrap() }
+        Self { folder: super::open_folder() }
     }
 
     /// A forge with `lab/arm`, whose branch `main` has `worlds/a.wbt` and a controller.

@@ -33,7 +33,12 @@ pub const PASSWORD: &str = "open sesame";
 
 /// Asks for a page with the password.
 pub async fn get_as_administrator(url: &str) -> Answer {
-    read(client().get(url).basic_auth("admin", PASSWORD)).await.unwrap()
+    get_with_password(url, PASSWORD).await
+}
+
+/// Asks for a page with any password.
+pub async fn get_with_password(url: &str, password: &str) -> Answer {
+    read(client().get(url).basic_auth("admin", password)).await.unwrap()
 }
 
 /// Posts a body, with a password where there is one. Returns the status.

@@ -23,6 +23,7 @@ pub mod stopwatch;
 pub mod webots;
 
 use std::io::Write;
+use std::os::unix::fs::PermissionsExt;
 use std::time::{Duration, Instant};
 
 use nix::sys::resource::{Resource, getrlimit, setrlimit};
@@ -35,6 +36,24 @@ pub fn needs(program: &str, package: &str) {
     let paths = std::env::var_os("PATH").unwrap();
     let is_there = std::env::split_paths(&paths).any(|folder| folder.join(program).is_file());
     assert!(is_there, "this test needs {program}: apt install {package}");
+}
+
+/// A folder that other users can read.
+pub fn open_folder() -> tempfile::TempDir {
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::set_permissions(folder.path(), PermissionsExt::from_mode(0o755)).unwrap();
+    folder
+}
+
+/// A folder with links to these programs alone, for PATH.
+pub fn programs(names: &[&str]) -> tempfile::TempDir {
+    let (folder, paths) = (open_folder(), std::env::var_os("PATH").unwrap());
+    for name in names {
+        let real = std::env::split_paths(&paths).map(|folder| folder.join(name)).find(|path| path.is_file());
+        let real = real.unwrap_or_else(|| panic!("this test needs {name}"));
+        std::os::unix::fs::symlink(real, folder.path().join(name)).unwrap();
+    }
+    folder
 }
 
 /// Says that a test, or a part of it, is left out here, and why. Not by a macro: what those print is shown for tests that fail

@@ -8,6 +8,8 @@ use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 use serde_json::Value;
 
+use super::git::Forge;
+use super::webots::Webots;
 use super::{SOON, holds_soon, http, ports, raise_file_limit};
 
 /// A server that was started for one test. It is killed with the test, and its log is printed if the test fails.
@@ -19,6 +21,7 @@ pub struct Server {
     pub port: u16,
     name: &'static str,
     _temporary: Option<tempfile::TempDir>,
+    _parts: Option<(Forge, Webots)>,
 }
 
 /// A server before it is started.
@@ -31,6 +34,7 @@ pub struct Builder {
     folder: Option<PathBuf>,
     files: Option<u32>,
     before: Option<String>,
+    parts: Option<(Forge, Webots)>,
 }
 
 /// A session server that watches these simulation servers (`HOST:PORT`).
@@ -59,9 +63,31 @@ pub fn simulation_server(webots: &Path, repositories: &Path, places: u16) -> Bui
         .env("DEMO_SIMULATOR_BIND", "127.0.0.1")
 }
 
+/// A simulation server with a forge of its own that has `lab/arm`, and with the demo simulator.
+pub fn demo_server(places: u16) -> Builder {
+    server_of(Webots::launcher(), places)
+}
+
+/// The same with this Webots.
+pub fn server_of(webots: Webots, places: u16) -> Builder {
+    let forge = Forge::with_arm();
+    let builder = simulation_server(&webots.path(), forge.path(), places);
+    Builder { parts: Some((forge, webots)), ..builder }
+}
+
 impl Builder {
     fn new(program: &'static str, name: &'static str, config: Value, port: u16) -> Self {
-        Self { program, name, config, port, environment: Vec::new(), folder: None, files: None, before: None }
+        Self {
+            program,
+            name,
+            config,
+            port,
+            environment: Vec::new(),
+            folder: None,
+            files: None,
+            before: None,
+            parts: None,
+        }
     }
 
     /// Sets a key of the configuration; `a.b` is a key of a part.
@@ -142,7 +168,19 @@ impl Builder {
             .stderr(log)
             .spawn()
             .unwrap();
-        Server { child, folder, port: self.port, name: self.name, _temporary: temporary }
+        Server { child, folder, port: self.port, name: self.name, _temporary: temporary, _parts: self.parts }
+    }
+
+    /// Starts the program, which has to end with this exit code and a line that says why. Beside it there is only the log, and
+    /// nothing where the code is that of a wrong configuration. Gives back the line.
+    pub async fn refused(self, code: i32) -> String {
+        let mut server = self.spawn();
+        assert_eq!(server.ended().await, Some(code), "{}", server.log());
+        let log = server.log();
+        let told: Vec<&str> = log.lines().filter(|line| line.starts_with("error: ")).collect();
+        let logged = log.lines().filter(|line| code != 2 && line.starts_with("20")).count();
+        assert!(told.len() == 1 && log.lines().count() == 1 + logged, "{log}");
+        told[0].to_owned()
     }
 
     /// Starts the program and waits until it answers.
@@ -201,6 +239,45 @@ impl Server {
         let crowd: Vec<_> = (0..clients).map(connect).collect();
         self.signal(Signal::SIGCONT);
         drop(crowd);
+    }
+
+    /// Asks the server to end, which it does in order.
+    pub async fn stops(&mut self) {
+        self.signal(Signal::SIGTERM);
+        assert_eq!(self.ended().await, Some(0));
+    }
+
+    /// What it tells programs.
+    pub async fn status(&self) -> Value {
+        http::get(&self.url("/status")).await.json()
+    }
+
+    /// The simulations that it has.
+    pub async fn simulations(&self) -> Vec<Value> {
+        self.status().await["simulations"].as_array().unwrap().clone()
+    }
+
+    /// Waits until so many simulations wait for their clients.
+    pub async fn until_away(&self, count: usize) {
+        let are_away =
+            async || self.simulations().await.iter().filter(|one| one["awayUntil"].is_u64()).count() == count;
+        super::until(&format!("{count} are away"), are_away).await;
+    }
+
+    /// What it tells Prometheus.
+    pub async fn metrics(&self) -> String {
+        http::get(&self.url("/metrics")).await.text()
+    }
+
+    /// What it tells visitors.
+    pub async fn monitor(&self) -> String {
+        http::get(&self.url("/monitor")).await.text()
+    }
+
+    /// Whether it is ready: the code, and why not.
+    pub async fn health(&self) -> (u16, String) {
+        let answer = http::try_get(&self.url("/health")).await.unwrap();
+        (answer.status.as_u16(), answer.text())
     }
 
     /// Waits until the server has ended by itself; gives back its exit code.

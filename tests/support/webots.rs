@@ -11,7 +11,7 @@ pub struct Webots {
 impl Webots {
     /// A script with this text below `#!/usr/bin/env bash`.
     pub fn script(text: &str) -> Self {
-        let folder = tempfile::tempdir().unwrap();
+        let folder = super::open_folder();
         let path = folder.path().join("webots");
         std::fs::write(&path, format!("#!/usr/bin/env bash\n{text}\n")).unwrap();
         std::fs::set_permissions(&path, std::fs::Permissions::from_mode(0o755)).unwrap();
@@ -43,4 +43,12 @@ pub fn instances_below(folder: &Path) -> Vec<(i32, String)> {
         })
         .map(|process| (process.pid(), process.cmdline().unwrap_or_default().join(" ")))
         .collect()
+}
+
+/// The folders of simulations in a cache.
+pub fn instance_folders_in(cache: &Path) -> Vec<PathBuf> {
+    let inside = |folder: PathBuf| std::fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.path());
+    let runs = inside(cache.join("runs"));
+    let is_instance = |path: &PathBuf| path.file_name().unwrap().to_string_lossy().starts_with("instance-");
+    runs.flat_map(inside).filter(is_instance).collect()
 }

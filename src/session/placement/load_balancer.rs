@@ -239,25 +239,6 @@ mod tests {
     }
 
     #[test]
-    fn a_server_gets_clients_from_its_first_report_until_it_is_lost_or_removed() {
-        let now = Instant::now();
-        let mut fleet = LoadBalancer::new(PlacementPolicy::default());
-        assert!(!fleet.available(now));
-        fleet.add("a");
-        assert_eq!((fleet.available(now), fleet.pick(now, |_| true)), (false, None));
-        fleet.report(&"a", now, load_only(20.0));
-        assert_eq!((fleet.available(now), fleet.pick(now, |_| true)), (true, Some("a")));
-        fleet.lose(&"a");
-        assert_eq!((fleet.available(now), fleet.effective_load(&"a")), (false, None));
-        fleet.report(&"a", now, load_only(20.0));
-        assert!(fleet.available(now));
-        fleet.remove(&"a");
-        assert_eq!((fleet.available(now), fleet.client_cost(&"a")), (false, None));
-        fleet.report(&"unknown", now, load_only(20.0));
-        assert!(!fleet.available(now));
-    }
-
-    #[test]
     fn a_report_decides_whether_a_server_takes_clients() {
         let instances = |present, places, accepting| Some(ClientCounts { present, places, arrivals: 7, accepting });
         for (why, load, instances, available) in [

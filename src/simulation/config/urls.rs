@@ -43,7 +43,7 @@ impl SimulationConfig {
     /// Returns the address at which this server itself reaches simulations.
     pub fn address_of_simulations(&self) -> Ipv4Addr {
         let bind = self.bind_of_containers();
-        if self.docker && !bind.is_unspecified() { bind } else { Ipv4Addr::LOCALHOST }
+        if bind.is_unspecified() { Ipv4Addr::LOCALHOST } else { bind }
     }
 
     fn client_urls(&self) -> ClientUrls {

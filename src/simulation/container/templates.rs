@@ -172,7 +172,8 @@ mod tests {
         }
         for kind in [ProjectKind::Editor, ProjectKind::Competition] {
             for debug in [false, true] {
-                assert!(Templates { folder: None, debug }.compose(kind).is_ok());
+                let template = Templates { folder: None, debug }.compose(kind).unwrap();
+                assert_eq!(template.text.contains("stdin_open: true"), debug, "{kind:?}");
             }
         }
     }

@@ -241,32 +241,6 @@ mod tests {
         SpawnSpec { grace: Duration::from_secs(20), ..SpawnSpec::new(command, Path::new("/nowhere")) }
     }
 
-    fn is_empty(group: i32) -> bool {
-        killpg(Pid::from_raw(group), None) == Err(Errno::ESRCH)
-    }
-
-    #[actix_rt::test]
-    async fn dropping_the_guard_or_the_future_kills_the_group() {
-        for drop_guard in [true, false] {
-            let (group, ended) =
-                ProcessGroup::start(&shell("trap '' TERM; sleep 1000 & sleep 1000"), Stdio::null(), Stdio::null())
-                    .unwrap();
-            let leader = group.leader();
-            assert!(!is_empty(leader));
-            if drop_guard {
-                drop(group);
-                assert_eq!(ended.await, ExitReason::Signal(9));
-            } else {
-                drop(ended);
-                let deadline = std::time::Instant::now() + Duration::from_secs(20);
-                while !is_empty(leader) {
-                    assert!(std::time::Instant::now() < deadline, "it lives on");
-                    actix_rt::time::sleep(POLL).await;
-                }
-            }
-        }
-    }
-
     #[actix_rt::test]
     async fn what_a_launcher_has_launched_gets_the_grace_time_too() {
         let folder = tempfile::tempdir().unwrap();

@@ -54,19 +54,3 @@ impl fmt::Debug for Token {
         out.write_str("Token")
     }
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_token_is_read_as_it_was_written_and_nothing_else_is() {
-        let token = Token::new(7);
-        assert_eq!(Token::parse(&token.reveal()), Some(token));
-        assert_ne!(Token::new(7), token);
-        for wrong in ["", "x", &token.reveal().repeat(2), &"0".repeat(47), &"g".repeat(48), &"+".repeat(48)] {
-            assert_eq!(Token::parse(wrong), None, "{wrong}");
-        }
-        assert_eq!(format!("{token:?}"), "Token");
-    }
-}

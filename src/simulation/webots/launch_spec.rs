@@ -1,7 +1,6 @@
 //! The launch specification: everything that one Webots is started with.
 
 use std::ffi::OsString;
-use std::net::{IpAddr, Ipv4Addr};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -132,9 +131,9 @@ impl LaunchSpec {
 
     /// Waits until it is ready at its port.
     pub fn until_ready(&self) -> impl Future<Output = ()> + use<> {
-        let of_container = self.containers.as_ref().map(|_| IpAddr::from(self.config.address_of_simulations()));
-        let forwarded = of_container.or_else(|| self.launcher.reached());
-        let address = forwarded.unwrap_or(Ipv4Addr::LOCALHOST.into());
-        until_answering((address, self.slot.port).into(), forwarded.is_some())
+        let own_network = self.launcher.reached();
+        let address = own_network.unwrap_or_else(|| self.config.address_of_simulations().into());
+        let is_forwarded = self.containers.is_some() || own_network.is_some();
+        until_answering((address, self.slot.port).into(), is_forwarded)
     }
 }
