@@ -6,7 +6,7 @@
 //! | module | contents |
 //! |---|---|
 //! | [`shared::text`] | untrusted texts, made safe to show |
-//! | [`shared::config`] | configuration files: loading, errors, kinds of values, keys with their defaults (`keys`) |
+//! | [`shared::config`] | configuration files: loading, errors, kinds of values, a macro for structs of keys (`keys`) |
 //! | [`shared::domain`] | addresses, loads, world URLs and the forges that they name (`project_url`), a server's report |
 //! | [`shared::run`] | start, readiness, log, stop |
 //! | [`shared::http`] | pages, live updates, WebSockets, limits, certificates, metrics |
@@ -17,11 +17,11 @@
 //! | [`session::web`] | routes, pages, `/status`, Prometheus metrics and the WebSocket of the session server |
 //! | [`simulation::process`] | process trees: how they start and end (`process_group`; what has left its group: `process_tree`); directories of simulations |
 //! | [`simulation::machine`] | readings of the machine and its GPUs, the load; which GPU a simulation gets (`spread`) |
-//! | [`simulation::checkout`] | worlds checked out with git, within limits of time and size (`checkout_limits`) |
-//! | `simulation::isolation` | how a simulation is launched: its level of isolation, environment and limits |
-//! | [`simulation::container`] | simulations in containers: what a project requests, its image, its compose project |
+//! | [`simulation::checkout`] | worlds checked out with git, within the limits that keys give (`timing.checkout`, `projectSize`) |
+//! | `simulation::isolation` | how a simulation is launched: its level of isolation, the variables that it inherits, limits |
+//! | [`simulation::container`] | simulations in containers: what a project requests, its image, its compose project (its GPU and user, too) |
 //! | [`simulation::ends`] | how simulations have ended: counter, table, their logs (`kept_output`) |
-//! | [`simulation::webots`] | one running Webots: command line, what it prints and its log (`output`), end |
+//! | [`simulation::webots`] | one running Webots: command line, its GPU (`launch_spec`), what it prints and its log (`output`), end |
 //! | [`simulation::client`] | one web client, the session of its simulation |
 //! | [`simulation::slots`] | the slots that clients wait for: leases, the queue (`slot_pool`), shares (`party`) |
 //! | [`simulation::sessions`] | how a connection is attached to its session, and how a client resumes it |
@@ -32,7 +32,7 @@
 //! The HTML of pages is in `templates/session` and `templates/simulation` (`row.html`: a row of the monitor's table), their
 //! styles and scripts in `templates/assets`.
 //!
-//! Each server also has a folder `config` (every key), its `app` (start and end) and its `state` (what its paths share). Files
+//! Each server also has a folder `config` (every key; time limits in `timing`), its `app` (start and end) and its `state` (what its paths share). Files
 //! of `simulation` are the wire [`protocol`](simulation::protocol), the `snapshot` of all simulations, the `simulation_id`, the
 //! `client_identity`, the `failed_starts`, the `announcer` (key `notify`), `preflight` (`--check`) and `readiness` (`/health`).
 //! The programs are in `src/bin`.

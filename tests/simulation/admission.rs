@@ -36,9 +36,6 @@ async fn a_world_runs_only_where_its_repository_is_allowed() {
         (format!("https://evil.org/github.com/lab/{end}"), not_allowed),
         (format!("https://github.com.evil.org/lab/arm/{end}"), not_allowed),
         (format!("https://github.com/LAB/Secret.git/{end}"), "Cannot run simulation from blocked repository"),
-        (format!("https://github.com/lab/secret.git.git/{end}"), "ends in .git more than once"),
-        ("https://github.com/lab/arm/-/blob/evil/worlds/a.wbt".to_owned(), "blocked repository"),
-        (format!("https://github.com/lab/%2e%2e/lab-evil/arm/{end}"), wrong),
         (format!("https://github.com@evil.org/lab/arm/{end}"), wrong),
     ];
     for (url, words) in table {

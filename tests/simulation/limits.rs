@@ -32,7 +32,7 @@ async fn sizes_are_limited() {
         String::from_utf8(made.stdout).unwrap().trim().to_owned()
     };
     let worlds = git(&work, &["rev-parse", "HEAD:worlds"]);
-    let words = [(4, "The project is larger than 1 MiB"), (7, "takes more memory than this simulation server allows")];
+    let words = [(4, "The project is larger than 1 MiB"), (7, "fatal: Out of memory")];
     for (levels, words) in words {
         let mut tree = worlds.trim().to_owned();
         for _ in 0..levels {

@@ -5,7 +5,7 @@ use std::time::SystemTime;
 
 use serde::Serialize;
 
-use super::server_record::ServerRecord;
+use super::server_record::{ServerRecord, ServerState};
 use crate::shared::domain::PublicAddress;
 use crate::shared::run::serialize_timestamp;
 
@@ -55,22 +55,6 @@ pub struct ServerStatus {
     pub client_cost: Option<f64>,
 }
 
-/// The state of a simulation server.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
-#[serde(rename_all = "lowercase")]
-pub enum ServerState {
-    /// It was not probed yet.
-    Unknown,
-    /// It accepts clients.
-    Up,
-    /// Its load leaves no room for one more client, or it has no free slot.
-    Full,
-    /// It accepts no new clients: it drains itself, the configuration drains it, or no name resolves to it any more.
-    Draining,
-    /// Its last probe failed.
-    Down,
-}
-
 /// A simulation server has changed its state, or lookups of a name have begun to fail or to succeed.
 #[derive(Debug, Clone, Serialize)]
 pub struct StateChange {
@@ -83,19 +67,6 @@ pub struct StateChange {
     pub state: ServerState,
     /// The reason, as text.
     pub why: String,
-}
-
-impl ServerState {
-    /// The name of the state in pages and metrics.
-    pub fn word(self) -> &'static str {
-        match self {
-            Self::Unknown => "unknown",
-            Self::Up => "up",
-            Self::Full => "full",
-            Self::Draining => "draining",
-            Self::Down => "down",
-        }
-    }
 }
 
 impl FleetStatus {

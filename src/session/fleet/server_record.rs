@@ -3,11 +3,28 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
-use super::fleet_status::ServerState;
+use serde::Serialize;
+
 use super::probe_error::ProbeError;
 use crate::session::mail::NoticeKind;
 use crate::session::placement;
 use crate::shared::domain::{ProjectUrl, ServerReport};
+
+/// The state of a simulation server.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum ServerState {
+    /// It was not probed yet.
+    Unknown,
+    /// It accepts clients.
+    Up,
+    /// Its load leaves no room for one more client, or it has no free slot.
+    Full,
+    /// It accepts no new clients: it drains itself, the configuration drains it, or no name resolves to it any more.
+    Draining,
+    /// Its last probe failed.
+    Down,
+}
 
 /// One simulation server.
 #[derive(Debug, Clone)]
@@ -43,6 +60,19 @@ pub struct ServerChange {
     pub why: String,
     /// What is mailed to the administrator.
     pub events: Vec<NoticeKind>,
+}
+
+impl ServerState {
+    /// The name of the state in pages and metrics.
+    pub fn word(self) -> &'static str {
+        match self {
+            Self::Unknown => "unknown",
+            Self::Up => "up",
+            Self::Full => "full",
+            Self::Draining => "draining",
+            Self::Down => "down",
+        }
+    }
 }
 
 impl ServerRecord {

@@ -3,8 +3,8 @@
 
 use std::collections::VecDeque;
 
-use super::fleet_status::{NameStatus, ServerState, StateChange};
-use super::server_record::{ServerChange, ServerRecord};
+use super::fleet_status::{NameStatus, StateChange};
+use super::server_record::{ServerChange, ServerRecord, ServerState};
 use crate::session::config::SessionConfig;
 use crate::session::mail::{self, Mailer, Notice, NoticeKind, Topic};
 use crate::shared::domain::PublicAddress;

@@ -54,10 +54,10 @@ pub enum CheckoutError {
 }
 
 impl CheckoutError {
-    /// Whether it is this server's fault, so that another server may do better: its cache, its disk, its network, its
-    /// processes.
+    /// Whether it is this server's fault, so that another server may do better: its disk, its network, its processes. A
+    /// cached repository may look broken because of what its owner has put there, and the next start has a new one.
     pub fn is_own(&self) -> bool {
-        matches!(self, Self::Machine(..) | Self::Damaged(..))
+        matches!(self, Self::Machine(..))
     }
 }
 

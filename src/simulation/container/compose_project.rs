@@ -10,7 +10,7 @@ use serde_json::{Value, json};
 use super::build_plan::{BuildPlan, PROJECT_PATH};
 use super::built_image::BuiltImage;
 use super::container_request::ContainerRequest;
-use super::gpu_access::GpuAccess;
+use super::gpu_detection::GpuAccess;
 use super::project_paths::ProjectPaths;
 use super::start_error::StartError;
 use super::templates::{CONTROLLER, WEBOTS};

@@ -8,7 +8,7 @@ mod container_request;
 mod container_service;
 mod docker;
 mod dockerfile;
-mod gpu_access;
+mod gpu_detection;
 mod image;
 mod image_export;
 mod network;

@@ -13,7 +13,7 @@ use serde::Serialize;
 use which::which;
 
 use super::cgroup::{Cgroup, Cgroups};
-use super::environment;
+use super::inherited_environment;
 use super::network::OwnNetwork;
 use super::program::Program;
 use super::sandbox::Sandbox;
@@ -276,7 +276,7 @@ impl Launcher {
     pub fn prepare(&self, mut program: Program<'_>) -> io::Result<(SpawnSpec, Option<Cgroup>)> {
         let cgroup = self.cgroups.as_ref().and_then(Cgroups::make);
         let mut command = cgroup.as_ref().map(Cgroup::joining).unwrap_or_default();
-        let mut environment = environment::allowed(&self.variables);
+        let mut environment = inherited_environment::allowed(&self.variables);
         environment.push(program.display.variable());
         environment.extend(program.variables.iter().cloned());
         if let Method::Sandbox(sandbox) = &self.method {

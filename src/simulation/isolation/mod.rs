@@ -5,7 +5,7 @@ mod disk;
 mod disk_use;
 mod display;
 mod docker_cgroup;
-mod environment;
+mod inherited_environment;
 mod keyrings;
 mod launcher;
 mod mount;
