@@ -69,8 +69,8 @@
 //! [`simulation::webots::Webots`] owns its process group, its instance directory and the lease of its slot through
 //! guards, so that all three are freed in any state, even after a panic. One [`simulation::process::guardian`] process
 //! ends everything that the simulation server has started once the server has exited for any reason.
-//! One `simulation::isolation::Watcher` measures what each simulation uses, and finds the ports on which starting
-//! simulations listen. One thread copies all streams that are relayed.
+//! One `simulation::isolation::Watcher` enforces the limits that the kernel does not, and notes what simulations use. One
+//! thread copies all streams that are relayed; the server exits if it panics.
 //!
 //! # What ends, and what restarts
 //!

@@ -108,7 +108,7 @@ pub async fn serve(assembly: Application) -> Result<(), AppError> {
         stop: Duration::from_secs(1),
         trusted_proxies: server.config.trusted_proxies.clone(),
     };
-    let simulations = server.launcher.reached().unwrap_or_else(|| server.config.address_of_simulations().into());
+    let simulations = server.launcher.reached().unwrap_or_else(|| server.config.address_of_simulations());
     let stream_thread = StreamThread::start();
     let stream_thread =
         stream_thread.map_err(|why| AppError::Unavailable(format!("streams can't be relayed: {why}")))?;

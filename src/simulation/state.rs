@@ -45,7 +45,7 @@ pub struct AppState {
     pub spread: Option<Arc<Spread>>,
     /// Launches simulations at a level of isolation.
     pub launcher: Arc<Launcher>,
-    /// Monitors the limits and the ports of simulations.
+    /// Monitors the limits of simulations.
     pub watcher: Watcher,
     /// Creates the containers of simulations; `None` if they don't run in containers.
     pub containers: Option<Arc<ContainerService>>,

@@ -56,15 +56,14 @@ export class Lifeline extends EventTarget {
     }
   }
 
-  /** The connection has closed, perhaps after an answer that asks for patience. */
-  broken(isAnswered = false) {
+  /** The connection has closed. */
+  broken() {
     this.#isLost = true;
     if (this.#tries > 0) {
       // Those who were lost together don't come back together.
       const pause = Math.min(LONGEST_PAUSE, FIRST_PAUSE * 2 ** (this.#tries - 1)) * (0.5 + Math.random());
       this.#next = Math.min(this.#next, Date.now() + pause);
-      if (!isAnswered)
-        this.#tell('refused');
+      this.#tell('refused');
     }
     this.#look();
   }

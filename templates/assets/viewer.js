@@ -13,8 +13,6 @@ let simulation;
 let viewer;
 /** Watches the connection of a simulation that one can come back to. */
 let lifeline;
-/** Why it may not come back yet. */
-let refusal;
 let countdown;
 /** Counts the time that a simulation has left which is paused. */
 let idling;
@@ -33,7 +31,6 @@ const FIRST_PAUSE = 1000;
 const ANNOUNCEMENT = 'announcement:';
 
 /** Who is told so is not out of luck: somebody leaves. */
-const SHARE = /Clients of your address have|You have \d+ places/;
 const BUSY = /no simulation server available|places .* are taken|Clients of your address have|You have \d+ places/i;
 /** Before a server is asked for again although one is free, doubled each time up to the longest, in milliseconds. */
 const FIRST_WAIT = 2000;
@@ -242,10 +239,7 @@ function follow(current, server, world, isBack = false) {
   // Who comes back hears it again, if it is still so.
   find('watched').hidden = true;
   on('failed', (why) => {
-    if (isBack && SHARE.test(why)) {
-      refusal = why;
-      lifeline?.broken(true);
-    } else if (isBack)
+    if (isBack)
       failed(ended(why));
     else
       refused(world, why);
@@ -258,10 +252,7 @@ function follow(current, server, world, isBack = false) {
     lifeline ??= watch(current.absence);
     headerLinks(true);
   });
-  on('broken', () => {
-    refusal = undefined;
-    lifeline?.broken();
-  });
+  on('broken', () => lifeline?.broken());
 }
 
 /** Who comes back to what has ended hears why, unless nobody came back in time. */
@@ -279,16 +270,14 @@ function watch(absence) {
   let isTold = false;
   on('lost', ({ since, left }) => {
     const waits = left > 0 ? `Your simulation waits another ${duration(left)}.` : 'Your simulation may have ended.';
-    notice(refusal ? `${refusal}.` : `No connection since ${duration(since)}.`, waits);
-    if (!refusal)
-      light('', 'No connection', 'It is tried again and again.');
+    notice(`No connection since ${duration(since)}.`, waits);
+    light('', 'No connection', 'It is tried again and again.');
     viewer?.stale?.();
     if (!isTold)
       find('spoken').textContent = `No connection. ${waits}`;
     isTold = true;
   });
   on('found', () => {
-    refusal = undefined;
     notice();
     showWord();
     if (isTold)
@@ -495,7 +484,7 @@ function leave() {
   clearTimeout(waiting?.timer);
   waiting = undefined;
   lifeline?.close();
-  lifeline = refusal = undefined;
+  lifeline = undefined;
   forget();
   notice();
   showWord();

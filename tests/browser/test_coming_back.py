@@ -103,36 +103,6 @@ class Offline(Running):
         self.leaves_nothing(page, server)
 
 
-class Share(Running):
-    # The web server in front of it says where a client is.
-    simulation = {"maxPlacesPerAddress": 1, "trustedProxies": ["127.0.0.1"], "timing": {"absence": 30}}
-
-    def keeps_to_the_rules(self, page):
-        """The header is sent to all, and not all allow it."""
-
-    def test_who_comes_back_to_an_address_that_has_its_share_waits_and_keeps_its_token(self):
-        page, server = self.running()
-        pid = self.pid(server)
-        page.tab.goto("about:blank")
-        until("it is away", lambda: server.status()["simulations"][0].get("awayUntil"))
-        # Where it comes back another one has the only place.
-        other = Client(server, "192.0.2.1", {"start": {"url": WORLD.format("playground")}})
-        until("the other one runs", lambda: len(server.status()["simulations"]) == 2)
-        page.from_address("192.0.2.1")
-        page.tab.go_back()
-        expect(page.tab.locator("#notice-text")).to_contain_text("Clients of your address have 1 places")
-        expect(page.tab.locator("#notice-advice")).to_contain_text("Your simulation waits another")
-        expect(page.tab.locator("#problem")).to_be_hidden()
-        self.assertEqual(len(page.tab.evaluate("JSON.parse(sessionStorage.getItem('simulation')).token")), 48)
-        tries = len([url for url in page.asked if url.endswith("/client")])
-        self.assertLess(tries, 8, "tries with growing pauses")
-        other.close()
-        expect(page.tab.locator("#notice")).to_be_hidden()
-        expect(page.tab.locator("[data-step=simulation].done")).to_be_visible()
-        self.assertEqual(self.pid(server), pid)
-        self.leaves_nothing(page, server)
-
-
 class Busy(Running):
     # Else the session server would take the port of the only place.
     session = {"port": free_ports(64) + 63}

@@ -35,7 +35,7 @@ async fn a_projects_own_dockerfile_is_built_once_for_all_who_want_it_and_what_it
         client.patiently("webots:", BUILT).await;
         let heard = client.heard.join("\n");
         for words in [
-            "loading: Step 5/8 : COPY . $PROJECT_PATH",
+            "loading: Step 5/9 : COPY . $PROJECT_PATH",
             "loading: docker-compose.yml of the project is not used here",
             "loading: .env of the project is not used here",
         ] {
@@ -148,7 +148,7 @@ async fn a_client_that_leaves_in_the_middle_of_a_build_ends_it() {
     let forge = with(&format!("FROM {NAME}\nLABEL test.long=yes\nRUN sleep 1000\n"));
     let server = server(forge.path(), 1).start().await;
     let mut client = Client::start(&server, &arm()).await;
-    client.patiently("loading: Step 4/5 : RUN sleep 1000", BUILT).await;
+    client.patiently("loading: Step 4/6 : RUN sleep 1000", BUILT).await;
     let builds = async || ask(&["ps", "--all", "--quiet", "--filter", "label=test.long=yes"]).lines().count();
     until("it is built", async || builds().await == 1).await;
     client.leave().await;

@@ -28,6 +28,16 @@ fn its_servers_and_its_door_are_those_of_the_demo_on_kubernetes() {
         assert_eq!(rules(&swarm), rules(&kubernetes));
         assert!(!rules(&swarm).is_empty(), "{rule}");
     }
+    // What keeps secrets from Webots, and forged headers from servers, is that of every door.
+    let door = read("nginx-door.conf");
+    for header in ["Authorization", "Cookie", "X-Forwarded-User", "X-Forwarded-For", "Forwarded", "Host", "Upgrade"] {
+        let rule = format!("proxy_set_header {header} ");
+        let rules = |conf: &str| -> Vec<String> {
+            conf.lines().map(str::trim).filter(|line| line.starts_with(&rule)).map(str::to_owned).collect()
+        };
+        assert!(!rules(&door).is_empty(), "{header}");
+        assert_eq!([rules(&swarm), rules(&kubernetes)], [rules(&door), rules(&door)]);
+    }
 }
 
 #[test]

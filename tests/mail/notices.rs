@@ -19,6 +19,7 @@ async fn a_notice_becomes_a_mail_in_plain_text() {
     assert_eq!(mail.field("from"), "fleet@example.org");
     assert_eq!(mail.recipients(), ["admin@example.org"]);
     assert_eq!(mail.header("To"), ["Admin <admin@example.org>"]);
+    assert_eq!(mail.header("Auto-Submitted"), ["auto-generated"]);
     assert_eq!((mail.header("Date").len(), mail.header("Message-ID").len()), (1, 1));
     assert_eq!(mail.subject(), "Simulation server not responding: sim1.example.org:2000");
     let now = humantime::format_rfc3339(std::time::SystemTime::now()).to_string();

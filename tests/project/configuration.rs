@@ -16,6 +16,8 @@ struct Kind {
     program: &'static str,
     heading: &'static str,
     aliases: &'static [&'static str],
+    /// The configuration with the least keys.
+    smallest: Value,
 }
 
 fn kinds() -> [Kind; 2] {
@@ -24,11 +26,13 @@ fn kinds() -> [Kind; 2] {
             program: env!("CARGO_BIN_EXE_session-server"),
             heading: "## Session server",
             aliases: SessionConfig::ALIASES,
+            smallest: json!({"simulationServers": []}),
         },
         Kind {
             program: env!("CARGO_BIN_EXE_simulation-server"),
             heading: "## Simulation server",
             aliases: SimulationConfig::ALIASES,
+            smallest: json!({}),
         },
     ]
 }
@@ -43,7 +47,7 @@ impl Kind {
 
     /// Every key with its default; of a part, as `part.key`.
     fn defaults(&self) -> BTreeMap<String, Value> {
-        let output = self.check("{}");
+        let output = self.check(&self.smallest.to_string());
         let Value::Object(all) = serde_json::from_slice(&output.stdout).unwrap() else { panic!("{output:?}") };
         let mut keys = BTreeMap::new();
         for (key, value) in all {
@@ -113,7 +117,11 @@ fn the_page_names_every_key_once_with_its_default_and_no_other() {
         assert_eq!(named, known, "{}", kind.heading);
         for (key, told) in &rows {
             let default = &defaults[key];
-            if told == "none" {
+            if told == "required" {
+                let output = kind.check("{}");
+                let told = String::from_utf8_lossy(&output.stderr);
+                assert!(output.status.code() == Some(2) && told.ends_with(&format!(" {key}: it is missing")), "{told}");
+            } else if told == "none" {
                 let empty = [json!(null), json!([]), json!({})];
                 assert!(empty.contains(default), "{key}: the page says none, it is {default}");
             } else {
@@ -159,7 +167,7 @@ fn a_password_may_lie_in_a_file_and_is_not_shown() {
     std::fs::write(secret.path(), "s3cret\n").unwrap();
     for (kind, key) in [(session, "mailSenderPassword"), (simulation, "adminPassword")] {
         let with = |value: Value| {
-            let mut config = json!({});
+            let mut config = kind.smallest.clone();
             config[key] = value;
             kind.check(&config.to_string())
         };
@@ -182,7 +190,7 @@ fn a_password_may_lie_in_a_file_and_is_not_shown() {
 #[test]
 fn engines_set_addresses_by_the_environment() {
     for kind in kinds() {
-        let mut config = json!({});
+        let mut config = kind.smallest.clone();
         config["server"] = "$FLEET_ADDRESS".into();
         config["publicUrl"] = "$FLEET_URL".into();
         let file = tempfile::NamedTempFile::new().unwrap();

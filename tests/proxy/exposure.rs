@@ -6,6 +6,7 @@ use super::fleet::Fleet;
 use super::rules::{Place, Rules};
 use super::users::oauth2_proxy;
 use super::web_server::{Kind, WebServer};
+use crate::support::http::PASSWORD;
 use crate::support::listener::listen;
 use crate::support::ports;
 
@@ -76,20 +77,22 @@ through_both!(an_editor_is_at_the_port_of_its_webots_and_500_more);
 /// A browser sends the administrator's password, and the cookie of who has signed in, to every path of their host; the web server
 /// tells simulation servers who that is.
 async fn no_simulation_gets_a_secret(rules: Rules) {
-    let fleet = Fleet::start(rules).await;
+    let fleet = Fleet::start_with(rules, |server| server.set("adminPassword", PASSWORD)).await;
     let visitor = fleet.browser.at("127.0.0.9");
     let webots = fleet.here.port + 1;
     listen(TcpListener::bind(("127.0.0.1", webots)).unwrap(), |request| {
         let head = request.head.to_lowercase();
-        let secrets = ["authorization", "cookie", "x-forwarded-user", "anna"];
+        let secrets = ["authorization", "cookie", "x-forwarded-user", "anna", "203.0.113.9"];
         Some((200, if secrets.iter().any(|secret| head.contains(secret)) { "told" } else { "nothing" }))
     });
     let secrets = [("authorization", "Basic YWRtaW46b3BlbiBzZXNhbWU="), ("cookie", "_oauth2_proxy=anna")];
+    let forged = [("x-forwarded-for", "203.0.113.9"), ("forwarded", "for=203.0.113.9")];
+    let secrets = [secrets, forged].concat();
     let url = |port: u16| format!("https://{}/{port}/", fleet.browser.host);
     assert_eq!(visitor.ask(&url(webots), &secrets).await.text(), "nothing");
-    // The server itself does: its answer to a wrong one says so.
+    // The server itself does: it would answer 401 without the password.
     let output = format!("{}output?id=none", url(fleet.here.port));
-    assert_eq!(fleet.browser.ask(&output, &[]).await.status, 404);
+    assert_eq!(visitor.ask(&output, &secrets).await.status, 404);
 }
 
 #[actix_rt::test]

@@ -95,7 +95,7 @@ impl Rules {
                 let changes = [("4180", port.to_string()), ("2000|3000", format!("{}|{}", here[0], there[0]))];
                 let changes = changes.each_ref().map(|(from, to)| (*from, to.as_str()));
                 let users = adapt(include_str!("../../deploy/nginx-users.conf"), &changes);
-                let last = "  proxy_set_header Forwarded \"\";\n";
+                let last = "\n  proxy_set_header Forwarded \"\";\n";
                 adapt(&Self::Nginx.text(place), &[(last, &format!("{last}{users}"))])
             }
             Self::Nginx => adapt(

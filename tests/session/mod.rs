@@ -7,6 +7,7 @@ mod discovery;
 mod door;
 mod mail;
 mod memory;
+mod names;
 mod placement;
 mod pushing;
 mod seeing;

@@ -55,7 +55,8 @@ async fn the_waiting_line_is_served_in_order_and_forgets_who_leaves() {
 async fn one_address_leaves_places_and_a_part_of_the_line_to_others() {
     let builder = demo_server(4).set("waitingLine", 4);
     let server = builder.set("maxPlacesPerAddress", 3).start().await;
-    let (greedy, other, third) = ("203.0.113.9", "203.0.113.10", "203.0.113.11");
+    let (greedy, greedy_too) = ("2001:db8::1", "2001:db8::2");
+    let (other, third) = ("2001:db8:0:1::1", "203.0.113.11");
     let mut inside = Vec::new();
     for _ in 0..3 {
         let mut client = Client::start_from(&server, greedy, &arm()).await;
@@ -68,7 +69,8 @@ async fn one_address_leaves_places_and_a_part_of_the_line_to_others() {
         assert_eq!(client.until("").await, format!("queue: {ahead}"));
         line.push(client);
     }
-    let told = Client::start_from(&server, greedy, &arm()).await.until("").await;
+    // The addresses of a /64 are one.
+    let told = Client::start_from(&server, greedy_too, &arm()).await.until("").await;
     let words =
         "loading: Error: Clients of your address have 3 places of this simulation server, and 3 more are waiting";
     assert!(told.starts_with(words), "{told}");

@@ -1,8 +1,10 @@
 //! A server that can start no simulation says so and is not offered; one that is limited says that too.
 
+use std::path::PathBuf;
+
 use serde_json::Value;
 
-use super::scene::arm;
+use super::scene::{arm, instance_folders, nothing_left};
 use crate::support::client::Client;
 use crate::support::git::Forge;
 use crate::support::program::{Server, demo_server, session_server, simulation_server};
@@ -123,4 +125,20 @@ async fn the_limit_of_files_is_raised_as_far_as_it_is_needed() {
     assert_eq!(soft, 128 + 10 * 8 + 300 * 2);
     let few = simulation_server(&webots.path(), forge.path(), 10).files(300).start().await;
     assert!(few.log().contains("300 files may be open, which is enough for 46 clients"), "{}", few.log());
+}
+
+#[actix_rt::test]
+async fn clients_that_leave_at_once_leave_no_folder() {
+    let (forge, webots) = (Forge::with_arm(), Webots::launcher());
+    let server = simulation_server(&webots.path(), forge.path(), 8).start().await;
+    let visitor = async |number: u64| {
+        for visit in 0..40 {
+            let client = Client::start(&server, &arm()).await;
+            actix_rt::time::sleep(std::time::Duration::from_millis((number + 5 * visit) % 50)).await;
+            client.leave().await;
+        }
+    };
+    futures_util::future::join_all((0..8).map(visitor)).await;
+    until("no folder is left", async || instance_folders(&server.folder) == Vec::<PathBuf>::new()).await;
+    nothing_left(&server, 8).await;
 }

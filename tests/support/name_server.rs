@@ -28,7 +28,7 @@ fn own_mounts() -> Option<&'static str> {
 }
 
 /// An address of the loopback for a name server of this process alone; `None` where it can't have the port.
-fn free_address() -> Option<Ipv4Addr> {
+pub fn free_address() -> Option<Ipv4Addr> {
     static LAST: AtomicU8 = AtomicU8::new(0);
     let process = u8::try_from(std::process::id() % 250).unwrap();
     loop {
@@ -43,7 +43,7 @@ fn free_address() -> Option<Ipv4Addr> {
 }
 
 /// A shell script after which a server finds its name server at this address, `None` where that can't be.
-fn asking(address: Ipv4Addr, folder: &std::path::Path) -> Option<String> {
+pub fn asking(address: Ipv4Addr, folder: &std::path::Path) -> Option<String> {
     let file = folder.join("resolv.conf");
     std::fs::write(&file, format!("nameserver {address}\noptions timeout:1 attempts:1\n")).unwrap();
     let mount = format!("mount --bind {} /etc/resolv.conf && exec \"$0\" \"$@\"", file.display());

@@ -41,8 +41,8 @@ pub struct SessionConfig {
     /// `{port}`. Default: none, and each is reached under its own address.
     #[serde(deserialize_with = "optional_expanded")]
     pub public_url: Option<PublicUrl>,
-    /// The simulation servers: HOST:PORT, HOST/PORT, or `dns+NAME:PORT` for all addresses of a name. Default:
-    /// none.
+    /// The simulation servers: HOST:PORT, HOST/PORT, or `dns+NAME:PORT` for all addresses of a name.
+    /// Required.
     pub simulation_servers: Vec<ServerEntry>,
     /// Those of `simulationServers` that get no new clients. They are still monitored. Default: none.
     pub drained_servers: Vec<PublicAddress>,
@@ -169,6 +169,7 @@ impl SessionConfig {
 
 impl Configuration for SessionConfig {
     const ALIASES: &'static [&'static str] = &[];
+    const REQUIRED: &'static [&'static str] = &["simulationServers"];
 
     fn complete(&mut self, _: &std::path::Path) -> Result<Vec<String>, InvalidValueError> {
         let mut warnings = Vec::new();

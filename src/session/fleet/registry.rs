@@ -1,8 +1,8 @@
 //! Actor: owns the state of the fleet; answers picks; publishes whether a server can take a client.
 //!
 //! One for the whole server, created at start; it never ends. It alone decides availability: it receives every report
-//! and every pick, so that a pick counts at once. It starts a monitor for each simulation server and for each name that
-//! resolves to some, and a new one after a panic.
+//! and every pick, so that a pick counts at once. It looks names up, and starts a monitor for each simulation server, a new one
+//! after a panic.
 
 use std::mem::discriminant;
 use std::net::IpAddr;

@@ -6,7 +6,7 @@
 use std::error::Error;
 
 use lettre::message::Mailbox;
-use lettre::message::header::ContentType;
+use lettre::message::header::{ContentType, HeaderName, HeaderValue};
 use lettre::transport::smtp::Error as SmtpError;
 use lettre::transport::smtp::authentication::Credentials;
 use lettre::transport::smtp::client::{Tls, TlsParameters};
@@ -59,7 +59,10 @@ impl SmtpRelay {
     /// When the SMTP server does not take it.
     pub(super) async fn deliver(&self, NoticeText { subject, body }: NoticeText) -> Result<String, String> {
         let message = Message::builder().from(self.from.clone()).to(self.to.clone()).subject(subject).message_id(None);
-        let message = message.header(ContentType::TEXT_PLAIN).body(body).map_err(|error| error.to_string())?;
+        let mut message = message.header(ContentType::TEXT_PLAIN).body(body).map_err(|error| error.to_string())?;
+        // Automatic responders must not answer (RFC 3834).
+        let name = HeaderName::new_from_ascii_str("Auto-Submitted");
+        message.headers_mut().insert_raw(HeaderValue::new(name, "auto-generated".to_owned()));
         // lettre's timeout covers connecting only. Its pool would reuse a connection after a timeout for the next
         // e-mail.
         let answer = async { self.transport()?.send(message).await }.await.map_err(|error| reason(&error))?;

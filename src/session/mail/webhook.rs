@@ -2,6 +2,8 @@
 //!
 //! Anybody who knows the URL can post there, so it is a secret: no log and no error contains it.
 
+use std::time::Duration;
+
 use serde_json::json;
 
 use crate::shared::config::Secret;
@@ -27,7 +29,8 @@ impl Webhook {
     pub(super) async fn deliver(&self, text: &str) -> Result<String, String> {
         // Messengers take what is in angle brackets for links and calls.
         let text: Vec<String> = text.lines().map(client_text).collect();
-        let mut connector = awc::Connector::new();
+        // The delivery as a whole has a timeout; awc has one of its own for connections that is shorter.
+        let mut connector = awc::Connector::new().timeout(Duration::from_hours(24));
         if let Some(config) = tls::client_config() {
             connector = connector.rustls_0_23(config);
         }

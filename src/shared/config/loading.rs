@@ -17,6 +17,8 @@ use crate::shared::text::one_line;
 pub trait Configuration: DeserializeOwned + Serialize {
     /// Aliases of keys.
     const ALIASES: &'static [&'static str];
+    /// Keys that must be there.
+    const REQUIRED: &'static [&'static str] = &[];
 
     /// Sets the values that depend on the machine and on the configuration file, and checks the rules between values.
     /// Returns warnings.
@@ -76,6 +78,10 @@ pub fn load<C: Configuration>(file: &Path) -> Result<LoadedConfig<C>, ConfigErro
         let problem = one_line(&source.to_string());
         wrong(if key == "." || key == "?" { problem } else { format!("{key}: {problem}") })
     })?;
+    let given: serde_json::Map<String, serde_json::Value> = serde_json::from_str(text).unwrap_or_default();
+    if let Some(key) = C::REQUIRED.iter().find(|key| !given.contains_key(**key)) {
+        return Err(wrong(format!("{key}: it is missing")));
+    }
     // A repeated key is reported once.
     unknown.retain(|key: &String| seen.insert(key.clone()));
     let known = known_keys(&config);

@@ -148,7 +148,8 @@ impl ProjectUrl {
     pub fn candidates(&self) -> Vec<Reading> {
         let inside = self.inside();
         let before_worlds = inside.len().saturating_sub(2);
-        (1..=before_worlds)
+        // No branch has more slashes.
+        (1..=before_worlds.min(12))
             .filter_map(|length| {
                 let reference = inside.get(..length)?.join("/");
                 let folder = inside.get(length..before_worlds)?.join("/");

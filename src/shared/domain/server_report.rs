@@ -25,10 +25,10 @@ pub struct ServerReport {
     #[serde(default, deserialize_with = "optional_object")]
     pub instances: Option<Instances>,
     /// Repositories whose worlds the server runs at any load.
-    #[serde(default)]
+    #[serde(default, deserialize_with = "prefixes")]
     pub allowed_repositories: Vec<UrlPrefix>,
     /// Repositories whose worlds it never runs.
-    #[serde(default)]
+    #[serde(default, deserialize_with = "prefixes")]
     pub blocked_repositories: Vec<UrlPrefix>,
     /// The highest load, in percent, at which other worlds may run; 0: never.
     #[serde(default)]
@@ -67,6 +67,12 @@ pub struct Instances {
 
 fn line<'de, D: serde::Deserializer<'de>>(deserializer: D) -> Result<String, D::Error> {
     String::deserialize(deserializer).map(|text| one_line(&text))
+}
+
+/// Prefixes that this version does not know guide nobody: their server enforces them itself.
+fn prefixes<'de, D: serde::Deserializer<'de>>(deserializer: D) -> Result<Vec<UrlPrefix>, D::Error> {
+    let texts = Vec::<String>::deserialize(deserializer)?;
+    Ok(texts.into_iter().filter_map(|text| UrlPrefix::try_from(text).ok()).collect())
 }
 
 fn optional_line<'de, D: serde::Deserializer<'de>>(deserializer: D) -> Result<Option<String>, D::Error> {

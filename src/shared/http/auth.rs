@@ -51,10 +51,7 @@ impl BasicAuth {
     /// When the password is missing or wrong, or `peer` has sent too many.
     pub fn check(&self, request: &HttpRequest, peer: Peer) -> Result<(), AuthError> {
         let given = password_of(request).ok_or(AuthError::NoPassword)?;
-        // A proxy that does not report client addresses shares one quota with all such proxies. While too many addresses
-        // are tracked, others may send no password.
-        let address = peer.rate_limit_key().unwrap_or(Ipv6Addr::UNSPECIFIED.into());
-        if self.attempts.check(address) != Some(true) {
+        if !self.may_try(peer) {
             return Err(AuthError::TooMany);
         }
         if given.as_bytes().ct_eq(self.password.reveal().as_bytes()).into() {
@@ -62,6 +59,12 @@ impl BasicAuth {
         }
         log::warn!("client {peer}: a wrong administrator password");
         Err(AuthError::NoPassword)
+    }
+
+    /// Whether a client may send one more password. A proxy that does not report client addresses shares one quota with all
+    /// such proxies. While too many addresses are tracked, others may send none.
+    fn may_try(&self, peer: Peer) -> bool {
+        self.attempts.check(peer.rate_limit_key().unwrap_or(Ipv6Addr::UNSPECIFIED.into())) == Some(true)
     }
 }
 
@@ -117,5 +120,21 @@ impl AuthError {
 impl actix_web::ResponseError for AuthError {
     fn error_response(&self) -> HttpResponse {
         self.answer()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::net::IpAddr;
+
+    use super::*;
+
+    #[test]
+    fn only_so_many_addresses_may_send_passwords() {
+        let auth = BasicAuth::new(serde_json::from_str("\"open sesame\"").unwrap());
+        let may_try = |number: u32| auth.may_try(Peer::Client(IpAddr::from((number << 8).to_be_bytes())));
+        let tried: Vec<bool> = (0..20_000).map(may_try).collect();
+        let limit = tried.iter().position(|may| !may).unwrap();
+        assert!((1_000..20_000).contains(&limit) && !tried[limit..].contains(&true), "{limit}");
     }
 }

@@ -38,7 +38,7 @@ impl ContentSecurityPolicy {
     fn new(run: &[String], data: &str, connect: &[String], [frames, ancestors]: [&str; 2], sandbox: &str) -> Self {
         let own = |sources: Vec<&str>| [vec!["'self'"], sources].concat().join(" ");
         let files = own(run.iter().map(String::as_str).filter(|source| !source.starts_with("ws")).collect());
-        let wasm = if run.is_empty() { "" } else { " 'wasm-unsafe-eval'" };
+        let wasm = if sandbox.is_empty() { "" } else { " 'wasm-unsafe-eval'" };
         let connect = own(connect.iter().map(String::as_str).collect());
         Self(format!(
             "default-src 'none'; script-src {files}{wasm}; style-src {files}; img-src {files}{data}; \

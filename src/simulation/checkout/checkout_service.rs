@@ -98,17 +98,20 @@ impl CheckoutService {
         progress: &SharedProgress,
     ) -> Result<Project, CheckoutError> {
         let instance = Arc::new(instance);
-        let (mut world, mut redirects) = (world.clone(), 0);
+        let (mut world, mut redirects, mut is_mended) = (world.clone(), 0, false);
         let checked_out = loop {
             match self.attempt(&world, &instance, progress).await {
                 Err(CheckoutError::Moved(..)) if redirects < redirect::MAX_REDIRECTS => {
                     redirects += 1;
                     world = self.resolver.moved(&world).await?;
                 }
+                Err(error @ CheckoutError::Damaged(..)) if !is_mended => {
+                    is_mended = true;
+                    self.mend(&world, &error).await?;
+                }
                 done => break done,
             }
         };
-        self.mend(&world, checked_out.as_ref().err()).await?;
         let (revision, WorkTree { size, pointers, world: file }) = checked_out?;
         let file = file?;
         let warning = (pointers > 0).then(|| lfs::warning(pointers, self.has_lfs));
@@ -124,10 +127,9 @@ impl CheckoutService {
         })
     }
 
-    /// Discards a cached repository that has turned out to be corrupt, so that the next start fetches it anew.
-    async fn mend(&self, world: &ProjectUrl, failure: Option<&CheckoutError>) -> Result<(), CheckoutError> {
-        let Some(failure @ CheckoutError::Damaged(..)) = failure else { return Ok(()) };
-        log::warn!("{failure}. The cached repository is broken: it is fetched anew for the next client");
+    /// Discards a cached repository that has turned out to be corrupt.
+    async fn mend(&self, world: &ProjectUrl, failure: &CheckoutError) -> Result<(), CheckoutError> {
+        log::warn!("{failure}. The cached repository is broken: it is fetched anew");
         self.resolver.discard(world).await
     }
 
@@ -173,8 +175,11 @@ impl CheckoutService {
     pub async fn restore_controller(&self, project: &Project, file: &str) -> Result<(), CheckoutError> {
         let refused = || CheckoutError::NoController(file.to_owned());
         let path = file_restore::controller(&project.revision.folder, file).ok_or_else(refused)?;
-        let restored = self.restore(project, &path).await;
-        self.mend(&project.url, restored.as_ref().err()).await?;
+        let mut restored = self.restore(project, &path).await;
+        if let Err(error @ CheckoutError::Damaged(..)) = &restored {
+            self.mend(&project.url, error).await?;
+            restored = self.restore(project, &path).await;
+        }
         if restored? { Ok(()) } else { Err(refused()) }
     }
 

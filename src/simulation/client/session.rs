@@ -46,6 +46,8 @@ pub struct Session {
     /// What it keeps for a client that returns.
     pub(super) resumption: Resumption,
     pub(super) is_watched: bool,
+    /// The reset of a controller, while it runs.
+    resetting: Option<SpawnHandle>,
 }
 
 /// Interval of `absence` messages to a client that may return, which show that the connection works.
@@ -73,6 +75,7 @@ impl Session {
                 is_ready: false,
                 resumption: Resumption::default(),
                 is_watched: false,
+                resetting: None,
             };
             session.request_slot(&request.url, ctx);
             session
@@ -115,15 +118,19 @@ impl Session {
         let State::Launched(WebotsHandle(webots)) = &self.state else {
             return self.text(protocol::nothing_to_reset());
         };
+        if self.resetting.is_some() {
+            return log::info!("{}: a controller is being reset already", self.name());
+        }
         let restored = webots.send(ResetController(file.clone())).into_actor(self);
-        restored
-            .map(move |answer, this, _| match answer {
+        self.resetting = Some(ctx.spawn(restored.map(move |answer, this, _| {
+            this.resetting = None;
+            match answer {
                 Ok(Ok(())) => this.text(protocol::reset_controller(&file)),
                 // This error does not end the simulation.
                 Ok(Err(error)) => this.text(protocol::error(&error.to_string())),
                 Err(error) => log::warn!("{}: no controller was reset: {error}", this.name()),
-            })
-            .spawn(ctx);
+            }
+        })));
     }
 
     fn exited(&mut self, WebotsExit { clean, own, why }: &WebotsExit, ctx: &mut Context<Self>) {

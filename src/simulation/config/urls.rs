@@ -41,9 +41,12 @@ impl SimulationConfig {
     }
 
     /// Returns the address at which this server itself reaches simulations.
-    pub fn address_of_simulations(&self) -> Ipv4Addr {
-        let bind = self.bind_of_containers();
-        if bind.is_unspecified() { Ipv4Addr::LOCALHOST } else { bind }
+    pub fn address_of_simulations(&self) -> IpAddr {
+        let bind = match self.bind {
+            IpAddr::V6(bind) if !self.docker && self.ports_are_public() => bind.into(),
+            _ => IpAddr::V4(self.bind_of_containers()),
+        };
+        if bind.is_unspecified() { Ipv4Addr::LOCALHOST.into() } else { bind }
     }
 
     fn client_urls(&self) -> ClientUrls {

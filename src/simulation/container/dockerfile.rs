@@ -73,6 +73,8 @@ impl Dockerfile {
             return Err(wrong(first, &instruction, "the file ends within it"));
         }
         found.text.push_str(OPEN_HOME);
+        // What the project says of it does not count. Writing to a string can't fail.
+        writeln!(found.text, "LABEL {LABEL}={owner}").ok();
         Ok(found)
     }
 
@@ -133,8 +135,10 @@ mod tests {
         let expected = "# a comment\nARG IMAGE\nfrom $IMAGE \\\n  as base\nLABEL webots-fleet.owner=x\nRUN a \\\n  # inside\n  \
                         FROM b\nFROM scratch\nLABEL webots-fleet.owner=x\n";
         let found = Dockerfile::read(text, "x").unwrap();
+        // The last one counts, whatever the project says.
+        let end = format!("{OPEN_HOME}LABEL webots-fleet.owner=x\n");
         assert_eq!(
-            (found.text.strip_suffix(OPEN_HOME), found.bases),
+            (found.text.strip_suffix(end.as_str()), found.bases),
             (Some(expected), vec!["$IMAGE".to_owned(), "scratch".to_owned()])
         );
     }

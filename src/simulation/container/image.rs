@@ -13,7 +13,7 @@ use super::compose_project::DEFAULT_MEMORY;
 use super::docker::{Docker, DockerError, SHORT_TIMEOUT};
 use super::dockerfile::LABEL;
 use super::owned_resources::{ResourceOwner, digest};
-use super::start_error::{StartError, is_disk_full};
+use super::start_error::{StartError, blame, is_disk_full};
 use super::steps;
 use crate::simulation::checkout::{OnProgress, Project, SingleFlight};
 use crate::simulation::config::SimulationConfig;
@@ -95,11 +95,13 @@ impl Images {
         if let Some(config) = self.inspect(&name, CONFIG).await? {
             return Ok(BuiltImage::read(name, &config)?);
         }
+        let is_projects = build.folder.is_some();
         let (this, project, tag) = (Arc::clone(self), Arc::clone(project), name.clone());
         let job = |sender| async move { this.build_now(&tag, &project, build, sender).await };
         self.jobs.join(name.clone(), progress, job).await?;
-        let config = self.inspect(&name, CONFIG).await?;
-        Ok(BuiltImage::read(name, &config.ok_or_else(|| StartError::Server(REMOVED.to_owned()))?)?)
+        let inspect = ["image", "inspect", "--format", CONFIG, &name];
+        let config = self.docker.run(&inspect, SHORT_TIMEOUT).await.map_err(|error| blame(is_projects, error))?;
+        Ok(BuiltImage::read(name, config.trim())?)
     }
 
     async fn build_now(
@@ -109,7 +111,8 @@ impl Images {
         build: ImageBuild,
         sender: watch::Sender<String>,
     ) -> Result<(), StartError> {
-        let _permit = self.permit(&sender).await?;
+        // What has no step of a project takes seconds.
+        let _permit = if build.folder.is_some() { Some(self.permit(&sender).await?) } else { None };
         let ImageBuild { dockerfile, folder, arguments } = build;
         let (instance, root) = (project.instance.path().to_owned(), project.folder().to_owned());
         let prepare = move || {

@@ -5,9 +5,6 @@ use super::docker::{Docker, DockerError, SHORT_TIMEOUT};
 /// The option by which containers in a network can't reach each other.
 const ALONE: &str = "com.docker.network.bridge.enable_icc=false";
 
-/// What Docker says of a network that exists.
-const KNOWN: [&str; 2] = ["already exists", "have same bridge name"];
-
 /// Creates the network of this name, which is also that of its interface, unless it exists.
 ///
 /// # Errors
@@ -17,8 +14,11 @@ pub async fn join(docker: &Docker, name: &str) -> Result<(), DockerError> {
     let interface = format!("com.docker.network.bridge.name={name}");
     let create = ["network", "create", "--driver", "bridge", "--opt", &interface, "--opt", ALONE, name];
     match docker.run(&create, SHORT_TIMEOUT).await {
+        Err(DockerError::Failed { message, .. }) if message.contains("already exists") => Ok(()),
         // Two that are created at the same time would have the same interface, which Docker refuses.
-        Err(DockerError::Failed { message, .. }) if KNOWN.iter().any(|words| message.contains(words)) => Ok(()),
+        Err(DockerError::Failed { message, .. }) if message.contains("have same bridge name") => {
+            docker.run(&["network", "inspect", name], SHORT_TIMEOUT).await.map(drop)
+        }
         created => created.map(drop),
     }
 }

@@ -75,7 +75,10 @@ pub async fn run_cleanup(
                 RETRY_INTERVAL
             }
             // Docker does not answer, or another process removes the same.
-            _ => RETRY_INTERVAL,
+            failed => {
+                log::debug!("what was left is not removed yet: {failed:?}");
+                RETRY_INTERVAL
+            }
         };
         let reserve = config.disk_reserve;
         let is_full = actix_rt::task::spawn_blocking(move || is_disk_full(reserve)).await.unwrap_or_default();

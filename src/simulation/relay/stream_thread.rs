@@ -39,7 +39,11 @@ impl StreamThread {
         let shared = Arc::new(Shared { epoll, streams: Mutex::default(), next: AtomicU64::new(0) });
         let (buffer, interrupted, closing) = (vec![0; BUFFER], BTreeSet::new(), VecDeque::new());
         let copier = Copier { shared: Arc::clone(&shared), buffer, interrupted, closing };
-        std::thread::Builder::new().name("streams".to_owned()).spawn(move || copier.run())?;
+        std::thread::Builder::new().name("streams".to_owned()).spawn(move || {
+            // Without it all streams would stand still: the service manager restarts the server.
+            std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| copier.run())).ok();
+            std::process::abort()
+        })?;
         Ok(Self(shared))
     }
 

@@ -44,6 +44,10 @@ impl ViewRequests {
                 _ => {}
             }
         }
+        // The codec looks at the size of a frame once all of it is there.
+        if self.unread.len() > MAX_MESSAGE + 14 {
+            return Err(io::ErrorKind::InvalidData.into());
+        }
         Ok(kept.freeze())
     }
 }

@@ -132,7 +132,7 @@ impl LaunchSpec {
     /// Waits until it is ready at its port.
     pub fn until_ready(&self) -> impl Future<Output = ()> + use<> {
         let own_network = self.launcher.reached();
-        let address = own_network.unwrap_or_else(|| self.config.address_of_simulations().into());
+        let address = own_network.unwrap_or_else(|| self.config.address_of_simulations());
         let is_forwarded = self.containers.is_some() || own_network.is_some();
         until_answering((address, self.slot.port).into(), is_forwarded)
     }

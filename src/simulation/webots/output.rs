@@ -126,7 +126,7 @@ pub fn follow(
                 take(line);
             });
             if debt > FREE {
-                std::thread::sleep(Duration::from_millis(1000 * debt / limit.max(1)));
+                std::thread::sleep(Duration::from_micros(1_000_000 * debt / limit.max(1)));
                 debt = 0;
             }
         }
