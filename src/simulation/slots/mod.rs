@@ -10,4 +10,4 @@ mod slot_pool;
 pub use messages::{GetSnapshot, StopOne};
 pub use slot_event::SlotEvent;
 pub use slot_lease::{Slot, SlotLease, update};
-pub use slot_pool::{SlotPool, is_free};
+pub use slot_pool::SlotPool;

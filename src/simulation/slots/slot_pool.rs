@@ -159,7 +159,7 @@ impl SlotPool {
 }
 
 /// Whether no program listens on a port, over IPv4 or IPv6; a machine may have only one of them.
-pub fn is_free(port: u16) -> bool {
+fn is_free(port: u16) -> bool {
     let is_taken = |error: std::io::Error| error.kind() == ErrorKind::AddrInUse;
     TcpListener::bind((Ipv4Addr::UNSPECIFIED, port)).is_ok()
         && !TcpListener::bind((Ipv6Addr::UNSPECIFIED, port)).is_err_and(is_taken)

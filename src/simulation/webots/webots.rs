@@ -21,7 +21,6 @@ use crate::simulation::checkout::CheckoutError;
 use crate::simulation::container::StartError;
 use crate::simulation::ends::{EndReason, Taken};
 use crate::simulation::process::ProcessGroup;
-use crate::simulation::slots::is_free;
 use crate::simulation::snapshot::Stage;
 use crate::simulation::streams::StreamRegistration;
 
@@ -131,7 +130,7 @@ impl Webots {
     /// Starts the process, and calls [`Self::ended`] when it has ended.
     fn spawn(&mut self, target: LaunchTarget, ctx: &mut Context<Self>) -> std::io::Result<()> {
         // Another program may have taken it during the checkout, and would be taken for Webots.
-        if !is_free(self.spec.slot.port) {
+        if self.spec.is_port_taken() {
             return Err(std::io::ErrorKind::AddrInUse.into());
         }
         let (Launched { group, cgroup, tail, log, peak }, ended) =
