@@ -5,8 +5,8 @@ use std::io;
 use actix::{Actor, AsyncContext, StreamHandler};
 use actix_http::ws::{Codec, Frame, Item};
 use actix_web::web::{Bytes, BytesMut, Payload};
-use actix_web::{HttpRequest, HttpResponse};
-use actix_web_actors::ws::{self, CloseCode, CloseReason, Message, ProtocolError, WebsocketContext};
+use actix_web::{HttpRequest, HttpResponse, ResponseError};
+use actix_web_actors::ws::{self, CloseCode, CloseReason, HandshakeError, Message, ProtocolError, WebsocketContext};
 use bytestring::ByteString;
 use futures_util::stream::{self, Stream, StreamExt};
 use tokio_util::codec::Decoder;
@@ -107,25 +107,55 @@ impl MessageReader {
     }
 }
 
+/// Takes the frames of a client out of the bytes that it sends.
+pub struct FrameReader {
+    codec: Codec,
+    /// What is no whole frame yet.
+    unread: BytesMut,
+}
+
+impl Default for FrameReader {
+    fn default() -> Self {
+        Self { codec: Codec::new().max_size(MAX_MESSAGE), unread: BytesMut::new() }
+    }
+}
+
+impl FrameReader {
+    /// Adds bytes of the client.
+    pub fn add(&mut self, bytes: &[u8]) {
+        self.unread.extend_from_slice(bytes);
+    }
+
+    /// The next frame; `None` while it is incomplete.
+    ///
+    /// # Errors
+    /// When it is too large or breaks the rules of WebSockets.
+    pub fn take(&mut self) -> Result<Option<Frame>, ProtocolError> {
+        let frame = self.codec.decode(&mut self.unread)?;
+        // The codec tells that a frame is too large only when all of it is there.
+        if frame.is_none() && self.unread.len() > MAX_MESSAGE + FRAME_HEADER {
+            return Err(ProtocolError::Overflow);
+        }
+        Ok(frame)
+    }
+}
+
 /// The messages of a client. Bytes are read only once all messages before them were taken: actix' own stream reads on
-/// while messages wait, and tells that a message is too large only when all of it is there, so that one client could fill
-/// the memory.
+/// while messages wait, so that one client could fill the memory.
 fn messages(payload: Payload) -> impl Stream<Item = Result<Message, ProtocolError>> {
-    let codec = Codec::new().max_size(MAX_MESSAGE);
-    stream::unfold((payload, codec, BytesMut::new()), async |(mut payload, mut codec, mut unread)| {
+    stream::unfold((payload, FrameReader::default()), async |(mut payload, mut frames)| {
         let message = loop {
-            match codec.decode(&mut unread) {
+            match frames.take() {
                 Ok(Some(frame)) => break message(frame),
-                Ok(None) if unread.len() > MAX_MESSAGE + FRAME_HEADER => break Err(ProtocolError::Overflow),
                 Ok(None) => {}
                 Err(error) => break Err(error),
             }
             match payload.next().await? {
-                Ok(bytes) => unread.extend_from_slice(&bytes),
+                Ok(bytes) => frames.add(&bytes),
                 Err(error) => break Err(ProtocolError::Io(io::Error::other(error))),
             }
         };
-        Some((message, (payload, codec, unread)))
+        Some((message, (payload, frames)))
     })
 }
 
@@ -138,6 +168,11 @@ fn message(frame: Frame) -> Result<Message, ProtocolError> {
         Frame::Close(reason) => Message::Close(reason),
         Frame::Continuation(item) => Message::Continuation(item),
     })
+}
+
+/// The answer to a request that can't be upgraded to a WebSocket.
+pub fn refuse(error: &HandshakeError) -> HttpResponse {
+    HttpResponse::build(error.error_response().status()).body(format!("Error: this is a WebSocket: {error}."))
 }
 
 /// Upgrades a request to a WebSocket that the given actor serves, or answers with the error. The actor must pass all
@@ -154,9 +189,6 @@ where
             ctx.add_stream(messages(payload));
             actor
         })),
-        Err(error) => {
-            let status = actix_web::ResponseError::error_response(&error).status();
-            HttpResponse::build(status).body(format!("Error: this is a WebSocket: {error}."))
-        }
+        Err(error) => refuse(&error),
     }
 }

@@ -4,23 +4,19 @@ use std::io;
 
 use actix_http::ws::{Codec, Frame, Message};
 use actix_web::web::{Bytes, BytesMut};
-use tokio_util::codec::{Decoder, Encoder};
+use tokio_util::codec::Encoder;
 
-/// Size limit of a message, in bytes.
-const MAX_MESSAGE: usize = 8 * 1024;
+use crate::shared::http::websocket::FrameReader;
 
 /// Reads what a read-only client sends.
 pub struct ViewRequests {
-    from_client: Codec,
+    from_client: FrameReader,
     to_webots: Codec,
-    /// What is no whole frame yet.
-    unread: BytesMut,
 }
 
 impl Default for ViewRequests {
     fn default() -> Self {
-        let from_client = Codec::new().max_size(MAX_MESSAGE);
-        Self { from_client, to_webots: Codec::new().client_mode(), unread: BytesMut::new() }
+        Self { from_client: FrameReader::default(), to_webots: Codec::new().client_mode() }
     }
 }
 
@@ -30,9 +26,9 @@ impl ViewRequests {
     /// # Errors
     /// When the client closes or violates the protocol.
     pub fn filter(&mut self, sent: &[u8], has_answered: bool) -> io::Result<Bytes> {
-        self.unread.extend_from_slice(sent);
+        self.from_client.add(sent);
         let mut kept = BytesMut::new();
-        while let Some(frame) = self.from_client.decode(&mut self.unread).map_err(io::Error::other)? {
+        while let Some(frame) = self.from_client.take().map_err(io::Error::other)? {
             match frame {
                 Frame::Text(text) if !has_answered => {
                     let text = String::from_utf8_lossy(&text).into_owned();
@@ -43,10 +39,6 @@ impl ViewRequests {
                 Frame::Close(_) => return Err(io::ErrorKind::UnexpectedEof.into()),
                 _ => {}
             }
-        }
-        // The codec looks at the size of a frame once all of it is there.
-        if self.unread.len() > MAX_MESSAGE + 14 {
-            return Err(io::ErrorKind::InvalidData.into());
         }
         Ok(kept.freeze())
     }

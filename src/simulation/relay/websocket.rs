@@ -1,12 +1,12 @@
 //! The WebSocket of a stream: its handshake with both ends.
 
 use actix_rt::time::timeout;
-use actix_web::{HttpRequest, HttpResponse, ResponseError};
+use actix_web::{HttpRequest, HttpResponse};
 use actix_web_actors::ws;
 
 use super::stream::Stream;
 use super::upstream::{ANSWER_TIMEOUT, Upstream};
-use crate::shared::http::upgrade;
+use crate::shared::http::{upgrade, websocket};
 
 /// Connects a client with the WebSocket at this URL, or answers why that can't be. A client that is `read_only` can only
 /// request a kind of stream. `held` is dropped with the connection.
@@ -19,10 +19,7 @@ pub async fn connect(
 ) -> HttpResponse {
     let mut response = match ws::handshake(request) {
         Ok(response) => response,
-        Err(error) => {
-            let status = error.error_response().status();
-            return HttpResponse::build(status).body(format!("Error: this is a WebSocket: {error}."));
-        }
+        Err(error) => return websocket::refuse(&error),
     };
     let (webots, from_webots) = match timeout(ANSWER_TIMEOUT, upstream.open_websocket(url)).await {
         Ok(Ok(opened)) => opened,
