@@ -13,6 +13,7 @@ use super::mail_address;
 use super::server_entry::ServerEntry;
 use super::timing::Timing;
 use crate::session::placement::PlacementPolicy;
+use crate::shared::config::keys::keys;
 use crate::shared::config::{
     Configuration, ExpandedPath, InvalidValueError, Secret, expanded, folder, is_web_url, local_address, object,
     one_or_many, optional_expanded, optional_whole, percent, require, seconds, whole,
@@ -20,89 +21,91 @@ use crate::shared::config::{
 use crate::shared::domain::{ClientUrls, PublicAddress, PublicUrl, check_host};
 use crate::shared::http::TrustedProxies;
 
+keys! {
 /// Every key of the session server. The original's keys keep their meaning.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(rename_all = "camelCase", default)]
 pub struct SessionConfig {
     /// Fully qualified domain name of the session server. Default: `localhost`, with a warning.
     #[serde(deserialize_with = "expanded")]
-    pub server: String,
+    pub server: String = String::new(),
     /// Whether URLs begin with `https` and `wss`. Default: true.
-    pub ssl: bool,
+    pub ssl: bool = true,
     /// Local port; 0 takes any free one. Default: 1999.
     #[serde(deserialize_with = "whole::<0, 65535, _, _>")]
-    pub port: u16,
+    pub port: u16 = 1999,
     /// Local address to listen on. Default: `::`, all addresses of IPv4 and IPv6.
     #[serde(deserialize_with = "local_address")]
-    pub bind: IpAddr,
+    pub bind: IpAddr = Ipv6Addr::UNSPECIFIED.into(),
     /// Whether a reverse proxy rewrites ports in URLs: HOST/PORT, not HOST:PORT. Default: true.
-    pub port_rewrite: bool,
+    pub port_rewrite: bool = true,
     /// How clients reach the simulation servers through one reverse proxy: a URL with the placeholders `{host}` and
     /// `{port}`. Default: none, and each is reached under its own address.
     #[serde(deserialize_with = "optional_expanded")]
-    pub public_url: Option<PublicUrl>,
+    pub public_url: Option<PublicUrl> = None,
     /// The simulation servers: HOST:PORT, HOST/PORT, or `dns+NAME:PORT` for all addresses of a name.
     /// Required.
-    pub simulation_servers: Vec<ServerEntry>,
+    pub simulation_servers: Vec<ServerEntry> = Vec::new(),
     /// Those of `simulationServers` that get no new clients. They are still monitored. Default: none.
-    pub drained_servers: Vec<PublicAddress>,
+    pub drained_servers: Vec<PublicAddress> = Vec::new(),
     /// Mail address of the administrator, who gets notifications. Default: none, and there are no notifications.
     #[serde(deserialize_with = "mail_address::optional")]
-    pub administrator: Option<Mailbox>,
+    pub administrator: Option<Mailbox> = None,
     /// Host of the SMTP server. Default: none, and there are no notifications.
-    pub mail_server: Option<String>,
+    pub mail_server: Option<String> = None,
     /// SMTP port. Default: 25, with a password 587.
     #[serde(deserialize_with = "optional_whole::<1, 65535, _, _>")]
-    pub mail_server_port: Option<u16>,
+    pub mail_server_port: Option<u16> = None,
     /// Whether the SMTP server encrypts from the first byte, without STARTTLS. Default: true for port 465, else false.
-    pub mail_server_implicit_tls: Option<bool>,
+    pub mail_server_implicit_tls: Option<bool> = None,
     /// Mail address that notifications come from. Default: none, and there are no notifications.
     #[serde(deserialize_with = "mail_address::optional")]
-    pub mail_sender: Option<Mailbox>,
+    pub mail_sender: Option<Mailbox> = None,
     /// User name for SMTP. Default: `mailSender`.
-    pub mail_sender_user: Option<String>,
+    pub mail_sender_user: Option<String> = None,
     /// Password for SMTP. With a password the connection is always encrypted. Default: none.
-    pub mail_sender_password: Option<Secret>,
+    pub mail_sender_password: Option<Secret> = None,
     /// URL to which each mail's notices are posted as JSON, `{"text": ...}`, as Slack and Matrix take them. Default: none.
-    pub webhook: Option<Secret>,
+    pub webhook: Option<Secret> = None,
     /// A message that open viewers and the monitor show: `{"text": ..., "until": ...}`. Default: none.
-    pub announcement: Option<Announcement>,
+    pub announcement: Option<Announcement> = None,
     /// Password for actions such as `/announcement`. Default: none, and actions are off.
-    pub admin_password: Option<Secret>,
+    pub admin_password: Option<Secret> = None,
     /// Folder of `session/output.log`. Default: `log`.
     #[serde(deserialize_with = "folder")]
-    pub log_dir: ExpandedPath,
+    pub log_dir: ExpandedPath = ExpandedPath("log".into()),
     /// Log to standard output. Default: false.
-    pub debug: bool,
+    pub debug: bool = false,
     /// A simulation server with this load (percent) or more gets no client. Above 100, the load does not matter.
     /// Default: 95.
     #[serde(deserialize_with = "percent::<1000, _>")]
-    pub load_threshold: f64,
+    pub load_threshold: f64 = PlacementPolicy::default().threshold,
     /// Interval between two probes of a simulation server, in seconds. Default: 1.
     #[serde(with = "seconds")]
-    pub load_refresh: Duration,
+    pub load_refresh: Duration = Duration::from_secs(1),
     /// Load (percent) that a client adds to a simulation server that reports only its load. For the others it is
     /// learned, starting from this. Default: 2.
     #[serde(deserialize_with = "percent::<100, _>")]
-    pub client_cost: f64,
+    pub client_cost: f64 = PlacementPolicy::default().client_cost,
     /// Limit of open client `WebSockets` in all. Default: 20000.
     #[serde(deserialize_with = "whole::<1, 1_000_000, _, _>")]
-    pub max_clients: usize,
+    pub max_clients: usize = 20_000,
     /// Limit of open client `WebSockets` per client address. Default: three quarters of `maxClients`, but at most 1000,
     /// because a class sits behind one address.
     #[serde(deserialize_with = "optional_whole::<1, 1_000_000, _, _>")]
-    pub max_clients_per_address: Option<usize>,
+    pub max_clients_per_address: Option<usize> = None,
     /// Reverse proxies, as addresses or networks, whose header `X-Forwarded-For` is trusted.
     /// Default: `["127.0.0.0/8", "::1/128"]`.
-    pub trusted_proxies: TrustedProxies,
+    pub trusted_proxies: TrustedProxies = TrustedProxies::default(),
     /// Worlds that the page `/viewer` offers: URLs, or `{"title": ..., "url": ...}`. Default: none.
     #[serde(deserialize_with = "one_or_many")]
-    pub examples: Vec<Example>,
+    pub examples: Vec<Example> = Vec::new(),
     /// URL of Webots' own viewer (`WebotsView.js`), for simulation servers that don't have it. Default: none.
-    pub viewer_script: Option<url::Url>,
+    pub viewer_script: Option<url::Url> = None,
     /// All other durations.
     #[serde(deserialize_with = "object")]
-    pub timing: Timing,
+    pub timing: Timing = Timing::default(),
+}
 }
 
 /// Upper limit of `timing.stop`: the server stops within five seconds.
@@ -210,42 +213,5 @@ impl Configuration for SessionConfig {
             warnings.push("mailSender is not set: notifications are off".to_owned());
         }
         Ok(warnings)
-    }
-}
-
-impl Default for SessionConfig {
-    fn default() -> Self {
-        let PlacementPolicy { threshold, client_cost, .. } = PlacementPolicy::default();
-        Self {
-            server: String::new(),
-            ssl: true,
-            port: 1999,
-            bind: Ipv6Addr::UNSPECIFIED.into(),
-            port_rewrite: true,
-            public_url: None,
-            simulation_servers: Vec::new(),
-            drained_servers: Vec::new(),
-            administrator: None,
-            mail_server: None,
-            mail_server_port: None,
-            mail_server_implicit_tls: None,
-            mail_sender: None,
-            mail_sender_user: None,
-            mail_sender_password: None,
-            webhook: None,
-            announcement: None,
-            admin_password: None,
-            log_dir: ExpandedPath("log".into()),
-            debug: false,
-            load_threshold: threshold,
-            load_refresh: Duration::from_secs(1),
-            client_cost,
-            max_clients: 20_000,
-            max_clients_per_address: None,
-            trusted_proxies: TrustedProxies::default(),
-            examples: Vec::new(),
-            viewer_script: None,
-            timing: Timing::default(),
-        }
     }
 }
