@@ -63,6 +63,19 @@ impl Rules {
         let pattern = |ports: &[u16]| ports.iter().map(u16::to_string).collect::<Vec<_>>().join("|");
         let editors = |ports: &[u16]| pattern(&ports[1..].iter().map(|port| port + 500).collect::<Vec<_>>());
         let any_address = |port: &str| format!("listen [::]:{port};\n");
+        // What the examples of nginx for a host on the internet have in common.
+        let site = |text: &str, own: &[(&str, &str)]| {
+            let shared: [(&str, &str); 7] = [
+                ("/etc/letsencrypt/live/fleet.example.org/fullchain.pem", chain),
+                ("/etc/letsencrypt/live/fleet.example.org/privkey.pem", key),
+                ("fleet.example.org", "localhost"),
+                (&any_address("80"), "\n"),
+                (&any_address("443 ssl"), "\n"),
+                ("listen 80;", &format!("listen 127.0.0.1:{http};")),
+                ("listen 443 ssl;", &format!("listen 127.0.0.1:{https} ssl;")),
+            ];
+            adapt(&adapt(text, own), &shared)
+        };
         match self {
             Self::Apache => adapt(
                 include_str!("../../deploy/apache.conf"),
@@ -98,7 +111,7 @@ impl Rules {
                 let last = "\n  proxy_set_header Forwarded \"\";\n";
                 adapt(&Self::Nginx.text(place), &[(last, &format!("{last}{users}"))])
             }
-            Self::Nginx => adapt(
+            Self::Nginx => site(
                 include_str!("../../deploy/nginx.conf"),
                 &[
                     // First, as other numbers may hold this one.
@@ -106,13 +119,6 @@ impl Rules {
                     ("  #location", "  location"),
                     ("  #  ", "    "),
                     ("  #}", "  }"),
-                    ("/etc/letsencrypt/live/fleet.example.org/fullchain.pem", chain),
-                    ("/etc/letsencrypt/live/fleet.example.org/privkey.pem", key),
-                    ("fleet.example.org", "localhost"),
-                    (&any_address("80"), "\n"),
-                    (&any_address("443 ssl"), "\n"),
-                    ("listen 80;", &format!("listen 127.0.0.1:{http};")),
-                    ("listen 443 ssl;", &format!("listen 127.0.0.1:{https} ssl;")),
                     ("  2000   127.0.0.1:2000;", &format!("  {0} 127.0.0.1:{0};", here[0])),
                     ("  #3000  192.0.2.3:3000;", &format!("  {0} 192.0.2.3:{0};", there[0])),
                     ("200[1-9]|201[0-9]|2020", &pattern(&here[1..])),
@@ -122,16 +128,9 @@ impl Rules {
                     ("192.0.2.3", "127.0.0.2"),
                 ],
             ),
-            Self::Door => adapt(
+            Self::Door => site(
                 include_str!("../../deploy/nginx-door.conf"),
                 &[
-                    ("/etc/letsencrypt/live/fleet.example.org/fullchain.pem", chain),
-                    ("/etc/letsencrypt/live/fleet.example.org/privkey.pem", key),
-                    ("fleet.example.org", "localhost"),
-                    (&any_address("80"), "\n"),
-                    (&any_address("443 ssl"), "\n"),
-                    ("listen 80;", &format!("listen 127.0.0.1:{http};")),
-                    ("listen 443 ssl;", &format!("listen 127.0.0.1:{https} ssl;")),
                     ("192\\.0\\.2\\.[0-9]+", "127\\.0\\.0\\.[23]"),
                     ("192.0.2.1:1999", &format!("127.0.0.1:{session}")),
                     ("(?<fleet_port>2000)", &format!("(?<fleet_port>{})", here[0])),
