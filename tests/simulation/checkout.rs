@@ -263,6 +263,26 @@ fn has_half_a_pack(repository: &Path) -> bool {
 }
 
 #[actix_rt::test]
+async fn one_controller_is_reset_at_a_time() {
+    let (forge, webots, folder) = (Forge::with_arm(), Webots::launcher(), tempfile::tempdir().unwrap());
+    let mark = folder.path().join("wait");
+    let wrapper = GitWrapper::new(&format!("while [ -e {} ]; do sleep 0.05; done", mark.display()));
+    let builder = simulation_server(&webots.path(), forge.path(), 1).env("PATH", &wrapper.path());
+    let server = builder.start().await;
+    let mut client = Client::ready(&server).await;
+    std::fs::write(&mark, "").unwrap();
+    for _ in 0..3 {
+        client.send(r#"{"reset controller": "c/c.py"}"#).await;
+    }
+    let ignored = "a controller is being reset already";
+    until("two are ignored", async || server.log().matches(ignored).count() == 2).await;
+    std::fs::remove_file(&mark).unwrap();
+    client.until("reset controller: c/c.py").await;
+    client.send(r#"{"reset controller": "c/c.py"}"#).await;
+    client.until("reset controller: c/c.py").await;
+}
+
+#[actix_rt::test]
 async fn a_controller_is_reset_and_nothing_else() {
     let (forge, webots) = (Forge::with_arm(), Webots::launcher());
     forge.commit("lab/arm", "main", &[("protos/p.txt", "original")]);

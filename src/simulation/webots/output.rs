@@ -141,6 +141,28 @@ pub fn follow(
 mod tests {
     use super::*;
 
+    struct Nobody;
+
+    impl Actor for Nobody {
+        type Context = Context<Self>;
+    }
+
+    impl Handler<OutputEvent> for Nobody {
+        type Result = ();
+
+        fn handle(&mut self, _: OutputEvent, _: &mut Self::Context) {}
+    }
+
+    #[actix_rt::test]
+    async fn a_large_limit_is_one_too() {
+        let (reader, mut writer) = std::io::pipe().unwrap();
+        let begin = Instant::now();
+        let (_, ended) = follow(reader, 16 << 20, None, Nobody.start().recipient()).unwrap();
+        std::thread::spawn(move || writer.write_all(&vec![b'x'; 4 << 20]));
+        ended.await.unwrap();
+        assert!(begin.elapsed() > Duration::from_millis(240), "{:?}", begin.elapsed());
+    }
+
     #[test]
     fn only_whole_lines_are_events() {
         let table = [
