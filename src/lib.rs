@@ -32,8 +32,8 @@
 //! The HTML of pages is in `templates/session` and `templates/simulation` (`row.html`: a row of the monitor's table), their
 //! styles and scripts in `templates/assets`.
 //!
-//! Each server also has a folder `config` (every key; time limits in `timing`), its `app` (start and end) and its `state` (what its paths share). Files
-//! of `simulation` are the wire [`protocol`](simulation::protocol), the `snapshot` of all simulations, the `simulation_id`, the
+//! Each server also has a folder `config` (every key; time limits in `timing`), its `app` (start and end) and its `state`
+//! (what its paths share). Files of `simulation` are the wire [`protocol`](simulation::protocol), the `snapshot` of all simulations, the `simulation_id`, the
 //! `client_identity`, the `failed_starts`, the `announcer` (key `notify`), `preflight` (`--check`) and `readiness` (`/health`).
 //! The programs are in `src/bin`.
 //! Imports point down only, in the order that `tests/project/layering.rs` lists. `session` and `simulation` never see each

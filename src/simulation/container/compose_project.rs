@@ -95,8 +95,9 @@ impl ComposeProject {
 
     /// The settings of each service, which override the template.
     fn overridden(&self, command: &[String]) -> Value {
+        let access = GpuAccess::find();
         let service = |(name, has_command): (&String, &bool)| {
-            let mut service = protected(name, &GpuAccess::find(), self.request.gpu.as_ref(), &self.config);
+            let mut service = protected(name, &access, self.request.gpu.as_ref(), &self.config);
             service.insert("container_name", json!(container_of(&self.name, name)));
             let built = match name.as_str() {
                 WEBOTS => Some((&self.image, command.to_vec())),

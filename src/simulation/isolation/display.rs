@@ -26,8 +26,9 @@ pub enum Display {
 }
 
 /// Starts Xvfb, waits until it reports its number, and then becomes the program that follows its own three arguments: Xvfb,
-/// the authority file, and options. At level `none` its pipe is in the folder of the instance, which goes with it. Xvfb has a session of its own, so that the SIGTERM for the program does not reach it. Its only
-/// screen has the width, height and bits of a pixel that `xvfb-run` has.
+/// the authority file, and options. At level `none` its pipe is in the folder of the instance, which goes with it. Xvfb
+/// has a session of its own, so that the SIGTERM for the program does not reach it. Its only screen has the width, height
+/// and bits of a pixel that `xvfb-run` has.
 const LAUNCHER: &str = r#"
 folder=$(mktemp -d -p "${1%/*}" 2>/dev/null || mktemp -d) && mkfifo "$folder/ready" || exit
 setpriv --pdeathsig KILL setsid "$0" -screen 0 1280x1024x24 -nolisten tcp $2 -fp built-ins -auth "$1" -displayfd 3 \
