@@ -223,7 +223,8 @@ pub fn server(repositories: &Path, places: u16) -> Builder {
     simulation_server(Path::new("/nowhere"), repositories, places)
         .set("isolation", "container")
         .set("webots", serde_json::Value::Null)
-        .set("timing", serde_json::json!({ "heartbeat": 0.5 }))
+        // A client of a test reads nothing, not even pings, while the test waits for an image that another one needs.
+        .set("timing", serde_json::json!({ "heartbeat": 0.5, "silence": 300 }))
         .env("DOCKER_HOST", &host())
         .env("DOCKER_CONFIG", &daemon().folder.display().to_string())
 }
