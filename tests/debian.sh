@@ -1,4 +1,4 @@
-# What makes Debian roots by debootstrap. To be sourced.
+# Makes clean Debians by mmdebstrap. To be sourced.
 # shellcheck shell=bash
 
 # The first mirror that apt of this machine has, or FLEET_MIRROR; nothing if there is none.
@@ -9,9 +9,10 @@ debian_mirror() {
     printf '%s\n' "${mirror%%$'\n'*}"
 }
 
-# The script of debootstrap for a distribution; a system that is newer than debootstrap is made as the others of its family.
-debootstrap_script() { # DISTRIBUTION MIRROR
-    local script=/usr/share/debootstrap/scripts/$1
-    [[ -e $script || $2 != *ubuntu* ]] || script=/usr/share/debootstrap/scripts/gutsy
-    printf '%s\n' "$script"
+# Makes a distribution with these packages, a folder or an archive (NAME.tar).
+make_debian() { # DISTRIBUTION PACKAGES TARGET OPTION FOR mmdebstrap...
+    local mirror components=main
+    mirror=$(debian_mirror)
+    [[ $mirror != *ubuntu* ]] || components=main,universe
+    mmdebstrap --variant=minbase --components="$components" --dpkgopt=force-unsafe-io --include="$2" "${@:4}" "$1" "$3" "$mirror"
 }

@@ -14,11 +14,11 @@ command -v cargo >/dev/null || {
 PATH=$PATH:/usr/sbin
 # The C compiler links the programs; python3 and openssl make counterparts for mail and TLS; xvfb gives a display,
 # bubblewrap sandboxes, pasta networks for them; the fleet is tested behind both web servers, by a real browser too, and its package and the guide
-# to it in a Debian that debootstrap makes; nft loads the packet filter; promtool reads the alerts, dnsmasq leads to simulation servers, and kubectl
+# to it in a Debian that mmdebstrap makes; nft loads the packet filter; promtool reads the alerts, dnsmasq leads to simulation servers, and kubectl
 # puts what is for Kubernetes together.
 tests/install.sh cc=gcc,libc6-dev git=git git-lfs=git-lfs flock=util-linux openssl=openssl python3=python3 python3-venv=python3-venv \
     Xvfb=xvfb bwrap=bubblewrap pasta=passt apache2=apache2-bin nginx=nginx setpriv=util-linux chromium=chromium \
-    debootstrap=debootstrap dpkg-shlibdeps=dpkg-dev desktop-file-validate=desktop-file-utils xhost=x11-xserver-utils \
+    mmdebstrap=mmdebstrap dpkg-shlibdeps=dpkg-dev desktop-file-validate=desktop-file-utils xhost=x11-xserver-utils \
     systemd-analyze=systemd ip=iproute2 nft=nftables promtool=prometheus dnsmasq=dnsmasq-base kubectl=kubernetes-client
 # The same browser without windows takes half of the processor time, where there is a package of it.
 ! apt-cache show chromium-headless-shell >/dev/null 2>&1 ||
@@ -82,9 +82,7 @@ elapsed() {
 export CARGO_INCREMENTAL=0
 start tests/deploy/prepare.sh
 start tests/python.sh
-mkdir -p target/tmp
-! command -v dockerd >/dev/null || start tests/containers/root.sh target/tmp/containers.tar
-! command -v dockerd >/dev/null || start tests/swarm.sh prepare
+! command -v dockerd >/dev/null || start tests/image_root.sh target/tmp/images.tar
 cargo test --locked --no-run
 # Where these have failed, those who need them say why.
 wait "${jobs[@]}" || true
@@ -97,11 +95,9 @@ containers="tests/own_network.sh ${CARGO[*]} --test containers"
 faults="${CARGO[*]} --test faults --"
 beside=("$containers" 'tests/browser/run' "$faults whole_again" "${CARGO[*]} --test simulation_limits")
 memory=$(awk '$1 == "MemAvailable:" { print int($2 / 1024) }' /proc/meminfo)
-# The package and the guide are mostly systemd and apt that wait: what is measured beside them does not notice.
-for command in tests/deploy/{guide,package}.sh; do
-    start "$command"
-    ((memory > 10000)) || finish "$command"
-done
+# The package is mostly systemd that waits: what is measured beside it does not notice.
+start tests/deploy/package.sh
+((memory > 10000)) || finish tests/deploy/package.sh
 tests/own_tmp.sh "${CARGO[@]}" --lib --bins --test integration || failed+=('cargo test')
 echo "runs side by side, and tells when each has ended: ${beside[*]@Q}"
 for command in "${beside[@]}"; do
@@ -113,7 +109,7 @@ done
 # The images of this one don't wait for a machine of its own.
 touch "$logs/busy"
 ((memory <= 10000)) || start tests/swarm.sh
-for command in tests/deploy/{package,guide}.sh "${beside[@]}"; do
+for command in tests/deploy/package.sh "${beside[@]}"; do
     # shellcheck disable=SC2086
     [[ -z ${jobs[$command]-} ]] || finish $command
 done
@@ -124,7 +120,14 @@ start $faults --skip whole_again
 finish $faults --skip whole_again
 rm "$logs/busy"
 [[ -n ${jobs[tests/swarm.sh]-} ]] || start tests/swarm.sh
-finish tests/swarm.sh
+# The guide is mostly apt that unpacks, in the time in which the Swarm waits.
+guide='nice -n 19 tests/deploy/guide.sh'
+((memory > 10000)) || finish tests/swarm.sh
+# shellcheck disable=SC2086
+start $guide
+[[ -z ${jobs[tests/swarm.sh]-} ]] || finish tests/swarm.sh
+# shellcheck disable=SC2086
+finish $guide
 
 echo "tests: $(elapsed), build included"
 ((${#skipped[@]} == 0)) || echo "SKIPPED, not passed: ${skipped[*]}" >&2

@@ -3,9 +3,8 @@
 # update, edit, kill; what a visitor meets in Chromium. Says what it measures.
 #
 # dockerd runs in namespaces of its own, from which nothing can be reached. So the images that the Dockerfile begins with are
-# a Debian that debootstrap makes, kept in target/deploy, with an apt-get that has nothing to do and a cargo that copies what is built
-# already: FLEET_BIN, an absolute path, names its folder. `tests/swarm.sh prepare` makes that Debian alone. As long as there is a file FLEET_BUSY,
-# it makes the images, and nothing that is measured.
+# the Debian that tests/image_root.sh makes, with an apt-get that has nothing to do and a cargo that copies what is built already: FLEET_BIN, an
+# absolute path, names its folder. As long as there is a file FLEET_BUSY, it makes the images, and nothing that is measured.
 set -Eeuo pipefail
 cd "$(dirname "$(readlink -f "${BASH_SOURCE[0]}")")/.."
 PATH=$PATH:/usr/sbin:/sbin
@@ -24,15 +23,14 @@ skip() { # WHY
 }
 
 ((EUID == 0)) || skip 'dockerd needs root'
-for program in dockerd docker debootstrap unshare nsenter ip iptables python3 openssl "${CHROMIUM:-chromium}"; do
+for program in dockerd docker unshare nsenter ip iptables python3 openssl "${CHROMIUM:-chromium}"; do
     command -v "$program" >/dev/null || skip "there is no $program"
 done
-# shellcheck disable=SC1091
-DISTRIBUTION=$(. /etc/os-release && echo "${VERSION_CODENAME-}")
-readonly DISTRIBUTION BIN=${FLEET_BIN:-$PWD/target/debug} ROOT=$PWD/target/deploy/swarm-$DISTRIBUTION
+readonly BIN=${FLEET_BIN:-$PWD/target/debug} ROOT=target/tmp/images.tar
 readonly WORLD=https://github.com/webots-fleet/demo/blob/main/worlds/playground.wbt
 readonly DOOR=http://127.0.0.1:8080 VIEWER=http://localhost:8080/viewer
-[[ ${1-} == prepare || -x $BIN/session-server && -x $BIN/rehearse ]] || fail "there are no programs in $BIN: cargo build"
+[[ -x $BIN/session-server && -x $BIN/rehearse ]] || fail "there are no programs in $BIN: cargo build"
+tests/image_root.sh "$ROOT" || skip 'no Debian can be made here'
 PYTHON=$(tests/python.sh)
 readonly PYTHON
 WORK=$(mktemp -d)
@@ -183,20 +181,6 @@ told() {
     printf '%-64s %s\n' "$1" "$2"
 }
 
-# --- The Debian of all images.
-
-if [[ ! -e $ROOT/.complete ]]; then
-    rm -rf "$ROOT"
-    mkdir -p "${ROOT%/*}"
-    debootstrap --variant=minbase --include=ca-certificates,curl,git,tini,nginx-light "$DISTRIBUTION" "$ROOT" \
-        "${FLEET_MIRROR:-http://deb.debian.org/debian}" >"$WORK/debootstrap" 2>&1 ||
-        skip "no Debian can be made here: $(tail -n 1 "$WORK/debootstrap")"
-    rm -rf "$ROOT/var/cache/apt/archives"
-    touch "$ROOT/.complete"
-fi
-# Nothing else that takes long can be made without the programs.
-[[ ${1-} != prepare ]] || exit 0
-
 # --- A machine with dockerd, which ends with this script.
 
 mkdir -p "$WORK/data"
@@ -227,7 +211,7 @@ printf '#!/bin/sh\nmkdir -p target/dist\ncp /programs/* target/dist/\n' >"$WORK/
 cp "$BIN"/{session-server,simulation-server,demo-simulator} "$WORK/base"
 strip "$WORK"/base/*-server "$WORK/base/demo-simulator" 2>/dev/null || true
 chmod +x "$WORK"/base/*
-tar --directory "$ROOT" --create . | docker import - debian:bookworm-slim >/dev/null
+docker import "$ROOT" debian:bookworm-slim >/dev/null
 cat >"$WORK/base/Dockerfile" <<'END'
 FROM debian:bookworm-slim
 COPY apt-get cargo /usr/local/bin/

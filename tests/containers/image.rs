@@ -25,17 +25,17 @@ const SKIPPED: i32 = 77;
 /// # Errors
 /// Where it can't be made.
 pub fn prepare() -> Result<(), String> {
-    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/containers/root.sh");
+    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/image_root.sh");
     let status = Command::new(script).arg(archive()).status().unwrap();
     match status.code() {
         Some(0) => Ok(()),
-        Some(SKIPPED) => Err("there is no debootstrap, or no mirror of Debian".to_owned()),
+        Some(SKIPPED) => Err("there is no mmdebstrap, or no mirror of Debian".to_owned()),
         _ => panic!("the Debian of the images can't be made: {status}"),
     }
 }
 
 fn archive() -> String {
-    format!("{}/containers.tar", env!("CARGO_TARGET_TMPDIR"))
+    format!("{}/images.tar", env!("CARGO_TARGET_TMPDIR"))
 }
 
 /// Makes the images in the daemon, with `folder` for what they are made of.

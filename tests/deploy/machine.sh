@@ -1,6 +1,6 @@
 # Machines for the scripts beside this one: clean Debians whose systemd runs. To be sourced, with the script's own arguments.
 #
-# The Debian is made by debootstrap once, and kept in target/deploy. The scripts can run side by side. Each machine looks at it through an overlay in
+# The Debian is made by mmdebstrap once, and kept in target/deploy. The scripts can run side by side. Each machine looks at it through an overlay in
 # memory, in namespaces of its own (processes, mounts, network), so that nothing of a run is left, however it ends.
 #
 # FLEET_DISTRIBUTION and FLEET_MIRROR, say 'jammy' and 'http://archive.ubuntu.com/ubuntu', make another system of it.
@@ -142,21 +142,17 @@ boot() { # NAME
 # --- What a machine is made of.
 
 make_root() {
-    local mirror script made="$PACKAGES ${LATER[*]}"
+    local made="$PACKAGES ${LATER[*]}"
     [[ ! -e $ROOT/.complete || $(<"$ROOT/.complete") != "$made" ]] || return 0
-    mirror=$(debian_mirror)
-    [[ -n $mirror ]] || skip 'this is no Debian or Ubuntu with a package mirror'
-    script=$(debootstrap_script "$DISTRIBUTION" "$mirror")
+    [[ -n $(debian_mirror) ]] || skip 'this is no Debian or Ubuntu with a package mirror'
     rm -rf "$ROOT"
     echo "makes a clean $DISTRIBUTION, once"
-    debootstrap --variant=minbase --include="$PACKAGES" "$DISTRIBUTION" "$ROOT" "$mirror" "$script" \
-        >"$WORK/debootstrap.log" 2>&1 || {
-        tail -n 5 "$WORK/debootstrap.log" >&2
-        fail 'debootstrap failed'
+    # What was downloaded stays, and the lists of packages.
+    make_debian "$DISTRIBUTION" "$PACKAGES" "$ROOT" --skip=cleanup/apt \
+        --customize-hook="chroot \"\$1\" apt-get install --quiet --yes --download-only ${LATER[*]}" >"$WORK/mmdebstrap.log" 2>&1 || {
+        tail -n 5 "$WORK/mmdebstrap.log" >&2
+        fail 'mmdebstrap failed'
     }
-    [[ $mirror != *ubuntu* ]] || echo "deb $mirror $DISTRIBUTION main universe" >"$ROOT/etc/apt/sources.list"
-    chroot "$ROOT" sh -c 'apt-get update --quiet --quiet && apt-get install --quiet --yes --download-only "$@"' later "${LATER[@]}" \
-        >"$WORK/debootstrap.log" 2>&1 || fail "$(tail -n 5 "$WORK/debootstrap.log")"
     echo "$made" >"$ROOT/.complete"
 }
 
@@ -185,7 +181,7 @@ make_packages() {
 prepare_all() {
     local tool lock
     [[ $(id -u) == 0 ]] || skip 'only root can make a Debian of its own'
-    for tool in debootstrap dpkg-deb unshare nsenter setpriv pivot_root findmnt; do
+    for tool in mmdebstrap dpkg-deb unshare nsenter setpriv pivot_root findmnt; do
         command -v "$tool" >/dev/null || skip "$tool is not installed"
     done
     mkdir -p "$DEPLOY" "$WORK"
