@@ -14,13 +14,13 @@ use serde::{Deserialize, Serialize};
 
 /// The networks of proxies whose header `X-Forwarded-For` is trusted.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(try_from = "Vec<String>", into = "Vec<String>")]
+#[serde(try_from = "Vec<String>")]
 pub struct TrustedProxies(Vec<IpNet>);
 
 /// The name of a header in which a web server tells who its client is.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(try_from = "String", into = "String")]
-pub struct UserHeader(HeaderName);
+#[serde(try_from = "String")]
+pub struct UserHeader(String);
 
 /// The client at the other end of a connection.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -64,7 +64,7 @@ impl TrustedProxies {
     /// of them.
     pub fn trusted_header(&self, request: &HttpRequest, header: &UserHeader) -> Option<String> {
         let is_trusted = request.peer_addr().is_some_and(|address| self.trusts(address.ip().to_canonical()));
-        let mut lines = request.headers().get_all(&header.0).filter(|_| is_trusted);
+        let mut lines = request.headers().get_all(header.0.as_str()).filter(|_| is_trusted);
         match (lines.next(), lines.next()) {
             (Some(line), None) => String::from_utf8(line.as_bytes().to_vec()).ok(),
             _ => None,
@@ -121,14 +121,10 @@ impl TryFrom<String> for UserHeader {
     type Error = String;
 
     fn try_from(text: String) -> Result<Self, String> {
-        let name = HeaderName::try_from(&text);
-        name.map(Self).map_err(|_| format!("{text:?} is no name of a header, such as X-Forwarded-User"))
-    }
-}
-
-impl From<UserHeader> for String {
-    fn from(UserHeader(name): UserHeader) -> Self {
-        name.to_string()
+        match HeaderName::try_from(&text) {
+            Ok(_) => Ok(Self(text)),
+            Err(_) => Err(format!("{text:?} is no name of a header, such as X-Forwarded-User")),
+        }
     }
 }
 
@@ -150,12 +146,6 @@ impl TryFrom<Vec<String>> for TrustedProxies {
             })
         };
         texts.into_iter().map(network).collect::<Result<_, _>>().map(Self)
-    }
-}
-
-impl From<TrustedProxies> for Vec<String> {
-    fn from(TrustedProxies(networks): TrustedProxies) -> Self {
-        networks.iter().map(ToString::to_string).collect()
     }
 }
 
