@@ -1,6 +1,7 @@
 //! Types of configuration values. The error of an invalid value says what is expected.
 
 use std::borrow::Cow;
+use std::env::VarError;
 use std::fmt;
 use std::marker::PhantomData;
 use std::net::IpAddr;
@@ -12,6 +13,7 @@ use serde::de::value::MapAccessDeserializer;
 use serde::de::{DeserializeOwned, Error as _, IntoDeserializer, MapAccess, Visitor};
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use serde_json::Value;
+use shellexpand::LookupError;
 
 use crate::shared::text::excerpt;
 
@@ -30,11 +32,12 @@ impl TryFrom<String> for ExpandedPath {
         if text.contains('\0') {
             return Err(format!("{text:?} is not a path: it contains a NUL"));
         }
-        match shellexpand::full(&text) {
-            Ok(expanded) => Ok(Self(PathBuf::from(expanded.into_owned()))),
-            Err(error) => Err(format!("{text:?} names the environment variable {}, which is not set", error.var_name)),
-        }
+        shellexpand::full(&text).map(|path| Self(path.into_owned().into())).map_err(|error| not_set(&text, &error))
     }
+}
+
+fn not_set(text: &str, error: &LookupError<VarError>) -> String {
+    format!("{text:?} names the environment variable {}, which is not set", error.var_name)
 }
 
 /// Reads a text and expands `$VARIABLE`.
@@ -43,9 +46,7 @@ impl TryFrom<String> for ExpandedPath {
 /// When the value is not a text, or names a variable that is not set.
 pub fn expanded<'de, D: Deserializer<'de>>(deserializer: D) -> Result<String, D::Error> {
     let text = String::deserialize(deserializer)?;
-    shellexpand::env(&text).map(Cow::into_owned).map_err(|error| {
-        D::Error::custom(format!("{text:?} names the environment variable {}, which is not set", error.var_name))
-    })
+    shellexpand::env(&text).map(Cow::into_owned).map_err(|error| D::Error::custom(not_set(&text, &error)))
 }
 
 /// Reads the path of a directory.

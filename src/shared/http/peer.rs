@@ -56,8 +56,7 @@ impl TrustedProxies {
 
     /// The client of a connection on which no request was received yet.
     pub fn of_connection(&self, address: IpAddr) -> Peer {
-        let address = address.to_canonical();
-        if self.trusts(address) { Peer::Proxy(address) } else { Peer::Client(address) }
+        self.resolve(address.to_canonical(), &HeaderMap::new())
     }
 
     /// The value of a header that a trusted proxy sets. A header that is there twice has none: the client may have sent one
@@ -71,27 +70,24 @@ impl TrustedProxies {
         }
     }
 
+    /// The last address of the header's chain that is not a trusted proxy. A hop that is not an address ends the chain.
     fn resolve(&self, connected: IpAddr, headers: &HeaderMap) -> Peer {
         if !self.trusts(connected) {
             return Peer::Client(connected);
         }
-        match joined(headers, "x-forwarded-for") {
-            Some(chain) => Peer::Client(self.client(connected, &chain)),
-            None => Peer::Proxy(connected),
+        // A line that is not text is not an address.
+        let lines: Vec<&str> = headers.get_all("x-forwarded-for").map(|line| line.to_str().unwrap_or("?")).collect();
+        if lines.is_empty() {
+            return Peer::Proxy(connected);
         }
-    }
-
-    /// Returns the last address of a chain that is not a trusted proxy. A hop that is not an address ends the chain.
-    fn client(&self, connected: IpAddr, chain: &str) -> IpAddr {
         let mut nearest = connected;
-        for hop in chain.rsplit(',') {
-            match address(hop.trim()) {
-                Some(address) if self.trusts(address) => nearest = address,
-                Some(address) => return address,
-                None => break,
+        for hop in lines.join(",").rsplit(',').map_while(|hop| address(hop.trim())) {
+            nearest = hop;
+            if !self.trusts(hop) {
+                break;
             }
         }
-        nearest
+        Peer::Client(nearest)
     }
 
     /// Whether programs on this machine are trusted.
@@ -102,12 +98,6 @@ impl TrustedProxies {
     fn trusts(&self, address: IpAddr) -> bool {
         self.0.iter().any(|network| network.contains(&address))
     }
-}
-
-/// Joins all lines of a header; `None` if there are none. A line that is not text becomes `?`, which is not an address.
-fn joined(headers: &HeaderMap, name: &str) -> Option<String> {
-    let lines: Vec<&str> = headers.get_all(name).map(|line| line.to_str().unwrap_or("?")).collect();
-    (!lines.is_empty()).then(|| lines.join(","))
 }
 
 /// Parses an address as reverse proxies write it: some add the port.

@@ -10,8 +10,8 @@ use super::container::{ContainerDisplay, ContainerSettings, EDITOR_PORT};
 use super::gpus::GpuUse;
 use super::isolation::{IsolationSetting, SandboxFolders, VariableName};
 use super::resources::ResourceLimits;
-use super::streaming::Streaming;
 use super::timing::Timing;
+use super::urls::Streaming;
 use crate::shared::config::keys::keys;
 use crate::shared::config::{
     Configuration, ExpandedPath, Secret, choice, expanded, folder, is_web_url, local_address, minutes_or_zero, object,
