@@ -17,7 +17,7 @@ use crate::session::config::Announcement;
 use crate::session::fleet::Pick;
 use crate::session::state::AppState;
 use crate::shared::http::liveness::{self, Liveness};
-use crate::shared::http::websocket::MessageError;
+use crate::shared::http::websocket::wrong_message;
 use crate::shared::http::{ConnectionPermit, Peer};
 use crate::shared::run::{Phase, closing};
 use crate::shared::text::client_text;
@@ -146,9 +146,9 @@ impl StreamHandler<Result<Message, ProtocolError>> for WebClient {
                 Self::close(CloseCode::Policy, ctx);
             }
             other => {
-                let error = MessageError::from(other);
-                log::debug!("client {}: {error}", self.peer);
-                Self::close(error.code(), ctx);
+                let (problem, code) = wrong_message(other);
+                log::debug!("client {}: {problem}", self.peer);
+                Self::close(code, ctx);
             }
         }
     }

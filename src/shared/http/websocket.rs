@@ -16,40 +16,15 @@ const MAX_MESSAGE: usize = 8 * 1024;
 /// Largest header of a WebSocket frame, in bytes (RFC 6455, section 5.2).
 const FRAME_HEADER: usize = 14;
 
-/// Why a message can't be read, as text for the client; the connection must be closed.
-#[derive(Debug, thiserror::Error)]
-pub enum MessageError {
-    /// The message is longer than [`MAX_MESSAGE`].
-    #[error("Wrong message: it is longer than {} KiB", MAX_MESSAGE / 1024)]
-    TooLarge,
-    /// The message is binary, or not UTF-8.
-    #[error("Wrong message: allowed are short texts")]
-    NotText,
-    /// The frame violates the WebSocket protocol.
-    #[error("Wrong message: {0}")]
-    Protocol(ProtocolError),
-}
-
-impl MessageError {
-    /// The code to close the WebSocket with.
-    pub fn code(&self) -> CloseCode {
-        match self {
-            Self::TooLarge => CloseCode::Size,
-            Self::NotText => CloseCode::Unsupported,
-            Self::Protocol(_) => CloseCode::Protocol,
-        }
-    }
-}
-
-/// Why a connection must be closed: what a client has sent instead of a text.
-impl From<Result<Message, ProtocolError>> for MessageError {
-    fn from(message: Result<Message, ProtocolError>) -> Self {
-        match message {
-            Ok(_) => Self::NotText,
-            Err(ProtocolError::Overflow) => Self::TooLarge,
-            Err(error) => Self::Protocol(error),
-        }
-    }
+/// Why a connection must be closed, as text for the client, with the code: it has sent what is neither a text nor about the
+/// connection.
+pub fn wrong_message(message: Result<Message, ProtocolError>) -> (String, CloseCode) {
+    let (problem, code) = match message {
+        Ok(_) => ("allowed are short texts".to_owned(), CloseCode::Unsupported),
+        Err(ProtocolError::Overflow) => (format!("it is longer than {} KiB", MAX_MESSAGE / 1024), CloseCode::Size),
+        Err(error) => (error.to_string(), CloseCode::Protocol),
+    };
+    (format!("Wrong message: {problem}"), code)
 }
 
 /// Takes the frames of a client out of the bytes that it sends.
@@ -93,9 +68,12 @@ fn messages(payload: Payload) -> impl Stream<Item = Result<Message, ProtocolErro
     let state = (payload, FrameReader::default(), BytesMut::new());
     stream::unfold(state, async |(mut payload, mut frames, mut partial)| {
         let message = loop {
-            match frames.take().and_then(|frame| frame.map(|frame| complete(frame, &mut partial)).transpose()) {
-                Ok(Some(Some(message))) => break Ok(message),
-                Ok(Some(None)) => {}
+            match frames.take() {
+                Ok(Some(frame)) => {
+                    if let Some(message) = complete(frame, &mut partial).transpose() {
+                        break message;
+                    }
+                }
                 Ok(None) => match payload.next().await? {
                     Ok(bytes) => frames.add(&bytes),
                     // The connection broke without a close frame, as when a laptop is closed.
@@ -143,7 +121,7 @@ pub fn refuse(error: &HandshakeError) -> HttpResponse {
 }
 
 /// Upgrades a request to a WebSocket that the given actor serves, or answers with the error. The actor gets
-/// complete messages; what is neither a text nor about the connection is a [`MessageError`].
+/// complete messages, and those that are a [`wrong_message`].
 pub fn open<A>(request: &HttpRequest, payload: Payload, actor: A) -> HttpResponse
 where
     A: Actor<Context = WebsocketContext<A>> + StreamHandler<Result<Message, ProtocolError>>,

@@ -11,7 +11,7 @@ use actix_web_actors::ws::{CloseCode, CloseReason, Message, ProtocolError, Webso
 
 use super::session::Session;
 use crate::shared::http::liveness::{self, Liveness};
-use crate::shared::http::websocket::MessageError;
+use crate::shared::http::websocket::wrong_message;
 use crate::shared::http::{ConnectionPermit, Peer};
 use crate::shared::run::closing;
 use crate::simulation::client_identity::ClientIdentity;
@@ -162,10 +162,10 @@ impl StreamHandler<Result<Message, ProtocolError>> for WebClient {
                 self.finish(protocol::error("Too many requests on one connection"), CloseCode::Policy, ctx);
             }
             other => {
-                let error = MessageError::from(other);
-                log::info!("client {}: {error}", self.peer);
+                let (problem, code) = wrong_message(other);
+                log::info!("client {}: {problem}", self.peer);
                 self.leave();
-                self.finish(protocol::error(&error.to_string()), error.code(), ctx);
+                self.finish(protocol::error(&problem), code, ctx);
             }
         }
     }
