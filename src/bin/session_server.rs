@@ -26,12 +26,10 @@ struct Arguments {
 
 fn main() -> ExitCode {
     let arguments = Arguments::parse();
-    let loaded = match start::read::<SessionConfig>(&arguments.config) {
-        Ok(loaded) => loaded,
-        Err(code) => return code,
-    };
+    let loaded = start::read::<SessionConfig>(&arguments.config);
     if arguments.options.check {
-        return start::check(&loaded);
+        start::check(&loaded);
+        return ExitCode::SUCCESS;
     }
     if arguments.test_mail {
         return test_mail(&loaded.config);

@@ -38,38 +38,27 @@ enum Part {
     },
 }
 
-/// Removes the containers that a server with this configuration has left.
-fn sweep(config: &std::path::Path) -> ExitCode {
-    match start::read::<SimulationConfig>(config) {
-        Ok(loaded) if loaded.config.isolation == IsolationSetting::Container => {
-            container::sweep_all(&container::ResourceOwner::of(&loaded.config.cache_dir.0));
-            ExitCode::SUCCESS
-        }
-        Ok(_) => ExitCode::SUCCESS,
-        Err(code) => code,
-    }
-}
-
 fn main() -> ExitCode {
     let arguments = Arguments::parse();
     if let Some(Part::Sweep { config }) = &arguments.part {
-        return sweep(config);
+        let config = start::read::<SimulationConfig>(config).config;
+        if config.isolation == IsolationSetting::Container {
+            container::sweep_all(&container::ResourceOwner::of(&config.cache_dir.0));
+        }
+        return ExitCode::SUCCESS;
     }
     if let Some(Part::Guard(arguments)) = &arguments.part {
         let sweep = |owner: &String| container::sweep_all(&container::ResourceOwner::named(owner));
         let remove = || arguments.containers.iter().for_each(sweep);
         return ExitCode::from(guardian::guard(arguments, remove));
     }
-    let loaded = match start::read::<SimulationConfig>(&arguments.config) {
-        Ok(loaded) => loaded,
-        Err(code) => return code,
-    };
+    let loaded = start::read::<SimulationConfig>(&arguments.config);
     if arguments.options.check {
-        let code = start::check(&loaded);
+        start::check(&loaded);
         for finding in preflight::check(&loaded.config) {
             eprintln!("{finding}");
         }
-        return code;
+        return ExitCode::SUCCESS;
     }
     let log = loaded.config.log_dir.0.join("simulation/output.log");
     let log = (!loaded.config.debug).then_some(log.as_path());

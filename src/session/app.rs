@@ -42,7 +42,7 @@ pub async fn run(mut config: SessionConfig, file: PathBuf) -> Result<(), AppErro
     let connections = ConnectionLimiter::new(connections, clients, config.max_clients_per_address);
     let (phase_sender, phase) = watch::channel(Phase::Open);
     let address = SocketAddr::new(config.bind, config.port);
-    let socket = server::listen(address).map_err(|source| AppError::Bind { address, source })?;
+    let socket = server::listen(address).map_err(|error| format!("can't listen on {address}: {error}"))?;
     let port = socket.local_addr()?.port();
     config.port = port;
     let stop = config.timing.stop;
@@ -58,7 +58,7 @@ pub async fn run(mut config: SessionConfig, file: PathBuf) -> Result<(), AppErro
     actix_rt::spawn(service_manager::feed_watchdog(async move || registry.send(GetStatus).await.is_ok()));
     tokio::select! {
         () = handle_commands(&mut signals, &file, &server, port) => {}
-        fault = permanent::stopped("Registry", server.registry.clone()) => return Err(AppError::ActorStopped(fault)),
+        fault = permanent::stopped("Registry", server.registry.clone()) => return Err(fault.into()),
     }
     log::info!("stopping");
     service_manager::stopping("stopping");
@@ -88,8 +88,7 @@ async fn handle_commands(signals: &mut Signals, file: &Path, server: &AppState, 
 /// Options of the HTTP server for this many connections.
 fn options(config: &SessionConfig, connections: usize) -> HttpServerOptions {
     HttpServerOptions {
-        workers: threads(),
-        max_per_worker: (connections / threads()).max(1),
+        max_connections: connections,
         silence: config.timing.silence,
         stop: config.timing.stop,
         trusted_proxies: config.trusted_proxies.clone(),
@@ -98,7 +97,7 @@ fn options(config: &SessionConfig, connections: usize) -> HttpServerOptions {
 
 /// Returns the limits of connections and of clients, so that `files` open files are enough for them and the rest of the
 /// server. The limit of clients is lower: the remaining connections serve the error that there are too many clients.
-fn bound_clients(files: u64, config: &SessionConfig) -> Result<(usize, usize), AppError> {
+fn bound_clients(files: u64, config: &SessionConfig) -> Result<(usize, usize), String> {
     let all = usize::try_from(files).unwrap_or(usize::MAX);
     let names = config.simulation_servers.iter().filter(|entry| entry.name().is_some()).count();
     let servers = config.simulation_servers.len() - names;
@@ -106,12 +105,7 @@ fn bound_clients(files: u64, config: &SessionConfig) -> Result<(usize, usize), A
     let looked_up = (FILES_PER_SERVER * SERVERS_PER_NAME * names).min(all / 4);
     let connections = all.saturating_sub(OWN_FILES + FILES_PER_SERVER * servers + looked_up);
     let possible = connections - connections / 16;
-    Ok((connections, limit_clients(files, possible, config.max_clients, "one client".to_owned())?))
-}
-
-/// Number of threads that serve connections.
-fn threads() -> usize {
-    std::thread::available_parallelism().map_or(1, usize::from)
+    Ok((connections, limit_clients(files, possible, config.max_clients, "one client")?))
 }
 
 /// Creates the server's state, and starts its actors.
@@ -120,7 +114,7 @@ fn assemble(
     connections: ConnectionLimiter,
     phase: watch::Receiver<Phase>,
 ) -> Result<AppState, AppError> {
-    let metrics = Metrics::new();
+    let metrics = Metrics::default();
     let latencies = metrics.histogram("webots_session_report_seconds", "Time in which simulation servers answer")?;
     let picks = metrics.counter("webots_session_requests_total", "Requests for a simulation server", "outcome")?;
     for outcome in OUTCOMES {

@@ -67,7 +67,8 @@ impl Application {
         config.max_clients = bound_clients(&config)?;
         let (phase_sender, phase) = watch::channel(Phase::Open);
         let (requests, commands) = tokio::sync::mpsc::channel(4);
-        let socket = bind(&config)?;
+        let address = SocketAddr::new(config.bind, config.port);
+        let socket = server::listen(address).map_err(|error| format!("can't listen on {address}: {error}"))?;
         let server = Arc::new(assemble(Arc::new(config), phase, requests)?);
         Ok(Self { server, socket, signals, phase: phase_sender, commands })
     }
@@ -80,7 +81,7 @@ impl Application {
 
 /// Raises the limit of open files, and returns the number of clients that it allows. `maxClients` may be lowered,
 /// because each client has connections for pages besides its WebSocket.
-fn bound_clients(config: &SimulationConfig) -> Result<usize, AppError> {
+fn bound_clients(config: &SimulationConfig) -> Result<usize, String> {
     let places = config.max_connections;
     let needed = OWN_FILES + FILES_PER_SIMULATION * usize::from(places);
     // What is relayed has a connection on either side.
@@ -88,7 +89,7 @@ fn bound_clients(config: &SimulationConfig) -> Result<usize, AppError> {
     let wanted = config.max_clients.saturating_mul(each).saturating_add(needed);
     let files = raise_open_files(u64::try_from(wanted).unwrap_or(u64::MAX));
     let rest = usize::try_from(files).unwrap_or(usize::MAX).saturating_sub(needed);
-    limit_clients(files, rest / each, config.max_clients, format!("{places} places and one client"))
+    limit_clients(files, rest / each, config.max_clients, &format!("{places} places and one client"))
 }
 
 /// Runs a server until a signal or an administrator stops it.
@@ -100,18 +101,14 @@ pub async fn serve(assembly: Application) -> Result<(), AppError> {
     let owner = server.containers.as_ref().map(|containers| containers.run.name());
     let _guardian = Guardian::start(server.run.path(), owner)?;
     let shared = web::Data::from(Arc::clone(&server));
-    let threads = std::thread::available_parallelism().map_or(1, usize::from);
     let options = HttpServerOptions {
-        workers: threads,
-        max_per_worker: (max_tcp(&server.config) / threads).max(1),
+        max_connections: max_tcp(&server.config),
         silence: server.config.timing.silence,
         stop: Duration::from_secs(1),
         trusted_proxies: server.config.trusted_proxies.clone(),
     };
     let simulations = server.launcher.reached().unwrap_or_else(|| server.config.address_of_simulations());
-    let stream_thread = StreamThread::start();
-    let stream_thread =
-        stream_thread.map_err(|why| AppError::Unavailable(format!("streams can't be relayed: {why}")))?;
+    let stream_thread = StreamThread::start().map_err(|why| format!("streams can't be relayed: {why}"))?;
     let silence = options.silence;
     let app = move || {
         let upstream = Upstream::new(simulations, stream_thread.clone(), silence);
@@ -127,10 +124,8 @@ pub async fn serve(assembly: Application) -> Result<(), AppError> {
     actix_rt::spawn(service_manager::feed_watchdog(async move || watched.send(GetSnapshot).await.is_ok()));
     let why = tokio::select! {
         why = handle_commands(&mut signals, &mut commands, &server, &phase_sender) => why,
-        fault = permanent::stopped("SlotPool", slots.clone()) => return Err(AppError::ActorStopped(fault)),
-        fault = permanent::stopped("LoadMonitor", server.load_monitor.clone()) => {
-            return Err(AppError::ActorStopped(fault));
-        }
+        fault = permanent::stopped("SlotPool", slots.clone()) => return Err(fault.into()),
+        fault = permanent::stopped("LoadMonitor", server.load_monitor.clone()) => return Err(fault.into()),
     };
     log::info!("stopping");
     service_manager::stopping(why);
@@ -172,11 +167,6 @@ async fn handle_commands(
     }
 }
 
-fn bind(config: &SimulationConfig) -> Result<TcpListener, AppError> {
-    let address = SocketAddr::new(config.bind, config.port);
-    server::listen(address).map_err(|source| AppError::Bind { address, source })
-}
-
 /// Limit of TCP connections: those of clients, the same number for pages and other requests, and what is relayed.
 fn max_tcp(config: &SimulationConfig) -> usize {
     config.max_clients.saturating_mul(TCP_PER_CLIENT + streams_per_client(config))
@@ -193,14 +183,14 @@ fn assemble(
     requests: tokio::sync::mpsc::Sender<ServerCommand>,
 ) -> Result<AppState, AppError> {
     let folder = config.cache_dir.0.clone();
-    let cache_fault = |source| AppError::Folder { key: "cacheDir", folder: folder.clone(), source };
+    let cache_fault = |error| format!("the folder {} (cacheDir) can't be used: {error}", folder.display());
     let cache_dir = CacheDir::claim(&folder).map_err(cache_fault)?;
     let (run, leftovers) = RunDir::open(&folder).map_err(cache_fault)?;
     if leftovers != Leftovers::default() {
         let Leftovers { runs, processes } = leftovers;
         log::warn!("removed what {runs} earlier runs had left, {processes} processes among it");
     }
-    let launcher = Launcher::start(&config).map_err(|error| AppError::Unavailable(error.to_string()))?;
+    let launcher = Launcher::start(&config)?;
     let containers = open_containers(&config, &run)?;
     let rules = AdmissionRules {
         allowed: config.allowed_repositories.clone(),
@@ -209,10 +199,10 @@ fn assemble(
         share_idle_time: config.share_idle_time,
     };
     let checkouts = open_checkouts(&config, cache_dir, &run, &rules).map_err(cache_fault)?;
-    let metrics = Metrics::new();
+    let metrics = Metrics::default();
     let logs = config.log_dir.0.join("simulation");
     let ends = Ends::start(logs, launcher.level().to_string(), &metrics);
-    let ends = ends.map_err(|why| AppError::Unavailable(format!("ends of simulations can't be recorded: {why}")))?;
+    let ends = ends.map_err(|why| format!("ends of simulations can't be recorded: {why}"))?;
     let (per_address, per_user) = (config.max_places_per_address, config.max_places_per_user);
     let slots =
         SlotPool::new(config.streaming_ports(), config.waiting_line, per_address, per_user, ends.clone()).start();
@@ -223,7 +213,7 @@ fn assemble(
     announcer::start(&config);
     let usage = UsageMonitor::default();
     let watcher = Watcher::start(run.path().to_owned(), config.disk_reserve, usage.clone());
-    let watcher = watcher.map_err(|error| AppError::Unavailable(format!("simulations can't be watched: {error}")))?;
+    let watcher = watcher.map_err(|error| format!("simulations can't be watched: {error}"))?;
     let starts = metrics.counter("webots_simulation_starts_total", "Simulations that were asked for", "outcome")?;
     for outcome in ["ready", "refused", "full"] {
         starts.with_label_values(&[outcome]);
@@ -264,11 +254,11 @@ fn assemble(
 }
 
 /// Opens the container service, if simulations run in containers.
-fn open_containers(config: &Arc<SimulationConfig>, run: &RunDir) -> Result<Option<Arc<ContainerService>>, AppError> {
+fn open_containers(config: &Arc<SimulationConfig>, run: &RunDir) -> Result<Option<Arc<ContainerService>>, String> {
     if config.isolation != IsolationSetting::Container {
         return Ok(None);
     }
-    let unavailable = |why| AppError::Unavailable(format!("isolation is \"container\", but {why}"));
+    let unavailable = |why| format!("isolation is \"container\", but {why}");
     Ok(Some(Arc::new(ContainerService::open(Arc::clone(config), run.path()).map_err(unavailable)?)))
 }
 

@@ -30,14 +30,6 @@ pub struct DnsName {
     pub port: u16,
 }
 
-/// A text that is not an entry of `simulationServers`.
-#[derive(Debug, thiserror::Error)]
-#[error(
-    "{0:?} is no simulation server; allowed is HOST:PORT, or HOST/PORT where a web server rewrites ports, and \
-     dns+NAME:PORT for all addresses of a name"
-)]
-pub struct EntryError(String);
-
 impl ServerEntry {
     /// The address of the simulation server, unless this is a name.
     pub fn server(&self) -> Option<&PublicAddress> {
@@ -57,14 +49,19 @@ impl ServerEntry {
 }
 
 impl TryFrom<String> for ServerEntry {
-    type Error = EntryError;
+    type Error = String;
 
-    fn try_from(text: String) -> Result<Self, EntryError> {
+    fn try_from(text: String) -> Result<Self, String> {
         let entry = match text.strip_prefix("dns+") {
             Some(name) => dns_name(name).map(Self::Name),
             None => text.parse().ok().map(Self::Server),
         };
-        entry.ok_or(EntryError(text))
+        entry.ok_or_else(|| {
+            format!(
+                "{text:?} is no simulation server; allowed is HOST:PORT, or HOST/PORT where a web server rewrites \
+                 ports, and dns+NAME:PORT for all addresses of a name"
+            )
+        })
     }
 }
 
@@ -104,7 +101,7 @@ fn dns_name(text: &str) -> Option<DnsName> {
 mod tests {
     use super::*;
 
-    fn read(text: &str) -> Result<ServerEntry, EntryError> {
+    fn read(text: &str) -> Result<ServerEntry, String> {
         text.to_owned().try_into()
     }
 

@@ -15,10 +15,10 @@ use super::timing::Timing;
 use crate::session::placement::PlacementPolicy;
 use crate::shared::config::keys::keys;
 use crate::shared::config::{
-    Configuration, ExpandedPath, InvalidValueError, Secret, expanded, folder, is_web_url, local_address, object,
-    one_or_many, optional_expanded, optional_whole, percent, require, seconds, whole,
+    Configuration, ExpandedPath, Secret, expanded, folder, is_web_url, local_address, object, one_or_many,
+    optional_expanded, optional_whole, percent, require, seconds, whole,
 };
-use crate::shared::domain::{ClientUrls, PublicAddress, PublicUrl, check_host};
+use crate::shared::domain::{ClientUrls, PublicAddress, PublicUrl, complete_host};
 use crate::shared::http::TrustedProxies;
 
 keys! {
@@ -142,11 +142,9 @@ impl SessionConfig {
     pub fn client_urls(&self) -> ClientUrls {
         ClientUrls { ssl: self.ssl, public: self.public_url.clone() }
     }
-}
 
-impl SessionConfig {
     /// Normalizes the addresses of simulation servers, and checks that each is listed once.
-    fn check_servers(&mut self) -> Result<(), InvalidValueError> {
+    fn check_servers(&mut self) -> Result<(), String> {
         let listed = self.simulation_servers.iter_mut().filter_map(|entry| match entry {
             ServerEntry::Server(address) => Some(address),
             ServerEntry::Name(_) => None,
@@ -171,16 +169,11 @@ impl SessionConfig {
 }
 
 impl Configuration for SessionConfig {
-    const ALIASES: &'static [&'static str] = &[];
     const REQUIRED: &'static [&'static str] = &["simulationServers"];
 
-    fn complete(&mut self, _: &std::path::Path) -> Result<Vec<String>, InvalidValueError> {
+    fn complete(&mut self, _: &std::path::Path) -> Result<Vec<String>, String> {
         let mut warnings = Vec::new();
-        if self.server.is_empty() {
-            warnings.push("server is not set: URLs will name localhost".to_owned());
-            "localhost".clone_into(&mut self.server);
-        }
-        check_host(&self.server, self.port_rewrite).map_err(|problem| InvalidValueError { key: "server", problem })?;
+        warnings.extend(complete_host(&mut self.server, self.port_rewrite)?);
         self.check_servers()?;
         require(self.timing.silence > self.timing.ping, "timing.silence", || {
             format!("{} s is not more than timing.ping", self.timing.silence.as_secs_f64())

@@ -181,7 +181,7 @@ async fn probe(client: &awc::Client, url: &str, load_only: bool) -> Result<(Serv
     if length != Some(bytes.len()) {
         return Err(ProbeError::BadAnswer("an answer that does not end as its Content-Length says".to_owned()));
     }
-    let load = Load::parse(&bytes).map_err(|error| ProbeError::BadAnswer(shortened(&error.to_string())))?;
+    let load = Load::parse(&bytes).map_err(|error| ProbeError::BadAnswer(shortened(&error)))?;
     plausible(load).map(|load| (ServerReport::load_only(load), false))
 }
 

@@ -14,7 +14,7 @@ use super::server_record::ServerRecord;
 use crate::session::config::SessionConfig;
 use crate::shared::domain::PublicAddress;
 use crate::shared::http::tls;
-use crate::shared::run::{Supervisor, TooManyPanics};
+use crate::shared::run::Supervisor;
 
 /// All servers and names, with the servers' monitors.
 pub struct ServerTable {
@@ -66,7 +66,7 @@ impl ServerTable {
     ///
     /// # Errors
     /// When there were too many panics.
-    pub fn restart_gone(&mut self) -> Result<(), TooManyPanics> {
+    pub fn restart_gone(&mut self) -> Result<(), String> {
         self.monitors.restart_gone()
     }
 

@@ -8,7 +8,7 @@ use super::server_record::{ServerChange, ServerRecord, ServerState};
 use crate::session::config::SessionConfig;
 use crate::session::mail::{self, Mailer, Notice, NoticeKind, Topic};
 use crate::shared::domain::PublicAddress;
-use crate::shared::run::{Supervisor, TooManyPanics};
+use crate::shared::run::Supervisor;
 
 /// The last changes, and the mailer that notifies the administrator.
 pub struct StateHistory {
@@ -30,7 +30,7 @@ impl StateHistory {
     ///
     /// # Errors
     /// When there were too many panics.
-    pub fn restart_gone(&mut self) -> Result<(), TooManyPanics> {
+    pub fn restart_gone(&mut self) -> Result<(), String> {
         self.mailers.restart_gone()
     }
 

@@ -40,7 +40,7 @@ async fn monitor(server: web::Data<AppState>) -> HttpResponse {
 async fn events(request: HttpRequest, server: web::Data<AppState>) -> HttpResponse {
     let permit = match server.connections.admit(ConnectionKind::Page, server.config.trusted_proxies.peer(&request)) {
         Ok(permit) => permit,
-        Err(refused) => return refused.answer(),
+        Err(refused) => return HttpResponse::from_error(refused),
     };
     let shown = server.clone();
     let render = move || {

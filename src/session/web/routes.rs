@@ -82,7 +82,7 @@ fn open_websocket(request: &HttpRequest, stream: web::Payload, server: &web::Dat
     let peer = server.config.trusted_proxies.peer(request);
     let permit = match server.connections.admit(ConnectionKind::Client, peer) {
         Ok(permit) => permit,
-        Err(refused) => return refused.answer(),
+        Err(refused) => return HttpResponse::from_error(refused),
     };
     let server = Arc::clone(server);
     // Pages that don't ask for them would not understand them.

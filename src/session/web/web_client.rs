@@ -17,7 +17,7 @@ use crate::session::config::Announcement;
 use crate::session::fleet::Pick;
 use crate::session::state::AppState;
 use crate::shared::http::liveness::{self, Liveness};
-use crate::shared::http::websocket::{ClientMessage, MessageReader};
+use crate::shared::http::websocket::wrong_message;
 use crate::shared::http::{ConnectionPermit, Peer};
 use crate::shared::run::{Phase, closing};
 use crate::shared::text::client_text;
@@ -30,7 +30,6 @@ pub struct WebClient {
     sent: Option<bool>,
     /// Whether it has requested announcements.
     wants_announcements: bool,
-    reader: MessageReader,
     _permit: ConnectionPermit,
 }
 
@@ -39,8 +38,7 @@ type Context = WebsocketContext<WebClient>;
 impl WebClient {
     /// A client that has just connected; `permit` counts it.
     pub fn new(server: Arc<AppState>, peer: Peer, wants_announcements: bool, permit: ConnectionPermit) -> Self {
-        let (liveness, reader) = (Liveness::new(), MessageReader::default());
-        Self { server, peer, liveness, sent: None, wants_announcements, reader, _permit: permit }
+        Self { server, peer, liveness: Liveness::default(), sent: None, wants_announcements, _permit: permit }
     }
 
     fn close(code: CloseCode, ctx: &mut Context) {
@@ -134,23 +132,23 @@ impl StreamHandler<Update> for WebClient {
 
 impl StreamHandler<Result<Message, ProtocolError>> for WebClient {
     fn handle(&mut self, message: Result<Message, ProtocolError>, ctx: &mut Self::Context) {
-        match self.reader.read(message) {
-            Ok(Some(ClientMessage::Text(text))) if self.liveness.may_answer() => self.pick(&text, ctx),
-            Ok(Some(ClientMessage::Ping(data))) if self.liveness.may_answer() => ctx.pong(&data),
-            Ok(Some(ClientMessage::Pong(content))) => self.liveness.pong(&content),
-            Ok(Some(ClientMessage::Close(reason))) => {
+        match message {
+            Ok(Message::Text(text)) if self.liveness.may_answer() => self.pick(&text, ctx),
+            Ok(Message::Ping(data)) if self.liveness.may_answer() => ctx.pong(&data),
+            Ok(Message::Pong(content)) => self.liveness.pong(&content),
+            Ok(Message::Close(reason)) => {
                 ctx.close(reason);
                 ctx.stop();
             }
-            Ok(None) => {}
-            Ok(Some(ClientMessage::Text(_) | ClientMessage::Ping(_))) => {
+            Ok(Message::Text(_) | Message::Ping(_)) => {
                 log::warn!("client {}: asks too much between two pings", self.peer);
                 ctx.text("Error: too many requests on one connection.");
                 Self::close(CloseCode::Policy, ctx);
             }
-            Err(error) => {
-                log::debug!("client {}: {error}", self.peer);
-                Self::close(error.code(), ctx);
+            other => {
+                let (problem, code) = wrong_message(other);
+                log::debug!("client {}: {problem}", self.peer);
+                Self::close(code, ctx);
             }
         }
     }

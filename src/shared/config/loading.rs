@@ -3,20 +3,18 @@
 //! An error is one line with the file, the key, what was found and what is expected. An unknown key is a warning with
 //! the most similar known key.
 
-use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
-use super::error::ConfigError;
 use super::secret::read_file;
 use crate::shared::text::one_line;
 
 /// A server's configuration.
 pub trait Configuration: DeserializeOwned + Serialize {
     /// Aliases of keys.
-    const ALIASES: &'static [&'static str];
+    const ALIASES: &'static [&'static str] = &[];
     /// Keys that must be there.
     const REQUIRED: &'static [&'static str] = &[];
 
@@ -24,25 +22,16 @@ pub trait Configuration: DeserializeOwned + Serialize {
     /// Returns warnings.
     ///
     /// # Errors
-    /// When a value contradicts others.
-    fn complete(&mut self, file: &Path) -> Result<Vec<String>, InvalidValueError>;
-}
-
-/// A value that contradicts others.
-#[derive(Debug)]
-pub struct InvalidValueError {
-    /// The key of the value.
-    pub key: &'static str,
-    /// What was found, and what is expected.
-    pub problem: String,
+    /// When a value contradicts others: its key, what was found, and what is expected.
+    fn complete(&mut self, file: &Path) -> Result<Vec<String>, String>;
 }
 
 /// Checks a rule for the value of a key; `problem` says what was found, and what is expected.
 ///
 /// # Errors
 /// When the rule does not hold.
-pub fn require(holds: bool, key: &'static str, problem: impl FnOnce() -> String) -> Result<(), InvalidValueError> {
-    if holds { Ok(()) } else { Err(InvalidValueError { key, problem: problem() }) }
+pub fn require(holds: bool, key: &'static str, problem: impl FnOnce() -> String) -> Result<(), String> {
+    if holds { Ok(()) } else { Err(format!("{key}: {}", problem())) }
 }
 
 /// A configuration that was read from a file.
@@ -57,73 +46,59 @@ pub struct LoadedConfig<C> {
 /// Reads a configuration file.
 ///
 /// # Errors
-/// When the file can't be read, or a value is not allowed.
-pub fn load<C: Configuration>(file: &Path) -> Result<LoadedConfig<C>, ConfigError> {
-    let wrong = |problem| ConfigError { file: file.to_owned(), problem };
-    let text = read_file(file).map_err(|error| wrong(format!("can't be read: {error}")))?;
+/// When the file can't be read, or a value is not allowed: one line, with the file.
+pub fn load<C: Configuration>(file: &Path) -> Result<LoadedConfig<C>, String> {
+    let of_file = |line: String| format!("{}: {line}", file.display());
+    let (config, warnings) = parse(file).map_err(of_file)?;
+    Ok(LoadedConfig { config, warnings: warnings.into_iter().map(of_file).collect() })
+}
+
+fn parse<C: Configuration>(file: &Path) -> Result<(C, Vec<String>), String> {
+    let text = read_file(file).map_err(|error| format!("can't be read: {error}"))?;
     // Some editors begin a file with a byte order mark.
     let text = text.strip_prefix('\u{feff}').unwrap_or(&text);
     if !text.trim_start().starts_with('{') {
-        return Err(wrong("it is not a JSON object; allowed is {\"KEY\": VALUE, ...}".to_owned()));
+        return Err("it is not a JSON object; allowed is {\"KEY\": VALUE, ...}".to_owned());
     }
-    let mut unknown = Vec::new();
-    let mut seen = BTreeSet::new();
     let mut json = serde_json::Deserializer::from_str(text);
     let mut track = serde_path_to_error::Track::new();
-    let tracked = serde_path_to_error::Deserializer::new(&mut json, &mut track);
-    let parsed = serde_ignored::deserialize(tracked, |path| unknown.push(path.to_string()))
-        .and_then(|config| json.end().map(|()| config));
-    let mut config: C = parsed.map_err(|source| {
+    let parsed = C::deserialize(serde_path_to_error::Deserializer::new(&mut json, &mut track));
+    let mut config = parsed.and_then(|config| json.end().map(|()| config)).map_err(|source| {
         let key = one_line(&track.path().to_string());
         let problem = one_line(&source.to_string());
-        wrong(if key == "." || key == "?" { problem } else { format!("{key}: {problem}") })
+        if key == "." || key == "?" { problem } else { format!("{key}: {problem}") }
     })?;
     let given: serde_json::Map<String, serde_json::Value> = serde_json::from_str(text).unwrap_or_default();
     if let Some(key) = C::REQUIRED.iter().find(|key| !given.contains_key(**key)) {
-        return Err(wrong(format!("{key}: it is missing")));
+        return Err(format!("{key}: it is missing"));
     }
-    // A repeated key is reported once.
-    unknown.retain(|key: &String| seen.insert(key.clone()));
     let known = known_keys(&config);
-    let mut warnings: Vec<String> = unknown.iter().map(|key| unknown_key(file, key, &known)).collect();
-    let more =
-        config.complete(file).map_err(|InvalidValueError { key, problem }| wrong(format!("{key}: {problem}")))?;
-    warnings.extend(more.iter().map(|warning| format!("{}: {warning}", file.display())));
-    Ok(LoadedConfig { config, warnings })
-}
-
-/// Returns all values of a configuration; nested ones under `part.key`.
-fn flat_values<C: Serialize>(config: &C) -> BTreeMap<String, serde_json::Value> {
-    let values = serde_json::to_value(config).unwrap_or_default();
-    let mut flat = BTreeMap::new();
-    for (key, value) in values.as_object().into_iter().flatten() {
-        match value {
-            serde_json::Value::Object(part) => {
-                flat.extend(part.iter().map(|(inner, value)| (format!("{key}.{inner}"), value.clone())));
-            }
-            value => drop(flat.insert(key.clone(), value.clone())),
-        }
-    }
-    flat
+    let unknown = given.keys().filter(|key| !known.contains(key));
+    let mut warnings: Vec<String> = unknown.map(|key| unknown_key(key, &known)).collect();
+    warnings.extend(config.complete(file)?);
+    Ok((config, warnings))
 }
 
 /// Returns every key of a configuration, and those of its parts as `part.key`.
 fn known_keys<C: Configuration>(config: &C) -> Vec<String> {
-    let parts = serde_json::to_value(config).unwrap_or_default();
-    let parts = parts.as_object().into_iter().flat_map(|values| values.keys().cloned().collect::<Vec<_>>());
-    let aliases = C::ALIASES.iter().map(|&alias| alias.to_owned());
-    aliases.chain(flat_values(config).into_keys()).chain(parts).collect()
+    let mut known: Vec<String> = C::ALIASES.iter().map(|&alias| alias.to_owned()).collect();
+    let values = serde_json::to_value(config).unwrap_or_default();
+    for (key, value) in values.as_object().into_iter().flatten() {
+        known.extend(value.as_object().into_iter().flatten().map(|(inner, _)| format!("{key}.{inner}")));
+        known.push(key.clone());
+    }
+    known
 }
 
-/// The warning about an unknown key, with the most similar known one.
-fn unknown_key(file: &Path, key: &str, known: &[String]) -> String {
+/// The warning about an unknown key, with the most similar known one. Parts refuse the keys that they don't know.
+fn unknown_key(key: &str, known: &[String]) -> String {
     let nearest = known
         .iter()
         .map(|candidate| (strsim::normalized_damerau_levenshtein(key, candidate), candidate))
         .filter(|(similarity, _)| *similarity > 0.5)
         .max_by(|(one, _), (other, _)| one.total_cmp(other));
     let hint = nearest.map(|(_, candidate)| format!("; did you mean {candidate:?}?")).unwrap_or_default();
-    format!("{}: unknown key {key:?} is ignored{hint}", file.display())
+    format!("unknown key {key:?} is ignored{hint}")
 }
 
 #[cfg(test)]
@@ -137,9 +112,7 @@ mod tests {
     }
 
     impl Configuration for Small {
-        const ALIASES: &'static [&'static str] = &[];
-
-        fn complete(&mut self, _: &Path) -> Result<Vec<String>, InvalidValueError> {
+        fn complete(&mut self, _: &Path) -> Result<Vec<String>, String> {
             Ok(Vec::new())
         }
     }
@@ -151,8 +124,8 @@ mod tests {
         std::fs::write(file.path(), format!(r#"{{"loadRefresh": 1, {again} "colour": 2}}"#)).unwrap();
         let told = load::<Small>(file.path()).unwrap().warnings;
         let expected = [
-            r#"unknown key "loadRefrsh" is ignored; did you mean "loadRefresh"?"#,
             r#"unknown key "colour" is ignored"#,
+            r#"unknown key "loadRefrsh" is ignored; did you mean "loadRefresh"?"#,
         ];
         assert_eq!(told, expected.map(|words| format!("{}: {words}", file.path().display())));
     }

@@ -1,13 +1,11 @@
 //! Configuration files: loading, errors, and the types of values.
 
-mod error;
 pub mod keys;
 mod loading;
 mod secret;
 mod value;
 
-pub use error::ConfigError;
-pub use loading::{Configuration, InvalidValueError, LoadedConfig, load, require};
+pub use loading::{Configuration, LoadedConfig, load, require};
 pub use secret::Secret;
 pub use value::{
     ExpandedPath, choice, expanded, folder, is_web_url, local_address, minutes_or_zero, object, one_or_many,

@@ -1,15 +1,24 @@
 //! Types of configuration values. The error of an invalid value says what is expected.
 
 use std::borrow::Cow;
+use std::env::VarError;
 use std::fmt;
 use std::marker::PhantomData;
 use std::net::IpAddr;
+use std::ops::RangeInclusive;
 use std::path::PathBuf;
 use std::time::Duration;
 
 use serde::de::value::MapAccessDeserializer;
-use serde::de::{DeserializeOwned, Error as _, IntoDeserializer, MapAccess, Unexpected, Visitor};
+use serde::de::{DeserializeOwned, Error as _, IntoDeserializer, MapAccess, Visitor};
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
+use serde_json::Value;
+use shellexpand::LookupError;
+
+use crate::shared::text::excerpt;
+
+/// How much of a value that is not allowed is shown, in characters.
+const MAX_SHOWN: usize = 60;
 
 /// A path with `~` and `$VARIABLE` expanded.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
@@ -23,11 +32,12 @@ impl TryFrom<String> for ExpandedPath {
         if text.contains('\0') {
             return Err(format!("{text:?} is not a path: it contains a NUL"));
         }
-        match shellexpand::full(&text) {
-            Ok(expanded) => Ok(Self(PathBuf::from(expanded.into_owned()))),
-            Err(error) => Err(format!("{text:?} names the environment variable {}, which is not set", error.var_name)),
-        }
+        shellexpand::full(&text).map(|path| Self(path.into_owned().into())).map_err(|error| not_set(&text, &error))
     }
+}
+
+fn not_set(text: &str, error: &LookupError<VarError>) -> String {
+    format!("{text:?} names the environment variable {}, which is not set", error.var_name)
 }
 
 /// Reads a text and expands `$VARIABLE`.
@@ -36,9 +46,7 @@ impl TryFrom<String> for ExpandedPath {
 /// When the value is not a text, or names a variable that is not set.
 pub fn expanded<'de, D: Deserializer<'de>>(deserializer: D) -> Result<String, D::Error> {
     let text = String::deserialize(deserializer)?;
-    shellexpand::env(&text).map(Cow::into_owned).map_err(|error| {
-        D::Error::custom(format!("{text:?} names the environment variable {}, which is not set", error.var_name))
-    })
+    shellexpand::env(&text).map(Cow::into_owned).map_err(|error| D::Error::custom(not_set(&text, &error)))
 }
 
 /// Reads the path of a directory.
@@ -61,6 +69,14 @@ pub fn local_address<'de, D: Deserializer<'de>>(deserializer: D) -> Result<IpAdd
         .map_err(|_| D::Error::custom(format!("{text:?} is not an IP address; allowed are such as 127.0.0.1 or ::1")))
 }
 
+/// Reads a value with `read`, or `null`.
+fn optional<'de, T, D: Deserializer<'de>>(
+    deserializer: D,
+    read: impl FnOnce(Value) -> serde_json::Result<T>,
+) -> Result<Option<T>, D::Error> {
+    Option::<Value>::deserialize(deserializer)?.map(read).transpose().map_err(D::Error::custom)
+}
+
 /// Reads a text, expands `$VARIABLE`, and converts it to a value; `null` is `None`.
 ///
 /// # Errors
@@ -70,10 +86,7 @@ where
     T: TryFrom<String, Error: fmt::Display>,
     D: Deserializer<'de>,
 {
-    #[derive(Deserialize)]
-    struct Text(#[serde(deserialize_with = "expanded")] String);
-    let text = Option::<Text>::deserialize(deserializer)?;
-    text.map(|Text(text)| T::try_from(text).map_err(D::Error::custom)).transpose()
+    optional(deserializer, |value| T::try_from(expanded(value)?).map_err(serde_json::Error::custom))
 }
 
 /// Reads the name of a choice.
@@ -98,24 +111,10 @@ where
     T: TryFrom<u64>,
     D: Deserializer<'de>,
 {
-    struct Whole<const MIN: u64, const MAX: u64>;
-    impl<const MIN: u64, const MAX: u64> Visitor<'_> for Whole<MIN, MAX> {
-        type Value = u64;
-
-        fn expecting(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
-            write!(out, "a whole number from {MIN} to {MAX}")
-        }
-
-        fn visit_u64<E: serde::de::Error>(self, number: u64) -> Result<u64, E> {
-            if (MIN..=MAX).contains(&number) {
-                Ok(number)
-            } else {
-                Err(E::invalid_value(Unexpected::Unsigned(number), &self))
-            }
-        }
-    }
-    let number = deserializer.deserialize_any(Whole::<MIN, MAX>)?;
-    T::try_from(number).map_err(|_| D::Error::custom(format!("{number} is too large")))
+    let value = Value::deserialize(deserializer)?;
+    let number = value.as_u64().filter(|number| (MIN..=MAX).contains(number));
+    let number = number.and_then(|number| T::try_from(number).ok());
+    number.ok_or_else(|| not_allowed(&value, format_args!("a whole number from {MIN} to {MAX}")))
 }
 
 /// Reads a whole number from `MIN` to `MAX`, or `null`.
@@ -127,10 +126,7 @@ where
     T: TryFrom<u64>,
     D: Deserializer<'de>,
 {
-    #[derive(Deserialize)]
-    #[serde(bound = "T: TryFrom<u64>")]
-    struct Number<const MIN: u64, const MAX: u64, T>(#[serde(deserialize_with = "whole::<MIN, MAX, _, _>")] T);
-    Ok(Option::<Number<MIN, MAX, T>>::deserialize(deserializer)?.map(|number| number.0))
+    optional(deserializer, whole::<MIN, MAX, _, _>)
 }
 
 /// Reads a percentage from 0 to `MAX`.
@@ -138,21 +134,19 @@ where
 /// # Errors
 /// When the value is something else.
 pub fn percent<'de, const MAX: u16, D: Deserializer<'de>>(deserializer: D) -> Result<f64, D::Error> {
-    deserializer.deserialize_any(Between { least: 0.0, most: MAX.into(), what: "a number of percent" })
+    between(deserializer, 0.0..=MAX.into(), "percent")
 }
 
 /// A duration, written as a number of seconds.
 pub mod seconds {
-    use super::{Between, Deserializer, Duration, Serializer};
+    use super::{Deserializer, Duration, Serializer, between};
 
     /// Reads a number of seconds from 0.01 to a year.
     ///
     /// # Errors
     /// When the value is something else.
     pub fn deserialize<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Duration, D::Error> {
-        let year = 31_536_000.0;
-        let number = deserializer.deserialize_any(Between { least: 0.01, most: year, what: "a number of seconds" })?;
-        Ok(Duration::from_secs_f64(number))
+        between(deserializer, 0.01..=31_536_000.0, "seconds").map(Duration::from_secs_f64)
     }
 
     /// Writes the seconds.
@@ -167,30 +161,27 @@ pub mod seconds {
 /// A duration in seconds, or 0 for none.
 pub mod seconds_or_zero {
     pub use super::seconds::serialize;
-    use super::{Between, Deserializer, Duration};
+    use super::{Deserializer, Duration, between};
 
     /// Reads a number of seconds from 0 to a day.
     ///
     /// # Errors
     /// When the value is something else.
     pub fn deserialize<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Duration, D::Error> {
-        let number =
-            deserializer.deserialize_any(Between { least: 0.0, most: 86_400.0, what: "a number of seconds" })?;
-        Ok(Duration::from_secs_f64(number))
+        between(deserializer, 0.0..=86_400.0, "seconds").map(Duration::from_secs_f64)
     }
 }
 
 /// A duration in minutes, or 0 for none.
 pub mod minutes_or_zero {
-    use super::{Between, Deserializer, Duration, Serializer};
+    use super::{Deserializer, Duration, Serializer, between};
 
     /// Reads a number of minutes from 0 to a day.
     ///
     /// # Errors
     /// When the value is something else.
     pub fn deserialize<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Duration, D::Error> {
-        let number = deserializer.deserialize_any(Between { least: 0.0, most: 1440.0, what: "a number of minutes" })?;
-        Ok(Duration::from_secs_f64(60.0 * number))
+        between(deserializer, 0.0..=1440.0, "minutes").map(|number| Duration::from_secs_f64(60.0 * number))
     }
 
     /// Writes the minutes.
@@ -202,32 +193,20 @@ pub mod minutes_or_zero {
     }
 }
 
-/// A number between two others, both included.
-struct Between {
-    least: f64,
-    most: f64,
-    what: &'static str,
+/// Reads a number of this range.
+fn between<'de, D: Deserializer<'de>>(
+    deserializer: D,
+    range: RangeInclusive<f64>,
+    unit: &str,
+) -> Result<f64, D::Error> {
+    let value = Value::deserialize(deserializer)?;
+    let number = value.as_f64().filter(|number| range.contains(number));
+    let (least, most) = (range.start(), range.end());
+    number.ok_or_else(|| not_allowed(&value, format_args!("a number of {unit} from {least} to {most}")))
 }
 
-impl Visitor<'_> for Between {
-    type Value = f64;
-
-    fn expecting(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(out, "{} from {} to {}", self.what, self.least, self.most)
-    }
-
-    fn visit_f64<E: serde::de::Error>(self, number: f64) -> Result<f64, E> {
-        if (self.least..=self.most).contains(&number) {
-            Ok(number)
-        } else {
-            Err(E::invalid_value(Unexpected::Float(number), &self))
-        }
-    }
-
-    fn visit_u64<E: serde::de::Error>(self, number: u64) -> Result<f64, E> {
-        #[expect(clippy::cast_precision_loss, reason = "numbers that large are out of range anyway")]
-        self.visit_f64(number as f64)
-    }
+fn not_allowed<E: serde::de::Error>(value: &Value, allowed: fmt::Arguments<'_>) -> E {
+    E::custom(format_args!("{} is not allowed; allowed is {allowed}", excerpt(&value.to_string(), MAX_SHOWN)))
 }
 
 /// Reads an object. serde alone accepts a list as well, as the values of the first keys.
@@ -255,10 +234,7 @@ pub fn object<'de, T: Deserialize<'de>, D: Deserializer<'de>>(deserializer: D) -
 /// # Errors
 /// When the value is something else.
 pub fn optional_object<'de, T: DeserializeOwned, D: Deserializer<'de>>(deserializer: D) -> Result<Option<T>, D::Error> {
-    #[derive(Deserialize)]
-    #[serde(bound = "T: DeserializeOwned")]
-    struct Part<T>(#[serde(deserialize_with = "object")] T);
-    Ok(Option::<Part<T>>::deserialize(deserializer)?.map(|part| part.0))
+    optional(deserializer, object)
 }
 
 /// Reads a list; a single value is a list of one, and `null` an empty one.
@@ -270,9 +246,9 @@ where
     T: DeserializeOwned,
     D: Deserializer<'de>,
 {
-    match serde_json::Value::deserialize(deserializer)? {
-        serde_json::Value::Null => Ok(Vec::new()),
-        many @ serde_json::Value::Array(_) => serde_json::from_value(many),
+    match Value::deserialize(deserializer)? {
+        Value::Null => Ok(Vec::new()),
+        many @ Value::Array(_) => serde_json::from_value(many),
         one => serde_json::from_value(one).map(|value| vec![value]),
     }
     .map_err(D::Error::custom)

@@ -20,18 +20,20 @@ pub struct PublicAddress {
     rewritten: bool,
 }
 
-/// Checks that a text is a host name or an IP address.
+/// Checks the key `server`, a host name or an IP address. An empty one becomes `localhost`, with a warning.
 ///
 /// # Errors
 /// When it is neither; the text says what was found, and what is expected.
-pub fn check_host(host: &str, rewritten: bool) -> Result<(), String> {
-    let address = format!("{host}{}1", if rewritten { '/' } else { ':' });
-    let plain = address.parse::<PublicAddress>().is_ok();
-    if plain {
-        Ok(())
-    } else {
-        Err(format!("{host:?} is no host; allowed are names and addresses, those of IPv6 in brackets"))
+pub fn complete_host(server: &mut String, rewritten: bool) -> Result<Option<String>, String> {
+    if server.is_empty() {
+        "localhost".clone_into(server);
+        return Ok(Some("server is not set: URLs will name localhost".to_owned()));
     }
+    let address = format!("{server}{}1", if rewritten { '/' } else { ':' });
+    let checked = address.parse::<PublicAddress>().map(|_| None);
+    checked.map_err(|_| {
+        format!("server: {server:?} is no host; allowed are names and addresses, those of IPv6 in brackets")
+    })
 }
 
 impl PublicAddress {

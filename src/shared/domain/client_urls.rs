@@ -8,36 +8,26 @@ use super::address::PublicAddress;
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
 pub struct PublicUrl {
-    /// The reverse proxy, `HOST` or `HOST:PORT`.
+    /// The WebSocket URL of the reverse proxy, without a slash at its end.
     door: String,
-    ssl: bool,
     /// The path after the reverse proxy, with placeholders.
     path: String,
 }
 
 impl PublicUrl {
-    /// Returns the WebSocket URL of a server, without a slash at its end.
-    pub fn websocket_url(&self, address: &PublicAddress) -> String {
-        format!("{}{}", self.websocket_door(), self.path_of(address))
-    }
-
-    /// Returns the HTTP URL of a server, without a slash at its end.
-    pub fn http_url(&self, address: &PublicAddress) -> String {
-        format!("{}{}", self.http_door(), self.path_of(address))
-    }
-
     /// Returns the WebSocket URL of the reverse proxy itself, without a slash at its end.
     pub fn websocket_door(&self) -> String {
-        format!("{}://{}", if self.ssl { "wss" } else { "ws" }, self.door)
+        self.door.clone()
     }
 
     /// Returns the HTTP URL of the reverse proxy itself, without a slash at its end.
     pub fn http_door(&self) -> String {
-        format!("{}://{}", if self.ssl { "https" } else { "http" }, self.door)
+        with_http(&self.door)
     }
 
-    fn path_of(&self, address: &PublicAddress) -> String {
-        self.path.replace("{host}", address.host()).replace("{port}", &address.port().to_string())
+    fn websocket_url(&self, address: &PublicAddress) -> String {
+        let path = self.path.replace("{host}", address.host()).replace("{port}", &address.port().to_string());
+        format!("{}{path}", self.door)
     }
 }
 
@@ -47,18 +37,14 @@ impl TryFrom<String> for PublicUrl {
     fn try_from(text: String) -> Result<Self, String> {
         let parts = || {
             let (scheme, rest) = text.split_once("://")?;
-            let ssl = match scheme {
-                "ws" => false,
-                "wss" => true,
-                _ => return None,
-            };
             let (door, path) = rest.split_at_checked(rest.find('/')?)?;
             // The name is normalized, as in the address of a server.
             let door: PublicAddress = format!("{door}/1").parse().ok()?;
             let plain = path.replacen("{host}", "", 1).replacen("{port}", "", 1);
             let is_of_path = |letter: char| letter.is_ascii_alphanumeric() || "/-._".contains(letter);
             let fits = path.contains("{port}") && !path.ends_with('/') && plain.chars().all(is_of_path);
-            fits.then(|| Self { door: door.host().to_owned(), ssl, path: path.to_owned() })
+            let door = format!("{scheme}://{}", door.host());
+            (fits && matches!(scheme, "ws" | "wss")).then(|| Self { door, path: path.to_owned() })
         };
         parts().ok_or_else(|| {
             format!("{text:?} is not allowed; allowed is such as \"wss://fleet.example.org/{{host}}/{{port}}\"")
@@ -68,7 +54,7 @@ impl TryFrom<String> for PublicUrl {
 
 impl From<PublicUrl> for String {
     fn from(url: PublicUrl) -> Self {
-        format!("{}{}", url.websocket_door(), url.path)
+        url.door + &url.path
     }
 }
 
@@ -89,8 +75,13 @@ impl ClientUrls {
 
     /// Returns the HTTP URL of a server, without a slash at its end.
     pub fn http_url(&self, address: &PublicAddress) -> String {
-        self.public.as_ref().map_or_else(|| address.http_url(self.ssl), |public| public.http_url(address))
+        with_http(&self.websocket_url(address))
     }
+}
+
+/// The same URL for HTTP: `ws` becomes `http`, and `wss` becomes `https`.
+fn with_http(websocket_url: &str) -> String {
+    websocket_url.replacen("ws", "http", 1)
 }
 
 #[cfg(test)]
@@ -109,7 +100,7 @@ mod tests {
             ("ws://Fleet.org:8080/a/{port}", "ws://fleet.org:8080/a/2000", "http://fleet.org:8080/a/2000"),
             ("wss://[::1]/{port}-{host}", "wss://[::1]/2000-10.0.1.7", "https://[::1]/2000-10.0.1.7"),
         ] {
-            let url = public(text).unwrap();
+            let url = ClientUrls { ssl: false, public: Some(public(text).unwrap()) };
             assert_eq!((url.websocket_url(&address).as_str(), url.http_url(&address).as_str()), (websocket, http));
         }
         let url = public("wss://fleet.org/{host}/{port}").unwrap();

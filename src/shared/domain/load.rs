@@ -9,11 +9,6 @@ use serde::{Deserialize, Serialize};
 #[serde(try_from = "f64", into = "f64")]
 pub struct Load(f64);
 
-/// A number that is not a load.
-#[derive(Debug, PartialEq, thiserror::Error)]
-#[error("{0} is no load; a load is a finite number of percent that is not negative")]
-pub struct LoadError(String);
-
 impl Load {
     /// The load of an idle machine.
     pub const ZERO: Self = Self(0.0);
@@ -35,19 +30,22 @@ impl Load {
     ///
     /// # Errors
     /// When the body is anything else.
-    pub fn parse(body: &[u8]) -> Result<Self, LoadError> {
+    pub fn parse(body: &[u8]) -> Result<Self, String> {
         let text = String::from_utf8_lossy(body);
-        let number: f64 = text.trim().parse().map_err(|_| LoadError(format!("{:?}", text.trim())))?;
-        Self::try_from(number)
+        Self::try_from(text.trim().parse::<f64>().map_err(|_| no_load(format_args!("{:?}", text.trim())))?)
     }
 }
 
 impl TryFrom<f64> for Load {
-    type Error = LoadError;
+    type Error = String;
 
-    fn try_from(number: f64) -> Result<Self, LoadError> {
-        if number.is_finite() && number >= 0.0 { Ok(Self(number)) } else { Err(LoadError(number.to_string())) }
+    fn try_from(number: f64) -> Result<Self, String> {
+        if number.is_finite() && number >= 0.0 { Ok(Self(number)) } else { Err(no_load(number)) }
     }
+}
+
+fn no_load(what: impl fmt::Display) -> String {
+    format!("{what} is no load; a load is a finite number of percent that is not negative")
 }
 
 impl From<Load> for f64 {

@@ -8,7 +8,7 @@ mod project_url;
 mod server_report;
 mod url_prefix;
 
-pub use address::{PublicAddress, check_host};
+pub use address::{PublicAddress, complete_host};
 pub use admission::AdmissionRules;
 pub use client_urls::{ClientUrls, PublicUrl};
 pub use load::Load;

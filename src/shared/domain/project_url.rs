@@ -1,6 +1,7 @@
 //! The URL of a world in a git repository, as a web client types it.
 
 use std::fmt;
+use std::path::Path;
 
 use percent_encoding::percent_decode_str;
 
@@ -80,9 +81,7 @@ impl ProjectUrl {
             [.., folder, world] if folder == "worlds" => world,
             _ => return Err(url_error("missing worlds folder: it does not end in /worlds/NAME.wbt")),
         };
-        let is_world =
-            world.len() > 4 && world.get(world.len() - 4..).is_some_and(|end| end.eq_ignore_ascii_case(".wbt"));
-        if !is_world {
+        if !Path::new(world).extension().is_some_and(|extension| extension.eq_ignore_ascii_case("wbt")) {
             return Err(url_error(format!("missing world file: {world:?} is no world file")));
         }
         if inside.len() < 3 {
@@ -128,12 +127,6 @@ impl ProjectUrl {
         format!("https://{}/{}", self.host, self.repository_segments().join("/"))
     }
 
-    /// The path segments after the repository: reference, directory and world, without the segments that a Git host
-    /// inserts before them.
-    fn inside(&self) -> &[String] {
-        self.segments.get(self.reference..).unwrap_or_default()
-    }
-
     /// The kind of reference that the URL names.
     pub fn kind(&self) -> RefKind {
         self.kind
@@ -146,7 +139,8 @@ impl ProjectUrl {
 
     /// The possible readings, sorted by the length of the reference, shortest first.
     pub fn candidates(&self) -> Vec<Reading> {
-        let inside = self.inside();
+        // Reference, directory and world, without the segments that a Git host inserts before them.
+        let inside = self.segments.get(self.reference..).unwrap_or_default();
         let before_worlds = inside.len().saturating_sub(2);
         // No branch has more slashes.
         (1..=before_worlds.min(12))
@@ -167,8 +161,8 @@ impl fmt::Display for ProjectUrl {
 
 /// A repository's name without the `.git` that git may append: both name the same repository.
 pub(super) fn without_git(name: &str) -> Result<String, ProjectUrlError> {
-    let plain = name.get(name.len().saturating_sub(4)..).filter(|end| end.eq_ignore_ascii_case(".git"));
-    let plain = plain.and_then(|end| name.get(..name.len() - end.len())).unwrap_or(name);
+    let split = name.len().checked_sub(4).and_then(|end| name.split_at_checked(end));
+    let plain = split.filter(|(_, end)| end.eq_ignore_ascii_case(".git")).map_or(name, |(plain, _)| plain);
     if plain.is_empty() {
         return Err(url_error("it names no repository"));
     }

@@ -15,14 +15,6 @@ pub struct UrlPrefix {
     segments: Vec<String>,
 }
 
-/// A text of the configuration that is not a URL prefix.
-#[derive(Debug, thiserror::Error)]
-#[error("{text:?} is no URL prefix: {problem}; allowed are such as https://github.com/USER")]
-pub struct UrlPrefixError {
-    text: String,
-    problem: String,
-}
-
 impl UrlPrefix {
     /// Whether this prefix covers a world's repository. Names are compared case-insensitively, as the Git hosts do.
     pub fn covers(&self, world: &ProjectUrl) -> bool {
@@ -49,10 +41,12 @@ impl UrlPrefix {
 }
 
 impl TryFrom<String> for UrlPrefix {
-    type Error = UrlPrefixError;
+    type Error = String;
 
-    fn try_from(text: String) -> Result<Self, UrlPrefixError> {
-        let wrong = |ProjectUrlError { problem }| UrlPrefixError { text: text.clone(), problem };
+    fn try_from(text: String) -> Result<Self, String> {
+        let wrong = |ProjectUrlError { problem }| {
+            format!("{text:?} is no URL prefix: {problem}; allowed are such as https://github.com/USER")
+        };
         let (host, mut segments) = split_url(text.trim_end_matches('/')).map_err(wrong)?;
         if split_repository(&segments).is_ok() {
             return Err(wrong(ProjectUrlError { problem: "it names a part of a repository".to_owned() }));

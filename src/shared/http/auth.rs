@@ -79,20 +79,7 @@ pub fn require_administrator(auth: Option<&BasicAuth>, request: &HttpRequest, pe
     let Some(auth) = auth else {
         return Some(HttpResponse::Forbidden().body("Error: actions are off; adminPassword is not set."));
     };
-    auth.check(request, peer).err().map(AuthError::answer)
-}
-
-/// Whether a page shows what only administrators may see: the request brings the password. With another one, which may be
-/// meant for a web server in front, the page is as everybody sees it.
-///
-/// # Errors
-/// When `peer` has sent too many passwords: the page must not pass for that of a stranger.
-pub fn is_administrator(auth: Option<&BasicAuth>, request: &HttpRequest, peer: Peer) -> Result<bool, AuthError> {
-    match auth.map(|auth| auth.check(request, peer)) {
-        Some(Ok(())) => Ok(true),
-        Some(Err(AuthError::TooMany)) => Err(AuthError::TooMany),
-        Some(Err(AuthError::NoPassword)) | None => Ok(false),
-    }
+    auth.check(request, peer).err().map(HttpResponse::from_error)
 }
 
 /// The password that a request brings, with whatever user name.
@@ -105,21 +92,14 @@ fn password_of(request: &HttpRequest) -> Option<String> {
     text.split_once(':').map(|(_, password)| password.to_owned())
 }
 
-impl AuthError {
-    /// The response to a refused request.
-    pub fn answer(self) -> HttpResponse {
+impl actix_web::ResponseError for AuthError {
+    fn error_response(&self) -> HttpResponse {
         match self {
             Self::NoPassword => HttpResponse::Unauthorized()
                 .insert_header((header::WWW_AUTHENTICATE, "Basic realm=\"administrator\""))
                 .body(self.to_string()),
             Self::TooMany => HttpResponse::TooManyRequests().insert_header(retry_after()).body(self.to_string()),
         }
-    }
-}
-
-impl actix_web::ResponseError for AuthError {
-    fn error_response(&self) -> HttpResponse {
-        self.answer()
     }
 }
 

@@ -48,10 +48,8 @@ pub struct ClientStream {
     unread: Vec<u8>,
     /// The beginning of the line that is read, without line breaks.
     line: Vec<u8>,
-    /// Whether the byte before was the end of a line.
-    line_ended: bool,
-    /// The length of the body that the head tells.
-    body: usize,
+    /// The length of the body that the head tells; `None` before its first line.
+    body: Option<usize>,
     /// Whether the system takes no more of an answer, since the client does not read.
     is_blocked: bool,
     state: State,
@@ -67,8 +65,7 @@ impl ClientStream {
             upgrade: UpgradeSlot::default(),
             unread: Vec::new(),
             line: Vec::new(),
-            line_ended: false,
-            body: 0,
+            body: None,
             is_blocked: false,
             state: State::Request,
             stopping: Some(Box::pin(stopping.cancelled_owned())),
@@ -109,24 +106,20 @@ impl ClientStream {
         }
         for (index, byte) in self.unread.iter().take(room).enumerate() {
             match byte {
-                // An empty line ends the head of a request.
-                b'\n' if self.line_ended => {
-                    self.line_ended = false;
-                    self.state = after(std::mem::take(&mut self.body), false);
-                    return index + 1;
+                // An empty line ends the head of a request, and means nothing before one.
+                b'\n' if self.line.is_empty() => {
+                    if let Some(body) = self.body.take() {
+                        self.state = after(body, false);
+                        return index + 1;
+                    }
                 }
                 b'\n' => {
-                    self.line_ended = true;
-                    self.body = content_length(&self.line).unwrap_or(self.body);
+                    self.body = content_length(&self.line).or(self.body).or(Some(0));
                     self.line.clear();
                 }
                 b'\r' => {}
-                other => {
-                    self.line_ended = false;
-                    if self.line.len() < MAX_LINE {
-                        self.line.push(*other);
-                    }
-                }
+                other if self.line.len() < MAX_LINE => self.line.push(*other),
+                _ => {}
             }
         }
         room

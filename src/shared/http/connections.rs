@@ -42,21 +42,18 @@ pub struct ConnectionLimiter {
     max_clients: usize,
     /// Limit of web clients per address.
     per_address: usize,
-    open: Arc<Mutex<Open>>,
+    open: Arc<Mutex<HashMap<Key, usize>>>,
 }
 
-#[derive(Debug, Default)]
-struct Open {
-    all: HashMap<ConnectionKind, usize>,
-    by_address: HashMap<(ConnectionKind, IpAddr), usize>,
-}
+/// What a number of open connections is about: those of an address, or all of a kind.
+type Key = (ConnectionKind, Option<IpAddr>);
 
 /// One connection that is counted until this is dropped.
 #[derive(Debug)]
 pub struct ConnectionPermit {
     kind: ConnectionKind,
     address: Option<IpAddr>,
-    open: Arc<Mutex<Open>>,
+    open: Arc<Mutex<HashMap<Key, usize>>>,
 }
 
 /// Why a connection is refused, as text for the client.
@@ -80,7 +77,7 @@ impl ConnectionLimiter {
 
     /// Number of open connections of a kind.
     pub fn count(&self, kind: ConnectionKind) -> usize {
-        self.open.lock().all.get(&kind).copied().unwrap_or_default()
+        self.open.lock().get(&(kind, None)).copied().unwrap_or_default()
     }
 
     /// Counts a connection. A proxy that does not report its clients' addresses stands for many clients, so only the
@@ -104,56 +101,48 @@ impl ConnectionLimiter {
         };
         let address = peer.rate_limit_key();
         let mut open = self.open.lock();
-        let Open { all, by_address } = &mut *open;
-        let all = all.entry(kind).or_default();
-        if *all >= max {
+        let count = |key| open.get(&key).copied().unwrap_or_default();
+        if count((kind, None)) >= max {
             return Err(ConnectionLimitError::InAll);
         }
-        if let Some(address) = address {
-            let count = by_address.entry((kind, address)).or_default();
-            if *count >= max_per_address {
-                return Err(ConnectionLimitError::FromAddress);
-            }
-            *count += 1;
+        if address.is_some() && count((kind, address)) >= max_per_address {
+            return Err(ConnectionLimitError::FromAddress);
         }
-        *all += 1;
+        for key in keys(kind, address) {
+            *open.entry(key).or_default() += 1;
+        }
         drop(open);
         Ok(ConnectionPermit { kind, address, open: Arc::clone(&self.open) })
     }
 }
 
+/// The numbers in which a connection is counted.
+fn keys(kind: ConnectionKind, address: Option<IpAddr>) -> impl Iterator<Item = Key> {
+    [Some((kind, None)), address.map(|address| (kind, Some(address)))].into_iter().flatten()
+}
+
 impl Drop for ConnectionPermit {
     fn drop(&mut self) {
         let mut open = self.open.lock();
-        if let Some(all) = open.all.get_mut(&self.kind) {
-            *all -= 1;
-        }
-        let Some(key) = self.address.map(|address| (self.kind, address)) else {
-            return;
-        };
-        if let Some(count) = open.by_address.get_mut(&key) {
-            *count -= 1;
-            if *count == 0 {
-                open.by_address.remove(&key);
+        for key in keys(self.kind, self.address) {
+            let left = open.get_mut(&key).map(|count| {
+                *count -= 1;
+                *count
+            });
+            if left == Some(0) {
+                open.remove(&key);
             }
         }
     }
 }
 
-impl ConnectionLimitError {
-    /// Returns the response to a refused client.
-    pub fn answer(self) -> HttpResponse {
+impl actix_web::ResponseError for ConnectionLimitError {
+    fn error_response(&self) -> HttpResponse {
         let status = match self {
             Self::InAll => StatusCode::SERVICE_UNAVAILABLE,
             Self::FromAddress => StatusCode::TOO_MANY_REQUESTS,
         };
         HttpResponse::build(status).insert_header(retry_after()).body(self.to_string())
-    }
-}
-
-impl actix_web::ResponseError for ConnectionLimitError {
-    fn error_response(&self) -> HttpResponse {
-        self.answer()
     }
 }
 
@@ -188,9 +177,9 @@ mod tests {
         let permit = admit("2001:db8::1").unwrap();
         assert_eq!(admit("2001:db8::2").unwrap_err(), ConnectionLimitError::FromAddress, "the same /64");
         let _neighbour = admit("2001:db8:0:1::1").unwrap();
-        assert_eq!(connections.open.lock().by_address.len(), 2);
+        assert_eq!(connections.open.lock().len(), 3);
         drop(permit);
-        assert_eq!(connections.open.lock().by_address.len(), 1);
+        assert_eq!(connections.open.lock().len(), 2);
         assert_eq!(connections.count(ConnectionKind::Client), 1);
     }
 }

@@ -10,8 +10,7 @@ use std::time::Duration;
 use actix_web::HttpResponse;
 use actix_web::http::header;
 use actix_web::web::Bytes;
-use futures_util::future::LocalBoxFuture;
-use futures_util::stream;
+use futures_util::stream::{self, StreamExt};
 use parking_lot::Mutex;
 use serde::Serialize;
 use tokio::sync::watch;
@@ -86,14 +85,13 @@ impl LiveUpdates {
         });
         drop(running);
         events.mark_changed();
-        let closing = Box::pin(closing(phase));
-        let stream_of_events = EventStream { events, unsent: Bytes::new(), closing, _permit: permit };
+        let page = EventStream { events, unsent: Bytes::new(), _permit: permit };
         HttpResponse::Ok()
             .content_type("text/event-stream")
             .insert_header((header::CACHE_CONTROL, "no-store"))
             // A reverse proxy must not buffer events.
             .insert_header(("X-Accel-Buffering", "no"))
-            .streaming(stream::unfold(stream_of_events, EventStream::next))
+            .streaming(stream::unfold(page, EventStream::next).take_until(Box::pin(closing(phase))))
     }
 
     async fn render_each_period<R, F>(self, events: watch::Sender<Bytes>, render: R)
@@ -132,21 +130,17 @@ struct EventStream {
     events: watch::Receiver<Bytes>,
     /// The rest of an event.
     unsent: Bytes,
-    closing: LocalBoxFuture<'static, ()>,
     _permit: ConnectionPermit,
 }
 
 impl EventStream {
-    /// Returns the next bytes for the page; `None` if the server stops or the rendering task has panicked.
+    /// Returns the next bytes for the page; `None` if the rendering task has panicked.
     async fn next(mut self) -> Option<(Result<Bytes, std::convert::Infallible>, Self)> {
         if self.unsent.is_empty() {
-            self.unsent = tokio::select! {
-                changed = actix_rt::time::timeout(KEEP_ALIVE, self.events.changed()) => match changed {
-                    Ok(Ok(())) => self.events.borrow_and_update().clone(),
-                    Ok(Err(_)) => return None,
-                    Err(_) => Bytes::from_static(b"data: {}\n\n"),
-                },
-                () = &mut self.closing => return None,
+            self.unsent = match actix_rt::time::timeout(KEEP_ALIVE, self.events.changed()).await {
+                Ok(Ok(())) => self.events.borrow_and_update().clone(),
+                Ok(Err(_)) => return None,
+                Err(_) => Bytes::from_static(b"data: {}\n\n"),
             };
         }
         let chunk = self.unsent.split_to(CHUNK.min(self.unsent.len()));

@@ -20,12 +20,14 @@ pub struct Liveness {
 /// Limit of answers between two pongs.
 const ANSWERS: u32 = 100;
 
-impl Liveness {
+impl Default for Liveness {
     /// Starts with a new connection.
-    pub fn new() -> Self {
+    fn default() -> Self {
         Self { alive: Instant::now(), asked: rand::random(), answers: 0 }
     }
+}
 
+impl Liveness {
     /// Returns the content of the next ping.
     pub fn ping(&mut self) -> [u8; 8] {
         self.asked = rand::random();
@@ -73,19 +75,13 @@ where
     });
 }
 
-impl Default for Liveness {
-    fn default() -> Self {
-        Self::new()
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
 
     #[test]
     fn only_the_right_pong_is_a_sign_of_life() {
-        let mut liveness = Liveness::new();
+        let mut liveness = Liveness::default();
         while liveness.may_answer() {}
         liveness.pong(b"");
         assert!(!liveness.may_answer(), "a pong that nobody asked for proves nothing");

@@ -34,11 +34,6 @@ impl<'text> Gauge<'text> {
 }
 
 impl Metrics {
-    /// Creates an empty registry.
-    pub fn new() -> Self {
-        Self::default()
-    }
-
     /// Adds a counter with one label.
     ///
     /// # Errors

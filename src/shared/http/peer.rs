@@ -14,13 +14,13 @@ use serde::{Deserialize, Serialize};
 
 /// The networks of proxies whose header `X-Forwarded-For` is trusted.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(try_from = "Vec<String>", into = "Vec<String>")]
+#[serde(try_from = "Vec<String>")]
 pub struct TrustedProxies(Vec<IpNet>);
 
 /// The name of a header in which a web server tells who its client is.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(try_from = "String", into = "String")]
-pub struct UserHeader(HeaderName);
+#[serde(try_from = "String")]
+pub struct UserHeader(String);
 
 /// The client at the other end of a connection.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -56,42 +56,38 @@ impl TrustedProxies {
 
     /// The client of a connection on which no request was received yet.
     pub fn of_connection(&self, address: IpAddr) -> Peer {
-        let address = address.to_canonical();
-        if self.trusts(address) { Peer::Proxy(address) } else { Peer::Client(address) }
+        self.resolve(address.to_canonical(), &HeaderMap::new())
     }
 
     /// The value of a header that a trusted proxy sets. A header that is there twice has none: the client may have sent one
     /// of them.
     pub fn trusted_header(&self, request: &HttpRequest, header: &UserHeader) -> Option<String> {
         let is_trusted = request.peer_addr().is_some_and(|address| self.trusts(address.ip().to_canonical()));
-        let mut lines = request.headers().get_all(&header.0).filter(|_| is_trusted);
+        let mut lines = request.headers().get_all(header.0.as_str()).filter(|_| is_trusted);
         match (lines.next(), lines.next()) {
             (Some(line), None) => String::from_utf8(line.as_bytes().to_vec()).ok(),
             _ => None,
         }
     }
 
+    /// The last address of the header's chain that is not a trusted proxy. A hop that is not an address ends the chain.
     fn resolve(&self, connected: IpAddr, headers: &HeaderMap) -> Peer {
         if !self.trusts(connected) {
             return Peer::Client(connected);
         }
-        match joined(headers, "x-forwarded-for") {
-            Some(chain) => Peer::Client(self.client(connected, &chain)),
-            None => Peer::Proxy(connected),
+        // A line that is not text is not an address.
+        let lines: Vec<&str> = headers.get_all("x-forwarded-for").map(|line| line.to_str().unwrap_or("?")).collect();
+        if lines.is_empty() {
+            return Peer::Proxy(connected);
         }
-    }
-
-    /// Returns the last address of a chain that is not a trusted proxy. A hop that is not an address ends the chain.
-    fn client(&self, connected: IpAddr, chain: &str) -> IpAddr {
         let mut nearest = connected;
-        for hop in chain.rsplit(',') {
-            match address(hop.trim()) {
-                Some(address) if self.trusts(address) => nearest = address,
-                Some(address) => return address,
-                None => break,
+        for hop in lines.join(",").rsplit(',').map_while(|hop| address(hop.trim())) {
+            nearest = hop;
+            if !self.trusts(hop) {
+                break;
             }
         }
-        nearest
+        Peer::Client(nearest)
     }
 
     /// Whether programs on this machine are trusted.
@@ -102,12 +98,6 @@ impl TrustedProxies {
     fn trusts(&self, address: IpAddr) -> bool {
         self.0.iter().any(|network| network.contains(&address))
     }
-}
-
-/// Joins all lines of a header; `None` if there are none. A line that is not text becomes `?`, which is not an address.
-fn joined(headers: &HeaderMap, name: &str) -> Option<String> {
-    let lines: Vec<&str> = headers.get_all(name).map(|line| line.to_str().unwrap_or("?")).collect();
-    (!lines.is_empty()).then(|| lines.join(","))
 }
 
 /// Parses an address as reverse proxies write it: some add the port.
@@ -121,14 +111,10 @@ impl TryFrom<String> for UserHeader {
     type Error = String;
 
     fn try_from(text: String) -> Result<Self, String> {
-        let name = HeaderName::try_from(&text);
-        name.map(Self).map_err(|_| format!("{text:?} is no name of a header, such as X-Forwarded-User"))
-    }
-}
-
-impl From<UserHeader> for String {
-    fn from(UserHeader(name): UserHeader) -> Self {
-        name.to_string()
+        match HeaderName::try_from(&text) {
+            Ok(_) => Ok(Self(text)),
+            Err(_) => Err(format!("{text:?} is no name of a header, such as X-Forwarded-User")),
+        }
     }
 }
 
@@ -150,12 +136,6 @@ impl TryFrom<Vec<String>> for TrustedProxies {
             })
         };
         texts.into_iter().map(network).collect::<Result<_, _>>().map(Self)
-    }
-}
-
-impl From<TrustedProxies> for Vec<String> {
-    fn from(TrustedProxies(networks): TrustedProxies) -> Self {
-        networks.iter().map(ToString::to_string).collect()
     }
 }
 

@@ -8,6 +8,7 @@ use std::fmt::Debug;
 use std::future::ready;
 use std::io;
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr, TcpListener};
+use std::thread::available_parallelism;
 use std::time::Duration;
 
 use actix_http::body::MessageBody;
@@ -54,10 +55,8 @@ pub fn listen(address: SocketAddr) -> io::Result<TcpListener> {
 /// Options of a server's connections.
 #[derive(Debug, Clone)]
 pub struct HttpServerOptions {
-    /// Number of threads that serve connections.
-    pub workers: usize,
-    /// Limit of connections per thread; further ones wait in the kernel's queue, where they need no open files.
-    pub max_per_worker: usize,
+    /// Limit of connections; further ones wait in the kernel's queue, where they need no open files.
+    pub max_connections: usize,
     /// Time after which a connection is closed if nothing could be delivered to it.
     pub silence: Duration,
     /// Timeout of open connections when the server stops, in whole seconds.
@@ -86,9 +85,10 @@ where
     S::Response: Into<Response<B>>,
     B: MessageBody + 'static,
 {
-    let HttpServerOptions { workers, max_per_worker, stop, .. } = options;
-    let server = Server::build().workers(workers).max_concurrent_connections(max_per_worker);
-    let server = server.disable_signals().shutdown_timeout(stop.as_secs());
+    let threads = available_parallelism().map_or(1, usize::from);
+    let server =
+        Server::build().workers(threads).max_concurrent_connections((options.max_connections / threads).max(1));
+    let server = server.disable_signals().shutdown_timeout(options.stop.as_secs());
     // When the server stops, idle connections end at once.
     let (stops, stopping) = (server.graceful_shutdown_signal(), CancellationToken::new());
     let told = stopping.clone();

@@ -39,16 +39,11 @@ pub fn start(file: Option<&Path>) -> std::io::Result<()> {
             out,
             "{time} [{:<5}] {}: {}",
             record.level(),
-            short(record.target()),
+            record.target().trim_start_matches("webots_fleet::"),
             one_line(&record.args().to_string())
         )
     });
     let logger = builder.build();
     log::set_max_level(logger.filter());
     log::set_boxed_logger(Box::new(logger)).map_err(std::io::Error::other)
-}
-
-/// A module's path without the name of the crate.
-fn short(target: &str) -> &str {
-    target.strip_prefix("webots_fleet::").unwrap_or(target)
 }

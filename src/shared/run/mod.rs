@@ -1,6 +1,5 @@
 //! Start of a server, its readiness, its log, and signals.
 
-mod app_error;
 mod logging;
 mod open_files;
 pub mod permanent;
@@ -12,9 +11,9 @@ pub mod start;
 mod supervisor;
 mod timestamp;
 
-pub use app_error::AppError;
 pub use open_files::{limit_clients, raise_open_files};
 pub use rotated_file::RotatedFile;
 pub use signals::{Phase, ServerCommand, Signals, closing};
-pub use supervisor::{Supervisor, TooManyPanics};
+pub use start::AppError;
+pub use supervisor::Supervisor;
 pub use timestamp::{seconds_since_1970, serialize_timestamp, timestamp, timestamp_in_milliseconds};

@@ -2,8 +2,6 @@
 
 use nix::sys::resource::{Resource, getrlimit, setrlimit};
 
-use super::app_error::AppError;
-
 /// The limit that is assumed if the system does not report it.
 const USUAL: u64 = 1024;
 
@@ -25,9 +23,12 @@ pub fn raise_open_files(wanted: u64) -> u64 {
 ///
 /// # Errors
 /// When they are not even enough for what is `needed` at least.
-pub fn limit_clients(files: u64, possible: usize, max_clients: usize, needed: String) -> Result<usize, AppError> {
+pub fn limit_clients(files: u64, possible: usize, max_clients: usize, needed: &str) -> Result<usize, String> {
     if possible == 0 {
-        return Err(AppError::NoClients { files, needed });
+        return Err(format!(
+            "{files} files may be open, which is not enough for {needed}; ulimit -Hn, or LimitNOFILE of systemd, \
+             allows more"
+        ));
     }
     if possible < max_clients {
         log::warn!(

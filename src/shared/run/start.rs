@@ -10,10 +10,13 @@ use super::{pid_file, service_manager};
 use crate::shared::config::{self, Configuration, LoadedConfig};
 use crate::shared::text::one_line;
 
+/// Why a server can't start, or can't continue, in one line.
+pub type AppError = Box<dyn std::error::Error + Send + Sync>;
+
 /// Exit code: the server failed at run time, for example because its port is in use.
 pub const FAILED: u8 = 1;
 /// Exit code: the configuration is invalid.
-pub const WRONG_CONFIGURATION: u8 = 2;
+const WRONG_CONFIGURATION: i32 = 2;
 
 /// The options that both programs have.
 #[derive(clap::Args)]
@@ -26,42 +29,31 @@ pub struct CommonArgs {
     pub pid_file: Option<PathBuf>,
 }
 
-/// Reads a configuration file. Prints what is invalid in it, in one line.
-///
-/// # Errors
-/// The program's exit code, if the configuration is invalid.
-pub fn read<C: Configuration>(file: &Path) -> Result<LoadedConfig<C>, ExitCode> {
-    config::load(file).map_err(|error| {
+/// Reads a configuration file. An invalid one ends the program, which prints what is invalid in it, in one line.
+pub fn read<C: Configuration>(file: &Path) -> LoadedConfig<C> {
+    config::load(file).unwrap_or_else(|error| {
         // A key may contain any text.
-        eprintln!("error: {}", one_line(&error.to_string()));
-        ExitCode::from(WRONG_CONFIGURATION)
+        eprintln!("error: {}", one_line(&error));
+        std::process::exit(WRONG_CONFIGURATION)
     })
 }
 
 /// Prints the effective configuration to standard output, and warnings to the error output.
-pub fn check<C: Configuration>(loaded: &LoadedConfig<C>) -> ExitCode {
+pub fn check<C: Configuration>(loaded: &LoadedConfig<C>) {
     for warning in &loaded.warnings {
         eprintln!("warning: {}", one_line(warning));
     }
-    match serde_json::to_string_pretty(&loaded.config) {
-        Ok(text) => {
-            // The reader may have closed the pipe.
-            writeln!(std::io::stdout(), "{text}").ok();
-            ExitCode::SUCCESS
-        }
-        Err(error) => {
-            eprintln!("error: {error}");
-            ExitCode::from(WRONG_CONFIGURATION)
-        }
-    }
+    let text = serde_json::to_string_pretty(&loaded.config).unwrap_or_else(|error| format!("error: {error}"));
+    // The reader may have closed the pipe.
+    writeln!(std::io::stdout(), "{text}").ok();
 }
 
 /// Starts the log in a file, without one on standard output, writes the PID file if requested, and runs a server until it stops.
-pub fn serve<E: std::error::Error>(
+pub fn serve(
     log: Option<&Path>,
     options: &CommonArgs,
     warnings: &[String],
-    server: impl Future<Output = Result<(), E>>,
+    server: impl Future<Output = Result<(), AppError>>,
 ) -> ExitCode {
     // The file is locked until the end of the process.
     let _pid_file = match options.pid_file.as_deref().map(pid_file::write).transpose() {

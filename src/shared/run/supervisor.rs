@@ -21,13 +21,6 @@ pub struct Supervisor<K, A: Actor> {
     panics: VecDeque<Instant>,
 }
 
-/// Actors of one kind panic again and again: the server must exit and be restarted.
-#[derive(Debug, PartialEq, Eq, thiserror::Error)]
-#[error("more than {MAX_PANICS} panics of one kind of actor ({kind}) within {} s", WINDOW.as_secs())]
-pub struct TooManyPanics {
-    kind: &'static str,
-}
-
 impl<K: Ord + Display, A: Actor> Supervisor<K, A> {
     /// No actors yet; `start` starts one.
     pub fn new(kind: &'static str, start: impl Fn(&K) -> Option<Addr<A>> + 'static) -> Self {
@@ -54,8 +47,8 @@ impl<K: Ord + Display, A: Actor> Supervisor<K, A> {
     /// Replaces actors that have panicked.
     ///
     /// # Errors
-    /// When there were too many panics.
-    pub fn restart_gone(&mut self) -> Result<(), TooManyPanics> {
+    /// When actors of this kind panic again and again: the server must exit and be restarted.
+    pub fn restart_gone(&mut self) -> Result<(), String> {
         let now = Instant::now();
         self.actors.retain(|key, actor| {
             if actor.connected() {
@@ -66,7 +59,11 @@ impl<K: Ord + Display, A: Actor> Supervisor<K, A> {
             (self.start)(key).inspect(|new| *actor = new.clone()).is_some()
         });
         while self.panics.pop_front_if(|at| now.duration_since(*at) > WINDOW).is_some() {}
-        if self.panics.len() > MAX_PANICS { Err(TooManyPanics { kind: self.kind }) } else { Ok(()) }
+        if self.panics.len() <= MAX_PANICS {
+            return Ok(());
+        }
+        let (kind, window) = (self.kind, WINDOW.as_secs());
+        Err(format!("more than {MAX_PANICS} panics of one kind of actor ({kind}) within {window} s"))
     }
 }
 

@@ -11,7 +11,7 @@ use actix_web_actors::ws::{CloseCode, CloseReason, Message, ProtocolError, Webso
 
 use super::session::Session;
 use crate::shared::http::liveness::{self, Liveness};
-use crate::shared::http::websocket::{ClientMessage, MessageReader};
+use crate::shared::http::websocket::wrong_message;
 use crate::shared::http::{ConnectionPermit, Peer};
 use crate::shared::run::closing;
 use crate::simulation::client_identity::ClientIdentity;
@@ -27,7 +27,6 @@ pub struct WebClient {
     user: Option<String>,
     session: Attached,
     liveness: Liveness,
-    reader: MessageReader,
     _permit: ConnectionPermit,
 }
 
@@ -51,8 +50,7 @@ type Context = WebsocketContext<WebClient>;
 impl WebClient {
     /// A client that has just connected; `permit` counts it.
     pub fn new(server: Arc<AppState>, (peer, user): (Peer, Option<String>), permit: ConnectionPermit) -> Self {
-        let (liveness, reader) = (Liveness::new(), MessageReader::default());
-        Self { server, peer, user, session: Attached::No, liveness, reader, _permit: permit }
+        Self { server, peer, user, session: Attached::No, liveness: Liveness::default(), _permit: permit }
     }
 
     fn finish(&mut self, last_words: String, code: CloseCode, ctx: &mut Context) {
@@ -146,11 +144,11 @@ impl Actor for WebClient {
 
 impl StreamHandler<Result<Message, ProtocolError>> for WebClient {
     fn handle(&mut self, message: Result<Message, ProtocolError>, ctx: &mut Self::Context) {
-        match self.reader.read(message) {
-            Ok(Some(ClientMessage::Text(text))) if self.liveness.may_answer() => self.handle_request(&text, ctx),
-            Ok(Some(ClientMessage::Ping(data))) if self.liveness.may_answer() => ctx.pong(&data),
-            Ok(Some(ClientMessage::Pong(content))) => self.liveness.pong(&content),
-            Ok(Some(ClientMessage::Close(reason))) => {
+        match message {
+            Ok(Message::Text(text)) if self.liveness.may_answer() => self.handle_request(&text, ctx),
+            Ok(Message::Ping(data)) if self.liveness.may_answer() => ctx.pong(&data),
+            Ok(Message::Pong(content)) => self.liveness.pong(&content),
+            Ok(Message::Close(reason)) => {
                 // After any other close code, or none, the client may return.
                 if reason.as_ref().is_some_and(|reason| reason.code == CloseCode::Normal) {
                     self.leave();
@@ -158,16 +156,16 @@ impl StreamHandler<Result<Message, ProtocolError>> for WebClient {
                 ctx.close(reason);
                 ctx.stop();
             }
-            Ok(None) => {}
-            Ok(Some(ClientMessage::Text(_) | ClientMessage::Ping(_))) => {
+            Ok(Message::Text(_) | Message::Ping(_)) => {
                 log::warn!("client {}: asks too much between two pings", self.peer);
                 self.leave();
                 self.finish(protocol::error("Too many requests on one connection"), CloseCode::Policy, ctx);
             }
-            Err(error) => {
-                log::info!("client {}: {error}", self.peer);
+            other => {
+                let (problem, code) = wrong_message(other);
+                log::info!("client {}: {problem}", self.peer);
                 self.leave();
-                self.finish(protocol::error(&error.to_string()), error.code(), ctx);
+                self.finish(protocol::error(&problem), code, ctx);
             }
         }
     }

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 
-use crate::shared::config::{ExpandedPath, InvalidValueError, one_or_many};
+use crate::shared::config::{ExpandedPath, one_or_many};
 
 /// Paths that each sandbox mounts itself.
 const OF_EACH: [&str; 3] = ["/", "/proc", "/dev"];
@@ -65,14 +65,15 @@ impl SandboxFolders {
     ///
     /// # Errors
     /// When a directory is the root of the system, or one that each sandbox mounts itself.
-    pub fn check(&self) -> Result<(), InvalidValueError> {
+    pub fn check(&self) -> Result<(), String> {
         for (key, paths) in [("sandbox.readable", &self.readable), ("sandbox.writable", &self.writable)] {
             let is_of_each =
                 |path: &Path| path.canonicalize().is_ok_and(|path| OF_EACH.map(Path::new).contains(&&*path));
             if let Some(path) = paths.iter().find(|path| is_of_each(&path.0)) {
                 let path = path.0.display();
-                let problem = format!("\"{path}\" can't be shown: each sandbox has its own; allowed is what is inside");
-                return Err(InvalidValueError { key, problem });
+                return Err(format!(
+                    "{key}: \"{path}\" can't be shown: each sandbox has its own; allowed is what is inside"
+                ));
             }
         }
         Ok(())

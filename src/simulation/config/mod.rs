@@ -5,7 +5,6 @@ mod gpus;
 mod isolation;
 mod resources;
 mod simulation_config;
-mod streaming;
 mod timing;
 mod urls;
 
@@ -14,5 +13,5 @@ pub use gpus::GpuUse;
 pub use isolation::{IsolationSetting, SandboxFolders, SandboxNetwork, VariableName};
 pub use resources::ResourceLimits;
 pub use simulation_config::SimulationConfig;
-pub use streaming::Streaming;
 pub use timing::Timing;
+pub use urls::Streaming;

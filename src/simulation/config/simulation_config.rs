@@ -10,14 +10,14 @@ use super::container::{ContainerDisplay, ContainerSettings, EDITOR_PORT};
 use super::gpus::GpuUse;
 use super::isolation::{IsolationSetting, SandboxFolders, VariableName};
 use super::resources::ResourceLimits;
-use super::streaming::Streaming;
 use super::timing::Timing;
+use super::urls::Streaming;
 use crate::shared::config::keys::keys;
 use crate::shared::config::{
-    Configuration, ExpandedPath, InvalidValueError, Secret, choice, expanded, folder, is_web_url, local_address,
-    minutes_or_zero, object, one_or_many, optional_expanded, optional_whole, percent, require, seconds, whole,
+    Configuration, ExpandedPath, Secret, choice, expanded, folder, is_web_url, local_address, minutes_or_zero, object,
+    one_or_many, optional_expanded, optional_whole, percent, require, seconds, whole,
 };
-use crate::shared::domain::{PublicUrl, UrlPrefix, check_host};
+use crate::shared::domain::{PublicUrl, UrlPrefix, complete_host};
 use crate::shared::http::{Origin, TrustedProxies, UserHeader};
 use crate::simulation::checkout::Mirrors;
 use crate::simulation::machine::display::{self, DisplayName};
@@ -216,14 +216,10 @@ impl SimulationConfig {
 impl Configuration for SimulationConfig {
     const ALIASES: &'static [&'static str] = &["fullyQualifiedDomainName", "persistentDockerImages"];
 
-    fn complete(&mut self, file: &Path) -> Result<Vec<String>, InvalidValueError> {
+    fn complete(&mut self, file: &Path) -> Result<Vec<String>, String> {
         file.clone_into(&mut self.file);
         let mut warnings = Vec::new();
-        if self.server.is_empty() {
-            warnings.push("server is not set: URLs will name localhost".to_owned());
-            "localhost".clone_into(&mut self.server);
-        }
-        check_host(&self.server, self.port_rewrite).map_err(|problem| InvalidValueError { key: "server", problem })?;
+        warnings.extend(complete_host(&mut self.server, self.port_rewrite)?);
         if self.webots_home.is_none() {
             self.webots_home = std::env::var_os("WEBOTS_HOME").map(|home| ExpandedPath(home.into()));
         }

@@ -3,8 +3,21 @@
 use std::net::{IpAddr, Ipv4Addr};
 use std::ops::RangeInclusive;
 
-use super::{SimulationConfig, Streaming};
+use serde::{Deserialize, Serialize};
+
+use super::SimulationConfig;
 use crate::shared::domain::{ClientUrls, PublicAddress};
+
+/// How clients reach the streams of simulations.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Streaming {
+    /// Each at the port of its Webots.
+    #[default]
+    Direct,
+    /// Through this server, with a token.
+    Relay,
+}
 
 impl SimulationConfig {
     /// Returns this server's HTTP URL for clients.

@@ -291,7 +291,7 @@ mod tests {
     use crate::simulation::ends::Ends;
 
     fn slots() -> Addr<SlotPool> {
-        let ends = Ends::start(PathBuf::from("/nonexistent"), String::new(), &Metrics::new()).unwrap();
+        let ends = Ends::start(PathBuf::from("/nonexistent"), String::new(), &Metrics::default()).unwrap();
         SlotPool::new(2001..=2001, 1, None, None, ends).start()
     }
 

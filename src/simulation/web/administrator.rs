@@ -2,7 +2,7 @@
 
 use actix_web::HttpRequest;
 
-use crate::shared::http::{AuthError, is_administrator};
+use crate::shared::http::AuthError;
 use crate::simulation::config::SimulationConfig;
 use crate::simulation::state::AppState;
 
@@ -21,14 +21,15 @@ impl Visitor {
     /// The sender of a request.
     ///
     /// # Errors
-    /// When its address has sent too many passwords.
+    /// When its address has sent too many passwords: the page must not pass for that of a stranger.
     pub fn of(request: &HttpRequest, server: &AppState) -> Result<Self, AuthError> {
         let peer = server.config.trusted_proxies.peer(request);
-        Ok(match &server.admin_auth {
-            None => Self::Anybody,
-            auth if is_administrator(auth.as_ref(), request, peer)? => Self::Administrator,
-            Some(_) => Self::Stranger,
-        })
+        match server.admin_auth.as_ref().map(|auth| auth.check(request, peer)) {
+            None => Ok(Self::Anybody),
+            Some(Ok(())) => Ok(Self::Administrator),
+            Some(Err(AuthError::NoPassword)) => Ok(Self::Stranger),
+            Some(Err(error @ AuthError::TooMany)) => Err(error),
+        }
     }
 
     /// Whether the visitor may see the ports of simulations: a client that reaches one controls its simulation. If no
