@@ -75,13 +75,12 @@ fn fleet() -> FleetStatus {
     });
     let address = |number: u16| format!("simulation{number}.example.org:{}", 2000 + number).parse().unwrap();
     let servers = (0..SERVERS).map(|number| ServerStatus {
-        address: address(number),
         record: ServerRecord {
             state: if number % 10 == 0 { ServerState::Full } else { ServerState::Up },
             report: Some(Arc::new(serde_json::from_value(report.clone()).unwrap())),
             latency: Some(Duration::from_millis(3)),
             answered: Some(Instant::now()),
-            ..ServerRecord::new(false)
+            ..ServerRecord::new(address(number), false)
         },
         error: None,
         effective_load: Some(44.5),

@@ -4,7 +4,8 @@ use super::scenario::THRESHOLD;
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
 use std::time::{Duration, Instant};
-use webots_fleet::session::placement::{ClientCounts, LoadBalancer, LoadReport, PlacementPolicy};
+use webots_fleet::session::placement::{LoadBalancer, PlacementPolicy};
+use webots_fleet::shared::domain::{Instances, Load, ServerReport};
 
 /// What a server reports.
 #[derive(Debug, Clone, Copy)]
@@ -57,13 +58,15 @@ impl Own {
 
 impl Dispatcher for Own {
     fn report(&mut self, server: usize, now: f64, seen: Seen) {
-        let instances =
-            ClientCounts { present: seen.present, places: 100_000, arrivals: seen.arrivals, accepting: true };
-        let report = LoadReport { load: seen.load, instances: self.instances.then_some(instances) };
-        self.fleet.report(&server, self.at(now), report);
-        if self.hears_of_failures {
-            self.fleet.note_failures(&server, self.at(now), seen.failed_starts);
-        }
+        let Seen { load, present: running, arrivals, failed_starts } = seen;
+        let instances = Instances { running, places: 100_000, arrivals, ..Instances::default() };
+        let report = ServerReport {
+            load: Load::try_from(load).unwrap_or_default(),
+            instances: self.instances.then_some(instances),
+            failed_starts: if self.hears_of_failures { failed_starts } else { 0 },
+            ..ServerReport::default()
+        };
+        self.fleet.report(&server, self.at(now), &report, true);
     }
 
     fn place(&mut self, now: f64) -> Option<usize> {

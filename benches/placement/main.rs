@@ -26,7 +26,8 @@ use scenario::{Arrivals, Outcome, Scenario, Sizes};
 use std::hint::black_box;
 use std::process::ExitCode;
 use std::time::{Duration, Instant};
-use webots_fleet::session::placement::{ClientCounts, LoadBalancer, LoadReport, PlacementPolicy};
+use webots_fleet::session::placement::{LoadBalancer, PlacementPolicy};
+use webots_fleet::shared::domain::{Instances, Load, ServerReport};
 
 fn main() -> ExitCode {
     let begin = Instant::now();
@@ -144,11 +145,12 @@ fn speed() {
     let start = Instant::now();
     let mut fleet = LoadBalancer::new(PlacementPolicy::default());
     (0..SERVERS).for_each(|id| fleet.add(id));
-    let report = |round: u32| LoadReport {
-        load: 30.0,
-        instances: Some(ClientCounts { present: 10, places: 100, arrivals: 10 + u64::from(round), accepting: true }),
+    let report = |arrivals| ServerReport {
+        load: Load::try_from(30.0).unwrap_or_default(),
+        instances: Some(Instances { running: 10, places: 100, arrivals, ..Instances::default() }),
+        ..ServerReport::default()
     };
-    (0..SERVERS).for_each(|id| fleet.report(&id, start, report(0)));
+    (0..SERVERS).for_each(|id| fleet.report(&id, start, &report(10), true));
     let begin = Instant::now();
     for _ in 0..ROUNDS {
         black_box(fleet.pick(start, |_| true));
@@ -156,7 +158,7 @@ fn speed() {
     let place = begin.elapsed() / ROUNDS;
     let begin = Instant::now();
     for id in 0..SERVERS {
-        fleet.report(&id, start + Duration::from_secs(1), report(2));
+        fleet.report(&id, start + Duration::from_secs(1), &report(12), true);
     }
     println!("\n1,000 servers: a placement takes {place:?}, a report {:?}", begin.elapsed() / SERVERS);
 }

@@ -9,7 +9,7 @@ use actix_web::{App, web};
 use tokio::sync::watch;
 
 use super::announcements::Announcements;
-use super::config::SessionConfig;
+use super::config::{Announcement, SessionConfig};
 use super::state::AppState;
 use crate::session::fleet::{GetStatus, Reconfigure, Registry};
 use crate::session::web::configure;
@@ -72,12 +72,13 @@ pub async fn run(mut config: SessionConfig, file: PathBuf) -> Result<(), AppErro
 
 /// Handles signals, until the server must stop.
 async fn handle_commands(signals: &mut Signals, file: &Path, server: &AppState, port: u16) {
+    let mut announced = server.config.announcement.clone();
     loop {
         match signals.next().await {
             ServerCommand::Stop => return,
             ServerCommand::Reload => {
                 service_manager::reloading();
-                reload(file, server);
+                reload(file, server, &mut announced);
                 service_manager::ready(port);
             }
             ServerCommand::Drain => log::info!("SIGUSR1 changes nothing here: simulation servers are drained"),
@@ -120,7 +121,7 @@ fn assemble(
     for outcome in OUTCOMES {
         picks.with_label_values(&[outcome]).reset();
     }
-    let announcements = Arc::new(Announcements::start(config.announcement.clone()));
+    let announcements = Announcements::start(config.announcement.clone());
     let (available_sender, available) = watch::channel(false);
     let config = Arc::new(config);
     let registry = Registry::start(Arc::clone(&config), latencies, available_sender);
@@ -140,8 +141,9 @@ fn assemble(
     })
 }
 
-/// Reads the configuration file again. One that can't be used changes nothing.
-fn reload(file: &Path, server: &AppState) {
+/// Reads the configuration file again. One that can't be used changes nothing. `announced` is the announcement that it
+/// had before: an unchanged one does not replace what was posted since.
+fn reload(file: &Path, server: &AppState, announced: &mut Option<Announcement>) {
     match config::load::<SessionConfig>(file) {
         Ok(loaded) => {
             for warning in &loaded.warnings {
@@ -149,7 +151,10 @@ fn reload(file: &Path, server: &AppState) {
             }
             let entries = loaded.config.simulation_servers.len();
             log::info!("read {} again: {entries} entries in simulationServers", file.display());
-            server.announcements.reconfigure(loaded.config.announcement.clone());
+            if *announced != loaded.config.announcement {
+                announced.clone_from(&loaded.config.announcement);
+                server.announcements.set(announced.clone());
+            }
             // The URLs of the fleet stay as they were at the start.
             let config = SessionConfig { ssl: server.config.ssl, ..loaded.config };
             server.registry.do_send(Reconfigure(Arc::new(config)));

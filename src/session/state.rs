@@ -4,11 +4,12 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use actix::prelude::*;
+use actix_web::error::ErrorServiceUnavailable;
 use tokio::sync::watch;
 
 use super::announcements::Announcements;
 use super::config::SessionConfig;
-use crate::session::fleet::{Pick, PickError, Registry};
+use crate::session::fleet::{FleetStatus, GetStatus, Pick, PickError, Registry};
 use crate::shared::domain::ClientUrls;
 use crate::shared::http::{BasicAuth, ConnectionKind, ConnectionLimiter, LiveUpdates, Metrics};
 use crate::shared::run::Phase;
@@ -34,7 +35,7 @@ pub struct AppState {
     /// The open monitor pages.
     pub live: LiveUpdates,
     /// The administrator's announcement.
-    pub announcements: Arc<Announcements>,
+    pub announcements: Announcements,
     /// Checks the administrator's password, where one is configured.
     pub admin_auth: Option<BasicAuth>,
     /// When the server was started.
@@ -45,6 +46,14 @@ impl AppState {
     /// Number of connected web clients.
     pub fn clients(&self) -> usize {
         self.connections.count(ConnectionKind::Client)
+    }
+
+    /// Asks the registry for the status of the fleet.
+    ///
+    /// # Errors
+    /// Once the registry has stopped, and the server with it.
+    pub async fn status(&self) -> Result<Arc<FleetStatus>, actix_web::Error> {
+        self.registry.send(GetStatus).await.map_err(|_| ErrorServiceUnavailable("Error: the server stops."))
     }
 
     /// Asks the registry for a simulation server, and returns its URL.

@@ -52,11 +52,11 @@ async fn a_dead_host_is_named() {
 async fn a_mail_arrives_once_the_server_is_there() {
     let (reserved, port) = dead_port();
     let mailer = start(port, &json!({}));
-    mailer.send(notice("a", NoticeKind::NotResponding)).await.unwrap();
+    mailer.send(notice("a", NoticeKind::NotResponding)).unwrap();
     let failures = wait_for_log(Level::Warn, port, 2).await;
     assert!(failures[0].contains("Connection refused"), "{failures:?}");
-    mailer.send(notice("b", NoticeKind::NotResponding)).await.unwrap();
-    mailer.send(notice("a", NoticeKind::WorkingAgain)).await.unwrap();
+    mailer.send(notice("b", NoticeKind::NotResponding)).unwrap();
+    mailer.send(notice("a", NoticeKind::WorkingAgain)).unwrap();
     wait_for_log(Level::Warn, port, 4).await;
     drop(reserved);
     let mut smtp = Smtp::start(&["--port", &port.to_string()]).await;
@@ -73,12 +73,12 @@ async fn a_mail_arrives_once_the_server_is_there() {
 async fn a_mail_is_given_up_with_one_line() {
     let (reserved, port) = dead_port();
     let mailer = start(port, &json!({"timing": {"mailPatience": 0.5}}));
-    mailer.send(notice("lost", NoticeKind::NotResponding)).await.unwrap();
+    mailer.send(notice("lost", NoticeKind::NotResponding)).unwrap();
     let lines = wait_for_log(Level::Error, port, 1).await;
     assert!(lines[0].starts_with("mail given up (Simulation server not responding: lost:2000): "), "{lines:?}");
     drop(reserved);
     let mut smtp = Smtp::start(&["--port", &port.to_string()]).await;
-    mailer.send(notice("new", NoticeKind::NotResponding)).await.unwrap();
+    mailer.send(notice("new", NoticeKind::NotResponding)).unwrap();
     assert_eq!(smtp.mail().await.subject(), "Simulation server not responding: new:2000");
     assert_eq!(logged(Level::Error, port).len(), 1);
 }
@@ -87,11 +87,11 @@ async fn a_mail_is_given_up_with_one_line() {
 async fn a_silent_server_holds_up_nobody_and_leaves_nothing_open() {
     let mut smtp = Smtp::start(&["--hang", "greeting"]).await;
     let mailer = start(smtp.port, &json!({"timing": {"mailAnswer": 3, "mailPatience": 4}}));
-    mailer.send(notice("sim", NoticeKind::NotResponding)).await.unwrap();
+    mailer.send(notice("sim", NoticeKind::NotResponding)).unwrap();
     smtp.wait_for("opened").await;
     let stopwatch = Stopwatch::start();
     let asked = stopwatch.lap();
-    mailer.send(notice("other", NoticeKind::NotResponding)).await.unwrap();
+    mailer.send(notice("other", NoticeKind::NotResponding)).unwrap();
     assert!(asked.elapsed() < Duration::from_millis(500), "a notice was taken after {:?}", asked.elapsed());
     let lines = wait_for_log(Level::Warn, smtp.port, 1).await;
     assert!(lines[0].ends_with("no answer within 3 s"), "{lines:?}");

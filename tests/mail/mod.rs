@@ -9,10 +9,10 @@ mod settings;
 use std::time::SystemTime;
 
 use ::log::Level;
-use actix::Addr;
 use serde_json::{Value, json};
+use tokio::sync::mpsc::UnboundedSender;
 use webots_fleet::session::config::SessionConfig;
-use webots_fleet::session::mail::{self, Channel, Mailer, Notice, NoticeKind};
+use webots_fleet::session::mail::{self, Channel, Notice, NoticeKind};
 use webots_fleet::shared::config::Configuration;
 use webots_fleet::shared::domain::Load;
 
@@ -50,7 +50,7 @@ fn loaded(port: u16, more: &Value) -> SessionConfig {
     config
 }
 
-fn start(port: u16, more: &Value) -> Addr<Mailer> {
+fn start(port: u16, more: &Value) -> UnboundedSender<Notice> {
     keep_log();
     mail::start(&loaded(port, more)).all().next().expect("mails are on").clone()
 }

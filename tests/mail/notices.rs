@@ -14,7 +14,7 @@ use crate::support::smtp::Smtp;
 async fn a_notice_becomes_a_mail_in_plain_text() {
     let mut smtp = Smtp::start(&[]).await;
     let mailer = start(smtp.port, &json!({}));
-    mailer.send(notice("sim1.example.org", NoticeKind::NotResponding)).await.unwrap();
+    mailer.send(notice("sim1.example.org", NoticeKind::NotResponding)).unwrap();
     let mail = smtp.mail().await;
     assert_eq!(mail.field("from"), "fleet@example.org");
     assert_eq!(mail.recipients(), ["admin@example.org"]);
@@ -38,7 +38,7 @@ async fn a_thousand_servers_that_fail_together_are_one_mail() {
     let mut smtp = Smtp::start(&[]).await;
     let mailer = start(smtp.port, &json!({"timing": {"gather": 3}}));
     for number in 0..1_000 {
-        mailer.do_send(notice(&format!("sim{number}"), NoticeKind::NotResponding));
+        mailer.send(notice(&format!("sim{number}"), NoticeKind::NotResponding)).unwrap();
     }
     let mail = smtp.mail().await;
     assert_eq!(mail.subject(), "Simulation servers: 1000 not responding");
@@ -46,7 +46,7 @@ async fn a_thousand_servers_that_fail_together_are_one_mail() {
         assert!(mail.field("text").contains(server), "no {server}");
     }
     // The next mail is the next notice's: nothing else was on its way.
-    mailer.send(notice("other", NoticeKind::MaximumLoad)).await.unwrap();
+    mailer.send(notice("other", NoticeKind::MaximumLoad)).unwrap();
     assert_eq!(smtp.mail().await.subject(), "Simulation server reached maximum load: other:2000");
     nothing_unexpected(smtp.port);
 }
@@ -56,11 +56,11 @@ async fn a_flapping_server_is_one_mail_in_its_time_with_a_count() {
     let mut smtp = Smtp::start(&[]).await;
     let mailer = start(smtp.port, &json!({"timing": {"flapping": 2}}));
     let first = Instant::now();
-    mailer.send(notice("sim", NoticeKind::NotResponding)).await.unwrap();
+    mailer.send(notice("sim", NoticeKind::NotResponding)).unwrap();
     assert_eq!(smtp.mail().await.subject(), "Simulation server not responding: sim:2000");
     for turn in 0..9 {
         let event = if turn % 2 == 0 { NoticeKind::WorkingAgain } else { NoticeKind::NotResponding };
-        mailer.do_send(notice("sim", event));
+        mailer.send(notice("sim", event)).unwrap();
     }
     let mail = smtp.mail().await;
     assert!(first.elapsed() > Duration::from_secs(2), "the second mail came after {:?}", first.elapsed());
@@ -78,7 +78,7 @@ async fn nothing_from_outside_gets_into_the_headers_or_begins_a_line() {
     let mailer = start(smtp.port, &json!({}));
     let mut evil = notice("sim\r\nBcc: thief@example.com\r\n\r\nbody", NoticeKind::NotResponding);
     evil.error = Some("<script>alert(1)</script>\r\n.\r\nRCPT TO:<thief@example.com>\u{1b}[2J".to_owned());
-    mailer.send(evil).await.unwrap();
+    mailer.send(evil).unwrap();
     let mail = smtp.mail().await;
     assert_eq!(mail.recipients(), ["admin@example.org"]);
     assert!(mail.header("Bcc").is_empty(), "{mail:?}");

@@ -118,7 +118,6 @@ impl SessionConfig {
             threshold: self.load_threshold,
             client_cost: self.client_cost,
             placement_timeout: self.timing.placement,
-            ..PlacementPolicy::default()
         }
     }
 

@@ -6,7 +6,6 @@ use std::time::SystemTime;
 use serde::Serialize;
 
 use super::server_record::{ServerRecord, ServerState};
-use crate::shared::domain::PublicAddress;
 use crate::shared::run::serialize_timestamp;
 
 /// Everything that is known of the fleet.
@@ -41,8 +40,6 @@ pub struct NameStatus {
 /// What is known of one simulation server.
 #[derive(Debug, Clone)]
 pub struct ServerStatus {
-    /// Its address; unique in the fleet.
-    pub address: PublicAddress,
     /// What its probes have shown.
     pub record: ServerRecord,
     /// Why the last probe failed, if it did, or why others are preferred to it, if they are.

@@ -23,24 +23,13 @@ pub struct NameTable(BTreeMap<DnsName, ResolvedName>);
 /// One name.
 struct ResolvedName {
     servers: BTreeSet<PublicAddress>,
-    /// Why the last lookup failed, if it did.
-    error: Option<String>,
-    /// When lookups last began to fail or to succeed.
-    since: SystemTime,
+    status: NameStatus,
     /// Whether a lookup is in progress.
     is_looked_up: bool,
 }
 
 /// Longest error text that is kept, in characters.
 const MAX_ERROR_LENGTH: usize = 120;
-
-/// What a lookup has changed.
-pub struct NameChange {
-    /// Whether it resolves to other servers than before.
-    pub servers: bool,
-    /// The new status, if lookups have begun to fail, or to succeed again.
-    pub turned: Option<NameStatus>,
-}
 
 /// Resolves a name to simulation servers.
 pub async fn servers(name: DnsName) -> LookupResult {
@@ -56,8 +45,7 @@ impl NameTable {
         for name in entries.iter().filter_map(ServerEntry::name) {
             let known = before.remove(name).unwrap_or_else(|| ResolvedName {
                 servers: BTreeSet::new(),
-                error: None,
-                since: SystemTime::now(),
+                status: NameStatus { name: name.to_string(), servers: 0, error: None, since: SystemTime::now() },
                 is_looked_up: false,
             });
             self.0.insert(name.clone(), known);
@@ -72,21 +60,29 @@ impl NameTable {
         self.0.iter_mut().filter_map(due).collect()
     }
 
-    /// Records a lookup. Returns what has changed; `None` if the name is no longer listed.
-    pub fn record(&mut self, name: &DnsName, answer: LookupResult) -> Option<NameChange> {
-        let known = self.0.get_mut(name)?;
-        known.is_looked_up = false;
-        let failed_before = known.error.take().is_some();
+    /// Records a lookup, unless the name is no longer listed. Returns whether it resolves to other servers than before;
+    /// and the new status, if lookups have begun to fail, or to succeed again.
+    pub fn record(&mut self, name: &DnsName, answer: LookupResult) -> Option<(bool, Option<NameStatus>)> {
+        let ResolvedName { servers, status, is_looked_up } = self.0.get_mut(name)?;
+        *is_looked_up = false;
+        let failed_before = status.error.take().is_some();
         let mut has_moved = false;
         match answer {
-            Ok(servers) => has_moved = std::mem::replace(&mut known.servers, servers) != known.servers,
-            Err(error) => known.error = Some(excerpt(&error, MAX_ERROR_LENGTH)),
+            Ok(found) => {
+                let (new, gone) = (found.difference(servers).count(), servers.difference(&found).count());
+                has_moved = new + gone > 0;
+                if has_moved {
+                    log::info!("{name}: leads to other servers: {new} new, {gone} gone");
+                }
+                (status.servers, *servers) = (found.len(), found);
+            }
+            Err(error) => status.error = Some(excerpt(&error, MAX_ERROR_LENGTH)),
         }
-        let has_turned = failed_before != known.error.is_some();
+        let has_turned = failed_before != status.error.is_some();
         if has_turned {
-            known.since = SystemTime::now();
+            status.since = SystemTime::now();
         }
-        Some(NameChange { servers: has_moved, turned: has_turned.then(|| known.status(name)) })
+        Some((has_moved, has_turned.then(|| status.clone())))
     }
 
     /// The servers of these entries, in their order, without duplicates.
@@ -102,13 +98,6 @@ impl NameTable {
 
     /// What is known of each name.
     pub fn status(&self) -> Vec<NameStatus> {
-        self.0.iter().map(|(name, known)| known.status(name)).collect()
-    }
-}
-
-impl ResolvedName {
-    fn status(&self, name: &DnsName) -> NameStatus {
-        let (servers, error) = (self.servers.len(), self.error.clone());
-        NameStatus { name: name.to_string(), servers, error, since: self.since }
+        self.0.values().map(|known| known.status.clone()).collect()
     }
 }

@@ -14,15 +14,14 @@ use actix::prelude::*;
 use tokio::sync::watch;
 
 use super::fleet_status::{FleetStatus, ServerStatus};
-use super::name_table::{self, LookupResult, NameChange};
+use super::name_table::{self, LookupResult};
 use super::pick::{Pick, PickError};
 use super::probe_error::ProbeError;
 use super::server_monitor::ProbeResult;
-use super::server_record::is_refused;
-use super::server_table::{ListChange, ServerTable};
+use super::server_record::{ServerRecord, ServerState, is_refused};
+use super::server_table::ServerTable;
 use super::state_history::StateHistory;
 use crate::session::config::{DnsName, SessionConfig};
-use crate::session::placement::LoadBalancer;
 use crate::shared::domain::{Load, ProjectUrl, PublicAddress, ServerReport};
 use crate::shared::http::AddressQuota;
 
@@ -40,7 +39,6 @@ pub struct Reconfigure(pub Arc<SessionConfig>);
 pub struct Registry {
     config: Arc<SessionConfig>,
     latencies: prometheus::Histogram,
-    fleet: LoadBalancer<PublicAddress>,
     /// Limits the placements of an address that reserve room. A placement reserves room until its client arrives or is
     /// given up, so a client that requests servers again and again could lock out all others. Placements beyond the limit
     /// take room only once their clients have arrived.
@@ -70,7 +68,6 @@ impl Registry {
         Self::create(|ctx| {
             let servers = ServerTable::new(&config, ctx.address().recipient());
             Self {
-                fleet: LoadBalancer::new(config.policy()),
                 quota: AddressQuota::new(BURST, PER_MINUTE),
                 changes: StateHistory::new(&config),
                 config,
@@ -81,29 +78,23 @@ impl Registry {
         })
     }
 
-    /// Applies a change of the list of servers.
-    fn follow(&mut self, ListChange { added, gone, turned }: ListChange) {
-        for server in added {
-            self.fleet.add(server);
+    /// Evaluates the last reports again, because a threshold has changed, or which servers are drained.
+    fn reevaluate(&mut self) {
+        let last = |record: &ServerRecord| {
+            Some((
+                record.address.clone(),
+                record.report.clone().filter(|_| record.current().is_some())?,
+                record.answered?,
+            ))
+        };
+        for (server, report, at) in self.servers.in_order().filter_map(last).collect::<Vec<_>>() {
+            self.record(&server, Ok(report), at);
         }
-        for server in gone {
-            self.fleet.remove(&server);
-        }
-        self.reevaluate(turned);
-    }
-
-    /// Evaluates the last reports of these servers again, because a threshold has changed, or whether they are drained.
-    fn reevaluate(&mut self, servers: Vec<PublicAddress>) {
-        for server in servers {
-            let record = self.servers.get(&server);
-            if let Some((report, at)) = record.and_then(|record| Some((record.current()?.clone(), record.answered?))) {
-                self.record(&server, Ok(report), at);
-            }
-        }
+        self.publish();
     }
 
     fn tick(&mut self, ctx: &mut Context<Self>) {
-        if let Err(too_many) = self.servers.restart_gone().and_then(|()| self.changes.restart_gone()) {
+        if let Err(too_many) = self.servers.monitors.restart_gone().and_then(|()| self.changes.mailers.restart_gone()) {
             // The app stops the server when the registry has stopped.
             log::error!("{too_many}");
             ctx.stop();
@@ -113,7 +104,7 @@ impl Registry {
 
     /// Publishes a change of availability.
     fn publish(&mut self) {
-        let available = self.fleet.available(Instant::now());
+        let available = self.servers.fleet.available(Instant::now());
         if *self.available.borrow() != available {
             log::info!("{} simulation server is available", if available { "a" } else { "no" });
             self.available.send_replace(available);
@@ -121,68 +112,62 @@ impl Registry {
     }
 
     /// Records the result of a probe that ended at this time.
-    fn record(&mut self, server: &PublicAddress, answer: Result<ServerReport, ProbeError>, at: Instant) {
-        let Some(record) = self.servers.get_mut(server) else {
-            return;
-        };
+    fn record(&mut self, server: &PublicAddress, answer: Result<Arc<ServerReport>, ProbeError>, at: Instant) {
+        let ServerTable { records, fleet, .. } = &mut self.servers;
+        let Some(record) = records.get_mut(server) else { return };
         if record.unlisted && answer.is_err() {
-            self.servers.forget(server);
-            self.fleet.remove(server);
-            return;
+            return self.servers.forget(server);
         }
-        let failed_starts = answer.as_ref().ok().map(|report| report.failed_starts);
         let change = match answer {
-            Ok(report) => record.succeeded(report, at, self.fleet.limit(server).unwrap_or(self.config.load_threshold)),
+            Ok(report) => {
+                let limit = fleet.limit(server).unwrap_or(self.config.load_threshold);
+                let change = record.succeeded(Arc::clone(&report), at, limit);
+                let was_ejected = fleet.is_ejected(server);
+                fleet.report(server, at, &report, record.state != ServerState::Draining);
+                if fleet.is_ejected(server) && !was_ejected {
+                    log::warn!("{server}: {}", ejected(report.failed_starts));
+                }
+                change
+            }
             Err(error) => {
                 let is_another = record.error().is_some_and(|before| discriminant(before) != discriminant(&error));
                 if is_another {
                     log::info!("{server}: still down: {error}");
                 }
+                fleet.lose(server);
                 record.failed(error)
             }
         };
-        match record.for_placement() {
-            Some(report) => self.fleet.report(server, at, report),
-            None => self.fleet.lose(server),
-        }
-        if let Some(failed) = failed_starts {
-            let was_ejected = self.fleet.is_ejected(server);
-            self.fleet.note_failures(server, at, failed);
-            if self.fleet.is_ejected(server) && !was_ejected {
-                log::warn!("{server}: {}", ejected(failed));
-            }
-        }
         if let Some(change) = change {
-            self.changes.add(server, record, change);
+            self.changes.add(record, change);
         }
     }
 
     /// Chooses a server for a client of this address.
     fn pick(&mut self, world: Option<&ProjectUrl>, from: Option<IpAddr>) -> Result<PublicAddress, PickError> {
-        let Self { fleet, servers, .. } = self;
-        let accepts = |address: &PublicAddress, world| servers.get(address)?.accepts(world);
+        let ServerTable { records, fleet, .. } = &mut self.servers;
+        let accepts = |address: &PublicAddress, world| records.get(address)?.accepts(world);
         let eligible = |address: &PublicAddress| world.is_none_or(|world| accepts(address, world) == Some(true));
         let now = Instant::now();
         let picked =
             if self.quota.take(from) { fleet.pick(now, eligible) } else { fleet.pick_unreserved(now, eligible) };
         picked.ok_or_else(|| match world {
-            Some(world) if is_refused(servers.records(), world) => PickError::NotAccepted(world.repository()),
+            Some(world) if is_refused(records.values(), world) => PickError::NotAccepted(world.repository()),
             _ => PickError::Unavailable,
         })
     }
 
-    fn status_of(&self, address: &PublicAddress) -> Option<ServerStatus> {
-        let record = self.servers.get(address)?.clone();
+    fn status_of(&self, record: &ServerRecord) -> ServerStatus {
+        let (fleet, address) = (&self.servers.fleet, &record.address);
         let failed = record.current().map_or(0, |report| report.failed_starts);
         let error = record.error().map(ToString::to_string);
-        Some(ServerStatus {
-            error: error.or_else(|| self.fleet.is_ejected(address).then(|| ejected(failed))),
-            effective_load: self.fleet.effective_load(address),
-            in_flight: self.fleet.in_flight(address),
-            client_cost: self.fleet.client_cost(address),
-            address: address.clone(),
-            record,
-        })
+        ServerStatus {
+            error: error.or_else(|| fleet.is_ejected(address).then(|| ejected(failed))),
+            effective_load: fleet.effective_load(address),
+            in_flight: fleet.in_flight(address),
+            client_cost: fleet.client_cost(address),
+            record: record.clone(),
+        }
     }
 
     /// Looks up each name whose last lookup has ended.
@@ -198,18 +183,13 @@ impl Registry {
     }
 
     fn record_lookup(&mut self, name: &DnsName, answer: LookupResult) {
-        let Some(NameChange { servers, turned }) = self.servers.names.record(name, answer) else {
-            return;
-        };
+        let Some((has_moved, turned)) = self.servers.names.record(name, answer) else { return };
         if let Some(status) = turned {
             self.changes.add_name(status);
         }
-        if servers {
-            let change = self.servers.follow_names(&self.config);
-            let (added, gone) = (change.added.len(), change.gone.len() + change.turned.len());
-            log::info!("{name}: leads to other servers: {added} new, {gone} gone or back");
-            self.follow(change);
-            self.publish();
+        if has_moved {
+            self.servers.follow_names(&self.config);
+            self.reevaluate();
         }
     }
 }
@@ -225,8 +205,7 @@ impl Actor for Registry {
     fn started(&mut self, ctx: &mut Self::Context) {
         // The requests and reports of a whole fleet may arrive at the same moment.
         ctx.set_mailbox_capacity(4096);
-        let change = self.servers.apply(&self.config);
-        self.follow(change);
+        self.servers.apply(&self.config);
         ctx.run_interval(TICK, Self::tick);
         self.look_up_names(ctx);
         ctx.run_interval(LOOKUP_INTERVAL, Self::look_up_names);
@@ -238,10 +217,10 @@ impl Handler<ProbeResult> for Registry {
 
     fn handle(&mut self, ProbeResult { server, latency, answer }: ProbeResult, _: &mut Self::Context) {
         self.latencies.observe(latency.as_secs_f64());
-        if let Some(record) = self.servers.get_mut(&server) {
+        if let Some(record) = self.servers.records.get_mut(&server) {
             record.latency = Some(latency);
         }
-        self.record(&server, answer, Instant::now());
+        self.record(&server, answer.map(Arc::new), Instant::now());
         self.publish();
     }
 }
@@ -260,14 +239,13 @@ impl Handler<GetStatus> for Registry {
     type Result = MessageResult<GetStatus>;
 
     fn handle(&mut self, _: GetStatus, _: &mut Self::Context) -> Self::Result {
-        let servers = self.servers.in_order().filter_map(|address| self.status_of(address));
+        let loads = self.servers.records.values().filter_map(|record| Some(record.current()?.load));
         MessageResult(Arc::new(FleetStatus {
             available: *self.available.borrow(),
-            mean_load: Load::mean(self.servers.records().filter_map(|record| Some(record.current()?.load)))
-                .map(Load::percent),
-            servers: servers.collect(),
+            mean_load: Load::mean(loads).map(Load::percent),
+            servers: self.servers.in_order().map(|record| self.status_of(record)).collect(),
             names: self.servers.names.status(),
-            changes: self.changes.recent().clone(),
+            changes: self.changes.recent.clone(),
         }))
     }
 }
@@ -276,12 +254,8 @@ impl Handler<Reconfigure> for Registry {
     type Result = ();
 
     fn handle(&mut self, Reconfigure(config): Reconfigure, _: &mut Self::Context) {
-        self.fleet.set_policy(config.policy());
+        self.servers.apply(&config);
         self.config = config;
-        let change = self.servers.apply(&self.config);
-        self.follow(change);
-        let all = self.servers.in_order().cloned().collect();
-        self.reevaluate(all);
-        self.publish();
+        self.reevaluate();
     }
 }

@@ -1,9 +1,9 @@
-//! Actor: probes one simulation server.
+//! Task: probes one simulation server.
 //!
 //! Created by the registry for each simulation server. Every [`ProbeSettings::interval`] it requests the server's
 //! state, one request at a time, and sends the result to the registry. If the registry's mailbox is full, the result is
-//! dropped: the next probe replaces it. The monitor ends when the registry stops it; after a panic the registry starts
-//! a new one.
+//! dropped: the next probe replaces it. The task ends when the registry drops its channel; after a panic the registry
+//! starts a new one.
 //!
 //! It requests `/status`, or `/load` if the server has no such page: the original has only that. No answer is trusted:
 //! the whole probe has a timeout, the answer a size limit, and the load must be plausible.
@@ -17,7 +17,9 @@ use actix_web::web::Bytes;
 use awc::error::{ConnectError, SendRequestError};
 use awc::http::StatusCode;
 use awc::http::header::CONTENT_LENGTH;
+use futures_util::FutureExt;
 use rustls::ClientConfig;
+use tokio::time::{MissedTickBehavior, interval_at};
 
 use super::probe_error::ProbeError;
 use super::resolver::HostResolver;
@@ -56,22 +58,6 @@ impl ProbeSettings {
     }
 }
 
-/// Stops a monitor.
-#[derive(Message)]
-#[rtype(result = "()")]
-pub struct Stop;
-
-/// The actor.
-pub struct ServerMonitor {
-    server: PublicAddress,
-    settings: ProbeSettings,
-    client: awc::Client,
-    results: Recipient<ProbeResult>,
-    probing: bool,
-    /// Until when only `/load` is requested, because the server has no `/status`.
-    load_only_until: Option<Instant>,
-}
-
 /// Size limit of an answer, in bytes.
 const MAX_ANSWER_SIZE: usize = 1024 * 1024;
 /// The highest plausible load, in percent.
@@ -101,72 +87,40 @@ fn client(interval: Duration, tls: Option<Arc<ClientConfig>>) -> awc::Client {
     awc::Client::builder().connector(connector).disable_timeout().disable_redirects().finish()
 }
 
-impl ServerMonitor {
-    /// A monitor of one server. Must be created on the thread on which it will run.
-    pub fn new(
-        server: PublicAddress,
-        settings: ProbeSettings,
-        tls: Option<Arc<ClientConfig>>,
-        results: Recipient<ProbeResult>,
-    ) -> Self {
-        let client = client(settings.interval, tls);
-        Self { server, settings, client, results, probing: false, load_only_until: None }
-    }
-
-    fn probe(&mut self, ctx: &mut Context<Self>) {
-        if std::mem::replace(&mut self.probing, true) {
-            return;
-        }
-        let ProbeSettings { timeout, ssl, .. } = self.settings;
-        let (client, url) = (self.client.clone(), self.server.http_url(ssl));
-        let load_only = self.load_only_until.is_some_and(|end| Instant::now() < end);
+/// Probes a server now, and then at regular times in a random slot, until the registry stops: reports of all servers in
+/// the same slot would delay the requests of clients.
+pub async fn monitor(
+    server: PublicAddress,
+    ProbeSettings { interval, timeout, ssl }: ProbeSettings,
+    tls: Option<Arc<ClientConfig>>,
+    results: Recipient<ProbeResult>,
+) {
+    let (client, url) = (client(interval, tls), server.http_url(ssl));
+    let first = (BEGIN.elapsed() + interval.mul_f64(rand::random())).div_duration_f64(SLOT).ceil();
+    let mut times = interval_at((*BEGIN + SLOT.mul_f64(first)).into(), interval);
+    times.set_missed_tick_behavior(MissedTickBehavior::Skip);
+    // Until when only `/load` is requested, because the server has no `/status`.
+    let mut load_only_until = None;
+    loop {
         let begun = Instant::now();
-        let probe = async move {
-            let answer = actix_rt::time::timeout(timeout, probe(&client, &url, load_only)).await;
-            (answer.unwrap_or(Err(ProbeError::Timeout(timeout))), begun.elapsed())
-        };
-        probe
-            .into_actor(self)
-            .map(move |(answer, latency), monitor, ctx| {
-                monitor.probing = false;
-                if let Ok((_, has_status)) = answer
-                    && !load_only
-                {
-                    monitor.load_only_until = (!has_status).then(|| Instant::now() + LOAD_ONLY);
-                }
-                let answer = answer.map(|(report, _)| report);
-                match monitor.results.try_send(ProbeResult { server: monitor.server.clone(), latency, answer }) {
-                    Ok(()) => {}
-                    Err(SendError::Full(_)) => log::warn!("{}: a report is lost, too many are waiting", monitor.server),
-                    // The registry has stopped, and the server with it.
-                    Err(SendError::Closed(_)) => ctx.stop(),
-                }
-            })
-            .spawn(ctx);
-    }
-}
-
-impl Actor for ServerMonitor {
-    type Context = Context<Self>;
-
-    /// Probes now, and then at regular times in a random slot: reports of all servers in the same slot would delay the
-    /// requests of clients.
-    fn started(&mut self, ctx: &mut Self::Context) {
-        self.probe(ctx);
-        let since = BEGIN.elapsed();
-        let first = (since + self.settings.interval.mul_f64(rand::random())).div_duration_f64(SLOT).ceil();
-        ctx.run_later(SLOT.mul_f64(first).saturating_sub(since), |monitor, ctx| {
-            monitor.probe(ctx);
-            ctx.run_interval(monitor.settings.interval, Self::probe);
-        });
-    }
-}
-
-impl Handler<Stop> for ServerMonitor {
-    type Result = ();
-
-    fn handle(&mut self, _: Stop, ctx: &mut Self::Context) {
-        ctx.stop();
+        let load_only = load_only_until.is_some_and(|end| begun < end);
+        let answer = actix_rt::time::timeout(timeout, probe(&client, &url, load_only)).await;
+        let (answer, latency) = (answer.unwrap_or(Err(ProbeError::Timeout(timeout))), begun.elapsed());
+        if let Ok((_, has_status)) = answer
+            && !load_only
+        {
+            load_only_until = (!has_status).then(|| Instant::now() + LOAD_ONLY);
+        }
+        let answer = answer.map(|(report, _)| report);
+        match results.try_send(ProbeResult { server: server.clone(), latency, answer }) {
+            Ok(()) => {}
+            Err(SendError::Full(_)) => log::warn!("{server}: a report is lost, too many are waiting"),
+            // The registry has stopped, and the server with it.
+            Err(SendError::Closed(_)) => return,
+        }
+        // A time that has passed during the probe is left out.
+        times.tick().now_or_never();
+        times.tick().await;
     }
 }
 

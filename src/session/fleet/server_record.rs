@@ -5,30 +5,32 @@ use std::time::{Duration, Instant, SystemTime};
 
 use serde::Serialize;
 
+use super::fleet_status::StateChange;
 use super::probe_error::ProbeError;
 use crate::session::mail::NoticeKind;
-use crate::session::placement;
-use crate::shared::domain::{ProjectUrl, ServerReport};
+use crate::shared::domain::{ProjectUrl, PublicAddress, ServerReport};
 
-/// The state of a simulation server.
+/// The state of a simulation server. Those that need attention come first, as on the monitor.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum ServerState {
-    /// It was not probed yet.
-    Unknown,
-    /// It accepts clients.
-    Up,
-    /// Its load leaves no room for one more client, or it has no free slot.
-    Full,
-    /// It accepts no new clients: it drains itself, the configuration drains it, or no name resolves to it any more.
-    Draining,
     /// Its last probe failed.
     Down,
+    /// It was not probed yet.
+    Unknown,
+    /// It accepts no new clients: it drains itself, the configuration drains it, or no name resolves to it any more.
+    Draining,
+    /// Its load leaves no room for one more client, or it has no free slot.
+    Full,
+    /// It accepts clients.
+    Up,
 }
 
 /// One simulation server.
 #[derive(Debug, Clone)]
 pub struct ServerRecord {
+    /// Its address; unique in the fleet.
+    pub address: PublicAddress,
     /// Whether it is listed in `drainedServers`.
     pub drained: bool,
     /// Whether no name resolves to it any more.
@@ -49,18 +51,8 @@ pub struct ServerRecord {
     pub told_full: bool,
 }
 
-/// A server has changed its state.
-#[derive(Debug, PartialEq)]
-pub struct ServerChange {
-    /// Its new state.
-    pub state: ServerState,
-    /// Time of the change.
-    pub at: SystemTime,
-    /// The reason, as text.
-    pub why: String,
-    /// What is mailed to the administrator.
-    pub events: Vec<NoticeKind>,
-}
+/// A change of a server's state, and what is mailed to the administrator.
+pub type ServerChange = (StateChange, Vec<NoticeKind>);
 
 impl ServerState {
     /// The name of the state in pages and metrics.
@@ -77,8 +69,9 @@ impl ServerState {
 
 impl ServerRecord {
     /// A server that was not probed yet.
-    pub fn new(drained: bool) -> Self {
+    pub fn new(address: PublicAddress, drained: bool) -> Self {
         Self {
+            address,
             drained,
             unlisted: false,
             state: ServerState::Unknown,
@@ -93,11 +86,24 @@ impl ServerRecord {
 
     /// Records a report that arrived at this time; the server counts as full from the load `limit` on, in percent.
     /// Returns what has changed.
-    pub fn succeeded(&mut self, report: ServerReport, at: Instant, limit: f64) -> Option<ServerChange> {
-        let (state, why) = self.judge(&report, limit);
-        self.report = Some(Arc::new(report));
-        self.answered = Some(at);
-        self.enter(state, why)
+    pub fn succeeded(&mut self, report: Arc<ServerReport>, at: Instant, limit: f64) -> Option<ServerChange> {
+        let load = report.load.percent();
+        let full = report.instances.filter(|instances| instances.present() >= instances.places);
+        let (state, reason) = if self.drained {
+            (ServerState::Draining, " (drained by drainedServers)".to_owned())
+        } else if self.unlisted {
+            (ServerState::Draining, " (no name leads to it any more)".to_owned())
+        } else if report.draining {
+            (ServerState::Draining, " (it drains itself)".to_owned())
+        } else if let Some(full) = full {
+            (ServerState::Full, format!(", {} clients in {} places", full.present(), full.places))
+        } else if load >= limit {
+            (ServerState::Full, format!(" of {limit:.1} %"))
+        } else {
+            (ServerState::Up, String::new())
+        };
+        (self.report, self.answered) = (Some(report), Some(at));
+        self.enter(state, || format!("load {load:.1} %{reason}"))
     }
 
     /// Records that a probe has failed. Returns what has changed.
@@ -122,48 +128,14 @@ impl ServerRecord {
         self.report.as_ref().map(|report| report.accepts(world))
     }
 
-    /// The last report in the terms of the placement policy. `None` takes the server out of placement: it is down, or
-    /// it is drained and does not report counts, without which `accepting` can't be passed on.
-    pub fn for_placement(&self) -> Option<placement::LoadReport> {
-        let report = self.current()?;
-        let accepting = self.state != ServerState::Draining;
-        let instances = report.instances.map(|instances| placement::ClientCounts {
-            present: instances.present(),
-            places: instances.places,
-            arrivals: instances.arrivals,
-            accepting,
-        });
-        (accepting || instances.is_some()).then(|| placement::LoadReport { load: report.load.percent(), instances })
-    }
-
-    fn judge(&self, report: &ServerReport, limit: f64) -> (ServerState, impl FnOnce() -> String + use<>) {
-        let load = report.load.percent();
-        let no_place = report.instances.filter(|instances| instances.present() >= instances.places);
-        let state = if self.drained || self.unlisted || report.draining {
-            ServerState::Draining
-        } else if load >= limit || no_place.is_some() {
-            ServerState::Full
-        } else {
-            ServerState::Up
-        };
-        let reason = match (state, no_place) {
-            (ServerState::Draining, _) if self.drained => " (drained by drainedServers)".to_owned(),
-            (ServerState::Draining, _) if self.unlisted => " (no name leads to it any more)".to_owned(),
-            (ServerState::Draining, _) => " (it drains itself)".to_owned(),
-            (ServerState::Full, Some(full)) => format!(", {} clients in {} places", full.present(), full.places),
-            (ServerState::Full, None) => format!(" of {limit:.1} %"),
-            _ => String::new(),
-        };
-        (state, move || format!("load {load:.1} %{reason}"))
-    }
-
     fn enter(&mut self, state: ServerState, why: impl FnOnce() -> String) -> Option<ServerChange> {
         let before = std::mem::replace(&mut self.state, state);
         if before == state {
             return None;
         }
         self.since = SystemTime::now();
-        Some(ServerChange { state, at: self.since, why: why(), events: self.events(before) })
+        let change = StateChange { at: self.since, server: self.address.to_string(), state, why: why() };
+        Some((change, self.events(before)))
     }
 
     /// The four events of the original. A server that was full, then down, then up is both working again and available
@@ -210,12 +182,12 @@ mod tests {
 
     /// The events of each step: a load, or `None` for a failure.
     fn events(steps: &[Option<f64>]) -> Vec<Vec<NoticeKind>> {
-        let mut record = ServerRecord::new(false);
+        let mut record = ServerRecord::new("host:2000".parse().unwrap(), false);
         let change = |step: &Option<f64>| match step {
-            Some(load) => record.succeeded(report(*load), Instant::now(), 95.0),
+            Some(load) => record.succeeded(Arc::new(report(*load)), Instant::now(), 95.0),
             None => record.failed(ProbeError::Connection(String::new())),
         };
-        steps.iter().map(change).map(|change| change.map(|change| change.events).unwrap_or_default()).collect()
+        steps.iter().map(change).map(|change| change.map(|(_, events)| events).unwrap_or_default()).collect()
     }
 
     #[test]

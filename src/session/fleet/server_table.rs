@@ -4,14 +4,16 @@
 //! A server that no name resolves to any more gets no clients. It is monitored as long as it answers, because a name
 //! may resolve to it again, and so that its clients stay visible until they have left.
 
+use std::collections::hash_map::Entry;
 use std::collections::{BTreeSet, HashMap};
 
 use actix::prelude::*;
 
 use super::name_table::NameTable;
-use super::server_monitor::{ProbeResult, ProbeSettings, ServerMonitor, Stop};
+use super::server_monitor::{ProbeResult, ProbeSettings, monitor};
 use super::server_record::ServerRecord;
 use crate::session::config::SessionConfig;
+use crate::session::placement::LoadBalancer;
 use crate::shared::domain::PublicAddress;
 use crate::shared::http::tls;
 use crate::shared::run::Supervisor;
@@ -20,131 +22,106 @@ use crate::shared::run::Supervisor;
 pub struct ServerTable {
     /// The names of the configuration that are resolved.
     pub names: NameTable,
+    /// What is known of placing clients on the servers.
+    pub fleet: LoadBalancer<PublicAddress>,
+    /// The tasks that probe the servers.
+    pub monitors: Monitors,
+    /// What is known of each server.
+    pub records: HashMap<PublicAddress, ServerRecord>,
     /// In the order of the configuration.
     listed: Vec<PublicAddress>,
-    watched: HashMap<PublicAddress, ServerRecord>,
     settings: ProbeSettings,
-    monitors: Supervisor<PublicAddress, ServerMonitor>,
     /// The thread of the monitors, so that requests of clients do not wait for them.
     thread: Arbiter,
     results: Recipient<ProbeResult>,
 }
 
-/// The difference between two lists of servers.
-#[derive(Debug, Default)]
-pub struct ListChange {
-    /// Servers that are monitored from now on.
-    pub added: Vec<PublicAddress>,
-    /// Servers that are no longer monitored.
-    pub gone: Vec<PublicAddress>,
-    /// Servers that a name resolves to again, or no longer.
-    pub turned: Vec<PublicAddress>,
-}
+/// The monitors, by server. They get no messages.
+type Monitors = Supervisor<PublicAddress, ()>;
 
 impl ServerTable {
     /// No servers yet; `results` receives each probe.
     pub fn new(config: &SessionConfig, results: Recipient<ProbeResult>) -> Self {
         let (settings, thread) = (ProbeSettings::new(config), Arbiter::new());
-        let monitors = monitors(&thread, settings, results.clone());
-        let (names, listed, watched) = (NameTable::default(), Vec::new(), HashMap::new());
-        Self { names, listed, watched, settings, monitors, thread, results }
+        Self {
+            names: NameTable::default(),
+            fleet: LoadBalancer::new(config.policy()),
+            monitors: monitors(&thread, settings, results.clone()),
+            records: HashMap::new(),
+            listed: Vec::new(),
+            settings,
+            thread,
+            results,
+        }
     }
 
     /// Applies a configuration: servers that it no longer lists are removed.
-    pub fn apply(&mut self, config: &SessionConfig) -> ListChange {
+    pub fn apply(&mut self, config: &SessionConfig) {
         let settings = ProbeSettings::new(config);
         if std::mem::replace(&mut self.settings, settings) != settings {
-            self.monitors.all().for_each(|monitor| monitor.do_send(Stop));
             self.monitors = monitors(&self.thread, settings, self.results.clone());
-            self.watched.keys().for_each(|server| self.monitors.add(server.clone()));
+            self.records.keys().for_each(|server| self.monitors.add(server.clone()));
         }
+        self.fleet.set_policy(config.policy());
         self.names.apply(&config.simulation_servers);
-        self.list(config, true)
-    }
-
-    /// Replaces monitors that have panicked.
-    ///
-    /// # Errors
-    /// When there were too many panics.
-    pub fn restart_gone(&mut self) -> Result<(), String> {
-        self.monitors.restart_gone()
+        self.list(config, |_| true);
     }
 
     /// Applies changed names: a server that no name resolves to any more is removed if it does not answer.
-    pub fn follow_names(&mut self, config: &SessionConfig) -> ListChange {
-        self.list(config, false)
+    pub fn follow_names(&mut self, config: &SessionConfig) {
+        self.list(config, |record| record.current().is_none());
     }
 
-    fn list(&mut self, config: &SessionConfig, at_once: bool) -> ListChange {
-        let mut change = ListChange::default();
+    /// Follows the lists of servers and of drained servers. Those that are in no list are removed if they are `gone`.
+    fn list(&mut self, config: &SessionConfig, gone: impl Fn(&ServerRecord) -> bool) {
         self.listed = self.names.servers(&config.simulation_servers);
         let listed: BTreeSet<&PublicAddress> = self.listed.iter().collect();
-        for (server, record) in &mut self.watched {
-            let unlisted = !listed.contains(server);
-            let turned = std::mem::replace(&mut record.unlisted, unlisted) != unlisted;
+        for (server, record) in &mut self.records {
+            record.unlisted = !listed.contains(server);
             record.drained = config.drained_servers.contains(server);
-            if unlisted && (at_once || record.current().is_none()) {
-                change.gone.push(server.clone());
-            } else if turned {
-                change.turned.push(server.clone());
+        }
+        let unlisted = self.records.iter().filter(|(_, record)| record.unlisted && gone(record));
+        for server in unlisted.map(|(server, _)| server.clone()).collect::<Vec<_>>() {
+            self.forget(&server);
+        }
+        for server in &self.listed {
+            if let Entry::Vacant(entry) = self.records.entry(server.clone()) {
+                self.fleet.add(server.clone());
+                self.monitors.add(server.clone());
+                entry.insert(ServerRecord::new(server.clone(), config.drained_servers.contains(server)));
             }
         }
-        for server in self.listed.iter().filter(|server| !self.watched.contains_key(*server)) {
-            change.added.push(server.clone());
-        }
-        for server in &change.gone {
-            self.forget(server);
-        }
-        for server in &change.added {
-            self.monitors.add(server.clone());
-            self.watched.insert(server.clone(), ServerRecord::new(config.drained_servers.contains(server)));
-        }
-        change
     }
 
     /// Removes a server and stops its monitor.
     pub fn forget(&mut self, server: &PublicAddress) {
-        if self.watched.remove(server).is_some() {
+        if self.records.remove(server).is_some() {
             log::info!("{server}: no longer watched");
-            if let Some(monitor) = self.monitors.remove(server) {
-                monitor.do_send(Stop);
-            }
+            self.monitors.remove(server);
+            self.fleet.remove(server);
         }
     }
 
-    /// What is known of a server.
-    pub fn get(&self, server: &PublicAddress) -> Option<&ServerRecord> {
-        self.watched.get(server)
-    }
-
-    /// The mutable record of a server.
-    pub fn get_mut(&mut self, server: &PublicAddress) -> Option<&mut ServerRecord> {
-        self.watched.get_mut(server)
-    }
-
-    /// What is known of all servers.
-    pub fn records(&self) -> impl Iterator<Item = &ServerRecord> {
-        self.watched.values()
-    }
-
-    /// All servers in the order of the configuration; those that are no longer listed come last.
-    pub fn in_order(&self) -> impl Iterator<Item = &PublicAddress> {
-        let unlisted = self.watched.iter().filter(|(_, record)| record.unlisted);
+    /// What is known of all servers, in the order of the configuration; those that are no longer listed come last.
+    pub fn in_order(&self) -> impl Iterator<Item = &ServerRecord> {
+        let unlisted = self.records.iter().filter(|(_, record)| record.unlisted);
         let unlisted: BTreeSet<_> = unlisted.map(|(server, _)| server).collect();
-        self.listed.iter().chain(unlisted)
+        self.listed.iter().chain(unlisted).filter_map(|server| self.records.get(server))
     }
 }
 
 /// No monitors yet; they run on this thread.
-fn monitors(
-    thread: &Arbiter,
-    settings: ProbeSettings,
-    results: Recipient<ProbeResult>,
-) -> Supervisor<PublicAddress, ServerMonitor> {
+fn monitors(thread: &Arbiter, settings: ProbeSettings, results: Recipient<ProbeResult>) -> Monitors {
     let (thread, tls) = (thread.handle(), tls::client_config());
-    Supervisor::new("monitor of server", move |server: &PublicAddress| {
+    Supervisor::new("monitor of server", move |server: &PublicAddress, mut stopped| {
         let (server, tls, results) = (server.clone(), tls.clone(), results.clone());
-        let monitor = move |_: &mut Context<ServerMonitor>| ServerMonitor::new(server, settings, tls, results);
-        Some(ServerMonitor::start_in_arbiter(&thread, monitor))
+        thread.spawn_fn(move || {
+            actix_rt::spawn(async move {
+                tokio::select! {
+                    () = monitor(server, settings, tls, results) => {}
+                    _ = stopped.recv() => {}
+                }
+            });
+        });
     })
 }

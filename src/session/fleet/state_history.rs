@@ -6,15 +6,15 @@ use std::collections::VecDeque;
 use super::fleet_status::{NameStatus, StateChange};
 use super::server_record::{ServerChange, ServerRecord, ServerState};
 use crate::session::config::SessionConfig;
-use crate::session::mail::{self, Mailer, Notice, NoticeKind, Topic};
-use crate::shared::domain::PublicAddress;
+use crate::session::mail::{self, Notice, NoticeKind};
 use crate::shared::run::Supervisor;
 
 /// The last changes, and the mailer that notifies the administrator.
 pub struct StateHistory {
-    recent: VecDeque<StateChange>,
-    /// One for each channel of notices.
-    mailers: Supervisor<&'static str, Mailer>,
+    /// The last changes, the newest first.
+    pub recent: VecDeque<StateChange>,
+    /// One for each channel of notices. Unsent notices of one that has panicked are lost.
+    pub mailers: Supervisor<&'static str, Notice>,
 }
 
 /// How many changes are kept.
@@ -26,29 +26,15 @@ impl StateHistory {
         Self { recent: VecDeque::new(), mailers: mail::start(config) }
     }
 
-    /// Starts a new mailer if the last one has panicked. Its unsent notices are lost.
-    ///
-    /// # Errors
-    /// When there were too many panics.
-    pub fn restart_gone(&mut self) -> Result<(), String> {
-        self.mailers.restart_gone()
-    }
-
-    /// Returns the last changes, the newest first.
-    pub fn recent(&self) -> &VecDeque<StateChange> {
-        &self.recent
-    }
-
     /// Adds a change of a server whose record is now `record`.
-    pub fn add(&mut self, server: &PublicAddress, record: &ServerRecord, change: ServerChange) {
-        let ServerChange { state, at, why, events } = change;
-        self.list(StateChange { at, server: server.to_string(), state, why });
+    pub fn add(&mut self, record: &ServerRecord, (change, events): ServerChange) {
         // The last known values: a server that does not answer reports no load, and one that works again no error.
         let load = record.report.as_ref().map(|report| report.load);
         for event in events {
-            let error = record.last_error.as_ref().filter(|_| event.topic() == Topic::Health).map(ToString::to_string);
-            self.notify(&Notice { server: server.to_string(), event, load, error, at });
+            let error = record.last_error.as_ref().filter(|_| !event.is_about_load()).map(ToString::to_string);
+            self.notify(&Notice { server: change.server.clone(), event, load, error, at: change.at });
         }
+        self.list(change);
     }
 
     /// Adds that lookups of a name have begun to fail, or succeed again.
@@ -74,8 +60,8 @@ impl StateHistory {
 
     fn notify(&self, notice: &Notice) {
         for mailer in self.mailers.all() {
-            if let Err(lost) = mailer.try_send(notice.clone()) {
-                log::error!("{}: no notice is sent: {lost}", notice.server);
+            if mailer.send(notice.clone()).is_err() {
+                log::error!("{}: no notice is sent: its mailer has panicked", notice.server);
             }
         }
     }

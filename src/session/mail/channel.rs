@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use tokio::time::timeout;
 
-use super::notice_text::{NoticeText, signature};
+use super::notice_text::{signature, test_text};
 use super::smtp::SmtpRelay;
 use super::webhook::Webhook;
 use crate::session::config::SessionConfig;
@@ -13,6 +13,8 @@ use crate::shared::text::one_line;
 /// A channel for notices. Each has its own retries: one that does not work holds up no other.
 #[derive(Clone)]
 pub struct Channel {
+    /// Its name in the log.
+    pub(super) name: &'static str,
     /// `HOST:PORT` of the server that takes the texts.
     pub(super) server: String,
     transport: Transport,
@@ -33,33 +35,25 @@ impl Channel {
     pub fn mail(config: &SessionConfig) -> Result<Self, String> {
         let relay = SmtpRelay::new(config).map_err(|key| format!("notifications are off: {key} is not set"))?;
         let (server, transport) = (relay.server(), Transport::Smtp(Box::new(relay)));
-        Ok(Self { server, transport, time_limit: config.timing.mail_answer })
+        Ok(Self { name: "mail", server, transport, time_limit: config.timing.mail_answer })
     }
 
     /// To the URL of the key `webhook`, if it is set.
     pub fn webhook(config: &SessionConfig) -> Option<Self> {
         let webhook = config.webhook.clone().map(Webhook)?;
         let (server, transport) = (webhook.server(), Transport::Webhook(webhook));
-        Some(Self { server, transport, time_limit: config.timing.mail_answer })
-    }
-
-    /// Its name in the log.
-    pub(super) fn name(&self) -> &'static str {
-        match self.transport {
-            Transport::Smtp(_) => "mail",
-            Transport::Webhook(_) => "webhook",
-        }
+        Some(Self { name: "webhook", server, transport, time_limit: config.timing.mail_answer })
     }
 
     /// Delivers a text within `timing.mailAnswer`. Returns the server's answer.
     ///
     /// # Errors
     /// Why it is not taken, in one line.
-    pub(super) async fn deliver(&self, text: NoticeText) -> Result<String, String> {
+    pub(super) async fn deliver(&self, text: &str) -> Result<String, String> {
         let delivered = timeout(self.time_limit, async {
             match &self.transport {
                 Transport::Smtp(relay) => relay.deliver(text).await,
-                Transport::Webhook(webhook) => webhook.deliver(&text.body).await,
+                Transport::Webhook(webhook) => webhook.deliver(text).await,
             }
         });
         let timed_out = |_| Err(format!("no answer within {} s", self.time_limit.as_secs_f64()));
@@ -72,7 +66,7 @@ impl Channel {
     /// # Errors
     /// Why it was not taken.
     pub async fn test(&self, config: &SessionConfig) -> Result<String, String> {
-        let answer = self.deliver(NoticeText::test(&signature(config))).await?;
+        let answer = self.deliver(&test_text(&signature(config))).await?;
         Ok(format!("{} took a test: {answer}", self.server))
     }
 }

@@ -8,5 +8,5 @@ mod smtp;
 mod webhook;
 
 pub use channel::Channel;
-pub use mailer::{Mailer, start};
-pub use outbox::{Notice, NoticeKind, Topic};
+pub use mailer::start;
+pub use outbox::{Notice, NoticeKind};

@@ -10,34 +10,21 @@ use crate::shared::text::excerpt;
 /// Longest untrusted text that is shown, in characters.
 const MAX_LETTERS: usize = 500;
 
-/// A text about notices, for all channels.
-#[derive(Debug)]
-pub struct NoticeText {
-    /// The subject of a mail.
-    pub subject: String,
-    /// The text, of several lines. The first is the subject.
-    pub body: String,
-}
-
 /// The last lines of each text: where the monitor is, and which session server has sent it.
 pub fn signature(config: &SessionConfig) -> String {
     format!("Monitor: {}/monitor\nSent by the session server {}\n", config.http_url(), config.address())
 }
 
-impl NoticeText {
-    /// The text about these entries.
-    pub fn new(entries: &[MailEntry], signature: &str) -> Self {
-        let subject = summary(entries);
-        let entries: String = entries.iter().map(paragraph).collect();
-        Self { body: format!("{subject}\n\n{entries}{signature}"), subject }
-    }
+/// The text about these entries, of several lines. The first is the subject of a mail.
+pub fn notice_text(entries: &[MailEntry], signature: &str) -> String {
+    let paragraphs: String = entries.iter().map(paragraph).collect();
+    format!("{}\n\n{paragraphs}{signature}", summary(entries))
+}
 
-    /// The text of `--test-mail`.
-    pub fn test(signature: &str) -> Self {
-        let subject = "Test of the session server's notifications".to_owned();
-        let words = "Nothing has happened: notices about simulation servers will arrive like this one.";
-        Self { body: format!("{subject}\n\n{words}\n\n{signature}"), subject }
-    }
+/// The text of `--test-mail`.
+pub fn test_text(signature: &str) -> String {
+    let words = "Nothing has happened: notices about simulation servers will arrive like this one.";
+    format!("Test of the session server's notifications\n\n{words}\n\n{signature}")
 }
 
 fn paragraph(MailEntry { notice, held_back, .. }: &MailEntry) -> String {

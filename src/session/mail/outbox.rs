@@ -11,14 +11,11 @@
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant, SystemTime};
 
-use actix::Message;
-
 use crate::session::config::Timing;
 use crate::shared::domain::Load;
 
 /// A change of a simulation server that is mailed to the administrator.
-#[derive(Message, Debug, Clone, PartialEq)]
-#[rtype(result = "()")]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Notice {
     /// The simulation server's address, or the name that resolves to some.
     pub server: String,
@@ -45,15 +42,6 @@ pub enum NoticeKind {
     AvailableAgain,
 }
 
-/// What an event is about.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub enum Topic {
-    /// Whether a server responds, or lookups of a name succeed.
-    Health,
-    /// Whether a server has room for clients.
-    Capacity,
-}
-
 impl NoticeKind {
     /// The event as text that follows 'simulation server'.
     pub fn words(self) -> &'static str {
@@ -65,12 +53,9 @@ impl NoticeKind {
         }
     }
 
-    /// The topic of the event.
-    pub fn topic(self) -> Topic {
-        match self {
-            Self::NotResponding | Self::WorkingAgain => Topic::Health,
-            Self::MaximumLoad | Self::AvailableAgain => Topic::Capacity,
-        }
+    /// Its topic: whether a server has room for clients, or else whether it responds, or lookups of a name succeed.
+    pub fn is_about_load(self) -> bool {
+        matches!(self, Self::MaximumLoad | Self::AvailableAgain)
     }
 }
 
@@ -91,7 +76,8 @@ pub struct MailEntry {
 #[derive(Debug, Clone)]
 pub struct Outbox {
     timing: Timing,
-    topics: BTreeMap<(Topic, String), TopicState>,
+    /// By [`NoticeKind::is_about_load`], then by server.
+    topics: BTreeMap<(bool, String), TopicState>,
     /// The delay after the next failure.
     delay: Duration,
     /// After a failure: nothing is sent before this time.
@@ -113,7 +99,7 @@ impl Outbox {
     }
 
     fn topic(&mut self, notice: &Notice) -> &mut TopicState {
-        self.topics.entry((notice.event.topic(), notice.server.clone())).or_default()
+        self.topics.entry((notice.event.is_about_load(), notice.server.clone())).or_default()
     }
 
     /// Adds a notice.

@@ -12,7 +12,6 @@ use lettre::transport::smtp::authentication::Credentials;
 use lettre::transport::smtp::client::{Tls, TlsParameters};
 use lettre::{AsyncSmtpTransport, AsyncTransport, Message, Tokio1Executor};
 
-use super::notice_text::NoticeText;
 use crate::session::config::SessionConfig;
 use crate::shared::config::Secret;
 
@@ -53,13 +52,15 @@ impl SmtpRelay {
         format!("{}:{}", self.host, self.port)
     }
 
-    /// Delivers an e-mail. Returns the SMTP server's answer.
+    /// Delivers a text, whose first line is the subject of the e-mail. Returns the SMTP server's answer.
     ///
     /// # Errors
     /// When the SMTP server does not take it.
-    pub(super) async fn deliver(&self, NoticeText { subject, body }: NoticeText) -> Result<String, String> {
+    pub(super) async fn deliver(&self, text: &str) -> Result<String, String> {
+        let subject = text.lines().next().unwrap_or_default();
         let message = Message::builder().from(self.from.clone()).to(self.to.clone()).subject(subject).message_id(None);
-        let mut message = message.header(ContentType::TEXT_PLAIN).body(body).map_err(|error| error.to_string())?;
+        let mut message =
+            message.header(ContentType::TEXT_PLAIN).body(text.to_owned()).map_err(|error| error.to_string())?;
         // Automatic responders must not answer (RFC 3834).
         let name = HeaderName::new_from_ascii_str("Auto-Submitted");
         message.headers_mut().insert_raw(HeaderValue::new(name, "auto-generated".to_owned()));

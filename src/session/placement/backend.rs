@@ -3,32 +3,23 @@
 use super::cost::{CostFit, Estimate, FULL, FleetCost, believable};
 use super::policy::PlacementPolicy;
 use super::replicas::Replicas;
+use crate::shared::domain::{Instances, ServerReport};
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 
 /// A server's load is the mean of its samples over this time: a client that has left stays in it this long.
 const MEAN_WINDOW: Duration = Duration::from_secs(5);
+/// Time until an arrived client shows fully in the reported load: its simulation takes a while to start, too.
+const SETTLING: Duration = Duration::from_secs(8);
 
-/// What a simulation server answered to a probe.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct LoadReport {
-    /// The mean load of the last five seconds, in percent. A load that is negative or not finite counts as no answer.
-    pub load: f64,
-    /// Its simulations; `None` if the server reports only a load.
-    pub instances: Option<ClientCounts>,
-}
-
-/// The part of a report about the server's simulations.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct ClientCounts {
-    /// Number of simulations: queued, starting, idle and running.
-    pub present: u32,
-    /// Number of slots.
-    pub places: u32,
-    /// Number of clients that have requested a start since that server was started.
-    pub arrivals: u64,
-    /// Whether the server accepts new clients; `false` while it is drained.
-    pub accepting: bool,
+/// The part of a report that placement uses.
+#[derive(Debug, Clone, Copy)]
+struct LastReport {
+    at: Instant,
+    /// The mean load of the last five seconds, in percent.
+    load: f64,
+    /// `None` if the server reports only a load.
+    instances: Option<Instances>,
 }
 
 /// A client that was sent to a server and has not been seen there.
@@ -49,8 +40,8 @@ struct ClientDelta {
 
 impl ClientDelta {
     /// The clients of this change that a mean load taken at `now` does not show.
-    fn unseen(&self, now: Instant, settling: Duration) -> f64 {
-        let span = if self.clients > 0.0 { settling } else { MEAN_WINDOW };
+    fn unseen(&self, now: Instant) -> f64 {
+        let span = if self.clients > 0.0 { SETTLING } else { MEAN_WINDOW };
         let age = now.saturating_duration_since(self.at);
         if age >= span {
             return 0.0;
@@ -59,21 +50,15 @@ impl ClientDelta {
     }
 }
 
-/// Clients that a report does not show.
-#[derive(Debug, Clone, Copy, Default)]
-struct Unseen {
-    /// Those that reserve room.
-    reserved: f64,
-    /// The others.
-    unreserved: f64,
-}
-
 /// One server of the fleet.
 #[derive(Debug)]
 pub(super) struct Backend {
-    up: bool,
-    /// The last good report and when it came; kept while the server is down, to know what is new when it comes back.
-    last: Option<(Instant, LoadReport)>,
+    /// Whether it answers.
+    pub(super) up: bool,
+    /// Whether it takes new clients; `false` while it is drained.
+    accepting: bool,
+    /// The last report; kept while the server is down, to know what is new when it comes back.
+    last: Option<LastReport>,
     /// The placements whose clients have not been seen yet, oldest first.
     in_flight: VecDeque<Placement>,
     /// Number of them that reserve room.
@@ -83,13 +68,15 @@ pub(super) struct Backend {
     /// Number of clients that arrive per placement made here, including those of other session servers.
     clients_per_placement: f64,
     settling: VecDeque<ClientDelta>,
-    /// What `settling` hid from the last report.
-    unseen: Unseen,
+    /// Number of clients that `settling` hid from the last report.
+    unseen: f64,
+    /// Those of them that reserve room.
+    unseen_reserved: f64,
     fit: CostFit,
     /// The estimate from that fit that the fleet has.
-    estimate: Estimate,
+    pub(super) estimate: Estimate,
     /// What a client is expected to add to the load, in percent.
-    cost: f64,
+    pub(super) cost: f64,
     /// When this server was chosen last, as a number that grows with each placement of the fleet.
     pub(super) last_pick: u64,
 }
@@ -99,13 +86,15 @@ impl Backend {
     pub(super) fn new(policy: &PlacementPolicy, last_pick: u64) -> Self {
         Self {
             up: false,
+            accepting: true,
             last: None,
             in_flight: VecDeque::new(),
             reserved: 0,
             fresh: 0,
             clients_per_placement: 1.0,
             settling: VecDeque::new(),
-            unseen: Unseen::default(),
+            unseen: 0.0,
+            unseen_reserved: 0.0,
             fit: CostFit::new(policy.client_cost),
             cost: believable(policy.client_cost),
             estimate: Estimate::default(),
@@ -113,34 +102,30 @@ impl Backend {
         }
     }
 
-    /// Records a report that arrived at `now`; a report that is older than the last is ignored.
+    /// Records a report that arrived at `now`, not before the last one.
     pub(super) fn report(
         &mut self,
         now: Instant,
-        report: LoadReport,
+        report: &ServerReport,
+        accepting: bool,
         policy: &PlacementPolicy,
         fleet: &mut FleetCost,
         replicas: &mut Replicas,
     ) {
-        if !report.load.is_finite() || report.load < 0.0 {
-            self.lose();
-            return;
-        }
-        if self.last.is_some_and(|(at, _)| now < at) {
-            return;
-        }
-        self.note_changes(now, report.instances, replicas);
+        let report = LastReport { at: now, load: report.load.percent(), instances: report.instances };
+        self.note_changes(report, replicas);
         self.fresh = 0;
-        self.settle(now, policy);
-        self.learn(now, report);
-        self.last = Some((now, report));
-        self.up = true;
-        self.update_cost(fleet, policy);
-    }
-
-    /// Records that the server does not answer.
-    pub(super) fn lose(&mut self) {
-        self.up = false;
+        self.settle(now);
+        self.learn(report);
+        self.last = Some(report);
+        (self.up, self.accepting) = (true, accepting);
+        // A report of only a load teaches nothing, because it does not show which part of the load is clients: that
+        // server's cost is the fixed one.
+        let counts = report.instances.is_some();
+        let estimate = if counts { self.fit.estimate(self.cost) } else { Estimate::default() };
+        fleet.replace(self.estimate, estimate);
+        self.estimate = estimate;
+        self.cost = if counts { fleet.cost(estimate, policy.client_cost) } else { believable(policy.client_cost) };
     }
 
     /// Records that a client was sent here.
@@ -150,30 +135,24 @@ impl Backend {
         self.fresh += usize::from(takes_room);
     }
 
-    /// Gives up overdue clients.
-    pub(super) fn expire(&mut self, now: Instant, policy: &PlacementPolicy, replicas: &mut Replicas) {
+    /// Gives up overdue clients. Returns the number of those that reserved room.
+    pub(super) fn expire(&mut self, now: Instant, policy: &PlacementPolicy) -> usize {
         let is_late = |placed: &Placement| now.saturating_duration_since(placed.at) >= policy.placement_timeout;
         let late = self.in_flight.partition_point(is_late);
         let given_up = self.in_flight.drain(..late).filter(|placed| placed.takes_room).count();
         self.reserved -= given_up;
-        replicas.count(0.0, count(given_up));
-    }
-
-    /// When the oldest placement is given up, unless its client arrives before.
-    pub(super) fn next_expiry(&self, policy: &PlacementPolicy) -> Option<Instant> {
-        self.in_flight.front().and_then(|placed| placed.at.checked_add(policy.placement_timeout))
+        given_up
     }
 
     /// Whether a client can be sent here.
     pub(super) fn has_room(&self, policy: &PlacementPolicy) -> bool {
-        let Some((_, report)) = self.last.filter(|_| self.up) else {
-            return false;
+        let has_slot = |instances: Instances| {
+            let taken = f64::from(instances.present()) + count(self.reserved) + self.sent_by_others();
+            taken < f64::from(instances.places)
         };
-        let has_slot = report.instances.is_none_or(|instances| {
-            let taken = f64::from(instances.present) + count(self.reserved) + self.sent_by_others();
-            instances.accepting && taken < f64::from(instances.places)
-        });
-        has_slot && self.effective_load().is_some_and(|load| load < self.limit(policy))
+        self.accepting
+            && self.effective_load().is_some_and(|load| load < self.limit(policy))
+            && self.last.is_some_and(|report| report.instances.is_none_or(has_slot))
     }
 
     /// The load, in percent, from which on this server gets no client.
@@ -186,16 +165,16 @@ impl Backend {
     /// The load, in percent, that is expected once it shows all clients that reserve room; `None` if the server is
     /// down.
     pub(super) fn effective_load(&self) -> Option<f64> {
-        self.load_with(self.unseen.reserved, self.reserved)
+        self.load_with(self.unseen_reserved, self.reserved)
     }
 
     /// The same with all clients that were sent here; servers are compared by this load.
     pub(super) fn rank_load(&self) -> Option<f64> {
-        self.load_with(self.unseen.reserved + self.unseen.unreserved, self.in_flight.len())
+        self.load_with(self.unseen, self.in_flight.len())
     }
 
     fn load_with(&self, unseen: f64, in_flight: usize) -> Option<f64> {
-        let (_, LoadReport { load, .. }) = self.last.filter(|_| self.up)?;
+        let LastReport { load, .. } = self.last.filter(|_| self.up)?;
         // The overload of a full machine is unknown, so it may still be full after clients have left.
         let unseen = if load < FULL { unseen } else { unseen.max(0.0) };
         let ahead = unseen + count(in_flight) + self.sent_by_others();
@@ -212,65 +191,39 @@ impl Backend {
         self.in_flight.len()
     }
 
-    /// Load that one more client is expected to add, in percent.
-    pub(super) fn cost(&self) -> f64 {
-        self.cost
-    }
-
-    /// This server's estimate of the cost of a client.
-    pub(super) fn estimate(&self) -> Estimate {
-        self.estimate
-    }
-
-    /// Passes this server's estimate to the fleet, and takes the cost that follows from all servers. A report of only a
-    /// load teaches nothing, because it does not show which part of the load is clients: that server's cost is the
-    /// fixed one.
-    fn update_cost(&mut self, fleet: &mut FleetCost, policy: &PlacementPolicy) {
-        let counts = self.last.is_some_and(|(_, report)| report.instances.is_some());
-        let estimate = if counts { self.fit.estimate(self.cost) } else { Estimate::default() };
-        fleet.replace(self.estimate, estimate);
-        self.estimate = estimate;
-        self.cost = if counts { fleet.cost(estimate, policy.client_cost) } else { believable(policy.client_cost) };
-    }
-
-    fn learn(&mut self, now: Instant, report: LoadReport) {
-        let Some(((before, _), instances)) = self.last.zip(report.instances) else {
-            return;
-        };
-        let unseen = self.unseen.reserved + self.unseen.unreserved;
+    fn learn(&mut self, report: LastReport) {
+        let Some((before, instances)) = self.last.zip(report.instances) else { return };
         // Clients in the queue cost nothing yet.
-        let present = f64::from(instances.present.min(instances.places));
-        let shown = (present - unseen).max(0.0);
+        let present = f64::from(instances.present().min(instances.places));
+        let shown = (present - self.unseen).max(0.0);
         // While many start, it is uncertain how much of them the load shows.
         let trust = if shown < present { shown / present } else { 1.0 };
-        self.fit.learn(shown, report.load, now.saturating_duration_since(before), trust * trust);
+        self.fit.learn(shown, report.load, report.at.saturating_duration_since(before.at), trust * trust);
     }
 
     /// Drops the changes that the load shows by now, and sums up the others.
-    fn settle(&mut self, now: Instant, policy: &PlacementPolicy) {
-        self.settling.retain(|change| change.unseen(now, policy.settling) != 0.0);
-        self.unseen = Unseen::default();
-        for change in &self.settling {
-            let clients = change.unseen(now, policy.settling);
-            *(if change.takes_room { &mut self.unseen.reserved } else { &mut self.unseen.unreserved }) += clients;
-        }
+    fn settle(&mut self, now: Instant) {
+        self.settling.retain(|change| change.unseen(now) != 0.0);
+        self.unseen = self.settling.iter().map(|change| change.unseen(now)).sum();
+        let reserved = self.settling.iter().filter(|change| change.takes_room);
+        self.unseen_reserved = reserved.map(|change| change.unseen(now)).sum();
     }
 
     /// Compares the report with the one before: which clients arrived, which left.
-    fn note_changes(&mut self, now: Instant, new: Option<ClientCounts>, replicas: &mut Replicas) {
-        let Some(new) = new else {
+    fn note_changes(&mut self, report: LastReport, replicas: &mut Replicas) {
+        let Some(new) = report.instances else {
             // A load alone does not show arrivals: every placement is assumed to have arrived at once.
             let all = self.in_flight.drain(..);
             self.settling.extend(all.map(|Placement { at, takes_room }| ClientDelta { at, clients: 1.0, takes_room }));
             self.reserved = 0;
             return;
         };
-        let old = self.last.and_then(|(at, report)| report.instances.map(|old| (at, old)));
+        let old = self.last.and_then(|last| Some((last.at, last.instances?)));
         let Some((before, old)) = old.filter(|(_, old)| old.arrivals <= new.arrivals) else {
             // The first report, or a restarted server: its load contains nothing of the past. Placements in flight may
             // still arrive.
             self.settling.clear();
-            self.fit.count_arrivals(f64::from(new.present));
+            self.fit.count_arrivals(f64::from(new.present()));
             return;
         };
         let arrivals = usize::try_from(new.arrivals - old.arrivals).unwrap_or(usize::MAX);
@@ -286,23 +239,25 @@ impl Backend {
         // Other changes: clients that arrived without a placement from here, minus those that left. When they happened
         // is unknown: half-way between the reports is assumed.
         let came = count(came);
-        let others = f64::from(new.present) - f64::from(old.present) - came;
+        let others = f64::from(new.present()) - f64::from(old.present()) - came;
         self.fit.count_arrivals(came + others.max(0.0));
         if others != 0.0 {
-            let at = before + now.saturating_duration_since(before) / 2;
+            let at = before + report.at.saturating_duration_since(before) / 2;
             self.settling.push_back(ClientDelta { at, clients: others, takes_room: true });
         }
     }
 }
 
+/// A number of clients, to calculate with.
 #[expect(clippy::cast_precision_loss, reason = "there are no 2^52 clients")]
-fn count(clients: usize) -> f64 {
+pub(super) fn count(clients: usize) -> f64 {
     clients as f64
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::shared::domain::Load;
 
     /// One server, the start of its clock, and what its fleet has learned of costs and of other session servers.
     struct Server(Backend, Instant, FleetCost, Replicas);
@@ -330,10 +285,11 @@ mod tests {
         /// A report with a load and, of the server's clients, those present and the arrivals.
         fn report(&mut self, seconds: f64, load: f64, counts: Option<(u32, u64)>) {
             let instances =
-                counts.map(|(present, arrivals)| ClientCounts { present, places: 1000, arrivals, accepting: true });
-            let at = self.at(seconds);
-            self.0.expire(at, &PlacementPolicy::default(), &mut self.3);
-            self.0.report(at, LoadReport { load, instances }, &PlacementPolicy::default(), &mut self.2, &mut self.3);
+                counts.map(|(running, arrivals)| Instances { running, places: 1000, arrivals, ..Instances::default() });
+            let report = ServerReport { instances, ..ServerReport::load_only(Load::try_from(load).unwrap()) };
+            let (at, policy) = (self.at(seconds), PlacementPolicy::default());
+            self.0.expire(at, &policy);
+            self.0.report(at, &report, true, &policy, &mut self.2, &mut self.3);
         }
 
         fn assert_load(&self, expected: f64, tolerance: f64) {
@@ -365,7 +321,7 @@ mod tests {
         for second in 9..300 {
             server.place(f64::from(second));
             server.report(f64::from(second), f64::from(second % 90), None);
-            assert_eq!(server.0.cost().to_bits(), 2.0_f64.to_bits());
+            assert_eq!(server.0.cost.to_bits(), 2.0_f64.to_bits());
         }
     }
 
@@ -390,23 +346,21 @@ mod tests {
     }
 
     #[test]
-    fn a_repeated_or_late_report_changes_nothing() {
+    fn a_repeated_report_changes_nothing() {
         let mut server = Server::new(10.0, Some((5, 5)));
         (0..2).for_each(|_| server.place(0.0));
         server.report(1.0, 10.0, Some((6, 6)));
         let before = server.0.effective_load().unwrap();
-        for (at, load, counts) in [(1.0, 10.0, (6, 6)), (0.0, 70.0, (0, 0))] {
-            server.report(at, load, Some(counts));
-            assert_eq!(server.0.in_flight(), 1);
-            server.assert_load(before, 0.01);
-        }
+        server.report(1.0, 10.0, Some((6, 6)));
+        assert_eq!(server.0.in_flight(), 1);
+        server.assert_load(before, 0.01);
     }
 
     #[test]
     fn a_server_that_was_started_again_keeps_what_is_on_its_way() {
         let mut server = Server::new(60.0, Some((30, 500)));
         server.place(0.0);
-        server.0.lose();
+        server.0.up = false;
         server.report(3.0, 1.0, Some((0, 0)));
         assert_eq!(server.0.in_flight(), 1);
         server.assert_load(3.0, 0.1);

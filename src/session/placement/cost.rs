@@ -52,7 +52,7 @@ pub(super) struct Estimate {
 }
 
 /// The fit for one server: the weighted sums of its reports, and what follows from them.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Default)]
 pub(super) struct CostFit {
     guess: f64,
     weight: f64,
@@ -76,21 +76,7 @@ impl CostFit {
     /// Nothing learned yet: a client costs `guess` percent.
     pub(super) fn new(guess: f64) -> Self {
         let guess = believable(guess);
-        Self {
-            guess,
-            weight: 0.0,
-            clients: 0.0,
-            clients_squared: 0.0,
-            load: 0.0,
-            clients_by_load: 0.0,
-            idle_load: 0.0,
-            idle_weight: BASE_TRUST,
-            seen: 0.0,
-            arrived: 0.0,
-            base: 0.0,
-            slope: guess,
-            variance: guess * guess,
-        }
+        Self { guess, idle_weight: BASE_TRUST, slope: guess, variance: guess * guess, ..Self::default() }
     }
 
     /// This server's own estimate. `believed` is the cost that was assumed until now, in percent: a high estimate is
@@ -212,7 +198,8 @@ impl FleetCost {
 
 #[cfg(test)]
 mod tests {
-    use crate::session::placement::{ClientCounts, LoadBalancer, LoadReport, PlacementPolicy};
+    use crate::session::placement::{LoadBalancer, PlacementPolicy};
+    use crate::shared::domain::{Instances, Load, ServerReport};
     use std::time::{Duration, Instant};
 
     /// A fleet of this many servers, and its start.
@@ -222,9 +209,9 @@ mod tests {
         (fleet, Instant::now())
     }
 
-    fn report(load: f64, present: u32, arrivals: u32) -> LoadReport {
-        let instances = ClientCounts { present, places: 1000, arrivals: arrivals.into(), accepting: true };
-        LoadReport { load, instances: Some(instances) }
+    fn report(load: f64, present: u32, arrivals: u32) -> ServerReport {
+        let instances = Instances { running: present, places: 1000, arrivals: arrivals.into(), ..Instances::default() };
+        ServerReport { instances: Some(instances), ..ServerReport::load_only(Load::try_from(load).unwrap()) }
     }
 
     fn assert_near(value: Option<f64>, expected: f64, tolerance: f64) {
@@ -239,7 +226,7 @@ mod tests {
             let present = if (step / 10).is_multiple_of(2) { step % 10 } else { 10 - step % 10 };
             let noise = if second.is_multiple_of(2) { 1.0 } else { -1.0 };
             let load = (5.0 + cost * f64::from(present) + noise).min(100.0);
-            fleet.report(&id, start + Duration::from_secs(second.into()), report(load, present, step + 1));
+            fleet.report(&id, start + Duration::from_secs(second.into()), &report(load, present, step + 1), true);
         }
     }
 
@@ -261,7 +248,7 @@ mod tests {
         (0..4).for_each(|id| teach(&mut fleet, id, start, 6.0));
         fleet.add(9);
         assert_eq!(fleet.client_cost(&9), Some(2.0));
-        fleet.report(&9, start, report(0.0, 0, 0));
+        fleet.report(&9, start, &report(0.0, 0, 0), true);
         assert_near(fleet.client_cost(&9), 6.0, 0.6);
         // Similar servers count as equal, apart from the shift of the mean between their last reports.
         assert_near(fleet.client_cost(&1), 6.0, 0.6);
@@ -281,7 +268,7 @@ mod tests {
         let (mut fleet, start) = fleet(2.0, 1);
         for second in 0..300_u32 {
             let now = start + Duration::from_secs(second.into());
-            fleet.report(&0, now, report(100.0, 20 + second, 20 + second));
+            fleet.report(&0, now, &report(100.0, 20 + second, 20 + second), true);
             assert!(!fleet.available(now));
         }
         assert!(fleet.client_cost(&0).is_some_and(|cost| cost >= 2.0));
@@ -295,7 +282,7 @@ mod tests {
             arrivals += present.saturating_sub(before);
             before = *present;
             for _ in 0..*seconds {
-                fleet.report(&0, start + Duration::from_secs(second), report(*load, *present, arrivals));
+                fleet.report(&0, start + Duration::from_secs(second), &report(*load, *present, arrivals), true);
                 second += 1;
             }
         }

@@ -4,8 +4,7 @@
 //! the lowest last report. The [`LoadBalancer`] therefore counts each of its own placements as load at once, until the
 //! reports show it.
 //!
-//! - `load_balancer`: the servers, and the choice between them; `policy`: its parameters;
-//! - `ranking`: the servers sorted by load, so that a large fleet is as fast as a small one;
+//! - `load_balancer`: the servers sorted by load, and the choice between them; `policy`: its parameters;
 //! - `backend`: what is known of one server;
 //! - `cost`: what a client costs a server, learned from its reports;
 //! - `ejection`: which servers come last, because their starts fail;
@@ -19,9 +18,7 @@ mod cost;
 mod ejection;
 mod load_balancer;
 mod policy;
-mod ranking;
 mod replicas;
 
-pub use backend::{ClientCounts, LoadReport};
 pub use load_balancer::LoadBalancer;
 pub use policy::PlacementPolicy;

@@ -13,18 +13,10 @@ pub struct PlacementPolicy {
     pub client_cost: f64,
     /// Time after which a placement is given up if its client does not arrive. Default: 15 seconds.
     pub placement_timeout: Duration,
-    /// Time until an arrived client shows fully in the reported load, which is a mean of five seconds, and a simulation
-    /// takes a while to start. Default: 8 seconds.
-    pub settling: Duration,
 }
 
 impl Default for PlacementPolicy {
     fn default() -> Self {
-        Self {
-            threshold: 95.0,
-            client_cost: 2.0,
-            placement_timeout: Duration::from_secs(15),
-            settling: Duration::from_secs(8),
-        }
+        Self { threshold: 95.0, client_cost: 2.0, placement_timeout: Duration::from_secs(15) }
     }
 }

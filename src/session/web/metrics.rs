@@ -8,7 +8,7 @@ pub fn gauges<'text>(clients: usize, status: &FleetStatus) -> Vec<Gauge<'text>> 
     let count = |wanted: ServerState| status.servers.iter().filter(|server| server.record.state == wanted).count();
     let all = [ServerState::Unknown, ServerState::Up, ServerState::Full, ServerState::Draining, ServerState::Down];
     let of_servers = |name, help, value: &dyn Fn(&ServerStatus) -> Option<f64>| {
-        let value = |server: &ServerStatus| Some((vec![server.address.to_string()], value(server)?));
+        let value = |server: &ServerStatus| Some((vec![server.record.address.to_string()], value(server)?));
         Gauge { name, help, labels: &["server"], values: status.servers.iter().filter_map(value).collect() }
     };
     let of_names = |name, help, value: &dyn Fn(&NameStatus) -> f64| {

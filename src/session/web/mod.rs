@@ -4,7 +4,6 @@ mod actions;
 mod metrics;
 mod page_routes;
 pub mod pages;
-mod queries;
 mod routes;
 mod status;
 mod web_client;

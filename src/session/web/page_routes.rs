@@ -2,11 +2,10 @@
 
 use std::time::SystemTime;
 
-use actix_web::{HttpRequest, HttpResponse, web};
+use actix_web::{HttpRequest, HttpResponse, Result, web};
 use askama::Template;
 
 use super::pages::{self, Viewer, WebotsViewer};
-use super::queries::{status, with_status};
 use crate::asset;
 use crate::session::fleet::FleetStatus;
 use crate::session::state::AppState;
@@ -27,14 +26,12 @@ pub fn configure(app: &mut web::ServiceConfig) {
         .service(path("/assets/{name}", READ, asset));
 }
 
-async fn monitor(server: web::Data<AppState>) -> HttpResponse {
+async fn monitor(server: web::Data<AppState>) -> Result<HttpResponse> {
+    let (status, announcement) = (server.status().await?, server.announcements.current());
     let (clients, started) = (server.clients(), SystemTime::now() - server.started.elapsed());
-    let announcement = server.announcements.current();
     let more = (announcement.as_deref(), server.admin_auth.is_some());
-    with_status(&server, |status| {
-        html(pages::monitor(status, clients, &server.client_urls, started, more), &ContentSecurityPolicy::own())
-    })
-    .await
+    let page = pages::monitor(&status, clients, &server.client_urls, started, more);
+    Ok(html(page, &ContentSecurityPolicy::own()))
 }
 
 async fn events(request: HttpRequest, server: web::Data<AppState>) -> HttpResponse {
@@ -46,7 +43,7 @@ async fn events(request: HttpRequest, server: web::Data<AppState>) -> HttpRespon
     let render = move || {
         let server = shown.clone();
         async move {
-            let status = status(&server).await?;
+            let status = server.status().await.ok()?;
             let announcement = server.announcements.current();
             let view = pages::view(&status, server.clients(), &server.client_urls, announcement.as_deref());
             view.inspect_err(|error| log::error!("the monitor page can't be rendered: {error}")).ok()
@@ -55,26 +52,20 @@ async fn events(request: HttpRequest, server: web::Data<AppState>) -> HttpRespon
     server.live.listen(permit, server.phase.clone(), render)
 }
 
-async fn viewer(request: HttpRequest, server: web::Data<AppState>) -> HttpResponse {
-    with_status(&server, |status| {
-        let script = server.config.viewer_script.as_ref().map(url::Url::as_str);
-        let page = Viewer { version: env!("CARGO_PKG_VERSION"), examples: &server.config.examples, script };
-        let policy = ContentSecurityPolicy::viewer(&request, &fleet(&server, status));
-        html(page.render(), &policy)
-    })
-    .await
+async fn viewer(request: HttpRequest, server: web::Data<AppState>) -> Result<HttpResponse> {
+    let fleet = fleet(&server, &*server.status().await?);
+    let script = server.config.viewer_script.as_ref().map(url::Url::as_str);
+    let page = Viewer { version: env!("CARGO_PKG_VERSION"), examples: &server.config.examples, script };
+    Ok(html(page.render(), &ContentSecurityPolicy::viewer(&request, &fleet)))
 }
 
 /// Webots' own viewer is third-party code, and a link to this page can name another script on a host of the fleet. So
 /// it runs in an embedded page with an origin of its own.
-async fn webots_viewer(server: web::Data<AppState>) -> HttpResponse {
-    with_status(&server, |status| {
-        let mut sources = fleet(&server, status);
-        sources.extend(server.config.viewer_script.as_ref().map(|script| script.origin().ascii_serialization()));
-        let page = WebotsViewer { version: env!("CARGO_PKG_VERSION") };
-        html(page.render(), &ContentSecurityPolicy::foreign(&sources))
-    })
-    .await
+async fn webots_viewer(server: web::Data<AppState>) -> Result<HttpResponse> {
+    let mut sources = fleet(&server, &*server.status().await?);
+    sources.extend(server.config.viewer_script.as_ref().map(|script| script.origin().ascii_serialization()));
+    let page = WebotsViewer { version: env!("CARGO_PKG_VERSION") };
+    Ok(html(page.render(), &ContentSecurityPolicy::foreign(&sources)))
 }
 
 fn fleet(server: &AppState, status: &FleetStatus) -> Vec<String> {
@@ -82,7 +73,7 @@ fn fleet(server: &AppState, status: &FleetStatus) -> Vec<String> {
         Some(public) => vec![public.http_door(), public.websocket_door()],
         // Names may resolve to other servers by the time the page starts a simulation.
         None if !status.names.is_empty() => any_host(server.client_urls.ssl),
-        None => fleet_sources(status.servers.iter().map(|one| &one.address), server.client_urls.ssl),
+        None => fleet_sources(status.servers.iter().map(|one| &one.record.address), server.client_urls.ssl),
     }
 }
 

@@ -6,7 +6,7 @@ use std::time::{Duration, SystemTime};
 use askama::Template;
 
 use crate::session::config::{Announcement, Example};
-use crate::session::fleet::{FleetStatus, NameStatus, ServerState, ServerStatus, StateChange};
+use crate::session::fleet::{FleetStatus, ServerState, ServerStatus, StateChange};
 use crate::shared::domain::{ClientUrls, Instances};
 use crate::shared::http::{PageView, TableRow};
 use crate::shared::run::timestamp;
@@ -18,23 +18,17 @@ use crate::shared::text::one_line;
 struct Monitor<'view> {
     version: &'static str,
     started: String,
-    announcement: &'view str,
     /// Whether administrators can do something here.
     has_actions: bool,
-    glance: &'view str,
-    changes: &'view str,
-    rows: &'view [TableRow],
+    view: &'view PageView,
 }
 
 /// The summary of the fleet.
 #[derive(Template)]
 #[template(path = "session/glance.html")]
 struct Glance<'status> {
-    names: &'status [NameStatus],
-    available: bool,
+    status: &'status FleetStatus,
     clients: usize,
-    mean_load: Option<f64>,
-    servers: usize,
     answering: usize,
     taking: usize,
     down: usize,
@@ -55,7 +49,6 @@ struct ServerRow<'server> {
     error: Option<&'server str>,
     load: Option<f64>,
     load_value: f64,
-    effective: Option<f64>,
     effective_value: f64,
     instances: Option<Instances>,
     repositories: Vec<String>,
@@ -113,7 +106,7 @@ pub fn view(
 ) -> Result<PageView, askama::Error> {
     let rows = status.servers.iter().map(|server| {
         let html = ServerRow::new(server, urls).render()?;
-        Ok(TableRow { key: server.address.to_string(), html })
+        Ok(TableRow { key: server.record.address.to_string(), html })
     });
     let rows = rows.collect::<Result<Vec<TableRow>, askama::Error>>()?;
     let announced = announcement.map(|one| Announced { text: &one.text, until: one.until.map(timestamp) }.render());
@@ -137,17 +130,8 @@ pub fn monitor(
     (announcement, has_actions): (Option<&Announcement>, bool),
 ) -> Result<String, askama::Error> {
     let view = view(status, clients, urls, announcement)?;
-    let part = |id| view.parts.get(id).map(String::as_str).unwrap_or_default();
-    let page = Monitor {
-        version: env!("CARGO_PKG_VERSION"),
-        started: timestamp(started),
-        announcement: part("announcement"),
-        has_actions,
-        glance: part("glance"),
-        changes: part("changes"),
-        rows: view.tables.get("servers").map(Vec::as_slice).unwrap_or_default(),
-    };
-    page.render()
+    let started = timestamp(started);
+    Monitor { version: env!("CARGO_PKG_VERSION"), started, has_actions, view: &view }.render()
 }
 
 impl<'status> Glance<'status> {
@@ -159,11 +143,8 @@ impl<'status> Glance<'status> {
         // Numbers that another server reports may be arbitrarily large.
         let sum = |part: fn(Instances) -> u32| instances().map(|one| u64::from(part(one))).sum::<u64>();
         Self {
-            names: &status.names,
-            available: status.available,
+            status,
             clients,
-            mean_load: status.mean_load,
-            servers: status.servers.len(),
             answering: count(&[ServerState::Up, ServerState::Full, ServerState::Draining]),
             taking: count(&[ServerState::Up]),
             down: count(&[ServerState::Down]),
@@ -188,12 +169,11 @@ impl<'server> ServerRow<'server> {
         };
         Self {
             server,
-            monitor: format!("{}/monitor", urls.http_url(&server.address)),
-            rank: rank(record.state),
+            monitor: format!("{}/monitor", urls.http_url(&server.record.address)),
+            rank: record.state as u8,
             error: server.error.as_deref().filter(|_| record.state == ServerState::Down),
             load,
             load_value: sort_value(load),
-            effective: server.effective_load,
             effective_value: sort_value(server.effective_load),
             instances: instances(server),
             repositories: repositories.iter().map(|prefix| one_line(without_scheme(prefix.as_str()))).collect(),
@@ -214,17 +194,6 @@ impl Changes<'_> {
 
 fn instances(server: &ServerStatus) -> Option<Instances> {
     server.record.current()?.instances
-}
-
-/// Sort rank of a state: states that need attention come first.
-fn rank(state: ServerState) -> u8 {
-    match state {
-        ServerState::Down => 0,
-        ServerState::Unknown => 1,
-        ServerState::Draining => 2,
-        ServerState::Full => 3,
-        ServerState::Up => 4,
-    }
 }
 
 fn without_scheme(url: &str) -> &str {

@@ -3,14 +3,14 @@
 use std::borrow::Cow;
 use std::sync::Arc;
 
+use actix_web::error::ErrorInternalServerError;
 use actix_web::http::{StatusCode, header};
-use actix_web::{HttpRequest, HttpResponse, web};
+use actix_web::{HttpRequest, HttpResponse, Result, web};
 use percent_encoding::percent_decode_str;
 
 use super::actions;
 use super::metrics;
 use super::page_routes;
-use super::queries::{status, with_status};
 use super::status::status_page;
 use super::web_client::WebClient;
 use crate::session::fleet::{Pick, PickError};
@@ -96,20 +96,20 @@ async fn availability(server: web::Data<AppState>) -> HttpResponse {
 }
 
 async fn load(server: web::Data<AppState>) -> HttpResponse {
-    let load = status(&server).await.map_or(-1.0, |status| status.displayed_mean_load());
+    let load = server.status().await.map_or(-1.0, |status| status.displayed_mean_load());
     HttpResponse::Ok().content_type("text/plain").body(load.to_string())
 }
 
-async fn status_json(server: web::Data<AppState>) -> HttpResponse {
-    with_status(&server, |status| HttpResponse::Ok().json(status_page(&server, status))).await
+async fn status_json(server: web::Data<AppState>) -> Result<HttpResponse> {
+    let status = server.status().await?;
+    Ok(HttpResponse::Ok().json(status_page(&server, &status)))
 }
 
-async fn metrics_text(server: web::Data<AppState>) -> HttpResponse {
-    with_status(&server, |status| match server.metrics.render(&metrics::gauges(server.clients(), status)) {
-        Ok(text) => HttpResponse::Ok().content_type(CONTENT_TYPE).body(text),
-        Err(error) => HttpResponse::InternalServerError().body(format!("Error: {error}.")),
-    })
-    .await
+async fn metrics_text(server: web::Data<AppState>) -> Result<HttpResponse> {
+    let status = server.status().await?;
+    let text = server.metrics.render(&metrics::gauges(server.clients(), &status));
+    let text = text.map_err(|error| ErrorInternalServerError(format!("Error: {error}.")))?;
+    Ok(HttpResponse::Ok().content_type(CONTENT_TYPE).body(text))
 }
 
 async fn health() -> HttpResponse {

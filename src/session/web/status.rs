@@ -26,8 +26,8 @@ pub fn status_page(server: &AppState, status: &FleetStatus) -> Value {
 fn server_status(server: &ServerStatus, urls: &ClientUrls) -> Value {
     let (record, report) = (&server.record, server.record.current());
     json!({
-        "address": server.address,
-        "monitor": format!("{}/monitor", urls.http_url(&server.address)),
+        "address": record.address,
+        "monitor": format!("{}/monitor", urls.http_url(&record.address)),
         "state": record.state,
         "since": timestamp(record.since),
         "load": report.map(|report| report.load),

@@ -8,6 +8,7 @@ use std::sync::Arc;
 
 use actix::prelude::*;
 use actix_web_actors::ws::{CloseCode, CloseReason, Message, ProtocolError, WebsocketContext};
+use bytestring::ByteString;
 use futures_util::StreamExt;
 use futures_util::stream::{self, Stream};
 use serde::Deserialize;
@@ -27,7 +28,6 @@ pub struct WebClient {
     server: Arc<AppState>,
     peer: Peer,
     liveness: Liveness,
-    sent: Option<bool>,
     /// Whether it has requested announcements.
     wants_announcements: bool,
     _permit: ConnectionPermit,
@@ -38,7 +38,7 @@ type Context = WebsocketContext<WebClient>;
 impl WebClient {
     /// A client that has just connected; `permit` counts it.
     pub fn new(server: Arc<AppState>, peer: Peer, wants_announcements: bool, permit: ConnectionPermit) -> Self {
-        Self { server, peer, liveness: Liveness::default(), sent: None, wants_announcements, _permit: permit }
+        Self { server, peer, liveness: Liveness::default(), wants_announcements, _permit: permit }
     }
 
     fn close(code: CloseCode, ctx: &mut Context) {
@@ -84,48 +84,43 @@ impl Actor for WebClient {
     }
 }
 
-/// A message to the web client that is not an answer.
-enum Update {
-    /// Whether some simulation server can take a client.
-    Availability(bool),
-    /// The text of the announcement; empty once it is over.
-    Announcement(String),
-    /// The server stops; the connection is closed.
-    Closing,
-}
-
-/// The current availability and its changes; then the stop of the server, which ends the stream.
-fn updates(mut available: watch::Receiver<bool>, phase: watch::Receiver<Phase>) -> impl Stream<Item = Update> {
+/// The current availability and its changes, never the same value twice in a row; then `None`, the stop of the server.
+fn updates(
+    mut available: watch::Receiver<bool>,
+    phase: watch::Receiver<Phase>,
+) -> impl Stream<Item = Option<ByteString>> {
     available.mark_changed();
-    let changes = stream::unfold(available, async |mut available| {
-        available.changed().await.ok()?;
-        let update = Update::Availability(*available.borrow_and_update());
-        Some((update, available))
+    let changes = stream::unfold((available, None), async |(mut available, sent)| {
+        loop {
+            available.changed().await.ok()?;
+            let now = *available.borrow_and_update();
+            if sent != Some(now) {
+                let text = ByteString::from_static(if now { "1" } else { "0" });
+                return Some((Some(text), (available, Some(now))));
+            }
+        }
     });
-    changes.take_until(Box::pin(closing(phase))).chain(stream::iter([Update::Closing]))
+    changes.take_until(Box::pin(closing(phase))).chain(stream::iter([None]))
 }
 
-/// The current announcement, if there is one, and each change.
-fn announcements(mut all: watch::Receiver<Option<Arc<Announcement>>>) -> impl Stream<Item = Update> {
+/// The current announcement, if there is one, and each change; no text once it is over.
+fn announcements(mut all: watch::Receiver<Option<Arc<Announcement>>>) -> impl Stream<Item = Option<ByteString>> {
     if all.borrow().is_some() {
         all.mark_changed();
     }
     stream::unfold(all, async |mut all| {
         all.changed().await.ok()?;
         let text = all.borrow_and_update().as_ref().map(|one| client_text(&one.text)).unwrap_or_default();
-        Some((Update::Announcement(text), all))
+        Some((Some(format!("announcement: {text}").trim_end().into()), all))
     })
 }
 
-impl StreamHandler<Update> for WebClient {
-    fn handle(&mut self, update: Update, ctx: &mut Context) {
-        match update {
-            Update::Announcement(text) => ctx.text(format!("announcement: {text}").trim_end().to_owned()),
-            Update::Closing => Self::close(CloseCode::Away, ctx),
-            Update::Availability(available) if self.sent.replace(available) != Some(available) => {
-                ctx.text(if available { "1" } else { "0" });
-            }
-            Update::Availability(_) => {}
+/// Texts to the web client that are no answers; `None` closes the connection.
+impl StreamHandler<Option<ByteString>> for WebClient {
+    fn handle(&mut self, text: Option<ByteString>, ctx: &mut Context) {
+        match text {
+            Some(text) => ctx.text(text),
+            None => Self::close(CloseCode::Away, ctx),
         }
     }
 }
