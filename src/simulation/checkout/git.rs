@@ -7,7 +7,9 @@ use std::time::Duration;
 use rustix::process::Resource;
 
 use super::git_error::GitError;
-use crate::simulation::process::{ExitReason, Ran, Run, RunError};
+use crate::shared::config::ExpandedPath;
+use crate::simulation::config::SimulationConfig;
+use crate::simulation::process::{ExitReason, Ran, Run};
 
 /// Runs git with this server's settings.
 pub struct Git {
@@ -21,7 +23,7 @@ pub struct Git {
 pub struct Call<'call> {
     /// The bare repository.
     pub repository: &'call Path,
-    /// Settings that it needs, each as `name=value`.
+    /// Settings that it needs besides, each as `name=value`.
     pub settings: Vec<String>,
     /// The command and its arguments.
     pub arguments: Vec<OsString>,
@@ -60,13 +62,15 @@ const MAX_ANSWER: u64 = 64 * 1024 * 1024;
 const MAX_LINE: usize = 500;
 
 impl Git {
-    /// Prepares git for the server whose run has this folder. `config` is the administrator's file of settings; a remote may
-    /// be silent for so long.
-    pub fn new(run: &Path, config: Option<&Path>, silence: Duration) -> Self {
-        let config = config.map(|file| std::path::absolute(file).unwrap_or_else(|_| file.to_owned()));
-        let quoted = |file: PathBuf| file.to_string_lossy().replace('\\', "\\\\").replace('"', "\\\"");
-        let include = config.map(|file| format!("[include]\n\tpath = \"{}\"\n", quoted(file)));
-        let silence = format!("[http]\n\tlowSpeedLimit = 1\n\tlowSpeedTime = {}\n", silence.as_secs().max(1));
+    /// Prepares git for the server whose run has this folder.
+    pub fn new(run: &Path, config: &SimulationConfig) -> Self {
+        let include = config.git_config.as_ref().map(|ExpandedPath(file)| {
+            let file = std::path::absolute(file).unwrap_or_else(|_| file.clone());
+            let quoted = file.to_string_lossy().replace('\\', "\\\\").replace('"', "\\\"");
+            format!("[include]\n\tpath = \"{quoted}\"\n")
+        });
+        let silence = stall_timeout(config).as_secs().max(1);
+        let silence = format!("[http]\n\tlowSpeedLimit = 1\n\tlowSpeedTime = {silence}\n");
         let settings = (run.join("gitconfig"), include.unwrap_or_default() + SETTINGS + &silence);
         Self { settings, mark: run.to_owned() }
     }
@@ -101,14 +105,11 @@ impl Git {
                 cause = line;
             }
         };
-        let ran = self.prepared(call, &command).run(on_line).await;
-        match ran {
+        match self.prepared(call, &command).run(on_line).await {
             Ok(Ran { ending: ExitReason::Code(0), answer }) => Ok(answer),
-            Ok(Ran { ending: ExitReason::NotStarted, .. }) => Err(GitError::Machine(cause)),
-            Ok(Ran { ending, .. }) => Err(GitError::Failed { command, ending, message: cause }),
-            Err(error @ RunError::NotStarted(_)) => Err(GitError::Machine(format!("git {error}"))),
-            Err(RunError::Slow(limit)) => Err(GitError::Slow(limit)),
-            Err(RunError::TooLong) => Err(GitError::TooLong(command)),
+            Ok(Ran { ending: ExitReason::NotStarted, .. }) => Err(GitError::machine(cause)),
+            Ok(Ran { ending, .. }) => Err(GitError::ended(&command, ending, &cause)),
+            Err(error) => Err(GitError::not_ended(&command, &error)),
         }
     }
 
@@ -138,6 +139,11 @@ impl Git {
         }
         run
     }
+}
+
+/// How long a remote may be silent, and packing a cached repository hold a fetch up.
+pub fn stall_timeout(config: &SimulationConfig) -> Duration {
+    config.timing.checkout / 4
 }
 
 /// Ranks git's messages: the first fatal line names the cause, else the first error; later lines are consequences.

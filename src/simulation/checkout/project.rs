@@ -15,8 +15,8 @@ pub struct Project {
     pub world: WorldFile,
     /// What it takes of the disk, in bytes.
     pub size: u64,
-    /// Warnings for the client.
-    pub warnings: Vec<String>,
+    /// A warning for the client.
+    pub warning: Option<String>,
     /// The URL that it was checked out from.
     pub(super) url: ProjectUrl,
     pub(super) revision: Revision,

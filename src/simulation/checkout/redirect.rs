@@ -6,11 +6,11 @@
 
 use url::Url;
 
-use super::checkout_error::CheckoutError;
+use super::checkout_error::{CheckoutError, moved};
 use super::git::Call;
-use super::mirrors::{Mirrors, Remote};
-use super::repository::Repository;
+use super::repository::{REMOTE, Repository};
 use crate::shared::domain::{AdmissionRules, Load, ProjectUrl};
+use crate::simulation::config::{Mirrors, Remote};
 
 /// Limit of redirects for a world.
 pub const MAX_REDIRECTS: usize = 5;
@@ -31,9 +31,9 @@ pub async fn follow(
         Some(location) => target(mirrors, rules, world, &location),
         None => Err("to where its forge does not say".to_owned()),
     };
-    let (moved, remote) = target.map_err(|why| CheckoutError::Moved(world.repository(), why))?;
-    log::info!("{} is at {}", world.repository(), remote.location);
-    Ok((moved, remote))
+    let target = target.map_err(|why| moved(world, &why))?;
+    log::info!("{} is at {}", world.repository(), target.1.location);
+    Ok(target)
 }
 
 /// The `Location` to which a Git host redirects requests for a repository.
@@ -49,8 +49,7 @@ async fn location(repository: &Repository) -> Option<String> {
             location = Some(value.to_owned());
         }
     };
-    let remote = repository.remote();
-    let call = repository.call(&["ls-remote", "--quiet", "--", &remote.location, "HEAD"]);
+    let call = repository.call(&["ls-remote", "--quiet", "--", REMOTE, "HEAD"]);
     // It fails again, since the forge sends it elsewhere.
     repository.run(Call { environment, ..call }, on_line).await.ok();
     location
