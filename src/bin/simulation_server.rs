@@ -56,7 +56,7 @@ fn main() -> ExitCode {
         return sweep(config);
     }
     if let Some(Part::Guard(arguments)) = &arguments.part {
-        let sweep = |owner: &String| container::sweep_all(&container::ResourceOwner::named(owner));
+        let sweep = |owner: &String| container::sweep_all(&container::ResourceOwner(owner.clone()));
         let remove = || arguments.containers.iter().for_each(sweep);
         return ExitCode::from(guardian::guard(arguments, remove));
     }

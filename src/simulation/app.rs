@@ -97,7 +97,7 @@ fn bound_clients(config: &SimulationConfig) -> Result<usize, AppError> {
 /// When an actor that must live has stopped, or the system refuses what the server needs.
 pub async fn serve(assembly: Application) -> Result<(), AppError> {
     let Application { server, socket, mut signals, phase: phase_sender, mut commands } = assembly;
-    let owner = server.containers.as_ref().map(|containers| containers.run.name());
+    let owner = server.containers.as_ref().map(|containers| containers.run.0.as_str());
     let _guardian = Guardian::start(server.run.path(), owner)?;
     let shared = web::Data::from(Arc::clone(&server));
     let threads = std::thread::available_parallelism().map_or(1, usize::from);

@@ -1,6 +1,6 @@
 //! A project that was checked out for one client.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::Arc;
 
 use super::revision::Revision;
@@ -20,18 +20,13 @@ pub struct Project {
     /// The URL that it was checked out from.
     pub(super) url: ProjectUrl,
     pub(super) revision: Revision,
-    /// The project's directory.
-    pub(super) folder: PathBuf,
+    /// The project's directory, with `worlds` and `controllers` inside.
+    pub folder: PathBuf,
     /// The instance directory; removed with the project.
     pub instance: Arc<InstanceDir>,
 }
 
 impl Project {
-    /// The project's folder, with `worlds` and `controllers` inside.
-    pub fn folder(&self) -> &Path {
-        &self.folder
-    }
-
     /// What tells this project from others: its repository, its commit, and its folder there.
     pub fn identity(&self) -> String {
         format!("{} {} {}", self.url.repository(), self.revision.commit, self.revision.folder)
